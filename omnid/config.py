@@ -10,7 +10,7 @@ from typing import Annotated, Final, Literal
 
 from msgspec import Meta
 
-from drivers.logs.log_folder import RotationSettings
+from drivers.logs.rotating_log import RotationSettings
 from omnid.camera_config import CamerasConfig, PairConfig, TimingConfig
 from omnid.controller.motor_settings import MotorSettings
 from omnid.core.control.control_law import ControllerSettings

@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Literal, Self
+from typing import Literal, Self
 
 from mcap.exceptions import McapError
 from mcap.writer import CompressionType, Writer
@@ -31,7 +31,7 @@ _TRANSIENT_LOCAL = "".join(
     )
 )
 _FLUSH_NS = 5 * 10**8  # A chunk ends after this time, by the stamps.
-_END_NS = 2**63  # Valid stamps are smaller.
+END_NS = 2**63  # Valid stamps are smaller.
 
 
 class LogWriter:
@@ -58,7 +58,12 @@ class LogWriter:
         self.messages = self.persisted = 0
         self._channels: dict[tuple[str, str], int] = {}
         self._schemas: dict[str, int] = {}
-        self._file = self._open("xb" if exclusive else "wb")
+        try:
+            self._file = self._path.open("xb" if exclusive else "wb")
+        except OSError as error:
+            raise DriverError(
+                f"cannot create the log {str(self._path)!r}: {error.strerror}; give a path that can be written"
+            ) from error
         lock(self._file)
         self._usable = True
         self._flushed_bytes = 0
@@ -66,7 +71,10 @@ class LogWriter:
         with self._guarded():
             self._writer = Writer(self._file, chunk_bytes, _COMPRESSIONS[compression])
             self._writer.start("ros2", "omnid")
-            self._attach(attachments or {})
+            for name, data in (attachments or {}).items():
+                media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
+                self._writer.add_attachment(0, 0, name, media_type, data)
+            self._file.flush()
             self._flushed_bytes = self._file.tell()
 
     def write(self, topic: str, schema_name: str, data: bytes | memoryview, stamp_ns: int) -> None:
@@ -75,7 +83,7 @@ class LogWriter:
         stamp_ns: log time [ns of Unix time]. Raises DriverError for an unknown type, an invalid stamp, or where the
         file cannot be written.
         """
-        if not 0 <= stamp_ns < _END_NS:
+        if not 0 <= stamp_ns < END_NS:
             raise DriverError(f"cannot log a message on {topic!r}: its stamp {stamp_ns} ns is not a time")
         with self._guarded():
             channel = self._channels.get((topic, schema_name)) or self._register(topic, schema_name)
@@ -109,7 +117,10 @@ class LogWriter:
         try:
             if self._usable:
                 with self._guarded():
-                    self._finish()
+                    self._flush()
+                    self._writer.finish()  # type: ignore[no-untyped-call]
+                    self._file.flush()
+                    self._reach_disk()
         finally:
             self._abandon()
 
@@ -121,17 +132,9 @@ class LogWriter:
     ) -> None:
         self.close()
 
-    def _open(self, mode: Literal["wb", "xb"]) -> IO[bytes]:
-        try:
-            return self._path.open(mode)
-        except OSError as error:
-            raise DriverError(
-                f"cannot create the log {str(self._path)!r}: {error.strerror}; give a path that can be written"
-            ) from error
-
     @contextmanager
     def _guarded(self) -> Iterator[None]:
-        """Turn a failure to write into DriverError and close the file, whose content can be recovered."""
+        """Turn a failure to write into DriverError and close the file, which can be read up to its end."""
         if not self._usable:
             raise DriverError(f"cannot write the log {str(self._path)!r}: it is closed or failed before")
         try:
@@ -149,12 +152,6 @@ class LogWriter:
         self._usable = False
         with suppress(OSError):
             self._file.close()
-
-    def _attach(self, attachments: Mapping[str, bytes]) -> None:
-        for name, data in attachments.items():
-            media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
-            self._writer.add_attachment(0, 0, name, media_type, data)
-        self._file.flush()
 
     def _register(self, topic: str, schema_name: str) -> int:
         if len(self._channels) >= _MAX_CHANNELS:
@@ -185,12 +182,6 @@ class LogWriter:
     def _note_persisted(self) -> None:
         self._flushed_bytes = self._file.tell()
         self.persisted = self.messages
-
-    def _finish(self) -> None:
-        self._flush()
-        self._writer.finish()  # type: ignore[no-untyped-call]
-        self._file.flush()
-        self._reach_disk()
 
     def _reach_disk(self) -> None:
         os.fsync(self._file.fileno())

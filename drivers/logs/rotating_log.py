@@ -1,22 +1,47 @@
-"""A recording in several files, which continues while the disk has space and never stops the program."""
+"""A recording in several files, which continues while the disk has space and never stops the program.
+
+    <name>_20260131T235900Z_001.mcap.part   being written, or left by a program that crashed: readable up to its end
+    <name>_20260131T235900Z_001.mcap        complete
+
+The time is that of the first message, UTC; the number counts the files of one run and those of the same second. No
+files with other names are deleted. Several programs may share a folder: a file being written is locked.
+"""
 
 from __future__ import annotations
 
 import logging
 import os
+import re
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final, Literal
 
+from drivers.backoff import Backoff
 from drivers.errors import DriverError
 from drivers.events import EventCallback
-from drivers.logs.log_folder import LogFolder, RotationSettings, complete_path, delete_file
-from drivers.logs.mcap_writer import LogWriter
+from drivers.logs.file_lock import is_locked
+from drivers.logs.mcap_writer import END_NS, LogWriter
 
+_PART: Final = ".part"
 _FIRST_RETRY_S: Final = 1.0
-_END_NS: Final = 2**63  # Valid stamps are smaller.
+_MAX_NUMBER: Final = 999_999
+_MB: Final = 10**6
+
+
+@dataclass(frozen=True, slots=True)
+class RotationSettings:
+    """Limits at which a new file is started, and limits of the files kept."""
+
+    file_bytes: int = 500 * _MB  # size at which a new file is started
+    file_s: float = 600.0  # age at which a new file is started, by the stamps
+    keep_files: int = 1000  # the oldest are deleted
+    keep_bytes: int = 20_000 * _MB  # of all files, including the one being written at its full size
+    free_bytes: int = 1000 * _MB  # reserved on the disk: with less free space nothing is recorded
+    sync_s: float = 3.0  # period of writing to the disk (fsync)
+    retry_s: float = 30.0  # longest wait between two tries after a failure of the disk
 
 
 @dataclass(slots=True)
@@ -35,32 +60,33 @@ class RotatingLogState:
 
 
 class RotatingLog:
-    """Writes messages to MCAP files of limited size and age, each with the attachments; see log_folder for their names.
+    """Writes messages to MCAP files of limited size and age in a folder, each with the attachments.
 
-    It never raises: on a full or failing disk, or without its folder, it stops, reports that once by `on_event`,
-    counts lost messages, tries again with growing waits, and reports when it continues. For one thread; `state` may
-    be read from any.
+    The folder is made if its parent exists. It never raises: on a full or failing disk, or without its folder, it
+    stops, reports that once by `on_event`, counts lost messages, tries again with growing waits, and reports when it
+    continues. For one thread; `state` may be read from any.
     """
 
     def __init__(
-        self, folder: LogFolder, rotation: RotationSettings, attachments: Mapping[str, bytes],
+        self, folder: Path, name: str, rotation: RotationSettings, attachments: Mapping[str, bytes],
         *, on_event: EventCallback,
     ) -> None:  # fmt: skip
+        """name: of the files; characters that could lead out of the folder are replaced."""
         self.state = RotatingLogState()
-        self._folder, self._rotation, self._on_event = folder, rotation, on_event
+        self._folder, self._name, self._rotation, self._on_event = folder, _file_name(name), rotation, on_event
         self._attachments = dict(attachments)
         self._writer: LogWriter | None = None
-        self._path = folder.path
-        self._number = 1
+        self._path = folder
+        self._number = 0
         self._start_ns = 0
         self._synced_s = self._retry_at_s = 0.0
-        self._retry_s = _FIRST_RETRY_S
+        self._backoff = Backoff(min(_FIRST_RETRY_S, rotation.retry_s), rotation.retry_s)
         self._lost_before = 0  # lost messages when it stopped
 
     def write(self, topic: str, schema_name: str, data: bytes | memoryview, stamp_ns: int) -> None:
         """Write a message, CDR with its encapsulation header, at its stamp [ns of Unix time]."""
         self.state.messages += 1
-        if not 0 <= stamp_ns < _END_NS:
+        if not 0 <= stamp_ns < END_NS:
             self._refuse(f"{topic!r}: its stamp {stamp_ns} ns is not a time")
             return
         writer = self._current(stamp_ns)
@@ -94,10 +120,11 @@ class RotatingLog:
         return writer.size_bytes >= self._rotation.file_bytes or age_s >= self._rotation.file_s
 
     def _begin(self, stamp_ns: int) -> None:
+        """Make room, then create a file; the recording stops where that fails."""
         keep = self._rotation
-        self.state.deleted += self._folder.delete_oldest(keep.keep_files - 1, keep.keep_bytes - keep.file_bytes)
+        self.state.deleted += self._delete_oldest(keep.keep_files - 1, keep.keep_bytes - keep.file_bytes)
         try:
-            self._folder.require_free_space(keep.free_bytes + keep.file_bytes)
+            self._require_free_space(keep.free_bytes + keep.file_bytes)
             self._writer = self._created(stamp_ns)
         except DriverError as error:
             self._stop(error)
@@ -109,21 +136,25 @@ class RotatingLog:
             self.state.status = "recording"
 
     def _created(self, stamp_ns: int) -> LogWriter:
-        """Create a file with an unused name, which no other program uses."""
-        while True:
-            path, number = self._folder.unused_path(stamp_ns, self._number)
-            self._number, self._path = number + 1, path
+        """Create a file with the next number that no other program uses."""
+        at = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(stamp_ns // 10**9))
+        while self._number < _MAX_NUMBER:
+            self._number += 1
+            self._path = self._folder / f"{self._name}_{at}_{self._number:03}.mcap{_PART}"
+            if os.path.lexists(_complete(self._path)):
+                continue
             try:
-                writer = LogWriter(path, self._attachments, compression="none", exclusive=True)
+                writer = LogWriter(self._path, self._attachments, compression="none", exclusive=True)
             except DriverError as error:
                 if isinstance(error.__cause__, FileExistsError):
                     continue
-                delete_file(path)
+                _delete(self._path)
                 raise
-            if not os.path.lexists(complete_path(path)):
+            if not os.path.lexists(_complete(self._path)):
                 return writer
-            delete_file(path)  # another program has completed a file of this name since the check
+            _delete(self._path)  # another program has completed a file of this name since the check
             _drop(writer)
+        raise DriverError(f"cannot record to {str(self._folder)!r}: all file numbers are used; name another folder")
 
     def _refuse(self, reason: str) -> None:
         self.state.refused += 1
@@ -141,15 +172,15 @@ class RotatingLog:
             self.state.lost += writer.messages - writer.persisted
             _drop(writer)
             if not writer.persisted:
-                delete_file(self._path)
+                _delete(self._path)
         self.state.problem, self.state.file = str(error), ""
-        self._retry_at_s = time.monotonic() + self._retry_s
-        self._retry_s = min(2 * self._retry_s, self._rotation.retry_s)
+        self._retry_at_s = time.monotonic() + self._backoff.next_s()
 
     def _resume(self) -> None:
         """Report that a new file is being written."""
         lost = self.state.lost - self._lost_before
-        self.state.status, self.state.problem, self._retry_s = "recording", "", _FIRST_RETRY_S
+        self.state.status, self.state.problem = "recording", ""
+        self._backoff.reset()
         self._on_event(logging.INFO, f"recording: continues in {str(self._path)!r}; {lost} messages were lost")
 
     def _maintain(self, writer: LogWriter) -> None:
@@ -161,7 +192,7 @@ class RotatingLog:
         writer.sync()
         self._synced_s = time.monotonic()
         try:
-            self._folder.require_free_space(self._rotation.free_bytes)
+            self._require_free_space(self._rotation.free_bytes)
         except DriverError as error:
             self._end()
             self._stop(error)
@@ -180,11 +211,70 @@ class RotatingLog:
 
     def _rename(self) -> None:
         try:
-            self._path.rename(complete_path(self._path))
+            self._path.rename(_complete(self._path))
         except OSError as error:
             raise DriverError(
                 f"cannot rename the log {str(self._path)!r}: {error.strerror}; is its folder gone?"
             ) from error
+
+    def _delete_oldest(self, max_files: int, max_bytes: int) -> int:
+        """Delete the oldest recordings until the limits are met, and return the number of deleted files.
+
+        Files that are being written, or cannot be deleted, are kept.
+        """
+        found = sorted(self._recordings())
+        total_bytes, deleted = sum(size for *_, size in found), 0
+        for _, _, path, size in found:
+            if len(found) - deleted <= max_files and total_bytes <= max_bytes:
+                break
+            if not is_locked(path) and _delete(path):
+                total_bytes -= size
+                deleted += 1
+        return deleted
+
+    def _recordings(self) -> Iterator[tuple[str, int, Path, int]]:
+        """Yield time, number, path and size [bytes] of the files with this name; they sort by age."""
+        pattern = re.compile(re.escape(self._name) + r"_(\d{8}T\d{6}Z)_(\d{3,6})\.mcap(?:\.part)?")
+        with suppress(OSError), os.scandir(self._folder) as entries:
+            for entry in entries:
+                found = pattern.fullmatch(entry.name)
+                if found and entry.is_file(follow_symlinks=False):
+                    with suppress(OSError):  # another program may have deleted it
+                        yield found[1], int(found[2]), Path(entry.path), entry.stat().st_size
+
+    def _require_free_space(self, wanted_bytes: int) -> None:
+        """Create the folder; raise DriverError where it cannot be created, or the disk has less free space."""
+        try:
+            with suppress(FileExistsError):
+                self._folder.mkdir()
+            disk = os.statvfs(self._folder)
+        except OSError as error:
+            raise DriverError(
+                f"cannot record to {str(self._folder)!r}: {error.strerror}; name another folder"
+            ) from error
+        free = disk.f_bavail * disk.f_frsize
+        if free < wanted_bytes:
+            raise DriverError(
+                f"cannot record to {str(self._folder)!r}: {free // _MB} MB are free and "
+                f"{-(-wanted_bytes // _MB)} needed; make room, or keep fewer or smaller files"
+            )
+
+
+def _file_name(name: str) -> str:
+    return re.sub(r"[^\w.-]", "-", name)
+
+
+def _complete(part: Path) -> Path:
+    """Return the path of a file after its completion."""
+    return part.with_name(part.name.removesuffix(_PART))
+
+
+def _delete(path: Path) -> bool:
+    """Delete a file; False where that fails."""
+    with suppress(OSError):
+        path.unlink()
+        return True
+    return False
 
 
 def _drop(writer: LogWriter) -> None:

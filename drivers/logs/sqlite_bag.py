@@ -17,8 +17,8 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
+from urllib.parse import quote
 
-from drivers.bounded_sqlite import bound_work, open_bounded
 from drivers.errors import DriverError
 from drivers.logs.log import MAX_RECORD_BYTES, LogDamage, LoggedMessage
 
@@ -28,6 +28,9 @@ _MAX_REASON: Final = 120  # characters
 _LEAST_ROW_BYTES: Final = 8  # pointer, sizes, number, and the types of four columns
 _ROW_INSTRUCTIONS: Final = 100  # Instructions of SQLite that a row may take; it needs 10 to 20, sorted twice as many.
 _FEWEST_INSTRUCTIONS: Final = 1_000_000
+_BLOCK: Final = 10_000  # instructions of SQLite's virtual machine between two calls of the progress handler
+# A file that is shorter than it states is read up to its end with a writable schema only; it is opened read-only.
+_PRAGMAS: Final = ("trusted_schema = OFF", "cell_size_check = ON", "mmap_size = 0", "writable_schema = ON")
 _TABLES: Final = (
     "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name IN ('topics', 'messages') "
     "AND sql LIKE 'CREATE TABLE%'"
@@ -68,10 +71,7 @@ class SqliteBag:
         self._damage, self._closed = LogDamage(), False
         self._found: _Times | None = None
         try:
-            self._bag = open_bounded(path, MAX_RECORD_BYTES)
-            self._bag.text_factory = partial(str, encoding="utf-8", errors="replace")
-            # A file that is shorter than it states is read up to its end in this mode only; nothing is written.
-            self._bag.execute("PRAGMA writable_schema = ON")
+            self._bag = _opened(path)
             self._bound_work()
             is_bag = (
                 self._bag.execute(_TABLES).fetchone()[0] == 2
@@ -183,8 +183,34 @@ class SqliteBag:
         return self._bytes
 
     def _bound_work(self) -> None:
+        """Bound the instructions of the next queries by the number of rows that fit; beyond it sqlite3.Error.
+
+        In a hostile file many pages refer to the same one, so that a query over a small file may never end.
+        """
         rows = self._measured_bytes() // _LEAST_ROW_BYTES
-        bound_work(self._bag, max(_FEWEST_INSTRUCTIONS, rows * _ROW_INSTRUCTIONS))
+        left = max(_FEWEST_INSTRUCTIONS, rows * _ROW_INSTRUCTIONS) // _BLOCK
+
+        def is_too_long() -> bool:
+            nonlocal left
+            left -= 1
+            return left < 0
+
+        self._bag.set_progress_handler(is_too_long, _BLOCK)
+
+
+def _opened(path: Path) -> sqlite3.Connection:
+    """Open a file, which may be damaged or hostile, for reading from any thread. Raise sqlite3.Error."""
+    uri = f"file:{quote(str(path.resolve()))}?mode=ro"
+    database = sqlite3.connect(uri, uri=True, check_same_thread=False)
+    try:
+        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_RECORD_BYTES)
+        for pragma in _PRAGMAS:
+            database.execute(f"PRAGMA {pragma}")
+    except BaseException:
+        database.close()
+        raise
+    database.text_factory = partial(str, encoding="utf-8", errors="replace")
+    return database
 
 
 def _line(error: Exception) -> str:

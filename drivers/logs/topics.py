@@ -68,7 +68,7 @@ def choose_motion_topics(log: str, topics: Mapping[str, str], wanted: MotionTopi
     # omnid records the wheels of joints as an Odometry.
     of_joints = wanted.joints and (wanted.wheels or JOINT_STATE in topics.values())
     wheels = JOINT_STATE if of_joints else ODOMETRY
-    for kind, name, knob in ((wheels, wanted.wheels, "motion.wheel_topic"), (IMU, wanted.imu, "motion.imu_topic")):
+    for kind, name, knob in ((wheels, wanted.wheels, "motion.wheels"), (IMU, wanted.imu, "motion.imu")):
         if name:
             if topics.get(name) != kind:
                 found = f"holds {topics[name]}" if topics.get(name) else "is not"

@@ -86,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
     geometry = config.motor.drive.geometry()
     with closing(RealtimeRobot(world, _robot(args), config.motor.protocol, geometry, args.seed, warn)) as robot:
         config = replace(config, motor=replace(config.motor, port=robot.port))
-        gyro = robot.open_gyro() if config.motion.imu == "auto" else None
+        gyro = robot.open_gyro() if config.motion.imu != "off" else None
         code = LiveRun(config, _connected(robot, gyro), log, robot.rig, show).run()
     return _end(args, robot, code)
 

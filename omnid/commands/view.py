@@ -177,8 +177,15 @@ def _log(sink: RerunSink, config: Config, args: argparse.Namespace) -> int:
     """Draw the recorded poses of a log, else what is computed from its images."""
     from drivers.errors import FrameDecodeError
     from drivers.logs.open_log import log_info
-    from omnid.recordings.odometry_topic import choose_odometry_topic, no_pose, odometry_topics
-    from omnid.recordings.recording_reader import CLOUD, ODOMETRY, STATUS, RecordingReader
+    from omnid.recordings.recording import (
+        CLOUD,
+        ODOMETRY,
+        STATUS,
+        RecordingReader,
+        choose_odometry_topic,
+        no_pose,
+        odometry_topics,
+    )
     from omnid.runs.replay import ReplayOptions
     from omnid.transport.records import OdometryRecord
     from omnid.transport.topics import MAP_POSE, SCAN

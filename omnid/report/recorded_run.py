@@ -22,8 +22,16 @@ from calib.rig_file import parse_rig
 from drivers.logs.log import LogInfo
 from drivers.logs.open_log import log_info
 from omnid.formats.tum import POSITION_LIMIT_M
-from omnid.recordings.odometry_topic import choose_odometry_topic, no_pose
-from omnid.recordings.recording_reader import CLOUD, DRIVE, ODOMETRY, STATUS, TWIST_COMMAND, RecordingReader
+from omnid.recordings.recording import (
+    CLOUD,
+    DRIVE,
+    ODOMETRY,
+    STATUS,
+    TWIST_COMMAND,
+    RecordingReader,
+    choose_odometry_topic,
+    no_pose,
+)
 from omnid.tracking_state import TrackingState
 from omnid.transport import status_names
 from omnid.transport.decode import Cloud, Diagnostics, PoseInMap

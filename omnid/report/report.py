@@ -27,7 +27,7 @@ from omnid.config import Config
 from omnid.formats.plan import Lines, between, draw_ends, draw_plan, drawn_heights, sheet_of, write
 from omnid.formats.tum import Trajectory
 from omnid.recordings.evaluation import Metrics, evaluate
-from omnid.recordings.recording_reader import DRIVE, TWIST_COMMAND
+from omnid.recordings.recording import DRIVE, TWIST_COMMAND
 from omnid.report.charts import Array, Curve, chart, grid, style_and_script
 from omnid.report.page import embedded, facts, figure, note, page, table
 from omnid.report.recorded_run import STATES, UNKNOWN, Event, RecordedRun, root

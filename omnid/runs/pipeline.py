@@ -24,9 +24,8 @@ from omnid.messages import (
     OdometryUpdate,
     PlaceUpdate,
 )
-from omnid.sinks.drive import LiveDrive, ReplayDrive
+from omnid.sinks.drive import LiveDrive, ReplayDrive, SimulatedWheels
 from omnid.sinks.encoder import Outgoing
-from omnid.sinks.simulated_wheels import SimulatedWheels
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry
 from omnid.stages.lockstep_drive import LockstepDrive

@@ -10,7 +10,6 @@ from typing import Final
 
 from drivers.events import EventCallback
 from drivers.frame import Camera, FrameSource
-from drivers.logs.log_folder import LogFolder
 from drivers.logs.rotating_log import RotatingLog
 from omnid.config import Config
 from omnid.engine.graph import NEWEST, Graph
@@ -34,8 +33,8 @@ def open_recorder(
     report: takes severity and text of problems. encode, offset_ns: see Recorder.
     """
     attachments = {"omnid.toml": dump(config).encode()} | ({"rig.toml": rig.encode()} if rig else {})
-    folder = LogFolder(Path(config.record.folder), config.bus.robot)
-    log = RotatingLog(folder, config.record.rotation(), attachments, on_event=report)
+    folder = Path(config.record.folder)
+    log = RotatingLog(folder, config.bus.robot, config.record.rotation(), attachments, on_event=report)
     return Recorder(log, config.bus.robot, encode, offset_ns=offset_ns, skip_invalid=True)
 
 

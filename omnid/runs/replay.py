@@ -39,12 +39,11 @@ from omnid.runs.sensor_sources import motion_topics
 from omnid.runs.session import LOG_POINTS, OPENCV_THREADS, Session, attached_rig
 from omnid.settings import dump
 from omnid.sinks.bus_sink import BusSink
-from omnid.sinks.drive import ReplayDrive
+from omnid.sinks.drive import ReplayDrive, SimulatedWheels
 from omnid.sinks.encoder import Outgoing
 from omnid.sinks.files import MapFile, PlanFile, TrajectoryFile, check_outputs, write_known
 from omnid.sinks.pose_collector import MapPoseCollector, PoseCollector
 from omnid.sinks.recorder import Recorder, SingleLog
-from omnid.sinks.simulated_wheels import SimulatedWheels
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry
 from omnid.stages.synchronise import Synchronise

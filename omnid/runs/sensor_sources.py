@@ -23,10 +23,15 @@ def motion_topics(config: Config) -> MotionTopics:
     """Return the topics of a log to read. Raise OmnidError where only one of the two wheel joints is named."""
     settings = config.motion
     return MotionTopics(
-        "" if settings.wheels == "off" else settings.wheel_topic or None,
-        "" if settings.imu == "off" else settings.imu_topic or None,
+        _topic(settings.wheels),
+        _topic(settings.imu),
         joint_wheels(config),
     )
+
+
+def _topic(named: str) -> str | None:
+    """Return the topic of a log that a setting names; None: the only one, "": none."""
+    return {"auto": None, "off": ""}.get(named, named)
 
 
 def joint_wheels(config: Config) -> JointWheels | None:
@@ -70,12 +75,12 @@ class SensorSources:
         """offset_ns: from the stamps of images to Unix time. with_images: the samples come with the images."""
         settings, joints = config.motion, joint_wheels(config)
         topics = set()
-        if settings.wheels == "auto" and not with_images:
+        if settings.wheels != "off" and not with_images:
             if controller is not None:
                 controller.take_wheels = inbox.add
             else:
                 topics.add(JOINT_STATES if joints else WHEEL_ODOM)
-        if settings.imu == "auto" and not with_images:
+        if settings.imu != "off" and not with_images:
             topics.add(IMU)
         self.receiver = SensorReceiver(
             inbox.add, offset_ns, frozenset(topics), partial(report, logging.WARNING), joints

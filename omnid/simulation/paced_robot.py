@@ -186,7 +186,7 @@ class PacedRobot:
     def _is_given(self, sample: MotionSample) -> bool:
         """True if the settings ask for samples of this kind."""
         motion = self._config.motion
-        return (motion.imu if isinstance(sample, GyroSample) else motion.wheels) == "auto"
+        return (motion.imu if isinstance(sample, GyroSample) else motion.wheels) != "off"
 
     def _frame(self, vehicle: Vehicle, camera: Camera, seq: int, stamp_ns: int) -> Frame:
         state = self._states[camera]

@@ -24,7 +24,7 @@ from omnid.core.frames import base_pose
 from omnid.core.odometry.stereo_frame import Features
 from omnid.messages import OdometryUpdate, PlaceUpdate
 from omnid.plain_text import plain
-from omnid.recordings.recording_reader import DECODERS, Content
+from omnid.recordings.recording import DECODERS, Content
 from omnid.sinks.encoder import Encoder, MapEncoding, Outgoing, StateReports
 from omnid.stages.front_end import FrontEnd
 from omnid.transport import status_names

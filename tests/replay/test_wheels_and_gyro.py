@@ -129,8 +129,8 @@ def test_broken_messages_and_topics_that_are_not_clear_are_reported(
     assert "skipped 2 messages of wheels or IMU" in reader.warnings[0]
     reader = LogReader(log, motion=MotionTopics())
     list(reader.messages())
-    assert "several topics of sensor_msgs/msg/Imu" in reader.warnings[0] and "motion.imu_topic" in reader.warnings[0]
-    with pytest.raises(DriverError, match=r"'/nothing' is not in .*motion\.wheel_topic must be one of nav_msgs"):
+    assert "several topics of sensor_msgs/msg/Imu" in reader.warnings[0] and "motion.imu" in reader.warnings[0]
+    with pytest.raises(DriverError, match=r"'/nothing' is not in .*motion\.wheels must be one of nav_msgs"):
         LogReader(log, motion=MotionTopics(wheels="/nothing"))
 
 

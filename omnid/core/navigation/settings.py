@@ -54,7 +54,7 @@ class NavigationSettings:
     unlocalised_m: Annotated[
         float, Meta(ge=0, le=1000), "way in the map that it drives by odometry alone before it stops, m"
     ] = 3.0
-    unlocalised_s: Annotated[float, Meta(ge=1, le=86_400), "wait for the pose in the map before it fails, s"] = 60.0
+    unlocalised_s: float = 60.0  # wait for the pose in the map before it fails
     map_sigma_m: float = 0.3  # largest sigma of the pose in the map, m
     reach_m: Annotated[float, Meta(ge=1, le=100_000), "goals and paths that begin farther away are refused, m"] = 100.0
     routes: Annotated[str, "folder of the routes; it is made if it is missing"] = "routes"

@@ -46,9 +46,7 @@ class OdometryLimits:
         "longest time for which wheels and gyro carry the pose on while the cameras show "
         "nothing, as degraded; 0: never, s",
     ] = 10.0
-    bridge_sigma_m: Annotated[
-        float, Meta(ge=0.001, le=10), "uncertainty of the position that ends that, standard deviation, m"
-    ] = 0.15
+    bridge_sigma_m: float = 0.15  # uncertainty of the position that ends that, standard deviation
 
     def __post_init__(self) -> None:
         """Raise OmnidError unless a keyframe may have more landmarks than a pose needs."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,21 +16,21 @@ class MotionSensorSettings:
     """Wheels and gyro in addition to the cameras. Scales, bias and offsets of their clocks are estimated on the way."""
 
     wheels: Annotated[
-        Literal["auto", "off"],
-        "speeds of the wheels: those that the motor controller reports, of the bus (cmd/wheel_odom) or of the log",
-    ] = "auto"
-    imu: Annotated[Literal["auto", "off"], "gyro: that of the bus (cmd/imu) or of the log"] = "auto"
-    wheel_topic: Annotated[
         str,
-        "topic of a log with nav_msgs/msg/Odometry of the wheels; empty: the only one whose "
-        "name contains 'wheel'. With wheel_joints: of JointState; empty: the only one",
-    ] = ""
+        "speeds of the wheels; auto: those that the motor controller reports, of the bus (cmd/wheel_odom), or of the "
+        "only topic of a log with nav_msgs/msg/Odometry whose name contains 'wheel', with wheel_joints of JointState; "
+        "off; or that topic of the log",
+    ] = "auto"
+    imu: Annotated[
+        str,
+        "gyro; auto: that of the bus (cmd/imu), or of the only topic of a log with sensor_msgs/msg/Imu; off; or that "
+        "topic of the log",
+    ] = "auto"
     wheel_joints: Annotated[
         tuple[str, ...],
         "names of the left and the right wheel in sensor_msgs/msg/JointState, of a log or cmd/joint_states, which then "
         "stands for the Odometry of the wheels; radius and track are those of motor.drive; empty: none",
     ] = ()
-    imu_topic: Annotated[str, "topic of a log with sensor_msgs/msg/Imu; empty: the only one"] = ""
     imu_rpy_deg: Annotated[
         tuple[float, float, float],
         "orientation of the IMU on the base: roll about x, then pitch about y, then yaw about z, deg; not applied to "

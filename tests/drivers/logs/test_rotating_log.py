@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import logging
 import os
 import shutil
@@ -19,10 +20,9 @@ from mcap.reader import make_reader
 
 from drivers.errors import DriverError
 from drivers.logs.file_lock import is_locked
-from drivers.logs.log_folder import LogFolder, RotationSettings
 from drivers.logs.mcap_file import McapFile
 from drivers.logs.mcap_writer import LogWriter
-from drivers.logs.rotating_log import RotatingLog
+from drivers.logs.rotating_log import RotatingLog, RotationSettings
 from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, START_NS, image
 
 ROOT = Path(__file__).parents[3]
@@ -43,7 +43,7 @@ class Bench:
 
     def __init__(self, folder: Path, rotation: RotationSettings, name: str = "robot") -> None:
         self.folder, self.events = folder, Events()
-        self.log = RotatingLog(LogFolder(folder, name), rotation, RIG, on_event=self.events)
+        self.log = RotatingLog(folder, name, rotation, RIG, on_event=self.events)
         self.state, self._count = self.log.state, 0
 
     def write(self, count: int, size: int = 1000) -> None:
@@ -119,6 +119,16 @@ def test_deletes_and_counts_the_oldest_files(bench: Callable[..., Bench]) -> Non
     assert set(strangers) < set(names) and left_by_a_crash.name not in names
     assert [name[-8:] for name in names if name not in strangers] == ["008.mcap", "009.mcap", "010.mcap"]
     assert recording.state.deleted == 8 and recording.state.lost == 0
+
+
+def test_a_file_that_another_program_writes_is_not_deleted(bench: Callable[..., Bench]) -> None:
+    recording = bench(replace(ROOMY, file_s=1.0, keep_files=2))
+    recording.folder.mkdir()
+    written = recording.folder / "robot_20200101T000000Z_001.mcap.part"
+    with written.open("wb") as file:
+        fcntl.flock(file.fileno(), fcntl.LOCK_EX)
+        recording.write(200)
+    assert written.exists() and recording.state.deleted == recording.state.files - 1 > 3
 
 
 def test_symbolic_links_are_neither_counted_nor_deleted(bench: Callable[..., Bench], tmp_path: Path) -> None:

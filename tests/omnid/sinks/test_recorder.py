@@ -14,8 +14,9 @@ from rosbags.highlevel import AnyReader
 
 from drivers.frame import Camera, Frame, gray
 from drivers.logs.log_reader import LogReader
+from drivers.logs.rotating_log import RotationSettings
 from drivers.motor import VelocityCommand
-from omnid.config import Config
+from omnid.config import Config, RecordConfig
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.messages import MapUpdate, OdometryUpdate
 from omnid.runs.record import open_recorder
@@ -115,8 +116,9 @@ def attached(path: Path) -> list[str]:
         return [attachment.name for attachment in make_reader(file).iter_attachments()]
 
 
-def test_every_file_has_the_state_of_the_odometry(tmp_path: Path) -> None:
-    config = settings(tmp_path / "log", file_s=1.0)
+def test_every_file_has_the_state_of_the_odometry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(RecordConfig, "rotation", lambda _: RotationSettings(file_s=1.0, free_bytes=0))
+    config = settings(tmp_path / "log")
     recorder = open_recorder(config, "", lambda *_: None, encode=Encoder(np.eye(4), MapEncoding(0)))
     for n in range(30):
         recorder.process(replace(odometry(n), stamp_ns=START_NS + n * 10**8))

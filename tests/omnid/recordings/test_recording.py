@@ -11,7 +11,7 @@ from drivers.logs.mcap_writer import LogWriter
 from drivers.logs.open_log import log_info
 from omnid.cli import main
 from omnid.errors import OmnidError
-from omnid.recordings.odometry_topic import choose_odometry_topic
+from omnid.recordings.recording import choose_odometry_topic
 from omnid.transport import codec
 
 START_NS = 1_700_000_000 * 10**9

@@ -1,4 +1,4 @@
-"""The reader of recorded runs: messages of one robot, decoded one by one in the order of log time.
+"""Recorded runs: which topic holds the poses, and the messages of one robot, decoded in the order of log time.
 
 Any log with a topic of nav_msgs/msg/Odometry can be read. The robot's other topics have the same name up to the
 last slash, and the last part under which omnid publishes them.
@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing
 from functools import partial
+from pathlib import Path
 from typing import Final, NamedTuple, TypeAlias
 
 from drivers.errors import FrameDecodeError
@@ -40,9 +41,66 @@ TWIST_COMMAND: Final = "cmd/twist"
 IMAGES: Final = (PANORAMA, "lower/image_raw/compressed", "lower/image_raw")  # in the order of preference
 # A larger message is counted and not decoded, so that a damaged file cannot exhaust the memory.
 MAX_MESSAGE_BYTES: Final = 64 * 2**20
+MAX_LISTED: Final = 8  # topics in a message
 
 Content: TypeAlias = OdometryRecord | PoseInMap | Diagnostics | Cloud | Scan | TwistRecord | RosImage
 Decoder: TypeAlias = Callable[[LoggedMessage], Content]
+
+
+def odometry_topics(found: LogInfo) -> list[str]:
+    """Return the topics that hold odometry messages."""
+    return [name for name, (schema, count) in found.topics.items() if schema == ODOMETRY_SCHEMA and count]
+
+
+def choose_odometry_topic(found: LogInfo, topic: str | None = None, robot: str | None = None) -> str:
+    """Return the topic of the poses.
+
+    1. A topic or a robot that the user names is taken; it must hold nav_msgs/msg/Odometry.
+    2. Else the only topic with messages of that type is taken.
+    3. Of several, the only one that has omnid's name `.../odom` is taken.
+    4. Else the user must name one.
+
+    topic: the full name, such as /omnid/odom; robot: stands for /<robot>/odom. Raise OmnidError where there is no
+    such topic, or several and none is named.
+    """
+    known = odometry_topics(found)
+    if topic is None and robot is not None:
+        topic = f"/{robot.strip('/')}/{ODOMETRY}"
+    if topic is not None:
+        if topic not in known:
+            raise OmnidError(
+                f"{found.path}: no {ODOMETRY_SCHEMA} on {topic!r}: found {_listed(known)}; name one of these topics"
+            )
+        return topic
+    if not known:
+        raise OmnidError(_no_odometry(found))
+    own = [name for name in known if name.endswith(f"/{ODOMETRY}")]
+    if len(known) == 1 or len(own) == 1:
+        return known[0] if len(known) == 1 else own[0]
+    raise OmnidError(f"{found.path}: several topics with {ODOMETRY_SCHEMA}: {_listed(known)}; choose one with --topic")
+
+
+def no_pose(path: Path, topic: str) -> OmnidError:
+    """Return the error for a log whose topic of the poses has none that can be read."""
+    return OmnidError(
+        f"{path}: topic {topic!r} has no readable pose; `omnid log info {path}` tells whether the log is complete"
+    )
+
+
+def _no_odometry(found: LogInfo) -> str:
+    if any(schema in IMAGE_TYPES for schema, _ in found.topics.values()):
+        rig = "" if "rig.toml" in found.attachments else " --rig rig.toml"
+        return (
+            f"{found.path}: images but no {ODOMETRY_SCHEMA}: run `omnid replay {found.path}{rig} --record "
+            "out.mcap` and use out.mcap"
+        )
+    return f"{found.path}: no {ODOMETRY_SCHEMA}: found {_listed(found.topics)}; expected a recording of a run"
+
+
+def _listed(names: Iterable[str]) -> str:
+    every = sorted(names)
+    shown = ", ".join(ascii(name) for name in every[:MAX_LISTED]) or "none"
+    return shown + (f" and {len(every) - MAX_LISTED} more" if len(every) > MAX_LISTED else "")
 
 
 class RecordedMessage(NamedTuple):
