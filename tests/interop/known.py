@@ -1,4 +1,4 @@
-"""A log of known numbers, written by omnid, and messages as nested dicts and lists, the same for all readers.
+"""A log of each kind of message, written by omnid, and its messages as rosbags decodes them, as nested dicts and lists.
 
 Bytes are represented by length and SHA-256, clouds also by their points, as read_log.mjs prints them.
 """
@@ -6,6 +6,7 @@ Bytes are represented by length and SHA-256, clouds also by their points, as rea
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from omnid.transport import codec, map_codec
 from omnid.transport.image_codec import image_cdr, image_topic
 from omnid.transport.records import DiagnosticStatus, FrameTransform
 from omnid.transport.status_names import ODOMETRY, Key
+from tests.drivers.logs.mcap_logs import STORE
 
 START_NS = 1_700_000_000 * 10**9 + 123_456_789
 PERIOD_NS = 33_333_333
@@ -34,10 +36,10 @@ def write_known(path: Path, compression: Any = "lz4") -> Expected:
     numbers = np.random.default_rng(5)
     expected: Expected = {}
     with LogWriter(path, ATTACHED, compression=compression) as log:
-        for index in range(COUNT):
-            for topic, schema, data, message in _messages(START_NS + index * PERIOD_NS, numbers):
-                log.write(topic, schema, data, START_NS + index * PERIOD_NS)
-                expected.setdefault(topic, []).append(message)
+        for stamp_ns in range(START_NS, START_NS + COUNT * PERIOD_NS, PERIOD_NS):
+            for topic, schema, data in _messages(stamp_ns, numbers):
+                log.write(topic, schema, data, stamp_ns)
+                expected.setdefault(topic, []).append(plain(STORE.deserialize_cdr(data, schema)))
     return expected
 
 
@@ -61,126 +63,20 @@ def plain(value: Any) -> Any:
     return found
 
 
-def _messages(stamp_ns: int, numbers: np.random.Generator) -> list[tuple[str, str, bytes, dict[str, Any]]]:
-    """Return one message of each kind: topic, type, bytes, expected content."""
+def _messages(stamp_ns: int, numbers: np.random.Generator) -> Iterator[tuple[str, str, bytes]]:
+    """Yield topic, type and bytes of a message of each kind; the lower camera's image is a JPEG, the upper's is raw."""
     T, twist = se3.exp(numbers.normal(size=6)), numbers.normal(size=6)
-    covariances = [0.01 * factor @ factor.T for factor in numbers.normal(size=(2, 6, 6))]
-    return [
-        (
-            "/omnid/odom",
-            codec.ODOMETRY_SCHEMA,
-            codec.odometry_cdr(stamp_ns, T, covariances[0], twist, covariances[1]),
-            {
-                "header": _header(stamp_ns, "odom"),
-                "child_frame_id": "base_link",
-                "pose": {"pose": _pose(T), "covariance": covariances[0].ravel().tolist()},
-                "twist": {
-                    "twist": {"linear": _xyz(twist[:3]), "angular": _xyz(twist[3:])},
-                    "covariance": covariances[1].ravel().tolist(),
-                },
-            },
-        ),
-        (
-            "/omnid/pose",
-            codec.POSE_SCHEMA,
-            codec.pose_stamped_cdr(stamp_ns, T),
-            {"header": _header(stamp_ns, "odom"), "pose": _pose(T)},
-        ),
-        (
-            "/tf",
-            codec.TRANSFORM_SCHEMA,
-            codec.transform_cdr(stamp_ns, [FrameTransform("odom", "base_link", T)]),
-            {
-                "transforms": [
-                    {
-                        "header": _header(stamp_ns, "odom"),
-                        "child_frame_id": "base_link",
-                        "transform": {"translation": _pose(T)["position"], "rotation": _pose(T)["orientation"]},
-                    }
-                ]
-            },
-        ),
-        (
-            "/omnid/drive",
-            codec.TWIST_SCHEMA,
-            codec.twist_stamped_cdr(stamp_ns, "base_link", twist[0], twist[5]),
-            {
-                "header": _header(stamp_ns, "base_link"),
-                "twist": {"linear": _xyz((twist[0], 0.0, 0.0)), "angular": _xyz((0.0, 0.0, twist[5]))},
-            },
-        ),
-        _status(stamp_ns),
-        _cloud(stamp_ns, numbers),
-        *(_image(frame) for frame in _frames(stamp_ns, numbers)),
-    ]
-
-
-def _status(stamp_ns: int) -> tuple[str, str, bytes, dict[str, Any]]:
-    status = DiagnosticStatus(ODOMETRY, 1, "über 90 °C", {Key.INLIERS: "3"})
-    message = {
-        "header": _header(stamp_ns, ""),
-        "status": [
-            {
-                "level": 1,
-                "name": ODOMETRY,
-                "message": "über 90 °C",
-                "hardware_id": "",
-                "values": [{"key": "inliers", "value": "3"}],
-            }
-        ],
-    }
-    return "/omnid/status", codec.DIAGNOSTICS_SCHEMA, codec.diagnostics_cdr(stamp_ns, [status]), message
-
-
-def _cloud(stamp_ns: int, numbers: np.random.Generator) -> tuple[str, str, bytes, dict[str, Any]]:
+    one, other = (0.01 * factor @ factor.T for factor in numbers.normal(size=(2, 6, 6)))
     packed = numbers.normal(size=(50, 4)).astype("<f4")
-    fields = [
-        {"name": name, "offset": 4 * i, "datatype": 7, "count": 1}
-        for i, name in enumerate(("x", "y", "z", "confidence"))
-    ]
-    message = {
-        "header": _header(stamp_ns, "odom"),
-        "height": 1,
-        "width": 50,
-        "fields": fields,
-        "is_bigendian": False,
-        "point_step": 16,
-        "row_step": 800,
-        "data": digest(packed.tobytes()),
-        "is_dense": True,
-        "points": packed.astype(float).tolist(),
-    }
-    data = map_codec.point_cloud_cdr(stamp_ns, "odom", packed[:, :3], packed[:, 3])
-    return "/omnid/cloud", CLOUD, data, message
-
-
-def _frames(stamp_ns: int, numbers: np.random.Generator) -> list[Frame]:
-    """Return a JPEG of the lower camera and raw pixels of the upper one."""
     pixels = numbers.integers(0, 256, (24, 32), dtype=np.uint8)
+    status = DiagnosticStatus(ODOMETRY, 1, "über 90 °C", {Key.INLIERS: "3"})
+    yield "/omnid/odom", codec.ODOMETRY_SCHEMA, codec.odometry_cdr(stamp_ns, T, one, twist, other)
+    yield "/omnid/pose", codec.POSE_SCHEMA, codec.pose_stamped_cdr(stamp_ns, T)
+    yield "/tf", codec.TRANSFORM_SCHEMA, codec.transform_cdr(stamp_ns, [FrameTransform("odom", "base_link", T)])
+    yield "/omnid/drive", codec.TWIST_SCHEMA, codec.twist_stamped_cdr(stamp_ns, "base_link", twist[0], twist[5])
+    yield "/omnid/status", codec.DIAGNOSTICS_SCHEMA, codec.diagnostics_cdr(stamp_ns, [status])
+    yield "/omnid/cloud", CLOUD, map_codec.point_cloud_cdr(stamp_ns, "odom", packed[:, :3], packed[:, 3])
     jpeg = cv2.imencode(".jpg", pixels)[1].tobytes()
-    return [Frame(0, stamp_ns, "lower", "jpeg", jpeg), Frame(0, stamp_ns, "upper", "mono8", pixels, 32, 24)]
-
-
-def _image(frame: Frame) -> tuple[str, str, bytes, dict[str, Any]]:
-    schema, data = image_cdr(frame, frame.stamp_ns)
-    message: dict[str, Any] = {"header": _header(frame.stamp_ns, frame.camera)}
-    if frame.encoding == "jpeg":
-        message |= {"format": "jpeg"}
-    else:
-        message |= {"height": 24, "width": 32, "encoding": "mono8", "is_bigendian": 0, "step": 32}
-    return f"/omnid/{image_topic(frame)}", schema, data, message | {"data": digest(bytes(frame.data))}
-
-
-def _header(stamp_ns: int, frame: str) -> dict[str, Any]:
-    return {"stamp": {"sec": stamp_ns // 10**9, "nanosec": stamp_ns % 10**9}, "frame_id": frame}
-
-
-def _xyz(values: Any) -> dict[str, float]:
-    return dict(zip("xyz", map(float, values), strict=True))
-
-
-def _pose(T: np.ndarray) -> dict[str, Any]:
-    return {
-        "position": _xyz(T[:3, 3]),
-        "orientation": dict(zip("xyzw", map(float, se3.quaternion(T[:3, :3])), strict=True)),
-    }
+    frames = Frame(0, stamp_ns, "lower", "jpeg", jpeg), Frame(0, stamp_ns, "upper", "mono8", pixels, 32, 24)
+    for frame in frames:
+        yield f"/omnid/{image_topic(frame)}", *image_cdr(frame, stamp_ns)

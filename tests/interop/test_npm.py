@@ -23,7 +23,7 @@ def read(log: Path) -> tuple[dict[str, Any], Expected]:
     for entry in messages:
         message = entry["message"]
         if "/cmd/" not in entry["topic"]:
-            stamp = (message["transforms"][0] if entry["topic"] == "/tf" else message)["header"]["stamp"]
+            stamp = message.get("transforms", [message])[0]["header"]["stamp"]
             assert int(entry["log_ns"]) == stamp["sec"] * 10**9 + stamp["nanosec"]
         found.setdefault(entry["topic"], []).append(message)
     return head, found
