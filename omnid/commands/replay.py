@@ -94,6 +94,7 @@ if TYPE_CHECKING:  # the help and other commands do not load these
     examples=(
         "replay drive.mcap --rig rig.toml --tum est.txt --cloud map.ply --plan plan.png",
         "replay drive.mcap --record out.mcap --method paper",
+        "replay drive.mcap --rerun out.rrd",
         "replay drive.mcap --start-s 60 --seconds 20",
     ),
 )
