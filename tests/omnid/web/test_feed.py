@@ -36,7 +36,6 @@ from omnid.web.snapshot import (
     LARGEST_MAP_PX,
     LONGEST_VALUE,
     MOST_CELLS,
-    MOST_SECTORS,
     MOST_VALUES,
     MOST_WARNINGS,
     map_in_odom,
@@ -286,17 +285,6 @@ def test_obstacles_are_drawn_from_the_pose_nearest_in_time() -> None:
     assert json.loads(scan_message(scan([math.inf], [0.0]), poses)) == nothing
 
 
-def test_a_fine_scan_is_thinned_and_keeps_the_nearest_obstacle() -> None:
-    count = 2 * MOST_SECTORS + 1
-    ranges = np.full(count, 3.0)
-    ranges[7] = 0.4
-    azimuths = np.linspace(-math.pi, math.pi, count)
-    found = json.loads(scan_message(scan(ranges.tolist(), azimuths.tolist()), [pose(100, 0.0, 0.0, 0.0)]))
-    assert MOST_SECTORS // 2 < len(found["points"]) <= MOST_SECTORS + 1
-    away_m = np.hypot(*np.array(found["points"]).T)
-    assert away_m.min() == pytest.approx(0.4, abs=1e-3) and found["nearest"][0] == pytest.approx(0.4)
-
-
 def test_the_state_of_a_drive_and_of_a_recording() -> None:
     report = NavigationReport(1, "blocked", "it waits", "route dock", 5, math.nan, "goal", "no", "hall", 2.5)
     assert json.loads(navigation_message(report)) == {
@@ -442,52 +430,6 @@ def test_a_status_makes_new_parts_and_a_daemon_that_has_ended_takes_them_along()
     feed.inbox.put("map_pose", b"nonsense", b"")
     feed._process_inbox()
     assert feed.state.broken == 1
-
-
-def test_the_place_of_the_map_is_kept_until_another_is_known() -> None:
-    feed = RobotFeed(BusConfig())
-    add_pose(feed, 4)  # at 1 m, -1 m, stamped 10**9 + 4
-
-    def map_pose(stamp_ns: int, x_m: float) -> list[float | None] | None:
-        T = se3.transform(se3.rotation_exp([0.0, 0.0, 0.4]), [x_m, 0.0, 0.0])
-        feed.inbox.put("map_pose", codec.pose_with_covariance_cdr(stamp_ns, T, np.eye(6)), b"")
-        feed._process_inbox()
-        return feed._map_in_odom
-
-    assert map_pose(10**9 + 5, 0.0) is None
-    assert map_pose(10**9 + 4, 0.25) == pytest.approx([0.75, -1.0, 0.0], abs=1e-6)
-    assert map_pose(10**9 + 5, 7.0) == pytest.approx([0.75, -1.0, 0.0], abs=1e-6)
-    assert map_pose(10**9 + 4, 0.5) == pytest.approx([0.5, -1.0, 0.0], abs=1e-6)
-    assert json.loads(feed._encode_state())["map_in_odom"] == feed._map_in_odom
-
-
-def test_large_messages_reach_their_channels_and_wrong_ones_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    feed = RobotFeed(BusConfig())
-    navigation = DiagnosticStatus(NAVIGATION, 0, "", {str(Key.STATE): "driving", str(Key.REASON): ""})
-    jpeg = panorama(b"\xff\xd8\xff\xe0 bytes")
-    channels = (feed._scan_channel, feed._navigation_channel, feed._map_channel, feed._panorama_channel)
-
-    async def take(*taken: tuple[str, bytes]) -> tuple[int, ...]:
-        for topic, payload in taken:
-            await feed._take_large(topic, payload)
-        return tuple(channel.version for channel in channels)
-
-    report = codec.diagnostics_cdr(10**18, [navigation])
-    good = (("scan", SCAN), ("navigation", report), ("map", MAP), ("panorama", jpeg))
-    for count, one in enumerate(good, 1):
-        assert asyncio.run(take(one)) == tuple([1] * count + [0] * (4 - count))
-    message = feed._panorama_channel.message(0)
-    assert isinstance(message, bytes)
-    header, _, body = message[4:].partition(b"}")
-    assert json.loads(header + b"}") == {"type": "panorama", "stamp_ms": 1000} and body == b"\xff\xd8\xff\xe0 bytes"
-    assert feed.state.broken == 0
-    # A panorama too soon after another is left out, one that is no JPEG is refused.
-    monkeypatch.setattr(feed_module, "PANORAMA_S", 1000.0)
-    assert asyncio.run(take(("panorama", jpeg)))[3] == 1
-    monkeypatch.setattr(feed_module, "PANORAMA_S", 0.0)
-    assert asyncio.run(take(("panorama", jpeg)))[3] == 2
-    assert asyncio.run(take(("panorama", panorama(b"GIF89a")), ("scan", b"x"), ("map", b"x")))[3] == 2
-    assert feed.state.broken == 3
 
 
 @pytest.mark.parametrize("has_map", [True, False])
