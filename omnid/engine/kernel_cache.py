@@ -34,7 +34,7 @@ from omnid.engine.logging_setup import Report, log_unlimited
 from omnid.engine.process import python, python_environment
 from omnid.errors import OmnidError
 
-KEPT_STATES: Final = 4  # other states whose code stays: of other installations, and of an update that is taken back
+KEPT_STATES: Final = 20  # other states whose code stays, 3 MB each: of other installations, and of earlier versions
 MOST_CHILDREN: Final = 2  # 480 MB with the program that waits, of the 768 that the service may have
 TIMEOUT_S: Final = 600.0  # as long as the service may take to start; half a minute on a laptop
 
@@ -65,6 +65,8 @@ def prepare_kernels(report: Report = log_unlimited) -> None:
     if not reason:
         try:
             _compile_modules(_kernel_modules(), kept_folder())
+            with suppress(OSError):
+                os.utime(folder_of_state())  # used: not the next to be removed
         except Exception as error:  # what pickle and LLVM raise for damaged files
             shutil.rmtree(folder_of_state(), ignore_errors=True)
             reason = f"what was there is damaged ({type(error).__name__})"
