@@ -80,7 +80,7 @@ def found(folder: Path) -> RigResult:
 
 def run(*words: object, corners: str = "7x6", square_mm: float = 30) -> int:
     board = ["--corners", corners, "--square-mm", str(square_mm), "--quiet", "--model", "omni"]
-    return main(["calibrate", "rig", *map(str, words), *board])
+    return main(["calibrate", "rig", *board, *map(str, words)])
 
 
 def between(rig: Rig) -> Array:
