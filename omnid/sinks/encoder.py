@@ -20,8 +20,8 @@ from omnid.messages import GridUpdate, MapUpdate, NavigationUpdate, ObstacleRing
 from omnid.navigation_state import NavigationState
 from omnid.tracking_state import MapState, TrackingState
 from omnid.transport import codec, map_codec, navigation_codec
-from omnid.transport.codec import ERROR, OK, WARN
-from omnid.transport.motion_codec import IMU_SCHEMA, WHEEL_SCHEMA, gyro_cdr, wheel_cdr
+from omnid.transport.codec import ERROR, IMU_SCHEMA, OK, WARN
+from omnid.transport.motion_codec import WHEEL_SCHEMA, gyro_cdr, wheel_cdr
 from omnid.transport.moving_codec import moving_cdr
 from omnid.transport.records import DiagnosticStatus, FrameTransform
 from omnid.transport.scan_codec import SCAN_SCHEMA, scan_cdr

@@ -22,6 +22,8 @@ from omnid.transport import ros_types as ros
 from omnid.transport.records import DiagnosticStatus, FrameTransform, HeadingRecord, OdometryRecord, TwistRecord
 
 ODOMETRY_SCHEMA = "nav_msgs/msg/Odometry"
+IMU_SCHEMA = "sensor_msgs/msg/Imu"
+JOINT_SCHEMA = "sensor_msgs/msg/JointState"
 POSE_SCHEMA = "geometry_msgs/msg/PoseStamped"
 MAP_POSE_SCHEMA = "geometry_msgs/msg/PoseWithCovarianceStamped"
 TRANSFORM_SCHEMA = "tf2_msgs/msg/TFMessage"

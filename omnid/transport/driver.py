@@ -65,11 +65,11 @@ class Driver:
     @property
     def connected(self) -> bool:
         """True if a robot subscribes to the commands."""
-        return _matches(self._publishers[self._twist])
+        return _has_receiver(self._publishers[self._twist])
 
     def require_connected(self) -> None:
         """Return as soon as a robot subscribes to the commands. Raise OmnidError after CONNECT_S."""
-        if not _happens(lambda: self.connected):
+        if not _holds_in_time(lambda: self.connected):
             raise self._absent("receives commands")
 
     def twist(self, velocity_mps: float, yaw_rate_radps: float) -> None:
@@ -116,7 +116,7 @@ class Driver:
         """
         key = f"{self._robot}/{request_key(topic)}"
         with self._session.declare_querier(key, timeout=timeout_s, **_QUALITY) as querier:
-            if not _happens(lambda: _matches(querier)):
+            if not _holds_in_time(lambda: _has_receiver(querier)):
                 raise self._absent("takes such requests")
             self.asked_ns = now_ns = time.time_ns()
             for reply in querier.get(payload=payload_at(now_ns), attachment=self._attachment(now_ns)):
@@ -149,17 +149,17 @@ class Driver:
         return ros2.attachment(self._sent, sent_ns, self._gid)
 
 
-def _happens(is_so: Callable[[], bool]) -> bool:
+def _holds_in_time(condition: Callable[[], bool]) -> bool:
     """Wait for a condition; return True once it holds, False after CONNECT_S."""
     deadline_s = time.monotonic() + CONNECT_S
-    while not is_so():
+    while not condition():
         if time.monotonic() > deadline_s:
             return False
         time.sleep(_POLL_S)
     return True
 
 
-def _matches(declared: zenoh.Publisher | zenoh.Querier) -> bool:
+def _has_receiver(declared: zenoh.Publisher | zenoh.Querier) -> bool:
     status: Any = declared.matching_status  # zenoh's stub takes it for a bool
     return bool(status.matching)
 

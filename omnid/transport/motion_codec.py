@@ -8,15 +8,13 @@ from typing import Final
 import numpy as np
 
 from drivers.errors import FrameDecodeError
-from drivers.logs.ros_messages import BASE_FRAME, IMU, JOINT_STATE, ODOMETRY, JointWheels, parse_motion
+from drivers.logs.ros_messages import BASE_FRAME, JointWheels, parse_motion
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.errors import OmnidError
 from omnid.transport import ros_types as ros
-from omnid.transport.codec import header_message, message_cdr, odometry_cdr
+from omnid.transport.codec import IMU_SCHEMA, ODOMETRY_SCHEMA, header_message, message_cdr, odometry_cdr
 
-WHEEL_SCHEMA: Final = ODOMETRY
-IMU_SCHEMA: Final = IMU
-JOINT_SCHEMA: Final = JOINT_STATE
+WHEEL_SCHEMA: Final = ODOMETRY_SCHEMA
 LARGEST_RATE: Final = 100.0  # m/s and rad/s: larger ones are faults of the sender
 _UNKNOWN_VARIANCE: Final = 1e9  # Variance of the parts of a pose that wheels do not measure.
 _UNKNOWN: Final = np.array([-1.0, *[0.0] * 8])  # REP 145: the message has no orientation, and no acceleration

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
-from omnid.transport import codec, motion_codec, navigation_codec
+from omnid.transport import codec, navigation_codec
 from omnid.transport.scan_codec import SCAN_SCHEMA
 
 MAP_POSE: Final = "map_pose"
@@ -40,11 +40,10 @@ PUBLISHED: Final = {
     PANORAMA: Topic(IMAGE_SCHEMA),
     "navigation": Topic(codec.DIAGNOSTICS_SCHEMA, latched=True),
     "plan": Topic(navigation_codec.PATH_SCHEMA, latched=True),
-    "wheel_odom": Topic(motion_codec.WHEEL_SCHEMA),
-    "imu": Topic(motion_codec.IMU_SCHEMA),
+    "wheel_odom": Topic(codec.ODOMETRY_SCHEMA),
+    "imu": Topic(codec.IMU_SCHEMA),
     CLOCK: Topic(codec.CLOCK_SCHEMA, realtime=True),
 }
-SERVED: Final = ("config", "rig")  # texts that answer queries
 STOP: Final = "cmd/stop"
 ARM: Final = "cmd/arm"
 BUMPER: Final = "cmd/bumper"
@@ -68,9 +67,9 @@ WHEEL_ODOM: Final = "cmd/wheel_odom"
 IMU: Final = "cmd/imu"
 JOINT_STATES: Final = "cmd/joint_states"
 SENSOR_TOPICS: Final = {
-    WHEEL_ODOM: motion_codec.WHEEL_SCHEMA,
-    IMU: motion_codec.IMU_SCHEMA,
-    JOINT_STATES: motion_codec.JOINT_SCHEMA,
+    WHEEL_ODOM: codec.ODOMETRY_SCHEMA,
+    IMU: codec.IMU_SCHEMA,
+    JOINT_STATES: codec.JOINT_SCHEMA,
 }
 TWIST: Final = "twist"
 HEADING: Final = "heading"

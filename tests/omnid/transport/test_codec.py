@@ -21,10 +21,11 @@ from drivers.motion import GyroSample, WheelSample
 from omnid.core.obstacles.moving_tracker import MovingObstacle
 from omnid.errors import OmnidError
 from omnid.transport import codec, map_codec
+from omnid.transport.codec import IMU_SCHEMA
 from omnid.transport.decode import decode_cloud, decode_diagnostics, decode_map, decode_pose
 from omnid.transport.features_attachment import MOST, features_from_bytes, features_to_bytes
 from omnid.transport.image_codec import image_cdr, image_topic
-from omnid.transport.motion_codec import IMU_SCHEMA, WHEEL_SCHEMA, gyro_cdr, wheel_cdr
+from omnid.transport.motion_codec import WHEEL_SCHEMA, gyro_cdr, wheel_cdr
 from omnid.transport.moving_codec import FIELDS, moving_cdr
 from omnid.transport.navigation_codec import PATH_SCHEMA, STRING_SCHEMA, PlanarGoal, goal_cdr, path_cdr, string_cdr
 from omnid.transport.pose_attachment import PoseAttachment

@@ -31,9 +31,9 @@ from omnid.core.navigation.requests import (
 )
 from omnid.errors import OmnidError
 from omnid.transport import codec
-from omnid.transport.codec import bool_cdr, header_message, message_cdr
+from omnid.transport.codec import IMU_SCHEMA, JOINT_SCHEMA, bool_cdr, header_message, message_cdr
 from omnid.transport.commands import LONGEST_PAYLOAD, CommandReceiver
-from omnid.transport.motion_codec import IMU_SCHEMA, JOINT_SCHEMA, gyro_cdr, wheel_cdr
+from omnid.transport.motion_codec import gyro_cdr, wheel_cdr
 from omnid.transport.navigation_codec import (
     PlanarGoal,
     goal_cdr,

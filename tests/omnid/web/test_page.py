@@ -36,7 +36,7 @@ from tests.waiting import PATIENCE_S, wait_until
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytestmark = [pytest.mark.browser, pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")]
-SIZES = {"phone": (390, 844), "desk": (1280, 800)}
+SIZES = {"phone": (390, 844), "desk": (1366, 768)}
 HOSTILE = "<img src=x onerror=document.title='hacked'><script>document.title='hacked'</script>"
 WAIT_MS = 20_000
 
