@@ -1,4 +1,4 @@
-"""Compiled part of the descriptors of corners: see descriptors.py for their definition."""
+"""Compiled part of the descriptors of corners: see features.py for their definition."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.places.place_map import Link, PlaceKeyframe, PlaceLimits
-from omnid.core.places.recognition import Recognition
+from omnid.core.places.recognition import Recognition, angle_rad, length_m
 
 Array = NDArray[np.float64]
 
@@ -101,16 +101,6 @@ def _consistent(a: Hypothesis, b: Hypothesis, poses: Mapping[int, Array]) -> boo
 def _apart(a: Hypothesis, b: Hypothesis) -> bool:
     moved = se3.inverse(a.T_odom_rect) @ b.T_odom_rect
     return length_m(moved) > APART_M or angle_rad(moved) > APART_RAD
-
-
-def length_m(T: Array) -> float:
-    """Return the length of the translation of a transform (4, 4)."""
-    return float(np.linalg.norm(T[:3, 3]))
-
-
-def angle_rad(T: Array) -> float:
-    """Return the angle of the rotation of a transform (4, 4)."""
-    return math.acos(min(1.0, max(-1.0, (float(np.trace(T[:3, :3])) - 1) / 2)))
 
 
 # Odometry computes dense depth at its own keyframes. Where it makes none, the map waits for this multiple of the

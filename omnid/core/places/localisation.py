@@ -17,7 +17,7 @@ from omnid.core.mapping.scan_grid import KeyframeScans
 from omnid.core.places.correction import MapCorrection
 from omnid.core.places.drift import relative_covariance
 from omnid.core.places.features import describe
-from omnid.core.places.hypotheses import Hypotheses, Hypothesis, SearchSchedule, length_m
+from omnid.core.places.hypotheses import Hypotheses, Hypothesis, SearchSchedule
 from omnid.core.places.map_parts import Ageing, FixedPlaces, MapParts
 from omnid.core.places.map_pose import UNKNOWN_PLACE, MapPose, OdometryFrame
 from omnid.core.places.place_map import (
@@ -30,7 +30,7 @@ from omnid.core.places.place_map import (
     by_odometry,
 )
 from omnid.core.places.place_search import NEAR_M, Expected, PlaceSearch
-from omnid.core.places.recognition import MIN_MATCHES, Recognition
+from omnid.core.places.recognition import MIN_MATCHES, Recognition, length_m
 from omnid.core.places.signature import Thumbnail, thumbnail
 from omnid.core.types.stereo_model import StereoModel
 from omnid.tracking_state import MapState

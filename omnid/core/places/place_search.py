@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.places.features import FEATURES
-from omnid.core.places.hypotheses import angle_rad, length_m
-from omnid.core.places.place_comparison import compare, supported, unambiguous
 from omnid.core.places.place_map import PlaceFeatures, PlaceKeyframe, PlaceMap
-from omnid.core.places.recognition import Recognition
+from omnid.core.places.recognition import Recognition, angle_rad, compare, length_m, supported, unambiguous
 from omnid.core.places.signature import Signature, signature_of, similarities
 from omnid.core.types.stereo_model import StereoModel
 

@@ -13,8 +13,8 @@ from omnid.core.odometry.estimates import PoseEstimate
 from omnid.core.odometry.landmarks import Keyframe
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.features import FEATURES, describe
-from omnid.core.places.place_comparison import compare, supported, unambiguous
 from omnid.core.places.place_map import PlaceFeatures
+from omnid.core.places.recognition import compare, supported, unambiguous
 from omnid.core.types.stereo_model import StereoModel
 
 MAX_KEYFRAMES: Final = 8  # kept in memory; by trial on development seeds

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calib import se3
-from omnid.core.places.map_parts import MapParts
+from omnid.core.places.map_parts import FixedPlaces, MapParts
 from omnid.core.places.place_map import PlaceMap
 from tests.omnid.core.places.test_place_map import keyframe
 
@@ -57,3 +57,14 @@ def test_dropped_keyframes_are_forgotten() -> None:
     assert not parts.forget_dropped()
     places.drop(1)
     assert parts.forget_dropped() and parts.others() == [0, 2]
+
+
+def test_near_ones_are_found_in_their_order() -> None:
+    places = map_of(10)
+    places.drop(4)
+    fixed = FixedPlaces(places, sorted(places.keyframes))
+    assert fixed.within(np.array([4.2, 0, 0]), 1.0) == [5]
+    assert fixed.within(np.array([3.0, 0, 0]), 1.0) == [2, 3]
+    places.move({5: se3.exp([50.0, 0, 0, 0, 0, 0])})
+    assert fixed.within(np.array([5.0, 0, 0]), 0.5) == [5] and list(fixed.scans) == fixed.ids
+    assert FixedPlaces(places, []).within(np.zeros(3), 1.0) == []
