@@ -12,7 +12,7 @@ import base64
 import binascii
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, Literal, TypeAlias
 
@@ -23,6 +23,7 @@ from msgspec.structs import asdict, astuple
 from numpy.typing import NDArray
 
 from calib import se3
+from calib.atomic_file import write_file
 from calib.errors import CalibError
 from calib.models.camera import Mask, OmniCamera
 from calib.models.equirectangular import EquirectangularCamera
@@ -315,35 +316,6 @@ def write_rig(path: Path, rig: Rig) -> None:
     for side, image in painted.items():
         write_file(path.with_name(images[side]), png(image))
     write_file(path, text)
-
-
-def write_file(path: Path, data: bytes) -> None:
-    """Write a file atomically; a pipe or a device is written directly."""
-    target = Path(os.path.realpath(path))
-    try:
-        _write_whole(target, data)
-    except OSError as error:
-        raise CalibError(f"{path}: cannot be written: {error.strerror or error}") from error
-
-
-def _write_whole(target: Path, data: bytes) -> None:
-    if target.exists() and not target.is_file():
-        target.write_bytes(data)
-        return
-    temporary = target.with_name(f".{target.name}.{os.getpid()}")
-    try:
-        temporary.unlink(missing_ok=True)
-        with open(temporary, "xb", opener=_open_no_link) as file:
-            file.write(data)
-        temporary.replace(target)
-    except OSError:
-        with suppress(OSError):
-            temporary.unlink()
-        raise
-
-
-def _open_no_link(path: str, flags: int) -> int:
-    return os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
 
 
 def png(image: NDArray[np.uint8]) -> bytes:

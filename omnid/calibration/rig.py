@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from calib import se3
+from calib.atomic_file import write_file
 from calib.boards.board import BoardView
 from calib.boards.marker_board import AprilGrid
 from calib.boards.print_shape import AS_DRAWN, PrintShape
@@ -26,7 +27,7 @@ from calib.models.camera import Mask
 from calib.models.names import sees_directly
 from calib.models.ocam import OcamCamera, View
 from calib.rig import Rig
-from calib.rig_file import write_file, write_rig
+from calib.rig_file import write_rig
 from calib.rig_frame import is_turned_over, rig_between
 from drivers.logs.log_reader import AnyCameras, LogCameras
 from omnid.calibration.board_search import AnyBoard, Progress, find_boards, select_diverse_views, silent

@@ -165,7 +165,8 @@ class _Progress:
 
 
 def _write(folder: Path, number: int, pair: tuple[Image, Image]) -> None:
-    from calib.rig_file import png, write_file
+    from calib.atomic_file import write_file
+    from calib.rig_file import png
 
     for side, image in zip(("lower", "upper"), pair, strict=True):
         write_file(folder / f"{side}_{number:03d}.png", png(image))

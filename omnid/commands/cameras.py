@@ -73,7 +73,8 @@ def _list() -> int:
 
 
 def _snapshot(args: argparse.Namespace) -> int:
-    from calib.rig_file import png, write_file
+    from calib.atomic_file import write_file
+    from calib.rig_file import png
     from omnid.calibration.snapshot import annotated, described, view_of, warnings
 
     try:

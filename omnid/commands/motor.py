@@ -106,7 +106,7 @@ def _write(path: Path, text: str, values: dict[str, str], drive: DriveSettings) 
     """Set the values in the file, after a check that a reader gets these values and all others as before."""
     from dataclasses import replace
 
-    from calib.rig_file import write_file
+    from calib.atomic_file import write_file
     from omnid.config import Config
     from omnid.doctor.wheel_wiring import toml_with
     from omnid.settings import parse

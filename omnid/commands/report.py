@@ -24,7 +24,7 @@ from omnid.commands.options import command, option
 )
 def run(args: argparse.Namespace) -> int:
     """Write the page."""
-    from calib.rig_file import write_file
+    from calib.atomic_file import write_file
     from omnid.formats.tum import read_tum
     from omnid.plain_text import plain
     from omnid.report.recorded_run import read_run

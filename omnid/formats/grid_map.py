@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from calib.atomic_file import replacement
 from omnid.core.mapping.scan_grid import FREE, OCCUPIED, Grid
 from omnid.errors import OmnidError
-from omnid.formats.whole_file import replacement
 
 _WHITE, _BLACK, _GREY = 254, 0, 205  # free, occupied and unknown, as map_saver writes them
 # With nav2's default of 0.25, grey (255 - 205) / 255 = 0.196 would count as free.

@@ -17,13 +17,13 @@ from typing import IO, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.atomic_file import replacement
 from calib.panorama import Cylinder
 from omnid.core.mapping.range_scan import MAX_RANGE_M, SECTORS
 from omnid.core.places.place_map import DESCRIPTOR, UNUSED, KeyframeUse, Link, PlaceFeatures, PlaceKeyframe, PlaceMap
 from omnid.core.places.place_rig import PlaceRig
 from omnid.core.places.signature import COLUMNS, ROWS
 from omnid.errors import OmnidError
-from omnid.formats.whole_file import replacement
 
 FORMAT: Final = 7  # to be raised where thumbnails or features of a place are computed otherwise: old maps fit no more
 # Maps up to version 6 were SQLite databases.

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
-from itertools import pairwise
+from io import BytesIO, TextIOWrapper
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +17,7 @@ FILE_LIMIT_BYTES = 1 << 28  # about 2.5 million poses, days of driving; a log gi
 POSITION_LIMIT_M = 1e9  # Largest coordinate, so that squares and sums cannot overflow.
 STAMP_LIMIT_NS = 1 << 62  # Largest stamp, so that the difference of two stamps fits int64.
 _DECIMALS = 9  # nanoseconds, nanometres
-_COLUMNS = 8  # t x y z qx qy qz qw
 _MIN_QUATERNION = 1e-9  # largest component below which a quaternion counts as zero
-_SHOWN_CHARACTERS = 60  # Most characters of a wrong value in a message.
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,122 +28,84 @@ class Trajectory:
     T: NDArray[np.float64]  # (N, 4, 4)
 
 
-@dataclass(frozen=True, slots=True)
-class _Row:
-    line: int
-    stamp_ns: int
-    pose: tuple[float, ...]  # x y z qx qy qz qw, quaternion of any length above zero
-
-
 def read_tum(path: str | Path) -> Trajectory:
     """Return the trajectory of a TUM file, sorted by stamp.
 
     Blank lines and everything after `#` are skipped; quaternions are normalised. A repeated stamp is refused: two poses
     at one time contradict each other. Raises OmnidError that names the file, the line and what was found.
     """
-    text = _read_text(Path(path))
-    rows = sorted(_rows(text, str(path)), key=lambda row: row.stamp_ns)
-    if not rows:
+    # 1. Stamps and numbers of each line.
+    raw, stamps, poses, lines, line = _read(Path(path)), list[int](), list[list[float]](), list[int](), 0
+    try:
+        for line, content in enumerate(TextIOWrapper(BytesIO(raw), "utf-8-sig"), start=1):
+            words = content.partition("#")[0].split()
+            if words:
+                stamp_ns, pose = _row(words)
+                stamps.append(stamp_ns)
+                poses.append(pose)
+                lines.append(line)
+    except UnicodeDecodeError:
+        raise OmnidError(f"{path}: expected 't x y z qx qy qz qw' in each line, found bytes that are no text") from None
+    except ValueError as error:
+        raise OmnidError(f"{path}, line {line}: {error}") from error
+    if not lines:
         raise OmnidError(f"{path}: no pose found: expected lines 't x y z qx qy qz qw'")
-    _refuse_repeated_stamps(rows, str(path))
-    return _trajectory(rows)
+    # 2. Sorted by stamp, each once.
+    order = np.argsort(stamps, kind="stable")
+    stamps_ns, pose_of = np.array(stamps, np.int64)[order], np.array(poses)[order]
+    for n in np.flatnonzero(np.diff(stamps_ns) == 0).tolist():
+        first, second = lines[order[n]], lines[order[n + 1]]
+        raise OmnidError(
+            f"{path}, line {second}: expected each stamp once, found that of line {first} again: remove one of the two"
+        )
+    q = pose_of[:, 3:] / np.abs(pose_of[:, 3:]).max(axis=1, keepdims=True)  # so that squares in se3 cannot overflow
+    T = se3.transform(se3.rotation(q), pose_of[:, :3])
+    stamps_ns.setflags(write=False)
+    T.setflags(write=False)
+    return Trajectory(stamps_ns, T)
 
 
 def tum_row(stamp_ns: int, T: NDArray[np.float64]) -> str:
     """Return a TUM line without newline: 9 decimals, w >= 0, never '-0', so the same bytes for the same pose."""
     sign, (whole_s, rest_ns) = "-" if stamp_ns < 0 else "", divmod(abs(int(stamp_ns)), 10**9)
-    pose = np.concatenate([T[:3, 3], _canonical(se3.quaternion(T[:3, :3]))])
-    numbers = [f"{float(value):.{_DECIMALS}f}" for value in np.round(pose, _DECIMALS) + 0.0]
-    return " ".join([f"{sign}{whole_s}.{rest_ns:09d}", *numbers])
+    q = se3.quaternion(T[:3, :3])
+    # The last component that prints as non-zero (w, else z, y, x) is positive.
+    visible = np.round(q, _DECIMALS)[np.round(q, _DECIMALS) != 0.0]
+    pose = np.round(np.concatenate([T[:3, 3], -q if visible.size and visible[-1] < 0.0 else q]), _DECIMALS) + 0.0
+    return " ".join([f"{sign}{whole_s}.{rest_ns:09d}", *(f"{float(value):.{_DECIMALS}f}" for value in pose)])
 
 
-def _canonical(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return q or -q, so that the last component that prints as non-zero (w, else z, y, x) is positive."""
-    printed: NDArray[np.float64] = np.round(q, _DECIMALS)
-    visible = printed[printed != 0.0]
-    return -printed if visible.size and visible[-1] < 0.0 else printed
-
-
-def _read_text(path: Path) -> str:
+def _read(path: Path) -> bytes:
     try:
         with path.open("rb") as file:
             raw = file.read(FILE_LIMIT_BYTES + 1)
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        found = error.strerror if isinstance(error, OSError) else error
-        raise OmnidError(f"{path}: cannot read the trajectory: {found}") from error
+        raise OmnidError(f"{path}: cannot read the trajectory: {getattr(error, 'strerror', None) or error}") from error
     if len(raw) > FILE_LIMIT_BYTES:
         raise OmnidError(f"{path}: expected at most {FILE_LIMIT_BYTES >> 20} MiB: split the file")
+    return raw
+
+
+def _row(words: list[str]) -> tuple[int, list[float]]:
+    """Return the stamp [ns] and x y z qx qy qz qw of a line. Raises ValueError with what was found."""
+    found = repr(" ".join(words[:9])[:60])
+    if len(words) != 8:
+        raise ValueError(f"expected 8 numbers separated by spaces (t x y z qx qy qz qw), found {len(words)}: {found}")
+    # Not by float64, whose resolution at Unix times is 238 ns. adjusted() comes first: 1e999999999 has no end.
     try:
-        return raw.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = raw.count(b"\n", 0, error.start) + 1
-        found = f"found byte 0x{raw[error.start]:02x}, which is not text"
-        raise OmnidError(f"{path}, line {line}: expected 't x y z qx qy qz qw', {found}: is it a TUM file?") from error
-
-
-def _rows(text: str, name: str) -> Iterator[_Row]:
-    lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
-    for line, content in enumerate(lines, start=1):
-        words = content.partition("#")[0].split()
-        if words:
-            try:
-                yield _row(words, line)
-            except ValueError as error:
-                raise OmnidError(f"{name}, line {line}: {error}") from error
-
-
-def _row(words: list[str], line: int) -> _Row:
-    if len(words) != _COLUMNS:
-        found = _shortened(" ".join(words[: _COLUMNS + 1]))
-        raise ValueError(
-            f"expected {_COLUMNS} numbers separated by spaces (t x y z qx qy qz qw), found {len(words)}: {found}"
-        )
-    pose = tuple(_number(word) for word in words[1:])
-    if max(abs(value) for value in pose[:3]) > POSITION_LIMIT_M:
-        raise ValueError(f"expected a position within {POSITION_LIMIT_M:g} m, found {_shortened(' '.join(words[1:4]))}")
-    if max(abs(value) for value in pose[3:]) < _MIN_QUATERNION:
-        raise ValueError(f"expected a unit quaternion, found zero: {_shortened(' '.join(words[4:]))}")
-    return _Row(line, _stamp_ns(words[0]), pose)
-
-
-def _number(word: str) -> float:
-    try:
-        value = float(word)
-    except ValueError:
-        value = float("nan")
-    if not np.isfinite(value):
-        raise ValueError(f"expected a finite number, found {_shortened(word)}")
-    return value
-
-
-def _stamp_ns(word: str) -> int:
-    """Return the ns of a stamp in decimal seconds, without float64, whose resolution at Unix times is 238 ns."""
-    try:
-        stamp_s = Decimal(word)
+        stamp_s = Decimal(words[0])
     except InvalidOperation:
         stamp_s = Decimal("nan")
-    # adjusted() is checked first: int() of 1e999999999 would not end
     if not stamp_s.is_finite() or stamp_s.adjusted() > 12 or abs(stamp_s.scaleb(9)) >= STAMP_LIMIT_NS:
-        raise ValueError(f"expected a stamp in seconds, found {_shortened(word)}")
-    return int(stamp_s.scaleb(9).to_integral_value())
-
-
-def _shortened(text: str) -> str:
-    return repr(text if len(text) <= _SHOWN_CHARACTERS else text[: _SHOWN_CHARACTERS - 3] + "...")
-
-
-def _refuse_repeated_stamps(rows: list[_Row], name: str) -> None:
-    for first, second in pairwise(rows):
-        if first.stamp_ns == second.stamp_ns:
-            found = f"found that of line {first.line} again"
-            raise OmnidError(f"{name}, line {second.line}: expected each stamp once, {found}: remove one of the two")
-
-
-def _trajectory(rows: list[_Row]) -> Trajectory:
-    stamps_ns = np.array([row.stamp_ns for row in rows], dtype=np.int64)
-    pose = np.array([row.pose for row in rows], dtype=np.float64)
-    q = pose[:, 3:] / np.abs(pose[:, 3:]).max(axis=1, keepdims=True)  # scaled so that squares in se3 cannot overflow
-    T = se3.transform(se3.rotation(q), pose[:, :3])
-    stamps_ns.setflags(write=False)
-    T.setflags(write=False)
-    return Trajectory(stamps_ns, T)
+        raise ValueError(f"expected a stamp in seconds, found {words[0][:60]!r}")
+    try:
+        pose = [float(word) for word in words[1:]]
+    except ValueError:
+        pose = [float("nan")]
+    if not np.isfinite(pose).all():
+        raise ValueError(f"expected finite numbers, found {found}")
+    if max(map(abs, pose[:3])) > POSITION_LIMIT_M:
+        raise ValueError(f"expected a position within {POSITION_LIMIT_M:g} m, found {found}")
+    if max(map(abs, pose[3:])) < _MIN_QUATERNION:
+        raise ValueError(f"expected a unit quaternion, found zero: {found}")
+    return int(stamp_s.scaleb(9).to_integral_value()), pose
