@@ -49,6 +49,7 @@ _NAMES: Final = MappingProxyType(
     }
 )
 _SHOWN: Final = 60  # characters of a value in a message
+_NAMED: Final = 200  # unknown keys in a message, which may be all of a file of an earlier version
 MAX_NUMBER: Final = 1e300  # larger numbers overflow in products
 
 
@@ -79,7 +80,11 @@ def convert(root: type[T], table: dict[str, Any], path: Path = ()) -> T:
 
     path: of the table within its file.
     """
-    _check(root, root, table, path)
+    if unknown := list(_unknown_keys(root, table, path)):
+        text = str(unknown_key(root, *unknown[0]))
+        others = ", ".join(dotted(other) for _, other in unknown[1:_NAMED])
+        raise ValueError(f"{text}; unknown are also {others}" if others else text)
+    _check(root, table, path)
     try:
         return msgspec.convert(table, root)
     except msgspec.ValidationError as error:
@@ -191,8 +196,24 @@ def _bounded(kind: Any) -> tuple[Any, str]:
     return bare, f" from {low} to {high}"
 
 
-def _check(root: Any, kind: Any, value: object, path: Path) -> None:
-    """Raise ValueError for unknown keys, values in the place of sections, and numbers that are not finite."""
+def _unknown_keys(kind: Any, value: object, path: Path) -> Iterator[tuple[Any, Path]]:
+    """Yield section and path of each key that its section does not have."""
+    bare, _ = _bounded(kind)
+    element = get_args(bare)[0] if get_origin(bare) is tuple else None
+    if is_section(kind) and isinstance(value, dict):
+        types = types_of(kind)
+        for name, inner in value.items():
+            if name in types:
+                yield from _unknown_keys(types[name], inner, (*path, name))
+            else:
+                yield kind, (*path, name)
+    elif is_section(element) and isinstance(value, list):
+        for number, inner in enumerate(value):
+            yield from _unknown_keys(element, inner, (*path[:-1], f"{path[-1]}[{number}]"))
+
+
+def _check(kind: Any, value: object, path: Path) -> None:
+    """Raise ValueError for values in the place of sections, and numbers that are not finite; all keys are known."""
     bare, _ = _bounded(kind)
     element = get_args(bare)[0] if get_origin(bare) is tuple else None
     if is_section(kind):
@@ -200,12 +221,10 @@ def _check(root: Any, kind: Any, value: object, path: Path) -> None:
             raise ValueError(f"{dotted(path)}: expected a section, found {shown(value)}")
         types = types_of(kind)
         for name, inner in value.items():
-            if name not in types:
-                raise unknown_key(root, kind, (*path, name))
-            _check(root, types[name], inner, (*path, name))
+            _check(types[name], inner, (*path, name))
     elif is_section(element) and isinstance(value, list):
         for number, inner in enumerate(value):
-            _check(root, element, inner, (*path[:-1], f"{path[-1]}[{number}]"))
+            _check(element, inner, (*path[:-1], f"{path[-1]}[{number}]"))
     elif not _is_finite(value):
         raise ValueError(f"{dotted(path)}: expected {described(kind)}, found {shown(value)}")
 

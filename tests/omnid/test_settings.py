@@ -89,6 +89,7 @@ def test_overrides_win_over_the_file_and_later_ones_over_earlier(tmp_path: Path)
         ("[stero]\nwindow_px = 5", "unknown key stero: did you mean stereo?"),
         ("[motor.serial]\nprot = 'x'", "unknown key motor.serial.prot: did you mean motor.serial.port?"),
         ("[stereo]\nzzz = 5", "unknown key stereo.zzz: known are stereo.window_px, "),
+        ("[stereo]\nwindow = 5\n[motor]\nx = 1\n[y]", "did you mean stereo.window_px?; unknown are also motor.x, y"),
         ('"a\\nb" = 1', "unknown key 'a\\nb': known are robot, "),
         ("stereo = 5", "stereo: expected a section, found 5"),
         ("robot.name = 'x'", "robot: expected a string, found a section"),
