@@ -12,7 +12,7 @@ from typing import NoReturn
 
 import pytest
 
-from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Slot
+from omnid.engine.graph import LOSSLESS, NEWEST, Graph
 from omnid.errors import OmnidError
 from tests.omnid.engine.graph_parts import LONG_S, Apply, Collect, Sums, both, fail_at, stopped_at
 
@@ -37,33 +37,6 @@ def test_threads_give_the_results_of_inline() -> None:
     assert raw == list(range(101))
     assert sums == [4 * k + 1 for k in range(50)] + [100, -1]  # with the results of finish
     assert late == [sums[k] + sums[k + 1] for k in range(0, 52, 2)] + [-1]
-
-
-@both
-def test_a_slot_as_a_sink_keeps_the_newest(threaded: bool) -> None:
-    slot: Slot[int] = Slot()
-    assert slot.get() is None
-    graph = Graph(threaded=threaded)
-    graph.sink("newest", slot, graph.source("numbers", lambda: range(10)))
-    graph.run()
-    assert slot.get() == 9
-
-
-def test_direct_stages_and_sinks_run_in_the_thread_of_the_one_before() -> None:
-    names: list[str] = []
-
-    class Named:
-        def process(self, number: int) -> int:
-            names.append(threading.current_thread().name)
-            return number
-
-    graph, out = Graph(), Collect()
-    first = graph.stage("first", Named(), graph.source("numbers", lambda: iter(range(3))))
-    graph.sink("out", out, graph.stage("second", Named(), first, direct=True))
-    graph.sink("third", Named(), first, direct=True)
-    graph.run()
-    assert set(names) == {"first"} and out.got == [0, 1, 2]
-    assert [stats.processed for stats in graph.telemetry.stages if stats.name in ("second", "third")] == [3, 3]
 
 
 @both
@@ -95,19 +68,6 @@ def test_a_source_settles_until_all_that_follows_is_done(threaded: bool) -> None
     graph.run()
     assert slow.got == list(range(20))
     assert behind == 20 * [0]
-
-
-def test_a_failure_ends_the_wait_of_a_source_that_settles() -> None:
-    graph = Graph(policy=LOSSLESS)
-
-    def numbers() -> Iterator[int]:
-        yield 0
-        graph.settle()
-        yield 1
-
-    graph.stage("bad", Apply(fail_at(0)), graph.source("numbers", numbers))
-    with pytest.raises(ValueError, match="cannot take 0"):
-        graph.run()
 
 
 @both
@@ -212,32 +172,6 @@ def test_stop_from_a_signal_handler_drains_and_finishes(threaded: bool, handled:
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_a_second_stop_drops_the_inboxes_and_releases_a_waiting_writer() -> None:
-    graph, sink, third, ended = Graph(depth=1), Collect(), threading.Event(), threading.Event()
-
-    def numbers() -> Iterator[int]:
-        try:
-            yield from (0, 1)
-            third.set()  # one message in process, one in the inbox: the next one has to wait
-            yield from count(2)
-        finally:
-            ended.set()
-
-    def hold(message: int) -> int:
-        assert third.wait(LONG_S)
-        graph.stop()
-        graph.stop()
-        assert ended.wait(LONG_S)  # the writer was released while its reader still works
-        return message
-
-    graph.sink("sink", sink, graph.stage("hold", Apply(hold), graph.source("numbers", numbers)))
-    with pytest.raises(KeyboardInterrupt, match="stopped twice"):
-        graph.run()
-    numbers_stats, hold_stats, _ = graph.telemetry.stages
-    assert (hold_stats.processed, hold_stats.dropped) == (1, numbers_stats.processed - 1)
-    assert sink.finished == 0
-
-
 def test_a_second_ctrl_c_interrupts_an_inline_stage() -> None:
     graph, sink = Graph(threaded=False), Collect()
 
@@ -252,19 +186,6 @@ def test_a_second_ctrl_c_interrupts_an_inline_stage() -> None:
         graph.run()
     assert sink.got == [0, 1]
     assert sink.finished == 0
-
-
-def test_wake_ends_a_blocked_source() -> None:
-    graph, sink, closed = Graph(), Collect(), threading.Event()
-
-    def camera() -> Iterator[int]:
-        yield 1
-        graph.stop()
-        assert closed.wait(LONG_S)
-
-    graph.sink("sink", sink, graph.source("camera", camera, wake=closed.set))
-    graph.run()
-    assert (sink.got, sink.finished) == ([1], 1)
 
 
 def test_refuses_wrong_wiring() -> None:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Iterator
 from functools import partial
 
-import numpy as np
 import pytest
 
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph
-from tests.omnid.engine.graph_parts import LONG_S, Apply, Collect, both
+from tests.omnid.engine.graph_parts import LONG_S, Apply, Collect
 
 pytestmark = pytest.mark.usefixtures("no_thread_is_left")
 
@@ -61,19 +59,6 @@ def test_newest_drops_the_oldest_and_counts_it() -> None:
     assert counted["numbers"] == counted["fast"] == (50, 0)
 
 
-@both
-def test_merges_several_sources_into_one_inbox(threaded: bool) -> None:
-    graph, sink = Graph(threaded=threaded), Collect()
-    streams = [graph.source("even", lambda: range(0, 100, 2)), graph.source("odd", lambda: range(1, 60, 2))]
-    graph.sink("sink", sink, *streams)
-    graph.run()
-    assert sorted(sink.got) == sorted([*range(0, 100, 2), *range(1, 60, 2)])
-    assert [number for number in sink.got if number % 2] == list(range(1, 60, 2))
-    assert sink.finished == 1
-    if not threaded:
-        assert sink.got[:60] == list(range(60))  # inline: round robin
-
-
 def test_a_failed_reader_releases_its_waiting_writer() -> None:
     graph, third = Graph(depth=1), threading.Event()
 
@@ -90,30 +75,6 @@ def test_a_failed_reader_releases_its_waiting_writer() -> None:
     with pytest.raises(ValueError, match="cannot take 0"):
         graph.run()
     assert [(row.n, row.drops) for row in graph.telemetry.summary()] == [(3, 0), (0, 2)]
-
-
-def test_of_two_writers_each_drops_its_own_oldest_message() -> None:
-    """So a camera never takes the place of the other one's image."""
-    graph, gate, out = Graph(policy=NEWEST, depth=1), threading.Event(), Collect()
-    sent = [threading.Event(), threading.Event()]
-
-    def numbers(offset: int, done: threading.Event) -> Iterator[int]:
-        yield from range(offset, offset + 5)
-        done.set()
-
-    class Slow:
-        def process(self, number: int) -> int:
-            if not gate.is_set():
-                for event in sent:
-                    event.wait(5)
-                gate.set()
-            return number
-
-    lower = graph.source("lower", lambda: numbers(0, sent[0]))
-    upper = graph.source("upper", lambda: numbers(100, sent[1]))
-    graph.sink("out", out, graph.stage("slow", Slow(), lower, upper), policy=LOSSLESS)
-    graph.run()
-    assert {4, 104} <= set(out.got)
 
 
 class Held:
@@ -152,70 +113,3 @@ def test_parts_of_dropped_messages_go_along_with_the_next_one_of_their_writer(de
         assert [number for number in found if number // 100 == first // 100] == list(range(first, first + 20))
         assert depth == 1 or (first + 19,) in out.got
     assert all(len({number // 100 for number in message}) == 1 for message in out.got)
-
-
-class Recorded:
-    """Passes numbers on after an optional wait, and keeps what it was given."""
-
-    def __init__(self, wait_s: float = 0.0) -> None:
-        self.seen: list[int] = []
-        self._wait_s = wait_s
-
-    def process(self, number: int) -> int:
-        self.seen.append(number)
-        time.sleep(self._wait_s)
-        return number
-
-
-@pytest.mark.parametrize("bound", [True, False])
-def test_a_bound_head_works_only_for_what_the_tail_will_take(bound: bool) -> None:
-    """Without the bound, the head's work on most messages is dropped in front of the slow tail."""
-    graph, head, tail = Graph(policy=NEWEST, depth=1), Recorded(), Recorded(0.03)
-
-    def numbers() -> Iterator[int]:
-        for number in range(200):
-            time.sleep(0.001)
-            yield number
-
-    graph.sink("tail", tail, graph.stage("head", head, graph.source("numbers", numbers)))
-    if bound:
-        graph.bound("head", "tail")
-    graph.run()
-    assert tail.seen[-1] == 199  # the last one is not lost
-    assert (len(head.seen) <= len(tail.seen) + 1) == bound
-
-
-def test_after_long_work_that_follows_a_result_the_tail_takes_the_newest() -> None:
-    """A message prepared for it during its own work has become old meanwhile."""
-    made: list[int] = []  # numbers so far, of which the last one is the newest
-    ages: list[int] = []  # how many newer ones there were when the tail took one after its long work
-    during: list[int] = []  # how many were made during that
-
-    class Tail:
-        after_work = False
-        taken = 0
-
-        def process(self, number: int) -> None:
-            if self.after_work:
-                ages.append(made[-1] - number)
-            self.taken += 1
-            self.after_work = self.taken % 5 == 0
-            time.sleep(0.005)
-
-        def after(self) -> None:
-            if self.after_work:
-                before = made[-1]
-                time.sleep(0.06)
-                during.append(made[-1] - before)
-
-    def numbers() -> Iterator[int]:
-        for number in range(600):
-            made.append(number)
-            time.sleep(0.001)
-            yield number
-
-    graph = Graph(policy=NEWEST, depth=1)
-    graph.sink("tail", Tail(), graph.stage("head", Recorded(0.003), graph.source("numbers", numbers)))
-    graph.bound("head", "tail")
-    graph.run()
-    assert np.median(ages) < np.median(during) / 2

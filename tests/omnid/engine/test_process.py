@@ -24,17 +24,6 @@ def test_each_signal_reaches_the_handler_and_the_one_before_comes_back() -> None
     assert {number: signal.getsignal(number) for number in STOP_SIGNALS} == before
 
 
-@pytest.mark.usefixtures("default_signals")
-def test_an_ignored_signal_stays_ignored() -> None:
-    """As SIGHUP under nohup."""
-    signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    came = list[int]()
-    with handle_stop_signals(lambda number, _: came.append(number)):
-        signal.raise_signal(signal.SIGHUP)
-        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
-    assert came == []
-
-
 def test_modules_of_the_current_folder_are_not_imported(tmp_path: Path) -> None:
     (tmp_path / "omnid.py").write_text("print('planted')")
     words = python("-c", "import omnid, os; print(omnid.__file__, os.environ['KEY'])")

@@ -23,7 +23,6 @@ from omnid.engine.realtime import (
     RealtimeSettings,
     ThreadStart,
     highest_priority,
-    may_lock,
     priorities,
 )
 
@@ -80,10 +79,6 @@ def seen_in(name: str, start: ThreadStart) -> dict[str, tuple[str, int]]:
     return seen
 
 
-def test_threads_have_names_in_the_kernel() -> None:
-    assert seen_in("lower", ThreadStart({})) == {"source": ("lower", os.SCHED_OTHER), "sink": ("sink", os.SCHED_OTHER)}
-
-
 @allowed
 def test_only_the_named_thread_has_priority() -> None:
     seen = seen_in("lower", ThreadStart({"lower": 10}))
@@ -134,31 +129,6 @@ print(json.dumps({"reported": reported, "locked": locked_kb()}))
     assert done.reported.endswith(f"swapped out: {LOCK_ADVICE}") and done.locked == 0  # not even tried
 
 
-@pytest.mark.skipif(not may_lock(), reason="no right to lock memory: ulimit -l unlimited")
-def test_locks_memory_without_allocating_it() -> None:
-    done = answer("""
-import cv2
-before = locked_kb()
-reported = lock_memory()
-room = bytearray(8 << 20)
-lines = Path("/proc/self/status").read_text().splitlines()
-resident = next(int(line.split()[1]) for line in lines if line.startswith("VmRSS"))
-print(json.dumps({"reported": reported, "before": before, "locked": locked_kb(), "resident": resident}))
-""")
-    assert done.reported == "" and done.before == 0
-    assert done.locked > 100_000 and done.resident < done.locked / 2  # stacks of OpenCV's threads, never touched
-
-
-def test_prepare_applies_the_settings() -> None:
-    done = answer("""
-refused = prepare(RealtimeSettings(lock_memory=False, longest_run_ms=300))
-print(json.dumps({"frozen": gc.get_freeze_count(), "switch_s": sys.getswitchinterval(), "refused": refused,
-                  "run": resource.getrlimit(resource.RLIMIT_RTTIME)[0]}))
-""")
-    assert done.frozen > 1000 and done.refused == []
-    assert (done.switch_s, done.run) == (pytest.approx(1e-3), 300_000)
-
-
 @allowed
 def test_the_kernel_ends_a_real_time_thread_that_does_not_wait() -> None:
     done = process("""
@@ -169,48 +139,3 @@ while time.monotonic() < until_s:
     pass
 """)
     assert done.returncode == -signal.SIGXCPU
-
-
-ALLOCATING_THREAD = """
-def resident_mb():
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS")) / 1024
-def work():
-    for _ in range(3):
-        data = [b"x" * 60_000 for _ in range(700)]
-lock_memory()
-before = resident_mb()
-thread = threading.Thread(target=work); thread.start(); thread.join()
-print(json.dumps({"kept_mb": resident_mb() - before}))
-"""
-
-
-@pytest.mark.skipif(not may_lock(), reason="no right to lock memory: ulimit -l unlimited")
-def test_freed_memory_of_a_thread_returns_to_the_kernel_though_locked() -> None:
-    """The thread frees 42 MB, which a malloc arena of its own would keep."""
-    assert answer("use_one_malloc_arena()" + ALLOCATING_THREAD).kept_mb < 10
-
-
-GIVEN_BACK = """
-import llvmlite.binding as llvm
-from omnid.engine.realtime import give_back_code
-def code_kb():
-    kb, is_code = 0, False
-    for line in Path("/proc/self/smaps").read_text().splitlines():
-        words = line.split()
-        if "-" in words[0]:
-            is_code = words[1] == "r-xp" and "llvmlite" in line
-        kb += int(words[1]) if is_code and words[0] == "Rss:" else 0
-    return kb
-llvm.initialize_native_target()
-before_kb = code_kb()
-give_back_code("llvmlite")
-after_kb = code_kb()
-llvm.parse_assembly("define void @f() { ret void }").verify()
-print(json.dumps({"before_kb": before_kb, "after_kb": after_kb, "again_kb": code_kb()}))
-"""
-
-
-def test_code_that_was_given_back_is_read_again_where_it_is_run() -> None:
-    found = answer(GIVEN_BACK)
-    assert found.before_kb > 1000 and found.after_kb == 0 < found.again_kb

@@ -9,7 +9,7 @@ from itertools import count
 import pytest
 
 from omnid.engine.graph import NEWEST, Graph
-from omnid.engine.ticker import Ticker, skipped_deadlines
+from omnid.engine.ticker import Ticker
 from tests.omnid.engine.graph_parts import LONG_S, Action, Apply, Collect, both
 
 pytestmark = pytest.mark.usefixtures("no_thread_is_left")
@@ -41,13 +41,6 @@ def test_a_failing_ticker_is_closed_and_ends_the_run(threaded: bool) -> None:
         graph.run()
     assert caught.value.__notes__ == ["in 'motor'"]
     assert (action.calls, action.closed, sink.finished) == (3, 1, 1)
-
-
-@pytest.mark.parametrize(
-    ("late_ns", "skipped"), [(-50, 0), (0, 0), (99, 0), (100, 1), (199, 1), (1000, 10), (1050, 10)]
-)
-def test_skips_missed_deadlines_and_keeps_the_phase(late_ns: int, skipped: int) -> None:
-    assert skipped_deadlines(5_000, 5_000 + late_ns, 100) == skipped
 
 
 def test_a_stalled_ticker_counts_missed_deadlines_without_a_burst() -> None:

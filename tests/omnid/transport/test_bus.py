@@ -29,7 +29,7 @@ from omnid.transport import session as transport_session
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import ERROR, OK, WARN
 from omnid.transport.pose_attachment import PoseAttachment
-from omnid.transport.session import open_client, open_session, robots_there, zenoh_config
+from omnid.transport.session import open_client, open_session, zenoh_config
 from omnid.transport.topics import PUBLISHED
 from tests.omnid.transport.bus_fixtures import DEADLINE_S, ROUTER, free_endpoint, numbers, odometry, script, session
 from tests.omnid.transport.bus_fixtures import SUBSCRIBER as STAMP_SUBSCRIBER
@@ -59,19 +59,6 @@ with zenoh.open(config) as session:
     received = session.declare_subscriber("omnid/**", lambda sample: None)
     print("ready", flush=True)
     time.sleep(100)
-"""
-FLOODER = """
-import json, sys, zenoh
-config = zenoh.Config()
-config.insert_json5("mode", '"client"')
-config.insert_json5("connect/endpoints", json.dumps([sys.argv[1]]))
-config.insert_json5("scouting/multicast/enabled", "false")
-config.insert_json5("transport/shared_memory/enabled", "false")
-session = zenoh.open(config)
-session.put("anything/else", bytes(300_000_000), congestion_control=zenoh.CongestionControl.BLOCK)
-print("ready", flush=True)
-import time
-time.sleep(1000)
 """
 
 
@@ -178,16 +165,6 @@ def test_another_process_reads_the_same_odometry() -> None:
         np.testing.assert_array_equal(record.covariance, expected.covariance)
 
 
-def test_publish_refuses_unknown_topics_and_a_closed_bus() -> None:
-    bus = Bus(BusConfig(listen=()))
-    with pytest.raises(OmnidError, match="key"):
-        bus.publish("a/*", b"")
-    bus.close()
-    bus.close()
-    with pytest.raises(OmnidError, match="cannot publish"):
-        bus.publish("odom", b"")
-
-
 def test_late_subscribers_receive_the_newest_message_at_once() -> None:
     endpoint = free_endpoint()
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
@@ -230,14 +207,6 @@ def test_late_subscribers_of_ros_receive_the_static_frames() -> None:
     assert came == [b"frames", b"refined"] and kept == {"tf_static", "map"}
 
 
-def test_clients_receive_messages_above_the_limit_of_the_daemon() -> None:
-    endpoint, payload = free_endpoint(), bytes(3 << 20)
-    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus, Robot(connect=(endpoint,)) as robot:
-        received: list[int] = []
-        robot.on_message(lambda topic, data, _: received.append(len(data)))
-        wait_until(lambda: bus.publish("cloud", payload) is None and len(payload) in received)
-
-
 # Endpoints and routers.
 
 
@@ -269,24 +238,6 @@ def test_a_taken_or_silent_endpoint_is_refused_with_the_setting_to_change() -> N
     with pytest.raises(OmnidError, match="write protocol/host:port") as wrong:
         open_client(BusConfig(connect=("nowhere",)), timeout_s=60.0)
     assert not isinstance(wrong.value, Unreachable)
-
-
-def test_the_robots_that_are_reached_are_named() -> None:
-    endpoint = free_endpoint()
-    with (
-        contextlib.closing(Bus(BusConfig(robot="bob", listen=(endpoint,)))),
-        contextlib.closing(open_client(BusConfig(robot="ada", connect=(endpoint,)))) as program,
-        contextlib.closing(open_client(BusConfig(connect=(endpoint,)))) as other,
-    ):
-        assert robots_there(program) == "robots there: bob"
-        held = [other.liveliness().declare_token(f"robot{number}/alive") for number in range(7)]
-        wait_until(lambda: robots_there(program) == "robots there: bob, robot0, robot1, robot2, robot3, 3 more")
-        del held
-
-
-def test_a_peer_publishes_without_its_router() -> None:
-    with contextlib.closing(Bus(BusConfig(listen=(free_endpoint(),), connect=(free_endpoint(),)))) as bus:
-        bus.publish("odom", odometry(1))
 
 
 @pytest.mark.slow
@@ -457,36 +408,6 @@ def test_does_not_connect_to_a_peer_that_another_one_introduces() -> None:
         wait_until(lambda: bool(commands))
         assert bus._session is not None
         assert intruder.zid() not in bus._session.info.peers_zid() and not received.is_set()
-
-
-def resident_mb() -> int:
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS")) // 1024
-
-
-@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux's /proc")
-def test_does_not_collect_large_messages() -> None:
-    """The sender may not write anything; 300 MB of one message would be kept until its last byte otherwise."""
-    endpoint = free_endpoint()
-    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
-        commands: list[str] = []
-        bus.subscribe_commands(lambda request: commands.append(request.topic), {})
-        before_mb, halt, most_mb = resident_mb(), threading.Event(), [0]
-
-        def watch() -> None:
-            while not halt.wait(0.01):
-                most_mb[0] = max(most_mb[0], resident_mb())
-
-        thread = threading.Thread(target=watch)
-        thread.start()
-        try:
-            with script(FLOODER, endpoint), Robot(connect=(endpoint,)) as operator:
-                driver = operator.driver()
-                wait_until(lambda: driver.stop() is None and bool(commands))
-        finally:
-            halt.set()
-            thread.join()
-    assert most_mb[0] - before_mb < 100
 
 
 def test_more_sessions_than_there_are_places_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:

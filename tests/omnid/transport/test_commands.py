@@ -23,11 +23,6 @@ from omnid.core.control.heading_controller import Setpoint
 from omnid.core.navigation.requests import (
     GoalRequest,
     NavigationCommand,
-    NavigationFrame,
-    NavigationVerb,
-    PathRequest,
-    RouteAction,
-    RouteRequest,
 )
 from omnid.errors import OmnidError
 from omnid.transport import codec
@@ -44,11 +39,10 @@ from omnid.transport.navigation_codec import (
     string_from_cdr,
 )
 from omnid.transport.navigation_commands import LONGEST_PAYLOAD as LONGEST_PATH
-from omnid.transport.navigation_commands import MOST_WAITING, NavigationReceiver, RequestQueue
-from omnid.transport.records import TwistRecord
+from omnid.transport.navigation_commands import NavigationReceiver
 from omnid.transport.requests import Answer, Request
 from omnid.transport.sensor_receiver import SensorReceiver
-from omnid.transport.stamps import EARLY, NOT_RISING, TOO_OLD, UNSTAMPED, USED_BEFORE, RefusedStamp, StampRule
+from omnid.transport.stamps import NOT_RISING, UNSTAMPED, USED_BEFORE, RefusedStamp, StampRule
 from omnid.transport.topics import IMU, JOINT_STATES, SENSOR_TOPICS, WHEEL_ODOM
 
 STALE_S = 0.5
@@ -67,14 +61,6 @@ def refusal(rule: StampRule, stamp_ns: int, topic: str = "cmd/twist") -> str:
     except RefusedStamp as error:
         return str(error)
     return ""
-
-
-@pytest.mark.parametrize("topic", ["cmd/twist", "cmd/arm"])
-@pytest.mark.parametrize(("later_s", "reason"), [(0.0, ""), (-30.0, ""), (30.0, ""), (-90.0, TOO_OLD), (90.0, EARLY)])
-def test_synchronised_clocks_differ_by_the_longest_age(topic: str, later_s: float, reason: str) -> None:
-    rule = StampRule(60.0)
-    assert refusal(rule, now_ns(later_s), topic) == reason
-    assert refusal(rule, 0, topic) == UNSTAMPED
 
 
 def test_stamps_of_other_clocks_rise_in_each_topic_and_begin_again_after_an_arming() -> None:
@@ -228,17 +214,6 @@ def test_a_plain_twist_without_stamp_counts_where_the_clocks_differ(accepted: Ac
     assert len(other.setpoints) == 4 and other.receiver.refused == {"stamp does not rise": 1}
 
 
-def test_refusals_are_reported_with_what_to_do() -> None:
-    lines: list[str] = []
-    receiver = CommandReceiver(AcceptedCommands(), StampRule(STALE_S), report=lines.append)
-    for topic, payload in (("twist", plain_twist()), ("twist", b"{}"), ("\n\x1b[2J" * 50, twist())):
-        receiver.receive(Request(f"cmd/{topic}", payload))
-    assert lines[0].startswith("a command on cmd/twist is refused: no stamp; fill in the stamp")
-    assert 'bus.command_clock = "arrival"' in lines[0]
-    assert lines[1].startswith("a command on cmd/twist is refused: malformed; twist takes TwistStamped or Twist")
-    assert all(line.isprintable() and len(line) < 200 for line in lines) and len(lines) == 3
-
-
 def stream(start_ns: int, count: int = 5) -> list[bytes]:
     """Return commands at 20 Hz by a sender's clock."""
     return [codec.twist_stamped_cdr(start_ns + round(i * 5e7), "base_link", 0.3, 0.0) for i in range(count)]
@@ -263,13 +238,6 @@ def test_refuses_replayed_and_reordered_commands_of_another_clock() -> None:
     accepted.receive("cmd/heading", codec.heading_cdr(10**12, 0.4, 1.5))
     accepted.receive("cmd/stop", recorded[0])
     assert len(accepted.setpoints) == 6 and accepted.stops == 2
-
-
-def test_a_refused_command_does_not_move_the_sequence() -> None:
-    accepted = AcceptedCommands(synchronised=False)
-    accepted.receive("cmd/twist", codec.twist_stamped_cdr(10**15, "base_link", math.nan, 0.0))
-    accepted.receive("cmd/twist", stream(10**12, 1)[0])
-    assert accepted.receiver.accepted == 1
 
 
 def damaged(rng: random.Random, good: bytes) -> bytes:
@@ -327,45 +295,6 @@ def test_a_request_that_was_sent_before_the_stop_and_comes_after_it_is_refused(a
     assert accepted.receive("cmd/arm", arm(), id=7) is None, "the controller answers"
     assert accepted.arms[0].id == 7 and before_ns <= accepted.arms[0].arrival_ns <= time.monotonic_ns()
     assert len(accepted.arms) == accepted.receiver.arms == 1
-
-
-def test_arming_lets_the_stamps_of_another_clock_begin_again_and_counts_once() -> None:
-    """A stamp far in the future would lock its topic until the restart."""
-    accepted = AcceptedCommands(synchronised=False)
-    accepted.receive("cmd/twist", codec.twist_stamped_cdr(2**31 * 10**9 - 1, "base_link", 0.3, 0.0))
-    for payload in stream(10**12):
-        accepted.receive("cmd/twist", payload)
-    assert len(accepted.setpoints) == 1 and accepted.receiver.refused == {"stamp does not rise": 5}
-    accepted.receive("cmd/arm", codec.header_cdr(10**12))
-    for payload in stream(10**12):
-        accepted.receive("cmd/twist", payload)
-    assert len(accepted.setpoints) == 6 and len(accepted.arms) == 1
-    for stamp_ns in (10**15, 10**11, 10**11, 10**15):
-        accepted.receive("cmd/arm", codec.header_cdr(stamp_ns), id=stamp_ns)
-    assert [request.id for request in accepted.arms[1:]] == [10**15, 10**11], "also of a clock that began again"
-    assert accepted.receiver.refused["stamp was used before"] == 2
-
-
-def test_the_topic_names_the_source(accepted: AcceptedCommands) -> None:
-    for key in ("cmd/twist", "cmd/operator/twist", "cmd/planner/twist"):
-        accepted.receive(key, twist(), "somebody")
-    assert [command.source for command in accepted.commands] == ["operator", "operator", "planner"]
-    assert all(command.sender == "somebody" for command in accepted.commands)
-
-
-def test_the_arrival_is_that_of_the_message_not_of_its_decoding(
-    accepted: AcceptedCommands, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A stop that arrives while the command is decoded voids it."""
-    decoded_ns: list[int] = []
-
-    def decode(payload: bytes) -> TwistRecord:
-        decoded_ns.append(time.monotonic_ns())
-        return codec.twist_from_cdr(payload)
-
-    monkeypatch.setattr("omnid.transport.commands.twist_from_cdr", decode)
-    accepted.receive("cmd/twist", twist())
-    assert accepted.arrivals_ns[0] < decoded_ns[0]
 
 
 @pytest.mark.hazard("H08")
@@ -455,21 +384,6 @@ def test_messages_of_the_navigation_round_trip() -> None:
     np.testing.assert_array_equal(path.xy, xy)
     assert path_from_cdr(path_cdr(7, "odom", xy)).heading_rad is None
     assert string_from_cdr(string_cdr("repeat hall")) == "repeat hall"
-
-
-def test_requests_are_passed_on() -> None:
-    received, now_ns = Received(), time.time_ns()
-    command = received.send("goal", goal(now_ns))
-    assert command is not None and (command.stamp_ns, command.id) == (now_ns, 5) and received.answer is None
-    assert command.request == GoalRequest(NavigationFrame.MAP, 1.5, -2.0, pytest.approx(0.5))
-    command = received.send("path", path_cdr(now_ns, "odom", [[0, 0], [1, 1]]))
-    assert command is not None and isinstance(command.request, PathRequest)
-    verbs = [received.send("navigation", string_cdr(verb), time.time_ns()).request for verb in NavigationVerb]
-    assert verbs == list(NavigationVerb)
-    assert received.send("route", string_cdr("repeat hall loops=2"), time.time_ns()).request == RouteRequest(
-        RouteAction.REPEAT, "hall", False, 2
-    )
-    assert not received.lines and received.receiver.accepted == 6
 
 
 @pytest.mark.hazard("H27")
@@ -569,26 +483,6 @@ def test_a_tilted_goal_is_refused() -> None:
     payload[-8:] = np.float64(0.7071).tobytes()
     with pytest.raises(OmnidError, match="about z"):
         goal_from_cdr(bytes(payload))
-
-
-def test_the_queue_gives_all_requests_even_where_a_batch_is_dropped() -> None:
-    queue = RequestQueue()
-    commands = [NavigationCommand(NavigationVerb.PAUSE, k) for k in range(3)]
-    for command in commands:
-        queue.put(command)
-    batches = queue.batches()
-    next(batches)  # dropped by an inbox
-    assert list(next(batches)) == commands
-    queue.end()
-    assert list(next(batches)) == []
-    assert list(batches) == []
-
-
-def test_the_queue_keeps_the_newest_of_too_many() -> None:
-    queue = RequestQueue()
-    for k in range(MOST_WAITING + 5):
-        queue.put(NavigationCommand(NavigationVerb.PAUSE, k))
-    assert [command.arrival_ns for command in next(queue.batches())] == list(range(5, MOST_WAITING + 5))
 
 
 # Samples of wheels and gyro.

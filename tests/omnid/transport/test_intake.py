@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import socket
 import time
-from collections import Counter, deque
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -17,21 +17,12 @@ from omnid.errors import OmnidError
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import WARN
-from omnid.transport.intake import MOST_SENDERS, TAKEN_PER_DECODED, UNKNOWN, Budget, Intake, budget_of
-from omnid.transport.open_requests import OpenRequests
-from omnid.transport.requests import MOST_OPEN, Request, answer_of
+from omnid.transport.intake import UNKNOWN, budget_of
+from omnid.transport.requests import Request
 from omnid.transport.stop_datagram import ASKED, STOPPED, StopListener, StopSender, addresses
-from omnid.transport.topics import ARM, PUBLISHED, REQUEST_TOPICS, STOP, command_topics, request_key
+from omnid.transport.topics import REQUEST_TOPICS, command_topics, request_key
 from tests.omnid.transport.bus_fixtures import free_endpoint, robot, script
 from tests.waiting import wait_until
-
-
-def test_each_source_has_its_topics_and_the_short_ones_are_those_of_all() -> None:
-    topics = command_topics(("operator", "planner"))
-    named = {f"cmd/{source}{kind}" for source in ("", "operator/", "planner/") for kind in ("twist", "heading")}
-    assert named <= topics.keys() and len(topics) - len(named) == len(command_topics(())) - 2
-    assert topics["cmd/planner/twist"] == topics["cmd/twist"] == "geometry_msgs/msg/TwistStamped"
-    assert {STOP, ARM} | REQUEST_TOPICS <= topics.keys() and not topics.keys() & PUBLISHED.keys()
 
 
 @pytest.mark.parametrize("topic", sorted(REQUEST_TOPICS))
@@ -119,32 +110,6 @@ def test_a_flood_on_one_key_is_bounded_and_keeps_no_other_key_out(key: str) -> N
             assert commands[topic] - before <= most
 
 
-BUDGET = Budget(10.0, 5)
-
-
-def test_a_sender_has_its_own_budget_and_the_key_has_one() -> None:
-    ring = deque("a" * 9 + "b")
-    found = Intake("cmd/x", lambda: ring.popleft() if ring else None, BUDGET, lambda message: message[0])
-    taken = [message for _ in range(4) for message in found.messages(lambda: 50.0)]
-    assert taken == ["a"] * 5 + ["b"] and found.refused == 4 and found.crowded == 0
-    ring.extend("c" * 100)
-    for _ in range(20):
-        list(found.messages(lambda: 50.0))
-    assert len(ring) == 99 - (TAKEN_PER_DECODED * 5 - 10) and found.crowded > 0, "the rest is left in the ring"
-    assert found.refused == 9, "the one that waits is not lost"
-    assert list(found.messages(lambda: 50.0 + 0.1)) == ["c"]
-
-
-def test_invented_senders_take_no_memory() -> None:
-    ring, now_s = deque[str](), [50.0]
-    found = Intake("cmd/x", lambda: ring.popleft() if ring else None, BUDGET, lambda message: message)
-    for number in range(1000):
-        ring.append(str(number))
-        now_s[0] += 1.0
-        assert list(found.messages(lambda: now_s[0])) == [str(number)]
-    assert len(found._senders) == MOST_SENDERS
-
-
 @pytest.mark.parametrize("answer", [Answer(True, "driving"), Answer(False, "not armed: d\u00e9sarm\u00e9\n" * 50)])
 def test_a_request_gets_the_answer_that_is_given_later(answer: Answer) -> None:
     with robot() as (bus, program, received), ThreadPoolExecutor(1) as thread:
@@ -155,55 +120,6 @@ def test_a_request_gets_the_answer_that_is_given_later(answer: Answer) -> None:
         bus.answer(received[0].id, answer)
         bus.answer(received[0].id, Answer(False, "a second one"))
         assert asked.result() == answer
-
-
-def test_an_answer_may_decide_about_earlier_requests_too() -> None:
-    with robot() as (bus, program, received), ThreadPoolExecutor(3) as threads:
-        arms = []
-        for count in (1, 2):
-            arms.append(threads.submit(program.driver().arm))
-            wait_until(lambda count=count: len(received) == count)
-        pause = threads.submit(program.driver().navigate, "pause")
-        wait_until(lambda: len(received) == 3)
-        bus.answer(received[1].id, Answer(True, "armed"), also_before="cmd/arm")
-        assert [arm.result().text for arm in arms] == ["armed", "armed"]
-        bus.answer(received[2].id, Answer(True, "paused"))
-        assert pause.result().text == "paused"
-
-
-def test_requests_that_wait_take_bounded_memory() -> None:
-    with zenoh.open(
-        zenoh.Config.from_json5('{mode: "peer", listen: {endpoints: []}, scouting: {multicast: {enabled: false}}}')
-    ) as session:
-        queries = session.declare_queryable("x", zenoh.handlers.FifoChannel(2 * MOST_OPEN))
-        waiting = [session.get("x", timeout=30.0) for _ in range(2 * MOST_OPEN)]
-        requests = OpenRequests()
-        ids = [requests.add("cmd/arm", queries.recv()) for _ in waiting]
-        for id in (ids[0], ids[-1]):
-            requests.answer(id, Answer(True, str(id)))
-        requests.send()
-        del requests  # ends those that are open
-        texts = [[answer_of(reply.ok.payload.to_bytes()) for reply in replies if reply.ok] for replies in waiting]
-    assert texts == [[]] * (2 * MOST_OPEN - 1) + [[Answer(True, str(ids[-1]))]], "the oldest were given up"
-
-
-def test_a_request_without_an_answer_is_an_error() -> None:
-    with robot() as (_, program, received):
-        with pytest.raises(OmnidError, match="omnid has not answered"):
-            program.driver().arm(timeout_s=0.3)
-        assert [request.topic for request in received] == ["cmd/arm"]
-    endpoint = free_endpoint()
-    with (
-        contextlib.closing(Bus(BusConfig(listen=(endpoint,)))),
-        Robot(connect=(endpoint,)) as program,
-        pytest.raises(OmnidError, match=r"no robot 'omnid' takes such requests there \(robots there: omnid\)"),
-    ):
-        program.driver().arm()
-
-
-@pytest.mark.parametrize("payload", [b"", b"{}", b"[1]", b"null", b'{"done": 1}', b"\xff", b"[" * 100_000])
-def test_what_is_no_answer_is_none(payload: bytes) -> None:
-    assert answer_of(payload) is None
 
 
 def test_a_stop_is_confirmed_only_where_the_robot_says_so() -> None:

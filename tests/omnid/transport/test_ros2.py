@@ -8,7 +8,6 @@ import shutil
 import struct
 import subprocess
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -46,27 +45,12 @@ def test_type_hashes_are_those_of_ros(schema: str) -> None:
     assert ros2.type_hash(schema).startswith(f"RIHS01_{HASHES[schema]}") and len(ros2.type_hash(schema)) == 71
 
 
-def test_the_data_key_is_the_one_that_ros_subscribes_to() -> None:
-    assert ros2.data_key(0, "/omnid/odom", codec.ODOMETRY_SCHEMA) == ODOMETRY_KEY
-
-
 def test_the_attachment_equals_that_of_zenohs_serializer() -> None:
     gid = bytes(range(16))
     made = ros2.attachment(7, 1_700_000_000_123_456_789, gid)
     assert len(made) == 33
     assert made == bytes(ext.z_serialize((ext.Int64(7), ext.Int64(1_700_000_000_123_456_789), gid)))
     assert made.hex() == "0700000000000000" + struct.pack("<q", 1_700_000_000_123_456_789).hex() + "10" + gid.hex()
-
-
-def test_tokens_are_those_of_rmw_zenoh() -> None:
-    node = ros2.RmwNode(5, "aac3178e146ba6f1fc6e6a4085e77f21", "robot")
-    assert node.token == "@ros2_lv/5/aac3178e146ba6f1fc6e6a4085e77f21/0/0/NN/%/%/robot"
-    assert node.publisher(3, "/site/robot/odom", codec.ODOMETRY_SCHEMA) == (
-        "@ros2_lv/5/aac3178e146ba6f1fc6e6a4085e77f21/0/3/MP/%/%/robot/%site%robot%odom/"
-        "nav_msgs::msg::dds_::Odometry_/RIHS01_3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0/"
-        "::,10:,:,:,,"
-    )
-    assert len({ros2.gid_of(node.publisher(i, "/a", codec.ODOMETRY_SCHEMA)) for i in range(3)}) == 3
 
 
 def test_rmw_zenoh_receives_the_same_message_with_its_attachment() -> None:
@@ -130,15 +114,6 @@ def test_joins_the_router_of_ros_where_that_holds_the_endpoint(mode: str) -> Non
         )
         odom.undeclare()
     assert received[0][:2] == ("cmd/twist", twist) and poses[0] == odometry(1)
-
-
-def test_joins_nothing_but_a_router() -> None:
-    endpoint = free_endpoint()
-    config = BusConfig(listen=(endpoint,), ros2="rmw_zenoh")
-    with contextlib.closing(Bus(config)), pytest.raises(OmnidError, match="stop the other program"):
-        Bus(replace(config, robot="other"))
-    with script(ROUTER, endpoint), pytest.raises(OmnidError, match="stop the other program"):
-        Bus(replace(config, ros2="off"))
 
 
 def test_a_name_that_ros_does_not_allow_is_refused() -> None:

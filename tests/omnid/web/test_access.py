@@ -10,7 +10,7 @@ pytest.importorskip("starlette", reason="needs the packages of omnid[web]")
 from starlette.requests import HTTPConnection
 
 from omnid.errors import OmnidError
-from omnid.web.access import Access, Role, new_token, token_of
+from omnid.web.access import Access, Role, token_of
 
 TOKEN, STOP_TOKEN = "abcde-fghjk-mnpqr-stuvw", "stop-stop-stop-stop"
 LOCAL = Access(TOKEN, frozenset(("localhost", "127.0.0.1", "[::1]")), False, "omnid_8447")
@@ -112,13 +112,6 @@ def test_other_sites_may_only_link_to_the_page(path: str, expected: str) -> None
     assert reason(LOCAL, COOKIE, {"sec-fetch-site": "cross-site"}, path=path) == expected
 
 
-def test_only_the_page_that_asks_for_the_token_needs_none() -> None:
-    assert [reason(LOCAL, path=path) for path in ("/", "/static/login.css")] == ["", ""]
-    assert reason(LOCAL, OWN, path="/login", method="POST") == ""
-    assert reason(LOCAL, OWN, path="/", kind="websocket") == "no token"
-    assert reason(LOCAL, path="/static/page.js") == "no token"
-
-
 def test_the_token_for_stops_may_see_and_stop_and_nothing_else() -> None:
     cookie = {"cookie": f"omnid_8447={BOTH.new_cookie(Role.STOP)}", **OWN}
     for headers in ({"authorization": f"Bearer {STOP_TOKEN}"}, cookie):
@@ -130,15 +123,6 @@ def test_the_token_for_stops_may_see_and_stop_and_nothing_else() -> None:
     assert reason(BOTH, COOKIE, OWN, path="/arm", method="POST") == ""
     assert BOTH.role_of(f" {TOKEN}\n") is Role.DRIVE and BOTH.role_of(STOP_TOKEN) is Role.STOP
     assert LOCAL.role_of("") is None, "without a token for stops an empty one is none"
-
-
-def test_tokens_differ_and_the_file_keeps_one(tmp_path: Path) -> None:
-    assert len({new_token() for _ in range(100)}) == 100 and len(new_token()) == 23
-    path = tmp_path / "token"
-    token = token_of(path)
-    assert path.stat().st_mode & 0o777 == 0o600 and token_of(path) == token != token_of(None)
-    path.chmod(0o640)
-    assert token_of(path) == token
 
 
 @pytest.mark.parametrize(

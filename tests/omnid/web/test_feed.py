@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
 import math
 import time
@@ -13,39 +12,30 @@ from typing import Any
 
 import numpy as np
 import pytest
-import zenoh
 from starlette.websockets import WebSocket
 
 from calib import se3
 from drivers.frame import Frame
 from omnid.monitor.robot_state import RobotState
 from omnid.transport import codec, map_codec
-from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.decode import Diagnostics, Map, NavigationReport, Pose, PoseInMap
+from omnid.transport.bus import BusConfig
+from omnid.transport.decode import Diagnostics, Map, Pose
 from omnid.transport.image_codec import image_cdr
 from omnid.transport.pose_attachment import PoseAttachment
 from omnid.transport.records import DiagnosticStatus
 from omnid.transport.scan_codec import Scan, scan_cdr
 from omnid.transport.status_names import NAVIGATION, ODOMETRY, PLACES, WHEELS, Key
-from omnid.web import browsers as browsers_module
-from omnid.web import feed as feed_module
 from omnid.web.browsers import Browsers
-from omnid.web.channels import MOST_POINTS, LivePath, Newest, compact, with_header
+from omnid.web.channels import MOST_POINTS, LivePath, Newest
 from omnid.web.feed import RobotFeed
 from omnid.web.snapshot import (
     LARGEST_MAP_PX,
-    LONGEST_VALUE,
-    MOST_CELLS,
-    MOST_VALUES,
     MOST_WARNINGS,
-    map_in_odom,
     map_message,
-    navigation_message,
-    parts_message,
     scan_message,
     state_message,
 )
-from tests.omnid.transport.bus_fixtures import free_endpoint, odometry
+from tests.omnid.transport.bus_fixtures import odometry
 
 # The path.
 
@@ -75,48 +65,6 @@ def test_browsers_that_come_at_any_time_show_the_same_path() -> None:
     assert sum(len(point) > 2 for point in shown[1]) == 1 and shown[1][0][0] == pytest.approx(90.01, abs=0.1)
 
 
-def test_a_path_of_nothing_but_gaps_and_of_wrong_numbers_stays_small() -> None:
-    path = LivePath()
-    for step in range(3 * MOST_POINTS):
-        path.add(float(step % 1000), 0.0, gap=True)
-        path.add(math.nan, 0.0)
-        path.add(1e300, -math.inf)
-    message = json.loads(path.message(0))
-    assert 0 < len(message["points"]) <= MOST_POINTS
-
-
-def test_json_has_no_number_that_is_not_finite() -> None:
-    with pytest.raises(ValueError, match="not JSON compliant"):
-        compact({"x": math.nan})
-    assert with_header({"type": "map"}, b"\0") == b'\0\0\0\x0e{"type":"map"}\0'
-
-
-def test_a_gap_is_a_jump_of_more_than_a_metre_or_ten_steps() -> None:
-    path = LivePath()
-    for x_m in (0.0, 0.9, 1.9, 3.0):
-        path.add(x_m, 0.0)
-    assert json.loads(path.message(0))["points"] == [[0.0, 0.0], [0.9, 0.0], [1.9, 0.0], [3.0, 0.0, 1]]
-    path._path.step_m = 0.5
-    for x_m in (7.5, 12.6):
-        path.add(x_m, 0.0)
-    assert json.loads(path.message(0))["points"][-2:] == [[7.5, 0.0], [12.6, 0.0, 1]]
-
-
-def test_the_message_begins_after_what_was_seen_and_with_all_after_a_clear() -> None:
-    path = LivePath()
-    for x_m in (0.0, 0.5, 1.00049):
-        path.add(x_m, -x_m)
-    assert path.version == 3
-    assert json.loads(path.message(2)) == {"type": "path", "from": 2, "points": [[1.0, -1.0]]}
-    assert [json.loads(path.message(seen))["from"] for seen in (0, 1, 3)] == [0, 1, 3]
-    path.clear()
-    assert path.version == 4
-    path.add(7.0, 0.0)
-    assert path.version == 5
-    assert [json.loads(path.message(seen))["from"] for seen in (0, 3, 4, 5)] == [0, 0, 0, 1]
-    assert json.loads(path.message(3))["points"] == [[7.0, 0.0]]
-
-
 # Messages.
 
 
@@ -138,20 +86,6 @@ def state(*statuses: DiagnosticStatus) -> RobotState:
 def shown(robot: RobotState, link: str = "") -> dict[str, Any]:
     message: dict[str, Any] = json.loads(state_message("rover", robot, link, {"more": 3}))
     return message
-
-
-def test_the_state_names_pose_speed_and_uncertainty() -> None:
-    robot = state()
-    assert shown(robot)["pose"] is None and not shown(robot)["fresh"] and shown(robot)["more"] == 3
-    robot.pose = pose(0, 1.5, -2.0, 0.5)
-    found = shown(robot)["pose"]
-    assert (found["x_m"], found["y_m"], found["z_m"], found["speed_mps"]) == (1.5, -2.0, 0.1, 0.3)
-    assert found["yaw_rad"] == pytest.approx(0.5) and found["sigma_mm"] == pytest.approx(3.0)
-    assert found["sigma_deg"] == pytest.approx(math.degrees(0.006), rel=1e-5)
-    assert (found["inliers"], found["tracked"], found["resets"], found["sent_ms"]) == (40, 50, 2, 5.0)
-    for sent_ns, sent_ms in ((0, None), (-1, None), (1, 1e-6), (2**63, None)):
-        robot.pose = pose(0, 0.0, 0.0, 0.0, sent_ns)
-        assert shown(robot)["pose"]["sent_ms"] == sent_ms
 
 
 @pytest.mark.parametrize(
@@ -196,30 +130,6 @@ def test_warnings_come_with_the_worst_first_and_with_their_remedies() -> None:
     assert len(shown(many)["warnings"]) == MOST_WARNINGS
 
 
-def test_all_parts_are_listed_with_the_worst_first_and_stages_last() -> None:
-    stage = DiagnosticStatus("omnid: stage x", 0, "", {})
-    robot = state(
-        stage,
-        DiagnosticStatus("omnid: b", 0, "", {f"k{n}": "v" * 200 for n in range(MOST_VALUES + 5)}),
-        DiagnosticStatus("omnid: a", 0, "", {}),
-        DiagnosticStatus("omnid: c", 6, "", {}),
-    )
-    parts = json.loads(parts_message(robot))["parts"]
-    assert [part["name"] for part in parts] == ["c", "a", "b", "stage x"] and parts[0]["level"] == 2
-    assert len(parts[2]["values"]) == MOST_VALUES
-    assert all(len(value) <= LONGEST_VALUE for entry in parts[2]["values"] for value in entry)
-
-
-def test_the_origin_of_the_map_in_odom_follows_from_two_poses_of_the_same_time() -> None:
-    T_map_base = se3.transform(se3.rotation_exp([0, 0, 0.2]), [4.0, 1.0, 0.0])
-    poses = [pose(10, 9.0, 9.0, 9.0), pose(20, 1.0, 2.0, 0.9)]
-    found = map_in_odom(PoseInMap(20, T_map_base, np.eye(6)), poses)
-    assert found is not None
-    c, s = math.cos(0.7), math.sin(0.7)
-    assert found == pytest.approx([1.0 - (4.0 * c - s), 2.0 - (4.0 * s + c), 0.7], rel=1e-5)
-    assert map_in_odom(PoseInMap(15, T_map_base, np.eye(6)), poses) is None
-
-
 def unpacked(message: bytes) -> tuple[dict[str, Any], bytes]:
     """Return header and content of a message."""
     size = int.from_bytes(message[:4], "big")
@@ -254,20 +164,6 @@ def test_a_large_map_is_reduced_and_loses_no_obstacle() -> None:
     assert header["width"] == LARGEST_MAP_PX and header["cell_m"] == 0.05
 
 
-@pytest.mark.parametrize(
-    "grid",
-    [
-        Map(0, "other", np.zeros((2, 2), np.int8), 0.05, (0.0, 0.0)),
-        Map(0, "odom", np.zeros((0, 2), np.int8), 0.05, (0.0, 0.0)),
-        Map(0, "odom", np.zeros((2, 2), np.int8), math.nan, (0.0, 0.0)),
-        Map(0, "odom", np.zeros((2, 2), np.int8), 0.05, (0.0, math.inf)),
-    ],
-)
-def test_a_map_that_cannot_be_drawn_is_sent_without_cells(grid: Map) -> None:
-    header, content = unpacked(map_message(grid))
-    assert (header["width"], header["height"], content) == (0, 0, b"")
-
-
 def scan(ranges: list[float], azimuths: list[float], frame: str = "base_link", stamp_ns: int = 100) -> Scan:
     return Scan(stamp_ns, frame, np.array(azimuths), np.array(ranges), np.array([]), 8.0)
 
@@ -283,20 +179,6 @@ def test_obstacles_are_drawn_from_the_pose_nearest_in_time() -> None:
     assert json.loads(scan_message(scan(ranges, azimuths, "map"), poses)) == nothing
     assert json.loads(scan_message(scan(ranges, azimuths), [])) == nothing
     assert json.loads(scan_message(scan([math.inf], [0.0]), poses)) == nothing
-
-
-def test_the_state_of_a_drive_and_of_a_recording() -> None:
-    report = NavigationReport(1, "blocked", "it waits", "route dock", 5, math.nan, "goal", "no", "hall", 2.5)
-    assert json.loads(navigation_message(report)) == {
-        "type": "navigation",
-        "state": "blocked",
-        "reason": "it waits",
-        "task": "route dock",
-        "left_m": None,
-        "teaching": "hall",
-        "taught_m": 2.5,
-        "refusal": "no",
-    }
 
 
 # The feed.
@@ -326,51 +208,6 @@ async def until(condition: Callable[[], object]) -> None:
     while not condition():
         assert time.monotonic() < end_s
         await asyncio.sleep(0.001)
-
-
-def test_a_message_is_refused_from_its_limit_on_and_the_newest_large_one_counts() -> None:
-    async def check() -> None:
-        feed = RobotFeed(BusConfig())
-        receive = feed._receiver(asyncio.get_running_loop())
-        limits = {
-            "odom": 1 << 16,
-            "map_pose": 1 << 16,
-            "status": 1 << 20,
-            "scan": 1 << 20,
-            "map": MOST_CELLS + (1 << 16),
-            "panorama": 1 << 23,
-            "navigation": 1 << 16,
-        }
-        for broken, (topic, limit) in enumerate(limits.items(), 1):
-            receive(topic, bytes(limit), b"")
-            assert feed.state.broken == broken - 1, topic
-            receive(topic, bytes(limit + 1), b"")
-            assert feed.state.broken == broken, topic
-        receive("elsewhere", b"", b"")
-        receive("elsewhere", b"1", b"")
-        assert feed.state.broken == len(limits) + 1
-        assert set(feed._large) == {"scan", "map", "panorama", "navigation"}
-        receive("scan", b"new", b"")
-        assert feed._large["scan"] == b"new"
-        taken = iter(lambda: feed.inbox.get(0.0), None)
-        assert [message.topic for message in taken] == ["odom", "map_pose", "status", "elsewhere"]
-        await asyncio.sleep(0)
-        assert feed._wake.is_set() and feed._large_wake.is_set()
-
-    asyncio.run(check())
-
-
-def test_the_path_begins_again_with_a_smaller_number_and_has_a_gap_after_a_reset() -> None:
-    feed = RobotFeed(BusConfig())
-    for seq, resets in ((5, 0), (6, 0), (6, 0), (7, 1), (8, 1)):
-        add_pose(feed, seq, resets)
-    feed._process_inbox()
-    assert points(feed) == [[1.25, -1.0], [1.5, -1.0], [1.75, -1.0, 1], [2.0, -1.0]]
-    assert len(feed._poses) == 5
-    add_pose(feed, 1, 1)
-    add_pose(feed, 2, 1)
-    feed._process_inbox()
-    assert points(feed) == [[0.25, -1.0], [0.5, -1.0]] and len(feed._poses) == 2
 
 
 def test_a_robot_that_has_started_again_is_shown_without_what_belongs_to_its_odom_before() -> None:
@@ -408,74 +245,6 @@ def test_a_robot_that_has_started_again_is_shown_without_what_belongs_to_its_odo
     assert json.loads(feed._scan_channel.message(1)) == {"type": "scan", "points": [], "nearest": None}
     report = json.loads(feed._navigation_channel.message(1))
     assert (report["state"], report["task"], report["left_m"]) == ("", "", None)
-
-
-def test_a_status_makes_new_parts_and_a_daemon_that_has_ended_takes_them_along() -> None:
-    feed = RobotFeed(BusConfig())
-    add_pose(feed, 1)
-    feed._process_inbox()
-    assert feed._parts_channel.version == 0
-    feed.inbox.put("status", STATUS, b"")
-    feed._process_inbox()
-    assert feed._parts_channel.version == 1 and WHEELS in feed.state.statuses
-    for alive in (None, True):
-        feed.state.alive = alive
-        feed._forget_ended()
-        assert feed.state.statuses
-    feed.state.alive = False
-    feed._forget_ended()
-    assert not feed.state.statuses and feed._parts_channel.version == 2
-    feed._forget_ended()
-    assert feed._parts_channel.version == 2
-    feed.inbox.put("map_pose", b"nonsense", b"")
-    feed._process_inbox()
-    assert feed.state.broken == 1
-
-
-@pytest.mark.parametrize("has_map", [True, False])
-def test_it_follows_a_robot_from_what_was_published_before(monkeypatch: pytest.MonkeyPatch, has_map: bool) -> None:
-    monkeypatch.setattr(feed_module, "REQUEST_S", 0.001)
-    monkeypatch.setattr(feed_module, "QUIET_S", 0.02)
-    endpoint = free_endpoint()
-
-    async def check(bus: Bus) -> RobotFeed:
-        bus.publish("status", STATUS)
-        if has_map:
-            bus.publish("map", MAP)
-        feed = RobotFeed(BusConfig(connect=(endpoint,)))
-        following = asyncio.create_task(feed.run())
-        await until(lambda: feed._map_channel.version if has_map else feed._parts_channel.version)
-        assert not feed.link and WHEELS in feed.state.statuses and feed._parts_channel.version
-        await until(lambda: feed.state.alive)
-        shown = feed._state_channel.version
-        await until(lambda: feed._state_channel.version > shown + 1)  # without a message
-        # A panorama is subscribed to while a browser asks for it.
-        browser = browsers_module._Browser([])
-        feed.browsers._open.add(browser)
-        assert not bus.is_received("panorama")
-        browser.wanted.add("panorama")
-        await until(lambda: bus.is_received("panorama"))
-        bus.publish("panorama", panorama(b"\xff\xd8 bytes"))
-        await until(lambda: feed._panorama_channel.version)
-        end = feed._end_panorama
-        assert end is not None and feed.robot is not None
-        await feed._follow_requests(feed.robot, feed._receiver(asyncio.get_running_loop()))
-        assert feed._end_panorama is end, "it goes on while it is asked for"
-        browser.wanted.clear()
-        await until(lambda: not bus.is_received("panorama"))
-        assert feed._end_panorama is None
-        bus.publish("scan", SCAN)
-        await until(lambda: feed._scan_channel.version)
-        following.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await following
-        return feed
-
-    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
-        feed = asyncio.run(check(bus))
-    assert feed.robot is not None
-    with pytest.raises(zenoh.ZError):
-        feed.robot.driver()  # the connection is closed
 
 
 def channels(*names: str) -> list[Newest]:
@@ -517,74 +286,3 @@ class Page:
     def closed(self) -> int:
         """The code with which it was closed, 0 if it was not."""
         return int(self.sent[-1]["code"]) if self.sent and self.sent[-1]["type"] == "websocket.close" else 0
-
-
-def shows(page: Page, text: str) -> bool:
-    """True if the newest message of a browser has a text."""
-    return bool(page.texts) and text in page.texts[-1]
-
-
-def test_a_browser_gets_the_newest_message_of_each_kind_once_it_has_answered() -> None:
-    async def check() -> None:
-        state, extra = channels("state", "extra")
-        browsers = Browsers((state, extra), frozenset(("extra",)))
-        page = Page(browsers)
-        await until(lambda: len(browsers) == 1)
-        state.changed()
-        extra.changed()
-        browsers.notify()
-        await until(lambda: page.texts)
-        for _ in range(3):
-            state.changed()
-            browsers.notify()
-        await asyncio.sleep(0)
-        assert page.texts == ["state 1"] and not browsers.want("extra")
-        page.say("ok")
-        await until(lambda: len(page.texts) > 1)
-        assert page.texts == ["state 1", "state 4"] and browsers.skipped == {"state": 2}
-        page.say("show extra")
-        page.say("ok")
-        await until(lambda: len(page.texts) > 2)
-        assert page.texts[2] == "extra 1" and browsers.want("extra") and browsers.sent == {"state": 2, "extra": 1}
-        assert browsers.answer.count == 2 and browsers.answer.p(1.0) < 10.0
-        page.say("hide extra")
-        page.say("ok")
-        await until(lambda: not browsers.want("extra"))
-        extra.changed()
-        state.changed()
-        browsers.notify()
-        await until(lambda: len(page.texts) > 3)
-        assert page.texts[3] == "state 5"
-        page.leave()
-        await page.serving
-        assert not len(browsers) and not page.closed and not browsers.closed
-
-    asyncio.run(check())
-
-
-@pytest.mark.parametrize("text", ["ok", "show state", "hide", "show", "arm", ""])
-def test_a_browser_that_sends_what_no_page_sends_is_closed(text: str) -> None:
-    async def check() -> None:
-        browsers = Browsers(channels("state", "extra"), frozenset(("extra",)))
-        page = Page(browsers)
-        page.say(text)
-        await page.serving
-        assert page.closed == 1008 and browsers.closed == {"unexpected message": 1} and not len(browsers)
-
-    asyncio.run(check())
-
-
-def test_a_browser_that_does_not_answer_is_disconnected(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(browsers_module, "ANSWER_S", 0.01)
-
-    async def check() -> None:
-        (state,) = channels("state")
-        state.changed()
-        browsers = Browsers((state,))
-        page = Page(browsers)
-        await until(lambda: page.closed)
-        assert page.closed == 1001 and browsers.closed == {"no answer": 1}
-        page.leave()
-        await page.serving
-
-    asyncio.run(check())

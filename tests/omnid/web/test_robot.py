@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-import math
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -22,14 +21,14 @@ from omnid.core.control.velocity_limits import VelocityLimits
 from omnid.monitor.robot_state import ReceivedMessage
 from omnid.monitor.stopping import stop
 from omnid.monitor.teleop import FIRST_SHARE, limits_of
-from omnid.transport import codec, driver
+from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.pose_attachment import PoseAttachment
 from omnid.transport.requests import Answer, Request
 from omnid.transport.topics import command_topics
 from omnid.web import robot, snapshot
 from omnid.web.feed import RobotFeed
-from omnid.web.robot import LONGEST_BODY, RobotPage, goal_of, stick_request
+from omnid.web.robot import RobotPage
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry
 from tests.waiting import wait_until
 
@@ -161,31 +160,6 @@ def test_a_stop_ends_once_it_is_confirmed_and_one_asked_for_meanwhile_is_sent_ag
     assert asyncio.run(stops()) == [expected] * 4
 
 
-def test_a_stop_that_is_not_confirmed_says_so(rover: Rover, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(robot, "stop", partial(stop, answer_s=0.1))
-    assert asyncio.run(RobotPage(rover.feed()).stop()) == Answer(
-        False, "the stop is NOT confirmed: use the emergency stop"
-    )
-    monkeypatch.setattr(driver, "CONNECT_S", 0.01)
-    endpoint = free_endpoint()
-    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))):  # a robot without wheels
-        feed = RobotFeed(BusConfig(connect=(endpoint,)))
-        with Robot(settings=feed.bus, timeout_s=30.0) as feed.robot:
-            wheels = RobotPage(feed)
-            answer = asyncio.run(wheels.stop())
-            assert not answer.done and not wheels.is_stopping
-            assert "NOT confirmed: use the emergency stop. no robot 'omnid' receives" in answer.text
-
-
-def test_a_robot_that_does_not_read_is_not_waited_for(page: RobotPage, monkeypatch: pytest.MonkeyPatch) -> None:
-    reads = threading.Event()
-    assert page.feed.robot is not None
-    monkeypatch.setattr(robot, "ANSWER_S", 0.01)
-    monkeypatch.setattr(driver.Driver, "twist", lambda *_: reads.wait(30.0))
-    assert post(page, "/drive", f"1 0 {NOW_MS} a").done
-    reads.set()
-
-
 def test_the_stick_sends_a_share_of_the_limits(
     rover: Rover, page: RobotPage, clock_ms: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -281,33 +255,6 @@ def test_arming_that_was_asked_for_before_a_stop_and_comes_after_it_is_refused(
     assert post(page, "/arm", f"{clock_ms[0]}").done
 
 
-def test_requests_are_answered_by_the_robot_one_of_each_kind_at_a_time(
-    rover: Rover, page: RobotPage, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    async def crowd() -> list[Answer]:
-        rover.answering.clear()
-        first = asyncio.create_task(posted(page, "/goal", f"1 2 {NOW_MS}"))
-        await until(lambda: "cmd/goal" in rover.topics)
-        second = await posted(page, "/goal", f"3 4 {NOW_MS}")
-        arm = asyncio.create_task(posted(page, "/arm", f"{NOW_MS}"))  # of another kind
-        await until(lambda: page._busy == {"goal", "arm"})
-        rover.answering.set()
-        return [second, *await asyncio.gather(first, arm), await posted(page, "/goal", f"5 6 {NOW_MS}")]
-
-    granted = Answer(True, "as asked")
-    assert asyncio.run(crowd()) == [Answer(False, "another request has no answer yet"), granted, granted, granted]
-    assert rover.topics == ["cmd/goal", "cmd/arm", "cmd/goal"] and page.arms == 1
-    rover.is_granted = False
-    assert post(page, "/map") == Answer(False, "omnid refuses: a fault holds")
-    assert post(page, "/navigation", "pause") == Answer(False, "omnid refuses: a fault holds")
-    monkeypatch.setattr(driver, "CONNECT_S", 0.01)
-    with Robot("other", settings=BusConfig(robot="other", connect=(rover.endpoint,)), timeout_s=30.0) as other:
-        page.feed.robot = other
-        for _ in range(2):  # the first does not keep the second out
-            answer = post(page, "/arm", f"{NOW_MS}")
-            assert not answer.done and "takes such requests" in answer.text
-
-
 @pytest.mark.hazard("H47")
 @pytest.mark.parametrize(
     ("path", "text", "words"),
@@ -340,42 +287,3 @@ def test_what_lets_the_robot_move_and_comes_late_or_without_a_stamp_is_refused(
 ) -> None:
     answer = post(page, path, text)
     assert not answer.done and words in answer.text and not rover.topics and page.arms == 0
-
-
-@pytest.mark.parametrize(
-    ("path", "text"),
-    [
-        ("/route", f"repeat hall loops=2 stamp={NOW_MS}"),
-        ("/navigation", f"resume stamp={NOW_MS}"),
-        ("/navigation", f"cancel stamp={LATE_MS}"),
-        ("/route", "stop"),
-        ("/route", "teach hall"),
-        ("/goal", f"1 2 {NOW_MS - 1000}"),
-        ("/arm", f"{NOW_MS}"),
-        ("/map", ""),
-        ("/drive", f"0.5 0 {NOW_MS} a"),
-        ("/drive", f"0 0 {LATE_MS} a"),
-    ],
-)
-def test_without_a_connection_a_request_is_not_done(alone: RobotPage, path: str, text: str) -> None:
-    answer = post(alone, path, text)
-    assert not answer.done and "There is no connection: not connected yet" in answer.text
-    alone._sending = True
-    assert path != "/drive" or "overloaded" in post(alone, path, text).text
-
-
-def test_a_goal_is_in_metres_and_degrees_and_the_stick_in_shares() -> None:
-    assert goal_of(f"1.5 -2 {NOW_MS}") == (1.5, -2.0, None) and goal_of(f"0 0 0 {NOW_MS}") == (0.0, 0.0, 0.0)
-    assert goal_of(f"-0.25 3.1234 -90 {NOW_MS - 1000}") == (-0.25, 3.1234, -math.pi / 2)
-    assert stick_request("-1 0.1234 123456789012345 z9") == (-1.0, 0.1234, 123456789012345, "z9")
-
-
-def test_a_body_is_read_to_its_end_and_no_farther_than_its_limit(
-    page: RobotPage, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert post(page, "/route", "teach ", "hall").done
-    assert "no request about routes" in post(page, "/route", "x" * LONGEST_BODY).text
-    for chunks in (["x" * (LONGEST_BODY + 1)], ["x" * LONGEST_BODY, "x", "x"]):
-        assert "256 bytes" in post(page, "/route", *chunks).text
-    monkeypatch.setattr(robot, "BODY_S", 0.005)
-    assert "did not come" in post(page, "/route", "teach ", ends=False).text

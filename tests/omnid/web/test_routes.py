@@ -94,14 +94,6 @@ def test_requests_reach_the_robot_and_its_answer_the_page(robot: tuple[WebServer
     assert (shown["state"], shown["task"], shown["left_m"]) == ("driving", "route dock", 3.5)
 
 
-def test_the_map_is_saved_when_it_is_asked_for(robot: tuple[WebServer, Navigator]) -> None:
-    server, _ = robot
-    assert answer(robot, "/map", "") == {"done": True, "text": "does save"}
-    assert answer(robot, "/map", "x" * 100_000) == {"done": False, "text": "omnid refuses: that cannot be"}
-    assert server.request("/map", "POST").status == 403 and server.request("/map", headers=server.bearer).status == 405
-    assert server.request("/map", "POST", {**server.bearer, "Origin": "http://evil.example"}).status == 403
-
-
 @pytest.mark.hazard("H47")
 def test_the_stick_drives_while_the_page_shows_the_state_of_the_robot(robot: tuple[WebServer, Navigator]) -> None:
     server, navigator = robot
