@@ -111,8 +111,8 @@ def _rectified(found: RigCalibration, images: PairedImages, rig: Rig) -> str:
         for side, mounted in zip(reversed(images.sides), (rig.upper, rig.lower), strict=True)
     ]
     canvas = _color(np.vstack(rows))
-    for column in range(PANORAMA_WIDTH // (2 * LINES), PANORAMA_WIDTH, PANORAMA_WIDTH // LINES):
-        canvas[:, column] = LINE_COLOR
+    # Lines stand as far apart in a sector, whose panorama is narrower than a full turn.
+    canvas[:, PANORAMA_WIDTH // (2 * LINES) :: PANORAMA_WIDTH // LINES] = LINE_COLOR
     return figure(canvas, f"{name}: the upper panorama above the lower one; a point is in the same column of both")
 
 
