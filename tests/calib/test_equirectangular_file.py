@@ -11,8 +11,6 @@ import pytest
 
 from calib.equirectangular_file import import_helvipad, stacked_rig
 from calib.errors import CalibError
-from calib.panorama import fit_cylinder
-from calib.rig_file import parse_rig, rig_toml
 
 # As the data set has it: centimetres, and numbers of the lidar and of the lenses, which are not used.
 HELVIPAD = {
@@ -42,22 +40,6 @@ def test_rows_of_helvipad_have_the_angles_that_its_authors_compute_with(calibrat
     # The middle of the image is ahead, its right is right.
     np.testing.assert_allclose(rig.lower.T_cam_rig[:3, :3].T @ [0, 0, 1], [1, 0, 0], atol=1e-12)
     np.testing.assert_allclose(rig.lower.T_cam_rig[:3, :3].T @ [1, 0, 0], [0, -1, 0], atol=1e-12)
-
-
-def test_the_panorama_is_a_full_turn_with_the_columns_of_the_images() -> None:
-    """The two ends of a stitched image meet: no column is missing, and none is counted twice."""
-    rig = stacked_rig((1024, 512), 0.2)
-    cylinder = fit_cylinder(rig)
-    assert cylinder.width == cylinder.turn_px == 1024
-    behind = np.array([[-1.0, y, 0.0] for y in np.linspace(-0.01, 0.01, 101)])
-    pixels = rig.lower.camera.project(behind @ rig.lower.T_cam_rig[:3, :3].T)
-    assert (pixels[:, 0] >= 0).all() and (pixels[:, 0] <= 1023).all()
-
-
-def test_the_rig_file_keeps_the_model() -> None:
-    rig = stacked_rig((1920, 512), 0.191)
-    again = parse_rig(rig_toml(rig))
-    assert again.lower.camera == rig.lower.camera and 'model = "equirectangular"' in rig_toml(rig)
 
 
 @pytest.mark.parametrize(

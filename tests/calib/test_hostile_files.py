@@ -7,13 +7,12 @@ import struct
 import zlib
 from itertools import pairwise
 
-import numpy as np
 import pytest
 
 from calib.errors import CalibError
 from calib.models.unified import UnifiedCamera
 from calib.ocam_file import parse_ocam
-from calib.panorama import Cylinder, fit_cylinder, remap_tables
+from calib.panorama import fit_cylinder
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import parse_rig, rig_toml
 from tests.limited import run_limited
@@ -154,10 +153,6 @@ def test_refuses_a_rig_that_asks_for_a_huge_panorama(omni_rig: Rig, factor: floa
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 400
 
 
-def test_the_width_of_a_panorama_may_be_chosen(omni_rig: Rig) -> None:
-    assert fit_cylinder(enlarged(omni_rig, 11), 1024).width == 1024
-
-
 TABLES = """
 from tests.calib.conftest import misaligned, omni_cameras
 from calib.panorama import Cylinder, remap_tables
@@ -171,10 +166,3 @@ def test_tables_take_little_more_memory_than_they_need(omni_rig: Rig) -> None:
     """6 million pixels: 49 MB of tables; all at once the projection would take more than 1 GB."""
     printed, memory_mb = run_limited(TABLES)
     assert printed == "(1500, 4096)" and memory_mb < 250
-
-
-def test_tables_in_blocks_are_the_tables_of_each_row(omni_rig: Rig) -> None:
-    cylinder = Cylinder(300, 150, 70.0)
-    whole = remap_tables(omni_rig, omni_rig.upper, cylinder, pad_px=3)
-    last = remap_tables(omni_rig, omni_rig.upper, Cylinder(300, 1, cylinder.row0 - 149), pad_px=3)
-    np.testing.assert_allclose([table[149] for table in whole], [table[0] for table in last], atol=1e-3)

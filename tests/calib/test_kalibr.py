@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -101,28 +100,6 @@ def test_reads_lenses_and_keeps_them_in_rig_files(
             parameterise(rig.lower.camera)
 
 
-def test_uses_the_camera_chain_without_imu_transforms() -> None:
-    rig = parse_kalibr(chain((None, None), T_UPPER_LOWER, NAMED))
-    T_found = rig.upper.T_cam_rig @ se3.inverse(rig.lower.T_cam_rig)
-    np.testing.assert_allclose(T_found, T_UPPER_LOWER, atol=1e-14)
-    np.testing.assert_allclose(rig.lower.viewpoint, 0, atol=1e-15)
-    np.testing.assert_allclose(rig.upper.viewpoint, [0, 0, rig.baseline_m], atol=1e-14)
-    x_lower = rig.lower.T_cam_rig[:3, 0]
-    z_lower = se3.inverse(T_UPPER_LOWER)[:3, 3] / rig.baseline_m
-    u_lower = np.array([-1.0, 0, 0])  # fu < 0: the image's u runs against the camera's x
-    np.testing.assert_allclose(
-        x_lower, (u_lower - z_lower * (z_lower @ u_lower)) / np.sqrt(1 - (z_lower @ u_lower) ** 2), atol=1e-3
-    )
-    np.testing.assert_allclose(rig.lower.T_cam_rig[:3, 2], z_lower, atol=1e-14)
-
-
-def test_combines_one_imu_transform_with_the_chain() -> None:
-    for T_imu in ((BOTH[0], None), (None, BOTH[1])):
-        rig = parse_kalibr(chain(T_imu, T_UPPER_LOWER, NAMED))
-        np.testing.assert_allclose(rig.lower.T_cam_rig, BOTH[0], atol=1e-14)
-        np.testing.assert_allclose(rig.upper.T_cam_rig, BOTH[1], atol=1e-14)
-
-
 def warnings_of(text: str, **names: str) -> list[str]:
     lines: list[str] = []
     parse_kalibr(text, "c.yaml", warn=lines.append, **names)
@@ -134,15 +111,6 @@ def test_says_that_only_z_of_the_imu_tells_the_lower_camera() -> None:
     (line,) = warnings_of(text)
     assert line == "c.yaml: lower is cam0 by z of the IMU, which must point up; if it does not, give --lower cam1"
     assert warnings_of(text, lower="cam0") == warnings_of(chain(BOTH, None, NAMED)) == []
-
-
-def test_says_that_omni_cameras_without_a_flip_count_as_lenses() -> None:
-    """A mirror whose images were flipped before they were calibrated has such focal lengths, too."""
-    mirrors = chain(BOTH, None, NAMED)
-    lenses = re.sub(r"(intrinsics: \[[\d.]+, )-", r"\1", mirrors)
-    assert lenses != mirrors and warnings_of(mirrors) == []
-    (line,) = warnings_of(lenses)
-    assert "count as lenses" in line and "give them masks" in line
 
 
 @pytest.mark.parametrize(

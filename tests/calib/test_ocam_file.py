@@ -10,7 +10,7 @@ import pytest
 from calib import se3
 from calib.errors import CalibError
 from calib.models.ocam import OcamCamera
-from calib.ocam_file import import_ocam, parse_ocam, read_transform, straight_up
+from calib.ocam_file import import_ocam, parse_ocam, read_transform
 
 # The layout of the toolbox's own export, with own numbers.
 TEXT = """#polynomial coefficients for the DIRECT mapping function (ocam_model.ss in MATLAB). Used by cam2world
@@ -94,19 +94,6 @@ def test_imports_a_rig_from_two_files_and_a_transform(tmp_path: Path, view: str)
     np.testing.assert_allclose(rig.upper.viewpoint, (0, 0, float(np.linalg.norm(T_LOWER_UPPER[:3, 3]))), atol=1e-14)
     # The image's u is the camera's y in this model, and the rig's x.
     assert rig.lower.T_cam_rig[1, 0] > 0.99
-
-
-@pytest.mark.parametrize("view", ["mirror", "direct"])
-def test_baseline_is_vertical_for_upward_cameras(tmp_path: Path, view: str) -> None:
-    (tmp_path / "c.txt").write_text(TEXT)
-    path = tmp_path / "c.txt"
-    rig = import_ocam(path, path, straight_up(0.2), "mirror" if view == "mirror" else "direct")
-    axis = rig.lower.camera.lift(np.array([rig.lower.camera.center]))[0] @ rig.lower.T_cam_rig[:3, :3]
-    # In a mirror the middle of the image shows the camera below, through a lens the ceiling.
-    np.testing.assert_allclose(axis, np.array([0, 0, -1 if view == "mirror" else 1]), atol=1e-12)
-    for baseline in (0.0, -0.2, float("nan")):
-        with pytest.raises(CalibError, match="--baseline"):
-            straight_up(baseline)
 
 
 @pytest.mark.parametrize(

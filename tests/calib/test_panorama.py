@@ -11,9 +11,8 @@ import pytest
 from calib import se3
 from calib.errors import CalibError
 from calib.models.camera import Mask
-from calib.panorama import Cylinder, at_scale, fit_cylinder, remap_tables, visible
+from calib.panorama import Cylinder, fit_cylinder, remap_tables, visible
 from calib.rig import MountedCamera, Rig
-from tests.simulation import make_rig
 from tests.simulation.rigs import R_RIG_AHEAD, lens, lens_rig
 
 # Widest step at which a sector begins or ends, and what misaligned cameras and the corners of an image add or take.
@@ -55,16 +54,6 @@ def test_a_sector_has_the_columns_of_what_both_cameras_see(
     assert missing.mean() < 0.002
 
 
-@pytest.mark.parametrize("rig", [make_rig(size=256), lens_rig(lens("pinhole", 100, (640, 480)))])
-def test_a_panorama_knows_its_scale(rig: Rig) -> None:
-    whole = fit_cylinder(rig)
-    half = fit_cylinder(rig, scale=0.5)
-    assert (whole.scale, half.scale) == (1.0, 0.5) and half.full_turn.scale == 0.5
-    assert fit_cylinder(rig, whole.turn_px // 2).scale == pytest.approx(0.5, abs=0.01)
-    assert whole.resized(whole.width // 2).scale == pytest.approx(0.5, abs=0.01)
-    assert [at_scale(48, half.scale), at_scale(1, half.scale), at_scale(0.3, 0.25)] == [24, 1, 1]
-
-
 def test_pixels_and_rays_of_a_sector_agree_with_those_of_the_full_turn() -> None:
     """Each point has one column; what the sector does not show lies beside it, never in it."""
     rng = np.random.default_rng(1)
@@ -78,22 +67,6 @@ def test_pixels_and_rays_of_a_sector_agree_with_those_of_the_full_turn() -> None
         rays = cylinder.rays(pixels)
         np.testing.assert_allclose(np.cross(rays, points), 0, atol=1e-9 * 100)
         assert ((rays * points).sum(axis=1) > 0).all()
-
-
-def test_mirrors_struts_and_masts_have_a_full_turn() -> None:
-    """A hub, three struts and a mast that hides 40 degrees leave no sector."""
-    rig = make_rig(size=384)
-    whole = fit_cylinder(rig)
-    assert whole.width == whole.turn_px and whole.first == 0
-    rows, columns = np.mgrid[:384, :384] - 191.5
-    for hidden_deg, is_full in ((40, True), (60, False)):
-        shown = np.where(np.abs(np.arctan2(rows, columns)) > np.deg2rad(hidden_deg / 2), 255, 0).astype(np.uint8)
-        mask = Mask((191.5, 191.5), 20.0, 186.0, shown)
-        hidden = replace(rig, lower=replace(rig.lower, mask=mask), upper=replace(rig.upper, mask=mask))
-        found = fit_cylinder(hidden)
-        assert (found.width == found.turn_px) == is_full
-        if is_full:
-            assert found.turn_px == whole.turn_px
 
 
 def test_cameras_that_share_no_view_are_refused() -> None:
@@ -119,11 +92,3 @@ def test_lenses_back_to_back_side_by_side_need_a_shared_ring(field_deg: float, i
         shared = field_deg - 180
         with pytest.raises(CalibError, match=rf"share {shared - 1}\.\d degrees of elevation.*back to back"):
             fit_cylinder(rig)
-
-
-def test_a_sector_may_have_finer_columns_than_a_full_turn() -> None:
-    """A telephoto pair of 4,000 px: 48,000 columns of a full turn, of which 4,000 are kept."""
-    cylinder = fit_cylinder(lens_rig(lens("pinhole", 30, (4000, 2400))))
-    assert cylinder.turn_px > 40000 and cylinder.width < 5000
-    with pytest.raises(CalibError, match=r"a panorama with the resolution of its images would have 1[0-9]{4} columns"):
-        fit_cylinder(lens_rig(lens("pinhole", 30, (19000, 12000))))

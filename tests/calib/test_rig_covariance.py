@@ -5,9 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
-from calib.errors import CalibError
 from calib.fit.parameterisation import parameterise
 from calib.models.camera import Array
 from calib.rig import Rig
@@ -40,14 +38,3 @@ def test_round_trip_is_exact(rig: Rig) -> None:
     np.testing.assert_allclose(found.sigmas**2, np.diag(matrix), rtol=1e-12)
     assert rig_toml(parse_rig(text)) == text
     assert parse_rig(rig_toml(rig)).covariance is None
-
-
-def test_select_returns_the_marginal_covariance(omni_rig: Rig) -> None:
-    names = names_of(omni_rig)
-    matrix = random_matrix(len(names))
-    found = RigCovariance.of_matrix(names, matrix).select(["baseline", "lower fv"])
-    chosen = [names.index("baseline"), names.index("lower fv")]
-    np.testing.assert_allclose(found.matrix, matrix[np.ix_(chosen, chosen)], rtol=1e-9)
-    assert found.sigma("baseline") == pytest.approx(np.sqrt(matrix[-1, -1]))
-    with pytest.raises(CalibError, match="no parameter 'lower k1'"):
-        found.select(["lower k1"])

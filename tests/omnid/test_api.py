@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -23,8 +22,6 @@ from drivers.logs.log_reader import LogReader
 from omnid.engine.graph import Graph
 from omnid.errors import OmnidError
 from omnid.formats.tum import Trajectory, tum_row
-from omnid.runs.run_result import RunFailedError
-from omnid.stages.synchronise import Synchronise
 from tests.conftest import PAIRS
 from tests.ply import read_ply
 from tests.replay import edited
@@ -106,23 +103,6 @@ def test_the_result_holds_arrays_counters_and_timings(result: omnid.RunResult) -
     assert not {"statistics", "collect-poses"} & result.timings.keys()
 
 
-def test_a_result_and_a_pose_print_as_one_line(result: omnid.RunResult, scene: Path, pairs: list[Pair]) -> None:
-    length_m = result.counters.length_m
-    assert (
-        repr(result)
-        == str(result)
-        == (
-            f"<RunResult: {PAIRS} poses ({PAIRS} tracking), {1e-9 * np.ptp(result.stamps_ns):.1f} s, {length_m:.2f} m, "
-            f"{len(result.map.xyz) if result.map is not None else 0} map points, 1 warnings>"
-        )
-    )
-    pose = omnid.Odometry(scene / "rig.toml").process(*pairs[0])
-    assert re.fullmatch(
-        r"<pose 0: tracking, x \+0\.000 y \+0\.000 z \+0\.000 m, heading [+-]0\.00 deg, sigma .* mm>", str(pose)
-    )
-    assert np.array_equal(pose.position, pose.T_odom_rig[:3, 3]) and pose.T is pose.T_odom_rig
-
-
 def test_a_result_is_compared_with_the_truth(result: omnid.RunResult, tmp_path: Path) -> None:
     result.save_tum(tmp_path / "truth.tum")
     metrics = result.evaluate(tmp_path / "truth.tum")
@@ -168,25 +148,6 @@ def test_images_give_the_bytes_of_a_replay(scene: Path, pairs: list[Pair], resul
     depth, seen = odometry.depth(poses[-1]), poses[-1].depth.panoramas
     assert depth.disparity.shape == seen.lower.panorama.shape == seen.upper.panorama.shape
     assert depth.points.shape == (len(depth.variance_m2), 3) and len(depth.points) > 500
-
-
-def test_images_give_the_bytes_of_a_replay_with_the_papers_method(scene: Path, start: Path, pairs: list[Pair]) -> None:
-    expected = omnid.replay(start, scene / "rig.toml", method="paper")
-    odometry = omnid.Odometry(scene / "rig.toml", overrides=["odometry.method=paper"])
-    assert np.array_equal([odometry.process(*pair).T_odom_rig for pair in pairs[:FEW]], expected.T_odom_rig)
-
-
-def test_masks_are_found_in_images(scene: Path, start: Path, pairs: list[Pair]) -> None:
-    rig = read_rig(scene / "rig.toml")
-    bare = replace(rig, lower=replace(rig.lower, mask=None), upper=replace(rig.upper, mask=None))
-    odometry = omnid.Odometry(bare, mask_images=[(lower, upper) for _, lower, upper in pairs[:FEW]])
-    expected = omnid.replay(start, bare)
-    assert odometry.rig.lower.mask is not None and odometry.rig.upper.mask is not None
-    assert np.array_equal([odometry.process(*pair).T_odom_rig for pair in pairs[:FEW]], expected.T_odom_rig)
-    assert omnid.Odometry(bare).rig.lower.mask is None
-    for wrong in ([pairs[0][1]], [pairs[0]]):
-        with pytest.raises(OmnidError, match="mask_images: expected pairs"):
-            omnid.Odometry(bare, mask_images=wrong)  # type: ignore[arg-type]
 
 
 def test_wrong_images_and_stamps_are_refused_and_change_nothing(scene: Path, pairs: list[Pair]) -> None:
@@ -237,13 +198,6 @@ def test_an_image_that_repeats_an_earlier_one_is_refused_and_changes_nothing(sce
         odometry.process(stamp_ns + later_ns, *buffers)
 
 
-def test_exchanged_images_are_refused(scene: Path, pairs: list[Pair]) -> None:
-    odometry = omnid.Odometry(scene / "rig.toml")
-    with pytest.raises(OmnidError, match="the other way round"):
-        for stamp_ns, lower, upper in pairs[:6]:
-            odometry.process(stamp_ns, upper, lower)
-
-
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
@@ -267,18 +221,6 @@ def test_settings_that_a_replay_ignores_are_warnings_or_errors(tmp_path: Path, s
     assert "live.status_s" in found.warnings[0]
     with pytest.raises(OmnidError, match=r"live\.status_s"):
         omnid.replay(start, scene / "rig.toml", overrides=["live.status_s=2.0"])
-
-
-def test_a_late_error_holds_the_result_so_far(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails_at_the_tenth(self: Synchronise, frame: object, process: object = Synchronise.process) -> object:
-        if self.counts["pairs"] == 10:
-            raise OmnidError("the disk is gone")
-        return process(self, frame)  # type: ignore[operator]
-
-    monkeypatch.setattr(Synchronise, "process", fails_at_the_tenth)
-    with pytest.raises(RunFailedError, match="the disk is gone") as caught:
-        omnid.replay(scene / "log.mcap", scene / "rig.toml")
-    assert len(caught.value.result.stamps_ns) == caught.value.result.counters.poses == 10
 
 
 def test_ctrl_c_ends_a_replay_with_a_keyboard_interrupt(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -62,15 +62,6 @@ def test_the_shell_completes_commands_and_options(tmp_path: Path) -> None:
     assert completions("omnid calibrate dr") == {"drive"}
 
 
-def test_the_list_of_commands_loads_no_opencv() -> None:
-    program = "import sys; from omnid.cli import main\ntry: main(['--help'])\nfinally: print('cv2' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
-    lines = done.stdout.splitlines()
-    assert lines[-1] == "False" and all(
-        any(line.strip().startswith(words.split()[0]) for line in lines) for words in COMMANDS
-    )
-
-
 @pytest.mark.parametrize(
     ("words", "line"),
     [

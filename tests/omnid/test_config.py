@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from omnid.config import FIRST_SETTINGS, USED_ONLY_BY, Config, load_config, unused_settings
+from omnid.config import FIRST_SETTINGS, Config, load_config, unused_settings
 from omnid.errors import OmnidError
 from omnid.settings import dump_minimal, paths_of
 
@@ -48,15 +48,6 @@ def test_a_wrong_key_is_answered_by_a_similar_one(key: str, proposed: str) -> No
         load_config(None, [f"{key}=1"])
 
 
-def test_one_override_needs_no_list() -> None:
-    assert load_config(overrides="motor.rate_hz=31") == load_config(overrides=["motor.rate_hz=31"]) != Config()
-
-
-@pytest.mark.parametrize("path", USED_ONLY_BY)
-def test_the_table_of_unused_settings_names_keys_that_exist(path: str) -> None:
-    assert any(f"{known}.".startswith(f"{path}.") for known in paths_of(Config))
-
-
 @pytest.mark.parametrize(
     ("command", "override"),
     [
@@ -73,20 +64,8 @@ def test_refuses_an_override_that_the_command_ignores(command: str, override: st
         unused_settings(config, command, [override])
 
 
-def test_warns_in_one_line_of_settings_in_the_file_that_a_replay_ignores() -> None:
-    config = load_config(None, ["cameras.width_px=640", "service.stall_timeout_s=5"])
-    (warning,) = unused_settings(config, "replay", [])
-    assert warning == "`omnid replay` does not use these settings: cameras.width_px, service.stall_timeout_s"
-    assert unused_settings(config, "run", []) == []
-
-
 def test_the_daemon_refuses_a_setpoint_in_its_configuration() -> None:
     config = load_config(None, ["controller.setpoint.velocity_mps=0.3"])
     with pytest.raises(OmnidError, match="velocity_mps is set, but `omnid run` drives by the setpoints"):
         unused_settings(config, "run", [])
     assert unused_settings(config, "replay", ["controller.setpoint.velocity_mps=0.3"]) == []
-
-
-@pytest.mark.parametrize("command", ["run", "replay"])
-def test_the_defaults_give_no_warning(command: str) -> None:
-    assert unused_settings(Config(), command, []) == []

@@ -144,10 +144,6 @@ def test_refuses_a_wrong_override(override: str, expected: str) -> None:
     assert message.startswith("override ") and expected in message
 
 
-def test_refuses_an_override_below_a_value_of_the_file() -> None:
-    assert "stereo: expected a section, found 5" in refusal("stereo = 5", "stereo.window_px=5")
-
-
 def test_names_a_file_that_cannot_be_read(tmp_path: Path) -> None:
     for path in (tmp_path / "missing.toml", tmp_path, Path("a\0b"), written(tmp_path, b"#" * (1 << 20) + b"#")):
         with pytest.raises(OmnidError, match=r"settings file .*(omnid|missing|test_|a\\x00b)"):

@@ -6,7 +6,6 @@ import re
 import shutil
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
 import pytest
@@ -81,14 +80,6 @@ def test_the_unit_allows_what_the_configuration_asks_for() -> None:
     assert "RestrictRealtime" not in unit and unit["UMask"] == "0027"  # recordings are not for all users
     limit = unit["MemoryMax"]
     assert limit.endswith("M") and 2 * DAEMON_MB <= int(limit[:-1]) <= 4 * DAEMON_MB
-
-
-def test_what_the_unit_starts_is_shipped() -> None:
-    """The program's name is that of the package, its configuration that beside the unit."""
-    project = tomllib.loads((SYSTEMD.parent / "pyproject.toml").read_text())["project"]
-    words = COMMAND.split()
-    assert Path(words[0]).name in project["scripts"]
-    assert (SYSTEMD / Path(words[-1]).name).is_file()
 
 
 def test_the_examples_of_udev_are_commented_and_those_of_cameras_are_what_omnid_cameras_prints() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -129,15 +128,3 @@ def test_the_viewer_does_not_run_it(hostile: Path) -> None:
         "print(subprocess.run(python(*VIEWER, '--version'), capture_output=True, text=True).stdout)"
     )
     assert "rerun" in run(hostile, "-c", ask).stdout
-
-
-def test_each_program_is_started_by_one_function() -> None:
-    """Code that starts a Python names the interpreter in one file only; the others name it in a message."""
-    starts = re.compile(r"\[\s*sys\.executable|exec\w*\(\s*sys\.executable|^\s+sys\.executable,|multiprocessing", re.M)
-    found = [
-        path.relative_to(ROOT).as_posix()
-        for layer in ("calib", "drivers", "omnid")
-        for path in sorted((ROOT / layer).rglob("*.py"))
-        if starts.search(path.read_text("utf-8"))
-    ]
-    assert found == ["omnid/engine/process.py"]

@@ -56,16 +56,6 @@ def test_finds_boards_on_all_sides(
         assert np.nanmedian(off) < limit_px / 2 and np.nanpercentile(off, 90) < limit_px, seed
 
 
-def test_finds_boards_with_squares_of_six_pixels() -> None:
-    T = poses(1, distance_m=(0.55, 0.6))[0]
-    rendered = RENDERER.render_board(T)
-    sides = np.linalg.norm(np.diff(rendered.corners.reshape(5, 6, 2), axis=1), axis=2)
-    assert 4 < np.median(sides) < 8
-    view = find_board(rendered.image, BOARD).view
-    assert view is not None
-    assert np.nanmax(errors_px(view.pixels, rendered.corners)) < 0.3
-
-
 def test_finds_a_board_through_a_fisheye_lens() -> None:
     camera = OcamCamera((-180.0, 0.0, 1.2e-3), (238.0, 241.0), (1.0, 0.0, 0.0), (480, 480), "direct")
     mask = Mask(camera.center, 0.0, 232.0)
@@ -88,29 +78,6 @@ def test_corner_order_is_clockwise_and_starts_at_a_dark_square() -> None:
         assert rendered.image[first[1], first[0]] < rendered.image[second[1], second[0]]
         flipped = find_board(np.ascontiguousarray(rendered.image[:, ::-1]), BOARD).view
         assert flipped is not None
-
-
-def test_drops_a_hidden_corner_and_keeps_the_others() -> None:
-    rendered = RENDERER.render_board(poses(1)[0])
-    image = rendered.image.copy()
-    u, v = rendered.corners[14].round().astype(int)
-    cv2.circle(image, (int(u), int(v)), 4, 128, -1)
-    view = find_board(image, BOARD).view
-    assert view is not None
-    off = errors_px(view.pixels, rendered.corners)
-    assert 1 <= np.isnan(off).sum() <= 3 and np.nanmax(off) < 0.3
-
-
-def test_drops_corners_that_are_off_by_less_than_a_fifth_of_a_square() -> None:
-    """The edge of a shadow moves corners: they are told from the others by the scatter of those."""
-    rendered = RENDERER.render_board(poses(1)[0])
-    image, moved_px = rendered.image.copy(), 2
-    u, v = rendered.corners[14].round().astype(int).tolist()
-    image[v - 6 : v + 7, u - 6 : u + 7] = rendered.image[v - 6 : v + 7, u - 6 - moved_px : u + 7 - moved_px]
-    view = find_board(image, BOARD).view
-    assert view is not None
-    off = errors_px(view.pixels, rendered.corners)
-    assert 1 <= np.isnan(off).sum() <= 3 and np.nanmax(off) < 0.3
 
 
 @pytest.mark.slow

@@ -43,22 +43,6 @@ def test_finds_the_visible_corners_in_a_mirror(board: MarkerBoard, hidden: float
     assert np.nanmedian(off) < 0.05 and np.nanpercentile(off, 90) < 0.3
 
 
-@pytest.mark.parametrize("board", [CHARUCO, GRID, CharucoBoard(6, 5, 0.05, 0.0375, "4X4_50", legacy=True)])
-def test_finds_the_corners_of_a_print_seen_directly(board: MarkerBoard) -> None:
-    """The print is drawn by the codes of the family, so the tags' numbers and orientation are those of Kalibr."""
-    sheet, pixels = print_of(board)
-    view = find_marker_board(sheet, board)
-    assert view is not None and view.confidence > 0.9
-    assert np.nanmax(np.linalg.norm(view.pixels - pixels, axis=1)) < 0.1
-
-
-def test_a_grid_has_the_frame_of_kalibr() -> None:
-    np.testing.assert_allclose(GRID.points[:3, :2], [[0, 0], [0.06, 0], [0.078, 0]])
-    np.testing.assert_allclose(GRID.points[8:10, :2], [[0, 0.06], [0.06, 0.06]])
-    np.testing.assert_allclose(GRID.markers.corners[5].mean(axis=0), [0.108, 0.108])
-    assert len(GRID.points) == 48 and GRID.window == pytest.approx(0.2)
-
-
 def test_another_dictionary_is_no_board_and_named() -> None:
     """In the mirror image of a print: in a rendered image a search that finds nothing tries all specks of noise."""
     image = np.ascontiguousarray(print_of(FEW_MARKERS)[0][:, ::-1])

@@ -37,14 +37,3 @@ def test_a_smooth_field_is_a_misfit(field: np.ndarray) -> None:
     structure = residual_structure(PIXELS, field + 0.05 * NOISE, BOARD.points, CENTER)
     rms = float(np.sqrt((field**2).mean()))
     assert structure.is_misfit and 0.6 * rms < structure.systematic_px < 1.1 * rms
-
-
-def test_unknown_residuals_and_outliers_are_left_out() -> None:
-    residuals = 0.1 * NOISE
-    residuals[:, ::7] = np.nan
-    residuals[3::10, 4] = 40.0
-    assert residual_structure(PIXELS, residuals, BOARD.points, CENTER).noise_px == pytest.approx(0.1, rel=0.1)
-
-
-def test_few_corners_are_no_misfit() -> None:
-    assert not residual_structure(PIXELS[:1], NOISE[:1], BOARD.points, CENTER).is_misfit

@@ -66,7 +66,3 @@ def test_is_robust_to_false_matches_and_sigmas_are_consistent(rig: Rig, around: 
         assert drift.angle_sigma**2 == pytest.approx(axis @ drift.covariance[:3, :3] @ axis)
     spread = np.sqrt(CORRELATED_POINTS * np.mean(np.square(misses)))
     assert 0.6 < spread < 1.2, "the noise here is independent"
-
-
-def test_returns_none_for_too_few_points(rig: Rig, around: Array) -> None:
-    assert estimate_rig_drift(*rays(rig, around[:29], rig)) is None

@@ -49,19 +49,6 @@ def test_finds_a_drawn_rim_from_different_guesses(guess: tuple[float, float]) ->
     assert_ring(find_rim(drawn(), guess))
 
 
-def test_finds_a_hub_with_and_without_a_glint() -> None:
-    image = drawn(inner=60.0)
-    assert_ring(find_rim(image, (384.0, 384.0)), inner=60.0)
-    cv2.circle(image, (391, 378), 20, 130, -1)
-    assert_ring(find_rim(image, (384.0, 384.0)), inner=60.0)
-
-
-def test_finds_a_rim_with_a_third_covered() -> None:
-    image = drawn()
-    image[np.abs(np.arctan2(V - CENTER[1], U - CENTER[0])) < np.pi / 3.2] = 9
-    assert_ring(find_rim(image, (384.0, 384.0)))
-
-
 def squares() -> NDArray[np.float64]:
     return np.asarray((U // 40 + V // 40) % 2 * 255)
 
@@ -91,10 +78,6 @@ NOTHING: dict[str, Callable[[], NDArray[np.float64]]] = {
 def test_returns_none_for_images_without_a_rim(name: str) -> None:
     image = np.clip(NOTHING[name](), 0, 255).astype(np.uint8)
     assert find_rim(image, (image.shape[1] / 2, image.shape[0] / 2)) is None
-
-
-def test_returns_none_inside_the_mirror() -> None:
-    assert find_rim(drawn()[160:-160, 160:-160], (224.0, 224.0)) is None
 
 
 def test_finds_the_rim_of_a_real_mirror(shared_data: Path) -> None:
@@ -150,13 +133,6 @@ def test_masks_rim_hub_and_struts() -> None:
     assert (mask.image[radius > RIM + 1] == 0).all()
     clear = ~hidden & (radius < RIM - 6) & (radius > 45)
     assert (mask.image[clear] > 0).mean() > 0.93
-
-
-def test_masks_no_strut_without_struts() -> None:
-    mask = find_mask(frames(10, Sensor()), (200.0, 198.0))
-    assert mask.image is not None
-    v, u = np.indices(SIZE[::-1])
-    assert (mask.image[np.hypot(u - MIDDLE[0], v - MIDDLE[1]) < RIM - 4] > 0).mean() > 0.995
 
 
 def test_refuses_few_frames_and_frames_without_a_rim() -> None:

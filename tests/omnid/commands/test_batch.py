@@ -112,22 +112,6 @@ def test_a_program_that_is_killed_is_run_again_and_an_interrupted_batch_leaves_n
     assert not (out / "log.mcap").exists()
 
 
-def test_a_scheduler_gives_the_same(tmp_path: Path) -> None:
-    log, known = short_log(tmp_path / "log.mcap"), tmp_path / "scheduler.json"
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    server = ("--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(known))
-    worker = ("--nthreads", "1", "--no-dashboard", "--no-nanny", "--local-directory", str(tmp_path))
-    python = (sys.executable, "-m")
-    with subprocess.Popen([*python, "distributed.cli.dask_scheduler", *server], **quiet) as scheduler:  # type: ignore[call-overload]
-        wait_until(known.exists)
-        address = json.loads(known.read_text())["address"]
-        with subprocess.Popen([*python, "distributed.cli.dask_worker", address, *worker], **quiet) as work:  # type: ignore[call-overload]
-            code, _, err = omnid("batch", log, "--out", tmp_path / "out", "--scheduler", address)
-            work.kill()
-        scheduler.kill()
-    assert code == 0 and result(tmp_path / "out" / "log.mcap")["replay"]["counters"]["poses"] >= 3, err
-
-
 def test_finds_logs(tmp_path: Path) -> None:
     images = ("d/run1/lower/1.5.png", "d/run1/upper/1.5.png", "d/run2/cam0/data/1.5.png", "d/run2/cam1/data/1.5.png")
     logs = ("a/1.mcap", "a/2.mcap", "a/notes.txt", "b/bag_0.db3", "b/bag_1.db3", "b/metadata.yaml", "c/x.bag")

@@ -12,8 +12,7 @@ import pytest
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import read_rig, write_rig
-from drivers.errors import DriverError
-from omnid import OmnidError, calibrate_drive, replay
+from omnid import replay
 from omnid.cli import main
 from omnid.formats.tum import read_tum
 from omnid.recordings.evaluation import evaluate
@@ -38,14 +37,6 @@ def test_a_short_drive_is_refused(scene: Path, short: Path, tmp_path: Path, caps
     code = calibrate(short, "--rig", scene / "rig.toml", "-o", tmp_path / "rig.toml")
     assert code == 2 and "take a longer drive" in capsys.readouterr().err
     assert not (tmp_path / "rig.toml").exists()
-
-
-def test_a_log_and_the_rig_may_be_names_of_files(scene: Path, short: Path) -> None:
-    """The command gives a list of paths, as above."""
-    with pytest.raises(OmnidError, match="take a longer drive"):
-        calibrate_drive(str(short), str(scene / "rig.toml"))
-    with pytest.raises((OmnidError, DriverError), match=r"absent\.mcap"):
-        calibrate_drive([str(short.with_name("absent.mcap"))], str(scene / "rig.toml"))
 
 
 @pytest.mark.parametrize(

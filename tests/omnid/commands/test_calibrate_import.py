@@ -38,19 +38,6 @@ def test_imports_kalibr_files(kalibr: Path, tmp_path: Path, capsys: pytest.Captu
         assert "--height-m: expected 0.1 to 10 m" in capsys.readouterr().err
 
 
-def test_says_what_an_import_takes_from_the_imu(
-    kalibr: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    text = kalibr.read_text().replace("cam0:", "cam0:\n  timeshift_cam_imu: 0.002")
-    text = text.replace("cam1:", "cam1:\n  timeshift_cam_imu: 0.005").replace("lower/", "a/").replace("upper/", "b/")
-    kalibr.write_text(text)
-    assert omnid(kalibr, "-o", tmp_path / "rig.toml") == 0
-    printed = capsys.readouterr()
-    assert "upper exposed +3.0 ms against its stamps" in printed.out
-    assert f"omnid: warning: {kalibr}: lower is cam0 by z of the IMU" in printed.err
-    assert read_rig(tmp_path / "rig.toml").times.upper_delay_s == pytest.approx(0.003)
-
-
 def test_imports_ocam_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "c.txt").write_text(OCAM)
     (tmp_path / "T.toml").write_text(f"T_upper_lower = {T_UPPER_LOWER.tolist()}")

@@ -33,19 +33,6 @@ def test_live_writes_what_it_keeps_and_goes_on_where_it_ended(
     assert again.out == "" and f"{PAIRS} pairs, not enough yet" in again.err and len(list(kept.iterdir())) == 2 * PAIRS
 
 
-@pytest.mark.parametrize("side", ["lower", "upper"])
-def test_live_goes_on_after_half_a_pair(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], side: str
-) -> None:
-    omnid, kept, half = Command(capsys), tmp_path / "kept", f"{side}_001.png"
-    kept.mkdir()
-    before = (folder / f"{side}_00.png").read_bytes()
-    (kept / half).write_bytes(before)
-    again = omnid("calibrate", "live", kept, "--log", folder, *OPTIONS)
-    assert again.code == 1 and f"{PAIRS} pairs, not enough yet" in again.err
-    assert (kept / half).read_bytes() == before and len(list(kept.iterdir())) == 2 * PAIRS + 1
-
-
 def test_live_refuses_images_of_another_size(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for path in folder.iterdir():
         if path.stem.startswith("upper_"):

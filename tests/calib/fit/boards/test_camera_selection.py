@@ -7,10 +7,8 @@ import pytest
 
 from calib import se3
 from calib.boards.board import Board, BoardView
-from calib.errors import CalibError
 from calib.fit.boards.camera_selection import MODELS, camera_structure, select_calibration
 from calib.models.camera import Mask
-from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
 from tests.simulation.boards import board_poses_around_camera
 from tests.simulation.mirrors import MirrorCamera
@@ -52,16 +50,3 @@ def test_selects_a_model_that_describes_a_tilted_camera() -> None:
     )
     assert not camera_structure(selected.calibration).is_misfit
     assert selected.calibration.fit.mean_px < 0.08
-
-
-@pytest.mark.slow
-def test_the_tangential_model_describes_a_tilted_camera() -> None:
-    found = select_calibration(views(TILTED), BOARD, SIZE, "ocam_tangential").calibration
-    assert isinstance(found.camera, OcamCamera) and any(found.camera.tangential)
-    assert found.fit.mean_px < 0.08 and not camera_structure(found).is_misfit
-    assert [name for name, _, _ in found.parameters][-2:] == ["p1", "p2"]
-
-
-def test_an_unknown_model_is_refused() -> None:
-    with pytest.raises(CalibError, match=r"model: expected one of auto, .*found 'pinhole'"):
-        select_calibration([], BOARD, SIZE, "pinhole")  # type: ignore[arg-type]

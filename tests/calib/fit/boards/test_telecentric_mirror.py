@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 
 import pytest
@@ -16,7 +15,6 @@ from calib.models.wavefront import TERMS
 from calib.rig import Rig
 from tests.bench.calibration import board_rig, projected_views
 
-RADIUS_M = 0.03
 BOARD = Board(5, 4, 0.08)  # as large as one of 9 x 6 corners, with fewer of them to fit
 
 
@@ -58,17 +56,3 @@ def test_boards_of_paraboloids_give_the_profile_of_the_mirrors_twice_as_well() -
         before, after = ({name: sigma for name, _, sigma in side} for side in (one, other))
         assert after["a4"] < 0.7 * before["a4"] and after["w_s"] < 0.5 * before["w_s"]
     assert len(found.covariance) == len(free.covariance)
-
-
-@pytest.mark.slow
-def test_mirrors_of_another_kind_are_not_taken_for_paraboloids() -> None:
-    """Hyperboloids below their second focus: the image of another curve, and no wavefront."""
-    _, perfect = board_rig(21, 1.0)
-    xi, sides = 0.9, []
-    for mounted in (perfect.lower, perfect.upper):
-        camera = mounted.camera
-        assert isinstance(camera, UnifiedCamera)
-        focal = (camera.focal[0] * (1 + xi) / 2, camera.focal[1] * (1 + xi) / 2)
-        sides.append(replace(mounted, camera=replace(camera, xi=xi, focal=focal)))
-    free = freely_fitted(replace(perfect, lower=sides[0], upper=sides[1]), perfect, xi, pairs=7)
-    assert telecentric_if_as_good(free) is free

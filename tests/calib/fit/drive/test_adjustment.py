@@ -9,7 +9,7 @@ import pytest
 
 from calib import se3
 from calib.errors import CalibError
-from calib.fit.drive.adjustment import adjust_drive, adjust_pairs, held_out_error, observation_sigma
+from calib.fit.drive.adjustment import adjust_drive, held_out_error, observation_sigma
 from calib.fit.drive.observations import DriveObservations, DriveState, KeyframeMotion, project
 from calib.fit.drive.problem import DriveProblem
 from calib.fit.drive.rig_parameters import LINE_TIME, UPPER_DELAY, RigParameters
@@ -172,71 +172,3 @@ def test_delay_of_the_upper_camera_and_line_time_are_found(truth: Rig) -> None:
     assert times.upper_delay_s == pytest.approx(7e-3, abs=3e-4)
     assert times.line_time_s == pytest.approx(30e-6, abs=1e-6)
     assert np.median(rays_apart_deg(found.rig, truth)) < 0.01
-
-
-def test_rays_of_both_cameras_meet_after_adjusting_pairs(truth: Rig) -> None:
-    """Points that are seen once by both cameras, from a rig that is off by some pixels; a tenth of them are wrong."""
-    rng = np.random.default_rng(7)
-    count = 400
-    azimuth, range_m = rng.uniform(-np.pi, np.pi, count), rng.uniform(0.8, 4.0, count)
-    points = np.column_stack([range_m * np.cos(azimuth), range_m * np.sin(azimuth), rng.uniform(-0.8, 0.8, count)])
-    landmark, camera = (part.ravel() for part in np.mgrid[:count, :2])
-    pixels = project(truth, camera, points[landmark]) + NOISE_PX * rng.standard_normal((2 * count, 2))
-    pixels[: count // 5] += rng.uniform(-5, 5, (count // 5, 2))
-    seen = np.isfinite(pixels).all(axis=1)
-    seen &= np.isin(landmark, np.flatnonzero(np.bincount(landmark[seen], minlength=count) == 2))
-    observed, used = DriveObservations(0 * landmark, landmark, camera, pixels).only(seen)
-    parameters = RigParameters.about(disturbed(truth, rng))
-    state = DriveState(
-        np.eye(4)[None],
-        points[used] * rng.uniform(0.9, 1.1, (len(used), 1)),
-        np.zeros(len(parameters.names)),
-        KeyframeMotion.still(1),
-    )
-    before = ray_gaps_px(parameters.rig, observed)
-    after = ray_gaps_px(parameters.at(adjust_pairs(parameters, state, observed, PRIOR)), observed)
-    assert np.median(after) < 1.5 * NOISE_PX < 0.3 * np.median(before)
-
-
-def ray_gaps_px(rig: Rig, observed: DriveObservations) -> Array:
-    """Return the distances of upper pixels from the epipolar planes of the lower ones, in pixels of the horizon."""
-    lower, upper = (
-        mounted.camera.lift(observed.pixels[observed.camera == side]) @ mounted.T_cam_rig[:3, :3]
-        for side, mounted in enumerate((rig.lower, rig.upper))
-    )
-    normal = np.cross(rig.upper.viewpoint - rig.lower.viewpoint, lower)
-    sines = (normal * upper).sum(axis=1) / np.linalg.norm(normal, axis=1)
-    return np.abs(sines) * 138.0
-
-
-def test_rays_that_do_not_meet_in_one_point_are_found(truth: Rig) -> None:
-    """Wavefronts of a millimetre, which near and far landmarks show; the cameras are exact at 1.5 m."""
-    state, observations = drive(truth, 8)
-    waves = np.array([[4e-4, 8e-4, -1.2e-3, -1.4e-3, 6e-4], [-3e-4, 1e-3, -4e-4, -1e-3, 5e-4]])
-    points = problem_points(truth, state, observations)
-    pixels = (
-        observations.pixels
-        + project(truth, observations.camera, points, waves)
-        - project(truth, observations.camera, points)
-    )
-    observations = replace(observations, pixels=pixels)
-    parameters = RigParameters.about(truth, waves=True)
-    prior = np.diag([*np.diag(PRIOR), *np.ones(10)])
-    found = adjust_drive(parameters, replace(state, steps=np.zeros(25)), observations, prior)
-    assert found.sigma_px == pytest.approx(NOISE_PX, rel=0.15)
-    np.testing.assert_allclose(parameters.wavefronts_at(found.state.steps), waves, atol=3e-4)
-    assert np.median(rays_apart_deg(found.rig, truth)) < 0.01
-
-
-def test_observations_that_are_alike_leave_more_to_the_prior(truth: Rig) -> None:
-    """A prior half as strong as the drive, about a centre that is off, weighs ten times as much."""
-    state, observations = drive(truth, 9)
-    parameters = RigParameters.about(disturbed(truth, np.random.default_rng(9)))
-    begin = replace(state, steps=np.zeros(15))
-    free = adjust_drive(parameters, begin, observations, PRIOR)
-    prior = np.diag(1 / (2 * np.diag(free.covariance)))
-    once, ten = (
-        np.abs(adjust_drive(parameters, begin, observations, prior, alike=alike).state.steps).sum()
-        for alike in (1.0, 10.0)
-    )
-    assert ten < 0.7 * once < 0.7 * np.abs(free.state.steps).sum()
