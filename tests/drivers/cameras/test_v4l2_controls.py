@@ -10,10 +10,8 @@ import pytest
 from drivers.cameras import v4l2_ioctl as v4l2
 from drivers.cameras.camera_state import (
     CameraExposure,
-    ExposureRanges,
     ExposureRequest,
     ExposureSetting,
-    ValueRange,
 )
 from drivers.cameras.v4l2_controls import (
     AUTO_EXPOSURE,
@@ -119,17 +117,6 @@ def exposure_of(controls: ExposureControls) -> CameraExposure:
     return CameraExposure(controls.ranges, in_force=controls.read())
 
 
-def test_reads_ranges_and_values_of_the_exposure(camera: FakeCamera) -> None:
-    exposure = exposure_of(ExposureControls(FD))
-    assert exposure.ranges == ExposureRanges(ValueRange(300, 204_700, 100), ValueRange(0, 255, 5))
-    assert exposure.in_force == ExposureSetting(15_600, 65) and camera.written == []
-    assert str(ExposureControls(FD)) == "exposure 0.3 to 204.7 ms, gain 0 to 255"
-    assert str(ExposureControls(FD, with_gain=False)) == "exposure 0.3 to 204.7 ms"
-    del camera.controls[EXPOSURE]
-    controls = ExposureControls(FD)
-    assert controls.ranges is None and controls.read() is None and str(controls) == ""
-
-
 def test_takes_over_sets_once_when_due_and_gives_all_back(camera: FakeCamera) -> None:
     before, controls = dict(camera.values), ExposureControls(FD)
     exposure = exposure_of(controls)
@@ -150,15 +137,6 @@ def test_takes_over_sets_once_when_due_and_gives_all_back(camera: FakeCamera) ->
     assert {**camera.values, EXPOSURE: before[EXPOSURE]} == before
 
 
-def test_a_request_for_none_gives_back_and_the_next_one_takes_over_again(camera: FakeCamera) -> None:
-    controls = ExposureControls(FD, with_gain=False)
-    exposure = exposure_of(controls)
-    for setting, mode in ((ExposureSetting(8000), 1), (None, APERTURE_PRIORITY), (ExposureSetting(900), 1)):
-        exposure.request = ExposureRequest(setting, after_ns=0)
-        controls.follow(exposure, 1)
-        assert camera.values[AUTO_EXPOSURE] == mode and camera.values[GAIN] == 65
-
-
 def test_a_refusal_is_kept_and_ends_the_requests_a_lost_device_raises(camera: FakeCamera) -> None:
     controls = ExposureControls(FD)
     exposure = exposure_of(controls)
@@ -173,14 +151,3 @@ def test_a_refusal_is_kept_and_ends_the_requests_a_lost_device_raises(camera: Fa
     lost.request, camera.failing = exposure.request, errno.ENODEV
     with pytest.raises(OSError, match="No such device"):
         ExposureControls(FD).follow(lost, 1)
-
-
-@pytest.mark.parametrize(("value", "nearest"), [(-9, 3), (3.9, 3), (6, 8), (12, 13), (20, 18), (1e9, 18)])
-def test_the_nearest_value_is_a_step_of_the_range(value: float, nearest: int) -> None:
-    """The largest value of a range need not be one of its steps."""
-    assert ValueRange(3, 19, 5).nearest(value) == nearest
-
-
-def test_both_cameras_accept_a_common_range() -> None:
-    assert ValueRange(3, 200, 1).common(ValueRange(10, 100, 5)) == ValueRange(10, 100, 5)
-    assert ValueRange(0, 50, 2).nearest(49.9) == 50 and ValueRange(7, 7, 0).nearest(3) == 7

@@ -11,8 +11,6 @@ import pytest
 
 from drivers.cameras import v4l2_ioctl as v4l2
 from drivers.cameras.v4l2_device import (
-    StreamFormat,
-    V4l2Stream,
     capture_devices,
     device_error,
     offered_image,
@@ -129,14 +127,6 @@ def test_auto_prefers_a_format_without_decoding_if_it_is_fast_enough(
     assert image(FakeCamera(), tmp_path / "video", **fields) == expected
 
 
-def test_a_device_that_refuses_one_format_as_busy_has_others(tmp_path: Path) -> None:
-    camera = FakeCamera()
-    camera.busy_formats = ("GREY", "YUYV")
-    assert image(camera, tmp_path / "video") == "MJPG 1280x960 at 30 Hz"
-    camera.failing = errno.EBUSY
-    assert image(camera, tmp_path / "video") == "None", "another program streams from it"
-
-
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
@@ -160,23 +150,6 @@ def test_refuses_other_modes_and_names_what_the_device_sets(
 def test_errors_of_the_system_have_advice(number: int, advice: str) -> None:
     message = str(device_error("/dev/video0", OSError(number, os.strerror(number))))
     assert message.startswith("camera /dev/video0 ") and advice in message and "\n" not in message
-
-
-def test_what_is_no_video_device_leaves_nothing_open() -> None:
-    before = len(os.listdir("/proc/self/fd"))
-    for device, advice in (
-        ("/dev/null", "is not a video device; `omnid cameras` lists"),
-        ("/dev/none", "is not there"),
-    ):
-        with pytest.raises(DriverError, match=advice):
-            V4l2Stream(V4l2Settings(device))
-    assert len(os.listdir("/proc/self/fd")) == before
-
-
-def test_a_format_has_the_least_size_of_its_images() -> None:
-    grey, mjpg = StreamFormat("GREY", 640, 480, 640, 30.0), StreamFormat("MJPG", 640, 480, 0, 0.0)
-    assert (grey.min_bytes, grey.encoding, str(grey)) == (640 * 480, "mono8", "GREY 640x480 at 30 Hz")
-    assert (mjpg.min_bytes, mjpg.encoding, str(mjpg)) == (1, "jpeg", "MJPG 640x480")
 
 
 @pytest.mark.parametrize(

@@ -53,13 +53,3 @@ def test_the_requests_have_the_kernels_numbers(abi: tuple[dict[str, Any], int]) 
     assert {name: hex(names[name]) for name in REQUESTS} == {
         name: hex(numbers[bits]) for name, numbers in REQUESTS.items()
     }
-
-
-def test_converts_formats_to_four_letters() -> None:
-    assert v4l2_ioctl.fourcc_code("YUYV") == 0x56595559 and v4l2_ioctl.fourcc_code("Y16") == 0x20363159
-    assert v4l2_ioctl.fourcc(0x47504A4D) == "MJPG" and v4l2_ioctl.fourcc(0x20363159) == "Y16"
-
-
-def test_an_ordinary_file_is_an_error(tmp_path: Any) -> None:
-    with open(tmp_path / "file", "w") as file, pytest.raises(OSError, match="ioctl"):
-        v4l2_ioctl.call(file.fileno(), v4l2_ioctl.QUERYCAP, v4l2_ioctl.Capability())

@@ -23,7 +23,6 @@ from tests.drivers.logs.mcap_logs import (
     UPPER,
     Entry,
     compressed,
-    image,
     image_message,
     jpeg,
     pairs,
@@ -97,14 +96,6 @@ def test_raw_images(
         np.testing.assert_array_equal(gray(frame), to_gray(pixels))
 
 
-@pytest.mark.parametrize(("order", "bigendian"), [("<u2", 0), (">u2", 1)])
-def test_sixteen_bits_in_both_byte_orders(tmp_path: Path, order: str, bigendian: int) -> None:
-    values = np.random.default_rng(2).integers(0, 2**16, (9, 14), np.uint16)
-    data = image_message(START_NS, "mono16", values.astype(order), bigendian)
-    frames, _ = read(write_log(tmp_path / "log.mcap", [Entry(t, IMAGE, data, 0) for t in ("/a/lower", "/a/upper")]))
-    np.testing.assert_array_equal(gray(frames[0]), values >> 8)
-
-
 def deep_log(folder: Path, kind: str, images: list[NDArray[np.uint16]]) -> Path:
     """Write a log with images of the lower camera; kind: byte order of mono16, or png."""
     entries = []
@@ -165,14 +156,6 @@ def test_a_part_of_a_log_is_counted_from_its_start(tmp_path: Path) -> None:
         read(log, span_s=(5.0, 9.0))
 
 
-def test_accepts_a_folder_with_one_log(tmp_path: Path) -> None:
-    write_log(tmp_path / "bag_0.mcap", pairs(2))
-    assert places(read(tmp_path)[0]) == in_order(2)
-    write_log(tmp_path / "other_1.mcap", pairs(2))
-    with pytest.raises(DriverError, match=r"bag_0\.mcap, other_1\.mcap"):
-        LogReader(tmp_path)
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_sorts_frames_within_the_window(tmp_path: Path, seed: int) -> None:
     """The times of logging differ from those of the headers."""
@@ -194,32 +177,8 @@ def test_drops_and_counts_frames_after_their_window(tmp_path: Path) -> None:
     assert "dropped 2 frames" in reader.warnings[0]
 
 
-def test_drops_and_counts_frames_with_the_same_stamp(tmp_path: Path) -> None:
-    entries = pairs(5)
-    copy = image(LOWER, entries[4].log_time_ns, 200)
-    frames, reader = read(write_log(tmp_path / "log.mcap", [*entries[:5], copy, *entries[5:], entries[9]]))
-    assert places(frames) == in_order(5)
-    assert reader.counts["duplicate"] == 2 and bytes(frames[4].data) != jpeg(200)
-
-
-def test_both_cameras_may_have_the_same_stamp(tmp_path: Path) -> None:
-    entries = [image(topic, START_NS + n) for n in range(3) for topic in (UPPER, LOWER)]
-    frames, _ = read(write_log(tmp_path / "log.mcap", entries))
-    assert [(f.camera, f.seq) for f in frames] == [(c, n) for n in range(3) for c in ("lower", "upper")]
-
-
 def test_replaces_an_unset_stamp_by_the_log_time(tmp_path: Path) -> None:
     entries = [Entry(e.topic, e.type, compressed(0, jpeg(1)), e.log_time_ns) for e in pairs(3)]
     frames, reader = read(write_log(tmp_path / "log.mcap", entries))
     assert places(frames) == in_order(3)
     assert reader.counts["unstamped"] == 6 and len(reader.warnings) == 1
-
-
-def test_reads_frames_repeatedly_and_stops_after_close(tmp_path: Path) -> None:
-    reader = LogReader(write_log(tmp_path / "log.mcap", pairs(50)), window=2)
-    assert places(list(reader.frames())) == places(list(reader.frames())) == in_order(50)
-    stream = reader.frames()
-    next(stream)
-    reader.close()
-    reader.close()
-    assert len(list(stream)) < 4

@@ -21,8 +21,8 @@ from mcap.writer import CompressionType
 from drivers.logs import mcap_file
 from drivers.logs.log import RecordError, unpack_zstd
 from drivers.logs.log_reader import LogReader
-from drivers.logs.mcap_file import MAGIC, McapFile, ros_name
-from tests.drivers.logs.mcap_logs import COMPRESSED, IMAGE, LOWER, UPPER, Entry, pairs, write_log
+from drivers.logs.mcap_file import MAGIC, McapFile
+from tests.drivers.logs.mcap_logs import IMAGE, LOWER, UPPER, pairs, write_log
 from tests.drivers.logs.test_formats import read, survivors
 
 COMPRESSIONS: Final = (CompressionType.LZ4, CompressionType.ZSTD, CompressionType.NONE)
@@ -134,39 +134,7 @@ def test_memory_does_not_grow_with_the_log(tmp_path: Path, order: str) -> None:
         tracemalloc.stop()
 
 
-def test_chunks_that_overlap_in_time_are_unpacked_again_beyond_a_bound(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Each chunk holds images of the whole time, so all are open at once."""
-    monkeypatch.setattr(mcap_file, "_MAX_UNPACKED_BYTES", 3000)
-    entries = pairs(60)
-    spread = [entries[k] for start in range(10) for k in range(start, 120, 10)]
-    path = write_log(tmp_path / "log.mcap", spread, chunk_size=4000)
-    assert read(path, window=4)[0] == read(write_log(tmp_path / "sorted.mcap", entries))[0]
-
-
-def test_a_frame_does_not_keep_its_chunk_in_memory(tmp_path: Path) -> None:
-    ballast = Entry("/ballast", "std_msgs/msg/String", bytes(2 * 2**20), 0)
-    entries = [e for pair in pairs(10) for e in (ballast._replace(log_time_ns=pair.log_time_ns), pair)]
-    path = write_log(tmp_path / "log.mcap", entries, chunk_size=2**21)
-    tracemalloc.start()
-    try:
-        with closing(LogReader(path)) as reader:
-            frames = list(reader.frames())
-        assert len(frames) == 20 and tracemalloc.get_traced_memory()[0] < 3 * 2**20
-    finally:
-        tracemalloc.stop()
-
-
 # Attachments and topics
-
-
-def test_attachments_with_and_without_a_summary(tmp_path: Path) -> None:
-    files = [("rig.toml", b"version = 1"), ("big", bytes(17 * 2**20)), ("empty", b"")]
-    path = write_log(tmp_path / "log.mcap", pairs(2), files)
-    assert LogReader(path).attachments() == {"rig.toml": b"version = 1", "empty": b""}
-    path.write_bytes(path.read_bytes()[:-9])
-    assert LogReader(path).attachments() == {"rig.toml": b"version = 1", "empty": b""}
 
 
 @pytest.mark.parametrize("with_summary", [True, False])
@@ -190,15 +158,6 @@ def test_ignores_a_corrupt_attachment_and_a_corrupt_summary(tmp_path: Path) -> N
     path.write_bytes(data)
     reader = LogReader(path)
     assert reader.topics == {"lower": LOWER, "upper": UPPER} and reader.pair_estimate() is None
-
-
-@pytest.mark.parametrize(
-    "name", [COMPRESSED, "sensor_msgs/CompressedImage", "sensor_msgs::msg::dds_::CompressedImage_"]
-)
-def test_a_type_has_one_name(tmp_path: Path, name: str) -> None:
-    assert ros_name(name) == COMPRESSED
-    found, _ = read(write_log(tmp_path / "log.mcap", pairs(2), schema_names={COMPRESSED: name}))
-    assert len(found) == 4
 
 
 def text(words: str) -> bytes:

@@ -17,7 +17,6 @@ from drivers.logs.ros_messages import (
     ODOMETRY,
     JointWheels,
     MotionReading,
-    image_encoding,
     parse_image,
     parse_motion,
 )
@@ -63,14 +62,6 @@ def test_damaged_images_raise_only_decode_errors(kind: str) -> None:
             assert parse_image(kind, memoryview(bytes(data))).stamp_ns >= 0
         except FrameDecodeError as error:
             assert "\n" not in str(error)
-
-
-def test_encodings_have_one_name() -> None:
-    pixels = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
-    found = parse_image(IMAGE, memoryview(image_message(10**18 + 5, "8UC3", pixels)))
-    assert (found.encoding, found.width, found.height, found.step, found.stamp_ns) == ("bgr8", 4, 2, 12, 10**18 + 5)
-    for data, otherwise, encoding in ((b"\xff\xd8\xff\xe0", "png", "jpeg"), (b"\x89PNG", "", "png"), (b"", "x", "x")):
-        assert image_encoding(data, otherwise) == encoding
 
 
 def odometry(velocity_mps: float, yaw_rate_radps: float) -> bytes:

@@ -9,7 +9,6 @@ import shutil
 import subprocess
 import sys
 import time
-import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
@@ -18,12 +17,10 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from drivers.errors import DriverError
 from drivers.logs.file_lock import is_locked
 from drivers.logs.mcap_file import McapFile
-from drivers.logs.mcap_writer import LogWriter
 from drivers.logs.rotating_log import RotatingLog, RotationSettings
-from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, START_NS, image
+from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, START_NS
 
 ROOT = Path(__file__).parents[3]
 RIG = {"rig.toml": b"version = 1"}
@@ -154,32 +151,6 @@ def test_limits_the_size_of_all_files(bench: Callable[..., Bench]) -> None:
     assert max(sizes) <= 1_000_000 + 256 * 1024 and recording.state.deleted > 3  # one chunk beyond the file's size
 
 
-def test_two_recordings_share_a_folder(bench: Callable[..., Bench]) -> None:
-    few = replace(ROOMY, file_s=1.0, keep_files=1)
-    one, other = bench(few), bench(few)
-    for _ in range(20):
-        one.write(20)
-        other.write(20)
-    one.log.close()
-    other.log.close()
-    assert one.state.lost == other.state.lost == 0 and not one.events and not other.events
-    files = list(one.folder.iterdir())
-    assert len(files) + one.state.deleted + other.state.deleted == one.state.files + other.state.files >= 26
-    assert all(file.suffix == ".mcap" and counted(file) for file in files)
-
-
-def test_refuses_invalid_messages_without_damage_to_the_file(bench: Callable[..., Bench]) -> None:
-    recording = bench()
-    recording.write(1)
-    for schema, stamp_ns in (("no/msg/Such", START_NS), (COMPRESSED, -1), (COMPRESSED, 2**64)):
-        recording.log.write(LOWER, schema, b"", stamp_ns)
-    recording.write(1)
-    recording.log.close()
-    assert (recording.state.refused, recording.state.lost, recording.state.files) == (3, 0, 1)
-    assert len(recording.events) == 1 and "no/msg/Such" in recording.events[0][1]
-    assert counted(next(recording.folder.iterdir())) == 2
-
-
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
     """A file system of 3 MB."""
@@ -289,16 +260,6 @@ def test_detects_a_removed_folder_and_its_return(bench: Callable[..., Bench], tm
     assert counted(next(recording.folder.iterdir())) == recording.state.messages - recording.state.lost > 0
 
 
-@pytest.mark.parametrize("path", ["missing/log", "file", "file/log", "x" * 300])
-def test_reports_an_unusable_folder_once(bench: Callable[..., Bench], tmp_path: Path, path: str) -> None:
-    (tmp_path / "file").write_bytes(b"")
-    recording = bench(folder=tmp_path / path)
-    recording.write(100)
-    recording.log.close()
-    assert (recording.state.lost, recording.state.stops, len(recording.events)) == (100, 1, 1)
-    assert str(tmp_path / path) in recording.events[0][1] and "\n" not in recording.events[0][1]
-
-
 @pytest.mark.parametrize("name", ["a/b", "ü n/../..", "-", "%s\0\n"])
 def test_no_name_escapes_the_folder(bench: Callable[..., Bench], name: str) -> None:
     recording = bench(name=name)
@@ -306,28 +267,3 @@ def test_no_name_escapes_the_folder(bench: Callable[..., Bench], name: str) -> N
     recording.log.close()
     (file,) = recording.folder.iterdir()
     assert counted(file) == 3 and file.name.isprintable()
-
-
-def test_memory_does_not_grow_with_the_recording(bench: Callable[..., Bench]) -> None:
-    recording = bench(replace(ROOMY, file_bytes=10**7, keep_files=1))
-    recording.write(10, size=100_000)
-    tracemalloc.start()
-    try:
-        recording.write(500, size=100_000)
-        assert tracemalloc.get_traced_memory()[1] < 4 * 2**20 and recording.state.files >= 5
-    finally:
-        tracemalloc.stop()
-
-
-def test_counts_the_persisted_messages_at_any_time(tmp_path: Path) -> None:
-    path = tmp_path / "log.mcap"
-    with LogWriter(path, chunk_bytes=3000) as log:
-        for n in range(100):
-            log.write(*image(LOWER, START_NS + n * TICK_NS))
-            kept = len(list(McapFile(path).messages()))
-            assert log.persisted == kept and log.messages == n + 1
-        assert n - log.persisted < 15 and log.size_bytes == path.stat().st_size
-        log.sync()
-        assert log.persisted == 100
-    with pytest.raises(DriverError, match="File exists"):
-        LogWriter(path, exclusive=True)

@@ -10,7 +10,7 @@ from drivers.frame import Camera
 from drivers.logs.log_reader import LogReader
 from drivers.logs.ros_messages import JointWheels
 from drivers.logs.topics import MotionTopics, choose_motion_topics, choose_topics
-from tests.drivers.logs.mcap_logs import BARE, COMPRESSED, IMAGE, START_NS, Entry, pairs, text, write_log
+from tests.drivers.logs.mcap_logs import BARE, IMAGE, START_NS, Entry, pairs, text, write_log
 
 CHATTER = Entry("/chatter", "std_msgs/msg/String", text("hello"), START_NS)
 
@@ -40,23 +40,7 @@ def test_requested_topics_with_and_without_a_summary(tmp_path: Path, layout: dic
     assert reader.topics == {"lower": "/b", "upper": "/a"} and len(list(reader.frames())) == 4
 
 
-def test_identifies_the_other_camera_where_one_is_requested(tmp_path: Path) -> None:
-    path = write_log(tmp_path / "log.mcap", pairs(2, "/a", "/upper/b"))
-    assert LogReader(path, lower="/a").topics == {"lower": "/a", "upper": "/upper/b"}
-
-
 IMAGES = {"/a/lower/image_raw": IMAGE, "/a/upper/image_raw": IMAGE}
-
-
-def test_prefers_compressed_images_and_ignores_depth() -> None:
-    both = IMAGES | {name + "/compressed": COMPRESSED for name in IMAGES}
-    both |= {name + "/compressedDepth": COMPRESSED for name in IMAGES}
-    assert choose_topics("log", both, {"lower": None, "upper": None}) == {
-        "lower": "/a/lower/image_raw/compressed",
-        "upper": "/a/upper/image_raw/compressed",
-    }
-    raw = "/a/lower/image_raw"
-    assert choose_topics("log", both, {"lower": raw, "upper": None})["lower"] == raw
 
 
 @pytest.mark.parametrize(
@@ -90,18 +74,6 @@ def test_ambiguity_is_an_error_that_lists_the_candidates(
     with pytest.raises(DriverError, match=message) as caught:
         choose_topics("log", topics, {"lower": wanted.get("lower"), "upper": wanted.get("upper")})
     assert str(caught.value).isprintable()
-
-
-def test_a_topic_that_is_not_cdr_is_no_image_topic(tmp_path: Path) -> None:
-    path = write_log(tmp_path / "log.mcap", pairs(2), use_chunking=False, enable_crcs=False)
-    path.write_bytes(path.read_bytes().replace(b"\3\0\0\0cdr", b"\3\0\0\0xyz"))
-    with pytest.raises(DriverError, match=r"no image topics in .*: found /lower/image_raw/compressed, /upper"):
-        LogReader(path)
-
-
-def test_the_error_names_the_log(tmp_path: Path) -> None:
-    with pytest.raises(DriverError, match=r"no image topics in '.*log\.mcap': found /chatter"):
-        LogReader(write_log(tmp_path / "log.mcap", [CHATTER]))
 
 
 def test_wheels_of_joints_are_an_odometry_where_omnid_has_recorded_them() -> None:

@@ -15,15 +15,10 @@ from typing import Any
 import pytest
 
 from drivers.errors import DriverError
-from drivers.motor import MotorStatus, VelocityCommand, is_stop, stop_command
-from drivers.motors.protocols.differential_drive import DifferentialDrive
+from drivers.motor import MotorStatus, VelocityCommand, stop_command
 from drivers.motors.protocols.line_protocol import (
-    LineProtocol,
-    StatusMessage,
     VelocityMessage,
     WatchdogReply,
-    WatchdogRequest,
-    decode,
     encode,
 )
 from drivers.motors.protocols.motor_protocol import T, Transaction
@@ -66,25 +61,6 @@ def test_steers_to_the_heading(heading_rad: float) -> None:
     assert state.base.pose[2] == pytest.approx(heading_rad, abs=0.01)
 
 
-def test_turns_the_short_way_across_half_a_turn() -> None:
-    state = SimulatedLine()
-    drive(state, 6.0, VelocityCommand(0, 0.2, 3.0, 0.0))
-    before, turned = state.base.pose[2], 0.0
-    for _ in range(40):
-        drive(state, 0.05, VelocityCommand(0, 0.2, -3.0, 0.0))
-        turned += math.remainder(state.base.pose[2] - before, math.tau)
-        before = state.base.pose[2]
-    assert turned == pytest.approx(math.tau - 6.0, abs=0.05)
-
-
-def test_stop_does_not_turn_towards_its_heading() -> None:
-    state = SimulatedLine()
-    drive(state, 4.0, VelocityCommand(0, 0.2, 1.0, 0.0))
-    drive(state, 2.0, stop_command(0))
-    assert state.base.pose[2] == pytest.approx(1.0, abs=0.01)
-    assert state.base.velocity_mps == 0.0 and is_stop(stop_command(7))
-
-
 def test_a_command_after_a_gap_in_seq_is_an_error_but_carried_out() -> None:
     state = SimulatedLine()
     command = VelocityCommand(0, 0.2, 0.0, 0.0)
@@ -93,32 +69,7 @@ def test_a_command_after_a_gap_in_seq_is_an_error_but_carried_out() -> None:
     assert state.base.errors == 1 and state.base.last_command.velocity_mps == command.velocity_mps
 
 
-def test_heading_counts_from_where_the_host_connected() -> None:
-    state = SimulatedLine()
-    drive(state, 4.0, VelocityCommand(0, 0.0, 1.0, 0.1))
-    state.handle(encode(WatchdogRequest(500)))
-    answer = decode(state.handle(encode(VelocityMessage(0, stop_command(0)))) or b"")
-    assert isinstance(answer, StatusMessage) and answer.status.heading_rad == 0.0
-    assert state.base.pose[2] == pytest.approx(1.0, abs=0.01)
-
-
-@pytest.mark.parametrize("dt_s", [-0.1, math.nan, math.inf, 61.0])
-def test_refuses_invalid_times(dt_s: float) -> None:
-    with pytest.raises(DriverError, match="cannot advance"):
-        SimulatedLine().base.advance(dt_s)
-
-
 # The serial motor and the simulated controller over a pty
-
-
-def test_seq_wraps_around(simulated: SimulatedMotor) -> None:
-    protocol = LineProtocol(DifferentialDrive())
-    protocol._seq = 65500
-    motor = SerialMotor(simulated.port, protocol, timeout_s=REPLY_S, watchdog_ms=10_000)
-    with contextlib.closing(motor):
-        for i in range(100):
-            motor.send(VelocityCommand(i, 0.001 * i, 0.1 * i, -0.02 * i))
-        assert simulated.base.commands == 101 and simulated.base.errors == 0 and motor.garbage == motor.bad_frames == 0
 
 
 def test_an_invalid_command_sends_nothing(simulated: SimulatedMotor) -> None:
@@ -247,45 +198,7 @@ def test_an_echo_is_no_reply() -> None:
         SerialMotor(simulated.port, connect_s=0.1)
 
 
-class Noisy(SimulatedLine):
-    """A controller with a bad cable: noise and old replies before each valid one."""
-
-    def handle(self, line: bytes) -> bytes | None:
-        """Return the usual reply after noise, a broken line and an old status."""
-        reply = super().handle(line) or b""
-        old_status = encode(StatusMessage(9999, MotorStatus(9.0, 0, 0, True, 9, 9.0)))
-        return b"\xff\x00$S,1" + b"$S,9,9*0000\n" + old_status + reply
-
-
-def test_skips_and_counts_noise_before_the_reply() -> None:
-    with (
-        contextlib.closing(SimulatedMotor(Noisy())) as simulated,
-        contextlib.closing(SerialMotor(simulated.port, timeout_s=REPLY_S)) as motor,
-    ):
-        assert motor.send(stop_command(0)).fault == 0
-        assert motor.bad_frames == 3 and motor.garbage == 3 * 6  # connected, stopped, sent
-
-
 # The protocol's host, without a port
-
-
-def test_heading_continues_after_a_reconnection() -> None:
-    """A controller measures from 0 again once its watchdog is set; the heading reported by the protocol continues."""
-    protocol, simulated = LineProtocol(DifferentialDrive()), SimulatedLine()
-    run(protocol.connect(500), simulated)
-    turn(protocol, simulated, 1.0)
-    assert simulated.base.pose[2] == pytest.approx(1.0, abs=0.01)
-    run(protocol.connect(500), simulated)
-    status = turn(protocol, simulated, 1.5)
-    assert simulated.base.pose[2] == pytest.approx(1.5, abs=0.01)
-    assert status.heading_rad == pytest.approx(1.5, abs=0.01)
-
-
-def turn(protocol: LineProtocol, simulated: SimulatedLine, heading_rad: float) -> MotorStatus:
-    for _ in range(100):
-        status = run(protocol.drive(VelocityCommand(0, 0.1, heading_rad, 0.0), 0.0), simulated)
-        simulated.base.advance(0.05)
-    return status
 
 
 def run(transaction: Transaction[T], simulated: SimulatedLine) -> T:

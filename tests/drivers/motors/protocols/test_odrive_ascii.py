@@ -32,10 +32,6 @@ def armed() -> ODriveAscii:
     return protocol
 
 
-def test_checksum_is_the_exclusive_or() -> None:
-    assert with_checksum("v 0 0") == b"v 0 0*%d\n" % (ord("v") ^ ord(" ") ^ ord("0") ^ ord(" ") ^ ord("0"))
-
-
 def test_bytes_of_a_command() -> None:
     lines = ["v 0 2.50000", "v 1 7.50000", "f 0", "f 1", "r axis0.error", "r axis1.error", "r vbus_voltage"]
     assert written(armed().drive(TURN, 0.0)) == b"".join(map(with_checksum, lines))

@@ -28,13 +28,6 @@ def test_status_in_the_units_of_the_base() -> None:
     assert (status.battery_v, status.fault) == (24.6, 20) and math.isnan(status.heading_rad)
 
 
-def test_skips_echoes_and_counts_invalid_lines() -> None:
-    protocol = Roboteq(DRIVE)
-    echoed = (b"!S 1 150", b"+", b"!S 2 450", b"+", b"?S", b"S=150:450", b"?V 2", b"V=246", b"?FF")
-    assert result(protocol.drive(TURN, 0.0), *echoed, b"\xff\x00", b"V=24x", b"FF=0").battery_v == 24.6
-    assert protocol.bad_frames == 2
-
-
 @pytest.mark.parametrize("missing", range(len(ANSWERS)))
 def test_waits_for_every_confirmation_and_every_reply(missing: int) -> None:
     with pytest.raises(UnfinishedError):

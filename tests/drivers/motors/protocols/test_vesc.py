@@ -10,7 +10,7 @@ import pytest
 from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
 from drivers.motors.protocols.differential_drive import DifferentialDrive
-from drivers.motors.protocols.vesc import MASK, MAX_ERPM, PacketFramer, Vesc, packet
+from drivers.motors.protocols.vesc import MASK, MAX_ERPM, Vesc, packet
 from tests.drivers.motors.transactions import UnfinishedError, result, written
 
 DRIVE = DifferentialDrive(track_m=0.5, wheel_radius_m=0.5 / math.pi, pole_pairs=7, can_id=9)  # 420 erpm at 1 m/s
@@ -58,14 +58,6 @@ def test_fault_and_timeout_of_either() -> None:
     assert not result(Vesc(DRIVE).drive(TURN, 0.0), values(3, 0, status=b""), values(9, 0, status=b"")).watchdog_expired
 
 
-@pytest.mark.parametrize("answer", [values(9, 0)[:-3], values(9, 0, mask=1), b"\x04" + bytes(14), values(9, 0) + b"xx"])
-def test_ignores_other_payloads(answer: bytes) -> None:
-    protocol = Vesc(DRIVE)
-    with pytest.raises(UnfinishedError):
-        result(protocol.drive(TURN, 0.0), values(3, 0), answer)
-    assert protocol.bad_frames == 1
-
-
 @pytest.mark.parametrize("other", [b"\x32" + config(9, 100)[1:], config(9, 100)[:9], b"\x11"])
 def test_takes_no_other_and_no_cut_payload_for_a_timeout(other: bytes) -> None:
     """The watchdog in force decides when the wheels stop by themselves."""
@@ -83,19 +75,3 @@ def test_refuses_a_timeout_that_is_off_or_longer(timeout_ms: int) -> None:
     with pytest.raises(DriverError, match=f"500 ms requested, {timeout_ms} ms in force in the VESC with id 9"):
         result(Vesc(DRIVE).connect(500), config(3, 500), config(9, timeout_ms))
     assert result(Vesc(DRIVE).connect(500), config(9, 500), config(3, 400)) == 400
-
-
-def test_framer_finds_the_next_packet() -> None:
-    framer = PacketFramer()
-    damaged = bytearray(packet(b"hello"))
-    damaged[4] ^= 1
-    assert framer.feed(b"\x00\xff" + bytes(damaged) + packet(b"\x04") + packet(bytes(300))) == [b"\x04", bytes(300)]
-    assert framer.garbage == 2 + len(damaged)
-
-
-def test_framer_skips_invalid_lengths() -> None:
-    framer = PacketFramer()
-    assert framer.feed(b"\x02\x00" + b"\x03\x00\x05" + b"\x03\xff\xff" + packet(b"\x04")) == [b"\x04"]
-    framer.feed(b"\x03\x01\xff")
-    framer.reset()
-    assert framer.feed(packet(b"\x04")) == [b"\x04"]

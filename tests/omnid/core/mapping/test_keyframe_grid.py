@@ -56,13 +56,6 @@ def test_the_map_moves_when_a_loop_moves_its_keyframes() -> None:
     assert OCCUPIED in near(after, x, y)
 
 
-def test_a_keyframe_that_leaves_takes_its_evidence_along() -> None:
-    grid = KeyframeGrid(0.05)
-    grid.draw(seen(len(PATH)), T_BASE_RECT)
-    found = grid.draw(seen(len(PATH), first=2), T_BASE_RECT)
-    assert same(found, drawn_at_once(SCANS[2:], PATH[2:])) and grid.redrawn == 2
-
-
 def test_it_grows_and_is_bounded() -> None:
     grid = KeyframeGrid(0.05)
     nothing = grid.draw(of({}, np.zeros((0, 4, 4))), T_BASE_RECT)

@@ -61,11 +61,6 @@ def test_a_box_before_a_wall_is_found_although_most_points_are_of_the_wall() -> 
     np.testing.assert_allclose(ring[within(8, 50)], 3.0, atol=0.02)
 
 
-def test_few_points_are_no_obstacle() -> None:
-    ring = seen(arc(3.0, (-60, 60), (-0.9, 0.7), 20_000), arc(1.0, (0, 1), (-0.5, 0.5), LIMITS.min_points - 1))
-    np.testing.assert_allclose(ring[within(-50, 50)], 3.0, atol=0.02)
-
-
 def test_no_range_is_longer_than_the_longest() -> None:
     """A bin of inverse range may begin before it and end beyond: a map with such a range is refused when it is read."""
     for range_m in np.arange(5.55, 8.0, 0.1):
@@ -80,8 +75,3 @@ def test_beyond_the_longest_range_is_free_and_above_the_band_is_nothing() -> Non
     ring = seen(arc(9.0, (-30, 30), (-0.5, 0.5), 20_000), arc(2.0, (90, 120), (1.0, 1.4)))
     assert np.isposinf(ring[within(-28, 28)]).all()
     assert np.isnan(ring[within(92, 118)]).all()
-
-
-def test_nothing_is_unknown() -> None:
-    ring = point_scan(np.zeros((0, 3)), np.zeros(0), VIEW, LIMITS)
-    assert np.isnan(ring).all()

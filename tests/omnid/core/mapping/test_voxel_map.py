@@ -7,8 +7,6 @@ import pytest
 from numpy.typing import NDArray
 
 from omnid.core.mapping.voxel_map import MapPoints, VoxelMap
-from omnid.errors import OmnidError
-from tests.omnid.allocations import taken
 
 Array = NDArray[np.float64]
 
@@ -28,24 +26,6 @@ def row(start: int, count: int) -> Array:
 
 def as_bytes(points: MapPoints) -> bytes:
     return b"".join(a.tobytes() for a in (points.xyz, points.confidence, points.frames, points.age))
-
-
-def test_mean_is_weighted_by_information() -> None:
-    voxels = VoxelMap(voxel_m=1.0, capacity=64)
-    voxels.insert(one(0.2, -0.5, 7.5), np.array([0.01]), seq=1)
-    voxels.insert(one(0.6, -0.1, 7.5), np.array([0.03]), seq=2)
-    points = voxels.points()
-    np.testing.assert_allclose(points.xyz, [[0.3, -0.4, 7.5]], atol=1e-6)
-    assert (points.frames.tolist(), points.age.tolist()) == ([2], [0])
-
-
-def test_counts_a_frame_once() -> None:
-    voxels = VoxelMap(voxel_m=1.0, capacity=64)
-    voxels.insert(np.repeat(one(0.5, 0.5, 0.5), 100, axis=0), var(100), seq=4)
-    voxels.insert(one(0.1, 0.5, 0.5), var(1), seq=4)
-    assert len(voxels) == 1 and voxels.points(min_frames=2).xyz.shape == (0, 3)
-    assert voxels.points(min_frames=1).frames.tolist() == [1]
-    assert voxels.points(min_frames=1).xyz[0, 0] == pytest.approx(50.1 / 101)
 
 
 def test_agrees_with_a_dictionary() -> None:
@@ -68,16 +48,6 @@ def test_agrees_with_a_dictionary() -> None:
     assert found.age.tolist() == [19 - seen[k][-1] for k in keys]
 
 
-def test_min_frames_and_age() -> None:
-    voxels = VoxelMap(voxel_m=1.0, capacity=64)
-    for seq in range(10):
-        voxels.insert(row(0, 3 if seq < 4 else 1), var(3 if seq < 4 else 1), seq)
-    assert voxels.points(5).age.tolist() == [0]
-    assert voxels.points(4).age.tolist() == [0, 6, 6]
-    voxels.insert(row(0, 2), var(2), 7)  # a late frame
-    assert voxels.points(4).age.tolist() == [0, 2, 6]
-
-
 def test_confidence_grows_with_frames_and_precision() -> None:
     voxels = VoxelMap(voxel_m=0.05, capacity=64)
     history = []
@@ -98,29 +68,6 @@ def test_counts_refused_points_and_leaves_them_out() -> None:
     variance[4:8] = [0.0, -1.0, np.nan, np.inf]
     voxels.insert(points, variance, 0)
     assert (voxels.refused, len(voxels)) == (8, 1)
-
-
-def test_maps_the_corners_of_its_range() -> None:
-    voxels = VoxelMap(voxel_m=1.0, capacity=64)
-    edge = float(1 << 20)
-    corners = np.array([[s * (edge - 0.5) for s in signs] for signs in np.ndindex(2, 2, 2)]) * 2 - edge + 0.5
-    voxels.insert(np.vstack([corners, np.nextafter(-edge, 0.0) * np.ones((1, 3))]), var(9), 0)
-    assert (voxels.refused, len(voxels)) == (0, 8)
-
-
-def test_inserts_an_empty_frame() -> None:
-    voxels = VoxelMap()
-    voxels.insert(np.empty((0, 3)), np.empty(0), 0)
-    points = voxels.points()
-    assert len(voxels) == 0 and points.xyz.shape == (0, 3) and points.xyz.dtype == np.float32
-
-
-def test_tiny_variance_does_not_overflow() -> None:
-    voxels = VoxelMap(voxel_m=1.0, capacity=64)
-    voxels.insert(row(0, 2), np.array([1e-320, 1e300]), 0)
-    points = voxels.points(1)
-    np.testing.assert_allclose(points.xyz[:, 0], [0.5, 1.5])
-    assert ((points.confidence > 0.0) & (points.confidence < 1.0)).all()
 
 
 def test_evicts_old_single_voxels_then_the_least_confident() -> None:
@@ -149,17 +96,6 @@ def test_memory_stays_bounded(capacity: int) -> None:
     assert len(voxels.points(1).xyz) == len(voxels)
 
 
-def test_keeps_voxels_that_are_seen_again() -> None:
-    rng = np.random.default_rng(4)
-    voxels = VoxelMap(voxel_m=1.0, capacity=1024)
-    for seq in range(200):
-        voxels.insert(row(0, 100), var(100), seq)
-        voxels.insert(rng.uniform(-1e5, 1e5, (50, 3)), var(50), seq)
-    assert voxels.evicted > 5000
-    points = voxels.points(200)
-    np.testing.assert_allclose(points.xyz, row(0, 100), atol=1e-4)
-
-
 def test_same_input_gives_the_same_bytes() -> None:
     def run() -> VoxelMap:
         rng = np.random.default_rng(9)
@@ -171,36 +107,3 @@ def test_same_input_gives_the_same_bytes() -> None:
     first, second = run(), run()
     assert first.evicted == second.evicted > 0
     assert as_bytes(first.points(1)) == as_bytes(second.points(1)) != b""
-
-
-def test_snapshot_is_a_copy() -> None:
-    voxels = VoxelMap(voxel_m=1.0, capacity=64)
-    voxels.insert(row(0, 3), var(3), 0)
-    before = voxels.points(1)
-    kept = as_bytes(before)
-    voxels.insert(row(0, 3) + 0.3, var(3), 1)
-    assert as_bytes(before) == kept
-
-
-def test_a_snapshot_needs_little_extra_memory() -> None:
-    """A live run takes one every two seconds for hours; its peak memory stays with the process."""
-    rng = np.random.default_rng(3)
-    voxels = VoxelMap(voxel_m=0.05)
-    voxels.insert(rng.uniform(-4.0, 4.0, (100_000, 3)), var(100_000), 0)
-    most, held = taken(lambda: voxels.points(1))
-    assert held > 20 * len(voxels) and most < 1.75 * held
-
-
-@pytest.mark.parametrize("count", [4095, 4096, 4097, 8193])
-def test_a_snapshot_has_all_points_of_several_blocks(count: int) -> None:
-    voxels = VoxelMap(voxel_m=1.0)
-    voxels.insert(row(0, count), var(count), 0)
-    points = voxels.points(1)
-    np.testing.assert_array_equal(points.xyz, row(0, count).astype(np.float32))
-    assert (points.age == 0).all() and len(set(points.confidence.tolist())) == 1 and points.confidence[0] > 0
-
-
-@pytest.mark.parametrize(("voxel_m", "capacity"), [(0.0, 64), (np.nan, 64), (-1.0, 64), (0.1, 0), (0.1, 100), (0.1, 8)])
-def test_refuses_wrong_settings(voxel_m: float, capacity: int) -> None:
-    with pytest.raises(OmnidError, match="expected"):
-        VoxelMap(voxel_m, capacity)

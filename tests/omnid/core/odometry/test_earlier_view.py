@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from calib import se3
 from calib.panorama import Cylinder
-from omnid.core.odometry.earlier_kernels import HALF_PX, SAME, copy_windows, correlations
+from omnid.core.odometry.earlier_kernels import HALF_PX
 from omnid.core.odometry.earlier_view import EarlierView, contradicted
-from omnid.core.odometry.exposure_times import Exposure, RigVelocity
-from omnid.core.types.panorama import PaddedPanorama
-from omnid.core.types.pixel_times import PixelTimes
-from omnid.core.types.stereo_model import StereoModel
+from omnid.core.odometry.exposure_times import Exposure
 from tests.omnid.core.scenery import texture, wrapped
 
 Array = NDArray[np.float64]
@@ -82,59 +78,3 @@ def test_what_is_fixed_to_the_camera_is_contradicted() -> None:
     # Where turn and translation cancel, both hypotheses are the same place.
     assert wrong(now, earlier, 1.5 * RANGE_M, inside) > 0.75
     assert wrong(now, earlier, RANGE_M, MIDDLE) < 0.02
-
-
-def test_points_are_seen_where_the_motion_puts_them_when_their_pixels_were_exposed() -> None:
-    late_s, twist = 0.02, np.array([3.0, 0, 0, 0, 0, 4.0])
-    now, earlier = seen_from(np.eye(4)), seen_from(se3.exp(-late_s * twist) @ T_EARLIER_NOW)
-    rows_s = np.full((120, 480), late_s, np.float32)
-    motion = RigVelocity(twist, np.zeros((6, 6)))
-    exposure = Exposure(PixelTimes(0.0, rows_s, rows_s), motion, StereoModel(CYLINDER, 0.2))
-    assert wrong(now, earlier, RANGE_M, MIDDLE, exposure=exposure) < 0.02
-    assert wrong(now, earlier, RANGE_M, MIDDLE) > 0.2
-
-
-def test_what_the_earlier_view_does_not_show_is_not_contradicted() -> None:
-    now, earlier = seen_from(np.eye(4)), seen_from(T_EARLIER_NOW)
-    assert wrong(now, earlier, 0.5 * RANGE_M, MIDDLE, ~EVERYWHERE) == 0
-
-
-def test_at_rest_a_point_is_confirmed() -> None:
-    """Both hypotheses are one there."""
-    image, pixels = with_reflection(seen_from(np.eye(4))), np.array([[100.0, 94.0], [200.0, 60.0]])
-    view = EarlierView(wrapped(image), EVERYWHERE, np.eye(4))
-    assert not contradicted(wrapped(image), pixels, CYLINDER.rays(pixels), CYLINDER, view).any()
-
-
-@pytest.mark.parametrize("seen", [(20.0, 30.0), (20.3, 30.6), (33.9, 7.1)])
-def test_correlations_are_those_of_numpy(seen: tuple[float, float]) -> None:
-    now, earlier = texture(3), texture(4)
-    room = np.empty(3 * SAME, np.int32)
-    copy_windows(now.ravel(), earlier.ravel(), now.shape[1], 40, 50, np.array(seen), room)
-    in_world, on_rig = correlations(room)
-    window = now[47:54, 37:44].ravel()
-    assert on_rig == pytest.approx(np.corrcoef(window, earlier[47:54, 37:44].ravel())[0, 1], abs=1e-6)
-    u, v = np.meshgrid(*(at + np.arange(-HALF_PX, HALF_PX + 1, dtype=np.float32) for at in seen))
-    patch = cv2.remap(earlier.astype(np.float32), u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR)
-    assert in_world == pytest.approx(np.corrcoef(window, patch.ravel())[0, 1], abs=0.02)
-
-
-@pytest.mark.parametrize("row", [0.0, 2.0, 117.0, 119.0])
-def test_a_window_that_leaves_the_image_contradicts_nothing(row: float) -> None:
-    """Those of the middle row, of other texture, contradict more than half."""
-    now, earlier = texture(3), texture(4)
-    pixels = np.column_stack([np.arange(0.0, 480, 5), np.full(96, row)])
-    view = EarlierView(wrapped(earlier), EVERYWHERE, np.eye(4))
-    middle = np.column_stack([pixels[:, 0], np.full(96, 60.0)])
-    assert not contradicted(wrapped(now), pixels, CYLINDER.rays(pixels), CYLINDER, view).any()
-    assert contradicted(wrapped(now), middle, CYLINDER.rays(middle), CYLINDER, view).mean() > 0.5
-
-
-def test_a_sector_has_no_points_beyond_its_ends() -> None:
-    """A point that the earlier sector does not show is not contradicted."""
-    sector = Cylinder(width=120, height=120, row0=60.0, turn_px=480, first=180)
-    image = PaddedPanorama(texture(5, (120, 160)), 20, turn_px=480, first=180)
-    pixels = np.array([[3.0, 50.0]])
-    turned = se3.exp(np.array([0, 0, 0, 0, 0, 0.5]))
-    view = EarlierView(image, np.ones((120, 120), bool), turned)
-    assert not contradicted(image, pixels, sector.rays(pixels), sector, view).any()

@@ -10,8 +10,8 @@ from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.odometry.exposure_times import Exposure, RigVelocity
 from omnid.core.odometry.pose_estimation import SharedError, gauss_newton
-from omnid.core.stereo.triangulation import triangulate, view
-from omnid.core.types.pixel_times import AT_ONCE, PixelTimes
+from omnid.core.stereo.triangulation import view
+from omnid.core.types.pixel_times import PixelTimes
 from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
@@ -77,29 +77,6 @@ def test_views_are_corrected_to_the_instant_of_the_stamp(times: PixelTimes) -> N
     assert np.abs(MODEL.cylinder.wrap(columns - upper[:, 0])).max() < 0.05 and (spread_px > 0).all()
 
 
-def test_the_derivative_is_that_of_the_shift() -> None:
-    points, times = world(20), TIMES[3]
-    shift = Exposure(times, RigVelocity(TWIST, SIGMA**2), MODEL).shift(points)
-    for k in range(6):
-        step = 1e-3 * np.eye(6)[k]
-        more, less = (Exposure(times, RigVelocity(TWIST + s * step, SIGMA**2), MODEL).shift(points) for s in (1, -1))
-        numeric = np.column_stack([more.lower - less.lower, (more.upper - less.upper)[:, ::-1]]) / 2e-3
-        np.testing.assert_allclose(shift.by_motion[:, :, k], numeric, atol=0.1 * np.abs(numeric).max() + 1e-3)
-
-
-def test_the_noise_of_the_views_is_that_of_an_unknown_velocity() -> None:
-    """Corrected by a wrong velocity, views err as their noise says."""
-    points, times = world(), TIMES[0]
-    truth = view(points, MODEL.cylinder, MODEL.baseline_m)
-    lower, upper = seen(points, times, TWIST)
-    rng, z2 = np.random.default_rng(1), []
-    for _ in range(40):
-        believed = RigVelocity(TWIST + SIGMA @ rng.standard_normal(6), SIGMA**2)
-        views, noise = Exposure(times, believed, MODEL).corrected(lower, upper[:, 1])
-        z2.append((views - truth)[:, 2] ** 2 / noise[:, 2, 2])
-    assert 0.7 < np.sqrt(np.mean(z2)) < 1.3
-
-
 def test_velocity_and_pose_are_estimated_together() -> None:
     """The rows of a rolling shutter tell the velocity where the landmarks are known."""
     points, times = world(), TIMES[2]
@@ -116,31 +93,3 @@ def test_velocity_and_pose_are_estimated_together() -> None:
     assert errors[1] < 0.2 * errors[0]
     assert np.abs(believed.twist + free.shared - TWIST).max() < 0.02
     assert np.trace(free.covariance) > np.trace(fixed.covariance)
-
-
-def test_points_that_cannot_be_triangulated_stay_as_they_are() -> None:
-    exposure = Exposure(TIMES[0], RigVelocity(TWIST, SIGMA**2), MODEL)
-    pixels = np.array([[100.0, 50.0], [200.0, 60.0]])
-    views, noise = exposure.corrected(pixels, np.array([48.0, np.nan]))  # diverging rays; not found
-    assert not np.isfinite(triangulate(views, MODEL.cylinder, MODEL.baseline_m)).any()
-    np.testing.assert_array_equal(views[:, :2], pixels)
-    assert (noise == 0).all()
-
-
-def test_an_exposure_at_once_leaves_views_as_they_are_seen() -> None:
-    """A frame whose pixels are all exposed at the stamp takes the same steps as others, to the last bit."""
-    exposure = Exposure.of(AT_ONCE, RigVelocity(TWIST, SIGMA**2), MODEL)
-    points = np.array([[2.0, 1.0, 0.5], [-1.0, 3.0, -0.2]])
-    views = view(points, MODEL.cylinder, MODEL.baseline_m)
-    pixels, disparity = views[:, :2], views[:, 2] - views[:, 1]
-    shift = exposure.shift(points)
-    assert not shift.lower.any() and not shift.upper.any() and shift.by_motion.shape == (2, 4, 0)
-    assert not shift.noise(exposure.motion).any() and not shift.column_sigma(exposure.motion).any()
-    corrected, noise = exposure.corrected(pixels, views[:, 2])
-    assert corrected.tobytes() == views.tobytes() and not noise.any() and exposure.derivatives(views).shape == (2, 3, 0)
-    columns, spread_px = exposure.upper_columns(pixels, views[:, 2])
-    assert columns.tobytes() == pixels[:, 0].tobytes() and not spread_px.any()
-    upper, spread_px = exposure.upper_pixels(pixels, disparity)
-    np.testing.assert_array_equal(upper, np.column_stack([pixels[:, 0], pixels[:, 1] + disparity]))
-    assert not spread_px.any() and exposure.is_known
-    assert not Exposure.of(PixelTimes(0.015), exposure.motion, MODEL).times.is_at_once

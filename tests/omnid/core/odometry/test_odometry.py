@@ -11,12 +11,10 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.estimates import OdometryEstimate, OdometryLimits
-from omnid.core.odometry.landmarks import Keyframe
 from omnid.core.odometry.odometry import VisualOdometry
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings
 from omnid.core.places.relocalisation import Relocaliser
-from omnid.core.stereo.triangulation import view
 from omnid.core.types.stereo_model import StereoModel
 from omnid.tracking_state import TrackingState
 from tests.omnid.core.scenery import RenderedCameras, motion_errors
@@ -77,46 +75,6 @@ def test_estimates_the_path_through_a_right_angle(odometry: VisualOdometry, fram
         assert estimate.tracked >= estimate.inliers >= 50
 
 
-def test_a_keyframe_is_made_when_it_is_asked_for_or_before_the_next_frame(
-    cameras: RenderedCameras, frames: list[StereoFrame]
-) -> None:
-    class Kept(Relocaliser):
-        def add(self, frame: StereoFrame, keyframe: Keyframe) -> None:
-            made.append(frame.seq)
-            super().add(frame, keyframe)
-
-    made: list[int] = []
-    found = []
-    for early in (False, True):
-        made.clear()
-        odometry = VisualOdometry(cameras.model, KltSettings(), OdometryLimits(sparse_s=0), Kept(cameras.model))
-        for k, frame in enumerate(frames[:4]):
-            estimate = odometry.process(frame, PERIOD_S * (k > 0))
-            assert estimate.is_keyframe and (made[-1] == frame.seq) == (k == 0), "only the first comes with its pose"
-            if early:
-                odometry.complete()
-                odometry.complete()
-                assert made == list(range(k + 1))
-            assert len(estimate.features.new) <= len(estimate.features.inliers) or k == 0
-        found.append(estimate)
-    assert found[0].is_keyframe and found[0].inliers == found[1].inliers
-    np.testing.assert_array_equal(found[0].T_odom_rect, found[1].T_odom_rect)
-    np.testing.assert_array_equal(found[0].covariance, found[1].covariance)
-
-
-def test_with_one_keyframe_every_frame_is_measured_against_the_previous_one(
-    cameras: RenderedCameras, frames: list[StereoFrame]
-) -> None:
-    traces = {}
-    for keyframes in (1, 8):
-        estimates = run(visual_odometry(cameras.model, OdometryLimits(keyframes=keyframes)), frames)
-        assert motion_errors(estimates[-1].T_odom_rect, truth(len(frames) - 1))[0] < 6e-3
-        assert min(estimate.inliers for estimate in estimates) >= 50
-        traces[keyframes] = np.array([np.trace(estimate.covariance[:3, :3]) for estimate in estimates])
-    assert (np.diff(traces[1]) > 0).all()
-    assert traces[1][3] > 2 * traces[8][3]  # the error of every step stays
-
-
 def test_the_covariance_matches_the_error(odometry: VisualOdometry, frames: list[StereoFrame]) -> None:
     for k, estimate in enumerate(run(odometry, frames)[1:], 1):
         np.testing.assert_allclose(estimate.covariance, estimate.covariance.T, atol=1e-12)
@@ -130,22 +88,6 @@ def test_the_velocity_is_in_the_rig_frame(odometry: VisualOdometry, frames: list
     estimates = run(odometry, frames[:5])
     np.testing.assert_allclose(estimates[4].velocity, [0.5, 0, 0, 0, 0, 0], atol=0.06)
     assert (np.linalg.eigvalsh(estimates[4].velocity_covariance) > 0).all()
-
-
-def test_landmarks_are_observed_in_several_keyframes(cameras: RenderedCameras, frames: list[StereoFrame]) -> None:
-    """Each observation agrees with the projection of the landmark into that keyframe."""
-    odometry = visual_odometry(cameras.model, OdometryLimits(refresh=1.0))
-    run(odometry, frames[:10])
-    store = odometry._map.store
-    rows = np.searchsorted(store.table.id, store.observations.landmark)
-    later = np.flatnonzero(store.observations.keyframe != store.table.anchor[rows])
-    assert len(store.keyframes) >= 2 and len(later) > 50
-    for k in later:
-        T_odom_rect = store.keyframes[int(store.observations.keyframe[k])].T_odom_rect
-        points = se3.apply(se3.inverse(T_odom_rect), store.table.points[rows[k]][None])
-        error = store.observations.views[k] - view(points, cameras.model.cylinder, cameras.model.baseline_m)[0]
-        error[0] = cameras.model.cylinder.wrap(error[0])
-        assert np.nanmax(np.abs(error)) < 1.5
 
 
 def test_standing_still_does_not_drift(odometry: VisualOdometry, cameras: RenderedCameras) -> None:

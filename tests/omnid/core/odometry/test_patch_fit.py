@@ -45,23 +45,6 @@ def test_a_shift_is_found_to_hundredths_under_another_gain_and_offset() -> None:
         assert np.abs(error(fit).mean(axis=0)).max() < 0.01
 
 
-def test_a_patch_may_move_by_less_than_the_reach() -> None:
-    far = np.array([1.6, -1.3])
-    templates, cells = patches(400, far)
-    fit = fit_patches(templates, cells, ONE_IMAGE, 1.0)
-    assert fit.fits.mean() > 0.9
-    assert np.sqrt(((fit.shift - far)[fit.fits] ** 2).mean()) < 0.03
-    nearer = fit_patches(templates, cells[:, 1:-1, 1:-1], ONE_IMAGE, 1.0)
-    assert nearer.fits.mean() < 0.1
-
-
-def test_patches_of_two_images_have_two_gains() -> None:
-    bright, dim = patches(400, SHIFT), patches(400, SHIFT, gain=0.5)
-    templates, cells = (np.concatenate([a[:200], b[200:]]) for a, b in zip(bright, dim, strict=True))
-    fit = fit_patches(templates, cells, np.repeat([3, 8], 200), 1.0)
-    assert fit.fits.mean() > 0.95 and np.sqrt((error(fit) ** 2).mean()) < 0.02
-
-
 def test_the_covariance_is_that_of_the_errors() -> None:
     """Pixels of a panorama have correlated noise: NOISE_CORRELATION times the variance of independent ones."""
     rng = np.random.default_rng(9)
@@ -78,17 +61,3 @@ def test_the_covariance_is_that_of_the_errors() -> None:
         squared = np.einsum("ni,nij,nj->n", error(fit), np.linalg.inv(fit.covariance[fit.fits]), error(fit))
         assert fit.fits.mean() > 0.8
         assert 0.5 < np.sqrt(np.median(squared) / 1.386) < 1.5  # the median of chi^2 with two degrees is 1.386
-
-
-def test_flat_patches_and_edges_without_an_end_do_not_fit() -> None:
-    ramp = np.broadcast_to(np.linspace(20, 200, CELL_PX).astype(np.uint8), (5, CELL_PX, CELL_PX))
-    flat = np.full((5, CELL_PX, CELL_PX), 90, np.uint8)
-    for image in (ramp, flat):
-        fit = fit_patches(image, image, np.zeros(5, np.intp), 1.0)
-        assert not fit.fits.any() and np.isfinite(fit.covariance).all()
-
-
-def test_no_patches() -> None:
-    none = np.zeros((0, CELL_PX, CELL_PX), np.uint8)
-    fit = fit_patches(none, none, np.zeros(0, np.intp), 1.0)
-    assert fit.shift.shape == (0, 2) and fit.covariance.shape == (0, 2, 2) and fit.fits.shape == (0,)

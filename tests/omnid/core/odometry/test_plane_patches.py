@@ -11,9 +11,7 @@ from calib.panorama import Cylinder
 from omnid.core.odometry.plane_patches import (
     TEMPLATE_PX,
     align,
-    disparity_slopes,
     fitted_slopes,
-    moved_slopes,
     plane_templates,
 )
 from omnid.core.stereo.triangulation import view
@@ -107,25 +105,6 @@ def test_patches_of_a_wall_are_the_pixels_of_the_other_view(upper: bool) -> None
     assert np.abs(np.median((found.pixels - seen)[found.found], axis=0)).max() < 0.003
 
 
-def test_a_plane_seen_edge_on_bends_no_patch() -> None:
-    pixels = np.array([[500.0, 150.0], [460.0, 120.0]])
-    points, slopes = surfaces_at(pixels)
-    onto_the_wall = np.tile(se3.exp([*(-DISTANCE_M * NORMAL), 0, 0, 0]), (2, 1, 1))
-    keyframe, keys = panorama(np.eye(4)), np.zeros(2, np.intp)
-    templates = plane_templates({0: keyframe}, keys, pixels, (points, slopes), onto_the_wall, MODEL, pixels)
-    np.testing.assert_array_equal(templates[0], keyframe.image[143:158, PAD_PX + 493 : PAD_PX + 508])
-    np.testing.assert_array_equal(moved_slopes((points, slopes), onto_the_wall, MODEL), 0.0)
-
-
-def test_slopes_in_another_view_are_those_of_the_wall() -> None:
-    points, slopes = surfaces_at(pixels_of(20))
-    T_ref_curr = se3.inverse(T_CURR_REF)
-    there = CYLINDER.pixels(se3.apply(T_CURR_REF, points))
-    truth = surfaces_at(there, T_ref_curr)[1]
-    assert np.abs(truth - slopes).max() > 0.02
-    np.testing.assert_allclose(moved_slopes((points, slopes), np.tile(T_CURR_REF, (20, 1, 1)), MODEL), truth, atol=1e-4)
-
-
 def test_slopes_are_fitted_from_a_wrong_start() -> None:
     pixels = np.rint(pixels_of(60))
     points, slopes = surfaces_at(pixels)
@@ -137,28 +116,3 @@ def test_slopes_are_fitted_from_a_wrong_start() -> None:
     assert np.median(np.abs(slopes)[:, 0]) > 0.05
     assert np.median(np.abs(fitted - slopes)[1:], axis=0).max() < 0.004
     np.testing.assert_array_equal(fitted[0], start[0])
-
-
-def test_slopes_stay_at_the_start_where_nothing_is_to_be_seen() -> None:
-    blank = PaddedPanorama(np.full((300, 1200 + 2 * PAD_PX), 90, np.uint8), PAD_PX)
-    pixels, start = np.array([[500.0, 150.0], [500.0, 4.0]]), np.array([[0.1, -0.05], [0.0, 0.02]])
-    np.testing.assert_array_equal(fitted_slopes((blank, blank), pixels, pixels + 9.0, start, MODEL), start)
-
-
-def test_slopes_of_a_plane_beside_a_step_and_with_gaps() -> None:
-    column, row = np.meshgrid(np.arange(200.0), np.arange(100.0))
-    plane = (20 + 0.05 * (column - 100) - 0.02 * (row - 50)).astype(np.float32)
-    plane[:, 104:] += 9  # a nearer object beside it
-    plane[::3] = np.nan
-    slopes = disparity_slopes(plane, np.array([[98.0, 50.0], [5.0, 50.0]]), np.array([19.9, 15.25]))
-    np.testing.assert_allclose(slopes[0], [0.05, -0.02], atol=0.004)
-    for unknown, centre in ((plane * np.nan, 20.0), (plane, np.nan)):
-        found = disparity_slopes(unknown, np.array([[98.0, 50.0]]), np.array([centre]))
-        np.testing.assert_array_equal(found, [[0, 0]])
-
-
-def test_a_patch_whose_image_is_missing_is_an_error() -> None:
-    pixels = pixels_of(2)
-    surfaces, T = surfaces_at(pixels), np.tile(np.eye(4), (2, 1, 1))
-    with pytest.raises(KeyError, match="8"):
-        plane_templates({7: panorama(np.eye(4))}, np.array([7, 8]), pixels, surfaces, T, MODEL, pixels)

@@ -14,7 +14,6 @@ from omnid.core.odometry import pose_search
 from omnid.core.odometry.estimates import OdometryEstimate, OdometryLimits, PoseEstimate
 from omnid.core.odometry.motion_filter import SensedMotion
 from omnid.core.odometry.odometry import VisualOdometry
-from omnid.core.odometry.runner_up_motions import CLEAR_STEPS, Doubt, doubt_after, likeliest
 from omnid.core.odometry.tracking import KltSettings
 from omnid.core.places.relocalisation import Relocaliser
 from omnid.tracking_state import TrackingState
@@ -72,30 +71,6 @@ def pose(x_m: float, cost: float, inliers: int = 100, runner_up: Array | None = 
     )
 
 
-def test_of_poses_whose_landmarks_contradict_each_other_the_nearest_to_the_prediction_is_taken() -> None:
-    near, far = pose(0.05, 20.0, inliers=50), pose(0.32, 10.0)
-    far = replace(far, landmarks=np.arange(50, 105))
-    for one, other in ((near, far), (far, near)):
-        found = likeliest(one, [other], np.eye(4), 0.5)
-        assert found.T_odom_rect[0, 3] == 0.05
-        assert found.runner_up is not None and found.runner_up == pytest.approx([0.27, 0, 0, 0, 0, 0])
-    # Landmarks that support both poses, and a pose that far fewer support, contradict nothing.
-    for landmarks in (np.arange(20, 75), np.arange(50, 130)):
-        found = likeliest(near, [replace(far, landmarks=landmarks)], np.eye(4), 0.5)
-        assert found.T_odom_rect[0, 3] == 0.32 and found.runner_up is None
-
-
-def test_a_runner_up_is_within_reach_elsewhere_and_nearly_as_likely() -> None:
-    near, unlikely, far, same = pose(0.3, 0.25), pose(0.3, 0.5), pose(0.9, 0.1), pose(0.01, 0.2, inliers=120)
-    best = pose(0.0, 0.2)
-    found = likeliest(best, [near], np.eye(4), 0.5)
-    assert found.runner_up is not None and found.runner_up == pytest.approx([0.3, 0, 0, 0, 0, 0])
-    for other in (unlikely, far, pose(0.3, 0.25, inliers=49)):
-        assert likeliest(best, [other], np.eye(4), 0.5).runner_up is None
-    assert likeliest(best, [same], np.eye(4), 0.5).inliers == 120
-    assert likeliest(unlikely, [best], np.eye(4), 0.5).T_odom_rect[0, 3] == 0
-
-
 @pytest.mark.parametrize(("reach_m", "expected_m"), [(0.002, 0.028), (0.05, 0.0)])
 def test_the_pose_by_outliers_is_sought_where_the_inliers_show_no_motion_of_a_vehicle(
     alike: RenderedCameras, monkeypatch: pytest.MonkeyPatch, reach_m: float, expected_m: float
@@ -109,20 +84,3 @@ def test_the_pose_by_outliers_is_sought_where_the_inliers_show_no_motion_of_a_ve
     last = pose_search.LastFrame(np.eye(4), frame.lower)
     found = search.with_runner_up(frame, pose(0.0, 0.6, inliers=70), last, T_predicted, 0.1, reach_m=reach_m)
     assert found.T_odom_rect[0, 3] == expected_m
-
-
-def test_a_doubt_ends_where_clear_steps_go_on_as_was_chosen() -> None:
-    def after(clear_m: float) -> Doubt | None:
-        """Return what is left of a doubt between 0.05 and 0.35 m, after clear steps of clear_m."""
-        x_m = 0.05
-        doubt = doubt_after(None, np.eye(4), pose(x_m, 0, runner_up=np.array([PERIOD_M, 0, 0, 0, 0, 0])), PERIOD_S)
-        for _ in range(CLEAR_STEPS):
-            assert doubt is not None and doubt.is_open
-            before, x_m = pose(x_m, 0).T_odom_rect, x_m + clear_m
-            doubt = doubt_after(doubt, before, pose(x_m, 0), PERIOD_S)
-        return doubt
-
-    assert after(0.06) is None
-    wrong = after(0.34)
-    assert wrong is not None and not wrong.is_open
-    assert wrong.covariance(se3.exp([1.0, 0, 0, 0, 0, 0]))[0, 0] == pytest.approx(PERIOD_M**2, rel=1e-2)

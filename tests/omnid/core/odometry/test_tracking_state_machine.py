@@ -97,12 +97,6 @@ def test_transition(before: TrackingStatus, facts: FrameFacts, after: TrackingSt
     assert next_status(before, facts, LIMITS) == after
 
 
-def test_the_first_refused_frame_is_lost_where_one_is_enough() -> None:
-    limits = OdometryLimits(lost_s=0, restart_s=0)
-    assert next_status(FIX, FrameFacts(REFUSED, DT_S, textured=False), limits) == refused(LOST, 1)
-    assert next_status(FIX, FrameFacts(REFUSED, DT_S), limits).restart
-
-
 @pytest.mark.parametrize(("dt_s", "lost", "started_again"), [(0.25, 2, 4), (0.125, 3, 7), (0.0625, 5, 13)])
 def test_times_and_not_frames_decide(dt_s: float, lost: int, started_again: int) -> None:
     limits, status, seen = replace(LIMITS, restart_s=0.5), FIX, []
@@ -111,14 +105,3 @@ def test_times_and_not_frames_decide(dt_s: float, lost: int, started_again: int)
         seen.append(status)
     assert [status.state for status in seen] == [DEGRADED] * (lost - 1) + [LOST] * (started_again - lost + 1)
     assert [status.restart for status in seen] == [False] * (started_again - 1) + [True]
-
-
-def test_a_time_without_frames_is_no_evidence_against_the_map() -> None:
-    limits = replace(LIMITS, lost_s=0.6, restart_s=0.6)
-    first = next_status(FIX, FrameFacts(REFUSED, 60.0), limits)
-    second = next_status(first, FrameFacts(REFUSED, 60.0), limits)
-    assert (first.state, second.state, second.time_since_fix_s) == (DEGRADED, DEGRADED, 120.0)
-    third = next_status(second, FrameFacts(REFUSED, 60.0), limits)
-    fourth = next_status(third, FrameFacts(REFUSED, 60.0), limits)
-    assert (third.state, third.restart, fourth.restart) == (LOST, False, False)
-    assert next_status(fourth, FrameFacts(REFUSED, 60.0), limits).restart

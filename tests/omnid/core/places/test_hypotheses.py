@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from calib import se3
 from omnid.core.places.hypotheses import CONSISTENT, SURE_INLIERS, Hypotheses, Hypothesis
@@ -43,31 +42,3 @@ def test_one_that_contradicts_does_not_count() -> None:
 def test_a_robot_at_rest_needs_recognitions_with_more_inliers() -> None:
     assert consistent(*[hypothesis(0.0)] * 5) == 0
     assert consistent(*[hypothesis(0.0, inliers=SURE_INLIERS) for _ in range(3)]) == CONSISTENT
-
-
-def test_keyframes_that_left_the_map_do_not_count() -> None:
-    assert consistent(*[hypothesis(0.1 * k) for k in range(2)], hypothesis(0.2), poses=POSES) == CONSISTENT
-    kept = Hypotheses()
-    for k in range(2):
-        kept.add(hypothesis(0.1 * k), POSES)
-    old, moved = hypothesis(0.2), {PLACE + 1: POSES[PLACE], NEWEST: POSES[NEWEST]}
-    recognised = Recognition(PLACE + 1, old.recognition.T_place_rect, COVARIANCE, old.recognition.inliers, 30, 4)
-    assert kept.add(Hypothesis(recognised, NEWEST, np.eye(4), COVARIANCE, old.T_odom_rect), moved) == []
-
-
-def test_a_recognition_is_taken_once() -> None:
-    kept, one = Hypotheses(), hypothesis(0.0)
-    assert kept.take(one) and not kept.take(one) and kept.take(hypothesis(0.0))
-    kept.add(one, POSES)
-    assert len(kept) == 1
-    kept.clear()
-    assert len(kept) == 0
-
-
-def test_the_edge_leads_from_the_place_to_the_newest_keyframe() -> None:
-    T_keyframe_rect = pose(0.3, 0.1, 0.2)
-    one = hypothesis(0.0)
-    link = Hypothesis(one.recognition, NEWEST, T_keyframe_rect, COVARIANCE, one.T_odom_rect).link()
-    assert (link.a, link.b, link.inliers) == (PLACE, NEWEST, 12)
-    assert np.allclose(link.T_a_b @ T_keyframe_rect, one.recognition.T_place_rect)
-    assert np.trace(link.covariance) == pytest.approx(2 * np.trace(COVARIANCE), rel=0.3)

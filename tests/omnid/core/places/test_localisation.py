@@ -100,24 +100,6 @@ def test_loops_halve_the_error_and_odom_never_jumps(
     assert first * STEP_M < 3.0 + OUT[-1] / 2 + 1.0 + 1.0
 
 
-def test_keyframes_are_limited_by_time(cameras: RenderedCameras, frames: list[StereoFrame]) -> None:
-    """As many a second as the settings say, however dense they are to be; the first one at once."""
-    dense = PlaceLimits(keyframe_m=0.05, rate_hz=1.0)
-    localiser = MapLocaliser(cameras.model, dense)
-    run(localiser, odometry(frames[:11]))
-    stamps_ns = [localiser.places.keyframes[id].stamp_ns for id in sorted(localiser.places.keyframes)]
-    assert stamps_ns == [0, 1_000_000_000, 2_000_000_000]
-
-
-def test_an_idle_localiser_follows_odometry_and_keeps_nothing(frames: list[StereoFrame], out: MapLocaliser) -> None:
-    localiser = deepcopy(out)
-    before = localiser.counts
-    for frame in odometry(frames)[len(OUT) :]:
-        pose = localiser.process(frame, idle=True)
-    assert localiser.counts == before and pose.state is MapState.ODOMETRY_ONLY
-    assert np.array_equal(pose.T_map_odom, np.eye(4))
-
-
 def test_carried_away_it_finds_itself_in_the_map_again(frames: list[StereoFrame], out: MapLocaliser) -> None:
     """After the reset odom is meaningless in the map until three frames agree."""
     localiser = deepcopy(out)
@@ -199,17 +181,6 @@ def test_in_a_saved_map_the_covariance_is_that_of_the_place_and_not_of_odom(
     for pose, sigma_m in zip(found, sigmas_m, strict=True):
         assert 0.002 < sigma_m < 0.1 if pose.state is MapState.LOCALIZED else sigma_m > 1000.0
     assert {pose.state for pose in found} == {MapState.ODOMETRY_ONLY, MapState.LOCALIZED}
-
-
-def test_a_full_map_may_drop_the_keyframe_that_was_just_recognised(
-    cameras: RenderedCameras, frames: list[StereoFrame], out: MapLocaliser
-) -> None:
-    most = len(out.places)
-    back = slice(len(OUT), len(OUT) + 13)
-    localiser = MapLocaliser(cameras.model, PlaceLimits(max_keyframes=most, keyframe_m=0.15), deepcopy(out.places))
-    found = run(localiser, odometry(frames[back], POSES[back]))
-    assert localiser.places.dropped > 0 and len(localiser.places) == most
-    assert found[-1].state is MapState.LOCALIZED
 
 
 def test_localisation_alone_leaves_the_map_as_it_is(

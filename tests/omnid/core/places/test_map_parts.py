@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calib import se3
-from omnid.core.places.map_parts import FixedPlaces, MapParts
+from omnid.core.places.map_parts import MapParts
 from omnid.core.places.place_map import PlaceMap
 from tests.omnid.core.places.test_place_map import keyframe
 
@@ -15,12 +15,6 @@ def map_of(count: int) -> PlaceMap:
     for id in range(count):
         places.add(keyframe(id), se3.exp([float(id), 0, 0, 0, 0, 0]), None)
     return places
-
-
-def test_a_run_with_a_saved_map_begins_a_part_of_its_own() -> None:
-    parts = MapParts(map_of(2))
-    assert (parts.current, parts.ids(), parts.others(), parts.oldest()) == (1, [], [0, 1], [0, 1])
-    assert MapParts(PlaceMap()).current == 0 and MapParts(PlaceMap()).oldest() == []
 
 
 def test_the_newer_part_moves_when_two_are_joined() -> None:
@@ -49,22 +43,3 @@ def test_the_older_part_stays_where_it_is_although_it_is_joined_from_a_newer_one
     parts.join(1, se3.exp([0.0, 3.0, 0.0, 0.0, 0.0, 0.0]))
     assert parts.current == 1 and parts.ids() == [1, 2] and parts.others() == [0]
     np.testing.assert_allclose(places.poses[2][:3, 3], [0.0, 3.0, 0.0])
-
-
-def test_dropped_keyframes_are_forgotten() -> None:
-    places = map_of(3)
-    parts = MapParts(places)
-    assert not parts.forget_dropped()
-    places.drop(1)
-    assert parts.forget_dropped() and parts.others() == [0, 2]
-
-
-def test_near_ones_are_found_in_their_order() -> None:
-    places = map_of(10)
-    places.drop(4)
-    fixed = FixedPlaces(places, sorted(places.keyframes))
-    assert fixed.within(np.array([4.2, 0, 0]), 1.0) == [5]
-    assert fixed.within(np.array([3.0, 0, 0]), 1.0) == [2, 3]
-    places.move({5: se3.exp([50.0, 0, 0, 0, 0, 0])})
-    assert fixed.within(np.array([5.0, 0, 0]), 0.5) == [5] and list(fixed.scans) == fixed.ids
-    assert FixedPlaces(places, []).within(np.zeros(3), 1.0) == []

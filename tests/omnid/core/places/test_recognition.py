@@ -10,8 +10,7 @@ import pytest
 from calib import se3
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.features import describe
-from omnid.core.places.place_map import PlaceFeatures
-from omnid.core.places.recognition import VOTERS, recognise, votes
+from omnid.core.places.recognition import recognise
 from tests.omnid.core.scenery import RenderedCameras, motion_errors
 from tests.simulation import corridor
 from tests.simulation.paths import planar_poses
@@ -46,17 +45,3 @@ def test_another_place_and_darkness_are_not_recognised(cameras: RenderedCameras,
     assert found is None or found.inliers < 15
     nothing = describe(cameras.darkness(4))
     assert len(nothing.views) == 0 and recognise(nothing, there, 0, 0.0, cameras.model) is None
-
-
-def test_features_vote_for_their_place_and_the_turn(cameras: RenderedCameras, frames: list[StereoFrame]) -> None:
-    """Half of the features are enough, as people may hide the others."""
-    width, here = cameras.cylinder.width, describe(frames[0])
-    for frame, yaw in zip(frames[1:], YAWS[1:], strict=True):
-        found = describe(frame)
-        half = found.views[:, 0] < width / 2
-        count, turn = votes(PlaceFeatures(found.descriptors[half], found.views[half]), here, width)
-        assert count >= 12 and abs(np.angle(np.exp(1j * (turn - yaw)))) < 0.3
-    elsewhere = describe(replace(cameras, scene=corridor(7)).frame(3, POSES[0]))
-    assert votes(here, here, width) == (VOTERS, pytest.approx(np.pi / 24)) and votes(elsewhere, here, width)[0] < 8
-    nothing = describe(cameras.darkness(4))
-    assert votes(nothing, here, width) == votes(here, nothing, width) == (0, 0.0)

@@ -11,9 +11,6 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.odometry.landmarks import Keyframe
 from omnid.core.odometry.stereo_frame import StereoFrame
-from omnid.core.places import relocalisation
-from omnid.core.places.features import describe
-from omnid.core.places.place_map import PlaceFeatures
 from omnid.core.places.relocalisation import Relocaliser
 from tests.omnid.core.scenery import RenderedCameras, motion_errors
 from tests.simulation import corridor
@@ -75,33 +72,6 @@ def test_the_newest_keyframes_are_kept_up_to_the_bound(
     assert relocaliser.locate(nearby) is not None
     _add(relocaliser, cameras.darkness(30), se3.exp([20.0, 0, 0, 0, 0, 0]))
     assert relocaliser.locate(nearby) is None
-
-
-def test_a_keyframe_is_described_once_and_only_for_a_search(
-    cameras: RenderedCameras, keyframe: StereoFrame, nearby: StereoFrame, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Descriptions cost milliseconds, which most keyframes never need."""
-    described = []
-
-    def counted(frame: StereoFrame) -> PlaceFeatures:
-        described.append(frame.seq)
-        return describe(frame)
-
-    monkeypatch.setattr(relocalisation, "describe", counted)
-    relocaliser = Relocaliser(cameras.model, max_keyframes=2)
-    for k in range(3):
-        _add(relocaliser, replace(keyframe, seq=10 + k), se3.exp([10.0 + k, 0, 0, 0, 0, 0]))
-    assert described == []
-    relocaliser.locate(nearby)
-    relocaliser.locate(nearby)
-    assert described == [nearby.seq, 11, 12, nearby.seq]
-
-
-def test_a_packed_frame_has_the_same_disparities_for_the_motion_it_was_packed_for(keyframe: StereoFrame) -> None:
-    image = keyframe.disparity
-    packed = replace(keyframe, disparities=lambda exposure: image if exposure is None else image[:0]).packed()
-    assert packed.disparity.tobytes() == image.tobytes() and 0 < np.isfinite(image).mean() < 1
-    assert packed.disparities is not image
 
 
 def test_of_two_places_that_look_the_same_none_is_chosen(

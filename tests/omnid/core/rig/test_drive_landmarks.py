@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.rig.drive_landmarks import MAX_KEYFRAMES, MIN_KEYFRAMES, DriveLandmarks, View
+from omnid.core.rig.drive_landmarks import DriveLandmarks, View
 from omnid.core.stereo.triangulation import view
 from omnid.core.types.stereo_model import StereoModel
 from tests.omnid.core.scenery import RenderedCameras
@@ -42,17 +42,3 @@ def test_landmarks_are_where_the_path_predicts_them(cameras: RenderedCameras, vi
         error[:, 0] = cameras.model.cylinder.wrap(error[:, 0])
         assert np.median(np.abs(error)) < 0.15
         assert seen.sum() > 300
-
-
-def test_each_landmark_has_enough_keyframes_and_a_number(cameras: RenderedCameras, views: list[View]) -> None:
-    found = followed(views, cameras.model).observations()
-    lower = found.camera == 0
-    assert np.bincount(found.landmark[lower]).min() >= MIN_KEYFRAMES
-    assert np.array_equal(np.unique(found.landmark), np.arange(len(found.points)))
-    pairs = np.column_stack([found.keyframe, found.landmark, found.camera])
-    assert len(np.unique(pairs, axis=0)) == len(pairs)
-
-
-def test_old_images_are_not_kept(cameras: RenderedCameras, views: list[View]) -> None:
-    landmarks = followed([views[k % 2] for k in range(MAX_KEYFRAMES + 5)], cameras.model)
-    assert len(landmarks._keyframes) == MAX_KEYFRAMES + 1

@@ -7,8 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from omnid.core.rig.column_finding import RigState
-from omnid.core.rig.first_pairs import MOST_ROUND_PAIRS, PATIENT_PAIRS, RETRY_S, ROUND_PAIRS, FirstPairs
-from omnid.core.types.pixel_times import PixelTimes
+from omnid.core.rig.first_pairs import MOST_ROUND_PAIRS, RETRY_S, ROUND_PAIRS, FirstPairs
 from tests.omnid.core.rig.shown_pairs import ShownPair
 from tests.omnid.core.scenery import RenderedCameras
 
@@ -56,10 +55,3 @@ def test_darkness_decides_nothing_and_the_next_round_begins_later(room: Room, pa
     for number in range(ROUND_PAIRS):
         first.add(ShownPair(round(2 * RETRY_S * SECOND_NS) + number, pair.lower, pair.upper, pair.visible))
     assert first.state is RigState.FITS
-
-
-def test_pairs_of_unknown_motion_wait_but_not_for_ever(room: Room, pair: ShownPair) -> None:
-    skewed = ShownPair(0, pair.lower, pair.upper, pair.visible, PixelTimes(skew_s=0.01))
-    first = FirstPairs(room[0].cylinder)
-    assert pairs_until_decided(first, skewed) == PATIENT_PAIRS + ROUND_PAIRS
-    assert first.used_unknown_motion and first.state is RigState.FITS

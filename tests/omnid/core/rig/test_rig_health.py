@@ -16,8 +16,8 @@ from calib.rig_file import read_rig
 from drivers.logs.log_reader import LogReader
 from omnid.camera_config import PairConfig
 from omnid.config import Config, PanoramaConfig
-from omnid.core.rig.column_finding import POINTS, RigState
-from omnid.core.rig.rig_health import MIN_PLACES, VIEWS, RigHealth
+from omnid.core.rig.column_finding import RigState
+from omnid.core.rig.rig_health import VIEWS, RigHealth
 from omnid.diagnostics.part_status import rig_status
 from omnid.engine.flow import NEWEST
 from omnid.engine.graph import Graph
@@ -128,21 +128,6 @@ def test_a_robot_that_stands_gets_no_finding(true: tuple[RigHealth, Collector]) 
     assert status.message.startswith("not checked yet")
 
 
-def test_few_places_give_no_finding_however_often(true: tuple[RigHealth, Collector]) -> None:
-    places = true[1][::3]
-    assert 4 * (MIN_PLACES - 1) > VIEWS
-    assert monitor_after(true, places[: MIN_PLACES - 1] * 4).finding is None
-    found = monitor_after(true, places[:MIN_PLACES] * 3).finding
-    assert found is not None and found.state is RigState.FITS and found.tried <= MIN_PLACES * POINTS
-
-
-def test_uses_no_more_views_than_its_period_allows(true: tuple[RigHealth, Collector]) -> None:
-    assert monitor_after(true, true[1], every_s=PERIOD_S + 1).new_views == len(true[1]) // 2
-    back = monitor_after(true, true[1][:4])
-    back.drive(replace(true[1][9], stamp_ns=1))  # also after the clock was set back
-    assert back.new_views == 5
-
-
 def test_a_rig_that_moves_during_the_run_is_detected(turned: Turned, true: tuple[RigHealth, Collector]) -> None:
     _, after = turned((0.0, 0.0, 0.5))
     monitor = monitor_after(true, [*true[1], *after, *after])  # the same loop, where every place was viewed before
@@ -207,17 +192,6 @@ def test_the_drive_overrules_the_start_except_for_exchanged_cameras(
             health.drive(replace(one, seq=number, stamp_ns=round(number * PERIOD_S * SECONDS)))
         assert health.state is state and begun in (state, RigState.BROKEN, RigState.FITS)
     assert rig_status(health).level == 2 and "exchange" in rig_status(health).message
-
-
-def test_a_check_in_the_dark_changes_no_state(turned: Turned, true: tuple[RigHealth, Collector]) -> None:
-    _, wrong = turned((0.0, 3.0, 0.0))
-    health = started(true, wrong[:4])
-    rng = np.random.default_rng(4)
-    for number, one in enumerate(true[1]):
-        black = wrapped(rng.normal(9, 2, one.lower.panorama.shape).clip(0, 255).astype(np.uint8))
-        seen = replace(one, lower=black, upper=black, stamp_ns=round(number * PERIOD_S * SECONDS))
-        health.drive(seen)
-    assert health.state is RigState.BROKEN
 
 
 def test_after_a_loss_exchanged_cameras_are_noticed_and_end_no_run(true: tuple[RigHealth, Collector]) -> None:

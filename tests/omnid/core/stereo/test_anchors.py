@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from omnid.core.stereo.anchors import CELL_PX, CHUNK_LINES, AnchorPropagation, Candidates, line_difference
+from omnid.core.stereo.anchors import AnchorPropagation, Candidates, line_difference
 from tests.omnid.core.scenery import texture
 
 Flags = NDArray[np.bool_]
@@ -34,26 +34,6 @@ def test_line_difference_is_the_mean_of_the_pixels_on_the_line() -> None:
         )
     expected = np.abs(picked[0] - picked[1]).mean()
     assert line_difference((lower, upper), start, end, 32)[0] == pytest.approx(expected, abs=1.0)
-
-
-def test_line_differences_do_not_depend_on_the_chunks() -> None:
-    image = texture(15, SHAPE)
-    count = CHUNK_LINES + 7
-    start, end = (np.repeat(lines(point), count, axis=1) for point in ((10, 20, 0), (40, 80, 0)))
-    start[2, -1] = 40
-    difference = line_difference((image, image), start, end, 4)
-    assert (difference[:-1] == 0).all() and difference[-1] > 5
-
-
-def test_returns_the_lowest_total_and_the_margin_to_the_runner_up() -> None:
-    point = np.array([3, 0, 3, 0, 3, 4])
-    rows = Candidates(point, np.arange(6), np.zeros(6, np.float32))
-    best, margin = rows.best(np.array([5, 2, 4, 7, 9, 1], np.float32), 5)
-    np.testing.assert_array_equal(best[[0, 3, 4]], [1, 2, 5])
-    np.testing.assert_array_equal(margin, [5, 0, 0, 1, np.inf])
-    _, margin = rows.best(np.array([5, 2, 5, 7, 9, 1], np.float32), 5)
-    assert margin[3] == 0  # equal totals have no margin
-    np.testing.assert_array_equal(rows.of(np.arange(5) == 3).disparity, [0, 2, 4])
 
 
 def courses() -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
@@ -84,22 +64,3 @@ def test_a_few_anchors_at_one_end_decide_the_whole_wall() -> None:
     disparity, clear = propagated(sure, pixels)
     assert clear[~sure].mean() > 0.9
     assert np.mean(disparity[clear] == SHIFT_PX) > 0.98
-
-
-def test_anchors_do_not_spread_across_a_gap() -> None:
-    pixels = grid_of_pixels()
-    columns = pixels % SHAPE[1]
-    pixels = pixels[(columns < 5 * CELL_PX) | (columns >= 7 * CELL_PX)]
-    columns = pixels % SHAPE[1]
-    disparity, clear = propagated(columns < 12, pixels)
-    assert clear[(columns > 12) & (columns < 150)].mean() > 0.9
-    assert not clear[columns >= 7 * CELL_PX].any()
-    assert (disparity[columns >= 7 * CELL_PX] == SHIFT_PX - COURSE_PX).all()  # unchanged
-
-
-def test_changes_nothing_without_anchors_or_without_candidates() -> None:
-    pixels = grid_of_pixels()
-    for sure in (np.zeros(len(pixels), bool), np.ones(len(pixels), bool)):
-        disparity, clear = propagated(sure, pixels)
-        assert not clear.any()
-        np.testing.assert_array_equal(disparity, np.where(sure, SHIFT_PX, SHIFT_PX - COURSE_PX))

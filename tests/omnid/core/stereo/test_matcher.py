@@ -84,27 +84,6 @@ def test_sad_takes_the_lowest_sum_with_left_right_check() -> None:
         assert down[best] <= 12 * 81 and abs(int(np.argmin(up)) - best) <= 1
 
 
-def test_enhanced_sad_equals_sad_on_a_unique_texture() -> None:
-    lower = texture(5, SHAPE)
-    upper = np.roll(texture(5, SHAPE), SHIFT_PX, axis=0)
-    original, enhanced = (matched(method, noisy(lower, 6), noisy(upper, 7), middle()) for method in ("sad", "enhanced"))
-    assert len(original[0]) > 800
-    np.testing.assert_array_equal(original[0], enhanced[0])
-    assert np.mean(original[1] == enhanced[1]) > 0.99
-    assert np.abs(original[1] - SHIFT_PX).max() < 0.6
-
-
-def test_enhanced_sad_equals_sad_without_an_anchor() -> None:
-    """A wall of identical courses has no unique point, so no anchor."""
-    course = texture(1, (COURSE_PX * 3, SHAPE[1]), 2.0)[COURSE_PX : 2 * COURSE_PX]
-    wall = np.tile(course, (SHAPE[0] // COURSE_PX, 1))
-    pair = noisy(wall, 3), noisy(np.roll(wall, 4, axis=0), 4)
-    original, enhanced = (matched(method, *pair, middle()) for method in ("sad", "enhanced"))
-    assert len(original[0]) > 100
-    for ours, theirs in zip(enhanced, original, strict=True):
-        np.testing.assert_array_equal(ours, theirs)
-
-
 @pytest.mark.parametrize("method", METHODS)
 def test_no_valid_pixels_give_no_matches(method: str) -> None:
     image = texture(19, SHAPE)
@@ -193,40 +172,6 @@ def test_finds_two_depths_side_by_side(method: str) -> None:
     for side, expected in ((columns < 105, 8), (columns > 135, 31)):
         assert side.sum() > 250
         assert np.mean(np.abs(disparity[side] - expected) < 0.3) > 0.95
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_matches_every_row_whose_match_lies_in_the_image(method: str) -> None:
-    """Rows near the lower border: a small disparity needs no space for the largest one."""
-    lower, valid = texture(16, SHAPE), middle((12, SHAPE[0] - 16))
-    pixels, disparity = matched(method, lower, np.roll(lower, 8, axis=0), valid)
-    assert np.abs(disparity - 8).max() < 0.6
-    assert (np.histogram(pixels // SHAPE[1], bins=11, range=(12, SHAPE[0] - 16))[0] > 50).all()
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_finds_every_disparity_of_the_range(method: str) -> None:
-    lower, valid = texture(17, SHAPE), middle()
-    for shift in (3, 17, 33, DISPARITIES - 3):
-        pixels, disparity = matched(method, lower, np.roll(lower, shift, axis=0), valid)
-        assert len(pixels) > 800 and np.mean(np.abs(disparity - shift) < 0.6) > 0.98, shift
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_matches_a_panorama_with_fewer_rows_than_disparities(method: str) -> None:
-    lower = texture(18, (DISPARITIES - 4, 240))
-    pixels, disparity = matched(method, lower, np.roll(lower, 6, axis=0), np.ones(lower.shape, bool))
-    inside = (pixels // 240 > 8) & (pixels // 240 < DISPARITIES - 16)
-    assert inside.sum() > 100 and np.mean(np.abs(disparity[inside] - 6) < 0.6) > 0.95
-
-
-def test_noise_is_no_edge() -> None:
-    """The threshold of the edges follows the noise that the panorama is said to have."""
-    rng = np.random.default_rng(6)
-    wall = np.clip(rng.normal(90, 12, SHAPE), 0, 255).astype(np.uint8)
-    matcher = Matcher(SHAPE, MatchingSettings(disparities=DISPARITIES, max_difference=60.0))
-    pixels = [len(matcher.match(wall, np.roll(wall, 6, axis=0), middle(), noise_grey)[0]) for noise_grey in (0.0, 12.0)]
-    assert pixels[0] > 100 and pixels[1] < 0.1 * pixels[0]
 
 
 def test_the_search_follows_columns_that_have_moved() -> None:

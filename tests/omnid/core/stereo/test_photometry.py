@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from omnid.core.stereo.photometry import (
     MAX_GAIN,
     TARGET_LEVEL,
-    UNKNOWN_NOISE,
     brightened,
     gain_of,
     light,
@@ -44,15 +43,6 @@ def test_noise_is_measured_beside_texture(sigma: float) -> None:
     assert 0.6 * sigma < found < 1.5 * sigma
 
 
-def test_noise_is_measured_only_where_both_cameras_see() -> None:
-    image = np.random.default_rng(3).integers(0, 255, SHAPE).astype(np.uint8)
-    image[:, :320] = 90
-    left = np.zeros(SHAPE, bool)
-    left[:, :320] = True
-    assert noise_sigma(image, left & (np.arange(SHAPE[1]) < 300)) < 0.5 < noise_sigma(image, ~left)
-    assert noise_sigma(image, ~EVERYWHERE) == UNKNOWN_NOISE
-
-
 def test_dim_panoramas_are_brought_to_one_level_and_bright_ones_are_left() -> None:
     image = np.full(SHAPE, 30, np.uint8)
     image[:80] = 10
@@ -79,10 +69,3 @@ def test_the_dimmer_panorama_of_a_pair_becomes_as_bright_as_the_other(share: flo
     # Two thirds behind it leave no more than a third that shows the brightness.
     pair[1][:, : 2 * SHAPE[1] // 3] = 5
     assert share < 0.9 or gains_of(*pair, (1.0, 1.0)) == (1.0, 1.0)
-
-
-def test_the_gain_of_a_covered_camera_is_bounded() -> None:
-    lower, black = np.full(SHAPE, 100, np.uint8), np.full(SHAPE, 3, np.uint8)
-    assert gains_of(lower, black, (1.0, MAX_GAIN)) == (1.0, MAX_GAIN)
-    nothing = 0 * black
-    assert gains_of(lower, nothing, (1.0, MAX_GAIN)) == (1.0, MAX_GAIN)

@@ -35,13 +35,3 @@ def test_the_search_near_a_prior_corrects_it(error_px: float) -> None:
     assert costs.shape == (2 * REACH_PX + 1, len(pixels))
     found = refined(prior, pixels, costs, np.argmin(costs, axis=0))
     assert (np.abs(found - SHIFT_PX) < 0.3).mean() > 0.95
-
-
-def test_a_prior_that_changes_along_the_column_is_followed() -> None:
-    """The disparity of a pixel is that of the prior where it is found, not where it was searched from."""
-    prior = np.full(SHAPE, SHIFT_PX, np.float32) + 0.1 * np.arange(SHAPE[0], dtype=np.float32)[:, None]
-    pixels = np.arange(40, 50) * SHAPE[1] + 100
-    costs = np.full((2 * REACH_PX + 1, len(pixels)), 9, np.uint16)
-    costs[REACH_PX + 1] = 0
-    found = refined(prior, pixels, costs, np.full(len(pixels), REACH_PX + 1))
-    assert found == pytest.approx(1 + SHIFT_PX + 0.1 * np.arange(41, 51), abs=1e-4)

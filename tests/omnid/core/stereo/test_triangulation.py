@@ -30,32 +30,6 @@ def test_intersecting_rays_give_the_point(points: Array) -> None:
     np.testing.assert_allclose(found, points, atol=1e-12)
 
 
-def test_skew_rays_give_the_middle_of_their_common_perpendicular(points: Array) -> None:
-    origin = np.array([0.0, 0.0, 0.2])
-    lower = points
-    upper = points - origin + np.random.default_rng(3).normal(0, 0.02, points.shape)
-    found = common_perpendicular(lower, upper, origin)
-    for n1, n2, middle in zip(lower, upper, found, strict=True):
-        (along_lower, along_upper), *_ = np.linalg.lstsq(np.column_stack([n1, -n2]), origin, rcond=None)
-        np.testing.assert_allclose(middle, (along_lower * n1 + along_upper * n2 + origin) / 2, atol=1e-9)
-
-
-def test_diverging_and_parallel_rays_give_nan() -> None:
-    origin = np.array([0.0, 0, 0.2])
-    lower = np.array([[1.0, 0, -0.1], [1, 0, 0], [1, 0, 0.1]])
-    upper = np.array([[1.0, 0, 0.1], [2, 0, 0], [1, 0, 0]])
-    found = common_perpendicular(lower, upper, origin)
-    assert np.isnan(found[:2]).all()
-    np.testing.assert_allclose(found[2], [2, 0, 0.2])
-
-
-def test_triangulation_inverts_the_view(points: Array) -> None:
-    views = view(points, CYLINDER, BASELINE_M)
-    np.testing.assert_allclose(triangulate(views, CYLINDER, BASELINE_M), points, atol=1e-9)
-    disparity = CYLINDER.focal_px * BASELINE_M / np.hypot(points[:, 0], points[:, 1])
-    np.testing.assert_allclose(views[:, 2] - views[:, 1], disparity)
-
-
 def test_jacobian_equals_the_numeric_derivative(points: Array) -> None:
     step = 1e-6
     slope = np.empty((len(points), 3, 3))
