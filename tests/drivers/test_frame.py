@@ -107,6 +107,14 @@ def test_refuses_a_jpeg_of_which_rows_of_blocks_were_lost(sampling: int, lost: i
         gray(jpeg(broken))
 
 
+def test_refuses_restart_markers_in_another_order_and_where_none_belong() -> None:
+    whole, markers = interrupted(cv2.IMWRITE_JPEG_SAMPLING_FACTOR_422)
+    at, interval = markers[5] + 1, whole.index(b"\xff\xdd")
+    for broken in (whole[:at] + b"\xd0" + whole[at + 1 :], whole[:interval] + whole[interval + 6 :]):
+        with pytest.raises(FrameDecodeError, match="Corrupt JPEG data"):
+            gray(jpeg(broken))
+
+
 @pytest.mark.parametrize("size", [(96, 250), (90, 9), (16, 8)])
 @pytest.mark.parametrize("interval", [0, 1, 5, 1000])
 @pytest.mark.parametrize("mode", ["grey", "420", "422", "440", "444", "progressive"])

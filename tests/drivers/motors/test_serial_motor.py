@@ -16,7 +16,9 @@ import pytest
 
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, stop_command
+from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.line_protocol import (
+    LineProtocol,
     VelocityMessage,
     WatchdogReply,
     encode,
@@ -59,6 +61,17 @@ def test_steers_to_the_heading(heading_rad: float) -> None:
     state = SimulatedLine()
     drive(state, 6.0, VelocityCommand(0, 0.2, heading_rad, 0.0))
     assert state.base.pose[2] == pytest.approx(heading_rad, abs=0.01)
+
+
+def test_turns_the_short_way_across_half_a_turn() -> None:
+    state = SimulatedLine()
+    drive(state, 6.0, VelocityCommand(0, 0.2, 3.0, 0.0))
+    before, turned = state.base.pose[2], 0.0
+    for _ in range(40):
+        drive(state, 0.05, VelocityCommand(0, 0.2, -3.0, 0.0))
+        turned += math.remainder(state.base.pose[2] - before, math.tau)
+        before = state.base.pose[2]
+    assert turned == pytest.approx(math.tau - 6.0, abs=0.05)
 
 
 def test_a_command_after_a_gap_in_seq_is_an_error_but_carried_out() -> None:
@@ -199,6 +212,25 @@ def test_an_echo_is_no_reply() -> None:
 
 
 # The protocol's host, without a port
+
+
+def test_heading_continues_after_a_reconnection() -> None:
+    """A controller measures from 0 again once its watchdog is set; the heading reported by the protocol continues."""
+    protocol, simulated = LineProtocol(DifferentialDrive()), SimulatedLine()
+    run(protocol.connect(500), simulated)
+    turn(protocol, simulated, 1.0)
+    assert simulated.base.pose[2] == pytest.approx(1.0, abs=0.01)
+    run(protocol.connect(500), simulated)
+    status = turn(protocol, simulated, 1.5)
+    assert simulated.base.pose[2] == pytest.approx(1.5, abs=0.01)
+    assert status.heading_rad == pytest.approx(1.5, abs=0.01)
+
+
+def turn(protocol: LineProtocol, simulated: SimulatedLine, heading_rad: float) -> MotorStatus:
+    for _ in range(100):
+        status = run(protocol.drive(VelocityCommand(0, 0.1, heading_rad, 0.0), 0.0), simulated)
+        simulated.base.advance(0.05)
+    return status
 
 
 def run(transaction: Transaction[T], simulated: SimulatedLine) -> T:

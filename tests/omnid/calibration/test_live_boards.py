@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-import time
 from importlib.resources import files
-from itertools import islice
 from pathlib import Path
 
 import cv2
@@ -14,9 +12,7 @@ import pytest
 
 from calib.boards.board import BoardView
 from calib.models.camera import Mask
-from drivers.cameras.log_camera import LogCamera, LogClock, LogImages
-from drivers.frame import gray
-from omnid.calibration.live_boards import HOURS, CameraCoverage, LiveBoards, PairOutcome, newest_pairs, status
+from omnid.calibration.live_boards import HOURS, LiveBoards, PairOutcome, status
 from tests.omnid.commands.test_calibrate_rig import BOARD, render_pairs, rig_of
 
 PAIRS = 2  # of different places
@@ -64,42 +60,4 @@ def at(hour: float, radius: float) -> BoardView:
     return BoardView("", np.vstack([middle, middle + 0.5, [math.nan, math.nan]]))
 
 
-def test_hours_and_rings_are_those_of_a_clock_in_the_image() -> None:
-    coverage = CameraCoverage(RIM)
-    for hour, radius in ((12, 15), (3, 60), (9, 95)):
-        coverage.add(at(hour, radius))
-    counts = coverage.counts()
-    assert [tuple(place) for place in np.argwhere(counts)] == [(0, 0), (1, 3), (2, 9)]
-    assert coverage.missing() == [
-        "no board at 1, 2, 4 to 8, 10, 11 o'clock",
-        "one ring only: hold it nearer, farther, higher, lower",
-    ]
-
-
-def test_enough_is_all_hours_and_two_rings() -> None:
-    coverage = CameraCoverage(RIM)
-    for hour in range(1, 13):
-        coverage.add(at(hour, 60))
-    assert coverage.missing() == ["one ring only: hold it nearer, farther, higher, lower"]
-    for hour in range(1, 7):
-        coverage.add(at(2 * hour, 20))
-    assert coverage.missing() == []
-
-
 SAMPLE = Path(str(files("omnid.sample") / "log.mcap"))
-
-
-def test_pairs_of_cameras_are_the_newest() -> None:
-    images, clock = LogImages.load(SAMPLE), LogClock()
-    lower, upper = (LogCamera(images, side, clock) for side in ("lower", "upper"))
-    begin_s, pairs = time.monotonic(), newest_pairs(lower, upper)
-    for _ in islice(pairs, 3):
-        time.sleep(0.35)  # more than three images of each camera, which must not wait in a queue
-    assert time.monotonic() - begin_s > 1.0
-    one, _ = next(pairs)
-    lower.close()
-    upper.close()
-    elapsed_ns = (time.monotonic() - begin_s) * 1e9
-    shown = next(frame for _, frame in images.lower if np.array_equal(gray(frame), one))
-    first_ns = images.lower[0][1].stamp_ns
-    assert 0.9e9 < shown.stamp_ns - first_ns < elapsed_ns

@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 import omnid
 from calib.rig_file import read_rig
 from omnid.calibration.mask import MaskCalibration
 from omnid.cli import main
-from tests.replay.edited import Image, images, save
 from tests.simulation.disturbances import REFLECTION_RADIUS
 from tests.simulation.logs import write_log
 from tests.simulation.recipes import build
 
 SIZE_PX, PAIRS = 200, 24
-FROZEN_PX = 80  # whole blocks of a JPEG, so that they keep their pixels
 
 
 def command(*words: object) -> int:
@@ -67,23 +62,3 @@ def test_the_command_writes_a_rig_that_needs_no_other_mask(
 def test_a_robot_that_hardly_turns_is_refused(scene: Path) -> None:
     with pytest.raises(omnid.OmnidError, match=r"shows \d of 16 headings of a turn, 12 are needed: record a log"):
         omnid.calibrate_mask(scene / "log.mcap", scene / "rig.toml")
-
-
-def test_a_part_that_is_frozen_is_no_fixed_one(spin: Path, tmp_path: Path) -> None:
-    """Its driver may write it again, and a mask would hide it for good; such pairs show no heading."""
-    taken = images(spin / "log.mcap")
-    frozen = grey(next(one for one in taken if one.camera == "lower"))[:, :FROZEN_PX]
-    log = save(tmp_path / "log.mcap", (with_left(one, frozen) if one.camera == "lower" else one for one in taken))
-    with pytest.raises(omnid.OmnidError, match=r"shows [0-3] of 16 headings"):
-        omnid.calibrate_mask(log, spin / "rig.toml")
-
-
-def grey(image: Image) -> NDArray[np.uint8]:
-    """Return the pixels (H, W) of an image of a log."""
-    return np.asarray(cv2.imdecode(np.frombuffer(image.jpeg, np.uint8), cv2.IMREAD_GRAYSCALE), np.uint8)
-
-
-def with_left(image: Image, part: NDArray[np.uint8]) -> Image:
-    """Return an image whose left part (H, FROZEN_PX) is another one."""
-    pixels = np.hstack([part, grey(image)[:, FROZEN_PX:]])
-    return replace(image, jpeg=cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 98])[1].tobytes())

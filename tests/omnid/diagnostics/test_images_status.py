@@ -13,7 +13,7 @@ from omnid.simulation.robot import make_robot
 from omnid.stages.geometry import geometry
 from omnid.tracking_state import TrackingState
 from omnid.transport.codec import ERROR, OK, STALE
-from omnid.transport.status_names import FIXED_PERCENT, lost_parts_key
+from omnid.transport.status_names import lost_parts_key
 from tests.omnid.small_pair import small_depth
 
 S = 1_000_000_000
@@ -70,15 +70,3 @@ def test_names_camera_directions_and_time_and_reports_changes_once() -> None:
     assert (status().level, status().message) == (OK, LIVE)
     assert lines == [f"images: {text}", "images: the upper camera is frozen all around", f"images: {LIVE}"]
     assert statistics.lost_parts == {"upper": 3}
-
-
-def test_tells_once_that_a_part_is_fixed_to_a_camera() -> None:
-    statistics, lines, share = RunStatistics(), [], [0.0]  # type: ignore[var-annotated]
-    place = geometry(make_robot(256).rig, Config().panorama)
-    status = ImagesStatus(place, statistics, lines.append, lambda: share[0])
-    statistics.process(update(ALL_LIVE, S))
-    assert FIXED_PERCENT not in status().values and not lines
-    share[0] = 0.067
-    entries = [status(), status()]
-    assert [entry.values[FIXED_PERCENT] for entry in entries] == ["7", "7"]
-    assert len(lines) == 1 and "(7%) shows what is fixed to a camera" in lines[0] and entries[0].level == OK

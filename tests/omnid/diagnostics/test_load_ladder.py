@@ -31,21 +31,6 @@ def test_under_lasting_overload_everything_is_given_up_in_order() -> None:
     assert observed.ladder.level is LoadLevel.REDUCED
 
 
-def test_some_dropped_images_change_nothing() -> None:
-    observed = Observed()
-    observed.level_after(2 * OBSERVATIONS_UP, dropped=30)
-    assert observed.level_after(100, dropped=3) == 2
-    assert observed.level_after(1, dropped=60) == observed.level_after(1, dropped=0) == 2  # not consecutive
-
-
-def test_what_was_given_up_is_taken_up_again_step_by_step() -> None:
-    observed = Observed()
-    observed.level_after(2 * OBSERVATIONS_UP, dropped=30)
-    assert observed.level_after(OBSERVATIONS_DOWN - 1, dropped=0) == 2
-    assert observed.level_after(1, dropped=0) == 1
-    assert observed.level_after(OBSERVATIONS_DOWN, dropped=0) == 0
-
-
 def test_it_waits_longer_each_time_that_was_too_soon() -> None:
     observed = Observed()
     waits = []

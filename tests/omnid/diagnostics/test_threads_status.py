@@ -8,10 +8,7 @@ import time
 from omnid.diagnostics.threads_status import (
     LIBRARIES,
     MAIN,
-    ThreadShare,
     ThreadsStatus,
-    ThreadTime,
-    shares,
     thread_times,
 )
 from omnid.engine.realtime import name_thread
@@ -51,11 +48,3 @@ def test_the_status_has_the_shares_of_running_threads_by_name() -> None:
     assert {MAIN, "burn (1) x", LIBRARIES} <= values.keys() and float(values["burn (1) x"]) > 0
     by_name = [float(share) for name, share in values.items() if name != Key.ALL]
     assert abs(float(values[Key.ALL]) - sum(by_name)) < 0.001 * (len(by_name) + 1)
-
-
-def test_adds_up_the_threads_of_a_name_and_an_id_that_is_used_again_begins_at_zero() -> None:
-    before = {1: ThreadTime("pool", 1.0), 2: ThreadTime("odometry", 2.0), 7: ThreadTime("old", 5.0)}
-    after = {1: ThreadTime("pool", 1.5), 2: ThreadTime("odometry", 6.0), 3: ThreadTime("pool", 0.5)}
-    assert shares(before, after, 10.0) == {"odometry": ThreadShare(1, 0.4), "pool": ThreadShare(2, 0.1)}
-    assert shares(before, {7: ThreadTime("new", 1.0)}, 2.0) == {"new": ThreadShare(1, 0.5)}
-    assert thread_times(2**22 + 1) == {}, "above the largest id of a process"

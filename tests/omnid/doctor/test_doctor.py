@@ -25,9 +25,9 @@ from omnid.config import RecordConfig
 from omnid.controller.motor_settings import MotorSettings
 from omnid.core.compiled import cache_folder
 from omnid.doctor import devices, machine
-from omnid.doctor.devices import access, cameras, holders, motor
+from omnid.doctor.devices import access, cameras, motor
 from omnid.doctor.finding import Finding
-from omnid.doctor.machine import BUILT_S, bus, clock, compiled_functions, disk, is_synchronised, programs, rig
+from omnid.doctor.machine import BUILT_S, bus, clock, compiled_functions, disk, is_synchronised, rig
 from omnid.transport.bus_config import BusConfig
 
 ROOT = Path(__file__).parents[3]
@@ -125,28 +125,6 @@ def test_checks_the_port_of_the_motor(port: str) -> None:
     assert found.level == "warning" and f"of group {group}" in found.found and 'GROUP="dialout"' in found.advice
 
 
-@pytest.mark.parametrize(
-    ("settings", "level", "words"),
-    [
-        (MotorSettings(), "ok", "motor.port is empty"),
-        (MotorSettings("simulated"), "ok", "simulated"),
-        (MotorSettings(protocol="waveshare_json"), "error", "'waveshare_json' is not known"),
-        (MotorSettings("/dev/ttyNONE"), "error", "does not exist"),
-        (MotorSettings("/etc/passwd"), "error", "is no serial port"),
-    ],
-)
-def test_checks_other_motor_settings(settings: MotorSettings, level: str, words: str) -> None:
-    found = next(motor(settings))
-    assert found.level == level and words in found.found
-
-
-def test_names_the_process_that_has_a_device_open() -> None:
-    with open(os.devnull), opened_elsewhere(ROOT / "pyproject.toml"):
-        (holder,) = holders(ROOT / "pyproject.toml")
-    assert holder.startswith("python") and "pid" in holder
-    assert holders(ROOT / "pyproject.toml") == []
-
-
 def as_another_user(script: str) -> list[str]:
     """Return the lines that a script prints as a user without rights."""
     text = f"import os, resource; from pathlib import Path\n{script.format(user=UNPRIVILEGED)}"
@@ -202,13 +180,6 @@ def test_checks_the_space_for_recordings(tmp_path: Path) -> None:
     assert f"\nWorkingDirectory={machine.STATE}\n" in unit and f"\nStateDirectory={machine.STATE.name}\n" in unit
 
 
-def test_checks_the_packages(monkeypatch: pytest.MonkeyPatch) -> None:
-    (found,) = programs()
-    assert found.level == "ok" and "cv2" in found.found and "zenoh 1." in found.found
-    monkeypatch.setitem(machine.PACKAGES, "missing-package", "missing_part")  # type: ignore[attr-defined]
-    assert [finding.level for finding in programs()] == ["error", "ok"]
-
-
 def test_checks_the_rig(scene: Path, tmp_path: Path) -> None:
     size = read_rig(scene / "rig.toml").lower.camera.size
     assert all(finding.level != "error" for finding in rig(scene / "rig.toml", size))
@@ -251,14 +222,6 @@ def test_warns_of_open_endpoints_without_rules(endpoint: str, local: bool) -> No
         assert (found.level == "ok") == local and local != ("bus.config" in found.advice)
 
 
-def test_names_the_file_that_says_who_may_command_and_finds_wrong_settings(tmp_path: Path) -> None:
-    (tmp_path / "site.json5").write_text("{}")
-    found = bus(BusConfig(listen=("tcp/0.0.0.0:7447",), config=str(tmp_path / "site.json5")))
-    assert found.level == "ok" and "site.json5" in found.found
-    wrong = bus(BusConfig(config="nowhere.json5"))
-    assert wrong.level == "error" and "bus.config" in wrong.found
-
-
 def test_the_command_runs_all_checks_and_returns_an_exit_code(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -272,19 +235,6 @@ def test_the_command_runs_all_checks_and_returns_an_exit_code(
     assert {found["level"] for found in json.loads(capsys.readouterr().out)} <= {"ok", "warning", "error"}
     assert main(["doctor", "--set", "cameras.widht_px=3"]) == 2
     assert "cameras.width_px" in capsys.readouterr().err
-
-
-def test_tells_whether_functions_are_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    nowhere = tmp_path / "no service"
-    (kept,) = compiled_functions(nowhere)
-    assert kept.level == "ok" and "kept in " in kept.found, "conftest.py has compiled them"
-    monkeypatch.setenv("OMNID_CACHE_DIR", str(tmp_path / "empty"))
-    (empty,) = compiled_functions(nowhere)
-    assert empty.level == "ok" and "the next start compiles it" in empty.found
-    (tmp_path / "file").touch()
-    monkeypatch.setenv("OMNID_CACHE_DIR", str(tmp_path / "file" / "cache"))
-    (refused,) = compiled_functions(nowhere)
-    assert refused.level == "warning" and "Not a directory" in refused.found and "OMNID_CACHE_DIR" in refused.advice
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root reads the service's cache")

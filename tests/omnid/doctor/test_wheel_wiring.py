@@ -13,11 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.simulated.simulated_motor import SIMULATED_CONTROLLERS, SimulatedController, SimulatedMotor
 from omnid.config import load_config
 from omnid.controller.motor_settings import DriveSettings, MotorSettings
-from omnid.doctor.wheel_wiring import Seen, WiringTest, toml_with, wiring
+from omnid.doctor.wheel_wiring import WiringTest
 from omnid.errors import OmnidError
 from tests.replay.command import Command
 from tests.waiting import wait_until
@@ -121,27 +120,6 @@ def test_answers_without_a_result(answers: list[str], message: str) -> None:
         assert not any(motor.base.commanded_mps) and not list(given)
 
 
-def test_a_late_answer_to_a_stop_is_no_fault() -> None:
-    """A busy computer answers later than the 0.16 s of the driver now and then."""
-    with simulated("roboteq", swapped=True) as (config, person, motor):
-        person.base.late_stops = 3
-        drive = WiringTest(config, person.answer, speed_mps=0.4, turns=0, move_s=0.05, rest_s=0.0).run()
-        assert drive.swapped and person.base.late_stops == 0 and not any(motor.base.commanded_mps)
-
-
-@pytest.mark.parametrize("swapped", [False, True])
-@pytest.mark.parametrize("reverse_left", [False, True])
-@pytest.mark.parametrize("reverse_right", [False, True])
-def test_the_found_wiring_undoes_that_of_the_base(swapped: bool, reverse_left: bool, reverse_right: bool) -> None:
-    true = DifferentialDrive(swapped=swapped, reverse_left=reverse_left, reverse_right=reverse_right)
-    seen = []
-    for channels in ((1.0, 0.0), (0.0, 1.0)):
-        left, right = true.to_sides(*channels)
-        seen.append(Seen("left" if left else "right", left + right > 0))
-    found = DifferentialDrive(**wiring(*seen))
-    assert true.to_sides(*found.to_channels(1.0, 2.0)) == (1.0, 2.0)
-
-
 def test_the_command_asks_prints_and_writes(tmp_path: Path) -> None:
     path = tmp_path / "omnid.toml"
     path.write_text(
@@ -170,15 +148,6 @@ def test_the_command_asks_prints_and_writes(tmp_path: Path) -> None:
     found = load_config(path)
     assert (found.motor.drive.swapped, found.motor.drive.reverse_left, found.motor.drive.reverse_right) == (1, 1, 0)
     assert found.record.file_mb == 7 and found.motor.drive.wheel_radius_m == RADIUS_M
-
-
-def test_a_section_is_set_where_it_is_or_added() -> None:
-    assert toml_with("", "a.b", {"x": "1"}) == "[a.b]\nx = 1\n"
-    assert toml_with("[a]\ny = 2\n", "a.b", {"x": "1"}) == "[a]\ny = 2\n\n[a.b]\nx = 1\n"
-    assert toml_with("[a.b] # mine", "a.b", {"x": "1"}) == "[a.b] # mine\nx = 1\n"
-    assert toml_with("[a.b]\n x=3 # old\ny = 2\n[c]\nx = 4\n", "a.b", {"x": "1", "z": "5"}) == (
-        "[a.b]\nx = 1\nz = 5\ny = 2\n[c]\nx = 4\n"
-    )
 
 
 @pytest.mark.parametrize(

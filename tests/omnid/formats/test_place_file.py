@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from omnid.core.places.place_map import PlaceMap
 from omnid.errors import OmnidError
 from omnid.formats.place_file import read_places, write_places
 from tests.bench.faults.mutation import mutated
@@ -57,18 +56,6 @@ def test_reads_what_was_written_and_writes_the_same_bytes(tmp_path: Path, count:
     write_places(tmp_path / "b.omap", read, rig)
     content = (tmp_path / "b.omap").read_bytes()
     assert content == (tmp_path / "a.omap").read_bytes() and len(content) < 10_000 + 50_000 * count
-
-
-def test_numpy_opens_a_map(omap: Path) -> None:
-    with np.load(omap, allow_pickle=False) as found:
-        assert found["keyframes"]["id"].tolist() == [0, 1, 2, 3] and len(found["descriptors"]) == 4 * 256
-
-
-def test_the_bound_of_the_map_that_is_filled_holds(omap: Path) -> None:
-    places, _ = read_places(omap, PlaceMap(max_keyframes=3))
-    assert len(places) == 4
-    places.add(dataclasses.replace(places.keyframes[0], id=10), np.eye(4))
-    assert len(places) == 3
 
 
 def test_any_mutation_of_a_map_is_a_map_or_one_line(tmp_path: Path) -> None:
@@ -155,46 +142,6 @@ def test_a_map_that_was_changed_with_right_checksums_is_refused(
     with pytest.raises(OmnidError, match=message) as refused:
         read_places(omap)
     assert "\n" not in str(refused.value)
-
-
-def test_a_compressed_map_is_refused(omap: Path) -> None:
-    with np.load(omap) as found, omap.with_name("b.omap").open("wb") as file:
-        np.savez_compressed(file, **found)
-    with pytest.raises(OmnidError, match="compressed"):
-        read_places(omap.with_name("b.omap"))
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"T_odom_rect": np.full((4, 4), np.nan)}, "a pose is not finite"),
-        ({"T_odom_rect": np.diag([2.0, 0.5, 1, 1])}, "a pose is no rotation"),
-        ({"T_odom_rect": np.diag([-1.0, 1, 1, 1])}, "a pose is no rotation"),
-        ({"covariance": -np.eye(6)}, "a covariance is not positive"),
-        ({"covariance": np.triu(np.ones((6, 6)))}, "a covariance is not symmetric"),
-        ({"covariance": np.full((6, 6), np.inf)}, "a covariance is not finite"),
-        ({"free_m": np.full(360, np.nan, np.float16)}, "a range is outside"),
-        ({"free_m": np.full(360, -1000, np.float16)}, "a range is outside"),
-        ({"thumbnail": np.zeros((16, 64), np.int8)}, "cannot write the map"),
-        ({"session": -1}, "outside its range"),
-    ],
-)
-def test_values_outside_their_range_are_not_written(omap: Path, change: dict[str, object], message: str) -> None:
-    places, before = some_places(3), omap.read_bytes()
-    places.keyframes[1] = dataclasses.replace(places.keyframes[1], **change)
-    with pytest.raises(OmnidError, match=message):
-        write_places(omap, places, RIG)
-    assert omap.read_bytes() == before and os.listdir(omap.parent) == ["a.omap"]
-
-
-def test_a_loop_needs_an_uncertainty_and_odometry_that_stood_still_has_none(omap: Path) -> None:
-    places, nothing = some_places(3), np.zeros((6, 6))
-    places.links[0] = dataclasses.replace(places.links[0], covariance=nothing)
-    write_places(omap, places, RIG)
-    assert len(read_places(omap)[0].links) == 3
-    places.links[2] = dataclasses.replace(places.links[2], covariance=nothing)
-    with pytest.raises(OmnidError, match=r"cannot write the map: a covariance is not positive: choose another file$"):
-        write_places(omap, places, RIG)
 
 
 def test_a_map_is_on_the_disk_before_it_gets_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

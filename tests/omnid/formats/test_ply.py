@@ -46,13 +46,6 @@ def test_the_layout_agrees_with_the_header(tmp_path: Path) -> None:
     assert np.array_equal(vertices["y"], points.xyz[:, 1]) and np.array_equal(vertices["age"], points.age)
 
 
-def test_replaces_the_old_map_and_leaves_no_other_file(tmp_path: Path) -> None:
-    path = tmp_path / "map.ply"
-    for count in (5, 2):
-        write_ply(str(path), some_points(count))
-    assert len(read_ply(str(path)).xyz) == 2 and list(tmp_path.iterdir()) == [path]
-
-
 def test_a_reader_keeps_the_old_map_while_a_new_one_is_written(tmp_path: Path) -> None:
     path = tmp_path / "map.ply"
     write_ply(path, some_points(5))
@@ -60,12 +53,6 @@ def test_a_reader_keeps_the_old_map_while_a_new_one_is_written(tmp_path: Path) -
         old = path.read_bytes()
         write_ply(path, some_points(900))
         assert reader.read() == old
-
-
-def test_same_points_give_the_same_bytes(tmp_path: Path) -> None:
-    for name in ("a.ply", "b.ply"):
-        write_ply(tmp_path / name, some_points(50))
-    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
 def test_refuses_paths_that_cannot_be_written(tmp_path: Path) -> None:

@@ -11,10 +11,8 @@ import pytest
 from calib.atomic_file import write_file
 from omnid.errors import OmnidError
 from omnid.formats.place_file import read_places, write_places
-from omnid.formats.route_file import RouteFolder
 from omnid.formats.whole_file import write_whole
 from tests.omnid.formats.place_maps import RIG, some_places
-from tests.omnid.formats.test_route_file import route
 
 
 def write_map(path: Path, content: bytes) -> None:
@@ -48,14 +46,6 @@ def test_a_link_in_the_place_of_the_temporary_file_is_not_followed(
     (tmp_path / f".file.{os.getpid()}.part").symlink_to(victim)
     write(path, b"new")
     assert victim.read_bytes() == b"mine" and path.is_file() and not path.is_symlink()
-
-
-def test_what_killed_writers_of_a_route_have_left_is_removed(tmp_path: Path) -> None:
-    left, of_others = tmp_path / ".hall.route.json.4194305.part", tmp_path / f".hall.route.json.{os.getppid()}.part"
-    left.write_bytes(b"{")
-    of_others.write_bytes(b"{")
-    RouteFolder(tmp_path).write(route())
-    assert not left.exists() and of_others.exists()
 
 
 def test_a_loop_of_links_is_one_line(tmp_path: Path) -> None:

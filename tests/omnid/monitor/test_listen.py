@@ -20,15 +20,13 @@ from calib import se3
 from drivers.logs.mcap_file import MAGIC
 from omnid.client import Robot
 from omnid.formats.tum import read_tum
-from omnid.monitor import listen
-from omnid.monitor.listen import load_line, load_table, print_state, status_table, summary_line
-from omnid.monitor.robot_state import Inbox, ReceivedMessage, RobotState
+from omnid.monitor.listen import print_state, status_table, summary_line
+from omnid.monitor.robot_state import ReceivedMessage, RobotState
 from omnid.transport import codec, map_codec
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.decode import Diagnostics
 from omnid.transport.pose_attachment import PoseAttachment
 from omnid.transport.records import DiagnosticStatus
-from omnid.transport.status_names import BUS, SIMULATION, THREADS, WHEELS, Key
+from omnid.transport.status_names import BUS, WHEELS
 from tests.omnid.transport.bus_fixtures import DEADLINE_S, free_endpoint
 from tests.replay.command import Command, rows
 from tests.waiting import wait_until
@@ -174,24 +172,6 @@ def test_tells_that_the_daemon_has_ended() -> None:
     assert "its daemon has ended" in state.state and state.state in summary_line("omnid", state)
 
 
-def test_the_statuses_of_a_daemon_that_has_ended_are_not_shown(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(listen, "SHOW_PERIOD_S", 0.02)
-    endpoint, state, parts, ended = free_endpoint(), RobotState(), list[int](), list[int]()
-    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus, Robot(connect=(endpoint,)) as robot:
-
-        def show() -> None:
-            """End the daemon once a status was shown, and the command once none is shown any more."""
-            parts.append(len(state.statuses))
-            if state.alive and state.statuses:
-                bus.close()
-            elif any(parts) and not state.statuses:
-                ended.append(1)
-
-        publish(bus, 1)
-        listen.follow(robot, state, Inbox(), [], show, time.monotonic() + DEADLINE_S, ended)
-    assert max(parts) == 1 and parts[-1] == 0
-
-
 class Terminal(io.StringIO):
     def isatty(self) -> bool:
         return True
@@ -212,82 +192,3 @@ def test_the_table_holds_no_control_characters_of_messages() -> None:
     assert shown.index("wheels") < shown.index("bus"), "the error comes first"
     assert summary_line("omnid", RobotState()) == "omnid: no pose yet"
     assert list(status_table("omnid", RobotState(), 0)) == ["omnid: no pose yet"]
-
-
-@pytest.mark.parametrize(("columns", "lines"), [(80, 24), (60, 20), (20, 3), (1, 1)])
-def test_the_table_fits_the_terminal(monkeypatch: pytest.MonkeyPatch, columns: int, lines: int) -> None:
-    state = received(1, 2)
-    many = [DiagnosticStatus(f"omnid: part {n}", n % 3, "a message " * 10, {"key": "value" * 30}) for n in range(40)]
-    state.process(ReceivedMessage(time.time_ns(), "status", codec.diagnostics_cdr(1, many), b""))
-    monkeypatch.setenv("COLUMNS", str(columns))
-    monkeypatch.setenv("LINES", str(lines))
-    terminal = Terminal()
-    print_state("omnid", state, 0, terminal)
-    shown = terminal.getvalue().removeprefix("\x1b[H\x1b[J").splitlines()
-    assert len(shown) <= max(2, lines - 1) and max(map(len, shown)) <= columns
-    assert "omnid: tracking".startswith(shown[0][: columns - 1][:15])
-    assert lines < 20 or "more; make the window higher" in shown[-1]
-
-
-def test_the_load_is_shown_by_threads() -> None:
-    state = RobotState()
-    assert load_line("rover", state) == "rover: no load of its threads yet"
-    values = {"all": "0.500", "bus": "0.104", "odometry": "0.396", "words": "none", "\x1b[2J": "0.001"}
-    state.statuses[THREADS] = DiagnosticStatus(THREADS, 0, "", values)
-    assert list(load_table("rover", state)) == [
-        "rover: 50.0 % of a core",
-        "   39.6 %  odometry",
-        "   10.4 %  bus",
-        "    0.1 %  \\x1b[2J",
-    ]
-    assert load_line("rover", state) == "rover: 50.0 % of a core, 39.6 % odometry, 10.4 % bus, 0.1 % \\x1b[2J"
-    out = io.StringIO()
-    print_state("rover", state, 0, out, shows_load=True)
-    assert out.getvalue() == load_line("rover", state) + "\n"
-
-
-def test_poses_of_a_simulated_clock_have_no_age() -> None:
-    state = RobotState()
-
-    def receive(number: int) -> None:
-        payload = codec.odometry_cdr(time.time_ns(), np.eye(4), 1e-6 * np.eye(6), np.zeros(6), np.eye(6))
-        attachment = PoseAttachment(number, "tracking", 0, 50, 60, time.time_ns()).to_bytes()
-        state.process(ReceivedMessage(time.time_ns(), "odom", payload, attachment))
-
-    receive(1)
-    assert state.age.count == 1
-    pace = DiagnosticStatus(SIMULATION, 0, "", {Key.REAL_TIME_FACTOR: "0.50"})
-    state.process(ReceivedMessage(time.time_ns(), "status", codec.diagnostics_cdr(10**18, [pace]), b""))
-    receive(2)
-    assert state.age.count == 0 and "0.50 x real time" in summary_line("rover", state)
-
-
-def test_counts_missed_poses_but_not_those_of_a_restart() -> None:
-    assert received(1, 2, 5, 6).missed == 2
-    assert received(5, 6, 1, 2).missed == 0
-    broken = received(1)
-    assert broken.process(ReceivedMessage(1, "odom", b"nonsense", b"")) is None and broken.broken == 1
-
-
-def test_the_statuses_of_a_daemon_that_has_ended_are_forgotten_once() -> None:
-    state = received(1)
-    status = Diagnostics(1, (DiagnosticStatus(WHEELS, 0, "armed", {}),))
-    state.add_diagnostics(status)
-    state.set_alive(True)
-    assert not state.forget_ended() and state.statuses
-    for alive in (False, True):  # it is back before the next message is processed
-        state.set_alive(alive)
-    assert state.forget_ended() and not state.statuses
-    state.add_diagnostics(status)
-    assert not state.forget_ended() and state.statuses
-    state.set_alive(False)
-    assert state.forget_ended() and not state.forget_ended()
-    assert (state.ends, state.restarts, received(5, 6, 1, 2, 2).restarts) == (2, 0, 1)
-
-
-def test_the_inbox_drops_the_oldest_when_full() -> None:
-    inbox = Inbox()
-    for number in range(2010):
-        inbox.put(str(number), b"", b"")
-    first = inbox.get(0.0)
-    assert inbox.dropped == 10 and first is not None and first.topic == "10"

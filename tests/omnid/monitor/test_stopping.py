@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from omnid.errors import OmnidError
 from omnid.monitor.stopping import stop
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
@@ -69,8 +68,3 @@ def test_a_status_from_before_the_stop_does_not_confirm_it() -> None:
         bus._stop_listener.close()
         assert stop(BusConfig(connect=(endpoint,)))
     assert stops == ["cmd/stop"] * 3, "it is sent again until a new status confirms it"
-
-
-def test_without_a_robot_there_the_error_is_that_of_the_bus() -> None:
-    with pytest.raises(OmnidError, match="cannot reach"):
-        stop(BusConfig(connect=(free_endpoint(),)), answer_s=1.0)

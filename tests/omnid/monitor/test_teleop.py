@@ -8,7 +8,6 @@ import pytest
 
 from omnid.core.control.velocity_limits import VelocityLimits
 from omnid.monitor.teleop import HOLD_S, REST_S, Stick
-from tests.replay.command import Command
 
 LIMITS = VelocityLimits(velocity_mps=1.0, yaw_rate_radps=2.0)
 UP, DOWN, RIGHT, LEFT = b"\x1b[A", b"\x1b[B", b"\x1b[C", b"\x1b[D"
@@ -25,20 +24,6 @@ def test_a_motion_lasts_as_long_as_its_key_is_repeated(stick: Stick) -> None:
     assert stick.twist(10.0 + HOLD_S) == (0.5, 0.0)
     assert stick.twist(10.01 + HOLD_S) == (0.0, 0.0)
     assert stick.commands(10.0 + HOLD_S + REST_S) and not stick.commands(10.01 + HOLD_S + REST_S)
-
-
-def test_axes_are_independent_and_the_last_key_counts(stick: Stick) -> None:
-    stick.press(UP + LEFT, 0.0)
-    assert stick.twist(0.1) == (0.5, 1.0)
-    stick.press(DOWN + RIGHT, 0.2)
-    assert stick.twist(0.2) == (-0.5, -1.0)
-
-
-def test_the_share_stays_within_the_limits(stick: Stick) -> None:
-    stick.press(b"+" * 50 + UP, 0.0)
-    assert stick.twist(0.0) == (1.0, 0.0)
-    stick.press(b"-" * 50, 0.0)
-    assert 0.0 < stick.twist(0.0)[0] <= 0.1
 
 
 @pytest.mark.parametrize("key", [b" ", b"x", b"\x1b", b"\xff", b"\n"])
@@ -75,16 +60,7 @@ def test_a_stop_after_a_part_of_a_key_is_a_stop(stick: Stick, begun: bytes) -> N
     assert stick.stop_asked
 
 
-def test_letters(stick: Stick) -> None:
-    stick.press(b"aq", 0.0)
-    assert stick.arm_asked and stick.quit and not stick.stop_asked
-
-
 def test_keys_that_were_typed_while_it_connected_stop_and_arm_and_move_nothing(stick: Stick) -> None:
     stick.press(UP + b"a ", -math.inf)
     assert stick.arm_asked and stick.stop_asked
     assert stick.twist(0.0) == (0.0, 0.0) and not stick.commands(0.0)
-
-
-def test_needs_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
-    assert "run it in a terminal" in Command(capsys).refused("drive")

@@ -8,10 +8,7 @@ import numpy as np
 import pytest
 
 from drivers.logs.mcap_writer import LogWriter
-from drivers.logs.open_log import log_info
 from omnid.cli import main
-from omnid.errors import OmnidError
-from omnid.recordings.recording import choose_odometry_topic
 from omnid.transport import codec
 
 START_NS = 1_700_000_000 * 10**9
@@ -56,11 +53,3 @@ def test_the_report_has_the_topic_of_the_rule(tmp_path: Path, capsys: pytest.Cap
         assert code == 2 and "omnid: " in capsys.readouterr().err and not page.exists()
     else:
         assert code == 0 and f"3 poses of {expected}" in capsys.readouterr().out
-
-
-def test_a_robot_stands_for_its_topic(tmp_path: Path) -> None:
-    found = log_info(recording(tmp_path / "log.mcap", ("/rover/odom", "/site/digger/odom")))
-    assert choose_odometry_topic(found, robot="rover") == "/rover/odom"
-    assert choose_odometry_topic(found, robot="site/digger") == "/site/digger/odom"
-    with pytest.raises(OmnidError, match="'/crane/odom'"):
-        choose_odometry_topic(found, robot="crane")

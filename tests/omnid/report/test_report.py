@@ -22,7 +22,6 @@ from omnid.cli import main
 from omnid.errors import OmnidError
 from omnid.formats.tum import Trajectory, tum_row
 from omnid.recordings.evaluation import evaluate
-from omnid.report.charts import thinned
 from omnid.report.recorded_run import RecordedRun, read_run
 from omnid.report.report import MAX_EVENTS, _Truth, report_html
 from omnid.transport.records import DiagnosticStatus
@@ -33,7 +32,6 @@ from tests.omnid.report.recorded_logs import (
     T_odom_base,
     at,
     cloud,
-    corrupt_chunks,
     drive,
     map_pose,
     odom,
@@ -43,7 +41,6 @@ from tests.omnid.report.recorded_logs import (
     status,
 )
 
-TERMINAL = "x\x1b[31m\x07\x9b2J"
 EVIL = "<script>alert('x')</script>\"'&<img src=x onerror=y>"
 STARTED_AGAIN = ("state", "the robot was started again, with a new odom")
 
@@ -171,29 +168,6 @@ def test_any_bytes_give_a_page_or_one_error_line(tmp_path: Path, seed: int) -> N
         assert "\n" not in str(error)
 
 
-@pytest.fixture
-def hostile(tmp_path: Path) -> Path:
-    """A log whose topic, frames, states, file name, attachments and settings hold sequences that control a terminal."""
-    entries = [odom(k, topic=f"/{TERMINAL}/odom") for k in range(5)]
-    entries += [
-        status(2, DiagnosticStatus(ODOMETRY, 2, TERMINAL, {TERMINAL: TERMINAL})),
-        status(3, DiagnosticStatus(TERMINAL, 1, f"{TERMINAL} again", {})),
-    ]
-    attachments = {f"{TERMINAL}.txt": b"", "omnid.toml": b'"\\u001b]0;x\\u0007" = "\\u009b31m"', "rig.toml": b"a = 1"}
-    return save(tmp_path / f"{TERMINAL}.mcap", entries, attachments)
-
-
-def test_prints_no_control_characters_of_a_log(hostile: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    page = hostile.with_name("page.html")
-    main(["report", str(hostile), "-o", str(page)])
-    main(["log", "info", str(hostile)])
-    main(["log", "info", str(hostile.with_name(f"{TERMINAL}.none"))])
-    main(["report", str(hostile), "--topic", TERMINAL, "-o", str(page)])
-    shown = "".join((*capsys.readouterr(), page.read_text("utf-8")))
-    assert "poses of" in shown and "odom" in shown
-    assert not set(shown) & {chr(code) for code in (*range(9), *range(11, 32), *range(127, 160))}
-
-
 def test_states_gaps_resets_losses_and_messages_are_events(tmp_path: Path) -> None:
     camera = camera_name("upper")
     entries = [
@@ -270,62 +244,6 @@ def test_a_robot_that_was_started_again_during_the_recording_has_not_jumped_to_i
     assert event_texts(found).count(STARTED_AGAIN) == 1 and sum(count for _, count in found.resets) == resets
 
 
-def test_a_gap_and_late_status_are_no_restart(tmp_path: Path) -> None:
-    """The way during the gap counts; a report that was recorded late has fewer resets than the one before."""
-    entries = [*straight(0, 10), length(9, 0.9), state(9, "tracking", 1)]
-    entries += [odom(60, se3.transform(np.eye(3), [5.0, 0.0, 0.0])), length(60, 5.0, 1), state(8, "tracking", 0)]
-    found = read_run(save(tmp_path / "a.mcap", entries))
-    assert found.length_m() == pytest.approx(5.0) and STARTED_AGAIN not in event_texts(found)
-
-
-def test_what_is_invalid_is_left_out_and_counted(tmp_path: Path) -> None:
-    far = np.eye(4)
-    far[0, 3] = 1e12
-    stray = (at(10), "/omnid/odom", "nav_msgs/msg/Odometry", odom(10**6)[3])
-    entries = [*run(10), (at(10), *odom(10, far)[1:]), stray, (at(11), *odom(5, np.eye(4))[1:]), odom(12)]
-    found = read_run(save(tmp_path / "log.mcap", entries))
-    assert (len(found.t_s), found.unreadable, found.late) == (11, 2, 1)
-    text = Page(report_html(found)).text
-    assert "2 messages were left out" in text and "1 poses were left out" in text
-    log = save(tmp_path / "a.mcap", run(60))
-    corrupt_chunks(log)
-    found = read_run(log)
-    assert found.corrupt == 2 and 40 < len(found.t_s) < 60
-    page = report_html(found)
-    assert "2 corrupt chunks or records were skipped." in page and "MB, cut or corrupt. Poses" in page
-    single = save(tmp_path / "b.mcap", [odom(0), map_pose(1, np.eye(4))], {"omnid.toml": b"a." * 20_000 + b"a = 1"})
-    assert not len(read_run(single).map_poses) and "settings cannot be read" in html_of(single)
-
-
-def test_shows_stages_latencies_and_what_a_foreign_log_lacks(tmp_path: Path) -> None:
-    def second(k: int) -> tuple[DiagnosticStatus, ...]:
-        odometry = {"inliers": str(200 + k), "tracked": "300", "rate_hz": "9.5"}
-        odometry |= {"capture_to_pose_p50_ms": "81.25", "capture_to_pose_p99_ms": "163.00"}
-        stereo = {"processed": str(10 * k), "dropped": str(k), "work_p50_ms": "31.5", "work_max_ms": "52.1"}
-        stage = DiagnosticStatus(stage_name("stereo"), 0, "", stereo)
-        return DiagnosticStatus(ODOMETRY, 0, "tracking", odometry), stage
-
-    entries = [*run(100), *(status(10 * k, *second(k)) for k in range(10))]
-    text = Page(html_of(save(tmp_path / "log.mcap", entries))).text
-    words = ("81.2 / 163 ms", "31.5", "52.1", "stereo, dropped", "inliers of the pose", "messages dropped (9)")
-    assert [word for word in words if word not in text] == [] and "no status of the daemon" not in text
-
-    entries = [odom(k, topic="/wheels/odometry", sigma_m=0.0) for k in range(30)]
-    text = Page(html_of(save(tmp_path / "foreign.mcap", entries))).text
-    words = (
-        "Run of wheels",
-        "does not hold the state",
-        "they were not set",
-        "no numbers of landmarks",
-        "no status of the daemon",
-        "holds no images",
-        "o rig.toml is attached",
-        "holds no map",
-        "holds no commands",
-    )
-    assert [word for word in words if word not in text] == []
-
-
 def test_the_path_in_the_map_is_drawn_beside_that_of_odometry_and_its_correction_over_time(tmp_path: Path) -> None:
     moved = se3.exp([0.3, 0.4, 0, 0, 0, 0.1])
     poses = [entry for k in range(60) for entry in (odom(k), map_pose(k, np.eye(4) if k < 30 else moved))]
@@ -361,16 +279,6 @@ def test_compares_with_the_truth_as_eval_does(tmp_path: Path, capsys: pytest.Cap
     assert "do both use the same clock" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("height_m", "low"), [(0.9, "0.8"), (1.5, "1")])
-def test_the_plan_draws_what_is_above_the_floor_where_the_rig_states_its_height(
-    tmp_path: Path, height_m: float, low: str
-) -> None:
-    """The floor filled the plans of robots whose cameras are lower than a metre."""
-    attached = {"rig.toml": rig_toml(attached_rig_of_sample().at_height(height_m)).encode()}
-    log = save(tmp_path / "a.mcap", [*run(3), cloud(2, np.zeros((5, 3)))], attached)
-    assert f"those from {low} m below the rig's height at the start to 1.5 m above" in Page(html_of(log)).text
-
-
 def test_shows_a_panorama_of_a_log_with_images(tmp_path: Path) -> None:
     """The log holds the sample's first images, and poses."""
     entries = run(20)
@@ -382,15 +290,6 @@ def test_shows_a_panorama_of_a_log_with_images(tmp_path: Path) -> None:
     log = save(tmp_path / "log.mcap", entries, {"rig.toml": rig_toml(attached_rig_of_sample()).encode()})
     page = Page(html_of(log))
     assert [tag for tag, _ in page.tags].count("img") == 2 and "panorama at the first pose" in page.text
-
-
-def test_thinning_keeps_spikes_and_gaps() -> None:
-    t_s, values = np.arange(100_000) * 0.01, np.zeros(100_000)
-    values[[777, 50_001]] = 5.0, -7.0
-    t_s[80_000:] += 500.0
-    points = thinned(t_s, values)
-    assert len(points) < 1000 and {5.0, -7.0, None} <= {value for _, value in points}
-    assert thinned(t_s[:3], values[:3]) == [(0.0, 0.0), (0.01, 0.0), (0.02, 0.0)]
 
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from omnid.simulation.clearance import DriveRecord, clearance_m, footprints
+from omnid.simulation.clearance import clearance_m, footprints
 from omnid.simulation.rendering.shapes import box
 from omnid.simulation.rendering.surfaces import Rectangle
 
@@ -31,11 +31,3 @@ def test_the_distance_is_that_of_the_nearest_point_from_the_outline() -> None:
     assert clearance_m(segments, (3.0, 1.0), 0.2) == pytest.approx(0.8) and clearance_m(segments, (1.0, 0.9), 0.2) < 0
     around = footprints(box(RNG, (5.0, 5.0), (1.0, 1.0, 0.5), 0.0), 0.4)
     assert clearance_m(around, (5.0, 3.5), 0.2) == pytest.approx(0.8)
-
-
-def test_a_contact_is_reported_when_it_begins() -> None:
-    lines = list[str]()
-    record = DriveRecord(lines.append)
-    for distance_m in (0.1, -0.01, -0.02, 0.1, 0.0):
-        record.add_clearance(distance_m, (1.0, 2.0, 0.0))
-    assert record.contacts == 2 and lines == ["contact with an obstacle at 1.00, 2.00 m in the world"] * 2

@@ -12,12 +12,10 @@ import pytest
 from omnid.controller.statistics import ControllerState
 from omnid.core.navigation.path import drive_path
 from omnid.core.navigation.requests import PathRequest, RouteAction, RouteRequest
-from omnid.formats.plan import MARGIN_PX
 from omnid.messages import NavigationUpdate, PlaceUpdate, RequestAnswer
 from omnid.navigation_state import NavigationState
-from omnid.simulation.demonstration import PX_PER_M, RECOGNISED_S, TeachAndRepeat, cross_track_m, draw
+from omnid.simulation.demonstration import RECOGNISED_S, TeachAndRepeat
 from omnid.simulation.lockstep import Moment, Request
-from omnid.simulation.world_file import load_world
 from omnid.tracking_state import MapState
 
 REACHED, DRIVING = NavigationState.REACHED, NavigationState.DRIVING
@@ -79,27 +77,3 @@ def test_a_drive_that_fails_is_reported(
     list(script(moment(17.0, REACHED, MapState.ODOMETRY_ONLY)) if at_s > 17.0 else ())
     assert list(script(moment(at_s, state, map_state, refusal))) == ["end"]
     assert script.end == end and math.isinf(script.repeated_s)
-
-
-def test_both_paths_and_what_was_seen_are_drawn() -> None:
-    first = np.array([[-1.0, -1.0], [0.0, -1.0], [0.0, 0.0]])
-    aside = np.array([0.0, 0.5])
-    obstacles = np.column_stack([np.linspace(-2, 2, 400), np.full(400, 2.0)])
-    world = load_world("room", 1)
-    image = draw(world, np.vstack([obstacles, [(90.0, 0.0)]]), first, first + aside).astype(int)
-    assert image.shape[0] < image.shape[1]
-    # 1. The repeated path is red, the taught one black: here two metres of each, the start mark on the taught one.
-    red = (image[..., 2] - image[..., 0] > 100).sum()
-    assert 2.0 * PX_PER_M < red < 5 * 2.0 * PX_PER_M
-    without = draw(world, obstacles, first[:0], first[:0]).astype(int)
-    assert (image.max(axis=2) < 40).sum() - (without.max(axis=2) < 40).sum() > 4 * 2.0 * PX_PER_M
-    # 2. What was seen is drawn in its cells; a position outside the world is not.
-    bare = draw(world, obstacles[:0], first[:0], first[:0]).astype(int)
-    seen = (without != bare).any(axis=2)
-    assert seen.sum() == pytest.approx(4.0 / 0.05 * math.ceil(0.05 * PX_PER_M) ** 2, rel=0.2)
-    # 3. The start is marked and named: a ring of 18 px and a word.
-    marked = draw(world, obstacles[:0], first[:1], first[:0]).astype(int)
-    assert (marked.max(axis=2) < 40).sum() - (bare.max(axis=2) < 40).sum() > 120
-    # 4. The legend stands below, and the scale bar above.
-    assert (image[-20:] < 255).any() and (image[40:60, -3 * MARGIN_PX :] < 40).any()
-    np.testing.assert_allclose(cross_track_m(first, np.array([(-0.5, -1.2), (0.3, -0.5), (-1.0, -1.0)])), [0.2, 0.3, 0])

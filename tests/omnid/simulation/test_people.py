@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from omnid.simulation.people import IMPATIENT, PATIENCE_S, Walkers
+from omnid.simulation.people import Walkers
 from omnid.simulation.world_file import load_world
 from tests.omnid.simulation.test_world_file import HALL, write
 
@@ -22,19 +22,6 @@ def test_polite_people_wait_until_the_robot_has_gone(tmp_path: Path) -> None:
     for tenth in range(31, 41):
         people.advance(0.1 * tenth, (-0.5, -0.5))  # behind the person, who goes away from it
     assert people.places()[0][0] == pytest.approx(0.2, abs=0.06)
-
-
-def test_people_who_have_waited_for_long_come_nearer_and_then_turn_round(tmp_path: Path) -> None:
-    polite = HALL.replace('repeat = "back and forth"', 'repeat = "back and forth"\nwaits_within_m = 0.8')
-    people = Walkers(load_world(write(tmp_path, polite), 1).people)
-    x_m = []
-    for tenth in range(1, 120):
-        people.advance(0.1 * tenth, (0.5, -1.0))  # in the way for good
-        x_m.append(people.places()[0][0])
-    for at_m in (0.5 - 0.8, 0.5 - IMPATIENT * 0.8):
-        stood = np.flatnonzero(np.abs(np.array(x_m[:100]) - at_m) < 0.06)
-        assert len(stood) == pytest.approx(10 * PATIENCE_S, abs=6)
-    assert x_m[-1] < -0.5, "he has turned round"
 
 
 def test_people_walk_and_some_wait_for_the_robot(tmp_path: Path) -> None:

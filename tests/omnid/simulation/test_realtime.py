@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from contextlib import closing
 from itertools import islice
@@ -48,25 +47,6 @@ def test_commands_on_the_serial_port_move_the_cameras() -> None:
     assert [stamp for stamp, _ in truth] == [frame.stamp_ns for frame in frames["lower"]]
     assert truth[-1][1][0] - truth[0][1][0] > 0.1
     assert robot.drive.contacts == 0
-
-
-def test_the_gyro_measures_the_turn_of_the_base() -> None:
-    drive = DifferentialDrive()
-    with (
-        closing(RealtimeRobot(load_world("room", 1), make_robot(SIZE), "line", drive)) as robot,
-        closing(SerialMotor(robot.port, LineProtocol(drive), timeout_s=1.0, watchdog_ms=2000)) as motor,
-    ):
-        gyro = robot.open_gyro()
-        assert gyro is not None
-        turned_rad, first_ns, last_ns, begin_rad = 0.0, 0, 0, robot.pose_at(0)[2]
-        for sample in gyro.samples():
-            motor.send(VelocityCommand(0, 0.2, 1.0, 0.0))
-            turned_rad += (sample.stamp_ns - last_ns) * 1e-9 * sample.z_radps if last_ns else 0.0
-            last_ns, first_ns = sample.stamp_ns, first_ns or sample.stamp_ns
-            if turned_rad > 0.4 or sample.stamp_ns - first_ns > 5e9:
-                break
-        truth_rad = math.remainder(robot.pose_at(last_ns)[2] - begin_rad, math.tau)
-    assert truth_rad > 0.2 and turned_rad == pytest.approx(truth_rad, abs=0.1)
 
 
 @pytest.mark.parametrize(

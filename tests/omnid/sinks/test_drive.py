@@ -19,7 +19,7 @@ from omnid.core.control.heading_controller import Setpoint
 from omnid.engine.telemetry import StageStats
 from omnid.messages import NavigationUpdate, OdometryUpdate, RequestAnswer
 from omnid.navigation_state import NavigationState
-from omnid.sinks.drive import LiveDrive, PlannerDrive, ReplayDrive, SimulatedWheels, granted_words
+from omnid.sinks.drive import PlannerDrive, ReplayDrive, SimulatedWheels
 from omnid.tracking_state import TrackingState
 from omnid.transport.requests import Answer
 
@@ -84,33 +84,6 @@ def test_a_motor_controller_that_failed_ends_a_replay(link: Any, monkeypatch: py
         drive.process(odometry(2))
     with pytest.raises(DriverError, match="does not answer"):
         drive.finish()
-
-
-def test_a_replay_counts_commands_errors_and_stops(link: Any) -> None:
-    drive = ReplayDrive(link, AHEAD, np.eye(4))
-    link.statistics.state.sent = 7
-    link.statistics.state.stops.update(["the pose is stale", "the pose is lost"])
-    drive.finish()
-    assert drive.counts() == {"commands": 7, "errors": 0, "stops": 2} and link.ended
-
-
-def test_a_live_pose_keeps_its_stamp(link: Any) -> None:
-    LiveDrive(link, np.eye(4)).process(odometry(123))
-    assert [pose.stamp_ns for pose in link.poses] == [123] and link.setpoints == []
-
-
-def test_what_a_robot_does_is_a_sentence() -> None:
-    idle, driving = NavigationState.IDLE, NavigationState.DRIVING
-    assert granted_words("teach dock", idle).startswith("it records the route dock: drive it, then finish it")
-    assert granted_words("repeat dock", driving) == "it repeats the route dock"
-    assert granted_words("pause", NavigationState.PAUSED, "by a request") == "paused: by a request"
-    assert granted_words("cancel", NavigationState.CANCELLED, "by a request") == "cancelled: by a request"
-
-
-@pytest.mark.parametrize("verb", ["cancel", "pause"])
-def test_a_cancel_of_nothing_is_no_goal_that_is_reached(verb: str) -> None:
-    assert granted_words(verb, NavigationState.REACHED) == "nothing is under way (reached)"
-    assert granted_words(verb, NavigationState.FAILED, "no way") == "nothing is under way (failed: no way)"
 
 
 def test_the_answers_of_the_navigation_are_given_and_its_route_is_handed_on(link: Any) -> None:

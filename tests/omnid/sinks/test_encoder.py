@@ -6,18 +6,13 @@ from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
-import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from calib import se3
 from drivers.motor import VelocityCommand
 from omnid.core.mapping.voxel_map import MapPoints
-from omnid.messages import MapUpdate, NavigationUpdate, OdometryUpdate, RequestAnswer
-from omnid.navigation_state import NavigationState
-from omnid.sinks.encoder import Encoder, MapEncoding, Outgoing, navigation_status, static_frames
-from omnid.sinks.pose_collector import PoseCollector
-from omnid.tracking_state import TrackingState
-from omnid.transport.codec import ERROR, OK, WARN
+from omnid.messages import MapUpdate
+from omnid.sinks.encoder import Encoder, MapEncoding, Outgoing, static_frames
 from tests.simulation import make_rig
 
 OFFSET_NS = 10**18
@@ -57,48 +52,3 @@ def test_the_static_frames_lead_from_the_base_to_the_cameras() -> None:
     assert list(found) == [("base_link", "rig"), ("rig", "lower"), ("rig", "upper")]
     np.testing.assert_allclose(found["base_link", "rig"], rig.T_base_rig, atol=1e-12)
     np.testing.assert_allclose(found["rig", "upper"] @ rig.upper.T_cam_rig, np.eye(4), atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("state", "level"),
-    [(NavigationState.DRIVING, OK), (NavigationState.BLOCKED, WARN), (NavigationState.FAILED, ERROR)],
-)
-def test_the_level_follows_the_state_of_the_navigation(state: NavigationState, level: int) -> None:
-    status = navigation_status(NavigationUpdate(1, 1, None, state, "why"))
-    assert (status.level, status.message) == (level, f"{state}: why")
-
-
-def test_the_entry_has_what_is_known() -> None:
-    least = navigation_status(NavigationUpdate(1, 1, None, NavigationState.IDLE))
-    assert least.values == {"state": "idle"} and least.message == "idle"
-    answers = (RequestAnswer(1, "b", "no map"),)
-    update = NavigationUpdate(
-        1, 1, None, NavigationState.DRIVING, "", "goal", 7, 1.25, -0.5, 2, teaching="way", taught_m=3.0, answers=answers
-    )
-    assert navigation_status(update).values == {
-        "state": "driving",
-        "task": "goal",
-        "command_ns": "7",
-        "left_m": "1.250",
-        "offset_m": "-0.500",
-        "loops_left": "2",
-        "teaching": "way",
-        "taught_m": "3.00",
-        "request": "b",
-        "refusal": "no map",
-    }
-
-
-@pytest.mark.parametrize("count", [0, 3])
-def test_poses_of_a_run_are_kept_in_arrays(count: int) -> None:
-    collector, depth = PoseCollector(), cast("Any", None)
-    for seq in range(count):
-        collector.process(
-            OdometryUpdate(
-                seq, 10**9 + seq, np.eye(4) * seq, np.eye(6) * seq, np.zeros(6), np.eye(6), "lost", 0, 5, 9, depth
-            )
-        )
-    assert collector.stamps_ns.tolist() == list(range(10**9, 10**9 + count))
-    assert collector.T_odom_rig.shape == (count, 4, 4) and collector.covariances.shape == (count, 6, 6)
-    assert collector.T_odom_rig[:, 0, 0].tolist() == collector.covariances[:, 5, 5].tolist() == list(range(count))
-    assert collector.states == (TrackingState.LOST,) * count

@@ -5,14 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from omnid.simulation.cameras import SimulatedCameras
 from omnid.simulation.lockstep import with_masks
-from omnid.simulation.people import Walkers
 from omnid.simulation.rendering.polished_floor import PolishedFloor, reflectance
 from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
 from omnid.simulation.robot import make_robot
-from omnid.simulation.world_file import WorldOptions, parse_world
 
 ROBOT = make_robot(256)
 RIG = with_masks(ROBOT.rig)
@@ -66,15 +63,6 @@ def test_a_wall_is_seen_upside_down_where_the_floor_is(side: str) -> None:
     assert _grey(matt, mounted.camera.project((T_cam_base @ [*in_floor, 1.0])[None, :3])) == 0.0
     assert mirrored == pytest.approx(share * grey, rel=0.03) and mirrored > 5
     np.testing.assert_array_equal(polished[matt > 100], matt[matt > 100])  # what stands is as it was
-
-
-def test_a_world_file_says_that_its_floor_is_polished() -> None:
-    images = {}
-    for finish in ("matt", "polished"):
-        world = parse_world(ROOM.format(finish=finish), "room", 1, WorldOptions())
-        frame = SimulatedCameras(RIG, ROBOT.sensor, world, 1, 2).frame("lower", 0, 0, RIG.T_base_rig, Walkers(()))
-        images[finish] = np.frombuffer(frame.data, np.uint8).astype(int)
-    assert np.abs(images["matt"] - images["polished"]).max() > 10
 
 
 def _grey(image: np.ndarray, pixel: np.ndarray) -> float:
