@@ -26,7 +26,7 @@ if TYPE_CHECKING:  # the help and other commands do not load these
 
 
 @command(
-    option("world", help="room, corridor, building, hall, or a file *.toml (omnid/simulation/WORLDS.md)"),
+    option("world", help="room, corridor, building, hall, or a file *.toml (docs/drive.md)"),
     option(
         "--speed",
         choices=(AUTO, REAL_TIME),

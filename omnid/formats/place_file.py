@@ -1,4 +1,4 @@
-"""Map files (.omap): a map of places as an uncompressed .npz file, which `numpy.load` opens; see OMAP.md.
+"""Map files (.omap): a map of places as an uncompressed .npz file, which `numpy.load` opens; see docs/formats.md.
 
 A map is written to a temporary file in the same folder, synced and renamed, so that a program that is killed leaves the
 old map whole. What is read is checked: each array by its type, its size and the CRC-32 of the archive, each value by

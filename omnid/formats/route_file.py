@@ -1,4 +1,4 @@
-"""Route files (.route.json, see ROUTE.md): written whole, read strictly, whatever their bytes."""
+"""Route files (.route.json, see docs/formats.md): written whole, read strictly, whatever their bytes."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def parse_route(content: bytes, name: str) -> Route:
     try:
         found = json.loads(content)
     except (ValueError, RecursionError):
-        raise OmnidError(f"{name}: this is no route file: expected JSON, see omnid/formats/ROUTE.md") from None
+        raise OmnidError(f"{name}: this is no route file: expected JSON, see docs/formats.md") from None
     if not isinstance(found, dict) or found.get("format") != FORMAT:
         raise OmnidError(f'{name}: this is no route file: expected "format": "{FORMAT}"')
     if found.get("version") != VERSION:

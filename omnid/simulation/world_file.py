@@ -1,4 +1,4 @@
-"""World files: TOML, described in omnid/simulation/WORLDS.md; textures follow from a seed.
+"""World files: TOML, described in docs/drive.md; textures follow from a seed.
 
 schema = 1
 start = [0.0, 0.0, 0.0]

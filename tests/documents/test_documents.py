@@ -15,15 +15,25 @@ import omnid
 from omnid.cli import COMMANDS, command_at
 from omnid.config import Config
 from omnid.transport.topics import PUBLISHED, command_topics, ros_name
-from tests.documents.site_hooks import DOCS, ROOT, pages, prose_and_code
 
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
 GIF_BYTES, STILL_BYTES = 1_000_000, 60_000
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 
 
 def documents() -> list[Path]:
-    """Return README, the pages and what they include."""
-    return sorted({ROOT / source for source in pages() if source.endswith(".md")})
+    """Return the pages of the site, and the documents at the top of the project."""
+    return sorted([*DOCS.rglob("*.md"), *ROOT.glob("*.md")])
+
+
+def prose_and_code(text: str) -> Iterator[tuple[str, bool]]:
+    """Yield each line, and True where it belongs to a block of code."""
+    fenced = False
+    for line in text.splitlines():
+        is_fence = line.lstrip().startswith("```")
+        yield line, fenced or is_fence or line.startswith("    ")
+        fenced ^= is_fence
 
 
 @cache

@@ -2,7 +2,7 @@
 
 Faults of robot, pose and host disarm: with controller.arming = "manual" the wheels stay stopped after them until
 cmd/arm. A stop that was asked for latches in every mode. No command, a stale one and a jump of the heading do not
-disarm: the operator has let go, or must send again. The whole table, with tests: omnid/controller/SAFETY.md.
+disarm: the operator has let go, or must send again. The whole table, with tests: docs/safety.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""SAFETY.md: each hazard has a test that is marked with it, and each reason to stop says whether it disarms."""
+"""docs/safety.md: each hazard has a test that is marked with it, and each reason to stop says whether it disarms."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from omnid.core.control import safety_rules
 from omnid.core.control.arming import AUTOMATIC, MANUAL
 
 ROOT = Path(__file__).parents[3]
-TEXT = (ROOT / "omnid/controller/SAFETY.md").read_text("utf-8")
+TEXT = (ROOT / "docs/safety.md").read_text("utf-8")
 MARK = re.compile(r"@pytest\.mark\.hazard\(([^)]*)\)")
 
 
@@ -32,7 +32,7 @@ def test_every_reason_to_stop_has_a_row_that_says_whether_it_disarms() -> None:
         if line.startswith("| ") and len(cells := line.split("|")) == 7
     }
     for rule in safety_rules.RULES:
-        assert rule.reason in rows, f"add a row for {rule.reason!r} to the table of SAFETY.md"
+        assert rule.reason in rows, f"add a row for {rule.reason!r} to the table of docs/safety.md"
         if rule.reason not in (safety_rules.ENDS, safety_rules.NOT_ARMED):
             latches = rule.disarms or rule.reason == safety_rules.ASKED
             assert rows[rule.reason].startswith("yes" if latches else "no"), rule.reason
