@@ -144,6 +144,13 @@ def test_a_map_that_was_changed_with_right_checksums_is_refused(
     assert "\n" not in str(refused.value)
 
 
+def test_a_compressed_map_is_refused(omap: Path) -> None:
+    with np.load(omap) as found, omap.with_name("b.omap").open("wb") as file:
+        np.savez_compressed(file, **found)
+    with pytest.raises(OmnidError, match="compressed"):
+        read_places(omap.with_name("b.omap"))
+
+
 def test_a_map_is_on_the_disk_before_it_gets_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Else a power cut could leave an empty file in the place of the map. The calls are made, and their order kept."""
     calls: list[tuple[str, str]] = []

@@ -57,6 +57,14 @@ def test_a_name_cannot_leave_the_folder(tmp_path: Path) -> None:
             folder.delete(name)
 
 
+def test_a_copy_under_another_name_is_refused(tmp_path: Path) -> None:
+    folder = RouteFolder(tmp_path)
+    folder.write(route())
+    folder.path("other").write_bytes(folder.path("hall").read_bytes())
+    with pytest.raises(OmnidError, match="this is the route hall"):
+        folder.read("other")
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

@@ -26,6 +26,13 @@ def test_a_motion_lasts_as_long_as_its_key_is_repeated(stick: Stick) -> None:
     assert stick.commands(10.0 + HOLD_S + REST_S) and not stick.commands(10.01 + HOLD_S + REST_S)
 
 
+def test_the_share_stays_within_the_limits(stick: Stick) -> None:
+    stick.press(b"+" * 50 + UP, 0.0)
+    assert stick.twist(0.0) == (1.0, 0.0)
+    stick.press(b"-" * 50, 0.0)
+    assert 0.0 < stick.twist(0.0)[0] <= 0.1
+
+
 @pytest.mark.parametrize("key", [b" ", b"x", b"\x1b", b"\xff", b"\n"])
 def test_any_other_key_ends_the_motion(stick: Stick, key: bytes) -> None:
     stick.press(UP + key, 0.0)
@@ -58,6 +65,11 @@ def test_a_stop_after_a_part_of_a_key_is_a_stop(stick: Stick, begun: bytes) -> N
     assert stick.twist(0.0) == (0.0, 0.0), "the key Esc ends the motion"
     stick.press(b" ", 0.1)
     assert stick.stop_asked
+
+
+def test_letters(stick: Stick) -> None:
+    stick.press(b"aq", 0.0)
+    assert stick.arm_asked and stick.quit and not stick.stop_asked
 
 
 def test_keys_that_were_typed_while_it_connected_stop_and_arm_and_move_nothing(stick: Stick) -> None:

@@ -50,6 +50,17 @@ def straight(count: int, step_m: float, heading_rad: float = 0.0) -> Trajectory:
     return trajectory(STEP_NS * np.arange(count), T)
 
 
+def test_truth_in_another_world_is_no_error() -> None:
+    truth = spline()
+    moved = trajectory(truth.stamps_ns, se3.exp([4.0, -2.0, 1.0, 0.3, -0.2, 2.5]) @ truth.T)
+    metrics = evaluate(moved, truth)
+    assert (metrics.pairs, metrics.coverage) == (80, 1.0)
+    assert metrics.length_estimate_m == pytest.approx(metrics.length_truth_m)
+    errors = [metrics.ate_rmse_m, metrics.ate_max_m, metrics.end_error_m, metrics.heading_max_rad]
+    errors += [metrics.rpe_translation_rmse_m, metrics.rpe_rotation_rmse_rad, metrics.length_error_ratio]
+    np.testing.assert_allclose(errors, 0.0, atol=1e-7)
+
+
 def test_known_errors() -> None:
     metrics = evaluate(straight(11, 0.099, heading_rad=-0.02), straight(11, 0.1))
     assert metrics.length_truth_m == pytest.approx(1.0)

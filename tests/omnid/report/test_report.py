@@ -32,6 +32,7 @@ from tests.omnid.report.recorded_logs import (
     T_odom_base,
     at,
     cloud,
+    corrupt_chunks,
     drive,
     map_pose,
     odom,
@@ -41,6 +42,7 @@ from tests.omnid.report.recorded_logs import (
     status,
 )
 
+TERMINAL = "x\x1b[31m\x07\x9b2J"
 EVIL = "<script>alert('x')</script>\"'&<img src=x onerror=y>"
 STARTED_AGAIN = ("state", "the robot was started again, with a new odom")
 
@@ -168,6 +170,29 @@ def test_any_bytes_give_a_page_or_one_error_line(tmp_path: Path, seed: int) -> N
         assert "\n" not in str(error)
 
 
+@pytest.fixture
+def hostile(tmp_path: Path) -> Path:
+    """A log whose topic, frames, states, file name, attachments and settings hold sequences that control a terminal."""
+    entries = [odom(k, topic=f"/{TERMINAL}/odom") for k in range(5)]
+    entries += [
+        status(2, DiagnosticStatus(ODOMETRY, 2, TERMINAL, {TERMINAL: TERMINAL})),
+        status(3, DiagnosticStatus(TERMINAL, 1, f"{TERMINAL} again", {})),
+    ]
+    attachments = {f"{TERMINAL}.txt": b"", "omnid.toml": b'"\\u001b]0;x\\u0007" = "\\u009b31m"', "rig.toml": b"a = 1"}
+    return save(tmp_path / f"{TERMINAL}.mcap", entries, attachments)
+
+
+def test_prints_no_control_characters_of_a_log(hostile: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = hostile.with_name("page.html")
+    main(["report", str(hostile), "-o", str(page)])
+    main(["log", "info", str(hostile)])
+    main(["log", "info", str(hostile.with_name(f"{TERMINAL}.none"))])
+    main(["report", str(hostile), "--topic", TERMINAL, "-o", str(page)])
+    shown = "".join((*capsys.readouterr(), page.read_text("utf-8")))
+    assert "poses of" in shown and "odom" in shown
+    assert not set(shown) & {chr(code) for code in (*range(9), *range(11, 32), *range(127, 160))}
+
+
 def test_states_gaps_resets_losses_and_messages_are_events(tmp_path: Path) -> None:
     camera = camera_name("upper")
     entries = [
@@ -242,6 +267,25 @@ def test_a_robot_that_was_started_again_during_the_recording_has_not_jumped_to_i
     found = read_run(save(tmp_path / "a.mcap", entries))
     assert found.length_m() == pytest.approx(2 * 1.9) and found.restarts == [20]
     assert event_texts(found).count(STARTED_AGAIN) == 1 and sum(count for _, count in found.resets) == resets
+
+
+def test_what_is_invalid_is_left_out_and_counted(tmp_path: Path) -> None:
+    far = np.eye(4)
+    far[0, 3] = 1e12
+    stray = (at(10), "/omnid/odom", "nav_msgs/msg/Odometry", odom(10**6)[3])
+    entries = [*run(10), (at(10), *odom(10, far)[1:]), stray, (at(11), *odom(5, np.eye(4))[1:]), odom(12)]
+    found = read_run(save(tmp_path / "log.mcap", entries))
+    assert (len(found.t_s), found.unreadable, found.late) == (11, 2, 1)
+    text = Page(report_html(found)).text
+    assert "2 messages were left out" in text and "1 poses were left out" in text
+    log = save(tmp_path / "a.mcap", run(60))
+    corrupt_chunks(log)
+    found = read_run(log)
+    assert found.corrupt == 2 and 40 < len(found.t_s) < 60
+    page = report_html(found)
+    assert "2 corrupt chunks or records were skipped." in page and "MB, cut or corrupt. Poses" in page
+    single = save(tmp_path / "b.mcap", [odom(0), map_pose(1, np.eye(4))], {"omnid.toml": b"a." * 20_000 + b"a = 1"})
+    assert not len(read_run(single).map_poses) and "settings cannot be read" in html_of(single)
 
 
 def test_the_path_in_the_map_is_drawn_beside_that_of_odometry_and_its_correction_over_time(tmp_path: Path) -> None:
