@@ -143,7 +143,6 @@ def main() -> None:
     arguments = parser.parse_args()
     table = ResultTable(
         "mapped_poles" if arguments.poles else "mapped_floor",
-        "obstacles",
         f"Cells of {'plain poles' if arguments.poles else 'things'} that maps call free",
         (
             Column("cells of"),

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
+from typing import Final
+
 from omnid.core.control.motion_monitor import NOT_COMMANDED, NOT_SEEN
 from omnid.core.control.safety_rules import POSE_LOST, POSE_STALE
 from omnid.transport.status_names import STOPPED_PREFIX
@@ -22,52 +25,20 @@ def camera_fault(setting: Setting, line: str, part: str, word: str) -> Outcome:
     return Outcome("alive, recovered by itself", "stopped, turned again with the next setpoint", status)
 
 
-@trial("upper camera stuck")
-def upper_stuck(setting: Setting) -> Outcome:
-    """No more images of one camera."""
-    return camera_fault(setting, "upper mute", "pairing", "no images of the upper camera")
-
-
-@trial("lower camera stuck")
-def lower_stuck(setting: Setting) -> Outcome:
-    """No more images of the other."""
-    return camera_fault(setting, "lower mute", "pairing", "no images of the lower camera")
-
-
-@trial("both cameras stuck")
-def both_stuck(setting: Setting) -> Outcome:
-    """No more images at all."""
-    return camera_fault(setting, "both mute", "pairing", "no images of the lower and the upper camera")
-
-
-@trial("garbage JPEG")
-def garbage(setting: Setting) -> Outcome:
-    """Noise between a JPEG's first and last bytes."""
-    return camera_fault(setting, "lower garbage", "pairing", "cannot be decoded")
-
-
-@trial("JPEG cut in half")
-def cut(setting: Setting) -> Outcome:
-    """Images whose end is missing."""
-    return camera_fault(setting, "both cut", "pairing", "cannot be decoded")
-
-
-@trial("black frames")
-def black(setting: Setting) -> Outcome:
-    """The light goes off."""
-    return camera_fault(setting, "both black", "odometry", "lost")
-
-
-@trial("upper camera frozen")
-def upper_frozen(setting: Setting) -> Outcome:
-    """One camera delivers the same image with new stamps."""
-    return camera_fault(setting, "upper frozen", "pairing", "images of the upper camera are frozen")
-
-
-@trial("both cameras frozen")
-def both_frozen(setting: Setting) -> Outcome:
-    """Both cameras deliver the same image with new stamps."""
-    return camera_fault(setting, "both frozen", "pairing", "images of the lower and the upper camera are frozen")
+# Fault -> what is injected, the part of the status that names it, and the words in which it does.
+NO_IMAGES, FROZEN = "no images of the", "are frozen"
+CAMERA_FAULTS: Final = {
+    "upper camera stuck": ("upper mute", "pairing", f"{NO_IMAGES} upper camera"),
+    "lower camera stuck": ("lower mute", "pairing", f"{NO_IMAGES} lower camera"),
+    "both cameras stuck": ("both mute", "pairing", f"{NO_IMAGES} lower and the upper camera"),
+    "garbage JPEG": ("lower garbage", "pairing", "cannot be decoded"),
+    "JPEG cut in half": ("both cut", "pairing", "cannot be decoded"),
+    "black frames": ("both black", "odometry", "lost"),
+    "upper camera frozen": ("upper frozen", "pairing", f"images of the upper camera {FROZEN}"),
+    "both cameras frozen": ("both frozen", "pairing", f"images of the lower and the upper camera {FROZEN}"),
+}
+for name, (line, part, word) in CAMERA_FAULTS.items():
+    trial(name)(partial(camera_fault, line=line, part=part, word=word))
 
 
 @trial("every fourth image repeated")

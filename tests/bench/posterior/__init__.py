@@ -1,1 +1,0 @@
-"""Obstacles by one posterior for each direction and range: an experiment that is to replace omnid/core/obstacles."""
