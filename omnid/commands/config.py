@@ -43,10 +43,20 @@ def run(args: argparse.Namespace) -> int:
     args.config = args.file or args.config
     config = settings_of(args)
     if args.action == "check":
+        _require_usable(config)
         print("\n".join(_differences(config, str(args.file))))
     else:
         print(dump_minimal(config, FIRST_SETTINGS) if args.minimal else dump(config), end="")
     return 0
+
+
+def _require_usable(config: Config) -> None:
+    """Raise OmnidError or DriverError for words that only the daemon's start would refuse."""
+    from drivers.motors.protocols.protocol_registry import motor_protocol
+    from omnid.transport.bus_config import checked
+
+    checked(config.bus)
+    motor_protocol(config.motor.protocol)
 
 
 def _differences(config: Config, name: str) -> list[str]:

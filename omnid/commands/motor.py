@@ -50,11 +50,13 @@ from them, and have the emergency stop at hand. The daemon must not run. Ctrl-C 
 )
 def run(args: argparse.Namespace) -> int:
     """Test the wiring and print the settings."""
+    from drivers.motors.protocols.protocol_registry import motor_protocol
     from omnid.doctor.wheel_wiring import WiringTest
 
     config = settings_of(args).motor
     if not config.port:
         raise OmnidError("no motor controller is configured: name its port by --motor, or set motor.port")
+    motor_protocol(config.protocol)  # known before anybody is asked to raise the robot
     text = _text_of(args.write)
     test = WiringTest(config, ask, speed_mps=args.speed, turns=args.turns)
     if ask(_BEFORE).lower() != "yes":

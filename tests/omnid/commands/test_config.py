@@ -43,3 +43,8 @@ def test_check_lists_what_differs(omnid: Command, tmp_path: Path) -> None:
     )
     file.write_text("[bus]\nrobots = 'rover'\n")
     assert "did you mean bus.robot?" in omnid.refused("config", "check", file)
+    file.write_text("[motor]\nprotocol = 'waveshare_json'\n")
+    assert "expected one of line, roboteq" in omnid.refused("config", "check", file)
+    assert "expected one of line, roboteq" in omnid.refused("motor", "test", "--motor", "simulated", "--config", file)
+    file.write_text("[bus]\nrobot = 'a/*'\n")
+    assert "bus.robot is 'a/*'" in omnid.refused("config", "check", file)
