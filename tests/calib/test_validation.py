@@ -1,4 +1,4 @@
-"""Sizes of files and images, rigid transforms."""
+"""Sizes of files are bounded."""
 
 from __future__ import annotations
 

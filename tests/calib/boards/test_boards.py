@@ -1,4 +1,4 @@
-"""Boards: corners in order, sizes that no board has, and the shape of a print."""
+"""Sizes that no board has are refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Live calibration: which pairs are kept, what they cover, what is missing, and pairs of two cameras."""
+"""Live calibration: which pairs are kept."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The view, mirror or lens, by markers, rim and hub, lines, or boards near the rim; else it is asked for."""
+"""The view, mirror or lens, by markers; what the images leave open is asked for."""
 
 from __future__ import annotations
 

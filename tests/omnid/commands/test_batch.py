@@ -1,4 +1,4 @@
-"""`omnid batch` on short real logs: results, resumption, killed programs, interruption, a scheduler, wrong input."""
+"""`omnid batch` on short real logs: results, resumption, killed programs, interruption, wrong input."""
 
 from __future__ import annotations
 

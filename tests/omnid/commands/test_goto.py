@@ -34,22 +34,11 @@ def test_goals_in_odom_and_in_the_saved_map(tmp_path: Path, capsys: pytest.Captu
     port, truth = free_port(), tmp_path / "truth.tum"
     connect = ["--connect", f"tcp/127.0.0.1:{port}"]
     command = [
-        sys.executable,
-        "-m",
-        "omnid",
-        "simulate",
-        "room",
-        "--no-people",
-        "--size",
-        "320",
-        "--truth",
-        str(truth),
-        "--map",
-        str(tmp_path / "site.omap"),
-        "--set",
-        f'bus.listen=["tcp/127.0.0.1:{port}"]',
-        "--set",
-        "controller.collision.unknown=slow",
+        *(sys.executable, "-m", "omnid", "simulate", "room", "--no-people", "--size", "320"),
+        *("--truth", str(truth)),
+        *("--map", str(tmp_path / "site.omap")),
+        *("--set", f'bus.listen=["tcp/127.0.0.1:{port}"]'),
+        *("--set", "controller.collision.unknown=slow"),
     ]  # such small images show little of the floor
     goals: dict[str, list[tuple[str, ...]]] = {"odom": [("0.8", "0"), ("0", "0", "0")], "map": [tuple(map(str, GOAL))]}
     for frame, poses in goals.items():

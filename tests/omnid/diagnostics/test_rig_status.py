@@ -1,4 +1,4 @@
-"""The rig's entry of the status: its state with advice."""
+"""The rig's entry of the status: a rig that was not checked."""
 
 from __future__ import annotations
 

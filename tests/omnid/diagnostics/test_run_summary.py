@@ -1,4 +1,4 @@
-"""The summary of a run fits the terminal, and has one line for each counter where there is none."""
+"""The summary of a run ends with what everybody wants to know."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Telemetry: quantiles within 5 % in constant memory, counters of stages."""
+"""Telemetry: quantiles within 5 %, and the summary of stages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Plan view: positions, heights, size limits, readable without colour."""
+"""Plan view: positions, heights, size limits."""
 
 from __future__ import annotations
 

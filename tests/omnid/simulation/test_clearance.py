@@ -1,4 +1,4 @@
-"""Distance of a disc from what stands in its world, and the contacts of a drive."""
+"""Distance of a disc from what stands in its world."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`omnid demo --drive`: the requests of its script, and its image."""
+"""`omnid demo --drive`: the requests of its script, and drives that fail."""
 
 from __future__ import annotations
 

@@ -43,22 +43,11 @@ def test_a_slowed_daemon_reaches_its_goal_and_loses_nothing(tmp_path: Path, caps
     port, truth = free_port(), tmp_path / "truth.tum"
     connect = ["--connect", f"tcp/127.0.0.1:{port}"]
     command = [
-        sys.executable,
-        "-m",
-        "omnid",
-        "simulate",
-        "room",
-        "--no-people",
-        "--size",
-        "320",
-        "--truth",
-        str(truth),
-        "--set",
-        f'bus.listen=["tcp/127.0.0.1:{port}"]',
-        "--set",
-        "live.status_s=0.2",
-        "--set",
-        "controller.collision.unknown=slow",
+        *(sys.executable, "-m", "omnid", "simulate", "room", "--no-people", "--size", "320"),
+        *("--truth", str(truth)),
+        *("--set", f'bus.listen=["tcp/127.0.0.1:{port}"]'),
+        *("--set", "live.status_s=0.2"),
+        *("--set", "controller.collision.unknown=slow"),
     ]  # such small images show little of the floor
     with started(command, port) as daemon:
         wait_until(lambda: main(["arm", *connect]) == 0, "arming")

@@ -1,4 +1,4 @@
-"""People of a simulated world: they walk, wait for the robot, and turn round."""
+"""People of a simulated world: they walk, and wait for the robot."""
 
 from __future__ import annotations
 

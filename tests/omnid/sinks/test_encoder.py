@@ -1,4 +1,4 @@
-"""Which ROS 2 messages are made of an update, and the poses of a run in arrays."""
+"""Which ROS 2 messages are made of an update."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""CDR messages against rosbags, which is the oracle of their bytes; decoders that take any bytes; attachments."""
+"""CDR messages against rosbags, which is the oracle of their bytes; decoders that take any bytes."""
 
 from __future__ import annotations
 

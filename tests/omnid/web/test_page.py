@@ -303,20 +303,10 @@ def rests(page: Any) -> bool:
 def test_stick_keys_and_a_tap_drive_a_simulated_robot(browser: Any, size: str, scheme: str) -> None:
     endpoint = free_endpoint()
     command = [
-        sys.executable,
-        "-m",
-        "omnid",
-        "simulate",
-        "room",
-        "--no-people",
-        "--size",
-        "320",
-        "--set",
-        f'bus.listen=["{endpoint}"]',
-        "--set",
-        "live.status_s=0.5",
-        "--set",
-        "controller.collision.unknown=slow",
+        *(sys.executable, "-m", "omnid", "simulate", "room", "--no-people", "--size", "320"),
+        *("--set", f'bus.listen=["{endpoint}"]'),
+        *("--set", "live.status_s=0.5"),
+        *("--set", "controller.collision.unknown=slow"),
     ]  # such small images show little of the floor
     with (
         started(command, 0) as daemon,

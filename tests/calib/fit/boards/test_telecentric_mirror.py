@@ -1,4 +1,4 @@
-"""Mirrors below telecentric lenses: the wavefront that the image tells, found by boards, refused where it is none."""
+"""Mirrors below telecentric lenses: the wavefront that the image tells, found by boards."""
 
 from __future__ import annotations
 

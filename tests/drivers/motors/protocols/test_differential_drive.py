@@ -1,4 +1,4 @@
-"""The differential drive: units, signs, wiring, and limits that keep the curvature."""
+"""The differential drive: its wiring, and sizes that no base has."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Voxel map: fusion by information, frame counts, bounded memory, deterministic results."""
+"""Voxel map: confidence, refused points, bounded memory, deterministic results."""
 
 from __future__ import annotations
 

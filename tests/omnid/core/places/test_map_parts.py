@@ -1,4 +1,4 @@
-"""Parts of a map: membership, joining, and what is forgotten."""
+"""Parts of a map that are joined: which of them moves."""
 
 from __future__ import annotations
 

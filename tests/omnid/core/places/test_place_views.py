@@ -1,4 +1,4 @@
-"""Views of a map: parts, sizes, landmarks and grid in the axes of the base."""
+"""Views of a map: landmarks and grid in the axes of the base."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Landmarks of a drive: seen again in both panoramas where the path predicts them, and in bounded memory."""
+"""Landmarks of a drive are seen again in both panoramas where the path predicts them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A sensor's faults: struts and hub, a darker rim, changing light, noise, JPEG."""
+"""A sensor's faults: changing light and noise."""
 
 from __future__ import annotations
 
