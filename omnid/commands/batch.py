@@ -18,6 +18,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -228,13 +229,15 @@ def _client(scheduler: str | None, jobs: int) -> Any:
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # each connection and repetition is told
     if not scheduler:
         here = "127.0.0.1:0"  # dask has web servers in any case, by default for all machines of the network
-        return distributed.Client(
-            processes=False,
-            n_workers=1,
-            threads_per_worker=jobs,
-            dashboard_address=here,
-            worker_dashboard_address=here,
-        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # it looks for this machine's address, also without network
+            return distributed.Client(
+                processes=False,
+                n_workers=1,
+                threads_per_worker=jobs,
+                dashboard_address=here,
+                worker_dashboard_address=here,
+            )
     try:
         return distributed.Client(scheduler, timeout="10 s")
     except (OSError, TimeoutError, ValueError) as error:
