@@ -72,9 +72,7 @@ RULES = (
         ("zenoh",),
         excepted=(
             "omnid/transport/bus.py",
-            "omnid/transport/command_intake.py",
-            "omnid/transport/open_requests.py",
-            "omnid/transport/publishers.py",
+            "omnid/transport/intake.py",
             "omnid/transport/session.py",
             "omnid/transport/driver.py",
             "omnid/client.py",

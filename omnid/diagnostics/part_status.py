@@ -23,8 +23,8 @@ from omnid.stages.odometry import OdometryStage
 from omnid.stages.places import Places
 from omnid.tracking_state import MapState
 from omnid.transport.codec import ERROR, OK, STALE, WARN
+from omnid.transport.commands import SensorReceiver
 from omnid.transport.records import DiagnosticStatus
-from omnid.transport.sensor_receiver import SensorReceiver
 from omnid.transport.status_names import (
     FIXED_PERCENT,
     FLOOR,

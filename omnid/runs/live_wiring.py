@@ -45,10 +45,9 @@ from omnid.stages.obstacles import ADVICE
 from omnid.stages.places import Places
 from omnid.stages.synchronise import Synchronise
 from omnid.transport.bus import Bus
-from omnid.transport.commands import CommandReceiver
+from omnid.transport.commands import CommandReceiver, StampRule
 from omnid.transport.navigation_commands import NavigationReceiver, RequestQueue
 from omnid.transport.requests import Answer, Request
-from omnid.transport.stamps import StampRule
 from omnid.transport.status_names import DISARMED_BY_STOP
 from omnid.transport.topics import ARM, MAP, MAP_TOPICS, NAVIGATION_TOPICS, SENSOR_TOPICS, command_topics
 

@@ -15,7 +15,7 @@ from omnid.controller.link import DriveLink
 from omnid.engine.logging_setup import Report
 from omnid.errors import OmnidError
 from omnid.stages.motion_inbox import MotionInbox
-from omnid.transport.sensor_receiver import SensorReceiver
+from omnid.transport.commands import SensorReceiver
 from omnid.transport.topics import IMU, JOINT_STATES, WHEEL_ODOM
 
 

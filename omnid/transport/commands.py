@@ -1,20 +1,28 @@
-"""Commands from the network, validated: `<robot>/cmd/twist`, `/cmd/heading`, `/cmd/stop` and `/cmd/arm`.
+"""What comes from the network, validated: commands and contacts below `<robot>/cmd`, samples of wheels and gyro.
 
 twist is a geometry_msgs/msg/TwistStamped in base_link: linear.x m/s, angular.z rad/s; or a plain Twist, whose stamp is
 the time of sending that rmw_zenoh attaches. heading is a
 geometry_msgs/msg/Vector3Stamped: x the speed in m/s, z the heading in odom in rad. Both also exist for each source of
 commands, as cmd/planner/twist. stop may have any payload. arm is a std_msgs/msg/Header with the time it was sent.
 bumper and cliff are std_msgs/msg/Bool with the time of sending attached: all but a fresh False is a contact.
+
+The times of sending obey one rule, `bus.command_clock`: what can begin or resume a motion needs a stamp of now, so that
+a message that waited in a network, or was recorded, begins none later. What ends a motion needs none.
+
+Samples are wheel_odom (nav_msgs/msg/Odometry), imu (Imu) and joint_states (JointState). They are below `cmd`, too,
+because they move the pose while the cameras show nothing: only programs that may command the robot may write them.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple, Protocol
 
+from drivers.logs.ros_messages import JointWheels
+from drivers.motion import MotionSample
 from omnid.core.control.arming import OLDER_THAN_STOP, ArmRequest
 from omnid.core.control.command_sources import OPERATOR, PLANNER, TimedSetpoint
 from omnid.core.control.contacts import BUMPER, CLIFF
@@ -29,11 +37,81 @@ from omnid.transport.codec import (
     stamp_from_cdr,
     twist_from_cdr,
 )
+from omnid.transport.motion_codec import sample_from_cdr
 from omnid.transport.requests import Answer, Request
-from omnid.transport.stamps import ADVICE, RefusedStamp, StampRule
-from omnid.transport.topics import ARM, HEADING, STOP, TWIST
+from omnid.transport.topics import ARM, HEADING, SENSOR_TOPICS, STOP, TWIST
+
+UNSTAMPED: Final = "no stamp"
+TOO_OLD, EARLY = "too old", "stamp in the future"
+NOT_RISING: Final = "stamp does not rise"
+USED_BEFORE: Final = "stamp was used before"
+MOST_ARM_STAMPS: Final = 256  # remembered, where the senders' clocks are others
+_CLOCKS: Final = (
+    "on a busy computer try again; from another machine synchronise the clocks, or set bus.command_clock = "
+    '"arrival"; controller.deadlines.command_s is the longest age'
+)
+ADVICE: Final = {
+    UNSTAMPED: "fill in the stamp (ROS 2: `header: auto`; String: last word stamp=NANOSECONDS); for a plain Twist set "
+    'bus.command_clock = "arrival"',
+    TOO_OLD: _CLOCKS,
+    EARLY: _CLOCKS,
+    NOT_RISING: "one sender per topic, or arm the robot again for a sender whose clock began again",
+}
+
+
+class RefusedStamp(OmnidError):  # noqa: N818 - named after what it reports
+    """A stamp that is not fresh; its first argument is the reason, which is counted."""
+
+
+class StampRule:
+    """Judges stamps, ns of Unix time by the sender's clock; 0: the message has none.
+
+    Synchronised clocks: the stamp differs from this machine's clock by stale_s at most, before and after. Other clocks:
+    the stamps of each topic rise; after a request to arm they may begin again lower, as of another sender, and that
+    request needs a stamp that none of the last ones had.
+    """
+
+    def __init__(self, stale_s: float, *, synchronised: bool = True) -> None:
+        self.synchronised = synchronised
+        self._stale_ns = round(stale_s * 1e9)
+        self._newest_ns: dict[str, int] = {}  # stamp of the newest message that was accepted, by topic
+        self._arm_stamps_ns: deque[int] = deque(maxlen=MOST_ARM_STAMPS)
+
+    def check(self, topic: str, stamp_ns: int) -> None:
+        """Raise RefusedStamp for a message of a topic whose stamp is missing or not fresh."""
+        if not stamp_ns:
+            raise RefusedStamp(UNSTAMPED)
+        if self.synchronised:
+            self._check_age(stamp_ns)
+            return
+        if stamp_ns <= self._newest_ns.get(topic, 0):
+            raise RefusedStamp(NOT_RISING)
+        self._newest_ns[topic] = stamp_ns
+
+    def check_arm(self, stamp_ns: int) -> None:
+        """Raise RefusedStamp for a request to arm whose stamp is missing, not fresh or used before."""
+        if not stamp_ns:
+            raise RefusedStamp(UNSTAMPED)
+        if self.synchronised:
+            self._check_age(stamp_ns)
+        elif stamp_ns in self._arm_stamps_ns:
+            raise RefusedStamp(USED_BEFORE)
+
+    def accept_arm(self, stamp_ns: int) -> None:
+        """Remember a request to arm that was accepted; stamps may begin again after it."""
+        self._arm_stamps_ns.append(stamp_ns)
+        self._newest_ns.clear()
+
+    def _check_age(self, stamp_ns: int) -> None:
+        age_ns = time.time_ns() - stamp_ns
+        if age_ns > self._stale_ns:
+            raise RefusedStamp(TOO_OLD)
+        if age_ns < -self._stale_ns:
+            raise RefusedStamp(EARLY)
+
 
 LONGEST_PAYLOAD: Final = 4096  # bytes
+LONGEST_SAMPLE: Final = 8192  # bytes
 MAX_SPEED_MPS, MAX_YAW_RATE_RADPS, MAX_HEADING_RAD = 20.0, 50.0, 1000.0  # larger numbers are faults of the sender
 
 
@@ -218,3 +296,39 @@ class CommandReceiver:
 def _check_length(payload: bytes) -> None:
     if len(payload) > LONGEST_PAYLOAD:
         raise RefusedCommand("too long")
+
+
+class SensorReceiver:
+    """Passes valid samples on and counts the others; called from threads of the bus, never raises."""
+
+    def __init__(
+        self,
+        target: Callable[[MotionSample], None],
+        offset_ns: int,
+        topics: frozenset[str],
+        report: Callable[[str], None],
+        joints: JointWheels | None = None,
+    ) -> None:
+        """target: may be called from any thread. offset_ns: from the stamps of images to Unix time.
+
+        topics: those that are used. report: takes a line for the log, once for each topic. joints: the wheels.
+        """
+        self._joints = joints
+        self._target, self._offset_ns, self._topics, self._report = target, offset_ns, topics, report
+        self.refused: Counter[str] = Counter()  # by topic
+
+    def receive(self, key: str, payload: bytes) -> None:
+        """Handle one message."""
+        try:
+            if key not in self._topics:
+                raise OmnidError("it is not used: see motion.wheels, motion.wheel_joints and motion.imu")
+            if len(payload) > LONGEST_SAMPLE:
+                raise OmnidError(f"it has {len(payload)} bytes, more than {LONGEST_SAMPLE}")
+            sample = sample_from_cdr(payload, SENSOR_TOPICS[key], self._offset_ns, self._joints)
+        except OmnidError as error:
+            self.refused[key] += 1
+            if self.refused[key] == 1:
+                self._report(f"a message on {key} is refused: {error}; more of them are counted in the status")
+            return
+        if sample is not None:
+            self._target(sample)

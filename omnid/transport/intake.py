@@ -1,20 +1,33 @@
 """Intake of the bus from the messages that others send, with a limit for each key, and for each sender on it.
 
 zenoh puts messages into a ring without any Python, where the newest replace the oldest. A thread takes a bounded number
-of them, so that no flood takes the time of the stages: with a Python callback, each message would.
+of them, so that no flood takes the time of the stages: with a Python callback, each message would. One pass goes over
+the rings of all commands, stops first; the queries among them wait for their answers here.
 """
 
 from __future__ import annotations
 
+import json
 import time
-from collections import Counter, OrderedDict
-from collections.abc import Callable, Iterator
+from collections import Counter, OrderedDict, deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, Final, Generic, TypeVar
+from itertools import count
+from typing import Any, Final, Generic, NamedTuple, TypeAlias, TypeVar
 
-from omnid.transport.topics import PATH, REQUEST_TOPICS
+import zenoh
+
+from omnid.transport import ros2
+from omnid.transport.bus_config import BusConfig
+from omnid.transport.requests import MOST_OPEN, Answer, Request
+from omnid.transport.topics import ARM, PATH, REQUEST_TOPICS, STOP, request_key
 
 T = TypeVar("T")
+RequestCallback: TypeAlias = Callable[[Request], None]
+PERIOD_S: Final = 0.004  # Time between two passes.
+_UNKNOWN_TOPICS: Final = "cmd/**"
+_LAST: Final = (ARM, STOP)
 MOST_SENDERS: Final = 64  # Most senders on a key that are distinguished.
 TAKEN_PER_DECODED: Final = 4  # messages that are taken for one that a sender may have decoded
 
@@ -112,3 +125,149 @@ def floods(intakes: list[Intake[Any]]) -> Counter[str]:
     for intake in intakes:
         counts[intake.key] += intake.refused + intake.crowded
     return +counts
+
+
+class OpenRequests:
+    """The queries that wait for their answers. Where there are too many, the oldest one is dropped."""
+
+    def __init__(self) -> None:
+        self._numbers = count(1)
+        self._open: dict[int, tuple[str, zenoh.Query]] = {}
+        self._answered: deque[tuple[zenoh.Query, Answer]] = deque(maxlen=MOST_OPEN)
+
+    def add(self, topic: str, query: zenoh.Query | None) -> int:
+        """Return the id of a message; query: what waits for the answer to it, None for a message that was put."""
+        id = next(self._numbers)
+        if query is not None:
+            self._open[id] = topic, query
+            if len(self._open) > MOST_OPEN:
+                self._open.pop(min(self._open.copy()), None)
+        return id
+
+    def answer(self, id: int, answer: Answer, *, also_before: str = "") -> None:
+        """Answer a request, once, from any thread, without waiting.
+
+        also_before: a topic on which a request takes the place of earlier ones, which get the same answer.
+        """
+        for other, (topic, query) in self._open.copy().items():
+            if (other == id or (other < id and topic == also_before)) and self._open.pop(other, None) is not None:
+                self._answered.append((query, answer))
+
+    def send(self) -> None:
+        """Send the answers; this may block while a program does not read, so it has a thread of its own."""
+        while self._answered:
+            query, answer = self._answered.popleft()
+            with suppress(zenoh.ZError):  # the program has gone
+                query.reply(query.key_expr, json.dumps(answer._asdict()), encoding=zenoh.Encoding.APPLICATION_JSON)
+
+
+class _Ring(NamedTuple):
+    """The messages, or the queries, of one key that wait."""
+
+    topic: str
+    prefix: str  # of the key, before the topic
+    intake: Intake[Any]
+
+
+class CommandIntake:
+    """Passes commands on within the budgets of their keys, by `process`, which one thread calls again and again."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        config: BusConfig,
+        topics: Mapping[str, str],
+        requests: OpenRequests,
+        callback: RequestCallback,
+    ) -> None:
+        """topics: those with a ring of their own; all others below `cmd` share one. requests: keeps unanswered queries.
+
+        callback: takes each message, in the thread of `process`.
+        """
+        self._callback, self._open = callback, requests
+        self._topics = frozenset((*topics, *_LAST))
+        self._declared: list[object] = []  # zenoh undeclares what is no longer referred to
+        self._rings = list(self._declare(session, config))
+        self._stops = [ring for ring in self._rings if ring.topic == STOP]
+
+    @property
+    def intakes(self) -> Sequence[Intake[Any]]:
+        """The takers of the messages of all rings, with the counts of refused messages."""
+        return [ring.intake for ring in self._rings]
+
+    def process(self) -> None:
+        """Pass on what has come. Of a stop and a request to arm in one pass the stop wins.
+
+        Which of the two was sent first is not known, because messages of different topics have no common order.
+        """
+        # 1. Stops.
+        stopped, asked_to_arm = self._stop(), False
+        # 2. All other messages; requests to arm are the last of them.
+        for ring in self._rings:
+            if ring.topic == STOP:
+                continue
+            for message in ring.intake.messages():
+                asked_to_arm |= ring.topic == ARM
+                if topic := self._topic(ring, message):
+                    self._pass_on(topic, message)
+        # 3. After a request to arm: a stop that came in the meantime, or else that of step 1 once more.
+        if asked_to_arm and not self._stop() and stopped:
+            self._callback(Request(STOP))
+
+    def _stop(self) -> bool:
+        """Pass on the stops that have come; return whether there was one."""
+        samples = [sample for ring in self._stops for sample in ring.intake.messages()]
+        if samples:
+            self._pass_on(STOP, samples[-1])
+        return bool(samples)
+
+    def _pass_on(self, topic: str, message: zenoh.Sample | zenoh.Query) -> None:
+        payload = b"" if message.payload is None else message.payload.to_bytes()
+        attached = b"" if message.attachment is None else message.attachment.to_bytes()
+        id = self._open.add(topic, message if isinstance(message, zenoh.Query) else None)
+        self._callback(Request(topic, payload, sender_of(message), ros2.sent_ns_in(attached), id))
+
+    def _topic(self, ring: _Ring, message: zenoh.Sample | zenoh.Query) -> str:
+        """Return the topic of a message; empty for a message that is not passed on.
+
+        These are queries of several keys, since a request names one robot and one topic, and messages in the shared
+        ring whose topic has a ring of its own.
+        """
+        key = str(message.key_expr).removeprefix(ring.prefix)
+        if isinstance(message, zenoh.Query):
+            return ring.topic if key == request_key(ring.topic) else ""
+        if ring.topic != _UNKNOWN_TOPICS:
+            return ring.topic
+        # A key of rmw_zenoh ends with the type of the message and the hash of that type.
+        topic = key if ring.prefix == self._rings[0].prefix else key.rsplit("/", 2)[0]
+        return "" if topic in self._topics else topic
+
+    def _declare(self, session: zenoh.Session, config: BusConfig) -> Iterator[_Ring]:
+        """Declare subscribers and queryables; yield their rings."""
+        own, ros = f"{config.robot}/", f"{config.ros2_domain}/{config.robot}/"
+        for topic in (*sorted(self._topics - {*_LAST}), _UNKNOWN_TOPICS, *_LAST):
+            yield self._ring(session.declare_subscriber, own, topic, topic)
+            if config.ros2 == "rmw_zenoh":
+                yield self._ring(
+                    session.declare_subscriber, ros, topic, topic if topic == _UNKNOWN_TOPICS else f"{topic}/*/*"
+                )
+            if topic in REQUEST_TOPICS:
+                yield self._ring(session.declare_queryable, own, topic, request_key(topic))
+
+    def _ring(self, declare: Callable[..., Any], prefix: str, topic: str, key: str) -> _Ring:
+        budget = UNKNOWN if topic == _UNKNOWN_TOPICS else budget_of(topic)
+        declared = declare(f"{prefix}{key}", zenoh.handlers.RingChannel(budget.burst))
+        self._declared.append(declared)
+        return _Ring(topic, prefix, Intake(key, declared.try_recv, budget, sender_of))
+
+
+def sender_of(message: zenoh.Sample | zenoh.Query) -> str:
+    """Return the identity of the program that sent a message, empty where it names none.
+
+    Programs with omnid.client give the source of their messages and attach an identity to their requests. Programs
+    with rmw_zenoh attach the gid of their publisher. zenoh itself adds nothing. The identity proves nothing: what a
+    program may do is decided by the access rules.
+    """
+    if isinstance(message, zenoh.Sample) and message.source_info is not None:
+        return str(message.source_info.source_id.zid)
+    return "" if message.attachment is None else ros2.gid_in(message.attachment.to_bytes())

@@ -27,7 +27,16 @@ from omnid.core.navigation.requests import (
 from omnid.errors import OmnidError
 from omnid.transport import codec
 from omnid.transport.codec import IMU_SCHEMA, JOINT_SCHEMA, bool_cdr, header_message, message_cdr
-from omnid.transport.commands import LONGEST_PAYLOAD, CommandReceiver
+from omnid.transport.commands import (
+    LONGEST_PAYLOAD,
+    NOT_RISING,
+    UNSTAMPED,
+    USED_BEFORE,
+    CommandReceiver,
+    RefusedStamp,
+    SensorReceiver,
+    StampRule,
+)
 from omnid.transport.motion_codec import gyro_cdr, wheel_cdr
 from omnid.transport.navigation_codec import (
     PlanarGoal,
@@ -41,8 +50,6 @@ from omnid.transport.navigation_codec import (
 from omnid.transport.navigation_commands import LONGEST_PAYLOAD as LONGEST_PATH
 from omnid.transport.navigation_commands import NavigationReceiver
 from omnid.transport.requests import Answer, Request
-from omnid.transport.sensor_receiver import SensorReceiver
-from omnid.transport.stamps import NOT_RISING, UNSTAMPED, USED_BEFORE, RefusedStamp, StampRule
 from omnid.transport.topics import IMU, JOINT_STATES, SENSOR_TOPICS, WHEEL_ODOM
 
 STALE_S = 0.5
