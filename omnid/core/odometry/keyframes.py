@@ -37,7 +37,6 @@ class KeyframeRequest:
     covariance: Array  # (6, 6) [t; r] in the rectified frame
     exposure: Exposure
     pixels: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (N, 2) px of the known landmarks
-    ids: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))  # (N,) of them; () to observe none
     views: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (N, 3) px of them at the stamp
 
 
@@ -89,7 +88,6 @@ class Keyframes:
         if len(self._map) >= self._limits.min_inliers:
             self._relocaliser.add(replace(frame, exposure=request.exposure), keyframe)
         self._most_inliers, self._tracked_s = 0, 0.0
-        self._map.store.add_observations(frame.seq, request.ids, request.views)
         return new.pixels
 
     def _wanted(self) -> int:

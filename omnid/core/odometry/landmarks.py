@@ -1,19 +1,16 @@
-"""Store of landmarks and keyframes: points relative to their keyframes, and all observations of each landmark.
+"""Store of landmarks and keyframes: points relative to the keyframes that saw them first.
 
 A landmark is anchored in the keyframe that saw it first. Its position is kept in that keyframe's rectified frame, so
-that a keyframe can be moved (bundle adjustment of a window, loop closing) and its landmarks move with it. Every later
-keyframe in which the landmark is an inlier adds an observation.
+that a keyframe can be moved (loop closing) and its landmarks move with it.
 
 Bounds: at most max_keyframes keyframes K; a keyframe adds at most as many landmarks as the caller passes (F, the
-features wanted), so N <= K F landmarks and at most K observations of each, K N rows of 40 bytes. A landmark leaves with
-its anchor or after max_misses frames without it; a keyframe leaves when it is the oldest of too many or anchors no
-landmark any more; an observation leaves with its landmark or its keyframe.
+features wanted), so N <= K F landmarks. A landmark leaves with its anchor or after max_misses frames without it; a
+keyframe leaves when it is the oldest of too many or anchors no landmark any more.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,25 +70,8 @@ class LandmarkTable:
         return LandmarkTable(none, none, vectors, matrices, vectors, pixels, pixels, vectors, matrices, pixels, none)
 
 
-@dataclass(frozen=True, slots=True)
-class ObservationTable:
-    """One row for each landmark in each keyframe that observed it, its anchor included."""
-
-    landmark: Indices  # (M,) id
-    keyframe: Indices  # (M,) seq
-    views: Array  # (M, 3) px: column, lower row, upper row; NaN: not measured in the upper panorama
-
-    @staticmethod
-    def empty() -> ObservationTable:
-        """Return a table without rows."""
-        return ObservationTable(np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros((0, 3)))
-
-
-Table = TypeVar("Table", LandmarkTable, ObservationTable)
-
-
 class LandmarkStore:
-    """Keyframes by seq, their landmarks and the observations."""
+    """Keyframes by seq, and their landmarks."""
 
     def __init__(self, model: StereoModel, max_keyframes: int = 8, max_misses: int = 3) -> None:
         self._model, self._max_keyframes, self._max_misses = model, max_keyframes, max_misses
@@ -99,10 +79,9 @@ class LandmarkStore:
         self.clear()
 
     def clear(self) -> None:
-        """Remove all keyframes, landmarks and observations."""
+        """Remove all keyframes and landmarks."""
         self.keyframes: dict[int, Keyframe] = {}
         self.table = LandmarkTable.empty()
-        self.observations = ObservationTable.empty()
 
     def __len__(self) -> int:
         return len(self.table.id)
@@ -146,7 +125,6 @@ class LandmarkStore:
         )
         self.keyframes[keyframe.seq] = keyframe
         self.table = _joined(self.table, new)
-        self._observe(ids, keyframe.seq, views)
         while len(self.keyframes) > self._max_keyframes:
             self.keyframes.pop(min(self.keyframes))
         self._select(np.isin(self.table.anchor, list(self.keyframes)))
@@ -179,14 +157,6 @@ class LandmarkStore:
                 self.keyframes[seq], found.anchor_points[own], found.anchor_covariance[own]
             )
         self.table = found
-
-    def add_observations(self, seq: int, ids: Indices, views: Array) -> None:
-        """Add observations (M, 3) [px] in a keyframe of landmarks (ids) that were known before.
-
-        Landmarks and keyframes that have been removed are ignored.
-        """
-        known = np.isin(ids, self.table.id) & (seq in self.keyframes)
-        self._observe(ids[known], seq, views[known])
 
     def update_depths(self, rows: Indices, disparity: Array, variance: Array, T_odom_rect: Array) -> None:
         """Correct the points of landmarks (rows (M,) of the table) by disparities (M,) [px] measured at a pose.
@@ -260,18 +230,11 @@ class LandmarkStore:
         anchors, counts = np.unique(self.table.anchor[rows], return_counts=True)
         return {int(a): float(n) / len(rows) for a, n in zip(anchors, counts, strict=True)}
 
-    def _observe(self, ids: Indices, seq: int, views: Array) -> None:
-        self.observations = _joined(self.observations, ObservationTable(ids, np.full(len(ids), seq), views))
-
     def _select(self, kept: Flags) -> None:
-        """Keep some landmarks (flags (N,)), the keyframes that anchor them, and the observations between both."""
+        """Keep some landmarks (flags (N,)) and the keyframes that anchor them."""
         self.table = _selected(self.table, kept)
         anchors = set(self.table.anchor.tolist())
         self.keyframes = {seq: keyframe for seq, keyframe in self.keyframes.items() if seq in anchors}
-        rows = self.observations
-        self.observations = _selected(
-            rows, np.isin(rows.landmark, self.table.id) & np.isin(rows.keyframe, list(self.keyframes))
-        )
 
 
 def _in_odom(keyframe: Keyframe, points: Array, covariance: Array) -> tuple[Array, Array]:
@@ -281,14 +244,14 @@ def _in_odom(keyframe: Keyframe, points: Array, covariance: Array) -> tuple[Arra
     return found
 
 
-def _selected(table: Table, kept: Flags) -> Table:
+def _selected(table: LandmarkTable, kept: Flags) -> LandmarkTable:
     """Return the rows of a table for which kept (N,) is true."""
-    return type(table)(*(getattr(table, column.name)[kept] for column in fields(table)))
+    return LandmarkTable(*(getattr(table, column.name)[kept] for column in fields(table)))
 
 
-def _joined(first: Table, second: Table) -> Table:
+def _joined(first: LandmarkTable, second: LandmarkTable) -> LandmarkTable:
     """Return the rows of two tables."""
-    return type(first)(
+    return LandmarkTable(
         *(np.concatenate([getattr(first, column.name), getattr(second, column.name)]) for column in fields(first))
     )
 

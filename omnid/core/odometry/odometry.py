@@ -304,7 +304,7 @@ class VisualOdometry:
         request = self._request(frame, usable, exposure)
         if self._limits.keyframes == 1:
             return request
-        return replace(request, pixels=estimate.pixels, ids=ids, views=estimate.views)
+        return replace(request, pixels=estimate.pixels, views=estimate.views)
 
     def _request(self, frame: StereoFrame, usable: Flags, exposure: Exposure) -> KeyframeRequest:
         """Return the request of a keyframe at the current pose, all of whose landmarks are new."""
