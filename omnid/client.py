@@ -24,22 +24,23 @@ import zenoh
 
 from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig
+from omnid.transport.codec import PoseAttachment
 from omnid.transport.decode import (
     Cloud,
     Diagnostics,
     Map,
     NavigationReport,
     Pose,
+    Scan,
     decode_cloud,
     decode_diagnostics,
     decode_map,
     decode_navigation,
     decode_pose,
+    decode_scan,
 )
 from omnid.transport.driver import CONNECT_S, Driver
-from omnid.transport.pose_attachment import PoseAttachment
 from omnid.transport.requests import Answer
-from omnid.transport.scan_codec import Scan, decode_scan
 from omnid.transport.session import ALIVE, HERE, Unreachable, open_client, robots_there
 
 __all__ = [

@@ -21,8 +21,7 @@ from drivers.frame import Frame, FrameSource, gray
 from omnid.calibration.board_search import AnyBoard, search_board
 from omnid.calibration.images import SIDES, Image, middle_px
 from omnid.errors import OmnidError
-from omnid.transport.codec import OK
-from omnid.transport.records import DiagnosticStatus
+from omnid.transport.codec import OK, DiagnosticStatus
 from omnid.transport.status_names import CALIBRATION, Key
 
 HOURS: Final = 12  # sectors; hour 12 is the top of the image

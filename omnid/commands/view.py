@@ -187,7 +187,7 @@ def _log(sink: RerunSink, config: Config, args: argparse.Namespace) -> int:
         odometry_topics,
     )
     from omnid.runs.replay import ReplayOptions
-    from omnid.transport.records import OdometryRecord
+    from omnid.transport.decode import OdometryRecord
     from omnid.transport.topics import MAP_POSE, SCAN
 
     found = log_info(args.log)

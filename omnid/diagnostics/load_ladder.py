@@ -7,8 +7,7 @@ from typing import Final
 
 from omnid.engine.telemetry import StageStats
 from omnid.load_level import LoadLevel
-from omnid.transport.codec import OK, WARN
-from omnid.transport.records import DiagnosticStatus
+from omnid.transport.codec import OK, WARN, DiagnosticStatus
 from omnid.transport.status_names import LOAD, Key
 
 PERIOD_S: Final = 1.0  # A ticker observes the pairing with this period.

@@ -22,9 +22,8 @@ from omnid.stages.obstacles import CameraFloor
 from omnid.stages.odometry import OdometryStage
 from omnid.stages.places import Places
 from omnid.tracking_state import MapState
-from omnid.transport.codec import ERROR, OK, STALE, WARN
+from omnid.transport.codec import ERROR, OK, STALE, WARN, DiagnosticStatus
 from omnid.transport.commands import SensorReceiver
-from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import (
     FIXED_PERCENT,
     FLOOR,

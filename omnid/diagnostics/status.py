@@ -19,9 +19,8 @@ from omnid.messages import OdometryUpdate
 from omnid.stages.synchronise import Synchronise
 from omnid.tracking_state import TrackingState
 from omnid.transport import status_names
-from omnid.transport.codec import ERROR, OK, STALE, WARN
+from omnid.transport.codec import ERROR, OK, STALE, WARN, DiagnosticStatus
 from omnid.transport.commands import CommandReceiver
-from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import Key, time_key
 
 # If the skew between the cameras changes by more, their clocks run at different rates.

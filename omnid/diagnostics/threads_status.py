@@ -8,8 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from omnid.transport.codec import OK
-from omnid.transport.records import DiagnosticStatus
+from omnid.transport.codec import OK, DiagnosticStatus
 from omnid.transport.status_names import THREADS, Key
 
 LIBRARIES: Final = "libraries"  # threads that libraries started without a name: OpenCV's and BLAS's pools

@@ -21,7 +21,7 @@ import serial  # type: ignore[import-untyped]
 
 from drivers.motion import GyroSample
 from omnid.transport.bus_config import BusConfig
-from omnid.transport.motion_codec import gyro_cdr
+from omnid.transport.sensor_codec import gyro_cdr
 from omnid.transport.session import HERE, open_client
 
 PACKET = struct.Struct("<BB4hB")

@@ -12,8 +12,7 @@ from omnid.camera_config import CamerasConfig
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.light.exposure_law import STEP_S, ExposureLaw, ExposureState, GreyLevels, UsefulArea
 from omnid.messages import FramePair
-from omnid.transport.codec import OK, WARN
-from omnid.transport.records import DiagnosticStatus
+from omnid.transport.codec import OK, WARN, DiagnosticStatus
 from omnid.transport.status_names import EXPOSURE, Key
 
 PERIOD_SHARE: Final = 0.9  # Longest exposure by the images' period: the rest reads the image out.

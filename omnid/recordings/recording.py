@@ -24,13 +24,23 @@ from omnid.transport.codec import (
     MAP_POSE_SCHEMA,
     ODOMETRY_SCHEMA,
     POINT_CLOUD_SCHEMA,
+    SCAN_SCHEMA,
     TWIST_SCHEMA,
+)
+from omnid.transport.decode import (
+    Cloud,
+    Diagnostics,
+    OdometryRecord,
+    PoseInMap,
+    Scan,
+    TwistRecord,
+    decode_cloud,
+    decode_diagnostics,
+    decode_map_pose,
+    decode_scan,
     odometry_from_cdr,
     twist_from_cdr,
 )
-from omnid.transport.decode import Cloud, Diagnostics, PoseInMap, decode_cloud, decode_diagnostics, decode_map_pose
-from omnid.transport.records import OdometryRecord, TwistRecord
-from omnid.transport.scan_codec import SCAN_SCHEMA, Scan, decode_scan
 from omnid.transport.topics import MAP_POSE, PANORAMA, SCAN
 
 ODOMETRY: Final = "odom"

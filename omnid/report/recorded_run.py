@@ -34,8 +34,8 @@ from omnid.recordings.recording import (
 )
 from omnid.tracking_state import TrackingState
 from omnid.transport import status_names
-from omnid.transport.decode import Cloud, Diagnostics, PoseInMap
-from omnid.transport.records import DiagnosticStatus, OdometryRecord, TwistRecord
+from omnid.transport.codec import DiagnosticStatus
+from omnid.transport.decode import Cloud, Diagnostics, OdometryRecord, PoseInMap, TwistRecord
 from omnid.transport.status_names import Key, short_name
 from omnid.transport.topics import MAP_POSE
 

@@ -38,7 +38,7 @@ from omnid.sinks.encoder import status_report
 from omnid.sinks.recorder import Recorder
 from omnid.stages.geometry import Geometry
 from omnid.transport.bus import Bus
-from omnid.transport.records import DiagnosticStatus
+from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.status_names import with_remedy
 
 StatusPublisher: TypeAlias = Callable[[list[DiagnosticStatus]], None]
@@ -337,8 +337,7 @@ def _load() -> None:
 
 
 def _compile_serialisers() -> None:
-    from omnid.transport.codec import compile_serialisers
-    from omnid.transport.navigation_codec import PATH_SCHEMA, STRING_SCHEMA
+    from omnid.transport.codec import PATH_SCHEMA, STRING_SCHEMA, compile_serialisers
 
     compile_serialisers(PATH_SCHEMA, STRING_SCHEMA)
 

@@ -33,7 +33,7 @@ from omnid.runs.session import Session
 from omnid.sinks.pose_collector import MapPoseCollector
 from omnid.stages.synchronise import Synchronise
 from omnid.tracking_state import MapState, TrackingState
-from omnid.transport.records import DiagnosticStatus
+from omnid.transport.codec import DiagnosticStatus
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

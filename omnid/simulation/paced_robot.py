@@ -32,8 +32,7 @@ from omnid.simulation.realtime import SAMPLES
 from omnid.simulation.robot import SimulatedRobot
 from omnid.simulation.vehicle import Tick, Vehicle
 from omnid.simulation.world_file import World
-from omnid.transport.codec import OK
-from omnid.transport.records import DiagnosticStatus
+from omnid.transport.codec import OK, DiagnosticStatus
 from omnid.transport.status_names import SIMULATION, Key
 
 RECENT: Final = 30  # pairs over which the real-time factor is measured: three seconds

@@ -11,10 +11,8 @@ from drivers.motor import VelocityCommand
 from omnid.messages import OdometryUpdate, PlaceUpdate
 from omnid.sinks.encoder import Encoder, Outgoing, StateReports, static_frames
 from omnid.transport.bus import Bus
-from omnid.transport.codec import clock_cdr
-from omnid.transport.features_attachment import features_to_bytes
-from omnid.transport.image_codec import image_cdr
-from omnid.transport.pose_attachment import PoseAttachment
+from omnid.transport.codec import PoseAttachment, clock_cdr, features_to_bytes
+from omnid.transport.sensor_codec import image_cdr
 from omnid.transport.topics import CLOCK, PANORAMA
 
 

@@ -19,12 +19,19 @@ from omnid.core.mapping.voxel_map import MapPoints
 from omnid.messages import GridUpdate, MapUpdate, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
 from omnid.navigation_state import NavigationState
 from omnid.tracking_state import MapState, TrackingState
-from omnid.transport import codec, map_codec, navigation_codec
-from omnid.transport.codec import ERROR, IMU_SCHEMA, OK, WARN
-from omnid.transport.motion_codec import WHEEL_SCHEMA, gyro_cdr, wheel_cdr
-from omnid.transport.moving_codec import moving_cdr
-from omnid.transport.records import DiagnosticStatus, FrameTransform
-from omnid.transport.scan_codec import SCAN_SCHEMA, scan_cdr
+from omnid.transport import codec
+from omnid.transport.codec import (
+    ERROR,
+    IMU_SCHEMA,
+    OK,
+    SCAN_SCHEMA,
+    WARN,
+    DiagnosticStatus,
+    FrameTransform,
+    moving_cdr,
+    scan_cdr,
+)
+from omnid.transport.sensor_codec import WHEEL_SCHEMA, gyro_cdr, wheel_cdr
 from omnid.transport.status_names import NAVIGATION, ODOMETRY, PLACES, Key
 from omnid.transport.topics import MAP_POSE, SCAN
 
@@ -99,7 +106,7 @@ class Encoder:
             case GridUpdate():
                 grid = message.grid
                 stamp_ns = message.stamp_ns + self.offset_ns
-                payload = map_codec.grid_cdr(stamp_ns, "map", grid.cells, grid.cell_m, grid.corner)
+                payload = codec.grid_cdr(stamp_ns, "map", grid.cells, grid.cell_m, grid.corner)
                 yield OutgoingMessage("map", codec.GRID_SCHEMA, payload)
             case NavigationUpdate():
                 yield from self._navigation(message)
@@ -141,7 +148,7 @@ class Encoder:
     def _map(self, update: MapUpdate) -> Iterator[OutgoingMessage]:
         stamp_ns = update.stamp_ns + self.offset_ns
         points = _most_confident(update.points, self._map_encoding.points)
-        payload = map_codec.point_cloud_cdr(stamp_ns, "odom", *points, T_frame_points=self.T_base_rig)
+        payload = codec.point_cloud_cdr(stamp_ns, "odom", *points, T_frame_points=self.T_base_rig)
         yield OutgoingMessage("cloud", codec.POINT_CLOUD_SCHEMA, payload)
 
     def _navigation(self, update: NavigationUpdate) -> Iterator[OutgoingMessage]:
@@ -150,8 +157,8 @@ class Encoder:
         yield OutgoingMessage("navigation", codec.DIAGNOSTICS_SCHEMA, codec.diagnostics_cdr(stamp_ns, [status]))
         if update.plan is not None:
             plan = update.plan
-            payload = navigation_codec.path_cdr(stamp_ns, plan.frame, plan.xy, plan.heading_rad)
-            yield OutgoingMessage("plan", navigation_codec.PATH_SCHEMA, payload)
+            payload = codec.path_cdr(stamp_ns, plan.frame, plan.xy, plan.heading_rad)
+            yield OutgoingMessage("plan", codec.PATH_SCHEMA, payload)
 
 
 def static_frames(encode: Encoder, stamp_ns: int) -> OutgoingMessage:

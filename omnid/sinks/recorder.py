@@ -14,9 +14,8 @@ from omnid.diagnostics.run_summary import RunStatistics
 from omnid.errors import OmnidError
 from omnid.messages import OdometryUpdate, PlaceUpdate
 from omnid.sinks.encoder import Encoder, Outgoing, OutgoingMessage, StateReports, static_frames, status_report
-from omnid.transport.codec import ERROR, OK
-from omnid.transport.image_codec import image_cdr, image_topic
-from omnid.transport.records import DiagnosticStatus
+from omnid.transport.codec import ERROR, OK, DiagnosticStatus
+from omnid.transport.sensor_codec import image_cdr, image_topic
 from omnid.transport.status_names import RECORDING
 
 Recorded: TypeAlias = Frame | Outgoing

@@ -19,9 +19,8 @@ from omnid.engine.threads import Poller
 from omnid.errors import OmnidError
 from omnid.transport import ros2, status_names
 from omnid.transport.bus_config import BusConfig, checked
-from omnid.transport.codec import ERROR, OK, WARN
+from omnid.transport.codec import ERROR, OK, WARN, DiagnosticStatus
 from omnid.transport.intake import PERIOD_S, QUERY, CommandIntake, Intake, OpenRequests, RequestCallback, floods
-from omnid.transport.records import DiagnosticStatus
 from omnid.transport.requests import Answer, Request
 from omnid.transport.session import ALIVE, EndpointTaken, open_session, reason, router_in_place
 from omnid.transport.stop_datagram import StopListener

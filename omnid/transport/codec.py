@@ -1,14 +1,18 @@
-"""Encoding and decoding of ROS 2 (Humble) messages as CDR bytes, by rosbags; the same for recordings and the bus.
+"""What is sent: ROS 2 (Humble) messages as CDR bytes, by rosbags; the same for recordings and the bus.
 
 Arrays in SI units; p_a = T_a_b @ p_b; covariances in the order x y z rx ry rz, row-major (nav_msgs/msg/Odometry).
+Attachments of zenoh are JSON with what a ROS 2 message has no field for. omnid.transport.decode reads all of this.
 """
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from functools import cache, lru_cache
-from typing import TypeAlias
+from struct import pack
+from typing import TYPE_CHECKING, Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,8 +23,13 @@ from rosbags.typesys.store import Typestore
 from calib import se3
 from omnid.errors import OmnidError
 from omnid.transport import ros_types as ros
-from omnid.transport.records import DiagnosticStatus, FrameTransform, HeadingRecord, OdometryRecord, TwistRecord
 
+if TYPE_CHECKING:
+    from omnid.core.obstacles.moving_tracker import MovingObstacle
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Frames = tuple[str, str]
 ODOMETRY_SCHEMA = "nav_msgs/msg/Odometry"
 IMU_SCHEMA = "sensor_msgs/msg/Imu"
 JOINT_SCHEMA = "sensor_msgs/msg/JointState"
@@ -36,7 +45,9 @@ GRID_SCHEMA = "nav_msgs/msg/OccupancyGrid"
 HEADER_SCHEMA = "std_msgs/msg/Header"
 CLOCK_SCHEMA = "rosgraph_msgs/msg/Clock"
 BOOL_SCHEMA = "std_msgs/msg/Bool"
-_PLAIN_TWIST_BYTES = 4 + 6 * 8  # encapsulation header, two vectors
+PATH_SCHEMA = "nav_msgs/msg/Path"
+STRING_SCHEMA = "std_msgs/msg/String"
+SCAN_SCHEMA = "sensor_msgs/msg/LaserScan"
 # Types whose serialisers are compiled at the start of a run, see compile_serialisers.
 SCHEMAS = (
     ODOMETRY_SCHEMA,
@@ -51,21 +62,76 @@ SCHEMAS = (
     HEADER_SCHEMA,
     CLOCK_SCHEMA,
 )
-
-# A quaternion whose norm differs from 1 by more than this is refused: more than rounding to float32 or to six decimals
-# makes, and less than a quaternion of zeros or one that was scaled.
-QUATERNION_TOLERANCE = 1e-3
 NS_PER_S = 1_000_000_000
 MAX_SECONDS = 2**31 - 1  # builtin_interfaces/msg/Time counts seconds in an int32
-
-Array = NDArray[np.float64]
-Frames = tuple[str, str]
-Cartesian: TypeAlias = (
-    "ros.geometry_msgs__msg__Vector3 | ros.geometry_msgs__msg__Point | ros.geometry_msgs__msg__Quaternion"
-)
-
-
 OK, WARN, ERROR, STALE = range(4)  # levels of diagnostic_msgs/msg/DiagnosticStatus
+CLOUD_FIELDS = ("x", "y", "z", "confidence")
+CLOUD_BLOCK = 4096  # points transformed at once: temporary arrays of a whole map would fragment the memory
+# m, m/s; sigma and sigma_v: of position and velocity along the axis in which they are largest.
+MOVING_FIELDS: Final = ("x", "y", "z", "vx", "vy", "radius", "sigma", "sigma_v")
+FEATURE_KINDS: Final = ("inliers", "rejected", "new")
+MOST_FEATURES: Final = 2000  # features of a kind
+_MAX_ATTACHMENT_BYTES: Final = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class FrameTransform:
+    """One edge of the frame tree: p_parent = T_parent_child @ p_child."""
+
+    parent: str
+    child: str
+    T_parent_child: Array  # (4, 4)
+
+
+@dataclass(frozen=True, slots=True)
+class DiagnosticStatus:
+    """Status of one part of the robot; names and keys: omnid.transport.status_names."""
+
+    name: str
+    level: int  # OK ...
+    message: str
+    values: Mapping[str, str]
+
+
+class PlanarGoal(NamedTuple):
+    """Content of a PoseStamped on the floor."""
+
+    stamp_ns: int
+    frame: str
+    x_m: float
+    y_m: float
+    heading_rad: float | None  # None: the quaternion is all zeros, which asks for no heading
+
+
+@dataclass(frozen=True, slots=True)
+class PoseAttachment:
+    """The zenoh attachment of a pose: sequence number, tracking state and landmark counts."""
+
+    seq: int = -1
+    state: str = "unknown"  # tracking | degraded | lost
+    resets: int = 0  # how often odom was started again with an unknown gap
+    inliers: int = 0  # landmarks that agree with the pose
+    tracked: int = 0  # landmarks found in the images
+    sent_ns: int = 0  # Unix time at which it was handed to the network
+
+    def to_bytes(self) -> bytes:
+        """Encode as JSON."""
+        return json.dumps(asdict(self), separators=(",", ":")).encode()
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> Self:
+        """Decode; missing entries keep their defaults. Raise OmnidError for anything but a JSON object."""
+        try:
+            found = json.loads(data) if len(data) <= _MAX_ATTACHMENT_BYTES else None
+        except (ValueError, RecursionError):
+            found = None
+        if not isinstance(found, dict):
+            raise OmnidError(
+                f"the {len(data)} bytes attached to a pose are not a JSON object; check that omnid sent them"
+            )
+        defaults = asdict(cls())
+        known = {name: found[name] for name, default in defaults.items() if type(found.get(name)) is type(default)}
+        return cls(**known)
 
 
 @cache
@@ -205,39 +271,6 @@ def heading_cdr(stamp_ns: int, velocity_mps: float, heading_rad: float) -> bytes
     return message_cdr(ros.geometry_msgs__msg__Vector3Stamped(header_message(stamp_ns, "odom"), vector), VECTOR_SCHEMA)
 
 
-def twist_from_cdr(payload: bytes) -> TwistRecord:
-    """Decode a TwistStamped; its numbers need not be finite. Raise OmnidError for any other bytes."""
-    message = message_from_cdr(payload, TWIST_SCHEMA)
-    assert isinstance(message, ros.geometry_msgs__msg__TwistStamped)
-    return TwistRecord(
-        unchecked_stamp_ns(message.header.stamp),
-        message.header.frame_id,
-        message.twist.linear.x,
-        message.twist.angular.z,
-    )
-
-
-def is_plain_twist(payload: bytes) -> bool:
-    """True if a payload has the length of a geometry_msgs/msg/Twist, which no TwistStamped has."""
-    return len(payload) == _PLAIN_TWIST_BYTES
-
-
-def plain_twist_from_cdr(payload: bytes) -> TwistRecord:
-    """Decode a Twist, which has no stamp (0) and no frame. Raise OmnidError for any other bytes."""
-    twist = message_from_cdr(payload, PLAIN_TWIST_SCHEMA)
-    assert isinstance(twist, ros.geometry_msgs__msg__Twist)
-    return TwistRecord(0, "", twist.linear.x, twist.angular.z)
-
-
-def heading_from_cdr(payload: bytes) -> HeadingRecord:
-    """Decode a Vector3Stamped; its numbers need not be finite. Raise OmnidError for any other bytes."""
-    message = message_from_cdr(payload, VECTOR_SCHEMA)
-    assert isinstance(message, ros.geometry_msgs__msg__Vector3Stamped)
-    return HeadingRecord(
-        unchecked_stamp_ns(message.header.stamp), message.header.frame_id, message.vector.x, message.vector.z
-    )
-
-
 def clock_cdr(stamp_ns: int) -> bytes:
     """Encode the time of a run, for programs that follow it."""
     return message_cdr(ros.rosgraph_msgs__msg__Clock(time_message(stamp_ns)), CLOCK_SCHEMA)
@@ -248,23 +281,9 @@ def header_cdr(stamp_ns: int) -> bytes:
     return message_cdr(header_message(stamp_ns, ""), HEADER_SCHEMA)
 
 
-def stamp_from_cdr(payload: bytes) -> int:
-    """Decode the stamp of a Header, ns; it may be invalid. Raise OmnidError for any other bytes."""
-    message = message_from_cdr(payload, HEADER_SCHEMA)
-    assert isinstance(message, ros.std_msgs__msg__Header)
-    return unchecked_stamp_ns(message.stamp)
-
-
 def bool_cdr(value: bool) -> bytes:
     """Encode a std_msgs/msg/Bool, which is the message of cmd/bumper and cmd/cliff."""
     return message_cdr(ros.std_msgs__msg__Bool(value), BOOL_SCHEMA)
-
-
-def bool_from_cdr(payload: bytes) -> bool:
-    """Decode a Bool. Raise OmnidError for any other bytes."""
-    message = message_from_cdr(payload, BOOL_SCHEMA)
-    assert isinstance(message, ros.std_msgs__msg__Bool)
-    return bool(message.data)
 
 
 def message_from_cdr(payload: bytes, schema: str) -> object:
@@ -275,40 +294,133 @@ def message_from_cdr(payload: bytes, schema: str) -> object:
         raise OmnidError(f"{len(payload)} bytes are not a {schema} in CDR ({error}); check the sender") from error
 
 
-def unchecked_stamp_ns(stamp: ros.builtin_interfaces__msg__Time) -> int:
-    """Return a stamp that may be invalid; callers check it."""
-    return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
+def point_cloud_cdr(
+    stamp_ns: int,
+    frame: str,
+    points: ArrayLike,
+    confidence: ArrayLike,
+    *,
+    T_frame_points: NDArray[np.float64] | None = None,
+) -> bytes:
+    """Encode a sensor_msgs/msg/PointCloud2 of points (N, 3) [m] with confidence (N,): float32, 16 bytes per point.
+
+    T_frame_points (4, 4) maps the points into `frame`; None where they are given in it.
+    """
+    return packed_cloud_cdr(stamp_ns, frame, CLOUD_FIELDS, _packed(points, confidence, T_frame_points))
 
 
-def odometry_from_cdr(payload: bytes) -> OdometryRecord:
-    """Decode an Odometry message. Raise OmnidError unless the bytes are one with a finite, rigid pose."""
-    message = message_from_cdr(payload, ODOMETRY_SCHEMA)
-    assert isinstance(message, ros.nav_msgs__msg__Odometry)
-    twist = message.twist.twist
-    return OdometryRecord(
-        stamp_ns=_stamp_ns(message.header.stamp),
-        T_odom_base=rigid_transform(message.pose.pose),
-        covariance=message.pose.covariance.reshape(6, 6),
-        velocity=np.array([*_xyz(twist.linear), *_xyz(twist.angular)]),
-        velocity_covariance=message.twist.covariance.reshape(6, 6),
-        frames=(message.header.frame_id, message.child_frame_id),
+def packed_cloud_cdr(stamp_ns: int, frame: str, names: Sequence[str], rows: NDArray[np.float32]) -> bytes:
+    """Encode a sensor_msgs/msg/PointCloud2 of rows (N, F), little-endian float32, whose F fields have these names."""
+    number = ros.sensor_msgs__msg__PointField.FLOAT32
+    message = ros.sensor_msgs__msg__PointCloud2(
+        header=header_message(stamp_ns, frame),
+        height=1,
+        width=len(rows),
+        fields=[ros.sensor_msgs__msg__PointField(name, 4 * i, number, 1) for i, name in enumerate(names)],
+        is_bigendian=False,
+        point_step=4 * len(names),
+        row_step=4 * len(names) * len(rows),
+        data=rows.reshape(-1).view(np.uint8),
+        is_dense=bool(np.isfinite(rows).all()),
+    )
+    return message_cdr(message, POINT_CLOUD_SCHEMA)
+
+
+def _packed(points: ArrayLike, confidence: ArrayLike, T: NDArray[np.float64] | None) -> NDArray[np.float32]:
+    """Return points, transformed in double precision, and confidence as (N, 4) little-endian float32."""
+    points, confidence = np.asarray(points).reshape(-1, 3), np.asarray(confidence).reshape(-1)
+    if len(points) != len(confidence):
+        raise OmnidError(f"{len(confidence)} confidences for {len(points)} points: expected one for each point")
+    packed = np.empty((len(points), 4), "<f4")
+    packed[:, 3] = confidence
+    for start in range(0, len(points), CLOUD_BLOCK):
+        at = slice(start, start + CLOUD_BLOCK)
+        packed[at, :3] = points[at] if T is None else se3.apply(T, points[at])
+    return packed
+
+
+def grid_cdr(stamp_ns: int, frame: str, cells: NDArray[np.int8], cell_m: float, corner: tuple[float, float]) -> bytes:
+    """Encode a nav_msgs/msg/OccupancyGrid of cells (H, W), z = 0 in `frame`; corner: x, y of cell (0, 0), m."""
+    height, width = cells.shape
+    corner_pose = pose_message(se3.transform(np.eye(3), (*corner, 0.0)))
+    info = ros.nav_msgs__msg__MapMetaData(time_message(stamp_ns), cell_m, width, height, corner_pose)
+    message = ros.nav_msgs__msg__OccupancyGrid(header_message(stamp_ns, frame), info, cells.reshape(-1))
+    return message_cdr(message, GRID_SCHEMA)
+
+
+def moving_cdr(stamp_ns: int, frame: str, moving: Sequence[MovingObstacle]) -> bytes:
+    """Encode moving obstacles in a frame as a PointCloud2, a point each, none included.
+
+    Raise OmnidError where the stamp does not fit a ROS time.
+    """
+    rows = [[one.x_m, one.y_m, 0.0, one.vx_mps, one.vy_mps, one.radius_m, *_sigmas(one)] for one in moving]
+    return packed_cloud_cdr(stamp_ns, frame, MOVING_FIELDS, np.array(rows, "<f4").reshape(-1, len(MOVING_FIELDS)))
+
+
+def _sigmas(one: MovingObstacle) -> tuple[float, float]:
+    position, velocity = (one.covariance[at, at] for at in (slice(0, 2), slice(2, 4)))
+    largest = [float(np.sqrt(max(0.0, np.linalg.eigvalsh(part)[-1]))) for part in (position, velocity)]
+    return largest[0], largest[1]
+
+
+def goal_cdr(goal: PlanarGoal) -> bytes:
+    """Encode a goal as a PoseStamped."""
+    pose = _planar_pose(goal.x_m, goal.y_m, goal.heading_rad)
+    return message_cdr(
+        ros.geometry_msgs__msg__PoseStamped(header_message(goal.stamp_ns, goal.frame), pose), POSE_SCHEMA
     )
 
 
-def _stamp_ns(stamp: ros.builtin_interfaces__msg__Time) -> int:
-    """Return the stamp of an Odometry. Raise OmnidError for one that is invalid."""
-    if stamp.sec < 0 or stamp.nanosec >= NS_PER_S:
-        raise OmnidError(f"odometry stamp {stamp.sec} s {stamp.nanosec} ns: expected Unix time; check the sender")
-    return unchecked_stamp_ns(stamp)
+def path_cdr(stamp_ns: int, frame: str, xy: ArrayLike, heading_rad: float | None = None) -> bytes:
+    """Encode a path through positions (N, 2); its poses point along it, the last one to the given heading."""
+    points = np.asarray(xy, np.float64).reshape(-1, 2)
+    steps = np.diff(points, axis=0, append=points[-1:])
+    headings: list[float | None] = [float(math.atan2(dy, dx)) for dx, dy in steps]
+    headings[-1:] = [heading_rad]
+    header = header_message(stamp_ns, frame)
+    poses = [
+        ros.geometry_msgs__msg__PoseStamped(header, _planar_pose(float(x), float(y), heading))
+        for (x, y), heading in zip(points, headings, strict=True)
+    ]
+    return message_cdr(ros.nav_msgs__msg__Path(header, poses), PATH_SCHEMA)
 
 
-def _xyz(vector: Cartesian) -> tuple[float, float, float]:
-    return vector.x, vector.y, vector.z
+def string_cdr(text: str) -> bytes:
+    """Encode a std_msgs/msg/String."""
+    return message_cdr(ros.std_msgs__msg__String(text), STRING_SCHEMA)
 
 
-def rigid_transform(pose: ros.geometry_msgs__msg__Pose) -> Array:
-    """Return the transform (4, 4) of a pose. Raise OmnidError unless it is finite and rigid."""
-    q, position = (*_xyz(pose.orientation), pose.orientation.w), _xyz(pose.position)
-    if not abs(math.hypot(*q) - 1.0) < QUATERNION_TOLERANCE or not all(map(math.isfinite, position)):
-        raise OmnidError(f"pose {position} {q}: expected finite numbers and a unit quaternion; check the sender")
-    return se3.transform(se3.rotation(q), position)
+def _planar_pose(x_m: float, y_m: float, heading_rad: float | None) -> ros.geometry_msgs__msg__Pose:
+    half_rad = 0.0 if heading_rad is None else 0.5 * heading_rad
+    w = 0.0 if heading_rad is None else math.cos(half_rad)
+    quaternion = ros.geometry_msgs__msg__Quaternion(0.0, 0.0, math.sin(half_rad), w)
+    return ros.geometry_msgs__msg__Pose(ros.geometry_msgs__msg__Point(x_m, y_m, 0.0), quaternion)
+
+
+def scan_cdr(stamp_ns: int, frame: str, ranges_m: Floats, sigma_m: Floats, limits_m: tuple[float, float]) -> bytes:
+    """Encode a sensor_msgs/msg/LaserScan of sectors (N,) that divide a full turn from azimuth -pi on.
+
+    As REP 117 says: inf is free up to the longest range, NaN is unknown. sigma_m: standard deviations of the ranges,
+    sent as intensities. limits_m: least and longest range. CDR is written here: little-endian (OMG RTPS 2.2, 10.2).
+
+    Raise OmnidError where the stamp does not fit a ROS time.
+    """
+    name = frame.encode() + b"\0"
+    head = pack("<iII", *ros_time(stamp_ns), len(name)) + name
+    step = 2 * math.pi / len(ranges_m)
+    numbers = pack("<7f", step / 2 - math.pi, math.pi - step / 2, step, 0.0, 0.0, *limits_m)
+    arrays = [
+        part
+        for values in (ranges_m, sigma_m)
+        for part in (pack("<I", len(values)), np.ascontiguousarray(values, "<f4").tobytes())
+    ]
+    return b"".join([b"\0\1\0\0", head, bytes(-len(head) % 4), numbers, *arrays])
+
+
+def features_to_bytes(pixels: Mapping[str, Array]) -> bytes:
+    """Encode the zenoh attachment of a panorama: pixels (N, 2) of its features, column and row, by kind.
+
+    They are rounded to whole pixels; at most MOST_FEATURES of each kind.
+    """
+    rounded = {kind: np.rint(pixels[kind][:MOST_FEATURES]).astype(int).tolist() for kind in FEATURE_KINDS}
+    return json.dumps(rounded, separators=(",", ":")).encode()

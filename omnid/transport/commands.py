@@ -29,7 +29,7 @@ from omnid.core.control.contacts import BUMPER, CLIFF
 from omnid.core.control.heading_controller import Setpoint
 from omnid.errors import OmnidError
 from omnid.transport import topics
-from omnid.transport.codec import (
+from omnid.transport.decode import (
     bool_from_cdr,
     heading_from_cdr,
     is_plain_twist,
@@ -37,8 +37,8 @@ from omnid.transport.codec import (
     stamp_from_cdr,
     twist_from_cdr,
 )
-from omnid.transport.motion_codec import sample_from_cdr
 from omnid.transport.requests import Answer, Request
+from omnid.transport.sensor_codec import sample_from_cdr
 from omnid.transport.topics import ARM, HEADING, SENSOR_TOPICS, STOP, TWIST
 
 UNSTAMPED: Final = "no stamp"

@@ -1,28 +1,115 @@
-"""Decoded messages of a robot, for subscribers and readers of recordings; the bytes may be anything.
+"""What is read: messages of a robot, of its commanders and of recordings, decoded; the bytes may be anything.
 
 Arrays in SI units, not to be written to; p_a = T_a_b @ p_b.
 """
 
 from __future__ import annotations
 
+import json
 import math
 import time
 from dataclasses import dataclass
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
 from omnid.errors import OmnidError
-from omnid.transport import codec, map_codec, status_names
 from omnid.transport import ros_types as ros
-from omnid.transport.codec import unchecked_stamp_ns
-from omnid.transport.pose_attachment import PoseAttachment
-from omnid.transport.records import DiagnosticStatus
+from omnid.transport import status_names
+from omnid.transport.codec import (
+    BOOL_SCHEMA,
+    CLOUD_FIELDS,
+    DIAGNOSTICS_SCHEMA,
+    FEATURE_KINDS,
+    GRID_SCHEMA,
+    HEADER_SCHEMA,
+    MAP_POSE_SCHEMA,
+    MOST_FEATURES,
+    NS_PER_S,
+    ODOMETRY_SCHEMA,
+    PATH_SCHEMA,
+    PLAIN_TWIST_SCHEMA,
+    POINT_CLOUD_SCHEMA,
+    POSE_SCHEMA,
+    SCAN_SCHEMA,
+    STRING_SCHEMA,
+    TWIST_SCHEMA,
+    VECTOR_SCHEMA,
+    DiagnosticStatus,
+    PlanarGoal,
+    PoseAttachment,
+    message_from_cdr,
+)
 from omnid.transport.status_names import Key
 
-ALIGNED = 0.999_999  # w of a quaternion that is taken for no rotation
 Array = NDArray[np.float64]
+Frames = tuple[str, str]
+_PLAIN_TWIST_BYTES = 4 + 6 * 8  # encapsulation header, two vectors
+# A quaternion whose norm differs from 1 by more than this is refused: more than rounding to float32 or to six decimals
+# makes, and less than a quaternion of zeros or one that was scaled.
+QUATERNION_TOLERANCE = 1e-3
+Cartesian: TypeAlias = (
+    "ros.geometry_msgs__msg__Vector3 | ros.geometry_msgs__msg__Point | ros.geometry_msgs__msg__Quaternion"
+)
+MAX_PATH_POSES: Final = 10_000
+_MOST_TILT: Final = 0.05  # Largest x and y of a quaternion that counts as a turn about z: a tilt of 6 degrees.
+MOST_RANGES: Final = 100_000
+_MAX_FEATURES_BYTES: Final = 1 << 17
+_MAX_PX: Final = 1e5
+ALIGNED = 0.999_999  # w of a quaternion that is taken for no rotation
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryRecord:
+    """Content of a nav_msgs/msg/Odometry message."""
+
+    stamp_ns: int
+    T_odom_base: Array  # (4, 4)
+    covariance: Array  # (6, 6) of the pose, in odom axes
+    velocity: Array  # (6,) [m/s, rad/s] in the base frame
+    velocity_covariance: Array  # (6, 6)
+    frames: Frames  # (parent, child)
+
+
+class TwistRecord(NamedTuple):
+    """Content of a TwistStamped of a ground robot."""
+
+    stamp_ns: int
+    frame: str
+    velocity_mps: float
+    yaw_rate_radps: float
+
+
+class HeadingRecord(NamedTuple):
+    """Content of a Vector3Stamped that commands a heading."""
+
+    stamp_ns: int
+    frame: str
+    velocity_mps: float
+    heading_rad: float
+
+
+class PlanarPath(NamedTuple):
+    """Content of a Path on the floor."""
+
+    stamp_ns: int
+    frame: str
+    xy: NDArray[np.float64]  # (N, 2) m
+    heading_rad: float | None  # of the last pose; None: its quaternion is all zeros
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scan:
+    """Content of a LaserScan."""
+
+    stamp_ns: int
+    frame: str
+    azimuths_rad: NDArray[np.floating]  # (N,) counter-clockwise from x
+    ranges_m: NDArray[np.floating]  # (N,) inf: free up to max_range_m, NaN: unknown
+    sigma_m: NDArray[np.floating]  # (N,) NaN: unknown; empty in scans of other senders
+    max_range_m: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,6 +209,162 @@ class NavigationReport:
     taught_m: float = 0.0
 
 
+def twist_from_cdr(payload: bytes) -> TwistRecord:
+    """Decode a TwistStamped; its numbers need not be finite. Raise OmnidError for any other bytes."""
+    message = message_from_cdr(payload, TWIST_SCHEMA)
+    assert isinstance(message, ros.geometry_msgs__msg__TwistStamped)
+    return TwistRecord(
+        unchecked_stamp_ns(message.header.stamp),
+        message.header.frame_id,
+        message.twist.linear.x,
+        message.twist.angular.z,
+    )
+
+
+def is_plain_twist(payload: bytes) -> bool:
+    """True if a payload has the length of a geometry_msgs/msg/Twist, which no TwistStamped has."""
+    return len(payload) == _PLAIN_TWIST_BYTES
+
+
+def plain_twist_from_cdr(payload: bytes) -> TwistRecord:
+    """Decode a Twist, which has no stamp (0) and no frame. Raise OmnidError for any other bytes."""
+    twist = message_from_cdr(payload, PLAIN_TWIST_SCHEMA)
+    assert isinstance(twist, ros.geometry_msgs__msg__Twist)
+    return TwistRecord(0, "", twist.linear.x, twist.angular.z)
+
+
+def heading_from_cdr(payload: bytes) -> HeadingRecord:
+    """Decode a Vector3Stamped; its numbers need not be finite. Raise OmnidError for any other bytes."""
+    message = message_from_cdr(payload, VECTOR_SCHEMA)
+    assert isinstance(message, ros.geometry_msgs__msg__Vector3Stamped)
+    return HeadingRecord(
+        unchecked_stamp_ns(message.header.stamp), message.header.frame_id, message.vector.x, message.vector.z
+    )
+
+
+def stamp_from_cdr(payload: bytes) -> int:
+    """Decode the stamp of a Header, ns; it may be invalid. Raise OmnidError for any other bytes."""
+    message = message_from_cdr(payload, HEADER_SCHEMA)
+    assert isinstance(message, ros.std_msgs__msg__Header)
+    return unchecked_stamp_ns(message.stamp)
+
+
+def bool_from_cdr(payload: bytes) -> bool:
+    """Decode a Bool. Raise OmnidError for any other bytes."""
+    message = message_from_cdr(payload, BOOL_SCHEMA)
+    assert isinstance(message, ros.std_msgs__msg__Bool)
+    return bool(message.data)
+
+
+def unchecked_stamp_ns(stamp: ros.builtin_interfaces__msg__Time) -> int:
+    """Return a stamp that may be invalid; callers check it."""
+    return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
+
+
+def odometry_from_cdr(payload: bytes) -> OdometryRecord:
+    """Decode an Odometry message. Raise OmnidError unless the bytes are one with a finite, rigid pose."""
+    message = message_from_cdr(payload, ODOMETRY_SCHEMA)
+    assert isinstance(message, ros.nav_msgs__msg__Odometry)
+    twist = message.twist.twist
+    return OdometryRecord(
+        stamp_ns=_stamp_ns(message.header.stamp),
+        T_odom_base=rigid_transform(message.pose.pose),
+        covariance=message.pose.covariance.reshape(6, 6),
+        velocity=np.array([*_xyz(twist.linear), *_xyz(twist.angular)]),
+        velocity_covariance=message.twist.covariance.reshape(6, 6),
+        frames=(message.header.frame_id, message.child_frame_id),
+    )
+
+
+def _stamp_ns(stamp: ros.builtin_interfaces__msg__Time) -> int:
+    """Return the stamp of an Odometry. Raise OmnidError for one that is invalid."""
+    if stamp.sec < 0 or stamp.nanosec >= NS_PER_S:
+        raise OmnidError(f"odometry stamp {stamp.sec} s {stamp.nanosec} ns: expected Unix time; check the sender")
+    return unchecked_stamp_ns(stamp)
+
+
+def _xyz(vector: Cartesian) -> tuple[float, float, float]:
+    return vector.x, vector.y, vector.z
+
+
+def rigid_transform(pose: ros.geometry_msgs__msg__Pose) -> Array:
+    """Return the transform (4, 4) of a pose. Raise OmnidError unless it is finite and rigid."""
+    q, position = (*_xyz(pose.orientation), pose.orientation.w), _xyz(pose.position)
+    if not abs(math.hypot(*q) - 1.0) < QUATERNION_TOLERANCE or not all(map(math.isfinite, position)):
+        raise OmnidError(f"pose {position} {q}: expected finite numbers and a unit quaternion; check the sender")
+    return se3.transform(se3.rotation(q), position)
+
+
+def goal_from_cdr(payload: bytes) -> PlanarGoal:
+    """Decode a PoseStamped. Raise OmnidError for other bytes, numbers that are not finite, and a tilted pose."""
+    message = message_from_cdr(payload, POSE_SCHEMA)
+    assert isinstance(message, ros.geometry_msgs__msg__PoseStamped)
+    x_m, y_m = _planar_position(message.pose)
+    stamp_ns = unchecked_stamp_ns(message.header.stamp)
+    return PlanarGoal(stamp_ns, message.header.frame_id, x_m, y_m, _planar_heading(message.pose))
+
+
+def path_from_cdr(payload: bytes) -> PlanarPath:
+    """Decode a path of 1 to MAX_PATH_POSES poses. Raise OmnidError as goal_from_cdr."""
+    message = message_from_cdr(payload, PATH_SCHEMA)
+    assert isinstance(message, ros.nav_msgs__msg__Path)
+    if not 1 <= len(message.poses) <= MAX_PATH_POSES:
+        raise OmnidError(f"a path of {len(message.poses)} poses: expected 1 to {MAX_PATH_POSES}")
+    xy = np.array([_planar_position(entry.pose) for entry in message.poses])
+    stamp_ns = unchecked_stamp_ns(message.header.stamp)
+    return PlanarPath(stamp_ns, message.header.frame_id, xy, _planar_heading(message.poses[-1].pose))
+
+
+def string_from_cdr(payload: bytes) -> str:
+    """Decode a String. Raise OmnidError for any other bytes."""
+    message = message_from_cdr(payload, STRING_SCHEMA)
+    assert isinstance(message, ros.std_msgs__msg__String)
+    return message.data
+
+
+def _planar_position(pose: ros.geometry_msgs__msg__Pose) -> tuple[float, float]:
+    if not (math.isfinite(pose.position.x) and math.isfinite(pose.position.y)):
+        raise OmnidError("a position is not finite; check the sender")
+    return pose.position.x, pose.position.y
+
+
+def _planar_heading(pose: ros.geometry_msgs__msg__Pose) -> float | None:
+    q = (pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w)
+    if not any(q):
+        return None
+    if not abs(math.hypot(*q) - 1.0) < QUATERNION_TOLERANCE or max(abs(q[0]), abs(q[1])) > _MOST_TILT:
+        raise OmnidError(f"orientation {q}: expected a unit quaternion about z, or all zeros; check the sender")
+    return float(se3.yaw(se3.transform(se3.rotation(q), (0.0, 0.0, 0.0))))
+
+
+def decode_scan(payload: bytes, _: bytes = b"") -> Scan:
+    """Decode a LaserScan. Raise OmnidError for any other bytes."""
+    message = message_from_cdr(payload, SCAN_SCHEMA)
+    assert isinstance(message, ros.sensor_msgs__msg__LaserScan)
+    count = len(message.ranges)
+    if count > MOST_RANGES or not (math.isfinite(message.angle_min) and math.isfinite(message.angle_increment)):
+        raise OmnidError(
+            f"a scan of {count} ranges from {message.angle_min} rad by {message.angle_increment} rad was "
+            f"found; expected finite angles and at most {MOST_RANGES} ranges"
+        )
+    azimuths = message.angle_min + message.angle_increment * np.arange(count)
+    stamp_ns = unchecked_stamp_ns(message.header.stamp)
+    return Scan(
+        stamp_ns, message.header.frame_id, azimuths, message.ranges, message.intensities, float(message.range_max)
+    )
+
+
+def features_from_bytes(data: bytes) -> dict[str, Array]:
+    """Decode the pixels (N, 2) of features by kind. Raise OmnidError for any other bytes."""
+    try:
+        found = json.loads(data) if len(data) <= _MAX_FEATURES_BYTES else {}
+        pixels = {kind: np.asarray(found[kind], np.float64).reshape(-1, 2)[:MOST_FEATURES] for kind in FEATURE_KINDS}
+    except (ValueError, TypeError, KeyError, RecursionError, OverflowError):
+        reason = f"the {len(data)} bytes attached to a panorama are not features; check that omnid sent them"
+        raise OmnidError(reason) from None
+    return {kind: points[(np.abs(points) < _MAX_PX).all(axis=1)] for kind, points in pixels.items()}
+
+
 def decode_navigation(payload: bytes, _: bytes = b"") -> NavigationReport:
     """Decode the state of the navigation. Raise OmnidError for any other bytes."""
     report = decode_diagnostics(payload)
@@ -155,7 +398,7 @@ def decode_pose(payload: bytes, attachment: bytes, received_ns: int | None = Non
     received_ns: time of arrival, of Unix time; default: now.
     """
     received_ns = time.time_ns() if received_ns is None else received_ns
-    record = codec.odometry_from_cdr(payload)
+    record = odometry_from_cdr(payload)
     return Pose(
         record.stamp_ns,
         record.T_odom_base,
@@ -169,7 +412,7 @@ def decode_pose(payload: bytes, attachment: bytes, received_ns: int | None = Non
 
 def decode_diagnostics(payload: bytes, _: bytes = b"") -> Diagnostics:
     """Decode a DiagnosticArray. Raise OmnidError for any other bytes."""
-    message = codec.message_from_cdr(payload, codec.DIAGNOSTICS_SCHEMA)
+    message = message_from_cdr(payload, DIAGNOSTICS_SCHEMA)
     assert isinstance(message, ros.diagnostic_msgs__msg__DiagnosticArray)
     statuses = tuple(
         DiagnosticStatus(entry.name, int(entry.level), entry.message, {pair.key: pair.value for pair in entry.values})
@@ -180,34 +423,34 @@ def decode_diagnostics(payload: bytes, _: bytes = b"") -> Diagnostics:
 
 def decode_cloud(payload: bytes, _: bytes = b"") -> Cloud:
     """Decode a PointCloud2 with omnid's fields. Raise OmnidError for any other bytes."""
-    message = codec.message_from_cdr(payload, codec.POINT_CLOUD_SCHEMA)
+    message = message_from_cdr(payload, POINT_CLOUD_SCHEMA)
     assert isinstance(message, ros.sensor_msgs__msg__PointCloud2)
-    step = 4 * len(map_codec.CLOUD_FIELDS)
+    step = 4 * len(CLOUD_FIELDS)
     fields = [(entry.name, entry.offset) for entry in message.fields]
-    own = fields == [(name, 4 * i) for i, name in enumerate(map_codec.CLOUD_FIELDS)] and not message.is_bigendian
+    own = fields == [(name, 4 * i) for i, name in enumerate(CLOUD_FIELDS)] and not message.is_bigendian
     if not own or message.point_step != step or message.data.size % step:
         raise OmnidError(
             f"a cloud with {len(fields)} fields and {message.point_step} bytes a point was found; "
-            f"expected the fields {', '.join(map_codec.CLOUD_FIELDS)} in {step} bytes"
+            f"expected the fields {', '.join(CLOUD_FIELDS)} in {step} bytes"
         )
-    packed = message.data.view("<f4").reshape(-1, len(map_codec.CLOUD_FIELDS))
+    packed = message.data.view("<f4").reshape(-1, len(CLOUD_FIELDS))
     return Cloud(unchecked_stamp_ns(message.header.stamp), message.header.frame_id, packed[:, :3], packed[:, 3])
 
 
 def decode_map_pose(payload: bytes, _: bytes = b"") -> PoseInMap:
     """Decode a PoseWithCovarianceStamped. Raise OmnidError unless the bytes are one with a finite, rigid pose."""
-    message = codec.message_from_cdr(payload, codec.MAP_POSE_SCHEMA)
+    message = message_from_cdr(payload, MAP_POSE_SCHEMA)
     assert isinstance(message, ros.geometry_msgs__msg__PoseWithCovarianceStamped)
     return PoseInMap(
         unchecked_stamp_ns(message.header.stamp),
-        codec.rigid_transform(message.pose.pose),
+        rigid_transform(message.pose.pose),
         message.pose.covariance.reshape(6, 6),
     )
 
 
 def decode_map(payload: bytes, _: bytes = b"") -> Map:
     """Decode an OccupancyGrid that is parallel to its frame's axes. Raise OmnidError for any other bytes."""
-    message = codec.message_from_cdr(payload, codec.GRID_SCHEMA)
+    message = message_from_cdr(payload, GRID_SCHEMA)
     assert isinstance(message, ros.nav_msgs__msg__OccupancyGrid)
     info, at = message.info, message.info.origin
     if message.data.size != info.width * info.height or not (info.resolution > 0 and abs(at.orientation.w) > ALIGNED):

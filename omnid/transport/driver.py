@@ -10,7 +10,7 @@ import zenoh
 
 from omnid.errors import OmnidError
 from omnid.transport import codec, ros2
-from omnid.transport.navigation_codec import PlanarGoal, goal_cdr, string_cdr
+from omnid.transport.codec import PlanarGoal, goal_cdr, string_cdr
 from omnid.transport.requests import Answer, answer_of
 from omnid.transport.session import robots_there
 from omnid.transport.topics import ARM, GOAL, HEADING, MAP, NAVIGATION, ROUTE, SAVE_MAP, STOP, TWIST, request_key

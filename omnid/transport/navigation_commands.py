@@ -29,10 +29,9 @@ from omnid.core.navigation.requests import (
     route_request,
 )
 from omnid.errors import OmnidError
-from omnid.transport.codec import OK
+from omnid.transport.codec import OK, DiagnosticStatus
 from omnid.transport.commands import ADVICE, RefusedStamp, StampRule
-from omnid.transport.navigation_codec import goal_from_cdr, path_from_cdr, string_from_cdr
-from omnid.transport.records import DiagnosticStatus
+from omnid.transport.decode import goal_from_cdr, path_from_cdr, string_from_cdr
 from omnid.transport.requests import Answer, Request
 from omnid.transport.status_names import REFUSED_PREFIX, REQUESTS
 from omnid.transport.topics import GOAL, NAVIGATION, PATH

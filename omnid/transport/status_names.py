@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 
 from omnid.core.control.safety_rules import ASKED
 from omnid.tracking_state import TrackingState
-from omnid.transport.records import DiagnosticStatus
+from omnid.transport.codec import DiagnosticStatus
 
 PREFIX: Final = "omnid: "
 ODOMETRY: Final = f"{PREFIX}odometry"

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
-from omnid.transport import codec, navigation_codec
-from omnid.transport.scan_codec import SCAN_SCHEMA
+from omnid.transport import codec
+from omnid.transport.codec import SCAN_SCHEMA
 
 MAP_POSE: Final = "map_pose"
 SCAN: Final = "scan"
@@ -39,7 +39,7 @@ PUBLISHED: Final = {
     "drive": Topic(codec.TWIST_SCHEMA),
     PANORAMA: Topic(IMAGE_SCHEMA),
     "navigation": Topic(codec.DIAGNOSTICS_SCHEMA, latched=True),
-    "plan": Topic(navigation_codec.PATH_SCHEMA, latched=True),
+    "plan": Topic(codec.PATH_SCHEMA, latched=True),
     "wheel_odom": Topic(codec.ODOMETRY_SCHEMA),
     "imu": Topic(codec.IMU_SCHEMA),
     CLOCK: Topic(codec.CLOCK_SCHEMA, realtime=True),
@@ -55,13 +55,13 @@ NAVIGATION: Final = "cmd/navigation"
 ROUTE: Final = "cmd/route"
 NAVIGATION_TOPICS: Final = {
     GOAL: codec.POSE_SCHEMA,
-    PATH: navigation_codec.PATH_SCHEMA,
-    NAVIGATION: navigation_codec.STRING_SCHEMA,
-    ROUTE: navigation_codec.STRING_SCHEMA,
+    PATH: codec.PATH_SCHEMA,
+    NAVIGATION: codec.STRING_SCHEMA,
+    ROUTE: codec.STRING_SCHEMA,
 }
 MAP: Final = "cmd/map"
 SAVE_MAP: Final = "save"  # the request on it
-MAP_TOPICS: Final = {MAP: navigation_codec.STRING_SCHEMA}
+MAP_TOPICS: Final = {MAP: codec.STRING_SCHEMA}
 REQUEST_TOPICS: Final = frozenset((ARM, *NAVIGATION_TOPICS, MAP))  # that have an answer
 WHEEL_ODOM: Final = "cmd/wheel_odom"
 IMU: Final = "cmd/imu"

@@ -28,11 +28,17 @@ from omnid.recordings.recording import DECODERS, Content
 from omnid.sinks.encoder import Encoder, MapEncoding, Outgoing, StateReports
 from omnid.stages.front_end import FrontEnd
 from omnid.transport import status_names
-from omnid.transport.decode import Cloud, Diagnostics, Pose, PoseInMap, decode_pose
-from omnid.transport.features_attachment import features_from_bytes
-from omnid.transport.pose_attachment import PoseAttachment
-from omnid.transport.records import OdometryRecord
-from omnid.transport.scan_codec import Scan
+from omnid.transport.codec import PoseAttachment
+from omnid.transport.decode import (
+    Cloud,
+    Diagnostics,
+    OdometryRecord,
+    Pose,
+    PoseInMap,
+    Scan,
+    decode_pose,
+    features_from_bytes,
+)
 from omnid.transport.status_names import ODOMETRY, STAGE_PREFIX, parsed_time_key, short_name
 from omnid.transport.topics import PANORAMA
 

@@ -20,8 +20,7 @@ from omnid.client import Diagnostics, Map, NavigationReport, Robot, Unreachable
 from omnid.errors import OmnidError
 from omnid.monitor.robot_state import Inbox, RobotState
 from omnid.transport.bus_config import BusConfig
-from omnid.transport.decode import Pose, decode_map, decode_map_pose, decode_navigation
-from omnid.transport.scan_codec import decode_scan
+from omnid.transport.decode import Pose, decode_map, decode_map_pose, decode_navigation, decode_scan
 from omnid.transport.topics import MAP_POSE, PANORAMA, SCAN
 from omnid.web.browsers import Browsers
 from omnid.web.channels import LivePath, Newest, Stored, with_header

@@ -15,8 +15,7 @@ from omnid.engine.telemetry import Histogram
 from omnid.monitor.robot_state import RobotState, importance
 from omnid.plain_text import plain
 from omnid.transport.codec import OK
-from omnid.transport.decode import Map, NavigationReport, Pose, PoseInMap
-from omnid.transport.scan_codec import Scan
+from omnid.transport.decode import Map, NavigationReport, Pose, PoseInMap, Scan
 from omnid.transport.status_names import PLACES, WHEELS, Key, short_name
 from omnid.web.channels import compact, with_header
 

@@ -26,7 +26,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from drivers.motion import MotionSample, WheelSample
 from omnid.formats.tum import read_tum
-from omnid.transport.motion_codec import gyro_cdr, wheel_cdr
+from omnid.transport.sensor_codec import gyro_cdr, wheel_cdr
 from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, UPPER, Entry, compressed, write_log
 from tests.replay.edited import dark, images
 from tests.simulation.motion_samples import SensorErrors, motion_samples

@@ -16,9 +16,9 @@ import numpy as np
 from calib import se3
 from drivers.frame import Frame
 from drivers.logs.mcap_writer import LogWriter
-from omnid.transport import codec, map_codec
-from omnid.transport.image_codec import image_cdr, image_topic
-from omnid.transport.records import DiagnosticStatus, FrameTransform
+from omnid.transport import codec
+from omnid.transport.codec import DiagnosticStatus, FrameTransform
+from omnid.transport.sensor_codec import image_cdr, image_topic
 from omnid.transport.status_names import ODOMETRY, Key
 from tests.drivers.logs.mcap_logs import STORE
 
@@ -75,7 +75,7 @@ def _messages(stamp_ns: int, numbers: np.random.Generator) -> Iterator[tuple[str
     yield "/tf", codec.TRANSFORM_SCHEMA, codec.transform_cdr(stamp_ns, [FrameTransform("odom", "base_link", T)])
     yield "/omnid/drive", codec.TWIST_SCHEMA, codec.twist_stamped_cdr(stamp_ns, "base_link", twist[0], twist[5])
     yield "/omnid/status", codec.DIAGNOSTICS_SCHEMA, codec.diagnostics_cdr(stamp_ns, [status])
-    yield "/omnid/cloud", CLOUD, map_codec.point_cloud_cdr(stamp_ns, "odom", packed[:, :3], packed[:, 3])
+    yield "/omnid/cloud", CLOUD, codec.point_cloud_cdr(stamp_ns, "odom", packed[:, :3], packed[:, 3])
     jpeg = cv2.imencode(".jpg", pixels)[1].tobytes()
     frames = Frame(0, stamp_ns, "lower", "jpeg", jpeg), Frame(0, stamp_ns, "upper", "mono8", pixels, 32, 24)
     for frame in frames:

@@ -19,11 +19,10 @@ import omnid.client
 from calib import se3
 from omnid.client import Answer, Cloud, Diagnostics, Driver, Map, Pose, Robot, subscribe
 from omnid.errors import OmnidError
-from omnid.transport import codec, map_codec
+from omnid.transport import codec, decode
 from omnid.transport.bus import Bus, BusConfig
+from omnid.transport.codec import DiagnosticStatus, PoseAttachment
 from omnid.transport.decode import decode_cloud, decode_diagnostics, decode_map, decode_pose
-from omnid.transport.pose_attachment import PoseAttachment
-from omnid.transport.records import DiagnosticStatus
 from omnid.transport.requests import Request
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, script
 from tests.waiting import wait_until
@@ -63,8 +62,8 @@ def test_keeps_only_the_newest_pose() -> None:
             codec.diagnostics_cdr(5, [DiagnosticStatus("a", 1, "so so", {"k": "v"})]),
             decode_diagnostics,
         ),
-        (Cloud, "cloud", map_codec.point_cloud_cdr(6, "odom", np.ones((4, 3)), np.ones(4)), decode_cloud),
-        (Map, "map", map_codec.grid_cdr(6, "odom", np.zeros((4, 3), np.int8), 0.1, (0.0, 0.0)), decode_map),
+        (Cloud, "cloud", codec.point_cloud_cdr(6, "odom", np.ones((4, 3)), np.ones(4)), decode_cloud),
+        (Map, "map", codec.grid_cdr(6, "odom", np.zeros((4, 3), np.int8), 0.1, (0.0, 0.0)), decode_map),
     ],
 )
 def test_any_bytes_are_decoded_or_refused(kind: type, topic: str, payload: bytes, decode) -> None:
@@ -118,7 +117,7 @@ def test_the_waypoint_example_drives_a_robot_to_the_last_waypoint() -> None:
         if request.topic == "cmd/arm":
             bus.answer(request.id, Answer(True, "armed"))
         elif request.topic == "cmd/heading":
-            _, _, velocity_mps, heading_rad = codec.heading_from_cdr(request.payload)
+            _, _, velocity_mps, heading_rad = decode.heading_from_cdr(request.payload)
             state["x"] += 0.1 * velocity_mps * math.cos(heading_rad)
             state["y"] += 0.1 * velocity_mps * math.sin(heading_rad)
         elif request.topic == "cmd/twist":
@@ -168,10 +167,10 @@ def test_sends_commands() -> None:
     received[:2] = sorted(received[:2], reverse=True)  # the order of different topics is not kept
     (twist, a, *_), (heading, b, *_), (stop, *_), (arm, c, _, sent_ns, _), (planned, d, *_), _ = received
     assert (twist, heading, stop, arm) == ("cmd/twist", "cmd/heading", "cmd/stop", "cmd/arm")
-    assert planned == "cmd/planner/twist" and codec.twist_from_cdr(d)[1:] == ("base_link", 0.5, -0.25)
-    assert codec.stamp_from_cdr(c) == sent_ns and before_ns <= sent_ns <= time.time_ns()
+    assert planned == "cmd/planner/twist" and decode.twist_from_cdr(d)[1:] == ("base_link", 0.5, -0.25)
+    assert decode.stamp_from_cdr(c) == sent_ns and before_ns <= sent_ns <= time.time_ns()
     senders = [request.sender for request in received]
     assert len({senders[0], senders[1], senders[2], senders[4]}) == 1 and senders[5] != senders[0]
     assert all(len(sender) >= 16 for sender in senders)
-    assert codec.twist_from_cdr(a)[1:] == ("base_link", 0.5, -0.25)
-    assert codec.heading_from_cdr(b)[1:] == ("odom", 0.75, 1.5)
+    assert decode.twist_from_cdr(a)[1:] == ("base_link", 0.5, -0.25)
+    assert decode.heading_from_cdr(b)[1:] == ("odom", 0.75, 1.5)

@@ -18,7 +18,7 @@ import zenoh
 
 from drivers.motion import GyroSample
 from omnid.transport.codec import IMU_SCHEMA
-from omnid.transport.motion_codec import sample_from_cdr
+from omnid.transport.sensor_codec import sample_from_cdr
 from tests.ports import free_port
 
 PATIENCE_S = 20.0  # for the start of a program on a busy machine

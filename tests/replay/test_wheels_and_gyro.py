@@ -28,7 +28,7 @@ from omnid.runs.run_result import RunResult
 from omnid.runs.sensor_sources import motion_topics
 from omnid.tracking_state import TrackingState
 from omnid.transport.decode import decode_diagnostics
-from omnid.transport.motion_codec import gyro_cdr, wheel_cdr
+from omnid.transport.sensor_codec import gyro_cdr, wheel_cdr
 from omnid.transport.status_names import MOTION, REFUSED_PREFIX
 from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, UPPER, Entry, compressed, write_log

@@ -27,9 +27,8 @@ from omnid.messages import OdometryUpdate
 from omnid.stages.lockstep_drive import controller_pose
 from omnid.stages.synchronise import Synchronise
 from omnid.transport import codec
-from omnid.transport.codec import ERROR, OK, WARN, diagnostics_cdr
+from omnid.transport.codec import ERROR, OK, WARN, DiagnosticStatus, diagnostics_cdr
 from omnid.transport.commands import CommandReceiver, StampRule
-from omnid.transport.records import DiagnosticStatus
 from omnid.transport.requests import Request
 from omnid.transport.status_names import Key, short_name
 from tests.omnid.small_pair import small_depth

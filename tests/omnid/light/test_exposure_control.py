@@ -13,8 +13,7 @@ from omnid.camera_config import CamerasConfig
 from omnid.light.exposure_control import ExposureControl
 from omnid.light.exposure_law import UsefulArea
 from omnid.messages import FramePair
-from omnid.transport.codec import OK, WARN
-from omnid.transport.records import DiagnosticStatus
+from omnid.transport.codec import OK, WARN, DiagnosticStatus
 from tests.simulation.recipes import mild_rig
 
 PERIOD_NS = 50_000_000

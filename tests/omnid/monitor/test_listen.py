@@ -22,10 +22,9 @@ from omnid.client import Robot
 from omnid.formats.tum import read_tum
 from omnid.monitor.listen import print_state, status_table, summary_line
 from omnid.monitor.robot_state import ReceivedMessage, RobotState
-from omnid.transport import codec, map_codec
+from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.pose_attachment import PoseAttachment
-from omnid.transport.records import DiagnosticStatus
+from omnid.transport.codec import DiagnosticStatus, PoseAttachment
 from omnid.transport.status_names import BUS, WHEELS
 from tests.omnid.transport.bus_fixtures import DEADLINE_S, free_endpoint
 from tests.replay.command import Command, rows
@@ -75,7 +74,7 @@ def test_prints_a_line_per_second_and_writes_files(tmp_path: Path) -> None:
     with contextlib.closing(Bus(BusConfig(robot="rover", listen=(endpoint,)))) as bus:
         bus.serve("rig", "name = 'rig'")
         bus.publish("/tf_static", codec.transform_cdr(10**18, []))
-        bus.publish("map", map_codec.grid_cdr(10**18, "map", np.zeros((2, 3), np.int8), 0.05, (0.0, 0.0)))
+        bus.publish("map", codec.grid_cdr(10**18, "map", np.zeros((2, 3), np.int8), 0.05, (0.0, 0.0)))
         with listening("--robot", "rover", "--connect", endpoint, "--seconds", 2.2, "--tum", tum, "--mcap", log) as it:
             out, err = publish_until_it_ends(bus, it)
     assert it.returncode == 0 and err == ""

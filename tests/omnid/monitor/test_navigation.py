@@ -15,8 +15,8 @@ from omnid.errors import OmnidError
 from omnid.monitor import navigation
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.navigation_codec import string_from_cdr
-from omnid.transport.records import DiagnosticStatus
+from omnid.transport.codec import DiagnosticStatus
+from omnid.transport.decode import string_from_cdr
 from omnid.transport.requests import Answer, Request
 from omnid.transport.status_names import NAVIGATION, Key
 from omnid.transport.topics import NAVIGATION as NAVIGATION_TOPIC

@@ -11,7 +11,7 @@ import pytest
 from omnid.monitor.stopping import stop
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.records import DiagnosticStatus
+from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.requests import Request
 from omnid.transport.status_names import DISARMED_BY_STOP, WHEELS, Key
 from tests.omnid.transport.bus_fixtures import free_endpoint, script

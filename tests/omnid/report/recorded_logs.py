@@ -11,8 +11,8 @@ from mcap.reader import make_reader
 
 from calib import se3
 from drivers.logs.mcap_writer import LogWriter
-from omnid.transport import codec, map_codec
-from omnid.transport.records import DiagnosticStatus
+from omnid.transport import codec
+from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.status_names import ODOMETRY, Key
 
 START_NS = 1_700_000_000 * 10**9
@@ -67,7 +67,7 @@ def drive(pose: float, speed_mps: float) -> Entry:
 
 def cloud(pose: float, points: np.ndarray, frame: str = "odom") -> Entry:
     """Return a map."""
-    payload = map_codec.point_cloud_cdr(at(pose), frame, points, np.ones(len(points)))
+    payload = codec.point_cloud_cdr(at(pose), frame, points, np.ones(len(points)))
     return at(pose), "/omnid/cloud", codec.POINT_CLOUD_SCHEMA, payload
 
 

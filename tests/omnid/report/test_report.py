@@ -24,7 +24,7 @@ from omnid.formats.tum import Trajectory, tum_row
 from omnid.recordings.evaluation import evaluate
 from omnid.report.recorded_run import RecordedRun, read_run
 from omnid.report.report import MAX_EVENTS, _Truth, report_html
-from omnid.transport.records import DiagnosticStatus
+from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.status_names import ODOMETRY, PAIRING, PLACES, SUMMARY, WHEELS, Key, camera_name, stage_name
 from tests.omnid.report.pages import SAMPLE, Page, assert_harmless, attached_rig_of_sample, html_of
 from tests.omnid.report.recorded_logs import (

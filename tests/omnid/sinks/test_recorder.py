@@ -21,7 +21,7 @@ from omnid.core.mapping.voxel_map import MapPoints
 from omnid.messages import MapUpdate, OdometryUpdate
 from omnid.runs.record import open_recorder
 from omnid.sinks.encoder import Encoder, MapEncoding, status_report
-from omnid.transport.records import DiagnosticStatus
+from omnid.transport.codec import DiagnosticStatus
 from tests.drivers.logs.mcap_logs import jpeg
 from tests.omnid.small_pair import small_depth
 

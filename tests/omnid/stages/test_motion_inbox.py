@@ -11,7 +11,7 @@ from drivers.logs.ros_messages import parse_motion
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.stages.motion_inbox import MotionInbox
 from omnid.transport.codec import IMU_SCHEMA
-from omnid.transport.motion_codec import gyro_cdr
+from omnid.transport.sensor_codec import gyro_cdr
 
 UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])
 

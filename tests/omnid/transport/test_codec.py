@@ -18,17 +18,32 @@ from drivers.frame import Frame
 from drivers.motion import GyroSample, WheelSample
 from omnid.core.obstacles.moving_tracker import MovingObstacle
 from omnid.errors import OmnidError
-from omnid.transport import codec, map_codec
-from omnid.transport.codec import IMU_SCHEMA
-from omnid.transport.decode import decode_cloud, decode_diagnostics, decode_map
-from omnid.transport.features_attachment import features_from_bytes
-from omnid.transport.image_codec import image_cdr, image_topic
-from omnid.transport.motion_codec import WHEEL_SCHEMA, gyro_cdr, wheel_cdr
-from omnid.transport.moving_codec import FIELDS, moving_cdr
-from omnid.transport.navigation_codec import PATH_SCHEMA, STRING_SCHEMA, PlanarGoal, goal_cdr, path_cdr, string_cdr
-from omnid.transport.pose_attachment import PoseAttachment
-from omnid.transport.records import DiagnosticStatus, FrameTransform
-from omnid.transport.scan_codec import SCAN_SCHEMA, decode_scan, scan_cdr
+from omnid.transport import codec, decode
+from omnid.transport.codec import (
+    IMU_SCHEMA,
+    MOVING_FIELDS,
+    PATH_SCHEMA,
+    SCAN_SCHEMA,
+    STRING_SCHEMA,
+    DiagnosticStatus,
+    FrameTransform,
+    PlanarGoal,
+    PoseAttachment,
+    goal_cdr,
+    moving_cdr,
+    path_cdr,
+    scan_cdr,
+    string_cdr,
+)
+from omnid.transport.decode import (
+    OdometryRecord,
+    decode_cloud,
+    decode_diagnostics,
+    decode_map,
+    decode_scan,
+    features_from_bytes,
+)
+from omnid.transport.sensor_codec import WHEEL_SCHEMA, gyro_cdr, image_cdr, image_topic, wheel_cdr
 from tests.omnid.sinks.test_recorder import frame
 
 STAMP_NS = 1_700_000_123_987_654_321
@@ -62,9 +77,9 @@ MESSAGES = {
     "string": (STRING_SCHEMA, string_cdr("teach dock")),
     "goal": (codec.POSE_SCHEMA, goal_cdr(PlanarGoal(STAMP_NS, "map", 1.0, 2.0, 0.5))),
     "path": (PATH_SCHEMA, path_cdr(STAMP_NS, "odom", [[1.0, 2.0], [3.0, 4.0]])),
-    "cloud": (codec.POINT_CLOUD_SCHEMA, map_codec.point_cloud_cdr(STAMP_NS, "rig", POINTS, CONFIDENCE)),
-    "no cloud": (codec.POINT_CLOUD_SCHEMA, map_codec.point_cloud_cdr(STAMP_NS, "rig", np.empty((0, 3)), np.empty(0))),
-    "grid": (codec.GRID_SCHEMA, map_codec.grid_cdr(STAMP_NS, "odom", CELLS, 0.1, (-2.0, 5.5))),
+    "cloud": (codec.POINT_CLOUD_SCHEMA, codec.point_cloud_cdr(STAMP_NS, "rig", POINTS, CONFIDENCE)),
+    "no cloud": (codec.POINT_CLOUD_SCHEMA, codec.point_cloud_cdr(STAMP_NS, "rig", np.empty((0, 3)), np.empty(0))),
+    "grid": (codec.GRID_SCHEMA, codec.grid_cdr(STAMP_NS, "odom", CELLS, 0.1, (-2.0, 5.5))),
     "scan": (SCAN_SCHEMA, scan_cdr(STAMP_NS, "base_link", RANGES, SIGMA, (0.1, 6.0))),
     "moving": (codec.POINT_CLOUD_SCHEMA, moving_cdr(STAMP_NS, "odom", [PERSON] * 3)),
     "wheels": (WHEEL_SCHEMA, wheel_cdr(WheelSample(5, 0.25, -0.5), STAMP_NS)),
@@ -87,7 +102,7 @@ def test_own_writers_align_as_ros_does_whatever_the_length_of_the_frame(name: st
         header, step / 2 - math.pi, math.pi - step / 2, step, 0.0, 0.0, 0.0, 6.0, RANGES, SIGMA
     )
     assert scan_cdr(STAMP_NS, name, RANGES, SIGMA, (0.0, 6.0)) == bytes(STORE.serialize_cdr(scan, SCAN_SCHEMA))
-    fields = [ros.sensor_msgs__msg__PointField(field, 4 * i, 7, 1) for i, field in enumerate(FIELDS)]
+    fields = [ros.sensor_msgs__msg__PointField(field, 4 * i, 7, 1) for i, field in enumerate(MOVING_FIELDS)]
     for count in (0, 1, 3):
         points = np.array([[1.5, -0.25, 0, 0, 0.75, 0.25, 0.2, 0.5]] * count, "<f4").reshape(-1).view(np.uint8)
         cloud = ros.sensor_msgs__msg__PointCloud2(header, 1, count, fields, False, 32, 32 * count, points, True)
@@ -143,11 +158,11 @@ def overwritten(offset: int, value: bytes) -> bytes:
     ("make", "words"),
     [
         *(
-            (lambda data=data: codec.odometry_from_cdr(data), ".")
+            (lambda data=data: decode.odometry_from_cdr(data), ".")
             for data in (b"", b"\x00", b"\x00\x01\x00\x00", b"hello", bytes(724), odometry()[:-9])
         ),
         *(
-            (lambda at=at, value=value: codec.odometry_from_cdr(overwritten(at, value)), "stamp|quaternion")
+            (lambda at=at, value=value: decode.odometry_from_cdr(overwritten(at, value)), "stamp|quaternion")
             for at, value in (
                 (4, struct.pack("<i", -1)),
                 (8, struct.pack("<I", 10**9)),
@@ -155,7 +170,7 @@ def overwritten(offset: int, value: bytes) -> bytes:
                 (92, struct.pack("<d", 3.0)),
             )
         ),
-        (lambda: codec.odometry_from_cdr(overwritten(44, struct.pack("<d", math.nan))), "expected finite"),
+        (lambda: decode.odometry_from_cdr(overwritten(44, struct.pack("<d", math.nan))), "expected finite"),
         (lambda: codec.pose_stamped_cdr(-1, T_ODOM_BASE), "stamp"),
         (lambda: codec.pose_stamped_cdr(2**31 * 10**9, T_ODOM_BASE), "stamp"),
         (lambda: scan_cdr(-1, "base_link", RANGES, SIGMA, (0.0, 6.0)), "stamp"),
@@ -163,7 +178,7 @@ def overwritten(offset: int, value: bytes) -> bytes:
         (lambda: image_cdr(frame(7, "upper", "bgr8"), -1), "-1 ns"),
         (lambda: codec.odometry_cdr(1, T_ODOM_BASE, np.eye(3), VELOCITY, COVARIANCE), "covariance"),
         (lambda: codec.diagnostics_cdr(1, [DiagnosticStatus("omnid", 4, "", {})]), "level 4"),
-        (lambda: map_codec.point_cloud_cdr(1, "rig", np.zeros((3, 3)), np.zeros(2)), "2 confidences for 3 points"),
+        (lambda: codec.point_cloud_cdr(1, "rig", np.zeros((3, 3)), np.zeros(2)), "2 confidences for 3 points"),
         *(
             (lambda data=data: features_from_bytes(data), "attached to a panorama")
             for data in (
@@ -190,7 +205,7 @@ def test_what_is_no_message_is_refused(make: Callable[[], object], words: str) -
 @pytest.mark.parametrize(
     ("decode", "good"),
     [
-        (codec.odometry_from_cdr, odometry()),
+        (decode.odometry_from_cdr, odometry()),
         (decode_scan, MESSAGES["scan"][1]),
         (decode_map, MESSAGES["grid"][1]),
         (decode_cloud, MESSAGES["cloud"][1]),
@@ -211,4 +226,4 @@ def test_any_bytes_give_a_message_or_one_line(decode: Callable[[bytes], object],
         except OmnidError as error:
             assert "\n" not in str(error)
         else:
-            assert not isinstance(decoded, codec.OdometryRecord) or se3.is_rigid(decoded.T_odom_base)
+            assert not isinstance(decoded, OdometryRecord) or se3.is_rigid(decoded.T_odom_base)

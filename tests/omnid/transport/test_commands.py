@@ -26,7 +26,17 @@ from omnid.core.navigation.requests import (
 )
 from omnid.errors import OmnidError
 from omnid.transport import codec
-from omnid.transport.codec import IMU_SCHEMA, JOINT_SCHEMA, bool_cdr, header_message, message_cdr
+from omnid.transport.codec import (
+    IMU_SCHEMA,
+    JOINT_SCHEMA,
+    PlanarGoal,
+    bool_cdr,
+    goal_cdr,
+    header_message,
+    message_cdr,
+    path_cdr,
+    string_cdr,
+)
 from omnid.transport.commands import (
     LONGEST_PAYLOAD,
     NOT_RISING,
@@ -37,19 +47,11 @@ from omnid.transport.commands import (
     SensorReceiver,
     StampRule,
 )
-from omnid.transport.motion_codec import gyro_cdr, wheel_cdr
-from omnid.transport.navigation_codec import (
-    PlanarGoal,
-    goal_cdr,
-    goal_from_cdr,
-    path_cdr,
-    path_from_cdr,
-    string_cdr,
-    string_from_cdr,
-)
+from omnid.transport.decode import goal_from_cdr, path_from_cdr, string_from_cdr
 from omnid.transport.navigation_commands import LONGEST_PAYLOAD as LONGEST_PATH
 from omnid.transport.navigation_commands import NavigationReceiver
 from omnid.transport.requests import Answer, Request
+from omnid.transport.sensor_codec import gyro_cdr, wheel_cdr
 from omnid.transport.topics import IMU, JOINT_STATES, SENSOR_TOPICS, WHEEL_ODOM
 
 STALE_S = 0.5

@@ -24,12 +24,10 @@ from calib import se3
 from drivers.frame import Frame
 from drivers.logs.mcap_writer import LogWriter
 from omnid.formats.tum import read_tum
-from omnid.transport import codec, map_codec
+from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.features_attachment import features_to_bytes
-from omnid.transport.image_codec import image_cdr
-from omnid.transport.pose_attachment import PoseAttachment
-from omnid.transport.records import DiagnosticStatus
+from omnid.transport.codec import DiagnosticStatus, PoseAttachment, features_to_bytes
+from omnid.transport.sensor_codec import image_cdr
 from omnid.transport.status_names import ODOMETRY, stage_name
 from tests.conftest import PAIRS
 from tests.omnid.transport.bus_fixtures import DEADLINE_S, free_endpoint
@@ -157,7 +155,7 @@ def publish(bus: Bus, number: int) -> None:
         PoseAttachment(number, "degraded", 0, 50, 60, time.time_ns()).to_bytes(),
     )
     bus.publish("map_pose", codec.pose_with_covariance_cdr(stamp_ns, se3.exp([0.2, 0, 0, 0, 0, 0]) @ T, np.eye(6)))
-    bus.publish("cloud", map_codec.point_cloud_cdr(stamp_ns, "odom", np.ones((5, 3)), np.ones(5)))
+    bus.publish("cloud", codec.point_cloud_cdr(stamp_ns, "odom", np.ones((5, 3)), np.ones(5)))
     statuses = [DiagnosticStatus(stage_name("odometry"), 0, "", {"work_p50_ms": "30.5"})]
     bus.publish("status", codec.diagnostics_cdr(stamp_ns, statuses))
     jpeg = cv2.imencode(".jpg", np.zeros((8, 16), np.uint8))[1]

@@ -17,13 +17,11 @@ from starlette.websockets import WebSocket
 from calib import se3
 from drivers.frame import Frame
 from omnid.monitor.robot_state import RobotState
-from omnid.transport import codec, map_codec
+from omnid.transport import codec
 from omnid.transport.bus import BusConfig
-from omnid.transport.decode import Diagnostics, Map, Pose
-from omnid.transport.image_codec import image_cdr
-from omnid.transport.pose_attachment import PoseAttachment
-from omnid.transport.records import DiagnosticStatus
-from omnid.transport.scan_codec import Scan, scan_cdr
+from omnid.transport.codec import DiagnosticStatus, PoseAttachment, scan_cdr
+from omnid.transport.decode import Diagnostics, Map, Pose, Scan
+from omnid.transport.sensor_codec import image_cdr
 from omnid.transport.status_names import NAVIGATION, ODOMETRY, PLACES, WHEELS, Key
 from omnid.web.browsers import Browsers
 from omnid.web.channels import MOST_POINTS, LivePath, Newest
@@ -185,7 +183,7 @@ def test_obstacles_are_drawn_from_the_pose_nearest_in_time() -> None:
 
 
 STATUS = codec.diagnostics_cdr(10**18, [DiagnosticStatus(WHEELS, 0, "armed", {Key.ARMED: "1"})])
-MAP = map_codec.grid_cdr(10**18, "odom", np.full((4, 3), 100, np.int8), 0.1, (-1.0, -2.0))
+MAP = codec.grid_cdr(10**18, "odom", np.full((4, 3), 100, np.int8), 0.1, (-1.0, -2.0))
 SCAN = scan_cdr(10**9, "base_link", np.ones(360, np.float32), np.ones(360, np.float32), (0.1, 6.0))
 
 

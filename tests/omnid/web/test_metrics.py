@@ -8,9 +8,8 @@ from prometheus_client import parser
 
 from omnid.monitor.robot_state import ReceivedMessage, RobotState
 from omnid.tracking_state import TrackingState
+from omnid.transport.codec import DiagnosticStatus, PoseAttachment
 from omnid.transport.decode import Diagnostics
-from omnid.transport.pose_attachment import PoseAttachment
-from omnid.transport.records import DiagnosticStatus
 from omnid.web.browsers import Browsers
 from omnid.web.metrics import metrics
 from tests.omnid.transport.bus_fixtures import odometry

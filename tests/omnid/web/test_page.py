@@ -22,10 +22,7 @@ import pytest
 
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.map_codec import grid_cdr
-from omnid.transport.pose_attachment import PoseAttachment
-from omnid.transport.records import DiagnosticStatus
-from omnid.transport.scan_codec import scan_cdr
+from omnid.transport.codec import DiagnosticStatus, PoseAttachment, grid_cdr, scan_cdr
 from omnid.transport.status_names import CALIBRATION
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry
 from tests.omnid.web.servers import WebServer, served

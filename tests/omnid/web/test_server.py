@@ -25,10 +25,9 @@ import numpy as np
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from omnid.transport import codec, map_codec
+from omnid.transport import codec
 from omnid.transport.bus import Bus
-from omnid.transport.pose_attachment import PoseAttachment
-from omnid.transport.records import DiagnosticStatus
+from omnid.transport.codec import DiagnosticStatus, PoseAttachment
 from omnid.transport.status_names import BUS, WHEELS
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry
 from tests.omnid.transport.test_access import authority
@@ -153,7 +152,7 @@ def test_poses_status_and_map_arrive(server: WebServer, bus: Bus) -> None:
     def run() -> None:
         publish(bus, next(seq))
         bus.publish("status", codec.diagnostics_cdr(10**18, [DiagnosticStatus(BUS, 0, "open", {"lost": "0"}), wheels]))
-        bus.publish("map", map_codec.grid_cdr(10**18, "odom", grid, 0.1, (-1.0, -2.0)))
+        bus.publish("map", codec.grid_cdr(10**18, "odom", grid, 0.1, (-1.0, -2.0)))
 
     with server.live(server.bearer) as live:
         shown = Shown(live)
@@ -171,7 +170,7 @@ def test_poses_status_and_map_arrive(server: WebServer, bus: Bus) -> None:
         cells = np.frombuffer(zlib.decompress(received["body"]), np.uint8).reshape(40, 30)
         assert (cells[1:, 0] == 2).all() and (cells[0, 1:] == 1).all() and (cells[1:, 1:] == 0).all()
         assert (received["cell_m"], received["x_m"], received["y_m"]) == (pytest.approx(0.1), -1.0, -2.0)
-        other = map_codec.grid_cdr(10**18, "elsewhere", grid, 0.1, (0.0, 0.0))
+        other = codec.grid_cdr(10**18, "elsewhere", grid, 0.1, (0.0, 0.0))
         received = shown.until("map", lambda: bus.publish("map", other), lambda found: found["frame"] == "elsewhere")
         assert (received["width"], received["body"]) == (0, b"")
 

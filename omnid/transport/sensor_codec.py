@@ -1,0 +1,116 @@
+"""Frames and samples of the drivers as messages of ROS 2, on topics that ROS tools and `omnid replay` recognise.
+
+Images: CDR is written here (OMG RTPS 2.2, 10.2: little-endian, numbers aligned to their size), not by rosbags: images
+are nearly all of a recording, and this copies each of them once; drivers.logs.ros_messages reads it. Wheels and gyro:
+nav_msgs/msg/Odometry and sensor_msgs/msg/Imu, both ways; wheels of a JointState.
+"""
+
+from __future__ import annotations
+
+import math
+from struct import pack
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.errors import FrameDecodeError
+from drivers.frame import Frame
+from drivers.logs.ros_messages import BASE_FRAME, COMPRESSED_IMAGE, IMAGE, JointWheels, parse_motion
+from drivers.motion import GyroSample, MotionSample, WheelSample
+from omnid.errors import OmnidError
+from omnid.transport import ros_types as ros
+from omnid.transport.codec import IMU_SCHEMA, ODOMETRY_SCHEMA, header_message, message_cdr, odometry_cdr, ros_time
+
+COMPRESSED: Final = ("jpeg", "png")
+# Encoding in drivers.frame -> name in sensor_msgs/image_encodings.hpp, where that is different.
+_ROS_NAMES: Final = {"yuyv": "yuv422_yuy2", "uyvy": "yuv422"}
+_PIXEL_BYTES: Final = {"mono16": 2, "bgr8": 3, "rgb8": 3, "bgra8": 4, "rgba8": 4, "yuyv": 2, "uyvy": 2}
+
+
+def image_topic(frame: Frame) -> str:
+    """Return the frame's topic below the robot's name, such as lower/image_raw/compressed."""
+    return f"{frame.camera}/image_raw" + ("/compressed" if frame.encoding in COMPRESSED else "")
+
+
+def image_cdr(frame: Frame, stamp_ns: int) -> tuple[str, bytes]:
+    """Return schema and CDR bytes of an undecoded frame with the given stamp [ns of Unix time]; frame_id is the camera.
+
+    Raise OmnidError where the stamp does not fit a ROS time.
+    """
+    header = _aligned(pack("<iI", *ros_time(stamp_ns)) + _string(frame.camera))
+    data = np.frombuffer(frame.data, np.uint8)
+    if frame.encoding in COMPRESSED:
+        return COMPRESSED_IMAGE, _message(_aligned(header + _string(frame.encoding)), data)
+    step = frame.step or frame.width * _PIXEL_BYTES.get(frame.encoding, 1)
+    size, name = pack("<II", frame.height, frame.width), _ROS_NAMES.get(frame.encoding, frame.encoding)
+    layout = _aligned(size + _string(name) + bytes([frame.bigendian])) + pack("<I", step)
+    return IMAGE, _message(header + layout, data[: step * _rows(frame)])
+
+
+def _rows(frame: Frame) -> int:
+    """Return the rows of a whole image; a driver's buffer may be longer, which ROS does not accept."""
+    return frame.height * 3 // 2 if frame.encoding == "nv12" else frame.height  # the colour planes follow as rows
+
+
+def _message(head: bytes, data: NDArray[Any]) -> bytes:
+    """Join a message of its head, a multiple of 4 bytes, and the array of its data."""
+    return b"".join((b"\0\1\0\0", head, pack("<I", data.size), data.data))
+
+
+def _string(text: str) -> bytes:
+    data = text.encode() + b"\0"
+    return pack("<I", len(data)) + data
+
+
+def _aligned(block: bytes) -> bytes:
+    return block + bytes(-len(block) % 4)
+
+
+WHEEL_SCHEMA: Final = ODOMETRY_SCHEMA
+LARGEST_RATE: Final = 100.0  # m/s and rad/s: larger ones are faults of the sender
+_UNKNOWN_VARIANCE: Final = 1e9  # Variance of the parts of a pose that wheels do not measure.
+_UNKNOWN: Final = np.array([-1.0, *[0.0] * 8])  # REP 145: the message has no orientation, and no acceleration
+
+
+def wheel_cdr(sample: WheelSample, stamp_ns: int) -> bytes:
+    """Encode the velocity by the wheels; the pose in the message is unknown."""
+    velocity = np.array([sample.velocity_mps, 0, 0, 0, 0, sample.yaw_rate_radps])
+    return odometry_cdr(stamp_ns, np.eye(4), _UNKNOWN_VARIANCE * np.eye(6), velocity, np.zeros((6, 6)))
+
+
+def gyro_cdr(sample: GyroSample, stamp_ns: int, frame: str = BASE_FRAME) -> bytes:
+    """Encode angular velocities about the axes of a frame."""
+    rates = ros.geometry_msgs__msg__Vector3(sample.x_radps, sample.y_radps, sample.z_radps)
+    message = ros.sensor_msgs__msg__Imu(
+        header_message(stamp_ns, frame),
+        ros.geometry_msgs__msg__Quaternion(0.0, 0.0, 0.0, 1.0),
+        _UNKNOWN,
+        rates,
+        np.zeros(9),
+        ros.geometry_msgs__msg__Vector3(0.0, 0.0, 0.0),
+        _UNKNOWN,
+    )
+    return message_cdr(message, IMU_SCHEMA)
+
+
+def sample_from_cdr(
+    payload: bytes, schema: str, offset_ns: int, joints: JointWheels | None = None
+) -> MotionSample | None:
+    """Decode a sample from the network; None for a JointState that has no wheel.
+
+    offset_ns: from the stamps of images to the sender's clock. joints: the wheels in a JointState.
+
+    Raise OmnidError for a message without a stamp, with rates that are not finite or absurd, and for other bytes.
+    """
+    try:
+        reading = parse_motion(schema, memoryview(payload), joints=joints)
+    except FrameDecodeError as error:
+        raise OmnidError(str(error)) from error
+    if not reading.rates:
+        return None
+    if not reading.stamp_ns:
+        raise OmnidError(f"a {schema} has no stamp; fill in header.stamp")
+    if any(abs(rate) > LARGEST_RATE for rate in reading.rates if math.isfinite(rate)):
+        raise OmnidError(f"a {schema} has rates above {LARGEST_RATE:.0f} m/s or rad/s: check its units")
+    return reading._replace(stamp_ns=reading.stamp_ns - offset_ns).sample(0)
