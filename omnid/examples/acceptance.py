@@ -7,6 +7,7 @@
 4. `python -m omnid.examples.acceptance LOG DISTANCE_M [RIG.toml]`; LOG is the recording, or a trajectory (.txt, TUM).
 
 Exit code 1: a length or the end of a round is off by more than 0.5 % and 10 mm, which placing a robot by eye explains.
+Exit code 2: there is nothing to judge, and one line says why.
 """
 
 import sys
@@ -18,7 +19,9 @@ from numpy.typing import NDArray
 
 import omnid
 from calib import se3
+from calib.errors import CalibError
 from calib.rig_file import read_rig
+from omnid.errors import OmnidError
 from omnid.formats.tum import read_tum
 
 STAND_M, STAND_RAD, STAND_S = 0.02, np.radians(2.0), 2.0  # at rest: the robot stays within these for this time
@@ -59,7 +62,8 @@ def judge(stamps_s: Array, T: Array, distance_m: float) -> int:
     """Print the errors of each round; return 1 where one is not accepted."""
     marks = visits(T, stands(stamps_s, T), distance_m)
     if len(marks) < 3:
-        sys.exit(f"expected stands of {STAND_S:g} s on A, on B {distance_m:g} m away, and on A; found {len(marks)}")
+        found = f"on B {distance_m:g} m away, and on A; found {len(marks)}"
+        raise OmnidError(f"expected stands of {STAND_S:g} s on A, {found}")
     legs_m = np.array([np.linalg.norm(T[b, :3, 3] - T[a, :3, 3]) for a, b in pairwise(marks)])
     for leg, length_m in enumerate(legs_m):
         print(f"{'AB'[leg % 2]} to {'BA'[leg % 2]} {length_m:.4f} m, {length_m / distance_m - 1:+.2%}")
@@ -73,10 +77,11 @@ def judge(stamps_s: Array, T: Array, distance_m: float) -> int:
     return int(not accepted)
 
 
-if __name__ == "__main__":
-    if len(sys.argv) not in (3, 4):
-        sys.exit(__doc__)
-    log, distance_m, *rig = sys.argv[1:]
+def main(arguments: list[str]) -> int:
+    """Judge the log or trajectory that the arguments name."""
+    if len(arguments) not in (2, 3):
+        raise OmnidError("expected LOG DISTANCE_M [RIG.toml], as the first lines of this file say")
+    log, distance_m, *rig = arguments
     if Path(log).suffix in (".txt", ".tum"):
         path = read_tum(Path(log))
         stamps_ns, T_odom_rig = path.stamps_ns, path.T
@@ -84,4 +89,12 @@ if __name__ == "__main__":
         run = omnid.replay(log, rig=rig[0] if rig else None)
         stamps_ns, T_odom_rig = run.stamps_ns, run.T_odom_rig
     T_rig_base = se3.inverse(read_rig(Path(rig[0])).T_base_rig) if rig else np.eye(4)
-    sys.exit(judge(1e-9 * (stamps_ns - stamps_ns[0]), T_odom_rig @ T_rig_base, float(distance_m)))
+    return judge(1e-9 * (stamps_ns - stamps_ns[0]), T_odom_rig @ T_rig_base, float(distance_m))
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main(sys.argv[1:]))
+    except (CalibError, OmnidError, ValueError) as error:  # of files, rigs and numbers: 1 is a verdict, 2 an error
+        print(f"acceptance: {error}", file=sys.stderr)
+        sys.exit(2)

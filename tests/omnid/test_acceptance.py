@@ -58,9 +58,23 @@ def test_errors_of_rounds(
     assert max(errors, key=float).startswith(longest), out
 
 
-def test_a_drive_without_a_round_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "est.txt"
-    write_rounds(path, (1.0,), 0.0)
-    monkeypatch.setattr("sys.argv", ["acceptance", str(path), "3.0"])
-    with pytest.raises(SystemExit, match="on B 3 m away"):
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["est.txt", "3.0"], "on B 3 m away"),
+        (["missing.mcap", "3.0"], "cannot read the log 'missing.mcap'"),
+        (["est.txt", "three"], "could not convert"),
+        ([], "expected LOG DISTANCE_M"),
+    ],
+)
+def test_what_cannot_be_judged_is_one_line_and_no_verdict(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, words: list[str], line: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_rounds(tmp_path / "est.txt", (1.0,), 0.0)
+    monkeypatch.setattr("sys.argv", ["acceptance", *words])
+    with pytest.raises(SystemExit) as ended:
         runpy.run_module("omnid.examples.acceptance", run_name="__main__")
+    assert ended.value.code == 2
+    error = capsys.readouterr().err
+    assert line in error and error.count("\n") == 1
