@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache, lru_cache
 from struct import pack
-from typing import TYPE_CHECKING, Final, NamedTuple, Self
+from typing import TYPE_CHECKING, ClassVar, Final, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -39,7 +39,6 @@ TRANSFORM_SCHEMA = "tf2_msgs/msg/TFMessage"
 POINT_CLOUD_SCHEMA = "sensor_msgs/msg/PointCloud2"
 DIAGNOSTICS_SCHEMA = "diagnostic_msgs/msg/DiagnosticArray"
 TWIST_SCHEMA = "geometry_msgs/msg/TwistStamped"
-PLAIN_TWIST_SCHEMA = "geometry_msgs/msg/Twist"
 VECTOR_SCHEMA = "geometry_msgs/msg/Vector3Stamped"
 GRID_SCHEMA = "nav_msgs/msg/OccupancyGrid"
 HEADER_SCHEMA = "std_msgs/msg/Header"
@@ -72,6 +71,15 @@ MOVING_FIELDS: Final = ("x", "y", "z", "vx", "vy", "radius", "sigma", "sigma_v")
 FEATURE_KINDS: Final = ("inliers", "rejected", "new")
 MOST_FEATURES: Final = 2000  # features of a kind
 _MAX_ATTACHMENT_BYTES: Final = 4096
+
+
+class RosMessage(Protocol):
+    """A message in the type of rosbags."""
+
+    __msgtype__: ClassVar[str]  # such as "nav_msgs/msg/Odometry"
+
+
+M = TypeVar("M", bound=RosMessage)
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,9 +154,9 @@ def compile_serialisers(*more: str) -> None:
         _typestore().get_msgdef(schema)
 
 
-def message_cdr(message: object, schema: str) -> bytes:
+def message_cdr(message: RosMessage) -> bytes:
     """Encode a message in the type of rosbags."""
-    return bytes(_typestore().serialize_cdr(message, schema))
+    return bytes(_typestore().serialize_cdr(message, message.__msgtype__))
 
 
 def ros_time(stamp_ns: int) -> tuple[int, int]:
@@ -214,26 +222,26 @@ def odometry_cdr(
         ros.geometry_msgs__msg__PoseWithCovariance(pose_message(T_odom_base), _covariance(covariance)),
         ros.geometry_msgs__msg__TwistWithCovariance(twist, _covariance(velocity_covariance)),
     )
-    return message_cdr(message, ODOMETRY_SCHEMA)
+    return message_cdr(message)
 
 
 def pose_stamped_cdr(stamp_ns: int, T_odom_body: Array) -> bytes:
     """Encode a geometry_msgs/msg/PoseStamped: the pose of a body in odom."""
     message = ros.geometry_msgs__msg__PoseStamped(header_message(stamp_ns, "odom"), pose_message(T_odom_body))
-    return message_cdr(message, POSE_SCHEMA)
+    return message_cdr(message)
 
 
 def pose_with_covariance_cdr(stamp_ns: int, T_map_body: Array, covariance: Array) -> bytes:
     """Encode a geometry_msgs/msg/PoseWithCovarianceStamped: the pose of a body in the map, covariance in its axes."""
     pose = ros.geometry_msgs__msg__PoseWithCovariance(pose_message(T_map_body), _covariance(covariance))
     message = ros.geometry_msgs__msg__PoseWithCovarianceStamped(header_message(stamp_ns, "map"), pose)
-    return message_cdr(message, MAP_POSE_SCHEMA)
+    return message_cdr(message)
 
 
 def transform_cdr(stamp_ns: int, transforms: Sequence[FrameTransform]) -> bytes:
     """Encode a tf2_msgs/msg/TFMessage: edges of the frame tree, all of one instant."""
     edges = [_edge(stamp_ns, edge) for edge in transforms]
-    return message_cdr(ros.tf2_msgs__msg__TFMessage(edges), TRANSFORM_SCHEMA)
+    return message_cdr(ros.tf2_msgs__msg__TFMessage(edges))
 
 
 def _edge(stamp_ns: int, edge: FrameTransform) -> ros.geometry_msgs__msg__TransformStamped:
@@ -245,9 +253,7 @@ def _edge(stamp_ns: int, edge: FrameTransform) -> ros.geometry_msgs__msg__Transf
 def diagnostics_cdr(stamp_ns: int, statuses: Sequence[DiagnosticStatus]) -> bytes:
     """Encode a diagnostic_msgs/msg/DiagnosticArray."""
     entries = [_status(status) for status in statuses]
-    return message_cdr(
-        ros.diagnostic_msgs__msg__DiagnosticArray(header_message(stamp_ns, ""), entries), DIAGNOSTICS_SCHEMA
-    )
+    return message_cdr(ros.diagnostic_msgs__msg__DiagnosticArray(header_message(stamp_ns, ""), entries))
 
 
 def _status(status: DiagnosticStatus) -> ros.diagnostic_msgs__msg__DiagnosticStatus:
@@ -262,36 +268,39 @@ def _status(status: DiagnosticStatus) -> ros.diagnostic_msgs__msg__DiagnosticSta
 def twist_stamped_cdr(stamp_ns: int, frame: str, linear_mps: float, yaw_rate_radps: float) -> bytes:
     """Encode a geometry_msgs/msg/TwistStamped of a ground robot: forward speed and yaw rate in `frame`."""
     twist = ros.geometry_msgs__msg__Twist(_vector((linear_mps, 0, 0)), _vector((0, 0, yaw_rate_radps)))
-    return message_cdr(ros.geometry_msgs__msg__TwistStamped(header_message(stamp_ns, frame), twist), TWIST_SCHEMA)
+    return message_cdr(ros.geometry_msgs__msg__TwistStamped(header_message(stamp_ns, frame), twist))
 
 
 def heading_cdr(stamp_ns: int, velocity_mps: float, heading_rad: float) -> bytes:
     """Encode a heading command, a geometry_msgs/msg/Vector3Stamped in odom: x is the speed, z the heading."""
     vector = _vector((velocity_mps, 0, heading_rad))
-    return message_cdr(ros.geometry_msgs__msg__Vector3Stamped(header_message(stamp_ns, "odom"), vector), VECTOR_SCHEMA)
+    return message_cdr(ros.geometry_msgs__msg__Vector3Stamped(header_message(stamp_ns, "odom"), vector))
 
 
 def clock_cdr(stamp_ns: int) -> bytes:
     """Encode the time of a run, for programs that follow it."""
-    return message_cdr(ros.rosgraph_msgs__msg__Clock(time_message(stamp_ns)), CLOCK_SCHEMA)
+    return message_cdr(ros.rosgraph_msgs__msg__Clock(time_message(stamp_ns)))
 
 
 def header_cdr(stamp_ns: int) -> bytes:
     """Encode a std_msgs/msg/Header, which is the message of cmd/arm."""
-    return message_cdr(header_message(stamp_ns, ""), HEADER_SCHEMA)
+    return message_cdr(header_message(stamp_ns, ""))
 
 
 def bool_cdr(value: bool) -> bytes:
     """Encode a std_msgs/msg/Bool, which is the message of cmd/bumper and cmd/cliff."""
-    return message_cdr(ros.std_msgs__msg__Bool(value), BOOL_SCHEMA)
+    return message_cdr(ros.std_msgs__msg__Bool(value))
 
 
-def message_from_cdr(payload: bytes, schema: str) -> object:
-    """Decode a message of a schema into the type of rosbags. Raise OmnidError for any other bytes."""
+def message_from_cdr(payload: bytes, kind: type[M]) -> M:
+    """Decode a message into a type of rosbags. Raise OmnidError for any other bytes."""
+    schema = kind.__msgtype__
     try:
-        return _typestore().deserialize_cdr(bytes(payload), schema)
+        message = _typestore().deserialize_cdr(bytes(payload), schema)
     except SerdeError as error:
         raise OmnidError(f"{len(payload)} bytes are not a {schema} in CDR ({error}); check the sender") from error
+    assert isinstance(message, kind)
+    return message
 
 
 def point_cloud_cdr(
@@ -323,7 +332,7 @@ def packed_cloud_cdr(stamp_ns: int, frame: str, names: Sequence[str], rows: NDAr
         data=rows.reshape(-1).view(np.uint8),
         is_dense=bool(np.isfinite(rows).all()),
     )
-    return message_cdr(message, POINT_CLOUD_SCHEMA)
+    return message_cdr(message)
 
 
 def _packed(points: ArrayLike, confidence: ArrayLike, T: NDArray[np.float64] | None) -> NDArray[np.float32]:
@@ -345,7 +354,7 @@ def grid_cdr(stamp_ns: int, frame: str, cells: NDArray[np.int8], cell_m: float, 
     corner_pose = pose_message(se3.transform(np.eye(3), (*corner, 0.0)))
     info = ros.nav_msgs__msg__MapMetaData(time_message(stamp_ns), cell_m, width, height, corner_pose)
     message = ros.nav_msgs__msg__OccupancyGrid(header_message(stamp_ns, frame), info, cells.reshape(-1))
-    return message_cdr(message, GRID_SCHEMA)
+    return message_cdr(message)
 
 
 def moving_cdr(stamp_ns: int, frame: str, moving: Sequence[MovingObstacle]) -> bytes:
@@ -366,9 +375,7 @@ def _sigmas(one: MovingObstacle) -> tuple[float, float]:
 def goal_cdr(goal: PlanarGoal) -> bytes:
     """Encode a goal as a PoseStamped."""
     pose = _planar_pose(goal.x_m, goal.y_m, goal.heading_rad)
-    return message_cdr(
-        ros.geometry_msgs__msg__PoseStamped(header_message(goal.stamp_ns, goal.frame), pose), POSE_SCHEMA
-    )
+    return message_cdr(ros.geometry_msgs__msg__PoseStamped(header_message(goal.stamp_ns, goal.frame), pose))
 
 
 def path_cdr(stamp_ns: int, frame: str, xy: ArrayLike, heading_rad: float | None = None) -> bytes:
@@ -382,12 +389,12 @@ def path_cdr(stamp_ns: int, frame: str, xy: ArrayLike, heading_rad: float | None
         ros.geometry_msgs__msg__PoseStamped(header, _planar_pose(float(x), float(y), heading))
         for (x, y), heading in zip(points, headings, strict=True)
     ]
-    return message_cdr(ros.nav_msgs__msg__Path(header, poses), PATH_SCHEMA)
+    return message_cdr(ros.nav_msgs__msg__Path(header, poses))
 
 
 def string_cdr(text: str) -> bytes:
     """Encode a std_msgs/msg/String."""
-    return message_cdr(ros.std_msgs__msg__String(text), STRING_SCHEMA)
+    return message_cdr(ros.std_msgs__msg__String(text))
 
 
 def _planar_pose(x_m: float, y_m: float, heading_rad: float | None) -> ros.geometry_msgs__msg__Pose:

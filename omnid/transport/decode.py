@@ -19,24 +19,10 @@ from omnid.errors import OmnidError
 from omnid.transport import ros_types as ros
 from omnid.transport import status_names
 from omnid.transport.codec import (
-    BOOL_SCHEMA,
     CLOUD_FIELDS,
-    DIAGNOSTICS_SCHEMA,
     FEATURE_KINDS,
-    GRID_SCHEMA,
-    HEADER_SCHEMA,
-    MAP_POSE_SCHEMA,
     MOST_FEATURES,
     NS_PER_S,
-    ODOMETRY_SCHEMA,
-    PATH_SCHEMA,
-    PLAIN_TWIST_SCHEMA,
-    POINT_CLOUD_SCHEMA,
-    POSE_SCHEMA,
-    SCAN_SCHEMA,
-    STRING_SCHEMA,
-    TWIST_SCHEMA,
-    VECTOR_SCHEMA,
     DiagnosticStatus,
     PlanarGoal,
     PoseAttachment,
@@ -211,8 +197,7 @@ class NavigationReport:
 
 def twist_from_cdr(payload: bytes) -> TwistRecord:
     """Decode a TwistStamped; its numbers need not be finite. Raise OmnidError for any other bytes."""
-    message = message_from_cdr(payload, TWIST_SCHEMA)
-    assert isinstance(message, ros.geometry_msgs__msg__TwistStamped)
+    message = message_from_cdr(payload, ros.geometry_msgs__msg__TwistStamped)
     return TwistRecord(
         unchecked_stamp_ns(message.header.stamp),
         message.header.frame_id,
@@ -228,15 +213,13 @@ def is_plain_twist(payload: bytes) -> bool:
 
 def plain_twist_from_cdr(payload: bytes) -> TwistRecord:
     """Decode a Twist, which has no stamp (0) and no frame. Raise OmnidError for any other bytes."""
-    twist = message_from_cdr(payload, PLAIN_TWIST_SCHEMA)
-    assert isinstance(twist, ros.geometry_msgs__msg__Twist)
+    twist = message_from_cdr(payload, ros.geometry_msgs__msg__Twist)
     return TwistRecord(0, "", twist.linear.x, twist.angular.z)
 
 
 def heading_from_cdr(payload: bytes) -> HeadingRecord:
     """Decode a Vector3Stamped; its numbers need not be finite. Raise OmnidError for any other bytes."""
-    message = message_from_cdr(payload, VECTOR_SCHEMA)
-    assert isinstance(message, ros.geometry_msgs__msg__Vector3Stamped)
+    message = message_from_cdr(payload, ros.geometry_msgs__msg__Vector3Stamped)
     return HeadingRecord(
         unchecked_stamp_ns(message.header.stamp), message.header.frame_id, message.vector.x, message.vector.z
     )
@@ -244,15 +227,13 @@ def heading_from_cdr(payload: bytes) -> HeadingRecord:
 
 def stamp_from_cdr(payload: bytes) -> int:
     """Decode the stamp of a Header, ns; it may be invalid. Raise OmnidError for any other bytes."""
-    message = message_from_cdr(payload, HEADER_SCHEMA)
-    assert isinstance(message, ros.std_msgs__msg__Header)
+    message = message_from_cdr(payload, ros.std_msgs__msg__Header)
     return unchecked_stamp_ns(message.stamp)
 
 
 def bool_from_cdr(payload: bytes) -> bool:
     """Decode a Bool. Raise OmnidError for any other bytes."""
-    message = message_from_cdr(payload, BOOL_SCHEMA)
-    assert isinstance(message, ros.std_msgs__msg__Bool)
+    message = message_from_cdr(payload, ros.std_msgs__msg__Bool)
     return bool(message.data)
 
 
@@ -263,8 +244,7 @@ def unchecked_stamp_ns(stamp: ros.builtin_interfaces__msg__Time) -> int:
 
 def odometry_from_cdr(payload: bytes) -> OdometryRecord:
     """Decode an Odometry message. Raise OmnidError unless the bytes are one with a finite, rigid pose."""
-    message = message_from_cdr(payload, ODOMETRY_SCHEMA)
-    assert isinstance(message, ros.nav_msgs__msg__Odometry)
+    message = message_from_cdr(payload, ros.nav_msgs__msg__Odometry)
     twist = message.twist.twist
     return OdometryRecord(
         stamp_ns=_stamp_ns(message.header.stamp),
@@ -297,8 +277,7 @@ def rigid_transform(pose: ros.geometry_msgs__msg__Pose) -> Array:
 
 def goal_from_cdr(payload: bytes) -> PlanarGoal:
     """Decode a PoseStamped. Raise OmnidError for other bytes, numbers that are not finite, and a tilted pose."""
-    message = message_from_cdr(payload, POSE_SCHEMA)
-    assert isinstance(message, ros.geometry_msgs__msg__PoseStamped)
+    message = message_from_cdr(payload, ros.geometry_msgs__msg__PoseStamped)
     x_m, y_m = _planar_position(message.pose)
     stamp_ns = unchecked_stamp_ns(message.header.stamp)
     return PlanarGoal(stamp_ns, message.header.frame_id, x_m, y_m, _planar_heading(message.pose))
@@ -306,8 +285,7 @@ def goal_from_cdr(payload: bytes) -> PlanarGoal:
 
 def path_from_cdr(payload: bytes) -> PlanarPath:
     """Decode a path of 1 to MAX_PATH_POSES poses. Raise OmnidError as goal_from_cdr."""
-    message = message_from_cdr(payload, PATH_SCHEMA)
-    assert isinstance(message, ros.nav_msgs__msg__Path)
+    message = message_from_cdr(payload, ros.nav_msgs__msg__Path)
     if not 1 <= len(message.poses) <= MAX_PATH_POSES:
         raise OmnidError(f"a path of {len(message.poses)} poses: expected 1 to {MAX_PATH_POSES}")
     xy = np.array([_planar_position(entry.pose) for entry in message.poses])
@@ -317,8 +295,7 @@ def path_from_cdr(payload: bytes) -> PlanarPath:
 
 def string_from_cdr(payload: bytes) -> str:
     """Decode a String. Raise OmnidError for any other bytes."""
-    message = message_from_cdr(payload, STRING_SCHEMA)
-    assert isinstance(message, ros.std_msgs__msg__String)
+    message = message_from_cdr(payload, ros.std_msgs__msg__String)
     return message.data
 
 
@@ -339,8 +316,7 @@ def _planar_heading(pose: ros.geometry_msgs__msg__Pose) -> float | None:
 
 def decode_scan(payload: bytes, _: bytes = b"") -> Scan:
     """Decode a LaserScan. Raise OmnidError for any other bytes."""
-    message = message_from_cdr(payload, SCAN_SCHEMA)
-    assert isinstance(message, ros.sensor_msgs__msg__LaserScan)
+    message = message_from_cdr(payload, ros.sensor_msgs__msg__LaserScan)
     count = len(message.ranges)
     if count > MOST_RANGES or not (math.isfinite(message.angle_min) and math.isfinite(message.angle_increment)):
         raise OmnidError(
@@ -412,8 +388,7 @@ def decode_pose(payload: bytes, attachment: bytes, received_ns: int | None = Non
 
 def decode_diagnostics(payload: bytes, _: bytes = b"") -> Diagnostics:
     """Decode a DiagnosticArray. Raise OmnidError for any other bytes."""
-    message = message_from_cdr(payload, DIAGNOSTICS_SCHEMA)
-    assert isinstance(message, ros.diagnostic_msgs__msg__DiagnosticArray)
+    message = message_from_cdr(payload, ros.diagnostic_msgs__msg__DiagnosticArray)
     statuses = tuple(
         DiagnosticStatus(entry.name, int(entry.level), entry.message, {pair.key: pair.value for pair in entry.values})
         for entry in message.status
@@ -423,8 +398,7 @@ def decode_diagnostics(payload: bytes, _: bytes = b"") -> Diagnostics:
 
 def decode_cloud(payload: bytes, _: bytes = b"") -> Cloud:
     """Decode a PointCloud2 with omnid's fields. Raise OmnidError for any other bytes."""
-    message = message_from_cdr(payload, POINT_CLOUD_SCHEMA)
-    assert isinstance(message, ros.sensor_msgs__msg__PointCloud2)
+    message = message_from_cdr(payload, ros.sensor_msgs__msg__PointCloud2)
     step = 4 * len(CLOUD_FIELDS)
     fields = [(entry.name, entry.offset) for entry in message.fields]
     own = fields == [(name, 4 * i) for i, name in enumerate(CLOUD_FIELDS)] and not message.is_bigendian
@@ -439,8 +413,7 @@ def decode_cloud(payload: bytes, _: bytes = b"") -> Cloud:
 
 def decode_map_pose(payload: bytes, _: bytes = b"") -> PoseInMap:
     """Decode a PoseWithCovarianceStamped. Raise OmnidError unless the bytes are one with a finite, rigid pose."""
-    message = message_from_cdr(payload, MAP_POSE_SCHEMA)
-    assert isinstance(message, ros.geometry_msgs__msg__PoseWithCovarianceStamped)
+    message = message_from_cdr(payload, ros.geometry_msgs__msg__PoseWithCovarianceStamped)
     return PoseInMap(
         unchecked_stamp_ns(message.header.stamp),
         rigid_transform(message.pose.pose),
@@ -450,8 +423,7 @@ def decode_map_pose(payload: bytes, _: bytes = b"") -> PoseInMap:
 
 def decode_map(payload: bytes, _: bytes = b"") -> Map:
     """Decode an OccupancyGrid that is parallel to its frame's axes. Raise OmnidError for any other bytes."""
-    message = message_from_cdr(payload, GRID_SCHEMA)
-    assert isinstance(message, ros.nav_msgs__msg__OccupancyGrid)
+    message = message_from_cdr(payload, ros.nav_msgs__msg__OccupancyGrid)
     info, at = message.info, message.info.origin
     if message.data.size != info.width * info.height or not (info.resolution > 0 and abs(at.orientation.w) > ALIGNED):
         raise OmnidError(

@@ -20,7 +20,7 @@ from drivers.logs.ros_messages import BASE_FRAME, COMPRESSED_IMAGE, IMAGE, Joint
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.errors import OmnidError
 from omnid.transport import ros_types as ros
-from omnid.transport.codec import IMU_SCHEMA, ODOMETRY_SCHEMA, header_message, message_cdr, odometry_cdr, ros_time
+from omnid.transport.codec import ODOMETRY_SCHEMA, header_message, message_cdr, odometry_cdr, ros_time
 
 COMPRESSED: Final = ("jpeg", "png")
 # Encoding in drivers.frame -> name in sensor_msgs/image_encodings.hpp, where that is different.
@@ -91,7 +91,7 @@ def gyro_cdr(sample: GyroSample, stamp_ns: int, frame: str = BASE_FRAME) -> byte
         ros.geometry_msgs__msg__Vector3(0.0, 0.0, 0.0),
         _UNKNOWN,
     )
-    return message_cdr(message, IMU_SCHEMA)
+    return message_cdr(message)
 
 
 def sample_from_cdr(

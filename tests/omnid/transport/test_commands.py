@@ -28,7 +28,6 @@ from omnid.errors import OmnidError
 from omnid.transport import codec
 from omnid.transport.codec import (
     IMU_SCHEMA,
-    JOINT_SCHEMA,
     PlanarGoal,
     bool_cdr,
     goal_cdr,
@@ -529,7 +528,7 @@ def joint_cdr(names: list[str], velocities: list[float], stamp_ns: int = OFFSET_
     message = ros.sensor_msgs__msg__JointState(
         header_message(stamp_ns, ""), names, np.zeros(len(names)), np.array(velocities), np.zeros(0)
     )
-    return message_cdr(message, JOINT_SCHEMA)
+    return message_cdr(message)
 
 
 def test_wheels_are_joints_where_these_are_named(lines: list[str]) -> None:
