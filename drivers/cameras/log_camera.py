@@ -115,12 +115,38 @@ class LogClock:
             return self._epoch_ns
 
 
-class LogCamera:
-    """One camera of a log, played forwards and backwards until it is closed.
+class _Playback:
+    """A part of a log, played forwards and backwards until it is closed.
 
-    clock: start of the log, shared by both cameras. pace: speed relative to the recording. once: play the log once,
-    forwards. The stamp of a frame is the time at which it is due; frames that are due before the construction are not
-    delivered. Raises DriverError for a pace out of range.
+    clock: start of the log, shared by the cameras and the motion. pace: speed relative to the recording. once: play the
+    log once, forwards.
+    """
+
+    def __init__(self, images: LogImages, clock: LogClock, *, pace: float = 1.0, once: bool = False) -> None:
+        self._images, self._clock, self._pace, self._once = images, clock, pace, once
+        self._closed = False
+
+    def close(self) -> None:
+        """End the playback; may be called twice, from any thread."""
+        self._closed = True
+
+    def _due(self, entries: Sequence[tuple[int, T]]) -> Iterator[tuple[int, T, int]]:
+        """Yield stamp [ns], entry and direction of the pass when each entry is due, until closed."""
+        epoch_ns = self._clock.epoch_ns()
+        for due_ns, entry, direction in passes_of(entries, self._images, self._once):
+            stamp_ns = epoch_ns + round(due_ns / self._pace)
+            while not self._closed and (left_s := (stamp_ns - time.monotonic_ns()) * 1e-9) > 0:
+                time.sleep(min(left_s, POLL_PERIOD_S))
+            if self._closed:
+                return
+            yield stamp_ns, entry, direction
+
+
+class LogCamera(_Playback):
+    """One camera of a log.
+
+    The stamp of a frame is the time at which it is due; frames that are due before the construction are not delivered.
+    Raises DriverError for a pace out of range.
     """
 
     def __init__(
@@ -131,20 +157,14 @@ class LogCamera:
                 f"the pace of a log is {pace:g}; give a number from {MIN_PACE:g} to {MAX_PACE:g}; above "
                 "1 is faster than it was recorded"
             )
-        self._images, self._frames = images, images.lower if camera == "lower" else images.upper
-        self._clock, self._pace, self._once = clock, pace, once
+        super().__init__(images, clock, pace=pace, once=once)
+        self._frames = images.lower if camera == "lower" else images.upper
         self._created_ns = time.monotonic_ns()
-        self._closed = False
         self.state = CameraState(mode="a recorded log")
 
     def frames(self) -> Iterator[Frame]:
         """Yield the frames when they are due, until closed; those that are not read in time are dropped and counted."""
-        epoch_ns = self._clock.epoch_ns()
-        for seq, (due_ns, frame) in enumerate(self._schedule()):
-            stamp_ns = epoch_ns + round(due_ns / self._pace)
-            self._sleep_until(stamp_ns)
-            if self._closed:
-                break
+        for seq, (stamp_ns, frame, _) in enumerate(self._due(self._frames)):
             if time.monotonic_ns() <= stamp_ns + MAX_DELAY_NS:
                 self.state.status = "streaming"
                 self.state.frames += 1
@@ -153,46 +173,19 @@ class LogCamera:
                 self.state.drops += stamp_ns > self._created_ns
         self.state.status = "closed"
 
-    def close(self) -> None:
-        """End frames(); may be called twice, from any thread."""
-        self._closed = True
 
-    def _schedule(self) -> Iterator[tuple[int, Frame]]:
-        """Yield each frame with its time since the epoch at pace 1 [ns]."""
-        return ((due_ns, frame) for due_ns, frame, _ in _passes(self._frames, self._images, self._once))
-
-    def _sleep_until(self, due_ns: int) -> None:
-        while not self._closed and (left_s := (due_ns - time.monotonic_ns()) * 1e-9) > 0:
-            time.sleep(min(left_s, POLL_PERIOD_S))
-
-
-class LogMotion:
+class LogMotion(_Playback):
     """Wheels and IMU of a log, played as its cameras are: on the way back all rates have the other sign."""
-
-    def __init__(self, images: LogImages, clock: LogClock, *, pace: float = 1.0, once: bool = False) -> None:
-        """clock: that of the cameras. pace, once: as theirs."""
-        self._images, self._clock, self._pace, self._once = images, clock, pace, once
-        self._closed = False
 
     def samples(self) -> Iterator[MotionSample]:
         """Yield the samples when they are due, until closed."""
         if not self._images.motion:
             return
-        epoch_ns = self._clock.epoch_ns()
-        for due_ns, sample, direction in _passes(self._images.motion, self._images, self._once):
-            stamp_ns = epoch_ns + round(due_ns / self._pace)
-            while not self._closed and (left_s := (stamp_ns - time.monotonic_ns()) * 1e-9) > 0:
-                time.sleep(min(left_s, POLL_PERIOD_S))
-            if self._closed:
-                break
+        for stamp_ns, sample, direction in self._due(self._images.motion):
             yield _scaled(sample, stamp_ns, direction * self._pace)
 
-    def close(self) -> None:
-        """End samples(); may be called twice, from any thread."""
-        self._closed = True
 
-
-def _passes(entries: Sequence[tuple[int, T]], images: LogImages, once: bool) -> Iterator[tuple[int, T, int]]:
+def passes_of(entries: Sequence[tuple[int, T]], images: LogImages, once: bool) -> Iterator[tuple[int, T, int]]:
     """Yield the entries of a log pass after pass, every second pass backwards.
 
     Each has its time since the epoch at pace 1 [ns], and the direction of the pass: 1, or -1 backwards. once: one pass.

@@ -7,7 +7,7 @@ import mmap
 import os
 import re
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -67,14 +67,23 @@ def device_error(device: str, error: OSError) -> DriverError:
     return DriverError(f"camera {device} {advice}")
 
 
+@contextmanager
+def _opened(device: str | os.PathLike[str]) -> Iterator[int]:
+    """Open a device without waiting for it, and close it at the end; raise OSError."""
+    fd = os.open(device, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        yield fd
+    finally:
+        os.close(fd)
+
+
 class V4l2Stream:
     """A device opened for this program alone; raises DriverError where it cannot be opened or configured."""
 
     def __init__(self, settings: V4l2Settings) -> None:
         self._resources = ExitStack()
         try:
-            self.fd = os.open(settings.device, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
-            self._resources.callback(os.close, self.fd)
+            self.fd = self._resources.enter_context(_opened(settings.device))
             self.bus_info = _require_capture(self.fd)
             self.image = _set_image(self.fd, settings)
             self._maps = [self._mapped(index) for index in range(_request_buffers(self.fd, settings.buffers))]
@@ -125,7 +134,7 @@ class V4l2Stream:
         v4l2.call(self.fd, v4l2.STREAMON, v4l2.Int32(v4l2.CAPTURE))
 
 
-def query_capability(fd: int) -> v4l2.Capability:
+def _query_capability(fd: int) -> v4l2.Capability:
     """Return the identity of the device and the capabilities of this node of it (`device_caps`)."""
     found = v4l2.Capability()
     v4l2.call(fd, v4l2.QUERYCAP, found)
@@ -136,7 +145,7 @@ def query_capability(fd: int) -> v4l2.Capability:
 
 def _require_capture(fd: int) -> str:
     """Return the bus_info of a capture device: where it is plugged in; raise DriverError for any other device."""
-    found = query_capability(fd)
+    found = _query_capability(fd)
     needed = v4l2.CAP_VIDEO_CAPTURE | v4l2.CAP_STREAMING
     if found.device_caps & needed != needed:
         raise DriverError(
@@ -280,11 +289,8 @@ def offered_image(settings: V4l2Settings) -> StreamFormat | None:
     Raises DriverError where the device cannot be opened or offers no such image.
     """
     try:
-        fd = os.open(settings.device, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
-        try:
+        with _opened(settings.device) as fd:
             return _set_image(fd, settings)
-        finally:
-            os.close(fd)
     except OSError as error:
         if error.errno == errno.EBUSY:
             return None
@@ -298,15 +304,12 @@ def _device(root: Path, entry: Path) -> CaptureDevice | None:
     driver = (entry / "device/driver").resolve().name if (entry / "device/driver").exists() else ""
     bus = problem = exposure = ""
     try:
-        fd = os.open(node, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
-        try:
-            found = query_capability(fd)
+        with _opened(node) as fd:
+            found = _query_capability(fd)
             if not found.device_caps & v4l2.CAP_VIDEO_CAPTURE or found.device_caps & _MEMORY_TO_MEMORY:
                 return None
             driver, bus = found.driver.decode("utf-8", "replace"), found.bus_info.decode("utf-8", "replace")
             exposure = str(ExposureControls(fd))
-        finally:
-            os.close(fd)
     except OSError as error:
         problem = str(device_error(str(node), error))
     # udev's ID_PATH is a part of the link's name (60-persistent-v4l.rules), which only one node of a port has.

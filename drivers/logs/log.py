@@ -109,6 +109,12 @@ class LogInfo:
         return sum(count for _, count in self.topics.values())
 
 
+def widened(span_ns: tuple[int, int] | None, time_ns: int) -> tuple[int, int]:
+    """Return the first and last time of a span (None: an empty one) and of one more time."""
+    first_ns, last_ns = span_ns or (time_ns, time_ns)
+    return min(first_ns, time_ns), max(last_ns, time_ns)
+
+
 def unpack_zstd(data: bytes | memoryview) -> memoryview:
     """Return the content of a frame of zstd; raise RecordError where it is damaged or larger than MAX_RECORD_BYTES."""
     try:

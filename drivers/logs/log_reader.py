@@ -13,7 +13,7 @@ from typing import NamedTuple, TypeAlias
 
 from drivers.errors import DriverError, FrameDecodeError
 from drivers.frame import SAMPLE_BITS, Camera, Frame, gray, is_deep
-from drivers.logs.log import LoggedMessage, RecordError
+from drivers.logs.log import LoggedMessage, RecordError, widened
 from drivers.logs.open_log import open_log
 from drivers.logs.ros_messages import RosImage
 from drivers.logs.topics import MotionChoice, MotionTopics, choose_motion_topics, choose_topics
@@ -221,8 +221,7 @@ class LogReader:
             return None
 
     def _widen(self, what: str, stamp_ns: int) -> None:
-        first_ns, last_ns = self._spans.get(what, (stamp_ns, stamp_ns))
-        self._spans[what] = min(first_ns, stamp_ns), max(last_ns, stamp_ns)
+        self._spans[what] = widened(self._spans.get(what), stamp_ns)
 
     def _of_another_clock(self) -> Iterator[str]:
         """Yield a warning for wheels or gyro none of whose samples lies between the images."""

@@ -11,13 +11,11 @@ from pathlib import Path
 from typing import Final
 
 from drivers.errors import DriverError
-from drivers.logs import ros1_bag, sqlite_bag
+from drivers.logs.bags import ROS1_MAGIC, SQLITE_MAGIC, Ros1Bag, SqliteBag
 from drivers.logs.file_lock import is_locked
 from drivers.logs.image_folder import ImageFolder, image_folders
-from drivers.logs.log import Log, LogDamage, LoggedMessage, LogInfo, LogState
+from drivers.logs.log import Log, LogDamage, LoggedMessage, LogInfo, LogState, widened
 from drivers.logs.mcap_file import McapFile
-from drivers.logs.ros1_bag import Ros1Bag
-from drivers.logs.sqlite_bag import SqliteBag
 
 MAX_PARTS: Final = 1000
 _MAX_LISTED: Final = 8
@@ -50,8 +48,7 @@ def log_info(path: str | os.PathLike[str]) -> LogInfo:
             counts, span_ns = Counter[str](), None
             for message in log.messages():
                 counts[message.topic] += 1
-                first_ns, last_ns = span_ns or (message.log_time_ns, message.log_time_ns)
-                span_ns = min(first_ns, message.log_time_ns), max(last_ns, message.log_time_ns)
+                span_ns = widened(span_ns, message.log_time_ns)
         broken, cut, readable_bytes = log.damage()
         state = LogState.BROKEN if cut or broken else LogState.WHOLE if is_indexed else LogState.UNINDEXED
         size_bytes = _size_bytes(Path(path))
@@ -77,12 +74,12 @@ def _open_file(path: Path) -> Log:
         if path.exists() and not path.is_file():
             raise DriverError(f"cannot read the log {str(path)!r}: it is no regular file; give a log of {LOG_SUFFIXES}")
         with path.open("rb") as file:
-            start = file.read(max(len(sqlite_bag.MAGIC), len(ros1_bag.MAGIC)))
+            start = file.read(max(len(SQLITE_MAGIC), len(ROS1_MAGIC)))
     except OSError as error:
         raise DriverError(f"cannot read the log {str(path)!r}: {error.strerror}") from error
-    if start.startswith(sqlite_bag.MAGIC):
+    if start.startswith(SQLITE_MAGIC):
         return SqliteBag(path)
-    return Ros1Bag(path) if start.startswith(ros1_bag.MAGIC) else McapFile(path)
+    return Ros1Bag(path) if start.startswith(ROS1_MAGIC) else McapFile(path)
 
 
 def _open_folder(path: Path, rate_hz: float) -> Log:

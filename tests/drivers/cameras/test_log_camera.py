@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.cameras.log_camera import MAX_DELAY_NS, LogCamera, LogClock, LogImages, LogMotion
+from drivers.cameras.log_camera import MAX_DELAY_NS, LogCamera, LogClock, LogImages, LogMotion, passes_of
 from drivers.errors import DriverError
 from drivers.frame import Camera, Frame
 from drivers.logs.log_reader import LogReader
@@ -29,7 +29,8 @@ def recorded(scene: Path) -> LogImages:
 
 def stamps(recorded: LogImages, camera: Camera, count: int) -> list[int]:
     """Return the due times of a camera at pace 1 [ns], without waiting."""
-    return [at_ns for at_ns, _ in islice(LogCamera(recorded, camera, LogClock(0))._schedule(), count)]
+    entries = recorded.lower if camera == "lower" else recorded.upper
+    return [at_ns for at_ns, _, _ in islice(passes_of(entries, recorded, once=False), count)]
 
 
 def test_the_images_are_those_of_the_log(scene: Path, recorded: LogImages) -> None:

@@ -1,8 +1,9 @@
-"""A bag of ROS 2 in SQLite (.db3), as `ros2 bag record -s sqlite3` writes it, read by Python's sqlite3.
+"""Bags of ROS 1 (.bag, format 2.0), read by rosbags, and of ROS 2 in SQLite (.db3), read by Python's sqlite3.
 
-Layout: rosbag2_storage_sqlite3, versions 1 to 4: table topics (id, name, type, serialization_format, ...) and table
-messages (id, topic_id, timestamp [ns], data). A write-ahead log beside the file counts, as a recorder that was killed
-leaves it. rosbags reads neither that, nor a bag without metadata.yaml, nor messages that are compressed one by one.
+Layout of the latter, as `ros2 bag record -s sqlite3` writes it: rosbag2_storage_sqlite3, versions 1 to 4: table topics
+(id, name, type, serialization_format, ...) and table messages (id, topic_id, timestamp [ns], data). A write-ahead log
+beside the file counts, as a recorder that was killed leaves it. rosbags reads neither that, nor a bag without
+metadata.yaml, nor messages that are compressed one by one.
 
 Each row has bytes of its own in a file that is whole. So a file of N bytes, with its write-ahead log, has at most N / 8
 rows with N bytes of data, and what has more is damaged: its pages are named more than once.
@@ -13,16 +14,19 @@ from __future__ import annotations
 import sqlite3
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import quote
 
-from drivers.errors import DriverError
-from drivers.logs.log import MAX_RECORD_BYTES, LogDamage, LoggedMessage
+from rosbags.rosbag1 import Reader
 
-MAGIC: Final = b"SQLite format 3\0"
+from drivers.errors import DriverError
+from drivers.logs.log import MAX_RECORD_BYTES, LogDamage, LoggedMessage, widened
+
+SQLITE_MAGIC: Final = b"SQLite format 3\0"
 _MAX_TOPICS: Final = 4096
 _MAX_REASON: Final = 120  # characters
 _LEAST_ROW_BYTES: Final = 8  # pointer, sizes, number, and the types of four columns
@@ -63,12 +67,27 @@ class _Times:
     complete: bool = False  # False: the file is damaged
 
 
-class SqliteBag:
-    """A Log of one .db3 file; raises DriverError where it is no bag."""
+class _Bag:
+    """State that the bags of both kinds share."""
 
     def __init__(self, path: Path) -> None:
         self.name, self._path = str(path), path
         self._damage, self._closed = LogDamage(), False
+
+    def attachments(self) -> dict[str, bytes]:
+        """Return none: a bag has no attachments."""
+        return {}
+
+    def damage(self) -> LogDamage:
+        """Return the faults found by the last call of messages()."""
+        return self._damage
+
+
+class SqliteBag(_Bag):
+    """A Log of one .db3 file; raises DriverError where it is no bag."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
         self._found: _Times | None = None
         try:
             self._bag = _opened(path)
@@ -134,14 +153,6 @@ class SqliteBag:
                 line = f"is cut or corrupt after {count} messages ({_line(error)}): used those before"
                 self._damage = LogDamage(broken, f"the bag {self.name!r} {line}")
 
-    def attachments(self) -> dict[str, bytes]:
-        """Return none: a bag has no attachments."""
-        return {}
-
-    def damage(self) -> LogDamage:
-        """Return the faults found by the last call of messages()."""
-        return self._damage
-
     def close(self) -> None:
         """Close the file; may be called twice."""
         self._closed = True
@@ -155,9 +166,8 @@ class SqliteBag:
                 for key, time_ns in self._rows(_TIMES):
                     found.counts[key] += 1
                     if isinstance(time_ns, int):
-                        first_ns, last_ns = found.span_ns or (time_ns, time_ns)
-                        found.in_order = found.in_order and time_ns >= last_ns
-                        found.span_ns = min(first_ns, time_ns), max(last_ns, time_ns)
+                        found.in_order = found.in_order and (not found.span_ns or time_ns >= found.span_ns[1])
+                        found.span_ns = widened(found.span_ns, time_ns)
                 found.complete = True
             except (sqlite3.Error, OverflowError):
                 # A sorted reading would end at the damage, before its first message.
@@ -215,4 +225,59 @@ def _opened(path: Path) -> sqlite3.Connection:
 
 def _line(error: Exception) -> str:
     """Return an error in one line: SQLite quotes the file, which may contain anything."""
-    return " ".join(str(error).split())[:_MAX_REASON]
+    return " ".join(str(error).split())[:_MAX_REASON] or type(error).__name__
+
+
+ROS1_MAGIC: Final = b"#ROSBAG V2.0\n"
+
+
+class Ros1Bag(_Bag):
+    """A Log of one .bag file; raises DriverError where it cannot be opened.
+
+    rosbags trusts the lengths in a file and raises errors of any kind for a damaged one: all count as damage.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self._reader = Reader(path)
+        try:
+            self._reader.open()
+            self._topics = {name: found.msgtype or "" for name, found in self._reader.topics.items()}
+            self._counts = {name: found.msgcount for name, found in self._reader.topics.items()}
+        except Exception as error:
+            raise DriverError(
+                f"cannot read the bag {self.name!r}: {_line(error)}; if it was cut, `rosbag reindex` mends it"
+            ) from error
+
+    def topics(self) -> Mapping[str, str]:
+        """Return name -> type of all topics."""
+        return self._topics
+
+    def counts(self) -> Mapping[str, int] | None:
+        """Return the number of messages of each topic by the index."""
+        return self._counts
+
+    def span_ns(self) -> tuple[int, int] | None:
+        """Return the first and last log time by the index; None without messages."""
+        return (self._reader.start_time, self._reader.end_time - 1) if any(self._counts.values()) else None
+
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[LoggedMessage]:
+        """Yield the messages of these topics in the order of log time."""
+        wanted = [connection for connection in self._reader.connections if topics is None or connection.topic in topics]
+        self._damage = LogDamage()
+        count = 0
+        try:
+            for connection, time_ns, data in self._reader.messages(wanted) if wanted else ():
+                count += 1
+                yield LoggedMessage(connection.topic, connection.msgtype, time_ns, partial(bytes, data), aligned=False)
+                if self._closed:
+                    return
+        except Exception as error:
+            line = f"the bag {self.name!r} is corrupt after {count} messages ({_line(error)}): used those before"
+            self._damage = LogDamage(cut=line)
+
+    def close(self) -> None:
+        """Close the file; may be called twice."""
+        self._closed = True
+        with suppress(Exception):  # it is closed already
+            self._reader.close()
