@@ -79,11 +79,6 @@ class SimulatedBase:
         self.command_wheel(LEFT, velocity_mps - half_mps)
         self.command_wheel(RIGHT, velocity_mps + half_mps)
 
-    def command_channels(self, first_mps: float, second_mps: float) -> None:
-        """Command the speeds of both channels."""
-        for side, speed_mps in zip(SIDES, self.drive.to_sides(first_mps, second_mps), strict=True):
-            self.command_wheel(side, speed_mps)
-
     def command_channel(self, channel: int, speed_mps: float) -> None:
         """Command the speed of one channel, 0 or 1."""
         side = self.side_of(channel)
@@ -180,12 +175,27 @@ class SimulatedBase:
         return (left_mps + right_mps) / 2, (right_mps - left_mps) / self.drive.track_m
 
 
-def reply_to(base: SimulatedBase, framer: Framer, handle: Callable[[bytes], bytes], data: bytes) -> bytes:
-    """Return a controller's replies to all frames that end in data; count other bytes as errors."""
-    before = framer.garbage
-    replies = b"".join(handle(frame) for frame in framer.feed(data))
-    base.errors += framer.garbage - before
-    return replies
+class SimulatedFirmware:
+    """Simulated firmware of one kind of controller: handles frames, and turns the wheels of its base."""
+
+    def __init__(self, base: SimulatedBase, framer: Framer) -> None:
+        self.base, self._framer = base, framer
+
+    def feed(self, data: bytes) -> bytes:
+        """Return the replies to all frames that end in data; count other bytes as errors."""
+        before = self._framer.garbage
+        replies = b"".join(self._handle(frame) for frame in self._framer.feed(data))
+        self.base.errors += self._framer.garbage - before
+        return replies
+
+    def _handle(self, frame: bytes) -> bytes:
+        """Return the reply to a frame, empty without one."""
+        raise NotImplementedError
+
+    def _reject(self, reply: bytes) -> bytes:
+        """Count an error and return the reply to it."""
+        self.base.errors += 1
+        return reply
 
 
 def _clamp(value: float, magnitude: float) -> float:

@@ -17,38 +17,31 @@ from drivers.motors.protocols.line_protocol import (
     decode,
     encode,
 )
-from drivers.motors.simulated.simulated_base import MotionLimits, SimulatedBase, reply_to
+from drivers.motors.simulated.simulated_base import MotionLimits, SimulatedBase, SimulatedFirmware
 
 
-class SimulatedLine:
+class SimulatedLine(SimulatedFirmware):
     """One controller; heading_input: steer to the commanded heading, else follow the commanded yaw rate."""
 
     def __init__(
         self, drive: DifferentialDrive | None = None, *, heading_input: bool = True, limits: MotionLimits | None = None
     ) -> None:
-        self.base = SimulatedBase(drive, limits)
+        super().__init__(SimulatedBase(drive, limits), LineFramer())
         self._heading_input = heading_input
-        self._assembler = LineFramer()
         self._zero_rad = 0.0  # heading in the world at which the controller's heading is 0
         self._next_seq: int | None = None
 
-    def feed(self, data: bytes) -> bytes:
-        """Return the replies to all lines that end in data."""
-        return reply_to(self.base, self._assembler, lambda line: self.handle(line) or b"", data)
-
-    def handle(self, line: bytes) -> bytes | None:
-        """Return the reply to a line, None without one."""
+    def _handle(self, frame: bytes) -> bytes:
         try:
-            message = decode(line)
+            message = decode(frame)
         except ProtocolError:
-            message = None
+            return self._reject(b"")
         match message:
             case VelocityMessage(seq, command):
                 return self._drive(seq, command)
             case WatchdogRequest(watchdog_ms):
                 return self._connect(watchdog_ms)
-        self.base.errors += 1
-        return None
+        return self._reject(b"")
 
     def _drive(self, seq: int, command: VelocityCommand) -> bytes:
         self.base.errors += self._next_seq not in (None, seq)

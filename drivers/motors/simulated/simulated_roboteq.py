@@ -8,27 +8,22 @@ import re
 from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.motor_protocol import TextFramer
 from drivers.motors.protocols.roboteq import MAX_RPM, S_PER_MIN
-from drivers.motors.simulated.simulated_base import SimulatedBase, reply_to
+from drivers.motors.simulated.simulated_base import SimulatedBase, SimulatedFirmware
 
 _COMMAND = re.compile(rb"!S ([12]) (-?[0-9]{1,5})")
 
 
-class SimulatedRoboteq:
+class SimulatedRoboteq(SimulatedFirmware):
     """One controller; by default it echoes, as a real one does."""
 
     def __init__(self, drive: DifferentialDrive | None = None) -> None:
-        self.base = SimulatedBase(drive)
+        super().__init__(SimulatedBase(drive), TextFramer())
         self.base.watchdog_ms = 1000
-        self._framer = TextFramer()
         self._echo = True
 
-    def feed(self, data: bytes) -> bytes:
-        """Return the replies to all lines that end in data."""
-        return reply_to(self.base, self._framer, self._handle, data)
-
-    def _handle(self, line: bytes) -> bytes:
-        echo = line + b"\r" if self._echo else b""
-        return echo + (self._reply(line) or self._rejection()) + b"\r"
+    def _handle(self, frame: bytes) -> bytes:
+        echo = frame + b"\r" if self._echo else b""
+        return echo + (self._reply(frame) or self._reject(b"-")) + b"\r"
 
     def _reply(self, line: bytes) -> bytes | None:
         if command := _COMMAND.fullmatch(line):
@@ -36,10 +31,6 @@ class SimulatedRoboteq:
         if setting := re.fullmatch(rb"\^(ECHOF|RWD) ([0-9]{1,5})", line):
             return self._set(setting[1], int(setting[2]))
         return self._query(line)
-
-    def _rejection(self) -> bytes:
-        self.base.errors += 1
-        return b"-"
 
     def _drive(self, channel: int, rpm: int) -> bytes | None:
         if abs(rpm) > MAX_RPM:

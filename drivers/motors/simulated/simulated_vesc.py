@@ -7,7 +7,7 @@ import struct
 
 from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.vesc import S_PER_MIN, PacketFramer
-from drivers.motors.simulated.simulated_base import SimulatedBase, reply_to
+from drivers.motors.simulated.simulated_base import SimulatedBase, SimulatedFirmware
 
 _LOCAL_ID = 77  # CAN id of the controller on the serial port.
 _SET_RPM, _GET_APPCONF, _ALIVE, _FORWARD_CAN, _GET_VALUES_SELECTIVE = 8, 17, 30, 34, 50  # COMM_PACKET_ID
@@ -16,31 +16,24 @@ _SIGNATURE = 0x1234ABCD  # any: the driver ignores it
 _CRC_POLYNOMIAL = 0x1021
 
 
-class SimulatedVesc:
+class SimulatedVesc(SimulatedFirmware):
     """A pair of controllers; timeout_ms: of both, as set by VESC Tool."""
 
     def __init__(self, drive: DifferentialDrive | None = None, timeout_ms: int = 500) -> None:
-        self.base = SimulatedBase(drive)
+        super().__init__(SimulatedBase(drive), PacketFramer())
         self.base.watchdog_ms = timeout_ms
-        self._framer = PacketFramer()
 
-    def feed(self, data: bytes) -> bytes:
-        """Return the replies to all packets that end in data."""
-        return reply_to(self.base, self._framer, self._route, data)
-
-    def _route(self, payload: bytes) -> bytes:
+    def _handle(self, frame: bytes) -> bytes:
         """Pass the payload to the controller on the port or on CAN; no reply for an unknown id."""
-        if payload[0] != _FORWARD_CAN:
-            return self._reply(0, payload)
-        if len(payload) > 2 and payload[1] == self.base.drive.can_id:
-            return self._reply(1, payload[2:])
-        self.base.errors += 1
-        return b""
+        if frame[0] != _FORWARD_CAN:
+            return self._reply(0, frame)
+        if len(frame) > 2 and frame[1] == self.base.drive.can_id:
+            return self._reply(1, frame[2:])
+        return self._reject(b"")
 
     def _reply(self, channel: int, payload: bytes) -> bytes:
         if _ARGUMENT_BYTES.get(payload[0]) != len(payload) - 1:
-            self.base.errors += 1
-            return b""
+            return self._reject(b"")
         if payload[0] == _SET_RPM:
             self._drive(channel, struct.unpack(">i", payload[1:])[0])
         elif payload[0] == _ALIVE:

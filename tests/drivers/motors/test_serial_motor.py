@@ -36,7 +36,7 @@ OTHER_ID = 65534  # user and group without rights
 def drive(state: SimulatedLine, seconds: float, command: VelocityCommand) -> None:
     """Send a command at 20 Hz."""
     for _ in range(round(seconds * 20)):
-        assert state.handle(encode(VelocityMessage(state.base.commands, command))) is not None
+        assert state.feed(encode(VelocityMessage(state.base.commands, command)))
         state.base.advance(0.05)
 
 
@@ -78,7 +78,7 @@ def test_a_command_after_a_gap_in_seq_is_an_error_but_carried_out() -> None:
     state = SimulatedLine()
     command = VelocityCommand(0, 0.2, 0.0, 0.0)
     for seq, sent in ((65535, stop_command(0)), (0, stop_command(0)), (2, command)):
-        assert state.handle(encode(VelocityMessage(seq, sent))) is not None
+        assert state.feed(encode(VelocityMessage(seq, sent)))
     assert state.base.errors == 1 and state.base.last_command.velocity_mps == command.velocity_mps
 
 
@@ -236,7 +236,7 @@ def turn(protocol: LineProtocol, simulated: SimulatedLine, heading_rad: float) -
 def run(transaction: Transaction[T], simulated: SimulatedLine) -> T:
     """Run a transaction that needs one reply, and return its result."""
     try:
-        transaction.send(simulated.handle(next(transaction)) or b"")
+        transaction.send(simulated.feed(next(transaction)))
     except StopIteration as done:
         return done.value  # type: ignore[no-any-return]
     raise AssertionError("the transaction waits for more")
