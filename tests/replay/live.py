@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import zenoh
 from rosbags.typesys import Stores, get_typestore
 
-from drivers.motors.simulated.simulated_line import SimulatedLine
+from drivers.motors.simulated.simulated_controllers import SimulatedLine
 from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from omnid.transport import codec, decode
 from omnid.transport.decode import OdometryRecord

@@ -184,11 +184,11 @@ class SimulatedFirmware:
     def feed(self, data: bytes) -> bytes:
         """Return the replies to all frames that end in data; count other bytes as errors."""
         before = self._framer.garbage
-        replies = b"".join(self._handle(frame) for frame in self._framer.feed(data))
+        replies = b"".join(self.handle(frame) for frame in self._framer.feed(data))
         self.base.errors += self._framer.garbage - before
         return replies
 
-    def _handle(self, frame: bytes) -> bytes:
+    def handle(self, frame: bytes) -> bytes:
         """Return the reply to a frame, empty without one."""
         raise NotImplementedError
 

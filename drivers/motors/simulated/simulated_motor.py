@@ -17,10 +17,12 @@ from drivers.motor import MotorStatus, VelocityCommand, stop_command
 from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.motor_protocol import MotorProtocol, T, Transaction
 from drivers.motors.simulated.simulated_base import STEP_S, Pose, SimulatedBase
-from drivers.motors.simulated.simulated_line import SimulatedLine
-from drivers.motors.simulated.simulated_odrive import SimulatedODrive
-from drivers.motors.simulated.simulated_roboteq import SimulatedRoboteq
-from drivers.motors.simulated.simulated_vesc import SimulatedVesc
+from drivers.motors.simulated.simulated_controllers import (
+    SimulatedLine,
+    SimulatedODrive,
+    SimulatedRoboteq,
+    SimulatedVesc,
+)
 
 READ_LIMIT_BYTES = 4096
 POSES_KEPT = 1000  # Number of poses that are kept with their times: those of some seconds.

@@ -25,7 +25,7 @@ from drivers.motors.protocols.line_protocol import (
 )
 from drivers.motors.protocols.motor_protocol import T, Transaction
 from drivers.motors.serial_motor import NoReplyError, SerialMotor
-from drivers.motors.simulated.simulated_line import SimulatedLine
+from drivers.motors.simulated.simulated_controllers import SimulatedLine
 from drivers.motors.simulated.simulated_motor import SimulatedMotor
 
 PATIENCE_S = 20.0  # bounds a wait on a loaded machine; not a measured limit
@@ -104,10 +104,10 @@ def opens_as_another_user(port: str) -> bool:
 class SlowToSetUp(SimulatedLine):
     """A controller that takes longer to set its watchdog than a command may take, as an ODrive by 50 commands/s."""
 
-    def handle(self, line: bytes) -> bytes | None:
-        if line.startswith(b"$W"):
+    def handle(self, frame: bytes) -> bytes:
+        if frame.startswith(b"$W"):
             time.sleep(0.1)
-        return super().handle(line)
+        return super().handle(frame)
 
 
 def test_after_silence_a_controller_has_the_time_to_be_set_up_again() -> None:
@@ -171,10 +171,10 @@ def test_refuses_invalid_settings(simulated: SimulatedMotor, watchdog_ms: int, t
 class FixedWatchdog(SimulatedLine):
     """A controller that keeps its own watchdog time."""
 
-    def handle(self, line: bytes) -> bytes | None:
+    def handle(self, frame: bytes) -> bytes:
         """Return the usual reply, but with 1000 ms in force."""
-        reply = super().handle(line)
-        return encode(WatchdogReply(1000)) if reply and reply.startswith(b"$A") else reply
+        reply = super().handle(frame)
+        return encode(WatchdogReply(1000)) if reply.startswith(b"$A") else reply
 
 
 def test_verifies_the_watchdog_in_force() -> None:
@@ -201,9 +201,9 @@ def test_a_watchdog_that_stays_expired_is_an_error() -> None:
 class Echo(SimulatedLine):
     """A port that returns all that is sent."""
 
-    def handle(self, line: bytes) -> bytes | None:
-        """Return the line itself."""
-        return line
+    def handle(self, frame: bytes) -> bytes:
+        """Return the frame itself."""
+        return frame
 
 
 def test_an_echo_is_no_reply() -> None:
