@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -15,13 +16,15 @@ from calib.fit.drive.adjustment import (
     OBSERVATIONS_ALIKE,
     DriveAdjustment,
     adjust_drive,
+    adjust_pairs,
     held_out_error,
     observation_sigma,
 )
 from calib.fit.drive.camera_terms import DriveModelScore, best_model, candidate_distortions, drive_structure
-from calib.fit.drive.rig_parameters import LINE_TIME, UPPER_DELAY, RigParameters
-from calib.fit.drive.rig_prior import baseline_by_prior, prior_information
+from calib.fit.drive.rig_parameters import LINE_TIME, TRANSFORM_NAMES, UPPER_DELAY, RigParameters
+from calib.fit.drive.rig_prior import baseline_by_prior, nominal_sigmas, prior_information
 from calib.fit.residual_structure import ResidualStructure
+from calib.fit.rig_drift import apply_drift
 from calib.fit.rig_uncertainty import drive_uncertainty
 from calib.models.ocam import has_wavefront
 from calib.rig import Rig, ShutterTimes
@@ -29,12 +32,11 @@ from calib.rig_covariance import RigCovariance
 from calib.rig_file import read_rig
 from drivers.logs.log_reader import AnyCameras, LogCameras
 from omnid.calibration.board_search import Progress, silent
-from omnid.calibration.drive_observations import Drives, collect
-from omnid.calibration.drive_scale import level_turn, rescaled, scale_change, turned_about_lower
-from omnid.calibration.drive_start import straightened, with_masks
-from omnid.calibration.images import SIDES
-from omnid.calibration.same_rig import require_same_rig
+from omnid.calibration.drive_observations import Drives, collect, observe_pairs
+from omnid.calibration.images import SIDES, open_log
+from omnid.calibration.rig_check import check_rig, read_rig_pairs, with_masks
 from omnid.config import Config
+from omnid.core.stereo.triangulation import common_perpendicular
 from omnid.errors import OmnidError
 
 Array = NDArray[np.float64]
@@ -56,6 +58,11 @@ START_DISTORTION = ("p1", "p2")
 TIMES = (UPPER_DELAY, LINE_TIME)
 # Times below these are those of synchronous cameras with global shutters; so are times within four of their sigmas.
 MIN_TIME, TIME_SIGMAS = {UPPER_DELAY: 0.5, LINE_TIME: 1.0}, 4.0
+# Rounds of matching columns before the first drive: each matches in panoramas that the one before has straightened, so
+# that wrong matches become fewer.
+PAIR_ROUNDS = 3
+# Largest difference of stamps during which no motion counts: 3 ms are 3 mm at walking speed.
+SYNCHRONOUS_S = 3e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,6 +210,33 @@ def calibrate_drive(
     )
 
 
+def straightened(
+    log: Path, parameters: RigParameters, cameras: LogCameras, config: Config, progress: Progress
+) -> Array:
+    """Return steps (P,) to a rig with which columns match, from where tracking works; OmnidError if there is none."""
+    rig = parameters.rig
+    with closing(open_log(log, cameras, rig)) as reader:
+        pairs = read_rig_pairs(reader, rig)
+    finding = check_rig(pairs, rig, config.panorama).finding
+    progress(finding.summary)
+    if finding.drift is None:
+        raise OmnidError(
+            f"calibrate drive: {finding.summary}; are both cameras the ones of this rig, not exchanged, "
+            "and is there enough to see?"
+        )
+    # Errors of a centre have the effect of a shifted viewpoint, so only the rotation is a start.
+    steps = parameters.transform_steps(apply_drift(rig, replace(finding.drift, shift=np.zeros(2))))
+    prior = prior_information(parameters, rig)
+    if float(np.median([abs(pair.skew_s) for pair in pairs])) > SYNCHRONOUS_S:
+        return steps  # the motion between the exposures would be taken for errors of the centres
+    for _ in range(PAIR_ROUNDS):
+        state, observations = observe_pairs(pairs, parameters.at(steps), config)
+        steps = adjust_pairs(parameters, replace(state, steps=steps), observations, prior)
+    finding = check_rig(pairs, parameters.at(steps), config.panorama).finding
+    progress(finding.summary)
+    return steps
+
+
 def _in_rounds(
     logs: Sequence[Path],
     parameters: RigParameters,
@@ -284,3 +318,134 @@ def significant_times(found: DriveAdjustment) -> tuple[str, ...]:
         for name, value, sigma in zip(names, values, sigmas, strict=True)
         if name in TIMES and abs(value) > max(MIN_TIME[name], TIME_SIGMAS * sigma)
     )
+
+
+GRADIENT_STEP = 0.01
+MAX_LEVEL_RAD = np.deg2rad(3.0)  # Most tilt of a frame that was meant to be level.
+MIN_EXTENT_M = 0.3  # Least shorter side of a path that determines its plane.
+MAX_ROUGHNESS = 0.02  # Most rms distance of a path from its plane, by the shorter side.
+
+
+def scale_gradient(found: DriveAdjustment) -> Array:
+    """Return the relative change (P,) of lengths by each step of the rig, for the same pixels.
+
+    Depth comes from the rays of both cameras to the same pixels; near landmarks count more, as in the odometry.
+    """
+    pixels = _common_pixels(found)
+    ranges = _ranges(found.rig, pixels)
+    weight = np.where(np.isfinite(ranges), ranges**-2, 0.0)
+    gradient = np.zeros(len(found.prior))
+    for k, step in enumerate(GRADIENT_STEP * np.eye(len(found.prior))):
+        ahead, behind = (_ranges(found.parameters.at(found.state.steps + sign * step), pixels) for sign in (1, -1))
+        change = np.nan_to_num(np.log(ahead / behind))
+        gradient[k] = float(weight @ change / weight.sum()) / (2 * GRADIENT_STEP)
+    return gradient
+
+
+def scale_change(found: DriveAdjustment, before: Rig) -> float:
+    """Return the relative change of lengths from the rig before to the adjusted one, for the same pixels."""
+    pixels = _common_pixels(found)
+    ranges, old = _ranges(found.rig, pixels), _ranges(before, pixels)
+    known = np.isfinite(ranges) & np.isfinite(old)
+    return float(np.average(np.log(ranges[known] / old[known]), weights=ranges[known] ** -2)) if known.any() else np.nan
+
+
+def _common_pixels(found: DriveAdjustment) -> tuple[Array, Array]:
+    """Return the pixels (N, 2) of landmarks that both cameras saw at once, in the lower and in the upper image."""
+    seen = found.observations
+    key = seen.keyframe * (seen.landmark.max() + 1) + seen.landmark
+    _, lower, upper = np.intersect1d(key[seen.camera == 0], key[seen.camera == 1], return_indices=True)
+    return seen.pixels[seen.camera == 0][lower], seen.pixels[seen.camera == 1][upper]
+
+
+def _ranges(rig: Rig, pixels: tuple[Array, Array]) -> Array:
+    """Return the distances (N,) from the lower viewpoint of points at pixels (N, 2) of both cameras."""
+    rays = [m.camera.lift(p) @ m.T_cam_rig[:3, :3] for m, p in zip((rig.lower, rig.upper), pixels, strict=True)]
+    points = common_perpendicular(rays[0], rays[1], rig.upper.viewpoint - rig.lower.viewpoint)
+    return np.asarray(np.linalg.norm(points, axis=1))
+
+
+def rescaled(rig: Rig, ratio: float) -> Rig:
+    """Return the rig with a longer or shorter baseline: all lengths of its odometry change by that ratio."""
+    viewpoint = rig.lower.viewpoint + ratio * (rig.upper.viewpoint - rig.lower.viewpoint)
+    R_upper_rig = rig.upper.T_cam_rig[:3, :3]
+    return replace(rig, upper=replace(rig.upper, T_cam_rig=se3.transform(R_upper_rig, -R_upper_rig @ viewpoint)))
+
+
+def level_turn(rig: Rig, T_rig_odom: Array) -> Array | None:
+    """Return the rotation (3, 3) of the rig frame that puts the plane of a path into the x-y plane of the base.
+
+    None where the path (K poses) shows no plane, or one that is too far from the base's.
+    """
+    T_odom_rig = se3.inverse(T_rig_odom)
+    positions = T_odom_rig[:, :3, 3]
+    _, sizes, axes = np.linalg.svd(positions - positions.mean(axis=0))
+    sizes = sizes / np.sqrt(len(positions))
+    if 2 * sizes[1] < MIN_EXTENT_M or sizes[2] > MAX_ROUGHNESS * sizes[1]:
+        return None
+    normal = (T_rig_odom[:, :3, :3] @ axes[2]).mean(axis=0)
+    R_base_rig = rig.T_base_rig[:3, :3]
+    up = R_base_rig @ normal / np.linalg.norm(normal)
+    up = up * np.sign(up[2])
+    axis = np.cross(up, [0.0, 0.0, 1.0])
+    angle = float(np.arctan2(np.linalg.norm(axis), up[2]))
+    if angle > MAX_LEVEL_RAD:
+        return None
+    turn = se3.rotation_exp(axis * (angle / max(np.linalg.norm(axis), np.finfo(float).tiny)))
+    return np.asarray(R_base_rig.T @ turn @ R_base_rig)
+
+
+def turned_about_lower(rig: Rig, R: Array) -> Rig:
+    """Return the rig with both cameras rotated by R (3, 3) in the rig frame, about the lower viewpoint."""
+    T = se3.transform(R, rig.lower.viewpoint - R @ rig.lower.viewpoint)
+    lower, upper = (replace(m, T_cam_rig=m.T_cam_rig @ se3.inverse(T)) for m in (rig.lower, rig.upper))
+    return replace(rig, lower=lower, upper=upper)
+
+
+# Largest rotation of the upper camera, and of the baseline's direction, against a measured rig. A nominal rig does not
+# know how its cameras were mounted: its limit is three of its sigmas (TURN_SIGMA_RAD in `rig_prior.py`).
+MAX_TURN_RAD, MAX_NOMINAL_TURN_RAD = np.deg2rad(2.8), np.deg2rad(4.5)
+# Largest change of a camera's parameter, in sigmas of a nominal rig: 1 of 16,000 normal errors is larger.
+MAX_CHANGE_SIGMAS = 4.0
+
+
+def require_same_rig(parameters: RigParameters, steps: Array, *, tracked: bool = True) -> None:
+    """Raise OmnidError where the drive asks for another rig than the one given; tracked: as of `different_rig`."""
+    reason = different_rig(parameters, steps, tracked=tracked)
+    if reason:
+        raise OmnidError(
+            f"calibrate drive: {reason}; is the rig that of these cameras? Nothing is written for another "
+            "one: start from its own or nominal rig"
+        )
+
+
+def different_rig(parameters: RigParameters, steps: Array, *, tracked: bool = True) -> str:
+    """Return by which a rig after steps (P,) is not the one of the parameters; empty where it may be.
+
+    tracked: False before the motion is known: an upper camera that is exposed late then appears shifted.
+    """
+    first = len(parameters.rig_names) - len(TRANSFORM_NAMES)
+    change = (steps * parameters.units)[first : len(parameters.rig_names)]
+    turn, lean = float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:])) if tracked else 0.0
+    limit = MAX_NOMINAL_TURN_RAD if is_nominal(parameters.rig) else MAX_TURN_RAD
+    if max(turn, lean) > limit:
+        return (
+            f"the upper camera is turned by {np.rad2deg(turn):.1f} deg and its baseline by {np.rad2deg(lean):.1f} deg "
+            f"against the rig's file, expected {np.rad2deg(limit):.1f} deg at most"
+        )
+    away = np.abs(steps / nominal_sigmas(parameters))[:first]
+    worst = int(np.argmax(away))
+    if away[worst] <= MAX_CHANGE_SIGMAS:
+        return ""
+    old, new = parameters.values[worst], (parameters.values + steps * parameters.units)[worst]
+    return (
+        f"{parameters.names[worst]} would change from {old:.5g} to {new:.5g}, more than another calibration of the "
+        "same camera and mirror"
+    )
+
+
+def is_nominal(rig: Rig) -> bool:
+    """True if a rig was not measured: no covariance, and one camera exactly above the other without any rotation."""
+    T = rig.upper.T_cam_rig @ se3.inverse(rig.lower.T_cam_rig)
+    straight = np.allclose(T[:3, :3], np.eye(3), atol=1e-9) and np.allclose(T[:2, 3], 0, atol=1e-9)
+    return rig.covariance is None and bool(straight)

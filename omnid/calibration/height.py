@@ -13,9 +13,8 @@ from calib import se3
 from calib.rig import Rig
 from calib.rig_file import read_rig, write_rig
 from drivers.logs.log_reader import AnyCameras, LogCameras
-from omnid.calibration.drive_start import with_masks
 from omnid.calibration.images import open_log
-from omnid.calibration.rig_check import read_rig_pairs
+from omnid.calibration.rig_check import read_rig_pairs, with_masks
 from omnid.config import Config
 from omnid.core.floor import MOST_PAIRS, Floor, FloorEstimator
 from omnid.errors import OmnidError

@@ -17,8 +17,8 @@ from calib.rig import MountedCamera, Rig
 from calib.rig_file import read_rig, write_rig
 from drivers.logs.log_reader import AnyCameras, LogCameras
 from omnid.calibration.drive_observations import tracked_updates
-from omnid.calibration.drive_start import with_masks
 from omnid.calibration.images import open_log
+from omnid.calibration.rig_check import with_masks
 from omnid.config import Config
 from omnid.core.frames import of_base
 from omnid.core.obstacles.fixed_parts import HEADINGS, LEAST_HEADINGS, FixedParts

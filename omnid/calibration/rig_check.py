@@ -33,13 +33,11 @@ from omnid.errors import OmnidError
 from omnid.messages import FramePair
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.front_end import FrontEnd
-from omnid.stages.geometry import geometry
+from omnid.stages.geometry import geometry, with_rims
 from omnid.stages.synchronise import Decoder
 
 # Number of pairs that are used, spread over the log: some thousand matches of different places.
 PAIRS: Final = 24
-
-
 # Most corrections of the upper camera's pose: each finds more points than the one before, as more of them match.
 REFINEMENTS: Final = 3
 # Median time between the exposures of the pairs: the stamps of cameras that are triggered together scatter by less.
@@ -218,3 +216,9 @@ def moving_rig_finding(log: Path, rig: Rig, cameras: LogCameras, config: Config)
                 found.append(match(seen.lower, seen.upper, seen.visible, exposure))
             number += 1
     return judge(together(found[-PAIRS:]), place.cylinder)
+
+
+def with_masks(log: Path, rig: Rig, cameras: LogCameras) -> Rig:
+    """Return the rig with the masks of its mirrors, found in the images of a log where the rig has none."""
+    with closing(open_log(log, cameras, rig)) as reader:
+        return with_rims(rig, reader.frames())

@@ -7,8 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omnid.commands.json_output import print_json
-from omnid.commands.options import JSON, SETTINGS, command, settings_of
+from omnid.commands.options import JSON, SETTINGS, command, print_json, settings_of
 
 if TYPE_CHECKING:
     from omnid.config import Config

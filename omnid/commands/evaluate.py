@@ -8,8 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
-from omnid.commands.json_output import print_json
-from omnid.commands.options import JSON, command, option
+from omnid.commands.options import JSON, command, option, print_json
 
 # Position error (ATE), as a share of the true length, above which the trajectories hardly are of one drive: odometry
 # that is lost half of the way is below.

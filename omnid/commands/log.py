@@ -8,8 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omnid.commands.json_output import print_json
-from omnid.commands.options import JSON, command, option
+from omnid.commands.options import JSON, command, option, print_json
 from omnid.utc import utc
 
 if TYPE_CHECKING:

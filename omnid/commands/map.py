@@ -9,7 +9,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omnid.commands.json_output import print_json
 from omnid.commands.options import (
     JSON,
     QUIET,
@@ -20,6 +19,7 @@ from omnid.commands.options import (
     command,
     exclusive,
     option,
+    print_json,
     settings_of,
 )
 from omnid.errors import OmnidError

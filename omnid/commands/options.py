@@ -22,6 +22,11 @@ if TYPE_CHECKING:  # the help and other commands do not load these
     from calib.rig import Rig
     from drivers.logs.log_reader import LogCameras
     from omnid.config import Config
+import math
+import sys
+from dataclasses import asdict, is_dataclass
+from enum import Enum
+from typing import TextIO
 
 PROFILES: Final = {
     "small": ("panorama.scale=0.5", "odometry.limits.features=250"),
@@ -273,3 +278,26 @@ MAP: Final = group(
     option("--localize-only", action="store_true", setting="places.localize_only", help="leave the map as it is"),
 )
 REPLACE: Final = option("--replace", action="store_true", help="replace it, with all places that routes refer to")
+
+
+def print_json(value: object, stream: TextIO | None = None) -> None:
+    """Print dataclasses, mappings, sequences and numbers; a number that is not finite becomes null."""
+    print(json.dumps(_plain(value), indent=2, allow_nan=False), file=stream or sys.stdout)
+
+
+def _plain(value: Any) -> Any:
+    if is_dataclass(value) and not isinstance(value, type):
+        return _plain(asdict(value))
+    if hasattr(value, "_asdict"):  # a NamedTuple
+        return _plain(value._asdict())
+    if isinstance(value, Mapping):
+        return {str(key): _plain(inner) for key, inner in value.items()}
+    if isinstance(value, tuple | list):
+        return [_plain(inner) for inner in value]
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, Enum):
+        return value.value
+    return value

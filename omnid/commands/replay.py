@@ -8,8 +8,20 @@ from pathlib import Path
 from shutil import get_terminal_size
 from typing import TYPE_CHECKING, NamedTuple
 
-from omnid.commands.json_output import print_json
-from omnid.commands.options import JSON, MAP, QUIET, RATE, RIG, SETTINGS, cameras, command, group, option, settings_of
+from omnid.commands.options import (
+    JSON,
+    MAP,
+    QUIET,
+    RATE,
+    RIG,
+    SETTINGS,
+    cameras,
+    command,
+    group,
+    option,
+    print_json,
+    settings_of,
+)
 from omnid.errors import OmnidError
 
 if TYPE_CHECKING:  # the help and other commands do not load these

@@ -11,8 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from omnid.commands.json_output import print_json
-from omnid.commands.options import JSON, ROBOT, SETTINGS, command, exclusive, option, settings_of
+from omnid.commands.options import JSON, ROBOT, SETTINGS, command, exclusive, option, print_json, settings_of
 from omnid.errors import OmnidError
 
 if TYPE_CHECKING:  # the help and other commands do not load these
@@ -37,7 +36,7 @@ def arm(args: argparse.Namespace) -> int:
 @command(*ROBOT, *SETTINGS, examples=("stop", "stop --robot rover --connect tcp/robot:7447"))
 def stop(args: argparse.Namespace) -> int:
     """Stop the robot; return 1 if it has not confirmed that."""
-    from omnid.monitor.stopping import stop as stop_robot
+    from omnid.monitor.navigation import stop as stop_robot
 
     bus = settings_of(args).bus
     if stop_robot(bus):

@@ -1,4 +1,4 @@
-"""Requests of commands, and the progress of goals, routes and the teaching of a route until their end."""
+"""Requests of commands: stops, and the progress of goals, routes and the teaching of a route until their end."""
 
 from __future__ import annotations
 
@@ -7,16 +7,22 @@ import select
 import sys
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from typing import Final
 
-from omnid.client import CONNECT_S, Answer, Driver, NavigationReport, Robot
+from omnid.client import CONNECT_S, HERE, Answer, Diagnostics, Driver, NavigationReport, Robot, Subscription
 from omnid.engine.process import handle_stop_signals
 from omnid.errors import OmnidError
 from omnid.navigation_state import NavigationState
 from omnid.transport.bus_config import BusConfig
+from omnid.transport.driver import ANSWER_S
+from omnid.transport.status_names import DISARMED_BY_STOP, WHEELS, Key
+from omnid.transport.stop_datagram import STOPPED, StopSender
 
 SILENCE_S: Final = 10.0  # A robot that sends no report for this time counts as gone.
 SHOWN_S: Final = 0.5  # Time between two lines of progress.
+_DATAGRAM_S: Final = 0.15  # After this time a stop goes over the bus, too: the robot is behind a router, or far away.
+_REPEAT_S: Final = 0.2  # Time between two stops.
 
 
 def connected(bus: BusConfig) -> Robot:
@@ -125,3 +131,33 @@ def record_until_enter(robot: Robot, name: str) -> int:
         return 130
     print(f"{name} is written")
     return 0
+
+
+def stop(bus: BusConfig, answer_s: float = ANSWER_S, connection: Robot | None = None) -> bool:
+    """Stop the robot, and go on until its status confirms it; False where it has not in time.
+
+    It goes as a datagram first, which needs no place among the sessions of the bus, and over the bus where that is not
+    answered: over a connection that there is, else over a new one. Raise OmnidError where the robot cannot be reached.
+    """
+    deadline_s = time.monotonic() + answer_s
+    with StopSender(bus.robot, bus.connect or (HERE,)) as datagrams:
+        if datagrams.ask(_DATAGRAM_S):
+            return datagrams.ask(deadline_s - time.monotonic()) == STOPPED
+        with (
+            nullcontext(connection) if connection else Robot(settings=bus, timeout_s=CONNECT_S) as robot,
+            robot.subscribe(Diagnostics) as statuses,
+        ):
+            driver = robot.driver()
+            driver.require_connected()
+            statuses.newest()  # The one that the robot has kept is from before this stop.
+            while time.monotonic() < deadline_s:
+                driver.stop()
+                if _is_stopped(statuses) or datagrams.ask(0.0) == STOPPED:
+                    return True
+    return False
+
+
+def _is_stopped(statuses: Subscription[Diagnostics]) -> bool:
+    """True if a status within the time until the next stop says that a stop disarmed the robot."""
+    report = statuses.wait(_REPEAT_S)
+    return report is not None and report.value(WHEELS, Key.DISARMED_BY) == DISARMED_BY_STOP

@@ -25,7 +25,7 @@ from omnid.client import Answer, Driver, Robot
 from omnid.core.control.velocity_limits import VelocityLimits
 from omnid.core.navigation.requests import NavigationRequest, may_begin_motion, navigation_verb, route_request
 from omnid.errors import OmnidError
-from omnid.monitor.stopping import stop
+from omnid.monitor.navigation import stop
 from omnid.monitor.teleop import FIRST_SHARE, limits_of
 from omnid.transport.driver import ANSWER_S
 from omnid.web.feed import RobotFeed

@@ -11,8 +11,7 @@ from calib.fit.drive.observations import DriveObservations, DriveState, Keyframe
 from calib.fit.drive.rig_parameters import LINE_TIME, UPPER_DELAY, RigParameters
 from calib.models.camera import Array
 from calib.rig import Rig
-from omnid.calibration.drive_scale import level_turn, rescaled, turned_about_lower
-from omnid.calibration.same_rig import require_same_rig
+from omnid.calibration.drive import level_turn, require_same_rig, rescaled, turned_about_lower
 from omnid.errors import OmnidError
 from omnid.simulation.rendering.rigs import make_rig
 from tests.simulation.paths import loop, vibrate

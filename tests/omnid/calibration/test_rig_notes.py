@@ -8,7 +8,7 @@ import pytest
 
 from calib.fit.residual_structure import ResidualStructure
 from calib.fit.rig_uncertainty import DriveUncertainty
-from omnid.calibration.rig_notes import accuracy_warnings
+from omnid.calibration.rig import accuracy_warnings
 from tests.bench.calibration import board_rig
 
 RIG = board_rig(21, 0.0)[0]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from omnid.monitor.stopping import stop
+from omnid.monitor.navigation import stop
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import DiagnosticStatus

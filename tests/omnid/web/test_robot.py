@@ -18,8 +18,8 @@ from starlette.routing import Route
 
 from omnid.client import Robot
 from omnid.core.control.velocity_limits import VelocityLimits
+from omnid.monitor.navigation import stop
 from omnid.monitor.robot_state import ReceivedMessage
-from omnid.monitor.stopping import stop
 from omnid.monitor.teleop import FIRST_SHARE, limits_of
 from omnid.transport import decode
 from omnid.transport.bus import Bus, BusConfig
