@@ -320,26 +320,9 @@ def significant_times(found: DriveAdjustment) -> tuple[str, ...]:
     )
 
 
-GRADIENT_STEP = 0.01
 MAX_LEVEL_RAD = np.deg2rad(3.0)  # Most tilt of a frame that was meant to be level.
 MIN_EXTENT_M = 0.3  # Least shorter side of a path that determines its plane.
 MAX_ROUGHNESS = 0.02  # Most rms distance of a path from its plane, by the shorter side.
-
-
-def scale_gradient(found: DriveAdjustment) -> Array:
-    """Return the relative change (P,) of lengths by each step of the rig, for the same pixels.
-
-    Depth comes from the rays of both cameras to the same pixels; near landmarks count more, as in the odometry.
-    """
-    pixels = _common_pixels(found)
-    ranges = _ranges(found.rig, pixels)
-    weight = np.where(np.isfinite(ranges), ranges**-2, 0.0)
-    gradient = np.zeros(len(found.prior))
-    for k, step in enumerate(GRADIENT_STEP * np.eye(len(found.prior))):
-        ahead, behind = (_ranges(found.parameters.at(found.state.steps + sign * step), pixels) for sign in (1, -1))
-        change = np.nan_to_num(np.log(ahead / behind))
-        gradient[k] = float(weight @ change / weight.sum()) / (2 * GRADIENT_STEP)
-    return gradient
 
 
 def scale_change(found: DriveAdjustment, before: Rig) -> float:

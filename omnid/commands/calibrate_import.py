@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import os
 import re
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +19,7 @@ from calib.ocam_file import import_ocam, read_transform, straight_up
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import write_rig
 from omnid.commands.calibrate_options import HEIGHT, height_of, with_height
-from omnid.commands.options import command, exclusive, option
+from omnid.commands.options import command, exclusive, option, warn
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
 
@@ -111,11 +110,7 @@ def _kalibr(args: argparse.Namespace) -> Rig:
             "holds its transforms"
         )
     check_outputs([("--output", args.output)], [("the file that is read", args.camchain)])
-    return import_kalibr(args.camchain, args.lower, args.upper, _warn)
-
-
-def _warn(line: str) -> None:
-    print(f"omnid: warning: {line}", file=sys.stderr)
+    return import_kalibr(args.camchain, args.lower, args.upper, warn)
 
 
 def _ocam(args: argparse.Namespace) -> Rig:

@@ -14,11 +14,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from omnid.commands.calibrate_options import BOARD, board_of, options_of
-from omnid.commands.options import SETTINGS, cameras, command, option, settings_of
+from omnid.commands.options import SETTINGS, cameras, command, device_opener, option, settings_of
 from omnid.errors import OmnidError
 
 if TYPE_CHECKING:  # the help and other commands do not load these
-    from drivers.logs.log_reader import LogCameras
     from omnid.calibration.images import Image
     from omnid.calibration.live_boards import LiveBoards, PairOutcome
     from omnid.config import Config
@@ -96,31 +95,24 @@ def _taken_before(folder: Path | None, boards: LiveBoards) -> int:
     return max((int(name) for name in lower | upper if name.isascii() and name.isdigit()), default=0)
 
 
-def _cameras_of(args: argparse.Namespace) -> LogCameras:
-    from drivers.logs.log_reader import LogCameras
-
-    config = settings_of(args)
-    return LogCameras(args.lower, args.upper, config.cameras.bits, config.log.rate_hz)
-
-
 def _of_log(args: argparse.Namespace) -> Iterator[tuple[Image, Image]]:
+    from drivers.logs.log_reader import LogCameras
     from omnid.calibration.images import read_pairs
 
-    pairs = read_pairs(args.log, _cameras_of(args))
+    config = settings_of(args)
+    pairs = read_pairs(args.log, LogCameras(args.lower, args.upper, config.cameras.bits, config.log.rate_hz))
     return ((pairs.sides[0][name], pairs.sides[1][name]) for name in pairs.names)
 
 
 def _of_cameras(config: Config, closing: ExitStack) -> Iterator[tuple[Image, Image]]:
-    from drivers.cameras.v4l2_camera import V4l2Camera
     from omnid.calibration.live_boards import newest_pairs
-    from omnid.engine.logging_setup import log
 
-    config.cameras.require_two_devices()
-    sources = []
-    for camera in ("lower", "upper"):
-        sources.append(V4l2Camera(config.cameras.settings(camera), camera, on_event=log))
-        closing.callback(sources[-1].close)
-    return newest_pairs(sources[0], sources[1])
+    open_camera = device_opener(config)
+    lower = open_camera("lower")
+    closing.callback(lower.close)
+    upper = open_camera("upper")
+    closing.callback(upper.close)
+    return newest_pairs(lower, upper)
 
 
 def _bus(config: Config, closing: ExitStack) -> Bus | None:

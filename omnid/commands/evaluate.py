@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
-from omnid.commands.options import JSON, command, option, print_json
+from omnid.commands.options import JSON, command, option, print_json, warn
 
 # Position error (ATE), as a share of the true length, above which the trajectories hardly are of one drive: odometry
 # that is lost half of the way is below.
@@ -54,10 +53,9 @@ def run(args: argparse.Namespace) -> int:
     metrics = evaluate(read_tum(args.estimate), truth, tolerance_s, args.align)
     live = evaluate(read_tum(args.live), truth, tolerance_s, args.align) if args.live else None
     if metrics.ate_rmse_m > ANOTHER_DRIVE * metrics.length_truth_m:
-        print(
-            f"omnid: warning: the estimate is off by {metrics.ate_rmse_m:.2f} m on a way of "
-            f"{metrics.length_truth_m:.2f} m: is this the truth of the same drive, in the same frame of the robot?",
-            file=sys.stderr,
+        warn(
+            f"the estimate is off by {metrics.ate_rmse_m:.2f} m on a way of {metrics.length_truth_m:.2f} m: is this "
+            "the truth of the same drive, in the same frame of the robot?"
         )
     if args.json:
         print_json(asdict(metrics) | ({} if live is None else {"live": asdict(live)}))

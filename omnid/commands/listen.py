@@ -5,14 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from omnid.commands.options import ROBOT, SECONDS, SETTINGS, command, option, settings_of
-from omnid.errors import OmnidError
-
-
-def check_seconds(seconds: float | None) -> None:
-    """Raise OmnidError where the value of --seconds is no duration."""
-    if seconds is not None and not 0 < seconds < 1e9:
-        raise OmnidError(f"--seconds {seconds} is not a duration: expected seconds above 0")
+from omnid.commands.options import ROBOT, SECONDS, SETTINGS, check_seconds, command, option, settings_of
 
 
 @command(

@@ -21,6 +21,7 @@ from omnid.commands.options import (
     option,
     print_json,
     settings_of,
+    warn,
 )
 from omnid.errors import OmnidError
 from omnid.utc import utc
@@ -65,7 +66,7 @@ def build(args: argparse.Namespace) -> int:
     if args.output.exists() and not (args.extend or args.replace):
         raise OmnidError(f"map build: {args.output} exists: --extend adds these logs to it, --replace makes a new one")
     for warning in warnings:
-        print(f"omnid: warning: {warning}", file=sys.stderr)
+        warn(warning)
     built = _built(args, config)
     if isinstance(built, int):
         print(f"omnid: interrupted: {args.output} was not written", file=sys.stderr)
@@ -92,7 +93,7 @@ def _built(args: argparse.Namespace, config: Config) -> RigPlaces | int | None:
         )
         result = run_log(log, config, options)
         for warning in result.warnings:
-            print(f"omnid: warning: {log}: {warning}", file=sys.stderr)
+            warn(f"{log}: {warning}")
         if result.signal:
             return result.signal
         built = result.rig_places
@@ -194,10 +195,9 @@ def _exported(
     for _, kind, path in outputs:
         if kind == "--grid":
             if not any(keyframe.free_m.any() for keyframe in places.keyframes.values()):
-                print(
-                    f"omnid: warning: {path}: no cell is free: the map was built without the height of the cameras "
-                    f"above the floor: {ADVICE}, and build the map again",
-                    file=sys.stderr,
+                warn(
+                    f"{path}: no cell is free: the map was built without the height of the cameras above the floor: "
+                    f"{ADVICE}, and build the map again"
                 )
             write_grid(path, place_views.grid(places, rig, args.cell))
         elif kind == "--ply":

@@ -4,29 +4,29 @@
     def run(args: argparse.Namespace) -> int: ...
 
 `omnid/cli.py` names the module of each command. An option with `setting="motor.port"` stands for that setting:
-`settings_of(args)` returns the configuration with all of them.
+`settings_of(args)` returns the configuration with all of them. At the end: how commands print warnings and JSON.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing
-from dataclasses import dataclass
-from pathlib import Path
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, TypeAlias
-
-if TYPE_CHECKING:  # the help and other commands do not load these
-    from calib.rig import Rig
-    from drivers.logs.log_reader import LogCameras
-    from omnid.config import Config
 import math
 import sys
-from dataclasses import asdict, is_dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, is_dataclass
 from enum import Enum
-from typing import TextIO
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final, TextIO, TypeAlias
+
+from omnid.errors import OmnidError
+
+if TYPE_CHECKING:  # the help and other commands do not load these
+    from drivers.cameras.v4l2_camera import V4l2Camera
+    from drivers.frame import Camera
+    from drivers.logs.log_reader import LogCameras
+    from omnid.config import Config
 
 PROFILES: Final = {
     "small": ("panorama.scale=0.5", "odometry.limits.features=250"),
@@ -185,6 +185,13 @@ ROBOT: Final = (
 )
 SECONDS: Final = option("--seconds", type=float, metavar="N", help="end after N seconds; default: on Ctrl-C")
 
+
+def check_seconds(seconds: float | None) -> None:
+    """Raise OmnidError where the value of --seconds is no duration."""
+    if seconds is not None and not 0 < seconds < 1e9:
+        raise OmnidError(f"--seconds {seconds} is not a duration: expected seconds above 0")
+
+
 # A log, its cameras and its rig.
 RIG: Final = option("--rig", type=Path, help="the rig.toml of the cameras; default: that attached to the log")
 RATE: Final = option(
@@ -226,11 +233,6 @@ def cameras(
     return lower, upper
 
 
-def log_with_rig(text: str) -> tuple[Option, ...]:
-    """Declare LOG, --rig, --lower and --upper. text: the help of LOG."""
-    return (option("log", type=Path, metavar="LOG", help=text), RIG, *cameras("the {camera} camera's topic"))
-
-
 def log_cameras(args: argparse.Namespace) -> LogCameras:
     """Return the cameras of a log by --lower, --upper, --bits and --rate."""
     from drivers.logs.log_reader import LogCameras
@@ -238,20 +240,13 @@ def log_cameras(args: argparse.Namespace) -> LogCameras:
     return LogCameras(args.lower, args.upper, args.bits, args.rate or 0.0)
 
 
-def rig_of(args: argparse.Namespace) -> Rig:
-    """Return the rig of args.rig, or the one that is attached to args.log. Raise OmnidError if there is none."""
-    from calib.rig_file import read_rig
+def device_opener(config: Config) -> Callable[[Camera], V4l2Camera]:
+    """Return what opens a camera of the settings; its events are logged. Raise OmnidError unless there are two."""
+    from drivers.cameras.v4l2_camera import V4l2Camera
+    from omnid.engine.logging_setup import log
 
-    return read_rig(args.rig) if args.rig else attached_rig_of(args)
-
-
-def attached_rig_of(args: argparse.Namespace) -> Rig:
-    """Return the rig that is attached to args.log. Raise OmnidError if there is none."""
-    from drivers.logs.log_reader import LogReader
-    from omnid.runs.session import attached_rig
-
-    with closing(LogReader(args.log, args.lower, args.upper)) as reader:
-        return attached_rig(reader, args.log)
+    config.cameras.require_two_devices()
+    return lambda camera: V4l2Camera(config.cameras.settings(camera), camera, on_event=log)
 
 
 # Maps of places.
@@ -278,6 +273,11 @@ MAP: Final = group(
     option("--localize-only", action="store_true", setting="places.localize_only", help="leave the map as it is"),
 )
 REPLACE: Final = option("--replace", action="store_true", help="replace it, with all places that routes refer to")
+
+
+def warn(line: str) -> None:
+    """Print a warning on stderr."""
+    print(f"omnid: warning: {line}", file=sys.stderr)
 
 
 def print_json(value: object, stream: TextIO | None = None) -> None:

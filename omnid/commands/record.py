@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import argparse
 import logging
-from contextlib import ExitStack
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omnid.commands.options import SETTINGS, cameras, command, option, settings_of
+from omnid.commands.options import SETTINGS, cameras, command, device_opener, option, settings_of
 
 if TYPE_CHECKING:  # the help and other commands do not load these
     from omnid.config import Config
@@ -34,35 +34,24 @@ if TYPE_CHECKING:  # the help and other commands do not load these
 )
 def run(args: argparse.Namespace) -> int:
     """Record until a signal comes; return 1 if nothing was recorded."""
-    from drivers.cameras.v4l2_camera import V4l2Camera
-    from drivers.frame import Camera
+    from omnid.engine.logging_setup import log
     from omnid.runs.record import record
 
     config = settings_of(args)
     rig = _rig(config, wanted=args.rig is not None)
-    cameras: tuple[Camera, ...] = ("lower", "upper")
-    config.cameras.require_two_devices()
-    with ExitStack() as closing:
-        sources: dict[Camera, V4l2Camera] = {}
-        for name in cameras:
-            sources[name] = V4l2Camera(config.cameras.settings(name), name, on_event=_log)
-            closing.callback(sources[name].close)
-        state = record(sources, config, rig, _log).state
+    open_camera = device_opener(config)
+    with closing(open_camera("lower")) as lower, closing(open_camera("upper")) as upper:
+        state = record({"lower": lower, "upper": upper}, config, rig, log).state
     return 0 if state.messages > state.lost + state.refused else 1
 
 
 def _rig(config: Config, *, wanted: bool) -> str:
     """Return the rig's TOML; "" if there is none, because the recording may be for its calibration."""
     from calib.rig_file import read_rig, rig_toml
+    from omnid.engine.logging_setup import log
 
     path = Path(config.cameras.rig)
     if not (wanted or path.exists()):
-        _log(logging.WARNING, f"no rig is attached because {path} does not exist: `omnid replay` will need --rig")
+        log(logging.WARNING, f"no rig is attached because {path} does not exist: `omnid replay` will need --rig")
         return ""
     return rig_toml(read_rig(path))
-
-
-def _log(level: int, text: str) -> None:
-    from omnid.engine.logging_setup import log
-
-    log(level, text)

@@ -21,6 +21,7 @@ from omnid.commands.options import (
     option,
     print_json,
     settings_of,
+    warn,
 )
 from omnid.errors import OmnidError
 
@@ -117,7 +118,7 @@ def run(args: argparse.Namespace) -> int:
 
     config = settings_of(args)
     for warning in unused_settings(config, "replay", args.overrides):
-        print(f"omnid: warning: {warning}", file=sys.stderr)
+        warn(warning)
     options = ReplayOptions(
         rig=args.rig,
         topics=(args.lower, args.upper),
@@ -178,7 +179,7 @@ def _print_result(result: RunResult, options: ReplayOptions, output: Output, *, 
     from omnid.sinks.files import on_stdout
 
     for warning in result.warnings:
-        print(f"omnid: warning: {warning}", file=sys.stderr)
+        warn(warning)
     stream = sys.stderr if on_stdout(options.files) else sys.stdout
     if output.as_json:
         print_json(

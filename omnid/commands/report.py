@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from omnid.commands.options import command, option
+from omnid.commands.options import TRUTH, command, option
 
 
 @command(
@@ -18,7 +18,7 @@ from omnid.commands.options import command, option
         "nav_msgs/msg/Odometry",
     ),
     option("-o", "--output", type=Path, metavar="FILE", default=Path("report.html"), help="default: report.html"),
-    option("--truth", type=Path, metavar="FILE", help="the true path of the rig, TUM format"),
+    TRUTH,
     option("--topic", metavar="TOPIC", help="the odometry topic, where there are several"),
     examples=("report out.mcap -o report.html",),
 )

@@ -6,16 +6,18 @@ import argparse
 import logging
 import sys
 from collections import Counter, defaultdict
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omnid.commands.options import MAP, SETTINGS, attached_rig_of, cameras, command, option, settings_of
+from omnid.commands.options import MAP, SETTINGS, cameras, command, device_opener, option, settings_of
 from omnid.errors import OmnidError
 
 RUNNING = 2  # time that the cameras are opened: first for the masks, then for the run
 
 if TYPE_CHECKING:  # the help and other commands do not load these
+    from calib.rig import Rig
     from drivers.cameras.log_camera import LogCamera, LogMotion
     from drivers.frame import Camera
     from omnid.config import Config
@@ -68,25 +70,21 @@ def run(args: argparse.Namespace) -> int:
         log(logging.WARNING, warning)
     show = HANDLER.show if sys.stderr.isatty() else None
     if args.log is None:
-        _require_no_log_options(args)
-        return LiveRun(config, ConnectedRobot(_devices(config)), log, show=show).run()
+        if args.once or args.pace != 1.0:
+            raise OmnidError("--once and --pace need the images of a log: add --log, or leave them out")
+        return LiveRun(config, ConnectedRobot(device_opener(config)), log, show=show).run()
     config = replace(config, controller=config.controller.of_log)
     opener, motion = _recorded(args, config)
     robot = ConnectedRobot(opener, motion)
-    return LiveRun(config, robot, log, None if args.rig else attached_rig_of(args), show).run()
+    return LiveRun(config, robot, log, None if args.rig else _attached_rig(args), show).run()
 
 
-def _require_no_log_options(args: argparse.Namespace) -> None:
-    if args.once or args.pace != 1.0:
-        raise OmnidError("--once and --pace need the images of a log: add --log, or leave them out")
+def _attached_rig(args: argparse.Namespace) -> Rig:
+    from drivers.logs.log_reader import LogReader
+    from omnid.runs.session import attached_rig
 
-
-def _devices(config: Config) -> OpenCamera:
-    from drivers.cameras.v4l2_camera import V4l2Camera
-    from omnid.engine.logging_setup import log
-
-    config.cameras.require_two_devices()
-    return lambda camera: V4l2Camera(config.cameras.settings(camera), camera, on_event=log)
+    with closing(LogReader(args.log, args.lower, args.upper)) as reader:
+        return attached_rig(reader, args.log)
 
 
 def _recorded(args: argparse.Namespace, config: Config) -> tuple[OpenCamera, LogMotion]:

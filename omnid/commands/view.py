@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 from urllib.parse import quote
 
-from omnid.commands.listen import check_seconds
 from omnid.commands.options import (
     QUIET,
     RIG,
@@ -26,11 +25,13 @@ from omnid.commands.options import (
     SECONDS,
     SETTINGS,
     cameras,
+    check_seconds,
     command,
     exclusive,
     group,
     option,
     settings_of,
+    warn,
 )
 from omnid.commands.replay import Output, replay_and_print
 from omnid.engine.process import handle_stop_signals, python, python_environment
@@ -216,7 +217,7 @@ def _log(sink: RerunSink, config: Config, args: argparse.Namespace) -> int:
     if pending is not None:
         sink.draw(pending)
     if unreadable := reader.unreadable.total() + reader.damaged + broken_images:
-        print(f"omnid: warning: {args.log}: {unreadable} messages or pieces cannot be read", file=sys.stderr)
+        warn(f"{args.log}: {unreadable} messages or pieces cannot be read")
     if not sink.poses:
         raise no_pose(args.log, reader.topic)
     return 0
