@@ -147,27 +147,8 @@ def _queried(session: zenoh.Session, key: str) -> zenoh.Sample | None:
     return next((reply.ok for reply in replies if reply.ok is not None), None)
 
 
-class _Connection:
-    """A session that is ended once; zenoh undeclares what is declared on it when nothing refers to it any longer."""
-
-    def __init__(self, settings: BusConfig, timeout_s: float) -> None:
-        self._session = open_client(settings, timeout_s)
-        self._declared: list[object] = []
-
-    def close(self) -> None:
-        """End the connection; a second call does nothing."""
-        with suppress(zenoh.ZError):
-            self._session.close()  # type: ignore[no-untyped-call]  # the stub has no return type
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-
-class Robot(_Connection):
-    """A connection to a robot, direct or through a router.
+class Robot:
+    """A connection to a robot, direct or through a router; it is ended once.
 
     settings: section [bus] of omnid's configuration, for TLS and passwords, which its file `config` holds.
     """
@@ -183,7 +164,19 @@ class Robot(_Connection):
         endpoints = (connect,) if isinstance(connect, str) else tuple(connect)
         given = settings or BusConfig(robot=robot, connect=endpoints)
         self.name = given.robot
-        super().__init__(given, timeout_s)
+        self._session = open_client(given, timeout_s)
+        self._declared: list[object] = []  # zenoh undeclares what nothing refers to any longer
+
+    def close(self) -> None:
+        """End the connection; a second call does nothing."""
+        with suppress(zenoh.ZError):
+            self._session.close()  # type: ignore[no-untyped-call]  # the stub has no return type
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def subscribe(self, kind: type[T]) -> Subscription[T]:
         """Subscribe to messages of a kind: Pose, Diagnostics, Cloud, Map, NavigationReport or Scan."""
