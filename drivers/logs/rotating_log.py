@@ -73,7 +73,8 @@ class RotatingLog:
     ) -> None:  # fmt: skip
         """name: of the files; characters that could lead out of the folder are replaced."""
         self.state = RotatingLogState()
-        self._folder, self._name, self._rotation, self._on_event = folder, _file_name(name), rotation, on_event
+        self._folder, self._rotation, self._on_event = folder, rotation, on_event
+        self._name = re.sub(r"[^\w.-]", "-", name)
         self._attachments = dict(attachments)
         self._writer: LogWriter | None = None
         self._path = folder
@@ -204,18 +205,13 @@ class RotatingLog:
             return
         try:
             writer.close()
-            self._rename()
+            self._path.rename(_complete(self._path))
         except DriverError as error:
             self._stop(error)
-        self._writer, self.state.file = None, ""
-
-    def _rename(self) -> None:
-        try:
-            self._path.rename(_complete(self._path))
         except OSError as error:
-            raise DriverError(
-                f"cannot rename the log {str(self._path)!r}: {error.strerror}; is its folder gone?"
-            ) from error
+            reason = f"{error.strerror}; is its folder gone?"
+            self._stop(DriverError(f"cannot rename the log {str(self._path)!r}: {reason}"))
+        self._writer, self.state.file = None, ""
 
     def _delete_oldest(self, max_files: int, max_bytes: int) -> int:
         """Delete the oldest recordings until the limits are met, and return the number of deleted files.
@@ -258,10 +254,6 @@ class RotatingLog:
                 f"cannot record to {str(self._folder)!r}: {free // _MB} MB are free and "
                 f"{-(-wanted_bytes // _MB)} needed; make room, or keep fewer or smaller files"
             )
-
-
-def _file_name(name: str) -> str:
-    return re.sub(r"[^\w.-]", "-", name)
 
 
 def _complete(part: Path) -> Path:
