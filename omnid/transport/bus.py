@@ -24,7 +24,7 @@ from omnid.transport.intake import PERIOD_S, QUERY, CommandIntake, Intake, OpenR
 from omnid.transport.requests import Answer, Request
 from omnid.transport.session import ALIVE, EndpointTaken, open_session, reason, router_in_place
 from omnid.transport.stop_datagram import StopListener
-from omnid.transport.topics import CLOCK, PUBLISHED, STOP, Topic, ros_name
+from omnid.transport.topics import CLOCK, PUBLISHED, STOP, Topic, plain_key, ros_name
 
 _HEARTBEAT_S: Final = 0.5  # rmw_zenoh's
 
@@ -69,9 +69,8 @@ class TopicPublisher:
 
     def __init__(self, session: zenoh.Session, config: BusConfig, name: str, graph: RosGraph) -> None:
         topic, ros = PUBLISHED[name], ros_name(config.robot, name)
-        plain = f"{config.robot}/{name.removeprefix('/')}"
         token = graph.publisher(name, topic)
-        self._plain = _declared_publisher(session, plain, topic)
+        self._plain = _declared_publisher(session, plain_key(config.robot, name), topic)
         self._ros: zenoh.Publisher | ext.AdvancedPublisher | None = None
         if config.ros2 == "rmw_zenoh":
             declared = _declared_keeper if topic.transient_local else _declared_publisher
@@ -337,7 +336,7 @@ class Bus:
             self._on_command(Request(STOP))
 
     def _declare_queryable(self, session: zenoh.Session, name: str) -> None:
-        key = f"{self._config.robot}/{name.removeprefix('/')}"
+        key = plain_key(self._config.robot, name)
         queryable = session.declare_queryable(key, zenoh.handlers.RingChannel(QUERY.burst))
         self._declared.append(queryable)
         self._queries[name] = Intake(f"queries for {name}", queryable.try_recv, QUERY)
@@ -349,8 +348,7 @@ class Bus:
             for query in intake.messages():
                 if name in self._newest:
                     payload, encoding, attachment = self._newest[name]
-                    key = f"{self._config.robot}/{name.removeprefix('/')}"
-                    query.reply(key, payload, encoding=encoding, attachment=attachment)
+                    query.reply(plain_key(self._config.robot, name), payload, encoding=encoding, attachment=attachment)
 
     def _declare_subscribers(self, session: zenoh.Session, callback: RequestCallback) -> None:
         if not self.is_unique:

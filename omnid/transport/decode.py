@@ -306,7 +306,7 @@ def _planar_position(pose: ros.geometry_msgs__msg__Pose) -> tuple[float, float]:
 
 
 def _planar_heading(pose: ros.geometry_msgs__msg__Pose) -> float | None:
-    q = (pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w)
+    q = (*_xyz(pose.orientation), pose.orientation.w)
     if not any(q):
         return None
     if not abs(math.hypot(*q) - 1.0) < QUATERNION_TOLERANCE or max(abs(q[0]), abs(q[1])) > _MOST_TILT:

@@ -103,3 +103,8 @@ def request_key(topic: str) -> str:
 def ros_name(robot: str, topic: str) -> str:
     """Return the ROS 2 name of a robot's topic, which is also its name in recordings: "odom" -> "/<robot>/odom"."""
     return topic if topic.startswith("/") else f"/{robot}/{topic}"
+
+
+def plain_key(robot: str, topic: str) -> str:
+    """Return the key of a robot's topic for programs without ROS 2, always below its name: "/tf" -> "<robot>/tf"."""
+    return f"{robot}/{topic.removeprefix('/')}"
