@@ -37,9 +37,10 @@ def test_a_call_that_blocks_for_ever_does_not_keep_the_program_from_ending() -> 
 
 @pytest.mark.usefixtures("no_thread_is_left")
 def test_the_calls_of_a_poller_go_on_after_an_error_and_end_with_close(capsys: pytest.CaptureFixture[str]) -> None:
-    calls, enough = list[str](), threading.Event()
+    calls, made, enough = list[str](), threading.Event(), threading.Event()
 
     def action() -> None:
+        assert made.wait(LONG_S)  # the first calls may come before the poller has its name here
         calls.append(threading.current_thread().name)
         if len(calls) == 1:
             raise OSError("no link")
@@ -48,6 +49,7 @@ def test_the_calls_of_a_poller_go_on_after_an_error_and_end_with_close(capsys: p
             poller.close()  # an action may close its own poller
 
     poller = Poller(action, 1e-3, "short work")
+    made.set()
     assert enough.wait(LONG_S)
     poller.close()
     assert set(calls) == {"short work"} and capsys.readouterr().err.count("OSError: no link") == 1
