@@ -2,7 +2,7 @@
 
 An epipolar line is a column, so each direction is a problem of its own, whose floor has a disparity that is linear in
 the row. Each patch of a column is explained by one disparity. Where there is no texture all of them are as likely, and
-the logarithm of the ratio is 0. README.md has the equations.
+the logarithm of the ratio is 0. docs/obstacles.md has them.
 
 Panoramas are brought to one working size (pair_views.py), so that no parameter depends on the size of the images.
 """

@@ -1,7 +1,7 @@
 """Log-odds of floor and of surfaces in cells of a square in odom, which follows the robot.
 
 Evidence of pairs is added up cell by cell. A cell is free only by floor that was seen in each direction that crosses
-it, and taken where a surface is more likely than not. README.md has the equations.
+it, and taken where a surface is more likely than not. docs/obstacles.md has them.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Something narrow and upright by one pair: it hides the floor behind it, which is seen on either side of it.
 
 What is plain shows nothing itself, and the grid's log-odds of a cell come from all places: floor that a pole hides is
-seen beside it from the next one. README.md has the equations.
+seen beside it from the next one. docs/obstacles.md has them.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Usual evidence of each cell of the floor, and where floor that was free is suddenly hidden: something has come.
 
 A person hides all floor behind the feet from one image to the next, while the grid's log-odds, which are sums of many
-pairs, follow later. So each cell keeps the mean of its evidence, and a pair is judged against it. README.md has the
-equations.
+pairs, follow later. So each cell keeps the mean of its evidence, and a pair is judged against it. How fresh the
+evidence of a cell is (`Watch`) says where something may have come unseen. The equations are in docs/obstacles.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Results of the odometry: the pose that a frame supports, and the estimate that is published."""
+"""Results of the odometry, and its limits: the pose that a frame supports, and the estimate that is published."""
 
 from __future__ import annotations
 

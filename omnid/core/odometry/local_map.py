@@ -1,4 +1,4 @@
-"""Local map: prediction, tracking and alignment of the landmarks near the robot."""
+"""Local map: prediction, tracking and alignment of the landmarks near the robot, and their depths a frame later."""
 
 from __future__ import annotations
 

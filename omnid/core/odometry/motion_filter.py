@@ -1,4 +1,7 @@
-"""Kalman filter of the motion: velocity and acceleration, six of each (Dang et al. 2012, eq. (10), (11))."""
+"""Kalman filter of the motion: velocity and acceleration, six of each (Dang et al. 2012, eq. (10), (11)).
+
+Below it: the motion that wheels and gyro measure between two stamps.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Kanade-Lucas-Tomasi tracking on panoramas, of which a full turn wraps around, with the forward-backward check."""
+"""Kanade-Lucas-Tomasi tracking on panoramas, of which a full turn wraps around, with the forward-backward check.
+
+Below it: turns between two panoramas, by circular correlation and by the paper's steps (Dang et al. 2012, IV.F).
+"""
 
 from __future__ import annotations
 
