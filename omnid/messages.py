@@ -109,7 +109,7 @@ class OdometryUpdate:
     witness: Witness = AGREE  # whether images, wheels and gyro show the same motion
     refused_mps: float = 0.0  # speed of a pose that was refused for it alone; 0: none was
     T_odom_rect: Array = field(default_factory=lambda: np.eye(4))  # (4, 4) the same pose, as it was estimated
-    # covariance of T_odom_rect, [t; r] in the rectified axes
+    # covariance of T_odom_rect, [t; r] in the rectified axes, without the errors of the rig
     covariance_rect: Array = field(default_factory=lambda: np.zeros((6, 6)))
 
     def __repr__(self) -> str:

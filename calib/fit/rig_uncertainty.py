@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -13,18 +14,21 @@ from calib.fit.parameterisation import parameterise
 from calib.models.camera import Array
 from calib.models.ocam import has_wavefront
 from calib.rig import Rig
-from calib.rig_covariance import TRANSFORM_NAMES
+from calib.rig_covariance import TRANSFORM_NAMES, RigCovariance
 
 # Steps of numeric derivatives, by points [m] and by parameters [sigmas]: small against the curvature of a projection,
 # large against its rounding.
 POINT_STEP_M, SIGMA_STEP = 1e-5, 0.1
 # The place of the predicted drive: walls around the rig at these distances [m], seen at these slopes z/r.
 WALLS_M, SLOPES, AZIMUTHS = (1.2, 2.0, 4.0), np.linspace(-0.9, 0.6, 11), 16
-# Length of the predicted drive, short against WALLS_M, and its directions: the walls are the same all around, so that
-# few are enough.
-DRIVE_M, DIRECTIONS = 0.1, 4
+# Length [m] and turn [rad] of the predicted motions, short against WALLS_M, and the directions of a drive: the walls
+# are the same all around, so that few are enough.
+MOTION, DIRECTIONS = 0.1, 4
 # Least number of points that both cameras must see.
 MIN_POINTS = 30
+# A rig whose file states no covariance may be wrong by this: the turn of one camera against the other, and the part of
+# the baseline, which is that of all lengths.
+UNSTATED_TURN_RAD, UNSTATED_SCALE = math.radians(0.05), 0.002
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +60,9 @@ def perturbed_rig(rig: Rig, names: tuple[str, ...], changes: Array) -> Rig:
     change = dict(zip(names, changes.tolist(), strict=True))
     cameras = []
     for side, mounted in (("lower", rig.lower), ("upper", rig.upper)):
+        if not any(name.startswith(side) for name in names):
+            cameras.append(mounted.camera)
+            continue
         parameters = parameterise(mounted.camera, wavefront=has_wavefront(mounted.camera))
         steps = [
             change.pop(f"{side} {name}", 0.0) / unit
@@ -84,13 +91,54 @@ def drive_uncertainty(rig: Rig) -> DriveUncertainty | None:
     variances = np.zeros(2)
     for azimuth in 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS:
         direction = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-        J = _motion_by_parameters(rig, points, DRIVE_M * direction, (names, sigmas))
+        J = _motion_by_parameters(rig, points, np.concatenate([MOTION * direction, np.zeros(3)]), (names, sigmas))
         if J is None:
             return None
-        effect = np.stack([direction @ J[:3], J[5]]) / DRIVE_M
+        effect = np.stack([direction @ J[:3], J[5]]) / MOTION
         variances += np.einsum("ep,pq,eq->e", effect, rig.covariance.correlation, effect) / DIRECTIONS
     scale, heading_rad_m = np.sqrt(np.maximum(0.0, variances)).tolist()
     return DriveUncertainty(scale, heading_rad_m)
+
+
+@dataclass(frozen=True, slots=True)
+class MotionErrors:
+    """How wrong motions are measured by the K independent errors of a rig, of one sigma each, to first order.
+
+    [:, d, k] is the error [t; r] of a measured motion, per metre or radian along axis d of the rectified frame, by
+    error k. A turn of one camera against the other displaces points by the square of their distance, while the motion
+    moves them by its inverse: so the derivatives are linear in the distance of what is seen.
+    """
+
+    constant: Array  # (6, 6, K)
+    per_m: Array  # (6, 6, K) by the median distance of what is seen
+
+    def at(self, distance_m: float) -> Array:
+        """Return the derivatives (6, 6, K) where the median of what is seen is so far away."""
+        return np.asarray(self.constant + distance_m * self.per_m)
+
+
+def motion_errors(rig: Rig) -> MotionErrors:
+    """Return the errors of motions by the rig's covariance, or by UNSTATED_* where it has none."""
+    covariance = rig.covariance
+    if covariance is None:
+        sigmas = np.array([UNSTATED_TURN_RAD] * 3 + [UNSTATED_SCALE * rig.baseline_m])
+        covariance = RigCovariance.of_matrix(("r_x", "r_y", "r_z", "baseline"), np.diag(sigmas**2))
+    # 1. Independent errors: a root of the correlations, whose eigenvalues may be negative by rounding.
+    is_open = covariance.sigmas > 0
+    eigenvalues, vectors = np.linalg.eigh(covariance.correlation * np.outer(is_open, is_open))
+    root = vectors * np.sqrt(np.maximum(eigenvalues, 0.0))
+    # 2. The motions along all axes by each parameter, in sigmas, among the walls and among some that are twice as far;
+    #    every second of the points is enough.
+    scaled, near_m = (covariance.names, np.maximum(covariance.sigmas, np.finfo(float).tiny)), WALLS_M[1]
+    derivatives = []
+    for factor in (1.0, 2.0):
+        points = factor * seen_points(rig)[::2]
+        along = [_motion_by_parameters(rig, points, MOTION * axis, scaled) for axis in np.eye(6)]
+        none = np.zeros((6, len(covariance.names)))
+        derivatives.append(np.stack([none if J is None else J / MOTION @ root for J in along], axis=1))
+    near, far = derivatives
+    per_m = (far - near) / near_m
+    return MotionErrors(near - near_m * per_m, per_m)
 
 
 def seen_points(rig: Rig) -> Array:
@@ -115,8 +163,10 @@ def _pixels(rig: Rig, points: Array) -> Array:
     )
 
 
-def _motion_by_parameters(rig: Rig, points: Array, move: Array, scaled: tuple[tuple[str, ...], Array]) -> Array | None:
-    """Return the derivatives (6, P) of the measured motion (translation, rotation) by parameters in units of scaled.
+def _motion_by_parameters(
+    rig: Rig, points: Array, motion: Array, scaled: tuple[tuple[str, ...], Array]
+) -> Array | None:
+    """Return the derivatives (6, P) of a measured motion (6,) [t; r] of the rig by parameters in units of scaled.
 
     None where the cameras see too few points from both ends: a model of a lens may have no pixel for some of them.
 
@@ -124,14 +174,17 @@ def _motion_by_parameters(rig: Rig, points: Array, move: Array, scaled: tuple[tu
     end, by the same pixels' equations: J_point dX + J_pose dp + J_parameter = 0, in least squares.
     """
     T_rig_rect = se3.inverse(rig.T_rect_rig)
-    ends = points - move
+    if len(points) < MIN_POINTS:
+        return None
+    T_end_start = se3.inverse(se3.exp(motion))
+    ends = se3.apply(T_end_start, points)
     first, last = (_pixels_by_parameters(rig, se3.apply(T_rig_rect, at), scaled) for at in (points, ends))
     by_start, by_end = (_pixels_by_point(rig, at) for at in (points, ends))
     seen = np.all([np.isfinite(part).all(axis=(1, 2)) for part in (first, last, by_start, by_end)], axis=0)
     if seen.sum() < MIN_POINTS:
         return None
     first, last, by_start, by_end, ends = (part[seen] for part in (first, last, by_start, by_end, ends))
-    shift = -np.linalg.pinv(by_start) @ first  # (N, 3, P)
+    shift = -T_end_start[:3, :3] @ np.linalg.pinv(by_start) @ first  # (N, 3, P), in the axes of the end
     # The pose moves and turns the points the other way: dX_end = -dp - w x X_end.
     by_pose = np.concatenate([-by_end, by_end @ se3.hat(ends)], axis=2)
     right = (by_end @ shift + last).reshape(-1, first.shape[2])

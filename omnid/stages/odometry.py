@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
+from calib.fit.rig_uncertainty import motion_errors
 from omnid.config import OdometryConfig
 from omnid.core.control.motion_monitor import AGREE, Witness
 from omnid.core.odometry.earlier_view import EarlierView
@@ -18,6 +19,7 @@ from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.motion_agreement import Contradiction, MotionAgreement, contradiction_after
 from omnid.core.odometry.motion_sensors import BIAS, MotionSensors
 from omnid.core.odometry.odometry import VisualOdometry
+from omnid.core.odometry.rig_error import RigError
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.relocalisation import Relocaliser
 from omnid.core.types.panorama import PaddedPanorama
@@ -59,6 +61,7 @@ class OdometryStage:
         self.sensors, self._agreement = MotionSensors(se3.inverse(self._T_base_rect)), MotionAgreement()
         self.last_fault = AGREE  # the last disagreement that was more than a doubt
         self._contradiction: Contradiction | None = None  # of all poses so far by wheels and gyro
+        self._rig_error = RigError(motion_errors(geometry.rig))
 
     def _features(self) -> float:
         """Return the share of the landmarks that the next keyframe is to have."""
@@ -102,14 +105,15 @@ class OdometryStage:
         return self._update(pair, estimate, covariance_rect)
 
     def _update(self, pair: Panoramas, estimate: OdometryEstimate, covariance_rect: Array) -> OdometryUpdate:
-        """Return the message of an estimate at a pair; covariance_rect (6, 6): that of its pose."""
+        """Return the message of an estimate at a pair; covariance_rect (6, 6): that of its pose by a right rig."""
         earlier = self._earlier(pair, estimate)
+        with_rig_error = covariance_rect + self._rig_error.at(estimate.T_odom_rect, estimate.distance_m)
         T_odom_rig = self._T_rig_rect @ estimate.T_odom_rect @ se3.inverse(self._T_rig_rect)
         return OdometryUpdate(
             pair.seq,
             pair.stamp_ns,
             T_odom_rig,
-            self._in_rig(covariance_rect),
+            self._in_rig(with_rig_error),
             self._to_rig @ estimate.velocity,
             self._in_rig(estimate.velocity_covariance),
             _state(estimate.state, pair, self.witness),

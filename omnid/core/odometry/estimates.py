@@ -65,6 +65,7 @@ JUMP_M, JUMP_RAD = 0.5, math.radians(30)
 # A smaller step keeps the view: landmarks are a metre away and farther, so that they move by 6 degrees at most besides
 # the turn.
 SAME_VIEW_M, SAME_VIEW_RAD = 0.1, math.radians(10)
+ROOM_M = 2.0  # median distance of landmarks that are not known: in a room
 SAME_M = 0.02  # Poses that differ less are one, because four sigmas of a pose that few landmarks support are as large.
 # Sigmas of a pose of which nothing is known any more; larger ones would leave no digits to differences of covariances.
 # Sigmas of a pose of which nothing is known any more, m and rad, because larger ones would leave no digits to
@@ -158,6 +159,7 @@ class OdometryEstimate:
     refused_mps: float = 0.0  # speed of a pose that was refused for it alone; 0: none was
     # The motion during the exposures, for dense stereo of the frame; None: not known.
     exposure: Exposure | None = None
+    distance_m: float = ROOM_M  # median of the landmarks
 
 
 @dataclass(frozen=True, slots=True)

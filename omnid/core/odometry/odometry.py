@@ -14,7 +14,15 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.corners import corners
-from omnid.core.odometry.estimates import GapStep, OdometryEstimate, OdometryLimits, PoseEstimate, bounded, supports
+from omnid.core.odometry.estimates import (
+    ROOM_M,
+    GapStep,
+    OdometryEstimate,
+    OdometryLimits,
+    PoseEstimate,
+    bounded,
+    supports,
+)
 from omnid.core.odometry.exposure_times import Exposure, RigVelocity
 from omnid.core.odometry.frame_exposures import FrameExposures
 from omnid.core.odometry.frame_to_map import FrameToMap
@@ -67,6 +75,7 @@ class VisualOdometry:
         self._step: tuple[Array, Array] | None = None  # last step by the cameras, and its covariance
         self._requested: KeyframeRequest | None = None  # keyframe that the last frame asked for, see complete
         self._added: int | None = None  # seq of the keyframe that the last frame became
+        self._distance_m = ROOM_M  # median of the landmarks by which the last pose was found
         self._exposures = FrameExposures(
             self._motion,
             model,
@@ -207,6 +216,9 @@ class VisualOdometry:
         self._covariance = estimate.covariance + (self._map.covariance_of(estimate) if len(estimate.landmarks) else 0.0)
         self._doubt = doubt_after(self._doubt, self._T_odom_rect, estimate, self._since_fix_s(dt_s))
         self._T_odom_rect, self._previous = estimate.T_odom_rect, frame.lower
+        if len(estimate.landmarks):
+            away = self._map.store.table.points[estimate.landmarks] - self._T_odom_rect[:3, 3]
+            self._distance_m = float(np.median(np.linalg.norm(away, axis=1)))
         in_doubt = self._in_doubt or estimate.doubtful_depths
         facts = FrameFacts(FrameOutcome.ACCEPTED, dt_s, estimate.inliers, runner_up=in_doubt, turned=turned)
         self._advance(replace(facts, lower_only=estimate.upper_ratio < self._limits.good_inlier_ratio))
@@ -325,4 +337,5 @@ class VisualOdometry:
             features or Features(),
             self._step,
             exposure=exposure,
+            distance_m=self._distance_m,
         )
