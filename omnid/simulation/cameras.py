@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 from calib.rig import Rig
 from drivers.frame import CAMERAS, Camera, Frame
 from omnid.simulation.people import Walkers
-from omnid.simulation.rendering.polished_floor import PolishedFloor
+from omnid.simulation.rendering.mirrors import PANES, Mirror, brightened
 from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.sensor import Floats, MountedSensor, Sensor
 from omnid.simulation.rendering.surfaces import Scene
-from omnid.simulation.world_file import World
+from omnid.simulation.world import World
 
 Array = NDArray[np.float64]
 
@@ -28,23 +28,30 @@ class SimulatedCameras:
             name: MountedSensor.of(sensor, mounted.visible, mounted.camera.size)
             for name, mounted in self._mounted.items()
         }
-        self._floors = {name: PolishedFloor(mounted) for name, mounted in self._mounted.items() if world.is_polished}
+        self._mirrors = {name: Mirror(mounted) for name, mounted in self._mounted.items()}
 
     def frame(
         self, camera: Camera, seq: int, stamp_ns: int, T_world_rig: Array, people: Walkers, *, brightness: float = 1.0
     ) -> Frame:
         """Return the frame of a camera on a rig at T_world_rig (4, 4)."""
         scene = Scene((*self._world.standing, *people.faces()))
-        light = np.float32(brightness * self._world.brightness)
+        light = np.float32(brightness * self._world.light_at(people.time_s))
         ideal = self.ideal(camera, scene, T_world_rig)
+        for patch in self._world.sun:
+            lit = patch.rectangle(people.time_s, PANES)
+            ideal = brightened(ideal, lit, patch.gain, scene, self._mounted[camera], T_world_rig, self._samples)
         rng = np.random.default_rng([self._seed, 43, CAMERAS.index(camera), seq])
         width, height = self._mounted[camera].camera.size
-        image = self._sensors[camera].expose(ideal * light, rng)
+        sensor = self._sensors[camera]
+        image = sensor.expose(ideal * light, rng)
+        if sensor.sensor.is_compressed:
+            return Frame(seq, stamp_ns, camera, "jpeg", sensor.jpeg(image), width, height)
         return Frame(seq, stamp_ns, camera, "mono8", image, width, height)
 
     def ideal(self, camera: Camera, scene: Scene, T_world_rig: Array) -> Floats:
         """Return the image (H, W) of a scene without the errors of a sensor; another renderer replaces this."""
         ideal = render_grey(scene, self._mounted[camera], T_world_rig, self._samples)
-        if camera in self._floors:
-            ideal = self._floors[camera].reflected(ideal, scene, T_world_rig, self._samples)
+        floors = [face for face in scene.rectangles if face.name == "floor"][: self._world.is_polished]
+        for surface in (*floors, *self._world.panes):
+            ideal = self._mirrors[camera].reflected(ideal, scene, surface, T_world_rig, self._samples)
         return ideal

@@ -10,26 +10,39 @@ from numpy.typing import NDArray
 
 from drivers.motors.simulated.simulated_base import Pose
 from omnid.simulation.rendering.surfaces import Rectangle
+from omnid.simulation.world import Ground, World
 
 Array = NDArray[np.float64]
 FLOOR_M = 0.02  # what is lower than this is driven over
 MOST_POSES: Final = 200_000  # Most poses that are kept, of five hours; the oldest ones are dropped.
 
 
-def footprints(rectangles: Sequence[Rectangle], height_m: float) -> Array:
+LEVEL: Final = Ground()
+
+
+def footprints(rectangles: Sequence[Rectangle], height_m: float, ground: Ground = LEVEL) -> Array:
     """Return the segments (N, 2, 2) [m] on the floor of all that reaches below a height, other than the floor.
 
-    Boxes and walls are closed by upright rectangles, so that their outlines are enough.
+    Heights count from the ground below; rectangles named "floor" are never met. Boxes and walls are closed
+    by upright rectangles, so that their outlines are enough.
     """
     segments = []
     for rectangle in rectangles:
+        if rectangle.name == "floor":
+            continue
         corners = rectangle.corners
+        corners[:, 2] -= ground.heights_m(corners[:, 0].mean())
         if np.ptp(corners[:, 2]) > FLOOR_M and corners[:, 2].min() < height_m and corners[:, 2].max() > FLOOR_M:
             spread = corners[:, :2] - corners[0, :2]
             far = int(np.argmax((spread**2).sum(axis=1)))
             other = int(np.argmax(((corners[:, :2] - corners[far, :2]) ** 2).sum(axis=1)))
             segments.append(corners[[far, other], :2])
     return np.array(segments).reshape(-1, 2, 2)
+
+
+def obstacles_of(world: World, height_m: float) -> Array:
+    """Return the segments (N, 2, 2) of all that stands in a world, of its panes, and of the edges of its floor."""
+    return np.concatenate([footprints((*world.standing, *world.panes), height_m, world.ground), world.edges])
 
 
 def clearance_m(segments: Array, place: tuple[float, float], radius_m: float) -> float:
@@ -40,6 +53,19 @@ def clearance_m(segments: Array, place: tuple[float, float], radius_m: float) ->
     to_place = np.asarray(place) - a
     share = np.clip((to_place * along).sum(axis=1) / np.maximum((along**2).sum(axis=1), 1e-12), 0.0, 1.0)
     return float(np.linalg.norm(to_place - share[:, None] * along, axis=1).min()) - radius_m
+
+
+def ranges_m(segments: Array, place: tuple[float, float], azimuths_rad: Array) -> Array:
+    """Return the distances (N,) [m] from a place to the first of segments (M, 2, 2) along azimuths (N,); inf: none."""
+    if not len(segments):
+        return np.full(len(azimuths_rad), np.inf)
+    ray = np.column_stack([np.cos(azimuths_rad), np.sin(azimuths_rad)])
+    start, along = segments[:, 0] - place, segments[:, 1] - segments[:, 0]
+    across = ray[:, None, 0] * along[:, 1] - ray[:, None, 1] * along[:, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance_m = (start[:, 0] * along[:, 1] - start[:, 1] * along[:, 0]) / across
+        share = (start[:, 0] * ray[:, None, 1] - start[:, 1] * ray[:, None, 0]) / across
+    return np.where((distance_m > 0) & (share >= 0) & (share <= 1), distance_m, np.inf).min(axis=1)
 
 
 class DriveRecord:

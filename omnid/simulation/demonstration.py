@@ -17,7 +17,7 @@ from omnid.messages import NavigationUpdate, ObstacleRing, PlaceUpdate
 from omnid.navigation_state import NavigationState
 from omnid.simulation.clearance import footprints
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun
-from omnid.simulation.world_file import World
+from omnid.simulation.world import World
 from omnid.tracking_state import MapState
 
 Array = NDArray[np.float64]

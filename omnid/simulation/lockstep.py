@@ -39,7 +39,7 @@ from omnid.simulation.cameras import SimulatedCameras
 from omnid.simulation.rendering.sensor import Sensor
 from omnid.simulation.robot import SimulatedRobot
 from omnid.simulation.vehicle import START_NS, Tick, Vehicle
-from omnid.simulation.world_file import World
+from omnid.simulation.world import World
 from omnid.sinks.drive import NAVIGATION_SENDER
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry
@@ -283,7 +283,7 @@ class _Lockstep:
 
     def _pair(self, seq: int, stamp_ns: int) -> Iterator[Frame]:
         """Yield the frames of a pair, without those that a fault takes away."""
-        T_world_rig = self._vehicle.T_world_base @ self._rig.T_base_rig
+        T_world_rig = self._vehicle.T_world_rig
         brightness = 0.0 if self._has("dark") else 1.0
         for camera in CAMERAS:
             if not self._has(f"no {camera} image"):

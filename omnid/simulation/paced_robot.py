@@ -31,7 +31,7 @@ from omnid.simulation.paced_link import Delivery, PacedLink
 from omnid.simulation.realtime import SAMPLES
 from omnid.simulation.robot import SimulatedRobot
 from omnid.simulation.vehicle import Tick, Vehicle
-from omnid.simulation.world_file import World
+from omnid.simulation.world import World
 from omnid.transport.codec import OK, DiagnosticStatus
 from omnid.transport.status_names import SIMULATION, Key
 
@@ -191,7 +191,7 @@ class PacedRobot:
         state = self._states[camera]
         state.status = "streaming"
         state.frames += 1
-        return self._rendered.frame(camera, seq, stamp_ns, vehicle.T_world_base @ self.rig.T_base_rig, vehicle.people)
+        return self._rendered.frame(camera, seq, stamp_ns, vehicle.T_world_rig, vehicle.people)
 
     def _take_tick(self, tick: Tick, report: TickReport) -> None:
         """Pass a tick on, and report a contact."""

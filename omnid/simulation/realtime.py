@@ -15,7 +15,6 @@ from typing import Final
 
 import numpy as np
 
-from calib import se3
 from drivers.cameras.camera_state import CameraState
 from drivers.cameras.log_camera import LogClock
 from drivers.frame import Camera, Frame
@@ -24,11 +23,11 @@ from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.simulated.simulated_base import Pose
 from drivers.motors.simulated.simulated_motor import SimulatedMotor, simulated_controller
 from omnid.simulation.cameras import SimulatedCameras
-from omnid.simulation.clearance import DriveRecord, clearance_m, footprints
+from omnid.simulation.clearance import DriveRecord, clearance_m, footprints, obstacles_of
 from omnid.simulation.lockstep import with_masks
 from omnid.simulation.people import Walkers
 from omnid.simulation.robot import SimulatedRobot, traction
-from omnid.simulation.world_file import World
+from omnid.simulation.world import World
 
 POLL_S: Final = 0.002  # Time between two checks whether the motion up to an exposure is known.
 LONGEST_WAIT_S: Final = 0.2  # Longest wait for the motion up to an exposure; then the newest pose is taken.
@@ -59,7 +58,7 @@ class RealtimeRobot:
         self._turned = (0, base.pose[2])  # time [ns] and heading [rad] of the last measurement of the gyro
         self._yaw_rate_radps = 0.0
         self._rendered = SimulatedCameras(self.rig, robot.sensor, world, seed, SAMPLES)
-        self._standing = footprints(world.standing, robot.height_m)
+        self._standing = obstacles_of(world, robot.height_m)
         self.drive = DriveRecord(report)  # with the stamps of the lower camera
 
     def open_camera(self, camera: Camera, clock: LogClock) -> SimulatedCamera:
@@ -117,8 +116,8 @@ class RealtimeRobot:
             clearances_m = [clearance_m(one, pose[:2], self._robot.radius_m) for one in (self._standing, walking)]
             self.drive.add_pose(stamp_ns, pose)
             self.drive.add_clearance(min(clearances_m), pose)
-        T_world_base = se3.transform(se3.rotation_exp([0.0, 0.0, pose[2]]), [pose[0], pose[1], 0.0])
-        return self._rendered.frame(camera, seq, stamp_ns, T_world_base @ self.rig.T_base_rig, people)
+        T_world_rig = self._world.ground.T_world_base(pose) @ self._robot.T_base_leaning @ self.rig.T_base_rig
+        return self._rendered.frame(camera, seq, stamp_ns, T_world_rig, people)
 
     def walkers(self) -> Walkers:
         """Return the people at the start; each camera has its own copies, which walk in the same way."""

@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 
 from calib import se3
+from calib.models.camera import Array
 from calib.rig import Rig
 from drivers.motors.simulated.simulated_base import MotionLimits, Traction
 from omnid.simulation.rendering.rigs import make_rig
@@ -45,6 +46,16 @@ class WheelErrors:
 
 
 @dataclass(frozen=True, slots=True)
+class Push:
+    """A time [s] in which somebody pushes the base aside."""
+
+    start_s: float
+    end_s: float
+    sideways_mps: float
+    yaw_rate_radps: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class GyroErrors:
     """Bias about base x, y, z, and noise of a sample, rad/s."""
 
@@ -69,6 +80,16 @@ class SimulatedRobot:
     rate_hz: float = 10.0  # of the cameras
     samples: int = 2  # in lock-step: rays of a pixel, per axis
     pose_delay_s: float = 0.1  # in lock-step: from the exposure to the pose's arrival at the controller
+    lean_rad: tuple[float, float] = (
+        0.0,
+        0.0,
+    )  # roll and pitch by which the base leans, which its rig file does not say
+    pushes: tuple[Push, ...] = ()
+
+    @property
+    def T_base_leaning(self) -> Array:
+        """Return the pose (4, 4) of the leaning base in the level one."""
+        return se3.transform(se3.rotation_exp([*self.lean_rad, 0.0]), [0.0, 0.0, 0.0])
 
 
 def make_robot(size_px: int = IMAGE_PX, rig: Rig | None = None) -> SimulatedRobot:

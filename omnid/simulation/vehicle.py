@@ -15,15 +15,15 @@ from calib import se3
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from drivers.motor import VelocityCommand
 from drivers.motors.protocols.protocol_registry import motor_protocol
-from drivers.motors.simulated.simulated_base import Pose
+from drivers.motors.simulated.simulated_base import Pose, Traction
 from drivers.motors.simulated.simulated_motor import LockstepMotor, simulated_controller
 from omnid.config import Config
 from omnid.controller.controller import Controller
 from omnid.controller.statistics import TickReport
-from omnid.simulation.clearance import clearance_m, footprints
+from omnid.simulation.clearance import clearance_m, footprints, obstacles_of
 from omnid.simulation.people import Walkers
-from omnid.simulation.robot import SimulatedRobot, traction
-from omnid.simulation.world_file import World
+from omnid.simulation.robot import SimulatedRobot, WheelErrors, traction
+from omnid.simulation.world import World
 
 Array = NDArray[np.float64]
 START_NS: Final = 1_000_000_000_000  # Start of the simulated clock.
@@ -56,10 +56,11 @@ class Vehicle:
         self.now_ns = self._start_ns = start_ns
         self.people = Walkers(world.people)
         self._take_tick = take_tick
+        self._ground, self._robot = world.ground, robot
         drive = config.motor.drive.geometry()
         self.twin = simulated_controller(config.motor.protocol, drive)
         base = self.twin.base
-        base.pose, base.limits, base.traction = world.start, robot.limits, traction(robot.wheels, seed)
+        base.pose, base.limits, base.traction = world.start, robot.limits, self._traction(robot.wheels, seed)
         self.motor = LockstepMotor(
             motor_protocol(config.motor.protocol)(drive), self.twin, config.motor.watchdog_ms, lambda: self.now_ns
         )
@@ -78,7 +79,7 @@ class Vehicle:
         self._gyro_noise = random.Random(seed + 1)
         self._gyro_ns = start_ns
         self.samples: list[MotionSample] = []  # since they were taken
-        self._robot, self._standing = robot, footprints(world.standing, robot.height_m)
+        self._standing = obstacles_of(world, robot.height_m)
 
     @property
     def time_s(self) -> float:
@@ -93,8 +94,12 @@ class Vehicle:
     @property
     def T_world_base(self) -> Array:
         """Return the true pose (4, 4) of the base."""
-        x_m, y_m, heading_rad = self.twin.base.pose
-        return se3.transform(se3.rotation_exp([0.0, 0.0, heading_rad]), [x_m, y_m, 0.0])
+        return self._ground.T_world_base(self.twin.base.pose)
+
+    @property
+    def T_world_rig(self) -> Array:
+        """Return the true pose (4, 4) of the rig, which may lean otherwise than its file says."""
+        return self.T_world_base @ self._robot.T_base_leaning @ self._robot.rig.T_base_rig
 
     def post(self, due_ns: int, deliver: Callable[[], None]) -> None:
         """Have a message delivered to the controller before its first tick at or after a time."""
@@ -124,19 +129,47 @@ class Vehicle:
 
     def _move(self, until_ns: int) -> None:
         base, dt_s = self.twin.base, (until_ns - self.now_ns) * 1e-9
-        before_rad = base.pose[2]
+        before = base.pose
         base.advance(dt_s)
+        for push in self._robot.pushes:
+            if push.start_s <= self.time_s < push.end_s:
+                x_m, y_m, heading_rad = base.pose
+                aside_m = push.sideways_mps * dt_s
+                x_m, y_m = x_m - aside_m * math.sin(heading_rad), y_m + aside_m * math.cos(heading_rad)
+                base.pose = x_m, y_m, heading_rad + push.yaw_rate_radps * dt_s
         self.now_ns = until_ns
         if self._robot.has_gyro and dt_s > 0.0:
-            self._sense_rotation(math.remainder(base.pose[2] - before_rad, math.tau) / dt_s)
+            self._sense_rotation(self._turned(before, base.pose) / dt_s)
         self.people.advance(self.time_s, base.pose[:2])
 
-    def _sense_rotation(self, yaw_rate_radps: float) -> None:
+    def _turned(self, before: Pose, now: Pose) -> Array:
+        """Return the rotation vector (3,) of the base between two poses, in its own frame."""
+        if not self._ground.profile:
+            return np.array([0.0, 0.0, math.remainder(now[2] - before[2], math.tau)])
+        return se3.rotation_log(
+            (se3.inverse(self._ground.T_world_base(before)) @ self._ground.T_world_base(now))[:3, :3]
+        )
+
+    def _traction(self, wheels: WheelErrors, seed: int) -> Traction:
+        """Return the travel of both wheels over the plane, which is less than that over a slope."""
+        over_slope, ground = traction(wheels, seed), self._ground
+        if not ground.profile:
+            return over_slope
+
+        def over_plane(dt_s: float, left_m: float, right_m: float) -> tuple[float, float]:
+            cosine = float(ground.T_world_base(self.twin.base.pose)[:2, 0] @ _ahead(self.twin.base.pose))
+            left_m, right_m = over_slope(dt_s, left_m, right_m)
+            return cosine * left_m, cosine * right_m
+
+        return over_plane
+
+    def _sense_rotation(self, rates_radps: Array) -> None:
         """Add a sample of the gyro: the mean over the time since the last one."""
         errors = self._robot.gyro
         noise = [errors.noise_radps * self._gyro_noise.gauss(0.0, 1.0) for _ in range(3)]
         x, y, z = (bias + wrong for bias, wrong in zip(errors.bias_radps, noise, strict=True))
-        self.samples.append(GyroSample(self.now_ns, x, y, z + yaw_rate_radps))
+        about_x, about_y, about_z = rates_radps.tolist()
+        self.samples.append(GyroSample(self.now_ns, x + about_x, y + about_y, z + about_z))
 
     def _tick(self) -> None:
         report = self.controller.tick()
@@ -149,5 +182,10 @@ class Vehicle:
 
     def _clearance_m(self) -> float:
         x_m, y_m, _ = self.twin.base.pose
-        walking = footprints(self.people.faces(), self._robot.height_m)
+        walking = footprints(self.people.faces(), self._robot.height_m, self._ground)
         return min(clearance_m(segments, (x_m, y_m), self._robot.radius_m) for segments in (self._standing, walking))
+
+
+def _ahead(pose: Pose) -> Array:
+    """Return the unit vector (2,) along a heading."""
+    return np.array([math.cos(pose[2]), math.sin(pose[2])])

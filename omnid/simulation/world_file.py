@@ -26,23 +26,13 @@ from msgspec import Meta, Struct
 from calib.models.camera import Array
 from calib.typed_toml import bytes_of, convert, table_of
 from omnid.errors import OmnidError
+from omnid.simulation.named_worlds import is_named
+from omnid.simulation.named_worlds import world as named_world
 from omnid.simulation.people import Person
 from omnid.simulation.rendering import textures
 from omnid.simulation.rendering.shapes import CEILING_M, Point, Random, box, painted, posters
 from omnid.simulation.rendering.surfaces import Rectangle
-
-
-@dataclass(frozen=True, slots=True)
-class World:
-    """The floor is at z = 0 and the robot starts at x, y [m] with a heading [rad]."""
-
-    name: str
-    standing: tuple[Rectangle, ...]
-    people: tuple[Person, ...] = ()
-    start: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    brightness: float = 1.0  # factor on the grey of all images
-    is_polished: bool = False  # the floor mirrors the objects on it
-
+from omnid.simulation.world import World
 
 MAX_BYTES: Final = 1 << 18
 LARGEST_M: Final = 60.0  # side of a world: its textures must fit into memory
@@ -172,7 +162,14 @@ def shipped_worlds() -> list[str]:
 
 
 def load_world(name: str, seed: int = 0, options: WorldOptions | None = None) -> World:
-    """Return a shipped world or that of a file (a name that ends in .toml); raise OmnidError for wrong ones."""
+    """Return a shipped world or that of a file (a name that ends in .toml); raise OmnidError for wrong ones.
+
+    Other names are those of worlds like buildings (named_worlds.py).
+    """
+    if is_named(name):
+        options, made = options or WorldOptions(), named_world(name, seed)
+        people = made.people if options.people else ()
+        return replace(made, people=people, brightness=made.brightness * options.brightness)
     try:
         if name in shipped_worlds():
             data = (files("omnid.simulation.worlds") / f"{name}.toml").read_bytes()

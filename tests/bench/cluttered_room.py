@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from omnid.core.control.heading_controller import Setpoint, wrap_angle
 from omnid.simulation.lockstep import Moment, Request
-from omnid.simulation.world_file import World
+from omnid.simulation.world import World
 from tests.bench.floating_boxes import with_floating
 from tests.bench.uneven_floors import with_edge
 

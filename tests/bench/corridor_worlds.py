@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from omnid.simulation.rendering.surfaces import Rectangle
-from omnid.simulation.world_file import World
+from omnid.simulation.world import World
 
 SPEED_MPS: Final = 0.5  # of the robot that people meet
 STARTED_S: Final = 0.74  # by which a robot that starts is late against one that drives at SPEED_MPS from 0 s on

@@ -16,7 +16,7 @@ from omnid.engine.telemetry import Telemetry
 from omnid.messages import ObstacleRing, OdometryUpdate
 from omnid.sinks.encoder import Outgoing
 from omnid.stages.front_end import FrontEnd
-from tests.bench.obstacles import Counts, Segments, compare
+from tests.bench.log_rings import Counts, Segments, compare
 from tests.simulation import Scene
 
 Array = NDArray[np.float64]

@@ -24,7 +24,8 @@ from omnid.navigation_state import NavigationState
 from omnid.simulation.lockstep import Fault, Moment, Request, SimulatedRun, simulate
 from omnid.simulation.robot import Slip, WheelErrors, make_robot
 from omnid.simulation.vehicle import START_NS
-from omnid.simulation.world_file import World, load_world
+from omnid.simulation.world import World
+from omnid.simulation.world_file import load_world
 from tests.bench.building_round import building_round
 from tests.bench.results import Cell, Column, ResultTable
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from omnid.simulation.rendering.shapes import box
 from omnid.simulation.rendering.surfaces import Rectangle
-from omnid.simulation.world_file import World
+from omnid.simulation.world import World
 
 Size = tuple[float, float, float]  # along x, y, z [m]
 

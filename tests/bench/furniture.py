@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.simulation.rendering.surfaces import Rectangle
-from omnid.simulation.world_file import World
+from omnid.simulation.world import World
 from tests.bench.floating_boxes import Size, raised_box
 
 Array = NDArray[np.float64]

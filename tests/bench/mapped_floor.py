@@ -30,7 +30,8 @@ from omnid.core.places.place_views import grid
 from omnid.formats.place_file import read_places
 from omnid.simulation.lockstep import simulate
 from omnid.simulation.rendering.surfaces import Rectangle
-from omnid.simulation.world_file import World, load_world
+from omnid.simulation.world import World
+from omnid.simulation.world_file import load_world
 from tests.bench.cluttered_room import CLUTTER, Wanderer
 from tests.bench.fine_robot import fine_robot
 from tests.bench.obstacle_stops import CASES, SIZE_PX, TILES, world_of

@@ -37,7 +37,8 @@ from omnid.simulation.rendering.surfaces import Scene
 from omnid.simulation.rendering.textures import PAINTERS
 from omnid.simulation.robot import SimulatedRobot
 from omnid.simulation.vehicle import START_NS
-from omnid.simulation.world_file import World, load_world
+from omnid.simulation.world import World
+from omnid.simulation.world_file import load_world
 from tests.bench.cluttered_room import AT_EDGE, ROOMS, Wanderer, furnished, lowered, room_text
 from tests.bench.corridor_worlds import CROSSING, LIKE_FLOOR, POLISHED, SPEED_MPS, like_the_floor, world_text
 from tests.bench.fine_robot import BUILDS, USUAL, fine_robot

@@ -1,212 +1,194 @@
-"""Recall and false alarms of the obstacle ring against the true world: `python -m tests.bench.obstacles LOG ...`.
+"""Drives in worlds like buildings: `python -m tests.bench.obstacles [--only NAME ...] [--seeds 1 2] [--speed 0.3 0.5]`.
 
-LOG is a folder NAME_sN of `python -m tests.simulation NAME --seed N` (NAME_dim_sN: with --dim); the world is built
-again from the name and the seed. A sector counts as found where the ring has an obstacle no farther than the true one
-and its tolerance, as unknown where it has none and does not call the way free beyond the obstacle, and as missed where
-it has a farther one or none in a direction that it calls free; how many of all are called free is given, too, as what
-lies before a farther obstacle may be unknown. A false alarm is an obstacle before the nearest true one.
+Two tables follow from the same drives: how far the robot drove where nothing was in the way, and what it touched where
+something was. A drive is asked to go straight on, or to a goal; it ends when it is there, or when it could have been
+there at SLOWEST_MPS. Each is a line of build/results/obstacles.jsonl; the command goes on where it ended as long as the
+commit is the same.
 """
 
 from __future__ import annotations
 
 import argparse
-import re
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
-from pathlib import Path
+import json
+import math
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, replace
+from multiprocessing import get_context
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calib.rig_file import read_rig
 from omnid.config import load_config
-from omnid.core.mapping.range_scan import SECTORS
-from omnid.formats.tum import read_tum
-from omnid.messages import ObstacleRing
-from omnid.runs.replay import ReplayOptions, run_log
-from omnid.sinks.encoder import Outgoing
-from tests.bench.results import Cell, Column, ResultTable
-from tests.bench.seeds import family_and_seed
-from tests.simulation import RECIPES, Rectangle, build
+from omnid.core.control.heading_controller import Setpoint
+from omnid.core.navigation.requests import GoalRequest, NavigationFrame
+from omnid.simulation.lockstep import Moment, Request, SimulatedRun, simulate
+from omnid.simulation.named_worlds import HARMLESS, SLOWEST_MPS, Trial, trial
+from tests.bench.results import ROOT, Column, ResultTable, commit
 
-Array = NDArray[np.float64]
-RAYS: Final = 3  # true directions for each sector
-NEIGHBOURS: Final = 2  # sectors on either side that an edge may be off
-DISTANCES_M: Final = (0.3, 0.65, 1.0, 1.5, 2.0, 3.0, 4.0)
-LOWEST_M: Final = 0.05  # of a surface within the band of heights that counts
-CLASSES: Final = ("found", "unknown", "missed")
-WALLS: Final = ("brick", "granite", "plaster", "plain")
+LINES: Final = ROOT / "build" / "results" / "obstacles.jsonl"
+FAMILY: Final = "buildings"  # in seeds.toml
+SIDE_RAYS: Final = 3 * 512  # least number of rays along a side of an image
+OWN_MPS: Final = 0.05  # A contact at a lower speed is not the robot's own.
+DRIVEN: Final = 0.95  # share of what was asked that counts as all
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TrueRing:
-    """Nearest surfaces around a place."""
+@dataclass(frozen=True, slots=True)
+class Planned:
+    """A drive that is to be made; its text names it in LINES."""
 
-    near_m: Array  # (SECTORS,) nearest of the sector, inf without one
-    kind: NDArray[np.str_]  # (SECTORS,) of it
+    world: str
+    seed: int
+    speed_mps: float = 0.3
+    size_px: int = 512
 
-
-@dataclass(slots=True)
-class Counts:
-    """Sectors by class, for each group."""
-
-    of: dict[str, dict[str, int]] = field(default_factory=dict)
-    called_free: dict[str, int] = field(default_factory=dict)  # beyond the true obstacle
-    false_alarms: dict[str, int] = field(default_factory=dict)
-    ranges: dict[str, int] = field(default_factory=dict)  # that the ring gave
-    errors_m: dict[str, list[float]] = field(default_factory=dict)
-
-    def add(self, group: str, classes: Iterable[str]) -> None:
-        """Count sectors."""
-        counts = self.of.setdefault(group, dict.fromkeys(CLASSES, 0))
-        for one in classes:
-            counts[one] += 1
+    def __str__(self) -> str:
+        return f"{self.world} seed {self.seed}, {self.speed_mps:g} m/s, {self.size_px} px"
 
 
-class Segments:
-    """Upright surfaces of a world within the band of heights, as segments on the floor."""
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """What came of a drive."""
 
-    def __init__(self, rectangles: Iterable[Rectangle], band_m: tuple[float, float]) -> None:
-        ends, kinds = [], []
-        for rectangle in rectangles:
-            corners = rectangle.corners
-            low, high = corners[:, 2].min(), corners[:, 2].max()
-            if high - low > 0.01 and min(high, band_m[1]) - max(low, band_m[0]) > LOWEST_M:
-                far = corners[np.argmax(((corners - corners[0])[:, :2] ** 2).sum(axis=1))]
-                ends.append([corners[0, :2], far[:2]])
-                kinds.append(_kind(rectangle, float(high)))
-        self.ends, self.kinds = np.array(ends), np.array(kinds)
+    asked_m: float
+    driven_m: float  # towards what was asked
+    time_s: float  # from the first command to the end, or to the last motion
+    contacts: int
+    own: int  # of them, while the robot drove
+    clearance_m: float  # least
+    ended: str  # where it did not get there, why the wheels stopped last, in the daemon's words
+    cpu_s: float
 
-    def ring(self, x_m: float, y_m: float, yaw_rad: float) -> TrueRing:
-        """Return the true ring at a pose."""
-        azimuth = yaw_rad - np.pi + (np.arange(SECTORS * RAYS) + 0.5) * (2 * np.pi / (SECTORS * RAYS))
-        direction = np.column_stack([np.cos(azimuth), np.sin(azimuth)])
-        start, along = self.ends[:, 0] - [x_m, y_m], self.ends[:, 1] - self.ends[:, 0]
-        across = direction[:, None, 0] * along[None, :, 1] - direction[:, None, 1] * along[None, :, 0]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            distance = (start[:, 0] * along[:, 1] - start[:, 1] * along[:, 0]) / across
-            share = (start[None, :, 0] * direction[:, None, 1] - start[None, :, 1] * direction[:, None, 0]) / across
-        hit = np.where((distance > 0) & (share >= 0) & (share <= 1), distance, np.inf)
-        nearest = np.argmin(hit, axis=1)
-        ranges = hit[np.arange(len(hit)), nearest].reshape(SECTORS, RAYS)
-        best = np.argmin(ranges, axis=1)
-        kinds = self.kinds[nearest].reshape(SECTORS, RAYS)
-        return TrueRing(ranges[np.arange(SECTORS), best], kinds[np.arange(SECTORS), best])
+    @property
+    def share(self) -> float:
+        """Share of what was asked that was driven."""
+        return min(1.0, self.driven_m / self.asked_m)
 
 
-def tolerance_m(range_m: Array) -> Array:
-    """Return by how much a range may differ: three sigma of stereo, and the size of an edge."""
-    return np.asarray(0.1 + 0.03 * range_m**2)
+class Asker:
+    """Arms, then asks for the way straight on or for the goal; ends the drive there."""
+
+    def __init__(self, asked: Trial, speed_mps: float) -> None:
+        self._asked, self._speed_mps = asked, speed_mps
+        self._start: tuple[float, float] | None = None
+        self._sent_s = math.inf
+        self.began_s = math.inf
+
+    def __call__(self, moment: Moment) -> Iterator[Request]:
+        """Yield the requests at a moment."""
+        if moment.odometry is None:
+            return
+        if not moment.controller.armed:
+            if moment.time_s < 2.0:
+                yield "arm"
+            return
+        place = moment.T_world_base[:2, 3]
+        if self._start is None:
+            self._start, self.began_s = (float(place[0]), float(place[1])), moment.time_s
+        if self._asked.goal is None:
+            yield Setpoint(self._speed_mps, heading_rad=0.0)
+            if math.dist(self._start, place) >= self._asked.way_m:
+                yield "end"
+        elif math.isinf(self._sent_s):
+            self._sent_s = moment.time_s
+            yield GoalRequest(NavigationFrame.ODOM, *self._asked.goal)
+        elif moment.time_s > self._sent_s + 1.0 and moment.navigation is not None and moment.navigation.state.is_end:
+            yield "end"
 
 
-def compare(ring: ObstacleRing, truth: TrueRing, light: str, counts: Counts) -> None:
-    """Count the sectors of a ring."""
-    around = np.array([np.roll(truth.near_m, shift) for shift in range(-NEIGHBOURS, NEIGHBOURS + 1)])
-    seen = np.array([np.roll(ring.ranges_m, shift) for shift in range(-NEIGHBOURS, NEIGHBOURS + 1)])
-    nearest_seen = np.where(np.isnan(seen), np.inf, seen).min(axis=0)
-    known = np.isfinite(ring.ranges_m)
-    limit = truth.near_m + tolerance_m(np.where(np.isfinite(truth.near_m), truth.near_m, 0.0))
-    is_found = nearest_seen <= limit
-    is_unknown = ~is_found & np.isnan(ring.ranges_m) & (ring.free_m <= limit)
-    classes = np.where(is_found, "found", np.where(is_unknown, "unknown", "missed"))
-    is_free = ~is_found & (ring.free_m > limit)
-    least = around.min(axis=0)
-    is_false = known & (ring.ranges_m < least - tolerance_m(least))
-    inside = (truth.near_m >= DISTANCES_M[0]) & (truth.near_m < DISTANCES_M[-1])
-    bins = np.digitize(truth.near_m, DISTANCES_M)
-    for k in np.flatnonzero(inside):
-        distance = f"{DISTANCES_M[bins[k] - 1]:g} to {DISTANCES_M[bins[k]]:g} m"
-        for group in (f"distance|{distance}", f"surface|{truth.kind[k]}", f"light|{light}", "all|all"):
-            counts.add(group, [classes[k]])
-            counts.called_free[group] = counts.called_free.get(group, 0) + int(is_free[k])
-            counts.false_alarms[group] = counts.false_alarms.get(group, 0) + int(is_false[k])
-            counts.ranges[group] = counts.ranges.get(group, 0) + int(known[k])
-            if is_found[k] and known[k]:
-                counts.errors_m.setdefault(group, []).append(float(ring.ranges_m[k] - truth.near_m[k]))
+def drive(planned: Planned, overrides: Sequence[str] = ()) -> Drive:
+    """Make a drive."""
+    asked, cpu_s = trial(planned.world, planned.seed), time.process_time()
+    robot = replace(asked.robot(planned.size_px), samples=math.ceil(SIDE_RAYS / planned.size_px))
+    names = ("controller.limits.velocity_mps", "controller.heading.velocity_mps", "navigation.velocity_mps")
+    settings = [f"{name}={abs(planned.speed_mps)}" for name in names]
+    config = load_config(None, ["places.enabled=false", *settings, *overrides])
+    script = Asker(asked, planned.speed_mps)
+    asked_m = asked.way_m if asked.goal is None else math.hypot(*asked.goal[:2])
+    seconds = 5.0 + asked_m / min(SLOWEST_MPS, abs(planned.speed_mps))
+    run = simulate(asked.world, robot, script, seconds=seconds, seed=planned.seed, config=config)
+    return judged(run, asked, asked_m, script.began_s, time.process_time() - cpu_s)
 
 
-class RingCollector:
-    """Rings of a run."""
+def judged(run: SimulatedRun, asked: Trial, asked_m: float, began_s: float, cpu_s: float) -> Drive:
+    """Return what came of a run, by the truth."""
+    places = np.array([tick.pose[:2] for tick in run.ticks])
+    times_s = np.array([tick.time_s for tick in run.ticks])
+    speeds = np.linalg.norm(np.diff(places, axis=0), axis=1) / np.diff(times_s)
+    driven_m = float(np.linalg.norm(places[-1] - places[0]))
+    if asked.goal is not None:
+        c, s = math.cos(asked.world.start[2]), math.sin(asked.world.start[2])
+        x_m, y_m, _ = asked.goal
+        goal = places[0] + (c * x_m - s * y_m, s * x_m + c * y_m)
+        driven_m = asked_m - float(np.linalg.norm(places[-1] - goal))
+    moved = np.flatnonzero(speeds > OWN_MPS)
+    last_s = times_s[moved[-1] + 1] if len(moved) else began_s
+    at_contact = [int(np.argmin(np.abs(times_s[1:] - tick.time_s))) for tick in run.contacts]
+    stops = [line.removeprefix("the wheels stop: ") for _, line in run.lines if line.startswith("the wheels stop")]
+    states = [f"{update.state}: {update.reason}" for update in run.navigation if update.reason]
+    ended = "" if driven_m >= DRIVEN * asked_m else "; ".join([*states[-1:], *stops[-1:]])
+    own = sum(bool(speeds[tick] > OWN_MPS) for tick in at_contact)
+    return Drive(asked_m, driven_m, float(last_s - began_s), len(run.contacts), own, run.clearance_m, ended, cpu_s)
 
-    def __init__(self) -> None:
-        self.rings: list[ObstacleRing] = []
 
-    def process(self, message: Outgoing) -> None:
-        """Keep a ring."""
-        if isinstance(message, ObstacleRing):
-            self.rings.append(message)
+def known_drives() -> dict[str, Drive]:
+    """Return the drives of this commit that LINES has, by name."""
+    lines = (json.loads(line) for line in LINES.read_text().splitlines()) if LINES.exists() else ()
+    here = commit()
+    return {line["name"]: Drive(**line["drive"]) for line in lines if line["commit"] == here}
 
 
-def measure(folder: Path, overrides: list[str], counts: Counts) -> None:
-    """Replay a log and count its rings, from the second on: the first has no votes."""
-    match = re.fullmatch(r"(.+?)(_dim)?_s(\d+)", folder.name)
-    if match is None or match[1] not in RECIPES:
-        raise SystemExit(f"{folder}: expected a folder NAME_sN with NAME one of {', '.join(sorted(RECIPES))}")
-    rig, truth = read_rig(folder / "rig.toml"), read_tum(folder / "truth.txt")
-    config = load_config(None, ["places.enabled=false", *overrides])
-    found = RingCollector()
-    run_log(
-        folder / "log.mcap", config, ReplayOptions(rig=rig, inline=True, observer=lambda geometry, telemetry: found)
+def add_table(planned: Sequence[Planned], drives: dict[str, Drive]) -> None:
+    """Print and write the table of the harmless worlds."""
+    columns = (
+        Column("world"),
+        Column("drives"),
+        Column("driven of what was asked", "%", 0),
+        Column("time to that of steady speed", "", 2),
+        Column("contacts"),
+        Column("last stop"),
     )
-    scene = build(match[1], int(match[3]), pairs=len(truth.T)).scene
-    segments = Segments(scene.rectangles, config.obstacles.ring.heights_m)
-    poses = dict(zip(truth.stamps_ns.tolist(), truth.T @ np.linalg.inv(rig.T_base_rig), strict=True))
-    for ring in found.rings[1:]:
-        T = poses[ring.stamp_ns]
-        yaw = float(np.arctan2(T[1, 0], T[0, 0]))
-        compare(ring, segments.ring(float(T[0, 3]), float(T[1, 3]), yaw), "dim" if match[2] else "bright", counts)
-
-
-def _kind(rectangle: Rectangle, top_m: float) -> str:
-    if rectangle.name in WALLS:
-        return f"wall, {rectangle.name}"
-    if rectangle.name.startswith("poster"):
-        return "poster"
-    height = "below 0.4 m" if top_m < 0.4 else "0.4 to 0.8 m" if top_m < 0.8 else "above 0.8 m"
-    return f"box {height}"
-
-
-def rows(counts: Counts) -> Iterator[list[Cell]]:
-    """Yield the rows of the table."""
-    order = {group: i for i, group in enumerate(("distance", "surface", "light", "all"))}
-    for group in sorted(counts.of, key=lambda name: (order[name.split("|")[0]], name)):
-        total = sum(counts.of[group].values())
-        shares = [100 * counts.of[group][one] / total for one in CLASSES]
-        errors = np.abs(counts.errors_m.get(group, [np.nan]))
-        yield [
-            group.split("|")[1],
-            total,
-            *shares,
-            100 * counts.called_free[group] / total,
-            100 * counts.false_alarms[group] / max(1, counts.ranges[group]),
-            100 * float(np.median(errors)),
-            100 * float(np.quantile(errors, 0.95)),
-        ]
+    table = ResultTable("obstacles_free", "Where nothing is in the way", columns)
+    table.seeds = sorted({(FAMILY, one.seed) for one in planned})
+    for name in dict.fromkeys(one.world for one in planned):
+        made = [(one, drives[str(one)]) for one in planned if one.world == name and str(one) in drives]
+        if made:
+            ratios = [d.time_s * abs(one.speed_mps) / max(d.driven_m, 0.1) for one, d in made]
+            share = 100 * float(np.mean([d.share for _, d in made]))
+            reasons = "; ".join(dict.fromkeys(d.ended for _, d in made if d.ended))
+            table.add(name, len(made), share, float(np.median(ratios)), sum(d.own for _, d in made), reasons)
 
 
 def main() -> None:
-    """Print the table of all logs."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("logs", type=Path, nargs="+", metavar="LOG")
+    """Make the drives that are missing, print a line for each, and write the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", nargs="+", default=HARMLESS, metavar="NAME", help="worlds (omnid.simulation)")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1])
+    parser.add_argument("--speed", type=float, nargs="+", default=[0.3], help="m/s; below 0: backwards")
+    parser.add_argument("--px", type=int, nargs="+", default=[512], help="sizes of the images")
+    parser.add_argument("--jobs", type=int, default=1, help="drives at a time")
     parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE")
     arguments = parser.parse_args()
-    counts = Counts()
-    for folder in arguments.logs:
-        measure(folder, arguments.overrides, counts)
-    columns = (
-        Column("sectors of"),
-        Column("number"),
-        *(Column(one, "%", 2 if one == "missed" else 1) for one in CLASSES),
-        Column("called free", "%", 2),
-        Column("false alarms of ranges", "%", 2),
-        Column("error, median", "cm", 1),
-        Column("error, p95", "cm", 1),
-    )
-    table = ResultTable("obstacles", "Recall of the obstacle ring", columns)
-    table.seeds = [seed for folder in arguments.logs if (seed := family_and_seed(folder.name))]
-    for row in rows(counts):
-        table.add(*row)
+    here, drives = commit(), known_drives()
+    wanted = [
+        Planned(name, seed, speed_mps, size_px)
+        for name in arguments.only
+        for speed_mps in arguments.speed
+        for size_px in arguments.px
+        for seed in arguments.seeds
+    ]
+    missing = [planned for planned in wanted if str(planned) not in drives]
+    LINES.parent.mkdir(parents=True, exist_ok=True)
+    with ProcessPoolExecutor(arguments.jobs, get_context("spawn")) as pool, LINES.open("a") as lines:
+        waiting = {pool.submit(drive, planned, arguments.overrides): planned for planned in missing}
+        for future in as_completed(waiting):
+            name, made = str(waiting[future]), future.result()
+            drives[name] = made
+            print(f"{name}: {made}", flush=True)
+            lines.write(json.dumps({"commit": here, "name": name, "drive": asdict(made)}) + "\n")
+            lines.flush()
+    add_table(wanted, drives)
 
 
 if __name__ == "__main__":

@@ -30,7 +30,8 @@ from omnid.simulation.demonstration import ANSWER_S, cross_track_m
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun, simulate
 from omnid.simulation.robot import SimulatedRobot
 from omnid.simulation.vehicle import START_NS
-from omnid.simulation.world_file import World, WorldOptions, load_world
+from omnid.simulation.world import World
+from omnid.simulation.world_file import WorldOptions, load_world
 from omnid.tracking_state import MapState
 from tests.bench.fine_robot import fine_robot
 from tests.bench.results import Cell, Column, ResultTable

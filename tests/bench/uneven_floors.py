@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.simulation.rendering.surfaces import Rectangle
-from omnid.simulation.world_file import World
+from omnid.simulation.world import World
 
 Array = NDArray[np.float64]
 

@@ -31,7 +31,8 @@ from omnid.simulation.lockstep import SimulatedRun, simulate, with_masks
 from omnid.simulation.people import Walkers
 from omnid.simulation.robot import make_robot
 from omnid.simulation.vehicle import START_NS
-from omnid.simulation.world_file import World, load_world
+from omnid.simulation.world import World
+from omnid.simulation.world_file import load_world
 
 Image = NDArray[np.uint8]
 FOLDER: Final = Path(__file__).parents[2] / "docs" / "images"

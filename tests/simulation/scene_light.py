@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from calib.models.camera import Array
-from omnid.simulation.rendering.polished_floor import BLACK, WHITE
+from omnid.simulation.rendering.mirrors import BLACK, WHITE
 from omnid.simulation.rendering.sensor import Floats
 from omnid.simulation.rendering.surfaces import LIGHT, Rectangle, Scene, Texture
 from tests.simulation.disturbances import Disturbance

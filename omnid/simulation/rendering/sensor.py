@@ -25,6 +25,7 @@ class Sensor:
     blur_px: float = 0.5
     black_level: float = 5.0
     jpeg_quality: int = 90
+    is_compressed: bool = False  # the frames of a drive are JPEG, too
     vignette: float = 0.0  # how much darker the rim is, 0 to 1
     flicker: float = 0.0  # standard deviation of the brightness from frame to frame
     brightness: float = 1.0  # factor on the ideal image

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from calib.models.camera import Array
@@ -12,6 +14,7 @@ PX_PER_M = 320.0  # finer than a 768 pixel camera resolves at 0.6 m
 CEILING_M = 2.6
 Random = np.random.Generator
 Point = tuple[float, float]
+Paint = Callable[[Point], Texture]  # of a face, by its sides [m]
 
 
 def painted(rng: Random, kind: str, size_m: Point, px_per_m: float = PX_PER_M) -> Texture:
@@ -35,15 +38,32 @@ def posters(rng: Random, on: Rectangle, count: int, first: int = 0) -> list[Rect
 
 def box(rng: Random, centre: Point, size_m: tuple[float, float, float], yaw_rad: float) -> list[Rectangle]:
     """Return a box on the floor: four sides and the top, each with a texture of its own."""
+    return solid((*centre, 0.0), size_m, yaw_rad, lambda sides: _face(rng, sides), is_raised=False)
+
+
+def solid(
+    at: tuple[float, float, float],
+    size_m: tuple[float, float, float],
+    yaw_rad: float,
+    paint: Paint,
+    *,
+    is_raised: bool = True,
+    name: str = "box",
+) -> list[Rectangle]:
+    """Return a box: four sides, the top, and the bottom of a raised one; at: the middle of its bottom."""
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     x, y, up = np.array([c, s, 0]) * size_m[0], np.array([-s, c, 0]) * size_m[1], np.array([0, 0, size_m[2]])
-    low = np.array([*centre, 0]) - (x + y) / 2
+    low = np.array(at, float) - (x + y) / 2
     # (upper left corner, edge to the right) of each face as seen from outside
     sides = [(low + up, x), (low + x + up, y), (low + x + y + up, -x), (low + y + up, -y)]
-    faces = [(a, u, -up) for a, u in sides] + [(low + y + up, x, -y)]
-    return [Rectangle(a, u, v, _face(rng, u, v), "box") for a, u, v in faces]
+    faces = [(a, u, -up) for a, u in sides] + [(low + y + up, x, -y), (low, x, y)][: 1 + is_raised]
+    return [Rectangle(a, u, v, paint((_length(u), _length(v))), name) for a, u, v in faces]
 
 
-def _face(rng: Random, u: Array, v: Array) -> Texture:
-    size = tuple(max(8, round(float(np.linalg.norm(e)) * PX_PER_M)) for e in (u, v))
-    return textures.poster(rng, (size[0], size[1]))
+def _length(edge: Array) -> float:
+    return float(np.linalg.norm(edge))
+
+
+def _face(rng: Random, sides_m: Point) -> Texture:
+    width, height = (max(8, round(side_m * PX_PER_M)) for side_m in sides_m)
+    return textures.poster(rng, (width, height))

@@ -82,6 +82,124 @@ def white(_: Random, size: Size, __: float) -> Texture:
     return np.full(size[::-1], 225, np.uint8)
 
 
+def linoleum(rng: Random, size: Size, px_per_m: float) -> Texture:
+    """Return a floor of one grey, with a little dirt and grain."""
+    return _grey(rng.uniform(115, 175) + 0.8 * value_noise(rng, size, px_per_m * 1.5, 0.8))
+
+
+def epoxy(rng: Random, size: Size, px_per_m: float) -> Texture:
+    """Return a cast floor: a light grey with the broad waves of the trowel."""
+    return _grey(rng.uniform(150, 190) + 0.9 * value_noise(rng, size, px_per_m * 0.8, 0.4))
+
+
+def marbled(rng: Random, size: Size, px_per_m: float) -> Texture:
+    """Return linoleum with streaks of two greys along its web."""
+    streaks = _stretched(rng, size, px_per_m * 0.12, 4.0)
+    return _grey(rng.uniform(120, 160) + 6 * streaks + 2 * value_noise(rng, size, px_per_m * 0.05))
+
+
+def concrete(rng: Random, size: Size, px_per_m: float) -> Texture:
+    """Return smoothed concrete: clouds, pores, and sawn joints every few metres."""
+    image = rng.uniform(115, 150) + 5 * value_noise(rng, size, px_per_m * 0.8, 0.75)
+    image -= 25 * (value_noise(rng, size, px_per_m * 0.02) > 3.2)
+    for axis, apart_m in ((0, rng.uniform(2.2, 3.2)), (1, rng.uniform(2.2, 3.2))):
+        _joints(
+            image, axis, round(rng.uniform(0.2, 0.8) * apart_m * px_per_m), apart_m * px_per_m, 0.006 * px_per_m, 70
+        )
+    return _grey(image)
+
+
+def glazed(rng: Random, size: Size, px_per_m: float) -> Texture:
+    """Return glazed tiles: nearly one grey each, with joints."""
+    side_m = rng.choice([0.3, 0.45, 0.6])
+    return _flags(rng, size, px_per_m, side_m, 2.5, 1.2, (0.004, rng.uniform(90, 120)))
+
+
+def slabs(rng: Random, size: Size, px_per_m: float) -> Texture:
+    """Return polished stone: dark slabs with thin joints."""
+    return _flags(rng, size, px_per_m, 0.6, 3.0, 5.0, (0.002, 60.0), base=rng.uniform(85, 120))
+
+
+def carpet(rng: Random, size: Size, px_per_m: float) -> Texture:
+    """Return a pile with a woven pattern that repeats itself."""
+    side = round(px_per_m * rng.uniform(0.25, 0.4))
+    motif = np.full((side, side), 0.0, np.float32)
+    for radius in (0.42, 0.28, 0.12):
+        corners = side / 2 * (1 + 2 * radius * np.array([(0, 1), (1, 0), (0, -1), (-1, 0)]))
+        cv2.fillPoly(motif, [np.rint(corners).astype(np.int32)], float(rng.choice([-1, 1]) * rng.uniform(8, 22)))
+    times = (-(-size[1] // side), -(-size[0] // side))
+    return _grey(rng.uniform(75, 120) + np.tile(motif, times)[: size[1], : size[0]] + 6 * value_noise(rng, size, 4.0))
+
+
+def parquet_along(rng: Random, size: Size, px_per_m: float) -> Texture:
+    """Return staggered oak staves along u."""
+    return _boards(rng, size, px_per_m, (0.6, 0.07), 7.0, 3.0)
+
+
+def parquet_across(rng: Random, size: Size, px_per_m: float) -> Texture:
+    """Return staggered oak staves along v."""
+    return np.ascontiguousarray(parquet_along(rng, size[::-1], px_per_m).T)
+
+
+def laminate(rng: Random, size: Size, px_per_m: float) -> Texture:
+    """Return printed planks along u with fine joints."""
+    return _boards(rng, size, px_per_m, (1.28, 0.19), 2.0, 2.5)
+
+
+def _stretched(rng: Random, size: Size, coarsest_px: float, times: float) -> NDArray[np.float32]:
+    """Return value noise (H, W) whose structures are longer along u."""
+    short = max(8, round(size[0] / times))
+    return np.asarray(cv2.resize(value_noise(rng, (short, size[1]), coarsest_px), size), np.float32)
+
+
+def _joints(image: Array | NDArray[np.float32], axis: int, first: int, apart: float, wide: float, grey: float) -> None:
+    """Draw lines across an axis of an image; one narrower than a pixel has a part of the grey."""
+    lines, part = np.moveaxis(image, axis, 0), min(wide, 1.0)
+    for at in np.rint(np.arange(first, len(lines), apart)).astype(int):
+        lines[at : at + max(1, round(wide))] += part * (grey - lines[at : at + max(1, round(wide))])
+
+
+def _flags(
+    rng: Random,
+    size: Size,
+    px_per_m: float,
+    side_m: float,
+    spread: float,
+    grain: float,
+    joint: tuple[float, float],
+    base: float | None = None,
+) -> Texture:
+    """Return square flags; joint: width [m] and grey."""
+    side = side_m * px_per_m
+    first = rng.uniform(0, side, 2)
+    rows, columns = (
+        ((np.arange(n) + side - offset) // side).astype(int) for n, offset in zip(size[::-1], first, strict=True)
+    )
+    level = (base or rng.uniform(140, 190)) + spread * rng.standard_normal((rows[-1] + 1, columns[-1] + 1))
+    image = level[np.ix_(rows, columns)] + grain * value_noise(rng, size, px_per_m * 0.2, 0.75)
+    for axis in (0, 1):
+        _joints(image, axis, round(first[axis]), side, joint[0] * px_per_m, joint[1])
+    return _grey(image)
+
+
+def _boards(
+    rng: Random, size: Size, px_per_m: float, board_m: tuple[float, float], spread: float, grain: float
+) -> Texture:
+    """Return boards (length, width) along u, each course beginning elsewhere; spread: of their greys."""
+    length, width = (side_m * px_per_m for side_m in board_m)
+    base = rng.uniform(105, 150)
+    image = base + grain * _stretched(rng, size, px_per_m * 0.03, 14.0)
+    for top in np.arange(0, size[1], width):
+        course = image[round(top) : round(top + width)]
+        first = rng.uniform(0, length)
+        ends = np.rint(np.arange(first, size[0] + length, length)).astype(int)
+        for begin, end in zip([0, *ends], ends, strict=False):
+            course[:, begin:end] += spread * rng.standard_normal()
+        _joints(course, 1, int(ends[0]), length, 0.0015 * px_per_m, base - 45)
+    _joints(image, 0, 0, width, 0.0015 * px_per_m, base - 45)
+    return _grey(image)
+
+
 PAINTERS: dict[str, Painter] = {
     "brick": brick,
     "plaster": plaster,
@@ -89,6 +207,16 @@ PAINTERS: dict[str, Painter] = {
     "tiles": tiles,
     "plain": plain,
     "white": white,
+    "linoleum": linoleum,
+    "epoxy": epoxy,
+    "marbled": marbled,
+    "concrete": concrete,
+    "glazed": glazed,
+    "slabs": slabs,
+    "carpet": carpet,
+    "parquet_along": parquet_along,
+    "parquet_across": parquet_across,
+    "laminate": laminate,
 }
 
 

@@ -17,7 +17,8 @@ from omnid.core.navigation.requests import GoalRequest, NavigationFrame
 from omnid.navigation_state import NavigationState
 from omnid.simulation.lockstep import Fault, Moment, Request, SimulatedRun, simulate
 from omnid.simulation.robot import Slip, WheelErrors, make_robot
-from omnid.simulation.world_file import World, load_world
+from omnid.simulation.world import World
+from omnid.simulation.world_file import load_world
 
 SIZE = 160
 CONFIG = load_config(None, ["controller.collision.unknown=slow"])  # such small images show little of the floor

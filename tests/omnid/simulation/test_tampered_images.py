@@ -12,7 +12,8 @@ from omnid.config import load_config
 from omnid.core.control.collision_monitor import IMAGES_REMEDY, UNSEEN, UNWATCHED
 from omnid.simulation.lockstep import Fault, SimulatedRun, Tamper, simulate
 from omnid.simulation.robot import make_robot
-from omnid.simulation.world_file import World, load_world
+from omnid.simulation.world import World
+from omnid.simulation.world_file import load_world
 from tests.bench.faults.images import Frozen, sector
 from tests.bench.obstacle_stops import ahead
 

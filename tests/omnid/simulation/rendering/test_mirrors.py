@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from omnid.simulation.lockstep import with_masks
-from omnid.simulation.rendering.polished_floor import PolishedFloor, reflectance
+from omnid.simulation.rendering.mirrors import Mirror, reflectance
 from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
 from omnid.simulation.robot import make_robot
@@ -51,7 +51,7 @@ def test_the_share_is_that_of_fresnels_equations(angle_deg: float, share: float)
 def test_a_wall_is_seen_upside_down_where_the_floor_is(side: str) -> None:
     mounted = getattr(RIG, side)
     matt = render_grey(SCENE, mounted, RIG.T_base_rig, 2)
-    polished = PolishedFloor(mounted).reflected(matt, SCENE, RIG.T_base_rig, 2)
+    polished = Mirror(mounted).reflected(matt, SCENE, SCENE.named("floor"), RIG.T_base_rig, 2)
     on_wall, in_floor = (WALL_M, 0.0, 0.4), (WALL_M, 0.0, -0.4)
     T_cam_base = mounted.T_cam_rig @ np.linalg.inv(RIG.T_base_rig)
     viewpoint = np.linalg.inv(T_cam_base)[:3, 3]

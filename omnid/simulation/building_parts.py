@@ -1,0 +1,345 @@
+"""Parts of buildings as they are: painted walls with doors and skirting boards, lit ceilings, windows, furniture.
+
+A `Builder` collects the surfaces of one world; all greys follow from its random generator.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import cv2
+import numpy as np
+
+from calib.models.camera import Array
+from omnid.simulation.rendering import textures
+from omnid.simulation.rendering.shapes import CEILING_M, Paint, Point, Random, painted, solid
+from omnid.simulation.rendering.surfaces import Rectangle, Texture
+
+Point3 = tuple[float, float, float]
+WALL_PX_PER_M: Final = 100.0
+THING_PX_PER_M: Final = 250.0
+MOST_FLOOR_PX: Final = 6e6  # of one floor
+GAP_M: Final = 0.003  # of what hangs on a wall from it
+UP: Final = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, slots=True)
+class Opening:
+    """A door that stands open in a wall, by its distance from the wall's beginning."""
+
+    at_m: float
+    width_m: float
+    height_m: float = 2.1
+
+
+def plain_paint(rng: Random, grey: float, grain: float = 0.8, px_per_m: float = THING_PX_PER_M) -> Paint:
+    """Return what paints a face in one grey with a little grain."""
+
+    def paint(sides_m: Point) -> Texture:
+        width, height = (max(8, round(side_m * px_per_m)) for side_m in sides_m)
+        noise = grain * rng.standard_normal((height, width), np.float32)
+        return np.clip(np.rint(grey + cv2.GaussianBlur(noise, (0, 0), 0.8)), 0, 255).astype(np.uint8)
+
+    return paint
+
+
+def kind_paint(rng: Random, kind: str) -> Paint:
+    """Return what paints a face by a kind of texture (textures.PAINTERS)."""
+    return lambda sides_m: painted(rng, kind, sides_m, THING_PX_PER_M)
+
+
+class Builder:
+    """Collects the surfaces of a world."""
+
+    def __init__(self, rng: Random, floor: str, ceiling_m: float = CEILING_M) -> None:
+        """floor: the kind of its texture."""
+        self.rng, self.floor_kind, self.ceiling_m = rng, floor, ceiling_m
+        self.faces: list[Rectangle] = []
+        self.panes: list[Rectangle] = []  # of glass: they are touched, and mirror a little
+        self.wall_grey = float(rng.uniform(165, 215))
+        self.skirting_m = float(rng.choice([0.06, 0.08, 0.1]))
+        self.skirting_grey = float(rng.choice([60, 95, 215, 235]))
+        self.door_grey = float(rng.choice([110, 150, 205, 228]))
+
+    # Floors and ceilings
+
+    def floor(
+        self, low: Point, high: Point, heights_m: tuple[float, float] = (0.0, 0.0), kind: str | None = None
+    ) -> None:
+        """Add a floor between two corners, of two heights at its ends along x."""
+        (x0, y0), (x1, y1) = low, high
+        px_per_m = min(THING_PX_PER_M, math.sqrt(MOST_FLOOR_PX / ((x1 - x0) * (y1 - y0))))
+        texture = painted(self.rng, kind or self.floor_kind, (x1 - x0, y1 - y0), px_per_m)
+        texture = _lit(texture, self._falloff((x1 - x0, y1 - y0), edge_m=0.12))
+        along = np.array([x1 - x0, 0.0, heights_m[1] - heights_m[0]])
+        self.faces.append(
+            Rectangle(np.array([x0, y1, heights_m[0]]), along, np.array([0.0, y0 - y1, 0.0]), texture, "floor")
+        )
+
+    def ceiling(self, low: Point, high: Point, lamps_apart_m: float = 2.4) -> None:
+        """Add a ceiling of panels with lamps in rows along x."""
+        (x0, y0), (x1, y1), top_m = low, high, self.ceiling_m
+        size_m, px_per_m = (x1 - x0, y1 - y0), 60.0
+        grey = self.rng.uniform(185, 205)
+        texture = np.full((round(size_m[1] * px_per_m), round(size_m[0] * px_per_m)), grey, np.uint8)
+        if self.rng.random() < 0.6:  # panels in a grid
+            step = round(0.6 * px_per_m)
+            texture[::step], texture[:, ::step] = grey - 45, grey - 45
+        panel = Rectangle(
+            np.array([x0, y0, top_m]), np.array([size_m[0], 0.0, 0.0]), np.array([0.0, size_m[1], 0.0]), texture, "top"
+        )
+        self.faces.append(panel)
+        lamp = np.full((8, 8), 255, np.uint8)
+        rows = max(1, round(size_m[1] / 2.8))
+        for y in (np.arange(rows) + 0.5) * size_m[1] / rows:
+            for x in np.arange(lamps_apart_m / 2, size_m[0] - 0.7, lamps_apart_m):
+                self.faces.append(panel.poster(lamp, (float(x) - 0.6, float(y) - 0.14, 1.2, 0.28), "lamp"))
+
+    # Walls
+
+    def wall(
+        self,
+        a: Point,
+        b: Point,
+        openings: Sequence[Opening] = (),
+        *,
+        doors: int = 0,
+        windows: int = 0,
+        pictures: int = 0,
+        grey: float | None = None,
+        skirting: bool = True,
+        height_m: float | None = None,
+    ) -> None:
+        """Add a painted wall between two points, left and right as seen from its front, with what hangs on it."""
+        rng, top_m = self.rng, height_m or self.ceiling_m
+        first, last = np.array([*a, 0.0]), np.array([*b, 0.0])
+        length_m = float(np.linalg.norm(last - first))
+        along = (last - first) / length_m
+        grey = self.wall_grey + rng.uniform(-6, 6) if grey is None else grey
+        begin_m, full = 0.0, []  # stretches from the floor to the ceiling
+        for opening in sorted(openings, key=lambda one: one.at_m):
+            full.append((begin_m, opening.at_m))
+            end_m = opening.at_m + opening.width_m
+            self._wall_piece(first + opening.at_m * along, opening.width_m * along, opening.height_m, top_m, grey)
+            for at_m in (opening.at_m - 0.06, end_m):  # the frame
+                self._strip(first, along, (at_m, 0.06), (0.0, opening.height_m + 0.06), self.door_grey, "frame")
+            begin_m = end_m
+        full.append((begin_m, length_m))
+        for begin_m, end_m in full:
+            if end_m - begin_m > 0.02:
+                self._wall_piece(first + begin_m * along, (end_m - begin_m) * along, 0.0, top_m, grey)
+        # What is on the wall, left to right without overlaps.
+        wanted = ["door"] * doors + ["window"] * windows + ["picture"] * pictures
+        rng.shuffle(wanted)
+        usable = [(p, q) for p, q in full if q - p > 1.3]
+        gaps = [[begin_m, begin_m] for begin_m, _ in full]  # where a door interrupts the skirting board
+        if usable and wanted:
+            spans = [q - p for p, q in usable]
+            slots = np.cumsum([0.0, *spans])
+            width_m = slots[-1] / len(wanted)
+            for number, kind in enumerate(wanted):
+                at = number * width_m
+                part = int(np.searchsorted(slots[1:-1], at, side="right"))
+                left_m = usable[part][0] + at - slots[part]
+                room_m = min(width_m, usable[part][1] - left_m)
+                size_m = {"door": 1.0, "window": 1.4, "picture": 0.5}[kind]
+                if room_m < size_m + 0.2:
+                    continue
+                left_m += rng.uniform(0.1, room_m - size_m - 0.1)
+                if kind == "door":
+                    self._door(first, along, left_m)
+                    gaps.append([left_m, left_m + size_m])
+                elif kind == "window":
+                    self._window(first, along, left_m, size_m)
+                else:
+                    height_m = rng.uniform(0.3, 0.6)
+                    page = textures.poster(rng, (150, round(300 * height_m)))
+                    self._hang(first, along, (left_m, 0.5), (1.3, 1.3 + height_m), page, "poster", 0.01)
+        if skirting:
+            for begin_m, end_m in full:
+                cuts = sorted([p, q] for p, q in gaps if begin_m <= p < end_m)
+                at_m = begin_m
+                for p, q in [*cuts, [end_m, end_m]]:
+                    if p - at_m > 0.02:
+                        self._strip(
+                            first, along, (at_m, p - at_m), (0.0, self.skirting_m), self.skirting_grey, "skirting"
+                        )
+                    at_m = max(at_m, q)
+
+    def partition(
+        self, x_m: float, ends_m: tuple[float, float], openings: Sequence[Opening], thick_m: float = 0.12
+    ) -> None:
+        """Add an inner wall across x, with two sides and the reveals of its openings; at_m from the larger y."""
+        low_m, high_m = sorted(ends_m)
+        front, back = x_m, x_m + thick_m
+        length_m = high_m - low_m
+        self.wall((front, high_m), (front, low_m), openings, grey=self.wall_grey)
+        mirrored = [replace(one, at_m=length_m - one.at_m - one.width_m) for one in openings]
+        self.wall((back, low_m), (back, high_m), mirrored, grey=self.wall_grey)
+        for one in openings:
+            left_m = high_m - one.at_m
+            through = np.array([thick_m, 0.0, 0.0])
+            for y_m in (left_m, left_m - one.width_m):
+                start = np.array([front, y_m, 0.0])
+                self._upright(start, through, (0.0, one.height_m), self.door_grey, "reveal")
+            paint = plain_paint(self.rng, self.door_grey, px_per_m=WALL_PX_PER_M)
+            origin = np.array([front, left_m, one.height_m])
+            across = np.array([0.0, -one.width_m, 0.0])
+            self.faces.append(Rectangle(origin, through, across, paint((thick_m, one.width_m)), "lintel"))
+
+    def room(
+        self, low: Point, high: Point, *, doors: int = 1, windows: int = 0, pictures: int = 1, end_doors: int = 0
+    ) -> None:
+        """Add four walls around a rectangle: windows in the long left one, doors in both long ones."""
+        (x0, y0), (x1, y1) = low, high
+        self.wall((x0, y1), (x1, y1), doors=doors * (not windows), windows=windows, pictures=pictures)
+        self.wall((x1, y1), (x1, y0), doors=end_doors, pictures=1)
+        self.wall((x1, y0), (x0, y0), doors=doors, pictures=pictures)
+        self.wall((x0, y0), (x0, y1), doors=1)
+
+    def _upright(self, start: Array, along: Array, heights_m: Point, grey: float, name: str) -> None:
+        low_m, high_m = heights_m
+        size_m = (float(np.linalg.norm(along)), high_m - low_m)
+        texture = plain_paint(self.rng, grey, px_per_m=WALL_PX_PER_M)(size_m)
+        self.faces.append(Rectangle(start + high_m * UP, along, (low_m - high_m) * UP, texture, name))
+
+    def _wall_piece(self, start: Array, along: Array, low_m: float, top_m: float, grey: float) -> None:
+        size_m = (float(np.linalg.norm(along)), top_m - low_m)
+        texture = plain_paint(self.rng, grey, 1.2, WALL_PX_PER_M)(size_m)
+        texture = _lit(texture, self._falloff(size_m, edge_m=0.05))
+        self.faces.append(Rectangle(start + top_m * UP, along, (low_m - top_m) * UP, texture, "wall"))
+
+    def _falloff(self, size_m: Point, edge_m: float) -> Array:
+        """Return the light (H, W) on a surface: brighter below lamps, darker in corners."""
+        phase = self.rng.uniform(0, math.tau)
+        x, y = (np.linspace(0.0, side_m, max(8, min(400, round(side_m / 0.03)))) for side_m in size_m)
+        waves = 1 + 0.05 * np.cos(math.tau * x / 2.4 + phase)
+        corners = [1 - 0.12 * (np.exp(-at / edge_m) + np.exp(-(at[-1] - at) / edge_m)) for at in (x, y)]
+        return np.asarray(np.outer(corners[1], waves * corners[0]))
+
+    def _hang(
+        self, first: Array, along: Array, span_m: Point, heights_m: Point, texture: Texture, name: str, off_m: float
+    ) -> None:
+        """Add a rectangle before a wall; span: its beginning and width."""
+        inwards = np.array([along[1], -along[0], 0.0])
+        origin = first + span_m[0] * along + heights_m[1] * UP + off_m * inwards
+        self.faces.append(Rectangle(origin, span_m[1] * along, (heights_m[0] - heights_m[1]) * UP, texture, name))
+
+    def _strip(self, first: Array, along: Array, span_m: Point, heights_m: Point, grey: float, name: str) -> None:
+        """Add a strip that stands 1.2 cm before a wall, with its upper edge."""
+        texture = plain_paint(self.rng, grey, px_per_m=WALL_PX_PER_M)((span_m[1], heights_m[1] - heights_m[0]))
+        self._hang(first, along, span_m, heights_m, texture, name, 0.012)
+        inwards = 0.012 * np.array([along[1], -along[0], 0.0])
+        top = first + span_m[0] * along + heights_m[1] * UP
+        self.faces.append(Rectangle(top, span_m[1] * along, inwards, texture[:8], name))
+
+    def _door(self, first: Array, along: Array, left_m: float) -> None:
+        """Add a closed door with its frame and handle, and the switch beside it."""
+        width, height, scale = 1.0, 2.1, 200
+        image = np.full((round(height * scale), round(width * scale)), self.door_grey, np.uint8)
+        frame = round(0.07 * scale)
+        dark = max(0.0, self.door_grey - 70)
+        image[frame - 2 : frame], image[frame:, frame - 2 : frame], image[frame:, -frame : 2 - frame] = dark, dark, dark
+        image[-2:] = 30
+        cv2.rectangle(image, (round(0.84 * scale), 205), (round(0.87 * scale), 240), 70, -1)
+        cv2.line(image, (round(0.75 * scale), 213), (round(0.86 * scale), 213), 200, 4)
+        if self.rng.random() < 0.5:
+            cv2.putText(image, str(self.rng.integers(100, 400)), (70, 110), cv2.FONT_HERSHEY_SIMPLEX, 0.7, 40, 2)
+        self._hang(first, along, (left_m, width), (0.0, height), image, "door", 2 * GAP_M)
+        switch = np.full((16, 16), 235, np.uint8)
+        switch[7:9], switch[0], switch[-1] = 190, 150, 120
+        self._hang(first, along, (left_m - 0.16, 0.08), (1.02, 1.1), switch, "switch", 0.01)
+
+    def _window(self, first: Array, along: Array, left_m: float, width_m: float) -> None:
+        """Add a window: bright panes, bars, a frame; a radiator stands below it."""
+        image = np.full((130, round(100 * width_m)), 255, np.uint8)
+        image[80:] = 235
+        for bar in (0, image.shape[1] // 2 - 3, image.shape[1] - 6):
+            image[:, bar : bar + 6] = 205
+        image[:6], image[-6:] = 205, 205
+        self._hang(first, along, (left_m, width_m), (0.9, 2.2), image, "window", GAP_M)
+        ribs = np.full((60, round(100 * width_m)), 215, np.uint8)
+        ribs[:, ::5] = 175
+        self._hang(first, along, (left_m, width_m), (0.12, 0.72), ribs, "radiator", 0.08)
+
+    # Things
+
+    def thing(
+        self, parts: Iterable[tuple[Point3, Point3]], at: Point, yaw_rad: float, paint: Paint, name: str = "box"
+    ) -> None:
+        """Add boxes of one thing: each by the middle of its bottom from the thing's place, and its sides [m]."""
+        c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+        for (x, y, z), size_m in parts:
+            place = (at[0] + c * x - s * y, at[1] + s * x + c * y, z)
+            self.faces += solid(place, size_m, yaw_rad, paint, name=name, is_raised=z > 0)
+
+    def star_chair(self, at: Point, yaw_rad: float) -> None:
+        """Add an office chair: five legs, a column, a seat and a back."""
+        legs, cloth = (
+            plain_paint(self.rng, self.rng.uniform(25, 190)),
+            plain_paint(self.rng, self.rng.uniform(35, 110), 5),
+        )
+        for number in range(5):
+            angle = yaw_rad + number * math.tau / 5
+            c, s = math.cos(angle), math.sin(angle)
+            self.faces += solid((at[0] + 0.16 * c, at[1] + 0.16 * s, 0.06), (0.3, 0.045, 0.035), angle, legs)
+            self.faces += solid(
+                (at[0] + 0.3 * c, at[1] + 0.3 * s, 0.0), (0.05, 0.05, 0.06), angle, legs, is_raised=False
+            )
+        self.thing([((0.0, 0.0, 0.08), (0.06, 0.06, 0.36))], at, yaw_rad, legs)
+        self.thing(
+            [((0.0, 0.0, 0.44), (0.46, 0.48, 0.08)), ((-0.22, 0.0, 0.58), (0.06, 0.42, 0.5))], at, yaw_rad, cloth
+        )
+
+    def table(self, at: Point, size_m: Point3, yaw_rad: float = 0.0) -> None:
+        """Add a plate on four legs; size: length, width, height."""
+        (length, width, height), thick = size_m, 0.03
+        legs = [
+            ((x * (length / 2 - 0.05), y * (width / 2 - 0.05), 0.0), (0.05, 0.05, height - thick))
+            for x in (1, -1)
+            for y in (1, -1)
+        ]
+        self.thing(legs, at, yaw_rad, plain_paint(self.rng, self.rng.uniform(40, 180)))
+        plate = [((0.0, 0.0, height - thick), (length, width, thick))]
+        self.thing(plate, at, yaw_rad, plain_paint(self.rng, self.rng.uniform(120, 225), 1.5))
+
+    def shelf(self, at: Point, yaw_rad: float, width_m: float = 0.9) -> None:
+        """Add boards between two sides, with books and boxes on them."""
+        boards = [((0.0, 0.0, z), (0.35, width_m, 0.02)) for z in (0.08, 0.45, 0.82, 1.19, 1.56)]
+        sides = [((0.0, y, 0.0), (0.35, 0.02, 1.8)) for y in (width_m / 2, -width_m / 2)]
+        self.thing([*boards, *sides], at, yaw_rad, plain_paint(self.rng, self.rng.uniform(120, 210), 1.5))
+        for z in (0.1, 0.47, 0.84, 1.21):
+            rows = [((-0.03, 0.0, z), (0.25, width_m - 0.08, self.rng.uniform(0.2, 0.3)))]
+            self.thing(rows, at, yaw_rad, lambda sides_m: textures.poster(self.rng, _px(sides_m)))
+
+    def adult(self, height_m: float = 1.75) -> tuple[Rectangle, ...]:
+        """Return a person on the origin who looks along x."""
+        k, rng = height_m / 1.75, self.rng
+        trousers, shirt, skin = (
+            plain_paint(rng, rng.uniform(*span), 4.0) for span in ((30, 110), (50, 210), (120, 180))
+        )
+        shoes = plain_paint(rng, rng.uniform(25, 80), 3.0)
+        faces: list[Rectangle] = []
+        for side in (1, -1):
+            faces += solid((0.06 * k, side * 0.1 * k, 0.0), (0.27 * k, 0.1 * k, 0.09 * k), 0.0, shoes, name="person")
+            faces += solid(
+                (0.0, side * 0.1 * k, 0.09 * k), (0.15 * k, 0.14 * k, 0.74 * k), 0.0, trousers, name="person"
+            )
+            faces += solid((0.0, side * 0.26 * k, 0.8 * k), (0.1 * k, 0.1 * k, 0.62 * k), 0.0, shirt, name="person")
+        faces += solid((0.0, 0.0, 0.83 * k), (0.22 * k, 0.42 * k, 0.6 * k), 0.0, shirt, name="person")
+        faces += solid((0.0, 0.0, 1.45 * k), (0.2 * k, 0.16 * k, 0.3 * k), 0.0, skin, name="person")
+        return tuple(faces)
+
+
+def _px(sides_m: Point) -> tuple[int, int]:
+    width, height = (max(16, round(side_m * THING_PX_PER_M)) for side_m in sides_m)
+    return width, height
+
+
+def _lit(texture: Texture, light: Array) -> Texture:
+    """Return a texture under a light of a coarser resolution."""
+    gain = cv2.resize(light.astype(np.float32), texture.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    return np.clip(np.rint(texture * gain), 0, 255).astype(np.uint8)
