@@ -1,7 +1,12 @@
-"""Trajectories in the TUM format: one pose a line, `t x y z qx qy qz qw` (seconds, metres, unit quaternion)."""
+"""Trajectories in the TUM format: one pose a line, `t x y z qx qy qz qw` (seconds, metres, unit quaternion).
+
+A head that names the columns, as `#timestamp [ns], p_RS_R_x [m], ..., q_RS_w [], ...` of EuRoC's CSV files, tells the
+order of the quaternion and the unit of the stamps.
+"""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from io import BytesIO, TextIOWrapper
@@ -17,6 +22,9 @@ FILE_LIMIT_BYTES = 1 << 28  # about 2.5 million poses, days of driving; a log gi
 POSITION_LIMIT_M = 1e9  # Largest coordinate, so that squares and sums cannot overflow.
 STAMP_LIMIT_NS = 1 << 62  # Largest stamp, so that the difference of two stamps fits int64.
 _DECIMALS = 9  # nanoseconds, nanometres
+# Decimal places by which the point of a stamp moves to nanoseconds, by its unit. Where the file does not name it, it is
+# the first unit that gives a time within the limit.
+_TO_NANOSECONDS = {"s": 9, "ms": 6, "us": 3, "ns": 0}
 _MIN_QUATERNION = 1e-9  # largest component below which a quaternion counts as zero
 
 
@@ -36,14 +44,19 @@ def read_tum(path: str | Path) -> Trajectory:
     """
     # 1. Stamps and numbers of each line.
     raw, stamps, poses, lines, line = _read(Path(path)), list[int](), list[list[float]](), list[int](), 0
+    layout = _Layout()
     try:
         for line, content in enumerate(TextIOWrapper(BytesIO(raw), "utf-8-sig"), start=1):
-            words = content.partition("#")[0].split()
-            if words:
-                stamp_ns, pose = _row(words)
+            data, _, comment = content.partition("#")
+            words = data.replace(",", " ").split()
+            if words and (lines or not _is_head(words)):
+                layout = layout if lines else layout.of_first_stamp(words[0])
+                stamp_ns, pose = _row(words[:8] if "," in data else words, layout)
                 stamps.append(stamp_ns)
                 poses.append(pose)
                 lines.append(line)
+            elif not lines:
+                layout = layout.of_head(data if words else comment)
     except UnicodeDecodeError:
         raise OmnidError(f"{path}: expected 't x y z qx qy qz qw' in each line, found bytes that are no text") from None
     except ValueError as error:
@@ -86,17 +99,48 @@ def _read(path: Path) -> bytes:
     return raw
 
 
-def _row(words: list[str]) -> tuple[int, list[float]]:
+@dataclass(frozen=True, slots=True)
+class _Layout:
+    """What the head of a file tells about its columns."""
+
+    quaternion: tuple[int, int, int, int] = (0, 1, 2, 3)  # places of x, y, z, w among the last four columns
+    unit: str = ""  # of the stamps, a key of _TO_NANOSECONDS
+
+    def of_head(self, text: str) -> _Layout:
+        """Return the layout by the names of the columns, as far as these are time, x, y, z and a quaternion."""
+        unit = re.match(r"[^,]*\[(s|ms|us|ns)\]", text)
+        names = re.sub(r"\[[^\]]*\]", "", text).replace(",", " ").lower().split()
+        axes = [name[-1] for name in names[1:8]]
+        if axes[:3] != ["x", "y", "z"] or sorted(axes[3:]) != ["w", "x", "y", "z"]:
+            return self
+        x, y, z, w = (axes[3:].index(axis) for axis in "xyzw")
+        return _Layout((x, y, z, w), unit[1] if unit else "")
+
+    def of_first_stamp(self, word: str) -> _Layout:
+        """Return the layout with the unit of the stamps, if the head does not name it: by the first one's size."""
+        if self.unit or not re.fullmatch(r"\d{10,19}", word):
+            return self
+        fitting = [unit for unit, places in _TO_NANOSECONDS.items() if int(word) * 10**places < STAMP_LIMIT_NS]
+        return _Layout(self.quaternion, fitting[0] if fitting else "")
+
+
+def _is_head(words: list[str]) -> bool:
+    """True for words of which none is a number: names of columns."""
+    return all(re.match(r"[-+.]?[0-9]", word) is None for word in words) and len(words) > 1
+
+
+def _row(words: list[str], layout: _Layout) -> tuple[int, list[float]]:
     """Return the stamp [ns] and x y z qx qy qz qw of a line. Raises ValueError with what was found."""
     found = repr(" ".join(words[:9])[:60])
     if len(words) != 8:
         raise ValueError(f"expected 8 numbers separated by spaces (t x y z qx qy qz qw), found {len(words)}: {found}")
     # Not by float64, whose resolution at Unix times is 238 ns. adjusted() comes first: 1e999999999 has no end.
+    places = _TO_NANOSECONDS[layout.unit or "s"]
     try:
-        stamp_s = Decimal(words[0])
+        stamp = Decimal(words[0])
     except InvalidOperation:
-        stamp_s = Decimal("nan")
-    if not stamp_s.is_finite() or stamp_s.adjusted() > 12 or abs(stamp_s.scaleb(9)) >= STAMP_LIMIT_NS:
+        stamp = Decimal("nan")
+    if not stamp.is_finite() or stamp.adjusted() > 21 - places or abs(stamp.scaleb(places)) >= STAMP_LIMIT_NS:
         raise ValueError(f"expected a stamp in seconds, found {words[0][:60]!r}")
     try:
         pose = [float(word) for word in words[1:]]
@@ -108,4 +152,4 @@ def _row(words: list[str]) -> tuple[int, list[float]]:
         raise ValueError(f"expected a position within {POSITION_LIMIT_M:g} m, found {found}")
     if max(map(abs, pose[3:])) < _MIN_QUATERNION:
         raise ValueError(f"expected a unit quaternion, found zero: {found}")
-    return int(stamp_s.scaleb(9).to_integral_value()), pose
+    return int(stamp.scaleb(places).to_integral_value()), [*pose[:3], *(pose[3 + place] for place in layout.quaternion)]

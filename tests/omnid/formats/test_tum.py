@@ -75,7 +75,7 @@ def test_accepts_other_layouts(tmp_path: Path) -> None:
     [
         ("1 2 3", "found 3: '1 2 3'"),
         ("1 " * 9, "found 9"),
-        ("1,0,0,0,0,0,0,1", "found 1: '1,0,0,0,0,0,0,1'"),
+        ("1,0,0,0,0,0,1", "found 7: '1 0 0 0 0 0 1'"),
         ("1 0 0 0 0 0 0 x", "expected finite numbers, found '1 0 0 0 0 0 0 x'"),
         ("1 0 0 nan 0 0 0 1", "finite"),
         ("1 0 -inf 0 0 0 0 1", "finite"),
@@ -93,6 +93,23 @@ def test_accepts_other_layouts(tmp_path: Path) -> None:
 def test_names_the_wrong_line(tmp_path: Path, line: str, found: str) -> None:
     message = refusal(tmp_path, f"# poses\n{GOOD}{line}\n{GOOD}")
     assert "line 3: expected" in message and found in message
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "#timestamp [ns], p_x [m], p_y [m], p_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], v_x []\r\n"
+        "1700000000100000000,1,2,3,0.5,0.5,0.5,-0.5,9\r\n1700000000200000000,1,2,3,1,0,0,0,9\r\n",
+        "timestamp,x,y,z,qx,qy,qz,qw\n1700000000.1,1,2,3,.5,.5,-.5,.5\n1700000000.2,1,2,3,0,0,0,1\n",
+        "# t tx ty tz qw qx qy qz\n1700000000.1 1 2 3 -.5 -.5 -.5 .5\n1700000000.2 1 2 3 1 0 0 0\n",
+        "1700000000100000000 1 2 3 .5 .5 -.5 .5\n1700000000200000000 1 2 3 0 0 0 1\n",
+        "1700000000100000 1 2 3 .5 .5 -.5 .5\n1700000000200000 1 2 3 0 0 0 1\n",
+    ],
+)
+def test_reads_columns_as_the_head_names_them(tmp_path: Path, text: str) -> None:
+    read = read_tum(written(tmp_path, text))
+    assert read.stamps_ns.tolist() == [1_700_000_000_100_000_000, 1_700_000_000_200_000_000]
+    np.testing.assert_allclose(se3.quaternion(read.T[:, :3, :3]), [[0.5, 0.5, -0.5, 0.5], [0, 0, 0, 1]], atol=1e-12)
 
 
 def test_refuses_random_bytes(tmp_path: Path) -> None:

@@ -1,0 +1,106 @@
+"""`omnid eval` and a truth of another body, unit, clock or convention: what explains the error is said and fitted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib import se3
+from calib.models.camera import Array
+from omnid.cli import main
+from omnid.formats.tum import tum_row
+
+STAMPS_NS = 1_700_000_000_000_000_000 + 50_000_000 * np.arange(120)
+S = np.linspace(0, 4, 120)
+CAMERA = se3.transform(se3.rotation_exp([1.2092, -1.2092, 1.2092]), [0.1, 0.02, -0.05])
+
+
+def drive(*, flat: bool) -> Array:
+    """Return the poses (N, 4, 4) of a curved drive, hand-held or in a plane."""
+    tilt = 0.0 if flat else 1.0
+    turn = np.stack([tilt * 0.15 * np.sin(3 * S), tilt * 0.12 * np.cos(2 * S), 0.4 + 0.8 * np.sin(S)], axis=1)
+    at_m = np.stack([3 + 2 * S, np.sin(S) - 7, tilt * (1.2 + 0.05 * np.sin(2 * S))], axis=1)
+    return se3.transform(se3.rotation_exp(turn), at_m)
+
+
+def estimated(T: Array) -> Array:
+    """Return an estimate of poses, some millimetres off."""
+    random = np.random.default_rng(1)
+    noise = random.normal(0, 1, (len(T), 6)) * np.repeat([0.004, 0.001], 3)
+    found = se3.inverse(T[0]) @ T @ se3.exp(noise)
+    return se3.inverse(found[0]) @ found
+
+
+def turned(deg: float, at_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Array:
+    return se3.transform(se3.rotation_exp([0, 0, np.deg2rad(deg)]), at_m)
+
+
+def in_mm(T: Array) -> Array:
+    scaled = T.copy()
+    scaled[:, :3, 3] *= 1e3
+    return scaled
+
+
+def rewritten(order: list[int], signs: list[int]) -> Callable[[Array, int], str]:
+    """Return a writer of TUM rows whose quaternions have another order and other signs."""
+
+    def row(T: Array, stamp_ns: int) -> str:
+        words = tum_row(stamp_ns, T).split()
+        q = [sign * float(words[4 + place]) for place, sign in zip(order, signs, strict=True)]
+        return " ".join([*words[:4], *map(str, q)])
+
+    return row
+
+
+def as_tum(T: Array, stamp_ns: int) -> str:
+    return tum_row(stamp_ns, T)
+
+
+HAND, FLAT = drive(flat=False), drive(flat=True)
+
+
+@pytest.mark.parametrize(
+    ("poses", "truth", "late_ns", "row", "said", "unknowns"),
+    [
+        (HAND, HAND @ turned(88.6), 0, as_tum, "another body than the rig, turned by 88.6 deg about z", 3),
+        (HAND, HAND @ turned(0, (0.3, 0.1, 0.2)), 0, as_tum, "than the rig, at x 0.30", 3),
+        (HAND, HAND @ CAMERA, 0, as_tum, "turned by 120.0 deg about (0.58 -0.58 0.58), at x 0.10", 6),
+        (FLAT, FLAT @ turned(88.6), 0, as_tum, "turned by 88.6 deg about z", 3),
+        (FLAT, FLAT @ turned(180, (0.4, 0, 0.7)), 0, as_tum, "(the path does not show z)", 5),
+        (HAND, in_mm(HAND), 0, as_tum, "its positions are in mm", 0),
+        (HAND, HAND, 350_000_000, as_tum, "its stamps are 0.350 s later", 1),
+        (HAND, HAND, -(10**18), as_tum, "its stamps are 1000000000.000 s earlier", 1),
+        (HAND, HAND @ turned(88.6), 40_000_000, as_tum, "0.040 s later, it is of another body than the rig, turned", 4),
+        (HAND, HAND, 0, rewritten([3, 0, 1, 2], [1, 1, 1, 1]), "its quaternions begin with w", 0),
+        (HAND, HAND, 0, rewritten([0, 1, 2, 3], [-1, -1, -1, 1]), "its rotations are inverse (conjugated", 0),
+        (HAND, se3.inverse(HAND), 0, as_tum, "its poses are inverse (T_body_world)", 0),
+        (HAND, HAND, 0, rewritten([0, 1, 2, 3], [-1, -1, -1, -1]), "", 0),
+        (HAND, HAND, 0, as_tum, "", 0),
+    ],
+)
+def test_says_what_explains_the_error_and_fits_it_where_asked(
+    poses: Array,
+    truth: Array,
+    late_ns: int,
+    row: Callable[[Array, int], str],
+    said: str,
+    unknowns: int,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    est, true = tmp_path / "est.txt", tmp_path / "truth.txt"
+    est.write_text("\n".join(as_tum(T, int(n)) for T, n in zip(estimated(poses), STAMPS_NS, strict=True)))
+    true.write_text("\n".join(row(T, int(n) + late_ns) for T, n in zip(truth, STAMPS_NS, strict=True)))
+    code = main(["eval", str(est), str(true)])
+    shown = capsys.readouterr()
+    assert code == (2 if abs(late_ns) > 10**10 else 0)
+    assert (said in shown.err and "--frame auto" in shown.err and shown.err.count("\n") == 1) if said else not shown.err
+    assert main(["eval", str(est), str(true), "--frame", "auto"]) == 0
+    shown = capsys.readouterr()
+    assert not shown.err and said in shown.out
+    assert (f"fitted to these poses: {unknowns}; the errors are optimistic" in shown.out) is bool(unknowns)
+    (errors,) = [line for line in shown.out.splitlines() if line.startswith("position error")]
+    assert float(errors.split("rmse")[1].split(",")[0]) < 20.0, "millimetres, of an estimate with 7 mm of noise"
