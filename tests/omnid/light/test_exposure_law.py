@@ -99,17 +99,7 @@ def test_a_coarse_control_does_not_hunt() -> None:
     assert len(steps) < 20 and (not waits or max(waits) >= LONGEST_STEP_S)
 
 
-class DeafSensor(Sensor):
-    """A camera whose images do not depend on the exposure."""
-
-    def levels(self, setting: ExposureSetting) -> GreyLevels:
-        return GreyLevels(40.0, 90.0)
-
-
-def test_notices_cameras_that_do_not_answer_but_not_a_covered_lens() -> None:
-    law = ExposureLaw(ExposureRanges(ValueRange(1, 10**6)), ExposureSetting(100), 20_000)
-    run(law, DeafSensor(1.0), 10.0)
-    assert law.state == "no answer" and run(law, DeafSensor(1.0), 10.0, 20.0) == []
+def test_a_covered_lens_is_too_dark() -> None:
     covered = ExposureLaw(RANGES, ExposureSetting(100, 0), 20_000)
     run(covered, Sensor(0.0), 20.0)
     assert covered.state == "too dark"
