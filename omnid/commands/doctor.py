@@ -47,7 +47,7 @@ def examine(config: Config) -> Iterator[Finding]:
     yield from devices.motor(config.motor, ROOT)
     yield from machine.rights(max(wanted.motor_priority, wanted.capture_priority), wanted.lock_memory)
     yield machine.clock()
-    yield from machine.compiled_functions()
+    yield machine.compiled_functions()
     rate = 2 * camera.width_px * camera.height_px * BYTES_PER_PIXEL * (camera.rate_hz or 30.0)
     yield from machine.disk(machine.STATE / config.record.folder, config.record, rate)
     yield machine.bus(config.bus)

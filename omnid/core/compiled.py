@@ -15,7 +15,7 @@ import os
 import platform
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -28,8 +28,7 @@ KERNEL_FILES: Final = "*_kernels.py"
 PACKAGE: Final = Path(__file__).parents[1]
 # error_model: a division by zero gives inf or NaN as in numpy.
 OPTIONS: Final = {"nogil": True, "error_model": "numpy"}
-_OTHERS_MAY_WRITE: Final = 0o022
-_declared: list[Kernel[Any, Any]] = []
+DECLARED: Final[list[Kernel[Any, Any]]] = []  # the compiled functions of all files that were imported so far
 
 
 class Kernel(Generic[P, R]):
@@ -45,11 +44,6 @@ class Kernel(Generic[P, R]):
         if self._compiled is None:
             self.compile(kept_folder())
         return self._compiled(*args, **kwargs)  # type: ignore[misc]  # it is compiled now
-
-    @property
-    def is_compiled(self) -> bool:
-        """True once the function is compiled."""
-        return self._compiled is not None
 
     def compile(self, folder: Path | None) -> None:
         """Compile the function, or read it from a folder, which keeps it; None: nothing is read or kept."""
@@ -102,7 +96,7 @@ def compiled(signature: str, writes: tuple[str, ...] = ()) -> Callable[[Callable
 
     def decorate(function: Callable[P, R]) -> Kernel[P, R]:
         kernel = Kernel(function, signature, writes)
-        _declared.append(kernel)
+        DECLARED.append(kernel)
         return kernel
 
     return decorate
@@ -111,11 +105,6 @@ def compiled(signature: str, writes: tuple[str, ...] = ()) -> Callable[[Callable
 def inner(function: Callable[P, R]) -> Inner[P, R]:
     """Make a function part of the compiled functions that call it."""
     return Inner(function)
-
-
-def declared() -> Iterator[Kernel[Any, Any]]:
-    """Return the compiled functions of all files that were imported so far, in the order of their declaration."""
-    return iter(tuple(_declared))
 
 
 def cache_folder() -> Path:
@@ -155,7 +144,7 @@ def why_unusable(folder: Path) -> str:
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         status = folder.stat()
-        if status.st_uid != os.geteuid() or status.st_mode & _OTHERS_MAY_WRITE:
+        if status.st_uid != os.geteuid() or status.st_mode & 0o022:
             return "it belongs to another user, or others can write to it"
         tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:

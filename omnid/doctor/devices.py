@@ -16,7 +16,7 @@ from drivers.errors import DriverError
 from drivers.motors.protocols.protocol_registry import motor_protocol
 from omnid.controller.motor import SIMULATED
 from omnid.controller.motor_settings import MotorSettings
-from omnid.doctor.finding import Finding
+from omnid.doctor.finding import Finding, error, ok, warning
 
 GROUPS: Final = ("video", "dialout")  # the unit's SupplementaryGroups
 OWN_NAME: Final = "omnid"  # Name of the daemon's processes.
@@ -31,22 +31,17 @@ def cameras(wanted: Mapping[str, V4l2Settings], known: list[CaptureDevice], root
         subject, path = f"camera {name}", root / settings.device.lstrip("/")
         device = next((one for one in known if (root / one.node.lstrip("/")).resolve() == path.resolve()), None)
         if not path.exists():
-            yield Finding(
-                "error",
+            yield error(
                 subject,
                 f"{settings.device} does not exist",
                 "connect the camera; `omnid cameras` lists the cameras and the udev rule for this name",
             )
         elif device is None:
-            yield Finding(
-                "error", subject, f"{settings.device} is no camera", "choose a device that `omnid cameras` lists"
-            )
+            yield error(subject, f"{settings.device} is no camera", "choose a device that `omnid cameras` lists")
         else:
             yield from _camera(subject, settings, device, path, root)
     if len({(root / settings.device.lstrip("/")).resolve() for settings in wanted.values()}) < len(wanted):
-        yield Finding(
-            "error", "cameras", "both names lead to one device", "configure one for each, see `omnid cameras`"
-        )
+        yield error("cameras", "both names lead to one device", "configure one for each, see `omnid cameras`")
 
 
 def _camera(subject: str, settings: V4l2Settings, device: CaptureDevice, path: Path, root: Path) -> Iterator[Finding]:
@@ -54,19 +49,19 @@ def _camera(subject: str, settings: V4l2Settings, device: CaptureDevice, path: P
     problems = list(access(subject, path))
     if others := holders(path, root):
         found = f"{settings.device} is open in {', '.join(others)}"
-        problems.append(Finding("warning", subject, found, "end that program"))
+        problems.append(warning(subject, found, "end that program"))
     image = "in use, so that its image was not tried"
     try:
         if device.problem:
             raise DriverError(device.problem)
         if not problems:
             image = str(offered_image(settings) or image)
-    except DriverError as error:
-        problems.append(Finding("error", subject, str(error), "change section [cameras] of the configuration"))
+    except DriverError as fault:
+        problems.append(error(subject, str(fault), "change section [cameras] of the configuration"))
     exposure = ""
     if settings.is_regulated:
         exposure = f", {device.exposure} set by omnid run" if device.exposure else ", exposure left to it"
-    yield from problems or [Finding("ok", subject, f"{device.name} at {device.node}, {image}{exposure}")]
+    yield from problems or [ok(subject, f"{device.name} at {device.node}, {image}{exposure}")]
 
 
 def motor(settings: MotorSettings, root: Path = Path("/")) -> Iterator[Finding]:
@@ -74,30 +69,29 @@ def motor(settings: MotorSettings, root: Path = Path("/")) -> Iterator[Finding]:
     subject, port = "motor", settings.port
     try:
         motor_protocol(settings.protocol)
-    except DriverError as error:
-        yield Finding("error", subject, str(error), "set motor.protocol")
+    except DriverError as fault:
+        yield error(subject, str(fault), "set motor.protocol")
     path = root / port.lstrip("/")
     if port in ("", SIMULATED):
-        yield Finding("ok", subject, "simulated" if port else "none is configured: motor.port is empty")
+        yield ok(subject, "simulated" if port else "none is configured: motor.port is empty")
     elif not path.exists():
-        yield Finding(
-            "error",
+        yield error(
             subject,
             f"{port} does not exist",
             "connect it; `ls -l /dev/serial/by-id` lists the ports, 90-omnid.rules gives it a name",
         )
     elif not stat.S_ISCHR(path.stat().st_mode):
-        yield Finding("error", subject, f"{port} is no serial port", "set motor.port")
+        yield error(subject, f"{port} is no serial port", "set motor.port")
     elif problems := [*access(subject, path), *_occupied(subject, port, path, root)]:
         yield from problems
     else:
-        yield Finding("ok", subject, f"{settings.protocol} on {port}")
+        yield ok(subject, f"{settings.protocol} on {port}")
 
 
 def _occupied(subject: str, port: str, path: Path, root: Path) -> Iterator[Finding]:
     if others := holders(path, root):
         advice = "end that program; 90-omnid.rules keeps ModemManager away from the port"
-        yield Finding("error", subject, f"{port} is in use by {', '.join(others)}", advice)
+        yield error(subject, f"{port} is in use by {', '.join(others)}", advice)
 
 
 def access(subject: str, device: Path) -> Iterator[Finding]:
@@ -107,15 +101,13 @@ def access(subject: str, device: Path) -> Iterator[Finding]:
     with suppress(KeyError):  # a group without a name
         group = grp.getgrgid(found.st_gid).gr_name
     if group not in GROUPS and found.st_mode & 0o006 != 0o006:
-        yield Finding(
-            "warning",
+        yield warning(
             subject,
             f"{device} is of group {group}, the service is in {' and '.join(GROUPS)}",
             'set GROUP="video" or GROUP="dialout" in its udev rule, see 90-omnid.rules',
         )
     elif not os.access(device, os.R_OK | os.W_OK):
-        yield Finding(
-            "error",
+        yield error(
             subject,
             f"no permission for {device} of group {group}",
             f"`sudo usermod -aG {group} $USER`, then log in again",

@@ -22,6 +22,21 @@ class Finding:
         return f"{self.level:<8} {self.subject:<13} {self.found}" + (f"; {self.advice}" if self.advice else "")
 
 
+def ok(subject: str, found: str) -> Finding:
+    """Return a finding that needs nothing."""
+    return Finding("ok", subject, found)
+
+
+def warning(subject: str, found: str, advice: str) -> Finding:
+    """Return a finding that a person should think about."""
+    return Finding("warning", subject, found, advice)
+
+
+def error(subject: str, found: str, advice: str = "") -> Finding:
+    """Return a finding with which the daemon does not do its work."""
+    return Finding("error", subject, found, advice)
+
+
 def summary(findings: Sequence[Finding]) -> str:
     """Return the last line of the report."""
     errors, warnings = (sum(finding.level == level for finding in findings) for level in ("error", "warning"))

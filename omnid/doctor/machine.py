@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import ipaddress
-import os
 import platform
 import re
 import shutil
@@ -19,14 +18,16 @@ from typing import Final
 from calib.errors import CalibError
 from calib.rig_file import read_rig
 from omnid.config import RecordConfig
-from omnid.doctor.finding import Finding
-from omnid.engine.kernel_cache import kept_kernels
+from omnid.core.compiled import cache_folder, why_unusable
+from omnid.doctor.finding import Finding, error, ok, warning
+from omnid.engine.kernel_cache import why_no_code
 from omnid.engine.realtime import LOCK_ADVICE, highest_priority, may_lock, priority_advice
 from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig, checked
 
 PACKAGES: Final = {
     "numpy": "numpy",
+    "numba": "numba",
     "opencv-python-headless": "cv2",
     "eclipse-zenoh": "zenoh",
     "mcap": "mcap",
@@ -39,7 +40,6 @@ _UNSYNCHRONISED: Final = 5  # TIME_ERROR of adjtimex(2)
 _TIMEX_BYTES: Final = 1024  # more than struct timex has on any platform
 _ENDPOINT = re.compile(r"[a-z-]+/\[?(?P<host>[^\]/]+?)\]?:\d{1,5}(?:[?#].*)?")
 STATE: Final = Path("/var/lib/omnid")  # StateDirectory and working directory of the unit
-CACHE: Final = Path("/var/cache/omnid")  # CacheDirectory of the unit
 
 
 def clock(now_s: float | None = None, synchronised: bool | None = None) -> Finding:
@@ -48,17 +48,14 @@ def clock(now_s: float | None = None, synchronised: bool | None = None) -> Findi
     synchronised = is_synchronised() if synchronised is None else synchronised
     shown = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(now_s))
     if now_s < BUILT_S:
-        return Finding(
-            "error", "clock", f"the time is wrong: {shown}", "`timedatectl set-ntp true`, or `sudo date -s ...`"
-        )
+        return error("clock", f"the time is wrong: {shown}", "`timedatectl set-ntp true`, or `sudo date -s ...`")
     if not synchronised:
-        return Finding(
-            "warning",
+        return warning(
             "clock",
             f"{shown}, not synchronised: logs of several machines will not match",
             "`timedatectl set-ntp true`, or install chrony",
         )
-    return Finding("ok", "clock", f"{shown}, synchronised")
+    return ok("clock", f"{shown}, synchronised")
 
 
 def is_synchronised() -> bool:
@@ -71,18 +68,17 @@ def rights(priority: int, lock_memory: bool) -> Iterator[Finding]:
     """Check that this user may have the real-time priority, and may lock memory."""
     highest = highest_priority()
     if priority > highest:
-        yield Finding(
-            "warning",
+        yield warning(
             "real time",
             f"priority {priority} is not allowed, this user may have {highest}; the unit sets LimitRTPRIO",
             priority_advice(priority),
         )
     else:
-        yield Finding("ok", "real time", f"priorities up to {highest} are allowed")
+        yield ok("real time", f"priorities up to {highest} are allowed")
     if lock_memory and not may_lock():
-        yield Finding("warning", "memory", "this user may not lock memory; the unit sets LimitMEMLOCK", LOCK_ADVICE)
+        yield warning("memory", "this user may not lock memory; the unit sets LimitMEMLOCK", LOCK_ADVICE)
     else:
-        yield Finding("ok", "memory", "may be locked" if may_lock() else "not locked: realtime.lock_memory = false")
+        yield ok("memory", "may be locked" if may_lock() else "not locked: realtime.lock_memory = false")
 
 
 def disk(folder: Path, config: RecordConfig, bytes_per_s: float) -> Iterator[Finding]:
@@ -98,15 +94,13 @@ def disk(folder: Path, config: RecordConfig, bytes_per_s: float) -> Iterator[Fin
             "delete files, or change record.folder",
         )
     else:
-        yield Finding(
-            "ok",
+        yield ok(
             "disk",
             f"{free / 1e9:.1f} GB free at {place}: the newest {room / 1e9:.1f} GB, about "
             f"{room / bytes_per_s / 3600:.1f} h, are kept of what is recorded",
         )
     if not folder.is_relative_to(STATE):
-        yield Finding(
-            "warning",
+        yield warning(
             "disk",
             f"the service may write in {STATE} only, record.folder is {folder}",
             f"`systemctl edit omnid`: [Service], ReadWritePaths={folder}",
@@ -120,42 +114,19 @@ def programs() -> Iterator[Finding]:
         try:
             import_module(module)
             loaded.append(f"{module} {_version(package)}")
-        except ImportError as error:
-            yield Finding("error", "programs", f"{package}: {error}", f"/opt/omnid/bin/pip install {package}")
-    yield Finding("ok", "programs", f"Python {platform.python_version()}, {', '.join(loaded)}")
+        except ImportError as fault:
+            yield error("programs", f"{package}: {fault}", f"/opt/omnid/bin/pip install {package}")
+    yield ok("programs", f"Python {platform.python_version()}, {', '.join(loaded)}")
 
 
-def compiled_functions(service: Path = CACHE) -> Iterator[Finding]:
-    """Check that functions can be compiled, and whether the next start finds them compiled.
-
-    service: the cache of the unit, which root asks about once the unit has made it; other users ask about their own.
-    """
-    try:
-        kept = kept_kernels(service if os.geteuid() == 0 and service.is_dir() else None)
-    except (ImportError, OSError) as error:
-        yield Finding(
-            "error",
-            "compiled code",
-            f"numba cannot be used: {error}",
-            "`/opt/omnid/bin/pip install numba`; "
-            "remove MemoryDenyWriteExecute= from the unit, or what else denies executable memory",
-        )
-        return
-    if kept.unusable:
-        yield Finding(
-            "warning",
-            "compiled code",
-            f"cannot be kept in {kept.folder}: {kept.unusable}: every start takes half a minute longer",
-            "make that folder writable, or set OMNID_CACHE_DIR to another one",
-        )
-    elif kept.is_kept:
-        yield Finding("ok", "compiled code", f"kept in {kept.folder}")
-    else:
-        yield Finding(
-            "ok",
-            "compiled code",
-            f"the next start compiles it, which takes half a minute, and keeps it in {kept.folder}",
-        )
+def compiled_functions() -> Finding:
+    """Check that functions can be compiled, and that they can be kept for the next start."""
+    if problem := why_no_code():
+        return error("compiled code", problem, "remove MemoryDenyWriteExecute= from the unit, or what else denies it")
+    if reason := why_unusable(folder := cache_folder()):
+        found = f"cannot be kept in {folder}: {reason}: every start takes half a minute longer"
+        return warning("compiled code", found, "make that folder writable, or set OMNID_CACHE_DIR to another one")
+    return ok("compiled code", f"kept in {folder}; the first start compiles it, which takes half a minute")
 
 
 def _version(package: str) -> str:
@@ -171,16 +142,15 @@ def rig(path: Path, size_px: tuple[int, int], floor_m: float = 0.0) -> Iterator[
     """
     try:
         found = read_rig(path)
-    except CalibError as error:
-        advice = "" if "omnid calibrate" in str(error) else "create one with `omnid calibrate`"
-        yield Finding("error", "rig", str(error), advice)
+    except CalibError as fault:
+        advice = "" if "omnid calibrate" in str(fault) else "create one with `omnid calibrate`"
+        yield error("rig", str(fault), advice)
         return
     cameras = {"lower": found.lower, "upper": found.upper}
     for name, mounted in cameras.items():
         width, height = mounted.camera.size
         if (width, height) != size_px:
-            yield Finding(
-                "error",
+            yield error(
                 "rig",
                 f"{path}: the {name} camera was calibrated with {width}x{height} px, "
                 f"[cameras] asks for {size_px[0]}x{size_px[1]}",
@@ -188,23 +158,20 @@ def rig(path: Path, size_px: tuple[int, int], floor_m: float = 0.0) -> Iterator[
             )
     height_m = found.height_m(floor_m)
     if height_m is None:
-        yield Finding(
-            "warning",
+        yield warning(
             "rig",
             f"{path} does not state the height of the cameras: nothing is free until the images show the floor",
             "state it by `omnid calibrate drive LOG --only height`, with --ruler-m as a check",
         )
     bare = [name for name, mounted in cameras.items() if mounted.mask is None]
     if bare:
-        yield Finding(
-            "warning",
+        yield warning(
             "rig",
             f"{path} has no mask for {' and '.join(bare)}, the rim is searched at each start",
             f"add [{bare[0]}.mask] with center, inner_px and outer_px",
         )
     else:
-        yield Finding(
-            "ok",
+        yield ok(
             "rig",
             f"{path}, {found.baseline_m:.3f} m between the viewpoints"
             + ("" if height_m is None else f", {height_m:.3f} m above the floor"),
@@ -215,19 +182,18 @@ def bus(config: BusConfig) -> Finding:
     """Check the settings of the bus, and who may send commands."""
     try:
         checked(config)
-    except OmnidError as error:
-        return Finding("error", "bus", str(error), "the daemon does not start with these settings")
+    except OmnidError as fault:
+        return error("bus", str(fault), "the daemon does not start with these settings")
     endpoints = ", ".join(endpoint for endpoint in (*config.listen, *config.connect) if not _is_local(endpoint))
     if endpoints and not config.config:
-        return Finding(
-            "warning",
+        return warning(
             "bus",
             f"anyone who reaches {endpoints} can drive the robot",
             "name a file with users in bus.config (omnid/transport/site.json5), or listen on tcp/127.0.0.1:7447 only",
         )
     if endpoints:
-        return Finding("ok", "bus", f"reachable at {endpoints}; who may command it is said in {config.config}")
-    return Finding("ok", "bus", "reachable from this machine only")
+        return ok("bus", f"reachable at {endpoints}; who may command it is said in {config.config}")
+    return ok("bus", "reachable from this machine only")
 
 
 def _is_local(endpoint: str) -> bool:

@@ -17,15 +17,14 @@ import time
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 from omnid.core.compiled import (
+    DECLARED,
     KERNEL_FILES,
     PACKAGE,
     cache_folder,
-    declared,
     folder_of_state,
     kept_folder,
     why_unusable,
@@ -38,7 +37,7 @@ KEPT_STATES: Final = 20  # other states whose code stays, 3 MB each: of other in
 MOST_CHILDREN: Final = 2  # 480 MB with the program that waits, of the 768 that the service may have
 TIMEOUT_S: Final = 600.0  # as long as the service may take to start; half a minute on a laptop
 
-_state = {"ready": False}
+_prepared: set[str] = set()  # names of the modules whose functions are ready
 
 
 def prepare_kernels(report: Report = log_unlimited) -> None:
@@ -47,38 +46,33 @@ def prepare_kernels(report: Report = log_unlimited) -> None:
     The second call and later ones do nothing. Raises OmnidError where the system allows no code that is made at run
     time.
     """
-    if _state["ready"]:
+    names = _kernel_modules()
+    if _prepared.issuperset(names):
         return
-    # 1. Executable memory, without which numba would end the program.
-    try:
-        _make_executable_memory()
-    except OSError as error:
+    # 1. Without executable memory numba would end the program.
+    if problem := why_no_code():
         raise OmnidError(
-            "the system allows no code that is compiled at run time: remove MemoryDenyWriteExecute= from "
-            f"the service, or what else denies executable memory ({error})"
-        ) from error
-    # 2. Compile what is not on the disk.
+            f"{problem}: remove MemoryDenyWriteExecute= from the service, or what else denies executable memory"
+        )
+    # 2. Compile what is not on the disk, and read it.
     started_s, reason = time.monotonic(), why_unusable(cache_folder())
     if not reason and kept_folder() is None:
-        reason = _compile_in_children(report)
-    # 3. Read it.
+        reason = _compile_in_children(names, report)
     if not reason:
         try:
-            _compile_modules(_kernel_modules(), kept_folder())
-            with suppress(OSError):
-                os.utime(folder_of_state())  # used: not the next to be removed
+            _compile_modules(names, kept_folder())
         except Exception as error:  # what pickle and LLVM raise for damaged files
             shutil.rmtree(folder_of_state(), ignore_errors=True)
             reason = f"what was there is damaged ({type(error).__name__})"
-    # 4. Or compile it for this run only.
+    # 3. Or compile it for this run only.
     if reason:
-        _compile_modules(_kernel_modules(), None)
+        _compile_modules(names, None)
         report(
             logging.WARNING,
             f"the compiled functions are not kept in {cache_folder()}: {reason}: this start took "
             f"{time.monotonic() - started_s:.0f} s longer; make that folder writable, or set OMNID_CACHE_DIR",
         )
-    _state["ready"] = True
+    _prepared.update(names)
 
 
 def read_kept_kernels() -> None:
@@ -87,30 +81,13 @@ def read_kept_kernels() -> None:
         _compile_modules(_kernel_modules(), folder)
 
 
-class KeptKernels(NamedTuple):
-    """Content of the disk, as the next start finds it."""
-
-    folder: Path
-    unusable: str  # why nothing can be kept there; empty if it can
-    is_kept: bool
-
-
-def kept_kernels(service: Path | None = None) -> KeptKernels:
-    """Return what is kept in the folder of this program, or in that of the service, which belongs to another user.
-
-    Raises OSError where the system allows no code that is made at run time, ImportError where numba is missing.
-    """
-    _make_executable_memory()
-    if find_spec("numba") is None:
-        raise ModuleNotFoundError("No module named 'numba'", name="numba")
-    if service is None:
-        return KeptKernels(cache_folder(), why_unusable(cache_folder()), kept_folder() is not None)
-    return KeptKernels(service, "", (service / folder_of_state().name).is_dir())
-
-
-def _make_executable_memory() -> None:
-    """Make and free a page of executable memory; OSError where the system denies it."""
-    mmap.mmap(-1, mmap.PAGESIZE, prot=mmap.PROT_READ | mmap.PROT_WRITE | mmap.PROT_EXEC).close()
+def why_no_code() -> str:
+    """Return why the system runs no code that is made at run time; empty if it does."""
+    try:
+        mmap.mmap(-1, mmap.PAGESIZE, prot=mmap.PROT_READ | mmap.PROT_WRITE | mmap.PROT_EXEC).close()
+    except OSError as error:
+        return f"the system allows no code that is compiled at run time ({error})"
+    return ""
 
 
 def _kernel_modules() -> list[str]:
@@ -123,17 +100,16 @@ def _compile_modules(names: Sequence[str], folder: Path | None) -> None:
     """Compile the functions of modules, or read them from a folder."""
     for name in names:
         import_module(name)
-    for kernel in declared():
+    for kernel in tuple(DECLARED):
         if kernel.function.__module__ in names:
             kernel.compile(folder)
 
 
-def _compile_in_children(report: Report) -> str:
+def _compile_in_children(names: Sequence[str], report: Report) -> str:
     """Compile all functions into the folder of this state by programs of their own; return why that failed, or ""."""
     shutil.rmtree(folder_of_state(), ignore_errors=True)  # one that others could write to
     report(logging.INFO, "compiling the loops over pixels and landmarks for this processor, once; takes half a minute")
-    started_s, names = time.monotonic(), _kernel_modules()
-    count = min(MOST_CHILDREN, len(os.sched_getaffinity(0)))
+    started_s, count = time.monotonic(), min(MOST_CHILDREN, len(os.sched_getaffinity(0)))
     with tempfile.TemporaryDirectory(prefix="making-", dir=cache_folder()) as parent:
         making = Path(parent, "kernels")
         making.mkdir(mode=0o700)
@@ -141,13 +117,8 @@ def _compile_in_children(report: Report) -> str:
             children = []
             for number in range(count):
                 command = python("-m", __name__, str(making), *names[number::count])
-                child = subprocess.Popen(
-                    command,
-                    env=python_environment(),
-                    stdin=subprocess.DEVNULL,
-                    stdout=subprocess.DEVNULL,
-                    stderr=subprocess.DEVNULL,
-                )
+                quiet = subprocess.DEVNULL
+                child = subprocess.Popen(command, env=python_environment(), stdin=quiet, stdout=quiet, stderr=quiet)
                 running.callback(child.wait)
                 running.callback(child.kill)
                 children.append(child)
@@ -160,26 +131,14 @@ def _compile_in_children(report: Report) -> str:
         with suppress(OSError):  # Another program has been faster: its folder is not empty.
             making.rename(folder_of_state())
     report(logging.INFO, f"compiled in {time.monotonic() - started_s:.0f} s; kept in {cache_folder()}")
-    _remove_other_states()
+    # Remove the oldest folders of other states.
+    with suppress(OSError):
+        others = [path for path in cache_folder().glob("kernels-*") if path != folder_of_state()]
+        for path in sorted(others, key=lambda path: path.stat().st_mtime)[:-KEPT_STATES]:
+            shutil.rmtree(path, ignore_errors=True)
     return "" if kept_folder() else "it was not written"
 
 
-def _remove_other_states() -> None:
-    """Remove the oldest folders of other states, and those that were left half made."""
-    with suppress(OSError):
-        paths = [path for path in cache_folder().glob("kernels-*") if path != folder_of_state()]
-        for path in sorted(paths, key=lambda path: path.stat().st_mtime)[:-KEPT_STATES]:
-            shutil.rmtree(path, ignore_errors=True)
-        for path in cache_folder().glob("making-*"):
-            if path.stat().st_mtime < time.time() - 2 * TIMEOUT_S:
-                shutil.rmtree(path, ignore_errors=True)
-
-
-def main(folder: Path, *names: str) -> None:
-    """Be a program that compiles: fill a folder with the functions of modules, and wait until it is on the disk."""
-    _compile_modules(names, folder)
+if __name__ == "__main__":  # a program that fills a folder with the functions of modules
+    _compile_modules(sys.argv[2:], Path(sys.argv[1]))
     os.sync()
-
-
-if __name__ == "__main__":
-    main(Path(sys.argv[1]), *sys.argv[2:])

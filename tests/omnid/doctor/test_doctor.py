@@ -5,7 +5,6 @@ from __future__ import annotations
 import grp
 import json
 import os
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -23,11 +22,10 @@ from drivers.errors import DriverError
 from omnid.cli import main
 from omnid.config import RecordConfig
 from omnid.controller.motor_settings import MotorSettings
-from omnid.core.compiled import cache_folder
 from omnid.doctor import devices, machine
 from omnid.doctor.devices import access, cameras, motor
 from omnid.doctor.finding import Finding
-from omnid.doctor.machine import BUILT_S, bus, clock, compiled_functions, disk, is_synchronised, rig
+from omnid.doctor.machine import BUILT_S, bus, clock, disk, is_synchronised, rig
 from omnid.transport.bus_config import BusConfig
 
 ROOT = Path(__file__).parents[3]
@@ -229,23 +227,9 @@ def test_the_command_runs_all_checks_and_returns_an_exit_code(
     assert main(["doctor", "--set", missing]) == 1
     *lines, last = capsys.readouterr().out.splitlines()
     assert {line[:9].strip() for line in lines} <= {"ok", "warning", "error"}
-    subjects = "camera lower,camera upper,rig,motor,real time,memory,clock,disk,bus,programs"
+    subjects = "camera lower,camera upper,rig,motor,real time,memory,clock,compiled code,disk,bus,programs"
     assert set(subjects.split(",")) <= {line[9:22].strip() for line in lines} and " errors, " in last
     assert main(["doctor", "--set", missing, "--json"]) == 1
     assert {found["level"] for found in json.loads(capsys.readouterr().out)} <= {"ok", "warning", "error"}
     assert main(["doctor", "--set", "cameras.widht_px=3"]) == 2
     assert "cameras.width_px" in capsys.readouterr().err
-
-
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root reads the service's cache")
-def test_root_learns_of_the_services_functions(tmp_path: Path) -> None:
-    service = tmp_path / "service"
-    shutil.copytree(cache_folder(), service, ignore=shutil.ignore_patterns("making-*"))
-    for path in (service, *service.rglob("*")):
-        os.chown(path, UNPRIVILEGED, UNPRIVILEGED)
-    (kept,) = compiled_functions(service)
-    assert kept.level == "ok" and kept.found == f"kept in {service}"
-    for folder in service.glob("kernels-*"):
-        shutil.rmtree(folder)
-    (empty,) = compiled_functions(service)
-    assert "the next start compiles it" in empty.found
