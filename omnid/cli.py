@@ -58,7 +58,7 @@ COMMANDS: Final[Mapping[str, Entry]] = MappingProxyType(
         "route list": Entry("robot:list_routes", "the routes in navigation.routes, here"),
         "route show": Entry("robot:show_route", "length, map and points of a route"),
         "route delete": Entry("robot:delete_route", "delete a route"),
-        "listen": Entry("listen", "show pose, state, rates and latencies of a robot, and record them"),
+        "listen": Entry("listen", "show pose, state, rates and latencies of a robot"),
         "view": Entry("view", "show a log or a robot: path, map, depth, plots (needs rerun)"),
         "web": Entry("web", "a page with state, path, warnings, stop and arm"),
         "batch": Entry("batch", "replay many logs; goes on where it was interrupted (extra `fleet`)"),
@@ -107,6 +107,9 @@ REMOVED: Final[Mapping[str, str]] = MappingProxyType(
         "eval --score": "KITTI's drift: `evo_rpe`; the score of Hilti 2026 is 100 exp(-0.46 ate_rmse_m)",
         "listen --all": "one program for each robot, with --robot NAME; many robots: Grafana on /metrics of `omnid "
         "web`",
+        "listen --load": "`top -H` on the robot names its threads",
+        "listen --mcap": "record.enabled on the robot, or `ros2 bag record` with bus.ros2",
+        "listen --tum": "`omnid replay --tum` of the robot's recording; live: `omnid.client.subscribe` (docs/api.md)",
         "log recover": "omnid reads cut logs as they are; for other programs: `mcap recover`, of mcap's own command "
         "line",
         "map align": "a map keeps the axes of its first drive; nav2 takes the offset to a plan as a transform",

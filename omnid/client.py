@@ -16,7 +16,7 @@ Several kinds of message, and commands, share one connection: see Robot and Driv
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from typing import Any, Final, Generic, Self, TypeVar, cast
 
@@ -207,15 +207,6 @@ class Robot:
                 subscriber.undeclare()  # type: ignore[no-untyped-call]  # the stub has no return type
 
         return end
-
-    def kept_messages(self, callback: Callable[[str, bytes, bytes], None], topics: Iterable[str]) -> None:
-        """Call callback(topic, payload, attachment) for the newest message of each topic that the robot keeps.
-
-        It serves a client that starts after a message of a rare topic, such as `map` or `tf_static`; see `on_message`.
-        """
-        for topic in topics:
-            if (sample := _queried(self._session, f"{self.name}/{topic}")) is not None:
-                callback(topic, sample.payload.to_bytes(), _attachment(sample))
 
     def driver(self, source: str = "") -> Driver:
         """Return a sender of commands to the wheels.

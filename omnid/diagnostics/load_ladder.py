@@ -70,5 +70,5 @@ class LoadLadder:
 
     def status(self) -> DiagnosticStatus:
         """Return the level as a status."""
-        values = {str(Key.LEVEL): str(int(self.level)), "changes": str(self._changes)}
-        return DiagnosticStatus(LOAD, WARN if self.level else OK, TEXTS[self.level], values)
+        values = {Key.LEVEL: int(self.level), "changes": self._changes}
+        return DiagnosticStatus.of(LOAD, WARN if self.level else OK, TEXTS[self.level], values)

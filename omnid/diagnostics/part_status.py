@@ -36,24 +36,22 @@ from omnid.transport.status_names import (
     lost_parts_key,
 )
 
-LEVELS: Final = MappingProxyType(
+# Level and message of each state of the rig.
+RIG_STATES: Final = MappingProxyType(
     {
-        RigState.UNCHECKED: OK,
-        RigState.FITS: OK,
-        RigState.DRIFTED: WARN,
-        RigState.EXCHANGED: ERROR,
-        RigState.BROKEN: ERROR,
-    }
-)
-ADVICE: Final = MappingProxyType(
-    {
-        RigState.UNCHECKED: "not checked yet: the robot must drive past different places",
-        RigState.FITS: "fits",
-        RigState.DRIFTED: "drifted: run omnid calibrate drive --only check on a recording; -o corrects the rotation of "
-        "the upper camera",
-        RigState.EXCHANGED: "the cameras are exchanged: exchange them in the configuration",
-        RigState.BROKEN: "broken: a camera is covered or has moved by degrees, or the rig's file is of other cameras: "
-        "run omnid calibrate drive --only check on a recording",
+        RigState.UNCHECKED: (OK, "not checked yet: the robot must drive past different places"),
+        RigState.FITS: (OK, "fits"),
+        RigState.DRIFTED: (
+            WARN,
+            "drifted: run omnid calibrate drive --only check on a recording; -o corrects the rotation of the upper "
+            "camera",
+        ),
+        RigState.EXCHANGED: (ERROR, "the cameras are exchanged: exchange them in the configuration"),
+        RigState.BROKEN: (
+            ERROR,
+            "broken: a camera is covered or has moved by degrees, or the rig's file is of other cameras: run omnid "
+            "calibrate drive --only check on a recording",
+        ),
     }
 )
 
@@ -61,27 +59,21 @@ ADVICE: Final = MappingProxyType(
 def rig_status(health: RigHealth) -> DiagnosticStatus:
     """Return the entry."""
     # 1. The state, with the words of the first pairs while the drive has shown nothing.
-    state, finding = health.state, health.finding
-    level, message = LEVELS[state], ADVICE[state]
-    values = {str(Key.STATE): str(state), "new_views": str(health.new_views), "needed_views": str(VIEWS)}
+    state, finding, start = health.state, health.finding, health.start_finding
+    level, message = RIG_STATES[state]
     if finding is None and health.warning:
         level, message = max(level, WARN), health.warning
     # 2. The evidence of the newest finding.
-    start = health.start_finding
+    values: dict[str, object] = {Key.STATE: state, "new_views": health.new_views, "needed_views": VIEWS}
     if start is not None:
-        values["exchanged_matches"] = str(start.exchanged_matches)
+        values["exchanged_matches"] = start.exchanged_matches
     newest = finding or (start.straight if start is not None else None)
     if newest is not None:
-        values |= {
-            "turn_deg": f"{newest.turn_deg:.3f}",
-            "offset_px": f"{newest.offset_px:+.2f}",
-            "left_px": f"{newest.left_px:.2f}",
-            "matches": str(newest.matches),
-            "tried": str(newest.tried),
-        }
+        names = ("turn_deg", "offset_px", "left_px", "matches", "tried")
+        values |= {name: getattr(newest, name) for name in names}
     if finding is not None:
-        values["age_s"] = f"{health.finding_age_s:.0f}"
-    return DiagnosticStatus(RIG, level, message, values)
+        values["age_s"] = health.finding_age_s
+    return DiagnosticStatus.of(RIG, level, message, values)
 
 
 def floor_status(camera_floor: CameraFloor) -> DiagnosticStatus:
@@ -89,21 +81,18 @@ def floor_status(camera_floor: CameraFloor) -> DiagnosticStatus:
     floor = camera_floor.floor
     if floor is None:
         return DiagnosticStatus(FLOOR, WARN, "the height of the cameras is not known: nothing is free", {})
-    values = {
-        str(Key.HEIGHT_M): f"{floor.height_m:.3f}",
-        str(Key.SIGMA_M): f"{floor.sigma_m:.3f}",
-        str(Key.TILT_DEG): f"{math.degrees(floor.tilt_rad):.2f}",
-    }
+    values = {Key.HEIGHT_M: floor.height_m, Key.SIGMA_M: floor.sigma_m, Key.TILT_DEG: math.degrees(floor.tilt_rad)}
     if camera_floor.stated is not None:
-        return DiagnosticStatus(FLOOR, OK, "the rig states the height of the cameras", values)
-    return DiagnosticStatus(FLOOR, WARN, "the height of the cameras is that which the images show", values)
+        return DiagnosticStatus.of(FLOOR, OK, "the rig states the height of the cameras", values)
+    return DiagnosticStatus.of(FLOOR, WARN, "the height of the cameras is that which the images show", values)
 
 
 def places_status(places: Places) -> DiagnosticStatus:
     """Return the state of the pose in the map, and the sizes and counters of the map."""
     state = places.state
-    values = {str(Key.STATE): str(state)} | {name: str(count) for name, count in places.counts.items()}
-    return DiagnosticStatus(PLACES, ERROR if state is MapState.LOST else OK, state, values)
+    return DiagnosticStatus.of(
+        PLACES, ERROR if state is MapState.LOST else OK, state, {Key.STATE: state, **places.counts}
+    )
 
 
 WRONG_WHEELS = "wheels contradict the cameras: check motor.drive (radius, track, reversed, swapped)"
@@ -111,49 +100,38 @@ SLIP = "wheels slip"
 
 
 def motion_status(
-    odometry: OdometryStage,
-    inbox: MotionInbox,
-    receiver: SensorReceiver | None = None,
-) -> Callable[[], DiagnosticStatus]:
-    """Return a function that returns the entry: samples, their estimated errors, and the sensor that differs."""
-    sensors = odometry.sensors
-
-    def status() -> DiagnosticStatus:
-        values = {
-            "wheel_samples": str(inbox.wheels),
-            "gyro_samples": str(inbox.gyro),
-            "dropped": str(inbox.dropped),
-            "slips": str(sensors.slips),
-            "refused_gyro": str(sensors.refused),
-        }
-        if sensors.steps:
-            values |= _estimates(sensors, wheels=bool(inbox.wheels), gyro=bool(inbox.gyro))
-        if receiver is not None:
-            values |= {f"{REFUSED_PREFIX}{key}": str(count) for key, count in sorted(receiver.refused.items())}
-        witness = odometry.witness
-        text = f"{witness.reason} {witness.detail}".strip()
-        if not sensors.wheels_are_sane or sensors.is_slipping:
-            text = SLIP if sensors.wheels_are_sane else WRONG_WHEELS
-        return DiagnosticStatus(MOTION, WARN if text else OK, text, values)
-
-    return status
-
-
-def _estimates(sensors: MotionSensors, *, wheels: bool, gyro: bool) -> dict[str, str]:
-    names = [("wheel_scale", DISTANCE, 1.0), ("turn_scale", TURN, 1.0), ("wheel_offset_ms", WHEEL_OFFSET, 1e3)]
-    of_gyro = [
-        ("gyro_offset_ms", GYRO_OFFSET, 1e3),
-        *((f"gyro_bias_{axis}_radps", BIAS.start + k, 1.0) for k, axis in enumerate("xyz")),
-    ]
-    chosen = (names if wheels else []) + (of_gyro if gyro else [])
-    return {
-        key: text
-        for name, state, unit in chosen
-        for key, text in (
-            (name, f"{unit * sensors.values[state]:.5f}"),
-            (f"{name}_sigma", f"{unit * sensors.sigmas[state]:.5f}"),
-        )
+    odometry: OdometryStage, inbox: MotionInbox, receiver: SensorReceiver | None = None
+) -> DiagnosticStatus:
+    """Return the entry of wheels and gyro: samples, their estimated errors, and the sensor that differs."""
+    sensors, witness = odometry.sensors, odometry.witness
+    values = {
+        "wheel_samples": inbox.wheels,
+        "gyro_samples": inbox.gyro,
+        "dropped": inbox.dropped,
+        "slips": sensors.slips,
+        "refused_gyro": sensors.refused,
+        **(_estimates(sensors, wheels=bool(inbox.wheels), gyro=bool(inbox.gyro)) if sensors.steps else {}),
     }
+    if receiver is not None:
+        values |= {f"{REFUSED_PREFIX}{key}": count for key, count in sorted(receiver.refused.items())}
+    text = f"{witness.reason} {witness.detail}".strip()
+    if sensors.is_slipping:
+        text = SLIP
+    if not sensors.wheels_are_sane:
+        text = WRONG_WHEELS
+    return DiagnosticStatus.of(MOTION, WARN if text else OK, text, values)
+
+
+def _estimates(sensors: MotionSensors, *, wheels: bool, gyro: bool) -> dict[str, float]:
+    """Return the estimated errors of the sensors that there are, each with its standard deviation."""
+    found = {}
+    if wheels:
+        found |= {"wheel_scale": (DISTANCE, 1.0), "turn_scale": (TURN, 1.0), "wheel_offset_ms": (WHEEL_OFFSET, 1e3)}
+    if gyro:
+        found |= {"gyro_offset_ms": (GYRO_OFFSET, 1e3)}
+        found |= {f"gyro_bias_{axis}_radps": (BIAS.start + k, 1.0) for k, axis in enumerate("xyz")}
+    values = {name: unit * float(sensors.values[state]) for name, (state, unit) in found.items()}
+    return values | {f"{name}_sigma": unit * float(sensors.sigmas[state]) for name, (state, unit) in found.items()}
 
 
 LIVE = "all parts are live"
@@ -196,10 +174,12 @@ class ImagesStatus:
         if fixed and not self._has_fixed:
             self._report(f"images: {FIXED.format(fixed)}")
         self._has_fixed = fixed > 0
-        values = {lost_parts_key(side): f"{(newest.stamp_ns - tiles.since_ns[side]) * 1e-9:.0f}" for side in lost}
+        values: dict[str, object] = {
+            lost_parts_key(side): round((newest.stamp_ns - tiles.since_ns[side]) * 1e-9) for side in lost
+        }
         if fixed:
-            values[FIXED_PERCENT] = f"{100 * fixed:.0f}"
-        return DiagnosticStatus(IMAGES, ERROR if lost else OK, message, values)
+            values[FIXED_PERCENT] = round(100 * fixed)
+        return DiagnosticStatus.of(IMAGES, ERROR if lost else OK, message, values)
 
     def _named(self, side: Side, tiles: TileStates) -> str:
         """Return what a camera does not show, such as "the upper camera is blind from 300 to 40 degrees"."""

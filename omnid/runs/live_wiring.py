@@ -20,7 +20,6 @@ from omnid.core.rig.rig_health import RigHealth
 from omnid.diagnostics.load_ladder import PERIOD_S, LoadLadder
 from omnid.diagnostics.part_status import ImagesStatus, floor_status, motion_status, places_status, rig_status
 from omnid.diagnostics.status import Latency, StatusCollector, StatusSources
-from omnid.diagnostics.threads_status import ThreadsStatus
 from omnid.engine.graph import NEWEST, Sink, Stream
 from omnid.engine.logging_setup import Report
 from omnid.formats.route_file import RouteFolder
@@ -227,12 +226,11 @@ class LiveWiring:
         images = ImagesStatus(self._geometry, session.statistics, warn, fixed_share)
         status = [
             self._ladder.status,
-            ThreadsStatus(),
             images,
             exposure.status,
             partial(rig_status, self._rig),
             *([received.navigation.status] if controller else ()),
-            motion_status(self._front_end.odometry, self._pairing.motion, sensors.receiver),
+            partial(motion_status, self._front_end.odometry, self._pairing.motion, sensors.receiver),
             *([partial(places_status, stages.places)] if stages.places else ()),
             *([partial(floor_status, stages.floor)] if stages.floor else ()),
             *self._robot.status,

@@ -213,7 +213,7 @@ class RunReport:
         return bool(inbox.wheels or inbox.gyro)
 
     def _motion(self) -> DiagnosticStatus:
-        return motion_status(self._stages.front_end.odometry, self._pairing.motion)()
+        return motion_status(self._stages.front_end.odometry, self._pairing.motion)
 
     def _drops(self) -> dict[str, int]:
         """Return all that was lost, by reason; zeros too."""

@@ -100,6 +100,12 @@ class DiagnosticStatus:
     message: str
     values: Mapping[str, str]
 
+    @classmethod
+    def of(cls, name: str, level: int, message: str, values: Mapping[str, object]) -> Self:
+        """Return a status. Numbers of values are written with five digits; what is unknown ("", NaN) is left out."""
+        texts = {str(key): f"{value:.5g}" if isinstance(value, float) else str(value) for key, value in values.items()}
+        return cls(name, level, message, {key: text for key, text in texts.items() if text not in ("", "nan")})
+
 
 class PlanarGoal(NamedTuple):
     """Content of a PoseStamped on the floor."""

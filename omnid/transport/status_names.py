@@ -30,7 +30,6 @@ MAP_FILE: Final = f"{PREFIX}map file"
 NAVIGATION: Final = f"{PREFIX}navigation"
 REQUESTS: Final = f"{PREFIX}requests"  # to the navigation
 LOAD: Final = f"{PREFIX}load"
-THREADS: Final = f"{PREFIX}threads"  # share of a core by the name of the thread
 IMAGES: Final = f"{PREFIX}images"  # parts of them that are frozen or blind
 FLOOR: Final = f"{PREFIX}floor"  # height of the cameras above it
 EXPOSURE: Final = f"{PREFIX}exposure"
@@ -68,7 +67,6 @@ class Key(StrEnum):
     MISSED = "missed"  # deadlines of a ticker
     # Load
     LEVEL = "level"  # of load shedding, 0: all is computed
-    ALL = "all"  # threads together, as a share of a core
     # Cameras and pairing
     DROPS = "drops"
     ERRORS = "errors"

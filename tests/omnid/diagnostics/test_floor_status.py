@@ -13,7 +13,7 @@ from tests.omnid.stages.test_keyframe_scan import depth
 
 def test_the_height_is_published_with_its_origin_and_warns_unless_it_is_stated() -> None:
     stated = floor_status(CameraFloor(make_rig().at_height(0.9), 0.0))
-    assert stated.level == OK and stated.values == {"height_m": "0.900", "sigma_m": "0.000", "tilt_deg": "0.00"}
+    assert stated.level == OK and stated.values == {"height_m": "0.9", "sigma_m": "0", "tilt_deg": "0"}
     camera_floor = CameraFloor(make_rig(), 0.0)
     unknown = floor_status(camera_floor)
     assert unknown.level == WARN and "nothing is free" in unknown.message and not unknown.values
