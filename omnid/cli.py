@@ -123,6 +123,7 @@ REMOVED: Final[Mapping[str, str]] = MappingProxyType(
         "run --tags": "`apriltag_ros`, or the package `pupil-apriltags`, finds AprilTags",
         "simulate --tags": "`apriltag_ros`, or the package `pupil-apriltags`, finds AprilTags",
         "view --port": "-o FILE.rrd, which `rerun --serve-web FILE.rrd` serves at ports of your choice",
+        "view --web": "-o FILE.rrd, which `rerun --serve-web FILE.rrd` shows in a browser",
         "web --all": "one page for each robot, with --robot NAME and --listen HOST:PORT, in tabs of one browser",
         "web --recordings": "the page lists no recordings; `omnid report LOG` writes the same report",
     }

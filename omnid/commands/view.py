@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import math
 import os
-import signal
 import socket
 import subprocess
 import sys
@@ -16,7 +15,6 @@ from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
-from urllib.parse import quote
 
 from omnid.commands.options import (
     QUIET,
@@ -27,7 +25,6 @@ from omnid.commands.options import (
     cameras,
     check_seconds,
     command,
-    exclusive,
     group,
     option,
     settings_of,
@@ -45,9 +42,6 @@ if TYPE_CHECKING:  # the help and other commands do not load these
     from omnid.stages.front_end import FrontEnd
     from omnid.viewer.rerun_sink import RerunSink
 
-LOCALHOST: Final = "127.0.0.1"
-# `python -m rerun_cli` does not return the exit code of the viewer.
-VIEWER: Final = ("-c", "import sys; from rerun_cli.__main__ import main; sys.exit(main())")
 MAP_EVERY_S: Final = 2.0  # between two maps of a replay
 
 
@@ -60,15 +54,12 @@ MAP_EVERY_S: Final = 2.0  # between two maps of a replay
         help="a recording, which is shown as it stands, or a log of images, which goes through the stages; without "
         "one, a robot is listened to",
     ),
-    exclusive(
-        option(
-            "-o",
-            "--output",
-            type=Path,
-            metavar="FILE.rrd",
-            help="a file that `rerun FILE.rrd` opens, here or elsewhere; default: a window",
-        ),
-        option("--web", action="store_true", help="a browser of this machine, until Ctrl-C"),
+    option(
+        "-o",
+        "--output",
+        type=Path,
+        metavar="FILE.rrd",
+        help="a file that `rerun FILE.rrd` opens, here or elsewhere; default: a window",
     ),
     group(
         "a log",
@@ -89,34 +80,18 @@ def run(args: argparse.Namespace) -> int:
         raise OmnidError("--topic, --replay and --rig belong to a log: name a LOG as well")
     if args.log is not None and (args.connect or args.seconds):
         raise OmnidError(f"--connect and --seconds do not go with {args.log}: leave out the LOG to show a robot")
-    config, viewers = settings_of(args), list[subprocess.Popen[bytes]]()
-    sink = sink_of(args.output, args.log, web=args.web, viewers=viewers)
+    config, sink = settings_of(args), sink_of(args.output, args.log)
     try:
         code = _robot(sink, config, args.seconds) if args.log is None else _log(sink, config, args)
-        sink.close()
-        if sink.poses:
-            print(f"{sink.poses} poses and {sink.images} images shown", flush=True)
-        if args.web and viewers:
-            print("omnid: complete; Ctrl-C ends the server", file=sys.stderr, flush=True)
-            with handle_stop_signals(lambda *_: _end(viewers)):
-                viewers[0].wait()
-        return code
     finally:
         sink.close()
-        if args.web:
-            _end(viewers)
+    if sink.poses:
+        print(f"{sink.poses} poses and {sink.images} images shown", flush=True)
+    return code
 
 
-def _end(viewers: list[subprocess.Popen[bytes]]) -> None:
-    for viewer in viewers:
-        with suppress(ProcessLookupError):
-            os.killpg(viewer.pid, signal.SIGTERM)
-
-
-def sink_of(
-    output: Path | None, log: Path | None, *, web: bool = False, viewers: list[subprocess.Popen[bytes]] | None = None
-) -> RerunSink:
-    """Return a sink that draws into a file, or into a viewer (output None), which it adds to the viewers.
+def sink_of(output: Path | None, log: Path | None) -> RerunSink:
+    """Return a sink that draws into a file, or into a window (output None).
 
     Raise OmnidError where Rerun is missing, or the file is the log.
     """
@@ -128,6 +103,10 @@ def sink_of(
     from omnid.sinks.files import check_outputs
     from omnid.viewer.rerun_sink import RerunSink, layout
 
+    if output is None:
+        return RerunSink(_window)
+    check_outputs([("the drawing", output)], [] if log is None else [("the log that is read", log)])
+
     def file() -> rerun.RecordingStream:
         import rerun
 
@@ -138,40 +117,40 @@ def sink_of(
             raise OmnidError(f"{output}: cannot be written: {error}; name another file") from error
         return stream
 
-    if output is not None:
-        check_outputs([("the drawing", output)], [] if log is None else [("the log that is read", log)])
-        return RerunSink(file)
-    return RerunSink(lambda: _viewer(web, [] if viewers is None else viewers))
+    return RerunSink(file)
 
 
-def _viewer(web: bool, viewers: list[subprocess.Popen[bytes]]) -> rerun.RecordingStream:
+def _window() -> rerun.RecordingStream:
     """Start Rerun's viewer and return its stream; unlike `rerun.spawn`, it is served to this machine only."""
     import rerun
 
     from omnid.viewer.rerun_sink import layout
 
-    if not web and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY") or sys.platform == "darwin"):
-        raise OmnidError("there is no display for a window: use -o FILE.rrd, or --web for a browser of this machine")
-    port, page = _free_port(), _free_port()
-    url = f"rerun+http://{LOCALHOST}:{port}/proxy"
-    mode = ("--serve-web", "--web-viewer-port", str(page)) if web else ("--expect-data-soon",)
-    # The viewer would report its use to its makers; `rerun analytics enable` turns that on again.
-    subprocess.run(python(*VIEWER, "analytics", "disable"), capture_output=True, check=False, env=python_environment())
-    words = python(*VIEWER, "--bind", LOCALHOST, "--port", str(port), "--hide-welcome-screen", *mode)
-    environment = python_environment(RUST_LOG="warn")
-    # In a session of its own: Ctrl-C does not end a window.
-    viewers.append(subprocess.Popen(words, stdin=subprocess.DEVNULL, start_new_session=True, env=environment))
-    stream = rerun.RecordingStream("omnid")
-    stream.connect_grpc(url, default_blueprint=layout())  # it waits for the viewer
-    if web:
-        print(f"omnid: open http://{LOCALHOST}:{page}/?url={quote(url, safe='')}", file=sys.stderr, flush=True)
-    return stream
-
-
-def _free_port() -> int:
+    if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY") or sys.platform == "darwin"):
+        raise OmnidError(
+            "there is no display for a window: use -o FILE.rrd, which `rerun --serve-web FILE.rrd` shows in a browser"
+        )
     with socket.socket() as probe:
-        probe.bind((LOCALHOST, 0))
-        return int(probe.getsockname()[1])
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    # The viewer would report its use to its makers; `rerun analytics enable` turns that on again.
+    subprocess.run(python("-m", "rerun_cli", "analytics", "disable"), capture_output=True, env=python_environment())
+    words = (
+        "-m",
+        "rerun_cli",
+        "--bind",
+        "127.0.0.1",
+        "--port",
+        str(port),
+        "--hide-welcome-screen",
+        "--expect-data-soon",
+    )
+    # In a session of its own: Ctrl-C does not end a window.
+    environment = python_environment(RUST_LOG="warn")
+    subprocess.Popen(python(*words), stdin=subprocess.DEVNULL, start_new_session=True, env=environment)
+    stream = rerun.RecordingStream("omnid")
+    stream.connect_grpc(f"rerun+http://127.0.0.1:{port}/proxy", default_blueprint=layout())  # it waits for the viewer
+    return stream
 
 
 def _log(sink: RerunSink, config: Config, args: argparse.Namespace) -> int:
