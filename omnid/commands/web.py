@@ -8,7 +8,7 @@ from pathlib import Path
 from omnid.commands.options import ROBOT, SETTINGS, command, option, settings_of
 from omnid.errors import OmnidError
 
-PACKAGES = ("prometheus_client", "starlette", "uvicorn", "websockets")
+PACKAGES = ("prometheus_client", "starlette", "uvicorn")
 
 
 @command(

@@ -1,7 +1,7 @@
 """Access to the page: two tokens, and protection against requests that other sites make a browser send.
 
-Any site that is open in the same browser may send requests here, open a websocket here, or let its own name point to
-this address (DNS rebinding). So a request must name a host of this server, come from a page of this server or from no
+Any site that is open in the same browser may send requests here, or let its own name point to this address (DNS
+rebinding). So a request must name a host of this server, come from a page of this server or from no
 page, and carry a token: as `Authorization: Bearer TOKEN`, or as the cookie that a browser gets for the token.
 """
 
@@ -44,7 +44,6 @@ _HEADERS: Final = (
     (b"cross-origin-resource-policy", b"same-origin"),
     (b"cache-control", b"no-store"),
 )
-_POLICY_VIOLATION: Final = 1008  # code of RFC 6455
 
 Scope = MutableMapping[str, Any]
 Message = MutableMapping[str, Any]
@@ -147,10 +146,9 @@ class Access:
         return self._matching(request.cookies.get(self.cookie, ""), _proof)
 
     def refusal(self, request: HTTPConnection) -> Refusal | None:
-        """Return the reason not to answer a request or a websocket; None to answer it."""
-        headers, host = request.headers, request.headers.get("host", "")
-        kind, path = request.scope["type"], request.scope["path"]
-        reads = request.scope.get("method") in ("GET", "HEAD")  # a websocket has no method
+        """Return the reason not to answer a request; None to answer it."""
+        headers, host, path = request.headers, request.headers.get("host", ""), request.scope["path"]
+        reads = request.scope["method"] in ("GET", "HEAD")
         # 1. DNS rebinding: the name must be one of this server.
         if not self._is_host(host):
             return _UNKNOWN_HOST
@@ -165,12 +163,12 @@ class Access:
         if is_of_other_site(request) and not (reads and path == "/"):
             return _OTHER_SITE
         # 3. The token, except for the form that asks for it.
-        if kind == "http" and path in OPEN_PATHS:
+        if path in OPEN_PATHS:
             return None
         role = self.role(request)
         if role is None:
             return _WRONG_TOKEN if "authorization" in headers or self.cookie in request.cookies else _NO_TOKEN
-        if role is Role.STOP and kind == "http" and not reads and path not in _STOPPING:
+        if role is Role.STOP and not reads and path not in _STOPPING:
             return _STOP_ONLY
         return None
 
@@ -229,9 +227,5 @@ class Guard:
             await self._app(scope, receive, send_protected)
             return
         self.refused[refusal.reason] += 1
-        if scope["type"] == "websocket":
-            await receive()
-            await send({"type": "websocket.close", "code": _POLICY_VIOLATION, "reason": refusal.reason})
-            return
         answer = PlainTextResponse(f"omnid web: {refusal.text}\n", refusal.status, {"connection": "close"})
         await answer(scope, receive, send_protected)

@@ -1,50 +1,56 @@
-"""The robot's messages from the bus to the channels of the browsers.
+"""The robot's messages from the bus, as the news that browsers ask for.
 
 zenoh calls in its own threads: they only put a message into a bounded inbox, or replace the newest one, and wake the
-event loop. Nothing that a browser does can reach that far.
+event loop. Nothing that a browser does can reach that far. A browser asks for what has changed since the news that it
+has shown, and is answered as soon as there is something: one that is slow skips what a newer message has replaced.
 """
 
 from __future__ import annotations
 
 import asyncio
+import json
 import math
 import time
+from bisect import bisect
 from collections import deque
-from collections.abc import Callable
-from contextlib import suppress
-from typing import Final
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Any, Final, NamedTuple
+
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse, Response
 
 from drivers.errors import FrameDecodeError
 from drivers.logs.ros_messages import COMPRESSED_IMAGE, parse_image
 from omnid.client import Diagnostics, Map, NavigationReport, Robot, Unreachable
+from omnid.core.mapping.thinned_path import ThinnedPath
 from omnid.errors import OmnidError
 from omnid.monitor.robot_state import Inbox, RobotState
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.decode import Pose, decode_map, decode_map_pose, decode_navigation, decode_scan
 from omnid.transport.topics import MAP_POSE, PANORAMA, SCAN
-from omnid.web.browsers import Browsers
-from omnid.web.channels import LivePath, Newest, Stored, with_header
 from omnid.web.snapshot import (
     MOST_CELLS,
     PATH_FRAME,
+    map_cells,
     map_in_odom,
-    map_message,
-    navigation_message,
-    no_map_message,
-    no_scan_message,
-    parts_message,
-    scan_message,
-    server_ms,
-    state_message,
+    navigation_news,
+    parts_news,
+    scan_news,
+    state_news,
 )
 
-PERIOD_S: Final = 0.03  # least time between two messages of the state
+PERIOD_S: Final = 0.03  # least time between two answers to a browser
 QUIET_S: Final = 0.5  # The state is sent after this time even without a message of the robot.
 RETRY_S: Final = 0.5
-REQUEST_S: Final = 0.2  # Period with which requests of browsers for channels are handled.
-NAVIGATION: Final = "navigation"
+WANTED_S: Final = 2.0  # The panorama is received for this time after a browser has asked for it.
 PANORAMA_S: Final = 0.4  # least time between two panoramas: what a robot publishes more often is left out
 MOST_POSES: Final = 100  # Most poses that are kept: a scan arrives later than the pose of its images.
+MOST_POINTS: Final = 4000  # Most points of the path.
+_FINEST_M: Final = 0.02  # Points of the path are at least this far apart, so that a robot at rest adds none.
+_LARGEST_M: Final = 1e6  # Largest coordinate that is drawn.
+_GAP_M: Final = 1.0  # A larger distance between two poses is drawn as a gap.
+NAVIGATION: Final = "navigation"
 _LARGEST: Final = {
     "odom": 1 << 16,
     MAP_POSE: 1 << 16,
@@ -55,12 +61,61 @@ _LARGEST: Final = {
     NAVIGATION: 1 << 16,
 }  # bytes
 _NEWEST_ONLY: Final = (NAVIGATION, SCAN, "map", PANORAMA)
-_JPEG: Final = b"\xff\xd8"
+NO_NAVIGATION: Final = NavigationReport(0, "", "", "", 0, math.nan, "", "")
 Receiver = Callable[[str, bytes, bytes], None]
 
 
+class _PathPoint(NamedTuple):
+    x_m: float
+    y_m: float
+    after_gap: bool  # the robot was put elsewhere before it
+    version: int  # of the news that it came with
+
+
+class LivePath:
+    """The path of the robot; a browser is sent the points that it has not seen."""
+
+    def __init__(self) -> None:
+        self._since = 0  # version since which points are only added
+        self._path = ThinnedPath[_PathPoint](
+            MOST_POINTS,
+            _FINEST_M,
+            lambda last, new, step_m: new.after_gap or math.dist(last[:2], new[:2]) >= step_m,
+            lambda dropped, new: new._replace(after_gap=dropped.after_gap or new.after_gap),
+        )
+
+    def add(self, x_m: float, y_m: float, version: int, *, gap: bool = False) -> None:
+        """Add a position, m. version: of the news that it comes with. gap: the robot was put elsewhere."""
+        if not (abs(x_m) < _LARGEST_M and abs(y_m) < _LARGEST_M):
+            return
+        path = self._path
+        if path.vertices:
+            moved_m = math.dist(path.vertices[-1][:2], (x_m, y_m))
+            gap = gap or moved_m > max(_GAP_M, 10 * path.step_m)
+        times_thinned = path.thinned
+        path.add(_PathPoint(x_m, y_m, gap and bool(path.vertices), version))
+        if path.thinned != times_thinned:
+            self._since = version  # all are sent again
+
+    def clear(self, version: int) -> None:
+        """Begin a new path: the robot has started again."""
+        self._path.clear()
+        self._since = version
+
+    def news(self, seen: int) -> dict[str, Any] | None:
+        """Return the points [x, y] added since that version, or all with `from` 0; after a gap [x, y, 1]."""
+        vertices = self._path.vertices
+        begin = bisect(vertices, seen, key=lambda point: point.version) if seen >= self._since else 0
+        if seen >= self._since and begin == len(vertices):
+            return None
+        points = [
+            [round(point.x_m, 3), round(point.y_m, 3), *([1] if point.after_gap else [])] for point in vertices[begin:]
+        ]
+        return {"from": begin, "points": points}
+
+
 class RobotFeed:
-    """Follows one robot and keeps the channels up to date."""
+    """Follows one robot, and answers the browsers."""
 
     def __init__(self, bus: BusConfig) -> None:
         """bus: settings of the connection, which has been checked."""
@@ -69,51 +124,78 @@ class RobotFeed:
         self.robot: Robot | None = None
         self.link = "not connected yet"  # why there is no connection; empty with one
         self.inbox = Inbox()
+        # Of the news: it grows by one each time, from the time of the start on, so that pages which were open while
+        # this program started again are behind.
+        self.version = self._start = int(1000 * time.time())
+        self._news: dict[str, tuple[int, Any]] = {}  # newest content of each kind, and the version that it came with
+        self._images: dict[str, bytes] = {}  # cells of the map, and the panorama
+        self._changed = asyncio.Condition()
+        self._wanted_until_s = -math.inf  # the panorama
         self._panorama_s = -PANORAMA_S  # when the newest one was taken
         self._poses: deque[Pose] = deque(maxlen=MOST_POSES)
         self._map_in_odom: list[float | None] | None = None
         self._large: dict[str, bytes] = {}  # newest map, panorama ... that are not processed yet
         self._wake, self._large_wake = asyncio.Event(), asyncio.Event()
-        self._state_channel = Newest("state", self._encode_state)
-        self._parts_channel = Newest("parts", lambda: parts_message(self.state))
-        self._map_channel, self._panorama_channel = Stored("map"), Stored(PANORAMA)
-        self._scan_channel, self._navigation_channel = Stored(SCAN), Stored(NAVIGATION)
-        self._end_panorama: Callable[[], None] | None = None
-        self.browsers = Browsers(
-            (
-                self._state_channel,
-                self.path,
-                self._parts_channel,
-                self._map_channel,
-                self._panorama_channel,
-                self._scan_channel,
-                self._navigation_channel,
-            ),
-            on_request=frozenset((PANORAMA,)),
-        )
+
+    def news(self, seen: int) -> dict[str, Any]:
+        """Return all that has changed since a version, and the state."""
+        seen = seen if self._start <= seen <= self.version else 0
+        extra = {
+            "dropped": self.inbox.dropped,
+            "panorama_comes": "panorama" in self._news,
+            "map_in_odom": self._map_in_odom,
+        }
+        found = {"seen": self.version, "state": state_news(self.bus.robot, self.state, self.link, extra)}
+        if (path := self.path.news(seen)) is not None:
+            found["path"] = path
+        return found | {kind: content for kind, (version, content) in self._news.items() if version > seen}
+
+    async def live(self, request: Request) -> Response:
+        """Answer a browser as soon as there are news: `seen` is the version of its last, `panorama` 1 asks for it."""
+        seen = request.query_params.get("seen", "")
+        if not (seen.isascii() and seen.isdigit() and len(seen) < 16):
+            return PlainTextResponse("omnid web: the page names the version of the news that it has seen\n", 400)
+        if request.query_params.get("panorama") == "1":
+            self._wanted_until_s = time.monotonic() + WANTED_S
+        if int(seen) == self.version:
+            async with self._changed:
+                await self._changed.wait()
+        text = json.dumps(self.news(int(seen)), separators=(",", ":"), allow_nan=False)
+        return Response(text, media_type="application/json")
+
+    async def image(self, request: Request) -> Response:
+        """Return the cells of the map, a byte each as `map_cells` makes them, or the newest panorama."""
+        kind = request.path_params["kind"]
+        if kind not in self._images:
+            return PlainTextResponse("omnid web: there is none\n", 404)
+        is_map = kind == "map"
+        headers = {"content-encoding": "deflate"} if is_map else {}
+        media_type = "application/octet-stream" if is_map else "image/jpeg"
+        return Response(self._images[kind], headers=headers, media_type=media_type)
 
     async def run(self) -> None:
         """Connect to the robot as soon as it can be reached, and follow it until this task is cancelled."""
         try:
-            await asyncio.gather(self._connect(), self._send_states(), self._process_large())
+            await asyncio.gather(self._connect(), self._give_news(), self._process_large())
         finally:
             if self.robot is not None:
                 self.robot.close()
 
-    async def _send_states(self) -> None:
+    async def _give_news(self) -> None:
+        """Process what has come, and let the browsers that wait have it."""
         while True:
             with suppress(TimeoutError):
                 async with asyncio.timeout(QUIET_S):
                     await self._wake.wait()
             self._wake.clear()
-            self._process_inbox()
-            self._forget_ended()
-            self._state_channel.changed()
-            self.browsers.notify()
+            self.process_inbox()
+            async with self._changed:
+                self.version += 1
+                self._changed.notify_all()
             await asyncio.sleep(PERIOD_S)
 
     async def _connect(self) -> None:
-        """Open the connection, take what was published before it, then subscribe to what browsers ask for."""
+        """Open the connection, take what was published before it, then receive the panorama while browsers show it."""
         loop = asyncio.get_running_loop()
         while self.robot is None:
             try:
@@ -121,19 +203,24 @@ class RobotFeed:
             except Unreachable as error:
                 self.link = str(error)
                 await asyncio.sleep(RETRY_S)
-        self.link = ""
+        self.link, receive, end = "", self._receiver(loop), None
         for topic in ("odom", MAP_POSE, "status", "map", SCAN, NAVIGATION):
-            self.robot.on_message(self._receiver(loop), topic)
+            self.robot.on_message(receive, topic)
         self.robot.on_alive(self.state.set_alive)
         diagnostics, grid = await asyncio.to_thread(_latched, self.robot)
         if diagnostics is not None:
             self.state.add_diagnostics(diagnostics)
-            self._parts_channel.changed()
-        if grid is not None and not self._map_channel.version:
+            self._set("parts", parts_news(self.state))
+        if grid is not None and "map" not in self._news:
             await self._take_map(grid)
         while True:
-            await asyncio.sleep(REQUEST_S)
-            await self._follow_requests(self.robot, self._receiver(loop))
+            await asyncio.sleep(0.1 * WANTED_S)
+            is_wanted = time.monotonic() < self._wanted_until_s
+            if is_wanted and end is None:
+                end = self.robot.on_message(receive, PANORAMA)
+            elif not is_wanted and end is not None:
+                await asyncio.to_thread(end)
+                end = None
 
     def _receiver(self, loop: asyncio.AbstractEventLoop) -> Receiver:
         """Return the function that zenoh's threads call for each message."""
@@ -153,50 +240,45 @@ class RobotFeed:
 
         return receive
 
-    def _process_inbox(self) -> None:
+    def _set(self, kind: str, content: Any) -> None:
+        """Have a content sent with the next news."""
+        self._news[kind] = self.version + 1, content
+
+    def process_inbox(self) -> None:
+        """Process the poses and statuses that have come; forget the statuses of a daemon that has ended."""
         while (message := self.inbox.get(0.0)) is not None:
             if message.topic == MAP_POSE:
-                self._take_map_pose(message.payload)
+                with self._counting_broken():
+                    in_map = decode_map_pose(message.payload)
+                    self._map_in_odom = map_in_odom(in_map, self._poses) or self._map_in_odom
                 continue
             before = self.state.pose
             pose = self.state.process(message)
             if pose is not None:
                 self._add_to_path(pose, before)
             elif message.topic == "status":
-                self._parts_channel.changed()
-
-    def _take_map_pose(self, payload: bytes) -> None:
-        try:
-            self._map_in_odom = map_in_odom(decode_map_pose(payload), self._poses) or self._map_in_odom
-        except OmnidError:
-            self.state.broken += 1
-
-    def _forget_ended(self) -> None:
-        """Show no more the statuses of a daemon that has ended."""
+                self._set("parts", parts_news(self.state))
         if self.state.forget_ended():
-            self._parts_channel.changed()
+            self._set("parts", parts_news(self.state))
 
     def _add_to_path(self, pose: Pose, before: Pose | None) -> None:
         """Add a pose; a smaller sequence number than before means that the daemon, and so odom, has begun again."""
         if before is not None and pose.attachment.seq < before.attachment.seq:
-            self._begin_again()
+            self.path.clear(self.version + 1)
+            self._poses.clear()
+            self._map_in_odom = None
+            self._images.clear()
+            nothing = {
+                "map": {"frame": PATH_FRAME, "width": 0},
+                SCAN: {"points": [], "nearest": None},
+                NAVIGATION: navigation_news(NO_NAVIGATION),
+                PANORAMA: 0,
+            }
+            for kind in nothing.keys() & self._news.keys():
+                self._set(kind, nothing[kind])
         self._poses.append(pose)
         gap = before is not None and pose.attachment.resets != before.attachment.resets
-        self.path.add(pose.x_m, pose.y_m, gap)
-
-    def _begin_again(self) -> None:
-        """Forget what belongs to the odom of a daemon that has ended, and let the browsers forget it."""
-        self.path.clear()
-        self._poses.clear()
-        self._map_in_odom = None
-        if self._map_channel.version:
-            self._map_channel.set(no_map_message(PATH_FRAME))
-        if self._scan_channel.version:
-            self._scan_channel.set(no_scan_message())
-        if self._navigation_channel.version:
-            self._navigation_channel.set(navigation_message(NavigationReport(0, "", "", "", 0, math.nan, "", "")))
-        if self._panorama_channel.version:
-            self._panorama_channel.set(with_header({"type": PANORAMA, "stamp_ms": 0}, b""))
+        self.path.add(pose.x_m, pose.y_m, self.version + 1, gap=gap)
 
     async def _process_large(self) -> None:
         """Encode maps and panoramas; they take longer than a pose may wait."""
@@ -206,48 +288,36 @@ class RobotFeed:
             for topic in _NEWEST_ONLY:
                 payload = self._large.pop(topic, None)
                 if payload is not None:
-                    await self._take_large(topic, payload)
-            self.browsers.notify()
+                    await self.take_large(topic, payload)
+            self._wake.set()
 
-    async def _take_large(self, topic: str, payload: bytes) -> None:
-        try:
+    async def take_large(self, topic: str, payload: bytes) -> None:
+        """Take a scan, a report of the navigation, a map or a panorama."""
+        with self._counting_broken():
             if topic == SCAN:
-                self._scan_channel.set(scan_message(decode_scan(payload), self._poses))
+                self._set(SCAN, scan_news(decode_scan(payload), self._poses))
             elif topic == NAVIGATION:
-                self._navigation_channel.set(navigation_message(decode_navigation(payload)))
+                self._set(NAVIGATION, navigation_news(decode_navigation(payload)))
             elif topic == "map":
                 await self._take_map(await asyncio.to_thread(decode_map, payload))
             elif time.monotonic() >= self._panorama_s + PANORAMA_S:
-                self._panorama_channel.set(_panorama_message(payload))
-                self._panorama_s = time.monotonic()
-        except (OmnidError, FrameDecodeError):
-            self.state.broken += 1
+                data = bytes(parse_image(COMPRESSED_IMAGE, memoryview(payload)).data)
+                if not data.startswith(b"\xff\xd8"):
+                    raise OmnidError("the panorama is no JPEG image")
+                self._images[PANORAMA], self._panorama_s = data, time.monotonic()
+                self._set(PANORAMA, self.version + 1)
 
     async def _take_map(self, grid: Map) -> None:
-        self._map_channel.set(await asyncio.to_thread(map_message, grid))
+        header, self._images["map"] = await asyncio.to_thread(map_cells, grid)
+        self._set("map", {**header, "version": self.version + 1})
 
-    async def _follow_requests(self, robot: Robot, receive: Receiver) -> None:
-        """Subscribe to the panorama while a browser shows it: it takes bandwidth that the robot may need."""
-        wanted = self.browsers.want(PANORAMA)
-        if wanted and self._end_panorama is None:
-            self._end_panorama = robot.on_message(receive, PANORAMA)
-        elif not wanted and self._end_panorama is not None:
-            end, self._end_panorama = self._end_panorama, None
-            await asyncio.to_thread(end)
-
-    def _encode_state(self) -> str:
-        return state_message(
-            self.bus.robot,
-            self.state,
-            self.link,
-            {
-                "server_ms": server_ms(),
-                "dropped": self.inbox.dropped,
-                "browsers": len(self.browsers),
-                "panoramas": self._panorama_channel.version,
-                "map_in_odom": self._map_in_odom,
-            },
-        )
+    @contextmanager
+    def _counting_broken(self) -> Iterator[None]:
+        """Count a message that cannot be decoded."""
+        try:
+            yield
+        except (OmnidError, FrameDecodeError):
+            self.state.broken += 1
 
 
 def _latched(robot: Robot) -> tuple[Diagnostics | None, Map | None]:
@@ -256,12 +326,3 @@ def _latched(robot: Robot) -> tuple[Diagnostics | None, Map | None]:
         diagnostics = reports.newest()
     with robot.subscribe(Map) as maps:
         return diagnostics, maps.newest()
-
-
-def _panorama_message(payload: bytes) -> bytes:
-    """Return the message `panorama`. Raise OmnidError or FrameDecodeError if it is no JPEG image."""
-    image = parse_image(COMPRESSED_IMAGE, memoryview(payload))
-    data = bytes(image.data)
-    if not data.startswith(_JPEG):
-        raise OmnidError("the panorama is no JPEG image; expected one in sensor_msgs/msg/CompressedImage")
-    return with_header({"type": PANORAMA, "stamp_ms": image.stamp_ns // 10**6}, data)

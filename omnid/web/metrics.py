@@ -16,7 +16,6 @@ from omnid.monitor.robot_state import RobotState
 from omnid.plain_text import plain
 from omnid.tracking_state import TrackingState
 from omnid.transport.status_names import number, short_name
-from omnid.web.browsers import Browsers
 from omnid.web.snapshot import LONGEST_VALUE, MOST_VALUES
 
 _TEXTS: Final = {
@@ -27,13 +26,13 @@ _TEXTS: Final = {
 Samples = Iterable[tuple[tuple[str, ...], float]]  # values of the labels, and the value
 
 
-def metrics(state: RobotState, browsers: Browsers, refused: Mapping[str, int], counts: Mapping[str, int]) -> bytes:
+def metrics(state: RobotState, refused: Mapping[str, int], counts: Mapping[str, int]) -> bytes:
     """Return all metrics as text; refused: requests by reason; counts: further counters, by name."""
 
     class Snapshot(Collector):
         def collect(self) -> Iterator[Metric]:
             yield from _of_robot(state)
-            yield from _of_server(browsers, refused, counts)
+            yield from _of_server(refused, counts)
 
     registry = CollectorRegistry(auto_describe=False)
     registry.register(Snapshot())
@@ -61,21 +60,11 @@ def _of_robot(state: RobotState) -> Iterator[Metric]:
     yield _labelled(Gauge, "omnid_status_value", "Numbers of the status", ["part", "key"], values)
 
 
-def _of_server(browsers: Browsers, refused: Mapping[str, int], counts: Mapping[str, int]) -> Iterator[Metric]:
+def _of_server(refused: Mapping[str, int], counts: Mapping[str, int]) -> Iterator[Metric]:
     for name, count in counts.items():
         yield _counter(f"omnid_web_{name}", _TEXTS[name], count)
-    yield _quantiles(
-        "omnid_web_answer_seconds", "From a message to the answer of a browser that has drawn it", browsers.answer
-    )
-    yield _gauge("omnid_web_browsers", "Open pages", len(browsers))
-    for name, text, label, counted in (
-        ("sent", "Messages sent to browsers", "channel", browsers.sent),
-        ("skipped", "Messages that a newer one replaced", "channel", browsers.skipped),
-        ("closed", "Pages that were disconnected", "reason", browsers.closed),
-        ("refused", "Requests that were refused", "reason", refused),
-    ):
-        samples = (((key,), count) for key, count in counted.items())
-        yield _labelled(Counter, f"omnid_web_{name}", text, [label], samples)
+    samples = (((reason,), count) for reason, count in refused.items())
+    yield _labelled(Counter, "omnid_web_refused", "Requests that were refused", ["reason"], samples)
 
 
 def _gauge(name: str, text: str, value: float) -> Metric:

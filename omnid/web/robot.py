@@ -19,7 +19,7 @@ from typing import Final, NamedTuple
 
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
-from starlette.routing import BaseRoute, Route, WebSocketRoute
+from starlette.routing import BaseRoute, Route
 
 from omnid.client import Answer, Driver, Robot
 from omnid.core.control.velocity_limits import VelocityLimits
@@ -78,7 +78,8 @@ class RobotPage:
     def routes(self) -> list[BaseRoute]:
         """Return the addresses."""
         return [
-            WebSocketRoute("/live", self.feed.browsers.serve),
+            Route("/live", self.feed.live),
+            Route("/image/{kind}", self.feed.image),
             _command_route("/stop", lambda _: self.stop()),
             _command_route("/arm", self.arm),
             _command_route("/drive", self.drive),
@@ -94,7 +95,7 @@ class RobotPage:
     def metrics(self, refused: Mapping[str, int]) -> bytes:
         """Return the metrics of the robot and of this server; refused: requests by reason."""
         counts = {"dropped": self.feed.inbox.dropped, "stops": self.stops, "arms": self.arms}
-        return metrics(self.feed.state, self.feed.browsers, refused, counts)
+        return metrics(self.feed.state, refused, counts)
 
     @property
     def is_stopping(self) -> bool:

@@ -37,7 +37,6 @@ DEFAULT_LISTEN: Final = "127.0.0.1:8447"
 STATIC: Final = Path(__file__).with_name("static")
 COOKIE_S: Final = 30 * 86_400  # A browser keeps the cookie for this time.
 LONGEST_FORM: Final = 1024  # bytes
-LONGEST_MESSAGE: Final = 256  # bytes, of a browser's websocket
 BACKLOG: Final = 2048  # connections that wait for the event loop
 END_S: Final = 2  # Time that browsers have to finish at the end.
 # A link of another site brings no cookie along (SameSite=Strict); a page that loads itself again does.
@@ -186,13 +185,10 @@ def _uvicorn_config(guard: Guard, settings: WebSettings) -> uvicorn.Config:
         guard,
         loop="asyncio",
         http="h11",
-        ws="websockets-sansio",
+        ws="none",
         interface="asgi3",
         lifespan="off",
         backlog=BACKLOG,
-        ws_max_size=LONGEST_MESSAGE,
-        ws_ping_interval=None,
-        ws_per_message_deflate=False,
         log_config=None,
         access_log=False,
         proxy_headers=False,

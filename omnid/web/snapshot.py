@@ -1,4 +1,4 @@
-"""The state of the robot as messages for browsers. Text from the network is shortened, without control characters."""
+"""The state of the robot as browsers are told it. Text from the network is shortened, without control characters."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from omnid.plain_text import plain
 from omnid.transport.codec import OK
 from omnid.transport.decode import Map, NavigationReport, Pose, PoseInMap, Scan
 from omnid.transport.status_names import PLACES, WHEELS, Key, short_name
-from omnid.web.channels import compact, with_header
 
 PATH_FRAME: Final = "odom"
 FRAMES: Final = (PATH_FRAME, "map")  # Frames of a map that is drawn.
@@ -43,32 +42,30 @@ def is_recent(stamp_ms: int) -> bool:
     return 0 <= server_ms() - stamp_ms <= 1000 * OLDEST_S
 
 
-def state_message(robot: str, state: RobotState, link: str, extra: Mapping[str, Any]) -> str:
-    """Return the message `state`: tracking, pose, rates, wheels, warnings.
+def state_news(robot: str, state: RobotState, link: str, extra: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the state: tracking, pose, rates, wheels, warnings.
 
     link: why there is no connection to the robot; empty with one. extra: further entries.
     """
-    return compact(
-        {
-            "type": "state",
-            "robot": plain(robot),
-            "link": plain(link),
-            "alive": state.alive,
-            "state": state.state,
-            "fresh": state.rate_hz > 0,
-            "rate_hz": finite(state.rate_hz),
-            "missed": state.missed,
-            "broken": state.broken,
-            "pose": None if state.pose is None else _pose(state.pose),
-            "age_ms": _quantiles_ms(state.age),
-            "network_ms": _quantiles_ms(state.network),
-            "wheels": _wheels(state),
-            "in_map": _in_map(state),
-            "pace": plain(state.real_time_factor),
-            "warnings": _warnings(state, link),
-            **extra,
-        }
-    )
+    return {
+        "robot": plain(robot),
+        "link": plain(link),
+        "alive": state.alive,
+        "state": state.state,
+        "fresh": state.rate_hz > 0,
+        "rate_hz": finite(state.rate_hz),
+        "missed": state.missed,
+        "broken": state.broken,
+        "pose": None if state.pose is None else _pose(state.pose),
+        "age_ms": _quantiles_ms(state.age),
+        "network_ms": _quantiles_ms(state.network),
+        "wheels": _wheels(state),
+        "in_map": _in_map(state),
+        "pace": plain(state.real_time_factor),
+        "warnings": _warnings(state, link),
+        "server_ms": server_ms(),
+        **extra,
+    }
 
 
 def map_in_odom(in_map: PoseInMap, poses: Iterable[Pose]) -> list[float | None] | None:
@@ -80,40 +77,33 @@ def map_in_odom(in_map: PoseInMap, poses: Iterable[Pose]) -> list[float | None] 
     return [finite(float(T_odom_map[0, 3])), finite(float(T_odom_map[1, 3])), finite(float(se3.yaw(T_odom_map)))]
 
 
-def parts_message(state: RobotState) -> str:
-    """Return the message `parts`: all status entries, the worst first, stages last."""
-    parts = sorted(state.statuses.values(), key=importance)
-    return compact(
+def parts_news(state: RobotState) -> list[dict[str, Any]]:
+    """Return all status entries, the worst first, stages last."""
+    return [
         {
-            "type": "parts",
-            "parts": [
-                {
-                    "name": plain(short_name(part.name)),
-                    "level": part.level % 4,
-                    "message": plain(part.message),
-                    "values": [
-                        [plain(key)[:LONGEST_VALUE], plain(value)[:LONGEST_VALUE]]
-                        for key, value in list(part.values.items())[:MOST_VALUES]
-                    ],
-                }
-                for part in parts
+            "name": plain(short_name(part.name)),
+            "level": part.level % 4,
+            "message": plain(part.message),
+            "values": [
+                [plain(key)[:LONGEST_VALUE], plain(value)[:LONGEST_VALUE]]
+                for key, value in list(part.values.items())[:MOST_VALUES]
             ],
         }
-    )
+        for part in sorted(state.statuses.values(), key=importance)
+    ]
 
 
-def map_message(grid: Map) -> bytes:
-    """Return the message `map`: cells of 0 unknown, 1 free, 2 occupied, row by row from low to high y, deflated.
+def map_cells(grid: Map) -> tuple[dict[str, Any], bytes]:
+    """Return a map's size and place, and its cells: 0 unknown, 1 free, 2 occupied, row by row from low to high y.
 
-    It has no cells unless the grid is in odom, which is the frame of the path, or in map, whose place in odom is part
-    of the message `state`.
+    The cells are deflated. The size is 0 unless the grid is in odom, which is the frame of the path, or in map, whose
+    place in odom is part of the state.
     """
     if not all(map(math.isfinite, (grid.cell_m, *grid.corner))) or not grid.cells.size or grid.frame not in FRAMES:
-        return no_map_message(grid.frame)
+        return {"width": 0, "frame": plain(grid.frame)}, b""
     step = -(-max(grid.cells.shape) // LARGEST_MAP_PX)
     cells = _reduced(np.where(grid.cells > 50, 2, np.where(grid.cells >= 0, 1, 0)).astype(np.uint8), step)
     header = {
-        "type": "map",
         "width": cells.shape[1],
         "height": cells.shape[0],
         "frame": grid.frame,
@@ -122,7 +112,7 @@ def map_message(grid: Map) -> bytes:
         "y_m": grid.corner[1],
         "known": _known_part(cells, step * grid.cell_m, grid.corner),
     }
-    return with_header(header, zlib.compress(cells.tobytes(), 1))
+    return header, zlib.compress(cells.tobytes(), 1)
 
 
 def _known_part(
@@ -136,22 +126,17 @@ def _known_part(
     return [float(start_m + cell_m * edge) for start_m, edge in zip((x_m, y_m, x_m, y_m), edges, strict=True)]
 
 
-def no_map_message(frame: str) -> bytes:
-    """Return a message `map` without cells, for which the page shows no map."""
-    return with_header({"type": "map", "width": 0, "height": 0, "frame": plain(frame)}, b"")
+def scan_news(scan: Scan, poses: Iterable[Pose]) -> dict[str, Any]:
+    """Return the nearest obstacles around the robot, in odom, and the nearest of all.
 
-
-def scan_message(scan: Scan, poses: Iterable[Pose]) -> str:
-    """Return the message `scan`: the nearest obstacles around the robot, in odom, and the nearest of all.
-
-    poses: the newest ones. The scan is drawn at the pose that is nearest in time. The message has no points where there
-    is no pose, or where the scan is not in the robot's own frame.
+    poses: the newest ones. The scan is drawn at the pose that is nearest in time. There are no points where there is no
+    pose, or where the scan is not in the robot's own frame.
     """
     place = min(poses, key=lambda pose: abs(pose.stamp_ns - scan.stamp_ns), default=None)
     seen = np.isfinite(scan.ranges_m) & (scan.ranges_m > 0) & (scan.ranges_m < _LARGEST_M)
     ranges_m, azimuths_rad = scan.ranges_m[seen].astype(float), scan.azimuths_rad[seen].astype(float)
     if place is None or scan.frame != BASE_FRAME or not ranges_m.size or not math.isfinite(place.yaw_rad):
-        return no_scan_message()
+        return {"points": [], "nearest": None}
     nearest = int(ranges_m.argmin())
     chosen = np.unique(np.append(np.arange(0, len(ranges_m), -(-len(ranges_m) // MOST_SECTORS)), nearest))
     angles = azimuths_rad[chosen] + place.yaw_rad
@@ -159,34 +144,23 @@ def scan_message(scan: Scan, poses: Iterable[Pose]) -> str:
         [place.x_m + ranges_m[chosen] * np.cos(angles), place.y_m + ranges_m[chosen] * np.sin(angles)]
     )
     turn_deg = math.degrees(math.remainder(float(azimuths_rad[nearest]), 2 * math.pi))
-    return compact(
-        {
-            "type": "scan",
-            "points": [[finite(x), finite(y)] for x, y in points.round(3)],
-            "nearest": [finite(float(ranges_m[nearest])), finite(turn_deg)],
-        }
-    )
+    return {
+        "points": [[finite(x), finite(y)] for x, y in points.round(3)],
+        "nearest": [finite(float(ranges_m[nearest])), finite(turn_deg)],
+    }
 
 
-def no_scan_message() -> str:
-    """Return a message `scan` without points, for which the page shows no obstacles."""
-    return compact({"type": "scan", "points": [], "nearest": None})
-
-
-def navigation_message(report: NavigationReport) -> str:
-    """Return the message `navigation`: what is driven or taught, and what became of the newest request."""
-    return compact(
-        {
-            "type": "navigation",
-            "state": plain(report.state),
-            "reason": plain(report.reason),
-            "task": plain(report.task),
-            "left_m": finite(report.left_m),
-            "teaching": plain(report.teaching),
-            "taught_m": finite(report.taught_m),
-            "refusal": plain(report.refusal),
-        }
-    )
+def navigation_news(report: NavigationReport) -> dict[str, Any]:
+    """Return what is driven or taught, and what became of the newest request."""
+    return {
+        "state": plain(report.state),
+        "reason": plain(report.reason),
+        "task": plain(report.task),
+        "left_m": finite(report.left_m),
+        "teaching": plain(report.teaching),
+        "taught_m": finite(report.taught_m),
+        "refusal": plain(report.refusal),
+    }
 
 
 def _reduced(cells: np.ndarray[Any, np.dtype[np.uint8]], step: int) -> np.ndarray[Any, np.dtype[np.uint8]]:

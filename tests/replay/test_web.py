@@ -15,14 +15,13 @@ from tests.replay.test_arming import MANUAL
 from tests.waiting import wait_until
 
 pytest.importorskip("starlette", reason="needs the packages of omnid[web]")
-pytest.importorskip("websockets", reason="needs the packages of omnid[web]")
 from tests.omnid.web.servers import Shown, WebServer, served
 
 
 def state(server: WebServer, holds: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
     """Return the state on a page that is opened now, as soon as a condition holds."""
-    with server.live(server.bearer) as live:
-        return Shown(live).until("state", holds=holds)
+    found: dict[str, Any] = Shown(server).until("state", holds=holds)
+    return found
 
 
 def test_arm_and_stop_from_the_page_and_a_daemon_that_starts_again(tmp_path: Path, course: Path) -> None:
@@ -55,6 +54,5 @@ def test_arm_and_stop_from_the_page_and_a_daemon_that_starts_again(tmp_path: Pat
         with started(command_line(course, daemon.port, base.port, *MANUAL), daemon.port):
             again = state(server, lambda found: found["alive"] and found["fresh"] and found["wheels"])
             assert not again["wheels"]["armed"]
-            with server.live(server.bearer) as live:
-                assert len(Shown(live).until("path")["points"]) < 200, "the path of the new start only"
+            assert len(Shown(server).until("path")["points"]) < 200, "the path of the new start only"
         assert server.end() == (0, "")

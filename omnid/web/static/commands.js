@@ -4,7 +4,7 @@ import { byId } from "./elements.js";
 
 const RETRY_MS = 300;
 const GIVE_UP_MS = 10000;
-const SILENT_MS = 2500; // without an answer, or news of the robot (connection.js)
+const SILENT_MS = 2500; // without an answer, or news of the robot (page.js)
 const SURE_MS = 4000;
 const EMERGENCY = "STOP IS NOT SENT: use the emergency stop on the robot";
 const NO_ANSWER = "NO ANSWER YET: use the emergency stop on the robot";

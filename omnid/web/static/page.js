@@ -1,7 +1,6 @@
-// Connects the elements of the page with the messages of the server. Text is only ever set as text, never as HTML.
+// Asks the server for news, and shows them. Text is only ever set as text, never as HTML.
 import { showCalibration } from "./calibration.js";
 import { wireCommands } from "./commands.js";
-import { Connection } from "./connection.js";
 import { byId, degrees, element, fixed, inWords, tableRow } from "./elements.js";
 import { Plan } from "./plan.js";
 import { showMapFile, wireGoal, wireMap, wireRoutes } from "./requests.js";
@@ -11,36 +10,68 @@ const LEVELS = ["good", "warn", "bad", "warn"];
 const LEVEL_NAMES = ["good", "warning", "error", "no news"];
 const STATES = { tracking: "good", degraded: "warn", lost: "bad" };
 
+const RETRY_MS = [300, 1000, 2000];
+const SILENT_MS = 2500; // the server answers at least every 0.5 s
+const GONE_MS = 10000; // a request without an answer is given up
+
 const plan = new Plan(byId("plan"));
 const goal = wireGoal(plan);
 const routes = wireRoutes();
 const shownByState = [wireCommands(), wireStick(), goal, routes];
-let imageUrl = "";
 let nearest = null; // distance in m and direction in degrees of the nearest obstacle
 
-function onMessage(message, body) {
-  switch (message.type) {
-    case "state": return showState(message);
-    case "path": return plan.addPath(message.from, message.points);
-    case "map":
-      byId("map-note").textContent = ["odom", "map"].includes(message.frame) ? "" : `a map in the frame ${message.frame} is not drawn`;
-      return plan.setMap(message, body);
-    case "parts":
-      showCalibration(message.parts.find((part) => part.name === "calibration"));
-      showMapFile(message.parts.find((part) => part.name === "map file"));
-      return showParts(message.parts);
-    case "navigation":
-      goal.showNavigation(message);
-      return routes.showNavigation(message);
-    case "scan":
-      nearest = message.nearest;
-      return plan.setObstacles(message.points);
-    case "panorama": return showPanorama(body);
+// Each request names the newest news that are shown, and is answered when there are others: so old ones never queue up.
+async function follow() {
+  let [seen, failures] = [0, 0];
+  for (;;) {
+    const noAnswer = () => showConnection("No answer from the robot's page. What is shown is old. STOP may not work.");
+    const timer = setTimeout(noAnswer, SILENT_MS);
+    try {
+      // The panorama comes while it is open and the page is seen: it takes bandwidth that the robot may need.
+      const panorama = byId("panorama-box").open && !document.hidden ? 1 : 0;
+      const response = await fetch(`live?seen=${seen}&panorama=${panorama}`, { signal: AbortSignal.timeout(GONE_MS) });
+      if (!response.ok) throw new Error(await response.text());
+      const news = await response.json();
+      await show(news);
+      showConnection("");
+      [seen, failures] = [news.seen, 0];
+    } catch (error) {
+      showConnection(`No connection to the robot's page: ${error.message}. What is shown is old. STOP may not work.`);
+      await new Promise((resolve) => setTimeout(resolve, RETRY_MS[Math.min(failures, RETRY_MS.length - 1)]));
+      failures += 1;
+    } finally {
+      clearTimeout(timer);
+    }
   }
-  return undefined;
 }
 
-function onConnection(text) {
+async function show(news) {
+  if (news.path) plan.addPath(news.path.from, news.path.points);
+  if (news.scan) {
+    nearest = news.scan.nearest;
+    plan.setObstacles(news.scan.points);
+  }
+  if (news.parts) {
+    showCalibration(news.parts.find((part) => part.name === "calibration"));
+    showMapFile(news.parts.find((part) => part.name === "map file"));
+    showParts(news.parts);
+  }
+  if (news.navigation) {
+    goal.showNavigation(news.navigation);
+    routes.showNavigation(news.navigation);
+  }
+  if (news.panorama !== undefined) showPanorama(news.panorama);
+  showState(news.state);
+  if (news.map) await showMap(news.map);
+}
+
+async function showMap(map) {
+  byId("map-note").textContent = ["odom", "map"].includes(map.frame) ? "" : `a map in the frame ${map.frame} is not drawn`;
+  const cells = map.width ? await (await fetch(`image/map?${map.version}`)).arrayBuffer() : null;
+  plan.setMap(cells === null ? null : { ...map, cells: new Uint8Array(cells) });
+}
+
+function showConnection(text) {
   byId("lost").hidden = !text;
   byId("lost").textContent = text;
   if (text) {
@@ -61,7 +92,7 @@ function showState(state) {
   showWarnings(state.warnings);
   showPose(state);
   byId("no-pose").hidden = state.pose !== null;
-  byId("panorama-note").hidden = state.panoramas > 0;
+  byId("panorama-note").hidden = state.panorama_comes;
   plan.setMapInOdom(state.map_in_odom);
   plan.setPose(state.pose, state.fresh);
 }
@@ -138,15 +169,11 @@ function showParts(parts) {
   }));
 }
 
-// An empty body: the robot has started again, and sent none yet.
-function showPanorama(body) {
+// version: 0 where the robot has started again, and sent none yet. One that comes while the last one loads is left out.
+function showPanorama(version) {
   const image = byId("panorama");
-  image.hidden = body.byteLength === 0;
-  if (image.hidden) return;
-  const before = imageUrl;
-  imageUrl = URL.createObjectURL(new Blob([body], { type: "image/jpeg" }));
-  image.src = imageUrl;
-  if (before) URL.revokeObjectURL(before);
+  image.hidden = version === 0;
+  if (version && image.complete) image.src = `image/panorama?${version}`;
 }
 
 function setBadge(id, text, className) {
@@ -161,11 +188,4 @@ byId("fit").addEventListener("click", () => plan.fit());
 plan.onFit = (fits) => byId("fit").setAttribute("aria-pressed", String(fits));
 wireMap();
 byId("panorama-note").textContent = "None comes yet: the robot publishes it unless bus.panorama_hz = 0.";
-const connection = new Connection(onMessage, onConnection);
-
-// The panorama comes while it is open and the page is seen: it takes bandwidth that the robot may need.
-const panorama = byId("panorama-box");
-const askForPanorama = () => connection.request("panorama", panorama.open && !document.hidden);
-panorama.addEventListener("toggle", askForPanorama);
-document.addEventListener("visibilitychange", askForPanorama);
-askForPanorama();
+follow();

@@ -58,14 +58,9 @@ export class Plan {
     this.draw();
   }
 
-  // Cells of 0 unknown, 1 free, 2 occupied, deflated, row by row from low to high y.
-  async setMap(header, body) {
-    const { width, height } = header;
-    this.map = null;
-    if (width && height) {
-      const stream = new Blob([body]).stream().pipeThrough(new DecompressionStream("deflate"));
-      this.map = { ...header, cells: new Uint8Array(await new Response(stream).arrayBuffer()) };
-    }
+  // A map with cells of 0 unknown, 1 free, 2 occupied, row by row from low to high y; null: none.
+  setMap(map) {
+    this.map = map;
     this.recolour();
   }
 

@@ -12,7 +12,6 @@ from tests.omnid.transport.bus_fixtures import free_endpoint
 
 pytest.importorskip("starlette", reason="needs the packages of omnid[web]")
 pytest.importorskip("prometheus_client", reason="needs the packages of omnid[web]")
-pytest.importorskip("websockets", reason="needs the packages of omnid[web]")
 from tests.omnid.web.servers import WebServer, served
 
 ROBOT = "rover"

@@ -14,8 +14,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import parse_qs, urlsplit
 
-from websockets.sync.client import ClientConnection, connect
-
 from tests.waiting import PATIENCE_S, ended
 
 ROOT = Path(__file__).parents[3]
@@ -71,8 +69,7 @@ class WebServer:
 
     def state_ms(self) -> int:
         """Return the server's time in the newest state, as a page knows it."""
-        with self.live(self.bearer) as live:
-            return int(Shown(live).until("state")["server_ms"])
+        return int(Shown(self).until("state")["server_ms"])
 
     def cookie(self) -> dict[str, str]:
         """Return the header of a browser that has opened the printed address."""
@@ -80,15 +77,14 @@ class WebServer:
         assert answer.status == 303 and answer.headers["location"] == "/"
         return {"Cookie": answer.headers["set-cookie"].split(";")[0]}
 
-    def live(self, headers: Mapping[str, str] | None = None, origin: str | None = None) -> ClientConnection:
-        """Open the websocket."""
-        return connect(
-            f"ws://{self.host}/live",
-            additional_headers=headers,
-            origin=origin,  # type: ignore[arg-type]
-            compression=None,
-            open_timeout=PATIENCE_S,
-        )
+    def image(self, kind: str) -> bytes:
+        """Return the cells of the map, as they are sent, or the panorama."""
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE_S)
+        try:
+            connection.request("GET", f"/image/{kind}", headers=self.bearer)
+            return connection.getresponse().read()
+        finally:
+            connection.close()
 
     def end(self, number: int = signal.SIGTERM) -> tuple[int, str]:
         """Send a signal; return the exit code and stderr."""
@@ -110,34 +106,30 @@ def served(*words: object) -> Iterator[WebServer]:
 
 
 class Shown:
-    """Content of a page: the newest message of each kind. Each message is answered as the page does."""
+    """Content of a page: the newest news of each kind; they are asked for as the page does."""
 
-    def __init__(self, live: ClientConnection) -> None:
-        self._live = live
-        self.newest: dict[str, dict[str, Any]] = {}
+    def __init__(self, server: WebServer) -> None:
+        self._server, self._seen = server, 0
+        self.newest: dict[str, Any] = {}
 
-    def read(self) -> dict[str, Any]:
-        """Take the next message."""
-        data = self._live.recv(PATIENCE_S)
-        if isinstance(data, str):
-            message: dict[str, Any] = json.loads(data)
-        else:
-            length = int.from_bytes(data[:4], "big")
-            message = {**json.loads(data[4 : 4 + length]), "body": data[4 + length :]}
-        self.newest[message["type"]] = message
-        self._live.send("ok")
-        return message
+    def read(self) -> None:
+        """Take the next news."""
+        answer = self._server.request(f"/live?seen={self._seen}", headers=self._server.bearer)
+        assert answer.status == 200, answer.text
+        news = json.loads(answer.text)
+        self._seen = news.pop("seen")
+        self.newest |= news
 
     def until(
         self,
         kind: str,
         action: Callable[[], object] = lambda: None,
-        holds: Callable[[dict[str, Any]], object] = lambda _: True,
-    ) -> dict[str, Any]:
-        """Repeat an action and take messages until one of a kind is there for which a condition holds; return it."""
+        holds: Callable[[Any], object] = lambda _: True,
+    ) -> Any:
+        """Repeat an action and take news until those of a kind are there for which a condition holds; return them."""
         end_s = time.monotonic() + PATIENCE_S
         while kind not in self.newest or not holds(self.newest[kind]):
-            assert time.monotonic() < end_s, f"no such message {kind!r} within {PATIENCE_S:g} s: {self.newest}"
+            assert time.monotonic() < end_s, f"no such news {kind!r} within {PATIENCE_S:g} s: {self.newest}"
             action()
             self.read()
         return self.newest[kind]

@@ -22,15 +22,13 @@ BEARER = {"authorization": f"Bearer {TOKEN}"}
 OWN = {"origin": f"http://{HOST}"}
 
 
-def reason(
-    access: Access, *headers: dict[str, str], path: str = "/metrics", method: str = "GET", kind: str = "http"
-) -> str:
+def reason(access: Access, *headers: dict[str, str], path: str = "/metrics", method: str = "GET") -> str:
     """Return the reason of a refusal, empty where the request enters; later headers replace earlier ones."""
     merged = {"host": HOST}
     for more in headers:
         merged |= more
     lines = [(name.encode(), value.encode("latin-1")) for name, value in merged.items() if value]
-    scope = {"type": kind, "path": path, "headers": lines} | ({"method": method} if kind == "http" else {})
+    scope = {"type": "http", "path": path, "headers": lines, "method": method}
     refusal = access.refusal(HTTPConnection(scope))
     return "" if refusal is None else refusal.reason
 
@@ -81,10 +79,9 @@ def test_only_own_names_are_answered(access: Access, host: str, enters: bool) ->
 )
 def test_the_token_or_its_cookie_is_needed(headers: dict[str, str], expected: str) -> None:
     assert reason(LOCAL, headers) == expected
-    assert reason(LOCAL, headers, OWN, kind="websocket", path="/live") == expected
+    assert reason(LOCAL, headers, OWN, path="/live") == expected
 
 
-@pytest.mark.parametrize("kind", ["http", "websocket"])
 @pytest.mark.parametrize(
     ("headers", "expected"),
     [
@@ -103,8 +100,8 @@ def test_the_token_or_its_cookie_is_needed(headers: dict[str, str], expected: st
         ({**BEARER, "origin": "http://evil.example"}, "cross-site"),
     ],
 )
-def test_commands_and_websockets_come_from_the_own_page(kind: str, headers: dict[str, str], expected: str) -> None:
-    assert reason(LOCAL, COOKIE, headers, kind=kind, method="POST", path="/stop") == expected
+def test_commands_come_from_the_own_page(headers: dict[str, str], expected: str) -> None:
+    assert reason(LOCAL, COOKIE, headers, method="POST", path="/stop") == expected
 
 
 @pytest.mark.parametrize(("path", "expected"), [("/", ""), ("/metrics", "cross-site"), ("/static/a.js", "cross-site")])
@@ -117,7 +114,7 @@ def test_the_token_for_stops_may_see_and_stop_and_nothing_else() -> None:
     for headers in ({"authorization": f"Bearer {STOP_TOKEN}"}, cookie):
         for path, method in (("/", "GET"), ("/metrics", "GET"), ("/stop", "POST"), ("/logout", "POST")):
             assert reason(BOTH, headers, path=path, method=method) == ""
-        assert reason(BOTH, headers, path="/live", kind="websocket") == ""
+        assert reason(BOTH, headers, path="/live") == ""
         for path in ("/arm", "/route", "/navigation", "/map", "/drive", "/goal", "/x/stop"):
             assert reason(BOTH, headers, path=path, method="POST") == "stop only"
     assert reason(BOTH, COOKIE, OWN, path="/arm", method="POST") == ""

@@ -1,18 +1,15 @@
-"""From the robot's messages to what browsers are sent, without a program: path, messages, feed, browsers."""
+"""From the robot's messages to what browsers are sent, without a program: path, news, feed."""
 
 from __future__ import annotations
 
 import asyncio
-import json
 import math
 import time
 import zlib
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
-from starlette.websockets import WebSocket
 
 from calib import se3
 from drivers.frame import Frame
@@ -23,42 +20,36 @@ from omnid.transport.codec import DiagnosticStatus, PoseAttachment, scan_cdr
 from omnid.transport.decode import Diagnostics, Map, Pose, Scan
 from omnid.transport.sensor_codec import image_cdr
 from omnid.transport.status_names import NAVIGATION, ODOMETRY, PLACES, WHEELS, Key
-from omnid.web.browsers import Browsers
-from omnid.web.channels import MOST_POINTS, LivePath, Newest
-from omnid.web.feed import RobotFeed
-from omnid.web.snapshot import (
-    LARGEST_MAP_PX,
-    MOST_WARNINGS,
-    map_message,
-    scan_message,
-    state_message,
-)
+from omnid.web.feed import MOST_POINTS, LivePath, RobotFeed
+from omnid.web.snapshot import LARGEST_MAP_PX, MOST_WARNINGS, map_cells, scan_news, state_news
 from tests.omnid.transport.bus_fixtures import odometry
 
 # The path.
 
 
-def follow(path: LivePath, shown: list[list[float]], seen: int) -> int:
-    """Apply the next message as the page does; return the version that is seen then."""
-    message = json.loads(path.message(seen))
-    assert message["from"] <= len(shown)
-    shown[message["from"] :] = message["points"]
-    return path.version
-
-
 def test_browsers_that_come_at_any_time_show_the_same_path() -> None:
-    path = LivePath()
+    path, version = LivePath(), 1
     shown: dict[int, list[list[float]]] = {1: [], 7: [], 100: []}
     seen = dict.fromkeys(shown, 0)
+
+    def follow(every: int) -> None:
+        """Apply the next news as the page does."""
+        news = path.news(seen[every])
+        if news is not None:
+            assert news["from"] <= len(shown[every])
+            shown[every][news["from"] :] = news["points"]
+        seen[every] = version
+
     for step in range(20_000):
-        path.add(0.01 * step, math.sin(0.01 * step), gap=step in (500, 15_000))
+        version = step + 1
+        path.add(0.01 * step, math.sin(0.01 * step), version, gap=step in (500, 15_000))
         if step == 9000:
-            path.clear()
+            path.clear(version)
         for every in shown:
             if step % every == 0:
-                seen[every] = follow(path, shown[every], seen[every])
-    for every, points in shown.items():
-        follow(path, points, seen[every])
+                follow(every)
+    for every in shown:
+        follow(every)
     assert shown[1] == shown[7] == shown[100] and 1000 < len(shown[1]) <= MOST_POINTS
     assert sum(len(point) > 2 for point in shown[1]) == 1 and shown[1][0][0] == pytest.approx(90.01, abs=0.1)
 
@@ -82,8 +73,7 @@ def state(*statuses: DiagnosticStatus) -> RobotState:
 
 
 def shown(robot: RobotState, link: str = "") -> dict[str, Any]:
-    message: dict[str, Any] = json.loads(state_message("rover", robot, link, {"more": 3}))
-    return message
+    return state_news("rover", robot, link, {"more": 3})
 
 
 @pytest.mark.parametrize(
@@ -128,18 +118,11 @@ def test_warnings_come_with_the_worst_first_and_with_their_remedies() -> None:
     assert len(shown(many)["warnings"]) == MOST_WARNINGS
 
 
-def unpacked(message: bytes) -> tuple[dict[str, Any], bytes]:
-    """Return header and content of a message."""
-    size = int.from_bytes(message[:4], "big")
-    return json.loads(message[4 : 4 + size]), message[4 + size :]
-
-
 @pytest.mark.parametrize("frame", ["odom", "map"])
 def test_a_map_is_sent_as_unknown_free_and_occupied_cells(frame: str) -> None:
     cells = np.array([[-1, 0, 50], [51, 100, 30]], np.int8)
-    header, content = unpacked(map_message(Map(0, frame, cells, 0.05, (-1.0, 2.0))))
+    header, content = map_cells(Map(0, frame, cells, 0.05, (-1.0, 2.0)))
     assert header == {
-        "type": "map",
         "width": 3,
         "height": 2,
         "frame": frame,
@@ -154,11 +137,11 @@ def test_a_map_is_sent_as_unknown_free_and_occupied_cells(frame: str) -> None:
 def test_a_large_map_is_reduced_and_loses_no_obstacle() -> None:
     cells = np.zeros((3, LARGEST_MAP_PX + 1), np.int8)
     cells[2, -1] = cells[0, 3] = 100
-    header, content = unpacked(map_message(Map(0, "odom", cells, 0.05, (0.0, 0.0))))
+    header, content = map_cells(Map(0, "odom", cells, 0.05, (0.0, 0.0)))
     assert (header["width"], header["height"], header["cell_m"]) == (LARGEST_MAP_PX // 2 + 1, 2, 0.1)
     small = np.frombuffer(zlib.decompress(content), np.uint8).reshape(2, -1)
     assert np.argwhere(small == 2).tolist() == [[0, 1], [1, LARGEST_MAP_PX // 2]]
-    header, content = unpacked(map_message(Map(0, "odom", cells[:, 1:], 0.05, (0.0, 0.0))))
+    header, content = map_cells(Map(0, "odom", cells[:, 1:], 0.05, (0.0, 0.0)))
     assert header["width"] == LARGEST_MAP_PX and header["cell_m"] == 0.05
 
 
@@ -170,13 +153,13 @@ def test_obstacles_are_drawn_from_the_pose_nearest_in_time() -> None:
     poses = [pose(10, 9.0, 9.0, 0.0), pose(90, 1.0, 2.0, math.pi / 2), pose(300, 5.0, 5.0, 0.0)]
     ranges = [2.0, math.nan, math.inf, 0.0, -1.0, 1.5, 2e4]
     azimuths = [0.0, 0.1, 0.2, 0.3, 0.4, 3 * math.pi / 2, 0.5]
-    found = json.loads(scan_message(scan(ranges, azimuths), poses))
+    found = scan_news(scan(ranges, azimuths), poses)
     np.testing.assert_allclose(found["points"], [(1.0, 4.0), (2.5, 2.0)], atol=1e-3)
     assert found["nearest"] == pytest.approx([1.5, -90.0])
-    nothing = {"type": "scan", "points": [], "nearest": None}
-    assert json.loads(scan_message(scan(ranges, azimuths, "map"), poses)) == nothing
-    assert json.loads(scan_message(scan(ranges, azimuths), [])) == nothing
-    assert json.loads(scan_message(scan([math.inf], [0.0]), poses)) == nothing
+    nothing = {"points": [], "nearest": None}
+    assert scan_news(scan(ranges, azimuths, "map"), poses) == nothing
+    assert scan_news(scan(ranges, azimuths), []) == nothing
+    assert scan_news(scan([math.inf], [0.0]), poses) == nothing
 
 
 # The feed.
@@ -196,20 +179,8 @@ def add_pose(feed: RobotFeed, seq: int, resets: int = 0) -> None:
     feed.inbox.put("odom", odometry(seq), PoseAttachment(seq, "tracking", resets, 50, 60, time.time_ns()).to_bytes())
 
 
-def points(feed: RobotFeed) -> list[list[float]]:
-    return list(json.loads(feed.path.message(0))["points"])
-
-
-async def until(condition: Callable[[], object]) -> None:
-    """Let the event loop go on until a condition holds."""
-    end_s = time.monotonic() + 30.0
-    while not condition():
-        assert time.monotonic() < end_s
-        await asyncio.sleep(0.001)
-
-
 def test_a_robot_that_has_started_again_is_shown_without_what_belongs_to_its_odom_before() -> None:
-    """The pages are sent messages without a map, obstacles, navigation and panorama, in place of the old ones."""
+    """The pages are sent news without a map, obstacles, navigation and panorama, in place of the old ones."""
     feed = RobotFeed(BusConfig())
     navigation = DiagnosticStatus(NAVIGATION, 0, "", {str(Key.STATE): "driving", str(Key.TASK): "goal"})
     large = {
@@ -218,69 +189,26 @@ def test_a_robot_that_has_started_again_is_shown_without_what_belongs_to_its_odo
         "panorama": panorama(b"\xff\xd8 bytes"),
         "navigation": codec.diagnostics_cdr(10**18, [navigation]),
     }
-    channels = (feed._map_channel, feed._scan_channel, feed._panorama_channel, feed._navigation_channel)
+    for seq in (4, 0):  # with nothing to forget there is nothing to send
+        add_pose(feed, seq)
+    feed.process_inbox()
+    assert not feed.news(0).keys() & large.keys()
+    add_pose(feed, 4)
+    feed.inbox.put("map_pose", codec.pose_with_covariance_cdr(10**9 + 4, np.eye(4), np.eye(6)), b"")
+    feed.process_inbox()
 
     async def take() -> None:
         for topic, payload in large.items():
-            await feed._take_large(topic, payload)
+            await feed.take_large(topic, payload)
 
-    for seq in (4, 0):  # with nothing to forget there is nothing to send
-        add_pose(feed, seq)
-    feed._process_inbox()
-    assert [channel.version for channel in channels] == [0, 0, 0, 0]
-    add_pose(feed, 4)
-    feed.inbox.put("map_pose", codec.pose_with_covariance_cdr(10**9 + 4, np.eye(4), np.eye(6)), b"")
-    feed._process_inbox()
     asyncio.run(take())
-    assert feed._map_in_odom is not None and [channel.version for channel in channels] == [1, 1, 1, 1]
+    news = feed.news(0)
+    assert news["state"]["map_in_odom"] is not None and news["map"]["width"] == 3 and news["panorama"]
+    assert news["scan"]["points"] and news["navigation"]["task"] == "goal" and len(news["path"]["points"]) == 2
     add_pose(feed, 0)
-    feed._process_inbox()
-    assert [channel.version for channel in channels] == [2, 2, 2, 2]
-    assert json.loads(feed._encode_state())["map_in_odom"] is None
-    no_map, no_panorama = (bytes(channel.message(1)[4:]) for channel in (feed._map_channel, feed._panorama_channel))
-    assert json.loads(no_map) == {"type": "map", "width": 0, "height": 0, "frame": "odom"}
-    assert json.loads(no_panorama) == {"type": "panorama", "stamp_ms": 0}
-    assert json.loads(feed._scan_channel.message(1)) == {"type": "scan", "points": [], "nearest": None}
-    report = json.loads(feed._navigation_channel.message(1))
+    feed.process_inbox()
+    news = feed.news(0)
+    assert news["state"]["map_in_odom"] is None and news["map"] == {"width": 0, "frame": "odom"}
+    assert news["panorama"] == 0 and news["scan"] == {"points": [], "nearest": None}
+    report = news["navigation"]
     assert (report["state"], report["task"], report["left_m"]) == ("", "", None)
-
-
-def channels(*names: str) -> list[Newest]:
-    """Return channels whose messages are their names and versions."""
-    found = [Newest(name, lambda: "") for name in names]
-    for channel in found:
-        channel._encode = lambda channel=channel: f"{channel.name} {channel.version}"  # type: ignore[misc]
-    return found
-
-
-# Browsers.
-
-
-class Page:
-    """A browser: what it was sent, and what it sends."""
-
-    def __init__(self, browsers: Browsers) -> None:
-        self.sent: list[dict[str, Any]] = []
-        self._events: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
-        self._events.put_nowait({"type": "websocket.connect"})
-        scope = {"type": "websocket", "path": "/live", "headers": []}
-        self.serving = asyncio.create_task(browsers.serve(WebSocket(scope, self._events.get, self._send)))
-
-    async def _send(self, message: Any) -> None:
-        self.sent.append(message)
-
-    def say(self, text: str) -> None:
-        self._events.put_nowait({"type": "websocket.receive", "text": text})
-
-    def leave(self) -> None:
-        self._events.put_nowait({"type": "websocket.disconnect", "code": 1000})
-
-    @property
-    def texts(self) -> list[str]:
-        """The messages so far."""
-        return [message["text"] for message in self.sent if message["type"] == "websocket.send"]
-
-    @property
-    def closed(self) -> int:
-        """The code with which it was closed, 0 if it was not."""
-        return int(self.sent[-1]["code"]) if self.sent and self.sent[-1]["type"] == "websocket.close" else 0

@@ -10,14 +10,13 @@ from omnid.monitor.robot_state import ReceivedMessage, RobotState
 from omnid.tracking_state import TrackingState
 from omnid.transport.codec import DiagnosticStatus, PoseAttachment
 from omnid.transport.decode import Diagnostics
-from omnid.web.browsers import Browsers
 from omnid.web.metrics import metrics
 from tests.omnid.transport.bus_fixtures import odometry
 
 
 def samples(state: RobotState) -> dict[tuple[str, ...], float]:
     """Return the values by their name and the values of their labels, in the order of these."""
-    text = metrics(state, Browsers([]), {"no token": 2}, {"dropped": 3, "stops": 0, "arms": 1}).decode()
+    text = metrics(state, {"no token": 2}, {"dropped": 3, "stops": 0, "arms": 1}).decode()
     found = [sample for family in parser.text_string_to_metric_families(text) for sample in family.samples]
     by_name = {
         (sample.name, *(sample.labels[label] for label in sorted(sample.labels))): sample.value for sample in found

@@ -62,8 +62,7 @@ def robot() -> Iterator[tuple[WebServer, Navigator]]:
     endpoint = free_endpoint()
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus, served("--connect", endpoint) as server:
         navigator = Navigator(bus)
-        with server.live(server.bearer) as live:
-            Shown(live).until("navigation", navigator.publish)
+        Shown(server).until("navigation", navigator.publish)
         yield server, navigator
 
 
@@ -89,8 +88,7 @@ def test_requests_reach_the_robot_and_its_answer_the_page(robot: tuple[WebServer
         assert navigator.asked[-1] == text
     refused = answer(robot, "/route", f"repeat lost stamp={server.state_ms()}")
     assert not refused["done"] and refused["text"] == "omnid refuses: that cannot be"
-    with server.live(server.bearer) as live:
-        shown = Shown(live).until("navigation", navigator.publish)
+    shown = Shown(server).until("navigation", navigator.publish)
     assert (shown["state"], shown["task"], shown["left_m"]) == ("driving", "route dock", 3.5)
 
 
