@@ -19,6 +19,7 @@ from drivers.motors.simulated.simulated_base import Pose
 from omnid.errors import OmnidError
 from omnid.simulation.building_parts import Builder, plain_paint
 from omnid.simulation.people import Person
+from omnid.simulation.rendering.ray_caster import AS_NEEDED
 from omnid.simulation.rendering.sensor import Sensor
 from omnid.simulation.rendering.shapes import Point
 from omnid.simulation.rendering.surfaces import Rectangle
@@ -59,7 +60,7 @@ class Trial:
 
     def robot(self, size_px: int = 512) -> SimulatedRobot:
         """Return the robot, with images of a size that come as JPEG from a lens with vignetting."""
-        usual = replace(make_robot(size_px), sensor=SENSOR)
+        usual = replace(make_robot(size_px), sensor=SENSOR, samples=AS_NEEDED)
         return replace(usual, **dict(self.changes))  # type: ignore[arg-type]
 
 

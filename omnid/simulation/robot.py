@@ -78,7 +78,7 @@ class SimulatedRobot:
     has_odometry: bool = True  # the daemon is given what the motor controller reports of its wheels
     has_gyro: bool = True
     rate_hz: float = 10.0  # of the cameras
-    samples: int = 2  # in lock-step: rays of a pixel, per axis
+    samples: int = 2  # in lock-step: rays of a pixel, per axis; 0: as many as needed
     pose_delay_s: float = 0.1  # in lock-step: from the exposure to the pose's arrival at the controller
     lean_rad: tuple[float, float] = (
         0.0,

@@ -14,7 +14,7 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from typing import Final
 
@@ -29,7 +29,6 @@ from tests.bench.results import ROOT, Column, ResultTable, commit
 
 LINES: Final = ROOT / "build" / "results" / "obstacles.jsonl"
 FAMILY: Final = "buildings"  # in seeds.toml
-SIDE_RAYS: Final = 3 * 512  # least number of rays along a side of an image
 OWN_MPS: Final = 0.05  # A contact at a lower speed is not the robot's own.
 DRIVEN: Final = 0.95  # share of what was asked that counts as all
 
@@ -100,7 +99,7 @@ class Asker:
 def drive(planned: Planned, overrides: Sequence[str] = ()) -> Drive:
     """Make a drive."""
     asked, cpu_s = trial(planned.world, planned.seed), time.process_time()
-    robot = replace(asked.robot(planned.size_px), samples=math.ceil(SIDE_RAYS / planned.size_px))
+    robot = asked.robot(planned.size_px)
     names = ("controller.limits.velocity_mps", "controller.heading.velocity_mps", "navigation.velocity_mps")
     settings = [f"{name}={abs(planned.speed_mps)}" for name in names]
     config = load_config(None, ["places.enabled=false", *settings, *overrides])

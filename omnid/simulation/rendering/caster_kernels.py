@@ -18,6 +18,11 @@ Numbers = NDArray[np.int32]
 Rows = tuple[Floats, Floats, Floats]  # x, y, z (N,), each contiguous: loops over columns become vector instructions
 # Least cosine between a ray and a rectangle's normal in a sample's footprint.
 MIN_SLANT = np.float32(0.02)
+# Least sine of the angle between a ray and a normal for which the ray has a direction on the surface.
+SHORT = np.float32(1e-4)
+# Texels across a footprint above which a smaller level is read, and below which one place across is enough.
+WIDEST, NARROW = np.float32(1.6), np.float32(0.8)
+MOST_STEPS = 24  # along a footprint
 # Columns of a surface: unit normal (3), fractions u and v per metre (3 each); distance along the normal, u and v of the
 # frame's origin; brightness, texels per m^2, least distance from the origin of any ray.
 SURFACE_COLUMNS = 15
@@ -140,6 +145,146 @@ def shade(
             footprint, level = footprint * QUARTER, level + 1
         size = (levels[level, 1], levels[level, 2])
         image[pixels[i]] += surfaces[k, 12] * bilinear(texels, levels[level, 0], size, (across[i], down[i]))
+
+
+@inner
+def is_behind(surface: Floats, rays: Rows, distance: Floats) -> bool:
+    """Return whether the plane of a rectangle lies behind what rays from the origin meet, or is not met at all."""
+    (x, y, z), count = rays, 0
+    for i in range(len(x)):
+        s = -surface[9] / (surface[0] * x[i] + surface[1] * y[i] + surface[2] * z[i])
+        count += (s > ZERO) & (s < distance[i])
+    return count == 0
+
+
+@inner
+def shade_one(
+    k: int,
+    surface: Floats,
+    rays: Rows,
+    spacing_and_distance: tuple[Floats, Floats],
+    pyramids: Whole,
+    levels: Whole,
+    texels: NDArray[np.uint8],
+    weight: np.float32,
+    pixels: Numbers,
+    image: Floats,
+) -> None:
+    """Add the grey of rays (N,) from the origin, one a pixel, that all meet one rectangle, over their footprints.
+
+    A footprint is a square across the ray, drawn out along the ray's projection on the surface; its grey is the mean of
+    places that cover it.
+    """
+    n0, n1, n2 = surface[0], surface[1], surface[2]
+    (x, y, z), (spacing, distance) = rays, spacing_and_distance
+    for i in range(len(x)):
+        cosine = n0 * x[i] + n1 * y[i] + n2 * z[i]
+        side = distance[i] * spacing[i]
+        # 1. The directions of the footprint on the surface: along the ray, and across.
+        ax, ay, az = x[i] - cosine * n0, y[i] - cosine * n1, z[i] - cosine * n2
+        length = np.float32(np.sqrt(ax * ax + ay * ay + az * az))
+        if length < SHORT:
+            ax, ay, az = surface[3], surface[4], surface[5]
+            length = np.float32(np.sqrt(ax * ax + ay * ay + az * az))
+        ax, ay, az = ax / length, ay / length, az / length
+        bx, by, bz = n1 * az - n2 * ay, n2 * ax - n0 * az, n0 * ay - n1 * ax
+        slant = ONE / max(abs(cosine), MIN_SLANT)
+        # 2. The level whose texels are about as large as the square, and the places that cover the footprint there.
+        level, last = pyramids[k, 0], pyramids[k, 0] + pyramids[k, 1] - 1
+        texels_across = side * np.float32(np.sqrt(surface[13]))
+        while texels_across > WIDEST and level < last:
+            texels_across, level = texels_across * HALF, level + 1
+        steps = min(int(np.ceil(texels_across * slant)), MOST_STEPS)
+        ways = 2 if texels_across > NARROW else 1
+        along, across = side * slant / np.float32(steps), side / np.float32(ways)
+        # 3. Place, and a step along and across, as fractions of the outline.
+        px, py, pz = distance[i] * x[i], distance[i] * y[i], distance[i] * z[i]
+        u = surface[10] + surface[3] * px + surface[4] * py + surface[5] * pz
+        v = surface[11] + surface[6] * px + surface[7] * py + surface[8] * pz
+        ua = along * (surface[3] * ax + surface[4] * ay + surface[5] * az)
+        va = along * (surface[6] * ax + surface[7] * ay + surface[8] * az)
+        ub = across * (surface[3] * bx + surface[4] * by + surface[5] * bz)
+        vb = across * (surface[6] * bx + surface[7] * by + surface[8] * bz)
+        # 4. The mean grey.
+        size, total = (levels[level, 1], levels[level, 2]), ZERO
+        for n in range(steps):
+            m = np.float32(n) - np.float32(steps - 1) * HALF
+            for way in range(ways):
+                w = np.float32(way) - np.float32(ways - 1) * HALF
+                total += bilinear(texels, levels[level, 0], size, (u + m * ua + w * ub, v + m * va + w * vb))
+        image[pixels[i]] += weight * surface[12] * total / np.float32(steps * ways)
+
+
+@compiled(
+    "(f4[:, ::1], f4[::1], i4[:, ::1], i8[::1], f4[:, ::1], f4[::1], i8[::1], b1[:, ::1], f4[:, :, ::1], f4[:, ::1], "
+    "i8[:, ::1], i8[:, ::1], u1[::1], f4, b1[:, ::1], f4[::1])",
+    writes=("seen", "image"),
+)
+def cast_plain_tiles(
+    rays: Floats,
+    spacing: Floats,
+    index: Numbers,
+    starts: Whole,
+    axes: Floats,
+    sines: Floats,
+    parents: Whole,
+    seen_by_parents: NDArray[np.bool_],
+    sides: Floats,
+    surfaces: Floats,
+    pyramids: Whole,
+    levels: Whole,
+    texels: NDArray[np.uint8],
+    weight: np.float32,
+    seen: NDArray[np.bool_],
+    image: Floats,
+) -> None:
+    """Add the greys of a central camera in M tiles that show one rectangle only, each times a weight.
+
+    One ray a pixel: rays (3, N), spacing (N,), index (2, N) of the pixel. axes (M, 3) and sines (M,): the tiles' cones;
+    parents (M,): larger tiles, and the rectangles that they may see (P, R). sides (R, 4, 3): normals, to the inside, of
+    the planes through the origin and an edge. seen (M, R): set to what the other tiles may see, for `cast`.
+    """
+    largest, surface_count = 0, len(surfaces)
+    for tile in range(len(starts) - 1):
+        largest = max(largest, starts[tile + 1] - starts[tile])
+    zeros = np.zeros(largest, np.float32)
+    nearest, distance = np.empty(largest, np.int32), np.empty(largest, np.float32)
+    tried = np.empty(surface_count, np.int64)
+    for tile in range(len(starts) - 1):
+        low, high = starts[tile], starts[tile + 1]
+        count = high - low
+        ray = rays[0, low:high], rays[1, low:high], rays[2, low:high]
+        origin = zeros[:count], zeros[:count], zeros[:count]
+        for i in range(count):
+            nearest[i], distance[i] = -1, FAR_M
+        # 1. The rectangles whose pyramids the tile's cone meets, up to those behind all that was met.
+        number = 0
+        for k in range(surface_count):
+            seen[tile, k] = False
+            if not seen_by_parents[parents[tile], k]:
+                continue
+            outside = 0
+            for n in range(4):
+                x, y, z = sides[k, n, 0], sides[k, n, 1], sides[k, n, 2]
+                outside += axes[tile, 0] * x + axes[tile, 1] * y + axes[tile, 2] * z < -sines[tile]
+            if outside:
+                continue
+            seen[tile, k] = True
+            if farther(distance[:count], surfaces[k, 14]) > 0:
+                take_nearer(np.int32(k), surfaces[k], ray, origin, nearest[:count], distance[:count])
+                tried[number] = k
+                number += 1
+        # 2. Is it the same one for all rays, with all others behind it?
+        only = nearest[0]
+        for i in range(1, count):
+            only = only if nearest[i] == only else -1
+        for n in range(number):
+            if only >= 0 and tried[n] != only and not is_behind(surfaces[tried[n]], ray, distance[:count]):
+                only = -1
+        if only >= 0:
+            seen[tile] = False
+            part = spacing[low:high], distance[:count]
+            shade_one(only, surfaces[only], ray, part, pyramids, levels, texels, weight, index[0, low:high], image)
 
 
 @compiled(

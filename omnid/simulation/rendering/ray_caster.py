@@ -19,11 +19,15 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.models.camera import Array, OmniCamera
 from calib.rig import MountedCamera
-from omnid.simulation.rendering.caster_kernels import SURFACE_COLUMNS, cast
+from omnid.simulation.rendering.caster_kernels import SURFACE_COLUMNS, cast, cast_plain_tiles
 from omnid.simulation.rendering.surfaces import Rectangle, Scene, Texture
 
 Floats = NDArray[np.float32]
 TILE_PX = 32
+# Number of samples for "as many as needed": one ray a pixel where a tile of NEEDED_PX shows one rectangle, else as many
+# as make SIDE_RAYS along a side of the image. With two a pixel and axis at 512 px, joints of tiles come and go from
+# pixel to pixel, as no lens shows them; with three they do not.
+AS_NEEDED, NEEDED_PX, SIDE_RAYS = 0, 8, 3 * 512
 # Pixels lifted at once, which bounds memory.
 RAY_CHUNK = 1 << 18
 # Number of ray tables that are cached.
@@ -54,18 +58,35 @@ class RayTable:
     axes: Array  # (M, 3) unit
     angles: Array  # (M,) [rad] from the axis to the farthest ray of a tile
     reach_m: float  # of the farthest origin from the camera's
+    tiles: NDArray[np.int64]  # (M,) row by row over all tiles of the image
+
+    def kept(self, tiles: NDArray[np.int64]) -> RayTable:
+        """Return the table of some of the tiles, in their order."""
+        rows = np.searchsorted(self.tiles, tiles)
+        spans = [np.arange(self.starts[row], self.starts[row + 1]) for row in rows]
+        chosen = np.concatenate(spans)
+        return replace(
+            self,
+            rays=np.ascontiguousarray(self.rays[:, chosen]),
+            spacing=self.spacing[chosen],
+            index=np.ascontiguousarray(self.index[:, chosen]),
+            starts=np.concatenate([[0], np.cumsum([len(span) for span in spans])]),
+            axes=self.axes[rows],
+            angles=self.angles[rows],
+            tiles=tiles,
+        )
 
 
-def ray_table(mounted: MountedCamera, supersample: int) -> RayTable:
-    """Return the rays of all samples (supersample^2 per pixel) inside the camera's mask."""
+def ray_table(mounted: MountedCamera, supersample: int, tile_samples: int = TILE_PX) -> RayTable:
+    """Return the rays of all samples (supersample^2 per pixel) inside the camera's mask, by tiles of a side."""
     width, height = mounted.camera.size
     rays, spacing = _lift_grid(mounted, supersample)
     ss_height, ss_width = height * supersample, width * supersample
     rows, columns = np.divmod(np.arange(ss_height * ss_width), ss_width)
-    tile = rows // TILE_PX * (-(-ss_width // TILE_PX)) + columns // TILE_PX
+    tile = rows // tile_samples * (-(-ss_width // tile_samples)) + columns // tile_samples
     index = np.flatnonzero(np.isfinite(rays[:, 0]) & np.isfinite(spacing))
     index = index[np.argsort(tile[index], kind="stable")]
-    _, starts = np.unique(tile[index], return_index=True)
+    tiles, starts = np.unique(tile[index], return_index=True)
     starts = np.append(starts, len(index))
     axes, angles = _cones(rays[index], starts)
     origins = _origins(mounted, supersample, index)
@@ -82,6 +103,7 @@ def ray_table(mounted: MountedCamera, supersample: int) -> RayTable:
         axes,
         angles,
         reach_m,
+        tiles,
     )
 
 
@@ -135,17 +157,33 @@ def _cones(rays: Floats, starts: NDArray[np.int64]) -> tuple[Array, Array]:
     return axes, np.arccos(np.clip(np.minimum.reduceat(cosines, starts[:-1]), -1, 1)) + CONE_MARGIN_RAD
 
 
-_tables: dict[tuple[int, int], tuple[MountedCamera, RayTable]] = {}
+_tables: dict[tuple[int, int], tuple[MountedCamera, tuple[RayTable, ...]]] = {}
 
 
-def cached_table(mounted: MountedCamera, supersample: int) -> RayTable:
-    """Return the camera's table, computed once; the camera is kept with it so that its id stays unique."""
+def cached_tables(mounted: MountedCamera, supersample: int) -> tuple[RayTable, ...]:
+    """Return the camera's table, computed once; the camera is kept with it so that its id stays unique.
+
+    AS_NEEDED: of all fine rays; of one ray a pixel, in the same tiles; of one ray a pixel in large tiles.
+    """
     key = (id(mounted), supersample)
     if key not in _tables:
         if len(_tables) >= MAX_TABLES:
             del _tables[next(iter(_tables))]
-        _tables[key] = (mounted, ray_table(mounted, supersample))
+        if supersample == AS_NEEDED:
+            finest = -(-SIDE_RAYS // max(mounted.camera.size))
+            fine, single = (ray_table(mounted, samples, NEEDED_PX * samples) for samples in (finest, 1))
+            common = np.intersect1d(fine.tiles, single.tiles)
+            _tables[key] = mounted, (fine.kept(common), single.kept(common), ray_table(mounted, 1))
+        else:
+            _tables[key] = mounted, (ray_table(mounted, supersample),)
     return _tables[key][1]
+
+
+def _parents(small: RayTable, large: RayTable) -> NDArray[np.int64]:
+    """Return in which of the large tiles each small one (M,) is."""
+    times, width = TILE_PX // NEEDED_PX, small.shape[1]
+    rows, columns = np.divmod(small.tiles, -(-width // NEEDED_PX))
+    return np.searchsorted(large.tiles, rows // times * (-(-width // TILE_PX)) + columns // times)
 
 
 # Guards against division by zero at a rectangle through the viewpoint [m].
@@ -162,18 +200,25 @@ def render_grey(
 ) -> Floats:
     """Return the ideal image (H, W) float32, 0 to 255; 0 outside the mask and for rays that hit no rectangle.
 
+    supersample: rays of a pixel, per axis, or AS_NEEDED.
     row_twist (6,): motion of the rig in its own frame from one image row to the next (rolling shutter).
     """
-    table = cached_table(mounted, supersample)
+    table, *single = cached_tables(mounted, supersample)
     poses, turned_rad = _row_poses(table, T_world_rig, np.zeros(6) if row_twist is None else row_twist)
     poses = poses @ se3.inverse(mounted.T_cam_rig)
     reach_m = table.reach_m + float(np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1).max())
-    corners = se3.apply(se3.inverse(poses[0]), np.array([r.corners for r in scene.rectangles]))
+    corners = se3.apply(se3.inverse(poses[0]), corners_of(scene.rectangles))
     distance_m = _distances_m(corners)
-    seen = tiles_that_see(table, corners, turned_rad + np.arcsin(np.clip(reach_m / distance_m, 0, 1)))
     order = np.argsort(distance_m, kind="stable")
     atlas = cached_atlas([r.texture for r in scene.rectangles])
     image = np.zeros(table.shape[0] * table.shape[1], np.float32)
+    surfaces = _surfaces([scene.rectangles[i] for i in order], poses[0], distance_m[order] - reach_m)
+    painted = surfaces, atlas.pyramids[order], atlas.levels, atlas.texels
+    if single:
+        seen = _plain_tiles(*single, corners[order], reach_m, table.supersample**2, painted, image)
+    else:
+        aside_rad = turned_rad + np.arcsin(np.clip(reach_m / distance_m, 0, 1))
+        seen = np.ascontiguousarray(tiles_that_see(table, corners, aside_rad)[:, order])
     cast(
         table.rays,
         table.origins,
@@ -181,14 +226,42 @@ def render_grey(
         table.index,
         table.starts,
         np.ascontiguousarray((se3.inverse(poses[:1]) @ poses)[:, :3]),
-        np.ascontiguousarray(seen[:, order]),
-        _surfaces([scene.rectangles[i] for i in order], poses[0], distance_m[order] - reach_m),
-        atlas.pyramids[order],
-        atlas.levels,
-        atlas.texels,
+        seen,
+        *painted,
         image,
     )
-    return np.asarray(image.reshape(table.shape) / np.float32(supersample**2), np.float32)
+    return np.asarray(image.reshape(table.shape) / np.float32(table.supersample**2), np.float32)
+
+
+def _plain_tiles(
+    single: RayTable,
+    large: RayTable,
+    corners: Array,
+    reach_m: float,
+    weight: int,
+    painted: tuple[Floats, NDArray[np.int64], NDArray[np.int64], NDArray[np.uint8]],
+    image: Floats,
+) -> NDArray[np.bool_]:
+    """Add the greys of the tiles that show one rectangle of corners (R, 4, 3) only; return what the others see."""
+    if reach_m:
+        raise ValueError("as many rays as needed: for central cameras that take all rows at once only")
+    seen = np.empty((len(single.tiles), len(corners)), bool)
+    cast_plain_tiles(
+        single.rays,
+        single.spacing,
+        single.index,
+        single.starts,
+        single.axes.astype(np.float32),
+        np.sin(np.minimum(single.angles, np.pi / 2)).astype(np.float32),
+        _parents(single, large),
+        np.ascontiguousarray(tiles_that_see(large, corners, np.zeros(len(corners)))),
+        sides_of(corners).astype(np.float32),
+        *painted,
+        np.float32(weight),
+        seen,
+        image,
+    )
+    return seen
 
 
 def _row_poses(table: RayTable, T_world_rig: Array, row_twist: Array) -> tuple[Array, float]:
@@ -206,13 +279,13 @@ def _surfaces(rectangles: Sequence[Rectangle], T_world_cam: Array, nearest_m: Ar
     nearest_m (R,): least distance of each from the origin of any ray.
     """
     rows = np.empty((len(rectangles), SURFACE_COLUMNS))
-    edges = np.array([np.column_stack([r.edge_u, r.edge_v, r.normal]) for r in rectangles])
+    edges = np.array([(r.edge_u, r.edge_v, r.normal) for r in rectangles]).transpose(0, 2, 1)
     from_origin = T_world_cam[:3, 3] - np.array([r.origin for r in rectangles])
     u_v_n = np.linalg.inv(edges)
     rows[:, :9] = (u_v_n @ T_world_cam[:3, :3])[:, [2, 0, 1]].reshape(-1, 9)
     rows[:, 9:12] = np.einsum("rij,rj->ri", u_v_n, from_origin)[:, [2, 0, 1]]
     rows[:, 12] = [r.brightness for r in rectangles]
-    rows[:, 13] = [r.texture.size / (r.width_m * r.height_m) for r in rectangles]
+    rows[:, 13] = [r.texture.size for r in rectangles] / np.linalg.norm(edges[:, :, :2], axis=1).prod(axis=1)
     rows[:, 14] = nearest_m - MARGIN_M
     return rows.astype(np.float32)
 
@@ -223,14 +296,28 @@ def tiles_that_see(table: RayTable, corners: Array, aside_rad: Array) -> NDArray
     A tile sees none of what lies between the sides of a pyramid if its whole cone is beyond one of them. aside_rad
     (R,): largest angle between a ray and the direction from the camera's origin of what it meets.
     """
-    # 1. The four sides through the origin and an edge, with normals to the inside; 0 where an edge leads to the origin.
-    normals = np.cross(corners, np.roll(corners, -1, axis=1))
-    inwards = np.sign((normals * corners.mean(axis=1, keepdims=True)).sum(axis=(1, 2)))
-    normals *= (inwards[:, None] / np.maximum(np.linalg.norm(normals, axis=2), MIN_DISTANCE_M**2))[:, :, None]
-    # 2. The least sine, of all four, of the angle from a side to the tile's axis.
+    normals = sides_of(corners)
+    # The least sine, of all four, of the angle from a side to the tile's axis.
     sines = np.min([table.axes @ normals[:, side].T for side in range(4)], axis=0)
     reach_rad = np.minimum(table.angles[:, None] + aside_rad, np.pi / 2)
     return np.asarray(sines >= -np.sin(reach_rad))
+
+
+def sides_of(corners: Array) -> Array:
+    """Return the normals (R, 4, 3), to the inside, of the sides of the pyramids from the origin through rectangles.
+
+    They are 0 where an edge leads to the origin.
+    """
+    normals = np.cross(corners, np.roll(corners, -1, axis=1))
+    inwards = np.sign((normals * corners.mean(axis=1, keepdims=True)).sum(axis=(1, 2)))
+    normals *= (inwards[:, None] / np.maximum(np.linalg.norm(normals, axis=2), MIN_DISTANCE_M**2))[:, :, None]
+    return np.asarray(normals)
+
+
+def corners_of(rectangles: Sequence[Rectangle]) -> Array:
+    """Return the corners (R, 4, 3) of rectangles."""
+    origins, u, v = (np.array([getattr(r, name) for r in rectangles]) for name in ("origin", "edge_u", "edge_v"))
+    return np.stack([origins, origins + u, origins + u + v, origins + v], axis=1)
 
 
 def _distances_m(corners: Array) -> Array:
