@@ -11,13 +11,12 @@ from msgspec import Struct
 
 from calib import se3
 from calib.errors import CalibError
-from calib.kalibr import load_yaml
 from calib.models.camera import Array
 from calib.models.ocam import MAX_COEFFICIENTS, OcamCamera, View
-from calib.rig import MIN_BASELINE_M, Rig
-from calib.rig_frame import rig_between
+from calib.rig import MIN_BASELINE_M
+from calib.text_files import decode, load_mapping
 from calib.typed_toml import convert, shown, table_of
-from calib.validation import MAX_PIXELS, MAX_SIDE_PX, decode, is_image_size, read_bytes, transform_of
+from calib.validation import MAX_PIXELS, MAX_SIDE_PX, is_image_size, read_bytes, transform_of
 
 # More than any file needs: one of the toolbox has about 2 kB.
 MAX_BYTES = 1 << 16
@@ -62,14 +61,8 @@ class _Line:
         return self.numbers(f"a count and {what}", count + 1)[1:]
 
 
-def import_ocam(lower_path: Path, upper_path: Path, T_lower_upper: Array, view: View = "mirror") -> Rig:
-    """Read the rig of two calib_results.txt; its frame is the lower viewpoint's, see rig_between."""
-    lower, upper = (parse_ocam(read_bytes(path, MAX_BYTES), view, str(path)) for path in (lower_path, upper_path))
-    return rig_between(lower, upper, T_lower_upper)
-
-
 def parse_ocam(text: str | bytes, view: View = "mirror", name: str = "calib_results.txt") -> OcamCamera:
-    """Parse the camera of a calib_results.txt's text; the inverse polynomial is checked and not used."""
+    """Parse the camera of a calib_results.txt's text; the inverse polynomial, of any length, is not used."""
     if len(text) > MAX_BYTES:
         raise CalibError(f"{name}: expected at most {MAX_BYTES} bytes, found {len(text)}")
     lines = [
@@ -77,16 +70,15 @@ def parse_ocam(text: str | bytes, view: View = "mirror", name: str = "calib_resu
         for number, line in enumerate(decode(text, name).splitlines(), 1)
         if line.strip() and not line.lstrip().startswith("#")
     ]
-    if len(lines) != 5:
+    if len(lines) < 4:
         raise CalibError(
-            f"{name}: expected 5 lines of numbers (polynomial, inverse polynomial, centre, affine, image "
-            f"size), found {len(lines)}"
+            f"{name}: expected lines of numbers (polynomial, inverse polynomial, centre, affine, image size), found "
+            f"{len(lines)}"
         )
     polynomial = lines[0].counted("polynomial coefficients")
-    lines[1].counted("inverse polynomial coefficients")
-    row, column = lines[2].numbers("row and column of the centre", 2)
-    c, d, e = lines[3].numbers("affine c d e", 3)
-    size = _size(lines[4])
+    row, column = lines[-3].numbers("row and column of the centre", 2)
+    c, d, e = lines[-2].numbers("affine c d e", 3)
+    size = _size(lines[-1])
     try:
         return OcamCamera(polynomial, (row, column), (c, d, e), size, view)
     except CalibError as error:
@@ -106,8 +98,8 @@ def read_transform(path: Path) -> Array:
     try:
         if path.suffix == ".toml":
             return _named(table_of(data))
-        if path.suffix in (".yaml", ".yml"):
-            return _named({str(key): value for key, value in load_yaml(data, name).items()})
+        if path.suffix in (".yaml", ".yml", ".json"):
+            return _named(dict(load_mapping(data, name)))
         words = " ".join(line.partition("#")[0] for line in decode(data, name).splitlines()).replace(",", " ").split()
         try:
             numbers = [float(word) for word in words]

@@ -42,6 +42,7 @@ from calib.models.unified import OMNI_NAMES, UnifiedCamera
 from calib.models.wavefront import WAVEFRONT_NAMES
 from calib.rig import MountedCamera, Rig, ShutterTimes
 from calib.rig_covariance import MAX_PARAMETERS, TRANSFORM_NAMES, RigCovariance
+from calib.text_files import decode
 from calib.typed_toml import convert, shown, table_of
 from calib.validation import MAX_PIXELS, MAX_SIDE_PX, is_image_size, read_bytes, transform_of
 
@@ -162,8 +163,9 @@ def read_rig(path: str | os.PathLike[str]) -> Rig:
 
 def parse_rig(text: str | bytes, folder: Path | None = None, name: str = "rig.toml") -> Rig:
     """Parse the rig of a `rig.toml`'s text; folder contains its mask images, None permits embedded ones only."""
+    data = decode(text, name).encode()
     with _within(f"{name}: "):
-        values = table_of(text.encode() if isinstance(text, str) else text)
+        values = table_of(data)
         _require_version("schema", values.get("schema"), SCHEMA)  # first, as another one has other keys
         table = convert(RigTable, values)
         lower, upper = (_mounted(side, getattr(table, side), folder) for side in SIDES)

@@ -17,13 +17,20 @@ MAX_LEAN_DEG = 45.0
 
 
 def rig_between(lower: OmniCamera, upper: OmniCamera, T_lower_upper: Array, topics: tuple[str, str] = ("", "")) -> Rig:
-    """Return the rig with its frame at the lower viewpoint: z to the upper one, x along the lower image's u axis."""
+    """Return the rig with its frame at the lower viewpoint: z to the upper one, x ahead (REP 103).
+
+    Ahead is the part across z of the mean optical axis, if the cameras look to the side. Of cameras that look along z,
+    as mirrors and fisheyes that see all around, x is the lower image's u axis.
+    """
     baseline = float(np.linalg.norm(T_lower_upper[:3, 3]))
     if not baseline >= MIN_BASELINE_M:
         raise CalibError(f"rig: the viewpoints must lie apart, found {baseline * 1e3:.3f} mm between them")
     z = T_lower_upper[:3, 3] / baseline
     u, v = image_axis(lower, (STEP_PX, 0.0)), image_axis(lower, (0.0, STEP_PX))
-    forward = u if abs(z @ u) < 0.9 else v
+    axes = optical_axis(lower), T_lower_upper[:3, :3] @ optical_axis(upper)
+    forward = (axes[0] + axes[1]) / 2
+    if np.linalg.norm(forward - z * (z @ forward)) < np.sin(np.deg2rad(MAX_LEAN_DEG)):
+        forward = u if abs(z @ u) < 0.9 else v
     x = forward - z * (z @ forward)
     x /= np.linalg.norm(x)
     T_lower_rig = se3.transform(np.column_stack([x, np.cross(z, x), z]), np.zeros(3))
@@ -38,9 +45,22 @@ def is_turned_over(rig: Rig) -> bool:
     lower part of its image. A lens that looks along the baseline may look up or down: False.
     """
     camera, z = rig.lower.camera, rig.lower.T_cam_rig[:3, 2]
-    ahead = camera.lift(np.array([camera.center]))[0]
-    below = image_axis(camera, (0.0, STEP_PX)) if sees_directly(camera) else ahead
+    below = image_axis(camera, (0.0, STEP_PX)) if sees_directly(camera) else optical_axis(camera)
     return bool(z @ below > np.cos(np.deg2rad(MAX_LEAN_DEG)))
+
+
+def turned_over_note(rig: Rig) -> str:
+    """Return the warning about a rig that is turned over."""
+    mounted = "stand upside down" if sees_directly(rig.lower.camera) else "look down into their mirrors"
+    return (
+        f"the upper camera is found below the lower one: exchange their images, unless the cameras {mounted}; "
+        "the rig's z would point down"
+    )
+
+
+def optical_axis(camera: OmniCamera) -> Array:
+    """Return the unit ray (3,) of the image's centre in the camera frame."""
+    return np.asarray(camera.lift(np.array([camera.center]))[0])
 
 
 def image_axis(camera: OmniCamera, step_px: tuple[float, float]) -> Array:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from os import PathLike
+from typing import TypeAlias
 
 import numpy as np
 
@@ -18,6 +19,10 @@ MAX_SIDE_PX = 32767  # because OpenCV's remap takes no larger images
 MAX_PIXELS = 64 * 2**20  # because a mask of one byte a pixel must fit the memory
 # A rotation typed with few digits is made orthonormal, so that one that a program wrote is not changed.
 ORTHONORMAL_TOLERANCE = 1e-9
+# Numbers of a rotation that are typed with three digits are this far off the nearest one; more are no rotation. Below
+# the second bound, 0.001 degree, nothing is said.
+TYPED_TOLERANCE, FEW_DIGITS = 1e-3, 1e-5
+Warn: TypeAlias = Callable[[str], None]
 
 
 def read_bytes(path: str | PathLike[str], limit: int = MAX_FILE_BYTES) -> bytes:
@@ -28,26 +33,32 @@ def read_bytes(path: str | PathLike[str], limit: int = MAX_FILE_BYTES) -> bytes:
         raise CalibError(f"{path}: {error}") from error
 
 
-def decode(data: bytes | str, name: str) -> str:
-    """Return the text of a calibration file, UTF-8."""
-    try:
-        return data if isinstance(data, str) else data.decode()
-    except UnicodeDecodeError as error:
-        raise CalibError(f"{name}: expected UTF-8 text, found byte {data[error.start]!r} at {error.start}") from error
-
-
 def is_image_size(width: float, height: float) -> bool:
     """True if images of this size [px] are supported."""
     return min(width, height) >= 1 and max(width, height) <= MAX_SIDE_PX and width * height <= MAX_PIXELS
 
 
-def transform_of(rows: Sequence[Sequence[float]] | None, key: str) -> Array:
-    """Return the rigid transform (4, 4) of the finite numbers under a key, with an orthonormal rotation."""
+def silent(line: str) -> None:
+    """Report nothing."""
+
+
+def transform_of(rows: Sequence[Sequence[float]] | None, key: str, warn: Warn = silent) -> Array:
+    """Return the rigid transform (4, 4) of the finite numbers under a key, with the nearest rotation.
+
+    `warn` takes a line about numbers that were typed with few digits.
+    """
     if rows is None or [len(row) for row in rows] != [4, 4, 4, 4]:
         raise CalibError(f"{key}: expected 4 rows of 4 numbers, found {'nothing' if rows is None else shown(rows)}")
     T = np.array(rows, float)
-    if not se3.is_rigid(T):
-        raise CalibError(f"{key}: expected a rotation and a translation over 0 0 0 1, found {shown(rows)}")
+    R = rigid(T)[:3, :3] if np.isfinite(T).all() else np.eye(3)
+    off = float(np.abs(T[:3, :3] - R).max())
+    if not (off <= TYPED_TOLERANCE and np.linalg.det(R) > 0 and np.abs(T[3] - np.eye(4)[3]).max() <= 1e-4):
+        most = f", up to {off:.2g} off a rotation" if np.isfinite(off) and np.linalg.det(R) > 0 else ""
+        raise CalibError(f"{key}: expected a rotation and a translation over 0 0 0 1, found {shown(rows)}{most}")
+    if off > FEW_DIGITS:
+        warn(
+            f"{key}: its numbers are up to {off:.1g} off a rotation, as typed with few digits: the nearest one is used"
+        )
     return rigid(T)
 
 

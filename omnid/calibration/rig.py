@@ -29,7 +29,7 @@ from calib.models.names import sees_directly
 from calib.models.ocam import OcamCamera, View
 from calib.rig import Rig
 from calib.rig_file import write_rig
-from calib.rig_frame import is_turned_over, rig_between
+from calib.rig_frame import is_turned_over, rig_between, turned_over_note
 from drivers.logs.log_reader import AnyCameras, LogCameras
 from omnid.calibration.board_search import AnyBoard, Progress, find_boards, select_diverse_views, silent
 from omnid.calibration.images import SIDES, Image, Images, PairedImages, brightest, read_pairs
@@ -269,11 +269,7 @@ def _order_notes(rig: Rig) -> list[str]:
     """Return a warning where the images of both cameras seem to be exchanged: the world would be upside down."""
     if not is_turned_over(rig):
         return []
-    mounted = "stand upside down" if sees_directly(rig.lower.camera) else "look down into their mirrors"
-    return [
-        f"the upper camera is found below the lower one: exchange their images, unless the cameras {mounted}; "
-        "the rig's z would point down"
-    ]
+    return [turned_over_note(rig)]
 
 
 def _masked_rig(found: RigCalibration, images: PairedImages, *, with_struts: bool) -> tuple[Rig, list[str]]:

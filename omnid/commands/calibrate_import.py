@@ -10,14 +10,17 @@ from pathlib import Path
 import numpy as np
 
 from calib import se3
+from calib.camera_files import import_pair, is_camera_info
 from calib.equirectangular_file import import_helvipad, stacked_rig
-from calib.kalibr import import_kalibr
+from calib.kalibr import import_chain
 from calib.models.camera import field_of_view
 from calib.models.names import model_name
 from calib.models.ocam import VIEWS, OcamCamera
-from calib.ocam_file import import_ocam, read_transform, straight_up
+from calib.ocam_file import read_transform, straight_up
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import write_rig
+from calib.text_files import MAX_JSON_BYTES, load_mapping
+from calib.validation import read_bytes
 from omnid.commands.calibrate_options import HEIGHT, height_of, with_height
 from omnid.commands.options import command, exclusive, option, warn
 from omnid.errors import OmnidError
@@ -25,12 +28,17 @@ from omnid.sinks.files import check_outputs
 
 
 @command(
-    option("camchain", nargs="?", type=Path, help="Kalibr's camchain.yaml, or Helvipad's calibration.json"),
+    option(
+        "camchain",
+        nargs="?",
+        type=Path,
+        help="both cameras: Kalibr's camchain.yaml, basalt's or Helvipad's calibration.json",
+    ),
     option(
         "--lower",
         default="",
-        help="the lower camera: its name in the camchain (cam0), its "
-        "calib_results.txt, or with a calibration.json a folder of its images",
+        help="the lower camera: its name in the camchain (cam0), or its file: OCamCalib's calib_results.txt, ROS's "
+        "camera_info, OpenCV's, EuRoC's sensor.yaml, camodocal's; with Helvipad's calibration.json a folder of images",
     ),
     option("--upper", default="", help="the same for the upper camera"),
     exclusive(
@@ -50,6 +58,13 @@ from omnid.sinks.files import check_outputs
     ),
     option(
         "--view", choices=VIEWS, help="OCamCalib: the world is seen in a mirror (default) or directly through a lens"
+    ),
+    option(
+        "--frame",
+        choices=("imu", "cameras"),
+        default="imu",
+        help="the rig frame of a file with T_cam_imu: that of the IMU, whose z must point up (default); cameras: the "
+        "origin at the lower viewpoint, z to the upper one, x ahead",
     ),
     HEIGHT,
     option("-o", "--output", type=Path, required=True, help="the rig.toml to write"),
@@ -78,15 +93,31 @@ def _must_be_writable(path: Path) -> None:
 def _imported(args: argparse.Namespace) -> Rig:
     if args.equirectangular:
         return _stitched(args)
-    if args.camchain and args.camchain.suffix == ".json":
-        check_outputs([("--output", args.output)], [("the file that is read", args.camchain)])
-        if not args.lower:
-            raise OmnidError(
-                f"{args.camchain}: it does not tell the size of the images: give --lower FOLDER, the "
-                "folder of the lower camera's images"
-            )
-        return import_helvipad(args.camchain, Path(args.lower))
-    return _kalibr(args) if args.camchain else _ocam(args)
+    if args.camchain is None:
+        return _pair(args)
+    if args.camchain.suffix == ".toml":
+        raise OmnidError(f"{args.camchain}: a rig.toml needs no import: use it as it is, --rig {args.camchain}")
+    check_outputs([("--output", args.output)], [("the file that is read", args.camchain)])
+    values = load_mapping(read_bytes(args.camchain, MAX_JSON_BYTES), str(args.camchain))
+    if is_camera_info(values) or "model_type" in values or "T_BS" in values:
+        raise OmnidError(f"{args.camchain}: it has one camera: give the files of both as --lower FILE --upper FILE")
+    if "stereo_baseline" in values:
+        return _helvipad(args)
+    if args.transform or args.baseline is not None or args.view:
+        raise OmnidError(
+            f"{args.camchain}: --transform, --baseline and --view go with files of one camera each; this one holds its "
+            "transforms"
+        )
+    return import_chain(args.camchain, args.lower, args.upper, args.frame, warn)
+
+
+def _helvipad(args: argparse.Namespace) -> Rig:
+    if not args.lower:
+        raise OmnidError(
+            f"{args.camchain}: it does not tell the size of the images: give --lower FOLDER, the folder of the lower "
+            "camera's images"
+        )
+    return import_helvipad(args.camchain, Path(args.lower))
 
 
 def _stitched(args: argparse.Namespace) -> Rig:
@@ -101,32 +132,17 @@ def _stitched(args: argparse.Namespace) -> Rig:
     return stacked_rig((int(size[1]), int(size[2])), args.baseline)
 
 
-def _kalibr(args: argparse.Namespace) -> Rig:
-    if args.camchain.suffix == ".toml":
-        raise OmnidError(f"{args.camchain}: a rig.toml needs no import: use it as it is, --rig {args.camchain}")
-    if args.transform or args.baseline is not None or args.view:
-        raise OmnidError(
-            f"{args.camchain}: --transform, --baseline and --view go with OCamCalib files; a Kalibr file "
-            "holds its transforms"
-        )
-    check_outputs([("--output", args.output)], [("the file that is read", args.camchain)])
-    return import_kalibr(args.camchain, args.lower, args.upper, warn)
-
-
-def _ocam(args: argparse.Namespace) -> Rig:
+def _pair(args: argparse.Namespace) -> Rig:
     if not (args.lower and args.upper):
         raise OmnidError(
-            "calibrate import: expected a Kalibr camchain.yaml, or two OCamCalib files as --lower and --upper"
-        )
-    if args.transform is None and args.baseline is None:
-        raise OmnidError(
-            "calibrate import: OCamCalib files do not contain the transform between the cameras: give "
-            "--transform FILE or --baseline METRES"
+            "calibrate import: expected a Kalibr camchain.yaml, or two files of one camera each as --lower and --upper"
         )
     read = [Path(args.lower), Path(args.upper), *([args.transform] if args.transform else [])]
     check_outputs([("--output", args.output)], [("a file that is read", path) for path in read])
-    T_lower_upper = read_transform(args.transform) if args.transform else straight_up(args.baseline)
-    return import_ocam(Path(args.lower), Path(args.upper), T_lower_upper, args.view or "mirror")
+    T_lower_upper = None
+    if args.transform or args.baseline is not None:
+        T_lower_upper = read_transform(args.transform) if args.transform else straight_up(args.baseline)
+    return import_pair(Path(args.lower), Path(args.upper), T_lower_upper, args.view or "mirror", warn)
 
 
 def describe(rig: Rig) -> str:

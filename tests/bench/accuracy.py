@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 import omnid
 from calib import se3
-from calib.kalibr import import_kalibr
+from calib.kalibr import import_chain
 from calib.rig import Rig
 from calib.rig_file import read_rig, write_rig
 from omnid.diagnostics.run_summary import summary_entries
@@ -75,7 +75,7 @@ def rig_of(folder: Path) -> Rig:
         return read_rig(folder / "rig.toml")
     with TemporaryDirectory() as work:
         path = Path(work) / "rig.toml"
-        write_rig(path, import_kalibr(camchain))
+        write_rig(path, import_chain(camchain))
         return read_rig(path)
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.kalibr import import_kalibr
+from calib.kalibr import import_chain
 from calib.rig import Rig
 from calib.rig_file import read_rig
 from drivers.logs.log_reader import LogReader
@@ -131,7 +131,7 @@ def rig_of(folder: Path) -> Rig:
     if (folder / "rig.toml").exists():
         return read_rig(folder / "rig.toml")
     if (folder / "camchain.yaml").exists():
-        return import_kalibr(folder / "camchain.yaml")
+        return import_chain(folder / "camchain.yaml")
     reader = LogReader(folder / "log.mcap")
     try:
         return attached_rig(reader, folder / "log.mcap")

@@ -58,7 +58,7 @@ def test_refuses_a_rig_that_would_fill_the_memory(text: str, reason: str) -> Non
 
 def test_refuses_yaml_aliases() -> None:
     text = "a: &a [x, x]\n" + "".join(f"{b}: &{b} [*{a}, *{a}, *{a}, *{a}]\n" for a, b in pairwise("abcdefghijklmnop"))
-    assert "no anchors and aliases" in refusal("kalibr", "parse_kalibr", repr(f"{text}cam0: *p\ncam1: *p\n"))
+    assert "no anchors and aliases" in refusal("kalibr", "parse_chain", repr(f"{text}cam0: *p\ncam1: *p\n"))
 
 
 @pytest.mark.parametrize(
@@ -71,7 +71,7 @@ def test_refuses_yaml_aliases() -> None:
     ],
 )
 def test_refuses_yaml_beyond_its_limits(text: str, reason: str) -> None:
-    assert reason in refusal("kalibr", "parse_kalibr", text)
+    assert reason in refusal("kalibr", "parse_chain", text)
 
 
 @pytest.mark.parametrize("text", ["'1\\n' * 7_000_000", "'1 ' * 7_000_000"])

@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from rosbags.typesys import Stores, get_typestore
 
 from calib import se3
-from calib.kalibr import import_kalibr
+from calib.kalibr import import_chain
 from calib.models.camera import Array, OmniCamera
 from calib.models.lens import DoubleSphereCamera
 from calib.models.names import sees_directly
@@ -158,7 +158,7 @@ def tracked(first: Any, second: Any) -> Array:
 def test_columns_of_a_recorded_pair_are_equal(shared_data: Path) -> None:
     """Points are in the same columns of both panoramas, and lower in the upper one."""
     folder = shared_data / "two_walls_crooked"
-    rig = import_kalibr(folder / "camchain.yaml")
+    rig = import_chain(folder / "camchain.yaml")
     cylinder = fit_cylinder(rig)
     lower, upper = (
         cv2.remap(image, *remap_tables(rig, mounted, cylinder), cv2.INTER_LINEAR)

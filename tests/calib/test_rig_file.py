@@ -151,8 +151,15 @@ def test_unreadable_files_are_one_line_errors(omni_rig: Rig, tmp_path: Path) -> 
     with pytest.raises(CalibError, match="cannot be written"):
         write_rig(tmp_path / "no" / "rig.toml", omni_rig)
     (tmp_path / "bytes.toml").write_bytes(b"schema = 1\xff")
-    with pytest.raises(CalibError, match="UTF-8"):
+    with pytest.raises(CalibError, match="expected TOML"):
         read_rig(tmp_path / "bytes.toml")
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "latin-1"])
+def test_reads_what_other_editors_leave(omni_rig: Rig, tmp_path: Path, encoding: str) -> None:
+    text = "# K\xe4lte\n" + rig_toml(omni_rig)
+    (tmp_path / "rig.toml").write_bytes(text.replace("\n", "\r\n").encode(encoding))
+    assert rig_toml(read_rig(tmp_path / "rig.toml")) == rig_toml(omni_rig)
 
 
 def test_damaged_text_is_a_calib_error_or_a_rig(ocam_rig: Rig) -> None:

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from rosbags.typesys import Stores, get_typestore
 
-from calib.kalibr import import_kalibr
+from calib.kalibr import import_chain
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import rig_toml
@@ -37,7 +37,7 @@ def main() -> None:
     args = parser.parse_args()
     # The floor of the world is at z = 0, and the truth is the pose of the lower viewpoint.
     height_m = float(read_tum(args.source / "truth.txt").T[0, 2, 3])
-    rig = reduced(import_kalibr(args.source / "camchain.yaml")).at_height(height_m)
+    rig = reduced(import_chain(args.source / "camchain.yaml")).at_height(height_m)
     reader = LogReader(args.source / "log.mcap")
     with LogWriter(args.target / "log.mcap", {"rig.toml": rig_toml(rig).encode()}, compression="none") as writer:
         for frame in reader.frames():

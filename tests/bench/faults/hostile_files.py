@@ -20,7 +20,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from calib.errors import CalibError
-from calib.kalibr import parse_kalibr
+from calib.kalibr import parse_chain
 from calib.ocam_file import parse_ocam
 from calib.rig_file import parse_rig
 from drivers.errors import DriverError
@@ -101,7 +101,7 @@ FORMATS: Final = {
     "rig.toml": Format(lambda folder: (folder / "rig.toml").read_bytes(), lambda path: parse_rig(path.read_bytes())),
     "camchain.yaml": Format(
         lambda _: chain(BOTH, T_UPPER_LOWER, NAMED).encode(),
-        lambda path: parse_kalibr(path.read_bytes()),
+        lambda path: parse_chain(path.read_bytes()),
     ),
     "calib_results.txt": Format(lambda _: OCAM, lambda path: parse_ocam(path.read_bytes())),
     "omnid.toml": Format(lambda _: dump(Config()).encode(), load_config),

@@ -47,7 +47,7 @@ def test_imports_ocam_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert se3.apply(found.upper.T_cam_rig @ se3.inverse(found.lower.T_cam_rig), [[0.0, 0, 0]])[0] == pytest.approx(
         T_UPPER_LOWER[:3, 3], abs=1e-11
     )
-    capsys.readouterr()
+    assert omnid(*files) == 2 and "give --transform FILE or --baseline METRES" in capsys.readouterr().err
     assert omnid(*files, "--baseline", 0.2, "--view", "direct") == 0
     assert "upper ocam direct 640x480, 0 to " in (line := capsys.readouterr().out)
     assert "baseline 200.0 mm, upper rotated by 0.00 deg" in line
@@ -61,10 +61,10 @@ def test_imports_ocam_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
         (("none.yaml", "-o", "rig.toml"), "cannot be read"),
         (("k.yaml", "-o", "k.yaml"), "that is read as well"),
         (("k.yaml", "-o", "k.yaml/rig.toml"), "there is no folder"),
-        (("k.yaml", "--baseline", 0.2, "-o", "rig.toml"), "go with OCamCalib files"),
+        (("k.yaml", "--baseline", 0.2, "-o", "rig.toml"), "this one holds its transforms"),
         (("rig2.toml", "-o", "rig.toml"), "needs no import"),
-        (("-o", "rig.toml"), "expected a Kalibr camchain.yaml, or two OCamCalib files"),
-        (("--lower", "a", "--upper", "b", "-o", "rig.toml"), "give --transform FILE or"),
+        (("-o", "rig.toml"), "expected a Kalibr camchain.yaml, or two files of one camera"),
+        (("--lower", "a", "--upper", "b", "-o", "rig.toml"), "a: cannot be read"),
         (("--equirectangular", "3840", "-o", "rig.toml"), "expected WIDTHxHEIGHT"),
     ],
 )

@@ -1,0 +1,220 @@
+"""Camera models of other programs, as cameras of omnid: one table of their names, exact where there is the same model.
+
+Kalibr, EuRoC and ROS name a projection and a distortion; OpenCV's many distortion terms (k3 and more) and the fov model
+have no equal here: the nearest camera is fitted over the image, and how far it is off is told.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Final
+
+import cv2
+import numpy as np
+import scipy.optimize
+
+from calib.errors import CalibError
+from calib.models.camera import Array, OmniCamera
+from calib.models.lens import LENS_KEYS, EquidistantCamera, lens_camera
+from calib.models.names import model_name
+from calib.models.unified import UnifiedCamera
+from calib.validation import MAX_PIXELS, MAX_SIDE_PX, Warn, is_image_size, silent
+
+FOCAL: Final = ("fu", "fv", "pu", "pv")
+RADTAN: Final = ("k1", "k2", "p1", "p2")
+EQUIDISTANT: Final = ("k1", "k2", "k3", "k4")
+# OpenCV's order, of which a file may give the first 4, 5, 8, 12 or 14.
+OPENCV: Final = (*RADTAN, "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty")
+# By the names of projection and distortion: the model, its intrinsics and its distortion terms, in the files' order.
+MODELS: Final[Mapping[tuple[str, str], tuple[str, tuple[str, ...], tuple[str, ...]]]] = {
+    ("omni", "radtan"): ("omni", ("xi", *FOCAL), RADTAN),
+    ("omni", "none"): ("omni", ("xi", *FOCAL), ()),
+    ("pinhole", "radtan"): ("pinhole", FOCAL, RADTAN),
+    ("pinhole", "opencv"): ("pinhole", FOCAL, OPENCV),
+    ("pinhole", "none"): ("pinhole", FOCAL, ()),
+    ("pinhole", "equidistant"): ("equidistant", FOCAL, EQUIDISTANT),
+    ("pinhole", "fov"): ("fov", FOCAL, ("w",)),
+    ("ds", "none"): ("ds", ("xi", "alpha", *FOCAL), ()),
+    ("eucm", "none"): ("eucm", ("alpha", "beta", *FOCAL), ()),
+}
+# Other names of the distortions: those of Kalibr's command line, EuRoC, ROS and OpenCV.
+DISTORTIONS: Final[Mapping[str, str]] = {
+    "": "none",
+    "equi": "equidistant",
+    "fisheye": "equidistant",
+    "radial-tangential": "radtan",
+    "plumb_bob": "opencv",
+    "rational_polynomial": "opencv",
+}
+# A camera that is fitted to another model may be this far off anywhere in the image, a few times the error of a corner.
+MAX_CONVERSION_PX: Final = 0.5
+GRID: Final = 24  # Places along each side of the image at which models are compared.
+# Largest radius on the plane z = 1, at 80 degrees, and number of radii to it, which show a distortion that turns back.
+WIDEST: Final = 5.7
+RADII: Final = 2000
+LOST_PX: Final = 100.0  # Error of a ray that a trial camera does not see.
+
+
+def camera_of_lists(
+    names: tuple[str, str],
+    intrinsics: Sequence[float],
+    terms: Sequence[float],
+    size: tuple[int, int],
+    warn: Warn = silent,
+) -> OmniCamera:
+    """Return the camera of the named projection and distortion. Errors begin with the key that is wrong."""
+    projection, distortion = names
+    if not distortion and "-" in projection:  # as on Kalibr's command line
+        projection, _, distortion = projection.partition("-")
+    distortion = DISTORTIONS.get(distortion, distortion)
+    known = [found for found in MODELS if found[0] == projection]
+    if not known:
+        projections = " or ".join(dict.fromkeys(found[0] for found in MODELS))
+        raise CalibError(f"camera_model: expected {projections}, found {names[0]!r}: calibrate with one of them")
+    if (projection, distortion) not in MODELS:
+        found = " or ".join(found[1] for found in known)
+        raise CalibError(f"distortion_model: expected {found}, found {distortion!r}: calibrate with one of them")
+    model, keys, term_keys = MODELS[projection, distortion]
+    if len(intrinsics) != len(keys):
+        raise CalibError(f"intrinsics: expected {len(keys)} numbers ({' '.join(keys)}), found {len(intrinsics)}")
+    if distortion == "none":
+        terms = ()
+    right_counts = (0, 4, 5, 8, 12, 14) if distortion == "opencv" else (len(term_keys),)
+    if len(terms) not in right_counts:
+        expected = " or ".join(map(str, right_counts))
+        raise CalibError(f"distortion_coeffs: expected {expected} numbers, found {len(terms)}")
+    return camera_of(model, dict(zip((*keys, *term_keys), (*intrinsics, *terms), strict=False)), size, warn)
+
+
+def camera_of(model: str, values: Mapping[str, float], size: tuple[int, int], warn: Warn = silent) -> OmniCamera:
+    """Return the camera of a model with named values; `warn` takes a line about one that is fitted."""
+    if not is_image_size(*size):
+        raise CalibError(
+            f"resolution: expected [width, height] in pixels, 1 to {MAX_SIDE_PX}, at most {MAX_PIXELS} in all, "
+            f"found {list(size)}"
+        )
+    fu, fv, pu, pv = (float(values[key]) for key in FOCAL)
+    focal, center = (fu, fv), (pu, pv)
+
+    def named(keys: Sequence[str]) -> list[float]:
+        return [float(values.get(key, 0.0)) for key in keys]
+
+    if model == "omni":
+        return UnifiedCamera(float(values["xi"]), focal, center, size, _four(named(RADTAN)))
+    if model == "equidistant":
+        return lens_camera("equidistant", named(EQUIDISTANT), focal, center, size)
+    if model in ("ds", "eucm"):
+        own = tuple(float(values[key]) for key in LENS_KEYS[model])
+        return lens_camera(model, own, focal, center, size)
+    if model == "ucm":  # the extended model with beta = 1
+        return lens_camera("eucm", (float(values["alpha"]), 1.0), focal, center, size)
+    plain = UnifiedCamera(0.0, focal, center, size, _four(named(RADTAN)))
+    if model == "pinhole" and not any(named(OPENCV[4:])):
+        return plain
+    if model == "fov":
+        start: OmniCamera = EquidistantCamera((0.0, 0.0, 0.0, 0.0), focal, center, size)
+        return _nearest(model, start, _fov_rays(values, focal, center, size), warn)
+    return _nearest("pinhole with k3 and more", plain, _opencv_rays(named(OPENCV), focal, center, size), warn)
+
+
+def _four(values: Sequence[float]) -> tuple[float, float, float, float]:
+    first, second, third, fourth = values
+    return first, second, third, fourth
+
+
+def _grid(size: tuple[int, int]) -> Array:
+    """Return pixels (N, 2) spread over an image."""
+    u, v = np.meshgrid(*(np.linspace(0, side - 1, GRID) for side in size))
+    return np.column_stack([u.ravel(), v.ravel()])
+
+
+def _fov_rays(
+    values: Mapping[str, float], focal: tuple[float, float], center: tuple[float, float], size: tuple[int, int]
+) -> tuple[Array, Array]:
+    """Return pixels (N, 2) and rays (N, 3) of the model fov: r_d = atan(2 r_u tan(w / 2)) / w (Devernay, Faugeras)."""
+    w = float(values["w"])
+    if not 0 < w < np.pi:
+        raise CalibError(f"fov camera: expected w between 0 and pi, found {w}")
+    pixels = _grid(size)
+    m = (pixels - center) / focal
+    radius = np.linalg.norm(m, axis=1)
+    seen = radius * w < np.deg2rad(88)
+    pixels, m, radius = pixels[seen], m[seen], radius[seen]
+    scale = np.where(radius > 0, np.tan(radius * w) / (2 * np.tan(w / 2)) / np.where(radius > 0, radius, 1), 1.0)
+    return pixels, np.column_stack([m * scale[:, None], np.ones(len(m))])
+
+
+def _opencv_rays(
+    terms: Sequence[float], focal: tuple[float, float], center: tuple[float, float], size: tuple[int, int]
+) -> tuple[Array, Array]:
+    """Return pixels (N, 2) and rays (N, 3) of a pinhole camera with OpenCV's distortion terms."""
+    K = np.array([[focal[0], 0, center[0]], [0, focal[1], center[1]], [0, 0, 1.0]])
+    found_pixels, found_rays = list[Array](), list[Array]()
+    for azimuth in np.linspace(0, 2 * np.pi, 2 * GRID, endpoint=False):
+        direction = np.array([np.cos(azimuth), np.sin(azimuth)])
+        # 1. Outwards as far as the pixels go outwards within the image: where the distortion turns back, rays end.
+        rho = np.linspace(0, WIDEST, RADII)
+        radius = np.linalg.norm(_opencv_project(rho[:, None] * direction, K, terms) - center, axis=1)
+        ended = np.flatnonzero((np.diff(radius) <= 0) | (radius[1:] > np.hypot(*size)))
+        end = int(ended[0]) + 1 if ended.size else RADII
+        # 2. Rays of evenly spaced pixels.
+        even = np.interp(np.linspace(0, radius[end - 1], 4 * GRID), radius[:end], rho[:end])
+        pixels = _opencv_project(even[:, None] * direction, K, terms)
+        inside = ((pixels >= 0) & (pixels <= np.array(size) - 1)).all(axis=1)
+        found_pixels.append(pixels[inside])
+        found_rays.append(np.column_stack([even[inside, None] * direction, np.ones(inside.sum())]))
+    return np.concatenate(found_pixels), np.concatenate(found_rays)
+
+
+def _opencv_project(m: Array, K: Array, terms: Sequence[float]) -> Array:
+    """Return the pixels (N, 2) of points (N, 2) of the plane z = 1 by OpenCV's distortion."""
+    rays = np.column_stack([m, np.ones(len(m))])
+    return np.asarray(cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, np.array(terms, float))[0].reshape(-1, 2))
+
+
+def _nearest(name: str, start: OmniCamera, rays: tuple[Array, Array], warn: Warn) -> OmniCamera:
+    """Return the camera near a start that projects rays (N, 3) to pixels (N, 2) best; CalibError if none does well."""
+    pixels, directions = rays
+    if len(pixels) < GRID:
+        raise CalibError(f"{name}: it sees too little of its image: calibrate with pinhole-equi or ds")
+    make, first = _variable(start)
+
+    def errors(values: Array) -> Array:
+        try:
+            off = make(values).project(directions) - pixels
+        except CalibError:
+            off = np.full(pixels.shape, LOST_PX)
+        return np.clip(np.nan_to_num(off, nan=LOST_PX), -LOST_PX, LOST_PX).ravel()
+
+    found = scipy.optimize.least_squares(errors, first, x_scale="jac", method="trf", max_nfev=200).x
+    camera, off = make(found), np.linalg.norm(errors(found).reshape(-1, 2), axis=1)
+    rms_px, most_px = float(np.sqrt((off**2).mean())), float(off.max())
+    if most_px > MAX_CONVERSION_PX:
+        raise CalibError(
+            f"{name} camera: the nearest {model_name(camera)} camera is up to {most_px:.2g} px off: calibrate with "
+            "Kalibr's omni-radtan, pinhole-equi, ds or eucm"
+        )
+    warn(
+        f"{name} is read as the nearest {model_name(camera)} camera, off by {rms_px:.2g} px rms, {most_px:.2g} px at "
+        "most"
+    )
+    return camera
+
+
+def _variable(start: OmniCamera) -> tuple[Callable[[Array], OmniCamera], Array]:
+    """Return the function that makes a camera of a vector of values, and the vector of the start."""
+    if isinstance(start, EquidistantCamera):
+        lens = start
+        return (
+            lambda v: replace(lens, focal=(v[0], v[1]), center=(v[2], v[3]), coefficients=_four(v[4:].tolist())),
+            np.array([*lens.focal, *lens.center, *lens.coefficients]),
+        )
+    assert isinstance(start, UnifiedCamera)
+    unified = start
+    return (
+        lambda v: replace(
+            unified, focal=(v[0], v[1]), center=(v[2], v[3]), distortion=_four(v[4:8].tolist()), xi=float(v[8])
+        ),
+        np.array([*unified.focal, *unified.center, *unified.distortion, unified.xi]),
+    )

@@ -1,0 +1,107 @@
+"""Texts of calibrations by other programs: their encodings, YAML (also of OpenCV's FileStorage) and JSON.
+
+YAML of unknown origin is bounded: no anchors, few levels, few values.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from typing import Any, Final
+
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent, NodeEvent, ScalarEvent
+
+from calib.errors import CalibError
+
+# Of YAML, enough for MAX_NODES of 16 characters; of JSON, in which basalt also writes the vignettes of its cameras.
+MAX_BYTES: Final = 1 << 15
+MAX_JSON_BYTES: Final = 1 << 21
+# Values and lists, because a camera has about 60.
+MAX_NODES: Final = 2000
+MAX_DEPTH: Final = 16  # Lists and mappings within each other: enough, as those of a camera are four deep.
+MAX_SCALAR: Final = 1000  # Characters of a value: enough for names of topics and paths.
+# The head of OpenCV's FileStorage is no directive of YAML; its tag marks a mapping of rows, cols and data.
+_OPENCV_HEAD: Final = re.compile(r"\A\s*%YAML:[^\n]*\n(\s*---[^\n]*\n)?")
+_OPENCV_TAG: Final = re.compile(r"!!opencv-(nd-)?matrix\b")
+
+
+def decode(data: bytes | str, name: str) -> str:
+    """Return the text of a calibration file: UTF-8 or UTF-16 by its byte order mark, else UTF-8, else Latin-1.
+
+    Numbers and keys are ASCII in each of them: only comments and names of topics differ.
+    """
+    if isinstance(data, str):
+        return data.removeprefix("\ufeff")
+    try:
+        if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+            return data.decode("utf-16")
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        if b"\0" in data:
+            raise CalibError(
+                f"{name}: expected UTF-8 text, found byte {data[error.start]!r} at {error.start}"
+            ) from error
+        return data.decode("latin-1")
+
+
+def load_mapping(data: str | bytes, name: str) -> Mapping[str, Any]:
+    """Parse YAML or JSON (plain data only) and return its first document's mapping; matrices become lists of rows."""
+    text = decode(data, name)
+    values: Any = None
+    try:
+        if text.lstrip().startswith("{"):
+            values = _json(text)
+        if values is None:
+            values = _yaml(text)
+    except (YAMLError, ValueError, RecursionError, TypeError, LookupError, AttributeError) as error:
+        raise CalibError(f"{name}: not a YAML file: {' '.join(str(error).split())[:200]}") from error
+    if not isinstance(values, Mapping):
+        raise CalibError(f"{name}: expected a YAML mapping, found {type(values).__name__}")
+    return {str(key): _with_rows(value) for key, value in values.items()}
+
+
+def _json(text: str) -> Any:
+    """Return the value of a JSON text; None for another text."""
+    if len(text) > MAX_JSON_BYTES:
+        raise ValueError(f"expected at most {MAX_JSON_BYTES} characters, found {len(text)}")
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+
+
+def _yaml(text: str) -> Any:
+    """Parse YAML; raise ValueError for one beyond the limits, and ruamel.yaml's error for a malformed one."""
+    if len(text) > MAX_BYTES:
+        raise ValueError(f"expected at most {MAX_BYTES} characters, found {len(text)}")
+    # 1. OpenCV's head and tags, and tabs, which YAML does not take for blanks.
+    text = _OPENCV_TAG.sub("", _OPENCV_HEAD.sub("", text)).expandtabs(2)
+    depth = nodes = 0
+    # 2. The events name anchors and aliases without resolving them.
+    for event in YAML(typ="safe", pure=True).parse(text):
+        if isinstance(event, AliasEvent) or (isinstance(event, NodeEvent) and event.anchor is not None):
+            raise ValueError(f"expected no anchors and aliases, found {str(event.anchor)[:40]}; write the values out")
+        depth += isinstance(event, CollectionStartEvent)
+        depth -= isinstance(event, CollectionEndEvent)
+        nodes += isinstance(event, NodeEvent)
+        if depth > MAX_DEPTH or nodes > MAX_NODES:
+            raise ValueError(f"expected at most {MAX_DEPTH} levels and {MAX_NODES} values, found more")
+        if isinstance(event, ScalarEvent) and len(event.value) > MAX_SCALAR:
+            raise ValueError(f"expected values of at most {MAX_SCALAR} characters, found {len(event.value)}")
+    # 3. The values of the first document: `ros2 topic echo` ends each message with a new one.
+    return next(iter(YAML(typ="safe", pure=True).load_all(text)), None)
+
+
+def _with_rows(value: Any) -> Any:
+    """Return a value in which each mapping of rows, cols and data is a list of rows."""
+    if isinstance(value, list):
+        return [_with_rows(one) for one in value]
+    if not isinstance(value, Mapping):
+        return value
+    rows, columns, data = value.get("rows"), value.get("cols"), value.get("data")
+    if isinstance(data, list) and isinstance(rows, int) and isinstance(columns, int) and len(data) == rows * columns:
+        return [data[row * columns : (row + 1) * columns] for row in range(rows)]
+    return {str(key): _with_rows(one) for key, one in value.items()}

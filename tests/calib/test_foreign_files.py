@@ -1,0 +1,286 @@
+"""Calibrations as other programs and editors leave them: what is read, what is said, what is refused."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib import se3
+from calib.camera_files import import_pair, read_camera
+from calib.errors import CalibError
+from calib.kalibr import parse_chain
+from calib.models.camera import Array, OmniCamera
+from calib.models.lens import DoubleSphereCamera, EquidistantCamera, ExtendedUnifiedCamera
+from calib.models.unified import UnifiedCamera
+from tests.calib.test_kalibr import BOTH, CAMERA, NAMED, T_UPPER_LOWER, chain, warnings_of
+
+PLAIN = chain(BOTH, None, NAMED)
+PINHOLE = UnifiedCamera(0.0, (440.0, 442.0), (320.0, 240.0), (640, 480), (-0.28, 0.07, 0.0002, 0.0001))
+# The upper of two cameras that look ahead, whose images' rows count down.
+T_AHEAD = se3.transform(se3.rotation_exp([0.01, 0.02, 0.01]), (0.0, 0.12, 0.003))
+IDENTITY = np.eye(3)
+TURNED = se3.rotation_exp([0.0, 0.02, 0.01])
+
+
+def rewritten(T: Array, digits: int) -> str:
+    return str([[round(float(value), digits) for value in row] for row in T])
+
+
+def inverses(form: Callable[[str, Array], str]) -> str:
+    return "".join(
+        f"cam{k}:{CAMERA}  rostopic: {topic}\n{form('T_imu_cam', se3.inverse(T))}"
+        for k, (T, topic) in enumerate(zip(BOTH, NAMED, strict=True))
+    )
+
+
+def opencv_matrix(key: str, T: Array) -> str:
+    return f"  {key}: !!opencv-matrix\n    rows: 4\n    cols: 4\n    dt: d\n    data: {T.ravel().tolist()}\n"
+
+
+def yaml_matrix(key: str, T: Array) -> str:
+    return f"  {key}: {T.tolist()}\n"
+
+
+def as_json() -> str:
+    """Return the chain as JSON, with the model's name as on Kalibr's command line."""
+    camera = {
+        "camera_model": "omni-radtan",
+        "intrinsics": [1, -207, 208, 383.5, 384.5],
+        "distortion_coeffs": [0.01, -0.02, 0.003, 0.004],
+        "resolution": [768, 770],
+    }
+    both = enumerate(zip(BOTH, NAMED, strict=True))
+    return json.dumps({f"cam{k}": {**camera, "rostopic": name, "T_cam_imu": T.tolist()} for k, (T, name) in both})
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        ("%YAML:1.0\n---\n" + PLAIN, ""),
+        ("%YAML:1.0\n" + PLAIN, ""),
+        ("%YAML:1.0\n---\n" + inverses(opencv_matrix), "cam0.T_imu_cam is the inverse of T_cam_imu, and is"),
+        (inverses(yaml_matrix), "cam1.T_imu_cam is the inverse of T_cam_imu"),
+        (PLAIN.encode("utf-8-sig"), ""),
+        (PLAIN.encode("utf-16"), ""),
+        (("# K\xe4lte\n" + PLAIN).encode("latin-1"), ""),
+        (PLAIN.replace("\n", "\r\n"), ""),
+        (PLAIN.replace("\n  ", "\n\t").replace(": ", ":\t"), ""),
+        (as_json(), ""),
+    ],
+)
+def test_reads_one_chain_in_every_dress(data: str | bytes, said: str) -> None:
+    lines = list[str]()
+    rig = parse_chain(data, "c.yaml", warn=lines.append)
+    np.testing.assert_allclose(rig.lower.T_cam_rig, BOTH[0], atol=1e-12)
+    np.testing.assert_allclose(rig.upper.T_cam_rig, BOTH[1], atol=1e-12)
+    assert rig.topics == NAMED and rig.lower.camera == parse_chain(PLAIN).lower.camera
+    assert any(said in line for line in lines) if said else not lines
+
+
+@pytest.mark.parametrize("digits", [3, 4])
+def test_takes_the_nearest_rotation_of_numbers_typed_with_few_digits(digits: int) -> None:
+    text = PLAIN.replace(str(BOTH[1].tolist()), rewritten(BOTH[1], digits))
+    (line,) = warnings_of(text)
+    assert "cam1.T_cam_imu: its numbers are up to" in line and "typed with few digits" in line
+    T = parse_chain(text).upper.T_cam_rig
+    np.testing.assert_allclose(T, BOTH[1], atol=10.0**-digits)
+    np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
+
+
+def test_refuses_numbers_that_are_no_rotation_with_the_figure() -> None:
+    with pytest.raises(CalibError, match=r"cam1.T_cam_imu: expected a rotation .*, up to 0\.00\d+ off a rotation"):
+        parse_chain(PLAIN.replace(str(BOTH[1].tolist()), rewritten(BOTH[1], 2)))
+
+
+def test_names_an_inverted_transform() -> None:
+    with pytest.raises(CalibError, match="cam1: T_cn_cnm1 is the inverse of what T_cam_imu says"):
+        parse_chain(chain(BOTH, se3.inverse(T_UPPER_LOWER), NAMED))
+    lines = warnings_of(chain((None, None), se3.inverse(T_UPPER_LOWER), NAMED))
+    assert len(lines) == 1 and "found below the lower one" in lines[0] and "T_cn_cnm1 is inverted" in lines[0]
+    read = parse_chain(
+        chain((None, None), se3.inverse(T_UPPER_LOWER), NAMED).replace("T_cn_cnm1", "T_cnm1_cn"), warn=lines.append
+    )
+    assert read.upper.viewpoint == pytest.approx([0, 0, 0.2012], abs=1e-4) and "is the inverse" in lines[-1]
+
+
+@pytest.mark.parametrize(("T", "lower"), [(T_AHEAD, "cam0"), (se3.inverse(T_AHEAD), "cam1")])
+def test_images_tell_the_lower_of_two_cameras_that_look_ahead(T: Array, lower: str) -> None:
+    camera = (
+        "\n  camera_model: pinhole\n  intrinsics: [225.0, 228.0, 380.0, 390.0]\n  distortion_model: radtan\n"
+        "  distortion_coeffs: [-0.1, 0.01, 0.001, 0.0002]\n  resolution: [768, 770]\n"
+    )
+    lines = list[str]()
+    rig = parse_chain(f"cam0:{camera}cam1:{camera}  T_cn_cnm1: {T.tolist()}\n", warn=lines.append)
+    assert len(lines) == 1 and f"lower is {lower} by what is below in the images" in lines[0]
+    assert rig.lower.T_cam_rig[2, 0] > 0.99, "x of the rig is ahead, along the optical axes"
+    assert rig.lower.T_cam_rig[0, 1] < -0.99, "y is to the left"
+
+
+def test_an_imu_whose_axes_are_no_rigs_is_left_out_where_asked() -> None:
+    T_imu = se3.transform(se3.rotation_exp([0.0, np.pi / 2, 0.0]), (0.1, 0.2, 0.3))
+    text = chain((BOTH[0] @ T_imu, BOTH[1] @ T_imu), None, NAMED)
+    rig = parse_chain(text, frame="cameras")
+    assert rig.upper.viewpoint == pytest.approx([0, 0, rig.baseline_m], abs=1e-12)
+
+
+def basalt(kind: str, **numbers: float) -> str:
+    def pose(T: Array) -> dict[str, float]:
+        values = [*T[:3, 3].tolist(), *se3.quaternion(T[:3, :3]).tolist()]
+        return dict(zip(("px", "py", "pz", "qx", "qy", "qz", "qw"), values, strict=True))
+
+    lens = {"camera_type": kind, "intrinsics": {"fx": 310.0, "fy": 315.0, "cx": 380.0, "cy": 390.0, **numbers}}
+    value = {
+        "T_imu_cam": [pose(se3.inverse(T)) for T in BOTH],
+        "intrinsics": [lens, lens],
+        "resolution": [[768, 770]] * 2,
+        "cam_time_offset_ns": 0,
+        "vignette": [],
+    }
+    return json.dumps({"value0": value})
+
+
+FOCAL, CENTER, SIZE = (310.0, 315.0), (380.0, 390.0), (768, 770)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (basalt("ds", xi=-0.27, alpha=0.55), DoubleSphereCamera(-0.27, 0.55, FOCAL, CENTER, SIZE)),
+        (basalt("eucm", alpha=0.6, beta=1.1), ExtendedUnifiedCamera(0.6, 1.1, FOCAL, CENTER, SIZE)),
+        (basalt("ucm", alpha=0.6), ExtendedUnifiedCamera(0.6, 1.0, FOCAL, CENTER, SIZE)),
+        (basalt("kb4", k1=0.01, k2=0.0, k3=0.0, k4=0.0), EquidistantCamera((0.01, 0, 0, 0), FOCAL, CENTER, SIZE)),
+        (
+            basalt("pinhole-radtan8", k1=-0.1, k2=0.01, p1=0.001, p2=0.002, k3=0, k4=0, k5=0, k6=0, rpmax=2),
+            UnifiedCamera(0.0, FOCAL, CENTER, SIZE, (-0.1, 0.01, 0.001, 0.002)),
+        ),
+    ],
+)
+def test_reads_basalts_calibration(text: str, expected: OmniCamera) -> None:
+    rig = parse_chain(text, "c.json")
+    assert rig.lower.camera == rig.upper.camera == expected
+    np.testing.assert_allclose(rig.upper.T_cam_rig, BOTH[1], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (basalt("bal"), "camera_type: expected ds, kb4, eucm, ucm, pinhole, pinhole-radtan8, fov, found 'bal'"),
+        (basalt("ds", xi=-0.27), "expected the number 'alpha' of its model"),
+        ('{"value0": {"T_imu_cam": []}}', "expected basalt's calibration with T_imu_cam, intrinsics and resolution"),
+        ("Camera1.fx: 190.9\nCamera1.fy: 190.9\n", r"found \['Camera1.fx', 'Camera1.fy'\]; files of one camera each"),
+    ],
+)
+def test_refuses_other_chains_in_one_line(text: str, message: str) -> None:
+    with pytest.raises(CalibError, match=message) as caught:
+        parse_chain(text, "c")
+    assert "\n" not in str(caught.value)
+
+
+def matrix(rows: int, columns: int, data: Array | list[float]) -> dict[str, object]:
+    return {"rows": rows, "cols": columns, "data": np.ravel(data).tolist()}
+
+
+def camera_info(model: str, terms: list[float], at_m: float = 0.0, R: Array = IDENTITY) -> dict[str, object]:
+    """Return camera_info of a camera at_m above the first one of a rectified pair."""
+    return {
+        "image_width": 640,
+        "image_height": 480,
+        "camera_name": "stereo/lower",
+        "camera_matrix": matrix(3, 3, [440.0, 0, 320, 0, 442, 240, 0, 0, 1]),
+        "distortion_model": model,
+        "distortion_coefficients": matrix(1, len(terms), terms),
+        "rectification_matrix": matrix(3, 3, R),
+        "projection_matrix": matrix(3, 4, [430.0, 0, 320, 0, 0, 430, 240, 430 * at_m, 0, 0, 1, 0]),
+    }
+
+
+def message(info: dict[str, object]) -> dict[str, object]:
+    """Return camera_info as a message of ROS 2."""
+    names = {"image_width": "width", "image_height": "height", "distortion_coefficients": "d", "camera_matrix": "k"}
+    names |= {"rectification_matrix": "r", "projection_matrix": "p", "distortion_model": "distortion_model"}
+    return {new: one["data"] if isinstance(one := info[old], dict) else one for old, new in names.items()}
+
+
+RADTAN = [-0.28, 0.07, 0.0002, 0.0001]
+K_OPENCV = "!!opencv-matrix\n  rows: 3\n  cols: 3\n  dt: d\n  data: [440., 0., 320., 0., 442., 240., 0., 0., 1.]\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "expected"),
+    [
+        ("a.yaml", json.dumps(camera_info("plumb_bob", [*RADTAN, 0.0])), PINHOLE),
+        ("a.json", json.dumps(message(camera_info("plumb_bob", [*RADTAN, 0.0]))), PINHOLE),
+        ("a.yaml", json.dumps(message(camera_info("rational_polynomial", [*RADTAN, 0, 0, 0, 0]))) + "\n---\n", PINHOLE),
+        ("a.yaml", json.dumps(camera_info("equidistant", [0.01, 0, 0, 0])), EquidistantCamera(
+            (0.01, 0, 0, 0), (440.0, 442.0), (320.0, 240.0), (640, 480))),
+        ("a.yml", f"%YAML:1.0\n---\nimage_width: 640\nimage_height: 480\ncamera_matrix: {K_OPENCV}"
+         f"distortion_coefficients: !!opencv-matrix\n  rows: 4\n  cols: 1\n  dt: d\n  data: {RADTAN}\n", PINHOLE),
+        ("a.yaml", "camera_model: pinhole\nintrinsics: [440, 442, 320, 240]\ndistortion_model: radial-tangential\n"
+         f"distortion_coefficients: {RADTAN}\nresolution: [640, 480]\nT_BS:\n  cols: 4\n  rows: 4\n"
+         f"  data: {np.eye(4).ravel().tolist()}\n", PINHOLE),
+        ("a.yaml", "%YAML:1.0\n---\nmodel_type: MEI\nimage_width: 640\nimage_height: 480\nmirror_parameters:\n"
+         "  xi: 1.5\ndistortion_parameters:\n  k1: 0.1\n  k2: 0.2\n  p1: 0.0\n  p2: 0.0\nprojection_parameters:\n"
+         "  gamma1: 500.0\n  gamma2: 501.0\n  u0: 320.0\n  v0: 240.0\n",
+         UnifiedCamera(1.5, (500.0, 501.0), (320.0, 240.0), (640, 480), (0.1, 0.2, 0.0, 0.0))),
+        ("a.yaml", "%YAML:1.0\n---\nmodel_type: KANNALA_BRANDT\nimage_width: 640\nimage_height: 480\n"
+         "projection_parameters:\n  k2: 0.01\n  k3: 0.0\n  k4: 0.0\n  k5: 0.0\n  mu: 200.0\n  mv: 201.0\n  u0: 320.0\n"
+         "  v0: 240.0\n", EquidistantCamera((0.01, 0, 0, 0), (200.0, 201.0), (320.0, 240.0), (640, 480))),
+    ],
+)  # fmt: skip
+def test_reads_files_of_one_camera(name: str, text: str, expected: OmniCamera, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(text)
+    assert read_camera(tmp_path / name).camera == expected
+
+
+def test_a_rectified_pair_tells_the_transform(tmp_path: Path) -> None:
+    for name, at_m in (("lower.yaml", 0.0), ("upper.yaml", 0.12)):
+        (tmp_path / name).write_text(json.dumps(camera_info("plumb_bob", [*RADTAN, 0], at_m, TURNED)))
+    rig = import_pair(tmp_path / "lower.yaml", tmp_path / "upper.yaml", None)
+    np.testing.assert_allclose(rig.upper.viewpoint, [0, 0, 0.12], atol=1e-12)
+    assert rig.lower.T_cam_rig[2, 0] > 0.99, "x of the rig is ahead"
+    (tmp_path / "alone.yaml").write_text(json.dumps(camera_info("plumb_bob", [*RADTAN, 0])))
+    with pytest.raises(CalibError, match="give --transform FILE or --baseline METRES"):
+        import_pair(tmp_path / "alone.yaml", tmp_path / "alone.yaml", None)
+
+
+@pytest.mark.parametrize(
+    ("terms", "most_px"),
+    [([*RADTAN, 0.02], 0.1), ([0.2, 0.05, 0.0002, 0.0001, 0.001, 0.5, 0.1, 0.01], 0.2)],
+)
+def test_distortion_without_an_equal_is_fitted_and_its_error_told(
+    terms: list[float], most_px: float, tmp_path: Path
+) -> None:
+    path, lines = tmp_path / "a.yaml", list[str]()
+    path.write_text(json.dumps(camera_info("rational_polynomial" if len(terms) > 5 else "plumb_bob", terms)))
+    camera = read_camera(path, warn=lines.append).camera
+    assert len(lines) == 1 and "is read as the nearest omni camera, off by" in lines[0]
+    # The same rays by OpenCV's equation, within the image.
+    k1, k2, p1, p2, k3, k4, k5, k6 = [*terms, 0, 0, 0, 0][:8]
+    x, y = np.meshgrid(np.linspace(-0.6, 0.6, 9), np.linspace(-0.45, 0.45, 9))
+    r2 = x * x + y * y
+    radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
+    u = 440 * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)) + 320
+    v = 442 * (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y) + 240
+    found = camera.project(np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3))
+    assert np.abs(found - np.stack([u, v], axis=-1).reshape(-1, 2)).max() < most_px
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (json.dumps(camera_info("thin_prism", [0.0] * 4)), "distortion_model: expected .*found 'thin_prism'"),
+        (json.dumps(camera_info("plumb_bob", [0.1, 0.2])), "distortion_coefficients: expected 0 or 4 or 5"),
+        (json.dumps(camera_info("rational_polynomial", [-0.9, 0.9, 0, 0, -0.1, 0.5, -0.5, 0.9])), "px off: calibrate"),
+        ("model_type: SCARAMUZZA\n", "import the calib_results.txt of OCamCalib"),
+        ("M1: [1]\nD1: [2]\n", r"expected one camera as ROS's camera_info.*found the keys \['D1', 'M1'\]"),
+    ],
+)
+def test_refuses_other_files_of_one_camera_in_one_line(text: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "a.yaml").write_text(text)
+    with pytest.raises(CalibError, match=message) as caught:
+        read_camera(tmp_path / "a.yaml")
+    assert str(caught.value).startswith(str(tmp_path)) and "\n" not in str(caught.value)
