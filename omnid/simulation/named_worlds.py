@@ -13,11 +13,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final
 
+import cv2
 import numpy as np
 
+from calib.models.camera import Array
 from drivers.motors.simulated.simulated_base import Pose
 from omnid.errors import OmnidError
-from omnid.simulation.building_parts import Builder, plain_paint
+from omnid.simulation.building_parts import Builder, Opening, plain_paint
+from omnid.simulation.clearance import obstacles_of
 from omnid.simulation.people import Person
 from omnid.simulation.rendering.ray_caster import AS_NEEDED
 from omnid.simulation.rendering.sensor import Sensor
@@ -249,6 +252,131 @@ def trolley(b: Builder, at: Point, yaw_rad: float) -> list[Rectangle]:
     return faces
 
 
+# To a goal
+
+
+def _two_rooms(b: Builder, door_m: float, at_y_m: float) -> float:
+    """Add two rooms with an open door between them; return where along x the wall with the door is."""
+    x_m, low, high = b.rng.uniform(1.8, 2.2), (-1.6, -2.2), (5.6, 2.2)
+    b.floor(low, high)
+    b.ceiling(low, high)
+    b.room(low, high, doors=1, pictures=3)
+    b.partition(x_m, (low[1], high[1]), [Opening(high[1] - at_y_m - door_m / 2, door_m)])
+    b.shelf((4.4, low[1] + 0.2), math.pi / 2)
+    b.table((-0.6, high[1] - 0.5), (1.2, 0.7, 0.74))
+    return x_m
+
+
+def _door(b: Builder, aslant: str) -> Trial:
+    """A door of 0.8 m, straight ahead or 30 degrees aside."""
+    door_y_m = 0.0 if not aslant else float(b.rng.choice([-1, 1])) * math.tan(math.radians(30.0)) * 2.0
+    x_m = _two_rooms(b, 0.8, door_y_m)
+    return Trial(_built(b), goal=(x_m + 1.8, door_y_m, 0.0))
+
+
+def _office(b: Builder) -> Trial:
+    """Desks with star-legged chairs along both walls, and one chair on the way."""
+    low, high = (-1.4, -2.2), (6.2, 2.4)
+    b.floor(low, high)
+    b.ceiling(low, high)
+    b.room(low, high, doors=1, windows=3, pictures=2)
+    b.thing([((0.0, 0.0, 0.0), (0.28, 0.28, 0.33))], (0.4, -1.8), 0.0, plain_paint(b.rng, 60.0))
+    b.shelf((-1.1, -1.2), 0.0)
+    for at_m, y_m in ((1.2, 1.9), (3.6, 1.9), (2.4, -1.75), (5.0, -1.75)):
+        x_m, inwards = at_m + b.rng.uniform(-0.2, 0.2), math.copysign(1.0, -y_m)
+        b.table((x_m, y_m), (1.4, 0.75, 0.74))
+        b.star_chair((x_m + b.rng.uniform(-0.3, 0.3), y_m + inwards * b.rng.uniform(0.5, 0.75)), b.rng.uniform(0, 7))
+
+    def put() -> None:
+        b.star_chair((b.rng.uniform(2.2, 3.2), b.rng.uniform(-0.5, 0.5)), b.rng.uniform(0, math.tau))
+
+    return _with_a_way(b, (5.2, 0.2, 0.0), put)
+
+
+def _clutter(b: Builder) -> Trial:
+    """A room full of things, through which a way is left."""
+    low, high = (-1.4, -2.4), (5.6, 2.4)
+    b.floor(low, high)
+    b.ceiling(low, high)
+    b.room(low, high, doors=1, windows=2, pictures=1)
+
+    def put() -> None:
+        places: list[Point] = []
+        for _ in range(60):
+            at = float(b.rng.uniform(0.9, 4.0)), float(b.rng.uniform(-2.0, 2.0))
+            if len(places) < 8 and all(math.dist(at, other) > 0.85 for other in places):
+                places.append(at)
+                _put(b, str(b.rng.choice(["box", "carton", "chair", "table", "bin"])), at)
+
+    return _with_a_way(b, (4.6, float(b.rng.uniform(-1.0, 1.0)), 0.0), put)
+
+
+def _with_a_way(b: Builder, goal: Pose, put: Callable[[], None]) -> Trial:
+    """Return the trial with things put at random, again and again until a way leads to the goal."""
+    empty = len(b.faces)
+    for _ in range(200):
+        put()
+        built = _built(b)
+        if can_drive(obstacles_of(built, 1.2), (0.0, 0.0), goal[:2]):
+            return Trial(built, goal=goal)
+        del b.faces[empty:]
+    raise OmnidError("no way leads through what was put here 200 times; take another seed")
+
+
+def _put(b: Builder, kind: str, at: Point) -> None:
+    """Add a thing of a room."""
+    rng, yaw_rad = b.rng, b.rng.uniform(0, math.tau)
+    if kind == "chair":
+        b.star_chair(at, yaw_rad)
+    elif kind == "table":
+        b.table(at, (0.8, 0.6, 0.72), yaw_rad)
+    else:
+        spans = {"box": (0.3, 0.6), "carton": (0.3, 0.5), "bin": (0.25, 0.3)}[kind]
+        size_m = rng.uniform(*spans), rng.uniform(*spans), rng.uniform(0.3, 0.9)
+        grey, grain = rng.uniform(40, 220), 6.0 if kind == "carton" else 1.0
+        b.thing([((0.0, 0.0, 0.0), size_m)], at, yaw_rad, plain_paint(rng, grey, grain))
+
+
+def can_drive(segments: Array, start: Point, goal: Point, beside_m: float = FREE_M) -> bool:
+    """Return whether a way leads from start to goal that is nowhere nearer than beside_m to segments (N, 2, 2)."""
+    points = np.concatenate([segments.reshape(-1, 2), [start, goal]])
+    low = points.min(axis=0) - 1.0
+    width, height = np.ceil((points.max(axis=0) + 1.0 - low) / CELL_M).astype(int).tolist()
+    free = np.full((height, width), 255, np.uint8)
+    for ends in np.rint((segments - low) / CELL_M).astype(int):
+        cv2.line(free, ends[0].tolist(), ends[1].tolist(), 0)
+    wide = cv2.distanceTransform(free, cv2.DIST_L2, 5) * CELL_M > beside_m
+    _, parts = cv2.connectedComponents(wide.astype(np.uint8), connectivity=4)
+    at = [parts[tuple(np.rint((np.array(place) - low) / CELL_M).astype(int)[::-1])] for place in (start, goal)]
+    return bool(at[0] and at[0] == at[1])
+
+
+def _dead_end_and_back(b: Builder) -> Trial:
+    """The robot stands in a dead end 1.2 m wide, nose to its end; the goal is in the corridor outside, aside."""
+    low, high, end_m = (-3.2, -0.6), (0.75, 3.6), 0.75
+    b.floor((low[0], low[1] - 1.0), (end_m, high[1]))
+    b.ceiling((low[0], low[1] - 1.0), (end_m, high[1]))
+    for a, c in (
+        ((-1.4, 0.6), (end_m, 0.6)),  # the dead end, clockwise
+        ((end_m, 0.6), (end_m, -0.6)),
+        ((end_m, -0.6), (low[0], -0.6)),
+        ((low[0], -0.6), (low[0], high[1])),  # the corridor
+        ((low[0], high[1]), (-1.4, high[1])),
+        ((-1.4, high[1]), (-1.4, 0.6)),
+    ):
+        b.wall(a, c, doors=int(math.dist(a, c) > 2.0), pictures=int(math.dist(a, c) > 2.0))
+    return Trial(_built(b), goal=(-2.3, 2.6, math.pi / 2))
+
+
+def _doorway_with_person(b: Builder) -> Trial:
+    """Somebody stands in a door of 0.9 m, sees the robot come, and walks on into its room, and aside."""
+    x_m = _two_rooms(b, 0.9, 0.0)
+    aside_m = float(b.rng.choice([-1, 1])) * 1.4
+    path = ((x_m + 0.1, 0.0), (x_m - 0.5, aside_m * 0.5), (x_m - 0.7, aside_m))
+    walker = Person(b.adult(), path, 0.8, start_s=b.rng.uniform(7.0, 9.0))
+    return Trial(_built(b, people=(walker,)), goal=(x_m + 1.8, 0.0, 0.0))
+
+
 _WORLDS: Final[dict[str, tuple[str | None, Callable[..., Trial]]]] = {
     **{name: (kind, _floor_in_corridor) for name, kind in FLOORS.items() if name != "polished"},
     "polished": ("slabs", _polished_corridor),
@@ -265,10 +393,16 @@ _WORLDS: Final[dict[str, tuple[str | None, Callable[..., Trial]]]] = {
     "weak_motor": (None, _robot(wheels=replace(USUAL_WHEELS, left=USUAL_WHEELS.left - 0.08))),
     "trolley_leaves": (None, _trolley_leaves),
     "person_passes": (None, _person_passes),
+    "door_80(_aslant|)": (None, _door),
+    "office": (None, _office),
+    "clutter": (None, _clutter),
+    "dead_end_and_back": (None, _dead_end_and_back),
+    "doorway_with_person": (None, _doorway_with_person),
 }
 HARMLESS: Final = (
     *FLOORS,
     *(name + HALL for name in FLOORS),
     *("ramp_2", "ramp_5", "ramp_8", "lean_1deg", "lift_gap", "sun_moving", "light_switch", "dark_and_on", "pushed"),
     *("slip_20", "slip_40", "weak_motor", "trolley_leaves", "person_passes"),
+    *("door_80", "door_80_aslant", "office", "clutter", "dead_end_and_back", "doorway_with_person"),  # to a goal
 )

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from omnid.simulation.clearance import clearance_m, obstacles_of, ranges_m
-from omnid.simulation.named_worlds import FLOORS, HARMLESS, trial
+from omnid.simulation.named_worlds import FLOORS, HARMLESS, can_drive, trial
 from omnid.simulation.world_file import load_world
 
 ROBOT_M = 0.2, 1.2  # radius and height
@@ -17,6 +17,7 @@ WANTED = {
     *(f"{floor}_hall" for floor in FLOORS),
     *("ramp_2", "ramp_5", "ramp_8", "lean_1deg", "lift_gap", "sun_moving", "light_switch", "dark_and_on", "pushed"),
     *("slip_20", "slip_40", "weak_motor", "trolley_leaves", "person_passes"),
+    *("door_80", "door_80_aslant", "office", "clutter", "dead_end_and_back", "doorway_with_person"),
 }
 
 
@@ -25,9 +26,14 @@ def test_the_list_of_harmless_worlds_is_complete() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(set(HARMLESS) - {f"{floor}_hall" for floor in FLOORS if floor != "plain"}))
-def test_nothing_stands_in_the_way_of_harmless_worlds(name: str) -> None:
-    asked = trial(name, 1)
+@pytest.mark.parametrize("seed", [1, 2])
+def test_nothing_stands_in_the_way_of_harmless_worlds(name: str, seed: int) -> None:
+    asked = trial(name, seed)
     segments = obstacles_of(asked.world, ROBOT_M[1])
+    if asked.goal is not None:
+        assert can_drive(segments, (0.0, 0.0), asked.goal[:2])
+        assert not can_drive(segments, (0.0, 0.0), (30.0, 15.0))
+        return
     along = np.arange(0.0, asked.way_m, 0.1)
     assert min(clearance_m(segments, (x_m, 0.0), ROBOT_M[0]) for x_m in along) > 0.2
 
