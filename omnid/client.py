@@ -39,7 +39,7 @@ from omnid.transport.decode import (
     decode_pose,
     decode_scan,
 )
-from omnid.transport.driver import CONNECT_S, Driver
+from omnid.transport.driver import CONNECT_S, Driver, RobotTime
 from omnid.transport.requests import Answer
 from omnid.transport.session import ALIVE, HERE, Unreachable, open_client, robots_there
 
@@ -165,6 +165,7 @@ class Robot:
         given = settings or BusConfig(robot=robot, connect=endpoints)
         self.name = given.robot
         self._session = open_client(given, timeout_s)
+        self._time = RobotTime(self._session, self.name)
         self._declared: list[object] = []  # zenoh undeclares what nothing refers to any longer
 
     def close(self) -> None:
@@ -213,7 +214,8 @@ class Robot:
 
         source: one of controller.sources.names, such as "planner"; empty for that of the highest priority.
         """
-        return Driver(self._session, self.name, source)
+        self._time.refresh(wait=True)
+        return Driver(self._session, self.name, self._time, source)
 
     def query(self, name: str) -> str:
         """Return the robot's `config` or `rig`, both TOML; "" where it does not answer."""

@@ -79,6 +79,7 @@ class RotatingLog:
         self._writer: LogWriter | None = None
         self._path = folder
         self._number = 0
+        self._own: dict[str, int] = {}  # names of the files of this run, in their order
         self._start_ns = 0
         self._synced_s = self._retry_at_s = 0.0
         self._backoff = Backoff(min(_FIRST_RETRY_S, rotation.retry_s), rotation.retry_s)
@@ -102,6 +103,10 @@ class RotatingLog:
                 self._refuse(str(error))
             else:
                 self._stop(error)
+
+    def end_file(self) -> None:
+        """Complete the file: the next message begins another one."""
+        self._end()
 
     def close(self) -> None:
         """Complete the file and end the recording."""
@@ -152,6 +157,7 @@ class RotatingLog:
                 _delete(self._path)
                 raise
             if not os.path.lexists(_complete(self._path)):
+                self._own[_complete(self._path).name] = self._number
                 return writer
             _delete(self._path)  # another program has completed a file of this name since the check
             _drop(writer)
@@ -220,7 +226,7 @@ class RotatingLog:
         """
         found = sorted(self._recordings())
         total_bytes, deleted = sum(size for *_, size in found), 0
-        for _, _, path, size in found:
+        for *_, path, size in found:
             if len(found) - deleted <= max_files and total_bytes <= max_bytes:
                 break
             if not is_locked(path) and _delete(path):
@@ -228,15 +234,20 @@ class RotatingLog:
                 deleted += 1
         return deleted
 
-    def _recordings(self) -> Iterator[tuple[str, int, Path, int]]:
-        """Yield time, number, path and size [bytes] of the files with this name; they sort by age."""
+    def _recordings(self) -> Iterator[tuple[int, str, int, Path, int]]:
+        """Yield place in this run, time, number, path and size [bytes] of the files with this name; they sort by age.
+
+        Files of this run are the newest, in their order: the computer's clock may have been set back meanwhile.
+        """
         pattern = re.compile(re.escape(self._name) + r"_(\d{8}T\d{6}Z)_(\d{3,6})\.mcap(?:\.part)?")
         with suppress(OSError), os.scandir(self._folder) as entries:
             for entry in entries:
                 found = pattern.fullmatch(entry.name)
                 if found and entry.is_file(follow_symlinks=False):
+                    path = Path(entry.path)
                     with suppress(OSError):  # another program may have deleted it
-                        yield found[1], int(found[2]), Path(entry.path), entry.stat().st_size
+                        place = self._own.get(_complete(path).name, 0)
+                        yield place, found[1], int(found[2]), path, entry.stat().st_size
 
     def _require_free_space(self, wanted_bytes: int) -> None:
         """Create the folder; raise DriverError where it cannot be created, or the disk has less free space."""

@@ -9,6 +9,7 @@ import math
 import os
 import termios
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from enum import Enum, auto
 from typing import Final
@@ -18,9 +19,10 @@ import serial  # type: ignore[import-untyped]
 from drivers.backoff import Backoff
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, is_stop, stop_command
+from drivers.motors.heard import Heard
 from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.line_protocol import LineProtocol
-from drivers.motors.protocols.motor_protocol import MotorProtocol, T, Transaction
+from drivers.motors.protocols.motor_protocol import MotorProtocol, NoReplyError, T, Transaction
 
 CONNECT_TRY_S: Final = 0.2
 STOPS_AT_CLOSE: Final = 3  # tries
@@ -36,10 +38,6 @@ _REASONS = {
 }
 
 
-class NoReplyError(DriverError):
-    """No reply before the timeout, from a port that is still there."""
-
-
 class LateReplyError(NoReplyError):
     """No reply before the timeout, but the last one is so recent that the controller's watchdog cannot have expired."""
 
@@ -50,7 +48,7 @@ class _State(Enum):
     | state      | next command                                   | answer                                 |
     |------------|------------------------------------------------|----------------------------------------|
     | GONE       | open the port, then as SETTING_UP              |                                        |
-    | SETTING_UP | set the watchdog, then as STOP_FIRST           |                                        |
+    | SETTING_UP | set the watchdog, or await that; as STOP_FIRST |                                        |
     | STOP_FIRST | a stop in its place                            | DRIVING; STOP_FIRST where it expired   |
     | SILENT     | a stop in its place                            | SETTING_UP: it may have lost its power |
     | DRIVING    | the command                                    | DRIVING; STOP_FIRST where it expired   |
@@ -68,16 +66,17 @@ class _State(Enum):
 class SerialMotor:
     """The base on a serial port, locked for this program.
 
-    `send` blocks for at most timeout_s, plus the time to open the port where it was gone, and CONNECT_TRY_S where the
-    controller is to be set up; `close` for STOPS_AT_CLOSE times timeout_s. A command is sent once and never repeated:
-    the caller sends the next one at its own rate.
+    `send` blocks for at most timeout_s, twice that where the controller is set up, plus the time to open the port where
+    it was gone; `close` for STOPS_AT_CLOSE times timeout_s. A command is sent once and never repeated: the caller sends
+    the next one at its own rate.
 
     After LateReplyError the next command drives as usual. After any other error, a pause in which the controller's
     watchdog may have expired, or a new connection, `send` sends a stop in place of the first command and returns a
     status with watchdog_expired; the command after it drives. After a missing reply and a pause the controller is
     set up again once a stop has got a reply, because it may have been switched off and on, and another stop
     follows. A port that is gone is opened again by a later `send`, with growing waits, during which `send` fails at
-    once.
+    once. A port that is there stays open, and its controller is asked until it answers: some boards start again when
+    their port is opened, and boot for seconds.
     """
 
     def __init__(
@@ -92,8 +91,8 @@ class SerialMotor:
     ) -> None:
         """Open the port and set the controller's watchdog; raise DriverError where either fails.
 
-        protocol: default is the line protocol. baud: 0 is the protocol's default. connect_s: time for the first
-        reply; some boards restart when their port is opened and do not reply for seconds.
+        protocol: default is the line protocol. baud: 0 is the protocol's default. connect_s: time for the first reply;
+        0: it is not waited for, `send` opens the port and asks.
         """
         if not (math.isfinite(timeout_s) and timeout_s > 0):
             raise DriverError(f"motor timeout is {timeout_s} s; give a time above 0, for example 0.05")
@@ -110,7 +109,12 @@ class SerialMotor:
         self._last_sent_s = -math.inf  # start of the last command that got a reply, by _clock_s
         self._fresh_s = 0.0  # after it: the watchdog cannot have expired
         self._reopening, self._next_open_s = Backoff(FIRST_WAIT_S, LONGEST_WAIT_S), -math.inf
-        self._connect(connect_s)
+        self._asking: Transaction[float] | None = None  # of the setting-up, while its answer is awaited
+        self._ask_again_s = -math.inf
+        self._heard, self._problem = Heard(), ""
+        next(self._protocol.connect(watchdog_ms))  # what no controller can be asked for is an error at once
+        if connect_s:
+            self._connect(connect_s)
 
     @property
     def garbage(self) -> int:
@@ -156,7 +160,7 @@ class SerialMotor:
         if self._state is _State.GONE:
             self._open()
         if is_new:
-            self._set_up(time.monotonic() + max(CONNECT_TRY_S, self._timeout_s))
+            self._set_up(deadline_s)
             deadline_s = max(deadline_s, time.monotonic() + self._timeout_s)
         # 2. Send the command, or a stop in its place.
         now_s = _clock_s()
@@ -190,7 +194,7 @@ class SerialMotor:
     def _try_to_stop(self, deadline_s: float) -> None:
         """Send one stop; ignore a missing reply before the deadline. The last try may end after it."""
         try:
-            self._send(stop_command(0), time.monotonic() + max(CONNECT_TRY_S, self._timeout_s))
+            self._send(stop_command(0), time.monotonic() + 2 * max(CONNECT_TRY_S, self._timeout_s))
         except NoReplyError:
             if time.monotonic() >= deadline_s:
                 raise
@@ -199,7 +203,22 @@ class SerialMotor:
             raise DriverError(f"motor on {self._name} stays stopped by its watchdog; switch it off and on again")
 
     def _set_up(self, deadline_s: float) -> None:
-        in_force_ms = self._run(self._protocol.connect(self._watchdog_ms), deadline_s)
+        """Ask the controller to be set up, or go on to await its answer; ask again after CONNECT_TRY_S."""
+        now_s = time.monotonic()
+        if self._asking is None or now_s >= self._ask_again_s:
+            self._asking = None
+            self._ask_again_s = now_s + max(CONNECT_TRY_S, self._timeout_s)
+            self._asking = self._begun(self._protocol.connect(self._watchdog_ms))
+        asking, is_over = self._asking, deadline_s >= self._ask_again_s
+        try:
+            in_force_ms = self._result(asking, min(deadline_s, self._ask_again_s), is_over=is_over)
+        except NoReplyError as error:
+            self._problem = str(error) if is_over else self._problem
+            raise NoReplyError(self._problem or f"motor on {self._name} has not answered yet") from None
+        except DriverError:
+            self._asking = None
+            raise
+        self._asking, self._problem = None, ""
         self._fresh_s = FRESH_SHARE * in_force_ms / 1000
         self._state = _State.STOP_FIRST
         self._reopening.reset()
@@ -215,14 +234,18 @@ class SerialMotor:
         """Open the port; raise DriverError before the time of the next try, and where it cannot be opened."""
         if self._closed:
             raise DriverError(f"motor on {self._name} is closed; make a new one")
-        wait_s = self._next_open_s - time.monotonic()
-        if wait_s > 0:
-            raise DriverError(f"motor on {self._name} is gone; plug it in, it is tried again in {wait_s:.1f} s")
+        if time.monotonic() < self._next_open_s:
+            raise DriverError(self._problem or f"motor on {self._name} is gone; plug it in, it is tried again")
         self._next_open_s = time.monotonic() + self._reopening.next_s()
-        self._port, self._state = _opened(self._name, self._baud), _State.SETTING_UP
+        try:
+            self._port, self._state = _opened(self._name, self._baud), _State.SETTING_UP
+        except DriverError as error:
+            self._problem = str(error)
+            raise
+        self._problem = ""
 
     def _release(self) -> None:
-        port, self._port, self._state = self._port, None, _State.GONE
+        port, self._port, self._state, self._asking = self._port, None, _State.GONE, None
         if port is not None:
             with contextlib.suppress(OSError, termios.error):
                 fcntl.ioctl(port.fileno(), termios.TIOCNXCL)
@@ -230,47 +253,60 @@ class SerialMotor:
                 port.close()
 
     def _run(self, transaction: Transaction[T], deadline_s: float) -> T:
-        """Run a transaction and return its result.
+        """Run a transaction and return its result; NoReplyError after the deadline."""
+        return self._result(self._begun(transaction), deadline_s)
+
+    def _begun(self, transaction: Transaction[T]) -> Transaction[T]:
+        """Discard replies to earlier commands, and send the first bytes of a transaction."""
+        self._framer.reset()
+        self._heard = Heard()
+        with self._on_port():
+            if self._port is not None:
+                self._port.reset_input_buffer()
+            self._write(next(transaction))
+        return transaction
+
+    def _result(self, transaction: Transaction[T], deadline_s: float, *, is_over: bool = True) -> T:
+        """Return the result of a transaction that has begun; is_over: after the deadline it is given up.
 
         Raises NoReplyError after the deadline. The input is read once more after it, since a thread that was delayed
         may find a reply waiting that came in time.
         """
-        invalid_before = self._framer.garbage + self._protocol.bad_frames
         try:
-            self._discard_input()
-            self._write(next(transaction))
             overdue = False
             while not overdue:
                 overdue = time.monotonic() >= deadline_s
-                for frame in self._framer.feed(self._read(deadline_s)):
-                    self._write(transaction.send(frame))
-            raise NoReplyError
+                with self._on_port():
+                    data = self._read(deadline_s)
+                    self._heard.came(data)
+                    for frame in self._framer.feed(data):
+                        self._write(transaction.send(frame))
         except StopIteration as done:
             result: T = done.value
             return result
-        except NoReplyError:
-            invalid = self._framer.garbage + self._protocol.bad_frames - invalid_before
-            raise self._no_reply(invalid) from None
+        raise self._no_reply(transaction) if is_over else NoReplyError(f"motor on {self._name} has not answered yet")
+
+    @contextlib.contextmanager
+    def _on_port(self) -> Iterator[None]:
+        """Name the port in the errors of this block; a port that fails is released."""
+        try:
+            yield
+        except NoReplyError as error:
+            raise NoReplyError(f"motor on {self._name} {error}") from None
         except DriverError as error:
             raise DriverError(f"motor on {self._name}: {error}") from None
         except (OSError, termios.error) as error:
             self._release()
             raise DriverError(f"motor on {self._name} is gone ({_one_line(error)}); plug it in again") from None
 
-    def _discard_input(self) -> None:
-        """Discard replies to earlier commands."""
-        self._framer.reset()
-        if self._port is not None:
-            self._port.reset_input_buffer()
-
     def _write(self, data: bytes) -> None:
         """Write all data at once; raise NoReplyError if the output buffer is full, as the other end does not read."""
+        self._heard.sent(data)
         if data and self._port is not None:
-            try:
-                if os.write(self._port.fileno(), data) < len(data):
-                    raise NoReplyError
-            except BlockingIOError:
-                raise NoReplyError from None
+            with contextlib.suppress(BlockingIOError):
+                if os.write(self._port.fileno(), data) == len(data):
+                    return
+            raise NoReplyError("gave no answer: it takes no more bytes; check power and cable")
 
     def _read(self, deadline_s: float) -> bytes:
         """Return the bytes received up to now, or the first ones before the deadline, b"" without any.
@@ -279,7 +315,7 @@ class SerialMotor:
         machine that takes far longer than any timeout.
         """
         if self._port is None:
-            raise NoReplyError
+            raise NoReplyError("gave no answer: the port is closed")
         while not self._port.in_waiting:
             left_s = deadline_s - time.monotonic()
             if left_s <= 0:
@@ -287,16 +323,16 @@ class SerialMotor:
             time.sleep(min(left_s, POLL_PERIOD_S))
         return os.read(self._port.fileno(), READ_LIMIT_BYTES)
 
-    def _no_reply(self, invalid: int) -> NoReplyError:
-        """Return the error for a missing reply; invalid: received bytes and frames that could not be decoded."""
-        if invalid:
-            return NoReplyError(
-                f"motor on {self._name} answers, but not in its protocol; check motor.protocol, the baud rate "
-                f"({self._baud}) and the cable"
-            )
-        return NoReplyError(
-            f"motor on {self._name} gave no answer; check power, cable, the baud rate ({self._baud}) and motor.protocol"
-        )
+    def _no_reply(self, transaction: Transaction[T]) -> NoReplyError:
+        """Return the error for a missing reply: what the protocol has seen of it, else what came at all."""
+        found = ""
+        try:
+            transaction.throw(NoReplyError())
+        except NoReplyError as error:
+            found = str(error)
+        except StopIteration:
+            pass
+        return NoReplyError(f"motor on {self._name} {found or self._heard.words(self._baud)}")
 
 
 def _opened(port: str, baud: int) -> serial.Serial:

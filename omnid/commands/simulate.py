@@ -18,8 +18,10 @@ from omnid.errors import OmnidError
 AUTO, REAL_TIME = "auto", "1.0"
 
 if TYPE_CHECKING:  # the help and other commands do not load these
+    from collections.abc import Callable
+
     from drivers.motors.simulated.simulated_base import Pose
-    from omnid.runs.live import LiveRobot
+    from omnid.runs.live import LiveRobot, LiveRun
     from omnid.simulation.paced_robot import PacedRobot
     from omnid.simulation.realtime import RealtimeRobot, SimulatedGyro
     from omnid.simulation.robot import SimulatedRobot
@@ -81,22 +83,23 @@ def run(args: argparse.Namespace) -> int:
     if args.speed == AUTO:
         config = replace(config, motor=replace(config.motor, port=SIMULATED))
         paced = PacedRobot(world, _robot(args), config, args.seed, warn)
-        code = LiveRun(config, paced, log, paced.rig, show).run()
-        return _end(args, paced, code)
+        run = LiveRun(config, paced, log, paced.rig, show)
+        return _end(args, paced, run.run(), run)
     geometry = config.motor.drive.geometry()
     with closing(RealtimeRobot(world, _robot(args), config.motor.protocol, geometry, args.seed, warn)) as robot:
         config = replace(config, motor=replace(config.motor, port=robot.port))
         gyro = robot.open_gyro() if config.motion.imu != "off" else None
-        code = LiveRun(config, _connected(robot, gyro), log, robot.rig, show).run()
-    return _end(args, robot, code)
+        run = LiveRun(config, _connected(robot, gyro), log, robot.rig, show)
+        code = run.run()
+    return _end(args, robot, code, run)
 
 
-def _end(args: argparse.Namespace, robot: PacedRobot | RealtimeRobot, code: int) -> int:
+def _end(args: argparse.Namespace, robot: PacedRobot | RealtimeRobot, code: int, run: LiveRun) -> int:
     """Write the truth where it is asked for; return the exit code."""
     from omnid.engine.logging_setup import log
 
     if args.truth:
-        _write_truth(args.truth, robot.drive.truth, robot.offset_ns)
+        _write_truth(args.truth, robot.drive.truth, run.clock.unix_ns)
     log(logging.INFO, f"contacts with obstacles: {robot.drive.contacts}")
     return code
 
@@ -127,7 +130,7 @@ def _connected(robot: RealtimeRobot, gyro: SimulatedGyro | None) -> LiveRobot:
     return ConnectedRobot(open_camera, gyro=gyro)
 
 
-def _write_truth(path: Path, truth: dict[int, Pose], offset_ns: int) -> None:
+def _write_truth(path: Path, truth: dict[int, Pose], unix_ns: Callable[[int], int]) -> None:
     """Write the true poses of the base since the first one, with the stamps of the poses on the bus."""
     import numpy as np
 
@@ -138,4 +141,4 @@ def _write_truth(path: Path, truth: dict[int, Pose], offset_ns: int) -> None:
     zero = np.zeros(len(poses))
     R = se3.rotation_exp(np.column_stack([zero, zero, poses[:, 2]]))
     T = se3.transform(R, np.column_stack([poses[:, :2], zero]))
-    write_trajectory(path, np.array(list(truth), np.int64) + offset_ns, se3.inverse(T[:1]) @ T)
+    write_trajectory(path, np.array([unix_ns(stamp_ns) for stamp_ns in truth], np.int64), se3.inverse(T[:1]) @ T)

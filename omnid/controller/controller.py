@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from copy import copy
 
+from drivers.backoff import Backoff
 from drivers.errors import DriverError
 from drivers.motion import WheelSample
 from drivers.motor import MotorDriver, MotorStatus, VelocityCommand
@@ -19,10 +20,13 @@ from omnid.core.control.contacts import BUS, MOTOR, ContactState
 from omnid.core.control.control_law import ControlLaw, ControllerPose, ControllerSettings
 from omnid.core.control.heading_controller import Twist
 from omnid.core.control.motion_monitor import Motion
+from omnid.core.control.safety_rules import AWAITED
 from omnid.core.control.trust import MotorReport
 from omnid.core.control.velocity_limits import STOP
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.engine.flow import nothing
+
+FIRST_TOLD_S, LONGEST_TOLD_S = 2.0, 300.0  # between two lines about a motor controller that does not answer
 
 
 class Controller:
@@ -42,8 +46,11 @@ class Controller:
         *,
         clock_ns: Callable[[], int] = time.monotonic_ns,
         limited: Callable[[VelocityCommand], tuple[float, float]] | None = None,
+        boot_s: float | None = None,
     ) -> None:
         """report: takes lines for the log. clock_ns: the clock of the poses' stamps.
+
+        boot_s: the motor controller has not answered yet, and may boot for so long; None: it has.
 
         limited: velocity [m/s] and yaw rate [rad/s] that the driver makes of a command; None: those of the command.
         """
@@ -51,10 +58,12 @@ class Controller:
         self._limited = limited or _unlimited
         self._period_ns = round(period_s * 1e9)
         self._law = ControlLaw(settings, self._clock_ns())
+        self._boots_until_ns = self._clock_ns() + round((boot_s or 0.0) * 1e9)
+        self._told_again, self._tell_ns = Backoff(FIRST_TOLD_S, LONGEST_TOLD_S), 0
         self._last_ns = self._due_ns = 0  # the last tick, and when the next one is due
         self._driven_ns = 0  # capture of the newest pose that a command has followed from
         self._motor_stopped = False  # True if the motor controller stopped by itself before the last tick
-        self.state = ControllerState()
+        self.state = ControllerState(failed=boot_s is not None)
 
     @property
     def due_ns(self) -> int:
@@ -102,8 +111,14 @@ class Controller:
         # 1. Step the law.
         now_ns = self._clock_ns()
         dt_s, late_s = self._keep_rhythm(now_ns)
+        state = self.state
         output = self._law.step(
-            now_ns, dt_s, late_s=late_s, motor_failed=self.state.failed, motor_stopped=self._motor_stopped
+            now_ns,
+            dt_s,
+            late_s=late_s,
+            motor_awaited=state.failed and not state.sent,
+            motor_failed=state.failed,
+            motor_stopped=self._motor_stopped,
         )
         # 2. Keep its state for the status, and report what has changed.
         self._keep_state(output.reason)
@@ -166,17 +181,27 @@ class Controller:
             self.state.late += 1
             return None
         except DriverError as error:
-            if not self.state.failed:
-                self._report(str(error))
+            self._take_problem(str(error), command.stamp_ns)
             self.state.failed = True
             self.state.errors += 1
             self._law.stand()  # its own watchdog stops a motor controller that receives nothing
             return None
-        if self.state.failed:
-            self._report("the motor controller is back")
-        self.state.failed = False
+        if self.state.problem:
+            self._report("the motor controller is back" if self.state.sent else "the motor controller answers")
+        self.state.failed, self.state.problem, self.state.overdue = False, "", False
+        self._told_again.reset()
         self.state.sent += 1
         return status
+
+    def _take_problem(self, problem: str, now_ns: int) -> None:
+        """Keep why the motor controller has not taken a command; report it where it is new, after growing waits."""
+        state = self.state
+        state.overdue = not state.sent and now_ns > self._boots_until_ns
+        if state.failed and (problem == state.problem or now_ns < self._tell_ns):
+            return
+        state.problem = problem
+        self._tell_ns = now_ns + round(self._told_again.next_s() * 1e9)
+        self._report(problem if state.sent else f"{AWAITED}: {problem}")
 
     def _take_status(self, status: MotorStatus, now_ns: int) -> None:
         self._motor_stopped = status.watchdog_expired

@@ -25,7 +25,7 @@ from omnid.engine.process import python, python_environment
 from omnid.engine.telemetry import StageStats
 from omnid.errors import OmnidError
 
-START_S: Final = 30.0  # some boards restart when their port is opened
+START_S: Final = 30.0  # of the process, beyond the time in which the motor controller may boot
 END_S: Final = LONGEST_RAMP_S + 2.0
 RECEIVE_S: Final = 0.5
 PROCESS: Final = "omnid.controller.process"
@@ -73,7 +73,7 @@ class ControllerLink:
     """
 
     def __init__(self, start: ControllerStart, stats: StageStats, report: Callable[[str], None]) -> None:
-        """Start the process; DriverError where the motor controller cannot be opened."""
+        """Start the process; DriverError where its settings cannot be used, or where it waits in vain."""
         self._report = report
         self.take_wheels: Callable[[WheelSample], object] = nothing  # called with what the motor controller reports
         self.statistics = ControllerStatistics(stats)
@@ -85,7 +85,7 @@ class ControllerLink:
             self._process = _started(there.fileno())
         self._channel.send(start)
         try:
-            self._await_start()
+            self._await_start(START_S + start.motor.boot_s)
         except BaseException:
             self.close()
             raise
@@ -169,13 +169,13 @@ class ControllerLink:
     def _overdue(self) -> bool:
         return bool(self._ended_ns) and (time.monotonic_ns() - self._ended_ns) * S_PER_NS > END_S
 
-    def _await_start(self) -> None:
+    def _await_start(self, start_s: float) -> None:
         try:
-            first = self._channel.receive(START_S)
+            first = self._channel.receive(start_s)
         except EOFError:
             raise OmnidError(self._unexpected_end()) from None
         if first is NO_MESSAGE:
-            raise OmnidError(f"the controller process did not start within {START_S:.0f} s: is the host overloaded?")
+            raise OmnidError(f"the controller process did not start within {start_s:.0f} s: is the host overloaded?")
         if isinstance(first, StartFailed):
             raise DriverError(first.reason)
         if first.text:

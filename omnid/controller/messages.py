@@ -27,6 +27,7 @@ class ControllerStart(NamedTuple):
     motor: MotorSettings
     controller: ControllerSettings
     realtime: RealtimeSettings
+    waits: bool = False  # the start fails without a motor controller that answers; otherwise it is asked on
 
 
 class ControllerUpdate(NamedTuple):
@@ -42,7 +43,7 @@ class ControllerUpdate(NamedTuple):
 
 
 class StartFailed(NamedTuple):
-    """The process ends because it cannot open the motor controller."""
+    """The process ends because the motor controller's settings cannot be used, or because it has not answered."""
 
     reason: str
 

@@ -19,11 +19,13 @@ ANSWER_SHARE: Final = 0.8
 WATCHDOG_TICKS: Final = 4  # Least watchdog_ms in ticks: after a pause of half of it the driver sends a stop first.
 
 
-def open_motor(config: MotorSettings, closing: ExitStack) -> tuple[SerialMotor, SimulatedMotor | None]:
+def open_motor(
+    config: MotorSettings, closing: ExitStack, *, waits: bool = True
+) -> tuple[SerialMotor, SimulatedMotor | None]:
     """Return the driver of the configured port, and the simulated motor controller where the port is "simulated".
 
-    closing closes both. DriverError where there is no answer, and for a watchdog so short that one or two late ticks
-    would let it expire.
+    closing closes both. waits: for an answer, and DriverError where there is none; otherwise `send` asks for it.
+    DriverError for a watchdog so short that one or two late ticks would let it expire.
     """
     least_ms = WATCHDOG_TICKS * 1000 / config.rate_hz
     if config.watchdog_ms < least_ms:
@@ -38,6 +40,7 @@ def open_motor(config: MotorSettings, closing: ExitStack) -> tuple[SerialMotor, 
         baud=config.baud,
         timeout_s=ANSWER_SHARE / config.rate_hz,
         watchdog_ms=config.watchdog_ms,
+        connect_s=config.boot_s if waits else 0.0,
     )
     closing.callback(driver.close)
     return driver, simulated

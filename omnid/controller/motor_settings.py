@@ -40,6 +40,11 @@ class MotorSettings:
     port: Annotated[str, "serial port of the motor controller, or simulated; empty: none"] = ""
     protocol: Annotated[str, "line, roboteq, odrive_ascii, vesc, or a protocol of another package"] = "line"
     baud: Annotated[int, Meta(ge=0, le=4_000_000), "bits per second; 0: the protocol's own"] = 0
+    boot_s: Annotated[
+        float,
+        Meta(ge=0.1, le=600),
+        "a motor controller may take so long to boot when its port is opened; it is asked on after that, s",
+    ] = 10.0
     rate_hz: Annotated[float, Meta(ge=5, le=200), "commands per second"] = 20.0
     watchdog_ms: Annotated[
         int,

@@ -89,12 +89,12 @@ class ControllerLoop:
 
 
 def run_controller(channel: Channel) -> int:
-    """Run as the daemon's first message says; return the exit code, 2 where the motor controller cannot be opened."""
+    """Run as the daemon's first message says; return the exit code, 2 where it cannot start."""
     with ExitStack() as closing:
         closing.callback(channel.close)  # last of all, when the wheels are at rest
         start: ControllerStart = channel.receive(START_MESSAGE_S)
         try:
-            driver, _ = open_motor(start.motor, closing)
+            driver, _ = open_motor(start.motor, closing, waits=start.waits)
         except DriverError as error:
             channel.send(StartFailed(str(error)))
             return 2
@@ -105,6 +105,7 @@ def run_controller(channel: Channel) -> int:
             1.0 / start.motor.rate_hz,
             lambda text: channel.send(LogRecord(text)),
             limited=start.motor.drive.geometry().limited,
+            boot_s=None if start.waits else start.motor.boot_s,
         )
         ControllerLoop(channel, controller).run()
     return 0

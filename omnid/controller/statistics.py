@@ -35,6 +35,8 @@ class ControllerState:
     arm_answer: ArmAnswer = NO_ANSWER
     source: str = ""  # source of the commands that drive; empty while none does
     failed: bool = False  # the motor controller did not take the last command
+    problem: str = ""  # why, in words
+    overdue: bool = False  # it has not answered yet, though it has had the time to boot
     fault: int = 0  # the motor controller's own number
     battery_v: float = math.nan  # voltage that the motor controller reports
     slowed_by: str = ""  # why the base drives slowly; empty: it need not

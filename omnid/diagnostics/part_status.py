@@ -10,12 +10,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from omnid.core.nanoseconds import S_PER_NS
 from omnid.core.obstacles.unwatched import Unwatched
 from omnid.core.odometry.motion_sensors import BIAS, DISTANCE, GYRO_OFFSET, TURN, WHEEL_OFFSET, MotionSensors
 from omnid.core.rig.column_finding import RigState
 from omnid.core.rig.rig_health import VIEWS, RigHealth
 from omnid.core.stereo.tiles import SIDES, Side, TileStates
 from omnid.diagnostics.run_summary import RunStatistics
+from omnid.engine.robot_clock import RobotClock
 from omnid.stages.geometry import Geometry
 from omnid.stages.motion_inbox import MotionInbox
 from omnid.stages.obstacles import CameraFloor
@@ -25,6 +27,7 @@ from omnid.tracking_state import MapState
 from omnid.transport.codec import ERROR, OK, STALE, WARN, DiagnosticStatus
 from omnid.transport.commands import SensorReceiver
 from omnid.transport.status_names import (
+    CLOCK,
     FIXED_PERCENT,
     FLOOR,
     IMAGES,
@@ -132,6 +135,20 @@ def _estimates(sensors: MotionSensors, *, wheels: bool, gyro: bool) -> dict[str,
         found |= {f"gyro_bias_{axis}_radps": (BIAS.start + k, 1.0) for k, axis in enumerate("xyz")}
     values = {name: unit * float(sensors.values[state]) for name, (state, unit) in found.items()}
     return values | {f"{name}_sigma": unit * float(sensors.sigmas[state]) for name, (state, unit) in found.items()}
+
+
+STEP_S: Final = 60.0  # The status warns of a step of the clock for this time: people look at it now and then.
+
+
+def clock_status(clock: RobotClock) -> DiagnosticStatus:
+    """Return whether the computer's clock was set while the robot ran, and by how much."""
+    clock.follow()
+    if not clock.steps:
+        return DiagnosticStatus.of(CLOCK, OK, "followed", {"steps": 0})
+    since_s = (clock.monotonic_ns() - clock.step.at_ns) * S_PER_NS
+    values = {"steps": clock.steps, "step_s": f"{clock.step.change_ns * S_PER_NS:.3f}", "since_s": round(since_s)}
+    message = f"it was set {clock.step.words}: the stamps follow it"
+    return DiagnosticStatus.of(CLOCK, WARN if since_s < STEP_S else OK, message, values)
 
 
 LIVE = "all parts are live"

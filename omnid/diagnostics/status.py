@@ -12,7 +12,7 @@ from drivers.frame import Camera
 from omnid.controller.statistics import ControllerStatistics
 from omnid.core.control.arming import STARTED
 from omnid.core.control.collision_monitor import remedy
-from omnid.core.control.safety_rules import ASKED, COMMAND_STALE, FAILED, IDLE, NOT_ARMED
+from omnid.core.control.safety_rules import ASKED, AWAITED, COMMAND_STALE, FAILED, IDLE, NOT_ARMED
 from omnid.diagnostics.run_summary import RunCounters, RunStatistics
 from omnid.engine.telemetry import Histogram, StageStats, Telemetry
 from omnid.messages import OdometryUpdate
@@ -156,6 +156,7 @@ def _wheels(controller: ControllerStatistics, commands: CommandReceiver | None) 
     values |= _by_reason(status_names.IGNORED_PREFIX, state.refused)
     if commands is not None:
         values |= {Key.COMMANDS: commands.accepted, Key.STOPS: commands.stops}
+        values |= {Key.COMMAND_REFUSAL: commands.refusal}
         values |= _by_reason(status_names.REFUSED_PREFIX, commands.refused)
     late = controller.lateness
     values |= _times(status_names.CAPTURE_TO_WHEEL, controller.to_wheel) | _times(status_names.TICK_LATE, late)
@@ -169,6 +170,7 @@ def _wheels(controller: ControllerStatistics, commands: CommandReceiver | None) 
         Key.SOURCE: state.source,
         Key.OBSTACLE: state.obstacle,
         Key.OBSTACLE_STOPS: state.obstacle_stops,
+        Key.PROBLEM: state.problem,
         "battery_v": state.battery_v,
     }
     # 3. Whether the wheels turn, and why not.
@@ -176,12 +178,15 @@ def _wheels(controller: ControllerStatistics, commands: CommandReceiver | None) 
     message = reason or (f"driving slowly: {slow}" if slow else "driving")
     if not reason and state.blocked:
         message = f"stopped: {state.obstacle}"
+    if reason == AWAITED:
+        message = f"{AWAITED}: {state.problem}"
     if reason == NOT_ARMED:
         reason = state.disarmed_by
         message = reason if reason == STARTED else f"not armed: {reason}"
     is_slowed = not reason and bool(slow)
     level = WARN if is_slowed or reason not in NO_FAULTS else OK
-    if state.reason == FAILED or state.failed or state.fault:
+    boots = state.reason == AWAITED and not state.overdue
+    if not boots and (state.reason == FAILED or state.failed or state.fault):
         level = ERROR
     return DiagnosticStatus.of(status_names.WHEELS, level, message, values)
 

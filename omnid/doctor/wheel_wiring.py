@@ -14,7 +14,8 @@ from dataclasses import replace
 from typing import Final, NamedTuple
 
 from drivers.motor import VelocityCommand, stop_command
-from drivers.motors.serial_motor import LateReplyError, NoReplyError, SerialMotor
+from drivers.motors.protocols.motor_protocol import NoReplyError
+from drivers.motors.serial_motor import LateReplyError, SerialMotor
 from omnid.controller.motor import open_motor
 from omnid.controller.motor_settings import DriveSettings, MotorSettings
 from omnid.errors import OmnidError

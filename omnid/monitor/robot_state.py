@@ -9,6 +9,7 @@ from contextlib import suppress
 from queue import Empty, SimpleQueue
 from typing import Final, NamedTuple
 
+from omnid.core.nanoseconds import S_PER_NS
 from omnid.engine.telemetry import Histogram
 from omnid.errors import OmnidError
 from omnid.plain_text import plain
@@ -26,10 +27,11 @@ _MAX_AGE_NS: Final = 3_600 * 10**9  # a message that is older, or from the futur
 class ReceivedMessage(NamedTuple):
     """A message as it arrived."""
 
-    received_ns: int  # Unix time
+    received_ns: int  # Unix time, which may be set between two messages
     topic: str
     payload: bytes
     attachment: bytes
+    arrival_ns: int  # the same by CLOCK_MONOTONIC
 
 
 class Inbox:
@@ -41,7 +43,7 @@ class Inbox:
 
     def put(self, topic: str, payload: bytes, attachment: bytes) -> None:
         """Add a message that has just arrived; does not block."""
-        self._messages.put(ReceivedMessage(time.time_ns(), topic, payload, attachment))
+        self._messages.put(ReceivedMessage(time.time_ns(), topic, payload, attachment, time.monotonic_ns()))
         if self._messages.qsize() > _INBOX_DEPTH:
             with suppress(Empty):
                 self._messages.get_nowait()
@@ -74,7 +76,8 @@ class RobotState:
         """Count a message and return the pose in it, if it is one."""
         try:
             if message.topic == "odom":
-                return self._add_pose(decode_pose(message.payload, message.attachment, message.received_ns))
+                pose = decode_pose(message.payload, message.attachment, message.received_ns)
+                return self._add_pose(pose, message.arrival_ns * S_PER_NS)
             if message.topic == "status":
                 self.add_diagnostics(decode_diagnostics(message.payload))
         except OmnidError:
@@ -106,7 +109,7 @@ class RobotState:
         if self.real_time_factor:
             self.age = Histogram()
 
-    def _add_pose(self, pose: Pose) -> Pose:
+    def _add_pose(self, pose: Pose, arrival_s: float) -> Pose:
         """Count a pose. Skipped sequence numbers are missed poses; a smaller number means that the daemon restarted."""
         if self.pose is not None and 0 <= self.pose.attachment.seq < pose.attachment.seq:
             self.missed += pose.attachment.seq - self.pose.attachment.seq - 1
@@ -114,7 +117,7 @@ class RobotState:
             self.restarts += 1
         self.pose = pose
         self.poses += 1
-        self._arrivals_s.append(pose.received_ns * 1e-9)
+        self._arrivals_s.append(arrival_s)
         of_robot = [] if self.real_time_factor else [(self.age, pose.stamp_ns)]
         for histogram, since_ns in (*of_robot, (self.network, pose.attachment.sent_ns)):
             if 0 <= pose.received_ns - since_ns < _MAX_AGE_NS:
@@ -130,7 +133,7 @@ class RobotState:
     @property
     def time_since_pose_s(self) -> float:
         """Time since the newest pose arrived; inf before the first."""
-        return time.time() - self._arrivals_s[-1] if self._arrivals_s else math.inf
+        return time.monotonic() - self._arrivals_s[-1] if self._arrivals_s else math.inf
 
     @property
     def rate_hz(self) -> float:

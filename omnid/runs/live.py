@@ -29,6 +29,7 @@ from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Stream
 from omnid.engine.kernel_cache import prepare_kernels, read_kept_kernels
 from omnid.engine.logging_setup import Report
 from omnid.engine.realtime import ThreadStart, give_back_code, name_thread, prepare, priorities
+from omnid.engine.robot_clock import RobotClock, fixed_offset, log_time
 from omnid.engine.threads import started
 from omnid.errors import OmnidError
 from omnid.runs.sensor_sources import MotionSource
@@ -49,7 +50,7 @@ def add_status_tickers(session: Session, status: StatusCollector, bus: Bus, reco
     config, graph = session.config, session.graph
     publishers = [_status_on_bus(bus)]
     if recorder is not None:
-        publishers.append(_status_in_recording(recorder, session.now_ns))
+        publishers.append(lambda statuses: recorder.add(statuses, session.clock.monotonic_ns()))
     graph.ticker("status", config.live.status_s, StatusTick(status, *publishers))
     line = StatusLine(session.statistics, graph.telemetry, TICKERS)
     service = Service(graph.telemetry, line, config.service.stall_timeout_s)
@@ -87,17 +88,6 @@ def _status_on_bus(bus: Bus) -> StatusPublisher:
             bus.publish(message.topic, message.payload)
 
     return publish
-
-
-def _status_in_recording(recorder: Recorder, clock_ns: Callable[[], int]) -> StatusPublisher:
-    """Return a function that records statuses, in the time of all other messages also when the clock was set."""
-
-    def record(statuses: list[DiagnosticStatus]) -> None:
-        now_ns = clock_ns()
-        with suppress(OmnidError):  # the system's clock may be set to a time that no message can hold
-            recorder.add(status_report(now_ns, statuses), now_ns)
-
-    return record
 
 
 class TerminalStatus:
@@ -260,21 +250,16 @@ class LiveRun:
         self._config, self._robot, self._report, self._rig, self._show = config, robot, report, rig, show
         self._graph = _graph_that_waits() if robot.waits else _graph_in_time(config, report)
         self._connected = False
+        self.clock = log_time()  # that of the run, once it has begun
 
     def run(self) -> int:
         """Run until a signal comes, or the cameras end; return the exit code."""
         print_stacks_when_killed()
         loaded = started(_load, "imports")
-        offset_ns = time.time_ns() - self._robot.clock_ns()
+        clock_ns, warn = self._robot.clock_ns, partial(self._report, logging.WARNING)
+        self.clock = fixed_offset(clock_ns) if self._robot.waits else RobotClock(clock_ns, report=warn)
         with ExitStack() as outputs:
-            session = Session(
-                self._config,
-                self._graph,
-                outputs,
-                lambda text: self._report(logging.WARNING, text),
-                offset_ns=offset_ns,
-                clock_ns=self._robot.clock_ns,
-            )
+            session = Session(self._config, self._graph, outputs, warn, clock=self.clock)
             outputs.enter_context(session.signals(self._on_signal))
             geometry = self._geometry(session)
             loaded()

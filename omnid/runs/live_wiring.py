@@ -14,14 +14,22 @@ from drivers.motor import VelocityCommand
 from omnid.controller.link import DriveLink
 from omnid.core.control.arming import ArmAnswer
 from omnid.core.control.command_sources import PLANNER
-from omnid.core.control.safety_rules import NO_POSE
+from omnid.core.control.safety_rules import AWAITED, NO_POSE
 from omnid.core.navigation.requests import NavigationCommand
 from omnid.core.rig.rig_health import RigHealth
 from omnid.diagnostics.load_ladder import PERIOD_S, LoadLadder
-from omnid.diagnostics.part_status import ImagesStatus, floor_status, motion_status, places_status, rig_status
+from omnid.diagnostics.part_status import (
+    ImagesStatus,
+    clock_status,
+    floor_status,
+    motion_status,
+    places_status,
+    rig_status,
+)
 from omnid.diagnostics.status import Latency, StatusCollector, StatusSources
 from omnid.engine.graph import NEWEST, Sink, Stream
 from omnid.engine.logging_setup import Report
+from omnid.engine.robot_clock import RobotClock, SegmentTime
 from omnid.formats.route_file import RouteFolder
 from omnid.light.exposure_control import ExposureControl
 from omnid.light.exposure_law import UsefulArea
@@ -44,11 +52,12 @@ from omnid.stages.obstacles import ADVICE
 from omnid.stages.places import Places
 from omnid.stages.synchronise import Synchronise
 from omnid.transport.bus import Bus
-from omnid.transport.commands import CommandReceiver, StampRule
+from omnid.transport.commands import CommandReceiver
+from omnid.transport.freshness import Freshness
 from omnid.transport.navigation_commands import NavigationReceiver, RequestQueue
 from omnid.transport.requests import Answer, Request
 from omnid.transport.status_names import DISARMED_BY_STOP
-from omnid.transport.topics import ARM, MAP, MAP_TOPICS, NAVIGATION_TOPICS, SENSOR_TOPICS, command_topics
+from omnid.transport.topics import ARM, MAP, MAP_TOPICS, NAVIGATION_TOPICS, SENSOR_TOPICS, TIME, command_topics
 
 Receive: TypeAlias = Callable[[Request], Answer | None]  # returns None where there is no answer, or not yet
 NO_MOTOR: Final = "the daemon runs without a motor: set motor.port, or start it with --motor"
@@ -69,18 +78,20 @@ class LiveCommands:
         controller: DriveLink | None,
         navigate: Callable[[NavigationCommand], None],
         report: Report,
+        freshness: Freshness,
     ) -> None:
-        """navigate: takes requests to the navigation. report: takes lines for the log, with a level of `logging`."""
+        """navigate: takes requests to the navigation. report: takes lines for the log, with a level of `logging`.
+
+        freshness: the rule for the times of sending.
+        """
         self._session, self._bus, self._controller = session, bus, controller
         settings, warn = session.config.controller, partial(report, logging.WARNING)
-        stamps = StampRule(
-            settings.deadlines.command_s, synchronised=session.config.bus.command_clock == "synchronised"
-        )
-        self.navigation = NavigationReceiver(navigate, stamps, report=warn)
+        bus.serve(TIME, freshness.own_time)
+        self.navigation = NavigationReceiver(navigate, freshness, report=warn)
         self.commands: CommandReceiver | None = None
         if controller is not None:
             self.commands = CommandReceiver(
-                controller, stamps, sources=settings.sources.names, is_unique=lambda: bus.is_unique, report=warn
+                controller, freshness, sources=settings.sources.names, is_unique=lambda: bus.is_unique, report=warn
             )
             controller.statistics.take_arm_answer = self._answer_arm
 
@@ -112,6 +123,8 @@ class LiveCommands:
     def _answer_arm(self, answer: ArmAnswer) -> None:
         """Pass on the controller's answer; of several requests at once it answers the newest."""
         text = answer.refusal or "armed: it obeys commands from now on"
+        if answer.refusal == AWAITED and self._controller is not None:
+            text = f"{AWAITED}: {self._controller.statistics.state.problem}"
         if answer.refusal == NO_POSE:
             text = f"{NO_POSE}: {self._why_no_pose()}"
         self._bus.answer(answer.id, Answer(not answer.refusal, text), also_before=ARM)
@@ -134,12 +147,12 @@ class LiveWiring:
         """Connect the wheels, the bus, the samples of wheels and gyro, and the recording."""
         config = session.config
         self._session, self._geometry, self._robot, self._report = session, geometry, robot, report
-        self._latency, self._ladder = Latency(session.clock_ns), LoadLadder()
+        self._latency, self._ladder = Latency(session.clock.monotonic_ns), LoadLadder()
         self._controller = robot.connect(session)
         self._bus = session.open_bus(geometry.rig, gives_time=robot.waits)
         self._pairing = Synchronise(geometry.rig, config.pair, config.motion.R_base_imu)
         self._sensors = SensorSources(
-            config, self._pairing.motion, session.offset_ns, self._controller, report, with_images=robot.brings_samples
+            config, self._pairing.motion, session.clock, self._controller, report, with_images=robot.brings_samples
         )
         self._recorder = self._open_recorder() if config.record.enabled else None
         self._rig = RigHealth(geometry.cylinder, config.rig.check, config.rig.check_s)
@@ -171,7 +184,11 @@ class LiveWiring:
         if stages.places:
             files.save_map = stages.places.want_copy
         # 4. From the bus: commands, requests, samples.
-        received = LiveCommands(session, self._bus, self._controller, files.put, self._report)
+        freshness = Freshness(
+            config.controller.deadlines.command_s,
+            *((RobotClock(), session.clock) if robot.waits else (session.clock,)),
+        )
+        received = LiveCommands(session, self._bus, self._controller, files.put, self._report, freshness)
         received.subscribe(self._sensors, saver)
         # 5. Status.
         self._add_status(stages, exposure, received, saver)
@@ -200,7 +217,7 @@ class LiveWiring:
         session, config, bus = self._session, self._session.config, self._bus
         poses: dict[str, Sink[OdometryUpdate]] = {}
         if config.bus.panorama_hz:
-            poses["panorama"] = PanoramaSink(bus, config.bus.panorama_hz, session.offset_ns)
+            poses["panorama"] = PanoramaSink(bus, config.bus.panorama_hz, session.clock.unix_ns)
         if self._rig.uses_views:
             poses["rig"] = RigViews(self._rig)
         recorder, controller = self._recorder, self._controller
@@ -230,6 +247,7 @@ class LiveWiring:
             exposure.status,
             partial(rig_status, self._rig),
             *([received.navigation.status] if controller else ()),
+            partial(clock_status, session.clock),
             partial(motion_status, self._front_end.odometry, self._pairing.motion, sensors.receiver),
             *([partial(places_status, stages.places)] if stages.places else ()),
             *([partial(floor_status, stages.floor)] if stages.floor else ()),
@@ -246,7 +264,7 @@ class LiveWiring:
             received.commands,
             TICKERS,
             tuple(status),
-            session.clock_ns,
+            session.clock.monotonic_ns,
         )
         add_status_tickers(session, StatusCollector(sources), self._bus, self._recorder)
 
@@ -268,10 +286,9 @@ class LiveWiring:
 
     def _open_recorder(self) -> Recorder:
         session, rig = self._session, self._geometry.rig
-        encode = session.encoder(rig, LOG_POINTS)
-        recorder = open_recorder(
-            session.config, rig_toml(rig), self._report, encode=encode, offset_ns=session.offset_ns
-        )
+        times = SegmentTime(session.clock)
+        encode = session.encoder(rig, LOG_POINTS, times.unix_ns)
+        recorder = open_recorder(session.config, rig_toml(rig), self._report, encode=encode, time=times)
         session.outputs.callback(recorder.close)
         return recorder
 

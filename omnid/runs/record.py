@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
@@ -14,6 +13,7 @@ from drivers.logs.rotating_log import RotatingLog
 from omnid.config import Config
 from omnid.engine.graph import NEWEST, Graph
 from omnid.engine.process import handle_stop_signals
+from omnid.engine.robot_clock import RobotClock, SegmentTime
 from omnid.settings import dump
 from omnid.sinks.encoder import Encoder
 from omnid.sinks.recorder import Recorder
@@ -25,23 +25,23 @@ WAITING_RECORDS: Final = 20
 
 
 def open_recorder(
-    config: Config, rig: str, report: EventCallback, *, encode: Encoder | None = None, offset_ns: int = 0
+    config: Config, rig: str, report: EventCallback, *, encode: Encoder | None = None, time: SegmentTime | None = None
 ) -> Recorder:
     """Return a recorder to the folder of the configuration; the first message makes the first file.
 
     rig: the rig's TOML, or "" where there is none; it is attached to every file, as is the configuration.
-    report: takes severity and text of problems. encode, offset_ns: see Recorder.
+    report: takes severity and text of problems. encode, time: see Recorder.
     """
     attachments = {"omnid.toml": dump(config).encode()} | ({"rig.toml": rig.encode()} if rig else {})
     folder = Path(config.record.folder)
     log = RotatingLog(folder, config.bus.robot, config.record.rotation(), attachments, on_event=report)
-    return Recorder(log, config.bus.robot, encode, offset_ns=offset_ns, skip_invalid=True)
+    return Recorder(log, config.bus.robot, encode, time=time, skip_invalid=True)
 
 
 def record(sources: Mapping[Camera, FrameSource], config: Config, rig: str, report: EventCallback) -> Recorder:
     """Record frames with stamps of CLOCK_MONOTONIC until the sources end or a signal comes; return the recorder."""
-    offset_ns = time.time_ns() - time.monotonic_ns()
-    recorder = open_recorder(config, rig, report, offset_ns=offset_ns)
+    clock = RobotClock(report=lambda line: report(logging.WARNING, line))
+    recorder = open_recorder(config, rig, report, time=SegmentTime(clock))
     graph = Graph(policy=NEWEST, depth=WAITING_RECORDS)
     frames = [graph.source(name, source.frames, wake=source.close) for name, source in sources.items()]
     graph.sink("record", recorder, *frames)

@@ -13,6 +13,7 @@ from drivers.motion import MotionSample
 from omnid.config import Config
 from omnid.controller.link import DriveLink
 from omnid.engine.logging_setup import Report
+from omnid.engine.robot_clock import RobotClock
 from omnid.errors import OmnidError
 from omnid.stages.motion_inbox import MotionInbox
 from omnid.transport.commands import SensorReceiver
@@ -66,13 +67,13 @@ class SensorSources:
         self,
         config: Config,
         inbox: MotionInbox,
-        offset_ns: int,
+        clock: RobotClock,
         controller: DriveLink | None,
         report: Report,
         *,
         with_images: bool = False,
     ) -> None:
-        """offset_ns: from the stamps of images to Unix time. with_images: the samples come with the images."""
+        """clock: that of the stamps of images. with_images: the samples come with the images."""
         settings, joints = config.motion, joint_wheels(config)
         topics = set()
         if settings.wheels != "off" and not with_images:
@@ -83,5 +84,5 @@ class SensorSources:
         if settings.imu != "off" and not with_images:
             topics.add(IMU)
         self.receiver = SensorReceiver(
-            inbox.add, offset_ns, frozenset(topics), partial(report, logging.WARNING), joints
+            inbox.add, clock.stamp_ns, frozenset(topics), partial(report, logging.WARNING), joints
         )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -24,11 +23,12 @@ from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.graph import Graph
 from omnid.engine.process import handle_stop_signals
 from omnid.engine.realtime import RealtimeSettings
+from omnid.engine.robot_clock import RobotClock, log_time
 from omnid.engine.telemetry import StageStats
 from omnid.engine.threads import returns_within
 from omnid.errors import OmnidError
 from omnid.settings import dump
-from omnid.sinks.encoder import Encoder, map_encoding
+from omnid.sinks.encoder import Encoder, UnixTime, map_encoding
 from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.transport.bus import Bus
 
@@ -64,15 +64,11 @@ class Session:
         outputs: ExitStack,
         warn: Callable[[str], None],
         *,
-        offset_ns: int = 0,
-        clock_ns: Callable[[], int] = time.monotonic_ns,
+        clock: RobotClock | None = None,
     ) -> None:
-        """warn: takes a line for the user; offset_ns: from the stamps of the frames to Unix time.
-
-        clock_ns: the clock of these stamps.
-        """
+        """warn: takes a line for the user; clock: that of the stamps of the frames, None: they are Unix time."""
         self.config, self.graph, self.outputs, self.warn = config, graph, outputs, warn
-        self.offset_ns, self.clock_ns = offset_ns, clock_ns
+        self.clock = clock or log_time()
         self.statistics = RunStatistics()
         self.signal = 0  # number of the signal that ended the run
         self._focal_px = FLOOR_FOCAL_PX  # of the panoramas
@@ -106,12 +102,14 @@ class Session:
             self.warn(f"the bus has not closed within {BUS_END_S:g} s, for a subscriber does not read: it is given up")
 
     def start_controller(self, realtime: RealtimeSettings, *, of_replay: bool = False) -> ControllerLink:
-        """Start the controller process; DriverError where the motor cannot be opened.
+        """Start the controller process; DriverError where its settings cannot be used.
+
+        A live run waits for its motor controller as for its cameras, while a replay needs it at once: DriverError.
 
         The wheels stop, and the process ends, at the latest with `outputs`.
         """
         settings = self.config.controller.of_replay if of_replay else self.config.controller
-        start = ControllerStart(self.config.motor, self.with_obstacles_known(settings), realtime)
+        start = ControllerStart(self.config.motor, self.with_obstacles_known(settings), realtime, waits=of_replay)
         link = ControllerLink(start, self.graph.telemetry.add(StageStats("motor")), self.warn)
         self.outputs.callback(link.close)
         return link
@@ -141,14 +139,10 @@ class Session:
                 'or controller.collision.unknown = "slow"'
             )
 
-    def encoder(self, rig: Rig, cloud_points: int) -> Encoder:
-        """Return an encoder that limits the number of points of the map."""
+    def encoder(self, rig: Rig, cloud_points: int, unix_ns: UnixTime | None = None) -> Encoder:
+        """Return an encoder that limits the number of points of the map; unix_ns: None for that of the clock."""
         encoding = map_encoding(self.config, cloud_points)
-        return Encoder(rig.T_base_rig, encoding, self.offset_ns, rig)
-
-    def now_ns(self) -> int:
-        """Return the time, of Unix time, by the clock of the stamps."""
-        return self.clock_ns() + self.offset_ns
+        return Encoder(rig.T_base_rig, encoding, unix_ns or self.clock.unix_ns, rig)
 
     def dropped_messages(self) -> int:
         """Return the number of messages that were dropped in front of the stages and sinks."""

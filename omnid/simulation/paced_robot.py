@@ -83,7 +83,6 @@ class PacedRobot:
         self._vehicle: Vehicle | None = None
         self._link: PacedLink | None = None
         self._arrived_ns = 0  # of the newest message that was delivered to the controller
-        self.offset_ns = 0  # from the simulated time to Unix time
         self._states = {camera: CameraState(mode="simulated") for camera in CAMERAS}
         self._pace = RealTimeFactor(1.0 / robot.rate_hz)
         self._closed = self._ends = False
@@ -99,7 +98,6 @@ class PacedRobot:
 
     def connect(self, session: Session) -> DriveLink:
         """Set the robot up, with the controller of the settings."""
-        self.offset_ns = session.offset_ns
         config = replace(session.config, controller=session.with_obstacles_known(session.config.controller))
         self._link = PacedLink(session.graph.telemetry.add(StageStats("motor")), self._period_ns)
 

@@ -86,11 +86,6 @@ class RealtimeRobot:
         x, y, z = (bias + errors.noise_radps * self._gyro_noise.gauss(0.0, 1.0) for bias in errors.bias_radps)
         return x, y, z + self._yaw_rate_radps
 
-    @property
-    def offset_ns(self) -> int:
-        """Offset from the stamps to Unix time [ns]."""
-        return time.time_ns() - time.monotonic_ns()
-
     def pose_at(self, stamp_ns: int) -> Pose:
         """Return the pose at a time, as soon as it is known."""
         until_s = time.monotonic() + LONGEST_WAIT_S

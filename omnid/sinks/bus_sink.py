@@ -9,7 +9,7 @@ import cv2
 from drivers.frame import Frame
 from drivers.motor import VelocityCommand
 from omnid.messages import OdometryUpdate, PlaceUpdate
-from omnid.sinks.encoder import Encoder, Outgoing, StateReports, static_frames
+from omnid.sinks.encoder import Encoder, Outgoing, StateReports, UnixTime, same_time, static_frames
 from omnid.transport.bus import Bus
 from omnid.transport.codec import PoseAttachment, clock_cdr, features_to_bytes
 from omnid.transport.sensor_codec import image_cdr
@@ -22,7 +22,7 @@ class BusSink:
     def __init__(self, bus: Bus, encode: Encoder, clock: type[OdometryUpdate | VelocityCommand] | None = None) -> None:
         """clock: the kind of message, from one thread, by whose stamps /clock advances, where the bus has it."""
         self._clock, self._time_ns = clock, 0
-        self._bus, self._encode, self._states = bus, encode, StateReports(encode.offset_ns)
+        self._bus, self._encode, self._states = bus, encode, StateReports(encode.unix_ns)
         self._gave_frames = False
 
     def process(self, message: Outgoing) -> None:
@@ -30,7 +30,7 @@ class BusSink:
         # 1. The clock, before what is stamped by it.
         if self._clock is not None and isinstance(message, self._clock) and message.stamp_ns > self._time_ns:
             self._time_ns = message.stamp_ns
-            self._bus.publish(CLOCK, clock_cdr(message.stamp_ns + self._encode.offset_ns))
+            self._bus.publish(CLOCK, clock_cdr(self._encode.unix_ns(message.stamp_ns)))
         # 2. The message itself.
         attachment = _attachment(message).to_bytes() if isinstance(message, OdometryUpdate) else None
         for topic, _, payload in self._encode(message):
@@ -53,9 +53,9 @@ def _attachment(odometry: OdometryUpdate) -> PoseAttachment:
 class PanoramaSink:
     """Publishes the panorama of the lower camera as JPEG, at most rate_hz times a second, while it has a subscriber."""
 
-    def __init__(self, bus: Bus, rate_hz: float, offset_ns: int = 0) -> None:
-        """offset_ns: the Encoder's."""
-        self._bus, self._period_ns, self._offset_ns = bus, 1e9 / rate_hz, offset_ns
+    def __init__(self, bus: Bus, rate_hz: float, unix_ns: UnixTime = same_time) -> None:
+        """unix_ns: the Encoder's."""
+        self._bus, self._period_ns, self._unix_ns = bus, 1e9 / rate_hz, unix_ns
         self._next_ns = 0.0
 
     def process(self, odometry: OdometryUpdate) -> None:
@@ -69,5 +69,5 @@ class PanoramaSink:
         # 2. Publish it with its features.
         features = odometry.features
         pixels = {"inliers": features.inliers, "rejected": features.rejected, "new": features.new}
-        _, payload = image_cdr(frame, odometry.stamp_ns + self._offset_ns)
+        _, payload = image_cdr(frame, self._unix_ns(odometry.stamp_ns))
         self._bus.publish(PANORAMA, payload, features_to_bytes(pixels))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -47,6 +47,14 @@ NAVIGATION_LEVELS: Final = {
 }
 
 
+UnixTime: TypeAlias = Callable[[int], int]  # returns the Unix time of a stamp [ns]
+
+
+def same_time(stamp_ns: int) -> int:
+    """Return a stamp that is Unix time already."""
+    return stamp_ns
+
+
 class OutgoingMessage(NamedTuple):
     """An encoded message; a topic without a leading '/' is below the robot's name."""
 
@@ -71,13 +79,17 @@ class Encoder:
     """Encodes messages for ROS 2; the odom of the encoded ones is the base's frame at the first pair, not the rig's."""
 
     def __init__(
-        self, T_base_rig: NDArray[np.float64], map_encoding: MapEncoding, offset_ns: int = 0, rig: Rig | None = None
+        self,
+        T_base_rig: NDArray[np.float64],
+        map_encoding: MapEncoding,
+        unix_ns: UnixTime = same_time,
+        rig: Rig | None = None,
     ) -> None:
-        """offset_ns: from the stamps of the messages to Unix time; 0 for a log, whose stamps are Unix time.
+        """unix_ns: returns the Unix time of a stamp of the messages; those of a log are Unix time.
 
         rig: with the mounting of the cameras, for the static frames; None: they are left out.
         """
-        self.T_base_rig, self._map_encoding, self.offset_ns = T_base_rig, map_encoding, offset_ns
+        self.T_base_rig, self._map_encoding, self.unix_ns = T_base_rig, map_encoding, unix_ns
         self.rig = rig
 
     def __call__(self, message: Outgoing) -> Iterator[OutgoingMessage]:
@@ -86,33 +98,33 @@ class Encoder:
             case OdometryUpdate():
                 yield from self._poses(message)
             case VelocityCommand(stamp_ns, velocity_mps, _, yaw_rate_radps):
-                payload = codec.twist_stamped_cdr(stamp_ns + self.offset_ns, "base_link", velocity_mps, yaw_rate_radps)
+                payload = codec.twist_stamped_cdr(self.unix_ns(stamp_ns), "base_link", velocity_mps, yaw_rate_radps)
                 yield OutgoingMessage("drive", codec.TWIST_SCHEMA, payload)
             case PlaceUpdate():
                 yield from self._map_pose(message)
             case ObstacleRing():
                 payload = scan_cdr(
-                    message.stamp_ns + self.offset_ns,
+                    self.unix_ns(message.stamp_ns),
                     "base_link",
                     message.ranges_m,
                     message.sigma_m,
                     (0.0, self._map_encoding.max_range_m),
                 )
                 yield OutgoingMessage(SCAN, SCAN_SCHEMA, payload)
-                payload = moving_cdr(message.stamp_ns + self.offset_ns, "odom", message.moving)
+                payload = moving_cdr(self.unix_ns(message.stamp_ns), "odom", message.moving)
                 yield OutgoingMessage("moving", codec.POINT_CLOUD_SCHEMA, payload)
             case MapUpdate():
                 yield from self._map(message)
             case GridUpdate():
                 grid = message.grid
-                stamp_ns = message.stamp_ns + self.offset_ns
+                stamp_ns = self.unix_ns(message.stamp_ns)
                 payload = codec.grid_cdr(stamp_ns, "map", grid.cells, grid.cell_m, grid.corner)
                 yield OutgoingMessage("map", codec.GRID_SCHEMA, payload)
             case NavigationUpdate():
                 yield from self._navigation(message)
 
     def _poses(self, odometry: OdometryUpdate) -> Iterator[OutgoingMessage]:
-        stamp_ns = odometry.stamp_ns + self.offset_ns
+        stamp_ns = self.unix_ns(odometry.stamp_ns)
         T_odom_base, covariance, velocity, velocity_covariance = of_base(odometry, self.T_base_rig)
         pose = codec.odometry_cdr(
             stamp_ns, T_odom_base, in_outer_axes(T_odom_base, covariance), velocity, velocity_covariance
@@ -128,14 +140,14 @@ class Encoder:
         for sample in odometry.motion:
             if sample.stamp_ns > odometry.stamp_ns:
                 continue
-            stamp_ns = sample.stamp_ns + self.offset_ns
+            stamp_ns = self.unix_ns(sample.stamp_ns)
             if isinstance(sample, WheelSample):
                 yield OutgoingMessage("wheel_odom", WHEEL_SCHEMA, wheel_cdr(sample, stamp_ns))
             else:
                 yield OutgoingMessage("imu", IMU_SCHEMA, gyro_cdr(sample, stamp_ns))
 
     def _map_pose(self, update: PlaceUpdate) -> Iterator[OutgoingMessage]:
-        stamp_ns = update.stamp_ns + self.offset_ns
+        stamp_ns = self.unix_ns(update.stamp_ns)
         T_map_base, covariance = base_pose(update.T_map_rig, update.covariance, self.T_base_rig)
         T_map_odom, _ = base_pose(update.T_map_odom, update.covariance, self.T_base_rig)
         pose = codec.pose_with_covariance_cdr(stamp_ns, T_map_base, in_outer_axes(T_map_base, covariance))
@@ -146,13 +158,13 @@ class Encoder:
         yield OutgoingMessage("/tf", codec.TRANSFORM_SCHEMA, codec.transform_cdr(stamp_ns, [edge]))
 
     def _map(self, update: MapUpdate) -> Iterator[OutgoingMessage]:
-        stamp_ns = update.stamp_ns + self.offset_ns
+        stamp_ns = self.unix_ns(update.stamp_ns)
         points = _most_confident(update.points, self._map_encoding.points)
         payload = codec.point_cloud_cdr(stamp_ns, "odom", *points, T_frame_points=self.T_base_rig)
         yield OutgoingMessage("cloud", codec.POINT_CLOUD_SCHEMA, payload)
 
     def _navigation(self, update: NavigationUpdate) -> Iterator[OutgoingMessage]:
-        stamp_ns = update.stamp_ns + self.offset_ns
+        stamp_ns = self.unix_ns(update.stamp_ns)
         status = navigation_status(update)
         yield OutgoingMessage("navigation", codec.DIAGNOSTICS_SCHEMA, codec.diagnostics_cdr(stamp_ns, [status]))
         if update.plan is not None:
@@ -170,15 +182,15 @@ def static_frames(encode: Encoder, stamp_ns: int) -> OutgoingMessage:
     if encode.rig is not None:
         cameras = {"lower": encode.rig.lower, "upper": encode.rig.upper}
         edges += [FrameTransform("rig", name, se3.inverse(camera.T_cam_rig)) for name, camera in cameras.items()]
-    payload = codec.transform_cdr(stamp_ns + encode.offset_ns, edges)
+    payload = codec.transform_cdr(encode.unix_ns(stamp_ns), edges)
     return OutgoingMessage("/tf_static", codec.TRANSFORM_SCHEMA, payload)
 
 
 class StateReports:
-    """Yields a status when the state of the odometry, or of the pose in the map, changes; offset_ns: the Encoder's."""
+    """Yields a status when the state of the odometry, or of the pose in the map, changes; unix_ns: the Encoder's."""
 
-    def __init__(self, offset_ns: int = 0) -> None:
-        self._offset_ns = offset_ns
+    def __init__(self, unix_ns: UnixTime = same_time) -> None:
+        self._unix_ns = unix_ns
         self._last: tuple[str, int] | None = None
         self._last_in_map: MapState | None = None
 
@@ -201,7 +213,7 @@ class StateReports:
                 Key.TRACKED: str(message.tracks),
             }
             status = DiagnosticStatus(ODOMETRY, list(TrackingState).index(message.state), message.state, values)
-        yield status_report(message.stamp_ns + self._offset_ns, [status])
+        yield status_report(self._unix_ns(message.stamp_ns), [status])
 
 
 def status_report(stamp_ns: int, statuses: Sequence[DiagnosticStatus]) -> OutgoingMessage:

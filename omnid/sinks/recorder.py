@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Final, Protocol, TypeAlias
 
@@ -11,6 +12,7 @@ from drivers.frame import Frame
 from drivers.logs.mcap_writer import LogWriter
 from drivers.logs.rotating_log import RotatingLogState
 from omnid.diagnostics.run_summary import RunStatistics
+from omnid.engine.robot_clock import SegmentTime, log_time
 from omnid.errors import OmnidError
 from omnid.messages import OdometryUpdate, PlaceUpdate
 from omnid.sinks.encoder import Encoder, Outgoing, OutgoingMessage, StateReports, static_frames, status_report
@@ -31,6 +33,9 @@ class MessageLog(Protocol):
 
     def write(self, topic: str, schema_name: str, data: bytes, stamp_ns: int) -> None:
         """Add a message."""
+
+    def end_file(self) -> None:
+        """Complete the file: the next message begins another one."""
 
     def close(self) -> None:
         """Complete the last file."""
@@ -56,6 +61,9 @@ class SingleLog:
         self._writer.write(topic, schema_name, data, stamp_ns)
         self.state.messages += 1
 
+    def end_file(self) -> None:
+        """Do nothing: the time of a log has no steps that begin a file."""
+
     def close(self) -> None:
         """Complete the file; a second call does nothing."""
         if self._writer is not None:
@@ -80,14 +88,14 @@ class Recorder:
         robot: str,
         encode: Encoder | None = None,
         *,
-        offset_ns: int = 0,
+        time: SegmentTime | None = None,
         skip_invalid: bool = False,
     ) -> None:
-        """offset_ns: from the stamps of the messages to Unix time; the encoder has the same."""
+        """time: that of the files, which the encoder has as well; None: the stamps are Unix time."""
         self._log, self._robot, self._encode = log, robot, encode
-        self._offset_ns, self._skip_invalid = offset_ns, skip_invalid
-        self._states = StateReports(offset_ns)
-        self._added: deque[tuple[OutgoingMessage, int]] = deque(maxlen=_PENDING)
+        self._time, self._skip_invalid = time or SegmentTime(log_time()), skip_invalid
+        self._states = StateReports(self._time.unix_ns)
+        self._added: deque[tuple[Sequence[DiagnosticStatus], int]] = deque(maxlen=_PENDING)
         self._files = 0
         self._newest_ns = 0
         self._statistics = RunStatistics()  # its own: the last messages may reach the other sinks later
@@ -111,8 +119,12 @@ class Recorder:
 
     def process(self, message: Recorded) -> None:
         """Record a message and, for a pose, its state where it has changed or a new file has begun."""
-        stamp_ns = message.stamp_ns + self._offset_ns
+        # 1. A step of the computer's clock begins a new file: within one, all times are those of one clock.
+        if self._time.is_over():
+            self._log.end_file()
         self._write_added()
+        # 2. The message, and what changes with it.
+        stamp_ns = self._time.unix_ns(message.stamp_ns)
         try:
             self._write(self._encoded(message, stamp_ns), stamp_ns)
             if isinstance(message, OdometryUpdate | PlaceUpdate) and self._encode is not None:
@@ -125,9 +137,9 @@ class Recorder:
                 raise
             self.invalid += 1
 
-    def add(self, message: OutgoingMessage, stamp_ns: int) -> None:
-        """Record an encoded message at its Unix time; from any thread."""
-        self._added.append((message, stamp_ns))
+    def add(self, statuses: Sequence[DiagnosticStatus], stamp_ns: int) -> None:
+        """Record statuses with a stamp as those of other messages; from any thread."""
+        self._added.append((statuses, stamp_ns))
 
     def finish(self) -> None:
         """Write the final status and complete the last file."""
@@ -143,8 +155,10 @@ class Recorder:
 
     def _write_added(self) -> None:
         while self._added:
-            message, stamp_ns = self._added.popleft()
-            self._write([message], stamp_ns)
+            statuses, stamp_ns = self._added.popleft()
+            unix_ns = self._time.unix_ns(stamp_ns)
+            with suppress(OmnidError):  # the computer's clock may be set to a time that no message can hold
+                self._write([status_report(unix_ns, statuses)], unix_ns)
 
     def _encoded(self, message: Recorded, stamp_ns: int) -> Iterable[OutgoingMessage]:
         if isinstance(message, Frame):
@@ -154,7 +168,7 @@ class Recorder:
     def _state(self, pose: OdometryUpdate | PlaceUpdate, encode: Encoder) -> Iterator[OutgoingMessage]:
         """Yield the state of a pose where it changes; in every file once, and there with the static frames."""
         if isinstance(pose, OdometryUpdate) and self._files != self.state.files:
-            self._files, self._states = self.state.files, StateReports(self._offset_ns)
+            self._files, self._states = self.state.files, StateReports(self._time.unix_ns)
             yield static_frames(encode, pose.stamp_ns)
         yield from self._states(pose)
 

@@ -158,7 +158,8 @@ class Bus:
         self._warned = False
         self._session: zenoh.Session | None = None
         self._publishers: dict[str, TopicPublisher] = {}
-        self._newest: dict[str, tuple[bytes, zenoh.Encoding, bytes | None]] = {}
+        self._newest: dict[str, tuple[bytes, bytes | None]] = {}  # payload and attachment of latched topics
+        self._texts: dict[str, str | Callable[[], str]] = {}  # answers to queries, by name
         self._on_command: RequestCallback | None = None
         self._requests = OpenRequests()
         self._command_topics: Mapping[str, str] = {}
@@ -220,7 +221,7 @@ class Bus:
         if topic not in self._topics:
             raise OmnidError(f"bus key {topic!r} is not published; expected one of {', '.join(self._topics)}")
         if self._topics[topic].latched:
-            self._newest[topic] = (payload, zenoh.Encoding.APPLICATION_CDR, attachment)
+            self._newest[topic] = (payload, attachment)
         if self._session is None:
             self.lost += 1
             return
@@ -233,10 +234,13 @@ class Bus:
         """True if a topic has a subscriber."""
         return self._session is not None and self._publishers[topic].is_received
 
-    def serve(self, name: str, text: str) -> None:
-        """Answer queries for `<robot>/<name>` with a text, such as the configuration; a second text replaces it."""
-        is_new = name not in self._newest
-        self._newest[name] = (text.encode(), zenoh.Encoding.TEXT_PLAIN, None)
+    def serve(self, name: str, text: str | Callable[[], str]) -> None:
+        """Answer queries for `<robot>/<name>` with a text, such as the configuration, or with that of the moment.
+
+        A second call replaces the first.
+        """
+        is_new = name not in self._texts
+        self._texts[name] = text
         if is_new and self._session is not None:
             self._declare_queryable(self._session, name)
 
@@ -297,10 +301,10 @@ class Bus:
         self._watch_for_namesakes(session)
         self._graph = graph = RosGraph(session, self._config)
         self._publishers = {name: TopicPublisher(session, self._config, name, graph) for name in self._topics}
-        for name in {*self._newest, *(name for name, topic in self._topics.items() if topic.latched)}:
+        for name in {*self._texts, *(name for name, topic in self._topics.items() if topic.latched)}:
             self._declare_queryable(session, name)
-        for name, (payload, _, attached) in self._newest.items():  # published before the router was reached
-            if name in self._topics and self._topics[name].transient_local:
+        for name, (payload, attached) in self._newest.items():  # published before the router was reached
+            if self._topics[name].transient_local:
                 self._publishers[name].put(payload, attached)
         if self._on_command is not None:
             self._declare_subscribers(session, self._on_command)
@@ -346,9 +350,12 @@ class Bus:
         self._requests.send()
         for name, intake in list(self._queries.items()):
             for query in intake.messages():
-                if name in self._newest:
-                    payload, encoding, attachment = self._newest[name]
-                    query.reply(plain_key(self._config.robot, name), payload, encoding=encoding, attachment=attachment)
+                key, text = plain_key(self._config.robot, name), self._texts.get(name)
+                if text is not None:
+                    query.reply(key, text if isinstance(text, str) else text(), encoding=zenoh.Encoding.TEXT_PLAIN)
+                elif name in self._newest:
+                    payload, attachment = self._newest[name]
+                    query.reply(key, payload, encoding=zenoh.Encoding.APPLICATION_CDR, attachment=attachment)
 
     def _declare_subscribers(self, session: zenoh.Session, callback: RequestCallback) -> None:
         if not self.is_unique:

@@ -45,11 +45,6 @@ class BusConfig:
     config: Annotated[
         str, "a zenoh configuration file (JSON5): TLS, users, who may command; omnid/transport/site.json5 is an example"
     ] = ""
-    command_clock: Annotated[
-        Literal["synchronised", "arrival"],
-        "synchronised: stamps of commands must be within controller.deadlines.command_s of this machine's clock; "
-        "arrival: for senders with another clock, stamps must only rise",
-    ] = "synchronised"
     ros2: Annotated[Literal["off", "rmw_zenoh"], "connection to ROS 2 by its middleware rmw_zenoh"] = "off"
     ros2_domain: Annotated[int, Meta(ge=0, le=232), "ROS_DOMAIN_ID, for rmw_zenoh"] = 0
     panorama_hz: Annotated[
@@ -59,6 +54,7 @@ class BusConfig:
     # Keys of earlier versions, and what takes their place.
     REMOVED = MappingProxyType(
         {"mode": "bus.listen = [] makes a client of the router in bus.connect"}
+        | {"command_clock": "a sender with another clock repeats the robot's own time, see docs/bus.md, `Stamps`"}
         | {name: "zenoh's own file has it, see bus.config and omnid/transport/site.json5" for name in _IN_ZENOHS_FILE}
     )
 

@@ -6,8 +6,8 @@ geometry_msgs/msg/Vector3Stamped: x the speed in m/s, z the heading in odom in r
 commands, as cmd/planner/twist. stop may have any payload. arm is a std_msgs/msg/Header with the time it was sent.
 bumper and cliff are std_msgs/msg/Bool with the time of sending attached: all but a fresh False is a contact.
 
-The times of sending obey one rule, `bus.command_clock`: what can begin or resume a motion needs a stamp of now, so that
-a message that waited in a network, or was recorded, begins none later. What ends a motion needs none.
+When a message was sent is judged by one rule (omnid.transport.freshness): what can begin or resume a motion must have
+been sent just now, what goes on with one is at least as old as its arrival, what ends one is taken in any case.
 
 Samples are wheel_odom (nav_msgs/msg/Odometry), imu (Imu) and joint_states (JointState). They are below `cmd`, too,
 because they move the pose while the cameras show nothing: only programs that may command the robot may write them.
@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple, Protocol
 
@@ -37,78 +37,10 @@ from omnid.transport.decode import (
     stamp_from_cdr,
     twist_from_cdr,
 )
+from omnid.transport.freshness import Freshness, RefusedStamp
 from omnid.transport.requests import Answer, Request
 from omnid.transport.sensor_codec import sample_from_cdr
 from omnid.transport.topics import ARM, HEADING, SENSOR_TOPICS, STOP, TWIST
-
-UNSTAMPED: Final = "no stamp"
-TOO_OLD, EARLY = "too old", "stamp in the future"
-NOT_RISING: Final = "stamp does not rise"
-USED_BEFORE: Final = "stamp was used before"
-MOST_ARM_STAMPS: Final = 256  # remembered, where the senders' clocks are others
-_CLOCKS: Final = (
-    "on a busy computer try again; from another machine synchronise the clocks, or set bus.command_clock = "
-    '"arrival"; controller.deadlines.command_s is the longest age'
-)
-ADVICE: Final = {
-    UNSTAMPED: "fill in the stamp (ROS 2: `header: auto`; String: last word stamp=NANOSECONDS); for a plain Twist set "
-    'bus.command_clock = "arrival"',
-    TOO_OLD: _CLOCKS,
-    EARLY: _CLOCKS,
-    NOT_RISING: "one sender per topic, or arm the robot again for a sender whose clock began again",
-}
-
-
-class RefusedStamp(OmnidError):  # noqa: N818 - named after what it reports
-    """A stamp that is not fresh; its first argument is the reason, which is counted."""
-
-
-class StampRule:
-    """Judges stamps, ns of Unix time by the sender's clock; 0: the message has none.
-
-    Synchronised clocks: the stamp differs from this machine's clock by stale_s at most, before and after. Other clocks:
-    the stamps of each topic rise; after a request to arm they may begin again lower, as of another sender, and that
-    request needs a stamp that none of the last ones had.
-    """
-
-    def __init__(self, stale_s: float, *, synchronised: bool = True) -> None:
-        self.synchronised = synchronised
-        self._stale_ns = round(stale_s * 1e9)
-        self._newest_ns: dict[str, int] = {}  # stamp of the newest message that was accepted, by topic
-        self._arm_stamps_ns: deque[int] = deque(maxlen=MOST_ARM_STAMPS)
-
-    def check(self, topic: str, stamp_ns: int) -> None:
-        """Raise RefusedStamp for a message of a topic whose stamp is missing or not fresh."""
-        if not stamp_ns:
-            raise RefusedStamp(UNSTAMPED)
-        if self.synchronised:
-            self._check_age(stamp_ns)
-            return
-        if stamp_ns <= self._newest_ns.get(topic, 0):
-            raise RefusedStamp(NOT_RISING)
-        self._newest_ns[topic] = stamp_ns
-
-    def check_arm(self, stamp_ns: int) -> None:
-        """Raise RefusedStamp for a request to arm whose stamp is missing, not fresh or used before."""
-        if not stamp_ns:
-            raise RefusedStamp(UNSTAMPED)
-        if self.synchronised:
-            self._check_age(stamp_ns)
-        elif stamp_ns in self._arm_stamps_ns:
-            raise RefusedStamp(USED_BEFORE)
-
-    def accept_arm(self, stamp_ns: int) -> None:
-        """Remember a request to arm that was accepted; stamps may begin again after it."""
-        self._arm_stamps_ns.append(stamp_ns)
-        self._newest_ns.clear()
-
-    def _check_age(self, stamp_ns: int) -> None:
-        age_ns = time.time_ns() - stamp_ns
-        if age_ns > self._stale_ns:
-            raise RefusedStamp(TOO_OLD)
-        if age_ns < -self._stale_ns:
-            raise RefusedStamp(EARLY)
-
 
 LONGEST_PAYLOAD: Final = 4096  # bytes
 LONGEST_SAMPLE: Final = 8192  # bytes
@@ -117,7 +49,7 @@ MAX_SPEED_MPS, MAX_YAW_RATE_RADPS, MAX_HEADING_RAD = 20.0, 50.0, 1000.0  # large
 
 MALFORMED: Final = "malformed"
 SAME_NAME: Final = "another robot has this name"
-_ADVICE: Final = ADVICE | {
+_ADVICE: Final = {
     MALFORMED: "twist takes TwistStamped or Twist, heading Vector3Stamped, arm Header, bumper and cliff Bool, as CDR",
     SAME_NAME: "change bus.robot of one of them",
     "wrong frame": "give base_link for twist, odom for heading, or none",
@@ -184,6 +116,13 @@ class CommandTarget(Protocol):
         """Take the state of a bumper or a cliff sensor."""
 
 
+class _Stream(NamedTuple):
+    """Setpoints of one sender on one source: the first one begins a motion, the others go on with it."""
+
+    sender: str
+    arrival_ns: int  # of the newest
+
+
 class CommandReceiver:
     """Passes valid commands on and counts the others by reason; called from threads of the bus.
 
@@ -193,63 +132,68 @@ class CommandReceiver:
     def __init__(
         self,
         target: CommandTarget,
-        stamps: StampRule,
+        freshness: Freshness,
         *,
         sources: Sequence[str] = (OPERATOR, PLANNER),
         report: Callable[[str], None] | None = None,
         is_unique: Callable[[], bool] = lambda: True,
     ) -> None:
-        """stamps: the rule for the stamps; where the clocks differ, a plain Twist without stamp is accepted.
+        """freshness: the rule for the times of sending.
 
         sources: names; the first has the short topics cmd/twist and cmd/heading, too. report: takes lines for the log,
         one for each refusal. is_unique: False while another robot has this one's name, which is then not armed.
         """
         self._report, self._is_unique = report, is_unique
-        self._target, self._stamps = target, stamps
+        self._target, self._freshness = target, freshness
         self._stop_ns = 0  # arrival of the newest stop
         parsers = {TWIST: twist_command, HEADING: heading_command}
         self._topics = {f"cmd/{name}": (sources[0], parser) for name, parser in parsers.items()}
         self._topics |= {
             f"cmd/{source}/{name}": (source, parser) for source in sources for name, parser in parsers.items()
         }
+        self._streams: dict[str, _Stream] = {}  # by source; none after a stop
         self.accepted = self.stops = self.arms = 0
         self.refused: Counter[str] = Counter()
-        self._touched_ns: dict[str, int] = {}  # newest stamp of a contact, by topic
+        self.refusal = ""  # the newest one, in words
+        self._touched_ns: dict[str, int] = {}  # when the newest contact was sent, by topic
 
     def receive(self, request: Request) -> Answer | None:
         """Handle one message, never raises; return the refusal, None where there is none or the target decides."""
-        # Before anything else: a stop that arrives meanwhile voids the command. Both clocks are read at once, for the
-        # time at which a request was sent is computed by their difference.
-        arrival_ns, unix_ns = time.monotonic_ns(), time.time_ns()
+        arrival_ns = time.monotonic_ns()  # before anything else: a stop that arrives meanwhile voids the command
         if request.topic == STOP:
             self._stop_ns = arrival_ns
+            self._streams.clear()
             self.stops += 1
             self._target.stop()
             return None
         try:
             if request.topic in _CONTACTS:
-                self._touch(request)
+                self._touch(request, arrival_ns)
             elif request.topic == ARM:
-                self._arm(request, arrival_ns, unix_ns)
+                self._arm(request, arrival_ns)
             else:
                 self._drive(request, arrival_ns)
-        except (RefusedCommand, RefusedStamp) as refusal:
-            return self._refuse(request.topic, str(refusal))
+        except RefusedStamp as refusal:
+            return self._refuse(request.topic, refusal.reason, str(refusal))
+        except RefusedCommand as refusal:
+            return self._refuse(request.topic, *refusal.args)
         except OmnidError:
             return self._refuse(request.topic, MALFORMED)
         return None
 
-    def _refuse(self, topic: str, reason: str) -> Answer:
+    def _refuse(self, topic: str, reason: str, words: str = "") -> Answer:
+        """Count and report a refusal; words: where they say more than the reason."""
         self.refused[reason] += 1
-        text = f"{reason}; {_ADVICE[reason]}" if reason in _ADVICE else reason
+        text = words or (f"{reason}; {_ADVICE[reason]}" if reason in _ADVICE else reason)
+        self.refusal = f"a command on {ascii(topic)[1:-1][:_MAX_TOPIC]} is refused: {text}"
         if self._report is not None:
-            self._report(f"a command on {ascii(topic)[1:-1][:_MAX_TOPIC]} is refused: {text}")
+            self._report(self.refusal)
         return Answer(False, text)
 
-    def _touch(self, request: Request) -> None:
+    def _touch(self, request: Request, arrival_ns: int) -> None:
         """Pass the state of a contact on.
 
-        A contact ends only by a Bool of False with a fresh stamp, which is not older than that of the contact, because
+        A contact ends only by a Bool of False that was sent just now, and not before that of the contact, because
         messages may overtake each other. All other messages are a contact.
         """
         holds = True
@@ -257,25 +201,21 @@ class CommandReceiver:
             _check_length(request.payload)
             newest_ns = self._touched_ns.get(request.topic, 0)
             if bool_from_cdr(request.payload):
-                latest_ns = time.time_ns() if self._stamps.synchronised else request.sent_ns
-                self._touched_ns[request.topic] = max(newest_ns, min(request.sent_ns, latest_ns))
+                sent_ns = self._freshness.sent_ns(request, arrival_ns) or 0
+                self._touched_ns[request.topic] = max(newest_ns, min(sent_ns, arrival_ns))
             else:
-                self._stamps.check(request.topic, request.sent_ns)
-                holds = request.sent_ns < newest_ns
+                holds = self._freshness.require(request, arrival_ns) < newest_ns
         finally:
             self._target.touch(_CONTACTS[request.topic], holds=holds)
 
-    def _arm(self, request: Request, arrival_ns: int, unix_ns: int) -> None:
+    def _arm(self, request: Request, arrival_ns: int) -> None:
         _check_length(request.payload)
-        stamp_ns = stamp_from_cdr(request.payload)
-        self._stamps.check_arm(stamp_ns)
+        sent_ns = self._freshness.require(request, arrival_ns, stamp_from_cdr(request.payload))
         if not self._is_unique():
             raise RefusedCommand(SAME_NAME)
-        if self._stamps.synchronised and arrival_ns - (unix_ns - stamp_ns) <= self._stop_ns:
+        if sent_ns <= self._stop_ns:
             raise RefusedCommand(OLDER_THAN_STOP)
-        self._stamps.accept_arm(stamp_ns)
-        if not self._stamps.synchronised:
-            self._touched_ns.clear()  # a sender whose clock began again may release, too
+        self._streams.clear()
         self.arms += 1
         self._target.arm(ArmRequest(arrival_ns, request.id))
 
@@ -285,12 +225,17 @@ class CommandReceiver:
             raise RefusedCommand("unknown topic")
         _check_length(payload)
         source, parser = self._topics[topic]
-        command = parser(payload)
-        stamp_ns = command.stamp_ns or request.sent_ns
-        if stamp_ns or self._stamps.synchronised or not is_plain_twist(payload):
-            self._stamps.check(topic, stamp_ns)
+        command, stream = parser(payload), self._streams.get(source)
+        goes_on = (
+            stream is not None
+            and stream.sender == request.sender
+            and self._freshness.goes_on(stream.arrival_ns, arrival_ns)
+        )
+        judge = self._freshness.of_stream if goes_on else self._freshness.require
+        age_ns = max(0, arrival_ns - judge(request, arrival_ns, command.stamp_ns))
+        self._streams[source] = _Stream(request.sender, arrival_ns)
         self.accepted += 1
-        self._target.send_setpoint(TimedSetpoint(arrival_ns, command.setpoint, source, request.sender))
+        self._target.send_setpoint(TimedSetpoint(arrival_ns, command.setpoint, source, request.sender, age_ns))
 
 
 def _check_length(payload: bytes) -> None:
@@ -304,17 +249,17 @@ class SensorReceiver:
     def __init__(
         self,
         target: Callable[[MotionSample], None],
-        offset_ns: int,
+        stamp_ns: Callable[[int], int],
         topics: frozenset[str],
         report: Callable[[str], None],
         joints: JointWheels | None = None,
     ) -> None:
-        """target: may be called from any thread. offset_ns: from the stamps of images to Unix time.
+        """target: may be called from any thread. stamp_ns: returns the stamp, as those of images, of a Unix time.
 
         topics: those that are used. report: takes a line for the log, once for each topic. joints: the wheels.
         """
         self._joints = joints
-        self._target, self._offset_ns, self._topics, self._report = target, offset_ns, topics, report
+        self._target, self._stamp_ns, self._topics, self._report = target, stamp_ns, topics, report
         self.refused: Counter[str] = Counter()  # by topic
 
     def receive(self, key: str, payload: bytes) -> None:
@@ -324,7 +269,7 @@ class SensorReceiver:
                 raise OmnidError("it is not used: see motion.wheels, motion.wheel_joints and motion.imu")
             if len(payload) > LONGEST_SAMPLE:
                 raise OmnidError(f"it has {len(payload)} bytes, more than {LONGEST_SAMPLE}")
-            sample = sample_from_cdr(payload, SENSOR_TOPICS[key], self._offset_ns, self._joints)
+            sample = sample_from_cdr(payload, SENSOR_TOPICS[key], self._stamp_ns, self._joints)
         except OmnidError as error:
             self.refused[key] += 1
             if self.refused[key] == 1:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, Final
 
 import zenoh
@@ -13,11 +15,13 @@ from omnid.transport import codec, ros2
 from omnid.transport.codec import PlanarGoal, goal_cdr, string_cdr
 from omnid.transport.requests import Answer, answer_of
 from omnid.transport.session import robots_there
-from omnid.transport.topics import ARM, GOAL, HEADING, MAP, NAVIGATION, ROUTE, SAVE_MAP, STOP, TWIST, request_key
+from omnid.transport.topics import ARM, GOAL, HEADING, MAP, NAVIGATION, ROUTE, SAVE_MAP, STOP, TIME, TWIST, request_key
 
 CONNECT_S: Final = 2.0  # A connection is complete within this time.
+ASK_S: Final = 1.0  # Time between two questions for the robot's time, and for an answer.
 ANSWER_S: Final = 10.0  # more than a disk takes for a map or a route
 _POLL_S: Final = 0.002
+_LONGEST_TIME: Final = 20  # digits
 _SEQUENCE: Final = 1 << 32  # zenoh counts messages of a source in 32 bits
 # A stop must not be lost, and overtakes all else; requests go the same way.
 _QUALITY: Final[dict[str, Any]] = {
@@ -27,8 +31,49 @@ _QUALITY: Final[dict[str, Any]] = {
 }
 
 
+class RobotTime:
+    """A robot's own time, which senders attach to what they send, so that no clock of theirs matters.
+
+    The robot is asked for it, at most once in ASK_S; in between it is followed by this computer's monotonic clock.
+    """
+
+    def __init__(self, session: zenoh.Session, robot: str) -> None:
+        self._session, self._key = session, f"{robot}/{TIME}"
+        self._told: tuple[int, int] | None = None  # the robot's time, and ours when it came
+        self._asked_s = -math.inf
+
+    def ask(self) -> None:
+        """Ask the robot, and wait for its answer; a robot that is not there is not waited for."""
+        self._asked_s = time.monotonic()
+        for reply in self._session.get(self._key, timeout=ASK_S):
+            self._take(reply)
+
+    def refresh(self, *, wait: bool = False) -> None:
+        """Ask the robot where that is due; wait: for its answer, where it has told nothing yet."""
+        if time.monotonic() - self._asked_s <= ASK_S:
+            return
+        if wait and self._told is None:
+            self.ask()
+            return
+        self._asked_s = time.monotonic()
+        self._session.get(self._key, self._take, timeout=ASK_S)
+
+    @property
+    def now_ns(self) -> int:
+        """The robot's time, as late as its answer came; 0 where it is not known."""
+        if self._told is None:
+            return 0
+        robot_ns, own_ns = self._told
+        return robot_ns + time.monotonic_ns() - own_ns
+
+    def _take(self, reply: zenoh.Reply) -> None:
+        with suppress(ValueError):
+            if reply.ok is not None:
+                self._told = int(reply.ok.payload.to_bytes()[:_LONGEST_TIME]), time.monotonic_ns()
+
+
 class Driver:
-    """Sender of commands and requests.
+    """Sender of commands and requests. It attaches the robot's own time, so this computer's clock need not be right.
 
     A command is valid for controller.deadlines.command_s only: keep sending, or the wheels stop.
 
@@ -52,9 +97,9 @@ class Driver:
             driver.twist(0.0, 0.0)
     """
 
-    def __init__(self, session: zenoh.Session, robot: str, source: str = "") -> None:
+    def __init__(self, session: zenoh.Session, robot: str, own_time: RobotTime, source: str = "") -> None:
         prefix = f"cmd/{source}" if source else "cmd"
-        self._session, self._robot = session, robot
+        self._session, self._robot, self._time = session, robot, own_time
         self._twist, self._heading = f"{prefix}/{TWIST}", f"{prefix}/{HEADING}"
         self._publishers = {
             topic: _command_publisher(session, f"{robot}/{topic}") for topic in (self._twist, self._heading, STOP, ARM)
@@ -118,6 +163,7 @@ class Driver:
         with self._session.declare_querier(key, timeout=timeout_s, **_QUALITY) as querier:
             if not _holds_in_time(lambda: _has_receiver(querier)):
                 raise self._absent("takes such requests")
+            self._time.ask()
             self.asked_ns = now_ns = time.time_ns()
             for reply in querier.get(payload=payload_at(now_ns), attachment=self._attachment(now_ns)):
                 if reply.ok is not None and (answer := answer_of(reply.ok.payload.to_bytes())) is not None:
@@ -130,10 +176,11 @@ class Driver:
     def send(self, topic: str, payload: bytes) -> None:
         """Send CDR bytes on a topic such as cmd/goal, with the identity of this program, which distinguishes senders.
 
-        The time of sending is attached: it is the stamp of a message that has none of its own.
+        The time of sending is attached: by this computer's clock, and by the robot's own.
         """
         if topic not in self._publishers:
             self._publishers[topic] = _command_publisher(self._session, f"{self._robot}/{topic}")
+        self._time.refresh()
         publisher, attachment = self._publishers[topic], self._attachment(time.time_ns())
         publisher.put(payload, source_info=zenoh.SourceInfo(publisher.id, self._sent), attachment=attachment)
 
@@ -146,7 +193,7 @@ class Driver:
 
     def _attachment(self, sent_ns: int) -> bytes:
         self._sent = (self._sent + 1) % _SEQUENCE
-        return ros2.attachment(self._sent, sent_ns, self._gid)
+        return ros2.attachment(self._sent, sent_ns, self._gid, self._time.now_ns)
 
 
 def _holds_in_time(condition: Callable[[], bool]) -> bool:

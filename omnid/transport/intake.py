@@ -225,7 +225,9 @@ class CommandIntake:
         payload = b"" if message.payload is None else message.payload.to_bytes()
         attached = b"" if message.attachment is None else message.attachment.to_bytes()
         id = self._open.add(topic, message if isinstance(message, zenoh.Query) else None)
-        self._callback(Request(topic, payload, sender_of(message), ros2.sent_ns_in(attached), id))
+        self._callback(
+            Request(topic, payload, sender_of(message), ros2.sent_ns_in(attached), id, ros2.echo_ns_in(attached))
+        )
 
     def _topic(self, ring: _Ring, message: zenoh.Sample | zenoh.Query) -> str:
         """Return the topic of a message; empty for a message that is not passed on.

@@ -30,8 +30,8 @@ from omnid.core.navigation.requests import (
 )
 from omnid.errors import OmnidError
 from omnid.transport.codec import OK, DiagnosticStatus
-from omnid.transport.commands import ADVICE, RefusedStamp, StampRule
 from omnid.transport.decode import goal_from_cdr, path_from_cdr, string_from_cdr
+from omnid.transport.freshness import Freshness
 from omnid.transport.requests import Answer, Request
 from omnid.transport.status_names import REFUSED_PREFIX, REQUESTS
 from omnid.transport.topics import GOAL, NAVIGATION, PATH
@@ -52,12 +52,12 @@ class NavigationReceiver:
     def __init__(
         self,
         target: Callable[[NavigationCommand], None],
-        stamps: StampRule,
+        freshness: Freshness,
         *,
         report: Callable[[str], None] | None = None,
     ) -> None:
-        """target: may be called from any thread. stamps: as of CommandReceiver. report: takes lines for the log."""
-        self._target, self._stamps, self._report = target, stamps, report
+        """target: may be called from any thread. freshness: as of CommandReceiver. report: takes lines for the log."""
+        self._target, self._freshness, self._report = target, freshness, report
         self.accepted = 0
         self.refused: Counter[str] = Counter()  # by topic
 
@@ -68,20 +68,17 @@ class NavigationReceiver:
 
     def receive(self, message: Request) -> Answer | None:
         """Handle one message; return the refusal, None where the target answers."""
-        arrival_ns = time.time_ns()
         try:
             request, stamp_ns = self._parsed(message.topic, message.payload)
-            stamp_ns = stamp_ns or message.sent_ns
             if not (is_halt(request) or _is_finish(request)):
-                self._stamps.check(message.topic, stamp_ns)
+                self._freshness.require(message, time.monotonic_ns(), stamp_ns)
         except OmnidError as error:
             self.refused[message.topic] += 1
-            refusal = f"{error}; {ADVICE[str(error)]}" if isinstance(error, RefusedStamp) else str(error)
             if self._report is not None:
-                self._report(f"a request on {message.topic} is refused: {refusal}")
-            return Answer(False, refusal)
+                self._report(f"a request on {message.topic} is refused: {error}")
+            return Answer(False, str(error))
         self.accepted += 1
-        self._target(NavigationCommand(request, arrival_ns, stamp_ns, message.id))
+        self._target(NavigationCommand(request, time.time_ns(), stamp_ns or message.sent_ns, message.id))
         return None
 
     def _parsed(self, key: str, payload: bytes) -> tuple[NavigationRequest, int]:

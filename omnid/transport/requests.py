@@ -20,6 +20,7 @@ class Request(NamedTuple):
     sender: str = ""  # identity of the program that sent it, empty if unknown
     sent_ns: int = 0  # of Unix time, for a message without stamp; 0: it does not say it
     id: int = 0  # rises with each message
+    echo_ns: int = 0  # the robot's own time as the sender repeats it (omnid.transport.freshness); 0: it does not
 
 
 class Answer(NamedTuple):

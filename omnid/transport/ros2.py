@@ -17,6 +17,8 @@ from rosbags.typesys import Stores, get_typestore
 RELIABLE_LAST_10: Final = "::,10:,:,:,,"  # what is empty is rmw_zenoh's default: reliable, volatile, keep last
 TRANSIENT_LOCAL: Final = ":1:,1:,:,:,,"  # the newest message is kept for later subscribers, as of /tf_static
 GID_BYTES: Final = 16
+_PLAIN_BYTES: Final = struct.calcsize("<qqB") + GID_BYTES  # of an attachment of rmw_zenoh
+_ECHO_BYTES: Final = _PLAIN_BYTES + struct.calcsize("<q")  # of one of omnid's clients
 
 
 @cache
@@ -36,20 +38,29 @@ def data_key(domain: int, topic: str, schema: str) -> str:
     return f"{domain}{topic}/{dds_type(schema)}/{type_hash(schema)}"
 
 
-def attachment(seq: int, source_ns: int, gid: bytes) -> bytes:
-    """Return the attachment that rmw_zenoh expects: sequence number, time of sending [ns], the publisher's id."""
-    return struct.pack("<qqB", seq, source_ns, GID_BYTES) + gid
+def attachment(seq: int, source_ns: int, gid: bytes, echo_ns: int = 0) -> bytes:
+    """Return the attachment that rmw_zenoh expects: sequence number, time of sending [ns], the publisher's id.
+
+    echo_ns: to a robot its own time, which follows the id; 0: it is left out.
+    """
+    return struct.pack("<qqB", seq, source_ns, GID_BYTES) + gid + (struct.pack("<q", echo_ns) if echo_ns else b"")
 
 
 def gid_in(attached: bytes) -> str:
     """Return the publisher's id in an attachment of rmw_zenoh, in hexadecimal; empty for any other attachment."""
-    size = struct.calcsize("<qqB")
-    return attached[size:].hex() if len(attached) == size + GID_BYTES and attached[size - 1] == GID_BYTES else ""
+    is_one = len(attached) in (_PLAIN_BYTES, _ECHO_BYTES) and attached[_PLAIN_BYTES - GID_BYTES - 1] == GID_BYTES
+    return attached[_PLAIN_BYTES - GID_BYTES : _PLAIN_BYTES].hex() if is_one else ""
 
 
 def sent_ns_in(attached: bytes) -> int:
     """Return the time of sending in an attachment of rmw_zenoh [ns of Unix time]; 0 for any other attachment."""
     return int(struct.unpack_from("<q", attached, 8)[0]) if gid_in(attached) else 0
+
+
+def echo_ns_in(attached: bytes) -> int:
+    """Return the robot's own time in an attachment of omnid's clients; 0 for any other attachment."""
+    is_one = len(attached) == _ECHO_BYTES and gid_in(attached)
+    return int(struct.unpack_from("<q", attached, _PLAIN_BYTES)[0]) if is_one else 0
 
 
 def gid_of(token: str) -> bytes:

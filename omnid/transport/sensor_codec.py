@@ -8,6 +8,7 @@ nav_msgs/msg/Odometry and sensor_msgs/msg/Imu, both ways; wheels of a JointState
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from struct import pack
 from typing import Any, Final
 
@@ -95,11 +96,11 @@ def gyro_cdr(sample: GyroSample, stamp_ns: int, frame: str = BASE_FRAME) -> byte
 
 
 def sample_from_cdr(
-    payload: bytes, schema: str, offset_ns: int, joints: JointWheels | None = None
+    payload: bytes, schema: str, stamp_ns: Callable[[int], int], joints: JointWheels | None = None
 ) -> MotionSample | None:
     """Decode a sample from the network; None for a JointState that has no wheel.
 
-    offset_ns: from the stamps of images to the sender's clock. joints: the wheels in a JointState.
+    stamp_ns: returns the stamp, as those of images, of a Unix time. joints: the wheels in a JointState.
 
     Raise OmnidError for a message without a stamp, with rates that are not finite or absurd, and for other bytes.
     """
@@ -113,4 +114,4 @@ def sample_from_cdr(
         raise OmnidError(f"a {schema} has no stamp; fill in header.stamp")
     if any(abs(rate) > LARGEST_RATE for rate in reading.rates if math.isfinite(rate)):
         raise OmnidError(f"a {schema} has rates above {LARGEST_RATE:.0f} m/s or rad/s: check its units")
-    return reading._replace(stamp_ns=reading.stamp_ns - offset_ns).sample(0)
+    return reading._replace(stamp_ns=stamp_ns(reading.stamp_ns)).sample(0)

@@ -21,6 +21,7 @@ ODOMETRY: Final = f"{PREFIX}odometry"
 PAIRING: Final = f"{PREFIX}pairing"
 WHEELS: Final = f"{PREFIX}wheels"
 BUS: Final = f"{PREFIX}bus"
+CLOCK: Final = f"{PREFIX}clock"  # of the computer, whose steps the stamps follow
 SAME_NAME_COUNT: Final = "same_name"  # value of the entry of the bus: other robots of this name
 RECORDING: Final = f"{PREFIX}recording"
 RIG: Final = f"{PREFIX}rig"
@@ -87,6 +88,7 @@ class Key(StrEnum):
     TILT_DEG = "tilt_deg"
     # Wheels
     EXPIRIES = "expiries"
+    PROBLEM = "problem"  # why the motor controller took no command; no key while it does
     COMMANDS = "commands"
     STOPS = "stops"
     SOURCE = "source"  # of the commands that drive; no key while none does
@@ -95,6 +97,7 @@ class Key(StrEnum):
     REMEDY = "remedy"  # the way to arm, or past an obstacle; no key where none is needed
     OBSTACLE = "obstacle"  # why the collision monitor slows down or stops the base; no key while it does not
     OBSTACLE_STOPS = "obstacle_stops"
+    COMMAND_REFUSAL = "command_refusal"  # why the newest refused command was refused; no key before the first one
     ARM_REFUSAL = "arm_refusal"  # of the newest request to arm; no key where it was accepted
     # Simulation
     REAL_TIME_FACTOR = "real_time_factor"  # simulated time over time on the wall

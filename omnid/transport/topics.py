@@ -44,6 +44,7 @@ PUBLISHED: Final = {
     "imu": Topic(codec.IMU_SCHEMA),
     CLOCK: Topic(codec.CLOCK_SCHEMA, realtime=True),
 }
+TIME: Final = "time"  # a query for the robot's own time, which senders repeat
 STOP: Final = "cmd/stop"
 ARM: Final = "cmd/arm"
 BUMPER: Final = "cmd/bumper"

@@ -11,8 +11,9 @@ import pytest
 
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, stop_command
+from drivers.motors.protocols.motor_protocol import NoReplyError
 from drivers.motors.protocols.protocol_registry import PROTOCOLS
-from drivers.motors.serial_motor import LateReplyError, NoReplyError, SerialMotor
+from drivers.motors.serial_motor import LateReplyError, SerialMotor
 from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from tests.contract.simulated_motors import (
     BASE,

@@ -23,6 +23,7 @@ from omnid.transport import codec, decode
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import DiagnosticStatus, PoseAttachment
 from omnid.transport.decode import decode_cloud, decode_diagnostics, decode_map, decode_pose
+from omnid.transport.freshness import Freshness
 from omnid.transport.requests import Request
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, script
 from tests.waiting import wait_until
@@ -145,7 +146,9 @@ def test_the_waypoint_example_drives_a_robot_to_the_last_waypoint() -> None:
 
 def test_sends_commands() -> None:
     received: list[Request] = []
+    freshness = Freshness(60.0)
     with robot() as (bus, endpoint), Robot(connect=(endpoint,)) as connection:
+        bus.serve("time", freshness.own_time)
         driver = connection.driver()
         assert not driver.connected
         bus.subscribe_commands(received.append, {})
@@ -165,7 +168,7 @@ def test_sends_commands() -> None:
             other.driver().stop()
             wait_until(lambda: len(received) == 6)
     received[:2] = sorted(received[:2], reverse=True)  # the order of different topics is not kept
-    (twist, a, *_), (heading, b, *_), (stop, *_), (arm, c, _, sent_ns, _), (planned, d, *_), _ = received
+    (twist, a, *_), (heading, b, *_), (stop, *_), (arm, c, _, sent_ns, *_), (planned, d, *_), _ = received
     assert (twist, heading, stop, arm) == ("cmd/twist", "cmd/heading", "cmd/stop", "cmd/arm")
     assert planned == "cmd/planner/twist" and decode.twist_from_cdr(d)[1:] == ("base_link", 0.5, -0.25)
     assert decode.stamp_from_cdr(c) == sent_ns and before_ns <= sent_ns <= time.time_ns()
@@ -174,3 +177,7 @@ def test_sends_commands() -> None:
     assert all(len(sender) >= 16 for sender in senders)
     assert decode.twist_from_cdr(a)[1:] == ("base_link", 0.5, -0.25)
     assert decode.heading_from_cdr(b)[1:] == ("odom", 0.75, 1.5)
+    # Each says when it was sent by the robot's own time, whatever the clock of this computer.
+    for request in received:
+        freshness.require(Request(request.topic, echo_ns=request.echo_ns), time.monotonic_ns())
+    assert [r.echo_ns for r in received[2:]] == sorted(r.echo_ns for r in received[2:])

@@ -2,7 +2,7 @@
 
 A protocol does no I/O. It consists of transactions: generators that yield the bytes to write (none: only wait), are
 sent the next complete frame each time, and return the result. The driver runs a transaction up to a deadline;
-the transaction itself waits without a limit:
+the transaction itself waits without a limit, and may say what it has seen when that is over (NoReplyError):
 
     def connect(self, watchdog_ms):
         frame = yield b"^RWD %d\\r" % watchdog_ms
@@ -19,6 +19,16 @@ from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
 
 T = TypeVar("T")
+
+
+class NoReplyError(DriverError):
+    """No reply before the timeout, from a port that is still there.
+
+    It is thrown into a transaction whose time is over, which may raise another one: with what it has seen, as the
+    predicate of a sentence.
+    """
+
+
 Transaction: TypeAlias = Generator[bytes, bytes, T]
 
 

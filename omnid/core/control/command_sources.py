@@ -56,12 +56,16 @@ class SourceSettings:
 
 
 class TimedSetpoint(NamedTuple):
-    """A setpoint, the time of its arrival by the clock that steps the law, and where it comes from."""
+    """A setpoint, the time of its arrival by the clock that steps the law, and where it comes from.
+
+    age_ns: its age at its arrival, 0 where it is not known.
+    """
 
     arrival_ns: int
     setpoint: Setpoint
     source: str = OPERATOR
     sender: str = ""  # identity of the program that sent it; empty where it is not known
+    age_ns: int = 0
 
 
 class CommandSelector:

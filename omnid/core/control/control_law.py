@@ -179,11 +179,24 @@ class ControlLaw:
         self._ending = True
 
     def step(
-        self, now_ns: int, dt_s: float, *, late_s: float = 0.0, motor_failed: bool = False, motor_stopped: bool = False
+        self,
+        now_ns: int,
+        dt_s: float,
+        *,
+        late_s: float = 0.0,
+        motor_awaited: bool = False,
+        motor_failed: bool = False,
+        motor_stopped: bool = False,
     ) -> ControlOutput:
         """Return the motion that the base is to follow from now on; the previous one was commanded dt_s ago."""
         # 1. Faults, from deadlines and from motion that does not fit together, disarm; requests to arm are answered.
-        inputs = self.plausibility.added_to(self._inputs(now_ns, late_s, motor_failed, motor_stopped))
+        inputs = replace(
+            self.plausibility.added_to(self._inputs(now_ns)),
+            late_s=late_s,
+            motor_awaited=motor_awaited,
+            motor_failed=motor_failed,
+            motor_stopped=motor_stopped,
+        )
         deadlines = self._settings.deadlines
         accepted = self.arming.step(stop_reason(inputs, deadlines, FAULTS), now_ns, deadlines.command_s)
         if accepted is not None:
@@ -248,20 +261,17 @@ class ControlLaw:
         command = self.commands.current
         if command is None or command.arrival_ns <= self._void_ns:
             return math.inf
-        age_s = (now_ns - command.arrival_ns) * S_PER_NS
+        age_s = (now_ns - command.arrival_ns + command.age_ns) * S_PER_NS
         is_over = command.setpoint == TO_STAND and age_s > self._settings.deadlines.command_s
         return math.inf if is_over else age_s
 
-    def _inputs(self, now_ns: int, late_s: float, motor_failed: bool, motor_stopped: bool) -> SafetyInputs:
+    def _inputs(self, now_ns: int) -> SafetyInputs:
         pose = self._pose
         return SafetyInputs(
             pose_age_s=math.inf if pose is None else (now_ns - pose.stamp_ns) * S_PER_NS,
             pose_state="" if pose is None else pose.state,
             pose_jumped=self._pose_jumped,
             command_age_s=math.inf,
-            late_s=late_s,
-            motor_failed=motor_failed,
-            motor_stopped=motor_stopped,
             ending=self._ending,
             contact=self.contacts.take(),
         )

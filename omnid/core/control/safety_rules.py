@@ -40,6 +40,7 @@ class SafetyInputs:
     command_age_s: float  # age of a setpoint that arrived after the last stop
     late_s: float = 0.0
     pose_jumped: bool = False  # the heading differs from the one before by more than the base can turn
+    motor_awaited: bool = False  # True until the motor controller has answered for the first time
     motor_failed: bool = False  # True if the motor controller failed at the last tick
     pose_reset: bool = False  # odometry has lost its map and begun again
     pose_unsure: bool = False  # the velocity has been too uncertain for too long
@@ -63,6 +64,7 @@ class Rule(NamedTuple):
 
 ENDS: Final = "the run ends"
 ASKED: Final = "a stop was asked for"
+AWAITED: Final = "waiting for the motor"
 FAILED: Final = "the motor controller failed"
 STOPPED: Final = "the motor controller had stopped by itself"
 OVERLOADED: Final = "the host is overloaded"
@@ -91,6 +93,7 @@ RULES: Final = (
     Rule(ASKED, False, lambda now, _: now.stop_asked),
     Rule(CLIFF, True, lambda now, _: now.contact == CLIFF),
     Rule(BUMPER, True, lambda now, _: now.contact == BUMPER),
+    Rule(AWAITED, True, lambda now, _: now.motor_awaited),
     Rule(FAILED, True, lambda now, _: now.motor_failed),
     Rule(STOPPED, True, lambda now, _: now.motor_stopped),
     Rule(MOTOR_FAULT, True, lambda now, _: now.motor_faulty),

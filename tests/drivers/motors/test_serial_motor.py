@@ -23,8 +23,8 @@ from drivers.motors.protocols.line_protocol import (
     WatchdogReply,
     encode,
 )
-from drivers.motors.protocols.motor_protocol import T, Transaction
-from drivers.motors.serial_motor import NoReplyError, SerialMotor
+from drivers.motors.protocols.motor_protocol import NoReplyError, T, Transaction
+from drivers.motors.serial_motor import SerialMotor
 from drivers.motors.simulated.simulated_controllers import SimulatedLine
 from drivers.motors.simulated.simulated_motor import SimulatedMotor
 

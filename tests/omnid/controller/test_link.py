@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import os
+import select
 import signal
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -17,9 +19,11 @@ import pytest
 
 from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
+from drivers.motors.simulated.simulated_motor import simulated_controller
 from omnid.controller.link import ControllerLink
 from omnid.controller.messages import ControllerStart
 from omnid.controller.motor_settings import MotorSettings
+from omnid.controller.statistics import ControllerState
 from omnid.core.control import safety_rules
 from omnid.core.control.arming import AUTOMATIC, MANUAL, ArmRequest
 from omnid.core.control.command_sources import TimedSetpoint
@@ -276,6 +280,92 @@ def test_kills_a_process_that_does_not_end(robot: Robot, monkeypatch: pytest.Mon
     assert robot.link._process.returncode == -signal.SIGKILL and robot.error is None
 
 
-def test_raises_the_drivers_error_where_the_port_does_not_exist() -> None:
+def test_raises_the_drivers_error_where_the_port_does_not_exist_and_is_not_waited_for() -> None:
     with pytest.raises(DriverError, match=r"motor port '/dev/nothing'.*there is no such port"):
-        ControllerLink(start_message("/dev/nothing"), StageStats("motor"), print)
+        ControllerLink(start_message("/dev/nothing")._replace(waits=True), StageStats("motor"), print)
+
+
+@pytest.mark.hazard("H04")
+@pytest.mark.parametrize(
+    ("protocol", "boot_s"), [("line", 5.0), ("roboteq", 1.5), ("odrive_ascii", 1.5), ("vesc", 1.5)]
+)
+def test_a_board_that_starts_again_when_its_port_is_opened_is_asked_until_it_has_booted(
+    tmp_path: Path, protocol: str, boot_s: float
+) -> None:
+    """It is plugged in late, boots longer than it is said to, and is plugged in again; the process goes on."""
+    port, lines = tmp_path / "motor", list[str]()
+    start = start_message(port, MANUAL)
+    motor = replace(start.motor, protocol=protocol, boot_s=1.0, watchdog_ms=500)
+    with contextlib.closing(ControllerLink(start._replace(motor=motor), StageStats("motor"), lines.append)) as link:
+
+        def state(*, arm: bool = True) -> ControllerState:
+            link.receive_waiting()
+            link.send_pose(pose())
+            if arm and not link.statistics.state.armed:
+                link.arm(ArmRequest(time.monotonic_ns(), 1))
+            link.send_setpoint(TimedSetpoint(time.monotonic_ns(), AHEAD))
+            return link.statistics.state
+
+        # 1. There is no port: it is waited for, and nothing can be armed.
+        wait_until(lambda: state().overdue and "no such port" in state().problem, "the wait for the port")
+        assert state().reason == state().arm_answer.refusal == safety_rules.AWAITED and not state().armed
+        for _ in range(2):
+            # 2. A board boots for longer than a second, once for each time that its port is opened.
+            with contextlib.closing(BootingBoard(protocol, boot_s)) as board:
+                port.symlink_to(board.port)
+                before = state(arm=False).sent
+
+                def answers(board: BootingBoard = board, before: int = before) -> bool:
+                    return bool(board.boots) and not state(arm=False).failed and state(arm=False).sent > before + 5
+
+                wait_until(answers, "its answer")
+                assert board.boots == 1 and board.controller.base.unsafe_resumes == 0
+                # 3. It drives after it was armed, and only then.
+                assert not state(arm=False).armed and board.controller.base.commanded_mps == [0.0, 0.0]
+                wait_until(lambda: state().armed and board.controller.base.velocity_mps > 0.2, "motion")
+                port.unlink()
+            wait_until(lambda: state().failed and not state().armed, "the fault")
+        link.end()
+    assert sum("has not answered yet" in line or "gave no answer" in line for line in lines) < 12
+    assert "the motor controller answers" in lines and "the motor controller is back" in lines
+
+
+DRIVE = MotorSettings().drive.geometry()
+
+
+class BootingBoard:
+    """A board that starts again, and boots, whenever its port is opened, as those that an adapter resets by DTR."""
+
+    def __init__(self, protocol: str, boot_s: float) -> None:
+        self._protocol, self._boot_s, self.boots = protocol, boot_s, 0
+        self.controller = simulated_controller(protocol, DRIVE)
+        self._device, host = os.openpty()
+        self.port = os.ttyname(host)
+        os.close(host)  # so that it shows when another program opens it
+        self._leaving = False
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Unplug it."""
+        self._leaving = True
+        self._thread.join()
+        os.close(self._device)
+
+    def _serve(self) -> None:
+        port, is_open, booted_s, before_s = select.poll(), False, 0.0, time.monotonic()
+        port.register(self._device, select.POLLIN)
+        while not self._leaving:
+            events = dict(port.poll(2)).get(self._device, 0)
+            now_s = time.monotonic()
+            self.controller.base.advance(min(now_s - before_s, 0.05))
+            before_s = now_s
+            if events & select.POLLHUP:
+                is_open = False
+                time.sleep(0.002)
+            elif not is_open:
+                is_open, booted_s, self.boots = True, now_s + self._boot_s, self.boots + 1
+                self.controller = simulated_controller(self._protocol, DRIVE)
+            elif events & select.POLLIN:
+                data = os.read(self._device, 4096)
+                os.write(self._device, self.controller.feed(data) if now_s >= booted_s else b"")

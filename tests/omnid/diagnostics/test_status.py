@@ -28,7 +28,8 @@ from omnid.stages.lockstep_drive import controller_pose
 from omnid.stages.synchronise import Synchronise
 from omnid.transport import codec
 from omnid.transport.codec import ERROR, OK, WARN, DiagnosticStatus, diagnostics_cdr
-from omnid.transport.commands import CommandReceiver, StampRule
+from omnid.transport.commands import CommandReceiver
+from omnid.transport.freshness import Freshness
 from omnid.transport.requests import Request
 from omnid.transport.status_names import Key, short_name
 from tests.omnid.small_pair import small_depth
@@ -62,7 +63,7 @@ class Daemon:
         self.motor = AcceptingMotor()
         self.controller = Controller(self.motor, ControllerSettings().without_obstacles, 0.05)
         self.controller_statistics = ControllerStatistics(self.stages[1])
-        self.commands = CommandReceiver(self, StampRule(0.5))
+        self.commands = CommandReceiver(self, Freshness(0.5))
         self.report = StatusCollector(
             StatusSources(
                 self.telemetry,

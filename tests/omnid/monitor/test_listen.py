@@ -122,7 +122,7 @@ def test_refuses_invalid_options(words: tuple[str, ...], expected: str, capsys: 
 
 def received_message(number: int) -> ReceivedMessage:
     attachment = PoseAttachment(number, "tracking", 0, 50, 60, time.time_ns()).to_bytes()
-    return ReceivedMessage(time.time_ns(), "odom", odometry_at(number), attachment)
+    return ReceivedMessage(time.time_ns(), "odom", odometry_at(number), attachment, time.monotonic_ns())
 
 
 def received(*numbers: int) -> RobotState:
@@ -154,7 +154,7 @@ def test_the_table_holds_no_control_characters_of_messages() -> None:
         DiagnosticStatus(WHEELS, 2, "\x1b[2J\nhello", {"sent": "4"}),
         DiagnosticStatus(BUS, 0, "", {}),
     ]
-    state.process(ReceivedMessage(time.time_ns(), "status", codec.diagnostics_cdr(1, evil), b""))
+    state.process(ReceivedMessage(time.time_ns(), "status", codec.diagnostics_cdr(1, evil), b"", 0))
     terminal = Terminal()
     print_state("omnid", state, 0, terminal)
     shown = terminal.getvalue()

@@ -15,12 +15,9 @@ from omnid.engine.graph import NEWEST, Graph
 from omnid.runs.record import open_recorder, record
 from omnid.sinks.recorder import Recorder
 from omnid.transport.codec import ERROR, OK
-from tests.omnid.sinks.test_recorder import frame
+from tests.omnid.sinks.test_recorder import frame, times
 
 START_NS = 1_700_000_000 * 10**9
-
-
-OFFSET_NS = START_NS - 5 * 10**9  # boot time of the machine: five seconds before
 
 
 def settings(folder: Path, **more: Any) -> Config:
@@ -44,7 +41,7 @@ class Given:
 
 
 def test_a_blocked_disk_stops_no_camera(tmp_path: Path) -> None:
-    recorder = open_recorder(settings(tmp_path / "log"), "", lambda *_: None, offset_ns=OFFSET_NS)
+    recorder = open_recorder(settings(tmp_path / "log"), "", lambda *_: None, time=times())
     late = Late(recorder)
     graph, seen = Graph(policy=NEWEST, depth=3), Seen()
     stream = graph.source("lower", lambda: iter([frame(n, "lower") for n in range(50)]))
@@ -58,14 +55,14 @@ def test_a_blocked_disk_stops_no_camera(tmp_path: Path) -> None:
 
 def test_reports_the_state_of_the_recording(tmp_path: Path) -> None:
     config = settings(tmp_path / "log")
-    recorder = open_recorder(config, "", lambda *_: None, offset_ns=OFFSET_NS)
+    recorder = open_recorder(config, "", lambda *_: None, time=times())
     assert (recorder.status().level, recorder.status().message) == (OK, "waiting")
     recorder.process(frame(0, "lower"))
     status = recorder.status()
     assert status.message == "recording" and status.values["messages"] == "1" and Path(status.values["file"]).exists()
     recorder.close()
     full = replace(config, record=replace(config.record, free_mb=1_000_000))
-    recorder = open_recorder(full, "", lambda *_: None, offset_ns=OFFSET_NS)
+    recorder = open_recorder(full, "", lambda *_: None, time=times())
     recorder.process(frame(0, "lower"))
     status = recorder.status()
     assert status.level == ERROR and status.values["lost"] == "1" and "1000001 needed" in status.message

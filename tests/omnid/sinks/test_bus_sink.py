@@ -26,6 +26,12 @@ from tests.omnid.transport.bus_fixtures import free_endpoint
 from tests.waiting import wait_until
 
 OFFSET_NS = 10**18
+
+
+def unix_ns(stamp_ns: int) -> int:
+    return stamp_ns + OFFSET_NS
+
+
 IMAGE = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 255, (64, 160), np.uint8), (0, 0), 4)
 
 
@@ -39,7 +45,7 @@ def odometry(seq: int) -> OdometryUpdate:
 def test_a_pose_comes_with_its_state_and_the_frames_of_ros() -> None:
     endpoint, came = free_endpoint(), {}
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus, Robot(connect=(endpoint,)) as robot:
-        sink = BusSink(bus, Encoder(np.eye(4), MapEncoding(10), OFFSET_NS))
+        sink = BusSink(bus, Encoder(np.eye(4), MapEncoding(10), unix_ns))
         robot.on_message(lambda topic, payload, note: came.update({topic: (payload, note)}))
         wait_until(lambda: sink.process(odometry(2)) is None and {"odom", "pose", "tf"} <= came.keys())
     pose = decode_pose(*came["odom"])
@@ -58,9 +64,7 @@ def test_a_run_with_a_time_of_its_own_publishes_it_and_never_back(gives_time: bo
     came: list[tuple[str, bytes]] = []
     bus = Bus(BusConfig(listen=(endpoint,)), gives_time=gives_time)
     with contextlib.closing(bus), Robot(connect=(endpoint,)) as robot:
-        sink = BusSink(
-            bus, Encoder(np.eye(4), MapEncoding(10), OFFSET_NS), clock=OdometryUpdate if gives_time else None
-        )
+        sink = BusSink(bus, Encoder(np.eye(4), MapEncoding(10), unix_ns), clock=OdometryUpdate if gives_time else None)
         robot.on_message(lambda topic, payload, _: came.append((topic, payload)))
         wait_until(lambda: sink.process(odometry(len(came) + 2)) is None and any(topic == "odom" for topic, _ in came))
         newest = len(came) + 100
@@ -93,8 +97,8 @@ def test_panoramas_are_published_at_the_configured_rate() -> None:
     endpoint, came = free_endpoint(), []
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus, Robot(connect=(endpoint,)) as robot:
         robot.on_message(lambda topic, payload, note: came.append((payload, note)))
-        wait_until(lambda: PanoramaSink(bus, 0.5, OFFSET_NS).process(odometry(0)) is None and bool(came))
-        sink = PanoramaSink(bus, 0.5, OFFSET_NS)
+        wait_until(lambda: PanoramaSink(bus, 0.5, unix_ns).process(odometry(0)) is None and bool(came))
+        sink = PanoramaSink(bus, 0.5, unix_ns)
         for seq in range(100, 107):  # a second apart, later than those above
             sink.process(odometry(seq))
         wait_until(lambda: bool(came) and stamp_s(came[-1][0]) >= 106)

@@ -18,12 +18,14 @@ from drivers.logs.rotating_log import RotationSettings
 from drivers.motor import VelocityCommand
 from omnid.config import Config, RecordConfig
 from omnid.core.mapping.voxel_map import MapPoints
+from omnid.engine.robot_clock import SegmentTime
 from omnid.messages import MapUpdate, OdometryUpdate
 from omnid.runs.record import open_recorder
-from omnid.sinks.encoder import Encoder, MapEncoding, status_report
+from omnid.sinks.encoder import Encoder, MapEncoding
 from omnid.transport.codec import DiagnosticStatus
 from tests.drivers.logs.mcap_logs import jpeg
 from tests.omnid.small_pair import small_depth
+from tests.set_clock import SetClock
 
 ROOT = Path(__file__).parents[3]
 START_NS = 1_700_000_000 * 10**9
@@ -47,13 +49,17 @@ def settings(folder: Path, **more: Any) -> Config:
     return replace(config, record=replace(config.record, folder=str(folder), free_mb=0, file_mb=1, **more))
 
 
+def times() -> SegmentTime:
+    return SegmentTime(SetClock(OFFSET_NS).clock())
+
+
 def recorded(folder: Path) -> list[Path]:
     return sorted(folder.glob("*.mcap"))
 
 
 @pytest.mark.parametrize("encoding", ["jpeg", *LENGTHS])
 def test_recorded_images_are_read_unchanged_and_found_by_name(tmp_path: Path, encoding: str) -> None:
-    recorder = open_recorder(settings(tmp_path / "log"), "", lambda *_: None, offset_ns=OFFSET_NS)
+    recorder = open_recorder(settings(tmp_path / "log"), "", lambda *_: None, time=times())
     given = [frame(n, camera, encoding) for n in range(3) for camera in ("lower", "upper")]
     for each in given:
         recorder.process(each)
@@ -74,15 +80,14 @@ def odometry(seq: int, state: str = "tracking") -> OdometryUpdate:
 
 
 def test_all_messages_are_recorded_in_unix_time(tmp_path: Path) -> None:
-    encode = Encoder(np.eye(4), MapEncoding(100), OFFSET_NS)
-    recorder = open_recorder(
-        settings(tmp_path / "log"), "version = 1", lambda *_: None, encode=encode, offset_ns=OFFSET_NS
-    )
+    time = times()
+    encode = Encoder(np.eye(4), MapEncoding(100), time.unix_ns)
+    recorder = open_recorder(settings(tmp_path / "log"), "version = 1", lambda *_: None, encode=encode, time=time)
     points = MapPoints(np.zeros((3, 3), np.float32), np.zeros(3, np.float32), *[np.zeros(3, np.int32)] * 2)
     for n in range(4):
         recorder.process(odometry(n, "lost" if n == 3 else "tracking"))
         recorder.process(VelocityCommand(5 * 10**9 + n, 0.1, math.nan, 0.2))
-    recorder.add(status_report(START_NS, [DiagnosticStatus("omnid: test", 0, "fine", {})]), START_NS)
+    recorder.add([DiagnosticStatus("omnid: test", 0, "fine", {})], 5 * 10**9)
     recorder.process(MapUpdate(0, 5 * 10**9, points, np.zeros((0, 2))))
     recorder.finish()
     (path,) = recorded(tmp_path / "log")
@@ -109,6 +114,47 @@ def test_all_messages_are_recorded_in_unix_time(tmp_path: Path) -> None:
         "/tf_static": 1,
     }
     assert set(attached(path)) == {"omnid.toml", "rig.toml"}
+
+
+@pytest.mark.parametrize("step_s", [-7200.0, -3.0, 0.02, 3600.0, 1.5e8])
+def test_a_step_of_the_clock_begins_a_file_and_no_file_has_one_in_it(
+    tmp_path: Path, step_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The oldest files are deleted by their order in the run, whatever their names say."""
+    computer = SetClock(OFFSET_NS)
+    computer.advance(5.0)
+    time = SegmentTime(computer.clock())
+    encode = Encoder(np.eye(4), MapEncoding(0), time.unix_ns)
+    monkeypatch.setattr(RecordConfig, "rotation", lambda _: RotationSettings(keep_files=2, free_bytes=0))
+    config = settings(tmp_path / "log")
+    recorder = open_recorder(config, "", lambda *_: None, encode=encode, time=time)
+    for n in range(30):
+        stamp_ns = 5 * 10**9 + n * 10**8
+        for camera in ("lower", "upper"):
+            recorder.process(replace(frame(n, camera), stamp_ns=stamp_ns))
+        computer.advance(0.1)
+        recorder.add([DiagnosticStatus("omnid: test", 0, "fine", {})], stamp_ns)
+        if n in (9, 19):
+            computer.set_forwards(step_s)
+        recorder.process(replace(odometry(n), stamp_ns=stamp_ns))  # of images of before the step, later than it
+    recorder.finish()
+    written = []
+    for path in recorded(tmp_path / "log"):
+        with path.open("rb") as file:
+            logged = [(message.log_time, channel.topic) for _, channel, message in make_reader(file).iter_messages()]
+        with AnyReader([path]) as bag:
+            stamps = [
+                message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+                for connection, _, data in bag.messages()
+                if not connection.topic.startswith("/tf")
+                for message in [cast("Any", bag.deserialize(data, connection.msgtype))]
+            ]
+        assert sorted(stamps) == sorted(at_ns for at_ns, topic in logged if not topic.startswith("/tf"))
+        assert max(stamps) - min(stamps) < 1.1e9, "no step within a file"
+        images = [at_ns for at_ns, topic in logged if topic == "/omnid/lower/image_raw/compressed"]
+        written.append((images[0] - OFFSET_NS, len(images)))
+    steps_ns = round(step_s * 1e9)
+    assert sorted(written) == sorted([(6 * 10**9 + steps_ns, 10), (7 * 10**9 + 2 * steps_ns, 10)])
 
 
 def attached(path: Path) -> list[str]:

@@ -43,7 +43,7 @@ def test_numbers_of_the_status_with_labels_that_cannot_break_out() -> None:
 def test_the_state_of_the_newest_pose_is_one_and_the_others_nought() -> None:
     state, now_ns = RobotState(), time.time_ns()
     attachment = PoseAttachment(1, "tracking", 0, 50, 60, now_ns).to_bytes()
-    state.process(ReceivedMessage(now_ns, "odom", odometry(1), attachment))
+    state.process(ReceivedMessage(now_ns, "odom", odometry(1), attachment, time.monotonic_ns()))
     found = samples(state)
     assert {name: found["omnid_tracking_state", name] for name in TrackingState} == {
         name: name == "tracking" for name in TrackingState

@@ -222,7 +222,7 @@ def test_the_limits_are_read_again_after_the_robot_has_started_again(alone: Robo
         assert read() == 0.3
         serve(0.7)
         for seq in (9, 0):
-            feed.state.process(ReceivedMessage(1, "odom", odometry(seq), PoseAttachment(seq).to_bytes()))
+            feed.state.process(ReceivedMessage(1, "odom", odometry(seq), PoseAttachment(seq).to_bytes(), seq))
         assert read() == 0.7
 
 

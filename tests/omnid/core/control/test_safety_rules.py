@@ -19,6 +19,7 @@ CAUSES: dict[str, dict[str, object]] = {  # in the order in which they are repor
     safety_rules.ASKED: {"stop_asked": True},
     safety_rules.CLIFF: {"contact": safety_rules.CLIFF},
     safety_rules.BUMPER: {"contact": safety_rules.BUMPER},
+    safety_rules.AWAITED: {"motor_awaited": True},
     safety_rules.FAILED: {"motor_failed": True},
     safety_rules.STOPPED: {"motor_stopped": True},
     safety_rules.MOTOR_FAULT: {"motor_faulty": True},
