@@ -122,6 +122,7 @@ REMOVED: Final[Mapping[str, str]] = MappingProxyType(
         "replay --tags": "`apriltag_ros`, or the package `pupil-apriltags`, finds AprilTags",
         "run --tags": "`apriltag_ros`, or the package `pupil-apriltags`, finds AprilTags",
         "simulate --tags": "`apriltag_ros`, or the package `pupil-apriltags`, finds AprilTags",
+        "simulate --speed": "simulated time waits for the daemon, and is never faster than real time",
         "view --port": "-o FILE.rrd, which `rerun --serve-web FILE.rrd` serves at ports of your choice",
         "view --web": "-o FILE.rrd, which `rerun --serve-web FILE.rrd` shows in a browser",
         "web --all": "one page for each robot, with --robot NAME and --listen HOST:PORT, in tabs of one browser",

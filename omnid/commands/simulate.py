@@ -5,8 +5,6 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
-from collections import Counter, defaultdict
-from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -15,27 +13,14 @@ from typing import TYPE_CHECKING
 from omnid.commands.options import MAP, SETTINGS, command, option, settings_of
 from omnid.errors import OmnidError
 
-AUTO, REAL_TIME = "auto", "1.0"
-
 if TYPE_CHECKING:  # the help and other commands do not load these
     from collections.abc import Callable
 
     from drivers.motors.simulated.simulated_base import Pose
-    from omnid.runs.live import LiveRobot, LiveRun
-    from omnid.simulation.paced_robot import PacedRobot
-    from omnid.simulation.realtime import RealtimeRobot, SimulatedGyro
-    from omnid.simulation.robot import SimulatedRobot
 
 
 @command(
     option("world", help="room, corridor, building, hall, or a file *.toml (docs/drive.md)"),
-    option(
-        "--speed",
-        choices=(AUTO, REAL_TIME),
-        default=AUTO,
-        help="auto: simulated time waits for the daemon, and is never faster than real time; 1.0: real time, as on a "
-        "robot: what the computer cannot do in time is dropped; default %(default)s",
-    ),
     option("--seed", type=int, default=1, help="of textures and noise; default %(default)s"),
     option("--rig", type=Path, help="the rig.toml of the cameras; default: a straight rig"),
     option("--size", type=int, default=512, metavar="PX", help="of the images without --rig; default %(default)s"),
@@ -61,73 +46,38 @@ def run(args: argparse.Namespace) -> int:
     from omnid.engine.process import use_one_malloc_arena
 
     use_one_malloc_arena()  # first: the next imports load numpy, which starts threads
+    from calib.rig_file import read_rig
     from omnid.config import unused_settings
     from omnid.controller.motor import SIMULATED
     from omnid.engine.logging_setup import HANDLER, log
     from omnid.runs.live import LiveRun
     from omnid.simulation.paced_robot import PacedRobot
-    from omnid.simulation.realtime import RealtimeRobot
+    from omnid.simulation.robot import make_robot
     from omnid.simulation.world_file import WorldOptions, load_world
     from omnid.sinks.files import check_outputs
 
+    # 1. Check the options.
     check_outputs([("--truth", args.truth)] if args.truth else [], [])
     config = settings_of(args)
     for warning in unused_settings(config, "run", args.overrides):
         log(logging.WARNING, warning)
     if args.seed < 0:
         raise OmnidError(f"--seed {args.seed}: expected 0 or more")
-    options = WorldOptions(people=not args.no_people, brightness=args.light, other_posters=args.other_posters)
-    world = load_world(args.world, args.seed, options)
-    show = HANDLER.show if sys.stderr.isatty() else None
-    warn = partial(log, logging.WARNING)
-    if args.speed == AUTO:
-        config = replace(config, motor=replace(config.motor, port=SIMULATED))
-        paced = PacedRobot(world, _robot(args), config, args.seed, warn)
-        run = LiveRun(config, paced, log, paced.rig, show)
-        return _end(args, paced, run.run(), run)
-    geometry = config.motor.drive.geometry()
-    with closing(RealtimeRobot(world, _robot(args), config.motor.protocol, geometry, args.seed, warn)) as robot:
-        config = replace(config, motor=replace(config.motor, port=robot.port))
-        gyro = robot.open_gyro() if config.motion.imu != "off" else None
-        run = LiveRun(config, _connected(robot, gyro), log, robot.rig, show)
-        code = run.run()
-    return _end(args, robot, code, run)
-
-
-def _end(args: argparse.Namespace, robot: PacedRobot | RealtimeRobot, code: int, run: LiveRun) -> int:
-    """Write the truth where it is asked for; return the exit code."""
-    from omnid.engine.logging_setup import log
-
-    if args.truth:
-        _write_truth(args.truth, robot.drive.truth, run.clock.unix_ns)
-    log(logging.INFO, f"contacts with obstacles: {robot.drive.contacts}")
-    return code
-
-
-def _robot(args: argparse.Namespace) -> SimulatedRobot:
-    from calib.rig_file import read_rig
-    from omnid.simulation.robot import make_robot
-
     if not 64 <= args.size <= 2048:
         raise OmnidError(f"--size {args.size}: expected 64 to 2048 px")
-    return make_robot(args.size, read_rig(args.rig) if args.rig else None)
-
-
-def _connected(robot: RealtimeRobot, gyro: SimulatedGyro | None) -> LiveRobot:
-    """Return the robot as the run sees it; cameras that are opened together have one clock."""
-    from drivers.cameras.log_camera import LogClock
-    from drivers.frame import Camera
-    from omnid.runs.live import ConnectedRobot
-    from omnid.simulation.realtime import SimulatedCamera
-
-    clocks: defaultdict[int, LogClock] = defaultdict(LogClock)
-    opened: Counter[Camera] = Counter()
-
-    def open_camera(camera: Camera) -> SimulatedCamera:
-        opened[camera] += 1
-        return robot.open_camera(camera, clocks[opened[camera]])
-
-    return ConnectedRobot(open_camera, gyro=gyro)
+    # 2. Run in the world.
+    options = WorldOptions(people=not args.no_people, brightness=args.light, other_posters=args.other_posters)
+    world = load_world(args.world, args.seed, options)
+    robot = make_robot(args.size, read_rig(args.rig) if args.rig else None)
+    config = replace(config, motor=replace(config.motor, port=SIMULATED))
+    paced = PacedRobot(world, robot, config, args.seed, partial(log, logging.WARNING))
+    run = LiveRun(config, paced, log, paced.rig, HANDLER.show if sys.stderr.isatty() else None)
+    code = run.run()
+    # 3. Write the truth, and report contacts.
+    if args.truth:
+        _write_truth(args.truth, paced.drive.truth, run.clock.unix_ns)
+    log(logging.INFO, f"contacts with obstacles: {paced.drive.contacts}")
+    return code
 
 
 def _write_truth(path: Path, truth: dict[int, Pose], unix_ns: Callable[[int], int]) -> None:

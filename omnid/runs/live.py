@@ -189,14 +189,9 @@ class ConnectedRobot:
 
     waits: Final = False
 
-    def __init__(
-        self, open_camera: OpenCamera, motion: MotionSource | None = None, gyro: MotionSource | None = None
-    ) -> None:
-        """motion: wheels and gyro where the images are those of a log; None: those of the robot.
-
-        gyro: that of a simulated robot; None: samples of a gyro come by the bus.
-        """
-        self._open_camera, self._motion, self._gyro = open_camera, motion, gyro
+    def __init__(self, open_camera: OpenCamera, motion: MotionSource | None = None) -> None:
+        """motion: wheels and gyro where the images are those of a log; None: those of the robot."""
+        self._open_camera, self._motion = open_camera, motion
         self.brings_samples = motion is not None
         self._cameras: dict[Camera, LiveCamera] = {}
 
@@ -216,9 +211,8 @@ class ConnectedRobot:
 
     def sources(self, graph: Graph, take: Callable[[MotionSample], None]) -> list[Stream[Frame]]:
         """Add the cameras, and the samples of a log."""
-        for name, motion in (("motion", self._motion), ("gyro", self._gyro)):
-            if motion is not None:
-                graph.source(name, partial(map, take, motion.samples()), wake=motion.close)
+        if self._motion is not None:
+            graph.source("motion", partial(map, take, self._motion.samples()), wake=self._motion.close)
         return [graph.source(name, camera.frames, wake=camera.close) for name, camera in self._cameras.items()]
 
     def states(self) -> Mapping[Camera, CameraState]:

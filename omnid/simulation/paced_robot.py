@@ -28,7 +28,6 @@ from omnid.simulation.cameras import SimulatedCameras
 from omnid.simulation.clearance import DriveRecord
 from omnid.simulation.lockstep import STOPPING_NS, with_masks
 from omnid.simulation.paced_link import Delivery, PacedLink
-from omnid.simulation.realtime import SAMPLES
 from omnid.simulation.robot import SimulatedRobot
 from omnid.simulation.vehicle import Tick, Vehicle
 from omnid.simulation.world import World
@@ -77,7 +76,7 @@ class PacedRobot:
         """report: takes a line at each contact with an obstacle."""
         self.rig = with_masks(robot.rig)
         self._world, self._robot, self._config, self._seed = world, robot, config, seed
-        self._rendered = SimulatedCameras(self.rig, robot.sensor, world, seed, SAMPLES)
+        self._rendered = SimulatedCameras(self.rig, robot.sensor, world, seed, samples=1)
         self._period_ns = round(1e9 / robot.rate_hz)
         self._start_ns = time.monotonic_ns()
         self._vehicle: Vehicle | None = None
