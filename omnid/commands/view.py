@@ -167,7 +167,7 @@ def _log(sink: RerunSink, config: Config, args: argparse.Namespace) -> int:
         odometry_topics,
     )
     from omnid.runs.replay import ReplayOptions
-    from omnid.transport.decode import OdometryRecord
+    from omnid.transport.decode import Pose
     from omnid.transport.topics import MAP_POSE, SCAN
 
     found = log_info(args.log)
@@ -179,11 +179,11 @@ def _log(sink: RerunSink, config: Config, args: argparse.Namespace) -> int:
         )
         return draw_replay(sink, args.log, config, options, Output(quiet=args.quiet))
     reader = RecordingReader(found, choose_odometry_topic(found, args.topic, args.robot))
-    pending: OdometryRecord | None = None  # a pose until its state is known, which is recorded after it
+    pending: Pose | None = None  # a pose until its state is known, which is recorded after it
     broken_images = 0
     for message in reader.messages((ODOMETRY, MAP_POSE, STATUS, CLOUD, SCAN, reader.image_name())):
         due, content = pending, message.content
-        if isinstance(content, OdometryRecord):
+        if isinstance(content, Pose):
             pending = content
         else:
             due = None

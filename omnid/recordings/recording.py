@@ -30,15 +30,15 @@ from omnid.transport.codec import (
 from omnid.transport.decode import (
     Cloud,
     Diagnostics,
-    OdometryRecord,
+    Pose,
     PoseInMap,
     Scan,
     TwistRecord,
     decode_cloud,
     decode_diagnostics,
     decode_map_pose,
+    decode_pose,
     decode_scan,
-    odometry_from_cdr,
     twist_from_cdr,
 )
 from omnid.transport.topics import MAP_POSE, PANORAMA, SCAN
@@ -53,7 +53,7 @@ IMAGES: Final = (PANORAMA, "lower/image_raw/compressed", "lower/image_raw")  # i
 MAX_MESSAGE_BYTES: Final = 64 * 2**20
 MAX_LISTED: Final = 8  # topics in a message
 
-Content: TypeAlias = OdometryRecord | PoseInMap | Diagnostics | Cloud | Scan | TwistRecord | RosImage
+Content: TypeAlias = Pose | PoseInMap | Diagnostics | Cloud | Scan | TwistRecord | RosImage
 Decoder: TypeAlias = Callable[[LoggedMessage], Content]
 
 
@@ -196,7 +196,7 @@ def _finite_twist(data: bytes) -> TwistRecord:
 
 
 DECODERS: Final[Mapping[str, tuple[str, Callable[[bytes], Content]]]] = {
-    ODOMETRY: (ODOMETRY_SCHEMA, odometry_from_cdr),
+    ODOMETRY: (ODOMETRY_SCHEMA, decode_pose),
     MAP_POSE: (MAP_POSE_SCHEMA, decode_map_pose),
     STATUS: (DIAGNOSTICS_SCHEMA, decode_diagnostics),
     CLOUD: (POINT_CLOUD_SCHEMA, decode_cloud),

@@ -35,7 +35,7 @@ from omnid.recordings.recording import (
 from omnid.tracking_state import TrackingState
 from omnid.transport import status_names
 from omnid.transport.codec import DiagnosticStatus
-from omnid.transport.decode import Cloud, Diagnostics, OdometryRecord, PoseInMap, TwistRecord
+from omnid.transport.decode import Cloud, Diagnostics, Pose, PoseInMap, TwistRecord
 from omnid.transport.status_names import Key, short_name
 from omnid.transport.topics import MAP_POSE
 
@@ -259,7 +259,7 @@ def read_run(path: Path, topic: str | None = None) -> RecordedRun:
     found = log_info(path)
     reader = RecordingReader(found, choose_odometry_topic(found, topic))
     # 1. All messages; poses whose stamps are far from the time of logging, or that are out of range, are left out.
-    poses, map_poses = list[OdometryRecord](), list[PoseInMap]()
+    poses, map_poses = list[Pose](), list[PoseInMap]()
     statuses, names = list[tuple[int, list[DiagnosticStatus]]](), set[str]()
     drives: dict[str, list[TwistRecord]] = {}
     cloud: Cloud | None = None
@@ -267,7 +267,7 @@ def read_run(path: Path, topic: str | None = None) -> RecordedRun:
     out_of_range = late = 0
     for message in reader.messages((ODOMETRY, MAP_POSE, STATUS, CLOUD, DRIVE, TWIST_COMMAND)):
         match message.content:
-            case OdometryRecord() as pose:
+            case Pose() as pose:
                 offset_ns = message.log_time_ns - pose.stamp_ns if offset_ns is None else offset_ns
                 is_near = abs(message.log_time_ns - pose.stamp_ns - offset_ns) <= MAX_CLOCK_OFFSET_S * 1e9
                 if not (is_near and (np.abs(pose.T_odom_base[:3, 3]) <= POSITION_LIMIT_M).all()):
@@ -329,7 +329,7 @@ def read_run(path: Path, topic: str | None = None) -> RecordedRun:
     )
 
 
-def _corrections(map_poses: Sequence[PoseInMap], poses: Sequence[OdometryRecord], start_ns: int) -> tuple[Array, Array]:
+def _corrections(map_poses: Sequence[PoseInMap], poses: Sequence[Pose], start_ns: int) -> tuple[Array, Array]:
     """Return rows of t, correction in m and rad, sigma, and positions in the map, where odometry has the same stamp.
 
     The correction is the pose in the map relative to that of odometry: the part of map -> odom seen at the robot.

@@ -129,13 +129,12 @@ class PacedRobot:
         self._closed = True
 
     def _status(self) -> DiagnosticStatus:
-        time_s = (self.clock_ns() - self._start_ns) * 1e-9
         values = {
-            str(Key.REAL_TIME_FACTOR): f"{self._pace.value:.2f}",
-            "time_s": f"{time_s:.1f}",
-            "contacts": str(self.drive.contacts),
+            Key.REAL_TIME_FACTOR: f"{self._pace.value:.2f}",
+            "time_s": (self.clock_ns() - self._start_ns) * 1e-9,
+            "contacts": self.drive.contacts,
         }
-        return DiagnosticStatus(SIMULATION, OK, "its time waits for the daemon", values)
+        return DiagnosticStatus.of(SIMULATION, OK, "its time waits for the daemon", values)
 
     def _frames(self, settle: Callable[[], None], take: Callable[[MotionSample], None]) -> Iterator[Frame]:
         """Advance from pair to pair; settle: returns when the daemon has answered."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Final, NamedTuple, TypeAlias
 
@@ -206,13 +205,14 @@ class StateReports:
             if (message.state, message.reset_counter) == self._last:
                 return
             self._last = message.state, message.reset_counter
-            values: dict[str, str] = {
+            values = {
                 Key.STATE: message.state,
-                Key.RESETS: str(message.reset_counter),
-                Key.INLIERS: str(message.inliers),
-                Key.TRACKED: str(message.tracks),
+                Key.RESETS: message.reset_counter,
+                Key.INLIERS: message.inliers,
+                Key.TRACKED: message.tracks,
             }
-            status = DiagnosticStatus(ODOMETRY, list(TrackingState).index(message.state), message.state, values)
+            level = list(TrackingState).index(message.state)
+            status = DiagnosticStatus.of(ODOMETRY, level, message.state, values)
         yield status_report(self._unix_ns(message.stamp_ns), [status])
 
 
@@ -231,23 +231,18 @@ def _most_confident(points: MapPoints, count: int) -> tuple[NDArray[np.float32],
 
 def navigation_status(update: NavigationUpdate) -> DiagnosticStatus:
     """Return the status entry of an update, for its own topic."""
-    values: dict[str, str] = {Key.STATE: update.state}
-    if update.task:
-        values[Key.TASK] = update.task
-    if update.command_ns:
-        values[Key.COMMAND_NS] = str(update.command_ns)
-    if update.reason:
-        values[Key.REASON] = update.reason
-    for key, number in ((Key.LEFT_M, update.left_m), (Key.OFFSET_M, update.offset_m)):
-        if math.isfinite(number):
-            values[key] = f"{number:.3f}"
-    if update.loops_left > 1:
-        values[Key.LOOPS_LEFT] = str(update.loops_left)
+    values: dict[str, object] = {
+        Key.STATE: update.state,
+        Key.TASK: update.task,
+        Key.COMMAND_NS: update.command_ns or "",
+        Key.REASON: update.reason,
+        Key.LEFT_M: update.left_m,
+        Key.OFFSET_M: update.offset_m,
+        Key.LOOPS_LEFT: update.loops_left if update.loops_left > 1 else "",
+    }
     if update.teaching:
-        values |= {Key.TEACHING: update.teaching, Key.TAUGHT_M: f"{update.taught_m:.2f}"}
+        values |= {Key.TEACHING: update.teaching, Key.TAUGHT_M: update.taught_m}
     if update.answer is not None:
-        values[Key.REQUEST] = update.answer.request
-        if update.answer.refusal:
-            values[Key.REFUSAL] = update.answer.refusal
+        values |= {Key.REQUEST: update.answer.request, Key.REFUSAL: update.answer.refusal}
     message = f"{update.state}: {update.reason}" if update.reason else str(update.state)
-    return DiagnosticStatus(NAVIGATION, NAVIGATION_LEVELS.get(update.state, OK), message, values)
+    return DiagnosticStatus.of(NAVIGATION, NAVIGATION_LEVELS.get(update.state, OK), message, values)

@@ -109,13 +109,10 @@ class Recorder:
 
     def status(self) -> DiagnosticStatus:
         """Return the state as a diagnostic status, with counts of all that was lost after the inbox."""
-        state = self.state
-        counts = {
-            name: str(getattr(state, name)) for name in ("messages", "lost", "refused", "files", "deleted", "stops")
-        }
-        values = {"file": state.file, **counts, "invalid": str(self.invalid)}
+        state, names = self.state, ("file", "messages", "lost", "refused", "files", "deleted", "stops")
+        values = {name: getattr(state, name) for name in names} | {"invalid": self.invalid}
         level = ERROR if state.status == "stopped" else OK
-        return DiagnosticStatus(RECORDING, level, state.problem or state.status, values)
+        return DiagnosticStatus.of(RECORDING, level, state.problem or state.status, values)
 
     def process(self, message: Recorded) -> None:
         """Record a message and, for a pose, its state where it has changed or a new file has begun."""

@@ -202,11 +202,11 @@ class Bus:
             level, message = WARN, f"more messages on {counts.most_common(1)[0][0]} than are taken: end their sender"
         values = {
             "mode": "client" if self._config.is_client else "peer",
-            "lost": str(self.lost),
-            status_names.SAME_NAME_COUNT: str(len(self._namesakes)),
-            **{f"flooded, {key}": str(count) for key, count in sorted(counts.items())},
+            "lost": self.lost,
+            status_names.SAME_NAME_COUNT: len(self._namesakes),
+            **{f"flooded, {key}": count for key, count in sorted(counts.items())},
         }
-        return DiagnosticStatus(status_names.BUS, level, message, values)
+        return DiagnosticStatus.of(status_names.BUS, level, message, values)
 
     @property
     def is_unique(self) -> bool:

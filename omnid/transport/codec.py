@@ -11,7 +11,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache, lru_cache
-from struct import pack
 from typing import TYPE_CHECKING, ClassVar, Final, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
@@ -60,6 +59,7 @@ SCHEMAS = (
     GRID_SCHEMA,
     HEADER_SCHEMA,
     CLOCK_SCHEMA,
+    SCAN_SCHEMA,
 )
 NS_PER_S = 1_000_000_000
 MAX_SECONDS = 2**31 - 1  # builtin_interfaces/msg/Time counts seconds in an int32
@@ -414,20 +414,12 @@ def scan_cdr(stamp_ns: int, frame: str, ranges_m: Floats, sigma_m: Floats, limit
     """Encode a sensor_msgs/msg/LaserScan of sectors (N,) that divide a full turn from azimuth -pi on.
 
     As REP 117 says: inf is free up to the longest range, NaN is unknown. sigma_m: standard deviations of the ranges,
-    sent as intensities. limits_m: least and longest range. CDR is written here: little-endian (OMG RTPS 2.2, 10.2).
-
-    Raise OmnidError where the stamp does not fit a ROS time.
+    sent as intensities. limits_m: least and longest range. Raise OmnidError where the stamp does not fit a ROS time.
     """
-    name = frame.encode() + b"\0"
-    head = pack("<iII", *ros_time(stamp_ns), len(name)) + name
-    step = 2 * math.pi / len(ranges_m)
-    numbers = pack("<7f", step / 2 - math.pi, math.pi - step / 2, step, 0.0, 0.0, *limits_m)
-    arrays = [
-        part
-        for values in (ranges_m, sigma_m)
-        for part in (pack("<I", len(values)), np.ascontiguousarray(values, "<f4").tobytes())
-    ]
-    return b"".join([b"\0\1\0\0", head, bytes(-len(head) % 4), numbers, *arrays])
+    step, arrays = 2 * math.pi / len(ranges_m), [np.ascontiguousarray(one, "<f4") for one in (ranges_m, sigma_m)]
+    angles = (step / 2 - math.pi, math.pi - step / 2, step)
+    message = ros.sensor_msgs__msg__LaserScan(header_message(stamp_ns, frame), *angles, 0.0, 0.0, *limits_m, *arrays)
+    return message_cdr(message)
 
 
 def features_to_bytes(pixels: Mapping[str, Array]) -> bytes:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -45,18 +45,6 @@ MOST_RANGES: Final = 100_000
 _MAX_FEATURES_BYTES: Final = 1 << 17
 _MAX_PX: Final = 1e5
 ALIGNED = 0.999_999  # w of a quaternion that is taken for no rotation
-
-
-@dataclass(frozen=True, slots=True)
-class OdometryRecord:
-    """Content of a nav_msgs/msg/Odometry message."""
-
-    stamp_ns: int
-    T_odom_base: Array  # (4, 4)
-    covariance: Array  # (6, 6) of the pose, in odom axes
-    velocity: Array  # (6,) [m/s, rad/s] in the base frame
-    velocity_covariance: Array  # (6, 6)
-    frames: Frames  # (parent, child)
 
 
 class TwistRecord(NamedTuple):
@@ -116,8 +104,9 @@ class Pose:
     covariance: Array  # (6, 6) of the pose, x y z rx ry rz in odom axes, m^2 and rad^2
     velocity: Array  # (6,) m/s, rad/s in the base's axes
     velocity_covariance: Array  # (6, 6)
-    attachment: PoseAttachment  # state, sequence number, landmarks
-    received_ns: int  # of Unix time, by the receiver's clock
+    attachment: PoseAttachment = field(default_factory=PoseAttachment)  # state, sequence number, landmarks
+    received_ns: int = 0  # of Unix time, by the receiver's clock
+    frames: Frames = ("odom", "base_link")  # parent, child
 
     @property
     def state(self) -> str:
@@ -242,20 +231,6 @@ def unchecked_stamp_ns(stamp: ros.builtin_interfaces__msg__Time) -> int:
     return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
 
 
-def odometry_from_cdr(payload: bytes) -> OdometryRecord:
-    """Decode an Odometry message. Raise OmnidError unless the bytes are one with a finite, rigid pose."""
-    message = message_from_cdr(payload, ros.nav_msgs__msg__Odometry)
-    twist = message.twist.twist
-    return OdometryRecord(
-        stamp_ns=_stamp_ns(message.header.stamp),
-        T_odom_base=rigid_transform(message.pose.pose),
-        covariance=message.pose.covariance.reshape(6, 6),
-        velocity=np.array([*_xyz(twist.linear), *_xyz(twist.angular)]),
-        velocity_covariance=message.twist.covariance.reshape(6, 6),
-        frames=(message.header.frame_id, message.child_frame_id),
-    )
-
-
 def _stamp_ns(stamp: ros.builtin_interfaces__msg__Time) -> int:
     """Return the stamp of an Odometry. Raise OmnidError for one that is invalid."""
     if stamp.sec < 0 or stamp.nanosec >= NS_PER_S:
@@ -368,21 +343,22 @@ def _whole(text: str) -> int:
     return int(text) if text.isascii() and text.isdigit() and len(text) < 20 else 0
 
 
-def decode_pose(payload: bytes, attachment: bytes, received_ns: int | None = None) -> Pose:
-    """Decode an Odometry message and its attachment. Raise OmnidError for any other bytes.
+def decode_pose(payload: bytes, attachment: bytes = b"", received_ns: int | None = None) -> Pose:
+    """Decode an Odometry message and its attachment. Raise OmnidError unless it has a finite, rigid pose.
 
     received_ns: time of arrival, of Unix time; default: now.
     """
-    received_ns = time.time_ns() if received_ns is None else received_ns
-    record = odometry_from_cdr(payload)
+    message = message_from_cdr(payload, ros.nav_msgs__msg__Odometry)
+    twist = message.twist.twist
     return Pose(
-        record.stamp_ns,
-        record.T_odom_base,
-        record.covariance,
-        record.velocity,
-        record.velocity_covariance,
-        PoseAttachment.from_bytes(attachment) if attachment else PoseAttachment(),
-        received_ns,
+        stamp_ns=_stamp_ns(message.header.stamp),
+        T_odom_base=rigid_transform(message.pose.pose),
+        covariance=message.pose.covariance.reshape(6, 6),
+        velocity=np.array([*_xyz(twist.linear), *_xyz(twist.angular)]),
+        velocity_covariance=message.twist.covariance.reshape(6, 6),
+        attachment=PoseAttachment.from_bytes(attachment) if attachment else PoseAttachment(),
+        received_ns=time.time_ns() if received_ns is None else received_ns,
+        frames=(message.header.frame_id, message.child_frame_id),
     )
 
 

@@ -32,7 +32,6 @@ from omnid.transport.codec import PoseAttachment
 from omnid.transport.decode import (
     Cloud,
     Diagnostics,
-    OdometryRecord,
     Pose,
     PoseInMap,
     Scan,
@@ -92,7 +91,7 @@ def layout() -> Any:
     )
 
 
-def decoded(topic: str, payload: bytes, attachment: bytes, received_ns: int) -> Content | Pose | None:
+def decoded(topic: str, payload: bytes, attachment: bytes, received_ns: int) -> Content | None:
     """Return the content of a message, None for other topics; raise OmnidError or FrameDecodeError if it is broken."""
     if topic == "odom":
         return decode_pose(payload, attachment, received_ns)
@@ -112,14 +111,14 @@ class RerunSink:
         self._end: Array | None = None  # (3,) m, of the path
         self._state = "unknown"
         self._shown_state = ""
-        self._poses: deque[Pose | OdometryRecord] = deque(maxlen=100)  # a pose in the map comes later than that in odom
+        self._poses: deque[Pose] = deque(maxlen=100)  # a pose in the map comes later than that in odom
         self._messages: dict[str, tuple[int, str]] = {}  # level and message of each status
         self.poses = self.images = 0
 
-    def draw(self, content: Content | Pose, attachment: bytes = b"", received_ns: int = 0) -> None:
+    def draw(self, content: Content, attachment: bytes = b"", received_ns: int = 0) -> None:
         """Draw a decoded message; attachment: of a panorama; received_ns: of a pose by the bus, 0: not known."""
         match content:
-            case Pose() | OdometryRecord():
+            case Pose():
                 self._pose(content)
                 if received_ns:
                     self._plot(content.stamp_ns, "latency", "age", 1e-6 * (received_ns - content.stamp_ns))
@@ -216,9 +215,9 @@ class RerunSink:
         if np.isfinite(value):
             self._at(stamp_ns).log([plot, name], rr.Scalars(value))
 
-    def _pose(self, pose: Pose | OdometryRecord) -> None:
+    def _pose(self, pose: Pose) -> None:
         """Draw the robot, the newest piece of its path and its covariance; plot speeds and landmarks."""
-        if isinstance(pose, Pose) and pose.state != self._state:
+        if pose.attachment.seq >= 0:
             self._state = pose.state
         colour, width_px = STATES.get(self._state, STATES["unknown"])
         if self._state != self._shown_state:
@@ -255,7 +254,7 @@ class RerunSink:
         # 3. The plots.
         self._plot(stamp_ns, "speed", "m/s", float(np.linalg.norm(pose.velocity[:3])))
         self._plot(stamp_ns, "yaw_rate", "deg/s", float(np.rad2deg(pose.velocity[5])))
-        if isinstance(pose, Pose) and pose.attachment.seq >= 0:
+        if pose.attachment.seq >= 0:
             self._plot(stamp_ns, "landmarks", "tracked", pose.attachment.tracked)
             self._plot(stamp_ns, "landmarks", "inliers", pose.attachment.inliers)
 

@@ -21,7 +21,7 @@ from rosbags.typesys import Stores, get_typestore
 from drivers.motors.simulated.simulated_controllers import SimulatedLine
 from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from omnid.transport import codec, decode
-from omnid.transport.decode import OdometryRecord
+from omnid.transport.decode import Pose
 from tests.ports import free_port
 from tests.waiting import ended, wait_until
 
@@ -104,7 +104,7 @@ class Operator:
         }
         for key, value in settings.items():
             config.insert_json5(key, json.dumps(value))
-        self.poses: list[OdometryRecord] = []
+        self.poses: list[Pose] = []
         self.states: dict[str, Any] = {}  # newest status by name
         self.messages: set[tuple[str, str]] = set()  # part and message, all there were
         self._session = zenoh.open(config)
@@ -154,7 +154,7 @@ class Operator:
                 self.send("cmd/heading", codec.heading_cdr(time.time_ns(), *wish))
 
     def _pose(self, sample: zenoh.Sample) -> None:
-        self.poses.append(decode.odometry_from_cdr(sample.payload.to_bytes()))
+        self.poses.append(decode.decode_pose(sample.payload.to_bytes()))
 
     def _state(self, sample: zenoh.Sample) -> None:
         message: Any = STORE.deserialize_cdr(sample.payload.to_bytes(), codec.DIAGNOSTICS_SCHEMA)

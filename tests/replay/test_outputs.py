@@ -20,7 +20,7 @@ from omnid.formats.tum import read_tum
 from omnid.recordings.evaluation import evaluate
 from omnid.runs.replay import ReplayOptions, run_log
 from omnid.settings import parse
-from omnid.transport.decode import decode_diagnostics, decode_map, odometry_from_cdr
+from omnid.transport.decode import decode_diagnostics, decode_map, decode_pose
 from omnid.transport.status_names import SUMMARY, stage_name
 from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, STORE, UPPER, Entry, compressed, write_log
@@ -95,7 +95,7 @@ def test_record_holds_the_base_in_odom(omnid: Command, tmp_path: Path, scene: Pa
     T_odom_rig = read_tum(tum).T
     with out.open("rb") as file:
         reader = make_reader(file)
-        found = [odometry_from_cdr(m.data) for _, _, m in reader.iter_messages(["/omnid/odom"])]
+        found = [decode_pose(m.data) for _, _, m in reader.iter_messages(["/omnid/odom"])]
         (cloud,) = [STORE.deserialize_cdr(m.data, s.name) for s, _, m in reader.iter_messages(["/omnid/cloud"])]
         (grid,) = [decode_map(m.data) for _, _, m in reader.iter_messages(["/omnid/map"])]
     assert cloud.header.frame_id == "odom"

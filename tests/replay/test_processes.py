@@ -19,7 +19,7 @@ from mcap.reader import make_reader
 from drivers.motor import is_stop
 from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from omnid.formats.tum import read_tum
-from omnid.transport.decode import OdometryRecord, odometry_from_cdr
+from omnid.transport.decode import Pose, decode_pose
 from tests.busy import stopped_by_turns
 from tests.conftest import PAIRS
 from tests.ply import read_ply
@@ -104,13 +104,13 @@ def test_signals_leave_whole_results(tmp_path: Path, paused: Path, number: int, 
 
 def test_another_process_receives_the_poses(tmp_path: Path, scene: Path) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    poses: list[OdometryRecord] = []
+    poses: list[Pose] = []
     config = zenoh.Config()
     for key, value in (("listen/endpoints", f'["{endpoint}"]'), ("scouting/multicast/enabled", "false")):
         config.insert_json5(key, value)
     tum = tmp_path / "est.txt"
     with zenoh.open(config) as session:
-        session.declare_subscriber("rover/odom", lambda sample: poses.append(odometry_from_cdr(bytes(sample.payload))))
+        session.declare_subscriber("rover/odom", lambda sample: poses.append(decode_pose(bytes(sample.payload))))
         settings = ("--set", "bus.robot=rover", "--set", "bus.listen=[]", "--set", f'bus.connect=["{endpoint}"]')
         with started(replaying(scene, "--publish", "--realtime", "--quiet", "--tum", tum, *settings)) as process:
             _, err = process.communicate(timeout=PATIENCE_S)

@@ -14,7 +14,7 @@ from calib import se3
 from omnid.api import replay
 from omnid.formats.tum import Trajectory, read_tum
 from omnid.tracking_state import TrackingState
-from omnid.transport.decode import OdometryRecord, odometry_from_cdr
+from omnid.transport.decode import Pose, decode_pose
 from omnid.transport.status_names import ODOMETRY
 from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import STORE
@@ -25,9 +25,9 @@ from tests.simulation import build, write_log
 DARK_PAIRS = 20  # pairs, 2 s
 
 
-def recorded(path: Path) -> list[OdometryRecord]:
+def recorded(path: Path) -> list[Pose]:
     with path.open("rb") as file:
-        return [odometry_from_cdr(m.data) for _, _, m in make_reader(file).iter_messages(["/omnid/odom"])]
+        return [decode_pose(m.data) for _, _, m in make_reader(file).iter_messages(["/omnid/odom"])]
 
 
 def states(path: Path) -> list[tuple[str, int]]:

@@ -157,9 +157,9 @@ def test_another_process_reads_the_same_odometry() -> None:
     with contextlib.closing(bus), subscriber(endpoint, "site/robot-1/**", 5) as process:
         lines = publish_until_done(bus, "odom", process)
     assert lines[0::2] == ["site/robot-1/odom application/cdr Priority.REAL_TIME CongestionControl.DROP False"] * 5
-    records = [decode.odometry_from_cdr(bytes.fromhex(line)) for line in lines[1::2]]
+    records = [decode.decode_pose(bytes.fromhex(line)) for line in lines[1::2]]
     for record in records:
-        expected = decode.odometry_from_cdr(odometry(record.stamp_ns - 10**9))
+        expected = decode.decode_pose(odometry(record.stamp_ns - 10**9))
         np.testing.assert_array_equal(record.T_odom_base, expected.T_odom_base)
         np.testing.assert_array_equal(record.covariance, expected.covariance)
 

@@ -36,7 +36,7 @@ from omnid.transport.codec import (
     string_cdr,
 )
 from omnid.transport.decode import (
-    OdometryRecord,
+    Pose,
     decode_cloud,
     decode_diagnostics,
     decode_map,
@@ -158,11 +158,11 @@ def overwritten(offset: int, value: bytes) -> bytes:
     ("make", "words"),
     [
         *(
-            (lambda data=data: decode.odometry_from_cdr(data), ".")
+            (lambda data=data: decode.decode_pose(data), ".")
             for data in (b"", b"\x00", b"\x00\x01\x00\x00", b"hello", bytes(724), odometry()[:-9])
         ),
         *(
-            (lambda at=at, value=value: decode.odometry_from_cdr(overwritten(at, value)), "stamp|quaternion")
+            (lambda at=at, value=value: decode.decode_pose(overwritten(at, value)), "stamp|quaternion")
             for at, value in (
                 (4, struct.pack("<i", -1)),
                 (8, struct.pack("<I", 10**9)),
@@ -170,7 +170,7 @@ def overwritten(offset: int, value: bytes) -> bytes:
                 (92, struct.pack("<d", 3.0)),
             )
         ),
-        (lambda: decode.odometry_from_cdr(overwritten(44, struct.pack("<d", math.nan))), "expected finite"),
+        (lambda: decode.decode_pose(overwritten(44, struct.pack("<d", math.nan))), "expected finite"),
         (lambda: codec.pose_stamped_cdr(-1, T_ODOM_BASE), "stamp"),
         (lambda: codec.pose_stamped_cdr(2**31 * 10**9, T_ODOM_BASE), "stamp"),
         (lambda: scan_cdr(-1, "base_link", RANGES, SIGMA, (0.0, 6.0)), "stamp"),
@@ -205,7 +205,7 @@ def test_what_is_no_message_is_refused(make: Callable[[], object], words: str) -
 @pytest.mark.parametrize(
     ("decode", "good"),
     [
-        (decode.odometry_from_cdr, odometry()),
+        (decode.decode_pose, odometry()),
         (decode_scan, MESSAGES["scan"][1]),
         (decode_map, MESSAGES["grid"][1]),
         (decode_cloud, MESSAGES["cloud"][1]),
@@ -226,4 +226,4 @@ def test_any_bytes_give_a_message_or_one_line(decode: Callable[[bytes], object],
         except OmnidError as error:
             assert "\n" not in str(error)
         else:
-            assert not isinstance(decoded, OdometryRecord) or se3.is_rigid(decoded.T_odom_base)
+            assert not isinstance(decoded, Pose) or se3.is_rigid(decoded.T_odom_base)
