@@ -1,4 +1,4 @@
-"""Settings of the cameras, of the pairs of their images, and of the times of exposure."""
+"""Settings of the cameras, and of the pairs of their images."""
 
 from __future__ import annotations
 
@@ -79,20 +79,3 @@ class PairConfig:
         Literal["drop", "use"],
         "images with all pixels as before, which a frozen camera delivers; 'use' only for simulators without noise",
     ] = "drop"
-
-
-@dataclass(frozen=True, slots=True)
-class TimingConfig:
-    """Times of exposure relative to the stamps; 0: as the rig's file says, see `omnid calibrate drive`."""
-
-    line_time_us: Annotated[
-        float,
-        Meta(ge=0, le=1000),
-        "rolling shutter: time from the exposure of an image row to that of the next, us; "
-        "the stamp is that of the first row; 0: as in the rig's file, or global",
-    ] = 0.0
-    upper_delay_ms: Annotated[
-        float,
-        Meta(ge=-1000, le=1000),
-        "time by which the upper camera's exposure is later than the stamps say, ms; 0: as in the rig's file",
-    ] = 0.0

@@ -11,7 +11,7 @@ from typing import Annotated, Final, Literal
 from msgspec import Meta
 
 from drivers.logs.rotating_log import RotationSettings
-from omnid.camera_config import CamerasConfig, PairConfig, TimingConfig
+from omnid.camera_config import CamerasConfig, PairConfig
 from omnid.controller.motor_settings import MotorSettings
 from omnid.core.control.control_law import ControllerSettings
 from omnid.core.navigation.settings import NavigationSettings
@@ -31,9 +31,9 @@ from omnid.transport.bus_config import BusConfig
 class LogConfig:
     """Reading of logs."""
 
-    reorder_frames: Annotated[
-        int, Meta(ge=1, le=1000), "images sorted by their stamps: how late one may be in the log"
-    ] = 32
+    REMOVED = MappingProxyType({"reorder_frames": "images may be 32 late in a log"})
+
+    reorder_frames: int = 32  # images are sorted by their stamps: how late one may be in the log
     rate_hz: Annotated[
         float,
         Meta(ge=0, le=1000),
@@ -48,7 +48,8 @@ class LiveConfig:
     status_s: Annotated[float, Meta(ge=0.1, le=60), "period of the status, s"] = 1.0
 
     cloud_s: Annotated[float, Meta(ge=0, le=3600), "period of the maps on the bus, s; 0: only at the end"] = 2.0
-    shed_load: Annotated[bool, "give up the map, then half the landmarks, while the computer is too slow"] = True
+
+    REMOVED = MappingProxyType({"shed_load": "the map, then half the landmarks, are given up on a slow computer"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,11 +175,14 @@ class ServiceConfig:
 class Config:
     """The whole configuration."""
 
+    REMOVED = MappingProxyType(
+        {"camera": "the table [times] of the rig's file has upper_delay_s and line_time_s (`omnid calibrate drive`)"}
+    )
+
     log: LogConfig = field(default_factory=LogConfig)
     cameras: CamerasConfig = field(default_factory=CamerasConfig)
     rig: RigConfig = field(default_factory=RigConfig)
     pair: PairConfig = field(default_factory=PairConfig)
-    camera: TimingConfig = field(default_factory=TimingConfig)
     motion: MotionSensorSettings = field(default_factory=MotionSensorSettings)
     panorama: PanoramaConfig = field(default_factory=PanoramaConfig)
     stereo: StereoConfig = field(default_factory=StereoConfig)

@@ -174,7 +174,7 @@ class LiveWiring:
         self._warn_of_unstated_height()
         parts = run_places.known_to(self._parts(requests, files))
         stages = wire(graph, pairs, self._front_end, config, self._sinks(frames), parts)
-        if config.live.shed_load and not robot.waits:
+        if not robot.waits:
             graph.ticker("load", PERIOD_S, partial(self._ladder.observe, graph.telemetry.of("pair")))
         graph.bound("pair", "odometry")  # images that odometry has no time for are dropped before they are decoded
         # 3. Files of maps and routes.

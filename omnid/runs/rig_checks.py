@@ -43,7 +43,7 @@ def examined_rig(reader: LogReader, log: Path, place: Geometry, config: Config) 
 
 def _examine_panoramas(health: RigHealth, reader: LogReader, place: Geometry, config: Config) -> bool:
     """Check the first pairs; return False if their pixels were not exposed at once, which takes odometry to check."""
-    pairing, dewarp = Synchronise(place.rig, config.pair), Dewarp(place, config.panorama, config.camera)
+    pairing, dewarp = Synchronise(place.rig, config.pair), Dewarp(place, config.panorama)
     for frame in reader.frames():
         pair = pairing.process(frame)
         if pair is None:

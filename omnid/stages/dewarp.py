@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from calib.panorama import Maps, remap_tables, visible
 from drivers.jpeg import Steps
-from omnid.camera_config import TimingConfig
 from omnid.config import PanoramaConfig
 from omnid.core.stereo.photometry import brightened, gain_of, light, noise_sigma, pair_gains
 from omnid.core.stereo.tiles import SIDES, Side, TileMonitor, tile_columns
@@ -30,17 +29,15 @@ MIN_SHARED_PART = 0.05  # Least share of the panorama that both cameras must see
 class Dewarp:
     """Rectifies both images of a pair."""
 
-    def __init__(self, geometry: Geometry, config: PanoramaConfig, timing: TimingConfig | None = None) -> None:
+    def __init__(self, geometry: Geometry, config: PanoramaConfig) -> None:
         self._noise_grey: dict[Side, float] = {}  # noise of each camera before its gain
         self._measured_ns: int | None = None  # stamp of the pair in which the noise was measured last
         self._pad_px = config.pad_px
-        timing = timing or TimingConfig()
         rig, cylinder = geometry.rig, geometry.cylinder
         self._sector, self._scale = (cylinder.turn_px, cylinder.first), cylinder.scale
         self._lower, self._upper, self._blur_px, self._visible = _tables(geometry, config)
         self._tiles = TileMonitor(self._visible, tile_columns(cylinder))
-        self.upper_delay_s = timing.upper_delay_ms * 1e-3 or rig.times.upper_delay_s
-        line_s = timing.line_time_us * 1e-6 or rig.times.line_time_s
+        self.upper_delay_s, line_s = rig.times.upper_delay_s, rig.times.line_time_s
         inner = slice(config.pad_px, -config.pad_px)
         self._rows_s = [maps[1][:, inner] * np.float32(line_s) for maps in (self._lower, self._upper) if line_s]
         if self._visible.mean() < MIN_SHARED_PART:

@@ -29,7 +29,7 @@ class FrontEnd:
         """health: state of the rig; None: a new one, with the check of the configuration."""
         self.geometry = geometry
         self.health = health or RigHealth(geometry.cylinder, config.rig.check)
-        self.dewarp = Dewarp(geometry, config.panorama, config.camera)
+        self.dewarp = Dewarp(geometry, config.panorama)
         stereo = DenseStereo(geometry, config.stereo_settings())
         self.dense = DenseDepths(stereo.compute, stereo.confirmed)
         self.odometry = OdometryStage(geometry, config.odometry, self.dense, load)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 import omnid
 from calib import se3
+from calib.rig import ShutterTimes
 from calib.rig_covariance import RigCovariance
 from calib.rig_file import read_rig
 from omnid.core.rig.rig_health import RigContradictedError
@@ -135,7 +136,7 @@ def measure(name: str, seed: int, table: ResultTable) -> None:
     """Render a drive, replay it, and add its row."""
     run = CASES[name](seed)
     readout = Readout(1.0, (0.0, 0.0), 0.0, (LINE_US, LINE_US)) if name == "bumpy" else Readout()
-    words = [f"camera.line_time_us={LINE_US:g}"] if name == "bumpy" else []
+    times = ShutterTimes(0.0, 1e-6 * readout.line_time_us[0])
     with TemporaryDirectory() as work:
         folder = Path(work)
         if name == "people":
@@ -143,12 +144,12 @@ def measure(name: str, seed: int, table: ResultTable) -> None:
         else:
             write_log(folder, run.rig, run.poses, run.scene, sensor=run.sensor, seed=seed, readout=readout)
         truth, refused = read_tum(folder / "truth.txt"), False
-        rig = replace(read_rig(folder / "rig.toml"), covariance=EXACT)
+        rig = replace(read_rig(folder / "rig.toml"), covariance=EXACT, times=times)
         try:
-            result = omnid.replay(folder / "log.mcap", rig, overrides=words)
+            result = omnid.replay(folder / "log.mcap", rig)
         except RigContradictedError:
             refused = True
-            result = omnid.replay(folder / "log.mcap", rig, overrides=[*words, "rig.check=off"])
+            result = omnid.replay(folder / "log.mcap", rig, overrides=["rig.check=off"])
     T = truth.T[np.searchsorted(truth.stamps_ns, result.stamps_ns)]
     wrong = se3.log(se3.inverse(se3.inverse(T[0]) @ T) @ se3.inverse(result.T_odom_rig[0]) @ result.T_odom_rig)[1:, :3]
     squared = squared_errors(result, truth)

@@ -320,7 +320,7 @@ def kidnapped_row(folder: Path, seed: int) -> list[Cell]:
 def session_rows(folder: Path, count: int) -> Iterator[list[Cell]]:
     """Yield a row for each of the sessions that extend one map; the last one has the default distances and rate."""
     truth, rig = read_tum(folder / "truth.txt"), folder / "rig.toml"
-    denser = ["places.limits.keyframe_m=0.1", "places.limits.keyframe_deg=5", "places.limits.rate_hz=10"]
+    denser = ["places.limits.keyframe_m=0.1", "places.limits.keyframe_deg=5"]
     with TemporaryDirectory() as work:
         path = Path(work) / "a.omap"
         built = ["map", "build", str(folder / "log.mcap"), "-o", str(path), "--rig", str(rig), "--quiet"]

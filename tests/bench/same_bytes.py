@@ -64,7 +64,7 @@ LOGS = {
     "struts": Log(f"struts --seed 5 --pairs 30 {SMALL}"),
     "rooms": Log(f"rooms --seed 6 --pairs 40 {SMALL}"),
     "skewed": Log(f"two_walls --seed 7 --pairs 25 --speed 1.4 --skew-ms 15 {SMALL}"),
-    "rolling": Log(f"rooms --seed 8 --pairs 25 --line-time-us 52 {SMALL}", options=("--set", "camera.line_time_us=52")),
+    "rolling": Log(f"rooms --seed 8 --pairs 25 --line-time-us 52 {SMALL}"),
     "bridged": Log(f"rooms --seed 9 --pairs 30 {SMALL}"),
 }
 

@@ -52,7 +52,7 @@ def test_a_wrong_key_is_answered_by_a_similar_one(key: str, proposed: str) -> No
     ("command", "override"),
     [
         ("run", " controller.setpoint . velocity_mps=0.0"),
-        ("run", "log.reorder_frames=8"),
+        ("run", "log.rate_hz=8"),
         ("replay", "cameras.width_px=640"),
         ("replay", "live.cloud_s=1"),
         ("replay", "record.enabled=true"),

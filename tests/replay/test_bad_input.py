@@ -66,9 +66,9 @@ def test_the_order_in_the_log_changes_nothing(omnid: Command, tmp_path: Path, sc
 
 def test_counts_late_and_duplicate_images(omnid: Command, tmp_path: Path, scene: Path) -> None:
     taken = images(scene / "log.mcap")
-    late, rest = replace(taken[10], written_ns=taken[41].stamp_ns), taken[:10] + taken[11:]
-    log = save(tmp_path / "log.mcap", [*rest[:8], rest[7], *rest[8:40], late, *rest[40:]])
-    result = omnid.replay(log, "--set", "log.reorder_frames=8", rig=scene / "rig.toml")
+    late, rest = replace(taken[2], written_ns=taken[46].stamp_ns), taken[:2] + taken[3:]
+    log = save(tmp_path / "log.mcap", [*rest[:8], rest[7], *rest[8:45], late, *rest[45:]])
+    result = omnid.replay(log, rig=scene / "rig.toml")
     assert result.code == 0 and "warning" in result.err
     assert (result.count("late"), result.count("duplicate"), result.count("pairs")) == (1, 1, PAIRS - 1)
 

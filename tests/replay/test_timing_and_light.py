@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 import omnid
+from calib.rig import ShutterTimes
 from calib.rig_file import read_rig
 from omnid.formats.tum import Trajectory, read_tum
 from omnid.recordings.evaluation import Metrics, evaluate
@@ -19,7 +21,7 @@ SEED, SIZE, PAIRS = 3, 512, 24
 LINE_TIME_US = 40.0  # 20 ms for 512 rows
 
 
-def driven(folder: Path, *overrides: str, readout: Readout | None = None, sensor: Sensor | None = None) -> Metrics:
+def driven(folder: Path, readout: Readout | None = None, sensor: Sensor | None = None) -> Metrics:
     """Render the first metre of two_walls, and return the errors of a replay in which no pair was lost."""
     run = build("two_walls", SEED, SIZE, 99)
     write_log(
@@ -32,7 +34,8 @@ def driven(folder: Path, *overrides: str, readout: Readout | None = None, sensor
         supersample=2,
         readout=readout or Readout(),
     )
-    result = omnid.replay(folder / "log.mcap", read_rig(folder / "rig.toml"), overrides=overrides)
+    times = ShutterTimes(0.0, 1e-6 * readout.line_time_us[0]) if readout else ShutterTimes()
+    result = omnid.replay(folder / "log.mcap", replace(read_rig(folder / "rig.toml"), times=times))
     states = result.counters.states
     assert result.counters.pairs == PAIRS and states[TrackingState.LOST] == 0
     assert states[TrackingState.TRACKING] > 0.9 * PAIRS
@@ -45,7 +48,7 @@ def test_the_motion_between_the_exposures_is_corrected(tmp_path: Path) -> None:
     skew = driven(tmp_path / "skew", readout=Readout(speed, (15.0, 15.0)))
     assert abs(skew.length_error_ratio) < 0.0015 and skew.ate_rmse_m < 0.002
     rolling = Readout(speed, line_time_us=(LINE_TIME_US, LINE_TIME_US))
-    known = driven(tmp_path / "known", f"camera.line_time_us={LINE_TIME_US}", readout=rolling)
+    known = driven(tmp_path / "known", readout=rolling)
     assert abs(known.length_error_ratio) < 0.0015 and known.ate_rmse_m < 0.002
 
 

@@ -11,8 +11,11 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
+from calib.rig import ShutterTimes
+from calib.rig_file import write_rig
 from omnid.simulation.rendering.sensor import DIM
 from tests.simulation.disturbances import DISTURBANCES
 from tests.simulation.logs import write_log
@@ -99,6 +102,8 @@ def main() -> None:
         disturbances=arguments.disturb,
         progress=progress,
     )
+    if any(line):
+        write_rig(arguments.out / "rig.toml", replace(rig, times=ShutterTimes(0.0, 1e-6 * line[0])))
     sys.stderr.write("\n")
 
 

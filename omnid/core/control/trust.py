@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Annotated, Final, Literal, NamedTuple
 
 from msgspec import Meta
@@ -23,12 +24,9 @@ OFF: Final = 0.0  # exact: the value of a setting that switches its rule off
 class TrustSettings:
     """Levels at which the base slows down or stops."""
 
-    degraded_speed: Annotated[
-        float,
-        Meta(ge=0.05, le=1),
-        "share of the speed and yaw rate of controller.limits while the pose is degraded "
-        "or some motion is unexplained; 1: no slowing",
-    ] = 0.5
+    REMOVED = MappingProxyType({"degraded_speed": "half the speed while the pose is degraded"})
+
+    degraded_speed: float = 0.5  # share of the speeds while the pose is degraded or some motion is unexplained
     velocity_sigma_mps: Annotated[
         float,
         Meta(ge=0, le=10),

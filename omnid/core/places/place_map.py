@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Annotated, Final, NamedTuple
 
 import numpy as np
@@ -21,15 +22,13 @@ NO_KEYFRAME: Final = -1  # Used in place of an id, because ids are never negativ
 class PlaceLimits:
     """Distance and number of the keyframes that stay."""
 
+    REMOVED = MappingProxyType({"rate_hz": "at most 5 keyframes a second"})
+
     keyframe_m: Annotated[
         float, Meta(ge=0.05, le=10), "distance after which a keyframe is kept for the recognition of the place, m"
     ] = 0.3
     keyframe_deg: Annotated[float, Meta(ge=1, le=180), "turn after which a keyframe is kept, deg"] = 15.0
-    rate_hz: Annotated[
-        float,
-        Meta(ge=0.1, le=100),
-        "keyframes a second, at most: each is searched for in the map, which takes some 30 ms",
-    ] = 5.0
+    rate_hz: float = 5.0  # keyframes a second, at most: each is searched for in the map, in some 30 ms
     max_keyframes: Annotated[
         int,
         Meta(ge=2, le=100_000),
