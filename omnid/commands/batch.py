@@ -1,7 +1,7 @@
 """`omnid batch`: replay many logs by dask, on this machine or on a cluster, with one folder and one JSON a log.
 
-Each log is replayed by programs of their own, so that nothing that a log does stops the others. Their results are
-written into a temporary folder that takes its place at the end: a program that was killed leaves no half result.
+Each log is replayed by programs of their own, so that nothing that a log does stops the others. The JSON is written
+last, at once: a folder without it is done again.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 import warnings
 from collections import Counter
@@ -27,6 +26,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NoReturn
 
+from calib.atomic_file import write_file
 from omnid.commands.options import CONFIG, SET, cameras, command, option, settings_of
 from omnid.engine.process import python, python_environment
 from omnid.errors import OmnidError
@@ -112,49 +112,37 @@ def replay(job: Job) -> dict[str, Any]:
     Raise RuntimeError where the program was killed, so that dask tries once more.
     """
     started_s = time.monotonic()
-    job.folder.parent.mkdir(parents=True, exist_ok=True)
-    attempt = Path(tempfile.mkdtemp(prefix=".attempt-", dir=job.folder.parent))
-    try:
-        code, summary = _omnid(job.words, attempt, job.timeout_s)
-        if code is not None and code < 0:
-            raise RuntimeError(f"{job.log}: the program was ended by signal {-code}")
-        lines = (attempt / "messages.txt").read_text("utf-8", "replace").strip().splitlines()
-        result: dict[str, Any] = {"log": str(job.log), "key": job.key, "status": "failed", "error": ""}
-        if code in (0, 1):
-            result["status"] = DONE[code]
-        else:
-            last = one_line(lines[-1]).removeprefix("omnid: ") if lines else f"exit code {code}"
-            result["error"] = f"more than {job.timeout_s:g} s" if code is None else last
-        result["replay"] = summary
-        if code == 0 and job.truth is not None:
-            result["eval"] = _omnid(("eval", "est.txt", str(job.truth), "--json"), attempt, job.timeout_s)[1]
-        if code == 0 and RECORDING in job.words:
-            _omnid(("report", RECORDING, "-o", "report.html"), attempt, job.timeout_s)
-        result["seconds"] = round(time.monotonic() - started_s, 3)
-        (attempt / RESULT_FILE).write_text(json.dumps(result, indent=1) + "\n")
-        attempt.chmod(0o755)  # that of a temporary folder is for its owner only
-        shutil.rmtree(job.folder, ignore_errors=True)
-        os.replace(attempt, job.folder)
-        return result
-    finally:
-        shutil.rmtree(attempt, ignore_errors=True)
+    shutil.rmtree(job.folder, ignore_errors=True)
+    job.folder.mkdir(parents=True)
+    code, summary = _omnid(job.words, job)
+    if code is not None and code < 0:
+        raise RuntimeError(f"{job.log}: the program was ended by signal {-code}")
+    lines = (job.folder / "messages.txt").read_text("utf-8", "replace").strip().splitlines()
+    error = one_line(lines[-1]).removeprefix("omnid: ") if lines else f"exit code {code}"
+    result: dict[str, Any] = {"log": str(job.log), "key": job.key, "status": DONE.get(code, "failed"), "error": ""}
+    if code not in DONE:
+        result["error"] = f"more than {job.timeout_s:g} s" if code is None else error
+    result["replay"] = summary
+    if code == 0 and job.truth is not None:
+        result["eval"] = _omnid(("eval", "est.txt", str(job.truth), "--json"), job)[1]
+    if code == 0 and RECORDING in job.words:
+        _omnid(("report", RECORDING, "-o", "report.html"), job)
+    result["seconds"] = round(time.monotonic() - started_s, 3)
+    write_file(job.folder / RESULT_FILE, json.dumps(result, indent=1).encode() + b"\n")
+    return result
 
 
-def _omnid(words: Sequence[str], folder: Path, timeout_s: float) -> tuple[int | None, Any]:
-    """Run omnid in a folder; return its exit code (None: it took too long) and the JSON that it printed, if any."""
-    with (folder / "messages.txt").open("ab") as messages:
-        environment = python_environment(**ENVIRONMENT)
-        command = python("-m", "omnid", *words)
-        program = subprocess.Popen(command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=messages)
-        try:
-            text, _ = program.communicate(timeout=timeout_s)
-        except subprocess.TimeoutExpired:
-            program.terminate()  # which stops the wheels and leaves no file half written
-            program.wait()
-            return None, None
-    with suppress(ValueError):
-        return program.returncode, json.loads(text)
-    return program.returncode, None
+def _omnid(words: Sequence[str], job: Job) -> tuple[int | None, Any]:
+    """Run omnid in the folder of a job; return its exit code (None: it took too long) and the JSON that it printed."""
+    command, environment = python("-m", "omnid", *words), python_environment(**ENVIRONMENT)
+    with (job.folder / "messages.txt").open("ab") as messages, suppress(subprocess.TimeoutExpired):
+        done = subprocess.run(
+            command, cwd=job.folder, env=environment, stdout=subprocess.PIPE, stderr=messages, timeout=job.timeout_s
+        )
+        with suppress(ValueError):
+            return done.returncode, json.loads(done.stdout)
+        return done.returncode, None
+    return None, None
 
 
 def _jobs(args: argparse.Namespace) -> list[Job]:
@@ -167,7 +155,7 @@ def _jobs(args: argparse.Namespace) -> list[Job]:
         )
     if args.out.exists() and not args.out.is_dir():
         raise OmnidError(f"batch: --out {str(args.out)!r}: expected a folder for the results, found a file")
-    options = [("--rig", args.rig and args.rig.absolute()), ("--config", args.config and args.config.absolute())]
+    options = [(f"--{name}", path and path.absolute()) for name, path in (("rig", args.rig), ("config", args.config))]
     options += [("--lower", args.lower), ("--upper", args.upper), *(("--set", value) for value in args.overrides)]
     options += [("--record", RECORDING if args.record else None), *OUTPUTS]
     given = tuple(str(word) for option in options if option[1] is not None for word in option)
@@ -176,14 +164,14 @@ def _jobs(args: argparse.Namespace) -> list[Job]:
     if not logs:
         raise OmnidError(f"batch: no log in {', '.join(args.logs)}; give files, folders, or patterns in quotes")
     common = os.path.commonpath([log.parent for log in logs])
-    known_map = Path(settings.places.map) if settings.places.map else None
     jobs = []
     for log in logs:
         beside = (log if log.is_dir() else log.parent) / args.truth
         truth = beside if args.truth and beside.is_file() else None
         words = ("replay", str(log), *given, "--inline", "--quiet", "--json")
-        inputs = [path for path in (log, truth, args.rig, args.config, known_map) if path]
-        files = [file for path in inputs for file in (sorted(path.rglob("*")) if path.is_dir() else [path])]
+        # The result is another one where the words, the version, or one of the files that are read is another.
+        inputs = [log, truth, args.rig, args.config, settings.places.map and Path(settings.places.map)]
+        files = [file for path in inputs if path for file in (sorted(path.rglob("*")) if path.is_dir() else [path])]
         stats = [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
         key = hashlib.sha256(json.dumps([__version__, words, str(truth), stats]).encode()).hexdigest()
         jobs.append(Job(log, args.out.absolute() / log.relative_to(common), words, truth, args.timeout_s, key))
@@ -228,16 +216,10 @@ def _client(scheduler: str | None, jobs: int) -> Any:
         raise OmnidError(f"batch needs dask.distributed: install the extra `fleet` into {sys.prefix}") from error
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # each connection and repetition is told
     if not scheduler:
-        here = "127.0.0.1:0"  # dask has web servers in any case, by default for all machines of the network
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # it looks for this machine's address, also without network
-            return distributed.Client(
-                processes=False,
-                n_workers=1,
-                threads_per_worker=jobs,
-                dashboard_address=here,
-                worker_dashboard_address=here,
-            )
+        # dask has web servers in any case, by default for all machines of the network.
+        warnings.simplefilter("ignore", RuntimeWarning)  # it looks for this machine's address, also without network
+        here = dict.fromkeys(("dashboard_address", "worker_dashboard_address"), "127.0.0.1:0")
+        return distributed.Client(processes=False, n_workers=1, threads_per_worker=jobs, **here)
     try:
         return distributed.Client(scheduler, timeout="10 s")
     except (OSError, TimeoutError, ValueError) as error:

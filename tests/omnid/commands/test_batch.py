@@ -109,7 +109,7 @@ def test_a_program_that_is_killed_is_run_again_and_an_interrupted_batch_leaves_n
         batch.communicate(timeout=DEADLINE_S)
     assert batch.returncode == 130
     wait_until(lambda: not replays_of(log))
-    assert not (out / "log.mcap").exists()
+    assert not (out / "log.mcap" / "result.json").exists()
 
 
 def test_finds_logs(tmp_path: Path) -> None:
