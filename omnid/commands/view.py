@@ -17,12 +17,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from omnid.commands.options import (
-    QUIET,
-    RIG,
     ROBOT,
     SECONDS,
     SETTINGS,
-    cameras,
     check_seconds,
     command,
     group,
@@ -51,8 +48,8 @@ MAP_EVERY_S: Final = 2.0  # between two maps of a replay
         type=Path,
         nargs="?",
         metavar="LOG",
-        help="a recording, which is shown as it stands, or a log of images, which goes through the stages; without "
-        "one, a robot is listened to",
+        help="a recording, which is shown as it stands (of a log of images: `omnid replay LOG --rerun FILE.rrd`); "
+        "without one, a robot is listened to",
     ),
     option(
         "-o",
@@ -61,33 +58,29 @@ MAP_EVERY_S: Final = 2.0  # between two maps of a replay
         metavar="FILE.rrd",
         help="a file that `rerun FILE.rrd` opens, here or elsewhere; default: a window",
     ),
-    group(
-        "a log",
-        option("--topic", metavar="TOPIC", help="the odometry topic of a recording, where there are several"),
-        option("--replay", action="store_true", help="compute again from the images of a recording"),
-        RIG,
-        *cameras(),
-        QUIET,
-    ),
+    option("--topic", metavar="TOPIC", help="the odometry topic of a recording, where there are several"),
     group("a robot", *ROBOT, SECONDS),
     *SETTINGS,
     examples=("view out.mcap", "view out.mcap -o out.rrd", "view --robot rover --connect tcp/robot:7447"),
 )
 def run(args: argparse.Namespace) -> int:
-    """Show the log or the robot; return 1 if there was no pose to show."""
+    """Show the recording or the robot; return 1 if there was no pose to show."""
     check_seconds(args.seconds)
-    if args.log is None and (args.topic or args.replay or args.rig):
-        raise OmnidError("--topic, --replay and --rig belong to a log: name a LOG as well")
+    if args.log is None and args.topic:
+        raise OmnidError("--topic belongs to a recording: name a LOG as well")
     if args.log is not None and (args.connect or args.seconds):
         raise OmnidError(f"--connect and --seconds do not go with {args.log}: leave out the LOG to show a robot")
     config, sink = settings_of(args), sink_of(args.output, args.log)
     try:
-        code = _robot(sink, config, args.seconds) if args.log is None else _log(sink, config, args)
+        if args.log is None:
+            _draw_robot(sink, config, args.seconds)
+        else:
+            _draw_recording(sink, args.log, args.topic, args.robot)
     finally:
         sink.close()
     if sink.poses:
         print(f"{sink.poses} poses and {sink.images} images shown", flush=True)
-    return code
+    return int(not sink.poses)
 
 
 def sink_of(output: Path | None, log: Path | None) -> RerunSink:
@@ -153,8 +146,8 @@ def _window() -> rerun.RecordingStream:
     return stream
 
 
-def _log(sink: RerunSink, config: Config, args: argparse.Namespace) -> int:
-    """Draw the recorded poses of a log, else what is computed from its images."""
+def _draw_recording(sink: RerunSink, log: Path, topic: str | None, robot: str | None) -> None:
+    """Draw what is recorded. Raise OmnidError where there is no pose in it."""
     from drivers.errors import FrameDecodeError
     from drivers.logs.open_log import log_info
     from omnid.recordings.recording import (
@@ -164,42 +157,30 @@ def _log(sink: RerunSink, config: Config, args: argparse.Namespace) -> int:
         RecordingReader,
         choose_odometry_topic,
         no_pose,
-        odometry_topics,
     )
-    from omnid.runs.replay import ReplayOptions
     from omnid.transport.decode import Pose
     from omnid.transport.topics import MAP_POSE, SCAN
 
-    found = log_info(args.log)
-    if args.replay or not (args.topic or args.robot or odometry_topics(found)):
-        options = ReplayOptions(
-            rig=args.rig,
-            topics=(args.lower, args.upper),
-            settings=args.config,
-        )
-        return draw_replay(sink, args.log, config, options, Output(quiet=args.quiet))
-    reader = RecordingReader(found, choose_odometry_topic(found, args.topic, args.robot))
+    found = log_info(log)
+    reader = RecordingReader(found, choose_odometry_topic(found, topic, robot))
     pending: Pose | None = None  # a pose until its state is known, which is recorded after it
     broken_images = 0
     for message in reader.messages((ODOMETRY, MAP_POSE, STATUS, CLOUD, SCAN, reader.image_name())):
-        due, content = pending, message.content
-        if isinstance(content, Pose):
-            pending = content
-        else:
-            due = None
-            try:
-                sink.draw(content)
-            except FrameDecodeError:
-                broken_images += 1
-        if due is not None:
-            sink.draw(due)
+        if isinstance(message.content, Pose):
+            if pending is not None:
+                sink.draw(pending)
+            pending = message.content
+            continue
+        try:
+            sink.draw(message.content)
+        except FrameDecodeError:
+            broken_images += 1
     if pending is not None:
         sink.draw(pending)
     if unreadable := reader.unreadable.total() + reader.damaged + broken_images:
-        warn(f"{args.log}: {unreadable} messages or pieces cannot be read")
+        warn(f"{log}: {unreadable} messages or pieces cannot be read")
     if not sink.poses:
-        raise no_pose(args.log, reader.topic)
-    return 0
+        raise no_pose(log, reader.topic)
 
 
 def draw_replay(sink: RerunSink, log: Path, config: Config, options: ReplayOptions, output: Output) -> int:
@@ -215,7 +196,7 @@ def draw_replay(sink: RerunSink, log: Path, config: Config, options: ReplayOptio
         sink.close()
 
 
-def _robot(sink: RerunSink, config: Config, seconds: float | None) -> int:
+def _draw_robot(sink: RerunSink, config: Config, seconds: float | None) -> None:
     """Draw a live robot until a signal, or for a number of seconds."""
     from drivers.errors import FrameDecodeError
     from omnid.client import Cloud, Diagnostics, Robot
@@ -242,4 +223,3 @@ def _robot(sink: RerunSink, config: Config, seconds: float | None) -> int:
                     sink.draw(content, message.attachment, message.received_ns)
     if not sink.poses:
         print(f"omnid: no pose of {config.bus.robot} came: `omnid listen` names those that are there", file=sys.stderr)
-    return int(not sink.poses)

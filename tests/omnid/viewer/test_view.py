@@ -64,7 +64,7 @@ def test_draws_keyframes_and_loops_of_the_map(tmp_path: Path, capsys: pytest.Cap
     run = build("there_and_back", seed=3, size=256)
     write_log(tmp_path, run.rig, run.poses, run.scene, sensor=run.sensor, seed=3)
     omnid, drawn = Command(capsys), tmp_path / "out.rrd"
-    assert omnid("view", tmp_path / "log.mcap", "--rig", tmp_path / "rig.toml", "--quiet", "-o", drawn).code == 0
+    assert omnid("replay", tmp_path / "log.mcap", "--rig", tmp_path / "rig.toml", "--quiet", "--rerun", drawn).code == 0
     keyframes = np.array(rows(drawn, "/odom/keyframes", "Points3D:positions")[-1].value)
     loops = rows(drawn, "/odom/loops", "LineStrips3D:strips")
     _, path = positions(drawn)
