@@ -34,7 +34,7 @@ from omnid.plain_text import one_line, plain
 from omnid.version import __version__
 
 RESULT_FILE, RECORDING = "result.json", "recording.mcap"
-DONE = {0: "ok", 1: "no pose"}  # by the exit code of `omnid replay`
+DONE: dict[int | None, str] = {0: "ok", 1: "no pose"}  # by the exit code of `omnid replay`
 OUTPUTS = (("--tum", "est.txt"), ("--map-tum", "map_est.txt"), ("--cloud", "cloud.ply"), ("--plan", "plan.png"))
 # One thread for each program: as many programs run as there are cores.
 ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1"}

@@ -127,7 +127,7 @@ def motion_status(
 
 def _estimates(sensors: MotionSensors, *, wheels: bool, gyro: bool) -> dict[str, float]:
     """Return the estimated errors of the sensors that there are, each with its standard deviation."""
-    found = {}
+    found: dict[str, tuple[int, float]] = {}
     if wheels:
         found |= {"wheel_scale": (DISTANCE, 1.0), "turn_scale": (TURN, 1.0), "wheel_offset_ms": (WHEEL_OFFSET, 1e3)}
     if gyro:

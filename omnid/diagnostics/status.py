@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from drivers.cameras.camera_state import CameraState
 from drivers.frame import Camera
@@ -213,7 +213,7 @@ def stage_status(stage: StageStats, lost: Key = Key.DROPPED, rate_hz: float = ma
 
 def summary_status(counters: RunCounters) -> DiagnosticStatus:
     """Return the entry of a finished replay: its counters, one number per key."""
-    groups = {
+    groups: dict[str, Mapping[Any, int]] = {
         "poses": counters.states,
         "dropped": counters.drops,
         "map": counters.map,

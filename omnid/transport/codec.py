@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache, lru_cache
-from typing import TYPE_CHECKING, ClassVar, Final, NamedTuple, Protocol, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -101,7 +101,7 @@ class DiagnosticStatus:
     values: Mapping[str, str]
 
     @classmethod
-    def of(cls, name: str, level: int, message: str, values: Mapping[str, object]) -> Self:
+    def of(cls, name: str, level: int, message: str, values: Mapping[Any, object]) -> Self:
         """Return a status. Numbers of values are written with five digits; what is unknown ("", NaN) is left out."""
         texts = {str(key): f"{value:.5g}" if isinstance(value, float) else str(value) for key, value in values.items()}
         return cls(name, level, message, {key: text for key, text in texts.items() if text not in ("", "nan")})
