@@ -25,13 +25,18 @@ class Heard:
         """Keep what has come."""
         self._came = (self._came + data)[:KEPT]
 
+    @property
+    def is_echo(self) -> bool:
+        """True if what comes back is what was sent."""
+        return len(self._came) >= LEAST and self._came[: len(self._sent)] == self._sent[: len(self._came)]
+
     def words(self, baud: int) -> str:
         """Return what came and what to check; baud: of the port."""
-        sent, came = self._sent, self._came
+        came = self._came
         # 1. Nothing, or what was sent.
         if not came:
             return f"gave no answer, not a byte; check power, cable, the baud rate ({baud}) and motor.protocol"
-        if len(came) >= LEAST and came[: len(sent)] == sent[: len(came)]:
+        if self.is_echo:
             return (
                 "gave no answer of its own: what comes back is what was sent; are TX and RX joined, or does the "
                 "adapter echo (RS-485)?"

@@ -329,10 +329,10 @@ class SerialMotor:
         try:
             transaction.throw(NoReplyError())
         except NoReplyError as error:
-            found = str(error)
+            found = "" if self._heard.is_echo else str(error)
         except StopIteration:
             pass
-        return NoReplyError(f"motor on {self._name} {found or self._heard.words(self._baud)}")
+        return NoReplyError(f"motor on {self._name}{f': {found}' if found else f' {self._heard.words(self._baud)}'}")
 
 
 def _opened(port: str, baud: int) -> serial.Serial:

@@ -37,13 +37,14 @@ from __future__ import annotations
 import binascii
 import math
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
 from drivers.motors.protocols.differential_drive import DifferentialDrive
-from drivers.motors.protocols.motor_protocol import Transaction, request, require_watchdog
+from drivers.motors.protocols.motor_protocol import NoReplyError, T, Transaction, request, require_watchdog
 
 SEQ_COUNT = 65536
 MAX_LINE = 64  # bytes
@@ -241,6 +242,7 @@ class LineProtocol:
         self._seq = 0
         self._zero_rad = 0.0  # heading at which the controller's heading is 0
         self._heading_rad = 0.0  # last reported
+        self._odd = ""  # what the newest line shows that is no reply; empty without one
 
     def framer(self) -> LineFramer:
         """Return a framer of lines."""
@@ -248,7 +250,7 @@ class LineProtocol:
 
     def connect(self, watchdog_ms: int) -> Transaction[float]:
         """Set the watchdog and return the time in force [ms]; raise DriverError where another one is in force."""
-        reply = yield from request(encode(WatchdogRequest(watchdog_ms)), self._watchdog)
+        reply = yield from self._ask(encode(WatchdogRequest(watchdog_ms)), self._watchdog)
         require_watchdog(watchdog_ms, reply.watchdog_ms)
         self._zero_rad = self._heading_rad
         return float(watchdog_ms)
@@ -259,9 +261,17 @@ class LineProtocol:
         heading_rad = math.remainder(command.heading_rad - self._zero_rad, math.tau)
         seq, self._seq = self._seq, (self._seq + 1) % SEQ_COUNT
         line = encode(VelocityMessage(seq, VelocityCommand(0, velocity_mps, heading_rad, yaw_rate_radps)))
-        reply = yield from request(line, lambda frame: self._status(frame, seq))
+        reply = yield from self._ask(line, lambda frame: self._status(frame, seq))
         self._heading_rad = math.remainder(reply.status.heading_rad + self._zero_rad, math.tau)
         return replace(reply.status, heading_rad=self._heading_rad)
+
+    def _ask(self, line: bytes, parse: Callable[[bytes], T | None]) -> Transaction[T]:
+        """Send a line and return the reply that parse accepts."""
+        self._odd = ""
+        try:
+            return (yield from request(line, parse))
+        except NoReplyError:
+            raise NoReplyError(self._odd) from None
 
     def _watchdog(self, frame: bytes) -> WatchdogReply | None:
         message = self._message(frame)
@@ -269,11 +279,13 @@ class LineProtocol:
 
     def _status(self, frame: bytes, seq: int) -> StatusMessage | None:
         message = self._message(frame)
+        if isinstance(message, StatusMessage) and message.seq != seq:
+            self._odd = f"it answers command {seq} with a status of {message.seq}: does its firmware repeat the number?"
         return message if isinstance(message, StatusMessage) and message.seq == seq else None
 
     def _message(self, frame: bytes) -> LineMessage | None:
         try:
             return decode(frame)
-        except ProtocolError:
-            self.bad_frames += 1
+        except ProtocolError as error:
+            self.bad_frames, self._odd = self.bad_frames + 1, str(error)
             return None

@@ -24,8 +24,7 @@ T = TypeVar("T")
 class NoReplyError(DriverError):
     """No reply before the timeout, from a port that is still there.
 
-    It is thrown into a transaction whose time is over, which may raise another one: with what it has seen, as the
-    predicate of a sentence.
+    It is thrown into a transaction whose time is over, which may raise another one that says what it has seen.
     """
 
 

@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
 from drivers.motors.protocols.differential_drive import DifferentialDrive
-from drivers.motors.protocols.motor_protocol import TextFramer, Transaction, require_watchdog
+from drivers.motors.protocols.motor_protocol import NoReplyError, TextFramer, Transaction, require_watchdog
 
 MAX_RPM = 65535
 S_PER_MIN = 60
@@ -69,17 +69,26 @@ class Roboteq:
 
     def _query(self, lines: Sequence[bytes], names: set[bytes]) -> Transaction[dict[bytes, list[int]]]:
         """Write lines, and return the replies by name once all commands are confirmed."""
-        unconfirmed = sum(line[:1] in b"!^" for line in lines)
+        commands = unconfirmed = sum(line[:1] in b"!^" for line in lines)
         values: dict[bytes, list[int]] = {}
-        frame = yield b"".join(line + b"\r" for line in lines)
-        while True:
-            unconfirmed -= frame == b"+"
-            if frame == b"-":
-                raise DriverError(f"it rejected one of {b', '.join(lines).decode()}; check its configuration")
-            if reply := _REPLY.fullmatch(frame):
-                values[reply[1]] = [int(number) for number in reply[2].split(b":")]
-            elif frame != b"+" and not _ECHO.fullmatch(frame):
-                self.bad_frames += 1
-            if unconfirmed <= 0 and names <= values.keys():
-                return values
-            frame = yield b""
+        try:
+            frame = yield b"".join(line + b"\r" for line in lines)
+            while True:
+                unconfirmed -= frame == b"+"
+                if frame == b"-":
+                    raise DriverError(f"it rejected one of {b', '.join(lines).decode()}; check its configuration")
+                if reply := _REPLY.fullmatch(frame):
+                    values[reply[1]] = [int(number) for number in reply[2].split(b":")]
+                elif frame != b"+" and not _ECHO.fullmatch(frame):
+                    self.bad_frames += 1
+                if unconfirmed <= 0 and names <= values.keys():
+                    return values
+                frame = yield b""
+        except NoReplyError:
+            missing = b", ".join(sorted(names - values.keys())).decode()
+            if not values and unconfirmed == commands:
+                raise
+            raise NoReplyError(
+                f"it confirmed {commands - unconfirmed} of {commands} commands"
+                f"{f', and says nothing of {missing}' if missing else ''}: is it a Roboteq with two channels?"
+            ) from None

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
 from drivers.motors.protocols.differential_drive import DifferentialDrive
-from drivers.motors.protocols.motor_protocol import T, Transaction
+from drivers.motors.protocols.motor_protocol import NoReplyError, T, Transaction
 
 SET_RPM, GET_APPCONF, FORWARD_CAN, GET_VALUES_SELECTIVE = 8, 17, 34, 50  # COMM_PACKET_ID in datatypes.h
 MASK = 1 << 7 | 1 << 8 | 1 << 15 | 1 << 17 | 1 << 21  # erpm, input voltage, fault, id, status
@@ -156,17 +156,32 @@ class Vesc:
     ) -> Transaction[tuple[tuple[int, T], tuple[int, T]]]:
         """Send a query to both controllers, then the commands; return (id, parsed reply) of each."""
         replies: dict[bool, tuple[int, T]] = {}  # the key is True for the controller on CAN
-        frame = yield packet(query) + packet(forwarded(self._drive.can_id, query)) + commands
-        while True:
-            reply = parse(frame)
-            if reply is None:
-                self.bad_frames += 1
-            else:
-                can_id, _ = reply
-                replies[can_id == self._drive.can_id] = reply
-            if len(replies) == 2:
-                return replies[False], replies[True]
-            frame = yield b""
+        other = -1  # command of the newest packet that is no reply
+        try:
+            frame = yield packet(query) + packet(forwarded(self._drive.can_id, query)) + commands
+            while True:
+                reply = parse(frame)
+                if reply is None:
+                    self.bad_frames, other = self.bad_frames + 1, frame[0]
+                else:
+                    can_id, _ = reply
+                    replies[can_id == self._drive.can_id] = reply
+                if len(replies) == 2:
+                    return replies[False], replies[True]
+                frame = yield b""
+        except NoReplyError:
+            raise NoReplyError(self._missing({key: can_id for key, (can_id, _) in replies.items()}, other)) from None
+
+    def _missing(self, ids: dict[bool, int], other: int) -> str:
+        """Return what the packets show that came while one was missing; ids: of those that replied. Empty: nothing."""
+        can_id = self._drive.can_id
+        if False in ids:
+            return f"VESC {ids[False]} answers, none with id {can_id} on CAN: motor.drive.can_id, or the wires of CAN"
+        if True in ids:
+            return f"VESC {can_id} is on the port itself, and no other one answers: motor.drive.can_id is the other's"
+        return (
+            "" if other < 0 else f"it answers packets of command {other}, which was not asked for: an older firmware?"
+        )
 
 
 def _config(payload: bytes) -> tuple[int, int] | None:

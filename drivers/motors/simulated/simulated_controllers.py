@@ -192,6 +192,8 @@ class SimulatedODrive(SimulatedFirmware):
     def _read(self, name: str) -> bytes:
         if name == "vbus_voltage":
             return b"%f" % self.base.battery_v
+        if match := re.fullmatch(r"axis([01])\.current_state", name):
+            return b"%d" % self._state[int(match[1])]
         if match := re.fullmatch(r"axis([01])\.error", name):
             expired = self.base.expired[self.base.side_of(int(match[1]))]
             return b"%d" % (self.base.fault | _WATCHDOG_EXPIRED * expired)
