@@ -30,6 +30,7 @@ from omnid.core.control.heading_controller import Setpoint
 from omnid.errors import OmnidError
 from omnid.transport import topics
 from omnid.transport.decode import (
+    beyond_the_floor,
     bool_from_cdr,
     heading_from_cdr,
     is_plain_twist,
@@ -47,6 +48,9 @@ LONGEST_SAMPLE: Final = 8192  # bytes
 MAX_SPEED_MPS, MAX_YAW_RATE_RADPS, MAX_HEADING_RAD = 20.0, 50.0, 1000.0  # larger numbers are faults of the sender
 
 
+LEAST_SPEED: Final = 1e-3  # m/s, rad/s; less in another direction is noise of a stick, more is another motion
+
+ASIDE: Final = "not possible with a differential drive"
 MALFORMED: Final = "malformed"
 SAME_NAME: Final = "another robot has this name"
 _ADVICE: Final = {
@@ -60,7 +64,7 @@ _MAX_TOPIC: Final = 60  # characters of a topic in the log
 
 
 class RefusedCommand(OmnidError):  # noqa: N818 - named after what it reports
-    """A command that must not be executed; its first argument is the reason, which is counted."""
+    """A command that must not be executed: the reason, which is counted, and where they say more the words for it."""
 
 
 class CommandMessage(NamedTuple):
@@ -76,6 +80,9 @@ def twist_command(payload: bytes) -> CommandMessage:
     stamp_ns, frame, velocity_mps, yaw_rate_radps = decode(payload)
     _check_frame(frame, "base_link")
     setpoint = Setpoint(_within(velocity_mps, MAX_SPEED_MPS), None, _within(yaw_rate_radps, MAX_YAW_RATE_RADPS))
+    for name, speed in beyond_the_floor(payload).items():
+        if not abs(speed) <= LEAST_SPEED:
+            raise RefusedCommand(ASIDE, f"twist.{name} = {speed:g} is {ASIDE}; send linear.x and angular.z only")
     return CommandMessage(stamp_ns, setpoint)
 
 

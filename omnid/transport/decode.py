@@ -206,6 +206,16 @@ def plain_twist_from_cdr(payload: bytes) -> TwistRecord:
     return TwistRecord(0, "", twist.linear.x, twist.angular.z)
 
 
+def beyond_the_floor(payload: bytes) -> dict[str, float]:
+    """Return the speeds of a TwistStamped or Twist, by name, that no base with two driven sides has."""
+    if is_plain_twist(payload):
+        twist = message_from_cdr(payload, ros.geometry_msgs__msg__Twist)
+    else:
+        twist = message_from_cdr(payload, ros.geometry_msgs__msg__TwistStamped).twist
+    named = {f"linear.{axis}": getattr(twist.linear, axis) for axis in "yz"}
+    return named | {f"angular.{axis}": getattr(twist.angular, axis) for axis in "xy"}
+
+
 def heading_from_cdr(payload: bytes) -> HeadingRecord:
     """Decode a Vector3Stamped; its numbers need not be finite. Raise OmnidError for any other bytes."""
     message = message_from_cdr(payload, ros.geometry_msgs__msg__Vector3Stamped)

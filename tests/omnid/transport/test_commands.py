@@ -145,6 +145,33 @@ def test_valid_commands_are_accepted(accepted: AcceptedCommands) -> None:
     assert accepted.receiver.accepted == 4 and accepted.receiver.refused == {}
 
 
+def aside(name: str, speed: float, *, is_stamped: bool = True) -> bytes:
+    """Return a Twist with a speed in a direction that the base has not."""
+    types: Any = STORE.types
+    vector, stamp = types["geometry_msgs/msg/Vector3"], types["builtin_interfaces/msg/Time"](*divmod(now_ns(), 10**9))
+    part, axis = name.split(".")
+    parts = {"linear": vector(0.3, 0.0, 0.0), "angular": vector(0.0, 0.0, -0.2)}
+    setattr(parts[part], axis, speed)
+    message = types["geometry_msgs/msg/Twist"](**parts)
+    if is_stamped:
+        message = types["geometry_msgs/msg/TwistStamped"](types["std_msgs/msg/Header"](stamp, "base_link"), message)
+    return bytes(STORE.serialize_cdr(message, message.__msgtype__))
+
+
+@pytest.mark.parametrize("name", ["linear.y", "linear.z", "angular.x", "angular.y"])
+@pytest.mark.parametrize("is_stamped", [True, False])
+def test_a_motion_that_the_base_cannot_make_is_named_and_not_made_in_part(name: str, is_stamped: bool) -> None:
+    lines: list[str] = []
+    accepted = AcceptedCommands()
+    accepted.receiver = CommandReceiver(accepted, accepted.freshness, report=lines.append)
+    for speed, expected in ((0.3, "0.3"), (-1e9, "-1e+09"), (math.nan, "nan")):
+        answer = accepted.receive("cmd/twist", aside(name, speed, is_stamped=is_stamped), sent_ns=now_ns())
+        assert answer is not None and f"twist.{name} = {expected} is not possible with a diff" in answer.text
+        assert answer.text in lines[-1] == accepted.receiver.refusal
+    assert accepted.receive("cmd/twist", aside(name, 1e-4, is_stamped=is_stamped), sent_ns=now_ns()) is None
+    assert accepted.setpoints == [Setpoint(0.3, None, -0.2)] and accepted.receiver.refused.total() == 3
+
+
 NOT_FINITE = [(lambda value=value: twist(velocity_mps=value)) for value in (math.nan, math.inf, -math.inf)]
 FAR = [(lambda value=value: twist(rate_radps=value)) for value in (1e300, -1e9, 1001.0)]
 OLD = [(lambda later_s=later_s: twist(later_s=later_s)) for later_s in (-0.6, -30.0, -59.0, -66.0, -1e8)]
