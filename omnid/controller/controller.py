@@ -162,6 +162,7 @@ class Controller:
         state.refused = commands.refused
         state.source = "" if law.reason or commands.current is None else commands.current.source
         state.slowed_by = law.plausibility.slowed_by
+        state.measured = law.plausibility.account.detail
         state.obstacle = "" if law.reason else monitor.reason
         state.blocked = bool(state.obstacle) and monitor.share == 0.0
         # 2. How often it began.
@@ -170,7 +171,7 @@ class Controller:
         if cuts_drive_short(before, state):
             state.stops[reason] += 1
         # 3. What a person should know of it.
-        for line in transitions(before, state, law.plausibility.witness):
+        for line in transitions(before, state, law.plausibility.account):
             self._report(line)
 
     def _send(self, command: VelocityCommand) -> MotorStatus | None:

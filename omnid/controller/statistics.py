@@ -13,7 +13,7 @@ from drivers.motion import WheelSample
 from drivers.motor import VelocityCommand
 from omnid.core.control.arming import NO_ANSWER, STARTED, ArmAnswer
 from omnid.core.control.collision_monitor import remedy
-from omnid.core.control.motion_monitor import ADVICE, DISAGREEMENTS, WITNESSES, Witness
+from omnid.core.control.motion_monitor import ADVICE, COMPARED, DISAGREEMENTS, WITNESSES, Witness
 from omnid.core.control.safety_rules import ENDS, IDLE
 from omnid.core.control.trust import MOTION_DOUBTFUL
 from omnid.engine.flow import nothing
@@ -41,6 +41,7 @@ class ControllerState:
     battery_v: float = math.nan  # voltage that the motor controller reports
     slowed_by: str = ""  # why the base drives slowly; empty: it need not
     slowed: int = 0  # how often it began to
+    measured: str = ""  # of the accounts of the motion that differ, and what may have made it; empty: they agree
     obstacle: str = ""  # why the collision monitor slows down or stops the base; empty: it does not
     blocked: bool = False  # it stops the base: the command leads to an obstacle
     obstacle_stops: int = 0  # how often it began to
@@ -81,7 +82,11 @@ def transitions(before: ControllerState, after: ControllerState, witness: Witnes
     if cuts_drive_short(before, after) and after.reason != ENDS:
         latched = f"; {UNTIL_ARMED}" if after.needs_request else ""
         advice = f"; {ADVICE}" if after.reason in DISAGREEMENTS else ""
-        yield f"the wheels stop: {after.reason}{_detail(after.reason, witness)}{advice}{latched}"
+        is_long = after.reason in COMPARED  # three accounts: a line of their own
+        detail = "" if is_long else _detail(after.reason, witness)
+        yield f"the wheels stop: {after.reason}{detail}{advice}{latched}"
+        if is_long and witness.detail:
+            yield f"measured: {witness.detail}"
 
 
 def _detail(reason: str, witness: Witness) -> str:

@@ -121,7 +121,7 @@ def motion_status(
     if sensors.is_slipping:
         text = SLIP
     if not sensors.wheels_are_sane:
-        text = WRONG_WHEELS
+        text = f"{WRONG_WHEELS}: {witness.detail}" if witness.detail else WRONG_WHEELS
     return DiagnosticStatus.of(MOTION, WARN if text else OK, text, values)
 
 

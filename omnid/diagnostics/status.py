@@ -171,6 +171,7 @@ def _wheels(controller: ControllerStatistics, commands: CommandReceiver | None) 
         Key.OBSTACLE: state.obstacle,
         Key.OBSTACLE_STOPS: state.obstacle_stops,
         Key.PROBLEM: state.problem,
+        Key.MEASURED: state.measured,
         "battery_v": state.battery_v,
     }
     # 3. Whether the wheels turn, and why not.

@@ -88,6 +88,7 @@ class Key(StrEnum):
     TILT_DEG = "tilt_deg"
     # Wheels
     EXPIRIES = "expiries"
+    MEASURED = "measured"  # of commands, wheels, gyro and images that differ; no key while they agree
     PROBLEM = "problem"  # why the motor controller took no command; no key while it does
     COMMANDS = "commands"
     STOPS = "stops"

@@ -21,10 +21,12 @@ from typing import Annotated, Final, NamedTuple
 
 from msgspec import Meta
 
+from omnid.core.control import likely_cause
 from omnid.core.control.heading_controller import LONGEST_TICK_S, Twist
 from omnid.core.control.velocity_limits import STOP
 from omnid.core.nanoseconds import S_PER_NS
 
+MOST_STEPS: Final = 64  # of images that are kept for the words about a disagreement: two seconds of 30 Hz
 MOST_ACCOUNTS: Final = 2048  # kept of each kind, because 10 s at the highest rate of commands have so many
 SIGMAS: Final = 3.0  # Of right differences 0.3 % exceed this, so that false alarms are rare.
 # Of the motion that stops, per second in which nothing is unexplained; by trial on development seeds.
@@ -140,7 +142,10 @@ class MotionMonitor:
         self._last_seen_ns = self._last_report_ns = 0
         self._wheels_report = False  # they have reported a motion: some controllers never do
         self._unexplained = {reason: [0.0, 0.0] for reason in COMPARED}  # m, rad
+        self._steps: deque[tuple[float, ...]] = deque(maxlen=MOST_STEPS)  # m, rad: seen, seen, commanded, commanded
+        self._last_seen: Motion | None = None
         self.reason = ""  # the disagreement for which the base must stop, until it has stood for REST_S
+        self.detail = ""  # what was measured of it, and what may have made it
 
     @property
     def is_doubtful(self) -> bool:
@@ -166,8 +171,12 @@ class MotionMonitor:
         if stamp_ns <= before_ns or not self._drives_at(stamp_ns):
             return
         dt_s = _passed_s(before_ns, stamp_ns)
-        explained = [*self._recent(self._commanded, stamp_ns), *self._recent(self._reported, stamp_ns)]
+        commanded = self._recent(self._commanded, stamp_ns)
+        explained = [*commanded, *self._recent(self._reported, stamp_ns)]
         velocity, yaw_rate = self._bands(explained, seen)
+        mean = _mean(commanded)
+        self._last_seen = seen
+        self._steps.append(tuple(dt_s * speed for speed in (seen.velocity_mps, seen.yaw_rate_radps, *mean)))
         self._add_beyond(0, velocity, seen.velocity_mps, dt_s)
         self._add_beyond(1, yaw_rate, seen.yaw_rate_radps, dt_s)
 
@@ -226,13 +235,39 @@ class MotionMonitor:
         """Add an unexplained speed; 0 lets the sum fall."""
         sums, limit = self._unexplained[reason], (self._settings.stop_m, self._settings.stop_rad)[axis]
         sums[axis] = max(0.0, sums[axis] + dt_s * (speed if speed > 0.0 else -RECOVERY * limit))
-        if sums[axis] > limit:
-            self.reason = self.reason or reason
+        if sums[axis] > limit and not self.reason:
+            self.reason, self.detail = reason, self._measured(reason)
+
+    def _measured(self, reason: str) -> str:
+        """Return the motion of all accounts in the last moments, and what may have made the difference."""
+        newest_ns = max(self._last_seen_ns, self._last_report_ns)
+        shown = [f"commanded {_words(*_mean(self._recent(self._commanded, newest_ns)))}"]
+        if reported := self._recent(self._reported, newest_ns):
+            shown.append(f"reported {_words(*_mean(reported))}")
+        if self._last_seen is not None:
+            shown.append(f"seen {_words(self._last_seen.velocity_mps, self._last_seen.yaw_rate_radps)}")
+        cause = ""
+        if reason != NOT_FOLLOWED and self._steps:
+            columns = list(zip(*self._steps, strict=True))
+            cause = likely_cause.of_wheels(likely_cause.Steps(*columns[:2]), likely_cause.Steps(*columns[2:]))
+        return f"({', '.join(shown)}){cause and ': '}{cause}"
 
     def _forget(self) -> None:
-        self.reason = ""
+        self.reason = self.detail = ""
+        self._steps.clear()
         for sums in self._unexplained.values():
             sums[:] = 0.0, 0.0
+
+
+def _mean(accounts: list[_TimedMotion]) -> tuple[float, float]:
+    """Return the mean velocity and yaw rate of accounts."""
+    count = max(1, len(accounts))
+    velocity_mps = sum(one.velocity_mps for one in accounts) / count
+    return velocity_mps, sum(one.yaw_rate_radps for one in accounts) / count
+
+
+def _words(velocity_mps: float, yaw_rate_radps: float) -> str:
+    return f"{velocity_mps:+.2f} m/s {yaw_rate_radps:+.2f} rad/s"
 
 
 def _passed_s(before_ns: int, now_ns: int) -> float:

@@ -126,6 +126,11 @@ class Plausibility:
             return POSE_DEGRADED
         return MOTION_DOUBTFUL if self._monitor.is_doubtful else self.witness.reason
 
+    @property
+    def account(self) -> Witness:
+        """What is measured of the disagreement for which the base stops, or drives slowly."""
+        return Witness(self._monitor.reason, self._monitor.detail, True) if self._monitor.reason else self.witness
+
     def add_pose(self, stamp_ns: int, state: str, seen: Motion, resets: int, witness: Witness = AGREE) -> None:
         """Take the next pose; a lost one says nothing about the motion."""
         self.witness = witness if self._checks else AGREE

@@ -31,6 +31,8 @@ from numpy.typing import NDArray
 
 from calib import se3
 from drivers.motion import MotionSample, WheelSample
+from omnid.core.control import likely_cause
+from omnid.core.control.likely_cause import Steps
 from omnid.core.control.motion_monitor import (
     AGREE,
     GYRO_DIFFERS,
@@ -238,7 +240,21 @@ class MotionAgreement:
         is_fault = bool(is_long or found.excess >= 1.0)
         turn = of_gyro if of_gyro.differs else of_wheels
         differences = (each.difference if each.differs else Difference() for each in (distance, turn))
-        return Witness(reason, found.text, is_fault, *differences)
+        cause = self._cause(reason, spans, Steps(seen_m.tolist(), seen_rad.tolist()))
+        detail = f"{'by a factor' if cause and is_late else found.text}{cause and ': '}{cause}"
+        return Witness(reason, detail, is_fault, *differences)
+
+    def _cause(self, reason: str, spans: _Spans, seen: Steps) -> str:
+        """Return what makes the accounts differ as they do; empty where that is not known."""
+        ways, turns, gyro = (
+            travel.between(spans.starts_s, spans.ends_s).tolist()
+            for travel in (self._wheels_m, self._wheels_rad, self._gyro_rad)
+        )
+        if reason == IMAGES_DIFFER:
+            return likely_cause.of_images(seen.turns, gyro)
+        if reason in (GYRO_DIFFERS, IMAGES_OR_GYRO):
+            return likely_cause.of_gyro(seen.turns, gyro)
+        return likely_cause.of_wheels(seen, Steps(ways, turns))
 
     def _finding(self, spans: _Spans, seen: Array, travel: _Travel, quantity: _Quantity) -> _Finding:
         """Compare the motion seen (N,) in steps with that of a sensor, both in metres or radians."""
