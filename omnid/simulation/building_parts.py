@@ -12,6 +12,7 @@ from typing import Final
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 
 from calib.models.camera import Array
 from omnid.simulation.rendering import textures
@@ -49,6 +50,11 @@ def plain_paint(rng: Random, grey: float, grain: float = 0.8, px_per_m: float = 
 def kind_paint(rng: Random, kind: str) -> Paint:
     """Return what paints a face by a kind of texture (textures.PAINTERS)."""
     return lambda sides_m: painted(rng, kind, sides_m, THING_PX_PER_M)
+
+
+def poster_paint(rng: Random) -> Paint:
+    """Return what paints a face as a printed page, a drawing or a photograph."""
+    return lambda sides_m: textures.poster(rng, _px(sides_m))
 
 
 class Builder:
@@ -181,14 +187,16 @@ class Builder:
         self.wall((back, low_m), (back, high_m), mirrored, grey=self.wall_grey)
         for one in openings:
             left_m = high_m - one.at_m
-            through = np.array([thick_m, 0.0, 0.0])
+            through = np.array([thick_m, 0.0])
             for y_m in (left_m, left_m - one.width_m):
-                start = np.array([front, y_m, 0.0])
-                self._upright(start, through, (0.0, one.height_m), self.door_grey, "reveal")
+                start = np.array([front, y_m])
+                self.upright(start, start + through, (0.0, one.height_m), self.door_grey)
             paint = plain_paint(self.rng, self.door_grey, px_per_m=WALL_PX_PER_M)
             origin = np.array([front, left_m, one.height_m])
             across = np.array([0.0, -one.width_m, 0.0])
-            self.faces.append(Rectangle(origin, through, across, paint((thick_m, one.width_m)), "lintel"))
+            self.faces.append(
+                Rectangle(origin, np.array([thick_m, 0.0, 0.0]), across, paint((thick_m, one.width_m)), "lintel")
+            )
 
     def room(
         self, low: Point, high: Point, *, doors: int = 1, windows: int = 0, pictures: int = 1, end_doors: int = 0
@@ -200,11 +208,13 @@ class Builder:
         self.wall((x1, y0), (x0, y0), doors=doors, pictures=pictures)
         self.wall((x0, y0), (x0, y1), doors=1)
 
-    def _upright(self, start: Array, along: Array, heights_m: Point, grey: float, name: str) -> None:
-        low_m, high_m = heights_m
+    def upright(self, a: ArrayLike, b: ArrayLike, heights_m: Point, grey: float) -> None:
+        """Add a bare upright rectangle between two points, left and right as seen from its front."""
+        (low_m, high_m), start = heights_m, np.array([*np.asarray(a), 0.0])
+        along = np.array([*np.asarray(b), 0.0]) - start
         size_m = (float(np.linalg.norm(along)), high_m - low_m)
         texture = plain_paint(self.rng, grey, px_per_m=WALL_PX_PER_M)(size_m)
-        self.faces.append(Rectangle(start + high_m * UP, along, (low_m - high_m) * UP, texture, name))
+        self.faces.append(Rectangle(start + high_m * UP, along, (low_m - high_m) * UP, texture, "wall"))
 
     def _wall_piece(self, start: Array, along: Array, low_m: float, top_m: float, grey: float) -> None:
         size_m = (float(np.linalg.norm(along)), top_m - low_m)
@@ -313,7 +323,7 @@ class Builder:
         self.thing([*boards, *sides], at, yaw_rad, plain_paint(self.rng, self.rng.uniform(120, 210), 1.5))
         for z in (0.1, 0.47, 0.84, 1.21):
             rows = [((-0.03, 0.0, z), (0.25, width_m - 0.08, self.rng.uniform(0.2, 0.3)))]
-            self.thing(rows, at, yaw_rad, lambda sides_m: textures.poster(self.rng, _px(sides_m)))
+            self.thing(rows, at, yaw_rad, poster_paint(self.rng))
 
     def adult(self, height_m: float = 1.75) -> tuple[Rectangle, ...]:
         """Return a person on the origin who looks along x."""

@@ -6,403 +6,44 @@ A corridor or hall is along x, and the robot starts at the origin.
 
 from __future__ import annotations
 
-import math
 import re
 import zlib
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
-import cv2
 import numpy as np
 
-from calib.models.camera import Array
-from drivers.motors.simulated.simulated_base import Pose
 from omnid.errors import OmnidError
-from omnid.simulation.building_parts import Builder, Opening, plain_paint
-from omnid.simulation.clearance import obstacles_of
-from omnid.simulation.people import Person
-from omnid.simulation.rendering.ray_caster import AS_NEEDED
-from omnid.simulation.rendering.sensor import Sensor
-from omnid.simulation.rendering.shapes import Point
-from omnid.simulation.rendering.surfaces import Rectangle
-from omnid.simulation.robot import Push, SimulatedRobot, Slip, WheelErrors, make_robot
-from omnid.simulation.world import Ground, SunPatch, World
+from omnid.simulation import harmless_worlds, hazard_worlds
+from omnid.simulation.building_parts import Builder
+from omnid.simulation.trials import Trial
+from omnid.simulation.world import World
 
-# Names of floors, with the kinds of their textures.
-FLOORS: Final = {
-    "plain": "linoleum",
-    "epoxy": "epoxy",
-    "marbled": "marbled",
-    "concrete": "concrete",
-    "carpet": "carpet",
-    "tiles": "glazed",
-    "parquet_along": "parquet_along",
-    "parquet_across": "parquet_across",
-    "laminate": "laminate",
-    "polished": "slabs",
-}
-HALL: Final = "_hall"  # ends the name of a floor that is in a hall instead of a corridor
+FLOORS: Final = tuple(harmless_worlds.FLOORS)
+HARMLESS: Final = harmless_worlds.NAMES
+HAZARDS: Final = hazard_worlds.NAMES
 PATTERNED: Final = ("marbled", "concrete", "carpet", "glazed")  # floors of worlds in which something else is tried
-WAY_M: Final = 8.0  # that is asked for straight on
-BEHIND_M: Final = 2.0  # of the start, where a corridor begins
-SLOWEST_MPS: Final = 0.1  # A drive that is slower than this on average ends unfinished.
-FREE_M: Final = 0.36  # from the middle of a base to what stands beside a way that it can surely drive
-CELL_M: Final = 0.05
+_MAKERS: Final = harmless_worlds.MAKERS | hazard_worlds.MAKERS
 
 
-@dataclass(frozen=True, slots=True)
-class Trial:
-    """A world, the robot in it, and what is asked: a way straight on, or a goal."""
-
-    world: World
-    changes: tuple[tuple[str, object], ...] = ()  # of fields of the robot
-    way_m: float = WAY_M
-    goal: Pose | None = None  # x, y [m], heading [rad] in odom, which begins at the start
-    is_harmless: bool = True
-
-    def robot(self, size_px: int = 512) -> SimulatedRobot:
-        """Return the robot, with images of a size that come as JPEG from a lens with vignetting."""
-        usual = replace(make_robot(size_px), sensor=SENSOR, samples=AS_NEEDED)
-        return replace(usual, **dict(self.changes))  # type: ignore[arg-type]
-
-
-SENSOR: Final = Sensor(vignette=0.25, flicker=0.005, is_compressed=True)
-USUAL_WHEELS: Final = WheelErrors()
-Make = Callable[[Builder], Trial]
-
-
-def trial(name: str, seed: int) -> Trial:
-    """Return the trial of a name: same name and seed, same world."""
-    for pattern, (floor, make) in _WORLDS.items():
+def trial(name: str, seed: int, floor: str | None = None) -> Trial:
+    """Return the trial of a name: same name and seed, same world; floor: another one of FLOORS."""
+    for pattern, (kind, make) in _MAKERS.items():
         if found := re.fullmatch(pattern, name):
             rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
-            kind = str(rng.choice(PATTERNED)) if floor is None else floor
+            kind = kind or str(rng.choice(PATTERNED))
+            if floor is not None:
+                kind = harmless_worlds.FLOORS[floor]
             made = make(Builder(rng, kind), *found.groups())
             return replace(made, world=replace(made.world, name=name))
-    raise OmnidError(f"world {name!r} is not known; the worlds like buildings are {', '.join(HARMLESS)}")
+    raise OmnidError(f"world {name!r} is not known; the worlds like buildings are {', '.join((*HARMLESS, *HAZARDS))}")
 
 
 def is_named(name: str) -> bool:
     """True if there is a world of that name."""
-    return any(re.fullmatch(pattern, name) for pattern in _WORLDS)
+    return any(re.fullmatch(pattern, name) for pattern in _MAKERS)
 
 
 def world(name: str, seed: int) -> World:
     """Return the world of a trial."""
     return trial(name, seed).world
-
-
-# Straight on, with nothing in the way
-
-
-def corridor(b: Builder, *, width_m: float = 1.8, length_m: float = 14.0, floor: bool = True) -> tuple[Point, Point]:
-    """Add a corridor along x about the robot's way; return its corners."""
-    aside_m = b.rng.uniform(-0.1, 0.1)
-    low, high = (-BEHIND_M, aside_m - width_m / 2), (length_m - BEHIND_M, aside_m + width_m / 2)
-    if floor:
-        b.floor(low, high)
-    b.ceiling(low, high)
-    b.room(low, high, doors=int(b.rng.integers(2, 5)), pictures=int(b.rng.integers(1, 4)))
-    return low, high
-
-
-def hall(b: Builder) -> tuple[Point, Point]:
-    """Add a hall with windows on one side, and furniture along its walls; return its corners."""
-    low, high = (-2.5, -3.5), (11.5, 3.5)
-    b.ceiling_m = 3.2
-    b.floor(low, high)
-    b.ceiling(low, high, 3.0)
-    b.room(low, high, doors=2, windows=4, pictures=3)
-    for x_m in np.arange(0.5, 10.0, 3.0):
-        b.shelf((x_m + b.rng.uniform(-0.5, 0.5), low[1] + 0.22), math.pi / 2)
-    for x_m in (2.0, 7.0):
-        place = x_m + b.rng.uniform(-1.0, 1.0), high[1] - 1.0
-        b.table(place, (1.4, 0.7, 0.74))
-        b.star_chair((place[0], place[1] - 0.7), b.rng.uniform(0, math.tau))
-    return low, high
-
-
-def _built(b: Builder, **fields: object) -> World:
-    return World("", tuple(b.faces), panes=tuple(b.panes), **fields)  # type: ignore[arg-type]
-
-
-def _floor_in_corridor(b: Builder) -> Trial:
-    corridor(b)
-    return Trial(_built(b, is_polished=b.floor_kind == "slabs"))
-
-
-def _floor_in_hall(b: Builder) -> Trial:
-    hall(b)
-    return Trial(_built(b, is_polished=b.floor_kind == "slabs"))
-
-
-def _polished_corridor(b: Builder) -> Trial:
-    """Windows in one wall, which the floor mirrors."""
-    low, high = (-BEHIND_M, -0.9), (12.0, 0.9)
-    b.floor(low, high)
-    b.ceiling(low, high)
-    b.room(low, high, doors=3, windows=5)
-    return Trial(_built(b, is_polished=True))
-
-
-def _robot(**changes: object) -> Make:
-    """Return what makes a corridor in which the robot is another one."""
-
-    def make(b: Builder) -> Trial:
-        corridor(b, width_m=2.2)
-        return Trial(_built(b), tuple(changes.items()))
-
-    return make
-
-
-def _lights(*lights: tuple[float, float]) -> Make:
-    def make(b: Builder) -> Trial:
-        corridor(b)
-        return Trial(_built(b, lights=lights))
-
-    return make
-
-
-def _ramp(b: Builder, degrees: str) -> Trial:
-    """A level metre, a ramp up, and a landing."""
-    slope, begin_m, long_m = math.tan(math.radians(float(degrees))), b.rng.uniform(1.4, 2.0), 4.0
-    top_m, low, high = slope * long_m, (-BEHIND_M, -0.9), (11.0, 0.9)
-    b.ceiling_m = 2.6 + top_m
-    b.floor(low, (begin_m, high[1]))
-    b.floor((begin_m, low[1]), (begin_m + long_m, high[1]), (0.0, top_m))
-    b.floor((begin_m + long_m, low[1]), high, (top_m, top_m))
-    b.ceiling(low, high)
-    b.room(low, high, doors=0, pictures=4)
-    profile = ((begin_m, 0.0), (begin_m + long_m, top_m))
-    return Trial(_built(b, ground=Ground(profile)), way_m=7.0)
-
-
-def _lift_gap(b: Builder) -> Trial:
-    """A corridor that ends at a lift, whose floor is another one beyond a gap of 2 cm."""
-    at_m, low, high = b.rng.uniform(1.6, 2.2), (-BEHIND_M, -0.9), (0.0, 0.9)
-    b.floor(low, (at_m, 0.9))
-    b.floor((at_m + 0.02, -0.8), (at_m + 2.3, 0.8), kind="linoleum")
-    b.floor((at_m, -0.8), (at_m + 0.02, 0.8), (-0.4, -0.4), "slabs")
-    b.ceiling(low, (at_m + 2.3, high[1]))
-    b.wall((-BEHIND_M, 0.9), (at_m, 0.9), doors=1, pictures=1)
-    b.wall((at_m, -0.9), (-BEHIND_M, -0.9), doors=1)
-    b.wall((-BEHIND_M, -0.9), (-BEHIND_M, 0.9))
-    for y_m in (0.8, -0.9):  # beside the door of the lift
-        b.wall((at_m, y_m + 0.1), (at_m, y_m), skirting=False)
-    for a, c in (((at_m, 0.8), (at_m + 2.3, 0.8)), ((at_m + 2.3, 0.8), (at_m + 2.3, -0.8))):
-        b.wall(a, c, skirting=False, grey=150.0)
-    b.wall((at_m + 2.3, -0.8), (at_m, -0.8), skirting=False, grey=150.0)
-    return Trial(_built(b), way_m=at_m + 1.0)
-
-
-def _door_step(b: Builder, height_cm: str) -> Trial:
-    """A sill across the way."""
-    corridor(b)
-    at_m, high_m = b.rng.uniform(1.8, 2.6), float(height_cm) / 100
-    b.thing([((0.0, 0.0, 0.0), (0.12, 1.9, high_m))], (at_m, 0.0), 0.0, plain_paint(b.rng, 150.0, 2.0), "floor")
-    profile = ((at_m - 0.06, 0.0), (at_m - 0.06, high_m), (at_m + 0.06, high_m), (at_m + 0.06, 0.0))
-    return Trial(_built(b, ground=Ground(profile)))
-
-
-def _sun_moving(b: Builder) -> Trial:
-    low, high = (-BEHIND_M, -1.0), (12.0, 1.0)
-    b.floor(low, high)
-    b.ceiling(low, high)
-    b.room(low, high, doors=2, windows=5)
-    sun = tuple(
-        SunPatch(
-            (x_m, b.rng.uniform(-0.4, 0.6)),
-            (1.3, 0.8),
-            b.rng.uniform(-0.4, 0.4),
-            (b.rng.uniform(-0.06, 0.06), 0.02),
-            0.7,
-        )
-        for x_m in np.arange(1.5, 10.0, 2.4)
-    )
-    return Trial(_built(b, sun=sun))
-
-
-def _trolley_leaves(b: Builder) -> Trial:
-    """A trolley stands in the way; after a while it is pulled on."""
-    _, high = corridor(b, width_m=2.0, length_m=20.0)
-    cart = tuple(trolley(b, (0.0, 0.0), 0.0))
-    path = ((2.2, 0.0), (high[0] - 1.2, 0.0))
-    start_s = b.rng.uniform(9.0, 11.0)
-    return Trial(_built(b, people=(Person(cart, path, 0.9, start_s=start_s),)))
-
-
-def _person_passes(b: Builder) -> Trial:
-    """Somebody comes towards the robot, and passes it."""
-    corridor(b, width_m=2.6)
-    side = float(b.rng.choice([-1, 1]))
-    path = ((9.0, side * 0.75), (-1.5, side * 0.8))
-    return Trial(_built(b, people=(Person(b.adult(), path, b.rng.uniform(0.9, 1.2), start_s=3.0),)))
-
-
-def trolley(b: Builder, at: Point, yaw_rad: float) -> list[Rectangle]:
-    """Return a trolley with a load, as faces which are not part of what stands."""
-    before = len(b.faces)
-    legs = [((x, y, 0.0), (0.1, 0.06, 0.16)) for x in (0.35, -0.35) for y in (0.22, -0.22)]
-    handle = [((-0.45, y, 0.16), (0.03, 0.03, 0.8)) for y in (0.25, -0.25)]
-    b.thing([*legs, *handle, ((-0.45, 0.0, 0.94), (0.03, 0.53, 0.03))], at, yaw_rad, plain_paint(b.rng, 70.0))
-    b.thing([((0.0, 0.0, 0.16), (0.9, 0.6, 0.05))], at, yaw_rad, plain_paint(b.rng, 165.0, 2.0))
-    b.thing([((0.08, 0.0, 0.21), (0.6, 0.5, b.rng.uniform(0.2, 0.5)))], at, yaw_rad, plain_paint(b.rng, 130.0, 5.0))
-    faces, b.faces = b.faces[before:], b.faces[:before]
-    return faces
-
-
-# To a goal
-
-
-def _two_rooms(b: Builder, door_m: float, at_y_m: float) -> float:
-    """Add two rooms with an open door between them; return where along x the wall with the door is."""
-    x_m, low, high = b.rng.uniform(1.8, 2.2), (-1.6, -2.2), (5.6, 2.2)
-    b.floor(low, high)
-    b.ceiling(low, high)
-    b.room(low, high, doors=1, pictures=3)
-    b.partition(x_m, (low[1], high[1]), [Opening(high[1] - at_y_m - door_m / 2, door_m)])
-    b.shelf((4.4, low[1] + 0.2), math.pi / 2)
-    b.table((-0.6, high[1] - 0.5), (1.2, 0.7, 0.74))
-    return x_m
-
-
-def _door(b: Builder, aslant: str) -> Trial:
-    """A door of 0.8 m, straight ahead or 30 degrees aside."""
-    door_y_m = 0.0 if not aslant else float(b.rng.choice([-1, 1])) * math.tan(math.radians(30.0)) * 2.0
-    x_m = _two_rooms(b, 0.8, door_y_m)
-    return Trial(_built(b), goal=(x_m + 1.8, door_y_m, 0.0))
-
-
-def _office(b: Builder) -> Trial:
-    """Desks with star-legged chairs along both walls, and one chair on the way."""
-    low, high = (-1.4, -2.2), (6.2, 2.4)
-    b.floor(low, high)
-    b.ceiling(low, high)
-    b.room(low, high, doors=1, windows=3, pictures=2)
-    b.thing([((0.0, 0.0, 0.0), (0.28, 0.28, 0.33))], (0.4, -1.8), 0.0, plain_paint(b.rng, 60.0))
-    b.shelf((-1.1, -1.2), 0.0)
-    for at_m, y_m in ((1.2, 1.9), (3.6, 1.9), (2.4, -1.75), (5.0, -1.75)):
-        x_m, inwards = at_m + b.rng.uniform(-0.2, 0.2), math.copysign(1.0, -y_m)
-        b.table((x_m, y_m), (1.4, 0.75, 0.74))
-        b.star_chair((x_m + b.rng.uniform(-0.3, 0.3), y_m + inwards * b.rng.uniform(0.5, 0.75)), b.rng.uniform(0, 7))
-
-    def put() -> None:
-        b.star_chair((b.rng.uniform(2.2, 3.2), b.rng.uniform(-0.5, 0.5)), b.rng.uniform(0, math.tau))
-
-    return _with_a_way(b, (5.2, 0.2, 0.0), put)
-
-
-def _clutter(b: Builder) -> Trial:
-    """A room full of things, through which a way is left."""
-    low, high = (-1.4, -2.4), (5.6, 2.4)
-    b.floor(low, high)
-    b.ceiling(low, high)
-    b.room(low, high, doors=1, windows=2, pictures=1)
-
-    def put() -> None:
-        places: list[Point] = []
-        for _ in range(60):
-            at = float(b.rng.uniform(0.9, 4.0)), float(b.rng.uniform(-2.0, 2.0))
-            if len(places) < 8 and all(math.dist(at, other) > 0.85 for other in places):
-                places.append(at)
-                _put(b, str(b.rng.choice(["box", "carton", "chair", "table", "bin"])), at)
-
-    return _with_a_way(b, (4.6, float(b.rng.uniform(-1.0, 1.0)), 0.0), put)
-
-
-def _with_a_way(b: Builder, goal: Pose, put: Callable[[], None]) -> Trial:
-    """Return the trial with things put at random, again and again until a way leads to the goal."""
-    empty = len(b.faces)
-    for _ in range(200):
-        put()
-        built = _built(b)
-        if can_drive(obstacles_of(built, 1.2), (0.0, 0.0), goal[:2]):
-            return Trial(built, goal=goal)
-        del b.faces[empty:]
-    raise OmnidError("no way leads through what was put here 200 times; take another seed")
-
-
-def _put(b: Builder, kind: str, at: Point) -> None:
-    """Add a thing of a room."""
-    rng, yaw_rad = b.rng, b.rng.uniform(0, math.tau)
-    if kind == "chair":
-        b.star_chair(at, yaw_rad)
-    elif kind == "table":
-        b.table(at, (0.8, 0.6, 0.72), yaw_rad)
-    else:
-        spans = {"box": (0.3, 0.6), "carton": (0.3, 0.5), "bin": (0.25, 0.3)}[kind]
-        size_m = rng.uniform(*spans), rng.uniform(*spans), rng.uniform(0.3, 0.9)
-        grey, grain = rng.uniform(40, 220), 6.0 if kind == "carton" else 1.0
-        b.thing([((0.0, 0.0, 0.0), size_m)], at, yaw_rad, plain_paint(rng, grey, grain))
-
-
-def can_drive(segments: Array, start: Point, goal: Point, beside_m: float = FREE_M) -> bool:
-    """Return whether a way leads from start to goal that is nowhere nearer than beside_m to segments (N, 2, 2)."""
-    points = np.concatenate([segments.reshape(-1, 2), [start, goal]])
-    low = points.min(axis=0) - 1.0
-    width, height = np.ceil((points.max(axis=0) + 1.0 - low) / CELL_M).astype(int).tolist()
-    free = np.full((height, width), 255, np.uint8)
-    for ends in np.rint((segments - low) / CELL_M).astype(int):
-        cv2.line(free, ends[0].tolist(), ends[1].tolist(), 0)
-    wide = cv2.distanceTransform(free, cv2.DIST_L2, 5) * CELL_M > beside_m
-    _, parts = cv2.connectedComponents(wide.astype(np.uint8), connectivity=4)
-    at = [parts[tuple(np.rint((np.array(place) - low) / CELL_M).astype(int)[::-1])] for place in (start, goal)]
-    return bool(at[0] and at[0] == at[1])
-
-
-def _dead_end_and_back(b: Builder) -> Trial:
-    """The robot stands in a dead end 1.2 m wide, nose to its end; the goal is in the corridor outside, aside."""
-    low, high, end_m = (-3.2, -0.6), (0.75, 3.6), 0.75
-    b.floor((low[0], low[1] - 1.0), (end_m, high[1]))
-    b.ceiling((low[0], low[1] - 1.0), (end_m, high[1]))
-    for a, c in (
-        ((-1.4, 0.6), (end_m, 0.6)),  # the dead end, clockwise
-        ((end_m, 0.6), (end_m, -0.6)),
-        ((end_m, -0.6), (low[0], -0.6)),
-        ((low[0], -0.6), (low[0], high[1])),  # the corridor
-        ((low[0], high[1]), (-1.4, high[1])),
-        ((-1.4, high[1]), (-1.4, 0.6)),
-    ):
-        b.wall(a, c, doors=int(math.dist(a, c) > 2.0), pictures=int(math.dist(a, c) > 2.0))
-    return Trial(_built(b), goal=(-2.3, 2.6, math.pi / 2))
-
-
-def _doorway_with_person(b: Builder) -> Trial:
-    """Somebody stands in a door of 0.9 m, sees the robot come, and walks on into its room, and aside."""
-    x_m = _two_rooms(b, 0.9, 0.0)
-    aside_m = float(b.rng.choice([-1, 1])) * 1.4
-    path = ((x_m + 0.1, 0.0), (x_m - 0.5, aside_m * 0.5), (x_m - 0.7, aside_m))
-    walker = Person(b.adult(), path, 0.8, start_s=b.rng.uniform(7.0, 9.0))
-    return Trial(_built(b, people=(walker,)), goal=(x_m + 1.8, 0.0, 0.0))
-
-
-_WORLDS: Final[dict[str, tuple[str | None, Callable[..., Trial]]]] = {
-    **{name: (kind, _floor_in_corridor) for name, kind in FLOORS.items() if name != "polished"},
-    "polished": ("slabs", _polished_corridor),
-    **{name + HALL: (kind, _floor_in_hall) for name, kind in FLOORS.items()},
-    r"ramp_(\d+)": (None, _ramp),
-    "lean_1deg": (None, _robot(lean_rad=(0.0, math.radians(1.0)))),
-    "lift_gap": (None, _lift_gap),
-    "sun_moving": (None, _sun_moving),
-    "light_switch": (None, _lights((6.0, 0.5), (13.0, 1.0))),
-    "dark_and_on": (None, _lights((8.0, 0.004), (11.0, 1.0))),
-    "pushed": (None, _robot(pushes=(Push(5.0, 5.5, 0.3, 0.15), Push(11.0, 11.5, -0.3, -0.15)))),
-    "slip_20": (None, _robot(wheels=replace(USUAL_WHEELS, slips=(Slip(5.0, 7.0, 0.2), Slip(12.0, 14.0, 0.2))))),
-    "slip_40": (None, _robot(wheels=replace(USUAL_WHEELS, slips=(Slip(8.0, 10.0, 0.4),)))),
-    "weak_motor": (None, _robot(wheels=replace(USUAL_WHEELS, left=USUAL_WHEELS.left - 0.08))),
-    "trolley_leaves": (None, _trolley_leaves),
-    "person_passes": (None, _person_passes),
-    "door_80(_aslant|)": (None, _door),
-    "office": (None, _office),
-    "clutter": (None, _clutter),
-    "dead_end_and_back": (None, _dead_end_and_back),
-    "doorway_with_person": (None, _doorway_with_person),
-}
-HARMLESS: Final = (
-    *FLOORS,
-    *(name + HALL for name in FLOORS),
-    *("ramp_2", "ramp_5", "ramp_8", "lean_1deg", "lift_gap", "sun_moving", "light_switch", "dark_and_on", "pushed"),
-    *("slip_20", "slip_40", "weak_motor", "trolley_leaves", "person_passes"),
-    *("door_80", "door_80_aslant", "office", "clutter", "dead_end_and_back", "doorway_with_person"),  # to a goal
-)

@@ -1,6 +1,6 @@
 """Cells of true things that the grid of a map calls free: `python -m tests.bench.mapped_floor --seeds FIRST LAST`.
 
-A simulated robot is driven at random through rooms full of things (`cluttered_room.py`) and maps them; the grid is that
+A simulated robot is driven at random through rooms full of things (`room_of_things`) and maps them; the grid is that
 of `omnid map export --grid`. A cell counts to a thing whose outline from above covers its middle; of what is narrower
 than a cell, its middle line.
 
@@ -29,18 +29,19 @@ from omnid.core.mapping.scan_grid import FREE, OCCUPIED, Grid
 from omnid.core.places.place_views import grid
 from omnid.formats.place_file import read_places
 from omnid.simulation.lockstep import simulate
+from omnid.simulation.named_worlds import trial
 from omnid.simulation.rendering.surfaces import Rectangle
 from omnid.simulation.world import World
 from omnid.simulation.world_file import load_world
-from tests.bench.cluttered_room import CLUTTER, Wanderer
 from tests.bench.fine_robot import fine_robot
-from tests.bench.obstacle_stops import CASES, SIZE_PX, TILES, world_of
+from tests.bench.obstacles import RANDOMLY_S, Wanderer
 from tests.bench.pole_rows import ThereAndBack, room_text
 from tests.bench.results import Column, ResultTable
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 CELL_M: Final = 0.05
+SIZE_PX: Final = 512
 HIGHEST_M: Final = 2.2  # Upper sides of things are lower than this, the ceiling is higher.
 LOW_M, THIN_M, POLE_M, LONG_M = 0.1, 0.035, 0.12, 0.5  # limits of the kinds of things
 FLOOR: Final = "floor without anything on it"
@@ -126,8 +127,8 @@ def drive(seed: int, path: Path, *, poles: bool) -> tuple[World, KindOf]:
     """Drive a seed, and write its map; return the world, and the kinds of the things in it."""
     config, robot = load_config(None, [f'places.map="{path}"']), fine_robot(SIZE_PX)
     if not poles:
-        world, _ = world_of(CLUTTER, seed, TILES)
-        simulate(world, robot, Wanderer(seed), seconds=CASES[CLUTTER], seed=seed, config=config)
+        world = trial("room_of_things", seed).world
+        simulate(world, robot, Wanderer(seed), seconds=RANDOMLY_S, seed=seed, config=config)
         return world, kind_of
     file = path.with_suffix(".toml")
     file.write_text(room_text(random.Random(seed), robot.radius_m))

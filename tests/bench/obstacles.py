@@ -1,9 +1,12 @@
 """Drives in worlds like buildings: `python -m tests.bench.obstacles [--only NAME ...] [--seeds 1 2] [--speed 0.3 0.5]`.
 
-Two tables follow from the same drives: how far the robot drove where nothing was in the way, and what it touched where
-something was. A drive is asked to go straight on, or to a goal; it ends when it is there, or when it could have been
-there at SLOWEST_MPS. Each is a line of build/results/obstacles.jsonl; the command goes on where it ended as long as the
-commit is the same.
+Two tables follow from the same command. The first: how far the robot drove where nothing was in the way. The second:
+what it touched where something was, and whether it stopped 0.05 to 0.8 m before that, or passed. A drive is asked to go
+straight on, to turn towards the hazard (--turning), or to a goal; it ends there, or where it has stood for a while.
+Each is a line of build/results/obstacles.jsonl; the command goes on where it ended as long as the commit is the same.
+
+With --open-loop FOLDER, pairs along the way are kept there with the truth, made by a base that nothing stops, and what
+today's ring calls free is compared with it (tests/bench/open_loop.py).
 """
 
 from __future__ import annotations
@@ -11,26 +14,45 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
+import random
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from itertools import product
 from multiprocessing import get_context
+from pathlib import Path
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from omnid.config import load_config
-from omnid.core.control.heading_controller import Setpoint
+from omnid.core.control.heading_controller import Setpoint, wrap_angle
 from omnid.core.navigation.requests import GoalRequest, NavigationFrame
+from omnid.simulation.clearance import clearance_m, footprints
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun, simulate
-from omnid.simulation.named_worlds import HARMLESS, SLOWEST_MPS, Trial, trial
+from omnid.simulation.named_worlds import FLOORS, HARMLESS, HAZARDS, trial
+from omnid.simulation.people import Walkers
+from omnid.simulation.robot import SimulatedRobot
+from omnid.simulation.trials import SLOWEST_MPS, Trial
+from tests.bench.fine_robot import BUILDS, USUAL, fine_robot
+from tests.bench.real_lenses import with_real_lenses
 from tests.bench.results import ROOT, Column, ResultTable, commit
+
+Array = NDArray[np.float64]
 
 LINES: Final = ROOT / "build" / "results" / "obstacles.jsonl"
 FAMILY: Final = "buildings"  # in seeds.toml
 OWN_MPS: Final = 0.05  # A contact at a lower speed is not the robot's own.
 DRIVEN: Final = 0.95  # share of what was asked that counts as all
+STOPS_M: Final = (0.05, 0.8)  # before a hazard
+STANDS_M, STANDS_S, HAZARD_STANDS_S = 0.03, 15.0, 8.0  # a drive ends that moved by less than this in that time
+TURN_RADIUS_M, TURN_M = 4.0, 2.4  # of the arc towards a hazard, which ends there
+RANDOMLY_S: Final = 40.0  # of a drive at random
+TEXTURED: Final = "marbled"  # the floor whose time is the measure of the others
+USUAL_MPS: Final = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,9 +63,16 @@ class Planned:
     seed: int
     speed_mps: float = 0.3
     size_px: int = 512
+    floor: str | None = None
+    build: str = USUAL
+    is_turning: bool = False
+    has_real_lenses: bool = False
 
     def __str__(self) -> str:
-        return f"{self.world} seed {self.seed}, {self.speed_mps:g} m/s, {self.size_px} px"
+        parts = [f"{self.world} seed {self.seed}, {self.speed_mps:g} m/s, {self.size_px} px"]
+        parts += [f"on {self.floor}"] * (self.floor is not None) + [f"{self.build} robot"] * (self.build != USUAL)
+        parts += ["turning"] * self.is_turning + ["real lenses"] * self.has_real_lenses
+        return ", ".join(parts)
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,42 +81,96 @@ class Drive:
 
     asked_m: float
     driven_m: float  # towards what was asked
-    time_s: float  # from the first command to the end, or to the last motion
+    time_s: float  # from the first command to the last motion
     contacts: int
     own: int  # of them, while the robot drove
     clearance_m: float  # least
+    stopped_m: float | None  # from the hazard at the end; None: there is none, or it was passed
     ended: str  # where it did not get there, why the wheels stopped last, in the daemon's words
+    pairs: int
     cpu_s: float
 
     @property
     def share(self) -> float:
         """Share of what was asked that was driven."""
-        return min(1.0, self.driven_m / self.asked_m)
+        return min(1.0, max(0.0, self.driven_m / self.asked_m))
+
+    @property
+    def is_right(self) -> bool:
+        """True if a hazard was not touched by the robot's own motion, and it passed or stopped at its distance."""
+        return not self.own and (self.stopped_m is None or STOPS_M[0] <= self.stopped_m <= STOPS_M[1])
+
+
+def ahead(moment: Moment) -> Iterator[Request]:
+    """Arm, and hold the stick ahead."""
+    if moment.odometry is not None and not moment.controller.armed and moment.time_s < 2.0:
+        yield "arm"
+    yield Setpoint(USUAL_MPS, heading_rad=0.0)
+
+
+class Wanderer:
+    """Holds the stick in one direction for some seconds, then in another one; turns away where the base stands."""
+
+    SPEEDS_MPS: Final = (0.3, 0.5, 0.8, -0.4)
+    MOVED_M, MOVED_RAD, STANDS_S = 0.05, 0.1, 1.5  # of a base that does not stand
+    LEG_S: Final = (2.0, 5.0)
+    TURN_RAD: Final = math.radians(70.0)  # largest change of the heading from leg to leg
+
+    def __init__(self, seed: int) -> None:
+        self._rng = random.Random(seed)
+        self._until_s, self._setpoint = 0.0, Setpoint(0.5, heading_rad=0.0)
+        self._moved_s, self._at, self._heading_rad = 0.0, (0.0, 0.0), 0.0
+
+    def __call__(self, moment: Moment) -> Iterator[Request]:
+        """Yield the operator's requests at a moment."""
+        if moment.odometry is not None and not moment.controller.armed and moment.time_s < 2.0:
+            yield "arm"
+        T = moment.T_odom_base
+        at, heading_rad = (float(T[0, 3]), float(T[1, 3])), math.atan2(T[1, 0], T[0, 0])
+        turned_rad = abs(wrap_angle(heading_rad - self._heading_rad))
+        if math.dist(at, self._at) > self.MOVED_M or turned_rad > self.MOVED_RAD:
+            self._at, self._heading_rad, self._moved_s = at, heading_rad, moment.time_s
+        stands = moment.time_s - self._moved_s > self.STANDS_S
+        if moment.time_s >= self._until_s or stands:
+            # Where the base stands the way is closed: any direction may be free.
+            most_rad = math.pi if stands else self.TURN_RAD
+            heading_rad += self._rng.uniform(-most_rad, most_rad)
+            self._setpoint = Setpoint(self._rng.choice(self.SPEEDS_MPS), heading_rad=heading_rad)
+            self._until_s, self._moved_s = moment.time_s + self._rng.uniform(*self.LEG_S), moment.time_s
+        yield self._setpoint
 
 
 class Asker:
-    """Arms, then asks for the way straight on or for the goal; ends the drive there."""
+    """Arms, then asks for the way or for the goal; ends the drive there, or where the base stands."""
 
-    def __init__(self, asked: Trial, speed_mps: float) -> None:
-        self._asked, self._speed_mps = asked, speed_mps
-        self._start: tuple[float, float] | None = None
-        self._sent_s = math.inf
-        self.began_s = math.inf
+    def __init__(self, asked: Trial, planned: Planned) -> None:
+        self._asked, self._stands_s = asked, STANDS_S if asked.things is None else HAZARD_STANDS_S
+        speed_mps = -planned.speed_mps if asked.motion == "back" else planned.speed_mps
+        self._setpoint = Setpoint(speed_mps, heading_rad=0.0)
+        if planned.is_turning or asked.motion == "turn left":
+            self._setpoint = Setpoint(speed_mps, yaw_rate_radps=abs(speed_mps) / TURN_RADIUS_M)
+        if asked.motion == "turn left":
+            self._setpoint = Setpoint(0.5 * speed_mps, yaw_rate_radps=speed_mps / 0.3)
+        self._start: Array | None = None
+        self._stood: tuple[float, Array] = (0.0, np.zeros(2))
+        self._sent_s = self.began_s = math.inf
 
     def __call__(self, moment: Moment) -> Iterator[Request]:
         """Yield the requests at a moment."""
-        if moment.odometry is None:
-            return
-        if not moment.controller.armed:
-            if moment.time_s < 2.0:
+        place = moment.T_world_base[:2, 3]
+        if moment.odometry is None or (not moment.controller.armed and self._start is None):
+            if moment.odometry is not None and moment.time_s < 2.0:
                 yield "arm"
             return
-        place = moment.T_world_base[:2, 3]
         if self._start is None:
-            self._start, self.began_s = (float(place[0]), float(place[1])), moment.time_s
+            self._start, self.began_s, self._stood = place.copy(), moment.time_s, (moment.time_s, place.copy())
+        if np.linalg.norm(place - self._stood[1]) > STANDS_M:
+            self._stood = moment.time_s, place.copy()
+        if moment.time_s - self._stood[0] > self._stands_s:
+            yield "end"
         if self._asked.goal is None:
-            yield Setpoint(self._speed_mps, heading_rad=0.0)
-            if math.dist(self._start, place) >= self._asked.way_m:
+            yield self._setpoint
+            if np.linalg.norm(place - self._start) >= self._asked.way_m:
                 yield "end"
         elif math.isinf(self._sent_s):
             self._sent_s = moment.time_s
@@ -96,25 +179,62 @@ class Asker:
             yield "end"
 
 
+def prepared(planned: Planned) -> tuple[Trial, SimulatedRobot]:
+    """Return the trial, with the start that the drive needs, and the robot."""
+    asked = trial(planned.world, planned.seed, planned.floor)
+    robot = asked.robot(planned.size_px)
+    if planned.build != USUAL:
+        build = BUILDS[planned.build]
+        robot = replace(
+            robot, rig=fine_robot(planned.size_px, build).rig, radius_m=build.radius_m, height_m=build.height_m
+        )
+    x_m, y_m, heading_rad = asked.world.start
+    if asked.motion == "ahead" and asked.goal is None:
+        if planned.is_turning:  # an arc to the left, at whose end the base looks along x
+            angle_rad = TURN_M / TURN_RADIUS_M
+            y_m, heading_rad = TURN_RADIUS_M * (1 - math.cos(angle_rad)), -angle_rad
+            if planned.speed_mps < 0:
+                y_m, heading_rad = -y_m, angle_rad
+        if planned.speed_mps < 0:
+            heading_rad += math.pi
+    return replace(asked, world=replace(asked.world, start=(x_m, y_m, heading_rad))), robot
+
+
+def config_for(planned: Planned, overrides: Sequence[str] = ()) -> list[str]:
+    """Return the settings of a drive."""
+    names = ("controller.limits.velocity_mps", "controller.heading.velocity_mps", "navigation.pursuit.velocity_mps")
+    speed_mps = 0.8 if planned.world.startswith("room_") else abs(planned.speed_mps)
+    settings = [f"{name}={speed_mps}" for name in names]
+    return ["places.enabled=false", *settings, *BUILDS[planned.build].settings, *overrides]
+
+
 def drive(planned: Planned, overrides: Sequence[str] = ()) -> Drive:
     """Make a drive."""
-    asked, cpu_s = trial(planned.world, planned.seed), time.process_time()
-    robot = asked.robot(planned.size_px)
-    names = ("controller.limits.velocity_mps", "controller.heading.velocity_mps", "navigation.velocity_mps")
-    settings = [f"{name}={abs(planned.speed_mps)}" for name in names]
-    config = load_config(None, ["places.enabled=false", *settings, *overrides])
-    script = Asker(asked, planned.speed_mps)
+    cpu_s, tamper = time.process_time(), None
+    asked, robot = prepared(planned)
+    if planned.has_real_lenses:
+        robot, tamper = with_real_lenses(
+            replace(robot, sensor=replace(robot.sensor, is_compressed=False)), planned.seed
+        )
     asked_m = asked.way_m if asked.goal is None else math.hypot(*asked.goal[:2])
+    asker = Asker(asked, planned)
+    script: Callable[[Moment], Iterator[Request]] = asker
     seconds = 5.0 + asked_m / min(SLOWEST_MPS, abs(planned.speed_mps))
-    run = simulate(asked.world, robot, script, seconds=seconds, seed=planned.seed, config=config)
-    return judged(run, asked, asked_m, script.began_s, time.process_time() - cpu_s)
+    if asked.motion == "at random":
+        script, seconds = Wanderer(planned.seed), RANDOMLY_S
+    config = load_config(None, config_for(planned, overrides))
+    run = simulate(asked.world, robot, script, seconds=seconds, seed=planned.seed, config=config, tamper=tamper)
+    began_s = 0.0 if math.isinf(asker.began_s) else asker.began_s
+    return judged(run, asked, robot, asked_m, began_s, time.process_time() - cpu_s)
 
 
-def judged(run: SimulatedRun, asked: Trial, asked_m: float, began_s: float, cpu_s: float) -> Drive:
+def judged(
+    run: SimulatedRun, asked: Trial, robot: SimulatedRobot, asked_m: float, began_s: float, cpu_s: float
+) -> Drive:
     """Return what came of a run, by the truth."""
-    places = np.array([tick.pose[:2] for tick in run.ticks])
-    times_s = np.array([tick.time_s for tick in run.ticks])
+    places, times_s = np.array([tick.pose[:2] for tick in run.ticks]), np.array([tick.time_s for tick in run.ticks])
     speeds = np.linalg.norm(np.diff(places, axis=0), axis=1) / np.diff(times_s)
+    # 1. How far it came.
     driven_m = float(np.linalg.norm(places[-1] - places[0]))
     if asked.goal is not None:
         c, s = math.cos(asked.world.start[2]), math.sin(asked.world.start[2])
@@ -123,12 +243,36 @@ def judged(run: SimulatedRun, asked: Trial, asked_m: float, began_s: float, cpu_
         driven_m = asked_m - float(np.linalg.norm(places[-1] - goal))
     moved = np.flatnonzero(speeds > OWN_MPS)
     last_s = times_s[moved[-1] + 1] if len(moved) else began_s
+    # 2. What it touched, and where it stood.
     at_contact = [int(np.argmin(np.abs(times_s[1:] - tick.time_s))) for tick in run.contacts]
-    stops = [line.removeprefix("the wheels stop: ") for _, line in run.lines if line.startswith("the wheels stop")]
-    states = [f"{update.state}: {update.reason}" for update in run.navigation if update.reason]
-    ended = "" if driven_m >= DRIVEN * asked_m else "; ".join([*states[-1:], *stops[-1:]])
     own = sum(bool(speeds[tick] > OWN_MPS) for tick in at_contact)
-    return Drive(asked_m, driven_m, float(last_s - began_s), len(run.contacts), own, run.clearance_m, ended, cpu_s)
+    is_through = driven_m >= DRIVEN * asked_m
+    stopped_m = None
+    if asked.things is not None and asked.motion == "ahead" and not is_through:
+        stopped_m = _from_hazard_m(run, asked, robot)
+    # 3. Why, in the daemon's words.
+    stops = [line.removeprefix("the wheels stop: ") for _, line in run.lines if line.startswith("the wheels stop")]
+    disarmed = [line for at_s, line in run.lines if line.startswith("disarmed") and at_s < run.ticks[-1].time_s - 2.5]
+    states = [f"{update.state}: {update.reason}" for update in run.navigation if update.reason]
+    ended = "" if is_through else "; ".join([*states[-1:], *(disarmed or stops)[-1:]])
+    time_s, pairs = float(last_s - began_s), len(run.stamps_ns)
+    return Drive(asked_m, driven_m, time_s, len(run.contacts), own, run.clearance_m, stopped_m, ended, pairs, cpu_s)
+
+
+def _from_hazard_m(run: SimulatedRun, asked: Trial, robot: SimulatedRobot) -> float:
+    """Return the distance of the outline from what is in the way, at the end."""
+    people = Walkers(asked.world.people)
+    for tick in run.ticks:
+        people.advance(tick.time_s, tick.pose[:2])
+    things = (*(asked.things or ()), *people.faces())
+    segments = np.concatenate([footprints(things, robot.height_m, asked.world.ground), asked.world.edges])
+    if asked.world.name == "steep_ramp":  # it begins there
+        x_m = asked.world.ground.profile[0][0]
+        segments = np.array([[[x_m, -1.2], [x_m, 1.2]]])
+    return clearance_m(segments, run.ticks[-1].pose[:2], robot.radius_m)
+
+
+# Results
 
 
 def known_drives() -> dict[str, Drive]:
@@ -138,45 +282,130 @@ def known_drives() -> dict[str, Drive]:
     return {line["name"]: Drive(**line["drive"]) for line in lines if line["commit"] == here}
 
 
-def add_table(planned: Sequence[Planned], drives: dict[str, Drive]) -> None:
-    """Print and write the table of the harmless worlds."""
+Made = Sequence[tuple[Planned, Drive]]
+
+
+def groups(made: Made) -> Iterator[tuple[str, Made]]:
+    """Yield the rows of a table: by world, then by speed, size and floor where there are several, then all."""
+    keys: tuple[Callable[[Planned], str], ...] = (
+        lambda one: one.world,
+        lambda one: f"at {one.speed_mps:g} m/s" + " turning" * one.is_turning,
+        lambda one: f"{one.size_px} px",
+        lambda one: f"on {one.floor or 'its own floor'}",
+        lambda one: f"{one.build} robot" + " with real lenses" * one.has_real_lenses,
+    )
+    for number, key in enumerate(keys):
+        names = list(dict.fromkeys(key(planned) for planned, _ in made))
+        if number == 0 or len(names) > 1:
+            yield from ((name, [one for one in made if key(one[0]) == name]) for name in names)
+    yield "all", made
+
+
+def pace(planned: Planned, made: Made) -> float:
+    """Return the time [s] of a metre on a textured floor at this speed and size; that of steady speed without one."""
+    times = [
+        drive.time_s / drive.driven_m
+        for one, drive in made
+        if one.world == TEXTURED and (one.speed_mps, one.size_px) == (planned.speed_mps, planned.size_px)
+    ]
+    return float(np.median(times)) if times else 1.0 / abs(planned.speed_mps)
+
+
+def add_free_table(made: Made) -> None:
+    """Print and write the table of the worlds in which nothing is in the way."""
     columns = (
         Column("world"),
         Column("drives"),
         Column("driven of what was asked", "%", 0),
-        Column("time to that of steady speed", "", 2),
+        Column("time to that of a textured floor", "", 2),
+        Column("all of it, in 1.5 times that time", "%", 0),
         Column("contacts"),
         Column("last stop"),
     )
     table = ResultTable("obstacles_free", "Where nothing is in the way", columns)
-    table.seeds = sorted({(FAMILY, one.seed) for one in planned})
-    for name in dict.fromkeys(one.world for one in planned):
-        made = [(one, drives[str(one)]) for one in planned if one.world == name and str(one) in drives]
-        if made:
-            ratios = [d.time_s * abs(one.speed_mps) / max(d.driven_m, 0.1) for one, d in made]
-            share = 100 * float(np.mean([d.share for _, d in made]))
-            reasons = "; ".join(dict.fromkeys(d.ended for _, d in made if d.ended))
-            table.add(name, len(made), share, float(np.median(ratios)), sum(d.own for _, d in made), reasons)
+    table.seeds = sorted({(FAMILY, planned.seed) for planned, _ in made})
+    for name, part in groups(made):
+        ratios = [d.time_s / max(d.driven_m, 0.1) / pace(one, made) for one, d in part]
+        good = [d.share >= DRIVEN and ratio <= 1.5 for (_, d), ratio in zip(part, ratios, strict=True)]
+        share = 100 * float(np.mean([d.share for _, d in part]))
+        reasons = "; ".join(dict.fromkeys(d.ended for _, d in part if d.ended)) if name in HARMLESS else ""
+        contacts = sum(d.own for _, d in part)
+        table.add(name, len(part), share, float(np.median(ratios)), 100 * float(np.mean(good)), contacts, reasons)
+
+
+def add_hazard_table(made: Made) -> None:
+    """Print and write the table of the worlds in which something is in the way."""
+    columns = (
+        Column("hazard"),
+        Column("drives"),
+        Column("contacts"),
+        Column("of the robot's own"),
+        Column("least clearance", "m", 2),
+        Column("passed, or stopped 0.05 to 0.8 m before it", "%", 0),
+        Column("stopped earlier"),
+        Column("distances of the stops", "m"),
+        Column("last stop"),
+    )
+    table = ResultTable("obstacles_touched", "What was touched", columns)
+    table.seeds = sorted({(FAMILY, planned.seed) for planned, _ in made})
+    for name, part in groups(made):
+        drives = [d for _, d in part]
+        stops = sorted(d.stopped_m for d in drives if d.stopped_m is not None)
+        is_one = len({one.world for one, _ in part}) == 1
+        table.add(
+            name,
+            len(drives),
+            sum(d.contacts for d in drives),
+            sum(d.own for d in drives),
+            min(d.clearance_m for d in drives),
+            100 * float(np.mean([d.is_right for d in drives])),
+            sum(stop_m > STOPS_M[1] for stop_m in stops),
+            " ".join(f"{stop_m:.2f}" for stop_m in stops) if is_one else "",
+            "; ".join(dict.fromkeys(d.ended for d in drives if d.ended))[:200] if is_one else "",
+        )
+
+
+def tables(wanted: Sequence[Planned], drives: dict[str, Drive]) -> None:
+    """Print and write both tables of the drives that were made."""
+    made = [(one, drives[str(one)]) for one in wanted if str(one) in drives]
+    for add, is_hazard in ((add_free_table, False), (add_hazard_table, True)):
+        part = [(one, d) for one, d in made if (one.world not in HARMLESS) == is_hazard]
+        if part:
+            add(part)
 
 
 def main() -> None:
     """Make the drives that are missing, print a line for each, and write the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="+", default=HARMLESS, metavar="NAME", help="worlds (omnid.simulation)")
+    parser.add_argument(
+        "--only", nargs="+", metavar="NAME", help="worlds; harmless, hazards: all of them; default both"
+    )
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])
     parser.add_argument("--speed", type=float, nargs="+", default=[0.3], help="m/s; below 0: backwards")
     parser.add_argument("--px", type=int, nargs="+", default=[512], help="sizes of the images")
+    parser.add_argument("--floor", nargs="+", choices=FLOORS, default=[None], help="other floors than the worlds' own")
+    parser.add_argument("--robot", nargs="+", choices=BUILDS, default=[USUAL], help="dimensions (fine_robot.py)")
+    parser.add_argument("--turning", action="store_true", help="towards hazards on an arc")
+    parser.add_argument("--real", action="store_true", help="images of real lenses (real_lenses.py)")
     parser.add_argument("--jobs", type=int, default=1, help="drives at a time")
+    parser.add_argument("--open-loop", type=Path, metavar="FOLDER", help="keep pairs there, and judge today's ring")
     parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE")
     arguments = parser.parse_args()
-    here, drives = commit(), known_drives()
+    lists = {"harmless": HARMLESS, "hazards": HAZARDS}
+    names = [name for given in arguments.only or lists for name in lists.get(given, (given,))]
     wanted = [
-        Planned(name, seed, speed_mps, size_px)
-        for name in arguments.only
-        for speed_mps in arguments.speed
-        for size_px in arguments.px
-        for seed in arguments.seeds
+        Planned(name, seed, speed_mps, size_px, floor, build, arguments.turning, arguments.real)
+        for name, speed_mps, size_px, floor, build, seed in product(
+            names, arguments.speed, arguments.px, arguments.floor, arguments.robot, arguments.seeds
+        )
     ]
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of the processes that follow
+    if arguments.open_loop:
+        from tests.bench.open_loop import judge_rings
+
+        judge_rings(wanted, arguments.open_loop, arguments.jobs)
+        return
+    here, drives = commit(), known_drives()
     missing = [planned for planned in wanted if str(planned) not in drives]
     LINES.parent.mkdir(parents=True, exist_ok=True)
     with ProcessPoolExecutor(arguments.jobs, get_context("spawn")) as pool, LINES.open("a") as lines:
@@ -187,7 +416,7 @@ def main() -> None:
             print(f"{name}: {made}", flush=True)
             lines.write(json.dumps({"commit": here, "name": name, "drive": asdict(made)}) + "\n")
             lines.flush()
-    add_table(wanted, drives)
+    tables(wanted, drives)
 
 
 if __name__ == "__main__":

@@ -27,8 +27,7 @@ from omnid.core.control.collision_monitor import RING_STALE, UNSEEN, UNWATCHED
 from omnid.simulation.lockstep import Fault, Moment, Request, Tamper, simulate
 from omnid.simulation.robot import make_robot
 from omnid.simulation.world_file import load_world
-from tests.bench.corridor_worlds import world_text
-from tests.bench.obstacle_stops import ahead
+from tests.bench.obstacles import ahead
 from tests.bench.results import Column, ResultTable
 
 Image = NDArray[np.uint8]
@@ -114,7 +113,7 @@ def pixels(frame: Frame) -> Image:
 class Case(NamedTuple):
     """A fault of the images, and the world in which it happens."""
 
-    world: str  # of tests.bench.corridor_worlds
+    world: str  # see world_text
     tamper: Callable[[], Tamper | None]
     faults: tuple[Fault, ...] = ()
     since_s: float = STARTS_S  # of the fault
@@ -140,6 +139,31 @@ CASES: Final[dict[str, Case]] = {
     "each second image repeated": Case("box", _repeating),
     "none": Case("box", lambda: None, since_s=0.0),
 }
+
+
+def world_text(case: str, rng: random.Random) -> str:
+    """Return a corridor along x with a box, or with a person who steps in 0.8 m before the robot, as a world file."""
+    left, right = rng.uniform(0.9, 1.5), -rng.uniform(0.9, 1.5)
+    walls = [rng.choice(("brick", "granite", "plaster")) for _ in range(2)]
+    lines = ["schema = 1", "start = [0.0, 0.0, 0.0]", "[space]", f"low = [-2.0, {right}]", f"high = [12.0, {left}]"]
+    corners = [[-2.0, left], [12.0, left], [12.0, right], [-2.0, right]]
+    for first, last, texture, per_m in (
+        (0, 1, walls[0], 0.6),
+        (2, 3, walls[1], 0.6),
+        (1, 2, "brick", 0.6),
+        (3, 0, "brick", 0.0),
+    ):
+        lines += ["[[wall]]", f"points = {[corners[first], corners[last]]}"]
+        lines += [f'texture = "{texture}"', f"posters_per_m = {per_m}"]
+    if case == "box":
+        size = [rng.uniform(0.25, 0.6), rng.uniform(0.25, 0.6), rng.uniform(0.4, 1.2)]
+        at = [rng.uniform(2.0, 3.0), rng.uniform(-0.15, 0.15)]
+        return "\n".join([*lines, "[[box]]", f"at = {at}", f"size_m = {size}", f"yaw_deg = {rng.uniform(-40, 40)}"])
+    aside = rng.choice((1, -1)) * (min(left, -right) - 0.3)
+    at_m = rng.uniform(2.3, 3.0)
+    lines += ["[[person]]", f"path = [[{at_m}, {aside}], [{at_m}, {rng.uniform(-0.1, 0.1)}]]"]
+    lines += [f"speed_mps = {rng.uniform(0.8, 1.4)}", f"starts_within_m = {1.0 + abs(aside) * 0.4}"]
+    return "\n".join(lines)
 
 
 class Outcome(NamedTuple):

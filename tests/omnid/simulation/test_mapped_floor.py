@@ -13,7 +13,7 @@ from omnid.formats.place_file import read_places
 from omnid.simulation.lockstep import simulate
 from omnid.simulation.world_file import load_world
 from tests.bench.fine_robot import fine_robot
-from tests.bench.obstacle_stops import ahead
+from tests.bench.obstacles import ahead
 
 BOX_M = (1.6, 0.75), (0.4, 0.4, 0.08)  # its middle, and its sides
 POLE_M = (1.3, -0.8), (0.06, 0.06, 1.8)

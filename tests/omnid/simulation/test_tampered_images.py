@@ -15,7 +15,7 @@ from omnid.simulation.robot import make_robot
 from omnid.simulation.world import World
 from omnid.simulation.world_file import load_world
 from tests.bench.faults.images import Frozen, sector
-from tests.bench.obstacle_stops import ahead
+from tests.bench.obstacles import ahead
 
 SIZE_PX = 256
 STARTS_S = 1.5

@@ -1,0 +1,486 @@
+"""Worlds in which something is in the way: on the floor, over it, below it, moving, or nearer than the view.
+
+What stands in the way is about 2 to 3 m ahead, a little beside the way.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Final
+
+import numpy as np
+
+from omnid.simulation.building_parts import Builder, Opening, Point3, kind_paint, plain_paint, poster_paint
+from omnid.simulation.people import Person, moved
+from omnid.simulation.rendering.shapes import Paint, Point, solid
+from omnid.simulation.rendering.surfaces import Rectangle
+from omnid.simulation.trials import BEHIND_M, Trial, built, corridor, put_thing
+from omnid.simulation.world import Ground
+
+Part = tuple[Point3, Point3]  # the middle of the bottom of a box, and its sides [m]
+PLAIN: Final = "plain_"  # begins the name of a thing that has one grey
+PRINTED: Final = ("box", "low_box", "block", "shelf", "drawer", "table")  # things with pictures on them
+LENGTH_M: Final = 12.0
+WALKER_MPS: Final = 0.5  # of the robot whose way people cross
+
+
+# Things on the floor, or over it, from the middle of what is in the way
+
+
+def _legs(apart: Point, side_m: float, high_m: float) -> list[Part]:
+    """Return four legs at the corners of a rectangle."""
+    return [((x * apart[0] / 2, y * apart[1] / 2, 0.0), (side_m, side_m, high_m)) for x in (1, -1) for y in (1, -1)]
+
+
+def _box(b: Builder) -> list[Part]:
+    return [((0.0, 0.0, 0.0), (b.rng.uniform(0.25, 0.6), b.rng.uniform(0.25, 0.6), b.rng.uniform(0.4, 1.2)))]
+
+
+def _low_box(b: Builder) -> list[Part]:
+    return [((0.0, 0.0, 0.0), (b.rng.uniform(0.25, 0.6), b.rng.uniform(0.25, 0.6), 0.08))]
+
+
+def _block(b: Builder) -> list[Part]:
+    return [((0.0, 0.0, 0.0), (b.rng.uniform(0.25, 0.5), b.rng.uniform(0.25, 0.5), b.rng.uniform(0.15, 0.6)))]
+
+
+def _pole(b: Builder) -> list[Part]:
+    side_m = b.rng.uniform(0.03, 0.08)
+    return [((0.0, 0.0, 0.0), (side_m, side_m, 1.8))]
+
+
+def _leg(_: Builder) -> list[Part]:
+    return [((0.0, 0.0, 0.0), (0.03, 0.03, 0.7)), ((0.0, 0.35, 0.7), (0.5, 0.8, 0.03))]
+
+
+def _bar(b: Builder) -> list[Part]:
+    return [((0.0, 0.0, b.rng.uniform(0.12, 1.1)), (0.03, 1.4, 0.03))]
+
+
+def _bar_end_on(b: Builder) -> list[Part]:
+    return [((0.7, 0.0, b.rng.uniform(0.12, 1.1)), (1.4, 0.04, 0.04))]
+
+
+def _table(b: Builder) -> list[Part]:
+    top_m = b.rng.uniform(0.6, 0.8)
+    return [*_legs((0.76, 0.56), 0.04, top_m), ((0.0, 0.0, top_m), (0.8, 0.6, 0.04))]
+
+
+def _tines(b: Builder) -> list[Part]:
+    low_m = b.rng.uniform(0.04, 0.1)
+    tines: list[Part] = [((0.5, y, low_m), (1.0, 0.12, 0.06)) for y in (0.25, -0.25)]
+    return [((1.3, 0.0, 0.0), (0.6, 0.9, 1.1)), *tines]
+
+
+def _chair(b: Builder) -> list[Part]:
+    seat_m = b.rng.uniform(0.4, 0.48)
+    back: list[Part] = [((-0.2, 0.0, z), (0.02, 0.42, 0.06)) for z in (0.6, 0.75, 0.88)]
+    posts: list[Part] = [((-0.2, y, seat_m), (0.03, 0.03, 0.5)) for y in (0.2, -0.2)]
+    return [*_legs((0.4, 0.4), 0.03, seat_m), ((0.0, 0.0, seat_m), (0.42, 0.42, 0.03)), *posts, *back]
+
+
+def _stool(b: Builder) -> list[Part]:
+    high_m = b.rng.uniform(0.45, 0.75)
+    return [*_legs((0.28, 0.28), 0.025, high_m), ((0.0, 0.0, high_m), (0.33, 0.33, 0.03))]
+
+
+def _ladder(b: Builder) -> list[Part]:
+    wide_m = b.rng.uniform(0.4, 0.55)
+    rungs: list[Part] = [((-0.3, 0.0, 0.28 * (n + 1)), (0.03, wide_m, 0.03)) for n in range(5)]
+    return [*_legs((0.6, wide_m), 0.04, 1.6), *rungs]
+
+
+def _barrier(b: Builder) -> list[Part]:
+    """Return two posts and a belt between them, which is what is in the way."""
+    posts: list[Part] = [((0.0, y, 0.0), (0.05, 0.05, 0.95)) for y in (0.75, -0.75)]
+    return [*posts, ((0.0, 0.0, b.rng.uniform(0.7, 0.9)), (0.005, 1.5, 0.05))]
+
+
+def _pallet(b: Builder) -> list[Part]:
+    runners: list[Part] = [((0.0, y, 0.0), (1.2, 0.1, 0.11)) for y in (-0.35, 0.0, 0.35)]
+    boards: list[Part] = [((x, 0.0, 0.11), (0.12, 0.8, 0.02)) for x in (-0.54, -0.27, 0.0, 0.27, 0.54)]
+    load: list[Part] = [((0.0, 0.0, 0.13), (0.9, 0.7, 0.4))] if b.rng.random() < 0.3 else []
+    return runners + boards + load
+
+
+def _trolley(b: Builder) -> list[Part]:
+    bed_m = b.rng.uniform(0.14, 0.24)
+    handle: list[Part] = [((-0.45, y, bed_m), (0.03, 0.03, 0.7)) for y in (0.25, -0.25)]
+    bed: list[Part] = [((0.0, 0.0, bed_m), (0.9, 0.6, 0.05)), ((-0.45, 0.0, bed_m + 0.7), (0.03, 0.53, 0.03))]
+    return [*_legs((0.7, 0.5), 0.08, bed_m), *bed, *handle]
+
+
+def _open_door(b: Builder) -> list[Part]:
+    return [((0.0, 0.0, 0.005), (b.rng.uniform(0.7, 0.9), 0.04, 2.0))]
+
+
+def _drawer(b: Builder) -> list[Part]:
+    """Return a cabinet beside the way, and a drawer that stands out of it into the way."""
+    return [((0.0, 0.95, 0.0), (0.5, 0.6, 1.2)), ((0.0, 0.35, b.rng.uniform(0.3, 0.8)), (0.45, 0.6, 0.18))]
+
+
+def _lying_person(b: Builder) -> list[Part]:
+    return [((0.0, 0.0, 0.0), (0.4, 1.1, b.rng.uniform(0.18, 0.24))), ((0.0, 0.7, 0.0), (0.2, 0.2, 0.2))]
+
+
+def _stairs_up(_: Builder) -> list[Part]:
+    return [((0.3 * n, 0.0, 0.16 * n), (0.3, 1.2, 0.16)) for n in range(5)]
+
+
+def _shelf(b: Builder) -> list[Part]:
+    boards: list[Part] = [((0.0, 0.0, z), (0.35, 0.9, 0.02)) for z in (b.rng.uniform(0.3, 0.4), 0.8, 1.25, 1.7)]
+    return [*_legs((0.32, 0.87), 0.025, 1.75), *boards]
+
+
+def _hose(_: Builder) -> list[Part]:
+    return [((0.0, 0.0, 0.0), (0.05, 1.6, 0.05))]
+
+
+def _dock(_: Builder) -> list[Part]:
+    """Return the charging station of a robot: a plate of 3 cm, and a back."""
+    return [((0.0, 0.0, 0.0), (0.4, 0.4, 0.03)), ((0.22, 0.0, 0.0), (0.06, 0.4, 0.3))]
+
+
+# By name: its parts, and the largest angle by which it is turned [deg].
+THINGS: Final[dict[str, tuple[Callable[[Builder], list[Part]], float]]] = {
+    "box": (_box, 40.0),
+    "low_box": (_low_box, 40.0),
+    "block": (_block, 90.0),
+    "pole": (_pole, 40.0),
+    "leg": (_leg, 15.0),
+    "bar": (_bar, 0.0),
+    "bar_end_on": (_bar_end_on, 0.0),
+    "table": (_table, 0.0),
+    "tines": (_tines, 0.0),
+    "chair": (_chair, 180.0),
+    "stool": (_stool, 45.0),
+    "ladder": (_ladder, 180.0),
+    "barrier": (_barrier, 20.0),
+    "pallet": (_pallet, 90.0),
+    "trolley": (_trolley, 180.0),
+    "open_door": (_open_door, 25.0),
+    "drawer": (_drawer, 10.0),
+    "lying_person": (_lying_person, 90.0),
+    "stairs_up": (_stairs_up, 15.0),
+    "shelf": (_shelf, 90.0),
+    "hose_5cm": (_hose, 25.0),
+    "dock": (_dock, 20.0),
+}
+
+
+def _wide_corridor(b: Builder) -> None:
+    corridor(b, width_m=b.rng.uniform(2.2, 3.0), length_m=LENGTH_M + BEHIND_M)
+
+
+def _hazard(b: Builder, first: int, **fields: object) -> Trial:
+    """Return the trial in which what was built since a number of faces is in the way."""
+    return Trial(built(b, **fields), things=tuple(b.faces[first:]))
+
+
+def _place(b: Builder) -> Point:
+    return b.rng.uniform(2.2, 3.0), b.rng.uniform(-0.15, 0.15)
+
+
+def _put(b: Builder, name: str, paint: Paint, at: Point, yaw_rad: float | None = None) -> None:
+    """Add a thing whose nearest part is at a place; yaw None: any of its own."""
+    parts_of, most_deg = THINGS[name]
+    yaw_rad = math.radians(b.rng.uniform(-most_deg, most_deg)) if yaw_rad is None else yaw_rad
+    first = len(b.faces)
+    b.thing(parts_of(b), (0.0, 0.0), yaw_rad, paint)
+    nearest_m = min(float(face.corners[:, 0].min()) for face in b.faces[first:])
+    shift = np.array([at[0] - nearest_m, at[1], 0.0])
+    b.faces[first:] = [replace(face, origin=face.origin + shift) for face in b.faces[first:]]
+
+
+def _thing(b: Builder, plain: str, name: str) -> Trial:
+    _wide_corridor(b)
+    first = len(b.faces)
+    if plain:
+        paint = plain_paint(b.rng, b.rng.uniform(60, 230))
+    elif name in PRINTED:
+        paint = poster_paint(b.rng)
+    else:
+        paint = kind_paint(b.rng, str(b.rng.choice(["granite", "plaster"])))
+    _put(b, name, paint, _place(b))
+    return _hazard(b, first)
+
+
+def _contrast(b: Builder, name: str, percent: str) -> Trial:
+    """A thing, or a drop of 15 cm, whose grey as it is seen differs from the floor's by so many per cent."""
+    share = 1 + float(b.rng.choice([-1, 1])) * float(percent) / 100
+    if name == "edge":
+        return _edge(b, "15", share)
+    _wide_corridor(b)
+    first, floor = len(b.faces), b.faces[0]
+    _put(b, name, plain_paint(b.rng, 100.0), _place(b))
+    grey = share * float(floor.texture.mean()) * floor.brightness
+
+    def painted(face: Rectangle) -> Rectangle:
+        value = np.clip(round(grey / face.brightness), 0, 255)
+        return replace(face, texture=np.full_like(face.texture, value))
+
+    b.faces[first:] = [painted(face) for face in b.faces[first:]]
+    return _hazard(b, first)
+
+
+# What the floor does
+
+
+def _edge(b: Builder, drop_cm: str, share: float | None = None, stairs: int = 1) -> Trial:
+    """A corridor whose floor falls, by steps of which each is 0.28 m long; share: of the grey below."""
+    at_m, half_m, drop_m = b.rng.uniform(2.0, 3.0), b.rng.uniform(1.1, 1.5), float(drop_cm) / 100
+    low, high = (-BEHIND_M, -half_m), (LENGTH_M, half_m)
+    b.floor(low, (at_m, half_m))
+    profile, x_m = [(at_m, 0.0)], at_m
+    for step in range(stairs):
+        z_m, end_m = -(step + 1) * drop_m, x_m + 0.28 if step + 1 < stairs else high[0]
+        before = b.faces[0].texture
+        b.floor((x_m, -half_m), (end_m, half_m), (z_m, z_m))
+        if share is not None:
+            value = np.clip(round(share * float(before.mean())), 0, 255)
+            b.faces[-1] = replace(b.faces[-1], texture=np.full_like(b.faces[-1].texture, value))
+        profile += [(x_m, z_m), (end_m, z_m)]
+        x_m = end_m
+    depth_m = stairs * drop_m
+    b.ceiling(low, high)
+    b.room(low, high, doors=2, pictures=3)
+    for a, c in (((at_m, half_m), (LENGTH_M, half_m)), ((LENGTH_M, -half_m), (at_m, -half_m))):
+        b.upright(a, c, (-depth_m, 0.0), b.wall_grey)
+    b.upright((LENGTH_M, half_m), (LENGTH_M, -half_m), (-depth_m, 0.0), b.wall_grey)
+    edge = np.array([[[at_m, -half_m], [at_m, half_m]]])
+    return Trial(built(b, ground=Ground(tuple(profile)), edges=edge), things=())
+
+
+def _steep_ramp(b: Builder) -> Trial:
+    """A ramp down of 20 degrees: it may be driven, or not."""
+    at_m, low, high = b.rng.uniform(2.0, 3.0), (-BEHIND_M, -1.2), (LENGTH_M, 1.2)
+    down_m = 2.0 * math.tan(math.radians(20.0))
+    b.floor(low, (at_m, 1.2))
+    b.floor((at_m, -1.2), (at_m + 2.0, 1.2), (0.0, -down_m))
+    b.floor((at_m + 2.0, -1.2), high, (-down_m, -down_m))
+    b.ceiling(low, high)
+    b.room(low, high, doors=2)
+    for a, c in (((at_m, 1.2), (LENGTH_M, 1.2)), ((LENGTH_M, -1.2), (at_m, -1.2)), ((LENGTH_M, 1.2), (LENGTH_M, -1.2))):
+        b.upright(a, c, (-down_m, 0.0), b.wall_grey)
+    return Trial(built(b, ground=Ground(((at_m, 0.0), (at_m + 2.0, -down_m)))), way_m=at_m + 3.0, things=())
+
+
+def _white_wall(b: Builder) -> Trial:
+    """A corridor that ends at a wall of fresh white paint, without a skirting board."""
+    end_m, half_m = b.rng.uniform(3.5, 4.5), b.rng.uniform(1.0, 1.4)
+    low, high = (-BEHIND_M, -half_m), (end_m, half_m)
+    b.floor(low, high)
+    b.ceiling(low, high)
+    b.wall((low[0], half_m), (end_m, half_m), doors=1, pictures=1)
+    b.wall((end_m, -half_m), (low[0], -half_m), doors=1)
+    b.wall((low[0], -half_m), (low[0], half_m))
+    first = len(b.faces)
+    b.upright((end_m, half_m), (end_m, -half_m), (0.0, b.ceiling_m), 225.0)
+    return _hazard(b, first)
+
+
+def _glass_with_frame(b: Builder) -> Trial:
+    """A glass door with a frame and a handle across the corridor; what is behind it is seen."""
+    _wide_corridor(b)
+    first, at_m = len(b.faces), b.rng.uniform(2.2, 3.0)
+    frame = plain_paint(b.rng, float(b.rng.choice([60.0, 170.0, 220.0])))
+    uprights: list[Part] = [((0.0, y, 0.0), (0.05, 0.05, 2.1)) for y in (-1.5, -0.5, 0.5, 1.5)]
+    across: list[Part] = [((0.0, 0.0, z), (0.04, 3.0, 0.06)) for z in (0.0, 2.05)]
+    handle: list[Part] = [((-0.05, 0.4, 0.9), (0.03, 0.03, 0.35))]
+    b.thing([*uprights, *across, *handle], (at_m, 0.0), 0.0, frame)
+    for left_m in (1.5, 0.5, -0.5):
+        origin, along = np.array([at_m, left_m, 2.05]), np.array([0.0, -1.0, 0.0])
+        b.panes.append(Rectangle(origin, along, np.array([0.0, 0.0, -1.99]), np.full((8, 8), 255, np.uint8), "pane"))
+    return replace(_hazard(b, first), things=(*b.faces[first:], *b.panes))
+
+
+def _star_legs(b: Builder) -> Trial:
+    _wide_corridor(b)
+    first = len(b.faces)
+    b.star_chair((b.rng.uniform(2.5, 3.0), b.rng.uniform(-0.1, 0.1)), b.rng.uniform(0, math.tau))
+    return _hazard(b, first)
+
+
+# People
+
+
+def _people(b: Builder, *people: Person) -> Trial:
+    return Trial(built(b, people=people), things=())
+
+
+def _standing(b: Builder, height_m: float) -> Trial:
+    """Somebody stands in the way, looking anywhere."""
+    _wide_corridor(b)
+    at, towards = _place(b), b.rng.uniform(-1, 1, 2)
+    path = (at, (at[0] + towards[0], at[1] + towards[1]))
+    return _people(b, Person(b.adult(height_m), path, 0.0))
+
+
+def _leads(b: Builder, *, comes_back: bool) -> Trial:
+    """Somebody walks ahead of the robot and stops, or then steps back towards it."""
+    _wide_corridor(b)
+    y_m, stop_m = b.rng.uniform(-0.1, 0.1), b.rng.uniform(3.0, 4.5)
+    path: tuple[Point, ...] = ((1.2, y_m), (stop_m, y_m))
+    rests_s: tuple[float, ...] = (0.0, b.rng.uniform(0.5, 2.5))
+    if comes_back:
+        path, rests_s = (*path, (stop_m - 0.6, y_m)), (*rests_s, 0.0)
+    return _people(
+        b, Person(b.adult(), path, b.rng.uniform(0.5, 0.8), start_s=b.rng.uniform(2.0, 4.0), rests_s=rests_s)
+    )
+
+
+def _steps_in(b: Builder, within_cm: str) -> Trial:
+    """Somebody steps into the way when the robot is so near."""
+    _wide_corridor(b)
+    x_m, aside_m = b.rng.uniform(2.3, 3.0), float(b.rng.choice([-1, 1])) * 0.95
+    starts_m = float(within_cm) / 100 + 0.2 + abs(aside_m) * 0.4
+    path = ((x_m, aside_m), (x_m, b.rng.uniform(-0.1, 0.1)))
+    return _people(b, Person(b.adult(), path, b.rng.uniform(0.8, 1.4), starts_within_m=starts_m))
+
+
+def _crossing(b: Builder, how: str, side: int = 0) -> Person:
+    """Return who crosses the way, from a side, 0: either one; unless one of them stops, they meet."""
+    x_m, speed_mps = b.rng.uniform(2.8, 3.5), b.rng.uniform(0.8, 1.6)
+    aside_m = (side or float(b.rng.choice([-1, 1]))) * 1.8
+    along_m = float(b.rng.choice([-1, 1])) * abs(aside_m) if how == "diagonally" else 0.0
+    before_m = WALKER_MPS * (math.hypot(along_m, aside_m) / speed_mps + b.rng.uniform(0.0, 0.8))
+    path: tuple[Point, ...] = ((x_m - along_m, aside_m), (x_m + along_m, -aside_m))
+    start_s, starts_within_m = 0.0, math.hypot(before_m, aside_m)
+    if how == "turns_round":
+        path = (path[0], (x_m, b.rng.uniform(-0.1, 0.1)), path[0])
+    if how in ("turns_round", "diagonally"):
+        start_s, starts_within_m = 0.75 + (x_m - before_m) / WALKER_MPS, 0.0
+    return Person(b.adult(), path, speed_mps, start_s=start_s, starts_within_m=starts_within_m)
+
+
+def _crosses(b: Builder, how: str) -> Trial:
+    half_m = b.rng.uniform(2.1, 2.6)
+    low, high = (-BEHIND_M, -half_m), (LENGTH_M, half_m)
+    b.floor(low, high)
+    b.ceiling(low, high)
+    b.room(low, high, doors=3, pictures=3)
+    people = [_crossing(b, how, side) for side in ((1, -1) if how == "two" else (0,))]
+    if how == "from_a_door":
+        (person,) = people
+        (x_m, y_m), _ = person.path
+        wall_m, wide_m = math.copysign(b.rng.uniform(0.9, 1.2), y_m), 0.9
+        ends = sorted(((-BEHIND_M, wall_m), (LENGTH_M, wall_m)), reverse=wall_m < 0)
+        b.wall(ends[0], ends[1], [Opening(abs(x_m - ends[0][0]) - wide_m / 2, wide_m)])
+    if how == "like_the_floor":
+        floor = b.faces[0]
+        grey = float(floor.texture.mean()) * floor.brightness
+
+        def painted(face: Rectangle) -> Rectangle:
+            return replace(face, texture=np.full_like(face.texture, np.clip(round(grey / face.brightness), 0, 255)))
+
+        people = [replace(one, faces=tuple(map(painted, one.faces))) for one in people]
+    return _people(b, *people)
+
+
+# Nearer than the view, and rooms full of things
+
+
+def _near(b: Builder, what: str, where: str) -> Trial:
+    """Something stands 0.15 to 0.3 m from the outline of a robot that starts; it is driven towards it."""
+    corridor(b, width_m=2.8)
+    first, apart_m = len(b.faces), 0.2 + b.rng.uniform(0.15, 0.3)
+    angle = {"ahead": 0.0, "behind": math.pi, "beside": math.pi / 2}[where] + b.rng.uniform(-0.15, 0.15)
+    c, s = math.cos(angle), math.sin(angle)
+    if what == "person":
+        place = (apart_m + 0.2) * c, (apart_m + 0.2) * s, angle + math.pi
+        b.faces += [moved(face, place) for face in b.adult()]
+    else:
+        side_m = b.rng.uniform(0.3, 0.5) if what == "box" else b.rng.uniform(0.06, 0.1)
+        paint = kind_paint(b.rng, {"white_pole": "white", "textured_pole": "granite", "box": "plaster"}[what])
+        at = ((apart_m + side_m / 2) * c, (apart_m + side_m / 2) * s, 0.0)
+        b.faces += solid(at, (side_m, side_m, 0.6 if what == "box" else 1.8), angle, paint, is_raised=False)
+    motion = {"ahead": "ahead", "behind": "back", "beside": "turn left"}[where]
+    return replace(_hazard(b, first), motion=motion)  # type: ignore[arg-type]
+
+
+def _room(b: Builder, what: str) -> Trial:
+    """A room full of things at random places, which an operator drives through at random."""
+    x_m, y_m = b.rng.uniform(2.6, 4.0), b.rng.uniform(2.4, 3.5)
+    end_m = x_m + 1.5 * (what == "at_an_edge")
+    low, high = (-x_m, -y_m), (end_m, y_m)
+    b.floor(low, (x_m, y_m))
+    ground, edges = Ground(), np.zeros((0, 2, 2))
+    if what == "at_an_edge":
+        drop_m = float(b.rng.choice([0.08, 0.15, 0.3, 0.5]))
+        b.floor((x_m, -y_m), high, (-drop_m, -drop_m))
+        ground, edges = Ground(((x_m, 0.0), (x_m, -drop_m))), np.array([[[x_m, -y_m], [x_m, y_m]]])
+        for a, c in (((x_m, y_m), high), ((end_m, -y_m), (x_m, -y_m)), (high, (end_m, -y_m))):
+            b.upright(a, c, (-drop_m, 0.0), b.wall_grey)
+    b.ceiling(low, high)
+    b.room(low, high, doors=2, pictures=3, windows=2)
+    first, places = len(b.faces), [(0.0, 0.0)]
+    for _ in range(300):
+        at = float(b.rng.uniform(0.5 - x_m, x_m - 0.5)), float(b.rng.uniform(0.5 - y_m, y_m - 0.5))
+        if len(places) < 15 and math.hypot(*at) > 1.3 and all(math.dist(at, other) > 0.9 for other in places[1:]):
+            places.append(at)
+            if len(places) % 3:
+                put_thing(b, str(b.rng.choice(["box", "carton", "chair", "table", "bin"])), at)
+            else:
+                name = str(b.rng.choice(["low_box", "pole", "stool", "bar"]))
+                _put(b, name, plain_paint(b.rng, b.rng.uniform(50, 230)), at)
+    people = []
+    for _ in range(200):
+        path = tuple(
+            (float(b.rng.uniform(0.4 - x_m, x_m - 0.4)), float(b.rng.uniform(0.4 - y_m, y_m - 0.4))) for _ in "ab"
+        )
+        clear = all(_apart_m(place, *path) > 0.6 for place in places[1:])
+        if what == "with_people" and len(people) < 2 and clear and math.dist(*path) > 2.0:
+            walk = {"start_s": b.rng.uniform(3.0, 6.0), "repeat": "back and forth", "waits_within_m": 1.0}
+            people.append(Person(b.adult(), path, b.rng.uniform(0.8, 1.6), **walk))
+    world = built(
+        b, start=(0.0, 0.0, b.rng.uniform(-math.pi, math.pi)), people=tuple(people), ground=ground, edges=edges
+    )
+    return Trial(world, things=tuple(b.faces[first:]), motion="at random")
+
+
+def _apart_m(point: Point, first: Point, last: Point) -> float:
+    """Return the distance of a point from the line between two others."""
+    x, y = last[0] - first[0], last[1] - first[1]
+    along = ((point[0] - first[0]) * x + (point[1] - first[1]) * y) / (x * x + y * y)
+    along = min(max(along, 0.0), 1.0)
+    return math.dist(point, (first[0] + along * x, first[1] + along * y))
+
+
+CROSSING: Final = ("straight", "diagonally", "like_the_floor", "two", "from_a_door", "turns_round")
+# By a pattern of names: the kind of the floor, None: one with a pattern, and what makes the trial of a match.
+MAKERS: Final[dict[str, tuple[str | None, Callable[..., Trial]]]] = {
+    rf"({PLAIN}|)({'|'.join(THINGS)})": (None, _thing),
+    r"(pole|box|leg|edge)_(\d+)percent": ("linoleum", _contrast),
+    r"edge_(\d+)cm": (None, _edge),
+    "stairs_down": (None, partial(_edge, drop_cm="17", stairs=5)),
+    "steep_ramp": (None, _steep_ramp),
+    "white_wall": (None, _white_wall),
+    "glass_with_frame": (None, _glass_with_frame),
+    "star_legs": (None, _star_legs),
+    "person_stands": (None, partial(_standing, height_m=1.75)),
+    "child_stands": (None, partial(_standing, height_m=1.0)),
+    "person_stops": (None, partial(_leads, comes_back=False)),
+    "person_steps_back": (None, partial(_leads, comes_back=True)),
+    r"person_steps_in_at_(\d+)cm": (None, _steps_in),
+    rf"person_crosses_({'|'.join(CROSSING)})": (None, _crosses),
+    r"near_(white_pole|textured_pole|box|person)_(ahead|behind|beside)": (None, _near),
+    r"room_(of_things|with_people|at_an_edge)": (None, _room),
+}
+NAMES: Final = (
+    *THINGS,
+    *(PLAIN + name for name in THINGS),
+    *(f"{name}_{percent}percent" for name in ("pole", "box", "leg", "edge") for percent in (10, 20)),
+    *(f"edge_{drop}cm" for drop in (8, 15, 30, 50)),
+    *("stairs_down", "steep_ramp", "white_wall", "glass_with_frame", "star_legs", "person_stands", "child_stands"),
+    *("person_stops", "person_steps_back", "person_steps_in_at_80cm", "person_steps_in_at_150cm"),
+    *(f"person_crosses_{how}" for how in CROSSING),
+    *(
+        f"near_{what}_{where}"
+        for what in ("white_pole", "textured_pole", "box", "person")
+        for where in ("ahead", "behind", "beside")
+    ),
+    *("room_of_things", "room_with_people", "room_at_an_edge"),
+)

@@ -1,0 +1,122 @@
+"""Stored pairs along the ways of worlds like buildings, with the truth: `tests.bench.obstacles --open-loop FOLDER`.
+
+Nothing stops the base: it drives on until it is 0.15 m from what is in the way. Each drive is a file of numpy, which
+any method can be tried on, and what today's ring told of it. Arrays by pair (N): lower, upper (N, H, W) uint8;
+stamps_ns; T_world_base (N, 4, 4), true; first_m (N, 360), the range from the base's origin in its sectors to the first
+thing that the base would touch, of the heights that it sweeps, or to where the floor falls; inf: none; ring_m, free_m
+(N, 360) of the ring, NaN where there was none. Of the world: T_base_rig (4, 4), as its file says; profile (P, 2), the
+heights z of the floor at places x; radius_m and height_m of the base.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.frame import Frame, gray
+from omnid.config import load_config
+from omnid.core.control.heading_controller import Setpoint
+from omnid.core.mapping.range_scan import SECTORS, azimuths
+from omnid.simulation.clearance import clearance_m, footprints, obstacles_of, ranges_m
+from omnid.simulation.lockstep import Moment, Request, simulate
+from omnid.simulation.people import Walkers
+from omnid.simulation.vehicle import START_NS
+from tests.bench.results import Column, ResultTable
+
+if TYPE_CHECKING:
+    from tests.bench.obstacles import Planned
+
+Array = NDArray[np.float64]
+EVERY: Final = 3  # pair that is stored
+LONGEST_M: Final = 4.0  # of the way that is stored
+NEAR_M: Final = 0.15  # from the outline to what is in the way, where a drive ends
+LOOK_M, LOOK_RAD = 3.0, np.radians(15.0)  # what counts of a ring
+BEYOND_M: Final = 0.1
+
+
+def stored(planned: Planned, folder: Path) -> Path:
+    """Return the file of a drive, which is made where there is none."""
+    from tests.bench.obstacles import config_for, prepared
+
+    path = folder / f"{planned}.npz".replace(" ", "_").replace(",", "").replace("/", "p")
+    if path.exists():
+        return path
+    asked, robot = prepared(planned)
+    segments, people, images, kept = obstacles_of(asked.world, robot.height_m), Walkers(asked.world.people), {}, {}
+
+    def kept_image(_: float, frame: Frame) -> Frame:
+        if frame.seq % EVERY == 0:
+            images[frame.camera, frame.stamp_ns] = gray(frame)
+        return frame
+
+    def on(moment: Moment) -> Iterator[Request]:
+        if moment.odometry is not None and not moment.controller.armed:
+            yield "arm"
+        x_m, y_m = moment.T_world_base[:2, 3].tolist()
+        people.advance(moment.time_s, (x_m, y_m))
+        all_segments = np.concatenate([segments, footprints(people.faces(), robot.height_m, asked.world.ground)])
+        heading_rad = float(np.arctan2(moment.T_world_base[1, 0], moment.T_world_base[0, 0]))
+        first_m = ranges_m(all_segments, (x_m, y_m), azimuths() + heading_rad)
+        kept[START_NS + round(moment.time_s * 1e9)] = moment.T_world_base, first_m
+        is_near = clearance_m(all_segments, (x_m, y_m), robot.radius_m) < NEAR_M
+        driven_m = float(np.linalg.norm(np.array([x_m, y_m]) - asked.world.start[:2]))
+        yield Setpoint(planned.speed_mps, heading_rad=0.0)
+        if (is_near and driven_m > NEAR_M) or driven_m > LONGEST_M:
+            yield "end"
+
+    config = load_config(None, config_for(planned, ["controller.collision.check=false"]))
+    seconds = 3.0 + LONGEST_M / abs(planned.speed_mps)
+    run = simulate(asked.world, robot, on, seconds=seconds, seed=planned.seed, config=config, tamper=kept_image)
+    rings = {ring.stamp_ns: ring for ring in run.rings}
+    stamps = [stamp_ns for camera, stamp_ns in images if camera == "lower" and stamp_ns in kept]
+    none = np.full(SECTORS, np.nan)
+    folder.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(
+        path,
+        lower=np.array([images["lower", stamp_ns] for stamp_ns in stamps]),
+        upper=np.array([images["upper", stamp_ns] for stamp_ns in stamps]),
+        stamps_ns=np.array(stamps, np.int64),
+        T_world_base=np.array([kept[stamp_ns][0] for stamp_ns in stamps]),
+        first_m=np.array([kept[stamp_ns][1] for stamp_ns in stamps], np.float32),
+        ring_m=np.array([rings[s].ranges_m if s in rings else none for s in stamps], np.float32),
+        free_m=np.array([rings[s].free_m if s in rings else none for s in stamps], np.float32),
+        T_base_rig=run.T_base_rig,
+        profile=np.array(asked.world.ground.profile or [(0.0, 0.0)]),
+        radius_m=robot.radius_m,
+        height_m=robot.height_m,
+    )
+    return path
+
+
+def shares(path: Path, *, backwards: bool) -> tuple[int, float, float]:
+    """Return the number of rings, the share of 3 m ahead that they call free, and of rays that are falsely free."""
+    with np.load(path) as file:
+        free_m, first_m = (np.asarray(file[name], float) for name in ("free_m", "first_m"))
+    told = np.isfinite(free_m).all(axis=1)
+    about_rad = azimuths() - (np.pi if backwards else 0.0)
+    looked = np.abs(np.arctan2(np.sin(about_rad), np.cos(about_rad))) < LOOK_RAD
+    free_m, first_m = (np.minimum(part[told][:, looked], LOOK_M) for part in (free_m, first_m))
+    free = float(np.minimum(free_m, first_m).sum() / max(first_m.sum(), 1e-9))
+    return int(told.sum()), free, float((free_m > first_m + BEYOND_M).mean()) if told.any() else float("nan")
+
+
+def judge_rings(wanted: Sequence[Planned], folder: Path, jobs: int) -> None:
+    """Make the files that are missing, and print a row for each world."""
+    columns = (
+        Column("world"),
+        Column("rings"),
+        Column("free of what is free up to 3 m, within 15 degrees", "%", 0),
+        Column("rays falsely free more than 0.1 m beyond the first thing", "%", 1),
+    )
+    table = ResultTable("obstacles_open_loop", "The obstacle ring on stored pairs", columns)
+    make: Callable[[Planned, Path], Path] = stored
+    with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
+        for planned, path in zip(wanted, pool.map(make, wanted, [folder] * len(wanted)), strict=True):
+            count, free, false = shares(path, backwards=planned.speed_mps < 0)
+            table.add(str(planned), count, 100 * free, 100 * false, seed=("buildings", planned.seed))
