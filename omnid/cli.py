@@ -119,6 +119,7 @@ REMOVED: Final[Mapping[str, str]] = MappingProxyType(
         "map info": "`omnid map show FILE.omap`",
         "map merge": "`omnid map build LOG ... -o FILE.omap --extend` adds the logs of one map to the other",
         "map tags": "`apriltag_ros`, or the package `pupil-apriltags`, finds AprilTags",
+        "motor test --write": "the lines that it prints belong into the section [motor.drive] of the configuration",
         "replay --tags": "`apriltag_ros`, or the package `pupil-apriltags`, finds AprilTags",
         "run --tags": "`apriltag_ros`, or the package `pupil-apriltags`, finds AprilTags",
         "simulate --tags": "`apriltag_ros`, or the package `pupil-apriltags`, finds AprilTags",

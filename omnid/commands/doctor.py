@@ -40,7 +40,6 @@ def examine(config: Config) -> Iterator[Finding]:
     from omnid.doctor import devices, machine
 
     camera, wanted = config.cameras, config.realtime
-    yield from machine.programs()
     named = {name: camera.settings(name) for name in ("lower", "upper")}
     yield from devices.cameras(named, capture_devices(ROOT), ROOT)
     yield from machine.rig(Path(camera.rig), (camera.width_px, camera.height_px), config.obstacles.ring.floor_m)

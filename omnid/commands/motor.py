@@ -1,10 +1,9 @@
-"""`omnid motor test`: find out how the motors are wired, wheel by wheel, and write the settings for that."""
+"""`omnid motor test`: find out how the motors are wired, wheel by wheel, and print the settings for that."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omnid.commands.options import SETTINGS, command, option, settings_of
@@ -13,7 +12,6 @@ from omnid.errors import OmnidError
 if TYPE_CHECKING:  # the help and other commands do not load these
     from omnid.controller.motor_settings import DriveSettings
 
-SECTION = "motor.drive"
 _BEFORE = """The wheels will turn. Raise the robot so that none of them touches the ground, keep hands and hair away
 from them, and have the emergency stop at hand. The daemon must not run. Ctrl-C stops the wheels. Type yes to begin: """
 
@@ -33,16 +31,10 @@ from them, and have the emergency stop at hand. The daemon must not run. Ctrl-C 
         metavar="N",
         help="of the wheels for the scale, 0: do not test it; default %(default)s",
     ),
-    option(
-        "--write",
-        type=Path,
-        metavar="FILE",
-        help="set the lines in this configuration file; its other lines stay as they are",
-    ),
     *SETTINGS,
     examples=(
         "motor test --motor /dev/omnid/motor --config /etc/omnid/omnid.toml",
-        "motor test --motor simulated --set motor.protocol=roboteq --write omnid.toml",
+        "motor test --motor simulated --set motor.protocol=roboteq",
     ),
     description="Turn each motor forwards and back, ask which wheel moved and which way, then turn both wheels a "
     "number of times and ask for the true number. It prints the lines of the configuration that make the wheels turn "
@@ -57,16 +49,13 @@ def run(args: argparse.Namespace) -> int:
     if not config.port:
         raise OmnidError("no motor controller is configured: name its port by --motor, or set motor.port")
     motor_protocol(config.protocol)  # known before anybody is asked to raise the robot
-    text = _text_of(args.write)
     test = WiringTest(config, ask, speed_mps=args.speed, turns=args.turns)
     if ask(_BEFORE).lower() != "yes":
         raise OmnidError("not begun: only `yes` starts the motors")
     drive = test.run()
     values = _lines(config.drive, drive)
-    print(f"\n[{SECTION}]", *(f"{key} = {value}" for key, value in values.items()), sep="\n")
+    print("\n[motor.drive]", *(f"{key} = {value}" for key, value in values.items()), sep="\n")
     print("as it was set" if drive == config.drive else "different from the settings so far")
-    if args.write is not None:
-        _write(args.write, text, values, drive)
     return 0
 
 
@@ -76,7 +65,7 @@ def ask(question: str) -> str:
     sys.stdout.flush()
     line = sys.stdin.readline()
     if not line:
-        raise OmnidError("no answer: the wheels stand, nothing was written")
+        raise OmnidError("no answer: the wheels stand")
     return line.strip()
 
 
@@ -85,42 +74,3 @@ def _lines(before: DriveSettings, drive: DriveSettings) -> dict[str, str]:
     wiring = {name: str(getattr(drive, name)).lower() for name in ("swapped", "reverse_left", "reverse_right")}
     scale = {"gear": repr(drive.gear)} if drive.gear != before.gear else {}
     return wiring | scale
-
-
-def _text_of(path: Path | None) -> str:
-    """Return the present text of the file to write, empty where there is none.
-
-    Raise OmnidError before the wheels turn if it is not a configuration or cannot be written.
-    """
-    from omnid.config import load_config
-    from omnid.sinks.files import check_outputs
-
-    if path is None:
-        return ""
-    check_outputs([("--write", path)], [])
-    if not path.exists():
-        return ""
-    load_config(path)
-    return path.read_text("utf-8")
-
-
-def _write(path: Path, text: str, values: dict[str, str], drive: DriveSettings) -> None:
-    """Set the values in the file, after a check that a reader gets these values and all others as before."""
-    from dataclasses import replace
-
-    from calib.atomic_file import write_file
-    from omnid.config import Config
-    from omnid.doctor.wheel_wiring import toml_with
-    from omnid.settings import parse
-
-    after, old = toml_with(text, SECTION, values), parse(Config, text.encode(), origin=str(path))
-    changed = {name: getattr(drive, name) for name in values}
-    wanted = replace(old, motor=replace(old.motor, drive=replace(old.motor.drive, **changed)))
-    try:
-        same = parse(Config, after.encode(), origin=str(path)) == wanted
-    except OmnidError:
-        same = False
-    if not same:
-        raise OmnidError(f"--write {path}: the section [{SECTION}] cannot be set there: put the lines above into it")
-    write_file(path, after.encode())
-    print(f"written to {path}")

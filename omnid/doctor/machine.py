@@ -1,17 +1,14 @@
-"""Checks of the machine: clock, real-time rights, disk, packages, compiled functions, the rig file and the bus."""
+"""Checks of the machine: clock, real-time rights, disk, compiled functions, the rig file and the bus."""
 
 from __future__ import annotations
 
 import ctypes
 import ipaddress
-import platform
 import re
 import shutil
 import time
 from collections.abc import Iterator
 from contextlib import suppress
-from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Final
 
@@ -25,16 +22,6 @@ from omnid.engine.realtime import LOCK_ADVICE, highest_priority, may_lock, prior
 from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig, checked
 
-PACKAGES: Final = {
-    "numpy": "numpy",
-    "numba": "numba",
-    "opencv-python-headless": "cv2",
-    "eclipse-zenoh": "zenoh",
-    "mcap": "mcap",
-    "rosbags": "rosbags",
-    "pyserial": "serial",
-    "filterpy": "filterpy",
-}  # package: module
 BUILT_S: Final = 1_735_689_600  # the start of 2025: an earlier time is wrong
 _UNSYNCHRONISED: Final = 5  # TIME_ERROR of adjtimex(2)
 _TIMEX_BYTES: Final = 1024  # more than struct timex has on any platform
@@ -107,18 +94,6 @@ def disk(folder: Path, config: RecordConfig, bytes_per_s: float) -> Iterator[Fin
         )
 
 
-def programs() -> Iterator[Finding]:
-    """Check that the packages omnid depends on can be imported; list their versions."""
-    loaded: list[str] = []
-    for package, module in PACKAGES.items():
-        try:
-            import_module(module)
-            loaded.append(f"{module} {_version(package)}")
-        except ImportError as fault:
-            yield error("programs", f"{package}: {fault}", f"/opt/omnid/bin/pip install {package}")
-    yield ok("programs", f"Python {platform.python_version()}, {', '.join(loaded)}")
-
-
 def compiled_functions() -> Finding:
     """Check that functions can be compiled, and that they can be kept for the next start."""
     if problem := why_no_code():
@@ -127,12 +102,6 @@ def compiled_functions() -> Finding:
         found = f"cannot be kept in {folder}: {reason}: every start takes half a minute longer"
         return warning("compiled code", found, "make that folder writable, or set OMNID_CACHE_DIR to another one")
     return ok("compiled code", f"kept in {folder}; the first start compiles it, which takes half a minute")
-
-
-def _version(package: str) -> str:
-    with suppress(PackageNotFoundError):
-        return version(package)
-    return "(of another package)"  # OpenCV has four, and distributions have their own
 
 
 def rig(path: Path, size_px: tuple[int, int], floor_m: float = 0.0) -> Iterator[Finding]:

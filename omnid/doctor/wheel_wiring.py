@@ -6,9 +6,8 @@ The wheels must not touch the ground. Commands go straight to the motor controll
 from __future__ import annotations
 
 import math
-import re
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from typing import Final, NamedTuple
@@ -169,16 +168,3 @@ def wiring(first: Seen, second: Seen) -> dict[str, bool]:
     """Return the settings of a base by the wheels that its two motors turn, which must be different wheels."""
     left, right = (first, second) if first.side == "left" else (second, first)
     return {"swapped": first.side == "right", "reverse_left": not left.forward, "reverse_right": not right.forward}
-
-
-def toml_with(text: str, section: str, values: Mapping[str, str]) -> str:
-    """Return a TOML text with keys of a section set, at the section's beginning; all other lines stay as they are."""
-    lines = "".join(f"{key} = {value}\n" for key, value in values.items())
-    header = re.search(rf"^[ \t]*\[\s*{re.escape(section)}\s*\][ \t]*(#.*)?\n?", text, re.MULTILINE)
-    if header is None:
-        before = f"{text.rstrip()}\n\n" if text.strip() else ""
-        return f"{before}[{section}]\n{lines}"
-    following = re.compile(r"^\s*\[", re.MULTILINE).search(text, header.end())
-    end = following.start() if following else len(text)
-    others = re.sub(rf"^[ \t]*({'|'.join(values)})[ \t]*=.*\n?", "", text[header.end() : end], flags=re.MULTILINE)
-    return f"{text[: header.start()]}{header[0].rstrip()}\n{lines}{others}{text[end:]}"
