@@ -19,7 +19,7 @@ from drivers.cameras.v4l2_device import (
 from drivers.cameras.v4l2_settings import V4l2Settings
 from drivers.errors import DriverError
 from omnid.cli import main
-from omnid.commands import cameras
+from omnid.commands import machine
 from tests.drivers.cameras.fake_camera import FakeCamera
 
 PORT = "pci-0000:00:14.0-usb-0:1:1.0"
@@ -90,14 +90,14 @@ def test_rules_match_the_ports_and_on_one_port_the_names(two_webcams: Path) -> N
 def test_the_command_lists_the_cameras(
     two_webcams: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(cameras, "ROOT", two_webcams)
+    monkeypatch.setattr(machine, "ROOT", two_webcams)
     monkeypatch.setattr(v4l2, "call", FakeCamera().call)
     assert main(["cameras"]) == 0
     printed = capsys.readouterr().out
     assert "/dev/video2  HD Webcam  (uvcvideo, usb-1)" in printed and "  exposure 0.3 to 204.7 ms" in printed
     assert "v4l2-ctl -d /dev/video2 --list-formats-ext" in printed
     assert "/etc/udev/rules.d/" in printed and "omnid/upper" in printed
-    monkeypatch.setattr(cameras, "ROOT", two_webcams / "none")
+    monkeypatch.setattr(machine, "ROOT", two_webcams / "none")
     assert main(["cameras"]) == 1
     missing = capsys.readouterr()
     assert missing.out == "" and missing.err.startswith("omnid: no cameras") and missing.err.count("\n") == 1

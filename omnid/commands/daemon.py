@@ -1,0 +1,328 @@
+"""The daemon and what is like it: `omnid run`, `simulate`, `demo`, `record`."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from collections import Counter, defaultdict
+from contextlib import closing
+from dataclasses import replace
+from functools import partial
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from omnid.commands.options import MAP, QUIET, SETTINGS, cameras, command, device_opener, option, settings_of
+from omnid.commands.replay import Output, replay_and_print
+from omnid.errors import OmnidError
+
+if TYPE_CHECKING:  # the help and other commands do not load these
+    from collections.abc import Callable
+
+    from calib.rig import Rig
+    from drivers.cameras.log_camera import LogCamera, LogMotion
+    from drivers.frame import Camera
+    from drivers.motors.simulated.simulated_base import Pose
+    from omnid.config import Config
+    from omnid.runs.live import OpenCamera
+
+
+RUNNING = 2  # time that the cameras are opened: first for the masks, then for the run
+
+
+@command(
+    option(
+        "--rig",
+        type=Path,
+        setting="cameras.rig",
+        help="the rig.toml of the cameras; default: that attached to the log, or without --log cameras.rig of the "
+        "settings",
+    ),
+    option("--motor", metavar="PORT", setting="motor.port", help="serial port of the controller, or 'simulated'"),
+    option(
+        "--log",
+        type=Path,
+        metavar="LOG",
+        help="use the images of a log instead of cameras, for a trial: in real time, forwards and backwards until it "
+        "is stopped",
+    ),
+    *cameras(
+        "device of the {camera} camera; default: cameras.{camera} of the settings; with --log the topic of its images, "
+        "default: found by name",
+        "DEVICE|TOPIC",
+    ),
+    option("--pace", type=float, default=1.0, help="speed of the log relative to its recording; default %(default)s"),
+    option("--once", action="store_true", help="stop at the end of the log"),
+    MAP,
+    *SETTINGS,
+    examples=(
+        "run --config /etc/omnid/omnid.toml",
+        "run --log drive.mcap --rig rig.toml --motor simulated",
+        "run --lower /dev/video0 --upper /dev/video2 --rig rig.toml",
+    ),
+)
+def run(args: argparse.Namespace) -> int:
+    """Run until a signal comes."""
+    from omnid.engine.process import use_one_malloc_arena
+
+    use_one_malloc_arena()  # first: the next imports load numpy, which starts threads
+    from omnid.config import unused_settings
+    from omnid.engine.logging_setup import HANDLER, log
+    from omnid.runs.live import ConnectedRobot, LiveRun
+
+    devices = {"cameras.lower": args.lower, "cameras.upper": args.upper}
+    config = settings_of(args, devices if args.log is None else {})
+    for warning in unused_settings(config, "run", args.overrides):
+        log(logging.WARNING, warning)
+    show = HANDLER.show if sys.stderr.isatty() else None
+    if args.log is None:
+        if args.once or args.pace != 1.0:
+            raise OmnidError("--once and --pace need the images of a log: add --log, or leave them out")
+        return LiveRun(config, ConnectedRobot(device_opener(config)), log, show=show).run()
+    config = replace(config, controller=config.controller.of_log)
+    opener, motion = _recorded(args, config)
+    robot = ConnectedRobot(opener, motion)
+    return LiveRun(config, robot, log, None if args.rig else _attached_rig(args), show).run()
+
+
+def _attached_rig(args: argparse.Namespace) -> Rig:
+    from drivers.logs.log_reader import LogReader
+    from omnid.runs.session import attached_rig
+
+    with closing(LogReader(args.log, args.lower, args.upper)) as reader:
+        return attached_rig(reader, args.log)
+
+
+def _recorded(args: argparse.Namespace, config: Config) -> tuple[OpenCamera, LogMotion]:
+    """Return what opens the cameras of a log, and its wheels and gyro: no others fit its images."""
+    from drivers.cameras.log_camera import LogCamera, LogClock, LogImages, LogMotion
+    from omnid.engine.logging_setup import log
+    from omnid.runs.sensor_sources import motion_topics
+
+    images = LogImages.load(args.log, args.lower, args.upper, motion_topics(config), config.cameras.bits)
+    for warning in images.warnings:
+        log(logging.WARNING, warning)
+    clocks: defaultdict[int, LogClock] = defaultdict(LogClock)  # one for each time that both cameras are opened
+    opened: Counter[Camera] = Counter()
+
+    def open_camera(camera: Camera) -> LogCamera:
+        opened[camera] += 1
+        return LogCamera(images, camera, clocks[opened[camera]], pace=args.pace, once=args.once)
+
+    return open_camera, LogMotion(images, clocks[RUNNING], pace=args.pace, once=args.once)
+
+
+@command(
+    option("world", help="room, corridor, building, hall, or a file *.toml (docs/drive.md)"),
+    option("--seed", type=int, default=1, help="of textures and noise; default %(default)s"),
+    option("--rig", type=Path, help="the rig.toml of the cameras; default: a straight rig"),
+    option("--size", type=int, default=512, metavar="PX", help="of the images without --rig; default %(default)s"),
+    option("--no-people", action="store_true", help="leave the people of the world out"),
+    option("--light", type=float, default=1.0, help="factor on the light; default %(default)s"),
+    option(
+        "--other-posters",
+        type=float,
+        default=0.0,
+        metavar="SHARE",
+        help="share of the posters that is exchanged, 0 to 1; default %(default)s",
+    ),
+    option("--truth", type=Path, metavar="FILE", help="write the true poses in odom, in the TUM format, at the end"),
+    MAP,
+    *SETTINGS,
+    examples=("simulate room", "simulate corridor --light 0.5 --map corridor.omap --set bus.robot=rover"),
+    description="Run the daemon with a simulated robot: cameras, motor controller and gyro (motion.imu=off: none) are "
+    "simulated. Everything else is as in `omnid run`: then `omnid arm`, `omnid drive`, `omnid goto`, `omnid web`. "
+    "Simulated time waits for the daemon: a busy computer slows it down, and loses nothing.",
+)
+def simulate(args: argparse.Namespace) -> int:
+    """Run until a signal comes."""
+    from omnid.engine.process import use_one_malloc_arena
+
+    use_one_malloc_arena()  # first: the next imports load numpy, which starts threads
+    from calib.rig_file import read_rig
+    from omnid.config import unused_settings
+    from omnid.controller.motor import SIMULATED
+    from omnid.engine.logging_setup import HANDLER, log
+    from omnid.runs.live import LiveRun
+    from omnid.simulation.paced_robot import PacedRobot
+    from omnid.simulation.robot import make_robot
+    from omnid.simulation.world_file import WorldOptions, load_world
+    from omnid.sinks.files import check_outputs
+
+    # 1. Check the options.
+    check_outputs([("--truth", args.truth)] if args.truth else [], [])
+    config = settings_of(args)
+    for warning in unused_settings(config, "run", args.overrides):
+        log(logging.WARNING, warning)
+    if args.seed < 0:
+        raise OmnidError(f"--seed {args.seed}: expected 0 or more")
+    if not 64 <= args.size <= 2048:
+        raise OmnidError(f"--size {args.size}: expected 64 to 2048 px")
+    # 2. Run in the world.
+    options = WorldOptions(people=not args.no_people, brightness=args.light, other_posters=args.other_posters)
+    world = load_world(args.world, args.seed, options)
+    robot = make_robot(args.size, read_rig(args.rig) if args.rig else None)
+    config = replace(config, motor=replace(config.motor, port=SIMULATED))
+    paced = PacedRobot(world, robot, config, args.seed, partial(log, logging.WARNING))
+    run = LiveRun(config, paced, log, paced.rig, HANDLER.show if sys.stderr.isatty() else None)
+    code = run.run()
+    # 3. Write the truth, and report contacts.
+    if args.truth:
+        _write_truth(args.truth, paced.drive.truth, run.clock.unix_ns)
+    log(logging.INFO, f"contacts with obstacles: {paced.drive.contacts}")
+    return code
+
+
+def _write_truth(path: Path, truth: dict[int, Pose], unix_ns: Callable[[int], int]) -> None:
+    """Write the true poses of the base since the first one, with the stamps of the poses on the bus."""
+    import numpy as np
+
+    from calib import se3
+    from omnid.sinks.files import write_trajectory
+
+    poses = np.array(list(truth.values())).reshape(-1, 3)
+    zero = np.zeros(len(poses))
+    R = se3.rotation_exp(np.column_stack([zero, zero, poses[:, 2]]))
+    T = se3.transform(R, np.column_stack([poses[:, :2], zero]))
+    write_trajectory(path, np.array([unix_ns(stamp_ns) for stamp_ns in truth], np.int64), se3.inverse(T[:1]) @ T)
+
+
+DRIVE_S = 90.0  # Longest drive in simulated time.
+
+
+@command(
+    option(
+        "--output",
+        type=Path,
+        default=Path("omnid-demo"),
+        metavar="FOLDER",
+        help="folder of the output files; default %(default)s",
+    ),
+    option(
+        "--drive",
+        action="store_true",
+        help="a simulated robot is taught a route of 6 m and repeats it; takes a minute or two, and writes drive.png "
+        "with both true paths",
+    ),
+    option("--seed", type=int, default=1, help="with --drive: of the world and its noise; default %(default)s"),
+    option("--verbose", action="store_true", help="print all counters, and the times of all stages"),
+    QUIET,
+    *SETTINGS,
+    examples=("demo", "demo --drive", "demo --output /tmp/demo --quiet"),
+)
+def demo(args: argparse.Namespace) -> int:
+    """Replay the sample and print its errors against the truth; or drive."""
+    if args.drive:
+        return _drive(args)
+    from omnid.formats.tum import read_tum
+    from omnid.recordings.evaluation import evaluate
+    from omnid.runs.replay import ReplayOptions
+
+    _make_folder(args.output)
+    tum = args.output / "trajectory.tum"
+    options = ReplayOptions(
+        tum=tum,
+        cloud=args.output / "map.ply",
+        plan=args.output / "plan.png",
+        record=args.output / "log.mcap",
+        publish=True,
+        bus_optional=True,
+        paced=True,
+        settings=args.config,
+    )
+    args.overrides = ["motor.port=simulated", "controller.setpoint.velocity_mps=0.3", *args.overrides]
+    config = settings_of(args)
+    sample = files("omnid.sample")
+    with as_file(sample / "log.mcap") as log, as_file(sample / "truth.txt") as truth:
+        code = replay_and_print(log, config, options, Output(args.quiet, args.verbose))
+        if code == 0:
+            print(f"\nagainst the truth:\n{evaluate(read_tum(tum), read_tum(truth))}")
+    return code
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise OmnidError(f"--output {folder}: cannot be made ({error.strerror}); name another folder") from error
+
+
+def _drive(args: argparse.Namespace) -> int:
+    """Drive a simulated robot; print the errors against the truth, and draw both paths."""
+    import cv2
+    import numpy as np
+
+    from omnid.engine.kernel_cache import prepare_kernels
+    from omnid.navigation_state import NavigationState
+    from omnid.simulation.demonstration import TeachAndRepeat, both_paths, cross_track_m, draw, drift_m, seen_obstacles
+    from omnid.simulation.lockstep import simulate
+    from omnid.simulation.robot import make_robot
+    from omnid.simulation.world_file import load_world
+
+    if args.seed < 0:
+        raise OmnidError(f"--seed {args.seed}: expected 0 or more")
+    _make_folder(args.output)
+    place_map, routes, image = (args.output / name for name in ("demo.omap", "routes", "drive.png"))
+    config = settings_of(args, {"places.map": place_map, "navigation.routes": routes})
+    place_map.unlink(missing_ok=True)  # of an earlier demonstration
+    world, robot = load_world("room", args.seed), make_robot()
+    prepare_kernels()  # which says so where it takes long
+    if not args.quiet:
+        print("a simulated robot is taught an oval and repeats it, in its own\ntime: a minute or two", flush=True)
+    script = TeachAndRepeat(lambda line: None if args.quiet else print(line, flush=True))
+    run = simulate(world, robot, script, seconds=DRIVE_S, seed=args.seed, config=config)
+    first, second = both_paths(run, script.repeated_s)
+    if not cv2.imwrite(str(image), draw(world, seen_obstacles(run), first, second)):
+        raise OmnidError(f"{image}: cannot be written; name another folder by --output")
+    end = script.end or f"not reached within {DRIVE_S:g} s"
+    print(f"end       {end}, contacts with obstacles: {len(run.contacts)}")
+    print(f"pose      {100 * drift_m(run):.1f} cm off at the end")
+    if len(second):
+        off_cm = 100 * cross_track_m(first, second)
+        print(f"repeated  {np.percentile(off_cm, 95):.1f} cm off the taught path (95 %), {off_cm.max():.1f} at most")
+    print(f"written   {image}, {place_map}")
+    return 0 if script.end == NavigationState.REACHED else 1
+
+
+@command(
+    option(
+        "folder",
+        type=Path,
+        nargs="?",
+        setting="record.folder",
+        help="folder of the files; default: record.folder of the settings",
+    ),
+    option(
+        "--rig",
+        type=Path,
+        setting="cameras.rig",
+        help="a rig.toml to attach; default: cameras.rig of the settings, if it exists",
+    ),
+    *cameras("the {camera} camera; default: cameras.{camera} of the settings", "DEVICE", are_settings=True),
+    *SETTINGS,
+    examples=("record recordings/ --rig rig.toml", "record boards/ --lower /dev/video0 --upper /dev/video2"),
+)
+def record(args: argparse.Namespace) -> int:
+    """Record until a signal comes; return 1 if nothing was recorded."""
+    from omnid.engine.logging_setup import log
+    from omnid.runs.record import record
+
+    config = settings_of(args)
+    rig = _rig(config, wanted=args.rig is not None)
+    open_camera = device_opener(config)
+    with closing(open_camera("lower")) as lower, closing(open_camera("upper")) as upper:
+        state = record({"lower": lower, "upper": upper}, config, rig, log).state
+    return 0 if state.messages > state.lost + state.refused else 1
+
+
+def _rig(config: Config, *, wanted: bool) -> str:
+    """Return the rig's TOML; "" if there is none, because the recording may be for its calibration."""
+    from calib.rig_file import read_rig, rig_toml
+    from omnid.engine.logging_setup import log
+
+    path = Path(config.cameras.rig)
+    if not (wanted or path.exists()):
+        log(logging.WARNING, f"no rig is attached because {path} does not exist: `omnid replay` will need --rig")
+        return ""
+    return rig_toml(read_rig(path))

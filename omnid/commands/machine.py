@@ -1,0 +1,281 @@
+"""Commands about this machine: `omnid doctor`, `cameras`, `motor test`, `install-service`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Generator, Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from omnid.commands.options import JSON, SETTINGS, cameras, command, option, print_json, settings_of
+from omnid.commands.tools import require_packages
+from omnid.errors import OmnidError
+
+if TYPE_CHECKING:  # the help and other commands do not load these
+    from drivers.frame import Camera, Frame
+    from omnid.calibration.images import Image
+    from omnid.calibration.snapshot import CameraView
+    from omnid.config import Config
+    from omnid.controller.motor_settings import DriveSettings
+    from omnid.doctor.finding import Finding
+
+
+ROOT = Path("/")  # folder of sys, dev and proc
+BYTES_PER_PIXEL = 0.3  # upper bound for a JPEG of a textured image
+
+
+@command(*SETTINGS, JSON, examples=("doctor --config /etc/omnid/omnid.toml",))
+def doctor(args: argparse.Namespace) -> int:
+    """Print a line for each check; return 1 if something is wrong."""
+    from omnid.doctor.finding import summary
+
+    found: list[Finding] = []
+    for finding in examine(settings_of(args)):
+        if not args.json:
+            print(finding, flush=True)
+        found.append(finding)
+    if args.json:
+        print_json(found)
+    else:
+        print(summary(found))
+    return int(any(finding.level == "error" for finding in found))
+
+
+def examine(config: Config) -> Iterator[Finding]:
+    """Return the findings of all checks, the quick ones first."""
+    from drivers.cameras.v4l2_device import capture_devices
+    from omnid.doctor import devices, machine
+
+    camera, wanted = config.cameras, config.realtime
+    named = {name: camera.settings(name) for name in ("lower", "upper")}
+    yield from devices.cameras(named, capture_devices(ROOT), ROOT)
+    yield from machine.rig(Path(camera.rig), (camera.width_px, camera.height_px), config.obstacles.ring.floor_m)
+    yield from devices.motor(config.motor, ROOT)
+    yield from machine.rights(max(wanted.motor_priority, wanted.capture_priority), wanted.lock_memory)
+    yield machine.clock()
+    yield machine.compiled_functions()
+    rate = 2 * camera.width_px * camera.height_px * BYTES_PER_PIXEL * (camera.rate_hz or 30.0)
+    yield from machine.disk(machine.STATE / config.record.folder, config.record, rate)
+    yield machine.bus(config.bus)
+
+
+CAMERAS: tuple[Camera, Camera] = ("lower", "upper")
+SETTLE = 10  # images of a camera that are skipped: its exposure adapts in the first ones
+_ADVICE = """
+To name them /dev/omnid/lower and /dev/omnid/upper in whatever order they are plugged in, put this into {file}
+(exchange lower and upper if they are the other way round), then run
+`udevadm control --reload && udevadm trigger --subsystem-match=video4linux`:
+"""
+
+
+@command(
+    option("--snapshot", type=Path, metavar="DIR", help="write DIR/lower.png and DIR/upper.png"),
+    option("--log", type=Path, metavar="LOG", help="of --snapshot: take the images of a log"),
+    *cameras("of --log: images of the {camera} camera; default: by name"),
+    *SETTINGS,
+    examples=(
+        "cameras",
+        "cameras --snapshot views --config /etc/omnid/omnid.toml",
+        "cameras --snapshot views --log drive.mcap",
+    ),
+    description="List cameras and the udev rule to copy. With --snapshot write an image of each "
+    "configured camera with the mirror's rim, and print a measure of its focus, which is highest where "
+    "the lens is set best.",
+)
+def show_cameras(args: argparse.Namespace) -> int:
+    """Print the list, or write the snapshots; return 1 if there is no camera, or something to correct."""
+    if args.snapshot is not None:
+        return _snapshot(args)
+    for name in ("log", "lower", "upper"):
+        if getattr(args, name) is not None:
+            raise OmnidError(f"--{name} belongs to --snapshot DIR: name the folder for the images as well")
+    return _list()
+
+
+def _list() -> int:
+    from drivers.cameras.v4l2_device import RULES_FILE, capture_devices, udev_rules
+
+    devices = capture_devices(ROOT)
+    if not devices:
+        print(
+            "omnid: no cameras: the kernel has no capture device; check the cables and the output of `dmesg`",
+            file=sys.stderr,
+        )
+        return 1
+    for device in devices:
+        print(f"{device.node}  {device.name}  ({', '.join(filter(None, (device.driver, device.bus)))})")
+        exposure = device.exposure or "no exposure time to set"
+        for line in filter(None, (device.by_path, device.by_id, device.problem or exposure)):
+            print(f"  {line}")
+    print(f"\nThe modes of a camera: v4l2-ctl -d {devices[0].node} --list-formats-ext")
+    if rules := list(udev_rules(devices)):
+        print(_ADVICE.format(file=RULES_FILE), *rules, sep="\n")
+    return 0
+
+
+def _snapshot(args: argparse.Namespace) -> int:
+    from calib.atomic_file import write_file
+    from calib.rig_file import png
+    from omnid.calibration.snapshot import annotated, described, view_of, warnings
+
+    try:
+        args.snapshot.mkdir(exist_ok=True)
+    except OSError as error:
+        raise OmnidError(f"--snapshot {args.snapshot}: {error.strerror}; name a folder that can be made") from error
+    views: dict[str, CameraView] = {name: view_of(images) for name, images in _images(args)}
+    for name, view in views.items():
+        path = args.snapshot / f"{name}.png"
+        write_file(path, png(annotated(name, view)))
+        print(f"{path}: {described(view)}")
+    problems = list(warnings(views))
+    for problem in problems:
+        print(f"omnid: {problem}", file=sys.stderr)
+    return int(bool(problems))
+
+
+def _images(args: argparse.Namespace) -> Iterator[tuple[Camera, list[Image]]]:
+    """Yield the first images of each camera. Raise OmnidError or DriverError for one that gives none."""
+    from itertools import islice
+
+    from drivers.frame import gray
+    from omnid.calibration.snapshot import IMAGES
+
+    for camera in CAMERAS:
+        frames = _of_device(args, camera) if args.log is None else _of_log(args, camera)
+        with closing(frames):
+            found = [gray(frame) for frame in islice(frames, IMAGES)]
+        if not found:
+            raise OmnidError(f"the {camera} camera gave no image: check its cable, and see `omnid doctor`")
+        yield camera, found
+
+
+def _of_log(args: argparse.Namespace, camera: Camera) -> Generator[Frame, None, None]:
+    from drivers.logs.log_reader import LogReader
+
+    config = settings_of(args)
+    with closing(
+        LogReader(args.log, args.lower, args.upper, bits=config.cameras.bits, rate_hz=config.log.rate_hz)
+    ) as reader:
+        yield from (frame for frame in reader.frames() if frame.camera == camera)
+
+
+def _of_device(args: argparse.Namespace, camera: Camera) -> Generator[Frame, None, None]:
+    """Yield frames once the exposure has adapted; they end when the camera gives none within the driver's time."""
+    from itertools import islice
+
+    from drivers.cameras.v4l2_camera import V4l2Camera
+
+    settings = settings_of(args).cameras.settings(camera)
+
+    def end_when_lost(_: int, __: str) -> None:
+        if source.state.status == "lost":
+            source.close()
+
+    source = V4l2Camera(settings, camera, on_event=end_when_lost)
+    with closing(source):
+        yield from islice(source.frames(), SETTLE, None)
+
+
+_BEFORE = """The wheels will turn. Raise the robot so that none of them touches the ground, keep hands and hair away
+from them, and have the emergency stop at hand. The daemon must not run. Ctrl-C stops the wheels. Type yes to begin: """
+
+
+@command(
+    option(
+        "--motor",
+        metavar="PORT",
+        setting="motor.port",
+        help="serial port of the controller, or 'simulated'; default: motor.port of the settings",
+    ),
+    option("--speed", type=float, default=0.1, metavar="MPS", help="of a wheel, m/s; default %(default)s"),
+    option(
+        "--turns",
+        type=float,
+        default=3.0,
+        metavar="N",
+        help="of the wheels for the scale, 0: do not test it; default %(default)s",
+    ),
+    *SETTINGS,
+    examples=(
+        "motor test --motor /dev/omnid/motor --config /etc/omnid/omnid.toml",
+        "motor test --motor simulated --set motor.protocol=roboteq",
+    ),
+    description="Turn each motor forwards and back, ask which wheel moved and which way, then turn both wheels a "
+    "number of times and ask for the true number. It prints the lines of the configuration that make the wheels turn "
+    "as commanded.",
+)
+def test_motor(args: argparse.Namespace) -> int:
+    """Test the wiring and print the settings."""
+    from drivers.motors.protocols.protocol_registry import motor_protocol
+    from omnid.doctor.wheel_wiring import WiringTest
+
+    config = settings_of(args).motor
+    if not config.port:
+        raise OmnidError("no motor controller is configured: name its port by --motor, or set motor.port")
+    motor_protocol(config.protocol)  # known before anybody is asked to raise the robot
+    test = WiringTest(config, ask, speed_mps=args.speed, turns=args.turns)
+    if ask(_BEFORE).lower() != "yes":
+        raise OmnidError("not begun: only `yes` starts the motors")
+    drive = test.run()
+    values = _lines(config.drive, drive)
+    print("\n[motor.drive]", *(f"{key} = {value}" for key, value in values.items()), sep="\n")
+    print("as it was set" if drive == config.drive else "different from the settings so far")
+    return 0
+
+
+def ask(question: str) -> str:
+    """Print a question and return the answer. Raise OmnidError at the end of the input."""
+    sys.stdout.write(question)
+    sys.stdout.flush()
+    line = sys.stdin.readline()
+    if not line:
+        raise OmnidError("no answer: the wheels stand")
+    return line.strip()
+
+
+def _lines(before: DriveSettings, drive: DriveSettings) -> dict[str, str]:
+    """Return keys and TOML values: always those of the wiring, those of the scale only where the test changed them."""
+    wiring = {name: str(getattr(drive, name)).lower() for name in ("swapped", "reverse_left", "reverse_right")}
+    scale = {"gear": repr(drive.gear)} if drive.gear != before.gear else {}
+    return wiring | scale
+
+
+@command(
+    option("--page", action="store_true", help="also the unit of the page (`omnid web`), for this machine only"),
+    option("--dry-run", action="store_true", help="list what would be done, change nothing"),
+    option("--yes", action="store_true", help="do not ask"),
+    examples=("install-service --dry-run", "install-service --page"),
+    description="Install the systemd unit for this program, example udev rules, a minimal configuration and the user "
+    "that it runs as. Files that people edit are kept where they exist.",
+)
+def install_service(args: argparse.Namespace) -> int:
+    """List the steps, ask, and take them; return 1 where the answer is no."""
+    from omnid.service import install
+
+    if args.page:
+        require_packages()
+    program = Path(sys.prefix) / "bin" / "omnid"
+    steps = install.steps(program, page=args.page)
+    for step in steps:
+        print(step.description)
+    if args.dry_run:
+        return 0
+    if not steps:
+        print("nothing to do")
+        return 0
+    if not (args.yes or _agrees()):
+        print("nothing was changed")
+        return 1
+    for step in steps:
+        step.act()
+    print(install.next_steps(program, page=args.page))
+    return 0
+
+
+def _agrees() -> bool:
+    try:
+        return input("Do this? [y/N] ").strip().lower() in ("y", "yes")
+    except EOFError:
+        return False

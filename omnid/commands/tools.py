@@ -1,0 +1,185 @@
+"""Commands about settings and runs: `omnid config`, `listen`, `web`, `report`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from omnid.commands.options import ROBOT, SECONDS, SETTINGS, TRUTH, check_seconds, command, option, settings_of
+from omnid.errors import OmnidError
+
+if TYPE_CHECKING:  # the help and other commands do not load these
+    from omnid.config import Config
+
+
+@command(
+    option("action", nargs="?", choices=("print", "check"), default="print", help="default: print"),
+    option("file", nargs="?", type=Path, metavar="FILE", help="of check"),
+    option(
+        "--minimal",
+        action="store_true",
+        help="print only what differs from the defaults, and what a new robot needs; all other defaults stay those of "
+        "the installed version",
+    ),
+    *SETTINGS,
+    examples=("config --minimal > omnid.toml", "config check omnid.toml"),
+    description="Print all settings with their defaults as TOML; or check a file.",
+)
+def print_config(args: argparse.Namespace) -> int:
+    """Print or check settings."""
+    from omnid.config import FIRST_SETTINGS
+    from omnid.settings import dump, dump_minimal
+
+    if (args.action == "print") != (args.file is None):
+        raise OmnidError(
+            f"omnid config {args.action}: "
+            + (
+                "name the file"
+                if args.file is None
+                else f"takes no file: `omnid config --config {args.file}` prints its settings"
+            )
+        )
+    args.config = args.file or args.config
+    config = settings_of(args)
+    if args.action == "check":
+        _require_usable(config)
+        print("\n".join(_differences(config, str(args.file))))
+    else:
+        print(dump_minimal(config, FIRST_SETTINGS) if args.minimal else dump(config), end="")
+    return 0
+
+
+def _require_usable(config: Config) -> None:
+    """Raise OmnidError or DriverError for words that only the daemon's start would refuse."""
+    from drivers.motors.protocols.protocol_registry import motor_protocol
+    from omnid.transport.bus_config import checked
+
+    checked(config.bus)
+    motor_protocol(config.motor.protocol)
+
+
+def _differences(config: Config, name: str) -> list[str]:
+    """Return a line about the file, and one for each setting that differs from its default."""
+    from omnid.config import Config
+    from omnid.settings import changed, value_at
+
+    paths = changed(config)
+    lines = [f"{path} = {value_at(config, path)!r}, default {value_at(Config(), path)!r}" for path in paths]
+    return [f"{name}: good; {len(paths)} settings differ from their defaults", *lines]
+
+
+@command(
+    *ROBOT,
+    SECONDS,
+    *SETTINGS,
+    examples=("listen", "listen --robot rover --connect tcp/robot:7447 --seconds 60"),
+)
+def listen(args: argparse.Namespace) -> int:
+    """Show the robot until the end; return 1 if no pose was received."""
+    from omnid.monitor.listen import listen
+
+    check_seconds(args.seconds)
+    return listen(settings_of(args).bus, args.seconds)
+
+
+PACKAGES = ("prometheus_client", "starlette", "uvicorn")
+
+
+@command(
+    *ROBOT,
+    option(
+        "--listen",
+        default="127.0.0.1:8447",
+        metavar="HOST:PORT",
+        help="where browsers connect; default %(default)s, this machine only; 0.0.0.0:8447 for its network",
+    ),
+    option(
+        "--token-file",
+        type=Path,
+        metavar="FILE",
+        help="the token; the file is made if it is missing; default: a new token at each start",
+    ),
+    option(
+        "--stop-token-file",
+        type=Path,
+        metavar="FILE",
+        help="a second token, which may see and stop, not arm; the file is made if it is missing; default: none",
+    ),
+    option(
+        "--host",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="a further name of this machine, in addresses of browsers; without --listen on the network: "
+        "localhost only",
+    ),
+    option("--tls-certificate", type=Path, metavar="FILE", help="serve over TLS; PEM"),
+    option("--tls-key", type=Path, metavar="FILE", help="the private key of the certificate, PEM"),
+    *SETTINGS,
+    examples=(
+        "web",
+        "web --connect tcp/robot:7447",
+        "web --listen 0.0.0.0:8447 --token-file /etc/omnid/web-token --config /etc/omnid/omnid.toml",
+    ),
+    description="Serve a page about a robot: state, path, map, warnings with their remedy, a stop and an "
+    "arm button; /metrics for Prometheus. It prints the address with a token: who knows it may stop and arm the robot.",
+)
+def web(args: argparse.Namespace) -> int:
+    """Serve until Ctrl-C."""
+    require_packages()
+    from omnid.web.server import WebSettings, serve
+
+    if (args.tls_certificate is None) != (args.tls_key is None):
+        raise OmnidError("--tls-certificate and --tls-key belong together: name both")
+    config = settings_of(args)
+    tls = (args.tls_certificate, args.tls_key) if args.tls_key else None
+    serve(config.bus, WebSettings(args.listen, args.token_file, args.stop_token_file, tuple(args.host), tls))
+    return 0
+
+
+def require_packages() -> None:
+    """Raise OmnidError where a package of the page is missing."""
+    import sys
+    from importlib.util import find_spec
+
+    missing = [name for name in PACKAGES if find_spec(name) is None]
+    if missing:
+        raise OmnidError(
+            f"omnid web needs {', '.join(missing)}, not installed: {sys.executable} -m pip install {' '.join(missing)}"
+        )
+
+
+@command(
+    option(
+        "log",
+        type=Path,
+        metavar="LOG",
+        help="what `omnid replay --record` or `omnid run` with record.enabled wrote, or any MCAP with "
+        "nav_msgs/msg/Odometry",
+    ),
+    option("-o", "--output", type=Path, metavar="FILE", default=Path("report.html"), help="default: report.html"),
+    TRUTH,
+    option("--topic", metavar="TOPIC", help="the odometry topic, where there are several"),
+    examples=("report out.mcap -o report.html",),
+)
+def report(args: argparse.Namespace) -> int:
+    """Write the page."""
+    from calib.atomic_file import write_file
+    from omnid.formats.tum import read_tum
+    from omnid.plain_text import plain
+    from omnid.report.recorded_run import read_run
+    from omnid.report.report import report_html
+    from omnid.sinks.files import check_outputs, on_stdout
+
+    inputs = [("the log that is read", args.log)] + ([("the truth", args.truth)] if args.truth else [])
+    check_outputs([("--output", args.output)], inputs)
+    truth = read_tum(args.truth) if args.truth else None
+    recorded = read_run(args.log, args.topic)
+    html = report_html(recorded, truth)
+    write_file(args.output, html.encode("utf-8", "replace"))  # a file's name may be no text
+    output = sys.stderr if on_stdout([("--output", args.output)]) else sys.stdout
+    line = f"{args.output}: {len(recorded.t_s)} poses of {recorded.topic}, {len(html) / 1e6:.2f} MB"
+    print(plain(line), file=output)
+    return 0
