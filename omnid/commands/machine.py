@@ -19,7 +19,7 @@ if TYPE_CHECKING:  # the help and other commands do not load these
     from omnid.calibration.snapshot import CameraView
     from omnid.config import Config
     from omnid.controller.motor_settings import DriveSettings
-    from omnid.doctor.finding import Finding
+    from omnid.doctor.checks import Finding
 
 
 ROOT = Path("/")  # folder of sys, dev and proc
@@ -29,7 +29,7 @@ BYTES_PER_PIXEL = 0.3  # upper bound for a JPEG of a textured image
 @command(*SETTINGS, JSON, examples=("doctor --config /etc/omnid/omnid.toml",))
 def doctor(args: argparse.Namespace) -> int:
     """Print a line for each check; return 1 if something is wrong."""
-    from omnid.doctor.finding import summary
+    from omnid.doctor.checks import summary
 
     found: list[Finding] = []
     for finding in examine(settings_of(args)):
@@ -46,19 +46,19 @@ def doctor(args: argparse.Namespace) -> int:
 def examine(config: Config) -> Iterator[Finding]:
     """Return the findings of all checks, the quick ones first."""
     from drivers.cameras.v4l2_device import capture_devices
-    from omnid.doctor import devices, machine
+    from omnid.doctor import checks
 
     camera, wanted = config.cameras, config.realtime
     named = {name: camera.settings(name) for name in ("lower", "upper")}
-    yield from devices.cameras(named, capture_devices(ROOT), ROOT)
-    yield from machine.rig(Path(camera.rig), (camera.width_px, camera.height_px), config.obstacles.ring.floor_m)
-    yield from devices.motor(config.motor, ROOT)
-    yield from machine.rights(max(wanted.motor_priority, wanted.capture_priority), wanted.lock_memory)
-    yield machine.clock()
-    yield machine.compiled_functions()
+    yield from checks.cameras(named, capture_devices(ROOT), ROOT)
+    yield from checks.rig(Path(camera.rig), (camera.width_px, camera.height_px), config.obstacles.ring.floor_m)
+    yield from checks.motor(config.motor, ROOT)
+    yield from checks.rights(max(wanted.motor_priority, wanted.capture_priority), wanted.lock_memory)
+    yield checks.clock()
+    yield checks.compiled_functions()
     rate = 2 * camera.width_px * camera.height_px * BYTES_PER_PIXEL * (camera.rate_hz or 30.0)
-    yield from machine.disk(machine.STATE / config.record.folder, config.record, rate)
-    yield machine.bus(config.bus)
+    yield from checks.disk(checks.STATE / config.record.folder, config.record, rate)
+    yield checks.bus(config.bus)
 
 
 CAMERAS: tuple[Camera, Camera] = ("lower", "upper")

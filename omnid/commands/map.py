@@ -81,7 +81,7 @@ def build(args: argparse.Namespace) -> int:
 
 def _built(args: argparse.Namespace, config: Config) -> RigPlaces | int | None:
     """Return the map of the logs; None: they have no keyframe. A number is that of the signal that ended it."""
-    from omnid.diagnostics.progress import Progress
+    from omnid.diagnostics.run_summary import Progress
     from omnid.formats.place_file import read_places
     from omnid.runs.place_maps import RigPlaces, new_places
     from omnid.runs.replay import ReplayOptions, run_log

@@ -157,7 +157,7 @@ def replay_and_print(log: Path, config: Config, options: ReplayOptions, output: 
     """Replay a log, print its warnings and its summary, and return the exit code."""
     from dataclasses import replace
 
-    from omnid.diagnostics.progress import Progress
+    from omnid.diagnostics.run_summary import Progress
     from omnid.runs.replay import run_log
     from omnid.runs.run_result import RunFailedError
 

@@ -1,19 +1,26 @@
-"""Counters of a run, and their summary in words."""
+"""Counters of a run, their summary in words, its progress, and warnings about the input that it makes apparent."""
 
 from __future__ import annotations
 
+import os
+import sys
+import time
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from textwrap import wrap
-from typing import Final
+from typing import Final, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
 
+from omnid.config import Config
+from omnid.core.rig.rig_health import RigHealth
 from omnid.core.stereo.tiles import Side
 from omnid.engine.telemetry import SummaryRow
 from omnid.messages import OdometryUpdate
+from omnid.stages.synchronise import FROZEN_IMAGES, Synchronise
 from omnid.tracking_state import TrackingState
 
 
@@ -151,3 +158,134 @@ def _listed(counts: Mapping[str, int]) -> str:
 
 def _share(count: int, total: int) -> str:
     return f"{count / total:.1%}" if total else "0 %"
+
+
+BAR_COLUMNS = 24
+
+
+class Progress:
+    """The action of a ticker: draws a bar, or writes a line where the stream is no terminal."""
+
+    def __init__(self, statistics: RunStatistics, expected: int | None, stream: TextIO | None = None) -> None:
+        self._statistics, self._expected = statistics, expected
+        self._stream = stream or sys.stderr
+        self._is_terminal = self._stream.isatty()
+        self._start_s = time.monotonic()
+        self._drawn = 0
+
+    @property
+    def period_s(self) -> float:
+        """Time between two calls."""
+        return 0.2 if self._is_terminal else 5.0
+
+    def __call__(self) -> None:
+        """Show the progress now."""
+        newest = self._statistics.newest
+        if newest is None:
+            return
+        done = newest.seq + 1  # with the pairs that were dropped
+        rate, dropped = done / max(1e-3, time.monotonic() - self._start_s), done - self._statistics.poses
+        line = f"{self._share(done)} {rate:5.1f} pairs/s  {self._statistics.length_m:8.2f} m  {newest.state}"
+        line += f"  {dropped} dropped" if dropped > 0 else ""
+        if not self._is_terminal:
+            self._write(f"omnid: {line}\n")
+            return
+        columns = 0
+        with suppress(OSError):
+            columns = os.get_terminal_size(self._stream.fileno()).columns
+        line = line[: (columns or 80) - 1]  # a wrapped line could not be overwritten
+        self._write("\r" + line.ljust(self._drawn))
+        self._drawn = len(line)
+
+    def close(self) -> None:
+        """Clear the bar."""
+        if self._drawn:
+            self._write("\r" + " " * self._drawn + "\r")
+
+    def _share(self, done: int) -> str:
+        if not self._expected:
+            return f"{done} pairs"
+        filled = min(BAR_COLUMNS, BAR_COLUMNS * done // self._expected)
+        bar = f"[{'#' * filled}{'.' * (BAR_COLUMNS - filled)}] " if self._is_terminal else ""
+        return f"{bar}{done}/{self._expected}"
+
+    def _write(self, text: str) -> None:
+        with suppress(OSError):  # the reader has gone: no reason to end the run
+            self._stream.write(text)
+            self._stream.flush()
+
+
+DARK_SHARE: Final = 0.1  # Share of dark pairs from which there is a warning.
+LOST_PARTS_SHARE: Final = 0.1  # Share of pairs with lost parts from which there is a warning.
+# Share of pairs without a sure pose; a smaller one is a gap, whose first pose may imply any speed.
+UNSURE_SHARE: Final = 0.1
+REPEATED: Final = {
+    "drop": "their pairs were left out; a simulator without noise needs pair.repeated_images = 'use'",
+    "use": "they were used, as pair.repeated_images says",
+}
+
+
+def input_warnings(pairing: Synchronise, rig: RigHealth, statistics: RunStatistics, config: Config) -> Iterator[str]:
+    """Yield one line for each problem of the input."""
+    yield from _image_warnings(pairing, config)
+    if rig.warning:
+        yield rig.warning
+    yield from _pose_warnings(statistics, config)
+
+
+def _image_warnings(pairing: Synchronise, config: Config) -> Iterator[str]:
+    """Yield the problems of the images and their stamps."""
+    counts = pairing.counts
+    if pairing.fault:
+        yield f"{counts['broken']} images could not be decoded; the first: {pairing.fault}"
+    if not counts["pairs"]:
+        yield _no_pair(pairing.closest_miss_ms, pairing.tolerance_ms)
+    elif min(counts["unpaired_lower"], counts["unpaired_upper"]) > counts["pairs"]:
+        closest_ms = pairing.closest_miss_ms or 0.0
+        yield (
+            f"most images of both cameras found no partner: the closest ones are {closest_ms:.3f} ms apart, "
+            f"pair.tolerance_ms is {pairing.tolerance_ms:g}; if no images are missing, synchronise the cameras"
+        )
+    for camera, images in pairing.repeated.items():
+        if images.longest >= FROZEN_IMAGES:
+            yield (
+                f"the {camera} camera was frozen: {images.count} of its images had all pixels as before, "
+                f"{images.longest} in a row; {REPEATED[config.pair.repeated_images]}"
+            )
+
+
+def _pose_warnings(statistics: RunStatistics, config: Config) -> Iterator[str]:
+    """Yield the problems that the odometry has met: dark pairs, parts of images without use, lost poses."""
+    if statistics.dark > statistics.poses * DARK_SHARE:
+        yield (
+            f"it was too dark in {statistics.dark} of {statistics.poses} pairs: the images have more noise than "
+            "contrast; more light, a longer exposure (cameras.exposure_us) or less gain"
+        )
+    for camera, pairs in statistics.lost_parts.items():
+        if pairs > statistics.poses * LOST_PARTS_SHARE:
+            yield (
+                f"a part of the {camera} camera's image was frozen, dark, saturated or blurred in {pairs} of "
+                f"{statistics.poses} pairs: it was not used; clean the mirror, check the camera and its driver"
+            )
+    lost = statistics.states[TrackingState.LOST]
+    unsure = lost + statistics.states[TrackingState.DEGRADED]
+    if statistics.too_fast and unsure > statistics.poses * UNSURE_SHARE:
+        yield (
+            f"the pose was lost or degraded in {unsure} of {statistics.poses} pairs, and the images show up to "
+            f"{statistics.fastest_mps:.1f} m/s: poses that imply more than odometry.limits.max_speed_mps = "
+            f"{config.odometry.limits.max_speed_mps:g} are refused; raise it if the robot is that fast"
+        )
+    elif lost > statistics.poses / 2:
+        yield (
+            f"the pose was lost in {lost} of {statistics.poses} pairs: is the rig that of these cameras, "
+            "is --lower the lower one, are the images bright and sharp?"
+        )
+
+
+def _no_pair(closest_ms: float | None, tolerance_ms: float) -> str:
+    if closest_ms is None:
+        return "no pair of images: one camera or both have none, see the drops below"
+    return (
+        f"no pair of images: the stamps of the two cameras are at least {closest_ms:.3f} ms apart, "
+        f"pair.tolerance_ms is {tolerance_ms:g}: increase it, or correct the clocks of the cameras"
+    )

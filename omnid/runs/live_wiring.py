@@ -31,8 +31,7 @@ from omnid.engine.graph import NEWEST, Sink, Stream
 from omnid.engine.logging_setup import Report
 from omnid.engine.robot_clock import RobotClock, SegmentTime
 from omnid.formats.route_file import RouteFolder
-from omnid.light.exposure_control import ExposureControl
-from omnid.light.exposure_law import UsefulArea
+from omnid.light.exposure import ExposureControl, UsefulArea
 from omnid.load_level import LoadLevel
 from omnid.messages import OdometryUpdate
 from omnid.runs.live import LiveRobot, add_status_tickers

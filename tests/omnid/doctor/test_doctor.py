@@ -22,10 +22,8 @@ from drivers.errors import DriverError
 from omnid.cli import main
 from omnid.config import RecordConfig
 from omnid.controller.motor_settings import MotorSettings
-from omnid.doctor import devices, machine
-from omnid.doctor.devices import access, cameras, motor
-from omnid.doctor.finding import Finding
-from omnid.doctor.machine import BUILT_S, bus, clock, disk, is_synchronised, rig
+from omnid.doctor import checks
+from omnid.doctor.checks import BUILT_S, Finding, access, bus, cameras, clock, disk, is_synchronised, motor, rig
 from omnid.transport.bus_config import BusConfig
 
 ROOT = Path(__file__).parents[3]
@@ -65,7 +63,7 @@ class Robot:
 
 @pytest.fixture
 def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Robot:
-    monkeypatch.setattr(devices, "offered_image", lambda _: IMAGE)
+    monkeypatch.setattr(checks, "offered_image", lambda _: IMAGE)
     return Robot(tmp_path)
 
 
@@ -76,7 +74,7 @@ def test_accepts_cameras_with_the_configured_image(robot: Robot, monkeypatch: py
     assert robot.examined(auto_exposure="rig")[0].found.endswith("30 Hz, exposure left to it")
     robot.known = [replace(device, exposure="exposure 1 to 9 ms") for device in robot.known]
     assert robot.examined(auto_exposure="rig")[0].found.endswith("30 Hz, exposure 1 to 9 ms set by omnid run")
-    monkeypatch.setattr(devices, "offered_image", lambda _: None)
+    monkeypatch.setattr(checks, "offered_image", lambda _: None)
     assert "in use, so that its image was not tried" in robot.examined()[0].found
 
 
@@ -97,7 +95,7 @@ def test_finds_faults_of_cameras(robot: Robot, monkeypatch: pytest.MonkeyPatch) 
     def refuse(_: V4l2Settings) -> StreamFormat:
         raise DriverError("auto 1280x960 at 60 Hz is not offered")
 
-    monkeypatch.setattr(devices, "offered_image", refuse)
+    monkeypatch.setattr(checks, "offered_image", refuse)
     assert robot.examined()[1].level == "error" and "[cameras]" in robot.examined()[1].advice
 
 
@@ -138,8 +136,7 @@ def test_finds_a_device_without_permission() -> None:
         device.chmod(0)
         os.chown(device, -1, grp.getgrnam("video").gr_gid)
         (line,) = as_another_user(
-            "from omnid.doctor.devices import access\nos.setuid({user})\n"
-            + f"print(*access('motor', Path('{device}')))"
+            "from omnid.doctor.checks import access\nos.setuid({user})\n" + f"print(*access('motor', Path('{device}')))"
         )
         assert "no permission" in line and "usermod" in line
         device.chmod(0o660)
@@ -148,7 +145,7 @@ def test_finds_a_device_without_permission() -> None:
 
 def test_checks_the_rights_of_this_user() -> None:
     lines = as_another_user(
-        "from omnid.doctor.machine import rights\n"
+        "from omnid.doctor.checks import rights\n"
         "for kind in (resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK): resource.setrlimit(kind, (0, 0))\n"
         "os.getuid() or os.setuid({user})\n"
         "print(*rights(20, True), *rights(0, False), sep='\\n')"
@@ -167,15 +164,15 @@ def test_checks_the_system_time(now_s: float, synchronised: bool, level: str) ->
 
 
 def test_checks_the_space_for_recordings(tmp_path: Path) -> None:
-    (found,) = disk(machine.STATE / "not" / "yet", RecordConfig(keep_mb=10, free_mb=0), 1e6)
-    assert found.level == "ok" and f"free at {machine.STATE.parent}" in found.found and "newest 0.0 GB" in found.found
+    (found,) = disk(checks.STATE / "not" / "yet", RecordConfig(keep_mb=10, free_mb=0), 1e6)
+    assert found.level == "ok" and f"free at {checks.STATE.parent}" in found.found and "newest 0.0 GB" in found.found
     for enabled, level in ((False, "warning"), (True, "error")):
-        (found,) = disk(machine.STATE, RecordConfig(enabled=enabled, free_mb=10**9), 1e6)
+        (found,) = disk(checks.STATE, RecordConfig(enabled=enabled, free_mb=10**9), 1e6)
         assert found.level == level and "record.free_mb = 1000000000" in found.found
     *_, found = disk(tmp_path, RecordConfig(free_mb=0), 1e6)
     assert found.level == "warning" and f"ReadWritePaths={tmp_path}" in found.advice
     unit = (ROOT / "systemd" / "omnid.service").read_text()
-    assert f"\nWorkingDirectory={machine.STATE}\n" in unit and f"\nStateDirectory={machine.STATE.name}\n" in unit
+    assert f"\nWorkingDirectory={checks.STATE}\n" in unit and f"\nStateDirectory={checks.STATE.name}\n" in unit
 
 
 def test_checks_the_rig(scene: Path, tmp_path: Path) -> None:

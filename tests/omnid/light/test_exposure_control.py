@@ -10,8 +10,7 @@ from calib.rig import Rig
 from drivers.cameras.camera_state import CameraExposure, CameraState, ExposureRanges, ExposureSetting, ValueRange
 from drivers.frame import Camera
 from omnid.camera_config import CamerasConfig
-from omnid.light.exposure_control import ExposureControl
-from omnid.light.exposure_law import UsefulArea
+from omnid.light.exposure import ExposureControl, UsefulArea
 from omnid.messages import FramePair
 from omnid.transport.codec import OK, WARN, DiagnosticStatus
 from tests.simulation.recipes import mild_rig

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drivers.cameras.camera_state import ExposureRanges, ExposureSetting, ValueRange
-from omnid.light.exposure_law import LONGEST_STEP_S, STEP_S, TARGET, ExposureLaw, GreyLevels
+from omnid.light.exposure import LONGEST_STEP_S, STEP_S, TARGET, ExposureLaw, GreyLevels
 
 RANGES = ExposureRanges(ValueRange(100, 200_000, 100), ValueRange(0, 100))
 SCENE = np.random.default_rng(4).lognormal(0.0, 0.5, 400)  # radiances, mean about 1.1
