@@ -43,7 +43,24 @@ KINDS: Final = ("brick", "plaster", "granite", "plaster")  # Textures of a rando
 Side: TypeAlias = Annotated[float, Meta(ge=0.02, le=20.0)]  # m
 Size: TypeAlias = tuple[Side, Side, Side]
 Path: TypeAlias = Annotated[tuple[Point, ...], Meta(min_length=2, max_length=100)]
-Painted: TypeAlias = Literal["brick", "plaster", "granite", "tiles", "plain", "white"]
+Painted: TypeAlias = Literal[
+    "brick",
+    "plaster",
+    "granite",
+    "tiles",
+    "plain",
+    "white",
+    "linoleum",
+    "epoxy",
+    "marbled",
+    "concrete",
+    "glazed",
+    "slabs",
+    "carpet",
+    "parquet_along",
+    "parquet_across",
+    "laminate",
+]
 
 
 class Door(Struct, frozen=True, order=True):
@@ -177,7 +194,8 @@ def load_world(name: str, seed: int = 0, options: WorldOptions | None = None) ->
             data = bytes_of(name, MAX_BYTES)
         else:
             raise OmnidError(
-                f"world {name!r} is not known; name a file *.toml, or one of {', '.join(shipped_worlds())}"
+                f"world {name!r} is not known; name a file *.toml, a world like a building "
+                f"(docs/drive.md), or one of {', '.join(shipped_worlds())}"
             )
         return parse_world(data.decode(errors="surrogateescape"), name, seed, options or WorldOptions())
     except ValueError as error:
