@@ -33,16 +33,26 @@ _PNG_FIRST_CHUNK = 8
 _PNG_CHUNK_BYTES = 12  # length, name and CRC
 _MAX_PNG_CHUNKS = 1000
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by colour type
-_CHANNELS = {"mono8": 1, "mono16": 1, "bgr8": 3, "rgb8": 3, "bgra8": 4, "rgba8": 4, "yuyv": 2, "uyvy": 2, "nv12": 1}
 _LUMA = {"yuyv": 0, "uyvy": 1}  # index of the luma byte of the two bytes of a pixel
+# Conversions by encoding without the number of bits, which are 8 or 16 a sample.
+_TO_GRAY = {
+    "bgr": cv2.COLOR_BGR2GRAY,
+    "rgb": cv2.COLOR_RGB2GRAY,
+    "bgra": cv2.COLOR_BGRA2GRAY,
+    "rgba": cv2.COLOR_RGBA2GRAY,
+    "bayer_rggb": cv2.COLOR_BayerRGGB2GRAY,
+    "bayer_bggr": cv2.COLOR_BayerBGGR2GRAY,
+    "bayer_gbrg": cv2.COLOR_BayerGBRG2GRAY,
+    "bayer_grbg": cv2.COLOR_BayerGRBG2GRAY,
+}
+_LUMA_FIRST = ("mono8", "nv12", "nv21", "nv24")
+_DEEP = "16"  # ends the names of encodings of 16 bits a sample
+# The names are those of sensor_msgs/image_encodings.hpp; of nv12, nv21 and nv24 the plane of luma comes first.
+_CHANNELS = {**dict.fromkeys(_LUMA_FIRST, 1), "mono16": 1, "yuyv": 2, "uyvy": 2} | {
+    f"{name}{bits}": 1 if name.startswith("bayer") else len(name) for name in _TO_GRAY for bits in (8, 16)
+}
 SAMPLE_BITS = (8, 10, 12, 16)  # bits of a camera that images of 16 bits a sample may hold
 _MAX_REASON, _MAX_ENCODING = 120, 40  # characters in an error message
-_TO_GRAY = {
-    "bgr8": cv2.COLOR_BGR2GRAY,
-    "rgb8": cv2.COLOR_RGB2GRAY,
-    "bgra8": cv2.COLOR_BGRA2GRAY,
-    "rgba8": cv2.COLOR_RGBA2GRAY,
-}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,13 +62,13 @@ class Frame:
     seq: int  # number of the frame of this camera, from 0
     stamp_ns: int  # capture time
     camera: Camera
-    encoding: str  # jpeg | png | mono8 | mono16 | bgr8 | rgb8 | bgra8 | rgba8 | yuyv | uyvy | nv12
+    encoding: str  # jpeg | png | mono8 | mono16 | bgr8 | bayer_rggb8 | yuyv | uyvy | nv12 ...: see gray()
     data: memoryview | bytes | NDArray[Any]  # C-contiguous
     width: int = 0  # px
     height: int = 0  # px
     step: int = 0  # bytes from row to row; 0: rows without padding
-    bigendian: bool = False  # byte order of mono16
-    bits: int = 16  # one of SAMPLE_BITS: of these, mono16 and PNG of 16 bits a sample show the upper eight
+    bigendian: bool = False  # byte order of samples of 16 bits
+    bits: int = 16  # one of SAMPLE_BITS: of these, images of 16 bits a sample show the upper eight
 
 
 class FrameSource(Protocol):
@@ -74,7 +84,7 @@ class FrameSource(Protocol):
 def gray(frame: Frame) -> NDArray[np.uint8]:
     """Return the image as (H, W) uint8, C-contiguous and read-only; it never aliases a writable buffer.
 
-    Colours are converted with OpenCV's weights; of yuyv, uyvy and nv12 the luma is kept.
+    Colours are converted with OpenCV's weights, Bayer patterns are interpolated before; of YUV the luma is kept.
     An EXIF orientation is ignored, since the calibration belongs to the sensor's own axes. Raises FrameDecodeError for
     an image that is truncated, malformed or of an unknown encoding, and for a JPEG of which libjpeg notices that a part
     was lost: with restart markers nearly any, without them what leaves the rest of the image undecodable.
@@ -94,7 +104,7 @@ def coding_steps(frame: Frame) -> Steps:
 
 def is_deep(frame: Frame) -> bool:
     """True if an image has 16 bits a sample, of which Frame.bits are those of the camera."""
-    return frame.encoding == "mono16" or (frame.encoding == "png" and bytes(frame.data[_PNG_DEPTH]) == b"\x10")
+    return frame.encoding.endswith(_DEEP) or (frame.encoding == "png" and bytes(frame.data[_PNG_DEPTH]) == b"\x10")
 
 
 def upper_eight_bits(samples: NDArray[Any], bits: int) -> NDArray[np.uint8]:
@@ -178,21 +188,25 @@ def _unpack(frame: Frame) -> NDArray[np.uint8]:
     pixels = _pixels(frame)
     if frame.encoding in _LUMA:
         return np.array(pixels[..., _LUMA[frame.encoding]], np.uint8, order="C")
-    if _CHANNELS[frame.encoding] == 1 and pixels.dtype == np.uint8:
+    if frame.encoding in _LUMA_FIRST:
         return np.array(pixels, np.uint8, order="C") if pixels.flags.writeable else np.ascontiguousarray(pixels)
-    if frame.encoding == "mono16":
-        return upper_eight_bits(pixels, frame.bits)
-    return np.ascontiguousarray(cv2.cvtColor(np.ascontiguousarray(pixels), _TO_GRAY[frame.encoding]), np.uint8)
+    name = frame.encoding.removesuffix(_DEEP).removesuffix("8")
+    if name in _TO_GRAY:
+        native = np.ascontiguousarray(pixels, pixels.dtype.newbyteorder("="))
+        pixels = np.asarray(cv2.cvtColor(native, _TO_GRAY[name]))
+    return np.ascontiguousarray(pixels if pixels.dtype == np.uint8 else upper_eight_bits(pixels, frame.bits))
 
 
 def _pixels(frame: Frame) -> NDArray[Any]:
     """Return a view of the raw pixels, (H, W) or (H, W, channels), without the padding of rows and further planes."""
     channels = _CHANNELS.get(frame.encoding)
+    if not len(frame.data):
+        raise _decode_error(frame, "it is empty")
     if channels is None:
         raise _decode_error(frame, f"known encodings are {', '.join([*_START_MARKER, *_CHANNELS])}")
     _require_size(frame, frame.width, frame.height)
     dtype: np.dtype[Any] = np.dtype(np.uint8)
-    if frame.encoding == "mono16":
+    if frame.encoding.endswith(_DEEP):
         dtype = np.dtype(">u2" if frame.bigendian else "<u2")
     pixel_bytes = channels * dtype.itemsize
     row_bytes = frame.width * pixel_bytes

@@ -18,6 +18,7 @@ _WORDS: dict[str, Camera] = {
     "top": "upper",
     "up": "upper",
 }
+_COMPRESSED = "/compressed"  # ends the names of compressed images (image_transport)
 _MAX_LISTED = 16
 
 Wanted = Mapping[Camera, str | None]
@@ -37,9 +38,9 @@ def choose_topics(log: str, topics: Mapping[str, str], wanted: Wanted) -> dict[C
         raise DriverError(
             f"no image topics in {log}: found {_listed(topics)}; record {IMAGE} or {COMPRESSED_IMAGE} of both cameras"
         )
-    given = {name for name in wanted.values() if name is not None}
-    free = [name for name in images if name not in given]
-    found = {camera: _given(log, topics, wanted[camera]) or _guessed(log, free, camera) for camera in CAMERAS}
+    given = {camera: _given(log, topics, wanted[camera]) for camera in CAMERAS}
+    free = [name for name in images if name not in given.values()]
+    found = {camera: given[camera] or _guessed(log, free, camera) for camera in CAMERAS}
     return _both(log, images, found)
 
 
@@ -92,8 +93,11 @@ def _is_image(name: str, kind: str) -> bool:
 
 
 def _given(log: str, topics: Mapping[str, str], name: str | None) -> str | None:
+    """Return the topic of a requested camera; image_transport publishes it raw, compressed, or both."""
     if name is None:
         return None
+    transports = name, f"{name}{_COMPRESSED}", name.removesuffix(_COMPRESSED)
+    name = next((topic for topic in transports if topic in topics), name)
     if name not in topics:
         raise DriverError(f"no topic {name!r} in {log}: found {_listed(topics)}; give one of these")
     if topics[name] not in IMAGE_TYPES:
@@ -109,7 +113,7 @@ def _guessed(log: str, names: Iterable[str], camera: Camera) -> str | None:
     mine = [name for name in names if _camera_named(name) == camera]
     if len(_images(mine)) > 1:
         raise DriverError(f"several {camera} cameras in {log}: found {_listed(mine)}; give one of them by --{camera}")
-    return max(mine, key=lambda name: name.endswith("/compressed"), default=None)
+    return max(mine, key=lambda name: name.endswith(_COMPRESSED), default=None)
 
 
 def _camera_named(topic: str) -> Camera | None:
@@ -131,7 +135,7 @@ def _both(log: str, images: Mapping[str, str], found: Mapping[Camera, str | None
 
 
 def _images(names: Iterable[str]) -> set[str]:
-    return {name.removesuffix("/compressed") for name in names}
+    return {name.removesuffix(_COMPRESSED) for name in names}
 
 
 def _listed(names: Iterable[str]) -> str:

@@ -50,8 +50,30 @@ RAW = {  # encoding -> channels of COLOURS, and the grey image of them
     "rgba8": (4, lambda pixels: cv2.cvtColor(pixels, cv2.COLOR_RGBA2GRAY)),
     "yuyv": (2, lambda pixels: pixels[..., 0]),
     "uyvy": (2, lambda pixels: pixels[..., 1]),
-    "nv12": (1, lambda pixels: pixels[..., 0]),
+    **dict.fromkeys(("nv12", "nv21", "nv24"), (1, lambda pixels: pixels[..., 0])),
 }
+# Encoding -> rows and columns of the samples that are red, from the first ones on.
+BAYER = {"bayer_rggb": (0, 0), "bayer_bggr": (1, 1), "bayer_gbrg": (1, 0), "bayer_grbg": (0, 1)}
+
+
+@pytest.mark.parametrize("name", BAYER)
+@pytest.mark.parametrize(("dtype", "bits"), [("u1", 16), ("<u2", 10), (">u2", 12)])
+def test_bayer_patterns_are_interpolated(name: str, dtype: str, bits: int) -> None:
+    """Red light, which is 0.299 of the grey level of white."""
+    full = 255 if dtype == "u1" else 2**bits - 1
+    samples = np.zeros((HEIGHT, WIDTH), dtype)
+    row, column = BAYER[name]
+    samples[row::2, column::2] = full
+    encoding = f"{name}{8 * samples.itemsize}"
+    found = gray(frame(encoding, samples.tobytes(), bits=bits, bigendian=dtype == ">u2"))
+    assert found.shape == (HEIGHT, WIDTH) and np.abs(found[2:-2, 2:-2].astype(float) - 0.299 * 255).max() < 2
+
+
+@pytest.mark.parametrize(("encoding", "channels"), [("rgb16", 3), ("bgra16", 4)])
+def test_colours_of_16_bits_are_the_upper_eight(encoding: str, channels: int) -> None:
+    deep = COLOURS[..., :channels].astype("<u2") * 257
+    expected = gray(frame(encoding.replace("16", "8"), COLOURS[..., :channels].tobytes())).astype(int)
+    assert np.abs(gray(frame(encoding, deep.tobytes())) - expected).max() <= 1
 
 
 @pytest.mark.parametrize("encoding", RAW)
@@ -198,7 +220,7 @@ def test_detects_truncation_at_any_byte(suffix: str) -> None:
         (frame("mono8", bytes(100), width=-3), "size"),
         (frame("mono8", bytes(100), width=2**31, height=2**31), "size"),
         (frame("mono8", bytes(10**4), step=2**62), "bytes"),
-        (frame("bayer_rggb8", bytes(10**4)), "known encodings"),
+        (frame("bayer_rggb9", bytes(10**4)), "known encodings"),
         (frame("jpeg", encoded(".jpg")[:-40] + bytes(9000)), "Premature end"),
         (frame("jpeg", b""), "nothing"),
         (frame("jpeg", b"BM" + bytes(100)), "starts with"),

@@ -40,6 +40,14 @@ def test_requested_topics_with_and_without_a_summary(tmp_path: Path, layout: dic
     assert reader.topics == {"lower": "/b", "upper": "/a"} and len(list(reader.frames())) == 4
 
 
+@pytest.mark.parametrize("given", ["/cam{}/image_raw", "/cam{}/image_raw/compressed"])
+@pytest.mark.parametrize("logged", ["/cam{}/image_raw", "/cam{}/image_raw/compressed"])
+def test_an_image_is_one_topic_raw_and_compressed(tmp_path: Path, given: str, logged: str) -> None:
+    path = write_log(tmp_path / "log.mcap", pairs(2, *map(logged.format, (0, 1))))
+    reader = LogReader(path, *map(given.format, (0, 1)))
+    assert reader.topics == {"lower": logged.format(0), "upper": logged.format(1)} and len(list(reader.frames())) == 4
+
+
 IMAGES = {"/a/lower/image_raw": IMAGE, "/a/upper/image_raw": IMAGE}
 
 
