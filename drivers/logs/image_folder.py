@@ -95,8 +95,12 @@ class ImageFolder:
 
     def span_ns(self) -> tuple[int, int] | None:
         """Return the first and last stamp."""
-        stamps = [file.stamp_ns for files in self._files.values() for file in files]
-        return (min(stamps), max(stamps)) if stamps else None
+        spans = self.image_spans_ns().values()
+        return (min(first for first, _ in spans), max(last for _, last in spans)) if spans else None
+
+    def image_spans_ns(self) -> Mapping[str, tuple[int, int]]:
+        """Return the first and last stamp in each folder."""
+        return {topic: (min(files).stamp_ns, max(files).stamp_ns) for topic, files in self._files.items() if files}
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[LoggedMessage]:
         """Yield the images of these folders in the order of their stamps."""

@@ -10,7 +10,7 @@ from typing import Final, NamedTuple, Protocol
 
 import zstandard
 
-from drivers.logs.ros_messages import JointWheels, MotionReading, RosImage, parse_image, parse_motion
+from drivers.logs.ros_messages import JointWheels, MotionReading, RosImage, cdr_of_ros1, parse_image, parse_motion
 
 MAX_RECORD_BYTES: Final = 256 * 2**20  # of a message, of an image and of an unpacked chunk
 _ZSTD: Final = b"\x28\xb5\x2f\xfd"  # first bytes of a frame (RFC 8878); no message begins with them
@@ -35,6 +35,10 @@ class LoggedMessage:
         data = memoryview(self.read())
         return unpack_zstd(data) if bytes(data[: len(_ZSTD)]) == _ZSTD else data
 
+    def cdr(self) -> bytes:
+        """Return the bytes in CDR; raise RecordError or FrameDecodeError."""
+        return bytes(self.data()) if self.aligned else cdr_of_ros1(self.kind, self.data())
+
     def image(self) -> RosImage:
         """Return the image of an image message; raise FrameDecodeError or RecordError where there is none."""
         return parse_image(self.kind, self.data(), aligned=self.aligned)
@@ -49,7 +53,6 @@ class LogDamage(NamedTuple):
 
     broken: int = 0  # chunks and records that were skipped
     cut: str = ""  # one line that says where a log ends too early; empty for a complete log
-    readable_bytes: int | None = None  # length up to which the file could be read; None: all of it
 
 
 class Log(Protocol):
@@ -67,6 +70,9 @@ class Log(Protocol):
 
     def span_ns(self) -> tuple[int, int] | None:
         """Return the first and last log time; None where the log does not state it, or is empty."""
+
+    def image_spans_ns(self) -> Mapping[str, tuple[int, int]]:
+        """Return the first and last log time of each topic of images that has some, as far as they can be read."""
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[LoggedMessage]:
         """Yield the messages of these topics (None: all) in the order of log time; ends early after close."""
@@ -97,8 +103,8 @@ class LogInfo:
     path: Path
     size_bytes: int
     state: LogState
-    readable_bytes: int  # length up to which the file could be read
-    broken: int  # corrupt chunks and records in that length; those of an MCAP file with an index are not examined
+    broken: int  # corrupt chunks and records; 0 where they were not examined
+    fault: str  # one line that says what of the log is missing; empty for a complete log
     topics: Mapping[str, tuple[str, int]]  # topic -> type ('' where it cannot be decoded), number of messages
     span_ns: tuple[int, int] | None  # first and last log time; None without messages
     attachments: Mapping[str, int]  # name -> bytes of the readable ones, up to 32

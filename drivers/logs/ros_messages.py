@@ -36,6 +36,8 @@ _SYNONYMS: Final = {
     "8UC3": "bgr8",
     "8UC4": "bgra8",
     "16UC1": "mono16",
+    "16UC3": "bgr16",
+    "16UC4": "bgra16",
     "yuv422_yuy2": "yuyv",
     "yuv422": "uyvy",
 }
@@ -46,7 +48,7 @@ _MAX_TEXT: Final = 256  # bytes
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RosImage:
-    """One image message; the fields after data are 0 for compressed images."""
+    """One image message; width to bigendian are 0 for compressed images."""
 
     stamp_ns: int  # stamp of the header, 0 if unset
     encoding: str  # as in drivers.frame.Frame
@@ -55,6 +57,7 @@ class RosImage:
     height: int = 0  # px
     step: int = 0  # bytes from row to row
     bigendian: bool = False
+    carries: bool = False  # the nanoseconds of the stamp are a second or more
 
     def frame(self, camera: Camera = "lower", seq: int = 0, bits: int = 16) -> Frame:
         """Return the image as a frame of a camera. To decode it, neither the camera nor the number matters.
@@ -74,19 +77,20 @@ def parse_image(kind: str, message: memoryview, *, aligned: bool = True) -> RosI
         members = _Members(message, aligned)
         if not aligned:
             members.number("I")  # the sequence number that a header has in ROS 1
-        stamp_ns = _stamp_ns(members.number("i"), members.number("I"))
+        seconds, nanoseconds = members.number("i"), members.number("I")
+        stamp_ns, carries = _stamp_ns(seconds, nanoseconds), nanoseconds >= 10**9
         members.text()  # the frame: the topic identifies the camera
         if kind == IMAGE:
             height, width, encoding = members.number("I"), members.number("I"), members.text()
             bigendian, step = bool(members.number("B")), members.number("I")
             encoding = _SYNONYMS.get(encoding, encoding)
-            return RosImage(stamp_ns, encoding, members.octets(), width, height, step, bigendian)
+            return RosImage(stamp_ns, encoding, members.octets(), width, height, step, bigendian, carries)
         encoding, data = members.text(), members.octets()
     except struct.error as error:
         raise FrameDecodeError(f"a {kind} of {len(message)} bytes is truncated") from error
     # The first bytes decide the encoding, else the format, which is free text such as 'bgr8; jpeg compressed bgr8'.
     encoding = next((name for name, part in (("jpeg", "jp"), ("png", "png")) if part in encoding.lower()), encoding)
-    return RosImage(stamp_ns, image_encoding(data, encoding), data)
+    return RosImage(stamp_ns, image_encoding(data, encoding), data, carries=carries)
 
 
 def image_encoding(data: memoryview | bytes, otherwise: str = "") -> str:
@@ -155,6 +159,17 @@ def parse_motion(
     return MotionReading(stamp_ns, rates, frame)
 
 
+def cdr_of_ros1(kind: str, message: memoryview) -> bytes:
+    """Return a message of ROS 1 in CDR, as ROS 2 has it; raise FrameDecodeError where it is invalid or unknown."""
+    from rosbags.convert.converter import migrate_bytes  # which only recordings of ROS 1 need
+
+    stores = _typestore(Stores.ROS1_NOETIC), _typestore(Stores.ROS2_HUMBLE)
+    try:
+        return bytes(migrate_bytes(*stores, kind, kind, {}, message, src_is2=False, dst_is2=True))
+    except Exception as error:  # of any kind, as it trusts the lengths in the bytes
+        raise FrameDecodeError(f"a {kind} of {len(message)} bytes is truncated, invalid or unknown") from error
+
+
 def _decoded(kind: str, message: memoryview, aligned: bool) -> Any:
     """Return a message as rosbags decodes it; raise FrameDecodeError for other bytes."""
     store = _typestore(Stores.ROS2_HUMBLE if aligned else Stores.ROS1_NOETIC)
@@ -168,9 +183,8 @@ _typestore = cache(get_typestore)
 
 
 def _stamp_ns(seconds: int, nanoseconds: int) -> int:
-    if seconds < 0 or nanoseconds >= 10**9:
-        raise FrameDecodeError(f"a message has the invalid stamp {seconds} s {nanoseconds} ns")
-    return seconds * 10**9 + nanoseconds
+    """Return the stamp of a header, 0 where there is none; some drivers do not carry nanoseconds over to seconds."""
+    return seconds * 10**9 + nanoseconds if seconds >= 0 else 0
 
 
 class _Members:

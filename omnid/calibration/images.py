@@ -17,7 +17,7 @@ from drivers.errors import DriverError, FrameDecodeError
 from drivers.frame import MAX_PIXELS, Frame, gray, upper_eight_bits
 from drivers.logs.image_folder import IMAGE_SUFFIXES
 from drivers.logs.log_reader import LogCameras, LogReader
-from drivers.logs.open_log import LOG_SUFFIXES
+from drivers.logs.open_log import is_log_name
 from omnid.errors import OmnidError
 
 Image = NDArray[np.uint8]
@@ -74,7 +74,7 @@ def read_pairs(source: Path, cameras: LogCameras = BY_NAME) -> PairedImages:
 
 
 def _is_log(source: Path) -> bool:
-    return source.suffix in LOG_SUFFIXES
+    return is_log_name(source.name)
 
 
 def _repeats(sides: Sequence[Images]) -> dict[str, str]:

@@ -39,7 +39,7 @@ def info(args: argparse.Namespace) -> int:
     code, logs = 0, []
     for number, path in enumerate(args.logs):
         try:
-            found = log_info(path)
+            found = log_info(path, examine=True)
         except DriverError as error:
             print(f"omnid: {_shown(str(error))}", file=sys.stderr)
             code = 2
@@ -72,14 +72,14 @@ def _described(found: LogInfo) -> Iterator[str]:
 def _state(found: LogInfo) -> str:
     from drivers.logs.log import LogState
 
-    if found.state is LogState.BROKEN and found.path.suffix not in (".mcap", ".part"):
-        return f"cut or corrupt, with {found.broken} corrupt records: what can be read is used"
+    faults = [_shown(found.fault)] if found.fault else []
+    if found.broken:
+        faults.append(f"{found.broken} corrupt chunks or records, which are skipped")
+    advice = f"; for other programs: {_MEND}" if found.path.suffix in (".mcap", ".part") else ""
     if found.state is LogState.BROKEN:
-        corrupt = f", with {found.broken} corrupt chunks or records" if found.broken else ""
-        position = f"byte {found.readable_bytes} of {found.size_bytes}"
-        return f"cut or corrupt after {position}{corrupt}: omnid reads what is before; for other programs: {_MEND}"
+        return f"{found.state.value}: {'; '.join(faults)}{advice}"
     if found.state is LogState.UNINDEXED:
-        return f"{found.state.value}: omnid reads it; for other programs: {_MEND}"
+        return f"{found.state.value}: omnid reads it{advice}"
     return str(found.state.value)
 
 

@@ -182,10 +182,10 @@ def _decoder(name: str, kind: str) -> Decoder | None:
 
 
 def _of_bytes(decode: Callable[[bytes], Content], message: LoggedMessage) -> Content:
-    data = message.data()
-    if len(data) > MAX_MESSAGE_BYTES:
-        raise OmnidError(f"a message of {len(data)} bytes: expected at most {MAX_MESSAGE_BYTES}")
-    return decode(bytes(data))
+    size = len(message.data())
+    if size > MAX_MESSAGE_BYTES:
+        raise OmnidError(f"a message of {size} bytes: expected at most {MAX_MESSAGE_BYTES}")
+    return decode(message.cdr())
 
 
 def _finite_twist(data: bytes) -> TwistRecord:

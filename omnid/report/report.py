@@ -148,8 +148,7 @@ def _warnings(run: RecordedRun, true: Trajectory | None) -> list[str]:
     """Return what is missing or doubtful in the log."""
     found, lines = run.info, []
     if found.state is LogState.BROKEN:
-        where = f"after byte {found.readable_bytes} of {found.size_bytes}"
-        lines.append(f"The log is cut or corrupt {where}; this is what could be read.")
+        lines.append(f"The log is cut or corrupt: {found.fault}.")
     if run.corrupt:
         lines.append(f"{run.corrupt} corrupt chunks or records were skipped.")
     if run.unreadable:

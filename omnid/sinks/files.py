@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from drivers.logs.file_lock import is_locked, lock
 from drivers.logs.image_folder import IMAGE_SUFFIXES
-from drivers.logs.open_log import LOG_SUFFIXES
+from drivers.logs.open_log import is_log_name
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.errors import OmnidError
 from omnid.formats.plan import NO_LOOPS, drawn_heights, plan_view
@@ -41,7 +41,7 @@ def check_outputs(outputs: Named, inputs: Named) -> None:
             raise OmnidError(f"{option} {path}: this is {other} as well; name another file")
         folders = [folder for _, folder in inputs if folder.is_dir() and folder.resolve() in path.resolve().parents]
         # A plan is an image beside the folders of a log, not in them.
-        is_read = path.suffix.lower() in LOG_SUFFIXES or (path.suffix.lower() in IMAGE_SUFFIXES and option != "--plan")
+        is_read = is_log_name(path.name) or (path.suffix.lower() in IMAGE_SUFFIXES and option != "--plan")
         if folders and is_read and path.is_file():
             raise OmnidError(f"{option} {path}: this is a file of {folders[0]}, which is read; name another file")
 

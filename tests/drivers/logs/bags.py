@@ -13,6 +13,7 @@ from typing import Any
 import cv2
 import zstandard
 from mcap.writer import Writer as McapWriter
+from rosbags.convert.converter import migrate_bytes
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
@@ -58,10 +59,8 @@ def write_killed_db3(folder: Path, entries: Sequence[Entry]) -> Path:
 
 
 def ros1_bytes(entry: Entry) -> bytes:
-    message, types = STORE.deserialize_cdr(entry.data, entry.type), ROS1.types
-    stamp = types["builtin_interfaces/msg/Time"](message.header.stamp.sec, message.header.stamp.nanosec)
-    header = types["std_msgs/msg/Header"](3, stamp, message.header.frame_id)
-    return bytes(ROS1.serialize_ros1(types[entry.type](header, message.format, message.data), entry.type))
+    migrated = migrate_bytes(STORE, ROS1, entry.type, entry.type, {}, entry.data, src_is2=True, dst_is2=False)
+    return bytes(migrated)
 
 
 def write_bag(path: Path, entries: Sequence[Entry], compression: str = "") -> Path:
@@ -76,6 +75,43 @@ def write_bag(path: Path, entries: Sequence[Entry], compression: str = "") -> Pa
         for entry in entries:
             writer.write(connections[entry.topic], entry.log_time_ns, ros1_bytes(entry))
     return path
+
+
+def unclosed_bag(path: Path, *, open_chunk: bool = False) -> Path:
+    """Make a bag of one chunk the .bag.active of a recorder that was killed: without its index.
+
+    open_chunk: its chunk was not ended either, so that its size is not known.
+    """
+    data = bytearray(path.read_bytes())
+    start = len(b"#ROSBAG V2.0\n")
+    (size,) = struct.unpack_from("<I", data, start)
+    at = data.index(b"index_pos=", start) + len(b"index_pos=")
+    (index,) = struct.unpack_from("<Q", data, at)
+    data[at : at + 8] = bytes(8)
+    active = path.with_name(f"{path.name}.active")
+    if open_chunk:
+        first = start + 4 + size
+        first += 4 + struct.unpack_from("<I", data, first)[0]
+        (size,) = struct.unpack_from("<I", data, first)
+        stated = data.index(b"size=", first) + len(b"size=")
+        data[stated : stated + 4] = data[first + 4 + size : first + 8 + size] = bytes(4)
+    active.write_bytes(data[:index])
+    path.unlink()
+    return active
+
+
+def write_interrupted_db3(folder: Path, entries: Sequence[Entry]) -> Path:
+    """Write the file of a recorder that was killed within a transaction, which its journal undoes."""
+    whole, killed = write_db3(folder, entries), folder / "killed"
+    killed.mkdir()
+    with closing(sqlite3.connect(whole)) as bag:
+        bag.execute("PRAGMA cache_size = 1")
+        bag.execute("BEGIN")
+        bag.execute("UPDATE messages SET data = zeroblob(9)")
+        for suffix in ("", "-journal"):
+            shutil.copy(f"{whole}{suffix}", f"{killed / whole.name}{suffix}")
+        bag.rollback()
+    return killed / whole.name
 
 
 def write_ros1_mcap(path: Path, entries: Sequence[Entry]) -> Path:

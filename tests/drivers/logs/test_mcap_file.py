@@ -187,7 +187,7 @@ def test_topics_have_types_that_can_be_decoded_and_their_names_are_bounded(tmp_p
     encodings = ((10, 1, "cdr"), (11, 1, "ros1"), (12, 2, "ros1"), (13, 1, "json"), (14, 9, "cdr"))
     known = schema(1, IMAGE) + schema(2, "std_msgs/String")
     known += b"".join(channel(number, kind, f"/{number}", encoding) for number, kind, encoding in encodings)
-    expected = {"/10": IMAGE, "/11": IMAGE, "/12": "", "/13": "", "/14": ""}
+    expected = {"/10": IMAGE, "/11": IMAGE, "/12": "std_msgs/msg/String", "/13": "", "/14": ""}
     assert topics_of(tmp_path / "log.mcap", known) == expected
     malformed = record(Opcode.CHANNEL, b"\1\0\xff\xff\xff\xff") + record(Opcode.SCHEMA, b"\1\0\xff\xff\xff\xff")
     assert topics_of(tmp_path / "log.mcap", malformed + channel(1, 9, "x" * 1000)) == {"x" * 256: ""}

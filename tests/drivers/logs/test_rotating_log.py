@@ -241,7 +241,8 @@ print(state.status, state.messages, state.lost, state.stops, len(recording.event
     messages, lost, stops, reports, files = map(int, numbers)
     assert (status, messages, stops, reports, files) == ("stopped", 200, 1, 1, kept) and 170 <= lost <= 200
     parts = [McapFile(path) for path in (tmp_path / "log").iterdir()]
-    assert sum(len(list(part.messages())) for part in parts) == messages - lost
+    # Of the chunk that did not fit, the first messages can be read.
+    assert messages - lost <= sum(len(list(part.messages())) for part in parts) < messages - lost + 30
 
 
 def test_detects_a_removed_folder_and_its_return(bench: Callable[..., Bench], tmp_path: Path) -> None:
