@@ -10,6 +10,7 @@ from typing import Annotated, Final, Literal
 
 from msgspec import Meta
 
+from drivers.logs.image_times import TimeSource
 from drivers.logs.rotating_log import RotationSettings
 from omnid.camera_config import CamerasConfig, PairConfig
 from omnid.controller.motor_settings import MotorSettings
@@ -39,6 +40,11 @@ class LogConfig:
         Meta(ge=0, le=1000),
         "images per second of folders; 0: their names or times.txt state when they were taken",
     ] = 0.0
+    time: Annotated[
+        TimeSource,
+        "when an image was taken: 'header': the stamp of its message, 'log': the time of logging, 'auto': the "
+        "header's, or the log's where those are not set, do not advance, or are of two clocks",
+    ] = "auto"
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from drivers.errors import DriverError
+from drivers.logs.image_times import SHORTEST_STEP_NS
 from drivers.logs.log import MAX_RECORD_BYTES, LogDamage, LoggedMessage, RecordError
 from drivers.logs.ros_messages import COMPRESSED_IMAGE, RosImage, image_encoding
 
@@ -37,8 +38,6 @@ _MAX_VISITED: Final = 10_000
 _MAX_STAMP_BYTES: Final = 64 * 2**20
 _MAX_ATTACHMENT_BYTES: Final = 16 * 2**20
 _MAX_STAMP_NS: Final = 2**62  # The year 2116: two stamps differ by what fits 64 bits.
-# No pair of cameras takes 1,000 images a second, as those that are named by microseconds seem to.
-_SHORTEST_STEP_NS: Final = 1_000_000
 _NANOSECONDS: Final = re.compile(r"\d{16,19}")
 
 
@@ -156,7 +155,7 @@ def _stamped(top: Path, folder: Path, rate_hz: float) -> list[_StampedFile]:
             )
         found.append(_StampedFile(stamp_ns, topic, path))
     steps_ns = sorted(after.stamp_ns - before.stamp_ns for before, after in pairwise(sorted(found)))
-    if lines is None and steps_ns and 0 < steps_ns[len(steps_ns) // 2] <= _SHORTEST_STEP_NS:
+    if lines is None and steps_ns and 0 < steps_ns[len(steps_ns) // 2] <= SHORTEST_STEP_NS:
         raise DriverError(
             f"the images beside {str(paths[0])!r} are {steps_ns[len(steps_ns) // 2] / 1000:g} us apart, as names are "
             f"nanoseconds; write seconds to {STAMP_FILES[0]}, or give --rate HZ, which is log.rate_hz of the settings"

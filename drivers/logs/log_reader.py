@@ -5,14 +5,18 @@ from __future__ import annotations
 import heapq
 import math
 import os
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple, TypeAlias
 
+import numpy as np
+from numpy.typing import NDArray
+
 from drivers.errors import DriverError, FrameDecodeError
 from drivers.frame import SAMPLE_BITS, Camera, Frame, gray, is_deep
+from drivers.logs.image_times import MAX_HELD_BYTES, ImageTimes, TimedImage, TimeSource
 from drivers.logs.log import LoggedMessage, RecordError, widened
 from drivers.logs.open_log import open_log
 from drivers.logs.ros_messages import RosImage
@@ -22,15 +26,16 @@ from drivers.motion import MotionSample, WheelSample
 _WARNINGS = {
     "late": "dropped {} frames older than others read before: record with less delay or raise log.reorder_frames",
     "duplicate": "dropped {} frames with the same stamp as the frame before of the same camera",
+    "carried": "{} stamps have 10^9 nanoseconds or more, which were added to their seconds",
     "broken_motion": "skipped {} messages of wheels or IMU that are not valid; the first: {motion_fault}",
     "no_joints": "none of {} messages of joints names the wheels: see motion.wheel_joints",
     "broken": "skipped {} messages of the cameras' topics that hold no valid image; the first: {fault}",
-    "unstamped": "{} frames have no stamp in their header: used the time of logging",
     "broken_records": "skipped {} corrupt chunks or records of the file",
 }
 MAX_WAITING_SAMPLES = 65_536  # Samples of wheels and IMU that wait for the next images: some minutes.
-MAX_HELD_BYTES = 256 * 2**20  # of the images that wait for earlier ones
-_COUNTERS = ("lower", "upper", *_WARNINGS)
+MOST_PERCENT = 99.0
+NEUTRAL_GREY, NEAR_NEUTRAL = 128, 16  # grey levels of colourless U and V, and how near those of weak colours are
+_COUNTERS = ("lower", "upper", "unstamped", "repeated", *_WARNINGS)
 WHOLE = (0.0, math.inf)  # span of all of a log [s]
 
 
@@ -41,10 +46,11 @@ class LogCameras(NamedTuple):
     upper: str | None = None
     bits: int = 16
     rate_hz: float = 0.0
+    time: TimeSource = "auto"
 
     def reader(self, path: str | os.PathLike[str]) -> LogReader:
         """Open a log."""
-        return LogReader(path, self.lower, self.upper, bits=self.bits, rate_hz=self.rate_hz)
+        return LogReader(path, self.lower, self.upper, bits=self.bits, rate_hz=self.rate_hz, time=self.time)
 
 
 # Both topics, or more.
@@ -57,13 +63,14 @@ class LogReader:
     path, rate_hz: as for `open_log`. bits: of the samples of images of 16 bits, see Frame. lower, upper: topics, where
     their names do not identify the cameras. window: number of frames that are held back to sort them by stamp. span_s:
     the part of the log that is read, from and until so many seconds after the stamp of its first image. motion: topics
-    of wheels and IMU; None: their samples are not read. Raises DriverError where the path is no such log, or the
+    of wheels and IMU; None: their samples are not read. time: which of its two times an image is stamped with, see
+    `image_times`. Raises DriverError where the path is no such log, or the
     topics of the two cameras are ambiguous.
 
     During and after frames() and messages(), `counts` has 'lower' and 'upper' (frames delivered), 'late', 'duplicate',
-    'unstamped' (log time used), 'broken' (messages without a valid image), 'broken_motion' and 'broken_records' (chunks
-    or records of the file). After its end `truncated` is True for an incomplete log, and `warnings` has one line per
-    kind of fault.
+    'repeated' (of these, with the same content), 'unstamped' (time of logging used), 'broken' (messages without a valid
+    image), 'broken_motion' and 'broken_records' (chunks or records of the file). After its end `truncated` is True for
+    an incomplete log, and `warnings` has one line per kind of fault.
     """
 
     def __init__(
@@ -77,8 +84,9 @@ class LogReader:
         motion: MotionTopics | None = None,
         bits: int = 16,
         rate_hz: float = 0.0,
+        time: TimeSource = "auto",
     ) -> None:
-        self._window, self._closed, self._span_s, self._bits = window, False, span_s, bits
+        self._window, self._closed, self._span_s, self._bits, self._time = window, False, span_s, bits, time
         self._log = open_log(path, rate_hz)
         self._motion = MotionChoice(frozenset())
         self._joints = motion.joints if motion else None
@@ -111,22 +119,38 @@ class LogReader:
 
     def _sorted(self) -> Iterator[Frame | MotionSample]:
         buffer, samples = _ReorderBuffer(self._window, self._bits, self.counts), _Samples()
+        for timed in self._times.stamped(self._images()):
+            self._widen("images", timed.image.stamp_ns)
+            yield from self._due_samples(samples, timed.log_ns)
+            for frame in buffer.push(timed.camera, timed.image):
+                yield from samples.until(frame.stamp_ns)
+                yield frame
+        if not self._closed:
+            yield from self._due_samples(samples, None)
+            for frame in buffer.drain():
+                yield from samples.until(frame.stamp_ns)
+                yield frame
+
+    def _images(self) -> Iterator[TimedImage]:
+        """Yield the images in the order of logging; the samples between them wait."""
         cameras = {topic: camera for camera, topic in self._cameras.items()}
         for message in self._log.messages({*cameras, *self._motion.names}):
             if self._closed:
                 return
-            if message.topic not in cameras:
-                sample = self._sample(message)
-                if sample is not None:
-                    yield from samples.push(sample)
-            elif (image := self._image(message)) is not None:
-                for frame in buffer.push(cameras[message.topic], image):
-                    yield from samples.until(frame.stamp_ns)
-                    yield frame
-        if not self._closed:
-            for frame in buffer.drain():
-                yield from samples.until(frame.stamp_ns)
-                yield frame
+            log_ns = self._times.logged_ns(message.log_time_ns)
+            if message.topic in cameras:
+                image = self._image(message)
+                if image is not None:
+                    yield TimedImage(cameras[message.topic], image, log_ns)
+            elif len(self._unstamped) < MAX_WAITING_SAMPLES:
+                self._unstamped.append((log_ns, message))
+
+    def _due_samples(self, samples: _Samples, until_ns: int | None) -> Iterator[MotionSample]:
+        """Stamp the samples that were logged until then, None: all; yield the earliest ones where too many wait."""
+        while self._unstamped and (until_ns is None or self._unstamped[0][0] <= until_ns):
+            sample = self._sample(*self._unstamped.popleft())
+            if sample is not None:
+                yield from samples.push(sample)
 
     def _in_span(self, messages: Iterator[Frame | MotionSample]) -> Iterator[Frame | MotionSample]:
         """Yield the messages of the part that is read; other frames do not count, so that seq begins at 0 there."""
@@ -174,6 +198,8 @@ class LogReader:
         self._motion_fault = ""  # of the first message of wheels or IMU that is not valid
         self._other_joints = 0  # messages of joints without the wheels
         self._spans: dict[str, tuple[int, int]] = {}  # first and last stamp of images, wheels and gyro
+        self._times = ImageTimes(self._time)
+        self._unstamped: deque[tuple[int, LoggedMessage]] = deque()  # samples with their times of logging
 
     def _image(self, logged: LoggedMessage) -> RosImage | None:
         """Return an image, None of a broken one.
@@ -187,32 +213,35 @@ class LogReader:
             self.counts["broken"] += 1
             self._fault = self._fault or str(error)
             return None
-        self.counts["unstamped"] += not image.stamp_ns and logged.log_time_ns != 0
-        stamp_ns = image.stamp_ns or logged.log_time_ns
-        self._widen("images", stamp_ns)
-        return replace(image, stamp_ns=stamp_ns, data=memoryview(bytes(image.data)))
+        self.counts["carried"] += image.carries
+        return replace(image, data=memoryview(bytes(image.data)))
 
     def _examine(self, topic: str, image: RosImage) -> None:
-        """Warn where the first image of a topic would be black, because its samples hold fewer bits than stated."""
+        """Warn where the first image of a topic would be black, or grey, as it is encoded otherwise than stated."""
         if topic in self._examined:
             return
         self._examined.add(topic)
         frame = image.frame(bits=self._bits)
         with suppress(FrameDecodeError):  # who decodes the image says what is wrong with it
+            if image.width and _is_neutral(gray(frame)):
+                self.warnings.append(
+                    f"the first image of {topic!r} ({image.encoding!r}) has grey levels near {NEUTRAL_GREY} only, as "
+                    "colours have in YUV: is its encoding right? yuv422 is UYVY, yuv422_yuy2 is YUYV"
+                )
             if self._bits == SAMPLE_BITS[-1] and is_deep(frame) and gray(frame).max() < 2**12 >> 8:
                 self.warnings.append(
                     f"the first image of {topic!r} has samples of 16 bits, none above {2**12 - 1}: of a camera of 10 "
                     "or 12 bits? State cameras.bits, or --bits"
                 )
 
-    def _sample(self, logged: LoggedMessage) -> MotionSample | None:
-        """Return a sample, None of a broken one."""
+    def _sample(self, log_ns: int, logged: LoggedMessage) -> MotionSample | None:
+        """Return a sample with its time of logging, None of a broken one."""
         try:
             reading = logged.motion(self._joints)
             if not reading.rates:
                 self._other_joints += 1
                 return None
-            sample = reading.sample(logged.log_time_ns)
+            sample = reading._replace(stamp_ns=self._times.sample_ns(reading.stamp_ns, log_ns)).sample(log_ns)
             self._widen("wheels" if isinstance(sample, WheelSample) else "gyro", sample.stamp_ns)
             return sample
         except (FrameDecodeError, RecordError) as error:
@@ -241,11 +270,17 @@ class LogReader:
         self.truncated = bool(damage.cut)
         if damage.cut:
             self.warnings.append(damage.cut)
+        self.counts["unstamped"] = self._times.by_log.total()
         self.counts["no_joints"] = 0 if "wheels" in self._spans else self._other_joints
         found = {name: text for name, text in _WARNINGS.items() if self.counts[name]}
         faults = {"fault": self._fault, "motion_fault": self._motion_fault}
         self.warnings += [text.format(self.counts[name], **faults) for name, text in found.items()]
-        self.warnings += self._of_another_clock()
+        self.warnings += [*self._times.warnings(), *self._of_another_clock()]
+
+
+def _is_neutral(image: NDArray[np.uint8]) -> bool:
+    """True if nearly all grey levels (H, W) are near the middle."""
+    return bool(np.percentile(np.abs(image.astype(np.int16) - NEUTRAL_GREY), MOST_PERCENT) <= NEAR_NEUTRAL)
 
 
 class _Samples:
@@ -291,7 +326,7 @@ class _ReorderBuffer:
         self._held_bytes = 0
         self._arrivals = 0
         self._newest_ns = 0
-        self._last_ns: dict[Camera, int] = {}
+        self._last: dict[Camera, RosImage] = {}
 
     def push(self, camera: Camera, image: RosImage) -> Iterator[Frame]:
         """Add an image, whose data must not change afterwards; yield the frames that are due."""
@@ -309,11 +344,13 @@ class _ReorderBuffer:
     def _pop(self) -> Iterator[Frame]:
         oldest = heapq.heappop(self._heap)
         self._held_bytes -= len(oldest.image.data)
-        if self._last_ns.get(oldest.camera) == oldest.stamp_ns:
+        last = self._last.get(oldest.camera)
+        if last is not None and last.stamp_ns == oldest.stamp_ns:
             self._counts["duplicate"] += 1
+            self._counts["repeated"] += last.data == oldest.image.data
         elif oldest.stamp_ns < self._newest_ns:
             self._counts["late"] += 1
         else:
-            self._newest_ns = self._last_ns[oldest.camera] = oldest.stamp_ns
+            self._newest_ns, self._last[oldest.camera] = oldest.stamp_ns, oldest.image
             self._counts[oldest.camera] += 1
             yield oldest.image.frame(oldest.camera, self._counts[oldest.camera] - 1, self._bits)

@@ -191,6 +191,7 @@ class _Replay:
             motion=motion,
             bits=self._config.cameras.bits,
             rate_hz=log.rate_hz,
+            time=log.time,
         )
         named = ("", "")
         if rig and not (lower and upper):

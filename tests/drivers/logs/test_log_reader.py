@@ -96,6 +96,20 @@ def test_raw_images(
         np.testing.assert_array_equal(gray(frame), to_gray(pixels))
 
 
+@pytest.mark.parametrize("encoding", ["yuv422", "yuv422_yuy2"])
+def test_colours_that_are_taken_for_brightness_are_a_question(tmp_path: Path, encoding: str) -> None:
+    """Of yuv422 the luma is the second of two bytes, of yuv422_yuy2 the first."""
+    luma = np.random.default_rng(2).integers(0, 256, (9, 14), np.uint8)
+    pixels = np.dstack([np.full_like(luma, 120), luma])
+    data = image_message(START_NS, encoding, pixels)
+    log = write_log(tmp_path / "log.mcap", [Entry(topic, IMAGE, data, START_NS) for topic in (LOWER, UPPER)])
+    frames, reader = read(log)
+    if encoding == "yuv422":
+        assert (gray(frames[0]) == luma).all() and not reader.warnings
+    else:
+        assert len(reader.warnings) == 2 and "is its encoding right? yuv422 is UYVY" in reader.warnings[0]
+
+
 def deep_log(folder: Path, kind: str, images: list[NDArray[np.uint16]]) -> Path:
     """Write a log with images of the lower camera; kind: byte order of mono16, or png."""
     entries = []

@@ -113,7 +113,9 @@ def test_warns_of_stamps_that_are_apart(
     omnid: Command, tmp_path: Path, scene: Path, apart_ns: int, expected: str
 ) -> None:
     taken = [replace(p, stamp_ns=p.stamp_ns + apart_ns * (p.camera == "upper")) for p in images(scene / "log.mcap")]
-    result = omnid.replay(save(tmp_path / "log.mcap", taken), "--set", "pair.tolerance_ms=10", rig=scene / "rig.toml")
+    log, settings = save(tmp_path / "log.mcap", taken), ("pair.tolerance_ms=10", "log.time='header'")
+    words = [word for setting in settings for word in ("--set", setting)]
+    result = omnid.replay(log, *words, rig=scene / "rig.toml")
     assert result.code == 1 and expected in result.err and "pair.tolerance_ms" in result.err
     assert result.count("unpaired_lower") == result.count("unpaired_upper") == PAIRS
 

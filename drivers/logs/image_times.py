@@ -1,0 +1,252 @@
+"""Times of the images of a log: by their headers, or by the times of logging where those cannot be used.
+
+A camera driver stamps the header when the image is taken; the recorder logs the message when it arrives. Of the two
+the header is the better one, unless it is not set, does not advance, or counts by another clock.
+
+1. The first images decide for the whole log: their headers are used if they advance and both cameras share a clock.
+2. Afterwards an image whose header is not set, repeats the one before, or lies ahead of its time of logging has the
+   time of logging, moved by the usual delay between both.
+3. Where the headers step against the times of logging and run on regularly from there, a clock was set. The images
+   after it are a new segment, whose stamps are moved so that time runs on.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from operator import sub
+from statistics import median
+from typing import Final, Literal, TypeAlias
+
+from drivers.frame import CAMERAS, Camera
+from drivers.logs.file_order import LATEST_NS
+from drivers.logs.ros_messages import RosImage
+
+TimeSource: TypeAlias = Literal["auto", "header", "log"]
+
+FIRST_IMAGES: Final = 16  # of both cameras, by which the headers are judged
+MAX_HELD_BYTES: Final = 256 * 2**20  # of the images that wait for later ones
+SHORTEST_STEP_NS: Final = 1_000_000  # No camera takes 1,000 images a second, as stamps that hardly advance say.
+STEP_NS: Final = 500_000_000  # Delays between header and logging change by less, unless a clock is set.
+FASTEST: Final = 3.0  # After a step clocks and images run on, at rates that differ by less than this factor.
+LOOKED_AHEAD: Final = 3  # images of a camera that tell a step of the clock from one wrong stamp
+DELAYS: Final = 8  # recent delays, whose median is the usual one
+EPOCH_NS: Final = 10**18  # The year 2001: earlier stamps count from a start, as of the computer.
+
+
+@dataclass(slots=True)
+class TimedImage:
+    """An image of a camera with both its times."""
+
+    camera: Camera
+    image: RosImage  # its stamp is that of the header, 0 if unset
+    log_ns: int  # by ImageTimes.logged_ns()
+
+
+@dataclass(slots=True)
+class _CameraTimes:
+    """What is known of the times of one camera."""
+
+    header_ns: int = 0  # of the image before
+    newest_ns: int = 0  # latest header of the segment
+    stamp_ns: int = 0  # of the image before, as delivered
+    log_ns: int = 0  # of the image before
+    data: memoryview = field(default_factory=lambda: memoryview(b""))  # of the image before
+    shift_ns: int = 0  # from headers to stamps, after steps of the clock
+    delays_ns: deque[int] = field(default_factory=lambda: deque(maxlen=DELAYS))  # header minus time of logging
+    least_delay_ns: int = -LATEST_NS  # the largest of them in the segment: negative where images arrive late
+    periods_ns: deque[int] = field(default_factory=lambda: deque(maxlen=DELAYS))
+
+    @property
+    def delay_ns(self) -> int:
+        """The usual header minus the time of logging."""
+        return round(median(self.delays_ns)) if self.delays_ns else 0
+
+    @property
+    def period_ns(self) -> int:
+        """The usual time between two images."""
+        return round(median(self.periods_ns)) if self.periods_ns else 0
+
+
+class ImageTimes:
+    """Stamps the images of a log; `source` is header or log once the first images have decided."""
+
+    def __init__(self, source: TimeSource = "auto") -> None:
+        self.source: TimeSource = source
+        self.by_log: Counter[str] = Counter()  # images with the time of logging, by what is wrong with their headers
+        self.notes: list[str] = []
+        self._is_auto = source == "auto"
+        self._has_log = True  # the times of logging advance
+        self._cameras: dict[Camera, _CameraTimes] = {camera: _CameraTimes() for camera in CAMERAS}
+        self._last_log_ns: int | None = None
+        self._log_shift_ns = 0
+        self._steps: list[tuple[int, int]] = []  # stamp before, and size of each step of the clock
+        self._first_ns: int | None = None
+        self._fault = ""  # of the headers, where the times of logging are used for all images
+
+    def stamped(self, images: Iterable[TimedImage]) -> Iterator[TimedImage]:
+        """Yield the images, which come in the order of logging, with the stamps that are used."""
+        waiting: deque[TimedImage] = deque()
+        is_decided = False
+        for image in images:
+            waiting.append(image)
+            held = sum(len(each.image.data) for each in waiting) > MAX_HELD_BYTES
+            if not is_decided and (held or len(waiting) >= FIRST_IMAGES):
+                self._decide(waiting)
+                is_decided = True
+            while is_decided and (held or len(waiting) >= FIRST_IMAGES) and waiting:
+                yield self._next(waiting)
+                held = False
+        if not is_decided:
+            self._decide(waiting)
+        while waiting:
+            yield self._next(waiting)
+
+    def sample_ns(self, header_ns: int, log_ns: int) -> int:
+        """Return the stamp of a sample of wheels or IMU, by the clock of the images; log_ns: by logged_ns()."""
+        if self.source == "log" or not header_ns:
+            return log_ns
+        if not self._steps:
+            return header_ns
+        lower = self._cameras["lower"]
+        expected_ns = log_ns + lower.delay_ns + lower.shift_ns
+        shifts = (0, *(times.shift_ns for times in self._cameras.values()))
+        return min((header_ns + shift_ns for shift_ns in shifts), key=lambda stamp_ns: abs(stamp_ns - expected_ns))
+
+    def warnings(self) -> Iterator[str]:
+        """Yield one line for each fault of the stamps."""
+        yield from self.notes
+        if self.by_log:
+            reasons = " or ".join(self.by_log)
+            yield f"used the times of logging for {self.by_log.total()} images: the stamps of their headers {reasons}"
+        if self._steps:
+            first_ns, size_ns = self._steps[0]
+            way, size_s = "forward" if size_ns > 0 else "back", abs(size_ns) * 1e-9
+            at_s, others = (first_ns - (self._first_ns or 0)) * 1e-9, len(self._steps) - 1
+            more = f" ({others} more steps follow)" if others else ""
+            yield (
+                f"the clock of the images was set {way} by {size_s:.3f} s {at_s:.3f} s after the first one{more}: the "
+                "images after it are a new segment, whose stamps are moved so that time runs on"
+            )
+
+    def logged_ns(self, log_ns: int) -> int:
+        """Return the time of logging of the next message; where the recorder's clock was set back, it runs on."""
+        moved_ns = log_ns + self._log_shift_ns
+        if self._last_log_ns is not None and moved_ns < self._last_log_ns:
+            period_ns = max(times.period_ns for times in self._cameras.values())
+            self._log_shift_ns += self._last_log_ns + period_ns - moved_ns
+            if self.source == "log":
+                self._steps.append((self._last_log_ns, moved_ns - self._last_log_ns))
+            moved_ns = log_ns + self._log_shift_ns
+        self._last_log_ns = moved_ns
+        return moved_ns
+
+    def _decide(self, first: Iterable[TimedImage]) -> None:
+        """Choose the times for the whole log by its first images."""
+        mine = {camera: [each for each in first if each.camera == camera] for camera in CAMERAS}
+        headers = [[each.image.stamp_ns for each in images] for images in mine.values() if len(images) > 1]
+        logged = [[each.log_ns for each in images] for images in mine.values() if len(images) > 1]
+        self._has_log = bool(logged) and all(_step_ns(times) >= SHORTEST_STEP_NS for times in logged)
+        delays = [
+            median(each.image.stamp_ns - each.log_ns for each in images) for images in mine.values() if len(images) > 1
+        ]
+        if any(header.count(0) > len(header) / 2 for header in headers):
+            self._fault = "are 0"
+        elif any(_step_ns(header) < SHORTEST_STEP_NS for header in headers):
+            self._fault = "do not advance"
+        elif len(delays) == len(CAMERAS) and abs(delays[0] - delays[1]) > STEP_NS:
+            self._fault = f"are {abs(delays[0] - delays[1]) * 1e-9:.3f} s apart between the cameras"
+        if self._is_auto:
+            self.source = "log" if self._fault and self._has_log else "header"
+        known = [stamp_ns for header in headers for stamp_ns in header]
+        is_old = known and 0 < median(known) < EPOCH_NS
+        if self.source == "header" and is_old and all(min(times) > EPOCH_NS for times in logged):
+            self.notes.append(
+                "the stamps of the images begin in 1970, as by a clock that counts from the start of the computer; "
+                'log.time = "log" takes the times of logging'
+            )
+
+    def _next(self, waiting: deque[TimedImage]) -> TimedImage:
+        """Take the first of the images that wait, and stamp it with regard to those behind it."""
+        first = waiting.popleft()
+        behind = [each for each in waiting if each.camera == first.camera][:LOOKED_AHEAD]
+        times, header_ns = self._cameras[first.camera], first.image.stamp_ns
+        stamp_ns = self._stamp_ns(times, first, behind)
+        if self._first_ns is None:
+            self._first_ns = stamp_ns
+        before_ns, now_ns = (times.log_ns, first.log_ns) if self.source == "log" else (times.header_ns, header_ns)
+        if 0 < before_ns < now_ns:
+            times.periods_ns.append(now_ns - before_ns)
+        times.header_ns, times.log_ns, times.data, times.stamp_ns = header_ns, first.log_ns, first.image.data, stamp_ns
+        return replace(first, image=replace(first.image, stamp_ns=stamp_ns))
+
+    def _stamp_ns(self, times: _CameraTimes, first: TimedImage, behind: list[TimedImage]) -> int:
+        """Return the stamp of an image; behind: the next images of its camera."""
+        header_ns, before_ns = first.image.stamp_ns, times.header_ns
+        by_log_ns = first.log_ns + times.delay_ns + times.shift_ns
+        if self.source == "log":
+            if self._is_auto:
+                self.by_log[self._fault] += 1
+            return first.log_ns
+        # 1. A header that is not set, or is that of another image.
+        if not header_ns and first.log_ns:
+            self.by_log["are 0"] += 1
+            return by_log_ns
+        if before_ns == header_ns and first.image.data != times.data and self._has_log and self._is_auto:
+            self.by_log["do not advance"] += 1
+            return by_log_ns
+        # 2. A step of the clock, after which it runs on.
+        size_ns = self._step(times, first, behind)
+        if size_ns:
+            self._move(times, size_ns)
+        elif self._is_ahead(times, first):
+            self.by_log["lie ahead of the log"] += 1
+            return by_log_ns
+        # 3. Late images tell nothing about the usual delay.
+        if header_ns >= times.newest_ns:
+            times.newest_ns = header_ns
+            times.delays_ns.append(header_ns - first.log_ns)
+            times.least_delay_ns = max(times.least_delay_ns, header_ns - first.log_ns)
+        return header_ns + times.shift_ns
+
+    def _is_ahead(self, times: _CameraTimes, first: TimedImage) -> bool:
+        """True if the header has jumped to a time long after that of logging; no image is logged before it is taken."""
+        if not (self._is_auto and self._has_log and times.delays_ns):
+            return False
+        latest_ns = max(times.newest_ns, first.log_ns + times.least_delay_ns)
+        return first.image.stamp_ns > latest_ns + STEP_NS
+
+    def _step(self, times: _CameraTimes, first: TimedImage, behind: list[TimedImage]) -> int:
+        """Return by how much a clock was set before an image; 0 where it was not."""
+        if not (first.image.stamp_ns < times.newest_ns or self._is_ahead(times, first)):
+            return 0
+        if not (behind and self._has_log and times.delays_ns):
+            return 0
+        # Late images go back as well, but they are logged all at once, or are few, or the next one is not late.
+        headers = [first.image.stamp_ns, *(each.image.stamp_ns for each in behind)]
+        logged = [first.log_ns, *(each.log_ns for each in behind)]
+        passed_ns, logged_ns = headers[-1] - headers[0], max(1, logged[-1] - logged[0])
+        is_usual = passed_ns < FASTEST * len(behind) * (times.period_ns or passed_ns)
+        if headers != sorted(set(headers)) or not is_usual or not 1 / FASTEST < passed_ns / logged_ns < FASTEST:
+            return 0
+        sizes_ns = [delay_ns - times.delay_ns for delay_ns in map(sub, headers, logged)]
+        size_ns = round(median(sizes_ns))
+        is_one = all(abs(each) > times.period_ns and each * size_ns > 0 for each in sizes_ns)
+        return size_ns if is_one else 0
+
+    def _move(self, times: _CameraTimes, size_ns: int) -> None:
+        """Begin a segment, whose stamps continue those before; both cameras are moved alike where one clock was set."""
+        shift_ns = times.shift_ns - size_ns
+        others = [other.shift_ns for other in self._cameras.values() if other is not times]
+        shift_ns = next((other for other in others if abs(other - shift_ns) < times.period_ns / 2), shift_ns)
+        if shift_ns not in others:
+            self._steps.append((times.stamp_ns, size_ns))
+        times.shift_ns, times.newest_ns, times.least_delay_ns = shift_ns, 0, -LATEST_NS
+        times.delays_ns.clear()
+
+
+def _step_ns(times: list[int]) -> float:
+    """Return the usual step between times, in any order."""
+    return median(after - before for before, after in pairwise(sorted(times)))
