@@ -24,7 +24,7 @@ from drivers.logs.topics import MotionChoice, MotionTopics, choose_motion_topics
 from drivers.motion import MotionSample, WheelSample
 
 _WARNINGS = {
-    "late": "dropped {} frames older than others read before: record with less delay or raise log.reorder_frames",
+    "late": "dropped {} frames older than others read before, by more than 32 images: record with less delay",
     "duplicate": "dropped {} frames with the same stamp as the frame before of the same camera",
     "carried": "{} stamps have 10^9 nanoseconds or more, which were added to their seconds",
     "broken_motion": "skipped {} messages of wheels or IMU that are not valid; the first: {motion_fault}",

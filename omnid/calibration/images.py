@@ -5,8 +5,9 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -14,11 +15,12 @@ from numpy.typing import NDArray
 
 from calib.rig import Rig
 from drivers.errors import DriverError, FrameDecodeError
-from drivers.frame import MAX_PIXELS, Frame, gray, upper_eight_bits
-from drivers.logs.image_folder import IMAGE_SUFFIXES
+from drivers.frame import CAMERAS, MAX_PIXELS, Frame, gray, upper_eight_bits
+from drivers.logs.image_folder import IMAGE_SUFFIXES, image_folders
 from drivers.logs.log_reader import LogCameras, LogReader
 from drivers.logs.open_log import is_log_name
 from omnid.errors import OmnidError
+from omnid.stages.image_loss import ImageLoss, image_loss, unpaired_by_chance
 
 Image = NDArray[np.uint8]
 # By name, all of one size.
@@ -38,7 +40,8 @@ class PairedImages:
 
     sides: tuple[Images, Images]
     topics: tuple[str, str] = ("", "")
-    notes: tuple[str, ...] = ()  # about images that were left out
+    notes: tuple[str, ...] = ()  # about images that were left out, and faults of a log
+    loss: str = ""  # one line where more than a tenth of a log's images make no pair
 
     @property
     def names(self) -> list[str]:
@@ -53,11 +56,13 @@ def read_pairs(source: Path, cameras: LogCameras = BY_NAME) -> PairedImages:
     and would count the same errors again.
     """
     # 1. Read the images of both cameras.
-    of_log = _is_log(source) or (source.is_dir() and any(map(_is_log, source.iterdir())))
+    of_log = _is_log(source) or (source.is_dir() and (any(map(_is_log, source.iterdir())) or _has_folders(source)))
     if not of_log and (cameras.lower or cameras.upper):
         raise OmnidError(f"{source}: only a log has topics; found a folder of images")
+    faults, loss = tuple[str, ...](), ""
     if of_log:
-        sides, topics = _of_log(source, cameras)
+        sides, topics, read = _of_log(source, cameras)
+        faults, loss = read.notes, str(read.loss)
     else:
         sides, topics = _of_folder(source, cameras.bits), ("", "")
     if not sides[0].keys() & sides[1].keys():
@@ -70,7 +75,12 @@ def read_pairs(source: Path, cameras: LogCameras = BY_NAME) -> PairedImages:
     repeated = _repeats(sides)
     kept = [{name: image for name, image in side.items() if name not in repeated} for side in sides]
     notes = tuple(f"left out {name}: the same image as {earlier}" for name, earlier in repeated.items())
-    return PairedImages((kept[0], kept[1]), topics, notes)
+    return PairedImages((kept[0], kept[1]), topics, (*faults, *([loss] if loss else []), *notes), loss)
+
+
+def _has_folders(source: Path) -> bool:
+    """True if a folder is a log of folders of images, one for each camera."""
+    return not any(source.glob(f"{SIDES[0]}_*")) and len(image_folders(source)) > 1
 
 
 def _is_log(source: Path) -> bool:
@@ -140,22 +150,60 @@ def _require_one_size(images: Images) -> None:
         raise OmnidError(f"calibrate: expected images of one camera, all of one size, found {shown}")
 
 
-def _of_log(log: Path, cameras: LogCameras) -> tuple[tuple[Images, Images], tuple[str, str]]:
-    """Return LOG_PAIRS pairs of a log, without those that cannot be decoded, and its topics."""
+class LogPairs(NamedTuple):
+    """Which pairs of a log are used, and what of it is not."""
+
+    number: int  # pairs with nearly equal stamps
+    within_ns: float  # largest difference of the stamps of a pair in a run: half a period
+    loss: ImageLoss
+    notes: tuple[str, ...]  # of the reader
+
+    @property
+    def stride(self) -> int:
+        """Each pair of this number is used."""
+        return max(1, self.number // LOG_PAIRS)
+
+
+def decoded_pairs(reader: LogReader, *, keep: bool = True) -> tuple[LogPairs, dict[int, tuple[Image, Image]]]:
+    """Return the pairs of a log, of which up to twice LOG_PAIRS are decoded: number -> images of both cameras.
+
+    keep: return these. What is lost is counted as in a run: of all images without a partner, and of those that were
+    decoded.
+    """
+    # 1. Stamps of all images.
+    frames = [replace(frame, data=b"") for frame in reader.frames()]
+    stamps = {camera: [frame.stamp_ns for frame in frames if frame.camera == camera] for camera in CAMERAS}
+    periods = {camera: float(np.median(np.diff(own))) if len(own) > 1 else None for camera, own in stamps.items()}
+    within_ns = max(TOLERANCE_NS, *(period / 2 for period in periods.values() if period))
+    joined = sum(1 for _ in paired(iter(frames), within_ns))
+    arrived = {camera: len(own) for camera, own in stamps.items()}
+    unpaired = unpaired_by_chance(arrived, {camera: count - joined for camera, count in arrived.items()}, periods)
+    found = LogPairs(sum(1 for _ in paired(iter(frames))), within_ns, image_loss(reader.counts), ())
+    # 2. Images of some pairs.
+    images, broken = dict[int, tuple[Image, Image]](), 0
+    for number, (lower, upper) in enumerate(paired(reader.frames())):
+        if number % found.stride == 0:
+            try:
+                pair = gray(lower), gray(upper)
+                images |= {number: pair} if keep else {}
+            except FrameDecodeError:
+                broken += 2
+    loss = image_loss(reader.counts, unpaired=unpaired, undecodable=broken * found.stride)
+    return found._replace(loss=loss, notes=tuple(reader.warnings)), images
+
+
+def _of_log(log: Path, cameras: LogCameras) -> tuple[tuple[Images, Images], tuple[str, str], LogPairs]:
+    """Return LOG_PAIRS pairs of a log, without those that cannot be decoded, its topics, and what is not used."""
     sides: tuple[Images, Images] = ({}, {})
     with closing(cameras.reader(log)) as reader:
-        stride = max(1, sum(1 for _ in paired(reader.frames())) // LOG_PAIRS)
-        for number, pair in enumerate(paired(reader.frames())):
-            if number % stride:
-                continue
-            with suppress(FrameDecodeError):
-                images = [gray(frame) for frame in pair]
-                for side, image in zip(sides, images, strict=True):
-                    side[f"pair{number:05d}"] = image
+        found, images = decoded_pairs(reader)
         topics = reader.topics
+    for number, pair in images.items():
+        for side, image in zip(sides, pair, strict=True):
+            side[f"pair{number:05d}"] = image
     for side in sides:
         _require_one_size(side)
-    return sides, (topics["lower"], topics["upper"])
+    return sides, (topics["lower"], topics["upper"]), found
 
 
 def paired(frames: Iterator[Frame], tolerance_ns: float = TOLERANCE_NS) -> Iterator[tuple[Frame, Frame]]:

@@ -35,6 +35,7 @@ from omnid.version import __version__
 
 RESULT_FILE, RECORDING = "result.json", "recording.mcap"
 DONE: dict[int | None, str] = {0: "ok", 1: "no pose"}  # by the exit code of `omnid replay`
+LOSSY = "images lost"  # where it ends with 1, but has poses
 OUTPUTS = (("--tum", "est.txt"), ("--map-tum", "map_est.txt"), ("--cloud", "cloud.ply"), ("--plan", "plan.png"))
 # One thread for each program: as many programs run as there are cores.
 ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1"}
@@ -123,9 +124,12 @@ def replay(job: Job) -> dict[str, Any]:
     if code not in DONE:
         result["error"] = f"more than {job.timeout_s:g} s" if code is None else error
     result["replay"] = summary
-    if code == 0 and job.truth is not None:
+    if code == 1 and summary and summary["counters"]["loss"] and summary["counters"]["poses"]:
+        result["status"] = LOSSY
+    has_poses = result["status"] in (DONE[0], LOSSY)
+    if has_poses and job.truth is not None:
         result["eval"] = _omnid(("eval", "est.txt", str(job.truth), "--json"), job)[1]
-    if code == 0 and RECORDING in job.words:
+    if has_poses and RECORDING in job.words:
         _omnid(("report", RECORDING, "-o", "report.html"), job)
     result["seconds"] = round(time.monotonic() - started_s, 3)
     write_file(job.folder / RESULT_FILE, json.dumps(result, indent=1).encode() + b"\n")
@@ -200,7 +204,7 @@ def _stored(job: Job) -> dict[str, Any] | None:
     """Return the result of an earlier run of the same job, None without one. Raise OmnidError for another log's."""
     try:
         result: dict[str, Any] = json.loads((job.folder / RESULT_FILE).read_text())
-        log, is_done = result["log"], result["key"] == job.key and result["status"] in DONE.values()
+        log, is_done = result["log"], result["key"] == job.key and result["status"] in (*DONE.values(), LOSSY)
     except (OSError, ValueError, TypeError, KeyError):
         return None
     if log != str(job.log):

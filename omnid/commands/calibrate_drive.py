@@ -58,14 +58,14 @@ PARTS: Final = ("check", "height", "mask")
     ),
     description="Adjust all parameters of a rig to drives with turns; then find the height of the cameras, if the rig "
     "states none, and what is fixed to them, where the first log shows it. Exit code 1: the rig has drifted (--only "
-    "check), the ruler contradicts, or nothing was found that could be written.",
+    "check), the ruler contradicts, nothing was found that could be written, or a tenth of the images made no pair.",
 )
 def run(args: argparse.Namespace) -> int:
     """Examine the logs, print what was found, and write the rig; see the exit codes above."""
     from omnid.engine.kernel_cache import prepare_kernels
 
     _check(args)
-    start = _start(args)
+    start, is_lossy = _start(args)
     prepare_kernels()
     # 1. Check the rig, or adjust all of it.
     rig, has_drifted = start, False
@@ -86,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
         write_rig(args.output, rig)
         print(f"{args.output}: written, {height_of(rig)}")
     is_found = rig is not start or args.only is not None
-    return 0 if is_found and not has_drifted else 1
+    return 0 if is_found and not has_drifted and not is_lossy else 1
 
 
 def _check(args: argparse.Namespace) -> None:
@@ -101,16 +101,21 @@ def _check(args: argparse.Namespace) -> None:
             raise OmnidError("--distance-m sets the length of the baseline, which --only leaves as it is")
 
 
-def _start(args: argparse.Namespace) -> Rig:
-    """Return the rig to start from; refuse logs that cannot be read."""
+def _start(args: argparse.Namespace) -> tuple[Rig, bool]:
+    """Return the rig to start from, and whether many images of a log make no pair; print the faults of the logs."""
+    from omnid.calibration.images import decoded_pairs, open_log
     from omnid.runs.session import attached_rig
 
-    start = None if args.rig is None else read_rig(args.rig)
+    start, is_lossy = None if args.rig is None else read_rig(args.rig), False
     for log in args.logs:
-        with closing(log_cameras(args).reader(log)) as reader:
+        with closing(open_log(log, log_cameras(args), start)) as reader:
             start = start or attached_rig(reader, log)
+            found, _ = decoded_pairs(reader, keep=False)
+        for line in filter(None, (*found.notes, str(found.loss))):
+            print(f"warning: {log}: {line}", file=sys.stderr)
+        is_lossy |= found.loss.is_lossy
     assert start is not None, "there is a log"
-    return start
+    return start, is_lossy
 
 
 def _adjusted(args: argparse.Namespace, rig: Rig) -> Rig:

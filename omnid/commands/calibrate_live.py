@@ -100,7 +100,10 @@ def _of_log(args: argparse.Namespace) -> Iterator[tuple[Image, Image]]:
     from omnid.calibration.images import read_pairs
 
     config = settings_of(args)
-    pairs = read_pairs(args.log, LogCameras(args.lower, args.upper, config.cameras.bits, config.log.rate_hz))
+    log = config.log
+    pairs = read_pairs(args.log, LogCameras(args.lower, args.upper, config.cameras.bits, log.rate_hz, log.time))
+    for line in pairs.notes:
+        print(f"omnid: warning: {line}", file=sys.stderr)
     return ((pairs.sides[0][name], pairs.sides[1][name]) for name in pairs.names)
 
 

@@ -57,7 +57,10 @@ MODEL_HELP = (
     ),
 )
 def run(args: argparse.Namespace) -> int:
-    """Calibrate the rig, write the files, and print the warnings on stderr and the result as one line."""
+    """Calibrate the rig, write the files, and print the warnings on stderr and the result as one line.
+
+    Return 1 where more than a tenth of a log's images made no pair.
+    """
     board = board_of(args)
     named = [("--output", args.output), ("--report", args.report)]
     read = [("a file that is read", args.images)]
@@ -83,4 +86,4 @@ def run(args: argparse.Namespace) -> int:
         print(f"warning: {line}", file=sys.stderr)
     print(f"{args.output}: {found}")
     print(f"{args.output}: {height_of(found.rig)}")
-    return 0
+    return int(bool(found.images.loss))

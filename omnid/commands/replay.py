@@ -112,7 +112,7 @@ if TYPE_CHECKING:  # the help and other commands do not load these
     ),
 )
 def run(args: argparse.Namespace) -> int:
-    """Replay the log and print its summary; return 1 where no pose was found."""
+    """Replay the log and print its summary; return 1 where no pose was found, or a tenth of the images made no pair."""
     from omnid.config import unused_settings
     from omnid.runs.replay import ReplayOptions
 
@@ -167,7 +167,7 @@ def replay_and_print(log: Path, config: Config, options: ReplayOptions, output: 
         _print_result(error.result, options, output, failed=True)
         raise
     _print_result(result, options, output)
-    return 128 + result.signal if result.signal else int(result.counters.no_pose)
+    return 128 + result.signal if result.signal else int(result.counters.no_pose or bool(result.counters.loss))
 
 
 def _print_result(result: RunResult, options: ReplayOptions, output: Output, *, failed: bool = False) -> None:

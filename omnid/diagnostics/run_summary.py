@@ -70,6 +70,7 @@ class RunCounters:
     map: Mapping[str, int] = field(default_factory=dict)  # voxels and points; empty without a map
     places: Mapping[str, int] = field(default_factory=dict)  # keyframes, loops, refusals; empty without a map of places
     motor: Mapping[str, int] = field(default_factory=dict)  # commands, errors, stops; empty without a motor
+    loss: str = ""  # one line where more than a tenth of the images make no pair
 
     @property
     def no_pose(self) -> bool:

@@ -161,7 +161,10 @@ class RunReport:
         counters = RunCounters.of(statistics, self._pairing.counts["pairs"], self._drops())
         mapping, places = self._stages.mapping, self._stages.places
         return replace(
-            counters, map={} if mapping is None else mapping.counts, places={} if places is None else places.counts
+            counters,
+            map={} if mapping is None else mapping.counts,
+            places={} if places is None else places.counts,
+            loss=self._loss(),
         )
 
     def places(self) -> PlaceMap | None:
@@ -187,6 +190,8 @@ class RunReport:
     def warnings(self) -> Iterator[str]:
         """Return warnings about the log and the images."""
         yield from self._reader.warnings
+        if self._loss():
+            yield self._loss()
         statistics = self._session.statistics
         if statistics.poses or not self._session.signal:
             fault = self._stages.front_end.odometry.last_fault
@@ -205,6 +210,10 @@ class RunReport:
         stages = (stats for stats in self._session.graph.telemetry.stages if stats.name not in BOOKKEEPING)
         motion = [self._motion()] if self._has_motion else []
         return [summary_status(self.counters(statistics)), *motion, *map(stage_status, stages)]
+
+    def _loss(self) -> str:
+        """Return one line about images that make no pair; empty where these are few, or were dropped on purpose."""
+        return "" if self._session.dropped_messages() else str(self._pairing.loss(self._reader.counts))
 
     @property
     def _has_motion(self) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
+from collections.abc import Mapping
 from statistics import median_low
 from typing import Final
 
@@ -17,6 +18,7 @@ from drivers.motion import MotionSample
 from omnid.camera_config import PairConfig
 from omnid.errors import OmnidError
 from omnid.messages import FramePair
+from omnid.stages.image_loss import ImageLoss, image_loss, unpaired_by_chance
 from omnid.stages.motion_inbox import MotionInbox
 
 SKEW_GAIN: Final = 0.02  # weight of a new skew in the running mean: a memory of about 50 pairs
@@ -83,13 +85,14 @@ Image = NDArray[np.uint8]
 class Decoder:
     """Grey images of the size that the rig was calibrated for.
 
-    `broken` counts the frames that could not be used, `fault` is the reason of the first of them.
+    `broken` counts the frames that could not be used, `other_size` those of them that have another size than the ones
+    before, `fault` is the reason of the first of them.
     """
 
     def __init__(self, rig: Rig) -> None:
         self._sizes: dict[Camera, tuple[int, int]] = {"lower": rig.lower.camera.size, "upper": rig.upper.camera.size}
         self._fitted: set[Camera] = set()
-        self.broken = 0
+        self.broken = self.other_size = 0
         self.fault = ""
 
     def __call__(self, frame: Frame) -> Image | None:
@@ -111,6 +114,7 @@ class Decoder:
                 f"the {frame.camera} camera's images are {found[0]}x{found[1]} px, the rig's are {expected[0]}x"
                 f"{expected[1]} px: give the rig of these cameras with --rig"
             )
+        self.other_size += 1
         self._skip(f"{frame.camera} frame {frame.seq} is {found[0]}x{found[1]} px, unlike those before")
         return None
 
@@ -201,6 +205,7 @@ class FrameMatcher:
         self.fixed_ns = tolerance_ns  # 0: none
         self._periods: dict[Camera, Period] = {"lower": Period(), "upper": Period()}
         self._waiting: dict[Camera, deque[Frame]] = {"lower": deque(), "upper": deque()}
+        self._arrived: Counter[Camera] = Counter()
         self.unpaired: Counter[Camera] = Counter()
         self.closest_miss_ns: int | None = None  # smallest gap between frames of both cameras that made no pair
 
@@ -208,6 +213,12 @@ class FrameMatcher:
     def waiting(self) -> int:
         """Number of frames that wait for a partner."""
         return sum(map(len, self._waiting.values()))
+
+    @property
+    def unpaired_by_chance(self) -> int:
+        """Number of unpaired frames, without those of a faster camera that the other has no partners for."""
+        periods_ns = {camera: period.ns for camera, period in self._periods.items()}
+        return unpaired_by_chance(self._arrived, {camera: self.unpaired[camera] for camera in periods_ns}, periods_ns)
 
     @property
     def tolerance_ns(self) -> float:
@@ -221,6 +232,7 @@ class FrameMatcher:
     def arrive(self, frame: Frame) -> None:
         """Take note of a frame's stamp."""
         self._periods[frame.camera].add(frame.stamp_ns)
+        self._arrived[frame.camera] += 1
 
     def couple(self) -> tuple[Frame, Frame] | None:
         """Return the first frames of both cameras that wait within the tolerance; None without any.
@@ -324,6 +336,12 @@ class Synchronise:
     def waiting(self) -> int:
         """Number of frames that wait for a partner."""
         return self._matcher.waiting
+
+    def loss(self, read: Mapping[str, int]) -> ImageLoss:
+        """Return the images of a log that made no pair; read: counts of its reader."""
+        broken, other_size = self._decode.broken, self._decode.other_size
+        unpaired = self._matcher.unpaired_by_chance
+        return image_loss(read, unpaired=unpaired, undecodable=broken - other_size, other_size=other_size)
 
     @property
     def counts(self) -> dict[str, int]:

@@ -1,0 +1,145 @@
+"""One content in every format of logs gives the same images, pairs, poses and reports; loss ends with code 1."""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from omnid.calibration.images import read_pairs
+from tests.conftest import PAIRS
+from tests.drivers.logs.bags import unclosed_bag, write_bag, write_db3
+from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, UPPER, Entry, compressed, write_log
+from tests.drivers.logs.test_formats import FORMATS, WITHOUT_INDEX
+from tests.replay.command import Command
+from tests.replay.edited import Image, images, save
+
+QUICK = ("--inline", "--set", "places.enabled=false", "--set", 'motion.imu=""')
+
+
+def entries(scene: Path) -> list[Entry]:
+    topics = {"lower": LOWER, "upper": UPPER}
+    taken = images(scene / "log.mcap")
+    return [Entry(topics[i.camera], COMPRESSED, compressed(i.stamp_ns, i.jpeg), i.written_ns) for i in taken]
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_command_reads_every_format_alike(omnid: Command, tmp_path: Path, scene: Path, name: str) -> None:
+    log = FORMATS[name](tmp_path, entries(scene))
+    # 1. `log info`
+    code, out, err = omnid("log", "info", log)
+    assert (
+        (code, err) == (0, "")
+        and re.search(r"state +whole", out)
+        and ("without an index" in out) == (name in WITHOUT_INDEX)
+    )
+    assert len(re.findall(rf" +{COMPRESSED} +{PAIRS} ", out)) == 2
+    # 2. `calibrate`
+    pairs = read_pairs(log)
+    assert len(pairs.names) == PAIRS and not pairs.notes and not pairs.loss
+    assert all(map(np.array_equal, pairs.sides[0].values(), read_pairs(scene / "log.mcap").sides[0].values()))
+    # 3. `replay`
+    rows = []
+    for source in (scene / "log.mcap", log):
+        result = omnid.replay(source, *QUICK, "--tum", tmp_path / "est.txt", rig=scene / "rig.toml")
+        assert result.code == 0 and not result.err and result.count("pairs") == PAIRS
+        rows.append((tmp_path / "est.txt").read_bytes())
+    assert rows[0] == rows[1]
+
+
+def test_reports_of_every_format_are_the_same(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    mcap = tmp_path / "run.mcap"
+    assert omnid.replay(scene / "log.mcap", *QUICK, "--record", mcap, rig=scene / "rig.toml").code == 0
+    with mcap.open("rb") as file:
+        found = [
+            Entry(channel.topic, schema.name, message.data, message.log_time)
+            for schema, channel, message in make_reader(file).iter_messages()
+            if schema is not None and channel.topic.endswith(("/odom", "/status"))
+        ]
+    logs = [
+        write_log(tmp_path / "few.mcap", found),
+        write_db3(tmp_path / "few", found),
+        write_db3(tmp_path / "packed", found, zstd=True),
+        write_bag(tmp_path / "few.bag", found, "LZ4"),
+        unclosed_bag(write_bag(tmp_path / "killed.bag", found)),
+    ]
+    pages = []
+    for log in logs:
+        page = tmp_path / "report.html"
+        code, _, err = omnid("report", log, "-o", page)
+        assert code == 0, err
+        text = page.read_text()
+        assert ("is cut or corrupt" in text) == (log.suffix == ".active")
+        pages.append(re.findall(r"<div class='numbers'>.*?</div>", text))
+    assert pages[0] and pages == [pages[0]] * len(logs)
+
+
+def exif(jpeg: bytes) -> bytes:
+    """Return the image with the orientation of a camera that was turned by 90 degrees."""
+    tag = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
+    return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(tag) + 2) + tag + jpeg[2:]
+
+
+def restarting(jpeg: bytes) -> bytes:
+    """Return the image coded again with restart markers, at the quality at which little changes."""
+    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
+    coding = [cv2.IMWRITE_JPEG_QUALITY, 100, cv2.IMWRITE_JPEG_RST_INTERVAL, 2]
+    return cv2.imencode(".jpg", image, coding)[1].tobytes()
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [lambda jpeg: jpeg + bytes(1000), lambda jpeg: jpeg + b"serial 123" * 50, exif, restarting],
+    ids=["zeros behind the end", "text behind the end", "EXIF", "restart markers"],
+)
+def test_jpegs_as_cameras_write_them(
+    omnid: Command, tmp_path: Path, scene: Path, edit: Callable[[bytes], bytes]
+) -> None:
+    log = save(tmp_path / "log.mcap", [replace(i, jpeg=edit(i.jpeg)) for i in images(scene / "log.mcap")])
+    result = omnid.replay(log, *QUICK, rig=scene / "rig.toml")
+    assert result.code == 0 and not result.err and result.count("pairs") == PAIRS
+
+
+SMALL = cv2.imencode(".jpg", np.zeros((64, 64), np.uint8))[1].tobytes()
+# What happens to every fourth pair -> exit code and line of a replay.
+LOSSES: dict[str, tuple[Callable[[Image], Image | None], int, str]] = {
+    "nothing": (lambda image: image, 0, ""),
+    "an image is missing": (lambda image: None if image.camera == "upper" else image, 1, "without a partner"),
+    "an image is cut": (
+        lambda image: replace(image, jpeg=image.jpeg[:3000]) if image.camera == "lower" else image,
+        1,
+        "12 of 48 images made no pair: 6 without a partner, 6 not decodable",
+    ),
+    "an image is small": (
+        lambda image: replace(image, jpeg=SMALL) if image.camera == "lower" else image,
+        1,
+        "6 without a partner, 6 of another size",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_loss_is_told_by_the_exit_code(omnid: Command, tmp_path: Path, scene: Path, name: str) -> None:
+    edit, code, line = LOSSES[name]
+    taken = [edit(image) if image.pair % 4 == 1 else image for image in images(scene / "log.mcap")]
+    log = save(tmp_path / "log.mcap", [image for image in taken if image is not None])
+    result = omnid.replay(log, *QUICK, rig=scene / "rig.toml")
+    assert result.code == code and line in result.err
+    assert ("images made no pair" in result.err) == (code == 1)
+    if name != "an image is small":
+        assert bool(read_pairs(log).loss) == (code == 1)
+
+
+def test_a_camera_of_half_the_rate_loses_nothing(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    taken = [image for image in images(scene / "log.mcap") if image.camera == "lower" or image.pair % 2 == 0]
+    log = save(tmp_path / "log.mcap", taken)
+    result = omnid.replay(log, *QUICK, rig=scene / "rig.toml")
+    assert result.code == 0 and result.count("pairs") == PAIRS // 2 and "made no pair" not in result.err
+    assert not read_pairs(log).loss
