@@ -16,7 +16,7 @@ import math
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
-LEAST_M, LEAST_RAD = 0.05, 0.09  # motion that shows a relation: above the noise of images, a turn of 5 degrees
+LEAST_M, LEAST_RAD = 0.01, 0.02  # root of the sum of squares that shows a relation: ten times the noise of 100 steps
 ALIKE: Final = 0.8  # correlation of accounts that are proportional, up to a delay and slip
 SAME: Final = 0.2  # share by which a factor may differ from one that explains it
 DEG_PER_RAD: Final = math.degrees(1.0)
@@ -77,7 +77,7 @@ def _factor(found: Sequence[float], seen: Sequence[float], least: float) -> floa
     pairs = [(x, y) for x, y in zip(found, seen, strict=True) if math.isfinite(x) and math.isfinite(y)]
     squares_x, squares_y = sum(x * x for x, _ in pairs), sum(y * y for _, y in pairs)
     product = sum(x * y for x, y in pairs)
-    if sum(abs(y) for _, y in pairs) < least or abs(product) < ALIKE * math.sqrt(squares_x * squares_y):
+    if math.sqrt(squares_y) < least or abs(product) < ALIKE * math.sqrt(squares_x * squares_y):
         return None
     return product / squares_y if product else None
 

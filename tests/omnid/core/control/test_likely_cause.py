@@ -96,6 +96,8 @@ def witness(path: Path, wheels: Wheels | None, gyro: Gyro | None, seconds: float
             "the wheels turn 0.5 times as far as the images: motor.drive.track_m",
         ),
         (curves, lambda v, w: (v, -w), lambda w: -w, "the images turn the other way: are they mirrored?"),
+        # The first tenth of a second of a turn, after which the base is stopped.
+        (lambda t: (0.3, 0.6 if t > 3.79 else 0.0), right_wheels, math.degrees, "times as far as the images: deg/s?"),
         # Wheels that turn as commanded, whatever the base does: driven straight on, it turns on the spot.
         (lambda _: (0.0, 2.0), lambda v, w: (0.3, 0.0), right_gyro, "motor.drive.reverse_left, or"),
     ],
