@@ -12,15 +12,17 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.rig import Rig
 from omnid.config import Config
+from omnid.core.mapping.range_scan import azimuths
 from omnid.engine.telemetry import Telemetry
 from omnid.messages import ObstacleRing, OdometryUpdate
+from omnid.simulation.clearance import footprints, ranges_m
 from omnid.sinks.encoder import Outgoing
 from omnid.stages.front_end import FrontEnd
-from tests.bench.log_rings import Counts, Segments, compare
 from tests.simulation import Scene
 
 Array = NDArray[np.float64]
 
+NEAREST_M, FARTHEST_M = 0.3, 4.0  # of the obstacles that count
 POINTS: Final = 2000  # of a keyframe, evenly chosen
 SIGMAS: Final = 3.0  # a point whose range is wrong by more of its own, and by
 WRONG_PART: Final = 0.05  # this part of the range, is wrong
@@ -36,7 +38,7 @@ class DepthMeasure:
     config: Config
     errors: list[Array] = field(default_factory=list)  # of ranges, relative
     wrong: list[NDArray[np.bool_]] = field(default_factory=list)
-    counts: Counts = field(default_factory=Counts)
+    sectors: list[tuple[int, int, int, int]] = field(default_factory=list)  # see _compare_ring
     _front_end: FrontEnd | None = None
     _rings: int = 0
 
@@ -57,9 +59,8 @@ class DepthMeasure:
     @property
     def obstacle_shares(self) -> tuple[float, float]:
         """Missed sectors of those with an obstacle, and false alarms of the ranges, in per cent."""
-        sectors = sum(self.counts.of["all|all"].values())
-        missed = 100 * self.counts.of["all|all"]["missed"] / sectors
-        return missed, 100 * self.counts.false_alarms["all|all"] / max(1, self.counts.ranges["all|all"])
+        missed, near, false, told = np.sum(self.sectors, axis=0)
+        return 100 * missed / near, 100 * false / max(1, told)
 
     def _compare_points(self, update: OdometryUpdate) -> None:
         assert self._front_end is not None
@@ -78,10 +79,20 @@ class DepthMeasure:
         self.wrong.append(np.abs(error_m) > limit_m)
 
     def _compare_ring(self, ring: ObstacleRing) -> None:
+        """Count sectors: called free beyond the true obstacle, with one, with a range before it, with a range."""
         T = self.T_world_rig[ring.stamp_ns] @ se3.inverse(self.rig.T_base_rig)
-        segments = Segments(self.scene.rectangles, self.config.obstacles.ring.heights_m)
-        yaw = float(np.arctan2(T[1, 0], T[0, 0]))
-        compare(ring, segments.ring(float(T[0, 3]), float(T[1, 3]), yaw), "", self.counts)
+        segments = footprints(self.scene.rectangles, self.config.obstacles.ring.heights_m[1])
+        rays = (azimuths()[:, None] + se3.yaw(T) + np.radians([-1 / 3, 0.0, 1 / 3])).ravel()
+        true_m = ranges_m(segments, (float(T[0, 3]), float(T[1, 3])), rays).reshape(-1, 3).min(axis=1)
+        limit_m = 0.1 + 0.03 * np.where(np.isfinite(true_m), true_m, 0.0) ** 2  # three sigma of stereo
+        found_m = np.where(np.isnan(ring.ranges_m), np.inf, ring.ranges_m)
+        # An edge may be two sectors off.
+        around, seen = (np.min([np.roll(part, by) for by in range(-2, 3)], axis=0) for part in (true_m, found_m))
+        near = (true_m > NEAREST_M) & (true_m < FARTHEST_M)
+        missed = near & (seen > true_m + limit_m) & (ring.free_m > true_m + limit_m)
+        told = near & np.isfinite(ring.ranges_m)
+        false = told & (ring.ranges_m < around - 0.1 - 0.03 * np.minimum(around, FARTHEST_M) ** 2)
+        self.sectors.append(tuple(int(part.sum()) for part in (missed, near, false, told)))  # type: ignore[arg-type]
 
 
 def true_ranges_m(scene: Scene, origin: Array, directions: Array) -> Array:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.models.camera import Array, OmniCamera
+from calib.models.camera import Array, Mask, OmniCamera
 from calib.rig import MountedCamera
 from omnid.simulation.rendering.caster_kernels import SURFACE_COLUMNS, cast, cast_plain_tiles
 from omnid.simulation.rendering.surfaces import Rectangle, Scene, Texture
@@ -157,26 +157,30 @@ def _cones(rays: Floats, starts: NDArray[np.int64]) -> tuple[Array, Array]:
     return axes, np.arccos(np.clip(np.minimum.reduceat(cosines, starts[:-1]), -1, 1)) + CONE_MARGIN_RAD
 
 
-_tables: dict[tuple[int, int], tuple[MountedCamera, tuple[RayTable, ...]]] = {}
+_tables: list[tuple[OmniCamera, Mask, int, tuple[RayTable, ...]]] = []  # the one made last at the end
 
 
 def cached_tables(mounted: MountedCamera, supersample: int) -> tuple[RayTable, ...]:
-    """Return the camera's table, computed once; the camera is kept with it so that its id stays unique.
+    """Return the camera's table, computed once for equal cameras and masks.
 
     AS_NEEDED: of all fine rays; of one ray a pixel, in the same tiles; of one ray a pixel in large tiles.
     """
-    key = (id(mounted), supersample)
-    if key not in _tables:
-        if len(_tables) >= MAX_TABLES:
-            del _tables[next(iter(_tables))]
-        if supersample == AS_NEEDED:
-            finest = -(-SIDE_RAYS // max(mounted.camera.size))
-            fine, single = (ray_table(mounted, samples, NEEDED_PX * samples) for samples in (finest, 1))
-            common = np.intersect1d(fine.tiles, single.tiles)
-            _tables[key] = mounted, (fine.kept(common), single.kept(common), ray_table(mounted, 1))
-        else:
-            _tables[key] = mounted, (ray_table(mounted, supersample),)
-    return _tables[key][1]
+    mask = mounted.visible
+    ring = mask.center, mask.inner_px, mask.outer_px
+    for camera, kept, samples, tables in _tables:
+        is_ring = (kept.center, kept.inner_px, kept.outer_px) == ring and kept.image is mask.image
+        if samples == supersample and is_ring and camera == mounted.camera:
+            return tables
+    if supersample == AS_NEEDED:
+        finest = -(-SIDE_RAYS // max(mounted.camera.size))
+        fine, single = (ray_table(mounted, samples, NEEDED_PX * samples) for samples in (finest, 1))
+        common = np.intersect1d(fine.tiles, single.tiles)
+        made: tuple[RayTable, ...] = fine.kept(common), single.kept(common), ray_table(mounted, 1)
+    else:
+        made = (ray_table(mounted, supersample),)
+    del _tables[: len(_tables) - MAX_TABLES + 1]
+    _tables.append((mounted.camera, mask, supersample, made))
+    return made
 
 
 def _parents(small: RayTable, large: RayTable) -> NDArray[np.int64]:
