@@ -79,7 +79,7 @@ class DepthMeasure:
         self.wrong.append(np.abs(error_m) > limit_m)
 
     def _compare_ring(self, ring: ObstacleRing) -> None:
-        """Count sectors: called free beyond the true obstacle, with one, with a range before it, with a range."""
+        """Count sectors: free or with a range beyond the true obstacle; with one; with a range before it; with any."""
         T = self.T_world_rig[ring.stamp_ns] @ se3.inverse(self.rig.T_base_rig)
         segments = footprints(self.scene.rectangles, self.config.obstacles.ring.heights_m[1])
         rays = (azimuths()[:, None] + se3.yaw(T) + np.radians([-1 / 3, 0.0, 1 / 3])).ravel()
@@ -89,7 +89,8 @@ class DepthMeasure:
         # An edge may be two sectors off.
         around, seen = (np.min([np.roll(part, by) for by in range(-2, 3)], axis=0) for part in (true_m, found_m))
         near = (true_m > NEAREST_M) & (true_m < FARTHEST_M)
-        missed = near & (seen > true_m + limit_m) & (ring.free_m > true_m + limit_m)
+        is_unknown = np.isnan(ring.ranges_m) & (ring.free_m <= true_m + limit_m)
+        missed = near & (seen > true_m + limit_m) & ~is_unknown
         told = near & np.isfinite(ring.ranges_m)
         false = told & (ring.ranges_m < around - 0.1 - 0.03 * np.minimum(around, FARTHEST_M) ** 2)
         self.sectors.append(tuple(int(part.sum()) for part in (missed, near, false, told)))  # type: ignore[arg-type]
