@@ -151,9 +151,11 @@ class ObstaclesConfig:
 class RecordConfig:
     """Recordings of `omnid run`, `omnid record` and `omnid replay --record`."""
 
+    REMOVED = MappingProxyType({"file_mb": "a new file begins at 500 MB"})
+
     enabled: Annotated[bool, "omnid run records images and results"] = False
     folder: Annotated[str, "folder of the recordings; it is made if it is missing"] = "recordings"
-    file_mb: Annotated[int, Meta(ge=1, le=1_000_000), "size at which a new file begins, MB"] = 500
+    file_mb: int = 500  # size at which a new file begins, MB
     keep_mb: Annotated[int, Meta(ge=2, le=1_000_000_000), "total size of all files, MB; the oldest are deleted"] = (
         20_000
     )

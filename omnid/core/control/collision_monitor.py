@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Annotated, Final, Literal, NamedTuple
 
 from msgspec import Meta
@@ -39,6 +40,10 @@ IGNORE: Final = "ignore"
 class CollisionSettings:
     """Outline of the base, distances and times at which it stops and slows down before obstacles."""
 
+    REMOVED = MappingProxyType(
+        {"side_m": "it needs 4 cm of free space at its sides", "time_s": "it keeps 1.5 s to a collision"}
+    )
+
     check: Annotated[bool, "slow down and stop before obstacles, whatever the source of the command"] = True
     front_m: Annotated[
         float, Meta(ge=0, le=5), "outline of the base: its front, m ahead of the origin of base_link"
@@ -46,12 +51,8 @@ class CollisionSettings:
     rear_m: Annotated[float, Meta(ge=0, le=5), "outline of the base: its rear, m behind the origin"] = 0.25
     half_width_m: Annotated[float, Meta(ge=0.01, le=5), "outline of the base: half its width, m"] = 0.22
     stop_m: Annotated[float, Meta(ge=0.01, le=5), "the base stops so far before an obstacle, m"] = 0.15
-    side_m: Annotated[float, Meta(ge=0, le=5), "free space that it needs at its sides, m"] = 0.04
-    time_s: Annotated[
-        float,
-        Meta(ge=0.2, le=10),
-        "time to collision that it keeps: its speed is at most the distance to where it must stop, divided by this, s",
-    ] = 1.5
+    side_m: float = 0.04  # free space that it needs at its sides, m
+    time_s: float = 1.5  # time to collision that it keeps: speed <= distance / time_s, s
     slow_m: float = 0.5  # an obstacle nearer than this ahead slows it down to slow_mps, m
     slow_side_m: float = 0.12  # the same beside its way, m
     slow_mps: Annotated[float, Meta(ge=0.01, le=10), "speed near obstacles and into the unknown, m/s"] = 0.2

@@ -24,7 +24,12 @@ OFF: Final = 0.0  # exact: the value of a setting that switches its rule off
 class TrustSettings:
     """Levels at which the base slows down or stops."""
 
-    REMOVED = MappingProxyType({"degraded_speed": "half the speed while the pose is degraded"})
+    REMOVED = MappingProxyType(
+        {
+            "degraded_speed": "half the speed while the pose is degraded",
+            "motor_fault": "a fault of the motor controller stops the wheels",
+        }
+    )
 
     degraded_speed: float = 0.5  # share of the speeds while the pose is degraded or some motion is unexplained
     velocity_sigma_mps: Annotated[
@@ -35,7 +40,7 @@ class TrustSettings:
     yaw_rate_sigma_radps: Annotated[float, Meta(ge=0, le=20), "the same of the yaw rate, rad/s; 0: never"] = 0.4
     sigma_s: float = 0.3  # time for which a standard deviation may be higher, s
     odometry_reset: Annotated[Literal["stop", "ignore"], "when odometry has lost its map and begins again"] = "stop"
-    motor_fault: Annotated[Literal["stop", "ignore"], "when the motor controller reports a fault"] = "stop"
+    motor_fault: Literal["stop", "ignore"] = "stop"  # when the motor controller reports a fault
     battery_v: Annotated[
         float, Meta(ge=0, le=1000), "the wheels stop when the battery's voltage stays below, V; 0: never"
     ] = 0.0
