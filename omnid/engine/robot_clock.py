@@ -26,6 +26,7 @@ SLEW: Final = 500e-6  # most by which NTP changes the rate of a clock: MAXFREQ o
 STEP_NS: Final = 1_000_000  # less than two images of a pair are apart
 FOLLOW_NS: Final = 10**9  # time between two offsets that are followed in silence
 KEPT: Final = 64  # offsets that are remembered: stamps of the last minute, whatever the clock does
+END_NS: Final = 2**31 * 10**9  # of the times of ROS, which begin in 1970 and end in 2038
 READINGS: Final = 3  # of both clocks: the one with the least time between them counts
 
 
@@ -66,8 +67,8 @@ class RobotClock:
         self._unix_ns, self._report = unix_ns, report
         self._following = Lock()
         offset_ns, _, self._right_ns = self._measured()
-        self._adopted_ns = self._right_ns
-        self._offsets: tuple[_Offset, ...] = (_Offset(-math.inf, offset_ns),)
+        self._adopted_ns, self._is_time = self._right_ns, 0 <= self._right_ns + offset_ns < END_NS
+        self._offsets: tuple[_Offset, ...] = (_Offset(-math.inf, offset_ns if self._is_time else 0),)
         self.steps, self.step = 0, ClockStep(0, 0)
 
     def follow(self) -> None:
@@ -77,6 +78,11 @@ class RobotClock:
         try:
             # 1. By how much has it changed, and by how much can slewing have changed it since it was right?
             offset_ns, error_ns, now_ns = self._measured()
+            was_time, self._is_time = self._is_time, 0 <= now_ns + offset_ns < END_NS
+            if not self._is_time:  # no message can hold it
+                if was_time:
+                    self._report("the computer's clock was set to a time outside 1970 to 2038: stamps go on as before")
+                return
             change_ns = offset_ns - self._offsets[-1].offset_ns
             if abs(change_ns) <= error_ns:
                 self._right_ns = now_ns
@@ -171,4 +177,5 @@ def duration_words(seconds: float) -> str:
     seconds = abs(seconds)
     units = (("days", 86_400.0, 2.0), ("h", 3_600.0, 1.0), ("min", 60.0, 2.0), ("s", 1.0, 1.0))
     name, unit_s = next(((name, unit_s) for name, unit_s, least in units if seconds >= least * unit_s), ("ms", 1e-3))
-    return f"{seconds / unit_s:.3g} {name}"
+    amount = seconds / unit_s
+    return f"{amount:.0f} {name}" if amount >= 100.0 else f"{amount:.3g} {name}"

@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import json
 import math
+import secrets
 import time
 from bisect import bisect
 from collections import deque
@@ -124,9 +125,9 @@ class RobotFeed:
         self.robot: Robot | None = None
         self.link = "not connected yet"  # why there is no connection; empty with one
         self.inbox = Inbox()
-        # Of the news: it grows by one each time, from the time of the start on, so that pages which were open while
-        # this program started again are behind.
-        self.version = self._start = int(1000 * time.time())
+        # Of the news: it grows by one each time, from a number of this start, so that pages which were open while this
+        # program started again have seen none of them.
+        self.version = self._start = secrets.randbits(50)
         self._news: dict[str, tuple[int, Any]] = {}  # newest content of each kind, and the version that it came with
         self._images: dict[str, bytes] = {}  # cells of the map, and the panorama
         self._changed = asyncio.Condition()

@@ -6,6 +6,7 @@ import pytest
 
 from omnid.diagnostics.part_status import clock_status
 from omnid.engine.robot_clock import RobotClock
+from omnid.transport import codec
 from omnid.transport.codec import OK, WARN
 from tests.set_clock import SetClock
 
@@ -17,7 +18,7 @@ START_NS = 1_700_000_000 * S
     ("step_s", "words"),
     [
         (3600.0, "forwards by 1 h"),
-        (55 * 365.25 * 86400.0, "forwards by 2.01e+04 days"),  # a board without a battery learns the time
+        (10 * 365.0 * 86400.0, "forwards by 3650 days"),  # a board without a battery learns the time
         (-3 * 3600.0, "back by 3 h"),
         (0.02, "forwards by 20 ms"),
         (-0.3, "back by 300 ms"),
@@ -59,6 +60,23 @@ def test_slewing_is_followed_in_silence(rate: float) -> None:
         before_ns, unix_ns = unix_ns, clock.unix_ns(computer.monotonic_ns)
         assert abs(unix_ns - computer.unix_ns) < 1_100_000 and unix_ns > before_ns
     assert not lines and clock.steps == 0 and clock_status(clock).level == OK
+
+
+@pytest.mark.parametrize("step_s", [30 * 365.25 * 86400.0, -60 * 365.25 * 86400.0])
+def test_a_time_that_no_message_can_hold_is_not_followed(step_s: float) -> None:
+    lines: list[str] = []
+    computer = SetClock(START_NS)
+    clock = computer.clock(lines.append)
+    for change_s in (step_s, 7.0, -step_s):
+        computer.advance(1.0)
+        computer.set_forwards(change_s)
+        clock.follow()
+        time_ns = clock.unix_ns(computer.monotonic_ns)
+        assert 0 <= codec.ros_time(time_ns)[0] <= codec.MAX_SECONDS
+    assert time_ns == computer.unix_ns == START_NS + 10 * S and clock.steps == 1
+    assert len(lines) == 2 and "outside 1970 to 2038" in lines[0] and "forwards by 7 s" in lines[1]
+    begun = SetClock(START_NS + round(step_s * 1e9))
+    assert begun.clock().unix_ns(5 * S) == 5 * S, "of a computer that begins with such a time"
 
 
 def test_a_thread_that_is_not_scheduled_between_two_readings_has_seen_no_step() -> None:
