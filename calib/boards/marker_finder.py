@@ -14,7 +14,7 @@ from calib.boards.board import BoardView
 from calib.boards.board_shape import quadratic_terms
 from calib.boards.corner_candidates import BLUR_PX, Grey, describe_corners, smoothed
 from calib.boards.corner_grid import WINDOW_PART, refine_subpixel
-from calib.boards.corner_refinement import refine_in_mapping
+from calib.boards.corner_refinement import refine_in_mappings
 from calib.boards.derived_images import Image
 from calib.boards.marker_board import MarkerBoard
 from calib.boards.marker_reading import read_markers
@@ -152,14 +152,14 @@ def _side_px(mapping: LocalMapping) -> float:
 def _refined(grey: Grey, points: Array, pixels: Array, window: float) -> Array:
     """Return the pixels moved onto the corners, without those off the mapping of their neighbours."""
     good = pixels.copy()
-    for k in np.flatnonzero(np.isfinite(pixels[:, 0])):
-        mapping = _mapping_of_others(points, good, int(k))
-        if mapping is not None:
-            terms = np.vstack([good[k], mapping.coefficients[1:]])
-            good[k] = refine_in_mapping(grey, terms, good[k], window)
+    seen = [int(k) for k in np.flatnonzero(np.isfinite(pixels[:, 0]))]
+    mappings = {k: mapping for k in seen if (mapping := _mapping_of_others(points, pixels, k)) is not None}
+    if mappings:
+        own = np.array([np.vstack([pixels[k], mapping.coefficients[1:]]) for k, mapping in mappings.items()])
+        good[list(mappings)] = refine_in_mappings(grey, own, own[:, 0], window)
     for _ in range(len(points)):
-        mappings = {int(k): _mapping_of_others(points, good, int(k)) for k in np.flatnonzero(np.isfinite(good[:, 0]))}
-        off = {k: _irregularity(mapping, good[k]) for k, mapping in mappings.items()}
+        left = [int(k) for k in np.flatnonzero(np.isfinite(good[:, 0]))]
+        off = {k: _irregularity(_mapping_of_others(points, good, k), good[k]) for k in left}
         worst = max(off, key=lambda k: off[k], default=None)
         if worst is None or off[worst] < 1:
             break

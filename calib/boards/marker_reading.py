@@ -18,8 +18,8 @@ MIN_PERIMETER_PART, PIXELS_PER_BIT = 0.015, 6
 # Markers whose middles are at most this many sides (of the larger one) apart must predict each other's position,
 # within this part of a side.
 NEIGHBOUR_SIDES, MAX_OFF_PART = 3.2, 0.45
-# One marker alone may be misread.
-MIN_MARKERS = 2
+# One marker alone may be misread; so many that lie as on the board are not.
+MIN_MARKERS, SURE_MARKERS = 2, 6
 # The largest dictionary of every family that users print.
 FAMILIES = ("4X4_1000", "5X5_1000", "6X6_1000", "7X7_1000", "APRILTAG_36h11", "ARUCO_ORIGINAL")
 # Least markers of another dictionary of which a hint tells.
@@ -34,14 +34,19 @@ def read_markers(image: Image, layout: MarkerLayout, *, thorough: bool) -> Marke
     best: dict[bool, Markers] = {False: {}, True: {}}
     detector = _detector(layout.border_bits)
     for number, derived in enumerate(derived_images(image)):
+        gained = False
         for reflected in (False, True):
-            # After the first image the better of the two stays.
             mine, other = len(best[reflected]), len(best[not reflected])
-            if number and (mine < other or mine == len(layout.ids)):
+            # Several markers that lie as on the board are no misread ones: the other view is not read. After the first
+            # image the better of the two stays.
+            if other >= SURE_MARKERS or (number and mine < other):
                 continue
             found = _detected(detector, layout, derived, reflected)
             best[reflected] = consistent_markers({**found, **best[reflected]}, layout)
-        if not thorough:
+            gained |= len(best[reflected]) > mine
+        most = max(map(len, best.values()))
+        # Where a derived image shows no further marker of a board that is well seen, the next one does not either.
+        if not thorough or most == len(layout.ids) or (number and not gained and most >= SURE_MARKERS):
             break
     found = max(best.values(), key=len)
     return found if len(found) >= MIN_MARKERS else {}
@@ -71,10 +76,10 @@ def consistent_markers(markers: Markers, layout: MarkerLayout) -> Markers:
     """Return the largest set of markers each of which predicts the position of its neighbours in the set."""
     on_board = {int(number): corners for number, corners in zip(layout.ids, layout.corners, strict=True)}
     known = [number for number in markers if number in on_board]
-    links = {
-        number: [other for other in known if other != number and _is_neighbour(number, other, markers, on_board)]
-        for number in known
-    }
+    if not known:
+        return {}
+    linked = _links(np.array([markers[k] for k in known]), np.array([on_board[k] for k in known]))
+    links = {number: [known[other] for other in np.flatnonzero(row)] for number, row in zip(known, linked, strict=True)}
     best, left = list[int](), set(known)
     while left:
         group, queue = set[int](), [left.pop()]
@@ -87,24 +92,30 @@ def consistent_markers(markers: Markers, layout: MarkerLayout) -> Markers:
     return {number: markers[number] for number in best}
 
 
-def _is_neighbour(number: int, other: int, markers: Markers, on_board: Markers) -> bool:
-    """True if two markers are near each other on the board, and each predicts the other's middle."""
-    sides = [float(np.linalg.norm(on_board[one][0] - on_board[one][1])) for one in (number, other)]
-    apart = float(np.linalg.norm(on_board[number].mean(axis=0) - on_board[other].mean(axis=0)))
-    return apart <= NEIGHBOUR_SIDES * max(sides) and all(
-        _predicts(markers[a], on_board[a], markers[b], on_board[b]) for a, b in ((number, other), (other, number))
+def _links(image: Array, board: Array) -> NDArray[np.bool_]:
+    """Return the pairs (N, N) of markers that are near each other on the board, and each predict the other's middle.
+
+    image (N, 4, 2) [px], board (N, 4, 2) [m]: the markers' corners.
+    """
+    middles, board_middles = image.mean(axis=1), board.mean(axis=1)
+    side = np.linalg.norm(np.diff(image, axis=1), axis=2).mean(axis=1)
+    board_side = np.linalg.norm(board[:, 0] - board[:, 1], axis=1)
+    apart = np.linalg.norm(board_middles[:, None] - board_middles, axis=2)
+    # The plane of marker a places the middle of marker b in the image.
+    H = np.array(
+        [
+            cv2.getPerspectiveTransform(b.astype(np.float32), i.astype(np.float32))
+            for b, i in zip(board, image, strict=True)
+        ]
     )
-
-
-def _predicts(image_a: Array, board_a: Array, image_b: Array, board_b: Array) -> bool:
-    """True if the plane of marker a places the middle of marker b, in the image, where it is."""
-    H = cv2.getPerspectiveTransform(board_a.astype(np.float32), image_a.astype(np.float32))
-    middle = H @ np.array([*board_b.mean(axis=0), 1.0])
-    side = float(np.linalg.norm(np.diff(image_b, axis=0), axis=1).mean())
-    off = np.linalg.norm(middle[:2] / middle[2] - image_b.mean(axis=0))
+    placed = np.einsum("aij,bj->abi", H, np.column_stack([board_middles, np.ones(len(board))]))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        off = np.linalg.norm(placed[..., :2] / placed[..., 2:] - middles, axis=2)
     # The plane bends in a mirror: more over several sides.
-    steps = float(np.linalg.norm(board_b.mean(axis=0) - board_a.mean(axis=0)) / np.linalg.norm(board_b[0] - board_b[1]))
-    return bool(middle[2] > 0 and off < MAX_OFF_PART * side * max(1.0, steps / 2))
+    steps = np.maximum(1.0, apart / board_side / 2)
+    predicts = (placed[..., 2] > 0) & (off < MAX_OFF_PART * side * steps)
+    near = apart <= NEIGHBOUR_SIDES * np.maximum(board_side[:, None], board_side)
+    return np.asarray(predicts & predicts.T & near & ~np.eye(len(image), dtype=bool))
 
 
 def _detector(border_bits: int) -> cv2.aruco.ArucoDetector:

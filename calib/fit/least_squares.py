@@ -93,9 +93,11 @@ class Ending:
     damping: float = np.inf
 
 
-def minimise(problem: Problem[State], state: State, ending: Ending) -> State:
-    """Return the state of least cost near the one given (Levenberg and Marquardt)."""
-    damping = START_DAMPING
+def minimise(problem: Problem[State], state: State, ending: Ending, damping: float = START_DAMPING) -> State:
+    """Return the state of least cost near the one given (Levenberg and Marquardt).
+
+    damping: of the first step; one next to the minimum needs hardly any.
+    """
     for _ in range(ending.steps):
         # 1. Linearise at the state, with the scale of its residuals.
         scale = problem.scale(state)

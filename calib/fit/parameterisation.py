@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calib.errors import CalibError
 from calib.models.camera import Array, OmniCamera
+from calib.models.derivatives import pixel_derivatives
 from calib.models.ocam import ASTIGMATISM_NAMES, TANGENTIAL_NAMES, OcamCamera
 from calib.models.unified import OMNI_NAMES, UnifiedCamera
 from calib.models.wavefront import WAVEFRONT_NAMES
@@ -16,8 +17,8 @@ from calib.models.wavefront import WAVEFRONT_NAMES
 # One step of a wavefront's coefficient [m], so that it moves a board at half a metre by about half a pixel, as steps of
 # the other parameters do.
 WAVEFRONT_UNIT_M = 1e-3
-# A parameter: its name, its value, and one step in its own unit.
-_Row = tuple[str, float, float]
+# Centre and affine of an ocam camera; e moves along with d.
+OCAM_NAMES = ("center_row", "center_column", "c", "d")
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +36,11 @@ class CameraParameterisation:
         if isinstance(self.base, UnifiedCamera):
             return _omni_camera(self.base, values)
         return _ocam_camera(self.base, values)
+
+    def derivatives(self, steps: Array, points: Array) -> tuple[Array, Array]:
+        """Return the derivatives of the camera's pixels by points (N, 3), (N, 2, 3), and by the steps, (N, 2, P)."""
+        by_point, by_plain = pixel_derivatives(self.camera_at(steps), points, self.names)
+        return by_point, by_plain * self.units
 
     def plain_values(self, steps: Array) -> Array:
         """Return the parameters (P,) at the steps in their own units."""
@@ -55,44 +61,58 @@ def parameterise(
     objects such as boards show it.
     """
     if isinstance(camera, UnifiedCamera):
-        rows = _omni_rows(camera, distortion)
+        kept = ("xi", *OMNI_NAMES[1:5], *distortion)
+        chosen = [name for name, value in _values(camera).items() if value != 0 or name in kept]
     elif isinstance(camera, OcamCamera):
-        rows = _ocam_rows(camera, wavefront=wavefront)
+        values = _values(camera)
+        chosen = [name for name in values if name[0] == "a" and name[1:].isdigit() and values[name] != 0]
+        chosen += OCAM_NAMES
+        # p1 and p2 are correlated, so both are adjusted or neither.
+        chosen += TANGENTIAL_NAMES if any(camera.tangential) else ()
+        chosen += ASTIGMATISM_NAMES if wavefront or any(camera.astigmatism) else ()
+        chosen += WAVEFRONT_NAMES if wavefront else ()
     else:
         raise CalibError(
             f"calibrate: expected an omni or ocam camera, whose parameters can be fitted, found "
             f"{type(camera).__name__}: calibrate lenses by Kalibr"
         )
-    names, start, units = zip(*rows, strict=True)
-    return CameraParameterisation(camera, names, np.array(start), np.array(units))
+    return with_names(camera, chosen)
 
 
-def _omni_rows(camera: UnifiedCamera, distortion: Collection[str]) -> list[_Row]:
-    scale = min(camera.size) / 2
-    values = (camera.xi, *camera.focal, *camera.center, *camera.distortion)
-    pixels = OMNI_NAMES[1:5]  # the others have no unit
-    rows = [(name, value, 1.0 if name in pixels else 1 / scale) for name, value in zip(OMNI_NAMES, values, strict=True)]
-    kept = ("xi", *pixels, *distortion)
-    return [row for row in rows if row[1] != 0 or row[0] in kept]
+def with_names(camera: UnifiedCamera | OcamCamera, names: Sequence[str]) -> CameraParameterisation:
+    """Return the parameterisation about a camera by the named parameters, also those that are 0."""
+    if isinstance(camera, OcamCamera):
+        highest = max(int(name[1:]) for name in names if name[0] == "a" and name[1:].isdigit())
+        missing = highest + 1 - len(camera.polynomial)
+        camera = replace(camera, polynomial=(*camera.polynomial, *[0.0] * max(0, missing)))
+    values, scale = _values(camera), min(camera.size) / 2
+    units = [_unit(name, scale, is_omni=isinstance(camera, UnifiedCamera)) for name in names]
+    return CameraParameterisation(camera, tuple(names), np.array([values[name] for name in names]), np.array(units))
 
 
-def _ocam_rows(camera: OcamCamera, *, wavefront: bool) -> list[_Row]:
-    scale = min(camera.size) / 2
-    rows = [(f"a{power}", value, scale ** -float(power)) for power, value in enumerate(camera.polynomial) if value != 0]
-    rows += _rows(("center_row", "center_column"), camera.center_row_column, 1.0)
-    rows += _rows(("c", "d"), camera.affine[:2], 1 / scale)
-    # p1 and p2 are correlated, so both are adjusted or neither.
-    if any(camera.tangential):
-        rows += _rows(TANGENTIAL_NAMES, camera.tangential, 1 / scale**2)
-    if wavefront or any(camera.astigmatism):
-        rows += _rows(ASTIGMATISM_NAMES, camera.astigmatism, 1 / scale**3)
-    if wavefront:
-        rows += _rows(WAVEFRONT_NAMES, camera.wavefront, WAVEFRONT_UNIT_M)
-    return rows
+def _values(camera: UnifiedCamera | OcamCamera) -> dict[str, float]:
+    """Return all parameters by name, in the order of results."""
+    if isinstance(camera, UnifiedCamera):
+        plain = (camera.xi, *camera.focal, *camera.center, *camera.distortion)
+        return dict(zip(OMNI_NAMES, plain, strict=True))
+    values = {f"a{power}": value for power, value in enumerate(camera.polynomial)}
+    values |= dict(zip(OCAM_NAMES, (*camera.center_row_column, *camera.affine[:2]), strict=True))
+    values |= dict(zip(TANGENTIAL_NAMES, camera.tangential, strict=True))
+    values |= dict(zip(ASTIGMATISM_NAMES, camera.astigmatism, strict=True))
+    return values | dict(zip(WAVEFRONT_NAMES, camera.wavefront, strict=True))
 
 
-def _rows(names: Iterable[str], values: Iterable[float], unit: float) -> list[_Row]:
-    return [(name, value, unit) for name, value in zip(names, values, strict=True)]
+def _unit(name: str, scale: float, *, is_omni: bool) -> float:
+    """Return one step of a parameter, which moves the image by about a pixel; scale: half of its smaller side [px]."""
+    if name in (*OMNI_NAMES[1:5], *OCAM_NAMES[:2]):
+        return 1.0
+    if is_omni or name in OCAM_NAMES[2:]:
+        return 1 / scale
+    if name in TANGENTIAL_NAMES:
+        return float(1 / scale**2)
+    if name in ASTIGMATISM_NAMES:
+        return float(1 / scale**3)
+    return WAVEFRONT_UNIT_M if name in WAVEFRONT_NAMES else float(scale ** -float(name[1:]))
 
 
 def _omni_camera(base: UnifiedCamera, values: dict[str, float]) -> UnifiedCamera:

@@ -159,10 +159,10 @@ class OcamCamera:
             x, y = self._undistort(x, y)
         rho = np.hypot(x, y)
         z = self.height(np.where(rho <= self._radii[-1], rho, np.nan))
-        rays = np.column_stack([x, y, self._sign * z])
+        rays = np.column_stack([x, y, self.sign * z])
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         if any(self.wavefront):
-            return wavefronts.points_at(self.distance_m, rays, self.wavefront, -self._sign)
+            return wavefronts.points_at(self.distance_m, rays, self.wavefront, -self.sign)
         return np.asarray(rays)
 
     def project(self, points: Array) -> Array:
@@ -174,23 +174,23 @@ class OcamCamera:
         if any(self.wavefront):
             norm = np.linalg.norm(points, axis=1, keepdims=True)
             at = self.distance_m * points / np.where(norm > 0, norm, np.nan)
-            points = wavefronts.directions_to(at, self.wavefront, -self._sign)
+            points = wavefronts.directions_to(at, self.wavefront, -self.sign)
         return self._project_rays(points)
 
     def project_near(self, points: Array) -> Array:
         """Return pixels (N, 2) of points (N, 3) [m] at their own distances; like project() without a wavefront."""
         points = np.asarray(points, float)
         if any(self.wavefront):
-            points = wavefronts.directions_to(points, self.wavefront, -self._sign)
+            points = wavefronts.directions_to(points, self.wavefront, -self.sign)
         return self._project_rays(points)
 
     def _project_rays(self, points: Array) -> Array:
         r = np.hypot(points[:, 0], points[:, 1])
-        rho = self._radius(r, self._sign * points[:, 2])
+        rho = self.radius(r, self.sign * points[:, 2])
         scale = rho / np.where(r > 0, r, 1.0)
         x, y = points[:, 0] * scale, points[:, 1] * scale
         if self._is_distorted:
-            bent_x, bent_y = self._distort(x, y)
+            bent_x, bent_y = self.distort(x, y)
             is_unfolded = self._is_unfolded(x, y)
             x, y = np.where(is_unfolded, bent_x, np.nan), np.where(is_unfolded, bent_y, np.nan)
         c, d, e = self.affine
@@ -201,7 +201,7 @@ class OcamCamera:
     def _is_distorted(self) -> bool:
         return any(self.tangential) or any(self.astigmatism)
 
-    def _distort(self, x: Array, y: Array) -> tuple[Array, Array]:
+    def distort(self, x: Array, y: Array) -> tuple[Array, Array]:
         """Apply the tangential and astigmatic terms to ideal points x, y (N,) [px]."""
         (p1, p2), (s1, s2) = self.tangential, self.astigmatism
         x2, xy, y2 = x * x, x * y, y * y
@@ -216,23 +216,23 @@ class OcamCamera:
         ideal_x, ideal_y = x.copy(), y.copy()
         with np.errstate(all="ignore"):
             for _ in range(TANGENTIAL_STEPS):
-                distorted_x, distorted_y = self._distort(ideal_x, ideal_y)
+                distorted_x, distorted_y = self.distort(ideal_x, ideal_y)
                 error_x, error_y = distorted_x - x, distorted_y - y
-                xx, xy, yy = self._jacobian(ideal_x, ideal_y)
+                xx, xy, yy = self.distortion_jacobian(ideal_x, ideal_y)
                 determinant = xx * yy - xy * xy
                 ideal_x = ideal_x - (yy * error_x - xy * error_y) / determinant
                 ideal_y = ideal_y - (xx * error_y - xy * error_x) / determinant
-            distorted_x, distorted_y = self._distort(ideal_x, ideal_y)
+            distorted_x, distorted_y = self.distort(ideal_x, ideal_y)
             converged = np.hypot(distorted_x - x, distorted_y - y) < TANGENTIAL_TOLERANCE_PX
             found = converged & self._is_unfolded(ideal_x, ideal_y)
         return np.where(found, ideal_x, np.nan), np.where(found, ideal_y, np.nan)
 
     def _is_unfolded(self, x: Array, y: Array) -> NDArray[np.bool_]:
         """True (N,) up to where the terms turn back, to pixels of other rays: their symmetric Jacobian is positive."""
-        xx, xy, yy = self._jacobian(x, y)
+        xx, xy, yy = self.distortion_jacobian(x, y)
         return np.asarray((xx > 0) & (xx * yy > xy * xy))
 
-    def _jacobian(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
+    def distortion_jacobian(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
         """Return xx, xy, yy, each (N,), of the Jacobian [xx xy; xy yy] of the tangential and astigmatic terms."""
         (p1, p2), (s1, s2) = self.tangential, self.astigmatism
         xx2, xy2, yy2 = x * x, x * y, y * y
@@ -243,10 +243,11 @@ class OcamCamera:
         )
 
     @property
-    def _sign(self) -> float:
+    def sign(self) -> float:
+        """The sign of z of rays that are seen in a mirror, -1, or directly, 1."""
         return -1.0 if self.view == "mirror" else 1.0
 
-    def _radius(self, r: Array, z: Array) -> Array:
+    def radius(self, r: Array, z: Array) -> Array:
         """Solve f(rho) * r = z * rho for rho (N,) by Newton steps within one interval of the table."""
         norm = np.hypot(r, z)
         unit = np.where((norm > 0) & np.isfinite(norm), norm, np.nan)
@@ -256,7 +257,7 @@ class OcamCamera:
         rho = (low + high) / 2
         with np.errstate(all="ignore"):
             for _ in range(SOLVE_STEPS):
-                height, slope = self._height_and_slope(rho)
+                height, slope = self.height_and_slope(rho)
                 value = height * r - z * rho
                 is_below = value < 0
                 low, high = np.where(is_below, rho, low), np.where(is_below, high, rho)
@@ -266,7 +267,7 @@ class OcamCamera:
                     break
         return np.where(np.isfinite(unit) & (angle <= self._angles[-1]), rho, np.nan)
 
-    def _height_and_slope(self, radius_px: Array) -> tuple[Array, Array]:
+    def height_and_slope(self, radius_px: Array) -> tuple[Array, Array]:
         """Return f(rho) and f'(rho), both (N,), by one Horner scheme: numpy's two take most of a calibration's time."""
         height, slope = np.full_like(radius_px, self.polynomial[-1]), np.zeros_like(radius_px)
         for coefficient in self.polynomial[-2::-1]:

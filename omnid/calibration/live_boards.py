@@ -63,7 +63,7 @@ class CameraCoverage:
         """Return a text about what no board covers yet, for the person who holds the board."""
         counts = self.counts()
         hours = [int(hour) or HOURS for hour in np.flatnonzero(counts.sum(axis=0) == 0)]
-        found = [f"no board at {_listed(sorted(hours))} o'clock"] if hours else []
+        found = [f"no board at {listed(sorted(hours))} o'clock"] if hours else []
         rings = int((np.count_nonzero(counts, axis=1) >= HOURS // 2).sum())
         if rings < NEEDED_RINGS:
             found.append("one ring only: hold it nearer, farther, higher, lower")
@@ -84,7 +84,7 @@ def moved(a: BoardView | None, b: BoardView | None) -> float:
     return float(known.mean()) if known.size else math.inf
 
 
-def _listed(hours: Sequence[int]) -> str:
+def listed(hours: Sequence[int]) -> str:
     """Return "1 to 4, 9" for 1, 2, 3, 4, 9."""
     groups: list[list[int]] = []
     for hour in hours:

@@ -21,16 +21,17 @@ from calib.fit.boards.rig_fit import RigCalibration, refine_rig_calibration, rig
 from calib.fit.boards.rig_problem import PairView
 from calib.fit.boards.rig_selection import select_rig
 from calib.fit.residual_structure import ResidualStructure
-from calib.fit.rig_uncertainty import DriveUncertainty, drive_uncertainty, seen_points
+from calib.fit.rig_uncertainty import DriveUncertainty, drive_uncertainty
 from calib.masks.rim import find_rim
 from calib.masks.stack_mask import find_mask
-from calib.models.camera import Array, Mask
+from calib.models.camera import Mask
 from calib.models.names import sees_directly
 from calib.models.ocam import OcamCamera, View
 from calib.rig import Rig
 from calib.rig_file import write_rig
 from calib.rig_frame import is_turned_over, rig_between, turned_over_note
 from drivers.logs.log_reader import AnyCameras, LogCameras
+from omnid.calibration.angle_table import AngleRow, angle_lines, angle_rows, missing_boards
 from omnid.calibration.board_search import AnyBoard, Progress, find_boards, select_diverse_views, silent
 from omnid.calibration.images import SIDES, Image, Images, PairedImages, brightest, read_pairs
 from omnid.calibration.rig_report import rig_report_html
@@ -53,7 +54,7 @@ class RigResult:
     images: PairedImages
     notes: tuple[str, ...]  # about repeated images, baseline, view, order of the cameras, and masks that are missing
     drives: DriveUncertainty | None  # errors of drives by the covariance; None if the cameras see too little in common
-    missing: str  # which pairs to add
+    angles: tuple[tuple[AngleRow, ...], ...]  # residuals and coverage of the lower and the upper camera
 
     @property
     def is_misfit(self) -> bool:
@@ -66,7 +67,9 @@ class RigResult:
         """Limits of the result, one line each."""
         found = self.calibration
         return [
-            *accuracy_warnings([found.structure(side) for side in range(len(SIDES))], self.drives, self.missing),
+            *accuracy_warnings(
+                [found.structure(side) for side in range(len(SIDES))], self.drives, missing_boards(self.angles)
+            ),
             *found.shape.notes(found.board.points),
             *self.notes,
             *(f"left out {bad.name}: {bad.reason}" for bad in found.rejected),
@@ -86,13 +89,18 @@ class RigResult:
             + (f", good for {GOOD_PART:.1%} of length" if self.drives and self.drives.length_part <= GOOD_PART else "")
         )
 
+    @property
+    def tables(self) -> list[str]:
+        """Return the tables of residuals by the angle from the axis, in lines."""
+        return [line for name, rows in zip(SIDES, self.angles, strict=True) for line in angle_lines(name, rows)]
+
     def save(self, path: str | PathLike[str]) -> None:
         """Write the rig.toml, and masks with struts to PNGs in the same folder."""
         write_rig(Path(path), self.rig)
 
     def save_report(self, path: str | PathLike[str]) -> None:
         """Write an HTML page with residuals, coverage and panoramas."""
-        write_file(Path(path), rig_report_html(self.calibration, self.images, self.rig).encode())
+        write_file(Path(path), rig_report_html(self.calibration, self.images, self.rig, self.angles).encode())
 
 
 def calibrate_rig(
@@ -130,9 +138,9 @@ def calibrate_rig(
     rig, unmasked = _masked_rig(found, images, with_struts=with_struts)
     rig = replace(rig, covariance=rig_covariance(found, rig))
     drives = drive_uncertainty(rig)
-    missing = missing_views(found.views, rig) if drives else ""
+    angles = tuple(tuple(angle_rows(found, rig, side)) for side in range(len(SIDES)))
     notes = (*images.notes, *baseline_notes, *shown, *_order_notes(rig), *unmasked)
-    return RigResult(rig, found, images, notes, drives, missing)
+    return RigResult(rig, found, images, notes, drives, angles)
 
 
 def _find_views(images: PairedImages, board: AnyBoard, progress: Progress) -> list[PairView]:
@@ -172,6 +180,7 @@ def _fit(
     # 1. Fit the rig to a board as drawn.
     found, rejected = _fit_board(views, images, board, AS_DRAWN, chosen, progress)
     # 2. Refine the corners with the cameras, and fit the rig again.
+    progress("rig: refining the corners")
     found = refine_rig_calibration(found, images.sides)
     rejected += found.rejected
     # 3. If the print differs from its drawing, fit the cameras and the rig again with its shape.
@@ -202,6 +211,7 @@ def _fit_board(
         # 1. Fit the models to the camera's views, and select one.
         seen = [own for view in views if (own := view.seen[side]) is not None]
         height, width = images.sides[side][seen[0].name].shape if seen else (0, 0)
+        progress(f"{name} camera: fitting {len(seen)} views")
         selected = select_calibration(seen, board, (width, height), model, direction, shape)
         for camera_score in selected.scores:
             word = "selected" if camera_score.model == selected.model else "compared"
@@ -214,6 +224,7 @@ def _fit_board(
         rejected += [RejectedView(view.name, f"{name} camera: {view.reason}") for view in bad]
         views = _without(views, side, {view.name for view in bad})
     # 3. Fit the transform between the cameras, and the cameras with it.
+    progress(f"rig: fitting {sum(None not in view.seen for view in views)} pairs")
     lower, upper = (camera.calibration.camera for camera in cameras)
     polynomials = _polynomials(cameras) if model == "auto" else None
     selection = select_rig(views, board, (lower, upper), polynomials, shape)
@@ -297,10 +308,6 @@ def _mask(center: tuple[float, float], images: Images, *, with_struts: bool) -> 
 # Relative error of a drive's length. Up to GOOD_PART there is no warning. From MISFIT_PART on the warning advises
 # against the rig: that is a third of the error of wheels, about a per cent, which the cameras are to improve on.
 MISFIT_PART, GOOD_PART = 0.003, 0.001
-# Six pairs, spread over the azimuth, lower the error of lengths to a third or less.
-MORE_PAIRS = 6
-# Corners and rays are counted up to this percentile: the last ones are those of one slanted board.
-HIGHEST_PERCENT = 98.0
 
 
 def accuracy_warnings(
@@ -327,33 +334,4 @@ def accuracy_warnings(
     )
     advice = ": do not use it where that matters" if drives.length_part >= MISFIT_PART else ""
     lines = [f"{line}; {cost}{advice}" for line in misfits]
-    return lines or [f"the images leave something open: {cost}; {missing}"]
-
-
-def missing_views(views: Sequence[PairView], rig: Rig) -> str:
-    """Return which pairs to add: of the camera, and of higher or lower boards, where the most elevations are missing.
-
-    The profile of a mirror is extrapolated from the elevations of the corners to those of a drive, whose lengths depend
-    on it.
-    """
-    points, gaps = seen_points(rig), list[tuple[float, str, float, float, str]]()
-    if not len(points):
-        return ""
-    for side, (name, mounted) in enumerate(zip(SIDES, (rig.lower, rig.upper), strict=True)):
-        pixels = np.concatenate([seen.pixels for view in views if (seen := view.seen[side]) is not None])
-        R_rect_cam = rig.T_rect_rig[:3, :3] @ mounted.T_cam_rig[:3, :3].T
-        corners = _elevations_deg(mounted.camera.lift(pixels[np.isfinite(pixels[:, 0])]) @ R_rect_cam.T)
-        needed = _elevations_deg(points - se3.apply(rig.T_rect_rig, mounted.viewpoint[None]))
-        for word, percent, sign in (("higher", HIGHEST_PERCENT, 1), ("lower", 100 - HIGHEST_PERCENT, -1)):
-            reached, wanted = (float(np.nanpercentile(part, percent)) for part in (corners, needed))
-            gaps.append((sign * (wanted - reached), name, reached, wanted, word))
-    _, name, reached, wanted, word = max(gaps)
-    return (
-        f"the {name} camera saw boards to an elevation of {reached:+.0f} deg only, a drive looks to {wanted:+.0f} deg: "
-        f"add {MORE_PAIRS} pairs with the board {word}, all around"
-    )
-
-
-def _elevations_deg(rays: Array) -> Array:
-    """Return the angles (N,) of rays (N, 3) in the rectified frame above the plane across the baseline."""
-    return np.asarray(np.rad2deg(np.arctan2(rays[:, 2], np.hypot(rays[:, 0], rays[:, 1]))))
+    return lines or [f"the images leave something open: {cost}{missing and '; '}{missing}"]

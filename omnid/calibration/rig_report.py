@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from html import escape
 
 import cv2
@@ -15,6 +15,7 @@ from calib.fit.boards.rig_fit import MOTION_NAMES, RigCalibration
 from calib.models.camera import Array
 from calib.panorama import fit_cylinder, remap_tables
 from calib.rig import Rig
+from omnid.calibration.angle_table import HEAD, AngleRow
 from omnid.calibration.images import SIDES, Image, PairedImages
 from omnid.report.page import bar, figure, folded, page, table
 
@@ -29,8 +30,8 @@ LINES = 24
 FINE = 4
 
 
-def rig_report_html(found: RigCalibration, images: PairedImages, rig: Rig) -> str:
-    """Return the page."""
+def rig_report_html(found: RigCalibration, images: PairedImages, rig: Rig, angles: Sequence[Sequence[AngleRow]]) -> str:
+    """Return the page; angles: the tables of the lower and the upper camera."""
     left_out = "".join(
         f"<p class='warn'>left out {escape(bad.name)}: {escape(bad.reason)}</p>" for bad in found.rejected
     )
@@ -41,10 +42,11 @@ def rig_report_html(found: RigCalibration, images: PairedImages, rig: Rig) -> st
         "<h2>Between the cameras</h2>",
         _motion(found),
     ]
-    for name, parameters in zip(SIDES, found.parameters, strict=True):
+    for name, parameters, by_angle in zip(SIDES, found.parameters, angles, strict=True):
         rows = [(key, f"{value:.8g}", f"{sigma:.2g}") for key, value, sigma in parameters]
         parts += [
             f"<h2>The {name} camera</h2>",
+            table(HEAD, [row.cells() for row in by_angle]),
             folded("parameters", table(("parameter", "value", "standard deviation"), rows)),
         ]
     coverage = "".join(_coverage(found, images, side) for side in range(len(SIDES)))

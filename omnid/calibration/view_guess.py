@@ -25,7 +25,7 @@ from calib.boards.board import Board, BoardView
 from calib.boards.marker_board import MarkerBoard
 from calib.errors import CalibError
 from calib.fit.boards.camera_fit import BAD_LINEAR_RAD, consistent_views, observations
-from calib.fit.boards.ocam_fit import DEGREE
+from calib.fit.boards.camera_models import DEGREE
 from calib.fit.boards.ocam_linear import powers, solve_linear
 from calib.masks.rim import find_rim
 from calib.models.camera import Array

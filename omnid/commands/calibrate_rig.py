@@ -84,6 +84,8 @@ def run(args: argparse.Namespace) -> int:
         found.save_report(args.report)
     for line in found.warnings:
         print(f"warning: {line}", file=sys.stderr)
+    for line in found.tables:
+        print(line)
     print(f"{args.output}: {found}")
     print(f"{args.output}: {height_of(found.rig)}")
     return int(bool(found.images.loss))

@@ -5,7 +5,6 @@ Every image has its own pose, which is a block of six unknowns of the normal equ
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
@@ -14,7 +13,7 @@ import numpy as np
 from calib import se3
 from calib.errors import CalibError
 from calib.fit.boards.smooth_misfit import covariance_with_misfit, smooth_fields
-from calib.fit.least_squares import ArrowSystem, Ending, minimise
+from calib.fit.least_squares import DAMPING_FACTOR, START_DAMPING, ArrowSystem, Ending, minimise
 from calib.fit.robust_scale import robust_sigma
 from calib.models.camera import Array
 
@@ -31,9 +30,6 @@ HUBER_WIDTH = 2.5
 MIN_SIGMA_PX = 0.02
 # Residual of a corner that the model cannot project: larger than any residual of a corner in the image.
 LOST_PX = 300.0
-# Step of numeric derivatives. Parameters are scaled so that one unit moves the image by about a pixel; points are moved
-# by this part of their distance.
-DIFFERENCE_STEP = 1e-4
 
 
 class Projection(Protocol):
@@ -43,7 +39,18 @@ class Projection(Protocol):
         """Return pixels (N, 2) of points (N, 3), NaN for points without an image."""
 
 
-CameraFactory = Callable[[Array], Projection]
+class Parameters(Protocol):
+    """A camera that depends on steps (P,), which are 0 at the start of a fit."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Return the names (P,) of the steps."""
+
+    def camera_at(self, steps: Array) -> Projection:
+        """Return the camera at the steps; CalibError if there is none."""
+
+    def derivatives(self, steps: Array, points: Array) -> tuple[Array, Array]:
+        """Return the derivatives of the pixels by points (N, 3), (N, 2, 3), and by the steps, (N, 2, P)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,28 +125,29 @@ def residuals(camera: Projection, T_cam_board: Array, observed: Observations, po
 
 
 def adjust_bundle(
-    camera_of: CameraFactory,
-    parameters: Array,
+    parameters: Parameters,
     T_cam_board: Array,
     observed: Observations,
     *,
     kernel_rounds: int = KERNEL_ROUNDS,
     prior: Prior | None = None,
+    ending: Ending = ENDING,
 ) -> BundleResult:
     """Minimise the robust reprojection error over parameters (P,) and poses (K, 4, 4), from the given start values.
 
     The steps (S,) of the board's modes, if it has any, are unknowns too, and start at 0.
     kernel_rounds: number of optimisations; 1 is enough if the start values are nearly right.
     """
-    parameters = np.asarray(parameters, float)
-    none = Prior(np.zeros(len(parameters)), np.full(len(parameters), np.inf))
-    problem = _BoardProblem(camera_of, observed, prior or none, np.inf)
-    state = problem.state(parameters, np.zeros(observed.mode_count), np.asarray(T_cam_board, float))
-    sigma = np.inf
+    count = len(parameters.names)
+    none = Prior(np.zeros(count), np.full(count, np.inf))
+    problem = _BoardProblem(parameters, observed, prior or none, np.inf)
+    state = problem.state(np.zeros(count), np.zeros(observed.mode_count), np.asarray(T_cam_board, float))
+    sigma, damping = np.inf, START_DAMPING
     for _ in range(kernel_rounds):
         sigma = min(sigma, robust_sigma(state.residuals, MIN_SIGMA_PX))
         problem = replace(problem, kernel_px=HUBER_WIDTH * sigma)
-        state = minimise(problem, state, ENDING)
+        state = minimise(problem, state, ending, damping)
+        damping = min(START_DAMPING, ending.damping / DAMPING_FACTOR)  # the next one begins next to its minimum
     return _bundle_result(problem, state)
 
 
@@ -160,7 +168,7 @@ class _BoardProblem:
     Its common unknowns are the camera's parameters (P,), then the steps (S,) of the board's modes.
     """
 
-    camera_of: CameraFactory
+    unknowns: Parameters
     observed: Observations
     prior: Prior
     kernel_px: float
@@ -169,7 +177,7 @@ class _BoardProblem:
         """Return the iterate with these parameters and poses; CalibError if there is no such camera."""
         points = self.observed.points_at(board_steps)
         return _State(
-            parameters, board_steps, poses, residuals(self.camera_of(parameters), poses, self.observed, points)
+            parameters, board_steps, poses, residuals(self.unknowns.camera_at(parameters), poses, self.observed, points)
         )
 
     def scale(self, state: _State) -> float:
@@ -208,7 +216,7 @@ class _BoardProblem:
         prior, to_prior = (np.pad(part, (0, J_in.shape[2] - len(part))) for part in (prior, to_prior))
         between = (J_in.swapaxes(1, 2) @ J_pose).swapaxes(0, 1).reshape(J_in.shape[2], 6 * K)
         return ArrowSystem(
-            A=np.tensordot(J_in, J_in, axes=((0, 1), (0, 1))) + np.diag(prior),
+            A=(J_in.swapaxes(1, 2) @ J_in).sum(axis=0) + np.diag(prior),
             B=between,
             C=J_pose.swapaxes(1, 2) @ J_pose,
             a=np.einsum("kri,kr->i", J_in, r) - to_prior,
@@ -218,16 +226,10 @@ class _BoardProblem:
     def _jacobians(self, state: _State) -> tuple[Array, Array]:
         """Return derivatives of modelled pixels by common unknowns (K, N, 2, P + S) and left twists (K, N, 2, 6)."""
         points = se3.apply(state.poses, self.observed.points_at(state.board_steps))
-        flat = points.reshape(-1, 3)
-        columns = []
-        for step in DIFFERENCE_STEP * np.eye(len(state.parameters)):
-            ahead, behind = (self.camera_of(state.parameters + sign * step).project(flat) for sign in (1, -1))
-            columns.append((ahead - behind) / (2 * DIFFERENCE_STEP))
-        by_parameter = np.nan_to_num(np.stack(columns, axis=-1)) if columns else np.zeros((len(flat), 2, 0))
-        by_point = _by_point(self.camera_of(state.parameters), flat)
+        flat, shape = points.reshape(-1, 3), points.shape[:2]
+        by_point, by_parameter = map(_finite, self.unknowns.derivatives(state.parameters, flat))
         by_pose = np.concatenate([by_point, -by_point @ se3.hat(flat)], axis=-1)
-        shape = points.shape[:2]
-        by_common = by_parameter.reshape(*shape, 2, len(columns))
+        by_common = by_parameter.reshape(*shape, 2, by_parameter.shape[2])
         if self.observed.modes is not None:
             turned = np.einsum("kij,njs->knis", state.poses[:, :3, :3], self.observed.modes)
             by_common = np.concatenate([by_common, by_point.reshape(*shape, 2, 3) @ turned], axis=3)
@@ -241,12 +243,9 @@ def _huber_weights(residual: Array, kernel_px: float) -> tuple[Array, Array]:
     return np.nan_to_num(residual), weight
 
 
-def _by_point(camera: Projection, points: Array) -> Array:
-    """Return the derivative (N, 2, 3) of the pixels by the points; one projection of all moved points."""
-    reach = DIFFERENCE_STEP * np.linalg.norm(points, axis=1, keepdims=True)
-    moved = points + reach * np.vstack([np.eye(3), -np.eye(3)])[:, None]  # (6, N, 3)
-    pixels = camera.project(moved.reshape(-1, 3)).reshape(2, 3, len(points), 2)
-    return np.asarray(np.nan_to_num(np.moveaxis((pixels[0] - pixels[1]) / (2 * reach), 0, -1)))
+def _finite(values: Array) -> Array:
+    """Return values with 0 for those that are not finite: a point without an image has no derivative."""
+    return np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
 
 
 def _bundle_result(problem: _BoardProblem, state: _State) -> BundleResult:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,8 +13,7 @@ from calib.boards.corner_refinement import refine_with_camera
 from calib.boards.print_shape import AS_DRAWN, PrintShape
 from calib.errors import CalibError
 from calib.fit.boards.bundle import BundleResult, Observations
-from calib.fit.boards.camera_models import FittedModel, Model, fit_model
-from calib.fit.boards.ocam_fit import DEGREE
+from calib.fit.boards.camera_models import DEGREE, FittedModel, Model, fit_model, refit
 from calib.fit.boards.ocam_linear import solve_linear
 from calib.models.camera import Array, OmniCamera
 from calib.models.ocam import View
@@ -96,8 +95,20 @@ def calibrate_consistent(
 
     ocam: the ocam camera fitted to the same views, if it is known, as the start of the other models.
     """
+    solved = fit_model(model, observations(views, board, shape), size, view, ocam)
+    return _without_outliers(solved, views, rejected, board, shape, lambda seen: fit_model(model, seen, size, view))
+
+
+def _without_outliers(
+    solved: FittedModel,
+    views: Sequence[BoardView],
+    rejected: Sequence[RejectedView],
+    board: CalibrationBoard,
+    shape: PrintShape,
+    fit_again: Callable[[Observations], FittedModel],
+) -> CameraCalibration:
+    """Return the calibration of a fit, which is repeated without the views that fit much worse than the others."""
     good, rejected = list(views), list(rejected)
-    solved = fit_model(model, observations(good, board, shape), size, view, ocam)
     for _ in range(MAX_REJECTIONS):
         bad = outlier_views(solved.fit)
         if not bad.any():
@@ -105,7 +116,7 @@ def calibrate_consistent(
         rejected += [rejected_view(seen.name, solved.fit, k) for k, seen in enumerate(good) if bad[k]]
         good = [seen for k, seen in enumerate(good) if not bad[k]]
         _require(len(good), "consistent views", rejected)
-        solved = fit_model(model, observations(good, board, shape), size, view)
+        solved = fit_again(observations(good, board, shape))
     warnings = _warnings(solved, observations(good, board))
     return CameraCalibration(
         solved.camera,
@@ -122,13 +133,17 @@ def calibrate_consistent(
 def refine_camera_calibration(
     found: CameraCalibration, images: Mapping[str, NDArray[np.uint8]], model: Model, view: View
 ) -> CameraCalibration:
-    """Refine the corners with the calibrated camera, and calibrate it again; images by the views' names."""
+    """Refine the corners with the calibrated camera, and fit its parameters again; images by the views' names."""
     views = [
         replace(seen, pixels=refine_with_camera(images[seen.name], seen.pixels, found.board, found.camera, T))
         for seen, T in zip(found.views, found.fit.T_cam_board, strict=True)
     ]
-    again = fit_camera(views, found.board, found.camera.size, model, view, found.shape)
-    return replace(again, rejected=found.rejected + again.rejected)
+    names = [name for name, _, _ in found.parameters]
+    again = refit(found.camera, names, found.fit.T_cam_board, observations(views, found.board, found.shape))
+    size = found.camera.size
+    return _without_outliers(
+        again, views, found.rejected, found.board, found.shape, lambda seen: fit_model(model, seen, size, view)
+    )
 
 
 def observations(

@@ -2,32 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from calib.fit.boards.bundle import BundleResult, Observations
+import numpy as np
+
+from calib.errors import CalibError
+from calib.fit.boards.bundle import BundleResult, Observations, adjust_bundle
 from calib.fit.boards.cross_validation import held_out_error_px
-from calib.fit.boards.ocam_fit import (
-    DEGREE,
-    add_tangential,
-    fit_ocam,
-    ocam_factory,
-    ocam_parameters,
-    ocam_structure,
-    raise_degree,
-)
-from calib.fit.boards.unified_fit import DISTORTION_TERMS, fit_unified, unified_factory, unified_parameters
-from calib.models.camera import OmniCamera
-from calib.models.ocam import OcamCamera, View
+from calib.fit.boards.ocam_linear import powers, solve_linear
+from calib.fit.boards.unified_start import unified_start
+from calib.fit.parameterisation import OCAM_NAMES, with_names
+from calib.models.camera import Array, OmniCamera
+from calib.models.ocam import TANGENTIAL_NAMES, OcamCamera, View
+from calib.models.unified import OMNI_NAMES, UnifiedCamera
 
 # In ascending order of the number of parameters. A more general model is one more entry here and in fit_model.
 Model = Literal["omni", "ocam", "ocam_tangential"]
 MODELS: tuple[Model, ...] = ("omni", "ocam", "ocam_tangential")
+# Degree of the polynomial at the start, as in the toolbox. Higher ones than HIGHER_DEGREES would bend the profile
+# between the radii of the corners.
+DEGREE = 4
+HIGHER_DEGREES = (5, 6)
+# Numbers of distortion terms that an omni camera may have: none, k1 k2, and p1 p2 as well.
+DISTORTION_TERMS = (0, 2, 4)
 # A further term is used if it reduces the error by this part, because a smaller gain may come from a mirror that
 # is not quite central, and then bends rays by tenths of a degree.
 MIN_IMPROVEMENT = 0.1
-# Degrees tried above DEGREE: higher ones would bend the profile between the radii of the corners.
-HIGHER_DEGREES = (5, 6)
 # A tangential camera of degree 5 is used if its held-out error is lower by this part than that of degree 4.
 MIN_HELD_OUT_IMPROVEMENT = 0.01
 
@@ -40,6 +42,11 @@ class FittedModel:
     fit: BundleResult
     parameters: tuple[tuple[str, float, float], ...]  # name, value, standard deviation
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Return the names of the parameters."""
+        return tuple(name for name, _, _ in self.parameters)
+
 
 def fit_model(
     model: Model, observed: Observations, size: tuple[int, int], view: View, ocam: FittedModel | None = None
@@ -51,51 +58,59 @@ def fit_model(
     """
     match model:
         case "omni":
-            return _fit_omni(observed, ocam or _first_ocam(observed, size, view))
+            return _fit_omni(observed, ocam or fit_ocam(observed, size, view))
         case "ocam":
-            return _with_best_degree(observed, _first_ocam(observed, size, view))
+            return _with_best_degree(observed, fit_ocam(observed, size, view))
         case "ocam_tangential":
-            has_start = ocam is not None and ocam_structure(_ocam(ocam)) == (DEGREE, False)
-            return _fit_tangential(observed, ocam if ocam and has_start else _first_ocam(observed, size, view))
+            has_start = ocam is not None and ocam.names == ocam_names(DEGREE)
+            return _fit_tangential(observed, ocam if ocam and has_start else fit_ocam(observed, size, view))
 
 
-def _first_ocam(observed: Observations, size: tuple[int, int], view: View) -> FittedModel:
-    first = fit_ocam(observed, size, view)
-    return _fitted_ocam(first, ocam_factory(size, view)(first.parameters))
+def ocam_names(degree: int) -> tuple[str, ...]:
+    """Return the parameters of an ocam camera without tangential terms: a0, a2 ..., centre and affine."""
+    return (*(f"a{power}" for power in powers(degree)), *OCAM_NAMES)
+
+
+def fit_ocam(observed: Observations, size: tuple[int, int], view: View = "mirror") -> FittedModel:
+    """Fit an ocam camera of degree DEGREE; size (width, height) [px]. CalibError if no camera fits."""
+    linear = solve_linear(observed, size, DEGREE, view)
+    if linear.coefficients[0] >= 0:
+        raise CalibError(
+            "calibrate: no mirror or lens shows boards as in these views; leave out those whose corners "
+            "are wrong, and check --corners"
+        )
+    polynomial = np.zeros(DEGREE + 1)
+    polynomial[powers(DEGREE)] = linear.coefficients / linear.scale_px ** powers(DEGREE).astype(float)
+    camera = OcamCamera(tuple(polynomial.tolist()), linear.center, (1.0, 0.0, 0.0), size, view)
+    return refit(camera, ocam_names(DEGREE), linear.T_cam_board, observed)
+
+
+def refit(camera: OmniCamera, names: Sequence[str], T_cam_board: Array, observed: Observations) -> FittedModel:
+    """Fit the named parameters of a camera and the poses (K, 4, 4), from their start values."""
+    assert isinstance(camera, OcamCamera | UnifiedCamera)
+    parameters = with_names(camera, names)
+    fit = adjust_bundle(parameters, T_cam_board, observed)
+    values = parameters.plain_values(fit.parameters)
+    sigmas = np.sqrt(np.maximum(0, np.diag(fit.covariance))) * parameters.units
+    named = zip(parameters.names, values.tolist(), sigmas.tolist(), strict=True)
+    return FittedModel(parameters.camera_at(fit.parameters), fit, tuple(named))
 
 
 def _with_best_degree(observed: Observations, ocam: FittedModel) -> FittedModel:
     """Return the ocam camera of the lowest degree that no higher one improves significantly."""
     best = trial = ocam
-    for _ in HIGHER_DEGREES:
-        trial = _with_higher_degree(observed, trial)
+    for degree in HIGHER_DEGREES:
+        trial = refit(_ocam(trial), ocam_names(degree), trial.fit.T_cam_board, observed)
         best = trial if _is_significantly_better(best.fit, trial.fit) else best
     return best
 
 
-def _with_higher_degree(observed: Observations, ocam: FittedModel) -> FittedModel:
-    camera = _ocam(ocam)
-    degree, tangential = ocam_structure(camera)
-    fit = raise_degree(ocam.fit, observed, camera)
-    factory = ocam_factory(camera.size, camera.view, degree + 1, tangential=tangential)
-    return _fitted_ocam(fit, factory(fit.parameters))
-
-
 def _fit_tangential(observed: Observations, ocam: FittedModel) -> FittedModel:
     """Fit tangential terms to a camera of degree 4, and choose degree 4 or 5 by the held-out error."""
-    camera = _ocam(ocam)
-    fit = add_tangential(ocam.fit, observed, camera)
-    degree, _ = ocam_structure(camera)
-    low = _fitted_ocam(fit, ocam_factory(camera.size, camera.view, degree, tangential=True)(fit.parameters))
-    high = _with_higher_degree(observed, low)
+    low = refit(_ocam(ocam), (*ocam_names(DEGREE), *TANGENTIAL_NAMES), ocam.fit.T_cam_board, observed)
+    high = refit(_ocam(low), (*ocam_names(DEGREE + 1), *TANGENTIAL_NAMES), low.fit.T_cam_board, observed)
     low_px, high_px = (held_out_error_px(one.camera, one.fit.T_cam_board, observed) for one in (low, high))
     return high if high_px < (1 - MIN_HELD_OUT_IMPROVEMENT) * low_px else low
-
-
-def _fitted_ocam(fit: BundleResult, camera: OcamCamera) -> FittedModel:
-    degree = len(camera.polynomial) - 1
-    tangential = len(fit.parameters) > degree + 4
-    return FittedModel(camera, fit, tuple(ocam_parameters(fit, camera.size, degree, tangential=tangential)))
 
 
 def _ocam(fitted: FittedModel) -> OcamCamera:
@@ -105,14 +120,13 @@ def _ocam(fitted: FittedModel) -> OcamCamera:
 
 def _fit_omni(observed: Observations, ocam: FittedModel) -> FittedModel:
     """Fit omni cameras, and return the one with the fewest distortion terms that more do not improve significantly."""
-    start = _ocam(ocam)
-    best, terms = fit_unified(observed, start, ocam.fit.T_cam_board, 0), 0
+    camera, T_cam_board = unified_start(_ocam(ocam), observed, ocam.fit.T_cam_board)
+    best = refit(camera, OMNI_NAMES[: 5 + DISTORTION_TERMS[0]], T_cam_board, observed)
+    trial = best
     for more in DISTORTION_TERMS[1:]:
-        trial = fit_unified(observed, start, ocam.fit.T_cam_board, more)
-        if _is_significantly_better(best, trial):
-            best, terms = trial, more
-    camera = unified_factory(start.size, terms)(best.parameters)
-    return FittedModel(camera, best, tuple(unified_parameters(best, start.size, terms)))
+        trial = refit(trial.camera, OMNI_NAMES[: 5 + more], trial.fit.T_cam_board, observed)
+        best = trial if _is_significantly_better(best.fit, trial.fit) else best
+    return best
 
 
 def _is_significantly_better(best: BundleResult, trial: BundleResult) -> bool:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from calib.errors import CalibError
-from calib.fit.boards.bundle import CameraFactory, Observations, Prior, Projection, adjust_bundle
+from calib.fit.boards.bundle import Observations, Parameters, Prior, Projection, adjust_bundle
+from calib.fit.least_squares import Ending
 from calib.fit.parameterisation import parameterise
 from calib.models.camera import Array, OmniCamera
 
@@ -13,7 +16,8 @@ from calib.models.camera import Array, OmniCamera
 # fold is fitted, because one wrong view among fewer is not noticed.
 FOLDS = 4
 MIN_TRAINING_VIEWS = 3
-NO_PARAMETERS = np.zeros(0)
+# End of a fold's search: it begins at the fit to all views, and scores are compared by a hundredth.
+ENDING = Ending(steps=20, gain=1e-4)
 
 
 def held_out_error_px(camera: OmniCamera, T_cam_board: Array, observed: Observations) -> float:
@@ -22,36 +26,43 @@ def held_out_error_px(camera: OmniCamera, T_cam_board: Array, observed: Observat
     Every fold refits the camera's parameters, starting from the fit to all views with poses T_cam_board (K, 4, 4), and
     then only the poses of the views left out.
     """
-    parameters = parameterise(camera)
-    return cross_validated_px(parameters.camera_at, len(parameters.names), T_cam_board, observed)
+    return cross_validated_px(parameterise(camera), T_cam_board, observed)
 
 
 def cross_validated_px(
-    camera_of: CameraFactory, count: int, T_cam_board: Array, observed: Observations, prior: Prior | None = None
+    parameters: Parameters, T_cam_board: Array, observed: Observations, prior: Prior | None = None
 ) -> float:
-    """Return the mean error [px] of views left out, for cameras of count parameters, 0 at the fit to all views."""
+    """Return the mean error [px] of views left out, for parameters about the fit to all views."""
     numbers, errors = np.arange(len(observed.pixels)), list[Array]()
     for fold in range(FOLDS):
         held_out = numbers % FOLDS == fold
         if (~held_out).sum() < MIN_TRAINING_VIEWS or not held_out.any():
             continue
+        seen, left = observed.select(~held_out), observed.select(held_out)
         try:
             trained = adjust_bundle(
-                camera_of,
-                np.zeros(count),
-                T_cam_board[~held_out],
-                observed.select(~held_out),
-                kernel_rounds=1,
-                prior=prior,
+                parameters, T_cam_board[~held_out], seen, kernel_rounds=1, prior=prior, ending=ENDING
             )
-            fitted = camera_of(trained.parameters)
+            fixed = FixedParameters(parameters, trained.parameters)
+            found = adjust_bundle(fixed, T_cam_board[held_out], left, kernel_rounds=1, ending=ENDING)
         except (CalibError, np.linalg.LinAlgError):
             return float("inf")
-        errors.append(_pose_errors_px(fitted, T_cam_board[held_out], observed.select(held_out)))
+        errors.append(found.errors_px.ravel())
     return float(np.nanmean(np.concatenate(errors))) if errors else float("inf")
 
 
-def _pose_errors_px(camera: Projection, T_cam_board: Array, observed: Observations) -> Array:
-    """Return the errors (N,) of a fixed camera after the poses have been adjusted."""
-    found = adjust_bundle(lambda _: camera, NO_PARAMETERS, T_cam_board, observed, kernel_rounds=1)
-    return found.errors_px.ravel()
+@dataclass(frozen=True, slots=True)
+class FixedParameters:
+    """A camera without unknowns: that of parameters at given steps."""
+
+    parameters: Parameters
+    steps: Array  # (P,)
+    names: tuple[str, ...] = ()
+
+    def camera_at(self, steps: Array) -> Projection:
+        """Return the camera."""
+        return self.parameters.camera_at(self.steps)
+
+    def derivatives(self, steps: Array, points: Array) -> tuple[Array, Array]:
+        """Return the derivatives by points (N, 3), (N, 2, 3), and by no steps, (N, 2, 0)."""
+        return self.parameters.derivatives(self.steps, points)[0], np.zeros((len(points), 2, 0))

@@ -18,10 +18,10 @@ from calib.models.ocam import View
 
 # Grid search for the centre: start half width in parts of the image.
 SEARCH_PART = 0.16
-# Points per axis, and factor of the width per round, so that a round goes as far as to the neighbours of the best point
-# of the last one: half of its width, and a tenth.
-SEARCH_SIDE = 5
-SEARCH_SHRINK = 0.55
+# Points per axis of the first round and of the others. Each goes from the best point of the last one half-way to its
+# neighbours, and a tenth farther.
+FIRST_SIDE, SEARCH_SIDE = 5, 3
+SEARCH_PART_OF_STEP = 0.55
 # Width at which the search ends, because the fit that follows refines the centre.
 SEARCH_END_PX = 0.5
 # Errors are capped, so that one bad image does not determine the centre.
@@ -60,11 +60,12 @@ def _solved(seen: bytes, views: int, board: bytes, size: tuple[int, int], degree
     width, height = size
     problem = _LinearProblem(observed, degree, min(size) / 2)
     center, reach = np.array([(height - 1) / 2, (width - 1) / 2]), SEARCH_PART * max(size)
+    side = FIRST_SIDE
     while reach > SEARCH_END_PX:
-        steps = np.linspace(-reach, reach, SEARCH_SIDE)
+        steps = np.linspace(-reach, reach, side)
         trials = [center + np.array([row, column]) for row in steps for column in steps]
         center = min(trials, key=lambda trial: float(np.nanmean(problem.solve(trial).errors_rad)))
-        reach *= SEARCH_SHRINK
+        reach, side = SEARCH_PART_OF_STEP * (steps[1] - steps[0]), SEARCH_SIDE
     return _with_proper_poses(problem.solve(center), view)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from calib.boards.print_shape import AS_DRAWN, BENDS, MODE_NAMES, PrintShape, all_modes, significant_part
 from calib.errors import CalibError
-from calib.fit.boards.bundle import CameraFactory, Observations, Prior, adjust_bundle
+from calib.fit.boards.bundle import Observations, Parameters, Prior, adjust_bundle
 from calib.models.camera import Array
 
 # Least squared Mahalanobis distance from the drawing, because a board as drawn exceeds it once in ten thousand
@@ -20,16 +20,16 @@ MIN_CHI2_BENDS, MIN_CHI2_STRETCH = 21.1, 15.1
 
 
 def find_print_shape(
-    camera_of: CameraFactory, count: int, fitted: Observations, T_cam_board: Array, prior: Prior | None = None
+    parameters: Parameters, fitted: Observations, T_cam_board: Array, prior: Prior | None = None
 ) -> PrintShape:
     """Return the significant part of the print's shape; AS_DRAWN where the adjustment fails.
 
-    camera_of: the camera at steps (count,) from the fitted one. fitted: observations with the drawing's points.
+    parameters: about the fitted camera. fitted: observations with the drawing's points.
     T_cam_board: fitted poses (K, 4, 4) of the board as drawn.
     """
     free = replace(fitted, modes=all_modes(fitted.points))
     try:
-        found = adjust_bundle(camera_of, np.zeros(count), T_cam_board, free, prior=prior)
+        found = adjust_bundle(parameters, T_cam_board, free, prior=prior)
     except (CalibError, np.linalg.LinAlgError):
         return AS_DRAWN
     bends, stretch = slice(0, BENDS), slice(BENDS, len(MODE_NAMES))

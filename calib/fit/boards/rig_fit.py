@@ -114,7 +114,7 @@ def fit_rig(
         rejected += [rejected_view(good[k].name, fit, k) for k in np.flatnonzero(bad).tolist()]
         good = [view for view, is_bad in zip(good, bad, strict=True) if not is_bad]
         _require(sum(map(_is_pair, good)), "consistent pairs of views", rejected)
-        found = unknowns.camera(fit.parameters)
+        found = unknowns.camera_at(fit.parameters)
         start = (found.lower, found.upper)
         fit, unknowns = _solve(good, printed, start, found.T_upper_lower, fit.T_cam_board[~bad], telecentric)
     if fit.mean_px > MAX_MEAN_PX:
@@ -192,7 +192,7 @@ def _solve(
     """Adjust the cameras, the transform between them, and a pose T_lower_board (K, 4, 4) for every view."""
     unknowns = rig_unknowns(printed[0], cameras, T_upper_lower, T_lower_board, telecentric=telecentric)
     observed = rig_observations(good, printed)
-    fit = adjust_bundle(unknowns.camera, np.zeros(unknowns.ends[-1]), T_lower_board, observed, prior=unknowns.prior)
+    fit = adjust_bundle(unknowns, T_lower_board, observed, prior=unknowns.prior)
     return fit, unknowns
 
 
@@ -200,15 +200,14 @@ def rig_print_shape(found: RigCalibration) -> PrintShape:
     """Return the significant part of the print's shape, of a rig that was fitted to a board as drawn."""
     unknowns = _unknowns_about(found)
     observed = rig_observations(found.views, (found.board, AS_DRAWN))
-    return find_print_shape(unknowns.camera, unknowns.ends[-1], observed, found.fit.T_cam_board, unknowns.prior)
+    return find_print_shape(unknowns, observed, found.fit.T_cam_board, unknowns.prior)
 
 
 def rig_held_out_px(found: RigCalibration) -> float:
     """Return the mean error [px] of views that were left out of the fit of both cameras and the transform."""
     unknowns = _unknowns_about(found)
     return cross_validated_px(
-        unknowns.camera,
-        unknowns.ends[-1],
+        unknowns,
         found.fit.T_cam_board,
         rig_observations(found.views, (found.board, found.shape), fixed=True),
         unknowns.prior,
@@ -232,7 +231,7 @@ def _rig_calibration(
     unknowns: RigParameterisation,
     rejected: Sequence[RejectedView],
 ) -> RigCalibration:
-    found = unknowns.camera(fit.parameters)
+    found = unknowns.camera_at(fit.parameters)
     J = unknowns.plain_by_steps(fit.parameters)
     covariance = J @ fit.covariance @ J.T
     sigmas = iter(np.sqrt(np.maximum(0, np.diag(covariance))).tolist())

@@ -18,6 +18,7 @@ from calib.fit.parameterisation import CameraParameterisation, parameterise
 from calib.models.camera import Array, OmniCamera
 from calib.models.ocam import ASTIGMATISM_NAMES, has_wavefront, project_near
 from calib.models.wavefront import WAVEFRONT_NAMES
+from calib.rig_covariance import TRANSFORM_NAMES
 
 # Prior of the terms of real mirrors, because they are about one step: secondary astigmatism by about a pixel,
 # wavefronts by a millimetre, or by what a TelecentricMirror says.
@@ -64,6 +65,12 @@ class RigParameterisation:
     corners: int
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """Return the names of the steps."""
+        lower, upper = self.parameterisations
+        return (*lower.names, *upper.names, *TRANSFORM_NAMES)
+
+    @property
     def ends(self) -> tuple[int, int, int]:
         """Return the end indices of the lower camera's, the upper camera's and the transform's steps."""
         lower, upper = (len(side.names) for side in self.parameterisations)
@@ -79,7 +86,29 @@ class RigParameterisation:
                     center[first + k], sigma[first + k] = -side.start[k] / side.units[k], MIRROR_SIGMA_STEPS
         return Prior(center, sigma)
 
-    def camera(self, steps: Array) -> PairCamera:
+    def derivatives(self, steps: Array, points: Array) -> tuple[Array, Array]:
+        """Return the derivatives of both cameras' pixels by points (M, 3), (M, 2, 3), and by the steps, (M, 2, P).
+
+        The transform's are those of a further small motion: its own steps differ from it by an invertible matrix.
+        """
+        lower_end, upper_end, end = self.ends
+        lower, upper = self.parameterisations
+        T_upper_lower = se3.exp(steps[upper_end:] * self.units) @ self.T_upper_lower
+        both = points.reshape(-1, 2, self.corners, 3)
+        own = both[:, 0].reshape(-1, 3), se3.apply(T_upper_lower, both[:, 1].reshape(-1, 3))
+        by_point, by_steps = np.zeros((*both.shape[:3], 2, 3)), np.zeros((*both.shape[:3], 2, end))
+        shape = (len(both), self.corners, 2, -1)
+        lower_by_point, lower_by_steps = lower.derivatives(steps[:lower_end], own[0])
+        upper_by_point, upper_by_steps = upper.derivatives(steps[lower_end:upper_end], own[1])
+        by_point[:, 0] = lower_by_point.reshape(shape)
+        by_point[:, 1] = (upper_by_point @ T_upper_lower[:3, :3]).reshape(shape)
+        by_steps[:, 0, ..., :lower_end] = lower_by_steps.reshape(shape)
+        by_steps[:, 1, ..., lower_end:upper_end] = upper_by_steps.reshape(shape)
+        by_twist = np.concatenate([upper_by_point, -upper_by_point @ se3.hat(own[1])], axis=2) * self.units
+        by_steps[:, 1, ..., upper_end:] = by_twist.reshape(shape)
+        return by_point.reshape(-1, 2, 3), by_steps.reshape(-1, 2, end)
+
+    def camera_at(self, steps: Array) -> PairCamera:
         """Return both cameras at the steps."""
         lower_end, upper_end, _ = self.ends
         lower, upper = self.parameterisations

@@ -22,6 +22,7 @@ import numpy as np
 from calib.errors import CalibError
 from calib.fit.parameterisation import CameraParameterisation, parameterise
 from calib.models.camera import Array, OmniCamera
+from calib.models.derivatives import pixel_derivatives
 from calib.models.ocam import OcamCamera
 from calib.models.wavefront import TERMS, WAVEFRONT_NAMES
 
@@ -78,6 +79,11 @@ class TelecentricMirror:
         parts = wavefront_parts(camera) + DEVIATIONS * values[-TERMS - 1 : -1]
         radius_m = RADIUS_M * float(np.exp(RADIUS_LOG_SIGMA * values[-1]))
         return replace(camera, wavefront=tuple((radius_m * parts).tolist()))
+
+    def derivatives(self, steps: Array, points: Array) -> tuple[Array, Array]:
+        """Return the derivatives of the camera's pixels by points (N, 3), (N, 2, 3), and by the steps, (N, 2, P)."""
+        by_point, by_plain = pixel_derivatives(self.camera_at(steps), points, self.plain.names)
+        return by_point, by_plain @ self.plain_by_steps(steps)
 
     def plain_values(self, steps: Array) -> Array:
         """Return the parameters of `plain` at the steps, without the radius, in their own units."""

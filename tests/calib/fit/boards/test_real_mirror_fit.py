@@ -15,7 +15,7 @@ from calib.boards.board import Board, BoardView
 from calib.boards.board_finder import find_board
 from calib.fit.boards.camera_fit import CameraCalibration, fit_camera, refine_camera_calibration
 from calib.fit.boards.camera_models import Model
-from calib.fit.boards.unified_fit import unified_from_ocam
+from calib.fit.boards.unified_start import unified_from_ocam
 from calib.models.camera import Array
 from calib.models.ocam import OcamCamera
 

@@ -1,0 +1,172 @@
+"""Derivatives of the pixels of cameras by points and by named parameters, in closed form, for the fits.
+
+The names are those of files: OMNI_NAMES of a unified camera; of an ocam camera a0, a2 ..., center_row, center_column,
+c, d (with which e moves along, because their difference is a rotation of the camera), and the terms of real mirrors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from calib.errors import CalibError
+from calib.models.camera import Array, OmniCamera
+from calib.models.ocam import ASTIGMATISM_NAMES, TANGENTIAL_NAMES, OcamCamera
+from calib.models.unified import UnifiedCamera
+from calib.models.wavefront import TERMS, WAVEFRONT_NAMES, directions_to, offsets
+
+# Step on the unit sphere of the derivatives of a wavefront's offsets, which are smooth over a radian.
+SPHERE_STEP = 1e-4
+# Terms of the series that inverts the effect of the offset on the direction: each is about a thousandth of the last.
+SERIES = 3
+
+
+def pixel_derivatives(camera: OmniCamera, points: Array, names: Sequence[str]) -> tuple[Array, Array]:
+    """Return the derivatives (N, 2, 3) by points (N, 3) [m], near ones as they are, and (N, 2, P) by the parameters.
+
+    Not finite where the camera does not see a point.
+    """
+    with np.errstate(all="ignore"):
+        if isinstance(camera, UnifiedCamera):
+            return _of_unified(camera, points, names)
+        if isinstance(camera, OcamCamera):
+            return _of_ocam(camera, points, names)
+    raise CalibError(f"calibrate: expected an omni or ocam camera, found {type(camera).__name__}")
+
+
+def _of_unified(camera: UnifiedCamera, points: Array, names: Sequence[str]) -> tuple[Array, Array]:
+    """Mei and Rives 2007: m = (x, y) / (z + xi |p|), distortion, focal lengths."""
+    norm = np.linalg.norm(points, axis=1)
+    w = points[:, 2] + camera.xi * norm
+    m = points[:, :2] / w[:, None]
+    by_w = camera.xi * points / norm[:, None] + np.array([0.0, 0.0, 1.0])
+    m_by_point = (np.eye(2, 3) - m[:, :, None] * by_w[:, None]) / w[:, None, None]
+    k1, k2, p1, p2 = camera.distortion
+    x, y = m.T
+    r2 = x * x + y * y
+    radial, slope = 1 + r2 * (k1 + k2 * r2), 2 * k1 + 4 * k2 * r2
+    bent = _pairs(
+        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    )
+    cross = slope * x * y + 2 * p1 * x + 2 * p2 * y
+    D = _matrices(
+        radial + slope * x * x + 2 * p1 * y + 6 * p2 * x, cross, cross, radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
+    )
+    zero, one = np.zeros(len(points)), np.ones(len(points))
+    focal = np.array(camera.focal)
+    columns = {
+        "xi": np.einsum("nij,nj->ni", D, -m * (norm / w)[:, None]) * focal,
+        "fu": _pairs(bent[:, 0], zero),
+        "fv": _pairs(zero, bent[:, 1]),
+        "pu": _pairs(one, zero),
+        "pv": _pairs(zero, one),
+        "k1": m * r2[:, None] * focal,
+        "k2": m * (r2 * r2)[:, None] * focal,
+        "p1": _pairs(2 * x * y, r2 + 2 * y * y) * focal,
+        "p2": _pairs(r2 + 2 * x * x, 2 * x * y) * focal,
+    }
+    return focal[:, None] * (D @ m_by_point), _stacked(columns, names, len(points))
+
+
+def _of_ocam(camera: OcamCamera, points: Array, names: Sequence[str]) -> tuple[Array, Array]:
+    """Scaramuzza et al. 2006, with the implicit function f(rho) r - z rho = 0 for the radius."""
+    points = np.asarray(points, float)
+    waves = [name for name in names if name in WAVEFRONT_NAMES]
+    # 1. The direction of the ray through the point, of a mirror whose rays do not meet in one point.
+    ray_by_point, rays = None, points
+    ray_by_wave = dict[str, Array]()
+    if waves or any(camera.wavefront):
+        rays = directions_to(points, camera.wavefront, -camera.sign)
+        ray_by_point, ray_by_wave = _direction_derivatives(camera, points, rays, waves)
+    # 2. The radius of that direction.
+    X, Y, z = rays[:, 0], rays[:, 1], camera.sign * rays[:, 2]
+    r = np.hypot(X, Y)
+    rho = camera.radius(r, z)
+    f, slope = camera.height_and_slope(rho)
+    by_rho = slope * r - z
+    is_off_axis = r > 1e-12 * np.abs(z)
+    safe = np.where(is_off_axis, r, 1.0)
+    ux, uy = np.where(is_off_axis, X / safe, 0.0), np.where(is_off_axis, Y / safe, 0.0)
+    ratio = np.where(is_off_axis, rho / safe, f / z)
+    rho_by_r, rho_by_z = -f / by_rho, rho / by_rho
+    # 3. The ideal point rho (X, Y) / r.
+    x, y = X * ratio, Y * ratio
+    cross = (rho_by_r - ratio) * ux * uy
+    ideal_by_ray = np.stack(
+        [
+            _pairs(ratio + (rho_by_r - ratio) * ux * ux, cross),
+            _pairs(cross, ratio + (rho_by_r - ratio) * uy * uy),
+            _pairs(ux, uy) * (camera.sign * rho_by_z)[:, None],
+        ],
+        axis=2,
+    )
+    # 4. Tangential and astigmatic terms, and the affine.
+    bent_x, bent_y = camera.distort(x, y)
+    xx, xy, yy = camera.distortion_jacobian(x, y)
+    c, d, e = camera.affine
+    A = np.array([[e, 1.0], [c, d]]) @ _matrices(xx, xy, xy, yy)
+    by_ray = A @ ideal_by_ray
+    x2, y2, rho2, zero, one = x * x, y * y, x * x + y * y, np.zeros(len(x)), np.ones(len(x))
+    affine = np.array([[e, 1.0], [c, d]])
+    columns = {
+        "center_row": _pairs(zero, one),
+        "center_column": _pairs(one, zero),
+        "c": _pairs(zero, bent_x),
+        "d": _pairs(bent_x, bent_y),
+        TANGENTIAL_NAMES[0]: _pairs(2 * x * y, rho2 + 2 * y2) @ affine.T,
+        TANGENTIAL_NAMES[1]: _pairs(rho2 + 2 * x2, 2 * x * y) @ affine.T,
+        ASTIGMATISM_NAMES[0]: _pairs(4 * x2 * x, -4 * y2 * y) @ affine.T,
+        ASTIGMATISM_NAMES[1]: _pairs(6 * x2 * y + 2 * y2 * y, 2 * x2 * x + 6 * x * y2) @ affine.T,
+    }
+    for name in names:
+        if name[0] == "a" and name[1:].isdigit():
+            columns[name] = np.einsum("nij,nj->ni", A, _pairs(ux, uy) * (-r * rho ** int(name[1:]) / by_rho)[:, None])
+    columns |= {name: np.einsum("nij,nj->ni", by_ray, change) for name, change in ray_by_wave.items()}
+    by_point = by_ray if ray_by_point is None else by_ray @ ray_by_point
+    return by_point, _stacked(columns, names, len(points))
+
+
+def _direction_derivatives(
+    camera: OcamCamera, points: Array, rays: Array, waves: Sequence[str]
+) -> tuple[Array, dict[str, Array]]:
+    """Return the derivatives of unit directions (N, 3) by points, (N, 3, 3), and by the wavefront's terms, (N, 3) each.
+
+    d is along p - o(d), so with P = (I - d d^T) / |p - o| and the derivative O of the offset o by the
+    direction, dd = P (dp - O dd - do), which is a series in P O.
+    """
+    axis = -camera.sign
+    left = points - offsets(rays, camera.wavefront, axis)
+    norm = np.linalg.norm(left, axis=1)[:, None, None]
+    P = (np.eye(3) - rays[:, :, None] * rays[:, None]) / norm
+    by_direction = np.stack(
+        [
+            (offsets(rays + step, camera.wavefront, axis) - offsets(rays - step, camera.wavefront, axis))
+            / (2 * SPHERE_STEP)
+            for step in SPHERE_STEP * np.eye(3)
+        ],
+        axis=2,
+    )
+    by_point, term = P, P
+    for _ in range(SERIES):
+        term = -P @ by_direction @ term
+        by_point = by_point + term
+    by_wave = {}
+    for name in waves:
+        one = tuple(float(name == other) for other in WAVEFRONT_NAMES)
+        assert len(one) == TERMS
+        by_wave[name] = -np.einsum("nij,nj->ni", by_point, offsets(rays, one, axis))
+    return by_point, by_wave
+
+
+def _pairs(u: Array, v: Array) -> Array:
+    return np.stack([u, v], axis=1)
+
+
+def _matrices(a: Array, b: Array, c: Array, d: Array) -> Array:
+    """Return matrices (N, 2, 2) [a b; c d]."""
+    return np.stack([_pairs(a, b), _pairs(c, d)], axis=1)
+
+
+def _stacked(columns: dict[str, Array], names: Sequence[str], count: int) -> Array:
+    return np.stack([columns[name] for name in names], axis=2) if names else np.zeros((count, 2, 0))

@@ -1,0 +1,76 @@
+"""Two cheap lenses that look ahead: the table of residuals by the angle, what no board covered, and the report."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib import se3
+from calib.boards.board import Board, BoardView
+from calib.fit.boards.rig_fit import RigCalibration, fit_rig
+from calib.fit.boards.rig_problem import PairView
+from calib.models.ocam import OcamCamera
+from calib.rig import Rig
+from calib.rig_frame import rig_between
+from omnid.calibration.angle_table import angle_lines, angle_rows, missing_boards
+from omnid.calibration.images import PairedImages
+from omnid.calibration.rig_report import rig_report_html
+
+BOARD, SIZE = Board(9, 6, 0.025), (640, 480)
+LENS = OcamCamera((-230.0, 0.0, 1.5e-3, -6e-7, 1.6e-9), (238.0, 321.0), (1.0, 0.0, 0.0), SIZE, "direct")
+# x of such a camera is down the rows: the upper one is 8 cm against it.
+T_LOWER_UPPER = se3.exp([-0.08, 0.001, 0.002, 0.01, -0.02, 0.01])
+NOISE_PX = 0.1
+
+
+def calibrated(widest_deg: float) -> tuple[RigCalibration, Rig]:
+    """Return a rig fitted to corners of boards up to an angle from the axes, left and right, but not above."""
+    random, views = np.random.default_rng(2), list[PairView]()
+    while len(views) < 24:
+        angle, azimuth = np.deg2rad(random.uniform(0, widest_deg)), random.uniform(0.6, 2 * np.pi - 0.6)
+        ahead = np.array([-np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth), -np.cos(angle)])
+        turn = se3.rotation_exp(random.normal(0, 0.35, 3)) @ np.diag([1.0, -1.0, -1.0])
+        T = se3.transform(turn, 0.25 * ahead) @ se3.transform(np.eye(3), -BOARD.points.mean(axis=0))
+        pixels = [
+            LENS.project(se3.apply(T_cam_lower @ T, BOARD.points))
+            for T_cam_lower in (np.eye(4), se3.inverse(T_LOWER_UPPER))
+        ]
+        if all(np.isfinite(p).all() and (p > 2).all() and (p < np.array(SIZE) - 3).all() for p in pixels):
+            seen = [BoardView(str(len(views)), p + random.normal(0, NOISE_PX, p.shape), 1.0) for p in pixels]
+            views.append(PairView(str(len(views)), (seen[0], seen[1])))
+    found = fit_rig(views, BOARD, (LENS, LENS))
+    return found, rig_between(found.lower, found.upper, se3.inverse(found.T_upper_lower))
+
+
+@pytest.fixture(scope="module")
+def fitted() -> tuple[RigCalibration, Rig]:
+    """Return the rig of boards up to 40 degrees from the axes."""
+    return calibrated(40.0)
+
+
+def test_residuals_are_told_by_the_angle_and_what_no_board_covered(fitted: tuple[RigCalibration, Rig]) -> None:
+    for side in (0, 1):
+        rows = angle_rows(*fitted, side)
+        corners = sum(
+            int(np.isfinite(view.seen[side].pixels[:, 0]).sum()) for view in fitted[0].views if view.seen[side]
+        )
+        assert [row.low_deg for row in rows] == [10 * number for number in range(len(rows))] and len(rows) >= 7
+        assert sum(row.corners for row in rows) == corners
+        assert all(row.rms_px == pytest.approx(NOISE_PX, rel=0.3) for row in rows if row.corners > 60)
+        assert rows[-1].corners == 0 and len(rows[-1].uncovered) == rows[-1].visible
+        assert 12 in rows[4].uncovered and not {3, 9} & set(rows[2].uncovered)
+        lines = angle_lines("upper", rows)
+        assert len(lines) == len(rows) + 2 and "60 to 70 deg" in lines[8] and "o'clock" in "".join(lines)
+
+
+def test_more_pairs_are_asked_for_where_a_drive_looks(fitted: tuple[RigCalibration, Rig]) -> None:
+    advice = missing_boards([angle_rows(*fitted, side) for side in (0, 1)])
+    assert "of the rays of a drive pass the" in advice and "deg from its axis" in advice
+
+
+def test_the_report_of_lenses_that_look_ahead_is_written(fitted: tuple[RigCalibration, Rig]) -> None:
+    found, rig = fitted
+    blank = {view.name: np.full(SIZE[::-1], 90, np.uint8) for view in found.views}
+    images = PairedImages((blank, blank))
+    page = rig_report_html(found, images, rig, [angle_rows(found, rig, side) for side in (0, 1)])
+    assert page.count("<td>60 to 70 deg</td>") == 2 and page.count("<img") >= 3
