@@ -35,11 +35,13 @@ from omnid.simulation.clearance import clearance_m, footprints
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun, simulate
 from omnid.simulation.named_worlds import FLOORS, HARMLESS, HAZARDS, trial
 from omnid.simulation.people import Walkers
+from omnid.simulation.rendering.surfaces import Scene
 from omnid.simulation.robot import SimulatedRobot
 from omnid.simulation.trials import SLOWEST_MPS, Trial
 from tests.bench.fine_robot import BUILDS, USUAL, fine_robot
 from tests.bench.real_lenses import with_real_lenses
 from tests.bench.results import ROOT, Column, ResultTable, commit
+from tests.simulation.photographs import with_photographs
 
 Array = NDArray[np.float64]
 
@@ -67,11 +69,14 @@ class Planned:
     build: str = USUAL
     is_turning: bool = False
     has_real_lenses: bool = False
+    has_photographs: bool = False  # of floors, walls and pictures
+    overrides: tuple[str, ...] = ()  # of settings
 
     def __str__(self) -> str:
         parts = [f"{self.world} seed {self.seed}, {self.speed_mps:g} m/s, {self.size_px} px"]
         parts += [f"on {self.floor}"] * (self.floor is not None) + [f"{self.build} robot"] * (self.build != USUAL)
         parts += ["turning"] * self.is_turning + ["real lenses"] * self.has_real_lenses
+        parts += ["photographs"] * self.has_photographs + list(self.overrides)
         return ", ".join(parts)
 
 
@@ -188,6 +193,9 @@ def prepared(planned: Planned) -> tuple[Trial, SimulatedRobot]:
         robot = replace(
             robot, rig=fine_robot(planned.size_px, build).rig, radius_m=build.radius_m, height_m=build.height_m
         )
+    if planned.has_photographs:
+        standing = with_photographs(Scene(asked.world.standing), planned.seed).rectangles
+        asked = replace(asked, world=replace(asked.world, standing=standing))
     x_m, y_m, heading_rad = asked.world.start
     if asked.motion == "ahead" and asked.goal is None:
         if planned.is_turning:  # an arc to the left, at whose end the base looks along x
@@ -200,15 +208,15 @@ def prepared(planned: Planned) -> tuple[Trial, SimulatedRobot]:
     return replace(asked, world=replace(asked.world, start=(x_m, y_m, heading_rad))), robot
 
 
-def config_for(planned: Planned, overrides: Sequence[str] = ()) -> list[str]:
+def settings_for(planned: Planned) -> list[str]:
     """Return the settings of a drive."""
     names = ("controller.limits.velocity_mps", "controller.heading.velocity_mps", "navigation.pursuit.velocity_mps")
     speed_mps = 0.8 if planned.world.startswith("room_") else abs(planned.speed_mps)
     settings = [f"{name}={speed_mps}" for name in names]
-    return ["places.enabled=false", *settings, *BUILDS[planned.build].settings, *overrides]
+    return ["places.enabled=false", *settings, *BUILDS[planned.build].settings, *planned.overrides]
 
 
-def drive(planned: Planned, overrides: Sequence[str] = ()) -> Drive:
+def drive(planned: Planned) -> Drive:
     """Make a drive."""
     cpu_s, tamper = time.process_time(), None
     asked, robot = prepared(planned)
@@ -222,7 +230,7 @@ def drive(planned: Planned, overrides: Sequence[str] = ()) -> Drive:
     seconds = 5.0 + asked_m / min(SLOWEST_MPS, abs(planned.speed_mps))
     if asked.motion == "at random":
         script, seconds = Wanderer(planned.seed), RANDOMLY_S
-    config = load_config(None, config_for(planned, overrides))
+    config = load_config(None, settings_for(planned))
     run = simulate(asked.world, robot, script, seconds=seconds, seed=planned.seed, config=config, tamper=tamper)
     began_s = 0.0 if math.isinf(asker.began_s) else asker.began_s
     return judged(run, asked, robot, asked_m, began_s, time.process_time() - cpu_s)
@@ -387,14 +395,16 @@ def main() -> None:
     parser.add_argument("--robot", nargs="+", choices=BUILDS, default=[USUAL], help="dimensions (fine_robot.py)")
     parser.add_argument("--turning", action="store_true", help="towards hazards on an arc")
     parser.add_argument("--real", action="store_true", help="images of real lenses (real_lenses.py)")
+    parser.add_argument("--photographs", action="store_true", help="on floors, walls and pictures (scikit-image's)")
     parser.add_argument("--jobs", type=int, default=1, help="drives at a time")
     parser.add_argument("--open-loop", type=Path, metavar="FOLDER", help="keep pairs there, and judge today's ring")
     parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE")
     arguments = parser.parse_args()
     lists = {"harmless": HARMLESS, "hazards": HAZARDS}
     names = [name for given in arguments.only or lists for name in lists.get(given, (given,))]
+    changed = arguments.turning, arguments.real, arguments.photographs, tuple(arguments.overrides)
     wanted = [
-        Planned(name, seed, speed_mps, size_px, floor, build, arguments.turning, arguments.real)
+        Planned(name, seed, speed_mps, size_px, floor, build, *changed)
         for name, speed_mps, size_px, floor, build, seed in product(
             names, arguments.speed, arguments.px, arguments.floor, arguments.robot, arguments.seeds
         )
@@ -409,7 +419,7 @@ def main() -> None:
     missing = [planned for planned in wanted if str(planned) not in drives]
     LINES.parent.mkdir(parents=True, exist_ok=True)
     with ProcessPoolExecutor(arguments.jobs, get_context("spawn")) as pool, LINES.open("a") as lines:
-        waiting = {pool.submit(drive, planned, arguments.overrides): planned for planned in missing}
+        waiting = {pool.submit(drive, planned): planned for planned in missing}
         for future in as_completed(waiting):
             name, made = str(waiting[future]), future.result()
             drives[name] = made

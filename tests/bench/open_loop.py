@@ -42,7 +42,7 @@ BEYOND_M: Final = 0.1
 
 def stored(planned: Planned, folder: Path) -> Path:
     """Return the file of a drive, which is made where there is none."""
-    from tests.bench.obstacles import config_for, prepared
+    from tests.bench.obstacles import prepared, settings_for
 
     path = folder / f"{planned}.npz".replace(" ", "_").replace(",", "").replace("/", "p")
     if path.exists():
@@ -70,7 +70,7 @@ def stored(planned: Planned, folder: Path) -> Path:
         if (is_near and driven_m > NEAR_M) or driven_m > LONGEST_M:
             yield "end"
 
-    config = load_config(None, config_for(planned, ["controller.collision.check=false"]))
+    config = load_config(None, [*settings_for(planned), "controller.collision.check=false"])
     seconds = 3.0 + LONGEST_M / abs(planned.speed_mps)
     run = simulate(asked.world, robot, on, seconds=seconds, seed=planned.seed, config=config, tamper=kept_image)
     rings = {ring.stamp_ns: ring for ring in run.rings}

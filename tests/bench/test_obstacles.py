@@ -11,7 +11,7 @@ import pytest
 from tests.bench import obstacles, open_loop
 from tests.bench.obstacles import Drive, Planned
 
-NEAR = Planned("near_box_ahead", 1, 0.3, 192)
+NEAR = Planned("near_box_ahead", 1, 0.3, 192, overrides=("controller.collision.check=false",))
 
 
 def test_a_drive_through_a_near_box_is_a_contact_and_has_a_row(
@@ -20,7 +20,7 @@ def test_a_drive_through_a_near_box_is_a_contact_and_has_a_row(
     monkeypatch.setenv("OMNID_RESULTS", str(tmp_path))
     asked, robot = obstacles.prepared(NEAR)
     monkeypatch.setattr(obstacles, "prepared", lambda planned: (replace(asked, way_m=0.8), robot))
-    made = obstacles.drive(NEAR, ["controller.collision.check=false"])
+    made = obstacles.drive(NEAR)
     assert made.own == made.contacts >= 1 and made.clearance_m < -0.1
     assert 0.76 < made.driven_m < 1.0 and not made.ended and made.pairs > 25
     obstacles.tables([NEAR], {str(NEAR): made})

@@ -47,7 +47,7 @@ def with_photographs(scene: Scene, seed: int) -> Scene:
 def _painter(face: Rectangle) -> Callable[[Random, Rectangle], Rectangle]:
     if face.name.startswith(("poster", "box")):
         return _as_poster
-    return _as_surface if face.name == "floor" or face.name in PAINTERS else lambda _, unchanged: unchanged
+    return _as_surface if face.name in ("floor", "wall", *PAINTERS) else lambda _, unchanged: unchanged
 
 
 def _as_surface(rng: Random, face: Rectangle) -> Rectangle:
