@@ -127,7 +127,7 @@ class RobotFeed:
         self.inbox = Inbox()
         # Of the news: it grows by one each time, from a number of this start, so that pages which were open while this
         # program started again have seen none of them.
-        self.version = self._start = secrets.randbits(50)
+        self.version = self._start = secrets.randbits(48)  # of 15 digits at most
         self._news: dict[str, tuple[int, Any]] = {}  # newest content of each kind, and the version that it came with
         self._images: dict[str, bytes] = {}  # cells of the map, and the panorama
         self._changed = asyncio.Condition()
