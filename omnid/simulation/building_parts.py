@@ -42,7 +42,7 @@ def plain_paint(rng: Random, grey: float, grain: float = 0.8, px_per_m: float = 
     def paint(sides_m: Point) -> Texture:
         width, height = (max(8, round(side_m * px_per_m)) for side_m in sides_m)
         noise = grain * rng.standard_normal((height, width), np.float32)
-        return np.clip(np.rint(grey + cv2.GaussianBlur(noise, (0, 0), 0.8)), 0, 255).astype(np.uint8)
+        return np.asarray(np.clip(np.rint(grey + cv2.GaussianBlur(noise, (0, 0), 0.8)), 0, 255), np.uint8)
 
     return paint
 
@@ -352,4 +352,4 @@ def _px(sides_m: Point) -> tuple[int, int]:
 def _lit(texture: Texture, light: Array) -> Texture:
     """Return a texture under a light of a coarser resolution."""
     gain = cv2.resize(light.astype(np.float32), texture.shape[::-1], interpolation=cv2.INTER_LINEAR)
-    return np.clip(np.rint(texture * gain), 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(np.rint(texture * gain), 0, 255), np.uint8)

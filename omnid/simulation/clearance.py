@@ -65,7 +65,8 @@ def ranges_m(segments: Array, place: tuple[float, float], azimuths_rad: Array) -
     with np.errstate(divide="ignore", invalid="ignore"):
         distance_m = (start[:, 0] * along[:, 1] - start[:, 1] * along[:, 0]) / across
         share = (start[:, 0] * ray[:, None, 1] - start[:, 1] * ray[:, None, 0]) / across
-    return np.where((distance_m > 0) & (share >= 0) & (share <= 1), distance_m, np.inf).min(axis=1)
+    met = (distance_m > 0) & (share >= 0) & (share <= 1)
+    return np.asarray(np.where(met, distance_m, np.inf).min(axis=1))
 
 
 class DriveRecord:

@@ -426,15 +426,15 @@ def _room(b: Builder, what: str) -> Trial:
             else:
                 name = str(b.rng.choice(["low_box", "pole", "stool", "bar"]))
                 _put(b, name, plain_paint(b.rng, b.rng.uniform(50, 230)), at)
-    people = []
+    people: list[Person] = []
     for _ in range(200):
         path = tuple(
             (float(b.rng.uniform(0.4 - x_m, x_m - 0.4)), float(b.rng.uniform(0.4 - y_m, y_m - 0.4))) for _ in "ab"
         )
         clear = all(_apart_m(place, *path) > 0.6 for place in places[1:])
         if what == "with_people" and len(people) < 2 and clear and math.dist(*path) > 2.0:
-            walk = {"start_s": b.rng.uniform(3.0, 6.0), "repeat": "back and forth", "waits_within_m": 1.0}
-            people.append(Person(b.adult(), path, b.rng.uniform(0.8, 1.6), **walk))
+            speed_mps, start_s = b.rng.uniform(0.8, 1.6), b.rng.uniform(3.0, 6.0)
+            people.append(Person(b.adult(), path, speed_mps, "back and forth", start_s, waits_within_m=1.0))
     world = built(
         b, start=(0.0, 0.0, b.rng.uniform(-math.pi, math.pi)), people=tuple(people), ground=ground, edges=edges
     )

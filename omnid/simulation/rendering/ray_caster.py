@@ -187,7 +187,7 @@ def _parents(small: RayTable, large: RayTable) -> NDArray[np.int64]:
     """Return in which of the large tiles each small one (M,) is."""
     times, width = TILE_PX // NEEDED_PX, small.shape[1]
     rows, columns = np.divmod(small.tiles, -(-width // NEEDED_PX))
-    return np.searchsorted(large.tiles, rows // times * (-(-width // TILE_PX)) + columns // times)
+    return np.asarray(np.searchsorted(large.tiles, rows // times * (-(-width // TILE_PX)) + columns // times))
 
 
 # Guards against division by zero at a rectangle through the viewpoint [m].
@@ -219,7 +219,7 @@ def render_grey(
     surfaces = _surfaces([scene.rectangles[i] for i in order], poses[0], distance_m[order] - reach_m)
     painted = surfaces, atlas.pyramids[order], atlas.levels, atlas.texels
     if single:
-        seen = _plain_tiles(*single, corners[order], reach_m, table.supersample**2, painted, image)
+        seen = _plain_tiles(single[0], single[1], corners[order], reach_m, table.supersample**2, painted, image)
     else:
         aside_rad = turned_rad + np.arcsin(np.clip(reach_m / distance_m, 0, 1))
         seen = np.ascontiguousarray(tiles_that_see(table, corners, aside_rad)[:, order])
