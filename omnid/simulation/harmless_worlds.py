@@ -147,9 +147,9 @@ def _trolley_leaves(b: Builder) -> Trial:
 
 def _person_passes(b: Builder) -> Trial:
     """Somebody comes towards the robot, and passes it."""
-    corridor(b, width_m=2.6)
+    corridor(b, width_m=3.0)
     side = float(b.rng.choice([-1, 1]))
-    path = ((9.0, side * 0.75), (-1.5, side * 0.8))
+    path = ((9.0, side * 0.95), (-1.5, side * 0.95))
     return Trial(built(b, people=(Person(b.adult(), path, b.rng.uniform(0.9, 1.2), start_s=3.0),)))
 
 

@@ -94,13 +94,14 @@ def epoxy(rng: Random, size: Size, px_per_m: float) -> Texture:
 
 def marbled(rng: Random, size: Size, px_per_m: float) -> Texture:
     """Return linoleum with streaks of two greys along its web."""
-    streaks = _stretched(rng, size, px_per_m * 0.12, 4.0)
-    return _grey(rng.uniform(120, 160) + 6 * streaks + 2 * value_noise(rng, size, px_per_m * 0.05))
+    streaks = _stretched(rng, size, px_per_m * 0.06, 3.0)
+    return _grey(rng.uniform(120, 160) + 7 * streaks + 4 * value_noise(rng, size, px_per_m * 0.02))
 
 
 def concrete(rng: Random, size: Size, px_per_m: float) -> Texture:
     """Return smoothed concrete: clouds, pores, and sawn joints every few metres."""
     image = rng.uniform(115, 150) + 5 * value_noise(rng, size, px_per_m * 0.8, 0.75)
+    image += 2.5 * value_noise(rng, size, px_per_m * 0.03, 0.9)
     image -= 25 * (value_noise(rng, size, px_per_m * 0.02) > 3.2)
     for axis, apart_m in ((0, rng.uniform(2.2, 3.2)), (1, rng.uniform(2.2, 3.2))):
         _joints(

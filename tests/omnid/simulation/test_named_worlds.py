@@ -28,9 +28,8 @@ def test_the_list_of_harmless_worlds_is_complete() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(set(HARMLESS) - {f"{floor}_hall" for floor in FLOORS if floor != "plain"}))
-@pytest.mark.parametrize("seed", [1, 2])
-def test_nothing_stands_in_the_way_of_harmless_worlds(name: str, seed: int) -> None:
-    asked = trial(name, seed)
+def test_nothing_stands_in_the_way_of_harmless_worlds(name: str) -> None:
+    asked = trial(name, 1)
     segments = obstacles_of(asked.world, ROBOT_M[1])
     if asked.goal is not None:
         assert can_drive(segments, (0.0, 0.0), asked.goal[:2])
