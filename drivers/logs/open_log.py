@@ -166,7 +166,9 @@ def _missing(folder: Path, logs: Sequence[Path]) -> list[str]:
     there = {match[0] for log in logs if (match := _NAME.match(log.name))}
     if metadata.is_file() and metadata.stat().st_size <= _MAX_METADATA_BYTES:
         listed = _LISTED_FILES.search(metadata.read_text("utf-8", "replace"))
-        names = [line.strip().removeprefix("- ").strip("'\" ") for line in listed[1].splitlines()] if listed else []
+        # The first versions of rosbag2 listed paths.
+        lines = listed[1].splitlines() if listed else []
+        names = [Path(line.strip().removeprefix("- ").strip("'\" ")).name for line in lines]
         plain = {name[: match.end(4)] for name in there if (match := _NAME.match(name))}
         return [name for name in names if not ((match := _NAME.match(name)) and name[: match.end(4)] in plain)]
     numbers = {int(match[3]): match for log in logs if (match := _NAME.fullmatch(log.name)) and match[3]}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
@@ -179,16 +180,22 @@ def decoded_pairs(reader: LogReader, *, keep: bool = True) -> tuple[LogPairs, di
     arrived = {camera: len(own) for camera, own in stamps.items()}
     unpaired = unpaired_by_chance(arrived, {camera: count - joined for camera, count in arrived.items()}, periods)
     found = LogPairs(sum(1 for _ in paired(iter(frames))), within_ns, image_loss(reader.counts), ())
-    # 2. Images of some pairs.
+    # 2. Images of some pairs; those of another size than most are of no use.
     images, broken = dict[int, tuple[Image, Image]](), 0
+    sizes = Counter[tuple[tuple[int, ...], ...]]()
     for number, (lower, upper) in enumerate(paired(reader.frames())):
         if number % found.stride == 0:
             try:
                 pair = gray(lower), gray(upper)
-                images |= {number: pair} if keep else {}
             except FrameDecodeError:
                 broken += 2
-    loss = image_loss(reader.counts, unpaired=unpaired, undecodable=broken * found.stride)
+                continue
+            sizes[pair[0].shape, pair[1].shape] += 1
+            images |= {number: pair} if keep else {}
+    usual = sizes.most_common(1)[0] if sizes else ((), 0)
+    images = {number: pair for number, pair in images.items() if (pair[0].shape, pair[1].shape) == usual[0]}
+    other_size = 2 * (sizes.total() - usual[1]) * found.stride
+    loss = image_loss(reader.counts, unpaired=unpaired, undecodable=broken * found.stride, other_size=other_size)
     return found._replace(loss=loss, notes=tuple(reader.warnings)), images
 
 
@@ -201,8 +208,6 @@ def _of_log(log: Path, cameras: LogCameras) -> tuple[tuple[Images, Images], tupl
     for number, pair in images.items():
         for side, image in zip(sides, pair, strict=True):
             side[f"pair{number:05d}"] = image
-    for side in sides:
-        _require_one_size(side)
     return sides, (topics["lower"], topics["upper"]), found
 
 
