@@ -6,7 +6,7 @@ import heapq
 import os
 import re
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Final
@@ -33,7 +33,7 @@ _NAME: Final = re.compile(
 )
 _MAX_METADATA_BYTES: Final = 2**20
 _LISTED_FILES: Final = re.compile(r"^ *relative_file_paths:[ \t]*\n((?:[ \t]*- .*\n)*)", re.M)
-_FORMATS: Final = {
+_FORMATS: Final[dict[bytes, Callable[[Path, str], Log]]] = {
     mcap_file.MAGIC: McapFile,
     sqlite_bag.MAGIC: SqliteBag,
     ros1_bag.MAGIC: Ros1Bag,
