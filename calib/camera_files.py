@@ -20,7 +20,7 @@ from calib.models.camera import Array, OmniCamera
 from calib.models.ocam import View
 from calib.ocam_file import parse_ocam
 from calib.rig import Rig
-from calib.rig_frame import rig_between
+from calib.rig_frame import is_turned_over, rig_between, turned_over_note
 from calib.text_files import MAX_JSON_BYTES, load_mapping
 from calib.typed_toml import shown
 from calib.validation import Warn, read_bytes, silent, transform_of
@@ -66,7 +66,10 @@ def import_pair(
             f"{lower_path} and {upper_path} do not contain the transform between the cameras: give --transform FILE or "
             "--baseline METRES"
         )
-    return rig_between(lower.camera, upper.camera, T_lower_upper)
+    rig = rig_between(lower.camera, upper.camera, T_lower_upper)
+    if is_turned_over(rig):
+        warn(turned_over_note(rig))
+    return rig
 
 
 def read_camera(path: Path, view: View = "mirror", warn: Warn = silent) -> CameraFile:

@@ -20,6 +20,7 @@ MIN_PERIMETER_PART, PIXELS_PER_BIT = 0.015, 6
 NEIGHBOUR_SIDES, MAX_OFF_PART = 3.2, 0.45
 # One marker alone may be misread; so many that lie as on the board are not.
 MIN_MARKERS, SURE_MARKERS = 2, 6
+ENOUGH_PART = 0.9
 # The largest dictionary of every family that users print.
 FAMILIES = ("4X4_1000", "5X5_1000", "6X6_1000", "7X7_1000", "APRILTAG_36h11", "ARUCO_ORIGINAL")
 # Least markers of another dictionary of which a hint tells.
@@ -45,8 +46,10 @@ def read_markers(image: Image, layout: MarkerLayout, *, thorough: bool) -> Marke
             best[reflected] = consistent_markers({**found, **best[reflected]}, layout)
             gained |= len(best[reflected]) > mine
         most = max(map(len, best.values()))
-        # Where a derived image shows no further marker of a board that is well seen, the next one does not either.
-        if not thorough or most == len(layout.ids) or (number and not gained and most >= SURE_MARKERS):
+        # The corners of a few markers that are missing are predicted by the others. Where a derived image shows no
+        # further marker of a board that is well seen, the next one does not either.
+        is_enough = most >= ENOUGH_PART * len(layout.ids) or (number and not gained)
+        if not thorough or (most >= min(SURE_MARKERS, len(layout.ids)) and is_enough):
             break
     found = max(best.values(), key=len)
     return found if len(found) >= MIN_MARKERS else {}

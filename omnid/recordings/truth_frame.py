@@ -248,8 +248,9 @@ def _fitted(
 ) -> tuple[float, tuple[float, Array | None, int, str]] | None:
     """Return the error that is left, and delay, T_rig_body, number of fitted unknowns and unknown axes.
 
-    The error is that of the positions in parts of their spread, plus that of the rotations [rad]. start: delay [s] and
-    unit. free (13,): the unknowns that are fitted: T_truth_odom, lever arm and rotation of T_rig_body, delay.
+    The error is what `omnid eval` shows: of poses of which the first ones agree, that of the positions in parts of
+    their spread, plus that of the rotations [rad]. start: delay [s] and unit. free (13,): the unknowns that are fitted:
+    T_truth_odom, lever arm and rotation of T_rig_body, delay.
     """
     delay_s, unit = start
     T = truth.T.copy()
@@ -298,7 +299,6 @@ def _gauss_newton(
         return None
     middle = len(pair.T_odom_rig) // 2
     T_truth_odom = pair.T_truth_body[middle] @ se3.inverse(pair.T_odom_rig[middle] @ T_rig_body)
-    spread_m = max(_rms(pair.T_truth_body[:, :3, 3] - pair.T_truth_body[:, :3, 3].mean(axis=0)), LEAST_SIGMA)
     begun_s, normal, prior = delay_s, np.eye(int(free.sum())), np.eye(int(free.sum()))
     for _ in range(STEPS):
         # 1. Residuals (N, 6), and their standard deviations in translation and in rotation.
@@ -332,11 +332,17 @@ def _gauss_newton(
             pair = moved
         if np.linalg.norm(step) < 1e-8:
             break
-    E = pair.T_odom_rig @ T_rig_body
-    r = se3.log(se3.inverse(T_truth_odom @ E) @ pair.T_truth_body)
     determined, unknown = _determined(normal, prior, free)
     is_rig = not free[6:12].any()
-    return _rms(r[:, :3]) / spread_m + _rms(r[:, 3:]), (delay_s, None if is_rig else T_rig_body, determined, unknown)
+    return _shown_error(pair, T_rig_body), (delay_s, None if is_rig else T_rig_body, determined, unknown)
+
+
+def _shown_error(pair: _Pair, T_rig_body: Array) -> float:
+    """Return the error that `omnid eval` shows; see `_fitted`."""
+    T_true = pair.T_truth_body @ se3.inverse(T_rig_body)
+    off = se3.inverse(T_true) @ T_true[0] @ se3.inverse(pair.T_odom_rig[0]) @ pair.T_odom_rig
+    spread_m = max(_rms(T_true[:, :3, 3] - T_true[:, :3, 3].mean(axis=0)), LEAST_SIGMA)
+    return _rms(off[:, :3, 3]) / spread_m + _rms(se3.rotation_log(off[:, :3, :3]))
 
 
 def _rms(vectors: Array) -> float:

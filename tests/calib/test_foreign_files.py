@@ -242,6 +242,10 @@ def test_a_rectified_pair_tells_the_transform(tmp_path: Path) -> None:
     rig = import_pair(tmp_path / "lower.yaml", tmp_path / "upper.yaml", None)
     np.testing.assert_allclose(rig.upper.viewpoint, [0, 0, 0.12], atol=1e-12)
     assert rig.lower.T_cam_rig[2, 0] > 0.99, "x of the rig is ahead"
+    assert rig.lower.T_cam_rig[1, 2] < -0.99, "the upper camera is where the rows of the image begin"
+    lines = list[str]()
+    import_pair(tmp_path / "upper.yaml", tmp_path / "lower.yaml", None, warn=lines.append)
+    assert len(lines) == 1 and "found below the lower one" in lines[0]
     (tmp_path / "alone.yaml").write_text(json.dumps(camera_info("plumb_bob", [*RADTAN, 0])))
     with pytest.raises(CalibError, match="give --transform FILE or --baseline METRES"):
         import_pair(tmp_path / "alone.yaml", tmp_path / "alone.yaml", None)

@@ -132,11 +132,13 @@ def adjust_bundle(
     kernel_rounds: int = KERNEL_ROUNDS,
     prior: Prior | None = None,
     ending: Ending = ENDING,
+    has_covariance: bool = True,
 ) -> BundleResult:
     """Minimise the robust reprojection error over parameters (P,) and poses (K, 4, 4), from the given start values.
 
     The steps (S,) of the board's modes, if it has any, are unknowns too, and start at 0.
-    kernel_rounds: number of optimisations; 1 is enough if the start values are nearly right.
+    kernel_rounds: number of optimisations; 1 is enough if the start values are nearly right. has_covariance: without,
+    the result's is empty.
     """
     count = len(parameters.names)
     none = Prior(np.zeros(count), np.full(count, np.inf))
@@ -148,7 +150,7 @@ def adjust_bundle(
         problem = replace(problem, kernel_px=HUBER_WIDTH * sigma)
         state = minimise(problem, state, ending, damping)
         damping = min(START_DAMPING, ending.damping / DAMPING_FACTOR)  # the next one begins next to its minimum
-    return _bundle_result(problem, state)
+    return _bundle_result(problem, state, has_covariance=has_covariance)
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,12 +216,13 @@ class _BoardProblem:
             J_in = np.concatenate([J_in, (root * fields).reshape(K, rows, -1)], axis=2)
         # Neither the board's shape nor the fields have a prior.
         prior, to_prior = (np.pad(part, (0, J_in.shape[2] - len(part))) for part in (prior, to_prior))
+        flat = J_in.reshape(K * rows, J_in.shape[2])
         between = (J_in.swapaxes(1, 2) @ J_pose).swapaxes(0, 1).reshape(J_in.shape[2], 6 * K)
         return ArrowSystem(
-            A=(J_in.swapaxes(1, 2) @ J_in).sum(axis=0) + np.diag(prior),
+            A=flat.T @ flat + np.diag(prior),
             B=between,
             C=J_pose.swapaxes(1, 2) @ J_pose,
-            a=np.einsum("kri,kr->i", J_in, r) - to_prior,
+            a=flat.T @ r.ravel() - to_prior,
             c=np.einsum("kri,kr->ki", J_pose, r).ravel(),
         )
 
@@ -248,13 +251,13 @@ def _finite(values: Array) -> Array:
     return np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
 
 
-def _bundle_result(problem: _BoardProblem, state: _State) -> BundleResult:
+def _bundle_result(problem: _BoardProblem, state: _State, *, has_covariance: bool) -> BundleResult:
     """Return the result with the covariance of the common unknowns, in which the model's misfit is counted."""
     residual, weight = _huber_weights(state.residuals, problem.kernel_px)
     P, count = state.parameters.size, state.parameters.size + state.board_steps.size
     freedom = 2 * float(weight.sum()) - count - 6 * len(residual)
     variance = float((weight[..., None] * residual**2).sum()) / max(freedom, 1.0)
-    if not count:
+    if not (count and has_covariance):
         return BundleResult(state.parameters, state.poses, state.residuals, np.zeros((0, 0)))
     fields = smooth_fields(problem.observed.pixels, problem.observed.cameras)
     system = problem.normal_equations(state, problem.kernel_px, fields).reduced()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -16,8 +17,10 @@ from calib.models.camera import Array, OmniCamera
 # fold is fitted, because one wrong view among fewer is not noticed.
 FOLDS = 4
 MIN_TRAINING_VIEWS = 3
-# End of a fold's search: it begins at the fit to all views, and scores are compared by a hundredth.
-ENDING = Ending(steps=20, gain=1e-4)
+
+
+# A fold's search begins at the fit to all views, and scores are compared by a hundredth.
+_fit_fold = partial(adjust_bundle, kernel_rounds=1, ending=Ending(steps=20, gain=1e-4), has_covariance=False)
 
 
 def held_out_error_px(camera: OmniCamera, T_cam_board: Array, observed: Observations) -> float:
@@ -40,11 +43,9 @@ def cross_validated_px(
             continue
         seen, left = observed.select(~held_out), observed.select(held_out)
         try:
-            trained = adjust_bundle(
-                parameters, T_cam_board[~held_out], seen, kernel_rounds=1, prior=prior, ending=ENDING
-            )
+            trained = _fit_fold(parameters, T_cam_board[~held_out], seen, prior=prior)
             fixed = FixedParameters(parameters, trained.parameters)
-            found = adjust_bundle(fixed, T_cam_board[held_out], left, kernel_rounds=1, ending=ENDING)
+            found = _fit_fold(fixed, T_cam_board[held_out], left)
         except (CalibError, np.linalg.LinAlgError):
             return float("inf")
         errors.append(found.errors_px.ravel())
