@@ -87,6 +87,7 @@ class StatusCollector:
             Key.AGE_S: self._age_s(newest.stamp_ns),
             Key.INLIERS: newest.inliers,
             Key.TRACKED: newest.tracks,
+            Key.RUN: status_names.RUN_ID,
             Key.RESETS: newest.reset_counter,
             Key.LENGTH_M: statistics.length_m,
             "level_grey": newest.light.level_grey,

@@ -5,7 +5,6 @@ Times are in s since the first pose. A pose takes 300 bytes: an hour at 30 Hz 32
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -181,32 +180,17 @@ class RecordedRun:
         return sorted(found, key=lambda event: event.start_s)
 
     def _starts_and_resets(self) -> None:
-        """Find the starts of the daemon, with a new odom, and the resets of odometry.
-
-        A smaller number of resets, or a shorter path, tells of a start; reports of each kind come in order. The new
-        odom begins after the longest gap since the last report that the daemon ran on, or after the next gap.
-        """
-        before, since_s, newest = dict[bool, tuple[float, float, float]](), -math.inf, -1
-        gaps = self.gaps()
+        """Find the starts of the daemon, with a new odom, by the identity of its runs, and the resets of odometry."""
+        run, newest = "", -1
         for t_s, status in self.entries(status_names.ODOMETRY):
-            resets = status_names.count(status.values.get(Key.RESETS, ""))
-            length_m = status_names.number(status.values.get(Key.LENGTH_M, ""))
+            resets, now = status_names.count(status.values.get(Key.RESETS, "")), status.values.get(Key.RUN, run)
             if resets is None:
                 continue
-            now = (t_s, float(resets), -1.0 if length_m is None else length_m)
-            last = before.get(length_m is None, now)
-            if now[0] >= last[0]:
-                if now[1] < last[1] or now[2] < last[2]:
-                    inside = gaps[(gaps[:, 1] > since_s) & (gaps[:, 1] <= t_s)]
-                    longest = inside[np.argsort(inside[:, 0] - inside[:, 1], kind="stable")][:1]
-                    chosen = longest if len(longest) else gaps[gaps[:, 1] > t_s][:1]
-                    self.restarts += np.searchsorted(self.t_s, chosen[:, 1]).tolist()
-                    self.restarted_s.append(t_s)
-                    before.clear()
-                    newest = 0
-                elif length_m is not None or False not in before:
-                    since_s = t_s
-                before[length_m is None] = now
+            if run and now != run:
+                self.restarts += [index for index in [int(np.searchsorted(self.t_s, t_s))] if 0 < index < len(self.t_s)]
+                self.restarted_s.append(t_s)
+                newest = 0
+            run = now
             if resets > newest >= 0:
                 self.resets.append((t_s, resets - newest))
             newest = max(resets, newest)

@@ -13,6 +13,7 @@ from omnid.sinks.encoder import Encoder, Outgoing, StateReports, UnixTime, same_
 from omnid.transport.bus import Bus
 from omnid.transport.codec import PoseAttachment, clock_cdr, features_to_bytes
 from omnid.transport.sensor_codec import image_cdr
+from omnid.transport.status_names import RUN_ID
 from omnid.transport.topics import CLOCK, PANORAMA
 
 
@@ -22,7 +23,7 @@ class BusSink:
     def __init__(self, bus: Bus, encode: Encoder, clock: type[OdometryUpdate | VelocityCommand] | None = None) -> None:
         """clock: the kind of message, from one thread, by whose stamps /clock advances, where the bus has it."""
         self._clock, self._time_ns = clock, 0
-        self._bus, self._encode, self._states = bus, encode, StateReports(encode.unix_ns)
+        self._bus, self._encode, self._states = bus, encode, StateReports(encode.unix_ns, RUN_ID)
         self._gave_frames = False
 
     def process(self, message: Outgoing) -> None:

@@ -186,10 +186,11 @@ def static_frames(encode: Encoder, stamp_ns: int) -> OutgoingMessage:
 
 
 class StateReports:
-    """Yields a status when the state of the odometry, or of the pose in the map, changes; unix_ns: the Encoder's."""
+    """Yields a status when the state of the odometry, or of the pose in the map, changes."""
 
-    def __init__(self, unix_ns: UnixTime = same_time) -> None:
-        self._unix_ns = unix_ns
+    def __init__(self, unix_ns: UnixTime = same_time, run_id: str = "") -> None:
+        """unix_ns: the Encoder's. run_id: of the run, where others record it; a log of one's own holds one run."""
+        self._unix_ns, self._run_id = unix_ns, run_id
         self._last: tuple[str, int] | None = None
         self._last_in_map: MapState | None = None
 
@@ -207,6 +208,7 @@ class StateReports:
             self._last = message.state, message.reset_counter
             values = {
                 Key.STATE: message.state,
+                Key.RUN: self._run_id,
                 Key.RESETS: message.reset_counter,
                 Key.INLIERS: message.inliers,
                 Key.TRACKED: message.tracks,

@@ -7,6 +7,7 @@ parse them, and they hold no number that changes from one report to the next.
 from __future__ import annotations
 
 import math
+import secrets
 from collections.abc import Mapping
 from dataclasses import replace
 from enum import StrEnum
@@ -45,6 +46,8 @@ IGNORED_PREFIX: Final = "ignored, "  # begins the keys that count valid commands
 
 DISARMED_BY_STOP: Final = ASKED  # the value of disarmed_by after a stop
 
+RUN_ID: Final = secrets.token_hex(4)  # of this program: one that starts again has another, and another odom
+
 _TIME_SUFFIX: Final = "_ms"
 
 
@@ -56,6 +59,7 @@ class Key(StrEnum):
 
     # Odometry. An entry with `state` is published when the state changes and has the stamp of that pose.
     STATE = "state"
+    RUN = "run"  # identity of the daemon's run, of its odom: RUN_ID
     RESETS = "resets"
     INLIERS = "inliers"  # landmarks that agree with the pose
     TRACKED = "tracked"  # landmarks found in the images
