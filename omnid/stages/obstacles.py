@@ -19,10 +19,11 @@ from omnid.core.frames import of_base
 from omnid.core.mapping.range_scan import SECTORS, FreeRanges
 from omnid.core.obstacles.column import NEAREST_M, ColumnEvidence, Columns, floor_plane
 from omnid.core.obstacles.fixed_parts import FixedParts
-from omnid.core.obstacles.grid import ObstacleGrid
+from omnid.core.obstacles.grid import GridRing, ObstacleGrid
 from omnid.core.obstacles.moving_tracker import MovingTracker
 from omnid.core.obstacles.narrow import narrow_m, nothing_narrow
 from omnid.core.obstacles.pair_views import FOCAL_PX
+from omnid.core.obstacles.rays.pair_rings import RayRings
 from omnid.core.obstacles.settings import RingSettings
 from omnid.core.obstacles.unwatched import Unwatched, without
 from omnid.load_level import Load, LoadLevel, full_load
@@ -102,6 +103,7 @@ class PairRings:
         self._columns: Columns | None = None
         self._evidence: ColumnEvidence | None = None  # of the newest pair
         self._grid = ObstacleGrid(FOCAL_PX * geometry.rig.baseline_m, settings)
+        self._rays = RayRings(geometry.cylinder, geometry.rig.baseline_m, settings) if settings.rays else None
         self._tracker = MovingTracker()
         self._unwatched = Unwatched(geometry.cylinder, geometry.rig.T_base_rig @ geometry.T_rig_rect)
         self._resets = 0
@@ -111,6 +113,8 @@ class PairRings:
         # 1. Forget the grid and the tracks where odometry has begun again.
         if odometry.reset_counter != self._resets:
             self._grid.begin_again()
+            if self._rays is not None:
+                self._rays.grid.clear()
             self._tracker.clear()
             self._resets, self._is_misled = odometry.reset_counter, False
         panoramas, self._evidence = odometry.depth.panoramas, None
@@ -127,9 +131,17 @@ class PairRings:
             return unknown
         # 2. The evidence of the images, without their dead and blind parts.
         lost = panoramas.tiles.lost_pixels(panoramas.visible.shape)
+        pose = transform(planar(T_odom_base))
+        if self._rays is not None:
+            new = GridRing(*self._rays.add(odometry.stamp_ns, pose, panoramas.lower, panoramas.upper, lost))
+            self._evidence = self._rays.evidence
+            new = without(new, unwatched, self._unwatched.directions(panoramas.tiles.unknown))
+            moving = self._tracker.update(odometry.stamp_ns, self._rays.grid.viewpoint(pose), new.arrivals)
+            return ObstacleRing(
+                odometry.seq, odometry.stamp_ns, new.ranges_m, new.sigma_m, new.free_m, T_odom_base, moving, unwatched
+            )
         evidence = self._evidence = columns.evidence(panoramas.lower, panoramas.upper, lost)
         # 3. The grid, its ring, and the moving obstacles.
-        pose = transform(planar(T_odom_base))
         unseen = self._unwatched.directions(panoramas.tiles.unknown)
         ring = without(self._grid.update(odometry.stamp_ns, pose, evidence), unwatched, unseen)
         moving = self._tracker.update(odometry.stamp_ns, self._grid.viewpoint(pose), ring.arrivals)
@@ -158,6 +170,8 @@ class PairRings:
         if self._is_misled and self.fixed.is_on_the_spot:
             # The floor too near to be seen is taken to be free again: a base that came here might know better.
             self._grid.begin_again()
+            if self._rays is not None:
+                self._rays.grid.clear()
             self._tracker.clear()
             self._is_misled = False
 
@@ -178,6 +192,8 @@ class PairRings:
                 panoramas.visible & ~self._left_out,
             )
             self._grid.set_floor(T_rect_floor, plane.height_m)
+            if self._rays is not None:
+                self._rays.set_floor(T_rect_floor, panoramas.visible & ~self._left_out)
         return self._columns
 
 

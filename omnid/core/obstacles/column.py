@@ -149,6 +149,26 @@ class Columns:
         ratios = self._floor(floor), self._surface(surfaces), self._level(floor)
         return ColumnEvidence(*ratios, self.nearest_floor_m, ~self._unseen)
 
+    @property
+    def panoramas(self) -> WorkingPanoramas:
+        """The working panoramas of this plane."""
+        return self._panoramas
+
+    @property
+    def visible(self) -> Flags:
+        """Pixels (H, DIRECTIONS) of the working panoramas that both cameras see."""
+        return self._visible
+
+    @property
+    def first_bin(self) -> int:
+        """First disparity that is compared."""
+        return self._first_bin
+
+    @property
+    def last_row(self) -> int:
+        """Last row in use."""
+        return self._last_row
+
     def _floor(self, views: Views) -> Floats:
         """Return the log-likelihood ratios (K, DIRECTIONS) of the floor against all other disparities."""
         others, scale = np.empty((self.bins, DIRECTIONS), np.float32), np.float32(DIFFERENCE_RATIO / UNITS)

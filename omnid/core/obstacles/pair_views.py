@@ -83,6 +83,13 @@ class WorkingPanoramas:
         whole[:, self.shown] = shown
         return whole
 
+    def grey(self, panorama: PaddedPanorama) -> Floats:
+        """Return a panorama (H, DIRECTIONS) in the working size, with the floor's horizon level."""
+        image = self.sized(np.ascontiguousarray(panorama.panorama)).astype(np.float32)
+        if self._maps is None:
+            return image
+        return np.asarray(cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
+
     def views(self, lower: PaddedPanorama, upper: PaddedPanorama, live: Bytes) -> tuple[Views, Views]:
         """Return the views of a pair for surfaces, and for the floor; live (H, DIRECTIONS): 255 where it is seen."""
         noise_grey = math.hypot(self._noise_grey(lower), self._noise_grey(upper))  # of their difference

@@ -1,0 +1,307 @@
+"""The grid of a run: what is known of cells of floor around the base, by the rays of all pairs.
+
+Cells of 5 cm in odom hold the log-odds L of a thing that stands, hangs or steps there, and whether they are known.
+1. Evidence of a pair: e = r log [q / (1 - q)] / [q_0 / (1 - q_0)] of each bin, q the probability that the first thing
+   is there where the ray comes with the probability r; q_0 its prior. So the prior of the rays does not count twice.
+2. Errors of pairs from one place are alike: noise with the correlation rho, that falls to 0 over 5 cm of way. Of a pair
+   counts what is new: L += e - rho e', e' that of the pair before. What stands as before adds little; what has changed,
+   all at once. L forgets by (1 - rho) / n, so that more than n views of a place are no more.
+3. Hidden Markov prediction: something comes into a cell with a small probability in each pair, so L has a lower bound;
+   and what nobody sees may be entered from where nothing is known, at 1.6 m/s by a person, 25 cm wide.
+4. Too near to be seen: known by what is seen past a cell. What hides the nearest floor in view may stand anywhere
+   before it, unless something is known there.
+5. What hangs over floor in view shows a surface in half of the pairs: the mean of what single pairs show, over 25 cm.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from omnid.core.mapping.range_scan import SECTORS, azimuths
+from omnid.core.obstacles.rays import cell_belief_kernels as kernels
+from omnid.core.obstacles.rays.parameters import GridParameters
+from omnid.core.obstacles.rays.posterior import RayBelief
+from omnid.core.obstacles.usual_floor import Arrivals
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Bytes = NDArray[np.uint8]
+Flags = NDArray[np.bool_]
+
+CELL_M: Final = 0.05
+CELLS: Final = 256
+MARGIN_CELLS: Final = 110  # nearer to the border than this, the square is moved
+VIEW_CELLS: Final = 90  # on either side of the base that a pair changes
+OWN_CELLS: Final = 3  # on either side of the base that nothing else can be in
+CROSS: Final = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
+SQUARE: Final = np.ones((3, 3), np.uint8)
+
+
+class BeliefRing(NamedTuple):
+    """Nearest things and free floor around the base."""
+
+    ranges_m: Floats  # (SECTORS,) first thing; inf: floor up to the longest range; NaN: unknown
+    sigma_m: Floats  # (SECTORS,) of the ranges
+    free_m: Floats  # (SECTORS,) up to which the way is free
+    arrivals: Arrivals  # of this pair, about the viewpoint
+
+
+def unknown_ring() -> BeliefRing:
+    """Return the ring of a pair that shows no floor."""
+    nan = np.full(SECTORS, np.nan, np.float32)
+    return BeliefRing(nan, nan, np.zeros(SECTORS, np.float32), Arrivals(nan, nan, np.zeros(SECTORS, bool)))
+
+
+class BeliefGrid:
+    """Log-odds of cells, in a square that follows the base."""
+
+    def __init__(self, at_1m: float, max_range_m: float, parameters: GridParameters) -> None:
+        self._p, self._at_1m = parameters, at_1m
+        self._max_range_m = min(max_range_m, (MARGIN_CELLS - 2) * CELL_M)
+        self._azimuths = azimuths()
+        self._T_rect_base = np.eye(4)
+        self.clear()
+
+    def viewpoint(self, T_odom_base: Array) -> Array:
+        """Return the pose (4, 4) of axes parallel to the base's at the viewpoint."""
+        T = np.eye(4)
+        T[:2, 3] = self._T_base_rect[:2, 3]
+        return np.asarray(T_odom_base @ T)
+
+    def set_floor(self, T_rect_base: Array) -> None:
+        """Take T_rect_base (4, 4), from the base level on the floor to the columns."""
+        self._T_rect_base = T_rect_base
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self.odds = np.full((CELLS, CELLS), self._p.prior, np.float32)
+        self._before = np.zeros((CELLS, CELLS), np.float32)
+        self._shown = np.zeros((CELLS, CELLS), np.float32)
+        self.known = np.zeros((CELLS, CELLS), np.uint8)
+        self._floor_was_behind = np.zeros((CELLS, CELLS), np.uint8)
+        self._corner: NDArray[np.int64] | None = None
+        self._place_m: Array | None = None
+        self._last_ns: int | None = None
+        self._carry = 0.0
+
+    def update(self, stamp_ns: int, T_odom_base: Array, belief: RayBelief) -> BeliefRing:
+        """Add a pair, whose base has the planar pose T_odom_base (4, 4); return what is known."""
+        p = self._p
+        is_first = self._last_ns is None
+        passed_s = 0.0 if self._last_ns is None else max(stamp_ns - self._last_ns, 0) * 1e-9
+        self._last_ns = stamp_ns
+        place = T_odom_base[:2, 3] / CELL_M
+        corner = self._follow(place)
+        at = np.floor(place).astype(np.int64) - corner
+        rows, columns = (slice(int(n) - VIEW_CELLS, int(n) + VIEW_CELLS + 1) for n in (at[1], at[0]))
+        way_m = math.inf if self._place_m is None else math.dist(T_odom_base[:2, 3], self._place_m)
+        self._place_m = T_odom_base[:2, 3].copy()
+        rho = p.same_place * max(1.0 - way_m / p.apart_m, 0.0)
+        # 1. Evidence and state of each cell.
+        found, states = self._gathered(T_odom_base, CELL_M * (corner + (columns.start, rows.start) + 0.5), belief)
+        in_view, past = states == kernels.IN_VIEW, states == kernels.SEEN_PAST
+        observed = in_view & (found[kernels.VIEW] > 0.5)
+        # Who comes onto floor that was free is seen by one pair.
+        was_free = (self._taken() < p.was_free).view(np.uint8)
+        changed = np.zeros((CELLS, CELLS), np.uint8)
+        was_seen = self._before[rows, columns] < -p.comes
+        changed[rows, columns] = (found[kernels.RATIO] > p.comes) & was_seen & in_view & (was_free[rows, columns] > 0)
+        # 2. What is new of it.
+        odds, before = self.odds[rows, columns], self._before[rows, columns]
+        change = found[kernels.RATIO] - np.float32(rho) * before
+        keep = np.float32(1 - (1 - rho) / p.views)
+        updated = np.clip(p.prior + keep * (odds - p.prior) + change, p.arrival, p.most)
+        odds[in_view] = updated[in_view]
+        self._before[:] = 0
+        self._before[rows, columns] = np.where(in_view, found[kernels.RATIO], 0)
+        shown = cv2.blur(found[kernels.SURFACE], (5, 5))
+        self._shown[rows, columns] += np.where(
+            in_view, np.float32(p.shown_rate * (1 - rho)) * (shown - self._shown[rows, columns]), 0
+        )
+        # 3. What is known: seen, or seen past; who comes where nobody sees.
+        every = np.zeros((CELLS, CELLS), np.uint8)
+        every[rows, columns] = states
+        watched = np.zeros((CELLS, CELLS), np.uint8)
+        watched[rows, columns] = observed | past | (states == kernels.MOSTLY_PAST)
+        known = self.known[rows, columns]
+        known[observed] = 1
+        known[past] = 1
+        eye = (T_odom_base @ self._T_base_rect)[:2, 3] / CELL_M - corner
+        yaw = float(se3.yaw(T_odom_base))
+        if is_first:
+            self._assume_free(eye, yaw, belief)
+        flooded = np.zeros((CELLS, CELLS), np.uint8)
+        around = np.array([*eye, CELL_M]), self._azimuths + yaw, float(belief.ends_m[0])
+        kernels.too_near(self._taken(), every, flooded, *around)
+        # Only where floor was seen behind before: what hides it from the start may stand where it did.
+        flooded &= self._floor_was_behind
+        watched |= ((every == kernels.HIDDEN) & (self.known > 0)).view(np.uint8)
+        if not is_first:
+            self._who_comes(passed_s, watched)
+        hides = flooded & was_free
+        self._floor_was_behind = (every == kernels.SEEN_PAST).view(np.uint8)
+        self.known[flooded > 0] = 0
+        arrived = np.empty(len(self._azimuths))
+        view = np.array([*eye, self._max_range_m, CELL_M])
+        # Who comes is wider than a speck of noise.
+        wide = cv2.morphologyEx(changed | hides, cv2.MORPH_OPEN, SQUARE)
+        kernels.first_changed(wide, view, self._azimuths + yaw, arrived)
+        is_nearer = arrived < belief.ends_m[0]
+        arrivals = Arrivals(
+            np.where(is_nearer, belief.ends_m[0], arrived).astype(np.float32),
+            np.where(is_nearer, p.near_sigma * belief.ends_m[0], 0.5 * arrived**2 / self._at_1m).astype(np.float32),
+            is_nearer,
+        )
+        own = (
+            slice(int(at[1]) - OWN_CELLS, int(at[1]) + OWN_CELLS + 1),
+            slice(int(at[0]) - OWN_CELLS, int(at[0]) + OWN_CELLS + 1),
+        )
+        self.odds[own], self.known[own], self._shown[own] = p.arrival, 1, 0.0
+        # 4. The ring.
+        hit, sigma, free = np.empty((3, len(self._azimuths)))
+        view = np.array([*(place - corner), self._max_range_m, CELL_M])
+        kernels.ways(self._taken(), view, self._azimuths + yaw, p.risk, hit, sigma, free)
+        free = np.minimum(free, np.nan_to_num(hit, nan=np.inf))
+        is_open = np.isnan(hit) & (free >= 0.9 * self._max_range_m)
+        return BeliefRing(
+            np.where(is_open, np.inf, hit).astype(np.float32),
+            sigma.astype(np.float32),
+            free.astype(np.float32),
+            arrivals,
+        )
+
+    def _assume_free(self, eye: Array, yaw_rad: float, belief: RayBelief) -> None:
+        """Take the floor too near to be seen for free at the start, up to what hides the nearest floor in view.
+
+        That is where a surface is seen. A wall that leaves the view goes on straight from where it is in view on both
+        sides. Anything else may stand anywhere before the floor that it hides.
+        """
+        p, near_m = self._p, float(belief.ends_m[0])
+        hides, count = self._hides(belief), len(belief.first)
+        reach_m = np.where(hides, 0.0, near_m + 2 * CELL_M)
+        first_m = belief.ends_m[
+            np.minimum((np.cumsum(belief.first, axis=1) > 0.5).argmax(axis=1), len(belief.ends_m) - 1)
+        ]
+        surface_m = belief.nearer_m - CELL_M
+        step = math.tau / count
+        for run in _runs(hides):
+            reach_m[run] = np.where(np.isfinite(surface_m[run]), surface_m[run], 0.0)
+            before, after = (run[0] - 1) % count, (run[-1] + 1) % count
+            if max(first_m[before], first_m[after]) < near_m + p.leaves_m and len(run) < count // 2:
+                # The chord between both ends.
+                wide, here = (len(run) + 1) * step, np.arange(1, len(run) + 1) * step
+                near, far = first_m[before], first_m[after]
+                chord = near * far * math.sin(wide) / (near * np.sin(here) + far * np.sin(wide - here))
+                reach_m[run] = np.maximum(reach_m[run], chord - 2 * CELL_M)
+        reach_m = np.min([np.roll(reach_m, shift) for shift in range(-3, 4)], axis=0)
+        y, x = np.indices((CELLS, CELLS)) + 0.5
+        x, y = x - eye[0], y - eye[1]
+        T = self._T_rect_base
+        turn = math.atan2(T[1, 0], T[0, 0]) - yaw_rad
+        at = np.floor((math.pi - np.arctan2(y, x) - turn) / math.tau * count).astype(np.intp) % count
+        free = np.hypot(x, y) * CELL_M < reach_m[at]
+        self.known[free] = 1
+        self.odds[free & (self.odds < 0)] = p.arrival
+
+    def _hides(self, belief: RayBelief) -> Flags:
+        """Return the directions (D,) in which the nearest floor in view is hidden."""
+        bins = int(np.searchsorted(belief.ends_m, belief.ends_m[0] + self._p.near_m))
+        hidden = belief.first[:, :bins].sum(axis=1)
+        three = (np.roll(hidden, 1) + hidden + np.roll(hidden, -1)) / 3
+        return np.asarray((three > self._p.hidden) & (belief.view[:, 0] > 0))
+
+    def is_floor(self, T_odom_base: Array, ranges_m: Array, directions: int) -> Flags:
+        """Return the bins (N, directions) about the viewpoint, at ranges (N,), whose cells are floor by all pairs."""
+        if self._corner is None:
+            return np.zeros((len(ranges_m), directions), bool)
+        T = T_odom_base @ self._T_base_rect
+        azimuth = math.pi - (np.arange(directions) + 0.5) * (math.tau / directions)
+        unit = np.column_stack([np.cos(azimuth), np.sin(azimuth)]) @ T[:2, :2].T
+        cells = np.floor((T[:2, 3] + ranges_m[:, None, None] * unit) / CELL_M).astype(np.intp) - self._corner
+        x, y = np.clip(cells[..., 0], 0, CELLS - 1), np.clip(cells[..., 1], 0, CELLS - 1)
+        return np.asarray((self.known[y, x] > 0) & (self.odds[y, x] < self._p.prior))
+
+    def _taken(self) -> Floats:
+        """Return the probability of a thing in cells, 2 where nothing is known."""
+        p = self._p
+        hanging = np.clip(p.shown_weight * (self._shown - p.shown_least), -9.0, 6.0) + np.float32(p.arrival)
+        odds = np.maximum(self.odds, hanging)
+        taken = 1 / (1 + np.exp(-odds))
+        return np.where((self.known > 0) | (self.odds > 0), taken, np.float32(2)).astype(np.float32)
+
+    def _who_comes(self, passed_s: float, watched: Bytes) -> None:
+        """Spread what is not known through cells that nobody sees."""
+        p = self._p
+        open_ = (1 - watched) & (self.odds <= 0)
+        wide = cv2.morphologyEx(open_, cv2.MORPH_OPEN, np.ones((p.person_cells, p.person_cells), np.uint8))
+        source = wide & (1 - self.known)
+        self._carry += p.walk_mps * passed_s / CELL_M
+        steps = int(self._carry)
+        self._carry -= steps
+        for step in range(min(steps, CELLS)):
+            source = cv2.dilate(source, CROSS if step % 2 else SQUARE) & wide
+        self.known[source > 0] = 0
+
+    @property
+    def _T_base_rect(self) -> Array:
+        return se3.inverse(self._T_rect_base)
+
+    def _gathered(self, T_odom_base: Array, first_m: Array, belief: RayBelief) -> tuple[Floats, Bytes]:
+        """Return evidence (3, N, N) and states (N, N) of the cells in view, the first with its middle at first_m."""
+        p = self._p
+        T_rect_odom = self._T_rect_base @ se3.inverse(T_odom_base)
+        x, y = (T_rect_odom @ np.array([first_m[0], first_m[1], 0.0, 1.0]))[:2]
+        c, s = T_rect_odom[0, 0], T_rect_odom[1, 0]
+        norm = math.hypot(c, s)
+        side = 2 * VIEW_CELLS + 1
+        cells, states = np.empty((3, side, side), np.float32), np.empty((side, side), np.uint8)
+        hides = self._hides(belief)
+        near = np.where(belief.view[:, 0] > 0, np.where(hides, 2, 1), 0).astype(np.uint8)
+        kernels.gather(
+            belief.ratios,
+            belief.view,
+            belief.surface,
+            near,
+            belief.ends_m,
+            self._at_1m,
+            np.array([x, y, c / norm, s / norm]),
+            CELL_M,
+            float(belief.ends_m[-2]),
+            p.thin_m,
+            cells,
+            states,
+        )
+        return cells, states
+
+    def _follow(self, place: Array) -> NDArray[np.int64]:
+        """Move the square where the base comes near its border; return its corner, in cells of odom."""
+        cell = np.floor(place).astype(np.int64)
+        if self._corner is None:
+            self._corner = cell - CELLS // 2
+            return self._corner
+        at = cell - self._corner
+        if ((at >= MARGIN_CELLS) & (at < CELLS - MARGIN_CELLS)).all():
+            return self._corner
+        x, y = np.clip(at - CELLS // 2, -CELLS, CELLS).tolist()
+        gone = np.ones((CELLS, CELLS), bool)
+        gone[max(-y, 0) : CELLS - max(y, 0), max(-x, 0) : CELLS - max(x, 0)] = False
+        for layer, unknown in ((self.odds, self._p.prior), (self._before, 0), (self._shown, 0), (self.known, 0)):
+            layer[:] = np.roll(layer, (-y, -x), axis=(0, 1))
+            layer[gone] = unknown
+        self._corner = self._corner + np.array([x, y])
+        return self._corner
+
+
+def _runs(flags: Flags) -> list[NDArray[np.intp]]:
+    """Return the runs of directions (D,) of a turn that are set."""
+    if flags.all() or not flags.any():
+        return [np.flatnonzero(flags)] if flags.any() else []
+    start = int(np.flatnonzero(~flags)[0])
+    at = np.flatnonzero(np.roll(flags, -start))
+    return [(run + start) % len(flags) for run in np.split(at, np.flatnonzero(np.diff(at) > 1) + 1)]
