@@ -82,6 +82,8 @@ class StatusCollector:
             level, message = STALE, "no new pose"
         elif newest.light.is_too_dark and newest.state != TrackingState.LOST:
             level, message = WARN, f"{newest.state}: it is too dark"
+        elif newest.image_fault:
+            level, message = max(WARN, level), f"{newest.state}: {newest.image_fault}"
         values = {
             Key.RATE_HZ: self._rate_hz("poses", statistics.poses),
             Key.AGE_S: self._age_s(newest.stamp_ns),

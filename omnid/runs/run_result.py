@@ -202,6 +202,7 @@ class RunReport:
                 yield f"wheels and gyro: {message}"
             if self._stages.floor is not None and self._stages.floor.summary():
                 yield self._stages.floor.summary()
+            yield from self._stages.front_end.odometry.image_faults
             health = self._stages.front_end.health
             yield from input_warnings(self._pairing, health, statistics, self._session.config)
 

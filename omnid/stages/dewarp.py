@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from calib.panorama import Maps, remap_tables, visible
 from drivers.jpeg import Steps
 from omnid.config import PanoramaConfig
+from omnid.core.odometry.image_breaks import RawImage
 from omnid.core.stereo.photometry import brightened, gain_of, light, noise_sigma, pair_gains
 from omnid.core.stereo.tiles import SIDES, Side, TileMonitor, tile_columns
 from omnid.core.types.panorama import PaddedPanorama
@@ -39,6 +40,11 @@ class Dewarp:
         self._tiles = TileMonitor(self._visible, tile_columns(cylinder))
         self.upper_delay_s, line_s = rig.times.upper_delay_s, rig.times.line_time_s
         inner = slice(config.pad_px, -config.pad_px)
+        lower, upper = (tuple(table[:, inner] for table in maps) for maps in (self._lower, self._upper))
+        self.raw_images = (
+            RawImage(lower[0], lower[1], rig.lower.camera.size),
+            RawImage(upper[0], upper[1], rig.upper.camera.size),
+        )
         self._rows_s = [maps[1][:, inner] * np.float32(line_s) for maps in (self._lower, self._upper) if line_s]
         if self._visible.mean() < MIN_SHARED_PART:
             raise OmnidError(

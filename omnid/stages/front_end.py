@@ -32,7 +32,7 @@ class FrontEnd:
         self.dewarp = Dewarp(geometry, config.panorama)
         stereo = DenseStereo(geometry, config.stereo_settings())
         self.dense = DenseDepths(stereo.compute, stereo.confirmed)
-        self.odometry = OdometryStage(geometry, config.odometry, self.dense, load)
+        self.odometry = OdometryStage(geometry, config.odometry, self.dense, load, self.dewarp.raw_images)
         self.poses = CheckedOdometry(self.odometry, self.health)
 
     def process(self, pair: FramePair) -> OdometryUpdate:

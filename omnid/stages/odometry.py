@@ -16,6 +16,7 @@ from omnid.core.control.motion_monitor import AGREE, Witness
 from omnid.core.odometry.earlier_view import EarlierView
 from omnid.core.odometry.estimates import OdometryEstimate
 from omnid.core.odometry.exposure_times import Exposure
+from omnid.core.odometry.image_breaks import RawImage
 from omnid.core.odometry.motion_agreement import Contradiction, MotionAgreement, contradiction_after
 from omnid.core.odometry.motion_sensors import BIAS, MotionSensors
 from omnid.core.odometry.odometry import VisualOdometry
@@ -48,10 +49,17 @@ class OdometryMethod(Protocol):
 class OdometryStage:
     """Estimate poses in odom, which is the rig frame of the first pair."""
 
-    def __init__(self, geometry: Geometry, config: OdometryConfig, dense: DenseDepths, load: Load = full_load) -> None:
-        """dense: computes the depth of keyframes."""
+    def __init__(
+        self,
+        geometry: Geometry,
+        config: OdometryConfig,
+        dense: DenseDepths,
+        load: Load = full_load,
+        raw_images: tuple[RawImage, RawImage] | None = None,
+    ) -> None:
+        """dense: computes the depth of keyframes. raw_images: see VisualOdometry."""
         self._dense, self._load = dense, load
-        self._method = _method(geometry.model(config.noise_px), config, self._features)
+        self._method = _method(geometry.model(config.noise_px), config, self._features, raw_images)
         self._T_rig_rect = geometry.T_rig_rect
         self._to_rig = se3.adjoint(self._T_rig_rect)
         self._last_ns: int | None = None
@@ -71,6 +79,12 @@ class OdometryStage:
     def witness(self) -> Witness:
         """That of images, wheels and gyro which differs from the others now."""
         return self._agreement.result
+
+    @property
+    def image_faults(self) -> list[str]:
+        """One line for each way in which the images of a camera are torn or displaced."""
+        breaks = self._method.breaks if isinstance(self._method, VisualOdometry) else None
+        return [] if breaks is None else breaks.words
 
     def process(self, pair: Panoramas) -> OdometryUpdate:
         """Return the pose at a pair."""
@@ -127,6 +141,7 @@ class OdometryStage:
             estimate.is_keyframe,
             self._agreement.result,
             estimate.refused_mps,
+            estimate.image_fault,
             estimate.T_odom_rect,
             covariance_rect,
         )
@@ -183,9 +198,14 @@ def _state(state: TrackingState, pair: Panoramas, witness: Witness) -> TrackingS
     return TrackingState.DEGRADED if state is TrackingState.TRACKING and is_doubtful else state
 
 
-def _method(model: StereoModel, config: OdometryConfig, features: Callable[[], float]) -> OdometryMethod:
+def _method(
+    model: StereoModel,
+    config: OdometryConfig,
+    features: Callable[[], float],
+    raw_images: tuple[RawImage, RawImage] | None,
+) -> OdometryMethod:
     if config.method == "default":
-        return VisualOdometry(model, config.klt, config.limits, Relocaliser(model), features)
+        return VisualOdometry(model, config.klt, config.limits, Relocaliser(model), features, raw_images)
     from omnid.core.odometry.paper.paper_odometry import PaperOdometry  # imported only where it is used
 
     return PaperOdometry(model, config.klt, config.tracker, config.reference)

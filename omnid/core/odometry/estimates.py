@@ -157,6 +157,7 @@ class OdometryEstimate:
     step: tuple[Array, Array] | None = None  # T_prev_curr and its covariance (6, 6) by the cameras alone; None: a break
     is_keyframe: bool = False  # dense stereo of the frame is computed for the local map
     refused_mps: float = 0.0  # speed of a pose that was refused for it alone; 0: none was
+    image_fault: str = ""  # how the images of a camera are torn or displaced, see image_breaks.py; empty: they are not
     # The motion during the exposures, for dense stereo of the frame; None: not known.
     exposure: Exposure | None = None
     distance_m: float = ROOM_M  # median of the landmarks

@@ -26,6 +26,7 @@ from omnid.core.odometry.estimates import (
 from omnid.core.odometry.exposure_times import Exposure, RigVelocity
 from omnid.core.odometry.frame_exposures import FrameExposures
 from omnid.core.odometry.frame_to_map import FrameToMap
+from omnid.core.odometry.image_breaks import ImageBreaks, RawImage
 from omnid.core.odometry.keyframes import KeyframeLocaliser, KeyframeRequest, Keyframes
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.motion_model import MotionModel
@@ -37,6 +38,7 @@ from omnid.core.odometry.tracking import KltSettings
 from omnid.core.odometry.tracking_state_machine import FrameFacts, FrameOutcome, TrackingStatus, next_status
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.stereo_model import StereoModel
+from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -59,8 +61,12 @@ class VisualOdometry:
         limits: OdometryLimits,
         relocaliser: KeyframeLocaliser,
         features: Callable[[], float] = lambda: 1.0,
+        raw_images: tuple[RawImage, RawImage] | None = None,
     ) -> None:
-        """features: called for each keyframe, the share of limits.features that it is to have."""
+        """features: called for each keyframe, the share of limits.features that it is to have.
+
+        raw_images: where the raw images of both cameras show the panoramas; None: they are not tested for breaks.
+        """
         self._limits, self._model, self._relocaliser = limits, model, relocaliser
         self._map = LocalMap(model, klt, limits.keyframes)
         self._keyframes = Keyframes(self._map, model, replace(klt, levels=1), limits, relocaliser, features)
@@ -85,12 +91,27 @@ class VisualOdometry:
             frame_to_map=self._frame_to_map,
         )
         self._search = PoseSearch(self._map, model, limits, frame_to_map=self._frame_to_map, exposures=self._exposures)
+        self.breaks = None if raw_images is None else ImageBreaks(model, raw_images)
 
     def process(self, frame: StereoFrame, dt_s: float) -> OdometryEstimate:
         """Return the pose at a frame, dt_s [s] after the previous one (0 for the first).
 
-        The keyframe that it may have to become is made by `complete`: its depths take longer than the pose.
+        The keyframe that it may have to become is made by `complete`: its depths take longer than the pose. The pose is
+        degraded at best while the images are torn or displaced.
         """
+        estimate = self._pose(frame, dt_s)
+        if self.breaks is None or not frame.times.is_at_once:
+            return estimate
+        self.breaks.add(frame.seq, (frame.lower, frame.upper), estimate.T_odom_rect, self._map, dt_s)
+        if not self.breaks.fault and not self.breaks.covariance.any():
+            return estimate
+        is_torn = self.breaks.fault and estimate.state is TrackingState.TRACKING
+        state = TrackingState.DEGRADED if is_torn else estimate.state
+        covariance = bounded(estimate.covariance + self.breaks.covariance)
+        return replace(estimate, state=state, covariance=covariance, image_fault=self.breaks.fault)
+
+    def _pose(self, frame: StereoFrame, dt_s: float) -> OdometryEstimate:
+        """Return the pose at a frame, whose images are whole: the algorithm."""
         self.complete()
         dt_s = max(dt_s, 0.0)
         self._step = None

@@ -1,0 +1,77 @@
+"""Images that are whole, but not of one instant or of one geometry: what buses, buffers and stabilisers make of them.
+
+Each function returns images (N, H, W) of one camera; those that it leaves are the same objects. axis 0: a line is a row
+of the raw image, and what follows it is below; 1: it is a column, as of a sensor that was mounted on its side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.uint8]
+Line = int | Callable[[int], int]  # where the image breaks: a line, or that of each image by its number
+
+
+def tear(
+    images: Sequence[Image], line: Line, *, every: int = 1, axis: int = 0, new_below: bool = False, since: int = 1
+) -> list[Image]:
+    """Return images whose lines from one on are those of the image before, in each `every`-th from `since` on.
+
+    new_below: the lines before it are old instead.
+    """
+    torn = list(images)
+    for number in range(max(1, since), len(images)):
+        if (number - since) % every == 0:
+            first, second = images[number], images[number - 1]
+            parts = (second, first) if new_below else (first, second)
+            torn[number] = _joined(parts, _at(line, number), axis)
+    return torn
+
+
+def shift(images: Sequence[Image], by_px: tuple[int, int], *, since: int) -> list[Image]:
+    """Return images that are displaced by (columns, rows) from one on; their edges are repeated."""
+    return warp(images, np.array([[1.0, 0.0, by_px[0]], [0.0, 1.0, by_px[1]]]), since=since)
+
+
+def turn(images: Sequence[Image], angle_deg: float, *, since: int) -> list[Image]:
+    """Return images that are turned about their middle from one on, as by a mirror that has moved."""
+    height, width = images[0].shape
+    return warp(images, cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), angle_deg, 1.0), since=since)
+
+
+def warp(images: Sequence[Image], affine: NDArray[np.float64], *, since: int) -> list[Image]:
+    """Return images that are mapped by an affine (2, 3) from one on; their edges are repeated."""
+    height, width = images[0].shape
+    return [
+        np.asarray(cv2.warpAffine(image, affine, (width, height), borderMode=cv2.BORDER_REPLICATE), np.uint8)
+        if number >= since
+        else image
+        for number, image in enumerate(images)
+    ]
+
+
+def repeat_lines(
+    images: Sequence[Image], line: Line, count: int, *, every: int = 1, axis: int = 0, since: int = 1
+) -> list[Image]:
+    """Return images in which `count` lines from one on are there twice; negative: so many are missing."""
+    found = list(images)
+    for number in range(since, len(images), every):
+        size, at = images[number].shape[axis], _at(line, number)
+        lines = np.arange(size)
+        source = np.where(lines < at, lines, np.clip(lines - count, 0, size - 1))
+        found[number] = np.take(images[number], source, axis=axis)
+    return found
+
+
+def _at(line: Line, number: int) -> int:
+    return line(number) if callable(line) else line
+
+
+def _joined(parts: tuple[Image, Image], line: int, axis: int) -> Image:
+    """Return the lines of the first part before a line, and those of the second one from it on."""
+    before, after = (np.split(part, [line], axis=axis)[number] for number, part in enumerate(parts))
+    return np.ascontiguousarray(np.concatenate([before, after], axis=axis))
