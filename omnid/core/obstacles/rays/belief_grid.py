@@ -230,7 +230,7 @@ class BeliefGrid:
     def _taken(self) -> Floats:
         """Return the probability of a thing in cells, 2 where nothing is known."""
         p = self._p
-        hanging = np.clip(p.shown_weight * (self._shown - p.shown_least), -9.0, 6.0) + np.float32(p.arrival)
+        hanging = np.clip(p.shown_weight * (self._shown - p.shown_least), -9.0, 6.0) + np.float32(p.hanging)
         odds = np.maximum(self.odds, hanging)
         taken = 1 / (1 + np.exp(-odds))
         return np.where((self.known > 0) | (self.odds > 0), taken, np.float32(2)).astype(np.float32)

@@ -80,6 +80,7 @@ class GridParameters:
     was_free: float = 0.01  # probability of a thing in a cell that was free
     comes: float = 2.0  # by which one pair has seen floor, and the next one a thing [nats]
     near_sigma: float = 0.3  # of the range of what hides the nearest floor in view, as a share
-    shown_rate: float = 0.1  # of the mean of single pairs
-    shown_least: float = 0.05  # mean from which something hangs there,
-    shown_weight: float = 60.0  # and its log-odds by this mean
+    hanging: float = -5.0  # log-odds of something that hangs over floor in view
+    shown_rate: float = 0.15  # of the mean of single pairs
+    shown_least: float = 0.025  # mean from which something hangs there,
+    shown_weight: float = 100.0  # and its log-odds by this mean
