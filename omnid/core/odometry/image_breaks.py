@@ -45,6 +45,7 @@ SIGMA_PX: Final = 0.1  # of a flow, because patches err by some hundredths, and 
 LAG_S: Final = 0.003  # standard deviation of the time between the exposures of two cameras that are triggered together
 # Squared Mahalanobis distance of a flow, a sum of two squares, from which on it is an outlier, and costs no more.
 OUTLIER_SQUARED: Final = 32.0
+MOST_SCALE: Final = 25.0  # of the variance of flows: half a pixel; where it is larger, flows are displaced
 GOOD_SHARE: Final = 0.2  # of the flows, that no break displaces: of one camera, or up to a line
 GOOD_SQUARED: Final = -2 * math.log(1 - GOOD_SHARE)  # below which so many sums of two squares of unit variance are
 LINES: Final = 24  # lines that are tried: each has some ten landmarks between it and the next
@@ -346,10 +347,15 @@ def likeliest_break(flow: _Flow, raws: tuple[RawImage, RawImage], focal_px: floa
     """Return the break that flows show beyond doubt; None: there is none."""
     y, null = flow.y, flow.null
     # 1. The null hypothesis, robustly; the scale of what it leaves.
-    x = _robust(null, y, np.zeros(null.shape[2]))
-    left = y - null @ x
+    size = null.shape[2]
+    weak = null.reshape(-1, size)
+    everywhere = np.linalg.solve(weak.T @ weak + np.diag(_prior(size)), weak.T @ y.ravel())
+    solutions = [_robust(null, y, start) for start in (np.zeros(size), everywhere)]
+    lefts = [y - null @ solution for solution in solutions]
+    costs = [np.minimum((each**2).sum(axis=1), OUTLIER_SQUARED * MOST_SCALE).sum() for each in lefts]
+    x, left = (each[int(np.argmin(costs))] for each in (solutions, lefts))
     squared = (left**2).sum(axis=1)
-    scale = max(1.0, float(np.quantile(squared, GOOD_SHARE)) / GOOD_SQUARED)
+    scale = float(np.clip(np.quantile(squared, GOOD_SHARE) / GOOD_SQUARED, 1.0, MOST_SCALE))
     outlier = OUTLIER_SQUARED * scale
     used = squared < outlier
     most_off = int(np.bincount(flow.camera[~used], minlength=2).argmax())
