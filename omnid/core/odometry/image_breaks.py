@@ -349,8 +349,10 @@ def likeliest_break(flow: _Flow, raws: tuple[RawImage, RawImage], focal_px: floa
     # 1. The null hypothesis, robustly; the scale of what it leaves.
     size = null.shape[2]
     weak = null.reshape(-1, size)
-    everywhere = np.linalg.solve(weak.T @ weak + np.diag(_prior(size)), weak.T @ y.ravel())
-    solutions = [_robust(null, y, start) for start in (np.zeros(size), everywhere)]
+    information = weak.T @ weak + np.diag(_prior(size))
+    everywhere: Array = np.asarray(np.linalg.solve(information, weak.T @ y.ravel()), float)
+    nowhere: Array = np.zeros(size)
+    solutions = [_robust(null, y, start) for start in (nowhere, everywhere)]
     lefts = [y - null @ solution for solution in solutions]
     costs = [np.minimum((each**2).sum(axis=1), OUTLIER_SQUARED * MOST_SCALE).sum() for each in lefts]
     x, left = (each[int(np.argmin(costs))] for each in (solutions, lefts))
