@@ -18,7 +18,7 @@ from calib.errors import CalibError
 from calib.foreign_models import camera_of, camera_of_lists
 from calib.models.camera import Array, OmniCamera
 from calib.models.ocam import View
-from calib.ocam_file import parse_ocam
+from calib.ocam_file import is_ocam, parse_ocam
 from calib.rig import Rig
 from calib.rig_frame import is_turned_over, rig_between, turned_over_note
 from calib.text_files import MAX_JSON_BYTES, load_mapping
@@ -75,7 +75,8 @@ def import_pair(
 def read_camera(path: Path, view: View = "mirror", warn: Warn = silent) -> CameraFile:
     """Read the file of one camera, of any of these programs, told by its content. view: of OCamCalib's."""
     data, name = read_bytes(path, MAX_JSON_BYTES), str(path)
-    if path.suffix.lower() not in (".yaml", ".yml", ".json"):
+    is_named = path.suffix.lower() in (".yaml", ".yml", ".json", ".xml")
+    if not is_named or is_ocam(data, name):
         return CameraFile(parse_ocam(data, view, name))
     values = load_mapping(data, name)
     try:
@@ -146,7 +147,7 @@ def _camodocal(values: Mapping[str, Any], warn: Warn) -> OmniCamera:
             found[names.get(str(key), str(key))] = float(value)
     missing = [key for key, ours in names.items() if ours not in found]
     if missing:
-        raise CalibError(f"{model} camera: expected {', '.join(missing)} in its projection_parameters, found none")
+        raise CalibError(f"{kind}: expected {', '.join(missing)} among its parameters, found {shown(sorted(found))}")
     return camera_of(model, found, (_whole(values, WIDTH), _whole(values, HEIGHT)), warn)
 
 

@@ -64,7 +64,7 @@ def camera_of_lists(
     warn: Warn = silent,
 ) -> OmniCamera:
     """Return the camera of the named projection and distortion. Errors begin with the key that is wrong."""
-    projection, distortion = names
+    projection, distortion = (name.lower() for name in names)
     if not distortion and "-" in projection:  # as on Kalibr's command line
         projection, _, distortion = projection.partition("-")
     distortion = DISTORTIONS.get(distortion, distortion)

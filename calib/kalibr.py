@@ -157,8 +157,9 @@ def _times(lower: ChainCamera, upper: ChainCamera) -> ShutterTimes:
 
 def _cameras(values: Mapping[str, Any]) -> dict[str, ChainCamera]:
     """Return cam0, cam1, ... in ascending order."""
-    if "value0" in values:
-        return _basalt(values["value0"])
+    values = values.get("value0", values)
+    if not isinstance(values, Mapping) or "T_imu_cam" in values:
+        return _basalt(values)
     names = [key for key in values if re.fullmatch(r"cam\d{1,3}", key)]
     if len(names) < 2:
         others = shown(sorted(values)) if values else "none"
@@ -170,7 +171,9 @@ def _cameras(values: Mapping[str, Any]) -> dict[str, ChainCamera]:
     for key in sorted(names, key=lambda key: int(key[3:])):
         if not isinstance(values[key], Mapping):
             raise CalibError(f"{key}: expected a table, found {shown(values[key])}")
-        found[key] = convert(ChainCamera, {name: values[key][name] for name in known if name in values[key]}, (key,))
+        found[key] = convert(
+            ChainCamera, {name: values[key][name] for name in known if values[key].get(name) is not None}, (key,)
+        )
     return found
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -65,11 +66,7 @@ def parse_ocam(text: str | bytes, view: View = "mirror", name: str = "calib_resu
     """Parse the camera of a calib_results.txt's text; the inverse polynomial, of any length, is not used."""
     if len(text) > MAX_BYTES:
         raise CalibError(f"{name}: expected at most {MAX_BYTES} bytes, found {len(text)}")
-    lines = [
-        _Line(number, line.split(), name)
-        for number, line in enumerate(decode(text, name).splitlines(), 1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
+    lines = _lines(text, name)
     if len(lines) < 4:
         raise CalibError(
             f"{name}: expected lines of numbers (polynomial, inverse polynomial, centre, affine, image size), found "
@@ -83,6 +80,20 @@ def parse_ocam(text: str | bytes, view: View = "mirror", name: str = "calib_resu
         return OcamCamera(polynomial, (row, column), (c, d, e), size, view)
     except CalibError as error:
         raise CalibError(f"{name}: {error}") from error
+
+
+def is_ocam(text: str | bytes, name: str) -> bool:
+    """True for a text whose first line that is no comment is a count and numbers."""
+    return next((line.words[0].isdigit() and len(line.words) > 1 for line in _lines(text, name)), False)
+
+
+def _lines(text: str | bytes, name: str) -> list[_Line]:
+    """Return the lines of numbers, without comments (# here, % in MATLAB) and commas."""
+    found = [
+        _Line(number, re.split(r"[#%]", line, maxsplit=1)[0].replace(",", " ").split(), name)
+        for number, line in enumerate(decode(text, name).splitlines(), 1)
+    ]
+    return [line for line in found if line.words]
 
 
 def _size(line: _Line) -> tuple[int, int]:
@@ -100,7 +111,7 @@ def read_transform(path: Path) -> Array:
             return _named(table_of(data))
         if path.suffix in (".yaml", ".yml", ".json"):
             return _named(dict(load_mapping(data, name)))
-        words = " ".join(line.partition("#")[0] for line in decode(data, name).splitlines()).replace(",", " ").split()
+        words = [word for line in _lines(data, name) for word in line.words]
         try:
             numbers = [float(word) for word in words]
         except ValueError as error:

@@ -23,8 +23,8 @@ MAX_JSON_BYTES: Final = 1 << 21
 MAX_NODES: Final = 2000
 MAX_DEPTH: Final = 16  # Lists and mappings within each other: enough, as those of a camera are four deep.
 MAX_SCALAR: Final = 1000  # Characters of a value: enough for names of topics and paths.
-# The head of OpenCV's FileStorage is no directive of YAML; its tag marks a mapping of rows, cols and data.
-_OPENCV_HEAD: Final = re.compile(r"\A\s*%YAML:[^\n]*\n(\s*---[^\n]*\n)?")
+# The head of OpenCV's FileStorage, or of a YAML of another version; the tag marks a mapping of rows, cols and data.
+_HEAD: Final = re.compile(r"\A\s*%YAML[:\s][^\n]*\n(\s*---[^\n]*\n)?")
 _OPENCV_TAG: Final = re.compile(r"!!opencv-(nd-)?matrix\b")
 
 
@@ -54,12 +54,16 @@ def load_mapping(data: str | bytes, name: str) -> Mapping[str, Any]:
     try:
         if text.lstrip().startswith("{"):
             values = _json(text)
+        if text.lstrip().startswith("<"):
+            raise ValueError("it is XML: write it as .yml, with OpenCV's FileStorage")
         if values is None:
             values = _yaml(text)
-    except (YAMLError, ValueError, RecursionError, TypeError, LookupError, AttributeError) as error:
+    # AssertionError, too, and more are raised by ruamel.yaml for damaged texts.
+    except (YAMLError, ValueError, RecursionError, TypeError, LookupError, AttributeError, AssertionError) as error:
         raise CalibError(f"{name}: not a YAML file: {' '.join(str(error).split())[:200]}") from error
     if not isinstance(values, Mapping):
-        raise CalibError(f"{name}: expected a YAML mapping, found {type(values).__name__}")
+        found = "nothing" if values is None else type(values).__name__
+        raise CalibError(f"{name}: expected a YAML mapping, found {found}")
     return {str(key): _with_rows(value) for key, value in values.items()}
 
 
@@ -77,8 +81,8 @@ def _yaml(text: str) -> Any:
     """Parse YAML; raise ValueError for one beyond the limits, and ruamel.yaml's error for a malformed one."""
     if len(text) > MAX_BYTES:
         raise ValueError(f"expected at most {MAX_BYTES} characters, found {len(text)}")
-    # 1. OpenCV's head and tags, and tabs, which YAML does not take for blanks.
-    text = _OPENCV_TAG.sub("", _OPENCV_HEAD.sub("", text)).expandtabs(2)
+    # 1. The head, OpenCV's tags, and tabs, which YAML does not take for blanks.
+    text = _OPENCV_TAG.sub("", _HEAD.sub("", text)).expandtabs(2)
     depth = nodes = 0
     # 2. The events name anchors and aliases without resolving them.
     for event in YAML(typ="safe", pure=True).parse(text):

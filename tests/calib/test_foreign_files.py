@@ -15,6 +15,7 @@ from calib.errors import CalibError
 from calib.kalibr import parse_chain
 from calib.models.camera import Array, OmniCamera
 from calib.models.lens import DoubleSphereCamera, EquidistantCamera, ExtendedUnifiedCamera
+from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
 from tests.calib.test_kalibr import BOTH, CAMERA, NAMED, T_UPPER_LOWER, chain, warnings_of
 
@@ -62,6 +63,8 @@ def as_json() -> str:
     [
         ("%YAML:1.0\n---\n" + PLAIN, ""),
         ("%YAML:1.0\n" + PLAIN, ""),
+        ("%YAML 1.0\n---\n" + PLAIN, ""),
+        (PLAIN.replace("omni\n", "Omni\n").replace("radtan", "RadTan") + "  timeshift_cam_imu: null\n", ""),
         ("%YAML:1.0\n---\n" + inverses(opencv_matrix), "cam0.T_imu_cam is the inverse of T_cam_imu, and is"),
         (inverses(yaml_matrix), "cam1.T_imu_cam is the inverse of T_cam_imu"),
         (PLAIN.encode("utf-8-sig"), ""),
@@ -162,6 +165,7 @@ FOCAL, CENTER, SIZE = (310.0, 315.0), (380.0, 390.0), (768, 770)
 def test_reads_basalts_calibration(text: str, expected: OmniCamera) -> None:
     rig = parse_chain(text, "c.json")
     assert rig.lower.camera == rig.upper.camera == expected
+    assert parse_chain(json.dumps(json.loads(text)["value0"])).lower.camera == expected, "also without its wrapper"
     np.testing.assert_allclose(rig.upper.T_cam_rig, BOTH[1], atol=1e-12)
 
 
@@ -171,6 +175,8 @@ def test_reads_basalts_calibration(text: str, expected: OmniCamera) -> None:
         (basalt("bal"), "camera_type: expected ds, kb4, eucm, ucm, pinhole, pinhole-radtan8, fov, found 'bal'"),
         (basalt("ds", xi=-0.27), "expected the number 'alpha' of its model"),
         ('{"value0": {"T_imu_cam": []}}', "expected basalt's calibration with T_imu_cam, intrinsics and resolution"),
+        ("<?xml version='1.0'?>\n<opencv_storage></opencv_storage>", "it is XML: write it as .yml, with OpenCV's"),
+        ("", "expected a YAML mapping, found nothing"),
         ("Camera1.fx: 190.9\nCamera1.fy: 190.9\n", r"found \['Camera1.fx', 'Camera1.fy'\]; files of one camera each"),
     ],
 )
@@ -217,6 +223,8 @@ K_OPENCV = "!!opencv-matrix\n  rows: 3\n  cols: 3\n  dt: d\n  data: [440., 0., 3
         ("a.yaml", json.dumps(message(camera_info("rational_polynomial", [*RADTAN, 0, 0, 0, 0]))) + "\n---\n", PINHOLE),
         ("a.yaml", json.dumps(camera_info("equidistant", [0.01, 0, 0, 0])), EquidistantCamera(
             (0.01, 0, 0, 0), (440.0, 442.0), (320.0, 240.0), (640, 480))),
+        ("a.yaml", "# polynomial\n3 -200 0 0.001\n240 320\n1 0 0\n480 640\n", OcamCamera(
+            (-200.0, 0.0, 0.001), (240.0, 320.0), (1.0, 0.0, 0.0), (640, 480), "mirror")),
         ("a.yml", f"%YAML:1.0\n---\nimage_width: 640\nimage_height: 480\ncamera_matrix: {K_OPENCV}"
          f"distortion_coefficients: !!opencv-matrix\n  rows: 4\n  cols: 1\n  dt: d\n  data: {RADTAN}\n", PINHOLE),
         ("a.yaml", "camera_model: pinhole\nintrinsics: [440, 442, 320, 240]\ndistortion_model: radial-tangential\n"

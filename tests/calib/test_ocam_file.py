@@ -37,7 +37,8 @@ T_LOWER_UPPER = se3.exp([0.02, -0.01, -0.2, 0.02, 0.05, 0.3])
 
 
 def test_parses_every_number_as_the_toolbox_defines_it() -> None:
-    for text in (TEXT, TEXT.encode(), TEXT.replace("\n", "\r\n")):
+    with_notes = TEXT.replace("480 640", "480, 640  # height, width").replace("318.540278", "318.540278 % centre")
+    for text in (TEXT, TEXT.encode(), TEXT.replace("\n", "\r\n"), with_notes):
         assert parse_ocam(text, "direct") == OcamCamera(
             (-231.5, 0.0, 1.54e-3, -5.96e-7, 1.59e-9),
             (240.378942, 318.540278),
