@@ -110,7 +110,7 @@ class BeliefGrid:
         # Who comes onto floor that was free is seen by one pair.
         was_free = (self._taken() < p.was_free).view(np.uint8)
         changed = np.zeros((CELLS, CELLS), np.uint8)
-        was_seen = self._before[rows, columns] < -p.comes
+        was_seen = self._before[rows, columns] < -p.was_seen
         changed[rows, columns] = (found[kernels.RATIO] > p.comes) & was_seen & in_view & (was_free[rows, columns] > 0)
         # 2. What is new of it.
         odds, before = self.odds[rows, columns], self._before[rows, columns]
@@ -151,7 +151,10 @@ class BeliefGrid:
         view = np.array([*eye, self._max_range_m, CELL_M])
         # Who comes is wider than a speck of noise.
         wide = cv2.morphologyEx(changed | hides, cv2.MORPH_OPEN, SQUARE)
-        kernels.first_changed(wide, view, self._azimuths + yaw, arrived)
+        kernels.first_changed(wide, was_free, view, self._azimuths + yaw, p.behind_m, arrived)
+        for run in _runs(np.isfinite(arrived)):
+            if len(run) * float(arrived[run].mean()) * math.tau / SECTORS < p.comes_m:
+                arrived[run] = np.nan
         is_nearer = arrived < belief.ends_m[0]
         arrivals = Arrivals(
             np.where(is_nearer, belief.ends_m[0], arrived).astype(np.float32),

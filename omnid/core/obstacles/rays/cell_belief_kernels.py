@@ -182,23 +182,30 @@ def too_near(taken: Floats, states: Bytes, flooded: Bytes, origin: Doubles, angl
             r += 0.5 * cell
 
 
-@compiled("(u1[:, ::1], f8[::1], f8[::1], f8[::1])", writes=("ranges",))
-def first_changed(changed: Bytes, origin: Doubles, angles: Doubles, ranges: Doubles) -> None:
-    """Write the ranges (N,) from the viewpoint to the first cell that is 1 along directions (N,), NaN without one.
+@compiled("(u1[:, ::1], u1[:, ::1], f8[::1], f8[::1], f8, f8[::1])", writes=("ranges",))
+def first_changed(
+    changed: Bytes, was_free: Bytes, origin: Doubles, angles: Doubles, behind_m: float, ranges: Doubles
+) -> None:
+    """Write the ranges (N,) from the viewpoint to the first cell that is changed along directions (N,), NaN: none.
 
-    changed (H, W); origin (4,): viewpoint in cells, longest way [m], size of a cell [m].
+    changed, was_free (H, W): 1 where so; what comes hides floor that was free for behind_m. origin (4,): viewpoint in
+    cells, longest way [m], size of a cell [m].
     """
     height, width = changed.shape
     cell = origin[3]
     for n in range(len(angles)):
         dx, dy = math.cos(angles[n]) / cell, math.sin(angles[n]) / cell
         ranges[n] = np.nan
-        r = cell
+        r, begin = cell, -1.0
         while r < origin[2]:
             i, j = math.floor(origin[1] + r * dy), math.floor(origin[0] + r * dx)
             if i < 0 or j < 0 or i >= height or j >= width:
                 break
-            if changed[i, j]:
-                ranges[n] = r
+            if begin < 0.0 and changed[i, j]:
+                begin = r
+            if begin >= 0.0 and not was_free[i, j]:
+                break
+            if begin >= 0.0 and r - begin >= behind_m:
+                ranges[n] = begin
                 break
             r += 0.5 * cell

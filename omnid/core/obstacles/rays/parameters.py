@@ -35,7 +35,7 @@ class RayParameters:
     surface_noise: float = 0.4  # of the best surface where there is none [nats]
     noise_share: float = 0.4  # sigma of a step by noise alone, by the noise of a pixel of both views
     grey_share: float = 0.06  # least sigma of the floor's grey, by the grey,
-    near_grey_share: float = 0.02  # and where it is known at that range
+    near_grey_share: float = 0.01  # and where it is known at that range
     # Temperatures, as neighbouring bins and directions are not independent.
     w_floor: float = 0.15
     w_edge: float = 0.5
@@ -78,7 +78,10 @@ class GridParameters:
     near_m: float = 0.06  # and the length of these bins
     leaves_m: float = 0.6  # from the nearest floor in view, within which a wall leaves the view
     was_free: float = 0.01  # probability of a thing in a cell that was free
-    comes: float = 2.0  # by which one pair has seen floor, and the next one a thing [nats]
+    was_seen: float = 0.5  # by which one pair has seen floor,
+    comes: float = 2.0  # and the next one a thing [nats]
+    comes_m: float = 0.2  # least width of who comes,
+    behind_m: float = 0.35  # and of floor that was free behind
     near_sigma: float = 0.3  # of the range of what hides the nearest floor in view, as a share
     hanging: float = -5.0  # log-odds of something that hangs over floor in view
     shown_rate: float = 0.15  # of the mean of single pairs
