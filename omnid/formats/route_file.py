@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Final, Literal, TypeAlias
 
+import msgspec
 import numpy as np
+from msgspec import Meta, Struct
 
 from omnid.core.navigation.path import FARTHEST_M
 from omnid.core.navigation.requests import route_name
@@ -23,8 +26,6 @@ SUFFIX: Final = ".route.json"
 # has MOST_POINTS points and one keyframe at most for each of them, which is less than 4 MB.
 MAX_BYTES: Final = 8 << 20
 MOST_KEYFRAMES: Final = 20_000
-# Speeds and turns that no robot on wheels has are those of a damaged file.
-FASTEST_MPS: Final = 20.0
 COLUMNS: Final = (
     "x_m",
     "y_m",
@@ -35,7 +36,33 @@ COLUMNS: Final = (
     "in_keyframe_y_m",
     "in_keyframe_yaw_rad",
 )
-_KEYS: Final = {"format", "version", "name", "created_s", "map", "columns", "points", "keyframes", "crc32"}
+_NO_ROUTE: Final = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)  # raised for bytes that are none
+
+_Position: TypeAlias = Annotated[float, Meta(ge=-FARTHEST_M, le=FARTHEST_M)]
+_Yaw: TypeAlias = Annotated[float, Meta(ge=-1e4, le=1e4)]
+_Speed: TypeAlias = Annotated[float, Meta(ge=-20.0, le=20.0)]  # no robot on wheels has another
+_Number: TypeAlias = Annotated[int, Meta(ge=0, lt=1 << 62)]
+_Keyframe: TypeAlias = Annotated[int, Meta(ge=NO_KEYFRAME, lt=1 << 62)]
+_Point: TypeAlias = tuple[_Position, _Position, _Yaw, _Speed, _Keyframe, _Position, _Position, _Yaw]  # the COLUMNS
+
+
+class _Head(Struct):
+    """What tells whether a file can be read."""
+
+    format: Literal["omnid route"]
+    version: int
+
+
+class _Content(_Head, forbid_unknown_fields=True):
+    """A file of this version."""
+
+    name: str
+    created_s: Annotated[int, Meta(ge=0, lt=1 << 40)]
+    map: Annotated[str, Meta(max_length=4096)]
+    columns: Annotated[list[str], Meta(max_length=len(COLUMNS))]
+    points: Annotated[list[_Point], Meta(min_length=2, max_length=MOST_POINTS)]
+    keyframes: Annotated[list[tuple[_Number, _Number]], Meta(max_length=MOST_KEYFRAMES)]  # id, stamp [ns]
+    crc32: int
 
 
 def route_bytes(route: Route) -> bytes:
@@ -62,74 +89,34 @@ def parse_route(content: bytes, name: str) -> Route:
     if len(content) > MAX_BYTES:
         raise OmnidError(f"{name}: {len(content) >> 20} MB: expected a route of at most {MAX_BYTES >> 20} MB")
     try:
-        found = json.loads(content)
-    except (ValueError, RecursionError):
-        raise OmnidError(f"{name}: this is no route file: expected JSON, see docs/formats.md") from None
-    if not isinstance(found, dict) or found.get("format") != FORMAT:
-        raise OmnidError(f'{name}: this is no route file: expected "format": "{FORMAT}"')
-    if found.get("version") != VERSION:
-        raise OmnidError(
-            f"{name}: this is a route of version {ascii(found.get('version'))[:20]}, expected {VERSION}: "
-            "teach it again, or update omnid"
-        )
+        version = msgspec.json.decode(content, type=_Head).version
+    except _NO_ROUTE:
+        raise OmnidError(f'{name}: this is no route file: expected JSON with "format": "{FORMAT}"') from None
+    if version != VERSION:
+        raise OmnidError(f"{name}: this is a route of version {version}, expected {VERSION}: teach it again, or update")
     try:
-        return _route(found)
-    except OmnidError as error:
+        found = msgspec.json.decode(content, type=_Content)
+        if tuple(found.columns) != COLUMNS:
+            raise OmnidError(f"expected the columns {', '.join(COLUMNS)}")
+        if found.crc32 != _checksum(found.name, found.points, found.keyframes):
+            raise OmnidError("the checksum is wrong")
+        numbers = np.array(found.points, np.float64)
+        keyframes = np.array([point[4] for point in found.points], np.int64)
+        return Route(
+            route_name(found.name),
+            numbers[:, :3],
+            numbers[:, 3],
+            keyframes,
+            numbers[:, 5:],
+            dict(found.keyframes),
+            found.created_s,
+            found.map,
+        )
+    except (*_NO_ROUTE, OmnidError) as error:
         raise OmnidError(f"{name}: the route is damaged: {error}: teach it again") from None
 
 
-def _route(found: dict[str, Any]) -> Route:
-    """Return the route of a file's content. Raise OmnidError with what is wrong."""
-    _require(found.keys() == _KEYS and found["columns"] == list(COLUMNS), "its keys are not those of a route")
-    title, map_name = found["name"], found["map"]
-    _require(isinstance(title, str) and isinstance(map_name, str) and len(map_name) <= 4096, "its names are no texts")
-    points = _rows(found["points"], len(COLUMNS), MOST_POINTS)
-    keyframes = _rows(found["keyframes"], 2, MOST_KEYFRAMES)
-    _require(all(type(v) is int and 0 <= v < 2**62 for row in keyframes for v in row), "its keyframes are no numbers")
-    _require(len(points) >= 2, "it has no points")
-    _require(all(type(row[4]) is int and NO_KEYFRAME <= row[4] < 2**62 for row in points), "a keyframe is no number")
-    _require(found["crc32"] == _checksum(title, points, keyframes), "the checksum is wrong")
-    numbers = np.array(points, np.float64)
-    _require(bool(np.isfinite(numbers).all()), "a number is not finite")
-    _require(
-        float(np.abs(numbers[:, [0, 1, 5, 6]]).max()) <= FARTHEST_M
-        and float(np.abs(numbers[:, [2, 7]]).max()) <= 1e4
-        and float(np.abs(numbers[:, 3]).max()) <= FASTEST_MPS,
-        "a number is out of range",
-    )
-    created = found["created_s"]
-    _require(type(created) is int and 0 <= created < 2**40, "its time is no number")
-    return Route(
-        route_name(title),
-        numbers[:, :3],
-        numbers[:, 3],
-        np.array([row[4] for row in points], np.int64),
-        numbers[:, 5:],
-        {id: stamp for id, stamp in keyframes},
-        created,
-        map_name,
-    )
-
-
-def _rows(value: Any, width: int, most: int) -> list[list[Any]]:
-    """Return a value if it is a list of at most `most` rows of `width` numbers. Raise OmnidError for any other."""
-    _require(isinstance(value, list) and len(value) <= most, f"expected a list of at most {most} rows")
-    for row in value:
-        _require(
-            isinstance(row, list)
-            and len(row) == width
-            and all(type(v) in (int, float) and abs(v) < 2.0**63 for v in row),
-            f"expected {width} numbers a row",
-        )
-    return list(value)
-
-
-def _require(holds: bool, text: str) -> None:
-    if not holds:
-        raise OmnidError(text)
-
-
-def _checksum(name: str, points: list[list[Any]], keyframes: list[list[Any]]) -> int:
+def _checksum(name: str, points: Sequence[Sequence[float]], keyframes: Sequence[Sequence[int]]) -> int:
     return zlib.crc32(json.dumps([name, points, keyframes], separators=(",", ":")).encode())
 
 
