@@ -316,9 +316,10 @@ def _load() -> None:
 
 
 def _compile_serialisers() -> None:
-    from omnid.transport.codec import PATH_SCHEMA, STRING_SCHEMA, compile_serialisers
+    from omnid.transport.codec import compile_serialisers
+    from omnid.transport.topics import PUBLISHED, command_topics
 
-    compile_serialisers(PATH_SCHEMA, STRING_SCHEMA)
+    compile_serialisers({topic.schema for topic in PUBLISHED.values()} | set(command_topics(()).values()))
 
 
 def _import_rarely_used() -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple, Protocol, Self, TypeVar
@@ -46,21 +46,6 @@ BOOL_SCHEMA = "std_msgs/msg/Bool"
 PATH_SCHEMA = "nav_msgs/msg/Path"
 STRING_SCHEMA = "std_msgs/msg/String"
 SCAN_SCHEMA = "sensor_msgs/msg/LaserScan"
-# Types whose serialisers are compiled at the start of a run, see compile_serialisers.
-SCHEMAS = (
-    ODOMETRY_SCHEMA,
-    POSE_SCHEMA,
-    MAP_POSE_SCHEMA,
-    TRANSFORM_SCHEMA,
-    POINT_CLOUD_SCHEMA,
-    DIAGNOSTICS_SCHEMA,
-    TWIST_SCHEMA,
-    VECTOR_SCHEMA,
-    GRID_SCHEMA,
-    HEADER_SCHEMA,
-    CLOCK_SCHEMA,
-    SCAN_SCHEMA,
-)
 NS_PER_S = 1_000_000_000
 MAX_SECONDS = 2**31 - 1  # builtin_interfaces/msg/Time counts seconds in an int32
 OK, WARN, ERROR, STALE = range(4)  # levels of diagnostic_msgs/msg/DiagnosticStatus
@@ -154,9 +139,9 @@ def _typestore() -> Typestore:
     return get_typestore(Stores.ROS2_HUMBLE)
 
 
-def compile_serialisers(*more: str) -> None:
-    """Compile all serialisers now: compilation at first use would delay all threads, that of the motor included."""
-    for schema in (*SCHEMAS, *more):
+def compile_serialisers(schemas: Iterable[str]) -> None:
+    """Compile serialisers now: compilation at first use would delay all threads, that of the motor included."""
+    for schema in schemas:
         _typestore().get_msgdef(schema)
 
 

@@ -30,11 +30,9 @@ from omnid.core.control.heading_controller import Setpoint
 from omnid.errors import OmnidError
 from omnid.transport import topics
 from omnid.transport.decode import (
-    beyond_the_floor,
+    ASIDE_NAMES,
     bool_from_cdr,
     heading_from_cdr,
-    is_plain_twist,
-    plain_twist_from_cdr,
     stamp_from_cdr,
     twist_from_cdr,
 )
@@ -46,10 +44,7 @@ from omnid.transport.topics import ARM, HEADING, SENSOR_TOPICS, STOP, TWIST
 LONGEST_PAYLOAD: Final = 4096  # bytes
 LONGEST_SAMPLE: Final = 8192  # bytes
 MAX_SPEED_MPS, MAX_YAW_RATE_RADPS, MAX_HEADING_RAD = 20.0, 50.0, 1000.0  # larger numbers are faults of the sender
-
-
 LEAST_SPEED: Final = 1e-3  # m/s, rad/s; less in another direction is noise of a stick, more is another motion
-
 ASIDE: Final = "not possible with a differential drive"
 MALFORMED: Final = "malformed"
 SAME_NAME: Final = "another robot has this name"
@@ -76,11 +71,10 @@ class CommandMessage(NamedTuple):
 
 def twist_command(payload: bytes) -> CommandMessage:
     """Decode a speed and a yaw rate. Raise RefusedCommand or OmnidError for anything else."""
-    decode = plain_twist_from_cdr if is_plain_twist(payload) else twist_from_cdr
-    stamp_ns, frame, velocity_mps, yaw_rate_radps = decode(payload)
+    stamp_ns, frame, velocity_mps, yaw_rate_radps, aside = twist_from_cdr(payload)
     _check_frame(frame, "base_link")
     setpoint = Setpoint(_within(velocity_mps, MAX_SPEED_MPS), None, _within(yaw_rate_radps, MAX_YAW_RATE_RADPS))
-    for name, speed in beyond_the_floor(payload).items():
+    for name, speed in zip(ASIDE_NAMES, aside, strict=True):
         if not abs(speed) <= LEAST_SPEED:
             raise RefusedCommand(ASIDE, f"twist.{name} = {speed:g} is {ASIDE}; send linear.x and angular.z only")
     return CommandMessage(stamp_ns, setpoint)

@@ -33,6 +33,7 @@ from omnid.transport.status_names import Key
 Array = NDArray[np.float64]
 Frames = tuple[str, str]
 _PLAIN_TWIST_BYTES = 4 + 6 * 8  # encapsulation header, two vectors
+ASIDE_NAMES: Final = ("linear.y", "linear.z", "angular.x", "angular.y")
 # A quaternion whose norm differs from 1 by more than this is refused: more than rounding to float32 or to six decimals
 # makes, and less than a quaternion of zeros or one that was scaled.
 QUATERNION_TOLERANCE = 1e-3
@@ -48,21 +49,13 @@ ALIGNED = 0.999_999  # w of a quaternion that is taken for no rotation
 
 
 class TwistRecord(NamedTuple):
-    """Content of a TwistStamped of a ground robot."""
+    """Content of a TwistStamped, or of a Twist, which has no stamp (0) and no frame."""
 
     stamp_ns: int
     frame: str
     velocity_mps: float
     yaw_rate_radps: float
-
-
-class HeadingRecord(NamedTuple):
-    """Content of a Vector3Stamped that commands a heading."""
-
-    stamp_ns: int
-    frame: str
-    velocity_mps: float
-    heading_rad: float
+    aside: tuple[float, float, float, float]  # what no base with two driven sides has: see ASIDE_NAMES
 
 
 class PlanarPath(NamedTuple):
@@ -185,55 +178,42 @@ class NavigationReport:
 
 
 def twist_from_cdr(payload: bytes) -> TwistRecord:
-    """Decode a TwistStamped; its numbers need not be finite. Raise OmnidError for any other bytes."""
-    message = message_from_cdr(payload, ros.geometry_msgs__msg__TwistStamped)
-    return TwistRecord(
-        unchecked_stamp_ns(message.header.stamp),
-        message.header.frame_id,
-        message.twist.linear.x,
-        message.twist.angular.z,
-    )
+    """Decode a TwistStamped, or a Twist, whose length no TwistStamped has; its numbers need not be finite.
 
-
-def is_plain_twist(payload: bytes) -> bool:
-    """True if a payload has the length of a geometry_msgs/msg/Twist, which no TwistStamped has."""
-    return len(payload) == _PLAIN_TWIST_BYTES
-
-
-def plain_twist_from_cdr(payload: bytes) -> TwistRecord:
-    """Decode a Twist, which has no stamp (0) and no frame. Raise OmnidError for any other bytes."""
-    twist = message_from_cdr(payload, ros.geometry_msgs__msg__Twist)
-    return TwistRecord(0, "", twist.linear.x, twist.angular.z)
-
-
-def beyond_the_floor(payload: bytes) -> dict[str, float]:
-    """Return the speeds of a TwistStamped or Twist, by name, that no base with two driven sides has."""
-    if is_plain_twist(payload):
-        twist = message_from_cdr(payload, ros.geometry_msgs__msg__Twist)
+    Raise OmnidError for any other bytes.
+    """
+    if len(payload) == _PLAIN_TWIST_BYTES:
+        stamp_ns, frame, twist = 0, "", message_from_cdr(payload, ros.geometry_msgs__msg__Twist)
     else:
-        twist = message_from_cdr(payload, ros.geometry_msgs__msg__TwistStamped).twist
-    named = {f"linear.{axis}": getattr(twist.linear, axis) for axis in "yz"}
-    return named | {f"angular.{axis}": getattr(twist.angular, axis) for axis in "xy"}
+        message = message_from_cdr(payload, ros.geometry_msgs__msg__TwistStamped)
+        stamp_ns, frame, twist = unchecked_stamp_ns(message.header.stamp), message.header.frame_id, message.twist
+    linear, angular = twist.linear, twist.angular
+    return TwistRecord(stamp_ns, frame, linear.x, angular.z, (linear.y, linear.z, angular.x, angular.y))
 
 
-def heading_from_cdr(payload: bytes) -> HeadingRecord:
-    """Decode a Vector3Stamped; its numbers need not be finite. Raise OmnidError for any other bytes."""
+def heading_from_cdr(payload: bytes) -> tuple[int, str, float, float]:
+    """Decode a Vector3Stamped that commands a heading: its stamp [ns], frame, speed [m/s] and heading [rad].
+
+    Its numbers need not be finite. Raise OmnidError for any other bytes.
+    """
     message = message_from_cdr(payload, ros.geometry_msgs__msg__Vector3Stamped)
-    return HeadingRecord(
-        unchecked_stamp_ns(message.header.stamp), message.header.frame_id, message.vector.x, message.vector.z
-    )
+    header, vector = message.header, message.vector
+    return unchecked_stamp_ns(header.stamp), header.frame_id, vector.x, vector.z
 
 
 def stamp_from_cdr(payload: bytes) -> int:
     """Decode the stamp of a Header, ns; it may be invalid. Raise OmnidError for any other bytes."""
-    message = message_from_cdr(payload, ros.std_msgs__msg__Header)
-    return unchecked_stamp_ns(message.stamp)
+    return unchecked_stamp_ns(message_from_cdr(payload, ros.std_msgs__msg__Header).stamp)
 
 
 def bool_from_cdr(payload: bytes) -> bool:
     """Decode a Bool. Raise OmnidError for any other bytes."""
-    message = message_from_cdr(payload, ros.std_msgs__msg__Bool)
-    return bool(message.data)
+    return bool(message_from_cdr(payload, ros.std_msgs__msg__Bool).data)
+
+
+def string_from_cdr(payload: bytes) -> str:
+    """Decode a String. Raise OmnidError for any other bytes."""
+    return message_from_cdr(payload, ros.std_msgs__msg__String).data
 
 
 def unchecked_stamp_ns(stamp: ros.builtin_interfaces__msg__Time) -> int:
@@ -276,12 +256,6 @@ def path_from_cdr(payload: bytes) -> PlanarPath:
     xy = np.array([_planar_position(entry.pose) for entry in message.poses])
     stamp_ns = unchecked_stamp_ns(message.header.stamp)
     return PlanarPath(stamp_ns, message.header.frame_id, xy, _planar_heading(message.poses[-1].pose))
-
-
-def string_from_cdr(payload: bytes) -> str:
-    """Decode a String. Raise OmnidError for any other bytes."""
-    message = message_from_cdr(payload, ros.std_msgs__msg__String)
-    return message.data
 
 
 def _planar_position(pose: ros.geometry_msgs__msg__Pose) -> tuple[float, float]:
