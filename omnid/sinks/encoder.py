@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Final, NamedTuple, TypeAlias
+from typing import Final, NamedTuple, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,20 +19,10 @@ from omnid.messages import GridUpdate, MapUpdate, NavigationUpdate, ObstacleRing
 from omnid.navigation_state import NavigationState
 from omnid.tracking_state import MapState, TrackingState
 from omnid.transport import codec
-from omnid.transport.codec import (
-    ERROR,
-    IMU_SCHEMA,
-    OK,
-    SCAN_SCHEMA,
-    WARN,
-    DiagnosticStatus,
-    FrameTransform,
-    moving_cdr,
-    scan_cdr,
-)
-from omnid.transport.sensor_codec import WHEEL_SCHEMA, gyro_cdr, wheel_cdr
+from omnid.transport.codec import ERROR, OK, WARN, DiagnosticStatus, FrameTransform
+from omnid.transport.sensor_codec import gyro_cdr, wheel_cdr
 from omnid.transport.status_names import NAVIGATION, ODOMETRY, PLACES, Key
-from omnid.transport.topics import MAP_POSE, SCAN
+from omnid.transport.topics import MAP_POSE, PUBLISHED, SCAN
 
 Outgoing: TypeAlias = (
     OdometryUpdate | VelocityCommand | MapUpdate | PlaceUpdate | GridUpdate | ObstacleRing | NavigationUpdate
@@ -60,6 +50,11 @@ class OutgoingMessage(NamedTuple):
     topic: str
     schema: str
     payload: bytes
+
+    @classmethod
+    def on(cls, topic: str, payload: bytes) -> Self:
+        """Return a message on one of the topics that are published."""
+        return cls(topic, PUBLISHED[topic].schema, payload)
 
 
 class MapEncoding(NamedTuple):
@@ -93,83 +88,61 @@ class Encoder:
 
     def __call__(self, message: Outgoing) -> Iterator[OutgoingMessage]:
         """Yield the encoded messages of a message."""
+        stamp_ns = self.unix_ns(message.stamp_ns)
         match message:
             case OdometryUpdate():
-                yield from self._poses(message)
-            case VelocityCommand(stamp_ns, velocity_mps, _, yaw_rate_radps):
-                payload = codec.twist_stamped_cdr(self.unix_ns(stamp_ns), "base_link", velocity_mps, yaw_rate_radps)
-                yield OutgoingMessage("drive", codec.TWIST_SCHEMA, payload)
+                yield from self._poses(message, stamp_ns)
+            case VelocityCommand(_, velocity_mps, _, yaw_rate_radps):
+                payload = codec.twist_stamped_cdr(stamp_ns, "base_link", velocity_mps, yaw_rate_radps)
+                yield OutgoingMessage.on("drive", payload)
             case PlaceUpdate():
-                yield from self._map_pose(message)
+                yield from self._map_pose(message, stamp_ns)
             case ObstacleRing():
-                payload = scan_cdr(
-                    self.unix_ns(message.stamp_ns),
-                    "base_link",
-                    message.ranges_m,
-                    message.sigma_m,
-                    (0.0, self._map_encoding.max_range_m),
-                )
-                yield OutgoingMessage(SCAN, SCAN_SCHEMA, payload)
-                payload = moving_cdr(self.unix_ns(message.stamp_ns), "odom", message.moving)
-                yield OutgoingMessage("moving", codec.POINT_CLOUD_SCHEMA, payload)
+                limits_m = 0.0, self._map_encoding.max_range_m
+                scan = codec.scan_cdr(stamp_ns, "base_link", message.ranges_m, message.sigma_m, limits_m)
+                yield OutgoingMessage.on(SCAN, scan)
+                yield OutgoingMessage.on("moving", codec.moving_cdr(stamp_ns, "odom", message.moving))
             case MapUpdate():
-                yield from self._map(message)
+                points = _most_confident(message.points, self._map_encoding.points)
+                cloud = codec.point_cloud_cdr(stamp_ns, "odom", *points, T_frame_points=self.T_base_rig)
+                yield OutgoingMessage.on("cloud", cloud)
             case GridUpdate():
                 grid = message.grid
-                stamp_ns = self.unix_ns(message.stamp_ns)
                 payload = codec.grid_cdr(stamp_ns, "map", grid.cells, grid.cell_m, grid.corner)
-                yield OutgoingMessage("map", codec.GRID_SCHEMA, payload)
+                yield OutgoingMessage.on("map", payload)
             case NavigationUpdate():
-                yield from self._navigation(message)
+                status = navigation_status(message)
+                yield OutgoingMessage.on("navigation", codec.diagnostics_cdr(stamp_ns, [status]))
+                if message.plan is not None:
+                    plan = message.plan
+                    yield OutgoingMessage.on("plan", codec.path_cdr(stamp_ns, plan.frame, plan.xy, plan.heading_rad))
 
-    def _poses(self, odometry: OdometryUpdate) -> Iterator[OutgoingMessage]:
-        stamp_ns = self.unix_ns(odometry.stamp_ns)
+    def _poses(self, odometry: OdometryUpdate, stamp_ns: int) -> Iterator[OutgoingMessage]:
         T_odom_base, covariance, velocity, velocity_covariance = of_base(odometry, self.T_base_rig)
         pose = codec.odometry_cdr(
             stamp_ns, T_odom_base, in_outer_axes(T_odom_base, covariance), velocity, velocity_covariance
         )
-        yield OutgoingMessage("odom", codec.ODOMETRY_SCHEMA, pose)
-        yield OutgoingMessage("pose", codec.POSE_SCHEMA, codec.pose_stamped_cdr(stamp_ns, T_odom_base))
+        yield OutgoingMessage.on("odom", pose)
+        yield OutgoingMessage.on("pose", codec.pose_stamped_cdr(stamp_ns, T_odom_base))
         edge = FrameTransform("odom", "base_link", T_odom_base)
-        yield OutgoingMessage("/tf", codec.TRANSFORM_SCHEMA, codec.transform_cdr(stamp_ns, [edge]))
-        yield from self._motion(odometry)
-
-    def _motion(self, odometry: OdometryUpdate) -> Iterator[OutgoingMessage]:
-        """Yield the samples of wheels and gyro up to the pair; those after it come with the next one again."""
+        yield OutgoingMessage.on("/tf", codec.transform_cdr(stamp_ns, [edge]))
+        # Samples of wheels and gyro up to the pair; those after it come with the next one again.
         for sample in odometry.motion:
             if sample.stamp_ns > odometry.stamp_ns:
                 continue
-            stamp_ns = self.unix_ns(sample.stamp_ns)
             if isinstance(sample, WheelSample):
-                yield OutgoingMessage("wheel_odom", WHEEL_SCHEMA, wheel_cdr(sample, stamp_ns))
+                yield OutgoingMessage.on("wheel_odom", wheel_cdr(sample, self.unix_ns(sample.stamp_ns)))
             else:
-                yield OutgoingMessage("imu", IMU_SCHEMA, gyro_cdr(sample, stamp_ns))
+                yield OutgoingMessage.on("imu", gyro_cdr(sample, self.unix_ns(sample.stamp_ns)))
 
-    def _map_pose(self, update: PlaceUpdate) -> Iterator[OutgoingMessage]:
-        stamp_ns = self.unix_ns(update.stamp_ns)
+    def _map_pose(self, update: PlaceUpdate, stamp_ns: int) -> Iterator[OutgoingMessage]:
         T_map_base, covariance = base_pose(update.T_map_rig, update.covariance, self.T_base_rig)
-        T_map_odom, _ = base_pose(update.T_map_odom, update.covariance, self.T_base_rig)
         pose = codec.pose_with_covariance_cdr(stamp_ns, T_map_base, in_outer_axes(T_map_base, covariance))
-        yield OutgoingMessage(MAP_POSE, codec.MAP_POSE_SCHEMA, pose)
-        if not update.is_known:  # a transform has no covariance that could say so
-            return
-        edge = FrameTransform("map", "odom", T_map_odom)
-        yield OutgoingMessage("/tf", codec.TRANSFORM_SCHEMA, codec.transform_cdr(stamp_ns, [edge]))
-
-    def _map(self, update: MapUpdate) -> Iterator[OutgoingMessage]:
-        stamp_ns = self.unix_ns(update.stamp_ns)
-        points = _most_confident(update.points, self._map_encoding.points)
-        payload = codec.point_cloud_cdr(stamp_ns, "odom", *points, T_frame_points=self.T_base_rig)
-        yield OutgoingMessage("cloud", codec.POINT_CLOUD_SCHEMA, payload)
-
-    def _navigation(self, update: NavigationUpdate) -> Iterator[OutgoingMessage]:
-        stamp_ns = self.unix_ns(update.stamp_ns)
-        status = navigation_status(update)
-        yield OutgoingMessage("navigation", codec.DIAGNOSTICS_SCHEMA, codec.diagnostics_cdr(stamp_ns, [status]))
-        if update.plan is not None:
-            plan = update.plan
-            payload = codec.path_cdr(stamp_ns, plan.frame, plan.xy, plan.heading_rad)
-            yield OutgoingMessage("plan", codec.PATH_SCHEMA, payload)
+        yield OutgoingMessage.on(MAP_POSE, pose)
+        if update.is_known:  # a transform has no covariance that could say that it is not
+            T_map_odom, _ = base_pose(update.T_map_odom, update.covariance, self.T_base_rig)
+            edge = FrameTransform("map", "odom", T_map_odom)
+            yield OutgoingMessage.on("/tf", codec.transform_cdr(stamp_ns, [edge]))
 
 
 def static_frames(encode: Encoder, stamp_ns: int) -> OutgoingMessage:
@@ -181,8 +154,7 @@ def static_frames(encode: Encoder, stamp_ns: int) -> OutgoingMessage:
     if encode.rig is not None:
         cameras = {"lower": encode.rig.lower, "upper": encode.rig.upper}
         edges += [FrameTransform("rig", name, se3.inverse(camera.T_cam_rig)) for name, camera in cameras.items()]
-    payload = codec.transform_cdr(encode.unix_ns(stamp_ns), edges)
-    return OutgoingMessage("/tf_static", codec.TRANSFORM_SCHEMA, payload)
+    return OutgoingMessage.on("/tf_static", codec.transform_cdr(encode.unix_ns(stamp_ns), edges))
 
 
 class StateReports:
@@ -220,7 +192,7 @@ class StateReports:
 
 def status_report(stamp_ns: int, statuses: Sequence[DiagnosticStatus]) -> OutgoingMessage:
     """Return statuses as one encoded message."""
-    return OutgoingMessage("status", codec.DIAGNOSTICS_SCHEMA, codec.diagnostics_cdr(stamp_ns, statuses))
+    return OutgoingMessage.on("status", codec.diagnostics_cdr(stamp_ns, statuses))
 
 
 def _most_confident(points: MapPoints, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

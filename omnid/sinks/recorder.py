@@ -19,6 +19,7 @@ from omnid.sinks.encoder import Encoder, Outgoing, OutgoingMessage, StateReports
 from omnid.transport.codec import ERROR, OK, DiagnosticStatus
 from omnid.transport.sensor_codec import image_cdr, image_topic
 from omnid.transport.status_names import RECORDING
+from omnid.transport.topics import ros_name
 
 Recorded: TypeAlias = Frame | Outgoing
 FinalStatus: TypeAlias = Callable[[RunStatistics], Sequence[DiagnosticStatus]]
@@ -171,5 +172,4 @@ class Recorder:
 
     def _write(self, messages: Iterable[OutgoingMessage], stamp_ns: int) -> None:
         for topic, schema, payload in messages:
-            name = topic if topic.startswith("/") else f"/{self._robot}/{topic}"
-            self._log.write(name, schema, payload, stamp_ns)
+            self._log.write(ros_name(self._robot, topic), schema, payload, stamp_ns)

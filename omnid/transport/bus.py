@@ -22,11 +22,16 @@ from omnid.transport.bus_config import BusConfig, checked
 from omnid.transport.codec import ERROR, OK, WARN, DiagnosticStatus
 from omnid.transport.intake import PERIOD_S, QUERY, CommandIntake, Intake, OpenRequests, RequestCallback, floods
 from omnid.transport.requests import Answer, Request
-from omnid.transport.session import ALIVE, EndpointTaken, open_session, reason, router_in_place
+from omnid.transport.session import ALIVE, EndpointTaken, has_receiver, open_session, reason, router_in_place
 from omnid.transport.stop_datagram import StopListener
 from omnid.transport.topics import CLOCK, PUBLISHED, STOP, Topic, plain_key, ros_name
 
+__all__ = ["Bus", "BusConfig"]
+
 _HEARTBEAT_S: Final = 0.5  # rmw_zenoh's
+QUERY_PERIOD_S: Final = 0.01
+MOST_NAMESAKES: Final = 64  # Most that are distinguished; anyone may declare tokens where no users are configured.
+FLOOD_S: Final = 10.0  # The status warns of a flood for this time after its end.
 
 
 class RosGraph:
@@ -73,20 +78,15 @@ class TopicPublisher:
         self._plain = _declared_publisher(session, plain_key(config.robot, name), topic)
         self._ros: zenoh.Publisher | ext.AdvancedPublisher | None = None
         if config.ros2 == "rmw_zenoh":
-            declared = _declared_keeper if topic.transient_local else _declared_publisher
-            self._ros = declared(session, ros2.data_key(config.ros2_domain, ros, topic.schema), topic)
+            key = ros2.data_key(config.ros2_domain, ros, topic.schema)
+            self._ros = _declared_publisher(session, key, topic, keeps=topic.transient_local)
         self._gid = ros2.gid_of(token)
         self._seq = 0
 
     @property
     def is_received(self) -> bool:
         """True if there is a subscriber."""
-        found: list[Any] = [
-            publisher.matching_status
-            for publisher in (self._plain, self._ros)
-            if isinstance(publisher, zenoh.Publisher)
-        ]  # zenoh's stub takes the status for a bool
-        return any(status.matching for status in found)
+        return any(has_receiver(one) for one in (self._plain, self._ros) if isinstance(one, zenoh.Publisher))
 
     def put(self, payload: bytes, attachment: bytes | None) -> None:
         """Send to all subscribers; microseconds where there are none."""
@@ -96,45 +96,31 @@ class TopicPublisher:
             self._ros.put(payload, attachment=ros2.attachment(self._seq, time.time_ns(), self._gid))
 
 
-def _declared_publisher(session: zenoh.Session, key: str, topic: Topic) -> zenoh.Publisher:
+def _declared_publisher(
+    session: zenoh.Session, key: str, topic: Topic, *, keeps: bool = False
+) -> zenoh.Publisher | ext.AdvancedPublisher:
     """Declare a publisher, not express: each express message fills one of the few batches of every router on the way.
 
-    Poses were dropped there, and the latency is the same.
+    Poses were dropped there, and the latency is the same. keeps: it keeps its newest message for late subscribers, as
+    rmw_zenoh does for transient local (rmw_publisher_data.cpp): a cache, detection of the publisher, heartbeats.
     """
-    return session.declare_publisher(
-        key,
-        encoding=zenoh.Encoding.APPLICATION_CDR,
-        congestion_control=zenoh.CongestionControl.DROP,
-        priority=zenoh.Priority.REAL_TIME if topic.realtime else zenoh.Priority.DATA,
-        express=False,
-        reliability=zenoh.Reliability.RELIABLE,
-    )
-
-
-def _declared_keeper(session: zenoh.Session, key: str, topic: Topic) -> ext.AdvancedPublisher:
-    """Declare a publisher that keeps its newest message for late subscribers, as rmw_zenoh does for transient local.
-
-    rmw_publisher_data.cpp of ros2/rmw_zenoh: a cache, detection of the publisher, sporadic heartbeats.
-    """
+    quality: dict[str, Any] = {
+        "encoding": zenoh.Encoding.APPLICATION_CDR,
+        "congestion_control": zenoh.CongestionControl.DROP,
+        "priority": zenoh.Priority.REAL_TIME if topic.realtime else zenoh.Priority.DATA,
+        "express": False,
+        "reliability": zenoh.Reliability.RELIABLE,
+    }
+    if not keeps:
+        return session.declare_publisher(key, **quality)
     return ext.declare_advanced_publisher(
         session,
         key,
-        encoding=zenoh.Encoding.APPLICATION_CDR,
-        congestion_control=zenoh.CongestionControl.DROP,
-        priority=zenoh.Priority.DATA,
-        express=False,
-        reliability=zenoh.Reliability.RELIABLE,
+        **quality,
         cache=ext.CacheConfig(1),
         sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=_HEARTBEAT_S),
         publisher_detection=True,
     )
-
-
-__all__ = ["Bus", "BusConfig"]
-
-QUERY_PERIOD_S: Final = 0.01
-MOST_NAMESAKES: Final = 64  # Most that are distinguished; anyone may declare tokens where no users are configured.
-FLOOD_S: Final = 10.0  # The status warns of a flood for this time after its end.
 
 
 class Bus:

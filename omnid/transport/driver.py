@@ -14,7 +14,7 @@ from omnid.errors import OmnidError
 from omnid.transport import codec, ros2
 from omnid.transport.codec import PlanarGoal, goal_cdr, string_cdr
 from omnid.transport.requests import Answer, answer_of
-from omnid.transport.session import robots_there
+from omnid.transport.session import has_receiver, robots_there
 from omnid.transport.topics import ARM, GOAL, HEADING, MAP, NAVIGATION, ROUTE, SAVE_MAP, STOP, TIME, TWIST, request_key
 
 CONNECT_S: Final = 2.0  # A connection is complete within this time.
@@ -110,7 +110,7 @@ class Driver:
     @property
     def connected(self) -> bool:
         """True if a robot subscribes to the commands."""
-        return _has_receiver(self._publishers[self._twist])
+        return has_receiver(self._publishers[self._twist])
 
     def require_connected(self) -> None:
         """Return as soon as a robot subscribes to the commands. Raise OmnidError after CONNECT_S."""
@@ -161,7 +161,7 @@ class Driver:
         """
         key = f"{self._robot}/{request_key(topic)}"
         with self._session.declare_querier(key, timeout=timeout_s, **_QUALITY) as querier:
-            if not _holds_in_time(lambda: _has_receiver(querier)):
+            if not _holds_in_time(lambda: has_receiver(querier)):
                 raise self._absent("takes such requests")
             self._time.ask()
             self.asked_ns = now_ns = time.time_ns()
@@ -204,11 +204,6 @@ def _holds_in_time(condition: Callable[[], bool]) -> bool:
             return False
         time.sleep(_POLL_S)
     return True
-
-
-def _has_receiver(declared: zenoh.Publisher | zenoh.Querier) -> bool:
-    status: Any = declared.matching_status  # zenoh's stub takes it for a bool
-    return bool(status.matching)
 
 
 def _command_publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:

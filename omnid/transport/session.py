@@ -118,6 +118,12 @@ def robots_there(session: zenoh.Session) -> str:
     return plain(f"robots there: {', '.join([*names[:_NAMED], *more])}") if names else "no robot is there"
 
 
+def has_receiver(declared: zenoh.Publisher | zenoh.Querier) -> bool:
+    """Return whether a program takes what a publisher sends, or what a querier asks."""
+    status: Any = declared.matching_status  # zenoh's stub takes it for a bool
+    return bool(status.matching)
+
+
 def router_in_place(config: BusConfig) -> BusConfig | None:
     """Return the configuration of a client of the router that holds the endpoints of a peer; None without a router."""
     client = replace(config, listen=(), connect=config.listen)
