@@ -89,28 +89,51 @@ def _require_writable(option: str, path: Path) -> None:
 
 
 class TrajectoryFile:
-    """The trajectory T_odom_rig as TUM, one line a pair, written as soon as the pose is known."""
+    """A trajectory as TUM, one line a pose, written as soon as the pose is known.
+
+    The file is opened for the first pose: a run without poses leaves an existing file as it was.
+    """
 
     def __init__(self, path: Path) -> None:
-        self._file = _TumFile(path)
+        self._path = path
+        self._file: FileIO | None = None
+        self._whole_bytes = 0
 
     def process(self, odometry: OdometryUpdate) -> None:
-        """Write the row of a pose."""
-        self._file.write(odometry.stamp_ns, odometry.T_odom_rig)
+        """Write the row of a pose T_odom_rig."""
+        self.write(odometry.stamp_ns, odometry.T_odom_rig)
+
+    def write(self, stamp_ns: int, T: NDArray[np.float64]) -> None:
+        """Write the row of a pose (4, 4)."""
+        row = tum_row(stamp_ns, T).encode("ascii") + b"\n"
+        try:
+            if self._file is None:
+                self._file = self._path.open("wb", buffering=0)
+                lock(self._file)
+            written = self._file.write(row)
+            while written < len(row):  # a full disk takes a part of the row, then nothing
+                written += self._file.write(row[written:])
+        except OSError as error:
+            with suppress(OSError):
+                if self._file is not None:
+                    self._file.truncate(self._whole_bytes)  # remove the part of a row
+            raise _no_longer_written(self._path, error) from error
+        self._whole_bytes += len(row)
 
     def finish(self) -> None:
         """Close the file."""
-        self._file.close()
+        if self._file is not None:
+            self._file.close()
 
 
 def write_trajectory(path: Path, stamps_ns: NDArray[np.int64], poses: NDArray[np.float64]) -> None:
     """Write poses (N, 4, 4) as TUM; without poses an existing file stays as it is. Raises OmnidError."""
-    file = _TumFile(path)
+    file = TrajectoryFile(path)
     try:
         for stamp_ns, T in zip(stamps_ns.tolist(), poses, strict=True):
             file.write(stamp_ns, T)
     finally:
-        file.close()
+        file.finish()
 
 
 def write_known(
@@ -124,7 +147,7 @@ def write_known(
         try:
             path.write_bytes(b"")  # no poses of an earlier run
         except OSError as error:
-            raise OmnidError(f"{path}: can no longer be written: {error.strerror or error}") from error
+            raise _no_longer_written(path, error) from error
     write_trajectory(path, stamps_ns[known], poses[known])
     if known.all():
         return []
@@ -132,39 +155,8 @@ def write_known(
     return [f"{path}: {left_out}: no place of the map was recognised there, so it is not known where in it they are"]
 
 
-class _TumFile:
-    """A file that is opened for the first pose: a run without poses leaves an existing file as it was."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._file: FileIO | None = None
-        self._whole_bytes = 0
-
-    def write(self, stamp_ns: int, T: NDArray[np.float64]) -> None:
-        """Write the row of a pose."""
-        try:
-            self._append(tum_row(stamp_ns, T).encode("ascii") + b"\n")
-        except OSError as error:
-            raise OmnidError(f"{self._path}: can no longer be written: {error.strerror or error}") from error
-
-    def close(self) -> None:
-        """Close the file."""
-        if self._file is not None:
-            self._file.close()
-
-    def _append(self, row: bytes) -> None:
-        if self._file is None:
-            self._file = self._path.open("wb", buffering=0)
-            lock(self._file)
-        try:
-            written = self._file.write(row)
-            while written < len(row):  # a full disk takes a part of the row, then nothing
-                written += self._file.write(row[written:])
-        except OSError:
-            with suppress(OSError):
-                self._file.truncate(self._whole_bytes)  # remove the part of a row
-            raise
-        self._whole_bytes += len(row)
+def _no_longer_written(path: Path, error: OSError) -> OmnidError:
+    return OmnidError(f"{path}: can no longer be written: {error.strerror or error}")
 
 
 class MapFile:
