@@ -26,7 +26,7 @@ TYPICAL_M: Final = 1.3  # range at which the near floor is seen
 SIDE: Final = 3  # directions on either side with which a bin is compared
 
 
-def sigma_of(values: Floats) -> float:
+def sigma_of(values: Floats | Array) -> float:
     """Return the robust standard deviation of differences that are 0 in the mean."""
     return MAD * float(np.median(np.abs(values)))
 

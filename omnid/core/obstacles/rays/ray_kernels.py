@@ -82,7 +82,7 @@ def mean_between(sums: Floats, u: int, first: float, end: float) -> float:
     i, j = int(first), int(end)
     a = sums[i, u] + (first - i) * (sums[i + 1, u] - sums[i, u])
     b = sums[j, u] + (end - j) * (sums[j + 1, u] - sums[j, u])
-    return (b - a) / max(end - first, 1e-6)
+    return float((b - a) / max(end - first, 1e-6))
 
 
 @compiled("(f4[:, ::1], f4[:, ::1], f4[::1], f4[::1], f4[:, ::1], f4[:, ::1])", writes=("steps", "greys"))
