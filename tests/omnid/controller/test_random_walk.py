@@ -62,6 +62,9 @@ ODDITIES = (
 )
 
 
+AWAITED_TICKS = 50  # before the motor controller answers for the first time
+
+
 class RandomMotor:
     """A motor driver that fails, is late or has stopped by itself, as the test sets it for the next command."""
 
@@ -202,6 +205,8 @@ class Walk:
                 self.rings = self.rng.choice(RINGS)
                 self.quiet, self.main = self.rng.random() < 0.1, self.rng.choice(SENDERS)
             self.events()
+            if tick < AWAITED_TICKS:
+                self.motor.fault = "silent"
             self.tick()
         return self.seen
 
