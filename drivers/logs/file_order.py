@@ -31,7 +31,7 @@ def steps_back(times: Sequence[int]) -> list[int]:
     starts, low, high = [0], found[0], found[back[0] - 1]  # begins of segments; first and last time of the newest one
     for at, end in pairwise([*back.tolist(), len(found)]):
         run = found[at:end]  # which ascends
-        within = run[np.searchsorted(run, low) : np.searchsorted(run, high)]
+        within = run[np.searchsorted(run, low) : np.searchsorted(run, high, "right")]
         is_step = bool(run[-1] < low - FAR_STEPS * period)
         if within.size > 1:
             segment = found[starts[-1] : at]

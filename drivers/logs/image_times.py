@@ -4,8 +4,8 @@ A camera driver stamps the header when the image is taken; the recorder logs the
 the header is the better one, unless it is not set, does not advance, or counts by another clock.
 
 1. The first images decide for the whole log: their headers are used if they advance and both cameras share a clock.
-2. Afterwards an image whose header is not set, repeats the one before, or lies ahead of its time of logging has the
-   time of logging, moved by the usual delay between both.
+2. Afterwards an image whose header is not set, repeats the one before, or alone lies far from its time of logging has
+   the time of logging, moved by the usual delay between both.
 3. Where the headers step against the times of logging and run on regularly from there, a clock was set. The images
    after it are a new segment, whose stamps are moved so that time runs on.
 """
@@ -21,7 +21,7 @@ from statistics import median
 from typing import Final, Literal, TypeAlias
 
 from drivers.frame import CAMERAS, Camera
-from drivers.logs.file_order import LATEST_NS
+from drivers.logs.file_order import LATEST_NS, LONGEST_STEP
 from drivers.logs.ros_messages import RosImage
 
 TimeSource: TypeAlias = Literal["auto", "header", "log"]
@@ -185,7 +185,9 @@ class ImageTimes:
     def _stamp_ns(self, times: _CameraTimes, first: TimedImage, behind: list[TimedImage]) -> int:
         """Return the stamp of an image; behind: the next images of its camera."""
         header_ns, before_ns = first.image.stamp_ns, times.header_ns
-        by_log_ns = first.log_ns + times.delay_ns + times.shift_ns
+        delays_ns = times.delays_ns or [each.image.stamp_ns - each.log_ns for each in behind if each.image.stamp_ns]
+        usual_ns = round(median(delays_ns)) if delays_ns else 0
+        by_log_ns = first.log_ns + usual_ns + times.shift_ns
         if self.source == "log":
             if self._is_auto:
                 self.by_log[self._fault] += 1
@@ -194,15 +196,16 @@ class ImageTimes:
         if not header_ns and first.log_ns:
             self.by_log["are 0"] += 1
             return by_log_ns
-        if before_ns == header_ns and first.image.data != times.data and self._has_log and self._is_auto:
+        if header_ns and before_ns == header_ns and first.image.data != times.data and self._has_log and self._is_auto:
             self.by_log["do not advance"] += 1
             return by_log_ns
         # 2. A step of the clock, after which it runs on.
         size_ns = self._step(times, first, behind)
         if size_ns:
             self._move(times, size_ns)
-        elif self._is_ahead(times, first):
-            self.by_log["lie ahead of the log"] += 1
+        elif self._is_ahead(times, first) or self._is_alone(times, first, behind):
+            is_ahead = header_ns - first.log_ns > usual_ns
+            self.by_log["lie ahead of the log" if is_ahead else "lie long before the log"] += 1
             return by_log_ns
         # 3. Late images tell nothing about the usual delay.
         if header_ns >= times.newest_ns:
@@ -217,6 +220,19 @@ class ImageTimes:
             return False
         latest_ns = max(times.newest_ns, first.log_ns + times.least_delay_ns)
         return first.image.stamp_ns > latest_ns + STEP_NS
+
+    def _is_alone(self, times: _CameraTimes, first: TimedImage, behind: list[TimedImage]) -> bool:
+        """True if the header of an image lies far from its time of logging, and those of all others do not.
+
+        An image that was delivered late is logged between others, which are as far apart as always.
+        """
+        if not (self._is_auto and self._has_log and len(behind) == LOOKED_AHEAD):
+            return False
+        if times.log_ns and behind[0].log_ns - times.log_ns < LONGEST_STEP * times.period_ns:
+            return False
+        others_ns = [*times.delays_ns, *(each.image.stamp_ns - each.log_ns for each in behind)]
+        apart_ns = min(abs(first.image.stamp_ns - first.log_ns - other_ns) for other_ns in others_ns)
+        return max(others_ns) - min(others_ns) < STEP_NS < apart_ns
 
     def _step(self, times: _CameraTimes, first: TimedImage, behind: list[TimedImage]) -> int:
         """Return by how much a clock was set before an image; 0 where it was not."""
@@ -233,7 +249,9 @@ class ImageTimes:
             return 0
         sizes_ns = [delay_ns - times.delay_ns for delay_ns in map(sub, headers, logged)]
         size_ns = round(median(sizes_ns))
-        is_one = all(abs(each) > times.period_ns and each * size_ns > 0 for each in sizes_ns)
+        spread_ns = sum(max(some) - min(some) for some in (times.delays_ns, sizes_ns))
+        least_ns = max(times.period_ns, spread_ns)
+        is_one = all(abs(each) > least_ns and each * size_ns > 0 for each in sizes_ns)
         return size_ns if is_one else 0
 
     def _move(self, times: _CameraTimes, size_ns: int) -> None:

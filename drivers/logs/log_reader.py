@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import DriverError, FrameDecodeError
-from drivers.frame import SAMPLE_BITS, Camera, Frame, gray, is_deep
-from drivers.logs.image_times import MAX_HELD_BYTES, ImageTimes, TimedImage, TimeSource
+from drivers.frame import CAMERAS, SAMPLE_BITS, Camera, Frame, gray, is_deep
+from drivers.logs.image_times import MAX_HELD_BYTES, STEP_NS, ImageTimes, TimedImage, TimeSource
 from drivers.logs.log import LoggedMessage, RecordError, widened
 from drivers.logs.open_log import open_log
 from drivers.logs.ros_messages import RosImage
@@ -97,9 +97,10 @@ class LogReader:
             if motion is not None:
                 self._motion = choose_motion_topics(repr(self._log.name), topics, motion)
             self._reset()
-        except DriverError:
+        except DriverError as error:
+            cut = self._log.damage().cut
             self.close()
-            raise
+            raise DriverError(f"{error}; {cut}" if cut else str(error)) from error
 
     @property
     def topics(self) -> dict[Camera, str]:
@@ -120,7 +121,8 @@ class LogReader:
     def _sorted(self) -> Iterator[Frame | MotionSample]:
         buffer, samples = _ReorderBuffer(self._window, self._bits, self.counts), _Samples()
         for timed in self._times.stamped(self._images()):
-            self._widen("images", timed.image.stamp_ns)
+            for what in ("images", timed.camera):
+                self._widen(what, timed.image.stamp_ns)
             yield from self._due_samples(samples, timed.log_ns)
             for frame in buffer.push(timed.camera, timed.image):
                 yield from samples.until(frame.stamp_ns)
@@ -197,7 +199,7 @@ class LogReader:
         self._fault = ""  # of the first message without a valid image
         self._motion_fault = ""  # of the first message of wheels or IMU that is not valid
         self._other_joints = 0  # messages of joints without the wheels
-        self._spans: dict[str, tuple[int, int]] = {}  # first and last stamp of images, wheels and gyro
+        self._spans: dict[str, tuple[int, int]] = {}  # first and last stamp of images, each camera, wheels and gyro
         self._times = ImageTimes(self._time)
         self._unstamped: deque[tuple[int, LoggedMessage]] = deque()  # samples with their times of logging
 
@@ -253,8 +255,15 @@ class LogReader:
         self._spans[what] = widened(self._spans.get(what), stamp_ns)
 
     def _of_another_clock(self) -> Iterator[str]:
-        """Yield a warning for wheels or gyro none of whose samples lies between the images."""
-        images = self._spans.get("images")
+        """Yield a warning for cameras, and for wheels or gyro, whose stamps are shifted against each other."""
+        images, both = self._spans.get("images"), [self._spans.get(camera) for camera in CAMERAS]
+        if both[0] and both[1]:
+            begin_ns, end_ns = (upper_ns - lower_ns for lower_ns, upper_ns in zip(*both, strict=True))
+            if min(abs(begin_ns), abs(end_ns)) > STEP_NS > abs(begin_ns - end_ns):
+                yield (
+                    f"the images of the upper camera begin and end {abs(begin_ns) * 1e-9:.1f} s "
+                    f"{'after' if begin_ns > 0 else 'before'} those of the lower one by their stamps: of another clock?"
+                )
         for what in ("wheels", "gyro"):
             span = self._spans.get(what)
             if images and span and (span[0] > images[1] or span[1] < images[0]):

@@ -81,6 +81,9 @@ UNUSABLE: Final[dict[str, tuple[Times, str]]] = {
     "stopped on the way": (lambda topic, number, ns: min(ns, taken(topic, HALF)), "for 38 images"),
     "two clocks": (lambda topic, number, ns: ns - 7 * S * (topic == LOWER), "7.000 s apart between the cameras"),
     "one of the future": (lambda topic, number, ns: ns + 3600 * S * (number == HALF), "for 2 images: .* lie ahead"),
+    "one of the past": (lambda topic, number, ns: ns - 3600 * S * (number == HALF), "for 2 images: .* long before"),
+    "the first of the future": (lambda topic, number, ns: ns + 3600 * S * (number == 0), "for 2 images: .* lie ahead"),
+    "the first of the past": (lambda topic, number, ns: ns - 3600 * S * (number == 0), "for 2 images: .* long before"),
     "one zero": (lambda topic, number, ns: ns * (number != HALF), "for 2 images: .* are 0"),
 }
 
@@ -96,7 +99,7 @@ def test_where_headers_cannot_be_used_the_times_of_logging_are(tmp_path: Path, n
 
 
 @pytest.mark.parametrize("write", [write_log, write_bag, write_db3], ids=["mcap", "bag", "db3"])
-@pytest.mark.parametrize("size_s", [-3600, -1, -0.3, 1, 3600])
+@pytest.mark.parametrize("size_s", [-3600, -1, -0.3, -0.2, 1, 3600])
 @pytest.mark.parametrize("both", [True, False], ids=["headers and logging", "headers"])
 def test_a_clock_that_is_set_begins_a_segment(tmp_path: Path, write: object, size_s: float, both: bool) -> None:
     """No image after it is sorted among those before it, nor lost; time runs on."""
@@ -123,6 +126,20 @@ def test_a_clock_that_is_set_between_two_parts_begins_a_segment(tmp_path: Path) 
     write_log(tmp_path / "bag_1.mcap", written[2 * HALF :])
     frames, warnings = read(tmp_path)
     assert shown(frames) == AS_TAKEN and len(warnings) == 1 and "set back by 1.0" in warnings[0]
+
+
+def test_logging_with_varying_delay_is_no_step_of_a_clock(tmp_path: Path) -> None:
+    def logged(topic: str, number: int, ns: int) -> int:
+        return ns + int(np.random.default_rng(2 * number + (topic == UPPER)).uniform(0, 3 * STEP_NS))
+
+    frames, warnings = read(write_log(tmp_path / "log.mcap", entries(lambda topic, number, ns: ns, logged)))
+    assert shown(frames) == AS_TAKEN and not warnings
+
+
+def test_cameras_with_two_clocks_are_told_where_their_times_of_logging_are_no_better(tmp_path: Path) -> None:
+    clock: Times = lambda topic, number, ns: ns - 3 * S * (topic == UPPER)  # noqa: E731
+    _, warnings = read(write_log(tmp_path / "log.mcap", entries(clock, clock)))
+    assert len(warnings) == 1 and "upper camera begin and end 3.0 s before those of the lower one" in warnings[0]
 
 
 def test_the_clock_of_one_camera_is_set(tmp_path: Path) -> None:
