@@ -63,11 +63,16 @@ def image_folders(path: Path) -> list[Path]:
     for visited, (folder, inner, files) in enumerate(os.walk(path)):
         here = Path(folder)
         inner[:] = sorted(inner) if len(here.relative_to(path).parts) < _MAX_DEPTH else []
-        if here != path and any(Path(name).suffix.lower() in SUFFIXES for name in files):
+        if here != path and any(map(_is_image, files)):
             found.append(here)
         if visited >= _MAX_VISITED or len(found) >= _MAX_FOLDERS:
             break
     return found
+
+
+def _is_image(name: str) -> bool:
+    """True for the name of an image; hidden files such as ._1.png are of macOS."""
+    return Path(name).suffix.lower() in SUFFIXES and not name.startswith(".")
 
 
 class ImageFolder:
@@ -130,7 +135,7 @@ class ImageFolder:
 def _stamped(top: Path, folder: Path, rate_hz: float) -> list[_StampedFile]:
     """Return the images of a folder with their stamps; raise DriverError where one has none."""
     topic = folder.relative_to(top).as_posix()
-    paths = sorted((path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES), key=_numbers_of)
+    paths = sorted((path for path in folder.iterdir() if _is_image(path.name)), key=_numbers_of)
     _require_own_files(top, paths)
     if rate_hz:
         return [_StampedFile(round(index * 1e9 / rate_hz), topic, path) for index, path in enumerate(paths)]

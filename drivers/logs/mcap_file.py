@@ -246,7 +246,10 @@ class McapFile(ChunkedFile):
             self._types, self._channels, self._statistics = {}, {}, None
             return False
         self._attachments = attachments
-        return bool(self._channels)
+        # A writer may repeat channels there without their schemas: then their types are in the data only.
+        return bool(self._channels) and all(
+            not channel.schema_id or channel.schema_id in self._types for channel in self._channels.values()
+        )
 
 
 def ros_name(schema_name: str) -> str:

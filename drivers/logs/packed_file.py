@@ -68,7 +68,7 @@ def unpack(path: Path, folder: Path) -> Path:
         stream = next(open_ for magic, open_ in _BY_MAGIC.items() if start.startswith(magic))(file)
         while True:
             try:
-                block = stream.read(_BLOCK_BYTES)
+                block = stream.read1(_BLOCK_BYTES)  # read() loses what precedes a cut
             except _FAULTS:
                 # What follows is cut or corrupt, which the reader of the unpacked log tells.
                 break

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
@@ -66,11 +67,13 @@ def read_pairs(source: Path, cameras: LogCameras = BY_NAME) -> PairedImages:
     else:
         sides, topics = _of_folder(source, cameras.bits), ("", "")
     if not sides[0].keys() & sides[1].keys():
-        counted = ", ".join(f"{len(side)} of the {name} camera" for name, side in zip(SIDES, sides, strict=True))
-        raise OmnidError(
-            f"{source}: no pair of images: found {counted}; expected pairs like lower_001.png "
-            "and upper_001.png in a folder, or images with nearly equal stamps in a log"
-        )
+        counts = [len(side) for side in sides]
+        expected = "pairs like lower_001.png and upper_001.png"
+        if of_log:
+            counts, expected = list(read.arrived), f"images whose stamps differ by less than {TOLERANCE_NS // 10**6} ms"
+        counted = ", ".join(f"{count} of the {name} camera" for name, count in zip(SIDES, counts, strict=True))
+        found = "; ".join([f"found {counted}", *faults])
+        raise OmnidError(f"{source}: no pair of images: expected {expected}, {found}")
     # 2. Leave out those that repeat an earlier instant.
     repeated = _repeats(sides)
     kept = [{name: image for name, image in side.items() if name not in repeated} for side in sides]
@@ -157,6 +160,7 @@ class LogPairs(NamedTuple):
     within_ns: float  # largest difference of the stamps of a pair in a run: half a period
     loss: ImageLoss
     notes: tuple[str, ...]  # of the reader
+    arrived: tuple[int, ...]  # images of the lower and the upper camera
 
     @property
     def stride(self) -> int:
@@ -174,22 +178,40 @@ def decoded_pairs(reader: LogReader, *, keep: bool = True) -> tuple[LogPairs, di
     frames = [replace(frame, data=b"") for frame in reader.frames()]
     stamps = {camera: [frame.stamp_ns for frame in frames if frame.camera == camera] for camera in CAMERAS}
     periods = {camera: float(np.median(np.diff(own))) if len(own) > 1 else None for camera, own in stamps.items()}
-    within_ns = max(TOLERANCE_NS, *(period / 2 for period in periods.values() if period))
+    within_ns = max([TOLERANCE_NS, *(period / 2 for period in periods.values() if period)])
     joined = sum(1 for _ in paired(iter(frames), within_ns))
     arrived = {camera: len(own) for camera, own in stamps.items()}
     unpaired = unpaired_by_chance(arrived, {camera: count - joined for camera, count in arrived.items()}, periods)
-    found = LogPairs(sum(1 for _ in paired(iter(frames))), within_ns, image_loss(reader.counts), ())
-    # 2. Images of some pairs.
-    images, broken = dict[int, tuple[Image, Image]](), 0
+    found = LogPairs(
+        sum(1 for _ in paired(iter(frames))), within_ns, image_loss(reader.counts), (), tuple(arrived.values())
+    )
+    # 2. Images of some pairs; those of another size than most are of no use.
+    images, broken, fault = dict[int, tuple[Image, Image]](), 0, ""
+    sizes = Counter[tuple[tuple[int, ...], ...]]()
     for number, (lower, upper) in enumerate(paired(reader.frames())):
         if number % found.stride == 0:
             try:
                 pair = gray(lower), gray(upper)
-                images |= {number: pair} if keep else {}
-            except FrameDecodeError:
-                broken += 2
-    loss = image_loss(reader.counts, unpaired=unpaired, undecodable=broken * found.stride)
-    return found._replace(loss=loss, notes=tuple(reader.warnings)), images
+            except FrameDecodeError as error:
+                broken, fault = broken + 2, fault or str(error)
+                continue
+            sizes[pair[0].shape, pair[1].shape] += 1
+            images |= {number: pair} if keep else {}
+    usual = sizes.most_common(1)[0] if sizes else ((), 0)
+    images = {number: pair for number, pair in images.items() if (pair[0].shape, pair[1].shape) == usual[0]}
+    other_size = 2 * (sizes.total() - usual[1])
+    loss = image_loss(
+        reader.counts,
+        unpaired=unpaired,
+        undecodable=broken * found.stride,
+        other_size=other_size * found.stride,
+    )
+    notes = list(reader.warnings)
+    if broken:
+        notes.append(f"left out {broken // 2} pairs with an image that cannot be decoded; the first: {fault}")
+    if other_size:
+        notes.append(f"left out {other_size // 2} pairs with an image of another size than most")
+    return found._replace(loss=loss, notes=tuple(notes)), images
 
 
 def _of_log(log: Path, cameras: LogCameras) -> tuple[tuple[Images, Images], tuple[str, str], LogPairs]:
@@ -201,8 +223,6 @@ def _of_log(log: Path, cameras: LogCameras) -> tuple[tuple[Images, Images], tupl
     for number, pair in images.items():
         for side, image in zip(sides, pair, strict=True):
             side[f"pair{number:05d}"] = image
-    for side in sides:
-        _require_one_size(side)
     return sides, (topics["lower"], topics["upper"]), found
 
 

@@ -246,6 +246,24 @@ def test_parts_that_metadata_lists_but_are_not_there_are_named(
     assert log_info(tmp_path).state is (LogState.WHOLE if missing is None else LogState.BROKEN)
 
 
+def test_a_compressed_file_is_read_up_to_its_cut(tmp_path: Path) -> None:
+    path = packed(write_log(tmp_path / "log.mcap", pairs(60)), ".gz")
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 3 // 4])
+    found, reader = read(path)
+    assert found == expected(60)[: len(found)] and len(found) > 60 and reader.truncated and len(reader.warnings) == 1
+
+
+def test_a_cut_before_the_images_of_one_camera_is_named(tmp_path: Path) -> None:
+    path = write_log(tmp_path / "log.mcap", sorted(pairs(20), key=lambda entry: entry.topic), **SMALL)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 3])
+    with pytest.raises(DriverError, match=r"found only .* is cut or corrupt after byte"):
+        LogReader(path)
+
+
+def test_a_summary_without_schemas_is_no_index(tmp_path: Path) -> None:
+    assert read(mcap(repeat_schemas=False)(tmp_path, pairs(PAIRS)))[0] == expected(PAIRS)
+
+
 def test_a_part_that_was_unpacked_or_completed_is_read_once(tmp_path: Path) -> None:
     for suffix in ("", ".zstd"):
         for number in range(2):

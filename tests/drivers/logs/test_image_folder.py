@@ -121,3 +121,11 @@ def test_a_link_within_the_folder_is_an_image_and_a_pipe_that_comes_later_is_not
         last.unlink()
         os.mkfifo(last)
         assert len(list(reader.frames())) == 5 and reader.counts["broken"] == 1
+
+
+def test_hidden_files_beside_the_images_are_left_out(tmp_path: Path) -> None:
+    """As macOS writes them to other disks."""
+    folder = write_folders(tmp_path / "images", pairs(3))
+    (folder / "lower" / "._1.jpg").write_bytes(b"\0\5\x16\7")
+    with closing(LogReader(folder)) as reader:
+        assert len(list(reader.frames())) == 6 and not reader.warnings
