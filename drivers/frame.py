@@ -69,6 +69,7 @@ class Frame:
     step: int = 0  # bytes from row to row; 0: rows without padding
     bigendian: bool = False  # byte order of samples of 16 bits
     bits: int = 16  # one of SAMPLE_BITS: of these, images of 16 bits a sample show the upper eight
+    bayer: str = ""  # encoding such as bayer_rggb8 of what was compressed: a jpeg or png of one channel is a pattern
 
 
 class FrameSource(Protocol):
@@ -136,17 +137,25 @@ def _decoded_jpeg(frame: Frame, data: NDArray[np.uint8]) -> NDArray[np.uint8]:
         if _EXTRANEOUS_AT_END not in str(error):
             raise
         image = simplejpeg.decode_jpeg(_ZEROS_BEFORE_END.sub(b"", data.tobytes()), "GRAY")
-    return np.asarray(image[..., 0])
+    return _interpolated(frame, image[..., 0]) if colours == "Gray" else np.asarray(image[..., 0])
 
 
 def _decoded_png(frame: Frame, data: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    if not data.tobytes().rstrip(b"\0").endswith(_PNG_END):
+    if data.tobytes().rfind(_PNG_END) < 0:
         raise _decode_error(frame, f"its end is missing after {data.size} bytes")
-    _require_samples(frame, *_png_size(data))
+    width, height, channels = _png_size(data)
+    _require_samples(frame, width, height, channels)
     image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH)
     if image is None or image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
         raise _decode_error(frame, "its content is corrupt")
+    image = _interpolated(frame, image) if channels == 1 else image
     return np.ascontiguousarray(image if image.dtype == np.uint8 else upper_eight_bits(image, frame.bits))
+
+
+def _interpolated(frame: Frame, image: NDArray[Any]) -> NDArray[Any]:
+    """Return the grey image (H, W) of one that may be a Bayer pattern, as frame.bayer says."""
+    name = frame.bayer.removesuffix(_DEEP).removesuffix("8")
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(image), _TO_GRAY[name]) if name in _TO_GRAY else image)
 
 
 def _require_samples(frame: Frame, width: int, height: int, channels: int) -> None:

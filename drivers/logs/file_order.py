@@ -38,7 +38,7 @@ def steps_back(times: Sequence[int]) -> list[int]:
             before = np.sort(segment[segment > within[0] - LONGEST_STEP * period])
             behind = np.searchsorted(before, within)
             again = np.count_nonzero((behind > 0) & (before[behind] - before[behind - 1] < LONGEST_STEP * period))
-            is_step |= again > max(1, within.size / 2)
+            is_step = is_step or bool(again > max(1, within.size / 2))
         if is_step:
             starts.append(at)
         low, high = (run[0], run[-1]) if is_step else (min(low, run[0]), max(high, run[-1]))

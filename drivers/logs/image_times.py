@@ -158,6 +158,9 @@ class ImageTimes:
             self._fault = "do not advance"
         elif len(delays) == len(CAMERAS) and abs(delays[0] - delays[1]) > STEP_NS:
             self._fault = f"are {abs(delays[0] - delays[1]) * 1e-9:.3f} s apart between the cameras"
+        else:  # Times of logging that run at another rate, as those of a conversion, tell nothing about the headers.
+            rates = [_step_ns(header) / max(1, _step_ns(log)) for header, log in zip(headers, logged, strict=True)]
+            self._has_log = self._has_log and all(1 / FASTEST < rate < FASTEST for rate in rates)
         if self._is_auto:
             self.source = "log" if self._fault and self._has_log else "header"
         known = [stamp_ns for header in headers for stamp_ns in header]

@@ -19,7 +19,7 @@ from drivers.frame import CAMERAS, SAMPLE_BITS, Camera, Frame, gray, is_deep
 from drivers.logs.image_times import MAX_HELD_BYTES, STEP_NS, ImageTimes, TimedImage, TimeSource
 from drivers.logs.log import LoggedMessage, RecordError, widened
 from drivers.logs.open_log import open_log
-from drivers.logs.ros_messages import RosImage
+from drivers.logs.ros_messages import MotionReading, RosImage
 from drivers.logs.topics import MotionChoice, MotionTopics, choose_motion_topics, choose_topics
 from drivers.motion import MotionSample, WheelSample
 
@@ -144,15 +144,16 @@ class LogReader:
                 image = self._image(message)
                 if image is not None:
                     yield TimedImage(cameras[message.topic], image, log_ns)
-            elif len(self._unstamped) < MAX_WAITING_SAMPLES:
-                self._unstamped.append((log_ns, message))
+            elif (reading := self._reading(message)) is not None:
+                self._unstamped.append((log_ns, reading))
 
     def _due_samples(self, samples: _Samples, until_ns: int | None) -> Iterator[MotionSample]:
         """Stamp the samples that were logged until then, None: all; yield the earliest ones where too many wait."""
         while self._unstamped and (until_ns is None or self._unstamped[0][0] <= until_ns):
-            sample = self._sample(*self._unstamped.popleft())
-            if sample is not None:
-                yield from samples.push(sample)
+            log_ns, reading = self._unstamped.popleft()
+            sample = reading._replace(stamp_ns=self._times.sample_ns(reading.stamp_ns, log_ns)).sample(log_ns)
+            self._widen("wheels" if isinstance(sample, WheelSample) else "gyro", sample.stamp_ns)
+            yield from samples.push(sample)
 
     def _in_span(self, messages: Iterator[Frame | MotionSample]) -> Iterator[Frame | MotionSample]:
         """Yield the messages of the part that is read; other frames do not count, so that seq begins at 0 there."""
@@ -201,7 +202,8 @@ class LogReader:
         self._other_joints = 0  # messages of joints without the wheels
         self._spans: dict[str, tuple[int, int]] = {}  # first and last stamp of images, each camera, wheels and gyro
         self._times = ImageTimes(self._time)
-        self._unstamped: deque[tuple[int, LoggedMessage]] = deque()  # samples with their times of logging
+        # Samples with their times of logging; no stage waits for more.
+        self._unstamped: deque[tuple[int, MotionReading]] = deque(maxlen=MAX_WAITING_SAMPLES)
 
     def _image(self, logged: LoggedMessage) -> RosImage | None:
         """Return an image, None of a broken one.
@@ -236,20 +238,16 @@ class LogReader:
                     "or 12 bits? State cameras.bits, or --bits"
                 )
 
-    def _sample(self, log_ns: int, logged: LoggedMessage) -> MotionSample | None:
-        """Return a sample with its time of logging, None of a broken one."""
+    def _reading(self, logged: LoggedMessage) -> MotionReading | None:
+        """Return the rates in a message of wheels or IMU, None of a broken one, and of joints without the wheels."""
         try:
             reading = logged.motion(self._joints)
-            if not reading.rates:
-                self._other_joints += 1
-                return None
-            sample = reading._replace(stamp_ns=self._times.sample_ns(reading.stamp_ns, log_ns)).sample(log_ns)
-            self._widen("wheels" if isinstance(sample, WheelSample) else "gyro", sample.stamp_ns)
-            return sample
         except (FrameDecodeError, RecordError) as error:
             self.counts["broken_motion"] += 1
             self._motion_fault = self._motion_fault or str(error)
             return None
+        self._other_joints += not reading.rates
+        return reading if reading.rates else None
 
     def _widen(self, what: str, stamp_ns: int) -> None:
         self._spans[what] = widened(self._spans.get(what), stamp_ns)

@@ -6,7 +6,7 @@ import heapq
 import os
 import re
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Final
@@ -33,7 +33,7 @@ _NAME: Final = re.compile(
 )
 _MAX_METADATA_BYTES: Final = 2**20
 _LISTED_FILES: Final = re.compile(r"^ *relative_file_paths:[ \t]*\n((?:[ \t]*- .*\n)*)", re.M)
-_FORMATS: Final = {
+_FORMATS: Final[dict[bytes, Callable[[Path, str], Log]]] = {
     mcap_file.MAGIC: McapFile,
     sqlite_bag.MAGIC: SqliteBag,
     ros1_bag.MAGIC: Ros1Bag,
@@ -166,7 +166,9 @@ def _missing(folder: Path, logs: Sequence[Path]) -> list[str]:
     there = {match[0] for log in logs if (match := _NAME.match(log.name))}
     if metadata.is_file() and metadata.stat().st_size <= _MAX_METADATA_BYTES:
         listed = _LISTED_FILES.search(metadata.read_text("utf-8", "replace"))
-        names = [line.strip().removeprefix("- ").strip("'\" ") for line in listed[1].splitlines()] if listed else []
+        # The first versions of rosbag2 listed paths.
+        lines = listed[1].splitlines() if listed else []
+        names = [Path(line.strip().removeprefix("- ").strip("'\" ")).name for line in lines]
         plain = {name[: match.end(4)] for name in there if (match := _NAME.match(name))}
         return [name for name in names if not ((match := _NAME.match(name)) and name[: match.end(4)] in plain)]
     numbers = {int(match[3]): match for log in logs if (match := _NAME.fullmatch(log.name)) and match[3]}

@@ -58,13 +58,14 @@ class RosImage:
     step: int = 0  # bytes from row to row
     bigendian: bool = False
     carries: bool = False  # the nanoseconds of the stamp are a second or more
+    bayer: str = ""  # as in drivers.frame.Frame
 
     def frame(self, camera: Camera = "lower", seq: int = 0, bits: int = 16) -> Frame:
         """Return the image as a frame of a camera. To decode it, neither the camera nor the number matters.
 
         bits: see Frame.
         """
-        layout = self.width, self.height, self.step, self.bigendian, bits
+        layout = self.width, self.height, self.step, self.bigendian, bits, self.bayer
         return Frame(seq, self.stamp_ns, camera, self.encoding, self.data, *layout)
 
 
@@ -88,9 +89,12 @@ def parse_image(kind: str, message: memoryview, *, aligned: bool = True) -> RosI
         encoding, data = members.text(), members.octets()
     except struct.error as error:
         raise FrameDecodeError(f"a {kind} of {len(message)} bytes is truncated") from error
+    # image_transport compresses a Bayer pattern as it is, and says so: 'bayer_rggb8; jpeg compressed '.
+    source = encoding.partition(";")[0].strip()
+    bayer = source if source.startswith("bayer_") else ""
     # The first bytes decide the encoding, else the format, which is free text such as 'bgr8; jpeg compressed bgr8'.
     encoding = next((name for name, part in (("jpeg", "jp"), ("png", "png")) if part in encoding.lower()), encoding)
-    return RosImage(stamp_ns, image_encoding(data, encoding), data, carries=carries)
+    return RosImage(stamp_ns, image_encoding(data, encoding), data, carries=carries, bayer=bayer)
 
 
 def image_encoding(data: memoryview | bytes, otherwise: str = "") -> str:

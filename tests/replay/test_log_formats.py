@@ -133,8 +133,10 @@ def test_loss_is_told_by_the_exit_code(omnid: Command, tmp_path: Path, scene: Pa
     result = omnid.replay(log, *QUICK, rig=scene / "rig.toml")
     assert result.code == code and line in result.err
     assert ("images made no pair" in result.err) == (code == 1)
-    if name != "an image is small":
-        assert bool(read_pairs(log).loss) == (code == 1)
+    found = read_pairs(log)
+    assert bool(found.loss) == (code == 1)
+    left_out = [note for note in found.notes if note.startswith("left out 6 pairs")]
+    assert len(left_out) == (name in ("an image is cut", "an image is small"))
 
 
 def test_a_camera_of_half_the_rate_loses_nothing(omnid: Command, tmp_path: Path, scene: Path) -> None:

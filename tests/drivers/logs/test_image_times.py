@@ -179,6 +179,15 @@ def test_delays_of_the_recorder_are_no_step_of_the_clock(tmp_path: Path) -> None
     assert [frame.stamp_ns for frame in frames if frame.camera == "lower"] == [taken(LOWER, n) for n in range(COUNT)]
 
 
+def test_times_of_a_conversion_tell_nothing_about_the_stamps(tmp_path: Path) -> None:
+    """Three seconds without images are no step of the clock, though they were converted in two milliseconds."""
+    stamp: Times = lambda topic, number, ns: ns + 3 * S * (number >= HALF)  # noqa: E731
+    logged: Times = lambda topic, number, ns: 2 * START_NS + 2_000_000 * number + SKEW_NS[topic]  # noqa: E731
+    frames, warnings = read(write_log(tmp_path / "log.mcap", entries(stamp, logged)))
+    assert shown(frames) == AS_TAKEN and not warnings
+    assert frames[-1].stamp_ns == taken(UPPER, COUNT - 1) + 3 * S
+
+
 @pytest.mark.parametrize(("source", "first_ns"), [("header", 5 * S), ("log", START_NS + DELAY_NS), ("auto", 5 * S)])
 def test_the_setting_decides(tmp_path: Path, source: str, first_ns: int) -> None:
     """A clock that counts from the start of the computer is one as well, which is said."""

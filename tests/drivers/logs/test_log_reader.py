@@ -157,6 +157,21 @@ def test_first_bytes_decide_the_compression(tmp_path: Path, suffix: str, format_
     assert abs(int(gray(frames[0])[4, 4]) - 90) < 2
 
 
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+@pytest.mark.parametrize("colours", [False, True])
+def test_a_pattern_that_was_compressed_as_it_is_becomes_grey(tmp_path: Path, suffix: str, colours: bool) -> None:
+    """As image_transport does; a driver that compresses colours says the same of its source."""
+    pattern = np.zeros((16, 16), np.uint8)
+    pattern[::2, ::2] = 200  # red
+    image = (
+        np.dstack([np.zeros_like(pattern), np.zeros_like(pattern), np.full_like(pattern, 200)]) if colours else pattern
+    )
+    coding = [cv2.IMWRITE_JPEG_QUALITY, 100] if suffix == ".jpg" else []
+    data = compressed(START_NS, cv2.imencode(suffix, image, coding)[1].tobytes(), "bayer_rggb8; jpeg compressed ")
+    frames, _ = read(write_log(tmp_path / "log.mcap", [Entry(t, COMPRESSED, data, 0) for t in (LOWER, UPPER)]))
+    assert np.abs(gray(frames[0])[2:-2, 2:-2] - 0.299 * 200).max() < 4
+
+
 def test_a_part_of_a_log_is_counted_from_its_start(tmp_path: Path) -> None:
     log = write_log(tmp_path / "log.mcap", pairs(10))
     frames, reader = read(log, span_s=(0.2, 0.5))
