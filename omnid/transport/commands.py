@@ -19,6 +19,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Final, NamedTuple, Protocol
 
 from drivers.logs.ros_messages import JointWheels
@@ -36,10 +37,10 @@ from omnid.transport.decode import (
     stamp_from_cdr,
     twist_from_cdr,
 )
-from omnid.transport.freshness import Freshness, RefusedStamp
-from omnid.transport.requests import Answer, Request
+from omnid.transport.freshness import Freshness
+from omnid.transport.requests import Answer, Refused, Request
 from omnid.transport.sensor_codec import sample_from_cdr
-from omnid.transport.topics import ARM, HEADING, SENSOR_TOPICS, STOP, TWIST
+from omnid.transport.topics import ARM, HEADING, SENSOR_TOPICS, STOP, TWIST, setpoint_topics
 
 LONGEST_PAYLOAD: Final = 4096  # bytes
 LONGEST_SAMPLE: Final = 8192  # bytes
@@ -54,12 +55,11 @@ _ADVICE: Final = {
     "wrong frame": "give base_link for twist, odom for heading, or none",
     "unknown topic": "see controller.sources.names",
 }
-_CONTACTS: Final = {topics.BUMPER: BUMPER, topics.CLIFF: CLIFF}
 _MAX_TOPIC: Final = 60  # characters of a topic in the log
 
 
-class RefusedCommand(OmnidError):  # noqa: N818 - named after what it reports
-    """A command that must not be executed: the reason, which is counted, and where they say more the words for it."""
+def _refused(reason: str) -> Refused:
+    return Refused(reason, f"{reason}; {_ADVICE[reason]}" if reason in _ADVICE else "")
 
 
 class CommandMessage(NamedTuple):
@@ -70,18 +70,18 @@ class CommandMessage(NamedTuple):
 
 
 def twist_command(payload: bytes) -> CommandMessage:
-    """Decode a speed and a yaw rate. Raise RefusedCommand or OmnidError for anything else."""
+    """Decode a speed and a yaw rate. Raise OmnidError for anything else."""
     stamp_ns, frame, velocity_mps, yaw_rate_radps, aside = twist_from_cdr(payload)
     _check_frame(frame, "base_link")
     setpoint = Setpoint(_within(velocity_mps, MAX_SPEED_MPS), None, _within(yaw_rate_radps, MAX_YAW_RATE_RADPS))
     for name, speed in zip(ASIDE_NAMES, aside, strict=True):
         if not abs(speed) <= LEAST_SPEED:
-            raise RefusedCommand(ASIDE, f"twist.{name} = {speed:g} is {ASIDE}; send linear.x and angular.z only")
+            raise Refused(ASIDE, f"twist.{name} = {speed:g} is {ASIDE}; send linear.x and angular.z only")
     return CommandMessage(stamp_ns, setpoint)
 
 
 def heading_command(payload: bytes) -> CommandMessage:
-    """Decode a speed and a heading in odom. Raise RefusedCommand or OmnidError for anything else."""
+    """Decode a speed and a heading in odom. Raise OmnidError for anything else."""
     stamp_ns, frame, velocity_mps, heading_rad = heading_from_cdr(payload)
     _check_frame(frame, "odom")
     setpoint = Setpoint(_within(velocity_mps, MAX_SPEED_MPS), _within(heading_rad, MAX_HEADING_RAD))
@@ -90,15 +90,15 @@ def heading_command(payload: bytes) -> CommandMessage:
 
 def _within(value: float, limit: float) -> float:
     if not math.isfinite(value):
-        raise RefusedCommand("not finite")
+        raise _refused("not finite")
     if abs(value) > limit:
-        raise RefusedCommand("out of range")
+        raise _refused("out of range")
     return value
 
 
 def _check_frame(frame: str, expected: str) -> None:
     if frame not in ("", expected):
-        raise RefusedCommand("wrong frame")
+        raise _refused("wrong frame")
 
 
 class CommandTarget(Protocol):
@@ -147,11 +147,15 @@ class CommandReceiver:
         self._report, self._is_unique = report, is_unique
         self._target, self._freshness = target, freshness
         self._stop_ns = 0  # arrival of the newest stop
-        parsers = {TWIST: twist_command, HEADING: heading_command}
-        self._topics = {f"cmd/{name}": (sources[0], parser) for name, parser in parsers.items()}
-        self._topics |= {
-            f"cmd/{source}/{name}": (source, parser) for source in sources for name, parser in parsers.items()
+        # What is done with each message but a stop, given its time of arrival.
+        self._actions: dict[str, Callable[[Request, int], None]] = {
+            ARM: self._arm,
+            topics.BUMPER: partial(self._touch, BUMPER),
+            topics.CLIFF: partial(self._touch, CLIFF),
         }
+        parsers = {TWIST: twist_command, HEADING: heading_command}
+        for topic, (source, kind) in setpoint_topics(sources).items():
+            self._actions[topic] = partial(self._drive, source, parsers[kind])
         self._streams: dict[str, _Stream] = {}  # by source; none after a stop
         self.accepted = self.stops = self.arms = 0
         self.refused: Counter[str] = Counter()
@@ -168,30 +172,24 @@ class CommandReceiver:
             self._target.stop()
             return None
         try:
-            if request.topic in _CONTACTS:
-                self._touch(request, arrival_ns)
-            elif request.topic == ARM:
-                self._arm(request, arrival_ns)
-            else:
-                self._drive(request, arrival_ns)
-        except RefusedStamp as refusal:
-            return self._refuse(request.topic, refusal.reason, str(refusal))
-        except RefusedCommand as refusal:
-            return self._refuse(request.topic, *refusal.args)
+            if request.topic not in self._actions:
+                raise _refused("unknown topic")
+            self._actions[request.topic](request, arrival_ns)
+        except Refused as refusal:
+            return self._refuse(request.topic, refusal)
         except OmnidError:
-            return self._refuse(request.topic, MALFORMED)
+            return self._refuse(request.topic, _refused(MALFORMED))
         return None
 
-    def _refuse(self, topic: str, reason: str, words: str = "") -> Answer:
-        """Count and report a refusal; words: where they say more than the reason."""
-        self.refused[reason] += 1
-        text = words or (f"{reason}; {_ADVICE[reason]}" if reason in _ADVICE else reason)
-        self.refusal = f"a command on {ascii(topic)[1:-1][:_MAX_TOPIC]} is refused: {text}"
+    def _refuse(self, topic: str, refusal: Refused) -> Answer:
+        """Count and report a refusal."""
+        self.refused[refusal.reason] += 1
+        self.refusal = f"a command on {ascii(topic)[1:-1][:_MAX_TOPIC]} is refused: {refusal}"
         if self._report is not None:
             self._report(self.refusal)
-        return Answer(False, text)
+        return Answer(False, str(refusal))
 
-    def _touch(self, request: Request, arrival_ns: int) -> None:
+    def _touch(self, contact: str, request: Request, arrival_ns: int) -> None:
         """Pass the state of a contact on.
 
         A contact ends only by a Bool of False that was sent just now, and not before that of the contact, because
@@ -207,26 +205,22 @@ class CommandReceiver:
             else:
                 holds = self._freshness.require(request, arrival_ns) < newest_ns
         finally:
-            self._target.touch(_CONTACTS[request.topic], holds=holds)
+            self._target.touch(contact, holds=holds)
 
     def _arm(self, request: Request, arrival_ns: int) -> None:
         _check_length(request.payload)
         sent_ns = self._freshness.require(request, arrival_ns, stamp_from_cdr(request.payload))
         if not self._is_unique():
-            raise RefusedCommand(SAME_NAME)
+            raise _refused(SAME_NAME)
         if sent_ns <= self._stop_ns:
-            raise RefusedCommand(OLDER_THAN_STOP)
+            raise _refused(OLDER_THAN_STOP)
         self._streams.clear()
         self.arms += 1
         self._target.arm(ArmRequest(arrival_ns, request.id))
 
-    def _drive(self, request: Request, arrival_ns: int) -> None:
-        topic, payload = request.topic, request.payload
-        if topic not in self._topics:
-            raise RefusedCommand("unknown topic")
-        _check_length(payload)
-        source, parser = self._topics[topic]
-        command, stream = parser(payload), self._streams.get(source)
+    def _drive(self, source: str, parser: Callable[[bytes], CommandMessage], request: Request, arrival_ns: int) -> None:
+        _check_length(request.payload)
+        command, stream = parser(request.payload), self._streams.get(source)
         goes_on = (
             stream is not None
             and stream.sender == request.sender
@@ -241,7 +235,7 @@ class CommandReceiver:
 
 def _check_length(payload: bytes) -> None:
     if len(payload) > LONGEST_PAYLOAD:
-        raise RefusedCommand("too long")
+        raise _refused("too long")
 
 
 class SensorReceiver:

@@ -19,8 +19,7 @@ from typing import Final
 
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.engine.robot_clock import RobotClock, duration_words
-from omnid.errors import OmnidError
-from omnid.transport.requests import Request
+from omnid.transport.requests import Refused, Request
 
 UNSTAMPED: Final = "no stamp"
 TOO_OLD, EARLY = "too old", "stamp in the future"
@@ -35,15 +34,9 @@ _ADVICE: Final = {
 }
 
 
-class RefusedStamp(OmnidError):  # noqa: N818 - named after what it reports
-    """A message that was not sent just now.
-
-    reason: in the words that are counted. str() adds what was measured and what to do.
-    """
-
-    def __init__(self, reason: str, found: str = "") -> None:
-        self.reason = reason
-        super().__init__(f"{reason}{f': {found}' if found else ''}; {_ADVICE[reason]}")
+def _refused(reason: str, found: str = "") -> Refused:
+    """Return the refusal of a message that was not sent just now; found: what was measured."""
+    return Refused(reason, f"{reason}{f': {found}' if found else ''}; {_ADVICE[reason]}")
 
 
 class Freshness:
@@ -72,18 +65,18 @@ class Freshness:
         return min(found_ns, key=lambda sent_ns: abs(arrival_ns - sent_ns), default=None)
 
     def require(self, request: Request, arrival_ns: int, stamp_ns: int = 0) -> int:
-        """Return when what can begin a motion was sent. Raise RefusedStamp where it was not sent just now."""
+        """Return when what can begin a motion was sent. Raise Refused where it was not sent just now."""
         sent_ns = self.sent_ns(request, arrival_ns, stamp_ns)
         if sent_ns is None:
-            raise RefusedStamp(UNSTAMPED)
+            raise _refused(UNSTAMPED)
         if sent_ns - arrival_ns > self._stale_ns:
-            raise RefusedStamp(EARLY, f"by {duration_words((sent_ns - arrival_ns) * S_PER_NS)} by the robot's clock")
+            raise _refused(EARLY, f"by {duration_words((sent_ns - arrival_ns) * S_PER_NS)} by the robot's clock")
         return self._not_stale(sent_ns, arrival_ns)
 
     def of_stream(self, request: Request, arrival_ns: int, stamp_ns: int = 0) -> int:
         """Return when what goes on with a motion was sent, by itself or by its arrival: the earlier one counts.
 
-        Raise RefusedStamp where that is long ago.
+        Raise Refused where that is long ago.
         """
         sent_ns = self.sent_ns(request, arrival_ns, stamp_ns)
         return self._not_stale(arrival_ns if sent_ns is None else min(arrival_ns, sent_ns), arrival_ns)
@@ -95,5 +88,5 @@ class Freshness:
     def _not_stale(self, sent_ns: int, arrival_ns: int) -> int:
         age_ns = arrival_ns - sent_ns
         if age_ns > self._stale_ns:
-            raise RefusedStamp(TOO_OLD, f"sent {duration_words(age_ns * S_PER_NS)} ago by the robot's clock")
+            raise _refused(TOO_OLD, f"sent {duration_words(age_ns * S_PER_NS)} ago by the robot's clock")
         return sent_ns

@@ -21,7 +21,7 @@ from drivers.logs.ros_messages import BASE_FRAME, COMPRESSED_IMAGE, IMAGE, Joint
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.errors import OmnidError
 from omnid.transport import ros_types as ros
-from omnid.transport.codec import ODOMETRY_SCHEMA, header_message, message_cdr, odometry_cdr, ros_time
+from omnid.transport.codec import header_message, message_cdr, odometry_cdr, ros_time
 
 COMPRESSED: Final = ("jpeg", "png")
 # Encoding in drivers.frame -> name in sensor_msgs/image_encodings.hpp, where that is different.
@@ -68,7 +68,6 @@ def _aligned(block: bytes) -> bytes:
     return block + bytes(-len(block) % 4)
 
 
-WHEEL_SCHEMA: Final = ODOMETRY_SCHEMA
 LARGEST_RATE: Final = 100.0  # m/s and rad/s: larger ones are faults of the sender
 _UNKNOWN_VARIANCE: Final = 1e9  # Variance of the parts of a pose that wheels do not measure.
 _UNKNOWN: Final = np.array([-1.0, *[0.0] * 8])  # REP 145: the message has no orientation, and no acceleration

@@ -77,20 +77,22 @@ HEADING: Final = "heading"
 _SETPOINTS: Final = {TWIST: codec.TWIST_SCHEMA, HEADING: codec.VECTOR_SCHEMA}
 
 
+def setpoint_topics(sources: Sequence[str]) -> dict[str, tuple[str, str]]:
+    """Return the topics of setpoints with their source and kind, TWIST or HEADING.
+
+    sources: names, of which the first has the short topics, too.
+    """
+    short, kinds = sources[0] if sources else "", list(_SETPOINTS)
+    named = {f"cmd/{source}/{kind}": (source, kind) for source in sources for kind in kinds}
+    return {f"cmd/{kind}": (short, kind) for kind in kinds} | named
+
+
 def command_topics(sources: Sequence[str]) -> dict[str, str]:
-    """Return the topics of commands with their types; sources: names, of which the first has the short topics too."""
-    setpoints = {f"cmd/{name}": schema for name, schema in _SETPOINTS.items()}
-    named = {f"cmd/{source}/{name}": schema for source in sources for name, schema in _SETPOINTS.items()}
-    return {
-        **setpoints,
-        STOP: EMPTY_SCHEMA,
-        ARM: codec.HEADER_SCHEMA,
-        **CONTACT_TOPICS,
-        **NAVIGATION_TOPICS,
-        **MAP_TOPICS,
-        **SENSOR_TOPICS,
-        **named,
-    }
+    """Return the topics of commands with their types; sources: as of setpoint_topics."""
+    short = {f"cmd/{kind}": schema for kind, schema in _SETPOINTS.items()}
+    stops = {STOP: EMPTY_SCHEMA, ARM: codec.HEADER_SCHEMA}
+    named = {topic: _SETPOINTS[kind] for topic, (_, kind) in setpoint_topics(sources).items()}
+    return short | stops | CONTACT_TOPICS | NAVIGATION_TOPICS | MAP_TOPICS | SENSOR_TOPICS | named
 
 
 def request_key(topic: str) -> str:

@@ -43,7 +43,7 @@ from omnid.transport.decode import (
     decode_scan,
     features_from_bytes,
 )
-from omnid.transport.sensor_codec import WHEEL_SCHEMA, gyro_cdr, image_cdr, image_topic, wheel_cdr
+from omnid.transport.sensor_codec import gyro_cdr, image_cdr, image_topic, wheel_cdr
 from tests.omnid.sinks.test_recorder import frame
 
 STAMP_NS = 1_700_000_123_987_654_321
@@ -82,7 +82,7 @@ MESSAGES = {
     "grid": (codec.GRID_SCHEMA, codec.grid_cdr(STAMP_NS, "odom", CELLS, 0.1, (-2.0, 5.5))),
     "scan": (SCAN_SCHEMA, scan_cdr(STAMP_NS, "base_link", RANGES, SIGMA, (0.1, 6.0))),
     "moving": (codec.POINT_CLOUD_SCHEMA, moving_cdr(STAMP_NS, "odom", [PERSON] * 3)),
-    "wheels": (WHEEL_SCHEMA, wheel_cdr(WheelSample(5, 0.25, -0.5), STAMP_NS)),
+    "wheels": (codec.ODOMETRY_SCHEMA, wheel_cdr(WheelSample(5, 0.25, -0.5), STAMP_NS)),
     "gyro": (IMU_SCHEMA, gyro_cdr(GyroSample(6, 0.125, -0.25, 0.5, of_base=True), STAMP_NS)),
 }
 
