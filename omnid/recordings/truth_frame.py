@@ -7,14 +7,15 @@ T_rig_body of that body, and the unknown pose T_truth_odom of the estimate's wor
 
 Both poses and the delay are fitted by Gauss-Newton in one linearisation: with E = T_odom_rig T_rig_body and the body's
 twist v, the residual r = log((T_truth_odom E)^-1 T_truth_body) changes by -Ad(E^-1) a - x + v delay. The same is done
-for each other convention in which the file may be written, and the simplest one that explains the error is told.
+for other conventions in which the file may be written. The simplest difference that explains the error is told, if what
+each half of the drive shows of it explains the error of the other half: drift, jumps and other drives show none.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -26,9 +27,10 @@ from omnid.formats.tum import Trajectory
 Array = NDArray[np.float64]
 # Of two explanations the simpler one is told, unless the other leaves less than this part of its error.
 WORTH_PART: Final = 0.5
+SMALL_ERROR: Final = 0.02  # in parts of the path's spread, and rad: that of odometry, which needs no explanation
 # Units of positions, as the number of them in a metre.
 UNITS: Final = {"m": 1.0, "mm": 1e3, "cm": 1e2, "km": 1e-3, "feet": 1 / 0.3048, "inches": 1 / 0.0254}
-MAX_POSES: Final = 300  # Poses of a fit, evenly spread: enough for 13 unknowns.
+MAX_POSES: Final = 100  # Poses of a fit, evenly spread: enough for 13 unknowns.
 STEPS: Final = 30  # Gauss-Newton steps: a bound, the search ends earlier.
 # Prior of T_rig_body: what the path does not show stays near 0.
 PRIOR_RAD, PRIOR_M, PRIOR_S = 1.0, 1.0, 1.0
@@ -109,48 +111,81 @@ def _turn(T: Array) -> str:
     return f"{math.degrees(angle_rad):.1f} deg about ({axis[0]:.2f} {axis[1]:.2f} {axis[2]:.2f})"
 
 
+@dataclass(frozen=True, slots=True)
+class _Way:
+    """A way in which a truth may be written, and what of it is fitted."""
+
+    reading: str  # a key of READINGS
+    read: Trajectory
+    unit: str  # a key of UNITS
+    delay_s: float  # at the start of the fit, if has_delay
+    has_delay: bool = False
+    is_turned: bool = False
+    has_lever: bool = False
+
+    @property
+    def changes(self) -> int:
+        """Return the number of differences."""
+        return (self.reading != "") + (self.unit != "m") + self.has_delay + self.is_turned + self.has_lever
+
+    def fit(self, estimate: Trajectory) -> tuple[float, TruthFrame]:
+        """Return the error that is left, and the difference."""
+        free = np.repeat([True, self.has_lever, self.is_turned, self.has_delay], [6, 3, 3, 1])
+        fit = _fitted(estimate, self.read, (self.delay_s, self.unit), free)
+        return (np.inf, TruthFrame()) if fit is None else (fit[0], TruthFrame(self.reading, self.unit, *fit[1]))
+
+
 def find_truth_frame(estimate: Trajectory, truth: Trajectory) -> TruthFrame | None:
     """Return the simplest difference that explains the error of an estimate; None where none is needed.
 
-    A difference explains an error if no other leaves less than half of it. The rigid transform between the two worlds
-    is no difference.
+    A difference explains an error if no other leaves less than half of it, and if half of the drive shows the
+    difference that halves the error of the other half: drift shows none. The rigid transform between the two worlds is
+    no difference.
     """
-    if min(len(estimate.stamps_ns), len(truth.stamps_ns)) < 4:
+    if min(len(estimate.stamps_ns), len(truth.stamps_ns)) < 4 or _error(estimate, truth) < SMALL_ERROR:
         return None
-    # 1. For each convention, without and with a delay, the fit of all that may differ.
-    ways = list[tuple[str, Trajectory, bool, float, str]]()
+    # 1. For each convention, without and with a delay, the fit of all that may differ. Another convention is looked for
+    # as long as none leaves little.
+    general = list[tuple[_Way, float, TruthFrame]]()
+    least = np.inf
     for reading, poses in READINGS.items():
         read = Trajectory(truth.stamps_ns, poses(truth.T))
         for has_delay in (False, True):
             delay_s = _delay_s(estimate, read) if has_delay else 0.0
             pair = _common(estimate, read, delay_s)
             if pair is not None:
-                ways.append((reading, read, has_delay, delay_s, _unit(pair)))
-    general = [_fit_of(estimate, way, is_turned=True, has_lever=True) for way in ways]
-    least = max(LEAST_SIGMA, min((error for _, error, _ in general), default=np.inf))
+                way = _Way(reading, read, _unit(pair), delay_s, has_delay, is_turned=True, has_lever=True)
+                general.append((way, *way.fit(estimate)))
+                least = max(LEAST_SIGMA, min(least, general[-1][1]))
+        if least < SMALL_ERROR:
+            break
     # 2. Of those that leave little, the fits of less.
-    found = list(general)
-    for way, (_, error, _) in zip(ways, general, strict=True):
-        if WORTH_PART * error <= least:
-            for is_turned, has_lever in ((False, False), (True, False), (False, True)):
-                found.append(_fit_of(estimate, way, is_turned=is_turned, has_lever=has_lever))
-    # 3. The simplest that explains the error.
-    good = [one for one in found if WORTH_PART * one[1] <= least]
-    changes, _, frame = min(good, key=lambda one: one[:2], default=(0, 0.0, TruthFrame()))
-    return frame if changes else None
+    good = [one for one in general if WORTH_PART * one[1] <= least]
+    less = [
+        replace(way, is_turned=is_turned, has_lever=has_lever)
+        for way, _, _ in good
+        for is_turned, has_lever in ((False, False), (True, False), (False, True))
+    ]
+    good += [(way, error, frame) for way in less for error, frame in [way.fit(estimate)] if WORTH_PART * error <= least]
+    # 3. The simplest that explains the error, and that of each half of the drive by the other half.
+    if not good:
+        return None
+    way, _, frame = min(good, key=lambda one: (one[0].changes, one[1]))
+    return frame if way.changes and _is_shown_by_halves(estimate, truth, way) else None
 
 
-def _fit_of(
-    estimate: Trajectory, way: tuple[str, Trajectory, bool, float, str], *, is_turned: bool, has_lever: bool
-) -> tuple[int, float, TruthFrame]:
-    """Return number of differences, error that is left and difference of a truth that is written in a way."""
-    reading, read, has_delay, delay_s, unit = way
-    free = np.repeat([True, has_lever, is_turned, has_delay], [6, 3, 3, 1])
-    changes = (reading != "") + (unit != "m") + has_delay + is_turned + has_lever
-    fit = _fitted(estimate, read, (delay_s, unit), free)
-    if fit is None:
-        return changes, np.inf, TruthFrame()
-    return changes, fit[0], TruthFrame(reading, unit, *fit[1])
+def _is_shown_by_halves(estimate: Trajectory, truth: Trajectory, way: _Way) -> bool:
+    """True if what each half of a drive shows explains the other half's error; one of the whole spread is the most."""
+    middle = len(estimate.stamps_ns) // 2
+    first, second = (Trajectory(estimate.stamps_ns[part], estimate.T[part]) for part in np.s_[:middle, middle:])
+    left = [_error(other, way.fit(one)[1].rig_poses(truth)) for one, other in ((first, second), (second, first))]
+    return sum(left) < WORTH_PART * sum(min(1.0, _error(half, truth)) for half in (first, second))
+
+
+def _error(estimate: Trajectory, truth: Trajectory) -> float:
+    """Return the error that `omnid eval` shows; see `_fitted`; infinite without poses at the same times."""
+    pair = _common(estimate, truth, 0.0)
+    return np.inf if pair is None else _shown_error(pair, np.eye(4))
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,9 +219,7 @@ def _seconds(trajectory: Trajectory, origin: Trajectory) -> Array:
 
 def _unit(pair: _Pair) -> str:
     """Return the unit of the truth's positions, by their spread against that of the estimate."""
-    spread, true_spread = (
-        float(np.linalg.norm(T[:, :3, 3] - T[:, :3, 3].mean(axis=0))) for T in (pair.T_odom_rig, pair.T_truth_body)
-    )
+    spread, true_spread = _spread(pair.T_odom_rig), _spread(pair.T_truth_body)
     if min(spread, true_spread) <= 0.0:
         return "m"
     ratio = math.log(true_spread / spread)
@@ -249,8 +282,8 @@ def _fitted(
     """Return the error that is left, and delay, T_rig_body, number of fitted unknowns and unknown axes.
 
     The error is what `omnid eval` shows: of poses of which the first ones agree, that of the positions in parts of
-    their spread, plus that of the rotations [rad]. start: delay [s] and unit. free (13,): the unknowns that are fitted:
-    T_truth_odom, lever arm and rotation of T_rig_body, delay.
+    the larger of both spreads, plus that of the rotations [rad]. start: delay [s] and unit. free (13,): the unknowns
+    that are fitted: T_truth_odom, lever arm and rotation of T_rig_body, delay.
     """
     delay_s, unit = start
     T = truth.T.copy()
@@ -330,7 +363,7 @@ def _gauss_newton(
             if moved is None:
                 return None
             pair = moved
-        if np.linalg.norm(step) < 1e-8:
+        if np.linalg.norm(step) < LEAST_SIGMA:
             break
     determined, unknown = _determined(normal, prior, free)
     is_rig = not free[6:12].any()
@@ -341,8 +374,13 @@ def _shown_error(pair: _Pair, T_rig_body: Array) -> float:
     """Return the error that `omnid eval` shows; see `_fitted`."""
     T_true = pair.T_truth_body @ se3.inverse(T_rig_body)
     off = se3.inverse(T_true) @ T_true[0] @ se3.inverse(pair.T_odom_rig[0]) @ pair.T_odom_rig
-    spread_m = max(_rms(T_true[:, :3, 3] - T_true[:, :3, 3].mean(axis=0)), LEAST_SIGMA)
+    spread_m = max(*(_spread(T) for T in (T_true, pair.T_odom_rig)), LEAST_SIGMA)
     return _rms(off[:, :3, 3]) / spread_m + _rms(se3.rotation_log(off[:, :3, :3]))
+
+
+def _spread(T: Array) -> float:
+    """Return how far the positions of poses (N, 4, 4) are from their mean."""
+    return _rms(T[:, :3, 3] - T[:, :3, 3].mean(axis=0))
 
 
 def _rms(vectors: Array) -> float:

@@ -104,3 +104,44 @@ def test_says_what_explains_the_error_and_fits_it_where_asked(
     assert (f"fitted to these poses: {unknowns}; the errors are optimistic" in shown.out) is bool(unknowns)
     (errors,) = [line for line in shown.out.splitlines() if line.startswith("position error")]
     assert float(errors.split("rmse")[1].split(",")[0]) < 20.0, "millimetres, of an estimate with 7 mm of noise"
+
+
+def wander(seed: int) -> Array:
+    """Return the poses (N, 4, 4) of a random walk."""
+    steps = np.random.default_rng(seed).normal(0, 1, (len(S), 6)) * np.repeat([0.05, 0.03], 3)
+    return se3.transform(se3.rotation_exp(steps[:, 3:].cumsum(axis=0)), steps[:, :3].cumsum(axis=0))
+
+
+def with_jump(T: Array) -> Array:
+    later = np.arange(len(T)) >= 60
+    return np.where(later[:, None, None], T[60] @ se3.exp([0.3, 0.3, 0.25, 0.0, 0.02, 0.0]) @ se3.inverse(T[60]) @ T, T)
+
+
+def scaled(T: Array, factor: float) -> Array:
+    return se3.transform(T[:, :3, :3], factor * T[:, :3, 3])
+
+
+STANDING = np.broadcast_to(np.eye(4), HAND.shape)
+TURNING = se3.transform(se3.rotation_exp(np.outer(S, [0.0, 0.0, 0.8])), np.zeros((len(S), 3)))
+
+
+@pytest.mark.parametrize(
+    ("estimate", "truth"),
+    [
+        (HAND, scaled(HAND, 0.97)),
+        (with_jump(FLAT), FLAT),
+        (with_jump(wander(1)), wander(1)),
+        (wander(2), wander(3)),
+        (wander(4), wander(5)),
+        (with_jump(STANDING), STANDING),
+        (with_jump(TURNING), TURNING),
+        (TURNING, TURNING @ se3.exp(np.random.default_rng(2).normal(0, 0.02, (len(S), 6)))),
+    ],
+)
+def test_claims_no_difference_where_none_explains_the_error(
+    estimate: Array, truth: Array, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, poses in (("est.txt", estimated(estimate)), ("truth.txt", truth)):
+        (tmp_path / name).write_text("\n".join(as_tum(T, int(n)) for T, n in zip(poses, STAMPS_NS, strict=True)))
+    assert main(["eval", str(tmp_path / "est.txt"), str(tmp_path / "truth.txt")]) == 0
+    assert "--frame auto" not in capsys.readouterr().err
