@@ -84,7 +84,7 @@ class ImageFolder:
     def __init__(self, path: Path, folders: Sequence[Path], rate_hz: float = 0.0) -> None:
         """rate_hz: images a second; 0: their names or times.txt state their stamps."""
         self.name = str(path)
-        self._path, self._closed = path, False
+        self._path, self._closed, self._is_by_rate = path, False, rate_hz > 0
         self._files = {folder.relative_to(path).as_posix(): _stamped(path, folder, rate_hz) for folder in folders}
         if sum(map(len, self._files.values())) > MAX_IMAGES:
             raise DriverError(f"{self.name!r} contains more than {MAX_IMAGES} images; give a part of them")
@@ -124,8 +124,15 @@ class ImageFolder:
         return {ATTACHMENT: data} if len(data) <= _MAX_ATTACHMENT_BYTES else {}
 
     def damage(self) -> LogDamage:
-        """Return none: a file that is no image is counted when it is read."""
-        return LogDamage()
+        """Return what the numbers of images say; a file that is no image is counted when it is read."""
+        counts = {topic: len(files) for topic, files in self._files.items()}
+        if not self._is_by_rate or len(set(counts.values())) == 1:
+            return LogDamage()
+        found = ", ".join(f"{count} in {topic!r}" for topic, count in counts.items())
+        return LogDamage(
+            cut=f"images of {self.name!r} are missing: found {found}; by a rate they are paired in the order of their "
+            "names, wrongly behind a missing one: write times.txt"
+        )
 
     def close(self) -> None:
         """End messages()."""

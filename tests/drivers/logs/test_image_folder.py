@@ -129,3 +129,13 @@ def test_hidden_files_beside_the_images_are_left_out(tmp_path: Path) -> None:
     (folder / "lower" / "._1.jpg").write_bytes(b"\0\5\x16\7")
     with closing(LogReader(folder)) as reader:
         assert len(list(reader.frames())) == 6 and not reader.warnings
+
+
+@pytest.mark.parametrize("missing", [0, 1])
+def test_a_missing_image_is_told_where_a_rate_stands_for_stamps(tmp_path: Path, missing: int) -> None:
+    folder = write_folders(tmp_path / "images", pairs(4))
+    for path in sorted((folder / "upper").iterdir())[:missing]:
+        path.unlink()
+    with closing(LogReader(folder, rate_hz=10.0)) as reader:
+        assert len(list(reader.frames())) == 8 - missing and len(reader.warnings) == missing
+        assert all("found 4 in 'lower', 3 in 'upper'" in line for line in reader.warnings)
