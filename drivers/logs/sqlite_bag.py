@@ -225,14 +225,14 @@ class SqliteBag:
         """Open the file for reading from any thread; it may be damaged or hostile. Raise sqlite3.Error.
 
         SQLite must write where it finds a journal, or a write-ahead log in a folder that cannot be written: then all
-        files are copied.
+        files are copied. A file that had a write-ahead log is read as one that does not change.
         """
         self._measured_bytes()
         try:
             return self._connected(self._files[0], "ro")
         except sqlite3.Error:
             if not any(file.exists() for file in self._files[1:]):
-                raise
+                return self._connected(self._files[0], "ro&immutable=1")  # else it locks what nobody writes
         with scratch_folder(self.name, self._bytes) as folder:
             for file in filter(Path.exists, self._files):
                 shutil.copyfile(file, folder / file.name)

@@ -7,10 +7,12 @@ import fcntl
 import gzip
 import os
 import random
+import shutil
 import sqlite3
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final, NamedTuple
 
 import lz4.frame  # type: ignore[import-untyped]
@@ -187,6 +189,24 @@ def test_a_growing_database_is_read_as_far_as_it_is_written(tmp_path: Path) -> N
             writer.executemany("INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)", rows)
         writer.commit()
         assert len(list(log.messages())) == 4 * 201 and not log.damage().cut
+
+
+def test_a_closed_database_in_a_folder_that_cannot_be_written_is_read_by_any_user(tmp_path: Path) -> None:
+    with TemporaryDirectory() as place:
+        path = Path(shutil.copy(write_db3(tmp_path / "bag", pairs(PAIRS)), place))
+        with closing(sqlite3.connect(path)) as writer:
+            writer.execute("PRAGMA journal_mode = WAL")
+        Path(place).chmod(0o555)
+        child = os.fork()
+        if child == 0:  # as another user than root, who may write everywhere
+            try:
+                if os.getuid() == 0:
+                    os.setuid(65534)
+                os._exit(read(path)[0] != expected(PAIRS))
+            finally:
+                os._exit(2)
+        assert os.waitpid(child, 0)[1] == 0
+        Path(place).chmod(0o755)
 
 
 # Folders and parts
