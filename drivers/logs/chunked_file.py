@@ -338,7 +338,9 @@ class ChunkedFile(ABC):
                     elif record.kind is RecordKind.MESSAGE:
                         head = self._head(source, record)
                         topic = self._topic(head.channel)
-                        if topic is not None and (topics is None or topic.name in topics):
+                        if topic is None:
+                            raise RecordError(f"the channel {head.channel} of a message is unknown")
+                        if topics is None or topic.name in topics:
                             place = block.begin, head.offset, head.size
                             yield (block.begin, record.begin), _Waiting(head.log_time_ns, *place, topic, block)
                 except RecordError:

@@ -209,6 +209,16 @@ def test_a_closed_database_in_a_folder_that_cannot_be_written_is_read_by_any_use
         Path(place).chmod(0o755)
 
 
+def test_a_message_of_an_unknown_connection_is_told(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "log.bag", pairs(PAIRS))
+    data = bytearray(path.read_bytes())
+    at = data.rindex(b"conn=", 0, data.rindex(b"\xff\xd8\xff")) + len(b"conn=")  # of the last image
+    data[at] = 77
+    path.write_bytes(data)
+    found, reader = read(path)
+    assert len(found) == 2 * PAIRS - 1 and reader.warnings == ["skipped 1 corrupt chunks or records of the file"]
+
+
 # Folders and parts
 
 
