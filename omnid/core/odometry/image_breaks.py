@@ -434,7 +434,7 @@ class _Candidate(NamedTuple):
 
     def columns(self, flow: _Flow, raws: tuple[RawImage, RawImage]) -> list[Array]:
         """Return the derivatives (N, 2, K) of flows by the amount of each camera."""
-        of = _columns(flow, self.form, raws)
+        of = _columns(flow, raws)[:, :, _own_columns(self.form)]
         sizes = np.array([raw.size[1 - self.form.axis] for raw in raws])
         where = (flow.raw[:, 1 - self.form.axis] >= self.part * sizes[flow.camera]) != self.is_before
         return [of * (where & (flow.camera == camera))[:, None, None] for camera in self.cameras]
@@ -444,14 +444,26 @@ def _gain(candidate: _Candidate) -> float:
     return candidate.gain
 
 
-def _columns(flow: _Flow, form: _Form, raws: tuple[RawImage, RawImage]) -> Array:
-    """Return the derivatives (N, 2, K) of flows by the amount of a break."""
-    if form.kind == "rolling":
-        along = np.array([raw.size[1 - form.axis] for raw in raws])[flow.camera]
-        return np.asarray((flow.raw[:, 1 - form.axis] / along - 0.5)[:, None, None] * flow.steps[:, :, :2])
-    if form.kind == "turned":
-        return np.concatenate([flow.shift, flow.turn], axis=2)
-    return flow.steps[:, :, form.column : form.column + 1] if form.kind == "torn" else flow.shift
+def _columns(flow: _Flow, raws: tuple[RawImage, RawImage]) -> Array:
+    """Return the derivatives (N, 2, 10) of flows: by shift and turn, parts of steps, slopes over rows and columns."""
+    slopes = []
+    for axis in (0, 1):
+        along = np.array([raw.size[1 - axis] for raw in raws])[flow.camera]
+        slopes.append((flow.raw[:, 1 - axis] / along - 0.5)[:, None, None] * flow.steps[:, :, :2])
+    return np.concatenate([flow.shift, flow.turn, flow.steps, *slopes], axis=2)
+
+
+def _own_columns(form: _Form) -> slice:
+    """Return which of these columns the amount of a form of break has."""
+    match form.kind:
+        case "displaced":
+            return slice(2)
+        case "turned":
+            return slice(3)
+        case "torn":
+            return slice(3 + form.column, 4 + form.column)
+        case "rolling":
+            return slice(6 + 2 * form.axis, 8 + 2 * form.axis)
 
 
 def _candidates(
@@ -467,51 +479,67 @@ def _candidates(
     null = flow.null[used].reshape(-1, m)
     information = np.linalg.inv(null.T @ null + np.diag(_prior(m)))
     left = left - flow.null @ (information @ (null.T @ left[used].ravel()))
+    # 1. Sums of products of all columns for the landmarks beyond each line, by axis.
+    columns = _columns(flow, raws)
+    products = np.swapaxes(columns, 1, 2) @ np.concatenate([columns, flow.null, left[:, :, None]], axis=2)
+    sums = [_beyond_lines(flow, used, products, axis, raws) for axis in (0, 1)]
+    width = columns.shape[2]
     for form in FORMS:
-        columns = _columns(flow, form, raws)
-        k = columns.shape[2]
-        # 1. Sums of products for the landmarks beyond each line.
-        Z = np.concatenate([columns, flow.null, left[:, :, None]], axis=2)
-        products = np.swapaxes(columns, 1, 2) @ Z
-        beyond, after = np.zeros((2, form.lines, k, k + m + 1)), np.zeros((2, form.lines))
-        for camera, raw in enumerate(raws):
-            rows = np.flatnonzero(used & (flow.camera == camera))
-            place = (flow.raw[rows, 1 - form.axis] * form.lines / raw.size[1 - form.axis]).astype(np.intp)
-            order = np.argsort(place, kind="stable")
-            starts = np.flatnonzero(np.diff(place[order], prepend=-1))
-            if len(rows):
-                beyond[camera, place[order][starts]] = np.add.reduceat(products[rows[order]], starts)
-            after[camera] = np.bincount(place, minlength=form.lines)
-        beyond, after = (part[:, ::-1].cumsum(axis=1)[:, ::-1] for part in (beyond, after))
+        own_columns = _own_columns(form)
+        k = own_columns.stop - (own_columns.start or 0)
+        beyond, after = (part[:, : form.lines] for part in sums[form.axis])
+        enough = {cameras: _enough(after[list(cameras)]) for cameras in SETS}
+        systems: dict[bool, tuple[Array, Array]] = {}  # normal equations of both cameras: what is beyond, or before
         # 2. What each break explains. One of both cameras alike is the same on either side of its line, but for a step.
         for is_before, cameras in [(False, each) for each in form.sets] + [(True, each) for each in form.others]:
-            shown = after[list(cameras)]
-            rest = shown[:, :1] - shown if form.lines > 1 else shown
-            enough = np.ones(form.lines, bool)
-            for side in (shown, rest):
-                enough &= (side.sum(axis=0) >= LEAST) & (side.min(axis=0) >= LEAST_EACH)
-            if not enough.any():
+            if not enough[cameras].any():
                 continue
-            own, size = beyond[list(cameras)], k * len(cameras)
-            own = own[:, :1] - own if is_before else own
-            with_null = np.moveaxis(own[..., k : k + m], 0, 1).reshape(form.lines, size, m)
-            S = RIDGE * np.eye(size) - with_null @ information @ np.swapaxes(with_null, 1, 2)
-            for number in range(len(cameras)):
-                block = slice(number * k, (number + 1) * k)
-                S[:, block, block] += own[number, :, :, :k]
-            b = np.moveaxis(own[..., -1], 0, 1).reshape(form.lines, size)
-            amount = np.linalg.solve(S, b[:, :, None])[:, :, 0]
+            if is_before not in systems:
+                own = beyond[:, :, own_columns]
+                own = own[:, :1] - own if is_before else own
+                with_null = np.moveaxis(own[..., width : width + m], 0, 1).reshape(form.lines, 2 * k, m)
+                S = RIDGE * np.eye(2 * k) - with_null @ information @ np.swapaxes(with_null, 1, 2)
+                for camera, block in enumerate((slice(k), slice(k, 2 * k))):
+                    S[:, block, block] += own[camera][:, :, own_columns]
+                systems[is_before] = S, np.moveaxis(own[..., -1], 0, 1).reshape(form.lines, 2 * k)
+            S, b = systems[is_before]
+            chosen, is_good = slice(k * cameras[0], k * (cameras[-1] + 1)), enough[cameras]
+            b, size = b[:, chosen], k * len(cameras)
+            amount = np.linalg.solve(S[:, chosen, chosen], b[:, :, None])[:, :, 0]
             if form.kind == "torn":
                 most = np.abs(amount).max(axis=1)
-                enough &= (most > LEAST_PART) & (most < 1.0 / LEAST_PART)
+                is_good = is_good & (most > LEAST_PART) & (most < 1.0 / LEAST_PART)
             if form.kind == "displaced" and form.lines > 1:  # lines that are twice or missing are whole ones
-                enough &= np.linalg.norm(amount.reshape(form.lines, -1, 2), axis=2).max(axis=1) > LEAST_PX
+                is_good = is_good & (np.linalg.norm(amount.reshape(form.lines, -1, 2), axis=2).max(axis=1) > LEAST_PX)
             cost = _cost(size, count)
-            gain = np.where(enough, (b * amount).sum(axis=1) / (2 * scale * CORRELATED) - cost, -np.inf)
+            gain = np.where(is_good, (b * amount).sum(axis=1) / (2 * scale * CORRELATED) - cost, -np.inf)
             line = int(gain.argmax())
-            if enough[line]:
+            if is_good[line]:
                 found.append(_Candidate(float(gain[line]), form, cameras, line / form.lines, cost, is_before))
     return found
+
+
+def _enough(beyond: Array) -> Flags:
+    """True (L,) for the lines that have enough flows on either side, by the numbers (C, L) beyond them by camera."""
+    before = beyond[:, :1] - beyond if beyond.shape[1] > 1 else beyond
+    sides = [(side.sum(axis=0) >= LEAST) & (side.min(axis=0) >= LEAST_EACH) for side in (beyond, before)]
+    return np.asarray(sides[0] & sides[1])
+
+
+def _beyond_lines(
+    flow: _Flow, used: Flags, products: Array, axis: int, raws: tuple[RawImage, RawImage]
+) -> tuple[Array, Array]:
+    """Return sums of products (2, LINES, K, M) and numbers (2, LINES) of the flows beyond each line, by camera."""
+    beyond, after = np.zeros((2, LINES, *products.shape[1:])), np.zeros((2, LINES))
+    for camera, raw in enumerate(raws):
+        rows = np.flatnonzero(used & (flow.camera == camera))
+        place = (flow.raw[rows, 1 - axis] * LINES / raw.size[1 - axis]).astype(np.intp)
+        order = np.argsort(place, kind="stable")
+        starts = np.flatnonzero(np.diff(place[order], prepend=-1))
+        if len(rows):
+            beyond[camera, place[order][starts]] = np.add.reduceat(products[rows[order]], starts)
+        after[camera] = np.bincount(place, minlength=LINES)
+    return beyond[:, ::-1].cumsum(axis=1)[:, ::-1], after[:, ::-1].cumsum(axis=1)[:, ::-1]
 
 
 def _cost(parameters: int, flows: int) -> float:
