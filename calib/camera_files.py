@@ -6,7 +6,7 @@ a file, or it is straight up.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -79,24 +79,30 @@ def read_camera(path: Path, view: View = "mirror", warn: Warn = silent) -> Camer
     if not is_named or is_ocam(data, name):
         return CameraFile(parse_ocam(data, view, name))
     values = load_mapping(data, name)
+    read = _reader(values)
+    if read is None:
+        raise CalibError(
+            f"{name}: expected one camera as ROS's camera_info, OpenCV, EuRoC's sensor.yaml, camodocal or OCamCalib "
+            f"write it, found the keys {shown(sorted(values))}"
+        )
     try:
-        if is_camera_info(values):
-            return _camera_info(values, lambda line: warn(f"{name}: {line}"))
-        if "model_type" in values:
-            return CameraFile(_camodocal(values, lambda line: warn(f"{name}: {line}")))
-        if "T_BS" in values:
-            return _euroc(values, lambda line: warn(f"{name}: {line}"))
+        return read(values, lambda line: warn(f"{name}: {line}"))
     except (CalibError, ValueError, TypeError) as error:
         raise error if str(error).startswith(name) else CalibError(f"{name}: {error}") from error
-    raise CalibError(
-        f"{name}: expected one camera as ROS's camera_info, OpenCV, EuRoC's sensor.yaml, camodocal or OCamCalib write "
-        f"it, found the keys {shown(sorted(values))}"
-    )
 
 
-def is_camera_info(values: Mapping[str, Any]) -> bool:
-    """True for the values of one camera in ROS's or OpenCV's form."""
-    return any(key in values for key in MATRIX) and any(key in values for key in TERMS)
+def is_one_camera(values: Mapping[str, Any]) -> bool:
+    """True for the values of a file of one camera."""
+    return _reader(values) is not None
+
+
+def _reader(values: Mapping[str, Any]) -> Callable[[Mapping[str, Any], Warn], CameraFile] | None:
+    """Return the function that reads the values of one camera, by their keys; None for others."""
+    if any(key in values for key in MATRIX) and any(key in values for key in TERMS):
+        return _camera_info
+    if "model_type" in values:
+        return _camodocal
+    return _euroc if "T_BS" in values else None
 
 
 def _camera_info(values: Mapping[str, Any], warn: Warn) -> CameraFile:
@@ -131,7 +137,7 @@ def _euroc(values: Mapping[str, Any], warn: Warn) -> CameraFile:
     return CameraFile(camera, transform_of(values["T_BS"], "T_BS", warn))
 
 
-def _camodocal(values: Mapping[str, Any], warn: Warn) -> OmniCamera:
+def _camodocal(values: Mapping[str, Any], warn: Warn) -> CameraFile:
     """Return the camera of a file of camodocal, as VINS-Mono and VINS-Fusion use it."""
     kind = str(values["model_type"]).upper()
     if kind not in CAMODOCAL:
@@ -148,7 +154,7 @@ def _camodocal(values: Mapping[str, Any], warn: Warn) -> OmniCamera:
     missing = [key for key, ours in names.items() if ours not in found]
     if missing:
         raise CalibError(f"{kind}: expected {', '.join(missing)} among its parameters, found {shown(sorted(found))}")
-    return camera_of(model, found, (_whole(values, WIDTH), _whole(values, HEIGHT)), warn)
+    return CameraFile(camera_of(model, found, (_whole(values, WIDTH), _whole(values, HEIGHT)), warn))
 
 
 def _numbers(values: Mapping[str, Any], keys: tuple[str, ...], counts: tuple[int, ...]) -> Array:

@@ -58,7 +58,7 @@ def load_mapping(data: str | bytes, name: str) -> Mapping[str, Any]:
             raise ValueError("it is XML: write it as .yml, with OpenCV's FileStorage")
         if values is None:
             values = _yaml(text)
-    # AssertionError, too, and more are raised by ruamel.yaml for damaged texts.
+    # ruamel.yaml raises all of these for damaged texts.
     except (YAMLError, ValueError, RecursionError, TypeError, LookupError, AttributeError, AssertionError) as error:
         raise CalibError(f"{name}: not a YAML file: {' '.join(str(error).split())[:200]}") from error
     if not isinstance(values, Mapping):

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from calib import se3
-from calib.camera_files import import_pair, is_camera_info
+from calib.camera_files import import_pair, is_one_camera
 from calib.equirectangular_file import import_helvipad, stacked_rig
 from calib.kalibr import import_chain
 from calib.models.camera import field_of_view
@@ -99,7 +99,7 @@ def _imported(args: argparse.Namespace) -> Rig:
         raise OmnidError(f"{args.camchain}: a rig.toml needs no import: use it as it is, --rig {args.camchain}")
     check_outputs([("--output", args.output)], [("the file that is read", args.camchain)])
     values = load_mapping(read_bytes(args.camchain, MAX_JSON_BYTES), str(args.camchain))
-    if is_camera_info(values) or "model_type" in values or "T_BS" in values:
+    if is_one_camera(values):
         raise OmnidError(f"{args.camchain}: it has one camera: give the files of both as --lower FILE --upper FILE")
     if "stereo_baseline" in values:
         return _helvipad(args)
