@@ -28,7 +28,7 @@ from omnid.engine.telemetry import StageStats
 from omnid.engine.threads import returns_within
 from omnid.errors import OmnidError
 from omnid.settings import dump
-from omnid.sinks.encoder import Encoder, UnixTime, map_encoding
+from omnid.sinks.encoder import Encoder, UnixTime
 from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.transport.bus import Bus
 
@@ -141,8 +141,8 @@ class Session:
 
     def encoder(self, rig: Rig, cloud_points: int, unix_ns: UnixTime | None = None) -> Encoder:
         """Return an encoder that limits the number of points of the map; unix_ns: None for that of the clock."""
-        encoding = map_encoding(self.config, cloud_points)
-        return Encoder(rig.T_base_rig, encoding, unix_ns or self.clock.unix_ns, rig)
+        scan_range_m = self.config.obstacles.ring.max_range_m
+        return Encoder(rig.T_base_rig, cloud_points, unix_ns or self.clock.unix_ns, rig, scan_range_m)
 
     def dropped_messages(self) -> int:
         """Return the number of messages that were dropped in front of the stages and sinks."""

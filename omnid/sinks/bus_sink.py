@@ -8,10 +8,10 @@ import cv2
 
 from drivers.frame import Frame
 from drivers.motor import VelocityCommand
-from omnid.messages import OdometryUpdate, PlaceUpdate
-from omnid.sinks.encoder import Encoder, Outgoing, StateReports, UnixTime, same_time, static_frames
+from omnid.messages import OdometryUpdate
+from omnid.sinks.encoder import Changes, Encoder, Outgoing, UnixTime, pose_attachment, same_time
 from omnid.transport.bus import Bus
-from omnid.transport.codec import PoseAttachment, clock_cdr, features_to_bytes
+from omnid.transport.codec import clock_cdr, features_to_bytes
 from omnid.transport.sensor_codec import image_cdr
 from omnid.transport.status_names import RUN_ID
 from omnid.transport.topics import CLOCK, PANORAMA
@@ -23,8 +23,7 @@ class BusSink:
     def __init__(self, bus: Bus, encode: Encoder, clock: type[OdometryUpdate | VelocityCommand] | None = None) -> None:
         """clock: the kind of message, from one thread, by whose stamps /clock advances, where the bus has it."""
         self._clock, self._time_ns = clock, 0
-        self._bus, self._encode, self._states = bus, encode, StateReports(encode.unix_ns, RUN_ID)
-        self._gave_frames = False
+        self._bus, self._encode, self._changes = bus, encode, Changes(encode, RUN_ID)
 
     def process(self, message: Outgoing) -> None:
         """Publish a message; a pose with its attachment, and what has changed: states and static frames."""
@@ -33,22 +32,12 @@ class BusSink:
             self._time_ns = message.stamp_ns
             self._bus.publish(CLOCK, clock_cdr(self._encode.unix_ns(message.stamp_ns)))
         # 2. The message itself.
-        attachment = _attachment(message).to_bytes() if isinstance(message, OdometryUpdate) else None
+        attachment = pose_attachment(message, time.time_ns()) if isinstance(message, OdometryUpdate) else None
         for topic, _, payload in self._encode(message):
             self._bus.publish(topic, payload, attachment if topic == "odom" else None)
-        # 3. Where they have changed: the state, and once the static frames.
-        changed = [*self._states(message)] if isinstance(message, OdometryUpdate | PlaceUpdate) else []
-        if isinstance(message, OdometryUpdate) and not self._gave_frames:
-            self._gave_frames = True
-            changed.append(static_frames(self._encode, message.stamp_ns))
-        for topic, _, payload in changed:
+        # 3. What changes seldom, where it has changed.
+        for topic, _, payload in self._changes(message):
             self._bus.publish(topic, payload)
-
-
-def _attachment(odometry: OdometryUpdate) -> PoseAttachment:
-    return PoseAttachment(
-        odometry.seq, odometry.state, odometry.reset_counter, odometry.inliers, odometry.tracks, time.time_ns()
-    )
 
 
 class PanoramaSink:

@@ -12,14 +12,13 @@ from calib import se3
 from calib.rig import Rig
 from drivers.motion import WheelSample
 from drivers.motor import VelocityCommand
-from omnid.config import Config
 from omnid.core.frames import base_pose, in_outer_axes, of_base
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.messages import GridUpdate, MapUpdate, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
 from omnid.navigation_state import NavigationState
 from omnid.tracking_state import MapState, TrackingState
 from omnid.transport import codec
-from omnid.transport.codec import ERROR, OK, WARN, DiagnosticStatus, FrameTransform
+from omnid.transport.codec import ERROR, OK, WARN, DiagnosticStatus, FrameTransform, PoseAttachment
 from omnid.transport.sensor_codec import gyro_cdr, wheel_cdr
 from omnid.transport.status_names import NAVIGATION, ODOMETRY, PLACES, Key
 from omnid.transport.topics import MAP_POSE, PUBLISHED, SCAN
@@ -57,34 +56,24 @@ class OutgoingMessage(NamedTuple):
         return cls(topic, PUBLISHED[topic].schema, payload)
 
 
-class MapEncoding(NamedTuple):
-    """Encoding of the map and of the scan."""
-
-    points: int  # largest number of points of the cloud: the most confident ones
-    max_range_m: float = 6.0  # of the scan
-
-
-def map_encoding(config: Config, points: int) -> MapEncoding:
-    """Return the encoding of the configuration with a limit on the number of points."""
-    return MapEncoding(points, config.obstacles.ring.max_range_m)
-
-
 class Encoder:
     """Encodes messages for ROS 2; the odom of the encoded ones is the base's frame at the first pair, not the rig's."""
 
     def __init__(
         self,
         T_base_rig: NDArray[np.float64],
-        map_encoding: MapEncoding,
+        cloud_points: int,
         unix_ns: UnixTime = same_time,
         rig: Rig | None = None,
+        scan_range_m: float = 6.0,
     ) -> None:
-        """unix_ns: returns the Unix time of a stamp of the messages; those of a log are Unix time.
+        """cloud_points: the largest number of points of the cloud, the most confident ones.
 
-        rig: with the mounting of the cameras, for the static frames; None: they are left out.
+        unix_ns: returns the Unix time of a stamp of the messages; those of a log are Unix time. rig: with the mounting
+        of the cameras, for the static frames; None: they are left out.
         """
-        self.T_base_rig, self._map_encoding, self.unix_ns = T_base_rig, map_encoding, unix_ns
-        self.rig = rig
+        self.T_base_rig, self.unix_ns, self.rig = T_base_rig, unix_ns, rig
+        self._cloud_points, self._scan_range_m = cloud_points, scan_range_m
 
     def __call__(self, message: Outgoing) -> Iterator[OutgoingMessage]:
         """Yield the encoded messages of a message."""
@@ -98,12 +87,12 @@ class Encoder:
             case PlaceUpdate():
                 yield from self._map_pose(message, stamp_ns)
             case ObstacleRing():
-                limits_m = 0.0, self._map_encoding.max_range_m
+                limits_m = 0.0, self._scan_range_m
                 scan = codec.scan_cdr(stamp_ns, "base_link", message.ranges_m, message.sigma_m, limits_m)
                 yield OutgoingMessage.on(SCAN, scan)
                 yield OutgoingMessage.on("moving", codec.moving_cdr(stamp_ns, "odom", message.moving))
             case MapUpdate():
-                points = _most_confident(message.points, self._map_encoding.points)
+                points = _most_confident(message.points, self._cloud_points)
                 cloud = codec.point_cloud_cdr(stamp_ns, "odom", *points, T_frame_points=self.T_base_rig)
                 yield OutgoingMessage.on("cloud", cloud)
             case GridUpdate():
@@ -157,24 +146,35 @@ def static_frames(encode: Encoder, stamp_ns: int) -> OutgoingMessage:
     return OutgoingMessage.on("/tf_static", codec.transform_cdr(encode.unix_ns(stamp_ns), edges))
 
 
-class StateReports:
-    """Yields a status when the state of the odometry, or of the pose in the map, changes."""
+def pose_attachment(odometry: OdometryUpdate, sent_ns: int = 0) -> bytes:
+    """Return what is attached to a pose; sent_ns: Unix time at which it is handed to the network."""
+    counts = odometry.reset_counter, odometry.inliers, odometry.tracks
+    return PoseAttachment(odometry.seq, odometry.state, *counts, sent_ns).to_bytes()
 
-    def __init__(self, unix_ns: UnixTime = same_time, run_id: str = "") -> None:
-        """unix_ns: the Encoder's. run_id: of the run, where others record it; a log of one's own holds one run."""
-        self._unix_ns, self._run_id = unix_ns, run_id
+
+class Changes:
+    """Yields what changes seldom: the static frames once, and a status when the state of odom, or in the map, changes.
+
+    A status of the odometry has the stamp of its pose.
+    """
+
+    def __init__(self, encode: Encoder, run_id: str = "") -> None:
+        """run_id: of the run, where others record it; a log of one's own holds one run."""
+        self._encode, self._run_id = encode, run_id
         self._last: tuple[str, int] | None = None
         self._last_in_map: MapState | None = None
 
-    def __call__(self, message: OdometryUpdate | PlaceUpdate) -> Iterator[OutgoingMessage]:
-        """Yield the status of a pose if its state differs from the last one."""
+    def __call__(self, message: Outgoing) -> Iterator[OutgoingMessage]:
+        """Yield what differs from the last message of this kind."""
         if isinstance(message, PlaceUpdate):
             if message.state == self._last_in_map:
                 return
             self._last_in_map = message.state
             level = ERROR if message.state is MapState.LOST else OK
             status = DiagnosticStatus(PLACES, level, message.state, {Key.STATE: message.state})
-        else:
+        elif isinstance(message, OdometryUpdate):
+            if self._last is None:
+                yield static_frames(self._encode, message.stamp_ns)
             if (message.state, message.reset_counter) == self._last:
                 return
             self._last = message.state, message.reset_counter
@@ -187,7 +187,9 @@ class StateReports:
             }
             level = list(TrackingState).index(message.state)
             status = DiagnosticStatus.of(ODOMETRY, level, message.state, values)
-        yield status_report(self._unix_ns(message.stamp_ns), [status])
+        else:
+            return
+        yield status_report(self._encode.unix_ns(message.stamp_ns), [status])
 
 
 def status_report(stamp_ns: int, statuses: Sequence[DiagnosticStatus]) -> OutgoingMessage:

@@ -15,7 +15,7 @@ from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.robot_clock import SegmentTime, log_time
 from omnid.errors import OmnidError
 from omnid.messages import OdometryUpdate, PlaceUpdate
-from omnid.sinks.encoder import Encoder, Outgoing, OutgoingMessage, StateReports, static_frames, status_report
+from omnid.sinks.encoder import Changes, Encoder, Outgoing, OutgoingMessage, status_report
 from omnid.transport.codec import ERROR, OK, DiagnosticStatus
 from omnid.transport.sensor_codec import image_cdr, image_topic
 from omnid.transport.status_names import RECORDING
@@ -95,7 +95,7 @@ class Recorder:
         """time: that of the files, which the encoder has as well; None: the stamps are Unix time."""
         self._log, self._robot, self._encode = log, robot, encode
         self._time, self._skip_invalid = time or SegmentTime(log_time()), skip_invalid
-        self._states = StateReports(self._time.unix_ns)
+        self._changes = None if encode is None else Changes(encode)
         self._added: deque[tuple[Sequence[DiagnosticStatus], int]] = deque(maxlen=_PENDING)
         self._files = 0
         self._newest_ns = 0
@@ -128,7 +128,7 @@ class Recorder:
             if isinstance(message, OdometryUpdate | PlaceUpdate) and self._encode is not None:
                 if isinstance(message, OdometryUpdate):
                     self._statistics.process(message)
-                self._write(self._state(message, self._encode), stamp_ns)
+                self._write(self._changed(message, self._encode), stamp_ns)
             self._newest_ns = max(self._newest_ns, stamp_ns)
         except OmnidError:  # for example a stamp that is not a time
             if not self._skip_invalid:
@@ -163,12 +163,11 @@ class Recorder:
             return [OutgoingMessage(image_topic(message), *image_cdr(message, stamp_ns))]
         return self._encode(message) if self._encode is not None else []
 
-    def _state(self, pose: OdometryUpdate | PlaceUpdate, encode: Encoder) -> Iterator[OutgoingMessage]:
-        """Yield the state of a pose where it changes; in every file once, and there with the static frames."""
-        if isinstance(pose, OdometryUpdate) and self._files != self.state.files:
-            self._files, self._states = self.state.files, StateReports(self._time.unix_ns)
-            yield static_frames(encode, pose.stamp_ns)
-        yield from self._states(pose)
+    def _changed(self, pose: OdometryUpdate | PlaceUpdate, encode: Encoder) -> Iterator[OutgoingMessage]:
+        """Return what has changed with a pose; all of that in every file once."""
+        if self._changes is None or (isinstance(pose, OdometryUpdate) and self._files != self.state.files):
+            self._files, self._changes = self.state.files, Changes(encode)
+        return self._changes(pose)
 
     def _write(self, messages: Iterable[OutgoingMessage], stamp_ns: int) -> None:
         for topic, schema, payload in messages:

@@ -25,10 +25,9 @@ from omnid.core.odometry.stereo_frame import Features
 from omnid.messages import OdometryUpdate, PlaceUpdate
 from omnid.plain_text import plain
 from omnid.recordings.recording import DECODERS, Content
-from omnid.sinks.encoder import Encoder, MapEncoding, Outgoing, StateReports
+from omnid.sinks.encoder import Changes, Encoder, Outgoing, pose_attachment
 from omnid.stages.front_end import FrontEnd
 from omnid.transport import status_names
-from omnid.transport.codec import PoseAttachment
 from omnid.transport.decode import (
     Cloud,
     Diagnostics,
@@ -294,17 +293,14 @@ class ReplayDrawing:
 
     def __init__(self, sink: RerunSink, front_end: FrontEnd) -> None:
         self._sink, self._geometry, self._dense = sink, front_end.geometry, front_end.dense
-        self._encode, self._states = Encoder(front_end.geometry.rig.T_base_rig, MapEncoding(MAP_POINTS)), StateReports()
+        self._encode = Encoder(front_end.geometry.rig.T_base_rig, MAP_POINTS)
+        self._changes = Changes(self._encode)
         self._keyframes: object = None  # that were drawn last
 
     def process(self, message: Outgoing) -> None:
         """Draw a message."""
-        attachment = b""
-        if isinstance(message, OdometryUpdate):
-            counts = (message.reset_counter, message.inliers, message.tracks)
-            attachment = PoseAttachment(message.seq, message.state, *counts).to_bytes()
-        changed = self._states(message) if isinstance(message, OdometryUpdate | PlaceUpdate) else ()
-        for topic, _, payload in (*changed, *self._encode(message)):
+        attachment = pose_attachment(message) if isinstance(message, OdometryUpdate) else b""
+        for topic, _, payload in (*self._changes(message), *self._encode(message)):
             content = decoded(topic, payload, attachment if topic == "odom" else b"", 0)
             if content is not None and not isinstance(content, PoseInMap):  # which may come before the pose in odom
                 self._sink.draw(content)

@@ -19,7 +19,7 @@ from omnid.core.odometry.stereo_frame import Features
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.messages import OdometryUpdate
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
-from omnid.sinks.encoder import Encoder, MapEncoding
+from omnid.sinks.encoder import Encoder
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.decode import decode_pose, features_from_bytes
 from tests.omnid.transport.bus_fixtures import free_endpoint
@@ -45,7 +45,7 @@ def odometry(seq: int) -> OdometryUpdate:
 def test_a_pose_comes_with_its_state_and_the_frames_of_ros() -> None:
     endpoint, came = free_endpoint(), {}
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus, Robot(connect=(endpoint,)) as robot:
-        sink = BusSink(bus, Encoder(np.eye(4), MapEncoding(10), unix_ns))
+        sink = BusSink(bus, Encoder(np.eye(4), 10, unix_ns))
         robot.on_message(lambda topic, payload, note: came.update({topic: (payload, note)}))
         wait_until(lambda: sink.process(odometry(2)) is None and {"odom", "pose", "tf"} <= came.keys())
     pose = decode_pose(*came["odom"])
@@ -64,7 +64,7 @@ def test_a_run_with_a_time_of_its_own_publishes_it_and_never_back(gives_time: bo
     came: list[tuple[str, bytes]] = []
     bus = Bus(BusConfig(listen=(endpoint,)), gives_time=gives_time)
     with contextlib.closing(bus), Robot(connect=(endpoint,)) as robot:
-        sink = BusSink(bus, Encoder(np.eye(4), MapEncoding(10), unix_ns), clock=OdometryUpdate if gives_time else None)
+        sink = BusSink(bus, Encoder(np.eye(4), 10, unix_ns), clock=OdometryUpdate if gives_time else None)
         robot.on_message(lambda topic, payload, _: came.append((topic, payload)))
         wait_until(lambda: sink.process(odometry(len(came) + 2)) is None and any(topic == "odom" for topic, _ in came))
         newest = len(came) + 100

@@ -12,7 +12,7 @@ from calib import se3
 from drivers.motor import VelocityCommand
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.messages import MapUpdate
-from omnid.sinks.encoder import Encoder, MapEncoding, Outgoing, static_frames
+from omnid.sinks.encoder import Encoder, Outgoing, static_frames
 from tests.simulation import make_rig
 
 OFFSET_NS = 10**18
@@ -27,7 +27,7 @@ STORE = get_typestore(Stores.ROS2_HUMBLE)
 
 def decoded(message: Outgoing, points: int = 10) -> list[tuple[str, Any]]:
     """Return topics and messages of ROS 2."""
-    encode = Encoder(np.eye(4), MapEncoding(points), unix_ns)
+    encode = Encoder(np.eye(4), points, unix_ns)
     return [(sent.topic, STORE.deserialize_cdr(sent.payload, sent.schema)) for sent in encode(message)]
 
 
@@ -48,7 +48,7 @@ def test_a_cloud_has_the_most_confident_points_in_their_order() -> None:
 
 def test_the_static_frames_lead_from_the_base_to_the_cameras() -> None:
     rig = replace(make_rig(size=256), T_base_rig=se3.exp([0.1, 0.0, 0.4, 0.0, 0.1, 0.5]))
-    sent = static_frames(Encoder(rig.T_base_rig, MapEncoding(1), unix_ns, rig), 5)
+    sent = static_frames(Encoder(rig.T_base_rig, 1, unix_ns, rig), 5)
     found = {}
     for edge in cast("Any", STORE.deserialize_cdr(sent.payload, sent.schema)).transforms:
         t, q = edge.transform.translation, edge.transform.rotation

@@ -21,7 +21,7 @@ from omnid.core.mapping.voxel_map import MapPoints
 from omnid.engine.robot_clock import SegmentTime
 from omnid.messages import MapUpdate, OdometryUpdate
 from omnid.runs.record import open_recorder
-from omnid.sinks.encoder import Encoder, MapEncoding
+from omnid.sinks.encoder import Encoder
 from omnid.transport.codec import DiagnosticStatus
 from tests.drivers.logs.mcap_logs import jpeg
 from tests.omnid.small_pair import small_depth
@@ -81,7 +81,7 @@ def odometry(seq: int, state: str = "tracking") -> OdometryUpdate:
 
 def test_all_messages_are_recorded_in_unix_time(tmp_path: Path) -> None:
     time = times()
-    encode = Encoder(np.eye(4), MapEncoding(100), time.unix_ns)
+    encode = Encoder(np.eye(4), 100, time.unix_ns)
     recorder = open_recorder(settings(tmp_path / "log"), "version = 1", lambda *_: None, encode=encode, time=time)
     points = MapPoints(np.zeros((3, 3), np.float32), np.zeros(3, np.float32), *[np.zeros(3, np.int32)] * 2)
     for n in range(4):
@@ -124,7 +124,7 @@ def test_a_step_of_the_clock_begins_a_file_and_no_file_has_one_in_it(
     computer = SetClock(OFFSET_NS)
     computer.advance(5.0)
     time = SegmentTime(computer.clock())
-    encode = Encoder(np.eye(4), MapEncoding(0), time.unix_ns)
+    encode = Encoder(np.eye(4), 0, time.unix_ns)
     monkeypatch.setattr(RecordConfig, "rotation", lambda _: RotationSettings(keep_files=2, free_bytes=0))
     config = settings(tmp_path / "log")
     recorder = open_recorder(config, "", lambda *_: None, encode=encode, time=time)
@@ -165,7 +165,7 @@ def attached(path: Path) -> list[str]:
 def test_every_file_has_the_state_of_the_odometry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(RecordConfig, "rotation", lambda _: RotationSettings(file_s=1.0, free_bytes=0))
     config = settings(tmp_path / "log")
-    recorder = open_recorder(config, "", lambda *_: None, encode=Encoder(np.eye(4), MapEncoding(0)))
+    recorder = open_recorder(config, "", lambda *_: None, encode=Encoder(np.eye(4), 0))
     for n in range(30):
         recorder.process(replace(odometry(n), stamp_ns=START_NS + n * 10**8))
     recorder.finish()
