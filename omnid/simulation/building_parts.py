@@ -20,6 +20,7 @@ from omnid.simulation.rendering.shapes import CEILING_M, Paint, Point, Random, p
 from omnid.simulation.rendering.surfaces import Rectangle, Texture
 
 Point3 = tuple[float, float, float]
+Part = tuple[Point3, Point3]  # the middle of the bottom of a box, from the middle of a thing, and its sides [m]
 WALL_PX_PER_M: Final = 100.0
 THING_PX_PER_M: Final = 250.0
 MOST_FLOOR_PX: Final = 6e6  # of one floor
@@ -277,9 +278,7 @@ class Builder:
 
     # Things
 
-    def thing(
-        self, parts: Iterable[tuple[Point3, Point3]], at: Point, yaw_rad: float, paint: Paint, name: str = "box"
-    ) -> None:
+    def thing(self, parts: Iterable[Part], at: Point, yaw_rad: float, paint: Paint, name: str = "box") -> None:
         """Add boxes of one thing: each by the middle of its bottom from the thing's place, and its sides [m]."""
         c, s = math.cos(yaw_rad), math.sin(yaw_rad)
         for (x, y, z), size_m in parts:

@@ -42,12 +42,12 @@ Make = Callable[[Builder], Trial]
 
 def _floor_in_corridor(b: Builder) -> Trial:
     corridor(b)
-    return Trial(built(b, is_polished=b.floor_kind == "slabs"))
+    return Trial(built(b))
 
 
 def _floor_in_hall(b: Builder) -> Trial:
     hall(b)
-    return Trial(built(b, is_polished=b.floor_kind == "slabs"))
+    return Trial(built(b))
 
 
 def _polished_corridor(b: Builder) -> Trial:
@@ -56,7 +56,7 @@ def _polished_corridor(b: Builder) -> Trial:
     b.floor(low, high)
     b.ceiling(low, high)
     b.room(low, high, doors=3, windows=5)
-    return Trial(built(b, is_polished=True))
+    return Trial(built(b))
 
 
 def _robot(**changes: object) -> Make:
@@ -139,7 +139,9 @@ def _sun_moving(b: Builder) -> Trial:
 def _trolley_leaves(b: Builder) -> Trial:
     """A trolley stands in the way; after a while it is pulled on."""
     _, high = corridor(b, width_m=2.0, length_m=20.0)
-    cart = tuple(trolley(b, (0.0, 0.0), 0.0))
+    first = len(b.faces)
+    b.thing(trolley(b), (0.0, 0.0), 0.0, plain_paint(b.rng, b.rng.uniform(60, 170), 3.0))
+    cart, b.faces = tuple(b.faces[first:]), b.faces[:first]
     path = ((2.2, 0.0), (high[0] - 1.2, 0.0))
     start_s = b.rng.uniform(9.0, 11.0)
     return Trial(built(b, people=(Person(cart, path, 0.9, start_s=start_s),)))

@@ -13,14 +13,13 @@ from typing import Final
 
 import numpy as np
 
-from omnid.simulation.building_parts import Builder, Opening, Point3, kind_paint, plain_paint, poster_paint
+from omnid.simulation.building_parts import Builder, Opening, Part, kind_paint, plain_paint, poster_paint
 from omnid.simulation.people import Person, moved
 from omnid.simulation.rendering.shapes import Paint, Point, solid
 from omnid.simulation.rendering.surfaces import Rectangle
-from omnid.simulation.trials import BEHIND_M, Trial, built, corridor, put_thing
+from omnid.simulation.trials import BEHIND_M, Trial, built, corridor, put_thing, trolley
 from omnid.simulation.world import Ground
 
-Part = tuple[Point3, Point3]  # the middle of the bottom of a box, and its sides [m]
 PLAIN: Final = "plain_"  # begins the name of a thing that has one grey
 PRINTED: Final = ("box", "low_box", "block", "shelf", "drawer", "table")  # things with pictures on them
 LENGTH_M: Final = 12.0
@@ -106,13 +105,6 @@ def _pallet(b: Builder) -> list[Part]:
     return runners + boards + load
 
 
-def _trolley(b: Builder) -> list[Part]:
-    bed_m = b.rng.uniform(0.14, 0.24)
-    handle: list[Part] = [((-0.45, y, bed_m), (0.03, 0.03, 0.7)) for y in (0.25, -0.25)]
-    bed: list[Part] = [((0.0, 0.0, bed_m), (0.9, 0.6, 0.05)), ((-0.45, 0.0, bed_m + 0.7), (0.03, 0.53, 0.03))]
-    return [*_legs((0.7, 0.5), 0.08, bed_m), *bed, *handle]
-
-
 def _open_door(b: Builder) -> list[Part]:
     return [((0.0, 0.0, 0.005), (b.rng.uniform(0.7, 0.9), 0.04, 2.0))]
 
@@ -160,7 +152,7 @@ THINGS: Final[dict[str, tuple[Callable[[Builder], list[Part]], float]]] = {
     "ladder": (_ladder, 180.0),
     "barrier": (_barrier, 20.0),
     "pallet": (_pallet, 90.0),
-    "trolley": (_trolley, 180.0),
+    "trolley": (trolley, 180.0),
     "open_door": (_open_door, 25.0),
     "drawer": (_drawer, 10.0),
     "lying_person": (_lying_person, 90.0),

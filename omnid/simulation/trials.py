@@ -11,7 +11,7 @@ import numpy as np
 
 from calib.models.camera import Array
 from drivers.motors.simulated.simulated_base import Pose
-from omnid.simulation.building_parts import Builder, plain_paint
+from omnid.simulation.building_parts import Builder, Part, plain_paint
 from omnid.simulation.rendering.ray_caster import AS_NEEDED
 from omnid.simulation.rendering.sensor import Sensor
 from omnid.simulation.rendering.shapes import Point
@@ -78,19 +78,18 @@ def hall(b: Builder) -> tuple[Point, Point]:
 
 def built(b: Builder, **fields: object) -> World:
     """Return the world of what was built."""
-    return World("", tuple(b.faces), panes=tuple(b.panes), **fields)  # type: ignore[arg-type]
+    polished = {"is_polished": b.floor_kind == "slabs"}
+    return World("", tuple(b.faces), panes=tuple(b.panes), **(polished | fields))  # type: ignore[arg-type]
 
 
-def trolley(b: Builder, at: Point, yaw_rad: float) -> list[Rectangle]:
-    """Return a trolley with a load, as faces which are not part of what stands."""
-    before = len(b.faces)
-    legs = [((x, y, 0.0), (0.1, 0.06, 0.16)) for x in (0.35, -0.35) for y in (0.22, -0.22)]
-    handle = [((-0.45, y, 0.16), (0.03, 0.03, 0.8)) for y in (0.25, -0.25)]
-    b.thing([*legs, *handle, ((-0.45, 0.0, 0.94), (0.03, 0.53, 0.03))], at, yaw_rad, plain_paint(b.rng, 70.0))
-    b.thing([((0.0, 0.0, 0.16), (0.9, 0.6, 0.05))], at, yaw_rad, plain_paint(b.rng, 165.0, 2.0))
-    b.thing([((0.08, 0.0, 0.21), (0.6, 0.5, b.rng.uniform(0.2, 0.5)))], at, yaw_rad, plain_paint(b.rng, 130.0, 5.0))
-    faces, b.faces = b.faces[before:], b.faces[:before]
-    return faces
+def trolley(b: Builder) -> list[Part]:
+    """Return a trolley whose handle is behind, with a load or without."""
+    bed_m = b.rng.uniform(0.14, 0.24)
+    legs: list[Part] = [((x, y, 0.0), (0.08, 0.08, bed_m)) for x in (0.35, -0.35) for y in (0.25, -0.25)]
+    handle: list[Part] = [((-0.45, y, bed_m), (0.03, 0.03, 0.7)) for y in (0.25, -0.25)]
+    bed: list[Part] = [((0.0, 0.0, bed_m), (0.9, 0.6, 0.05)), ((-0.45, 0.0, bed_m + 0.7), (0.03, 0.53, 0.03))]
+    load: list[Part] = [((0.08, 0.0, bed_m + 0.05), (0.6, 0.5, b.rng.uniform(0.2, 0.5)))]
+    return legs + handle + bed + load * int(b.rng.integers(2))
 
 
 def put_thing(b: Builder, kind: str, at: Point) -> None:

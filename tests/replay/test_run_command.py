@@ -167,6 +167,28 @@ def test_signals_end_it_without_output_at_any_time(scene: Path, number: int) -> 
     assert code == 0 and err == ""
 
 
+@pytest.mark.hazard("H04")
+def test_waits_for_its_motor_and_cannot_be_armed_before_that_has_answered(tmp_path: Path, course: Path) -> None:
+    port, words = free_port(), patient('controller.arming="manual"', "motor.boot_s=0.5")
+    with closing(Base(tmp_path)) as base:
+        base.unplug()
+        with started(command_line(course, port, base.port, *words), port) as daemon:
+            wait_until(lambda: answers(port) or not daemon.alive, "the bus")
+            with closing(Operator(port)) as operator:
+                operator.drive(0.3)
+                wait_until(lambda: len(operator.poses) > 5, "poses without a motor")
+                wait_until(lambda: "waiting for the motor: motor port" in operator.message("wheels"), "the status")
+                operator.arm()
+                wait_until(lambda: "waiting" in operator.values("wheels").get("arm_refusal", ""), "the refusal")
+                base.plug_in()
+                wait_until(lambda: operator.message("wheels") == "not armed since the start", "its answer")
+                assert not base.line.moved_since(0.0)
+                operator.arm()
+                wait_until(lambda: base.line.base.velocity_mps > 0.2, "motion")
+            code, err = daemon.end()
+    assert code == 0 and 1 <= err.count("waiting for the motor") < 5 and "the motor controller answers" in err
+
+
 BAD = {
     "no log": (["--log", "none.mcap"], "none.mcap"),
     "no rig": (["--log", "{log}"], "no rig.toml is attached"),
@@ -177,7 +199,14 @@ BAD = {
     "pace word": (["--log", "{log}", "--pace", "fast"], "--pace"),
     "pace without a log": (["--pace", "2"], "--log"),
     "once without a log": (["--once"], "--log"),
-    "no motor": (["--log", "{log}", "--rig", "{rig}", "--motor", "/dev/nothing"], "/dev/nothing"),
+    "short watchdog": (
+        ["--log", "{log}", "--rig", "{rig}", "--motor", "/dev/nothing", "--set", "motor.watchdog_ms=100"],
+        "watchdog_ms",
+    ),
+    "no such protocol": (
+        ["--log", "{log}", "--rig", "{rig}", "--motor", "/dev/nothing", "--set", 'motor.protocol="can"'],
+        "protocol",
+    ),
     "no camera": (["--rig", "{rig}", "--set", "cameras.lower=/dev/nothing"], "/dev/nothing"),
     "no such setting": (["--set", "controller.speed=1"], "controller.speed"),
 }

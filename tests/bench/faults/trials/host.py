@@ -117,6 +117,7 @@ def clock_step(setting: Setting) -> Outcome:
                 expect_stop(base)
             status = f"clock: {operator.message('clock')}; wheels: {operator.message('wheels')}"
             daemon.write_line("clock 0")
+            wait_until(lambda: abs(_ahead_s(operator)) < 10, "stamps that are right again")
             expect_motion(base)
         wait_until(lambda: operator.values("clock").get("steps") == "6", "the count of steps")
     return Outcome("alive", "stopped where setpoints look old; recovered; stamps follow", status)
