@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
 
     estimate, truth, tolerance_s = read_tum(args.estimate), read_tum(args.truth), args.tolerance_ms * 1e-3
     frame = find_truth_frame(estimate, truth)
-    of_rig = truth if frame is None else frame.rig_poses(truth)
+    of_rig = truth if frame is None else frame.rig_poses(truth, estimate)
     if args.frame == "auto":
         truth = of_rig
     try:

@@ -31,7 +31,7 @@ SMALL_ERROR: Final = 0.02  # in parts of the path's spread, and rad: that of odo
 # Units of positions, as the number of them in a metre.
 UNITS: Final = {"m": 1.0, "mm": 1e3, "cm": 1e2, "km": 1e-3, "feet": 1 / 0.3048, "inches": 1 / 0.0254}
 MAX_POSES: Final = 100  # Poses of a fit, evenly spread: enough for 13 unknowns.
-STEPS: Final = 30  # Gauss-Newton steps: a bound, the search ends earlier.
+STEPS: Final = 12  # Gauss-Newton steps: a bound, the search ends earlier.
 # Prior of T_rig_body: what the path does not show stays near 0.
 PRIOR_RAD, PRIOR_M, PRIOR_S = 1.0, 1.0, 1.0
 # Samples of the rates of the shorter and of the longer path, at most, for the correlation that finds a delay.
@@ -74,12 +74,16 @@ class TruthFrame:
     freedom: int = 0  # number of fitted unknowns that the path determines
     unknown: str = ""  # axes of the lever arm that the path does not show
 
-    def rig_poses(self, truth: Trajectory) -> Trajectory:
-        """Return the truth of the rig, in metres, on the estimate's clock."""
+    def rig_poses(self, truth: Trajectory, estimate: Trajectory) -> Trajectory:
+        """Return the truth of the rig, in metres, on the estimate's clock; after a delay at the estimate's stamps."""
         T = READINGS[self.reading](truth.T).copy()
         T[:, :3, 3] /= UNITS[self.unit]
-        stamps_ns = truth.stamps_ns - round(self.delay_s * 1e9)
-        return Trajectory(stamps_ns, T if self.T_rig_body is None else T @ se3.inverse(self.T_rig_body))
+        T = T if self.T_rig_body is None else T @ se3.inverse(self.T_rig_body)
+        of_rig = Trajectory(truth.stamps_ns - round(self.delay_s * 1e9), T)
+        if not self.delay_s:
+            return of_rig
+        inside = _inside(estimate, of_rig)
+        return Trajectory(estimate.stamps_ns[inside], _at(of_rig, estimate.stamps_ns[inside])[0])
 
     def __str__(self) -> str:
         """Return the differences in one line."""
@@ -177,9 +181,16 @@ def find_truth_frame(estimate: Trajectory, truth: Trajectory) -> TruthFrame | No
 def _is_shown_by_halves(estimate: Trajectory, truth: Trajectory, way: _Way) -> bool:
     """True if what each half of a drive shows explains the other half's error; one of the whole spread is the most."""
     middle = len(estimate.stamps_ns) // 2
-    first, second = (Trajectory(estimate.stamps_ns[part], estimate.T[part]) for part in np.s_[:middle, middle:])
-    left = [_error(other, way.fit(one)[1].rig_poses(truth)) for one, other in ((first, second), (second, first))]
-    return sum(left) < WORTH_PART * sum(min(1.0, _error(half, truth)) for half in (first, second))
+    halves = [Trajectory(estimate.stamps_ns[part], estimate.T[part]) for part in np.s_[:middle, middle:]]
+    left = plain = 0.0
+    for one, other in (halves, halves[::-1]):
+        of_rig = way.fit(one)[1].rig_poses(truth, other)
+        if not len(of_rig.stamps_ns):
+            return False
+        covered = _inside(other, of_rig)
+        same = Trajectory(other.stamps_ns[covered], other.T[covered])
+        left, plain = left + _error(same, of_rig), plain + min(1.0, _error(same, truth))
+    return left < WORTH_PART * plain
 
 
 def _error(estimate: Trajectory, truth: Trajectory) -> float:
@@ -199,17 +210,26 @@ class _Pair:
 
 def _common(estimate: Trajectory, truth: Trajectory, delay_s: float) -> _Pair | None:
     """Return the estimate's poses that the truth covers, evenly chosen, and the truth interpolated there."""
-    at_s = _seconds(estimate, estimate) + delay_s
-    true_s = _seconds(truth, estimate)
-    inside = np.flatnonzero((at_s >= true_s[0]) & (at_s <= true_s[-1]))
+    late = Trajectory(truth.stamps_ns - round(delay_s * 1e9), truth.T)
+    inside = _inside(estimate, late)
     if len(inside) < 4:
         return None
     chosen = inside[np.unique(np.linspace(0, len(inside) - 1, MAX_POSES).astype(int))]
-    after = np.clip(np.searchsorted(true_s, at_s[chosen], side="right"), 1, len(true_s) - 1)
-    gap_s = true_s[after] - true_s[after - 1]
-    twists = se3.log(se3.inverse(truth.T[after - 1]) @ truth.T[after]) / gap_s[:, None]
-    rest_s = at_s[chosen] - true_s[after - 1]
-    return _Pair(estimate.T[chosen], truth.T[after - 1] @ se3.exp(twists * rest_s[:, None]), twists)
+    return _Pair(estimate.T[chosen], *_at(late, estimate.stamps_ns[chosen]))
+
+
+def _inside(estimate: Trajectory, truth: Trajectory) -> NDArray[np.intp]:
+    """Return the numbers of an estimate's poses that a truth covers."""
+    stamps_ns, true_ns = estimate.stamps_ns, truth.stamps_ns
+    return np.flatnonzero((stamps_ns >= true_ns[0]) & (stamps_ns <= true_ns[-1]))
+
+
+def _at(trajectory: Trajectory, stamps_ns: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Return the poses (N, 4, 4) of a trajectory at times within it, and its twists (N, 6) [1/s] there."""
+    after = np.clip(np.searchsorted(trajectory.stamps_ns, stamps_ns, side="right"), 1, len(trajectory.T) - 1)
+    before, T = trajectory.stamps_ns[after - 1], trajectory.T[after - 1]
+    twists = se3.log(se3.inverse(T) @ trajectory.T[after]) / ((trajectory.stamps_ns[after] - before) / 1e9)[:, None]
+    return T @ se3.exp(twists * ((stamps_ns - before) / 1e9)[:, None]), twists
 
 
 def _seconds(trajectory: Trajectory, origin: Trajectory) -> Array:

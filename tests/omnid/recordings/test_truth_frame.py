@@ -72,6 +72,7 @@ HAND, FLAT = drive(flat=False), drive(flat=True)
         (FLAT, FLAT @ turned(180, (0.4, 0, 0.7)), 0, as_tum, "(the path does not show z)", 5),
         (HAND, in_mm(HAND), 0, as_tum, "its positions are in mm", 0),
         (HAND, HAND, 350_000_000, as_tum, "its stamps are 0.350 s later", 1),
+        (HAND, HAND, 1_375_000_000, as_tum, "its stamps are 1.375 s later", 1),
         (HAND, HAND, -(10**18), as_tum, "its stamps are 1000000000.000 s earlier", 1),
         (HAND, HAND @ turned(88.6), 40_000_000, as_tum, "0.040 s later, it is of another body than the rig, turned", 4),
         (HAND, HAND, 0, rewritten([3, 0, 1, 2], [1, 1, 1, 1]), "its quaternions begin with w", 0),
@@ -96,7 +97,8 @@ def test_says_what_explains_the_error_and_fits_it_where_asked(
     true.write_text("\n".join(row(T, int(n) + late_ns) for T, n in zip(truth, STAMPS_NS, strict=True)))
     code = main(["eval", str(est), str(true)])
     shown = capsys.readouterr()
-    assert code == (2 if abs(late_ns) > 10**10 else 0)
+    has_no_pairs = abs(late_ns) > 10**10 or late_ns % 50_000_000 == 25_000_000
+    assert code == (2 if has_no_pairs else 0)
     assert (said in shown.err and "--frame auto" in shown.err and shown.err.count("\n") == 1) if said else not shown.err
     assert main(["eval", str(est), str(true), "--frame", "auto"]) == 0
     shown = capsys.readouterr()
@@ -122,6 +124,7 @@ def scaled(T: Array, factor: float) -> Array:
 
 
 STANDING = np.broadcast_to(np.eye(4), HAND.shape)
+ALONG = se3.transform(np.eye(3), np.outer(2 * S + 0.2 * np.sin(3 * S), [1.0, 0.0, 0.0]))
 TURNING = se3.transform(se3.rotation_exp(np.outer(S, [0.0, 0.0, 0.8])), np.zeros((len(S), 3)))
 
 
@@ -130,6 +133,7 @@ TURNING = se3.transform(se3.rotation_exp(np.outer(S, [0.0, 0.0, 0.8])), np.zeros
     [
         (HAND, scaled(HAND, 0.97)),
         (with_jump(FLAT), FLAT),
+        (with_jump(ALONG), ALONG),
         (with_jump(wander(1)), wander(1)),
         (wander(2), wander(3)),
         (wander(4), wander(5)),
