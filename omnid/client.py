@@ -18,27 +18,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from typing import Any, Final, Generic, Self, TypeVar, cast
+from typing import Any, Final, Generic, Self, TypeVar
 
 import zenoh
 
 from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.codec import PoseAttachment
-from omnid.transport.decode import (
-    Cloud,
-    Diagnostics,
-    Map,
-    NavigationReport,
-    Pose,
-    Scan,
-    decode_cloud,
-    decode_diagnostics,
-    decode_map,
-    decode_navigation,
-    decode_pose,
-    decode_scan,
-)
+from omnid.transport.decode import DECODERS, Cloud, Diagnostics, Map, NavigationReport, Pose, Scan
 from omnid.transport.driver import CONNECT_S, Driver, RobotTime
 from omnid.transport.requests import Answer
 from omnid.transport.session import ALIVE, HERE, Unreachable, open_client, robots_there
@@ -62,13 +49,13 @@ __all__ = [
 ]
 
 T = TypeVar("T")
-_DECODE: Final[dict[type[Any], tuple[str, Callable[[bytes, bytes], Any]]]] = {
-    Pose: ("odom", decode_pose),
-    Diagnostics: ("status", decode_diagnostics),
-    Cloud: ("cloud", decode_cloud),
-    Map: ("map", decode_map),
-    NavigationReport: ("navigation", decode_navigation),
-    Scan: ("scan", decode_scan),
+_TOPICS: Final[dict[type[Any], str]] = {
+    Pose: "odom",
+    Diagnostics: "status",
+    Cloud: "cloud",
+    Map: "map",
+    NavigationReport: "navigation",
+    Scan: "scan",
 }
 # A query without an answer ends after this time, which a slow network must not exceed.
 _QUERY_TIMEOUT_S: Final = 1.0
@@ -184,9 +171,8 @@ class Robot:
         return self._subscription(kind)
 
     def _subscription(self, kind: type[T], on_close: Callable[[], None] | None = None) -> Subscription[T]:
-        key, decode = _DECODE[kind]
-        decoder = cast("Callable[[bytes, bytes], T]", decode)
-        return Subscription(self._session, f"{self.name}/{key}", decoder, on_close)
+        topic = _TOPICS[kind]
+        return Subscription(self._session, f"{self.name}/{topic}", DECODERS[topic], on_close)
 
     def on_message(self, callback: Callable[[str, bytes, bytes], None], topic: str = "*") -> Callable[[], None]:
         """Call callback(topic, payload, attachment) for each message of the robot from now on, in a zenoh thread.

@@ -19,29 +19,10 @@ from drivers.logs.log import LoggedMessage, LogInfo, RecordError
 from drivers.logs.open_log import open_log
 from drivers.logs.ros_messages import IMAGE_TYPES, RosImage
 from omnid.errors import OmnidError
-from omnid.transport.codec import (
-    DIAGNOSTICS_SCHEMA,
-    MAP_POSE_SCHEMA,
-    ODOMETRY_SCHEMA,
-    POINT_CLOUD_SCHEMA,
-    SCAN_SCHEMA,
-    TWIST_SCHEMA,
-)
-from omnid.transport.decode import (
-    Cloud,
-    Diagnostics,
-    Pose,
-    PoseInMap,
-    Scan,
-    TwistRecord,
-    decode_cloud,
-    decode_diagnostics,
-    decode_map_pose,
-    decode_pose,
-    decode_scan,
-    twist_from_cdr,
-)
-from omnid.transport.topics import MAP_POSE, PANORAMA, SCAN
+from omnid.transport import decode
+from omnid.transport.codec import ODOMETRY_SCHEMA, TWIST_SCHEMA
+from omnid.transport.decode import Cloud, Diagnostics, Pose, PoseInMap, Scan, TwistRecord, twist_from_cdr
+from omnid.transport.topics import MAP_POSE, PANORAMA, PUBLISHED, SCAN
 
 ODOMETRY: Final = "odom"
 STATUS: Final = "status"
@@ -177,15 +158,15 @@ def _decoder(name: str, kind: str) -> Decoder | None:
     """Return the decoder of messages of a topic; None where they are of another type than expected."""
     if name in IMAGES and kind in IMAGE_TYPES:
         return LoggedMessage.image
-    expected, decode = DECODERS.get(name, ("", None))
-    return partial(_of_bytes, decode) if decode is not None and kind == expected else None
+    expected, decoder = DECODERS.get(name, ("", None))
+    return partial(_of_bytes, decoder) if decoder is not None and kind == expected else None
 
 
-def _of_bytes(decode: Callable[[bytes], Content], message: LoggedMessage) -> Content:
+def _of_bytes(decoder: Callable[[bytes], Content], message: LoggedMessage) -> Content:
     size = len(message.data())
     if size > MAX_MESSAGE_BYTES:
         raise OmnidError(f"a message of {size} bytes: expected at most {MAX_MESSAGE_BYTES}")
-    return decode(message.cdr())
+    return decoder(message.cdr())
 
 
 def _finite_twist(data: bytes) -> TwistRecord:
@@ -195,12 +176,8 @@ def _finite_twist(data: bytes) -> TwistRecord:
     return twist
 
 
+# Type and decoder of each topic.
 DECODERS: Final[Mapping[str, tuple[str, Callable[[bytes], Content]]]] = {
-    ODOMETRY: (ODOMETRY_SCHEMA, decode_pose),
-    MAP_POSE: (MAP_POSE_SCHEMA, decode_map_pose),
-    STATUS: (DIAGNOSTICS_SCHEMA, decode_diagnostics),
-    CLOUD: (POINT_CLOUD_SCHEMA, decode_cloud),
-    SCAN: (SCAN_SCHEMA, decode_scan),
-    DRIVE: (TWIST_SCHEMA, _finite_twist),
-    TWIST_COMMAND: (TWIST_SCHEMA, _finite_twist),
+    **{name: (PUBLISHED[name].schema, decode.DECODERS[name]) for name in (ODOMETRY, MAP_POSE, STATUS, CLOUD, SCAN)},
+    **dict.fromkeys((DRIVE, TWIST_COMMAND), (TWIST_SCHEMA, _finite_twist)),
 }

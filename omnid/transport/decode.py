@@ -8,8 +8,9 @@ from __future__ import annotations
 import json
 import math
 import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,7 @@ from omnid.transport.codec import (
     message_from_cdr,
 )
 from omnid.transport.status_names import Key
+from omnid.transport.topics import MAP_POSE, SCAN
 
 Array = NDArray[np.float64]
 Frames = tuple[str, str]
@@ -397,3 +399,15 @@ def decode_map(payload: bytes, _: bytes = b"") -> Map:
         float(info.resolution),
         (at.position.x, at.position.y),
     )
+
+
+# By topic; each takes the payload and the attachment.
+DECODERS: Final[Mapping[str, Callable[..., Any]]] = {
+    "odom": decode_pose,
+    MAP_POSE: decode_map_pose,
+    "status": decode_diagnostics,
+    "cloud": decode_cloud,
+    "map": decode_map,
+    SCAN: decode_scan,
+    "navigation": decode_navigation,
+}
