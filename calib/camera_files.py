@@ -20,7 +20,7 @@ from calib.models.camera import Array, OmniCamera
 from calib.models.ocam import View
 from calib.ocam_file import is_ocam, parse_ocam
 from calib.rig import Rig
-from calib.rig_frame import is_turned_over, rig_between, turned_over_note
+from calib.rig_frame import mounting_notes, rig_between
 from calib.text_files import MAX_JSON_BYTES, load_mapping
 from calib.typed_toml import shown
 from calib.validation import Warn, read_bytes, silent, transform_of
@@ -67,8 +67,8 @@ def import_pair(
             "--baseline METRES"
         )
     rig = rig_between(lower.camera, upper.camera, T_lower_upper)
-    if is_turned_over(rig):
-        warn(turned_over_note(rig))
+    for note in mounting_notes(rig):
+        warn(note)
     return rig
 
 

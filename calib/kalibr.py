@@ -23,7 +23,7 @@ from calib.models.camera import Array, OmniCamera
 from calib.models.names import sees_directly
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig, ShutterTimes
-from calib.rig_frame import is_turned_over, rig_between, turned_over_note
+from calib.rig_frame import is_turned_over, mounting_notes, rig_between
 from calib.text_files import MAX_JSON_BYTES, load_mapping
 from calib.typed_toml import convert, shown
 from calib.validation import Warn, read_bytes, silent, transform_of
@@ -118,8 +118,8 @@ def _rig(cameras: Mapping[str, ChainCamera], named: tuple[str, str], frame: str,
         _warn_of_lean(rig, warn)
     else:
         rig = rig_between(models[0], models[1], poses[low] @ se3.inverse(poses[up]), topics)
-        if is_turned_over(rig):
-            warn(f"{turned_over_note(rig)} (or T_cn_cnm1 is inverted: write it as T_cnm1_cn)")
+        for note in mounting_notes(rig):
+            warn(f"{note} (or T_cn_cnm1 is inverted: write it as T_cnm1_cn)" if is_turned_over(rig) else note)
     return replace(rig, times=_times(cameras[low], cameras[up]))
 
 

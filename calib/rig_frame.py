@@ -49,13 +49,21 @@ def is_turned_over(rig: Rig) -> bool:
     return bool(z @ below > np.cos(np.deg2rad(MAX_LEAN_DEG)))
 
 
-def turned_over_note(rig: Rig) -> str:
-    """Return the warning about a rig that is turned over."""
-    mounted = "stand upside down" if sees_directly(rig.lower.camera) else "look down into their mirrors"
-    return (
-        f"the upper camera is found below the lower one: exchange their images, unless the cameras {mounted}; "
-        "the rig's z would point down"
-    )
+def mounting_notes(rig: Rig) -> list[str]:
+    """Return warnings about a rig that is turned over, or whose cameras stand side by side."""
+    if is_turned_over(rig):
+        mounted = "stand upside down" if sees_directly(rig.lower.camera) else "look down into their mirrors"
+        return [
+            f"the upper camera is found below the lower one: exchange their images, unless the cameras {mounted}; "
+            "the rig's z would point down"
+        ]
+    along = rig.lower.T_cam_rig[:3, 2] @ image_axis(rig.lower.camera, (STEP_PX, 0.0))
+    if abs(along) > np.cos(np.deg2rad(MAX_LEAN_DEG)):
+        return [
+            "the cameras are found side by side, along the rows of their images: one must stand above the other, "
+            "unless both lie on their sides; the rig's z would point to the side"
+        ]
+    return []
 
 
 def optical_axis(camera: OmniCamera) -> Array:

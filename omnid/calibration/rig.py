@@ -29,7 +29,7 @@ from calib.models.names import sees_directly
 from calib.models.ocam import OcamCamera, View
 from calib.rig import Rig
 from calib.rig_file import write_rig
-from calib.rig_frame import is_turned_over, rig_between, turned_over_note
+from calib.rig_frame import mounting_notes, rig_between
 from drivers.logs.log_reader import AnyCameras, LogCameras
 from omnid.calibration.angle_table import AngleRow, angle_lines, angle_rows, missing_boards
 from omnid.calibration.board_search import AnyBoard, Progress, find_boards, select_diverse_views, silent
@@ -139,7 +139,7 @@ def calibrate_rig(
     rig = replace(rig, covariance=rig_covariance(found, rig))
     drives = drive_uncertainty(rig)
     angles = tuple(tuple(angle_rows(found, rig, side)) for side in range(len(SIDES)))
-    notes = (*images.notes, *baseline_notes, *shown, *_order_notes(rig), *unmasked)
+    notes = (*images.notes, *baseline_notes, *shown, *mounting_notes(rig), *unmasked)
     return RigResult(rig, found, images, notes, drives, angles)
 
 
@@ -274,13 +274,6 @@ def _check_baseline(found: RigCalibration, board: AnyBoard, expected_m: float | 
     if abs(off) > WARNING_PART:
         return [f"the baseline of {baseline_mm:.2f} mm is {abs(off):.1%} off the expected {expected_mm:g} mm"]
     return []
-
-
-def _order_notes(rig: Rig) -> list[str]:
-    """Return a warning where the images of both cameras seem to be exchanged: the world would be upside down."""
-    if not is_turned_over(rig):
-        return []
-    return [turned_over_note(rig)]
 
 
 def _masked_rig(found: RigCalibration, images: PairedImages, *, with_struts: bool) -> tuple[Rig, list[str]]:

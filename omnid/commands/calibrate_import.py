@@ -20,6 +20,7 @@ from calib.ocam_file import read_transform, straight_up
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import write_rig
 from calib.text_files import MAX_JSON_BYTES, load_mapping
+from calib.typed_toml import shown
 from calib.validation import read_bytes
 from omnid.commands.calibrate_options import HEIGHT, height_of, with_height
 from omnid.commands.options import command, exclusive, option, warn
@@ -77,6 +78,13 @@ def run(args: argparse.Namespace) -> int:
     """Write the rig of another program, and print one line about it."""
     _must_be_writable(args.output)
     rig = with_height(_imported(args), args)
+    for side, mounted in (("lower", rig.lower), ("upper", rig.upper)):
+        if np.isnan(field_of_view(mounted.camera, mounted.visible)[0]):
+            width, height = mounted.camera.size
+            raise OmnidError(
+                f"the {side} camera sees nothing of its image of {width}x{height} px, whose centre is at "
+                f"{shown(mounted.camera.center)}: are both in the order of its program?"
+            )
     write_rig(args.output, rig)
     print(f"{args.output}: {describe(rig)}")
     return 0

@@ -254,6 +254,11 @@ def test_a_rectified_pair_tells_the_transform(tmp_path: Path) -> None:
     lines = list[str]()
     import_pair(tmp_path / "upper.yaml", tmp_path / "lower.yaml", None, warn=lines.append)
     assert len(lines) == 1 and "found below the lower one" in lines[0]
+    beside = camera_info("plumb_bob", [*RADTAN, 0])
+    beside["projection_matrix"] = matrix(3, 4, [430.0, 0, 320, -51.6, 0, 430, 240, 0, 0, 0, 1, 0])
+    (tmp_path / "right.yaml").write_text(json.dumps(beside))
+    import_pair(tmp_path / "lower.yaml", tmp_path / "right.yaml", None, warn=lines.append)
+    assert len(lines) == 2 and "the cameras are found side by side" in lines[1]
     (tmp_path / "alone.yaml").write_text(json.dumps(camera_info("plumb_bob", [*RADTAN, 0])))
     with pytest.raises(CalibError, match="give --transform FILE or --baseline METRES"):
         import_pair(tmp_path / "alone.yaml", tmp_path / "alone.yaml", None)

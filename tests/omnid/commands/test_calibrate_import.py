@@ -51,6 +51,9 @@ def test_imports_ocam_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert omnid(*files, "--baseline", 0.2, "--view", "direct") == 0
     assert "upper ocam direct 640x480, 0 to " in (line := capsys.readouterr().out)
     assert "baseline 200.0 mm, upper rotated by 0.00 deg" in line
+    (tmp_path / "c.txt").write_text(OCAM.replace("480 640", "240 318").replace("240.378942 318.540278", "480 640"))
+    assert omnid(*files, "--baseline", 0.2, "--view", "direct") == 2
+    assert "the lower camera sees nothing of its image of 318x240 px" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
