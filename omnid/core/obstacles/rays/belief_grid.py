@@ -104,7 +104,8 @@ class BeliefGrid:
         self._place_m = T_odom_base[:2, 3].copy()
         rho = p.same_place * max(1.0 - way_m / p.apart_m, 0.0)
         # 1. Evidence and state of each cell.
-        found, states = self._gathered(T_odom_base, CELL_M * (corner + (columns.start, rows.start) + 0.5), belief)
+        first_m = np.asarray(CELL_M * (corner + (columns.start, rows.start) + 0.5), float)
+        found, states = self._gathered(T_odom_base, first_m, belief)
         in_view, past = states == kernels.IN_VIEW, states == kernels.SEEN_PAST
         observed = in_view & (found[kernels.VIEW] > 0.5)
         # Who comes onto floor that was free is seen by one pair.
@@ -150,7 +151,7 @@ class BeliefGrid:
         arrived = np.empty(len(self._azimuths))
         view = np.array([*eye, self._max_range_m, CELL_M])
         # Who comes is wider than a speck of noise.
-        wide = cv2.morphologyEx(changed | hides, cv2.MORPH_OPEN, SQUARE)
+        wide = np.asarray(cv2.morphologyEx(changed | hides, cv2.MORPH_OPEN, SQUARE), np.uint8)
         kernels.first_changed(wide, was_free, view, self._azimuths + yaw, p.behind_m, arrived)
         for run in _runs(np.isfinite(arrived)):
             if len(run) * float(arrived[run].mean()) * math.tau / SECTORS < p.comes_m:
@@ -242,13 +243,14 @@ class BeliefGrid:
         """Spread what is not known through cells that nobody sees."""
         p = self._p
         open_ = (1 - watched) & (self.odds <= 0)
-        wide = cv2.morphologyEx(open_, cv2.MORPH_OPEN, np.ones((p.person_cells, p.person_cells), np.uint8))
+        person = np.ones((p.person_cells, p.person_cells), np.uint8)
+        wide = np.asarray(cv2.morphologyEx(open_, cv2.MORPH_OPEN, person), np.uint8)
         source = wide & (1 - self.known)
         self._carry += p.walk_mps * passed_s / CELL_M
         steps = int(self._carry)
         self._carry -= steps
         for step in range(min(steps, CELLS)):
-            source = cv2.dilate(source, CROSS if step % 2 else SQUARE) & wide
+            source = np.asarray(cv2.dilate(source, CROSS if step % 2 else SQUARE), np.uint8) & wide
         self.known[source > 0] = 0
 
     @property

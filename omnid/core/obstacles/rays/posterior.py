@@ -107,7 +107,7 @@ class RayPosterior:
         # 1. Steps of grey, pooled over three directions.
         steps, greys = np.empty((2, len(self._rows), DIRECTIONS), np.float32)
         kernels.grey_steps(panoramas.grey(lower), panoramas.grey(upper), self._rows, self._shifts, steps, greys)
-        pooled = (np.roll(steps, 1, axis=1) + 2 * steps + np.roll(steps, -1, axis=1)) / 4
+        pooled = np.asarray((np.roll(steps, 1, axis=1) + 2 * steps + np.roll(steps, -1, axis=1)) / 4, np.float32)
         sigmas, marks = floor_steps(pooled[:count], near, known, p)
         plain = max(p.noise_share * math.hypot(lower.noise_grey, upper.noise_grey), LEAST_STEP)
         far = np.abs(pooled[count:]).max(axis=0, initial=0.0) / max(float(sigmas[-1]), float(sigmas.min()))
@@ -123,8 +123,16 @@ class RayPosterior:
         seen = seen & (greys[:count].T < SATURATED)
         first = np.empty((DIRECTIONS, count + 1), np.float32)
         cells = np.empty((2, DIRECTIONS, count), np.float32)
+        by_direction = [np.ascontiguousarray(a.T) for a in (*stereo, pooled[:count], greys[:count], look)]
+        floor, surfaces, above, below, steps, greys, look = by_direction
         kernels.posterior(
-            *(np.ascontiguousarray(a.T) for a in (*stereo, pooled[:count], greys[:count], look)),
+            floor,
+            surfaces,
+            above,
+            below,
+            steps,
+            greys,
+            look,
             seen.view(np.uint8),
             sigmas,
             self._lengths_m,
