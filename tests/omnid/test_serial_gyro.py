@@ -65,7 +65,7 @@ def test_a_serial_gyro_is_published_on_the_bus() -> None:
             os.close(host)
             os.close(device)  # the device is unplugged
         _, errors = program.communicate(timeout=PATIENCE_S)
-    samples = [sample_from_cdr(payload, IMU_SCHEMA, 0) for payload in received]
+    samples = [sample_from_cdr(payload, IMU_SCHEMA, lambda unix_ns: unix_ns) for payload in received]
     assert len(samples) >= 10 and program.returncode == 1 and b"Traceback" not in errors
     for sample in samples:
         assert isinstance(sample, GyroSample) and not sample.of_base, "the robot's settings turn its axes"
