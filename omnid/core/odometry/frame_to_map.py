@@ -53,6 +53,8 @@ CORRELATED_LANDMARKS = 4.0
 # Expected value of the squared Mahalanobis distance of a view, because that is a sum of three squares, each with an
 # expected value of 1.
 VIEW_DIMENSIONS = 3
+# Cost of a landmark that is no inlier: that of the last one.
+OUTLIER_COST = KERNEL_WIDTH**2 / 2 * math.log1p(OUTLIER_SQUARED / KERNEL_WIDTH**2) / CORRELATED_LANDMARKS
 
 
 @dataclass(frozen=True, slots=True)
@@ -292,6 +294,5 @@ def _cost(squared: Array, in_view: int) -> float:
     that count as one; an outlier costs what the last inlier does.
     """
     width2 = KERNEL_WIDTH**2
-    inliers = float(np.log1p(squared / width2).sum())
-    outliers = (in_view - len(squared)) * math.log1p(OUTLIER_SQUARED / width2)
-    return width2 / 2 * (inliers + outliers) / CORRELATED_LANDMARKS / max(1, in_view)
+    inliers = width2 / 2 * float(np.log1p(squared / width2).sum()) / CORRELATED_LANDMARKS
+    return (inliers + (in_view - len(squared)) * OUTLIER_COST) / max(1, in_view)

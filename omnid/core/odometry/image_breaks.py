@@ -40,7 +40,7 @@ Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 Kind = Literal["torn", "displaced", "turned", "rolling"]
 
-MOST: Final = 160  # landmarks that are followed in each camera, so that the test takes a tenth of a pair's time
+MOST: Final = 160  # landmarks that are followed in each camera
 SIGMA_PX: Final = 0.1  # of a flow, because patches err by some hundredths, and people and shadows are near by
 LAG_S: Final = 0.003  # standard deviation of the time between the exposures of two cameras that are triggered together
 # Squared Mahalanobis distance of a flow, a sum of two squares, from which on it is an outlier, and costs no more.
@@ -54,6 +54,9 @@ STEADY_PX: Final = 64  # spread of lines that are one line in the words about th
 LEAST, LEAST_EACH = 8, 3  # landmarks on either side of a line in the cameras, and in each
 # Flows that count as one, as landmarks' errors do in the covariance of a pose.
 CORRELATED: Final = 4.0
+# Cost of a landmark (`PoseEstimate.cost`) whose view has the noise that is expected: the mean of the Cauchy kernel's.
+RIGHT_COST: Final = 0.31
+FOLLOWED: Final = 0.1  # part of a new pair in the mean of the costs
 SURE: Final = math.log(1e6)  # least logarithm of the ratio of likelihoods: a false one in some days of driving
 # Landmarks whose patch is not near the prediction, as a share, from which on they are searched farther away. In right
 # images it is below 0.1.
@@ -176,6 +179,7 @@ class ImageBreaks:
     _last: _View | None = None
     _confirmed: Indices = field(default_factory=lambda: np.zeros(0, np.intp))  # ids of landmarks
     _open: list[Break] = field(default_factory=list)
+    _usual_cost: float = RIGHT_COST  # of a landmark in whole images
     _pairs: Counter[tuple[Kind, tuple[int, ...], int]] = field(default_factory=Counter)
     _lines: dict[tuple[Kind, tuple[int, ...], int], list[Break]] = field(default_factory=dict)
 
@@ -186,13 +190,22 @@ class ImageBreaks:
         T_odom_rect: Array,
         local_map: LocalMap,
         dt_s: float,
+        cost: tuple[float, int] | None,
     ) -> Break | None:
-        """Use a pair (seq: its number) with its pose, dt_s after the one before; return the break that it shows."""
+        """Use a pair (seq: its number) with its pose, dt_s after the one before; return the break that it shows.
+
+        cost: mean of the landmarks in view, and their number, None: no pose was found. A break costs at least as much
+        as it must explain to be believed: where the views fit as usual there is none, and no flow is measured.
+        """
         last, found = self._last, None
         step = np.zeros(6) if last is None else se3.log(se3.inverse(last.T_odom_rect) @ T_odom_rect)
-        if last is not None and dt_s > 0:
+        is_usual = cost is not None and cost[1] * (cost[0] - self._usual_cost) < SURE and not self._open
+        if last is not None and dt_s > 0 and not is_usual:
             flow = self._flow(last, pair, T_odom_rect, step, LAG_S / dt_s)
             found = None if flow is None else likeliest_break(flow, self.raws, self.model.cylinder.focal_px)
+        if cost is not None and found is None:
+            usual = self._usual_cost + FOLLOWED * (cost[0] - self._usual_cost)
+            self._usual_cost = min(usual, RIGHT_COST)  # a run whose images are broken from the start is not usual
         self._spread(last, step, found)
         # Landmarks that were an inlier after they were added: of others the depth may be wrong, and so the flow.
         table = local_map.store.table

@@ -25,7 +25,7 @@ from omnid.core.odometry.estimates import (
 )
 from omnid.core.odometry.exposure_times import Exposure, RigVelocity
 from omnid.core.odometry.frame_exposures import FrameExposures
-from omnid.core.odometry.frame_to_map import FrameToMap
+from omnid.core.odometry.frame_to_map import OUTLIER_COST, FrameToMap
 from omnid.core.odometry.image_breaks import ImageBreaks, RawImage
 from omnid.core.odometry.keyframes import KeyframeLocaliser, KeyframeRequest, Keyframes
 from omnid.core.odometry.local_map import LocalMap
@@ -82,6 +82,7 @@ class VisualOdometry:
         self._requested: KeyframeRequest | None = None  # keyframe that the last frame asked for, see complete
         self._added: int | None = None  # seq of the keyframe that the last frame became
         self._distance_m = ROOM_M  # median of the landmarks by which the last pose was found
+        self._cost: tuple[float, int] | None = None  # of those in view, and their number; None: no pose was found
         self._exposures = FrameExposures(
             self._motion,
             model,
@@ -102,7 +103,8 @@ class VisualOdometry:
         estimate = self._pose(frame, dt_s)
         if self.breaks is None or not frame.times.is_at_once:
             return estimate
-        self.breaks.add(frame.seq, (frame.lower, frame.upper), estimate.T_odom_rect, self._map, dt_s)
+        pair = frame.lower, frame.upper
+        self.breaks.add(frame.seq, pair, estimate.T_odom_rect, self._map, dt_s, self._cost)
         if not self.breaks.fault and not self.breaks.covariance.any():
             return estimate
         is_torn = self.breaks.fault and estimate.state is TrackingState.TRACKING
@@ -114,7 +116,7 @@ class VisualOdometry:
         """Return the pose at a frame, whose images are whole: the algorithm."""
         self.complete()
         dt_s = max(dt_s, 0.0)
-        self._step = None
+        self._step = self._cost = None
         self._map.lost = frame.lost
         usable = self._static_mask.without(frame.usable)
         if self._previous is None:
@@ -237,6 +239,8 @@ class VisualOdometry:
         self._covariance = estimate.covariance + (self._map.covariance_of(estimate) if len(estimate.landmarks) else 0.0)
         self._doubt = doubt_after(self._doubt, self._T_odom_rect, estimate, self._since_fix_s(dt_s))
         self._T_odom_rect, self._previous = estimate.T_odom_rect, frame.lower
+        # What the upper camera does not show where it must be is an outlier there.
+        self._cost = estimate.cost + OUTLIER_COST * (1.0 - estimate.upper_ratio), estimate.in_view
         if len(estimate.landmarks):
             away = self._map.store.table.points[estimate.landmarks] - self._T_odom_rect[:3, 3]
             self._distance_m = float(np.median(np.linalg.norm(away, axis=1)))
