@@ -26,7 +26,6 @@ IMAGE_TYPES: Final = (IMAGE, COMPRESSED_IMAGE)
 ODOMETRY: Final = "nav_msgs/msg/Odometry"
 IMU: Final = "sensor_msgs/msg/Imu"
 JOINT_STATE: Final = "sensor_msgs/msg/JointState"
-MOTION_TYPES: Final = (ODOMETRY, IMU, JOINT_STATE)
 BASE_FRAME: Final = "base_link"  # Frame of messages whose axes are those of the base (REP 105), as omnid records them.
 NOT_MEASURED: Final = -1.0  # first number of the covariance of what an IMU does not measure (sensor_msgs/msg/Imu)
 

@@ -260,6 +260,7 @@ MAKERS: Final[dict[str, tuple[str | None, Callable[..., Trial]]]] = {
     r"ramp_(\d+)": (None, _ramp),
     "lean_1deg": (None, _robot(lean_rad=(0.0, math.radians(1.0)))),
     "lift_gap": (None, _lift_gap),
+    r"door_step_(\d+)cm": (None, _door_step),
     "sun_moving": (None, _sun_moving),
     "light_switch": (None, _lights((6.0, 0.5), (13.0, 1.0))),
     "dark_and_on": (None, _lights((8.0, 0.004), (11.0, 1.0))),

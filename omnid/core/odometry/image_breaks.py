@@ -305,8 +305,7 @@ class ImageBreaks:
         Their patches in the last one are bent as the step bends them. The upper camera is like a lower one whose frame
         is higher by the baseline, in which slopes are those over its own rows.
         """
-        there, found = np.full((len(rows), 2), np.nan), np.zeros(len(rows), bool)
-        off_px = np.full(len(rows), np.inf)
+        there, off_px = np.full((len(rows), 2), np.nan), np.full(len(rows), np.inf)
         T_as_before = last.T_odom_rect @ se3.exp(last.step)
         # 1. As the step predicts; else as if the rig had stood, or gone on as before: what a torn image shows.
         for T in (T_now, last.T_odom_rect, T_as_before):

@@ -18,8 +18,6 @@ Array = NDArray[np.float64]
 
 
 CONVERGED_PX = 0.01  # OpenCV's default: an iteration that moves the window less is the last one
-# Levels of a pyramid: a panorama of 380 rows has 6 rows left on the sixth, too few for a window.
-MAX_LEVELS = 6
 MIN_EIGENVALUE = 1e-4  # Of the window's gradients; OpenCV's default: below it the window has no texture.
 
 
