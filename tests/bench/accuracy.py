@@ -1,6 +1,8 @@
 """A table of errors against the truth: `python -m tests.bench.accuracy FOLDER ... [--set SECTION.KEY=VALUE ...]`.
 
 Each folder holds log.mcap, truth.txt and a rig.toml or camchain.yaml, as `python -m tests.simulation` writes them.
+With --cloud the points of `omnid replay --cloud` are compared with the surfaces of the world, too: a folder is then
+named RECIPE_sSEED. A cell of 10 cm is seen if a point within 10 cm of a surface lies in it.
 """
 
 from __future__ import annotations
@@ -23,7 +25,10 @@ from calib.rig_file import read_rig, write_rig
 from omnid.diagnostics.run_summary import summary_entries
 from omnid.formats.tum import Trajectory, read_tum
 from omnid.recordings.evaluation import evaluate
+from tests.bench.paper.truth import surface_distance_m
 from tests.bench.results import Cell, Column, ResultTable
+from tests.bench.seeds import family_and_seed
+from tests.simulation.recipes import build
 
 COLUMNS: Final = (
     Column("log"),
@@ -36,10 +41,19 @@ COLUMNS: Final = (
     Column("NEES, median", "", 1),
     Column("states"),
 )
+CELL_M: Final = 0.1  # of the cells that count as seen, and largest distance of their points from a surface
+FAR_M: Final = 0.2  # a point farther from all surfaces is wrong
+OF_CLOUD: Final = (
+    Column("points of the cloud"),
+    Column("their error p50", "cm", 2),
+    Column("p90", "cm", 2),
+    Column(f"beyond {FAR_M} m", "%", 2),
+    Column("cells seen"),
+)
 
 
-def row(folder: Path, overrides: Sequence[str]) -> list[Cell]:
-    """Return one row of the table: the errors of one log, and the shares of its states."""
+def row(folder: Path, overrides: Sequence[str], *, cloud: bool = False) -> list[Cell]:
+    """Return one row of the table: the errors of one log, the shares of its states, and the errors of its cloud."""
     result = omnid.replay(folder / "log.mcap", rig_of(folder), overrides=overrides)
     truth = read_tum(folder / "truth.txt")
     m = evaluate(Trajectory(result.stamps_ns, result.T_odom_rig), truth)
@@ -53,18 +67,40 @@ def row(folder: Path, overrides: Sequence[str]) -> list[Cell]:
         1e3 * m.rpe_translation_rmse_m,
         float(np.median(squared_errors(result, truth))),
         summary_entries(result.counters)["states"],
+        *(cloud_cells(folder, result, truth) if cloud else ()),
     ]
+
+
+def cloud_cells(folder: Path, result: omnid.RunResult, truth: Trajectory) -> list[Cell]:
+    """Return the number of points of the cloud, their distances from the surfaces of the world, and the cells seen."""
+    world = family_and_seed(folder.name)
+    if world is None:
+        raise SystemExit(f"{folder}: expected a folder RECIPE_sSEED, whose world is known")
+    assert result.map is not None
+    points = se3.apply(truth.T[0], result.map.xyz)
+    error = surface_distance_m(build(*world, pairs=len(truth.T)).scene, points)
+    cells = np.unique(np.floor(points[error < CELL_M] / CELL_M), axis=0)
+    p50, p90 = (100 * float(np.percentile(error, percent)) for percent in (50, 90))
+    return [len(points), p50, p90, 100 * float((error > FAR_M).mean()), len(cells)]
+
+
+def position_errors(result: omnid.RunResult, truth: Trajectory) -> NDArray[np.float64]:
+    """Return the errors (N - 1, 3) [m] of the positions after the first pose, in the true pose's axes.
+
+    The truth of a pose is the one that is nearest in time.
+    """
+    nearest = np.abs(truth.stamps_ns[None] - np.asarray(result.stamps_ns)[:, None]).argmin(axis=1)
+    T, found = truth.T[nearest], result.T_odom_rig
+    return se3.log(se3.inverse(se3.inverse(T[0]) @ T) @ se3.inverse(found[0]) @ found)[1:, :3]
 
 
 def squared_errors(result: omnid.RunResult, truth: Trajectory) -> NDArray[np.float64]:
     """Return e^T C^-1 e (N - 1,) of the positions e after the first pose, of which 3 is expected.
 
-    The truth of a pose is the one that is nearest in time. A rig without a stated covariance may be wrong by the prior
-    that the odometry adds: for a rendered one, which is exact, the figure is then much smaller than 3.
+    A rig without a stated covariance may be wrong by the prior that the odometry adds: for a rendered one, which is
+    exact, the figure is then much smaller than 3.
     """
-    nearest = np.abs(truth.stamps_ns[None] - np.asarray(result.stamps_ns)[:, None]).argmin(axis=1)
-    T, found = truth.T[nearest], result.T_odom_rig
-    wrong = se3.log(se3.inverse(se3.inverse(T[0]) @ T) @ se3.inverse(found[0]) @ found)[1:, :3]
+    wrong = position_errors(result, truth)
     return np.asarray(np.einsum("ni,nij,nj->n", wrong, np.linalg.inv(result.covariances[1:, :3, :3]), wrong))
 
 
@@ -84,11 +120,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folders", type=Path, nargs="+", metavar="FOLDER")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", dest="overrides")
+    parser.add_argument("--cloud", action="store_true", help="errors of the cloud, too")
     args = parser.parse_args()
     title = f"Rendered logs, {' '.join(args.overrides) or 'default settings'}"
-    table = ResultTable("accuracy", title, COLUMNS)
+    table = ResultTable("accuracy", title, COLUMNS + OF_CLOUD * args.cloud)
     for folder in args.folders:
-        table.add(*row(folder, args.overrides), folder=folder)
+        table.add(*row(folder, args.overrides, cloud=args.cloud), folder=folder)
 
 
 if __name__ == "__main__":

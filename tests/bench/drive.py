@@ -3,8 +3,7 @@
 Every case is a script: it arms the robot and sends goals as a person would. A row for each seed:
 what the navigation said at the end, true distance and heading error to the last goal, largest distance of the true
 path to the straight legs, contacts, least clearance; of a time in the dark the way and the error that it added to
-the pose; when slip was noticed, after it began, and how many pairs noticed it at other times. The building is driven
-around by map and path (tests/bench/building_round.py).
+the pose; when slip was noticed, after it began, and how many pairs noticed it at other times.
 """
 
 from __future__ import annotations
@@ -26,7 +25,6 @@ from omnid.simulation.robot import Slip, WheelErrors, make_robot
 from omnid.simulation.vehicle import START_NS
 from omnid.simulation.world import World
 from omnid.simulation.world_file import load_world
-from tests.bench.building_round import building_round
 from tests.bench.results import Cell, Column, ResultTable
 
 Goal = tuple[float, float, float]  # x [m], y [m], heading [deg] in odom
@@ -76,7 +74,6 @@ STRAIGHT: list[Goal] = [(10.0, 0.0, 0.0)]
 SQUARE: list[Goal] = [(2.5, 0.0, 90.0), (2.5, 2.5, 180.0), (0.0, 2.5, -90.0), (0.0, 0.0, 0.0)]
 DARK = Fault("dark", 10.0, 13.0)
 SLIP = Slip(10.0, 11.0, 0.2)
-BUILDING = "building"
 
 
 def corridor(seed: int) -> World:
@@ -159,7 +156,7 @@ def slip(case: Case, run: SimulatedRun) -> str:
 def main() -> None:
     """Print a table."""
     parser = argparse.ArgumentParser(prog="python -m tests.bench.drive")
-    parser.add_argument("cases", nargs="+", choices=[*CASES, BUILDING, "all"], metavar="CASE")
+    parser.add_argument("cases", nargs="+", choices=[*CASES, "all"], metavar="CASE")
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])
     parser.add_argument("--size", type=int, default=512)
     arguments = parser.parse_args()
@@ -179,10 +176,9 @@ def main() -> None:
         Column("processor time a pair", "s", 2),
     )
     table = ResultTable("drive", "A simulated robot in a closed loop", columns)
-    for name in [*CASES, BUILDING] if "all" in arguments.cases else arguments.cases:
+    for name in CASES if "all" in arguments.cases else arguments.cases:
         for seed in arguments.seeds:
-            size = arguments.size
-            cells = round_row(seed, size) if name == BUILDING else drive_row(CASES[name], seed, size)
+            cells = drive_row(CASES[name], seed, arguments.size)
             table.add(name, seed, *cells, seed=(f"drive {name}", seed))
 
 
@@ -193,26 +189,6 @@ def drive_row(case: Case, seed: int, size_px: int) -> list[Cell]:
     started_s = time.process_time()
     run = simulate(case.world(seed), robot, case.drive(), seconds=case.seconds, seed=seed, faults=case.faults)
     return [*row(case, run), (time.process_time() - started_s) / max(1, len(run.stamps_ns))]
-
-
-def round_row(seed: int, size_px: int) -> list[Cell]:
-    """Drive around the building in its map; return the figures."""
-    started_s = time.process_time()
-    end = building_round(seed, size_px)
-    way_m = np.linalg.norm(np.diff([tick.pose[:2] for tick in end.run.ticks], axis=0), axis=1).sum()
-    return [
-        end.words,
-        100 * end.error_m,
-        math.degrees(end.error_rad),
-        100 * end.off_path_m,
-        float(way_m),
-        len(end.run.contacts),
-        end.run.clearance_m,
-        None,
-        None,
-        end.stops,
-        (time.process_time() - started_s) / end.pairs,
-    ]
 
 
 if __name__ == "__main__":

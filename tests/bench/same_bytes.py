@@ -2,7 +2,7 @@
 
 `record` renders short logs into DIR/logs where they are missing, replays each one inline, keeps the outputs in
 DIR/outputs and their digests in DIR/digests.json. `compare` replays the same logs and prints the outputs that differ as
-JSON, trajectories and topics with the largest difference of their numbers; the exit code is 1 where one differs.
+JSON, trajectories with the largest difference of their numbers; the exit code is 1 where one differs.
 
 Outputs are the trajectories in odom and in the map, the cloud, the plan, and the messages of each recorded topic. The
 topic of the status is left out: it holds times of computation.
@@ -15,14 +15,13 @@ import hashlib
 import json
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, fields, is_dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 from mcap.reader import make_reader
-from rosbags.typesys import Stores, get_typestore
 
 from drivers.motion import MotionSample, WheelSample
 from omnid.formats.tum import read_tum
@@ -166,36 +165,6 @@ def largest_difference(before: Path, after: Path) -> float:
     return float(np.abs(a.T - b.T).max())
 
 
-def numbers(recording: Path, topic: str) -> list[list[float]]:
-    """Return all numbers of each message of a topic; messages that hold none of a known type are empty."""
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    with recording.open("rb") as file:
-        return [
-            list(_numbers_in(store.deserialize_cdr(message.data, schema.name)))
-            for schema, _, message in make_reader(file).iter_messages([topic])
-            if schema is not None
-        ]
-
-
-def _numbers_in(value: object) -> Iterator[float]:
-    if isinstance(value, bool | int | float):
-        yield float(value)
-    elif isinstance(value, list | tuple | np.ndarray):
-        for each in value:
-            yield from _numbers_in(each.item() if isinstance(each, np.generic) else each)
-    elif is_dataclass(value):
-        for each in fields(value):
-            yield from _numbers_in(getattr(value, each.name))
-
-
-def largest_difference_of(topic: str, before: Path, after: Path) -> float:
-    """Return the largest difference of a number of two recordings' messages; infinite where their counts differ."""
-    a, b = numbers(before, topic), numbers(after, topic)
-    if [len(each) for each in a] != [len(each) for each in b]:
-        return float("inf")
-    return max((float(np.abs(np.subtract(x, y)).max(initial=0.0)) for x, y in zip(a, b, strict=True)), default=0.0)
-
-
 def record(folder: Path, names: Iterable[str]) -> int:
     """Keep outputs and digests of the logs."""
     path = folder / "digests.json"
@@ -220,10 +189,6 @@ def compare(folder: Path, names: Iterable[str]) -> int:
             }
             for file in changed.keys() & {"odom.txt", "map.txt"}:
                 changed[file] = largest_difference(folder / "outputs" / name / file, outputs / file)
-            for topic in (each for each in changed if each.startswith("/")):
-                changed[topic] = largest_difference_of(
-                    topic, folder / "outputs" / name / RECORDING, outputs / RECORDING
-                )
             if changed:
                 different[name] = changed
             print(f"{name}: {len(now)} outputs, {len(changed)} differ", file=sys.stderr, flush=True)

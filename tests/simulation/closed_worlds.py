@@ -153,27 +153,6 @@ def symmetric_room(seed: int, size_m: Point = (6.0, 5.0)) -> Scene:
     return Scene((*sides, *opposite, floor, ceiling))
 
 
-def with_other_posters(scene: Scene, rng: Random, share: float) -> Scene:
-    """Return the scene in which so many of the posters have been exchanged."""
-    return Scene(
-        tuple(
-            replace(r, texture=textures.poster(rng, (r.texture.shape[1], r.texture.shape[0])))
-            if r.name.startswith("poster") and rng.random() < share
-            else r
-            for r in scene.rectangles
-        )
-    )
-
-
-def with_people(scene: Scene, rng: Random, around: Array, count: int = 3) -> Scene:
-    """Return the scene with boxes as large as people around a place (x, y) [m]; walls may hide some of them."""
-    faces: list[Rectangle] = []
-    for angle, distance_m in zip(rng.uniform(0, 2 * np.pi, count), rng.uniform(0.8, 1.8, count), strict=True):
-        at = (float(around[0] + distance_m * np.cos(angle)), float(around[1] + distance_m * np.sin(angle)))
-        faces += box(rng, at, (0.4, 0.25, 1.7), float(rng.uniform(0, np.pi)))
-    return Scene((*scene.rectangles, *faces))
-
-
 def repeating(seed: int, length_m: float, period_m: float = 0.3) -> Scene:
     """Return a corridor that looks the same again after each period along it, on walls, floor and ceiling.
 

@@ -8,13 +8,10 @@ the first motion after it) until the base slows down or stops for it, or the sta
 from __future__ import annotations
 
 import math
-import random
-import tempfile
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from pathlib import Path
 from typing import Final, NamedTuple
 
 import cv2
@@ -25,8 +22,8 @@ from drivers.frame import Camera, Frame
 from omnid.config import load_config
 from omnid.core.control.collision_monitor import RING_STALE, UNSEEN, UNWATCHED
 from omnid.simulation.lockstep import Fault, Moment, Request, Tamper, simulate
+from omnid.simulation.named_worlds import trial
 from omnid.simulation.robot import make_robot
-from omnid.simulation.world_file import load_world
 from tests.bench.obstacles import ahead
 from tests.bench.results import Column, ResultTable
 
@@ -113,7 +110,7 @@ def pixels(frame: Frame) -> Image:
 class Case(NamedTuple):
     """A fault of the images, and the world in which it happens."""
 
-    world: str  # see world_text
+    world: str  # its name
     tamper: Callable[[], Tamper | None]
     faults: tuple[Fault, ...] = ()
     since_s: float = STARTS_S  # of the fault
@@ -132,38 +129,13 @@ CASES: Final[dict[str, Case]] = {
     "sector blurred": Case(
         "box", lambda: lambda time_s, frame: blurred(time_s, frame, sector(SIZE_PX, 0.0, SECTOR_DEG))
     ),
-    "dark, a person steps in": Case("person at 0.8 m", lambda: None, (Fault("dark", STARTS_S, SECONDS),)),
+    "dark, a person steps in": Case("person_steps_in_at_80cm", lambda: None, (Fault("dark", STARTS_S, SECONDS),)),
     "late by 0.5 s": Case("box", lambda: Late(0.5), since_s=0.0),
     "late by 1 s": Case("box", lambda: Late(1.0), since_s=0.0),
     "half speed": Case("box", lambda: Late(speed=0.5)),
     "each second image repeated": Case("box", _repeating),
     "none": Case("box", lambda: None, since_s=0.0),
 }
-
-
-def world_text(case: str, rng: random.Random) -> str:
-    """Return a corridor along x with a box, or with a person who steps in 0.8 m before the robot, as a world file."""
-    left, right = rng.uniform(0.9, 1.5), -rng.uniform(0.9, 1.5)
-    walls = [rng.choice(("brick", "granite", "plaster")) for _ in range(2)]
-    lines = ["schema = 1", "start = [0.0, 0.0, 0.0]", "[space]", f"low = [-2.0, {right}]", f"high = [12.0, {left}]"]
-    corners = [[-2.0, left], [12.0, left], [12.0, right], [-2.0, right]]
-    for first, last, texture, per_m in (
-        (0, 1, walls[0], 0.6),
-        (2, 3, walls[1], 0.6),
-        (1, 2, "brick", 0.6),
-        (3, 0, "brick", 0.0),
-    ):
-        lines += ["[[wall]]", f"points = {[corners[first], corners[last]]}"]
-        lines += [f'texture = "{texture}"', f"posters_per_m = {per_m}"]
-    if case == "box":
-        size = [rng.uniform(0.25, 0.6), rng.uniform(0.25, 0.6), rng.uniform(0.4, 1.2)]
-        at = [rng.uniform(2.0, 3.0), rng.uniform(-0.15, 0.15)]
-        return "\n".join([*lines, "[[box]]", f"at = {at}", f"size_m = {size}", f"yaw_deg = {rng.uniform(-40, 40)}"])
-    aside = rng.choice((1, -1)) * (min(left, -right) - 0.3)
-    at_m = rng.uniform(2.3, 3.0)
-    lines += ["[[person]]", f"path = [[{at_m}, {aside}], [{at_m}, {rng.uniform(-0.1, 0.1)}]]"]
-    lines += [f"speed_mps = {rng.uniform(0.8, 1.4)}", f"starts_within_m = {1.0 + abs(aside) * 0.4}"]
-    return "\n".join(lines)
 
 
 class Outcome(NamedTuple):
@@ -190,19 +162,16 @@ def run(name: str, seed: int, overrides: tuple[str, ...] = ()) -> Outcome:
             first = (moment.time_s, named(moment))
         yield from ahead(moment)
 
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "world.toml"
-        path.write_text(world_text(case.world, random.Random(seed)))
-        done = simulate(
-            load_world(str(path), seed),
-            replace(make_robot(SIZE_PX), samples=1),
-            watched,
-            seconds=SECONDS,
-            seed=seed,
-            faults=case.faults,
-            tamper=case.tamper(),
-            config=load_config(None, ["places.enabled=false", *overrides]),
-        )
+    done = simulate(
+        trial(case.world, seed).world,
+        replace(make_robot(SIZE_PX), samples=1),
+        watched,
+        seconds=SECONDS,
+        seed=seed,
+        faults=case.faults,
+        tamper=case.tamper(),
+        config=load_config(None, ["places.enabled=false", *overrides]),
+    )
     ticks = done.ticks
     steps = list(pairwise(ticks))
     speeds = {two.time_s: math.dist(one.pose[:2], two.pose[:2]) / (two.time_s - one.time_s) for one, two in steps}

@@ -8,17 +8,16 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final
+from typing import Final
 
 from omnid.engine.kernel_cache import prepare_kernels
-from tests.bench.paper import path_following, turn_tracking, wall_matching, whole_building
+from tests.bench.paper import measures
 from tests.bench.paper.povray import INSTALL, PovrayError, available, shoot, write_world
 from tests.bench.paper.scenes import EXPERIMENTS, RigOptions
 from tests.bench.paper.views import DESCRIPTION, RENDERERS, Experiment
-from tests.bench.results import Cell, Column, ResultTable
+from tests.bench.results import Column, ResultTable
 from tests.simulation.logs import pack_log, write_log
 from tests.simulation.recipes import SimulatedRun
 
@@ -40,7 +39,7 @@ TURNS: Final = ResultTable(
         Column("scene"),
         Column("turn", "deg", 0),
         Column("moved"),
-        *(Column(f"{name}: {what}") for name in turn_tracking.TRACKERS for what in ("right", "claimed")),
+        *(Column(f"{name}: {what}") for name in measures.TRACKERS for what in ("right", "claimed")),
     ),
 )
 PATHS: Final = ResultTable(
@@ -59,56 +58,27 @@ PATHS: Final = ResultTable(
 )
 
 
-def add_wall(folder: Path, experiment: Experiment) -> None:
-    """Add the rows of a wall."""
-    for method, found in wall_matching.measure(folder, experiment).items():
-        shares = [100 * found[name] for name in ("wrong", "mismatched", "completeness", "coverage")]
-        WALL.add(experiment.label, method, found["matches"], *shares, 1e3 * found["rms_of_right_m"])
-
-
-def add_turns(folder: Path, experiment: Experiment) -> None:
-    """Add the rows of the turns."""
-    for row in turn_tracking.measure(folder, experiment)["turns"]:
-        counts = [found[what] for found in row["found"].values() for what in ("right", "claimed")]
-        TURNS.add(experiment.label, row["turn_deg"], row["moved"], *counts)
-
-
-def add_paths(folder: Path, experiment: Experiment) -> None:
-    """Add the rows of a path, with the errors of the map where one was measured."""
-    module = whole_building if experiment.name == "building" else path_following
-    for method, found in module.measure(folder, experiment).items():
-        PATHS.add(experiment.label, method, *path_cells(found), *map_cells(found.get("map")))
-
-
-def path_cells(found: dict[str, Any]) -> list[Cell]:
-    """Return the errors of a path."""
-    lengths = [1e3 * found[name] for name in ("ate_m", "end_m")]
-    return [100 * found["length_error"], *lengths, found["heading_deg"]]
-
-
-def map_cells(found: dict[str, float] | None) -> list[Cell]:
-    """Return the errors of a map; None where there is none."""
-    if found is None:
-        return [None, None, None]
-    return [1e3 * found["rms_m"], 100 * found["off_by_0.05_m"], 100 * found["completeness"]]
-
-
-MEASURES: Final[dict[str, Callable[[Path, Experiment], None]]] = {
-    "brick": add_wall,
-    "control": add_wall,
-    "smooth": add_wall,
-    "turns": add_turns,
-    "two_walls": add_paths,
-    "building": add_paths,
-}
+def measure_log(folder: Path) -> None:
+    """Add the rows of a log."""
+    experiment = Experiment.read(folder)
+    if experiment.name in ("brick", "control", "smooth"):
+        for method, figures in measures.walls(folder, experiment).items():
+            WALL.add(experiment.label, method, *figures)
+    elif experiment.name == "turns":
+        for turn in measures.turns(folder, experiment):
+            counts = [count[name] for name in measures.TRACKERS for count in (turn.right, turn.claimed)]
+            TURNS.add(experiment.label, turn.angle_deg, turn.is_moved, *counts)
+    else:
+        only = (measures.THE_PAPER, measures.OMNID) if experiment.name == "building" else tuple(measures.METHODS)
+        for method in only:
+            PATHS.add(experiment.label, method, *measures.path(folder, experiment, method))
 
 
 def measure(arguments: argparse.Namespace) -> None:
     """Measure each log of the folder."""
     prepare_kernels()
     for description in sorted(arguments.logs.glob(f"*/{DESCRIPTION}")):
-        experiment = Experiment.read(description.parent)
-        MEASURES[experiment.name](description.parent, experiment)
+        measure_log(description.parent)
 
 
 def trace_log(folder: Path, run: SimulatedRun, seed: int, supersample: int) -> None:

@@ -12,7 +12,8 @@ from omnid.simulation.rendering.rigs import RIM, make_rig
 from omnid.simulation.rendering.shapes import CEILING_M
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
 from omnid.simulation.rendering.textures import PAINTERS, value_noise
-from tests.bench.paper.building import building, round_trip
+from omnid.simulation.world_file import load_world
+from tests.bench.route_series import lap
 from tests.simulation import paths
 from tests.simulation.builders import corridor
 from tests.simulation.builders import wall as upright
@@ -127,10 +128,15 @@ def turns(seed: int, size: int, pairs: int, options: RigOptions) -> SimulatedRun
     return SimulatedRun(seeded_rig(seed, size, options), paths.planar_poses(xy, angles)[:pairs], corridor(seed))
 
 
-def building_run(seed: int, size: int, pairs: int, options: RigOptions) -> SimulatedRun:
-    """Return one round through the corridor of a building, back to its start (section V.D)."""
-    plan, scene = building(seed)
-    return SimulatedRun(seeded_rig(seed, size, options), round_trip(seed, plan, pairs), scene)
+def building(seed: int, size: int, pairs: int, options: RigOptions) -> SimulatedRun:
+    """Return one round through the corridor of the shipped world `building`, back to its start (section V.D)."""
+    line = lap(100.0)
+    ahead = np.roll(line, -1, axis=0) - line
+    heading = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
+    at, places = np.linspace(0, len(line) - 1, pairs), np.arange(len(line))
+    x, y, turned = (np.interp(at, places, values) for values in (*line.T, heading))
+    scene = Scene(load_world("building", seed).standing)
+    return SimulatedRun(seeded_rig(seed, size, options), paths.planar_poses(np.column_stack([x, y]), turned), scene)
 
 
 Recipe = Callable[[int, int, int, RigOptions], SimulatedRun]
@@ -140,7 +146,7 @@ EXPERIMENTS: dict[str, tuple[Recipe, int]] = {  # recipe and number of pairs
     "smooth": (smooth, 3),
     "two_walls": (two_walls, 99),
     "turns": (turns, 1 + len(TURNS_DEG) + len(MOVED_TURNS_DEG)),
-    "building": (building_run, 349),
+    "building": (building, 349),
 }
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from calib.models.camera import Array
 from calib.rig_file import read_rig
 from drivers.logs.log_reader import LogReader
 from omnid.config import Config
-from omnid.messages import FramePair, Panoramas
+from omnid.messages import Panoramas
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry, geometry
 from omnid.stages.synchronise import Synchronise
@@ -81,26 +81,10 @@ class Views:
 
 
 def load_views(folder: Path) -> Views:
-    """Return all panoramas of a short log."""
-    place = log_geometry(folder)
-    return Views(place, list(panoramas_of(folder, place)))
-
-
-def log_geometry(folder: Path) -> Geometry:
-    """Return the geometry of a log's rig, whose file has the masks."""
-    return geometry(read_rig(folder / "rig.toml"), Config().panorama)
-
-
-def panoramas_of(folder: Path, place: Geometry) -> Iterator[Panoramas]:
-    """Yield the panoramas of a log, one pair at a time."""
+    """Return all panoramas of a short log, whose rig has the masks."""
     config = Config()
-    dewarp = Dewarp(place, config.panorama)
-    yield from (dewarp.process(pair) for pair in _pairs(folder, place, config))
-
-
-def _pairs(folder: Path, place: Geometry, config: Config) -> Iterator[FramePair]:
-    sync, reader = Synchronise(place.rig, config.pair), LogReader(folder / "log.mcap")
-    try:
-        yield from (pair for frame in reader.frames() if (pair := sync.process(frame)) is not None)
-    finally:
-        reader.close()
+    place = geometry(read_rig(folder / "rig.toml"), config.panorama)
+    pairing, dewarp = Synchronise(place.rig, config.pair), Dewarp(place, config.panorama)
+    with closing(LogReader(folder / "log.mcap")) as reader:
+        pairs = [pair for frame in reader.frames() if (pair := pairing.process(frame)) is not None]
+    return Views(place, [dewarp.process(pair) for pair in pairs])

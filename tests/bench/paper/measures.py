@@ -1,0 +1,240 @@
+"""Figures of the paper's and omnid's methods on the rendered logs of section V: walls, turns, and paths with maps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+import omnid
+from calib import se3
+from calib.models.camera import Array
+from omnid.config import Config
+from omnid.core.odometry.corners import corners
+from omnid.core.odometry.paper.paper_odometry import turned_track
+from omnid.core.odometry.stereo_frame import StereoFrame
+from omnid.core.odometry.tracking import KltSettings, correlation_peaks, flow
+from omnid.core.stereo.matcher import edge_pixels, smooth
+from omnid.formats.tum import Trajectory, read_tum
+from omnid.messages import Panoramas
+from omnid.recordings.evaluation import evaluate
+from omnid.simulation.rendering.surfaces import Rectangle
+from omnid.stages.dense_depths import DenseStereo
+from tests.bench.paper.scenes import MOVED_TURNS_DEG, TURNS_DEG, WALL_M
+from tests.bench.paper.truth import Flags, cast, sees, surface_distance_m
+from tests.bench.paper.views import Experiment, Views, load_views
+from tests.bench.results import Cell
+from tests.simulation.recipes import SimulatedRun
+
+# V.B, fig. 8: SAD, enhanced SAD and omnid's matching on a wall of identical bricks, a control and a smooth wall.
+
+SAD_METHODS: Final = {"original SAD": "sad", "enhanced SAD": "enhanced", "semi-global (omnid)": "semiglobal"}
+WRONG_M: Final = 0.05  # largest distance of a right point from the wall
+MISMATCHED_M: Final = 0.2  # a point farther off is not only located inexactly
+HALF_ANGLE_DEG: Final = 45.0  # from straight ahead; farther along the wall, 5 cm are within the noise of the depth
+CELL_M: Final = 0.1  # side of the squares of the wall of which the covered ones are counted
+
+
+class WallFigures(NamedTuple):
+    """Figures of a method on a wall: shares in per cent."""
+
+    matches: float  # a pair
+    wrong: float  # over WRONG_M off
+    mismatched: float  # over MISMATCHED_M off
+    completeness: float  # right matches of the edge pixels, which every SAD method tries to match
+    coverage: float  # of the squares of the wall within HALF_ANGLE_DEG, those that hold a right match
+    rms_mm: float  # of the right ones
+
+
+def walls(folder: Path, experiment: Experiment) -> dict[str, WallFigures]:
+    """Return the figures of each method on the matches that truly show the wall."""
+    run, views, stereo = experiment.run, load_views(folder), Config().stereo
+    wall = next(face for face in run.scene.rectangles if face.name == "wall")
+    squares = round(2 * WALL_M * np.tan(np.deg2rad(HALF_ANGLE_DEG)) / CELL_M) * round(wall.height_m / CELL_M)
+    found = {}
+    for name, method in SAD_METHODS.items():
+        dense = DenseStereo(views.geometry, replace(stereo, matching=replace(stereo.matching, method=method)))
+        errors, covered, edges = [], [], 0
+        for panoramas, T_world_rig in zip(views.panoramas, run.poses, strict=True):
+            depth = dense.compute(panoramas)
+            on_wall, spots = _wall_points(run, views, T_world_rig, depth.pixels)
+            errors.append(se3.apply(T_world_rig, depth.points)[on_wall, 0] - WALL_M)
+            right = spots[on_wall, 1:][np.abs(errors[-1]) <= WRONG_M] - [T_world_rig[1, 3], 0.0]
+            covered.append(len(np.unique(np.floor(right / CELL_M), axis=0)) / squares)
+            edges += int(_wall_points(run, views, T_world_rig, _edges(panoramas))[0].sum())
+        off_m = np.abs(np.concatenate(errors))
+        right_m = off_m[off_m <= WRONG_M]
+        found[name] = WallFigures(
+            len(off_m) / len(errors),
+            *(100 * float((off_m > limit_m).mean()) for limit_m in (WRONG_M, MISMATCHED_M)),
+            100 * len(right_m) / edges,
+            100 * float(np.mean(covered)),
+            1e3 * float(np.sqrt(np.mean(right_m**2))),
+        )
+    return found
+
+
+def _wall_points(run: SimulatedRun, views: Views, T_world_rig: Array, pixels: Array) -> tuple[Flags, Array]:
+    """Return which pixels (N, 2) show the wall within HALF_ANGLE_DEG of straight ahead, and their points (N, 3)."""
+    rays = views.rays(pixels) @ T_world_rig[:3, :3].T
+    origin = views.viewpoint(T_world_rig)
+    distance, which = cast(run.scene, origin, rays)
+    wall = [number for number, face in enumerate(run.scene.rectangles) if face.name == "wall"]
+    ahead = np.abs(np.arctan2(rays[:, 1], rays[:, 0])) <= np.deg2rad(HALF_ANGLE_DEG)
+    return np.isin(which, wall) & ahead, origin + np.where(np.isfinite(distance), distance, 0)[:, None] * rays
+
+
+def _edges(panoramas: Panoramas) -> Array:
+    """Return the pixels (N, 2) of the lower panorama that every SAD method tries to match."""
+    matching = Config().stereo.matching
+    image = smooth(panoramas.lower.panorama, matching.sigma_px)
+    flat = edge_pixels(image, panoramas.visible, matching.edge_threshold, matching.max_points)
+    rows, columns = np.divmod(flat, image.shape[1])
+    return np.column_stack([columns, rows]).astype(float)
+
+
+# IV.F, fig. 7: plain KLT, the search in steps of 18 degrees and correlation, through turns of -180 to 180 degrees.
+
+FEATURES: Final = 500
+RIGHT_PX: Final = 3.0  # largest distance of a right feature from its true pixel
+Tracker = Callable[[StereoFrame, StereoFrame, Array], tuple[Array, Flags]]
+
+
+def _correlated(before: StereoFrame, after: StereoFrame, features: Array) -> tuple[Array, Flags]:
+    peaks = correlation_peaks(before.lower.panorama, after.lower.panorama, after.usable)
+    return turned_track(before, after, features, KltSettings(), peaks)
+
+
+TRACKERS: Final[dict[str, Tracker]] = {
+    # By Lucas and Kanade's own status, as the paper does.
+    "plain KLT": lambda before, after, at: flow(before.lower, after.lower, at, at, KltSettings()),
+    "18° steps": lambda before, after, at: turned_track(before, after, at, KltSettings()),
+    "correlation": _correlated,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """A turn from one pair to another: its angle, positive to the left, and the features that were followed."""
+
+    angle_deg: float
+    is_moved: bool  # with a small translation
+    features: int
+    right: dict[str, int]  # by tracker: claimed, and within RIGHT_PX
+    claimed: dict[str, int]
+
+
+def turns(folder: Path, experiment: Experiment) -> Iterator[Turn]:
+    """Yield the turns from the first pair of the log to each other one, and the ways back."""
+    run, views = experiment.run, load_views(folder)
+    frames = [
+        StereoFrame(p.seq, p.lower, p.upper, np.full(p.visible.shape, np.nan, np.float32), p.visible)
+        for p in views.panoramas
+    ]
+    angles = [(float(a), False) for a in TURNS_DEG] + [(float(a), True) for a in MOVED_TURNS_DEG]
+    for number, (angle_deg, is_moved) in enumerate(angles[: len(frames) - 1], 1):
+        yield _turn(run, views, frames, (0, number), angle_deg, is_moved)
+        if angle_deg:
+            yield _turn(run, views, frames, (number, 0), -angle_deg, is_moved)
+
+
+def _turn(
+    run: SimulatedRun,
+    views: Views,
+    frames: list[StereoFrame],
+    pair: tuple[int, int],
+    angle_deg: float,
+    is_moved: bool,
+) -> Turn:
+    """Track corners of one pair into another, and count those that are found where they truly are."""
+    (before, after), (T_before, T_after) = (frames[n] for n in pair), (run.poses[n] for n in pair)
+    # 1. Corners of the first panorama, and the points of the scene that they show.
+    pixels = corners(before.lower, before.usable, FEATURES)
+    origin, rays = views.viewpoint(T_before), views.rays(pixels) @ T_before[:3, :3].T
+    distance, _ = cast(run.scene, origin, rays)
+    hit = np.isfinite(distance)
+    pixels, points = pixels[hit], origin + distance[hit, None] * rays[hit]
+    # 2. Where the second panorama truly shows them.
+    true_pixels, visible = views.pixels(T_after, points), sees(run.scene, views.viewpoint(T_after), points)
+    right, claimed = {}, {}
+    for name, tracker in TRACKERS.items():
+        found, is_claimed = tracker(before, after, pixels)
+        error = found - true_pixels
+        error[:, 0] = views.geometry.cylinder.wrap(error[:, 0])
+        claimed[name] = int(is_claimed.sum())
+        right[name] = int((is_claimed & visible & (np.hypot(*error.T) <= RIGHT_PX)).sum())
+    return Turn(angle_deg, is_moved, len(pixels), right, claimed)
+
+
+# V.C, fig. 9, V.D, fig. 10: paths between two walls and around a building, and the map of the latter.
+
+SAD, ENHANCED = "stereo.matching.method=sad", "stereo.matching.method=enhanced"
+PAPER, KLT, KEYFRAME = "odometry.method=paper", "odometry.tracker=klt", "odometry.reference=keyframe"
+THE_PAPER: Final = "enhanced SAD, improved KLT, eq. 9 (the paper)"
+OMNID: Final = "bearings, keyframes, semi-global prior (omnid)"
+METHODS: Final = {  # settings; each step from the paper's method to omnid's
+    "original SAD, plain KLT, eq. 9": (PAPER, SAD, KLT),
+    "enhanced SAD, plain KLT, eq. 9": (PAPER, ENHANCED, KLT),
+    "original SAD, improved KLT, eq. 9": (PAPER, SAD),
+    THE_PAPER: (PAPER, ENHANCED),
+    "eq. 9 with keyframes": (PAPER, ENHANCED, KEYFRAME),
+    "bearings, frame to frame": ("odometry.limits.keyframes=1",),
+    "bearings, keyframes, enhanced SAD": (ENHANCED,),
+    OMNID: (),
+}
+NEAR_M: Final = 4.0  # the map is judged within this distance from the path
+SEEN_M: Final = 0.1  # a spot of a wall counts as mapped with a point this close
+SPOT_M: Final = 0.25  # distance between the spots
+HEIGHT_M: Final = (0.3, 2.2)  # lowest and highest spot
+OFF_M: Final = 0.05  # a point of the map farther from all surfaces is wrong
+
+
+def path(folder: Path, experiment: Experiment, method: str) -> list[Cell]:
+    """Return length [%], ATE, end [mm], heading [deg]; for a building the map's RMS [mm], wrong points, walls [%]."""
+    result = omnid.replay(folder / "log.mcap", folder / "rig.toml", overrides=list(METHODS[method]))
+    found = evaluate(Trajectory(result.stamps_ns, result.T_odom_rig), read_tum(folder / "truth.txt"))
+    lengths = (1e3 * found.ate_rmse_m, 1e3 * found.end_error_m)
+    cells: list[Cell] = [100 * found.length_error_ratio, *lengths, math.degrees(found.heading_max_rad)]
+    if experiment.name != "building":
+        return [*cells, None, None, None]
+    assert result.map is not None
+    return [*cells, *map_figures(experiment.run, result.map.xyz.astype(float))]
+
+
+def map_figures(run: SimulatedRun, xyz: Array) -> tuple[float, float, float]:
+    """Return the RMS distance [mm] of map points near the path from the nearest true surface, and two shares [%].
+
+    xyz (N, 3) m in odom. Shares: of the points that are wrong, and of the spots of walls that are mapped.
+    """
+    in_world = se3.apply(run.poses[0], xyz)
+    nearest_m = np.min([np.linalg.norm(in_world[:, :2] - T[:2, 3], axis=1) for T in run.poses[::3]], axis=0)
+    near = in_world[nearest_m < NEAR_M]
+    error = surface_distance_m(run.scene, near)
+    spots = np.concatenate([_spots(face) for face in run.scene.rectangles if _is_wall(face)])
+    visible = np.zeros(len(spots), bool)
+    for T in run.poses[::5]:
+        todo = ~visible & (np.linalg.norm((spots - T[:3, 3])[:, :2], axis=1) < NEAR_M)
+        visible[todo] |= sees(run.scene, T[:3, 3], spots[todo])
+    # A spot is mapped if its cell or one of its neighbours holds a point.
+    steps = np.stack(np.meshgrid(*3 * [[-1, 0, 1]]), axis=-1).reshape(-1, 3)
+    cells = {tuple(cell) for cell in np.floor(near / SEEN_M).astype(int).tolist()}
+    around = np.floor(spots[visible] / SEEN_M).astype(int)[:, None] + steps
+    mapped = float(np.mean([any(tuple(cell) in cells for cell in of_spot) for of_spot in around.tolist()]))
+    return 1e3 * float(np.sqrt((error**2).mean())), 100 * float((error > OFF_M).mean()), 100 * mapped
+
+
+def _is_wall(face: Rectangle) -> bool:
+    return abs(face.normal[2]) < 0.1 and face.width_m > 1.0
+
+
+def _spots(face: Rectangle) -> Array:
+    """Return points (N, 3) on a grid over a wall, at heights that a robot's cameras see well."""
+    across, down = (
+        (np.arange(count) + 0.5) / count for count in (max(1, round(m / SPOT_M)) for m in (face.width_m, face.height_m))
+    )
+    points = face.points(np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2))
+    return points[(points[:, 2] > HEIGHT_M[0]) & (points[:, 2] < HEIGHT_M[1])]
