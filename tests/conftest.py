@@ -27,12 +27,28 @@ sys.dont_write_bytecode = False
 
 PAIRS = 24
 COURSE_PAIRS = 22  # before the turn
+LONG = ("replay", "bench", "omnid/simulation", "omnid/web", "omnid/commands", "omnid/calibration", "documents")
 
 
 def pytest_xdist_auto_num_workers() -> int:
     """Return the number of workers of `-n auto`: one more than cores, as live tests wait, unless the cores are busy."""
     cores = len(os.sched_getaffinity(0))
     return cores + (os.getloadavg()[0] < cores)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Hand the files to the workers of `--dist loadfile` in the order of `pytest_collection_modifyitems`."""
+    if hasattr(config.option, "loadscopereorder"):
+        config.option.loadscopereorder = False  # else those with the fewest tests come last, which take longest
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the folders whose files take long, so that no worker has such a one left when the others have ended.
+
+    Their tests run programs, drives and calibrations.
+    """
+    first = [Path(__file__).parent / folder for folder in LONG]
+    items.sort(key=lambda item: not any(item.path.is_relative_to(folder) for folder in first))
 
 
 @pytest.hookimpl(wrapper=True)

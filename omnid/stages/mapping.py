@@ -25,7 +25,7 @@ Position: TypeAlias = tuple[float, float]  # x, y [m]
 MIN_VOXEL_FRAMES = 2  # frames that must have seen a voxel, also in a short run; one where there are fewer than 4
 FRAMES_PER_VOXEL_FRAME = 10  # frames of the run for each frame required, up to mapping.min_frames
 # Less motion shows the same points again. Measured: with 15 cm and 8 degrees half as many pairs enter the map, but of
-# its points up to 2.4 times as many are wrong where as much is seen (tests/bench/cloud_error.py).
+# its points up to 2.4 times as many are wrong where as much is seen (`tests.bench.accuracy --cloud`).
 SAME_VIEW_M, SAME_VIEW_TRACE = 0.03, 3 - math.radians(2) ** 2
 STANDING_NS = 1_000_000_000  # Least time between two pairs of the same view that enter the map.
 FINEST_STEP_M = 0.001  # Least distance between two vertices of the path: a robot at rest adds none.
