@@ -24,11 +24,12 @@ import zenoh
 
 from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig
-from omnid.transport.codec import PoseAttachment
-from omnid.transport.decode import DECODERS, Cloud, Diagnostics, Map, NavigationReport, Pose, Scan
+from omnid.transport.codec import Cloud, Diagnostics, Map, Pose, PoseAttachment, Scan
 from omnid.transport.driver import CONNECT_S, Driver, RobotTime
 from omnid.transport.requests import Answer
 from omnid.transport.session import ALIVE, HERE, Unreachable, open_client, robots_there
+from omnid.transport.status_names import NavigationReport
+from omnid.transport.topics import PUBLISHED
 
 __all__ = [
     "CONNECT_S",
@@ -172,7 +173,7 @@ class Robot:
 
     def _subscription(self, kind: type[T], on_close: Callable[[], None] | None = None) -> Subscription[T]:
         topic = _TOPICS[kind]
-        return Subscription(self._session, f"{self.name}/{topic}", DECODERS[topic], on_close)
+        return Subscription(self._session, f"{self.name}/{topic}", PUBLISHED[topic].decode, on_close)
 
     def on_message(self, callback: Callable[[str, bytes, bytes], None], topic: str = "*") -> Callable[[], None]:
         """Call callback(topic, payload, attachment) for each message of the robot from now on, in a zenoh thread.

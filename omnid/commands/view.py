@@ -158,7 +158,7 @@ def _draw_recording(sink: RerunSink, log: Path, topic: str | None, robot: str | 
         choose_odometry_topic,
         no_pose,
     )
-    from omnid.transport.decode import Pose
+    from omnid.transport.codec import Pose
     from omnid.transport.topics import MAP_POSE, SCAN
 
     found = log_info(log)

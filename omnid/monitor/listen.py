@@ -16,7 +16,7 @@ from omnid.engine.process import handle_stop_signals
 from omnid.monitor.robot_state import Inbox, RobotState, importance
 from omnid.plain_text import plain
 from omnid.transport.bus_config import BusConfig
-from omnid.transport.decode import Pose
+from omnid.transport.codec import Pose
 from omnid.transport.session import Unreachable
 from omnid.transport.status_names import short_name
 

@@ -13,8 +13,7 @@ from omnid.core.nanoseconds import S_PER_NS
 from omnid.engine.telemetry import Histogram
 from omnid.errors import OmnidError
 from omnid.plain_text import plain
-from omnid.transport.codec import DiagnosticStatus
-from omnid.transport.decode import Diagnostics, Pose, decode_diagnostics, decode_pose
+from omnid.transport.codec import Diagnostics, DiagnosticStatus, Pose, decode_diagnostics, decode_pose
 from omnid.transport.status_names import SIMULATION, STAGE_PREFIX, Key
 
 NO_POSE_S: Final = 2.0  # Without a pose for this time, state and rate of the last poses are no longer shown.

@@ -19,9 +19,17 @@ from drivers.logs.log import LoggedMessage, LogInfo, RecordError
 from drivers.logs.open_log import open_log
 from drivers.logs.ros_messages import IMAGE_TYPES, RosImage
 from omnid.errors import OmnidError
-from omnid.transport import decode
-from omnid.transport.codec import ODOMETRY_SCHEMA, TWIST_SCHEMA
-from omnid.transport.decode import Cloud, Diagnostics, Pose, PoseInMap, Scan, TwistRecord, twist_from_cdr
+from omnid.transport.codec import (
+    ODOMETRY_SCHEMA,
+    TWIST_SCHEMA,
+    Cloud,
+    Diagnostics,
+    Pose,
+    PoseInMap,
+    Scan,
+    TwistRecord,
+    twist_from_cdr,
+)
 from omnid.transport.topics import MAP_POSE, PANORAMA, PUBLISHED, SCAN
 
 ODOMETRY: Final = "odom"
@@ -178,6 +186,6 @@ def _finite_twist(data: bytes) -> TwistRecord:
 
 # Type and decoder of each topic.
 DECODERS: Final[Mapping[str, tuple[str, Callable[[bytes], Content]]]] = {
-    **{name: (PUBLISHED[name].schema, decode.DECODERS[name]) for name in (ODOMETRY, MAP_POSE, STATUS, CLOUD, SCAN)},
+    **{name: PUBLISHED[name][:2] for name in (ODOMETRY, MAP_POSE, STATUS, CLOUD, SCAN)},
     **dict.fromkeys((DRIVE, TWIST_COMMAND), (TWIST_SCHEMA, _finite_twist)),
 }

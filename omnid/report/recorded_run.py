@@ -33,8 +33,7 @@ from omnid.recordings.recording import (
 )
 from omnid.tracking_state import TrackingState
 from omnid.transport import status_names
-from omnid.transport.codec import DiagnosticStatus
-from omnid.transport.decode import Cloud, Diagnostics, Pose, PoseInMap, TwistRecord
+from omnid.transport.codec import Cloud, Diagnostics, DiagnosticStatus, Pose, PoseInMap, TwistRecord
 from omnid.transport.status_names import Key, short_name
 from omnid.transport.topics import MAP_POSE
 

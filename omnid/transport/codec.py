@@ -1,16 +1,20 @@
-"""What is sent: ROS 2 (Humble) messages as CDR bytes, by rosbags; the same for recordings and the bus.
+"""Messages of the bus and of recordings: types of ROS 2 (Humble) as CDR bytes, by rosbags, both ways.
 
-Arrays in SI units; p_a = T_a_b @ p_b; covariances in the order x y z rx ry rz, row-major (nav_msgs/msg/Odometry).
-Attachments of zenoh are JSON with what a ROS 2 message has no field for. omnid.transport.decode reads all of this.
+Types of rosbags stay in this file. Arrays are in SI units and not to be written to; p_a = T_a_b @ p_b; covariances are
+in the order x y z rx ry rz, row-major (nav_msgs/msg/Odometry). Attachments of zenoh are JSON with what a message has no
+field for. Bytes that are decoded may be anything: all decoders raise OmnidError for those that are no such message.
+Encoders raise it for a stamp that is no ROS time.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from functools import cache, lru_cache
+from dataclasses import asdict, dataclass, field
+from functools import cache
+from struct import calcsize
 from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
@@ -46,16 +50,11 @@ BOOL_SCHEMA = "std_msgs/msg/Bool"
 PATH_SCHEMA = "nav_msgs/msg/Path"
 STRING_SCHEMA = "std_msgs/msg/String"
 SCAN_SCHEMA = "sensor_msgs/msg/LaserScan"
-NS_PER_S = 1_000_000_000
-MAX_SECONDS = 2**31 - 1  # builtin_interfaces/msg/Time counts seconds in an int32
 OK, WARN, ERROR, STALE = range(4)  # levels of diagnostic_msgs/msg/DiagnosticStatus
-CLOUD_FIELDS = ("x", "y", "z", "confidence")
-CLOUD_BLOCK = 4096  # points transformed at once: temporary arrays of a whole map would fragment the memory
-# m, m/s; sigma and sigma_v: of position and velocity along the axis in which they are largest.
-MOVING_FIELDS: Final = ("x", "y", "z", "vx", "vy", "radius", "sigma", "sigma_v")
-FEATURE_KINDS: Final = ("inliers", "rejected", "new")
-MOST_FEATURES: Final = 2000  # features of a kind
-_MAX_ATTACHMENT_BYTES: Final = 4096
+NS_PER_S = 1_000_000_000
+# A quaternion whose norm differs from 1 by more than this is refused: more than rounding to float32 or to six decimals
+# makes, and less than a quaternion of zeros or one that was scaled.
+QUATERNION_TOLERANCE = 1e-3
 
 
 class RosMessage(Protocol):
@@ -66,71 +65,7 @@ class RosMessage(Protocol):
 
 M = TypeVar("M", bound=RosMessage)
 
-
-@dataclass(frozen=True, slots=True)
-class FrameTransform:
-    """One edge of the frame tree: p_parent = T_parent_child @ p_child."""
-
-    parent: str
-    child: str
-    T_parent_child: Array  # (4, 4)
-
-
-@dataclass(frozen=True, slots=True)
-class DiagnosticStatus:
-    """Status of one part of the robot; names and keys: omnid.transport.status_names."""
-
-    name: str
-    level: int  # OK ...
-    message: str
-    values: Mapping[str, str]
-
-    @classmethod
-    def of(cls, name: str, level: int, message: str, values: Mapping[Any, object]) -> Self:
-        """Return a status. Numbers of values are written with five digits; what is unknown ("", NaN) is left out."""
-        texts = {str(key): f"{value:.5g}" if isinstance(value, float) else str(value) for key, value in values.items()}
-        return cls(name, level, message, {key: text for key, text in texts.items() if text not in ("", "nan")})
-
-
-class PlanarGoal(NamedTuple):
-    """Content of a PoseStamped on the floor."""
-
-    stamp_ns: int
-    frame: str
-    x_m: float
-    y_m: float
-    heading_rad: float | None  # None: the quaternion is all zeros, which asks for no heading
-
-
-@dataclass(frozen=True, slots=True)
-class PoseAttachment:
-    """The zenoh attachment of a pose: sequence number, tracking state and landmark counts."""
-
-    seq: int = -1
-    state: str = "unknown"  # tracking | degraded | lost
-    resets: int = 0  # how often odom was started again with an unknown gap
-    inliers: int = 0  # landmarks that agree with the pose
-    tracked: int = 0  # landmarks found in the images
-    sent_ns: int = 0  # Unix time at which it was handed to the network
-
-    def to_bytes(self) -> bytes:
-        """Encode as JSON."""
-        return json.dumps(asdict(self), separators=(",", ":")).encode()
-
-    @classmethod
-    def from_bytes(cls, data: bytes) -> Self:
-        """Decode; missing entries keep their defaults. Raise OmnidError for anything but a JSON object."""
-        try:
-            found = json.loads(data) if len(data) <= _MAX_ATTACHMENT_BYTES else None
-        except (ValueError, RecursionError):
-            found = None
-        if not isinstance(found, dict):
-            raise OmnidError(
-                f"the {len(data)} bytes attached to a pose are not a JSON object; check that omnid sent them"
-            )
-        defaults = asdict(cls())
-        known = {name: found[name] for name, default in defaults.items() if type(found.get(name)) is type(default)}
-        return cls(**known)
+# Bytes, stamps and geometry.
 
 
 @cache
@@ -150,50 +85,130 @@ def message_cdr(message: RosMessage) -> bytes:
     return bytes(_typestore().serialize_cdr(message, message.__msgtype__))
 
 
-def ros_time(stamp_ns: int) -> tuple[int, int]:
-    """Return seconds and nanoseconds of a stamp. Raise OmnidError for one that is no ROS time."""
-    seconds, nanoseconds = divmod(int(stamp_ns), NS_PER_S)
-    if not 0 <= seconds <= MAX_SECONDS:
-        raise OmnidError(f"stamp {stamp_ns} ns does not fit a ROS time (1970 to 2038); give nanoseconds of Unix time")
-    return seconds, nanoseconds
+def message_from_cdr(payload: bytes, kind: type[M]) -> M:
+    """Decode a message into a type of rosbags."""
+    schema = kind.__msgtype__
+    try:
+        message = _typestore().deserialize_cdr(bytes(payload), schema)
+    except SerdeError as error:
+        raise OmnidError(f"{len(payload)} bytes are not a {schema} in CDR ({error}); check the sender") from error
+    assert isinstance(message, kind)
+    return message
 
 
 def time_message(stamp_ns: int) -> ros.builtin_interfaces__msg__Time:
-    """Return a stamp. Raise OmnidError for one that is no ROS time."""
-    return ros.builtin_interfaces__msg__Time(*ros_time(stamp_ns))
+    """Return a stamp."""
+    seconds, nanoseconds = divmod(int(stamp_ns), NS_PER_S)
+    if not 0 <= seconds < 1 << 31:  # an int32
+        raise OmnidError(f"stamp {stamp_ns} ns does not fit a ROS time (1970 to 2038); give nanoseconds of Unix time")
+    return ros.builtin_interfaces__msg__Time(seconds, nanoseconds)
 
 
 def header_message(stamp_ns: int, frame: str) -> ros.std_msgs__msg__Header:
-    """Return a header. Raise OmnidError for a stamp that is no ROS time."""
+    """Return a header."""
     return ros.std_msgs__msg__Header(time_message(stamp_ns), frame)
+
+
+def _stamp_ns(header: ros.std_msgs__msg__Header) -> int:
+    """Return a stamp that may be invalid; those who rely on it check it."""
+    return int(header.stamp.sec) * NS_PER_S + int(header.stamp.nanosec)
 
 
 def _vector(xyz: ArrayLike) -> ros.geometry_msgs__msg__Vector3:
     return ros.geometry_msgs__msg__Vector3(*(float(v) for v in np.asarray(xyz)))
 
 
-def _quaternion(R: ArrayLike) -> ros.geometry_msgs__msg__Quaternion:
-    return ros.geometry_msgs__msg__Quaternion(*_xyzw(np.asarray(R, np.float64).tobytes()))
+def _quaternion(R: Array) -> ros.geometry_msgs__msg__Quaternion:
+    return ros.geometry_msgs__msg__Quaternion(*se3.quaternion(R).tolist())
 
 
-@lru_cache(maxsize=8)
-def _xyzw(R: bytes) -> list[float]:
-    """Return the quaternion of a rotation; cached because several messages carry the same pose."""
-    return list(se3.quaternion(np.frombuffer(R).reshape(3, 3)).tolist())
+def _pose(T: Array) -> ros.geometry_msgs__msg__Pose:
+    return ros.geometry_msgs__msg__Pose(ros.geometry_msgs__msg__Point(*T[:3, 3].tolist()), _quaternion(T[:3, :3]))
 
 
-def pose_message(T: Array) -> ros.geometry_msgs__msg__Pose:
-    """Return the message of a transform (4, 4)."""
-    position = ros.geometry_msgs__msg__Point(*(float(v) for v in T[:3, 3]))
-    return ros.geometry_msgs__msg__Pose(position, _quaternion(T[:3, :3]))
+def _pose_with_covariance(T: Array, covariance: Array) -> ros.geometry_msgs__msg__PoseWithCovariance:
+    return ros.geometry_msgs__msg__PoseWithCovariance(_pose(T), np.ravel(covariance))
 
 
-def _covariance(matrix: ArrayLike) -> Array:
-    """Return a covariance (6, 6) as the array (36,) of a message. Raise OmnidError for another shape."""
-    flat = np.ascontiguousarray(matrix, np.float64).reshape(-1)
-    if flat.shape != (36,):
-        raise OmnidError(f"covariance of shape {np.shape(matrix)}: expected (6, 6), in the order x y z rx ry rz")
-    return flat
+def _rigid_transform(pose: ros.geometry_msgs__msg__Pose) -> Array:
+    """Return the transform (4, 4) of a pose, which must be finite and rigid."""
+    q, p = pose.orientation, pose.position
+    xyzw, position = (q.x, q.y, q.z, q.w), (p.x, p.y, p.z)
+    if not abs(math.hypot(*xyzw) - 1.0) < QUATERNION_TOLERANCE or not all(map(math.isfinite, position)):
+        raise OmnidError(f"pose {position} {xyzw}: expected finite numbers and a unit quaternion; check the sender")
+    return se3.transform(se3.rotation(xyzw), position)
+
+
+# Poses.
+
+
+@dataclass(frozen=True, slots=True)
+class PoseAttachment:
+    """The zenoh attachment of a pose: sequence number, tracking state and landmark counts."""
+
+    seq: int = -1
+    state: str = "unknown"  # tracking | degraded | lost
+    resets: int = 0  # how often odom was started again with an unknown gap
+    inliers: int = 0  # landmarks that agree with the pose
+    tracked: int = 0  # landmarks found in the images
+    sent_ns: int = 0  # Unix time at which it was handed to the network
+
+    def to_bytes(self) -> bytes:
+        """Encode as JSON."""
+        return json.dumps(asdict(self), separators=(",", ":")).encode()
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> Self:
+        """Decode a JSON object; missing entries, and those of another type, keep their defaults."""
+        try:
+            found = json.loads(data)
+        except (ValueError, RecursionError):
+            found = None
+        if not isinstance(found, dict):
+            raise OmnidError(
+                f"the {len(data)} bytes attached to a pose are not a JSON object; check that omnid sent them"
+            )
+        defaults = asdict(cls())
+        return cls(**{name: found[name] for name, own in defaults.items() if type(found.get(name)) is type(own)})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pose:
+    """Pose and velocity of the robot's base with their covariances."""
+
+    stamp_ns: int  # of Unix time, when the images were taken
+    T_odom_base: Array  # (4, 4) m
+    covariance: Array  # (6, 6) of the pose, x y z rx ry rz in odom axes, m^2 and rad^2
+    velocity: Array  # (6,) m/s, rad/s in the base's axes
+    velocity_covariance: Array  # (6, 6)
+    attachment: PoseAttachment = field(default_factory=PoseAttachment)  # state, sequence number, landmarks
+    received_ns: int = 0  # of Unix time, by the receiver's clock
+    frames: Frames = ("odom", "base_link")  # parent, child
+
+    @property
+    def state(self) -> str:
+        """tracking, degraded or lost; unknown where the sender is not omnid."""
+        return self.attachment.state
+
+    @property
+    def x_m(self) -> float:
+        """Position in odom, forward of the start."""
+        return float(self.T_odom_base[0, 3])
+
+    @property
+    def y_m(self) -> float:
+        """Position in odom, to the left of the start."""
+        return float(self.T_odom_base[1, 3])
+
+    @property
+    def z_m(self) -> float:
+        """Position in odom, above the start."""
+        return float(self.T_odom_base[2, 3])
+
+    @property
+    def yaw_rad(self) -> float:
+        """Heading in odom, counter-clockwise."""
+        return float(se3.yaw(self.T_odom_base))
 
 
 def odometry_cdr(
@@ -210,107 +225,174 @@ def odometry_cdr(
     message = ros.nav_msgs__msg__Odometry(
         header_message(stamp_ns, parent),
         child,
-        ros.geometry_msgs__msg__PoseWithCovariance(pose_message(T_odom_base), _covariance(covariance)),
-        ros.geometry_msgs__msg__TwistWithCovariance(twist, _covariance(velocity_covariance)),
+        _pose_with_covariance(T_odom_base, covariance),
+        ros.geometry_msgs__msg__TwistWithCovariance(twist, np.ravel(velocity_covariance)),
     )
     return message_cdr(message)
 
 
+def decode_pose(payload: bytes, attachment: bytes = b"", received_ns: int | None = None) -> Pose:
+    """Decode an Odometry with a finite, rigid pose and a valid stamp, and its attachment.
+
+    received_ns: time of arrival, of Unix time; default: now.
+    """
+    message = message_from_cdr(payload, ros.nav_msgs__msg__Odometry)
+    stamp, twist = message.header.stamp, message.twist.twist
+    if stamp.sec < 0 or stamp.nanosec >= NS_PER_S:
+        raise OmnidError(f"odometry stamp {stamp.sec} s {stamp.nanosec} ns: expected Unix time; check the sender")
+    return Pose(
+        stamp_ns=_stamp_ns(message.header),
+        T_odom_base=_rigid_transform(message.pose.pose),
+        covariance=message.pose.covariance.reshape(6, 6),
+        velocity=np.array([getattr(part, axis) for part in (twist.linear, twist.angular) for axis in "xyz"]),
+        velocity_covariance=message.twist.covariance.reshape(6, 6),
+        attachment=PoseAttachment.from_bytes(attachment) if attachment else PoseAttachment(),
+        received_ns=time.time_ns() if received_ns is None else received_ns,
+        frames=(message.header.frame_id, message.child_frame_id),
+    )
+
+
 def pose_stamped_cdr(stamp_ns: int, T_odom_body: Array) -> bytes:
     """Encode a geometry_msgs/msg/PoseStamped: the pose of a body in odom."""
-    message = ros.geometry_msgs__msg__PoseStamped(header_message(stamp_ns, "odom"), pose_message(T_odom_body))
-    return message_cdr(message)
+    return message_cdr(ros.geometry_msgs__msg__PoseStamped(header_message(stamp_ns, "odom"), _pose(T_odom_body)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseInMap:
+    """Pose of the robot's base in the map, and its covariance (6, 6) in the map's axes."""
+
+    stamp_ns: int
+    T_map_base: Array  # (4, 4) m
+    covariance: Array
 
 
 def pose_with_covariance_cdr(stamp_ns: int, T_map_body: Array, covariance: Array) -> bytes:
     """Encode a geometry_msgs/msg/PoseWithCovarianceStamped: the pose of a body in the map, covariance in its axes."""
-    pose = ros.geometry_msgs__msg__PoseWithCovariance(pose_message(T_map_body), _covariance(covariance))
-    message = ros.geometry_msgs__msg__PoseWithCovarianceStamped(header_message(stamp_ns, "map"), pose)
-    return message_cdr(message)
+    pose = _pose_with_covariance(T_map_body, covariance)
+    return message_cdr(ros.geometry_msgs__msg__PoseWithCovarianceStamped(header_message(stamp_ns, "map"), pose))
+
+
+def decode_map_pose(payload: bytes, _: bytes = b"") -> PoseInMap:
+    """Decode a PoseWithCovarianceStamped with a finite, rigid pose."""
+    message = message_from_cdr(payload, ros.geometry_msgs__msg__PoseWithCovarianceStamped)
+    covariance = message.pose.covariance.reshape(6, 6)
+    return PoseInMap(_stamp_ns(message.header), _rigid_transform(message.pose.pose), covariance)
+
+
+@dataclass(frozen=True, slots=True)
+class FrameTransform:
+    """One edge of the frame tree: p_parent = T_parent_child @ p_child."""
+
+    parent: str
+    child: str
+    T_parent_child: Array  # (4, 4)
 
 
 def transform_cdr(stamp_ns: int, transforms: Sequence[FrameTransform]) -> bytes:
     """Encode a tf2_msgs/msg/TFMessage: edges of the frame tree, all of one instant."""
-    edges = [_edge(stamp_ns, edge) for edge in transforms]
+    edges = []
+    for edge in transforms:
+        T = edge.T_parent_child
+        motion = ros.geometry_msgs__msg__Transform(_vector(T[:3, 3]), _quaternion(T[:3, :3]))
+        header = header_message(stamp_ns, edge.parent)
+        edges.append(ros.geometry_msgs__msg__TransformStamped(header, edge.child, motion))
     return message_cdr(ros.tf2_msgs__msg__TFMessage(edges))
 
 
-def _edge(stamp_ns: int, edge: FrameTransform) -> ros.geometry_msgs__msg__TransformStamped:
-    T = edge.T_parent_child
-    motion = ros.geometry_msgs__msg__Transform(_vector(T[:3, 3]), _quaternion(T[:3, :3]))
-    return ros.geometry_msgs__msg__TransformStamped(header_message(stamp_ns, edge.parent), edge.child, motion)
+# Status.
+
+
+@dataclass(frozen=True, slots=True)
+class DiagnosticStatus:
+    """Status of one part of the robot; names and keys: omnid.transport.status_names."""
+
+    name: str
+    level: int  # OK ...
+    message: str
+    values: Mapping[str, str]
+
+    @classmethod
+    def of(cls, name: str, level: int, message: str, values: Mapping[Any, object]) -> Self:
+        """Return a status. Numbers of values are written with five digits; what is unknown ("", NaN) is left out."""
+        texts = {str(key): f"{value:.5g}" if isinstance(value, float) else str(value) for key, value in values.items()}
+        return cls(name, level, message, {key: text for key, text in texts.items() if text not in ("", "nan")})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Diagnostics:
+    """Status of the parts of a robot: odometry, cameras, stages, wheels."""
+
+    stamp_ns: int
+    statuses: tuple[DiagnosticStatus, ...]
+
+    def value(self, name: str, key: str) -> str:
+        """Return the value of a key of the entry with that name, such as "omnid: odometry"; "" where there is none."""
+        found = (status.values[key] for status in self.statuses if status.name == name and key in status.values)
+        return next(found, "")
 
 
 def diagnostics_cdr(stamp_ns: int, statuses: Sequence[DiagnosticStatus]) -> bytes:
     """Encode a diagnostic_msgs/msg/DiagnosticArray."""
-    entries = [_status(status) for status in statuses]
+    entries = []
+    for status in statuses:
+        pairs = [ros.diagnostic_msgs__msg__KeyValue(key, value) for key, value in status.values.items()]
+        entry = ros.diagnostic_msgs__msg__DiagnosticStatus(status.level, status.name, status.message, "", pairs)
+        entries.append(entry)
     return message_cdr(ros.diagnostic_msgs__msg__DiagnosticArray(header_message(stamp_ns, ""), entries))
 
 
-def _status(status: DiagnosticStatus) -> ros.diagnostic_msgs__msg__DiagnosticStatus:
-    if not 0 <= status.level <= 3:
-        raise OmnidError(
-            f"diagnostic level {status.level} of {status.name}: expected 0 (ok), 1 (warning), 2 (error) or 3 (stale)"
-        )
-    pairs = [ros.diagnostic_msgs__msg__KeyValue(key, value) for key, value in status.values.items()]
-    return ros.diagnostic_msgs__msg__DiagnosticStatus(status.level, status.name, status.message, "", pairs)
+def decode_diagnostics(payload: bytes, _: bytes = b"") -> Diagnostics:
+    """Decode a DiagnosticArray."""
+    message = message_from_cdr(payload, ros.diagnostic_msgs__msg__DiagnosticArray)
+    statuses = tuple(
+        DiagnosticStatus(entry.name, int(entry.level), entry.message, {pair.key: pair.value for pair in entry.values})
+        for entry in message.status
+    )
+    return Diagnostics(_stamp_ns(message.header), statuses)
 
 
-def twist_stamped_cdr(stamp_ns: int, frame: str, linear_mps: float, yaw_rate_radps: float) -> bytes:
-    """Encode a geometry_msgs/msg/TwistStamped of a ground robot: forward speed and yaw rate in `frame`."""
-    twist = ros.geometry_msgs__msg__Twist(_vector((linear_mps, 0, 0)), _vector((0, 0, yaw_rate_radps)))
-    return message_cdr(ros.geometry_msgs__msg__TwistStamped(header_message(stamp_ns, frame), twist))
+# Maps and obstacles.
+
+CLOUD_FIELDS = ("x", "y", "z", "confidence")
+# m, m/s; sigma and sigma_v: of position and velocity along the axis in which they are largest.
+MOVING_FIELDS: Final = ("x", "y", "z", "vx", "vy", "radius", "sigma", "sigma_v")
 
 
-def heading_cdr(stamp_ns: int, velocity_mps: float, heading_rad: float) -> bytes:
-    """Encode a heading command, a geometry_msgs/msg/Vector3Stamped in odom: x is the speed, z the heading."""
-    vector = _vector((velocity_mps, 0, heading_rad))
-    return message_cdr(ros.geometry_msgs__msg__Vector3Stamped(header_message(stamp_ns, "odom"), vector))
+@dataclass(frozen=True, slots=True, eq=False)
+class Cloud:
+    """Points of the map."""
 
-
-def clock_cdr(stamp_ns: int) -> bytes:
-    """Encode the time of a run, for programs that follow it."""
-    return message_cdr(ros.rosgraph_msgs__msg__Clock(time_message(stamp_ns)))
-
-
-def header_cdr(stamp_ns: int) -> bytes:
-    """Encode a std_msgs/msg/Header, which is the message of cmd/arm."""
-    return message_cdr(header_message(stamp_ns, ""))
-
-
-def bool_cdr(value: bool) -> bytes:
-    """Encode a std_msgs/msg/Bool, which is the message of cmd/bumper and cmd/cliff."""
-    return message_cdr(ros.std_msgs__msg__Bool(value))
-
-
-def message_from_cdr(payload: bytes, kind: type[M]) -> M:
-    """Decode a message into a type of rosbags. Raise OmnidError for any other bytes."""
-    schema = kind.__msgtype__
-    try:
-        message = _typestore().deserialize_cdr(bytes(payload), schema)
-    except SerdeError as error:
-        raise OmnidError(f"{len(payload)} bytes are not a {schema} in CDR ({error}); check the sender") from error
-    assert isinstance(message, kind)
-    return message
+    stamp_ns: int
+    frame: str
+    points: Floats  # (N, 3) m
+    confidence: Floats  # (N,)
 
 
 def point_cloud_cdr(
-    stamp_ns: int,
-    frame: str,
-    points: ArrayLike,
-    confidence: ArrayLike,
-    *,
-    T_frame_points: NDArray[np.float64] | None = None,
+    stamp_ns: int, frame: str, points: ArrayLike, confidence: ArrayLike, *, T_frame_points: Array | None = None
 ) -> bytes:
     """Encode a sensor_msgs/msg/PointCloud2 of points (N, 3) [m] with confidence (N,): float32, 16 bytes per point.
 
-    T_frame_points (4, 4) maps the points into `frame`; None where they are given in it.
+    T_frame_points (4, 4) maps the points into `frame`, in double precision; None where they are given in it.
     """
-    return packed_cloud_cdr(stamp_ns, frame, CLOUD_FIELDS, _packed(points, confidence, T_frame_points))
+    points = np.asarray(points).reshape(-1, 3)
+    rows = np.empty((len(points), 4), "<f4")
+    rows[:, :3] = points if T_frame_points is None else se3.apply(T_frame_points, points)
+    rows[:, 3] = confidence
+    return _cloud_cdr(stamp_ns, frame, CLOUD_FIELDS, rows)
 
 
-def packed_cloud_cdr(stamp_ns: int, frame: str, names: Sequence[str], rows: NDArray[np.float32]) -> bytes:
-    """Encode a sensor_msgs/msg/PointCloud2 of rows (N, F), little-endian float32, whose F fields have these names."""
+def moving_cdr(stamp_ns: int, frame: str, moving: Sequence[MovingObstacle]) -> bytes:
+    """Encode moving obstacles in a frame as a PointCloud2, a point each, none included."""
+    rows = np.zeros((len(moving), len(MOVING_FIELDS)), "<f4")
+    for row, one in zip(rows, moving, strict=True):
+        variances = [np.linalg.eigvalsh(one.covariance[at, at])[-1] for at in (slice(0, 2), slice(2, 4))]
+        row[:] = [one.x_m, one.y_m, 0.0, one.vx_mps, one.vy_mps, one.radius_m, *np.sqrt(np.maximum(0.0, variances))]
+    return _cloud_cdr(stamp_ns, frame, MOVING_FIELDS, rows)
+
+
+def _cloud_cdr(stamp_ns: int, frame: str, names: Sequence[str], rows: Floats) -> bytes:
+    """Encode a PointCloud2 of rows (N, F), little-endian float32, whose F fields have these names."""
     number = ros.sensor_msgs__msg__PointField.FLOAT32
     message = ros.sensor_msgs__msg__PointCloud2(
         header=header_message(stamp_ns, frame),
@@ -326,47 +408,200 @@ def packed_cloud_cdr(stamp_ns: int, frame: str, names: Sequence[str], rows: NDAr
     return message_cdr(message)
 
 
-def _packed(points: ArrayLike, confidence: ArrayLike, T: NDArray[np.float64] | None) -> NDArray[np.float32]:
-    """Return points, transformed in double precision, and confidence as (N, 4) little-endian float32."""
-    points, confidence = np.asarray(points).reshape(-1, 3), np.asarray(confidence).reshape(-1)
-    if len(points) != len(confidence):
-        raise OmnidError(f"{len(confidence)} confidences for {len(points)} points: expected one for each point")
-    packed = np.empty((len(points), 4), "<f4")
-    packed[:, 3] = confidence
-    for start in range(0, len(points), CLOUD_BLOCK):
-        at = slice(start, start + CLOUD_BLOCK)
-        packed[at, :3] = points[at] if T is None else se3.apply(T, points[at])
-    return packed
+def decode_cloud(payload: bytes, _: bytes = b"") -> Cloud:
+    """Decode a PointCloud2 with omnid's fields."""
+    message = message_from_cdr(payload, ros.sensor_msgs__msg__PointCloud2)
+    step = 4 * len(CLOUD_FIELDS)
+    fields = [(entry.name, entry.offset) for entry in message.fields]
+    own = fields == [(name, 4 * i) for i, name in enumerate(CLOUD_FIELDS)] and not message.is_bigendian
+    if not own or message.point_step != step or message.data.size % step:
+        raise OmnidError(
+            f"a cloud with {len(fields)} fields and {message.point_step} bytes a point was found; "
+            f"expected the fields {', '.join(CLOUD_FIELDS)} in {step} bytes"
+        )
+    packed = message.data.view("<f4").reshape(-1, len(CLOUD_FIELDS))
+    return Cloud(_stamp_ns(message.header), message.header.frame_id, packed[:, :3], packed[:, 3])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Map:
+    """Occupancy grid of the map."""
+
+    stamp_ns: int
+    frame: str
+    cells: NDArray[np.int8]  # (H, W) -1 unknown, 0 free, up to 100 occupied; rows from low to high y, columns x
+    cell_m: float
+    corner: tuple[float, float]  # x, y of cell (0, 0), m
 
 
 def grid_cdr(stamp_ns: int, frame: str, cells: NDArray[np.int8], cell_m: float, corner: tuple[float, float]) -> bytes:
     """Encode a nav_msgs/msg/OccupancyGrid of cells (H, W), z = 0 in `frame`; corner: x, y of cell (0, 0), m."""
     height, width = cells.shape
-    corner_pose = pose_message(se3.transform(np.eye(3), (*corner, 0.0)))
+    corner_pose = _pose(se3.transform(np.eye(3), (*corner, 0.0)))
     info = ros.nav_msgs__msg__MapMetaData(time_message(stamp_ns), cell_m, width, height, corner_pose)
-    message = ros.nav_msgs__msg__OccupancyGrid(header_message(stamp_ns, frame), info, cells.reshape(-1))
+    return message_cdr(ros.nav_msgs__msg__OccupancyGrid(header_message(stamp_ns, frame), info, cells.reshape(-1)))
+
+
+def decode_map(payload: bytes, _: bytes = b"") -> Map:
+    """Decode an OccupancyGrid that is parallel to its frame's axes."""
+    message = message_from_cdr(payload, ros.nav_msgs__msg__OccupancyGrid)
+    info, T_frame_grid = message.info, _rigid_transform(message.info.origin)
+    is_parallel = np.allclose(T_frame_grid[:3, :3], np.eye(3), atol=QUATERNION_TOLERANCE)
+    if message.data.size != info.width * info.height or not (info.resolution > 0 and is_parallel):
+        raise OmnidError(
+            f"a map with {message.data.size} cells of {info.resolution:g} m was found; expected "
+            f"{info.width} x {info.height} cells of a positive size, parallel to the frame's axes"
+        )
+    cells, corner = message.data.reshape(info.height, info.width), (info.origin.position.x, info.origin.position.y)
+    return Map(_stamp_ns(message.header), message.header.frame_id, cells, float(info.resolution), corner)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scan:
+    """Content of a LaserScan."""
+
+    stamp_ns: int
+    frame: str
+    azimuths_rad: NDArray[np.floating]  # (N,) counter-clockwise from x
+    ranges_m: NDArray[np.floating]  # (N,) inf: free up to max_range_m, NaN: unknown
+    sigma_m: NDArray[np.floating]  # (N,) NaN: unknown; empty in scans of other senders
+    max_range_m: float
+
+
+def scan_cdr(stamp_ns: int, frame: str, ranges_m: Floats, sigma_m: Floats, limits_m: tuple[float, float]) -> bytes:
+    """Encode a sensor_msgs/msg/LaserScan of sectors (N,) that divide a full turn from azimuth -pi on.
+
+    As REP 117 says: inf is free up to the longest range, NaN is unknown. sigma_m: standard deviations of the ranges,
+    sent as intensities. limits_m: least and longest range.
+    """
+    step, arrays = 2 * math.pi / len(ranges_m), [np.ascontiguousarray(one, "<f4") for one in (ranges_m, sigma_m)]
+    angles = (step / 2 - math.pi, math.pi - step / 2, step)
+    message = ros.sensor_msgs__msg__LaserScan(header_message(stamp_ns, frame), *angles, 0.0, 0.0, *limits_m, *arrays)
     return message_cdr(message)
 
 
-def moving_cdr(stamp_ns: int, frame: str, moving: Sequence[MovingObstacle]) -> bytes:
-    """Encode moving obstacles in a frame as a PointCloud2, a point each, none included.
+def decode_scan(payload: bytes, _: bytes = b"") -> Scan:
+    """Decode a LaserScan with finite angles."""
+    message = message_from_cdr(payload, ros.sensor_msgs__msg__LaserScan)
+    start_rad, step_rad = message.angle_min, message.angle_increment
+    if not (math.isfinite(start_rad) and math.isfinite(step_rad)):
+        raise OmnidError(f"a scan from {start_rad} rad by {step_rad} rad was found; expected finite angles")
+    return Scan(
+        _stamp_ns(message.header),
+        message.header.frame_id,
+        start_rad + step_rad * np.arange(len(message.ranges)),
+        message.ranges,
+        message.intensities,
+        float(message.range_max),
+    )
 
-    Raise OmnidError where the stamp does not fit a ROS time.
-    """
-    rows = [[one.x_m, one.y_m, 0.0, one.vx_mps, one.vy_mps, one.radius_m, *_sigmas(one)] for one in moving]
-    return packed_cloud_cdr(stamp_ns, frame, MOVING_FIELDS, np.array(rows, "<f4").reshape(-1, len(MOVING_FIELDS)))
+
+# Commands and requests.
+
+ASIDE_NAMES: Final = ("linear.y", "linear.z", "angular.x", "angular.y")
+MAX_PATH_POSES: Final = 10_000
+_PLAIN_TWIST_BYTES: Final = calcsize("<4x6d")  # encapsulation header, two vectors
 
 
-def _sigmas(one: MovingObstacle) -> tuple[float, float]:
-    position, velocity = (one.covariance[at, at] for at in (slice(0, 2), slice(2, 4)))
-    largest = [float(np.sqrt(max(0.0, np.linalg.eigvalsh(part)[-1]))) for part in (position, velocity)]
-    return largest[0], largest[1]
+class TwistRecord(NamedTuple):
+    """Content of a TwistStamped, or of a Twist, which has no stamp (0) and no frame."""
+
+    stamp_ns: int
+    frame: str
+    velocity_mps: float
+    yaw_rate_radps: float
+    aside: tuple[float, float, float, float]  # what no base with two driven sides has: see ASIDE_NAMES
+
+
+class PlanarGoal(NamedTuple):
+    """Content of a PoseStamped on the floor."""
+
+    stamp_ns: int
+    frame: str
+    x_m: float
+    y_m: float
+    heading_rad: float | None  # None: the quaternion is all zeros, which asks for no heading
+
+
+class PlanarPath(NamedTuple):
+    """Content of a Path on the floor."""
+
+    stamp_ns: int
+    frame: str
+    xy: Array  # (N, 2) m
+    heading_rad: float | None  # of the last pose; None: its quaternion is all zeros
+
+
+def twist_stamped_cdr(stamp_ns: int, frame: str, linear_mps: float, yaw_rate_radps: float) -> bytes:
+    """Encode a geometry_msgs/msg/TwistStamped of a ground robot: forward speed and yaw rate in `frame`."""
+    twist = ros.geometry_msgs__msg__Twist(_vector((linear_mps, 0, 0)), _vector((0, 0, yaw_rate_radps)))
+    return message_cdr(ros.geometry_msgs__msg__TwistStamped(header_message(stamp_ns, frame), twist))
+
+
+def twist_from_cdr(payload: bytes) -> TwistRecord:
+    """Decode a TwistStamped, or a Twist, whose length no TwistStamped has; its numbers need not be finite."""
+    if len(payload) == _PLAIN_TWIST_BYTES:
+        stamp_ns, frame, twist = 0, "", message_from_cdr(payload, ros.geometry_msgs__msg__Twist)
+    else:
+        message = message_from_cdr(payload, ros.geometry_msgs__msg__TwistStamped)
+        stamp_ns, frame, twist = _stamp_ns(message.header), message.header.frame_id, message.twist
+    linear, angular = twist.linear, twist.angular
+    return TwistRecord(stamp_ns, frame, linear.x, angular.z, (linear.y, linear.z, angular.x, angular.y))
+
+
+def heading_cdr(stamp_ns: int, velocity_mps: float, heading_rad: float) -> bytes:
+    """Encode a heading command, a geometry_msgs/msg/Vector3Stamped in odom: x is the speed, z the heading."""
+    vector = _vector((velocity_mps, 0, heading_rad))
+    return message_cdr(ros.geometry_msgs__msg__Vector3Stamped(header_message(stamp_ns, "odom"), vector))
+
+
+def heading_from_cdr(payload: bytes) -> tuple[int, str, float, float]:
+    """Decode a heading command: its stamp [ns], frame, speed [m/s] and heading [rad], which need not be finite."""
+    message = message_from_cdr(payload, ros.geometry_msgs__msg__Vector3Stamped)
+    return _stamp_ns(message.header), message.header.frame_id, message.vector.x, message.vector.z
+
+
+def header_cdr(stamp_ns: int) -> bytes:
+    """Encode a std_msgs/msg/Header, which is the message of cmd/arm."""
+    return message_cdr(header_message(stamp_ns, ""))
+
+
+def stamp_from_cdr(payload: bytes) -> int:
+    """Decode the stamp of a Header, ns; it may be invalid."""
+    return _stamp_ns(message_from_cdr(payload, ros.std_msgs__msg__Header))
+
+
+def bool_from_cdr(payload: bytes) -> bool:
+    """Decode a std_msgs/msg/Bool, which is the message of cmd/bumper and cmd/cliff."""
+    return bool(message_from_cdr(payload, ros.std_msgs__msg__Bool).data)
+
+
+def string_cdr(text: str) -> bytes:
+    """Encode a std_msgs/msg/String."""
+    return message_cdr(ros.std_msgs__msg__String(text))
+
+
+def string_from_cdr(payload: bytes) -> str:
+    """Decode a String."""
+    return message_from_cdr(payload, ros.std_msgs__msg__String).data
+
+
+def clock_cdr(stamp_ns: int) -> bytes:
+    """Encode the time of a run, for programs that follow it."""
+    return message_cdr(ros.rosgraph_msgs__msg__Clock(time_message(stamp_ns)))
 
 
 def goal_cdr(goal: PlanarGoal) -> bytes:
     """Encode a goal as a PoseStamped."""
     pose = _planar_pose(goal.x_m, goal.y_m, goal.heading_rad)
     return message_cdr(ros.geometry_msgs__msg__PoseStamped(header_message(goal.stamp_ns, goal.frame), pose))
+
+
+def goal_from_cdr(payload: bytes) -> PlanarGoal:
+    """Decode a PoseStamped that is finite and not tilted."""
+    message = message_from_cdr(payload, ros.geometry_msgs__msg__PoseStamped)
+    x_m, y_m = _planar_position(message.pose)
+    return PlanarGoal(_stamp_ns(message.header), message.header.frame_id, x_m, y_m, _planar_heading(message.pose))
 
 
 def path_cdr(stamp_ns: int, frame: str, xy: ArrayLike, heading_rad: float | None = None) -> bytes:
@@ -383,9 +618,13 @@ def path_cdr(stamp_ns: int, frame: str, xy: ArrayLike, heading_rad: float | None
     return message_cdr(ros.nav_msgs__msg__Path(header, poses))
 
 
-def string_cdr(text: str) -> bytes:
-    """Encode a std_msgs/msg/String."""
-    return message_cdr(ros.std_msgs__msg__String(text))
+def path_from_cdr(payload: bytes) -> PlanarPath:
+    """Decode a path of 1 to MAX_PATH_POSES poses that are finite; the last one is not tilted."""
+    message = message_from_cdr(payload, ros.nav_msgs__msg__Path)
+    if not 1 <= len(message.poses) <= MAX_PATH_POSES:
+        raise OmnidError(f"a path of {len(message.poses)} poses: expected 1 to {MAX_PATH_POSES}")
+    xy = np.array([_planar_position(entry.pose) for entry in message.poses])
+    return PlanarPath(_stamp_ns(message.header), message.header.frame_id, xy, _planar_heading(message.poses[-1].pose))
 
 
 def _planar_pose(x_m: float, y_m: float, heading_rad: float | None) -> ros.geometry_msgs__msg__Pose:
@@ -395,16 +634,26 @@ def _planar_pose(x_m: float, y_m: float, heading_rad: float | None) -> ros.geome
     return ros.geometry_msgs__msg__Pose(ros.geometry_msgs__msg__Point(x_m, y_m, 0.0), quaternion)
 
 
-def scan_cdr(stamp_ns: int, frame: str, ranges_m: Floats, sigma_m: Floats, limits_m: tuple[float, float]) -> bytes:
-    """Encode a sensor_msgs/msg/LaserScan of sectors (N,) that divide a full turn from azimuth -pi on.
+def _planar_position(pose: ros.geometry_msgs__msg__Pose) -> tuple[float, float]:
+    if not (math.isfinite(pose.position.x) and math.isfinite(pose.position.y)):
+        raise OmnidError("a position is not finite; check the sender")
+    return pose.position.x, pose.position.y
 
-    As REP 117 says: inf is free up to the longest range, NaN is unknown. sigma_m: standard deviations of the ranges,
-    sent as intensities. limits_m: least and longest range. Raise OmnidError where the stamp does not fit a ROS time.
-    """
-    step, arrays = 2 * math.pi / len(ranges_m), [np.ascontiguousarray(one, "<f4") for one in (ranges_m, sigma_m)]
-    angles = (step / 2 - math.pi, math.pi - step / 2, step)
-    message = ros.sensor_msgs__msg__LaserScan(header_message(stamp_ns, frame), *angles, 0.0, 0.0, *limits_m, *arrays)
-    return message_cdr(message)
+
+def _planar_heading(pose: ros.geometry_msgs__msg__Pose) -> float | None:
+    q = pose.orientation
+    if not any((q.x, q.y, q.z, q.w)):
+        return None
+    T = _rigid_transform(pose)
+    if T[2, 2] < 0.5:  # tilted by 60 degrees: what was meant is not a turn about z
+        raise OmnidError(f"orientation {q.x, q.y, q.z, q.w}: expected a turn about z, or all zeros; check the sender")
+    return float(se3.yaw(T))
+
+
+# Features of a panorama.
+
+FEATURE_KINDS: Final = ("inliers", "rejected", "new")
+MOST_FEATURES: Final = 2000  # features of a kind
 
 
 def features_to_bytes(pixels: Mapping[str, Array]) -> bytes:
@@ -414,3 +663,13 @@ def features_to_bytes(pixels: Mapping[str, Array]) -> bytes:
     """
     rounded = {kind: np.rint(pixels[kind][:MOST_FEATURES]).astype(int).tolist() for kind in FEATURE_KINDS}
     return json.dumps(rounded, separators=(",", ":")).encode()
+
+
+def features_from_bytes(data: bytes) -> dict[str, Array]:
+    """Decode the pixels (N, 2) of features by kind."""
+    try:
+        found = json.loads(data)
+        return {kind: np.asarray(found[kind], np.float64).reshape(-1, 2) for kind in FEATURE_KINDS}
+    except (ValueError, TypeError, KeyError, RecursionError, OverflowError):
+        reason = f"the {len(data)} bytes attached to a panorama are not features; check that omnid sent them"
+        raise OmnidError(reason) from None

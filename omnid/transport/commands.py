@@ -30,13 +30,7 @@ from omnid.core.control.contacts import BUMPER, CLIFF
 from omnid.core.control.heading_controller import Setpoint
 from omnid.errors import OmnidError
 from omnid.transport import topics
-from omnid.transport.decode import (
-    ASIDE_NAMES,
-    bool_from_cdr,
-    heading_from_cdr,
-    stamp_from_cdr,
-    twist_from_cdr,
-)
+from omnid.transport.codec import ASIDE_NAMES, bool_from_cdr, heading_from_cdr, stamp_from_cdr, twist_from_cdr
 from omnid.transport.freshness import Freshness
 from omnid.transport.requests import Answer, Refused, Request
 from omnid.transport.sensor_codec import sample_from_cdr

@@ -29,8 +29,7 @@ from omnid.core.navigation.requests import (
     route_request,
 )
 from omnid.errors import OmnidError
-from omnid.transport.codec import OK, DiagnosticStatus
-from omnid.transport.decode import goal_from_cdr, path_from_cdr, string_from_cdr
+from omnid.transport.codec import OK, DiagnosticStatus, goal_from_cdr, path_from_cdr, string_from_cdr
 from omnid.transport.freshness import Freshness
 from omnid.transport.requests import Answer, Request
 from omnid.transport.status_names import REFUSED_PREFIX, REQUESTS

@@ -1,19 +1,15 @@
 """Frames and samples of the drivers as messages of ROS 2, on topics that ROS tools and `omnid replay` recognise.
 
-Images: CDR is written here (OMG RTPS 2.2, 10.2: little-endian, numbers aligned to their size), not by rosbags: images
-are nearly all of a recording, and this copies each of them once; drivers.logs.ros_messages reads it. Wheels and gyro:
-nav_msgs/msg/Odometry and sensor_msgs/msg/Imu, both ways; wheels of a JointState.
+Images: CompressedImage and Image. Wheels: Odometry, or JointState, which is only read. Gyro: Imu.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from struct import pack
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drivers.errors import FrameDecodeError
 from drivers.frame import Frame
@@ -21,7 +17,53 @@ from drivers.logs.ros_messages import BASE_FRAME, COMPRESSED_IMAGE, IMAGE, Joint
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.errors import OmnidError
 from omnid.transport import ros_types as ros
-from omnid.transport.codec import header_message, message_cdr, odometry_cdr, ros_time
+from omnid.transport.codec import header_message, message_cdr, odometry_cdr
+
+LARGEST_RATE: Final = 100.0  # m/s and rad/s: larger ones are faults of the sender
+_UNKNOWN_VARIANCE: Final = 1e9  # Variance of the parts of a pose that wheels do not measure.
+
+
+def wheel_cdr(sample: WheelSample, stamp_ns: int) -> bytes:
+    """Encode the velocity by the wheels as an Odometry; the pose in the message is unknown."""
+    velocity = np.array([sample.velocity_mps, 0, 0, 0, 0, sample.yaw_rate_radps])
+    return odometry_cdr(stamp_ns, np.eye(4), _UNKNOWN_VARIANCE * np.eye(6), velocity, np.zeros((6, 6)))
+
+
+def gyro_cdr(sample: GyroSample, stamp_ns: int, frame: str = BASE_FRAME) -> bytes:
+    """Encode angular velocities about the axes of a frame as an Imu."""
+    unknown = np.array([-1.0, *[0.0] * 8])  # REP 145: the message has no orientation, and no acceleration
+    message = ros.sensor_msgs__msg__Imu(
+        header_message(stamp_ns, frame),
+        ros.geometry_msgs__msg__Quaternion(0.0, 0.0, 0.0, 1.0),
+        unknown,
+        ros.geometry_msgs__msg__Vector3(sample.x_radps, sample.y_radps, sample.z_radps),
+        np.zeros(9),
+        ros.geometry_msgs__msg__Vector3(0.0, 0.0, 0.0),
+        unknown,
+    )
+    return message_cdr(message)
+
+
+def sample_from_cdr(
+    payload: bytes, schema: str, stamp_ns: Callable[[int], int], joints: JointWheels | None = None
+) -> MotionSample | None:
+    """Decode a sample of an Odometry, an Imu or a JointState, with a stamp; None for a JointState that has no wheel.
+
+    stamp_ns: returns the stamp, as those of images, of a Unix time. joints: the wheels in a JointState.
+    Rates that are absurd or not finite are refused.
+    """
+    try:
+        reading = parse_motion(schema, memoryview(payload), joints=joints)
+    except FrameDecodeError as error:
+        raise OmnidError(str(error)) from error
+    if not reading.rates:
+        return None
+    if not reading.stamp_ns:
+        raise OmnidError(f"a {schema} has no stamp; fill in header.stamp")
+    if any(abs(rate) > LARGEST_RATE for rate in reading.rates if math.isfinite(rate)):
+        raise OmnidError(f"a {schema} has rates above {LARGEST_RATE:.0f} m/s or rad/s: check its units")
+    return reading._replace(stamp_ns=stamp_ns(reading.stamp_ns)).sample(0)
+
 
 COMPRESSED: Final = ("jpeg", "png")
 # Encoding in drivers.frame -> name in sensor_msgs/image_encodings.hpp, where that is different.
@@ -35,82 +77,16 @@ def image_topic(frame: Frame) -> str:
 
 
 def image_cdr(frame: Frame, stamp_ns: int) -> tuple[str, bytes]:
-    """Return schema and CDR bytes of an undecoded frame with the given stamp [ns of Unix time]; frame_id is the camera.
+    """Return schema and CDR bytes of an undecoded frame with the given stamp [ns of Unix time]; frame_id: its camera.
 
-    Raise OmnidError where the stamp does not fit a ROS time.
+    A driver's buffer may be longer than its image, which ROS does not accept: the rest is left out.
     """
-    header = _aligned(pack("<iI", *ros_time(stamp_ns)) + _string(frame.camera))
-    data = np.frombuffer(frame.data, np.uint8)
+    header, data = header_message(stamp_ns, frame.camera), np.frombuffer(frame.data, np.uint8)
     if frame.encoding in COMPRESSED:
-        return COMPRESSED_IMAGE, _message(_aligned(header + _string(frame.encoding)), data)
+        return COMPRESSED_IMAGE, message_cdr(ros.sensor_msgs__msg__CompressedImage(header, frame.encoding, data))
     step = frame.step or frame.width * _PIXEL_BYTES.get(frame.encoding, 1)
-    size, name = pack("<II", frame.height, frame.width), _ROS_NAMES.get(frame.encoding, frame.encoding)
-    layout = _aligned(size + _string(name) + bytes([frame.bigendian])) + pack("<I", step)
-    return IMAGE, _message(header + layout, data[: step * _rows(frame)])
-
-
-def _rows(frame: Frame) -> int:
-    """Return the rows of a whole image; a driver's buffer may be longer, which ROS does not accept."""
-    return frame.height * 3 // 2 if frame.encoding == "nv12" else frame.height  # the colour planes follow as rows
-
-
-def _message(head: bytes, data: NDArray[Any]) -> bytes:
-    """Join a message of its head, a multiple of 4 bytes, and the array of its data."""
-    return b"".join((b"\0\1\0\0", head, pack("<I", data.size), data.data))
-
-
-def _string(text: str) -> bytes:
-    data = text.encode() + b"\0"
-    return pack("<I", len(data)) + data
-
-
-def _aligned(block: bytes) -> bytes:
-    return block + bytes(-len(block) % 4)
-
-
-LARGEST_RATE: Final = 100.0  # m/s and rad/s: larger ones are faults of the sender
-_UNKNOWN_VARIANCE: Final = 1e9  # Variance of the parts of a pose that wheels do not measure.
-_UNKNOWN: Final = np.array([-1.0, *[0.0] * 8])  # REP 145: the message has no orientation, and no acceleration
-
-
-def wheel_cdr(sample: WheelSample, stamp_ns: int) -> bytes:
-    """Encode the velocity by the wheels; the pose in the message is unknown."""
-    velocity = np.array([sample.velocity_mps, 0, 0, 0, 0, sample.yaw_rate_radps])
-    return odometry_cdr(stamp_ns, np.eye(4), _UNKNOWN_VARIANCE * np.eye(6), velocity, np.zeros((6, 6)))
-
-
-def gyro_cdr(sample: GyroSample, stamp_ns: int, frame: str = BASE_FRAME) -> bytes:
-    """Encode angular velocities about the axes of a frame."""
-    rates = ros.geometry_msgs__msg__Vector3(sample.x_radps, sample.y_radps, sample.z_radps)
-    message = ros.sensor_msgs__msg__Imu(
-        header_message(stamp_ns, frame),
-        ros.geometry_msgs__msg__Quaternion(0.0, 0.0, 0.0, 1.0),
-        _UNKNOWN,
-        rates,
-        np.zeros(9),
-        ros.geometry_msgs__msg__Vector3(0.0, 0.0, 0.0),
-        _UNKNOWN,
-    )
-    return message_cdr(message)
-
-
-def sample_from_cdr(
-    payload: bytes, schema: str, stamp_ns: Callable[[int], int], joints: JointWheels | None = None
-) -> MotionSample | None:
-    """Decode a sample from the network; None for a JointState that has no wheel.
-
-    stamp_ns: returns the stamp, as those of images, of a Unix time. joints: the wheels in a JointState.
-
-    Raise OmnidError for a message without a stamp, with rates that are not finite or absurd, and for other bytes.
-    """
-    try:
-        reading = parse_motion(schema, memoryview(payload), joints=joints)
-    except FrameDecodeError as error:
-        raise OmnidError(str(error)) from error
-    if not reading.rates:
-        return None
-    if not reading.stamp_ns:
-        raise OmnidError(f"a {schema} has no stamp; fill in header.stamp")
-    if any(abs(rate) > LARGEST_RATE for rate in reading.rates if math.isfinite(rate)):
-        raise OmnidError(f"a {schema} has rates above {LARGEST_RATE:.0f} m/s or rad/s: check its units")
-    return reading._replace(stamp_ns=stamp_ns(reading.stamp_ns)).sample(0)
+    rows = frame.height * 3 // 2 if frame.encoding == "nv12" else frame.height  # the colour planes follow as rows
+    name = _ROS_NAMES.get(frame.encoding, frame.encoding)
+    data = data[: step * rows]
+    message = ros.sensor_msgs__msg__Image(header, frame.height, frame.width, name, int(frame.bigendian), step, data)
+    return IMAGE, message_cdr(message)

@@ -9,13 +9,13 @@ from __future__ import annotations
 import math
 import secrets
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final, NamedTuple
 
 from omnid.core.control.safety_rules import ASKED
 from omnid.tracking_state import TrackingState
-from omnid.transport.codec import DiagnosticStatus
+from omnid.transport.codec import DiagnosticStatus, decode_diagnostics
 
 PREFIX: Final = "omnid: "
 ODOMETRY: Final = f"{PREFIX}odometry"
@@ -215,3 +215,41 @@ def tracking_state(message: str, values: Mapping[str, str]) -> TrackingState | N
     """Return the tracking state in an entry of the odometry: its key `state`, else its message; None without one."""
     text = values.get(Key.STATE, message)
     return TrackingState(text) if text in list(TrackingState) else None
+
+
+@dataclass(frozen=True, slots=True)
+class NavigationReport:
+    """State of goals, paths and routes; see omnid.navigation_state for the states."""
+
+    stamp_ns: int
+    state: str
+    reason: str  # of a halt or an end
+    task: str  # "goal", "path" or "route NAME"
+    command_ns: int  # stamp of the goal or path that it follows from; 0 without
+    left_m: float  # way to the end; NaN unknown
+    request: str  # the newest one
+    refusal: str  # empty where it was accepted
+    teaching: str = ""  # name of the route that is recorded
+    taught_m: float = 0.0
+
+
+def decode_navigation(payload: bytes, _: bytes = b"") -> NavigationReport:
+    """Decode the state of the navigation. Raise OmnidError for any other bytes."""
+    report = decode_diagnostics(payload)
+    keys = (Key.STATE, Key.REASON, Key.TASK, Key.COMMAND_NS, Key.LEFT_M, Key.REQUEST, Key.REFUSAL, Key.TEACHING)
+    state, reason, task, command, left, request, refusal, teaching = (report.value(NAVIGATION, key) for key in keys)
+    # A stamp has at most 19 digits, which a float does not hold.
+    command_ns = int(command) if command.isascii() and command.isdigit() and len(command) < 20 else 0
+    left_m, taught_m = number(left), number(report.value(NAVIGATION, Key.TAUGHT_M))
+    return NavigationReport(
+        report.stamp_ns,
+        state,
+        reason,
+        task,
+        command_ns,
+        math.nan if left_m is None else left_m,
+        request,
+        refusal,
+        teaching,
+        taught_m or 0.0,
+    )

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Final, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, Final, NamedTuple
 
 from omnid.transport import codec
-from omnid.transport.codec import SCAN_SCHEMA
+from omnid.transport.status_names import decode_navigation
 
 MAP_POSE: Final = "map_pose"
 SCAN: Final = "scan"
@@ -20,25 +20,26 @@ class Topic(NamedTuple):
     """A published topic and how it is delivered."""
 
     schema: str  # ROS 2 message type
+    decode: Callable[..., Any] = bytes  # takes payload and attachment; of those that programs of omnid read
     realtime: bool = False  # sent before messages of all other topics
     latched: bool = False  # late subscribers can query the newest message
     transient_local: bool = False  # ... and those of ROS 2 receive it
 
 
 PUBLISHED: Final = {
-    "odom": Topic(codec.ODOMETRY_SCHEMA, realtime=True, latched=True),
+    "odom": Topic(codec.ODOMETRY_SCHEMA, codec.decode_pose, realtime=True, latched=True),
     "pose": Topic(codec.POSE_SCHEMA, realtime=True, latched=True),
-    MAP_POSE: Topic(codec.MAP_POSE_SCHEMA, latched=True),
+    MAP_POSE: Topic(codec.MAP_POSE_SCHEMA, codec.decode_map_pose, latched=True),
     "/tf": Topic(codec.TRANSFORM_SCHEMA, realtime=True),
     "/tf_static": Topic(codec.TRANSFORM_SCHEMA, latched=True, transient_local=True),
-    "status": Topic(codec.DIAGNOSTICS_SCHEMA, latched=True),
-    "cloud": Topic(codec.POINT_CLOUD_SCHEMA, latched=True),
-    "map": Topic(codec.GRID_SCHEMA, latched=True, transient_local=True),
-    SCAN: Topic(SCAN_SCHEMA),
+    "status": Topic(codec.DIAGNOSTICS_SCHEMA, codec.decode_diagnostics, latched=True),
+    "cloud": Topic(codec.POINT_CLOUD_SCHEMA, codec.decode_cloud, latched=True),
+    "map": Topic(codec.GRID_SCHEMA, codec.decode_map, latched=True, transient_local=True),
+    SCAN: Topic(codec.SCAN_SCHEMA, codec.decode_scan),
     "moving": Topic(codec.POINT_CLOUD_SCHEMA),
     "drive": Topic(codec.TWIST_SCHEMA),
     PANORAMA: Topic(IMAGE_SCHEMA),
-    "navigation": Topic(codec.DIAGNOSTICS_SCHEMA, latched=True),
+    "navigation": Topic(codec.DIAGNOSTICS_SCHEMA, decode_navigation, latched=True),
     "plan": Topic(codec.PATH_SCHEMA, latched=True),
     "wheel_odom": Topic(codec.ODOMETRY_SCHEMA),
     "imu": Topic(codec.IMU_SCHEMA),

@@ -28,15 +28,7 @@ from omnid.recordings.recording import DECODERS, Content
 from omnid.sinks.encoder import Changes, Encoder, Outgoing, pose_attachment
 from omnid.stages.front_end import FrontEnd
 from omnid.transport import status_names
-from omnid.transport.decode import (
-    Cloud,
-    Diagnostics,
-    Pose,
-    PoseInMap,
-    Scan,
-    decode_pose,
-    features_from_bytes,
-)
+from omnid.transport.codec import Cloud, Diagnostics, Pose, PoseInMap, Scan, decode_pose, features_from_bytes
 from omnid.transport.status_names import ODOMETRY, STAGE_PREFIX, parsed_time_key, short_name
 from omnid.transport.topics import PANORAMA
 

@@ -28,7 +28,8 @@ from omnid.core.mapping.thinned_path import ThinnedPath
 from omnid.errors import OmnidError
 from omnid.monitor.robot_state import Inbox, RobotState
 from omnid.transport.bus_config import BusConfig
-from omnid.transport.decode import Pose, decode_map, decode_map_pose, decode_navigation, decode_scan
+from omnid.transport.codec import Pose, decode_map, decode_map_pose, decode_scan
+from omnid.transport.status_names import decode_navigation
 from omnid.transport.topics import MAP_POSE, PANORAMA, SCAN
 from omnid.web.snapshot import (
     MOST_CELLS,

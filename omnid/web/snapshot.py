@@ -14,9 +14,8 @@ from calib import se3
 from omnid.engine.telemetry import Histogram
 from omnid.monitor.robot_state import RobotState, importance
 from omnid.plain_text import plain
-from omnid.transport.codec import OK
-from omnid.transport.decode import Map, NavigationReport, Pose, PoseInMap, Scan
-from omnid.transport.status_names import PLACES, WHEELS, Key, short_name
+from omnid.transport.codec import OK, Map, Pose, PoseInMap, Scan
+from omnid.transport.status_names import PLACES, WHEELS, Key, NavigationReport, short_name
 
 PATH_FRAME: Final = "odom"
 FRAMES: Final = (PATH_FRAME, "map")  # Frames of a map that is drawn.

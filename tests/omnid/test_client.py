@@ -19,10 +19,16 @@ import omnid.client
 from calib import se3
 from omnid.client import Answer, Cloud, Diagnostics, Driver, Map, Pose, Robot, subscribe
 from omnid.errors import OmnidError
-from omnid.transport import codec, decode
+from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.codec import DiagnosticStatus, PoseAttachment
-from omnid.transport.decode import decode_cloud, decode_diagnostics, decode_map, decode_pose
+from omnid.transport.codec import (
+    DiagnosticStatus,
+    PoseAttachment,
+    decode_cloud,
+    decode_diagnostics,
+    decode_map,
+    decode_pose,
+)
 from omnid.transport.freshness import Freshness
 from omnid.transport.requests import Request
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, script
@@ -118,7 +124,7 @@ def test_the_waypoint_example_drives_a_robot_to_the_last_waypoint() -> None:
         if request.topic == "cmd/arm":
             bus.answer(request.id, Answer(True, "armed"))
         elif request.topic == "cmd/heading":
-            _, _, velocity_mps, heading_rad = decode.heading_from_cdr(request.payload)
+            _, _, velocity_mps, heading_rad = codec.heading_from_cdr(request.payload)
             state["x"] += 0.1 * velocity_mps * math.cos(heading_rad)
             state["y"] += 0.1 * velocity_mps * math.sin(heading_rad)
         elif request.topic == "cmd/twist":
@@ -170,13 +176,13 @@ def test_sends_commands() -> None:
     received[:2] = sorted(received[:2], reverse=True)  # the order of different topics is not kept
     (twist, a, *_), (heading, b, *_), (stop, *_), (arm, c, _, sent_ns, *_), (planned, d, *_), _ = received
     assert (twist, heading, stop, arm) == ("cmd/twist", "cmd/heading", "cmd/stop", "cmd/arm")
-    assert planned == "cmd/planner/twist" and decode.twist_from_cdr(d)[1:4] == ("base_link", 0.5, -0.25)
-    assert decode.stamp_from_cdr(c) == sent_ns and before_ns <= sent_ns <= time.time_ns()
+    assert planned == "cmd/planner/twist" and codec.twist_from_cdr(d)[1:4] == ("base_link", 0.5, -0.25)
+    assert codec.stamp_from_cdr(c) == sent_ns and before_ns <= sent_ns <= time.time_ns()
     senders = [request.sender for request in received]
     assert len({senders[0], senders[1], senders[2], senders[4]}) == 1 and senders[5] != senders[0]
     assert all(len(sender) >= 16 for sender in senders)
-    assert decode.twist_from_cdr(a)[1:4] == ("base_link", 0.5, -0.25)
-    assert decode.heading_from_cdr(b)[1:] == ("odom", 0.75, 1.5)
+    assert codec.twist_from_cdr(a)[1:4] == ("base_link", 0.5, -0.25)
+    assert codec.heading_from_cdr(b)[1:] == ("odom", 0.75, 1.5)
     # Each says when it was sent by the robot's own time, whatever the clock of this computer.
     for request in received:
         freshness.require(Request(request.topic, echo_ns=request.echo_ns), time.monotonic_ns())

@@ -20,8 +20,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from drivers.motors.simulated.simulated_controllers import SimulatedLine
 from drivers.motors.simulated.simulated_motor import SimulatedMotor
-from omnid.transport import codec, decode
-from omnid.transport.decode import Pose
+from omnid.transport import codec
+from omnid.transport.codec import Pose
 from tests.ports import free_port
 from tests.waiting import ended, wait_until
 
@@ -154,7 +154,7 @@ class Operator:
                 self.send("cmd/heading", codec.heading_cdr(time.time_ns(), *wish))
 
     def _pose(self, sample: zenoh.Sample) -> None:
-        self.poses.append(decode.decode_pose(sample.payload.to_bytes()))
+        self.poses.append(codec.decode_pose(sample.payload.to_bytes()))
 
     def _state(self, sample: zenoh.Sample) -> None:
         message: Any = STORE.deserialize_cdr(sample.payload.to_bytes(), codec.DIAGNOSTICS_SCHEMA)

@@ -20,7 +20,7 @@ from omnid.formats.tum import read_tum
 from omnid.recordings.evaluation import evaluate
 from omnid.runs.replay import ReplayOptions, run_log
 from omnid.settings import parse
-from omnid.transport.decode import decode_diagnostics, decode_map, decode_pose
+from omnid.transport.codec import decode_diagnostics, decode_map, decode_pose
 from omnid.transport.status_names import SUMMARY, stage_name
 from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, STORE, UPPER, Entry, compressed, write_log

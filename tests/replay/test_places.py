@@ -19,7 +19,7 @@ from omnid.formats.tum import read_tum
 from omnid.recordings.evaluation import evaluate
 from omnid.runs.replay import ReplayOptions, run_log
 from omnid.tracking_state import MapState
-from omnid.transport.decode import decode_diagnostics
+from omnid.transport.codec import decode_diagnostics
 from omnid.transport.status_names import PLACES
 from tests.drivers.logs.mcap_logs import STORE
 from tests.replay.command import Command

@@ -19,7 +19,7 @@ from mcap.reader import make_reader
 from drivers.motor import is_stop
 from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from omnid.formats.tum import read_tum
-from omnid.transport.decode import Pose, decode_pose
+from omnid.transport.codec import Pose, decode_pose
 from tests.busy import stopped_by_turns
 from tests.conftest import PAIRS
 from tests.ply import read_ply

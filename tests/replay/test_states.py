@@ -14,7 +14,7 @@ from calib import se3
 from omnid.api import replay
 from omnid.formats.tum import Trajectory, read_tum
 from omnid.tracking_state import TrackingState
-from omnid.transport.decode import Pose, decode_pose
+from omnid.transport.codec import Pose, decode_pose
 from omnid.transport.status_names import ODOMETRY
 from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import STORE

@@ -27,7 +27,7 @@ from omnid.runs.replay import ReplayOptions, run_log
 from omnid.runs.run_result import RunResult
 from omnid.runs.sensor_sources import motion_topics
 from omnid.tracking_state import TrackingState
-from omnid.transport.decode import decode_diagnostics
+from omnid.transport.codec import decode_diagnostics
 from omnid.transport.sensor_codec import gyro_cdr, wheel_cdr
 from omnid.transport.status_names import MOTION, REFUSED_PREFIX
 from tests.conftest import PAIRS

@@ -32,8 +32,7 @@ from omnid.formats.place_file import read_places, write_places
 from omnid.formats.tum import read_tum
 from omnid.settings import dump
 from omnid.transport import codec
-from omnid.transport.codec import DiagnosticStatus, PoseAttachment
-from omnid.transport.decode import decode_diagnostics, decode_pose
+from omnid.transport.codec import DiagnosticStatus, PoseAttachment, decode_diagnostics, decode_pose
 from tests.bench.faults.mutation import mutated
 from tests.bench.results import Column, ResultTable
 from tests.calib.test_kalibr import BOTH, NAMED, T_UPPER_LOWER, chain

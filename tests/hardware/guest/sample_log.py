@@ -11,7 +11,7 @@ from typing import NamedTuple
 from drivers.cameras.log_camera import LogImages
 from drivers.frame import Camera
 from omnid.client import Diagnostics, Pose, Robot
-from omnid.transport.decode import decode_diagnostics, decode_pose
+from omnid.transport.codec import decode_diagnostics, decode_pose
 from tests.hardware.guest.loopback import DEVICES, Loopback
 from tests.hardware.guest.unit import until
 

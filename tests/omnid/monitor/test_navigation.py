@@ -17,8 +17,7 @@ from omnid.monitor import navigation
 from omnid.monitor.navigation import stop
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.codec import DiagnosticStatus
-from omnid.transport.decode import string_from_cdr
+from omnid.transport.codec import DiagnosticStatus, string_from_cdr
 from omnid.transport.requests import Answer, Request
 from omnid.transport.status_names import DISARMED_BY_STOP, NAVIGATION, WHEELS, Key
 from omnid.transport.topics import NAVIGATION as NAVIGATION_TOPIC

@@ -21,7 +21,7 @@ from omnid.messages import OdometryUpdate
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
 from omnid.sinks.encoder import Encoder
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.decode import decode_pose, features_from_bytes
+from omnid.transport.codec import decode_pose, features_from_bytes
 from tests.omnid.transport.bus_fixtures import free_endpoint
 from tests.waiting import wait_until
 

@@ -24,7 +24,7 @@ from zenoh import ext
 
 from omnid.client import Pose, Robot, Unreachable, subscribe
 from omnid.errors import OmnidError
-from omnid.transport import codec, decode, ros2
+from omnid.transport import codec, ros2
 from omnid.transport import session as transport_session
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import ERROR, OK, WARN, PoseAttachment
@@ -157,9 +157,9 @@ def test_another_process_reads_the_same_odometry() -> None:
     with contextlib.closing(bus), subscriber(endpoint, "site/robot-1/**", 5) as process:
         lines = publish_until_done(bus, "odom", process)
     assert lines[0::2] == ["site/robot-1/odom application/cdr Priority.REAL_TIME CongestionControl.DROP False"] * 5
-    records = [decode.decode_pose(bytes.fromhex(line)) for line in lines[1::2]]
+    records = [codec.decode_pose(bytes.fromhex(line)) for line in lines[1::2]]
     for record in records:
-        expected = decode.decode_pose(odometry(record.stamp_ns - 10**9))
+        expected = codec.decode_pose(odometry(record.stamp_ns - 10**9))
         np.testing.assert_array_equal(record.T_odom_base, expected.T_odom_base)
         np.testing.assert_array_equal(record.covariance, expected.covariance)
 

@@ -30,19 +30,20 @@ from omnid.transport import codec
 from omnid.transport.codec import (
     IMU_SCHEMA,
     PlanarGoal,
-    bool_cdr,
     goal_cdr,
+    goal_from_cdr,
     header_message,
     message_cdr,
     path_cdr,
+    path_from_cdr,
     string_cdr,
+    string_from_cdr,
 )
 from omnid.transport.commands import (
     LONGEST_PAYLOAD,
     CommandReceiver,
     SensorReceiver,
 )
-from omnid.transport.decode import goal_from_cdr, path_from_cdr, string_from_cdr
 from omnid.transport.freshness import Freshness
 from omnid.transport.navigation_commands import LONGEST_PAYLOAD as LONGEST_PATH
 from omnid.transport.navigation_commands import NavigationReceiver
@@ -127,6 +128,10 @@ def heading(velocity_mps: float = 0.4, heading_rad: float = 1.5) -> bytes:
 
 def arm(later_s: float = 0.0) -> bytes:
     return codec.header_cdr(now_ns(later_s))
+
+
+def bool_cdr(value: bool) -> bytes:
+    return message_cdr(ros.std_msgs__msg__Bool(value))
 
 
 def stamped(stamp: bytes) -> bytes:

@@ -18,8 +18,7 @@ from omnid.monitor.robot_state import ReceivedMessage, RobotState
 from omnid.tracking_state import TrackingState
 from omnid.transport import codec
 from omnid.transport.bus import BusConfig
-from omnid.transport.codec import DiagnosticStatus, PoseAttachment, scan_cdr
-from omnid.transport.decode import Diagnostics, Map, Pose, Scan
+from omnid.transport.codec import Diagnostics, DiagnosticStatus, Map, Pose, PoseAttachment, Scan, scan_cdr
 from omnid.transport.sensor_codec import image_cdr
 from omnid.transport.status_names import NAVIGATION, ODOMETRY, PLACES, WHEELS, Key
 from omnid.web.feed import MOST_POINTS, LivePath, RobotFeed

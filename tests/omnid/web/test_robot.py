@@ -21,7 +21,7 @@ from omnid.core.control.velocity_limits import VelocityLimits
 from omnid.monitor.navigation import stop
 from omnid.monitor.robot_state import ReceivedMessage
 from omnid.monitor.teleop import FIRST_SHARE, limits_of
-from omnid.transport import decode
+from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import PoseAttachment
 from omnid.transport.requests import Answer, Request
@@ -51,7 +51,7 @@ class Rover:
     def _take(self, request: Request) -> None:
         self.topics.append(request.topic)
         if request.topic == "cmd/twist":
-            command = decode.twist_from_cdr(request.payload)
+            command = codec.twist_from_cdr(request.payload)
             self.twists.append((command.velocity_mps, command.yaw_rate_radps))
         elif request.topic != "cmd/stop":
             self.answering.wait(30.0)

@@ -13,10 +13,9 @@ import pytest
 
 from omnid.core.control.velocity_limits import VelocityLimits
 from omnid.monitor.teleop import FIRST_SHARE
-from omnid.transport import codec, decode
+from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.codec import DiagnosticStatus, PlanarGoal
-from omnid.transport.decode import goal_from_cdr, string_from_cdr
+from omnid.transport.codec import DiagnosticStatus, PlanarGoal, goal_from_cdr, string_from_cdr
 from omnid.transport.requests import Answer, Request
 from omnid.transport.status_names import NAVIGATION, WHEELS, Key
 from omnid.transport.topics import command_topics
@@ -36,7 +35,7 @@ class Navigator:
 
     def _take(self, request: Request) -> None:
         if request.topic == "cmd/twist":
-            command = decode.twist_from_cdr(request.payload)
+            command = codec.twist_from_cdr(request.payload)
             self.twists.append((command.velocity_mps, command.yaw_rate_radps))
             return
         if request.topic == "cmd/goal":
