@@ -20,10 +20,12 @@ from omnid.simulation.rendering.shapes import CEILING_M, Paint, Point, Random, p
 from omnid.simulation.rendering.surfaces import Rectangle, Texture
 
 Point3 = tuple[float, float, float]
-Part = tuple[Point3, Point3]  # the middle of the bottom of a box, from the middle of a thing, and its sides [m]
+# A box of a thing: the middle of its bottom, x, y, z, from the middle of the thing, then its sides along them [m].
+Part = tuple[float, float, float, float, float, float]
 WALL_PX_PER_M: Final = 100.0
 THING_PX_PER_M: Final = 250.0
 MOST_FLOOR_PX: Final = 6e6  # of one floor
+BEHIND_M: Final = 2.0  # of the start, where a corridor begins
 GAP_M: Final = 0.003  # of what hangs on a wall from it
 UP: Final = np.array([0.0, 0.0, 1.0])
 
@@ -35,6 +37,12 @@ class Opening:
     at_m: float
     width_m: float
     height_m: float = 2.1
+
+
+def four_legs(aside_m: Point, side_m: float, height_m: float) -> list[Part]:
+    """Return four legs; aside_m: of their middles from the middle of the thing, along x and y."""
+    x, y = aside_m
+    return [(i * x, j * y, 0.0, side_m, side_m, height_m) for i in (1, -1) for j in (1, -1)]
 
 
 def plain_paint(rng: Random, grey: float, grain: float = 0.8, px_per_m: float = THING_PX_PER_M) -> Paint:
@@ -209,6 +217,12 @@ class Builder:
         self.wall((x1, y0), (x0, y0), doors=doors, pictures=pictures)
         self.wall((x0, y0), (x0, y1), doors=1)
 
+    def space(self, low: Point, high: Point, **room: int) -> None:
+        """Add floor, ceiling and four walls of a room; room: the doors, windows and pictures of `room`."""
+        self.floor(low, high)
+        self.ceiling(low, high)
+        self.room(low, high, **room)
+
     def upright(self, a: ArrayLike, b: ArrayLike, heights_m: Point, grey: float) -> None:
         """Add a bare upright rectangle between two points, left and right as seen from its front."""
         (low_m, high_m), start = heights_m, np.array([*np.asarray(a), 0.0])
@@ -279,68 +293,108 @@ class Builder:
     # Things
 
     def thing(self, parts: Iterable[Part], at: Point, yaw_rad: float, paint: Paint, name: str = "box") -> None:
-        """Add boxes of one thing: each by the middle of its bottom from the thing's place, and its sides [m]."""
+        """Add the boxes of one thing."""
         c, s = math.cos(yaw_rad), math.sin(yaw_rad)
-        for (x, y, z), size_m in parts:
-            place = (at[0] + c * x - s * y, at[1] + s * x + c * y, z)
+        for x, y, z, length_m, width_m, height_m in parts:
+            place, size_m = (at[0] + c * x - s * y, at[1] + s * x + c * y, z), (length_m, width_m, height_m)
             self.faces += solid(place, size_m, yaw_rad, paint, name=name, is_raised=z > 0)
 
     def star_chair(self, at: Point, yaw_rad: float) -> None:
         """Add an office chair: five legs, a column, a seat and a back."""
-        legs, cloth = (
-            plain_paint(self.rng, self.rng.uniform(25, 190)),
-            plain_paint(self.rng, self.rng.uniform(35, 110), 5),
-        )
+        legs = plain_paint(self.rng, self.rng.uniform(25, 190))
+        cloth = plain_paint(self.rng, self.rng.uniform(35, 110), 5)
         for number in range(5):
             angle = yaw_rad + number * math.tau / 5
             c, s = math.cos(angle), math.sin(angle)
-            self.faces += solid((at[0] + 0.16 * c, at[1] + 0.16 * s, 0.06), (0.3, 0.045, 0.035), angle, legs)
-            self.faces += solid(
-                (at[0] + 0.3 * c, at[1] + 0.3 * s, 0.0), (0.05, 0.05, 0.06), angle, legs, is_raised=False
-            )
-        self.thing([((0.0, 0.0, 0.08), (0.06, 0.06, 0.36))], at, yaw_rad, legs)
-        self.thing(
-            [((0.0, 0.0, 0.44), (0.46, 0.48, 0.08)), ((-0.22, 0.0, 0.58), (0.06, 0.42, 0.5))], at, yaw_rad, cloth
-        )
+            leg, castor = ((at[0] + away_m * c, at[1] + away_m * s) for away_m in (0.16, 0.3))
+            self.faces += solid((*leg, 0.06), (0.3, 0.045, 0.035), angle, legs)
+            self.faces += solid((*castor, 0.0), (0.05, 0.05, 0.06), angle, legs, is_raised=False)
+        self.thing([(0.0, 0.0, 0.08, 0.06, 0.06, 0.36)], at, yaw_rad, legs)
+        self.thing([(0.0, 0.0, 0.44, 0.46, 0.48, 0.08), (-0.22, 0.0, 0.58, 0.06, 0.42, 0.5)], at, yaw_rad, cloth)
 
     def table(self, at: Point, size_m: Point3, yaw_rad: float = 0.0) -> None:
         """Add a plate on four legs; size: length, width, height."""
         (length, width, height), thick = size_m, 0.03
-        legs = [
-            ((x * (length / 2 - 0.05), y * (width / 2 - 0.05), 0.0), (0.05, 0.05, height - thick))
-            for x in (1, -1)
-            for y in (1, -1)
-        ]
+        legs = four_legs((length / 2 - 0.05, width / 2 - 0.05), 0.05, height - thick)
         self.thing(legs, at, yaw_rad, plain_paint(self.rng, self.rng.uniform(40, 180)))
-        plate = [((0.0, 0.0, height - thick), (length, width, thick))]
+        plate = [(0.0, 0.0, height - thick, length, width, thick)]
         self.thing(plate, at, yaw_rad, plain_paint(self.rng, self.rng.uniform(120, 225), 1.5))
 
     def shelf(self, at: Point, yaw_rad: float, width_m: float = 0.9) -> None:
         """Add boards between two sides, with books and boxes on them."""
-        boards = [((0.0, 0.0, z), (0.35, width_m, 0.02)) for z in (0.08, 0.45, 0.82, 1.19, 1.56)]
-        sides = [((0.0, y, 0.0), (0.35, 0.02, 1.8)) for y in (width_m / 2, -width_m / 2)]
+        boards = [(0.0, 0.0, z, 0.35, width_m, 0.02) for z in (0.08, 0.45, 0.82, 1.19, 1.56)]
+        sides = [(0.0, y, 0.0, 0.35, 0.02, 1.8) for y in (width_m / 2, -width_m / 2)]
         self.thing([*boards, *sides], at, yaw_rad, plain_paint(self.rng, self.rng.uniform(120, 210), 1.5))
         for z in (0.1, 0.47, 0.84, 1.21):
-            rows = [((-0.03, 0.0, z), (0.25, width_m - 0.08, self.rng.uniform(0.2, 0.3)))]
-            self.thing(rows, at, yaw_rad, poster_paint(self.rng))
+            row = (-0.03, 0.0, z, 0.25, width_m - 0.08, self.rng.uniform(0.2, 0.3))
+            self.thing([row], at, yaw_rad, poster_paint(self.rng))
 
     def adult(self, height_m: float = 1.75) -> tuple[Rectangle, ...]:
         """Return a person on the origin who looks along x."""
-        k, rng = height_m / 1.75, self.rng
+        k, rng, faces = height_m / 1.75, self.rng, list[Rectangle]()
         trousers, shirt, skin = (
             plain_paint(rng, rng.uniform(*span), 4.0) for span in ((30, 110), (50, 210), (120, 180))
         )
         shoes = plain_paint(rng, rng.uniform(25, 80), 3.0)
-        faces: list[Rectangle] = []
+        parts: list[tuple[Part, Paint]] = []
         for side in (1, -1):
-            faces += solid((0.06 * k, side * 0.1 * k, 0.0), (0.27 * k, 0.1 * k, 0.09 * k), 0.0, shoes, name="person")
-            faces += solid(
-                (0.0, side * 0.1 * k, 0.09 * k), (0.15 * k, 0.14 * k, 0.74 * k), 0.0, trousers, name="person"
-            )
-            faces += solid((0.0, side * 0.26 * k, 0.8 * k), (0.1 * k, 0.1 * k, 0.62 * k), 0.0, shirt, name="person")
-        faces += solid((0.0, 0.0, 0.83 * k), (0.22 * k, 0.42 * k, 0.6 * k), 0.0, shirt, name="person")
-        faces += solid((0.0, 0.0, 1.45 * k), (0.2 * k, 0.16 * k, 0.3 * k), 0.0, skin, name="person")
+            parts += [((0.06, side * 0.1, 0.0, 0.27, 0.1, 0.09), shoes)]
+            parts += [((0.0, side * 0.1, 0.09, 0.15, 0.14, 0.74), trousers)]
+            parts += [((0.0, side * 0.26, 0.8, 0.1, 0.1, 0.62), shirt)]
+        parts += [((0.0, 0.0, 0.83, 0.22, 0.42, 0.6), shirt), ((0.0, 0.0, 1.45, 0.2, 0.16, 0.3), skin)]
+        for (x, y, z, long_m, wide_m, high_m), paint in parts:
+            faces += solid((k * x, k * y, k * z), (k * long_m, k * wide_m, k * high_m), 0.0, paint, name="person")
         return tuple(faces)
+
+
+def corridor(b: Builder, *, width_m: float = 1.8, length_m: float = 14.0) -> tuple[Point, Point]:
+    """Add a corridor along x about the way of a robot that starts at the origin; return its corners."""
+    aside_m = b.rng.uniform(-0.1, 0.1)
+    low, high = (-BEHIND_M, aside_m - width_m / 2), (length_m - BEHIND_M, aside_m + width_m / 2)
+    b.floor(low, high)
+    b.ceiling(low, high)
+    b.room(low, high, doors=int(b.rng.integers(2, 5)), pictures=int(b.rng.integers(1, 4)))
+    return low, high
+
+
+def hall(b: Builder) -> tuple[Point, Point]:
+    """Add a hall with windows on one side, and furniture along its walls; return its corners."""
+    low, high = (-2.5, -3.5), (11.5, 3.5)
+    b.ceiling_m = 3.2
+    b.floor(low, high)
+    b.ceiling(low, high, 3.0)
+    b.room(low, high, doors=2, windows=4, pictures=3)
+    for x_m in np.arange(0.5, 10.0, 3.0):
+        b.shelf((x_m + b.rng.uniform(-0.5, 0.5), low[1] + 0.22), math.pi / 2)
+    for x_m in (2.0, 7.0):
+        place = x_m + b.rng.uniform(-1.0, 1.0), high[1] - 1.0
+        b.table(place, (1.4, 0.7, 0.74))
+        b.star_chair((place[0], place[1] - 0.7), b.rng.uniform(0, math.tau))
+    return low, high
+
+
+def trolley(b: Builder) -> list[Part]:
+    """Return a trolley whose handle is behind, with a load or without."""
+    bed_m = b.rng.uniform(0.14, 0.24)
+    legs = four_legs((0.35, 0.25), 0.08, bed_m)
+    handle: list[Part] = [(-0.45, y, bed_m, 0.03, 0.03, 0.7) for y in (0.25, -0.25)]
+    bed: list[Part] = [(0.0, 0.0, bed_m, 0.9, 0.6, 0.05), (-0.45, 0.0, bed_m + 0.7, 0.03, 0.53, 0.03)]
+    load: list[Part] = [(0.08, 0.0, bed_m + 0.05, 0.6, 0.5, b.rng.uniform(0.2, 0.5))]
+    return legs + handle + bed + load * int(b.rng.integers(2))
+
+
+def put_thing(b: Builder, kind: str, at: Point) -> None:
+    """Add a thing of a room."""
+    rng, yaw_rad = b.rng, b.rng.uniform(0, math.tau)
+    if kind == "chair":
+        b.star_chair(at, yaw_rad)
+    elif kind == "table":
+        b.table(at, (0.8, 0.6, 0.72), yaw_rad)
+    else:
+        spans = {"box": (0.3, 0.6), "carton": (0.3, 0.5), "bin": (0.25, 0.3)}[kind]
+        size_m = rng.uniform(*spans), rng.uniform(*spans), rng.uniform(0.3, 0.9)
+        grey, grain = rng.uniform(40, 220), 6.0 if kind == "carton" else 1.0
+        b.thing([(0.0, 0.0, 0.0, *size_m)], at, yaw_rad, plain_paint(rng, grey, grain))
 
 
 def _px(sides_m: Point) -> tuple[int, int]:

@@ -26,8 +26,7 @@ from msgspec import Meta, Struct
 from calib.models.camera import Array
 from calib.typed_toml import bytes_of, convert, table_of
 from omnid.errors import OmnidError
-from omnid.simulation.named_worlds import is_named
-from omnid.simulation.named_worlds import world as named_world
+from omnid.simulation.building_worlds import building_world
 from omnid.simulation.people import Person
 from omnid.simulation.rendering import textures
 from omnid.simulation.rendering.shapes import CEILING_M, Point, Random, box, painted, posters
@@ -181,10 +180,10 @@ def shipped_worlds() -> list[str]:
 def load_world(name: str, seed: int = 0, options: WorldOptions | None = None) -> World:
     """Return a shipped world or that of a file (a name that ends in .toml); raise OmnidError for wrong ones.
 
-    Other names are those of worlds like buildings (named_worlds.py).
+    Other names are those of worlds like buildings (building_worlds.py).
     """
-    if is_named(name):
-        options, made = options or WorldOptions(), named_world(name, seed)
+    options = options or WorldOptions()
+    if (made := building_world(name, seed)) is not None:
         people = made.people if options.people else ()
         return replace(made, people=people, brightness=made.brightness * options.brightness)
     try:
@@ -197,7 +196,7 @@ def load_world(name: str, seed: int = 0, options: WorldOptions | None = None) ->
                 f"world {name!r} is not known; name a file *.toml, a world like a building "
                 f"(docs/drive.md), or one of {', '.join(shipped_worlds())}"
             )
-        return parse_world(data.decode(errors="surrogateescape"), name, seed, options or WorldOptions())
+        return parse_world(data.decode(errors="surrogateescape"), name, seed, options)
     except ValueError as error:
         raise OmnidError(f"{name}: {error}") from None
 

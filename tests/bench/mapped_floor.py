@@ -29,7 +29,6 @@ from omnid.core.mapping.scan_grid import FREE, OCCUPIED, Grid
 from omnid.core.places.place_views import grid
 from omnid.formats.place_file import read_places
 from omnid.simulation.lockstep import simulate
-from omnid.simulation.named_worlds import trial
 from omnid.simulation.rendering.surfaces import Rectangle
 from omnid.simulation.world import World
 from omnid.simulation.world_file import load_world
@@ -37,6 +36,7 @@ from tests.bench.fine_robot import fine_robot
 from tests.bench.obstacles import RANDOMLY_S, Wanderer
 from tests.bench.pole_rows import ThereAndBack, room_text
 from tests.bench.results import Column, ResultTable
+from tests.simulation.hazard_worlds import trial
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

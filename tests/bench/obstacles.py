@@ -31,16 +31,16 @@ from numpy.typing import NDArray
 from omnid.config import load_config
 from omnid.core.control.heading_controller import Setpoint, wrap_angle
 from omnid.core.navigation.requests import GoalRequest, NavigationFrame
+from omnid.simulation.building_worlds import FLOORS
 from omnid.simulation.clearance import clearance_m, footprints
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun, simulate
-from omnid.simulation.named_worlds import FLOORS, HARMLESS, HAZARDS, trial
 from omnid.simulation.people import Walkers
 from omnid.simulation.rendering.surfaces import Scene
 from omnid.simulation.robot import SimulatedRobot
-from omnid.simulation.trials import SLOWEST_MPS, Trial
 from tests.bench.fine_robot import BUILDS, USUAL, fine_robot
 from tests.bench.real_lenses import with_real_lenses
 from tests.bench.results import ROOT, Column, ResultTable, commit
+from tests.simulation.hazard_worlds import HARMLESS, HAZARDS, Trial, trial
 from tests.simulation.photographs import with_photographs
 
 Array = NDArray[np.float64]
@@ -55,6 +55,7 @@ TURN_RADIUS_M, TURN_M = 4.0, 2.4  # of the arc towards a hazard, which ends ther
 RANDOMLY_S: Final = 40.0  # of a drive at random
 TEXTURED: Final = "marbled"  # the floor whose time is the measure of the others
 USUAL_MPS: Final = 0.5
+SLOWEST_MPS: Final = 0.1  # A drive that is slower than this on average ends unfinished.
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,10 +22,10 @@ from drivers.frame import Camera, Frame
 from omnid.config import load_config
 from omnid.core.control.collision_monitor import RING_STALE, UNSEEN, UNWATCHED
 from omnid.simulation.lockstep import Fault, Moment, Request, Tamper, simulate
-from omnid.simulation.named_worlds import trial
 from omnid.simulation.robot import make_robot
 from tests.bench.obstacles import ahead
 from tests.bench.results import Column, ResultTable
+from tests.simulation.hazard_worlds import trial
 
 Image = NDArray[np.uint8]
 Flags = NDArray[np.bool_]

@@ -1,4 +1,4 @@
-"""World files: what they describe stands there, and wrong ones are refused in one line."""
+"""World files: what they describe stands and walks there, and wrong ones are refused in one line."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import pytest
 
 from omnid.errors import OmnidError
 from omnid.simulation.clearance import clearance_m, footprints
+from omnid.simulation.people import Walkers
 from omnid.simulation.rendering import shapes
 from omnid.simulation.world_file import WorldOptions, load_world, shipped_worlds
 
@@ -116,3 +117,28 @@ def test_the_area_is_checked_before_anything_is_painted(
     monkeypatch.setattr(shapes.textures, "poster", None)
     with pytest.raises(OmnidError, match=r"the surfaces are \d+ m2; expected at most 1200"):
         load_world(write(tmp_path, text), 1)
+
+
+def test_polite_people_wait_until_the_robot_has_gone(tmp_path: Path) -> None:
+    polite = HALL.replace('repeat = "back and forth"', "waits_within_m = 0.8")
+    people = Walkers(load_world(write(tmp_path, polite), 1).people)
+    for tenth in range(1, 31):
+        people.advance(0.1 * tenth, (0.5, -1.0))  # in the way
+    assert -0.35 <= people.places()[0][0] <= -0.3
+    for tenth in range(31, 41):
+        people.advance(0.1 * tenth, (-0.5, -0.5))  # behind the person, who goes away from it
+    assert people.places()[0][0] == pytest.approx(0.2, abs=0.06)
+
+
+def test_people_walk_and_some_wait_for_the_robot(tmp_path: Path) -> None:
+    people = Walkers(load_world(write(tmp_path, HALL), 1).people)
+    people.advance(1.0, (-5.0, 0.0))
+    assert people.places()[0] == pytest.approx((-0.5, -1.0, 0.0))
+    people.advance(5.0, (-5.0, 0.0))
+    assert people.places()[0] == pytest.approx((0.5, -1.0, -np.pi))
+    assert people.places()[1][:2] == (3.0, 1.5)
+    people.advance(6.0, (1.5, 0.5))
+    people.advance(6.5, (1.5, 0.5))
+    assert people.places()[1][:2] == pytest.approx((3.0, 1.0))
+    people.advance(60.0, (-5.0, 0.0))
+    assert people.places()[1][:2] == pytest.approx((3.0, 0.5))

@@ -1,165 +1,162 @@
-"""Worlds in which something is in the way: on the floor, over it, below it, moving, or nearer than the view.
+"""Trials: a world like a building, the robot in it, and what is asked of it: `trial(name, seed)`.
 
-What stands in the way is about 2 to 3 m ahead, a little beside the way.
+In the harmless worlds nothing is in the way of what is asked. In the hazards something is: on the floor, over it, below
+it, moving, or nearer than the view, about 2 to 3 m ahead, a little beside the way.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 
-from omnid.simulation.building_parts import Builder, Opening, Part, kind_paint, plain_paint, poster_paint
+from drivers.motors.simulated.simulated_base import Pose
+from omnid.errors import OmnidError
+from omnid.simulation import building_worlds
+from omnid.simulation.building_parts import (
+    BEHIND_M,
+    Builder,
+    Opening,
+    Part,
+    corridor,
+    four_legs,
+    kind_paint,
+    plain_paint,
+    poster_paint,
+    put_thing,
+    trolley,
+)
+from omnid.simulation.building_worlds import Makers, building_world, built, made
 from omnid.simulation.people import Person, moved
+from omnid.simulation.rendering.ray_caster import AS_NEEDED
+from omnid.simulation.rendering.sensor import Sensor
 from omnid.simulation.rendering.shapes import Paint, Point, solid
 from omnid.simulation.rendering.surfaces import Rectangle
-from omnid.simulation.trials import BEHIND_M, Trial, built, corridor, put_thing, trolley
-from omnid.simulation.world import Ground
+from omnid.simulation.robot import Push, SimulatedRobot, Slip, WheelErrors, make_robot
+from omnid.simulation.world import Ground, World
 
-PLAIN: Final = "plain_"  # begins the name of a thing that has one grey
 PRINTED: Final = ("box", "low_box", "block", "shelf", "drawer", "table")  # things with pictures on them
 LENGTH_M: Final = 12.0
 WALKER_MPS: Final = 0.5  # of the robot whose way people cross
+SENSOR: Final = Sensor(vignette=0.25, flicker=0.005, is_compressed=True)
 
 
-# Things on the floor, or over it, from the middle of what is in the way
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """A world, the robot in it, and what is asked: the way straight on, or the goal of the world.
+
+    At a hazard, `things` and the edges of the floor are what must not be touched, and may end the way.
+    """
+
+    world: World
+    things: tuple[Rectangle, ...] | None = None  # None: nothing is in the way
+    motion: Literal["ahead", "back", "turn left", "at random"] = "ahead"  # that is asked for
+    changes: tuple[tuple[str, object], ...] = ()  # of fields of the robot
+
+    @property
+    def way_m(self) -> float:
+        """The way that is asked for straight on."""
+        return self.world.way_m
+
+    @property
+    def goal(self) -> Pose | None:
+        """The goal: x, y [m], heading [rad] in odom, which begins at the start."""
+        return self.world.goal
+
+    def robot(self, size_px: int = 512) -> SimulatedRobot:
+        """Return the robot, with images of a size that come as JPEG from a lens with vignetting."""
+        usual = replace(make_robot(size_px), sensor=SENSOR, samples=AS_NEEDED)
+        return replace(usual, **dict(self.changes))  # type: ignore[arg-type]
 
 
-def _legs(apart: Point, side_m: float, high_m: float) -> list[Part]:
-    """Return four legs at the corners of a rectangle."""
-    return [((x * apart[0] / 2, y * apart[1] / 2, 0.0), (side_m, side_m, high_m)) for x in (1, -1) for y in (1, -1)]
+def trial(name: str, seed: int, floor: str | None = None) -> Trial:
+    """Return the trial of a name: same name and seed, same world; floor: another one of building_worlds.FLOORS."""
+    if (world := building_world(name, seed, floor)) is not None:
+        return Trial(world)
+    found = made(MAKERS, name, seed, floor)
+    if found is None:
+        raise OmnidError(f"world {name!r} is not known; the worlds are {', '.join((*HARMLESS, *HAZARDS))}")
+    return replace(found, world=replace(found.world, name=name))
 
 
-def _box(b: Builder) -> list[Part]:
-    return [((0.0, 0.0, 0.0), (b.rng.uniform(0.25, 0.6), b.rng.uniform(0.25, 0.6), b.rng.uniform(0.4, 1.2)))]
-
-
-def _low_box(b: Builder) -> list[Part]:
-    return [((0.0, 0.0, 0.0), (b.rng.uniform(0.25, 0.6), b.rng.uniform(0.25, 0.6), 0.08))]
-
-
-def _block(b: Builder) -> list[Part]:
-    return [((0.0, 0.0, 0.0), (b.rng.uniform(0.25, 0.5), b.rng.uniform(0.25, 0.5), b.rng.uniform(0.15, 0.6)))]
-
-
-def _pole(b: Builder) -> list[Part]:
-    side_m = b.rng.uniform(0.03, 0.08)
-    return [((0.0, 0.0, 0.0), (side_m, side_m, 1.8))]
-
-
-def _leg(_: Builder) -> list[Part]:
-    return [((0.0, 0.0, 0.0), (0.03, 0.03, 0.7)), ((0.0, 0.35, 0.7), (0.5, 0.8, 0.03))]
-
-
-def _bar(b: Builder) -> list[Part]:
-    return [((0.0, 0.0, b.rng.uniform(0.12, 1.1)), (0.03, 1.4, 0.03))]
-
-
-def _bar_end_on(b: Builder) -> list[Part]:
-    return [((0.7, 0.0, b.rng.uniform(0.12, 1.1)), (1.4, 0.04, 0.04))]
-
-
-def _table(b: Builder) -> list[Part]:
-    top_m = b.rng.uniform(0.6, 0.8)
-    return [*_legs((0.76, 0.56), 0.04, top_m), ((0.0, 0.0, top_m), (0.8, 0.6, 0.04))]
-
-
-def _tines(b: Builder) -> list[Part]:
-    low_m = b.rng.uniform(0.04, 0.1)
-    tines: list[Part] = [((0.5, y, low_m), (1.0, 0.12, 0.06)) for y in (0.25, -0.25)]
-    return [((1.3, 0.0, 0.0), (0.6, 0.9, 1.1)), *tines]
-
-
-def _chair(b: Builder) -> list[Part]:
-    seat_m = b.rng.uniform(0.4, 0.48)
-    back: list[Part] = [((-0.2, 0.0, z), (0.02, 0.42, 0.06)) for z in (0.6, 0.75, 0.88)]
-    posts: list[Part] = [((-0.2, y, seat_m), (0.03, 0.03, 0.5)) for y in (0.2, -0.2)]
-    return [*_legs((0.4, 0.4), 0.03, seat_m), ((0.0, 0.0, seat_m), (0.42, 0.42, 0.03)), *posts, *back]
-
-
-def _stool(b: Builder) -> list[Part]:
-    high_m = b.rng.uniform(0.45, 0.75)
-    return [*_legs((0.28, 0.28), 0.025, high_m), ((0.0, 0.0, high_m), (0.33, 0.33, 0.03))]
-
-
-def _ladder(b: Builder) -> list[Part]:
-    wide_m = b.rng.uniform(0.4, 0.55)
-    rungs: list[Part] = [((-0.3, 0.0, 0.28 * (n + 1)), (0.03, wide_m, 0.03)) for n in range(5)]
-    return [*_legs((0.6, wide_m), 0.04, 1.6), *rungs]
-
-
-def _barrier(b: Builder) -> list[Part]:
-    """Return two posts and a belt between them, which is what is in the way."""
-    posts: list[Part] = [((0.0, y, 0.0), (0.05, 0.05, 0.95)) for y in (0.75, -0.75)]
-    return [*posts, ((0.0, 0.0, b.rng.uniform(0.7, 0.9)), (0.005, 1.5, 0.05))]
-
-
-def _pallet(b: Builder) -> list[Part]:
-    runners: list[Part] = [((0.0, y, 0.0), (1.2, 0.1, 0.11)) for y in (-0.35, 0.0, 0.35)]
-    boards: list[Part] = [((x, 0.0, 0.11), (0.12, 0.8, 0.02)) for x in (-0.54, -0.27, 0.0, 0.27, 0.54)]
-    load: list[Part] = [((0.0, 0.0, 0.13), (0.9, 0.7, 0.4))] if b.rng.random() < 0.3 else []
-    return runners + boards + load
-
-
-def _open_door(b: Builder) -> list[Part]:
-    return [((0.0, 0.0, 0.005), (b.rng.uniform(0.7, 0.9), 0.04, 2.0))]
-
-
-def _drawer(b: Builder) -> list[Part]:
-    """Return a cabinet beside the way, and a drawer that stands out of it into the way."""
-    return [((0.0, 0.95, 0.0), (0.5, 0.6, 1.2)), ((0.0, 0.35, b.rng.uniform(0.3, 0.8)), (0.45, 0.6, 0.18))]
-
-
-def _lying_person(b: Builder) -> list[Part]:
-    return [((0.0, 0.0, 0.0), (0.4, 1.1, b.rng.uniform(0.18, 0.24))), ((0.0, 0.7, 0.0), (0.2, 0.2, 0.2))]
-
-
-def _stairs_up(_: Builder) -> list[Part]:
-    return [((0.3 * n, 0.0, 0.16 * n), (0.3, 1.2, 0.16)) for n in range(5)]
-
-
-def _shelf(b: Builder) -> list[Part]:
-    boards: list[Part] = [((0.0, 0.0, z), (0.35, 0.9, 0.02)) for z in (b.rng.uniform(0.3, 0.4), 0.8, 1.25, 1.7)]
-    return [*_legs((0.32, 0.87), 0.025, 1.75), *boards]
-
-
-def _hose(_: Builder) -> list[Part]:
-    return [((0.0, 0.0, 0.0), (0.05, 1.6, 0.05))]
-
-
-def _dock(_: Builder) -> list[Part]:
-    """Return the charging station of a robot: a plate of 3 cm, and a back."""
-    return [((0.0, 0.0, 0.0), (0.4, 0.4, 0.03)), ((0.22, 0.0, 0.0), (0.06, 0.4, 0.3))]
-
-
-# By name: its parts, and the largest angle by which it is turned [deg].
-THINGS: Final[dict[str, tuple[Callable[[Builder], list[Part]], float]]] = {
-    "box": (_box, 40.0),
-    "low_box": (_low_box, 40.0),
-    "block": (_block, 90.0),
-    "pole": (_pole, 40.0),
-    "leg": (_leg, 15.0),
-    "bar": (_bar, 0.0),
-    "bar_end_on": (_bar_end_on, 0.0),
-    "table": (_table, 0.0),
-    "tines": (_tines, 0.0),
-    "chair": (_chair, 180.0),
-    "stool": (_stool, 45.0),
-    "ladder": (_ladder, 180.0),
-    "barrier": (_barrier, 20.0),
-    "pallet": (_pallet, 90.0),
-    "trolley": (trolley, 180.0),
-    "open_door": (_open_door, 25.0),
-    "drawer": (_drawer, 10.0),
-    "lying_person": (_lying_person, 90.0),
-    "stairs_up": (_stairs_up, 15.0),
-    "shelf": (_shelf, 90.0),
-    "hose_5cm": (_hose, 25.0),
-    "dock": (_dock, 20.0),
+# Things on the floor, or over it, from the middle of what is in the way: their parts, each drawn by `u` from a range,
+# and the largest angle by which they are turned [deg].
+Draw = Callable[[float, float], float]
+THINGS: Final[dict[str, tuple[Callable[[Draw], list[Part]], float]]] = {
+    "box": (lambda u: [(0, 0, 0, u(0.25, 0.6), u(0.25, 0.6), u(0.4, 1.2))], 40),
+    "low_box": (lambda u: [(0, 0, 0, u(0.25, 0.6), u(0.25, 0.6), 0.08)], 40),
+    "block": (lambda u: [(0, 0, 0, u(0.25, 0.5), u(0.25, 0.5), u(0.15, 0.6))], 90),
+    "pole": (lambda u: [(0, 0, 0, side := u(0.03, 0.08), side, 1.8)], 40),
+    "leg": (lambda u: [(0, 0, 0, 0.03, 0.03, 0.7), (0, 0.35, 0.7, 0.5, 0.8, 0.03)], 15),
+    "bar": (lambda u: [(0, 0, u(0.12, 1.1), 0.03, 1.4, 0.03)], 0),
+    "bar_end_on": (lambda u: [(0.7, 0, u(0.12, 1.1), 1.4, 0.04, 0.04)], 0),
+    "table": (
+        lambda u: [*four_legs((0.76 / 2, 0.56 / 2), 0.04, top := u(0.6, 0.8)), (0, 0, top, 0.8, 0.6, 0.04)],
+        0,
+    ),
+    # Of a fork lift.
+    "tines": (
+        lambda u: [
+            (1.3, 0, 0, 0.6, 0.9, 1.1),
+            *((0.5, y, low, 1.0, 0.12, 0.06) for low in [u(0.04, 0.1)] for y in (0.25, -0.25)),
+        ],
+        0,
+    ),
+    "chair": (
+        lambda u: [
+            *four_legs((0.2, 0.2), 0.03, seat := u(0.4, 0.48)),
+            (0, 0, seat, 0.42, 0.42, 0.03),
+            *((-0.2, y, seat, 0.03, 0.03, 0.5) for y in (0.2, -0.2)),
+            *((-0.2, 0, z, 0.02, 0.42, 0.06) for z in (0.6, 0.75, 0.88)),
+        ],
+        180,
+    ),
+    "stool": (
+        lambda u: [*four_legs((0.14, 0.14), 0.025, high := u(0.45, 0.75)), (0, 0, high, 0.33, 0.33, 0.03)],
+        45,
+    ),
+    "ladder": (
+        lambda u: [
+            *four_legs((0.3, (wide := u(0.4, 0.55)) / 2), 0.04, 1.6),
+            *((-0.3, 0, 0.28 * (n + 1), 0.03, wide, 0.03) for n in range(5)),
+        ],
+        180,
+    ),
+    # Two posts and a belt between them, which is what is in the way.
+    "barrier": (
+        lambda u: [
+            *((0, y, 0, 0.05, 0.05, 0.95) for y in (0.75, -0.75)),
+            (0, 0, u(0.7, 0.9), 0.005, 1.5, 0.05),
+        ],
+        20,
+    ),
+    "pallet": (
+        lambda u: [
+            *((0, y, 0, 1.2, 0.1, 0.11) for y in (-0.35, 0.0, 0.35)),
+            *((x, 0, 0.11, 0.12, 0.8, 0.02) for x in (-0.54, -0.27, 0.0, 0.27, 0.54)),
+            *([(0, 0, 0.13, 0.9, 0.7, 0.4)] if u(0.0, 1.0) < 0.3 else []),
+        ],
+        90,
+    ),
+    "open_door": (lambda u: [(0, 0, 0.005, u(0.7, 0.9), 0.04, 2.0)], 25),
+    # A cabinet beside the way, and a drawer that stands out of it into the way.
+    "drawer": (lambda u: [(0, 0.95, 0, 0.5, 0.6, 1.2), (0, 0.35, u(0.3, 0.8), 0.45, 0.6, 0.18)], 10),
+    "lying_person": (lambda u: [(0, 0, 0, 0.4, 1.1, u(0.18, 0.24)), (0, 0.7, 0, 0.2, 0.2, 0.2)], 90),
+    "stairs_up": (lambda u: [(0.3 * n, 0, 0.16 * n, 0.3, 1.2, 0.16) for n in range(5)], 15),
+    "shelf": (
+        lambda u: [
+            *four_legs((0.32 / 2, 0.87 / 2), 0.025, 1.75),
+            *((0, 0, z, 0.35, 0.9, 0.02) for z in (u(0.3, 0.4), 0.8, 1.25, 1.7)),
+        ],
+        90,
+    ),
+    "hose_5cm": (lambda u: [(0, 0, 0, 0.05, 1.6, 0.05)], 25),
+    # The charging station of a robot: a plate of 3 cm, and a back.
+    "dock": (lambda u: [(0, 0, 0, 0.4, 0.4, 0.03), (0.22, 0, 0, 0.06, 0.4, 0.3)], 20),
 }
 
 
@@ -176,12 +173,12 @@ def _place(b: Builder) -> Point:
     return b.rng.uniform(2.2, 3.0), b.rng.uniform(-0.15, 0.15)
 
 
-def _put(b: Builder, name: str, paint: Paint, at: Point, yaw_rad: float | None = None) -> None:
-    """Add a thing whose nearest part is at a place; yaw None: any of its own."""
-    parts_of, most_deg = THINGS[name]
-    yaw_rad = math.radians(b.rng.uniform(-most_deg, most_deg)) if yaw_rad is None else yaw_rad
+def _put(b: Builder, name: str, paint: Paint, at: Point) -> None:
+    """Add a thing whose nearest part is at a place, turned at random."""
+    parts_of, most_deg = THINGS.get(name, (lambda _: trolley(b), 180))
+    yaw_rad = math.radians(b.rng.uniform(-most_deg, most_deg))
     first = len(b.faces)
-    b.thing(parts_of(b), (0.0, 0.0), yaw_rad, paint)
+    b.thing(parts_of(b.rng.uniform), (0.0, 0.0), yaw_rad, paint)
     nearest_m = min(float(face.corners[:, 0].min()) for face in b.faces[first:])
     shift = np.array([at[0] - nearest_m, at[1], 0.0])
     b.faces[first:] = [replace(face, origin=face.origin + shift) for face in b.faces[first:]]
@@ -209,13 +206,13 @@ def _contrast(b: Builder, name: str, percent: str) -> Trial:
     first, floor = len(b.faces), b.faces[0]
     _put(b, name, plain_paint(b.rng, 100.0), _place(b))
     grey = share * float(floor.texture.mean()) * floor.brightness
-
-    def painted(face: Rectangle) -> Rectangle:
-        value = np.clip(round(grey / face.brightness), 0, 255)
-        return replace(face, texture=np.full_like(face.texture, value))
-
-    b.faces[first:] = [painted(face) for face in b.faces[first:]]
+    b.faces[first:] = [_in_grey(face, grey) for face in b.faces[first:]]
     return _hazard(b, first)
+
+
+def _in_grey(face: Rectangle, grey: float) -> Rectangle:
+    """Return a face that is seen in one grey, under the light on it."""
+    return replace(face, texture=np.full_like(face.texture, np.clip(round(grey / face.brightness), 0, 255)))
 
 
 # What the floor does
@@ -257,7 +254,8 @@ def _steep_ramp(b: Builder) -> Trial:
     b.room(low, high, doors=2)
     for a, c in (((at_m, 1.2), (LENGTH_M, 1.2)), ((LENGTH_M, -1.2), (at_m, -1.2)), ((LENGTH_M, 1.2), (LENGTH_M, -1.2))):
         b.upright(a, c, (-down_m, 0.0), b.wall_grey)
-    return Trial(built(b, ground=Ground(((at_m, 0.0), (at_m + 2.0, -down_m)))), way_m=at_m + 3.0, things=())
+    ground = Ground(((at_m, 0.0), (at_m + 2.0, -down_m)))
+    return Trial(built(b, ground=ground, way_m=at_m + 3.0), things=())
 
 
 def _white_wall(b: Builder) -> Trial:
@@ -279,10 +277,9 @@ def _glass_with_frame(b: Builder) -> Trial:
     _wide_corridor(b)
     first, at_m = len(b.faces), b.rng.uniform(2.2, 3.0)
     frame = plain_paint(b.rng, float(b.rng.choice([60.0, 170.0, 220.0])))
-    uprights: list[Part] = [((0.0, y, 0.0), (0.05, 0.05, 2.1)) for y in (-1.5, -0.5, 0.5, 1.5)]
-    across: list[Part] = [((0.0, 0.0, z), (0.04, 3.0, 0.06)) for z in (0.0, 2.05)]
-    handle: list[Part] = [((-0.05, 0.4, 0.9), (0.03, 0.03, 0.35))]
-    b.thing([*uprights, *across, *handle], (at_m, 0.0), 0.0, frame)
+    uprights: list[Part] = [(0.0, y, 0.0, 0.05, 0.05, 2.1) for y in (-1.5, -0.5, 0.5, 1.5)]
+    across: list[Part] = [(0.0, 0.0, z, 0.04, 3.0, 0.06) for z in (0.0, 2.05)]
+    b.thing([*uprights, *across, (-0.05, 0.4, 0.9, 0.03, 0.03, 0.35)], (at_m, 0.0), 0.0, frame)
     for left_m in (1.5, 0.5, -0.5):
         origin, along = np.array([at_m, left_m, 2.05]), np.array([0.0, -1.0, 0.0])
         b.panes.append(Rectangle(origin, along, np.array([0.0, 0.0, -1.99]), np.full((8, 8), 255, np.uint8), "pane"))
@@ -350,10 +347,7 @@ def _crossing(b: Builder, how: str, side: int = 0) -> Person:
 
 def _crosses(b: Builder, how: str) -> Trial:
     half_m = b.rng.uniform(2.1, 2.6)
-    low, high = (-BEHIND_M, -half_m), (LENGTH_M, half_m)
-    b.floor(low, high)
-    b.ceiling(low, high)
-    b.room(low, high, doors=3, pictures=3)
+    b.space((-BEHIND_M, -half_m), (LENGTH_M, half_m), doors=3, pictures=3)
     people = [_crossing(b, how, side) for side in ((1, -1) if how == "two" else (0,))]
     if how == "from_a_door":
         (person,) = people
@@ -364,11 +358,7 @@ def _crosses(b: Builder, how: str) -> Trial:
     if how == "like_the_floor":
         floor = b.faces[0]
         grey = float(floor.texture.mean()) * floor.brightness
-
-        def painted(face: Rectangle) -> Rectangle:
-            return replace(face, texture=np.full_like(face.texture, np.clip(round(grey / face.brightness), 0, 255)))
-
-        people = [replace(one, faces=tuple(map(painted, one.faces))) for one in people]
+        people = [replace(one, faces=tuple(_in_grey(face, grey) for face in one.faces)) for one in people]
     return _people(b, *people)
 
 
@@ -441,10 +431,27 @@ def _apart_m(point: Point, first: Point, last: Point) -> float:
     return math.dist(point, (first[0] + along * x, first[1] + along * y))
 
 
+def _robot(b: Builder, **changes: object) -> Trial:
+    """A corridor in which the robot is another one, or something happens to it."""
+    corridor(b, width_m=2.2)
+    return Trial(built(b), changes=tuple(changes.items()))
+
+
+USUAL: Final = WheelErrors()
 CROSSING: Final = ("straight", "diagonally", "like_the_floor", "two", "from_a_door", "turns_round")
-# By a pattern of names: the kind of the floor, None: one with a pattern, and what makes the trial of a match.
-MAKERS: Final[dict[str, tuple[str | None, Callable[..., Trial]]]] = {
-    rf"({PLAIN}|)({'|'.join(THINGS)})": (None, _thing),
+NEAR: Final = ("white_pole", "textured_pole", "box", "person")
+ALL_THINGS: Final = (*THINGS, "trolley")
+# Worlds in which nothing is in the way, but for those of building_worlds.
+OF_ROBOT: Final[Makers[Trial]] = {
+    "lean_1deg": (None, partial(_robot, lean_rad=(0.0, math.radians(1.0)))),
+    "pushed": (None, partial(_robot, pushes=(Push(5.0, 5.5, 0.3, 0.15), Push(11.0, 11.5, -0.3, -0.15)))),
+    "slip_20": (None, partial(_robot, wheels=WheelErrors(slips=(Slip(5.0, 7.0, 0.2), Slip(12.0, 14.0, 0.2))))),
+    "slip_40": (None, partial(_robot, wheels=WheelErrors(slips=(Slip(8.0, 10.0, 0.4),)))),
+    "weak_motor": (None, partial(_robot, wheels=replace(USUAL, left=USUAL.left - 0.08))),
+}
+MAKERS: Final[Makers[Trial]] = {
+    **OF_ROBOT,
+    rf"(plain_|)({'|'.join(ALL_THINGS)})": (None, _thing),
     r"(pole|box|leg|edge)_(\d+)percent": ("linoleum", _contrast),
     r"edge_(\d+)cm": (None, _edge),
     "stairs_down": (None, partial(_edge, drop_cm="17", stairs=5)),
@@ -458,21 +465,18 @@ MAKERS: Final[dict[str, tuple[str | None, Callable[..., Trial]]]] = {
     "person_steps_back": (None, partial(_leads, comes_back=True)),
     r"person_steps_in_at_(\d+)cm": (None, _steps_in),
     rf"person_crosses_({'|'.join(CROSSING)})": (None, _crosses),
-    r"near_(white_pole|textured_pole|box|person)_(ahead|behind|beside)": (None, _near),
+    rf"near_({'|'.join(NEAR)})_(ahead|behind|beside)": (None, _near),
     r"room_(of_things|with_people|at_an_edge)": (None, _room),
 }
-NAMES: Final = (
-    *THINGS,
-    *(PLAIN + name for name in THINGS),
+HARMLESS: Final = (*building_worlds.NAMES, *OF_ROBOT)
+HAZARDS: Final = (
+    *ALL_THINGS,
+    *(f"plain_{name}" for name in ALL_THINGS),
     *(f"{name}_{percent}percent" for name in ("pole", "box", "leg", "edge") for percent in (10, 20)),
     *(f"edge_{drop}cm" for drop in (8, 15, 30, 50)),
     *("stairs_down", "steep_ramp", "white_wall", "glass_with_frame", "star_legs", "person_stands", "child_stands"),
     *("person_stops", "person_steps_back", "person_steps_in_at_80cm", "person_steps_in_at_150cm"),
     *(f"person_crosses_{how}" for how in CROSSING),
-    *(
-        f"near_{what}_{where}"
-        for what in ("white_pole", "textured_pole", "box", "person")
-        for where in ("ahead", "behind", "beside")
-    ),
+    *(f"near_{what}_{where}" for what in NEAR for where in ("ahead", "behind", "beside")),
     *("room_of_things", "room_with_people", "room_at_an_edge"),
 )
