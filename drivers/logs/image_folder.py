@@ -13,18 +13,19 @@ import errno
 import os
 import re
 import stat
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from decimal import Decimal, InvalidOperation
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Final, NamedTuple
 
+import numpy as np
+
 from drivers.errors import DriverError
 from drivers.logs.image_times import SHORTEST_STEP_NS
-from drivers.logs.log import MAX_RECORD_BYTES, LogDamage, LoggedMessage, RecordError
-from drivers.logs.ros_messages import COMPRESSED_IMAGE, RosImage, image_encoding
+from drivers.logs.log import ENTRY, MAX_RECORD_BYTES, Entries, RecordError, Topic
+from drivers.logs.ros_messages import COMPRESSED_IMAGE, compressed_image
 
 SUFFIXES: Final = (".png", ".jpg", ".jpeg")
 # What OpenCV reads as an image, as of boards: a log has those above.
@@ -37,24 +38,13 @@ _MAX_FOLDERS: Final = 64
 _MAX_VISITED: Final = 10_000
 _MAX_STAMP_BYTES: Final = 64 * 2**20
 _MAX_ATTACHMENT_BYTES: Final = 16 * 2**20
-_MAX_STAMP_NS: Final = 2**62  # The year 2116: two stamps differ by what fits 64 bits.
+_MAX_STAMP_NS: Final = 2**31 * 10**9  # of the times of ROS, which end in 2038
 _NANOSECONDS: Final = re.compile(r"\d{16,19}")
 
 
 class _StampedFile(NamedTuple):
     stamp_ns: int
-    topic: str
     path: Path
-
-
-@dataclass(frozen=True, slots=True)
-class _LoggedFile(LoggedMessage):
-    """An image file, whose stamp is its log time."""
-
-    def image(self) -> RosImage:
-        """Return the image, which is not yet decoded."""
-        data = memoryview(self.read())
-        return RosImage(self.log_time_ns, image_encoding(data), data)
 
 
 def image_folders(path: Path) -> list[Path]:
@@ -76,43 +66,44 @@ def _is_image(name: str) -> bool:
 
 
 class ImageFolder:
-    """A Log of folders of images; the topic of each is its path below the given folder.
+    """A LogFile of folders of images; the topic of each is its path below the given folder.
 
     Raises DriverError where an image has no stamp.
     """
 
+    is_indexed = True
+
     def __init__(self, path: Path, folders: Sequence[Path], rate_hz: float = 0.0) -> None:
         """rate_hz: images a second; 0: their names or times.txt state their stamps."""
-        self.name = str(path)
-        self._path, self._closed, self._is_by_rate = path, False, rate_hz > 0
-        self._files = {folder.relative_to(path).as_posix(): _stamped(path, folder, rate_hz) for folder in folders}
-        if sum(map(len, self._files.values())) > MAX_IMAGES:
-            raise DriverError(f"{self.name!r} contains more than {MAX_IMAGES} images; give a part of them")
+        self._path = path
+        self._files = [sorted(_stamped(path, folder, rate_hz)) for folder in folders]
+        names = [folder.relative_to(path).as_posix() for folder in folders]
+        self.topics = {number: Topic(name, COMPRESSED_IMAGE) for number, name in enumerate(names)}
+        self.faults: Counter[str] = Counter()
+        self.cut = ""
+        counts = [len(files) for files in self._files]
+        if sum(counts) > MAX_IMAGES:
+            raise DriverError(f"{str(path)!r} contains more than {MAX_IMAGES} images; give a part of them")
+        if rate_hz and len(set(counts)) > 1:
+            found = ", ".join(f"{count} in {name!r}" for name, count in zip(names, counts, strict=True))
+            self.cut = (
+                f"images of {str(path)!r} are missing: found {found}; by a rate they are paired in the order of their "
+                "names, wrongly behind a missing one: write times.txt"
+            )
 
-    def topics(self) -> Mapping[str, str]:
-        """Return folder -> sensor_msgs/msg/CompressedImage."""
-        return dict.fromkeys(self._files, COMPRESSED_IMAGE)
+    def entries(self) -> Iterator[Entries]:
+        """Yield the places of the images."""
+        for folder, files in enumerate(self._files):
+            places = [(folder, stamp_ns, folder, number) for number, (stamp_ns, _) in enumerate(files)]
+            yield np.array(places, ENTRY)
 
-    def counts(self) -> Mapping[str, int] | None:
-        """Return the number of images in each folder."""
-        return {topic: len(files) for topic, files in self._files.items()}
-
-    def span_ns(self) -> tuple[int, int] | None:
-        """Return the first and last stamp."""
-        spans = self.image_spans_ns().values()
-        return (min(first for first, _ in spans), max(last for _, last in spans)) if spans else None
-
-    def image_spans_ns(self) -> Mapping[str, tuple[int, int]]:
-        """Return the first and last stamp in each folder."""
-        return {topic: (min(files).stamp_ns, max(files).stamp_ns) for topic, files in self._files.items() if files}
-
-    def messages(self, topics: Collection[str] | None = None) -> Iterator[LoggedMessage]:
-        """Yield the images of these folders in the order of their stamps."""
-        wanted = [files for topic, files in self._files.items() if topics is None or topic in topics]
-        for stamp_ns, topic, path in sorted(file for files in wanted for file in files):
-            if self._closed:
-                return
-            yield _LoggedFile(topic, COMPRESSED_IMAGE, stamp_ns, partial(_content, path))
+    def read(self, channel: int, time_ns: int, block: int, offset: int) -> bytes:
+        """Return an image as a message, whose stamp is that of the image; raise RecordError where it is unreadable."""
+        path = self._files[block][offset].path
+        try:
+            return compressed_image(time_ns, _read_regular(path, MAX_RECORD_BYTES))
+        except OSError as error:
+            raise RecordError(f"{str(path)!r} cannot be read: {error.strerror}") from error
 
     def attachments(self) -> dict[str, bytes]:
         """Return the rig.toml in the folder of the folders, if it is a regular file of at most 16 MiB."""
@@ -123,29 +114,16 @@ class ImageFolder:
             return {}
         return {ATTACHMENT: data} if len(data) <= _MAX_ATTACHMENT_BYTES else {}
 
-    def damage(self) -> LogDamage:
-        """Return what the numbers of images say; a file that is no image is counted when it is read."""
-        counts = {topic: len(files) for topic, files in self._files.items()}
-        if not self._is_by_rate or len(set(counts.values())) == 1:
-            return LogDamage()
-        found = ", ".join(f"{count} in {topic!r}" for topic, count in counts.items())
-        return LogDamage(
-            cut=f"images of {self.name!r} are missing: found {found}; by a rate they are paired in the order of their "
-            "names, wrongly behind a missing one: write times.txt"
-        )
-
     def close(self) -> None:
-        """End messages()."""
-        self._closed = True
+        """No file stays open."""
 
 
 def _stamped(top: Path, folder: Path, rate_hz: float) -> list[_StampedFile]:
     """Return the images of a folder with their stamps; raise DriverError where one has none."""
-    topic = folder.relative_to(top).as_posix()
     paths = sorted((path for path in folder.iterdir() if _is_image(path.name)), key=_numbers_of)
     _require_own_files(top, paths)
     if rate_hz:
-        return [_StampedFile(round(index * 1e9 / rate_hz), topic, path) for index, path in enumerate(paths)]
+        return [_StampedFile(round(index * 1e9 / rate_hz), path) for index, path in enumerate(paths)]
     lines = _stamp_lines(folder)
     if lines is not None and len(lines) != len(paths):
         raise DriverError(
@@ -165,7 +143,7 @@ def _stamped(top: Path, folder: Path, rate_hz: float) -> list[_StampedFile]:
                 f"{str(path)!r} {where} {text[:40]!r}: expected nanoseconds of 16 to 19 digits as its name, or seconds "
                 f"in {STAMP_FILES[0]}; else give --rate HZ, which is log.rate_hz of the settings"
             )
-        found.append(_StampedFile(stamp_ns, topic, path))
+        found.append(_StampedFile(stamp_ns, path))
     steps_ns = sorted(after.stamp_ns - before.stamp_ns for before, after in pairwise(sorted(found)))
     if lines is None and steps_ns and 0 < steps_ns[len(steps_ns) // 2] <= SHORTEST_STEP_NS:
         raise DriverError(
@@ -226,10 +204,3 @@ def _read_regular(path: Path, most_bytes: int) -> bytes:
         if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
             raise OSError(errno.EINVAL, "it is no regular file")
         return file.read(most_bytes)
-
-
-def _content(path: Path) -> bytes:
-    try:
-        return _read_regular(path, MAX_RECORD_BYTES)
-    except OSError as error:
-        raise RecordError(f"{str(path)!r} cannot be read: {error.strerror}") from error

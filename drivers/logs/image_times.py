@@ -21,7 +21,7 @@ from statistics import median
 from typing import Final, Literal, TypeAlias
 
 from drivers.frame import CAMERAS, Camera
-from drivers.logs.file_order import LATEST_NS, LONGEST_STEP
+from drivers.logs.log import LATEST_NS, LONGEST_STEP
 from drivers.logs.ros_messages import RosImage
 
 TimeSource: TypeAlias = Literal["auto", "header", "log"]

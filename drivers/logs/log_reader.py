@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from drivers.errors import DriverError, FrameDecodeError
 from drivers.frame import CAMERAS, SAMPLE_BITS, Camera, Frame, gray, is_deep
 from drivers.logs.image_times import MAX_HELD_BYTES, STEP_NS, ImageTimes, TimedImage, TimeSource
-from drivers.logs.log import LoggedMessage, RecordError, widened
+from drivers.logs.log import LoggedMessage, RecordError
 from drivers.logs.open_log import open_log
 from drivers.logs.ros_messages import MotionReading, RosImage
 from drivers.logs.topics import MotionChoice, MotionTopics, choose_motion_topics, choose_topics
@@ -30,7 +30,7 @@ _WARNINGS = {
     "broken_motion": "skipped {} messages of wheels or IMU that are not valid; the first: {motion_fault}",
     "no_joints": "none of {} messages of joints names the wheels: see motion.wheel_joints",
     "broken": "skipped {} messages of the cameras' topics that hold no valid image; the first: {fault}",
-    "broken_records": "skipped {} corrupt chunks or records of the file",
+    "broken_records": "skipped {} corrupt chunks or records of the file; the first: {record_fault}",
 }
 MAX_WAITING_SAMPLES = 65_536  # Samples of wheels and IMU that wait for the next images: some minutes.
 MOST_PERCENT = 99.0
@@ -181,11 +181,10 @@ class LogReader:
         self._log.close()
 
     def pair_estimate(self) -> int | None:
-        """Return the largest possible number of pairs, for a progress bar; None where the log does not state it, or
-        is read in part."""
-        counts = self._log.counts()
-        if counts is None or self._span_s != WHOLE:
+        """Return the largest possible number of pairs, for a progress bar; None where the log is read in part."""
+        if self._span_s != WHOLE:
             return None
+        counts = self._log.counts()
         return min(counts.get(topic, 0) for topic in self._cameras.values())
 
     def attachments(self) -> dict[str, bytes]:
@@ -250,7 +249,8 @@ class LogReader:
         return reading if reading.rates else None
 
     def _widen(self, what: str, stamp_ns: int) -> None:
-        self._spans[what] = widened(self._spans.get(what), stamp_ns)
+        first_ns, last_ns = self._spans.get(what, (stamp_ns, stamp_ns))
+        self._spans[what] = min(first_ns, stamp_ns), max(last_ns, stamp_ns)
 
     def _of_another_clock(self) -> Iterator[str]:
         """Yield a warning for cameras, and for wheels or gyro, whose stamps are shifted against each other."""
@@ -280,7 +280,7 @@ class LogReader:
         self.counts["unstamped"] = self._times.by_log.total()
         self.counts["no_joints"] = 0 if "wheels" in self._spans else self._other_joints
         found = {name: text for name, text in _WARNINGS.items() if self.counts[name]}
-        faults = {"fault": self._fault, "motion_fault": self._motion_fault}
+        faults = {"fault": self._fault, "motion_fault": self._motion_fault, "record_fault": damage.first}
         self.warnings += [text.format(self.counts[name], **faults) for name, text in found.items()]
         self.warnings += [*self._times.warnings(), *self._of_another_clock()]
 

@@ -6,14 +6,13 @@ until the recorder has closed the file, as rosbag renames it from .bag.active th
 
 from __future__ import annotations
 
-import bz2
 import struct
-from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-import lz4.frame  # type: ignore[import-untyped]
+import numpy as np
 
 from drivers.logs.chunked_file import (
     MAX_DEFINITION_BYTES,
@@ -24,58 +23,47 @@ from drivers.logs.chunked_file import (
     MessageHead,
     Record,
     RecordKind,
-    Topic,
     content,
+    unpacked_chunk,
 )
-from drivers.logs.log import MAX_RECORD_BYTES, RecordError, widened
+from drivers.logs.log import ENTRY, Entries, RecordError, Topic
 
 MAGIC: Final = b"#ROSBAG V2.0\n"
 
 _LENGTH: Final = struct.Struct("<I")
-_ENTRY: Final = struct.Struct("<III")  # of an index: seconds, nanoseconds, offset in the chunk
-_COUNT: Final = struct.Struct("<II")  # of the description of a chunk: connection, number of messages
+_ENTRY: Final = np.dtype([(name, "<u4") for name in ("seconds", "nanoseconds", "offset")])  # of an index
 _MAX_HEADER_BYTES: Final = 2**16
-_MESSAGE, _BAG, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 4, 5, 6, 7
-_KINDS: Final = {
-    _MESSAGE: RecordKind.MESSAGE,
-    _INDEX: RecordKind.INDEX,
-    _CHUNK: RecordKind.CHUNK,
-    _CONNECTION: RecordKind.DEFINITION,
-}
+_BAG: Final = 3
+_KINDS: Final = {2: RecordKind.MESSAGE, 4: RecordKind.INDEX, 5: RecordKind.CHUNK, 7: RecordKind.DEFINITION}
 
 
 class Ros1Bag(ChunkedFile):
-    """A Log of one .bag file; raises DriverError where it cannot be read."""
+    """A LogFile of one .bag file; raises DriverError where it cannot be read."""
 
-    def __init__(self, path: Path, name: str | None = None) -> None:
-        self._connections: dict[int, Topic] = {}
-        self._counts: Counter[int] = Counter()  # by connection
-        self._span_ns: tuple[int, int] | None = None
-        self._chunk_times: dict[int, int] = {}  # log time of the first message by the begin of the chunk
+    def __init__(self, path: Path, name: str) -> None:
         super().__init__(path, MAGIC, name)
-
-    def topics(self) -> Mapping[str, str]:
-        """Return name -> type, from the index; of a file without one from its first part."""
-        return {topic.name: topic.kind for topic in self._connections.values()}
-
-    def counts(self) -> Mapping[str, int] | None:
-        """Return the number of messages of each topic by the index, None without it."""
-        if not self._has_index:
-            return None
-        counts = Counter(dict.fromkeys(self.topics(), 0))
-        for connection, topic in self._connections.items():
-            counts[topic.name] += self._counts[connection]
-        return counts
-
-    def span_ns(self) -> tuple[int, int] | None:
-        """Return the first and last log time by the index; None without it, or without messages."""
-        return self._span_ns
+        self._index_begin, self._indexed_records = 0, 0  # as the first record states them
+        bag = next(self._records(self, self._start, self.size), None)
+        if bag is not None and bag.opcode == _BAG:
+            with suppress(RecordError):
+                self._indexed_records = _number(bag, b"conn_count") + _number(bag, b"chunk_count")
+                self._index_begin = _numbers(bag, b"index_pos", 1, "Q")[0]
+        self.is_indexed = self._is_closed()
 
     def attachments(self) -> dict[str, bytes]:
         """Return none: a bag has no attachments."""
         return {}
 
-    # The format
+    def _is_closed(self) -> bool:
+        return self._start < self._index_begin < self.size
+
+    def _is_whole(self, last: Record) -> bool:
+        records = self._records(self, self._index_begin, self.size)
+        return sum(not record.is_cut for record in records) >= self._indexed_records
+
+    def _summary(self) -> Iterator[Record]:
+        records = self._records(self, self._index_begin, self.size)
+        yield from (record for record in records if record.kind is RecordKind.DEFINITION and not record.is_cut)
 
     def _records(self, source: ByteSource, start: int, end: int) -> Iterator[Record]:
         offset = start
@@ -84,102 +72,47 @@ class Ros1Bag(ChunkedFile):
             offset += _LENGTH.size
             if size > min(end - offset, _MAX_HEADER_BYTES):
                 return
-            fields, offset = _fields(bytes(source.read(offset, size))), offset + size
+            fields, offset = _fields(bytes(source.read_bytes(offset, size))), offset + size
             opcode = fields.get(b"op", b"")
             if len(opcode) != 1 or offset + _LENGTH.size > end:
                 return
             size, offset = _length(source, offset), offset + _LENGTH.size
-            kind, is_cut = _KINDS.get(opcode[0], RecordKind.OTHER), size > end - offset
-            if source is self and self._index_begin and begin >= self._index_begin:
-                kind = RecordKind.END
-            yield Record(kind, begin, offset, size, opcode[0], fields, is_cut)
+            is_cut = size > end - offset
+            yield Record(_KINDS.get(opcode[0], RecordKind.OTHER), begin, offset, size, opcode[0], fields, is_cut)
             if is_cut:
                 return
             offset += size
 
     def _unpack(self, chunk: Record, data: memoryview) -> bytes | memoryview:
-        size = _number(chunk, b"size")
-        if size > MAX_RECORD_BYTES:
-            raise RecordError(f"the chunk unpacks to {size} bytes, more than {MAX_RECORD_BYTES}")
-        compression, unpacked = chunk.fields.get(b"compression"), b""
-        try:
-            if compression == b"none":
-                return data[: size or len(data)]
-            if compression == b"bz2":
-                unpacked = bz2.BZ2Decompressor().decompress(data, max_length=size)
-            elif compression == b"lz4":
-                unpacked = bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size))
-            else:
-                raise RecordError(f"the compression {compression!r} is unknown")
-        except (RuntimeError, ValueError, EOFError, OSError, MemoryError) as error:
-            raise RecordError(f"the chunk does not unpack: {error}") from error
+        compression, size = chunk.fields.get(b"compression", b""), _number(chunk, b"size")
+        unpacked = unpacked_chunk(compression.replace(b"none", b""), data, size or len(data))
         if len(unpacked) != size and not chunk.is_cut:
-            raise RecordError("the chunk's content does not match its size")
+            raise RecordError("its content does not match its size")
         return unpacked
 
     def _head(self, source: ByteSource, message: Record) -> MessageHead:
-        return MessageHead(_number(message, b"conn"), _time_ns(message, b"time"), message.offset, message.size)
+        seconds, nanoseconds = _numbers(message, b"time", 2)
+        return MessageHead(_number(message, b"conn"), seconds * 10**9 + nanoseconds, message.offset, message.size)
 
-    def _index(self, record: Record) -> tuple[int, Iterator[MessageHead]]:
-        connection, body = _number(record, b"conn"), content(self, record.offset, record.size)
-        entries = _ENTRY.iter_unpack(body[: len(body) // _ENTRY.size * _ENTRY.size])
-        return connection, (MessageHead(connection, sec * 10**9 + nsec, offset) for sec, nsec, offset in entries)
-
-    def _first_ns(self, chunk: Record) -> int:
-        return self._chunk_times.get(chunk.begin, -1)
+    def _index(self, record: Record, chunk: int) -> Entries:
+        body = content(self, record.offset, record.size)
+        found = np.frombuffer(body[: len(body) // _ENTRY.itemsize * _ENTRY.itemsize], _ENTRY)
+        entries = np.empty(len(found), ENTRY)
+        entries["channel"], entries["block"], entries["offset"] = _number(record, b"conn"), chunk, found["offset"]
+        entries["time_ns"] = found["seconds"].astype(np.int64) * 10**9 + found["nanoseconds"]
+        return entries
 
     def _define(self, source: ByteSource, record: Record) -> None:
-        if len(self._connections) >= MAX_DEFINITIONS or record.size > MAX_DEFINITION_BYTES:
+        if len(self.topics) >= MAX_DEFINITIONS or record.size > MAX_DEFINITION_BYTES:
             raise RecordError(f"more than {MAX_DEFINITIONS} connections, or a large one")
         about = _fields(bytes(content(source, record.offset, record.size)))
         found = record.fields.get(b"topic", b""), about.get(b"type", b"")
         topic, kind = (text[:MAX_NAME].decode("utf-8", "replace") for text in found)
-        self._connections[_number(record, b"conn")] = Topic(topic, kind.replace("/", "/msg/", 1), aligned=False)
-
-    def _topic(self, channel: int) -> Topic | None:
-        return self._connections.get(channel)
-
-    def _is_closed(self) -> bool:
-        return self._has_index
-
-    def _read_index(self) -> bool:
-        """Learn connections, and numbers and times of messages, from the records behind the chunks."""
-        self._index_begin, self._has_index = 0, False
-        try:
-            bag = next(self._records(self, self._start, self.size))
-            begin = _numbers(bag, b"index_pos", 1, "Q")[0]
-            left = _number(bag, b"conn_count") + _number(bag, b"chunk_count")
-            if bag.opcode != _BAG or not self._start < begin < self.size:
-                return False
-            for record in self._records(self, begin, self.size):
-                if record.is_cut or not left:
-                    break
-                left -= 1
-                if record.opcode == _CONNECTION:
-                    self._define(self, record)
-                elif record.opcode == _CHUNK_INFO:
-                    self._add_chunk(record)
-        except (RecordError, StopIteration, struct.error):
-            left = 1
-        if left:
-            self._counts, self._span_ns, self._chunk_times = Counter(), None, {}
-            return False
-        self._index_begin = begin
-        return True
-
-    def _add_chunk(self, record: Record) -> None:
-        """Take note of the description of a chunk."""
-        first_ns, last_ns = (_time_ns(record, name) for name in (b"start_time", b"end_time"))
-        body = content(self, record.offset, record.size)
-        self._chunk_times[_numbers(record, b"chunk_pos", 1, "Q")[0]] = first_ns
-        for connection, count in _COUNT.iter_unpack(body[: len(body) // _COUNT.size * _COUNT.size]):
-            self._counts[connection] += count
-        if len(body) >= _COUNT.size:
-            self._span_ns = widened(widened(self._span_ns, first_ns), last_ns)
+        self.topics[_number(record, b"conn")] = Topic(topic, kind.replace("/", "/msg/", 1), aligned=False)
 
 
 def _length(source: ByteSource, offset: int) -> int:
-    return int.from_bytes(source.read(offset, _LENGTH.size), "little")
+    return int.from_bytes(source.read_bytes(offset, _LENGTH.size), "little")
 
 
 def _fields(header: bytes) -> dict[bytes, bytes]:
@@ -206,8 +139,3 @@ def _numbers(record: Record, name: bytes, count: int, code: str = "I") -> tuple[
 
 def _number(record: Record, name: bytes) -> int:
     return _numbers(record, name, 1)[0]
-
-
-def _time_ns(record: Record, name: bytes) -> int:
-    seconds, nanoseconds = _numbers(record, name, 2)
-    return seconds * 10**9 + nanoseconds

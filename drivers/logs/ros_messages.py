@@ -101,6 +101,13 @@ def image_encoding(data: memoryview | bytes, otherwise: str = "") -> str:
     return _MAGIC.get(bytes(data[:3]), otherwise)
 
 
+def compressed_image(stamp_ns: int, image: bytes) -> bytes:
+    """Return an image file as a COMPRESSED_IMAGE in CDR, with an empty frame and format."""
+    # Both strings have a length of 1, for the zero that ends them, and are filled up to four bytes.
+    head = struct.pack("<4siII4xI4xI", b"\0\1\0\0", *divmod(stamp_ns, 10**9), 1, 1, len(image))
+    return head + image
+
+
 class JointWheels(NamedTuple):
     """The joints of the driven wheels in a JointState, and the geometry of the base."""
 

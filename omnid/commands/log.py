@@ -12,7 +12,7 @@ from omnid.commands.options import JSON, command, option, print_json
 from omnid.utc import utc
 
 if TYPE_CHECKING:
-    from drivers.logs.log import LogInfo
+    from drivers.logs.open_log import LogInfo
 
 MAX_COLUMN = 60  # Most characters of a topic or a type, so that a line of the table fits a terminal.
 _MEND = "`mcap recover`, of mcap's own command line"
@@ -33,8 +33,7 @@ MAX_LINE = 5000  # Most characters of a line: it may contain the path of a file.
 def info(args: argparse.Namespace) -> int:
     """Print the content of each log; return 1 if one is broken, 2 if one is no log."""
     from drivers.errors import DriverError
-    from drivers.logs.log import LogState
-    from drivers.logs.open_log import log_info
+    from drivers.logs.open_log import LogState, log_info
 
     code, logs = 0, []
     for number, path in enumerate(args.logs):
@@ -70,7 +69,7 @@ def _described(found: LogInfo) -> Iterator[str]:
 
 
 def _state(found: LogInfo) -> str:
-    from drivers.logs.log import LogState
+    from drivers.logs.open_log import LogState
 
     faults = [_shown(found.fault)] if found.fault else []
     if found.broken:

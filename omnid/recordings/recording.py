@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Final, NamedTuple, TypeAlias
 
 from drivers.errors import FrameDecodeError
-from drivers.logs.log import LoggedMessage, LogInfo, RecordError
-from drivers.logs.open_log import open_log
+from drivers.logs.log import LoggedMessage, RecordError
+from drivers.logs.open_log import LogInfo, open_log
 from drivers.logs.ros_messages import IMAGE_TYPES, RosImage
 from omnid.errors import OmnidError
 from omnid.transport.codec import (

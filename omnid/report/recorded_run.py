@@ -18,8 +18,7 @@ from calib import se3
 from calib.errors import CalibError
 from calib.rig import Rig
 from calib.rig_file import parse_rig
-from drivers.logs.log import LogInfo
-from drivers.logs.open_log import log_info
+from drivers.logs.open_log import LogInfo, log_info
 from omnid.formats.tum import POSITION_LIMIT_M
 from omnid.recordings.recording import (
     CLOUD,

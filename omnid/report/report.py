@@ -20,8 +20,8 @@ from calib.models.names import model_in_words
 from calib.panorama import fit_cylinder, remap_tables
 from calib.rig import MountedCamera
 from drivers.errors import DriverError
-from drivers.logs.log import LogState
 from drivers.logs.log_reader import LogReader
+from drivers.logs.open_log import LogState
 from drivers.logs.ros_messages import IMAGE_TYPES
 from omnid.config import Config
 from omnid.formats.plan import Lines, between, draw_ends, draw_plan, drawn_heights, sheet_of, write

@@ -7,6 +7,7 @@ import fcntl
 import gzip
 import os
 import random
+import re
 import shutil
 import sqlite3
 from collections.abc import Callable, Sequence
@@ -22,10 +23,9 @@ from mcap.writer import CompressionType
 
 from drivers.errors import DriverError
 from drivers.frame import Frame
-from drivers.logs.log import LogInfo, LogState
 from drivers.logs.log_reader import LogReader
 from drivers.logs.mcap_file import MAGIC
-from drivers.logs.open_log import log_info, logs_in, open_log
+from drivers.logs.open_log import LogInfo, LogState, log_info, logs_in, open_log
 from drivers.logs.topics import MotionTopics
 from drivers.motion import GyroSample
 from tests.drivers.logs.bags import (
@@ -130,6 +130,13 @@ def survivors(path: Path) -> tuple[Contents, LogReader] | None:
         return None
 
 
+def is_one_fault(warnings: list[str]) -> bool:
+    """True if a corrupt record is told, and where it is."""
+    return [re.sub("byte [0-9].*", "byte", line) for line in warnings] == [
+        "skipped 1 corrupt chunks or records of the file; the first: the chunk at byte"
+    ]
+
+
 # Whole logs
 
 
@@ -140,7 +147,7 @@ def test_frames_and_contents_are_the_same_in_every_format(tmp_path: Path, name: 
     assert found == expected(PAIRS)
     assert not reader.warnings and not reader.truncated and reader.counts["lower"] == PAIRS
     with closing(LogReader(path)) as again:
-        assert again.pair_estimate() == (None if name in WITHOUT_INDEX else PAIRS)
+        assert again.pair_estimate() == PAIRS
         assert contents(list(again.frames())) == contents(list(again.frames())) == found
     info: LogInfo = log_info(path)
     images = {topic: entry for topic, entry in info.topics.items() if topic != "/imu"}
@@ -216,7 +223,7 @@ def test_a_message_of_an_unknown_connection_is_told(tmp_path: Path) -> None:
     data[at] = 77
     path.write_bytes(data)
     found, reader = read(path)
-    assert len(found) == 2 * PAIRS - 1 and reader.warnings == ["skipped 1 corrupt chunks or records of the file"]
+    assert len(found) == 2 * PAIRS - 1 and is_one_fault(reader.warnings)
 
 
 # Folders and parts
@@ -430,7 +437,7 @@ def test_damaged_logs_give_frames_or_one_line(tmp_path: Path, name: str) -> None
     assert refused and (complete or name.startswith("mcap"))
 
 
-@pytest.mark.parametrize("name", MCAP_LAYOUTS)
+@pytest.mark.parametrize("name", [*MCAP_LAYOUTS, "bag, bz2"])
 def test_flipped_bits_change_no_frame_of_a_chunk(tmp_path: Path, name: str) -> None:
     path = FORMATS[name](tmp_path, pairs(2))
     whole, chance, readable = path.read_bytes(), random.Random(5), 0
@@ -460,7 +467,7 @@ def test_a_corrupt_chunk_of_a_bag_costs_its_own_frames(tmp_path: Path) -> None:
     path = write_bag(tmp_path / "log.bag", pairs(1), "BZ2")
     path.write_bytes(path.read_bytes().replace(b"BZh9", b"BZh0"))
     found, reader = read(path)
-    assert found == [] and reader.warnings == ["skipped 1 corrupt chunks or records of the file"]
+    assert found == [] and is_one_fault(reader.warnings)
 
 
 def test_a_transaction_that_was_not_ended_is_undone(tmp_path: Path) -> None:
@@ -482,7 +489,7 @@ def test_a_cut_database_that_was_written_topic_by_topic_is_read_in_the_order_of_
         and stamps == sorted(stamps)
         and {frame[2:] for frame in found} < {frame[2:] for frame in expected(60)}
     )
-    assert len(reader.warnings) == 1 and "cut or corrupt" in reader.warnings[0]
+    assert "cut or corrupt" in reader.warnings[0]
 
 
 @pytest.mark.parametrize("name", ["mcap, lz4", "mcap, zstd"])
@@ -540,7 +547,6 @@ def test_a_database_whose_pages_are_named_again_and_again_ends(tmp_path: Path) -
     repeat_pages(path)
     assert path.stat().st_size < 100_000
     with closing(open_log(path)) as bag:
-        assert bag.counts() is None
         for topics in ([LOWER], ["/another"]):
             assert len(list(bag.messages(topics))) <= path.stat().st_size // 8
             assert "more rows than its size allows" in bag.damage().cut

@@ -18,7 +18,7 @@ import pytest
 from mcap.reader import make_reader
 
 from drivers.logs.file_lock import is_locked
-from drivers.logs.mcap_file import McapFile
+from drivers.logs.open_log import open_log
 from drivers.logs.rotating_log import RotatingLog, RotationSettings
 from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, START_NS
 
@@ -202,7 +202,7 @@ def test_a_full_disk_stops_the_recording_until_there_is_room(small_disk: Path, b
     assert [level for level, _ in recording.events] == [logging.WARNING, logging.INFO]
     assert recording.events[1][1].endswith(f"; {recording.state.lost} messages were lost")
     whole = sum(counted(path) for path in recording.folder.glob("*.mcap"))
-    saved = len(list(McapFile(recording.folder / recording.names()[0]).messages()))
+    saved = len(list(open_log(recording.folder / recording.names()[0]).messages()))
     assert saved >= 25 and whole >= 50 and recording.state.stops == 1
     assert recording.state.messages == saved + whole + recording.state.lost
 
@@ -240,7 +240,7 @@ print(state.status, state.messages, state.lost, state.stops, len(recording.event
     status, *numbers = done.stdout.split()
     messages, lost, stops, reports, files = map(int, numbers)
     assert (status, messages, stops, reports, files) == ("stopped", 200, 1, 1, kept) and 170 <= lost <= 200
-    parts = [McapFile(path) for path in (tmp_path / "log").iterdir()]
+    parts = [open_log(path) for path in (tmp_path / "log").iterdir()]
     # Of the chunk that did not fit, the first messages can be read.
     assert messages - lost <= sum(len(list(part.messages())) for part in parts) < messages - lost + 30
 
