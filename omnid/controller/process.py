@@ -94,7 +94,7 @@ def run_controller(channel: Channel) -> int:
         closing.callback(channel.close)  # last of all, when the wheels are at rest
         start: ControllerStart = channel.receive(START_MESSAGE_S)
         try:
-            driver, _ = open_motor(start.motor, closing, waits=start.waits)
+            driver = open_motor(start.motor, closing, waits=start.waits)
         except DriverError as error:
             channel.send(StartFailed(str(error)))
             return 2

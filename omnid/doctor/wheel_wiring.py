@@ -12,9 +12,9 @@ from contextlib import ExitStack, suppress
 from dataclasses import replace
 from typing import Final, NamedTuple
 
-from drivers.motor import VelocityCommand, stop_command
+from drivers.motor import MotorDriver, VelocityCommand, stop_command
 from drivers.motors.protocols.motor_protocol import NoReplyError
-from drivers.motors.serial_motor import LateReplyError, SerialMotor
+from drivers.motors.serial_motor import LateReplyError
 from omnid.controller.motor import open_motor
 from omnid.controller.motor_settings import DriveSettings, MotorSettings
 from omnid.errors import OmnidError
@@ -72,7 +72,7 @@ class WiringTest:
         """Return the settings of the drive as the wiring is. Raise OmnidError where the answers do not determine it."""
         plain = replace(self._config.drive, swapped=False, reverse_left=False, reverse_right=False)
         with ExitStack() as closing:
-            motor, _ = open_motor(replace(self._config, drive=plain), closing)
+            motor = open_motor(replace(self._config, drive=plain), closing)
             while True:
                 first, second = (self._observe(motor, plain.track_m, channel) for channel in (1, 2))
                 if first.side != second.side:
@@ -82,10 +82,10 @@ class WiringTest:
         if not self._turns:
             return drive
         with ExitStack() as closing:
-            motor, _ = open_motor(replace(self._config, drive=drive), closing)
+            motor = open_motor(replace(self._config, drive=drive), closing)
             return self._scaled(motor, drive)
 
-    def _observe(self, motor: SerialMotor, track_m: float, channel: int) -> Seen:
+    def _observe(self, motor: MotorDriver, track_m: float, channel: int) -> Seen:
         """Turn one motor forwards and back, and ask what moved."""
         turn = -1.0 if channel == 1 else 1.0  # the command of the other wheel becomes 0
         velocity_mps, yaw_rate_radps = self._speed_mps / 2, turn * self._speed_mps / track_m
@@ -115,7 +115,7 @@ class WiringTest:
             pass
         return Seen(side, answer == "y")
 
-    def _scaled(self, motor: SerialMotor, drive: DriveSettings) -> DriveSettings:
+    def _scaled(self, motor: MotorDriver, drive: DriveSettings) -> DriveSettings:
         """Turn both wheels by a number of turns, ask for the true number, and correct the gear by their ratio."""
         around_m = math.tau * drive.wheel_radius_m
         self._ask(f"Mark both tyres. The wheels will turn forwards {self._turns:g} times. Press Enter: ")
@@ -129,7 +129,7 @@ class WiringTest:
                     is_right = abs(turns / commanded - 1) <= RIGHT_SCALE
                     return drive if is_right else replace(drive, gear=float(f"{drive.gear * commanded / turns:.4g}"))
 
-    def _move(self, motor: SerialMotor, velocity_mps: float, yaw_rate_radps: float, duration_s: float) -> float:
+    def _move(self, motor: MotorDriver, velocity_mps: float, yaw_rate_radps: float, duration_s: float) -> float:
         """Drive for this time, then stop; return the time for which it drove, s."""
         period_s = 1 / self._config.rate_hz
         _stop(motor)  # after a pause the driver sends one in place of the first command
@@ -149,7 +149,7 @@ class WiringTest:
         return moved_s
 
 
-def _stop(motor: SerialMotor) -> None:
+def _stop(motor: MotorDriver) -> None:
     """Stop the wheels; DriverError where the controller gives no answer within ANSWER_S.
 
     A late one is the fault of a busy computer: the stop is sent again.

@@ -16,7 +16,7 @@ from drivers.motion import GyroSample, MotionSample, WheelSample
 from drivers.motor import VelocityCommand
 from drivers.motors.protocols.protocol_registry import motor_protocol
 from drivers.motors.simulated.simulated_base import Pose, Traction
-from drivers.motors.simulated.simulated_motor import LockstepMotor, simulated_controller
+from drivers.motors.simulated.simulated_motor import SimulatedMotor, simulated_controller
 from omnid.config import Config
 from omnid.controller.controller import Controller
 from omnid.controller.statistics import TickReport
@@ -61,7 +61,7 @@ class Vehicle:
         self.twin = simulated_controller(config.motor.protocol, drive)
         base = self.twin.base
         base.pose, base.limits, base.traction = world.start, robot.limits, self._traction(robot.wheels, seed)
-        self.motor = LockstepMotor(
+        self.motor = SimulatedMotor(
             motor_protocol(config.motor.protocol)(drive), self.twin, config.motor.watchdog_ms, lambda: self.now_ns
         )
         self.controller = Controller(
@@ -128,16 +128,15 @@ class Vehicle:
         return samples
 
     def _move(self, until_ns: int) -> None:
-        base, dt_s = self.twin.base, (until_ns - self.now_ns) * 1e-9
-        before = base.pose
-        base.advance(dt_s)
+        base, begin_s, dt_s = self.twin.base, self.time_s, (until_ns - self.now_ns) * 1e-9
+        before, self.now_ns = base.pose, until_ns
+        self.motor.advance()
         for push in self._robot.pushes:
-            if push.start_s <= self.time_s < push.end_s:
+            if push.start_s <= begin_s < push.end_s:
                 x_m, y_m, heading_rad = base.pose
                 aside_m = push.sideways_mps * dt_s
                 x_m, y_m = x_m - aside_m * math.sin(heading_rad), y_m + aside_m * math.cos(heading_rad)
                 base.pose = x_m, y_m, heading_rad + push.yaw_rate_radps * dt_s
-        self.now_ns = until_ns
         if self._robot.has_gyro and dt_s > 0.0:
             self._sense_rotation(self._turned(before, base.pose) / dt_s)
         self.people.advance(self.time_s, base.pose[:2])

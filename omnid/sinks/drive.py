@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import DriverError
-from drivers.motor import VelocityCommand, is_stop, stop_command
+from drivers.motor import VelocityCommand, is_stop
 from drivers.motors.protocols.protocol_registry import motor_protocol
-from drivers.motors.simulated.simulated_base import LONGEST_ADVANCE_S, SimulatedBase
-from drivers.motors.simulated.simulated_motor import LockstepMotor, simulated_controller
+from drivers.motors.simulated.simulated_base import SimulatedBase
+from drivers.motors.simulated.simulated_motor import SimulatedMotor, simulated_controller
 from omnid.controller.link import ControllerLink, DriveLink
 from omnid.controller.motor_settings import MotorSettings
 from omnid.core.control.command_sources import PLANNER, TimedSetpoint
@@ -151,30 +151,24 @@ class SimulatedWheels:
 
     def __init__(self, settings: MotorSettings) -> None:
         drive = settings.drive.geometry()
-        self._controller = simulated_controller(settings.protocol, drive)
         self._now_ns, self._moves = 0, False
-        self._rearm_s = 0.5e-3 * settings.watchdog_ms
         self._sent = self._stops = 0
-        self._motor = LockstepMotor(
-            motor_protocol(settings.protocol)(drive), self._controller, settings.watchdog_ms, lambda: self._now_ns
+        self._motor = SimulatedMotor(
+            motor_protocol(settings.protocol)(drive),
+            simulated_controller(settings.protocol, drive),
+            settings.watchdog_ms,
+            lambda: self._now_ns,
         )
 
     @property
     def base(self) -> SimulatedBase:
         """The simulated base."""
-        return self._controller.base
+        return self._motor.base
 
     def process(self, command: VelocityCommand) -> None:
-        """Let the base drive until the command's stamp, then send it."""
-        # 1. Drive on until the stamp.
-        since_s = (command.stamp_ns - self._now_ns) * 1e-9 if self._now_ns else 0.0
+        """Let the base drive until the command's stamp, then send it; count it, and each stop of wheels that moved."""
         self._now_ns = command.stamp_ns
-        self.base.advance(min(since_s, LONGEST_ADVANCE_S))
-        # 2. Send the command. After a pause the watchdog may have expired: then the controller expects a stop first.
-        if since_s > self._rearm_s:
-            self._motor.send(stop_command(command.stamp_ns))
         self._motor.send(command)
-        # 3. Count it, and each stop of wheels that moved.
         self._sent += 1
         self._stops += self._moves and is_stop(command)
         self._moves = not is_stop(command)

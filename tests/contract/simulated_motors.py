@@ -12,7 +12,8 @@ from drivers.motors.protocols.protocol_registry import PROTOCOLS
 from drivers.motors.serial_motor import SerialMotor
 from drivers.motors.simulated.simulated_base import MotionLimits
 from drivers.motors.simulated.simulated_controllers import SimulatedLine, SimulatedVesc
-from drivers.motors.simulated.simulated_motor import SIMULATED_CONTROLLERS, SimulatedController, SimulatedMotor
+from drivers.motors.simulated.simulated_motor import SIMULATED_CONTROLLERS, SimulatedController
+from tests.contract.pty_motor import PtyMotor
 
 NAMES = sorted(PROTOCOLS)
 PATIENCE_S = 20.0  # bounds a wait on a loaded machine; not a measured limit
@@ -45,9 +46,9 @@ def run(transaction: Transaction[T], controller: SimulatedController, framer: Fr
 @contextlib.contextmanager
 def connected_motor(
     name: str, drive: DifferentialDrive = BASE, *, watchdog_ms: int = LONG_MS, timeout_s: float = REPLY_S
-) -> Iterator[tuple[SerialMotor, SimulatedMotor]]:
+) -> Iterator[tuple[SerialMotor, PtyMotor]]:
     """Yield a driver and the simulated motor that it is connected to."""
-    with contextlib.closing(SimulatedMotor(controller_of(name, drive, watchdog_ms))) as simulated:
+    with contextlib.closing(PtyMotor(controller_of(name, drive, watchdog_ms))) as simulated:
         protocol = PROTOCOLS[name](drive)
         motor = SerialMotor(simulated.port, protocol, timeout_s=timeout_s, watchdog_ms=watchdog_ms,
                             connect_s=PATIENCE_S)  # fmt: skip

@@ -14,7 +14,7 @@ from drivers.motor import MotorStatus, VelocityCommand, stop_command
 from drivers.motors.protocols.motor_protocol import NoReplyError
 from drivers.motors.protocols.protocol_registry import PROTOCOLS
 from drivers.motors.serial_motor import LateReplyError, SerialMotor
-from drivers.motors.simulated.simulated_motor import SimulatedMotor
+from tests.contract.pty_motor import PtyMotor
 from tests.contract.simulated_motors import (
     BASE,
     INSTANT,
@@ -193,7 +193,7 @@ def test_a_late_reply_is_discarded(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_missing_reply_at_the_connection_is_an_error(name: str) -> None:
-    with contextlib.closing(SimulatedMotor(controller_of(name))) as simulated:
+    with contextlib.closing(PtyMotor(controller_of(name))) as simulated:
         simulated.drop_input = True
         with pytest.raises(DriverError, match="gave no answer"):
             SerialMotor(simulated.port, PROTOCOLS[name](BASE), watchdog_ms=LONG_MS, connect_s=0.1)
@@ -204,14 +204,14 @@ def test_a_missing_reply_at_the_connection_is_an_error(name: str) -> None:
 @pytest.mark.parametrize(("name", "other"), [("line", "roboteq"), ("roboteq", "vesc"), ("vesc", "odrive_ascii")])
 def test_detects_another_protocol(name: str, other: str) -> None:
     controller = controller_of(name)
-    with contextlib.closing(SimulatedMotor(controller)) as simulated, pytest.raises(DriverError, match="protocol"):
+    with contextlib.closing(PtyMotor(controller)) as simulated, pytest.raises(DriverError, match="protocol"):
         SerialMotor(simulated.port, PROTOCOLS[other](BASE), watchdog_ms=LONG_MS, connect_s=0.1)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_an_unplugged_controller_is_an_error_and_reconnects(name: str, tmp_path: Path) -> None:
     port = tmp_path / "motor"
-    first = SimulatedMotor(controller_of(name))
+    first = PtyMotor(controller_of(name))
     port.symlink_to(first.port)
     motor = SerialMotor(str(port), PROTOCOLS[name](BASE), timeout_s=REPLY_S, watchdog_ms=LONG_MS)
     with contextlib.closing(motor):
@@ -222,7 +222,7 @@ def test_an_unplugged_controller_is_an_error_and_reconnects(name: str, tmp_path:
             motor.send(FORWARD)
         with pytest.raises(DriverError, match=r"no such port|tried again"):
             motor.send(FORWARD)
-        with contextlib.closing(SimulatedMotor(controller_of(name))) as second:
+        with contextlib.closing(PtyMotor(controller_of(name))) as second:
             second.expire()  # from now on a first command other than a stop is an error
             port.symlink_to(second.port)
             assert until(lambda: first_status(motor) is not None and second.base.commanded_mps != [0.0, 0.0])

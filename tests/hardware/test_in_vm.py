@@ -22,9 +22,9 @@ from drivers.cameras.log_camera import LogImages
 from drivers.frame import Frame
 from drivers.logs.log_reader import LogReader
 from drivers.motors.simulated.simulated_controllers import SimulatedLine
-from drivers.motors.simulated.simulated_motor import LONGEST_ABSENCE_S
 from omnid.runs.session import attached_rig
 from omnid.stages.geometry import with_rims
+from tests.contract.pty_motor import LONGEST_ABSENCE_S
 from tests.hardware.guest_report import names_in, passed, run_tests
 from tests.hardware.image import ROOT
 from tests.hardware.machine import Guest, Result

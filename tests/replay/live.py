@@ -19,9 +19,9 @@ import zenoh
 from rosbags.typesys import Stores, get_typestore
 
 from drivers.motors.simulated.simulated_controllers import SimulatedLine
-from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from omnid.transport import codec
 from omnid.transport.codec import Pose
+from tests.contract.pty_motor import PtyMotor
 from tests.ports import free_port
 from tests.waiting import ended, wait_until
 
@@ -67,7 +67,7 @@ class Base:
     def __init__(self, folder: Path) -> None:
         self.line = RecordedLine()
         self.port = folder / "motor"
-        self.twin = SimulatedMotor(self.line)
+        self.twin = PtyMotor(self.line)
         self.port.symlink_to(self.twin.port)
 
     @property
@@ -83,7 +83,7 @@ class Base:
     def plug_in(self) -> None:
         """Open another pty under the same name; the controller starts again."""
         self.line = RecordedLine()
-        self.twin = SimulatedMotor(self.line)
+        self.twin = PtyMotor(self.line)
         self.port.symlink_to(self.twin.port)
 
     def close(self) -> None:

@@ -17,11 +17,11 @@ import zenoh
 from mcap.reader import make_reader
 
 from drivers.motor import is_stop
-from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from omnid.formats.tum import read_tum
 from omnid.transport.codec import Pose, decode_pose
 from tests.busy import stopped_by_turns
 from tests.conftest import PAIRS
+from tests.contract.pty_motor import PtyMotor
 from tests.ply import read_ply
 from tests.ports import free_port
 from tests.replay.command import Command, Result, rows
@@ -122,7 +122,7 @@ def test_another_process_receives_the_poses(tmp_path: Path, scene: Path) -> None
 
 
 def test_motor_gets_the_commands_and_stops_at_the_end(omnid: Command, scene: Path) -> None:
-    motor = SimulatedMotor()
+    motor = PtyMotor()
     try:
         setpoint = ("controller.setpoint.velocity_mps=0.4", "controller.setpoint.heading_deg=10")
         sets = (word for setting in setpoint for word in ("--set", setting))
@@ -142,7 +142,7 @@ def test_starts_a_simulated_motor(omnid: Command, scene: Path) -> None:
 
 
 def test_a_lost_motor_ends_the_run(tmp_path: Path, scene: Path) -> None:
-    motor = SimulatedMotor()
+    motor = PtyMotor()
     tum = tmp_path / "est.txt"
     with started(replaying(scene, "--realtime", "--quiet", "--tum", tum, "--motor", motor.port)) as process:
         wait_until(lambda: tum.exists() and tum.read_bytes().count(b"\n") >= 3)

@@ -1,14 +1,7 @@
-"""Simulated controllers: on a pseudo-terminal in real time, or in lock step with a simulated clock."""
+"""Simulated motor controllers as a motor driver, whose time passes by a clock."""
 
 from __future__ import annotations
 
-import contextlib
-import os
-import select
-import threading
-import time
-import tty
-from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Final, Protocol
 
@@ -16,17 +9,13 @@ from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, stop_command
 from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.motor_protocol import MotorProtocol, T, Transaction
-from drivers.motors.simulated.simulated_base import STEP_S, Pose, SimulatedBase
+from drivers.motors.simulated.simulated_base import LONGEST_ADVANCE_S, SimulatedBase
 from drivers.motors.simulated.simulated_controllers import (
     SimulatedLine,
     SimulatedODrive,
     SimulatedRoboteq,
     SimulatedVesc,
 )
-
-READ_LIMIT_BYTES = 4096
-POSES_KEPT = 1000  # Number of poses that are kept with their times: those of some seconds.
-LONGEST_ABSENCE_S = 0.05  # a thread that was not scheduled for longer does not advance: the host was not late
 
 
 class SimulatedController(Protocol):
@@ -58,95 +47,10 @@ def simulated_controller(protocol: str, drive: DifferentialDrive) -> SimulatedCo
 
 
 class SimulatedMotor:
-    """A controller on a pty in real time; a thread stands for the processor of the real device."""
+    """A MotorDriver whose bytes reach the controller at once, and whose base moves as time passes by a clock.
 
-    def __init__(self, controller: SimulatedController | None = None) -> None:
-        """Open the pty; `port` is the path for the driver."""
-        self.controller = controller or SimulatedLine()
-        self.unsent = 0  # replies dropped because the host did not read
-        self.drop_replies = False  # fault: commands are carried out without a reply
-        self.drop_input = False  # fault: received bytes are ignored
-        self.garbage = b""  # fault: sent before each reply
-        self.poses: deque[tuple[int, Pose]] = deque(maxlen=POSES_KEPT)  # time (CLOCK_MONOTONIC) [ns] and pose
-        device, self._host = os.openpty()
-        tty.setraw(self._host)  # kept open: without an open host side, reads of the device side fail
-        os.set_blocking(device, False)
-        self._device: int | None = device  # None: unplugged
-        self.port = os.ttyname(self._host)
-        self._expiring, self._unplugging = threading.Event(), threading.Event()
-        self._wake_read, self._wake_write = os.pipe()
-        self._thread = threading.Thread(target=self._serve, name="simulated-motor", daemon=True)
-        self._thread.start()
-
-    @property
-    def base(self) -> SimulatedBase:
-        """The simulated base."""
-        return self.controller.base
-
-    def expire(self) -> None:
-        """Let the watchdog stop the wheels at once."""
-        self._expiring.set()
-        while self._expiring.is_set() and self._thread.is_alive():
-            time.sleep(STEP_S)
-
-    def unplug(self) -> None:
-        """Close the pty permanently, as a pulled plug does; the controller runs on, its watchdog stops the wheels."""
-        self._unplugging.set()
-        while self._device is not None and self._thread.is_alive():
-            time.sleep(STEP_S)
-
-    def send(self, data: bytes) -> None:
-        """Send bytes; drop them where the host does not read."""
-        with contextlib.suppress(BlockingIOError):
-            if self._device is not None and os.write(self._device, data) == len(data):
-                return
-        self.unsent += 1
-
-    def close(self) -> None:
-        """End the thread and close the pty; a second call does nothing."""
-        if not self._thread.is_alive():
-            return
-        os.write(self._wake_write, b"x")
-        self._thread.join()
-        self._close_pty()
-        for descriptor in (self._wake_read, self._wake_write):
-            os.close(descriptor)
-
-    def _close_pty(self) -> None:
-        if self._device is not None:
-            os.close(self._device)
-            os.close(self._host)
-            self._device = None
-
-    def _serve(self) -> None:
-        last_s = time.monotonic()
-        while True:
-            sources = [self._wake_read] if self._device is None else [self._wake_read, self._device]
-            readable, _, _ = select.select(sources, [], [], STEP_S)
-            now_s = time.monotonic()
-            self.base.advance(min(now_s - last_s, LONGEST_ABSENCE_S))
-            last_s = now_s
-            self.poses.append((round(now_s * 1e9), self.base.pose))
-            if self._wake_read in readable:
-                return
-            if self._expiring.is_set():
-                self.base.expire()
-                self._expiring.clear()
-            if self._unplugging.is_set():
-                self._close_pty()
-            elif readable and self._device is not None:
-                self._receive(os.read(self._device, READ_LIMIT_BYTES))
-
-    def _receive(self, data: bytes) -> None:
-        if self.drop_input:
-            return
-        replies = self.controller.feed(data)
-        if replies and not self.drop_replies:
-            self.send(self.garbage + replies)
-
-
-class LockstepMotor:
-    """A MotorDriver whose bytes reach the controller at once; like the serial driver it begins with a stop."""
+    Like the serial driver it begins with a stop, and sends one after a pause in which the watchdog may have expired.
+    """
 
     def __init__(
         self, protocol: MotorProtocol, controller: SimulatedController, watchdog_ms: int, clock_ns: Callable[[], int]
@@ -154,15 +58,32 @@ class LockstepMotor:
         """Connect; DriverError where the controller does not take the watchdog's time."""
         self._protocol, self._controller, self._clock_ns = protocol, controller, clock_ns
         self._framer = protocol.framer()
+        self._longest_pause_ns = watchdog_ms * 1_000_000 // 2
+        self._now_ns = self._answered_ns = clock_ns()
         self.status: MotorStatus | None = None  # the last reply
         self.cut = False  # fault: no byte arrives at either end
         self._run(protocol.connect(watchdog_ms))
         self._run(protocol.drive(stop_command(0), clock_ns() * 1e-9))
 
+    @property
+    def base(self) -> SimulatedBase:
+        """The simulated base."""
+        return self._controller.base
+
+    def advance(self) -> None:
+        """Let the base move until now."""
+        now_ns = self._clock_ns()
+        self.base.advance(min((now_ns - self._now_ns) * 1e-9, LONGEST_ADVANCE_S))
+        self._now_ns = now_ns
+
     def send(self, command: VelocityCommand) -> MotorStatus:
         """Send a command and return the controller's reply; DriverError without one."""
+        self.advance()
         self.status = None
-        self.status = self._run(self._protocol.drive(command, self._clock_ns() * 1e-9))
+        if self._now_ns - self._answered_ns > self._longest_pause_ns:
+            self._run(self._protocol.drive(stop_command(0), self._now_ns * 1e-9))
+        self.status = self._run(self._protocol.drive(command, self._now_ns * 1e-9))
+        self._answered_ns = self._now_ns
         return self.status
 
     def close(self) -> None:

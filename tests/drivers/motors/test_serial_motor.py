@@ -26,7 +26,7 @@ from drivers.motors.protocols.line_protocol import (
 from drivers.motors.protocols.motor_protocol import NoReplyError, T, Transaction
 from drivers.motors.serial_motor import SerialMotor
 from drivers.motors.simulated.simulated_controllers import SimulatedLine
-from drivers.motors.simulated.simulated_motor import SimulatedMotor
+from tests.contract.pty_motor import PtyMotor
 
 PATIENCE_S = 20.0  # bounds a wait on a loaded machine; not a measured limit
 REPLY_S = 2.0
@@ -48,8 +48,8 @@ def until(condition: Callable[[], bool]) -> bool:
 
 
 @pytest.fixture
-def simulated() -> Iterator[SimulatedMotor]:
-    with contextlib.closing(SimulatedMotor()) as simulated:
+def simulated() -> Iterator[PtyMotor]:
+    with contextlib.closing(PtyMotor()) as simulated:
         yield simulated
 
 
@@ -85,7 +85,7 @@ def test_a_command_after_a_gap_in_seq_is_an_error_but_carried_out() -> None:
 # The serial motor and the simulated controller over a pty
 
 
-def test_an_invalid_command_sends_nothing(simulated: SimulatedMotor) -> None:
+def test_an_invalid_command_sends_nothing(simulated: PtyMotor) -> None:
     with contextlib.closing(SerialMotor(simulated.port, timeout_s=REPLY_S)) as motor:
         before = simulated.base.commands
         with pytest.raises(DriverError, match="velocity is nan"):
@@ -111,7 +111,7 @@ class SlowToSetUp(SimulatedLine):
 
 
 def test_after_silence_a_controller_has_the_time_to_be_set_up_again() -> None:
-    with contextlib.closing(SimulatedMotor(SlowToSetUp(heading_input=False))) as simulated:
+    with contextlib.closing(PtyMotor(SlowToSetUp(heading_input=False))) as simulated:
         motor = SerialMotor(simulated.port, timeout_s=0.05, watchdog_ms=200, connect_s=PATIENCE_S)
         with contextlib.closing(motor):
             simulated.drop_replies = True
@@ -130,7 +130,7 @@ def failure(motor: SerialMotor) -> DriverError | None:
     return None
 
 
-def test_after_a_command_that_was_refused_a_stop_comes_first(simulated: SimulatedMotor) -> None:
+def test_after_a_command_that_was_refused_a_stop_comes_first(simulated: PtyMotor) -> None:
     with contextlib.closing(SerialMotor(simulated.port, timeout_s=REPLY_S)) as motor:
         assert not motor.send(VelocityCommand(0, 0.3, 0.0, 0.0)).watchdog_expired and motor.replaced_by_stop == 0
         with pytest.raises(DriverError):
@@ -140,7 +140,7 @@ def test_after_a_command_that_was_refused_a_stop_comes_first(simulated: Simulate
 
 
 @pytest.mark.hazard("H42")
-def test_no_other_program_can_open_the_port(simulated: SimulatedMotor) -> None:
+def test_no_other_program_can_open_the_port(simulated: PtyMotor) -> None:
     os.chmod(simulated.port, 0o666)
     assert opens_as_another_user(simulated.port)
     motor = SerialMotor(simulated.port, timeout_s=REPLY_S)
@@ -163,7 +163,7 @@ def test_open_failure_gives_advice(port: str, what: str) -> None:
 
 
 @pytest.mark.parametrize(("watchdog_ms", "timeout_s"), [(0, 0.05), (20_000, 0.05), (500, 0.0), (500, math.nan)])
-def test_refuses_invalid_settings(simulated: SimulatedMotor, watchdog_ms: int, timeout_s: float) -> None:
+def test_refuses_invalid_settings(simulated: PtyMotor, watchdog_ms: int, timeout_s: float) -> None:
     with pytest.raises(DriverError, match=r"watchdog|timeout"):
         SerialMotor(simulated.port, watchdog_ms=watchdog_ms, timeout_s=timeout_s)
 
@@ -179,7 +179,7 @@ class FixedWatchdog(SimulatedLine):
 
 def test_verifies_the_watchdog_in_force() -> None:
     with (
-        contextlib.closing(SimulatedMotor(FixedWatchdog())) as simulated,
+        contextlib.closing(PtyMotor(FixedWatchdog())) as simulated,
         pytest.raises(DriverError, match="500 ms requested, 1000 ms in force"),
     ):
         SerialMotor(simulated.port, timeout_s=REPLY_S)
@@ -194,7 +194,7 @@ class ExpiredForever(SimulatedLine):
 
 def test_a_watchdog_that_stays_expired_is_an_error() -> None:
     controller = ExpiredForever()
-    with contextlib.closing(SimulatedMotor(controller)) as simulated, pytest.raises(DriverError, match="stays stopped"):
+    with contextlib.closing(PtyMotor(controller)) as simulated, pytest.raises(DriverError, match="stays stopped"):
         SerialMotor(simulated.port, timeout_s=REPLY_S, connect_s=0.1)
 
 
@@ -207,7 +207,7 @@ class Echo(SimulatedLine):
 
 
 def test_an_echo_is_no_reply() -> None:
-    with contextlib.closing(SimulatedMotor(Echo())) as simulated, pytest.raises(DriverError, match="no answer"):
+    with contextlib.closing(PtyMotor(Echo())) as simulated, pytest.raises(DriverError, match="no answer"):
         SerialMotor(simulated.port, connect_s=0.1)
 
 
@@ -258,7 +258,7 @@ class Stalling(SimulatedLine):
 
 def test_a_full_output_buffer_is_an_error_and_close_returns() -> None:
     controller = Stalling()
-    with contextlib.closing(SimulatedMotor(controller)) as simulated:
+    with contextlib.closing(PtyMotor(controller)) as simulated:
         motor = SerialMotor(simulated.port, timeout_s=REPLY_S / 4, watchdog_ms=10_000)  # waited for four times
         controller.reading.clear()
         fill(simulated.port)

@@ -17,7 +17,8 @@ from drivers.motors.protocols.protocol_registry import PROTOCOLS
 from drivers.motors.serial_motor import SerialMotor
 from drivers.motors.simulated.simulated_base import SimulatedBase
 from drivers.motors.simulated.simulated_controllers import SimulatedODrive, SimulatedRoboteq, SimulatedVesc
-from drivers.motors.simulated.simulated_motor import SimulatedController, SimulatedMotor
+from drivers.motors.simulated.simulated_motor import SimulatedController
+from tests.contract.pty_motor import PtyMotor
 
 DRIVE = DifferentialDrive(can_id=2)
 NAMES = sorted(PROTOCOLS)
@@ -80,7 +81,7 @@ EVERY = [
     ],
 )
 def test_what_is_measured_is_named(name: str, answer: Callable[[bytes], bytes], expected: str) -> None:
-    with contextlib.closing(SimulatedMotor(Board(answer))) as board, pytest.raises(DriverError) as caught:
+    with contextlib.closing(PtyMotor(Board(answer))) as board, pytest.raises(DriverError) as caught:
         SerialMotor(board.port, PROTOCOLS[name](DRIVE), timeout_s=0.3, connect_s=0.1)
     assert expected in str(caught.value) and board.port in str(caught.value) and "\n" not in str(caught.value)
 
@@ -109,7 +110,7 @@ class OneChannel(SimulatedRoboteq):
 )
 def test_a_board_that_cannot_drive_says_why(name: str, controller: SimulatedController, expected: str) -> None:
     problems = set()
-    with contextlib.closing(SimulatedMotor(controller)) as board:
+    with contextlib.closing(PtyMotor(controller)) as board:
         motor = SerialMotor(board.port, PROTOCOLS[name](DRIVE), timeout_s=1.0, watchdog_ms=10_000, connect_s=0.0)
         with contextlib.closing(motor):
             for command in [stop_command(0), *[VelocityCommand(0, 0.3, 0.0, 0.0)] * 40]:

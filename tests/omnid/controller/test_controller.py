@@ -13,7 +13,6 @@ import pytest
 from drivers.motor import MotorStatus, VelocityCommand, is_stop
 from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.serial_motor import LateReplyError, SerialMotor
-from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from omnid.controller.controller import Controller
 from omnid.core.control import safety_rules
 from omnid.core.control.arming import AUTOMATIC
@@ -21,6 +20,7 @@ from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControllerPose, ControllerSettings
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.control.safety_rules import Deadlines
+from tests.contract.pty_motor import PtyMotor
 from tests.omnid.controller.bench import (
     LIMITS,
     PERIOD_NS,
@@ -227,7 +227,7 @@ def test_sends_headings_in_the_motor_controllers_own_count(bench: Bench) -> None
 
 
 @contextlib.contextmanager
-def real_controller(twin: SimulatedMotor) -> Iterator[Controller]:
+def real_controller(twin: PtyMotor) -> Iterator[Controller]:
     driver = SerialMotor(twin.port, timeout_s=2.0, watchdog_ms=10_000)
     settings = ControllerSettings(Deadlines(5.0, 5.0, 5.0), LIMITS, arming=AUTOMATIC).without_obstacles
     controller = Controller(driver, settings, 0.02)
@@ -237,7 +237,7 @@ def real_controller(twin: SimulatedMotor) -> Iterator[Controller]:
         driver.close()
 
 
-def run_until(controller: Controller, twin: SimulatedMotor, setpoint: Setpoint, happens: Callable[[], bool]) -> None:
+def run_until(controller: Controller, twin: PtyMotor, setpoint: Setpoint, happens: Callable[[], bool]) -> None:
     """Tick with the simulated base's heading as the pose; headings in odom are 0.7 rad larger."""
     deadline_s = time.monotonic() + PATIENCE_S
     while not happens():
@@ -252,7 +252,7 @@ def run_until(controller: Controller, twin: SimulatedMotor, setpoint: Setpoint, 
 @pytest.mark.parametrize("setpoint", [Setpoint(0.1, 1.1), Setpoint(0.1, None, 0.4), Setpoint(0.0, None, 0.4)])
 def test_a_simulated_motor_that_holds_headings_follows_headings_and_rates(setpoint: Setpoint) -> None:
     """The line protocol's own heading controller gets headings in its count, 0.7 rad less than those in odom."""
-    with contextlib.closing(SimulatedMotor()) as twin, real_controller(twin) as controller:
+    with contextlib.closing(PtyMotor()) as twin, real_controller(twin) as controller:
         if setpoint.heading_rad is not None:
             goal_rad = setpoint.heading_rad - 0.7
             run_until(controller, twin, setpoint, lambda: abs(twin.base.pose[2] - goal_rad) < 0.02)

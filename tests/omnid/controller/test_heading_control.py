@@ -13,7 +13,6 @@ from drivers.motor import MotorStatus, VelocityCommand
 from drivers.motors.serial_motor import SerialMotor
 from drivers.motors.simulated.simulated_base import MotionLimits, SimulatedBase
 from drivers.motors.simulated.simulated_controllers import SimulatedLine
-from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from omnid.controller.controller import Controller
 from omnid.core.control.arming import AUTOMATIC, ArmRequest
 from omnid.core.control.command_sources import TimedSetpoint
@@ -22,6 +21,7 @@ from omnid.core.control.heading_controller import HeadingLimits, Setpoint
 from omnid.core.control.heading_goal import longest_lead_rad
 from omnid.core.control.safety_rules import POSE_JUMPED, Deadlines
 from omnid.core.control.velocity_limits import VelocityLimits
+from tests.contract.pty_motor import PtyMotor
 
 PERIOD_S = 0.05
 LIMITS = VelocityLimits(yaw_rate_radps=1.0)
@@ -153,7 +153,7 @@ def test_a_stale_pose_that_was_relocalised_moves_no_goal() -> None:
 
 def test_a_real_serial_line_shows_the_same() -> None:
     """In real time on a pty; on a busy machine the bound is the lead times the motor controller's gain."""
-    twin = SimulatedMotor(SimulatedLine(limits=FAST))
+    twin = PtyMotor(SimulatedLine(limits=FAST))
     fastest_radps = 0.0
     with contextlib.closing(twin), contextlib.closing(SerialMotor(twin.port, timeout_s=1.0, watchdog_ms=9000)) as wire:
         controller, until_s = Controller(wire, SETTINGS, PERIOD_S), time.monotonic() + 2.5

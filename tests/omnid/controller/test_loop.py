@@ -11,7 +11,6 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from omnid.controller import process
 from omnid.controller.controller import Controller
 from omnid.controller.ipc import Channel, socket_pair
@@ -23,6 +22,7 @@ from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControllerPose
 from omnid.core.control.safety_rules import ENDS
 from omnid.engine.realtime import RealtimeSettings
+from tests.contract.pty_motor import PtyMotor
 from tests.omnid.controller.bench import AHEAD, PERIOD_S, UNATTENDED, Wheels
 
 MANY = 100  # messages that wait together, more than one tick may leave over
@@ -142,7 +142,7 @@ def test_ticks_keep_the_rhythm_of_the_settings() -> None:
     """The times at which ticks were due are multiples of the period, however late each was."""
     ours, theirs = socket_pair()
     daemon, period_s = Channel(ours), 0.04
-    with contextlib.closing(SimulatedMotor()) as motor, ours:
+    with contextlib.closing(PtyMotor()) as motor, ours:
         settings = MotorSettings(port=motor.port, rate_hz=1 / period_s, watchdog_ms=5000)
         daemon.send(ControllerStart(settings, UNATTENDED, RealtimeSettings(lock_memory=False, motor_priority=0)))
         thread = threading.Thread(target=run_controller, args=(Channel(theirs),))

@@ -13,10 +13,11 @@ from pathlib import Path
 
 import pytest
 
-from drivers.motors.simulated.simulated_motor import SIMULATED_CONTROLLERS, SimulatedController, SimulatedMotor
+from drivers.motors.simulated.simulated_motor import SIMULATED_CONTROLLERS, SimulatedController
 from omnid.controller.motor_settings import DriveSettings, MotorSettings
 from omnid.doctor.wheel_wiring import WiringTest
 from omnid.errors import OmnidError
+from tests.contract.pty_motor import PtyMotor
 from tests.replay.command import Command
 from tests.waiting import wait_until
 
@@ -77,12 +78,12 @@ class Person:
 
 
 @contextlib.contextmanager
-def simulated(protocol: str, **wiring: object) -> Iterator[tuple[MotorSettings, Person, SimulatedMotor]]:
+def simulated(protocol: str, **wiring: object) -> Iterator[tuple[MotorSettings, Person, PtyMotor]]:
     """Yield settings that do not know the wiring, a person, and the base."""
     drive = DriveSettings(wheel_radius_m=RADIUS_M, gear=20.0)
     true = replace(drive.geometry(), **wiring)  # type: ignore[arg-type]
     watched = WatchedController(SIMULATED_CONTROLLERS[protocol](true))
-    with contextlib.closing(SimulatedMotor(watched)) as motor:
+    with contextlib.closing(PtyMotor(watched)) as motor:
         # At 5 Hz an answer may take 0.16 s: a busy computer is not what is tested here.
         settings = MotorSettings(motor.port, protocol, rate_hz=5.0, watchdog_ms=1000, drive=drive)
         yield settings, Person(watched), motor
