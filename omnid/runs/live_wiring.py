@@ -51,9 +51,7 @@ from omnid.stages.obstacles import ADVICE
 from omnid.stages.places import Places
 from omnid.stages.synchronise import Synchronise
 from omnid.transport.bus import Bus
-from omnid.transport.commands import CommandReceiver
-from omnid.transport.freshness import Freshness
-from omnid.transport.navigation_commands import NavigationReceiver, RequestQueue
+from omnid.transport.commands import CommandReceiver, Freshness, NavigationReceiver, RequestQueue
 from omnid.transport.requests import Answer, Request
 from omnid.transport.status_names import DISARMED_BY_STOP
 from omnid.transport.topics import ARM, MAP, MAP_TOPICS, NAVIGATION_TOPICS, SENSOR_TOPICS, TIME, command_topics

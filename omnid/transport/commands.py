@@ -1,25 +1,43 @@
-"""What comes from the network, validated: commands and contacts below `<robot>/cmd`, samples of wheels and gyro.
+"""What comes from the network, validated: commands and contacts, requests to the navigation, samples; below `cmd`.
 
-twist is a geometry_msgs/msg/TwistStamped in base_link: linear.x m/s, angular.z rad/s; or a plain Twist, whose stamp is
-the time of sending that rmw_zenoh attaches. heading is a
-geometry_msgs/msg/Vector3Stamped: x the speed in m/s, z the heading in odom in rad. Both also exist for each source of
-commands, as cmd/planner/twist. stop may have any payload. arm is a std_msgs/msg/Header with the time it was sent.
-bumper and cliff are std_msgs/msg/Bool with the time of sending attached: all but a fresh False is a contact.
+    twist              geometry_msgs/msg/TwistStamped in base_link: linear.x m/s, angular.z rad/s; or a plain Twist,
+                       whose stamp is the time of sending that rmw_zenoh attaches
+    heading            geometry_msgs/msg/Vector3Stamped: x the speed in m/s, z the heading in odom in rad
+    stop               anything
+    arm                std_msgs/msg/Header with the time it was sent
+    bumper, cliff      std_msgs/msg/Bool with the time of sending attached: all but a fresh False is a contact
+    goal, path         geometry_msgs/msg/PoseStamped, nav_msgs/msg/Path in map or odom; a quaternion of zeros asks for
+                       no heading
+    navigation, route  std_msgs/msg/String: "cancel", "pause", "resume"; "teach NAME [replace]", "finish", "repeat NAME
+                       [reverse] [loops=N]", "stop". A String has no stamp of its own: its time of sending is attached,
+                       or it is the last word, stamp=NANOSECONDS
+    wheel_odom, imu, joint_states  nav_msgs/msg/Odometry, Imu, JointState
 
-When a message was sent is judged by one rule (omnid.transport.freshness): what can begin or resume a motion must have
-been sent just now, what goes on with one is at least as old as its arrival, what ends one is taken in any case.
+twist and heading also exist for each source of commands, as cmd/planner/twist. Samples are below `cmd`, too, because
+they move the pose while the cameras show nothing: only programs that may command the robot may write them.
 
-Samples are wheel_odom (nav_msgs/msg/Odometry), imu (Imu) and joint_states (JointState). They are below `cmd`, too,
-because they move the pose while the cameras show nothing: only programs that may command the robot may write them.
+When was a message sent? One rule (`Freshness`) for all that can begin, resume or release a motion. All times in it are
+the robot's CLOCK_MONOTONIC. A message says when it was sent by
+
+    echo   the robot's own time, as the robot told it to the sender, attached; no clock of anybody else is in it
+    stamp  Unix time by the sender's clock, in its header or attached; compared with the robot's clocks
+
+and the nearer of the two to its arrival counts. What can begin a motion (arm, a goal, the first setpoint of a stream,
+the release of a contact) must say it, and have been sent within stale_s of its arrival: a message that waited in a
+network, or was recorded, begins none. What goes on with a motion is as old as it says, and at least as its arrival; it
+need not say anything. What ends a motion is taken in any case.
 """
 
 from __future__ import annotations
 
 import math
+import re
+import secrets
 import time
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
+from queue import SimpleQueue
 from typing import Final, NamedTuple, Protocol
 
 from drivers.logs.ros_messages import JointWheels
@@ -28,32 +46,108 @@ from omnid.core.control.arming import OLDER_THAN_STOP, ArmRequest
 from omnid.core.control.command_sources import OPERATOR, PLANNER, TimedSetpoint
 from omnid.core.control.contacts import BUMPER, CLIFF
 from omnid.core.control.heading_controller import Setpoint
+from omnid.core.nanoseconds import S_PER_NS
+from omnid.core.navigation.path import FARTHEST_M
+from omnid.core.navigation.requests import (
+    GoalRequest,
+    NavigationCommand,
+    NavigationFrame,
+    NavigationRequest,
+    PathRequest,
+    RouteAction,
+    RouteRequest,
+    is_halt,
+    navigation_verb,
+    route_request,
+)
+from omnid.engine.robot_clock import RobotClock, duration_words
 from omnid.errors import OmnidError
-from omnid.transport import topics
-from omnid.transport.codec import ASIDE_NAMES, bool_from_cdr, heading_from_cdr, stamp_from_cdr, twist_from_cdr
-from omnid.transport.freshness import Freshness
-from omnid.transport.requests import Answer, Refused, Request
+from omnid.plain_text import plain
+from omnid.transport import codec, topics
+from omnid.transport.codec import OK, DiagnosticStatus
+from omnid.transport.requests import MOST_OPEN, Answer, Request
 from omnid.transport.sensor_codec import sample_from_cdr
-from omnid.transport.topics import ARM, HEADING, SENSOR_TOPICS, STOP, TWIST, setpoint_topics
+from omnid.transport.status_names import REFUSED_PREFIX, REQUESTS
 
-LONGEST_PAYLOAD: Final = 4096  # bytes
-LONGEST_SAMPLE: Final = 8192  # bytes
-MAX_SPEED_MPS, MAX_YAW_RATE_RADPS, MAX_HEADING_RAD = 20.0, 50.0, 1000.0  # larger numbers are faults of the sender
+LONGEST_PAYLOAD, LONGEST_PATH = 4096, 1 << 20  # bytes
+# Larger numbers are faults of the sender.
+MAX_SPEED_MPS, MAX_YAW_RATE_RADPS, MAX_HEADING_RAD = 20.0, 50.0, 1000.0
 LEAST_SPEED: Final = 1e-3  # m/s, rad/s; less in another direction is noise of a stick, more is another motion
 ASIDE: Final = "not possible with a differential drive"
 MALFORMED: Final = "malformed"
 SAME_NAME: Final = "another robot has this name"
+UNSTAMPED: Final = "no stamp"
+TOO_OLD, EARLY = "too old", "stamp in the future"
+_CLOCKS: Final = (
+    "synchronise the clocks, or stamp with the robot's own time: omnid.client attaches it, another program may repeat "
+    "the stamp of the newest odom; controller.deadlines.command_s is the longest age"
+)
 _ADVICE: Final = {
     MALFORMED: "twist takes TwistStamped or Twist, heading Vector3Stamped, arm Header, bumper and cliff Bool, as CDR",
     SAME_NAME: "change bus.robot of one of them",
     "wrong frame": "give base_link for twist, odom for heading, or none",
     "unknown topic": "see controller.sources.names",
+    UNSTAMPED: "fill in the stamp (ROS 2: `header: auto`; String: last word stamp=NANOSECONDS), or repeat that of odom",
+    TOO_OLD: f"on a busy computer try again; else {_CLOCKS}",
+    EARLY: _CLOCKS,
 }
-_MAX_TOPIC: Final = 60  # characters of a topic in the log
+_STAMPED: Final = re.compile(r"(.*\S)\s+stamp=(\d{1,19})\s*", re.DOTALL)
 
 
-def _refused(reason: str) -> Refused:
-    return Refused(reason, f"{reason}; {_ADVICE[reason]}" if reason in _ADVICE else "")
+class Refused(OmnidError):  # noqa: N818 - named after what it reports
+    """A message that is not obeyed; reason: in the words that are counted. str() says more, and what to do."""
+
+    def __init__(self, reason: str, found: str = "") -> None:
+        """found: what was measured; a sentence of its own, with the remedy, where there is no advice for the reason."""
+        words = f"{reason}: {found}" if found else reason
+        super().__init__(f"{words}; {_ADVICE[reason]}" if reason in _ADVICE else found or reason)
+        self.reason = reason
+
+
+class Freshness:
+    """Judges when messages were sent; arrival_ns is when they came."""
+
+    def __init__(self, stale_s: float, clock: RobotClock | None = None, simulated: RobotClock | None = None) -> None:
+        """clock: that of the computer. simulated: that of a simulated robot, of which a stamp may be as well."""
+        self.stale_ns = round(stale_s * 1e9)
+        self._clock, self._simulated = clock or RobotClock(), simulated
+        self._zero_ns = secrets.randbits(61)  # an echo of an earlier run is none of this one
+
+    def own_time(self) -> str:
+        """Return the robot's own time for senders, who repeat it as an echo."""
+        return str(time.monotonic_ns() + self._zero_ns)
+
+    def sent_ns(self, request: Request, arrival_ns: int, stamp_ns: int = 0) -> int | None:
+        """Return when a message was sent; None: it does not say it.
+
+        stamp_ns: in the message; 0: that which is attached counts.
+        """
+        found_ns = [request.echo_ns - self._zero_ns] if request.echo_ns else []
+        if unix_ns := stamp_ns or request.sent_ns:
+            found_ns.append(self._clock.stamp_ns(unix_ns))
+            if self._simulated is not None:
+                found_ns.append(arrival_ns - self._simulated.age_ns(unix_ns))
+        return min(found_ns, key=lambda sent_ns: abs(arrival_ns - sent_ns), default=None)
+
+    def require(self, request: Request, arrival_ns: int, stamp_ns: int = 0, *, goes_on: bool = False) -> int:
+        """Return when a message was sent. Raise Refused where that was long ago.
+
+        goes_on: it goes on with a motion; else it can begin one, and must say when it was sent.
+        """
+        sent_ns = self.sent_ns(request, arrival_ns, stamp_ns)
+        if goes_on:
+            sent_ns = arrival_ns if sent_ns is None else min(arrival_ns, sent_ns)
+        if sent_ns is None:
+            raise Refused(UNSTAMPED)
+        age_ns, by_robot = arrival_ns - sent_ns, "by the robot's clock"
+        if age_ns < -self.stale_ns:
+            raise Refused(EARLY, f"by {duration_words(-age_ns * S_PER_NS)} {by_robot}")
+        if age_ns > self.stale_ns:
+            raise Refused(TOO_OLD, f"sent {duration_words(age_ns * S_PER_NS)} ago {by_robot}")
+        return sent_ns
+
+
+# Commands.
 
 
 class CommandMessage(NamedTuple):
@@ -65,10 +159,10 @@ class CommandMessage(NamedTuple):
 
 def twist_command(payload: bytes) -> CommandMessage:
     """Decode a speed and a yaw rate. Raise OmnidError for anything else."""
-    stamp_ns, frame, velocity_mps, yaw_rate_radps, aside = twist_from_cdr(payload)
+    stamp_ns, frame, velocity_mps, yaw_rate_radps, aside = codec.twist_from_cdr(payload)
     _check_frame(frame, "base_link")
     setpoint = Setpoint(_within(velocity_mps, MAX_SPEED_MPS), None, _within(yaw_rate_radps, MAX_YAW_RATE_RADPS))
-    for name, speed in zip(ASIDE_NAMES, aside, strict=True):
+    for name, speed in zip(codec.ASIDE_NAMES, aside, strict=True):
         if not abs(speed) <= LEAST_SPEED:
             raise Refused(ASIDE, f"twist.{name} = {speed:g} is {ASIDE}; send linear.x and angular.z only")
     return CommandMessage(stamp_ns, setpoint)
@@ -76,23 +170,29 @@ def twist_command(payload: bytes) -> CommandMessage:
 
 def heading_command(payload: bytes) -> CommandMessage:
     """Decode a speed and a heading in odom. Raise OmnidError for anything else."""
-    stamp_ns, frame, velocity_mps, heading_rad = heading_from_cdr(payload)
+    stamp_ns, frame, velocity_mps, heading_rad = codec.heading_from_cdr(payload)
     _check_frame(frame, "odom")
-    setpoint = Setpoint(_within(velocity_mps, MAX_SPEED_MPS), _within(heading_rad, MAX_HEADING_RAD))
-    return CommandMessage(stamp_ns, setpoint)
+    return CommandMessage(
+        stamp_ns, Setpoint(_within(velocity_mps, MAX_SPEED_MPS), _within(heading_rad, MAX_HEADING_RAD))
+    )
 
 
 def _within(value: float, limit: float) -> float:
     if not math.isfinite(value):
-        raise _refused("not finite")
+        raise Refused("not finite")
     if abs(value) > limit:
-        raise _refused("out of range")
+        raise Refused("out of range")
     return value
 
 
 def _check_frame(frame: str, expected: str) -> None:
     if frame not in ("", expected):
-        raise _refused("wrong frame")
+        raise Refused("wrong frame")
+
+
+def _check_length(payload: bytes) -> None:
+    if len(payload) > LONGEST_PAYLOAD:
+        raise Refused("too long")
 
 
 class CommandTarget(Protocol):
@@ -143,12 +243,12 @@ class CommandReceiver:
         self._stop_ns = 0  # arrival of the newest stop
         # What is done with each message but a stop, given its time of arrival.
         self._actions: dict[str, Callable[[Request, int], None]] = {
-            ARM: self._arm,
+            topics.ARM: self._arm,
             topics.BUMPER: partial(self._touch, BUMPER),
             topics.CLIFF: partial(self._touch, CLIFF),
         }
-        parsers = {TWIST: twist_command, HEADING: heading_command}
-        for topic, (source, kind) in setpoint_topics(sources).items():
+        parsers = {topics.TWIST: twist_command, topics.HEADING: heading_command}
+        for topic, (source, kind) in topics.setpoint_topics(sources).items():
             self._actions[topic] = partial(self._drive, source, parsers[kind])
         self._streams: dict[str, _Stream] = {}  # by source; none after a stop
         self.accepted = self.stops = self.arms = 0
@@ -159,7 +259,7 @@ class CommandReceiver:
     def receive(self, request: Request) -> Answer | None:
         """Handle one message, never raises; return the refusal, None where there is none or the target decides."""
         arrival_ns = time.monotonic_ns()  # before anything else: a stop that arrives meanwhile voids the command
-        if request.topic == STOP:
+        if request.topic == topics.STOP:
             self._stop_ns = arrival_ns
             self._streams.clear()
             self.stops += 1
@@ -167,21 +267,16 @@ class CommandReceiver:
             return None
         try:
             if request.topic not in self._actions:
-                raise _refused("unknown topic")
+                raise Refused("unknown topic")
             self._actions[request.topic](request, arrival_ns)
-        except Refused as refusal:
-            return self._refuse(request.topic, refusal)
-        except OmnidError:
-            return self._refuse(request.topic, _refused(MALFORMED))
+        except OmnidError as error:
+            refusal = error if isinstance(error, Refused) else Refused(MALFORMED)
+            self.refused[refusal.reason] += 1
+            self.refusal = f"a command on {plain(request.topic)} is refused: {refusal}"
+            if self._report is not None:
+                self._report(self.refusal)
+            return Answer(False, str(refusal))
         return None
-
-    def _refuse(self, topic: str, refusal: Refused) -> Answer:
-        """Count and report a refusal."""
-        self.refused[refusal.reason] += 1
-        self.refusal = f"a command on {ascii(topic)[1:-1][:_MAX_TOPIC]} is refused: {refusal}"
-        if self._report is not None:
-            self._report(self.refusal)
-        return Answer(False, str(refusal))
 
     def _touch(self, contact: str, request: Request, arrival_ns: int) -> None:
         """Pass the state of a contact on.
@@ -193,7 +288,7 @@ class CommandReceiver:
         try:
             _check_length(request.payload)
             newest_ns = self._touched_ns.get(request.topic, 0)
-            if bool_from_cdr(request.payload):
+            if codec.bool_from_cdr(request.payload):
                 sent_ns = self._freshness.sent_ns(request, arrival_ns) or 0
                 self._touched_ns[request.topic] = max(newest_ns, min(sent_ns, arrival_ns))
             else:
@@ -203,11 +298,11 @@ class CommandReceiver:
 
     def _arm(self, request: Request, arrival_ns: int) -> None:
         _check_length(request.payload)
-        sent_ns = self._freshness.require(request, arrival_ns, stamp_from_cdr(request.payload))
+        sent_ns = self._freshness.require(request, arrival_ns, codec.stamp_from_cdr(request.payload))
         if not self._is_unique():
-            raise _refused(SAME_NAME)
+            raise Refused(SAME_NAME)
         if sent_ns <= self._stop_ns:
-            raise _refused(OLDER_THAN_STOP)
+            raise Refused(OLDER_THAN_STOP)
         self._streams.clear()
         self.arms += 1
         self._target.arm(ArmRequest(arrival_ns, request.id))
@@ -218,18 +313,119 @@ class CommandReceiver:
         goes_on = (
             stream is not None
             and stream.sender == request.sender
-            and self._freshness.goes_on(stream.arrival_ns, arrival_ns)
+            and arrival_ns - stream.arrival_ns <= self._freshness.stale_ns
         )
-        judge = self._freshness.of_stream if goes_on else self._freshness.require
-        age_ns = max(0, arrival_ns - judge(request, arrival_ns, command.stamp_ns))
+        sent_ns = self._freshness.require(request, arrival_ns, command.stamp_ns, goes_on=goes_on)
         self._streams[source] = _Stream(request.sender, arrival_ns)
         self.accepted += 1
+        age_ns = max(0, arrival_ns - sent_ns)
         self._target.send_setpoint(TimedSetpoint(arrival_ns, command.setpoint, source, request.sender, age_ns))
 
 
-def _check_length(payload: bytes) -> None:
-    if len(payload) > LONGEST_PAYLOAD:
-        raise _refused("too long")
+# Requests to the navigation.
+
+
+class NavigationReceiver:
+    """Passes valid requests on and counts the others; called from threads of the bus, never raises.
+
+    What ends a motion (cancel, pause, finish, stop) is obeyed whatever its age. All else needs a fresh stamp: a request
+    that waited in a network must not start a drive minutes later.
+    """
+
+    def __init__(
+        self,
+        target: Callable[[NavigationCommand], None],
+        freshness: Freshness,
+        *,
+        report: Callable[[str], None] | None = None,
+    ) -> None:
+        """target: may be called from any thread. freshness: as of CommandReceiver. report: takes lines for the log."""
+        self._target, self._freshness, self._report = target, freshness, report
+        self.accepted = 0
+        self.refused: Counter[str] = Counter()  # by topic
+
+    def status(self) -> DiagnosticStatus:
+        """Return how many requests were accepted, and how many were not valid, by topic."""
+        refused = {f"{REFUSED_PREFIX}{key}": str(count) for key, count in sorted(self.refused.items())}
+        return DiagnosticStatus(REQUESTS, OK, "", {"accepted": str(self.accepted), **refused})
+
+    def receive(self, message: Request) -> Answer | None:
+        """Handle one message; return the refusal, None where the target answers."""
+        try:
+            request, stamp_ns = navigation_request(message.topic, message.payload)
+            is_finish = isinstance(request, RouteRequest) and request.action is RouteAction.FINISH
+            if not (is_halt(request) or is_finish):
+                self._freshness.require(message, time.monotonic_ns(), stamp_ns)
+        except OmnidError as error:
+            self.refused[message.topic] += 1
+            if self._report is not None:
+                self._report(f"a request on {message.topic} is refused: {error}")
+            return Answer(False, str(error))
+        self.accepted += 1
+        self._target(NavigationCommand(request, time.time_ns(), stamp_ns or message.sent_ns, message.id))
+        return None
+
+
+def navigation_request(topic: str, payload: bytes) -> tuple[NavigationRequest, int]:
+    """Decode a request and its stamp [ns], 0 where it has none. Raise OmnidError for anything else."""
+    longest = LONGEST_PATH if topic == topics.PATH else LONGEST_PAYLOAD
+    if len(payload) > longest:
+        raise OmnidError(f"{len(payload)} bytes: expected at most {longest}")
+    if topic == topics.GOAL:
+        goal = codec.goal_from_cdr(payload)
+        _check_near(goal.x_m, goal.y_m)
+        return GoalRequest(_frame(goal.frame), goal.x_m, goal.y_m, goal.heading_rad), goal.stamp_ns
+    if topic == topics.PATH:
+        path = codec.path_from_cdr(payload)
+        _check_near(*path.xy.ravel())
+        return PathRequest(_frame(path.frame), path.xy, path.heading_rad), path.stamp_ns
+    text = codec.string_from_cdr(payload)
+    stamped = _STAMPED.fullmatch(text)
+    text, stamp_ns = (stamped[1], int(stamped[2])) if stamped else (text, 0)
+    return (navigation_verb(text) if topic == topics.NAVIGATION else route_request(text)), stamp_ns
+
+
+def _frame(name: str) -> NavigationFrame:
+    if name not in list(NavigationFrame):
+        raise OmnidError(f"the frame {name[:40]!a}: expected map or odom")
+    return NavigationFrame(name)
+
+
+def _check_near(*positions_m: float) -> None:
+    if not all(abs(value) <= FARTHEST_M for value in positions_m):
+        raise OmnidError(f"a position beyond {FARTHEST_M:g} m: check the sender")
+
+
+class RequestQueue:
+    """Requests from threads of the bus to the graph: a source that loses none but the oldest of too many."""
+
+    def __init__(self) -> None:
+        self._waiting: deque[NavigationCommand] = deque(maxlen=MOST_OPEN)
+        self._wake: SimpleQueue[bool] = SimpleQueue()  # True: there is a request; False: the end
+
+    def put(self, command: NavigationCommand) -> None:
+        """Add a request; from any thread."""
+        self._waiting.append(command)
+        self._wake.put(True)
+
+    def end(self) -> None:
+        """End `batches`; from any thread."""
+        self._wake.put(False)
+
+    def batches(self) -> Iterator[Iterable[NavigationCommand]]:
+        """Yield for each request all that wait; taking them removes them.
+
+        An inbox may drop a batch: the next one has its requests.
+        """
+        while self._wake.get():
+            yield self._taken()
+
+    def _taken(self) -> Iterator[NavigationCommand]:
+        while self._waiting:
+            yield self._waiting.popleft()
+
+
+# Samples of wheels and gyro.
 
 
 class SensorReceiver:
@@ -256,9 +452,9 @@ class SensorReceiver:
         try:
             if key not in self._topics:
                 raise OmnidError("it is not used: see motion.wheels, motion.wheel_joints and motion.imu")
-            if len(payload) > LONGEST_SAMPLE:
-                raise OmnidError(f"it has {len(payload)} bytes, more than {LONGEST_SAMPLE}")
-            sample = sample_from_cdr(payload, SENSOR_TOPICS[key], self._stamp_ns, self._joints)
+            if len(payload) > LONGEST_PAYLOAD:
+                raise OmnidError(f"it has {len(payload)} bytes, more than {LONGEST_PAYLOAD}")
+            sample = sample_from_cdr(payload, topics.SENSOR_TOPICS[key], self._stamp_ns, self._joints)
         except OmnidError as error:
             self.refused[key] += 1
             if self.refused[key] == 1:

@@ -9,8 +9,6 @@ from __future__ import annotations
 import json
 from typing import Final, NamedTuple
 
-from omnid.errors import OmnidError
-
 MOST_OPEN: Final = 64  # requests that wait for their answers; each holds a message in memory
 
 
@@ -22,16 +20,7 @@ class Request(NamedTuple):
     sender: str = ""  # identity of the program that sent it, empty if unknown
     sent_ns: int = 0  # of Unix time, for a message without stamp; 0: it does not say it
     id: int = 0  # rises with each message
-    echo_ns: int = 0  # the robot's own time as the sender repeats it (omnid.transport.freshness); 0: it does not
-
-
-class Refused(OmnidError):  # noqa: N818 - named after what it reports
-    """A message that is not obeyed; reason: in the words that are counted. str() says more, and what to do."""
-
-    def __init__(self, reason: str, words: str = "") -> None:
-        """words: default: the reason."""
-        super().__init__(words or reason)
-        self.reason = reason
+    echo_ns: int = 0  # the robot's own time as the sender repeats it (omnid.transport.commands); 0: it does not
 
 
 class Answer(NamedTuple):

@@ -35,20 +35,12 @@ _RETRY_S: Final = 0.5  # between two attempts of a client to connect
 _ALIVE_TIMEOUT_S: Final = 1.0
 _NAMED: Final = 5  # Most robots that a message names.
 _MAX_COMMAND_BYTES: Final = 16_384  # Limit of all commands but paths.
-_MAX_SESSIONS: Final = 128  # each holds received fragments in memory
 _DEFAULTS: Final[dict[str, Any]] = {  # where zenoh's own file leaves zenoh's
     "connect/retry": {"period_init_ms": 500, "period_max_ms": 2000, "period_increase_factor": 2},
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,  # else a peer makes this one connect to endpoints of its choice
     "transport/shared_memory/enabled": False,  # faster above 100 kB only, and leaves files behind
     "transport/link/tx/queue/size/real_time": 16,  # 2 are soon full on a busy host, and poses are dropped
-}
-_GUARDS: Final[dict[str, Any]] = {
-    "transport/link/rx/max_message_size": 1 << 20,  # zenoh collects fragments up to 1 GiB before access rules apply
-    # Connections that send nothing hold one of the places for the time-out: they lock others out for 1 s at most.
-    # zenoh's defaults are 100 places and 10 s.
-    "transport/unicast/accept_pending": 1000,
-    "transport/unicast/accept_timeout": 1000,
 }
 _ALWAYS: Final = (
     "declare_subscriber",
@@ -157,8 +149,8 @@ def zenoh_config(config: BusConfig, *, guarded: bool = True) -> zenoh.Config:
     # 2. omnid's defaults, where the file says nothing.
     defaults = dict(_DEFAULTS)
     if guarded:
-        defaults |= _GUARDS
-        defaults["transport/unicast/max_sessions"] = _MAX_SESSIONS
+        # zenoh collects fragments up to 1 GiB before access rules apply.
+        defaults["transport/link/rx/max_message_size"] = 1 << 20
         defaults["low_pass_filter"] = _size_limits(config)
         defaults["access_control"] = _access_control(config)
     for key, value in defaults.items():

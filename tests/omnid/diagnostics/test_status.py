@@ -28,8 +28,7 @@ from omnid.stages.lockstep_drive import controller_pose
 from omnid.stages.synchronise import Synchronise
 from omnid.transport import codec
 from omnid.transport.codec import ERROR, OK, WARN, DiagnosticStatus, diagnostics_cdr
-from omnid.transport.commands import CommandReceiver
-from omnid.transport.freshness import Freshness
+from omnid.transport.commands import CommandReceiver, Freshness
 from omnid.transport.requests import Request
 from omnid.transport.status_names import Key, short_name
 from tests.omnid.small_pair import small_depth

@@ -7,7 +7,6 @@ import json
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -19,13 +18,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-import zenoh
 from zenoh import ext
 
 from omnid.client import Pose, Robot, Unreachable, subscribe
 from omnid.errors import OmnidError
 from omnid.transport import codec, ros2
-from omnid.transport import session as transport_session
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import ERROR, OK, WARN, PoseAttachment
 from omnid.transport.session import open_client, open_session, zenoh_config
@@ -407,26 +404,3 @@ def test_does_not_connect_to_a_peer_that_another_one_introduces() -> None:
         wait_until(lambda: bool(commands))
         assert bus._session is not None
         assert intruder.zid() not in bus._session.info.peers_zid() and not received.is_set()
-
-
-def test_more_sessions_than_there_are_places_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each session holds fragments in memory. The places are few here; the bus is the real one."""
-    monkeypatch.setattr(transport_session, "_MAX_SESSIONS", 3)
-    endpoint = free_endpoint()
-    place = {"mode": "client", "connect__endpoints": [endpoint], "connect__timeout_ms": 2000}
-    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))), contextlib.ExitStack() as stack:
-        for _ in range(3):
-            stack.enter_context(session(**place))
-        with pytest.raises(zenoh.ZError):
-            stack.enter_context(session(**place))
-
-
-def test_idle_connections_do_not_lock_others_out() -> None:
-    """Twice as many connections as zenoh accepts by default, none of which sends a byte."""
-    endpoint = free_endpoint()
-    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))), contextlib.ExitStack() as stack:
-        port = int(endpoint.rpartition(":")[2])
-        for _ in range(200):
-            stack.enter_context(socket.create_connection(("127.0.0.1", port)))
-        with Robot(connect=(endpoint,), timeout_s=5.0) as operator:  # zenoh's own limits: 10 s
-            assert operator.alive

@@ -40,13 +40,13 @@ from omnid.transport.codec import (
     string_from_cdr,
 )
 from omnid.transport.commands import (
+    LONGEST_PATH,
     LONGEST_PAYLOAD,
     CommandReceiver,
+    Freshness,
+    NavigationReceiver,
     SensorReceiver,
 )
-from omnid.transport.freshness import Freshness
-from omnid.transport.navigation_commands import LONGEST_PAYLOAD as LONGEST_PATH
-from omnid.transport.navigation_commands import NavigationReceiver
 from omnid.transport.requests import Answer, Request
 from omnid.transport.sensor_codec import gyro_cdr, wheel_cdr
 from omnid.transport.topics import IMU, JOINT_STATES, SENSOR_TOPICS, WHEEL_ODOM
