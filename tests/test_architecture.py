@@ -62,9 +62,7 @@ RULES = (
         ("threading", "_thread"),
         excepted=(
             "omnid/engine/graph.py",
-            "omnid/engine/inbox.py",
             "omnid/engine/threads.py",
-            "omnid/engine/ticker.py",
         ),
     ),
     Rule(

@@ -98,7 +98,7 @@ def _recorded(args: argparse.Namespace, config: Config) -> tuple[OpenCamera, Log
     """Return what opens the cameras of a log, and its wheels and gyro: no others fit its images."""
     from drivers.cameras.log_camera import LogCamera, LogClock, LogImages, LogMotion
     from omnid.engine.logging_setup import log
-    from omnid.runs.sensor_sources import motion_topics
+    from omnid.runs.session import motion_topics
 
     images = LogImages.load(args.log, args.lower, args.upper, motion_topics(config), config.cameras.bits)
     for warning in images.warnings:

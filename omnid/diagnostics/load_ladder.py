@@ -33,7 +33,7 @@ TEXTS: Final[Mapping[LoadLevel, str]] = {
 class LoadLadder:
     """Chooses the load level from the share of the images that the pairing drops.
 
-    A ticker calls `observe` with the period PERIOD_S; stages read `level` from other threads.
+    A ticker calls `observe` with the period PERIOD_S; the pairs of images carry the level to the stages.
     """
 
     def __init__(self) -> None:
@@ -44,8 +44,8 @@ class LoadLadder:
         self._descended = False  # True if the last change of the level resumed work
         self._changes = 0
 
-    def observe(self, pairing: StageStats) -> None:
-        """Choose the level from the counters of the stage that takes the images."""
+    def observe(self, pairing: StageStats) -> LoadLevel:
+        """Return the level that follows from the counters of the stage that takes the images."""
         # 1. The share of the images that were dropped since the last observation.
         seen = pairing.processed, pairing.dropped
         taken, dropped = (now - before for now, before in zip(seen, self._seen, strict=True))
@@ -63,6 +63,7 @@ class LoadLadder:
         elif self._calm >= self._patience and self.level > LoadLevel.FULL:
             self._descended = True
             self._change(LoadLevel(self.level - 1))
+        return self.level
 
     def _change(self, level: LoadLevel) -> None:
         self.level, self._slow, self._calm = level, 0, 0

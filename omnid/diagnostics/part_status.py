@@ -20,7 +20,7 @@ from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.robot_clock import RobotClock
 from omnid.stages.geometry import Geometry
 from omnid.stages.motion_inbox import MotionInbox
-from omnid.stages.obstacles import CameraFloor
+from omnid.stages.obstacles import CameraFloor, Obstacles
 from omnid.stages.odometry import OdometryStage
 from omnid.stages.places import Places
 from omnid.tracking_state import MapState
@@ -166,15 +166,15 @@ class ImagesStatus:
         geometry: Geometry,
         statistics: RunStatistics,
         report: Callable[[str], object],
-        fixed_share: Callable[[], float] = lambda: 0.0,
+        obstacles: Obstacles | None = None,
     ) -> None:
         """report: takes a line for the log where the message changes, and where fixed parts are found first.
 
-        fixed_share: share of the panoramas that shows what is fixed to a camera.
+        obstacles: knows what part of the panoramas shows what is fixed to a camera.
         """
         self._unwatched = Unwatched(geometry.cylinder, geometry.rig.T_base_rig @ geometry.T_rig_rect)
         self._statistics, self._report, self._message = statistics, report, LIVE
-        self._fixed_share, self._has_fixed = fixed_share, False
+        self._obstacles, self._has_fixed = obstacles, False
 
     def __call__(self) -> DiagnosticStatus:
         """Return the entry."""
@@ -187,7 +187,7 @@ class ImagesStatus:
         if message != self._message:
             self._report(f"images: {message}")
         self._message = message
-        fixed = self._fixed_share()
+        fixed = 0.0 if self._obstacles is None else self._obstacles.fixed_share
         if fixed and not self._has_fixed:
             self._report(f"images: {FIXED.format(fixed)}")
         self._has_fixed = fixed > 0

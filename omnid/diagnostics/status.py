@@ -43,7 +43,6 @@ class StatusSources(NamedTuple):
     to_pose: Histogram  # s, from the capture of images to their pose
     controller: ControllerStatistics | None
     commands: CommandReceiver | None
-    tickers: frozenset[str]  # stages whose `dropped` are missed deadlines
     others: tuple[Callable[[], DiagnosticStatus], ...] = ()  # parts that make their own entries
     clock_ns: Callable[[], int] = time.monotonic_ns  # the clock of the stamps of images and poses
 
@@ -147,8 +146,7 @@ class StatusCollector:
             yield DiagnosticStatus.of(status_names.camera_name(name), level, message, values)
 
     def _stage(self, stage: StageStats) -> DiagnosticStatus:
-        lost = Key.MISSED if stage.name in self._sources.tickers else Key.DROPPED
-        return stage_status(stage, lost, self._rate_hz(stage.name, stage.processed))
+        return stage_status(stage, self._rate_hz(stage.name, stage.processed))
 
 
 def _wheels(controller: ControllerStatistics, commands: CommandReceiver | None) -> DiagnosticStatus:
@@ -200,17 +198,13 @@ def _by_reason(prefix: str, counts: Mapping[str, int]) -> dict[str, object]:
     return {f"{prefix}{reason}": count for reason, count in dict(counts).items()}
 
 
-def stage_status(stage: StageStats, lost: Key = Key.DROPPED, rate_hz: float = math.nan) -> DiagnosticStatus:
-    """Return the entry of a stage: work is the time for a message, cpu the processor time in it.
-
-    lost: key of the counter of lost messages, or of missed deadlines.
-    """
+def stage_status(stage: StageStats, rate_hz: float = math.nan) -> DiagnosticStatus:
+    """Return the entry of a stage: work is the time for a message."""
     values = {
         Key.RATE_HZ: rate_hz,
         Key.PROCESSED: stage.processed,
-        lost: stage.dropped,
+        Key.MISSED if stage.is_ticker else Key.DROPPED: stage.dropped,
         **_times(status_names.WORK, stage.wall),
-        **_times(status_names.CPU, stage.cpu),
     }
     return DiagnosticStatus.of(status_names.stage_name(stage.name), OK, "", values)
 
@@ -240,21 +234,6 @@ def _times(name: str, histogram: Histogram) -> dict[str, float]:
         return {}
     found = zip(("p50", "p99", "max"), (*histogram.quantiles(0.5, 0.99), histogram.max_s), strict=True)
     return {time_key(name, statistic): 1e3 * value_s for statistic, value_s in found}
-
-
-class StatusTick:
-    """Action of a ticker: makes a report and passes it to the consumers."""
-
-    def __init__(
-        self, report: Callable[[], list[DiagnosticStatus]], *consumers: Callable[[list[DiagnosticStatus]], None]
-    ) -> None:
-        self._report, self._consumers = report, consumers
-
-    def __call__(self) -> None:
-        """Make and pass one report."""
-        statuses = self._report()
-        for consume in self._consumers:
-            consume(statuses)
 
 
 class Latency:

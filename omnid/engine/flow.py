@@ -6,12 +6,9 @@ from collections.abc import Callable, Iterable, Iterator
 from enum import Enum
 from typing import Any, Final, Generic, Protocol, TypeVar
 
-from omnid.engine.telemetry import StageStats, Stopwatch
+from omnid.engine.telemetry import StageStats
 
 T = TypeVar("T")
-In = TypeVar("In")
-Mid = TypeVar("Mid")
-Out = TypeVar("Out")
 T_co = TypeVar("T_co", covariant=True)
 Out_co = TypeVar("Out_co", covariant=True)
 In_contra = TypeVar("In_contra", contravariant=True)
@@ -26,16 +23,10 @@ class Policy(Enum):
 
 LOSSLESS: Final = Policy.LOSSLESS
 NEWEST: Final = Policy.NEWEST
-END: Final = object()
 
 
 class Stage(Protocol[In_contra, Out_co]):
-    """A step of the flow; may also have `finish() -> Iterable[Out]` for the results left at the end.
-
-    And `after() -> None`, called after the result of each message was passed on: for work that no reader waits for.
-    And `merge(older: In, newer: In) -> In`, which returns what takes the place of two messages where its inbox drops
-    the older one: for a part of a message that must not be lost. It is called in the writer's thread.
-    """
+    """A step of the flow; may also have `finish() -> Iterable[Out]` for the results left at the end."""
 
     def process(self, message: In_contra, /) -> Out_co | None:
         """Return the result of the message, None without one."""
@@ -59,7 +50,7 @@ class Reader(Protocol):
 
 
 class Stream(Generic[T_co]):
-    """Output of a source or a stage, with any number of readers."""
+    """Output of a source or a stage, with any number of readers, which get each message in the order of the wiring."""
 
     def __init__(self) -> None:
         self.readers: list[Reader] = []
@@ -81,11 +72,9 @@ class Slot(Generic[T]):
     def __init__(self) -> None:
         self._value: T | None = None
 
-    def put(self, value: T, /) -> None:
-        """Replace the value: one atomic reference store, safe in a signal handler."""
+    def process(self, value: T, /) -> None:
+        """Replace the value: one atomic reference store."""
         self._value = value
-
-    process = put
 
     def get(self) -> T | None:
         """Return the newest value; None before the first."""
@@ -96,37 +85,20 @@ def nothing(*_: object) -> None:
     """Do nothing: used in place of a method that a stage does not have."""
 
 
-def newest(_: object, newer: object) -> object:
-    """Return the newer one of two messages: used in place of the `merge` that a stage does not have."""
-    return newer
-
-
 class Node:
     """A stage or a sink with its counters and its output stream."""
 
     def __init__(self, stats: StageStats, work: object) -> None:
-        self.name = stats.name
         self.stats = stats
         self.stream: Stream[Any] = Stream()
         self._process: Callable[[object], object | None] = getattr(work, "process", nothing)
-        self._after: Callable[[], object] = getattr(work, "after", nothing)
         self._finish: Callable[[], Iterable[object] | None] = getattr(work, "finish", nothing)
-        self.merge: Callable[[Any, Any], object] = getattr(work, "merge", newest)
 
-    def handle(self, message: object, passed_on: Callable[[], object] = nothing) -> None:
-        """Process the message, pass its result on, and let the stage do what it has left to do.
-
-        passed_on: called between the last two.
-        """
-        watch = Stopwatch()
-        result = self._process(message)
+    def handle(self, message: object) -> None:
+        """Process the message, and pass its result on."""
+        result = self.stats.timed(self._process, message)
         if result is not None:
-            watch.pause()
             self.stream.push(result)
-            watch.resume()
-        passed_on()
-        self._after()
-        self.stats.count(watch)
 
     def finish(self) -> None:
         """Pass on the results that remain at the end of the stream."""
@@ -147,7 +119,7 @@ class Direct:
     def put(self, message: object) -> None:
         """Handle the message; after a failure of the node it is counted as dropped instead."""
         if self._alive:
-            self._alive = self._succeeds(self._node.name, self._node.handle, message)
+            self._alive = self._succeeds(self._node.stats.name, self._node.handle, message)
         else:
             self._node.stats.dropped += 1
 
@@ -156,7 +128,7 @@ class Direct:
         self._writers -= 1
         if self._writers == 0:
             if self._alive:
-                self._succeeds(self._node.name, self._finish, self._node)
+                self._succeeds(self._node.stats.name, self._finish, self._node)
             self._node.stream.end()
 
 
@@ -164,27 +136,22 @@ class Source:
     """Input of the graph: messages of an iterable."""
 
     def __init__(self, stats: StageStats, messages: Callable[[], Iterable[object]], wake: Callable[[], None]) -> None:
-        self.name = stats.name
-        self.wake = wake
+        self.stats, self.wake, self._open = stats, wake, messages
         self.ended = False
         self.stream: Stream[Any] = Stream()
-        self._stats = stats
-        self._open = messages
         self._messages: Iterator[object] | None = None
-        self._close: Callable[[], object] = nothing
 
     def step(self) -> None:
         """Pass on the next message, or set `ended`."""
         if self._messages is None:
-            messages = iter(self._open())
-            self._close = getattr(messages, "close", nothing)
-            self._messages = self._stats.timed_each(messages)
-        message = next(self._messages, END)
-        if message is END:
+            self._messages = iter(self._open())
+        try:
+            message = self.stats.timed(next, self._messages)
+        except StopIteration:
             self.ended = True
         else:
             self.stream.push(message)
 
     def close(self) -> None:
         """Close the iterable if it can be closed (a generator's `finally` runs here)."""
-        self._close()
+        getattr(self._messages, "close", nothing)()

@@ -1,4 +1,4 @@
-"""The graph of stages and its threads. Only this module and those of inboxes and tickers import threading.
+"""The graph of stages and its threads: inboxes, tickers, the end of a run. Few other modules import threading.
 
 A stream exists before it is read, so a cycle cannot be wired. Messages flow through bounded inboxes that belong to
 their readers; the end of a stream flows the same way. Inline, the same stages run in the caller's thread, each message
@@ -7,16 +7,15 @@ depth first, with the same results. With several sources, or where streams merge
 
 from __future__ import annotations
 
-import signal
 import threading
+import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 from queue import Empty, SimpleQueue
 from typing import Any, Final, TypeVar
 
 from omnid.engine.flow import (
-    END,
     LOSSLESS,
     NEWEST,
     Direct,
@@ -30,9 +29,7 @@ from omnid.engine.flow import (
     Stream,
     nothing,
 )
-from omnid.engine.inbox import InFlight, Port, StageInbox
 from omnid.engine.telemetry import StageStats, Telemetry
-from omnid.engine.ticker import Ticker
 from omnid.errors import OmnidError
 
 __all__ = ["LOSSLESS", "NEWEST", "Graph", "Policy", "Sink", "Slot", "Stage", "Stream", "Ticker"]
@@ -41,6 +38,138 @@ T = TypeVar("T")
 In = TypeVar("In")
 Out = TypeVar("Out")
 _POLL_S: Final = 0.1  # a signal handled in another thread does not wake the main one, so it polls
+_END: Final = object()  # what an inbox gives after the last message
+
+
+class InFlight:
+    """Counts the messages that wait in the inboxes of a graph, or are being processed."""
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._changed = threading.Condition()
+
+    def add(self, count: int) -> None:
+        """Add to the number of messages; a negative count: they are done or dropped."""
+        with self._changed:
+            self._count += count
+            if not self._count:
+                self._changed.notify_all()
+
+    def is_none(self, timeout_s: float) -> bool:
+        """True as soon as there is none; False after the timeout."""
+        with self._changed:
+            return self._changed.wait_for(lambda: not self._count, timeout_s)
+
+
+class Inbox:
+    """Bounded queue in front of a stage's thread; it ends when all its writers have ended.
+
+    Up to `depth` messages of each writer wait. With the policy NEWEST a writer drops its own oldest message: so none
+    of two cameras takes the place of the other one's image.
+    """
+
+    def __init__(self, stats: StageStats, writers: int, depth: int, policy: Policy, in_flight: InFlight) -> None:
+        """in_flight: the count of the graph, in which a message is until its reader asks for the next one."""
+        self._stats, self._writers, self._depth, self._policy = stats, writers, depth, policy
+        self._in_flight, self._is_processing = in_flight, False
+        self._messages: deque[tuple[int, object]] = deque()  # with the number of the writer
+        self._changed = threading.Condition()
+        self._closed = False
+
+    def put(self, writer: int, message: object) -> None:
+        """Add a message of a writer."""
+        with self._changed:
+            own = [entry for entry in self._messages if entry[0] == writer]
+            if self._policy is LOSSLESS:
+                self._changed.wait_for(lambda: self._closed or len(self._messages) < self._depth * self._writers)
+            elif len(own) >= self._depth:
+                self._messages.remove(own[0])
+                self._in_flight.add(-1)
+                self._stats.dropped += 1
+            if self._closed:  # the reader has ended
+                self._stats.dropped += 1
+                return
+            self._messages.append((writer, message))
+            self._in_flight.add(1)
+            self._stats.busy_since_ns = self._stats.busy_since_ns or time.monotonic_ns()
+            self._changed.notify_all()
+
+    def get(self) -> object:
+        """Return the next message, _END after the last one; wait for it. The message before is done."""
+        if self._is_processing:
+            self._in_flight.add(-1)
+        with self._changed:
+            self._stats.busy_since_ns = time.monotonic_ns() if self._messages else 0
+            self._changed.wait_for(lambda: self._messages or not self._writers or self._closed)
+            self._is_processing = bool(self._messages)
+            if not self._messages:
+                return _END
+            self._changed.notify_all()
+            return self._messages.popleft()[1]
+
+    def end(self) -> None:
+        """Count one writer less."""
+        with self._changed:
+            self._writers -= 1
+            self._changed.notify_all()
+
+    def close(self) -> None:
+        """Drop and count all messages, those to come too: the reader has ended."""
+        with self._changed:
+            self._closed = True
+            self._stats.dropped += len(self._messages)
+            self._in_flight.add(-len(self._messages))
+            self._messages.clear()
+            self._stats.busy_since_ns = 0
+            self._changed.notify_all()
+
+
+class Port:
+    """The end of one writer's stream at an inbox; a Reader."""
+
+    def __init__(self, inbox: Inbox, writer: int) -> None:
+        self._inbox, self._writer = inbox, writer
+        self.end = inbox.end
+
+    def put(self, message: object) -> None:
+        """Add a message of the writer."""
+        self._inbox.put(self._writer, message)
+
+
+class Ticker:
+    """Calls an action at a fixed rate, independent of the stages.
+
+    The graph calls the action's optional `close` once, also after an error. `stats.dropped` counts missed deadlines: of
+    those that have passed, the newest is served, without drift and burst.
+    """
+
+    def __init__(self, name: str, period_s: float, action: Callable[[], object]) -> None:
+        if not 0.0 < period_s < threading.TIMEOUT_MAX:
+            raise OmnidError(f"ticker '{name}': expected a period above 0 s, found {period_s}")
+        self.stats = StageStats(name, is_ticker=True)
+        self._period_ns = round(period_s * 1e9)
+        self._action = action
+        self._halt = threading.Event()
+
+    def halt(self) -> None:
+        """End `run` before its next tick."""
+        self._halt.set()
+
+    def run(self, stopping: Callable[[], bool]) -> None:
+        """Tick until halted or stopping."""
+        deadline_ns = time.monotonic_ns()
+        while not self._halt.wait(max(0.0, (deadline_ns - time.monotonic_ns()) * 1e-9)) and not stopping():
+            now_ns = time.monotonic_ns()
+            skipped = max(0, now_ns - deadline_ns) // self._period_ns
+            self.stats.dropped += skipped
+            self.stats.busy_since_ns = now_ns
+            self.stats.timed(self._action)
+            self.stats.busy_since_ns = 0
+            deadline_ns += (1 + skipped) * self._period_ns
+
+    def close(self) -> None:
+        """Close the action."""
+        getattr(self._action, "close", nothing)()
 
 
 class Graph:
@@ -60,15 +189,14 @@ class Graph:
         sinks_wait: bool = False,
         on_thread: Callable[[str], object] = nothing,
     ) -> None:
-        self.telemetry = Telemetry()
-        self._policy, self._threaded, self._depth, self._on_thread = policy, threaded, depth, on_thread
-        self._sinks_wait = sinks_wait
+        self.telemetry, self.policy = Telemetry(), policy
+        self._threaded, self._depth, self._on_thread, self._sinks_wait = threaded, depth, on_thread, sinks_wait
         self._in_flight = InFlight()
         self._sources: list[Source] = []
-        self._inboxes: dict[str, StageInbox] = {}  # inboxes by the name of the stage
+        self._inboxes: list[Inbox] = []
         self._tickers: list[Ticker] = []
         self._threads: list[threading.Thread] = []
-        self._ended: set[str] = set()  # names of threads
+        self._ended: list[str] = []  # names of threads
         self._errors: list[BaseException] = []
         self._stops: deque[None] = deque(maxlen=2)
         self._wakeup: SimpleQueue[None] = SimpleQueue()  # its put is reentrant, so safe in a signal handler
@@ -89,19 +217,9 @@ class Graph:
     def stage(self, name: str, stage: Stage[In, Out], *inputs: Stream[In], direct: bool = False) -> Stream[Out]:
         """Add a stage, whose inputs merge into its one inbox; return its output.
 
-        direct: it has no inbox and no thread, and runs in that of the stage before it, which is its only input.
+        direct: it has no inbox and no thread, and runs in that of the stage before it.
         """
-        node = Node(self._add(StageStats(name)), stage)
-        return self._direct(node, *inputs) if direct else self._node(node, inputs, self._policy, self._depth)
-
-    def bound(self, head: str, tail: str) -> None:
-        """Let the stage `head` take a message only when `tail`, a stage after it, will soon be able to take the result.
-
-        So at most one message is between both, and under overload the head's inbox drops what is old before
-        any work is done for it: the tail gets the newest. Inline, nothing ever waits.
-        """
-        if self._threaded:
-            self._inboxes[head].prepare_for(self._inboxes[tail])
+        return self._node(name, stage, inputs, self.policy, self._depth, direct)
 
     def sink(
         self,
@@ -116,12 +234,8 @@ class Graph:
 
         direct: see `stage`; for work of microseconds, since to wake a thread takes longer.
         """
-        node = Node(self._add(StageStats(name)), sink)
-        if direct:
-            self._direct(node, *inputs)
-            return
         own = None if self._sinks_wait else policy
-        self._node(node, inputs, own or self._policy, self._depth if depth is None else depth)
+        self._node(name, sink, inputs, own or self.policy, self._depth if depth is None else depth, direct)
 
     def ticker(self, name: str, period_s: float, action: Callable[[], object]) -> Ticker:
         """Add an action that is called at a fixed rate in its own thread, also inline, until the run ends.
@@ -136,7 +250,7 @@ class Graph:
     def settle(self) -> None:
         """Wait until all messages have been processed, or the run ends: for a source whose time is stopped meanwhile.
 
-        What a stage does after it has passed on its result counts. Inline, nothing ever waits.
+        Inline, nothing ever waits.
         """
         while not (self._in_flight.is_none(_POLL_S) or self._stopping):
             pass
@@ -150,17 +264,31 @@ class Graph:
         self._wakeup.put(None)
 
     def run(self) -> None:
-        """Run until the sources have ended, the inboxes are empty and the threads have joined; only once.
+        """Run until all sources have ended and all threads have joined; only once.
 
-        Ctrl-C calls `stop`. Raises the first error of any stage with later ones in its notes, and KeyboardInterrupt
-        after a second stop.
+        Raises the first error of any stage with later ones in its notes, and KeyboardInterrupt after a second stop.
         """
         self._require_fresh()
         self._ran = True
-        with self._ctrl_c_stops():
-            self._execute()
-        for error in self._errors[1:]:
-            self._errors[0].add_note(f"and then: {error!r}")
+        tickers = [
+            threading.Thread(target=self._run_ticker, args=(each,), name=each.stats.name) for each in self._tickers
+        ]
+        try:
+            for thread in tickers + self._threads:
+                thread.start()
+            self._wait() if self._threaded else self._run_inline()
+        except BaseException as error:  # from the caller's signal handler, or no thread could be started
+            self._errors.insert(0, error)
+            self._stops.extend((None, None))
+            self._wait()
+        finally:
+            for ticker in self._tickers:
+                ticker.halt()
+            for thread in tickers:
+                if thread.ident is not None:
+                    thread.join()
+        for later in self._errors[1:]:
+            self._errors[0].add_note(f"and then: {later!r}")
         if self._errors:
             raise self._errors[0]
         if self._aborting:
@@ -182,18 +310,17 @@ class Graph:
         self._require_fresh()
         return self.telemetry.add(stats)
 
-    def _direct(self, node: Node, before: Stream[Any]) -> Stream[Any]:
-        before.readers.append(Direct(node, 1, self._succeeds, self._finish))
-        return node.stream
-
-    def _node(self, node: Node, inputs: tuple[Stream[Any], ...], policy: Policy, depth: int) -> Stream[Any]:
+    def _node(
+        self, name: str, work: object, inputs: tuple[Stream[Any], ...], policy: Policy, depth: int, direct: bool
+    ) -> Stream[Any]:
         if not inputs or depth < 1:
-            raise OmnidError(f"'{node.name}': expected inputs and a depth above 0, found {len(inputs)} and {depth}")
+            raise OmnidError(f"'{name}': expected inputs and a depth above 0, found {len(inputs)} and {depth}")
+        node = Node(self._add(StageStats(name)), work)
         readers: list[Reader] = [Direct(node, len(inputs), self._succeeds, self._finish)] * len(inputs)
-        if self._threaded:
-            inbox = StageInbox(node.stats, len(inputs), depth, policy, self._in_flight, node.merge)
-            self._inboxes[node.name] = inbox
-            self._thread(node.name, self._run_node, node, inbox)
+        if self._threaded and not direct:
+            inbox = Inbox(node.stats, len(inputs), depth, policy, self._in_flight)
+            self._inboxes.append(inbox)
+            self._thread(name, self._run_node, node, inbox)
             readers = [Port(inbox, writer) for writer in range(len(inputs))]
         for stream, reader in zip(inputs, readers, strict=True):
             stream.readers.append(reader)
@@ -203,7 +330,7 @@ class Graph:
         def run() -> None:
             self._on_thread(name)
             body(*args)
-            self._ended.add(name)
+            self._ended.append(name)
             self._wakeup.put(None)
 
         if self._threaded:
@@ -226,20 +353,21 @@ class Graph:
 
     def _advances(self, source: Source) -> bool:
         """True if the source took a step; otherwise it is closed and its stream ends."""
-        if not (source.ended or self._stopping) and self._succeeds(source.name, source.step):
+        name = source.stats.name
+        if not self._stopping and self._succeeds(name, source.step) and not source.ended:
             return True
-        self._succeeds(source.name, source.close)
+        self._succeeds(name, source.close)
         source.stream.end()
         return False
 
-    def _run_node(self, node: Node, inbox: StageInbox) -> None:
-        self._succeeds(node.name, self._drain, node, inbox)
+    def _run_node(self, node: Node, inbox: Inbox) -> None:
+        self._succeeds(node.stats.name, self._drain, node, inbox)
         inbox.close()
         node.stream.end()
 
-    def _drain(self, node: Node, inbox: StageInbox) -> None:
-        while (message := inbox.get()) is not END:
-            node.handle(message, inbox.passed_on)
+    def _drain(self, node: Node, inbox: Inbox) -> None:
+        while (message := inbox.get()) is not _END:
+            node.handle(message)
         self._finish(node)
 
     def _finish(self, node: Node) -> None:
@@ -254,66 +382,25 @@ class Graph:
                 active.append(source)
 
     def _run_ticker(self, ticker: Ticker) -> None:
-        self._on_thread(ticker.name)
-        self._succeeds(ticker.name, ticker.run, lambda: self._stopping)
-        self._succeeds(ticker.name, ticker.close)
-
-    def _execute(self) -> None:
-        ticker_threads = [
-            threading.Thread(target=self._run_ticker, args=(ticker,), name=ticker.name) for ticker in self._tickers
-        ]
-        try:
-            for thread in ticker_threads + self._threads:
-                thread.start()
-            self._wait() if self._threaded else self._run_inline()
-        except BaseException as error:  # from the caller's signal handler, or no thread could be started
-            self._errors.insert(0, error)
-            self._stops.extend((None, None))
-            self._wait()
-        finally:
-            for ticker in self._tickers:
-                ticker.halt()
-            for thread in filter(_started, ticker_threads):
-                thread.join()
+        name = ticker.stats.name
+        self._on_thread(name)
+        self._succeeds(name, ticker.run, lambda: self._stopping)
+        self._succeeds(name, ticker.close)
 
     def _wait(self) -> None:
-        started = list(filter(_started, self._threads))
-        while any(thread.name not in self._ended for thread in started):
+        """Wait for the threads that were started; pass a stop or a failure on to sources, tickers and inboxes."""
+        started = [thread for thread in self._threads if thread.ident is not None]
+        while len(self._ended) < len(started):
             with suppress(Empty):
                 self._wakeup.get(timeout=_POLL_S)
-            self._pass_on_stop()
+            if self._stopping:
+                for ticker in self._tickers:
+                    ticker.halt()
+                for source in self._sources:
+                    wake, source.wake = source.wake, nothing
+                    self._succeeds(source.stats.name, wake)
+            if self._aborting:
+                for inbox in self._inboxes:
+                    inbox.close()
         for thread in started:
             thread.join()
-
-    def _pass_on_stop(self) -> None:
-        if self._stopping:
-            for ticker in self._tickers:
-                ticker.halt()
-            for source in self._sources:
-                wake, source.wake = source.wake, nothing
-                self._succeeds(source.name, wake)
-        if self._aborting:
-            for inbox in self._inboxes.values():
-                inbox.close()
-
-    @contextmanager
-    def _ctrl_c_stops(self) -> Iterator[None]:
-        """Make Ctrl-C a stop: a KeyboardInterrupt could leave a lock or the state of a stage inconsistent."""
-        in_main = threading.current_thread() is threading.main_thread()
-        if not in_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
-            yield
-            return
-        signal.signal(signal.SIGINT, self._on_ctrl_c)
-        try:
-            yield
-        finally:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
-
-    def _on_ctrl_c(self, *_: object) -> None:
-        self.stop()
-        if self._aborting and not self._threaded:  # nothing else interrupts a stage in the main thread
-            raise KeyboardInterrupt
-
-
-def _started(thread: threading.Thread) -> bool:
-    return thread.ident is not None

@@ -6,7 +6,7 @@ import math
 import time
 from array import array
 from bisect import bisect_left
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import accumulate
 from typing import Any, NamedTuple, TypeVar
@@ -26,11 +26,10 @@ class Histogram:
     One thread adds; any thread may read at the same time and gets a state at most one duration old.
     """
 
-    __slots__ = ("_bins", "_total_s", "count", "max_s")
+    __slots__ = ("_bins", "count", "max_s")
 
     def __init__(self) -> None:
         self._bins = array("Q", bytes(8 * _BINS))
-        self._total_s = 0.0
         self.count = 0
         self.max_s = math.nan
 
@@ -38,53 +37,22 @@ class Histogram:
         """Add one duration."""
         octaves = math.log2(max(duration_s, _LOW_S) / _LOW_S)
         self._bins[int(min(octaves * _BINS_PER_OCTAVE, _BINS - 1))] += 1
-        self._total_s += duration_s
         self.max_s = duration_s if self.count == 0 else max(self.max_s, duration_s)
         self.count += 1
-
-    @property
-    def mean_s(self) -> float:
-        """Mean duration, s; NaN before the first."""
-        return self._total_s / self.count if self.count else math.nan
 
     def p(self, q: float) -> float:
         """Return the quantile q (0 to 1) of the durations, s; NaN before the first."""
         return self.quantiles(q)[0]
 
     def quantiles(self, *shares: float) -> list[float]:
-        """Return several quantiles as `p`, of one state."""
+        """Return quantiles (0 to 1) of the durations of one state, s; NaN before the first."""
         ranks = list(accumulate(self._bins[:]))
-        if ranks[-1] == 0:
-            return [math.nan] * len(shares)
-        return [self._quantile(ranks, share) for share in shares]
-
-    def _quantile(self, ranks: list[int], q: float) -> float:
-        """Return a quantile by the numbers of durations up to each bin."""
-        rank = max(1, math.ceil(q * ranks[-1]))
-        if rank >= ranks[-1]:
-            return self.max_s
-        centre_s: float = _LOW_S * 2.0 ** ((bisect_left(ranks, rank) + 0.5) / _BINS_PER_OCTAVE)
-        return min(centre_s, self.max_s)
-
-
-class Stopwatch:
-    """Wall time and processor time of the calling thread [ns], from its creation on, without pauses."""
-
-    __slots__ = ("cpu_ns", "wall_ns")
-
-    def __init__(self) -> None:
-        self.wall_ns = self.cpu_ns = 0  # while it ran; valid while it is paused
-        self.resume()
-
-    def pause(self) -> None:
-        """Stop."""
-        self.wall_ns += time.perf_counter_ns()
-        self.cpu_ns += time.thread_time_ns()
-
-    def resume(self) -> None:
-        """Go on."""
-        self.wall_ns -= time.perf_counter_ns()
-        self.cpu_ns -= time.thread_time_ns()
+        found = []
+        for share in shares:
+            rank = max(1, math.ceil(share * ranks[-1]))
+            centre_s: float = _LOW_S * 2.0 ** ((bisect_left(ranks, rank) + 0.5) / _BINS_PER_OCTAVE)
+            found.append(self.max_s if rank >= ranks[-1] else min(centre_s, self.max_s))
+        return found
 
 
 @dataclass(slots=True)
@@ -97,33 +65,19 @@ class StageStats:
     """
 
     name: str
+    is_ticker: bool = False
     processed: int = 0
     dropped: int = 0
     busy_since_ns: int = 0
     wall: Histogram = field(default_factory=Histogram)
-    cpu: Histogram = field(default_factory=Histogram)  # time of the processor, of the calling thread only
 
     def timed(self, call: Callable[..., T], *args: Any) -> T:
         """Return `call(*args)`, counted and timed; a call that raises is not counted."""
-        watch = Stopwatch()
+        start_ns = time.perf_counter_ns()
         result = call(*args)
-        self.count(watch)
-        return result
-
-    def timed_each(self, messages: Iterable[T]) -> Iterator[T]:
-        """Yield the messages, each counted and timed."""
-        watch = Stopwatch()
-        for message in messages:
-            self.count(watch)
-            yield message
-            watch = Stopwatch()
-
-    def count(self, watch: Stopwatch) -> None:
-        """Stop a running stopwatch, and count a message with the time that it took."""
-        watch.pause()
-        self.wall.add(watch.wall_ns * 1e-9)
-        self.cpu.add(watch.cpu_ns * 1e-9)
+        self.wall.add((time.perf_counter_ns() - start_ns) * 1e-9)
         self.processed += 1
+        return result
 
 
 class SummaryRow(NamedTuple):
@@ -158,6 +112,16 @@ class Telemetry:
     def stages(self) -> tuple[StageStats, ...]:
         """All counters."""
         return tuple(self._stages.values())
+
+    @property
+    def dropped_messages(self) -> int:
+        """Number of messages that were dropped in front of stages and sinks."""
+        return sum(stats.dropped for stats in self._stages.values() if not stats.is_ticker)
+
+    @property
+    def missed_deadlines(self) -> int:
+        """Number of deadlines that tickers have missed."""
+        return sum(stats.dropped for stats in self._stages.values() if stats.is_ticker)
 
     def summary(self) -> list[SummaryRow]:
         """Return one row per stage, for printing."""

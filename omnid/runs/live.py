@@ -1,11 +1,12 @@
-"""A live run: its robot (cameras, motor, simulated or not), its status for the service manager, and the run itself."""
+"""A live run: its robot (cameras, motor, simulated or not), how it joins stages, bus and wheels, and the run itself."""
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import ExitStack, closing, suppress
+from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from itertools import islice
@@ -15,114 +16,86 @@ from typing import Final, Protocol, TypeAlias
 import cv2
 
 from calib.rig import Rig
-from calib.rig_file import read_rig
+from calib.rig_file import read_rig, rig_toml
 from drivers.cameras.camera_state import CameraState
 from drivers.frame import CAMERAS, Camera, Frame, FrameSource
 from drivers.motion import MotionSample
+from drivers.motor import VelocityCommand
 from omnid.config import Config
 from omnid.controller.link import DriveLink
-from omnid.core.control.arming import MANUAL
-from omnid.diagnostics.run_summary import RunStatistics
-from omnid.diagnostics.status import StatusCollector, StatusTick
+from omnid.core.control.arming import MANUAL, ArmAnswer
+from omnid.core.control.command_sources import PLANNER
+from omnid.core.control.safety_rules import AWAITED, NO_POSE
+from omnid.core.navigation.situation import WheelState
+from omnid.core.rig.rig_health import RigHealth
+from omnid.diagnostics.load_ladder import PERIOD_S, LoadLadder
+from omnid.diagnostics.part_status import (
+    ImagesStatus,
+    clock_status,
+    floor_status,
+    motion_status,
+    places_status,
+    rig_status,
+)
+from omnid.diagnostics.status import Latency, StatusCollector, StatusSources
 from omnid.engine.flow import nothing
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Stream
 from omnid.engine.kernel_cache import prepare_kernels, read_kept_kernels
 from omnid.engine.logging_setup import Report
-from omnid.engine.realtime import ThreadStart, give_back_code, name_thread, prepare, priorities
-from omnid.engine.robot_clock import RobotClock, fixed_offset, log_time
+from omnid.engine.realtime import ThreadStart, give_back_code, name_thread, prepare
+from omnid.engine.robot_clock import RobotClock, SegmentTime, fixed_offset, log_time
 from omnid.engine.threads import started
 from omnid.errors import OmnidError
-from omnid.runs.sensor_sources import MotionSource
-from omnid.runs.session import OPENCV_THREADS, TICKERS, Session
-from omnid.runs.systemd import Service, StatusLine, print_stacks_when_killed
+from omnid.formats.route_file import RouteFolder
+from omnid.light.exposure import ExposureControl, UsefulArea
+from omnid.runs.place_maps import MapSaver, RunPlaces
+from omnid.runs.record import open_recorder
+from omnid.runs.rig_checks import RigViews
+from omnid.runs.route_files import RouteFiles
+from omnid.runs.session import BUS_POINTS, LOG_POINTS, OPENCV_THREADS, Session, joint_wheels
+from omnid.runs.systemd import Service, StatusLine, TerminalStatus, print_stacks_when_killed
+from omnid.runs.wiring import NavigationParts, Outputs, Parts, wheel_state, wire
+from omnid.sinks.bus_sink import BusSink, PanoramaSink
+from omnid.sinks.drive import LiveDrive, PlannerDrive, RingToController
 from omnid.sinks.encoder import status_report
-from omnid.sinks.recorder import Recorder
+from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry
+from omnid.stages.obstacles import ADVICE
 from omnid.transport.bus import Bus
-from omnid.transport.codec import DiagnosticStatus
-from omnid.transport.status_names import with_remedy
+from omnid.transport.codec import DiagnosticStatus, compile_serialisers
+from omnid.transport.commands import CommandReceiver, Freshness, NavigationReceiver, RequestQueue, SensorReceiver
+from omnid.transport.requests import Answer, Request
+from omnid.transport.status_names import DISARMED_BY_STOP, with_remedy
+from omnid.transport.topics import (
+    ARM,
+    IMU,
+    JOINT_STATES,
+    MAP,
+    MAP_TOPICS,
+    NAVIGATION_TOPICS,
+    PUBLISHED,
+    SENSOR_TOPICS,
+    TIME,
+    WHEEL_ODOM,
+    command_topics,
+)
 
-StatusPublisher: TypeAlias = Callable[[list[DiagnosticStatus]], None]
-
-
-def add_status_tickers(session: Session, status: StatusCollector, bus: Bus, recorder: Recorder | None) -> None:
-    """Publish and record the status periodically, and report progress to the service manager."""
-    config, graph = session.config, session.graph
-    publishers = [_status_on_bus(bus)]
-    if recorder is not None:
-        publishers.append(lambda statuses: recorder.add(statuses, session.clock.monotonic_ns()))
-    graph.ticker("status", config.live.status_s, StatusTick(status, *publishers))
-    line = StatusLine(session.statistics, graph.telemetry, TICKERS)
-    service = Service(graph.telemetry, line, config.service.stall_timeout_s)
-    graph.ticker("watchdog", service.period_s, service)
-
-
-def add_terminal_ticker(
-    session: Session, show: Callable[[str], None], report: Report, words: Callable[[], str]
-) -> None:
-    """Show the status in one line of a terminal; show: rewrites that line, which ends with the words."""
-    line = StatusLine(session.statistics, session.graph.telemetry, TICKERS)
-    terminal = TerminalStatus(
-        show, lambda: line() + words(), partial(report, logging.INFO), session.statistics, _ready(session.config)
-    )
-    session.graph.ticker("terminal", terminal.period_s, terminal)
+NO_MOTOR: Final = "the daemon runs without a motor: set motor.port, or start it with --motor"
+NO_PLANNER: Final = f"controller.sources.names lacks {PLANNER!r}: goals, paths and routes are off"
+NO_MAP_FILE: Final = (
+    "the robot keeps no map in a file: start its daemon with --map FILE.omap, or set places.map, "
+    "without --localize-only"
+)
 
 
-def _ready(config: Config) -> str:
-    """Return what to do now that the run is ready."""
-    endpoints = ", ".join(config.bus.connect if config.bus.is_client else config.bus.listen)
-    wheels = ""
-    if not config.motor.port:
-        wheels = "; no motor"
-    elif config.controller.arming == MANUAL:
-        wheels = "; the wheels turn after `omnid arm`"
-    return f"ready: poses of {config.bus.robot!r} at {endpoints or 'no endpoint'} (`omnid listen`){wheels}; Ctrl-C ends"
+class MotionSource(Protocol):
+    """A source of samples of wheels and gyro, read by a thread of its own."""
 
-
-def _status_on_bus(bus: Bus) -> StatusPublisher:
-    """Return a function that publishes statuses; where the bus is slow, only the status ticker waits."""
-
-    def publish(statuses: list[DiagnosticStatus]) -> None:
-        with suppress(OmnidError):  # the system's clock may be set to a time that no message can hold
-            message = status_report(time.time_ns(), [with_remedy(status) for status in statuses])
-            bus.publish(message.topic, message.payload)
-
-    return publish
-
-
-class TerminalStatus:
-    """The action of a ticker: shows a line as long as the run lasts."""
-
-    period_s: Final = 0.5
-
-    def __init__(
-        self,
-        show: Callable[[str], None],
-        line: Callable[[], str],
-        report: Callable[[str], None],
-        statistics: RunStatistics,
-        ready: str,
-    ) -> None:
-        """show: rewrites the line. line: its text. report: takes lines that stay. ready: of the start."""
-        self._show, self._line, self._report = show, line, report
-        self._statistics, self._ready = statistics, ready
-
-    def __call__(self) -> None:
-        """Report that the run is ready, once, and show the line."""
-        if self._ready:
-            self._report(self._ready)
-            self._ready = ""
-        self._show(f"{self._statistics.length_m:8.2f} m  {self._line()}")
+    def samples(self) -> Iterator[MotionSample]:
+        """Yield the samples until closed."""
 
     def close(self) -> None:
-        """Remove the line, and report the summary."""
-        self._show("")
-        statistics = self._statistics
-        states = ", ".join(f"{state} {count / statistics.poses:.1%}" for state, count in statistics.states.items())
-        self._report(
-            f"ended: {statistics.poses} poses, {statistics.length_m:.2f} m, {statistics.resets} resets"
-            f"{f'; {states}' if states else ''}"
-        )
+        """End samples(); from any thread."""
 
 
 MASK_FRAMES: Final = 60  # images of each camera in which the rim is searched, where the rig has no mask
@@ -242,7 +215,11 @@ class LiveRun:
     ) -> None:
         """rig: None for that of the configuration. show: rewrites a line of the terminal; None without a terminal."""
         self._config, self._robot, self._report, self._rig, self._show = config, robot, report, rig, show
-        self._graph = _graph_that_waits() if robot.waits else _graph_in_time(config, report)
+        if robot.waits:  # its time waits for the stages, so that nothing is dropped
+            self._graph = Graph(policy=LOSSLESS, sinks_wait=True, on_thread=name_thread)
+        else:
+            priorities: dict[str, int] = dict.fromkeys(CAMERAS, config.realtime.capture_priority)
+            self._graph = Graph(policy=NEWEST, depth=1, on_thread=ThreadStart(priorities, report))
         self._connected = False
         self.clock = log_time()  # that of the run, once it has begun
 
@@ -255,24 +232,28 @@ class LiveRun:
         with ExitStack() as outputs:
             session = Session(self._config, self._graph, outputs, warn, clock=self.clock)
             outputs.enter_context(session.signals(self._on_signal))
-            geometry = self._geometry(session)
+            # 1. The rig, with masks that are found in the first images; and the compiled functions.
+            rig = self._rig or read_rig(Path(self._config.cameras.rig))
+            with closing(self._robot.first_frames()) as frames:
+                geometry = session.geometry(rig, frames)
             loaded()
-            from omnid.runs.live_wiring import LiveWiring
-            from omnid.runs.place_maps import RunPlaces
-
             prepare_kernels()
             give_back_code("llvmlite")  # which has loaded the compiled functions, and does nothing else in a run
+            # 2. The connections, and the stages between them.
             self._connected = True
-            run_places = RunPlaces(self._config, geometry, session.warn)
-            LiveWiring(session, geometry, self._robot, self._report).wire(run_places)
+            run_places = RunPlaces(self._config, geometry, warn)
+            _join(session, geometry, self._robot, self._report, run_places)
             if self._show is not None:
-                from omnid.runs.live import add_terminal_ticker
-
-                add_terminal_ticker(session, self._show, self._report, self._robot.words)
+                line = StatusLine(session.statistics, self._graph.telemetry)
+                words = lambda: line() + self._robot.words()  # noqa: E731
+                say = partial(self._report, logging.INFO)
+                terminal = TerminalStatus(self._show, words, say, session.statistics, _ready(self._config))
+                self._graph.ticker("terminal", terminal.period_s, terminal)
+            # 3. The run, until a signal or a failure ends it.
             cv2.setNumThreads(OPENCV_THREADS)
             if not self._robot.waits:
                 for refused in prepare(self._config.realtime):
-                    session.warn(refused)
+                    warn(refused)
             started(_import_rarely_used, "imports")
             try:
                 self._graph.run()
@@ -283,7 +264,7 @@ class LiveRun:
             run_places.finish()
         return 0
 
-    def _on_signal(self, number: int, again: bool) -> None:
+    def _on_signal(self, again: bool) -> None:
         """End the program at once while the first images are awaited.
 
         Later the session has stopped the graph, which ends the run as soon as it begins: an exception while
@@ -292,34 +273,238 @@ class LiveRun:
         if not self._connected:
             raise SystemExit(0)
 
-    def _geometry(self, session: Session) -> Geometry:
-        rig = self._rig or read_rig(Path(self._config.cameras.rig))
-        with closing(self._robot.first_frames()) as frames:
-            return session.geometry(rig, frames)
+
+def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report, run_places: RunPlaces) -> None:
+    """Connect robot, bus and files, wire the stages between them, and add what is done from time to time."""
+    config, graph, clock, warn = session.config, session.graph, session.clock, session.warn
+    rig = geometry.rig
+
+    # 1. What is outside: cameras and wheels, the bus, the recording.
+    controller = robot.connect(session)
+    bus = session.open_bus(rig, gives_time=robot.waits)
+    recorder = None
+    if config.record.enabled:
+        times = SegmentTime(clock)
+        encode = session.encoder(rig, LOG_POINTS, times.unix_ns)
+        recorder = open_recorder(config, rig_toml(rig), report, encode=encode, time=times)
+        session.outputs.callback(recorder.close)
+    health = RigHealth(geometry.cylinder, config.rig.check, config.rig.check_s)
+    front_end = FrontEnd(geometry, config, health)
+    motion = front_end.pairing.motion
+
+    # 2. Who takes what the stages make.
+    latency = Latency(clock.monotonic_ns)
+    exposure = ExposureControl(UsefulArea(rig, geometry.cylinder), config.cameras, robot.states())
+    outputs = Outputs(
+        pairs={"exposure": exposure},
+        counters={"statistics": session.statistics, "latency": latency},
+        # The ticks of wheels that wait give the time.
+        bus=BusSink(bus, session.encoder(rig, BUS_POINTS), clock=VelocityCommand if robot.waits else None),
+        recorder=recorder,
+        records_images=True,
+    )
+    if config.bus.panorama_hz:
+        outputs.poses["panorama"] = PanoramaSink(bus, config.bus.panorama_hz, clock.unix_ns)
+    if health.uses_views:
+        outputs.poses["rig"] = RigViews(health)
+    if controller is not None:
+        outputs.rings["controller-ring"] = RingToController(controller)
+
+    # 3. The stages, and the navigation with its requests and files.
+    requests = RequestQueue()
+    files = RouteFiles(
+        RouteFolder(Path(config.navigation.routes)),
+        requests.put,
+        halts=lambda: controller.statistics.state.halts if controller else 0,
+    )
+    if rig.height_m(config.obstacles.ring.floor_m) is None:
+        warn(
+            "the rig states no height of the cameras: the floor is looked for in the images; "
+            f"until it is found, map, grid and obstacles call nothing free; {ADVICE}"
+        )
+    parts = Parts(map_every_s=config.live.cloud_s)
+    if controller is not None:
+        navigation = None
+        if PLANNER in config.controller.sources.names:
+            planner = PlannerDrive(controller, bus.answer, files)
+            wheels = partial(_wheel_state, controller)
+            navigation = NavigationParts(requests, wheels, planner, config.places.map)
+        else:
+            warn(NO_PLANNER)
+        drive = LiveDrive(controller, rig.T_base_rig, requests.end)
+        parts = replace(parts, drive=drive, navigation=navigation)
+    frames = robot.sources(graph, motion.add)
+    stages = wire(graph, frames, front_end, config, outputs, run_places.known_to(parts))
+
+    # 4. What is done from time to time: shedding of load, files of maps and routes.
+    ladder = LoadLadder()
+
+    def observe() -> None:
+        if not robot.waits:
+            front_end.pairing.load = ladder.observe(graph.telemetry.of("pair"))
+        if stages.mapping is not None:
+            stages.mapping.is_read = recorder is not None or bus.is_received("cloud")
+
+    graph.ticker("load", PERIOD_S, observe)
+    saver = None
+    if stages.places is not None and run_places.is_extended:
+        saver = MapSaver(run_places, stages.places, config.places.save_s, bus.answer)
+        graph.ticker("save", saver.PERIOD_S, saver)
+    if controller is not None:
+        graph.ticker("routes", files.PERIOD_S, files)
+    if stages.places is not None:
+        files.save_map = stages.places.want_copy
+
+    # 5. What comes from the bus: commands, requests, samples.
+    samples = _sample_receiver(config, motion.add, clock, controller, report, with_images=robot.brings_samples)
+    clocks = (RobotClock(), clock) if robot.waits else (clock,)
+    freshness = Freshness(config.controller.deadlines.command_s, *clocks)
+    bus.serve(TIME, freshness.own_time)
+    received = NavigationReceiver(files.put, freshness, report=warn)
+    commands = None
+    if controller is not None:
+        sources = config.controller.sources.names
+        commands = CommandReceiver(controller, freshness, sources=sources, is_unique=lambda: bus.is_unique, report=warn)
+        controller.statistics.take_arm_answer = partial(_answer_arm, session, bus, controller)
+    _subscribe(config, bus, controller, commands, received, samples, saver)
+
+    # 6. The status of all of them.
+    images = ImagesStatus(geometry, session.statistics, warn, stages.obstacles)
+    status: list[Callable[[], DiagnosticStatus]] = [
+        ladder.status,
+        images,
+        exposure.status,
+        partial(rig_status, health),
+        *([received.status] if controller is not None else ()),
+        partial(clock_status, clock),
+        partial(motion_status, front_end.odometry, motion, samples),
+        *([partial(places_status, stages.places)] if stages.places else ()),
+        *([partial(floor_status, stages.floor)] if stages.floor else ()),
+        *robot.status,
+        *(part.status for part in (bus, recorder, saver) if part is not None),
+    ]
+    collect = StatusCollector(
+        StatusSources(
+            graph.telemetry,
+            robot.states(),
+            front_end.pairing,
+            session.statistics,
+            latency.to_pose,
+            controller.statistics if controller is not None else None,
+            commands,
+            tuple(status),
+            clock.monotonic_ns,
+        )
+    )
+
+    def give_status() -> None:
+        statuses = collect()
+        with suppress(OmnidError):  # the system's clock may be set to a time that no message can hold
+            message = status_report(time.time_ns(), [with_remedy(status) for status in statuses])
+            bus.publish(message.topic, message.payload)  # where the bus is slow, only this ticker waits
+        if recorder is not None:
+            recorder.add(statuses, clock.monotonic_ns())
+
+    graph.ticker("status", config.live.status_s, give_status)
+    line = StatusLine(session.statistics, graph.telemetry)
+    service = Service(graph.telemetry, line, config.service.stall_timeout_s)
+    graph.ticker("watchdog", service.period_s, service)
 
 
-def _graph_in_time(config: Config, report: Report) -> Graph:
-    """Return a graph whose stages take the newest messages, in threads with the priorities of the settings."""
-    return Graph(policy=NEWEST, depth=1, on_thread=ThreadStart(priorities(config.realtime, *CAMERAS), report))
+def _wheel_state(controller: DriveLink) -> WheelState:
+    return wheel_state(controller.statistics.state)
 
 
-def _graph_that_waits() -> Graph:
-    """Return a graph that drops nothing, in threads as others are: the robot's time waits for it."""
-    return Graph(policy=LOSSLESS, sinks_wait=True, on_thread=name_thread)
+def _sample_receiver(
+    config: Config,
+    take: Callable[[MotionSample], None],
+    clock: RobotClock,
+    controller: DriveLink | None,
+    report: Report,
+    *,
+    with_images: bool,
+) -> SensorReceiver:
+    """Return the receiver of samples of the bus: of the gyro, and of the wheels where no motor controller gives them.
+
+    take: takes samples, from any thread. clock: that of the stamps of images. with_images: the samples come with the
+    images of a log or a simulation, since those of another motion would not fit them.
+    """
+    settings, joints = config.motion, joint_wheels(config)
+    topics = set()
+    if settings.wheels != "off" and not with_images:
+        if controller is not None:
+            controller.take_wheels = take
+        else:
+            topics.add(JOINT_STATES if joints else WHEEL_ODOM)
+    if settings.imu != "off" and not with_images:
+        topics.add(IMU)
+    return SensorReceiver(take, clock.stamp_ns, frozenset(topics), partial(report, logging.WARNING), joints)
+
+
+def _subscribe(
+    config: Config,
+    bus: Bus,
+    controller: DriveLink | None,
+    commands: CommandReceiver | None,
+    navigation: NavigationReceiver,
+    samples: SensorReceiver,
+    saver: MapSaver | None,
+) -> None:
+    """Begin to receive: without a motor only samples and requests to save the map."""
+    sources = config.controller.sources.names
+    topics = {**SENSOR_TOPICS, **MAP_TOPICS}
+    table: dict[str, Callable[[Request], Answer | None]] = {}
+    others: Callable[[Request], Answer | None] = lambda _: Answer(False, NO_MOTOR)  # noqa: E731
+    if commands is not None:
+        topics, others = command_topics(sources), commands.receive  # which counts unknown topics
+        refused = Answer(False, NO_PLANNER)
+        table = dict.fromkeys(NAVIGATION_TOPICS, navigation.receive if PLANNER in sources else lambda _: refused)
+    table[MAP] = saver.receive if saver is not None else lambda _: Answer(False, NO_MAP_FILE)
+
+    def receive(request: Request) -> None:
+        if request.topic in SENSOR_TOPICS:
+            samples.receive(request.topic, request.payload)
+            return
+        answer = table.get(request.topic, others)(request)
+        if answer is not None:
+            bus.answer(request.id, answer)
+
+    def is_stopped() -> bool:
+        return controller is not None and controller.statistics.state.disarmed_by == DISARMED_BY_STOP
+
+    bus.subscribe_commands(receive, topics, is_stopped)
+
+
+def _answer_arm(session: Session, bus: Bus, controller: DriveLink, answer: ArmAnswer) -> None:
+    """Pass on the controller's answer; of several requests at once it answers the newest."""
+    text = answer.refusal or "armed: it obeys commands from now on"
+    if answer.refusal == AWAITED:
+        text = f"{AWAITED}: {controller.statistics.state.problem}"
+    if answer.refusal == NO_POSE:
+        if session.graph.telemetry.of("pair").processed:
+            text += ": the first images are being processed: try again in a moment (`omnid listen` shows the state)"
+        else:
+            text += ": no images have come from the cameras (`omnid listen`, `omnid doctor`)"
+    bus.answer(answer.id, Answer(not answer.refusal, text), also_before=ARM)
+
+
+def _ready(config: Config) -> str:
+    """Return what to do now that the run is ready."""
+    endpoints = ", ".join(config.bus.connect if config.bus.is_client else config.bus.listen)
+    wheels = ""
+    if not config.motor.port:
+        wheels = "; no motor"
+    elif config.controller.arming == MANUAL:
+        wheels = "; the wheels turn after `omnid arm`"
+    return f"ready: poses of {config.bus.robot!r} at {endpoints or 'no endpoint'} (`omnid listen`){wheels}; Ctrl-C ends"
 
 
 def _load() -> None:
-    """Load what the stages need while images are awaited; what fails is loaded, and reported, where it is used."""
-    for load in (partial(import_module, "omnid.runs.live_wiring"), _compile_serialisers, read_kept_kernels):
+    """Prepare what the stages need while images are awaited; what fails is done, and reported, where it is used."""
+    schemas = {topic.schema for topic in PUBLISHED.values()} | set(command_topics(()).values())
+    for load in (partial(compile_serialisers, schemas), read_kept_kernels):
         with suppress(Exception):
             load()
-
-
-def _compile_serialisers() -> None:
-    from omnid.transport.codec import compile_serialisers
-    from omnid.transport.topics import PUBLISHED, command_topics
-
-    compile_serialisers({topic.schema for topic in PUBLISHED.values()} | set(command_topics(()).values()))
 
 
 def _import_rarely_used() -> None:

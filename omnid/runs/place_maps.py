@@ -20,7 +20,7 @@ from omnid.core.places.place_rig import PlaceRig, seen_by
 from omnid.core.places.place_views import keep_only, parts
 from omnid.errors import OmnidError
 from omnid.formats.place_file import read_places, write_places
-from omnid.runs.pipeline import RunParts
+from omnid.runs.wiring import Parts
 from omnid.sinks.files import check_outputs
 from omnid.stages.geometry import Geometry
 from omnid.stages.places import Places
@@ -87,7 +87,7 @@ class RunPlaces:
                 return None
         return RigPlaces(*read_places(path, new_places(settings)))
 
-    def known_to(self, parts: RunParts) -> RunParts:
+    def known_to(self, parts: Parts) -> Parts:
         """Return the parts of the run with this map, if there is one."""
         if self.places is None:
             return parts

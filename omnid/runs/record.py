@@ -14,14 +14,12 @@ from omnid.config import Config
 from omnid.engine.graph import NEWEST, Graph
 from omnid.engine.process import handle_stop_signals
 from omnid.engine.robot_clock import RobotClock, SegmentTime
+from omnid.runs.wiring import RECORDED_DEPTH
 from omnid.settings import dump
 from omnid.sinks.encoder import Encoder
 from omnid.sinks.recorder import Recorder
 
 PERIOD_S: Final = 15.0  # Time between two lines about the progress.
-
-# Messages of each kind that may wait for the disk; more drop the oldest.
-WAITING_RECORDS: Final = 20
 
 
 def open_recorder(
@@ -42,7 +40,7 @@ def record(sources: Mapping[Camera, FrameSource], config: Config, rig: str, repo
     """Record frames with stamps of CLOCK_MONOTONIC until the sources end or a signal comes; return the recorder."""
     clock = RobotClock(report=lambda line: report(logging.WARNING, line))
     recorder = open_recorder(config, rig, report, time=SegmentTime(clock))
-    graph = Graph(policy=NEWEST, depth=WAITING_RECORDS)
+    graph = Graph(policy=NEWEST, depth=RECORDED_DEPTH)
     frames = [graph.source(name, source.frames, wake=source.close) for name, source in sources.items()]
     graph.sink("record", recorder, *frames)
 

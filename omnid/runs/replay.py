@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Final, Protocol, TypeAlias
 
 import cv2
+import numpy as np
 
 from calib.rig import Rig
 from calib.rig_file import read_rig, rig_toml
@@ -26,30 +27,28 @@ from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.flow import Slot
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Sink, Stream
 from omnid.engine.kernel_cache import prepare_kernels
-from omnid.engine.playback_clock import PlaybackClock
 from omnid.engine.realtime import RealtimeSettings
 from omnid.engine.telemetry import Telemetry
 from omnid.errors import OmnidError
 from omnid.messages import MapUpdate, OdometryUpdate
-from omnid.runs.pipeline import RecordingSink, RunParts, Sinks, wire
 from omnid.runs.place_maps import RigPlaces, RunPlaces
 from omnid.runs.rig_checks import examined_rig
 from omnid.runs.run_result import RunFailedError, RunReport, RunResult
-from omnid.runs.sensor_sources import motion_topics
-from omnid.runs.session import LOG_POINTS, OPENCV_THREADS, Session, attached_rig
+from omnid.runs.session import LOG_POINTS, OPENCV_THREADS, Session, attached_rig, motion_topics
+from omnid.runs.wiring import Outputs, Parts, WiredStages, wire
 from omnid.settings import dump
 from omnid.sinks.bus_sink import BusSink
 from omnid.sinks.drive import ReplayDrive, SimulatedWheels
 from omnid.sinks.encoder import Outgoing
 from omnid.sinks.files import MapFile, PlanFile, TrajectoryFile, check_outputs, write_known
-from omnid.sinks.pose_collector import MapPoseCollector, PoseCollector
+from omnid.sinks.pose_collector import PlaceCollector, PoseCollector
 from omnid.sinks.recorder import Recorder, SingleLog
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry
-from omnid.stages.synchronise import Synchronise
 
 Topics: TypeAlias = tuple[str | None, str | None]  # of the lower and the upper camera
 UNPRIVILEGED: Final = RealtimeSettings(lock_memory=False, motor_priority=0)  # of the controller process of a replay
+POLL_S: Final = 0.05  # longest sleep of a paced replay, so that its end takes effect soon
 
 
 class ProgressDisplay(Protocol):
@@ -118,54 +117,51 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
 class _Replay:
     def __init__(self, log: Path, config: Config, options: ReplayOptions) -> None:
         self._log, self._config, self._options = log, config, options
-        self._poses = PoseCollector()
-        self._map_poses = MapPoseCollector()
+        self._poses, self._in_map = PoseCollector(), PlaceCollector()
         self._map: Slot[MapUpdate] = Slot()
-        self._drive: ReplayDrive | SimulatedWheels | None = None
+        self._wheels: ReplayDrive | SimulatedWheels | None = None
         self._warnings: list[str] = []
         self._begun_s = 0.0
 
     def run(self) -> RunResult:
-        check_outputs(self._options.files, self._inputs())
-        in_map = [name for name, _ in self._options.files if name in ("--map-tum", "--map-live-tum")]
-        if in_map and not self._config.places.enabled:
+        options, config = self._options, self._config
+        check_outputs(options.files, self._inputs())
+        in_map = [name for name, _ in options.files if name in ("--map-tum", "--map-live-tum")]
+        if in_map and not config.places.enabled:
             raise OmnidError(f"{in_map[0]}: places.enabled = false, so that there is no pose in the map; leave one out")
-        graph = Graph(
-            policy=NEWEST if self._options.drops else LOSSLESS,
-            threaded=not self._options.inline,
-        )
+        graph = Graph(policy=NEWEST if options.drops else LOSSLESS, threaded=not options.inline)
         with opencv_threads(OPENCV_THREADS), ExitStack() as outputs:
-            session = Session(self._config, graph, outputs, self._warnings.append)
+            session = Session(config, graph, outputs, self._warnings.append)
+            # 1. The log and its rig, which the first pairs are compared with.
             reader = self._reader()
             outputs.callback(reader.close)
             geometry = session.geometry(self._rig(reader), reader.frames())
             prepare_kernels()  # may take a minute: after a log or a rig that is wrong was refused
-            health = examined_rig(reader, self._log, geometry, self._config)
-            run_places = RunPlaces(
-                self._config, geometry, session.warn, self._options.rig_places, build=self._options.build
-            )
-            front_end = FrontEnd(geometry, self._config, health)
-            sinks, parts = self._sinks(session, front_end), run_places.known_to(self._parts(session, geometry))
-            pairing = Synchronise(geometry.rig, self._config.pair, self._config.motion.R_base_imu)
-            pairs = graph.stage("pair", pairing, self._messages(graph, reader, pairing))
-            stages = wire(graph, pairs, front_end, self._config, sinks, parts)
-            result = RunReport(session, reader, pairing, stages)
-            if sinks.recording is not None and isinstance(sinks.recording.sink, Recorder):
-                sinks.recording.sink.final_status = result.final_status
-            self._add_progress(session, reader)
+            front_end = FrontEnd(geometry, config, examined_rig(reader, self._log, geometry, config))
+            # 2. The stages, between the log and the outputs; one that cannot be opened ends the run before it begins.
+            run_places = RunPlaces(config, geometry, session.warn, options.rig_places, build=options.build)
+            parts = Parts(options.places, options.localize_only, map_every_s=options.map_every_s)
+            messages = self._messages(graph, reader, front_end)
+            sinks = self._outputs(session, front_end)
+            stages = wire(graph, [messages], front_end, config, sinks, run_places.known_to(parts))
+            report = RunReport(session, reader, stages)
+            if isinstance(sinks.recorder, Recorder):
+                sinks.recorder.final_status = report.final_status
+            if options.progress is not None:
+                progress = options.progress(session.statistics, reader.pair_estimate())
+                graph.ticker("progress", progress.period_s, progress)
+            # 3. The run; what it has found until an error is part of the error.
             self._begun_s = time.monotonic()
             try:
                 with session.signals(self._on_signal):
                     graph.run()
+                extended = run_places.finish()  # before the result is made: it may warn
             except (OmnidError, DriverError) as error:
                 if not session.statistics.poses or isinstance(error, RigContradictedError):
                     raise
-                raise RunFailedError(str(error), self._result(session, result)) from error
-            try:
-                extended = run_places.finish()  # before the result is made: it may warn
-            except OmnidError as error:
-                raise RunFailedError(str(error), self._result(session, result)) from error
-            return replace(self._result(session, result), rig_places=extended, map_file=run_places.written)
+                raise RunFailedError(str(error), self._result(session, report, stages)) from error
+            result = self._result(session, report, stages)
+            return replace(result, rig_places=extended, map_file=run_places.written)
 
     def _inputs(self) -> list[tuple[str, Path]]:
         """The files that are read, each with its name for errors."""
@@ -181,14 +177,13 @@ class _Replay:
     def _reader(self) -> LogReader:
         """Open the log; the topics are those of the options, else of the rig, else found by their names."""
         lower, upper = self._options.topics
-        rig, motion = self._options.rig, motion_topics(self._config)
-        log = self._config.log
+        rig, log = self._options.rig, self._config.log
         open_log = partial(
             LogReader,
             self._log,
             window=log.reorder_frames,
             span_s=self._options.span_s,
-            motion=motion,
+            motion=motion_topics(self._config),
             bits=self._config.cameras.bits,
             rate_hz=log.rate_hz,
             time=log.time,
@@ -207,62 +202,57 @@ class _Replay:
             return attached_rig(reader, self._log)
         return read_rig(found) if isinstance(found, Path) else found
 
-    def _messages(self, graph: Graph, reader: LogReader, pairing: Synchronise) -> Stream[Frame | MotionSample]:
+    def _messages(self, graph: Graph, reader: LogReader, front_end: FrontEnd) -> Stream[Frame | MotionSample]:
+        """Add the log as a source; paced, each message comes when its stamp is due."""
         if not self._options.paced:
             return graph.source("read", reader.messages)
-        clock = PlaybackClock()
+        ended: list[None] = []
 
-        def frames() -> Iterator[Frame]:
-            """Yield the frames; samples go straight to the pairing, since in its inbox they would replace frames."""
-            for message in clock.messages(reader.messages()):
+        def frames() -> Iterator[Frame | MotionSample]:
+            offset_ns: int | None = None
+            for message in reader.messages():
+                if offset_ns is None:
+                    offset_ns = time.monotonic_ns() - message.stamp_ns
+                due_ns = message.stamp_ns + offset_ns
+                while not ended and (left_s := (due_ns - time.monotonic_ns()) * 1e-9) > 0:
+                    time.sleep(min(left_s, POLL_S))
                 if isinstance(message, Frame):
                     yield message
-                else:
-                    pairing.motion.add(message)
+                else:  # in the inbox of the pairing samples would replace frames
+                    front_end.pairing.motion.add(message)
 
-        return graph.source("read", frames, wake=clock.wake)
+        return graph.source("read", frames, wake=lambda: ended.append(None))
 
-    def _sinks(self, session: Session, front_end: FrontEnd) -> Sinks:
-        """Open all outputs; one that cannot be opened ends the run before it begins."""
-        options, geometry = self._options, front_end.geometry
+    def _outputs(self, session: Session, front_end: FrontEnd) -> Outputs:
+        """Open all outputs."""
+        options, config, geometry = self._options, self._config, front_end.geometry
+        outputs = Outputs(counters={"statistics": session.statistics})
+        if options.collect:
+            outputs.poses["collect-poses"], outputs.maps["collect-map"] = self._poses, self._map
+        if options.tum:
+            outputs.poses["trajectory"] = TrajectoryFile(options.tum)
+        if options.map_tum or options.map_live_tum or options.collect:
+            outputs.places["collect-places"] = self._in_map
+        if options.cloud:
+            outputs.maps["map"] = MapFile(options.cloud)
+        if options.plan:
+            height_m = geometry.rig.height_m(config.obstacles.ring.floor_m)
+            outputs.maps["plan"] = PlanFile(options.plan, height_m or 0.0)
         recorder: Sink[Any] | None = None
         if options.observer:
             recorder = options.observer(front_end, session.graph.telemetry)
         if options.record:
-            recorder = self._recorder(session, geometry, options.record)
-        sinks = Sinks(
-            counters={"statistics": session.statistics},
-            bus=self._bus(session, geometry) if options.publish else None,
-            recording=None if recorder is None else RecordingSink(recorder),
-        )
-        if options.collect:
-            sinks.poses["collect-poses"] = self._poses
-            sinks.maps["collect-map"] = self._map
-        if options.tum:
-            sinks.poses["trajectory"] = TrajectoryFile(options.tum)
-        if options.map_tum or options.map_live_tum or options.collect:
-            sinks.places["collect-places"] = self._map_poses
-        if options.cloud:
-            sinks.maps["map"] = MapFile(options.cloud)
-        if options.plan:
-            height_m = geometry.rig.height_m(self._config.obstacles.ring.floor_m)
-            sinks.maps["plan"] = PlanFile(options.plan, height_m or 0.0)
-        return sinks
-
-    def _parts(self, session: Session, geometry: Geometry) -> RunParts:
-        """Return the wheels of the run, and the map that it begins with."""
-        options, config = self._options, self._config
+            attachments = {"rig.toml": rig_toml(geometry.rig).encode(), "omnid.toml": dump(config).encode()}
+            log = SingleLog(options.record, attachments)
+            recorder = Recorder(log, config.bus.robot, session.encoder(geometry.rig, LOG_POINTS))
+            session.outputs.callback(recorder.close)
         if config.motor.port == SIMULATED:
-            self._drive = SimulatedWheels(config.motor)
+            outputs.commands["wheels"] = self._wheels = SimulatedWheels(config.motor)
         elif config.motor.port:
             controller = session.start_controller(UNPRIVILEGED, of_replay=True)
-            self._drive = ReplayDrive(controller, config.controller.setpoint.setpoint(), geometry.rig.T_base_rig)
-        return RunParts(
-            known_places=options.places,
-            localize_only=options.localize_only,
-            drive=self._drive,
-            map_every_s=options.map_every_s,
-        )
+            setpoint = config.controller.setpoint.setpoint()
+            outputs.poses["controller"] = self._wheels = ReplayDrive(controller, setpoint, geometry.rig.T_base_rig)
+        return replace(outputs, bus=self._bus(session, geometry) if options.publish else None, recorder=recorder)
 
     def _bus(self, session: Session, geometry: Geometry) -> BusSink | None:
         try:
@@ -274,47 +264,37 @@ class _Replay:
             return None
         return BusSink(bus, session.encoder(geometry.rig, LOG_POINTS), clock=OdometryUpdate)
 
-    def _recorder(self, session: Session, geometry: Geometry, path: Path) -> Recorder:
-        config = self._config
-        attachments = {"rig.toml": rig_toml(geometry.rig).encode(), "omnid.toml": dump(config).encode()}
-        encode = session.encoder(geometry.rig, LOG_POINTS)
-        recorder = Recorder(SingleLog(path, attachments), config.bus.robot, encode)
-        session.outputs.callback(recorder.close)
-        return recorder
-
-    def _add_progress(self, session: Session, reader: LogReader) -> None:
-        if self._options.progress is not None:
-            progress = self._options.progress(session.statistics, reader.pair_estimate())
-            session.graph.ticker("progress", progress.period_s, progress)
-
-    def _on_signal(self, number: int, again: bool) -> None:
+    def _on_signal(self, again: bool) -> None:
         if again and self._options.inline:  # nothing else interrupts the stage that runs in this thread
             raise KeyboardInterrupt
 
-    def _result(self, session: Session, results: RunReport) -> RunResult:
-        counters = results.counters(session.statistics)
-        if self._drive is not None:
-            counters = replace(counters, motor=self._drive.counts())
-        newest, in_map = self._map.get(), results.map_poses(self._map_poses)
-        live, stamps_ns = self._map_poses.T_map_rig, self._map_poses.stamps_ns
-        if path := self._options.map_tum:
-            self._warnings += write_known(path, stamps_ns, in_map, results.known_in_map(self._map_poses))
-        if path := self._options.map_live_tum:
-            self._warnings += write_known(path, stamps_ns, live, self._map_poses.known)
+    def _result(self, session: Session, report: RunReport, stages: WiredStages) -> RunResult:
+        options, places, updates = self._options, stages.places, self._in_map
+        counters = report.counters(session.statistics)
+        if self._wheels is not None:
+            counters = replace(counters, motor=self._wheels.counts())
+        # 1. Poses in the map: as it is at the end, whose later loops have corrected them; and as they were known.
+        found = [] if places is None else [places.corrected(each) for each in updates]
+        known = np.zeros(0, bool) if places is None else places.known(updates)
+        in_map, live = (np.array(T, float).reshape(-1, 4, 4) for T in (found, [each.T_map_rig for each in updates]))
+        stamps_ns = np.array([each.stamp_ns for each in updates], np.int64)
+        if path := options.map_tum:
+            self._warnings += write_known(path, stamps_ns, in_map, known)
+        if path := options.map_live_tum:
+            self._warnings += write_known(path, stamps_ns, live, np.array([each.is_known for each in updates], bool))
+        # 2. All that was found.
+        newest = self._map.get()
         return RunResult(
-            self._poses.stamps_ns,
-            self._poses.T_odom_rig,
-            self._poses.covariances,
-            self._poses.states,
+            *self._poses.arrays(),
             counters,
-            results.timings(),
-            (*dict.fromkeys(self._warnings), *results.warnings()),
+            report.timings(),
+            (*dict.fromkeys(self._warnings), *report.warnings()),
             None if newest is None else newest.points,
             session.signal,
             in_map,
             live,
-            self._map_poses.states,
-            results.places() if self._options.collect else None,
+            tuple(each.state for each in updates),
+            places.map() if places is not None and options.collect else None,
             elapsed_s=time.monotonic() - self._begun_s,
         )
 

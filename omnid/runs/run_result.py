@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from importlib import import_module
 from os import PathLike
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib import se3
 from drivers.logs.log_reader import LogReader
 from omnid.core.control.motion_monitor import ADVICE
 from omnid.core.mapping.voxel_map import MapPoints
@@ -26,11 +24,9 @@ from omnid.errors import OmnidError
 from omnid.formats.ply import write_ply
 from omnid.formats.tum import Trajectory, read_tum, tum_row
 from omnid.recordings.evaluation import Metrics, evaluate
-from omnid.runs.pipeline import WiredStages
 from omnid.runs.place_maps import RigPlaces
 from omnid.runs.session import Session
-from omnid.sinks.pose_collector import MapPoseCollector
-from omnid.stages.synchronise import Synchronise
+from omnid.runs.wiring import WiredStages
 from omnid.tracking_state import MapState, TrackingState
 from omnid.transport.codec import DiagnosticStatus
 
@@ -88,30 +84,6 @@ class RunResult:
         true = truth if isinstance(truth, Trajectory) else read_tum(Path(truth))
         return evaluate(Trajectory(self.stamps_ns, self.T_odom_rig), true, tolerance_s, alignment)
 
-    def to_dataframe(self) -> Any:
-        """Return a pandas.DataFrame with a row for each pose, indexed by its time (UTC).
-
-        Columns: x, y, z [m] and qx, qy, qz, qw of T_odom_rig; sigma_m and sigma_rad, square roots of the largest
-        variance of position and rotation; state. Raises OmnidError where pandas is not installed.
-        """
-        try:
-            pandas = import_module("pandas")
-        except ImportError as error:
-            raise OmnidError("to_dataframe: pandas is not installed: pip install 'omnid[pandas]'") from error
-        T, count = self.T_odom_rig, len(self.stamps_ns)
-        quaternions = np.reshape([se3.quaternion(R) for R in T[:, :3, :3]], (count, 4))
-        sigmas = {
-            name: np.sqrt(np.linalg.eigvalsh(self.covariances[:, at, at])[:, -1])
-            for name, at in (("sigma_m", slice(0, 3)), ("sigma_rad", slice(3, 6)))
-        }
-        columns = {
-            **dict(zip("xyz", T[:, :3, 3].T, strict=True)),
-            **dict(zip(("qx", "qy", "qz", "qw"), quaternions.T, strict=True)),
-            **sigmas,
-            "state": [str(state) for state in self.states],
-        }
-        return pandas.DataFrame(columns, index=pandas.DatetimeIndex(self.stamps_ns, tz="UTC", name="time"))
-
     def save_tum(self, path: str | PathLike[str]) -> None:
         """Write the trajectory: a row `t x y z qx qy qz qw` for each pose (s, m, unit quaternion).
 
@@ -143,8 +115,6 @@ class RunFailedError(OmnidError):
         self.result = result
 
 
-READER_DROPS: Final = ("late", "duplicate", "broken", "broken_records")
-PAIRING_DROPS: Final = ("unpaired", "repeated")  # begin the names of its counts
 BOOKKEEPING: Final = frozenset(  # left out of the timings
     {"progress", "statistics", "collect-poses", "collect-map", "collect-places"}
 )
@@ -153,34 +123,24 @@ BOOKKEEPING: Final = frozenset(  # left out of the timings
 class RunReport:
     """Counters, timings, warnings and final status of a run over a log, read from its parts."""
 
-    def __init__(self, session: Session, reader: LogReader, pairing: Synchronise, stages: WiredStages) -> None:
-        self._session, self._reader, self._pairing, self._stages = session, reader, pairing, stages
+    def __init__(self, session: Session, reader: LogReader, stages: WiredStages) -> None:
+        self._session, self._reader, self._stages = session, reader, stages
+        self._pairing, self._odometry = stages.front_end.pairing, stages.front_end.odometry
 
     def counters(self, statistics: RunStatistics) -> RunCounters:
-        """Return the counters of the run with the given statistics."""
-        counters = RunCounters.of(statistics, self._pairing.counts["pairs"], self._drops())
+        """Return the counters of the run with the given statistics; all that was lost, by reason, zeros too."""
+        read, paired, telemetry = self._reader.counts, self._pairing.counts, self._session.graph.telemetry
+        drops = {name: read[name] for name in ("late", "duplicate", "broken", "broken_records")}
+        drops |= {name: count for name, count in paired.items() if name.startswith(("unpaired", "repeated"))}
+        drops["broken"] += paired["broken"]
+        drops["queue"] = telemetry.dropped_messages
         mapping, places = self._stages.mapping, self._stages.places
         return replace(
-            counters,
+            RunCounters.of(statistics, paired["pairs"], drops),
             map={} if mapping is None else mapping.counts,
             places={} if places is None else places.counts,
             loss=self._loss(),
         )
-
-    def places(self) -> PlaceMap | None:
-        """Return the map of places as it can be saved; None where there is none."""
-        return None if self._stages.places is None else self._stages.places.map()
-
-    def map_poses(self, poses: MapPoseCollector) -> NDArray[np.float64]:
-        """Return the collected poses in the map (N, 4, 4) as it is at the end: later loops have corrected them."""
-        places = self._stages.places
-        found = [] if places is None else [places.corrected(update) for update in poses.updates]
-        return np.array(found).reshape(-1, 4, 4)
-
-    def known_in_map(self, poses: MapPoseCollector) -> NDArray[np.bool_]:
-        """Return at which of the collected poses (N,) it is known at the end where odom lay in the map."""
-        places = self._stages.places
-        return np.zeros(0, np.bool_) if places is None else places.known(poses.updates)
 
     def timings(self) -> dict[str, SummaryRow]:
         """Return the times of the stages."""
@@ -193,41 +153,30 @@ class RunReport:
         if self._loss():
             yield self._loss()
         statistics = self._session.statistics
-        if statistics.poses or not self._session.signal:
-            fault = self._stages.front_end.odometry.last_fault
-            if fault.reason:
-                yield f"{fault.reason} {fault.detail}; {ADVICE}"
-            message = self._motion().message if self._has_motion else ""
-            if message and not (fault.reason and message.startswith(fault.reason)):
-                yield f"wheels and gyro: {message}"
-            if self._stages.floor is not None and self._stages.floor.summary():
-                yield self._stages.floor.summary()
-            yield from self._stages.front_end.odometry.image_faults
-            health = self._stages.front_end.health
-            yield from input_warnings(self._pairing, health, statistics, self._session.config)
+        if not statistics.poses and self._session.signal:
+            return
+        fault = self._odometry.last_fault
+        if fault.reason:
+            yield f"{fault.reason} {fault.detail}; {ADVICE}"
+        message = "".join(status.message for status in self._motion())
+        if message and not (fault.reason and message.startswith(fault.reason)):
+            yield f"wheels and gyro: {message}"
+        if self._stages.floor is not None and self._stages.floor.summary():
+            yield self._stages.floor.summary()
+        yield from self._odometry.image_faults
+        yield from input_warnings(self._pairing, self._stages.front_end.health, statistics, self._session.config)
 
     def final_status(self, statistics: RunStatistics) -> list[DiagnosticStatus]:
         """Return the counters of the run and of its stages, for the log."""
         stages = (stats for stats in self._session.graph.telemetry.stages if stats.name not in BOOKKEEPING)
-        motion = [self._motion()] if self._has_motion else []
-        return [summary_status(self.counters(statistics)), *motion, *map(stage_status, stages)]
+        return [summary_status(self.counters(statistics)), *self._motion(), *map(stage_status, stages)]
 
     def _loss(self) -> str:
         """Return one line about images that make no pair; empty where these are few, or were dropped on purpose."""
-        return "" if self._session.dropped_messages() else str(self._pairing.loss(self._reader.counts))
+        dropped = self._session.graph.telemetry.dropped_messages
+        return "" if dropped else str(self._pairing.loss(self._reader.counts))
 
-    @property
-    def _has_motion(self) -> bool:
+    def _motion(self) -> list[DiagnosticStatus]:
+        """Return the entry of wheels and gyro, if there were any."""
         inbox = self._pairing.motion
-        return bool(inbox.wheels or inbox.gyro)
-
-    def _motion(self) -> DiagnosticStatus:
-        return motion_status(self._stages.front_end.odometry, self._pairing.motion)
-
-    def _drops(self) -> dict[str, int]:
-        """Return all that was lost, by reason; zeros too."""
-        drops = {name: self._reader.counts[name] for name in READER_DROPS}
-        drops |= {name: count for name, count in self._pairing.counts.items() if name.startswith(PAIRING_DROPS)}
-        drops["broken"] += self._pairing.counts["broken"]
-        drops["queue"] = self._session.dropped_messages()
-        return drops
+        return [motion_status(self._odometry, inbox)] if inbox.wheels or inbox.gyro else []

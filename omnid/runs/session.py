@@ -13,6 +13,8 @@ from calib.rig import Rig
 from calib.rig_file import parse_rig, rig_toml
 from drivers.frame import Frame
 from drivers.logs.log_reader import LogReader
+from drivers.logs.ros_messages import JointWheels
+from drivers.logs.topics import MotionTopics
 from omnid.config import Config
 from omnid.controller.link import ControllerLink
 from omnid.controller.messages import ControllerStart
@@ -32,6 +34,13 @@ from omnid.sinks.encoder import Encoder, UnixTime
 from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.transport.bus import Bus
 
+BUS_END_S: Final = 3.0
+ROUTER_S: Final = 2.0  # Time between two attempts of a client to reach its router for the first time.
+OPENCV_THREADS: Final = 1  # within a stage: the stages are threads themselves
+# Largest number of points of the map, the most confident ones, in one message on the bus and in a log.
+BUS_POINTS: Final = 50_000
+LOG_POINTS: Final = 200_000
+
 
 def attached_rig(reader: LogReader, log: Path) -> Rig:
     """Return the rig of the rig.toml that is attached to the log; OmnidError if there is none."""
@@ -44,14 +53,22 @@ def attached_rig(reader: LogReader, log: Path) -> Rig:
     return parse_rig(attached, None, f"{log}: attached rig.toml")
 
 
-BUS_END_S: Final = 3.0
-ROUTER_S: Final = 2.0  # Time between two attempts of a client to reach its router for the first time.
-OPENCV_THREADS: Final = 1  # within a stage: the stages are threads themselves
-# Largest number of points of the map, the most confident ones, in one message on the bus and in a log.
-BUS_POINTS: Final = 50_000
-LOG_POINTS: Final = 200_000
-# They drop deadlines, not messages.
-TICKERS: Final = frozenset({"load", "motor", "progress", "router", "routes", "save", "status", "terminal", "watchdog"})
+def motion_topics(config: Config) -> MotionTopics:
+    """Return the topics of a log to read. Raise OmnidError where only one of the two wheel joints is named."""
+    named = {"auto": None, "off": ""}  # None: the only topic of the log, "": none
+    wheels, imu = (named.get(topic, topic) for topic in (config.motion.wheels, config.motion.imu))
+    return MotionTopics(wheels, imu, joint_wheels(config))
+
+
+def joint_wheels(config: Config) -> JointWheels | None:
+    """Return the wheels as joints, None where they are an Odometry. Raise OmnidError where only one is named."""
+    joints = config.motion.wheel_joints
+    if not joints:
+        return None
+    if len(joints) != 2 or len(set(joints)) != 2:
+        raise OmnidError(f"motion.wheel_joints = {list(joints)}: expected the names of two joints, or none")
+    drive = config.motor.drive.geometry()
+    return JointWheels(*joints, drive.wheel_radius_m, drive.track_m)
 
 
 class Session:
@@ -110,7 +127,7 @@ class Session:
         """
         settings = self.config.controller.of_replay if of_replay else self.config.controller
         start = ControllerStart(self.config.motor, self.with_obstacles_known(settings), realtime, waits=of_replay)
-        link = ControllerLink(start, self.graph.telemetry.add(StageStats("motor")), self.warn)
+        link = ControllerLink(start, self.graph.telemetry.add(StageStats("motor", is_ticker=True)), self.warn)
         self.outputs.callback(link.close)
         return link
 
@@ -120,46 +137,40 @@ class Session:
         Images that are too small to see the floor are reported, too: the base would stop without a reason in view.
         """
         collision = settings.collision
-        if collision.check and self.config.obstacles.enabled and collision.unknown == STOP:
-            self._warn_of_small_images()
-        if not collision.check or self.config.obstacles.enabled:
+        if not collision.check:
             return settings
-        self.warn(
-            "obstacles.enabled = false: the collision monitor is off, nothing keeps the base from driving "
-            "against obstacles"
-        )
-        return settings.without_obstacles
-
-    def _warn_of_small_images(self) -> None:
-        if self._focal_px < FLOOR_FOCAL_PX:
+        if not self.config.obstacles.enabled:
+            self.warn(
+                "obstacles.enabled = false: the collision monitor is off, nothing keeps the base from driving "
+                "against obstacles"
+            )
+            return settings.without_obstacles
+        if collision.unknown == STOP and self._focal_px < FLOOR_FOCAL_PX:
             self.warn(
                 f"the images are small: {self._focal_px:.0f} rows of the panorama a radian, where it takes "
                 f"{FLOOR_FOCAL_PX:.0f} to tell the floor from an edge of 5 cm (384 px by a mirror), so the base "
                 "will often stop because the way ahead is unknown; use larger images, "
                 'or controller.collision.unknown = "slow"'
             )
+        return settings
 
     def encoder(self, rig: Rig, cloud_points: int, unix_ns: UnixTime | None = None) -> Encoder:
         """Return an encoder that limits the number of points of the map; unix_ns: None for that of the clock."""
         scan_range_m = self.config.obstacles.ring.max_range_m
         return Encoder(rig.T_base_rig, cloud_points, unix_ns or self.clock.unix_ns, rig, scan_range_m)
 
-    def dropped_messages(self) -> int:
-        """Return the number of messages that were dropped in front of the stages and sinks."""
-        return sum(stats.dropped for stats in self.graph.telemetry.stages if stats.name not in TICKERS)
-
     @contextmanager
-    def signals(self, on_signal: Callable[[int, bool], None]) -> Iterator[None]:
+    def signals(self, on_signal: Callable[[bool], None]) -> Iterator[None]:
         """Stop the graph on SIGINT, SIGTERM and SIGHUP in this block, a second signal stops it at once.
 
-        on_signal: called in the handler with the number of the signal and whether it is the second one or later.
+        on_signal: called in the handler; True: it is the second signal or a later one.
         Outside the main thread, where Python has no signal handlers, the block leaves signals as they are.
         """
 
         def handle(number: int, _: FrameType | None) -> None:
             again, self.signal = self.signal != 0, number
             self.graph.stop()
-            on_signal(number, again)
+            on_signal(again)
 
         with ExitStack() as handlers:
             with suppress(ValueError):

@@ -107,9 +107,8 @@ class Service:
 class StatusLine:
     """One line about the run: state, poses per second since the last call, dropped messages, missed deadlines."""
 
-    def __init__(self, statistics: RunStatistics, telemetry: Telemetry, tickers: Collection[str] = ()) -> None:
-        """tickers: names of the stages whose `dropped` are deadlines, not messages."""
-        self._statistics, self._telemetry, self._tickers = statistics, telemetry, frozenset(tickers)
+    def __init__(self, statistics: RunStatistics, telemetry: Telemetry) -> None:
+        self._statistics, self._telemetry = statistics, telemetry
         self._poses, self._called_ns = statistics.poses, time.monotonic_ns()
 
     def __call__(self) -> str:
@@ -118,6 +117,40 @@ class StatusLine:
         rate_hz = (poses - self._poses) / max(1e-3, (now_ns - self._called_ns) * 1e-9)
         self._poses, self._called_ns = poses, now_ns
         state = newest.state if newest is not None and rate_hz > 0 else "waiting for images"
-        dropped = sum(stats.dropped for stats in self._telemetry.stages if stats.name not in self._tickers)
-        late = sum(stats.dropped for stats in self._telemetry.stages if stats.name in self._tickers)
+        dropped, late = self._telemetry.dropped_messages, self._telemetry.missed_deadlines
         return f"{state}, {rate_hz:.1f} poses/s, {dropped} messages dropped, {late} deadlines missed"
+
+
+class TerminalStatus:
+    """The action of a ticker: shows a line as long as the run lasts."""
+
+    period_s: Final = 0.5
+
+    def __init__(
+        self,
+        show: Callable[[str], None],
+        line: Callable[[], str],
+        report: Callable[[str], None],
+        statistics: RunStatistics,
+        ready: str,
+    ) -> None:
+        """show: rewrites the line. line: its text. report: takes lines that stay. ready: of the start."""
+        self._show, self._line, self._report = show, line, report
+        self._statistics, self._ready = statistics, ready
+
+    def __call__(self) -> None:
+        """Report that the run is ready, once, and show the line."""
+        if self._ready:
+            self._report(self._ready)
+            self._ready = ""
+        self._show(f"{self._statistics.length_m:8.2f} m  {self._line()}")
+
+    def close(self) -> None:
+        """Remove the line, and report the summary."""
+        self._show("")
+        statistics = self._statistics
+        states = ", ".join(f"{state} {count / statistics.poses:.1%}" for state, count in statistics.states.items())
+        self._report(
+            f"ended: {statistics.poses} poses, {statistics.length_m:.2f} m, {statistics.resets} resets"
+            f"{f'; {states}' if states else ''}"
+        )

@@ -32,9 +32,9 @@ from omnid.engine.graph import Graph
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
-from omnid.runs.pipeline import NavigationParts, RunParts, Sinks, WiredStages, wheel_state, wire
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.route_files import RouteFiles
+from omnid.runs.wiring import NavigationParts, Outputs, Parts, WiredStages, wheel_state, wire
 from omnid.simulation.cameras import SimulatedCameras
 from omnid.simulation.rendering.sensor import Sensor
 from omnid.simulation.robot import SimulatedRobot
@@ -45,7 +45,6 @@ from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry
 from omnid.stages.lockstep_drive import controller_pose
 from omnid.stages.obstacles import controller_ring
-from omnid.stages.synchronise import Synchronise
 
 T = TypeVar("T")
 
@@ -231,16 +230,20 @@ class _Lockstep:
         graph = Graph(threaded=False)
         frames = graph.source("cameras", lambda: self._messages(seconds))
         shape = geometry(self._rig, config.panorama)
-        pairs = graph.stage("pair", Synchronise(shape.rig, config.pair), frames)
         run_places = RunPlaces(config, shape, nothing)
         navigation = NavigationParts(self._requests, self._wheels, Take(self._take_navigation), config.places.map)
-        sinks = Sinks(
+        outputs = Outputs(
             poses={"poses": Take(self._take_pose)},
             rings={"rings": Take(self._take_ring)},
             places={"in map": Take(self._places.append)} if config.places.map else {},
         )
         self._stages = wire(
-            graph, pairs, FrontEnd(shape, config), config, sinks, run_places.known_to(RunParts(navigation=navigation))
+            graph,
+            [frames],
+            FrontEnd(shape, config),
+            config,
+            outputs,
+            run_places.known_to(Parts(navigation=navigation)),
         )
         # 2. The drive: the stages take what `_messages` yields.
         graph.run()

@@ -187,7 +187,7 @@ class PacedRobot:
     def connect(self, session: Session) -> DriveLink:
         """Set the robot up, with the controller of the settings."""
         config = replace(session.config, controller=session.with_obstacles_known(session.config.controller))
-        self._link = PacedLink(session.graph.telemetry.add(StageStats("motor")), self._period_ns)
+        self._link = PacedLink(session.graph.telemetry.add(StageStats("motor", is_ticker=True)), self._period_ns)
 
         def warn(_: float, line: str) -> None:
             if not self._ends:  # no more poses come then, which needs no line

@@ -81,6 +81,7 @@ class Dewarp:
             dimmer,
             pair.motion,
             tiles,
+            pair.load,
         )
 
     def _remapped(

@@ -1,4 +1,4 @@
-"""Front end of all runs: image pair, panoramas, check of the rig, odometry; and the dense depth of its pairs."""
+"""Front end of all runs: pairs of images, panoramas, check of the rig, odometry; and the dense depth of its pairs."""
 
 from __future__ import annotations
 
@@ -6,33 +6,31 @@ from dataclasses import replace
 
 from omnid.config import Config
 from omnid.core.rig.rig_health import RigHealth
-from omnid.load_level import Load, full_load
 from omnid.messages import FramePair, OdometryUpdate, Panoramas, StereoDepth
 from omnid.stages.dense_depths import DenseDepths, DenseStereo
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry
-from omnid.stages.motion_inbox import MOST_WAITING
 from omnid.stages.odometry import OdometryStage
+from omnid.stages.synchronise import Synchronise
 from omnid.tracking_state import TrackingState
 
 
 class FrontEnd:
-    """The stages from a pair to its pose, with the settings of one configuration.
+    """The stages from images to their pose, with the settings of one configuration.
 
-    A run with threads has `dewarp` and `poses` as two stages; `process` does the work of both. `dense` computes the
+    A run has `pairing`, `dewarp` and `poses` as stages; `process` does the work of the last two. `dense` computes the
     dense depth of their pairs for all stages that need it.
     """
 
-    def __init__(
-        self, geometry: Geometry, config: Config, health: RigHealth | None = None, *, load: Load = full_load
-    ) -> None:
+    def __init__(self, geometry: Geometry, config: Config, health: RigHealth | None = None) -> None:
         """health: state of the rig; None: a new one, with the check of the configuration."""
         self.geometry = geometry
         self.health = health or RigHealth(geometry.cylinder, config.rig.check)
+        self.pairing = Synchronise(geometry.rig, config.pair, config.motion.R_base_imu)
         self.dewarp = Dewarp(geometry, config.panorama)
         stereo = DenseStereo(geometry, config.stereo_settings())
         self.dense = DenseDepths(stereo.compute, stereo.confirmed)
-        self.odometry = OdometryStage(geometry, config.odometry, self.dense, load, self.dewarp.raw_images)
+        self.odometry = OdometryStage(geometry, config.odometry, self.dense, self.dewarp.raw_images)
         self.poses = CheckedOdometry(self.odometry, self.health)
 
     def process(self, pair: FramePair) -> OdometryUpdate:
@@ -68,11 +66,13 @@ class CheckedOdometry:
             return replace(update, state=TrackingState.DEGRADED)
         return update
 
-    @staticmethod
-    def merge(older: Panoramas, newer: Panoramas) -> Panoramas:
-        """Return the newer pair with the samples of both, where the older one is dropped: its step is that of both."""
-        return replace(newer, motion=(*older.motion, *newer.motion)[-MOST_WAITING:])
 
-    def after(self) -> None:
-        """Make the keyframe of the last pair, whose pose was passed on, if there is to be one."""
-        self._odometry.after()
+class Keyframes:
+    """A sink of poses that makes the keyframe of a pair. As their last reader it does so once the pose is passed on."""
+
+    def __init__(self, odometry: OdometryStage) -> None:
+        self._odometry = odometry
+
+    def process(self, _: OdometryUpdate) -> None:
+        """Complete the newest pair."""
+        self._odometry.complete()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import TypeAlias
 
 import numpy as np
@@ -14,7 +13,7 @@ from omnid.config import MappingConfig
 from omnid.core.mapping.scan_grid import KeyframeGrid
 from omnid.core.mapping.thinned_path import ThinnedPath
 from omnid.core.mapping.voxel_map import VoxelMap
-from omnid.load_level import Load, LoadLevel, full_load
+from omnid.load_level import LoadLevel
 from omnid.messages import GridUpdate, MapUpdate, OdometryUpdate, PlaceUpdate
 from omnid.stages.dense_depths import DenseDepths
 from omnid.tracking_state import TrackingState
@@ -37,26 +36,14 @@ def _is_step(last: Position, new: Position, step_m: float) -> bool:
     return math.dist(last, new) >= step_m
 
 
-def always() -> bool:
-    """Return True: the answer of a run whose maps are files."""
-    return True
-
-
 class Mapping:
     """Fuses points of small variance at tracked poses; returns the map periodically and at the end."""
 
-    def __init__(
-        self,
-        config: MappingConfig,
-        dense: DenseDepths,
-        every_s: float = 0.0,
-        load: Load = full_load,
-        is_read: Callable[[], bool] = always,
-    ) -> None:
+    def __init__(self, config: MappingConfig, dense: DenseDepths, every_s: float = 0.0) -> None:
         """dense: computes the depth of a pair that enters the map. every_s: between two maps, by the stamps; 0: one,
-        at the end. is_read: True while the map has a reader.
+        at the end.
         """
-        self._load, self._is_read = load, is_read
+        self.is_read = True  # whether the map has a reader: a live run notes it from time to time
         self._config, self._dense = config, dense
         self._every_ns, self._given_ns = round(every_s * 1e9), 0
         self._map = VoxelMap(config.voxel_m, 1 << config.log2_voxels)
@@ -96,12 +83,11 @@ class Mapping:
         stereo the odometry needs anyway, is due after half the time: then another pair can do without. While no client
         reads the map, keyframes are enough: one that reads it later finds all of it, of fewer views.
         """
-        if not (odometry.is_keyframe or self._is_read()):
+        if not (odometry.is_keyframe or self.is_read):
             return False
-        load = self._load()
-        if load >= LoadLevel.NO_MAP:
+        if odometry.load >= LoadLevel.NO_MAP:
             return False
-        shed_ns = SPARSE_NS if load is LoadLevel.SPARSE_MAP else 0
+        shed_ns = SPARSE_NS if odometry.load is LoadLevel.SPARSE_MAP else 0
         if self._mapped is None or not (self._min_gap_ns or shed_ns):
             return True
         since_ns, moved = odometry.stamp_ns - self._mapped[0], se3.inverse(self._mapped[1]) @ odometry.T_odom_rig
@@ -123,11 +109,10 @@ class Mapping:
 class MapGrid:
     """Draw the map periodically and at the end, where it has changed: it moves when a loop closes."""
 
-    def __init__(self, cell_m: float, T_base_rect: Array, every_s: float = 0.0, load: Load = full_load) -> None:
+    def __init__(self, cell_m: float, T_base_rect: Array, every_s: float = 0.0) -> None:
         """cell_m: side of a cell. every_s: time between two grids, by the stamps; 0: one grid, at the end."""
         self._grid, self._T_base_rect = KeyframeGrid(cell_m), T_base_rect
         self._every_ns, self._given_ns = round(every_s * 1e9), 0
-        self._load = load
         self._given: object = None  # scans of the last grid
         self._newest: PlaceUpdate | None = None
 
@@ -138,7 +123,7 @@ class MapGrid:
         self._newest = update
         if not self._every_ns or update.stamp_ns - self._given_ns < self._every_ns or update.scans is self._given:
             return None
-        return None if self._load() >= LoadLevel.NO_MAP else self._drawn(update)
+        return self._drawn(update)
 
     def finish(self) -> list[GridUpdate]:
         """Return the final grid, if there was a keyframe."""

@@ -26,7 +26,7 @@ from omnid.core.obstacles.pair_views import FOCAL_PX
 from omnid.core.obstacles.rays.pair_rings import RayRings
 from omnid.core.obstacles.settings import RingSettings
 from omnid.core.obstacles.unwatched import Unwatched, without
-from omnid.load_level import Load, LoadLevel, full_load
+from omnid.load_level import LoadLevel
 from omnid.messages import DensePoints, ObstacleRing, OdometryUpdate, Panoramas
 from omnid.stages.dense_depths import DenseDepths
 from omnid.stages.geometry import Geometry
@@ -209,9 +209,9 @@ SHED_PERIOD_NS: Final[Mapping[LoadLevel, int]] = {
 class Obstacles:
     """Makes a ring of each pair that is due, from the evidence of its columns."""
 
-    def __init__(self, geometry: Geometry, config: ObstaclesConfig, dense: DenseDepths, load: Load = full_load) -> None:
+    def __init__(self, geometry: Geometry, config: ObstaclesConfig, dense: DenseDepths) -> None:
         """dense: computes the depth of a pair, from which a floor is found that the rig does not state."""
-        self._load, self._dense = load, dense
+        self._dense = dense
         self._period_ns = 1e9 / config.rate_hz if config.rate_hz else 0.0
         self.floor = CameraFloor(geometry.rig, config.ring.floor_m)
         self._rings = PairRings(geometry, config.ring)
@@ -238,7 +238,7 @@ class Obstacles:
         """True if a pair is to give a ring."""
         if self._last_ns is None:
             return True
-        wait_ns = max(self._period_ns, SHED_PERIOD_NS[self._load()])
+        wait_ns = max(self._period_ns, SHED_PERIOD_NS[odometry.load])
         since_ns = odometry.stamp_ns - self._last_ns
         return since_ns < 0 or since_ns >= wait_ns - STAMP_JITTER_NS
 

@@ -25,7 +25,7 @@ from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.relocalisation import Relocaliser
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.stereo_model import StereoModel
-from omnid.load_level import Load, LoadLevel, full_load
+from omnid.load_level import LoadLevel
 from omnid.messages import OdometryUpdate, Panoramas, StereoDepth
 from omnid.stages.dense_depths import DenseDepths
 from omnid.stages.geometry import Geometry
@@ -54,11 +54,10 @@ class OdometryStage:
         geometry: Geometry,
         config: OdometryConfig,
         dense: DenseDepths,
-        load: Load = full_load,
         raw_images: tuple[RawImage, RawImage] | None = None,
     ) -> None:
         """dense: computes the depth of keyframes. raw_images: see VisualOdometry."""
-        self._dense, self._load = dense, load
+        self._dense, self._load = dense, LoadLevel.FULL
         self._method = _method(geometry.model(config.noise_px), config, self._features, raw_images)
         self._T_rig_rect = geometry.T_rig_rect
         self._to_rig = se3.adjoint(self._T_rig_rect)
@@ -73,7 +72,7 @@ class OdometryStage:
 
     def _features(self) -> float:
         """Return the share of the landmarks that the next keyframe is to have."""
-        return REDUCED_FEATURES if self._load() >= LoadLevel.REDUCED else 1.0
+        return REDUCED_FEATURES if self._load >= LoadLevel.REDUCED else 1.0
 
     @property
     def witness(self) -> Witness:
@@ -90,6 +89,7 @@ class OdometryStage:
         """Return the pose at a pair."""
         # 1. What wheels and gyro have measured since the pair before.
         last_ns, self._last_ns = self._last_ns, pair.stamp_ns
+        self._load = pair.load
         dt_s = 0.0 if last_ns is None else (pair.stamp_ns - last_ns) * 1e-9
         self.sensors.add(pair.motion)
         self._agreement.add(pair.motion, float(self.sensors.values[BIAS][2]))
@@ -146,8 +146,8 @@ class OdometryStage:
             covariance_rect,
         )
 
-    def after(self) -> None:
-        """Make the keyframe of the last pair, whose pose was passed on, if there is to be one."""
+    def complete(self) -> None:
+        """Make the keyframe of the last pair, if there is to be one; otherwise that is done before the next pair."""
         self._method.complete()
 
     def _earlier(self, pair: Panoramas, estimate: OdometryEstimate) -> EarlierView | None:

@@ -15,7 +15,7 @@ from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.localisation import MapLocaliser
 from omnid.core.places.map_pose import OdometryFrame
 from omnid.core.places.place_map import PlaceMap
-from omnid.load_level import Load, LoadLevel, full_load
+from omnid.load_level import LoadLevel
 from omnid.messages import MapKeyframes, OdometryUpdate, PlaceUpdate, StereoDepth
 from omnid.stages.dense_depths import DenseDepths
 from omnid.stages.geometry import Geometry
@@ -45,14 +45,13 @@ class Places:
         places: PlaceMap | None = None,
         *,
         localize_only: bool = False,
-        load: Load = full_load,
     ) -> None:
         """dense: computes the depth of keyframes. places: a map to be extended, None: a new one. localize_only: the map
         stays as it is.
 
         Nothing is recognised or kept from LoadLevel.NO_MAP on.
         """
-        self._dense, self._load = dense, load
+        self._dense = dense
         self._localiser = MapLocaliser(
             geometry.model(config.odometry.noise_px), config.places.limits, places, localize_only=localize_only
         )
@@ -85,7 +84,7 @@ class Places:
     def process(self, odometry: OdometryUpdate) -> PlaceUpdate:
         """Return the pose in the map at a pair."""
         # 1. The pose in the map.
-        pose = self._localiser.process(self._frame(odometry), idle=self._load() >= LoadLevel.NO_MAP)
+        pose = self._localiser.process(self._frame(odometry), idle=odometry.load >= LoadLevel.NO_MAP)
         self.state = pose.state
         # 2. Copies for other threads, which never read the map itself.
         if self._copy_wanted:

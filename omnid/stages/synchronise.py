@@ -17,6 +17,7 @@ from drivers.frame import Camera, Frame, coding_steps, gray
 from drivers.motion import MotionSample
 from omnid.camera_config import PairConfig
 from omnid.errors import OmnidError
+from omnid.load_level import LoadLevel
 from omnid.messages import FramePair
 from omnid.stages.image_loss import ImageLoss, image_loss, unpaired_by_chance
 from omnid.stages.motion_inbox import MotionInbox
@@ -309,6 +310,7 @@ class Synchronise:
         self.repeated: dict[Camera, RepeatedImages] = {"lower": RepeatedImages(), "upper": RepeatedImages()}
         self.skew = Skew()
         self.motion = MotionInbox(R_base_imu)
+        self.load = LoadLevel.FULL  # of the next pairs: a live run sets it
         self.newest_ns: dict[Camera, int] = {"lower": 0, "upper": 0}  # stamp of each camera's newest frame
 
     @property
@@ -421,6 +423,7 @@ class Synchronise:
             self.skew.exposure_ns * 1e-9,
             self.motion.take(lower.stamp_ns),
             (coding_steps(lower), coding_steps(upper)),
+            self.load,
         )
 
 

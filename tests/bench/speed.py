@@ -28,12 +28,11 @@ from omnid.config import load_config
 from omnid.engine.graph import Graph
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.messages import OdometryUpdate
-from omnid.runs.pipeline import Sinks, wire
 from omnid.runs.session import OPENCV_THREADS
+from omnid.runs.wiring import Outputs, wire
 from omnid.sinks.files import MapFile, TrajectoryFile
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry, with_rims
-from omnid.stages.synchronise import Synchronise
 from tests.bench.accuracy import rig_of
 from tests.bench.reference_kernels import ReferenceKernels
 from tests.bench.results import Column, ResultTable
@@ -103,10 +102,9 @@ def measure(folder: Path, pairs: int, hz: float, overrides: Sequence[str]) -> di
     with TemporaryDirectory() as work, clock.timed_stages():
         graph = Graph(threaded=False)
         trajectory, cloud = TrajectoryFile(Path(work) / "t"), MapFile(Path(work) / "m")
-        sinks = Sinks({"trajectory": trajectory, "measured": clock}, {"map": cloud})
+        outputs = Outputs(poses={"trajectory": trajectory, "measured": clock}, maps={"map": cloud})
         read = graph.source("read", lambda: to_and_fro(frames, pairs, round(1e9 / hz)))
-        paired = graph.stage("pair", Synchronise(place.rig, config.pair), read)
-        wire(graph, paired, FrontEnd(place, config), config, sinks)
+        wire(graph, [read], FrontEnd(place, config), config, outputs)
         graph.run()
     found = {label: 1e-6 * spent_ns / (pairs - SKIPPED) for label, spent_ns in clock.stage_ns.items()}
     found["all stages"] = sum(found.values())

@@ -112,16 +112,6 @@ def test_a_result_is_compared_with_the_truth(result: omnid.RunResult, tmp_path: 
     assert result.evaluate(longer).length_error_ratio == pytest.approx(1 / 1.25 - 1)
 
 
-def test_a_result_is_a_table(result: omnid.RunResult, monkeypatch: pytest.MonkeyPatch) -> None:
-    table = result.to_dataframe()
-    assert len(table) == PAIRS and table.index[0].value == result.stamps_ns[0]
-    assert np.array_equal(table[["x", "y", "z"]].to_numpy(), result.T_odom_rig[:, :3, 3])
-    assert set(table["state"]) == {"tracking"} and (table["sigma_m"].to_numpy()[1:] > 0).all()
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(OmnidError, match=r"pip install 'omnid\[pandas\]'"):
-        result.to_dataframe()
-
-
 def test_a_replay_reports_its_progress(scene: Path, start: Path) -> None:
     seen: list[tuple[int, int | None]] = []
     omnid.replay(start, rig=scene / "rig.toml", progress=lambda *counts: seen.append(counts))

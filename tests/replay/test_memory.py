@@ -18,11 +18,10 @@ from omnid.config import Config
 from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.graph import Graph
 from omnid.messages import OdometryUpdate
-from omnid.runs.pipeline import Sinks, wire
+from omnid.runs.wiring import Outputs, wire
 from omnid.sinks.files import MapFile, TrajectoryFile
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry, with_rims
-from omnid.stages.synchronise import Synchronise
 
 PAIRS = 2000
 PERIOD_NS = 100_000_000
@@ -59,9 +58,9 @@ def test_memory_stays_constant(tmp_path: Path, threaded: bool) -> None:
     monitor, statistics = MemoryMonitor(), RunStatistics()
     poses = {"monitor": monitor, "statistics": statistics, "trajectory": TrajectoryFile(tmp_path / "est.txt")}
     graph = Graph(threaded=threaded)
-    ends = Sinks(poses=poses, maps={"map": MapFile(tmp_path / "map.ply")})
+    ends = Outputs(poses=poses, maps={"map": MapFile(tmp_path / "map.ply")})
     read = graph.source("read", lambda: to_and_fro(frames, PAIRS))
-    wire(graph, graph.stage("pair", Synchronise(place.rig, config.pair), read), FrontEnd(place, config), config, ends)
+    wire(graph, [read], FrontEnd(place, config), config, ends)
     graph.run()
     print(statistics.states, monitor.mib)
     assert statistics.poses == PAIRS

@@ -25,7 +25,7 @@ from omnid.errors import OmnidError
 from omnid.formats.tum import read_tum
 from omnid.runs.replay import ReplayOptions, run_log
 from omnid.runs.run_result import RunResult
-from omnid.runs.sensor_sources import motion_topics
+from omnid.runs.session import motion_topics
 from omnid.tracking_state import TrackingState
 from omnid.transport.codec import decode_diagnostics
 from omnid.transport.sensor_codec import gyro_cdr, wheel_cdr

@@ -72,7 +72,6 @@ class Daemon:
                 self.latency.to_pose,
                 self.controller_statistics,
                 self.commands,
-                frozenset({"motor"}),
             )
         )
 

@@ -1,10 +1,11 @@
-"""The graph: end of the run, errors, stops; threads and inline give the same results."""
+"""The graph: inboxes, tickers, the end of the run, errors, stops; threads and inline give the same results."""
 
 from __future__ import annotations
 
 import os
 import signal
 import threading
+import time
 from collections.abc import Iterator
 from functools import partial
 from itertools import count
@@ -12,9 +13,9 @@ from typing import NoReturn
 
 import pytest
 
-from omnid.engine.graph import LOSSLESS, NEWEST, Graph
+from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Ticker
 from omnid.errors import OmnidError
-from tests.omnid.engine.graph_parts import LONG_S, Apply, Collect, Sums, both, fail_at, stopped_at
+from tests.omnid.engine.graph_parts import LONG_S, Action, Apply, Collect, Sums, both, fail_at, stopped_at
 
 pytestmark = pytest.mark.usefixtures("no_thread_is_left", "default_signals")
 
@@ -44,27 +45,21 @@ def test_a_source_settles_until_all_that_follows_is_done(threaded: bool) -> None
     graph, slow = Graph(policy=LOSSLESS, threaded=threaded, sinks_wait=True), Collect()
     behind: list[int] = []
 
-    class Later:
-        """A stage that goes on after its result was passed on."""
+    done: list[int] = []
 
-        done = 0
-
-        def process(self, message: int) -> int:
-            return message
-
-        def after(self) -> None:
-            threading.Event().wait(1e-3)
-            self.done += 1
-
-    later = Later()
+    def later(message: int) -> None:
+        threading.Event().wait(1e-3)
+        done.append(message)
 
     def numbers() -> Iterator[int]:
         for number in range(20):
             yield number
             graph.settle()
-            behind.append(2 * number + 2 - later.done - len(slow.got))
+            behind.append(2 * number + 2 - len(done) - len(slow.got))
 
-    graph.sink("slow", slow, graph.stage("later", later, graph.source("numbers", numbers)), policy=NEWEST, depth=1)
+    passed = graph.stage("pass", Apply(lambda message: message), graph.source("numbers", numbers))
+    graph.sink("slow", slow, passed, policy=NEWEST, depth=1)
+    graph.sink("later", Apply(later), passed, direct=True)  # the last reader, in the thread of its stage
     graph.run()
     assert slow.got == list(range(20))
     assert behind == 20 * [0]
@@ -154,13 +149,11 @@ def test_stop_from_another_thread_drains_and_finishes(threaded: bool) -> None:
 
 
 @both
-@pytest.mark.parametrize("handled", [True, False], ids=["SIGTERM handler", "Ctrl-C"])
-def test_stop_from_a_signal_handler_drains_and_finishes(threaded: bool, handled: bool) -> None:
+def test_stop_from_a_signal_handler_drains_and_finishes(threaded: bool) -> None:
     graph, sink = Graph(threaded=threaded), Collect()
-    number = signal.SIGTERM if handled else signal.SIGINT
     old = signal.signal(signal.SIGTERM, lambda *_: graph.stop())
     try:
-        act = partial(os.kill, os.getpid(), number)
+        act = partial(os.kill, os.getpid(), signal.SIGTERM)
         numbers = graph.source("numbers", count)
         graph.sink("sink", sink, graph.stage("pass", Apply(stopped_at(graph, 5, act)), numbers))
         graph.run()
@@ -169,23 +162,6 @@ def test_stop_from_a_signal_handler_drains_and_finishes(threaded: bool, handled:
     assert sink.got == list(range(graph.telemetry.stages[0].processed))
     assert len(sink.got) >= 6
     assert sink.finished == 1
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-
-
-def test_a_second_ctrl_c_interrupts_an_inline_stage() -> None:
-    graph, sink = Graph(threaded=False), Collect()
-
-    def stuck() -> None:
-        for _ in range(2):
-            os.kill(os.getpid(), signal.SIGINT)
-        assert not threading.Event().wait(LONG_S)
-
-    numbers = graph.source("numbers", count)
-    graph.sink("sink", sink, graph.stage("stuck", Apply(stopped_at(graph, 2, stuck)), numbers))
-    with pytest.raises(KeyboardInterrupt):
-        graph.run()
-    assert sink.got == [0, 1]
-    assert sink.finished == 0
 
 
 def test_refuses_wrong_wiring() -> None:
@@ -205,3 +181,111 @@ def test_refuses_wrong_wiring() -> None:
         graph.run()
     with pytest.raises(OmnidError, match="runs once"):
         graph.source("late", lambda: range(3))
+
+
+def test_lossless_waits_for_a_slow_reader_with_a_bounded_inbox() -> None:
+    graph, slow = Graph(policy=LOSSLESS, depth=3), Collect()
+    produced: list[int] = []
+    ahead: list[int] = []
+
+    def numbers() -> Iterator[int]:
+        for number in range(300):
+            produced.append(number)
+            yield number
+
+    def crawl(message: int) -> int:
+        threading.Event().wait(1e-4)
+        ahead.append(len(produced) - message)
+        return message
+
+    graph.sink("slow", slow, graph.stage("crawl", Apply(crawl), graph.source("numbers", numbers)))
+    graph.run()
+    assert slow.got == list(range(300))
+    assert max(ahead) <= 3 + 2  # the inbox, one message at the writer, one at the reader
+    assert [row.drops for row in graph.telemetry.summary()] == [0, 0, 0]
+
+
+def test_newest_drops_the_oldest_and_counts_it() -> None:
+    graph, slow, fast, all_sent = Graph(policy=NEWEST, depth=2), Collect(), Collect(), threading.Event()
+
+    def numbers() -> Iterator[int]:
+        yield from range(50)
+        all_sent.set()
+
+    def hold(message: int) -> int:
+        assert all_sent.wait(LONG_S)
+        return message
+
+    stream = graph.source("numbers", numbers)
+    graph.sink("slow", slow, graph.stage("hold", Apply(hold), stream), policy=LOSSLESS)
+    graph.sink("fast", fast, stream, policy=LOSSLESS)
+    graph.run()
+    assert fast.got == list(range(50))  # the policy of the sink
+    assert slow.got[-2:] == [48, 49]
+    assert len(slow.got) in (2, 3)  # and perhaps the first one
+    counted = {stats.name: (stats.processed, stats.dropped) for stats in graph.telemetry.stages}
+    assert counted["hold"] == (len(slow.got), 50 - len(slow.got))
+    assert counted["numbers"] == counted["fast"] == (50, 0)
+
+
+def test_a_failed_reader_releases_its_waiting_writer() -> None:
+    graph, third = Graph(depth=1), threading.Event()
+
+    def numbers() -> Iterator[int]:
+        yield from (0, 1)
+        third.set()  # one message in process, one in the inbox: the next one has to wait
+        yield 2
+
+    def fail(message: int) -> int:
+        assert third.wait(LONG_S)
+        raise ValueError(f"cannot take {message}")
+
+    graph.stage("fragile", Apply(fail), graph.source("numbers", numbers))
+    with pytest.raises(ValueError, match="cannot take 0"):
+        graph.run()
+    assert [(row.n, row.drops) for row in graph.telemetry.summary()] == [(3, 0), (0, 2)]
+
+
+@both
+def test_a_ticker_runs_beside_a_slow_stage(threaded: bool) -> None:
+    graph, sink, action = Graph(threaded=threaded), Collect(), Action(enough=20)
+
+    def hold(message: int) -> int:
+        assert action.reached.wait(LONG_S)  # the stage ends after 20 more ticks only
+        return message
+
+    graph.sink("sink", sink, graph.stage("hold", Apply(hold), graph.source("one", lambda: [7])))
+    ticker = graph.ticker("motor", 1e-3, action)
+    graph.run()
+    assert sink.got == [7]
+    assert action.closed == 1
+    assert ticker.stats.processed == action.calls >= 20
+    assert ticker.stats in graph.telemetry.stages
+
+
+@both
+def test_a_failing_ticker_is_closed_and_ends_the_run(threaded: bool) -> None:
+    graph, sink, action = Graph(threaded=threaded), Collect(), Action(enough=99, bad=3)
+    graph.sink("sink", sink, graph.source("numbers", lambda: (number % 7 for number in count())), policy=NEWEST)
+    graph.ticker("motor", 1e-3, action)
+    with pytest.raises(OSError, match="no answer") as caught:
+        graph.run()
+    assert caught.value.__notes__ == ["in 'motor'"]
+    assert (action.calls, action.closed, sink.finished) == (3, 1, 1)
+
+
+def test_a_stalled_ticker_counts_missed_deadlines_without_a_burst() -> None:
+    stalled, period_s = threading.Event(), 2e-3
+
+    def action() -> None:
+        if not stalled.is_set():
+            threading.Event().wait(25 * period_s)
+            stalled.set()
+        elif ticker.stats.processed >= 5:
+            ticker.halt()
+
+    ticker, start_s = Ticker("motor", period_s, action), time.monotonic()
+    ticker.run(lambda: False)
+    assert ticker.stats.processed == 6
+    assert ticker.stats.dropped >= 23  # of the deadlines within the stall the newest is served
+    assert ticker.stats.processed + ticker.stats.dropped <= (time.monotonic() - start_s) / period_s + 1

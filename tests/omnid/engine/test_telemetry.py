@@ -20,7 +20,7 @@ def test_quantiles_agree_with_sorting(centre: float) -> None:
     expected = np.quantile(durations_s, [0.0, 0.01, 0.5, 0.9, 0.99], method="inverted_cdf")
     assert histogram.quantiles(0.0, 0.01, 0.5, 0.9, 0.99) == pytest.approx(expected, rel=0.05)
     assert histogram.p(1.0) == histogram.max_s == durations_s.max()
-    assert histogram.mean_s == pytest.approx(durations_s.mean()) and histogram.count == 5000
+    assert histogram.count == 5000
 
 
 def test_summary_has_a_row_per_stage_in_milliseconds() -> None:

@@ -11,7 +11,6 @@ from drivers.frame import Frame
 from drivers.logs.log_reader import LogReader
 from omnid.camera_config import PairConfig
 from omnid.config import Config
-from omnid.engine.graph import Graph, Stream
 from omnid.messages import FramePair, StereoDepth
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.front_end import FrontEnd
@@ -45,8 +44,3 @@ def run_pairs(rig_geometry: Geometry, frames: list[Frame]) -> tuple[list[FramePa
 def depth_of(rig_geometry: Geometry, frames: list[Frame]) -> StereoDepth:
     (pair,), _ = run_pairs(rig_geometry, frames[:2])
     return StereoDepth(Dewarp(rig_geometry, CONFIG.panorama).process(pair))
-
-
-def paired(graph: Graph, rig_geometry: Geometry, frames: list[Frame]) -> tuple[Synchronise, Stream[FramePair]]:
-    pair = Synchronise(rig_geometry.rig, CONFIG.pair)
-    return pair, graph.stage("pair", pair, graph.source("read", lambda: frames))

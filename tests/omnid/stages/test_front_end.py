@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,6 @@ import pytest
 from calib import se3
 from calib.rig_file import read_rig
 from drivers.logs.log_reader import LogReader
-from drivers.motion import WheelSample
 from omnid.config import Config
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.rig.column_finding import PanoramaPair
@@ -20,7 +18,6 @@ from omnid.formats.tum import read_tum
 from omnid.messages import FramePair, Panoramas
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry, geometry
-from omnid.stages.motion_inbox import MOST_WAITING
 from omnid.stages.synchronise import Synchronise
 from tests.simulation.disturbances import DisturbedCamera
 
@@ -91,16 +88,3 @@ def test_the_reflection_of_a_lens_in_its_mirror_has_no_depth(place: Geometry, sc
             below += int((se3.apply(T, matched.points)[:, 2] < -0.5).sum())
             confirmed += int((se3.apply(T, front_end.dense.of(update.depth).points)[:, 2] < -0.5).sum())
     assert below > 100 and confirmed < 0.4 * below, (below, confirmed)
-
-
-def test_samples_of_a_dropped_pair_go_along_with_the_next_one(place: Geometry, pairs: list[FramePair]) -> None:
-    front_end = FrontEnd(place, Config())
-    samples = [WheelSample(number, 0.1, 0.0) for number in range(MOST_WAITING + 1)]
-    older, newer = (
-        front_end.dewarp.process(replace(pair, motion=tuple(motion)))
-        for pair, motion in zip(pairs, (samples[:2], samples[2:4]), strict=False)
-    )
-    merged = front_end.poses.merge(older, newer)
-    assert merged.motion == tuple(samples[:4]) and merged.seq == newer.seq and merged.lower is newer.lower
-    # They are bounded, and the oldest ones give way.
-    assert front_end.poses.merge(replace(older, motion=tuple(samples)), newer).motion[0] == samples[3]

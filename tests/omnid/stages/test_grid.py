@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from omnid.core.mapping.scan_grid import KeyframeScans
-from omnid.load_level import LoadLevel
 from omnid.messages import PlaceUpdate
 from omnid.stages.mapping import MapGrid
 from omnid.tracking_state import MapState
@@ -46,14 +45,6 @@ def test_without_a_period_it_is_drawn_at_the_end() -> None:
     empty = MapGrid(0.05, np.eye(4))
     empty.process(update(1, None))
     assert empty.finish() == []
-
-
-def test_nothing_is_drawn_while_the_computer_is_too_slow() -> None:
-    slow = [True]
-    stage = MapGrid(0.05, np.eye(4), 1.0, lambda: LoadLevel.NO_MAP if slow[0] else LoadLevel.FULL)
-    assert given(stage, [update(k, scans(k)) for k in range(1, 5)]) == []
-    slow[0] = False
-    assert given(stage, [update(6, scans(6))]) == [6]
 
 
 def test_scans_of_unknown_place_are_not_drawn_into_the_map() -> None:

@@ -100,7 +100,7 @@ def test_darkness_after_the_first_pair_costs_nothing(dark_pairs: int) -> None:
             images = [np.zeros_like(image) for image in images]
         wheels = tuple(WheelSample(stamp_ns + k * period_ns // 5, speed_mps, 0.0) for k in range(-9, 2))
         update = front_end.process(FramePair(number, stamp_ns, *images, skew_s, wheels))
-        front_end.poses.after()
+        front_end.odometry.complete()
     assert update.state is TrackingState.TRACKING and update.reset_counter == 0
     assert abs(update.T_odom_rig[0, 3] - along_m[0]) < 3e-3
     assert np.sqrt(update.covariance[0, 0]) < 0.01

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from calib import se3
-from drivers.frame import Camera, Frame
+from drivers.frame import CAMERAS, Camera, Frame
 from omnid.diagnostics.run_summary import RunStatistics
-from omnid.engine.graph import Graph
+from omnid.engine.graph import NEWEST, Graph
 from omnid.formats.tum import read_tum
 from omnid.messages import DensePoints, MapUpdate, OdometryUpdate
-from omnid.runs.pipeline import RunParts, Sinks, wire
+from omnid.runs.wiring import Outputs, Parts, wire
 from omnid.stages.geometry import Geometry, geometry
 from tests.conftest import PAIRS
-from tests.omnid.stages.scene_parts import CONFIG, depth_of, front_end, paired, run_pairs
+from tests.omnid.stages.scene_parts import CONFIG, depth_of, front_end, run_pairs
 from tests.simulation import make_rig
 
 MS = 1_000_000
@@ -97,10 +97,25 @@ def dropped(rig_geometry: Geometry, frames: list[Frame], slow: type) -> dict[str
             if isinstance(message, slow):
                 assert complete.wait(60.0), "the poses waited for the bus"
 
-    sinks = Sinks({"statistics": statistics, "complete": Complete()}, bus=SlowBus())
-    wire(
-        graph, paired(graph, rig_geometry, frames)[1], front_end(rig_geometry), CONFIG, sinks, RunParts(map_every_s=0.5)
-    )
+    outputs = Outputs(poses={"statistics": statistics, "complete": Complete()}, bus=SlowBus())
+    read = graph.source("read", lambda: frames)
+    wire(graph, [read], front_end(rig_geometry), CONFIG, outputs, Parts(map_every_s=0.5))
     graph.run()
     assert statistics.poses == PAIRS
     return {stage.name: stage.dropped for stage in graph.telemetry.stages}
+
+
+def test_live_old_images_are_dropped_before_any_work(rig_geometry: Geometry, frames: list[Frame]) -> None:
+    """One thread makes a pose of the newest images; each that is decoded gets one, however fast images come."""
+    graph, statistics = Graph(policy=NEWEST, depth=1), RunStatistics()
+    stages = front_end(rig_geometry)
+    cameras = {
+        name: graph.source(name, lambda name=name: [frame for frame in frames if frame.camera == name])  # type: ignore[misc]
+        for name in CAMERAS
+    }
+    wire(graph, list(cameras.values()), stages, CONFIG, Outputs(counters={"statistics": statistics}))
+    graph.run()
+    of = graph.telemetry.of
+    assert of("pair").dropped > 0 and of("odometry").dropped == 0
+    assert 0 < statistics.poses == of("dewarp").processed == of("odometry").processed == of("keyframes").processed
+    assert of("pair").dropped + of("pair").processed == 2 * PAIRS

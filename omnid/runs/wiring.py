@@ -1,0 +1,206 @@
+"""The wiring of a run: images in, poses, maps and velocity commands out, as in the figure of ARCHITECTURE.md."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol
+
+from drivers.frame import Frame
+from drivers.motion import MotionSample
+from drivers.motor import VelocityCommand
+from omnid.config import Config
+from omnid.controller.statistics import ControllerState
+from omnid.core.navigation.requests import NavigationCommand
+from omnid.core.navigation.situation import WheelState
+from omnid.core.places.place_map import PlaceMap
+from omnid.engine.graph import NEWEST, Graph, Sink, Stream
+from omnid.messages import FramePair, MapUpdate, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
+from omnid.sinks.drive import LiveDrive
+from omnid.sinks.encoder import Outgoing
+from omnid.stages.front_end import FrontEnd, Keyframes
+from omnid.stages.lockstep_drive import LockstepDrive
+from omnid.stages.mapping import MapGrid, Mapping
+from omnid.stages.navigation import NavigationStage
+from omnid.stages.obstacles import CameraFloor, Obstacles
+from omnid.stages.places import Places
+from omnid.stages.routes import RouteMap, Routes
+
+RECORDED_DEPTH = 20  # messages of each kind that may wait for the disk of a live recording
+
+
+@dataclass(frozen=True, slots=True)
+class Outputs:
+    """The consumers of a run; a map that none of them takes is not computed, nor are places."""
+
+    pairs: dict[str, Sink[FramePair]] = field(default_factory=dict)  # each takes the newest
+    poses: dict[str, Sink[OdometryUpdate]] = field(default_factory=dict)
+    counters: dict[str, Sink[OdometryUpdate]] = field(default_factory=dict)  # of poses, in the thread of the odometry
+    commands: dict[str, Sink[VelocityCommand]] = field(default_factory=dict)
+    maps: dict[str, Sink[MapUpdate]] = field(default_factory=dict)
+    places: dict[str, Sink[PlaceUpdate]] = field(default_factory=dict)
+    rings: dict[str, Sink[ObstacleRing]] = field(default_factory=dict)
+    bus: Sink[Outgoing] | None = None  # takes all messages that leave the run
+    recorder: Sink[Any] | None = None  # takes them as well
+    records_images: bool = False  # the recorder of a live run takes the images, too
+
+    @property
+    def take_all(self) -> bool:
+        """True if one of them takes every message that leaves the run."""
+        return self.bus is not None or self.recorder is not None
+
+
+class RequestSource(Protocol):
+    """Requests to the navigation; `end` ends `batches`."""
+
+    def batches(self) -> Iterator[Iterable[NavigationCommand]]:
+        """Yield requests."""
+
+    def end(self) -> None:
+        """End `batches`; from any thread."""
+
+
+class NavigationParts(NamedTuple):
+    """The surroundings of the navigation of a run with wheels."""
+
+    requests: RequestSource
+    wheels: Callable[[], WheelState]
+    drive: Sink[NavigationUpdate]
+    map_name: str  # of the file of the map; empty: it is not saved
+
+
+@dataclass(frozen=True, slots=True)
+class Parts:
+    """The differences between one run and another: its map of places, its wheels, its rates."""
+
+    known_places: PlaceMap | None = None  # the map to begin with; None: the run's own, where it is consumed
+    localize_only: bool = False  # the known map stays as it is
+    drive: LiveDrive | None = None  # the controller process; None: the law in lock-step gives the commands
+    navigation: NavigationParts | None = None
+    map_every_s: float = 0.0  # between two maps; 0: one, at the end
+
+
+def wheel_state(state: ControllerState) -> WheelState:
+    """Return the part of the controller's state that the navigation needs."""
+    return WheelState(
+        state.armed,
+        state.needs_request,
+        state.disarmed_by,
+        state.reason,
+        state.source,
+        state.obstacle if state.blocked else "",
+        state.halts,
+        state.halted_by,
+    )
+
+
+class WiredStages(NamedTuple):
+    """The stages that are asked for counts and warnings."""
+
+    front_end: FrontEnd
+    mapping: Mapping | None
+    places: Places | None
+    obstacles: Obstacles | None
+
+    @property
+    def floor(self) -> CameraFloor | None:
+        """The floor that the run uses; None where it needs none."""
+        user = self.places or self.obstacles
+        return None if user is None else user.floor
+
+
+def wire(
+    graph: Graph,
+    frames: Sequence[Stream[Frame | MotionSample]] | Sequence[Stream[Frame]],
+    front_end: FrontEnd,
+    config: Config,
+    outputs: Outputs,
+    parts: Parts | None = None,
+) -> WiredStages:
+    """Join the stages to the images and to the outputs; return those that are asked for counts.
+
+    Live (policy NEWEST), one thread makes a pose of the newest images, so that what is old is dropped before any work;
+    the stages behind it have an inbox each. Else decoding and dewarping are one bounded inbox ahead of the odometry.
+    """
+    parts, geometry = parts or Parts(), front_end.geometry
+    T_base_rig = geometry.rig.T_base_rig
+    mapping, places, obstacles = None, None, None
+    maps, in_map, grids, rings, ways = None, None, None, None, None
+
+    # 1. Images give pairs, pairs give panoramas, and these give poses.
+    pairs = graph.stage("pair", front_end.pairing, *frames)
+    panoramas = graph.stage("dewarp", front_end.dewarp, pairs, direct=True)
+    poses = graph.stage("odometry", front_end.poses, panoramas, direct=graph.policy is NEWEST)
+
+    # 2. Poses go to the controller, which waits for no stage.
+    if parts.drive is not None:
+        graph.sink("controller", parts.drive, poses, policy=NEWEST, depth=1)
+        commands = graph.source("drive", parts.drive.commands, wake=parts.drive.end)
+    else:
+        law = LockstepDrive(config.controller, 1.0 / config.motor.rate_hz, T_base_rig)
+        commands = graph.stage("drive", law, poses)
+
+    # 3. They give the map, the pose in it, and the obstacles, where these are consumed.
+    if outputs.maps or outputs.take_all:
+        mapping = Mapping(config.mapping, front_end.dense, parts.map_every_s)
+        maps = graph.stage("mapping", mapping, poses)
+    needs_places = outputs.places or outputs.take_all or parts.navigation or parts.known_places is not None
+    if config.places.enabled and needs_places:
+        places = Places(geometry, config, front_end.dense, parts.known_places, localize_only=parts.localize_only)
+        in_map = graph.stage("places", places, poses)
+    if in_map is not None and outputs.take_all:
+        grid = MapGrid(config.mapping.voxel_m, T_base_rig @ geometry.T_rig_rect, parts.map_every_s)
+        grids = graph.stage("grid", grid, in_map)
+    if config.obstacles.enabled and (outputs.rings or outputs.take_all or parts.navigation):
+        obstacles = Obstacles(geometry, config.obstacles, front_end.dense)
+        rings = graph.stage("obstacles", obstacles, poses)
+
+    # 4. All of them, and requests, give the way to drive.
+    if parts.navigation is not None:
+        requests, wheels, drive, map_name = parts.navigation
+        is_new = parts.known_places is None or not parts.known_places.keyframes
+        route_map = RouteMap(map_name, T_base_rig, geometry.T_rig_rect, is_new=is_new) if places else None
+        navigation = NavigationStage(
+            config.navigation, config.controller.collision, T_base_rig, wheels, Routes(route_map)
+        )
+        asked = graph.source("requests", requests.batches, wake=requests.end)
+        seen: list[Stream[Any]] = [poses, *(stream for stream in (in_map, rings) if stream is not None), asked]
+        ways = graph.stage("navigation", navigation, *seen)
+        graph.sink("planner", drive, ways, policy=NEWEST, depth=1)
+
+    # 5. What is made leaves the run.
+    taken: list[tuple[dict[str, Any], Stream[Any] | None, bool]] = [
+        (outputs.poses, poses, False),
+        (outputs.counters, poses, True),
+        (outputs.commands, commands, False),
+        (outputs.maps, maps, False),
+        (outputs.places, in_map, False),
+        (outputs.rings, rings, False),
+    ]
+    for name, pair_sink in outputs.pairs.items():
+        graph.sink(name, pair_sink, pairs, policy=NEWEST, depth=1)
+    for sinks, stream, direct in taken:
+        for name, sink in sinks.items():
+            if stream is not None:
+                graph.sink(name, sink, stream, direct=direct)
+    named: dict[str, Stream[Any] | None] = {
+        "bus": poses,
+        "bus-drive": commands,
+        "bus-map": maps,
+        "bus-places": in_map,
+        "bus-grid": grids,
+        "bus-scan": rings,
+        "bus-navigation": ways,
+    }
+    outgoing = {name: stream for name, stream in named.items() if stream is not None}
+    if outputs.recorder is not None:
+        images = frames if outputs.records_images else ()
+        depth = RECORDED_DEPTH if outputs.records_images else None
+        graph.sink("record", outputs.recorder, *images, *outgoing.values(), depth=depth)
+    if outputs.bus is not None:
+        for name, stream in outgoing.items():  # an inbox each: to encode a map takes longer than a pose may wait
+            graph.sink(name, outputs.bus, stream, policy=NEWEST)
+
+    # 6. The keyframe of a pair is made when its pose has been passed on: this reader of poses is the last one.
+    graph.sink("keyframes", Keyframes(front_end.odometry), poses, direct=True)
+    return WiredStages(front_end, mapping, places, obstacles)
