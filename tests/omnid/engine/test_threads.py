@@ -1,15 +1,13 @@
-"""Threads without a graph: calls that may block, short work again and again, and the pace of a played log."""
+"""Threads without a graph: calls that may block, and short work again and again."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
 import threading
-from types import SimpleNamespace
 
 import pytest
 
-from omnid.engine.playback_clock import PlaybackClock
 from omnid.engine.threads import Poller, returns_within, started
 
 LONG_S = 20.0  # a timeout that only a defect reaches
@@ -54,12 +52,3 @@ def test_the_calls_of_a_poller_go_on_after_an_error_and_end_with_close(capsys: p
     poller.close()
     assert set(calls) == {"short work"} and capsys.readouterr().err.count("OSError: no link") == 1
     assert not threading.Event().wait(0.02) and len(calls) == 3
-
-
-def test_playback_waits_for_the_stamps_until_woken() -> None:
-    hour_apart = [SimpleNamespace(stamp_ns=0), SimpleNamespace(stamp_ns=3600 * 10**9)]
-    clock = PlaybackClock()
-    waiting = clock.messages(hour_apart)
-    assert next(waiting) is hour_apart[0]
-    clock.wake()
-    assert next(waiting) is hour_apart[1]
