@@ -28,8 +28,7 @@ from omnid.utc import utc
 
 if TYPE_CHECKING:
     from omnid.config import Config
-    from omnid.core.places.place_map import PlaceMap
-    from omnid.core.places.place_rig import PlaceRig
+    from omnid.core.places.place_map import PlaceMap, PlaceRig
     from omnid.core.places.place_views import PlaceSummary
     from omnid.runs.place_maps import RigPlaces
 

@@ -70,8 +70,7 @@ def rig_status(health: RigHealth) -> DiagnosticStatus:
     values: dict[str, object] = {Key.STATE: state, "new_views": health.new_views, "needed_views": VIEWS}
     if start is not None:
         values["exchanged_matches"] = start.exchanged_matches
-    newest = finding or (start.straight if start is not None else None)
-    if newest is not None:
+    if (newest := finding or start) is not None:
         names = ("turn_deg", "offset_px", "left_px", "matches", "tried")
         values |= {name: getattr(newest, name) for name in names}
     if finding is not None:

@@ -20,9 +20,17 @@ from numpy.typing import NDArray
 from calib.atomic_file import replacement
 from calib.panorama import Cylinder
 from omnid.core.mapping.range_scan import MAX_RANGE_M, SECTORS
-from omnid.core.places.place_map import DESCRIPTOR, UNUSED, KeyframeUse, Link, PlaceFeatures, PlaceKeyframe, PlaceMap
-from omnid.core.places.place_rig import PlaceRig
-from omnid.core.places.signature import COLUMNS, ROWS
+from omnid.core.places.features import COLUMNS, ROWS
+from omnid.core.places.place_map import (
+    DESCRIPTOR,
+    UNUSED,
+    KeyframeUse,
+    Link,
+    PlaceFeatures,
+    PlaceKeyframe,
+    PlaceMap,
+    PlaceRig,
+)
 from omnid.errors import OmnidError
 
 FORMAT: Final = 7  # to be raised where thumbnails or features of a place are computed otherwise: old maps fit no more

@@ -15,9 +15,7 @@ from typing import Final
 from calib.rig import MountedCamera
 from calib.rig_file import rig_toml
 from omnid.config import Config, PlacesConfig
-from omnid.core.places.place_map import PlaceMap
-from omnid.core.places.place_rig import PlaceRig, seen_by
-from omnid.core.places.place_views import keep_only, parts
+from omnid.core.places.place_map import PlaceMap, PlaceRig
 from omnid.errors import OmnidError
 from omnid.formats.place_file import read_places, write_places
 from omnid.runs.wiring import Parts
@@ -103,7 +101,7 @@ class RunPlaces:
             )
         if given.rig.rig_hash != self._rig.rig_hash:
             self._warn(f"{name}: the rig was calibrated again since this map was made")
-        seen_by(given.places, given.rig, self._rig)
+        self._rig.adapt(given.places, given.rig)
 
     @property
     def is_extended(self) -> bool:
@@ -111,15 +109,14 @@ class RunPlaces:
         return self._writes
 
     def save(self, places: PlaceMap) -> bool:
-        """Write the joined part of a copy of the map, which is cut to it; return False if the part has nothing new.
+        """Write the joined part of a copy of the map; return False if the part has nothing new.
 
         Raises OmnidError if the file cannot be written.
         """
         joined = self._joined(places)
         if self._path is None or not joined - self._known or joined == self._saved:
             return False
-        keep_only(places, joined)
-        self._write(self._path, places)
+        self._write(self._path, places.part(joined))
         self._saved = joined
         return True
 
@@ -145,7 +142,7 @@ class RunPlaces:
         joined = self._joined(self.places)
         new = len(joined - self._known)
         unjoined = len(self.places.keyframes.keys() - joined - self._known)
-        keep_only(self.places, joined)
+        self.places = self.places.part(joined)
         found = RigPlaces(self.places, self._rig)
         name = self._path or "the map"
         if self._known and not new and unjoined:
@@ -162,7 +159,7 @@ class RunPlaces:
         """Return the keyframes that links join to the map that was given, or else the largest part."""
         if not places.keyframes:
             return frozenset()
-        found = parts(places)
+        found = places.parts()
         return frozenset(next((part for part in found if self._known.intersection(part)), found[0]))
 
 

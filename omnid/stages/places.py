@@ -12,8 +12,7 @@ from calib import se3
 from omnid.config import Config
 from omnid.core.mapping.range_scan import FreeRanges, RangeScan
 from omnid.core.odometry.stereo_frame import StereoFrame
-from omnid.core.places.localisation import MapLocaliser
-from omnid.core.places.map_pose import OdometryFrame
+from omnid.core.places.localisation import MapLocaliser, OdometryFrame
 from omnid.core.places.place_map import PlaceMap
 from omnid.load_level import LoadLevel
 from omnid.messages import MapKeyframes, OdometryUpdate, PlaceUpdate, StereoDepth

@@ -222,7 +222,7 @@ def test_a_map_that_another_program_has_written_meanwhile_is_not_replaced(
     """Two replays extend one map: the last one does not win."""
     omap, moved = tmp_path / "place.omap", tmp_path / "moved.omap"
     places, rig = read_places(built)
-    places.move({id: se3.transform(np.eye(3), [100.0, 50.0, 0.0]) @ T for id, T in places.poses.items()})
+    places.poses.update({id: se3.transform(np.eye(3), [100.0, 50.0, 0.0]) @ T for id, T in places.poses.items()})
     write_places(moved, places, rig)
     if exists:
         omap.write_bytes(built.read_bytes())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.places.drift import drift_factor, relative_covariance
-from omnid.core.places.place_map import Link, PlaceMap
-from omnid.core.places.pose_graph import PoseEdges, optimise
+from omnid.core.places.place_map import Link, PlaceMap, relative_covariance
+from omnid.core.places.pose_graph import ACCEPTED, PoseEdges, optimise
 
 Array = NDArray[np.float64]
 
@@ -20,8 +19,10 @@ LEAST_ODOMETRY: Final = np.diag([2e-4] * 3 + [2e-5] * 3) ** 2  # m, rad: of an e
 FITS_M, FITS_RAD = 0.01, 0.003  # A loop that the map fits within this needs no optimisation.
 LOOPS_THAT_FIT: Final = 3  # wait for the next optimisation, more of them in a large map; by trial on development seeds
 KEYFRAMES_PER_LOOP: Final = 50  # one more loop waits per this number of keyframes; by trial on development seeds
-ACCEPTED: Final = 0.5  # least weight of a loop that counts; the middle is enough, because weights end at 0 or 1
 RECENT: Final = 8  # Newest loops, because they show the present drift; a refused loop may be accepted while among them.
+# Share of the squared distances that the drift explains, because the others may be wrong loops, and that quantile of
+# the chi-squared distribution of six dimensions.
+QUANTILE, EXPECTED = 0.75, 7.841
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,7 +60,8 @@ class MapCorrection:
         fixed: keyframes (ids) that stay where they are; if there is none in the part, the oldest one stays.
         """
         # 1. Loops that the map fits already wait for others, so that its cost does not grow with the square of the map.
-        self._places.links += loops
+        places = self._places
+        places.links += loops
         self._waiting += len(loops)
         may_wait = self._waiting <= LOOPS_THAT_FIT + len(part) // KEYFRAMES_PER_LOOP
         if may_wait and not self._is_due and all(map(self._fits, loops)):
@@ -68,38 +70,32 @@ class MapCorrection:
         self.optimisations += 1
         # 2. The drift that the loops show, which weighs odometry in the graph.
         among = set(part)
-        links = [link for link in self._places.links if link.a in among]
+        links = [link for link in places.links if link.a in among]
         self.factor = self._drift_factor(links)
         # 3. The poses by all links but those between keyframes that stay, which say nothing of the others.
         links = [link for link in links if link.a not in fixed or link.b not in fixed]
         joined = {id for link in links for id in (link.a, link.b)}
         part = [id for id in part if id not in fixed or id in joined]
-        stays = np.array([id in fixed for id in part])
-        poses = np.array([self._places.poses[id] for id in part])
-        result = optimise(poses, self._edges(part, links), stays if stays.any() else None)
-        self._places.move(dict(zip(part, result.poses, strict=True)))
-        # 4. Loops that the graph refuses go.
-        self._refuse([links[n] for n in np.flatnonzero(result.weights < ACCEPTED)], links)
-        # 5. The covariance of later poses in the map.
-        newest = self._places.keyframes[part[-1]]
-        if np.isfinite(result.covariance).all():
-            self._anchor = _Anchor(newest.T_odom_rect, newest.covariance, result.covariance)
-
-    def _edges(self, part: list[int], links: list[Link]) -> PoseEdges:
-        """Return the edges of the graph of a part (ids of keyframes) by its links."""
         row = {id: n for n, id in enumerate(part)}
-        return PoseEdges(
+        by_odometry = [self.factor * link.covariance + LEAST_ODOMETRY for link in links]
+        edges = PoseEdges(
             np.array([(row[link.a], row[link.b]) for link in links]),
             np.array([link.T_a_b for link in links]),
-            np.array([self._covariance(link) for link in links]),
+            np.array([link.covariance if link.is_loop else S for link, S in zip(links, by_odometry, strict=True)]),
             np.array([link.is_loop for link in links]),
         )
-
-    def _refuse(self, refused: list[Link], links: list[Link]) -> None:
-        """Remove refused links of some from the map, but the newest loops."""
-        bad = {id(link) for link in refused} - {id(link) for link in _recent_loops(links)}
-        self._places.links = [link for link in self._places.links if id(link) not in bad]
+        stays = np.array([id in fixed for id in part])
+        result = optimise(np.array([places.poses[id] for id in part]), edges, stays if stays.any() else None)
+        places.poses.update(zip(part, result.poses, strict=True))
+        # 4. Loops that the graph refuses go, but the newest ones.
+        recent = [id(link) for link in links if link.is_loop][-RECENT:]
+        bad = {id(links[n]) for n in np.flatnonzero(result.weights < ACCEPTED)}.difference(recent)
+        places.links = [link for link in places.links if id(link) not in bad]
         self.rejected += len(bad)
+        # 5. The covariance of later poses in the map.
+        newest = places.keyframes[part[-1]]
+        if np.isfinite(result.covariance).all():
+            self._anchor = _Anchor(newest.T_odom_rect, newest.covariance, result.covariance)
 
     def _fits(self, loop: Link) -> bool:
         """True if the poses of a map agree with a loop."""
@@ -116,42 +112,47 @@ class MapCorrection:
         since = relative_covariance(T_anchor_rect, self._anchor.of_odom, covariance)
         return np.asarray(A @ self._anchor.of_map @ A.T + self.factor * since)
 
-    def _covariance(self, link: Link) -> Array:
-        return link.covariance if link.is_loop else self.factor * link.covariance + LEAST_ODOMETRY
-
     def _drift_factor(self, links: list[Link]) -> float:
         """Return the factor on odometry's covariance that explains the loops within one run."""
-        pairs = [
-            (link, self._places.keyframes[link.a], self._places.keyframes[link.b]) for link in links if link.is_loop
-        ]
-        pairs = [(link, a, b) for link, a, b in pairs if a.session == b.session]
-        if not pairs:
+        # 1. Loops by their keyframes, in the order of the last one. Such loops match the same features: what is wrong
+        #    with one of them is wrong with the others.
+        same: dict[tuple[int, int], list[Link]] = {}
+        for link in links:
+            a, b = self._places.keyframes[link.a], self._places.keyframes[link.b]
+            if link.is_loop and a.session == b.session:
+                same[link.a, link.b] = [*same.pop((link.a, link.b), []), link]
+        if not same:
             return self.factor
-        T_a_b = np.array([se3.inverse(a.T_odom_rect) @ b.T_odom_rect for _, a, b in pairs])
-        by_loop = np.array([link.T_a_b for link, _, _ in pairs])
-        by_odometry = relative_covariance(
-            T_a_b, np.array([a.covariance for _, a, _ in pairs]), np.array([b.covariance for _, _, b in pairs])
-        )
-        errors, spread = se3.log(se3.inverse(by_loop) @ T_a_b), np.array([link.covariance for link, _, _ in pairs])
-        by_odometry = by_odometry + LEAST_ODOMETRY
-        errors, by_odometry, spread = _per_pair([(link.a, link.b) for link, _, _ in pairs], errors, by_odometry, spread)
-        # The drift of the whole path, or of its newest part where that is larger: a rig may have been bent meanwhile.
+        # 2. Errors of odometry, and both covariances.
+        errors, by_odometry, by_loop = [], [], []
+        for (a, b), loops in same.items():
+            odometry = Link.by_odometry(self._places.keyframes[a], self._places.keyframes[b])
+            errors.append(np.mean([se3.log(se3.inverse(loop.T_a_b) @ odometry.T_a_b) for loop in loops], axis=0))
+            by_odometry.append(odometry.covariance + LEAST_ODOMETRY)
+            by_loop.append(np.mean([loop.covariance for loop in loops], axis=0))
+        # 3. The drift of the whole path, or of its newest part where that is larger: the rig may have been bent.
         return max(
-            drift_factor(errors[-count:], by_odometry[-count:], spread[-count:]) for count in (len(errors), RECENT)
+            drift_factor(*(np.array(values[-count:]) for values in (errors, by_odometry, by_loop)))
+            for count in (len(errors), RECENT)
         )
 
 
-def _per_pair(pairs: Sequence[tuple[int, int]], *values: Array) -> list[Array]:
-    """Return the means (K, ...) of values (N, ...) over loops between the same keyframes, in the order of the last one.
+def drift_factor(errors: Array, by_odometry: Array, by_loop: Array) -> float:
+    """Return the factor >= 1 on odometry's covariance that explains the errors (N, 6) of loops.
 
-    Such loops match the same features: what is wrong with one of them is wrong with the others.
+    errors: log of T_a_b by odometry in that by the loop; by_odometry, by_loop (N, 6, 6) their covariances, positive
+    definite. The factor is the one at which a quantile of the squared Mahalanobis distances is that of the
+    distribution: noise of the images is in odometry's covariance, an error of the rig is not.
     """
-    rows: dict[tuple[int, int], list[int]] = {}
-    for n, pair in enumerate(pairs):
-        rows[pair] = [*rows.pop(pair, []), n]
-    return [np.array([value[same].mean(axis=0) for same in rows.values()]) for value in values]
 
+    def is_explained(factor: float) -> bool:
+        S = factor * by_odometry + by_loop
+        squared = (errors * np.linalg.solve(S, errors[:, :, None])[:, :, 0]).sum(axis=1)
+        return bool(np.quantile(squared, QUANTILE) <= EXPECTED)
 
-def _recent_loops(links: list[Link]) -> list[Link]:
-    """Return the newest loops."""
-    return [link for link in links if link.is_loop][-RECENT:]
+    low, high = 1.0, 1.0
+    while not is_explained(high):
+        low, high = high, 2 * high
+    while low < (middle := math.sqrt(low * high)) < high:
+        low, high = (low, middle) if is_explained(middle) else (middle, high)
+    return high

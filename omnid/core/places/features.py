@@ -1,13 +1,16 @@
-"""Features of a place: corners of known depth, described upright and at one metric size.
+"""What a frame shows of its place: corners of known depth, described upright and at one metric size, and a thumbnail.
 
 A robot that drives stays upright, and the depth of a corner gives the size at which it is seen: so neither orientation
 nor scale has to be searched for. Descriptors are histograms of gradients like SIFT's (Lowe 2004). OpenCV's SIFT blurs
 the whole image 6 times for each octave, which is most of its cost. Here patches of 16x16 samples are cut from a pyramid
 of halved images, and all of them are handled at once.
+
+Thumbnails are compared by their spectra, at all headings at once, in a fraction of a millisecond.
 """
 
 from __future__ import annotations
 
+import math
 from functools import cache
 from typing import Final
 
@@ -17,23 +20,29 @@ from numpy.typing import NDArray
 
 from omnid.core.odometry.corners import corners, nearby_disparity
 from omnid.core.odometry.stereo_frame import StereoFrame
-from omnid.core.places.descriptor_kernels import BINS, CELLS, SAMPLES
-from omnid.core.places.descriptor_kernels import describe as write_histograms
 from omnid.core.places.place_map import PlaceFeatures
 from omnid.core.types.panorama import PaddedPanorama
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
+Signature = NDArray[np.complex64]
+Thumbnail = NDArray[np.int8]
 
 FEATURES: Final = 200  # kept of a frame; so that 1,000 keyframes have 34 MB; by trial on development seeds
 CORNERS: Final = 450  # detected, as the depth of some is not known; by trial on development seeds
 # Side of a feature, in baselines of the rig: disparity times this is its side in px.
 PATCH_BASELINES: Final = 2.0
-LEAST_SIDE_PX: Final = 16.0  # at all scales, because it has one sample a pixel
 LARGEST_SIDE_PX: Final = 240.0  # at scale 1; by trial on development seeds
-LEVELS: Final = 4  # Levels of the pyramid; because sides are 16 to 240 px, log2(240 / 16) = 3.9.
-# Standard deviation of the weights of a patch, as a share of its side; half of it, as in SIFT (Lowe 2004).
-WINDOW: Final = 0.5
+# Samples along a side of a patch, cells along a side, directions of the gradient in each cell; as in SIFT (Lowe 2004).
+SAMPLES, CELLS, BINS = 16, 4, 8
+LARGEST: Final = 0.2  # Limit of a histogram's entries, of one of length 1 (Lowe 2004).
+SCALE: Final = 512.0  # Factor on the square roots of a descriptor's shares, so that they fill a byte.
+
+ROWS, COLUMNS = 16, 128  # of a thumbnail: 2 kB a keyframe, 2.8 degrees a column; by trial on development seeds
+# Columns, rows: window of the mean that is subtracted, because brightness changes with the light.
+SMOOTH: Final = (31, 5)
+LEAST_CONTRAST: Final = 4.0  # grey levels: below it there is nothing to compare.
+THUMBNAIL_SCALE: Final = 30.0  # Root mean square of a thumbnail's values, so that hardly any exceeds a byte.
 
 
 def describe(frame: StereoFrame) -> PlaceFeatures:
@@ -42,26 +51,49 @@ def describe(frame: StereoFrame) -> PlaceFeatures:
     disparity = nearby_disparity(frame.disparity, pixels)
     located = np.flatnonzero(np.isfinite(disparity))[:FEATURES]
     pixels, disparity = pixels[located], disparity[located]
-    sides = np.minimum(PATCH_BASELINES * disparity, frame.lower.scale * LARGEST_SIDE_PX)
-    descriptors = describe_patches(frame.lower, pixels, np.maximum(sides, LEAST_SIDE_PX))
+    sides = np.clip(PATCH_BASELINES * disparity, SAMPLES, frame.lower.scale * LARGEST_SIDE_PX)
     views = np.column_stack([frame.lower.in_turn(pixels[:, 0]), pixels[:, 1], pixels[:, 1] + disparity])
-    return PlaceFeatures(descriptors, views.astype(np.float32))
+    return PlaceFeatures(describe_patches(frame.lower, pixels, sides), views.astype(np.float32))
 
 
 def describe_patches(panorama: PaddedPanorama, pixels: Array, sides_px: Array) -> NDArray[np.uint8]:
-    """Return descriptors (N, 128) of square patches at pixels (N, 2) with sides (N,) [px].
+    """Return descriptors (N, 128) of square patches at pixels (N, 2) with sides (N,) [px] of at least SAMPLES.
 
     They are the square roots of the histograms' shares (RootSIFT: Arandjelovic and Zisserman 2012), in bytes.
     """
-    descriptors = np.zeros((len(pixels), CELLS**2 * BINS), np.uint8)
-    write_histograms(_patches(panorama, pixels, sides_px), _cell_weights(), descriptors)
-    return descriptors
+    # 1. Lengths and directions (0 to BINS) of the gradients of the samples (N, SAMPLES, SAMPLES).
+    patches = _patches(panorama, pixels, sides_px)
+    dx = patches[:, 1:-1, 2:] - patches[:, 1:-1, :-2]
+    dy = patches[:, 2:, 1:-1] - patches[:, :-2, 1:-1]
+    length, angle = (np.asarray(of, np.float32).ravel() for of in cv2.cartToPolar(dx.ravel(), dy.ravel()))
+    direction = angle * np.float32(BINS / math.tau)
+    low = direction.astype(np.intp)
+    share = direction - low
+    # 2. Histograms (N, CELLS, CELLS, BINS): a gradient counts in the two directions next to its own, and in the cells
+    #    around it.
+    by_direction = np.zeros((len(length), BINS), np.float32)
+    each = np.arange(len(length)) * BINS
+    by_direction.ravel()[each + low % BINS] = length * (1 - share)
+    by_direction.ravel()[each + (low + 1) % BINS] = length * share
+    weights = _cell_weights()
+    by_rows = weights @ by_direction.reshape(len(patches), SAMPLES, SAMPLES * BINS)
+    cells = by_rows.reshape(len(patches), CELLS, SAMPLES, BINS)
+    histograms = (weights @ cells).reshape(len(patches), CELLS**2 * BINS)
+    # 3. Square roots of the shares; a patch without contrast has none.
+    tiny = np.finfo(np.float32).tiny
+    histograms /= np.maximum(np.linalg.norm(histograms, axis=1, keepdims=True), tiny)
+    histograms = np.minimum(histograms, np.float32(LARGEST))
+    histograms /= np.maximum(histograms.sum(axis=1, keepdims=True), tiny)
+    return np.minimum(np.rint(SCALE * np.sqrt(histograms)), np.iinfo(np.uint8).max).astype(np.uint8)
 
 
 def _patches(panorama: PaddedPanorama, pixels: Array, sides_px: Array) -> Floats:
-    """Return patches (N, SAMPLES + 2, SAMPLES + 2), with one sample more on each side for the gradients."""
+    """Return patches (N, SAMPLES + 2, SAMPLES + 2), with one sample more on each side for the gradients.
+
+    Each is cut from the coarsest image of the pyramid in which it has a sample a pixel.
+    """
     steps = sides_px / SAMPLES
-    levels = np.clip(np.floor(np.log2(np.maximum(steps, 1.0))), 0, LEVELS - 1).astype(int)
+    levels = np.floor(np.log2(steps)).astype(int)
     side = SAMPLES + 2
     offsets = np.arange(side) - (side - 1) / 2
     patches = np.zeros((len(pixels), side, side), np.float32)
@@ -84,8 +116,40 @@ def _patches(panorama: PaddedPanorama, pixels: Array, sides_px: Array) -> Floats
 
 @cache
 def _cell_weights() -> Floats:
-    """Return the weights (CELLS, SAMPLES) of the samples of a row in each cell: linear between middles, Gaussian."""
+    """Return the weights (CELLS, SAMPLES) of the samples of a row in each cell: linear between middles, Gaussian.
+
+    The standard deviation of the Gaussian is half a side, as in SIFT (Lowe 2004).
+    """
     at = (np.arange(SAMPLES) + 0.5) / SAMPLES
     middles = (np.arange(CELLS) + 0.5) / CELLS
     linear = np.maximum(0.0, 1 - CELLS * np.abs(at[None] - middles[:, None]))
-    return np.asarray(linear * np.exp(-0.5 * ((at - 0.5) / WINDOW) ** 2)[None], np.float32)
+    return np.asarray(linear * np.exp(-0.5 * ((at - 0.5) / 0.5) ** 2)[None], np.float32)
+
+
+def thumbnail(panorama: PaddedPanorama) -> Thumbnail:
+    """Return the panorama (H, W) at (ROWS, COLUMNS) of a full turn without its slow changes of brightness.
+
+    The root mean square is THUMBNAIL_SCALE; zeros for a panorama without contrast, and outside of a sector.
+    """
+    columns = max(1, round(COLUMNS * panorama.width / panorama.period_px))
+    small = cv2.resize(panorama.panorama, (columns, ROWS), interpolation=cv2.INTER_AREA).astype(np.float32)
+    pad = SMOOTH[0] // 2
+    border = cv2.BORDER_WRAP if columns == COLUMNS else cv2.BORDER_REPLICATE
+    contrast = small - cv2.blur(cv2.copyMakeBorder(small, 0, 0, pad, pad, border), SMOOTH)[:, pad:-pad]
+    whole, size = np.zeros((ROWS, COLUMNS), np.float32), float(np.linalg.norm(contrast))
+    if size >= LEAST_CONTRAST * math.sqrt(small.size):
+        first = round(COLUMNS * panorama.first / panorama.period_px)
+        whole[:, (first + np.arange(columns)) % COLUMNS] = contrast / size
+    return np.asarray(np.clip(np.rint(THUMBNAIL_SCALE * math.sqrt(whole.size) * whole), -127, 127), np.int8)
+
+
+def signature_of(small: Thumbnail) -> Signature:
+    """Return the signature of the panorama that has a thumbnail: its spectrum, row by row, of length 1."""
+    size = float(np.linalg.norm(small.astype(np.float32)))
+    return np.fft.rfft(small / max(size, 1.0), axis=1).astype(np.complex64)
+
+
+def similarities(a: Signature, others: NDArray[np.complex64]) -> NDArray[np.float32]:
+    """Return the largest circular correlations (N,) over all headings with others (N, ROWS, COLUMNS / 2 + 1)."""
+    correlation = np.fft.irfft(np.einsum("rk,nrk->nk", a, others.conj()), COLUMNS, axis=1)
+    return np.asarray(correlation.max(axis=1), np.float32)

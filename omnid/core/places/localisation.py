@@ -6,7 +6,9 @@ MapLocaliser.process is the algorithm, one frame at a time. Odometry stays as it
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -14,38 +16,137 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.mapping.scan_grid import KeyframeScans
+from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.correction import MapCorrection
-from omnid.core.places.drift import relative_covariance
-from omnid.core.places.features import describe
-from omnid.core.places.hypotheses import Hypotheses, Hypothesis, SearchSchedule
-from omnid.core.places.map_parts import Ageing, FixedPlaces, MapParts
-from omnid.core.places.map_pose import UNKNOWN_PLACE, MapPose, OdometryFrame
+from omnid.core.places.features import Thumbnail, describe, thumbnail
 from omnid.core.places.place_map import (
     NO_KEYFRAME,
     NOTHING,
+    Link,
     PlaceFeatures,
     PlaceKeyframe,
     PlaceLimits,
     PlaceMap,
-    by_odometry,
+    relative_covariance,
 )
-from omnid.core.places.place_search import NEAR_M, Expected, PlaceSearch
-from omnid.core.places.recognition import MIN_MATCHES, Recognition, length_m
-from omnid.core.places.signature import Thumbnail, thumbnail
+from omnid.core.places.recognition import MIN_MATCHES, Expected, PlaceSearch, Recognition, motion_between
 from omnid.core.types.stereo_model import StereoModel
 from omnid.tracking_state import MapState
 
 Array = NDArray[np.float64]
 
+# Set by trial on development seeds, where a line gives no other reason.
 LOCAL_M: Final = 3.0  # Loops closer along the path are ignored, because odometry itself still sees what is that near.
 TIES: Final = 50  # newest keyframes kept besides a fixed map, so that memory is bounded
-# Largest error of odometry, and its growth with the path; by trial on development seeds.
-GATE_M, GATE_PER_M = 0.15, 0.05
-GATE_RAD, GATE_RAD_PER_M = math.radians(3), math.radians(0.4)  # The same of the heading; by trial on development seeds.
 # After so many contradictions in a row odometry has missed a motion, because right ones in worlds that repeat had 3.
 CONTRADICTIONS: Final = 10
-# A pose counts as localised up to this length of path after the last recognition.
-RECENT_M: Final = 15.0
+RECENT_M: Final = 15.0  # A pose counts as localised up to this length of path after the last recognition.
+CONSISTENT: Final = 3  # recognitions that give the same pose, before they count
+KEPT: Final = 6  # recognitions that are remembered
+APART_M, APART_RAD = 0.05, math.radians(5)  # least motion between two frames that count as two
+SAME_M, SAME_RAD = 0.12, math.radians(1.5)  # largest difference of poses that agree
+SURE_INLIERS: Final = 24  # Inliers of recognitions that count without motion: a robot may be at rest.
+# Odometry computes dense depth at its own keyframes. Where it makes none, the map waits for this multiple of the
+# distance between its keyframes before it asks for dense depth itself.
+WAIT_FACTOR: Final = 2.0
+CHECK_M, CHECK_RAD = 0.1, math.radians(8)  # A recognition is checked in a frame that has moved by this amount.
+SEARCH_NS: Final = 200_000_000  # At most five searches a second, so that most of the time is left to other stages.
+JITTER_NS: Final = 5_000_000  # Stamps vary, so a rate that divides that of the cameras is reached with this tolerance.
+SEARCHES: Final = 10  # After this number of searches without success only new keyframes are searched for.
+# Covariance in a map of which nothing has been recognised, m^2 and rad^2, because it may be a kilometre away in any
+# direction.
+UNKNOWN_PLACE: Final[Array] = np.diag([1e6] * 3 + [np.pi**2] * 3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OdometryFrame:
+    """A frame with its pose by odometry."""
+
+    stereo: StereoFrame
+    stamp_ns: int
+    T_odom_rect: Array  # (4, 4)
+    covariance: Array  # (6, 6) of T_odom_rect, [t; r] in the rectified frame: m^2, m rad, rad^2
+    lost: bool
+    resets: int  # gaps of unknown motion so far
+    is_keyframe: bool  # True if its dense depth is known
+    scan: Callable[[], NDArray[np.float32]]  # returns distances (SECTORS,) [m], see mapping/range_scan.py
+    free_m: Callable[[], NDArray[np.float32]]  # returns up to where floor was seen, asked once at a keyframe
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapPose:
+    """Pose of odom in the map, and pose of the frame in the newest keyframe."""
+
+    T_map_odom: Array  # (4, 4); odom is the rectified frame of the first pair
+    covariance: Array  # (6, 6) of T_map_rect, the pose of the frame in the map; [t; r] in the rectified frame
+    state: MapState
+    keyframe: int  # id of the newest keyframe of the run; NO_KEYFRAME: none since the last gap
+    T_keyframe_rect: Array  # (4, 4) pose of the frame in that keyframe by odometry; the identity where there is none
+    is_known: bool  # True if it is known where odom lies in the map
+
+
+@dataclass(slots=True, eq=False)
+class Hypothesis:
+    """A recognition, and the frame it was made in."""
+
+    recognition: Recognition
+    keyframe: int  # id of the newest keyframe of the run at that time
+    T_keyframe_rect: Array  # (4, 4) by odometry
+    covariance: Array  # (6, 6) of T_keyframe_rect
+    T_odom_rect: Array  # (4, 4)
+    is_counted: bool = False  # it is a loop of the map already
+
+    def T_map_rect(self, poses: Mapping[int, Array]) -> Array:
+        """Return the pose of the frame in the map of these poses of keyframes."""
+        return np.asarray(poses[self.recognition.id] @ self.recognition.T_place_rect)
+
+    def T_map_odom(self, poses: Mapping[int, Array]) -> Array:
+        """Return the pose of odom in the map of these poses of keyframes."""
+        return np.asarray(self.T_map_rect(poses) @ se3.inverse(self.T_odom_rect))
+
+    def link(self) -> Link:
+        """Return the recognition as an edge from the recognised keyframe to the newest one of the run."""
+        place = self.recognition
+        to_frame = Link(place.id, -1, place.T_place_rect, place.covariance, place.inliers)
+        return to_frame.then(Link(self.keyframe, -1, self.T_keyframe_rect, self.covariance).reversed())
+
+
+class Hypotheses:
+    """Recognitions of the last frames, which count once enough of them agree."""
+
+    def __init__(self) -> None:
+        self._kept: deque[Hypothesis] = deque(maxlen=KEPT)
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def clear(self) -> None:
+        """Forget all recognitions."""
+        self._kept.clear()
+
+    def add(self, new: Hypothesis, poses: Mapping[int, Array]) -> list[Hypothesis]:
+        """Add a recognition; return the consistent ones, the new one last; none if there are fewer than CONSISTENT."""
+        distinct: list[Hypothesis] = []
+        for one in self._kept:
+            if one.recognition.id not in poses or one.keyframe not in poses:
+                continue
+            # 1. Both must place the newer frame at the same pose in the map.
+            moved_m, turned_rad = motion_between(one.T_map_odom(poses) @ new.T_odom_rect, new.T_map_rect(poses))
+            if moved_m < SAME_M and turned_rad < SAME_RAD and _is_distinct(one, distinct):
+                distinct.append(one)
+        # 2. Frames at one place count as one, unless they show much.
+        if _is_distinct(new, distinct):
+            distinct.append(new)
+        self._kept.append(new)
+        return distinct if len(distinct) >= CONSISTENT else []
+
+
+def _is_distinct(one: Hypothesis, others: list[Hypothesis]) -> bool:
+    """True if a recognition counts besides others: it has many inliers, or its frame is apart from theirs."""
+    if one.recognition.inliers >= SURE_INLIERS:
+        return True
+    moved = (motion_between(one.T_odom_rect, other.T_odom_rect) for other in others)
+    return all(moved_m > APART_M or turned_rad > APART_RAD for moved_m, turned_rad in moved)
 
 
 class MapLocaliser:
@@ -59,16 +160,13 @@ class MapLocaliser:
         """
         self._limits = limits
         self.places = places if places is not None else PlaceMap()
-        self._fixed = FixedPlaces(self.places, sorted(self.places.keyframes) if localize_only else [])
         self._localize_only = localize_only
-        self.places.max_keyframes = len(self._fixed.ids) + TIES + 1 if localize_only else limits.max_keyframes
+        self._fixed = frozenset(self.places.keyframes if localize_only else ())  # keyframes (ids) that stay
+        self.places.max_keyframes = len(self._fixed) + TIES + 1 if localize_only else limits.max_keyframes
         # A map has the columns of full turns, whatever sector of them the cameras show.
         self.search = PlaceSearch(replace(model, cylinder=model.cylinder.full_turn))
         self.correction = MapCorrection(self.places)
-        self.ageing = Ageing(self.places)
         self._session = 1 + max((k.session for k in self.places.keyframes.values()), default=-1)
-        self._parts = MapParts(self.places)
-        self._schedule = SearchSchedule(limits)
         self._hypotheses = Hypotheses()
         self._newest: PlaceKeyframe | None = None  # newest keyframe of this part, placed by odometry
         self._T_map_odom = np.eye(4)
@@ -77,21 +175,20 @@ class MapLocaliser:
         self._path_at: dict[int, float] = {}  # m, of the keyframes of this run
         self._recognised_at: tuple[float, Array] | None = None  # path and place of the last recognition that counted
         self._last_T: Array | None = None
-        self._scans: tuple[object, KeyframeScans] | None = None  # what they depend on, and they
+        self._searched: tuple[int, Array] | None = None  # stamp and T_odom_rect of the last search
+        self._failed = 0  # searches of this part of the map that found nothing
+        self._part: frozenset[int] | None = None  # keyframes that links join to the newest one; None: not known
+        self._scans: KeyframeScans | None = None  # of this part; None: it has changed
 
     def process(self, frame: OdometryFrame, *, idle: bool = False) -> MapPose:
         """Return the pose of odom in the map after a frame; idle: only by odometry, to save time."""
         self._advance(frame)
         if frame.lost:
             return self._pose(frame, MapState.LOST)
-        if idle:
-            return self._pose(frame, self._state())
-        is_keyframe = self._schedule.keyframe_is_due(
-            self._newest, frame.stamp_ns, frame.T_odom_rect, has_depth=frame.is_keyframe
-        )
-        if is_keyframe or self._search_is_due(frame):
+        is_keyframe = not idle and self._keyframe_is_due(frame)
+        if is_keyframe or (not idle and self._search_is_due(frame)):
             small, features = thumbnail(frame.stereo.lower), describe(frame.stereo)
-            # 1. Recognise: a shortlist by signatures, matches, RANSAC, Gauss-Newton; not what is ambiguous.
+            # 1. Recognise: a shortlist by thumbnails, matches, RANSAC, Gauss-Newton; not what is ambiguous.
             found = self._recognise(frame, small, features)
             # 2. Keep the keyframe, linked to the one before by odometry.
             if is_keyframe:
@@ -110,155 +207,176 @@ class MapLocaliser:
             "map_kb": self.places.nbytes // 1000,
             "loops": self.places.loops,
             "dropped": self.places.dropped,
-            "aged": self.ageing.aged,
+            "aged": self.places.aged,
             "rejected": self.correction.rejected,
-            "unjoined": max(0, len(self._parts) - 1),
+            "unjoined": max(0, len(self.places.parts()) - 1),
             "ambiguous": self.search.ambiguous,
             "refused": self.search.refused,
         }
 
     def map(self) -> PlaceMap:
         """Return the keyframes whose poses are known relative to the oldest one: what can be saved."""
-        return self.places.part(self._parts.oldest())
+        oldest = min(self.places.keyframes, default=0)
+        return self.places.part(next((part for part in self.places.parts() if oldest in part), []))
 
     def scans(self) -> KeyframeScans:
         """Return the range scans of the part of the map in which the pose is: the submaps that move with keyframes.
 
-        Of a map that stays as it is, its own ones only.
+        Of a map that stays as it is, its own ones only. The same object until they change.
         """
-        sizes = len(self.places), len(self.places.links), len(self._parts)
-        now = (self.places.next_id, self._parts.current, self.correction.optimisations, *sizes)
-        if self._scans is None or self._scans[0] != now:
-            shown = self._fixed if self._is_in_fixed else FixedPlaces(self.places, sorted(self._parts.ids()))
-            loops = tuple((link.a, link.b) for link in self.places.links if link.is_loop)
-            self._scans = now, KeyframeScans(shown.scans, shown.free_m, shown.poses, loops)
-        return self._scans[1]
+        if self._scans is None:
+            ids = sorted(self._fixed & self._current or self._current)
+            shown = [self.places.keyframes[id] for id in ids]
+            self._scans = KeyframeScans(
+                {keyframe.id: keyframe.scan for keyframe in shown},
+                {keyframe.id: keyframe.free_m for keyframe in shown},
+                np.array([self.places.poses[id] for id in ids]).reshape(-1, 4, 4),
+                tuple((link.a, link.b) for link in self.places.links if link.is_loop),
+            )
+        return self._scans
+
+    @property
+    def _current(self) -> frozenset[int]:
+        """The keyframes (ids) of the part of the map in which the pose is: those that links join to the newest one."""
+        if self._part is None:
+            newest = None if self._newest is None else self._newest.id
+            self._part = frozenset(next((part for part in self.places.parts() if newest in part), []))
+        return self._part
+
+    def _elsewhere(self) -> list[int]:
+        """Return the keyframes of other parts of the map that hold what recognises them."""
+        return [id for id in self.places.keyframes if id not in self._current and self._is_place(id)]
+
+    def _is_place(self, id: int) -> bool:
+        return len(self.places.keyframes[id].features.views) > 0
+
+    def _map_changed(self) -> None:
+        """Forget what was computed of the map before it changed."""
+        self._part = self._scans = None
+        if len(self._path_at.keys() - self.places.keyframes.keys()):
+            self._path_at = {id: at for id, at in self._path_at.items() if id in self.places.keyframes}
+        self.search.forget_dropped(self.places)
 
     def _advance(self, frame: OdometryFrame) -> None:
         """Sum up the path; after a gap of unknown motion, noticed or not, begin a new part of the map."""
         if self._last_T is not None:
-            self._path_m += length_m(se3.inverse(self._last_T) @ frame.T_odom_rect)
+            self._path_m += motion_between(self._last_T, frame.T_odom_rect)[0]
         self._last_T = frame.T_odom_rect
         is_wrong = self.search.contradicted >= CONTRADICTIONS
         if is_wrong:  # and so are the keyframes since the first contradiction
             for id in [id for id, at_m in self._path_at.items() if at_m > self._confirmed_m]:
                 self.places.drop(id)
-            self._forget_dropped()
         if frame.resets != self._resets or is_wrong:
             self._resets, self.search.contradicted = frame.resets, 0
             self._hypotheses.clear()
-            self._newest, self._recognised_at = None, None
-            self._schedule.restart()
-            self._parts.begin()
+            self._newest = self._recognised_at = self._searched = None
+            self._failed = 0
+            self._map_changed()
             self.correction.forget()
 
+    def _keyframe_is_due(self, frame: OdometryFrame) -> bool:
+        """True if the view has changed enough since the newest keyframe; sooner for a frame whose depth is known."""
+        newest, limits = self._newest, self._limits
+        if newest is None:
+            return True
+        if frame.stamp_ns - newest.stamp_ns < 1e9 / limits.rate_hz - JITTER_NS:
+            return False
+        moved_m, turned_rad = motion_between(newest.T_odom_rect, frame.T_odom_rect)
+        change = max(moved_m / limits.keyframe_m, turned_rad / math.radians(limits.keyframe_deg))
+        return change >= (1.0 if frame.is_keyframe else WAIT_FACTOR)
+
     def _search_is_due(self, frame: OdometryFrame) -> bool:
-        """True if a recognition is to be checked, or where odom is in the map is not known."""
-        is_unknown = self._recognised_at is None and any(map(self._is_place, self._parts.others()))
+        """True for a frame that becomes no keyframe if a recognition is to be checked, or odom's place is not known."""
+        if self._searched is None:
+            return True
+        searched_ns, T_odom_searched = self._searched
+        if frame.stamp_ns - searched_ns < SEARCH_NS:
+            return False
+        if self._failed < SEARCHES and self._recognised_at is None and self._elsewhere():
+            return True
+        moved_m, turned_rad = motion_between(T_odom_searched, frame.T_odom_rect)
         is_pending = len(self._hypotheses) > 0 and self._state() is not MapState.LOCALIZED
-        return self._schedule.search_is_due(
-            frame.stamp_ns, frame.T_odom_rect, is_unknown=is_unknown, is_pending=is_pending
-        )
-
-    def _elsewhere(self) -> list[int]:
-        """Return the keyframes of other parts of the map."""
-        return [id for id in self._parts.others() if self._is_place(id)]
-
-    def _is_place(self, id: int) -> bool:
-        """True if a keyframe holds what recognises it."""
-        return len(self.places.keyframes[id].features.views) > 0
+        return is_pending and (moved_m > CHECK_M or turned_rad > CHECK_RAD)
 
     def _recognise(self, frame: OdometryFrame, small: Thumbnail, features: PlaceFeatures) -> Recognition | None:
         """Return the place that the frame shows: near the expected pose, else in parts of the map of unknown pose."""
-        self._schedule.begin(frame.stamp_ns, frame.T_odom_rect)
-        expected = self._expected(frame)
-        found = self.search.near(small, features, self.places, expected)
+        self._searched = frame.stamp_ns, frame.T_odom_rect
+        found = self.search.find(small, features, self.places, self._expected(frame))
         self._confirmed_m = self._confirmed_m if self.search.contradicted else self._path_m
-        if found is None and (far := self._elsewhere()):
-            found = self.search.far(small, features, self.places, far)
-        self._schedule.end(found=found is not None, could_find=len(features.views) >= MIN_MATCHES)
+        if found is None and (elsewhere := self._elsewhere()):
+            found = self.search.find(small, features, self.places, elsewhere)
+        if found is not None:
+            self._failed = 0
+        elif len(features.views) >= MIN_MATCHES:  # it was not too dark to search
+            self._failed += 1
         return found
 
     def _expected(self, frame: OdometryFrame) -> Expected:
-        """Return the expected pose, and the largest errors relative to the keyframes that are no longer in view."""
-        T_map_rect = self._T_map_odom @ frame.T_odom_rect
-        ids = [id for id in self._around(T_map_rect[:3, 3]) if self._is_place(id)]
+        """Return the expected pose, and the drift since the keyframes that are no longer in view."""
+        # 1. Since odometry has left a keyframe of this run.
+        ids = [id for id in sorted(self._current) if self._is_place(id)]
         drift_m = self._path_m - np.array([self._path_at.get(id, -math.inf) for id in ids])
         left = drift_m >= LOCAL_M
         ids, drift_m = [ids[n] for n in np.flatnonzero(left).tolist()], drift_m[left]
+        # 2. Since the map last said where odom is, and from there to the keyframe.
         if self._recognised_at is not None:
             path_m, at = self._recognised_at
             apart_m = np.linalg.norm(self.places.positions(ids) - at, axis=1)
             drift_m = np.minimum(drift_m, self._path_m - path_m + apart_m)
-        error_m = dict(zip(ids, (GATE_M + GATE_PER_M * drift_m).tolist(), strict=True))
-        error_rad = dict(zip(ids, (GATE_RAD + GATE_RAD_PER_M * drift_m).tolist(), strict=True))
-        return Expected(T_map_rect, error_m, error_rad, self._state() is MapState.LOCALIZED)
-
-    @property
-    def _is_in_fixed(self) -> bool:
-        """True if the current part is a fixed map."""
-        return bool(self._fixed.ids) and self._parts.number(self._fixed.ids[0]) == self._parts.current
-
-    def _around(self, position: Array) -> list[int]:
-        """Return the keyframes of this part; of a fixed map only keyframes that may be near."""
-        moving = [id for id in self._parts.ids() if id not in self._fixed.known]
-        if not self._is_in_fixed or self._recognised_at is None:
-            return moving
-        # One that is farther than NEAR_M and the largest error, which grows with its distance, is not looked for.
-        path_m, at = self._recognised_at
-        drift_m = self._path_m - path_m + float(np.linalg.norm(position - at))
-        reach_m = (NEAR_M + GATE_M + GATE_PER_M * drift_m) / (1 - GATE_PER_M)
-        return self._fixed.within(position, reach_m) + moving
+        T_map_rect = self._T_map_odom @ frame.T_odom_rect
+        is_localised = self._state() is MapState.LOCALIZED
+        return Expected(T_map_rect, dict(zip(ids, drift_m.tolist(), strict=True)), is_localised)
 
     def _add(self, frame: OdometryFrame, small: Thumbnail, features: PlaceFeatures) -> None:
         """Add a keyframe to the map."""
         if self._localize_only:
             features = NOTHING
-            ties = [id for id in self.places.keyframes if id not in self._fixed.known]
+            ties = [id for id in self.places.keyframes if id not in self._fixed]
             for id in ties[: len(ties) - TIES + 1]:
                 self.places.drop(id)
         scan, free_m = frame.scan().astype(np.float16), frame.free_m().astype(np.float16)
         of_odometry = frame.stamp_ns, frame.T_odom_rect, frame.covariance
-        id = self.places.next_id
-        keyframe = PlaceKeyframe(id, self._session, *of_odometry, small, scan, free_m, features)
-        link = None if self._newest is None else by_odometry(self._newest, keyframe)
+        keyframe = PlaceKeyframe(self.places.next_id, self._session, *of_odometry, small, scan, free_m, features)
+        link = None if self._newest is None else Link.by_odometry(self._newest, keyframe)
         self.places.add(keyframe, self._T_map_odom @ frame.T_odom_rect, link)
-        self._parts.add(keyframe.id)
         self._path_at[keyframe.id] = self._path_m
         self._newest = keyframe
-        self._forget_dropped()
-
-    def _forget_dropped(self) -> None:
-        """Forget the keyframes that are no longer in the map."""
-        if self._parts.forget_dropped():
-            self._path_at = {id: at for id, at in self._path_at.items() if id in self.places.keyframes}
-            self.search.forget(self.places)
+        self._map_changed()
 
     def _age(self, found: Recognition) -> None:
         """Count what the search found and missed at a place that is known; what has aged leaves the map."""
         if self._localize_only or self._state() is not MapState.LOCALIZED:
             return
         at = (self.places.poses[found.id] @ found.T_place_rect)[:3, 3]
-        self.ageing.observe(at, self.search.compared, self._path_m)
-        self._forget_dropped()
+        self.places.observe(at, self.search.compared, self._path_m)
+        self._map_changed()
 
     def _close_loop(self, frame: OdometryFrame, found: Recognition, newest: PlaceKeyframe) -> None:
         """Link a recognised place, once several frames agree, and correct the map."""
+        # 1. The recognition, with those before it that agree.
         T_keyframe_rect = se3.inverse(newest.T_odom_rect) @ frame.T_odom_rect
         since = relative_covariance(T_keyframe_rect, newest.covariance, frame.covariance)
         hypothesis = Hypothesis(found, newest.id, T_keyframe_rect, since, frame.T_odom_rect)
-        if not (consistent := self._hypotheses.add(hypothesis, self.places.poses)):
+        poses = self.places.poses
+        if not (consistent := self._hypotheses.add(hypothesis, poses)):
             return
-        other = self._parts.number(found.id)
-        if other != self._parts.current:
-            self._parts.join(other, hypothesis.T_map_odom(self.places.poses) @ se3.inverse(self._T_map_odom))
+        # 2. A place in another part joins the two; the older one stays where it is.
+        part = self._current
+        if found.id not in part:
+            other = next(frozenset(ids) for ids in self.places.parts() if found.id in ids)
+            T_other_current = hypothesis.T_map_odom(poses) @ se3.inverse(self._T_map_odom)
+            moved, by = (part, T_other_current) if min(other) < min(part) else (other, se3.inverse(T_other_current))
+            poses.update({id: by @ poses[id] for id in moved})
+            part |= other
             self.correction.forget()
-        links = [one.link() for one in consistent if self._hypotheses.take(one)]
-        self.correction.close(
-            [link for link in links if link.a != link.b], sorted(self._parts.ids()), self._fixed.known
-        )
-        self._T_map_odom = self.places.poses[newest.id] @ se3.inverse(newest.T_odom_rect)
+        # 3. Loops, and the poses by them.
+        links = [one.link() for one in consistent if not one.is_counted]
+        for one in consistent:
+            one.is_counted = True
+        self.correction.close([link for link in links if link.a != link.b], sorted(part), self._fixed)
+        self._T_map_odom = poses[newest.id] @ se3.inverse(newest.T_odom_rect)
         self._recognised_at = self._path_m, (self._T_map_odom @ frame.T_odom_rect)[:3, 3]
+        self._map_changed()
 
     def _state(self) -> MapState:
         """Return the state of a frame whose pose in odom is known."""
@@ -267,10 +385,11 @@ class MapLocaliser:
 
     def _pose(self, frame: OdometryFrame, state: MapState) -> MapPose:
         """Return the pose of odom at a frame, relative to the newest keyframe where there is one."""
-        is_unknown = self._recognised_at is None and bool(self._elsewhere())
-        covariance = UNKNOWN_PLACE if is_unknown else self.correction.covariance_at(frame.T_odom_rect, frame.covariance)
-        newest = self._newest
-        if newest is None:
-            return MapPose(self._T_map_odom, covariance, state, NO_KEYFRAME, np.eye(4))
-        T_keyframe_rect = se3.inverse(newest.T_odom_rect) @ frame.T_odom_rect
-        return MapPose(self._T_map_odom, covariance, state, newest.id, T_keyframe_rect)
+        is_known = self._recognised_at is not None or not self._elsewhere()
+        covariance = UNKNOWN_PLACE
+        if is_known:
+            covariance = self.correction.covariance_at(frame.T_odom_rect, frame.covariance)
+        id, T_keyframe_rect = NO_KEYFRAME, np.eye(4)
+        if self._newest is not None:
+            id, T_keyframe_rect = self._newest.id, se3.inverse(self._newest.T_odom_rect) @ frame.T_odom_rect
+        return MapPose(self._T_map_odom, covariance, state, id, T_keyframe_rect, is_known)

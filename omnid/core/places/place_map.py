@@ -1,8 +1,8 @@
-"""Places of a map: keyframes with what recognises them, their poses in the map, and the links between them."""
+"""Places of a map: keyframes with what recognises them, their poses in the map, the links between them, and the rig."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Annotated, Final, NamedTuple
@@ -13,9 +13,22 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.places.drift import relative_covariance
+from calib.panorama import Cylinder
+
+Array = NDArray[np.float64]
 
 NO_KEYFRAME: Final = -1  # Used in place of an id, because ids are never negative.
+DESCRIPTOR: Final = 128  # Bytes of a descriptor; exact: 8 directions in 4 x 4 cells.
+# Most loops that a dropped keyframe leaves to its neighbour, the most certain ones.
+MOST_LOOPS: Final = 4
+# A map is of the same rig where baseline, shift [m] and turn [rad] of the rectified frame differ by less than this: the
+# rig may have been calibrated again.
+BASELINE_RATIO, SHIFT_M, TURN_RAD = 0.01, 0.01, 0.02
+# Ageing, by trial on development seeds.
+BESIDE_M: Final = 0.3  # A keyframe this near to a frame shows the same view, if nothing has changed.
+FOUND_INLIERS: Final = 20  # Inliers with which a keyframe counts as recognised.
+VISIT_M: Final = 3.0  # Length of path between two visits of a place.
+AGED_MISSES: Final = 3  # Consecutive visits at which a keyframe is missed, before the next one drops it.
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,9 +49,6 @@ class PlaceLimits:
     ] = 2000
 
 
-DESCRIPTOR: Final = 128  # Bytes of a descriptor; exact: 8 directions in 4 x 4 cells.
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaceFeatures:
     """Features of a lower panorama whose depth is known: descriptors (N, 128), views (N, 3) [px].
@@ -49,11 +59,6 @@ class PlaceFeatures:
     descriptors: NDArray[np.uint8]
     views: NDArray[np.float32]
 
-    @property
-    def nbytes(self) -> int:
-        """Memory that the features take."""
-        return self.descriptors.nbytes + self.views.nbytes
-
     def first(self, count: int) -> PlaceFeatures:
         """Return the first of the features: the strongest ones, which are evenly spread."""
         return PlaceFeatures(self.descriptors[:count], self.views[:count])
@@ -61,14 +66,6 @@ class PlaceFeatures:
 
 # Features of a frame that shows none; exact.
 NOTHING: Final = PlaceFeatures(np.zeros((0, DESCRIPTOR), np.uint8), np.zeros((0, 3), np.float32))
-
-
-Array = NDArray[np.float64]
-
-# Most loops that a dropped keyframe leaves to its neighbour, the most certain ones.
-MOST_LOOPS = 4
-# Bytes of a keyframe without its large arrays, because poses, covariance and links take about so many.
-OVERHEAD_BYTES = 1500
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,15 +77,27 @@ class PlaceKeyframe:
     stamp_ns: int
     T_odom_rect: Array  # (4, 4) as odometry estimated it, in the odom of its session
     covariance: Array  # (6, 6) of it, [t; r] in the rectified frame
-    thumbnail: NDArray[np.int8]  # (16, 128) the panorama's contrast, see signature.py
+    thumbnail: NDArray[np.int8]  # (16, 128) the panorama's contrast, see features.py
     scan: NDArray[np.float16]  # (360,) m, nearest obstacle by azimuth from -pi on, NaN unknown
     free_m: NDArray[np.float16]  # (360,) in the same order, up to which floor was seen, see FreeRanges
     features: PlaceFeatures
 
     @property
     def nbytes(self) -> int:
-        """Memory that the keyframe takes."""
-        return OVERHEAD_BYTES + self.thumbnail.nbytes + self.scan.nbytes + self.free_m.nbytes + self.features.nbytes
+        """Memory that the arrays of the keyframe take."""
+        arrays = self.T_odom_rect, self.covariance, self.thumbnail, self.scan, self.free_m
+        return sum(array.nbytes for array in (*arrays, self.features.descriptors, self.features.views))
+
+
+def relative_covariance(T_a_b: Array, of_a: Array, of_b: Array) -> Array:
+    """Return the covariance (..., 6, 6) of T_a_b for poses whose covariances grow along the path from a to b.
+
+    What b has beyond a; its negative part, where the estimate of b became better than that of a, is left out.
+    """
+    A = se3.adjoint(se3.inverse(T_a_b))
+    grown = of_b - A @ of_a @ np.swapaxes(A, -1, -2)
+    values, vectors = np.linalg.eigh((grown + np.swapaxes(grown, -1, -2)) / 2)
+    return np.asarray((vectors * np.maximum(values, 0.0)[..., None, :]) @ np.swapaxes(vectors, -1, -2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,6 +109,12 @@ class Link:
     T_a_b: Array  # (4, 4)
     covariance: Array  # (6, 6) of xi = [t; r]
     inliers: int = 0  # features that support a loop; 0: an edge of odometry
+
+    @staticmethod
+    def by_odometry(a: PlaceKeyframe, b: PlaceKeyframe) -> Link:
+        """Return the edge between two keyframes as odometry measured it."""
+        T_a_b = se3.inverse(a.T_odom_rect) @ b.T_odom_rect
+        return Link(a.id, b.id, T_a_b, relative_covariance(T_a_b, a.covariance, b.covariance))
 
     @property
     def is_loop(self) -> bool:
@@ -117,12 +132,6 @@ class Link:
         covariance = A @ self.covariance @ A.T + other.covariance
         weakest = min((n for n in (self.inliers, other.inliers) if n), default=0)
         return Link(self.a, other.b, self.T_a_b @ other.T_a_b, covariance, weakest)
-
-
-def by_odometry(a: PlaceKeyframe, b: PlaceKeyframe) -> Link:
-    """Return the edge between two keyframes as odometry measured it."""
-    T_a_b = se3.inverse(a.T_odom_rect) @ b.T_odom_rect
-    return Link(a.id, b.id, T_a_b, relative_covariance(T_a_b, a.covariance, b.covariance))
 
 
 class KeyframeUse(NamedTuple):
@@ -146,6 +155,8 @@ class PlaceMap:
         self.links: list[Link] = []
         self.uses: dict[int, KeyframeUse] = {}  # uses by id; a keyframe without an entry is UNUSED
         self.dropped = 0  # keyframes, because the map was full
+        self.aged = 0  # keyframes, because they were missed visit after visit
+        self._visits: dict[int, tuple[float, bool]] = {}  # path at the last visit, and whether it was found at it
 
     def __len__(self) -> int:
         return len(self.keyframes)
@@ -168,6 +179,21 @@ class PlaceMap:
     def positions(self, ids: Sequence[int]) -> Array:
         """Return the positions (N, 3) of keyframes in the map."""
         return np.array([self.poses[id][:3, 3] for id in ids]).reshape(-1, 3)
+
+    def parts(self) -> list[list[int]]:
+        """Return the ids of the keyframes that links join, part by part, the largest first, ids ascending.
+
+        A run that extends a saved map begins a part of its own, and so does odometry after a gap of unknown motion. A
+        place that is recognised in another part joins the two.
+        """
+        part_of = {id: {id} for id in sorted(self.keyframes)}
+        for link in self.links:
+            small, large = sorted((part_of[link.a], part_of[link.b]), key=len)
+            if small is not large:
+                large |= small
+                part_of.update(dict.fromkeys(small, large))
+        different = {id(part): sorted(part) for part in part_of.values()}
+        return sorted(different.values(), key=lambda ids: (-len(ids), ids[0]))
 
     def add(self, keyframe: PlaceKeyframe, T_map_rect: Array, link: Link | None = None) -> None:
         """Add a keyframe with the link of odometry that leads to it; None where there is no such link.
@@ -201,6 +227,7 @@ class PlaceMap:
         # 3. The keyframe leaves the map.
         del self.keyframes[id], self.poses[id]
         self.uses.pop(id, None)
+        self._visits.pop(id, None)
 
     def _least_useful(self, newest: int) -> int:
         """Return the id of the keyframe that is to be dropped, not the newest."""
@@ -209,11 +236,33 @@ class PlaceMap:
         nearest = int(apart[:, 1].argmin())
         # Where several are at one position, the second of them may be found first.
         pair = sorted({ids[nearest], *(ids[int(n)] for n in neighbour[nearest])})
-        return min(pair, key=self._usefulness)
+        uses = {id: self.uses.get(id, UNUSED) for id in pair}
+        return min(pair, key=lambda id: uses[id].found - uses[id].missed)
 
-    def _usefulness(self, id: int) -> int:
-        use = self.uses.get(id, UNUSED)
-        return use.found - use.missed
+    def observe(self, position: Array, inliers: Mapping[int, int], path_m: float) -> None:
+        """Count the keyframes that were compared with a frame at a position (3,) in the map; drop those that aged.
+
+        inliers: of each keyframe that was compared. path_m: of the run so far. A keyframe is counted once a visit, as
+        found where one frame of the visit finds it. One that was found at many visits is kept as long: light may come
+        back that one season takes away.
+        """
+        ids = [id for id in inliers if id in self.keyframes]
+        beside = np.linalg.norm(self.positions(ids) - position, axis=1) < BESIDE_M
+        for id, is_beside in zip(ids, beside.tolist(), strict=True):
+            is_found = inliers[id] >= FOUND_INLIERS
+            if not (is_found or is_beside):
+                continue
+            last_m, was_found = self._visits.get(id, (-np.inf, False))
+            is_new = path_m - last_m >= VISIT_M
+            self._visits[id] = path_m, is_found or (was_found and not is_new)
+            use = self.uses.get(id, UNUSED)
+            if is_found:
+                self.uses[id] = KeyframeUse(use.found + (is_new or not was_found), 0)
+            elif is_new and use.missed >= max(AGED_MISSES, use.found):
+                self.drop(id)
+                self.aged += 1
+            elif is_new:
+                self.uses[id] = KeyframeUse(use.found, use.missed + 1)
 
     def part(self, ids: Iterable[int]) -> PlaceMap:
         """Return a map of some keyframes, and the links between them."""
@@ -223,8 +272,43 @@ class PlaceMap:
         part.poses = {id: self.poses[id] for id in part.keyframes}
         part.links = [link for link in self.links if link.a in chosen and link.b in chosen]
         part.uses = {id: use for id, use in self.uses.items() if id in part.keyframes}
+        part.dropped = self.dropped
         return part
 
-    def move(self, poses: dict[int, Array]) -> None:
-        """Set the poses T_map_rect of keyframes after an optimisation."""
-        self.poses.update(poses)
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaceRig:
+    """The part of a rig on which a map depends: panoramas, baseline, frames of robot and rig, hash of its file."""
+
+    cylinder: Cylinder
+    baseline_m: float
+    T_rig_rect: Array  # (4, 4) of the rectified frame, in which a map is kept
+    T_base_rig: Array  # (4, 4)
+    rig_hash: str  # hexadecimal
+
+    @property
+    def T_base_rect(self) -> Array:
+        """Transform (4, 4) from the rectified frame to the robot's base, in whose axes a map is published."""
+        return self.T_base_rig @ self.T_rig_rect
+
+    def difference(self, other: PlaceRig) -> str:
+        """Return in words why places seen by this rig cannot be compared with those of another; "" where they can."""
+        if self.cylinder.width != other.cylinder.width:
+            return f"panoramas of {self.cylinder.width} columns, not {other.cylinder.width}"
+        if abs(self.baseline_m - other.baseline_m) > BASELINE_RATIO * other.baseline_m:
+            return f"a baseline of {self.baseline_m:.4f} m, not {other.baseline_m:.4f} m"
+        moved = se3.log(se3.inverse(self.T_rig_rect) @ other.T_rig_rect)
+        shift_m, turn_rad = float(np.linalg.norm(moved[:3])), float(np.linalg.norm(moved[3:]))
+        if turn_rad <= TURN_RAD and shift_m <= SHIFT_M:
+            return ""
+        moved_words = f"{1e3 * shift_m:.0f} mm and {np.degrees(turn_rad):.1f} degrees"
+        return f"viewpoints that lie otherwise in the rig, by {moved_words}"
+
+    def adapt(self, places: PlaceMap, rig_of_map: PlaceRig) -> None:
+        """Change the views of a map, in place, to those in the panoramas of this rig; its own rig has no difference.
+
+        The horizon's row depends on the masks, which may have been found in the images of the run.
+        """
+        shift = np.float32(self.cylinder.row0 - rig_of_map.cylinder.row0)
+        for keyframe in places.keyframes.values():
+            keyframe.features.views[:, 1:] += shift

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Set
 from dataclasses import dataclass
 from typing import Final
 
@@ -12,8 +11,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.mapping.scan_grid import Grid, scan_grid
 from omnid.core.mapping.voxel_map import MapPoints, VoxelMap
-from omnid.core.places.place_map import PlaceMap
-from omnid.core.places.place_rig import PlaceRig
+from omnid.core.places.place_map import PlaceMap, PlaceRig
 from omnid.core.stereo.triangulation import triangulate
 
 Array = NDArray[np.float64]
@@ -51,33 +49,12 @@ def summary(places: PlaceMap, rig: PlaceRig) -> PlaceSummary:
         sum(len(keyframe.features.views) for keyframe in keyframes),
         places.loops,
         places.dropped,
-        len(parts(places)),
+        len(places.parts()),
         float(sum(np.linalg.norm(link.T_a_b[:3, 3]) for link in places.links if not link.is_loop)),
         (float(extent[0]), float(extent[1])),
         min(stamps),
         max(stamps),
     )
-
-
-def parts(places: PlaceMap) -> list[list[int]]:
-    """Return the ids of the keyframes that links join, part by part, the largest first."""
-    part_of = {id: {id} for id in sorted(places.keyframes)}
-    for link in places.links:
-        a, b = part_of[link.a], part_of[link.b]
-        if a is not b:
-            small, large = sorted((a, b), key=len)
-            large |= small
-            part_of.update(dict.fromkeys(small, large))
-    different = {id(part): sorted(part) for part in part_of.values()}
-    return sorted(different.values(), key=lambda ids: (-len(ids), ids[0]))
-
-
-def keep_only(places: PlaceMap, ids: Set[int]) -> None:
-    """Remove all other keyframes from a map, and their links."""
-    places.links = [link for link in places.links if link.a in ids and link.b in ids]
-    for id in places.keyframes.keys() - ids:
-        del places.keyframes[id], places.poses[id]
-        places.uses.pop(id, None)
 
 
 def base_poses(places: PlaceMap, rig: PlaceRig) -> Array:

@@ -45,11 +45,6 @@ class PoseEdges:
     def __len__(self) -> int:
         return len(self.pairs)
 
-    @staticmethod
-    def empty() -> PoseEdges:
-        """Return no edges."""
-        return PoseEdges(np.zeros((0, 2), np.intp), np.zeros((0, 4, 4)), np.zeros((0, 6, 6)), np.zeros(0, bool))
-
 
 @dataclass(frozen=True, slots=True)
 class PoseGraphResult:
@@ -57,11 +52,9 @@ class PoseGraphResult:
 
     poses: Array  # (N, 4, 4)
     weights: Array  # (M,) 1 for odometry, 0 to 1 for loops
-    squared: Array  # (M,) squared Mahalanobis distances of the edges from the result
     # (6, 6) [t; r] of the last node in its axes, relative to the fixed ones; infinite if neither odometry nor accepted
     # loops join it to one of them.
     covariance: Array
-    steps: int  # steps of Gauss-Newton
     converged: bool
 
     @property
@@ -80,8 +73,10 @@ def optimise(poses: Array, edges: PoseEdges, fixed: Flags | None = None) -> Pose
         fixed = np.arange(len(poses)) == 0
     graph, loop, weights = _Graph(edges, fixed), edges.is_loop, np.ones(len(edges))
     residual, J = graph.linearised(poses)
-    mu, steps, converged = _first_mu((residual[loop] ** 2).sum(axis=1)), 0, False
-    while not converged and steps < MAX_STEPS:
+    # With this factor the cost is convex for the largest of the squared residuals.
+    largest = float((residual[loop] ** 2).sum(axis=1).max(initial=0.0))
+    mu, converged = LARGEST_SQUARED / max(2 * largest - LARGEST_SQUARED, LARGEST_SQUARED), False
+    for _ in range(MAX_STEPS):
         # 1. The weights of the loops at this mu; 2. one step of Gauss-Newton; 3. a steeper cost.
         weights[loop] = _weights((residual[loop] ** 2).sum(axis=1), mu)
         change = graph.solve(residual, J, weights)
@@ -89,32 +84,40 @@ def optimise(poses: Array, edges: PoseEdges, fixed: Flags | None = None) -> Pose
         residual, J = graph.linearised(poses)
         decided = bool((np.minimum(weights, 1 - weights) < UNDECIDED).all())
         converged = decided and float(np.abs(change).max()) < CONVERGED
-        mu, steps = STEEPER * mu, steps + 1
+        if converged:
+            break
+        mu *= STEEPER
     is_known = _connected(edges.pairs[weights > ACCEPTED], fixed)[-1]
     covariance = graph.last_covariance(J, weights) if is_known else np.full((6, 6), np.inf)
-    return PoseGraphResult(poses, weights, (residual**2).sum(axis=1), covariance, steps, converged)
+    return PoseGraphResult(poses, weights, covariance, converged)
 
 
 class _Graph:
     """The linear system of the edges; fixed nodes do not move."""
 
     def __init__(self, edges: PoseEdges, fixed: Flags) -> None:
-        self.edges = edges
+        self._edges = edges
         self._W = np.linalg.inv(np.linalg.cholesky(edges.covariance))  # W S W^T = I
         self._moves = ~fixed
         self._fixed = scipy.sparse.diags(np.repeat(np.where(fixed, 1.0, DAMPING), 6))
 
     def linearised(self, T: Array) -> tuple[Array, Array]:
-        """Return residuals (M, 6) and derivatives (M, 2, 6, 6), those by fixed nodes 0."""
-        residual, J = linearised(T, self.edges, self._W)
-        return residual, J * self._moves[self.edges.pairs][..., None, None]
+        """Return whitened residuals (M, 6), and their derivatives (M, 2, 6, 6) by small motions of the nodes a and b.
+
+        The residual of an edge is W log(T_a_b^-1 T_a^-1 T_b), and a node moves by T exp(x); fixed nodes do not.
+        """
+        pairs, W = self._edges.pairs, self._W
+        T_b_a = se3.inverse(T[pairs[:, 1]]) @ T[pairs[:, 0]]
+        residual = se3.log(se3.inverse(T_b_a @ self._edges.T_a_b))
+        by_b = W @ _inverse_right_jacobian(residual)
+        J = np.stack([-by_b @ se3.adjoint(T_b_a), by_b], axis=1) * self._moves[pairs][..., None, None]
+        return (W @ residual[..., None])[..., 0], J
 
     def solve(self, residual: Array, J: Array, weight: Array) -> Array:
         """Return the small motions (N, 6) of Gauss-Newton."""
-        root = np.sqrt(weight)
-        stacked = self._stacked(J, root)
-        gradient = stacked.T @ (root[:, None] * residual).ravel()
-        return np.asarray(-self._factorised(stacked).solve(gradient)).reshape(-1, 6)
+        stacked, factorised = self._factorised(J, weight)
+        gradient = stacked.T @ (np.sqrt(weight)[:, None] * residual).ravel()
+        return np.asarray(-factorised.solve(gradient)).reshape(-1, 6)
 
     def last_covariance(self, J: Array, weight: Array) -> Array:
         """Return the covariance (6, 6) of the last node: a block of the inverse of the normal equations."""
@@ -122,23 +125,20 @@ class _Graph:
             return np.zeros((6, 6))
         columns = np.zeros((6 * len(self._moves), 6))
         columns[-6:] = np.eye(6)
-        found = self._factorised(self._stacked(J, np.sqrt(weight))).solve(columns)[-6:]
+        found = self._factorised(J, weight)[1].solve(columns)[-6:]
         return np.asarray((found + found.T) / 2)
 
-    def _stacked(self, J: Array, root: Array) -> Any:
-        """Return the derivatives as a sparse matrix (6 M, 6 N), scaled by the roots (M,) of the weights."""
-        count = len(self.edges)
-        blocks = (root[:, None, None, None] * J).reshape(-1, 6, 6)
-        shape = (6 * count, 6 * len(self._moves))
-        return scipy.sparse.bsr_matrix((blocks, self.edges.pairs.ravel(), 2 * np.arange(count + 1)), shape=shape)
-
-    def _factorised(self, stacked: Any) -> Any:
-        """Return the factorised normal equations."""
+    def _factorised(self, J: Array, weight: Array) -> tuple[Any, Any]:
+        """Return the weighted derivatives as a sparse matrix (6 M, 6 N), and the factorised normal equations."""
         from scipy.sparse.linalg import splu  # scipy itself loads no packages in packages when they are used
 
-        H = scipy.sparse.csc_matrix(stacked.T @ stacked + self._fixed)
-        return splu(
-            H,
+        count = len(weight)
+        blocks = (np.sqrt(weight)[:, None, None, None] * J).reshape(-1, 6, 6)
+        stacked = scipy.sparse.bsr_matrix(
+            (blocks, self._edges.pairs.ravel(), 2 * np.arange(count + 1)), shape=(6 * count, 6 * len(self._moves))
+        )
+        return stacked, splu(
+            scipy.sparse.csc_matrix(stacked.T @ stacked + self._fixed),
             permc_spec="MMD_AT_PLUS_A",
             diag_pivot_thresh=0.0,
             relax=6,
@@ -147,29 +147,12 @@ class _Graph:
         )
 
 
-def linearised(T: Array, edges: PoseEdges, W: Array) -> tuple[Array, Array]:
-    """Return whitened residuals (M, 6), and their derivatives (M, 2, 6, 6) by small motions of the nodes a and b.
-
-    The residual of an edge is W log(T_a_b^-1 T_a^-1 T_b), and a node moves by T exp(x).
-    """
-    T_b_a = se3.inverse(T[edges.pairs[:, 1]]) @ T[edges.pairs[:, 0]]
-    residual = se3.log(se3.inverse(T_b_a @ edges.T_a_b))
-    by_b = W @ _inverse_right_jacobian(residual)
-    return (W @ residual[..., None])[..., 0], np.stack([-by_b @ se3.adjoint(T_b_a), by_b], axis=1)
-
-
 def _inverse_right_jacobian(xi: Array) -> Array:
     """Return the derivative (M, 6, 6) of log(exp(xi) exp(x)) by x at 0: its series up to the second order."""
     ad = np.zeros((len(xi), 6, 6))
     ad[:, :3, :3] = ad[:, 3:, 3:] = se3.hat(xi[:, 3:])
     ad[:, :3, 3:] = se3.hat(xi[:, :3])
     return np.asarray(np.eye(6) + ad / 2 + ad @ ad / 12)
-
-
-def _first_mu(squared: Array) -> float:
-    """Return the factor with which the cost is convex for the largest of the squared residuals."""
-    largest = float(squared.max(initial=0.0))
-    return LARGEST_SQUARED / max(2 * largest - LARGEST_SQUARED, LARGEST_SQUARED)
 
 
 def _weights(squared: Array, mu: float) -> Array:

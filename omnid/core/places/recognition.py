@@ -1,10 +1,13 @@
-"""Recognition of places: votes for keyframes, matches about a yaw, RANSAC and Gauss-Newton; what then counts."""
+"""Recognition of places: a shortlist by thumbnails and votes, matches about a yaw, RANSAC, Gauss-Newton; what counts.
+
+`PlaceSearch.find` is the algorithm for a frame in a map, `recognise` that for a frame and one keyframe.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -12,41 +15,47 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.pose_estimation import gauss_newton, ransac
-from omnid.core.places.place_map import PlaceFeatures
+from omnid.core.places.features import FEATURES, Signature, Thumbnail, signature_of, similarities
+from omnid.core.places.place_map import PlaceFeatures, PlaceMap
 from omnid.core.stereo.triangulation import point_covariance, triangulate, view
 from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
 
+# Set by trial on development seeds, where a line gives no other reason.
 RATIO: Final = 0.85  # largest distance of a match, as a share of the second best one's (Lowe 2004)
-# Largest difference between a match's azimuth and the yaw between both views; by trial on development seeds.
-YAW_WINDOW_RAD: Final = 1.2
-SIGMA_PX: Final = 0.7  # Standard deviation of corners and their disparities; by trial on development seeds.
-THRESHOLD_PX: Final = 4.0  # largest error of a view in the consensus set; by trial on development seeds
-MIN_MATCHES: Final = 8  # matches, and inliers among them, below which there is no pose; by trial on development seeds
+YAW_WINDOW_RAD: Final = 1.2  # Largest difference between a match's azimuth and the yaw between both views.
+SIGMA_PX: Final = 0.7  # Standard deviation of corners and their disparities.
+THRESHOLD_PX: Final = 4.0  # largest error of a view in the consensus set
+MIN_MATCHES: Final = 8  # matches, and inliers among them, below which there is no pose
 REACH_PX: Final = 3.0  # Reach of the second search about the predicted views, because the next brick is not far.
-# Distance of descriptors that may match in the second search; by trial on development seeds.
-LARGEST_SQUARED: Final = 0.35 * 512**2
+LARGEST_SQUARED: Final = 0.35 * 512**2  # Squared distance of descriptors that may match in the second search.
 # Squared Mahalanobis distance (4 sigma) from which a view is an outlier; so that 0.1 % of right ones are lost.
 OUTLIER_SQUARED: Final = 16.0
-CORRELATED: Final = 4.0  # features that count as one in the covariance; by trial on development seeds
+CORRELATED: Final = 4.0  # features that count as one in the covariance
 # m, rad: least standard deviations, however many features there are.
 FLOOR: Final = np.diag([0.004] * 3 + [0.0007] * 3) ** 2
-SECTORS: Final = 8  # Sectors of azimuth in which inliers are counted; of 45 degrees; by trial on development seeds.
-# Least inliers, and sectors of azimuth that hold them, where odometry agrees; by trial on development seeds.
+SECTORS: Final = 8  # Sectors of azimuth in which inliers are counted, of 45 degrees.
+# Least inliers, and sectors of azimuth that hold them, where odometry agrees ...
 NEAR_INLIERS, NEAR_SECTORS = 20, 4
-# The same where it gives no pose, because other worlds gave 10 inliers in 600 queries.
+# ... and where it gives no pose, because other worlds gave 10 inliers in 600 queries.
 FAR_INLIERS, FAR_SECTORS = 24, 5
-# At most PER_PLACE of the compared keyframes lie within SAME_PLACE_M of each other; by trial on development seeds.
+# At most PER_PLACE of the compared keyframes lie within SAME_PLACE_M of each other.
 PER_PLACE, SAME_PLACE_M = 3, 1.5
-# Share of the inliers with which another place makes a recognition ambiguous; by trial on development seeds.
-RUNNER_UP: Final = 0.6
-# Poses farther apart are different places.
-RUNNER_UP_M, RUNNER_UP_RAD = 0.5, math.radians(10)
-# Features of a frame that vote, evenly spread, the strongest ones first.
-VOTERS: Final = 64
+RUNNER_UP: Final = 0.6  # Share of the inliers with which another place makes a recognition ambiguous.
+RUNNER_UP_M, RUNNER_UP_RAD = 0.5, math.radians(10)  # Poses farther apart are different places.
+VOTERS: Final = 64  # Features of a frame that vote, evenly spread, the strongest ones first.
 BINS: Final = 24  # Bins of the yaw angle; three neighbours count together.
+NEAR_M: Final = 1.5  # Keyframes within this distance of the pose by odometry are searched, besides its error.
+ENOUGH_INLIERS: Final = 50  # Inliers of a place with which the search ends.
+# Most similar thumbnails whose features vote, and those with most votes that are compared: where odometry knows the
+# pose roughly, and where it does not.
+NEAR_EFFORT, FAR_EFFORT = (16, 3), (200, 8)
+# Largest error of odometry, and its growth with the path [m, m/m; rad, rad/m].
+GATE_M, GATE_PER_M = 0.15, 0.05
+GATE_RAD, GATE_RAD_PER_M = math.radians(3), math.radians(0.4)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,88 +70,79 @@ class Recognition:
     sectors: int  # number of SECTORS that hold inliers
 
 
-def recognise(
-    here: PlaceFeatures, there: PlaceFeatures, id: int, turn_rad: float, model: StereoModel
-) -> Recognition | None:
-    """Return the pose of a frame among the features of a keyframe; None where they do not fit.
+@dataclass(frozen=True, slots=True, eq=False)
+class Expected:
+    """Pose in the map that odometry expects for the frame, and the path over which it has drifted."""
 
-    turn_rad: about the yaw from the keyframe to the frame.
-    """
-    model = StereoModel(model.cylinder, model.baseline_m, SIGMA_PX)
-    a, b = matches(there, here, turn_rad, model)
-    if len(a) < MIN_MATCHES:
-        return None
-    points = triangulate(there.views.astype(float), model.cylinder, model.baseline_m)
-    views = here.views.astype(float)
-    T_rect_place, is_inlier = ransac(points[a], views[b], model, np.random.default_rng(id), THRESHOLD_PX)
-    if is_inlier.sum() < MIN_MATCHES:
-        return None
-    first = _fit(points[a[is_inlier]], views[b[is_inlier]], T_rect_place, model)
-    a2, b2 = near_matches(there, here, view(se3.apply(first[0], points), model.cylinder, model.baseline_m), model)
-    if len(a2) < MIN_MATCHES:
-        return None
-    T, covariance, squared = _fit(points[a2], views[b2], first[0], model)
-    kept = squared < OUTLIER_SQUARED
-    count = int(kept.sum())
-    if count < MIN_MATCHES:
-        return None
-    azimuth = np.floor(views[b2[kept], 0] * (SECTORS / model.cylinder.width)).astype(int) % SECTORS
-    covariance = CORRELATED * max(1.0, float(squared[kept].mean()) / 3) * covariance + FLOOR
-    return Recognition(id, se3.inverse(T), covariance, count, len(a), len(np.unique(azimuth)))
+    T_map_rect: Array  # (4, 4)
+    drift_m: Mapping[int, float]  # path by keyframe, inf: unknown; a keyframe without an entry is not searched
+    recognised: bool  # places were recognised lately: one that fits well is enough
+
+    def near(self, places: PlaceMap) -> list[int]:
+        """Return the keyframes that the frame may show."""
+        ids = list(self.drift_m)
+        apart_m = np.linalg.norm(places.positions(ids) - self.T_map_rect[:3, 3], axis=1)
+        reach_m = NEAR_M + GATE_M + GATE_PER_M * np.array(list(self.drift_m.values()))
+        return [ids[n] for n in np.flatnonzero(apart_m < reach_m).tolist()]
+
+    def confirms(self, place: Recognition, poses: Mapping[int, Array]) -> bool:
+        """True if a recognition is within the largest error of odometry."""
+        moved_m, turned_rad = motion_between(self.T_map_rect, poses[place.id] @ place.T_place_rect)
+        drift_m = self.drift_m[place.id]
+        return moved_m < GATE_M + GATE_PER_M * drift_m and turned_rad < GATE_RAD + GATE_RAD_PER_M * drift_m
 
 
-def _fit(points: Array, views: Array, T: Array, model: StereoModel) -> tuple[Array, Array, Array]:
-    """Return the pose T_curr_ref that explains the views (N, 3), its covariance, and the squared errors (N,)."""
-    spread = point_covariance(points, model.cylinder, model.baseline_m, model.sigma_px)
-    result = gauss_newton(points, spread, views, T, model)
-    return result.T, result.covariance, result.squared
+class PlaceSearch:
+    """Finds frames among keyframes, and counts what it refuses."""
 
+    def __init__(self, model: StereoModel) -> None:
+        self._model = model
+        self._signatures: dict[int, Signature] = {}
+        self.ambiguous = 0  # frames that fit two places equally well
+        self.refused = 0  # recognitions that odometry contradicts
+        self.contradicted = 0  # the newest of them, without one that odometry confirms in between
+        self.compared: dict[int, int] = {}  # inliers of each keyframe that the last search compared
 
-def matches(a: PlaceFeatures, b: PlaceFeatures, turn_rad: float, model: StereoModel) -> tuple[Indices, Indices]:
-    """Return indices (M,) into a and b of features that are mutual nearest neighbours and pass the ratio test.
+    def find(
+        self, small: Thumbnail, features: PlaceFeatures, places: PlaceMap, where: Expected | list[int]
+    ) -> Recognition | None:
+        """Return the best recognition of a frame, given by its thumbnail and features; None where there is none.
 
-    turn_rad: yaw from a to b, about which azimuths may differ by YAW_WINDOW_RAD.
-    """
-    if len(a.views) < 2 or len(b.views) < 2:
-        return np.zeros(0, np.intp), np.zeros(0, np.intp)
-    squared = distances(a, b)
-    # Azimuth falls with the column, and a turn to the left moves the world to the right.
-    turned = a.views[:, 0] + np.float32(model.cylinder.focal_px * turn_rad)
-    apart = _apart(turned, b.views[:, 0], model.cylinder.width)
-    squared[apart > YAW_WINDOW_RAD * model.cylinder.focal_px] = np.inf
-    best = squared.argmin(axis=1)
-    nearest = squared[np.arange(len(squared)), best]
-    second = np.partition(squared, 1, axis=1)[:, 1]
-    mutual = squared.argmin(axis=0)[best] == np.arange(len(squared))
-    chosen = np.flatnonzero(mutual & (nearest < RATIO**2 * second) & np.isfinite(nearest))
-    return chosen, best[chosen]
+        where: the pose that odometry expects, which must not contradict it; or keyframes (ids) of which odometry does
+        not know where they are.
+        """
+        is_near = isinstance(where, Expected)
+        ids = where.near(places) if isinstance(where, Expected) else where
+        voted, compared = NEAR_EFFORT if is_near else FAR_EFFORT
+        enough = ENOUGH_INLIERS if isinstance(where, Expected) and where.recognised else FEATURES + 1
+        # 1. The most similar thumbnails.
+        if ids:
+            others = np.array([self._signature(places, id) for id in ids])
+            ranked = np.argsort(-similarities(signature_of(small), others), kind="stable")
+            ids = [ids[n] for n in ranked[:voted].tolist()]
+        # 2. Votes and geometry of these.
+        known = {id: places.keyframes[id].features for id in ids}
+        found = compare(features, known, places.poses, compared, enough, self._model)
+        self.compared = {id: 0 if place is None else place.inliers for id, place in found.items()}
+        # 3. The best one, unless another place is as similar, or odometry contradicts it.
+        candidates = supported(found.values(), near=is_near)
+        best = unambiguous(candidates, places.poses)
+        self.ambiguous += best is None and bool(candidates)
+        if best is None or not isinstance(where, Expected):
+            return best
+        is_confirmed = where.confirms(best, places.poses)
+        self.refused += not is_confirmed
+        self.contradicted = 0 if is_confirmed else self.contradicted + 1
+        return best if is_confirmed else None
 
+    def _signature(self, places: PlaceMap, id: int) -> Signature:
+        if id not in self._signatures:
+            self._signatures[id] = signature_of(places.keyframes[id].thumbnail)
+        return self._signatures[id]
 
-def near_matches(a: PlaceFeatures, b: PlaceFeatures, predicted: Array, model: StereoModel) -> tuple[Indices, Indices]:
-    """Return indices (M,) into a and b of mutual nearest neighbours near the views (N, 3) that a pose predicts of a."""
-    squared = distances(a, b)
-    there = predicted.astype(np.float32)
-    far = (_apart(there[:, 0], b.views[:, 0], model.cylinder.width) > REACH_PX) | (squared > LARGEST_SQUARED)
-    for row in (1, 2):
-        far |= np.abs(b.views[None, :, row] - there[:, None, row]) > REACH_PX
-    squared[far] = np.inf
-    best = squared.argmin(axis=1)
-    nearest = squared[np.arange(len(squared)), best]
-    mutual = squared.argmin(axis=0)[best] == np.arange(len(squared))
-    chosen = np.flatnonzero(mutual & np.isfinite(nearest))
-    return chosen, best[chosen]
-
-
-def distances(a: PlaceFeatures, b: PlaceFeatures) -> NDArray[np.float32]:
-    """Return the squared distances (N, M) of the descriptors."""
-    x, y = a.descriptors.astype(np.float32), b.descriptors.astype(np.float32)
-    return np.asarray((x**2).sum(axis=1)[:, None] + (y**2).sum(axis=1)[None] - 2 * x @ y.T)
-
-
-def _apart(a: NDArray[np.float32], b: NDArray[np.float32], width: int) -> NDArray[np.float32]:
-    """Return the distances (N, M) [px] of columns around a panorama."""
-    apart = b[None] - a[:, None]
-    return np.asarray(np.abs(apart - np.float32(width) * np.rint(apart / np.float32(width))))
+    def forget_dropped(self, places: PlaceMap) -> None:
+        """Forget the keyframes that the map does not hold any more."""
+        self._signatures = {id: found for id, found in self._signatures.items() if id in places.keyframes}
 
 
 def compare(
@@ -156,14 +156,18 @@ def compare(
     """Compare a frame with the keyframes that most of its features vote for; return the recognition or None of each.
 
     known: features of each keyframe; poses: (4, 4) of each. At most `most` are compared, best first, until one is
-    recognised with `enough` inliers.
+    recognised with `enough` inliers; at most PER_PLACE near another one, so that a second, similar place is compared as
+    well, although all neighbours of the first are more similar.
     """
-    ids = list(known)
-    voted = [votes(here, known[id], model.cylinder.width) for id in ids]
-    ranked = np.argsort([-count for count, _ in voted], kind="stable")
+    voted = {id: votes(here, features, model.cylinder.width) for id, features in known.items()}
     found: dict[int, Recognition | None] = {}
-    for n in spread(ranked, np.array([poses[id][:3, 3] for id in ids]), most):
-        place = found[ids[n]] = recognise(here, known[ids[n]], ids[n], voted[n][1], model)
+    for id in sorted(known, key=lambda id: -voted[id][0]):
+        if len(found) == most:
+            break
+        beside = sum(np.linalg.norm(poses[id][:3, 3] - poses[other][:3, 3]) < SAME_PLACE_M for other in found)
+        if beside >= PER_PLACE:
+            continue
+        place = found[id] = recognise(here, known[id], id, voted[id][1], model)
         if place is not None and place.inliers >= enough:
             break
     return found
@@ -181,36 +185,93 @@ def unambiguous(found: list[Recognition], poses: Mapping[int, Array]) -> Recogni
     if best is None:
         return None
     T = poses[best.id] @ best.T_place_rect
-    rivals = (place for place in found if is_elsewhere(T, poses[place.id] @ place.T_place_rect))
-    return None if any(place.inliers > RUNNER_UP * best.inliers for place in rivals) else best
+    for place in found:
+        moved_m, turned_rad = motion_between(T, poses[place.id] @ place.T_place_rect)
+        is_elsewhere = moved_m > RUNNER_UP_M or turned_rad > RUNNER_UP_RAD
+        if is_elsewhere and place.inliers > RUNNER_UP * best.inliers:
+            return None
+    return best
 
 
-def is_elsewhere(a: Array, b: Array) -> bool:
-    """True if two poses (4, 4) are different places."""
-    between = se3.inverse(a) @ b
-    return length_m(between) > RUNNER_UP_M or angle_rad(between) > RUNNER_UP_RAD
+def recognise(
+    here: PlaceFeatures, there: PlaceFeatures, id: int, yaw_rad: float, model: StereoModel
+) -> Recognition | None:
+    """Return the pose of a frame among the features of a keyframe; None where they do not fit.
 
-
-def spread(ranked: NDArray[np.intp], at: Array, most: int) -> list[int]:
-    """Return the first `most` of ranked places (N,) at positions (N, 3), at most PER_PLACE near another.
-
-    So a second, similar place is compared as well, although all neighbours of the first are more similar.
+    yaw_rad: from the keyframe to the frame, roughly.
     """
-    chosen: list[int] = []
-    for n in ranked.tolist():
-        beside = np.linalg.norm(at[chosen] - at[n], axis=1) < SAME_PLACE_M
-        if beside.sum() < PER_PLACE:
-            chosen.append(n)
-        if len(chosen) == most:
-            break
-    return chosen
+    if len(here.views) < 2 or len(there.views) < 2:
+        return None
+    model, cylinder, baseline_m = replace(model, sigma_px=SIGMA_PX), model.cylinder, model.baseline_m
+    squared = distances(there, here)
+    points, views = triangulate(there.views.astype(float), cylinder, baseline_m), here.views.astype(float)
+    # 1. Matches whose azimuths differ by about the yaw. Azimuth falls with the column, and a turn to the left moves the
+    #    world to the right.
+    turned = there.views[:, 0] + np.float32(cylinder.focal_px * yaw_rad)
+    is_far = _columns_apart(turned, here.views[:, 0], cylinder.width) > YAW_WINDOW_RAD * cylinder.focal_px
+    a, b = mutual_nearest(np.where(is_far, np.float32(np.inf), squared), RATIO)
+    if len(a) < MIN_MATCHES:
+        return None
+    # 2. The pose by most of them, and by all that it explains.
+    T_rect_place, is_inlier = ransac(points[a], views[b], model, np.random.default_rng(id), THRESHOLD_PX)
+    if is_inlier.sum() < MIN_MATCHES:
+        return None
+    first, _, _ = _fit(points[a[is_inlier]], views[b[is_inlier]], T_rect_place, model)
+    # 3. The pose by the matches near the views that this one predicts, also those that are similar to others.
+    predicted = view(se3.apply(first, points), cylinder, baseline_m).astype(np.float32)
+    is_far = squared > LARGEST_SQUARED
+    is_far |= _columns_apart(predicted[:, 0], here.views[:, 0], cylinder.width) > REACH_PX
+    is_far |= (np.abs(here.views[None, :, 1:] - predicted[:, None, 1:]) > REACH_PX).any(axis=2)
+    a2, b2 = mutual_nearest(np.where(is_far, np.float32(np.inf), squared))
+    if len(a2) < MIN_MATCHES:
+        return None
+    T, covariance, errors = _fit(points[a2], views[b2], first, model)
+    # 4. Its support.
+    kept = errors < OUTLIER_SQUARED
+    count = int(kept.sum())
+    if count < MIN_MATCHES:
+        return None
+    azimuth = np.floor(views[b2[kept], 0] * (SECTORS / cylinder.width)).astype(int) % SECTORS
+    covariance = CORRELATED * max(1.0, float(errors[kept].mean()) / 3) * covariance + FLOOR
+    return Recognition(id, se3.inverse(T), covariance, count, len(a), len(np.unique(azimuth)))
+
+
+def _fit(points: Array, views: Array, T: Array, model: StereoModel) -> tuple[Array, Array, Array]:
+    """Return the pose T_curr_ref that explains the views (N, 3), its covariance, and the squared errors (N,)."""
+    spread = point_covariance(points, model.cylinder, model.baseline_m, model.sigma_px)
+    result = gauss_newton(points, spread, views, T, model)
+    return result.T, result.covariance, result.squared
+
+
+def mutual_nearest(squared: Floats, ratio: float = np.inf) -> tuple[Indices, Indices]:
+    """Return rows and columns (M,) of the elements of squared distances (N, K) that are the least of both.
+
+    Infinite ones are none. ratio: to the second least of the row, at most.
+    """
+    best, rows = squared.argmin(axis=1), np.arange(len(squared))
+    nearest, second = squared[rows, best], np.partition(squared, 1, axis=1)[:, 1]
+    is_mutual = (squared.argmin(axis=0)[best] == rows) & np.isfinite(nearest)
+    chosen = np.flatnonzero(is_mutual if np.isinf(ratio) else is_mutual & (nearest < ratio**2 * second))
+    return chosen, best[chosen]
+
+
+def distances(a: PlaceFeatures, b: PlaceFeatures) -> Floats:
+    """Return the squared distances (N, M) of the descriptors."""
+    x, y = a.descriptors.astype(np.float32), b.descriptors.astype(np.float32)
+    return np.asarray((x**2).sum(axis=1)[:, None] + (y**2).sum(axis=1)[None] - 2 * x @ y.T)
+
+
+def _columns_apart(a: Floats, b: Floats, width: int) -> Floats:
+    """Return the distances (N, M) [px] of columns around a panorama."""
+    apart = b[None] - a[:, None]
+    return np.asarray(np.abs(apart - np.float32(width) * np.rint(apart / np.float32(width))))
 
 
 def votes(here: PlaceFeatures, there: PlaceFeatures, width: int) -> tuple[int, float]:
-    """Return how many features of a frame have a match in a keyframe at one turn, and that turn [rad].
+    """Return how many features of a frame have a match in a keyframe at one yaw, and that yaw [rad].
 
-    The turn is the yaw from the keyframe to the frame; width: columns of the panorama. Of places that are not the same,
-    the matches are few, and their turns differ.
+    It is that from the keyframe to the frame; width: columns of the panorama. Of places that are not the same, the
+    matches are few, and their yaws differ.
     """
     if len(there.views) < 2 or not len(here.views):
         return 0, 0.0
@@ -224,14 +285,10 @@ def votes(here: PlaceFeatures, there: PlaceFeatures, width: int) -> tuple[int, f
     counts = np.bincount((turned * (BINS / width)).astype(np.intp) % BINS, minlength=BINS)
     together = counts + np.roll(counts, 1) + np.roll(counts, -1)
     bin = int(together.argmax())
-    return int(together[bin]), (bin + 0.5) * 2 * math.pi / BINS
+    return int(together[bin]), (bin + 0.5) * math.tau / BINS
 
 
-def length_m(T: Array) -> float:
-    """Return the length of the translation of a transform (4, 4)."""
-    return float(np.linalg.norm(T[:3, 3]))
-
-
-def angle_rad(T: Array) -> float:
-    """Return the angle of the rotation of a transform (4, 4)."""
-    return math.acos(min(1.0, max(-1.0, (float(np.trace(T[:3, :3])) - 1) / 2)))
+def motion_between(a: Array, b: Array) -> tuple[float, float]:
+    """Return the distance [m] and the angle [rad] between two poses (4, 4)."""
+    T = se3.inverse(a) @ b
+    return float(np.linalg.norm(T[:3, 3])), math.acos(min(1.0, max(-1.0, (float(np.trace(T[:3, :3])) - 1) / 2)))

@@ -1,8 +1,17 @@
-"""State of a rig by matches of some pairs: a point lies on one column of both panoramas if the rig fits."""
+"""State of a rig by matches of some pairs.
+
+A point that both cameras see lies on the same column of both panoramas, and lower in the upper one. With the cameras
+exchanged it lies higher, so the matches downwards from the lower panorama are then fewer than those downwards from the
+upper one. A rotation of a camera, or another mirror, moves the columns. In rendered rooms, corridors and bare walls, a
+right rig gives 0.00 to 0.41 matches with the cameras exchanged for each match, exchanged ones give 2.0 or more, and one
+that is turned by 3 deg is measured within 0.3 deg (four standard deviations subtracted).
+
+A mirror whose scale alone is larger than the rig's moves points along the columns only, which a wrong distance explains
+as well: that cannot be seen here.
+"""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
@@ -44,7 +53,7 @@ Image = NDArray[np.uint8]
 # Corners per pair, so that a round of two pairs has the matches of a finding (120) where four corners in ten are found.
 POINTS: Final = 160
 # The coarse search works on images reduced by this factor, because its cost falls with the fourth power, and the
-# tracker that follows converges from two reduced pixels away (MAX_STEP_PX).
+# tracker that follows converges from two reduced pixels away.
 COARSE: Final = 4
 # Half the side of a patch, in the reduced image: 36 px of the panorama, some ten degrees at 1300 columns. At all
 # scales, because fewer pixels match by chance.
@@ -56,13 +65,10 @@ ASIDE_PX: Final = 5
 DOWN_PX: Final = 30
 # Least correlation of a coarse match, because the search is wide, and a lower one lets more chance matches pass.
 MIN_CORRELATION: Final = 0.8
-# Largest step from the coarse match to the tracked point, px, because two reduced pixels are the error of the coarse
-# search.
-MAX_STEP_PX: Final = 2 * COARSE
 # Points at infinity have no disparity, and so less than this, because noise makes it negative for some of them, as
 # exchanged cameras do for all.
 MIN_DISPARITY_PX: Final = 0.5
-# Two levels are enough: half a window reaches 7 px, and 28 px on the second level, farther than MAX_STEP_PX.
+# Two levels are enough: half a window reaches 7 px, and 28 px on the second level, farther than the coarse search errs.
 KLT: Final = KltSettings(window_px=15, levels=2, max_error_px=0.3)
 # Standard deviation of a coarse patch with contrast, grey levels, because noise alone, averaged over COARSE^2 pixels,
 # has less.
@@ -131,7 +137,7 @@ def match(lower: PaddedPanorama, upper: PaddedPanorama, visible: Flags, exposure
     # 3. Keep those that stay near the coarse place and lie lower in the upper panorama than in the lower one.
     step = there - guess
     step[:, 0] = lower.apart(step[:, 0])
-    good &= likely & (np.abs(step).max(axis=1) < MAX_STEP_PX) & (there[:, 1] > points[:, 1] + MIN_DISPARITY_PX)
+    good &= likely & (np.abs(step).max(axis=1) < 2 * COARSE) & (there[:, 1] > points[:, 1] + MIN_DISPARITY_PX)
     found = Matches(points[good], there[good], len(points), clear)
     # 4. Views at the stamp of the pair, where its images were exposed at several times.
     return found if exposure is None else _at_stamp(found, exposure)
@@ -167,14 +173,8 @@ def _coarse(lower: PaddedPanorama, upper: PaddedPanorama, points: Array) -> tupl
         _, best, _, (right, down) = cv2.minMaxLoc(cv2.matchTemplate(strip, patch, cv2.TM_CCOEFF_NORMED))
         guess[index] += COARSE * (low + right - left), COARSE * down
         likely[index] = best >= MIN_CORRELATION
-        clear += _contrast_grey(patch) > CONTRAST_GREY
+        clear += bool(patch.std() > CONTRAST_GREY)
     return guess, likely, clear
-
-
-def _contrast_grey(patch: Image) -> float:
-    """Return patch.std(), in half of its time."""
-    apart = patch - np.add.reduce(patch, None, float) / patch.size
-    return math.sqrt(np.add.reduce(apart * apart, None) / patch.size)
 
 
 def _reduced(image: Image) -> Image:
@@ -204,20 +204,49 @@ MIN_IN_SECTOR: Final = 20
 # Median residual of the sectors, because a camera whose intrinsics have changed bends the columns all around; the
 # matches of one wall alone may be misled.
 DRIFTED_PX: Final = 0.3
+# Scatter of the columns in the first pairs, because right rigs stay below 0.45 px, other mirrors have 0.3 to 7 px. At
+# all scales, because most of the scatter of a right rig is of the matches, which err by parts of a pixel at each.
+SCATTERED_PX: Final = 0.6
+# Matches with the cameras exchanged, per match, because right rigs have up to 0.41, exchanged ones 2.0 or more.
+EXCHANGED_RATIO: Final = 1.2
 
 
 @dataclass(frozen=True, slots=True)
 class RigFinding:
     """Result of the check."""
 
-    state: RigState
-    matches: int
-    tried: int
+    found: Matches
+    exchanged_matches: int | None  # matches with the cameras exchanged; None: not tried
     offset_px: float  # median of upper minus lower columns
     spread_px: float  # 1.48 times the median absolute deviation
     by_azimuth: tuple[tuple[float, float, int], ...]  # degrees, median offset [px] or NaN, matches
     left_px: float  # median residual of the sectors after the drift: no rotation of a camera explains it
     drift: RigDrift | None
+
+    @property
+    def matches(self) -> int:
+        """Number of the matches."""
+        return len(self.found.lower)
+
+    @property
+    def tried(self) -> int:
+        """Number of the points that were searched."""
+        return self.found.tried
+
+    @property
+    def state(self) -> RigState:
+        """The state of the rig by this finding alone."""
+        matches, exchanged, clear = self.matches, self.exchanged_matches, self.found.clear
+        if exchanged is not None and max(matches, exchanged) >= MIN_MATCHES and exchanged > EXCHANGED_RATIO * matches:
+            return RigState.EXCHANGED
+        if exchanged is None and clear >= MIN_CONTRAST_POINTS and matches < MIN_MATCHED_PART * clear:
+            return RigState.BROKEN
+        if self.drift is None:
+            return RigState.UNCHECKED
+        if self.misfit_deg > BROKEN_DEG:
+            return RigState.BROKEN
+        is_bent = self.left_px > DRIFTED_PX if exchanged is None else self.spread_px > SCATTERED_PX
+        return RigState.DRIFTED if self.misfit_deg > DRIFTED_DEG or is_bent else RigState.FITS
 
     @property
     def turn_deg(self) -> float:
@@ -227,7 +256,11 @@ class RigFinding:
     @property
     def misfit_deg(self) -> float:
         """Rotation, or part of the shift, less SIGMAS standard deviations, in degrees; 0 where it is unknown."""
-        return 0.0 if self.drift is None else _misfit_deg(self.drift)
+        if self.drift is None:
+            return 0.0
+        angles = (self.drift.turn, self.drift.turn_sigma), (self.drift.shift, self.drift.shift_sigma)
+        turn, shift = (np.linalg.norm(angle) - SIGMAS * np.linalg.norm(sigma) for angle, sigma in angles)
+        return float(np.rad2deg(max(turn, SHIFT_WEIGHT * shift, 0.0)))
 
     @property
     def summary(self) -> str:
@@ -242,56 +275,32 @@ class RigFinding:
         )
 
 
-def judge(found: Matches, cylinder: Cylinder) -> RigFinding:
-    """Return what the matches of some pairs say about their rig."""
+def judge(found: Matches, cylinder: Cylinder, exchanged_matches: int | None = None) -> RigFinding:
+    """Return what the matches of some pairs say about their rig.
+
+    exchanged_matches: number of the matches with the cameras exchanged; None: not tried.
+    """
     # 1. Offsets of the columns, as they are.
     shifts = cylinder.wrap(found.upper[:, 0] - found.lower[:, 0])
     offset = float(np.median(shifts)) if len(shifts) else float("nan")
     spread = SIGMA_PER_MAD * float(np.median(np.abs(shifts - offset))) if len(shifts) else float("nan")
-    enough = len(shifts) >= MIN_MATCHES
     # 2. The rotation and shift of the upper camera that explain them.
-    drift = estimate_rig_drift(cylinder.rays(found.lower), cylinder.rays(found.upper)) if enough else None
+    drift = None
+    if len(shifts) >= MIN_MATCHES:
+        drift = estimate_rig_drift(cylinder.rays(found.lower), cylinder.rays(found.upper))
     # 3. What is left in each direction shows a camera whose intrinsics have changed.
     residuals = _by_azimuth(found.lower, drift.residuals * cylinder.focal_px, cylinder) if drift else ()
     offsets = [abs(median) for _, median, count in residuals if count >= MIN_IN_SECTOR]
     left_px = float(np.median(offsets)) if offsets else float("nan")
-    return RigFinding(
-        _state(drift, left_px, len(shifts), found.clear),
-        len(shifts),
-        found.tried,
-        offset,
-        spread,
-        _by_azimuth(found.lower, shifts, cylinder),
-        left_px,
-        drift,
-    )
-
-
-def _state(drift: RigDrift | None, left_px: float, matches: int, clear: int) -> RigState:
-    """Return the state by the drift, the residuals that it leaves, and the matches of points with clear contrast."""
-    if clear >= MIN_CONTRAST_POINTS and matches < MIN_MATCHED_PART * clear:
-        return RigState.BROKEN
-    if drift is None:
-        return RigState.UNCHECKED
-    worst = _misfit_deg(drift)
-    if worst > BROKEN_DEG:
-        return RigState.BROKEN
-    return RigState.DRIFTED if worst > DRIFTED_DEG or left_px > DRIFTED_PX else RigState.FITS
-
-
-def _misfit_deg(drift: RigDrift) -> float:
-    turn, shift = np.rad2deg(np.linalg.norm(drift.turn)), np.rad2deg(np.linalg.norm(drift.shift))
-    unsure = np.rad2deg(SIGMAS * np.array([np.linalg.norm(drift.turn_sigma), np.linalg.norm(drift.shift_sigma)]))
-    return float(max(max(0.0, turn - unsure[0]), SHIFT_WEIGHT * max(0.0, shift - unsure[1])))
+    by_azimuth = _by_azimuth(found.lower, shifts, cylinder)
+    return RigFinding(found, exchanged_matches, offset, spread, by_azimuth, left_px, drift)
 
 
 def _by_azimuth(lower: Array, shifts: Array, cylinder: Cylinder) -> tuple[tuple[float, float, int], ...]:
     """Return azimuth of the middle [deg], median offset [px], NaN without matches, and matches of each sector."""
     azimuth = cylinder.azimuth(lower[:, 0])
     sector = np.floor((azimuth + np.pi) / (2 * np.pi) * SECTORS).astype(int) % SECTORS
-    middle = -180 + (np.arange(SECTORS) + 0.5) * 360 / SECTORS
-    chosen = [shifts[sector == k] for k in range(SECTORS)]
-    return tuple(
-        (float(middle[k]), float(np.median(part)) if len(part) else float("nan"), len(part))
-        for k, part in enumerate(chosen)
-    )
+    middle_deg = -180 + (np.arange(SECTORS) + 0.5) * 360 / SECTORS
+    parts = [shifts[sector == k] for k in range(SECTORS)]
+    medians = [float(np.median(part)) if len(part) else float("nan") for part in parts]
+    return tuple(zip(middle_deg.tolist(), medians, map(len, parts), strict=True))

@@ -20,6 +20,7 @@ from calib.panorama import Cylinder
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.rig.column_finding import (
     BROKEN_DEG,
+    MIN_MATCHES,
     Matches,
     PanoramaPair,
     RigFinding,
@@ -29,10 +30,21 @@ from omnid.core.rig.column_finding import (
     match,
     together,
 )
-from omnid.core.rig.first_pairs import FirstPairs, StartFinding
 from omnid.errors import OmnidError
 
 Array = NDArray[np.float64]
+
+# Pairs of a round, and the most where matches are few, so that a start is checked within a second.
+ROUND_PAIRS, MOST_ROUND_PAIRS = 2, 8
+# Rounds that must agree before the rig counts as contradicted, because a hand before a mirror passes.
+CONTRADICTIONS: Final = 2
+# Between two rounds while the images show too little, because light changes slower than that. After MOST_ROUNDS without
+# a decision the first minute of a run is over, and the check ends.
+RETRY_NS: Final = 1_000_000_000
+MOST_ROUNDS: Final = 40
+# Pairs whose motion is not known, before such pairs are used as if the rig stood, because with a rig that is wrong by
+# degrees, no odometry starts that could find the motion.
+PATIENT_PAIRS: Final = 5
 
 # Views that are kept, and new views after which the rig is checked again, because at the default period they take 80 s
 # of driving.
@@ -46,6 +58,61 @@ RECENT_VIEWS: Final = 3
 SAME_VIEW_CORRELATION: Final = 0.8
 # Columns and rows of a thumbnail: three degrees a column, so that noise and small parts do not make a place new.
 THUMBNAIL: Final = (128, 24)
+
+
+class FirstPairs:
+    """Decides by the first pairs; where they show too little, by later ones.
+
+    A right rig is decided in one round, a contradiction needs CONTRADICTIONS rounds in a row. A round with too few
+    matches, as in darkness, decides nothing.
+    """
+
+    def __init__(self, cylinder: Cylinder, last_ns: int | None = None) -> None:
+        """last_ns: stamp of the last pair of an earlier check, RETRY_NS after which this one begins."""
+        self._cylinder = cylinder
+        self._straight: list[Matches] = []
+        self._exchanged: list[Matches] = []
+        self._contradictions = self._rounds = self._unknown_pairs = 0
+        self._last_ns = last_ns  # stamp of the last pair that was used
+        self.finding: RigFinding | None = None  # finding of the last round
+        self.state = RigState.UNCHECKED  # state that was decided
+
+    @property
+    def ended(self) -> bool:
+        """True if no more pairs are needed."""
+        return self.state is not RigState.UNCHECKED or self._rounds >= MOST_ROUNDS
+
+    @property
+    def used_unknown_motion(self) -> bool:
+        """True if pairs were used whose motion between the exposures is not known."""
+        return self._unknown_pairs > PATIENT_PAIRS
+
+    def add(self, pair: PanoramaPair, exposure: Exposure | None = None) -> None:
+        """Use a pair if it is needed and due, by its stamp; exposure: the motion between the exposures."""
+        # 1. A new round that confirms nothing begins some time after the last one.
+        begins = not self._straight and not self._contradictions and self._last_ns is not None
+        if self.ended or (begins and pair.stamp_ns < (self._last_ns or 0) + RETRY_NS):
+            return
+        # 2. Wait for pairs whose motion is known, if not for long.
+        if is_motion_unknown(pair, exposure):
+            self._unknown_pairs, exposure = self._unknown_pairs + 1, None
+            if not self.used_unknown_motion:
+                return
+        # 3. Match it as the rig says, and with the cameras exchanged.
+        self._straight.append(match(pair.lower, pair.upper, pair.visible, exposure))
+        self._exchanged.append(match(pair.upper, pair.lower, pair.visible))
+        self._last_ns = pair.stamp_ns
+        # 4. End the round once it has matches enough.
+        pairs = len(self._straight)
+        straight, exchanged = together(self._straight), len(together(self._exchanged).lower)
+        if pairs < MOST_ROUND_PAIRS and (pairs < ROUND_PAIRS or len(straight.lower) + exchanged < MIN_MATCHES):
+            return
+        self._straight, self._exchanged, self._rounds = [], [], self._rounds + 1
+        self.finding = judge(straight, self._cylinder, exchanged)
+        state = self.finding.state
+        self._contradictions = self._contradictions + 1 if state.is_contradicted else 0
+        if not state.is_contradicted or self._contradictions >= CONTRADICTIONS:
+            self.state = state
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,33 +143,24 @@ class DrivingViews:
         if is_motion_unknown(pair, exposure) or self._used_ns <= pair.stamp_ns < self._used_ns + self._every_ns:
             return None
         self._used_ns = pair.stamp_ns
-        # 2. The newest views alone may show a broken rig.
-        recent = None
-        if self._add_view(pair, exposure):
+        # 2. Keep its view, in the place of an older one of this place; not if the last one is of this place.
+        thumbnail = _thumbnail(pair)
+        same_place = [float(thumbnail @ view.thumbnail) > SAME_VIEW_CORRELATION for view in self._views]
+        is_new = thumbnail.any() and not any(same_place[-1:])
+        if is_new:
+            if any(same_place):
+                del self._views[same_place.index(True)]
+            self._views.append(_View(thumbnail, match(pair.lower, pair.upper, pair.visible, exposure)))
             self.new += 1
-            recent = self._recent_break()
         # 3. A whole check, after enough new views of enough places.
         if self.new >= VIEWS and len(self._views) >= MIN_PLACES:
             self.new = 0
             return judge(together(view.matches for view in self._views), self._cylinder)
-        return recent
-
-    def _add_view(self, pair: PanoramaPair, exposure: Exposure | None) -> bool:
-        """Keep a view unless the last one is from the same place; return True if it was kept."""
-        thumbnail = _thumbnail(pair)
-        same_place = [float(thumbnail @ view.thumbnail) > SAME_VIEW_CORRELATION for view in self._views]
-        if any(same_place[-1:]) or not thumbnail.any():
-            return False
-        if any(same_place):  # an older view of this place
-            del self._views[same_place.index(True)]
-        self._views.append(_View(thumbnail, match(pair.lower, pair.upper, pair.visible, exposure)))
-        return True
-
-    def _recent_break(self) -> RigFinding | None:
-        """Return the finding of the newest views if they show a broken rig."""
-        if len(self._views) < RECENT_VIEWS:
+        # 4. The newest views alone may show a broken rig.
+        if not is_new or len(self._views) < RECENT_VIEWS:
             return None
-        finding = judge(together(view.matches for view in islice(reversed(self._views), RECENT_VIEWS)), self._cylinder)
+        newest = islice(reversed(self._views), RECENT_VIEWS)
+        finding = judge(together(view.matches for view in newest), self._cylinder)
         return finding if finding.misfit_deg > BROKEN_DEG else None
 
 
@@ -141,8 +199,8 @@ class RigHealth:
         """every_s: time between two views of the drive; 0: none is used."""
         self._mode = mode
         self._cylinder = cylinder
-        self._first = FirstPairs(cylinder)
-        self._again: FirstPairs | None = None  # the pairs of a later check, until it has decided or ended
+        self._decided = FirstPairs(cylinder)  # the first check, or a later one that has decided
+        self._running = None if mode == "off" else self._decided  # the check that needs pairs; None: none does
         self._since = ""  # when the state was found, as a line begins
         self._views = DrivingViews(cylinder, every_s) if every_s else None
         self._later = RigState.UNCHECKED  # state by the views of the drive
@@ -152,7 +210,7 @@ class RigHealth:
     @property
     def state(self) -> RigState:
         """The state, by all that was seen."""
-        first = self._first.state
+        first = self._decided.state
         if first is RigState.EXCHANGED or self._later is RigState.UNCHECKED:
             return first
         return self._later
@@ -160,7 +218,7 @@ class RigHealth:
     @property
     def is_checking(self) -> bool:
         """True while first pairs, or those of a later check, are needed."""
-        return self._mode != "off" and (self._again is not None or not self._first.ended)
+        return self._running is not None
 
     @property
     def uses_views(self) -> bool:
@@ -168,9 +226,9 @@ class RigHealth:
         return self._views is not None
 
     @property
-    def start_finding(self) -> StartFinding | None:
+    def start_finding(self) -> RigFinding | None:
         """The newest finding of the first pairs; None before the first."""
-        return self._first.finding
+        return self._decided.finding
 
     @property
     def finding(self) -> RigFinding | None:
@@ -189,62 +247,65 @@ class RigHealth:
 
     @property
     def warning(self) -> str:
-        """One line about a rig that the first pairs do not fit, or could not check; empty for a good one."""
-        finding = self._first.finding
-        if self._mode == "off" or finding is None:
+        """One line about a rig that the first pairs contradict, or could not check, and what to do; else empty."""
+        check, finding = self._decided, self._decided.finding
+        if finding is None or check.state is RigState.FITS:
             return ""
-        if self._first.state.is_contradicted:
-            is_exchanged = finding.state is RigState.EXCHANGED
-            return self._since + contradiction(finding) + (LATE_OR_MOVED if self._since and not is_exchanged else "")
-        if self._first.state is RigState.UNCHECKED:
+        changed = LATE_OR_MOVED if self._since else ""
+        if check.state is RigState.EXCHANGED:
+            return (
+                f"{self._since}the images match better the other way round: {finding.exchanged_matches} points are "
+                f"seen as if the lower camera were the upper one, {finding.matches} as the rig says: {EXCHANGE}"
+            )
+        if check.state is RigState.BROKEN:
+            return (
+                f"{self._since}the images contradict the rig: the upper camera seems turned by {finding.turn_deg:.1f} "
+                f"deg by {finding.matches} points: {CALIBRATE}{changed}"
+            )
+        if check.state is RigState.UNCHECKED:
             return (
                 "the rig could not be checked by the images: too few points are seen by both cameras; are they "
                 "dark, covered or unsharp?"
             )
-        if finding.state is RigState.DRIFTED and self._first.used_unknown_motion:
+        if check.used_unknown_motion:
             return (
                 "the rig could only be checked to 2 deg: the cameras are not synchronised, and the motion between "
                 "their exposures is not known: check it by a recording of slow driving, `omnid calibrate drive --only "
                 "check`"
             )
-        if finding.state is RigState.DRIFTED:
-            return (
-                f"{self._since}the images do not quite fit the rig, {finding.straight.summary}: run `omnid calibrate "
-                "check` on a recording" + (LATE_OR_MOVED if self._since else "")
-            )
-        return ""
+        return (
+            f"{self._since}the images do not quite fit the rig, {finding.summary}: run `omnid calibrate drive --only "
+            f"check` on a recording{changed}"
+        )
 
     def begin(self, pair: PanoramaPair, exposure: Exposure | None = None) -> None:
         """Use one of the first pairs, some 30 ms of work; RigContradictedError where the mode is to refuse the rig.
 
-        exposure: the motion between the exposures of a pair that is not synchronised.
+        exposure: the motion between the exposures of a pair that is not synchronised. A later check, after a loss, ends
+        no run: it is repeated until the rig fits, as a hand before a mirror passes.
         """
-        if not self.is_checking:
+        check = self._running
+        if check is None:
             return
-        if self._again is not None:
-            self._add_again(self._again, pair, exposure)
-            return
-        self._first.add(pair, exposure)
-        if self._first.state.is_contradicted and self._mode == "refuse":
+        check.add(pair, exposure)
+        is_first = check is self._decided
+        if is_first and check.state.is_contradicted and self._mode == "refuse":
             raise RigContradictedError(self.warning)
+        if not check.ended:
+            return
+        self._running = None
+        if not is_first and check.state is not RigState.UNCHECKED:
+            self._decided, self._since = check, "after the pose was lost, "
+        if not is_first and check.state.is_contradicted:
+            self._running = FirstPairs(self._cylinder, pair.stamp_ns)
 
     def check_again(self) -> None:
         """Check the next pairs as the first ones, as the pose was lost: cables may have been exchanged meanwhile.
 
-        A contradiction ends no run that has had poses, and is checked again until the rig fits, as a hand before a
-        mirror passes. The state stays as it is while the pairs show too little.
+        The state stays as it is while the pairs show too little.
         """
-        if not self.is_checking:
-            self._again = FirstPairs(self._cylinder)
-
-    def _add_again(self, again: FirstPairs, pair: PanoramaPair, exposure: Exposure | None) -> None:
-        again.add(pair, exposure)
-        if not again.ended:
-            return
-        if again.state is not RigState.UNCHECKED:
-            self._first, self._since = again, "after the pose was lost, "
-        is_wrong = again.state.is_contradicted
-        self._again = FirstPairs(self._cylinder, pair.stamp_ns) if is_wrong else None
+        if self._running is None and self._mode != "off":
+            self._running = FirstPairs(self._cylinder)
 
     def drive(self, pair: PanoramaPair, exposure: Exposure | None = None) -> None:
         """Use a pair of the drive if it is due; a finding changes the state unless it saw too little."""
@@ -255,17 +316,3 @@ class RigHealth:
         self._found = finding, pair.stamp_ns
         if finding.state is not RigState.UNCHECKED:
             self._later = finding.state
-
-
-def contradiction(finding: StartFinding) -> str:
-    """Return what the first pairs show against the rig, and what to do."""
-    straight = finding.straight
-    if finding.state is RigState.EXCHANGED:
-        return (
-            f"the images match better the other way round: {finding.exchanged_matches} points are seen as if the "
-            f"lower camera were the upper one, {straight.matches} as the rig says: {EXCHANGE}"
-        )
-    return (
-        f"the images contradict the rig: the upper camera seems turned by {straight.turn_deg:.1f} deg by "
-        f"{straight.matches} points: {CALIBRATE}"
-    )

@@ -6,8 +6,7 @@ import numpy as np
 
 from calib import se3
 from calib.panorama import Cylinder
-from omnid.core.places.place_map import KeyframeUse, Link, PlaceFeatures, PlaceKeyframe, PlaceMap
-from omnid.core.places.place_rig import PlaceRig
+from omnid.core.places.place_map import KeyframeUse, Link, PlaceFeatures, PlaceKeyframe, PlaceMap, PlaceRig
 
 RIG = PlaceRig(
     Cylinder(1304, 378, 128.75),

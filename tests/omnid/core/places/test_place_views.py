@@ -7,8 +7,7 @@ import numpy as np
 from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.mapping.scan_grid import FREE, OCCUPIED
-from omnid.core.places.place_map import Link, PlaceFeatures, PlaceKeyframe, PlaceMap
-from omnid.core.places.place_rig import PlaceRig
+from omnid.core.places.place_map import Link, PlaceFeatures, PlaceKeyframe, PlaceMap, PlaceRig
 from omnid.core.places.place_views import grid, landmarks
 from omnid.core.stereo.triangulation import view
 from tests.omnid.core.mapping.rooms import OPEN, box, pose, scan_of

@@ -2,19 +2,106 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, fields, replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.places.pose_graph import PoseEdges, PoseGraphResult, optimise
-from tests.omnid.core.places.graphs import SIGMA_LOOP, joined, laps, without
+from omnid.core.places.correction import MapCorrection
+from omnid.core.places.place_map import Link, PlaceMap
+from omnid.core.places.pose_graph import ACCEPTED, PoseEdges, PoseGraphResult, optimise
+from tests.omnid.formats.place_maps import some_places
+
+Array = NDArray[np.float64]
+
+STEP_M = 0.3
+SIGMA_STEP = np.array([3e-3, 3e-3, 1e-3, 2e-4, 2e-4, 1e-3])  # m and rad, of each step of the odometry
+SIGMA_LOOP = np.array([0.01, 0.01, 0.01, 2e-3, 2e-3, 2e-3])
+
+
+@dataclass(frozen=True)
+class Laps:
+    """Poses, measurements and which loops are right."""
+
+    truth: Array  # (N, 4, 4)
+    odometry: PoseEdges
+    loops: PoseEdges
+    right: NDArray[np.bool_]  # (L,)
+
+    @property
+    def edges(self) -> PoseEdges:
+        """All edges: those of the odometry, then the loops."""
+        return joined(self.odometry, self.loops)
+
+    @property
+    def start(self) -> Array:
+        """Return the poses (N, 4, 4) of the odometry alone."""
+        poses = [np.eye(4)]
+        for step in self.odometry.T_a_b:
+            poses.append(poses[-1] @ step)
+        return np.array(poses)
+
+    def error_m(self, T: Array) -> float:
+        """Return the root mean square of the position errors, all in the frame of the first node."""
+        return float(np.sqrt(((T[:, :3, 3] - self.truth[:, :3, 3]) ** 2).sum(axis=1).mean()))
+
+
+def laps(seed: int, nodes: int, per_lap: int, loops: int, wrong: float) -> Laps:
+    """Return laps along a rectangle; `wrong` is the share of loops whose pose has nothing to do with the truth."""
+    rng = np.random.default_rng(seed)
+    truth = np.array([np.eye(4) for _ in range(nodes)])
+    for k in range(1, nodes):
+        turn = np.pi / 2 if k % (per_lap // 4) == 0 else 0.0
+        truth[k] = truth[k - 1] @ se3.exp([STEP_M, 0, 0, 0, 0, 0]) @ se3.exp([0, 0, 0, 0, 0, turn])
+    a = np.arange(nodes - 1)
+    odometry = measured(rng, truth, a, a + 1, SIGMA_STEP)
+    first = rng.integers(0, nodes - per_lap, loops)
+    laps_later = np.array([rng.integers(1, (nodes - 1 - k) // per_lap + 1) for k in first], np.intp)
+    second = np.clip(first + per_lap * laps_later + rng.integers(-2, 3, loops), 0, nodes - 1)
+    right = np.arange(loops) >= round(wrong * loops)
+    found = measured(rng, truth, first, second, SIGMA_LOOP, is_loop=True)
+    xi = np.concatenate(
+        [rng.uniform(-1, 1, (loops, 3)), rng.uniform(-0.1, 0.1, (loops, 2)), rng.uniform(-np.pi, np.pi, (loops, 1))],
+        axis=1,
+    )
+    elsewhere = np.array([rng.integers(0, nodes) for _ in range(loops)], np.intp)
+    b = np.where(right, second, elsewhere)
+    T = np.where(right[:, None, None], found.T_a_b, se3.exp(xi))
+    pairs = np.column_stack([first, b])
+    return Laps(truth, odometry, PoseEdges(pairs, T, found.covariance, np.ones(loops, bool)), right)
+
+
+def measured(
+    rng: np.random.Generator,
+    truth: Array,
+    a: NDArray[np.intp],
+    b: NDArray[np.intp],
+    sigma: Array,
+    is_loop: bool = False,
+) -> PoseEdges:
+    """Return edges with noise of those standard deviations (6,)."""
+    exact = se3.inverse(truth[a]) @ truth[b]
+    covariance = np.broadcast_to(np.diag(sigma**2), (len(a), 6, 6)).copy()
+    noisy = exact @ se3.exp(sigma * rng.normal(size=(len(a), 6)))
+    return PoseEdges(np.column_stack([a, b]), noisy, covariance, np.full(len(a), is_loop))
+
+
+def joined(*parts: PoseEdges) -> PoseEdges:
+    """Return all edges, one part after the other."""
+    return PoseEdges(*(np.concatenate([getattr(part, item.name) for part in parts]) for item in fields(PoseEdges)))
+
+
+def without(edges: PoseEdges, row: int) -> PoseEdges:
+    """Return the edges but one."""
+    return PoseEdges(*(np.delete(getattr(edges, item.name), row, axis=0) for item in fields(PoseEdges)))
 
 
 def loops_of(found: PoseGraphResult) -> NDArray[np.bool_]:
     """Return flags of the loops of a run of `laps` that were accepted."""
     odometry_edges = len(found.poses) - 1
-    return found.accepted[odometry_edges:]
+    return found.weights[odometry_edges:] > ACCEPTED
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -74,3 +161,44 @@ def test_the_same_graph_gives_the_same_bytes() -> None:
     run = laps(10, nodes=60, per_lap=20, loops=10, wrong=0.3)
     first, second = (optimise(run.start, run.edges) for _ in range(2))
     assert first.poses.tobytes() == second.poses.tobytes() and first.covariance.tobytes() == second.covariance.tobytes()
+
+
+BY_ODOMETRY = np.diag([3e-4] * 3 + [1e-4] * 3) ** 2  # of each keyframe more than of the one before
+BY_LOOP = np.diag([0.01] * 3 + [0.004] * 3) ** 2
+ERRORS = [
+    np.array([0.03, 0.03, -0.03, 0.011, 0.01, 0.0]),
+    np.array([-0.03, -0.02, 0.03, -0.011, -0.009, 0.0]),
+    np.array([0.02, 0.03, -0.03, 0.011, 0.01, 0.0]),
+]
+
+
+def driven(count: int = 12) -> PlaceMap:
+    """A map of one session whose odometry is exact."""
+    places = some_places(count, features=4)
+    places.links = []
+    for id in range(count):
+        places.keyframes[id] = replace(
+            places.keyframes[id], session=0, T_odom_rect=places.poses[id], covariance=(id + 1) * BY_ODOMETRY
+        )
+        if id:
+            places.links.append(Link(id - 1, id, se3.inverse(places.poses[id - 1]) @ places.poses[id], BY_ODOMETRY))
+    return places
+
+
+@pytest.mark.parametrize("apart", [0, 1])
+def test_loops_between_the_same_keyframes_count_as_one(apart: int) -> None:
+    """Three that contradict each other say little of the drift; of different keyframes they would say more."""
+    places = driven()
+    before, correction = places.poses[11].copy(), MapCorrection(places)
+    loops = []
+    for n, error in enumerate(ERRORS):
+        a, b = n * apart, 11 - n * apart
+        true = se3.inverse(places.poses[a]) @ places.poses[b]
+        loops.append(Link(a, b, true @ se3.exp(error), BY_LOOP, 25))
+    correction.close(loops, sorted(places.keyframes))
+    moved_m = float(np.linalg.norm((places.poses[11] - before)[:3, 3]))
+    assert correction.optimisations == 1
+    if apart:
+        assert correction.factor > 20
+    else:
+        assert correction.factor == 1.0 and moved_m < 0.003

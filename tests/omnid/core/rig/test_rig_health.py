@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import islice
@@ -17,14 +17,21 @@ from drivers.logs.log_reader import LogReader
 from omnid.camera_config import PairConfig
 from omnid.config import Config, PanoramaConfig
 from omnid.core.rig.column_finding import RigState
-from omnid.core.rig.rig_health import VIEWS, RigHealth
+from omnid.core.rig.rig_health import (
+    MOST_ROUND_PAIRS,
+    RETRY_NS,
+    ROUND_PAIRS,
+    VIEWS,
+    RigContradictedError,
+    RigHealth,
+)
 from omnid.diagnostics.part_status import rig_status
 from omnid.engine.flow import NEWEST
 from omnid.engine.graph import Graph
 from omnid.messages import Panoramas
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.front_end import FrontEnd
-from omnid.stages.geometry import geometry
+from omnid.stages.geometry import Geometry, geometry
 from omnid.stages.synchronise import Synchronise
 from omnid.tracking_state import TrackingState
 from omnid.transport.status_names import RIG
@@ -77,6 +84,11 @@ def monitored(folder: Path, rig: Rig, most: int | None = None) -> tuple[RigHealt
 
 
 @pytest.fixture(scope="module")
+def place(rooms: Path) -> Geometry:
+    return geometry(read_rig(rooms / "rig.toml"), PanoramaConfig())
+
+
+@pytest.fixture(scope="module")
 def true(rooms: Path) -> tuple[RigHealth, Collector]:
     return monitored(rooms, read_rig(rooms / "rig.toml"))
 
@@ -88,15 +100,20 @@ def turned(rooms: Path) -> Turned:
     return cache(lambda turn_deg: monitored(rooms, with_upper_rotated(right, turn_deg), VIEWS))
 
 
-def monitor_after(
-    true: tuple[RigHealth, Collector], panoramas: Sequence[Panoramas], every_s: float = PERIOD_S
-) -> RigHealth:
-    """Return a new monitor after these panoramas, PERIOD_S apart."""
-    assert true[0]._views is not None
-    monitor = RigHealth(true[0]._views._cylinder, "off", every_s)
+def driven(place: Geometry, panoramas: Sequence[Panoramas]) -> RigHealth:
+    """Return the state after these views of a drive, PERIOD_S apart."""
+    health = RigHealth(place.cylinder, "off", PERIOD_S)
     for number, one in enumerate(panoramas):
-        monitor.drive(replace(one, seq=number, stamp_ns=round(number * PERIOD_S * SECONDS)))
-    return monitor
+        health.drive(replace(one, seq=number, stamp_ns=round(number * PERIOD_S * SECONDS)))
+    return health
+
+
+def started(place: Geometry, pairs: Iterable[Panoramas], mode: str = "warn") -> RigHealth:
+    """Return the state after first pairs."""
+    health = RigHealth(place.cylinder, mode, PERIOD_S)
+    for one in pairs:
+        health.begin(one)
+    return health
 
 
 def test_a_correct_rig_is_good(true: tuple[RigHealth, Collector]) -> None:
@@ -122,23 +139,25 @@ def test_three_degrees_are_an_error(turned: Turned) -> None:
     assert status.level == 2 and status.message.startswith("broken: ")
 
 
-def test_a_robot_that_stands_gets_no_finding(true: tuple[RigHealth, Collector]) -> None:
-    status = rig_status(monitor_after(true, true[1][:1] * 100))
+def test_a_robot_that_stands_gets_no_finding(place: Geometry, true: tuple[RigHealth, Collector]) -> None:
+    status = rig_status(driven(place, true[1][:1] * 100))
     assert (status.level, status.values) == (0, {"state": "unchecked", "new_views": "1", "needed_views": str(VIEWS)})
     assert status.message.startswith("not checked yet")
 
 
-def test_a_rig_that_moves_during_the_run_is_detected(turned: Turned, true: tuple[RigHealth, Collector]) -> None:
+def test_a_rig_that_moves_during_the_run_is_detected(
+    place: Geometry, turned: Turned, true: tuple[RigHealth, Collector]
+) -> None:
     _, after = turned((0.0, 0.0, 0.5))
-    monitor = monitor_after(true, [*true[1], *after, *after])  # the same loop, where every place was viewed before
+    monitor = driven(place, [*true[1], *after, *after])  # the same loop, where every place was viewed before
     assert monitor.finding is not None and monitor.state is RigState.DRIFTED
     assert monitor.finding.turn_deg == pytest.approx(0.5, abs=0.05)
 
 
 @pytest.mark.hazard("H35")
-def test_a_mirror_that_is_knocked_makes_the_poses_degraded(rooms: Path, true: tuple[RigHealth, Collector]) -> None:
+def test_a_mirror_that_is_knocked_makes_the_poses_degraded(place: Geometry, true: tuple[RigHealth, Collector]) -> None:
     """Three new views of it are enough, long before a whole check is due."""
-    place, config = geometry(read_rig(rooms / "rig.toml"), PanoramaConfig()), Config()
+    config = Config()
     columns = round(3 / 360 * place.cylinder.width)
     health = RigHealth(place.cylinder, "refuse", PERIOD_S)
     poses = FrontEnd(place, config, health).poses
@@ -152,32 +171,42 @@ def test_a_mirror_that_is_knocked_makes_the_poses_degraded(rooms: Path, true: tu
     assert fits.process(true[1][8]).state is TrackingState.TRACKING
 
 
-def test_the_status_has_the_result_of_the_start(rooms: Path, true: tuple[RigHealth, Collector]) -> None:
-    right = read_rig(rooms / "rig.toml")
-    health = started(true, [])
+def test_the_status_has_the_result_of_the_start(
+    rooms: Path, place: Geometry, turned: Turned, true: tuple[RigHealth, Collector]
+) -> None:
+    """A right rig needs one round of two pairs, a contradiction two rounds that agree."""
+    health = started(place, [])
     assert rig_status(health).message.startswith("not checked yet") and health.state is RigState.UNCHECKED
-    health = started(true, true[1][:2])
+    assert started(place, true[1][:1]).state is RigState.UNCHECKED
+    health = started(place, true[1][:2])
     status = rig_status(health)
     assert (status.level, status.message, status.values["state"]) == (0, "fits", "fits") and not health.is_checking
-    for turn_deg, level, words in ((0.8, 1, "do not quite fit"), (3.0, 2, "contradict the rig")):
-        _, seen = monitored(rooms, with_upper_rotated(right, (turn_deg, 0.0, 0.0)), 4)
-        health = started(true, seen)
+    for turn_deg, pairs, level, words in ((0.8, 2, 1, "do not quite fit"), (3.0, 4, 2, "contradict the rig")):
+        seen = turned((turn_deg, 0.0, 0.0))[1]
+        assert started(place, seen[: pairs - 1]).state is RigState.UNCHECKED
+        health = started(place, seen[:pairs])
         status = rig_status(health)
         assert status.level == level and words in status.message
         assert health.state is (RigState.BROKEN if level == 2 else RigState.DRIFTED)
+    with pytest.raises(RigContradictedError, match="contradict the rig"):
+        started(place, seen[:4], "refuse")
 
 
-def started(true: tuple[RigHealth, Collector], pairs: Sequence[Panoramas]) -> RigHealth:
-    """Return the state after first pairs."""
-    assert true[0]._views is not None
-    health = RigHealth(true[0]._views._cylinder, "warn", PERIOD_S)
-    for one in pairs:
-        health.begin(one)
-    return health
+def test_darkness_at_the_start_decides_nothing_and_the_next_round_begins_later(
+    place: Geometry, true: tuple[RigHealth, Collector]
+) -> None:
+    dark = [darkened(one, 0.0, 0.0) for one in true[1]]
+    pairs = [replace(dark[n % 8], stamp_ns=n) for n in range(MOST_ROUND_PAIRS)]
+    pairs += [replace(one, stamp_ns=100 + n) for n, one in enumerate(true[1][: 2 * ROUND_PAIRS])]
+    health = started(place, pairs)
+    assert health.state is RigState.UNCHECKED and health.is_checking and "too few points" in health.warning
+    for number, one in enumerate(true[1][:ROUND_PAIRS]):
+        health.begin(replace(one, stamp_ns=2 * RETRY_NS + number))
+    assert health.state is RigState.FITS and not health.warning
 
 
 def test_the_drive_overrules_the_start_except_for_exchanged_cameras(
-    turned: Turned, true: tuple[RigHealth, Collector]
+    place: Geometry, turned: Turned, true: tuple[RigHealth, Collector]
 ) -> None:
     _, wrong = turned((0.0, 3.0, 0.0))
     exchanged = [replace(one, lower=one.upper, upper=one.lower) for one in true[1]]
@@ -186,7 +215,7 @@ def test_the_drive_overrules_the_start_except_for_exchanged_cameras(
         (true[1], wrong, RigState.BROKEN),
         (exchanged, true[1], RigState.EXCHANGED),
     ):
-        health = started(true, first[:4])
+        health = started(place, first[:4])
         begun = health.state
         for number, one in enumerate(later[:VIEWS]):
             health.drive(replace(one, seq=number, stamp_ns=round(number * PERIOD_S * SECONDS)))
@@ -194,17 +223,13 @@ def test_the_drive_overrules_the_start_except_for_exchanged_cameras(
     assert rig_status(health).level == 2 and "exchange" in rig_status(health).message
 
 
-def test_after_a_loss_exchanged_cameras_are_noticed_and_end_no_run(true: tuple[RigHealth, Collector]) -> None:
-    assert true[0]._views is not None
-    health = RigHealth(true[0]._views._cylinder, "refuse")
+def test_after_a_loss_exchanged_cameras_are_noticed_and_end_no_run(
+    place: Geometry, true: tuple[RigHealth, Collector]
+) -> None:
     pairs = [replace(one, stamp_ns=number * PERIOD_NS) for number, one in enumerate(true[1])]
     exchanged = [replace(one, lower=one.upper, upper=one.lower) for one in pairs]
-    for one in pairs[:4]:
-        health.begin(one)
-    assert health.state is RigState.FITS
     # 1. Without a loss the pairs are not used.
-    for one in exchanged[:4]:
-        health.begin(one)
+    health = started(place, [*pairs[:4], *exchanged[:4]], "refuse")
     assert health.state is RigState.FITS and not health.is_checking
     # 2. Four pairs show that the cameras are exchanged.
     health.check_again()
@@ -221,14 +246,9 @@ def test_after_a_loss_exchanged_cameras_are_noticed_and_end_no_run(true: tuple[R
     assert health.state is RigState.FITS and not health.warning
 
 
-def test_after_a_loss_a_late_camera_may_be_why_the_rig_does_not_fit(
-    turned: Turned, true: tuple[RigHealth, Collector]
-) -> None:
+def test_after_a_loss_a_late_camera_may_be_why_the_rig_does_not_fit(place: Geometry, turned: Turned) -> None:
     _, wrong = turned((0.0, 3.0, 0.0))
-    assert true[0]._views is not None
-    health = RigHealth(true[0]._views._cylinder, "warn")
-    for one in wrong:
-        health.begin(one)
+    health = started(place, wrong)
     assert health.state is RigState.BROKEN and "late" not in health.warning
     health.check_again()
     for one in wrong:
@@ -237,23 +257,23 @@ def test_after_a_loss_a_late_camera_may_be_why_the_rig_does_not_fit(
     assert health.warning.endswith("one of the cameras is late now, or was moved")
 
 
-@pytest.mark.parametrize(("gain", "noise"), [(0.0, 0.0), (0.0, 2.0), (0.0, 6.0), (0.02, 12.0)])
-def test_darkness_is_no_alarm(true: tuple[RigHealth, Collector], gain: float, noise: float) -> None:
-    """In the dark, noise gives points without a match."""
+def darkened(one: Panoramas, gain: float, noise: float) -> Panoramas:
     rng = np.random.default_rng(4)
+    images = [
+        np.clip(w.image * gain + 8 + noise * rng.standard_normal(w.image.shape), 0, 255).astype(np.uint8)
+        for w in (one.lower, one.upper)
+    ]
+    return replace(one, lower=replace(one.lower, image=images[0]), upper=replace(one.upper, image=images[1]))
 
-    def dark(one: Panoramas) -> Panoramas:
-        images = [
-            np.clip(w.image * gain + 8 + noise * rng.standard_normal(w.image.shape), 0, 255).astype(np.uint8)
-            for w in (one.lower, one.upper)
-        ]
-        return replace(one, lower=replace(one.lower, image=images[0]), upper=replace(one.upper, image=images[1]))
 
-    status = rig_status(monitor_after(true, [dark(one) for one in true[1]]))
+@pytest.mark.parametrize(("gain", "noise"), [(0.0, 0.0), (0.0, 6.0), (0.02, 12.0)])
+def test_darkness_is_no_alarm(place: Geometry, true: tuple[RigHealth, Collector], gain: float, noise: float) -> None:
+    """In the dark, noise gives points without a match."""
+    status = rig_status(driven(place, [darkened(one, gain, noise) for one in true[1]]))
     assert status.level == 0 and status.values["state"] == "unchecked", status
 
 
-def test_a_covered_camera_is_an_error(true: tuple[RigHealth, Collector]) -> None:
+def test_a_covered_camera_is_an_error(place: Geometry, true: tuple[RigHealth, Collector]) -> None:
     covered = [replace(one, upper=replace(one.upper, image=np.full_like(one.upper.image, 9))) for one in true[1]]
-    status = rig_status(monitor_after(true, covered))
+    status = rig_status(driven(place, covered))
     assert status.level == 2 and "covered" in status.message
