@@ -13,11 +13,8 @@ from drivers.motion import WheelSample
 from drivers.motor import MotorDriver, MotorStatus, VelocityCommand
 from drivers.motors.serial_motor import LateReplyError
 from omnid.controller.statistics import ControllerState, TickReport, cuts_drive_short, transitions
-from omnid.core.control.arming import ArmRequest
-from omnid.core.control.collision_monitor import ControllerRing
-from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.contacts import BUS, MOTOR, ContactState
-from omnid.core.control.control_law import ControlLaw, ControllerPose, ControllerSettings
+from omnid.core.control.control_law import ControlInput, ControlLaw, ControllerSettings
 from omnid.core.control.heading_controller import Twist
 from omnid.core.control.motion_monitor import Motion
 from omnid.core.control.safety_rules import AWAITED
@@ -75,36 +72,24 @@ class Controller:
         """True if the last command was the stop, or if the motor controller failed and stops the wheels by itself."""
         return self._law.motion == STOP or self.state.failed
 
-    def set_pose(self, pose: ControllerPose) -> None:
-        """Replace the pose."""
-        self._law.set_pose(pose)
-
-    def set_ring(self, ring: ControllerRing) -> None:
-        """Replace the obstacle ring."""
-        self._law.set_ring(ring)
-
-    def set_command(self, command: TimedSetpoint) -> None:
-        """Offer a setpoint; the newest of the source of the highest priority counts."""
+    def take(self, given: ControlInput) -> None:
+        """Take what the daemon gives: a pose, an obstacle ring, a setpoint, or a request to arm."""
         conflict = self._law.commands.conflict
-        self._law.set_command(command)
+        self._law.take(given)
         if self._law.commands.conflict != conflict:
             self._report(self._law.commands.conflict)
 
     def stop(self, asked_ns: int) -> None:
         """Stop the wheels at the next tick, until a request to arm that arrives later."""
-        self._law.stop(asked_ns)
+        self._law.arming.stop(asked_ns)
 
     def touch(self, contacts: ContactState) -> None:
         """Replace the state of bumpers and cliff sensors on the bus."""
         self._law.contacts.update(BUS, contacts)
 
-    def arm(self, request: ArmRequest) -> None:
-        """Ask to arm: the wheels may turn from the next tick on, by setpoints that arrive later."""
-        self._law.arm(request)
-
     def end(self) -> None:
         """Stop the wheels permanently."""
-        self._law.end()
+        self._law.ending = True
 
     def tick(self) -> TickReport:
         """Step the law and send its motion."""
@@ -185,7 +170,7 @@ class Controller:
             self._take_problem(str(error), command.stamp_ns)
             self.state.failed = True
             self.state.errors += 1
-            self._law.stand()  # its own watchdog stops a motor controller that receives nothing
+            self._law.motion = STOP  # its own watchdog stops a motor controller that receives nothing
             return None
         if self.state.problem:
             self._report("the motor controller is back" if self.state.sent else "the motor controller answers")
@@ -210,8 +195,8 @@ class Controller:
         self.state.fault, self.state.battery_v = status.fault, status.battery_v
         self._law.contacts.update(MOTOR, ContactState(status.bumper, status.cliff))
         if status.watchdog_expired:  # the base is at rest: the command was not obeyed
-            self._law.stand()
-        self._law.motor_heading(status.heading_rad, status.yaw_rate_radps)
+            self._law.motion = STOP
+        self._law.goal.update(status.heading_rad, status.yaw_rate_radps)
         # A motor controller that holds a heading chooses the yaw rate itself, so it cannot contradict the command.
         yaw_rate_radps = math.nan if math.isfinite(status.heading_rad) else status.yaw_rate_radps
         self._law.plausibility.add_report(

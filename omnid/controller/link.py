@@ -14,11 +14,8 @@ from drivers.motor import VelocityCommand
 from omnid.controller.ipc import NO_MESSAGE, Channel, socket_pair
 from omnid.controller.messages import LONGEST_RAMP_S, ControllerStart, ControllerUpdate, LogRecord, StartFailed
 from omnid.controller.statistics import ControllerStatistics, TickReport
-from omnid.core.control.arming import ArmRequest
-from omnid.core.control.collision_monitor import ControllerRing
-from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.contacts import NO_CONTACT
-from omnid.core.control.control_law import ControllerPose
+from omnid.core.control.control_law import ControlInput
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.engine.flow import nothing
 from omnid.engine.process import python, python_environment
@@ -40,23 +37,14 @@ class DriveLink(Protocol):
     statistics: ControllerStatistics
     take_wheels: Callable[[WheelSample], object]  # called with what the motor controller reports
 
-    def send_pose(self, pose: ControllerPose) -> None:
-        """Send a pose."""
-
-    def send_ring(self, ring: ControllerRing) -> None:
-        """Send an obstacle ring."""
-
-    def send_setpoint(self, command: TimedSetpoint) -> None:
-        """Send a setpoint."""
+    def send(self, given: ControlInput) -> None:
+        """Send a pose, an obstacle ring, a setpoint, or a request to arm."""
 
     def stop(self) -> None:
-        """Stop the wheels until `arm` is called later."""
+        """Stop the wheels until a request to arm is sent later."""
 
     def touch(self, contact: str, *, holds: bool) -> None:
         """Report a bumper or a cliff sensor (BUMPER, CLIFF)."""
-
-    def arm(self, request: ArmRequest) -> None:
-        """Ask to arm."""
 
     def end(self) -> None:
         """Have the wheels slow down to a stop, and `commands` end."""
@@ -90,20 +78,15 @@ class ControllerLink:
             self.close()
             raise
 
-    def send_pose(self, pose: ControllerPose) -> None:
-        """Send a pose, from any thread; the newest counts."""
-        self._send(pose)
+    def send(self, given: ControlInput) -> None:
+        """Send a pose, an obstacle ring, a setpoint, or a request to arm; from any thread.
 
-    def send_ring(self, ring: ControllerRing) -> None:
-        """Send an obstacle ring, from any thread; the newest counts."""
-        self._send(ring)
-
-    def send_setpoint(self, command: TimedSetpoint) -> None:
-        """Send a setpoint, its arrival by CLOCK_MONOTONIC, from any thread; the newest counts."""
-        self._send(command)
+        A request that is lost is not repeated: its sender sees that the robot is not armed.
+        """
+        self._send(given)
 
     def stop(self) -> None:
-        """Stop the wheels until `arm` is called later; from any thread."""
+        """Stop the wheels until a request to arm is sent later; from any thread."""
         self._stop_ns = time.monotonic_ns()
         self._send(None)
 
@@ -111,13 +94,6 @@ class ControllerLink:
         """Report a bumper or a cliff sensor (BUMPER, CLIFF); the base stays at rest while it holds. From one thread."""
         self._contacts = self._contacts.after(contact, holds=holds)
         self._send(None)
-
-    def arm(self, request: ArmRequest) -> None:
-        """Ask to arm, with the arrival of the request by CLOCK_MONOTONIC, from any thread.
-
-        A request that is lost is not repeated: the sender sees that the robot is not armed.
-        """
-        self._send(request)
 
     def end(self) -> None:
         """Have the wheels slow down to a stop and the process end; from any thread."""
@@ -152,7 +128,7 @@ class ControllerLink:
             self._process.wait()
         self._channel.close()
 
-    def _send(self, update: ControllerPose | ControllerRing | TimedSetpoint | ArmRequest | None) -> None:
+    def _send(self, update: ControlInput | None) -> None:
         self._channel.send(ControllerUpdate(self._stop_ns, update, self._contacts))
 
     def _receive(self, timeout_s: float) -> object:

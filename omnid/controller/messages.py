@@ -9,11 +9,8 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 from omnid.controller.motor_settings import MotorSettings
-from omnid.core.control.arming import ArmRequest
-from omnid.core.control.collision_monitor import ControllerRing
-from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.contacts import NO_CONTACT, ContactState
-from omnid.core.control.control_law import ControllerPose, ControllerSettings
+from omnid.core.control.control_law import ControlInput, ControllerSettings
 from omnid.engine.realtime import RealtimeSettings
 
 # The wheels are ramped down when the daemon ends. Wheels that still turn after this time are stopped at once, so that
@@ -38,7 +35,7 @@ class ControllerUpdate(NamedTuple):
     """
 
     stop_ns: int
-    update: ControllerPose | ControllerRing | TimedSetpoint | ArmRequest | None
+    update: ControlInput | None
     contacts: ContactState = NO_CONTACT
 
 

@@ -18,10 +18,6 @@ from omnid.controller.controller import Controller
 from omnid.controller.ipc import NO_MESSAGE, Channel
 from omnid.controller.messages import LONGEST_RAMP_S, ControllerStart, ControllerUpdate, LogRecord, StartFailed
 from omnid.controller.motor import open_motor
-from omnid.core.control.arming import ArmRequest
-from omnid.core.control.collision_monitor import ControllerRing
-from omnid.core.control.command_sources import TimedSetpoint
-from omnid.core.control.control_law import ControllerPose
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.engine.process import STOP_SIGNALS
 from omnid.engine.realtime import RealtimeSettings, ThreadStart, prepare
@@ -72,20 +68,12 @@ class ControllerLoop:
             return True
         if message is NO_MESSAGE:
             return False
-        self._take(message)
+        update: ControllerUpdate = message
+        self._controller.stop(update.stop_ns)
+        self._controller.touch(update.contacts)
+        if update.update is not None:
+            self._controller.take(update.update)
         return True
-
-    def _take(self, message: ControllerUpdate) -> None:
-        self._controller.stop(message.stop_ns)
-        self._controller.touch(message.contacts)
-        if isinstance(message.update, ControllerPose):
-            self._controller.set_pose(message.update)
-        elif isinstance(message.update, ControllerRing):
-            self._controller.set_ring(message.update)
-        elif isinstance(message.update, TimedSetpoint):
-            self._controller.set_command(message.update)
-        elif isinstance(message.update, ArmRequest):
-            self._controller.arm(message.update)
 
 
 def run_controller(channel: Channel) -> int:

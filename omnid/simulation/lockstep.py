@@ -314,9 +314,9 @@ class _Lockstep:
         arrival_ns = vehicle.now_ns + 1  # after the tick at this time, which has passed
         for request in self._drive(moment):
             if isinstance(request, Setpoint):
-                controller.set_command(TimedSetpoint(arrival_ns, request))
+                controller.take(TimedSetpoint(arrival_ns, request))
             elif request == "arm":
-                controller.arm(ArmRequest(arrival_ns))
+                controller.take(ArmRequest(arrival_ns))
             elif request == "stop":
                 controller.stop(arrival_ns)
             elif request == "end":
@@ -334,12 +334,12 @@ class _Lockstep:
         self._poses.append((odometry.stamp_ns, of_base(odometry, T_base_rig)[0], odometry.state))
         self._slipping.append(self._stages is not None and self._stages.front_end.odometry.sensors.is_slipping)
         pose = controller_pose(odometry, T_base_rig)
-        self._vehicle.post(odometry.stamp_ns + self._delay_ns, lambda: self._vehicle.controller.set_pose(pose))
+        self._vehicle.post(odometry.stamp_ns + self._delay_ns, lambda: self._vehicle.controller.take(pose))
 
     def _take_ring(self, ring: ObstacleRing) -> None:
         self._rings.append(ring)
         seen = controller_ring(ring)
-        self._vehicle.post(ring.stamp_ns + self._delay_ns, lambda: self._vehicle.controller.set_ring(seen))
+        self._vehicle.post(ring.stamp_ns + self._delay_ns, lambda: self._vehicle.controller.take(seen))
 
     def _take_navigation(self, update: NavigationUpdate) -> None:
         self._navigation.append(update)
@@ -347,7 +347,7 @@ class _Lockstep:
         if update.setpoint is not None:
             due_ns = self._vehicle.now_ns + self._delay_ns
             command = TimedSetpoint(due_ns, update.setpoint, PLANNER, NAVIGATION_SENDER)
-            self._vehicle.post(due_ns, lambda: self._vehicle.controller.set_command(command))
+            self._vehicle.post(due_ns, lambda: self._vehicle.controller.take(command))
 
 
 def _newest(messages: list[T]) -> T | None:

@@ -25,11 +25,9 @@ from omnid.config import Config
 from omnid.controller.controller import Controller
 from omnid.controller.link import DriveLink
 from omnid.controller.statistics import ControllerStatistics, TickReport
-from omnid.core.control.arming import ArmRequest
 from omnid.core.control.collision_monitor import ControllerRing
-from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.contacts import NO_CONTACT
-from omnid.core.control.control_law import ControllerPose
+from omnid.core.control.control_law import ControlInput, ControllerPose
 from omnid.engine.flow import nothing
 from omnid.engine.graph import Graph, Stream
 from omnid.engine.telemetry import StageStats
@@ -66,30 +64,21 @@ class PacedLink:
         self._contacts = NO_CONTACT
         self._ended = False
 
-    def send_pose(self, pose: ControllerPose) -> None:
-        """Send a pose."""
-        self._posted.put((pose.stamp_ns + self._delay_ns, lambda controller, _: controller.set_pose(pose)))
-
-    def send_ring(self, ring: ControllerRing) -> None:
-        """Send an obstacle ring."""
-        self._posted.put((ring.stamp_ns + self._delay_ns, lambda controller, _: controller.set_ring(ring)))
-
-    def send_setpoint(self, command: TimedSetpoint) -> None:
-        """Send a setpoint."""
-        self._post(lambda controller, at_ns: controller.set_command(command._replace(arrival_ns=at_ns)))
+    def send(self, given: ControlInput) -> None:
+        """Send a pose, an obstacle ring, a setpoint, or a request to arm."""
+        if isinstance(given, ControllerPose | ControllerRing):
+            self._posted.put((given.stamp_ns + self._delay_ns, lambda controller, _: controller.take(given)))
+        else:
+            self._post(lambda controller, at_ns: controller.take(given._replace(arrival_ns=at_ns)))
 
     def stop(self) -> None:
-        """Stop the wheels until `arm` is called later."""
+        """Stop the wheels until a request to arm is sent later."""
         self._post(lambda controller, at_ns: controller.stop(at_ns))
 
     def touch(self, contact: str, *, holds: bool) -> None:
         """Report a bumper or a cliff sensor; from one thread."""
         contacts = self._contacts = self._contacts.after(contact, holds=holds)
         self._post(lambda controller, _: controller.touch(contacts))
-
-    def arm(self, request: ArmRequest) -> None:
-        """Ask to arm."""
-        self._post(lambda controller, at_ns: controller.arm(request._replace(arrival_ns=at_ns)))
 
     def end(self) -> None:
         """Let `commands` end when the last ones are taken; the simulation makes sure that the wheels are at rest."""

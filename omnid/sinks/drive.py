@@ -39,7 +39,7 @@ class LiveDrive:
 
     def process(self, odometry: OdometryUpdate) -> None:
         """Send a pose."""
-        self._link.send_pose(controller_pose(odometry, self._T_base_rig))
+        self._link.send(controller_pose(odometry, self._T_base_rig))
 
     def finish(self) -> None:
         """Have the wheels slow down to a stop: there will be no more poses."""
@@ -65,7 +65,7 @@ class PlannerDrive:
     def process(self, update: NavigationUpdate) -> None:
         """Send a setpoint, if there is one, the answers, and a route that is to be written."""
         if update.setpoint is not None:
-            self._link.send_setpoint(TimedSetpoint(time.monotonic_ns(), update.setpoint, PLANNER, NAVIGATION_SENDER))
+            self._link.send(TimedSetpoint(time.monotonic_ns(), update.setpoint, PLANNER, NAVIGATION_SENDER))
         self._files.process(update)
         for answer in update.answers:
             words = answer.refusal or granted_words(answer.request, update.state, update.reason)
@@ -100,7 +100,7 @@ class RingToController:
 
     def process(self, ring: ObstacleRing) -> None:
         """Send a ring."""
-        self._link.send_ring(controller_ring(ring))
+        self._link.send(controller_ring(ring))
 
 
 class ReplayDrive:
@@ -118,8 +118,8 @@ class ReplayDrive:
         """Send a pose and the setpoint; DriverError where the motor controller has failed for FAILED_S."""
         # 1. Send both as of now, and take the controller's reports.
         now_ns = time.monotonic_ns()
-        self._link.send_pose(controller_pose(odometry, self._T_base_rig)._replace(stamp_ns=now_ns))
-        self._link.send_setpoint(TimedSetpoint(now_ns, self._setpoint))
+        self._link.send(controller_pose(odometry, self._T_base_rig)._replace(stamp_ns=now_ns))
+        self._link.send(TimedSetpoint(now_ns, self._setpoint))
         self._link.receive_waiting()
         # 2. End the run where the motor controller does not come back.
         if not self._link.statistics.state.failed:

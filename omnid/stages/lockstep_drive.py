@@ -49,7 +49,7 @@ class LockstepDrive:
         stamp_ns = odometry.stamp_ns
         self._tick_until(stamp_ns)
         # 2. The tick at this pose, whose command is recorded.
-        self._law.set_pose(controller_pose(odometry, self._T_base_rig))
+        self._law.take(controller_pose(odometry, self._T_base_rig))
         output = self._step(stamp_ns)
         return VelocityCommand(stamp_ns, output.motion.velocity_mps, output.heading_rad, output.motion.yaw_rate_radps)
 
@@ -67,7 +67,7 @@ class LockstepDrive:
     def _step(self, now_ns: int) -> ControlOutput:
         dt_s = 0.0 if self._last_ns is None else (now_ns - self._last_ns) * S_PER_NS
         self._last_ns = now_ns
-        self._law.set_command(TimedSetpoint(now_ns, self._setpoint))
+        self._law.take(TimedSetpoint(now_ns, self._setpoint))
         return self._law.step(now_ns, dt_s)
 
 

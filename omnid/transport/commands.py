@@ -198,14 +198,11 @@ def _check_length(payload: bytes) -> None:
 class CommandTarget(Protocol):
     """The controller; its methods may be called from any thread."""
 
-    def send_setpoint(self, command: TimedSetpoint) -> None:
-        """Take a setpoint; its arrival is ns of CLOCK_MONOTONIC."""
+    def send(self, given: TimedSetpoint | ArmRequest) -> None:
+        """Take a setpoint or a request to arm; its arrival is ns of CLOCK_MONOTONIC."""
 
     def stop(self) -> None:
-        """Stop the wheels until `arm` is called later."""
-
-    def arm(self, request: ArmRequest) -> None:
-        """Take a request to arm."""
+        """Stop the wheels until a request to arm arrives later."""
 
     def touch(self, contact: str, *, holds: bool) -> None:
         """Take the state of a bumper or a cliff sensor."""
@@ -305,7 +302,7 @@ class CommandReceiver:
             raise Refused(OLDER_THAN_STOP)
         self._streams.clear()
         self.arms += 1
-        self._target.arm(ArmRequest(arrival_ns, request.id))
+        self._target.send(ArmRequest(arrival_ns, request.id))
 
     def _drive(self, source: str, parser: Callable[[bytes], CommandMessage], request: Request, arrival_ns: int) -> None:
         _check_length(request.payload)
@@ -319,7 +316,7 @@ class CommandReceiver:
         self._streams[source] = _Stream(request.sender, arrival_ns)
         self.accepted += 1
         age_ns = max(0, arrival_ns - sent_ns)
-        self._target.send_setpoint(TimedSetpoint(arrival_ns, command.setpoint, source, request.sender, age_ns))
+        self._target.send(TimedSetpoint(arrival_ns, command.setpoint, source, request.sender, age_ns))
 
 
 # Requests to the navigation.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Final, Literal, NamedTuple
+from typing import Annotated, Final, Literal, NamedTuple, TypeAlias
 
 from msgspec import Meta
 
@@ -109,6 +109,10 @@ class ControllerPose(NamedTuple):
         return self.heading_rad + self.yaw_rate_radps * (now_ns - self.stamp_ns) * S_PER_NS
 
 
+# What the daemon gives the controller; of each kind the newest counts.
+ControlInput: TypeAlias = ControllerPose | ControllerRing | TimedSetpoint | ArmRequest
+
+
 class ControlOutput(NamedTuple):
     """The result of one step."""
 
@@ -130,10 +134,11 @@ class ControlLaw:
         """start_ns: setpoints that arrived until then are void."""
         self._settings = settings
         self._heading_controller = HeadingController(settings.heading)
-        self._goal = HeadingGoal(settings.heading, settings.limits)
+        self.goal = HeadingGoal(settings.heading, settings.limits)  # of a motor controller that holds headings
         self._void_ns = start_ns  # setpoints that arrived until then are void
-        self._ending = self._pose_jumped = False
-        self._pose: ControllerPose | None = None
+        self._pose_jumped = False
+        self.pose: ControllerPose | None = None  # the newest one
+        self.ending = False  # True: the wheels stop until the process ends
         self.arming = Arming(settings.arming)
         self.plausibility = Plausibility(settings.trust, settings.motion)
         self.contacts = Contacts()
@@ -143,40 +148,18 @@ class ControlLaw:
         self.motion = STOP  # motion of the base now, from which the next step continues
         self.reason = IDLE  # reason of the last step
 
-    @property
-    def pose(self) -> ControllerPose | None:
-        """The newest pose."""
-        return self._pose
-
-    def set_pose(self, pose: ControllerPose) -> None:
-        """Replace the pose."""
-        self._pose_jumped |= self._pose is not None and self._jumps(self._pose, pose)
-        self._pose = pose
-        self.plausibility.add_pose(pose.stamp_ns, pose.state, pose.motion, pose.resets, pose.witness)
-
-    def set_ring(self, ring: ControllerRing) -> None:
-        """Replace the obstacle ring."""
-        self.collision.set_ring(ring)
-
-    def set_command(self, command: TimedSetpoint) -> None:
-        """Offer a setpoint."""
-        self.commands.offer(command)
-
-    def stop(self, asked_ns: int) -> None:
-        """Stop the wheels at the next step, until a request to arm that arrives later."""
-        self.arming.stop(asked_ns)
-
-    def arm(self, request: ArmRequest) -> None:
-        """Ask to arm; the next step answers (arming.answer)."""
-        self.arming.request(request)
-
-    def stand(self) -> None:
-        """Take the base to be at rest, because its motor controller has stopped it: the next step starts from there."""
-        self.motion = STOP
-
-    def end(self) -> None:
-        """Stop the wheels until the process ends."""
-        self._ending = True
+    def take(self, given: ControlInput) -> None:
+        """Take a pose, an obstacle ring, a setpoint, or a request to arm, which the next step answers."""
+        if isinstance(given, ControllerPose):
+            self._pose_jumped |= self.pose is not None and self._jumps(self.pose, given)
+            self.pose = given
+            self.plausibility.add_pose(given.stamp_ns, given.state, given.motion, given.resets, given.witness)
+        elif isinstance(given, ControllerRing):
+            self.collision.set_ring(given)
+        elif isinstance(given, TimedSetpoint):
+            self.commands.offer(given)
+        else:
+            self.arming.request(given)
 
     def step(
         self,
@@ -190,43 +173,38 @@ class ControlLaw:
     ) -> ControlOutput:
         """Return the motion that the base is to follow from now on; the previous one was commanded dt_s ago."""
         # 1. Faults, from deadlines and from motion that does not fit together, disarm; requests to arm are answered.
-        inputs = replace(
-            self.plausibility.added_to(self._inputs(now_ns)),
+        pose, command = self.pose, self.commands.current
+        faults = SafetyInputs(
+            pose_age_s=math.inf if pose is None else (now_ns - pose.stamp_ns) * S_PER_NS,
+            pose_state="" if pose is None else pose.state,
+            command_age_s=math.inf,
             late_s=late_s,
+            pose_jumped=self._pose_jumped,
             motor_awaited=motor_awaited,
             motor_failed=motor_failed,
             motor_stopped=motor_stopped,
+            contact=self.contacts.take(),
+            ending=self.ending,
         )
-        deadlines = self._settings.deadlines
+        inputs, deadlines = self.plausibility.added_to(faults), self._settings.deadlines
         accepted = self.arming.step(stop_reason(inputs, deadlines, FAULTS), now_ns, deadlines.command_s)
         if accepted is not None:
             self._void_ns = max(self._void_ns, accepted.arrival_ns)
         # 2. The reason to stop, of all rules; it voids the setpoints that have arrived so far.
-        self.reason = stop_reason(
-            replace(
-                inputs,
-                stop_asked=self.arming.stop_asked,
-                armed=self.arming.armed,
-                command_age_s=self._command_age_s(now_ns),
-            ),
-            deadlines,
-        )
+        stopped, armed, age_s = self.arming.stop_asked, self.arming.armed, self._command_age_s(now_ns)
+        inputs = replace(inputs, stop_asked=stopped, armed=armed, command_age_s=age_s)
+        self.reason = stop_reason(inputs, deadlines)
         self._pose_jumped = False
         if self.reason:
             self._void_ns = now_ns
         # 3. The motion: a ramp to rest, or towards the setpoint as far as trust and obstacles allow.
-        pose, command = self._pose, self.commands.current
         if self.reason or pose is None or command is None:
-            self.motion, heading_rad = self._settings.limits.step(STOP, self.motion, dt_s), self._goal.stay()
+            self.motion, heading_rad = self._settings.limits.step(STOP, self.motion, dt_s), self.goal.stay()
         else:
             heading_rad = self._drive(command.setpoint, pose.heading_at(now_ns), now_ns, dt_s)
         # 4. The collision monitor follows the motion, so that it knows where an older ring is now.
         self.collision.follow(now_ns, self.motion)
         return ControlOutput(self.motion, heading_rad, self.reason)
-
-    def motor_heading(self, counted_rad: float, rate_radps: float) -> None:
-        """Take the heading, in its own count, and the yaw rate that the motor controller reported; NaN if unknown."""
-        self._goal.update(counted_rad, rate_radps)
 
     def _drive(self, setpoint: Setpoint, heading_rad: float, now_ns: int, dt_s: float) -> float:
         """Step the motion towards a setpoint; return the goal for a motor controller that holds headings."""
@@ -238,7 +216,7 @@ class ControlLaw:
         self.motion = limits.step(allowed, self.motion, dt_s)
         turn_rad = self.motion.yaw_rate_radps * min(max(dt_s, 0.0), LONGEST_TICK_S)
         error_rad = None if setpoint.heading_rad is None else wrap_angle(setpoint.heading_rad - heading_rad)
-        return self._goal.towards(turn_rad, error_rad)
+        return self.goal.towards(turn_rad, error_rad)
 
     def _jumps(self, before: ControllerPose, pose: ControllerPose) -> bool:
         """True if the heading has changed by more than the base can have turned since the last pose.
@@ -264,14 +242,3 @@ class ControlLaw:
         age_s = (now_ns - command.arrival_ns + command.age_ns) * S_PER_NS
         is_over = command.setpoint == TO_STAND and age_s > self._settings.deadlines.command_s
         return math.inf if is_over else age_s
-
-    def _inputs(self, now_ns: int) -> SafetyInputs:
-        pose = self._pose
-        return SafetyInputs(
-            pose_age_s=math.inf if pose is None else (now_ns - pose.stamp_ns) * S_PER_NS,
-            pose_state="" if pose is None else pose.state,
-            pose_jumped=self._pose_jumped,
-            command_age_s=math.inf,
-            ending=self._ending,
-            contact=self.contacts.take(),
-        )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from omnid.core.control.heading_controller import HeadingLimits, wrap_angle
+from omnid.core.control.heading_controller import HeadingLimits, clamp, wrap_angle
 from omnid.core.control.velocity_limits import VelocityLimits
 
 # Between the heading that the motor controller reported and its turn to the next goal; by trial with simulated
@@ -53,7 +53,7 @@ class HeadingGoal:
         if not math.isfinite(turn_rad) or (error_rad is not None and not math.isfinite(error_rad)):
             return self.stay()
         before_rad = self._counted_rad if self._goal_rad is None else self._goal_rad
-        lead_rad = _clamp(wrap_angle(before_rad + turn_rad - self._counted_rad), self._longest_rad)
+        lead_rad = clamp(wrap_angle(before_rad + turn_rad - self._counted_rad), self._longest_rad)
         if error_rad is not None and abs(error_rad) < self._longest_rad:
             lead_rad = min(max(lead_rad, min(error_rad, 0.0)), max(error_rad, 0.0))
         if abs(self._rate_radps) > self._highest_radps and self._rate_radps * lead_rad > 0:
@@ -65,7 +65,3 @@ class HeadingGoal:
         """Return the present heading as the goal, while the base slows down."""
         self._goal_rad = None
         return self._counted_rad
-
-
-def _clamp(value: float, magnitude: float) -> float:
-    return max(-magnitude, min(magnitude, value))

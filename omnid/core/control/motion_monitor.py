@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import takewhile
 from typing import Annotated, Final, NamedTuple
@@ -113,19 +114,12 @@ class _TimedMotion(NamedTuple):
     yaw_rate_radps: float
 
 
-class _Band(NamedTuple):
-    """Plausible values of a speed."""
+class _Beyond(NamedTuple):
+    """By how far a speed lies beyond what is plausible."""
 
-    low: float
-    high: float
-
-    def widened(self, share: float, tolerance: float) -> _Band:
-        """Return the band with a slip and a tolerance; a slip of the slowest speed never changes its sign."""
-        return _Band(self.low - share * abs(self.low) - tolerance, self.high + share * abs(self.high) + tolerance)
-
-    def beyond(self, value: float) -> float:
-        """Return by how far a value lies above the band, below 0 where it lies below; 0 inside."""
-        return max(0.0, value - self.high) - max(0.0, self.low - value)
+    axis: int  # 0: velocity, 1: yaw rate
+    speed: float  # 0: it is plausible
+    falls_short: bool  # too little of the plausible motion, or the other way
 
 
 class MotionMonitor:
@@ -172,13 +166,11 @@ class MotionMonitor:
             return
         dt_s = _passed_s(before_ns, stamp_ns)
         commanded = self._recent(self._commanded, stamp_ns)
-        explained = [*commanded, *self._recent(self._reported, stamp_ns)]
-        velocity, yaw_rate = self._bands(explained, seen)
-        mean = _mean(commanded)
         self._last_seen = seen
-        self._steps.append(tuple(dt_s * speed for speed in (seen.velocity_mps, seen.yaw_rate_radps, *mean)))
-        self._add_beyond(0, velocity, seen.velocity_mps, dt_s)
-        self._add_beyond(1, yaw_rate, seen.yaw_rate_radps, dt_s)
+        self._steps.append(tuple(dt_s * speed for speed in (seen.velocity_mps, seen.yaw_rate_radps, *_mean(commanded))))
+        for found in self._beyond([*commanded, *self._recent(self._reported, stamp_ns)], seen):
+            self._add(NOT_SEEN, found.axis, found.speed if found.falls_short else 0.0, dt_s)
+            self._add(NOT_COMMANDED, found.axis, 0.0 if found.falls_short else found.speed, dt_s)
 
     def add_report(self, now_ns: int, reported: Motion) -> None:
         """Compare what the wheels report with what was commanded; a yaw rate of NaN is not compared."""
@@ -193,10 +185,8 @@ class MotionMonitor:
         if not self._drives_at(now_ns):
             return
         dt_s = _passed_s(before_ns, now_ns)
-        velocity, yaw_rate = self._bands(self._recent(self._commanded, now_ns), reported)
-        self._add(NOT_FOLLOWED, 0, abs(velocity.beyond(reported.velocity_mps)), dt_s)
-        if math.isfinite(reported.yaw_rate_radps):
-            self._add(NOT_FOLLOWED, 1, abs(yaw_rate.beyond(reported.yaw_rate_radps)), dt_s)
+        for found in self._beyond(self._recent(self._commanded, now_ns), reported):
+            self._add(NOT_FOLLOWED, found.axis, found.speed, dt_s)
 
     def _drives_at(self, at_ns: int) -> bool:
         """True if a motion was commanded within the delay before a time."""
@@ -211,25 +201,24 @@ class MotionMonitor:
             if entry.at_ns <= at_ns
         ]
 
-    def _bands(self, explained: list[_TimedMotion], found: Motion) -> tuple[_Band, _Band]:
-        """Return the plausible velocities and yaw rates."""
-        limits = self._settings
-        speeds, rates = [one.velocity_mps for one in explained], [one.yaw_rate_radps for one in explained]
-        return (
-            _Band(min(speeds), max(speeds)).widened(limits.slip, limits.speed_mps + SIGMAS * found.velocity_sigma_mps),
-            _Band(min(rates), max(rates)).widened(
-                limits.slip, limits.yaw_rate_radps + SIGMAS * found.yaw_rate_sigma_radps
-            ),
-        )
+    def _beyond(self, explained: list[_TimedMotion], found: Motion) -> Iterator[_Beyond]:
+        """Yield by how far a motion lies beyond what others explain; nothing for a speed of NaN.
 
-    def _add_beyond(self, axis: int, band: _Band, value: float, dt_s: float) -> None:
-        """Add the unexplained part of what was seen: too little of what was commanded, or too much; none of NaN."""
-        if not math.isfinite(value):
-            return
-        beyond = band.beyond(value)
-        falls_short = beyond * (band.low + band.high) < 0.0
-        self._add(NOT_SEEN, axis, abs(beyond) if falls_short else 0.0, dt_s)
-        self._add(NOT_COMMANDED, axis, 0.0 if falls_short else abs(beyond), dt_s)
+        A slip of the slowest speed never changes its sign.
+        """
+        limits = self._settings
+        axes = (
+            (found.velocity_mps, limits.speed_mps + SIGMAS * found.velocity_sigma_mps),
+            (found.yaw_rate_radps, limits.yaw_rate_radps + SIGMAS * found.yaw_rate_sigma_radps),
+        )
+        for axis, (value, tolerance) in enumerate(axes):
+            if not math.isfinite(value):
+                continue
+            speeds = [(one.velocity_mps, one.yaw_rate_radps)[axis] for one in explained]
+            low, high = min(speeds), max(speeds)
+            low, high = low - limits.slip * abs(low) - tolerance, high + limits.slip * abs(high) + tolerance
+            beyond = max(0.0, value - high) - max(0.0, low - value)
+            yield _Beyond(axis, abs(beyond), beyond * (low + high) < 0.0)
 
     def _add(self, reason: str, axis: int, speed: float, dt_s: float) -> None:
         """Add an unexplained speed; 0 lets the sum fall."""

@@ -1,4 +1,4 @@
-"""Trust in pose and motor: uncertainty, resets, the motor controller's faults and its battery."""
+"""Trust in pose and motor: uncertainty, resets, motion that does not fit together, the motor's faults and battery."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated, Final, Literal, NamedTuple
 
 from msgspec import Meta
 
-from omnid.core.control.heading_controller import Twist
+from omnid.core.control.heading_controller import Twist, clamp
 from omnid.core.control.motion_monitor import AGREE, Motion, MotionMonitor, MotionSettings, Witness
 from omnid.core.control.safety_rules import SafetyInputs
 from omnid.core.control.velocity_limits import VelocityLimits
@@ -17,7 +17,8 @@ from omnid.tracking_state import TrackingState
 
 # A voltage that is low for a shorter time is that of a motor that starts; by trial on development seeds.
 BATTERY_S: Final = 2.0
-OFF: Final = 0.0  # exact: the value of a setting that switches its rule off
+POSE_DEGRADED: Final = "the pose is degraded"
+MOTION_DOUBTFUL: Final = "the motion that is seen or reported is not the commanded one"
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,66 +47,6 @@ class TrustSettings:
     ] = 0.0
 
 
-class PoseTrust:
-    """Follows uncertainty and resets from pose to pose."""
-
-    def __init__(self, settings: TrustSettings) -> None:
-        self._settings = settings
-        self._unsure_since_ns: int | None = None
-        self._newest_ns = 0
-        self._resets: int | None = None
-        self._reset = False
-
-    @property
-    def unsure(self) -> bool:
-        """True if the velocity of the poses has been too uncertain for too long."""
-        since_ns = self._unsure_since_ns
-        return since_ns is not None and (self._newest_ns - since_ns) * S_PER_NS >= self._settings.sigma_s
-
-    def add_pose(self, stamp_ns: int, velocity_sigma_mps: float, yaw_rate_sigma_radps: float, resets: int) -> None:
-        """Take the next pose, with the standard deviations of its velocity and the count of resets."""
-        settings = self._settings
-        high = (settings.velocity_sigma_mps != OFF and not velocity_sigma_mps <= settings.velocity_sigma_mps) or (
-            settings.yaw_rate_sigma_radps != OFF and not yaw_rate_sigma_radps <= settings.yaw_rate_sigma_radps
-        )
-        if not high:
-            self._unsure_since_ns = None
-        elif self._unsure_since_ns is None:
-            self._unsure_since_ns = stamp_ns
-        self._newest_ns = stamp_ns
-        self._reset |= self._resets not in (None, resets) and settings.odometry_reset == "stop"
-        self._resets = resets
-
-    def take_reset(self) -> bool:
-        """Return whether odometry has begun again since the last call."""
-        reset, self._reset = self._reset, False
-        return reset
-
-
-class MotorTrust:
-    """Follows the motor controller's fault and its battery."""
-
-    def __init__(self, settings: TrustSettings) -> None:
-        self._settings = settings
-        self._low_since_ns: int | None = None
-        self.faulty = False  # state of the last report
-        self.battery_empty = False
-
-    def add_report(self, now_ns: int, fault: int, battery_v: float) -> None:
-        """Take a report of the motor controller; battery_v: NaN where it is unknown."""
-        self.faulty = fault != 0 and self._settings.motor_fault == "stop"
-        if self._settings.battery_v == OFF or not battery_v < self._settings.battery_v:
-            self._low_since_ns, self.battery_empty = None, False
-            return
-        if self._low_since_ns is None:
-            self._low_since_ns = now_ns
-        self.battery_empty = (now_ns - self._low_since_ns) * S_PER_NS >= BATTERY_S
-
-
-POSE_DEGRADED: Final = "the pose is degraded"
-MOTION_DOUBTFUL: Final = "the motion that is seen or reported is not the commanded one"
-
-
 class MotorReport(NamedTuple):
     """The part of a motor controller's status that is judged; NaN: the controller does not report this value."""
 
@@ -118,16 +59,20 @@ class Plausibility:
     """Follows poses, commands and reports of the motor controller. Not thread-safe."""
 
     def __init__(self, trust: TrustSettings, motion: MotionSettings) -> None:
-        self._settings = trust
-        self._pose, self._motor = PoseTrust(trust), MotorTrust(trust)
+        self._settings, self._checks = trust, motion.check
         self._monitor = MotionMonitor(motion)
-        self._degraded, self._checks = False, motion.check
+        self._pose_ns = 0  # stamp of the newest pose
+        self._unsure_since_ns: int | None = None  # stamp of the first pose of those whose velocity is too uncertain
+        self._resets: int | None = None
+        self._is_degraded = self._is_reset = False
+        self._low_since_ns: int | None = None  # since when the voltage is low
+        self._is_faulty = self._is_battery_empty = False
         self.witness = AGREE  # witness of the newest pose
 
     @property
     def slowed_by(self) -> str:
         """The reason to drive slowly; empty without one."""
-        if self._degraded:
+        if self._is_degraded:
             return POSE_DEGRADED
         return MOTION_DOUBTFUL if self._monitor.is_doubtful else self.witness.reason
 
@@ -137,10 +82,22 @@ class Plausibility:
         return Witness(self._monitor.reason, self._monitor.detail, True) if self._monitor.reason else self.witness
 
     def add_pose(self, stamp_ns: int, state: str, seen: Motion, resets: int, witness: Witness = AGREE) -> None:
-        """Take the next pose; a lost one says nothing about the motion."""
+        """Take the next pose, and how often odometry has begun again; a lost pose says nothing about the motion."""
+        settings = self._settings
         self.witness = witness if self._checks else AGREE
-        self._degraded = state == TrackingState.DEGRADED
-        self._pose.add_pose(stamp_ns, seen.velocity_sigma_mps, seen.yaw_rate_sigma_radps, resets)
+        self._is_degraded = state == TrackingState.DEGRADED
+        # A NaN is uncertain; a level of 0 switches its rule off.
+        levels = (
+            (settings.velocity_sigma_mps, seen.velocity_sigma_mps),
+            (settings.yaw_rate_sigma_radps, seen.yaw_rate_sigma_radps),
+        )
+        if not any(level > 0 and not sigma <= level for level, sigma in levels):
+            self._unsure_since_ns = None
+        elif self._unsure_since_ns is None:
+            self._unsure_since_ns = stamp_ns
+        self._pose_ns = stamp_ns
+        self._is_reset |= self._resets not in (None, resets) and settings.odometry_reset == "stop"
+        self._resets = resets
         if state != TrackingState.LOST:
             self._monitor.add_seen(stamp_ns, seen)
 
@@ -150,17 +107,26 @@ class Plausibility:
 
     def add_report(self, now_ns: int, report: MotorReport) -> None:
         """Take a report of the motor controller."""
+        settings = self._settings
         self._monitor.add_report(now_ns, report.motion)
-        self._motor.add_report(now_ns, report.fault, report.battery_v)
+        self._is_faulty = report.fault != 0 and settings.motor_fault == "stop"
+        if not report.battery_v < settings.battery_v:
+            self._low_since_ns = None
+        elif self._low_since_ns is None:
+            self._low_since_ns = now_ns
+        low_s = 0.0 if self._low_since_ns is None else (now_ns - self._low_since_ns) * S_PER_NS
+        self._is_battery_empty = low_s >= BATTERY_S
 
     def added_to(self, inputs: SafetyInputs) -> SafetyInputs:
         """Return the inputs of the safety rules with these; a reset counts for one step."""
+        is_reset, self._is_reset = self._is_reset, False
+        since_ns = self._unsure_since_ns
         return replace(
             inputs,
-            pose_reset=self._pose.take_reset(),
-            pose_unsure=self._pose.unsure,
-            motor_faulty=self._motor.faulty,
-            battery_empty=self._motor.battery_empty,
+            pose_reset=is_reset,
+            pose_unsure=since_ns is not None and (self._pose_ns - since_ns) * S_PER_NS >= self._settings.sigma_s,
+            motor_faulty=self._is_faulty,
+            battery_empty=self._is_battery_empty,
             disagreement=self._monitor.reason or (self.witness.reason if self.witness.is_fault else ""),
         )
 
@@ -170,10 +136,6 @@ class Plausibility:
             return wanted
         share = self._settings.degraded_speed
         return Twist(
-            _clamp(wanted.velocity_mps, share * limits.velocity_mps),
-            _clamp(wanted.yaw_rate_radps, share * limits.yaw_rate_radps),
+            clamp(wanted.velocity_mps, share * limits.velocity_mps),
+            clamp(wanted.yaw_rate_radps, share * limits.yaw_rate_radps),
         )
-
-
-def _clamp(value: float, magnitude: float) -> float:
-    return max(-magnitude, min(magnitude, value))

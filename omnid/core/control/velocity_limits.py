@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Annotated, Final
 
 from msgspec import Meta
 
-from omnid.core.control.heading_controller import LONGEST_TICK_S, Twist
-from omnid.errors import OmnidError
+from omnid.core.control.heading_controller import LONGEST_TICK_S, Twist, clamp
 
 STOP: Final = Twist()
 
@@ -24,13 +23,6 @@ class VelocityLimits:
     yaw_rate_radps: Annotated[float, Meta(ge=0.001, le=20), "highest yaw rate, rad/s"] = 1.2
     yaw_acceleration_radps2: Annotated[float, Meta(ge=0.001, le=200), "highest yaw acceleration, rad/s^2"] = 4.0
 
-    def __post_init__(self) -> None:
-        """Raise OmnidError unless each number is finite and above 0."""
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if not (math.isfinite(value) and value > 0):
-                raise OmnidError(f"controller.limits.{field.name} is {value}; give a finite number above 0")
-
     def step(self, wanted: Twist, last: Twist, dt_s: float) -> Twist:
         """Return the motion to send dt_s after `last`; a wanted motion that is not finite is a stop.
 
@@ -41,12 +33,12 @@ class VelocityLimits:
         wanted, last = (motion if _finite(motion) else STOP for motion in (wanted, last))
         dt_s = min(max(dt_s, 0.0), LONGEST_TICK_S) if math.isfinite(dt_s) else 0.0
         top_mps, top_radps = self.velocity_mps, self.yaw_rate_radps
-        velocity_mps, yaw_rate_radps = _clamp(last.velocity_mps, top_mps), _clamp(last.yaw_rate_radps, top_radps)
+        velocity_mps, yaw_rate_radps = clamp(last.velocity_mps, top_mps), clamp(last.yaw_rate_radps, top_radps)
         # 2. Approach what is wanted with the accelerations allowed.
         reach_radps = self.yaw_acceleration_radps2 * dt_s
         return Twist(
-            self._velocity(velocity_mps, _clamp(wanted.velocity_mps, top_mps), dt_s),
-            yaw_rate_radps + _clamp(_clamp(wanted.yaw_rate_radps, top_radps) - yaw_rate_radps, reach_radps),
+            self._velocity(velocity_mps, clamp(wanted.velocity_mps, top_mps), dt_s),
+            yaw_rate_radps + clamp(clamp(wanted.yaw_rate_radps, top_radps) - yaw_rate_radps, reach_radps),
         )
 
     def _velocity(self, last_mps: float, wanted_mps: float, dt_s: float) -> float:
@@ -64,7 +56,3 @@ class VelocityLimits:
 
 def _finite(motion: Twist) -> bool:
     return math.isfinite(motion.velocity_mps) and math.isfinite(motion.yaw_rate_radps)
-
-
-def _clamp(value: float, magnitude: float) -> float:
-    return max(-magnitude, min(magnitude, value))

@@ -102,7 +102,7 @@ class Bench:
         resets: int = 0,
         witness: Witness = AGREE,
     ) -> None:
-        self.controller.set_pose(
+        self.controller.take(
             ControllerPose(
                 self.now_ns - round(age_s * 1e9),
                 heading_rad,
@@ -117,14 +117,14 @@ class Bench:
 
     def send_setpoint(self, setpoint: Setpoint = AHEAD, source: str = OPERATOR, sender: str = "") -> None:
         self.now_ns += 1
-        self.controller.set_command(TimedSetpoint(self.now_ns, setpoint, source, sender))
+        self.controller.take(TimedSetpoint(self.now_ns, setpoint, source, sender))
 
     def stop(self) -> None:
         self.controller.stop(self.now_ns)
 
     def arm(self) -> None:
         self.now_ns += 1
-        self.controller.arm(ArmRequest(self.now_ns, self.now_ns))
+        self.controller.take(ArmRequest(self.now_ns, self.now_ns))
 
     def tick(self, late_s: float = 0.0) -> None:
         self.now_ns += PERIOD_NS + round(late_s * 1e9)

@@ -243,8 +243,8 @@ def run_until(controller: Controller, twin: PtyMotor, setpoint: Setpoint, happen
     while not happens():
         assert time.monotonic() < deadline_s, "timeout"
         state = twin.base
-        controller.set_pose(ControllerPose(time.monotonic_ns(), state.pose[2] + 0.7, state.yaw_rate_radps, "tracking"))
-        controller.set_command(TimedSetpoint(time.monotonic_ns(), setpoint))
+        controller.take(ControllerPose(time.monotonic_ns(), state.pose[2] + 0.7, state.yaw_rate_radps, "tracking"))
+        controller.take(TimedSetpoint(time.monotonic_ns(), setpoint))
         controller.tick()
         time.sleep(0.02)
 

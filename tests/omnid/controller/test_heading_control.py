@@ -73,8 +73,8 @@ class Lockstep:
             self.now_ns += round(PERIOD_S * 1e9)
             base = self.driver.base
             heading_rad = math.remainder(base.pose[2] + self.jump_rad, math.tau)
-            self.controller.set_pose(ControllerPose(self.now_ns, heading_rad, base.yaw_rate_radps, "tracking"))
-            self.controller.set_command(TimedSetpoint(self.now_ns, setpoint))
+            self.controller.take(ControllerPose(self.now_ns, heading_rad, base.yaw_rate_radps, "tracking"))
+            self.controller.take(TimedSetpoint(self.now_ns, setpoint))
             self.controller.tick()
 
 
@@ -115,12 +115,12 @@ def test_a_setpoint_from_before_a_jump_is_void_and_the_robot_stays_armed() -> No
         robot.driver, replace(SETTINGS, arming="manual"), PERIOD_S, clock_ns=lambda: robot.now_ns
     )
     robot.run(STRAIGHT, 2)
-    robot.controller.arm(ArmRequest(robot.now_ns))
+    robot.controller.take(ArmRequest(robot.now_ns))
     robot.run(STRAIGHT, 40)
     assert robot.driver.base.velocity_mps > 0.15
     for _ in range(20):  # the operator sends no more, and the pose jumps
         robot.now_ns += round(PERIOD_S * 1e9)
-        robot.controller.set_pose(ControllerPose(robot.now_ns, 1.5, 0.0, "tracking"))
+        robot.controller.take(ControllerPose(robot.now_ns, 1.5, 0.0, "tracking"))
         robot.controller.tick()
     assert robot.heading_rad == 0.0 and robot.driver.base.velocity_mps == 0.0
     robot.jump_rad = 1.5
@@ -145,7 +145,7 @@ def test_a_stale_pose_that_was_relocalised_moves_no_goal() -> None:
         robot.controller.tick()
     robot.jump_rad = 2.0
     stale = ControllerPose(robot.now_ns - 6 * 10**9, 2.0, 0.0, "tracking")
-    robot.controller.set_pose(stale)
+    robot.controller.take(stale)
     robot.controller.tick()
     robot.run(STRAIGHT, 60)
     assert robot.driver.base.velocity_mps > 0.15 and robot.heading_rad == pytest.approx(0.0, abs=1e-9)
@@ -159,8 +159,8 @@ def test_a_real_serial_line_shows_the_same() -> None:
         controller, until_s = Controller(wire, SETTINGS, PERIOD_S), time.monotonic() + 2.5
         while time.monotonic() < until_s:
             base = twin.base
-            controller.set_pose(ControllerPose(time.monotonic_ns(), base.pose[2], base.yaw_rate_radps, "tracking"))
-            controller.set_command(TimedSetpoint(time.monotonic_ns(), Setpoint(0.2, 3.0)))
+            controller.take(ControllerPose(time.monotonic_ns(), base.pose[2], base.yaw_rate_radps, "tracking"))
+            controller.take(TimedSetpoint(time.monotonic_ns(), Setpoint(0.2, 3.0)))
             controller.tick()
             for _ in range(5):
                 time.sleep(PERIOD_S / 5)

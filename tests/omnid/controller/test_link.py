@@ -78,8 +78,8 @@ class Robot:
         wait_until(lambda: self._sent() and self.base.line.base.velocity_mps > 0.38, "motion")
 
     def _sent(self) -> bool:
-        self.link.send_pose(pose())
-        self.link.send_setpoint(TimedSetpoint(time.monotonic_ns(), AHEAD))
+        self.link.send(pose())
+        self.link.send(TimedSetpoint(time.monotonic_ns(), AHEAD))
         return True
 
     def joined(self) -> None:
@@ -166,7 +166,7 @@ def test_raises_where_the_process_was_killed(robot: Robot) -> None:
     robot.joined()
     assert robot.error is not None and "exit code -9" in str(robot.error) and "\n" not in str(robot.error)
     robot.link.stop()  # from threads that do not know it yet
-    robot.link.send_pose(pose())
+    robot.link.send(pose())
 
 
 def test_a_stop_arrives_although_the_channel_was_full(robot: Robot) -> None:
@@ -174,7 +174,7 @@ def test_a_stop_arrives_although_the_channel_was_full(robot: Robot) -> None:
     robot.drive()
     os.kill(robot.pid, signal.SIGSTOP)
     while not robot.link._channel.lost:
-        robot.link.send_setpoint(TimedSetpoint(time.monotonic_ns(), AHEAD))
+        robot.link.send(TimedSetpoint(time.monotonic_ns(), AHEAD))
     robot.link.stop()
     assert robot.link._channel.lost >= 2, "its own message was lost"
     os.kill(robot.pid, signal.SIGCONT)
@@ -186,7 +186,7 @@ def test_a_stop_arrives_although_the_channel_was_full(robot: Robot) -> None:
 def _sends_pose(robot: Robot) -> bool:
     """True if the channel took a pose."""
     lost = robot.link._channel.lost
-    robot.link.send_pose(pose())
+    robot.link.send(pose())
     return robot.link._channel.lost == lost
 
 
@@ -204,7 +204,7 @@ def test_a_stop_rides_along_with_everything_that_follows_and_needs_a_later_reque
         send, robot.link._channel.send = robot.link._channel.send, lambda _: None  # type: ignore[method-assign]
         robot.link.stop()
         robot.link._channel.send = send  # type: ignore[method-assign]
-        robot.link.arm(early)
+        robot.link.send(early)
         wait_until(lambda: not robot.base.drives, "the stop")
         wait_until(lambda: state.state.arm_answer.id == 1, "the answer")
         assert not state.state.armed and state.state.disarmed_by == safety_rules.ASKED
@@ -221,7 +221,7 @@ def test_a_contact_that_has_ended_and_whose_messages_were_lost_still_stops_the_b
     robot.link.touch(BUMPER, holds=True)
     robot.link.touch(BUMPER, holds=False)
     robot.link._channel.send = send  # type: ignore[method-assign]
-    robot.link.send_pose(pose())
+    robot.link.send(pose())
     state = robot.link.statistics
     wait_until(lambda: state.state.disarmed_by == BUMPER and not robot.base.drives, "the stop")
     robot.link.touch(CLIFF, holds=True)
@@ -233,7 +233,7 @@ def test_a_contact_that_has_ended_and_whose_messages_were_lost_still_stops_the_b
 
 
 def arm(robot: Robot) -> None:
-    robot.link.arm(ArmRequest(time.monotonic_ns(), 2))
+    robot.link.send(ArmRequest(time.monotonic_ns(), 2))
 
 
 OWNER = """
@@ -241,8 +241,8 @@ import sys, time
 from tests.omnid.controller.test_link import AHEAD, ControllerLink, StageStats, TimedSetpoint, pose, start_message
 link = ControllerLink(start_message(sys.argv[1]), StageStats("motor"), print)
 while True:
-    link.send_pose(pose())
-    link.send_setpoint(TimedSetpoint(time.monotonic_ns(), AHEAD))
+    link.send(pose())
+    link.send(TimedSetpoint(time.monotonic_ns(), AHEAD))
     time.sleep(0.05)
 """
 
@@ -300,10 +300,10 @@ def test_a_board_that_starts_again_when_its_port_is_opened_is_asked_until_it_has
 
         def state(*, arm: bool = True) -> ControllerState:
             link.receive_waiting()
-            link.send_pose(pose())
+            link.send(pose())
             if arm and not link.statistics.state.armed:
-                link.arm(ArmRequest(time.monotonic_ns(), 1))
-            link.send_setpoint(TimedSetpoint(time.monotonic_ns(), AHEAD))
+                link.send(ArmRequest(time.monotonic_ns(), 1))
+            link.send(TimedSetpoint(time.monotonic_ns(), AHEAD))
             return link.statistics.state
 
         # 1. There is no port: it is waited for, and nothing can be armed.

@@ -42,10 +42,10 @@ class RobotWithRings:
 
     def drives(self, velocity_mps: float, ranges: tuple[float, ...] | None) -> bool:
         """Send a command, and a ring unless there is none; True once the wheels turn in that direction."""
-        self.link.send_pose(pose())
+        self.link.send(pose())
         if ranges is not None:
-            self.link.send_ring(ControllerRing(time.monotonic_ns(), ranges))
-        self.link.send_setpoint(TimedSetpoint(time.monotonic_ns(), Setpoint(velocity_mps)))
+            self.link.send(ControllerRing(time.monotonic_ns(), ranges))
+        self.link.send(TimedSetpoint(time.monotonic_ns(), Setpoint(velocity_mps)))
         return self.base.line.base.velocity_mps * velocity_mps > 0.01
 
     def stands(self, velocity_mps: float, ranges: tuple[float, ...] | None) -> bool:

@@ -234,7 +234,7 @@ class Walk:
         while self.chance(0.06, 0.1):
             request = ArmRequest(self.delayed_ns(), self.now_ns)
             oracle.requests[:] = [request]  # the newest that was handed over counts
-            controller.arm(request)
+            controller.take(request)
         self.motor.fault = rng.choice(("silent", "late", "late", "expired")) if self.chance(0.004, 0.06) else ""
         self.motor.counted_rad = rng.uniform(-math.pi, math.pi) if self.chance(0.01, 0.1) else self.motor.counted_rad
         self.motor.rate_radps = rng.choice((0.0, 0.0, 0.5, -0.5, 3.0, -3.0, math.nan))
@@ -269,7 +269,7 @@ class Walk:
             witness=self.witness,
         )
         self.oracle.pose = pose
-        self.controller.set_pose(pose)
+        self.controller.take(pose)
 
     def send_ring(self) -> None:
         """Send an obstacle ring of the phase, some of them late."""
@@ -293,7 +293,7 @@ class Walk:
         )
         if self.oracle.ring is None or ring.stamp_ns >= self.oracle.ring.stamp_ns:
             self.oracle.ring = ring
-        self.controller.set_ring(ring)
+        self.controller.take(ring)
 
     def send_command(self) -> None:
         rng = self.rng
@@ -304,7 +304,7 @@ class Walk:
         setpoint = Setpoint(velocity_mps, heading_rad, rng.uniform(-5, 5))
         command = TimedSetpoint(self.delayed_ns(), setpoint, source, sender)
         self.oracle.take_command(command)
-        self.controller.set_command(command)
+        self.controller.take(command)
 
     def tick(self) -> None:
         """Tick, and hold the result against the oracle."""

@@ -27,7 +27,7 @@ def test_counts_commands_and_stops_before_obstacles() -> None:
     def drive(ranges: tuple[float, ...], ticks: int) -> ControllerState:
         for _ in range(ticks):
             bench.send_pose()
-            bench.controller.set_ring(ControllerRing(bench.now_ns, ranges))
+            bench.controller.take(ControllerRing(bench.now_ns, ranges))
             bench.send_setpoint()
             bench.tick()
         return bench.controller.state

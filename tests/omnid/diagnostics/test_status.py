@@ -76,7 +76,7 @@ class Daemon:
         )
 
     def send_setpoint(self, command: TimedSetpoint) -> None:
-        self.controller.set_command(command)
+        self.controller.take(command)
 
     def stop(self) -> None:
         self.controller.stop(time.monotonic_ns())
@@ -85,7 +85,7 @@ class Daemon:
         """Take a contact."""
 
     def arm(self, request: ArmRequest) -> None:
-        self.controller.arm(request)
+        self.controller.take(request)
 
     def collected(self) -> dict[str, DiagnosticStatus]:
         """Return all entries by short name, after encoding them."""
@@ -115,7 +115,7 @@ class Daemon:
         )
         self.statistics.process(odometry)
         self.latency.process(odometry)
-        self.controller.set_pose(controller_pose(odometry, np.eye(4)))
+        self.controller.take(controller_pose(odometry, np.eye(4)))
 
     def tick(self) -> None:
         self.controller_statistics.add(self.controller.tick())
@@ -172,7 +172,7 @@ def test_wheels_driving_stopped_and_faulty(daemon: Daemon) -> None:
     assert (status.level, status.message) == (OK, "no command")
     assert status.values["armed"] == "1" and not {"disarmed_by", "remedy", "source"} & set(status.values)
     assert "arm_refusal" not in status.values
-    daemon.controller.set_command(TimedSetpoint(time.monotonic_ns(), Setpoint(0.2, None)))
+    daemon.controller.take(TimedSetpoint(time.monotonic_ns(), Setpoint(0.2, None)))
     daemon.tick()
     status = daemon.collected()["wheels"]
     assert (status.level, status.message) == (OK, "driving") and status.values["sent"] == "3"

@@ -36,11 +36,11 @@ class Link:
         self.statistics = ControllerStatistics(StageStats("motor"))
         self.ended = False
 
-    def send_pose(self, pose: ControllerPose) -> None:
-        self.poses.append(pose)
-
-    def send_setpoint(self, command: TimedSetpoint) -> None:
-        self.setpoints.append((command.setpoint, command.arrival_ns))
+    def send(self, given: ControllerPose | TimedSetpoint) -> None:
+        if isinstance(given, ControllerPose):
+            self.poses.append(given)
+        else:
+            self.setpoints.append((given.setpoint, given.arrival_ns))
 
     def receive_waiting(self) -> None:
         """Nothing waits."""

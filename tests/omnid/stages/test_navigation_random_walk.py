@@ -110,13 +110,13 @@ class Walk:
         """Let persons and programs ask for things."""
         rng = self.rng
         if rng.random() < 0.01:
-            self.law.stop(self.arrival_ns)
+            self.law.arming.stop(self.arrival_ns)
             self.wanted = self.armed = False
         if rng.random() < (0.05 if self.armed else 0.3):
-            self.law.arm(ArmRequest(self.arrival_ns))
+            self.law.take(ArmRequest(self.arrival_ns))
         if self.operates and rng.random() < 0.8:
             setpoint = Setpoint(rng.uniform(-0.5, 0.5), None, rng.uniform(-0.5, 0.5))
-            self.law.set_command(TimedSetpoint(self.arrival_ns, setpoint, OPERATOR))
+            self.law.take(TimedSetpoint(self.arrival_ns, setpoint, OPERATOR))
             self.operated_s = self.t_s
         while rng.random() < (0.05 if self.wanted else 0.25):
             self.ask(self.request())
@@ -183,7 +183,7 @@ class Walk:
         self.seen[str(update.state)] += 1
         self.wanted = self.wanted and not update.state.is_end
         if update.setpoint is not None:
-            self.law.set_command(TimedSetpoint(self.arrival_ns, update.setpoint, PLANNER))
+            self.law.take(TimedSetpoint(self.arrival_ns, update.setpoint, PLANNER))
 
     seen_teaching = ""
 
@@ -194,7 +194,7 @@ class Walk:
         self.seq += 1
         T = transform(self.pose)
         velocity = np.array([self.motion[0], 0, 0, 0, 0, self.motion[1]])
-        self.law.set_pose(
+        self.law.take(
             ControllerPose(
                 self.now_ns, float(self.pose[2]), self.motion[1], self.state, self.motion[0], resets=self.resets
             )
@@ -221,7 +221,7 @@ class Walk:
                     *to[:2].tolist(), self.rng.uniform(-1, 1), self.rng.uniform(-1, 1), np.eye(4) * 0.01, 0.2
                 ),
             )
-        self.law.set_ring(ControllerRing(self.now_ns, tuple(ranges.tolist())))
+        self.law.take(ControllerRing(self.now_ns, tuple(ranges.tolist())))
         self.ringed_s = self.t_s
         self.stage.process(
             ObstacleRing(

@@ -84,19 +84,18 @@ class AcceptedCommands:
         """Have a message handled; return the answer."""
         return self.receiver.receive(Request(*message, **more))
 
-    def send_setpoint(self, command: TimedSetpoint) -> None:
-        """Keep a setpoint."""
-        self.commands.append(command)
-        self.setpoints.append(command.setpoint)
-        self.arrivals_ns.append(command.arrival_ns)
+    def send(self, given: TimedSetpoint | ArmRequest) -> None:
+        """Keep a setpoint or a request to arm."""
+        if isinstance(given, ArmRequest):
+            self.arms.append(given)
+            return
+        self.commands.append(given)
+        self.setpoints.append(given.setpoint)
+        self.arrivals_ns.append(given.arrival_ns)
 
     def stop(self) -> None:
         """Count a stop."""
         self.stops += 1
-
-    def arm(self, request: ArmRequest) -> None:
-        """Keep a request."""
-        self.arms.append(request)
 
     def touch(self, contact: str, *, holds: bool) -> None:
         """Keep a contact."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -12,7 +13,7 @@ import pytest
 from drivers.motor import is_stop
 from omnid.core.control import safety_rules
 from omnid.core.control.arming import AUTOMATIC, MANUAL, OLDER_THAN_STOP, STARTED, TOO_LATE, Arming, ArmRequest
-from omnid.core.control.contacts import BUMPER, CLIFF, LATCHING, NO_CONTACT
+from omnid.core.control.contacts import BUMPER, BUS, CLIFF, LATCHING, MOTOR, NO_CONTACT, Contacts, ContactState
 from omnid.core.control.motion_monitor import (
     ADVICE,
     COMPARED,
@@ -196,16 +197,16 @@ def test_a_request_that_arrived_before_the_stop_releases_nothing(driving: Bench)
     early = ArmRequest(driving.now_ns, 1)
     driving.now_ns += 1000
     driving.stop()
-    driving.controller.arm(early)
+    driving.controller.take(early)
     expect_stand(driving)
     assert driving.controller.state.arm_answer.refusal == OLDER_THAN_STOP
     driving.now_ns += 1
-    driving.controller.arm(ArmRequest(driving.now_ns, 2))
+    driving.controller.take(ArmRequest(driving.now_ns, 2))
     driving.now_ns += 1
     driving.stop()
     expect_stand(driving)
     driving.controller.stop(driving.now_ns)
-    driving.controller.arm(ArmRequest(driving.now_ns, 3))
+    driving.controller.take(ArmRequest(driving.now_ns, 3))
     expect_stand(driving)
     assert driving.controller.state.arm_answer == (3, OLDER_THAN_STOP)
     assert driving.lines.count(f"arming is refused: {OLDER_THAN_STOP}") == 1, "a repeated refusal is one line"
@@ -393,3 +394,37 @@ def test_each_halt_that_needs_a_person_is_counted_also_where_it_is_armed_again_a
     arming.step("no pose", 50, 1.0)
     arming.step("", 51, 1.0)
     assert arming.halts == halts + 3 + (mode == MANUAL)
+
+
+def test_a_message_changes_its_sensor_only_and_counts_each_beginning() -> None:
+    state = NO_CONTACT
+    assert state == ContactState(bumper=False, cliff=False, bumper_count=0, cliff_count=0)
+    for holds, count in ((True, 1), (True, 1), (False, 1), (True, 2)):
+        state = state.after(BUMPER, holds=holds)
+        assert state == ContactState(bumper=holds, bumper_count=count)
+    for holds, count in ((False, 0), (True, 1), (True, 1), (False, 1), (True, 2)):
+        state = state.after(CLIFF, holds=holds)
+        assert state == ContactState(bumper=True, cliff=holds, bumper_count=2, cliff_count=count)
+
+
+def test_no_contact_is_lost_and_none_is_made_up() -> None:
+    """Any messages of two origins: a contact is reported while it holds, and once where it has passed since."""
+    rng, seen = random.Random(1), set()
+    contacts, states = Contacts(), {BUS: NO_CONTACT, MOTOR: NO_CONTACT}
+    for _ in range(3000):
+        found: set[str] = set()
+        for _ in range(rng.choice((0, 0, 1, 3))):
+            origin, contact, holds = rng.choice((BUS, MOTOR)), rng.choice((BUMPER, CLIFF)), rng.random() < 0.3
+            held = states[origin].bumper if contact == BUMPER else states[origin].cliff
+            found |= {contact} if holds and not held else set()
+            states[origin] = states[origin].after(contact, holds=holds)
+            if rng.random() < 0.6:  # else a later message of the same origin replaces this one before it is taken
+                contacts.update(origin, states[origin])
+        for origin, state in states.items():
+            contacts.update(origin, state)
+            found |= {CLIFF} if state.cliff else set()
+            found |= {BUMPER} if state.bumper else set()
+        expected = CLIFF if CLIFF in found else BUMPER if BUMPER in found else ""
+        assert contacts.take() == expected
+        seen.add(expected)
+    assert seen == {CLIFF, BUMPER, ""}

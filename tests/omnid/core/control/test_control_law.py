@@ -26,12 +26,12 @@ def test_the_way_since_the_images_of_the_ring_counts() -> None:
     """One ring, a wall 1 m ahead: the base stops before the wall by its own motion, without another ring."""
     collision = CollisionSettings(stale_s=10.0)
     law = ControlLaw(ControllerSettings(arming=AUTOMATIC, collision=collision), START_NS)
-    law.set_ring(ControllerRing(START_NS, WALL))
+    law.take(ControllerRing(START_NS, WALL))
     driven_m = fastest_mps = 0.0
     for tick in range(1, 400):
         now_ns = START_NS + tick * TICK_NS
-        law.set_pose(ControllerPose(now_ns, 0.0, 0.0, "tracking", law.motion.velocity_mps))
-        law.set_command(TimedSetpoint(now_ns, Setpoint(0.5)))
+        law.take(ControllerPose(now_ns, 0.0, 0.0, "tracking", law.motion.velocity_mps))
+        law.take(TimedSetpoint(now_ns, Setpoint(0.5)))
         driven_m += law.step(now_ns, TICK_S).motion.velocity_mps * TICK_S
         fastest_mps = max(fastest_mps, law.motion.velocity_mps)
     assert law.motion.velocity_mps == 0.0 and fastest_mps > 0.15
@@ -45,9 +45,9 @@ def test_a_base_before_a_post_turns_to_a_heading_and_drives_on_from_there() -> N
         now_ns, turned = START_NS + tick * TICK_NS, round(math.degrees(heading_rad))
         # A post 0.38 m ahead of the first pose, so that the base may not begin an arc; it stays where it is.
         ranges = tuple(0.38 if abs(k - 179.5 + turned) < 8 else math.inf for k in range(360))
-        law.set_ring(ControllerRing(now_ns, ranges))
-        law.set_pose(ControllerPose(now_ns, heading_rad, law.motion.yaw_rate_radps, "tracking", 0.0))
-        law.set_command(TimedSetpoint(now_ns, Setpoint(0.3, heading_rad=math.radians(90))))
+        law.take(ControllerRing(now_ns, ranges))
+        law.take(ControllerPose(now_ns, heading_rad, law.motion.yaw_rate_radps, "tracking", 0.0))
+        law.take(TimedSetpoint(now_ns, Setpoint(0.3, heading_rad=math.radians(90))))
         motion = law.step(now_ns, TICK_S).motion
         heading_rad, driven_m = heading_rad + motion.yaw_rate_radps * TICK_S, driven_m + motion.velocity_mps * TICK_S
         assert motion.velocity_mps == 0.0 or heading_rad > math.radians(10)
@@ -66,11 +66,11 @@ def test_a_stick_that_is_held_leads_no_farther_however_small_the_first_step(
     left_m, tick_ns = 0.15 + 0.25 + 0.002, 10**9 // rate_hz
     ways = [left_m / math.cos(math.radians(k - 179.5)) if abs(k - 179.5) < 40 else math.inf for k in range(360)]
     ranges = tuple(way if is_seen or way == math.inf else math.nan for way in ways)
-    law.set_ring(ControllerRing(START_NS, ranges, tuple(min(way, 6.0) for way in ways)))
+    law.take(ControllerRing(START_NS, ranges, tuple(min(way, 6.0) for way in ways)))
     for tick in range(1, 4 * rate_hz):
         now_ns = START_NS + tick * tick_ns
-        law.set_pose(ControllerPose(now_ns, 0.0, 0.0, "tracking", law.motion.velocity_mps))
-        law.set_command(TimedSetpoint(now_ns, wanted))
+        law.take(ControllerPose(now_ns, 0.0, 0.0, "tracking", law.motion.velocity_mps))
+        law.take(TimedSetpoint(now_ns, wanted))
         left_m -= law.step(now_ns, 1 / rate_hz).motion.velocity_mps / rate_hz
     assert law.reason == "" and left_m > 0.15 + 0.25 - 0.004
 
@@ -79,9 +79,9 @@ def law_with(first: ControllerPose) -> ControlLaw:
     """Return a law that drives, without obstacles and without a comparison of motions, from a pose."""
     settings = ControllerSettings(arming=AUTOMATIC).of_log
     law = ControlLaw(settings, START_NS)
-    law.set_pose(first)
+    law.take(first)
     law.step(first.stamp_ns, TICK_S)
-    law.set_command(TimedSetpoint(first.stamp_ns + 1, Setpoint(0.3)))
+    law.take(TimedSetpoint(first.stamp_ns + 1, Setpoint(0.3)))
     law.step(first.stamp_ns + 1, TICK_S)
     assert law.reason == ""
     return law
@@ -114,7 +114,7 @@ def test_a_heading_jumps_where_the_base_cannot_have_turned_so_far() -> None:
             between_rad(pose.heading_rad, before.heading_rad + before.yaw_rate_radps * passed_s) - brake_rad,
         )
         law = law_with(before)
-        law.set_pose(pose)
+        law.take(pose)
         law.step(before.stamp_ns + 2, TICK_S)
         jumps = min(terms) > 0.0
         assert (law.reason == POSE_JUMPED) == jumps, (before, pose, terms)
@@ -129,8 +129,8 @@ def test_the_goal_of_a_motor_controller_does_not_pass_a_heading_across_pi(side: 
     goals_rad = []
     for tick in range(1, 120):
         now_ns = START_NS + tick * TICK_NS
-        law.set_pose(ControllerPose(now_ns, side * 3.13, 0.0, "tracking"))
-        law.set_command(TimedSetpoint(now_ns, Setpoint(0.0, -side * 3.13)))
+        law.take(ControllerPose(now_ns, side * 3.13, 0.0, "tracking"))
+        law.take(TimedSetpoint(now_ns, Setpoint(0.0, -side * 3.13)))
         goals_rad.append(side * law.step(now_ns, TICK_S).heading_rad)
     assert max(goals_rad) == pytest.approx(math.tau - 6.26) and min(goals_rad) >= 0.0
 
@@ -139,7 +139,7 @@ def test_the_goal_of_a_motor_controller_moves_by_the_turn_of_each_tick() -> None
     law, goal_rad = law_with(ControllerPose(START_NS, 0.0, 0.0, "tracking")), 0.0
     for tick, dt_s in enumerate((TICK_S, 0.05, 0.01, TICK_S, 0.03, 0.1), 1):
         now_ns = START_NS + tick * TICK_NS
-        law.set_command(TimedSetpoint(now_ns, Setpoint(0.0, None, 0.6)))
+        law.take(TimedSetpoint(now_ns, Setpoint(0.0, None, 0.6)))
         output = law.step(now_ns, dt_s)
         goal_rad += output.motion.yaw_rate_radps * dt_s
         assert output.heading_rad == pytest.approx(goal_rad) and output.motion.yaw_rate_radps > 0.0
@@ -149,10 +149,10 @@ def test_the_goal_of_a_motor_controller_moves_by_the_turn_of_each_tick() -> None
 
 def test_a_setpoint_of_the_very_instant_of_a_reason_to_stop_is_void() -> None:
     law = ControlLaw(ControllerSettings(arming=AUTOMATIC).of_log, START_NS)
-    law.set_pose(ControllerPose(START_NS, 0.0, 0.0, "tracking"))
-    law.set_command(TimedSetpoint(START_NS, Setpoint(0.3)))
+    law.take(ControllerPose(START_NS, 0.0, 0.0, "tracking"))
+    law.take(TimedSetpoint(START_NS, Setpoint(0.3)))
     assert law.step(START_NS, TICK_S).reason == IDLE
-    law.set_command(TimedSetpoint(START_NS + 1, Setpoint(0.3)))
+    law.take(TimedSetpoint(START_NS + 1, Setpoint(0.3)))
     assert law.step(START_NS + 1, TICK_S).reason == ""
 
 

@@ -11,12 +11,10 @@ import pytest
 from omnid.core.control.heading_controller import (
     LONGEST_TICK_S,
     HeadingController,
-    HeadingLimits,
     Setpoint,
     Twist,
     wrap_angle,
 )
-from omnid.errors import OmnidError
 
 DT_S = 0.05
 CONTROLLER = HeadingController()
@@ -125,9 +123,3 @@ def test_wrapped_angle_is_the_same_direction(angle_rad: float) -> None:
     wrapped = wrap_angle(angle_rad)
     assert -math.pi <= wrapped <= math.pi
     assert (math.cos(wrapped), math.sin(wrapped)) == pytest.approx((math.cos(angle_rad), math.sin(angle_rad)), abs=1e-6)
-
-
-@pytest.mark.parametrize("bad", [0.0, -1.0, *NOT_FINITE])
-def test_refuses_limits_that_are_not_above_zero(bad: float) -> None:
-    with pytest.raises(OmnidError, match="gain_hz"):
-        HeadingLimits(gain_hz=bad)

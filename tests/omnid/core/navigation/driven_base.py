@@ -69,7 +69,7 @@ class DrivenBase:
         self.T_map_odom = np.array(T_map_odom)
         settings = ControllerSettings(arming=AUTOMATIC, motion=MotionSettings(check=False))
         self.law = ControlLaw(settings if self.has_ring else settings.without_obstacles, -1)
-        self.law.set_pose(ControllerPose(0, float(self.pose[2]), 0.0, "tracking", 0.0))
+        self.law.take(ControllerPose(0, float(self.pose[2]), 0.0, "tracking", 0.0))
         self.law.step(0, 0.0)
         self._gain = 1.0 + 0.02 * self.rng.standard_normal(2)
         self._every = round(1.0 / pose_hz / TICK_S)
@@ -121,13 +121,13 @@ class DrivenBase:
 
     def _at_pose(self, now: Situation) -> Navigation:
         answer = self.navigator.step(now._replace(wheels=self.wheels))
-        self.law.set_pose(
+        self.law.take(
             ControllerPose(
                 now.stamp_ns, float(now.pose[2]), now.yaw_rate_radps, now.state, now.speed_mps, resets=now.resets
             )
         )
         if answer.setpoint is not None:
-            self.law.set_command(TimedSetpoint(round(self.t_s * 1e9), answer.setpoint, PLANNER))
+            self.law.take(TimedSetpoint(round(self.t_s * 1e9), answer.setpoint, PLANNER))
         self.samples.append(Sample(self.t_s, self.pose.copy(), self.v, self.w, answer))
         return answer
 

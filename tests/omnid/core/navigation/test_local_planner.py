@@ -68,7 +68,7 @@ class BaseAmongBoxes(DrivenBase):
             self.pose[:2]
             + (ranges * np.array([np.cos(AZIMUTHS + self.pose[2]), np.sin(AZIMUTHS + self.pose[2])])).T[seen]
         )
-        self.law.set_ring(ControllerRing(now.stamp_ns, tuple(ranges.tolist())))
+        self.law.take(ControllerRing(now.stamp_ns, tuple(ranges.tolist())))
         near_m = float(ranges[seen & (np.abs(AZIMUTHS) < 1.7)].min(initial=math.inf)) - OUTLINE.half_width_m
         return now._replace(obstacles=points, obstacle_m=near_m)
 

@@ -80,7 +80,7 @@ class BaseAmongPeople(BaseAmongBoxes):
                 )
                 for m in self.moving
             )
-            self.law.set_ring(ControllerRing(now.stamp_ns, tuple(ranges.tolist()), moving=points))
+            self.law.take(ControllerRing(now.stamp_ns, tuple(ranges.tolist()), moving=points))
         seen = np.isfinite(ranges)
         obstacles = self.pose[:2] + ranges[seen, None] * directions[seen]
         return now._replace(obstacles=obstacles, moving=forecast(self.moving, self.t_s - self.ring_s))

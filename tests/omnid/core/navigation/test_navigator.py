@@ -76,9 +76,9 @@ def test_pause_halts_and_resume_goes_on() -> None:
 @pytest.mark.hazard("H26")
 def test_a_stop_ends_the_drive_and_arming_does_not_start_it_again() -> None:
     base = driving()
-    base.law.stop(round(base.t_s * 1e9))
+    base.law.arming.stop(round(base.t_s * 1e9))
     assert rest(base, 1.0).state is NavigationState.CANCELLED
-    base.law.arm(ArmRequest(round(base.t_s * 1e9)))
+    base.law.take(ArmRequest(round(base.t_s * 1e9)))
     x = base.pose[0]
     rest(base, 2.0)
     assert base.pose[0] == pytest.approx(x, abs=1e-3)
@@ -96,7 +96,7 @@ def test_a_fault_pauses_the_drive_until_a_person_arms_and_resumes() -> None:
     assert "`omnid goto --resume`" in answer.reason and "the pose is lost" in answer.reason
     assert_stands(base)
     assert "not armed" in base.navigator.resume(base.seen()), "it must be armed first"
-    base.law.arm(ArmRequest(round(base.t_s * 1e9)))
+    base.law.take(ArmRequest(round(base.t_s * 1e9)))
     x = base.pose[0]
     assert rest(base, 1.0).state is NavigationState.PAUSED
     assert base.pose[0] == pytest.approx(x, abs=1e-3), "arming alone does not move it"
@@ -190,7 +190,7 @@ def test_a_new_goal_ends_the_stops_of_the_one_before() -> None:
 def test_waits_while_the_operator_drives_and_fails_where_it_was_taken_far_away() -> None:
     base = driving()
     for _ in range(100):
-        base.law.set_command(TimedSetpoint(round(base.t_s * 1e9), Setpoint(0.0), OPERATOR))
+        base.law.take(TimedSetpoint(round(base.t_s * 1e9), Setpoint(0.0), OPERATOR))
         base.tick()
     answer = base.samples[-1].navigation
     assert answer.state is NavigationState.PAUSED and answer.reason.startswith("operator drives: it goes on when")

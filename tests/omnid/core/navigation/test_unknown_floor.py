@@ -31,7 +31,7 @@ class BaseAmongPatches(DrivenBase):
         now = super().seen()
         free_m = np.minimum(self.boxes.ring(self.pose), SEEN_M)
         ranges_m = np.full(360, np.inf)
-        self.law.set_ring(ControllerRing(now.stamp_ns, tuple(ranges_m.tolist()), tuple(free_m.tolist())))
+        self.law.take(ControllerRing(now.stamp_ns, tuple(ranges_m.tolist()), tuple(free_m.tolist())))
         near = [end.sector for end in unknown_ends(ranges_m.tolist(), free_m.tolist(), OUTLINE.stop_m)]
         near = [k for k in near if free_m[k] < 1.2]
         angles = AZIMUTHS[near] + self.pose[2]
