@@ -6,7 +6,6 @@ lines to anchors (section III.B); `semiglobal`, the default, searches near a sem
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Literal, Protocol, TypeVar
 
@@ -15,50 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.stereo.anchors import AnchorPropagation, Candidates
-from omnid.core.stereo.semiglobal import (
-    NO_MATCH,
-    ColumnShift,
-    Costs,
-    Indices,
-    SadVolume,
-    SemiGlobalPrior,
-    WarpedSad,
-    local_minima,
-    refined,
-    subpixel,
-)
+from omnid.core.stereo.sad import NO_MATCH, Costs, Flags, Floats, Image, Indices, SadVolume, local_minima, subpixel
+from omnid.core.stereo.semiglobal import ColumnShift, SemiGlobalSearch
 
-Image = NDArray[np.uint8]
-
-RESPONSE_SCALE = 0.5  # because a 3x3 Sobel of 8-bit images reaches 1020: half of it and less is kept in 8 bits
-
-
-def smooth(image: Image, sigma_px: float) -> Image:
-    """Return the image blurred by a Gaussian against the noise of single pixels; sigma 0 returns it unchanged."""
-    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px), np.uint8) if sigma_px > 0 else image
-
-
-def edge_pixels(smoothed: Image, valid: NDArray[np.bool_], threshold: int, limit: int) -> NDArray[np.intp]:
-    """Return flat indices, ascending, of pixels where the Sobel response along the column is a maximum.
-
-    Only a change along the column distinguishes a match from its neighbours there, so only that is measured, and only
-    the crest of each edge is kept. threshold: least response, in units of the 3x3 Sobel (8 per grey level and pixel).
-    If more than limit remain, every n-th is taken, evenly over the image.
-    """
-    response = cv2.convertScaleAbs(cv2.Sobel(smoothed, cv2.CV_16S, 0, 1), alpha=RESPONSE_SCALE)
-    least = int(threshold * RESPONSE_SCALE)
-    crest = (response[1:-1] >= response[:-2]) & (response[1:-1] > response[2:]) & (response[1:-1] > least)
-    chosen = np.flatnonzero(crest & valid[1:-1]) + smoothed.shape[1]
-    return np.asarray(chosen[:: max(1, -(-len(chosen) // limit))])
-
-
-Flags = NDArray[np.bool_]
-Floats = NDArray[np.float32]
 Scalar = TypeVar("Scalar", bound=np.generic)
 Matches = tuple[Indices, Floats]  # flat indices (N,) into the lower panorama, disparities (N,) > 0 [px]
 
 METHODS = ("sad", "enhanced", "semiglobal")
-MIN_DISPARITY_PX = 0.5  # a smaller one is a point at infinity, within the noise; by trial on development seeds
+RESPONSE_SCALE = 0.5  # because a 3x3 Sobel of 8-bit images reaches 1020: half of it and less is kept in 8 bits
 # Largest disagreement of the disparities that both panoramas choose; as in OpenCV's samples (disp12MaxDiff).
 LEFT_RIGHT_PX = 1
 # Sobel response that noise of one grey level reaches in one pixel of a hundred; by trial on development seeds.
@@ -85,6 +48,30 @@ class MatchingSettings:
     sigma_px: float = 0.8  # standard deviation of the Gaussian blur before matching, px; 0: none
     max_candidates: int = 8  # enhanced: largest number of candidates compared for one pixel
 
+    @property
+    def max_cost(self) -> int:
+        """Largest SAD of a match."""
+        return int(self.max_difference * self.window_px**2)
+
+
+def smooth(image: Image, sigma_px: float) -> Image:
+    """Return the image blurred by a Gaussian against the noise of single pixels; sigma 0 returns it unchanged."""
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px), np.uint8) if sigma_px > 0 else image
+
+
+def edge_pixels(smoothed: Image, valid: Flags, threshold: int, limit: int) -> Indices:
+    """Return flat indices, ascending, of pixels where the Sobel response along the column is a maximum.
+
+    Only a change along the column distinguishes a match from its neighbours there, so only that is measured, and only
+    the crest of each edge is kept. threshold: least response, in units of the 3x3 Sobel (8 per grey level and pixel).
+    If more than limit remain, every n-th is taken, evenly over the image.
+    """
+    response = cv2.convertScaleAbs(cv2.Sobel(smoothed, cv2.CV_16S, 0, 1), alpha=RESPONSE_SCALE)
+    least = int(threshold * RESPONSE_SCALE)
+    crest = (response[1:-1] >= response[:-2]) & (response[1:-1] > response[2:]) & (response[1:-1] > least)
+    chosen = np.flatnonzero(crest & valid[1:-1]) + smoothed.shape[1]
+    return np.asarray(chosen[:: max(1, -(-len(chosen) // limit))])
+
 
 class CandidateSearch(Protocol):
     """A method that chooses among candidates."""
@@ -94,15 +81,18 @@ class CandidateSearch(Protocol):
 
         column_shift: see Matcher.match; a method may ignore it.
         """
-        ...
 
 
 class Matcher:
     """Matches edges of the lower panorama in the upper one; keeps its buffers between pairs."""
 
     def __init__(self, shape: tuple[int, int], matching: MatchingSettings) -> None:
-        self._matching = matching
-        self._search: CandidateSearch = SEARCHES[matching.method](shape, matching)
+        self._matching, m = matching, matching
+        self._search: CandidateSearch
+        if m.method in ("auto", "semiglobal"):
+            self._search = SemiGlobalSearch(shape, m.disparities, m.window_px, m.max_cost, LEFT_RIGHT_PX)
+        else:
+            self._search = ColumnSearch(shape, matching)
 
     def match(
         self, lower: Image, upper: Image, valid: Flags, noise_grey: float = 0.0, column_shift: ColumnShift | None = None
@@ -119,49 +109,11 @@ class Matcher:
         return self._search.search(lower, upper, pixels, column_shift)
 
 
-class SemiGlobalSearch:
-    """SAD near a semi-global prior."""
-
-    def __init__(self, shape: tuple[int, int], matching: MatchingSettings) -> None:
-        self._prior = SemiGlobalPrior(matching.disparities)
-        self._sad = WarpedSad(shape, matching.window_px)
-        self._disparities = matching.disparities  # the prior may search more
-        self._max_cost = matching.max_difference * matching.window_px**2
-
-    def search(self, lower: Image, upper: Image, pixels: Indices, column_shift: ColumnShift | None) -> Matches:
-        """Return the pixels with a prior and a minimum of the SAD near it, whose match lies in the image."""
-        prior, known = self._prior.disparity(lower, upper)
-        pixels = pixels[known.reshape(-1)[pixels]]
-        costs = self._sad.costs(lower, upper, prior, pixels, column_shift)
-        is_minimum = local_minima(costs, int(self._max_cost))
-        step = np.where(is_minimum, costs, NO_MATCH).argmin(axis=0)
-        disparity = refined(prior, pixels, costs, step)
-        inside = pixels // lower.shape[1] + disparity < len(lower)
-        in_range = (disparity > MIN_DISPARITY_PX) & (disparity < self._disparities)
-        kept = is_minimum.any(axis=0) & in_range & inside
-        return pixels[kept], disparity[kept]
-
-
 class ColumnSearch:
-    """Lowest SAD along the whole column with the left-right check (Dang et al. 2012, eq. (1))."""
+    """SAD along the whole column with the left-right check: the lowest one, or one chosen among several candidates.
 
-    def __init__(self, shape: tuple[int, int], matching: MatchingSettings) -> None:
-        self._volume = SadVolume(shape, matching.disparities, matching.window_px)
-        self._max_cost = matching.max_difference * matching.window_px**2
-
-    def search(self, lower: Image, upper: Image, pixels: Indices, column_shift: ColumnShift | None) -> Matches:
-        """Return the pixels whose lowest SAD is below the threshold and is the lowest from the upper panorama too."""
-        self._volume.fill(lower, upper)
-        costs = self._volume.at(pixels)
-        disparity = costs.argmin(axis=0)
-        choice, _ = self._volume.best_from_upper(pixels, disparity)
-        agrees = np.abs(choice - disparity) <= LEFT_RIGHT_PX
-        kept = _at(local_minima(costs, int(self._max_cost)), disparity) & agrees
-        return pixels[kept], subpixel(costs, disparity)[kept]
-
-
-class EnhancedSearch:
-    """SAD along the whole column; points with several candidates are decided by anchors (section III.B)."""
+    The former is eq. (1) of Dang et al. 2012, the latter section III.B.
+    """
 
     def __init__(self, shape: tuple[int, int], matching: MatchingSettings) -> None:
         self._matching = matching
@@ -175,8 +127,13 @@ class EnhancedSearch:
         """
         self._volume.fill(lower, upper)
         costs = self._volume.at(pixels)
+        disparity, lowest = costs.argmin(axis=0), costs.min(axis=0)
+        if self._matching.method == "sad":
+            kept = _at(local_minima(costs, self._matching.max_cost), disparity)
+            kept &= self._is_best_from_upper(pixels, disparity)
+            return pixels[kept], subpixel(costs, disparity)[kept]
         # 1. Points with one candidate are matched by the lowest SAD and become anchors.
-        disparity, minima = costs.argmin(axis=0), local_minima(costs, self._candidate_limit(costs.min(axis=0)))
+        minima = local_minima(costs, self._candidate_limit(lowest))
         count = np.count_nonzero(minima, axis=0)
         kept, ambiguous = (count == 1) & _at(minima, disparity), count > 1
         kept[kept] = self._is_best_from_upper(pixels[kept], disparity[kept])
@@ -186,7 +143,8 @@ class EnhancedSearch:
         disparity = propagation.disparity
         # 3. The upper panorama confirms: strictly where the margin to the runner-up was small.
         unclear = ambiguous & ~clear & _at(minima, disparity)
-        kept[clear] = self._is_candidate_from_upper(pixels[clear], disparity[clear])
+        _, lowest = self._volume.best_from_upper(pixels[clear], disparity[clear])
+        kept[clear] = _at(costs, disparity)[clear] <= self._candidate_limit(lowest)
         kept[unclear] = self._is_best_from_upper(pixels[unclear], disparity[unclear])
         return pixels[kept], subpixel(costs, disparity)[kept]
 
@@ -201,12 +159,6 @@ class EnhancedSearch:
         choice, _ = self._volume.best_from_upper(pixels, disparity)
         return np.asarray(np.abs(choice - disparity) <= LEFT_RIGHT_PX)
 
-    def _is_candidate_from_upper(self, pixels: Indices, disparity: Indices) -> Flags:
-        """Return the matches (N,) that are also candidates of their upper pixels."""
-        _, lowest = self._volume.best_from_upper(pixels, disparity)
-        cost = self._volume.around(pixels, disparity, 0)[0]
-        return np.asarray(cost <= self._candidate_limit(lowest))
-
     def _candidates(self, costs: Costs, minima: Flags, count: Indices) -> Candidates:
         """Return the minima of the points with more than one; of too many the lowest. Overwrites minima."""
         limit = self._matching.max_candidates
@@ -218,14 +170,6 @@ class EnhancedSearch:
         disparity, point = disparity[rows], point[rows]
         difference = costs[disparity, point] / np.float32(self._matching.window_px**2)
         return Candidates(point, disparity, difference.astype(np.float32))
-
-
-SEARCHES: dict[str, Callable[[tuple[int, int], MatchingSettings], CandidateSearch]] = {
-    "auto": SemiGlobalSearch,
-    "semiglobal": SemiGlobalSearch,
-    "enhanced": EnhancedSearch,
-    "sad": ColumnSearch,
-}
 
 
 def _at(values: NDArray[Scalar], disparity: Indices) -> NDArray[Scalar]:

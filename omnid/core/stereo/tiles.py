@@ -16,6 +16,7 @@ The last three are blind. A direction is unknown where one tile of either camera
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Final, Literal
 
 import cv2
@@ -23,7 +24,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.panorama import Cylinder
-from omnid.core.stereo.tile_kernels import column_energies, tile_sums
 
 Image = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
@@ -38,7 +38,7 @@ TILE_ROWS: Final = 4  # 63 rows at scale 1.
 SPACING_PX: Final = 2
 LEAST_SAMPLES: Final = 100
 # Grey level from which a pixel is saturated.
-SATURATED_GREY: Final = np.uint8(250)
+SATURATED_GREY: Final = 250
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,40 +58,37 @@ class TileSampler:
 
     def __init__(self, visible: Flags, columns: int = TILE_COLUMNS) -> None:
         """visible (H, W): pixels that show the world; columns of tiles in W."""
-        self._shape, self._columns = visible.shape, columns
         tile_pixels = visible.size / (TILE_ROWS * columns)
         self._spacing_px = SPACING_PX if tile_pixels >= LEAST_SAMPLES * SPACING_PX**2 else 1
-        self._visible = self._sample(visible.view(np.uint8))
-        self._tiles = borders(self._visible.shape[0], TILE_ROWS), borders(self._visible.shape[1], columns)
-        ones = np.ones_like(self._visible)
-        self.pixels = self._sums(ones, ones)[0]
+        self._mask = self._sampled(np.where(visible, np.uint8(255), np.uint8(0)))
+        self._rows, self._columns = (
+            borders(*side) for side in zip(self._mask.shape, (TILE_ROWS, columns), strict=True)
+        )
+        self.pixels = self._sums(np.asarray(self._mask & 1, np.uint8))
         self._before: Image | None = None
 
     @property
     def areas(self) -> Numbers:
         """Pixels (TILE_ROWS, C) of each tile that are counted where all of it shows the world."""
-        return np.asarray(np.diff(self._tiles[0])[:, None] * np.diff(self._tiles[1]))
+        return np.asarray(np.diff(self._rows)[:, None] * np.diff(self._columns))
 
     def add(self, panorama: Image) -> TileSums:
-        """Return the sums of the next panorama (H, W).
-
-        Raises ValueError if it has another shape: the compiled loops do not check their bounds.
-        """
-        if panorama.shape != self._shape:
-            raise ValueError(f"a panorama is {panorama.shape}, not {self._shape}")
-        sample = self._sample(panorama)
+        """Return the sums of the next panorama (H, W)."""
+        sample = np.asarray(cv2.bitwise_and(self._sampled(panorama), self._mask), np.uint8)
         before, self._before = self._before, sample
-        grey, square, saturated, change = self._sums(sample, sample if before is None else before)
-        return TileSums(self.pixels, grey, square, saturated, change, before is None)
+        saturated = np.asarray(cv2.threshold(sample, SATURATED_GREY - 1, 1, cv2.THRESH_BINARY)[1], np.uint8)
+        change = np.asarray(cv2.absdiff(sample, sample if before is None else before), np.uint8)
+        grey, square = self._sums(sample), self._sums(sample, cv2.REDUCE_SUM2)
+        return TileSums(self.pixels, grey, square, self._sums(saturated), self._sums(change), before is None)
 
-    def _sample(self, image: Image) -> Image:
+    def _sampled(self, image: Image) -> Image:
         return np.ascontiguousarray(image[:: self._spacing_px, :: self._spacing_px])
 
-    def _sums(self, image: Image, before: Image) -> NDArray[np.int32]:
-        """Return the sums (4, TILE_ROWS, C) of `tile_sums` of samples of an image and the one before."""
-        sums = np.empty((4, TILE_ROWS, self._columns), np.int32)
-        tile_sums(image, before, self._visible, *self._tiles, SATURATED_GREY, sums)
-        return sums
+    def _sums(self, image: Image, operation: int = cv2.REDUCE_SUM) -> Numbers:
+        """Return the sums (TILE_ROWS, C) of an image over each tile, or those of its squares."""
+        bands = [image[low:high] for low, high in pairwise(self._rows)]
+        by_column = np.array([cv2.reduce(band, 0, operation, dtype=cv2.CV_64F)[0] for band in bands])
+        return np.add.reduceat(by_column, self._columns[:-1], axis=1).astype(np.int32)
 
 
 def borders(pixels: int, tiles: int) -> NDArray[np.int32]:
@@ -181,17 +178,16 @@ class TileMonitor:
         # Pixels at half resolution, all of which show the world, and so do their neighbours.
         height, width = visible.shape[0] // 2, visible.shape[1] // 2
         shown = cv2.erode(visible.astype(np.uint8), np.ones((5, 5), np.uint8))[: 2 * height, : 2 * width]
-        self._half = np.ascontiguousarray(shown.reshape(height, 2, width, 2).min(axis=(1, 3)))
-        self._half_columns = borders(width, columns)
-        shown_columns = np.add.reduceat(self._half.sum(axis=0, dtype=np.int64), self._half_columns[:-1])
-        self._half_counts = np.maximum(shown_columns, 1)
+        half = shown.reshape(height, 2, width, 2).min(axis=(1, 3))
+        self._half_mask, self._half_columns = 255 * half, borders(width, columns)[:-1]
+        self._half_counts = np.maximum(np.add.reduceat(half.sum(axis=0, dtype=np.int64), self._half_columns), 1)
         self._since_ns = dict.fromkeys(SIDES, 0)
         self._lively = {side: np.zeros(self._judged.shape) for side in SIDES}  # share of pairs that changed
         self._still = {side: np.zeros(self._judged.shape, np.intp) for side in SIDES}  # pairs in a row without change
         self._faint = {side: np.zeros(columns, np.intp) for side in SIDES}  # pairs in a row with little energy
 
     def sums(self, side: Side, panorama: Image) -> TileSums:
-        """Return the sums of a camera's next panorama (H, W) as the camera gave it; ValueError for another shape."""
+        """Return the sums of a camera's next panorama (H, W) as the camera gave it."""
         return self._samplers[side].add(panorama)
 
     def update(
@@ -248,9 +244,13 @@ class TileMonitor:
 
         There the noise is halved, and the texture that dirt takes away is not.
         """
-        sums = np.empty(self._columns)
-        column_energies(np.ascontiguousarray(image), self._half, self._half_columns, sums)
-        return sums / self._half_counts
+        height, width = self._half_mask.shape
+        half = cv2.resize(image[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
+        # The first row and the first column have no neighbour before them.
+        beside = cv2.copyMakeBorder(half, 1, 0, 1, 0, cv2.BORDER_REPLICATE)
+        steps = [cv2.absdiff(half, before) & self._half_mask for before in (beside[1:, :-1], beside[:-1, 1:])]
+        by_column = sum(cv2.reduce(step, 0, cv2.REDUCE_SUM2, dtype=cv2.CV_64F)[0] for step in steps)
+        return np.asarray(np.add.reduceat(by_column, self._half_columns) / self._half_counts)
 
     def _blurred(self, side: Side, energy: Array, other: Array, noise_grey: float) -> Flags:
         """Return the columns (C,) in which a camera shows far less than the other one does."""

@@ -1,39 +1,17 @@
-"""Choosing among candidates by lines to anchors: line differences, propagation of anchors, points left undecided."""
+"""Choosing among candidates by lines to anchors, which are propagated along a wall of equal courses."""
 
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
-from omnid.core.stereo.anchors import AnchorPropagation, Candidates, line_difference
+from omnid.core.stereo.anchors import AnchorPropagation, Candidates
 from tests.omnid.core.scenery import texture
 
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
 SHAPE, SHIFT_PX, COURSE_PX = (160, 640), 20, 12
-
-
-def lines(*ends: tuple[float, float, float]) -> NDArray[np.float32]:
-    return np.array(ends, np.float32).T
-
-
-def test_line_difference_is_the_mean_of_the_pixels_on_the_line() -> None:
-    lower, upper = texture(13, SHAPE), texture(14, SHAPE)
-    start, end = lines((10, 20, 10)), lines((42, 84, 22))
-    along = (np.arange(32) + 0.5) / 32
-    picked = []
-    for image, first, last in ((lower, (10, 20), (42, 84)), (upper, (10, 30), (42, 106))):
-        column, row = (np.array(first) + along[:, None] * (np.array(last) - first)).T
-        c, r = column.astype(int), row.astype(int)
-        u, v = column - c, row - r
-        picked.append(
-            (image[r, c] * (1 - u) + image[r, c + 1] * u) * (1 - v)
-            + (image[r + 1, c] * (1 - u) + image[r + 1, c + 1] * u) * v
-        )
-    expected = np.abs(picked[0] - picked[1]).mean()
-    assert line_difference((lower, upper), start, end, 32)[0] == pytest.approx(expected, abs=1.0)
 
 
 def courses() -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
