@@ -61,6 +61,8 @@ def describe_patches(panorama: PaddedPanorama, pixels: Array, sides_px: Array) -
 
     They are the square roots of the histograms' shares (RootSIFT: Arandjelovic and Zisserman 2012), in bytes.
     """
+    if not len(pixels):
+        return np.zeros((0, CELLS**2 * BINS), np.uint8)
     # 1. Lengths and directions (0 to BINS) of the gradients of the samples (N, SAMPLES, SAMPLES).
     patches = _patches(panorama, pixels, sides_px)
     dx = patches[:, 1:-1, 2:] - patches[:, 1:-1, :-2]
