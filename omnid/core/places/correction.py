@@ -118,8 +118,8 @@ class MapCorrection:
         #    with one of them is wrong with the others.
         same: dict[tuple[int, int], list[Link]] = {}
         for link in links:
-            a, b = self._places.keyframes[link.a], self._places.keyframes[link.b]
-            if link.is_loop and a.session == b.session:
+            sessions = {self._places.keyframes[id].session for id in (link.a, link.b)}
+            if link.is_loop and len(sessions) == 1:
                 same[link.a, link.b] = [*same.pop((link.a, link.b), []), link]
         if not same:
             return self.factor

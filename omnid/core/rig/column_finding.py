@@ -259,7 +259,7 @@ class RigFinding:
         if self.drift is None:
             return 0.0
         angles = (self.drift.turn, self.drift.turn_sigma), (self.drift.shift, self.drift.shift_sigma)
-        turn, shift = (np.linalg.norm(angle) - SIGMAS * np.linalg.norm(sigma) for angle, sigma in angles)
+        turn, shift = (float(np.linalg.norm(angle) - SIGMAS * np.linalg.norm(sigma)) for angle, sigma in angles)
         return float(np.rad2deg(max(turn, SHIFT_WEIGHT * shift, 0.0)))
 
     @property
