@@ -6,8 +6,7 @@ have no equal here: the nearest camera is fitted over the image, and how far it 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import cv2
@@ -16,9 +15,8 @@ import scipy.optimize
 
 from calib.errors import CalibError
 from calib.models.camera import Array, OmniCamera
-from calib.models.lens import LENS_KEYS, EquidistantCamera, lens_camera
-from calib.models.names import model_name
-from calib.models.unified import UnifiedCamera
+from calib.models.names import camera_of as known_camera
+from calib.models.names import changed, model_name, values_of
 from calib.validation import MAX_PIXELS, MAX_SIDE_PX, Warn, is_image_size, silent
 
 FOCAL: Final = ("fu", "fv", "pu", "pv")
@@ -94,50 +92,28 @@ def camera_of(model: str, values: Mapping[str, float], size: tuple[int, int], wa
             f"resolution: expected [width, height] in pixels, 1 to {MAX_SIDE_PX}, at most {MAX_PIXELS} in all, "
             f"found {list(size)}"
         )
-    fu, fv, pu, pv = (float(values[key]) for key in FOCAL)
-    focal, center = (fu, fv), (pu, pv)
-
-    def named(keys: Sequence[str]) -> list[float]:
-        return [float(values.get(key, 0.0)) for key in keys]
-
-    if model == "omni":
-        return UnifiedCamera(float(values["xi"]), focal, center, size, _four(named(RADTAN)))
-    if model == "equidistant":
-        return lens_camera("equidistant", named(EQUIDISTANT), focal, center, size)
-    if model in ("ds", "eucm"):
-        own = tuple(float(values[key]) for key in LENS_KEYS[model])
-        return lens_camera(model, own, focal, center, size)
+    pinhole = {key: float(values[key]) for key in FOCAL}
+    plain = {**pinhole, "xi": 0.0, **{key: values[key] for key in RADTAN if key in values}}
     if model == "ucm":  # the extended model with beta = 1
-        return lens_camera("eucm", (float(values["alpha"]), 1.0), focal, center, size)
-    plain = UnifiedCamera(0.0, focal, center, size, _four(named(RADTAN)))
-    if model == "pinhole" and not any(named(OPENCV[4:])):
-        return plain
+        return known_camera("eucm", {**values, "beta": 1.0}, size)
     if model == "fov":
-        start: OmniCamera = EquidistantCamera((0.0, 0.0, 0.0, 0.0), focal, center, size)
-        return _nearest(model, start, _fov_rays(values, focal, center, size), warn)
-    return _nearest("pinhole with k3 and more", plain, _opencv_rays(named(OPENCV), focal, center, size), warn)
+        return _nearest(model, known_camera("equidistant", pinhole, size), _fov_rays(values, size), warn)
+    if model != "pinhole":
+        return known_camera(model, values, size)
+    start, terms = known_camera("omni", plain, size), [float(values.get(key, 0.0)) for key in OPENCV]
+    if not any(terms[4:]):
+        return start
+    return _nearest("pinhole with k3 and more", start, _opencv_rays(terms, values, size), warn)
 
 
-def _four(values: Sequence[float]) -> tuple[float, float, float, float]:
-    first, second, third, fourth = values
-    return first, second, third, fourth
-
-
-def _grid(size: tuple[int, int]) -> Array:
-    """Return pixels (N, 2) spread over an image."""
-    u, v = np.meshgrid(*(np.linspace(0, side - 1, GRID) for side in size))
-    return np.column_stack([u.ravel(), v.ravel()])
-
-
-def _fov_rays(
-    values: Mapping[str, float], focal: tuple[float, float], center: tuple[float, float], size: tuple[int, int]
-) -> tuple[Array, Array]:
+def _fov_rays(values: Mapping[str, float], size: tuple[int, int]) -> tuple[Array, Array]:
     """Return pixels (N, 2) and rays (N, 3) of the model fov: r_d = atan(2 r_u tan(w / 2)) / w (Devernay, Faugeras)."""
     w = float(values["w"])
     if not 0 < w < np.pi:
         raise CalibError(f"fov camera: expected w between 0 and pi, found {w}")
-    pixels = _grid(size)
-    m = (pixels - center) / focal
+    u, v = np.meshgrid(*(np.linspace(0, side - 1, GRID) for side in size))
+    pixels = np.column_stack([u.ravel(), v.ravel()])
+    m = (pixels - (values["pu"], values["pv"])) / (values["fu"], values["fv"])
     radius = np.linalg.norm(m, axis=1)
     seen = radius * w < np.deg2rad(88)
     pixels, m, radius = pixels[seen], m[seen], radius[seen]
@@ -145,11 +121,10 @@ def _fov_rays(
     return pixels, np.column_stack([m * scale[:, None], np.ones(len(m))])
 
 
-def _opencv_rays(
-    terms: Sequence[float], focal: tuple[float, float], center: tuple[float, float], size: tuple[int, int]
-) -> tuple[Array, Array]:
+def _opencv_rays(terms: Sequence[float], values: Mapping[str, float], size: tuple[int, int]) -> tuple[Array, Array]:
     """Return pixels (N, 2) and rays (N, 3) of a pinhole camera with OpenCV's distortion terms."""
-    K = np.array([[focal[0], 0, center[0]], [0, focal[1], center[1]], [0, 0, 1.0]])
+    center = (values["pu"], values["pv"])
+    K = np.array([[values["fu"], 0, center[0]], [0, values["fv"], center[1]], [0, 0, 1.0]])
     found_pixels, found_rays = list[Array](), list[Array]()
     for azimuth in np.linspace(0, 2 * np.pi, 2 * GRID, endpoint=False):
         direction = np.array([np.cos(azimuth), np.sin(azimuth)])
@@ -178,7 +153,10 @@ def _nearest(name: str, start: OmniCamera, rays: tuple[Array, Array], warn: Warn
     pixels, directions = rays
     if len(pixels) < GRID:
         raise CalibError(f"{name}: it sees too little of its image: calibrate with pinhole-equi or ds")
-    make, first = _variable(start)
+    first = values_of(start)
+
+    def make(values: Array) -> OmniCamera:
+        return changed(start, dict(zip(first, (values - [*first.values()]).tolist(), strict=True)))
 
     def errors(values: Array) -> Array:
         try:
@@ -187,7 +165,7 @@ def _nearest(name: str, start: OmniCamera, rays: tuple[Array, Array], warn: Warn
             off = np.full(pixels.shape, LOST_PX)
         return np.clip(np.nan_to_num(off, nan=LOST_PX), -LOST_PX, LOST_PX).ravel()
 
-    found = scipy.optimize.least_squares(errors, first, x_scale="jac", method="trf", max_nfev=200).x
+    found = scipy.optimize.least_squares(errors, [*first.values()], x_scale="jac", method="trf", max_nfev=200).x
     camera, off = make(found), np.linalg.norm(errors(found).reshape(-1, 2), axis=1)
     rms_px, most_px = float(np.sqrt((off**2).mean())), float(off.max())
     if most_px > MAX_CONVERSION_PX:
@@ -200,21 +178,3 @@ def _nearest(name: str, start: OmniCamera, rays: tuple[Array, Array], warn: Warn
         "most"
     )
     return camera
-
-
-def _variable(start: OmniCamera) -> tuple[Callable[[Array], OmniCamera], Array]:
-    """Return the function that makes a camera of a vector of values, and the vector of the start."""
-    if isinstance(start, EquidistantCamera):
-        lens = start
-        return (
-            lambda v: replace(lens, focal=(v[0], v[1]), center=(v[2], v[3]), coefficients=_four(v[4:].tolist())),
-            np.array([*lens.focal, *lens.center, *lens.coefficients]),
-        )
-    assert isinstance(start, UnifiedCamera)
-    unified = start
-    return (
-        lambda v: replace(
-            unified, focal=(v[0], v[1]), center=(v[2], v[3]), distortion=_four(v[4:8].tolist()), xi=float(v[8])
-        ),
-        np.array([*unified.focal, *unified.center, *unified.distortion, unified.xi]),
-    )

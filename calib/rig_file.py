@@ -26,19 +26,8 @@ from calib import se3
 from calib.atomic_file import write_file
 from calib.errors import CalibError
 from calib.models.camera import Mask, OmniCamera
-from calib.models.equirectangular import EquirectangularCamera
-from calib.models.lens import LENS_KEYS, LensCamera, lens_camera, lens_parameters
-from calib.models.names import model_name
-from calib.models.ocam import (
-    ASTIGMATISM_NAMES,
-    DISTANCE_M,
-    MAX_COEFFICIENTS,
-    NO_WAVEFRONT,
-    TANGENTIAL_NAMES,
-    OcamCamera,
-    View,
-)
-from calib.models.unified import OMNI_NAMES, UnifiedCamera
+from calib.models.names import NAMES, OCAM_NAMES, camera_of, is_coefficient, model_name, values_of
+from calib.models.ocam import DISTANCE_M, OcamCamera, View
 from calib.models.wavefront import WAVEFRONT_NAMES
 from calib.rig import MountedCamera, Rig, ShutterTimes
 from calib.rig_covariance import MAX_PARAMETERS, TRANSFORM_NAMES, RigCovariance
@@ -80,16 +69,9 @@ class OcamIntrinsics(Struct, frozen=True):
     distance_m: float | None = None  # at which the central model is exact
 
 
-PINHOLE_KEYS: Final = ("fu", "fv", "pu", "pv")
-# Numbers of the other models, in the order of the file.
-KEYS: Final[Mapping[str, tuple[str, ...]]] = {
-    "omni": OMNI_NAMES,
-    **{model: (*keys, *PINHOLE_KEYS) for model, keys in LENS_KEYS.items()},
-    "equirectangular": PINHOLE_KEYS,
-}
 INTRINSICS: Final[Mapping[str, type[Struct]]] = {
     "ocam": OcamIntrinsics,
-    **{model: defstruct(f"{model}_intrinsics", [(key, float) for key in keys]) for model, keys in KEYS.items()},
+    **{model: defstruct(f"{model}_intrinsics", [(key, float) for key in keys]) for model, keys in NAMES.items()},
 }
 
 
@@ -218,25 +200,13 @@ def _mounted(side: str, table: CameraTable, folder: Path | None) -> MountedCamer
 
 def _camera(table: CameraTable, i: Struct) -> OmniCamera:
     """Return the camera of a table and its intrinsics."""
-    if isinstance(i, OcamIntrinsics):
-        return OcamCamera(
-            i.polynomial,
-            (i.center_row, i.center_column),
-            (i.c, i.d, i.e),
-            table.size,
-            table.view or "mirror",
-            (i.p1 or 0.0, i.p2 or 0.0),
-            (i.s1 or 0.0, i.s2 or 0.0),
-            i.wavefront or NO_WAVEFRONT,
-            DISTANCE_M if i.distance_m is None else i.distance_m,
-        )
-    if table.model == "omni":
-        xi, fu, fv, pu, pv, k1, k2, p1, p2 = astuple(i)
-        return UnifiedCamera(xi, (fu, fv), (pu, pv), table.size, (k1, k2, p1, p2))
-    *parameters, fu, fv, pu, pv = astuple(i)
-    if table.model == "equirectangular":
-        return EquirectangularCamera((fu, fv), (pu, pv), table.size)
-    return lens_camera(table.model, parameters, (fu, fv), (pu, pv), table.size)
+    values = {name: value for name, value in asdict(i).items() if value is not None}
+    if not isinstance(i, OcamIntrinsics):
+        return camera_of(table.model, values, table.size)
+    distance_m = values.pop("distance_m", DISTANCE_M)
+    values |= {f"a{power}": value for power, value in enumerate(values.pop("polynomial"))}
+    values |= dict(zip(WAVEFRONT_NAMES, values.pop("wavefront", ()), strict=False))
+    return camera_of("ocam", values, table.size, table.view or "mirror", distance_m)
 
 
 def _mask(path: str, table: MaskTable, size: Size, folder: Path | None) -> Mask:
@@ -286,12 +256,11 @@ def _require_size(size: Size, found: tuple[int, ...]) -> None:
 def _covariance(table: CovarianceTable, rig: RigTable) -> RigCovariance:
     """Return the covariance of the parameters of both cameras and of the transform between them."""
     _require_version("covariance.version", table.version, COVARIANCE_VERSION)
-    ocam = ("center_row", "center_column", "c", "d", *TANGENTIAL_NAMES, *ASTIGMATISM_NAMES, *WAVEFRONT_NAMES)
     known, names = {*TRANSFORM_NAMES}, table.parameters
     for side, camera in (("lower", rig.lower), ("upper", rig.upper)):
-        coefficients = [f"a{power}" for power in range(MAX_COEFFICIENTS)]
-        own = (*coefficients, *ocam) if camera.model == "ocam" else OMNI_NAMES
-        known |= {f"{side} {name}" for name in own}
+        known |= {f"{side} {name}" for name in NAMES.get(camera.model, OCAM_NAMES)}
+        if camera.model == "ocam":
+            known |= {name for name in names if name.startswith(f"{side} ") and is_coefficient(name.split()[-1])}
     if not (1 <= len(names) <= MAX_PARAMETERS and known.issuperset(names)):
         raise CalibError(
             f"covariance.parameters: expected 1 to {MAX_PARAMETERS} names of the cameras' parameters and of the "
@@ -350,24 +319,13 @@ def rig_toml(rig: Rig, images: Mapping[str, str] | None = None) -> str:
 
 def _intrinsics(camera: OmniCamera) -> Mapping[str, object]:
     """Return the intrinsics of a camera by their keys; optional terms of an ocam camera that are 0 are None."""
-    if isinstance(camera, OcamCamera):
-        p1, p2 = camera.tangential if any(camera.tangential) else (None, None)
-        s1, s2 = camera.astigmatism if any(camera.astigmatism) else (None, None)
-        a, b, x, y, s = camera.wavefront
-        waves = ((a, b, x, y, s), camera.distance_m) if any(camera.wavefront) else (None, None)
-        return asdict(
-            OcamIntrinsics(camera.polynomial, *camera.center_row_column, *camera.affine, p1, p2, s1, s2, *waves)
-        )
-    values: tuple[float, ...]
-    if isinstance(camera, UnifiedCamera):
-        values = (camera.xi, *camera.focal, *camera.center, *camera.distortion)
-    elif isinstance(camera, LensCamera):
-        values = (*lens_parameters(camera), *camera.focal, *camera.center)
-    elif isinstance(camera, EquirectangularCamera):
-        values = (*camera.focal, *camera.center)
-    else:
-        raise CalibError(f"rig file: expected a camera of a known model, found {type(camera).__name__}")
-    return dict(zip(KEYS[model_name(camera)], values, strict=True))
+    if not isinstance(camera, OcamCamera):
+        return values_of(camera)
+    p1, p2 = camera.tangential if any(camera.tangential) else (None, None)
+    s1, s2 = camera.astigmatism if any(camera.astigmatism) else (None, None)
+    a, b, x, y, s = camera.wavefront
+    waves = ((a, b, x, y, s), camera.distance_m) if any(camera.wavefront) else (None, None)
+    return asdict(OcamIntrinsics(camera.polynomial, *camera.center_row_column, *camera.affine, p1, p2, s1, s2, *waves))
 
 
 def _mask_values(mask: Mask, name: str | None) -> Mapping[str, object]:

@@ -9,10 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib import se3
-from calib.errors import CalibError
-from calib.fit.parameterisation import parameterise
 from calib.models.camera import Array
-from calib.models.ocam import has_wavefront
+from calib.models.names import changed
 from calib.rig import Rig
 from calib.rig_covariance import TRANSFORM_NAMES, RigCovariance
 
@@ -58,22 +56,18 @@ def perturbed_rig(rig: Rig, names: tuple[str, ...], changes: Array) -> Rig:
     Raises CalibError if the result is no camera.
     """
     change = dict(zip(names, changes.tolist(), strict=True))
-    cameras = []
-    for side, mounted in (("lower", rig.lower), ("upper", rig.upper)):
-        if not any(name.startswith(side) for name in names):
-            cameras.append(mounted.camera)
-            continue
-        parameters = parameterise(mounted.camera, wavefront=has_wavefront(mounted.camera))
-        steps = [
-            change.pop(f"{side} {name}", 0.0) / unit
-            for name, unit in zip(parameters.names, parameters.units, strict=True)
-        ]
-        cameras.append(parameters.camera_at(np.array(steps)))
     r_x, r_y, r_z, e_x, e_y, longer = (change.pop(name, 0.0) for name in TRANSFORM_NAMES)
-    if change:
-        raise CalibError(f"covariance: the rig has no parameter {next(iter(change))!r}")
     moved = rig.with_upper_moved(np.array([r_x, r_y, r_z]), np.array([e_x, e_y]), longer)
-    return replace(moved, lower=replace(moved.lower, camera=cameras[0]), upper=replace(moved.upper, camera=cameras[1]))
+    lower, upper = (
+        replace(
+            mounted,
+            camera=changed(
+                mounted.camera, {name[6:]: value for name, value in change.items() if name.startswith(f"{side} ")}
+            ),
+        )
+        for side, mounted in (("lower", moved.lower), ("upper", moved.upper))
+    )
+    return replace(moved, lower=lower, upper=upper)
 
 
 def drive_uncertainty(rig: Rig) -> DriveUncertainty | None:

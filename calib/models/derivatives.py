@@ -1,7 +1,6 @@
-"""Derivatives of the pixels of cameras by points and by named parameters, in closed form, for the fits.
+"""Derivatives of the pixels of ocam cameras by points and by named parameters, in closed form, for the fit to boards.
 
-The names are those of files: OMNI_NAMES of a unified camera; of an ocam camera a0, a2 ..., center_row, center_column,
-c, d (with which e moves along, because their difference is a rotation of the camera), and the terms of real mirrors.
+The names are those of models/names.py; d moves e along, because their difference is a rotation of the camera.
 """
 
 from __future__ import annotations
@@ -10,10 +9,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calib.errors import CalibError
-from calib.models.camera import Array, OmniCamera
+from calib.models.camera import Array
 from calib.models.ocam import ASTIGMATISM_NAMES, TANGENTIAL_NAMES, OcamCamera
-from calib.models.unified import UnifiedCamera
 from calib.models.wavefront import TERMS, WAVEFRONT_NAMES, directions_to, offsets
 
 # Step on the unit sphere of the derivatives of a wavefront's offsets, which are smooth over a radian.
@@ -22,56 +19,17 @@ SPHERE_STEP = 1e-4
 SERIES = 3
 
 
-def pixel_derivatives(camera: OmniCamera, points: Array, names: Sequence[str]) -> tuple[Array, Array]:
+def pixel_derivatives(camera: OcamCamera, points: Array, names: Sequence[str]) -> tuple[Array, Array]:
     """Return the derivatives (N, 2, 3) by points (N, 3) [m], near ones as they are, and (N, 2, P) by the parameters.
 
-    Not finite where the camera does not see a point.
+    Not finite where the camera does not see a point. Scaramuzza et al. 2006, with the implicit function f(rho) r - z
+    rho = 0 for the radius.
     """
     with np.errstate(all="ignore"):
-        if isinstance(camera, UnifiedCamera):
-            return _of_unified(camera, points, names)
-        if isinstance(camera, OcamCamera):
-            return _of_ocam(camera, points, names)
-    raise CalibError(f"calibrate: expected an omni or ocam camera, found {type(camera).__name__}")
+        return _derivatives(camera, np.asarray(points, float), names)
 
 
-def _of_unified(camera: UnifiedCamera, points: Array, names: Sequence[str]) -> tuple[Array, Array]:
-    """Mei and Rives 2007: m = (x, y) / (z + xi |p|), distortion, focal lengths."""
-    norm = np.linalg.norm(points, axis=1)
-    w = points[:, 2] + camera.xi * norm
-    m = points[:, :2] / w[:, None]
-    by_w = camera.xi * points / norm[:, None] + np.array([0.0, 0.0, 1.0])
-    m_by_point = (np.eye(2, 3) - m[:, :, None] * by_w[:, None]) / w[:, None, None]
-    k1, k2, p1, p2 = camera.distortion
-    x, y = m.T
-    r2 = x * x + y * y
-    radial, slope = 1 + r2 * (k1 + k2 * r2), 2 * k1 + 4 * k2 * r2
-    bent = _pairs(
-        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-    )
-    cross = slope * x * y + 2 * p1 * x + 2 * p2 * y
-    D = _matrices(
-        radial + slope * x * x + 2 * p1 * y + 6 * p2 * x, cross, cross, radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
-    )
-    zero, one = np.zeros(len(points)), np.ones(len(points))
-    focal = np.array(camera.focal)
-    columns = {
-        "xi": np.einsum("nij,nj->ni", D, -m * (norm / w)[:, None]) * focal,
-        "fu": _pairs(bent[:, 0], zero),
-        "fv": _pairs(zero, bent[:, 1]),
-        "pu": _pairs(one, zero),
-        "pv": _pairs(zero, one),
-        "k1": m * r2[:, None] * focal,
-        "k2": m * (r2 * r2)[:, None] * focal,
-        "p1": _pairs(2 * x * y, r2 + 2 * y * y) * focal,
-        "p2": _pairs(r2 + 2 * x * x, 2 * x * y) * focal,
-    }
-    return focal[:, None] * (D @ m_by_point), _stacked(columns, names, len(points))
-
-
-def _of_ocam(camera: OcamCamera, points: Array, names: Sequence[str]) -> tuple[Array, Array]:
-    """Scaramuzza et al. 2006, with the implicit function f(rho) r - z rho = 0 for the radius."""
-    points = np.asarray(points, float)
+def _derivatives(camera: OcamCamera, points: Array, names: Sequence[str]) -> tuple[Array, Array]:
     waves = [name for name in names if name in WAVEFRONT_NAMES]
     # 1. The direction of the ray through the point, of a mirror whose rays do not meet in one point.
     ray_by_point, rays = None, points
@@ -120,7 +78,7 @@ def _of_ocam(camera: OcamCamera, points: Array, names: Sequence[str]) -> tuple[A
         ASTIGMATISM_NAMES[1]: _pairs(6 * x2 * y + 2 * y2 * y, 2 * x2 * x + 6 * x * y2) @ affine.T,
     }
     for name in names:
-        if name[0] == "a" and name[1:].isdigit():
+        if name[0] == "a":
             columns[name] = np.einsum("nij,nj->ni", A, _pairs(ux, uy) * (-r * rho ** int(name[1:]) / by_rho)[:, None])
     columns |= {name: np.einsum("nij,nj->ni", by_ray, change) for name, change in ray_by_wave.items()}
     by_point = by_ray if ray_by_point is None else by_ray @ ray_by_point

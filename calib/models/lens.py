@@ -6,9 +6,7 @@ middle of the image, and aberrations of a reflected wavefront.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
 
 import numpy as np
 
@@ -148,33 +146,6 @@ class EquidistantCamera:
 
 
 LensCamera = DoubleSphereCamera | ExtendedUnifiedCamera | EquidistantCamera
-# Parameters of each model in addition to the focal lengths and the centre, by their keys in files.
-LENS_KEYS: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {"ds": ("xi", "alpha"), "eucm": ("alpha", "beta"), "equidistant": ("k1", "k2", "k3", "k4")}
-)
-
-
-def lens_camera(
-    model: str,
-    parameters: Sequence[float],
-    focal: tuple[float, float],
-    center: tuple[float, float],
-    size: tuple[int, int],
-) -> LensCamera:
-    """Return a camera of a model; parameters as LENS_KEYS lists them. Raise CalibError for wrong ones."""
-    if model == "equidistant":
-        k1, k2, k3, k4 = parameters
-        return EquidistantCamera((k1, k2, k3, k4), focal, center, size)
-    first, second = parameters
-    made = DoubleSphereCamera if model == "ds" else ExtendedUnifiedCamera
-    return made(first, second, focal, center, size)
-
-
-def lens_parameters(camera: LensCamera) -> tuple[float, ...]:
-    """Return the parameters in the order of LENS_KEYS."""
-    if isinstance(camera, EquidistantCamera):
-        return camera.coefficients
-    return (camera.xi, camera.alpha) if isinstance(camera, DoubleSphereCamera) else (camera.alpha, camera.beta)
 
 
 def _check(

@@ -1,12 +1,30 @@
-"""Names of the camera models, in files and for people; which of them see directly, and how much of their images."""
+"""Camera models by their names, and their parameters by name: as files state them and as fits change them."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from calib.errors import CalibError
 from calib.models.camera import Mask, OmniCamera, inscribed_mask, whole_image
 from calib.models.equirectangular import EquirectangularCamera
 from calib.models.lens import DoubleSphereCamera, EquidistantCamera, ExtendedUnifiedCamera
-from calib.models.ocam import OcamCamera
-from calib.models.unified import UnifiedCamera
+from calib.models.ocam import ASTIGMATISM_NAMES, DISTANCE_M, TANGENTIAL_NAMES, OcamCamera, View
+from calib.models.unified import OMNI_NAMES, UnifiedCamera
+from calib.models.wavefront import WAVEFRONT_NAMES
+
+PINHOLE_NAMES = ("fu", "fv", "pu", "pv")
+# Parameters of the models in the order of files. Those of an ocam camera: a0, a1 ... of its polynomial, then these.
+NAMES: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "omni": OMNI_NAMES,
+        "ds": ("xi", "alpha", *PINHOLE_NAMES),
+        "eucm": ("alpha", "beta", *PINHOLE_NAMES),
+        "equidistant": ("k1", "k2", "k3", "k4", *PINHOLE_NAMES),
+        "equirectangular": PINHOLE_NAMES,
+    }
+)
+OCAM_NAMES = ("center_row", "center_column", "c", "d", "e", *TANGENTIAL_NAMES, *ASTIGMATISM_NAMES, *WAVEFRONT_NAMES)
 
 
 def model_name(camera: OmniCamera) -> str:
@@ -20,6 +38,90 @@ def model_name(camera: OmniCamera) -> str:
     if isinstance(camera, EquirectangularCamera):
         return "equirectangular"
     return "equidistant" if isinstance(camera, EquidistantCamera) else "omni"
+
+
+def values_of(camera: OmniCamera) -> dict[str, float]:
+    """Return all parameters of a camera by name, in the order of files; CalibError for a camera of no known model."""
+    if isinstance(camera, OcamCamera):
+        polynomial = {f"a{power}": value for power, value in enumerate(camera.polynomial)}
+        others = (*camera.center_row_column, *camera.affine, *camera.tangential, *camera.astigmatism, *camera.wavefront)
+        return polynomial | dict(zip(OCAM_NAMES, others, strict=True))
+    values: tuple[float, ...]
+    if isinstance(camera, UnifiedCamera):
+        values = (camera.xi, *camera.focal, *camera.center, *camera.distortion)
+    elif isinstance(camera, DoubleSphereCamera):
+        values = (camera.xi, camera.alpha, *camera.focal, *camera.center)
+    elif isinstance(camera, ExtendedUnifiedCamera):
+        values = (camera.alpha, camera.beta, *camera.focal, *camera.center)
+    elif isinstance(camera, EquidistantCamera):
+        values = (*camera.coefficients, *camera.focal, *camera.center)
+    elif isinstance(camera, EquirectangularCamera):
+        values = (*camera.focal, *camera.center)
+    else:
+        raise CalibError(f"expected a camera of a known model, found {type(camera).__name__}")
+    return dict(zip(NAMES[model_name(camera)], values, strict=True))
+
+
+def camera_of(
+    model: str,
+    values: Mapping[str, float],
+    size: tuple[int, int],
+    view: View = "mirror",
+    distance_m: float = DISTANCE_M,
+) -> OmniCamera:
+    """Return the camera of a model with these parameters; those of distortions and of real mirrors may be missing.
+
+    size (width, height) [px]; view and distance_m: of an ocam camera. Raise CalibError for values of no camera.
+    """
+    v = {name: float(value) for name, value in values.items()}
+    if model == "ocam":
+        degree = max(int(name[1:]) for name in v if is_coefficient(name))
+        s1, s2, p1, p2 = (v.get(name, 0.0) for name in (*ASTIGMATISM_NAMES, *TANGENTIAL_NAMES))
+        return OcamCamera(
+            tuple(v.get(f"a{power}", 0.0) for power in range(degree + 1)),
+            (v["center_row"], v["center_column"]),
+            (v["c"], v["d"], v["e"]),
+            size,
+            view,
+            (p1, p2),
+            (s1, s2),
+            tuple(v.get(name, 0.0) for name in WAVEFRONT_NAMES),
+            distance_m,
+        )
+    focal, center = (v["fu"], v["fv"]), (v["pu"], v["pv"])
+    k1, k2, k3, k4, p1, p2 = (v.get(name, 0.0) for name in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    match model:
+        case "omni":
+            return UnifiedCamera(v["xi"], focal, center, size, (k1, k2, p1, p2))
+        case "ds":
+            return DoubleSphereCamera(v["xi"], v["alpha"], focal, center, size)
+        case "eucm":
+            return ExtendedUnifiedCamera(v["alpha"], v["beta"], focal, center, size)
+        case "equidistant":
+            return EquidistantCamera((k1, k2, k3, k4), focal, center, size)
+    return EquirectangularCamera(focal, center, size)
+
+
+def changed(camera: OmniCamera, changes: Mapping[str, float]) -> OmniCamera:
+    """Return the camera after changes of named parameters; CalibError for a name or a result of no such camera.
+
+    d of an ocam camera moves d and e alike, because their difference is a rotation of the camera.
+    """
+    values = values_of(camera)
+    for name, change in changes.items():
+        if name not in values and not (isinstance(camera, OcamCamera) and is_coefficient(name)):
+            raise CalibError(f"a camera of the model {model_name(camera)} has no parameter {name!r}")
+        values[name] = values.get(name, 0.0) + change
+        if name == "d" and isinstance(camera, OcamCamera):
+            values["e"] += change
+    if isinstance(camera, OcamCamera):
+        return camera_of("ocam", values, camera.size, camera.view, camera.distance_m)
+    return camera_of(model_name(camera), values, camera.size)
+
+
+def is_coefficient(name: str) -> bool:
+    """True for the name of a coefficient of a polynomial, like a2."""
+    return name[0] == "a" and name[1:].isdigit()
 
 
 def model_in_words(camera: OmniCamera) -> str:

@@ -14,19 +14,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calib import se3
 from calib.fit.boards.rig_fit import RigCalibration
-from calib.fit.rig_uncertainty import seen_points
 from calib.models.camera import Array, OmniCamera, inside_image
 from calib.rig import MountedCamera, Rig
-from omnid.calibration.images import SIDES
 from omnid.calibration.live_boards import HOURS, listed
 
 BIN_DEG: Final = 10
 IMAGE_STEP_PX: Final = 4  # Between the pixels by which the parts of an image are told.
-MORE_PAIRS: Final = 6  # Six pairs, spread over the azimuth, lower the error of lengths to a third or less.
-# Part of the rays of a drive without a board near them that asks for more pairs: less is the edge of slanted boards.
-LEAST_PART: Final = 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +32,6 @@ class AngleRow:
     rms_px: float  # per coordinate; NaN without corners
     uncovered: tuple[int, ...]  # o'clock, 1 to 12, that the camera sees and no corner lay in
     visible: int  # number of hours that the camera sees
-    needed: float  # part of the rays of a drive that lie in the uncovered directions
 
     def cells(self) -> tuple[str, str, str, str]:
         """Return the texts of a table's row."""
@@ -62,26 +55,21 @@ def angle_rows(found: RigCalibration, rig: Rig, side: int) -> list[AngleRow]:
     # 1. The bins and hours of the corners, and their residuals.
     views = [(k, seen.pixels) for k, view in enumerate(found.views) if (seen := view.seen[side]) is not None]
     pixels = np.concatenate([seen for _, seen in views])
-    residuals = np.concatenate([np.split(found.fit.residuals[k], 2)[side] for k, _ in views])
+    residuals = np.concatenate([found.fit.residuals[k, side] for k, _ in views])
     known = np.isfinite(pixels).all(axis=1) & np.isfinite(residuals).all(axis=1)
     bins, hours = _places(camera, pixels[known])
     squares = (residuals[known] ** 2).mean(axis=1)
-    # 2. Those of the image, and of the rays of a drive.
+    # 2. Those of the image.
     image_bins, image_hours = _places(camera, _visible_pixels(mounted))
-    drive = seen_points(rig)
-    rays = se3.apply(mounted.T_cam_rig @ se3.inverse(rig.T_rect_rig), drive) if len(drive) else np.zeros((0, 3))
-    drive_bins, drive_hours = _places(camera, camera.project(rays))
     # 3. One row each.
     rows = []
     for number in range(int(max(bins.max(initial=0), image_bins.max(initial=0))) + 1):
         visible = np.unique(image_hours[image_bins == number])
         missing = visible[~np.isin(visible, hours[bins == number])]
-        needed = (drive_bins == number) & np.isin(drive_hours, missing)
         inside = bins == number
         rms_px = math.sqrt(float(squares[inside].mean())) if inside.any() else math.nan
         uncovered = tuple(sorted(int(hour) or HOURS for hour in missing))
-        part = float(needed.mean()) if len(needed) else 0.0
-        rows.append(AngleRow(BIN_DEG * number, int(inside.sum()), rms_px, uncovered, len(visible), part))
+        rows.append(AngleRow(BIN_DEG * number, int(inside.sum()), rms_px, uncovered, len(visible)))
     return rows
 
 
@@ -90,21 +78,6 @@ def angle_lines(name: str, rows: Sequence[AngleRow]) -> list[str]:
     lines = [f"{name} camera: residuals by the angle from its axis"]
     cells = [HEAD, *(row.cells() for row in rows)]
     return lines + [f"  {a:<19} {b:>7} {c:>8}  {d}".rstrip() for a, b, c, d in cells]
-
-
-def missing_boards(tables: Sequence[Sequence[AngleRow]]) -> str:
-    """Return which pairs to add: where the most rays of a drive pass no board; "" where few do."""
-    side, row = max(
-        ((side, row) for side, rows in enumerate(tables) for row in rows), key=lambda place: place[1].needed
-    )
-    if row.needed < LEAST_PART:
-        return ""
-    low, _, _, where = row.cells()
-    place = "all around" if where == "anywhere" else f"at {where}"
-    return (
-        f"{row.needed:.0%} of the rays of a drive pass the {SIDES[side]} camera where no board was: add {MORE_PAIRS} "
-        f"pairs with the board {low} from its axis, {place}"
-    )
 
 
 def _places(camera: OmniCamera, pixels: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

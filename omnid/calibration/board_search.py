@@ -9,20 +9,20 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
+from calib.boards.aprilgrid import AprilGrid, find_april_grid
 from calib.boards.board import Board, BoardView
 from calib.boards.board_finder import BoardSearch, find_board
-from calib.boards.marker_board import AprilGrid, CharucoBoard
-from calib.boards.marker_finder import find_marker_board
-from calib.boards.marker_reading import seen_dictionary
 from omnid.calibration.images import Image, Images
 from omnid.errors import OmnidError
 
-AnyBoard = Board | CharucoBoard | AprilGrid
+AnyBoard = Board | AprilGrid
 Progress = Callable[[str], None]  # receives the lines that a long calibration reports while it runs
 # A log shows similar views many times: this number of diverse views is as good as all, in a fraction of the time.
 MAX_LOG_VIEWS = 40
-# Images in which markers of other dictionaries are searched if no board is found.
-HINT_IMAGES = 3
+TAGS_HINT = (
+    "check --tags and --tag-spacing, and take images with the board nearer (six pixels a bit of its tags), sharp and "
+    "well lit"
+)
 
 
 def silent(line: str) -> None:
@@ -33,7 +33,7 @@ def search_board(image: Image, board: AnyBoard, name: str = "", *, thorough: boo
     """Search a board of any kind in an image; name: of the view that is found. thorough: see `find_board`."""
     if isinstance(board, Board):
         return find_board(image, board, name, thorough=thorough)
-    return BoardSearch(find_marker_board(image, board, name, thorough=thorough))
+    return BoardSearch(find_april_grid(image, board, name, thorough=thorough))
 
 
 def find_boards(images: Images, board: AnyBoard, *, thorough: bool, progress: Progress = silent) -> list[BoardView]:
@@ -54,7 +54,7 @@ def find_boards(images: Images, board: AnyBoard, *, thorough: bool, progress: Pr
     if views and max(other_grids.values(), default=0) > len(views):
         progress(f"the board was found in {len(views)}, {_grid_hint(other_grids)}")
     if not views:
-        hint = _grid_hint(other_grids) if isinstance(board, Board) else _marker_hint(images, board)
+        hint = _grid_hint(other_grids) if isinstance(board, Board) else TAGS_HINT
         raise OmnidError(f"calibrate: no {board} in any of {len(images)} images; {hint}")
     return views
 
@@ -73,19 +73,6 @@ def _grid_hint(other_grids: Counter[tuple[int, int]]) -> str:
         return "count the inner corners, and take images with the whole board in view, sharp and well lit"
     (columns, rows), times = other_grids.most_common(1)[0]
     return f"a grid of {columns}x{rows} was found in {times}: try --corners {columns}x{rows}"
-
-
-def _marker_hint(images: Images, board: CharucoBoard | AprilGrid) -> str:
-    layout, sample = board.markers, list(images.values())[:: -(-len(images) // HINT_IMAGES)]
-    names = [name for image in sample if (name := seen_dictionary(image, layout.border_bits))]
-    if not names:
-        return "take images with the board nearer (six pixels a bit of its markers), sharp and well lit"
-    name = Counter(names).most_common(1)[0][0]
-    if isinstance(board, CharucoBoard) and name != board.dictionary:
-        return f"markers of {name} were seen: try --dictionary {name}"
-    if isinstance(board, AprilGrid):
-        return f"markers of {name} were seen, not at the places of such a grid: check --tags and --tag-spacing"
-    return "its markers were seen, not at the places of such a board: check --corners, --marker-mm, --legacy-charuco"
 
 
 def select_diverse_views(views: Sequence[BoardView]) -> list[BoardView]:

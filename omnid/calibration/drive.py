@@ -17,12 +17,10 @@ from calib.fit.drive.adjustment import (
     DriveAdjustment,
     adjust_drive,
     adjust_pairs,
-    held_out_error,
+    drive_structure,
     observation_sigma,
 )
-from calib.fit.drive.camera_terms import DriveModelScore, best_model, candidate_distortions, drive_structure
 from calib.fit.drive.rig_parameters import LINE_TIME, TRANSFORM_NAMES, UPPER_DELAY, RigParameters
-from calib.fit.drive.rig_prior import baseline_by_prior, nominal_sigmas, prior_information
 from calib.fit.residual_structure import ResidualStructure
 from calib.fit.rig_drift import apply_drift
 from calib.fit.rig_uncertainty import drive_uncertainty
@@ -53,8 +51,8 @@ MIN_DISTANCE_M, MAX_SCALE_CHANGE = 1.0, 0.05
 # Error of the landmarks with the new rig, in parts of that with the old one. Free parameters always lower the error a
 # little, so a smaller gain does not show a better rig.
 SMALL_GAIN = 0.95
-# Distortion terms until the model is chosen: those of a camera tilted below its mirror.
-START_DISTORTION = ("p1", "p2")
+# Distortion terms of omni cameras that are fitted although the file has none: a camera may be tilted below its mirror.
+DISTORTION = ("p1", "p2")
 TIMES = (UPPER_DELAY, LINE_TIME)
 # Times below these are those of synchronous cameras with global shutters; so are times within four of their sigmas.
 MIN_TIME, TIME_SIGMAS = {UPPER_DELAY: 0.5, LINE_TIME: 1.0}, 4.0
@@ -72,7 +70,6 @@ class DriveCalibration:
     before: Rig
     rig: Rig  # with its covariance
     adjustment: DriveAdjustment
-    scores: tuple[DriveModelScore, ...]
     first_sigma_px: float  # of an observation with the rig as it was
     scale_change: float  # relative change of lengths against the rig before
     structure: tuple[ResidualStructure, ResidualStructure]  # of the residuals in the lower and the upper image
@@ -176,31 +173,25 @@ def calibrate_drive(
     #    lengths of other drives less well.
     cameras = LogCameras(*topics)
     before = with_masks(paths[0], rig, cameras)
-    distortion = START_DISTORTION if len(candidate_distortions(before)) > 1 else ()
     waves = any(has_wavefront(mounted.camera) for mounted in (before.lower, before.upper))
-    parameters = RigParameters.about(before, distortion, TIMES, waves=waves)
+    parameters = RigParameters.about(before, DISTORTION, TIMES, waves=waves)
     # 2. Straighten the panoramas until columns match, so that the odometry can track.
     steps = straightened(paths[0], parameters, cameras, config, progress)
     require_same_rig(parameters, steps, tracked=False)
     # 3. Track and adjust in rounds, until lengths change no more.
     found, drives = _in_rounds(paths, parameters, steps, cameras, config, progress)
-    # 4. Choose the distortion terms by landmarks held out, and the times of exposure that differ from none.
-    scores = tuple(_score(found, drives, terms, waves) for terms in candidate_distortions(before))
-    for score in scores if len(scores) > 1 else ():
-        progress(str(score))
-    terms, times = best_model(scores).distortion, significant_times(found)
-    # 5. Adjust once more with the chosen ones, and refuse what is another rig.
-    if (terms, times) != (distortion, TIMES):
-        parameters = RigParameters.about(_with_times(before, times), terms, times, waves=waves)
+    # 4. Adjust once more without the times of exposure that do not differ from none, and refuse what is another rig.
+    times = significant_times(found)
+    if times != TIMES:
+        parameters = RigParameters.about(_with_times(before, times), DISTORTION, times, waves=waves)
         found = _adjusted(parameters, _named_steps(parameters, found), drives)
     require_same_rig(parameters, found.state.steps)
-    # 6. The length of the baseline by the prior, the covariance, and a level frame of a nominal rig.
+    # 5. The length of the baseline by the prior, the covariance, and a level frame of a nominal rig.
     adjusted, level_rad = _finished_rig(before, found, drives)
     return DriveCalibration(
         before,
         adjusted,
         found,
-        scores,
         observation_sigma(before, found, drives.fixed),
         # By the rays of the adjustment, and by the length of the baseline.
         scale_change(found, before) + float(np.log(adjusted.baseline_m / before.baseline_m)),
@@ -226,12 +217,11 @@ def straightened(
         )
     # Errors of a centre have the effect of a shifted viewpoint, so only the rotation is a start.
     steps = parameters.transform_steps(apply_drift(rig, replace(finding.drift, shift=np.zeros(2))))
-    prior = prior_information(parameters, rig)
     if float(np.median([abs(pair.skew_s) for pair in pairs])) > SYNCHRONOUS_S:
         return steps  # the motion between the exposures would be taken for errors of the centres
     for _ in range(PAIR_ROUNDS):
         state, observations = observe_pairs(pairs, parameters.at(steps), config)
-        steps = adjust_pairs(parameters, replace(state, steps=steps), observations, prior)
+        steps = adjust_pairs(parameters, replace(state, steps=steps), observations)
     finding = check_rig(pairs, parameters.at(steps), config.panorama).finding
     progress(finding.summary)
     return steps
@@ -265,11 +255,8 @@ def _in_rounds(
 
 
 def _adjusted(parameters: RigParameters, steps: Array, drives: Drives) -> DriveAdjustment:
-    prior = prior_information(parameters, parameters.rig)
     alike = 1.0 if parameters.rig.covariance is None else OBSERVATIONS_ALIKE
-    return adjust_drive(
-        parameters, replace(drives.state, steps=steps), drives.observations, prior, drives.fixed, alike=alike
-    )
+    return adjust_drive(parameters, replace(drives.state, steps=steps), drives.observations, drives.fixed, alike=alike)
 
 
 def _named_steps(parameters: RigParameters, found: DriveAdjustment) -> Array:
@@ -278,19 +265,13 @@ def _named_steps(parameters: RigParameters, found: DriveAdjustment) -> Array:
     return np.array([steps.get(name, 0.0) for name in parameters.names])
 
 
-def _score(found: DriveAdjustment, drives: Drives, terms: tuple[str, ...], waves: bool) -> DriveModelScore:
-    parameters = RigParameters.about(found.parameters.rig, terms, TIMES, waves=waves)
-    prior = prior_information(parameters, parameters.rig)
-    return DriveModelScore(terms, held_out_error(parameters, found, prior, drives.fixed))
-
-
 def _finished_rig(before: Rig, found: DriveAdjustment, drives: Drives) -> tuple[Rig, float]:
     """Return the rig with baseline and covariance, and the angle [rad] by which a nominal rig's frame was levelled."""
     parameters = found.parameters
     names, units = parameters.rig_names, parameters.units[: len(parameters.rig_names)]
     change = found.state.steps[: len(names)] * units
     covariance = found.covariance[: len(names), : len(names)] * np.outer(units, units)
-    baseline_m, matrix = baseline_by_prior(before, names, change, covariance)
+    baseline_m, matrix = parameters.baseline(change, covariance)
     rig, level_rad = rescaled(found.rig, baseline_m / before.baseline_m), 0.0
     if before.covariance is None:
         ends = (*drives.fixed, drives.keyframes)
@@ -386,7 +367,7 @@ def turned_about_lower(rig: Rig, R: Array) -> Rig:
 
 
 # Largest rotation of the upper camera, and of the baseline's direction, against a measured rig. A nominal rig does not
-# know how its cameras were mounted: its limit is three of its sigmas (TURN_SIGMA_RAD in `rig_prior.py`).
+# know how its cameras were mounted: its limit is three of its sigmas (NOMINAL_SIGMAS in `rig_parameters.py`).
 MAX_TURN_RAD, MAX_NOMINAL_TURN_RAD = np.deg2rad(2.8), np.deg2rad(4.5)
 # Largest change of a camera's parameter, in sigmas of a nominal rig: 1 of 16,000 normal errors is larger.
 MAX_CHANGE_SIGMAS = 4.0
@@ -416,7 +397,7 @@ def different_rig(parameters: RigParameters, steps: Array, *, tracked: bool = Tr
             f"the upper camera is turned by {np.rad2deg(turn):.1f} deg and its baseline by {np.rad2deg(lean):.1f} deg "
             f"against the rig's file, expected {np.rad2deg(limit):.1f} deg at most"
         )
-    away = np.abs(steps / nominal_sigmas(parameters))[:first]
+    away = np.abs(steps / parameters.nominal_sigmas)[:first]
     worst = int(np.argmax(away))
     if away[worst] <= MAX_CHANGE_SIGMAS:
         return ""

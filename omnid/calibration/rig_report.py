@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.errors import CalibError
-from calib.fit.boards.rig_fit import MOTION_NAMES, RigCalibration
+from calib.fit.boards.bundle import TWIST_NAMES
+from calib.fit.boards.rig_fit import RigCalibration
 from calib.models.camera import Array
 from calib.panorama import fit_cylinder, remap_tables
 from calib.rig import Rig
@@ -68,21 +69,20 @@ def _motion(found: RigCalibration) -> str:
     sigmas = np.concatenate([found.motion_sigma[:3] * 1e3, np.rad2deg(found.motion_sigma[3:])])
     rows = [
         (name, f"{value:.4f} {unit}", f"{sigma:.4f}")
-        for name, value, sigma, unit in zip(MOTION_NAMES, values, sigmas, ["mm"] * 3 + ["deg"] * 3, strict=True)
+        for name, value, sigma, unit in zip(TWIST_NAMES, values, sigmas, ["mm"] * 3 + ["deg"] * 3, strict=True)
     ]
     return table(("T_upper_lower", "value", "standard deviation"), rows)
 
 
 def _coverage(found: RigCalibration, images: PairedImages, side: int) -> str:
     """Return the figure of one camera: all corners and their residuals on one of its images."""
-    camera = (found.lower, found.upper)[side]
+    camera = found.cameras[side]
     views = [(k, view.name, seen) for k, view in enumerate(found.views) if (seen := view.seen[side]) is not None]
     image = images.sides[side][views[0][1]]
     scale = COVERAGE_PX / image.shape[1]
     canvas = _color(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) // 2)
     for k, _, seen in views:
-        residuals = np.split(found.fit.residuals[k], 2)[side]
-        _draw_arrows(canvas, (seen.pixels + 0.5) * scale - 0.5, residuals * scale)
+        _draw_arrows(canvas, (seen.pixels + 0.5) * scale - 0.5, found.fit.residuals[k, side] * scale)
     middle = tuple(round(value * scale) for value in camera.center)
     cv2.drawMarker(canvas, middle, CENTER, cv2.MARKER_CROSS)
     text = f"all corners; arrows are the residuals, {ARROW:.0f} times as long; the cross is the centre"

@@ -6,21 +6,16 @@ import argparse
 import re
 from typing import Final
 
+from calib.boards.aprilgrid import AprilGrid
 from calib.boards.board import Board
-from calib.boards.marker_board import AprilGrid, CharucoBoard
 from calib.rig import LEAST_HEIGHT_M, MAX_HEIGHT_M, Rig
 from omnid.calibration.board_search import AnyBoard
 from omnid.commands.options import group, option
 from omnid.errors import OmnidError
 
-# Options (attribute, name) that each kind of board needs, and those that it may have besides.
-NEEDED = {
-    "checkerboard": ("corners", "square_mm"),
-    "charuco": ("corners", "square_mm", "marker_mm", "dictionary"),
-    "aprilgrid": ("tags", "tag_mm", "tag_spacing"),
-}
-OPTIONAL = {"charuco": ("legacy_charuco",)}
-ALL = ("corners", "square_mm", "marker_mm", "dictionary", "legacy_charuco", "tags", "tag_mm", "tag_spacing")
+# Options that each kind of board needs.
+NEEDED = {"checkerboard": ("corners", "square_mm"), "aprilgrid": ("tags", "tag_mm", "tag_spacing")}
+ALL = tuple(name for names in NEEDED.values() for name in names)
 
 
 def two_sides(text: str) -> tuple[int, int]:
@@ -37,23 +32,15 @@ BOARD: Final = group(
         "--board",
         choices=sorted(NEEDED),
         default="checkerboard",
-        help="checkerboard (default); charuco: a checkerboard with ArUco markers; aprilgrid: Kalibr's AprilTags 36h11. "
-        "Boards with markers may be half hidden",
+        help="checkerboard (default); aprilgrid: Kalibr's AprilTags 36h11, which may be half hidden",
     ),
     option(
         "--corners",
         type=two_sides,
         metavar="6x7",
-        help="inner corners (points where four squares meet) along both sides; for charuco along its columns and rows",
+        help="inner corners (points where four squares meet) along both sides",
     ),
     option("--square-mm", type=float, metavar="MM", help="side of one square"),
-    option("--marker-mm", type=float, metavar="MM", help="charuco: side of one marker"),
-    option("--dictionary", metavar="NAME", help="charuco: the markers' dictionary, like 5X5_100"),
-    option(
-        "--legacy-charuco",
-        action="store_true",
-        help="charuco: printed by OpenCV before 4.6 with an even number of rows of squares, a light square first",
-    ),
     option("--tags", type=two_sides, metavar="6x6", help="aprilgrid: tags along x and y (Kalibr's tagCols x tagRows)"),
     option("--tag-mm", type=float, metavar="MM", help="aprilgrid: side of one tag (tagSize)"),
     option(
@@ -67,12 +54,12 @@ BOARD: Final = group(
 
 def board_of(args: argparse.Namespace) -> AnyBoard:
     """Return the board that the options describe; OmnidError for missing or unused ones, CalibError for wrong sizes."""
-    given = [name for name in ALL if _is_given(getattr(args, name))]
+    given = [name for name in ALL if getattr(args, name) is not None]
     needed = NEEDED[args.board]
     missing = [name for name in needed if name not in given]
     if missing:
         raise OmnidError(f"--board {args.board}: expected {_options(needed)}, found no {_options(missing)}")
-    unused = [name for name in given if name not in (*needed, *OPTIONAL.get(args.board, ()))]
+    unused = [name for name in given if name not in needed]
     if unused:
         raise OmnidError(
             f"--board {args.board}: {_options(unused)} belongs to another kind of board; leave it out, or "
@@ -82,26 +69,16 @@ def board_of(args: argparse.Namespace) -> AnyBoard:
         columns, rows = args.tags
         return AprilGrid(columns, rows, args.tag_mm / 1e3, args.tag_spacing)
     columns, rows = args.corners
-    if args.board == "checkerboard":
-        return Board(columns, rows, args.square_mm / 1e3)
-    name = args.dictionary.removeprefix("DICT_")
-    return CharucoBoard(columns, rows, args.square_mm / 1e3, args.marker_mm / 1e3, name, args.legacy_charuco)
+    return Board(columns, rows, args.square_mm / 1e3)
 
 
 def options_of(args: argparse.Namespace) -> list[str]:
     """Return the options that describe the board, as words of a command line."""
     words = [] if args.board == "checkerboard" else ["--board", args.board]
-    for name in ALL:
+    for name in NEEDED[args.board]:
         value = getattr(args, name)
-        if _is_given(value):
-            words.append("--" + name.replace("_", "-"))
-            words += [] if value is True else ["x".join(map(str, value)) if isinstance(value, tuple) else f"{value}"]
-    return [f"{float(word):g}" if word.replace(".", "", 1).isdigit() else word for word in words]
-
-
-def _is_given(value: object) -> bool:
-    """True for the value of an option that was given; 0 is one, though 0 == False."""
-    return value is not None and value is not False
+        words += [_options([name]), "x".join(map(str, value)) if isinstance(value, tuple) else f"{value:g}"]
+    return words
 
 
 def _options(names: tuple[str, ...] | list[str]) -> str:

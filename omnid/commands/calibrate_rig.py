@@ -7,7 +7,6 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from calib.fit.boards.camera_selection import MODEL_CHOICES
 from omnid.calibration.board_search import silent
 from omnid.calibration.rig import calibrate_rig
 from omnid.calibration.view_guess import VIEW_CHOICES, VIEW_HELP
@@ -15,11 +14,6 @@ from omnid.commands.calibrate_options import BOARD, HEIGHT, board_of, height_of,
 from omnid.commands.options import BITS, RATE, cameras, command, log_cameras, option
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
-
-MODEL_HELP = (
-    "auto (default): fit all models and select by cross-validation; omni: unified model; ocam: polynomial; "
-    "ocam_tangential: polynomial with tangential terms"
-)
 
 
 @command(
@@ -39,14 +33,7 @@ MODEL_HELP = (
     *cameras("a log's topic of the {camera} camera"),
     BITS,
     RATE,
-    option("--model", choices=MODEL_CHOICES, default="auto", help=MODEL_HELP),
     option("--view", choices=VIEW_CHOICES, default="auto", help=VIEW_HELP),
-    option(
-        "--mask",
-        action="store_true",
-        help="also find hub and struts, and write the masks to PNGs in "
-        "the folder of the rig's file; they may be edited",
-    ),
     option("--report", type=Path, metavar="FILE", help="write an HTML report with residuals and panoramas"),
     HEIGHT,
     option("--quiet", action="store_true", help="no progress"),
@@ -72,9 +59,7 @@ def run(args: argparse.Namespace) -> int:
         args.images,
         board,
         topics=log_cameras(args),
-        model=args.model,
         view=args.view,
-        with_struts=args.mask,
         expected_baseline_m=None if expected_mm is None else expected_mm / 1e3,
         progress=silent if args.quiet else lambda line: print(line, file=sys.stderr),
     )

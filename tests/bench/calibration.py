@@ -33,14 +33,10 @@ import numpy as np
 
 import omnid
 from calib import se3
+from calib.boards.aprilgrid import AprilGrid
 from calib.boards.board import Board, BoardView
-from calib.boards.marker_board import AprilGrid
 from calib.boards.print_shape import AS_DRAWN, PrintShape
-from calib.fit.boards.camera_selection import select_calibration
-from calib.fit.boards.rig_covariance import rig_covariance
-from calib.fit.boards.rig_fit import RigCalibration
-from calib.fit.boards.rig_problem import PairView
-from calib.fit.boards.rig_selection import select_rig
+from calib.fit.boards.rig_fit import PairView, RigCalibration, calibrate_boards, rig_covariance
 from calib.fit.rig_uncertainty import AZIMUTHS, SLOPES, WALLS_M, drive_uncertainty
 from calib.models.camera import Array
 from calib.models.ocam import project_near
@@ -117,7 +113,7 @@ def render_drive(name: str, seed: int, amount: float, folder: Path) -> None:
 def calibrate(folder: Path, output: Path, options: Sequence[str] = ()) -> Rig:
     """Return the rig that `omnid calibrate rig` makes of the images of a folder, and print its line."""
     board = ["--corners", f"{BOARD.columns}x{BOARD.rows}", "--square-mm", f"{1e3 * BOARD.square_m:g}"]
-    words = ["calibrate", "rig", str(folder), *board, "--quiet", "-o", str(output), *options]
+    words = ["calibrate", "rig", str(folder), *board, "--view", "mirror", "--quiet", "-o", str(output), *options]
     with contextlib.redirect_stdout(sys.stderr):
         code = omnid_main(words)
     if code != 0:
@@ -166,21 +162,9 @@ def projected_views(
     return views
 
 
-def calibrated(views: list[PairView], size: tuple[int, int]) -> RigCalibration:
-    """Fit the rig by default, as `omnid calibrate rig` does to the same corners."""
-    chosen = [
-        select_calibration([view.seen[side] for view in views if view.seen[side] is not None], BOARD, size)
-        for side in (0, 1)
-    ]
-    mirrors = [one.polynomial for one in chosen]
-    assert mirrors[0] is not None and mirrors[1] is not None
-    cameras = (chosen[0].calibration.camera, chosen[1].calibration.camera)
-    return select_rig(views, BOARD, cameras, (mirrors[0], mirrors[1])).calibration
-
-
 def mounted_rig(found: RigCalibration) -> Rig:
     """Return the rig of a calibration, with its covariance."""
-    rig = rig_between(found.lower, found.upper, se3.inverse(found.T_upper_lower))
+    rig = rig_between(found.cameras[0], found.cameras[1], se3.inverse(found.T_upper_lower))
     return replace(rig, covariance=rig_covariance(found, rig))
 
 
@@ -302,7 +286,7 @@ def sigmas(args: argparse.Namespace) -> None:
     for seed in args.seeds:
         truth, perfect = board_rig(seed, args.amount)
         views = projected_views(truth, perfect, BOARD, PAIRS, NOISE_PX, seed=seed, noise_seed=[seed, 17])
-        rig = mounted_rig(calibrated(views, truth.lower.camera.size))
+        rig = mounted_rig(calibrate_boards(views, BOARD, [truth.lower.camera.size] * 2))
         stated = drive_uncertainty(rig)
         assert stated is not None
         found.append(drive_errors(rig, truth) / (stated.scale, stated.heading_rad_m))
@@ -350,7 +334,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--high", type=int, default=0, help="chain: further pairs in the outer part of the images")
     parser.add_argument("--bend-mm", type=float, default=0.0, help="chain: bend of the board")
     parser.add_argument("--stretch", type=float, default=0.0, help="chain: by which its x is longer, like 0.002")
-    parser.add_argument("--options", nargs="*", default=[], help="chain: words for `calibrate rig`, like model=omni")
+    parser.add_argument("--options", nargs="*", default=[], help="chain: words for `calibrate rig`, like view=mirror")
     args = parser.parse_args(arguments)
     {"chain": chain, "sigmas": sigmas, "check": check, "real": real}[args.part](args)
     return 0

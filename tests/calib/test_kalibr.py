@@ -9,7 +9,7 @@ import pytest
 
 from calib import se3
 from calib.errors import CalibError
-from calib.fit.parameterisation import parameterise
+from calib.fit.parameters import central_names
 from calib.kalibr import import_chain, parse_chain
 from calib.models.camera import Array, OmniCamera
 from calib.models.lens import DoubleSphereCamera, EquidistantCamera, ExtendedUnifiedCamera
@@ -97,7 +97,7 @@ def test_reads_lenses_and_keeps_them_in_rig_files(
     assert read_rig(tmp_path / "rig.toml").upper.camera == expected
     if model != "pinhole" or distortion == "equidistant":
         with pytest.raises(CalibError, match="by Kalibr"):
-            parameterise(rig.lower.camera)
+            central_names(rig.lower.camera)
 
 
 def warnings_of(text: str, **names: str) -> list[str]:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.fit.parameterisation import parameterise
+from calib.fit.parameters import central_names
 from calib.models.camera import Array
 from calib.rig import Rig
 from calib.rig_covariance import TRANSFORM_NAMES, RigCovariance
@@ -16,7 +16,7 @@ from calib.rig_file import parse_rig, rig_toml
 def names_of(rig: Rig) -> tuple[str, ...]:
     sides = (("lower", rig.lower), ("upper", rig.upper))
     return (
-        *(f"{side} {name}" for side, mounted in sides for name in parameterise(mounted.camera).names),
+        *(f"{side} {name}" for side, mounted in sides for name in central_names(mounted.camera)),
         *TRANSFORM_NAMES,
     )
 

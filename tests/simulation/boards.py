@@ -62,7 +62,7 @@ def print_rectangles(
     A surface that is a sum of functions of x and y is met exactly by parallelograms; a twist leaves gaps of some
     hundredths of a millimetre, between which the shape is flat.
     """
-    if shape.is_as_drawn:
+    if shape == AS_DRAWN:
         return [board_rectangle(board, T_rig_board, texture)]
     # Borders of the parts in squares from the first corner: the middles of the squares, where the texture is even.
     x, y = (

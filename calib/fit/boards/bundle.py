@@ -1,112 +1,109 @@
-"""Bundle adjustment of one camera and the poses of a board, with a Huber kernel.
+"""One estimate of the cameras that saw a board, the transform between them, the shape of the print, and its poses.
 
-Every image has its own pose, which is a block of six unknowns of the normal equations (`least_squares.py`).
+The estimate is the most likely one (maximum a posteriori): it minimises robust residuals of the corners, and priors of
+what a good mirror, lens or print hardly has. Terms that the images do not show are shrunk towards 0 by their prior, so
+none has to be selected. Every instant has a pose of the board, a block of six unknowns of the normal equations.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Final
 
 import numpy as np
+import scipy
 
 from calib import se3
+from calib.boards.board import CalibrationBoard
+from calib.boards.print_shape import MODE_NAMES, MODE_SIGMAS, MODE_UNITS, PrintShape, all_modes
 from calib.errors import CalibError
+from calib.fit.boards.mirror_prior import mirror_residuals
 from calib.fit.boards.smooth_misfit import covariance_with_misfit, smooth_fields
 from calib.fit.least_squares import DAMPING_FACTOR, START_DAMPING, ArrowSystem, Ending, minimise
+from calib.fit.parameters import stepped, units_of
 from calib.fit.robust_scale import robust_sigma
 from calib.models.camera import Array
+from calib.models.derivatives import pixel_derivatives
+from calib.models.names import values_of
+from calib.models.ocam import ASTIGMATISM_NAMES, TANGENTIAL_NAMES, OcamCamera
+from calib.models.wavefront import WAVEFRONT_NAMES
 
-# A damped step hardly moves along a flat direction, such as xi against the focal length: so the search ends only with a
-# nearly undamped step that lowers the cost in its ninth digit. The number of steps is a bound that is never reached by
-# good data.
-ENDING = Ending(steps=60, gain=1e-9, damping=1e-7)
+# The polynomial of a surface without a tip has even powers. Its terms above the fourth are 0 for a paraboloid and 0.2
+# steps, which are pixels at half of the image, for a hyperboloid of xi = 0.9; astigmatism is about one step.
+LENS_NAMES: Final = (
+    *("a0", "a2", "a4", "a6", "a8", "center_row", "center_column", "c", "d"),
+    *TANGENTIAL_NAMES,
+    *ASTIGMATISM_NAMES,
+)
+SHRUNK: Final = ("a6", "a8", *ASTIGMATISM_NAMES)
+SHRUNK_SIGMAS: Final = np.array([0.1, 0.1, 1.0, 1.0])
+TWIST_NAMES: Final = ("t_x", "t_y", "t_z", "r_x", "r_y", "r_z")
+# A damped step hardly moves along a flat direction: so the search ends only with a nearly undamped step that lowers the
+# cost in its ninth digit. The number of steps is a bound that is never reached by good data.
+ENDING: Final = Ending(steps=60, gain=1e-9, damping=1e-7)
 # Number of optimisations, each with the kernel's width estimated again, because the width depends on the residuals and
 # these on the width.
-KERNEL_ROUNDS = 3
+KERNEL_ROUNDS: Final = 3
 # Width of Huber's kernel in standard deviations of one coordinate, because 1 of 23 normal residuals (2-D) is longer.
-HUBER_WIDTH = 2.5
+HUBER_WIDTH: Final = 2.5
 # Least standard deviation assumed for a coordinate: exact corners would make the kernel's width 0.
-MIN_SIGMA_PX = 0.02
+MIN_SIGMA_PX: Final = 0.02
 # Residual of a corner that the model cannot project: larger than any residual of a corner in the image.
-LOST_PX = 300.0
+LOST_PX: Final = 300.0
 
 
-class Projection(Protocol):
-    """A camera, or several combined, that projects points."""
+@dataclass(frozen=True, slots=True)
+class BoardRig:
+    """One camera, or the lower and the upper one of a rig, and the board in front of them at K instants."""
 
-    def project(self, points: Array) -> Array:
-        """Return pixels (N, 2) of points (N, 3), NaN for points without an image."""
-
-
-class Parameters(Protocol):
-    """A camera that depends on steps (P,), which are 0 at the start of a fit."""
+    cameras: tuple[OcamCamera, ...]  # C
+    T_upper_lower: Array  # (4, 4); the identity of one camera
+    T_lower_board: Array  # (K, 4, 4)
+    shape: PrintShape
+    log_radii: Array  # (C,) of the mirrors, see mirror_prior.py
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Return the names (P,) of the steps."""
+        """Return the names of the parameters of each camera. The rays of a lens meet in one point."""
+        return LENS_NAMES if self.cameras[0].view == "direct" else (*LENS_NAMES, *WAVEFRONT_NAMES)
 
-    def camera_at(self, steps: Array) -> Projection:
-        """Return the camera at the steps; CalibError if there is none."""
+    def transforms(self) -> list[Array]:
+        """Return the poses (K, 4, 4) of the board in the frame of each camera."""
+        return [T @ self.T_lower_board for T in (np.eye(4), self.T_upper_lower)[: len(self.cameras)]]
 
-    def derivatives(self, steps: Array, points: Array) -> tuple[Array, Array]:
-        """Return the derivatives of the pixels by points (N, 3), (N, 2, 3), and by the steps, (N, 2, P)."""
+    def residuals(self, pixels: Array, drawn: Array) -> Array:
+        """Return measured minus modelled pixels (K, C, N, 2) of the corners drawn (N, 3) of the board.
 
-
-@dataclass(frozen=True, slots=True)
-class Observations:
-    """Observed corners: pixels (K, N, 2) in K images, NaN for unknown corners, of board points (N, 3) [m].
-
-    modes (N, 3, S) [m]: the board's points are points + modes @ steps, with unknown steps (S,) common to all views.
-    """
-
-    pixels: Array
-    points: Array
-    cameras: int = 1  # number of cameras that share the points of a view in equal parts
-    modes: Array | None = None
-
-    @property
-    def mode_count(self) -> int:
-        """Return the number S of unknown modes of the board's shape."""
-        return 0 if self.modes is None else self.modes.shape[2]
-
-    def points_at(self, steps: Array) -> Array:
-        """Return the board's points (N, 3) [m] after steps (S,) of its modes."""
-        return self.points if self.modes is None else self.points + self.modes @ steps
-
-    def select(self, chosen: Array) -> Observations:
-        """Return the images of an index or mask."""
-        return replace(self, pixels=self.pixels[chosen])
+        NaN without a measurement, LOST_PX without a projection.
+        """
+        points = self.shape.points(drawn)
+        cast = [
+            camera.project_near(se3.apply(T, points).reshape(-1, 3)).reshape(len(T), len(points), 2)
+            for camera, T in zip(self.cameras, self.transforms(), strict=True)
+        ]
+        off = pixels - np.stack(cast, axis=1)
+        return np.where(np.isnan(off) & np.isfinite(pixels), LOST_PX, off)
 
 
 @dataclass(frozen=True, slots=True)
-class Prior:
-    """Independent normal distributions of the parameters before the adjustment; sigma infinite: none."""
+class BoardFit:
+    """The most likely cameras and boards, with the covariance of all common unknowns in their own units."""
 
-    center: Array  # (P,)
-    sigma: Array  # (P,)
+    rig: BoardRig
+    residuals: Array  # (K, C, N, 2) measured minus modelled [px], NaN without a measurement
+    covariance: Array  # (P, P) of rig.names of each camera, TWIST_NAMES of two [m, rad], and MODE_NAMES [m, 1]
+    cost: float  # of the robust residuals and the priors [px^2]
+    variance: float  # of one coordinate of a residual [px^2]
+    complexity: float  # twice the logarithm of the part by which the images narrow the priors, but for a constant
 
-    def weights(self, kernel_px: float) -> Array:
-        """Return the weights (P,) of squared differences by those of residuals, for a width of Huber's kernel."""
-        return np.asarray((kernel_px / HUBER_WIDTH / self.sigma) ** 2)
-
-
-@dataclass(frozen=True, slots=True)
-class BundleResult:
-    """The result of a bundle adjustment; residuals are measured minus modelled [px], NaN without a measurement."""
-
-    parameters: Array  # (P,)
-    T_cam_board: Array  # (K, 4, 4)
-    residuals: Array  # (K, N, 2)
-    covariance: Array  # (P, P), with the misfit of the model
-    cost: float = 0.0  # of the robust residuals and the prior [px^2]
-    board_steps: Array = field(default_factory=lambda: np.zeros(0))  # (S,) of the modes of the board's shape
-    board_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (S, S), with the misfit of the model
+    def is_likelier(self, other: BoardFit) -> bool:
+        """True if the images make this model of the cameras more likely than another: the larger evidence (Laplace)."""
+        return (self.cost - other.cost) / other.variance + self.complexity < other.complexity
 
     @property
     def errors_px(self) -> Array:
-        """Return the length (K, N) of every residual."""
-        return np.asarray(np.linalg.norm(self.residuals, axis=2))
+        """Return the length (K, C, N) of every residual."""
+        return np.asarray(np.linalg.norm(self.residuals, axis=-1))
 
     @property
     def mean_px(self) -> float:
@@ -114,73 +111,53 @@ class BundleResult:
         return float(np.nanmean(self.errors_px))
 
 
-def residuals(camera: Projection, T_cam_board: Array, observed: Observations, points: Array) -> Array:
-    """Return measured minus modelled pixels (K, N, 2) of board points (N, 3).
+def fit_boards(start: BoardRig, pixels: Array, board: CalibrationBoard, *, telecentric: bool = False) -> BoardFit:
+    """Return the most likely cameras and boards near a start, by corners (K, C, N, 2) [px], NaN for unknown ones.
 
-    NaN without a measurement, LOST_PX without a projection.
+    telecentric: the cameras look at mirrors by parallel rays, see mirror_prior.py. CalibError where no camera fits.
     """
-    cast = camera.project(se3.apply(T_cam_board, points).reshape(-1, 3)).reshape(observed.pixels.shape)
-    lost = np.isnan(cast) & np.isfinite(observed.pixels)
-    return np.where(lost, LOST_PX, observed.pixels - cast)
-
-
-def adjust_bundle(
-    parameters: Parameters,
-    T_cam_board: Array,
-    observed: Observations,
-    *,
-    kernel_rounds: int = KERNEL_ROUNDS,
-    prior: Prior | None = None,
-    ending: Ending = ENDING,
-    has_covariance: bool = True,
-) -> BundleResult:
-    """Minimise the robust reprojection error over parameters (P,) and poses (K, 4, 4), from the given start values.
-
-    The steps (S,) of the board's modes, if it has any, are unknowns too, and start at 0.
-    kernel_rounds: number of optimisations; 1 is enough if the start values are nearly right. has_covariance: without,
-    the result's is empty.
-    """
-    count = len(parameters.names)
-    none = Prior(np.zeros(count), np.full(count, np.inf))
-    problem = _BoardProblem(parameters, observed, prior or none, np.inf)
-    state = problem.state(np.zeros(count), np.zeros(observed.mode_count), np.asarray(T_cam_board, float))
+    reach_m = float(np.median(np.linalg.norm(start.T_lower_board[:, :3, 3], axis=1)))
+    problem = _BoardProblem(pixels, board.points, reach_m, telecentric, np.inf)
+    state = problem.state(start)
     sigma, damping = np.inf, START_DAMPING
-    for _ in range(kernel_rounds):
+    for _ in range(KERNEL_ROUNDS):
         sigma = min(sigma, robust_sigma(state.residuals, MIN_SIGMA_PX))
         problem = replace(problem, kernel_px=HUBER_WIDTH * sigma)
-        state = minimise(problem, state, ending, damping)
-        damping = min(START_DAMPING, ending.damping / DAMPING_FACTOR)  # the next one begins next to its minimum
-    return _bundle_result(problem, state, has_covariance=has_covariance)
+        state = minimise(problem, state, ENDING, damping)
+        damping = min(START_DAMPING, ENDING.damping / DAMPING_FACTOR)  # the next one begins next to its minimum
+    return problem.result(state)
 
 
 @dataclass(frozen=True, slots=True)
 class _State:
-    """One iterate of the optimisation, with its residuals."""
+    """One iterate of the optimisation, with its residuals and those of its priors."""
 
-    parameters: Array  # (P,)
-    board_steps: Array  # (S,)
-    poses: Array  # (K, 4, 4)
-    residuals: Array  # (K, N, 2)
+    rig: BoardRig
+    residuals: Array  # (K, C, N, 2)
+    priors: Array  # (Q,) in standard deviations
 
 
 @dataclass(frozen=True, slots=True)
 class _BoardProblem:
-    """The robust reprojection error of a camera that saw boards, for one width of the kernel.
+    """The robust reprojection error of cameras that saw boards, and the priors, for one width of the kernel.
 
-    Its common unknowns are the camera's parameters (P,), then the steps (S,) of the board's modes.
+    Common unknowns: for each camera steps of its parameters and of its mirror's radius, the twist between two, and
+    those of the print's modes.
     """
 
-    unknowns: Parameters
-    observed: Observations
-    prior: Prior
+    pixels: Array  # (K, C, N, 2)
+    drawn: Array  # (N, 3)
+    reach_m: float  # the usual distance of the board
+    telecentric: bool
     kernel_px: float
+    modes: Array = field(init=False)
 
-    def state(self, parameters: Array, board_steps: Array, poses: Array) -> _State:
-        """Return the iterate with these parameters and poses; CalibError if there is no such camera."""
-        points = self.observed.points_at(board_steps)
-        return _State(
-            parameters, board_steps, poses, residuals(self.unknowns.camera_at(parameters), poses, self.observed, points)
-        )
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "modes", all_modes(self.drawn))
+
+    def state(self, rig: BoardRig) -> _State:
+        """Return the iterate of a rig."""
+        return _State(rig, rig.residuals(self.pixels, self.drawn), self._priors(rig))
 
     def scale(self, state: _State) -> float:
         """Return the width of Huber's kernel [px], which stays during a search."""
@@ -189,59 +166,142 @@ class _BoardProblem:
     def moved(self, state: _State, common: Array, blocks: Array) -> _State | None:
         """Return the state after a step; None if the parameters are not those of a camera."""
         try:
-            P = state.parameters.size
-            return self.state(
-                state.parameters + common[:P], state.board_steps + common[P:], se3.exp(blocks) @ state.poses
-            )
+            return self.state(self._moved(state.rig, common, blocks))
         except (CalibError, np.linalg.LinAlgError):
             return None
 
     def cost(self, state: _State, scale: float) -> float:
-        """Return the sum of Huber's function over the corners, and of the prior."""
-        length = np.linalg.norm(state.residuals, axis=2)
+        """Return the sum of Huber's function over the corners, and of the priors."""
+        length = np.linalg.norm(state.residuals, axis=-1)
         huber = np.where(length <= scale, length**2, scale * (2 * length - scale))
-        return float(np.nansum(huber) + self.prior.weights(scale) @ (state.parameters - self.prior.center) ** 2)
+        return float(np.nansum(huber) + (scale / HUBER_WIDTH) ** 2 * (state.priors @ state.priors))
 
     def normal_equations(self, state: _State, scale: float, fields: Array | None = None) -> ArrowSystem:
-        """Return the normal equations; fields (K, N, 2, F): further unknowns after all others, 0 now."""
+        """Return the normal equations; fields (K, C, N, 2, F): further unknowns after all others, 0 now."""
         residual, weight = _huber_weights(state.residuals, scale)
-        J_in, J_pose = self._jacobians(state)
-        K, rows = len(residual), 2 * residual.shape[1]
-        root = np.sqrt(weight)[..., None, None]
-        J_in, J_pose = ((root * J).reshape(K, rows, J.shape[-1]) for J in (J_in, J_pose))
-        r = (root[..., 0] * residual).reshape(K, -1)
-        prior = self.prior.weights(scale)
-        to_prior = prior * (state.parameters - self.prior.center)
+        J_common, J_pose = self._jacobians(state.rig)
+        K, root = len(residual), np.sqrt(weight)[..., None, None]
         if fields is not None:
-            J_in = np.concatenate([J_in, (root * fields).reshape(K, rows, -1)], axis=2)
-        # Neither the board's shape nor the fields have a prior.
-        prior, to_prior = (np.pad(part, (0, J_in.shape[2] - len(part))) for part in (prior, to_prior))
-        flat = J_in.reshape(K * rows, J_in.shape[2])
-        between = (J_in.swapaxes(1, 2) @ J_pose).swapaxes(0, 1).reshape(J_in.shape[2], 6 * K)
+            J_common = np.concatenate([J_common, fields], axis=-1)
+        J_common, J_pose = ((root * J).reshape(K, -1, J.shape[-1]) for J in (J_common, J_pose))
+        r = (root[..., 0] * residual).reshape(K, -1)
+        # The priors count in residuals of one standard deviation of a coordinate.
+        own = self._prior_jacobian(state.rig) * (scale / HUBER_WIDTH)
+        own = np.pad(own, ((0, 0), (0, J_common.shape[-1] - own.shape[1])))
+        flat = J_common.reshape(-1, J_common.shape[-1])
         return ArrowSystem(
-            A=flat.T @ flat + np.diag(prior),
-            B=between,
+            A=flat.T @ flat + own.T @ own,
+            B=(J_common.swapaxes(1, 2) @ J_pose).swapaxes(0, 1).reshape(flat.shape[1], 6 * K),
             C=J_pose.swapaxes(1, 2) @ J_pose,
-            a=flat.T @ r.ravel() - to_prior,
+            a=flat.T @ r.ravel() - own.T @ state.priors * (scale / HUBER_WIDTH),
             c=np.einsum("kri,kr->ki", J_pose, r).ravel(),
         )
 
-    def _jacobians(self, state: _State) -> tuple[Array, Array]:
-        """Return derivatives of modelled pixels by common unknowns (K, N, 2, P + S) and left twists (K, N, 2, 6)."""
-        points = se3.apply(state.poses, self.observed.points_at(state.board_steps))
-        flat, shape = points.reshape(-1, 3), points.shape[:2]
-        by_point, by_parameter = map(_finite, self.unknowns.derivatives(state.parameters, flat))
-        by_pose = np.concatenate([by_point, -by_point @ se3.hat(flat)], axis=-1)
-        by_common = by_parameter.reshape(*shape, 2, by_parameter.shape[2])
-        if self.observed.modes is not None:
-            turned = np.einsum("kij,njs->knis", state.poses[:, :3, :3], self.observed.modes)
-            by_common = np.concatenate([by_common, by_point.reshape(*shape, 2, 3) @ turned], axis=3)
-        return by_common, by_pose.reshape(*shape, 2, 6)
+    def result(self, state: _State) -> BoardFit:
+        """Return the result, in whose covariance the misfit of the model is counted."""
+        residual, weight = _huber_weights(state.residuals, self.kernel_px)
+        units = self._units(state.rig)
+        freedom = 2 * float(weight.sum()) - len(units) - 6 * len(residual)
+        variance = float((weight[..., None] * residual**2).sum()) / max(freedom, 1.0)
+        K, C, N, _ = self.pixels.shape
+        fields = smooth_fields(self.pixels.reshape(K, C * N, 2), C).reshape(K, C, N, 2, -1)
+        system = self.normal_equations(state, self.kernel_px, fields).reduced()
+        covariance = covariance_with_misfit(*system, len(units), variance) * np.outer(units, units)
+        # The radii of the mirrors are no parameters of a rig.
+        radii = [(len(state.rig.names) + 1) * (side + 1) - 1 for side in range(C)]
+        covariance = np.delete(np.delete(covariance, radii, axis=0), radii, axis=1)
+        wavefronts = [
+            side * (len(state.rig.names) + 1) + k
+            for side in range(C)
+            for k, name in enumerate((*state.rig.names, "radius"))
+            if name in (*WAVEFRONT_NAMES, "radius")
+        ]
+        prior = self._prior_jacobian(state.rig)[:, wavefronts]
+        complexity = np.linalg.slogdet(system[0][: len(units), : len(units)])[1] - np.linalg.slogdet(prior.T @ prior)[1]
+        cost = self.cost(state, self.kernel_px)
+        return BoardFit(state.rig, state.residuals, covariance, cost, variance, float(complexity))
+
+    def _units(self, rig: BoardRig) -> Array:
+        """Return one step (P,) of each common unknown in its own unit; a step moves the image by about a pixel."""
+        cameras = [[*units_of(camera, rig.names), 1.0] for camera in rig.cameras]
+        # The focal length is about a quarter of the image.
+        twist = np.repeat([self.reach_m, 1.0], 3) / (min(rig.cameras[0].size) / 4)
+        return np.concatenate([*cameras, *([twist] if len(cameras) > 1 else []), MODE_UNITS])
+
+    def _moved(self, rig: BoardRig, common: Array, blocks: Array) -> BoardRig:
+        """Return the rig after steps of the common unknowns (P,) and of the poses (K, 6)."""
+        n, C = len(rig.names) + 1, len(rig.cameras)
+        own, twist, modes = common[: C * n].reshape(C, n), common[C * n : -len(MODE_NAMES)], common[-len(MODE_NAMES) :]
+        cameras = [stepped(camera, rig.names, steps[:-1]) for camera, steps in zip(rig.cameras, own, strict=True)]
+        T_upper_lower = rig.T_upper_lower
+        if len(twist):
+            T_upper_lower = se3.exp(twist * self._units(rig)[C * n : C * n + 6]) @ T_upper_lower
+        return BoardRig(
+            tuple(camera for camera in cameras if isinstance(camera, OcamCamera)),
+            T_upper_lower,
+            se3.exp(blocks) @ rig.T_lower_board,
+            rig.shape.moved(modes),
+            rig.log_radii + own[:, -1],
+        )
+
+    def _jacobians(self, rig: BoardRig) -> tuple[Array, Array]:
+        """Return derivatives of the pixels by common unknowns (K, C, N, 2, P) and by left twists (K, C, N, 2, 6)."""
+        K, C, N, _ = self.pixels.shape
+        n, units, drawn = len(rig.names) + 1, self._units(rig), rig.shape.points(self.drawn)
+        J_common, J_pose = np.zeros((K, C, N, 2, len(units))), np.zeros((K, C, N, 2, 6))
+        for side, (camera, T) in enumerate(zip(rig.cameras, rig.transforms(), strict=True)):
+            points = se3.apply(T, drawn).reshape(-1, 3)
+            by_point, by_own = map(_finite, pixel_derivatives(camera, points, rig.names))
+            own = slice(side * n, side * n + n - 1)
+            J_common[:, side, ..., own] = by_own.reshape(K, N, 2, -1) * units[own]
+            by_mode = np.einsum("kij,njs->knis", T[:, :3, :3], self.modes)
+            J_common[:, side, ..., -len(MODE_NAMES) :] = by_point.reshape(K, N, 2, 3) @ by_mode
+            if side:
+                twist = np.concatenate([by_point, -by_point @ se3.hat(points)], axis=-1).reshape(K, N, 2, 6)
+                J_common[:, side, ..., C * n : C * n + 6] = twist * units[C * n : C * n + 6]
+                points = (points - rig.T_upper_lower[:3, 3]) @ rig.T_upper_lower[:3, :3]
+                by_point = by_point @ rig.T_upper_lower[:3, :3]
+            pose = np.concatenate([by_point, -by_point @ se3.hat(points)], axis=-1)
+            J_pose[:, side] = pose.reshape(K, N, 2, 6)
+        return J_common, J_pose
+
+    def _priors(self, rig: BoardRig) -> Array:
+        """Return the differences (Q,) of a rig from what is expected of it, in standard deviations."""
+        still = np.zeros(len(rig.names) + 1)
+        own = [self._camera_priors(rig, side, still) for side in range(len(rig.cameras))]
+        return np.concatenate([*own, np.array(rig.shape.values) / MODE_SIGMAS])
+
+    def _prior_jacobian(self, rig: BoardRig) -> Array:
+        """Return the derivatives (Q, P) of the priors by the common unknowns."""
+        step = 1e-4  # each prior is nearly linear over it
+        blocks = [
+            np.stack(
+                [
+                    (self._camera_priors(rig, side, one) - self._camera_priors(rig, side, -one)) / (2 * step)
+                    for one in step * np.eye(len(rig.names) + 1)
+                ],
+                axis=-1,
+            )
+            for side in range(len(rig.cameras))
+        ]
+        twist = np.zeros((0, 6 * (len(blocks) - 1)))
+        return np.asarray(scipy.linalg.block_diag(*blocks, twist, np.diag(MODE_UNITS / MODE_SIGMAS)))
+
+    def _camera_priors(self, rig: BoardRig, side: int, steps: Array) -> Array:
+        """Return the differences of a camera after steps of its parameters and radius from what is expected of it."""
+        camera = rig.cameras[side]
+        values = values_of(camera)
+        for name, change in zip(rig.names, (steps[:-1] * units_of(camera, rig.names)).tolist(), strict=True):
+            values[name] = values.get(name, 0.0) + change
+        values["e"] += values["d"] - camera.affine[1]
+        shrunk = np.array([values[name] for name in SHRUNK]) / units_of(camera, SHRUNK) / SHRUNK_SIGMAS
+        log_radius = float(rig.log_radii[side] + steps[-1])
+        return np.concatenate([shrunk, mirror_residuals(values, log_radius, telecentric=self.telecentric)])
 
 
 def _huber_weights(residual: Array, kernel_px: float) -> tuple[Array, Array]:
-    """Return residuals with 0 for missing ones, and Huber's weights (K, N)."""
-    length = np.linalg.norm(residual, axis=2)
+    """Return residuals with 0 for missing ones, and Huber's weights (K, C, N)."""
+    length = np.linalg.norm(residual, axis=-1)
     weight = np.where(np.isfinite(length), np.minimum(1.0, kernel_px / np.maximum(length, 1e-12)), 0.0)
     return np.nan_to_num(residual), weight
 
@@ -249,25 +309,3 @@ def _huber_weights(residual: Array, kernel_px: float) -> tuple[Array, Array]:
 def _finite(values: Array) -> Array:
     """Return values with 0 for those that are not finite: a point without an image has no derivative."""
     return np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
-
-
-def _bundle_result(problem: _BoardProblem, state: _State, *, has_covariance: bool) -> BundleResult:
-    """Return the result with the covariance of the common unknowns, in which the model's misfit is counted."""
-    residual, weight = _huber_weights(state.residuals, problem.kernel_px)
-    P, count = state.parameters.size, state.parameters.size + state.board_steps.size
-    freedom = 2 * float(weight.sum()) - count - 6 * len(residual)
-    variance = float((weight[..., None] * residual**2).sum()) / max(freedom, 1.0)
-    if not (count and has_covariance):
-        return BundleResult(state.parameters, state.poses, state.residuals, np.zeros((0, 0)))
-    fields = smooth_fields(problem.observed.pixels, problem.observed.cameras)
-    system = problem.normal_equations(state, problem.kernel_px, fields).reduced()
-    covariance = covariance_with_misfit(*system, count, variance)
-    return BundleResult(
-        state.parameters,
-        state.poses,
-        state.residuals,
-        covariance[:P, :P],
-        problem.cost(state, problem.kernel_px),
-        state.board_steps,
-        covariance[P:, P:],
-    )

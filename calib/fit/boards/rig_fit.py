@@ -1,63 +1,80 @@
-"""Joint bundle adjustment of two cameras, the transform between them, and the boards that they saw."""
+"""Calibration of one camera, or of a rig of two and the transform between them, by boards that they see at once."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calib import se3
 from calib.boards.board import BoardView, CalibrationBoard
 from calib.boards.corner_refinement import refine_with_camera
-from calib.boards.print_shape import AS_DRAWN, PrintShape
+from calib.boards.print_shape import AS_DRAWN, MODE_NAMES, PrintShape
 from calib.errors import CalibError
-from calib.fit.boards.bundle import BundleResult, adjust_bundle
-from calib.fit.boards.camera_fit import RejectedView, outlier_views, rejected_view
-from calib.fit.boards.cross_validation import cross_validated_px
-from calib.fit.boards.print_shape_fit import find_print_shape
-from calib.fit.boards.relative_pose import RelativePoseInitialisation, initialise_relative_pose
-from calib.fit.boards.rig_problem import (
-    PairView,
-    Printed,
-    RigParameterisation,
-    Sides,
-    rig_observations,
-    rig_unknowns,
-)
-from calib.fit.boards.telecentric_mirror import TelecentricMirror
+from calib.fit.boards.bundle import TWIST_NAMES, BoardFit, BoardRig, fit_boards
+from calib.fit.boards.linear_start import LinearCamera, solve_linear
+from calib.fit.boards.relative_pose import initialise_relative_pose
 from calib.fit.residual_structure import ResidualStructure, residual_structure
-from calib.models.camera import Array, OmniCamera
+from calib.fit.rig_uncertainty import central_differences
+from calib.models.camera import Array
+from calib.models.names import values_of
+from calib.models.ocam import OcamCamera, View
+from calib.rig import Rig
+from calib.rig_covariance import TRANSFORM_NAMES, RigCovariance
 
-# One pair determines the transform, but four are expected, because with them the consensus of most shows which pair is
-# wrong.
-MIN_PAIRS = 4
-# A bound for the loop. Each round rejects at most a third of the views, so it ends earlier for lack of pairs.
-MAX_REJECTIONS = 10
-# Larger mean errors mean that the images do not show one board at one time, or that the cameras are wrong, because
-# corners of right ones err by 0.05 to 0.15 px.
-MAX_MEAN_PX = 3.0
-MOTION_NAMES = ("t_x", "t_y", "t_z", "r_x", "r_y", "r_z")
+# With four views the median of their errors still shows which one is wrong; fewer are not enough for that.
+MIN_VIEWS: Final = 4
+# A view is an outlier if its median error exceeds this ratio of the views' median, and this error in pixels: with exact
+# corners the ratio alone would reject views for differences of no importance.
+BAD_RATIO, BAD_PX = 3.0, 0.25
+# The same for the mean ray error of the linear solution, which is larger because that solution has no affine terms and
+# its centre is that of a grid search.
+BAD_LINEAR_RATIO, BAD_LINEAR_RAD = 5.0, 0.01
+# Larger mean errors mean that the images do not show one board at one time: right ones have 0.05 to 0.15 px.
+MAX_MEAN_PX: Final = 3.0
+SIDES: Final = ("lower", "upper")
 Images = Mapping[str, NDArray[np.uint8]]
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class PairView:
+    """The views of a board at one instant by each camera; None: a camera does not see it."""
+
+    name: str
+    seen: tuple[BoardView | None, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class RejectedView:
+    """A view that was left out, and the reason."""
+
+    name: str
+    reason: str
 
 
 @dataclass(frozen=True, slots=True)
 class RigCalibration:
-    """A calibrated pair of cameras; fit has residuals (K, 2N, 2), the lower camera's first, and T_lower_board."""
+    """A calibrated camera, or a pair of them, and the views that it was fitted to."""
 
-    lower: OmniCamera
-    upper: OmniCamera
-    T_upper_lower: Array  # (4, 4)
+    fit: BoardFit
     board: CalibrationBoard
-    views: tuple[PairView, ...]
-    fit: BundleResult
-    parameters: tuple[tuple[tuple[str, float, float], ...], ...]  # of lower and upper: name, value, sigma
-    motion_sigma: Array  # (6,) sigmas of T_upper_lower, translation [m] and rotation [rad], in the upper frame
-    baseline_sigma_m: float
-    covariance: Array  # (P, P) of the cameras' parameters and of T_upper_lower (as motion_sigma)
+    views: tuple[PairView, ...]  # K
     rejected: tuple[RejectedView, ...] = ()
-    shape: PrintShape = AS_DRAWN
     telecentric: bool = False  # True if the cameras were fitted as mirrors below telecentric lenses
+
+    @property
+    def cameras(self) -> tuple[OcamCamera, ...]:
+        """Return the cameras, the lower one first."""
+        return self.fit.rig.cameras
+
+    @property
+    def T_upper_lower(self) -> Array:
+        """Return the transform (4, 4) between the cameras."""
+        return self.fit.rig.T_upper_lower
 
     @property
     def baseline_m(self) -> float:
@@ -65,193 +82,248 @@ class RigCalibration:
         return float(np.linalg.norm(self.T_upper_lower[:3, 3]))
 
     @property
+    def parameters(self) -> list[list[tuple[str, float, float]]]:
+        """Return name, value and standard deviation of the parameters of each camera."""
+        sigmas = np.sqrt(np.maximum(0, np.diag(self.fit.covariance)))
+        names = self.fit.rig.names
+        parts = np.split(sigmas[: len(names) * len(self.cameras)], len(self.cameras))
+        return [
+            [(name, values_of(camera)[name], sigma) for name, sigma in zip(names, part.tolist(), strict=True)]
+            for camera, part in zip(self.cameras, parts, strict=True)
+        ]
+
+    @property
+    def motion_covariance(self) -> Array:
+        """Return the covariance (6, 6) of T_upper_lower, translation [m] and rotation [rad], in the upper frame."""
+        first = len(self.fit.rig.names) * len(self.cameras)
+        return self.fit.covariance[first : first + len(TWIST_NAMES), first : first + len(TWIST_NAMES)]
+
+    @property
+    def motion_sigma(self) -> Array:
+        """Return the standard deviations (6,) of T_upper_lower."""
+        return np.sqrt(np.maximum(0, np.diag(self.motion_covariance)))
+
+    @property
+    def baseline_sigma_m(self) -> float:
+        """Return the standard deviation of the distance of the viewpoints [m]."""
+        along = self.T_upper_lower[:3, 3] / self.baseline_m
+        return float(np.sqrt(along @ self.motion_covariance[:3, :3] @ along))
+
+    @property
+    def shape(self) -> PrintShape:
+        """Return the shape of the print."""
+        return self.fit.rig.shape
+
+    @property
+    def shape_sigmas(self) -> Array:
+        """Return the standard deviations (4,) of the shape's values."""
+        return np.sqrt(np.maximum(0, np.diag(self.fit.covariance)[-len(MODE_NAMES) :]))
+
+    @property
     def pairs(self) -> int:
-        """Return the number of instants at which both cameras saw the board."""
+        """Return the number of instants at which all cameras saw the board."""
         return sum(map(_is_pair, self.views))
 
     def side_errors_px(self, side: int) -> Array:
         """Return the mean error (K,) of every view in the lower (0) or upper (1) camera; NaN without a view."""
-        errors = np.split(self.fit.errors_px, 2, axis=1)[side]
+        errors = self.fit.errors_px[:, side]
         known = np.isfinite(errors)
         return np.where(known.any(axis=1), np.nansum(errors, axis=1) / np.maximum(known.sum(axis=1), 1), np.nan)
 
     def structure(self, side: int) -> ResidualStructure:
         """Return the structure of the lower (0) or upper (1) camera's residuals."""
-        views = [view.seen[side] for view in self.views]
-        seen = [k for k, view in enumerate(views) if view is not None]
-        pixels = np.array([view.pixels for view in views if view is not None])
-        camera = (self.lower, self.upper)[side]
-        residuals = np.split(self.fit.residuals, 2, axis=1)[side][seen]
-        return residual_structure(pixels, residuals, self.board.points, camera.center)
+        views = [(k, own.pixels) for k, view in enumerate(self.views) if (own := view.seen[side]) is not None]
+        residuals = self.fit.residuals[[k for k, _ in views], side]
+        pixels = np.array([pixels for _, pixels in views])
+        return residual_structure(pixels, residuals, self.board.points, self.cameras[side].center)
 
 
-def fit_rig(
+def calibrate_boards(
     views: Sequence[PairView],
     board: CalibrationBoard,
-    cameras: Sides,
-    shape: PrintShape = AS_DRAWN,
-    telecentric: bool = False,
+    sizes: Sequence[tuple[int, int]],
+    view: View = "mirror",
+    images: Sequence[Images] = (),
+    progress: Progress = lambda line: None,
 ) -> RigCalibration:
-    """Fit two cameras and the transform between them to all views; outlier views are rejected.
+    """Calibrate one camera or two, and the transform between them, by views of a board; outlier views are rejected.
 
-    cameras: start values. shape: start value of the print's shape, whose free
-    modes are fitted. The terms of real mirrors (MIRROR_NAMES) are fitted if a start value has a wavefront, each for
-    itself or, if telecentric, as those of mirrors below telecentric lenses. Raises CalibError if fewer than MIN_PAIRS
-    pairs are consistent, or if the order of the board's corners is ambiguous.
+    sizes: (width, height) [px] of each camera's images. images: those of each camera by the views' names, in which the
+    corners are refined by the calibrated cameras; none: they stay. CalibError where fewer than MIN_VIEWS views of a
+    camera, or pairs of both, are consistent, or where the order of the board's corners is ambiguous.
     """
-    # 1. Relative pose initialisation; inconsistent views are rejected.
-    _require(sum(_is_pair(view) for view in views), "instants at which both cameras saw the board")
-    initial = initialise_relative_pose([view.seen for view in views], board, cameras)
+    # 1. Each camera by its own views: a linear solution, then the most likely camera. What fits neither is left out.
+    views, rejected, alone = list(views), list[RejectedView](), list[RigCalibration]()
+    for side, size in enumerate(sizes):
+        own = [PairView(one.name, (one.seen[side],)) for one in views if one.seen[side] is not None]
+        progress(f"{SIDES[side]} camera: fitting {len(own)} views")
+        found = _fit_camera(own, board, size, view)
+        alone.append(found)
+        where = f"{SIDES[side]} camera: " if len(sizes) > 1 else ""
+        rejected += [RejectedView(bad.name, where + bad.reason) for bad in found.rejected]
+        views = _without(views, side, {bad.name for bad in found.rejected})
+    # 2. The transform between the cameras, and all together.
+    if len(sizes) == 1:
+        found = replace(alone[0], rejected=())
+    else:
+        progress(f"rig: fitting {sum(map(_is_pair, views))} pairs")
+        found = _fit_pair(views, board, alone)
+    rejected += found.rejected
+    # 3. The corners again, by the calibrated cameras: twice, since they are moved by what the cameras lacked.
+    for _ in range(2 if images else 0):
+        progress("refining the corners")
+        found = _without_outliers(found.fit.rig, refined_views(found, images), board)
+        rejected += found.rejected
+    # 4. Mirrors below telecentric lenses, where these are more likely.
+    found = _telecentric_if_likelier(found) if view == "mirror" else found
+    return replace(found, rejected=tuple(rejected))
+
+
+def refined_views(found: RigCalibration, images: Sequence[Images]) -> list[PairView]:
+    """Return the views with their corners moved onto those of the images, by the calibrated cameras."""
+    poses = found.fit.rig.transforms()
+
+    def refined(k: int, side: int) -> BoardView | None:
+        seen = found.views[k].seen[side]
+        if seen is None:
+            return None
+        image, camera = images[side][seen.name], found.cameras[side]
+        return replace(seen, pixels=refine_with_camera(image, seen.pixels, found.board, camera, poses[side][k]))
+
+    return [
+        PairView(view.name, tuple(refined(k, side) for side in range(len(view.seen))))
+        for k, view in enumerate(found.views)
+    ]
+
+
+def consistent_views(
+    views: Sequence[PairView], board: CalibrationBoard, size: tuple[int, int], view: View
+) -> tuple[list[PairView], list[RejectedView], LinearCamera]:
+    """Reject views of one camera with large errors in the linear solution, the worst first; it affects the others."""
+    _require(len(views), "views of the board")
+    good, rejected = list(views), list[RejectedView]()
+    while True:
+        _require(len(good), "consistent views", rejected)
+        solved = solve_linear(_pixels(good, board)[:, 0], board.points, size, view)
+        worst, usual = int(np.argmax(solved.errors_rad)), float(np.median(solved.errors_rad))
+        if solved.errors_rad[worst] <= max(BAD_LINEAR_RATIO * min(usual, BAD_LINEAR_RAD), BAD_LINEAR_RAD):
+            return good, rejected, solved
+        reason = (
+            f"its corners lie {np.rad2deg(solved.errors_rad[worst]):.1f} deg or more off any board, the others "
+            f"{np.rad2deg(usual):.2f}"
+        )
+        rejected.append(RejectedView(good.pop(worst).name, reason))
+
+
+def rig_covariance(found: RigCalibration, rig: Rig) -> RigCovariance:
+    """Return the covariance of a calibration's parameters for its rig."""
+    names = [f"{side} {name}" for side in SIDES for name in found.fit.rig.names]
+    R_rect_lower = rig.T_rect_rig[:3, :3] @ rig.lower.T_cam_rig[:3, :3].T
+    R_upper_rect = found.T_upper_lower[:3, :3] @ R_rect_lower.T
+
+    def transform(twist: Array) -> Array:
+        """Return the parameters TRANSFORM_NAMES (6,) after a twist of T_upper_lower."""
+        T_lower_upper = se3.inverse(se3.exp(twist) @ found.T_upper_lower)
+        turn = se3.rotation_log(R_rect_lower @ T_lower_upper[:3, :3] @ R_upper_rect)
+        x, y, z = R_rect_lower @ T_lower_upper[:3, 3]
+        return np.array([*turn, x / z, y / z, np.linalg.norm(T_lower_upper[:3, 3])])
+
+    count = len(names) + len(TWIST_NAMES)
+    J = np.eye(count)
+    J[len(names) :, len(names) :] = central_differences(transform, 1e-6 * np.ones(6))  # it is nearly linear over it
+    return RigCovariance.of_matrix([*names, *TRANSFORM_NAMES], J @ found.fit.covariance[:count, :count] @ J.T)
+
+
+def _fit_camera(
+    views: Sequence[PairView], board: CalibrationBoard, size: tuple[int, int], view: View
+) -> RigCalibration:
+    """Fit one camera to its views."""
+    good, rejected, solved = consistent_views(views, board, size, view)
+    start = BoardRig((solved.camera(size, view),), np.eye(4), solved.T_cam_board, AS_DRAWN, np.zeros(1))
+    found = _without_outliers(start, good, board)
+    return replace(found, rejected=(*rejected, *found.rejected))
+
+
+def _fit_pair(views: Sequence[PairView], board: CalibrationBoard, alone: Sequence[RigCalibration]) -> RigCalibration:
+    """Fit two cameras and the transform between them."""
+    _require(sum(map(_is_pair, views)), "instants at which both cameras saw the board")
+    cameras = (alone[0].cameras[0], alone[1].cameras[0])
+    initial = initialise_relative_pose([(view.seen[0], view.seen[1]) for view in views], board, cameras)
     rejected = [RejectedView(views[k].name, reason) for k, reason in initial.rejected]
-    good, T_lower_board = _reordered_views(views, initial)
-    # 2. Bundle adjustment, repeated without the views that fit much worse than the others.
-    printed = (board, shape)
-    fit, unknowns = _solve(good, printed, cameras, initial.T_upper_lower, T_lower_board, telecentric)
-    for _ in range(MAX_REJECTIONS):
-        bad = outlier_views(fit)
-        if not bad.any():
-            break
-        rejected += [rejected_view(good[k].name, fit, k) for k in np.flatnonzero(bad).tolist()]
-        good = [view for view, is_bad in zip(good, bad, strict=True) if not is_bad]
-        _require(sum(map(_is_pair, good)), "consistent pairs of views", rejected)
-        found = unknowns.camera_at(fit.parameters)
-        start = (found.lower, found.upper)
-        fit, unknowns = _solve(good, printed, start, found.T_upper_lower, fit.T_cam_board[~bad], telecentric)
-    if fit.mean_px > MAX_MEAN_PX:
+    good = [_reordered(views[k], initial.orders.get(k)) for k in initial.T_lower_board]
+    _require(sum(map(_is_pair, good)), "consistent pairs of views", rejected)
+    shape = PrintShape(tuple(np.mean([one.shape.values for one in alone], axis=0).tolist()))
+    start = BoardRig(cameras, initial.T_upper_lower, np.array([*initial.T_lower_board.values()]), shape, np.zeros(2))
+    found = _without_outliers(start, good, board)
+    if found.fit.mean_px > MAX_MEAN_PX:
         raise CalibError(
-            f"calibrate rig: the corners are {fit.mean_px:.1f} px off any rig, expected {MAX_MEAN_PX:.0f} "
+            f"calibrate rig: the corners are {found.fit.mean_px:.1f} px off any rig, expected {MAX_MEAN_PX:.0f} "
             "at most; did the cameras see the board at the same time?"
         )
-    return _rig_calibration(good, printed, fit, unknowns, rejected)
+    return replace(found, rejected=(*rejected, *found.rejected))
 
 
-def refine_rig_calibration(found: RigCalibration, images: tuple[Images, Images]) -> RigCalibration:
-    """Refine the corners with the calibrated cameras, and calibrate the rig again; images by the views' names.
+def _without_outliers(start: BoardRig, views: Sequence[PairView], board: CalibrationBoard) -> RigCalibration:
+    """Fit cameras to views; as long as views fit much worse than the others, leave out these, a third at most."""
+    good, rejected = list(views), list[RejectedView]()
+    while True:
+        fit = fit_boards(start, _pixels(good, board), board)
+        errors = np.nanmedian(fit.errors_px.reshape(len(good), -1), axis=1)
+        bad = errors > max(BAD_RATIO * float(np.median(errors)), BAD_PX)
+        bad[np.argsort(-errors)[max(1, len(errors) // 3) :]] = False
+        if not bad.any():
+            return RigCalibration(fit, board, tuple(good), tuple(rejected))
+        rejected += [
+            RejectedView(good[k].name, f"its corners are {errors[k]:.2f} px off, the others {np.median(errors):.2f} px")
+            for k in np.flatnonzero(bad)
+        ]
+        good = [view for view, is_bad in zip(good, bad, strict=True) if not is_bad]
+        _require(sum(map(_is_pair, good)), "consistent pairs of views", rejected)
+        start = replace(fit.rig, T_lower_board=fit.rig.T_lower_board[~bad])
 
-    An instant that only one camera saw needs no image of the other.
-    """
-    cameras = (found.lower, found.upper)
-    poses = (found.fit.T_cam_board, found.T_upper_lower @ found.fit.T_cam_board)
-    views = []
-    for k, view in enumerate(found.views):
-        lower, upper = (
-            seen and _refined_view(seen, images[side][view.name], found.board, cameras[side], poses[side][k])
-            for side, seen in enumerate(view.seen)
-        )
-        views.append(PairView(view.name, (lower, upper)))
-    again = fit_rig(views, found.board, cameras, found.shape, found.telecentric)
-    return replace(again, rejected=found.rejected + again.rejected)
+
+def _telecentric_if_likelier(found: RigCalibration) -> RigCalibration:
+    """Return the calibration of mirrors below telecentric lenses if the images make it more likely."""
+    try:
+        fit = fit_boards(found.fit.rig, _pixels(found.views, found.board), found.board, telecentric=True)
+    except (CalibError, np.linalg.LinAlgError):
+        return found
+    return replace(found, fit=fit, telecentric=True) if fit.is_likelier(found.fit) else found
 
 
-def _refined_view(
-    seen: BoardView, image: NDArray[np.uint8], board: CalibrationBoard, camera: OmniCamera, T_cam_board: Array
-) -> BoardView:
-    return replace(seen, pixels=refine_with_camera(image, seen.pixels, board, camera, T_cam_board))
+def _pixels(views: Sequence[PairView], board: CalibrationBoard) -> Array:
+    """Return the corners (K, C, N, 2) of views, NaN for those that a camera does not see."""
+    none = np.full((len(board.points), 2), np.nan)
+    return np.array([[none if seen is None else seen.pixels for seen in view.seen] for view in views])
 
 
 def _is_pair(view: PairView) -> bool:
     return None not in view.seen
 
 
-def _require(count: int, what: str, rejected: Sequence[RejectedView] = ()) -> None:
-    if count < MIN_PAIRS:
-        left_out = "".join(f"; left out {bad.name}: {bad.reason}" for bad in rejected[:3])
-        raise CalibError(
-            f"calibrate rig: expected at least {MIN_PAIRS} {what}, found {count}{left_out}; hold the "
-            "board where both cameras see it whole, on all sides and tilted"
-        )
+def _without(views: Sequence[PairView], side: int, names: set[str]) -> list[PairView]:
+    """Remove one camera's views of the named instants; the other camera's views are kept."""
+    kept = [
+        replace(view, seen=tuple(None if k == side else seen for k, seen in enumerate(view.seen)))
+        if view.name in names
+        else view
+        for view in views
+    ]
+    return [view for view in kept if any(view.seen)]
 
 
-def _reordered_views(views: Sequence[PairView], initial: RelativePoseInitialisation) -> tuple[list[PairView], Array]:
-    """Return the consistent views, upper corners in the order of the lower ones, and the board poses (K, 4, 4)."""
-    kept = list(initial.T_lower_board)
-    good = [_with_reordered_upper(views[k], initial.orders.get(k)) for k in kept]
-    _require(
-        sum(map(_is_pair, good)),
-        "consistent pairs of views",
-        [RejectedView(views[k].name, reason) for k, reason in initial.rejected],
-    )
-    return good, np.array([initial.T_lower_board[k] for k in kept])
-
-
-def _with_reordered_upper(view: PairView, order: NDArray[np.intp] | None) -> PairView:
+def _reordered(view: PairView, order: NDArray[np.intp] | None) -> PairView:
+    """Return a view with the upper corners in the order of the lower ones."""
     lower, upper = view.seen
     if upper is None or order is None:
         return view
     return replace(view, seen=(lower, replace(upper, pixels=upper.pixels[order])))
 
 
-def _solve(
-    good: Sequence[PairView],
-    printed: Printed,
-    cameras: Sides,
-    T_upper_lower: Array,
-    T_lower_board: Array,
-    telecentric: bool,
-) -> tuple[BundleResult, RigParameterisation]:
-    """Adjust the cameras, the transform between them, and a pose T_lower_board (K, 4, 4) for every view."""
-    unknowns = rig_unknowns(printed[0], cameras, T_upper_lower, T_lower_board, telecentric=telecentric)
-    observed = rig_observations(good, printed)
-    fit = adjust_bundle(unknowns, T_lower_board, observed, prior=unknowns.prior)
-    return fit, unknowns
-
-
-def rig_print_shape(found: RigCalibration) -> PrintShape:
-    """Return the significant part of the print's shape, of a rig that was fitted to a board as drawn."""
-    unknowns = _unknowns_about(found)
-    observed = rig_observations(found.views, (found.board, AS_DRAWN))
-    return find_print_shape(unknowns, observed, found.fit.T_cam_board, unknowns.prior)
-
-
-def rig_held_out_px(found: RigCalibration) -> float:
-    """Return the mean error [px] of views that were left out of the fit of both cameras and the transform."""
-    unknowns = _unknowns_about(found)
-    return cross_validated_px(
-        unknowns,
-        found.fit.T_cam_board,
-        rig_observations(found.views, (found.board, found.shape), fixed=True),
-        unknowns.prior,
-    )
-
-
-def _unknowns_about(found: RigCalibration) -> RigParameterisation:
-    return rig_unknowns(
-        found.board,
-        (found.lower, found.upper),
-        found.T_upper_lower,
-        found.fit.T_cam_board,
-        telecentric=found.telecentric,
-    )
-
-
-def _rig_calibration(
-    good: Sequence[PairView],
-    printed: Printed,
-    fit: BundleResult,
-    unknowns: RigParameterisation,
-    rejected: Sequence[RejectedView],
-) -> RigCalibration:
-    found = unknowns.camera_at(fit.parameters)
-    J = unknowns.plain_by_steps(fit.parameters)
-    covariance = J @ fit.covariance @ J.T
-    sigmas = iter(np.sqrt(np.maximum(0, np.diag(covariance))).tolist())
-    parameters = tuple(
-        tuple((name, value, next(sigmas)) for name, value in side) for side in unknowns.plain_values(fit.parameters)
-    )
-    motion = covariance[-6:, -6:]
-    along = found.T_upper_lower[:3, 3] / np.linalg.norm(found.T_upper_lower[:3, 3])
-    return RigCalibration(
-        found.lower,
-        found.upper,
-        found.T_upper_lower,
-        printed[0],
-        tuple(good),
-        fit,
-        parameters,
-        np.sqrt(np.maximum(0, np.diag(motion))),
-        float(np.sqrt(along @ motion[:3, :3] @ along)),
-        covariance,
-        tuple(rejected),
-        printed[1].moved(fit.board_steps),
-        isinstance(unknowns.parameterisations[0], TelecentricMirror),
-    )
+def _require(count: int, what: str, rejected: Sequence[RejectedView] = ()) -> None:
+    if count < MIN_VIEWS:
+        left_out = "".join(f"; left out {bad.name}: {bad.reason}" for bad in rejected[:3])
+        raise CalibError(
+            f"calibrate: expected at least {MIN_VIEWS} {what}, found {count}{left_out}; hold the board where each "
+            "camera sees it whole, on all sides, near and tilted"
+        )

@@ -15,9 +15,10 @@ import numpy as np
 
 from calib.errors import CalibError
 from calib.fit.drive.observations import DriveObservations, DriveState, Flags
-from calib.fit.drive.problem import KERNEL, DriveProblem
+from calib.fit.drive.problem import DriveProblem
 from calib.fit.drive.rig_parameters import RigParameters
 from calib.fit.least_squares import Ending, minimise
+from calib.fit.residual_structure import OUTLIER_RATIO, ResidualStructure, systematic_px
 from calib.models.camera import Array
 from calib.rig import Rig
 
@@ -38,8 +39,6 @@ MIN_LANDMARKS = 100
 # Errors of a patch are alike in both cameras, and from keyframe to keyframe (correlation 0.9 in rendered rooms),
 # so ten of these observations tell about as much as one corner in a calibration by boards.
 OBSERVATIONS_ALIKE = 10.0
-# Every third landmark is held out of a comparison of models, so that most remain for the fit.
-HOLD_OUT = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,17 +72,17 @@ def adjust_drive(
     parameters: RigParameters,
     state: DriveState,
     observations: DriveObservations,
-    prior: Array,
     fixed: Sequence[int] = (0,),
     *,
     alike: float = 1.0,
 ) -> DriveAdjustment:
     """Return the rig, poses and landmarks of least robust reprojection error near those given.
 
-    prior: information (P, P) of the steps about zero. fixed: keyframes whose pose stays, one for each drive. alike:
-    number of observations that tell as much as one independent one; the prior gets so many times its weight.
+    fixed: keyframes whose pose stays, one for each drive. alike: number of observations that tell as much as one
+    independent one; the prior of the parameters gets so many times its weight.
     CalibError where fewer than MIN_LANDMARKS landmarks agree.
     """
+    prior = parameters.prior()
     problem = DriveProblem(parameters, observations, alike * prior, np.asarray(fixed))
     state, sigma_px = _minimised(problem, state, ROUGH_GAIN)
     for number in range(SELECTIONS):
@@ -105,38 +104,31 @@ def adjust_drive(
     return DriveAdjustment(parameters, state, observations, covariance, sigma_px, prior)
 
 
-def adjust_pairs(parameters: RigParameters, state: DriveState, observations: DriveObservations, prior: Array) -> Array:
+def adjust_pairs(parameters: RigParameters, state: DriveState, observations: DriveObservations) -> Array:
     """Return the steps (P,) by points that both cameras saw at once, near those of the state: a start for a drive.
 
     The only condition is that the rays of both cameras meet. It tells the columns of the panoramas, but no lengths. The
     poses of all keyframes stay; wherever they are, the result is the same.
     """
     everything = np.arange(len(state.T_rig_odom))
-    return _minimised(DriveProblem(parameters, observations, prior, everything), state, ROUGH_GAIN)[0].steps
+    return _minimised(DriveProblem(parameters, observations, parameters.prior(), everything), state, ROUGH_GAIN)[
+        0
+    ].steps
 
 
-def held_out_error(
-    parameters: RigParameters, found: DriveAdjustment, prior: Array, fixed: Sequence[int] = (0,)
-) -> float:
-    """Return the error [px] of landmarks that another model of the rig was not fitted to; robust (Cauchy's function).
-
-    parameters: of the other model. found: an adjustment, which gives observations, poses and points to start from.
-    """
-    # 1. The landmarks in two parts: those for the fit, and those held out.
-    held = found.observations.landmark % HOLD_OUT == 0
-    parts = [found.observations.only(chosen) for chosen in (~held, held)]
-    states = [replace(found.state, points=found.state.points[used], steps=np.zeros(len(prior))) for _, used in parts]
-    # 2. The rig of the other model and the poses, by the first part; parameters that both models have start alike.
-    steps = dict(zip(found.parameters.names, found.state.steps.tolist(), strict=True))
-    states[0] = replace(states[0], steps=np.array([steps.get(name, 0.0) for name in parameters.names]))
-    fitted, _ = _minimised(DriveProblem(parameters, parts[0][0], prior, np.asarray(fixed)), states[0], FINE_GAIN)
-    # 3. With that rig and those poses, the points that are held out.
-    everything = np.arange(len(fitted.T_rig_odom))
-    test = DriveProblem(parameters, parts[1][0], prior, everything, held=True)
-    tried, _ = _minimised(test, replace(fitted, points=states[1].points), ROUGH_GAIN)
-    # 4. Their robust mean error.
-    squared = (test.residuals(tried) ** 2).sum(axis=1) / (KERNEL * found.sigma_px) ** 2
-    return float(KERNEL * found.sigma_px * np.sqrt(np.mean(np.log1p(squared)) / 2))
+def drive_structure(found: DriveAdjustment) -> tuple[ResidualStructure, ResidualStructure]:
+    """Return the systematic part and the noise of the residuals in the lower and in the upper image."""
+    problem = DriveProblem(found.parameters, found.observations, found.prior, np.zeros(1, int))
+    residuals, seen, rig = problem.residuals(found.state), found.observations, found.rig
+    structures = []
+    for camera, mounted in enumerate((rig.lower, rig.upper)):
+        own = residuals[seen.camera == camera]
+        systematic = systematic_px(seen.pixels[seen.camera == camera], own, mounted.camera.center)
+        length = np.linalg.norm(own, axis=1)
+        usual = own[length < OUTLIER_RATIO * np.median(length)]
+        noise = float(np.sqrt(max(0.0, float(np.mean(usual**2)) - systematic**2)))
+        structures.append(ResidualStructure(systematic, noise))
+    return structures[0], structures[1]
 
 
 def observation_sigma(rig: Rig, found: DriveAdjustment, fixed: Sequence[int] = (0,)) -> float:

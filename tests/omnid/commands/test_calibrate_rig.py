@@ -27,7 +27,6 @@ from tests.simulation.boards import BoardRenderer, board_poses_around_rig
 BOARD = Board(7, 6, 0.03)
 T_UPPER_LOWER = se3.transform(se3.rotation_exp([0.02, -0.015, 0.3]), [0.004, -0.006, 0.18])
 PAIRS = 6
-CHARUCO_WORDS = ["--board", "charuco", "--corners", "6x5", "--square-mm", "50", "--marker-mm", "37.5"]
 
 
 def rig_of(size: int) -> Rig:
@@ -71,11 +70,11 @@ def many(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def found(folder: Path) -> RigResult:
     """Calibrate the rig by Python."""
-    return omnid.calibrate_rig(str(folder), BOARD, model="omni", expected_baseline_m=0.19)
+    return omnid.calibrate_rig(str(folder), BOARD, view="mirror", expected_baseline_m=0.19)
 
 
 def run(*words: object, corners: str = "7x6", square_mm: float = 30) -> int:
-    board = ["--corners", corners, "--square-mm", str(square_mm), "--quiet", "--model", "omni"]
+    board = ["--corners", corners, "--square-mm", str(square_mm), "--quiet", "--view", "mirror"]
     return main(["calibrate", "rig", *board, *map(str, words)])
 
 
@@ -84,7 +83,9 @@ def between(rig: Rig) -> Array:
 
 
 def turn_off_deg(rig: Rig) -> float:
-    gap = se3.inverse(T_UPPER_LOWER) @ between(rig)
+    """Return the error of the upper camera's rotation, whose frame is that of an ocam camera: x down, not against u."""
+    T_omni_ocam = se3.transform(np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]]), np.zeros(3))
+    gap = se3.inverse(T_UPPER_LOWER) @ T_omni_ocam @ between(rig) @ se3.inverse(T_omni_ocam)
     return float(np.rad2deg(np.linalg.norm(se3.rotation_log(gap[:3, :3]))))
 
 
@@ -93,31 +94,16 @@ def test_recovers_cameras_and_rig_from_images(many: Path, tmp_path: Path, capsys
     out, report = tmp_path / "rig.toml", tmp_path / "report.html"
     assert run(many, "-o", out, "--report", report, "--expected-baseline-mm", "180") == 0
     output = capsys.readouterr()
-    assert output.out.count("\n") == 2 and "16 pairs" in output.out
-    # No board was above the horizon, where a drive looks, too.
-    assert output.err.count("\n") == 1 and "with the board higher, all around" in output.err
+    assert "16 pairs" in output.out and "the board is bent by 0.0" in output.out and "no board" in output.out
+    assert output.err.count("\n") <= 1 and "where the tables say `no board`" in output.err
     found = read_rig(out)
-    assert turn_off_deg(found) < 0.02 and found.baseline_m == pytest.approx(TRUTH.baseline_m, abs=3e-4)
-    for mounted, truth in ((found.lower, rig_of(640).lower.camera), (found.upper, rig_of(640).upper.camera)):
-        assert isinstance(mounted.camera, UnifiedCamera) and isinstance(truth, UnifiedCamera)
-        assert mounted.camera.center == pytest.approx(truth.center, abs=0.1)
-        assert mounted.camera.focal == pytest.approx(truth.focal, rel=5e-4)
+    assert turn_off_deg(found) < 0.06 and found.baseline_m == pytest.approx(TRUTH.baseline_m, abs=3e-4)
+    for mounted, truth in ((found.lower, rig_of(640).lower), (found.upper, rig_of(640).upper)):
+        assert mounted.camera.center == pytest.approx(truth.camera.center, abs=0.1)
         assert mounted.mask is not None and mounted.mask.outer_px == pytest.approx(310, abs=3)
     page = report.read_text()
     # The panoramas, and the corners of each camera.
     assert page.count("data:image/jpeg;base64,") == 1 + 2 and "Baseline 180" in page and "r_x" in page
-
-
-@pytest.mark.slow
-def test_recovers_the_rig_with_the_polynomial_model(many: Path, tmp_path: Path) -> None:
-    assert run(many, "-o", tmp_path / "rig.toml", "--mask", "--model", "ocam") == 0
-    found = read_rig(tmp_path / "rig.toml")
-    assert found.baseline_m == pytest.approx(TRUTH.baseline_m, abs=3e-4)
-    T_omni_ocam = se3.transform(np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]]), np.zeros(3))  # x down, not against u
-    gap = se3.inverse(T_UPPER_LOWER) @ T_omni_ocam @ between(found) @ se3.inverse(T_omni_ocam)
-    assert np.rad2deg(np.linalg.norm(se3.rotation_log(gap[:3, :3]))) < 0.06
-    assert found.lower.mask is not None and found.lower.mask.image is not None
-    assert (tmp_path / "rig.lower.png").exists()
 
 
 def test_the_result_in_python_prints_itself_names_its_limits_and_is_saved(found: RigResult, tmp_path: Path) -> None:
@@ -144,7 +130,7 @@ def test_views_of_one_camera_are_used_and_exchanged_cameras_are_a_warning(
     assert "drives may be wrong by" in output.err
     assert "exchange their images, unless the cameras look down into their mirrors" in output.err
     assert "not seen" in (tmp_path / "report.html").read_text()
-    assert found.covariance is not None and "upper fv" in found.covariance.names
+    assert found.covariance is not None and "upper a2" in found.covariance.names
     assert abs(found.baseline_m - TRUTH.baseline_m) < 4 * found.covariance.sigma("baseline") < 8e-3
 
 
@@ -226,12 +212,7 @@ def test_invalid_input_is_one_line_and_exit_code_2(
         (["--corners", "6x5"], "--board checkerboard: expected --corners, --square-mm, found no --square-mm"),
         (["--corners", "6x5", "--square-mm", "0"], "expected squares of 0.1 mm to 10 m, found 0 mm"),
         (["--board", "aprilgrid", "--corners", "6x5"], "--tags, --tag-mm, --tag-spacing, found no --tags, --tag-mm"),
-        (
-            ["--corners", "6x5", "--square-mm", "30", "--dictionary", "4X4_50"],
-            "--dictionary belongs to another kind of board",
-        ),
-        ([*CHARUCO_WORDS, "--dictionary", "4X4"], "expected a dictionary of markers"),
-        ([*CHARUCO_WORDS, "--dictionary", "4X4_50", "--tags", "2x2"], "--tags belongs to another kind of board"),
+        (["--corners", "6x5", "--square-mm", "30", "--tags", "2x2"], "--tags belongs to another kind of board"),
         (["--board", "aprilgrid", "--tags", "6x6", "--tag-mm", "80", "--tag-spacing", "24"], "Kalibr's tagSpacing"),
     ],
 )

@@ -7,14 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
 from calib import se3
-from calib.fit.boards.bundle import Observations
+from calib.errors import CalibError
 from calib.models.camera import Array
-from calib.models.ocam import View
+from calib.models.ocam import OcamCamera, View
+
+# The polynomial of a surface without a tip has even powers of rho.
+POWERS = np.array([0, 2, 4])
 
 # Grid search for the centre: start half width in parts of the image.
 SEARCH_PART = 0.16
@@ -32,33 +34,33 @@ MIN_ACROSS_M, MIN_SQUARED = 1e-9, 1e-300
 
 @dataclass(frozen=True, slots=True)
 class LinearCamera:
-    """A camera with identity affine, its polynomial in rho / scale_px without linear term, and board poses."""
+    """A camera with identity affine, and the poses of the board in K views."""
 
-    coefficients: Array  # (D,) of powers 0, 2, 3 ... of rho / scale_px [px]
+    coefficients: Array  # (D,) of POWERS of rho / scale_px [px]
     scale_px: float
     center: tuple[float, float]  # (row, column) [px]
     T_cam_board: Array  # (K, 4, 4)
     errors_rad: Array  # (K,) mean angle between modelled and measured rays
 
+    def camera(self, size: tuple[int, int], view: View) -> OcamCamera:
+        """Return the camera; CalibError where the rays point away from what it sees."""
+        if self.coefficients[0] >= 0:
+            raise CalibError(
+                "calibrate: no mirror or lens shows boards as in these views; leave out those whose corners "
+                "are wrong, and check --corners"
+            )
+        polynomial = np.zeros(POWERS[-1] + 1)
+        polynomial[POWERS] = self.coefficients / self.scale_px ** POWERS.astype(float)
+        return OcamCamera(tuple(polynomial.tolist()), self.center, (1.0, 0.0, 0.0), size, view)
 
-def powers(degree: int) -> Array:
-    """Return the polynomial's powers of rho: 0, 2, 3 ... The slope of a smooth mirror is 0 on its axis."""
-    return np.array([0, *range(2, degree + 1)])
 
+def solve_linear(pixels: Array, points: Array, size: tuple[int, int], view: View) -> LinearCamera:
+    """Find the camera and poses of least ray error, with a search over the centre.
 
-def solve_linear(observed: Observations, size: tuple[int, int], degree: int, view: View) -> LinearCamera:
-    """Find the camera and poses of least ray error, with a search over the centre; size (width, height) [px]."""
-    pixels, points = np.asarray(observed.pixels, float), np.asarray(observed.points, float)
-    return _solved(pixels.tobytes(), len(pixels), points.tobytes(), size, degree, view)
-
-
-@lru_cache(maxsize=2)  # the fit of a camera starts from what has shown that its views are consistent
-def _solved(seen: bytes, views: int, board: bytes, size: tuple[int, int], degree: int, view: View) -> LinearCamera:
-    """Return the solution for the bytes of pixels (views, N, 2) and of points (N, 3)."""
-    pixels, points = np.frombuffer(seen).reshape(views, -1, 2), np.frombuffer(board).reshape(-1, 3)
-    observed = Observations(pixels, points)
+    pixels (K, N, 2): corners of board points (N, 3). size (width, height) [px].
+    """
     width, height = size
-    problem = _LinearProblem(observed, degree, min(size) / 2)
+    problem = _LinearProblem(pixels, points, min(size) / 2)
     center, reach = np.array([(height - 1) / 2, (width - 1) / 2]), SEARCH_PART * max(size)
     side = FIRST_SIDE
     while reach > SEARCH_END_PX:
@@ -84,29 +86,25 @@ def _with_proper_poses(solution: LinearCamera, view: View) -> LinearCamera:
 
 @dataclass(frozen=True, slots=True)
 class _LinearProblem:
-    observed: Observations
-    degree: int
+    pixels: Array  # (K, N, 2)
+    points: Array  # (N, 3)
     scale_px: float
 
     def solve(self, center: Array) -> LinearCamera:
         """Solve for poses and polynomial at a given centre (row, column)."""
-        xy = self.observed.pixels[..., ::-1] - center
-        T = _partial_poses(xy, self.observed.points)
-        across = np.linalg.norm(se3.apply(T, self.observed.points)[..., :2], axis=2)
+        xy = self.pixels[..., ::-1] - center
+        T = _partial_poses(xy, self.points)
+        across = np.linalg.norm(se3.apply(T, self.points)[..., :2], axis=2)
         rho = np.linalg.norm(xy, axis=2)
-        height = self.observed.points[:, :2] @ T[:, 2, :2].swapaxes(0, 1)
+        height = self.points[:, :2] @ T[:, 2, :2].swapaxes(0, 1)
         T[:, 2, :2] *= _signs(rho, across, height.T, self.scale_px)[:, None]
-        height = (self.observed.points[:, :2] @ T[:, 2, :2].swapaxes(0, 1)).T
-        coefficients, T[:, 2, 3] = _polynomial(rho, across, height, self.basis(rho))
-        f = self.basis(rho) @ coefficients
-        errors = np.minimum(_angles(np.dstack([xy, f]), se3.apply(T, self.observed.points)), CAP_RAD)
+        height = (self.points[:, :2] @ T[:, 2, :2].swapaxes(0, 1)).T
+        basis = (rho[..., None] / self.scale_px) ** POWERS
+        coefficients, T[:, 2, 3] = _polynomial(rho, across, height, basis)
+        errors = np.minimum(_angles(np.dstack([xy, basis @ coefficients]), se3.apply(T, self.points)), CAP_RAD)
         return LinearCamera(
             coefficients, self.scale_px, (float(center[0]), float(center[1])), T, np.nanmean(errors, axis=1)
         )
-
-    def basis(self, rho: Array) -> Array:
-        """Return the powers (..., D) of the scaled radius."""
-        return np.asarray((rho[..., None] / self.scale_px) ** powers(self.degree))
 
 
 def _partial_poses(xy: Array, points: Array) -> Array:
@@ -138,7 +136,7 @@ def _third_row(R: Array) -> Array:
 
 def _signs(rho: Array, across: Array, height: Array, scale_px: float) -> Array:
     """Return the sign (K,) of (r31, r32) for which each image's parabola f has a0 < 0; -f fits equally well."""
-    A, b, _ = _eliminate_depths(rho, across, height, (rho[..., None] / scale_px) ** powers(2))
+    A, b, _ = _eliminate_depths(rho, across, height, (rho[..., None] / scale_px) ** POWERS[:2])
     parabolas = np.linalg.pinv(A) @ b[..., None]
     return np.where(parabolas[:, 0, 0] > 0, -1.0, 1.0)
 
