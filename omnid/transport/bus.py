@@ -8,8 +8,10 @@ Each topic has its plain key, and what ROS 2 needs to find and to read it.
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from itertools import count
 from typing import Any, Final
 
 import zenoh
@@ -20,8 +22,8 @@ from omnid.errors import OmnidError
 from omnid.transport import ros2, status_names
 from omnid.transport.bus_config import BusConfig, checked
 from omnid.transport.codec import ERROR, OK, WARN, DiagnosticStatus
-from omnid.transport.intake import PERIOD_S, QUERY, CommandIntake, Intake, OpenRequests, RequestCallback, floods
-from omnid.transport.requests import Answer, Request
+from omnid.transport.intake import PERIOD_S, QUERY, CommandIntake, Intake, OpenRequests, RequestCallback
+from omnid.transport.requests import Request
 from omnid.transport.session import ALIVE, EndpointTaken, has_receiver, open_session, reason, router_in_place
 from omnid.transport.stop_datagram import StopListener
 from omnid.transport.topics import CLOCK, PUBLISHED, STOP, Topic, plain_key, ros_name
@@ -35,37 +37,30 @@ FLOOD_S: Final = 10.0  # The status warns of a flood for this time after its end
 
 
 class RosGraph:
-    """The entries in the graph of ROS 2: a node and its topics."""
+    """The entries in the graph of ROS 2: a node, its publishers and subscriptions; none where ROS 2 is off."""
 
     def __init__(self, session: zenoh.Session, config: BusConfig) -> None:
-        self._session, self._config = session, config
+        self._session, self._robot, self._is_on = session, config.robot, config.ros2 != "off"
         self._node = ros2.RmwNode(config.ros2_domain, str(session.zid()), ros2.node_name(config.robot))
+        self._entities = count(1)
         self._tokens: list[zenoh.LivelinessToken] = []
-        self._topics = list(PUBLISHED)  # their places are the ids of the entities
-        if config.ros2 == "rmw_zenoh":
-            self._declare(self._node.token)
+        self._declare(self._node.token)
 
     def publisher(self, topic: str, settings: Topic) -> str:
-        """Declare a publisher and return its token, "" where ROS 2 is off."""
-        if self._config.ros2 == "off":
-            return ""
-        name, entity = ros_name(self._config.robot, topic), self._entity(topic)
-        token = self._node.publisher(entity, name, settings.schema, transient_local=settings.transient_local)
-        return self._declare(token)
+        """Declare a publisher and return its token."""
+        quality = ros2.TRANSIENT_LOCAL if settings.transient_local else ros2.RELIABLE_LAST_10
+        return self._declare(self._endpoint("MP", topic, settings.schema, quality))
 
     def subscription(self, topic: str, schema: str) -> None:
-        """Declare a subscription, where ROS 2 is not off."""
-        if self._config.ros2 != "off":
-            self._declare(self._node.subscription(self._entity(topic), ros_name(self._config.robot, topic), schema))
+        """Declare a subscription."""
+        self._declare(self._endpoint("MS", topic, schema, ros2.RELIABLE_LAST_10))
 
-    def _entity(self, topic: str) -> int:
-        """Return the number of a topic, which is unique in the node."""
-        if topic not in self._topics:
-            self._topics.append(topic)
-        return 1 + self._topics.index(topic)
+    def _endpoint(self, kind: str, topic: str, schema: str, quality: str) -> str:
+        return self._node.endpoint(kind, next(self._entities), ros_name(self._robot, topic), schema, quality)
 
     def _declare(self, token: str) -> str:
-        self._tokens.append(self._session.liveliness().declare_token(token))
+        if self._is_on:
+            self._tokens.append(self._session.liveliness().declare_token(token))
         return token
 
 
@@ -73,15 +68,13 @@ class TopicPublisher:
     """The zenoh publishers of one topic: the plain key, and the key of ROS 2 where that is another."""
 
     def __init__(self, session: zenoh.Session, config: BusConfig, name: str, graph: RosGraph) -> None:
-        topic, ros = PUBLISHED[name], ros_name(config.robot, name)
-        token = graph.publisher(name, topic)
+        topic = PUBLISHED[name]
+        self._gid, self._seq = ros2.gid_of(graph.publisher(name, topic)), 0
         self._plain = _declared_publisher(session, plain_key(config.robot, name), topic)
         self._ros: zenoh.Publisher | ext.AdvancedPublisher | None = None
         if config.ros2 == "rmw_zenoh":
-            key = ros2.data_key(config.ros2_domain, ros, topic.schema)
+            key = ros2.data_key(config.ros2_domain, ros_name(config.robot, name), topic.schema)
             self._ros = _declared_publisher(session, key, topic, keeps=topic.transient_local)
-        self._gid = ros2.gid_of(token)
-        self._seq = 0
 
     @property
     def is_received(self) -> bool:
@@ -148,6 +141,7 @@ class Bus:
         self._texts: dict[str, str | Callable[[], str]] = {}  # answers to queries, by name
         self._on_command: RequestCallback | None = None
         self._requests = OpenRequests()
+        self.answer = self._requests.answer  # answers a request; nothing happens where no query waits for it
         self._command_topics: Mapping[str, str] = {}
         self._is_stopped: Callable[[], bool] = lambda: False
         self._stop_listener: StopListener | None = None
@@ -156,7 +150,7 @@ class Bus:
         self._commands: CommandIntake | None = None
         self._queries: dict[str, Intake[zenoh.Query]] = {}  # by name
         self._pollers: list[Poller] = []
-        self._flooded = 0  # messages above the budgets, when they were counted last
+        self._flooded = 0  # floods, when they were counted last
         self._flooded_s = -FLOOD_S
         self._closed = False
         self.lost = 0
@@ -181,7 +175,10 @@ class Bus:
             level, message = WARN, f"no router yet at {', '.join(self._config.connect)}"
         elif not self.is_unique:
             level, message = ERROR, self._same_name
-        counts = floods([*(self._commands.intakes if self._commands else ()), *self._queries.values()])
+        counts: Counter[str] = Counter()
+        for intake in (*(self._commands.intakes if self._commands else ()), *self._queries.values()):
+            counts[intake.key] += intake.floods
+        counts = +counts
         if counts.total() > self._flooded:
             self._flooded, self._flooded_s = counts.total(), time.monotonic()
         if level == OK and time.monotonic() < self._flooded_s + FLOOD_S:
@@ -241,13 +238,6 @@ class Bus:
         self._on_command, self._command_topics, self._is_stopped = callback, topics, is_stopped
         if self._session is not None:
             self._declare_subscribers(self._session, callback)
-
-    def answer(self, id: int, answer: Answer, *, also_before: str = "") -> None:
-        """Answer a request, once, from any thread, without waiting; nothing happens where no query waits for it.
-
-        also_before: a topic on which a request takes the place of earlier ones, which get the same answer.
-        """
-        self._requests.answer(id, answer, also_before=also_before)
 
     def close(self) -> None:
         """End the session; a second call does nothing. zenoh gives up on a subscriber that blocks after 10 s."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -77,14 +77,6 @@ class Intake(Generic[T]):
             self._kept = None
             self._allowed -= 1.0
             yield message
-
-
-def floods(intakes: list[Intake[Any]]) -> Counter[str]:
-    """Return by key how often there were more messages than the budget allows."""
-    counts: Counter[str] = Counter()
-    for intake in intakes:
-        counts[intake.key] += intake.floods
-    return +counts
 
 
 class OpenRequests:
@@ -182,12 +174,18 @@ class CommandIntake:
         return bool(samples)
 
     def _pass_on(self, topic: str, message: zenoh.Sample | zenoh.Query) -> None:
+        """Pass on a message with the identity of the program that sent it, empty where it names none.
+
+        Programs with omnid.client give the source of their messages and attach an identity to their requests. Programs
+        with rmw_zenoh attach the gid of their publisher. zenoh itself adds nothing. The identity proves nothing: what a
+        program may do is decided by the access rules.
+        """
         payload = b"" if message.payload is None else message.payload.to_bytes()
-        attached = b"" if message.attachment is None else message.attachment.to_bytes()
-        id = self._open.add(topic, message if isinstance(message, zenoh.Query) else None)
-        self._callback(
-            Request(topic, payload, sender_of(message), ros2.sent_ns_in(attached), id, ros2.echo_ns_in(attached))
-        )
+        sender, sent_ns, echo_ns = ros2.read_attachment(message.attachment.to_bytes() if message.attachment else b"")
+        query = message if isinstance(message, zenoh.Query) else None
+        if isinstance(message, zenoh.Sample) and message.source_info is not None:
+            sender = str(message.source_info.source_id.zid)
+        self._callback(Request(topic, payload, sender, sent_ns, self._open.add(topic, query), echo_ns))
 
     def _topic(self, ring: _Ring, message: zenoh.Sample | zenoh.Query) -> str:
         """Return the topic of a message; empty for a message that is not passed on.
@@ -221,15 +219,3 @@ class CommandIntake:
         declared = declare(f"{prefix}{key}", zenoh.handlers.RingChannel(budget.burst))
         self._declared.append(declared)
         return _Ring(topic, prefix, Intake(key, declared.try_recv, budget))
-
-
-def sender_of(message: zenoh.Sample | zenoh.Query) -> str:
-    """Return the identity of the program that sent a message, empty where it names none.
-
-    Programs with omnid.client give the source of their messages and attach an identity to their requests. Programs
-    with rmw_zenoh attach the gid of their publisher. zenoh itself adds nothing. The identity proves nothing: what a
-    program may do is decided by the access rules.
-    """
-    if isinstance(message, zenoh.Sample) and message.source_info is not None:
-        return str(message.source_info.source_id.zid)
-    return "" if message.attachment is None else ros2.gid_in(message.attachment.to_bytes())

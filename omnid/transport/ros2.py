@@ -7,18 +7,18 @@ attachment to every sample, liveliness tokens for the node and each of its publi
 from __future__ import annotations
 
 import hashlib
-import struct
 from dataclasses import dataclass
 from functools import cache
-from typing import Final
+from struct import Struct
+from typing import Final, NamedTuple
 
 from rosbags.typesys import Stores, get_typestore
 
 RELIABLE_LAST_10: Final = "::,10:,:,:,,"  # what is empty is rmw_zenoh's default: reliable, volatile, keep last
 TRANSIENT_LOCAL: Final = ":1:,1:,:,:,,"  # the newest message is kept for later subscribers, as of /tf_static
 GID_BYTES: Final = 16
-_PLAIN_BYTES: Final = struct.calcsize("<qqB") + GID_BYTES  # of an attachment of rmw_zenoh
-_ECHO_BYTES: Final = _PLAIN_BYTES + struct.calcsize("<q")  # of one of omnid's clients
+_HEAD: Final = Struct(f"<qqB{GID_BYTES}s")  # of an attachment
+_ECHO: Final = Struct("<q")
 
 
 @cache
@@ -38,29 +38,29 @@ def data_key(domain: int, topic: str, schema: str) -> str:
     return f"{domain}{topic}/{dds_type(schema)}/{type_hash(schema)}"
 
 
+class Attachment(NamedTuple):
+    """What is attached to a message by rmw_zenoh, or by a client of omnid."""
+
+    gid: str = ""  # id of the publisher, in hexadecimal
+    sent_ns: int = 0  # time of sending, of Unix time
+    echo_ns: int = 0  # the robot's own time, by a client of omnid; 0: there is none
+
+
 def attachment(seq: int, source_ns: int, gid: bytes, echo_ns: int = 0) -> bytes:
     """Return the attachment that rmw_zenoh expects: sequence number, time of sending [ns], the publisher's id.
 
     echo_ns: to a robot its own time, which follows the id; 0: it is left out.
     """
-    return struct.pack("<qqB", seq, source_ns, GID_BYTES) + gid + (struct.pack("<q", echo_ns) if echo_ns else b"")
+    return _HEAD.pack(seq, source_ns, GID_BYTES, gid) + (_ECHO.pack(echo_ns) if echo_ns else b"")
 
 
-def gid_in(attached: bytes) -> str:
-    """Return the publisher's id in an attachment of rmw_zenoh, in hexadecimal; empty for any other attachment."""
-    is_one = len(attached) in (_PLAIN_BYTES, _ECHO_BYTES) and attached[_PLAIN_BYTES - GID_BYTES - 1] == GID_BYTES
-    return attached[_PLAIN_BYTES - GID_BYTES : _PLAIN_BYTES].hex() if is_one else ""
-
-
-def sent_ns_in(attached: bytes) -> int:
-    """Return the time of sending in an attachment of rmw_zenoh [ns of Unix time]; 0 for any other attachment."""
-    return int(struct.unpack_from("<q", attached, 8)[0]) if gid_in(attached) else 0
-
-
-def echo_ns_in(attached: bytes) -> int:
-    """Return the robot's own time in an attachment of omnid's clients; 0 for any other attachment."""
-    is_one = len(attached) == _ECHO_BYTES and gid_in(attached)
-    return int(struct.unpack_from("<q", attached, _PLAIN_BYTES)[0]) if is_one else 0
+def read_attachment(attached: bytes) -> Attachment:
+    """Return the content of an attachment; that of any other bytes is empty."""
+    if len(attached) not in (_HEAD.size, _HEAD.size + _ECHO.size):
+        return Attachment()
+    _, sent_ns, gid_bytes, gid = _HEAD.unpack_from(attached)
+    echo_ns = int.from_bytes(attached[_HEAD.size :], "little", signed=True)
+    return Attachment(gid.hex(), sent_ns, echo_ns) if gid_bytes == GID_BYTES else Attachment()
 
 
 def gid_of(token: str) -> bytes:
@@ -81,15 +81,8 @@ class RmwNode:
         """Token of the node itself."""
         return f"@ros2_lv/{self.domain}/{self.zid}/0/0/NN/%/%/{self.name}"
 
-    def publisher(self, entity: int, topic: str, schema: str, *, transient_local: bool = False) -> str:
-        """Return the token of a publisher; entity: a number unique in the node."""
-        return self._endpoint("MP", entity, topic, schema, TRANSIENT_LOCAL if transient_local else RELIABLE_LAST_10)
-
-    def subscription(self, entity: int, topic: str, schema: str) -> str:
-        """Return the token of a subscription; entity: a number unique in the node."""
-        return self._endpoint("MS", entity, topic, schema, RELIABLE_LAST_10)
-
-    def _endpoint(self, kind: str, entity: int, topic: str, schema: str, quality: str) -> str:
+    def endpoint(self, kind: str, entity: int, topic: str, schema: str, quality: str) -> str:
+        """Return the token of a publisher (kind "MP") or subscription ("MS"); entity: a number unique in the node."""
         where = f"@ros2_lv/{self.domain}/{self.zid}/0/{entity}/{kind}/%/%/{self.name}"
         return f"{where}/{topic.replace('/', '%')}/{dds_type(schema)}/{type_hash(schema)}/{quality}"
 

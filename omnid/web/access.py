@@ -15,10 +15,11 @@ import re
 import secrets
 from collections import Counter
 from collections.abc import Awaitable, Callable, MutableMapping
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from starlette.requests import HTTPConnection
 from starlette.responses import PlainTextResponse
@@ -44,36 +45,21 @@ _HEADERS: Final = (
     (b"cross-origin-resource-policy", b"same-origin"),
     (b"cache-control", b"no-store"),
 )
+# Status and text of the answer to a request that is refused, by the reason that is counted.
+REFUSALS: Final = {
+    "unknown host": (403, "this server is not known by that name: start omnid web with --host NAME, or its address"),
+    "cross-site": (403, "requests of other sites are refused"),
+    "no origin": (403, "a change needs the header Origin of this page, or Authorization: Bearer TOKEN"),
+    "no token": (401, "a token is needed: open the address that `omnid web` printed"),
+    "wrong token": (401, "the token is not that of this server"),
+    "stop only": (403, "this token may see and stop, nothing else"),
+}
 
 Scope = MutableMapping[str, Any]
 Message = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[Message]]
 Send = Callable[[Message], Awaitable[None]]
 App = Callable[[Scope, Receive, Send], Awaitable[None]]
-
-
-class Refusal(NamedTuple):
-    """A request that is not answered; the reason is counted, the text is shown."""
-
-    status: int
-    reason: str
-    text: str
-
-
-_UNKNOWN_HOST: Final = Refusal(
-    403,
-    "unknown host",
-    "this server is not known by that name: start omnid web with --host NAME, or use its address",
-)
-_OTHER_SITE: Final = Refusal(403, "cross-site", "requests of other sites are refused")
-_NO_ORIGIN: Final = Refusal(
-    403,
-    "no origin",
-    "a request that changes something needs the header Origin of this page, or Authorization: Bearer TOKEN",
-)
-_NO_TOKEN: Final = Refusal(401, "no token", "a token is needed: open the address that `omnid web` printed")
-_WRONG_TOKEN: Final = Refusal(401, "wrong token", "the token is not that of this server")
-_STOP_ONLY: Final = Refusal(403, "stop only", "this token may see and stop, nothing else")
 
 
 class Role(StrEnum):
@@ -83,27 +69,20 @@ class Role(StrEnum):
     STOP = "stop"  # may see and stop
 
 
-def new_token() -> str:
-    """Return a random token of letters and digits in groups."""
-    return "-".join("".join(secrets.choice(_ALPHABET) for _ in range(5)) for _ in range(4))
-
-
 def token_of(path: Path | None, option: str = "--token-file") -> str:
     """Return the token in a file, which is made if it is missing; without a file a new token. option: its name.
 
     Raise OmnidError for a file that cannot be used, or that every user of this machine may read.
     """
+    made = "-".join("".join(secrets.choice(_ALPHABET) for _ in range(5)) for _ in range(4))
     if path is None:
-        return new_token()
+        return made
     try:
-        try:
+        with suppress(FileExistsError):
             number = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_CLOEXEC, 0o600)
-        except FileExistsError:
-            mode, text = path.stat().st_mode, path.read_text("ascii", "replace").strip()
-        else:
-            mode, text = 0o600, new_token()
             with os.fdopen(number, "w", encoding="ascii") as file:
-                file.write(f"{text}\n")
+                file.write(f"{made}\n")
+        mode, text = path.stat().st_mode, path.read_text("ascii", "replace").strip()
     except OSError as error:
         raise OmnidError(f"{option} {path}: cannot be used: {error.strerror}; name another file") from error
     if mode & 0o007:
@@ -145,32 +124,28 @@ class Access:
             return self.role_of(token) if scheme.lower() == "bearer" else None
         return self._matching(request.cookies.get(self.cookie, ""), _proof)
 
-    def refusal(self, request: HTTPConnection) -> Refusal | None:
-        """Return the reason not to answer a request; None to answer it."""
+    def refusal(self, request: HTTPConnection) -> str:
+        """Return the reason of REFUSALS not to answer a request; "" to answer it."""
         headers, host, path = request.headers, request.headers.get("host", ""), request.scope["path"]
-        reads = request.scope["method"] in ("GET", "HEAD")
+        reads, has_token = request.scope["method"] in ("GET", "HEAD"), "authorization" in headers
         # 1. DNS rebinding: the name must be one of this server.
         if not self._is_host(host):
-            return _UNKNOWN_HOST
+            return "unknown host"
         # 2. Other sites: a page of theirs may only link to the first page, and no site can set Authorization.
-        if "origin" in headers and headers["origin"].lower() not in (
-            f"http://{host.lower()}",
-            f"https://{host.lower()}",
-        ):
-            return _OTHER_SITE
-        if not reads and "origin" not in headers and "authorization" not in headers:
-            return _NO_ORIGIN
+        own = (f"http://{host.lower()}", f"https://{host.lower()}")
+        if headers.get("origin", own[0]).lower() not in own:
+            return "cross-site"
+        if not reads and "origin" not in headers and not has_token:
+            return "no origin"
         if is_of_other_site(request) and not (reads and path == "/"):
-            return _OTHER_SITE
+            return "cross-site"
         # 3. The token, except for the form that asks for it.
         if path in OPEN_PATHS:
-            return None
+            return ""
         role = self.role(request)
         if role is None:
-            return _WRONG_TOKEN if "authorization" in headers or self.cookie in request.cookies else _NO_TOKEN
-        if role is Role.STOP and not reads and path not in _STOPPING:
-            return _STOP_ONLY
-        return None
+            return "wrong token" if has_token or self.cookie in request.cookies else "no token"
+        return "stop only" if role is Role.STOP and not reads and path not in _STOPPING else ""
 
     def _matching(self, given: str, proof: Callable[[str], str]) -> Role | None:
         found = None
@@ -181,10 +156,13 @@ class Access:
 
     def _is_host(self, host: str) -> bool:
         found = _HOST.fullmatch(host)
-        if found is None:
-            return False
-        name = found[1].lower()
-        return name in self.hosts or (self.any_address and _is_address(name.strip("[]")))
+        name = found[1].lower() if found else ""
+        if name in self.hosts or not self.any_address:
+            return name in self.hosts
+        with suppress(ValueError):
+            ipaddress.ip_address(name.strip("[]"))
+            return True
+        return False
 
 
 def is_of_other_site(request: HTTPConnection) -> bool:
@@ -194,14 +172,6 @@ def is_of_other_site(request: HTTPConnection) -> bool:
 
 def _proof(token: str) -> str:
     return hmac.new(token.encode(), b"omnid web cookie", hashlib.sha256).hexdigest()
-
-
-def _is_address(text: str) -> bool:
-    try:
-        ipaddress.ip_address(text)
-    except ValueError:
-        return False
-    return True
 
 
 class Guard:
@@ -222,10 +192,9 @@ class Guard:
                 message["headers"] = [*message.get("headers", []), *_HEADERS]
             await send(message)
 
-        refusal = self._access.refusal(HTTPConnection(scope))
-        if refusal is None:
-            await self._app(scope, receive, send_protected)
-            return
-        self.refused[refusal.reason] += 1
-        answer = PlainTextResponse(f"omnid web: {refusal.text}\n", refusal.status, {"connection": "close"})
-        await answer(scope, receive, send_protected)
+        app, reason = self._app, self._access.refusal(HTTPConnection(scope))
+        if reason:
+            self.refused[reason] += 1
+            status, text = REFUSALS[reason]
+            app = PlainTextResponse(f"omnid web: {text}\n", status, {"connection": "close"})
+        await app(scope, receive, send_protected)

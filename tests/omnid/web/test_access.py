@@ -29,8 +29,7 @@ def reason(access: Access, *headers: dict[str, str], path: str = "/metrics", met
         merged |= more
     lines = [(name.encode(), value.encode("latin-1")) for name, value in merged.items() if value]
     scope = {"type": "http", "path": path, "headers": lines, "method": method}
-    refusal = access.refusal(HTTPConnection(scope))
-    return "" if refusal is None else refusal.reason
+    return access.refusal(HTTPConnection(scope))
 
 
 @pytest.mark.parametrize(
