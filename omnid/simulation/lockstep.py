@@ -7,7 +7,7 @@ pairs of images the controller ticks. A pose reaches it robot.pose_delay_s after
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Generic, Literal, TypeAlias, TypeVar
 
@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.rig import Rig
 from drivers.frame import CAMERAS, Frame
 from drivers.motion import MotionSample
 from omnid.config import Config
-from omnid.controller.statistics import ControllerState
+from omnid.controller.statistics import ControllerState, TickReport
 from omnid.core.control.arming import ArmRequest
 from omnid.core.control.command_sources import PLANNER, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
@@ -36,8 +35,7 @@ from omnid.runs.place_maps import RunPlaces
 from omnid.runs.route_files import RouteFiles
 from omnid.runs.wiring import NavigationParts, Outputs, Parts, WiredStages, wheel_state, wire
 from omnid.simulation.cameras import SimulatedCameras
-from omnid.simulation.rendering.sensor import Sensor
-from omnid.simulation.robot import SimulatedRobot
+from omnid.simulation.robot import SimulatedRobot, with_masks
 from omnid.simulation.vehicle import START_NS, Tick, Vehicle
 from omnid.simulation.world import World
 from omnid.sinks.drive import NAVIGATION_SENDER
@@ -106,8 +104,6 @@ Drive: TypeAlias = Callable[[Moment], Iterable[Request]]
 # Changes the pixels of a frame on its way to the stages: a fault of a camera, its driver or its mirror. The first
 # argument is the time of the frame since the start [s].
 Tamper: TypeAlias = Callable[[float, Frame], Frame]
-# Makes the cameras of a rig in a world, as SimulatedCameras does.
-MakeCameras: TypeAlias = Callable[[Rig, Sensor, World, int, int], SimulatedCameras]
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,11 +162,10 @@ def simulate(
     config: Config | None = None,
     faults: Iterable[Fault] = (),
     tamper: Tamper | None = None,
-    cameras: MakeCameras = SimulatedCameras,
 ) -> SimulatedRun:
     """Drive for a number of seconds of simulated time and return the run.
 
-    tamper: changes the images; None: they are as the simulated cameras make them. cameras: of another renderer.
+    tamper: changes the images; None: they are as the simulated cameras make them.
 
     A map of places (config.places.map) is read, extended and written as by `omnid run`; the pose in the map is computed
     where there is one. Raises OmnidError as `omnid run` does.
@@ -179,7 +174,7 @@ def simulate(
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        return _Lockstep(world, robot, drive, seed, config or Config(), tuple(faults), tamper, cameras).run(seconds)
+        return _Lockstep(world, robot, drive, seed, config or Config(), tuple(faults), tamper).run(seconds)
     finally:
         cv2.setNumThreads(threads)
 
@@ -194,33 +189,24 @@ class _Lockstep:
         config: Config,
         faults: tuple[Fault, ...],
         tamper: Tamper | None,
-        cameras: MakeCameras,
     ) -> None:
-        self._tamper = tamper
-        self._robot, self._drive, self._config, self._faults = robot, drive, config, faults
+        self._robot, self._drive, self._config, self._faults, self._tamper = robot, drive, config, faults, tamper
         self._rig = with_masks(robot.rig)
-        self._cameras = cameras(self._rig, robot.sensor, world, seed, robot.samples)
+        self._cameras = SimulatedCameras(self._rig, robot.sensor, world, seed, robot.samples)
         self._ticks: list[Tick] = []
         self._lines: list[tuple[float, str]] = []
-        self._vehicle = Vehicle(
-            world,
-            robot,
-            config,
-            seed,
-            lambda tick, _: self._ticks.append(tick),
-            lambda time_s, line: self._lines.append((time_s, line)),
-        )
+        self._vehicle = Vehicle(world, robot, config, seed, self._take_tick, self._take_line)
         self._delay_ns = round(robot.pose_delay_s * 1e9)
         self._requests = LockstepRequests()
         self._files = RouteFiles(RouteFolder(Path(config.navigation.routes)), self._requests.put)
         self._ends = False
         self._truth: dict[int, Array] = {}  # T_world_base by the stamp of a pair [ns]
         self._odometry: OdometryUpdate | None = None
-        self._poses: list[tuple[int, Array, str]] = []  # stamp [ns], T_odom_base, tracking state
+        # Stamp [ns], T_odom_base, tracking state, whether the wheels slip.
+        self._poses: list[tuple[int, Array, str, bool]] = []
         self._rings: list[ObstacleRing] = []
         self._navigation: list[NavigationUpdate] = []
         self._places: list[PlaceUpdate] = []
-        self._slipping: list[bool] = []
         self._stages: WiredStages | None = None
 
     def run(self, seconds: float) -> SimulatedRun:
@@ -249,12 +235,13 @@ class _Lockstep:
         graph.run()
         run_places.finish()
         # 3. Truth and estimates, at the stamps of the poses.
+        stamps_ns, poses, states, slipping = zip(*self._poses, strict=True) if self._poses else ((), (), (), ())
         return SimulatedRun(
-            np.array([stamp for stamp, _, _ in self._poses], np.int64),
-            np.array([self._truth[stamp] for stamp, _, _ in self._poses]).reshape(-1, 4, 4),
-            np.array([T for _, T, _ in self._poses]).reshape(-1, 4, 4),
-            tuple(state for _, _, state in self._poses),
-            np.array(self._slipping, bool),
+            np.array(stamps_ns, np.int64),
+            np.array([self._truth[stamp_ns] for stamp_ns in stamps_ns]).reshape(-1, 4, 4),
+            np.array(poses).reshape(-1, 4, 4),
+            states,
+            np.array(slipping, bool),
             tuple(self._ticks),
             tuple(self._lines),
             tuple(self._rings),
@@ -308,8 +295,8 @@ class _Lockstep:
             controller.state,
             self._odometry,
             self._poses[-1][1] if self._poses else np.eye(4),
-            _newest(self._navigation),
-            _newest(self._places),
+            self._navigation[-1] if self._navigation else None,
+            self._places[-1] if self._places else None,
         )
         arrival_ns = vehicle.now_ns + 1  # after the tick at this time, which has passed
         for request in self._drive(moment):
@@ -328,11 +315,17 @@ class _Lockstep:
     def _wheels(self) -> WheelState:
         return wheel_state(self._vehicle.controller.state)
 
+    def _take_tick(self, tick: Tick, _: TickReport) -> None:
+        self._ticks.append(tick)
+
+    def _take_line(self, time_s: float, line: str) -> None:
+        self._lines.append((time_s, line))
+
     def _take_pose(self, odometry: OdometryUpdate) -> None:
         T_base_rig = self._rig.T_base_rig
         self._odometry = odometry
-        self._poses.append((odometry.stamp_ns, of_base(odometry, T_base_rig)[0], odometry.state))
-        self._slipping.append(self._stages is not None and self._stages.front_end.odometry.sensors.is_slipping)
+        is_slipping = self._stages is not None and self._stages.front_end.odometry.sensors.is_slipping
+        self._poses.append((odometry.stamp_ns, of_base(odometry, T_base_rig)[0], odometry.state, is_slipping))
         pose = controller_pose(odometry, T_base_rig)
         self._vehicle.post(odometry.stamp_ns + self._delay_ns, lambda: self._vehicle.controller.take(pose))
 
@@ -348,13 +341,3 @@ class _Lockstep:
             due_ns = self._vehicle.now_ns + self._delay_ns
             command = TimedSetpoint(due_ns, update.setpoint, PLANNER, NAVIGATION_SENDER)
             self._vehicle.post(due_ns, lambda: self._vehicle.controller.take(command))
-
-
-def _newest(messages: list[T]) -> T | None:
-    return messages[-1] if messages else None
-
-
-def with_masks(rig: Rig) -> Rig:
-    """Return the rig with a mask of each camera: the whole image where none is known."""
-    lower, upper = (replace(mounted, mask=mounted.visible) for mounted in (rig.lower, rig.upper))
-    return replace(rig, lower=lower, upper=upper)

@@ -34,8 +34,8 @@ from omnid.engine.telemetry import StageStats
 from omnid.runs.session import Session
 from omnid.simulation.cameras import SimulatedCameras
 from omnid.simulation.clearance import DriveRecord
-from omnid.simulation.lockstep import STOPPING_NS, with_masks
-from omnid.simulation.robot import SimulatedRobot
+from omnid.simulation.lockstep import STOPPING_NS
+from omnid.simulation.robot import SimulatedRobot, with_masks
 from omnid.simulation.vehicle import Tick, Vehicle
 from omnid.simulation.world import World
 from omnid.transport.codec import OK, DiagnosticStatus

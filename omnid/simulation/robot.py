@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import random
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -12,7 +10,7 @@ import numpy as np
 from calib import se3
 from calib.models.camera import Array
 from calib.rig import Rig
-from drivers.motors.simulated.simulated_base import MotionLimits, Traction
+from drivers.motors.simulated.simulated_base import MotionLimits
 from omnid.simulation.rendering.rigs import make_rig
 from omnid.simulation.rendering.sensor import Sensor
 
@@ -80,10 +78,7 @@ class SimulatedRobot:
     rate_hz: float = 10.0  # of the cameras
     samples: int = 2  # in lock-step: rays of a pixel, per axis; 0: as many as needed
     pose_delay_s: float = 0.1  # in lock-step: from the exposure to the pose's arrival at the controller
-    lean_rad: tuple[float, float] = (
-        0.0,
-        0.0,
-    )  # roll and pitch by which the base leans, which its rig file does not say
+    lean_rad: tuple[float, float] = (0.0, 0.0)  # roll and pitch by which the base leans, which its rig does not say
     pushes: tuple[Push, ...] = ()
 
     @property
@@ -100,18 +95,7 @@ def make_robot(size_px: int = IMAGE_PX, rig: Rig | None = None) -> SimulatedRobo
     return SimulatedRobot(replace(made, T_base_rig=se3.transform(np.eye(3), [0.0, 0.0, CAMERA_HEIGHT_M])))
 
 
-def traction(wheels: WheelErrors, seed: int) -> Traction:
-    """Return the travel of both wheels over the ground as time passes from 0 on; the noise follows from the seed."""
-    rng, passed_s = random.Random(seed), 0.0
-
-    def over_ground(dt_s: float, left_m: float, right_m: float) -> tuple[float, float]:
-        nonlocal passed_s
-        passed_s += dt_s
-        kept = 1.0 - max((slip.share for slip in wheels.slips if slip.start_s <= passed_s < slip.end_s), default=0.0)
-        left_m, right_m = (
-            kept * travel_m * (1.0 + error) + wheels.noise * math.sqrt(abs(travel_m)) * rng.gauss(0.0, 1.0)
-            for travel_m, error in ((left_m, wheels.left), (right_m, wheels.right))
-        )
-        return left_m, right_m
-
-    return over_ground
+def with_masks(rig: Rig) -> Rig:
+    """Return the rig with a mask of each camera: the whole image where none is known."""
+    lower, upper = (replace(mounted, mask=mounted.visible) for mounted in (rig.lower, rig.upper))
+    return replace(rig, lower=lower, upper=upper)

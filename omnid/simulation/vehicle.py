@@ -15,14 +15,14 @@ from calib import se3
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from drivers.motor import VelocityCommand
 from drivers.motors.protocols.protocol_registry import motor_protocol
-from drivers.motors.simulated.simulated_base import Pose, Traction
+from drivers.motors.simulated.simulated_base import Pose
 from drivers.motors.simulated.simulated_motor import SimulatedMotor, simulated_controller
 from omnid.config import Config
 from omnid.controller.controller import Controller
 from omnid.controller.statistics import TickReport
 from omnid.simulation.clearance import clearance_m, footprints, obstacles_of
 from omnid.simulation.people import Walkers
-from omnid.simulation.robot import SimulatedRobot, WheelErrors, traction
+from omnid.simulation.robot import SimulatedRobot
 from omnid.simulation.world import World
 
 Array = NDArray[np.float64]
@@ -60,7 +60,7 @@ class Vehicle:
         drive = config.motor.drive.geometry()
         self.twin = simulated_controller(config.motor.protocol, drive)
         base = self.twin.base
-        base.pose, base.limits, base.traction = world.start, robot.limits, self._traction(robot.wheels, seed)
+        base.pose, base.limits, base.traction = world.start, robot.limits, self._over_ground
         self.motor = SimulatedMotor(
             motor_protocol(config.motor.protocol)(drive), self.twin, config.motor.watchdog_ms, lambda: self.now_ns
         )
@@ -76,7 +76,8 @@ class Vehicle:
         self._tick_ns = start_ns
         self._waiting: list[tuple[int, int, Callable[[], None]]] = []
         self._posted = 0
-        self._gyro_noise = random.Random(seed + 1)
+        self._wheel_noise, self._gyro_noise = random.Random(seed), random.Random(seed + 1)
+        self._rolled_s = 0.0  # time that the wheels have turned or stood
         self._gyro_ns = start_ns
         self.samples: list[MotionSample] = []  # since they were taken
         self._standing = obstacles_of(world, robot.height_m)
@@ -149,18 +150,21 @@ class Vehicle:
             (se3.inverse(self._ground.T_world_base(before)) @ self._ground.T_world_base(now))[:3, :3]
         )
 
-    def _traction(self, wheels: WheelErrors, seed: int) -> Traction:
-        """Return the travel of both wheels over the plane, which is less than that over a slope."""
-        over_slope, ground = traction(wheels, seed), self._ground
+    def _over_ground(self, dt_s: float, left_m: float, right_m: float) -> tuple[float, float]:
+        """Return the travel of both wheels over the plane: they slip, and over a slope it is less."""
+        wheels, ground, pose = self._robot.wheels, self._ground, self.twin.base.pose
+        noise = self._wheel_noise.gauss
+        self._rolled_s += dt_s
+        lost = [slip.share for slip in wheels.slips if slip.start_s <= self._rolled_s < slip.end_s]
+        kept = 1.0 - max(lost, default=0.0)
+        left_m, right_m = (
+            kept * travel_m * (1.0 + error) + wheels.noise * math.sqrt(abs(travel_m)) * noise(0.0, 1.0)
+            for travel_m, error in ((left_m, wheels.left), (right_m, wheels.right))
+        )
         if not ground.profile:
-            return over_slope
-
-        def over_plane(dt_s: float, left_m: float, right_m: float) -> tuple[float, float]:
-            cosine = float(ground.T_world_base(self.twin.base.pose)[:2, 0] @ _ahead(self.twin.base.pose))
-            left_m, right_m = over_slope(dt_s, left_m, right_m)
-            return cosine * left_m, cosine * right_m
-
-        return over_plane
+            return left_m, right_m
+        cosine = float(ground.T_world_base(pose)[:2, 0] @ np.array([math.cos(pose[2]), math.sin(pose[2])]))
+        return cosine * left_m, cosine * right_m
 
     def _sense_rotation(self, rates_radps: Array) -> None:
         """Add a sample of the gyro: the mean over the time since the last one."""
@@ -183,8 +187,3 @@ class Vehicle:
         x_m, y_m, _ = self.twin.base.pose
         walking = footprints(self.people.faces(), self._robot.height_m, self._ground)
         return min(clearance_m(segments, (x_m, y_m), self._robot.radius_m) for segments in (self._standing, walking))
-
-
-def _ahead(pose: Pose) -> Array:
-    """Return the unit vector (2,) along a heading."""
-    return np.array([math.cos(pose[2]), math.sin(pose[2])])

@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from itertools import pairwise
-from typing import Annotated, Final, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeAlias
 
 import numpy as np
 from msgspec import Meta, Struct
@@ -42,24 +42,10 @@ KINDS: Final = ("brick", "plaster", "granite", "plaster")  # Textures of a rando
 Side: TypeAlias = Annotated[float, Meta(ge=0.02, le=20.0)]  # m
 Size: TypeAlias = tuple[Side, Side, Side]
 Path: TypeAlias = Annotated[tuple[Point, ...], Meta(min_length=2, max_length=100)]
-Painted: TypeAlias = Literal[
-    "brick",
-    "plaster",
-    "granite",
-    "tiles",
-    "plain",
-    "white",
-    "linoleum",
-    "epoxy",
-    "marbled",
-    "concrete",
-    "glazed",
-    "slabs",
-    "carpet",
-    "parquet_along",
-    "parquet_across",
-    "laminate",
-]
+if TYPE_CHECKING:
+    Painted: TypeAlias = str
+else:
+    Painted = Literal[tuple(textures.PAINTERS)]
 
 
 class Door(Struct, frozen=True, order=True):
@@ -219,15 +205,9 @@ def parse_world(text: str, name: str, seed: int, options: WorldOptions) -> World
     if options.other_posters:
         surfaces = _exchanged(surfaces, options)
     start = x_m, y_m, math.radians(heading_deg)
-    is_polished = space.finish == "polished"
-    return World(
-        name,
-        tuple(surfaces),
-        people if options.people else (),
-        start,
-        options.brightness * world.light,
-        is_polished,
-    )
+    people = people if options.people else ()
+    brightness, is_polished = options.brightness * world.light, space.finish == "polished"
+    return World(name, tuple(surfaces), people, start, brightness, is_polished)
 
 
 def _errors(world: WorldTable) -> Iterator[str]:
@@ -241,22 +221,16 @@ def _errors(world: WorldTable) -> Iterator[str]:
         yaw_rad = math.radians(entry.yaw_deg)
         c, s = math.cos(yaw_rad), math.sin(yaw_rad)
         (x_m, y_m), (along_m, across_m) = entry.at, (side / 2 for side in entry.size_m[:2])
-        corners = [
-            (x_m + c * i * along_m - s * j * across_m, y_m + s * i * along_m + c * j * across_m)
-            for i in (-1, 1)
-            for j in (-1, 1)
-        ]
+        ends = [(i * along_m, j * across_m) for i in (-1, 1) for j in (-1, 1)]
+        corners = [(x_m + c * along - s * across, y_m + s * along + c * across) for along, across in ends]
         if not all(map(space.contains, corners)):
             yield f"box[{number}].at: expected a place where the whole box is within the space, found {entry.at}"
         dx_m, dy_m = start[0] - x_m, start[1] - y_m
         if abs(c * dx_m + s * dy_m) <= along_m and abs(c * dy_m - s * dx_m) <= across_m:
             yield f"box[{number}].at: expected a place where the robot does not start inside the box, found {entry.at}"
-    area_m2 = (
-        2 * math.prod(space.sides_m)
-        + sum(wall.area_m2(space.ceiling_m) for wall in world.wall)
-        + sum(_box_area_m2(entry.size_m) for entry in world.box)
-        + sum(_box_area_m2(walker.size_m) for walker in world.person)
-    )
+    sizes = [*(entry.size_m for entry in world.box), *(walker.size_m for walker in world.person)]
+    walls_m2 = sum(wall.area_m2(space.ceiling_m) for wall in world.wall)
+    area_m2 = 2 * math.prod(space.sides_m) + walls_m2 + sum(map(_box_area_m2, sizes))
     if area_m2 > LARGEST_AREA_M2:
         yield f"the surfaces are {area_m2:.0f} m2; expected at most {LARGEST_AREA_M2:g}"
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Protocol, runtime_checkable
 
 import cv2
@@ -125,28 +126,21 @@ def _sample_pixels(size: tuple[int, int], supersample: int) -> list[Array]:
     return np.array_split(pixels, -(-len(pixels) // RAY_CHUNK))
 
 
-_last_lifted: list[tuple[OmniCamera, int, tuple[Floats, Floats]]] = []  # at most one
-
-
 def _lift_grid(mounted: MountedCamera, supersample: int) -> tuple[Floats, Floats]:
     """Return rays (N, 3), NaN outside the mask, and the angle between neighbours (N,) of every sample, row by row."""
-    rays, spacing = _lifted(mounted.camera, supersample)
+    rays, spacing = _lifted(mounted.camera, supersample)  # type: ignore[arg-type]  # cameras are frozen
     pixels = np.concatenate(_sample_pixels(mounted.camera.size, supersample))
     return np.where(mounted.visible.contains(pixels)[:, None], rays, np.float32(np.nan)), spacing
 
 
+@lru_cache(1)
 def _lifted(camera: OmniCamera, supersample: int) -> tuple[Floats, Floats]:
     """Return rays and spacing of every sample without a mask; computed once for the equal lenses of a rig."""
-    for kept, samples, lifted in _last_lifted:
-        if samples == supersample and kept == camera:
-            return lifted
     width, height = camera.size
     rays = np.concatenate([camera.lift(chunk) for chunk in _sample_pixels(camera.size, supersample)])
     grid = rays.reshape(height * supersample, width * supersample, 3)
     solid_angle = np.linalg.norm(np.cross(np.gradient(grid, axis=0), np.gradient(grid, axis=1)), axis=2)
-    lifted = rays.astype(np.float32), np.sqrt(solid_angle).astype(np.float32).ravel()
-    _last_lifted[:] = [(camera, supersample, lifted)]
-    return lifted
+    return rays.astype(np.float32), np.sqrt(solid_angle).astype(np.float32).ravel()
 
 
 def _cones(rays: Floats, starts: NDArray[np.int64]) -> tuple[Array, Array]:

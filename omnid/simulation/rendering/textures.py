@@ -202,22 +202,11 @@ def _boards(
 
 
 PAINTERS: dict[str, Painter] = {
-    "brick": brick,
-    "plaster": plaster,
-    "granite": granite,
-    "tiles": tiles,
-    "plain": plain,
-    "white": white,
-    "linoleum": linoleum,
-    "epoxy": epoxy,
-    "marbled": marbled,
-    "concrete": concrete,
-    "glazed": glazed,
-    "slabs": slabs,
-    "carpet": carpet,
-    "parquet_along": parquet_along,
-    "parquet_across": parquet_across,
-    "laminate": laminate,
+    painter.__name__: painter
+    for painter in (
+        *(brick, plaster, granite, tiles, plain, white, linoleum, epoxy, marbled, concrete, glazed, slabs, carpet),
+        *(parquet_along, parquet_across, laminate),
+    )
 }
 
 

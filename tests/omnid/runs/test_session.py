@@ -9,8 +9,8 @@ import pytest
 from omnid.config import load_config
 from omnid.engine.graph import Graph
 from omnid.runs.session import Session
-from omnid.simulation.lockstep import with_masks
 from omnid.simulation.rendering.rigs import make_rig
+from omnid.simulation.robot import with_masks
 
 
 def warnings_of(size_px: int, *overrides: str) -> list[str]:

@@ -5,11 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from omnid.simulation.lockstep import with_masks
 from omnid.simulation.rendering.mirrors import Mirror, reflectance
 from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
-from omnid.simulation.robot import make_robot
+from omnid.simulation.robot import make_robot, with_masks
 
 ROBOT = make_robot(256)
 RIG = with_masks(ROBOT.rig)
