@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Mapping
+from itertools import product
 from statistics import median_low
 from typing import Final
 
@@ -125,7 +126,6 @@ class Decoder:
 
 
 KEPT: Final = 4  # earlier images compared with: a driver that is stuck may hand out its buffers in turn
-SAMPLED_PX: Final = 16  # rows and columns of the first comparison: the noise of any real image differs there
 FROZEN_IMAGES: Final = 5  # repeated images in a row after which a camera counts as frozen: a single one may be a glitch
 
 
@@ -137,7 +137,7 @@ class RepeatedImages:
     """
 
     def __init__(self) -> None:
-        self._earlier: deque[tuple[bytes, Image]] = deque(maxlen=KEPT)  # with samples of them, the newest first
+        self._earlier: deque[Image] = deque(maxlen=KEPT)  # the newest first
         self._equal = [0] * KEPT  # consecutive images that equal the one 1, 2 ... KEPT images earlier
         self.count = 0  # repeated images in all
         self.longest = 0  # most of them in a row
@@ -150,11 +150,11 @@ class RepeatedImages:
 
     def add(self, image: Image) -> bool:
         """Take the next image (H, W); return True if it repeats earlier ones."""
-        sample = image[::SAMPLED_PX, ::SAMPLED_PX].tobytes()  # decides at once for images that are not equal
-        for index, (earlier_sample, earlier) in enumerate(self._earlier):
-            is_equal = sample == earlier_sample and np.array_equal(image, earlier)
+        for index, earlier in enumerate(self._earlier):
+            # One row decides at once for images that are not equal: the noise of any real image differs there.
+            is_equal = np.array_equal(image[::2, 0], earlier[::2, 0]) and np.array_equal(image, earlier)
             self._equal[index] = self._equal[index] + 1 if is_equal else 0
-        self._earlier.appendleft((sample, image))
+        self._earlier.appendleft(image)
         repeated = any(count > index for index, count in enumerate(self._equal))
         self.count += repeated
         self._in_a_row = self._in_a_row + 1 if repeated else 0
@@ -162,132 +162,53 @@ class RepeatedImages:
         return repeated
 
 
-MAX_WAITING = 4  # frames of a camera that wait for a partner: the other camera may be delivered a few periods later
-PERIOD_STEPS = 16  # recent steps between the stamps of a camera, whose median is its period
-SURE_NS = 5_000_000  # stamps so close make a pair also before the period is known
-SURE_STEPS = 3  # Steps after which the period is known ...
-FIRST_NS = 100_000_000  # ... and the largest difference of a pair before: half the period at 5 Hz.
-OTHER: dict[Camera, Camera] = {"lower": "upper", "upper": "lower"}
+MAX_WAITING: Final = 4  # frames of a camera that wait: the other camera may be delivered a few periods later
+PERIOD_STEPS: Final = 16  # recent steps between the stamps of a camera, whose median is its period
+# Largest difference of a pair: while the period is not known, and always. A pause at the start is no period.
+SURE_NS, MOST_NS = 5_000_000, 100_000_000
 
 
-class Period:
-    """Period of a camera's images, by their stamps."""
+class _Camera:
+    """The frames of one camera on their way to pairs."""
 
     def __init__(self) -> None:
-        self._newest_ns: int | None = None
-        self._steps: deque[int] = deque(maxlen=PERIOD_STEPS)
-        self.ns: float | None = None  # median of the recent ones; None before the second image
+        self.waiting: deque[Frame] = deque()
+        self.steps_ns: deque[int] = deque(maxlen=PERIOD_STEPS)  # between the stamps of its frames
+        self.newest_ns = 0  # stamp of its newest frame
+        self.arrived = self.unpaired = 0  # numbers of frames
+        self.repeated = RepeatedImages()
 
     @property
-    def is_sure(self) -> bool:
-        """True if a single pause, as at the start of a camera, cannot be taken for the period."""
-        return len(self._steps) >= SURE_STEPS
-
-    def add(self, stamp_ns: int) -> None:
-        """Add an image."""
-        if self._newest_ns is not None and stamp_ns > self._newest_ns:
-            self._steps.append(stamp_ns - self._newest_ns)
-            self.ns = float(median_low(self._steps))
-        self._newest_ns = stamp_ns
-
-
-class FrameMatcher:
-    """Nearest-stamp matching of the frames of two cameras; reads stamps only, no images and no clock.
-
-    Frames of one camera come in the order of their stamps, those of both in any order. A match is final as soon as
-    there is one within the tolerance: waiting for a nearer one would delay every pair by a period.
-
-    tolerance_ns 0: half the period of the faster camera, so that every image of the slower one finds its nearest
-    partner whatever the phase between the cameras. Before the period is known, all but very close frames wait; a
-    pause between the first images may be taken for it, so at first no more than FIRST_NS counts.
-    """
-
-    def __init__(self, tolerance_ns: int) -> None:
-        self.fixed_ns = tolerance_ns  # 0: none
-        self._periods: dict[Camera, Period] = {"lower": Period(), "upper": Period()}
-        self._waiting: dict[Camera, deque[Frame]] = {"lower": deque(), "upper": deque()}
-        self._arrived: Counter[Camera] = Counter()
-        self.unpaired: Counter[Camera] = Counter()
-        self.closest_miss_ns: int | None = None  # smallest gap between frames of both cameras that made no pair
-
-    @property
-    def waiting(self) -> int:
-        """Number of frames that wait for a partner."""
-        return sum(map(len, self._waiting.values()))
-
-    @property
-    def unpaired_by_chance(self) -> int:
-        """Number of unpaired frames, without those of a faster camera that the other has no partners for."""
-        periods_ns = {camera: period.ns for camera, period in self._periods.items()}
-        return unpaired_by_chance(self._arrived, {camera: self.unpaired[camera] for camera in periods_ns}, periods_ns)
-
-    @property
-    def tolerance_ns(self) -> float:
-        """Largest difference between the stamps of a pair."""
-        periods = [period for period in self._periods.values() if period.ns is not None]
-        if self.fixed_ns or not periods:
-            return self.fixed_ns or SURE_NS
-        half_ns = min(period.ns for period in periods if period.ns is not None) / 2
-        return half_ns if any(period.is_sure for period in periods) else min(half_ns, FIRST_NS)
+    def period_ns(self) -> float | None:
+        """Median of the recent steps; None before the second image."""
+        return float(median_low(self.steps_ns)) if self.steps_ns else None
 
     def arrive(self, frame: Frame) -> None:
-        """Take note of a frame's stamp."""
-        self._periods[frame.camera].add(frame.stamp_ns)
-        self._arrived[frame.camera] += 1
+        """Let a frame wait for a partner."""
+        if self.newest_ns and frame.stamp_ns > self.newest_ns:
+            self.steps_ns.append(frame.stamp_ns - self.newest_ns)
+        self.newest_ns = frame.stamp_ns
+        self.arrived += 1
+        self.waiting.append(frame)
 
-    def couple(self) -> tuple[Frame, Frame] | None:
-        """Return the first frames of both cameras that wait within the tolerance; None without any.
+    def drop_oldest(self) -> None:
+        """Give a frame up that has found no partner."""
+        self.waiting.popleft()
+        self.unpaired += 1
 
-        There are such frames only when the period has just become known.
-        """
-        for lower in self._waiting["lower"]:
-            nearest = self._nearest(lower)
-            if nearest is not None and _gap_ns(lower, nearest) <= self.tolerance_ns:
-                return lower, nearest
-        return None
-
-    def partner(self, frame: Frame) -> Frame | None:
-        """Return the waiting frame of the other camera that is nearest in time, None without one in the tolerance."""
-        nearest = self._nearest(frame)
-        return nearest if nearest is not None and _gap_ns(frame, nearest) <= self.tolerance_ns else None
-
-    def wait(self, frame: Frame) -> None:
-        """Let a frame without a partner wait; the oldest one gives way when too many wait."""
-        nearest = self._nearest(frame)
-        if nearest is not None:
-            gap_ns = _gap_ns(frame, nearest)
-            self.closest_miss_ns = gap_ns if self.closest_miss_ns is None else min(gap_ns, self.closest_miss_ns)
-        waiting = self._waiting[frame.camera]
-        waiting.append(frame)
-        if len(waiting) > MAX_WAITING:
-            waiting.popleft()
-            self.unpaired[frame.camera] += 1
-
-    def remove(self, frame: Frame) -> None:
-        """Remove a waiting frame that turned out to be of no use; it does not count as unpaired."""
-        self._waiting[frame.camera].remove(frame)
-
-    def join(self, *pair: Frame) -> None:
-        """Make frames a pair. Older waiting frames can match no later one: they are dropped and counted."""
-        for frame in pair:
-            waiting = self._waiting[frame.camera]
-            while waiting and waiting[0].stamp_ns <= frame.stamp_ns:
-                dropped = waiting.popleft()
-                if dropped is not frame:
-                    self.unpaired[frame.camera] += 1
-
-    def drain(self) -> None:
-        """Drop and count all frames that wait."""
-        for camera, waiting in self._waiting.items():
-            self.unpaired[camera] += len(waiting)
-            waiting.clear()
-
-    def _nearest(self, frame: Frame) -> Frame | None:
-        return min(self._waiting[OTHER[frame.camera]], key=lambda other: _gap_ns(frame, other), default=None)
+    def take(self, frame: Frame) -> None:
+        """Take a frame that waits into a pair. Those before it can match no later one: they are given up."""
+        while self.waiting[0] is not frame:
+            self.drop_oldest()
+        self.waiting.popleft()
 
 
 class Synchronise:
-    """Joins each frame with the frame of the other camera that is nearest in time.
+    """Joins the frames of both cameras that are nearest in time.
+
+    A pair is made as soon as two frames that wait are within the tolerance: to wait for a nearer one would delay each
+    pair by a period. The tolerance is pair.tolerance_ms; 0: half the period of the faster camera, so that every image
+    of the slower one finds its nearest partner whatever the phase between the cameras.
 
     Live cameras and logs need no different policy. A log's frames come in the order of all stamps, a live camera's in
     that of its own: the first is a case of the second. Images are decoded once they have a partner, so that a camera
@@ -304,14 +225,14 @@ class Synchronise:
     def __init__(self, rig: Rig, config: PairConfig, R_base_imu: NDArray[np.float64] | None = None) -> None:
         """R_base_imu: rotation from the axes of the gyro to those of the base; None: they are the same."""
         self._decode = Decoder(rig)
-        self._matcher = FrameMatcher(round(config.tolerance_ms * 1e6))
+        self._cameras: dict[Camera, _Camera] = {"lower": _Camera(), "upper": _Camera()}
+        self._fixed_ns = round(config.tolerance_ms * 1e6)  # 0: none
+        self._closest_miss_ns: int | None = None
         self._pairs = 0
         self._use_repeated = config.repeated_images == "use"
-        self.repeated: dict[Camera, RepeatedImages] = {"lower": RepeatedImages(), "upper": RepeatedImages()}
         self.skew = Skew()
         self.motion = MotionInbox(R_base_imu)
         self.load = LoadLevel.FULL  # of the next pairs: a live run sets it
-        self.newest_ns: dict[Camera, int] = {"lower": 0, "upper": 0}  # stamp of each camera's newest frame
 
     @property
     def fault(self) -> str:
@@ -321,102 +242,101 @@ class Synchronise:
     @property
     def closest_miss_ms(self) -> float | None:
         """Smallest gap between images of both cameras that made no pair, ms; None without such images."""
-        miss_ns = self._matcher.closest_miss_ns
-        return None if miss_ns is None else miss_ns * 1e-6
+        return None if self._closest_miss_ns is None else self._closest_miss_ns * 1e-6
 
     @property
     def has_fixed_tolerance(self) -> bool:
         """True if the tolerance was set: cameras whose clocks drift apart then make no pairs some day."""
-        return self._matcher.fixed_ns > 0
+        return self._fixed_ns > 0
 
     @property
     def tolerance_ms(self) -> float:
         """Largest difference between the stamps of a pair, ms, as set or as it follows from the period."""
-        return self._matcher.tolerance_ns * 1e-6
+        return self._tolerance_ns * 1e-6
 
     @property
-    def waiting(self) -> int:
-        """Number of frames that wait for a partner."""
-        return self._matcher.waiting
-
-    def loss(self, read: Mapping[str, int]) -> ImageLoss:
-        """Return the images of a log that made no pair; read: counts of its reader."""
-        broken, other_size = self._decode.broken, self._decode.other_size
-        unpaired = self._matcher.unpaired_by_chance
-        return image_loss(read, unpaired=unpaired, undecodable=broken - other_size, other_size=other_size)
+    def newest_ns(self) -> dict[Camera, int]:
+        """Stamp of each camera's newest frame; 0 before the first."""
+        return {name: camera.newest_ns for name, camera in self._cameras.items()}
 
     @property
-    def counts(self) -> dict[str, int]:
-        """Pairs made, frames without a partner, images that could not be decoded, images that repeat earlier ones."""
-        unpaired = self._matcher.unpaired
-        return {
-            "pairs": self._pairs,
-            "unpaired_lower": unpaired["lower"],
-            "unpaired_upper": unpaired["upper"],
-            "broken": self._decode.broken,
-            "repeated_lower": self.repeated["lower"].count,
-            "repeated_upper": self.repeated["upper"].count,
-        }
+    def repeated(self) -> dict[Camera, RepeatedImages]:
+        """The images of each camera that repeat earlier ones."""
+        return {name: camera.repeated for name, camera in self._cameras.items()}
 
     @property
     def frozen(self) -> list[Camera]:
         """The cameras whose newest images are repeated ones."""
-        return [camera for camera, images in self.repeated.items() if images.frozen]
+        return [name for name, camera in self._cameras.items() if camera.repeated.frozen]
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Pairs made, frames without a partner, images that could not be decoded, images that repeat earlier ones."""
+        unpaired = {f"unpaired_{name}": camera.unpaired for name, camera in self._cameras.items()}
+        repeated = {f"repeated_{name}": camera.repeated.count for name, camera in self._cameras.items()}
+        return {"pairs": self._pairs, **unpaired, "broken": self._decode.broken, **repeated}
+
+    def loss(self, read: Mapping[str, int]) -> ImageLoss:
+        """Return the images of a log that made no pair; read: counts of its reader."""
+        cameras, broken, other_size = self._cameras.items(), self._decode.broken, self._decode.other_size
+        unpaired = unpaired_by_chance(
+            {name: camera.arrived for name, camera in cameras},
+            {name: camera.unpaired for name, camera in cameras},
+            {name: camera.period_ns for name, camera in cameras},
+        )
+        return image_loss(read, unpaired=unpaired, undecodable=broken - other_size, other_size=other_size)
 
     def process(self, message: Frame | MotionSample) -> FramePair | None:
         """Return the pair that a frame completes; None where the frame waits, is broken or shows nothing new."""
-        if isinstance(message, Frame):
-            return self._completed(message)
-        self.motion.add(message)
-        return None
-
-    def _completed(self, frame: Frame) -> FramePair | None:
-        self.newest_ns[frame.camera] = frame.stamp_ns
-        self._matcher.arrive(frame)
-        waiting = self._matcher.couple()
-        if waiting is not None:
-            pair = self._decoded(*waiting)
-            self._matcher.wait(frame)  # afterwards: it may push out the oldest one that waits
-            return pair
-        image: Image | None = None
-        while (partner := self._matcher.partner(frame)) is not None:
-            image = self._decode(frame) if image is None else image
-            partner_image = self._decode(partner)
-            if partner_image is None:
-                self._matcher.remove(partner)
-            if image is None:
-                return None
-            if partner_image is not None:
-                return self._joined({frame.camera: (frame, image), partner.camera: (partner, partner_image)})
-        self._matcher.wait(frame)
-        return None
-
-    def _decoded(self, lower: Frame, upper: Frame) -> FramePair | None:
-        """Return the pair of two frames that wait; None where one is broken, which no longer waits."""
-        lower_image, upper_image = self._decode(lower), self._decode(upper)
-        for frame, image in ((lower, lower_image), (upper, upper_image)):
-            if image is None:
-                self._matcher.remove(frame)
-        if lower_image is None or upper_image is None:
+        if not isinstance(message, Frame):
+            self.motion.add(message)
             return None
-        return self._joined({"lower": (lower, lower_image), "upper": (upper, upper_image)})
+        # 1. The frame waits for a partner.
+        camera = self._cameras[message.camera]
+        camera.arrive(message)
+        # 2. The two frames that are nearest in time make a pair, unless one of them is broken.
+        lower_waiting, upper_waiting = (each.waiting for each in self._cameras.values())
+        while lower_waiting and upper_waiting:
+            lower, upper = min(product(lower_waiting, upper_waiting), key=_gap_ns)
+            gap_ns = _gap_ns((lower, upper))
+            if gap_ns > self._tolerance_ns:
+                self._closest_miss_ns = min(gap_ns, self._closest_miss_ns or gap_ns)
+                break
+            lower_image, upper_image = self._decode(lower), self._decode(upper)
+            if lower_image is None:
+                lower_waiting.remove(lower)
+            if upper_image is None:
+                upper_waiting.remove(upper)
+            if lower_image is not None and upper_image is not None:
+                return self._joined(lower, lower_image, upper, upper_image)
+        # 3. Only a few wait.
+        if len(camera.waiting) > MAX_WAITING:
+            camera.drop_oldest()
+        return None
 
     def finish(self) -> tuple[()]:
         """Count the frames that still wait."""
-        self._matcher.drain()
+        for camera in self._cameras.values():
+            while camera.waiting:
+                camera.drop_oldest()
         return ()
 
-    def _joined(self, pair: dict[Camera, tuple[Frame, Image]]) -> FramePair | None:
-        (lower, lower_image), (upper, upper_image) = pair["lower"], pair["upper"]
-        self._matcher.join(lower, upper)
+    @property
+    def _tolerance_ns(self) -> float:
+        periods_ns = [camera.period_ns for camera in self._cameras.values() if camera.period_ns is not None]
+        return self._fixed_ns or min((SURE_NS if not periods_ns else min(periods_ns) / 2), MOST_NS)
+
+    def _joined(self, lower: Frame, lower_image: Image, upper: Frame, upper_image: Image) -> FramePair | None:
+        self._cameras["lower"].take(lower)
+        self._cameras["upper"].take(upper)
         self.skew.add(upper.stamp_ns - lower.stamp_ns)
-        repeated = [self.repeated[camera].add(image) for camera, (_, image) in pair.items()]
+        images = zip(self._cameras.values(), (lower_image, upper_image), strict=True)
+        repeated = [camera.repeated.add(image) for camera, image in images]
         if any(repeated) and not self._use_repeated:
             return None
-        seq = self._pairs
         self._pairs += 1
         return FramePair(
-            seq,
+            self._pairs - 1,
             lower.stamp_ns,
             lower_image,
             upper_image,
@@ -427,5 +347,5 @@ class Synchronise:
         )
 
 
-def _gap_ns(frame: Frame, other: Frame) -> int:
-    return abs(other.stamp_ns - frame.stamp_ns)
+def _gap_ns(frames: tuple[Frame, Frame]) -> int:
+    return abs(frames[1].stamp_ns - frames[0].stamp_ns)
