@@ -262,7 +262,7 @@ def _completes() -> bool:
 def _guarded(args: argparse.Namespace) -> int:
     from calib.errors import CalibError
     from drivers.errors import DriverError
-    from omnid.engine.logging_setup import configure_logging, log_unlimited
+    from omnid.engine.logging_setup import configure_logging, log
     from omnid.errors import OmnidError
 
     configure_logging()
@@ -271,7 +271,7 @@ def _guarded(args: argparse.Namespace) -> int:
         sys.stdout.flush()
         return code
     except (OmnidError, DriverError, CalibError) as error:
-        log_unlimited(logging.ERROR, str(error))
+        log(logging.ERROR, str(error))
         return WRONG_INPUT
     except KeyboardInterrupt:
         return 130
@@ -279,7 +279,7 @@ def _guarded(args: argparse.Namespace) -> int:
         _discard_stdout()
         return 141
     except OSError as error:  # not handled by the command: a full disk, a file name that is too long
-        log_unlimited(logging.ERROR, f"{error.filename or 'cannot write'}: {error.strerror or error}")
+        log(logging.ERROR, f"{error.filename or 'cannot write'}: {error.strerror or error}")
         _discard_stdout()
         return WRONG_INPUT
 

@@ -64,9 +64,6 @@ RUNNING = 2  # time that the cameras are opened: first for the masks, then for t
 )
 def run(args: argparse.Namespace) -> int:
     """Run until a signal comes."""
-    from omnid.engine.process import use_one_malloc_arena
-
-    use_one_malloc_arena()  # first: the next imports load numpy, which starts threads
     from omnid.config import unused_settings
     from omnid.engine.logging_setup import HANDLER, log
     from omnid.runs.live import ConnectedRobot, LiveRun
@@ -137,9 +134,6 @@ def _recorded(args: argparse.Namespace, config: Config) -> tuple[OpenCamera, Log
 )
 def simulate(args: argparse.Namespace) -> int:
     """Run until a signal comes."""
-    from omnid.engine.process import use_one_malloc_arena
-
-    use_one_malloc_arena()  # first: the next imports load numpy, which starts threads
     from calib.rig_file import read_rig
     from omnid.config import unused_settings
     from omnid.controller.motor import SIMULATED

@@ -29,7 +29,7 @@ from omnid.core.compiled import (
     kept_folder,
     why_unusable,
 )
-from omnid.engine.logging_setup import Report, log_unlimited
+from omnid.engine.logging_setup import Report, log
 from omnid.engine.process import python, python_environment
 from omnid.errors import OmnidError
 
@@ -40,7 +40,7 @@ TIMEOUT_S: Final = 600.0  # as long as the service may take to start; half a min
 _prepared: set[str] = set()  # names of the modules whose functions are ready
 
 
-def prepare_kernels(report: Report = log_unlimited) -> None:
+def prepare_kernels(report: Report = log) -> None:
     """Compile all functions, or read them from the disk; report compilations, and code that is not kept.
 
     The second call and later ones do nothing. Raises OmnidError where the system allows no code that is made at run

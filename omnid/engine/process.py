@@ -1,4 +1,4 @@
-"""This process and those that it starts: signals that stop a run, the memory allocator, Python programs.
+"""This process and those that it starts: signals that stop a run, Python programs.
 
 Imports nothing that starts a thread. `python -m NAME` and `python -c TEXT` look for modules in the current folder
 first, where a `numpy.py` may lie that another user wrote. Each program is therefore started with -P, which leaves that
@@ -7,17 +7,15 @@ folder out (Python 3.11 and later).
 
 from __future__ import annotations
 
-import ctypes
 import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from types import FrameType
 from typing import Final
 
 STOP_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # Ctrl-C, the service manager, a closed terminal
-_M_ARENA_MAX: Final = -8  # malloc.h of glibc
 
 
 @contextmanager
@@ -30,16 +28,6 @@ def handle_stop_signals(handler: Callable[[int, FrameType | None], object]) -> I
     finally:
         for number, previous in before.items():
             signal.signal(number, previous)
-
-
-def use_one_malloc_arena() -> None:
-    """Let all threads share one malloc arena; to be called before numpy starts its threads.
-
-    Otherwise glibc gives each thread its own arena, whose locked pages never return to the kernel, so every thread
-    keeps the most memory it ever needed. The main arena shrinks, locked or not.
-    """
-    with suppress(AttributeError):  # not glibc
-        ctypes.CDLL(None).mallopt(_M_ARENA_MAX, 1)
 
 
 def python(*words: str) -> list[str]:

@@ -37,7 +37,6 @@ _PR_SET_NAME: Final = 15
 _NAME_BYTES: Final = 15
 # MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT; without the last one, untouched stacks take 400 MB.
 _MCL_ALL: Final = 1 | 2 | 4
-_MADV_DONTNEED: Final = 4
 _LIBC: Final = ctypes.CDLL(None, use_errno=True)
 
 
@@ -91,11 +90,6 @@ class ThreadStart:
             )
 
 
-def priorities(config: RealtimeSettings, *captures: str) -> dict[str, int]:
-    """Return the priorities by thread, for ThreadStart; the controller has a process of its own."""
-    return {name: config.capture_priority for name in captures}
-
-
 def set_realtime_priority(priority: int) -> bool:
     """Make the calling thread SCHED_FIFO; False if that is not allowed."""
     with suppress(OSError):
@@ -130,20 +124,6 @@ def lock_memory() -> str:
     if _LIBC.mlockall(_MCL_ALL) != 0:
         return f"memory is not locked, it may be swapped out: {os.strerror(ctypes.get_errno())}; {LOCK_ADVICE}"
     return ""
-
-
-def give_back_code(library: str) -> None:
-    """Give the memory of the code of a library, part of the path of its file, back to the system; before it is locked.
-
-    For a library that is needed at the start only. Code that runs after all is read again from the file: what is
-    executable is never written, so nothing is lost. Without /proc nothing happens.
-    """
-    with suppress(OSError):
-        for line in Path("/proc/self/maps").read_text().splitlines():
-            addresses, access, *_, path = line.split(maxsplit=5)
-            if library in path and access == "r-xp":
-                first, end = (int(address, 16) for address in addresses.split("-"))
-                _LIBC.madvise(ctypes.c_void_p(first), ctypes.c_size_t(end - first), _MADV_DONTNEED)
 
 
 def may_lock() -> bool:

@@ -42,7 +42,7 @@ from omnid.engine.flow import nothing
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Stream
 from omnid.engine.kernel_cache import prepare_kernels, read_kept_kernels
 from omnid.engine.logging_setup import Report
-from omnid.engine.realtime import ThreadStart, give_back_code, name_thread, prepare
+from omnid.engine.realtime import ThreadStart, name_thread, prepare
 from omnid.engine.robot_clock import RobotClock, SegmentTime, fixed_offset, log_time
 from omnid.engine.threads import started
 from omnid.errors import OmnidError
@@ -238,7 +238,6 @@ class LiveRun:
                 geometry = session.geometry(rig, frames)
             loaded()
             prepare_kernels()
-            give_back_code("llvmlite")  # which has loaded the compiled functions, and does nothing else in a run
             # 2. The connections, and the stages between them.
             self._connected = True
             run_places = RunPlaces(self._config, geometry, warn)

@@ -25,7 +25,7 @@ from starlette.responses import FileResponse, HTMLResponse, PlainTextResponse, R
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
-from omnid.engine.logging_setup import is_journal, log_unlimited
+from omnid.engine.logging_setup import is_journal, log
 from omnid.engine.realtime import raise_file_limit
 from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig, checked
@@ -90,7 +90,7 @@ def serve(bus: BusConfig, settings: WebSettings) -> None:
             if stop_token:
                 print(f"{url}?token={stop_token} (may see and stop, not arm)", flush=True)
         if not local and settings.tls is None:
-            log_unlimited(
+            log(
                 logging.WARNING,
                 "the page can be reached from the network without encryption: everyone who can listen there learns the "
                 "token, and may arm the robot; use --tls-certificate and --tls-key, or a network that you trust",
