@@ -27,6 +27,15 @@ from omnid.stages.obstacles import controller_ring
 from omnid.transport.requests import Answer
 
 NAVIGATION_SENDER: Final = "navigation"  # identity of the sender: no other program drives on its source meanwhile
+GRANTED: Final = {
+    "goal": "it drives to the goal",
+    "path": "it drives along the path",
+    "resume": "it goes on",
+    "teach": "it records the route {0}: drive it, then finish it (`omnid route finish`)",
+    "finish": "the route is written",
+    "repeat": "it repeats the route {0}",
+    "stop": "the route has ended",
+}
 FAILED_S: Final = 3.0  # a motor controller that has failed for this time ends a replay
 
 
@@ -81,15 +90,7 @@ def granted_words(request: str, state: NavigationState, reason: str = "") -> str
     words = f"{state}: {reason}" if reason else str(state)
     if state.is_end and state is not NavigationState.CANCELLED:
         words = f"nothing is under way ({words})"
-    return {
-        "goal": "it drives to the goal",
-        "path": "it drives along the path",
-        "resume": "it goes on",
-        "teach": f"it records the route {name}: drive it, then finish it (`omnid route finish`)",
-        "finish": "the route is written",
-        "repeat": f"it repeats the route {name}",
-        "stop": "the route has ended",
-    }.get(verb, words)
+    return GRANTED.get(verb, words).format(name)
 
 
 class RingToController:

@@ -31,7 +31,7 @@ REPLACED: Final = ("--cloud", "--plan", "--ply", "--grid")  # options of files t
 def check_outputs(outputs: Named, inputs: Named) -> None:
     """Check that all outputs (option, path) can be written, and none is another one, an input (name, path) or in use.
 
-    Of an input that is a folder, logs and images in it are inputs as well. Raises OmnidError.
+    Of an input that is a folder, logs and images in it are inputs as well. Leaves no file behind. Raises OmnidError.
     """
     taken = {_identity(path): what for what, path in inputs}
     for option, path in outputs:
@@ -48,44 +48,42 @@ def check_outputs(outputs: Named, inputs: Named) -> None:
 
 def on_stdout(outputs: Named) -> bool:
     """True if one of the outputs is the standard output, so that no other text may be printed there."""
-    try:
+    with suppress(OSError):
         found = os.fstat(1)
-    except OSError:
-        return False
-    return any(path.exists() and os.path.samestat(path.stat(), found) for _, path in outputs)
+        return any(path.exists() and os.path.samestat(path.stat(), found) for _, path in outputs)
+    return False
 
 
 def _identity(path: Path) -> tuple[int, int] | str:
     """Return a key that is the same for all names of a file, hard and symbolic links included."""
-    try:
+    with suppress(OSError):
         found = path.stat()
         return found.st_dev, found.st_ino
-    except OSError:
-        return os.path.realpath(path)
+    return os.path.realpath(path)
 
 
 def _require_writable(option: str, path: Path) -> None:
-    """Raise OmnidError where a file cannot be written; leave no file behind."""
-    if str(path) == "-":
-        raise OmnidError(f"{option} -: expected the name of a file; use /dev/stdout for the standard output")
+    wrong, other = "", "name another file"
     try:
-        if path.is_dir():
-            raise OmnidError(f"{option} {path}: expected a file to write, found a folder")
-        if not path.parent.is_dir():
-            raise OmnidError(f"{option} {path}: there is no folder {path.parent}; make it first")
-        if path.exists() and not path.is_file():  # not opened: a pipe that is opened and closed would end its reader
-            if option in REPLACED:
-                raise OmnidError(f"{option} {path}: expected a file that can be replaced, found a device or a pipe")
-            return
-        is_new = not path.exists()
-        with path.open("ab"):
-            pass
-        if is_new:
-            os.unlink(os.path.realpath(path))  # where path is a link, it stays one
+        if str(path) == "-":
+            wrong, other = "expected the name of a file", "use /dev/stdout for the standard output"
+        elif path.is_dir():
+            wrong = "expected a file to write, found a folder"
+        elif not path.parent.is_dir():
+            wrong, other = f"there is no folder {path.parent}", "make it first"
+        elif path.exists() and not path.is_file():  # not opened: a pipe that is opened and closed would end its reader
+            wrong = "expected a file that can be replaced, found a device or a pipe" if option in REPLACED else ""
+        else:
+            is_new = not path.exists()
+            path.open("ab").close()
+            if is_new:
+                os.unlink(os.path.realpath(path))  # where path is a link, it stays one
+            elif is_locked(path):
+                wrong, other = "another program is writing it", "name another file, or wait"
     except OSError as error:
-        raise OmnidError(f"{option} {path}: cannot be written: {error.strerror or error}; name another file") from error
-    if is_locked(path):
-        raise OmnidError(f"{option} {path}: another program is writing it; name another file, or wait")
+        wrong = f"cannot be written: {error.strerror or error}"
+    if wrong:
+        raise OmnidError(f"{option} {path}: {wrong}; {other}")
 
 
 class TrajectoryFile:

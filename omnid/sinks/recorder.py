@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Final, Protocol, TypeAlias
+from typing import Final, TypeAlias
 
 from drivers.frame import Frame
 from drivers.logs.mcap_writer import LogWriter
-from drivers.logs.rotating_log import RotatingLogState
+from drivers.logs.rotating_log import RotatingLog, RotatingLogState
 from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.robot_clock import SegmentTime, log_time
 from omnid.errors import OmnidError
-from omnid.messages import OdometryUpdate, PlaceUpdate
+from omnid.messages import OdometryUpdate
 from omnid.sinks.encoder import Changes, Encoder, Outgoing, OutgoingMessage, status_report
 from omnid.transport.codec import ERROR, OK, DiagnosticStatus
 from omnid.transport.sensor_codec import image_cdr, image_topic
@@ -25,21 +25,6 @@ Recorded: TypeAlias = Frame | Outgoing
 FinalStatus: TypeAlias = Callable[[RunStatistics], Sequence[DiagnosticStatus]]
 
 _PENDING: Final = 256  # messages of other threads that may wait
-
-
-class MessageLog(Protocol):
-    """The file or files of a recorder: SingleLog, or drivers.logs.rotating_log.RotatingLog."""
-
-    state: RotatingLogState
-
-    def write(self, topic: str, schema_name: str, data: bytes, stamp_ns: int) -> None:
-        """Add a message."""
-
-    def end_file(self) -> None:
-        """Complete the file: the next message begins another one."""
-
-    def close(self) -> None:
-        """Complete the last file."""
 
 
 class SingleLog:
@@ -85,7 +70,7 @@ class Recorder:
 
     def __init__(
         self,
-        log: MessageLog,
+        log: SingleLog | RotatingLog,
         robot: str,
         encode: Encoder | None = None,
         *,
@@ -122,13 +107,18 @@ class Recorder:
             self._log.end_file()
         self._write_added()
         # 2. The message, and what changes with it.
-        stamp_ns = self._time.unix_ns(message.stamp_ns)
+        stamp_ns, encode = self._time.unix_ns(message.stamp_ns), self._encode
         try:
-            self._write(self._encoded(message, stamp_ns), stamp_ns)
-            if isinstance(message, OdometryUpdate | PlaceUpdate) and self._encode is not None:
+            if isinstance(message, Frame):
+                self._write([OutgoingMessage(image_topic(message), *image_cdr(message, stamp_ns))], stamp_ns)
+            elif encode is not None:
+                self._write(encode(message), stamp_ns)
                 if isinstance(message, OdometryUpdate):
                     self._statistics.process(message)
-                self._write(self._changed(message, self._encode), stamp_ns)
+                    if self._files != self.state.files:  # each file has all of what seldom changes
+                        self._files, self._changes = self.state.files, Changes(encode)
+                if self._changes is not None:
+                    self._write(self._changes(message), stamp_ns)
             self._newest_ns = max(self._newest_ns, stamp_ns)
         except OmnidError:  # for example a stamp that is not a time
             if not self._skip_invalid:
@@ -157,17 +147,6 @@ class Recorder:
             unix_ns = self._time.unix_ns(stamp_ns)
             with suppress(OmnidError):  # the computer's clock may be set to a time that no message can hold
                 self._write([status_report(unix_ns, statuses)], unix_ns)
-
-    def _encoded(self, message: Recorded, stamp_ns: int) -> Iterable[OutgoingMessage]:
-        if isinstance(message, Frame):
-            return [OutgoingMessage(image_topic(message), *image_cdr(message, stamp_ns))]
-        return self._encode(message) if self._encode is not None else []
-
-    def _changed(self, pose: OdometryUpdate | PlaceUpdate, encode: Encoder) -> Iterator[OutgoingMessage]:
-        """Return what has changed with a pose; all of that in every file once."""
-        if self._changes is None or (isinstance(pose, OdometryUpdate) and self._files != self.state.files):
-            self._files, self._changes = self.state.files, Changes(encode)
-        return self._changes(pose)
 
     def _write(self, messages: Iterable[OutgoingMessage], stamp_ns: int) -> None:
         for topic, schema, payload in messages:
