@@ -119,19 +119,19 @@ class LogReader:
             self._report()
 
     def _sorted(self) -> Iterator[Frame | MotionSample]:
-        buffer, samples = _ReorderBuffer(self._window, self._bits, self.counts), _Samples()
+        """Yield frames and samples by stamp; the newest frames are held back, as their times of logging may differ."""
+        waiting = _Waiting()
         for timed in self._times.stamped(self._images()):
             for what in ("images", timed.camera):
                 self._widen(what, timed.image.stamp_ns)
-            yield from self._due_samples(samples, timed.log_ns)
-            for frame in buffer.push(timed.camera, timed.image):
-                yield from samples.until(frame.stamp_ns)
-                yield frame
+            self._add_samples(waiting, timed.log_ns)
+            waiting.add(timed.image.stamp_ns, 1 + CAMERAS.index(timed.camera), timed.image)
+            while waiting.is_full(self._window):
+                yield from self._taken(waiting)
         if not self._closed:
-            yield from self._due_samples(samples, None)
-            for frame in buffer.drain():
-                yield from samples.until(frame.stamp_ns)
-                yield frame
+            self._add_samples(waiting, None)
+            while waiting.frames:
+                yield from self._taken(waiting)
 
     def _images(self) -> Iterator[TimedImage]:
         """Yield the images in the order of logging; the samples between them wait."""
@@ -147,13 +147,31 @@ class LogReader:
             elif (reading := self._reading(message)) is not None:
                 self._unstamped.append((log_ns, reading))
 
-    def _due_samples(self, samples: _Samples, until_ns: int | None) -> Iterator[MotionSample]:
-        """Stamp the samples that were logged until then, None: all; yield the earliest ones where too many wait."""
+    def _add_samples(self, waiting: _Waiting, until_ns: int | None) -> None:
+        """Stamp the samples that were logged until then, None: all."""
         while self._unstamped and (until_ns is None or self._unstamped[0][0] <= until_ns):
             log_ns, reading = self._unstamped.popleft()
             sample = reading._replace(stamp_ns=self._times.sample_ns(reading.stamp_ns, log_ns)).sample(log_ns)
             self._widen("wheels" if isinstance(sample, WheelSample) else "gyro", sample.stamp_ns)
-            yield from samples.push(sample)
+            waiting.add(sample.stamp_ns, 0, sample)
+
+    def _taken(self, waiting: _Waiting) -> Iterator[Frame | MotionSample]:
+        """Take the earliest entry and yield it; count instead a frame that is late, or is there twice."""
+        stamp_ns, rank, item = waiting.take()
+        if not isinstance(item, RosImage):
+            yield item
+            return
+        camera = CAMERAS[rank - 1]
+        last = waiting.last.get(camera)
+        if last is not None and last.stamp_ns == stamp_ns:
+            self.counts["duplicate"] += 1
+            self.counts["repeated"] += last.data == item.data
+        elif stamp_ns < waiting.newest_ns:
+            self.counts["late"] += 1
+        else:
+            waiting.newest_ns, waiting.last[camera] = stamp_ns, item
+            self.counts[camera] += 1
+            yield item.frame(camera, self.counts[camera] - 1, self._bits)
 
     def _in_span(self, messages: Iterator[Frame | MotionSample]) -> Iterator[Frame | MotionSample]:
         """Yield the messages of the part that is read; other frames do not count, so that seq begins at 0 there."""
@@ -290,74 +308,32 @@ def _is_neutral(image: NDArray[np.uint8]) -> bool:
     return bool(np.percentile(np.abs(image.astype(np.int16) - NEUTRAL_GREY), MOST_PERCENT) <= NEAR_NEUTRAL)
 
 
-class _Samples:
-    """Samples that wait for the frames before them, the earliest first."""
+class _Waiting:
+    """Frames and samples, the earliest first: of one stamp samples, the lower camera, the upper one, by arrival."""
 
     def __init__(self) -> None:
-        self._heap: list[tuple[int, int, MotionSample]] = []  # stamp, order of arrival
-        self._arrivals = 0
+        self.entries: list[tuple[int, int, int, RosImage | MotionSample]] = []  # stamp, rank, arrival
+        self.frames = self._arrivals = self._bytes = 0
+        self.newest_ns = 0  # stamp of the newest frame that was delivered
+        self.last: dict[Camera, RosImage] = {}  # image of each camera that was delivered
 
-    def push(self, sample: MotionSample) -> Iterator[MotionSample]:
-        """Add a sample; yield the earliest one where too many wait."""
-        heapq.heappush(self._heap, (sample.stamp_ns, self._arrivals, sample))
+    def add(self, stamp_ns: int, rank: int, item: RosImage | MotionSample) -> None:
+        """Add an entry; rank: 0 for a sample. The data of an image must not change afterwards."""
+        heapq.heappush(self.entries, (stamp_ns, rank, self._arrivals, item))
         self._arrivals += 1
-        if len(self._heap) > MAX_WAITING_SAMPLES:
-            yield heapq.heappop(self._heap)[2]
+        self._count(item, 1)
 
-    def until(self, stamp_ns: int) -> Iterator[MotionSample]:
-        """Yield the samples up to a stamp."""
-        while self._heap and self._heap[0][0] <= stamp_ns:
-            yield heapq.heappop(self._heap)[2]
+    def take(self) -> tuple[int, int, RosImage | MotionSample]:
+        """Take the earliest entry: stamp, rank, item."""
+        stamp_ns, rank, _, item = heapq.heappop(self.entries)
+        self._count(item, -1)
+        return stamp_ns, rank, item
 
+    def is_full(self, window: int) -> bool:
+        """True with more than `window` frames, 256 MiB of them, or more samples than a stage could wait for."""
+        samples = len(self.entries) - self.frames
+        return self.frames > window or self._bytes > MAX_HELD_BYTES or samples > MAX_WAITING_SAMPLES
 
-class _WaitingImage(NamedTuple):
-    """An image in the window; sorts by stamp, then lower before upper, then by arrival, so the order is unique."""
-
-    stamp_ns: int
-    camera: Camera
-    arrival: int
-    image: RosImage
-
-
-class _ReorderBuffer:
-    """Sorts the frames of two cameras: holds up to `window` and 256 MiB of them, and yields the oldest beyond that.
-
-    A frame older than one already delivered is dropped and counted as 'late'; one with the same stamp as the frame
-    before of its camera as 'duplicate'; 'lower' and 'upper' count the delivered frames.
-    """
-
-    def __init__(self, window: int, bits: int, counts: Counter[str]) -> None:
-        self._window, self._bits = window, bits
-        self._counts = counts
-        self._heap: list[_WaitingImage] = []
-        self._held_bytes = 0
-        self._arrivals = 0
-        self._newest_ns = 0
-        self._last: dict[Camera, RosImage] = {}
-
-    def push(self, camera: Camera, image: RosImage) -> Iterator[Frame]:
-        """Add an image, whose data must not change afterwards; yield the frames that are due."""
-        heapq.heappush(self._heap, _WaitingImage(image.stamp_ns, camera, self._arrivals, image))
-        self._arrivals += 1
-        self._held_bytes += len(image.data)
-        while self._heap and (len(self._heap) > self._window or self._held_bytes > MAX_HELD_BYTES):
-            yield from self._pop()
-
-    def drain(self) -> Iterator[Frame]:
-        """Yield all remaining frames."""
-        while self._heap:
-            yield from self._pop()
-
-    def _pop(self) -> Iterator[Frame]:
-        oldest = heapq.heappop(self._heap)
-        self._held_bytes -= len(oldest.image.data)
-        last = self._last.get(oldest.camera)
-        if last is not None and last.stamp_ns == oldest.stamp_ns:
-            self._counts["duplicate"] += 1
-            self._counts["repeated"] += last.data == oldest.image.data
-        elif oldest.stamp_ns < self._newest_ns:
-            self._counts["late"] += 1
-        else:
-            self._newest_ns, self._last[oldest.camera] = oldest.stamp_ns, oldest.image
-            self._counts[oldest.camera] += 1
-            yield oldest.image.frame(oldest.camera, self._counts[oldest.camera] - 1, self._bits)
+    def _count(self, item: RosImage | MotionSample, sign: int) -> None:
+        if isinstance(item, RosImage):
+            self.frames, self._bytes = self.frames + sign, self._bytes + sign * len(item.data)

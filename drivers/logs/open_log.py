@@ -12,18 +12,20 @@ from enum import Enum
 from pathlib import Path
 from typing import Final
 
-from drivers.errors import DriverError
+from drivers.errors import DriverError, FrameDecodeError
 from drivers.logs import mcap_file, ros1_bag, sqlite_bag
 from drivers.logs.file_lock import is_locked
 from drivers.logs.image_folder import ImageFolder, image_folders
-from drivers.logs.log import Log, LogFile
+from drivers.logs.log import Log, LogFile, LoggedMessage, RecordError
 from drivers.logs.mcap_file import McapFile
 from drivers.logs.packed_file import PACKED_SUFFIXES, is_packed, scratch_folder, unpack
 from drivers.logs.ros1_bag import Ros1Bag
+from drivers.logs.ros_messages import IMAGE_TYPES
 from drivers.logs.sqlite_bag import SqliteBag
 
 MAX_PARTS: Final = 1000
 _MAX_LISTED: Final = 8
+_JPEG_END: Final = b"\xff\xd9"  # ITU T.81, B.1.1.3
 LOG_SUFFIXES: Final = (".mcap", ".db3", ".bag")
 _UNFINISHED: Final = (".part", ".active")  # A recording of omnid, or of rosbag, has these until it is complete.
 # A log: name, time of its first message (of omnid's recordings and of ROS 1), number of the part, format.
@@ -72,7 +74,7 @@ class LogInfo:
     size_bytes: int
     state: LogState
     broken: int  # corrupt chunks and records; those that nothing but reading shows are 0 where it was not examined
-    fault: str  # one line that says what of the log is missing; empty for a complete log
+    fault: str  # one line that says what of the log, or of its images, is missing; empty for a complete log
     topics: Mapping[str, tuple[str, int]]  # topic -> type ('' where it cannot be decoded), number of messages
     span_ns: tuple[int, int] | None  # first and last log time; None without messages
     attachments: Mapping[str, int]  # name -> bytes of the readable ones, up to 32
@@ -86,27 +88,43 @@ class LogInfo:
 def log_info(path: str | os.PathLike[str], *, examine: bool = False) -> LogInfo:
     """Return the contents of a log of any format.
 
-    examine: read it to its end; otherwise corrupt chunks are not noticed. Raise DriverError without a log.
+    examine: read it to its end; otherwise corrupt chunks and images are not noticed. Raise DriverError without a log.
     """
     locked = is_locked(path)  # before it is read: the writer may end in the meantime
     with closing(open_log(path)) as log:
-        counts = Counter(message.topic for message in log.messages()) if examine else log.counts()
+        counts, cut_images = Counter[str]({} if examine else log.counts()), Counter[str]()
+        for message in log.messages() if examine else ():
+            counts[message.topic] += 1
+            cut_images[message.topic] += not _is_whole_image(message)
         damage = log.damage()
+        faults = [damage.cut] if damage.cut else []
+        faults += [f"{count} images of {topic!r} end too early" for topic, count in (+cut_images).items()]
         state = LogState.WHOLE if log.is_indexed else LogState.UNINDEXED
         if locked:
             state = LogState.WRITTEN
-        elif damage.cut or damage.broken:
+        elif faults or damage.broken:
             state = LogState.BROKEN
         return LogInfo(
             Path(path),
             _size_bytes(Path(path)),
             state,
             damage.broken,
-            damage.cut,
+            "; ".join(faults),
             {name: (kind, counts.get(name, 0)) for name, kind in sorted(log.topics().items())},
             log.span_ns(),
             {name: len(data) for name, data in log.attachments().items()},
         )
+
+
+def _is_whole_image(message: LoggedMessage) -> bool:
+    """True unless a message is a JPEG without its end of image, as a driver that was killed half-way leaves it."""
+    if message.kind not in IMAGE_TYPES:
+        return True
+    try:
+        image = message.image()
+    except (FrameDecodeError, RecordError):
+        return False
+    return image.encoding != "jpeg" or image.data.tobytes().rfind(_JPEG_END) >= 0
 
 
 def _size_bytes(path: Path) -> int:

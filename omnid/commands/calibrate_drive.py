@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from calib.rig_file import read_rig, write_rig
 from omnid.commands.calibrate_options import HEIGHT, height, height_of, with_height
-from omnid.commands.options import BITS, RATE, cameras, command, log_cameras, option
+from omnid.commands.options import BITS, LOG_TIME, RATE, cameras, command, log_cameras, option
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
 
@@ -32,6 +32,7 @@ PARTS: Final = ("check", "height", "mask")
     ),
     *cameras("the {camera} camera's topic"),
     BITS,
+    LOG_TIME,
     RATE,
     option(
         "--only",

@@ -11,7 +11,7 @@ from omnid.calibration.board_search import silent
 from omnid.calibration.rig import calibrate_rig
 from omnid.calibration.view_guess import VIEW_CHOICES, VIEW_HELP
 from omnid.commands.calibrate_options import BOARD, HEIGHT, board_of, height_of, with_height
-from omnid.commands.options import BITS, RATE, cameras, command, log_cameras, option
+from omnid.commands.options import BITS, LOG_TIME, RATE, cameras, command, log_cameras, option
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
 
@@ -32,6 +32,7 @@ from omnid.sinks.files import check_outputs
     ),
     *cameras("a log's topic of the {camera} camera"),
     BITS,
+    LOG_TIME,
     RATE,
     option("--view", choices=VIEW_CHOICES, default="auto", help=VIEW_HELP),
     option("--report", type=Path, metavar="FILE", help="write an HTML report with residuals and panoramas"),

@@ -208,6 +208,12 @@ BITS: Final = option(
     default=16,
     help="bits of the cameras in images of 16 bits a sample; default: 16",
 )
+LOG_TIME: Final = option(
+    "--time",
+    choices=("auto", "header", "log"),
+    default="auto",
+    help="when an image was taken: as log.time of the settings; default: auto",
+)
 TRUTH: Final = option("--truth", type=Path, metavar="FILE", help="the true path of the rig, TUM format")
 
 
@@ -234,10 +240,10 @@ def cameras(
 
 
 def log_cameras(args: argparse.Namespace) -> LogCameras:
-    """Return the cameras of a log by --lower, --upper, --bits and --rate."""
+    """Return the cameras of a log by --lower, --upper, --bits, --rate and --time."""
     from drivers.logs.log_reader import LogCameras
 
-    return LogCameras(args.lower, args.upper, args.bits, args.rate or 0.0)
+    return LogCameras(args.lower, args.upper, args.bits, args.rate or 0.0, args.time)
 
 
 def device_opener(config: Config) -> Callable[[Camera], V4l2Camera]:

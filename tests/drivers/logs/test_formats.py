@@ -39,7 +39,19 @@ from tests.drivers.logs.bags import (
     write_ros1_mcap,
     write_zstd_mcap,
 )
-from tests.drivers.logs.mcap_logs import BARE, COMPRESSED, LOWER, START_NS, UPPER, Entry, jpeg, pairs, text, write_log
+from tests.drivers.logs.mcap_logs import (
+    BARE,
+    COMPRESSED,
+    LOWER,
+    START_NS,
+    UPPER,
+    Entry,
+    compressed,
+    jpeg,
+    pairs,
+    text,
+    write_log,
+)
 
 PAIRS = 12
 Contents = list[tuple[str, int, int, bytes]]
@@ -500,6 +512,15 @@ def test_the_content_of_a_log_is_examined(tmp_path: Path, name: str) -> None:
     path.write_bytes(data)
     found = log_info(path, examine=True)
     assert found.state is LogState.BROKEN and found.broken == 1 and found.messages < 2 * PAIRS
+
+
+def test_images_without_an_end_are_told_when_a_log_is_examined(tmp_path: Path) -> None:
+    whole = pairs(3)
+    half = [entry._replace(data=compressed(entry.log_time_ns, jpeg(1)[:-40])) for entry in whole[:2]]
+    path = write_log(tmp_path / "log.mcap", [*half, *whole[2:]])
+    found = log_info(path, examine=True)
+    assert found.state is LogState.BROKEN and f"1 images of '{LOWER}' end too early" in found.fault
+    assert log_info(write_log(path, whole), examine=True).state is LogState.WHOLE
 
 
 @pytest.mark.parametrize("part", [0.5, 0.8])
