@@ -37,19 +37,18 @@ from __future__ import annotations
 import binascii
 import math
 import re
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
 from drivers.motors.protocols.differential_drive import DifferentialDrive
-from drivers.motors.protocols.motor_protocol import NoReplyError, T, Transaction, request, require_watchdog
+from drivers.motors.protocols.motor_protocol import NoReplyError, Transaction, request, require_watchdog
 
 SEQ_COUNT = 65536
 MAX_LINE = 64  # bytes
 _CRC_START = 0xFFFF
-
 _LINE = re.compile(rb"\$([VSWA](?:,-?[0-9]{1,6}){1,8})\*([0-9A-Fa-f]{4})\r?\n?")
 _BUMPER, _CLIFF = 1, 2  # bits of the contact
 
@@ -83,49 +82,22 @@ class ProtocolError(DriverError):
     """A line that does not match the grammar, or a number that is out of its range."""
 
 
-@dataclass(frozen=True, slots=True)
-class VelocityMessage:
-    """Host to controller: a command. Its stamp is not sent; a decoded one has stamp 0."""
+def encode(kind: str, *numbers: int) -> bytes:
+    """Return the line of a kind (V, S, W or A) with its numbers; raise ProtocolError for one out of its range.
 
-    seq: int
-    command: VelocityCommand
-
-
-@dataclass(frozen=True, slots=True)
-class StatusMessage:
-    """Controller to host: the reply to the command with this seq."""
-
-    seq: int
-    status: MotorStatus
-
-
-@dataclass(frozen=True, slots=True)
-class WatchdogRequest:
-    """Host to controller: set the time without a command after which the watchdog stops the wheels."""
-
-    watchdog_ms: int
-
-
-@dataclass(frozen=True, slots=True)
-class WatchdogReply:
-    """Controller to host: the watchdog time in force."""
-
-    watchdog_ms: int
-
-
-LineMessage = VelocityMessage | StatusMessage | WatchdogRequest | WatchdogReply
-
-
-def encode(message: LineMessage) -> bytes:
-    """Return the line of a message; raise ProtocolError for a number that is not finite or out of its range."""
-    kind, numbers = _fields(message)
+    A contact of 0 is left out.
+    """
     _check(kind, numbers)
-    body = ",".join([kind, *map(str, numbers)]).encode()
+    shown = numbers[:-1] if kind == "S" and not numbers[-1] else numbers
+    body = ",".join([kind, *map(str, shown)]).encode()
     return b"$%b*%04X\n" % (body, crc16(body))
 
 
-def decode(line: bytes) -> LineMessage:
-    """Return the message of a line, with or without its end; raise ProtocolError for any other bytes."""
+def decode(line: bytes) -> tuple[str, tuple[int, ...]]:
+    """Return kind and numbers of a line, with or without its end; raise ProtocolError for any other bytes.
+
+    The numbers of a status without a contact end with 0.
+    """
     match = _LINE.fullmatch(line)
     if match is None:
         raise ProtocolError(f"{line[:MAX_LINE]!r} is not a line of the motor protocol; check port and baud rate")
@@ -133,9 +105,11 @@ def decode(line: bytes) -> LineMessage:
     if int(crc, 16) != crc16(body):
         raise ProtocolError(f"{line[:MAX_LINE]!r} has a wrong checksum (found {crc16(body):04X}); check the cable")
     kind, *texts = body.decode("ascii").split(",")
-    numbers = [int(text) for text in texts]
+    numbers = tuple(map(int, texts))
+    if kind == "S" and len(numbers) == len(_FIELDS["S"]) - 1:
+        numbers = (*numbers, 0)  # firmware without contacts
     _check(kind, numbers)
-    return _message(kind, numbers)
+    return kind, numbers
 
 
 def crc16(data: bytes) -> int:
@@ -143,19 +117,30 @@ def crc16(data: bytes) -> int:
     return binascii.crc_hqx(data, _CRC_START)
 
 
-def _fields(message: LineMessage) -> tuple[str, list[int]]:
-    match message:
-        case VelocityMessage(seq, command):
-            return "V", [seq, *_motion(command)]
-        case StatusMessage(seq, status):
-            battery = -1 if math.isnan(status.battery_v) else _milli("battery", status.battery_v)
-            contact = _BUMPER * status.bumper + _CLIFF * status.cliff
-            numbers = [seq, *_motion(status), battery, status.fault, int(status.watchdog_expired)]
-            return "S", [*numbers, contact] if contact else numbers
-        case WatchdogRequest(watchdog_ms):
-            return "W", [watchdog_ms]
-        case WatchdogReply(watchdog_ms):
-            return "A", [watchdog_ms]
+def velocity_line(seq: int, command: VelocityCommand) -> bytes:
+    """Return the line of a command; raise ProtocolError for a number that is not finite or out of its range."""
+    return encode("V", seq, *_motion(command))
+
+
+def status_line(seq: int, status: MotorStatus) -> bytes:
+    """Return the line of a status, as the controller writes it."""
+    battery = -1 if math.isnan(status.battery_v) else _milli("battery", status.battery_v)
+    contact = _BUMPER * status.bumper + _CLIFF * status.cliff
+    return encode("S", seq, *_motion(status), battery, status.fault, int(status.watchdog_expired), contact)
+
+
+def command_of(numbers: Sequence[int]) -> VelocityCommand:
+    """Return the command in the numbers of a velocity line; its stamp, which is not sent, is 0."""
+    return VelocityCommand(0, *(milli / 1000 for milli in numbers[1:4]))
+
+
+def status_of(numbers: Sequence[int]) -> MotorStatus:
+    """Return the status in the numbers of a status line."""
+    velocity_mps, heading_rad, yaw_rate_radps = (milli / 1000 for milli in numbers[1:4])
+    battery_mv, fault, expired, contact = numbers[4:]
+    battery_v = math.nan if battery_mv < 0 else battery_mv / 1000
+    contacts = bool(contact & _BUMPER), bool(contact & _CLIFF)
+    return MotorStatus(velocity_mps, heading_rad, yaw_rate_radps, bool(expired), fault, battery_v, *contacts)
 
 
 def _motion(source: VelocityCommand | MotorStatus) -> tuple[int, int, int]:
@@ -173,30 +158,13 @@ def _milli(name: str, value: float) -> int:
     return round(milli)
 
 
-def _check(kind: str, numbers: list[int]) -> None:
+def _check(kind: str, numbers: Sequence[int]) -> None:
     fields = _FIELDS[kind]
-    if kind == "S" and len(numbers) == len(fields) - 1:
-        numbers = [*numbers, 0]  # firmware without contacts
     if len(numbers) != len(fields):
         raise ProtocolError(f"motor line {kind} has {len(numbers)} numbers, not {len(fields)}; check the firmware")
     for (name, unit, low, high), number in zip(fields, numbers, strict=True):
         if not low <= number <= high:
             raise ProtocolError(f"motor {name} {number:.6g} is outside {low} .. {high} {unit}; keep it inside")
-
-
-def _message(kind: str, numbers: list[int]) -> LineMessage:
-    if kind in "WA":
-        return (WatchdogRequest if kind == "W" else WatchdogReply)(numbers[0])
-    velocity_mps, heading_rad, yaw_rate_radps = (milli / 1000 for milli in numbers[1:4])
-    if kind == "V":
-        return VelocityMessage(numbers[0], VelocityCommand(0, velocity_mps, heading_rad, yaw_rate_radps))
-    battery_mv, fault, expired, *others = numbers[4:]
-    battery_v = math.nan if battery_mv < 0 else battery_mv / 1000
-    bumper, cliff = (bool(sum(others) & bit) for bit in (_BUMPER, _CLIFF))
-    status = MotorStatus(
-        velocity_mps, heading_rad, yaw_rate_radps, bool(expired), fault, battery_v, bumper=bumper, cliff=cliff
-    )
-    return StatusMessage(numbers[0], status)
 
 
 class LineFramer:
@@ -250,8 +218,8 @@ class LineProtocol:
 
     def connect(self, watchdog_ms: int) -> Transaction[float]:
         """Set the watchdog and return the time in force [ms]; raise DriverError where another one is in force."""
-        reply = yield from self._ask(encode(WatchdogRequest(watchdog_ms)), self._watchdog)
-        require_watchdog(watchdog_ms, reply.watchdog_ms)
+        (in_force_ms,) = yield from self._ask(encode("W", watchdog_ms), lambda numbers: True, "A")
+        require_watchdog(watchdog_ms, in_force_ms)
         self._zero_rad = self._heading_rad
         return float(watchdog_ms)
 
@@ -260,32 +228,31 @@ class LineProtocol:
         velocity_mps, yaw_rate_radps = self._drive.limited(command)
         heading_rad = math.remainder(command.heading_rad - self._zero_rad, math.tau)
         seq, self._seq = self._seq, (self._seq + 1) % SEQ_COUNT
-        line = encode(VelocityMessage(seq, VelocityCommand(0, velocity_mps, heading_rad, yaw_rate_radps)))
-        reply = yield from self._ask(line, lambda frame: self._status(frame, seq))
-        self._heading_rad = math.remainder(reply.status.heading_rad + self._zero_rad, math.tau)
-        return replace(reply.status, heading_rad=self._heading_rad)
 
-    def _ask(self, line: bytes, parse: Callable[[bytes], T | None]) -> Transaction[T]:
-        """Send a line and return the reply that parse accepts."""
+        def is_reply(numbers: Sequence[int]) -> bool:
+            if numbers[0] != seq:
+                found = f"it answers command {seq} with a status of {numbers[0]}"
+                self._odd = f"{found}: does its firmware repeat the number?"
+            return numbers[0] == seq
+
+        line = velocity_line(seq, VelocityCommand(0, velocity_mps, heading_rad, yaw_rate_radps))
+        status = status_of((yield from self._ask(line, is_reply, "S")))
+        self._heading_rad = math.remainder(status.heading_rad + self._zero_rad, math.tau)
+        return replace(status, heading_rad=self._heading_rad)
+
+    def _ask(self, line: bytes, is_reply: Callable[[Sequence[int]], bool], kind: str) -> Transaction[tuple[int, ...]]:
+        """Send a line and return the numbers of the first line of this kind that is the reply."""
         self._odd = ""
+
+        def parse(frame: bytes) -> tuple[int, ...] | None:
+            try:
+                found, numbers = decode(frame)
+            except ProtocolError as error:
+                self.bad_frames, self._odd = self.bad_frames + 1, str(error)
+                return None
+            return numbers if found == kind and is_reply(numbers) else None
+
         try:
             return (yield from request(line, parse))
         except NoReplyError:
             raise NoReplyError(self._odd) from None
-
-    def _watchdog(self, frame: bytes) -> WatchdogReply | None:
-        message = self._message(frame)
-        return message if isinstance(message, WatchdogReply) else None
-
-    def _status(self, frame: bytes, seq: int) -> StatusMessage | None:
-        message = self._message(frame)
-        if isinstance(message, StatusMessage) and message.seq != seq:
-            self._odd = f"it answers command {seq} with a status of {message.seq}: does its firmware repeat the number?"
-        return message if isinstance(message, StatusMessage) and message.seq == seq else None
-
-    def _message(self, frame: bytes) -> LineMessage | None:
-        try:
-            return decode(frame)
-        except ProtocolError as error:
-            self.bad_frames, self._odd = self.bad_frames + 1, str(error)
-            return None

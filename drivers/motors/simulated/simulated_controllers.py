@@ -12,16 +12,22 @@ from drivers.motors.protocols.line_protocol import (
     SEQ_COUNT,
     LineFramer,
     ProtocolError,
-    StatusMessage,
-    VelocityMessage,
-    WatchdogReply,
-    WatchdogRequest,
+    command_of,
     decode,
     encode,
+    status_line,
 )
 from drivers.motors.protocols.motor_protocol import TextFramer
+from drivers.motors.protocols.odrive_ascii import CLOSED_LOOP, WATCHDOG_EXPIRED, with_checksum
 from drivers.motors.protocols.roboteq import MAX_RPM, S_PER_MIN
-from drivers.motors.protocols.vesc import PacketFramer
+from drivers.motors.protocols.vesc import (
+    FORWARD_CAN,
+    GET_APPCONF,
+    GET_VALUES_SELECTIVE,
+    SET_RPM,
+    PacketFramer,
+    packet,
+)
 from drivers.motors.simulated.simulated_base import SIDES, MotionLimits, SimulatedBase, SimulatedFirmware
 
 
@@ -39,21 +45,18 @@ class SimulatedLine(SimulatedFirmware):
     def handle(self, frame: bytes) -> bytes:
         """Return the reply to a frame, empty without one."""
         try:
-            message = decode(frame)
+            kind, numbers = decode(frame)
         except ProtocolError:
             return self._reject(b"")
-        match message:
-            case VelocityMessage(seq, command):
-                return self._drive(seq, command)
-            case WatchdogRequest(watchdog_ms):
-                return self._connect(watchdog_ms)
-        return self._reject(b"")
+        if kind == "V":
+            return self._drive(numbers[0], command_of(numbers))
+        return self._connect(numbers[0]) if kind == "W" else self._reject(b"")
 
     def _drive(self, seq: int, command: VelocityCommand) -> bytes:
         self.base.errors += self._next_seq not in (None, seq)
         self._next_seq = (seq + 1) % SEQ_COUNT
         self.base.commands += 1
-        reply = encode(StatusMessage(seq, self._status()))
+        reply = status_line(seq, self._status())
         steers = self._heading_input and not is_stop(command)
         self.base.goal_heading_rad = command.heading_rad + self._zero_rad if steers else None
         self.base.command(command.velocity_mps, command.yaw_rate_radps)
@@ -65,24 +68,13 @@ class SimulatedLine(SimulatedFirmware):
         self._next_seq = None
         self._zero_rad = self.base.pose[2]
         self.base.command(0.0, 0.0)
-        return encode(WatchdogReply(watchdog_ms))
+        return encode("A", watchdog_ms)
 
     def _status(self) -> MotorStatus:
         base = self.base
         heading_rad = math.remainder(base.pose[2] - self._zero_rad, math.tau)
-        return MotorStatus(
-            base.velocity_mps,
-            heading_rad,
-            base.yaw_rate_radps,
-            base.watchdog_expired,
-            base.fault,
-            base.battery_v,
-            base.bumper,
-            base.cliff,
-        )
-
-
-_COMMAND = re.compile(rb"!S ([12]) (-?[0-9]{1,5})")
+        state = base.watchdog_expired, base.fault, base.battery_v, base.bumper, base.cliff
+        return MotorStatus(base.velocity_mps, heading_rad, base.yaw_rate_radps, *state)
 
 
 class SimulatedRoboteq(SimulatedFirmware):
@@ -99,43 +91,31 @@ class SimulatedRoboteq(SimulatedFirmware):
         return echo + (self._reply(frame) or self._reject(b"-")) + b"\r"
 
     def _reply(self, line: bytes) -> bytes | None:
-        if command := _COMMAND.fullmatch(line):
-            return self._drive(int(command[1]) - 1, int(command[2]))
+        base, rpm_per_mps = self.base, S_PER_MIN * self.base.drive.turns_per_m
+        if command := re.fullmatch(rb"!S ([12]) (-?[0-9]{1,5})", line):
+            if abs(int(command[2])) > MAX_RPM:
+                return None
+            base.commands += 1
+            base.command_channel(int(command[1]) - 1, int(command[2]) / rpm_per_mps)
+            return b"+"
         if setting := re.fullmatch(rb"\^(ECHOF|RWD) ([0-9]{1,5})", line):
-            return self._set(setting[1], int(setting[2]))
-        return self._query(line)
-
-    def _drive(self, channel: int, rpm: int) -> bytes | None:
-        if abs(rpm) > MAX_RPM:
-            return None
-        self.base.commands += 1
-        self.base.command_channel(channel, rpm * self._mps_per_rpm())
-        return b"+"
-
-    def _set(self, name: bytes, value: int) -> bytes:
-        if name == b"ECHOF":
-            self._echo = value == 0
-        else:
-            self.base.watchdog_ms = value
-        return b"+"
-
-    def _query(self, line: bytes) -> bytes | None:
-        speeds = b":".join(b"%d" % round(mps / self._mps_per_rpm()) for mps in self.base.channels_mps())
+            if setting[1] == b"ECHOF":
+                self._echo = int(setting[2]) == 0
+            else:
+                base.watchdog_ms = int(setting[2])
+            return b"+"
         return {
-            b"?S": b"S=" + speeds,
-            b"?V 2": b"V=%d" % round(self.base.battery_v * 10),
-            b"?FF": b"FF=%d" % self.base.fault,
-            b"~RWD": b"RWD=%d" % self.base.watchdog_ms,
+            b"?S": b"S=%d:%d" % tuple(round(mps * rpm_per_mps) for mps in base.channels_mps()),
+            b"?V 2": b"V=%d" % round(base.battery_v * 10),
+            b"?FF": b"FF=%d" % base.fault,
+            b"~RWD": b"RWD=%d" % base.watchdog_ms,
             b"~MXMD": b"MXMD=0",
         }.get(line)
 
-    def _mps_per_rpm(self) -> float:
-        """Return the wheel speed of one rpm of the motor."""
-        return math.tau * self.base.drive.wheel_radius_m / (S_PER_MIN * self.base.drive.gear)
-
 
 _FLOAT = r"(-?[0-9]{1,6}(?:\.[0-9]{1,6})?)"
-_WATCHDOG_EXPIRED, _CLOSED_LOOP, _IDLE = 0x800, 8, 1
+_ODRIVE_LINE = re.compile(rf"([vuf]) ([01])(?: {_FLOAT})?|([rw]) (\S+)(?: {_FLOAT})?")
+_IDLE = 1
 
 
 class SimulatedODrive(SimulatedFirmware):
@@ -154,50 +134,44 @@ class SimulatedODrive(SimulatedFirmware):
 
     def handle(self, frame: bytes) -> bytes:
         """Return the reply to a frame, empty without one."""
-        body, star, checksum = frame.partition(b"*")
-        if not star or not re.fullmatch(rb"[0-9]{1,3}", checksum) or int(checksum) != _xor(body):
+        body = frame.rpartition(b"*")[0].decode("latin-1")
+        if not body.isascii() or with_checksum(body).rstrip() != frame:
             return self._reject(b"")
-        reply = self._reply(body.decode("latin-1"))
-        return b"%b*%d\r\n" % (reply, _xor(reply)) if reply else b""
+        for axis in SIDES:
+            if self.base.expired[self.base.side_of(axis)]:
+                self._state[axis] = _IDLE
+        match = _ODRIVE_LINE.fullmatch(body)
+        reply = self._reply(*match.groups()) if match else self._reject(b"unknown command")
+        return with_checksum(reply.decode()).replace(b"\n", b"\r\n") if reply else b""
 
-    def _reply(self, line: str) -> bytes:
-        self._disarm_expired()
-        if match := re.fullmatch(rf"v ([01]) {_FLOAT}", line):
+    def _reply(
+        self, of_axis: str | None, axis: str | None, speed: str | None, access: str | None, name: str, value: str | None
+    ) -> bytes:
+        """Return the reply to a command of an axis, or to the reading or writing of a property."""
+        if access is not None:
+            return self._read(name) if access == "r" else self._write(name, float(value or 0))
+        number = int(axis or 0)
+        turns_per_m = self.base.drive.turns_per_m
+        if of_axis == "f":
+            return b"%.6f %.6f" % (
+                self.base.channels_m()[number] * turns_per_m,
+                self.base.channels_mps()[number] * turns_per_m,
+            )
+        self.base.feed(self.base.side_of(number))
+        if of_axis == "v":  # a disarmed axis does not turn
             self.base.commands += 1
-            return self._drive(int(match[1]), float(match[2]))
-        if match := re.fullmatch(r"u ([01])", line):
-            return self._feed_axis(int(match[1]))
-        if match := re.fullmatch(r"f ([01])", line):
-            turns = self._turns_per_m()
-            axis = int(match[1])
-            return b"%.6f %.6f" % (self.base.channels_m()[axis] * turns, self.base.channels_mps()[axis] * turns)
-        if match := re.fullmatch(r"r (\S+)", line):
-            return self._read(match[1])
-        if match := re.fullmatch(rf"w (\S+) {_FLOAT}", line):
-            return self._write(match[1], float(match[2]))
-        return self._reject(b"unknown command")
-
-    def _drive(self, axis: int, turns_per_s: float) -> bytes:
-        """Set the velocity and feed the watchdog; a disarmed axis does not turn."""
-        self._input_vel[axis] = turns_per_s
-        self._feed_axis(axis)
-        if self._state[axis] == _CLOSED_LOOP:
-            self.base.command_channel(axis, turns_per_s / self._turns_per_m())
-        return b""
-
-    def _feed_axis(self, axis: int) -> bytes:
-        self.base.feed(self.base.side_of(axis))
+            self._input_vel[number] = float(speed or 0)
+            if self._state[number] == CLOSED_LOOP:
+                self.base.command_channel(number, self._input_vel[number] / turns_per_m)
         return b""
 
     def _read(self, name: str) -> bytes:
-        if name == "vbus_voltage":
-            return b"%f" % self.base.battery_v
-        if match := re.fullmatch(r"axis([01])\.current_state", name):
-            return b"%d" % self._state[int(match[1])]
-        if match := re.fullmatch(r"axis([01])\.error", name):
-            expired = self.base.expired[self.base.side_of(int(match[1]))]
-            return b"%d" % (self.base.fault | _WATCHDOG_EXPIRED * expired)
-        return b"%g" % self._settings[name] if name in self._settings else self._reject(b"invalid property")
+        values = {**self._settings, "vbus_voltage": self.base.battery_v}
+        for axis in SIDES:
+            expired = self.base.expired[self.base.side_of(axis)]
+            values[f"axis{axis}.current_state"] = self._state[axis]
+            values[f"axis{axis}.error"] = self.base.fault | WATCHDOG_EXPIRED * expired
+        return b"%g" % values[name] if name in values else self._reject(b"invalid property")
 
     def _write(self, name: str, value: float) -> bytes:
         if match := re.fullmatch(r"axis([01])\.(error|requested_state)", name):
@@ -213,33 +187,17 @@ class SimulatedODrive(SimulatedFirmware):
     def _arm(self, axis: int, name: str, value: float) -> bytes:
         side = self.base.side_of(axis)
         if name == "error":
-            self.base.expired[side] = bool(int(value) & _WATCHDOG_EXPIRED)
-        elif value == _CLOSED_LOOP and not self.base.expired[side] and not self.base.fault:
-            self._state[axis] = _CLOSED_LOOP
-            self.base.command_channel(axis, self._input_vel[axis] / self._turns_per_m())
+            self.base.expired[side] = bool(int(value) & WATCHDOG_EXPIRED)
+        elif value == CLOSED_LOOP and not self.base.expired[side] and not self.base.fault:
+            self._state[axis] = CLOSED_LOOP
+            self.base.command_channel(axis, self._input_vel[axis] / self.base.drive.turns_per_m)
         return b""
-
-    def _disarm_expired(self) -> None:
-        for axis in SIDES:
-            if self.base.expired[self.base.side_of(axis)]:
-                self._state[axis] = _IDLE
-
-    def _turns_per_m(self) -> float:
-        return self.base.drive.gear / (math.tau * self.base.drive.wheel_radius_m)
-
-
-def _xor(data: bytes) -> int:
-    checksum = 0
-    for byte in data:
-        checksum ^= byte
-    return checksum
 
 
 _LOCAL_ID = 77  # CAN id of the controller on the serial port.
-_SET_RPM, _GET_APPCONF, _ALIVE, _FORWARD_CAN, _GET_VALUES_SELECTIVE = 8, 17, 30, 34, 50  # COMM_PACKET_ID
-_ARGUMENT_BYTES = {_SET_RPM: 4, _GET_APPCONF: 0, _ALIVE: 0, _GET_VALUES_SELECTIVE: 4}
+_ALIVE = 30  # COMM_ALIVE
+_ARGUMENT_BYTES = {SET_RPM: 4, GET_APPCONF: 0, _ALIVE: 0, GET_VALUES_SELECTIVE: 4}
 _SIGNATURE = 0x1234ABCD  # any: the driver ignores it
-_CRC_POLYNOMIAL = 0x1021
 
 
 class SimulatedVesc(SimulatedFirmware):
@@ -251,60 +209,34 @@ class SimulatedVesc(SimulatedFirmware):
 
     def handle(self, frame: bytes) -> bytes:
         """Pass the payload to the controller on the port or on CAN; no reply for an unknown id."""
-        if frame[0] != _FORWARD_CAN:
+        if frame[0] != FORWARD_CAN:
             return self._reply(0, frame)
         if len(frame) > 2 and frame[1] == self.base.drive.can_id:
             return self._reply(1, frame[2:])
         return self._reject(b"")
 
     def _reply(self, channel: int, payload: bytes) -> bytes:
+        base = self.base
+        can_id = base.drive.can_id if channel else _LOCAL_ID
+        erpm_per_mps = S_PER_MIN * base.drive.turns_per_m * base.drive.pole_pairs
         if _ARGUMENT_BYTES.get(payload[0]) != len(payload) - 1:
             return self._reject(b"")
-        if payload[0] == _SET_RPM:
-            self._drive(channel, struct.unpack(">i", payload[1:])[0])
-        elif payload[0] == _ALIVE:
-            self.base.feed(self.base.side_of(channel))
-        elif payload[0] == _GET_APPCONF:
-            return _packet(self._config(channel))
+        if payload[0] == GET_APPCONF:  # signature, id, timeout, and a filling that makes it a long packet
+            head = struct.pack(">BIBI", GET_APPCONF, _SIGNATURE, can_id, round(base.watchdog_ms))
+            return packet(head + bytes(range(256)) + bytes(150))
+        if payload[0] == GET_VALUES_SELECTIVE:
+            fields = {  # bit of the mask -> value
+                7: struct.pack(">i", round(base.channels_mps()[channel] * erpm_per_mps)),
+                8: struct.pack(">h", round(base.battery_v * 10)),
+                15: bytes((base.fault,)),
+                17: bytes((can_id,)),
+                21: bytes((base.expired[base.side_of(channel)],)),
+            }
+            (mask,) = struct.unpack(">I", payload[1:])
+            return packet(payload + b"".join(data for bit, data in fields.items() if mask >> bit & 1))
+        if payload[0] == SET_RPM:
+            base.commands += 1
+            base.command_channel(channel, struct.unpack(">i", payload[1:])[0] / erpm_per_mps)
         else:
-            return _packet(self._values(channel, struct.unpack(">I", payload[1:])[0]))
+            base.feed(base.side_of(channel))
         return b""
-
-    def _drive(self, channel: int, erpm: int) -> None:
-        self.base.commands += 1
-        self.base.command_channel(channel, erpm / self._erpm_per_mps())
-
-    def _config(self, channel: int) -> bytes:
-        """Return signature, id, timeout, and a filling that makes it a long packet."""
-        head = struct.pack(">BIBI", _GET_APPCONF, _SIGNATURE, self._id(channel), round(self.base.watchdog_ms))
-        return head + bytes(range(256)) + bytes(150)
-
-    def _values(self, channel: int, mask: int) -> bytes:
-        fields = {  # bit of the mask -> value
-            7: struct.pack(">i", round(self.base.channels_mps()[channel] * self._erpm_per_mps())),
-            8: struct.pack(">h", round(self.base.battery_v * 10)),
-            15: bytes((self.base.fault,)),
-            17: bytes((self._id(channel),)),
-            21: bytes((self.base.expired[self.base.side_of(channel)],)),
-        }
-        wanted = [data for bit, data in fields.items() if mask >> bit & 1]
-        return struct.pack(">BI", _GET_VALUES_SELECTIVE, mask) + b"".join(wanted)
-
-    def _id(self, channel: int) -> int:
-        return self.base.drive.can_id if channel else _LOCAL_ID
-
-    def _erpm_per_mps(self) -> float:
-        drive = self.base.drive
-        return S_PER_MIN * drive.pole_pairs * drive.gear / (math.tau * drive.wheel_radius_m)
-
-
-def _packet(payload: bytes) -> bytes:
-    """Return the packet of a payload; the CRC is computed bit by bit, to check the driver's."""
-    crc = 0
-    for byte in payload:
-        crc ^= byte << 8
-        for _ in range(8):
-            crc = (crc << 1 ^ _CRC_POLYNOMIAL if crc & 0x8000 else crc << 1) & 0xFFFF
-    size = len(payload)
-    head = bytes((2, size)) if size < 256 else bytes((3, size >> 8, size & 255))
-    return head + payload + bytes((crc >> 8, crc & 255, 3))

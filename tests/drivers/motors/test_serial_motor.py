@@ -17,12 +17,7 @@ import pytest
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, stop_command
 from drivers.motors.protocols.differential_drive import DifferentialDrive
-from drivers.motors.protocols.line_protocol import (
-    LineProtocol,
-    VelocityMessage,
-    WatchdogReply,
-    encode,
-)
+from drivers.motors.protocols.line_protocol import LineProtocol, encode, velocity_line
 from drivers.motors.protocols.motor_protocol import NoReplyError, T, Transaction
 from drivers.motors.serial_motor import SerialMotor
 from drivers.motors.simulated.simulated_controllers import SimulatedLine
@@ -36,7 +31,7 @@ OTHER_ID = 65534  # user and group without rights
 def drive(state: SimulatedLine, seconds: float, command: VelocityCommand) -> None:
     """Send a command at 20 Hz."""
     for _ in range(round(seconds * 20)):
-        assert state.feed(encode(VelocityMessage(state.base.commands, command)))
+        assert state.feed(velocity_line(state.base.commands, command))
         state.base.advance(0.05)
 
 
@@ -78,7 +73,7 @@ def test_a_command_after_a_gap_in_seq_is_an_error_but_carried_out() -> None:
     state = SimulatedLine()
     command = VelocityCommand(0, 0.2, 0.0, 0.0)
     for seq, sent in ((65535, stop_command(0)), (0, stop_command(0)), (2, command)):
-        assert state.feed(encode(VelocityMessage(seq, sent)))
+        assert state.feed(velocity_line(seq, sent))
     assert state.base.errors == 1 and state.base.last_command.velocity_mps == command.velocity_mps
 
 
@@ -174,7 +169,7 @@ class FixedWatchdog(SimulatedLine):
     def handle(self, frame: bytes) -> bytes:
         """Return the usual reply, but with 1000 ms in force."""
         reply = super().handle(frame)
-        return encode(WatchdogReply(1000)) if reply.startswith(b"$A") else reply
+        return encode("A", 1000) if reply.startswith(b"$A") else reply
 
 
 def test_verifies_the_watchdog_in_force() -> None:

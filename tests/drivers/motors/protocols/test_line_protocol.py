@@ -7,16 +7,15 @@ from dataclasses import replace
 
 import pytest
 
-from drivers.motor import MotorStatus, VelocityCommand, stop_command
+from drivers.motor import MotorStatus, VelocityCommand
 from drivers.motors.protocols.line_protocol import (
-    LineMessage,
     ProtocolError,
-    StatusMessage,
-    VelocityMessage,
-    WatchdogRequest,
     crc16,
     decode,
     encode,
+    status_line,
+    status_of,
+    velocity_line,
 )
 
 STATUS = MotorStatus(0.25, -1.5, 0.125, watchdog_expired=True, fault=7, battery_v=12.6)
@@ -28,14 +27,15 @@ def with_checksum(body: bytes) -> bytes:
 
 def test_known_lines() -> None:
     command = VelocityCommand(99, 0.3, -1.571, 0.0504)
-    assert encode(VelocityMessage(17, command)) == b"$V,17,300,-1571,50*D3E4\n"
-    assert encode(StatusMessage(17, STATUS)) == with_checksum(b"S,17,250,-1500,125,12600,7,1")
-    assert encode(WatchdogRequest(500)) == with_checksum(b"W,500")
+    assert velocity_line(17, command) == b"$V,17,300,-1571,50*D3E4\n"
+    assert status_line(17, STATUS) == with_checksum(b"S,17,250,-1500,125,12600,7,1")
+    assert encode("W", 500) == with_checksum(b"W,500")
 
 
 def test_the_contacts_are_an_eighth_number_that_firmware_without_them_leaves_out() -> None:
-    assert encode(StatusMessage(17, replace(STATUS, cliff=True))) == with_checksum(b"S,17,250,-1500,125,12600,7,1,2")
-    assert decode(with_checksum(b"S,17,250,-1500,125,12600,7,1")) == StatusMessage(17, STATUS)
+    assert status_line(17, replace(STATUS, cliff=True)) == with_checksum(b"S,17,250,-1500,125,12600,7,1,2")
+    kind, numbers = decode(with_checksum(b"S,17,250,-1500,125,12600,7,1"))
+    assert (kind, numbers[0], status_of(numbers)) == ("S", 17, STATUS)
     for wrong in (b"4", b"-1", b"0,0"):
         with pytest.raises(ProtocolError):
             decode(with_checksum(b"S,17,250,-1500,125,12600,7,1," + wrong))
@@ -48,14 +48,13 @@ def test_refuses_to_encode_numbers_out_of_range(field: str, bad: float) -> None:
         bad *= 3
     numbers = {"velocity_mps": 0.1, "heading_rad": 0.1, "yaw_rate_radps": 0.1, field: bad}
     with pytest.raises(ProtocolError):
-        encode(VelocityMessage(0, VelocityCommand(0, **numbers)))
+        velocity_line(0, VelocityCommand(0, **numbers))
 
 
-@pytest.mark.parametrize("message", [VelocityMessage(-1, stop_command(0)), VelocityMessage(65536, stop_command(0)),
-                                     WatchdogRequest(0), WatchdogRequest(19), WatchdogRequest(10_001)])  # fmt: skip
-def test_refuses_to_encode_counts_and_times_out_of_range(message: LineMessage) -> None:
+@pytest.mark.parametrize("line", [("V", -1, 0, 0, 0), ("V", 65536, 0, 0, 0), ("W", 0), ("W", 19), ("W", 10_001)])
+def test_refuses_to_encode_counts_and_times_out_of_range(line: tuple[str, int]) -> None:
     with pytest.raises(ProtocolError, match="keep it inside"):
-        encode(message)
+        encode(*line)
 
 
 @pytest.mark.parametrize(
@@ -70,7 +69,7 @@ def test_refuses_invalid_lines_with_a_valid_checksum(body: bytes) -> None:
 
 
 def test_detects_every_changed_byte() -> None:
-    line = encode(VelocityMessage(17, VelocityCommand(0, 0.3, -1.571, 0.05)))
+    line = velocity_line(17, VelocityCommand(0, 0.3, -1.571, 0.05))
     for i in range(len(line) - 1):
         for value in set(range(256)) - {line[i], line[i] ^ 0x20}:  # hexadecimal digits may be small letters
             with pytest.raises(ProtocolError):
