@@ -13,10 +13,11 @@ from typing import Literal, Self
 
 from mcap.exceptions import McapError
 from mcap.writer import CompressionType, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores
 
 from drivers.errors import DriverError
 from drivers.logs.file_lock import lock
+from drivers.logs.ros_messages import typestore
 
 _COMPRESSIONS = {"lz4": CompressionType.LZ4, "none": CompressionType.NONE}
 _MEDIA_TYPES = {".toml": "application/toml", ".yaml": "application/yaml", ".txt": "text/plain", ".png": "image/png"}
@@ -190,13 +191,10 @@ class LogWriter:
             raise FileNotFoundError(errno.ENOENT, "the file has been deleted")
 
 
-_typestore = cache(get_typestore)
-
-
 @cache
 def schema_text(schema_name: str) -> str:
     """Return the definition of a ROS 2 type and of all its parts; raise DriverError for an unknown type."""
-    store = _typestore(Stores.ROS2_HUMBLE)
+    store = typestore(Stores.ROS2_HUMBLE)
     if schema_name not in store.fielddefs:
         raise DriverError(f"unknown message type {schema_name!r}: give a type of ROS 2, such as nav_msgs/msg/Odometry")
     return store.generate_msgdef(schema_name, ros_version=2)[0]

@@ -1,9 +1,4 @@
-"""Images, wheels and gyros in the messages of ROS 2 (CDR) and ROS 1.
-
-Images are nearly all of a log, so they are decoded here without a copy: the members of a message follow each other, in
-CDR (OMG, RTPS 2.2, 10.2) after a header of 4 bytes and each number aligned to its own size, in ROS 1 little-endian and
-without both. The small messages of wheels and gyros are decoded by rosbags.
-"""
+"""Images, wheels and gyros in the messages of ROS 2 (CDR) and ROS 1, decoded by rosbags, which copies no image."""
 
 from __future__ import annotations
 
@@ -41,8 +36,6 @@ _SYNONYMS: Final = {
     "yuv422": "uyvy",
 }
 _MAGIC: Final = {b"\xff\xd8\xff": "jpeg", b"\x89PN": "png"}
-_CDR_HEADER_BYTES: Final = 4
-_MAX_TEXT: Final = 256  # bytes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,21 +66,14 @@ def parse_image(kind: str, message: memoryview, *, aligned: bool = True) -> RosI
 
     aligned: True for CDR (ROS 2), False for the serialisation of ROS 1.
     """
-    try:
-        members = _Members(message, aligned)
-        if not aligned:
-            members.number("I")  # the sequence number that a header has in ROS 1
-        seconds, nanoseconds = members.number("i"), members.number("I")
-        stamp_ns, carries = _stamp_ns(seconds, nanoseconds), nanoseconds >= 10**9
-        members.text()  # the frame: the topic identifies the camera
-        if kind == IMAGE:
-            height, width, encoding = members.number("I"), members.number("I"), members.text()
-            bigendian, step = bool(members.number("B")), members.number("I")
-            encoding = _SYNONYMS.get(encoding, encoding)
-            return RosImage(stamp_ns, encoding, members.octets(), width, height, step, bigendian, carries)
-        encoding, data = members.text(), members.octets()
-    except struct.error as error:
-        raise FrameDecodeError(f"a {kind} of {len(message)} bytes is truncated") from error
+    found = _decoded(kind, message, aligned)
+    stamp = found.header.stamp
+    stamp_ns, carries = _stamp_ns(stamp.sec, stamp.nanosec), stamp.nanosec >= 10**9
+    data = memoryview(found.data)
+    if kind == IMAGE:
+        encoding, is_big = _SYNONYMS.get(found.encoding, found.encoding), bool(found.is_bigendian)
+        return RosImage(stamp_ns, encoding, data, found.width, found.height, found.step, is_big, carries)
+    encoding = found.format
     # image_transport compresses a Bayer pattern as it is, and says so: 'bayer_rggb8; jpeg compressed '.
     source = encoding.partition(";")[0].strip()
     bayer = source if source.startswith("bayer_") else ""
@@ -173,7 +159,7 @@ def cdr_of_ros1(kind: str, message: memoryview) -> bytes:
     """Return a message of ROS 1 in CDR, as ROS 2 has it; raise FrameDecodeError where it is invalid or unknown."""
     from rosbags.convert.converter import migrate_bytes  # which only recordings of ROS 1 need
 
-    stores = _typestore(Stores.ROS1_NOETIC), _typestore(Stores.ROS2_HUMBLE)
+    stores = typestore(Stores.ROS1_NOETIC), typestore(Stores.ROS2_HUMBLE)
     try:
         return bytes(migrate_bytes(*stores, kind, kind, {}, message, src_is2=False, dst_is2=True))
     except Exception as error:  # of any kind, as it trusts the lengths in the bytes
@@ -182,50 +168,16 @@ def cdr_of_ros1(kind: str, message: memoryview) -> bytes:
 
 def _decoded(kind: str, message: memoryview, aligned: bool) -> Any:
     """Return a message as rosbags decodes it; raise FrameDecodeError for other bytes."""
-    store = _typestore(Stores.ROS2_HUMBLE if aligned else Stores.ROS1_NOETIC)
+    store = typestore(Stores.ROS2_HUMBLE if aligned else Stores.ROS1_NOETIC)
     try:
         return store.deserialize_cdr(message, kind) if aligned else store.deserialize_ros1(message, kind)
     except Exception as error:  # of any kind, as it trusts the lengths in the bytes
         raise FrameDecodeError(f"a {kind} of {len(message)} bytes is truncated or invalid") from error
 
 
-_typestore = cache(get_typestore)
+typestore = cache(get_typestore)
 
 
 def _stamp_ns(seconds: int, nanoseconds: int) -> int:
     """Return the stamp of a header, 0 where there is none; some drivers do not carry nanoseconds over to seconds."""
     return seconds * 10**9 + nanoseconds if seconds >= 0 else 0
-
-
-class _Members:
-    """Reads the members of a message in order; raises struct.error at the end of the bytes."""
-
-    def __init__(self, message: memoryview, aligned: bool) -> None:
-        """Raise FrameDecodeError where a message has no CDR header."""
-        self._order, self._body, self._aligned, self._offset = "<", message, aligned, 0
-        if aligned:
-            head = bytes(message[:_CDR_HEADER_BYTES])
-            if head[:2] not in (b"\0\0", b"\0\1") or len(head) < _CDR_HEADER_BYTES:
-                raise FrameDecodeError(f"a message starts with {head.hex()}, not with a CDR header")
-            self._order, self._body = "<" if head[1] else ">", message[_CDR_HEADER_BYTES:]
-
-    def number(self, code: str) -> int:
-        """Return a number; code: its format in struct."""
-        size = struct.calcsize("=" + code)
-        self._offset += -self._offset % size if self._aligned else 0
-        value: int = struct.unpack_from(self._order + code, self._body, self._offset)[0]
-        self._offset += size
-        return value
-
-    def octets(self) -> memoryview:
-        """Return a view of a sequence of bytes, which starts with its length."""
-        size = self.number("I")
-        block = self._body[self._offset : self._offset + size]
-        if len(block) < size:
-            raise struct.error(f"{size} bytes expected, {len(block)} found")
-        self._offset += size
-        return block
-
-    def text(self) -> str:
-        """Return a string, truncated to 256 bytes."""
-        return bytes(self.octets()[:_MAX_TEXT]).rstrip(b"\0").decode("utf-8", "replace")
