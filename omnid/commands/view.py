@@ -158,25 +158,16 @@ def _draw_recording(sink: RerunSink, log: Path, topic: str | None, robot: str | 
         choose_odometry_topic,
         no_pose,
     )
-    from omnid.transport.codec import Pose
     from omnid.transport.topics import MAP_POSE, SCAN
 
     found = log_info(log)
     reader = RecordingReader(found, choose_odometry_topic(found, topic, robot))
-    pending: Pose | None = None  # a pose until its state is known, which is recorded after it
     broken_images = 0
     for message in reader.messages((ODOMETRY, MAP_POSE, STATUS, CLOUD, SCAN, reader.image_name())):
-        if isinstance(message.content, Pose):
-            if pending is not None:
-                sink.draw(pending)
-            pending = message.content
-            continue
         try:
             sink.draw(message.content)
         except FrameDecodeError:
             broken_images += 1
-    if pending is not None:
-        sink.draw(pending)
     if unreadable := reader.unreadable.total() + reader.damaged + broken_images:
         warn(f"{log}: {unreadable} messages or pieces cannot be read")
     if not sink.poses:

@@ -101,7 +101,7 @@ class RerunSink:
         self._drawn: Counter[str] = Counter()
         self._end: Array | None = None  # (3,) m, of the path
         self._state = "unknown"
-        self._shown_state = ""
+        self._shown_state = self._state
         self._poses: deque[Pose] = deque(maxlen=100)  # a pose in the map comes later than that in odom
         self._messages: dict[str, tuple[int, str]] = {}  # level and message of each status
         self.poses = self.images = 0
@@ -210,10 +210,8 @@ class RerunSink:
         """Draw the robot, the newest piece of its path and its covariance; plot speeds and landmarks."""
         if pose.attachment.seq >= 0:
             self._state = pose.state
+        self._show_state(pose.stamp_ns)
         colour, width_px = STATES.get(self._state, STATES["unknown"])
-        if self._state != self._shown_state:
-            self._shown_state = self._state
-            self._at(pose.stamp_ns).log("state", rr.StateChange(state=plain(self._state)))
         self._poses.append(pose)
         self.poses += 1
         if not self.wants("pose"):
@@ -255,6 +253,7 @@ class RerunSink:
         for status in diagnostics.statuses:
             if status.name == ODOMETRY:
                 self._state = status_names.tracking_state(status.message, status.values) or self._state
+                self._show_state(stamp_ns)
             for key, text in status.values.items():
                 time, value_ms = parsed_time_key(key), status_names.number(text)
                 if time is not None and value_ms is not None and time.statistic == "p50":
@@ -265,6 +264,12 @@ class RerunSink:
                 self._messages[status.name] = status.level, status.message
                 text, level = f"{short_name(status.name)}: {status.message}", LEVELS[status.level % len(LEVELS)]
                 self._at(stamp_ns).log("log", rr.TextLog(plain(text), level=level))
+
+    def _show_state(self, stamp_ns: int) -> None:
+        """Draw a change of the state; that of a recorded pose is recorded after it, with the same stamp."""
+        if self._state != self._shown_state:
+            self._shown_state = self._state
+            self._at(stamp_ns).log("state", rr.StateChange(state=plain(self._state)))
 
     def _scan(self, scan: Scan) -> None:
         """Draw the obstacles around the base, and near it where their directions are unknown."""

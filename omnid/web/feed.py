@@ -32,7 +32,6 @@ from omnid.transport.codec import Pose, decode_map, decode_map_pose, decode_scan
 from omnid.transport.status_names import decode_navigation
 from omnid.transport.topics import MAP_POSE, PANORAMA, SCAN
 from omnid.web.snapshot import (
-    MOST_CELLS,
     PATH_FRAME,
     map_cells,
     map_in_odom,
@@ -43,25 +42,13 @@ from omnid.web.snapshot import (
 )
 
 PERIOD_S: Final = 0.03  # least time between two answers to a browser
-QUIET_S: Final = 0.5  # The state is sent after this time even without a message of the robot.
-RETRY_S: Final = 0.5
+QUIET_S: Final = 0.5  # The state is sent after this time even without a message of the robot; between two connections
 WANTED_S: Final = 2.0  # The panorama is received for this time after a browser has asked for it.
-PANORAMA_S: Final = 0.4  # least time between two panoramas: what a robot publishes more often is left out
 MOST_POSES: Final = 100  # Most poses that are kept: a scan arrives later than the pose of its images.
 MOST_POINTS: Final = 4000  # Most points of the path.
 _FINEST_M: Final = 0.02  # Points of the path are at least this far apart, so that a robot at rest adds none.
-_LARGEST_M: Final = 1e6  # Largest coordinate that is drawn.
-_GAP_M: Final = 1.0  # A larger distance between two poses is drawn as a gap.
 NAVIGATION: Final = "navigation"
-_LARGEST: Final = {
-    "odom": 1 << 16,
-    MAP_POSE: 1 << 16,
-    "status": 1 << 20,
-    SCAN: 1 << 20,
-    "map": MOST_CELLS + (1 << 16),
-    PANORAMA: 1 << 23,
-    NAVIGATION: 1 << 16,
-}  # bytes
+LARGEST: Final = 1 << 26  # bytes of a message: a map of 8,000 x 8,000 cells
 _NEWEST_ONLY: Final = (NAVIGATION, SCAN, "map", PANORAMA)
 NO_NAVIGATION: Final = NavigationReport(0, "", "", "", 0, math.nan, "", "")
 Receiver = Callable[[str, bytes, bytes], None]
@@ -88,13 +75,7 @@ class LivePath:
 
     def add(self, x_m: float, y_m: float, version: int, *, gap: bool = False) -> None:
         """Add a position, m. version: of the news that it comes with. gap: the robot was put elsewhere."""
-        if not (abs(x_m) < _LARGEST_M and abs(y_m) < _LARGEST_M):
-            return
-        path = self._path
-        if path.vertices:
-            moved_m = math.dist(path.vertices[-1][:2], (x_m, y_m))
-            gap = gap or moved_m > max(_GAP_M, 10 * path.step_m)
-        times_thinned = path.thinned
+        path, times_thinned = self._path, self._path.thinned
         path.add(_PathPoint(x_m, y_m, gap and bool(path.vertices), version))
         if path.thinned != times_thinned:
             self._since = version  # all are sent again
@@ -133,7 +114,6 @@ class RobotFeed:
         self._images: dict[str, bytes] = {}  # cells of the map, and the panorama
         self._changed = asyncio.Condition()
         self._wanted_until_s = -math.inf  # the panorama
-        self._panorama_s = -PANORAMA_S  # when the newest one was taken
         self._poses: deque[Pose] = deque(maxlen=MOST_POSES)
         self._map_in_odom: list[float | None] | None = None
         self._large: dict[str, bytes] = {}  # newest map, panorama ... that are not processed yet
@@ -204,7 +184,7 @@ class RobotFeed:
                 self.robot = await asyncio.to_thread(Robot, settings=self.bus)
             except Unreachable as error:
                 self.link = str(error)
-                await asyncio.sleep(RETRY_S)
+                await asyncio.sleep(QUIET_S)
         self.link, receive, end = "", self._receiver(loop), None
         for topic in ("odom", MAP_POSE, "status", "map", SCAN, NAVIGATION):
             self.robot.on_message(receive, topic)
@@ -228,7 +208,7 @@ class RobotFeed:
         """Return the function that zenoh's threads call for each message."""
 
         def receive(topic: str, payload: bytes, attachment: bytes) -> None:
-            if len(payload) > _LARGEST.get(topic, 0):
+            if len(payload) > LARGEST:
                 self.state.broken += 1
                 return
             if topic in _NEWEST_ONLY:
@@ -302,11 +282,11 @@ class RobotFeed:
                 self._set(NAVIGATION, navigation_news(decode_navigation(payload)))
             elif topic == "map":
                 await self._take_map(await asyncio.to_thread(decode_map, payload))
-            elif time.monotonic() >= self._panorama_s + PANORAMA_S:
+            else:
                 data = bytes(parse_image(COMPRESSED_IMAGE, memoryview(payload)).data)
                 if not data.startswith(b"\xff\xd8"):
                     raise OmnidError("the panorama is no JPEG image")
-                self._images[PANORAMA], self._panorama_s = data, time.monotonic()
+                self._images[PANORAMA] = data
                 self._set(PANORAMA, self.version + 1)
 
     async def _take_map(self, grid: Map) -> None:

@@ -32,8 +32,7 @@ from omnid.web.feed import RobotFeed
 from omnid.web.metrics import metrics
 from omnid.web.snapshot import is_recent, server_ms
 
-# The longest request, a route with a name of 64 letters and its options, has less than half of these bytes.
-LONGEST_BODY: Final = 256
+LONGEST_BODY: Final = 1024  # more than the longest request has, a route with a name of 64 letters and its options
 # A connection whose body has not arrived after this time is ended, so that slow ones do not collect.
 BODY_S: Final = 5.0
 # Other pages are refused for this time after the last request of the page that drives: several of its requests may be
@@ -268,15 +267,15 @@ def stamp_of(text: str) -> int:
     return int(text)
 
 
-async def text_of(request: Request, longest: int = LONGEST_BODY) -> str:
-    """Return the body of a request. Raise OmnidError above `longest` bytes, or if it does not arrive within BODY_S."""
+async def text_of(request: Request) -> str:
+    """Return the body of a request. Raise OmnidError above LONGEST_BODY bytes, or where it takes longer than BODY_S."""
     body = bytearray()
     try:
         async with asyncio.timeout(BODY_S):
             async for chunk in request.stream():
                 body += chunk
-                if len(body) > longest:
-                    raise OmnidError(f"a request of at most {longest} bytes was expected")
+                if len(body) > LONGEST_BODY:
+                    raise OmnidError(f"a request of at most {LONGEST_BODY} bytes was expected")
     except TimeoutError:
         raise OmnidError("the request did not come") from None
     return body.decode("utf-8", "replace")

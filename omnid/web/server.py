@@ -36,7 +36,6 @@ from omnid.web.robot import RobotPage, text_of
 DEFAULT_LISTEN: Final = "127.0.0.1:8447"
 STATIC: Final = Path(__file__).with_name("static")
 COOKIE_S: Final = 30 * 86_400  # A browser keeps the cookie for this time.
-LONGEST_FORM: Final = 1024  # bytes
 BACKLOG: Final = 2048  # connections that wait for the event loop
 END_S: Final = 2  # Time that browsers have to finish at the end.
 # A link of another site brings no cookie along (SameSite=Strict); a page that loads itself again does.
@@ -115,7 +114,7 @@ def site(page: RobotPage, access: Access, *, secure: bool) -> Guard:
     async def login(request: Request) -> Response:
         """Let a browser in that sends the token in a form."""
         try:
-            fields = parse_qs(await text_of(request, LONGEST_FORM), max_num_fields=4)
+            fields = parse_qs(await text_of(request), max_num_fields=4)
         except (OmnidError, ValueError):  # too long, too slow, or more fields
             return PlainTextResponse("omnid web: this is no token\n", 413)
         return let_in(fields.get("token", [""])[0])

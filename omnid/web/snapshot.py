@@ -20,14 +20,11 @@ from omnid.transport.status_names import PLACES, WHEELS, Key, NavigationReport, 
 PATH_FRAME: Final = "odom"
 FRAMES: Final = (PATH_FRAME, "map")  # Frames of a map that is drawn.
 BASE_FRAME: Final = "base_link"
-MOST_SECTORS: Final = 720  # Most sectors of a scan.
-_LARGEST_M: Final = 1e4  # range of a scan
 OLDEST_S: Final = 1.0  # age of the newest state that a page may have when it asks for a motion
 MOST_WARNINGS: Final = 20
 MOST_VALUES: Final = 60  # Most values of a part of the status.
 LONGEST_VALUE: Final = 100  # characters
 LARGEST_MAP_PX: Final = 1024  # edge of the map as it is sent; larger ones are reduced
-MOST_CELLS: Final = 1 << 26
 _ROBOT_GONE: Final = "start the daemon on the robot: omnid run, or systemctl start omnid"
 
 
@@ -132,16 +129,12 @@ def scan_news(scan: Scan, poses: Iterable[Pose]) -> dict[str, Any]:
     pose, or where the scan is not in the robot's own frame.
     """
     place = min(poses, key=lambda pose: abs(pose.stamp_ns - scan.stamp_ns), default=None)
-    seen = np.isfinite(scan.ranges_m) & (scan.ranges_m > 0) & (scan.ranges_m < _LARGEST_M)
+    seen = (scan.ranges_m > 0) & (scan.ranges_m <= scan.max_range_m)
     ranges_m, azimuths_rad = scan.ranges_m[seen].astype(float), scan.azimuths_rad[seen].astype(float)
-    if place is None or scan.frame != BASE_FRAME or not ranges_m.size or not math.isfinite(place.yaw_rad):
+    if place is None or scan.frame != BASE_FRAME or not ranges_m.size:
         return {"points": [], "nearest": None}
-    nearest = int(ranges_m.argmin())
-    chosen = np.unique(np.append(np.arange(0, len(ranges_m), -(-len(ranges_m) // MOST_SECTORS)), nearest))
-    angles = azimuths_rad[chosen] + place.yaw_rad
-    points = np.column_stack(
-        [place.x_m + ranges_m[chosen] * np.cos(angles), place.y_m + ranges_m[chosen] * np.sin(angles)]
-    )
+    nearest, angles = int(ranges_m.argmin()), azimuths_rad + place.yaw_rad
+    points = np.column_stack([place.x_m + ranges_m * np.cos(angles), place.y_m + ranges_m * np.sin(angles)])
     turn_deg = math.degrees(math.remainder(float(azimuths_rad[nearest]), 2 * math.pi))
     return {
         "points": [[finite(x), finite(y)] for x, y in points.round(3)],

@@ -19,8 +19,8 @@ from omnid.errors import OmnidError
 from omnid.transport import codec, ros2
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.requests import Request
-from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, odometry, script
-from tests.omnid.transport.ros2_fixtures import COMMANDS, TOPICS, client
+from omnid.transport.topics import PUBLISHED, command_topics, ros_name
+from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, odometry, script, session
 from tests.waiting import wait_until
 
 ODOMETRY_KEY = (
@@ -37,6 +37,7 @@ HASHES = {  # as published by ROS 2's own type description service, first digits
     "sensor_msgs/msg/CompressedImage": "15640771",
     "geometry_msgs/msg/TwistStamped": "5f0fcd4f",
 }
+COMMANDS = command_topics(("planner",))
 PACE_S = 0.01  # between messages, so that a reader which is slow for a moment has them all
 
 
@@ -55,9 +56,12 @@ def test_the_attachment_equals_that_of_zenohs_serializer() -> None:
 
 def test_rmw_zenoh_receives_the_same_message_with_its_attachment() -> None:
     endpoint, gids, numbers = free_endpoint(), set(), []
-    with contextlib.closing(Bus(BusConfig(listen=(endpoint,), ros2="rmw_zenoh"))) as bus, client(endpoint) as session:
+    with (
+        contextlib.closing(Bus(BusConfig(listen=(endpoint,), ros2="rmw_zenoh"))) as bus,
+        session(mode="client", connect__endpoints=[endpoint]) as node,
+    ):
         # A full FIFO that is not read any longer blocks the session, and its close with it.
-        samples = session.declare_subscriber(ODOMETRY_KEY, zenoh.handlers.RingChannel(100))
+        samples = node.declare_subscriber(ODOMETRY_KEY, zenoh.handlers.RingChannel(100))
         while len(numbers) < 3:
             bus.publish("odom", odometry(1), b'{"seq":1}')
             time.sleep(PACE_S)
@@ -79,10 +83,10 @@ def test_receives_a_twist_from_ros() -> None:
     key = ros2.data_key(3, "/omnid/cmd/twist", codec.TWIST_SCHEMA)
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,), ros2="rmw_zenoh", ros2_domain=3))) as bus:
         bus.subscribe_commands(received.append, COMMANDS)
-        with client(endpoint) as session:
+        with session(mode="client", connect__endpoints=[endpoint]) as node:
             message, gid = codec.twist_stamped_cdr(5, "base_link", 0.5, 0.1), bytes(range(16))
             attachment = ros2.attachment(1, 5, gid)
-            wait_until(lambda: session.put(key, message, attachment=attachment) is None and bool(received))
+            wait_until(lambda: node.put(key, message, attachment=attachment) is None and bool(received))
     assert received[0][:4] == ("cmd/twist", message, gid.hex(), 5)
 
 
@@ -93,20 +97,20 @@ def test_joins_the_router_of_ros_where_that_holds_the_endpoint(mode: str) -> Non
     with (
         script(ROUTER, endpoint),
         contextlib.closing(Bus(config, lines.append)) as bus,
-        client(endpoint, mode) as session,
+        session(mode=mode, connect__endpoints=[endpoint]) as node,
     ):
         assert lines == [f"the zenoh router at {endpoint} is joined as a client: who may connect is decided there"]
         assert bus.status().values["mode"] == "client" and bus.needs_router
         bus.subscribe_commands(received.append, COMMANDS)
         key, twist = ros2.data_key(3, "/omnid/cmd/twist", "geometry_msgs/msg/Twist"), bytes(52)
         attachment = ros2.attachment(1, 5, bytes(16))
-        odom = session.declare_subscriber(
+        odom = node.declare_subscriber(
             ros2.data_key(3, "/omnid/odom", codec.ODOMETRY_SCHEMA),
             lambda sample: poses.append(sample.payload.to_bytes()),
         )
         wait_until(
             lambda: (
-                session.put(key, twist, attachment=attachment) is None
+                node.put(key, twist, attachment=attachment) is None
                 and bus.publish("odom", odometry(1)) is None
                 and bool(received)
                 and bool(poses)
@@ -176,7 +180,8 @@ def test_a_separate_program_lists_and_reads_the_topics(tmp_path: Path) -> None:
         config = BusConfig(listen=(free_endpoint(),), connect=(endpoint,), ros2="rmw_zenoh")
         bus = stack.enter_context(contextlib.closing(Bus(config)))
         bus.subscribe_commands(lambda *_: None, COMMANDS)
-        wait_until(lambda: listed(endpoint) >= {f"{topic} [{schema}]" for topic, schema in TOPICS.items()})
+        topics = {name: topic.schema for name, topic in PUBLISHED.items() if name != "/clock"} | COMMANDS
+        wait_until(lambda: listed(endpoint) >= {f"{ros_name('omnid', name)} [{topics[name]}]" for name in topics})
         (tmp_path / "Odometry.msg").write_text(
             "std_msgs/Header header\nstring child_frame_id\n"
             "geometry_msgs/PoseWithCovariance pose\n"
