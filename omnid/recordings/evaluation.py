@@ -67,7 +67,7 @@ def evaluate(estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.01,
     """
     if alignment not in ALIGNMENTS:
         raise OmnidError(f"an alignment {', '.join(ALIGNMENTS)} was expected, {alignment!r} found")
-    of_estimate, of_truth = _associate(estimate.stamps_ns, truth.stamps_ns, _tolerance_ns(tolerance_s))
+    of_estimate, of_truth = associate(estimate.stamps_ns, truth.stamps_ns, _tolerance_ns(tolerance_s))
     if of_estimate.size < 2:
         raise OmnidError(
             f"2 poses at the same times (within {tolerance_s:g} s) were expected, {of_estimate.size} found:"
@@ -95,7 +95,7 @@ def _tolerance_ns(tolerance_s: float) -> int:
     return round(tolerance_s * 1e9)
 
 
-def _associate(
+def associate(
     stamps_ns: NDArray[np.int64], true_ns: NDArray[np.int64], tolerance_ns: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return indices (of the estimate, of the truth) of the associated poses, in time order, each at most once."""

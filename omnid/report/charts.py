@@ -79,10 +79,10 @@ def grid(figures: Sequence[str]) -> str:
 
 @cache
 def style_and_script() -> tuple[str, str]:
-    """Return the style and the script that draw the charts."""
+    """Return the style of a report with charts, and the script that draws them."""
     found = (files("omnid.report") / "uplot.html").read_text("utf-8").strip()
     licence, _, rest = found.partition("--><style>")
     style, _, script = rest.partition("</style><script>")
     licence = licence.removeprefix("<!--").strip()
-    own = (files("omnid.report") / "charts.js").read_text("utf-8")
-    return style, f"/* {licence} */\n{script.removesuffix('</script>')}\n{own}"
+    own_style, own = ((files("omnid.report") / name).read_text("utf-8") for name in ("report.css", "charts.js"))
+    return style + own_style, f"/* {licence} */\n{script.removesuffix('</script>')}\n{own}"

@@ -7,6 +7,7 @@ import hashlib
 import re
 from collections.abc import Sequence
 from html import escape
+from importlib.resources import files
 from typing import Final
 
 import cv2
@@ -16,30 +17,16 @@ from numpy.typing import NDArray
 Image = NDArray[np.uint8]
 
 JPEG_QUALITY: Final = 80
-STYLE: Final = """body{font:15px/1.5 system-ui,sans-serif;max-width:1060px;margin:2em auto;padding:0 1em;color:#222}
-h1{margin-bottom:.1em;overflow-wrap:anywhere}h2{margin:1.6em 0 .4em;border-bottom:2px solid #222}
-table{border-collapse:collapse;margin:.6em 0;font-variant-numeric:tabular-nums}small{color:#444}
-td,th{padding:.15em .8em;text-align:right;border-bottom:1px solid #ddd}
-@media(max-width:800px){table{display:block;overflow-x:auto}}
-@media(max-width:640px){body{margin:1em auto;padding:0 .7em}td,th{padding:.15em .4em}}
-td:first-child,th:first-child{text-align:left}img{max-width:100%}
-figure{margin:.7em 0;position:relative;break-inside:avoid}figcaption{color:#222;min-height:1.5em}
-td.bar{text-align:left;min-width:220px}.bar span{background:#777;height:.7em;display:inline-block}
-.note{border-left:4px solid #999;padding-left:.7em;color:#333}.warn{border-left:4px solid #000;padding-left:.7em}
-.tiles{display:grid;grid-template-columns:repeat(auto-fill,minmax(230px,1fr));gap:.6em}
-.tiles.wide{grid-template-columns:repeat(auto-fill,minmax(400px,1fr))}.tiles figure{margin:0}
-.tiles figcaption{font-size:.8em;line-height:1.3}details{margin:1em 0}summary{cursor:pointer}
-@media screen and (prefers-color-scheme:dark){html{background:#12161a}body>*{filter:invert(.92) hue-rotate(180deg)}
-body>* img{filter:invert(1) hue-rotate(180deg)}}"""
 # Control characters except tab and newline, which a terminal would obey where the page is printed.
 _CONTROL: Final = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 
 
 def page(title: str, parts: Sequence[str], style: str = "", script: str = "") -> str:
-    """Return an HTML page of parts, which are HTML; style is appended to STYLE. It may run the script, and no other.
+    """Return an HTML page of parts, which are HTML; style is appended to page.css. It may run the script, and no other.
 
     A page shows text from logs of unknown origin: it loads nothing, and runs only the script with this digest.
     """
+    own_style = (files("omnid.report") / "page.css").read_text("utf-8")
     script = _CONTROL.sub("\N{REPLACEMENT CHARACTER}", script)
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     allowed = f"; script-src 'sha256-{digest}'" if script else ""
@@ -47,7 +34,7 @@ def page(title: str, parts: Sequence[str], style: str = "", script: str = "") ->
     text = (
         f"<!DOCTYPE html><html lang='en'><head><meta charset='utf-8'><meta http-equiv='Content-Security-Policy' "
         f"content=\"{policy}\"><meta name='viewport' content='width=device-width'>"
-        f"<title>{escape(title)}</title><style>{STYLE}{style}</style></head>"
+        f"<title>{escape(title)}</title><style>{own_style}{style}</style></head>"
         f"<body>{''.join(parts)}{f'<script>{script}</script>' if script else ''}</body></html>\n"
     )
     return _CONTROL.sub("\N{REPLACEMENT CHARACTER}", text)

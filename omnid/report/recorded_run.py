@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
@@ -20,6 +19,7 @@ from calib.rig import Rig
 from calib.rig_file import parse_rig
 from drivers.logs.open_log import LogInfo, log_info
 from omnid.formats.tum import POSITION_LIMIT_M
+from omnid.plain_text import plain
 from omnid.recordings.recording import (
     CLOUD,
     DRIVE,
@@ -40,8 +40,8 @@ Array = NDArray[np.float64]
 STATES: Final = tuple(TrackingState)
 UNKNOWN: Final = -1  # rank of a state that is not recorded
 GOOD, WARNING, ERROR = range(3)
+MOST: Final = 64  # parts, and values of one, of a log of unknown origin
 MAX_CLOCK_OFFSET_S: Final = 3600.0  # change of the offset between stamps and times of logging
-MAX_PARTS, MAX_VALUES, MAX_TEXT = 64, 64, 160  # entries, values of one, characters: a log of unknown origin
 _COUNTERS: Final[Mapping[str, str]] = {  # of faults, with the text of the event when one rises
     Key.DROPS: "images dropped",
     Key.DROPPED: "messages dropped",
@@ -54,7 +54,7 @@ _COUNTERS: Final[Mapping[str, str]] = {  # of faults, with the text of the event
     Key.UNPAIRED_LOWER: "lower images without a partner",
     Key.UNPAIRED_UPPER: "upper images without a partner",
 }
-_COUNTER_PREFIXES: Final = (status_names.STOPPED_PREFIX, status_names.REFUSED_PREFIX)  # of counters
+_REASONS: Final = (status_names.STOPPED_PREFIX, status_names.REFUSED_PREFIX)  # begin counters with a reason
 _DIGITS: Final = str.maketrans("", "", "0123456789")
 
 
@@ -108,8 +108,8 @@ class RecordedRun:
         for t_s, status in ((t_s, status) for t_s, message in self.statuses for status in message):
             self.by_name.setdefault(status.name, []).append((t_s, status))
             values = self.newest[status.name].values if status.name in self.newest else {}
-            merged = dict([*{**values, **status.values}.items()][:MAX_VALUES])
-            self.newest[status.name] = DiagnosticStatus(status.name, status.level, status.message, merged)
+            merged = dict([*{**values, **status.values}.items()][:MOST])
+            self.newest[status.name] = replace(status, values=merged)
         # An entry with `state` has the stamp of the first pose in it; others tell the state of an earlier pose.
         entries = self.entries(status_names.ODOMETRY)
         entries = [(t, status) for t, status in entries if Key.STATE in status.values] or entries
@@ -209,28 +209,19 @@ class RecordedRun:
         One that rises again with the next report but one is the same event.
         """
         for key in self.values(name):
-            if not (key in _COUNTERS or key.startswith(_COUNTER_PREFIXES)):
+            is_reason = key.startswith(_REASONS)
+            if not (key in _COUNTERS or is_reason):
                 continue
-            times_s, counts = self.series(name, key)
-            if (
-                key.startswith(_COUNTER_PREFIXES)
-                and self.statuses
-                and len(times_s)
-                and times_s[0] > self.statuses[0][0]
-            ):
-                times_s, counts = np.insert(times_s, 0, times_s[0]), np.insert(counts, 0, 0.0)  # it has appeared
-            newest: Event | None = None
-            for (before, count), t_s in zip(pairwise(counts), times_s[1:], strict=True):
-                if count > before:
-                    rise = int(count - before)
-                    if newest is not None and t_s - newest.end_s <= 2.5:
-                        newest = replace(newest, end_s=t_s, count=newest.count + rise)
-                    else:
-                        if newest is not None:
-                            yield newest
-                        newest = Event(t_s, t_s, WARNING, short_name(name), _COUNTERS.get(key, key), rise)
-            if newest is not None:
-                yield newest
+            t_s, counts = self.series(name, key)
+            if is_reason and len(t_s) and t_s[0] > self.statuses[0][0]:  # the first one of this reason
+                t_s, counts = np.insert(t_s, 0, t_s[0]), np.insert(counts, 0, 0.0)
+            rises = np.diff(counts)
+            at = np.flatnonzero(rises > 0)
+            for same in np.split(at, np.flatnonzero(np.diff(t_s[at + 1]) > 2.5) + 1):
+                if len(same):
+                    start_s, end_s = float(t_s[same[0] + 1]), float(t_s[same[-1] + 1])
+                    text, count = _COUNTERS.get(key, key), int(rises[same].sum())
+                    yield Event(start_s, end_s, WARNING, short_name(name), text, count)
 
 
 def read_run(path: Path, topic: str | None = None) -> RecordedRun:
@@ -262,7 +253,7 @@ def read_run(path: Path, topic: str | None = None) -> RecordedRun:
                 map_poses.append(in_map)
             case Diagnostics(stamp_ns, entries):
                 bounded = [_bounded(status) for status in entries]
-                names |= {status.name for status in bounded[: MAX_PARTS - len(names)]}
+                names |= {status.name for status in bounded[: MOST - len(names)]}
                 statuses.append((stamp_ns, [status for status in bounded if status.name in names]))
             case Cloud():
                 cloud = message.content
@@ -333,5 +324,6 @@ def root(variances: Array) -> Array:
 
 
 def _bounded(status: DiagnosticStatus) -> DiagnosticStatus:
-    values = {key[:MAX_TEXT]: value[:MAX_TEXT] for key, value in [*status.values.items()][:MAX_VALUES]}
-    return DiagnosticStatus(status.name[:MAX_TEXT], status.level, status.message[:MAX_TEXT], values)
+    """Return a status as the report shows it: with short texts, and not too many."""
+    values = {plain(key): plain(value) for key, value in [*status.values.items()][:MOST]}
+    return DiagnosticStatus(plain(status.name), status.level, plain(status.message), values)

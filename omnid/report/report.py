@@ -26,7 +26,7 @@ from drivers.logs.ros_messages import IMAGE_TYPES
 from omnid.config import Config
 from omnid.formats.plan import Lines, between, draw_ends, draw_plan, drawn_heights, sheet_of, write
 from omnid.formats.tum import Trajectory
-from omnid.recordings.evaluation import Metrics, evaluate
+from omnid.recordings.evaluation import Metrics, associate, evaluate
 from omnid.recordings.recording import DRIVE, TWIST_COMMAND
 from omnid.report.charts import Array, Curve, chart, grid, style_and_script
 from omnid.report.page import embedded, facts, figure, note, page, table
@@ -57,27 +57,6 @@ MAX_EVENTS, MAX_ROWS, MAX_CROSSES = 400, 60, 40  # of the table of events, of ot
 PATH: Final = {UNKNOWN: ((60, 60, 60), 3), 0: ((60, 60, 60), 3), 1: ((0, 159, 230), 5), 2: ((0, 94, 213), 7)}
 TRUTH_COLOUR, MAP_COLOUR = (150, 150, 150), (200, 100, 0)
 LEVELS: Final = ("", "warning", "error")
-STYLE: Final = """.sub{color:#444;overflow-wrap:anywhere;margin-top:0}
-.numbers{display:flex;flex-wrap:wrap;gap:.6em 2em;margin:1em 0}.numbers b{display:block;font-size:1.35em}
-.numbers span{color:#444}.grid2{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(100%,400px),1fr));
-gap:0 1.5em}.grid2>*{min-width:0}.scroll{overflow-x:auto}
-.chart details{margin:.2em 0;color:#555;font-size:.85em}.u-legend{text-align:left;font-size:12px}
-.u-legend th,.u-legend td{font-weight:400;border:0}.u-legend table,table.u-legend{display:table}
-.words td,.words th,.events td,.events th{text-align:left;vertical-align:top}.facts tr:first-child{display:none}
-.events td:nth-child(-n+3){white-space:nowrap}.events{max-height:40em;overflow:auto;border:1px solid #ccc}
-.events td:nth-child(2){font-weight:bold}
-.sheet{position:relative;cursor:crosshair}.sheet img{display:block;width:100%}
-.sheet i{position:absolute;width:12px;height:12px;margin:-7px;border:2px solid #fff;border-radius:50%;
-background:#0072b2}.key{white-space:nowrap;margin-left:.9em;font-size:.92em}
-.key i{display:inline-block;width:26px;height:4px;margin:0 .3em .2em 0}
-.lane{display:flex;height:22px;font-size:.85em}.lane b{flex:0 0 9em;overflow:hidden;white-space:nowrap;font-weight:400}
-.lane div{flex:1;position:relative;border-bottom:1px solid #ddd}
-.lane i{position:absolute;top:3px;bottom:3px;min-width:5px}
-.s-1,.e0{background:#ccc}.s0{background:#b8d8ea}.s1,.e1{background:#e69f00}.s2,.e2{background:#d55e00}
-@media(max-width:640px){.events td:nth-child(-n+3){white-space:normal}.lane b{flex-basis:6em}}
-@media print{@page{margin:14mm}body{font-size:10pt;margin:0;padding:0;max-width:none;print-color-adjust:exact}
-.sheet img{max-height:150mm;width:auto}.events{font-size:8.5pt;max-height:none;overflow:visible;border:0}
-h2{break-after:avoid}tr{break-inside:avoid}.grid2{grid-template-columns:1fr 1fr}}"""
 
 
 def report_html(run: RecordedRun, true: Trajectory | None = None) -> str:
@@ -116,7 +95,7 @@ def report_html(run: RecordedRun, true: Trajectory | None = None) -> str:
         f"<p><small>Made by omnid {__version__}.</small></p></main>",
     ]
     style, script = style_and_script()
-    return page(f"{run.robot}: {run.path.name}", parts, style + STYLE, script)
+    return page(f"{run.robot}: {run.path.name}", parts, style, script)
 
 
 def _head(run: RecordedRun) -> list[str]:
@@ -171,13 +150,10 @@ class _Truth:
         stamps_ns = run.start_ns + np.rint(run.t_s * 1e9).astype(np.int64)
         T_estimate = T_rig_base @ run.T_odom_base @ run.T_base_rig
         self.metrics: Metrics = evaluate(Trajectory(stamps_ns, T_estimate), truth, tolerance_s)
-        after = np.clip(np.searchsorted(truth.stamps_ns, stamps_ns), 1, len(truth.stamps_ns) - 1)
-        is_before = stamps_ns - truth.stamps_ns[after - 1] <= truth.stamps_ns[after] - stamps_ns
-        nearest = np.where(is_before, after - 1, after)
-        near = np.abs(stamps_ns - truth.stamps_ns[nearest]) <= tolerance_s * 1e9
-        T_estimate, T_true = T_estimate[near], truth.T[nearest[near]]
+        of_run, of_truth = associate(stamps_ns, truth.stamps_ns, round(tolerance_s * 1e9))
+        T_estimate, T_true = T_estimate[of_run], truth.T[of_truth]
         T_true = T_estimate[0] @ se3.inverse(T_true[0]) @ T_true
-        self.t_s = run.t_s[near]
+        self.t_s = run.t_s[of_run]
         self.position_m = np.linalg.norm(T_estimate[:, :3, 3] - T_true[:, :3, 3], axis=1)
         self.heading_rad = se3.yaw(se3.inverse(T_true) @ T_estimate)
         self.base_xy: Array = (run.T_base_rig @ T_true @ T_rig_base)[:, :2, 3]
