@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Generic, Literal, TypeAlias, TypeVar
+from typing import Generic, Literal, TypeAlias, TypeVar
 
 import cv2
 import numpy as np
@@ -80,7 +80,6 @@ class Take(Generic[T]):
         self._take(message)
 
 
-STOPPING_NS: Final = 2_000_000_000  # At the end the wheels come to rest within this time.
 Array = NDArray[np.float64]
 
 
@@ -266,9 +265,7 @@ class _Lockstep:
             self._truth[stamp_ns] = vehicle.T_world_base
             yield from vehicle.take_samples()
             yield from self._pair(seq, stamp_ns)
-        # 4. The wheels come to rest.
-        vehicle.controller.end()
-        vehicle.advance(vehicle.now_ns + STOPPING_NS)
+        vehicle.come_to_rest()
         self._requests.end()
 
     def _pair(self, seq: int, stamp_ns: int) -> Iterator[Frame]:
@@ -326,18 +323,15 @@ class _Lockstep:
         self._odometry = odometry
         is_slipping = self._stages is not None and self._stages.front_end.odometry.sensors.is_slipping
         self._poses.append((odometry.stamp_ns, of_base(odometry, T_base_rig)[0], odometry.state, is_slipping))
-        pose = controller_pose(odometry, T_base_rig)
-        self._vehicle.post(odometry.stamp_ns + self._delay_ns, lambda: self._vehicle.controller.take(pose))
+        self._vehicle.post(controller_pose(odometry, T_base_rig), odometry.stamp_ns + self._delay_ns)
 
     def _take_ring(self, ring: ObstacleRing) -> None:
         self._rings.append(ring)
-        seen = controller_ring(ring)
-        self._vehicle.post(ring.stamp_ns + self._delay_ns, lambda: self._vehicle.controller.take(seen))
+        self._vehicle.post(controller_ring(ring), ring.stamp_ns + self._delay_ns)
 
     def _take_navigation(self, update: NavigationUpdate) -> None:
         self._navigation.append(update)
         self._files.process(update)
         if update.setpoint is not None:
             due_ns = self._vehicle.now_ns + self._delay_ns
-            command = TimedSetpoint(due_ns, update.setpoint, PLANNER, NAVIGATION_SENDER)
-            self._vehicle.post(due_ns, lambda: self._vehicle.controller.take(command))
+            self._vehicle.post(TimedSetpoint(due_ns, update.setpoint, PLANNER, NAVIGATION_SENDER), due_ns)

@@ -14,15 +14,14 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import replace
 from itertools import count
-from queue import Empty, Full, Queue, SimpleQueue
-from typing import Final, TypeAlias
+from queue import Empty, Full, Queue
+from typing import Final
 
 from drivers.cameras.camera_state import CameraState
 from drivers.frame import CAMERAS, Camera, Frame
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from drivers.motor import VelocityCommand
 from omnid.config import Config
-from omnid.controller.controller import Controller
 from omnid.controller.link import DriveLink
 from omnid.controller.statistics import ControllerStatistics, TickReport
 from omnid.core.control.collision_monitor import ControllerRing
@@ -34,7 +33,6 @@ from omnid.engine.telemetry import StageStats
 from omnid.runs.session import Session
 from omnid.simulation.cameras import SimulatedCameras
 from omnid.simulation.clearance import DriveRecord
-from omnid.simulation.lockstep import STOPPING_NS
 from omnid.simulation.robot import SimulatedRobot, with_masks
 from omnid.simulation.vehicle import Tick, Vehicle
 from omnid.simulation.world import World
@@ -42,9 +40,6 @@ from omnid.transport.codec import OK, DiagnosticStatus
 from omnid.transport.status_names import SIMULATION, Key
 
 MOST_COMMANDS: Final = 64  # If this number of commands waits for the stages, the simulated time waits, too.
-
-# Hands a message to the controller; its argument is the arrival by the simulated clock [ns].
-Delivery: TypeAlias = Callable[[Controller, int], None]
 
 
 class PacedLink:
@@ -54,12 +49,11 @@ class PacedLink:
     requests to arm with the next tick.
     """
 
-    def __init__(self, stats: StageStats, delay_ns: int) -> None:
+    def __init__(self, vehicle: Vehicle, stats: StageStats, delay_ns: int) -> None:
         """stats: counters of the tick."""
         self.statistics = ControllerStatistics(stats)
         self.take_wheels: Callable[[WheelSample], object] = nothing
-        self._delay_ns = delay_ns
-        self._posted: SimpleQueue[tuple[int, Delivery]] = SimpleQueue()
+        self._vehicle, self._delay_ns = vehicle, delay_ns
         self._commands: Queue[VelocityCommand] = Queue(MOST_COMMANDS)
         self._contacts = NO_CONTACT
         self._ended = False
@@ -67,18 +61,18 @@ class PacedLink:
     def send(self, given: ControlInput) -> None:
         """Send a pose, an obstacle ring, a setpoint, or a request to arm."""
         if isinstance(given, ControllerPose | ControllerRing):
-            self._posted.put((given.stamp_ns + self._delay_ns, lambda controller, _: controller.take(given)))
+            self._vehicle.post(given, given.stamp_ns + self._delay_ns)
         else:
-            self._post(lambda controller, at_ns: controller.take(given._replace(arrival_ns=at_ns)))
+            self._vehicle.post(given._replace(arrival_ns=0))
 
     def stop(self) -> None:
         """Stop the wheels until a request to arm is sent later."""
-        self._post(lambda controller, at_ns: controller.stop(at_ns))
+        self._vehicle.post("stop")
 
     def touch(self, contact: str, *, holds: bool) -> None:
         """Report a bumper or a cliff sensor; from one thread."""
-        contacts = self._contacts = self._contacts.after(contact, holds=holds)
-        self._post(lambda controller, _: controller.touch(contacts))
+        self._contacts = self._contacts.after(contact, holds=holds)
+        self._vehicle.post(self._contacts)
 
     def end(self) -> None:
         """Let `commands` end when the last ones are taken; the simulation makes sure that the wheels are at rest."""
@@ -93,11 +87,6 @@ class PacedLink:
                 if self._ended:
                     return
 
-    def posted(self) -> Iterator[tuple[int, Delivery]]:
-        """Yield what was sent since the last call, with the time from which it may be delivered [ns]."""
-        while not self._posted.empty():
-            yield self._posted.get()
-
     def take(self, report: TickReport) -> None:
         """Take the report of a tick; wait until its command has room."""
         self.statistics.add(report._replace(state=copy.deepcopy(report.state)))  # the controller changes its own
@@ -107,9 +96,6 @@ class PacedLink:
                 return
             except Full:
                 pass
-
-    def _post(self, deliver: Delivery) -> None:
-        self._posted.put((0, deliver))
 
 
 RECENT: Final = 30  # pairs over which the real-time factor is measured: three seconds
@@ -159,7 +145,6 @@ class PacedRobot:
         self._start_ns = time.monotonic_ns()
         self._vehicle: Vehicle | None = None
         self._link: PacedLink | None = None
-        self._arrived_ns = 0  # of the newest message that was delivered to the controller
         self._states = {camera: CameraState(mode="simulated") for camera in CAMERAS}
         self._pace = RealTimeFactor(1.0 / robot.rate_hz)
         self._closed = self._ends = False
@@ -176,13 +161,14 @@ class PacedRobot:
     def connect(self, session: Session) -> DriveLink:
         """Set the robot up, with the controller of the settings."""
         config = replace(session.config, controller=session.with_obstacles_known(session.config.controller))
-        self._link = PacedLink(session.graph.telemetry.add(StageStats("motor", is_ticker=True)), self._period_ns)
+        stats = session.graph.telemetry.add(StageStats("motor", is_ticker=True))
 
         def warn(_: float, line: str) -> None:
             if not self._ends:  # no more poses come then, which needs no line
                 session.warn(line)
 
         self._vehicle = Vehicle(self._world, self._robot, config, self._seed, self._take_tick, warn, self._start_ns)
+        self._link = PacedLink(self._vehicle, stats, self._period_ns)
         return self._link
 
     def sources(self, graph: Graph, take: Callable[[MotionSample], None]) -> list[Stream[Frame]]:
@@ -222,13 +208,13 @@ class PacedRobot:
             for seq in count():
                 # 1. Up to the exposure, by what the controller knows.
                 stamp_ns = self._start_ns + (seq + 1) * self._period_ns
-                self._advance(vehicle, link, stamp_ns, ticks_then=False)
+                vehicle.advance(stamp_ns, ticks_then=False)
                 # 2. The images, while the daemon works on those before.
                 pair = [self._frame(vehicle, camera, seq, stamp_ns) for camera in CAMERAS]
                 self.drive.add_pose(stamp_ns, vehicle.twin.base.pose)
                 # 3. The daemon's answers, which take effect with the tick of now.
                 settle()
-                self._advance(vehicle, link, stamp_ns)
+                vehicle.advance(stamp_ns)
                 for sample in vehicle.take_samples():
                     if self._is_given(sample):
                         take(sample)
@@ -241,20 +227,8 @@ class PacedRobot:
                 yield from pair
         finally:
             self._ends = True
-            vehicle.controller.end()
-            self._advance(vehicle, link, vehicle.now_ns + STOPPING_NS)
+            vehicle.come_to_rest()
             link.end()
-
-    def _advance(self, vehicle: Vehicle, link: PacedLink, until_ns: int, *, ticks_then: bool = True) -> None:
-        """Advance to a time; what was sent to the controller arrives at its ticks, in order."""
-        for due_ns, deliver in link.posted():
-            vehicle.post(due_ns, lambda deliver=deliver: self._deliver(vehicle, deliver))  # type: ignore[misc]
-        vehicle.advance(until_ns, ticks_then=ticks_then)
-
-    def _deliver(self, vehicle: Vehicle, deliver: Delivery) -> None:
-        """Hand a message to the controller: it arrives after the one before, and after the tick before."""
-        self._arrived_ns = max(self._arrived_ns, vehicle.last_tick_ns) + 1
-        deliver(vehicle.controller, self._arrived_ns)
 
     def _is_given(self, sample: MotionSample) -> bool:
         """True if the settings ask for samples of this kind."""

@@ -6,7 +6,9 @@ import heapq
 import math
 import random
 from collections.abc import Callable
-from typing import Final, NamedTuple
+from itertools import count
+from queue import SimpleQueue
+from typing import Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +22,10 @@ from drivers.motors.simulated.simulated_motor import SimulatedMotor, simulated_c
 from omnid.config import Config
 from omnid.controller.controller import Controller
 from omnid.controller.statistics import TickReport
+from omnid.core.control.arming import ArmRequest
+from omnid.core.control.command_sources import TimedSetpoint
+from omnid.core.control.contacts import ContactState
+from omnid.core.control.control_law import ControlInput
 from omnid.simulation.clearance import clearance_m, footprints, obstacles_of
 from omnid.simulation.people import Walkers
 from omnid.simulation.robot import SimulatedRobot
@@ -27,6 +33,9 @@ from omnid.simulation.world import World
 
 Array = NDArray[np.float64]
 START_NS: Final = 1_000_000_000_000  # Start of the simulated clock.
+STOPPING_NS: Final = 2_000_000_000  # At the end the wheels come to rest within this time.
+# What a controller is given; a stop disarms.
+Given: TypeAlias = ControlInput | ContactState | Literal["stop"]
 
 
 class Tick(NamedTuple):
@@ -74,8 +83,9 @@ class Vehicle:
         )
         self._period_ns = round(1e9 / config.motor.rate_hz)
         self._tick_ns = start_ns
-        self._waiting: list[tuple[int, int, Callable[[], None]]] = []
-        self._posted = 0
+        self._posted: SimpleQueue[tuple[int, int, Given]] = SimpleQueue()  # when it is due [ns], number
+        self._waiting: list[tuple[int, int, Given]] = []
+        self._numbers, self._arrived_ns = count(), 0
         self._wheel_noise, self._gyro_noise = random.Random(seed), random.Random(seed + 1)
         self._rolled_s = 0.0  # time that the wheels have turned or stood
         self._gyro_ns = start_ns
@@ -88,11 +98,6 @@ class Vehicle:
         return (self.now_ns - self._start_ns) * 1e-9
 
     @property
-    def last_tick_ns(self) -> int:
-        """Return the time of the last tick; before the first one, that of one before the start."""
-        return self._tick_ns - self._period_ns
-
-    @property
     def T_world_base(self) -> Array:
         """Return the true pose (4, 4) of the base."""
         return self._ground.T_world_base(self.twin.base.pose)
@@ -102,31 +107,52 @@ class Vehicle:
         """Return the true pose (4, 4) of the rig, which may lean otherwise than its file says."""
         return self.T_world_base @ self._robot.T_base_leaning @ self._robot.rig.T_base_rig
 
-    def post(self, due_ns: int, deliver: Callable[[], None]) -> None:
-        """Have a message delivered to the controller before its first tick at or after a time."""
-        heapq.heappush(self._waiting, (due_ns, self._posted, deliver))
-        self._posted += 1
+    def post(self, given: Given, due_ns: int = 0) -> None:
+        """Have the controller given something before its first tick at or after a time; from any thread.
+
+        It is on its way when `advance` is called next. A setpoint or a request without a time of arrival arrives then.
+        """
+        self._posted.put((due_ns, next(self._numbers), given))
 
     def advance(self, until_ns: int, *, ticks_then: bool = True) -> None:
         """Advance to a time, with all ticks and samples that are due until then.
 
         ticks_then: those that are due just then, too; otherwise the next call gives them.
         """
+        while not self._posted.empty():
+            heapq.heappush(self._waiting, self._posted.get())
         while (due_ns := min(self._tick_ns, self._gyro_ns)) < until_ns + ticks_then:
             self._move(due_ns)
             if due_ns == self._gyro_ns:
                 self._gyro_ns += round(1e9 / self._robot.gyro.rate_hz)
             if due_ns == self._tick_ns:
                 while self._waiting and self._waiting[0][0] <= self.now_ns:
-                    heapq.heappop(self._waiting)[2]()
+                    self._give(heapq.heappop(self._waiting)[2])
                 self._tick()
                 self._tick_ns += self._period_ns
         self._move(until_ns)
+
+    def come_to_rest(self) -> None:
+        """Have the controller stop the wheels permanently."""
+        self.controller.end()
+        self.advance(self.now_ns + STOPPING_NS)
 
     def take_samples(self) -> list[MotionSample]:
         """Return the samples of wheels and gyro since the last call."""
         samples, self.samples = self.samples, []
         return samples
+
+    def _give(self, given: Given) -> None:
+        """Give the controller something, which arrives after what it was given before, and after the tick before."""
+        self._arrived_ns = max(self._arrived_ns, self._tick_ns - self._period_ns) + 1
+        if given == "stop":
+            self.controller.stop(self._arrived_ns)
+        elif isinstance(given, ContactState):
+            self.controller.touch(given)
+        elif isinstance(given, TimedSetpoint | ArmRequest) and not given.arrival_ns:
+            self.controller.take(given._replace(arrival_ns=self._arrived_ns))
+        else:
+            self.controller.take(given)
 
     def _move(self, until_ns: int) -> None:
         base, begin_s, dt_s = self.twin.base, self.time_s, (until_ns - self.now_ns) * 1e-9
