@@ -25,17 +25,9 @@ MAX_ODD = 0.6
 MIN_CROSSING_RAD = np.deg2rad(18)
 # Least second derivative at a saddle point [grey levels / px^2].
 MIN_SADDLE = 0.6
-# Quality falls from 1 to this over the accepted range of the odd part; it stays above 0, because 0 is no corner.
-MIN_RING_QUALITY = 0.1
-# Contrast [grey levels] above which candidates are ranked by quality alone.
-FULL_CONTRAST = 40
-# Smallest side [px] of a shrunk image that is searched.
-MIN_LEVEL_SIDE_PX = 100
 MAX_PER_LEVEL = 4000  # Most candidates of a level, so that the largest board fits: 61 x 61 corners.
-# Candidates closer than SAME_PX, or than this part of their ring's radius, are the same corner, because neighbours are
-# 3 px apart at least (MIN_SPACING_PX), and farther than the radius of their rings.
-SAME_PX = 2.0
-SAME_RING_PART = 0.35
+# Candidates closer than this part of their ring's radius are the same corner: neighbours are farther than the radius.
+SAME_RING_PART = 0.5
 # cv2.remap expects images, not lists, so that samples are folded into rows of this length.
 REMAP_COLUMNS = 1024
 
@@ -81,8 +73,7 @@ class CornerCandidates:
 
 def find_corners(image: NDArray[np.uint8]) -> CornerCandidates:
     """Find all candidates in an image (H, W) at all scales; of several at one place the best is kept."""
-    levels = [level for level in LEVELS if min(image.shape) * level.scale >= MIN_LEVEL_SIDE_PX or level.scale == 1.0]
-    return _merge_levels([_at_level(image, level) for level in levels])
+    return _merge_levels([_at_level(image, level) for level in LEVELS])
 
 
 def describe_corners(image: Grey, pixels: Array, ring_px: float | Array) -> CornerCandidates:
@@ -157,7 +148,7 @@ def _classify_rings(ring: Array, pixels: Array, radius: Array) -> CornerCandidat
     angles, light, crossings = _edges(wave)
     between = np.minimum(angles[:, 1] - angles[:, 0], np.pi - (angles[:, 1] - angles[:, 0]))
     good = (crossings == 2) & (contrast >= MIN_CONTRAST) & (ratio < MAX_ODD) & (between > MIN_CROSSING_RAD)
-    quality = np.where(good, 1 - ratio / MAX_ODD * (1 - MIN_RING_QUALITY), 0.0)
+    quality = np.where(good, 1 - ratio, 0.0)
     return CornerCandidates(pixels, angles, light, contrast, quality, radius)
 
 
@@ -185,9 +176,8 @@ def _merge_levels(levels: list[CornerCandidates]) -> CornerCandidates:
             for name in ("pixels", "angles", "light", "contrast", "quality", "ring_px")
         )
     )
-    worth = both.quality * np.minimum(1, both.contrast / FULL_CONTRAST)
-    both = both.select(np.argsort(-worth, kind="stable"))
-    return both.select(_suppress_duplicates(both.pixels, np.maximum(SAME_PX, SAME_RING_PART * both.ring_px)))
+    both = both.select(np.argsort(-both.quality * both.contrast, kind="stable"))
+    return both.select(_suppress_duplicates(both.pixels, SAME_RING_PART * both.ring_px))
 
 
 def _suppress_duplicates(pixels: Array, reach: Array) -> NDArray[np.intp]:

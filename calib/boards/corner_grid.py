@@ -19,11 +19,6 @@ Cell = tuple[int, int]
 Grid = dict[Cell, Array]
 # To the neighbours along columns and rows: exact.
 STEPS: tuple[Cell, ...] = ((1, 0), (0, 1), (-1, 0), (0, -1))
-# Bounds of the growth, because no board has more corners, and every round adds a row at least.
-MAX_CELLS = 61 * 61
-MAX_ROUNDS = 64
-# Least corners of a grid, because a square has them.
-MIN_GRID_CORNERS = 4
 # Radius, in parts of the corner spacing, in which a predicted corner is searched, and radius of its ring: less than a
 # half, otherwise they would reach the next corner's. A smaller ring than MIN_RING_PX has too few pixels, twelve.
 SEARCH_PART, MIN_SEARCH_PX = 0.3, 1.5
@@ -31,8 +26,6 @@ RING_PART = 0.28
 MIN_RING_PX = 2.0
 # Smaller squares are not resolved.
 MIN_SPACING_PX = 3
-# A corner has a quality of MIN_RING_QUALITY to 1; one near the lower end is left out, because its ring is too odd.
-MIN_QUALITY = 0.15
 # Least contrast of a predicted corner, in parts of the grid's median contrast.
 MIN_CONTRAST_PART = 0.25
 # Corners of which that median is taken, because measuring all of them takes long on a wall full of corners.
@@ -44,7 +37,7 @@ SUBPIXEL_ITERATIONS, SUBPIXEL_CONVERGED_PX = 40, 1e-3
 
 
 def find_grids(image: Grey, corners: CornerCandidates) -> list[Grid]:
-    """Link an image's candidates to grids (MIN_GRID_CORNERS at least), the largest first."""
+    """Link an image's candidates to grids of a square at least, the largest first."""
     neighbour, back = link_neighbours(image, corners)
     squares = _in_square(neighbour, back)
     neighbour = np.where(squares, neighbour, NO_NEIGHBOUR)
@@ -55,7 +48,7 @@ def find_grids(image: Grey, corners: CornerCandidates) -> list[Grid]:
             cells = _flood_fill(int(seed), neighbour, back)
             taken[list(cells.values())] = True
             grids.append({cell: corners.pixels[index] for cell, index in cells.items()})
-    return sorted((grid for grid in grids if len(grid) >= MIN_GRID_CORNERS), key=len, reverse=True)
+    return sorted((grid for grid in grids if len(grid) >= 4), key=len, reverse=True)
 
 
 def _in_square(neighbour: NDArray[np.int64], back: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -80,7 +73,7 @@ def _flood_fill(seed: int, neighbour: NDArray[np.int64], back: NDArray[np.int64]
     # Corner -> its cell, and the number of its arm along the columns.
     placed: dict[int, tuple[Cell, int]] = {seed: ((0, 0), 0)}
     cells, queue = {(0, 0): seed}, deque([seed])
-    while queue and len(cells) < MAX_CELLS:
+    while queue:
         node = queue.popleft()
         (column, row), along = placed[node]
         for direction, (di, dj) in enumerate(STEPS):
@@ -100,9 +93,7 @@ def grow_grid(image: Grey, grid: Grid, most: int) -> Grid:
     """
     grid, refused = dict(grid), set[Cell]()
     contrast = _usual_contrast(image, grid)
-    for _ in range(MAX_ROUNDS):
-        if len(grid) > most:
-            break
+    while len(grid) <= most:
         guesses = {cell: guess for cell in _border(grid) - refused if (guess := predict(grid, cell)) is not None}
         if not guesses:
             break
@@ -180,7 +171,7 @@ def _accept_predicted(image: Grey, grid: Grid, guesses: Grid, contrast: float) -
     refined = refine_subpixel(image, start, sizes)
     seen = describe_corners(image, refined, np.maximum(MIN_RING_PX, RING_PART * sizes))
     near = np.linalg.norm(refined - start, axis=1) < np.maximum(MIN_SEARCH_PX, SEARCH_PART * sizes)
-    good = near & (sizes > MIN_SPACING_PX) & (seen.quality > MIN_QUALITY)
+    good = near & (sizes > MIN_SPACING_PX) & (seen.quality > 0)
     good &= seen.contrast > MIN_CONTRAST_PART * contrast
     return {cell: pixel for cell, pixel, fine in zip(guesses, refined, good, strict=True) if fine}
 

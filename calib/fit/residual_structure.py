@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.boards.board_shape import quadratic_terms
+from calib.boards.local_mapping import quadratic_terms
 from calib.models.camera import Array
 
 # Bins of the image: rings with equal numbers of corners, and sectors of azimuth.

@@ -11,7 +11,7 @@ import numpy as np
 
 from calib.boards.aprilgrid import AprilGrid, find_april_grid
 from calib.boards.board import Board, BoardView
-from calib.boards.board_finder import BoardSearch, find_board
+from calib.boards.checkerboard import BoardSearch, find_board
 from omnid.calibration.images import Image, Images
 from omnid.errors import OmnidError
 

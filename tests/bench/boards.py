@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.boards.board import Board
-from calib.boards.board_finder import find_board
+from calib.boards.checkerboard import find_board
 from calib.models.camera import Array, Mask, OmniCamera
 from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.boards.board import BoardView, CalibrationBoard
-from calib.boards.corner_refinement import refine_with_camera
+from calib.boards.local_mapping import refine_with_camera
 from calib.boards.print_shape import AS_DRAWN, MODE_NAMES, PrintShape
 from calib.errors import CalibError
 from calib.fit.boards.bundle import TWIST_NAMES, BoardFit, BoardRig, fit_boards

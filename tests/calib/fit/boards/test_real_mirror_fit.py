@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from calib.boards.board import Board, BoardView
-from calib.boards.board_finder import find_board
+from calib.boards.checkerboard import find_board
 from calib.fit.boards.rig_fit import PairView, calibrate_boards
 from calib.models.camera import Array
 

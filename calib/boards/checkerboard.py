@@ -1,0 +1,148 @@
+"""Detection of a checkerboard in a mirror image, by linked corner candidates.
+
+Corners are linked in the original image, the image with raised local contrast, the enlarged image, and a log-polar
+strip about the image's middle. A grid of them is accepted by one score: how well the squares alternate within the board
+and in the ring of squares around its corners, minus how well they go on beyond that ring, as brickwork and floors do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import islice
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.boards.board import Board, BoardView
+from calib.boards.board_order import MIN_FILLED, array_to_grid, largest_rectangle, orient_corners, select_board_window
+from calib.boards.corner_candidates import BLUR_PX, Grey, describe_corners, find_corners, sample, smoothed
+from calib.boards.corner_grid import MIN_RING_PX, RING_PART, Grid, find_grids, grow_grid, spacing, with_clockwise_axes
+from calib.boards.derived_images import DerivedImage, Image, derived_images
+from calib.boards.local_mapping import local_mapping, quadratic_terms, refined_corners, without_outliers
+from calib.models.camera import Array
+
+# Shorter side of the smallest image that is searched.
+MIN_SIDE_PX = 32
+# Number of grids per image that are grown and checked, those closest to the board's corner count.
+TRIED_GRIDS = 5
+# Least score of a board: right ones in hard renderings have 0.5 to 0.75, others 0.3 at most.
+MIN_SCORE = 0.4
+# Sampling positions within a square, away from its edges.
+MIDDLE = np.linspace(0.3, 0.7, 5)
+
+
+@dataclass(frozen=True, slots=True)
+class BoardSearch:
+    """The result for one image: the board's view, or the size (columns, rows) of another grid, (0, 0) for none."""
+
+    view: BoardView | None
+    grid_size: tuple[int, int] = (0, 0)
+
+
+def find_board(image: Image, board: Board, name: str = "", *, thorough: bool = True) -> BoardSearch:
+    """Find the board in an image (H, W) uint8, its corners refined to a fraction of a pixel.
+
+    thorough=False searches the original image only, about 0.1 s per megapixel: for logs with many frames.
+    """
+    if min(image.shape) < MIN_SIDE_PX:
+        return BoardSearch(None)
+    largest, blurred, has_floor = (0, 0), smoothed(image, BLUR_PX), False
+    for searched in derived_images(image) if thorough else islice(derived_images(image), 1):
+        # 1. Grow the grids by corners of the image itself. A floor is torn where its squares do not fit together, so a
+        #    part of it may look like a board with a few corners too many.
+        grids = [grow_grid(blurred, candidate, _most_corners(board)) for candidate in _grids(searched, board)]
+        has_floor |= any(len(grid) > (board.columns + 2) * (board.rows + 2) for grid in grids)
+        for grid in grids:
+            largest = max(largest, largest_rectangle(grid), key=lambda sides: sides[0] * sides[1])
+            is_floor = has_floor and len(grid) > board.columns * board.rows
+            placed = None if is_floor else select_board_window(grid, board)
+            if placed is None:
+                continue
+            # 2. Refine its corners, and leave out those that are none or off the others.
+            corners = _refined(image, blurred, orient_corners(blurred, placed, board), board)
+            share = float(np.isfinite(corners[:, 0]).mean())
+            # 3. Accept it by its score.
+            if share >= MIN_FILLED and board_score(blurred, corners, board) >= MIN_SCORE:
+                return BoardSearch(BoardView(name, corners, share))
+    # Bricks and letters form a few squares by chance: smaller grids are no boards of another size.
+    is_hint = min(largest) >= 3 and largest[0] * largest[1] >= 12
+    return BoardSearch(None, largest if is_hint else (0, 0))
+
+
+def _refined(image: Image, blurred: Grey, placed: Array, board: Board) -> Array:
+    """Return the corners (N, 2) of a window (rows, columns, 2), refined, with NaN for those that are not accepted."""
+    points = board.points[:, :2] / board.square_m
+    pixels = refined_corners(image, points, placed.reshape(-1, 2))
+    pixels[~_corner_mask(blurred, pixels.reshape(placed.shape)).ravel()] = np.nan
+    return without_outliers(points, pixels)
+
+
+def board_score(image: Grey, corners: Array, board: Board) -> float:
+    """Return how much corners (N, 2) look like all of a board: 1 at most, about 0 for a part of a larger pattern.
+
+    Steps of grey between neighbouring squares count from -1 to 1 in parts of the median step within the board. The
+    score is their mean within the board and in the ring of squares around its corners, as far as the image shows it,
+    minus the largest mean of a side beyond.
+    """
+    level = _square_means(image, corners, board)
+    sign = np.where(np.indices(level.shape).sum(axis=0) % 2 == 0, 1.0, -1.0)
+    down, along = np.diff(level, axis=0) * sign[1:], np.diff(level, axis=1) * sign[:, 1:]
+    usual = float(np.nanmedian(np.concatenate([down[2:-2, 2:-2].ravel(), along[2:-2, 2:-2].ravel()])))
+    down, along = (np.clip(steps / usual, -1, 1) for steps in (down, along))
+    sides = (
+        (along[0, 1:-1], down[0, 1:-1]),
+        (along[-1, 1:-1], down[-1, 1:-1]),
+        (down[1:-1, 0], along[1:-1, 0]),
+        (down[1:-1, -1], along[1:-1, -1]),
+    )
+    beyond = max(float(np.nan_to_num(np.concatenate(side)).mean()) for side in sides)
+    return float(np.nanmean(np.concatenate([down[1:-1, 1:-1].ravel(), along[1:-1, 1:-1].ravel()]))) - beyond
+
+
+def _square_means(image: Grey, corners: Array, board: Board) -> Array:
+    """Return the mean grey (rows + 3, columns + 3) of the squares between corners and in two rings around them.
+
+    NaN where no mapping is known, and outside of the image.
+    """
+    points, known = board.points[:, :2] / board.square_m, np.isfinite(corners[:, 0])
+    level = np.full((board.rows + 3, board.columns + 3), np.nan)
+    x, y = np.meshgrid(MIDDLE, MIDDLE)
+    for row, column in np.ndindex(level.shape):
+        place = np.clip([column - 2, row - 2], 0, [board.columns - 1, board.rows - 1]).astype(float)
+        mapping = local_mapping(place, points[known], corners[known], exact=True)
+        if mapping is not None:
+            terms = quadratic_terms(x + column - 2 - place[0], y + row - 2 - place[1])
+            pixels = terms @ mapping.coefficients
+            inside = ((pixels >= 0) & (pixels <= np.array(image.shape[::-1]) - 1)).all()
+            level[row, column] = sample(image, pixels).mean() if inside else np.nan
+    return level
+
+
+def _grids(searched: DerivedImage, board: Board) -> Iterator[Grid]:
+    """Yield grids of linked corners in pixels of the source image: those nearest to the board's size, and the largest.
+
+    The largest may contain the board, or show another count.
+    """
+    blurred = smoothed(searched.image, BLUR_PX)
+    grids, size = find_grids(blurred, find_corners(searched.image)), board.columns * board.rows
+    near = sorted(grids, key=lambda grid: abs(np.log(len(grid) / size)))[:TRIED_GRIDS]
+    for grid in [*near, *(grid for grid in grids[:1] if not any(grid is one for one in near))]:
+        grown = grow_grid(blurred, grid, _most_corners(board))
+        pixels = searched.to_source(np.array(list(grown.values())))
+        yield with_clockwise_axes(dict(zip(grown, pixels, strict=True)))
+
+
+def _most_corners(board: Board) -> int:
+    """Return the number of corners beyond which a grid is no board, and does not grow: a floor has thousands."""
+    return 3 * (board.columns + 2) * (board.rows + 2)
+
+
+def _corner_mask(blurred: Grey, corners: Array) -> NDArray[np.bool_]:
+    """Return the mask (rows, columns) of pixels whose ring of grey levels is that of a corner."""
+    grid = array_to_grid(corners)
+    rings = np.array([max(MIN_RING_PX, RING_PART * spacing(grid, cell)) for cell in grid])
+    likely = np.zeros(corners.shape[:2], bool)
+    column, row = np.array(list(grid)).T
+    likely[row, column] = describe_corners(blurred, np.array(list(grid.values())), rings).quality > 0
+    return likely
