@@ -179,6 +179,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     if _completes():
         words = os.environ["COMP_LINE"].split()[1:]
+    if not words and not _completes():
+        parser_of(words).print_help()
+        return 0
     _refuse_removed(words)
     return _guarded(parser_of(words).parse_args(words))
 

@@ -33,7 +33,7 @@ def connected(bus: BusConfig) -> Robot:
 def granted(robot: Robot, answer: Answer) -> str:
     """Return what the answer says. Raise OmnidError with the refusal."""
     if not answer.done:
-        raise OmnidError(f"{robot.name} refuses: {answer.text}")
+        raise OmnidError(f"the robot {robot.name} refuses: {answer.text}")
     return answer.text
 
 

@@ -197,7 +197,7 @@ class NavigationStage:
             _raise_if(command.void)
         match request:
             case NavigationVerb.CANCEL:
-                navigator.cancel("cancelled by a request")
+                navigator.cancel("by a request")
             case NavigationVerb.PAUSE:
                 navigator.pause(f"paused by a request: {RESUME}")
             case NavigationVerb.RESUME:

@@ -15,6 +15,11 @@ from omnid.cli import COMMANDS, REMOVED, command_at, main, parser_of
 EXAMPLES = {words: command_at(entry).examples for words, entry in COMMANDS.items()}
 
 
+def test_no_words_are_a_question_for_help(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 0
+    assert "install-service" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("words", COMMANDS)
 def test_help_has_a_description_and_examples_to_copy(
     words: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -57,6 +62,7 @@ def test_the_shell_completes_commands_and_options(tmp_path: Path) -> None:
         subprocess.run([sys.executable, "-m", "omnid"], env=environment, check=True)
         return {word.strip() for word in found.read_text().splitlines()}
 
+    assert completions("omnid ") >= {"run", "stop"}
     assert completions("omnid re") >= {"replay", "report", "record"}
     assert {"--rig", "--tum", "--plan"} <= completions("omnid replay --")
     assert completions("omnid calibrate dr") == {"drive"}

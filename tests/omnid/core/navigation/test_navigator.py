@@ -52,7 +52,7 @@ def assert_stands(base: DrivenBase) -> None:
 @pytest.mark.hazard("H24")
 def test_cancel_stops_at_once_and_then_gives_the_wheels_free() -> None:
     base = driving()
-    base.navigator.cancel("cancelled by a request")
+    base.navigator.cancel("by a request")
     answers = [base.samples[-1].navigation]
     while len(answers) <= STOPS + 1:
         answer = base.tick()
@@ -179,7 +179,7 @@ def test_a_fault_that_ends_by_itself_does_not_pause_the_drive() -> None:
 
 def test_a_new_goal_ends_the_stops_of_the_one_before() -> None:
     base = driving()
-    base.navigator.cancel("cancelled by a request")
+    base.navigator.cancel("by a request")
     assert base.navigator.stopping
     path = DrivePath((straight_leg(base.pose, (5.0, 0.0)),), 0.0)
     base.navigator.start("goal", NavigationFrame.ODOM, [path], base.seen())
