@@ -158,13 +158,14 @@ def simulate(args: argparse.Namespace) -> int:
     world = load_world(args.world, args.seed, options)
     robot = make_robot(args.size, read_rig(args.rig) if args.rig else None)
     config = replace(config, motor=replace(config.motor, port=SIMULATED))
-    paced = PacedRobot(world, robot, config, args.seed, partial(log, logging.WARNING))
+    warn = partial(log, logging.WARNING)
+    paced = PacedRobot(world, robot, config, args.seed, warn, keeps_truth=args.truth is not None)
     run = LiveRun(config, paced, log, paced.rig, HANDLER.show if sys.stderr.isatty() else None)
     code = run.run()
     # 3. Write the truth, and report contacts.
     if args.truth:
-        _write_truth(args.truth, paced.drive.truth, run.clock.unix_ns)
-    log(logging.INFO, f"contacts with obstacles: {paced.drive.contacts}")
+        _write_truth(args.truth, paced.truth, run.clock.unix_ns)
+    log(logging.INFO, f"contacts with obstacles: {paced.contacts}")
     return code
 
 

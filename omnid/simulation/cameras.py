@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from calib.rig import Rig
 from drivers.frame import CAMERAS, Camera, Frame
 from omnid.simulation.people import Walkers
-from omnid.simulation.rendering.mirrors import PANES, Mirror, brightened
+from omnid.simulation.rendering.mirrors import PANES, Mirror, seen_part
 from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.sensor import Floats, MountedSensor, Sensor
 from omnid.simulation.rendering.surfaces import Scene
@@ -39,7 +39,8 @@ class SimulatedCameras:
         ideal = self.ideal(camera, scene, T_world_rig)
         for patch in self._world.sun:
             lit = patch.rectangle(people.time_s, PANES)
-            ideal = brightened(ideal, lit, patch.gain, scene, self._mounted[camera], T_world_rig, self._samples)
+            shown = seen_part(lit, scene.rectangles, self._mounted[camera], T_world_rig, self._samples)
+            ideal = np.asarray(ideal * (1 + np.float32(patch.gain) * shown), np.float32)
         rng = np.random.default_rng([self._seed, 43, CAMERAS.index(camera), seq])
         width, height = self._mounted[camera].camera.size
         sensor = self._sensors[camera]

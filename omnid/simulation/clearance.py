@@ -1,20 +1,18 @@
-"""Distance of a robot's outline, a disc, from the objects in its world; the record of its true poses and contacts."""
+"""Distance of a robot's outline, a disc, from the objects in its world."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.motors.simulated.simulated_base import Pose
 from omnid.simulation.rendering.surfaces import Rectangle
 from omnid.simulation.world import Ground, World
 
 Array = NDArray[np.float64]
 FLOOR_M = 0.02  # what is lower than this is driven over
-MOST_POSES: Final = 200_000  # Most poses that are kept, of five hours; the oldest ones are dropped.
 
 
 LEVEL: Final = Ground()
@@ -67,28 +65,3 @@ def ranges_m(segments: Array, place: tuple[float, float], azimuths_rad: Array) -
         share = (start[:, 0] * ray[:, None, 1] - start[:, 1] * ray[:, None, 0]) / across
     met = (distance_m > 0) & (share >= 0) & (share <= 1)
     return np.asarray(np.where(met, distance_m, np.inf).min(axis=1))
-
-
-class DriveRecord:
-    """The true poses of a drive, in bounded memory, and its contacts with obstacles."""
-
-    def __init__(self, report: Callable[[str], None] | None) -> None:
-        """report: takes a line at each contact."""
-        self.truth: dict[int, Pose] = {}  # of the base in the world, by their stamps
-        self.contacts = 0
-        self._report, self._touches = report, False
-
-    def add_pose(self, stamp_ns: int, pose: Pose) -> None:
-        """Keep a pose."""
-        if len(self.truth) >= MOST_POSES:
-            del self.truth[next(iter(self.truth))]
-        self.truth[stamp_ns] = pose
-
-    def add_clearance(self, distance_m: float, pose: Pose) -> None:
-        """Count and report a contact when it begins; distance_m: from the nearest obstacle, see clearance_m."""
-        touches = distance_m <= 0
-        if touches and not self._touches:
-            self.contacts += 1
-            if self._report is not None:
-                self._report(f"contact with an obstacle at {pose[0]:.2f}, {pose[1]:.2f} m in the world")
-        self._touches = touches

@@ -21,6 +21,7 @@ from drivers.cameras.camera_state import CameraState
 from drivers.frame import CAMERAS, Camera, Frame
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from drivers.motor import VelocityCommand
+from drivers.motors.simulated.simulated_base import Pose
 from omnid.config import Config
 from omnid.controller.link import DriveLink
 from omnid.controller.statistics import ControllerStatistics, TickReport
@@ -32,7 +33,6 @@ from omnid.engine.graph import Graph, Stream
 from omnid.engine.telemetry import StageStats
 from omnid.runs.session import Session
 from omnid.simulation.cameras import SimulatedCameras
-from omnid.simulation.clearance import DriveRecord
 from omnid.simulation.robot import SimulatedRobot, with_masks
 from omnid.simulation.vehicle import Tick, Vehicle
 from omnid.simulation.world import World
@@ -135,9 +135,17 @@ class PacedRobot:
     brings_samples: Final = True
 
     def __init__(
-        self, world: World, robot: SimulatedRobot, config: Config, seed: int, report: Callable[[str], None]
+        self,
+        world: World,
+        robot: SimulatedRobot,
+        config: Config,
+        seed: int,
+        report: Callable[[str], None],
+        *,
+        keeps_truth: bool = False,
     ) -> None:
-        """report: takes a line at each contact with an obstacle."""
+        """report: takes a line at each contact with an obstacle. keeps_truth: the true poses, 250 bytes a pair."""
+        self._report, self._keeps_truth = report, keeps_truth
         self.rig = with_masks(robot.rig)
         self._world, self._robot, self._config, self._seed = world, robot, config, seed
         self._rendered = SimulatedCameras(self.rig, robot.sensor, world, seed, samples=1)
@@ -148,7 +156,8 @@ class PacedRobot:
         self._states = {camera: CameraState(mode="simulated") for camera in CAMERAS}
         self._pace = RealTimeFactor(1.0 / robot.rate_hz)
         self._closed = self._ends = False
-        self.drive = DriveRecord(report)  # with the stamps of the pairs
+        self.truth: dict[int, Pose] = {}  # true poses of the base in the world by the stamps of the pairs, where kept
+        self.contacts, self._touches = 0, False
 
     def clock_ns(self) -> int:
         """Return the simulated time; it begins with that of the computer, and never runs ahead of it."""
@@ -196,7 +205,7 @@ class PacedRobot:
         values = {
             Key.REAL_TIME_FACTOR: f"{self._pace.value:.2f}",
             "time_s": (self.clock_ns() - self._start_ns) * 1e-9,
-            "contacts": self.drive.contacts,
+            "contacts": self.contacts,
         }
         return DiagnosticStatus.of(SIMULATION, OK, "its time waits for the daemon", values)
 
@@ -211,7 +220,8 @@ class PacedRobot:
                 vehicle.advance(stamp_ns, ticks_then=False)
                 # 2. The images, while the daemon works on those before.
                 pair = [self._frame(vehicle, camera, seq, stamp_ns) for camera in CAMERAS]
-                self.drive.add_pose(stamp_ns, vehicle.twin.base.pose)
+                if self._keeps_truth:
+                    self.truth[stamp_ns] = vehicle.twin.base.pose
                 # 3. The daemon's answers, which take effect with the tick of now.
                 settle()
                 vehicle.advance(stamp_ns)
@@ -242,7 +252,11 @@ class PacedRobot:
         return self._rendered.frame(camera, seq, stamp_ns, vehicle.T_world_rig, vehicle.people)
 
     def _take_tick(self, tick: Tick, report: TickReport) -> None:
-        """Pass a tick on, and report a contact."""
+        """Pass a tick on; count and report a contact when it begins."""
         assert self._link is not None
         self._link.take(report)
-        self.drive.add_clearance(tick.clearance_m, tick.pose)
+        touches = tick.clearance_m <= 0
+        if touches and not self._touches:
+            self.contacts += 1
+            self._report(f"contact with an obstacle at {tick.pose[0]:.2f}, {tick.pose[1]:.2f} m in the world")
+        self._touches = touches

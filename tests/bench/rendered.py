@@ -39,7 +39,7 @@ from omnid.formats.tum import Trajectory, read_tum
 from omnid.recordings.evaluation import evaluate
 from omnid.simulation.people import Person, Walkers
 from omnid.simulation.rendering.ray_caster import render_grey
-from omnid.simulation.rendering.sensor import DIM, Floats, Sensor
+from omnid.simulation.rendering.sensor import Floats, Sensor
 from omnid.simulation.rendering.shapes import box
 from omnid.simulation.rendering.surfaces import Scene
 from omnid.tracking_state import TrackingState
@@ -51,7 +51,7 @@ from tests.simulation.disturbances import DISTURBANCES, Disturbance
 from tests.simulation.logs import pack_log
 from tests.simulation.photographs import with_photographs
 from tests.simulation.readout import PERIOD_NS, Readout
-from tests.simulation.recipes import mild_rig
+from tests.simulation.recipes import DIM, mild_rig
 from tests.simulation.rigs import lens, lens_rig
 
 SIZE: Final = 384

@@ -12,10 +12,11 @@ from calib.rig import ShutterTimes
 from calib.rig_file import read_rig
 from omnid.formats.tum import Trajectory, read_tum
 from omnid.recordings.evaluation import Metrics, evaluate
-from omnid.simulation.rendering.sensor import DIM, Sensor
+from omnid.simulation.rendering.sensor import Sensor
 from omnid.tracking_state import TrackingState
 from tests.simulation import build, write_log
 from tests.simulation.readout import Readout
+from tests.simulation.recipes import DIM
 
 SEED, SIZE, PAIRS = 3, 512, 24
 LINE_TIME_US = 40.0  # 20 ms for 512 rows

@@ -19,6 +19,8 @@ from tests.simulation.builders import KEPT, corridor, room
 from tests.simulation.closed_worlds import bricks, ring, symmetric_room, twin_corridor, two_laps_path
 
 TURN_DEG = 94.0
+# Mean grey of about 30 of 255; the brightness of each image differs by 20 %.
+DIM = Sensor(noise_sigma=5.0, vignette=0.4, flicker=0.2, brightness=0.3)
 
 
 @dataclass(frozen=True, slots=True)

@@ -73,7 +73,7 @@ class Mirror:
         """Return the ideal image (H, W) of a scene with what a surface mirrors; the scene may hold it, or not."""
         # 1. The part of each pixel that shows the surface, times what it reflects at the pixel's angle.
         others = [face for face in scene.rectangles if face is not surface]
-        shown = seen_part(surface, others, self._mounted, T_world_rig, 1)
+        shown = seen_part(replace(surface, texture=WHITE), others, self._mounted, T_world_rig, 1)
         if not shown.any():
             return image
         normal = (T_world_rig[:3, :3].T @ surface.normal).astype(np.float32)
@@ -90,22 +90,7 @@ class Mirror:
 def seen_part(
     surface: Rectangle, others: Sequence[Rectangle], mounted: MountedCamera, T_world_rig: Array, samples: int
 ) -> Floats:
-    """Return the part (H, W) of each pixel, 0 to 1, that shows a surface among others."""
-    flags = Scene((replace(surface, texture=WHITE), *(replace(face, texture=BLACK) for face in others)))
+    """Return the part (H, W) of each pixel, 0 to 1, that shows the white of a surface among others."""
+    flags = Scene((surface, *(replace(face, texture=BLACK) for face in others)))
     shown = render_grey(flags, mounted, T_world_rig, samples) / np.float32(255 * surface.brightness)
     return np.asarray(np.minimum(shown, 1), np.float32)
-
-
-def brightened(
-    image: Floats,
-    lit: Rectangle,
-    gain: float,
-    scene: Scene,
-    mounted: MountedCamera,
-    T_world_rig: Array,
-    samples: int,
-) -> Floats:
-    """Return the ideal image (H, W) of a scene whose floor is brighter by a gain in a rectangle just above it."""
-    flags = Scene((lit, *(replace(face, texture=BLACK) for face in scene.rectangles)))
-    shown = render_grey(flags, mounted, T_world_rig, samples) / np.float32(255 * lit.brightness)
-    return np.asarray(image * (1 + np.float32(gain) * shown), np.float32)

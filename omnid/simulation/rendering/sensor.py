@@ -55,10 +55,6 @@ def vignetting(sensor: Sensor, mask: Mask, size: tuple[int, int]) -> Floats:
     return np.asarray(1 - sensor.vignette * np.minimum((x**2 + y**2) / rim_px**2, 1), np.float32)
 
 
-# Mean grey of about 30 of 255; the brightness of each image differs by 20 %.
-DIM = Sensor(noise_sigma=5.0, vignette=0.4, flicker=0.2, brightness=0.3)
-
-
 @dataclass(frozen=True, slots=True)
 class MountedSensor:
     """One camera's sensor with its fixed patterns, computed once."""
