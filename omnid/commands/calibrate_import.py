@@ -12,13 +12,14 @@ import numpy as np
 from calib import se3
 from calib.camera_files import import_pair, is_one_camera
 from calib.equirectangular_file import import_helvipad, stacked_rig
+from calib.errors import CalibError
 from calib.kalibr import import_chain
 from calib.models.camera import field_of_view
 from calib.models.names import model_name
 from calib.models.ocam import VIEWS, OcamCamera
 from calib.ocam_file import read_transform, straight_up
 from calib.rig import MountedCamera, Rig
-from calib.rig_file import write_rig
+from calib.rig_file import read_rig, write_rig
 from calib.text_files import MAX_JSON_BYTES, load_mapping
 from calib.typed_toml import shown
 from calib.validation import read_bytes
@@ -69,6 +70,7 @@ from omnid.sinks.files import check_outputs
     ),
     HEIGHT,
     option("-o", "--output", type=Path, required=True, help="the rig.toml to write"),
+    option("--replace", action="store_true", help="write it in the place of a rig that states more than the new one"),
     examples=(
         "calibrate import camchain.yaml -o rig.toml",
         "calibrate import --equirectangular 3840x1920 --baseline 0.2 -o rig.toml",
@@ -85,9 +87,26 @@ def run(args: argparse.Namespace) -> int:
                 f"the {side} camera sees nothing of its image of {width}x{height} px, whose centre is at "
                 f"{shown(mounted.camera.center)}: are both in the order of its program?"
             )
+    if args.output.exists() and not args.replace:
+        _must_lose_nothing(args.output, rig)
     write_rig(args.output, rig)
     print(f"{args.output}: {describe(rig)}")
     return 0
+
+
+def _must_lose_nothing(path: Path, rig: Rig) -> None:
+    """Raise OmnidError where the file states something that was measured, and the new rig does not."""
+    try:
+        known = read_rig(path)
+    except CalibError as error:
+        raise OmnidError(f"--output {path} is no rig ({error}): --replace writes the rig in its place") from error
+    found = {"covariance": (known.covariance, rig.covariance), "height": (known.height_m(), rig.height_m())}
+    lost = [name for name, (before, after) in found.items() if before is not None and after is None]
+    if lost:
+        raise OmnidError(
+            f"--output {path}: it states the {' and the '.join(lost)} of a calibrated rig, which the new one does not: "
+            "choose another name, or --replace"
+        )
 
 
 def _must_be_writable(path: Path) -> None:

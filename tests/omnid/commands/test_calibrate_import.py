@@ -82,3 +82,17 @@ def test_invalid_requests_fail_before_files_are_written(
     before = sorted(kalibr.parent.iterdir())
     assert omnid(*words) == 2
     assert message in capsys.readouterr().err and sorted(kalibr.parent.iterdir()) == before
+
+
+def test_a_rig_with_a_height_is_replaced_where_that_is_asked_for(
+    kalibr: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = tmp_path / "rig.toml"
+    assert omnid(kalibr, "-o", rig, "--height-m", 0.8) == 0
+    assert omnid(kalibr, "-o", rig) == 2
+    assert "it states the height of a calibrated rig" in capsys.readouterr().err
+    assert read_rig(rig).height_m() == pytest.approx(0.8)
+    assert omnid(kalibr, "-o", rig, "--replace") == 0
+    assert read_rig(rig).height_m() is None
+    rig.write_text("no rig")
+    assert omnid(kalibr, "-o", rig) == 2 and "is no rig" in capsys.readouterr().err
