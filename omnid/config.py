@@ -132,7 +132,7 @@ class MappingConfig:
         "keyframes only while no client receives and no log records the cloud of a live run",
     ] = 5.0
     voxel_m: Annotated[float, Meta(ge=0.001, le=10), "edge of a voxel, m"] = 0.05
-    log2_voxels: int = 18  # the map holds up to 0.7 * 2^n voxels of 52 bytes
+    max_voxels: int = 180_000  # largest number of voxels, of 52 bytes each
     max_sigma_m: float = 0.15  # largest sigma of a point that enters the map, m
     min_frames: int = 6  # frames that must have observed a voxel that is written; fewer in a short run
     path_poses: int = 10_000  # vertices of the path in the plan view; when full, every second one is dropped

@@ -46,7 +46,7 @@ class Mapping:
         self.is_read = True  # whether the map has a reader: a live run notes it from time to time
         self._config, self._dense = config, dense
         self._every_ns, self._given_ns = round(every_s * 1e9), 0
-        self._map = VoxelMap(config.voxel_m, 1 << config.log2_voxels)
+        self._map = VoxelMap(config.voxel_m, config.max_voxels)
         self._path = ThinnedPath(config.path_poses, FINEST_STEP_M, _is_step)
         self._newest: tuple[int, int] | None = None
         self._min_gap_ns = round(1e9 / config.rate_hz) if config.rate_hz else 0

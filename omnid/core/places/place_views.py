@@ -106,7 +106,7 @@ def grid(places: PlaceMap, rig: PlaceRig, cell_m: float) -> Grid:
 def landmarks(places: PlaceMap, rig: PlaceRig) -> MapPoints:
     """Return the landmarks of all keyframes, fused in voxels."""
     count = sum(len(keyframe.features.views) for keyframe in places.keyframes.values())
-    fused = VoxelMap(VOXEL_M, 1 << max(4, (2 * count).bit_length()))
+    fused = VoxelMap(VOXEL_M, count)
     for id in sorted(places.keyframes):
         points = triangulate(places.keyframes[id].features.views.astype(float), rig.cylinder, rig.baseline_m)
         radius = np.hypot(points[:, 0], points[:, 1])

@@ -30,7 +30,7 @@ def as_bytes(points: MapPoints) -> bytes:
 
 def test_agrees_with_a_dictionary() -> None:
     rng = np.random.default_rng(5)
-    voxels = VoxelMap(voxel_m=0.1, capacity=4096)
+    voxels = VoxelMap(voxel_m=0.1, most=4096)
     sums: dict[tuple[int, ...], Array] = {}
     seen: dict[tuple[int, ...], list[int]] = {}
     for seq in range(20):
@@ -49,19 +49,19 @@ def test_agrees_with_a_dictionary() -> None:
 
 
 def test_confidence_grows_with_frames_and_precision() -> None:
-    voxels = VoxelMap(voxel_m=0.05, capacity=64)
+    voxels = VoxelMap(voxel_m=0.05, most=44)
     history = []
     for seq in range(6):
         voxels.insert(one(0.01, 0.01, 0.01), var(1, 1e-3), seq)
         history.append(float(voxels.points(1).confidence[0]))
     assert history == sorted(set(history)) and 0.0 < history[0] < 0.5 and history[-1] < 1.0
-    sharp = VoxelMap(voxel_m=0.05, capacity=64)
+    sharp = VoxelMap(voxel_m=0.05, most=44)
     sharp.insert(one(0.01, 0.01, 0.01), var(1, 1e-5), 0)
     assert sharp.points(1).confidence[0] > history[0]
 
 
 def test_counts_refused_points_and_leaves_them_out() -> None:
-    voxels = VoxelMap(voxel_m=1.0, capacity=64)
+    voxels = VoxelMap(voxel_m=1.0, most=44)
     points = np.repeat(one(0.5, 0.5, 0.5), 9, axis=0)
     points[0, 1], points[1, 2], points[2, 0], points[3, 0] = np.nan, np.inf, float(1 << 20), -1e300
     variance = var(9)
@@ -71,27 +71,27 @@ def test_counts_refused_points_and_leaves_them_out() -> None:
 
 
 def test_evicts_old_single_voxels_then_the_least_confident() -> None:
-    voxels = VoxelMap(voxel_m=1.0, capacity=64)
+    voxels = VoxelMap(voxel_m=1.0, most=44)
     voxels.insert(row(0, 15), var(15, 1e-8), seq=0)  # precise, but seen once and long ago
     for seq in (100, 101):
         voxels.insert(row(100, 15), var(15, 1e-2), seq)
         voxels.insert(row(200, 10), var(10, 1e2), seq)  # seen as often, but uncertain
-    voxels.insert(row(300, 5), var(5, 1e-2), seq=102)  # seen once, just now: 45 voxels, more than 0.7 * 64
-    assert (voxels.evicted, len(voxels)) == (13, 32)
+    voxels.insert(row(300, 5), var(5, 1e-2), seq=102)  # seen once, just now: 45 voxels
+    assert (voxels.evicted, len(voxels)) == (15, 30)
     survivors = voxels.points(1).xyz[:, 0] // 100
-    assert [int((survivors == group).sum()) for group in range(4)] == [2, 15, 10, 5]
-    voxels.insert(row(400, 13), var(13, 1e-2), seq=103)
+    assert [int((survivors == group).sum()) for group in range(4)] == [0, 15, 10, 5]
+    voxels.insert(row(400, 15), var(15, 1e-2), seq=103)
     survivors = voxels.points(1).xyz[:, 0] // 100
-    assert voxels.evicted == 26 and [int((survivors == group).sum()) for group in range(5)] == [0, 15, 0, 4, 13]
+    assert voxels.evicted == 30 and [int((survivors == group).sum()) for group in range(5)] == [0, 15, 0, 0, 15]
 
 
-@pytest.mark.parametrize("capacity", [16, 64, 1024])
-def test_memory_stays_bounded(capacity: int) -> None:
+@pytest.mark.parametrize("most", [16, 64, 1024])
+def test_memory_stays_bounded(most: int) -> None:
     rng = np.random.default_rng(2)
-    voxels = VoxelMap(voxel_m=0.1, capacity=capacity)
+    voxels = VoxelMap(voxel_m=0.1, most=most)
     for seq in range(5):
         voxels.insert(rng.uniform(-1e4, 1e4, (3000, 3)), var(3000), seq)
-        assert len(voxels) <= 0.7 * capacity
+        assert len(voxels) <= most
     assert len(voxels) + voxels.evicted == 15_000
     assert len(voxels.points(1).xyz) == len(voxels)
 
@@ -99,7 +99,7 @@ def test_memory_stays_bounded(capacity: int) -> None:
 def test_same_input_gives_the_same_bytes() -> None:
     def run() -> VoxelMap:
         rng = np.random.default_rng(9)
-        voxels = VoxelMap(voxel_m=0.1, capacity=512)
+        voxels = VoxelMap(voxel_m=0.1, most=350)
         for seq in range(30):
             voxels.insert(rng.normal(0.0, 1.0, (300, 3)), rng.uniform(1e-4, 1e-2, 300), seq)
         return voxels
