@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
 from dataclasses import replace
 from weakref import WeakKeyDictionary
 
@@ -29,107 +28,6 @@ DISPARITY_STEP_PX = 32  # the semi-global prior searches a multiple of it
 SPARE_ROWS = 16  # rows of a panorama beyond the largest disparity
 
 
-class DenseStereo:
-    """Computes disparities and points of the edges of the lower panorama."""
-
-    def __init__(self, geometry: Geometry, config: StereoConfig) -> None:
-        self._config, self._geometry, self._cylinder = config, geometry, geometry.cylinder
-        self._baseline_m = geometry.rig.baseline_m
-        self._idle: deque[Matcher] = deque()  # matchers with their buffers: one for each thread that matched at once
-
-    def compute(self, panoramas: Panoramas, exposure: Exposure | None = None) -> DensePoints:
-        """Return disparities and their points in the rig frame, at the stamp of the pair.
-
-        exposure: the motion during the exposures; None: unknown, or none is needed. May be called in several threads at
-        the same time.
-        """
-        # 1. Match the pixels of the lower panorama along their columns.
-        correction = None if exposure is None else DenseCorrection.of(exposure, panoramas.visible.shape)
-        columns, rows, found = self._match(panoramas, correction)
-        # 2. Correct rows and disparities to the stamp of the pair.
-        views, by_motion = np.column_stack([columns, rows, rows + found]).astype(float), np.zeros(len(found))
-        if correction is not None:
-            views, by_motion = correction.corrected(columns, rows, found)
-        disparity = np.full(panoramas.visible.shape, np.nan, np.float32)
-        disparity[rows, columns] = views[:, 2] - views[:, 1]
-        # 3. Triangulate, with the variance of each point.
-        points = triangulate(views, self._cylinder, self._baseline_m)
-        kept = np.isfinite(points).all(axis=1)
-        variance_m2 = self._variance_m2(points[kept], by_motion[kept])
-        points, pixels = se3.apply(self._geometry.T_rig_rect, points[kept]), np.column_stack([columns, rows])[kept]
-        return DensePoints(disparity, pixels.astype(float), points, variance_m2)
-
-    def confirmed(self, depth: StereoDepth, dense: DensePoints) -> DensePoints:
-        """Return the dense points of a pair without those that its earlier view contradicts."""
-        if depth.earlier is None:
-            return dense
-        points = se3.apply(se3.inverse(self._geometry.T_rig_rect), dense.points)
-        wrong = contradicted(depth.panoramas.lower, dense.pixels, points, self._cylinder, depth.earlier)
-        disparity = dense.disparity.copy()
-        columns, rows = dense.pixels[wrong].astype(np.intp).T
-        disparity[rows, columns] = np.nan
-        kept = np.flatnonzero(~wrong)
-        pixels, points, variance_m2 = (a.take(kept, axis=0) for a in (dense.pixels, dense.points, dense.variance_m2))
-        return DensePoints(disparity, pixels, points, variance_m2)
-
-    def _match(
-        self, panoramas: Panoramas, correction: DenseCorrection | None
-    ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float32]]:
-        """Return columns (N,), rows (N,) and disparities (N,) [px] as seen of the matched pixels."""
-        lower, pad = panoramas.lower, panoramas.lower.pad_px
-        valid = np.pad(panoramas.usable, ((0, 0), (pad, pad)))
-        try:
-            matcher = self._idle.pop()
-        except IndexError:
-            matcher = Matcher(lower.image.shape[:2], self._matching(lower.image.shape[0]))
-        pixels, disparity = matcher.match(
-            lower.image,
-            panoramas.upper.image,
-            valid,
-            lower.noise_grey,
-            None if correction is None else correction.column_shift(pad),
-        )
-        self._idle.append(matcher)
-        rows, columns = np.divmod(pixels, lower.image.shape[1])
-        return columns - pad, rows, disparity
-
-    def _variance_m2(self, points: Array, by_motion: Array) -> Array:
-        """Return variances (N,) along the rays to points (N, 3) in the rectified frame.
-
-        by_motion: variances (N,) [px^2] of their disparities by the uncertain motion between the exposures.
-
-        The distance from the axis is r = f t / d, so sigma_r = r^2 / (f t) * sigma_d; along the ray it is
-        sqrt(1 + z^2 / r^2) times as large.
-        """
-        r2, z2 = (points[:, :2] ** 2).sum(axis=1), points[:, 2] ** 2
-        per_px = r2 / (self._cylinder.focal_px * self._baseline_m)
-        return np.asarray((1 + z2 / r2) * per_px**2 * (self._config.noise_px**2 + by_motion))
-
-    def _matching(self, height: int) -> MatchingSettings:
-        """Return the settings with disparities up to those of the nearest points, for panoramas of height rows."""
-        nearest_px = self._cylinder.focal_px * self._baseline_m / self._config.min_range_m
-        needed = math.ceil(nearest_px / DISPARITY_STEP_PX) * DISPARITY_STEP_PX
-        matching = self._config.matching
-        return _limited(replace(matching, disparities=min(matching.disparities, needed)), height)
-
-
-def _limited(matching: MatchingSettings, height: int) -> MatchingSettings:
-    """Return the settings with no more disparities than panoramas of height rows allow."""
-    limit = (height - SPARE_ROWS) // DISPARITY_STEP_PX * DISPARITY_STEP_PX
-    if limit < DISPARITY_STEP_PX:
-        raise OmnidError(
-            f"the panoramas are {height} px high, stereo needs at least {DISPARITY_STEP_PX + SPARE_ROWS} px: use "
-            "larger images, or a rig whose cameras share more of their view"
-        )
-    return replace(matching, disparities=min(matching.disparities, limit))
-
-
-# Computes the dense depth of panoramas for a motion during their exposures; None: unknown, or none is needed.
-Compute = Callable[[Panoramas, Exposure | None], DensePoints]
-# Returns dense points without those that the earlier view of a depth contradicts.
-Confirm = Callable[[StereoDepth, DensePoints], DensePoints]
-
-
 class DenseDepths:
     """Dense depths, computed when they are first asked for.
 
@@ -138,8 +36,10 @@ class DenseDepths:
     while one computes, others that ask for the same pair wait for the result.
     """
 
-    def __init__(self, compute: Compute, confirm: Confirm = lambda _, dense: dense) -> None:
-        self._compute, self._confirm = compute, confirm
+    def __init__(self, geometry: Geometry, config: StereoConfig) -> None:
+        self._config, self._cylinder, self._baseline_m = config, geometry.cylinder, geometry.rig.baseline_m
+        self._T_rig_rect = geometry.T_rig_rect
+        self._idle: deque[Matcher] = deque()  # matchers with their buffers: one for each thread that matched at once
         self._known: WeakKeyDictionary[Panoramas, _Known] = WeakKeyDictionary()
         self._one = Lock()
 
@@ -148,20 +48,82 @@ class DenseDepths:
         known, dense = self._of(depth.panoramas), self.points(depth.panoramas, depth.exposure)
         with known.one:
             if known.confirmed is None or known.confirmed[0] is not dense or known.confirmed[1] is not depth.earlier:
-                known.confirmed = dense, depth.earlier, self._confirm(depth, dense)
+                known.confirmed = dense, depth.earlier, self._confirmed(depth, dense)
             return known.confirmed[2]
 
     def points(self, panoramas: Panoramas, exposure: Exposure | None = None) -> DensePoints:
-        """Return the depth of panoramas, as matched; of several motions during the exposures the last is remembered."""
+        """Return disparities and their points in the rig frame, as matched, at the stamp of the pair.
+
+        exposure: the motion during the exposures; None: unknown, or none is needed. Of several the last is remembered.
+        """
         known = self._of(panoramas)
         with known.one:
             if known.points is None or known.exposure is not exposure:
-                known.points, known.exposure = self._compute(panoramas, exposure), exposure
+                known.points, known.exposure = self._computed(panoramas, exposure), exposure
             return known.points
 
     def _of(self, panoramas: Panoramas) -> _Known:
         with self._one:
             return self._known.setdefault(panoramas, _Known())
+
+    def _computed(self, panoramas: Panoramas, exposure: Exposure | None) -> DensePoints:
+        """Return the depth of panoramas, corrected for a motion during their exposures."""
+        # 1. Match the pixels of the lower panorama along their columns.
+        lower, pad = panoramas.lower, panoramas.lower.pad_px
+        correction = None if exposure is None else DenseCorrection.of(exposure, panoramas.visible.shape)
+        valid = np.pad(panoramas.usable, ((0, 0), (pad, pad)))
+        shift = None if correction is None else correction.column_shift(pad)
+        try:
+            matcher = self._idle.pop()
+        except IndexError:
+            matcher = Matcher(lower.image.shape[:2], self._matching(lower.image.shape[0]))
+        flat, found = matcher.match(lower.image, panoramas.upper.image, valid, lower.noise_grey, shift)
+        self._idle.append(matcher)
+        rows, columns = np.divmod(flat, lower.image.shape[1])
+        columns -= pad
+        # 2. Correct rows and disparities to the stamp of the pair.
+        views, by_motion = np.column_stack([columns, rows, rows + found]).astype(float), np.zeros(len(found))
+        if correction is not None:
+            views, by_motion = correction.corrected(columns, rows, found)
+        disparity = np.full(panoramas.visible.shape, np.nan, np.float32)
+        disparity[rows, columns] = views[:, 2] - views[:, 1]
+        # 3. Triangulate, with the variance along the ray: the distance from the axis is r = f t / d, so sigma_r is
+        #    r^2 / (f t) sigma_d, and sqrt(1 + z^2 / r^2) times as large along the ray.
+        points = triangulate(views, self._cylinder, self._baseline_m)
+        kept = np.isfinite(points).all(axis=1)
+        points = points[kept]
+        r2, z2 = (points[:, :2] ** 2).sum(axis=1), points[:, 2] ** 2
+        per_px = r2 / (self._cylinder.focal_px * self._baseline_m)
+        variance_m2 = (1 + z2 / r2) * per_px**2 * (self._config.noise_px**2 + by_motion[kept])
+        pixels = np.column_stack([columns, rows])[kept].astype(float)
+        return DensePoints(disparity, pixels, se3.apply(self._T_rig_rect, points), variance_m2)
+
+    def _confirmed(self, depth: StereoDepth, dense: DensePoints) -> DensePoints:
+        """Return the dense points of a pair without those that its earlier view contradicts."""
+        if depth.earlier is None:
+            return dense
+        points = se3.apply(se3.inverse(self._T_rig_rect), dense.points)
+        wrong = contradicted(depth.panoramas.lower, dense.pixels, points, self._cylinder, depth.earlier)
+        disparity = dense.disparity.copy()
+        columns, rows = dense.pixels[wrong].astype(np.intp).T
+        disparity[rows, columns] = np.nan
+        kept = np.flatnonzero(~wrong)
+        pixels, points, variance_m2 = (a.take(kept, axis=0) for a in (dense.pixels, dense.points, dense.variance_m2))
+        return DensePoints(disparity, pixels, points, variance_m2)
+
+    def _matching(self, height: int) -> MatchingSettings:
+        """Return the settings with disparities up to those of the nearest points, for panoramas of height rows."""
+        step_px, matching = DISPARITY_STEP_PX, self._config.matching
+        nearest_px = self._cylinder.focal_px * self._baseline_m / self._config.min_range_m
+        limit = (height - SPARE_ROWS) // step_px * step_px
+        if limit < step_px:
+            raise OmnidError(
+                f"the panoramas are {height} px high, stereo needs at least {step_px + SPARE_ROWS} px: use "
+                "larger images, or a rig whose cameras share more of their view"
+            )
+        return replace(
+            matching, disparities=min(matching.disparities, math.ceil(nearest_px / step_px) * step_px, limit)
+        )
 
 
 class _Known:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from omnid.config import Config
 from omnid.core.rig.rig_health import RigHealth
 from omnid.messages import FramePair, OdometryUpdate, Panoramas, StereoDepth
-from omnid.stages.dense_depths import DenseDepths, DenseStereo
+from omnid.stages.dense_depths import DenseDepths
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry
 from omnid.stages.odometry import OdometryStage
@@ -28,8 +28,7 @@ class FrontEnd:
         self.health = health or RigHealth(geometry.cylinder, config.rig.check)
         self.pairing = Synchronise(geometry.rig, config.pair, config.motion.R_base_imu)
         self.dewarp = Dewarp(geometry, config.panorama)
-        stereo = DenseStereo(geometry, config.stereo_settings())
-        self.dense = DenseDepths(stereo.compute, stereo.confirmed)
+        self.dense = DenseDepths(geometry, config.stereo_settings())
         self.odometry = OdometryStage(geometry, config.odometry, self.dense, self.dewarp.raw_images)
         self.poses = CheckedOdometry(self.odometry, self.health)
 

@@ -347,9 +347,10 @@ class MapLocaliser:
         """Count what the search found and missed at a place that is known; what has aged leaves the map."""
         if self._localize_only or self._state() is not MapState.LOCALIZED:
             return
-        at = (self.places.poses[found.id] @ found.T_place_rect)[:3, 3]
+        at, aged = (self.places.poses[found.id] @ found.T_place_rect)[:3, 3], self.places.aged
         self.places.observe(at, self.search.compared, self._path_m)
-        self._map_changed()
+        if self.places.aged > aged:
+            self._map_changed()
 
     def _close_loop(self, frame: OdometryFrame, found: Recognition, newest: PlaceKeyframe) -> None:
         """Link a recognised place, once several frames agree, and correct the map."""

@@ -23,7 +23,7 @@ from omnid.formats.tum import Trajectory, read_tum
 from omnid.messages import Panoramas
 from omnid.recordings.evaluation import evaluate
 from omnid.simulation.rendering.surfaces import Rectangle
-from omnid.stages.dense_depths import DenseStereo
+from omnid.stages.dense_depths import DenseDepths
 from tests.bench.paper.scenes import MOVED_TURNS_DEG, TURNS_DEG, WALL_M
 from tests.bench.paper.truth import Flags, cast, sees, surface_distance_m
 from tests.bench.paper.views import Experiment, Views, load_views
@@ -57,10 +57,10 @@ def walls(folder: Path, experiment: Experiment) -> dict[str, WallFigures]:
     squares = round(2 * WALL_M * np.tan(np.deg2rad(HALF_ANGLE_DEG)) / CELL_M) * round(wall.height_m / CELL_M)
     found = {}
     for name, method in SAD_METHODS.items():
-        dense = DenseStereo(views.geometry, replace(stereo, matching=replace(stereo.matching, method=method)))
+        dense = DenseDepths(views.geometry, replace(stereo, matching=replace(stereo.matching, method=method)))
         errors, covered, edges = [], [], 0
         for panoramas, T_world_rig in zip(views.panoramas, run.poses, strict=True):
-            depth = dense.compute(panoramas)
+            depth = dense.points(panoramas)
             on_wall, spots = _wall_points(run, views, T_world_rig, depth.pixels)
             errors.append(se3.apply(T_world_rig, depth.points)[on_wall, 0] - WALL_M)
             right = spots[on_wall, 1:][np.abs(errors[-1]) <= WRONG_M] - [T_world_rig[1, 3], 0.0]
