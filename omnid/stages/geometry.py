@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.masks.rim import find_rim
-from calib.models.camera import Mask
 from calib.panorama import Cylinder, fit_cylinder
 from calib.rig import MountedCamera, Rig
 from drivers.frame import Camera, Frame
@@ -48,36 +47,24 @@ def geometry(rig: Rig, config: PanoramaConfig) -> Geometry:
 
 
 def with_rims(rig: Rig, frames: Iterable[Frame]) -> Rig:
-    """Return the rig with masks of the mirrors' rims, found in the first images of cameras without a mask."""
-    missing: list[Camera] = [name for name, camera in _cameras(rig).items() if camera.mask is None]
-    if not missing:
-        return rig
-    found = _find_rims(rig, missing, frames)
-    return replace(rig, lower=_masked(rig.lower, found.get("lower")), upper=_masked(rig.upper, found.get("upper")))
+    """Return the rig with masks of the mirrors' rims, found in the first images of cameras without a mask.
 
-
-def _cameras(rig: Rig) -> dict[Camera, MountedCamera]:
-    return {"lower": rig.lower, "upper": rig.upper}
-
-
-def _find_rims(rig: Rig, missing: list[Camera], frames: Iterable[Frame]) -> dict[Camera, Mask]:
-    """Return the rims in the maximum of the first images: a single one may be dark on one side."""
+    A rim is sought in the maximum of the images: a single one may be dark on one side.
+    """
+    mounted: dict[Camera, MountedCamera] = {"lower": rig.lower, "upper": rig.upper}
+    missing = {name for name, camera in mounted.items() if camera.mask is None}
     decode, stream = Decoder(rig), iter(frames)
     brightest: dict[Camera, NDArray[np.uint8]] = {}
-    found: dict[Camera, Mask] = {}
-    for _ in range(RIM_ATTEMPTS):
+    attempts = 0
+    while missing and attempts < RIM_ATTEMPTS:
+        attempts += 1
         for frame in islice(stream, FRAMES_PER_ATTEMPT):
             image = decode(frame)
             if image is not None:
                 brightest[frame.camera] = np.maximum(brightest.get(frame.camera, image), image)
-        for name in set(missing) & brightest.keys() - found.keys():
-            rim = find_rim(brightest[name], _cameras(rig)[name].camera.center)
+        for name in missing & brightest.keys():
+            rim = find_rim(brightest[name], mounted[name].camera.center)
             if rim is not None:
-                found[name] = rim
-        if len(found) == len(missing):
-            break
-    return found
-
-
-def _masked(camera: MountedCamera, mask: Mask | None) -> MountedCamera:
-    return camera if mask is None else replace(camera, mask=mask)
+                mounted[name] = replace(mounted[name], mask=rim)
+                missing = missing - {name}
+    return replace(rig, lower=mounted["lower"], upper=mounted["upper"]) if brightest else rig

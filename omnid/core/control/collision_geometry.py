@@ -17,7 +17,6 @@ from omnid.core.nanoseconds import S_PER_NS
 
 # Slower turns count as none; at 0.5 m/s an arc of 500 m, which errs by 4 mm in 2 m: enough.
 STRAIGHT_RADPS: Final = 1e-3
-SPARE_M: Final = 0.1  # Added to a reach beyond which nothing can lie, so that rounding does not count.
 TINY: Final = 1e-9  # Added to divisors, so that no division is by zero.
 MOST_MOTIONS: Final = 400  # remembered between a ring's images and now, because 2 s at the highest rate of ticks
 
@@ -135,7 +134,7 @@ def driven_over(outline: Outline, points: list[Point], pose: Pose2, velocity_mps
     side = math.copysign(1.0, velocity_mps)
     edge_m = outline.front_m if side > 0.0 else outline.rear_m
     way_m = math.hypot(pose.x_m, pose.y_m)
-    reach2 = (edge_m + outline.half_width_m + 2 * way_m + SPARE_M) ** 2  # what is farther away was not driven over
+    reach2 = (edge_m + outline.half_width_m + 2 * way_m) ** 2  # what is farther away was not driven over
     ahead = [(x, y) for x, y in points if side * x >= edge_m - TINY and x * x + y * y <= reach2]
     return any(
         edge_m - way_m <= side * x < edge_m and abs(y) <= outline.half_width_m for x, y in seen_from(pose, ahead)

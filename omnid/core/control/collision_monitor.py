@@ -28,7 +28,7 @@ from omnid.core.control.collision_geometry import (
     sector_edges_m,
     within_reach,
 )
-from omnid.core.control.heading_controller import Twist
+from omnid.core.control.heading_controller import BRAKING_SHARE, Twist
 from omnid.core.nanoseconds import S_PER_NS
 
 STOP: Final = "stop"
@@ -130,7 +130,6 @@ ALONG_SLOPE: Final = 0.05
 # A base that was stopped resumes in that direction only faster than this (half as fast as a slower command), because
 # free ranges change by a cell of 5 cm from ring to ring: at time_s of 1.5 s it is the speed for 9 cm.
 RESUME_MPS: Final = 0.06
-BRAKING_SHARE: Final = 0.8  # Share of the deceleration that is relied on, because the rest is for lag.
 BESIDE_M: Final = 0.05  # Room beyond the sides' clearance, because corrections of the heading swing no corner farther.
 # Step of the prediction of moving obstacles, short because a person at 1.5 m/s moves 0.15 m in it.
 MOVING_STEP_S: Final = 0.1

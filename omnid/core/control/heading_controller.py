@@ -10,7 +10,7 @@ from msgspec import Meta
 
 LONGEST_TICK_S: Final = 0.2  # a late tick does not allow a larger step; by trial on development seeds
 HALF_TURN_RAD: Final = 0.2  # closer to half a turn than this, noise would change the side to turn to
-# Share of the yaw acceleration that is planned for braking; the rest is left for the lag of the base.
+# Share of a deceleration that is planned for braking; the rest is left for the lag of the base.
 BRAKING_SHARE: Final = 0.8
 
 

@@ -7,7 +7,7 @@ which is some tenths of a per cent of the scale.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -41,8 +41,8 @@ EDGE_ROWS: Final = 4
 # Largest step of a patch: twice that of patches whose depth is known well, since the rig is not yet.
 REACH_PX: Final = 2
 # As the odometry's tracker. In the upper panorama the disparity predicts the place, so that one level is enough.
-TRACK: Final = KltSettings(window_px=15, levels=3, max_error_px=0.5)
-TRACK_UPPER: Final = KltSettings(window_px=15, levels=1, max_error_px=0.5)
+TRACK: Final = KltSettings()
+TRACK_UPPER: Final = replace(TRACK, levels=1)
 
 
 @dataclass(frozen=True, slots=True)

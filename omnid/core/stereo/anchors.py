@@ -25,8 +25,6 @@ Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
 CELL_PX = 32  # side of a cell, because the courses of most brick walls are lower
-# Rounds of propagation, because an anchor crosses a cell in each, and a panorama of 1300 columns has 41.
-MAX_ROUNDS = 64
 # Samples on the line to the anchor of a neighbouring cell; enough: every fourth pixel of two cells.
 LONG_LINE_SAMPLES = 16
 SHORT_LINE_SAMPLES = 8  # Samples on the line to the nearest anchor; enough: every fourth pixel of a cell.
@@ -119,17 +117,16 @@ class AnchorPropagation:
         central = self._central_points(ambiguous)
         seed[central[(self._anchor == NO_ANCHOR) & (central != NO_ANCHOR)]] = True
         candidates, tried_with = candidates.of(seed), np.zeros(count, np.intp)
-        for _ in range(MAX_ROUNDS):
+        while True:
             neighbours = np.count_nonzero(self._anchors_around(np.flatnonzero(seed)) != NO_ANCHOR, axis=1)
             active = np.zeros(count, bool)
             active[np.flatnonzero(seed)[neighbours > tried_with[seed]]] = True
             tried_with[seed] = neighbours
             if not active.any():
-                break
+                return new
             decided = self._decide_by_all_anchors(candidates.of(active)) & active
             self._anchor[self._cell[decided]] = np.flatnonzero(decided)
             new, seed = new | decided, seed & ~decided
-        return new
 
     def _decide_by_all_anchors(self, rows: Candidates) -> Flags:
         """Decide points by the mean over the lines to all anchors around; return those (N,) with a large margin."""
