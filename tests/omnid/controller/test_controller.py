@@ -6,6 +6,7 @@ import contextlib
 import math
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -14,8 +15,10 @@ from drivers.motor import MotorStatus, VelocityCommand, is_stop
 from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.serial_motor import LateReplyError, SerialMotor
 from omnid.controller.controller import Controller
+from omnid.controller.statistics import ControllerState
 from omnid.core.control import safety_rules
 from omnid.core.control.arming import AUTOMATIC
+from omnid.core.control.collision_monitor import BLOCKED, CollisionSettings, ControllerRing
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControllerPose, ControllerSettings
 from omnid.core.control.heading_controller import Setpoint
@@ -25,6 +28,7 @@ from tests.omnid.controller.bench import (
     LIMITS,
     PERIOD_NS,
     PERIOD_S,
+    SETTINGS,
     UNATTENDED,
     Bench,
 )
@@ -107,29 +111,6 @@ def test_a_drive_that_ends_by_a_setpoint_to_stand_is_not_called_cut_short(drivin
         driving.tick()
     assert is_stop(driving.last) and driving.controller.state.reason == safety_rules.IDLE
     assert bool(driving.lines) == bool(driving.controller.state.stops) == bool(turn_radps)
-
-
-def test_a_stop_voids_setpoints_and_latches_until_armed(driving: Bench) -> None:
-    driving.send_setpoint()
-    driving.now_ns += 1
-    driving.stop()
-    driving.now_ns += 1
-    driving.send_setpoint()  # within the same tick: the stop counts
-    driving.tick()
-    assert driving.controller.state.reason == safety_rules.ASKED
-    slows_down_from = driving.last.velocity_mps
-    assert 0.0 < slows_down_from < 0.3
-    for _ in range(10):
-        driving.send_pose()
-        driving.tick()
-    assert is_stop(driving.last) and driving.controller.state.reason == safety_rules.ASKED
-    driving.arm()
-    driving.send_pose()
-    driving.tick()
-    assert is_stop(driving.last) and driving.controller.state.reason == safety_rules.IDLE
-    send_both(driving)
-    driving.tick()
-    assert driving.last.velocity_mps > 0.0
 
 
 @pytest.mark.hazard("H40")
@@ -308,17 +289,26 @@ def test_wheels_that_are_limited_by_their_driver_follow_the_commands(known: bool
     assert (not bench.controller.state.stops and not bench.controller.state.slowed) == known
 
 
-def test_a_base_that_follows_drives_for_a_minute(bench: Bench) -> None:
-    """Starts, turns, stops; the images show the motion of the commands 0.1 s before."""
-    bench.wheels.velocity_mps = None
-    for tick in range(1200):
-        done = bench.wheels.commands[-2:][0] if bench.wheels.commands else None
-        bench.send_pose(
-            age_s=0.1,
-            velocity_mps=done.velocity_mps if done else 0.0,
-            sigma_mps=0.01,
-            rate_radps=done.yaw_rate_radps if done else 0.0,
-        )
-        bench.send_setpoint(Setpoint(0.4 if tick % 200 < 120 else 0.0, None, 0.6 if tick % 90 < 30 else 0.0))
-        bench.tick()
-    assert not bench.controller.state.stops and not bench.controller.state.slowed and bench.lines == []
+def test_counts_commands_and_stops_before_obstacles() -> None:
+    bench = Bench(replace(SETTINGS, collision=CollisionSettings()))
+
+    def drive(ranges: tuple[float, ...], ticks: int) -> ControllerState:
+        for _ in range(ticks):
+            bench.send_pose()
+            bench.controller.take(ControllerRing(bench.now_ns, ranges))
+            bench.send_setpoint()
+            bench.tick()
+        return bench.controller.state
+
+    bench.send_pose()
+    bench.arm()
+    bench.tick()
+    free = (math.inf,) * 360
+    state = drive(free, 20)
+    assert state.sent == len(bench.wheels.commands) == 21 and not state.blocked and not state.obstacle
+    slowed = drive(tuple(0.9 if 150 <= k < 210 else math.inf for k in range(360)), 3)
+    assert slowed.obstacle and not slowed.blocked and slowed.obstacle_stops == 0
+    for number in (1, 2):
+        stopped = drive(tuple(0.38 if 150 <= k < 210 else math.inf for k in range(360)), 10)
+        assert stopped.blocked and stopped.obstacle == BLOCKED and stopped.obstacle_stops == number
+        assert not drive(free, 10).blocked

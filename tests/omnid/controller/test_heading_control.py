@@ -128,14 +128,6 @@ def test_a_setpoint_from_before_a_jump_is_void_and_the_robot_stays_armed() -> No
     assert robot.driver.base.velocity_mps > 0.15, "it obeys the next one"
 
 
-def test_a_jump_within_the_reach_of_the_base_is_no_fault() -> None:
-    robot = Lockstep()
-    robot.run(STRAIGHT, 20)
-    robot.jump_rad = 0.25
-    robot.run(STRAIGHT, 20)
-    assert robot.controller.state.stops == {}
-
-
 def test_a_stale_pose_that_was_relocalised_moves_no_goal() -> None:
     """Wheels stand for a stale pose, which then is another one: the goal stays the heading that they have."""
     robot = Lockstep()

@@ -182,16 +182,6 @@ def test_a_stop_latches_in_both_modes(settings: str) -> None:
     assert bench.last.velocity_mps == 0.3
 
 
-def test_a_released_stick_does_not_disarm(driving: Bench) -> None:
-    for _ in range(40):
-        driving.send_pose()
-        driving.tick()
-    assert is_stop(driving.last) and driving.controller.state.armed
-    driving.send_setpoint()
-    driving.tick()
-    assert driving.last.velocity_mps > 0.0
-
-
 def test_a_request_that_arrived_before_the_stop_releases_nothing(driving: Bench) -> None:
     """In either order of their delivery, and at the same instant."""
     early = ArmRequest(driving.now_ns, 1)
@@ -210,17 +200,6 @@ def test_a_request_that_arrived_before_the_stop_releases_nothing(driving: Bench)
     expect_stand(driving)
     assert driving.controller.state.arm_answer == (3, OLDER_THAN_STOP)
     assert driving.lines.count(f"arming is refused: {OLDER_THAN_STOP}") == 1, "a repeated refusal is one line"
-
-
-def test_a_stop_that_is_repeated_after_its_release_changes_nothing(driving: Bench) -> None:
-    """Every message to the process carries the newest stop."""
-    asked_ns = driving.now_ns
-    driving.stop()
-    driving.tick()
-    driving.drive()
-    driving.controller.stop(asked_ns)
-    driving.tick()
-    assert driving.last.velocity_mps == 0.3 and driving.controller.state.armed
 
 
 @pytest.mark.parametrize("reason", FAULTS)
@@ -256,47 +235,11 @@ def test_refuses_a_request_that_was_handled_late(bench: Bench) -> None:
     expect_stand(bench)
 
 
-def test_commands_from_before_the_arming_are_void(bench: Bench) -> None:
-    bench.send_setpoint()
-    bench.send_pose()
-    bench.arm()
-    bench.tick()
-    assert is_stop(bench.last) and bench.controller.state.reason == safety_rules.IDLE
-    bench.send_setpoint()
-    bench.tick()
-    assert bench.last.velocity_mps > 0.0
-
-
-def test_to_arm_twice_changes_nothing(driving: Bench) -> None:
-    before = driving.last.velocity_mps
-    driving.arm()
-    driving.send_pose()
-    driving.send_setpoint()
-    driving.tick()
-    assert driving.last.velocity_mps == before == 0.3
-
-
 def test_the_state_names_the_source_that_drives(driving: Bench) -> None:
     assert driving.controller.state.source == "operator"
     driving.stop()
     driving.tick()
     assert driving.controller.state.source == ""
-
-
-@pytest.mark.parametrize("mode", [AUTOMATIC, MANUAL])
-def test_an_old_stop_that_is_repeated_does_not_release_a_newer_one(mode: str) -> None:
-    arming = Arming(mode)
-    arming.stop(5)
-    arming.request(ArmRequest(10))
-    arming.step("", 10, 1.0)
-    assert arming.armed
-    arming.stop(20)
-    arming.stop(5)
-    arming.step("", 30, 1.0)
-    assert arming.stop_asked and not arming.armed
-    arming.request(ArmRequest(15))
-    arming.step("", 30, 1.0)
-    assert not arming.armed and arming.answer.refusal == OLDER_THAN_STOP
 
 
 @pytest.mark.hazard("H08")
