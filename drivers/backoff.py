@@ -4,11 +4,11 @@ from __future__ import annotations
 
 
 class Backoff:
-    """Waits that double from `first_s` up to `longest_s`; reads no clock and does not wait itself."""
+    """Waits that double up to `longest_s`; reads no clock and does not wait itself."""
 
-    def __init__(self, first_s: float, longest_s: float) -> None:
-        self._first_s, self._longest_s = first_s, longest_s
-        self._next_s = first_s
+    def __init__(self, longest_s: float, *, first_s: float = 0.1) -> None:
+        self._first_s, self._longest_s = min(first_s, longest_s), longest_s
+        self._next_s = self._first_s
 
     def next_s(self) -> float:
         """Return the wait before the next try [s]."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
@@ -20,15 +21,15 @@ CAMERAS: tuple[Camera, Camera] = ("lower", "upper")
 
 MAX_PIXELS = 64 * 2**20
 # Pixels times channels of a compressed image: decoders of progressive and interlaced ones store all samples at once.
-MAX_SAMPLES = 64 * 2**20
+MAX_SAMPLES = MAX_PIXELS
 _START_MARKER = {"jpeg": b"\xff\xd8\xff", "png": b"\x89PNG\r\n\x1a\n"}  # ITU T.81, B.1.1.3; PNG 1.2, 3.1
 _JPEG_CHANNELS = {"Gray": 1, "YCbCr": 3, "RGB": 3}
 # Some webcams write zeros before the end of image, which libjpeg reports as a fault. A zero after 0xFF is none of them.
 _ZEROS_BEFORE_END = re.compile(rb"(?<!\xff)\0+(?=\xff\xd9)")
 _EXTRANEOUS_AT_END = "extraneous bytes before marker 0xd9"
 _PNG_END = b"IEND\xaeB`\x82"
-_PNG_HEADER = slice(12, 26)  # chunk IHDR: name, width, height, bit depth, colour type (PNG 1.2, 4.1.1)
-_PNG_DEPTH = slice(24, 25)
+# Signature, then the chunk IHDR: length, name, width, height, bit depth, colour type (PNG 1.2, 4.1.1).
+_PNG_START = struct.Struct(">8x4x4sIIBB")
 _PNG_FIRST_CHUNK = 8
 _PNG_CHUNK_BYTES = 12  # length, name and CRC
 _MAX_PNG_CHUNKS = 1000
@@ -105,7 +106,9 @@ def coding_steps(frame: Frame) -> Steps:
 
 def is_deep(frame: Frame) -> bool:
     """True if an image has 16 bits a sample, of which Frame.bits are those of the camera."""
-    return frame.encoding.endswith(_DEEP) or (frame.encoding == "png" and bytes(frame.data[_PNG_DEPTH]) == b"\x10")
+    if frame.encoding == "png" and len(frame.data) >= _PNG_START.size:
+        return bool(_PNG_START.unpack_from(np.frombuffer(frame.data, np.uint8).data)[3] == int(_DEEP))
+    return frame.encoding.endswith(_DEEP)
 
 
 def upper_eight_bits(samples: NDArray[Any], bits: int) -> NDArray[np.uint8]:
@@ -167,13 +170,10 @@ def _require_samples(frame: Frame, width: int, height: int, channels: int) -> No
 
 def _png_size(data: NDArray[np.uint8]) -> tuple[int, int, int]:
     """Return width, height and channels from the IHDR chunk; zeros without it, and for an animation."""
-    header = data[_PNG_HEADER].tobytes()
-    if len(header) < _PNG_HEADER.stop - _PNG_HEADER.start or not header.startswith(b"IHDR"):
+    if data.size < _PNG_START.size or _is_animated(data):
         return 0, 0, 0
-    if _is_animated(data):
-        return 0, 0, 0
-    channels = _PNG_CHANNELS.get(header[13], max(_PNG_CHANNELS.values()))
-    return int.from_bytes(header[4:8], "big"), int.from_bytes(header[8:12], "big"), channels
+    name, width, height, _, colours = _PNG_START.unpack_from(data.data)
+    return (width, height, _PNG_CHANNELS.get(colours, 4)) if name == b"IHDR" else (0, 0, 0)
 
 
 def _is_animated(data: NDArray[np.uint8]) -> bool:

@@ -21,8 +21,6 @@ from drivers.errors import DriverError
 from drivers.events import EventCallback, ignore_event
 from drivers.frame import Camera, Frame
 
-_FIRST_RETRY_S: Final = 0.1
-_SETTLED_FRAMES: Final = 30  # after fewer frames the wait before the next try doubles, else it starts again
 _PAUSE_S: Final = 0.005  # Pause where poll() reports a device as ready and no buffer is filled.
 _SEQUENCE_COUNT: Final = 2**32  # v4l2_buffer.sequence is an unsigned 32-bit counter
 _RECENT: Final = 16  # valid stamps by which the usual delay is judged, the least of theirs: half a second at 30 Hz
@@ -55,7 +53,7 @@ class V4l2Camera:
     def frames(self) -> Iterator[Frame]:
         """Yield the frames as they arrive, until `close`; those captured before the first call are discarded."""
         self._reading = True
-        reopening = Backoff(_FIRST_RETRY_S, self._settings.retry_s)
+        reopening = Backoff(self._settings.retry_s)
         try:
             self._discard()
             while not self._closing:
@@ -64,7 +62,7 @@ class V4l2Camera:
                     yield from self._images()
                 except (OSError, DriverError) as error:
                     self._lose(error)
-                    if self.state.frames - delivered > _SETTLED_FRAMES:
+                    if self.state.frames > delivered:
                         reopening.reset()
                     self._wake.wait(reopening.next_s())
         finally:

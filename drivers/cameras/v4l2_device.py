@@ -19,7 +19,6 @@ from drivers.errors import DriverError
 
 RULES_FILE: Final = "/etc/udev/rules.d/70-omnid-cameras.rules"  # ID_PATH is set by 60-persistent-v4l.rules
 _MEMORY_TO_MEMORY: Final = 0x8000 | 0x4000  # V4L2_CAP_VIDEO_M2M and V4L2_CAP_VIDEO_M2M_MPLANE: codecs
-_MAX_DEVICES: Final = 256
 _BYTES_PER_PIXEL: Final = {"GREY": 1, "NV12": 1, "YUYV": 2, "UYVY": 2}  # of the first plane; others are compressed
 _RATE_TOLERANCE: Final = 0.02  # relative; 29.97 Hz passes for 30 Hz
 _MIN_BUFFERS: Final = 2  # one to fill while the other is read
@@ -263,7 +262,7 @@ def capture_devices(root: Path = Path("/")) -> list[CaptureDevice]:
     its problem; metadata nodes, outputs and codecs are left out.
     """
     nodes = sorted((root / "sys/class/video4linux").glob("video*"), key=lambda path: (len(path.name), path.name))
-    found = [_device(root, path) for path in nodes[:_MAX_DEVICES] if _word(path / "index") in ("0", "")]
+    found = [_device(root, path) for path in nodes if _word(path / "index") in ("0", "")]
     return [device for device in found if device is not None]
 
 

@@ -25,12 +25,8 @@ import numpy as np
 import zstandard
 
 from drivers.errors import DriverError
-from drivers.logs.log import ENTRY, MAX_RECORD_BYTES, Entries, RecordError, Topic
+from drivers.logs.log import ENTRY, MAX_DEFINITIONS, MAX_RECORD_BYTES, Entries, RecordError, Topic
 
-# Bounds of what is kept in memory, whatever a file states.
-MAX_DEFINITIONS: Final = 4096  # channels, and schemas
-MAX_DEFINITION_BYTES: Final = 2**20
-MAX_NAME: Final = 256  # characters of a topic, a type or an attachment
 _KEPT_CHUNKS: Final = 4  # that stay unpacked: both cameras, wheels and gyro may have been written one after the other
 _NO_CHUNK: Final = -1  # offset of an entry outside of chunks, whose block is the begin of its record
 
@@ -190,7 +186,7 @@ class ChunkedFile(ABC):
             chunk, index = (record if record.kind is RecordKind.CHUNK else None), []
             if record.kind in (RecordKind.MESSAGE, RecordKind.DEFINITION):
                 loose += [(head, record.begin, _NO_CHUNK) for head in self._heads(self, [record]).values()]
-            elif record.kind is RecordKind.ATTACHMENT:
+            elif record.kind is RecordKind.ATTACHMENT and len(self._attached) < MAX_DEFINITIONS:
                 self._attached.append(record)
             elif record.kind is RecordKind.END:
                 break

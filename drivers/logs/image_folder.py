@@ -24,7 +24,7 @@ import numpy as np
 
 from drivers.errors import DriverError
 from drivers.logs.image_times import SHORTEST_STEP_NS
-from drivers.logs.log import ENTRY, MAX_RECORD_BYTES, Entries, RecordError, Topic
+from drivers.logs.log import ENTRY, MAX_ATTACHMENT_BYTES, MAX_RECORD_BYTES, Entries, RecordError, Topic
 from drivers.logs.ros_messages import COMPRESSED_IMAGE, compressed_image
 
 SUFFIXES: Final = (".png", ".jpg", ".jpeg")
@@ -32,12 +32,8 @@ SUFFIXES: Final = (".png", ".jpg", ".jpeg")
 IMAGE_SUFFIXES: Final = frozenset({*SUFFIXES, ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp"})
 STAMP_FILES: Final = ("times.txt", "timestamps.txt")
 ATTACHMENT: Final = "rig.toml"  # The rig's file, in the same folder as the folders of the cameras.
-MAX_IMAGES: Final = 1_000_000
 _MAX_DEPTH: Final = 4  # Folders of images are searched down to this depth below the given one.
-_MAX_FOLDERS: Final = 64
 _MAX_VISITED: Final = 10_000
-_MAX_STAMP_BYTES: Final = 64 * 2**20
-_MAX_ATTACHMENT_BYTES: Final = 16 * 2**20
 _MAX_STAMP_NS: Final = 2**31 * 10**9  # of the times of ROS, which end in 2038
 _NANOSECONDS: Final = re.compile(r"\d{16,19}")
 
@@ -48,14 +44,14 @@ class _StampedFile(NamedTuple):
 
 
 def image_folders(path: Path) -> list[Path]:
-    """Return the folders with images below a folder, at most 64, of the first 10,000 folders that are visited."""
+    """Return the folders with images below a folder, among the first 10,000 folders that are visited."""
     found: list[Path] = []
     for visited, (folder, inner, files) in enumerate(os.walk(path)):
         here = Path(folder)
         inner[:] = sorted(inner) if len(here.relative_to(path).parts) < _MAX_DEPTH else []
         if here != path and any(map(_is_image, files)):
             found.append(here)
-        if visited >= _MAX_VISITED or len(found) >= _MAX_FOLDERS:
+        if visited >= _MAX_VISITED:
             break
     return found
 
@@ -82,8 +78,6 @@ class ImageFolder:
         self.faults: Counter[str] = Counter()
         self.cut = ""
         counts = [len(files) for files in self._files]
-        if sum(counts) > MAX_IMAGES:
-            raise DriverError(f"{str(path)!r} contains more than {MAX_IMAGES} images; give a part of them")
         if rate_hz and len(set(counts)) > 1:
             found = ", ".join(f"{count} in {name!r}" for name, count in zip(names, counts, strict=True))
             self.cut = (
@@ -109,10 +103,10 @@ class ImageFolder:
         """Return the rig.toml in the folder of the folders, if it is a regular file of at most 16 MiB."""
         try:
             _require_own_files(self._path, [self._path / ATTACHMENT])
-            data = _read_regular(self._path / ATTACHMENT, _MAX_ATTACHMENT_BYTES + 1)
+            data = _read_regular(self._path / ATTACHMENT, MAX_ATTACHMENT_BYTES + 1)
         except (OSError, DriverError):
             return {}
-        return {ATTACHMENT: data} if len(data) <= _MAX_ATTACHMENT_BYTES else {}
+        return {ATTACHMENT: data} if len(data) <= MAX_ATTACHMENT_BYTES else {}
 
     def close(self) -> None:
         """No file stays open."""
@@ -171,7 +165,7 @@ def _stamp_lines(folder: Path) -> list[str] | None:
     """Return the lines of the list of stamps in the folder of the images or above; None without one."""
     for path in (place / name for place in (folder, folder.parent) for name in STAMP_FILES):
         try:
-            if path.is_file() and path.stat().st_size <= _MAX_STAMP_BYTES:
+            if path.is_file() and path.stat().st_size <= MAX_RECORD_BYTES:
                 lines = path.read_text("utf-8", "replace").splitlines()
                 return [line.strip() for line in lines if line.strip() and not line.startswith("#")]
         except OSError as error:

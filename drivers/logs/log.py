@@ -28,12 +28,17 @@ from drivers.logs.ros_messages import (
     parse_motion,
 )
 
+# Bounds of what is kept in memory, whatever a file states.
 MAX_RECORD_BYTES: Final = 256 * 2**20  # of a message, of an image and of an unpacked chunk
+MAX_DEFINITIONS: Final = 4096  # topics, and types
+MAX_DEFINITION_BYTES: Final = 2**20
+MAX_ATTACHMENT_BYTES: Final = 16 * 2**20
+MAX_NAME: Final = 256  # characters of a topic, a type or an attachment
+MAX_LISTED: Final = 16  # names in a message
 LATEST_NS: Final = 2**62  # A time beyond is none; the difference of two times fits 64 bits.
 FEWEST_IN_ORDER: Final = 8  # Where fewer messages of a topic follow each other on average, it is written out of order.
 LONGEST_STEP: Final = 1.5  # Where two messages are more periods apart than that, one is missing between them.
 FAR_STEPS: Final = 3  # Times that end so many periods before others are of another clock.
-_MAX_LISTED: Final = 8
 _ZSTD: Final = b"\x28\xb5\x2f\xfd"  # first bytes of a frame (RFC 8878); no message begins with them
 
 # Where a message is. In a file, messages are in the order of block and offset, whose meaning is the format's own.
@@ -173,7 +178,7 @@ class Log:
     def attachments(self) -> dict[str, bytes]:
         """Return name -> bytes of the attachments of the first file that has some, such as a rig.
 
-        They are at most 32 of up to 16 MiB each, 64 MiB in all.
+        They have up to 16 MiB each, 64 MiB in all.
         """
         assert self._index
         return next((found for found in (file.attachments() for file in self._files) if found), {})
@@ -184,8 +189,8 @@ class Log:
         faults = [fault for file in self._files for fault in file.faults]
         cuts = [file.cut for file in self._files if file.cut]
         if self._missing:
-            more = f" and {len(self._missing) - _MAX_LISTED} more" if len(self._missing) > _MAX_LISTED else ""
-            listed = ascii(", ".join(self._missing[:_MAX_LISTED]))[1:-1]
+            more = f" and {len(self._missing) - MAX_LISTED} more" if len(self._missing) > MAX_LISTED else ""
+            listed = ascii(", ".join(self._missing[:MAX_LISTED]))[1:-1]
             cuts.insert(0, f"parts of the log {self.name!r} are missing: {listed}{more}: used the others")
         return LogDamage(len(faults), faults[0] if faults else "", "; ".join(cuts))
 

@@ -21,9 +21,6 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Schema
 
 from drivers.logs.chunked_file import (
-    MAX_DEFINITION_BYTES,
-    MAX_DEFINITIONS,
-    MAX_NAME,
     ByteSource,
     ChunkedFile,
     MessageHead,
@@ -32,13 +29,21 @@ from drivers.logs.chunked_file import (
     content,
     unpacked_chunk,
 )
-from drivers.logs.log import ENTRY, LATEST_NS, MAX_RECORD_BYTES, Entries, RecordError, Topic
+from drivers.logs.log import (
+    ENTRY,
+    LATEST_NS,
+    MAX_ATTACHMENT_BYTES,
+    MAX_DEFINITION_BYTES,
+    MAX_DEFINITIONS,
+    MAX_NAME,
+    MAX_RECORD_BYTES,
+    Entries,
+    RecordError,
+    Topic,
+)
 
 MAGIC: Final = b"\x89MCAP0\r\n"
-# Bounds of what is kept in memory, whatever a file states.
-MAX_ATTACHMENT_BYTES: Final = 16 * 2**20
 MAX_ALL_ATTACHMENTS_BYTES: Final = 64 * 2**20
-_MAX_ATTACHMENTS: Final = 32
 
 _HEAD: Final = struct.Struct("<BQ")  # of a record: opcode, length of the content
 _CHUNK: Final = struct.Struct("<QQQII")  # first and last log time, unpacked size, CRC, length of the compression's name
@@ -73,7 +78,7 @@ class McapFile(ChunkedFile):
         """Return name -> bytes of the attachments that are valid and within the limits."""
         found: dict[str, bytes] = {}
         left = MAX_ALL_ATTACHMENTS_BYTES
-        for record in self._attached[:_MAX_ATTACHMENTS]:
+        for record in self._attached:
             if record.size > min(left, MAX_ATTACHMENT_BYTES):
                 continue
             left -= record.size

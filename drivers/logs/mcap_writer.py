@@ -17,11 +17,10 @@ from rosbags.typesys import Stores
 
 from drivers.errors import DriverError
 from drivers.logs.file_lock import lock
+from drivers.logs.log import LATEST_NS
 from drivers.logs.ros_messages import typestore
 
 _COMPRESSIONS = {"lz4": CompressionType.LZ4, "none": CompressionType.NONE}
-_MEDIA_TYPES = {".toml": "application/toml", ".yaml": "application/yaml", ".txt": "text/plain", ".png": "image/png"}
-_MAX_CHANNELS = 4096
 _KEPT_TOPICS = ("/tf_static",)  # ROS 2 keeps their newest message for late subscribers, also of `ros2 bag play`
 _TRANSIENT_LOCAL = "".join(
     (  # rosbag2's YAML: keep last, reliable, transient local, automatic liveliness
@@ -32,7 +31,6 @@ _TRANSIENT_LOCAL = "".join(
     )
 )
 _FLUSH_NS = 5 * 10**8  # A chunk ends after this time, by the stamps.
-END_NS = 2**63  # Valid stamps are smaller.
 
 
 class LogWriter:
@@ -73,8 +71,7 @@ class LogWriter:
             self._writer = Writer(self._file, chunk_bytes, _COMPRESSIONS[compression])
             self._writer.start("ros2", "omnid")
             for name, data in (attachments or {}).items():
-                media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
-                self._writer.add_attachment(0, 0, name, media_type, data)
+                self._writer.add_attachment(0, 0, name, "application/octet-stream", data)
             self._file.flush()
             self._flushed_bytes = self._file.tell()
 
@@ -84,7 +81,7 @@ class LogWriter:
         stamp_ns: log time [ns of Unix time]. Raises DriverError for an unknown type, an invalid stamp, or where the
         file cannot be written.
         """
-        if not 0 <= stamp_ns < END_NS:
+        if not 0 <= stamp_ns < LATEST_NS:
             raise DriverError(f"cannot log a message on {topic!r}: its stamp {stamp_ns} ns is not a time")
         with self._guarded():
             channel = self._channels.get((topic, schema_name)) or self._register(topic, schema_name)
@@ -155,8 +152,6 @@ class LogWriter:
             self._file.close()
 
     def _register(self, topic: str, schema_name: str) -> int:
-        if len(self._channels) >= _MAX_CHANNELS:
-            raise DriverError(f"cannot log {topic!r}: the log has {_MAX_CHANNELS} topics already")
         if schema_name not in self._schemas:
             text = schema_text(schema_name)
             self._schemas[schema_name] = self._writer.register_schema(schema_name, "ros2msg", text.encode())

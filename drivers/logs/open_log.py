@@ -16,7 +16,7 @@ from drivers.errors import DriverError, FrameDecodeError
 from drivers.logs import mcap_file, ros1_bag, sqlite_bag
 from drivers.logs.file_lock import is_locked
 from drivers.logs.image_folder import ImageFolder, image_folders
-from drivers.logs.log import Log, LogFile, LoggedMessage, RecordError
+from drivers.logs.log import MAX_ATTACHMENT_BYTES, MAX_LISTED, Log, LogFile, LoggedMessage, RecordError
 from drivers.logs.mcap_file import McapFile
 from drivers.logs.packed_file import PACKED_SUFFIXES, is_packed, scratch_folder, unpack
 from drivers.logs.ros1_bag import Ros1Bag
@@ -24,7 +24,6 @@ from drivers.logs.ros_messages import IMAGE_TYPES
 from drivers.logs.sqlite_bag import SqliteBag
 
 MAX_PARTS: Final = 1000
-_MAX_LISTED: Final = 8
 _JPEG_END: Final = b"\xff\xd9"  # ITU T.81, B.1.1.3
 LOG_SUFFIXES: Final = (".mcap", ".db3", ".bag")
 _UNFINISHED: Final = (".part", ".active")  # A recording of omnid, or of rosbag, has these until it is complete.
@@ -33,7 +32,6 @@ _NAME: Final = re.compile(
     r"(.+?)(_\d{8}T\d{6}Z|_\d{4}(?:-\d{2}){5})?(?:_(\d{1,9}))?(\.(?:mcap|db3|bag))"
     rf"(?:{'|'.join(map(re.escape, (*_UNFINISHED, *PACKED_SUFFIXES)))})*"
 )
-_MAX_METADATA_BYTES: Final = 2**20
 _LISTED_FILES: Final = re.compile(r"^ *relative_file_paths:[ \t]*\n((?:[ \t]*- .*\n)*)", re.M)
 _FORMATS: Final[dict[bytes, Callable[[Path, str], LogFile]]] = {
     mcap_file.MAGIC: McapFile,
@@ -171,7 +169,7 @@ def _open_folder(path: Path, rate_hz: float) -> Log:
         return Log(str(path), files, missing)
     if not logs and (folders := image_folders(path)):
         return Log(str(path), [ImageFolder(path, folders, rate_hz)])
-    names = ", ".join(log.name for log in logs[:_MAX_LISTED]) or "none"
+    names = ", ".join(log.name for log in logs[:MAX_LISTED]) or "none"
     raise DriverError(
         f"{str(path)!r} must contain one log ({' '.join(LOG_SUFFIXES)}), the numbered parts of one, or a "
         f"folder of images for each camera; found: {names}; give one file"
@@ -211,7 +209,7 @@ def _missing(folder: Path, logs: Sequence[Path]) -> list[str]:
     """Return the parts of a log that are not there: by metadata.yaml of rosbag2, else by a gap in their numbers."""
     metadata = folder / "metadata.yaml"
     there = {match[0] for log in logs if (match := _NAME.match(log.name))}
-    if metadata.is_file() and metadata.stat().st_size <= _MAX_METADATA_BYTES:
+    if metadata.is_file() and metadata.stat().st_size <= MAX_ATTACHMENT_BYTES:
         listed = _LISTED_FILES.search(metadata.read_text("utf-8", "replace"))
         # The first versions of rosbag2 listed paths.
         lines = listed[1].splitlines() if listed else []

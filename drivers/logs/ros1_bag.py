@@ -15,9 +15,6 @@ from typing import Final
 import numpy as np
 
 from drivers.logs.chunked_file import (
-    MAX_DEFINITION_BYTES,
-    MAX_DEFINITIONS,
-    MAX_NAME,
     ByteSource,
     ChunkedFile,
     MessageHead,
@@ -26,13 +23,12 @@ from drivers.logs.chunked_file import (
     content,
     unpacked_chunk,
 )
-from drivers.logs.log import ENTRY, Entries, RecordError, Topic
+from drivers.logs.log import ENTRY, MAX_DEFINITION_BYTES, MAX_DEFINITIONS, MAX_NAME, Entries, RecordError, Topic
 
 MAGIC: Final = b"#ROSBAG V2.0\n"
 
 _LENGTH: Final = struct.Struct("<I")
 _ENTRY: Final = np.dtype([(name, "<u4") for name in ("seconds", "nanoseconds", "offset")])  # of an index
-_MAX_HEADER_BYTES: Final = 2**16
 _BAG: Final = 3
 _KINDS: Final = {2: RecordKind.MESSAGE, 4: RecordKind.INDEX, 5: RecordKind.CHUNK, 7: RecordKind.DEFINITION}
 
@@ -70,7 +66,7 @@ class Ros1Bag(ChunkedFile):
         while offset + _LENGTH.size <= end:
             begin, size = offset, _length(source, offset)
             offset += _LENGTH.size
-            if size > min(end - offset, _MAX_HEADER_BYTES):
+            if size > min(end - offset, MAX_DEFINITION_BYTES):
                 return
             fields, offset = _fields(bytes(source.read_bytes(offset, size))), offset + size
             opcode = fields.get(b"op", b"")

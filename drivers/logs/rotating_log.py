@@ -23,11 +23,10 @@ from drivers.backoff import Backoff
 from drivers.errors import DriverError
 from drivers.events import EventCallback
 from drivers.logs.file_lock import is_locked
-from drivers.logs.mcap_writer import END_NS, LogWriter
+from drivers.logs.log import LATEST_NS
+from drivers.logs.mcap_writer import LogWriter
 
 _PART: Final = ".part"
-_FIRST_RETRY_S: Final = 1.0
-_MAX_NUMBER: Final = 999_999
 _MB: Final = 10**6
 
 
@@ -82,13 +81,13 @@ class RotatingLog:
         self._own: dict[str, int] = {}  # names of the files of this run, in their order
         self._start_ns = 0
         self._synced_s = self._retry_at_s = 0.0
-        self._backoff = Backoff(min(_FIRST_RETRY_S, rotation.retry_s), rotation.retry_s)
+        self._backoff = Backoff(rotation.retry_s)
         self._lost_before = 0  # lost messages when it stopped
 
     def write(self, topic: str, schema_name: str, data: bytes | memoryview, stamp_ns: int) -> None:
         """Write a message, CDR with its encapsulation header, at its stamp [ns of Unix time]."""
         self.state.messages += 1
-        if not 0 <= stamp_ns < END_NS:
+        if not 0 <= stamp_ns < LATEST_NS:
             self._refuse(f"{topic!r}: its stamp {stamp_ns} ns is not a time")
             return
         writer = self._current(stamp_ns)
@@ -144,7 +143,7 @@ class RotatingLog:
     def _created(self, stamp_ns: int) -> LogWriter:
         """Create a file with the next number that no other program uses."""
         at = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(stamp_ns // 10**9))
-        while self._number < _MAX_NUMBER:
+        while True:
             self._number += 1
             self._path = self._folder / f"{self._name}_{at}_{self._number:03}.mcap{_PART}"
             if os.path.lexists(_complete(self._path)):
@@ -156,12 +155,8 @@ class RotatingLog:
                     continue
                 _delete(self._path)
                 raise
-            if not os.path.lexists(_complete(self._path)):
-                self._own[_complete(self._path).name] = self._number
-                return writer
-            _delete(self._path)  # another program has completed a file of this name since the check
-            _drop(writer)
-        raise DriverError(f"cannot record to {str(self._folder)!r}: all file numbers are used; name another folder")
+            self._own[_complete(self._path).name] = self._number
+            return writer
 
     def _refuse(self, reason: str) -> None:
         self.state.refused += 1
@@ -239,7 +234,7 @@ class RotatingLog:
 
         Files of this run are the newest, in their order: the computer's clock may have been set back meanwhile.
         """
-        pattern = re.compile(re.escape(self._name) + r"_(\d{8}T\d{6}Z)_(\d{3,6})\.mcap(?:\.part)?")
+        pattern = re.compile(re.escape(self._name) + r"_(\d{8}T\d{6}Z)_(\d{3,})\.mcap(?:\.part)?")
         with suppress(OSError), os.scandir(self._folder) as entries:
             for entry in entries:
                 found = pattern.fullmatch(entry.name)

@@ -22,12 +22,11 @@ from urllib.parse import quote
 import numpy as np
 
 from drivers.errors import DriverError
-from drivers.logs.log import ENTRY, MAX_RECORD_BYTES, Entries, RecordError, Topic
+from drivers.logs.log import ENTRY, MAX_DEFINITIONS, MAX_RECORD_BYTES, Entries, RecordError, Topic
 from drivers.logs.packed_file import scratch_folder
 
 MAGIC: Final = b"SQLite format 3\0"
 _BESIDE: Final = ("-wal", "-journal")
-_MAX_TOPICS: Final = 4096
 _MAX_REASON: Final = 120  # characters
 _LEAST_ROW_BYTES: Final = 8  # pointer, sizes, number, and the types of four columns
 _ROW_INSTRUCTIONS: Final = 100  # Instructions of SQLite that a row may take; it needs 10 to 20.
@@ -42,7 +41,7 @@ _TABLES: Final = (
 _COLUMNS: Final = "SELECT name FROM pragma_table_info('messages') LIMIT 4"
 _EXPECTED: Final = [("id",), ("topic_id",), ("timestamp",), ("data",)]
 _TOPICS: Final = (
-    f"SELECT id, substr(name, 1, 256), substr(type, 1, 256), serialization_format FROM topics LIMIT {_MAX_TOPICS}"
+    f"SELECT id, substr(name, 1, 256), substr(type, 1, 256), serialization_format FROM topics LIMIT {MAX_DEFINITIONS}"
 )
 # Indexes are not used: a damaged one would leave rows out without an error.
 _ROWS: Final = "SELECT topic_id, timestamp, rowid, length(data) FROM messages NOT INDEXED ORDER BY rowid"

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 from drivers.errors import DriverError
 from drivers.frame import CAMERAS, Camera
+from drivers.logs.log import MAX_LISTED
 from drivers.logs.ros_messages import COMPRESSED_IMAGE, IMAGE, IMAGE_TYPES, IMU, JOINT_STATE, ODOMETRY, JointWheels
 
 _WORDS: dict[str, Camera] = {
@@ -19,7 +20,6 @@ _WORDS: dict[str, Camera] = {
     "up": "upper",
 }
 _COMPRESSED = "/compressed"  # ends the names of compressed images (image_transport)
-_MAX_LISTED = 16
 
 Wanted = Mapping[Camera, str | None]
 
@@ -31,7 +31,7 @@ def choose_topics(log: str, topics: Mapping[str, str], wanted: Wanted) -> dict[C
     without one is identified by a word of its topic's name. Raises DriverError, which lists the candidates, where the
     choice is ambiguous.
     """
-    images = {name: kind for name, kind in topics.items() if _is_image(name, kind)}
+    images = [name for name, kind in topics.items() if kind in IMAGE_TYPES and not name.endswith("/compressedDepth")]
     if not topics:
         raise DriverError(f"no messages can be read in {log}: `omnid log info` says whether it was cut")
     if not images:
@@ -40,8 +40,15 @@ def choose_topics(log: str, topics: Mapping[str, str], wanted: Wanted) -> dict[C
         )
     given = {camera: _given(log, topics, wanted[camera]) for camera in CAMERAS}
     free = [name for name in images if name not in given.values()]
-    found = {camera: given[camera] or _guessed(log, free, camera) for camera in CAMERAS}
-    return _both(log, images, found)
+    lower, upper = (given[camera] or _guessed(log, free, camera) for camera in CAMERAS)
+    if lower is None and upper is None and len(_images(images)) > 1:
+        raise DriverError(f"cannot tell the cameras in {log} apart: found {_listed(images)}; give --lower and --upper")
+    if lower is None or upper is None:
+        missing = "lower" if lower is None else "upper"
+        raise DriverError(f"no {missing} camera in {log}: found only {_listed(images)}; give --{missing} TOPIC")
+    if lower == upper:
+        raise DriverError(f"topic {lower!r} of {log} is named for both cameras: expected two topics")
+    return {"lower": lower, "upper": upper}
 
 
 class MotionTopics(NamedTuple):
@@ -88,10 +95,6 @@ def choose_motion_topics(log: str, topics: Mapping[str, str], wanted: MotionTopi
     return MotionChoice(frozenset(chosen), "; ".join(warnings))
 
 
-def _is_image(name: str, kind: str) -> bool:
-    return kind in IMAGE_TYPES and not name.endswith("/compressedDepth")
-
-
 def _given(log: str, topics: Mapping[str, str], name: str | None) -> str | None:
     """Return the topic of a requested camera; image_transport publishes it raw, compressed, or both."""
     if name is None:
@@ -105,33 +108,17 @@ def _given(log: str, topics: Mapping[str, str], name: str | None) -> str | None:
     return name
 
 
-def _guessed(log: str, names: Iterable[str], camera: Camera) -> str | None:
+def _guessed(log: str, names: Sequence[str], camera: Camera) -> str | None:
     """Return the topic named after the camera, preferably the compressed one, None without one.
 
     Raises DriverError where several cameras have such a name.
     """
-    mine = [name for name in names if _camera_named(name) == camera]
+    # The first word that names a camera counts: /upper/down_sampled is the upper camera.
+    words = {name: re.split(r"[^a-z0-9]+", name.lower()) for name in names}
+    mine = [name for name in names if next((_WORDS[word] for word in words[name] if word in _WORDS), None) == camera]
     if len(_images(mine)) > 1:
         raise DriverError(f"several {camera} cameras in {log}: found {_listed(mine)}; give one of them by --{camera}")
     return max(mine, key=lambda name: name.endswith(_COMPRESSED), default=None)
-
-
-def _camera_named(topic: str) -> Camera | None:
-    """Return the camera of the first word that names one: /upper/down_sampled is the upper camera."""
-    words = re.split(r"[^a-z0-9]+", topic.lower())
-    return next((_WORDS[word] for word in words if word in _WORDS), None)
-
-
-def _both(log: str, images: Mapping[str, str], found: Mapping[Camera, str | None]) -> dict[Camera, str]:
-    lower, upper = found["lower"], found["upper"]
-    if lower is None and upper is None and len(_images(images)) > 1:
-        raise DriverError(f"cannot tell the cameras in {log} apart: found {_listed(images)}; give --lower and --upper")
-    if lower is None or upper is None:
-        missing = "lower" if lower is None else "upper"
-        raise DriverError(f"no {missing} camera in {log}: found only {_listed(images)}; give --{missing} TOPIC")
-    if lower == upper:
-        raise DriverError(f"topic {lower!r} of {log} is named for both cameras: expected two topics")
-    return {"lower": lower, "upper": upper}
 
 
 def _images(names: Iterable[str]) -> set[str]:
@@ -141,6 +128,6 @@ def _images(names: Iterable[str]) -> set[str]:
 def _listed(names: Iterable[str]) -> str:
     """Return the names on one line, with unprintable characters escaped."""
     every = sorted(names)
-    shown = [name if name.isprintable() else ascii(name) for name in every[:_MAX_LISTED]]
-    more = f" and {len(every) - _MAX_LISTED} more" if len(every) > _MAX_LISTED else ""
+    shown = [name if name.isprintable() else ascii(name) for name in every[:MAX_LISTED]]
+    more = f" and {len(every) - MAX_LISTED} more" if len(every) > MAX_LISTED else ""
     return ", ".join(shown) + more

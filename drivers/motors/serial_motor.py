@@ -7,6 +7,7 @@ import errno
 import fcntl
 import math
 import os
+import string
 import termios
 import time
 from collections.abc import Iterator
@@ -19,7 +20,6 @@ import serial  # type: ignore[import-untyped]
 from drivers.backoff import Backoff
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, is_stop, stop_command
-from drivers.motors.heard import Heard
 from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.line_protocol import LineProtocol
 from drivers.motors.protocols.motor_protocol import MotorProtocol, NoReplyError, T, Transaction
@@ -29,7 +29,9 @@ STOPS_AT_CLOSE: Final = 3  # tries
 READ_LIMIT_BYTES: Final = 4096
 POLL_PERIOD_S: Final = 0.001  # Received bytes are read with this period while an answer is awaited.
 FRESH_SHARE: Final = 0.5  # After a pause of this share of the watchdog's time it may expire before a command arrives.
-FIRST_WAIT_S, LONGEST_WAIT_S = 0.2, 5.0  # between two attempts to open the port
+LONGEST_WAIT_S: Final = 5.0  # between two attempts to open the port
+HEARD_BYTES: Final = 256  # of what came instead of an answer: enough to say what it is
+_TEXT: Final = frozenset(string.printable.encode())
 _REASONS = {
     errno.ENOENT: "there is no such port; plug it in, or choose one of `ls /dev/serial/by-id/*`",
     errno.EACCES: "no permission; add the user to group dialout: `sudo usermod -aG dialout $USER`, and log in again",
@@ -108,10 +110,11 @@ class SerialMotor:
         self._state = _State.GONE
         self._last_sent_s = -math.inf  # start of the last command that got a reply, by _clock_s
         self._fresh_s = 0.0  # after it: the watchdog cannot have expired
-        self._reopening, self._next_open_s = Backoff(FIRST_WAIT_S, LONGEST_WAIT_S), -math.inf
+        self._reopening, self._next_open_s = Backoff(LONGEST_WAIT_S), -math.inf
         self._asking: Transaction[float] | None = None  # of the setting-up, while its answer is awaited
         self._ask_again_s = -math.inf
-        self._heard, self._problem = Heard(), ""
+        self._sent = self._came = b""  # the first bytes since a question was asked
+        self._problem = ""
         next(self._protocol.connect(watchdog_ms))  # what no controller can be asked for is an error at once
         if connect_s:
             self._connect(connect_s)
@@ -259,7 +262,7 @@ class SerialMotor:
     def _begun(self, transaction: Transaction[T]) -> Transaction[T]:
         """Discard replies to earlier commands, and send the first bytes of a transaction."""
         self._framer.reset()
-        self._heard = Heard()
+        self._sent = self._came = b""
         with self._on_port():
             if self._port is not None:
                 self._port.reset_input_buffer()
@@ -278,7 +281,7 @@ class SerialMotor:
                 overdue = time.monotonic() >= deadline_s
                 with self._on_port():
                     data = self._read(deadline_s)
-                    self._heard.came(data)
+                    self._came = (self._came + data)[:HEARD_BYTES]
                     for frame in self._framer.feed(data):
                         self._write(transaction.send(frame))
         except StopIteration as done:
@@ -301,7 +304,7 @@ class SerialMotor:
 
     def _write(self, data: bytes) -> None:
         """Write all data at once; raise NoReplyError if the output buffer is full, as the other end does not read."""
-        self._heard.sent(data)
+        self._sent = (self._sent + data)[:HEARD_BYTES]
         if data and self._port is not None:
             with contextlib.suppress(BlockingIOError):
                 if os.write(self._port.fileno(), data) == len(data):
@@ -329,10 +332,11 @@ class SerialMotor:
         try:
             transaction.throw(NoReplyError())
         except NoReplyError as error:
-            found = "" if self._heard.is_echo else str(error)
+            found = "" if _is_echo(self._sent, self._came) else str(error)
         except StopIteration:
             pass
-        return NoReplyError(f"motor on {self._name}{f': {found}' if found else f' {self._heard.words(self._baud)}'}")
+        found = f": {found}" if found else f" {_heard(self._sent, self._came, self._baud)}"
+        return NoReplyError(f"motor on {self._name}{found}")
 
 
 def _opened(port: str, baud: int) -> serial.Serial:
@@ -355,6 +359,30 @@ def _opened(port: str, baud: int) -> serial.Serial:
             f"motor port {port!r} at {baud} baud cannot be opened: "
             f"{reason or _one_line(error) + '; is it a serial port?'}"
         ) from None
+
+
+def _is_echo(sent: bytes, came: bytes) -> bool:
+    """True if what comes back is what was sent."""
+    return len(came) > 3 and came[: len(sent)] == sent[: len(came)]
+
+
+def _heard(sent: bytes, came: bytes, baud: int) -> str:
+    """Return in words what came from a port instead of an answer, and what makes a port send that."""
+    if not came:
+        return f"gave no answer, not a byte; check power, cable, the baud rate ({baud}) and motor.protocol"
+    if _is_echo(sent, came):
+        return (
+            "gave no answer of its own: what comes back is what was sent; are TX and RX joined, or does the "
+            "adapter echo (RS-485)?"
+        )
+    # Text, or bytes as another baud rate makes them.
+    if sum(byte in _TEXT for byte in came) >= 0.95 * len(came):
+        text = came.decode("ascii", "replace").strip()[:40]
+        return f"answers, but not in its protocol: {text!r}; is it another firmware, or another motor.protocol?"
+    return (
+        f"answers, but not in its protocol: bytes as {came[:8].hex(' ')}, which are no text; check the "
+        f"baud rate ({baud}, motor.baud), motor.protocol and the cable"
+    )
 
 
 def _clock_s() -> float:

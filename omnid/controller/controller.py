@@ -56,7 +56,7 @@ class Controller:
         self._period_ns = round(period_s * 1e9)
         self._law = ControlLaw(settings, self._clock_ns())
         self._boots_until_ns = self._clock_ns() + round((boot_s or 0.0) * 1e9)
-        self._told_again, self._tell_ns = Backoff(FIRST_TOLD_S, LONGEST_TOLD_S), 0
+        self._told_again, self._tell_ns = Backoff(LONGEST_TOLD_S, first_s=FIRST_TOLD_S), 0
         self._last_ns = self._due_ns = 0  # the last tick, and when the next one is due
         self._driven_ns = 0  # capture of the newest pose that a command has followed from
         self._motor_stopped = False  # True if the motor controller stopped by itself before the last tick

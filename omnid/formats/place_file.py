@@ -34,7 +34,6 @@ FORMAT: Final = 7  # to be raised where thumbnails or features of a place are co
 # Maps up to version 6 were SQLite databases.
 EARLIER: Final = b"SQLite format 3\0"
 MAX_FILE_BYTES: Final = 1 << 30
-MAX_FEATURES: Final = 4096  # of a keyframe
 MAX_PIXELS: Final = 1 << 15  # width and height of a panorama
 MAX_INTEGER: Final = 1 << 62
 MAX_POSITION_M: Final = 1e5
@@ -217,7 +216,6 @@ def _check(arrays: _Arrays) -> None:
     for numbers in (*counts, links["inliers"], head["dropped"]):
         _require((numbers >= 0) & (numbers < MAX_INTEGER), "a number is outside its range")
     _require(np.abs(keyframes["stamp_ns"]) < MAX_INTEGER, "a stamp is outside its range")
-    _require(keyframes["features"] <= MAX_FEATURES, "a keyframe has too many features")
     _require(np.array(len(views) == keyframes["features"].sum()), "the features are not those of the keyframes")
     for ranges, is_unknown in ((keyframes["scan"], np.isnan(keyframes["scan"])), (np.abs(keyframes["free_m"]), False)):
         _require(is_unknown | ((ranges >= 0) & (ranges <= MAX_RANGE_M)), f"a range is outside 0 to {MAX_RANGE_M:g} m")

@@ -25,7 +25,6 @@ SUFFIX: Final = ".route.json"
 # Limits of what is read, so that any file is refused in bounded time and memory. The longest route that can be taught
 # has MOST_POINTS points and one keyframe at most for each of them, which is less than 4 MB.
 MAX_BYTES: Final = 8 << 20
-MOST_KEYFRAMES: Final = 20_000
 COLUMNS: Final = (
     "x_m",
     "y_m",
@@ -61,7 +60,7 @@ class _Content(_Head, forbid_unknown_fields=True):
     map: Annotated[str, Meta(max_length=4096)]
     columns: Annotated[list[str], Meta(max_length=len(COLUMNS))]
     points: Annotated[list[_Point], Meta(min_length=2, max_length=MOST_POINTS)]
-    keyframes: Annotated[list[tuple[_Number, _Number]], Meta(max_length=MOST_KEYFRAMES)]  # id, stamp [ns]
+    keyframes: Annotated[list[tuple[_Number, _Number]], Meta(max_length=MOST_POINTS)]  # id, stamp [ns]
     crc32: int
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final, NamedTuple, TypeAlias
 
 from drivers.errors import FrameDecodeError
-from drivers.logs.log import LoggedMessage, RecordError
+from drivers.logs.log import MAX_LISTED, LoggedMessage, RecordError
 from drivers.logs.open_log import LogInfo, open_log
 from drivers.logs.ros_messages import IMAGE_TYPES, RosImage
 from omnid.errors import OmnidError
@@ -38,9 +38,6 @@ CLOUD: Final = "cloud"
 DRIVE: Final = "drive"
 TWIST_COMMAND: Final = "cmd/twist"
 IMAGES: Final = (PANORAMA, "lower/image_raw/compressed", "lower/image_raw")  # in the order of preference
-# A larger message is counted and not decoded, so that a damaged file cannot exhaust the memory.
-MAX_MESSAGE_BYTES: Final = 64 * 2**20
-MAX_LISTED: Final = 8  # topics in a message
 
 Content: TypeAlias = Pose | PoseInMap | Diagnostics | Cloud | Scan | TwistRecord | RosImage
 Decoder: TypeAlias = Callable[[LoggedMessage], Content]
@@ -113,7 +110,7 @@ class RecordedMessage(NamedTuple):
 class RecordingReader:
     """Reads the messages of one robot, the one with the given odometry topic (see choose_odometry_topic).
 
-    unreadable: messages left out, by topic: larger than MAX_MESSAGE_BYTES, not of their type, or not finite.
+    unreadable: messages left out, by topic: not of their type, or not finite.
     corrupt: chunks and records of the file left out. damaged: the same, and its missing end. All three are complete
     once all messages are read.
     """
@@ -171,9 +168,6 @@ def _decoder(name: str, kind: str) -> Decoder | None:
 
 
 def _of_bytes(decoder: Callable[[bytes], Content], message: LoggedMessage) -> Content:
-    size = len(message.data())
-    if size > MAX_MESSAGE_BYTES:
-        raise OmnidError(f"a message of {size} bytes: expected at most {MAX_MESSAGE_BYTES}")
     return decoder(message.cdr())
 
 

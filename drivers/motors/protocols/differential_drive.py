@@ -40,6 +40,11 @@ class DifferentialDrive:
         """Turns of a motor per metre of its wheel."""
         return self.gear / (math.tau * self.wheel_radius_m)
 
+    @property
+    def rpm_per_mps(self) -> float:
+        """Turns of a motor per minute at 1 m/s of its wheel."""
+        return 60 * self.turns_per_m
+
     def limited(self, command: VelocityCommand, max_wheel_mps: float = math.inf) -> tuple[float, float]:
         """Return velocity [m/s] and yaw rate [rad/s], scaled by one factor where a wheel would be too fast.
 

@@ -24,7 +24,6 @@ from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.motor_protocol import NoReplyError, TextFramer, Transaction, require_watchdog
 
 MAX_RPM = 65535
-S_PER_MIN = 60
 
 _REPLY = re.compile(rb"([A-Z]{1,6})=(-?[0-9]{1,10}(?::-?[0-9]{1,10}){0,9})")
 _ECHO = re.compile(rb"[!^~?%#].*", re.DOTALL)
@@ -37,7 +36,7 @@ class Roboteq:
 
     def __init__(self, drive: DifferentialDrive) -> None:
         self.bad_frames = 0
-        self._drive, self._rpm_per_mps = drive, S_PER_MIN * drive.turns_per_m
+        self._drive, self._rpm_per_mps = drive, drive.rpm_per_mps
 
     def framer(self) -> TextFramer:
         """Return a framer of lines."""

@@ -30,7 +30,6 @@ SET_RPM, GET_APPCONF, FORWARD_CAN, GET_VALUES_SELECTIVE = 8, 17, 34, 50  # COMM_
 MASK = 1 << 7 | 1 << 8 | 1 << 15 | 1 << 17 | 1 << 21  # erpm, input voltage, fault, id, status
 MAX_PAYLOAD = 512  # bytes; PACKET_MAX_PL_LEN in packet.h
 MAX_ERPM = 0x7FFFFFFF  # int32
-S_PER_MIN = 60
 SHORT, LONG, END = 2, 3, 3  # first byte of a packet, also the size of its head: 1 or 2 bytes of length; last byte
 _TAIL_BYTES = 3  # CRC and END
 _MIN_LONG_PAYLOAD = 255
@@ -141,7 +140,7 @@ class Vesc:
 
     def drive(self, command: VelocityCommand, now_s: float) -> Transaction[MotorStatus]:
         """Send the queries, then both speeds, at once; a speed sent before would clear an expired timeout."""
-        erpm_per_mps = S_PER_MIN * self._drive.turns_per_m * self._drive.pole_pairs
+        erpm_per_mps = self._drive.rpm_per_mps * self._drive.pole_pairs
         speeds = self._drive.channels(command, MAX_ERPM / erpm_per_mps)
         commands = [struct.pack(">Bi", SET_RPM, round(mps * erpm_per_mps)) for mps in speeds]
         packets = packet(commands[0]) + packet(forwarded(self._drive.can_id, commands[1]))

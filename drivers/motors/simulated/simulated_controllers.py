@@ -19,7 +19,7 @@ from drivers.motors.protocols.line_protocol import (
 )
 from drivers.motors.protocols.motor_protocol import TextFramer
 from drivers.motors.protocols.odrive_ascii import CLOSED_LOOP, WATCHDOG_EXPIRED, with_checksum
-from drivers.motors.protocols.roboteq import MAX_RPM, S_PER_MIN
+from drivers.motors.protocols.roboteq import MAX_RPM
 from drivers.motors.protocols.vesc import (
     FORWARD_CAN,
     GET_APPCONF,
@@ -91,7 +91,7 @@ class SimulatedRoboteq(SimulatedFirmware):
         return echo + (self._reply(frame) or self._reject(b"-")) + b"\r"
 
     def _reply(self, line: bytes) -> bytes | None:
-        base, rpm_per_mps = self.base, S_PER_MIN * self.base.drive.turns_per_m
+        base, rpm_per_mps = self.base, self.base.drive.rpm_per_mps
         if command := re.fullmatch(rb"!S ([12]) (-?[0-9]{1,5})", line):
             if abs(int(command[2])) > MAX_RPM:
                 return None
@@ -218,7 +218,7 @@ class SimulatedVesc(SimulatedFirmware):
     def _reply(self, channel: int, payload: bytes) -> bytes:
         base = self.base
         can_id = base.drive.can_id if channel else _LOCAL_ID
-        erpm_per_mps = S_PER_MIN * base.drive.turns_per_m * base.drive.pole_pairs
+        erpm_per_mps = base.drive.rpm_per_mps * base.drive.pole_pairs
         if _ARGUMENT_BYTES.get(payload[0]) != len(payload) - 1:
             return self._reject(b"")
         if payload[0] == GET_APPCONF:  # signature, id, timeout, and a filling that makes it a long packet

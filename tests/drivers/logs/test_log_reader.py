@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -71,29 +70,14 @@ def test_a_real_log_gives_every_frame_in_order(name: str, count: int) -> None:
     assert (reader.truncated, reader.warnings, reader.pair_estimate()) == (False, [], count)
 
 
-@pytest.mark.parametrize(
-    ("encoding", "to_gray"),
-    [
-        ("mono8", lambda p: p[..., 0]),
-        ("8UC1", lambda p: p[..., 0]),
-        ("bgr8", lambda p: cv2.cvtColor(np.ascontiguousarray(p[..., :3]), cv2.COLOR_BGR2GRAY)),
-        ("8UC3", lambda p: cv2.cvtColor(np.ascontiguousarray(p[..., :3]), cv2.COLOR_BGR2GRAY)),
-        ("rgb8", lambda p: cv2.cvtColor(np.ascontiguousarray(p[..., :3]), cv2.COLOR_RGB2GRAY)),
-        ("bgra8", lambda p: cv2.cvtColor(p, cv2.COLOR_BGRA2GRAY)),
-        ("rgba8", lambda p: cv2.cvtColor(p, cv2.COLOR_RGBA2GRAY)),
-    ],
-)
 @pytest.mark.parametrize("little_endian", [True, False])
-def test_raw_images(
-    tmp_path: Path, encoding: str, to_gray: Callable[[NDArray[Any]], NDArray[Any]], little_endian: bool
-) -> None:
-    pixels = np.random.default_rng(2).integers(0, 256, (9, 14, 4), np.uint8)
-    channels = {"mono8": 1, "8UC1": 1, "bgr8": 3, "8UC3": 3, "rgb8": 3}.get(encoding, 4)
-    data = image_message(START_NS, encoding, pixels[..., :channels], little_endian=little_endian)
+def test_raw_images_by_the_names_of_cv_bridge(tmp_path: Path, little_endian: bool) -> None:
+    pixels = np.random.default_rng(2).integers(0, 256, (9, 14, 3), np.uint8)
+    data = image_message(START_NS, "8UC3", pixels, little_endian=little_endian)
     frames, _ = read(write_log(tmp_path / "log.mcap", [Entry(t, IMAGE, data, 0) for t in ("/cam/top", "/cam/bottom")]))
     assert [frame.camera for frame in frames] == ["lower", "upper"]
     for frame in frames:
-        np.testing.assert_array_equal(gray(frame), to_gray(pixels))
+        np.testing.assert_array_equal(gray(frame), cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY))
 
 
 @pytest.mark.parametrize("encoding", ["yuv422", "yuv422_yuy2"])

@@ -23,7 +23,7 @@ from drivers.logs.log import RecordError, unpack_zstd
 from drivers.logs.log_reader import LogReader
 from drivers.logs.mcap_file import MAGIC
 from drivers.logs.open_log import open_log
-from tests.drivers.logs.mcap_logs import IMAGE, LOWER, UPPER, pairs, write_log
+from tests.drivers.logs.mcap_logs import IMAGE, LOWER, UPPER, compressed, jpeg, pairs, write_log
 from tests.drivers.logs.test_formats import is_one_fault, read, survivors
 
 COMPRESSIONS: Final = (CompressionType.LZ4, CompressionType.ZSTD, CompressionType.NONE)
@@ -123,7 +123,7 @@ def test_a_compressed_message_unpacks_to_a_bounded_size() -> None:
 @pytest.mark.parametrize("order", ["as taken", "camera by camera"])
 def test_memory_does_not_grow_with_the_log(tmp_path: Path, order: str) -> None:
     noise = np.random.default_rng(0).bytes(200_000)
-    entries = [entry._replace(data=entry.data + noise) for entry in pairs(100)]
+    entries = [entry._replace(data=compressed(entry.log_time_ns, jpeg(1) + noise)) for entry in pairs(100)]
     if order == "camera by camera":
         entries.sort(key=lambda entry: entry.topic)
     path = write_log(tmp_path / "log.mcap", entries, chunk_size=2**20)

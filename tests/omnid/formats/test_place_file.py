@@ -125,7 +125,6 @@ def edit(name: str, field: str, value: object, row: int = 1) -> Callable[[Arrays
         (edit("map", "rig_hash", b"", 0), "the hash of the rig is none"),
         (edit("keyframes", "features", -1), "outside its range"),
         (edit("keyframes", "features", 1), "the features are not those of the keyframes"),
-        (edit("keyframes", "features", 5000), "too many features"),
         (edit("keyframes", "T_map_rect", np.nan), "a pose is not finite"),
         (edit("keyframes", "scan", 1000), "a range is outside"),
         (edit("links", "a", 99), "joins no two keyframes"),
