@@ -87,42 +87,40 @@ class RunCounters:
 _NAME_COLUMNS: Final = 9
 
 
-def summary_entries(counters: RunCounters) -> dict[str, str]:
-    """Return the counters as texts, by name."""
-    states = ", ".join(f"{state} {_share(count, counters.poses)}" for state, count in counters.states.items())
-    entries = {
-        "pairs": str(counters.pairs),
-        "poses": str(counters.poses),
-        "length": f"{counters.length_m:.4f} m",
-        "states": states,
-        "resets": str(counters.resets),
-        "drops": _listed(counters.drops),
-    }
-    if counters.map:
-        entries["map"] = _listed(counters.map)
-    if counters.places:
-        entries["places"] = _listed(counters.places)
-    if counters.motor:
-        motor = counters.motor
-        entries["motor"] = f"{motor['commands']} commands sent, {motor['errors']} errors, {motor['stops']} stops"
-    return entries
+def summary_entries(counters: RunCounters, *, verbose: bool = True) -> dict[str, str]:
+    """Return the counters as texts, by name.
 
-
-def brief_entries(counters: RunCounters) -> dict[str, str]:
-    """Return what everybody wants to know: what was lost, if anything, and last the length and the states."""
-    entries = summary_entries(counters)
-    lost = {name: count for name, count in counters.drops.items() if count}
-    states = {state: count for state, count in counters.states.items() if count}
-    shown = {"poses": f"{counters.poses} of {counters.pairs} pairs of images"}
-    if lost:
-        shown["lost"] = _listed(lost)
-    if counters.resets:
-        shown["resets"] = f"{counters.resets}, after gaps in which the motion is unknown"
+    verbose: all of them, zeros too; else what everybody wants to know: what was lost, and last the length and states.
+    """
+    poses, resets, motor = counters.poses, counters.resets, ""
+    drops = {name: count for name, count in counters.drops.items() if count or verbose}
+    states = {state: count for state, count in counters.states.items() if count or verbose}
     if counters.motor:
-        shown["motor"] = entries["motor"]
-    shown["length"] = entries["length"]
-    shown["states"] = ", ".join(f"{state} {_share(count, counters.poses)}" for state, count in states.items())
-    return shown
+        motor = "{commands} commands sent, {errors} errors, {stops} stops".format_map(counters.motor)
+    length = {"length": f"{counters.length_m:.4f} m"}
+    shared = {"states": ", ".join(f"{state} {count / (poses or 1):.1%}" for state, count in states.items())}
+    if verbose:
+        found = {
+            "pairs": str(counters.pairs),
+            "poses": str(poses),
+            **length,
+            **shared,
+            "resets": str(resets),
+            "drops": _listed(drops),
+            "map": _listed(counters.map),
+            "places": _listed(counters.places),
+            "motor": motor,
+        }
+    else:
+        found = {
+            "poses": f"{poses} of {counters.pairs} pairs of images",
+            "lost": _listed(drops),
+            "resets": f"{resets}, after gaps in which the motion is unknown" if resets else "",
+            "motor": motor,
+            **length,
+            **shared,
+        }
+    return {name: text for name, text in found.items() if text or name == "states"}
 
 
 def run_summary(
@@ -140,7 +138,7 @@ def run_summary(
             f"{r.stage:<11}{r.n:>8}{r.drops:>7}{r.p50_ms:>9.2f}{r.p99_ms:>9.2f}{r.max_ms:>9.2f}" for r in timings if r.n
         ]
         lines.append("")
-    entries = summary_entries(counters) if verbose else brief_entries(counters)
+    entries = summary_entries(counters, verbose=verbose)
     lines += [line for name, text in entries.items() for line in folded_entry(name, text, columns)]
     return "\n".join(lines)
 
@@ -155,10 +153,6 @@ def folded_entry(name: str, text: str, columns: int) -> list[str]:
 
 def _listed(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{name} {count}" for name, count in counts.items())
-
-
-def _share(count: int, total: int) -> str:
-    return f"{count / total:.1%}" if total else "0 %"
 
 
 BAR_COLUMNS = 24

@@ -29,15 +29,16 @@ from omnid.core.control.safety_rules import AWAITED, NO_POSE
 from omnid.core.navigation.situation import WheelState
 from omnid.core.rig.rig_health import RigHealth
 from omnid.diagnostics.load_ladder import PERIOD_S, LoadLadder
-from omnid.diagnostics.part_status import (
+from omnid.diagnostics.status import (
     ImagesStatus,
+    Latency,
+    StatusCollector,
     clock_status,
     floor_status,
     motion_status,
     places_status,
     rig_status,
 )
-from omnid.diagnostics.status import Latency, StatusCollector, StatusSources
 from omnid.engine.flow import nothing
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Stream
 from omnid.engine.kernel_cache import prepare_kernels, read_kept_kernels
@@ -383,17 +384,15 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
         *(part.status for part in (bus, recorder, saver) if part is not None),
     ]
     collect = StatusCollector(
-        StatusSources(
-            graph.telemetry,
-            robot.states(),
-            front_end.pairing,
-            session.statistics,
-            latency.to_pose,
-            controller.statistics if controller is not None else None,
-            commands,
-            tuple(status),
-            clock.monotonic_ns,
-        )
+        graph.telemetry,
+        robot.states(),
+        front_end.pairing,
+        session.statistics,
+        latency.to_pose,
+        controller.statistics if controller is not None else None,
+        commands,
+        status,
+        clock.monotonic_ns,
     )
 
     def give_status() -> None:

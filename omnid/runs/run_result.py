@@ -16,9 +16,8 @@ from drivers.logs.log_reader import LogReader
 from omnid.core.control.motion_monitor import ADVICE
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.places.place_map import PlaceMap
-from omnid.diagnostics.part_status import motion_status
 from omnid.diagnostics.run_summary import RunCounters, RunStatistics, input_warnings
-from omnid.diagnostics.status import stage_status, summary_status
+from omnid.diagnostics.status import motion_status, stage_status, summary_status
 from omnid.engine.telemetry import SummaryRow
 from omnid.errors import OmnidError
 from omnid.formats.ply import write_ply

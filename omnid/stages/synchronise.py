@@ -39,7 +39,6 @@ class Skew:
     def __init__(self) -> None:
         self.mean_ns = math.nan  # running mean
         self.max_ns = 0  # largest absolute value
-        self._settled_ns = math.nan  # running mean once it has averaged over its whole memory
         self._pairs = 0
         self._recent: deque[int] = deque(maxlen=RECENT)
         self.exposure_ns = 0.0  # upper minus lower exposure of the newest pair
@@ -50,14 +49,7 @@ class Skew:
         gain = max(SKEW_GAIN, 1 / self._pairs)
         self.mean_ns = skew_ns if self._pairs == 1 else self.mean_ns + gain * (skew_ns - self.mean_ns)
         self.max_ns = max(self.max_ns, abs(skew_ns))
-        if self._pairs == round(1 / SKEW_GAIN):
-            self._settled_ns = self.mean_ns
         self.exposure_ns = self._between_exposures(skew_ns)
-
-    @property
-    def drift_ns(self) -> float:
-        """Change of the running mean since it had settled; NaN before."""
-        return self.mean_ns - self._settled_ns
 
     def _between_exposures(self, skew_ns: int) -> float:
         """Return the skew without the scatter of the stamps; 0 where the exposures may be simultaneous.

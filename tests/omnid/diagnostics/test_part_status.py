@@ -13,8 +13,8 @@ from omnid.config import Config
 from omnid.core.rig.rig_health import RigHealth
 from omnid.core.stereo.tiles import ALL_LIVE, TILE_COLUMNS, TILE_ROWS, TileStates
 from omnid.diagnostics.load_ladder import OBSERVATIONS_DOWN, OBSERVATIONS_UP, LoadLadder
-from omnid.diagnostics.part_status import LIVE, ImagesStatus, floor_status, rig_status
 from omnid.diagnostics.run_summary import RunCounters, RunStatistics, run_summary
+from omnid.diagnostics.status import LIVE, ImagesStatus, floor_status, rig_status
 from omnid.engine.telemetry import StageStats
 from omnid.load_level import LoadLevel
 from omnid.messages import OdometryUpdate, StereoDepth

@@ -21,7 +21,7 @@ from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControllerSettings
 from omnid.core.control.heading_controller import Setpoint
 from omnid.diagnostics.run_summary import RunStatistics
-from omnid.diagnostics.status import TIMEOUT_S, Latency, StatusCollector, StatusSources
+from omnid.diagnostics.status import TIMEOUT_S, Latency, StatusCollector
 from omnid.engine.telemetry import StageStats, Telemetry
 from omnid.messages import OdometryUpdate
 from omnid.stages.lockstep_drive import controller_pose
@@ -64,28 +64,23 @@ class Daemon:
         self.controller_statistics = ControllerStatistics(self.stages[1])
         self.commands = CommandReceiver(self, Freshness(0.5))
         self.report = StatusCollector(
-            StatusSources(
-                self.telemetry,
-                self.cameras,
-                self.pair,
-                self.statistics,
-                self.latency.to_pose,
-                self.controller_statistics,
-                self.commands,
-            )
+            self.telemetry,
+            self.cameras,
+            self.pair,
+            self.statistics,
+            self.latency.to_pose,
+            self.controller_statistics,
+            self.commands,
         )
 
-    def send_setpoint(self, command: TimedSetpoint) -> None:
-        self.controller.take(command)
+    def send(self, given: TimedSetpoint | ArmRequest) -> None:
+        self.controller.take(given)
 
     def stop(self) -> None:
         self.controller.stop(time.monotonic_ns())
 
     def touch(self, contact: str, *, holds: bool) -> None:
         """Take a contact."""
-
-    def arm(self, request: ArmRequest) -> None:
-        self.controller.take(request)
 
     def collected(self) -> dict[str, DiagnosticStatus]:
         """Return all entries by short name, after encoding them."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from omnid.diagnostics.part_status import clock_status
+from omnid.diagnostics.status import clock_status
 from omnid.engine.robot_clock import RobotClock
 from omnid.transport import codec
 from omnid.transport.codec import OK, WARN

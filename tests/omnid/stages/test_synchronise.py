@@ -146,17 +146,6 @@ def test_samples_go_along_with_the_pair_that_ends_their_step(pair: Synchronise) 
     assert second.motion == (wheels[2], wheels[1], wheels[4], gyro, wheels[3])
 
 
-@pytest.mark.parametrize("drift_ns", [0, 20_000, -20_000])
-def test_finds_the_drift_between_the_cameras(pair: Synchronise, drift_ns: int) -> None:
-    """A drift of 20 us per image is 6 ms within 300 images."""
-    rng = random.Random(7)
-    for index in range(300):
-        noise_ns = rng.randrange(-MS, MS)
-        made(pair, shot("lower", index), shot("upper", index, index * drift_ns + noise_ns))
-    expected_ns = drift_ns * (300 - 50 - 25)  # the slow mean lags by 50 images, the first one by 25
-    assert pair.skew.drift_ns == pytest.approx(expected_ns, abs=0.6 * MS)
-
-
 @pytest.fixture
 def free(rig: Rig) -> Synchronise:
     """Cameras that run freely: the default tolerance."""

@@ -25,7 +25,7 @@ from omnid.core.rig.rig_health import (
     RigContradictedError,
     RigHealth,
 )
-from omnid.diagnostics.part_status import rig_status
+from omnid.diagnostics.status import rig_status
 from omnid.engine.flow import NEWEST
 from omnid.engine.graph import Graph
 from omnid.messages import Panoramas
