@@ -45,6 +45,19 @@ DISTORTIONS: Final[Mapping[str, str]] = {
     "plumb_bob": "opencv",
     "rational_polynomial": "opencv",
 }
+# Models whose files name each number: those of basalt, then those of camodocal, with their names for ours.
+PINHOLE_KEYS: Final = {"fx": "fu", "fy": "fv", "cx": "pu", "cy": "pv"}
+NAMED: Final[Mapping[str, tuple[str, Mapping[str, str]]]] = {
+    **{model: (model, PINHOLE_KEYS) for model in ("ds", "eucm", "ucm", "pinhole", "fov")},
+    "kb4": ("equidistant", PINHOLE_KEYS),
+    "pinhole-radtan8": ("pinhole", PINHOLE_KEYS),
+    "PINHOLE": ("pinhole", PINHOLE_KEYS),
+    "MEI": ("omni", {"gamma1": "fu", "gamma2": "fv", "u0": "pu", "v0": "pv"}),
+    "KANNALA_BRANDT": (
+        "equidistant",
+        {"k2": "k1", "k3": "k2", "k4": "k3", "k5": "k4", "mu": "fu", "mv": "fv", "u0": "pu", "v0": "pv"},
+    ),
+}
 # A camera that is fitted to another model may be this far off anywhere in the image, a few times the error of a corner.
 MAX_CONVERSION_PX: Final = 0.5
 GRID: Final = 24  # Places along each side of the image at which models are compared.
@@ -83,6 +96,19 @@ def camera_of_lists(
         expected = " or ".join(map(str, right_counts))
         raise CalibError(f"distortion_coeffs: expected {expected} numbers, found {len(terms)}")
     return camera_of(model, dict(zip((*keys, *term_keys), (*intrinsics, *terms), strict=False)), size, warn)
+
+
+def camera_of_names(
+    key: str, kind: str, numbers: Mapping[str, float], size: tuple[int, int], warn: Warn = silent
+) -> OmniCamera:
+    """Return the camera of a model of NAMED, whose name is under a key of the file, with named numbers."""
+    if kind not in NAMED:
+        raise CalibError(f"{key}: expected {', '.join(NAMED)}, found {kind!r}")
+    model, names = NAMED[kind]
+    try:
+        return camera_of(model, {names.get(name, name): value for name, value in numbers.items()}, size, warn)
+    except KeyError as error:
+        raise CalibError(f"{kind}: expected the number {error} of its model") from error
 
 
 def camera_of(model: str, values: Mapping[str, float], size: tuple[int, int], warn: Warn = silent) -> OmniCamera:

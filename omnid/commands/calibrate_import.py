@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import argparse
-import os
 import re
 from pathlib import Path
 
 import numpy as np
 
 from calib import se3
-from calib.camera_files import import_pair, is_one_camera
-from calib.equirectangular_file import import_helvipad, stacked_rig
 from calib.errors import CalibError
-from calib.kalibr import import_chain
+from calib.importers import (
+    helvipad_rig,
+    import_chain,
+    import_pair,
+    is_one_camera,
+    read_transform,
+    stacked_rig,
+    straight_up,
+)
 from calib.models.camera import field_of_view
 from calib.models.names import model_name
 from calib.models.ocam import VIEWS, OcamCamera
-from calib.ocam_file import read_transform, straight_up
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import read_rig, write_rig
 from calib.text_files import MAX_JSON_BYTES, load_mapping
@@ -40,7 +44,7 @@ from omnid.sinks.files import check_outputs
         "--lower",
         default="",
         help="the lower camera: its name in the camchain (cam0), or its file: OCamCalib's calib_results.txt, ROS's "
-        "camera_info, OpenCV's, EuRoC's sensor.yaml, camodocal's; with Helvipad's calibration.json a folder of images",
+        "camera_info, OpenCV's, EuRoC's sensor.yaml, camodocal's",
     ),
     option("--upper", default="", help="the same for the upper camera"),
     exclusive(
@@ -78,7 +82,7 @@ from omnid.sinks.files import check_outputs
 )
 def run(args: argparse.Namespace) -> int:
     """Write the rig of another program, and print one line about it."""
-    _must_be_writable(args.output)
+    check_outputs([("--output", args.output)], [("a file that is read", path) for path in _read_files(args)])
     rig = with_height(_imported(args), args)
     for side, mounted in (("lower", rig.lower), ("upper", rig.upper)):
         if np.isnan(field_of_view(mounted.camera, mounted.visible)[0]):
@@ -109,12 +113,10 @@ def _must_lose_nothing(path: Path, rig: Rig) -> None:
         )
 
 
-def _must_be_writable(path: Path) -> None:
-    existing = path if path.exists() else path.parent
-    if not path.parent.is_dir():
-        raise OmnidError(f"--output {path}: there is no folder {path.parent}; make it first")
-    if not os.access(existing, os.W_OK):
-        raise OmnidError(f"--output {path}: {existing} is not writable")
+def _read_files(args: argparse.Namespace) -> list[Path]:
+    if args.camchain is not None:
+        return [args.camchain]
+    return [Path(path) for path in (args.lower, args.upper, args.transform) if path]
 
 
 def _imported(args: argparse.Namespace) -> Rig:
@@ -124,27 +126,17 @@ def _imported(args: argparse.Namespace) -> Rig:
         return _pair(args)
     if args.camchain.suffix == ".toml":
         raise OmnidError(f"{args.camchain}: a rig.toml needs no import: use it as it is, --rig {args.camchain}")
-    check_outputs([("--output", args.output)], [("the file that is read", args.camchain)])
     values = load_mapping(read_bytes(args.camchain, MAX_JSON_BYTES), str(args.camchain))
     if is_one_camera(values):
         raise OmnidError(f"{args.camchain}: it has one camera: give the files of both as --lower FILE --upper FILE")
     if "stereo_baseline" in values:
-        return _helvipad(args)
+        return helvipad_rig(values, str(args.camchain))
     if args.transform or args.baseline is not None or args.view:
         raise OmnidError(
             f"{args.camchain}: --transform, --baseline and --view go with files of one camera each; this one holds its "
             "transforms"
         )
     return import_chain(args.camchain, args.lower, args.upper, args.frame, warn)
-
-
-def _helvipad(args: argparse.Namespace) -> Rig:
-    if not args.lower:
-        raise OmnidError(
-            f"{args.camchain}: it does not tell the size of the images: give --lower FOLDER, the folder of the lower "
-            "camera's images"
-        )
-    return import_helvipad(args.camchain, Path(args.lower))
 
 
 def _stitched(args: argparse.Namespace) -> Rig:
@@ -164,8 +156,6 @@ def _pair(args: argparse.Namespace) -> Rig:
         raise OmnidError(
             "calibrate import: expected a Kalibr camchain.yaml, or two files of one camera each as --lower and --upper"
         )
-    read = [Path(args.lower), Path(args.upper), *([args.transform] if args.transform else [])]
-    check_outputs([("--output", args.output)], [("a file that is read", path) for path in read])
     T_lower_upper = None
     if args.transform or args.baseline is not None:
         T_lower_upper = read_transform(args.transform) if args.transform else straight_up(args.baseline)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 import omnid
 from calib import se3
-from calib.kalibr import import_chain
+from calib.importers import import_chain
 from calib.rig import Rig
 from calib.rig_file import read_rig, write_rig
 from omnid.diagnostics.run_summary import summary_entries

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from calib import se3
-from calib.camera_files import import_pair, read_camera
 from calib.errors import CalibError
-from calib.kalibr import parse_chain
+from calib.importers import import_pair, parse_chain, read_camera
 from calib.models.camera import Array, OmniCamera
 from calib.models.lens import DoubleSphereCamera, EquidistantCamera, ExtendedUnifiedCamera
 from calib.models.ocam import OcamCamera
@@ -110,15 +109,15 @@ def test_names_an_inverted_transform() -> None:
     assert read.upper.viewpoint == pytest.approx([0, 0, 0.2012], abs=1e-4) and "is the inverse" in lines[-1]
 
 
-@pytest.mark.parametrize(("T", "lower"), [(T_AHEAD, "cam0"), (se3.inverse(T_AHEAD), "cam1")])
-def test_images_tell_the_lower_of_two_cameras_that_look_ahead(T: Array, lower: str) -> None:
+def test_x_of_a_rig_whose_cameras_look_ahead_is_ahead() -> None:
     camera = (
         "\n  camera_model: pinhole\n  intrinsics: [225.0, 228.0, 380.0, 390.0]\n  distortion_model: radtan\n"
         "  distortion_coeffs: [-0.1, 0.01, 0.001, 0.0002]\n  resolution: [768, 770]\n"
     )
-    lines = list[str]()
-    rig = parse_chain(f"cam0:{camera}cam1:{camera}  T_cn_cnm1: {T.tolist()}\n", warn=lines.append)
-    assert len(lines) == 1 and f"lower is {lower} by what is below in the images" in lines[0]
+    text = f"cam0:{camera}cam1:{camera}  T_cn_cnm1: {T_AHEAD.tolist()}\n"
+    with pytest.raises(CalibError, match="neither topics nor heights identify the lower camera; name it"):
+        parse_chain(text)
+    rig = parse_chain(text, lower="cam0")
     assert rig.lower.T_cam_rig[2, 0] > 0.99, "x of the rig is ahead, along the optical axes"
     assert rig.lower.T_cam_rig[0, 1] < -0.99, "y is to the left"
 
@@ -172,7 +171,7 @@ def test_reads_basalts_calibration(text: str, expected: OmniCamera) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (basalt("bal"), "camera_type: expected ds, kb4, eucm, ucm, pinhole, pinhole-radtan8, fov, found 'bal'"),
+        (basalt("bal"), "camera_type: expected ds, eucm, ucm, .* found 'bal'"),
         (basalt("ds", xi=-0.27), "expected the number 'alpha' of its model"),
         ('{"value0": {"T_imu_cam": []}}', "expected basalt's calibration with T_imu_cam, intrinsics and resolution"),
         ("<?xml version='1.0'?>\n<opencv_storage></opencv_storage>", "it is XML: write it as .yml, with OpenCV's"),

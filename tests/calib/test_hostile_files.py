@@ -10,8 +10,8 @@ from itertools import pairwise
 import pytest
 
 from calib.errors import CalibError
+from calib.importers import parse_ocam
 from calib.models.unified import UnifiedCamera
-from calib.ocam_file import parse_ocam
 from calib.panorama import fit_cylinder
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import parse_rig, rig_toml
@@ -58,7 +58,7 @@ def test_refuses_a_rig_that_would_fill_the_memory(text: str, reason: str) -> Non
 
 def test_refuses_yaml_aliases() -> None:
     text = "a: &a [x, x]\n" + "".join(f"{b}: &{b} [*{a}, *{a}, *{a}, *{a}]\n" for a, b in pairwise("abcdefghijklmnop"))
-    assert "no anchors and aliases" in refusal("kalibr", "parse_chain", repr(f"{text}cam0: *p\ncam1: *p\n"))
+    assert "no anchors and aliases" in refusal("importers", "parse_chain", repr(f"{text}cam0: *p\ncam1: *p\n"))
 
 
 @pytest.mark.parametrize(
@@ -71,12 +71,12 @@ def test_refuses_yaml_aliases() -> None:
     ],
 )
 def test_refuses_yaml_beyond_its_limits(text: str, reason: str) -> None:
-    assert reason in refusal("kalibr", "parse_chain", text)
+    assert reason in refusal("importers", "parse_chain", text)
 
 
 @pytest.mark.parametrize("text", ["'1\\n' * 7_000_000", "'1 ' * 7_000_000"])
 def test_refuses_a_long_ocam_file(text: str) -> None:
-    assert "at most 65536 bytes" in refusal("ocam_file", "parse_ocam", text)
+    assert "at most 65536 bytes" in refusal("importers", "parse_ocam", text)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 from calib import se3
 from calib.errors import CalibError
 from calib.fit.parameters import central_names
-from calib.kalibr import import_chain, parse_chain
+from calib.importers import import_chain, parse_chain
 from calib.models.camera import Array, OmniCamera
 from calib.models.lens import DoubleSphereCamera, EquidistantCamera, ExtendedUnifiedCamera
 from calib.models.unified import UnifiedCamera

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from calib import se3
-from calib.camera_files import import_pair
 from calib.errors import CalibError
+from calib.importers import import_pair, parse_ocam, read_transform
 from calib.models.ocam import OcamCamera
-from calib.ocam_file import parse_ocam, read_transform
 
 # The layout of the toolbox's own export, with own numbers.
 TEXT = """#polynomial coefficients for the DIRECT mapping function (ocam_model.ss in MATLAB). Used by cam2world

@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from rosbags.typesys import Stores, get_typestore
 
 from calib import se3
-from calib.kalibr import import_chain
+from calib.importers import import_chain
 from calib.models.camera import Array, OmniCamera
 from calib.models.lens import DoubleSphereCamera
 from calib.models.names import sees_directly

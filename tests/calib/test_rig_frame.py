@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calib import se3
-from calib.ocam_file import straight_up
+from calib.importers import straight_up
 from calib.rig_frame import is_turned_over, rig_between
 from tests.calib.test_rig import parabolic_ocam, parabolic_omni
 from tests.simulation.rigs import LENSES, lens, lens_rig

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from rosbags.typesys import Stores, get_typestore
 
-from calib.kalibr import import_chain
+from calib.importers import import_chain
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import rig_toml

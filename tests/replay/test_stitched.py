@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calib.equirectangular_file import stacked_rig
+from calib.importers import stacked_rig
 from omnid.simulation.rendering.sensor import MountedSensor, Sensor
 from tests.replay.command import Command
 from tests.simulation import corridor, paths, render_grey, tum

@@ -20,8 +20,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from calib.errors import CalibError
-from calib.kalibr import parse_chain
-from calib.ocam_file import parse_ocam
+from calib.importers import parse_chain, parse_ocam
 from calib.rig_file import parse_rig
 from drivers.errors import DriverError
 from drivers.frame import gray

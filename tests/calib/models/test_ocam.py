@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from calib.importers import parse_ocam
 from calib.models.camera import Array
 from calib.models.ocam import View
-from calib.ocam_file import parse_ocam
 
 KEYS = ("ocam_std", "ocam_subpix")
 
