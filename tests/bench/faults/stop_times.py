@@ -17,7 +17,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from tests.bench.faults.trials.trial import FAULTY_DAEMON
+from tests.bench.faults.trials import FAULTY_DAEMON
 from tests.bench.results import Column, ResultTable
 from tests.replay.live import Base, Daemon, Operator, robot
 from tests.waiting import wait_until

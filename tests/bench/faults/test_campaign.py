@@ -2,30 +2,17 @@
 
 from __future__ import annotations
 
-import random
 from pathlib import Path
 
 import pytest
 
 from tests.bench.faults import hostile_commands, stop_times
 from tests.bench.faults.hostile_files import FORMATS, attack, short_run
-from tests.bench.faults.mutation import mutated
+from tests.bench.faults.trials import TRIALS, Setting
 
 
-@pytest.fixture(scope="module")
-def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return short_run(tmp_path_factory.mktemp("short"))
-
-
-def test_mutations_are_repeatable_and_differ() -> None:
-    data = bytes(range(256))
-    once, twice = ([mutated(random.Random(seed), data) for seed in range(200)] for _ in range(2))
-    assert once == twice
-    assert len(set(once)) > 190 and data not in once
-
-
-def test_mutated_files_give_a_result_or_one_line(short: Path) -> None:
-    memory_mb, found = attack(",".join(FORMATS), short, 60, seed=7)
+def test_mutated_files_give_a_result_or_one_line(tmp_path: Path) -> None:
+    memory_mb, found = attack(",".join(FORMATS), short_run(tmp_path), 60, seed=7)
     assert found == [] and 0 < memory_mb < 400
 
 
@@ -41,3 +28,10 @@ def test_mutated_commands_never_move_the_wheels(tmp_path: Path, course: Path, mo
 def test_the_wheels_come_to_rest(tmp_path: Path, course: Path, name: str) -> None:
     times = stop_times.stop_times(course, tmp_path / "stops", name, 2, seed=7)
     assert len(times) == 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", TRIALS)
+def test_no_fault_ends_the_daemon_or_moves_the_wheels(tmp_path: Path, course: Path, fault: str) -> None:
+    (tmp_path / "in").mkdir()
+    assert TRIALS[fault](Setting(course, tmp_path / "in")).process
