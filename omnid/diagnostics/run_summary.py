@@ -210,10 +210,9 @@ class Progress:
             self._stream.flush()
 
 
-DARK_SHARE: Final = 0.1  # Share of dark pairs from which there is a warning.
-LOST_PARTS_SHARE: Final = 0.1  # Share of pairs with lost parts from which there is a warning.
-# Share of pairs without a sure pose; a smaller one is a gap, whose first pose may imply any speed.
-UNSURE_SHARE: Final = 0.1
+# Share of the pairs that were dark, had lost parts or no sure pose, from which there is a warning. Fewer pairs without
+# a sure pose are a gap, whose first pose may imply any speed.
+NOTABLE_SHARE: Final = 0.1
 REPEATED: Final = {
     "drop": "their pairs were left out; a simulator without noise needs pair.repeated_images = 'use'",
     "use": "they were used, as pair.repeated_images says",
@@ -251,20 +250,20 @@ def _image_warnings(pairing: Synchronise, config: Config) -> Iterator[str]:
 
 def _pose_warnings(statistics: RunStatistics, config: Config) -> Iterator[str]:
     """Yield the problems that the odometry has met: dark pairs, parts of images without use, lost poses."""
-    if statistics.dark > statistics.poses * DARK_SHARE:
+    if statistics.dark > statistics.poses * NOTABLE_SHARE:
         yield (
             f"it was too dark in {statistics.dark} of {statistics.poses} pairs: the images have more noise than "
             "contrast; more light, a longer exposure (cameras.exposure_us) or less gain"
         )
     for camera, pairs in statistics.lost_parts.items():
-        if pairs > statistics.poses * LOST_PARTS_SHARE:
+        if pairs > statistics.poses * NOTABLE_SHARE:
             yield (
                 f"a part of the {camera} camera's image was frozen, dark, saturated or blurred in {pairs} of "
                 f"{statistics.poses} pairs: it was not used; clean the mirror, check the camera and its driver"
             )
     lost = statistics.states[TrackingState.LOST]
     unsure = lost + statistics.states[TrackingState.DEGRADED]
-    if statistics.too_fast and unsure > statistics.poses * UNSURE_SHARE:
+    if statistics.too_fast and unsure > statistics.poses * NOTABLE_SHARE:
         yield (
             f"the pose was lost or degraded in {unsure} of {statistics.poses} pairs, and the images show up to "
             f"{statistics.fastest_mps:.1f} m/s: poses that imply more than odometry.limits.max_speed_mps = "

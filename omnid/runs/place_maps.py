@@ -55,58 +55,44 @@ class RunPlaces:
         A file that does not exist is made by this run, unless it only localises.
         Raises OmnidError for a file that is no map, or that of another rig.
         """
-        settings, self._warn = config.places, warn
-        _require_consistent(settings)
-        uses_file = settings.map and given is None and not build
-        self._path = Path(settings.map) if uses_file else None
+        settings, self._warn, self._rig = config.places, warn, place_rig(geometry)
+        if settings.map and not settings.enabled:
+            raise OmnidError("places.map (--map) needs places.enabled = true: leave one of them out")
+        if settings.localize_only and not settings.map:
+            raise OmnidError("places.localize_only (--localize-only) needs a map: add --map FILE.omap, or leave it out")
+        # 1. The map: that which was given, that of the file, a new one, or none.
+        self._path = Path(settings.map) if settings.map and given is None and not build else None
+        self.is_extended = self._path is not None and not settings.localize_only  # this run writes the file
         self._version = None if self._path is None else _version(self._path)
-        self._writes = self._path is not None and not settings.localize_only
-        self._rig = place_rig(geometry)
-        if self._path is not None:
-            given = self._read(self._path, settings)
-        begins = build or (self._path is not None and given is None)
-        self.places: PlaceMap | None = None
-        if given is not None:
-            self.places = given.places
-        elif begins:
-            self.places = new_places(settings)
         self.written: Path | None = None  # the file, once the run has written it
+        if self._path is not None:
+            if self.is_extended:
+                check_outputs([("--map", self._path)], [])
+            if self.is_extended and not self._path.exists():
+                warn(f"{self._path}: there is no such map: this run begins a new one")
+            else:
+                given = RigPlaces(*read_places(self._path, new_places(settings)))
+        self.places: PlaceMap | None = None
+        if given is not None or build or self._path is not None:
+            self.places = new_places(settings) if given is None else given.places
         self._saved = frozenset[int]()  # keyframes in the file
         self._known = frozenset(given.places.keyframes) if given else frozenset[int]()
+        # 2. It must fit the rig, and is adapted to the panoramas of this run.
         if given is not None and self._known:
-            self._compare(given)
-
-    def _read(self, path: Path, settings: PlacesConfig) -> RigPlaces | None:
-        """Return the map of the file; None, with a warning, where this run begins it."""
-        if self._writes:
-            check_outputs([("--map", path)], [])
-            if not path.exists():
-                self._warn(f"{path}: there is no such map: this run begins a new one")
-                return None
-        return RigPlaces(*read_places(path, new_places(settings)))
+            name = self._path or "the map"
+            if difference := given.rig.difference(self._rig):
+                raise OmnidError(
+                    f"{name}: this map was made with {difference}: build one with this rig, by `omnid map build`"
+                )
+            if given.rig.rig_hash != self._rig.rig_hash:
+                warn(f"{name}: the rig was calibrated again since this map was made")
+            self._rig.adapt(given.places, given.rig)
 
     def known_to(self, parts: Parts) -> Parts:
         """Return the parts of the run with this map, if there is one."""
         if self.places is None:
             return parts
-        return replace(parts, known_places=self.places, localize_only=self._path is not None and not self._writes)
-
-    def _compare(self, given: RigPlaces) -> None:
-        """Check that the map fits the rig, and adapt it to the panoramas of this run."""
-        name = self._path or "the map"
-        difference = given.rig.difference(self._rig)
-        if difference:
-            raise OmnidError(
-                f"{name}: this map was made with {difference}: build one with this rig, by `omnid map build`"
-            )
-        if given.rig.rig_hash != self._rig.rig_hash:
-            self._warn(f"{name}: the rig was calibrated again since this map was made")
-        self._rig.adapt(given.places, given.rig)
-
-    @property
-    def is_extended(self) -> bool:
-        """True if the file of the map is written by this run."""
-        return self._writes
+        return replace(parts, known_places=self.places, localize_only=self._path is not None and not self.is_extended)
 
     def save(self, places: PlaceMap) -> bool:
         """Write the joined part of a copy of the map; return False if the part has nothing new.
@@ -149,9 +135,9 @@ class RunPlaces:
             self._warn(f"{name}: no place of it was recognised: nothing was added to it")
         elif unjoined:
             self._warn(f"{name}: {unjoined} keyframes after a gap were recognised nowhere: they were left out")
-        if self._path is not None and self._writes and new:
+        if self._path is not None and self.is_extended and new:
             self._write(self._path, self.places)
-        elif self._path is not None and self._writes and not self._known:
+        elif self._path is not None and self.is_extended and not self._known:
             self._warn(f"{self._path}: no keyframe was found: no map was written")
         return found
 
@@ -200,13 +186,6 @@ def _unmasked(camera: MountedCamera) -> MountedCamera:
     return replace(camera, mask=None)
 
 
-def _require_consistent(settings: PlacesConfig) -> None:
-    if settings.map and not settings.enabled:
-        raise OmnidError("places.map (--map) needs places.enabled = true: leave one of them out")
-    if settings.localize_only and not settings.map:
-        raise OmnidError("places.localize_only (--localize-only) needs a map: add --map FILE.omap, or leave it out")
-
-
 _LONGEST_REQUEST: Final = 64  # bytes
 
 
@@ -235,13 +214,13 @@ class MapSaver:
         copy = self._places.take_copy()
         if copy is not None:
             answer = self._save(copy)
-            while self._waiting:
-                self._answer(self._waiting.popleft(), answer)
+            for id in self._waiting:
+                self._answer(id, answer)
+            self._waiting.clear()
         self._ticks += 1
         if self._ticks >= self._every or self._asked:
             self._ticks = 0
-            while self._asked:
-                self._waiting.append(self._asked.popleft())
+            self._waiting.extend(self._asked.popleft() for _ in range(len(self._asked)))
             self._places.want_copy()
 
     def receive(self, request: Request) -> Answer | None:

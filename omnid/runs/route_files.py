@@ -21,8 +21,8 @@ from omnid.errors import OmnidError
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import NavigationUpdate
 from omnid.stages.routes import refusal_of_name
+from omnid.transport.requests import MOST_OPEN
 
-MOST_WAITING: Final = 64  # requests, as many as may wait in front of the stage
 LONGEST_WAIT_S: Final = 5.0  # A robot that sets out later than this after the request surprises people.
 
 
@@ -60,7 +60,7 @@ class RouteFiles:
         """Take a request; it waits for its file, if it needs one, and for waiting requests before it; halts do not."""
         if is_halt(command.request) or not (self._waiting or _needs_file(command.request)):
             self._pass_on(command)
-        elif len(self._waiting) >= MOST_WAITING:
+        elif len(self._waiting) >= MOST_OPEN:
             self._pass_on(command._replace(refusal="too many requests wait for files: ask again"))
         else:
             self._waiting.append(_Waiting(command, time.monotonic(), self._halts()))

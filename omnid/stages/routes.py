@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +18,6 @@ from omnid.messages import MapKeyframes
 from omnid.tracking_state import MapState
 
 Array = NDArray[np.float64]
-
-
-MOST_NOTED: Final = 200  # keyframes that identify a map: a route of the same map has most of them
 
 
 class RouteMap:
@@ -45,12 +40,6 @@ class RouteMap:
             return None
         T_map_rig = self._T_rig_rect @ T_map_rect @ self._T_rect_rig
         return KeyframePose(self.keyframes.stamps_ns[id], planar(self._T_base_rig @ T_map_rig @ self._T_rig_base))
-
-    def noted(self) -> Mapping[int, int]:
-        """Return stamps of some keyframes, evenly over the map."""
-        stamps_ns = self.keyframes.stamps_ns
-        chosen = list(stamps_ns)[:: max(1, len(stamps_ns) // MOST_NOTED)]
-        return {id: stamps_ns[id] for id in chosen}
 
 
 def refusal_of_name(name: str) -> str:
@@ -130,7 +119,7 @@ class Routes:
         if self.taught is not None:
             raise OmnidError(f"the route {self.taught.route.name} is being written: wait for its end")
         places = self._map()
-        route = self._recorder.route(places.keyframe, places.noted(), created_s, places.name)
+        route = self._recorder.route(places.keyframe, places.keyframes.stamps_ns, created_s, places.name)
         self.taught, self._finished, self._recorder = TaughtRoute(route, id), self._recorder, None
 
     def written(self, refusal: str) -> None:

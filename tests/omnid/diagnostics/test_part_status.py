@@ -12,7 +12,7 @@ from calib.panorama import fit_cylinder
 from omnid.config import Config
 from omnid.core.rig.rig_health import RigHealth
 from omnid.core.stereo.tiles import ALL_LIVE, TILE_COLUMNS, TILE_ROWS, TileStates
-from omnid.diagnostics.load_ladder import OBSERVATIONS_DOWN, OBSERVATIONS_UP, LoadLadder
+from omnid.diagnostics.load_ladder import PATIENCE, LoadLadder
 from omnid.diagnostics.run_summary import RunCounters, RunStatistics, run_summary
 from omnid.diagnostics.status import LIVE, ImagesStatus, floor_status, rig_status
 from omnid.engine.telemetry import StageStats
@@ -125,10 +125,14 @@ class Observed:
 
 def test_under_lasting_overload_everything_is_given_up_in_order() -> None:
     observed = Observed()
-    assert observed.level_after(OBSERVATIONS_UP - 1, dropped=30) == 0
-    assert [observed.level_after(1, dropped=30)] + [
-        observed.level_after(OBSERVATIONS_UP, dropped=30) for _ in range(4)
-    ] == [1, 2, 3, 3, 3]
+    assert observed.level_after(1, dropped=30) == 0
+    assert [observed.level_after(1, dropped=30)] + [observed.level_after(2, dropped=30) for _ in range(4)] == [
+        1,
+        2,
+        3,
+        3,
+        3,
+    ]
     assert observed.ladder.level is LoadLevel.REDUCED
 
 
@@ -136,10 +140,10 @@ def test_it_waits_longer_each_time_that_was_too_soon() -> None:
     observed = Observed()
     waits = []
     for _ in range(8):
-        observed.level_after(OBSERVATIONS_UP, dropped=30)
+        observed.level_after(2, dropped=30)
         waits.append(next(k for k in range(1, 1000) if observed.level_after(1, dropped=0) == 0))
-    assert waits[:3] == [OBSERVATIONS_DOWN, 2 * OBSERVATIONS_DOWN, 4 * OBSERVATIONS_DOWN]
-    assert waits[-1] == waits[-2] == 320
+    assert waits[:3] == [PATIENCE[0], 2 * PATIENCE[0], 4 * PATIENCE[0]]
+    assert waits[-1] == waits[-2] == PATIENCE[1]
 
 
 def test_what_everybody_wants_to_know_comes_last_and_zeros_are_left_out() -> None:

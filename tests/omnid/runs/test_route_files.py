@@ -22,7 +22,8 @@ from omnid.formats.route_file import RouteFolder
 from omnid.messages import NavigationUpdate
 from omnid.navigation_state import NavigationState
 from omnid.runs import route_files
-from omnid.runs.route_files import MOST_WAITING, RouteFiles
+from omnid.runs.route_files import RouteFiles
+from omnid.transport.requests import MOST_OPEN
 from tests.omnid.stages.test_navigation import Robot
 
 TEACH, FINISH = RouteRequest(RouteAction.TEACH, "hall"), RouteRequest(RouteAction.FINISH)
@@ -160,12 +161,12 @@ def test_what_waits_for_a_disk_begins_nothing_after_a_stop_or_a_long_time(
 def test_requests_that_wait_for_a_disk_are_bounded(tmp_path: Path) -> None:
     passed: list[NavigationCommand] = []
     files = RouteFiles(RouteFolder(tmp_path), passed.append)
-    for id in range(MOST_WAITING + 3):
+    for id in range(MOST_OPEN + 3):
         files.put(NavigationCommand(REPEAT, 0, id=id))
-    assert [command.id for command in passed] == list(range(MOST_WAITING, MOST_WAITING + 3))
+    assert [command.id for command in passed] == list(range(MOST_OPEN, MOST_OPEN + 3))
     assert all("ask again" in command.refusal for command in passed)
     files()
-    assert len(passed) == MOST_WAITING + 3 and "no route hall" in passed[-1].refusal
+    assert len(passed) == MOST_OPEN + 3 and "no route hall" in passed[-1].refusal
 
 
 @pytest.mark.parametrize("replace", [False, True])

@@ -1,8 +1,9 @@
-"""Pairing by stamps: frames in any order of arrival, unpaired and broken frames, skew and drift."""
+"""From frames to pairs: any order of arrival, broken, repeated and unpaired images, the skew between the cameras."""
 
 from __future__ import annotations
 
 import random
+from collections.abc import Iterable
 from itertools import pairwise
 
 import cv2
@@ -13,8 +14,10 @@ from calib.rig import Rig
 from drivers.frame import Camera, Frame
 from drivers.motion import GyroSample, WheelSample
 from omnid.camera_config import PairConfig
+from omnid.errors import OmnidError
 from omnid.messages import FramePair
-from omnid.stages.synchronise import MAX_WAITING, Synchronise
+from omnid.simulation.rendering.rigs import make_rig
+from omnid.stages.synchronise import FROZEN_IMAGES, KEPT, MAX_WAITING, Decoder, RepeatedImages, Skew, Synchronise
 from tests.simulation import build
 
 MS = 1_000_000
@@ -178,3 +181,135 @@ def test_free_running_cameras_lose_only_images_without_a_partner(free: Synchroni
 def test_a_slower_camera_decides_how_many_pairs_there_are(free: Synchronise) -> None:
     taken = [shot("lower", index) for index in range(90)] + [shot("upper", index, 12 * MS) for index in range(0, 90, 3)]
     assert len(made(free, *sorted(taken, key=lambda frame: frame.stamp_ns))) == 30
+
+
+LIVING = range(1000, 1100)  # numbers of images that differ
+
+
+def image(number: int) -> np.ndarray:
+    """Return a grey wall with the noise of the frame with this number."""
+    noise = np.random.default_rng(number).integers(-2, 3, (SIZE, SIZE))
+    return (90 + noise).astype(np.uint8)
+
+
+def seen(numbers: Iterable[int]) -> tuple[list[bool], RepeatedImages]:
+    repeated = RepeatedImages()
+    return [repeated.add(image(number)) for number in numbers], repeated
+
+
+def test_a_motionless_scene_has_no_repeated_image() -> None:
+    flags, repeated = seen(LIVING)
+    assert not any(flags) and not repeated.frozen and repeated.count == 0
+
+
+def test_a_camera_freezes_and_lives_again() -> None:
+    _, repeated = seen([1, *[2] * (FROZEN_IMAGES + 1)])
+    assert repeated.frozen and repeated.count == FROZEN_IMAGES
+    repeated.add(image(3))
+    assert not repeated.frozen and repeated.longest == FROZEN_IMAGES
+
+
+@pytest.mark.parametrize("buffers", range(2, KEPT + 1))
+def test_a_driver_that_hands_out_its_buffers_in_turn_is_frozen(buffers: int) -> None:
+    flags, repeated = seen([*range(100, 120), *list(range(buffers)) * 5])
+    assert repeated.frozen and not any(flags[: 20 + buffers]) and all(flags[20 + 2 * buffers :])
+
+
+def frames(lower: Iterable[int], upper: Iterable[int]) -> list[Frame]:
+    def shot(camera: Camera, index: int, number: int) -> Frame:
+        return Frame(index, 10**12 + index * PERIOD_NS, camera, "png", cv2.imencode(".png", image(number))[1])
+
+    return [
+        frame
+        for index, (low, up) in enumerate(zip(lower, upper, strict=True))
+        for frame in (shot("lower", index, low), shot("upper", index, up + 10**6))
+    ]
+
+
+@pytest.mark.hazard("H34")
+@pytest.mark.parametrize("dead", [("lower",), ("upper",), ("lower", "upper")])
+def test_pairs_of_a_frozen_camera_are_left_out(rig: Rig, dead: tuple[Camera, ...]) -> None:
+    """The images of the other camera go on; two images after the camera lives again there is a pair again."""
+    pairing, living = Synchronise(rig, PairConfig()), list(range(30))
+    frozen = [*living[:10], *[9] * 10, *living[20:]]
+    shots = frames(*(frozen if camera in dead else living for camera in ("lower", "upper")))
+    during = [pairing.process(frame) for frame in shots[:40]]
+    assert pairing.frozen == list(dead)
+    made = [pair for frame in [*shots[40:]] if (pair := pairing.process(frame)) is not None]
+    assert [pair is not None for pair in during[1::2]] == [True] * 10 + [False] * 10 and len(made) == 10
+    assert pairing.counts == {
+        "pairs": 20,
+        "unpaired_lower": 0,
+        "unpaired_upper": 0,
+        "broken": 0,
+        "repeated_lower": 10 * ("lower" in dead),
+        "repeated_upper": 10 * ("upper" in dead),
+    }
+    assert [pair.seq for pair in made] == list(range(10, 20)) and pairing.frozen == []
+
+
+def test_a_simulator_without_noise_may_use_them(rig: Rig) -> None:
+    pairing = Synchronise(rig, PairConfig(repeated_images="use"))
+    made = [pair for frame in frames([1] * 20, [1] * 20) if (pair := pairing.process(frame)) is not None]
+    assert len(made) == 20 and pairing.frozen == ["lower", "upper"] and pairing.counts["repeated_lower"] == 19
+
+
+def after(skews_ns: list[float]) -> float:
+    """The time between the exposures of the last pair, in ms."""
+    skew = Skew()
+    for value in skews_ns:
+        skew.add(round(value))
+    return skew.exposure_ns / MS
+
+
+def test_cameras_that_are_triggered_together_are_simultaneous_however_their_stamps_scatter() -> None:
+    rng = random.Random(1)
+    for count in (1, 5, 8, 20, 100):
+        assert after([rng.uniform(-2, 2) * MS for _ in range(count)]) == 0.0
+
+
+def test_the_skew_of_free_cameras_is_found_below_the_scatter_of_the_stamps() -> None:
+    rng = random.Random(2)
+    assert after([15 * MS]) == 15.0
+    assert after([15 * MS + rng.gauss(0, MS) for _ in range(60)]) == pytest.approx(15.0, abs=1.0)
+    assert after([-9 * MS + rng.gauss(0, 0.1 * MS) for _ in range(60)]) == pytest.approx(-9.0, abs=0.1)
+
+
+def test_the_skew_of_drifting_clocks_is_followed() -> None:
+    rng = random.Random(3)
+    drifting = [5 * MS + 0.2 * MS * index + rng.gauss(0, 0.1 * MS) for index in range(100)]
+    assert after(drifting) == pytest.approx(5 + 0.2 * 99, abs=0.15)
+
+
+def test_another_skew_after_a_lost_image_counts_at_once() -> None:
+    assert after([14 * MS] * 40 + [-19 * MS]) == -19.0
+
+
+SIDE_PX = 64
+IMAGE = np.arange(SIDE_PX**2, dtype=np.uint8).reshape(SIDE_PX, SIDE_PX).tobytes()
+
+
+def frame(camera: Camera = "lower", side_px: int = SIDE_PX, data: bytes = IMAGE) -> Frame:
+    return Frame(3, 7, camera, "mono8", data, side_px, side_px)
+
+
+def test_images_are_decoded() -> None:
+    decode = Decoder(make_rig(size=SIDE_PX))
+    lower, upper = decode(frame("lower")), decode(frame("upper", data=bytes(IMAGE[::-1])))
+    assert lower is not None and lower.tobytes() == IMAGE
+    assert upper is not None and upper.tobytes() == IMAGE[::-1]
+
+
+def test_damaged_frames_are_counted_with_the_first_reason() -> None:
+    decode = Decoder(make_rig(size=SIDE_PX))
+    assert decode(frame(data=b"short")) is None and decode(frame("upper", data=b"")) is None
+    assert decode.broken == 2 and "5 bytes" in decode.fault
+
+
+def test_the_first_image_must_have_the_size_of_the_rig_and_later_ones_are_left_out() -> None:
+    decode, half = Decoder(make_rig(size=SIDE_PX)), SIDE_PX // 2
+    small = frame(side_px=half, data=IMAGE[: half**2])
+    with pytest.raises(OmnidError, match="lower camera's images are 32x32 px, the rig's are 64x64 px"):
+        decode(small)
+    assert decode(frame()) is not None and decode(small) is None
+    assert decode.fault == "lower frame 3 is 32x32 px, unlike those before"
