@@ -54,7 +54,6 @@ def examine(config: Config) -> Iterator[Finding]:
     yield from checks.rig(Path(camera.rig), (camera.width_px, camera.height_px), config.obstacles.ring.floor_m)
     yield from checks.motor(config.motor, ROOT)
     yield from checks.rights(max(wanted.motor_priority, wanted.capture_priority), wanted.lock_memory)
-    yield checks.clock()
     yield checks.compiled_functions()
     rate = 2 * camera.width_px * camera.height_px * BYTES_PER_PIXEL * (camera.rate_hz or 30.0)
     yield from checks.disk(checks.STATE / config.record.folder, config.record, rate)
@@ -178,10 +177,6 @@ def _of_device(args: argparse.Namespace, camera: Camera) -> Generator[Frame, Non
         yield from islice(source.frames(), SETTLE, None)
 
 
-_BEFORE = """The wheels will turn. Raise the robot so that none of them touches the ground, keep hands and hair away
-from them, and have the emergency stop at hand. The daemon must not run. Ctrl-C stops the wheels. Type yes to begin: """
-
-
 @command(
     option(
         "--motor",
@@ -209,16 +204,13 @@ from them, and have the emergency stop at hand. The daemon must not run. Ctrl-C 
 def test_motor(args: argparse.Namespace) -> int:
     """Test the wiring and print the settings."""
     from drivers.motors.protocols.protocol_registry import motor_protocol
-    from omnid.doctor.wheel_wiring import WiringTest
+    from omnid.doctor.wheel_wiring import tested_drive
 
     config = settings_of(args).motor
     if not config.port:
         raise OmnidError("no motor controller is configured: name its port by --motor, or set motor.port")
     motor_protocol(config.protocol)  # known before anybody is asked to raise the robot
-    test = WiringTest(config, ask, speed_mps=args.speed, turns=args.turns)
-    if ask(_BEFORE).lower() != "yes":
-        raise OmnidError("not begun: only `yes` starts the motors")
-    drive = test.run()
+    drive = tested_drive(config, ask, speed_mps=args.speed, turns=args.turns)
     values = _lines(config.drive, drive)
     print("\n[motor.drive]", *(f"{key} = {value}" for key, value in values.items()), sep="\n")
     print("as it was set" if drive == config.drive else "different from the settings so far")

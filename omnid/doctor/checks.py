@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import ctypes
 import grp
 import ipaddress
 import os
 import re
 import shutil
 import stat
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -184,33 +182,8 @@ def _target(entry: Path) -> str:
     return ""
 
 
-BUILT_S: Final = 1_735_689_600  # the start of 2025: an earlier time is wrong
-_UNSYNCHRONISED: Final = 5  # TIME_ERROR of adjtimex(2)
-_TIMEX_BYTES: Final = 1024  # more than struct timex has on any platform
 _ENDPOINT = re.compile(r"[a-z-]+/\[?(?P<host>[^\]/]+?)\]?:\d{1,5}(?:[?#].*)?")
 STATE: Final = Path("/var/lib/omnid")  # StateDirectory and working directory of the unit
-
-
-def clock(now_s: float | None = None, synchronised: bool | None = None) -> Finding:
-    """Check that the system's time is plausible and synchronised."""
-    now_s = time.time() if now_s is None else now_s
-    synchronised = is_synchronised() if synchronised is None else synchronised
-    shown = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(now_s))
-    if now_s < BUILT_S:
-        return error("clock", f"the time is wrong: {shown}", "`timedatectl set-ntp true`, or `sudo date -s ...`")
-    if not synchronised:
-        return warning(
-            "clock",
-            f"{shown}, not synchronised: logs of several machines will not match",
-            "`timedatectl set-ntp true`, or install chrony",
-        )
-    return ok("clock", f"{shown}, synchronised")
-
-
-def is_synchronised() -> bool:
-    """True if the kernel's clock is synchronised, by chrony, ntpd or systemd-timesyncd."""
-    state = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES))  # all zeros: read only
-    return state not in (-1, _UNSYNCHRONISED)
 
 
 def rights(priority: int, lock_memory: bool) -> Iterator[Finding]:

@@ -54,11 +54,14 @@ def steps(program: Path, *, page: bool = False, root: Path = ROOT) -> list[Step]
             f"{program} is in a folder that the service cannot see: install omnid elsewhere, "
             "such as `sudo python3 -m venv /opt/omnid && sudo /opt/omnid/bin/pip install .`"
         )
+    if not re.fullmatch(r"[\w./+-]+", str(program), re.ASCII):
+        raise OmnidError(
+            f"{plain(str(program))}: the path has characters that a systemd unit cannot name: install omnid "
+            f"elsewhere, such as in {Path(SHIPPED_PROGRAM).parents[1]}"
+        )
     # 1. The units follow the program; the files that people edit are kept.
     units = ["omnid.service", "omnid-web.service"] if page else ["omnid.service"]
-    texts = {
-        f"etc/systemd/system/{unit}": service_file(unit).replace(SHIPPED_PROGRAM, exec_word(program)) for unit in units
-    }
+    texts = {f"etc/systemd/system/{unit}": service_file(unit).replace(SHIPPED_PROGRAM, str(program)) for unit in units}
     kept = {
         "etc/udev/rules.d/90-omnid.rules": service_file("90-omnid.rules"),
         "etc/omnid/omnid.toml": dump_minimal(Config(), FIRST_SETTINGS),
@@ -88,22 +91,6 @@ def _add_user() -> None:
     if done.returncode:
         reason = " ".join(done.stderr.split())
         raise OmnidError(f"the user omnid cannot be added: {reason}; run this command with sudo")
-
-
-def exec_word(program: Path) -> str:
-    """Return a program's path as the first word of ExecStart=; OmnidError for one that no unit can contain.
-
-    systemd.service(5), "Command lines", and systemd.unit(5), "Specifiers": a path with blanks is written in double
-    quotes, and a percent sign is doubled. Quotes and backslashes are refused: systemd 252 does not start such programs.
-    """
-    path = str(program)
-    if not path.isprintable() or re.search(r"[\"'\\]", path):
-        raise OmnidError(
-            f"{plain(path)}: the path has characters that a systemd unit cannot name: install omnid "
-            f"elsewhere, such as in {Path(SHIPPED_PROGRAM).parents[1]}"
-        )
-    escaped = path.replace("%", "%%")
-    return escaped if re.fullmatch(r"[\w./+-]+", path) else f'"{escaped}"'
 
 
 def next_steps(program: Path, *, page: bool = False) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +41,10 @@ class RouteMap:
             return None
         T_map_rig = self._T_rig_rect @ T_map_rect @ self._T_rect_rig
         return KeyframePose(self.keyframes.stamps_ns[id], planar(self._T_base_rig @ T_map_rig @ self._T_rig_base))
+
+    def noted(self) -> Mapping[int, int]:
+        """Return the stamps of the keyframes, which identify the map."""
+        return self.keyframes.stamps_ns
 
 
 def refusal_of_name(name: str) -> str:
@@ -119,7 +124,7 @@ class Routes:
         if self.taught is not None:
             raise OmnidError(f"the route {self.taught.route.name} is being written: wait for its end")
         places = self._map()
-        route = self._recorder.route(places.keyframe, places.keyframes.stamps_ns, created_s, places.name)
+        route = self._recorder.route(places.keyframe, places.noted(), created_s, places.name)
         self.taught, self._finished, self._recorder = TaughtRoute(route, id), self._recorder, None
 
     def written(self, refusal: str) -> None:

@@ -23,7 +23,7 @@ from omnid.cli import main
 from omnid.config import RecordConfig
 from omnid.controller.motor_settings import MotorSettings
 from omnid.doctor import checks
-from omnid.doctor.checks import BUILT_S, Finding, access, bus, cameras, clock, disk, is_synchronised, motor, rig
+from omnid.doctor.checks import Finding, access, bus, cameras, disk, motor, rig
 from omnid.transport.bus_config import BusConfig
 
 ROOT = Path(__file__).parents[3]
@@ -154,15 +154,6 @@ def test_checks_the_rights_of_this_user() -> None:
     assert "LimitRTPRIO=20" in lines[0] and "LimitMEMLOCK=infinity" in lines[1]
 
 
-@pytest.mark.parametrize(
-    ("now_s", "synchronised", "level"),
-    [(BUILT_S + 1e8, True, "ok"), (BUILT_S + 1e8, False, "warning"), (0.0, True, "error")],
-)
-def test_checks_the_system_time(now_s: float, synchronised: bool, level: str) -> None:
-    assert clock(now_s, synchronised).level == level
-    assert is_synchronised() in (True, False)
-
-
 def test_checks_the_space_for_recordings(tmp_path: Path) -> None:
     (found,) = disk(checks.STATE / "not" / "yet", RecordConfig(keep_mb=10, free_mb=0), 1e6)
     assert found.level == "ok" and f"free at {checks.STATE.parent}" in found.found and "newest 0.0 GB" in found.found
@@ -224,7 +215,7 @@ def test_the_command_runs_all_checks_and_returns_an_exit_code(
     assert main(["doctor", "--set", missing]) == 1
     *lines, last = capsys.readouterr().out.splitlines()
     assert {line[:9].strip() for line in lines} <= {"ok", "warning", "error"}
-    subjects = "camera lower,camera upper,rig,motor,real time,memory,clock,compiled code,disk,bus"
+    subjects = "camera lower,camera upper,rig,motor,real time,memory,compiled code,disk,bus"
     assert set(subjects.split(",")) <= {line[9:22].strip() for line in lines} and " errors, " in last
     assert main(["doctor", "--set", missing, "--json"]) == 1
     assert {found["level"] for found in json.loads(capsys.readouterr().out)} <= {"ok", "warning", "error"}

@@ -15,7 +15,7 @@ import pytest
 
 from drivers.motors.simulated.simulated_motor import SIMULATED_CONTROLLERS, SimulatedController
 from omnid.controller.motor_settings import DriveSettings, MotorSettings
-from omnid.doctor.wheel_wiring import WiringTest
+from omnid.doctor.wheel_wiring import tested_drive as drive_by_answers
 from omnid.errors import OmnidError
 from tests.contract.pty_motor import PtyMotor
 from tests.replay.command import Command
@@ -99,7 +99,7 @@ def simulated(protocol: str, **wiring: object) -> Iterator[tuple[MotorSettings, 
 )
 def test_the_settings_follow_from_what_the_wheels_did(protocol: str, true: dict[str, object]) -> None:
     with simulated(protocol, **true) as (config, person, motor):
-        drive = WiringTest(config, person.answer, speed_mps=0.4, turns=4, move_s=0.1, rest_s=0.05).run()
+        drive = drive_by_answers(config, person.answer, speed_mps=0.4, turns=4, move_s=0.1, rest_s=0.05)
         assert not any(motor.base.commanded_mps)
     expected = {"swapped": False, "reverse_left": False, "reverse_right": False, **true}
     for name, value in expected.items():
@@ -114,9 +114,9 @@ def test_the_settings_follow_from_what_the_wheels_did(protocol: str, true: dict[
 )
 def test_answers_without_a_result(answers: list[str], message: str) -> None:
     with simulated("roboteq") as (config, _, motor):
-        given = iter(answers)
+        given = iter(["yes", *answers])
         with pytest.raises(OmnidError, match=message):
-            WiringTest(config, lambda _: next(given), speed_mps=0.4, turns=0, move_s=0.05, rest_s=0.0).run()
+            drive_by_answers(config, lambda _: next(given), speed_mps=0.4, turns=0, move_s=0.05, rest_s=0.0)
         assert not any(motor.base.commanded_mps) and not list(given)
 
 
