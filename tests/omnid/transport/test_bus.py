@@ -7,17 +7,16 @@ import json
 import os
 import re
 import signal
-import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import zenoh
 from zenoh import ext
 
 from omnid.client import Pose, Robot, Unreachable, subscribe
@@ -27,24 +26,9 @@ from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import ERROR, OK, WARN, PoseAttachment
 from omnid.transport.session import open_client, open_session, zenoh_config
 from omnid.transport.topics import PUBLISHED
-from tests.omnid.transport.bus_fixtures import DEADLINE_S, ROUTER, free_endpoint, numbers, odometry, script, session
-from tests.omnid.transport.bus_fixtures import SUBSCRIBER as STAMP_SUBSCRIBER
+from tests.omnid.transport.bus_fixtures import ROUTER, SUBSCRIBER, free_endpoint, numbers, odometry, script, session
 from tests.waiting import wait_until
 
-SUBSCRIBER = """
-import json, sys, zenoh
-config = zenoh.Config()
-config.insert_json5("mode", '"client"')
-config.insert_json5("connect/endpoints", json.dumps([sys.argv[1]]))
-config.insert_json5("scouting/multicast/enabled", "false")
-with zenoh.open(config) as session:
-    samples = session.declare_subscriber(sys.argv[2], zenoh.handlers.FifoChannel(1000))
-    print("ready", flush=True)
-    for _ in range(int(sys.argv[3])):
-        s = samples.recv()
-        print(s.key_expr, s.encoding, s.priority, s.congestion_control, s.express, flush=True)
-        print(bytes(s.payload).hex(), flush=True)
-"""
 PEER = """
 import json, sys, time, zenoh
 config = zenoh.Config()
@@ -123,41 +107,22 @@ def test_zenohs_own_file_says_all_but_the_endpoints(tmp_path: Path) -> None:
 # Publishing.
 
 
-@contextlib.contextmanager
-def subscriber(endpoint: str, key: str, count: int) -> Iterator[subprocess.Popen[str]]:
-    arguments = [sys.executable, "-c", SUBSCRIBER, endpoint, key, str(count)]
-    with subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout is not None and process.stdout.readline() == "ready\n"
-            yield process
-        finally:
-            process.kill()
-
-
-def publish_until_done(bus: Bus, key: str, process: subprocess.Popen[str]) -> list[str]:
-    """Publish until the subscriber, whose subscription takes a moment to arrive, has all messages; return its lines."""
-    deadline = time.monotonic() + DEADLINE_S
-    for i in range(10_000):
-        bus.publish(key, odometry(i))
-        time.sleep(0.005)
-        if process.poll() is not None or time.monotonic() > deadline:
-            break
-    process.kill()
-    assert process.stdout is not None
-    return process.stdout.read().splitlines()
-
-
-def test_another_process_reads_the_same_odometry() -> None:
-    endpoint = free_endpoint()
-    bus = Bus(BusConfig(robot="site/robot-1", listen=(endpoint,)))
-    with contextlib.closing(bus), subscriber(endpoint, "site/robot-1/**", 5) as process:
-        lines = publish_until_done(bus, "odom", process)
-    assert lines[0::2] == ["site/robot-1/odom application/cdr Priority.REAL_TIME CongestionControl.DROP False"] * 5
-    records = [codec.decode_pose(bytes.fromhex(line)) for line in lines[1::2]]
-    for record in records:
-        expected = codec.decode_pose(odometry(record.stamp_ns - 10**9))
-        np.testing.assert_array_equal(record.T_odom_base, expected.T_odom_base)
-        np.testing.assert_array_equal(record.covariance, expected.covariance)
+def test_a_program_reads_the_same_odometry() -> None:
+    endpoint, came = free_endpoint(), list[zenoh.Sample]()
+    with (
+        contextlib.closing(Bus(BusConfig(robot="site/robot-1", listen=(endpoint,)))) as bus,
+        session(mode="client", connect__endpoints=[endpoint]) as program,
+    ):
+        subscriber = program.declare_subscriber("site/robot-1/**", came.append)
+        numbers = count()
+        wait_until(lambda: bus.publish("odom", odometry(next(numbers))) is None and len(came) >= 5)
+        subscriber.undeclare()
+    assert (came[0].express, came[0].congestion_control) == (False, zenoh.CongestionControl.DROP)
+    for sample in came:
+        assert (str(sample.key_expr), str(sample.encoding)) == ("site/robot-1/odom", "application/cdr")
+        assert sample.priority == zenoh.Priority.REAL_TIME
+        record = codec.decode_pose(sample.payload.to_bytes())
+        assert sample.payload.to_bytes() == odometry(record.stamp_ns - 10**9)
 
 
 def test_late_subscribers_receive_the_newest_message_at_once() -> None:
@@ -267,8 +232,8 @@ def test_direct_subscribers_lose_nothing_when_a_router_is_killed(tmp_path: Path)
     with contextlib.ExitStack() as stack:
         router = stack.enter_context(script(ROUTER, there))
         bus = stack.enter_context(contextlib.closing(Bus(BusConfig(listen=(here,), connect=(there,)))))
-        stack.enter_context(script(STAMP_SUBSCRIBER, here, "omnid/odom", str(direct)))
-        stack.enter_context(script(STAMP_SUBSCRIBER, there, "omnid/odom", str(behind)))
+        stack.enter_context(script(SUBSCRIBER, here, "omnid/odom", str(direct)))
+        stack.enter_context(script(SUBSCRIBER, there, "omnid/odom", str(behind)))
 
         def publish() -> int:
             number = next(sequence)

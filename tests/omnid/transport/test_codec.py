@@ -11,23 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
-from rosbags.typesys.stores import ros2_humble as ros
 
 from calib import se3
 from drivers.frame import Frame
-from drivers.motion import GyroSample, WheelSample
 from omnid.core.obstacles.moving_tracker import MovingObstacle
 from omnid.errors import OmnidError
 from omnid.transport import codec
 from omnid.transport.codec import (
-    IMU_SCHEMA,
     MOVING_FIELDS,
-    PATH_SCHEMA,
-    SCAN_SCHEMA,
-    STRING_SCHEMA,
     DiagnosticStatus,
     FrameTransform,
-    PlanarGoal,
     Pose,
     PoseAttachment,
     decode_cloud,
@@ -35,13 +28,10 @@ from omnid.transport.codec import (
     decode_map,
     decode_scan,
     features_from_bytes,
-    goal_cdr,
     moving_cdr,
-    path_cdr,
     scan_cdr,
-    string_cdr,
 )
-from omnid.transport.sensor_codec import gyro_cdr, image_cdr, image_topic, wheel_cdr
+from omnid.transport.sensor_codec import image_cdr, image_topic
 from tests.omnid.sinks.test_recorder import frame
 
 STAMP_NS = 1_700_000_123_987_654_321
@@ -63,62 +53,45 @@ def odometry(T: np.ndarray = T_ODOM_BASE, **more: Any) -> bytes:
     return codec.odometry_cdr(STAMP_NS, T, COVARIANCE, VELOCITY, 2.0 * COVARIANCE, **more)
 
 
-MESSAGES = {
-    "odometry": (codec.ODOMETRY_SCHEMA, odometry()),
-    "pose": (codec.POSE_SCHEMA, codec.pose_stamped_cdr(STAMP_NS, T_ODOM_BASE)),
-    "transforms": (codec.TRANSFORM_SCHEMA, codec.transform_cdr(STAMP_NS, EDGES)),
-    "diagnostics": (codec.DIAGNOSTICS_SCHEMA, codec.diagnostics_cdr(STAMP_NS, STATUSES)),
-    "twist": (codec.TWIST_SCHEMA, codec.twist_stamped_cdr(STAMP_NS, "base_link", 0.4, -0.3)),
-    "heading": (codec.VECTOR_SCHEMA, codec.heading_cdr(STAMP_NS, 0.4, -0.3)),
-    "header": (codec.HEADER_SCHEMA, codec.header_cdr(STAMP_NS)),
-    "string": (STRING_SCHEMA, string_cdr("teach dock")),
-    "goal": (codec.POSE_SCHEMA, goal_cdr(PlanarGoal(STAMP_NS, "map", 1.0, 2.0, 0.5))),
-    "path": (PATH_SCHEMA, path_cdr(STAMP_NS, "odom", [[1.0, 2.0], [3.0, 4.0]])),
-    "cloud": (codec.POINT_CLOUD_SCHEMA, codec.point_cloud_cdr(STAMP_NS, "rig", POINTS, CONFIDENCE)),
-    "no cloud": (codec.POINT_CLOUD_SCHEMA, codec.point_cloud_cdr(STAMP_NS, "rig", np.empty((0, 3)), np.empty(0))),
-    "grid": (codec.GRID_SCHEMA, codec.grid_cdr(STAMP_NS, "odom", CELLS, 0.1, (-2.0, 5.5))),
-    "scan": (SCAN_SCHEMA, scan_cdr(STAMP_NS, "base_link", RANGES, SIGMA, (0.1, 6.0))),
-    "moving": (codec.POINT_CLOUD_SCHEMA, moving_cdr(STAMP_NS, "odom", [PERSON] * 3)),
-    "wheels": (codec.ODOMETRY_SCHEMA, wheel_cdr(WheelSample(5, 0.25, -0.5), STAMP_NS)),
-    "gyro": (IMU_SCHEMA, gyro_cdr(GyroSample(6, 0.125, -0.25, 0.5, of_base=True), STAMP_NS)),
-}
+CLOUD = codec.point_cloud_cdr(STAMP_NS, "rig", POINTS, CONFIDENCE)
+GRID = codec.grid_cdr(STAMP_NS, "odom", CELLS, 0.1, (-2.0, 5.5))
+SCAN = scan_cdr(STAMP_NS, "base_link", RANGES, SIGMA, (0.1, 6.0))
+DIAGNOSTICS = codec.diagnostics_cdr(STAMP_NS, STATUSES)
 
 
-@pytest.mark.parametrize("name", MESSAGES)
-def test_bytes_are_those_that_rosbags_writes(name: str) -> None:
-    schema, payload = MESSAGES[name]
-    message: Any = STORE.deserialize_cdr(payload, schema)
-    assert bytes(STORE.serialize_cdr(message, schema)) == payload
+def test_what_others_read_is_as_ros_lays_it_out() -> None:
+    """Transforms, headings, moving obstacles and a cloud without points, by rosbags: omnid does not read them."""
 
+    def read(schema: str, payload: bytes) -> Any:
+        return STORE.deserialize_cdr(payload, schema)
 
-@pytest.mark.parametrize("name", ["odom", "o", "odo", "base_link", "rig7"])
-def test_own_writers_align_as_ros_does_whatever_the_length_of_the_frame(name: str) -> None:
-    header = ros.std_msgs__msg__Header(ros.builtin_interfaces__msg__Time(*divmod(STAMP_NS, 10**9)), name)
-    step = math.pi / 2
-    scan = ros.sensor_msgs__msg__LaserScan(
-        header, step / 2 - math.pi, math.pi - step / 2, step, 0.0, 0.0, 0.0, 6.0, RANGES, SIGMA
-    )
-    assert scan_cdr(STAMP_NS, name, RANGES, SIGMA, (0.0, 6.0)) == bytes(STORE.serialize_cdr(scan, SCAN_SCHEMA))
-    fields = [ros.sensor_msgs__msg__PointField(field, 4 * i, 7, 1) for i, field in enumerate(MOVING_FIELDS)]
-    for count in (0, 1, 3):
-        points = np.array([[1.5, -0.25, 0, 0, 0.75, 0.25, 0.2, 0.5]] * count, "<f4").reshape(-1).view(np.uint8)
-        cloud = ros.sensor_msgs__msg__PointCloud2(header, 1, count, fields, False, 32, 32 * count, points, True)
-        expected = bytes(STORE.serialize_cdr(cloud, codec.POINT_CLOUD_SCHEMA))
-        assert moving_cdr(STAMP_NS, name, [PERSON] * count) == expected
+    edges = read(codec.TRANSFORM_SCHEMA, codec.transform_cdr(STAMP_NS, EDGES)).transforms
+    assert [(edge.header.frame_id, edge.child_frame_id) for edge in edges] == [("map", "odom"), ("odom", "base_link")]
+    moved = edges[1].transform
+    assert (moved.translation.x, moved.translation.y, moved.translation.z) == (1.5, -2.25, 0.125)
+    q = moved.rotation
+    np.testing.assert_allclose(se3.rotation((q.x, q.y, q.z, q.w)), T_ODOM_BASE[:3, :3], atol=1e-12)
+    moving = read(codec.POINT_CLOUD_SCHEMA, moving_cdr(STAMP_NS, "odom", [PERSON] * 3))
+    assert (moving.header.frame_id, moving.width, moving.point_step) == ("odom", 3, 32)
+    assert [field.name for field in moving.fields] == list(MOVING_FIELDS)
+    row = moving.data.view("<f4").reshape(3, 8)[2]
+    np.testing.assert_allclose(row, [1.5, -0.25, 0, 0, 0.75, 0.25, 0.2, 0.5], rtol=1e-6)
+    nothing = codec.point_cloud_cdr(STAMP_NS, "rig", np.empty((0, 3)), np.empty(0))
+    assert (read(codec.POINT_CLOUD_SCHEMA, nothing).width, decode_cloud(nothing).points.shape) == (0, (0, 3))
 
 
 def test_what_is_decoded_is_what_was_encoded() -> None:
-    report = decode_diagnostics(MESSAGES["diagnostics"][1])
+    report = decode_diagnostics(DIAGNOSTICS)
     assert report.stamp_ns == STAMP_NS and [status.name for status in report.statuses] == ["a", "b"]
     assert (report.value("a", "k"), report.value("b", "k"), report.value("c", "k")) == ("v", "", "")
-    cloud = decode_cloud(MESSAGES["cloud"][1])
+    cloud = decode_cloud(CLOUD)
     assert (cloud.stamp_ns, cloud.frame) == (STAMP_NS, "rig")
     np.testing.assert_array_equal(cloud.points, POINTS)
     np.testing.assert_array_equal(cloud.confidence, CONFIDENCE)
-    grid = decode_map(MESSAGES["grid"][1])
+    grid = decode_map(GRID)
     assert (grid.stamp_ns, grid.frame, grid.cell_m, grid.corner) == (STAMP_NS, "odom", pytest.approx(0.1), (-2.0, 5.5))
     np.testing.assert_array_equal(grid.cells, CELLS)
-    scan = decode_scan(MESSAGES["scan"][1])
+    scan = decode_scan(SCAN)
     assert (scan.stamp_ns, scan.frame, scan.max_range_m) == (STAMP_NS, "base_link", 6.0)
     np.testing.assert_array_equal(scan.ranges_m, RANGES)
     np.testing.assert_array_equal(scan.sigma_m, SIGMA)
@@ -200,10 +173,10 @@ def test_what_is_no_message_is_refused(make: Callable[[], object], words: str) -
     ("decode", "good"),
     [
         (codec.decode_pose, odometry()),
-        (decode_scan, MESSAGES["scan"][1]),
-        (decode_map, MESSAGES["grid"][1]),
-        (decode_cloud, MESSAGES["cloud"][1]),
-        (decode_diagnostics, MESSAGES["diagnostics"][1]),
+        (decode_scan, SCAN),
+        (decode_map, GRID),
+        (decode_cloud, CLOUD),
+        (decode_diagnostics, DIAGNOSTICS),
     ],
 )
 def test_any_bytes_give_a_message_or_one_line(decode: Callable[[bytes], object], good: bytes) -> None:

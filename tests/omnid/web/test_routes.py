@@ -6,7 +6,6 @@ import contextlib
 import json
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -131,11 +130,3 @@ def test_the_stick_drives_while_the_page_shows_the_state_of_the_robot(robot: tup
     assert server.request("/drive", "POST", body=body).status == 403
     assert server.request("/drive", "POST", {**server.bearer, "Origin": "http://evil.example"}, body).status == 403
     assert len(navigator.twists) == count + 1
-
-
-def test_the_token_for_stops_neither_drives_nor_gives_goals(tmp_path: Path) -> None:
-    tokens = [tmp_path / name for name in ("all", "stop")]
-    with served("--connect", free_endpoint(), "--token-file", tokens[0], "--stop-token-file", tokens[1]) as server:
-        bearer = {"Authorization": f"Bearer {tokens[1].read_text().strip()}"}
-        for path, text in (("/drive", "1 0 1 a"), ("/goal", "1 2 3")):
-            assert server.request(path, "POST", bearer, text).status == 403
