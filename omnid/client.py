@@ -27,7 +27,7 @@ from omnid.transport.bus_config import BusConfig
 from omnid.transport.codec import Cloud, Diagnostics, Map, Pose, PoseAttachment, Scan
 from omnid.transport.driver import CONNECT_S, Driver, RobotTime
 from omnid.transport.requests import Answer
-from omnid.transport.session import ALIVE, HERE, Unreachable, open_client, robots_there
+from omnid.transport.session import ALIVE, HERE, QUERY_S, Unreachable, open_client, robots_there
 from omnid.transport.status_names import NavigationReport
 from omnid.transport.topics import PUBLISHED
 
@@ -58,8 +58,6 @@ _TOPICS: Final[dict[type[Any], str]] = {
     NavigationReport: "navigation",
     Scan: "scan",
 }
-# A query without an answer ends after this time, which a slow network must not exceed.
-_QUERY_TIMEOUT_S: Final = 1.0
 # The channel of a subscription has no wait with a timeout, so Subscription.wait polls: this is the delay that it adds.
 _POLL_S: Final = 0.002
 
@@ -131,7 +129,7 @@ def _attachment(sample: zenoh.Sample) -> bytes:
 
 def _queried(session: zenoh.Session, key: str) -> zenoh.Sample | None:
     """Return the answer to a query for a key, if there is any."""
-    replies = list(session.get(key, timeout=_QUERY_TIMEOUT_S))
+    replies = list(session.get(key, timeout=QUERY_S))
     return next((reply.ok for reply in replies if reply.ok is not None), None)
 
 
@@ -226,7 +224,7 @@ class Robot:
     @property
     def alive(self) -> bool:
         """True if the robot's daemon runs and can be reached."""
-        replies = self._session.liveliness().get(f"{self.name}/{ALIVE}", timeout=_QUERY_TIMEOUT_S)
+        replies = self._session.liveliness().get(f"{self.name}/{ALIVE}", timeout=QUERY_S)
         return any(reply.ok is not None for reply in replies)
 
 

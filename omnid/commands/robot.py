@@ -19,7 +19,6 @@ if TYPE_CHECKING:  # the help and other commands do not load these
     from omnid.core.navigation.route import Route
     from omnid.formats.route_file import RouteFolder
 
-FARTHEST_M: Final = 1e6
 NAME: Final = option("name", metavar="NAME", help="letters, digits, '-' and '_'")
 NO_WAIT: Final = option("--no-wait", action="store_true", help="end as soon as the robot has accepted it")
 
@@ -101,8 +100,6 @@ def goto(args: argparse.Namespace) -> int:
         raise OmnidError(f"goto: --{args.verb} takes no pose: leave one of them out")
     if not args.verb and len(args.pose) not in (2, 3):
         raise OmnidError(f"goto: expected X Y [YAW], numbers found: {len(args.pose)}")
-    if not all(math.isfinite(value) and abs(value) <= FARTHEST_M for value in args.pose):
-        raise OmnidError(f"goto: expected finite numbers of at most {FARTHEST_M:g}")
     with _connected(args) as robot:
         driver = robot.driver()
         if not args.verb:

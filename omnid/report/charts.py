@@ -18,7 +18,6 @@ from omnid.report.page import table
 Array = NDArray[np.float64]
 COLUMNS: Final = 400  # of a chart, in each of which the lowest and the highest value are kept
 MAX_CURVES: Final = 6
-LARGEST: Final = 1e9  # values beyond are invalid
 
 
 class Curve(NamedTuple):
@@ -33,7 +32,7 @@ def chart(title: str, curves: Sequence[Curve], *, unit: str = "", log: bool = Fa
     """Return a figure; "" where all curves are empty."""
     shown = []
     for name, t_s, values in curves:
-        valid = (np.abs(values) <= LARGEST) & ((values > 0) | (not log))
+        valid = np.isfinite(values) & ((values > 0) | (not log))
         if valid.any():
             shown.append(Curve(name, t_s[valid], values[valid]))
     if not shown:

@@ -32,7 +32,6 @@ __all__ = ["Bus", "BusConfig"]
 
 _HEARTBEAT_S: Final = 0.5  # rmw_zenoh's
 QUERY_PERIOD_S: Final = 0.01
-MOST_NAMESAKES: Final = 64  # Most that are distinguished; anyone may declare tokens where no users are configured.
 FLOOD_S: Final = 10.0  # The status warns of a flood for this time after its end.
 
 
@@ -201,8 +200,6 @@ class Bus:
 
         attachment: zenoh attachment for subscribers that know omnid. A topic with a leading '/' has no robot's name.
         """
-        if topic not in self._topics:
-            raise OmnidError(f"bus key {topic!r} is not published; expected one of {', '.join(self._topics)}")
         if self._topics[topic].latched:
             self._newest[topic] = (payload, attachment)
         if self._session is None:
@@ -295,7 +292,7 @@ class Bus:
             key, was_unique = str(sample.key_expr), self.is_unique
             if sample.kind == zenoh.SampleKind.DELETE:
                 self._namesakes.discard(key)
-            elif key != own and len(self._namesakes) < MOST_NAMESAKES:
+            elif key != own:
                 self._namesakes.add(key)
                 if was_unique:
                     self._report_same_name()

@@ -14,7 +14,6 @@ from omnid.errors import OmnidError
 KEY: Final = re.compile(r"[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*")
 _ENDPOINT: Final = re.compile(r"(tcp|udp|tls|quic|ws)/[^/\s]+:\d{1,5}([?#].*)?|unixsock-stream/\S+")
 _ROS_NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
-_MAX_FILE_BYTES: Final = 1 << 20
 _IN_ZENOHS_FILE: Final = (
     "retry_s",
     "tls_ca",
@@ -87,7 +86,7 @@ def text_of_file(path: str) -> str:
     """Return the text of zenoh's own file. Raise OmnidError where it cannot be read."""
     try:
         with open(path, encoding="utf-8") as file:
-            return file.read(_MAX_FILE_BYTES)
+            return file.read()
     except (OSError, ValueError) as error:
         cause = getattr(error, "strerror", None) or "it is not text in UTF-8"
         raise OmnidError(f"bus.config: cannot read {path!r}: {cause}; name a readable file") from None

@@ -14,15 +14,12 @@ from omnid.errors import OmnidError
 from omnid.transport import codec, ros2
 from omnid.transport.codec import PlanarGoal, goal_cdr, string_cdr
 from omnid.transport.requests import Answer, answer_of
-from omnid.transport.session import has_receiver, robots_there
+from omnid.transport.session import QUERY_S, has_receiver, robots_there
 from omnid.transport.topics import ARM, GOAL, HEADING, MAP, NAVIGATION, ROUTE, SAVE_MAP, STOP, TIME, TWIST, request_key
 
 CONNECT_S: Final = 2.0  # A connection is complete within this time.
-ASK_S: Final = 1.0  # Time between two questions for the robot's time, and for an answer.
 ANSWER_S: Final = 10.0  # more than a disk takes for a map or a route
 _POLL_S: Final = 0.002
-_LONGEST_TIME: Final = 20  # digits
-_SEQUENCE: Final = 1 << 32  # zenoh counts messages of a source in 32 bits
 # A stop must not be lost, and overtakes all else; requests go the same way.
 _QUALITY: Final[dict[str, Any]] = {
     "congestion_control": zenoh.CongestionControl.BLOCK,
@@ -34,7 +31,7 @@ _QUALITY: Final[dict[str, Any]] = {
 class RobotTime:
     """A robot's own time, which senders attach to what they send, so that no clock of theirs matters.
 
-    The robot is asked for it, at most once in ASK_S; in between it is followed by this computer's monotonic clock.
+    The robot is asked for it, at most once in QUERY_S; in between it is followed by this computer's monotonic clock.
     """
 
     def __init__(self, session: zenoh.Session, robot: str) -> None:
@@ -45,18 +42,18 @@ class RobotTime:
     def ask(self) -> None:
         """Ask the robot, and wait for its answer; a robot that is not there is not waited for."""
         self._asked_s = time.monotonic()
-        for reply in self._session.get(self._key, timeout=ASK_S):
+        for reply in self._session.get(self._key, timeout=QUERY_S):
             self._take(reply)
 
     def refresh(self, *, wait: bool = False) -> None:
         """Ask the robot where that is due; wait: for its answer, where it has told nothing yet."""
-        if time.monotonic() - self._asked_s <= ASK_S:
+        if time.monotonic() - self._asked_s <= QUERY_S:
             return
         if wait and self._told is None:
             self.ask()
             return
         self._asked_s = time.monotonic()
-        self._session.get(self._key, self._take, timeout=ASK_S)
+        self._session.get(self._key, self._take, timeout=QUERY_S)
 
     @property
     def now_ns(self) -> int:
@@ -69,7 +66,7 @@ class RobotTime:
     def _take(self, reply: zenoh.Reply) -> None:
         with suppress(ValueError):
             if reply.ok is not None:
-                self._told = int(reply.ok.payload.to_bytes()[:_LONGEST_TIME]), time.monotonic_ns()
+                self._told = int(reply.ok.payload.to_bytes()), time.monotonic_ns()
 
 
 class Driver:
@@ -192,7 +189,7 @@ class Driver:
         )
 
     def _attachment(self, sent_ns: int) -> bytes:
-        self._sent = (self._sent + 1) % _SEQUENCE
+        self._sent += 1
         return ros2.attachment(self._sent, sent_ns, self._gid, self._time.now_ns)
 
 

@@ -32,8 +32,7 @@ _PROTOCOL: Final = re.compile(r'"([a-z0-9_-]+)/')
 _USERS: Final = "transport/auth/usrpwd/dictionary_file"
 _CERTIFICATES: Final = "transport/link/tls/enable_mtls"
 _RETRY_S: Final = 0.5  # between two attempts of a client to connect
-_ALIVE_TIMEOUT_S: Final = 1.0
-_NAMED: Final = 5  # Most robots that a message names.
+QUERY_S: Final = 1.0  # A query without an answer ends after this time, which a slow network must not exceed.
 _MAX_COMMAND_BYTES: Final = 16_384  # Limit of all commands but paths.
 _DEFAULTS: Final[dict[str, Any]] = {  # where zenoh's own file leaves zenoh's
     "connect/retry": {"period_init_ms": 500, "period_max_ms": 2000, "period_increase_factor": 2},
@@ -104,10 +103,9 @@ def open_client(given: BusConfig, timeout_s: float = 0.0) -> zenoh.Session:
 
 def robots_there(session: zenoh.Session) -> str:
     """Return the names of the robots that a session reaches, as a part of a sentence."""
-    replies = session.liveliness().get(f"**/{ALIVE}", timeout=_ALIVE_TIMEOUT_S)
+    replies = session.liveliness().get(f"**/{ALIVE}", timeout=QUERY_S)
     names = sorted(str(reply.ok.key_expr).rpartition("/")[0] for reply in replies if reply.ok is not None)
-    more = [f"{len(names) - _NAMED} more"] if len(names) > _NAMED else []
-    return plain(f"robots there: {', '.join([*names[:_NAMED], *more])}") if names else "no robot is there"
+    return plain(f"robots there: {', '.join(names)}") if names else "no robot is there"
 
 
 def has_receiver(declared: zenoh.Publisher | zenoh.Querier) -> bool:

@@ -31,8 +31,6 @@ _LONGEST: Final = 512  # bytes
 _WAIT_MS: Final = 100  # Longest wait of the end of a daemon for its listener.
 _REQUEST: Final = re.compile(rb"omnid stop 1 ([0-9a-f]{16}) ([!-~]{1,256}) *")
 _ENDPOINT: Final = re.compile(r"(?:tcp|tls|ws)/(.+):(\d{1,5})(?:[?#].*)?")  # those whose UDP port is free
-_NONCE_BYTES: Final = 8
-_PADDING: Final = 8  # Added to requests, so that no answer is longer than its request.
 
 
 def addresses(endpoints: Sequence[str]) -> Iterator[tuple[str, int]]:
@@ -91,8 +89,9 @@ class StopSender:
     """The client of a stop: it asks all endpoints at the same time."""
 
     def __init__(self, robot: str, endpoints: Sequence[str]) -> None:
-        self._nonce = secrets.token_hex(_NONCE_BYTES).encode()
-        self._request = _HEAD + self._nonce + b" " + robot.encode() + b" " * _PADDING
+        self._nonce = secrets.token_hex(8).encode()
+        # No answer is longer than its request.
+        self._request = _HEAD + self._nonce + b" " + robot.encode() + b" " * len(STOPPED)
         self._sockets: list[socket.socket] = []
         for host, port in addresses(endpoints):
             with suppress(OSError):

@@ -276,18 +276,16 @@ class RobotFeed:
     async def take_large(self, topic: str, payload: bytes) -> None:
         """Take a scan, a report of the navigation, a map or a panorama."""
         with self._counting_broken():
-            if topic == SCAN:
-                self._set(SCAN, scan_news(decode_scan(payload), self._poses))
-            elif topic == NAVIGATION:
-                self._set(NAVIGATION, navigation_news(decode_navigation(payload)))
-            elif topic == "map":
-                await self._take_map(await asyncio.to_thread(decode_map, payload))
-            else:
-                data = bytes(parse_image(COMPRESSED_IMAGE, memoryview(payload)).data)
-                if not data.startswith(b"\xff\xd8"):
-                    raise OmnidError("the panorama is no JPEG image")
-                self._images[PANORAMA] = data
-                self._set(PANORAMA, self.version + 1)
+            match topic:
+                case "scan":
+                    self._set(SCAN, scan_news(decode_scan(payload), self._poses))
+                case "navigation":
+                    self._set(NAVIGATION, navigation_news(decode_navigation(payload)))
+                case "map":
+                    await self._take_map(await asyncio.to_thread(decode_map, payload))
+                case _:
+                    self._images[PANORAMA] = bytes(parse_image(COMPRESSED_IMAGE, memoryview(payload)).data)
+                    self._set(PANORAMA, self.version + 1)
 
     async def _take_map(self, grid: Map) -> None:
         header, self._images["map"] = await asyncio.to_thread(map_cells, grid)

@@ -21,7 +21,6 @@ PATH_FRAME: Final = "odom"
 FRAMES: Final = (PATH_FRAME, "map")  # Frames of a map that is drawn.
 BASE_FRAME: Final = "base_link"
 OLDEST_S: Final = 1.0  # age of the newest state that a page may have when it asks for a motion
-MOST_WARNINGS: Final = 20
 MOST_VALUES: Final = 60  # Most values of a part of the status.
 LONGEST_VALUE: Final = 100  # characters
 LARGEST_MAP_PX: Final = 1024  # edge of the map as it is sent; larger ones are reduced
@@ -214,7 +213,7 @@ def _warnings(state: RobotState, link: str) -> list[dict[str, Any]]:
     found += [
         _warning(part.level % 4, short_name(part.name), part.message, part.values.get(Key.REMEDY, "")) for part in parts
     ]
-    return found[:MOST_WARNINGS]
+    return found
 
 
 def _warning(level: int, name: str, message: str, remedy: str) -> dict[str, Any]:
