@@ -157,36 +157,37 @@ class Odometry:
         it where one of the first pairs shows that the images cannot be of this rig, unless rig.check says otherwise.
         """
         with self._lock:
-            return self._process(stamp_ns, lower, upper, upper_stamp_ns)
-
-    def _process(
-        self, stamp_ns: int, lower: InputImage, upper: InputImage, upper_stamp_ns: int | None
-    ) -> OdometryUpdate:
-        # 1. Refuse what is no pair of this rig; it changes nothing.
-        stamp_ns = self._later_stamp_ns(stamp_ns)
-        images = (self._checked("lower", lower), self._checked("upper", upper))
-        skew_ns = self._checked_skew_ns(stamp_ns, upper_stamp_ns)
-        # 2. Refuse an image that repeats an earlier one; it counts as an earlier one all the same.
-        self._refuse_repeated(images)
-        # 3. Follow the time between the exposures, which the stamps give with jitter.
-        if skew_ns is not None:
-            self._skew.add(skew_ns)
-        skew_s = 0.0 if skew_ns is None else self._skew.exposure_ns * 1e-9
-        # 4. Estimate the motion.
-        pair = FramePair(self._pairs, stamp_ns, *images, skew_s)
-        self._pairs, self._stamp_ns = self._pairs + 1, stamp_ns
-        return self._front_end.process(pair)
-
-    def _refuse_repeated(self, images: tuple[GreyImage, GreyImage]) -> None:
-        """Raise OmnidError where a camera delivers an image again."""
-        # The caller may read the next images into the same arrays.
-        pairs = zip(self._earlier.items(), images, strict=True)
-        found = [name for (name, earlier), image in pairs if earlier.add(image.copy())]
-        if found and not self._use_repeated:
-            raise OmnidError(
-                f"the image of the {' and the '.join(found)} camera is an earlier one, to the last pixel: leave such "
-                'pairs out, as a frozen camera shows no motion, or set pair.repeated_images="use"'
-            )
+            # 1. Refuse what is no pair of this rig; it changes nothing.
+            stamp_ns = _nanoseconds("stamp_ns", stamp_ns)
+            if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
+                raise OmnidError(
+                    f"stamp_ns: expected a stamp after that of the previous pair, {self._stamp_ns}, found "
+                    f"{stamp_ns}: give the pairs in the order of time, each once"
+                )
+            images = (self._checked("lower", lower), self._checked("upper", upper))
+            skew_ns = None if upper_stamp_ns is None else _nanoseconds("upper_stamp_ns", upper_stamp_ns) - stamp_ns
+            if skew_ns is not None and abs(skew_ns) >= MAX_SKEW_S * 1e9:
+                raise OmnidError(
+                    f"upper_stamp_ns: expected a stamp less than {MAX_SKEW_S:g} s from stamp_ns, {stamp_ns}, "
+                    f"found {upper_stamp_ns}: give both in nanoseconds of one clock"
+                )
+            # 2. Refuse an image that repeats an earlier one; it counts as an earlier one all the same. It is copied,
+            #    because the caller may read the next images into the same arrays.
+            pairs = zip(self._earlier.items(), images, strict=True)
+            found = [name for (name, earlier), image in pairs if earlier.add(image.copy())]
+            if found and not self._use_repeated:
+                raise OmnidError(
+                    f"the image of the {' and the '.join(found)} camera is an earlier one, to the last pixel: leave "
+                    'such pairs out, as a frozen camera shows no motion, or set pair.repeated_images="use"'
+                )
+            # 3. Follow the time between the exposures, which the stamps give with jitter; None: both at once.
+            if skew_ns is not None:
+                self._skew.add(skew_ns)
+            skew_s = 0.0 if skew_ns is None else self._skew.exposure_ns * 1e-9
+            # 4. Estimate the motion.
+            pair = FramePair(self._pairs, stamp_ns, *images, skew_s)
+            self._pairs, self._stamp_ns = self._pairs + 1, stamp_ns
+            return self._front_end.process(pair)
 
     def depth(self, pose: OdometryUpdate) -> DensePoints:
         """Return the dense depth of a pair that `process` has given the pose of; it is computed the first time.
@@ -196,27 +197,6 @@ class Odometry:
         """
         with self._lock:
             return self._front_end.dense.of(pose.depth)
-
-    def _checked_skew_ns(self, stamp_ns: int, upper_stamp_ns: int | None) -> int | None:
-        """Return the time from the lower to the upper stamp; None: both images were exposed at once."""
-        if upper_stamp_ns is None:
-            return None
-        skew_ns = _nanoseconds("upper_stamp_ns", upper_stamp_ns) - stamp_ns
-        if abs(skew_ns) >= MAX_SKEW_S * 1e9:
-            raise OmnidError(
-                f"upper_stamp_ns: expected a stamp less than {MAX_SKEW_S:g} s from stamp_ns, {stamp_ns}, "
-                f"found {upper_stamp_ns}: give both in nanoseconds of one clock"
-            )
-        return skew_ns
-
-    def _later_stamp_ns(self, stamp_ns: int) -> int:
-        stamp_ns = _nanoseconds("stamp_ns", stamp_ns)
-        if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
-            raise OmnidError(
-                f"stamp_ns: expected a stamp after that of the previous pair, {self._stamp_ns}, found "
-                f"{stamp_ns}: give the pairs in the order of time, each once"
-            )
-        return stamp_ns
 
     def _checked(self, name: Camera, image: InputImage) -> GreyImage:
         """Return the image, contiguous; OmnidError where it is not one of this camera."""

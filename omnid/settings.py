@@ -95,9 +95,9 @@ def _change(root: type, text: str) -> tuple[Path, object]:
             raise ValueError("expected section.key=value, found no '='")
         if not raw.isprintable() and any("\ud800" <= letter <= "\udfff" for letter in raw):
             raise ValueError(f"{dotted(path)}: expected UTF-8, found {shown(raw)}")
-        value = _scalar(raw)
-        if _is_text(_type_at(root, path)) and not isinstance(value, str):
-            value = raw
+        value, kind = _scalar(raw), get_args(_type_at(root, path))[0]
+        if (kind is str or get_origin(kind) is Literal) and not isinstance(value, str):
+            value = raw  # a text needs no quotes around it
         table: dict[str, Any] = {}
         _insert(table, path, value)
         convert(root, table)
@@ -130,12 +130,6 @@ def _type_at(root: Any, path: Path) -> Any:
     return kind
 
 
-def _is_text(kind: Any) -> bool:
-    """True for the type of a key whose values are texts: an override needs no quotes around them."""
-    bare = get_args(kind)[0]
-    return bare is str or get_origin(bare) is Literal
-
-
 def _insert(table: dict[str, Any], path: Path, value: object) -> None:
     """Set a value in nested tables. Raise ValueError where a section would replace a value."""
     for depth, name in enumerate(path[:-1]):
@@ -155,7 +149,7 @@ def _lines(settings: Any, default: Any, path: Path, wanted: Collection[str] | No
         if is_section(kind) or (wanted is not None and ".".join((*path, name)) not in wanted):
             continue
         value, usual = getattr(settings, name), getattr(default, name)
-        lines.append(f"# {_description(kind)}")
+        lines.append(f"# {next(found for found in get_args(kind)[1:] if isinstance(found, str))}")
         if wanted is None:
             lines.append(f"# {described(kind)}; default {_toml(usual)}")
         is_off = wanted is not None and value == usual
@@ -166,11 +160,6 @@ def _lines(settings: Any, default: Any, path: Path, wanted: Collection[str] | No
     for name, kind in types.items():
         if is_section(kind):
             yield from _lines(getattr(settings, name), getattr(default, name), (*path, name), wanted)
-
-
-def _description(kind: Any) -> str:
-    """Return the description of a key: the text in its annotation."""
-    return next(found for found in get_args(kind)[1:] if isinstance(found, str))
 
 
 def _toml(value: object) -> str:

@@ -53,9 +53,20 @@ def info(args: argparse.Namespace) -> int:
 
 
 def _described(found: LogInfo) -> Iterator[str]:
+    """Yield a line for each property, and the table of topics."""
+    from drivers.logs.open_log import LogState
+
+    faults = [_shown(found.fault)] if found.fault else []
+    if found.broken:
+        faults.append(f"{found.broken} corrupt chunks or records, which are skipped")
+    advice = f"; for other programs: {_MEND}" if found.path.suffix in (".mcap", ".part") else ""
+    states = {
+        LogState.BROKEN: f": {'; '.join(faults)}{advice}",
+        LogState.UNINDEXED: f": omnid reads it{advice}",
+    }
     yield f"log          {_shown(str(found.path))}"
     yield f"size         {_bytes(found.size_bytes)}"
-    yield f"state        {_state(found)}"
+    yield f"state        {found.state.value}{states.get(found.state, '')}"
     duration_s = 0.0
     if found.span_ns is not None:
         first_ns, last_ns = found.span_ns
@@ -64,30 +75,10 @@ def _described(found: LogInfo) -> Iterator[str]:
     yield f"messages     {found.messages}"
     listed = ", ".join(f"{_shown(name)} ({_bytes(size)})" for name, size in found.attachments.items())
     yield f"attachments  {listed or 'none'}"
-    if found.topics:
-        yield from _table(found, duration_s)
-
-
-def _state(found: LogInfo) -> str:
-    from drivers.logs.open_log import LogState
-
-    faults = [_shown(found.fault)] if found.fault else []
-    if found.broken:
-        faults.append(f"{found.broken} corrupt chunks or records, which are skipped")
-    advice = f"; for other programs: {_MEND}" if found.path.suffix in (".mcap", ".part") else ""
-    if found.state is LogState.BROKEN:
-        return f"{found.state.value}: {'; '.join(faults)}{advice}"
-    if found.state is LogState.UNINDEXED:
-        return f"{found.state.value}: omnid reads it{advice}"
-    return str(found.state.value)
-
-
-def _table(found: LogInfo, duration_s: float) -> Iterator[str]:
     rows = [(_shown(name), _shown(kind) or "-", count) for name, (kind, count) in found.topics.items()]
-    wide = min(MAX_COLUMN, max(len(name) for name, _, _ in rows))
-    wide_kind = min(MAX_COLUMN, max(len(kind) for _, kind, _ in rows))
-    yield ""
-    yield f"{'topic':<{wide}}  {'type':<{wide_kind}}{'messages':>10}{'Hz':>9}"
+    if rows:
+        wide, wide_kind = (min(MAX_COLUMN, max(map(len, column))) for column in list(zip(*rows, strict=True))[:2])
+        yield f"\n{'topic':<{wide}}  {'type':<{wide_kind}}{'messages':>10}{'Hz':>9}"
     for name, kind, count in rows:
         rate = f"{(count - 1) / duration_s:.2f}" if count > 1 and duration_s > 0 else "-"
         yield f"{name:<{wide}}  {kind:<{wide_kind}}{count:>10}{rate:>9}"

@@ -132,18 +132,14 @@ def settings_of(args: argparse.Namespace, more: Mapping[str, object] = _NO_SETTI
     from omnid.config import load_config
 
     named = {path: getattr(args, name) for entry in args.command.options for name, path in entry.settings()}
+    # As --set takes them.
     given = [
-        f"{path}={_text(value)}"
+        f"{path}={json.dumps(value) if isinstance(value, bool | list) else value}"
         for path, value in (named | dict(more)).items()
         if not (value is None or value is False)
     ]
     profile = PROFILES[args.profile] if getattr(args, "profile", None) else ()
     return load_config(args.config, [*profile, *args.overrides, *given])
-
-
-def _text(value: object) -> str:
-    """Return the value of an option as --set takes it."""
-    return json.dumps(value) if isinstance(value, bool | list) else str(value)
 
 
 # Settings of any command.

@@ -5,13 +5,9 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from omnid.commands.options import ROBOT, SECONDS, SETTINGS, TRUTH, check_seconds, command, option, settings_of
 from omnid.errors import OmnidError
-
-if TYPE_CHECKING:  # the help and other commands do not load these
-    from omnid.config import Config
 
 
 @command(
@@ -29,8 +25,10 @@ if TYPE_CHECKING:  # the help and other commands do not load these
 )
 def print_config(args: argparse.Namespace) -> int:
     """Print or check settings."""
-    from omnid.config import FIRST_SETTINGS
-    from omnid.settings import dump, dump_minimal
+    from drivers.motors.protocols.protocol_registry import motor_protocol
+    from omnid.config import FIRST_SETTINGS, Config
+    from omnid.settings import changed, dump, dump_minimal, value_at
+    from omnid.transport.bus_config import checked
 
     if (args.action == "print") != (args.file is None):
         raise OmnidError(
@@ -43,31 +41,17 @@ def print_config(args: argparse.Namespace) -> int:
         )
     args.config = args.file or args.config
     config = settings_of(args)
-    if args.action == "check":
-        _require_usable(config)
-        print("\n".join(_differences(config, str(args.file))))
-    else:
+    if args.action == "print":
         print(dump_minimal(config, FIRST_SETTINGS) if args.minimal else dump(config), end="")
-    return 0
-
-
-def _require_usable(config: Config) -> None:
-    """Raise OmnidError or DriverError for words that only the daemon's start would refuse."""
-    from drivers.motors.protocols.protocol_registry import motor_protocol
-    from omnid.transport.bus_config import checked
-
+        return 0
+    # Words that only the daemon's start would refuse.
     checked(config.bus)
     motor_protocol(config.motor.protocol)
-
-
-def _differences(config: Config, name: str) -> list[str]:
-    """Return a line about the file, and one for each setting that differs from its default."""
-    from omnid.config import Config
-    from omnid.settings import changed, value_at
-
     paths = changed(config)
-    lines = [f"{path} = {value_at(config, path)!r}, default {value_at(Config(), path)!r}" for path in paths]
-    return [f"{name}: good; {len(paths)} settings differ from their defaults", *lines]
+    print(f"{args.file}: good; {len(paths)} settings differ from their defaults")
+    for path in paths:
+        print(f"{path} = {value_at(config, path)!r}, default {value_at(Config(), path)!r}")
+    return 0
 
 
 @command(

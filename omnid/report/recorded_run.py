@@ -5,6 +5,7 @@ Times are in s since the first pose. A pose takes 300 bytes: an hour at 30 Hz 32
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -273,7 +274,14 @@ def read_run(path: Path, topic: str | None = None) -> RecordedRun:
     def seconds(stamp_ns: int) -> float:
         return (stamp_ns - start_ns) * 1e-9
 
-    corrections, map_xy = _corrections(map_poses, poses, start_ns)
+    # 3. The pose in the map relative to that of odometry with the same stamp: map -> odom as seen at the robot.
+    by_stamp = {pose.stamp_ns: pose.T_odom_base for pose in poses}
+    map_poses = [pose for pose in map_poses if pose.stamp_ns in by_stamp]
+    corrections = []
+    for in_map in map_poses:
+        T_map, T_odom = in_map.T_map_base, by_stamp[in_map.stamp_ns]
+        moved_m, sigma_m = math.dist(T_map[:2, 3], T_odom[:2, 3]), root(np.trace(in_map.covariance[:3, :3]))
+        corrections.append((seconds(in_map.stamp_ns), moved_m, se3.yaw(T_map @ se3.inverse(T_odom)), sigma_m))
     return RecordedRun(
         path=path,
         info=found,
@@ -289,8 +297,8 @@ def read_run(path: Path, topic: str | None = None) -> RecordedRun:
         variances=np.array([np.diag(pose.covariance) for pose in poses]),
         velocity=np.array([pose.velocity for pose in poses]),
         statuses=[(seconds(stamp_ns), entries) for stamp_ns, entries in statuses],
-        map_poses=corrections,
-        map_xy=map_xy,
+        map_poses=np.array(corrections).reshape(-1, 4),
+        map_xy=np.array([pose.T_map_base[:2, 3] for pose in map_poses]).reshape(-1, 2),
         drives={
             name: np.array([(seconds(twist.stamp_ns), twist.velocity_mps, twist.yaw_rate_radps) for twist in twists])
             for name, twists in drives.items()
@@ -300,22 +308,6 @@ def read_run(path: Path, topic: str | None = None) -> RecordedRun:
         late=late,
         corrupt=reader.corrupt,
     )
-
-
-def _corrections(map_poses: Sequence[PoseInMap], poses: Sequence[Pose], start_ns: int) -> tuple[Array, Array]:
-    """Return rows of t, correction in m and rad, sigma, and positions in the map, where odometry has the same stamp.
-
-    The correction is the pose in the map relative to that of odometry: the part of map -> odom seen at the robot.
-    """
-    by_stamp = {pose.stamp_ns: pose.T_odom_base for pose in poses}
-    both = [(pose, by_stamp[pose.stamp_ns]) for pose in map_poses if pose.stamp_ns in by_stamp]
-    if not both:
-        return np.zeros((0, 4)), np.zeros((0, 2))
-    T_map, T_odom = np.array([pose.T_map_base for pose, _ in both]), np.array([T for _, T in both])
-    moved_m = np.linalg.norm(T_map[:, :2, 3] - T_odom[:, :2, 3], axis=1)
-    sigma_m = root(np.array([np.diag(pose.covariance)[:3].sum() for pose, _ in both]))
-    t_s = np.array([(pose.stamp_ns - start_ns) * 1e-9 for pose, _ in both])
-    return np.column_stack([t_s, moved_m, se3.yaw(T_map @ se3.inverse(T_odom)), sigma_m]), T_map[:, :2, 3]
 
 
 def root(variances: Array) -> Array:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from html import escape
-from itertools import groupby, islice
+from itertools import islice, pairwise
 from typing import Any, Final
 
 import cv2
@@ -18,7 +18,6 @@ from calib.bounded_toml import parse_toml
 from calib.errors import CalibError
 from calib.models.names import model_in_words
 from calib.panorama import fit_cylinder, remap_tables
-from calib.rig import MountedCamera
 from drivers.errors import DriverError
 from drivers.logs.log_reader import LogReader
 from drivers.logs.open_log import LogState
@@ -111,7 +110,9 @@ def _head(run: RecordedRun) -> list[str]:
 def _key_figures(run: RecordedRun) -> str:
     count, end_s = len(run.t_s), run.end_s
     rate = f", {(count - 1) / end_s:.1f}/s" if end_s > 0 else ""
-    tiles = [("duration", _duration(end_s)), ("path", f"{run.length_m():.2f} m"), ("poses", f"{count}{rate}")]
+    minutes, hours = f"{end_s / 60:.1f} min", f"{end_s / 3600:.2f} h"
+    duration = f"{end_s:.1f} s" if end_s < 120 else minutes if end_s < 7200 else hours
+    tiles = [("duration", duration), ("path", f"{run.length_m():.2f} m"), ("poses", f"{count}{rate}")]
     known = run.ranks[run.ranks != UNKNOWN]
     if len(known):
         tiles += [(name, _share(int((known == rank).sum()), len(known))) for rank, name in enumerate(STATES)]
@@ -173,8 +174,10 @@ def _plan(run: RecordedRun, events: Sequence[Event], truth: _Truth | None) -> li
     # 2. The lines: a stretch of the path for each state; none leads from one odom to the next.
     xy, in_map = run.T_odom_base[:, :2, 3], _map_path(run)
     stretches: dict[int, list[Array]] = {}
-    for rank, first, last in _stretches(run):
-        stretches.setdefault(rank, []).append(xy[first:last])
+    breaks = {0, len(xy), *run.restarts, *(np.flatnonzero(np.diff(run.ranks)) + 1).tolist()}
+    for first, last in pairwise(sorted(breaks)):
+        begins_odom = first == 0 or first in run.restarts
+        stretches.setdefault(int(run.ranks[first]), []).append(xy[first if begins_odom else first - 1 : last])
     lines = [Lines([truth.base_xy], TRUTH_COLOUR, 2)] if truth else []
     lines += [Lines([in_map], MAP_COLOUR, 2)] if len(in_map) else []
     lines.append(Lines([part for parts in stretches.values() for part in parts], (255, 255, 255), 9))
@@ -182,7 +185,10 @@ def _plan(run: RecordedRun, events: Sequence[Event], truth: _Truth | None) -> li
     sheet = sheet_of(points_xy, np.vstack([xy, in_map, truth.base_xy if truth else np.zeros((0, 2))]))
     image = draw_plan(sheet, points_xy, confidence, lines)
     # 3. Times, losses, start and end.
-    for t_s in _round_times(run.end_s):
+    # Some six round times relate the path to the charts.
+    steps_s = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200)
+    step_s = next((step_s for step_s in steps_s if run.end_s <= 6 * step_s), 14400)
+    for t_s in np.arange(step_s, run.end_s, step_s):
         x, y = (int(v) for v in sheet.pixels(xy[np.searchsorted(run.t_s, t_s)][None])[0])
         cv2.circle(image, (x, y), 4, (0, 0, 0), cv2.FILLED, cv2.LINE_AA)
         write(image, _clock(t_s, run.end_s < 300), (x + 22, y - 8))
@@ -217,16 +223,6 @@ def _key(colour: tuple[int, int, int], name: str) -> str:
     return f"<span class='key'><i style='background:rgb({r},{g},{b})'></i>{name}</span>"
 
 
-def _stretches(run: RecordedRun) -> Iterator[tuple[int, int, int]]:
-    """Yield rank, first and last + 1 pose of each stretch of one state, which begins at the end of the one before."""
-    restarts = set(run.restarts)
-    odom = np.cumsum([index in restarts for index in range(len(run.t_s))])
-    for (rank, _), poses in groupby(range(len(run.t_s)), lambda index: (int(run.ranks[index]), int(odom[index]))):
-        indices = list(poses)
-        begins_odom = indices[0] == 0 or indices[0] in restarts
-        yield rank, indices[0] if begins_odom else indices[0] - 1, indices[-1] + 1
-
-
 def _spans(run: RecordedRun) -> list[tuple[float, float, int]]:
     """Return begin, end and rank of each time with one state; a gap without poses belongs to none."""
     ends_s, gap_ends = np.append(run.t_s[1:], run.end_s), dict(map(tuple, run.gaps()))
@@ -241,13 +237,6 @@ def _spans(run: RecordedRun) -> list[tuple[float, float, int]]:
 
 def _is_loss(event: Event) -> bool:
     return (event.source, event.text) == ("state", STATES[-1])
-
-
-def _round_times(end_s: float) -> list[float]:
-    """Return some six round times, which relate the path to the charts."""
-    steps_s = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200)
-    step_s = next((step_s for step_s in steps_s if end_s <= 6 * step_s), 14400)
-    return [step_s * k for k in range(1, math.ceil(end_s / step_s))][:MAX_ROWS]
 
 
 def _timeline(
@@ -293,12 +282,6 @@ def _clock(seconds: float, in_seconds: bool) -> str:
         return f"{seconds:.2f}".rstrip("0").rstrip(".") + " s"
     whole = abs(seconds)
     return f"{'-' if seconds < 0 else ''}{int(whole // 3600)}:{int(whole // 60) % 60:02}:{whole % 60:04.1f}"
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 120:
-        return f"{seconds:.1f} s"
-    return f"{seconds / 60:.1f} min" if seconds < 7200 else f"{seconds / 3600:.2f} h"
 
 
 def _share(count: int, total: int) -> str:
@@ -518,7 +501,11 @@ def _setup(run: RecordedRun) -> list[str]:
         if not np.allclose(T, np.eye(4)):
             rotation = ", ".join(f"{value:.3g}" for value in np.rad2deg(se3.rotation_log(T[:3, :3])))
             place = f"at {', '.join(f'{value:.3g}' for value in T[:3, 3])} m, rotated by {rotation} deg"
-        cameras = [(f"{name} camera", _camera(one)) for name, one in (("lower", rig.lower), ("upper", rig.upper))]
+        cameras = []
+        for name, one in (("lower", rig.lower), ("upper", rig.upper)):
+            size = f"{one.camera.size[0]}x{one.camera.size[1]} px"
+            mask = "with a mask" if one.mask else "without a mask"
+            cameras.append((f"{name} camera", f"{model_in_words(one.camera)}, {size}, {mask}"))
         rows = [("baseline", f"{rig.baseline_m * 1e3:.2f} mm"), *cameras, ("on the robot", place)]
         parts.append(facts([(name, escape(value)) for name, value in rows]))
     settings = run.attachments.get("omnid.toml")
@@ -531,11 +518,6 @@ def _setup(run: RecordedRun) -> list[str]:
         cells = [tuple(map(escape, row)) for row in found]
         parts.append(f"<div class='words scroll'>{table(('setting', 'value', 'default'), cells)}</div>")
     return parts
-
-
-def _camera(mounted: MountedCamera) -> str:
-    size = f"{mounted.camera.size[0]}x{mounted.camera.size[1]} px"
-    return f"{model_in_words(mounted.camera)}, {size}, {'with' if mounted.mask else 'without'} a mask"
 
 
 def _changed(settings: bytes) -> list[tuple[str, str, str]] | None:

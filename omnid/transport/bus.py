@@ -294,8 +294,12 @@ class Bus:
                 self._namesakes.discard(key)
             elif key != own:
                 self._namesakes.add(key)
-                if was_unique:
-                    self._report_same_name()
+                if was_unique and not self._warned:
+                    self._warned = True
+                    self._warn(self._same_name)
+                # Two robots that obey one operator are not what the operator expects.
+                if was_unique and self._on_command is not None:
+                    self._on_command(Request(STOP))
 
         tokens = session.liveliness()
         self._declared += [
@@ -303,14 +307,6 @@ class Bus:
             tokens.declare_subscriber(f"{self._config.robot}/{ALIVE}/*", on_token, history=True),
             tokens.declare_token(f"{self._config.robot}/{ALIVE}"),
         ]
-
-    def _report_same_name(self) -> None:
-        """Warn once, and stop the wheels: two robots that obey one operator are not what the operator expects."""
-        if not self._warned:
-            self._warned = True
-            self._warn(self._same_name)
-        if self._on_command is not None:
-            self._on_command(Request(STOP))
 
     def _declare_queryable(self, session: zenoh.Session, name: str) -> None:
         key = plain_key(self._config.robot, name)

@@ -8,7 +8,6 @@ stopped", which is never longer.
 
 from __future__ import annotations
 
-import ipaddress
 import re
 import secrets
 import select
@@ -51,7 +50,7 @@ class StopListener:
         self._poll = select.poll()
         proves = needs_proof(config)
         for host, port in addresses(config.listen):
-            if proves and not _is_loopback(host):
+            if proves and host not in ("localhost", "127.0.0.1", "::1"):
                 host = "127.0.0.1"
             with suppress(OSError):
                 self._sockets.append(_bound(host, port))
@@ -139,13 +138,6 @@ class StopSender:
                 if data == _HEAD + self._nonce + b" " + state.encode():
                     answer = state
         return answer
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 def _bound(host: str, port: int) -> socket.socket:

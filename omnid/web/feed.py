@@ -302,7 +302,5 @@ class RobotFeed:
 
 def _latched(robot: Robot) -> tuple[Diagnostics | None, Map | None]:
     """Return the status and the map that were published before the connection was made."""
-    with robot.subscribe(Diagnostics) as reports:
-        diagnostics = reports.newest()
-    with robot.subscribe(Map) as maps:
-        return diagnostics, maps.newest()
+    with robot.subscribe(Diagnostics) as reports, robot.subscribe(Map) as maps:
+        return reports.newest(), maps.newest()

@@ -11,7 +11,6 @@ from typing import Any, Final
 import numpy as np
 
 from calib import se3
-from omnid.engine.telemetry import Histogram
 from omnid.monitor.robot_state import RobotState, importance
 from omnid.plain_text import plain
 from omnid.transport.codec import OK, Map, Pose, PoseInMap, Scan
@@ -52,10 +51,10 @@ def state_news(robot: str, state: RobotState, link: str, extra: Mapping[str, Any
         "missed": state.missed,
         "broken": state.broken,
         "pose": None if state.pose is None else _pose(state.pose),
-        "age_ms": _quantiles_ms(state.age),
-        "network_ms": _quantiles_ms(state.network),
+        "age_ms": [finite(1e3 * state.age.p(q)) for q in (0.5, 0.99)],
+        "network_ms": [finite(1e3 * state.network.p(q)) for q in (0.5, 0.99)],
         "wheels": _wheels(state),
-        "in_map": _in_map(state),
+        "in_map": None if PLACES not in state.statuses else plain(state.statuses[PLACES].message),
         "pace": plain(state.real_time_factor),
         "warnings": _warnings(state, link),
         "server_ms": server_ms(),
@@ -105,20 +104,14 @@ def map_cells(grid: Map) -> tuple[dict[str, Any], bytes]:
         "cell_m": step * grid.cell_m,
         "x_m": grid.corner[0],
         "y_m": grid.corner[1],
-        "known": _known_part(cells, step * grid.cell_m, grid.corner),
+        "known": None,
     }
-    return header, zlib.compress(cells.tobytes(), 1)
-
-
-def _known_part(
-    cells: np.ndarray[Any, np.dtype[np.uint8]], cell_m: float, corner: tuple[float, float]
-) -> list[float] | None:
-    """Return left, low, right and high of what is known, m; None without any: a grid is as wide as views may reach."""
+    # Left, low, right and high of what is known, m: a grid is as wide as views may reach.
     rows, columns = np.nonzero(cells)
-    if not rows.size:
-        return None
-    (x_m, y_m), edges = corner, (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)
-    return [float(start_m + cell_m * edge) for start_m, edge in zip((x_m, y_m, x_m, y_m), edges, strict=True)]
+    if rows.size:
+        edges = np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1])
+        header["known"] = (np.tile(grid.corner, 2) + step * grid.cell_m * edges).tolist()
+    return header, zlib.compress(cells.tobytes(), 1)
 
 
 def scan_news(scan: Scan, poses: Iterable[Pose]) -> dict[str, Any]:
@@ -196,12 +189,6 @@ def _wheels(state: RobotState) -> dict[str, Any] | None:
     }
 
 
-def _in_map(state: RobotState) -> str | None:
-    """Return the state of the pose in the map of places; None where the robot has none."""
-    status = state.statuses.get(PLACES)
-    return None if status is None else plain(status.message)
-
-
 def _warnings(state: RobotState, link: str) -> list[dict[str, Any]]:
     """Return what is wrong, the worst first, each with its remedy."""
     found = []
@@ -218,11 +205,6 @@ def _warnings(state: RobotState, link: str) -> list[dict[str, Any]]:
 
 def _warning(level: int, name: str, message: str, remedy: str) -> dict[str, Any]:
     return {"level": level, "name": plain(name), "message": plain(message), "remedy": plain(remedy)}
-
-
-def _quantiles_ms(histogram: Histogram) -> list[float | None]:
-    """Return median and 99th percentile."""
-    return [finite(1e3 * histogram.p(q)) for q in (0.5, 0.99)]
 
 
 def finite(value: float) -> float | None:

@@ -123,8 +123,7 @@ def test_the_controller_does_not_run_it(hostile: Path, tmp_path: Path) -> None:
 def test_the_viewer_does_not_run_it(hostile: Path) -> None:
     pytest.importorskip("rerun")
     ask = (
-        "import subprocess\nfrom omnid.commands.view import VIEWER\n"
-        "from omnid.engine.process import python\n"
-        "print(subprocess.run(python(*VIEWER, '--version'), capture_output=True, text=True).stdout)"
+        "import subprocess\nfrom omnid.engine.process import python\nwords = python('-m', 'rerun_cli', '--version')\n"
+        "print(subprocess.run(words, capture_output=True, text=True).stdout)"
     )
     assert "rerun" in run(hostile, "-c", ask).stdout
