@@ -61,13 +61,7 @@ class PixelFormat(ctypes.Structure):
         ("pixelformat", _u32),
         ("field", _u32),
         ("bytesperline", _u32),
-        ("sizeimage", _u32),
-        ("colorspace", _u32),
-        ("priv", _u32),
-        ("flags", _u32),
-        ("ycbcr_enc", _u32),
-        ("quantization", _u32),
-        ("xfer_func", _u32),
+        ("others", _u32 * 7),  # size of the image, colours
     )
 
 
@@ -86,12 +80,9 @@ class StreamParameters(ctypes.Structure):
 
     _fields_ = (
         ("type", _u32),
-        ("capability", _u32),
-        ("capturemode", _u32),
+        ("capability", _u32 * 2),  # and the mode of capture
         ("timeperframe", Fraction),
-        ("extendedmode", _u32),
-        ("readbuffers", _u32),
-        ("reserved", _u8 * (200 - 6 * 4)),
+        ("others", _u8 * (200 - 4 * 4)),
     )
 
 
@@ -124,8 +115,7 @@ class V4l2Buffer(ctypes.Structure):
         ("memory", _u32),
         ("m", _BufferMemory),
         ("length", _u32),
-        ("reserved2", _u32),
-        ("request_fd", _u32),
+        ("others", _u32 * 2),
     )
 
     @property

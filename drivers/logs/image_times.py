@@ -16,7 +16,6 @@ from collections import Counter, deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from operator import sub
 from statistics import median
 from typing import Final, Literal, TypeAlias
 
@@ -36,7 +35,7 @@ DELAYS: Final = 8  # recent delays, whose median is the usual one
 EPOCH_NS: Final = 10**18  # The year 2001: earlier stamps count from a start, as of the computer.
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class TimedImage:
     """An image of a camera with both its times."""
 
@@ -44,30 +43,28 @@ class TimedImage:
     image: RosImage  # its stamp is that of the header, 0 if unset
     log_ns: int  # by ImageTimes.logged_ns()
 
+    @property
+    def delay_ns(self) -> int:
+        """The header minus the time of logging: negative where an image was logged after it was taken."""
+        return self.image.stamp_ns - self.log_ns
+
 
 @dataclass(slots=True)
 class _CameraTimes:
     """What is known of the times of one camera."""
 
-    header_ns: int = 0  # of the image before
+    before: TimedImage | None = None  # the last image
+    stamp_ns: int = 0  # of it, as delivered
     newest_ns: int = 0  # latest header of the segment
-    stamp_ns: int = 0  # of the image before, as delivered
-    log_ns: int = 0  # of the image before
-    data: memoryview = field(default_factory=lambda: memoryview(b""))  # of the image before
     shift_ns: int = 0  # from headers to stamps, after steps of the clock
-    delays_ns: deque[int] = field(default_factory=lambda: deque(maxlen=DELAYS))  # header minus time of logging
-    least_delay_ns: int = -LATEST_NS  # the largest of them in the segment: negative where images arrive late
+    delays_ns: deque[int] = field(default_factory=lambda: deque(maxlen=DELAYS))  # of images that are not late
+    least_delay_ns: int = -LATEST_NS  # the largest of them in the segment: no image is logged before it is taken
     periods_ns: deque[int] = field(default_factory=lambda: deque(maxlen=DELAYS))
-
-    @property
-    def delay_ns(self) -> int:
-        """The usual header minus the time of logging."""
-        return round(median(self.delays_ns)) if self.delays_ns else 0
 
     @property
     def period_ns(self) -> int:
         """The usual time between two images."""
-        return round(median(self.periods_ns)) if self.periods_ns else 0
+        return _median_ns(self.periods_ns)
 
 
 class ImageTimes:
@@ -76,31 +73,22 @@ class ImageTimes:
     def __init__(self, source: TimeSource = "auto") -> None:
         self.source: TimeSource = source
         self.by_log: Counter[str] = Counter()  # images with the time of logging, by what is wrong with their headers
-        self.notes: list[str] = []
-        self._is_auto = source == "auto"
-        self._has_log = True  # the times of logging advance
+        self._is_auto, self._is_decided, self._has_log = source == "auto", False, True  # the times of logging advance
         self._cameras: dict[Camera, _CameraTimes] = {camera: _CameraTimes() for camera in CAMERAS}
         self._last_log_ns: int | None = None
         self._log_shift_ns = 0
         self._steps: list[tuple[int, int]] = []  # stamp before, and size of each step of the clock
         self._first_ns: int | None = None
         self._fault = ""  # of the headers, where the times of logging are used for all images
+        self._is_old = False  # the headers count from the start of the computer
 
     def stamped(self, images: Iterable[TimedImage]) -> Iterator[TimedImage]:
         """Yield the images, which come in the order of logging, with the stamps that are used."""
         waiting: deque[TimedImage] = deque()
-        is_decided = False
         for image in images:
             waiting.append(image)
-            held = sum(len(each.image.data) for each in waiting) > MAX_HELD_BYTES
-            if not is_decided and (held or len(waiting) >= FIRST_IMAGES):
-                self._decide(waiting)
-                is_decided = True
-            while is_decided and (held or len(waiting) >= FIRST_IMAGES) and waiting:
+            while len(waiting) >= FIRST_IMAGES or sum(len(each.image.data) for each in waiting) > MAX_HELD_BYTES:
                 yield self._next(waiting)
-                held = False
-        if not is_decided:
-            self._decide(waiting)
         while waiting:
             yield self._next(waiting)
 
@@ -111,13 +99,17 @@ class ImageTimes:
         if not self._steps:
             return header_ns
         lower = self._cameras["lower"]
-        expected_ns = log_ns + lower.delay_ns + lower.shift_ns
+        expected_ns = log_ns + _median_ns(lower.delays_ns) + lower.shift_ns
         shifts = (0, *(times.shift_ns for times in self._cameras.values()))
         return min((header_ns + shift_ns for shift_ns in shifts), key=lambda stamp_ns: abs(stamp_ns - expected_ns))
 
     def warnings(self) -> Iterator[str]:
         """Yield one line for each fault of the stamps."""
-        yield from self.notes
+        if self._is_old:
+            yield (
+                "the stamps of the images begin in 1970, as by a clock that counts from the start of the computer; "
+                'log.time = "log" takes the times of logging'
+            )
         if self.by_log:
             reasons = " or ".join(self.by_log)
             yield f"used the times of logging for {self.by_log.total()} images: the stamps of their headers {reasons}"
@@ -145,13 +137,13 @@ class ImageTimes:
 
     def _decide(self, first: Iterable[TimedImage]) -> None:
         """Choose the times for the whole log by its first images."""
-        mine = {camera: [each for each in first if each.camera == camera] for camera in CAMERAS}
-        headers = [[each.image.stamp_ns for each in images] for images in mine.values() if len(images) > 1]
-        logged = [[each.log_ns for each in images] for images in mine.values() if len(images) > 1]
+        self._is_decided = True
+        of_cameras = [[each for each in first if each.camera == camera] for camera in CAMERAS]
+        of_cameras = [images for images in of_cameras if len(images) > 1]
+        headers = [[each.image.stamp_ns for each in images] for images in of_cameras]
+        logged = [[each.log_ns for each in images] for images in of_cameras]
+        delays = [_median_ns(each.delay_ns for each in images) for images in of_cameras]
         self._has_log = bool(logged) and all(_step_ns(times) >= SHORTEST_STEP_NS for times in logged)
-        delays = [
-            median(each.image.stamp_ns - each.log_ns for each in images) for images in mine.values() if len(images) > 1
-        ]
         if any(header.count(0) > len(header) / 2 for header in headers):
             self._fault = "are 0"
         elif any(_step_ns(header) < SHORTEST_STEP_NS for header in headers):
@@ -163,79 +155,66 @@ class ImageTimes:
             self._has_log = self._has_log and all(1 / FASTEST < rate < FASTEST for rate in rates)
         if self._is_auto:
             self.source = "log" if self._fault and self._has_log else "header"
-        known = [stamp_ns for header in headers for stamp_ns in header]
-        is_old = known and 0 < median(known) < EPOCH_NS
-        if self.source == "header" and is_old and all(min(times) > EPOCH_NS for times in logged):
-            self.notes.append(
-                "the stamps of the images begin in 1970, as by a clock that counts from the start of the computer; "
-                'log.time = "log" takes the times of logging'
-            )
+        is_old = 0 < _median_ns(stamp_ns for header in headers for stamp_ns in header) < EPOCH_NS
+        self._is_old = is_old and self.source == "header" and all(min(times) > EPOCH_NS for times in logged)
 
     def _next(self, waiting: deque[TimedImage]) -> TimedImage:
         """Take the first of the images that wait, and stamp it with regard to those behind it."""
+        if not self._is_decided:
+            self._decide(waiting)
         first = waiting.popleft()
         behind = [each for each in waiting if each.camera == first.camera][:LOOKED_AHEAD]
-        times, header_ns = self._cameras[first.camera], first.image.stamp_ns
+        times = self._cameras[first.camera]
         stamp_ns = self._stamp_ns(times, first, behind)
         if self._first_ns is None:
             self._first_ns = stamp_ns
-        before_ns, now_ns = (times.log_ns, first.log_ns) if self.source == "log" else (times.header_ns, header_ns)
-        if 0 < before_ns < now_ns:
-            times.periods_ns.append(now_ns - before_ns)
-        times.header_ns, times.log_ns, times.data, times.stamp_ns = header_ns, first.log_ns, first.image.data, stamp_ns
+        if times.before is not None:
+            is_log = self.source == "log"
+            before_ns = times.before.log_ns if is_log else times.before.image.stamp_ns
+            now_ns = first.log_ns if is_log else first.image.stamp_ns
+            if 0 < before_ns < now_ns:
+                times.periods_ns.append(now_ns - before_ns)
+        times.before, times.stamp_ns = first, stamp_ns
         return replace(first, image=replace(first.image, stamp_ns=stamp_ns))
 
     def _stamp_ns(self, times: _CameraTimes, first: TimedImage, behind: list[TimedImage]) -> int:
         """Return the stamp of an image; behind: the next images of its camera."""
-        header_ns, before_ns = first.image.stamp_ns, times.header_ns
-        delays_ns = times.delays_ns or [each.image.stamp_ns - each.log_ns for each in behind if each.image.stamp_ns]
-        usual_ns = round(median(delays_ns)) if delays_ns else 0
-        by_log_ns = first.log_ns + usual_ns + times.shift_ns
         if self.source == "log":
             if self._is_auto:
                 self.by_log[self._fault] += 1
             return first.log_ns
+        header_ns, before = first.image.stamp_ns, times.before
+        usual_ns = _median_ns(times.delays_ns or [each.delay_ns for each in behind if each.image.stamp_ns])
+        fault = ""
         # 1. A header that is not set, or is that of another image.
         if not header_ns and first.log_ns:
-            self.by_log["are 0"] += 1
-            return by_log_ns
-        if header_ns and before_ns == header_ns and first.image.data != times.data and self._has_log and self._is_auto:
-            self.by_log["do not advance"] += 1
-            return by_log_ns
-        # 2. A step of the clock, after which it runs on.
-        size_ns = self._step(times, first, behind)
-        if size_ns:
+            fault = "are 0"
+        elif self._judges and before and header_ns == before.image.stamp_ns and first.image.data != before.image.data:
+            fault = "do not advance" if header_ns else ""
+        # 2. A step of the clock, after which it runs on; else a time that is far from those of all other images.
+        elif size_ns := self._step(times, first, behind):
             self._move(times, size_ns)
-        elif self._is_ahead(times, first) or self._is_alone(times, first, behind):
-            is_ahead = header_ns - first.log_ns > usual_ns
-            self.by_log["lie ahead of the log" if is_ahead else "lie long before the log"] += 1
-            return by_log_ns
+        elif self._judges and (self._is_ahead(times, first) or _is_alone(times, first, behind)):
+            fault = "lie ahead of the log" if first.delay_ns > usual_ns else "lie long before the log"
+        if fault:
+            self.by_log[fault] += 1
+            return first.log_ns + usual_ns + times.shift_ns
         # 3. Late images tell nothing about the usual delay.
         if header_ns >= times.newest_ns:
             times.newest_ns = header_ns
-            times.delays_ns.append(header_ns - first.log_ns)
-            times.least_delay_ns = max(times.least_delay_ns, header_ns - first.log_ns)
+            times.delays_ns.append(first.delay_ns)
+            times.least_delay_ns = max(times.least_delay_ns, first.delay_ns)
         return header_ns + times.shift_ns
+
+    @property
+    def _judges(self) -> bool:
+        """True if a header may be replaced by the time of logging."""
+        return self._is_auto and self._has_log
 
     def _is_ahead(self, times: _CameraTimes, first: TimedImage) -> bool:
         """True if the header has jumped to a time long after that of logging; no image is logged before it is taken."""
-        if not (self._is_auto and self._has_log and times.delays_ns):
-            return False
         latest_ns = max(times.newest_ns, first.log_ns + times.least_delay_ns)
-        return first.image.stamp_ns > latest_ns + STEP_NS
-
-    def _is_alone(self, times: _CameraTimes, first: TimedImage, behind: list[TimedImage]) -> bool:
-        """True if the header of an image lies far from its time of logging, and those of all others do not.
-
-        An image that was delivered late is logged between others, which are as far apart as always.
-        """
-        if not (self._is_auto and self._has_log and len(behind) == LOOKED_AHEAD):
-            return False
-        if times.log_ns and behind[0].log_ns - times.log_ns < LONGEST_STEP * times.period_ns:
-            return False
-        others_ns = [*times.delays_ns, *(each.image.stamp_ns - each.log_ns for each in behind)]
-        apart_ns = min(abs(first.image.stamp_ns - first.log_ns - other_ns) for other_ns in others_ns)
-        return max(others_ns) - min(others_ns) < STEP_NS < apart_ns
+        return bool(self._judges and times.delays_ns and first.image.stamp_ns > latest_ns + STEP_NS)
 
     def _step(self, times: _CameraTimes, first: TimedImage, behind: list[TimedImage]) -> int:
         """Return by how much a clock was set before an image; 0 where it was not."""
@@ -244,16 +223,16 @@ class ImageTimes:
         if not (behind and self._has_log and times.delays_ns):
             return 0
         # Late images go back as well, but they are logged all at once, or are few, or the next one is not late.
-        headers = [first.image.stamp_ns, *(each.image.stamp_ns for each in behind)]
-        logged = [first.log_ns, *(each.log_ns for each in behind)]
-        passed_ns, logged_ns = headers[-1] - headers[0], max(1, logged[-1] - logged[0])
+        images = [first, *behind]
+        headers = [each.image.stamp_ns for each in images]
+        passed_ns, logged_ns = headers[-1] - headers[0], max(1, images[-1].log_ns - first.log_ns)
         is_usual = passed_ns < FASTEST * len(behind) * (times.period_ns or passed_ns)
         if headers != sorted(set(headers)) or not is_usual or not 1 / FASTEST < passed_ns / logged_ns < FASTEST:
             return 0
-        sizes_ns = [delay_ns - times.delay_ns for delay_ns in map(sub, headers, logged)]
-        size_ns = round(median(sizes_ns))
-        spread_ns = sum(max(some) - min(some) for some in (times.delays_ns, sizes_ns))
-        least_ns = max(times.period_ns, spread_ns)
+        usual_ns = _median_ns(times.delays_ns)
+        sizes_ns = [each.delay_ns - usual_ns for each in images]
+        size_ns = _median_ns(sizes_ns)
+        least_ns = max(times.period_ns, sum(max(some) - min(some) for some in (times.delays_ns, sizes_ns)))
         is_one = all(abs(each) > least_ns and each * size_ns > 0 for each in sizes_ns)
         return size_ns if is_one else 0
 
@@ -266,6 +245,26 @@ class ImageTimes:
             self._steps.append((times.stamp_ns, size_ns))
         times.shift_ns, times.newest_ns, times.least_delay_ns = shift_ns, 0, -LATEST_NS
         times.delays_ns.clear()
+
+
+def _is_alone(times: _CameraTimes, first: TimedImage, behind: list[TimedImage]) -> bool:
+    """True if the header of an image lies far from its time of logging, and those of all others do not.
+
+    An image that was delivered late is logged between others, which are as far apart as always.
+    """
+    if len(behind) < LOOKED_AHEAD:
+        return False
+    if times.before is not None and behind[0].log_ns - times.before.log_ns < LONGEST_STEP * times.period_ns:
+        return False
+    others_ns = [*times.delays_ns, *(each.delay_ns for each in behind)]
+    apart_ns = min(abs(first.delay_ns - other_ns) for other_ns in others_ns)
+    return max(others_ns) - min(others_ns) < STEP_NS < apart_ns
+
+
+def _median_ns(times: Iterable[int]) -> int:
+    """Return the median, 0 of none."""
+    found = list(times)
+    return round(median(found)) if found else 0
 
 
 def _step_ns(times: list[int]) -> float:
