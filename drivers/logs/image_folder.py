@@ -72,7 +72,7 @@ class ImageFolder:
     def __init__(self, path: Path, folders: Sequence[Path], rate_hz: float = 0.0) -> None:
         """rate_hz: images a second; 0: their names or times.txt state their stamps."""
         self._path = path
-        self._files = [sorted(_stamped(path, folder, rate_hz)) for folder in folders]
+        self._files = [sorted(_stamped(folder, rate_hz)) for folder in folders]
         names = [folder.relative_to(path).as_posix() for folder in folders]
         self.topics = {number: Topic(name, COMPRESSED_IMAGE) for number, name in enumerate(names)}
         self.faults: Counter[str] = Counter()
@@ -102,9 +102,8 @@ class ImageFolder:
     def attachments(self) -> dict[str, bytes]:
         """Return the rig.toml in the folder of the folders, if it is a regular file of at most 16 MiB."""
         try:
-            _require_own_files(self._path, [self._path / ATTACHMENT])
             data = _read_regular(self._path / ATTACHMENT, MAX_ATTACHMENT_BYTES + 1)
-        except (OSError, DriverError):
+        except OSError:
             return {}
         return {ATTACHMENT: data} if len(data) <= MAX_ATTACHMENT_BYTES else {}
 
@@ -112,10 +111,9 @@ class ImageFolder:
         """No file stays open."""
 
 
-def _stamped(top: Path, folder: Path, rate_hz: float) -> list[_StampedFile]:
+def _stamped(folder: Path, rate_hz: float) -> list[_StampedFile]:
     """Return the images of a folder with their stamps; raise DriverError where one has none."""
     paths = sorted((path for path in folder.iterdir() if _is_image(path.name)), key=_numbers_of)
-    _require_own_files(top, paths)
     if rate_hz:
         return [_StampedFile(round(index * 1e9 / rate_hz), path) for index, path in enumerate(paths)]
     lines = _stamp_lines(folder)
@@ -171,25 +169,6 @@ def _stamp_lines(folder: Path) -> list[str] | None:
         except OSError as error:
             raise DriverError(f"cannot read the stamps {str(path)!r}: {error.strerror}") from error
     return None
-
-
-def _require_own_files(top: Path, paths: Sequence[Path]) -> None:
-    """Raise DriverError, in one line, where a path is no regular file below the folder `top`.
-
-    A pipe or a device would be waited for without an end, and a link could lead to any file of the machine.
-    """
-    real_top = os.path.realpath(top)
-    others = [
-        path
-        for path in paths
-        if not path.is_file() or os.path.commonpath([real_top, os.path.realpath(path)]) != real_top
-    ]
-    if others:
-        more = f" and {len(others) - 1} more" if len(others) > 1 else ""
-        raise DriverError(
-            f"{str(others[0])!r}{more}: no regular file of the folder {str(top)!r}, but a pipe, a "
-            "device, a folder, or a link out of it: remove it, or copy what it leads to"
-        )
 
 
 def _read_regular(path: Path, most_bytes: int) -> bytes:
