@@ -39,19 +39,20 @@ class Metrics:
 
     def __str__(self) -> str:
         """Return aligned lines for a terminal, in m, mm, per cent and degrees."""
-        length = (
-            f"{self.length_estimate_m:.4f} m, truth {self.length_truth_m:.4f} m ({_percent(self.length_error_ratio)})"
-        )
+        ratio = self.length_error_ratio
+        error = "undefined" if math.isnan(ratio) else f"{100.0 * ratio:+.2f} %"
+        length = f"{self.length_estimate_m:.4f} m, truth {self.length_truth_m:.4f} m ({error})"
         errors_mm = (1e3 * v for v in (self.ate_rmse_m, self.ate_max_m, self.end_error_m))
         position = "rmse {:.2f}, max {:.2f}, end {:.2f} mm".format(*errors_mm)
         errors_deg = (math.degrees(v) for v in (self.heading_rmse_rad, self.heading_max_rad, self.heading_end_rad))
         heading = "rmse {:.3f}, max {:.3f}, end {:.3f} deg".format(*errors_deg)
+        step_mm, step_deg = 1e3 * self.rpe_translation_rmse_m, math.degrees(self.rpe_rotation_rmse_rad)
         rows = [
             ("associated poses", f"{self.pairs} ({self.coverage:.1%} of the truth)"),
             ("path length", length),
             ("position error (ATE)", position),
             ("heading error", heading),
-            ("step error (RPE)", f"rmse {_mm(self.rpe_translation_rmse_m)}, {_deg(self.rpe_rotation_rmse_rad)}"),
+            ("step error (RPE)", f"rmse {step_mm:.2f} mm, {step_deg:.3f} deg"),
             *([("scale", f"estimate times {self.scale:.5f}")] if self.scale != 1.0 else []),
         ]
         return "\n".join(f"{name:<21} {value}" for name, value in rows)
@@ -67,7 +68,9 @@ def evaluate(estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.01,
     """
     if alignment not in ALIGNMENTS:
         raise OmnidError(f"an alignment {', '.join(ALIGNMENTS)} was expected, {alignment!r} found")
-    of_estimate, of_truth = associate(estimate.stamps_ns, truth.stamps_ns, _tolerance_ns(tolerance_s))
+    if not math.isfinite(tolerance_s) or tolerance_s < 0.0:
+        raise OmnidError(f"a tolerance of 0 s or more was expected, {tolerance_s} found: try 0.01")
+    of_estimate, of_truth = associate(estimate.stamps_ns, truth.stamps_ns, round(tolerance_s * 1e9))
     if of_estimate.size < 2:
         raise OmnidError(
             f"2 poses at the same times (within {tolerance_s:g} s) were expected, {of_estimate.size} found:"
@@ -75,24 +78,6 @@ def evaluate(estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.01,
         )
     T_true = truth.T[of_truth]
     return _metrics(*aligned(estimate.T[of_estimate], T_true, alignment), T_true, len(T_true) / truth.stamps_ns.size)
-
-
-def _mm(distance_m: float) -> str:
-    return f"{1e3 * distance_m:.2f} mm"
-
-
-def _percent(ratio: float) -> str:
-    return "undefined" if math.isnan(ratio) else f"{100.0 * ratio:+.2f} %"
-
-
-def _deg(angle_rad: float) -> str:
-    return f"{math.degrees(angle_rad):.3f} deg"
-
-
-def _tolerance_ns(tolerance_s: float) -> int:
-    if not math.isfinite(tolerance_s) or tolerance_s < 0.0:
-        raise OmnidError(f"a tolerance of 0 s or more was expected, {tolerance_s} found: try 0.01")
-    return round(tolerance_s * 1e9)
 
 
 def associate(
