@@ -219,7 +219,7 @@ class ChunkedFile(ABC):
             found = np.concatenate([self._index(record, chunk.begin) for record in index])
             self._indexed[chunk.begin] = len(found)
             self._undefined.update(set(found["channel"].tolist()) - self.topics.keys())
-            return found
+            return found[np.argsort(found["offset"])]
         except RecordError as error:
             self.faults[str(error)] += 1
             return _entries([])

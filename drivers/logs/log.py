@@ -119,8 +119,8 @@ class _Index(NamedTuple):
     """The places of all N messages, in the order of the files."""
 
     topics: Mapping[str, str]  # name -> type
-    topic: NDArray[np.int64]  # (N,) index in topics
-    file: NDArray[np.int64]  # (N,) index of the file
+    topic: NDArray[np.int32]  # (N,) index in topics
+    file: NDArray[np.int16]  # (N,) index of the file
     entries: Entries
     order: NDArray[np.int64]  # (N,) rows in the order of time
 
@@ -204,28 +204,30 @@ class Log:
     def _index(self) -> _Index:
         # 1. Where the messages are.
         topics: dict[str, str] = {}
-        found: list[tuple[Entries, NDArray[np.int64]]] = []
+        found: list[tuple[Entries, NDArray[np.int32]]] = []
         for file in self._files:
             entries = np.concatenate([np.empty(0, ENTRY), *file.entries()])
-            entries = entries[np.lexsort((entries["offset"], entries["block"]))]
+            block, offset = entries["block"], entries["offset"]
+            if np.any((block[1:] < block[:-1]) | ((block[1:] == block[:-1]) & (offset[1:] < offset[:-1]))):
+                entries = entries[np.lexsort((offset, block))]
             for name, kind, _ in file.topics.values():
                 topics[name] = topics.get(name) or kind
             places = {name: place for place, name in enumerate(topics)}
             channels, which = np.unique(entries["channel"], return_inverse=True)
-            known = np.array([places[file.topics[c].name] if c in file.topics else -1 for c in channels], np.int64)
+            known = np.array([places[file.topics[c].name] if c in file.topics else -1 for c in channels], np.int32)
             for channel in channels[known < 0]:
                 file.faults[f"the channel {channel} of messages is unknown"] += 1
             numbers = known[which]
-            found.append((entries[numbers >= 0], numbers[numbers >= 0]))
-        entries, topic = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
-        of_file = np.repeat(np.arange(len(found)), [len(numbers) for _, numbers in found])
+            found.append((entries, numbers) if (known >= 0).all() else (entries[numbers >= 0], numbers[numbers >= 0]))
+        entries, topic = found[0] if len(found) == 1 else map(np.concatenate, zip(*found, strict=True))
+        of_file = np.repeat(np.arange(len(found), dtype=np.int16), [len(numbers) for _, numbers in found])
         # 2. Their order: by time within a segment, else by place in the file, as the sort is stable.
         images = [place for place, kind in enumerate(topics.values()) if kind in IMAGE_TYPES]
         segments = _segments(topic, entries["time_ns"], images)
         return _Index(topics, topic, of_file, entries, np.lexsort((entries["time_ns"], segments)))
 
 
-def _segments(topic: NDArray[np.int64], times: NDArray[np.int64], images: Iterable[int]) -> NDArray[np.int64]:
+def _segments(topic: NDArray[np.int32], times: NDArray[np.int64], images: Iterable[int]) -> NDArray[np.int64]:
     """Return the segment of each message (N,): between two of them the recorder's clock was set back.
 
     topic, times: (N,) in the order of the files. images: the topics that decide; others follow the first of them.
