@@ -3,9 +3,6 @@
 Layout, as `ros2 bag record -s sqlite3` writes it: rosbag2_storage_sqlite3, versions 1 to 4: table topics (id, name,
 type, serialization_format, ...) and table messages (id, topic_id, timestamp [ns], data). What a recorder that was
 killed leaves beside the file counts: a write-ahead log, or a journal by which the last transaction is undone.
-
-Each row has bytes of its own in a file that is whole. So a file of N bytes, with its write-ahead log, has at most N / 8
-rows with N bytes of data, and what has more is damaged: its pages are named more than once.
 """
 
 from __future__ import annotations
@@ -28,9 +25,6 @@ from drivers.logs.packed_file import scratch_folder
 MAGIC: Final = b"SQLite format 3\0"
 _BESIDE: Final = ("-wal", "-journal")
 _MAX_REASON: Final = 120  # characters
-_LEAST_ROW_BYTES: Final = 8  # pointer, sizes, number, and the types of four columns
-_ROW_INSTRUCTIONS: Final = 100  # Instructions of SQLite that a row may take; it needs 10 to 20.
-_BLOCK: Final = 10_000  # instructions of SQLite's virtual machine between two calls of the progress handler
 # A file that is shorter than it states is read up to its end with a writable schema only; it is opened read-only.
 _PRAGMAS: Final = ("trusted_schema = OFF", "cell_size_check = ON", "mmap_size = 0", "writable_schema = ON")
 _TABLES: Final = (
@@ -56,7 +50,7 @@ class SqliteBag:
 
     def __init__(self, path: Path, name: str) -> None:
         """name: for messages, where it is not the path."""
-        self.name, self.cut, self._bytes = name, "", 0
+        self.name, self.cut = name, ""
         self.faults: Counter[str] = Counter()
         self._files = [path, *(Path(f"{path}{suffix}") for suffix in _BESIDE)]
         try:
@@ -83,25 +77,17 @@ class SqliteBag:
         }
 
     def entries(self) -> Iterator[Entries]:
-        """Yield the places of all messages, as far as the file can be read and as many as it can hold."""
+        """Yield the places of all messages, as far as the file can be read."""
         places: list[tuple[int, int, int, int]] = []
-        total_bytes = 0
         try:
-            self._bound_work(self._bag)
             for channel, time_ns, row, size in self._bag.execute(_ROWS):
-                most = max((len(places) + 1) * _LEAST_ROW_BYTES, total_bytes)
-                if most > self._bytes and most > self._measured_bytes():
-                    raise sqlite3.DatabaseError("it has more rows than its size allows")
                 if all(isinstance(value, int) for value in (channel, time_ns, size)):
                     places.append((channel, time_ns, 0, row))
-                    total_bytes += size
                 else:
                     self.faults[f"row {row} of the table messages has no topic, time or data"] += 1
         except _FAULTS as error:
             line = f"is cut or corrupt after {len(places)} messages ({_line(error)}): used those before"
             self.cut = f"the bag {self.name!r} {line}"
-        finally:
-            self._bag.set_progress_handler(None, 0)
         yield np.array(places, ENTRY)
 
     def read(self, channel: int, time_ns: int, block: int, offset: int) -> bytes:
@@ -133,8 +119,9 @@ class SqliteBag:
         except sqlite3.Error:
             if not any(file.exists() for file in self._files[1:]):
                 return self._connected(self._files[0], "ro&immutable=1")  # else it locks what nobody writes
-        with scratch_folder(self.name, self._measured_bytes()) as folder:
-            for file in filter(Path.exists, self._files):
+        files = [file for file in self._files if file.exists()]
+        with scratch_folder(self.name, sum(file.stat().st_size for file in files)) as folder:
+            for file in files:
                 shutil.copyfile(file, folder / file.name)
             return self._connected(folder / self._files[0].name, "rw")
 
@@ -147,25 +134,11 @@ class SqliteBag:
             for pragma in _PRAGMAS:
                 database.execute(f"PRAGMA {pragma}")
             database.text_factory = partial(str, encoding="utf-8", errors="replace")
-            self._bound_work(database)
             database.execute(_TABLES).fetchone()
         except BaseException:
             database.close()
             raise
         return database
-
-    def _measured_bytes(self) -> int:
-        """Return the size of the file and of what is beside it; they grow while it is recorded."""
-        self._bytes = max(sum(file.stat().st_size for file in self._files if file.exists()), self._bytes)
-        return self._bytes
-
-    def _bound_work(self, database: sqlite3.Connection) -> None:
-        """Bound the instructions of the next queries by the number of rows that fit; beyond it sqlite3.Error.
-
-        In a hostile file many pages refer to the same one, so that a query over a small file may never end.
-        """
-        blocks = iter(range(100 + self._measured_bytes() // _LEAST_ROW_BYTES * _ROW_INSTRUCTIONS // _BLOCK))
-        database.set_progress_handler(lambda: next(blocks, None) is None, _BLOCK)
 
 
 def _line(error: Exception) -> str:

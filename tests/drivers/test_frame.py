@@ -89,14 +89,6 @@ def test_raw_images_with_and_without_padding_of_rows(encoding: str, padding: int
     np.testing.assert_array_equal(gray(frame(encoding, memoryview(data), step=step)), expected(pixels))
 
 
-@pytest.mark.parametrize(("order", "bigendian"), [("<u2", False), (">u2", True)])
-@pytest.mark.parametrize("padding", [0, 3])
-def test_mono16_keeps_its_upper_byte(order: str, bigendian: bool, padding: int) -> None:
-    values = (COLOURS[..., 0].astype(np.uint16) << 8) | COLOURS[..., 1]
-    data, step = padded_rows(values.astype(order), padding)
-    np.testing.assert_array_equal(gray(frame("mono16", data, step=step, bigendian=bigendian)), COLOURS[..., 0])
-
-
 def test_decodes_jpeg_without_huffman_tables() -> None:
     """Motion JPEG leaves the standard tables out (USB Video Class 1.5, payload of MJPEG, 3.1)."""
     data, bare, at = encoded(".jpg"), b"\xff\xd8", 2

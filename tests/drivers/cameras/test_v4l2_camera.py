@@ -67,43 +67,34 @@ def test_frames_go_on_after_a_loss_with_all_settings(tmp_path: Path, monkeypatch
     assert [text.partition(":")[2].split(",")[0] for text in events] == [" lost", " back"] * 2
 
 
-class Counter:
-    """An accounting with its state, fed with sequence numbers."""
-
-    def __init__(self) -> None:
-        self.state = CameraState()
-        self.accounting = BufferAccounting(self.state)
-
-    def accept(self, *sequences: int, flags: int = v4l2.TIMESTAMP_MONOTONIC, size: int = MIN_BYTES) -> list[bool]:
-        buffers = [v4l2.V4l2Buffer(sequence=sequence % 2**32, flags=flags, bytesused=size) for sequence in sequences]
-        return [self.accounting.accept(buffer, MIN_BYTES) for buffer in buffers]
-
-
-@pytest.fixture
-def counter() -> Counter:
-    return Counter()
+def accepted(state: CameraState, *buffers: dict[str, int]) -> list[bool]:
+    accounting = BufferAccounting(state)
+    usual = {"flags": v4l2.TIMESTAMP_MONOTONIC, "bytesused": MIN_BYTES}
+    return [accounting.accept(v4l2.V4l2Buffer(**(usual | buffer)), MIN_BYTES) for buffer in buffers]
 
 
 @pytest.mark.parametrize(
-    ("sequences", "drops"), [((7, 8, 10, 14), 4), ((2**32 - 2, 2**32 + 1), 2), ((3, 3 + 2**30), 2**30 - 1)]
+    ("sequences", "drops", "restarts"),
+    [
+        ((7, 8, 10, 14), 4, 0),
+        ((2**32 - 2, 1), 2, 0),  # across the overflow
+        ((3, 3 + 2**30), 2**30 - 1, 0),
+        *(((100, again), 0, 1) for again in (0, 99, 100)),
+    ],
 )
-def test_counts_gaps_as_drops_across_the_overflow_too(counter: Counter, sequences: tuple[int, ...], drops: int) -> None:
-    counter.accept(*sequences)
-    assert (counter.state.drops, counter.state.restarts) == (drops, 0)
+def test_gaps_of_the_sequence_are_drops_and_a_restart_drops_nothing(
+    sequences: tuple[int, ...], drops: int, restarts: int
+) -> None:
+    state = CameraState()
+    accepted(state, *({"sequence": sequence} for sequence in sequences))
+    assert (state.drops, state.restarts) == (drops, restarts)
 
 
-@pytest.mark.parametrize("again", [0, 99, 100])
-def test_a_restarted_sequence_drops_nothing(counter: Counter, again: int) -> None:
-    counter.accept(100, again)
-    assert (counter.state.drops, counter.state.restarts) == (0, 1)
-
-
-@pytest.mark.parametrize("broken", [{"flags": v4l2.TIMESTAMP_MONOTONIC | v4l2.BUFFER_ERROR}, {"size": 99}, {"size": 0}])
-def test_counts_broken_buffers_as_errors_and_not_as_drops(counter: Counter, broken: dict[str, int]) -> None:
-    assert counter.accept(0, 1) == [True, True]
-    assert counter.accept(2, 3, **broken) == [False, False]
-    assert counter.accept(4) == [True]
-    assert (counter.state.errors, counter.state.drops) == (2, 0)
+@pytest.mark.parametrize("broken", [{"flags": v4l2.BUFFER_ERROR}, {"bytesused": 99}, {"bytesused": 0}])
+def test_broken_buffers_are_errors_and_not_drops(broken: dict[str, int]) -> None:
+    state = CameraState()
+    assert accepted(state, {}, broken | {"sequence": 1}, {"sequence": 2}) == [True, False, True]
+    assert (state.errors, state.drops) == (1, 0)
 
 
 class Stamps:

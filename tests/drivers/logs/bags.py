@@ -22,8 +22,6 @@ from rosbags.typesys import Stores, get_typestore
 from tests.drivers.logs.mcap_logs import LOWER, STORE, Entry, write_log
 
 ROS1: Any = get_typestore(Stores.ROS1_NOETIC)
-PAGE_BYTES, LEVELS = 4096, 6
-CHILDREN = 500  # of an interior page of SQLite: cells of 6 bytes and pointers of 2
 
 
 def write_db3(folder: Path, entries: Sequence[Entry], zstd: bool = False) -> Path:
@@ -146,34 +144,3 @@ def write_folders(top: Path, entries: Sequence[Entry], names: Callable[[int], st
             data = cv2.imencode(suffix, cv2.imdecode(data, cv2.IMREAD_GRAYSCALE))[1]
         (folder / f"{names(entry.log_time_ns)}{suffix}").write_bytes(data.tobytes())
     return top
-
-
-def repeat_pages(path: Path) -> None:
-    """Make an SQLite bag whose interior pages name one leaf again and again: more rows than a disk holds.
-
-    The root of the messages becomes a tower of interior pages (SQLite file format, section 1.6) over the old one.
-    """
-    with closing(sqlite3.connect(path)) as bag:
-        bag.execute("VACUUM")
-        (root,) = bag.execute("SELECT rootpage FROM sqlite_master WHERE name = 'messages'").fetchone()
-        (size,) = bag.execute("PRAGMA page_size").fetchone()
-    assert size == PAGE_BYTES
-    data = bytearray(path.read_bytes())
-    child = len(data) // PAGE_BYTES + 1
-    data += data[(root - 1) * PAGE_BYTES : root * PAGE_BYTES]  # the old root
-    for _ in range(LEVELS - 1):
-        data += _interior(child)
-        child += 1
-    data[(root - 1) * PAGE_BYTES : root * PAGE_BYTES] = _interior(child)
-    data[28:32] = (len(data) // PAGE_BYTES).to_bytes(4, "big")  # pages in the header
-    path.write_bytes(data)
-
-
-def _interior(child: int) -> bytes:
-    """Return an interior page of a table, all of whose cells name one child."""
-    cell = struct.pack(">IB", child, 1)
-    cells = cell * CHILDREN
-    start = PAGE_BYTES - len(cells)
-    pointers = b"".join(struct.pack(">H", start + len(cell) * number) for number in range(CHILDREN))
-    head = struct.pack(">BHHHBI", 5, 0, CHILDREN, start, 0, child) + pointers
-    return head + bytes(start - len(head)) + cells

@@ -29,7 +29,6 @@ from drivers.logs.open_log import LogInfo, LogState, log_info, logs_in, open_log
 from drivers.logs.topics import MotionTopics
 from drivers.motion import GyroSample
 from tests.drivers.logs.bags import (
-    repeat_pages,
     unclosed_bag,
     write_bag,
     write_db3,
@@ -560,18 +559,6 @@ def test_a_database_of_other_tables_is_no_bag(tmp_path: Path, case: str) -> None
         bag.commit()
     with pytest.raises(DriverError, match="no bag of ROS 2"):
         LogReader(path)
-
-
-def test_a_database_whose_pages_are_named_again_and_again_ends(tmp_path: Path) -> None:
-    """It has 500**6 times the rows of one leaf."""
-    path = write_db3(tmp_path / "bag", [Entry(LOWER, COMPRESSED, b"\0\1\0\0", START_NS)] * 8)
-    repeat_pages(path)
-    assert path.stat().st_size < 100_000
-    with closing(open_log(path)) as bag:
-        for topics in ([LOWER], ["/another"]):
-            assert len(list(bag.messages(topics))) <= path.stat().st_size // 8
-            assert "more rows than its size allows" in bag.damage().cut
-    assert log_info(path).state is LogState.BROKEN
 
 
 @pytest.mark.parametrize("name", ["mcap", "db3"])
