@@ -119,16 +119,6 @@ class SerialMotor:
         if connect_s:
             self._connect(connect_s)
 
-    @property
-    def garbage(self) -> int:
-        """Received bytes that belonged to no complete frame."""
-        return self._framer.garbage
-
-    @property
-    def bad_frames(self) -> int:
-        """Received frames that could not be decoded."""
-        return self._protocol.bad_frames
-
     def send(self, command: VelocityCommand) -> MotorStatus:
         """Send a command and return the controller's status.
 

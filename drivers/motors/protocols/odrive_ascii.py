@@ -53,7 +53,6 @@ class ODriveAscii:
     baud = 115_200
 
     def __init__(self, drive: DifferentialDrive) -> None:
-        self.bad_frames = 0
         self._drive = drive
         self._disarmed = True
         self._still = 0  # consecutive commands to turn that no axis has followed
@@ -123,7 +122,7 @@ class ODriveAscii:
                 if numbers and len(numbers) == (2 if requests[len(replies)][0] == "f" else 1):
                     replies.append(numbers)
                 else:
-                    self.bad_frames, odd = self.bad_frames + 1, frame
+                    odd = frame
                     replies.clear()  # a reply is missing, so those before cannot be assigned: this ends in the timeout
                 if len(replies) == len(requests):
                     return replies

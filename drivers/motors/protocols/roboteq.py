@@ -26,7 +26,6 @@ from drivers.motors.protocols.motor_protocol import NoReplyError, TextFramer, Tr
 MAX_RPM = 65535
 
 _REPLY = re.compile(rb"([A-Z]{1,6})=(-?[0-9]{1,10}(?::-?[0-9]{1,10}){0,9})")
-_ECHO = re.compile(rb"[!^~?%#].*", re.DOTALL)
 
 
 class Roboteq:
@@ -35,7 +34,6 @@ class Roboteq:
     baud = 115_200
 
     def __init__(self, drive: DifferentialDrive) -> None:
-        self.bad_frames = 0
         self._drive, self._rpm_per_mps = drive, drive.rpm_per_mps
 
     def framer(self) -> TextFramer:
@@ -78,8 +76,6 @@ class Roboteq:
                     raise DriverError(f"it rejected one of {b', '.join(lines).decode()}; check its configuration")
                 if reply := _REPLY.fullmatch(frame):
                     values[reply[1]] = [int(number) for number in reply[2].split(b":")]
-                elif frame != b"+" and not _ECHO.fullmatch(frame):
-                    self.bad_frames += 1
                 if unconfirmed <= 0 and names <= values.keys():
                     return values
                 frame = yield b""

@@ -62,10 +62,9 @@ class VescValues:
 
 
 class PacketFramer:
-    """Splits a byte stream into payloads; a byte that does not start a packet is skipped as garbage."""
+    """Splits a byte stream into payloads; a byte that does not start a packet is skipped."""
 
     def __init__(self) -> None:
-        self.garbage = 0
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> list[bytes]:
@@ -77,14 +76,12 @@ class PacketFramer:
             payload = _payload(self._buffer, start, size) if size else None
             if payload is not None:
                 payloads.append(payload)
-            self.garbage += payload is None
             start += 1 if payload is None else size
         del self._buffer[:start]
         return payloads
 
     def reset(self) -> None:
         """Discard the incomplete packet."""
-        self.garbage += len(self._buffer)
         self._buffer.clear()
 
 
@@ -116,7 +113,6 @@ class Vesc:
     baud = 115_200
 
     def __init__(self, drive: DifferentialDrive) -> None:
-        self.bad_frames = 0
         self._drive = drive
 
     def framer(self) -> PacketFramer:
@@ -161,7 +157,7 @@ class Vesc:
             while True:
                 reply = parse(frame)
                 if reply is None:
-                    self.bad_frames, other = self.bad_frames + 1, frame[0]
+                    other = frame[0]
                 else:
                     can_id, _ = reply
                     replies[can_id == self._drive.can_id] = reply

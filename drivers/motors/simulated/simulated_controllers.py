@@ -10,7 +10,6 @@ from drivers.motor import MotorStatus, VelocityCommand, is_stop
 from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.line_protocol import (
     SEQ_COUNT,
-    LineFramer,
     ProtocolError,
     command_of,
     decode,
@@ -37,7 +36,7 @@ class SimulatedLine(SimulatedFirmware):
     def __init__(
         self, drive: DifferentialDrive | None = None, *, heading_input: bool = True, limits: MotionLimits | None = None
     ) -> None:
-        super().__init__(SimulatedBase(drive, limits), LineFramer())
+        super().__init__(SimulatedBase(drive, limits), TextFramer())
         self._heading_input = heading_input
         self._zero_rad = 0.0  # heading in the world at which the controller's heading is 0
         self._next_seq: int | None = None

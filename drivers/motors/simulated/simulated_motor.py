@@ -19,7 +19,7 @@ from drivers.motors.simulated.simulated_controllers import (
 
 
 class SimulatedController(Protocol):
-    """Simulated firmware: receives and sends bytes, and turns the wheels. Invalid bytes are counted as errors."""
+    """Simulated firmware: receives and sends bytes, and turns the wheels. Invalid frames are counted as errors."""
 
     @property
     def base(self) -> SimulatedBase:
