@@ -12,7 +12,7 @@ VERTEX = np.dtype([("xyz", "<f4", 3), ("confidence", "<f4"), ("frames", "<i4"), 
 
 
 def read_ply(path: str | Path) -> MapPoints:
-    """Return the points of a file of omnid.formats.ply."""
+    """Return the points of a file of omnid.formats.exports."""
     head, _, body = Path(path).read_bytes().partition(b"end_header\n")
     assert head.startswith(b"ply\nformat binary_little_endian 1.0\n")
     vertices = np.frombuffer(body, VERTEX)

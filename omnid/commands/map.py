@@ -176,10 +176,9 @@ def _exported(
     outputs: for each file the option that names it, its kind (that of an option of `map export`), and its path.
     """
     from omnid.core.places import place_views
-    from omnid.formats.grid_map import write_grid
+    from omnid.formats.exports import write_grid, write_ply
     from omnid.formats.place_file import read_places
     from omnid.formats.plan import drawn_heights
-    from omnid.formats.ply import write_ply
     from omnid.sinks.files import check_outputs, write_plan
     from omnid.stages.obstacles import ADVICE
 

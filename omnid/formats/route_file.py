@@ -17,7 +17,7 @@ from omnid.core.navigation.requests import route_name
 from omnid.core.navigation.route import DECIMALS, MOST_POINTS, Route
 from omnid.core.places.place_map import NO_KEYFRAME
 from omnid.errors import OmnidError
-from omnid.formats.whole_file import write_whole
+from omnid.formats.exports import write_whole
 
 FORMAT: Final = "omnid route"
 VERSION: Final = 1

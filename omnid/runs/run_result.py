@@ -20,7 +20,7 @@ from omnid.diagnostics.run_summary import RunCounters, RunStatistics, input_warn
 from omnid.diagnostics.status import motion_status, stage_status, summary_status
 from omnid.engine.telemetry import SummaryRow
 from omnid.errors import OmnidError
-from omnid.formats.ply import write_ply
+from omnid.formats.exports import write_ply
 from omnid.formats.tum import Trajectory, read_tum, tum_row
 from omnid.recordings.evaluation import Metrics, evaluate
 from omnid.runs.place_maps import RigPlaces

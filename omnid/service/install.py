@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 
 from omnid.config import FIRST_SETTINGS, Config
 from omnid.errors import OmnidError
-from omnid.formats.whole_file import write_whole
+from omnid.formats.exports import write_whole
 from omnid.plain_text import plain
 from omnid.settings import dump_minimal
 

@@ -18,10 +18,9 @@ from drivers.logs.image_folder import IMAGE_SUFFIXES
 from drivers.logs.open_log import is_log_name
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.errors import OmnidError
+from omnid.formats.exports import write_ply, write_whole
 from omnid.formats.plan import NO_LOOPS, drawn_heights, plan_view
-from omnid.formats.ply import write_ply
 from omnid.formats.tum import tum_row
-from omnid.formats.whole_file import write_whole
 from omnid.messages import MapUpdate, OdometryUpdate
 
 Named: TypeAlias = Sequence[tuple[str, Path]]

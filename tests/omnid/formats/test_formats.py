@@ -17,12 +17,10 @@ from calib.atomic_file import write_file
 from omnid.core.mapping.scan_grid import FREE, OCCUPIED, UNKNOWN, Grid
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.errors import OmnidError
-from omnid.formats.grid_map import write_grid
+from omnid.formats.exports import write_grid, write_ply, write_whole
 from omnid.formats.place_file import read_places, write_places
 from omnid.formats.plan import drawn_heights, plan_view
-from omnid.formats.ply import write_ply
 from omnid.formats.tum import read_tum, tum_row
-from omnid.formats.whole_file import write_whole
 from tests.omnid.formats.place_maps import RIG, some_places
 from tests.ply import read_ply
 

@@ -1,4 +1,8 @@
-"""Occupancy grids in the format of ROS's map_server and nav2: a PGM image and a YAML file that describes it."""
+"""Files for other programs, replaced at once, never written in part.
+
+Points are binary PLY: position, confidence, frames and age. Occupancy grids are those of ROS's map_server and nav2: a
+PGM image and a YAML file that describes it.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +13,22 @@ import numpy as np
 
 from calib.atomic_file import replacement
 from omnid.core.mapping.scan_grid import FREE, OCCUPIED, Grid
+from omnid.core.mapping.voxel_map import MapPoints
 from omnid.errors import OmnidError
 
+_VERTEX = np.dtype([("xyz", "<f4", 3), ("confidence", "<f4"), ("frames", "<i4"), ("age", "<i4")])
+_HEADER = """ply
+format binary_little_endian 1.0
+comment omnid map: metres, x forward, y left, z up; confidence 0 to 1; age in frames
+element vertex {count}
+property float x
+property float y
+property float z
+property float confidence
+property int frames
+property int age
+end_header
+"""
 _WHITE, _BLACK, _GREY = 254, 0, 205  # free, occupied and unknown, as map_saver writes them
 # With nav2's default of 0.25, grey (255 - 205) / 255 = 0.196 would count as free.
 _PLAIN = re.compile(r"[A-Za-z][A-Za-z0-9_-]*\.pgm")
@@ -22,6 +40,26 @@ negate: 0
 occupied_thresh: 0.65
 free_thresh: 0.196
 """
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file whole. Raises OmnidError if that is impossible."""
+    try:
+        with replacement(path) as partial:
+            partial.write_bytes(content)
+    except (OSError, ValueError) as error:
+        raise OmnidError(f"{path}: cannot write the file: {error}: choose another file") from error
+
+
+def write_ply(path: str | Path, points: MapPoints) -> None:
+    """Write the points as binary little-endian PLY; the file is replaced at once, never written in part.
+
+    Raises OmnidError if the file cannot be written.
+    """
+    vertices = np.empty(len(points.xyz), dtype=_VERTEX)
+    for name in ("xyz", "confidence", "frames", "age"):
+        vertices[name] = getattr(points, name)
+    write_whole(Path(path), _HEADER.format(count=len(vertices)).encode("ascii") + vertices.tobytes())
 
 
 def write_grid(path: Path, grid: Grid) -> None:
