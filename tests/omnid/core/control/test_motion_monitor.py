@@ -6,7 +6,6 @@ import math
 import random
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import takewhile
 
 import pytest
 
@@ -205,14 +204,3 @@ def test_recovers_where_the_contradiction_ends() -> None:
     assert not any(reason for _, _, reason in history)
     doubtful = [at_s for at_s, slow, _ in history if slow]
     assert doubtful and max(doubtful) < 12.0
-
-
-def test_can_be_switched_off_and_remembers_little() -> None:
-    monitor, history = run(steady(0.3), 10.0, World(seen=still), replace(MotionSettings(), check=False))
-    assert not any(doubtful or reason for _, doubtful, reason in history)
-    monitor = MotionMonitor(MotionSettings())
-    for tick in range(6_000):
-        monitor.add_command(tick * 5_000_000, Twist(0.3))
-        monitor.add_report(tick * 5_000_000, Motion(0.3, 0.0))
-    assert len(monitor._commanded) == len(monitor._reported) < 4096
-    assert len(list(takewhile(lambda entry: entry.at_ns > 0, monitor._commanded))) > 100

@@ -12,12 +12,10 @@ from omnid.core.stereo.tiles import (
     BLACK_GREY,
     IN_A_ROW,
     SIDES,
-    TILE_COLUMNS,
     TILE_ROWS,
     Side,
     TileMonitor,
     TileStates,
-    of_pixels,
 )
 
 Image = NDArray[np.uint8]
@@ -211,14 +209,6 @@ def test_the_time_of_a_lost_part_counts_from_its_first_pair() -> None:
     states = list(frozen(cameras, IN_A_ROW + 6))
     first_ns = (IN_A_ROW + 1) * 100_000_000
     assert {found.since_ns["upper"] for found in states if found is not ALL_LIVE} == {first_ns}
-
-
-def test_pixels_of_tiles() -> None:
-    """Each tile covers its part of the panorama."""
-    tiles = np.zeros((TILE_ROWS, TILE_COLUMNS), bool)
-    tiles[1, 20] = True
-    found = of_pixels(tiles, SHAPE)
-    assert found[64:128, 300:315].all() and found.sum() == 64 * 15
 
 
 def test_a_small_panorama_of_little_noise_is_live() -> None:
