@@ -27,10 +27,8 @@ from omnid.errors import OmnidError
 from omnid.utc import utc
 
 if TYPE_CHECKING:
-    from omnid.config import Config
     from omnid.core.places.place_map import PlaceMap, PlaceRig
     from omnid.core.places.place_views import PlaceSummary
-    from omnid.runs.place_maps import RigPlaces
 
 # Suffixes of `map show -o`, and the options of `map export` that write the same.
 KINDS = {".ply": "--ply", ".png": "--plan", ".yaml": "--grid", ".yml": "--grid"}
@@ -54,7 +52,10 @@ def build(args: argparse.Namespace) -> int:
     """Replay the logs one after the other, each in the map of those before; write the map."""
     from omnid.config import unused_settings
     from omnid.core.places.place_views import summary
-    from omnid.formats.place_file import write_places
+    from omnid.diagnostics.run_summary import Progress
+    from omnid.formats.place_file import read_places, write_places
+    from omnid.runs.place_maps import RigPlaces, new_places
+    from omnid.runs.replay import ReplayOptions, run_log
     from omnid.sinks.files import check_outputs
 
     config = settings_of(args)
@@ -66,25 +67,6 @@ def build(args: argparse.Namespace) -> int:
         raise OmnidError(f"map build: {args.output} exists: --extend adds these logs to it, --replace makes a new one")
     for warning in warnings:
         warn(warning)
-    built = _built(args, config)
-    if isinstance(built, int):
-        print(f"omnid: interrupted: {args.output} was not written", file=sys.stderr)
-        return 128 + built
-    if built is None or not built.places.keyframes:
-        print("omnid: no keyframe was found: no map was written", file=sys.stderr)
-        return 1
-    write_places(args.output, built.places, built.rig)
-    print(*_described(args.output, summary(built.places, built.rig), built.rig), sep="\n")
-    return 0
-
-
-def _built(args: argparse.Namespace, config: Config) -> RigPlaces | int | None:
-    """Return the map of the logs; None: they have no keyframe. A number is that of the signal that ended it."""
-    from omnid.diagnostics.run_summary import Progress
-    from omnid.formats.place_file import read_places
-    from omnid.runs.place_maps import RigPlaces, new_places
-    from omnid.runs.replay import ReplayOptions, run_log
-
     built = RigPlaces(*read_places(args.output, new_places(config.places))) if args.extend else None
     for log in args.logs:
         options = ReplayOptions(
@@ -94,9 +76,15 @@ def _built(args: argparse.Namespace, config: Config) -> RigPlaces | int | None:
         for warning in result.warnings:
             warn(f"{log}: {warning}")
         if result.signal:
-            return result.signal
+            print(f"omnid: interrupted: {args.output} was not written", file=sys.stderr)
+            return 128 + result.signal
         built = result.rig_places
-    return built
+    if built is None or not built.places.keyframes:
+        print("omnid: no keyframe was found: no map was written", file=sys.stderr)
+        return 1
+    write_places(args.output, built.places, built.rig)
+    print(*_described(args.output, summary(built.places, built.rig), built.rig), sep="\n")
+    return 0
 
 
 @command(

@@ -13,9 +13,10 @@ import argparse
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, is_dataclass
 from enum import Enum
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, TextIO, TypeAlias
@@ -35,45 +36,8 @@ _NO_SETTINGS: Final[Mapping[str, object]] = MappingProxyType({})
 _EXAMPLES: Final = "examples:"  # the first line of an epilog
 
 
-@dataclass(frozen=True, slots=True)
-class Option:
-    """One option or positional argument."""
-
-    names: tuple[str, ...]
-    setting: str | None  # dotted path of the setting that the option stands for
-    keywords: Mapping[str, Any]  # of argparse's add_argument
-
-    def add_to(self, parser: argparse._ActionsContainer) -> None:
-        """Add the option to a parser or a group of one."""
-        parser.add_argument(*self.names, **self.keywords)
-
-    def settings(self) -> Iterator[tuple[str, str]]:
-        """Yield the attribute of the parsed arguments and the setting that it stands for."""
-        if self.setting is not None:
-            yield self.keywords.get("dest") or self.names[-1].lstrip("-").replace("-", "_"), self.setting
-
-
-@dataclass(frozen=True, slots=True)
-class Group:
-    """Options under a title of their own in the help, or such that exclude each other (title None)."""
-
-    title: str | None
-    options: tuple[Option, ...]
-
-    def add_to(self, parser: argparse._ActionsContainer) -> None:
-        """Add the options to a parser."""
-        group: argparse._ActionsContainer
-        group = parser.add_mutually_exclusive_group() if self.title is None else parser.add_argument_group(self.title)
-        for entry in self.options:
-            entry.add_to(group)
-
-    def settings(self) -> Iterator[tuple[str, str]]:
-        """Yield the attributes and settings of all options."""
-        for entry in self.options:
-            yield from entry.settings()
-
-
 Run: TypeAlias = Callable[[argparse.Namespace], int]
+Option: TypeAlias = Callable[[argparse._ActionsContainer], None]  # adds an option, or several, to a parser
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,18 +45,18 @@ class Command:
     """A command without subcommands: what it takes and what it does."""
 
     run: Run
-    options: tuple[Option | Group, ...]
+    options: tuple[Option, ...]
     examples: tuple[str, ...]  # without `omnid`; a test parses them all
     description: str  # "": its line in the list of commands
 
     def add_to(self, parser: argparse.ArgumentParser, help: str) -> None:
         """Give a parser the options and the help of this command. help: its line in the list of commands."""
-        for entry in self.options:
-            entry.add_to(parser)
+        for add in self.options:
+            add(parser)
         parser.formatter_class = _ExamplesFormatter
         parser.description = self.description or f"{help[:1].upper()}{help[1:]}."
         parser.epilog = "\n".join((_EXAMPLES, *(f"  omnid {example}" for example in self.examples)))
-        parser.set_defaults(command=self)
+        parser.set_defaults(command=self, actions=parser._actions)
 
 
 class _ExamplesFormatter(argparse.HelpFormatter):
@@ -104,22 +68,33 @@ class _ExamplesFormatter(argparse.HelpFormatter):
         return super()._fill_text(text, width, indent)
 
 
-def option(*names: str, setting: str | None = None, **keywords: Any) -> Option:
-    """Declare an option or a positional argument; the keywords are those of argparse's add_argument."""
-    return Option(names, setting, keywords)
+def option(*names: str, setting: str = "", **keywords: Any) -> Option:
+    """Declare an option or a positional argument; the keywords are those of argparse's add_argument.
+
+    setting: dotted path of the setting that it stands for; "": none.
+    """
+
+    def add(parser: argparse._ActionsContainer) -> None:
+        parser.add_argument(*names, **keywords).setting = setting  # type: ignore[attr-defined]  # read by settings_of
+
+    return add
 
 
-def group(title: str, *options: Option) -> Group:
-    """Declare options that stand under a title of their own in the help."""
-    return Group(title, options)
+def group(title: str | None, *options: Option) -> Option:
+    """Declare options that stand under a title of their own in the help; None: of which at most one may be given."""
+
+    def add(parser: argparse._ActionsContainer) -> None:
+        below = parser.add_mutually_exclusive_group() if title is None else parser.add_argument_group(title)
+        for add_one in options:
+            add_one(below)
+
+    return add
 
 
-def exclusive(*options: Option) -> Group:
-    """Declare options of which at most one may be given."""
-    return Group(None, options)
+exclusive: Final = partial(group, None)
 
 
-def command(*options: Option | Group, examples: tuple[str, ...], description: str = "") -> Callable[[Run], Command]:
+def command(*options: Option, examples: tuple[str, ...], description: str = "") -> Callable[[Run], Command]:
     """Make a command of a function from parsed arguments to the exit code."""
     return lambda run: Command(run, options, examples, description)
 
@@ -131,7 +106,7 @@ def settings_of(args: argparse.Namespace, more: Mapping[str, object] = _NO_SETTI
     """
     from omnid.config import load_config
 
-    named = {path: getattr(args, name) for entry in args.command.options for name, path in entry.settings()}
+    named = {action.setting: getattr(args, action.dest) for action in args.actions if getattr(action, "setting", "")}
     # As --set takes them.
     given = [
         f"{path}={json.dumps(value) if isinstance(value, bool | list) else value}"
@@ -227,7 +202,7 @@ def cameras(
         option(
             f"--{camera}",
             metavar=metavar,
-            setting=f"cameras.{camera}" if are_settings else None,
+            setting=f"cameras.{camera}" if are_settings else "",
             help=text.format(camera=camera),
         )
         for camera in ("lower", "upper")

@@ -301,34 +301,24 @@ class ReplayDrawing:
             content = decoded(topic, payload, attachment if topic == "odom" else b"", 0)
             if content is not None and not isinstance(content, PoseInMap):  # which may come before the pose in odom
                 self._sink.draw(content)
-        if isinstance(message, OdometryUpdate):
-            self._images(message)
-        elif isinstance(message, PlaceUpdate):
-            self._places(message)
-
-    def _images(self, odometry: OdometryUpdate) -> None:
         sink, rig = self._sink, self._geometry.rig
-        if sink.wants("image"):
-            sink.panorama(odometry.stamp_ns, _jpeg(odometry.depth.panoramas.lower.panorama))
-            sink.features(odometry.stamp_ns, odometry.features)
-            dense = self._dense.of(odometry.depth)
+        if isinstance(message, OdometryUpdate) and sink.wants("image"):
+            sink.panorama(message.stamp_ns, _jpeg(message.depth.panoramas.lower.panorama))
+            sink.features(message.stamp_ns, message.features)
+            dense = self._dense.of(message.depth)
             focal_baseline = self._geometry.cylinder.focal_px * rig.baseline_m
-            sink.depth(odometry.stamp_ns, dense.disparity, focal_baseline, se3.apply(rig.T_base_rig, dense.points))
-
-    def _places(self, update: PlaceUpdate) -> None:
-        """Plot the correction, and draw keyframes and loops where the map has them now."""
-        keyframes, T_base_rig = update.scans, self._geometry.rig.T_base_rig
-        T_map_odom, _ = base_pose(update.T_map_odom, update.covariance, T_base_rig)
-        self._sink.correction(update.stamp_ns, T_map_odom)
-        if keyframes is None or keyframes is self._keyframes or not self._sink.wants("places"):
-            return
-        self._keyframes = keyframes
-        to_odom = se3.inverse(T_map_odom) @ T_base_rig @ self._geometry.T_rig_rect
-        at = dict(zip(keyframes.scans, (to_odom @ keyframes.T_map_rect)[:, :3, 3], strict=True))
-        loops = [(at[a], at[b]) for a, b in keyframes.loops if a in at and b in at]
-        self._sink.places(
-            update.stamp_ns, np.array(list(at.values())).reshape(-1, 3), np.array(loops).reshape(-1, 2, 3)
-        )
+            sink.depth(message.stamp_ns, dense.disparity, focal_baseline, se3.apply(rig.T_base_rig, dense.points))
+        elif isinstance(message, PlaceUpdate):
+            # The correction, and keyframes and loops where the map has them now.
+            T_map_odom, _ = base_pose(message.T_map_odom, message.covariance, rig.T_base_rig)
+            sink.correction(message.stamp_ns, T_map_odom)
+            keyframes = message.scans
+            if keyframes is not None and keyframes is not self._keyframes and sink.wants("places"):
+                self._keyframes = keyframes
+                to_odom = se3.inverse(T_map_odom) @ rig.T_base_rig @ self._geometry.T_rig_rect
+                at = dict(zip(keyframes.scans, (to_odom @ keyframes.T_map_rect)[:, :3, 3], strict=True))
+                loops = np.array([(at[a], at[b]) for a, b in keyframes.loops if a in at and b in at])
+                sink.places(message.stamp_ns, np.array(list(at.values())).reshape(-1, 3), loops.reshape(-1, 2, 3))
 
 
 def _jpeg(image: NDArray[np.uint8]) -> bytes:
