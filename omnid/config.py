@@ -271,12 +271,8 @@ def unused_settings(config: Config, command: str, overrides: Sequence[str]) -> l
 
 def _ignores(command: str, path: str) -> bool:
     """True if only the other command uses the key."""
-    parts = path.split(".")
-    for depth in range(len(parts), 0, -1):
-        only = USED_ONLY_BY.get(".".join(parts[:depth]))
-        if only is not None:
-            return only not in ("", command)
-    return False
+    longest = max((name for name in USED_ONLY_BY if f"{path}.".startswith(f"{name}.")), key=len, default="")
+    return USED_ONLY_BY.get(longest, "") not in ("", command)
 
 
 # The settings that a new robot may need, in `omnid config --minimal`.

@@ -38,7 +38,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from queue import SimpleQueue
-from typing import Final, NamedTuple, Protocol
+from typing import Final, Protocol
 
 from drivers.logs.ros_messages import JointWheels
 from drivers.motion import MotionSample
@@ -150,31 +150,22 @@ class Freshness:
 # Commands.
 
 
-class CommandMessage(NamedTuple):
-    """A decoded command and the time it was sent, by the sender's clock [ns of Unix time]; 0: it does not say it."""
-
-    stamp_ns: int
-    setpoint: Setpoint
-
-
-def twist_command(payload: bytes) -> CommandMessage:
-    """Decode a speed and a yaw rate. Raise OmnidError for anything else."""
+def twist_command(payload: bytes) -> tuple[int, Setpoint]:
+    """Return the stamp [ns], 0 without one, of a speed and a yaw rate. Raise OmnidError for anything else."""
     stamp_ns, frame, velocity_mps, yaw_rate_radps, aside = codec.twist_from_cdr(payload)
     _check_frame(frame, "base_link")
     setpoint = Setpoint(_within(velocity_mps, MAX_SPEED_MPS), None, _within(yaw_rate_radps, MAX_YAW_RATE_RADPS))
     for name, speed in zip(codec.ASIDE_NAMES, aside, strict=True):
         if not abs(speed) <= LEAST_SPEED:
             raise Refused(ASIDE, f"twist.{name} = {speed:g} is {ASIDE}; send linear.x and angular.z only")
-    return CommandMessage(stamp_ns, setpoint)
+    return stamp_ns, setpoint
 
 
-def heading_command(payload: bytes) -> CommandMessage:
-    """Decode a speed and a heading in odom. Raise OmnidError for anything else."""
+def heading_command(payload: bytes) -> tuple[int, Setpoint]:
+    """Return the stamp [ns] of a speed and a heading in odom. Raise OmnidError for anything else."""
     stamp_ns, frame, velocity_mps, heading_rad = codec.heading_from_cdr(payload)
     _check_frame(frame, "odom")
-    return CommandMessage(
-        stamp_ns, Setpoint(_within(velocity_mps, MAX_SPEED_MPS), _within(heading_rad, MAX_HEADING_RAD))
-    )
+    return stamp_ns, Setpoint(_within(velocity_mps, MAX_SPEED_MPS), _within(heading_rad, MAX_HEADING_RAD))
 
 
 def _within(value: float, limit: float) -> float:
@@ -206,13 +197,6 @@ class CommandTarget(Protocol):
 
     def touch(self, contact: str, *, holds: bool) -> None:
         """Take the state of a bumper or a cliff sensor."""
-
-
-class _Stream(NamedTuple):
-    """Setpoints of one sender on one source: the first one begins a motion, the others go on with it."""
-
-    sender: str
-    arrival_ns: int  # of the newest
 
 
 class CommandReceiver:
@@ -247,7 +231,9 @@ class CommandReceiver:
         parsers = {topics.TWIST: twist_command, topics.HEADING: heading_command}
         for topic, (source, kind) in topics.setpoint_topics(sources).items():
             self._actions[topic] = partial(self._drive, source, parsers[kind])
-        self._streams: dict[str, _Stream] = {}  # by source; none after a stop
+        # Sender and newest arrival of the setpoints of each source: the first one begins a motion, the others go on
+        # with it. There are none after a stop.
+        self._streams: dict[str, tuple[str, int]] = {}
         self.accepted = self.stops = self.arms = 0
         self.refused: Counter[str] = Counter()
         self.refusal = ""  # the newest one, in words
@@ -304,19 +290,18 @@ class CommandReceiver:
         self.arms += 1
         self._target.send(ArmRequest(arrival_ns, request.id))
 
-    def _drive(self, source: str, parser: Callable[[bytes], CommandMessage], request: Request, arrival_ns: int) -> None:
+    def _drive(
+        self, source: str, parser: Callable[[bytes], tuple[int, Setpoint]], request: Request, arrival_ns: int
+    ) -> None:
         _check_length(request.payload)
-        command, stream = parser(request.payload), self._streams.get(source)
-        goes_on = (
-            stream is not None
-            and stream.sender == request.sender
-            and arrival_ns - stream.arrival_ns <= self._freshness.stale_ns
-        )
-        sent_ns = self._freshness.require(request, arrival_ns, command.stamp_ns, goes_on=goes_on)
-        self._streams[source] = _Stream(request.sender, arrival_ns)
+        stamp_ns, setpoint = parser(request.payload)
+        sender, before_ns = self._streams.get(source, ("", -math.inf))
+        goes_on = sender == request.sender and arrival_ns - before_ns <= self._freshness.stale_ns
+        sent_ns = self._freshness.require(request, arrival_ns, stamp_ns, goes_on=goes_on)
+        self._streams[source] = request.sender, arrival_ns
         self.accepted += 1
         age_ns = max(0, arrival_ns - sent_ns)
-        self._target.send(TimedSetpoint(arrival_ns, command.setpoint, source, request.sender, age_ns))
+        self._target.send(TimedSetpoint(arrival_ns, setpoint, source, request.sender, age_ns))
 
 
 # Requests to the navigation.

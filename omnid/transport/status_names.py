@@ -11,7 +11,7 @@ import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Final, NamedTuple
+from typing import Final
 
 from omnid.core.control.safety_rules import ASKED
 from omnid.tracking_state import TrackingState
@@ -149,13 +149,6 @@ REMEDIES: Final = {
 _CAMERA_REMEDY: Final = "check its cable and its power; on the robot: omnid doctor"
 
 
-class TimeKey(NamedTuple):
-    """Name and statistic of a measured time."""
-
-    name: str  # such as "work"
-    statistic: str  # p50, p99, max ...
-
-
 def camera_name(camera: str) -> str:
     """Return the name of a camera's entry."""
     return f"{PREFIX}{camera} camera"
@@ -189,10 +182,10 @@ def time_key(name: str, statistic: str) -> str:
     return f"{name}_{statistic}{_TIME_SUFFIX}"
 
 
-def parsed_time_key(key: str) -> TimeKey | None:
-    """Return name and statistic of the key of a measured time; None for any other key."""
+def parsed_time_key(key: str) -> tuple[str, str]:
+    """Return name and statistic of the key of a measured time, ("work", "p50"); ("", "") for any other key."""
     name, _, statistic = key.removesuffix(_TIME_SUFFIX).rpartition("_")
-    return TimeKey(name, statistic) if name and key.endswith(_TIME_SUFFIX) else None
+    return (name, statistic) if name and key.endswith(_TIME_SUFFIX) else ("", "")
 
 
 def number(text: str) -> float | None:

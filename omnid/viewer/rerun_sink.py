@@ -255,10 +255,10 @@ class RerunSink:
                 self._state = status_names.tracking_state(status.message, status.values) or self._state
                 self._show_state(stamp_ns)
             for key, text in status.values.items():
-                time, value_ms = parsed_time_key(key), status_names.number(text)
-                if time is not None and value_ms is not None and time.statistic == "p50":
+                (time, statistic), value_ms = parsed_time_key(key), status_names.number(text)
+                if statistic == "p50" and value_ms is not None:
                     own = status.name.removeprefix(STAGE_PREFIX)
-                    name = own if own != status.name else f"{short_name(status.name)} {time.name}"
+                    name = own if own != status.name else f"{short_name(status.name)} {time}"
                     self._plot(stamp_ns, "latency", plain(name), value_ms)
             if self._messages.get(status.name) != (status.level, status.message):
                 self._messages[status.name] = status.level, status.message

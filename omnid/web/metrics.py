@@ -32,7 +32,10 @@ def metrics(state: RobotState, refused: Mapping[str, int], counts: Mapping[str, 
     class Snapshot(Collector):
         def collect(self) -> Iterator[Metric]:
             yield from _of_robot(state)
-            yield from _of_server(refused, counts)
+            for name, count in counts.items():
+                yield Counter(f"omnid_web_{name}", _TEXTS[name], count)
+            samples = (((reason,), count) for reason, count in refused.items())
+            yield _labelled(Counter, "omnid_web_refused", "Requests that were refused", ["reason"], samples)
 
     registry = CollectorRegistry(auto_describe=False)
     registry.register(Snapshot())
@@ -42,9 +45,9 @@ def metrics(state: RobotState, refused: Mapping[str, int], counts: Mapping[str, 
 def _of_robot(state: RobotState) -> Iterator[Metric]:
     yield _gauge("omnid_up", "1 if the daemon's token is on the bus", float(state.alive is True))
     yield _gauge("omnid_pose_rate_hz", "Poses received per second", state.rate_hz)
-    yield _counter("omnid_poses", "Poses received", state.poses)
-    yield _counter("omnid_poses_missed", "Skipped sequence numbers", state.missed)
-    yield _counter("omnid_messages_broken", "Messages that could not be decoded", state.broken)
+    yield Counter("omnid_poses", "Poses received", state.poses)
+    yield Counter("omnid_poses_missed", "Skipped sequence numbers", state.missed)
+    yield Counter("omnid_messages_broken", "Messages that could not be decoded", state.broken)
     states = [((str(name),), float(state.state == name)) for name in TrackingState]
     yield _labelled(Gauge, "omnid_tracking_state", "1 for the state of the newest pose", ["state"], states)
     yield _quantiles("omnid_pose_age_seconds", "From the images to the arrival of a pose", state.age)
@@ -60,20 +63,8 @@ def _of_robot(state: RobotState) -> Iterator[Metric]:
     yield _labelled(Gauge, "omnid_status_value", "Numbers of the status", ["part", "key"], values)
 
 
-def _of_server(refused: Mapping[str, int], counts: Mapping[str, int]) -> Iterator[Metric]:
-    for name, count in counts.items():
-        yield _counter(f"omnid_web_{name}", _TEXTS[name], count)
-    samples = (((reason,), count) for reason, count in refused.items())
-    yield _labelled(Counter, "omnid_web_refused", "Requests that were refused", ["reason"], samples)
-
-
 def _gauge(name: str, text: str, value: float) -> Metric:
     return Gauge(name, text, value if math.isfinite(value) else None)
-
-
-def _counter(name: str, text: str, value: float) -> Metric:
-    """Return a counter; its sample has the name with `_total`."""
-    return Counter(name, text, value)
 
 
 def _quantiles(name: str, text: str, histogram: Histogram) -> Metric:

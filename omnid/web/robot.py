@@ -15,7 +15,7 @@ import time
 from collections.abc import Awaitable, Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import Final, NamedTuple
+from typing import Final
 
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
@@ -42,20 +42,6 @@ _NUMBER: Final = r"(-?\d{1,6}(?:\.\d{1,4})?)"
 _GOAL: Final = re.compile(rf"{_NUMBER} {_NUMBER}(?: {_NUMBER})? (\d{{1,15}})")
 _STAMPED: Final = re.compile(r"(.*?)(?: stamp=(\d{1,15}))?", re.DOTALL)
 _STICK: Final = re.compile(r"(-?[01](?:\.\d{1,4})?) (-?[01](?:\.\d{1,4})?) (\d{1,15}) ([0-9a-z]{1,16})")
-
-
-class StickRequest(NamedTuple):
-    """A request of the stick."""
-
-    forward: float  # -1 to 1
-    turn: float  # -1 to 1, counter-clockwise
-    stamp_ms: int  # the server's time in the newest state that the page has shown
-    page: str  # identifies an open page
-
-    @property
-    def moves(self) -> bool:
-        """True if it asks for a motion."""
-        return bool(self.forward or self.turn)
 
 
 class RobotPage:
@@ -139,9 +125,13 @@ class RobotPage:
         return await self._asked("arm", Driver.arm)
 
     async def goal(self, request: Request) -> Answer:
-        """Pass on a goal in odom: see goal_of."""
-        goal = goal_of(await text_of(request))
-        return await self._asked("goal", lambda driver: driver.goal(*goal))
+        """Pass on a goal in odom, "X Y STAMP" or "X Y YAW STAMP" in m, m, deg; without YAW with any heading."""
+        found = _GOAL.fullmatch(await text_of(request))
+        if found is None:
+            raise OmnidError('a goal is "X Y STAMP" or "X Y YAW STAMP" in m, m, deg')
+        stamp_of(found[4])
+        heading_rad = None if found[3] is None else math.radians(float(found[3]))
+        return await self._asked("goal", lambda driver: driver.goal(float(found[1]), float(found[2]), heading_rad))
 
     async def _asked_in_words(
         self,
@@ -176,41 +166,44 @@ class RobotPage:
         return self.feed.robot
 
     async def drive(self, asked: Request) -> Answer:
-        """Send the command that a request of the stick asks for, unless the last one has not ended."""
-        request = stick_request(await text_of(asked))
-        refusal = self._stick_refusal(request)
-        if refusal:
-            return Answer(False, refusal)
+        """Send the command of the stick, "FORWARD TURN STAMP PAGE": shares from -1 to 1, the latter counter-clockwise.
+
+        STAMP is the server's time in the newest state that the page has shown; PAGE identifies an open page.
+        """
+        # 1. Parse the request.
+        found = _STICK.fullmatch(await text_of(asked))
+        forward, turn = (float(found[1]), float(found[2])) if found else (math.inf, math.inf)
+        if found is None or max(abs(forward), abs(turn)) > 1.0:
+            raise OmnidError('the stick sends "FORWARD TURN STAMP PAGE", the first two from -1 to 1')
+        moves, stamp_ms, page = bool(forward or turn), int(found[3]), found[4]
+        # 2. Refuse what may not drive now; a release always may.
+        if self.is_stopping:
+            return Answer(False, "a stop is not confirmed yet: drive after it")
+        if self._page != page and time.monotonic() < self._held_until_s:
+            return Answer(False, "another page drives")
+        if moves and not is_recent(stamp_ms):
+            return Answer(False, "the network is too slow to drive by it: the stick's request is more than 1 s late")
+        if self._sending:
+            return Answer(False, "the robot does not take the last command: is it overloaded?")
+        # 3. Send it.
         robot = self._robot()
-        self._page, self._held_until_s = request.page, time.monotonic() + HELD_S
+        self._page, self._held_until_s = page, time.monotonic() + HELD_S
         self._sending = True
         try:
             limits = await self._limits_of(robot)
             # The first request reads the robot's limits, which may take so long that the request is no longer recent.
-            if request.moves and not is_recent(request.stamp_ms):
+            if moves and not is_recent(stamp_ms):
                 return Answer(False, "the stick is ready now")
-            velocity_mps = FIRST_SHARE * request.forward * limits.velocity_mps
-            rate_radps = FIRST_SHARE * request.turn * limits.yaw_rate_radps
+            velocity_mps = FIRST_SHARE * forward * limits.velocity_mps
+            rate_radps = FIRST_SHARE * turn * limits.yaw_rate_radps
             send = partial(robot.driver().twist, velocity_mps, rate_radps)
             sending = asyncio.get_running_loop().run_in_executor(self._stick_thread, send)
             await asyncio.wait([sending], timeout=ANSWER_S / 2)  # a robot that does not read is not waited for
         finally:
             self._sending = False
-        if not request.moves:
+        if not moves:
             return Answer(True, "the stick is released: it stands")
         return Answer(True, f"it drives by the stick: {velocity_mps:+.2f} m/s, {math.degrees(rate_radps):+.0f}°/s")
-
-    def _stick_refusal(self, request: StickRequest) -> str:
-        """Return why a request is refused, empty where it is not."""
-        if self.is_stopping:
-            return "a stop is not confirmed yet: drive after it"
-        if self._page != request.page and time.monotonic() < self._held_until_s:
-            return "another page drives"
-        if request.moves and not is_recent(request.stamp_ms):
-            return "the network is too slow to drive by it: the stick's request is more than 1 s late"
-        if self._sending:
-            return "the robot does not take the last command: is it overloaded?"
-        return ""
 
     async def _limits_of(self, robot: Robot) -> VelocityLimits:
         """Return the robot's limits, read at the first call after its start."""
@@ -232,27 +225,6 @@ def _command_route(path: str, act: Callable[[Request], Awaitable[Answer]]) -> Ro
         return JSONResponse(answer._asdict(), 200 if answer.done else 409)
 
     return Route(path, respond, methods=["POST"])
-
-
-def stick_request(text: str) -> StickRequest:
-    """Parse "FORWARD TURN STAMP PAGE". Raise OmnidError for anything else."""
-    found = _STICK.fullmatch(text)
-    if found is None or max(abs(float(found[1])), abs(float(found[2]))) > 1.0:
-        raise OmnidError('the stick sends "FORWARD TURN STAMP PAGE", the first two from -1 to 1')
-    return StickRequest(float(found[1]), float(found[2]), int(found[3]), found[4])
-
-
-def goal_of(text: str) -> tuple[float, float, float | None]:
-    """Return x, y [m] and the heading [rad] of a goal in odom; a heading of None leaves it open.
-
-    text: "X Y STAMP" or "X Y YAW STAMP" in m, m, deg. Raise OmnidError for any other text, and for a stamp that is too
-    old.
-    """
-    found = _GOAL.fullmatch(text)
-    if found is None:
-        raise OmnidError('a goal is "X Y STAMP" or "X Y YAW STAMP" in m, m, deg')
-    stamp_of(found[4])
-    return float(found[1]), float(found[2]), None if found[3] is None else math.radians(float(found[3]))
 
 
 def stamp_of(text: str) -> int:

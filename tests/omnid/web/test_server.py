@@ -42,11 +42,6 @@ def publish(bus: Bus, seq: int, state: str = "tracking") -> None:
     bus.publish("odom", odometry(seq), PoseAttachment(seq, state, 0, 50, 60, time.time_ns()).to_bytes())
 
 
-def state_of(server: WebServer) -> dict[str, Any]:
-    found: dict[str, Any] = Shown(server).until("state")
-    return found
-
-
 def test_the_printed_address_lets_a_browser_in(server: WebServer) -> None:
     first = server.request("/")
     assert first.status == 401 and "token" in first.text and "page.js" not in first.text
