@@ -56,11 +56,6 @@ def plain_paint(rng: Random, grey: float, grain: float = 0.8, px_per_m: float = 
     return paint
 
 
-def kind_paint(rng: Random, kind: str) -> Paint:
-    """Return what paints a face by a kind of texture (textures.PAINTERS)."""
-    return lambda sides_m: painted(rng, kind, sides_m, THING_PX_PER_M)
-
-
 def poster_paint(rng: Random) -> Paint:
     """Return what paints a face as a printed page, a drawing or a photograph."""
     return lambda sides_m: textures.poster(rng, _px(sides_m))

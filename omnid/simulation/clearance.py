@@ -51,17 +51,3 @@ def clearance_m(segments: Array, place: tuple[float, float], radius_m: float) ->
     to_place = np.asarray(place) - a
     share = np.clip((to_place * along).sum(axis=1) / np.maximum((along**2).sum(axis=1), 1e-12), 0.0, 1.0)
     return float(np.linalg.norm(to_place - share[:, None] * along, axis=1).min()) - radius_m
-
-
-def ranges_m(segments: Array, place: tuple[float, float], azimuths_rad: Array) -> Array:
-    """Return the distances (N,) [m] from a place to the first of segments (M, 2, 2) along azimuths (N,); inf: none."""
-    if not len(segments):
-        return np.full(len(azimuths_rad), np.inf)
-    ray = np.column_stack([np.cos(azimuths_rad), np.sin(azimuths_rad)])
-    start, along = segments[:, 0] - place, segments[:, 1] - segments[:, 0]
-    across = ray[:, None, 0] * along[:, 1] - ray[:, None, 1] * along[:, 0]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        distance_m = (start[:, 0] * along[:, 1] - start[:, 1] * along[:, 0]) / across
-        share = (start[:, 0] * ray[:, None, 1] - start[:, 1] * ray[:, None, 0]) / across
-    met = (distance_m > 0) & (share >= 0) & (share <= 1)
-    return np.asarray(np.where(met, distance_m, np.inf).min(axis=1))

@@ -8,15 +8,21 @@ from typing import Final
 import numpy as np
 
 from calib import se3
-from calib.models.camera import Array
-from calib.rig import Rig
+from calib.models.camera import Array, Mask
+from calib.models.unified import UnifiedCamera
+from calib.rig import MountedCamera, Rig
 from drivers.motors.simulated.simulated_base import MotionLimits
-from omnid.simulation.rendering.rigs import make_rig
 from omnid.simulation.rendering.sensor import Sensor
 
 CAMERA_HEIGHT_M: Final = 0.9  # Height of the lower viewpoint over the floor.
 BASELINE_M: Final = 0.2
 IMAGE_PX: Final = 512
+# Radii of the horizon at scale 1 and of the mirror's rim, in parts of the image's width.
+HORIZON = 207.5676 / 768
+RIM = 373.0 / 768
+TOPICS = ("/lower/image_raw/compressed", "/upper/image_raw/compressed")
+# The image's centre shows the floor; up in the image is forward, and the mirror's flip is in fu < 0.
+R_RIG_CAM = np.array([[0, -1.0, 0], [-1, 0, 0], [0, 0, -1]])
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,11 +94,18 @@ class SimulatedRobot:
 
 
 def make_robot(size_px: int = IMAGE_PX, rig: Rig | None = None) -> SimulatedRobot:
-    """Return the default robot with images of that size, or with another rig."""
+    """Return the default robot with images of that size before straight parabolic mirrors, or with another rig."""
     if rig is not None:
         return SimulatedRobot(rig)
-    made = make_rig(size=size_px, baseline_m=BASELINE_M)
-    return SimulatedRobot(replace(made, T_base_rig=se3.transform(np.eye(3), [0.0, 0.0, CAMERA_HEIGHT_M])))
+    focal_px, centre = HORIZON * size_px, ((size_px - 1) / 2, (size_px - 1) / 2)
+    camera = UnifiedCamera(1.0, (-focal_px, focal_px), centre, (size_px, size_px))
+    lower, upper = (
+        MountedCamera(
+            camera, se3.inverse(se3.transform(R_RIG_CAM, [0.0, 0.0, height_m])), Mask(centre, 0.0, RIM * size_px)
+        )
+        for height_m in (0.0, BASELINE_M)
+    )
+    return SimulatedRobot(Rig(lower, upper, se3.transform(np.eye(3), [0.0, 0.0, CAMERA_HEIGHT_M]), TOPICS))
 
 
 def with_masks(rig: Rig) -> Rig:

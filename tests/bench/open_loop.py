@@ -23,7 +23,7 @@ from drivers.frame import Frame, gray
 from omnid.config import load_config
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.mapping.range_scan import SECTORS, azimuths
-from omnid.simulation.clearance import clearance_m, footprints, obstacles_of, ranges_m
+from omnid.simulation.clearance import clearance_m, footprints, obstacles_of
 from omnid.simulation.lockstep import Moment, Request, simulate
 from omnid.simulation.people import Walkers
 from omnid.simulation.vehicle import START_NS
@@ -38,6 +38,20 @@ LONGEST_M: Final = 4.0  # of the way that is stored
 NEAR_M: Final = 0.15  # from the outline to what is in the way, where a drive ends
 LOOK_M, LOOK_RAD = 3.0, np.radians(15.0)  # what counts of a ring
 BEYOND_M: Final = 0.1
+
+
+def ranges_m(segments: Array, place: tuple[float, float], azimuths_rad: Array) -> Array:
+    """Return the distances (N,) [m] from a place to the first of segments (M, 2, 2) along azimuths (N,); inf: none."""
+    if not len(segments):
+        return np.full(len(azimuths_rad), np.inf)
+    ray = np.column_stack([np.cos(azimuths_rad), np.sin(azimuths_rad)])
+    start, along = segments[:, 0] - place, segments[:, 1] - segments[:, 0]
+    across = ray[:, None, 0] * along[:, 1] - ray[:, None, 1] * along[:, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance_m = (start[:, 0] * along[:, 1] - start[:, 1] * along[:, 0]) / across
+        share = (start[:, 0] * ray[:, None, 1] - start[:, 1] * ray[:, None, 0]) / across
+    met = (distance_m > 0) & (share >= 0) & (share <= 1)
+    return np.asarray(np.where(met, distance_m, np.inf).min(axis=1))
 
 
 def stored(planned: Planned, folder: Path) -> Path:

@@ -1,7 +1,6 @@
 """Rendered worlds with exact ground truth: scenes, rigs, paths, and logs of a robot in them."""
 
 from omnid.simulation.rendering.ray_caster import render_grey
-from omnid.simulation.rendering.rigs import make_rig
 from omnid.simulation.rendering.sensor import MountedSensor, Sensor
 from omnid.simulation.rendering.shapes import box, posters
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
@@ -9,6 +8,7 @@ from tests.simulation.builders import corridor, room, wall
 from tests.simulation.images import render
 from tests.simulation.logs import camchain, tum, write_log
 from tests.simulation.recipes import RECIPES, SimulatedRun, build
+from tests.simulation.rigs import make_rig
 
 __all__ = [
     "RECIPES",

@@ -19,12 +19,12 @@ from omnid.errors import OmnidError
 from omnid.simulation import building_worlds
 from omnid.simulation.building_parts import (
     BEHIND_M,
+    THING_PX_PER_M,
     Builder,
     Opening,
     Part,
     corridor,
     four_legs,
-    kind_paint,
     plain_paint,
     poster_paint,
     put_thing,
@@ -34,7 +34,7 @@ from omnid.simulation.building_worlds import Makers, building_world, built, made
 from omnid.simulation.people import Person, moved
 from omnid.simulation.rendering.ray_caster import AS_NEEDED
 from omnid.simulation.rendering.sensor import Sensor
-from omnid.simulation.rendering.shapes import Paint, Point, solid
+from omnid.simulation.rendering.shapes import Paint, Point, painted, solid
 from omnid.simulation.rendering.surfaces import Rectangle
 from omnid.simulation.robot import Push, SimulatedRobot, Slip, WheelErrors, make_robot
 from omnid.simulation.world import Ground, World
@@ -171,6 +171,11 @@ def _hazard(b: Builder, first: int, **fields: object) -> Trial:
 
 def _place(b: Builder) -> Point:
     return b.rng.uniform(2.2, 3.0), b.rng.uniform(-0.15, 0.15)
+
+
+def kind_paint(rng: np.random.Generator, kind: str) -> Paint:
+    """Return what paints a face by a kind of texture (textures.PAINTERS)."""
+    return lambda sides_m: painted(rng, kind, sides_m, THING_PX_PER_M)
 
 
 def _put(b: Builder, name: str, paint: Paint, at: Point) -> None:

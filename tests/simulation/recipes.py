@@ -11,12 +11,12 @@ import numpy as np
 from calib.models.camera import Array
 from calib.rig import Rig
 from omnid.simulation.clearance import footprints
-from omnid.simulation.rendering.rigs import make_rig
 from omnid.simulation.rendering.sensor import Sensor
 from omnid.simulation.rendering.surfaces import Scene
 from tests.simulation import paths
 from tests.simulation.builders import KEPT, corridor, room
 from tests.simulation.closed_worlds import bricks, ring, symmetric_room, twin_corridor, two_laps_path
+from tests.simulation.rigs import make_rig
 
 TURN_DEG = 94.0
 # Mean grey of about 30 of 255; the brightness of each image differs by 20 %.

@@ -8,16 +8,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.rig import Rig
-from omnid.simulation.rendering.rigs import RIM, make_rig
 from omnid.simulation.rendering.shapes import CEILING_M
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
 from omnid.simulation.rendering.textures import PAINTERS, value_noise
+from omnid.simulation.robot import RIM
 from omnid.simulation.world_file import load_world
 from tests.bench.route_series import lap
 from tests.simulation import paths
 from tests.simulation.builders import corridor
 from tests.simulation.builders import wall as upright
 from tests.simulation.recipes import TURN_DEG, SimulatedRun
+from tests.simulation.rigs import make_rig
 
 WALL_M = 2.0  # section V.B: distance from the cameras to the wall
 WALL_SIZE_M = (9.0, CEILING_M)

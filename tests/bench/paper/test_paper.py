@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from omnid.simulation.rendering.ray_caster import render_grey
-from omnid.simulation.rendering.rigs import make_rig
 from tests.bench.paper import measures
 from tests.bench.paper.povray import INSTALL, available, shoot, write_world
 from tests.bench.paper.scenes import build
 from tests.bench.paper.views import Experiment
+from tests.simulation.rigs import make_rig
 
 # Rendered by POV-Ray: render brick --seed 1 --size 512 --pairs 1, turns --size 448 --pairs 5 --supersample 3.
 SMALL = Path(__file__).parent / "small"

@@ -11,7 +11,7 @@ from calib.fit.rig_uncertainty import drive_uncertainty
 from calib.models.unified import UnifiedCamera
 from calib.rig import Rig
 from calib.rig_covariance import RigCovariance
-from omnid.simulation.rendering.rigs import make_rig
+from tests.simulation.rigs import make_rig
 
 
 def with_sigma(rig: Rig, name: str, sigma: float) -> Rig:

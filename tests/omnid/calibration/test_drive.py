@@ -13,9 +13,8 @@ from calib.models.camera import Array
 from calib.rig import Rig
 from omnid.calibration.drive import level_turn, require_same_rig, rescaled, turned_about_lower
 from omnid.errors import OmnidError
-from omnid.simulation.rendering.rigs import make_rig
 from tests.simulation.paths import loop, vibrate
-from tests.simulation.rigs import nominal_rig, with_real_mirrors
+from tests.simulation.rigs import make_rig, nominal_rig, with_real_mirrors
 
 MEASURED = make_rig(misaligned_deg=(0.6, -0.4, 0.5))
 

@@ -15,7 +15,7 @@ from calib.rig_file import read_rig
 from omnid.calibration.height import HeightCalibration, on_floor
 from omnid.cli import main
 from omnid.core.floor import Floor
-from omnid.simulation.rendering.rigs import make_rig
+from tests.simulation.rigs import make_rig
 
 HEIGHT_M = 1.2  # of rendered rigs: tests/simulation/paths.py
 

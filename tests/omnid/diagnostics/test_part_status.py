@@ -18,7 +18,6 @@ from omnid.diagnostics.status import LIVE, ImagesStatus, floor_status, rig_statu
 from omnid.engine.telemetry import StageStats
 from omnid.load_level import LoadLevel
 from omnid.messages import OdometryUpdate, StereoDepth
-from omnid.simulation.rendering.rigs import make_rig
 from omnid.simulation.robot import make_robot
 from omnid.stages.geometry import geometry
 from omnid.stages.obstacles import CameraFloor
@@ -27,6 +26,7 @@ from omnid.transport.codec import ERROR, OK, STALE, WARN
 from omnid.transport.status_names import lost_parts_key
 from tests.omnid.small_pair import small_depth
 from tests.omnid.stages.test_keyframe_scan import depth
+from tests.simulation.rigs import make_rig
 
 
 @pytest.fixture

@@ -20,9 +20,9 @@ from omnid.engine.graph import Graph
 from omnid.errors import OmnidError
 from omnid.runs.live import MASK_FRAMES, ConnectedRobot, TerminalStatus, first_frames
 from omnid.runs.session import Session, attached_rig
-from omnid.simulation.rendering.rigs import make_rig
 from omnid.simulation.robot import with_masks
 from tests.drivers.logs.mcap_logs import pairs, write_log
+from tests.simulation.rigs import make_rig
 
 
 def warnings_of(size_px: int, *overrides: str) -> list[str]:

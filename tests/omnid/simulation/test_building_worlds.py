@@ -9,10 +9,11 @@ import pytest
 
 from omnid.errors import OmnidError
 from omnid.simulation.building_worlds import FLOORS, NAMES, building_world, can_drive
-from omnid.simulation.clearance import clearance_m, footprints, obstacles_of, ranges_m
+from omnid.simulation.clearance import clearance_m, footprints, obstacles_of
 from omnid.simulation.rendering.shapes import box
 from omnid.simulation.rendering.surfaces import Rectangle
 from omnid.simulation.world_file import load_world
+from tests.bench.open_loop import ranges_m
 from tests.simulation.hazard_worlds import HAZARDS, OF_ROBOT, trial
 
 ROBOT_M = 0.2, 1.2  # radius and height

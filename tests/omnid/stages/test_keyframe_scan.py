@@ -11,10 +11,10 @@ from calib import se3
 from omnid.core.mapping.range_scan import SECTORS, azimuths
 from omnid.core.obstacles.settings import RingSettings
 from omnid.messages import DensePoints, ObstacleRing
-from omnid.simulation.rendering.rigs import make_rig
 from omnid.stages.keyframe_scan import keyframe_free, keyframe_scan
 from omnid.stages.obstacles import CameraFloor
 from tests.omnid.core.test_floor import HEIGHT_M, plane, walls
+from tests.simulation.rigs import make_rig
 
 BOX_M, WALL_M = 1.4, 2.4
 AHEAD = np.abs(azimuths()) < 0.25  # of the rig, whose x is forward

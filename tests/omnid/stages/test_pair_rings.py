@@ -13,7 +13,6 @@ from omnid.core.obstacles.cell_kernels import SURFACE
 from omnid.core.obstacles.settings import RingSettings
 from omnid.core.stereo.tiles import TILE_COLUMNS, TILE_ROWS, TileStates
 from omnid.messages import ObstacleRing, OdometryUpdate, Panoramas, StereoDepth
-from omnid.simulation.rendering.rigs import make_rig
 from omnid.stages.geometry import Geometry
 from omnid.stages.obstacles import CameraFloor, PairRings
 from omnid.tracking_state import TrackingState
@@ -28,6 +27,7 @@ from tests.omnid.core.obstacles.drawn_floor import (
     striped,
     worn,
 )
+from tests.simulation.rigs import make_rig
 
 LIT_ROWS = slice(205, 225)  # of the floor 0.9 to 1.05 m away
 SHOWN = np.ones((CYLINDER.height, CYLINDER.width), bool)

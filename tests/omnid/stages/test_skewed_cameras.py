@@ -17,14 +17,13 @@ from omnid.config import Config, load_config
 from omnid.core.rig.rig_health import RigContradictedError
 from omnid.messages import FramePair
 from omnid.runs.replay import ReplayOptions, run_log
-from omnid.simulation.rendering.rigs import make_rig
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry
 from omnid.tracking_state import TrackingState
 from tests.simulation import MountedSensor, Sensor, build, corridor, render_grey, write_log
 from tests.simulation.paths import planar_poses
 from tests.simulation.readout import Readout
-from tests.simulation.rigs import with_upper_rotated
+from tests.simulation.rigs import make_rig, with_upper_rotated
 
 
 @pytest.fixture(scope="module")

@@ -16,9 +16,9 @@ from drivers.motion import GyroSample, WheelSample
 from omnid.camera_config import PairConfig
 from omnid.errors import OmnidError
 from omnid.messages import FramePair
-from omnid.simulation.rendering.rigs import make_rig
 from omnid.stages.synchronise import FROZEN_IMAGES, KEPT, MAX_WAITING, Decoder, RepeatedImages, Skew, Synchronise
 from tests.simulation import build
+from tests.simulation.rigs import make_rig
 
 MS = 1_000_000
 PERIOD_NS = 33_333_333

@@ -16,8 +16,8 @@ from calib.fit.drive.rig_parameters import LINE_TIME, UPPER_DELAY, RigParameters
 from calib.models.camera import Array
 from calib.models.unified import UnifiedCamera
 from calib.rig import Rig
-from omnid.simulation.rendering.rigs import make_rig
 from tests.simulation.paths import loop, vibrate
+from tests.simulation.rigs import make_rig
 
 KEYFRAMES, LANDMARKS = 14, 150
 NOISE_PX = 0.03

@@ -13,7 +13,7 @@ from calib.fit.rig_uncertainty import motion_errors
 from calib.rig import Rig
 from calib.rig_covariance import RigCovariance
 from omnid.core.odometry.rig_error import RigError
-from omnid.simulation.rendering.rigs import make_rig
+from tests.simulation.rigs import make_rig
 
 BASELINE_M, SCALE = 0.2, 0.01
 
