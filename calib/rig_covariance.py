@@ -17,9 +17,6 @@ from calib.models.camera import Array
 
 # Rotation [rad] and direction of the baseline [rad], in the rectified frame; length of the baseline [m].
 TRANSFORM_NAMES = ("r_x", "r_y", "r_z", "e_x", "e_y", "baseline")
-# No rig has more, because the largest has two ocam cameras with the largest polynomials, of 77 parameters each, and the
-# transform of 6.
-MAX_PARAMETERS = 160
 # Larger sigmas say nothing of any parameter, and their products overflow.
 MAX_SIGMA = 1e6
 # Correlations are rounded, so that their text is exact; a matrix may be negative by the rounding.
@@ -36,8 +33,8 @@ class RigCovariance:
 
     def __post_init__(self) -> None:
         count = len(self.names)
-        if not 1 <= count <= MAX_PARAMETERS or len(set(self.names)) != count:
-            raise CalibError(f"covariance: expected 1 to {MAX_PARAMETERS} different parameters, found {count}")
+        if not count or len(set(self.names)) != count:
+            raise CalibError(f"covariance: expected different parameters, found {count}")
         if self.sigmas.shape != (count,) or self.correlation.shape != (count, count):
             raise CalibError(
                 f"covariance: expected {count} sigmas and {count} x {count} correlations, found "

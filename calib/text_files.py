@@ -1,6 +1,6 @@
 """Texts of calibrations by other programs: their encodings, YAML (also of OpenCV's FileStorage) and JSON.
 
-YAML of unknown origin is bounded: no anchors, few levels, few values.
+YAML of unknown origin is bounded: it is short, and has no anchors.
 """
 
 from __future__ import annotations
@@ -12,17 +12,13 @@ from typing import Any, Final
 
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
-from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent, NodeEvent, ScalarEvent
+from ruamel.yaml.events import AliasEvent, NodeEvent
 
 from calib.errors import CalibError
 
-# Of YAML, enough for MAX_NODES of 16 characters; of JSON, in which basalt also writes the vignettes of its cameras.
+# Of YAML, since a camera has about 60 numbers; of JSON, in which basalt also writes the vignettes of its cameras.
 MAX_BYTES: Final = 1 << 15
 MAX_JSON_BYTES: Final = 1 << 21
-# Values and lists, because a camera has about 60.
-MAX_NODES: Final = 2000
-MAX_DEPTH: Final = 16  # Lists and mappings within each other: enough, as those of a camera are four deep.
-MAX_SCALAR: Final = 1000  # Characters of a value: enough for names of topics and paths.
 # The head of OpenCV's FileStorage, or of a YAML of another version; the tag marks a mapping of rows, cols and data.
 _HEAD: Final = re.compile(r"\A\s*%YAML[:\s][^\n]*\n(\s*---[^\n]*\n)?")
 _OPENCV_TAG: Final = re.compile(r"!!opencv-(nd-)?matrix\b")
@@ -83,18 +79,10 @@ def _yaml(text: str) -> Any:
         raise ValueError(f"expected at most {MAX_BYTES} characters, found {len(text)}")
     # 1. The head, OpenCV's tags, and tabs, which YAML does not take for blanks.
     text = _OPENCV_TAG.sub("", _HEAD.sub("", text)).expandtabs(2)
-    depth = nodes = 0
     # 2. The events name anchors and aliases without resolving them.
     for event in YAML(typ="safe", pure=True).parse(text):
         if isinstance(event, AliasEvent) or (isinstance(event, NodeEvent) and event.anchor is not None):
             raise ValueError(f"expected no anchors and aliases, found {str(event.anchor)[:40]}; write the values out")
-        depth += isinstance(event, CollectionStartEvent)
-        depth -= isinstance(event, CollectionEndEvent)
-        nodes += isinstance(event, NodeEvent)
-        if depth > MAX_DEPTH or nodes > MAX_NODES:
-            raise ValueError(f"expected at most {MAX_DEPTH} levels and {MAX_NODES} values, found more")
-        if isinstance(event, ScalarEvent) and len(event.value) > MAX_SCALAR:
-            raise ValueError(f"expected values of at most {MAX_SCALAR} characters, found {len(event.value)}")
     # 3. The values of the first document: `ros2 topic echo` ends each message with a new one.
     return next(iter(YAML(typ="safe", pure=True).load_all(text)), None)
 

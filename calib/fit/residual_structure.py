@@ -11,15 +11,12 @@ from calib.models.camera import Array
 
 # Bins of the image: rings with equal numbers of corners, and sectors of azimuth.
 RINGS, SECTORS = 6, 12
-# Least number of corners in a bin that is used, because the mean of fewer errs by more than half the noise.
-MIN_CORNERS = 4
 # A misfit is reported if the systematic part exceeds this part of the noise, and this error, because smaller ones do
 # not change the motion estimate by a measurable amount.
 MAX_SYSTEMATIC_PART, MAX_SYSTEMATIC_PX = 0.5, 0.03
 # Residuals longer than this many times their median length are outliers: 3 of 100 million of a
 # normal distribution.
 OUTLIER_RATIO = 5.0
-MIN_BOARD_M = 1e-6  # guards against division by zero where all corners are one
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +54,7 @@ def residual_structure(
 
 def _noise_px(residuals: Array, points: Array) -> float:
     """Return the rms of residuals (K, N, 2) after a quadratic function of the board is removed from every view."""
-    scale = max(float(np.abs(points[:, :2]).max()), MIN_BOARD_M)
+    scale = max(float(np.abs(points[:, :2]).max()), np.finfo(float).tiny)
     terms = quadratic_terms(points[:, 0] / scale, points[:, 1] / scale)
     squares, freedom = 0.0, 0
     for view in residuals:
@@ -86,11 +83,10 @@ def systematic_px(pixels: Array, residuals: Array, center: tuple[float, float]) 
     between, within, groups, used = 0.0, 0.0, 0, 0
     for number in np.unique(bins):
         group = components[bins == number]
-        if len(group) >= MIN_CORNERS:
-            mean = group.mean(axis=0)
-            between += len(group) * float((mean**2).sum())
-            within += float(((group - mean) ** 2).sum())
-            groups, used = groups + 1, used + len(group)
+        mean = group.mean(axis=0)
+        between += len(group) * float((mean**2).sum())
+        within += float(((group - mean) ** 2).sum())
+        groups, used = groups + 1, used + len(group)
     if used <= groups:
         return 0.0
     share = groups * within / (used - groups)

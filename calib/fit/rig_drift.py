@@ -27,12 +27,11 @@ MIN_POINTS = 30  # six for each unknown.
 # With 1, the rotation of right rigs is off by 1.1 to 3.8 sigma (rms of drives of development seeds, see
 # tests/bench/calibration.py); clusters of 10 degrees or of whole pairs explain no more of it than 1 does.
 CORRELATED_POINTS = 4.0
-MAX_ITERATIONS = 12  # enough: 70 of 72 estimates of test_rig_drift.py end before
+ITERATIONS = 12  # enough: 70 of 72 estimates of test_rig_drift.py end before
 # Width of the weights (Geman and McClure 1987) in standard deviations of the residuals, so that of normal errors 86 %
 # of the efficiency of least squares remains.
 KERNEL_WIDTH = 2.5
 MIN_SIGMA_RAD = 1e-5  # guards against division by zero: residuals of exact points
-CONVERGED_RAD = 1e-6  # a tenth of the least sigma, so that more iterations change nothing
 # Step of numeric derivatives by central differences: near the cube root of a double's rounding, 6e-6, which is best.
 DIFFERENCE_STEP_RAD = 1e-6
 # Prior of the upper viewpoint's lateral shift: a mirror moves by no more than some degrees of the baseline.
@@ -76,16 +75,13 @@ def estimate_rig_drift(lower: Array, upper: Array) -> RigDrift | None:
         return None
     x = np.zeros(5)
     prior = np.diag([0.0, 0, 0, SHIFT_SIGMA_RAD**-2, SHIFT_SIGMA_RAD**-2])
-    for _ in range(MAX_ITERATIONS):
+    for _ in range(ITERATIONS):
         residual, J = _residuals(x, lower, upper), _jacobian(x, lower, upper)
         sigma = max(MIN_SIGMA_RAD, SIGMA_PER_MAD * float(np.median(np.abs(residual - np.median(residual)))))
         weight = 1 / (1 + (residual / (KERNEL_WIDTH * sigma)) ** 2) ** 2
         variance = CORRELATED_POINTS * sigma**2
         H = (J * weight[:, None]).T @ J / variance + prior
-        step = np.linalg.solve(H, -(J * weight[:, None]).T @ residual / variance - prior @ x)
-        x = x + step
-        if np.abs(step).max() < CONVERGED_RAD:
-            break
+        x = x + np.linalg.solve(H, -(J * weight[:, None]).T @ residual / variance - prior @ x)
     return RigDrift(x[:3], x[3:], np.asarray(np.linalg.inv(H), float), _residuals(x, lower, upper), len(lower))
 
 

@@ -76,21 +76,15 @@ def drive_uncertainty(rig: Rig) -> DriveUncertainty | None:
     A drive among walls: points are triangulated by both cameras at its start, then the pose at its end is fitted to
     their pixels in both cameras, all to first order. Errors are root mean squares over the directions of the drive.
     """
-    if rig.covariance is None:
+    if rig.covariance is None or len(seen_points(rig)) < 2 * MIN_POINTS:
         return None
-    points = seen_points(rig)
-    if len(points) < MIN_POINTS:
-        return None
-    names, sigmas = rig.covariance.names, np.maximum(rig.covariance.sigmas, np.finfo(float).tiny)
+    J = motion_errors(rig).at(WALLS_M[1])
     variances = np.zeros(2)
     for azimuth in 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS:
-        direction = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-        J = _motion_by_parameters(rig, points, np.concatenate([MOTION * direction, np.zeros(3)]), (names, sigmas))
-        if J is None:
-            return None
-        effect = np.stack([direction @ J[:3], J[5]]) / MOTION
-        variances += np.einsum("ep,pq,eq->e", effect, rig.covariance.correlation, effect) / DIRECTIONS
-    scale, heading_rad_m = np.sqrt(np.maximum(0.0, variances)).tolist()
+        direction = np.array([np.cos(azimuth), np.sin(azimuth)])
+        along = np.einsum("idk,d->ik", J[:, :2], direction)  # errors (6, K) of a motion along the direction
+        variances += np.array([((direction @ along[:2]) ** 2).sum(), (along[5] ** 2).sum()]) / DIRECTIONS
+    scale, heading_rad_m = np.sqrt(variances).tolist()
     return DriveUncertainty(scale, heading_rad_m)
 
 

@@ -50,7 +50,7 @@ def find_boards(images: Images, board: AnyBoard, *, thorough: bool, progress: Pr
                 views.append(search.view)
             if search.grid_size != (0, 0):
                 other_grids[min(search.grid_size), max(search.grid_size)] += 1
-            progress(f"[{number}/{len(images)}] {name}: {_outcome(search, board)}")
+            progress(f"[{number}/{len(images)}] {name}: {_outcome(search)}")
     if views and max(other_grids.values(), default=0) > len(views):
         progress(f"the board was found in {len(views)}, {_grid_hint(other_grids)}")
     if not views:
@@ -59,10 +59,8 @@ def find_boards(images: Images, board: AnyBoard, *, thorough: bool, progress: Pr
     return views
 
 
-def _outcome(search: BoardSearch, board: AnyBoard) -> str:
+def _outcome(search: BoardSearch) -> str:
     view, (columns, rows) = search.view, search.grid_size
-    if view is not None and isinstance(board, Board):
-        return f"board found, confidence {view.confidence:.2f}"
     if view is not None:
         return f"board found, {int(np.isfinite(view.pixels[:, 0]).sum())} of {len(view.pixels)} corners"
     return f"no board, but a grid of {columns}x{rows}" if columns else "no board"

@@ -57,7 +57,9 @@ def read_pairs(source: Path, cameras: LogCameras = BY_NAME) -> PairedImages:
     and would count the same errors again.
     """
     # 1. Read the images of both cameras.
-    of_log = _is_log(source) or (source.is_dir() and (any(map(_is_log, source.iterdir())) or _has_folders(source)))
+    of_log = is_log_name(source.name) or (
+        source.is_dir() and (any(is_log_name(path.name) for path in source.iterdir()) or _has_folders(source))
+    )
     if not of_log and (cameras.lower or cameras.upper):
         raise OmnidError(f"{source}: only a log has topics; found a folder of images")
     faults, loss = tuple[str, ...](), ""
@@ -84,10 +86,6 @@ def read_pairs(source: Path, cameras: LogCameras = BY_NAME) -> PairedImages:
 def _has_folders(source: Path) -> bool:
     """True if a folder is a log of folders of images, one for each camera."""
     return not any(source.glob(f"{SIDES[0]}_*")) and len(image_folders(source)) > 1
-
-
-def _is_log(source: Path) -> bool:
-    return is_log_name(source.name)
 
 
 def _repeats(sides: Sequence[Images]) -> dict[str, str]:

@@ -18,7 +18,7 @@ from calib.fit.residual_structure import ResidualStructure
 from calib.fit.rig_uncertainty import DriveUncertainty, drive_uncertainty
 from calib.masks.rim import find_rim
 from calib.models.names import sees_directly
-from calib.rig import Rig
+from calib.rig import MAX_BASELINE_M, MIN_BASELINE_M, Rig
 from calib.rig_file import write_rig
 from calib.rig_frame import mounting_notes, rig_between
 from drivers.logs.log_reader import AnyCameras, LogCameras
@@ -29,9 +29,6 @@ from omnid.calibration.rig_report import rig_report_html
 from omnid.calibration.view_guess import ViewChoice, view_of_images
 from omnid.errors import OmnidError
 
-# The board scales the rig: a baseline outside this range, from smaller than any mirror to larger than any vehicle,
-# shows a wrong length of the board.
-BASELINE_RANGE_M = (0.01, 3.0)
 # Relative difference from the baseline by ruler. A tenth is no error of a ruler; 2 % are 4 mm of 200 mm.
 REFUSED_PART, WARNING_PART = 0.1, 0.02
 
@@ -150,7 +147,8 @@ def _find_views(images: PairedImages, board: AnyBoard, progress: Progress) -> li
 
 def _check_baseline(found: RigCalibration, board: AnyBoard, expected_m: float | None) -> list[str]:
     """Return warnings about the baseline; raises OmnidError if it is far from the expected one."""
-    baseline_mm, (low, high) = found.baseline_m * 1e3, BASELINE_RANGE_M
+    # The board scales the rig: a baseline that no rig has shows a wrong length of the board.
+    baseline_mm, (low, high) = found.baseline_m * 1e3, (MIN_BASELINE_M, MAX_BASELINE_M)
     option, length_mm = (
         ("--tag-mm", board.tag_m * 1e3) if isinstance(board, AprilGrid) else ("--square-mm", board.square_m * 1e3)
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from html import escape
 
 import cv2
@@ -27,8 +27,6 @@ MEASURED, RESIDUAL, CENTER, LINE_COLOR = (80, 200, 0), (0, 60, 255), (255, 200, 
 COVERAGE_PX, PANORAMA_WIDTH = 700, 1400  # widths of the figures
 # Number of columns drawn through both panoramas.
 LINES = 24
-# Fractional bits of pixels in OpenCV's drawing functions.
-FINE = 4
 
 
 def rig_report_html(found: RigCalibration, images: PairedImages, rig: Rig, angles: Sequence[Sequence[AngleRow]]) -> str:
@@ -125,11 +123,6 @@ def _color(image: NDArray[np.generic]) -> Image:
 def _draw_arrows(canvas: Image, pixels: Array, residuals: Array) -> None:
     for pixel, residual in zip(pixels, residuals, strict=True):
         if np.isfinite(pixel).all() and np.isfinite(residual).all():
-            start, end = _fixed_point(pixel), _fixed_point(pixel + ARROW * residual)
-            cv2.circle(canvas, start, 3 << FINE, MEASURED, 1, cv2.LINE_AA, FINE)
-            cv2.line(canvas, start, end, RESIDUAL, 1, cv2.LINE_AA, FINE)
-
-
-def _fixed_point(pixel: Iterable[float]) -> tuple[int, int]:
-    u, v = (round(float(value) * (1 << FINE)) for value in pixel)
-    return u, v
+            start, end = ((round(u), round(v)) for u, v in (pixel.tolist(), (pixel + ARROW * residual).tolist()))
+            cv2.circle(canvas, start, 3, MEASURED, 1, cv2.LINE_AA)
+            cv2.line(canvas, start, end, RESIDUAL, 1, cv2.LINE_AA)

@@ -26,10 +26,8 @@ FIRST_SIDE, SEARCH_SIDE = 5, 3
 SEARCH_PART_OF_STEP = 0.55
 # Width at which the search ends, because the fit that follows refines the centre.
 SEARCH_END_PX = 0.5
-# Errors are capped, so that one bad image does not determine the centre.
-CAP_RAD = 0.05
-# Guards against division by zero: distance of a corner from the axis [m], squared coefficient of t3.
-MIN_ACROSS_M, MIN_SQUARED = 1e-9, 1e-300
+# Guards against division by zero.
+TINY = np.finfo(float).tiny
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +64,8 @@ def solve_linear(pixels: Array, points: Array, size: tuple[int, int], view: View
     while reach > SEARCH_END_PX:
         steps = np.linspace(-reach, reach, side)
         trials = [center + np.array([row, column]) for row in steps for column in steps]
-        center = min(trials, key=lambda trial: float(np.nanmean(problem.solve(trial).errors_rad)))
+        # By the median view: one bad image does not determine the centre.
+        center = min(trials, key=lambda trial: float(np.nanmedian(problem.solve(trial).errors_rad)))
         reach, side = SEARCH_PART_OF_STEP * (steps[1] - steps[0]), SEARCH_SIDE
     return _with_proper_poses(problem.solve(center), view)
 
@@ -101,7 +100,7 @@ class _LinearProblem:
         height = (self.points[:, :2] @ T[:, 2, :2].swapaxes(0, 1)).T
         basis = (rho[..., None] / self.scale_px) ** POWERS
         coefficients, T[:, 2, 3] = _polynomial(rho, across, height, basis)
-        errors = np.minimum(_angles(np.dstack([xy, basis @ coefficients]), se3.apply(T, self.points)), CAP_RAD)
+        errors = _angles(np.dstack([xy, basis @ coefficients]), se3.apply(T, self.points))
         return LinearCamera(
             coefficients, self.scale_px, (float(center[0]), float(center[1])), T, np.nanmean(errors, axis=1)
         )
@@ -157,10 +156,10 @@ def _eliminate_depths(
 
     Every t3 occurs in its own image's equations only: these are projected onto the complement of its column.
     """
-    known, weight = np.isfinite(rho), 1 / np.maximum(across, MIN_ACROSS_M)
+    known, weight = np.isfinite(rho), 1 / np.maximum(across, TINY)
     A = np.where(known[..., None], basis * (across * weight)[..., None], 0.0)
     b, shift = (np.where(known, side * rho * weight, 0.0) for side in (height, -1.0))
-    squared = np.maximum((shift**2).sum(axis=1), MIN_SQUARED)
+    squared = np.maximum((shift**2).sum(axis=1), TINY)
     along_A, along_b = ((shift[:, None] @ side)[:, 0] / squared[:, None] for side in (A, b[..., None]))
 
     def shifts(coefficients: Array) -> Array:

@@ -24,9 +24,6 @@ MAX_POSE_ERROR_RAD = np.deg2rad(1.0)
 MIN_INLIER_DISTANCE, MAX_INLIER_DISTANCE, INLIER_RATIO = 0.06, 0.3, 5.0
 # The order of corners is ambiguous if a transform farther away than any inlier costs less than this ratio.
 MIN_COST_RATIO = 3.0
-# Weight of the capped mean in a transform's cost, which breaks ties of the median; the cap.
-MEAN_WEIGHT, MEAN_CAP = 0.1, 1.0
-MIN_LENGTH_M = 1e-9  # Least divisor, so that a transform without translation has a distance, too.
 ViewPair = tuple[BoardView | None, BoardView | None]
 
 
@@ -106,7 +103,8 @@ def _consensus(candidates: Array) -> tuple[Array, Array]:
     flat = candidates.reshape(-1, 4, 4)
     apart = np.array([_pose_distance(candidates, T) for T in flat])  # (K S, K, S)
     nearest = apart.min(axis=2)
-    cost = np.median(nearest, axis=1) + MEAN_WEIGHT * np.minimum(nearest, MEAN_CAP).mean(axis=1)
+    # Far ones count alike: the cost is that of MSAC (Torr and Zisserman 2000).
+    cost = np.minimum(nearest, MAX_INLIER_DISTANCE).mean(axis=1)
     best = int(cost.argmin())
     others = cost[apart[best].ravel() > MAX_INLIER_DISTANCE]
     if candidates.shape[1] > 1 and others.size and others.min() < max(MIN_COST_RATIO * cost[best], MIN_INLIER_DISTANCE):
@@ -121,4 +119,6 @@ def _pose_distance(T: Array, other: Array) -> Array:
     """Return the distances of transforms (..., 4, 4) from another: angle [rad] plus shift relative to its length."""
     gap = se3.rotation_log(np.swapaxes(T[..., :3, :3], -1, -2) @ other[:3, :3])
     shift = np.linalg.norm(T[..., :3, 3] - other[:3, 3], axis=-1)
-    return np.asarray(np.linalg.norm(gap, axis=-1) + shift / max(float(np.linalg.norm(other[:3, 3])), MIN_LENGTH_M))
+    return np.asarray(
+        np.linalg.norm(gap, axis=-1) + shift / max(float(np.linalg.norm(other[:3, 3])), np.finfo(float).tiny)
+    )

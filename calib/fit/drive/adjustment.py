@@ -34,6 +34,8 @@ SELECTIONS = 3
 # while landmarks are still selected, because the search goes on with the next selection, the fine one at the end.
 MAX_STEPS = 30
 ROUGH_GAIN, FINE_GAIN = 1e-3, 1e-6
+# Information of parameters that stay.
+HELD = 1e12
 # About six times the number of parameters of a rig. Fewer landmarks would not show that a parameter is wrong.
 MIN_LANDMARKS = 100
 # Errors of a patch are alike in both cameras, and from keyframe to keyframe (correlation 0.9 in rendered rooms),
@@ -135,7 +137,8 @@ def observation_sigma(rig: Rig, found: DriveAdjustment, fixed: Sequence[int] = (
     """Return the sigma [px] of one coordinate with another rig, which stays; poses and landmarks are adjusted."""
     parameters = RigParameters.about(rig)
     still = np.zeros(len(parameters.names))
-    problem = DriveProblem(parameters, found.observations, np.eye(len(still)), np.asarray(fixed), held=True)
+    held = np.eye(len(still)) * HELD
+    problem = DriveProblem(parameters, found.observations, held, np.asarray(fixed))
     return _minimised(problem, replace(found.state, steps=still), ROUGH_GAIN)[1]
 
 

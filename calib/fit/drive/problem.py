@@ -46,17 +46,12 @@ class DriveProblem:
     observations: DriveObservations
     prior: Array  # (P, P) information of the steps, about zero
     fixed: Indices  # keyframes whose pose stays
-    held: bool = False  # True: the rig stays at the state's steps
 
     def residuals(self, state: DriveState) -> Array:
         """Return measured minus modelled pixels (M, 2); LOST_PX where the model has no image."""
         seen = self.observations
-        cast = self.cast(state.steps, seen.camera, self.in_rig(state, state.steps))
+        cast = self.caster(state.steps, seen.camera)(self.in_rig(state, state.steps))
         return np.where(np.isfinite(cast), seen.pixels - cast, LOST_PX)
-
-    def cast(self, steps: Array, camera: Indices, points: Array) -> Array:
-        """Return pixels (M, 2) of points (M, 3) in the rig frame after steps (P,) of the parameters."""
-        return self.caster(steps, camera)(points)
 
     def caster(self, steps: Array, camera: Indices) -> Callable[[Array], Array]:
         """Return the projection of points (M, 3) in the rig frame to pixels (M, 2), after steps (P,)."""
@@ -85,8 +80,7 @@ class DriveProblem:
     def cost(self, state: DriveState, sigma_px: float) -> float:
         """Return the sum of Cauchy's function over the observations, and the prior's."""
         squared = (self.residuals(state) ** 2).sum(axis=1) / sigma_px**2
-        known = 0.0 if self.held else float(state.steps @ self.prior @ state.steps)
-        return float(KERNEL**2 * np.log1p(squared / KERNEL**2).sum()) + known
+        return float(KERNEL**2 * np.log1p(squared / KERNEL**2).sum() + state.steps @ self.prior @ state.steps)
 
     def scale(self, state: DriveState) -> float:
         """Return the standard deviation [px] of one coordinate, by the median."""
@@ -118,8 +112,7 @@ class DriveProblem:
         coupling = scipy.sparse.vstack(
             [J.by_pose.T @ by_point, scipy.sparse.csr_matrix((by_point.T @ J.by_steps).T)]
         ).tocsr()
-        known = np.zeros(len(state.steps)) if self.held else self.prior @ state.steps
-        a = np.concatenate([J.by_pose.T @ J.error, J.by_steps.T @ J.error - known])
+        a = np.concatenate([J.by_pose.T @ J.error, J.by_steps.T @ J.error - self.prior @ state.steps])
         return ArrowSystem(A, coupling, blocks, a, np.asarray(by_point.T @ J.error))
 
     def covariance(self, state: DriveState, scale: float, prior: Array) -> Array:
@@ -175,14 +168,12 @@ class DriveProblem:
         """Return the derivative (M, 2, P) of the pixels by the rig's steps."""
         parameters, camera = self.parameters, self.observations.camera
         J = np.zeros((len(camera), 2, len(state.steps)))
-        if self.held:
-            return J
         in_rig = self.in_rig(state, state.steps)
         for k, step in enumerate(STEP * np.eye(len(state.steps))):
             moved = [side for side in (0, 1) if parameters.moves_camera(side)[k]]
             at, is_time = np.flatnonzero(np.isin(camera, moved)), parameters.names[k] in parameters.times
             ahead, behind = (
-                self.cast(steps, camera[at], self.in_rig(state, steps)[at] if is_time else in_rig[at])
+                self.caster(steps, camera[at])(self.in_rig(state, steps)[at] if is_time else in_rig[at])
                 for steps in (state.steps + step, state.steps - step)
             )
             J[at, :, k] = np.nan_to_num((ahead - behind) / (2 * STEP))
