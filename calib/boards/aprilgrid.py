@@ -25,8 +25,6 @@ from calib.models.camera import Array
 
 # Corners (4, 2) [px] of tags by number, in the order of cv2.aruco.
 Tags = dict[int, Array]
-# Least and largest space between two tags, in parts of a tag.
-MIN_SPACING, MAX_SPACING = 0.05, 1.0
 # Tags as in Kalibr: number of those of the family 36h11, width of the border [bits], bits along a side within it.
 TAGS, TAG_BORDER_BITS, TAG_BITS = 587, 2, 6
 # Tag 0 of the family 36h11 (Olson 2011): row by row, the most significant bit at the upper left, 1 is light.
@@ -41,14 +39,12 @@ MIN_PERIMETER_PART, PIXELS_PER_BIT = 0.015, 6
 NEIGHBOUR_SIDES, MAX_OFF_PART = 3.2, 0.45
 # One tag alone may be misread; so many that lie as on the board are not.
 MIN_TAGS, SURE_TAGS = 2, 6
-ENOUGH_PART = 0.9
 # A predicted corner may move by a part of its square and pixels.
 MAX_MOVE, MAX_MOVE_PX = 0.12, 1.5
 # Radius of the ring about a corner, in parts of the window, and least radius [px].
 RING_PART, MIN_RING_PX = 1.2, 1.8
 # Half side of the window of the first refinement [px]; a smaller one has fewer than nine pixels, too few.
 MIN_WINDOW_PX = 1.5
-ROUNDS = 12  # enough: the boards of test_aprilgrid.py take 2 to 4
 # Least quality of a corner's ring, because the edge of what hides the board crosses others.
 MIN_QUALITY = 0.6
 # Least number of corners, and how far they lie off one line (ratio of the standard deviations), because fewer, or those
@@ -76,10 +72,10 @@ class AprilGrid:
             )
         if not MIN_SQUARE_M <= self.tag_m <= MAX_SQUARE_M:
             raise CalibError(f"board: expected tags of 0.1 mm to 10 m, found {self.tag_m * 1e3:g} mm")
-        if not MIN_SPACING <= self.spacing <= MAX_SPACING:
+        if not 0 < self.spacing <= 1:
             raise CalibError(
-                f"board: expected a space between tags of {MIN_SPACING:g} to {MAX_SPACING:g} of a tag's "
-                f"side, like Kalibr's tagSpacing, found {self.spacing:g}"
+                "board: expected a space between tags of at most a tag's side, like Kalibr's tagSpacing, found "
+                f"{self.spacing:g}"
             )
 
     @property
@@ -156,9 +152,8 @@ def _read_tags(image: Image, on_board: Array, *, thorough: bool) -> Tags:
             best[reflected] = consistent_tags({**found, **best[reflected]}, on_board)
             gained |= len(best[reflected]) > mine
         most = max(map(len, best.values()))
-        # The corners of a few tags that are missing are predicted by the others. Where a derived image shows no further
-        # tag of a grid that is well seen, the next one does not either.
-        is_enough = most >= ENOUGH_PART * len(on_board) or (number and not gained)
+        # Where a derived image shows no further tag of a grid that is well seen, the next one does not either.
+        is_enough = most == len(on_board) or (number and not gained)
         if not thorough or (most >= min(SURE_TAGS, len(on_board)) and is_enough):
             break
     found = max(best.values(), key=len)
@@ -238,7 +233,7 @@ def _grown(image: Grey, points: Array, places: Array, outlines: Array, window: f
     pixels = np.full(points.shape, np.nan)
     at, where = places, outlines
     refused = np.zeros(len(points), bool)
-    for _ in range(ROUNDS):
+    while True:
         tried = np.flatnonzero(np.isnan(pixels[:, 0]) & ~refused)
         mappings = {int(k): mapping for k in tried if (mapping := local_mapping(points[k], at, where)) is not None}
         if not mappings:

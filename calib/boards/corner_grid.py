@@ -28,8 +28,6 @@ MIN_RING_PX = 2.0
 MIN_SPACING_PX = 3
 # Least contrast of a predicted corner, in parts of the grid's median contrast.
 MIN_CONTRAST_PART = 0.25
-# Corners of which that median is taken, because measuring all of them takes long on a wall full of corners.
-CONTRAST_CELLS = 64
 # cv2.cornerSubPix: half window in parts of the corner spacing, and its limits.
 WINDOW_PART, MIN_WINDOW_PX, MAX_WINDOW_PX = 0.3, 2, 15
 # Its iterations and convergence, as in OpenCV's tutorial of it.
@@ -177,10 +175,9 @@ def _accept_predicted(image: Grey, grid: Grid, guesses: Grid, contrast: float) -
 
 
 def _usual_contrast(image: Grey, grid: Grid) -> float:
-    """Return the median contrast of the grid's corners, of some evenly chosen ones if there are many."""
-    cells = list(grid)[:: -(-len(grid) // CONTRAST_CELLS)]
-    rings = np.array([max(MIN_RING_PX, RING_PART * spacing(grid, cell)) for cell in cells])
-    return float(np.median(describe_corners(image, np.array([grid[cell] for cell in cells]), rings).contrast))
+    """Return the median contrast of the grid's corners."""
+    rings = np.array([max(MIN_RING_PX, RING_PART * spacing(grid, cell)) for cell in grid])
+    return float(np.median(describe_corners(image, np.array(list(grid.values())), rings).contrast))
 
 
 def refine_subpixel(image: Grey, pixels: Array, sizes: Array) -> Array:

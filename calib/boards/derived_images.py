@@ -19,8 +19,6 @@ MAX_ENLARGED_PIXELS = 1_600_000
 MAX_STRIP_PX, STRIP_TURNS = 2400, 1.3
 # Inner radius of a log-polar strip, in parts of the image's smaller side.
 STRIP_INNER_PART = 1 / 16
-# Outer radius, in parts of the larger side, because the border is there.
-STRIP_OUTER_PART = 1 / 2
 # Contrast limited adaptive histogram equalisation (CLAHE): clip limit, and number of tiles along each axis.
 CLAHE_CLIP_LIMIT, CLAHE_TILES = 4.0, 8
 
@@ -65,7 +63,7 @@ def unrolled(image: Image) -> DerivedImage:
 
 def _strip_scale(shape: tuple[int, int]) -> tuple[float, float, float]:
     """Return inner and outer radius [px] of a strip, and its pixels per radian; shape: (H, W) of the image."""
-    inner, outer = min(shape) * STRIP_INNER_PART, max(shape) * STRIP_OUTER_PART
+    inner, outer = min(shape) * STRIP_INNER_PART, max(shape) / 2
     return inner, outer, min(MAX_STRIP_PX, 2 * np.pi * outer) / (2 * np.pi)
 
 

@@ -83,14 +83,15 @@ class Problem(Protocol[State]):
 
 @dataclass(frozen=True, slots=True)
 class Ending:
-    """End of a search: after `steps`, or with a step of less than the relative gain, damped by less than `damping`.
+    """End of a search: with a step of less than the relative gain, damped by less than `damping`, or after `steps`.
 
-    A damped step follows the steep directions only: where flat ones count, the last step needs little damping.
+    A damped step follows the steep directions only: where flat ones count, the last step needs little damping. The
+    number of steps is a bound that is never reached by good data.
     """
 
-    steps: int
     gain: float
     damping: float = np.inf
+    steps: int = 60
 
 
 def minimise(problem: Problem[State], state: State, ending: Ending, damping: float = START_DAMPING) -> State:

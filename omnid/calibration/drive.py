@@ -39,9 +39,9 @@ from omnid.errors import OmnidError
 
 Array = NDArray[np.float64]
 
-# Rounds at least and at most: the second one tracks in panoramas that the rig of the first one has straightened. More
-# rounds follow while lengths still change.
-ROUNDS, MAX_ROUNDS = 2, 4
+# Most rounds: the second one tracks in panoramas that the rig of the first one has straightened. More follow while
+# lengths still change.
+MAX_ROUNDS = 4
 # Relative change of lengths in a round below which no further round is needed: a third of the scale's sigma after a
 # drive (0.3 % in rendered rooms).
 SETTLED = 1e-3
@@ -77,37 +77,33 @@ class DriveCalibration:
     drives: Drives
 
     def __str__(self) -> str:
-        uncertainty = drive_uncertainty(self.rig)
+        uncertainty, adjustment = drive_uncertainty(self.rig), self.adjustment
         return (
-            f"{'MISFIT: ' if self.is_misfit else ''}error {self.first_sigma_px:.3f} px before, "
-            f"{self.adjustment.sigma_px:.3f} px after, {self.drives.keyframes} keyframes, "
-            f"{len(self.adjustment.state.points)} landmarks, lengths change by {100 * self.scale_change:+.3f} %"
-            + (f"; drives: {uncertainty}" if uncertainty else "")
+            f"{'MISFIT: the residuals are not noise. ' if self.is_misfit else ''}{self.drives.keyframes} keyframes, "
+            f"{len(adjustment.state.points)} landmarks, {len(adjustment.observations)} observations; error "
+            f"{self.first_sigma_px:.3f} px before, {adjustment.sigma_px:.3f} px after, lengths change by "
+            f"{100 * self.scale_change:+.3f} %" + (f"; drives: {uncertainty}" if uncertainty else "")
         )
 
     def lines(self) -> list[str]:
         """Return the result as lines: errors before and after, change of lengths, each parameter with its sigma."""
         adjustment, parameters = self.adjustment, self.adjustment.parameters
-        uncertainty = drive_uncertainty(self.rig)
         lines = [
-            f"{'MISFIT: the residuals are not noise. ' if self.is_misfit else ''}{self.drives.keyframes} keyframes, "
-            f"{len(adjustment.state.points)} landmarks, {len(adjustment.observations)} observations; error "
-            f"{self.first_sigma_px:.3f} px before, {adjustment.sigma_px:.3f} px after",
+            str(self),
             *(f"{side}: {structure}" for side, structure in zip(SIDES, self.structure, strict=True)),
-            f"lengths change by {100 * self.scale_change:+.3f} %" + (f"; {uncertainty}" if uncertainty else ""),
             f"{'parameter':<14}{'before':>14}{'after':>14}{'sigma':>11}",
         ]
         after = parameters.values + adjustment.state.steps * parameters.units
         sigmas = adjustment.sigmas * parameters.units
         rows = zip(parameters.names, parameters.values, after, sigmas, adjustment.seen.tolist(), strict=True)
         for name, old, new, sigma, seen in rows:
-            unseen = "" if seen else "  the drive does not show it"
+            unseen = "" if seen else "  the drive does not show it: it stays near its start"
             lines.append(f"{name:<14}{old:>14.5f}{new:>14.5f}{sigma:>11.5f}{unseen}")
-        if not np.all(adjustment.seen):
-            lines.append("parameters that the drive does not show stay near their start")
-        if self.times:
-            times = ", ".join(f"{name} {value:.3g}" for name, value in self.times)
-            lines.append(f"times of exposure: {times}: in the table [times] of the file, where runs read them")
+        if (times := self.rig.times) != ShutterTimes():
+            lines.append(
+                f"times of exposure: upper delay {1e3 * times.upper_delay_s:.3g} ms, line time "
+                f"{1e6 * times.line_time_s:.3g} us: in the table [times] of the file, where runs read them"
+            )
         if self.level_rad:
             lines.append(
                 f"the rig frame was turned by {np.rad2deg(self.level_rad):.2f} deg, so that the drive lies in "
@@ -124,12 +120,6 @@ class DriveCalibration:
     def is_misfit(self) -> bool:
         """True if the model leaves more than the noise explains."""
         return any(structure.is_misfit for structure in self.structure)
-
-    @property
-    def times(self) -> list[tuple[str, float]]:
-        """Names and values of the rig's times of exposure that differ from none."""
-        values = {UPPER_DELAY: 1e3 * self.rig.times.upper_delay_s, LINE_TIME: 1e6 * self.rig.times.line_time_s}
-        return [(name, value) for name, value in values.items() if value]
 
     @property
     def distance_m(self) -> float:
@@ -249,7 +239,7 @@ def _in_rounds(
             f"round {number}: {len(drives.observations)} observations from {drives.keyframes} keyframes, error "
             f"{found.sigma_px:.3f} px, lengths {100 * moved:+.3f} %"
         )
-        if number >= ROUNDS and abs(moved) < SETTLED:
+        if number > 1 and abs(moved) < SETTLED:
             break
     return found, drives
 
@@ -374,17 +364,7 @@ MAX_CHANGE_SIGMAS = 4.0
 
 
 def require_same_rig(parameters: RigParameters, steps: Array, *, tracked: bool = True) -> None:
-    """Raise OmnidError where the drive asks for another rig than the one given; tracked: as of `different_rig`."""
-    reason = different_rig(parameters, steps, tracked=tracked)
-    if reason:
-        raise OmnidError(
-            f"calibrate drive: {reason}; is the rig that of these cameras? Nothing is written for another "
-            "one: start from its own or nominal rig"
-        )
-
-
-def different_rig(parameters: RigParameters, steps: Array, *, tracked: bool = True) -> str:
-    """Return by which a rig after steps (P,) is not the one of the parameters; empty where it may be.
+    """Raise OmnidError where the drive asks for another rig, after steps (P,), than the one of the parameters.
 
     tracked: False before the motion is known: an upper camera that is exposed late then appears shifted.
     """
@@ -392,19 +372,24 @@ def different_rig(parameters: RigParameters, steps: Array, *, tracked: bool = Tr
     change = (steps * parameters.units)[first : len(parameters.rig_names)]
     turn, lean = float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:])) if tracked else 0.0
     limit = MAX_NOMINAL_TURN_RAD if is_nominal(parameters.rig) else MAX_TURN_RAD
+    away = np.abs(steps / parameters.nominal_sigmas)[:first]
+    worst = int(np.argmax(away))
     if max(turn, lean) > limit:
-        return (
+        reason = (
             f"the upper camera is turned by {np.rad2deg(turn):.1f} deg and its baseline by {np.rad2deg(lean):.1f} deg "
             f"against the rig's file, expected {np.rad2deg(limit):.1f} deg at most"
         )
-    away = np.abs(steps / parameters.nominal_sigmas)[:first]
-    worst = int(np.argmax(away))
-    if away[worst] <= MAX_CHANGE_SIGMAS:
-        return ""
-    old, new = parameters.values[worst], (parameters.values + steps * parameters.units)[worst]
-    return (
-        f"{parameters.names[worst]} would change from {old:.5g} to {new:.5g}, more than another calibration of the "
-        "same camera and mirror"
+    elif away[worst] > MAX_CHANGE_SIGMAS:
+        old, new = parameters.values[worst], (parameters.values + steps * parameters.units)[worst]
+        reason = (
+            f"{parameters.names[worst]} would change from {old:.5g} to {new:.5g}, more than another calibration of the "
+            "same camera and mirror"
+        )
+    else:
+        return
+    raise OmnidError(
+        f"calibrate drive: {reason}; is the rig that of these cameras? Nothing is written for another "
+        "one: start from its own or nominal rig"
     )
 
 

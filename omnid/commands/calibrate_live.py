@@ -65,14 +65,17 @@ def run(args: argparse.Namespace) -> int:
         closing.callback(boards.close)
         number = _taken_before(args.images, boards)
         pairs = _of_log(args) if args.log else _of_cameras(config, closing)
-        show = _Progress(boards, _bus(config, closing))
+        bus, published_s = _bus(config, closing), -PUBLISH_S
         with suppress(KeyboardInterrupt):
             for pair in pairs:
                 outcome = boards.process(pair, need_still=args.log is None)
                 if outcome == "kept" and args.images is not None:
                     number += 1
                     _write(args.images, number, pair)
-                show(outcome)
+                _show(boards, outcome)
+                if bus is not None and time.monotonic() >= published_s + PUBLISH_S:
+                    published_s = time.monotonic()
+                    _publish(bus, boards, outcome)
     return _finish(args, boards)
 
 
@@ -132,31 +135,24 @@ def _bus(config: Config, closing: ExitStack) -> Bus | None:
     return bus
 
 
-class _Progress:
-    """Shows the newest outcome: one line on a terminal, which the next one replaces, else one for each kept pair."""
+def _show(boards: LiveBoards, outcome: PairOutcome) -> None:
+    """Print the newest outcome: one line on a terminal, which the next one replaces, else one for each kept pair."""
+    missing = "; ".join(boards.missing()) or "enough"
+    if sys.stdout.isatty():
+        width = shutil.get_terminal_size().columns - 1
+        print("\r" + f"{boards.pairs} ({outcome}): {missing}"[:width].ljust(width), end="", flush=True)
+    elif outcome == "kept":
+        print(f"{boards.pairs}: {missing}", flush=True)
 
-    def __init__(self, boards: LiveBoards, bus: Bus | None) -> None:
-        self._boards, self._bus = boards, bus
-        self._published_s = -PUBLISH_S
 
-    def __call__(self, outcome: PairOutcome) -> None:
-        missing = "; ".join(self._boards.missing()) or "enough"
-        if sys.stdout.isatty():
-            width = shutil.get_terminal_size().columns - 1
-            print("\r" + f"{self._boards.pairs} ({outcome}): {missing}"[:width].ljust(width), end="", flush=True)
-        elif outcome == "kept":
-            print(f"{self._boards.pairs}: {missing}", flush=True)
-        if self._bus is not None and time.monotonic() >= self._published_s + PUBLISH_S:
-            self._publish(self._bus, outcome)
+def _publish(bus: Bus, boards: LiveBoards, outcome: PairOutcome) -> None:
+    """Send the newest outcome to the page."""
+    from omnid.calibration.live_boards import status
+    from omnid.transport.codec import diagnostics_cdr
 
-    def _publish(self, bus: Bus, outcome: PairOutcome) -> None:
-        from omnid.calibration.live_boards import status
-        from omnid.transport.codec import diagnostics_cdr
-
-        self._published_s = time.monotonic()
-        if bus.needs_router:
-            bus.connect()
-        bus.publish("status", diagnostics_cdr(time.time_ns(), [status(self._boards, outcome)]))
+    if bus.needs_router:
+        bus.connect()
+    bus.publish("status", diagnostics_cdr(time.time_ns(), [status(boards, outcome)]))
 
 
 def _write(folder: Path, number: int, pair: tuple[Image, Image]) -> None:

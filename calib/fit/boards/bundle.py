@@ -21,7 +21,7 @@ from calib.fit.boards.mirror_prior import mirror_residuals
 from calib.fit.boards.smooth_misfit import covariance_with_misfit, smooth_fields
 from calib.fit.least_squares import DAMPING_FACTOR, START_DAMPING, ArrowSystem, Ending, minimise
 from calib.fit.parameters import stepped, units_of
-from calib.fit.robust_scale import robust_sigma
+from calib.fit.robust_scale import LOST_PX, robust_sigma
 from calib.models.camera import Array
 from calib.models.derivatives import pixel_derivatives
 from calib.models.names import values_of
@@ -39,17 +39,13 @@ SHRUNK: Final = ("a6", "a8", *ASTIGMATISM_NAMES)
 SHRUNK_SIGMAS: Final = np.array([0.1, 0.1, 1.0, 1.0])
 TWIST_NAMES: Final = ("t_x", "t_y", "t_z", "r_x", "r_y", "r_z")
 # A damped step hardly moves along a flat direction: so the search ends only with a nearly undamped step that lowers the
-# cost in its ninth digit. The number of steps is a bound that is never reached by good data.
-ENDING: Final = Ending(steps=60, gain=1e-9, damping=1e-7)
+# cost in its ninth digit.
+ENDING: Final = Ending(gain=1e-9, damping=1e-7)
 # Number of optimisations, each with the kernel's width estimated again, because the width depends on the residuals and
 # these on the width.
 KERNEL_ROUNDS: Final = 3
 # Width of Huber's kernel in standard deviations of one coordinate, because 1 of 23 normal residuals (2-D) is longer.
 HUBER_WIDTH: Final = 2.5
-# Least standard deviation assumed for a coordinate: exact corners would make the kernel's width 0.
-MIN_SIGMA_PX: Final = 0.02
-# Residual of a corner that the model cannot project: larger than any residual of a corner in the image.
-LOST_PX: Final = 300.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +117,7 @@ def fit_boards(start: BoardRig, pixels: Array, board: CalibrationBoard, *, telec
     state = problem.state(start)
     sigma, damping = np.inf, START_DAMPING
     for _ in range(KERNEL_ROUNDS):
-        sigma = min(sigma, robust_sigma(state.residuals, MIN_SIGMA_PX))
+        sigma = min(sigma, robust_sigma(state.residuals))
         problem = replace(problem, kernel_px=HUBER_WIDTH * sigma)
         state = minimise(problem, state, ENDING, damping)
         damping = min(START_DAMPING, ENDING.damping / DAMPING_FACTOR)  # the next one begins next to its minimum

@@ -30,9 +30,8 @@ MAX_SIGMA_PX = 1.0
 LOOSE_LANDMARK, LOOSE_OBSERVATION = 2.0, 6.0
 # Loose landmarks are left out in several rounds, because the rig moves without them, and others become loose.
 SELECTIONS = 3
-# A search ends after this number of steps, or where a step reduces the cost by less than a share of it: the rough one
-# while landmarks are still selected, because the search goes on with the next selection, the fine one at the end.
-MAX_STEPS = 30
+# A search ends where a step reduces the cost by less than a share of it: the rough one while landmarks are still
+# selected, because the search goes on with the next selection, the fine one at the end.
 ROUGH_GAIN, FINE_GAIN = 1e-3, 1e-6
 # Information of parameters that stay.
 HELD = 1e12
@@ -144,7 +143,7 @@ def observation_sigma(rig: Rig, found: DriveAdjustment, fixed: Sequence[int] = (
 
 def _minimised(problem: DriveProblem, state: DriveState, gain: float) -> tuple[DriveState, float]:
     """Return the state of least cost, and the standard deviation [px] of one coordinate there."""
-    found = minimise(problem, state, Ending(MAX_STEPS, gain))
+    found = minimise(problem, state, Ending(gain))
     return found, problem.scale(found)
 
 

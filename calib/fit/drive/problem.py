@@ -13,7 +13,7 @@ from calib.errors import CalibError
 from calib.fit.drive.observations import DriveObservations, DriveState, Indices, project
 from calib.fit.drive.rig_parameters import RigParameters
 from calib.fit.least_squares import ArrowSystem
-from calib.fit.robust_scale import robust_sigma
+from calib.fit.robust_scale import LOST_PX, robust_sigma
 from calib.models.camera import Array
 
 # Step of numeric derivatives, in steps of a parameter (about a pixel each) or in parts of a point's distance: a model
@@ -21,11 +21,6 @@ from calib.models.camera import Array
 STEP = 1e-4
 # Cauchy's function counts errors of more sigmas less, so that one of 3 sigmas has half of the weight.
 KERNEL = 3.0
-# Error of an observation whose point the model does not project: far outside of Cauchy's kernel, because observations
-# whose sigma exceeds a pixel are refused.
-LOST_PX = 50.0
-# Least standard deviation of a coordinate: exact observations would make the kernel's width 0.
-MIN_SIGMA_PX = 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +79,7 @@ class DriveProblem:
 
     def scale(self, state: DriveState) -> float:
         """Return the standard deviation [px] of one coordinate, by the median."""
-        return robust_sigma(self.residuals(state), MIN_SIGMA_PX)
+        return robust_sigma(self.residuals(state))
 
     def moved(self, state: DriveState, common: Array, blocks: Array) -> DriveState | None:
         """Return the state after steps of poses and rig (C,) and of landmarks (L, 3); None without such a camera."""
