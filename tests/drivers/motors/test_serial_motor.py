@@ -17,7 +17,7 @@ import pytest
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, stop_command
 from drivers.motors.protocols.differential_drive import DifferentialDrive
-from drivers.motors.protocols.line_protocol import LineProtocol, encode, velocity_line
+from drivers.motors.protocols.line_protocol import LineProtocol, encode
 from drivers.motors.protocols.motor_protocol import NoReplyError, T, Transaction
 from drivers.motors.serial_motor import SerialMotor
 from drivers.motors.simulated.simulated_controllers import SimulatedLine
@@ -26,13 +26,6 @@ from tests.contract.pty_motor import PtyMotor
 PATIENCE_S = 20.0  # bounds a wait on a loaded machine; not a measured limit
 REPLY_S = 2.0
 OTHER_ID = 65534  # user and group without rights
-
-
-def drive(state: SimulatedLine, seconds: float, command: VelocityCommand) -> None:
-    """Send a command at 20 Hz."""
-    for _ in range(round(seconds * 20)):
-        assert state.feed(velocity_line(state.base.commands, command))
-        state.base.advance(0.05)
 
 
 def until(condition: Callable[[], bool]) -> bool:
@@ -46,35 +39,6 @@ def until(condition: Callable[[], bool]) -> bool:
 def simulated() -> Iterator[PtyMotor]:
     with contextlib.closing(PtyMotor()) as simulated:
         yield simulated
-
-
-# The simulated controller
-
-
-@pytest.mark.parametrize("heading_rad", [1.0, -2.0, 3.1, -3.1])
-def test_steers_to_the_heading(heading_rad: float) -> None:
-    state = SimulatedLine()
-    drive(state, 6.0, VelocityCommand(0, 0.2, heading_rad, 0.0))
-    assert state.base.pose[2] == pytest.approx(heading_rad, abs=0.01)
-
-
-def test_turns_the_short_way_across_half_a_turn() -> None:
-    state = SimulatedLine()
-    drive(state, 6.0, VelocityCommand(0, 0.2, 3.0, 0.0))
-    before, turned = state.base.pose[2], 0.0
-    for _ in range(40):
-        drive(state, 0.05, VelocityCommand(0, 0.2, -3.0, 0.0))
-        turned += math.remainder(state.base.pose[2] - before, math.tau)
-        before = state.base.pose[2]
-    assert turned == pytest.approx(math.tau - 6.0, abs=0.05)
-
-
-def test_a_command_after_a_gap_in_seq_is_an_error_but_carried_out() -> None:
-    state = SimulatedLine()
-    command = VelocityCommand(0, 0.2, 0.0, 0.0)
-    for seq, sent in ((65535, stop_command(0)), (0, stop_command(0)), (2, command)):
-        assert state.feed(velocity_line(seq, sent))
-    assert state.base.errors == 1 and state.base.last_command.velocity_mps == command.velocity_mps
 
 
 # The serial motor and the simulated controller over a pty
