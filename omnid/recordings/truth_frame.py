@@ -39,10 +39,6 @@ GRID_SAMPLES, MAX_GRID_SAMPLES = 2048, 1 << 17
 LEAST_SIGMA: Final = 1e-6  # [m, rad] Residuals of exact poses count as this.
 
 
-def _as_written(T: Array) -> Array:
-    return T
-
-
 def _with_w_first(T: Array) -> Array:
     """Return poses whose quaternions were read as x y z w, and are w x y z."""
     w_xyz = se3.quaternion(T[:, :3, :3])
@@ -55,7 +51,7 @@ def _with_inverse_rotations(T: Array) -> Array:
 
 # How a file may be written, in words, and the poses T_world_body of the poses as they were read.
 READINGS: Final[dict[str, Callable[[Array], Array]]] = {
-    "": _as_written,
+    "": lambda T: T,
     "its quaternions begin with w": _with_w_first,
     "its poses are inverse (T_body_world)": se3.inverse,
     "its rotations are inverse (conjugated quaternions)": _with_inverse_rotations,
@@ -133,10 +129,18 @@ class _Way:
         return (self.reading != "") + (self.unit != "m") + self.has_delay + self.is_turned + self.has_lever
 
     def fit(self, estimate: Trajectory) -> tuple[float, TruthFrame]:
-        """Return the error that is left, and the difference."""
+        """Return the error that is left, see `_shown_error`, and the difference; infinite where nothing is fitted."""
         free = np.repeat([True, self.has_lever, self.is_turned, self.has_delay], [6, 3, 3, 1])
-        fit = _fitted(estimate, self.read, (self.delay_s, self.unit), free)
-        return (np.inf, TruthFrame()) if fit is None else (fit[0], TruthFrame(self.reading, self.unit, *fit[1]))
+        T = self.read.T.copy()
+        T[:, :3, 3] /= UNITS[self.unit]
+        truth = Trajectory(self.read.stamps_ns, T)
+        pair = _common(estimate, truth, self.delay_s)
+        if pair is None:
+            return np.inf, TruthFrame()
+        starts = _starts(pair) if self.is_turned else [np.eye(4)]
+        fits = [_gauss_newton(estimate, truth, self.delay_s, T_rig_body, free) for T_rig_body in starts]
+        error, found = min((fit for fit in fits if fit), key=lambda fit: fit[0], default=(np.inf, None))
+        return error, TruthFrame() if found is None else TruthFrame(self.reading, self.unit, *found)
 
 
 def find_truth_frame(estimate: Trajectory, truth: Trajectory) -> TruthFrame | None:
@@ -194,7 +198,7 @@ def _is_shown_by_halves(estimate: Trajectory, truth: Trajectory, way: _Way) -> b
 
 
 def _error(estimate: Trajectory, truth: Trajectory) -> float:
-    """Return the error that `omnid eval` shows; see `_fitted`; infinite without poses at the same times."""
+    """Return the error that `omnid eval` shows, see `_shown_error`; infinite without poses at the same times."""
     pair = _common(estimate, truth, 0.0)
     return np.inf if pair is None else _shown_error(pair, np.eye(4))
 
@@ -296,27 +300,6 @@ def _correlation(theirs: Array, ours: Array, overlap: Array) -> Array:
     return np.where(product > least, found, 0.0)
 
 
-def _fitted(
-    estimate: Trajectory, truth: Trajectory, start: tuple[float, str], free: NDArray[np.bool_]
-) -> tuple[float, tuple[float, Array | None, int, str]] | None:
-    """Return the error that is left, and delay, T_rig_body, number of fitted unknowns and unknown axes.
-
-    The error is what `omnid eval` shows: of poses of which the first ones agree, that of the positions in parts of
-    the larger of both spreads, plus that of the rotations [rad]. start: delay [s] and unit. free (13,): the unknowns
-    that are fitted: T_truth_odom, lever arm and rotation of T_rig_body, delay.
-    """
-    delay_s, unit = start
-    T = truth.T.copy()
-    T[:, :3, 3] /= UNITS[unit]
-    truth = Trajectory(truth.stamps_ns, T)
-    pair = _common(estimate, truth, delay_s)
-    if pair is None:
-        return None
-    starts = _starts(pair) if free[9:12].any() else [np.eye(4)]
-    fits = [_gauss_newton(estimate, truth, delay_s, T_rig_body, free) for T_rig_body in starts]
-    return min((fit for fit in fits if fit is not None), key=lambda one: one[0], default=None)
-
-
 def _starts(pair: _Pair) -> list[Array]:
     """Return start values of T_rig_body: none, and its rotation by the positions or by the rotations of the path."""
     starts = [np.eye(4)]
@@ -346,7 +329,10 @@ def _rotation_between(a: Array, b: Array) -> Array:
 def _gauss_newton(
     estimate: Trajectory, truth: Trajectory, delay_s: float, T_rig_body: Array, free: NDArray[np.bool_]
 ) -> tuple[float, tuple[float, Array | None, int, str]] | None:
-    """Fit the free unknowns; see `_fitted`."""
+    """Return the error that is left, and delay, T_rig_body, number of fitted unknowns and unknown axes.
+
+    free (13,): the unknowns that are fitted: T_truth_odom, lever arm and rotation of T_rig_body, delay.
+    """
     pair = _common(estimate, truth, delay_s)
     if pair is None:
         return None
@@ -391,7 +377,10 @@ def _gauss_newton(
 
 
 def _shown_error(pair: _Pair, T_rig_body: Array) -> float:
-    """Return the error that `omnid eval` shows; see `_fitted`."""
+    """Return the error that `omnid eval` shows, of poses of which the first ones agree.
+
+    It is that of the positions in parts of the larger of both spreads, plus that of the rotations [rad].
+    """
     T_true = pair.T_truth_body @ se3.inverse(T_rig_body)
     off = se3.inverse(T_true) @ T_true[0] @ se3.inverse(pair.T_odom_rig[0]) @ pair.T_odom_rig
     spread_m = max(*(_spread(T) for T in (T_true, pair.T_odom_rig)), LEAST_SIGMA)
