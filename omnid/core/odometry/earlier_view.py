@@ -54,8 +54,6 @@ def contradicted(
         seen -= earlier.exposure.shift(there).lower
     seen[:, 0] = earlier.lower.padded(seen[:, 0])
     # 2. The hypotheses, where it did.
-    now, before, usable = lower.image, earlier.lower.image, np.ascontiguousarray(earlier.usable)
-    (height, width), pad_px, turn_px = now.shape, lower.pad_px, cylinder.turn_px
-    wrong = np.empty(len(points), bool)
-    compare(now.reshape(-1), before.reshape(-1), height, width, pixels, seen, usable, pad_px, turn_px, LEAST, wrong)
+    wrong, usable = np.empty(len(points), bool), np.ascontiguousarray(earlier.usable)
+    compare(lower.image, earlier.lower.image, pixels, seen, usable, lower.pad_px, cylinder.turn_px, LEAST, wrong)
     return wrong
