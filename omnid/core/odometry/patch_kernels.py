@@ -1,6 +1,8 @@
-"""Compiled part of the fit of patches: see patch_fit.py for the equations and the meaning of the arguments."""
+"""Compiled part of the patches of planes: see plane_patches.py for the equations and the meaning of the arguments."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +15,8 @@ Image = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
-WINDOW_PX = 13  # Side of a patch, at most LANES.
-PIXELS = WINDOW_PX * WINDOW_PX
-# Enough: 98 % of the patches of test_patch_fit.py end before; a last step is below the hundredths that noise leaves.
+# Enough: 98 % of the patches of test_plane_patches.py end before; a last step is below the hundredths that noise
+# leaves.
 ITERATIONS, CONVERGED_PX = 12, 0.004
 # Scatter of the gains of the patches of an image, by vignetting and slanted light.
 GAIN_SIGMA = 0.05
@@ -28,292 +29,275 @@ MIN_DETERMINANT = 1e-3
 NOISE_CORRELATION = 3.0
 # Variance of a gradient of the panorama's noise per variance of the noise, which enlarges the gradients' matrix.
 GRADIENT_NOISE = 0.12
+MIDDLE_GREY = np.float32(128)  # is subtracted, so that sums of float32 lose less
 MIN_TRUE_GRADIENT = 0.2  # least share of the gradients' matrix that counts as texture.
-MIDDLE_GREY = np.float32(128.0)  # Subtracted from grey levels, so that float32 loses less.
-# Weights of Scharr's operator, as in OpenCV's Scharr.
-SIDE_WEIGHT, INNER_WEIGHT = np.float32(3 / 32), np.float32(10 / 32)
-# Columns of a row of a window in memory: a multiple of what the processor adds at once. Those beyond the window hold
-# zeros in the design. Sums are kept by column until the last row, so that their order is fixed.
-LANES = 16
-# So many because a design has three parts, gradients along column and row and greys; a line of a template has a border
-# on each side.
-PART, LINE = WINDOW_PX * LANES, LANES + 2
-
-ZERO = np.float32(0.0)
-FARTHEST_PX = 1e6  # more than the columns and rows of any panorama
 
 
 @compiled(
-    "(u1[:, :, ::1], u1[:, :, ::1], i8[:], f8, f8[:, ::1], f8[:, :, ::1], b1[::1])",
-    writes=("shift", "covariance", "fits"),
+    "(u1[:, ::1], i8[::1], f8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8, f4[:, :, ::1])", writes=("templates",)
+)
+def sample(
+    image: Image,
+    chosen: Indices,
+    centres: Array,
+    H: Array,
+    heights: Array,
+    shift: Array,
+    focal_px: float,
+    templates: Floats,
+) -> None:
+    """Write the templates (N, T, T) of the chosen patches, whose image this is.
+
+    centres (N, 2) [px] in the image; H (N, 3, 3): see `plane_patches.homographies`; heights (N, 2): z / r of the
+    patches in the image and in the current panorama; shift (N, 2) [px] of the templates' middle pixels from the centres
+    there. A template of which the plane explains a part alone is not bent.
+    """
+    side, half = templates.shape[1], templates.shape[1] // 2
+    columns, rows, rays = np.empty((side, side)), np.empty((side, side)), np.empty((3, side))
+    for n in chosen:
+        for j in range(side):
+            # Azimuth falls from column to column.
+            azimuth = (half - j - shift[n, 0]) / focal_px
+            c, s = math.cos(azimuth), math.sin(azimuth)
+            for a in range(3):
+                rays[a, j] = H[n, a, 0] * c + H[n, a, 1] * s
+        outside = 0
+        for i in range(side):
+            h = heights[n, 1] - (i - half + shift[n, 1]) / focal_px
+            x, y, z = H[n, 0, 2] * h, H[n, 1, 2] * h, H[n, 2, 2] * h
+            for j in range(side):
+                per_ahead = 1 / (rays[0, j] + x)
+                tangent = (rays[1, j] + y) * per_ahead
+                square = tangent * tangent
+                # The arctangent is its series: of 15 degrees it is exact to 1e-7 rad, and a patch is smaller.
+                arc = tangent * (1 - square * (1 / 3 - square * (1 / 5 - square * (1 / 7 - square / 9))))
+                down = focal_px * (heights[n, 0] - (rays[2, j] + z) * per_ahead / math.sqrt(1 + square))
+                columns[i, j], rows[i, j] = -focal_px * arc, down
+                is_inside = (per_ahead > 0) & (abs(focal_px * arc) < 2 * side) & (abs(down) < 2 * side)  # false for NaN
+                outside += not is_inside
+        for i in range(side):
+            for j in range(side):
+                across, down = columns[i, j], rows[i, j]
+                if outside:
+                    across, down = j - half + shift[n, 0], i - half + shift[n, 1]
+                templates[n, i, j] = cubic(image, centres[n, 0] + across, centres[n, 1] + down)
+
+
+@inner
+def cubic(image: Image, x: float, y: float) -> float:
+    """Return the grey between pixels by cubic convolution (Keys 1981, a = -1/2); the border is repeated.
+
+    Bilinear interpolation shifts fine texture by up to 0.02 px, depending on the place between the pixels.
+    """
+    (height, width), left, top = image.shape, math.floor(x), math.floor(y)
+    u, v = x - left, y - top
+    p, q = 1 - u, 1 - v
+    a, d = -0.5 * u * p * p, -0.5 * p * u * u
+    b, c = 1 + u * u * (1.5 * u - 2.5), 1 + p * p * (1.5 * p - 2.5)
+    left, before, right, after = (
+        within(left, width),
+        within(left - 1, width),
+        within(left + 1, width),
+        within(left + 2, width),
+    )
+    grey = 0.0
+    for k, weight in enumerate(
+        (-0.5 * v * q * q, 1 + v * v * (1.5 * v - 2.5), 1 + q * q * (1.5 * q - 2.5), -0.5 * q * v * v)
+    ):
+        row = within(top + k - 1, height)
+        grey += weight * (a * image[row, before] + b * image[row, left] + c * image[row, right] + d * image[row, after])
+    return grey
+
+
+@inner
+def within(index: int, size: int) -> int:
+    """Return the nearest index in [0, size)."""
+    return min(max(index, 0), size - 1)
+
+
+@compiled("(f4[:, :, ::1], u1[:, ::1], f8[:, ::1], f8[::1])", writes=("ratio",))
+def contrast_ratios(templates: Floats, image: Image, centres: Array, ratio: Array) -> None:
+    """Write the contrasts (N,) of the image's windows about pixels (N, 2), by those of templates (N, S + 2, S + 2)."""
+    (height, width), side = image.shape, templates.shape[1] - 2
+    for n in range(len(templates)):
+        left, top = math.floor(centres[n, 0] + 0.5) - side // 2, math.floor(centres[n, 1] + 0.5) - side // 2
+        a, aa, b, bb = 0.0, 0.0, 0.0, 0.0
+        for i in range(side):
+            line = image[min(max(top + i, 0), height - 1)]
+            for j in range(side):
+                mine, there = float(templates[n, i + 1, j + 1]), float(line[min(max(left + j, 0), width - 1)])
+                a, aa, b, bb = a + mine, aa + mine * mine, b + there, bb + there * there
+        ratio[n] = math.sqrt((bb - b * b / side**2) / max(aa - a * a / side**2, 1.0))
+
+
+@compiled(
+    "(f4[:, :, ::1], u1[:, ::1], f8[:, ::1], f8[::1], f8, i8, f8, f8[:, ::1], f8[:, ::1], f8[:, :, ::1], b1[::1])",
+    writes=("shift", "slopes", "covariance", "fits"),
 )
 def fit(
-    templates: Image, cells: Image, groups: Indices, noise_grey: float, shift: Array, covariance: Array, fits: Flags
+    templates: Floats,
+    image: Image,
+    centres: Array,
+    gains: Array,
+    noise_grey: float,
+    reach_px: int,
+    slope_sigma: float,
+    shift: Array,
+    slopes: Array,
+    covariance: Array,
+    fits: Flags,
 ) -> None:
-    """Write shift (N, 2), covariance (N, 2, 2) and fits (N,) of `patch_fit.fit_patches`."""
-    count, reach = len(templates), (cells.shape[1] - WINDOW_PX) // 2
-    # Arrays of one axis, because within them the compiler knows what does not overlap.
-    designs, lanes = np.empty((count, 3 * PART), np.float32), np.empty(9 * LANES, np.float32)
-    template, cell = (
-        np.empty((WINDOW_PX + 2) * LINE, np.float32),
-        np.empty((cells.shape[1], cells.shape[1] + LANES + 1), np.float32),
-    )
-    for k in range(len(template)):
-        template[k] = ZERO
-    clear(cell)
-    sums, normals, ratio = np.empty((count, 3)), np.empty((count, 3, 3)), np.empty(count)
-    for n in range(count):
-        write_design(templates[n], template, designs[n])
-        write_products(designs[n], lanes, sums[n], normals[n])
-        ratio[n] = np.sqrt(centred_energy(cells[n], reach) / max(normals[n, 2, 2], 1.0))
-    gain = group_medians(ratio, groups)
-    prior = 2 * max(noise_grey, 1.0) ** 2 / GAIN_SIGMA**2
-    inverse, solution = np.empty((3, 3)), np.empty(3)
-    for n in range(count):
-        normal = normals[n]
-        trace = normal[0, 0] + normal[1, 1]
-        determinant = normal[0, 0] * normal[1, 1] - normal[0, 1] ** 2
-        shift[n, 0], shift[n, 1], fits[n] = 0.0, 0.0, False
-        covariance[n, 0, 0], covariance[n, 0, 1], covariance[n, 1, 0], covariance[n, 1, 1] = 0.0, 0.0, 0.0, 0.0
-        if normal[2, 2] <= PIXELS * MIN_CONTRAST**2 or determinant <= MIN_DETERMINANT * trace**2:
-            continue
-        invert(normal, prior, inverse)
-        for row in range(cells.shape[1]):
-            for column in range(cells.shape[1]):
-                cell[row, column] = np.float32(cells[n, row, column]) - MIDDLE_GREY
-        residual = solve(designs[n], cell, lanes, reach, sums[n], normal, inverse, prior * gain[n], shift[n], solution)
-        fits[n] = max(abs(shift[n, 0]), abs(shift[n, 1])) < reach and LEAST_GAIN < solution[2] < LARGEST_GAIN
-        write_covariance(inverse, residual, min(max(solution[2], LEAST_GAIN), LARGEST_GAIN), covariance[n])
+    """Fit shift (N, 2), change of the slopes (N, 2) and gain of templates (N, S + 2, S + 2) to windows of an image.
 
-
-@compiled("(u1[:, ::1], f8[:, ::1], u1[:, :, ::1])", writes=("cells",))
-def cut(image: Image, centres: Array, cells: Image) -> None:
-    """Write cells (N, S, S) around whole pixels (N, 2) of an image (H, W), whose border is repeated."""
-    (height, width), side = image.shape, cells.shape[1]
-    for n in range(len(centres)):
-        left, top = -side, -side  # a place that is NaN or absurd: the first pixel
-        if abs(centres[n, 0]) < FARTHEST_PX and abs(centres[n, 1]) < FARTHEST_PX:
-            left, top = int(centres[n, 0]) - side // 2, int(centres[n, 1]) - side // 2
-        inside = left >= 0 and left + side <= width
-        for row in range(side):
-            line = image[min(max(top + row, 0), height - 1)]
-            if inside:
-                for column in range(side):
-                    cells[n, row, column] = line[left + column]
-            else:
-                for column in range(side):
-                    cells[n, row, column] = line[min(max(left + column, 0), width - 1)]
-
-
-@inner
-def clear(values: Floats) -> None:
-    """Set all values (M, N) to zero."""
-    for row in range(values.shape[0]):
-        for column in range(values.shape[1]):
-            values[row, column] = 0.0
-
-
-@inner
-def write_design(image: Image, template: Floats, design: Floats) -> None:
-    """Write minus the gradients along column and row (Scharr's 3x3 operator), and the window, into (3 PART,).
-
-    The window is the middle of the image (T, T). template ((WINDOW + 2) LINE,): room for it and its border.
+    centres (N, 2): pixels of the image at which the templates' middles are predicted. gains (N,): expected ones.
+    slopes: their prior on entry, with slope_sigma; 0: they do not change. covariance (N, 2, 2) [px^2] of the shift;
+    fits (N,): textured, and moved by less than reach_px.
     """
-    first = image.shape[0] // 2 - WINDOW_PX // 2 - 1
-    for row in range(WINDOW_PX + 2):
-        for column in range(WINDOW_PX + 2):
-            template[row * LINE + column] = np.float32(image[first + row, first + column]) - MIDDLE_GREY
-    for row in range(WINDOW_PX):
-        of_row, around = design[row * LANES :], template[row * LINE :]
-        for lane in range(LANES):
-            nw, n, ne = around[lane], around[lane + 1], around[lane + 2]
-            w, here, e = around[lane + LINE], around[lane + (LINE + 1)], around[lane + (LINE + 2)]
-            sw, s, se = around[lane + 2 * LINE], around[lane + (2 * LINE + 1)], around[lane + (2 * LINE + 2)]
-            of_row[lane] = SIDE_WEIGHT * ((nw - ne) + (sw - se)) + INNER_WEIGHT * (w - e)
-            of_row[lane + PART] = SIDE_WEIGHT * ((nw - sw) + (ne - se)) + INNER_WEIGHT * (n - s)
-            of_row[lane + 2 * PART] = here
-        for lane in range(WINDOW_PX, LANES):
-            of_row[lane] = of_row[lane + PART] = of_row[lane + 2 * PART] = ZERO
+    side, size = templates.shape[1] - 2, 5 if slope_sigma > 0 else 3
+    width = -(-side // 8) * 8  # columns of a window in memory, so that the compiler adds several at once
+    pixels, noise = side * side, 2 * max(noise_grey, 1.0) ** 2
+    design, inside = np.zeros((size, side, width), np.float32), np.zeros((side, width), np.float32)
+    window, room = np.zeros((side, width), np.float32), np.empty(width, np.float32)
+    cell = np.zeros((side + 2 * reach_px + 1, width + 2 * reach_px + 1), np.float32)
+    normal, inverse, sums = np.empty((size, size)), np.empty((size, size)), np.empty(size)
+    right, weighted, solution = np.empty(size), np.empty(size), np.empty(size)
+    inside[:, :side] = 1.0
+    for n in range(len(templates)):
+        fits[n], shift[n], covariance[n] = False, 0.0, 0.0
+        # 1. Templates with texture: sums and products of the design, about its means.
+        write_design(templates[n], design)
+        for a in range(size):
+            sums[a] = dot(design[a], inside, room)
+            for b in range(a + 1):
+                normal[a, b] = normal[b, a] = dot(design[a], design[b], room) - sums[a] * sums[b] / pixels
+        trace, determinant = normal[0, 0] + normal[1, 1], normal[0, 0] * normal[1, 1] - normal[0, 1] ** 2
+        if normal[2, 2] <= pixels * MIN_CONTRAST**2 or determinant <= MIN_DETERMINANT * trace**2:
+            continue
+        copy_cell(image, centres[n], side + 2 * reach_px + 1, cell)
+        x, y, gain, variance, residual = 0.0, 0.0, 1.0, noise, 0.0
+        for _ in range(ITERATIONS):
+            # 2. The window at the shift, and its products with the design and with itself.
+            write_window(cell, x + reach_px, y + reach_px, inside, window)
+            total = dot(window, inside, room)
+            residual = dot(window, window, room) - total * total / pixels
+            # 3. The step, with the priors of gain and slopes.
+            for a in range(size):
+                weighted[a] = right[a] = dot(design[a], window, room) - sums[a] * total / pixels
+                for b in range(size):
+                    inverse[a, b] = normal[a, b]
+            inverse[2, 2] += noise / GAIN_SIGMA**2
+            weighted[2] += noise / GAIN_SIGMA**2 * gains[n]
+            for a in range(3, size):
+                prior = NOISE_CORRELATION * variance / (gain * slope_sigma) ** 2
+                inverse[a, a] += prior
+                weighted[a] += prior * gain * slopes[n, a - 3]
+            invert(inverse)
+            for a in range(size):
+                solution[a] = 0.0
+                for b in range(size):
+                    solution[a] += inverse[a, b] * weighted[b]
+            for a in range(size):
+                residual -= 2 * right[a] * solution[a]
+                for b in range(size):
+                    residual += solution[a] * normal[a, b] * solution[b]
+            gain = min(max(solution[2], LEAST_GAIN), LARGEST_GAIN)
+            variance = max(residual / pixels, noise)
+            step_x, step_y = solution[0] / gain, solution[1] / gain
+            x, y = x + min(max(step_x, -1.0), 1.0), y + min(max(step_y, -1.0), 1.0)
+            if not (abs(x) < reach_px and abs(y) < reach_px) or max(abs(step_x), abs(step_y)) <= CONVERGED_PX:
+                break
+        # 4. The result.
+        fits[n] = abs(x) < reach_px and abs(y) < reach_px and LEAST_GAIN < solution[2] < LARGEST_GAIN
+        shift[n, 0], shift[n, 1] = x, y
+        for a in range(3, size):
+            slopes[n, a - 3] = solution[a] / gain
+        write_covariance(inverse, max(residual, 0.0) / (pixels - 4) / gain**2, pixels, covariance[n])
 
 
 @inner
-def write_products(design: Floats, lanes: Floats, sums: Array, normal: Array) -> None:
-    """Write the sums (3,) of the design's parts, and their products (3, 3) about the means; lanes (9 LANES,): room."""
-    for k in range(9 * LANES):
-        lanes[k] = ZERO
-    for row in range(WINDOW_PX):
-        of_row = design[row * LANES :]
-        for lane in range(LANES):
-            across, down, grey = of_row[lane], of_row[lane + PART], of_row[lane + 2 * PART]
-            lanes[lane] += across
-            lanes[lane + LANES] += down
-            lanes[lane + 2 * LANES] += grey
-            lanes[lane + 3 * LANES] += across * across
-            lanes[lane + 4 * LANES] += across * down
-            lanes[lane + 5 * LANES] += down * down
-            lanes[lane + 6 * LANES] += across * grey
-            lanes[lane + 7 * LANES] += down * grey
-            lanes[lane + 8 * LANES] += grey * grey
-    for a in range(3):
-        sums[a] = total_of(lanes, a)
-    product = 3
-    for b in range(3):
-        for a in range(b + 1):
-            normal[a, b] = normal[b, a] = total_of(lanes, product) - sums[a] * sums[b] / PIXELS
-            product += 1
+def write_design(template: Floats, design: Floats) -> None:
+    """Write the design (3 or 5, S, W) of a template (S + 2, S + 2): minus its derivatives, and the window itself.
+
+    The gradients along column and row are by Scharr's 3x3 operator; a slope moves a pixel by its column or row from
+    the middle.
+    """
+    size, side = design.shape[0], design.shape[1]
+    for i in range(side):
+        above, here, below = template[i], template[i + 1], template[i + 2]
+        for j in range(side):
+            left, right = 3 * (above[j] + below[j]) + 10 * here[j], 3 * (above[j + 2] + below[j + 2]) + 10 * here[j + 2]
+            up, down = (
+                3 * (above[j] + above[j + 2]) + 10 * above[j + 1],
+                3 * (below[j] + below[j + 2]) + 10 * below[j + 1],
+            )
+            design[0, i, j], design[1, i, j] = (left - right) / 32, (up - down) / 32
+            design[2, i, j] = here[j + 1] - MIDDLE_GREY
+    for a in range(3, size):
+        for i in range(side):
+            for j in range(side):
+                design[a, i, j] = design[1, i, j] * ((j if a == 3 else i) - side // 2)
 
 
 @inner
-def total_of(lanes: Floats, product: int) -> float:
-    """Return the sum of all lanes of a product."""
-    of_product, total = lanes[product * LANES :], 0.0
-    for lane in range(LANES):
-        total += of_product[lane]
+def copy_cell(image: Image, centre: Array, side: int, cell: Floats) -> None:
+    """Write the pixels of an image around a pixel (2,) into a cell (S, S or wider); the border is repeated."""
+    (height, width), half = image.shape, (side - 1) // 2
+    left, top = math.floor(centre[0] + 0.5) - half, math.floor(centre[1] + 0.5) - half
+    for i in range(side):
+        line, to = image[within(top + i, height)], cell[i]
+        for j in range(side):
+            to[j] = np.float32(line[within(left + j, width)]) - MIDDLE_GREY
+
+
+@inner
+def write_window(cell: Floats, x: float, y: float, inside: Floats, window: Floats) -> None:
+    """Write the window (S, W) that begins between the pixels of a cell, by bilinear interpolation."""
+    left, top = math.floor(x), math.floor(y)
+    u, v = np.float32(x - left), np.float32(y - top)
+    p, q = np.float32(1) - u, np.float32(1) - v
+    for i in range(window.shape[0]):
+        above, below, to, ones = cell[top + i, left:], cell[top + i + 1, left:], window[i], inside[i]
+        for j in range(window.shape[1]):
+            to[j] = ones[j] * (q * (p * above[j] + u * above[j + 1]) + v * (p * below[j] + u * below[j + 1]))
+
+
+@inner
+def dot(a: Floats, b: Floats, room: Floats) -> float:
+    """Return the sum of the products of two windows (S, W); by column (W,), which are added several at once."""
+    room[:] = 0.0
+    for i in range(a.shape[0]):
+        one, other = a[i], b[i]
+        for j in range(len(room)):
+            room[j] += one[j] * other[j]
+    total = 0.0
+    for j in range(len(room)):
+        total += room[j]
     return total
 
 
 @inner
-def centred_energy(cell: Image, reach: int) -> float:
-    """Return the sum of squares of the unshifted window about its mean."""
-    total, squares = 0, 0
-    for row in range(WINDOW_PX):
-        for column in range(WINDOW_PX):
-            grey = int(cell[reach + row, reach + column])
-            total += grey
-            squares += grey * grey
-    return squares - total * total / PIXELS
+def invert(H: Array) -> None:
+    """Replace a positive definite matrix (M, M) by its inverse, by sweeps (Goodnight 1979)."""
+    size = len(H)
+    for k in range(size):
+        pivot = 1 / H[k, k]
+        for a in range(size):
+            for b in range(size):
+                if a != k and b != k:
+                    H[a, b] -= H[a, k] * H[k, b] * pivot
+        for a in range(size):
+            if a != k:
+                H[a, k], H[k, a] = -H[a, k] * pivot, H[k, a] * pivot
+        H[k, k] = pivot
 
 
 @inner
-def group_medians(ratio: Array, groups: Indices) -> Array:
-    """Return for each patch (N,) the median ratio of its group, within the range of gains."""
-    gain, chosen = np.empty(len(ratio)), np.empty(len(ratio))
-    for n in range(len(ratio)):
-        gain[n] = 0.0
-    for n in range(len(ratio)):
-        if gain[n] > 0:
-            continue
-        count = 0
-        for k in range(n, len(ratio)):
-            if groups[k] == groups[n]:
-                chosen[count] = ratio[k]
-                count += 1
-        median = min(max(median_of(chosen, count), LEAST_GAIN), LARGEST_GAIN)
-        for k in range(n, len(ratio)):
-            if groups[k] == groups[n]:
-                gain[k] = median
-    return gain
-
-
-@inner
-def median_of(values: Array, count: int) -> float:
-    """Return the median of the first values, which are sorted (Shell 1959); np.median takes two seconds to compile."""
-    gap = count // 2
-    while gap > 0:
-        for n in range(gap, count):
-            value, place = values[n], n
-            while place >= gap and values[place - gap] > value:
-                values[place] = values[place - gap]
-                place -= gap
-            values[place] = value
-        gap //= 2
-    middle = count // 2
-    return float(values[middle] if count % 2 else (values[middle - 1] + values[middle]) / 2)
-
-
-@inner
-def invert(normal: Array, prior: float, inverse: Array) -> None:
-    """Write the inverse (3, 3) of the normal matrix with the prior of the gain."""
-    a, b, c = normal[0, 0], normal[0, 1], normal[0, 2]
-    d, e, f = normal[1, 1], normal[1, 2], normal[2, 2] + prior
-    m00, m01, m02 = d * f - e * e, c * e - b * f, b * e - c * d
-    scale = 1 / (a * m00 + b * m01 + c * m02)
-    inverse[0, 0], inverse[1, 1], inverse[2, 2] = m00 * scale, (a * f - c * c) * scale, (a * d - b * b) * scale
-    inverse[0, 1] = inverse[1, 0] = m01 * scale
-    inverse[0, 2] = inverse[2, 0] = m02 * scale
-    inverse[1, 2] = inverse[2, 1] = (b * c - a * e) * scale
-
-
-@inner
-def write_window_products(design: Floats, cell: Floats, reach: int, x: float, y: float, lanes: Floats) -> None:
-    """Write the products of the bilinear window at a shift x, y with the three parts of the design, with 1 and with
-    itself: (5 LANES,), by column.
-    """
-    left, top = min(int(np.floor(x)), reach - 1), min(int(np.floor(y)), reach - 1)
-    fx, fy = x - left, y - top
-    nw, ne = np.float32((1 - fy) * (1 - fx)), np.float32((1 - fy) * fx)
-    sw, se = np.float32(fy * (1 - fx)), np.float32(fy * fx)
-    for k in range(5 * LANES):
-        lanes[k] = ZERO
-    for row in range(WINDOW_PX):
-        of_row, above = design[row * LANES :], cell[reach + top + row, reach + left :]
-        below = cell[reach + top + row + 1, reach + left :]
-        for lane in range(LANES):
-            grey = nw * above[lane] + ne * above[lane + 1] + sw * below[lane] + se * below[lane + 1]
-            lanes[lane] += of_row[lane] * grey
-            lanes[lane + LANES] += of_row[lane + PART] * grey
-            lanes[lane + 2 * LANES] += of_row[lane + 2 * PART] * grey
-            lanes[lane + 3 * LANES] += grey
-            lanes[lane + 4 * LANES] += grey * grey
-
-
-@inner
-def solve(
-    design: Floats,
-    cell: Floats,
-    lanes: Floats,
-    reach: int,
-    sums: Array,
-    normal: Array,
-    inverse: Array,
-    of_gain: float,
-    shift: Array,
-    solution: Array,
-) -> float:
-    """Iterate shift (2,) and solution (3,) until they converge or leave the reach; return the mean squared residual.
-
-    lanes (9 LANES,): room for sums.
-    """
-    dx, dy, p0, p1, p2, energy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for _ in range(ITERATIONS):
-        # 1. The bilinear window at the shift, and its products with the design and with itself.
-        x, y = min(max(dx, -reach), reach), min(max(dy, -reach), reach)
-        write_window_products(design, cell, reach, x, y, lanes)
-        total, energy = 0.0, 0.0
-        for lane in range(WINDOW_PX):
-            total += lanes[lane + 3 * LANES]
-            energy += lanes[lane + 4 * LANES]
-        mean = total / PIXELS
-        energy -= total * mean
-        p0, p1 = total_of(lanes, 0) - sums[0] * mean, total_of(lanes, 1) - sums[1] * mean
-        p2 = total_of(lanes, 2) - sums[2] * mean
-        # 2. The step.
-        for a in range(3):
-            solution[a] = inverse[a, 0] * p0 + inverse[a, 1] * p1 + inverse[a, 2] * (p2 + of_gain)
-        scale = 1 / min(max(solution[2], LEAST_GAIN), LARGEST_GAIN)
-        step_x, step_y = solution[0] * scale, solution[1] * scale
-        dx += min(max(step_x, -1.0), 1.0)
-        dy += min(max(step_y, -1.0), 1.0)
-        if max(abs(step_x), abs(step_y)) <= CONVERGED_PX or max(abs(dx), abs(dy)) >= reach:
-            break
-    shift[0], shift[1] = dx, dy
-    # |y - M^T s|^2 of the last step, without computing the differences.
-    explained = 2 * (p0 * solution[0] + p1 * solution[1] + p2 * solution[2])
-    for a in range(3):
-        for b in range(3):
-            explained -= solution[a] * normal[a, b] * solution[b]
-    return float(max(energy - explained, 0.0) / PIXELS)
-
-
-@inner
-def write_covariance(inverse: Array, residual: float, gain: float, covariance: Array) -> None:
-    """Write the covariance (2, 2) [px^2] of a shift from the mean squared residual and the fitted gain."""
-    variance = residual * PIXELS / (PIXELS - 4) / gain**2
+def write_covariance(inverse: Array, variance: float, pixels: int, covariance: Array) -> None:
+    """Write the covariance (2, 2) [px^2] of a shift from the variance of the residuals in units of the template."""
     # Noise in the template is taken for texture: its part of the gradients' matrix is taken off.
-    determinant = inverse[0, 0] * inverse[1, 1] - inverse[0, 1] ** 2
+    determinant = inverse[0, 0] * inverse[1, 1] - inverse[0, 1] * inverse[1, 0]
     trace = (inverse[0, 0] + inverse[1, 1]) / max(determinant, 1e-12)
-    noise = GRADIENT_NOISE * PIXELS * variance / 2
-    texture = min(max(1 - 2 * noise / max(trace, 1e-9), MIN_TRUE_GRADIENT), 1.0)
+    texture = min(max(1 - GRADIENT_NOISE * pixels * variance / max(trace, 1e-9), MIN_TRUE_GRADIENT), 1.0)
     for a in range(2):
         for b in range(2):
             covariance[a, b] = NOISE_CORRELATION * variance / texture * inverse[a, b]

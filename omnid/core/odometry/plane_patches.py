@@ -18,54 +18,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.odometry import patch_kernels, plane_kernels, slope_kernels
-from omnid.core.odometry.patch_kernels import cut
+from omnid.core.odometry import patch_kernels
 from omnid.core.stereo.triangulation import triangulate
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
+Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
-WINDOW_PX = patch_kernels.WINDOW_PX
+WINDOW_PX = 13  # side of a patch
 TEMPLATE_PX = WINDOW_PX + 2  # holds the window and the border that the gradient's 3x3 operator needs
-
-
-@dataclass(frozen=True, slots=True)
-class PatchFit:
-    """Result for N patches."""
-
-    shift: Array  # (N, 2) px from the prediction
-    covariance: Array  # (N, 2, 2) px^2 that the noise of both images leaves
-    fits: Flags  # (N,) textured, and moved less than the reach
-
-
-def fit_patches(templates: Image, cells: Image, groups: Indices, noise_grey: float) -> PatchFit:
-    """Fit templates (N, T, T) to the current image's cells (N, C, C), cut where they are predicted.
-
-    The centre of a template is its pixel T // 2, T is TEMPLATE_PX or more. C is WINDOW_PX + 2 reach: a patch that has
-    to move by the reach or farther was predicted wrongly, and does not fit.
-    groups (N,): patches of one image have one number, and nearly one gain. noise_grey: standard deviation of the
-    noise of both images.
-    """
-    count = len(templates)
-    found = PatchFit(np.empty((count, 2)), np.empty((count, 2, 2)), np.empty(count, bool))
-    patch_kernels.fit(
-        np.ascontiguousarray(templates),
-        np.ascontiguousarray(cells),
-        groups,
-        noise_grey,
-        found.shift,
-        found.covariance,
-        found.fits,
-    )
-    return found
-
-
-Floats = NDArray[np.float32]
-
 # Half the side of the window in which the slope of the dense disparity is taken.
 SLOPE_REACH_PX = 8
 # Disparities that differ more belong to another surface.
@@ -73,7 +37,25 @@ SAME_SURFACE_PX = 2.0
 # px^2, weight of slope zero (an upright surface facing the camera) in the least squares: a full window has 6936
 # px^2, so that the slope is 0.7 % too flat.
 SLOPE_PRIOR = 50.0
-MIN_NOISE_GREY = 1.0  # Least noise of images: rounding, and errors of the model.
+# Side of the window in which slopes are fitted. They err by the third power of it, but a large window leaves the plane.
+# 17 was tried as well, on thirteen logs of development: set by trial.
+SLOPE_WINDOW_PX, SLOPE_ROUNDS = 21, 2
+MAX_SLOPE = 0.7  # Largest slope of a disparity, because a steeper plane is seen so obliquely that it has no patch.
+# Px/px, of the start, because those of dense stereo are a third too flat, its windows being upright.
+SLOPE_SIGMA = 0.1
+# Reach of patches whose pose and depth are known well.
+REACH_PX = 1
+# By which a patch may move sideways in the upper panorama from where it was tracked to.
+CROSS_PX = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class AlignedPatches:
+    """Positions of N patches in a panorama."""
+
+    pixels: Array  # (N, 2)
+    covariance: Array  # (N, 2, 2) px^2 that the noise leaves
+    found: Flags  # (N,) textured, and near the prediction
 
 
 def plane_templates(
@@ -86,8 +68,9 @@ def plane_templates(
     predicted: Array,
     *,
     upper: bool = False,
-) -> Image:
-    """Return templates (N, TEMPLATE, TEMPLATE) of patches at pixels (N, 2) of images, as the current view shows them.
+    window_px: int = WINDOW_PX,
+) -> Floats:
+    """Return templates (N, T, T) of patches at pixels (N, 2) of images, as the current view shows them.
 
     anchors (N,): the key of the image of each, one of the images. surfaces: points (N, 3) [m] at the patches' centres
     and slopes (N, 2) of the disparity there, both in the rectified frames of the images; T_curr_ref (N, 4, 4) from
@@ -95,30 +78,59 @@ def plane_templates(
     which shows the centres at predicted (N, 2). Where a plane is seen edge on, the patch is not bent. KeyError for an
     anchor without an image.
     """
-    templates = np.empty((len(pixels), TEMPLATE_PX, TEMPLATE_PX), np.uint8)
-    points, slopes = (np.ascontiguousarray(part) for part in surfaces)
-    T_curr_ref, shift = np.ascontiguousarray(T_curr_ref), np.ascontiguousarray(np.rint(predicted) - predicted)
-    height_m = model.baseline_m if upper else 0.0
-    # All panoramas of a run have the same columns.
-    centres = _padded(next(iter(images.values())), pixels) if images else pixels
-    rows = {key: np.flatnonzero(anchors == key) for key in images}
-    if sum(map(len, rows.values())) != len(anchors):
-        raise KeyError(f"anchors {set(anchors.tolist()) - set(images)} have no image")
-    for key, chosen in rows.items():
-        plane_kernels.sample(
-            images[key].image,
-            chosen,
-            centres,
-            points,
-            slopes,
-            T_curr_ref,
-            model.baseline_m,
-            height_m,
-            model.cylinder.focal_px,
-            shift,
-            templates,
-        )
+    templates = np.empty((len(pixels), window_px + 2, window_px + 2), np.float32)
+    H, heights = homographies(surfaces, T_curr_ref, model.baseline_m, model.baseline_m if upper else 0.0)
+    shift = np.ascontiguousarray(np.rint(predicted) - predicted)
+    for key in np.unique(anchors).tolist():
+        image, chosen = images[key], np.flatnonzero(anchors == key)
+        centres, focal_px = _padded(image, pixels), model.cylinder.focal_px
+        patch_kernels.sample(image.image, chosen, centres, H, heights, shift, focal_px, templates)
     return templates
+
+
+def homographies(
+    surfaces: tuple[Array, Array], T_curr_ref: Array, baseline_m: float, height_m: float
+) -> tuple[Array, Array]:
+    """Return the homographies (N, 3, 3) from rays of the current view to those of the keyframes; arguments as above.
+
+    The current viewpoint is height_m above the lower one. Both rays have their azimuth 0 at the patch. Also returns the
+    heights z / r (N, 2) of the patches in the keyframes, and in the current view.
+    """
+    (points, _), R = surfaces, T_curr_ref[:, :3, :3]
+    t = T_curr_ref[:, :3, 3] - (0.0, 0.0, height_m)
+    n = _turned(R, _normals(surfaces, baseline_m))
+    seen, back = _turned(R, points) + t, _turned(np.swapaxes(R, 1, 2), t)
+    scale = 1 + (n * t).sum(axis=1)
+    H = scale[:, None, None] * np.swapaxes(R, 1, 2) - back[:, :, None] * n[:, None]
+    r, seen_r = np.hypot(points[:, 0], points[:, 1]), np.hypot(seen[:, 0], seen[:, 1])
+    H = _azimuth_zero(points, r) @ H @ np.swapaxes(_azimuth_zero(seen, seen_r), 1, 2)
+    return np.ascontiguousarray(H), np.column_stack([points[:, 2] / r, seen[:, 2] / seen_r])
+
+
+def _azimuth_zero(points: Array, r: Array) -> Array:
+    """Return the rotations (N, 3, 3) about z that turn points (N, 3) at distances r (N,) from the axis to azimuth 0."""
+    turns, (c, s) = np.zeros((len(points), 3, 3)), points[:, :2].T / r
+    turns[:, 0, 0], turns[:, 0, 1], turns[:, 1, 0], turns[:, 1, 1], turns[:, 2, 2] = c, s, -s, c, 1.0
+    return turns
+
+
+def _normals(surfaces: tuple[Array, Array], baseline_m: float) -> Array:
+    """Return n (N, 3) [1/m] of the planes n . p = 1 through points (N, 3) with slopes (N, 2) of the disparity.
+
+    The disparity f t / r is f t n . u for the ray u with r = 1, azimuth and the height of u fall by 1 / f from pixel
+    to pixel: so the slopes are -t times the components of n along azimuth and axis.
+    """
+    points, slopes = surfaces
+    r = np.hypot(points[:, 0], points[:, 1])
+    x, y = points[:, 0] / r, points[:, 1] / r
+    sideways, up = (-slopes / baseline_m).T
+    ahead = (1 - up * points[:, 2]) / r
+    return np.column_stack([ahead * x - sideways * y, ahead * y + sideways * x, up])
+
+
+def _turned(R: Array, vectors: Array) -> Array:
+    """Return vectors (N, 3) turned by rotations (N, 3, 3)."""
+    return np.asarray((R @ vectors[:, :, None])[:, :, 0])
 
 
 def moved_slopes(surfaces: tuple[Array, Array], T_curr_ref: Array, model: StereoModel) -> Array:
@@ -126,10 +138,13 @@ def moved_slopes(surfaces: tuple[Array, Array], T_curr_ref: Array, model: Stereo
 
     surfaces: points (N, 3) and slopes (N, 2). Zero where the plane is seen nearly edge on.
     """
-    points, slopes = (np.ascontiguousarray(part) for part in surfaces)
-    moved = np.empty((len(points), 2))
-    plane_kernels.move_slopes(points, slopes, np.ascontiguousarray(T_curr_ref), model.baseline_m, moved)
-    return moved
+    R, t = T_curr_ref[:, :3, :3], T_curr_ref[:, :3, 3]
+    n, seen = _turned(R, _normals(surfaces, model.baseline_m)), _turned(R, surfaces[0]) + t
+    # The plane n' . p' = 1 + n' . t has the normal n' / (1 + n' . t).
+    n /= 1 + (n * t).sum(axis=1, keepdims=True)
+    along = (seen[:, 0] * n[:, 1] - seen[:, 1] * n[:, 0]) / np.hypot(seen[:, 0], seen[:, 1])
+    moved = -model.baseline_m * np.column_stack([along, n[:, 2]])
+    return np.where((np.abs(moved) < MAX_SLOPE).all(axis=1, keepdims=True), moved, 0.0)
 
 
 def disparity_slopes(disparity: Floats, points: Array, centre: Array) -> Array:
@@ -158,64 +173,64 @@ def fitted_slopes(
 
     start (N, 2): first values, which stay where near is NaN or the fit fails. A plane makes the upper window a bent
     lower one: its shift, its two slopes, gain and offset are fitted to both windows together, by Gauss-Newton with the
-    lower one's gradient as in `patch_fit`. The start is a weak prior. Dense slopes are a third too flat and scatter by
-    0.05; a landmark's patch, seen from elsewhere, would be shifted by tenths of a pixel.
+    lower one's gradient, in rounds, each of which bends the lower window anew. The start is a weak prior. Dense
+    slopes are a third too flat and scatter by 0.05; a landmark's patch, seen from elsewhere, would be shifted by tenths
+    of a pixel.
     """
-    known = np.flatnonzero(np.isfinite(near).all(axis=1))
-    lower, upper = pair
-    slopes, found = start.copy(), np.empty((len(known), 2))
-    heights = (model.cylinder.row0 - pixels[known, 1]) / model.cylinder.focal_px
-    noise_grey = max(lower.noise_grey, MIN_NOISE_GREY)
-    slope_kernels.fit(
-        lower.image,
-        upper.image,
-        _padded(lower, pixels[known]),
-        _padded(upper, near[known]),
-        np.ascontiguousarray(start[known]),
-        heights,
-        model.cylinder.focal_px,
-        noise_grey,
-        found,
-    )
-    slopes[known] = found
+    known, slopes = np.flatnonzero(np.isfinite(near).all(axis=1)), start.copy()
+    points, found, fits = pixels[known], start[known], np.ones(len(known), bool)
+    one, still = np.zeros(len(known), np.intp), np.tile(np.eye(4), (len(known), 1, 1))
+    predicted = near[known]
+    for _ in range(SLOPE_ROUNDS):
+        in_space = triangulate(np.column_stack([points, predicted[:, 1]]), model.cylinder, model.baseline_m)
+        surfaces, pixels_at = (in_space, found), np.rint(predicted)
+        templates = plane_templates(
+            {0: pair[0]}, one, points, surfaces, still, model, predicted, upper=True, window_px=SLOPE_WINDOW_PX
+        )
+        change = start[known] - found
+        fitted = _fit(templates, pair[1], pixels_at, one, REACH_PX, change, SLOPE_SIGMA)
+        fits &= fitted.found
+        found, predicted = found + change, predicted + fitted.pixels
+    fits &= (np.abs(found) < MAX_SLOPE).all(axis=1)
+    slopes[known[fits]] = found[fits]
     return slopes
 
 
-def _padded(panorama: PaddedPanorama, pixels: Array) -> Array:
-    """Return pixels (N, 2) of the padded image."""
-    return np.column_stack([panorama.padded(pixels[:, 0]), pixels[:, 1]])
-
-
-# Reach of patches whose pose and depth are known well, the least there is, because cells have whole pixels.
-REACH_PX = 1
-# By which a patch may move sideways in the upper panorama from where it was tracked to.
-CROSS_PX = 0.5
-
-
-@dataclass(frozen=True, slots=True)
-class AlignedPatches:
-    """Positions of N patches in a panorama."""
-
-    pixels: Array  # (N, 2)
-    covariance: Array  # (N, 2, 2) px^2 that the noise leaves
-    found: NDArray[np.bool_]  # (N,) textured, and near the prediction
-
-    @staticmethod
-    def of(fit: PatchFit, predicted: Array) -> AlignedPatches:
-        """Return the pixels of patches that were cut at predicted (N, 2)."""
-        return AlignedPatches(predicted + fit.shift, fit.covariance, fit.fits)
-
-
 def align(
-    templates: Image, current: PaddedPanorama, predicted: Array, groups: Indices, reach_px: int = REACH_PX
+    templates: Floats, current: PaddedPanorama, predicted: Array, groups: Indices, reach_px: int = REACH_PX
 ) -> AlignedPatches:
     """Align templates (N, TEMPLATE, TEMPLATE), centred on predicted (N, 2), with the current panorama.
 
-    groups (N,): patches that come from one image have one number. reach_px: a patch that has to move this far was
-    predicted wrongly.
+    groups (N,): patches that come from one image have one number, and nearly one gain. reach_px: a patch that has to
+    move this far was predicted wrongly.
     """
-    cells = _cut(current, np.rint(predicted), WINDOW_PX + 2 * reach_px)
-    return AlignedPatches.of(fit_patches(templates, cells, groups, current.noise_grey), predicted)
+    found = _fit(templates, current, np.rint(predicted), groups, reach_px, np.zeros((len(templates), 2)), 0.0)
+    return AlignedPatches(predicted + found.pixels, found.covariance, found.found)
+
+
+def _fit(
+    templates: Floats,
+    current: PaddedPanorama,
+    at: Array,
+    groups: Indices,
+    reach_px: int,
+    slopes: Array,
+    slope_sigma: float,
+) -> AlignedPatches:
+    """Fit templates (N, T, T) to the windows of a panorama at pixels (N, 2); the pixels returned are shifts.
+
+    slopes (N, 2): prior of their change, which is written; slope_sigma: its standard deviation, 0: they do not change.
+    """
+    count, centres = len(templates), _padded(current, at)
+    ratio, gains = np.empty(count), np.empty(count)
+    patch_kernels.contrast_ratios(templates, current.image, centres, ratio)
+    for group in np.unique(groups):
+        gains[groups == group] = np.median(ratio[groups == group])
+    gains = gains.clip(patch_kernels.LEAST_GAIN, patch_kernels.LARGEST_GAIN)
+    found = AlignedPatches(np.empty((count, 2)), np.empty((count, 2, 2)), np.empty(count, bool))
+    noise_grey, results = current.noise_grey, (found.pixels, slopes, found.covariance, found.found)
+    patch_kernels.fit(templates, current.image, centres, gains, noise_grey, reach_px, slope_sigma, *results)
+    return found
 
 
 def align_rows(
@@ -250,8 +265,6 @@ def view_noise(covariance: Array, row_variance: Array) -> Array:
     return noise
 
 
-def _cut(panorama: PaddedPanorama, centres: Array, side_px: int) -> Image:
-    """Return cells (N, side, side) around whole pixels (N, 2), also across the seam; the border is repeated."""
-    cells = np.empty((len(centres), side_px, side_px), np.uint8)
-    cut(panorama.image, np.column_stack([panorama.padded(centres[:, 0]), centres[:, 1]]), cells)
-    return cells
+def _padded(panorama: PaddedPanorama, pixels: Array) -> Array:
+    """Return pixels (N, 2) of the padded image."""
+    return np.column_stack([panorama.padded(pixels[:, 0]), pixels[:, 1]])

@@ -6,13 +6,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.odometry.plane_patches import WINDOW_PX, PatchFit, fit_patches
+from omnid.core.odometry.plane_patches import TEMPLATE_PX, AlignedPatches, align
+from omnid.core.types.panorama import PaddedPanorama
 
 Array = NDArray[np.float64]
 SHIFT = np.array([0.7, -0.45])  # of the current patches, px
-ONE_IMAGE = np.zeros(400, np.intp)
 REACH_PX = 2
-CELL_PX = WINDOW_PX + 2 * REACH_PX
+CELL_PX = TEMPLATE_PX + 2 * REACH_PX
+CENTRES = CELL_PX * np.array([(column, row) for row in range(20) for column in range(20)]) + CELL_PX // 2.0
 
 
 def patches(
@@ -33,14 +34,22 @@ def patches(
     return templates, cells
 
 
-def error(fit: PatchFit) -> Array:
-    return fit.shift[fit.fits] - SHIFT
+def fitted(templates: NDArray[np.uint8], cells: NDArray[np.uint8], noise_grey: float = 1.0) -> AlignedPatches:
+    """Align the middles of 400 templates with a panorama of 20 by 20 cells."""
+    image = cells.reshape(20, 20, CELL_PX, CELL_PX).swapaxes(1, 2).reshape(20 * CELL_PX, 20 * CELL_PX)
+    middle = np.ascontiguousarray(templates[:, REACH_PX:-REACH_PX, REACH_PX:-REACH_PX], np.float32)
+    panorama = PaddedPanorama(np.ascontiguousarray(image), 0, noise_grey)
+    return align(middle, panorama, CENTRES, np.zeros(400, np.intp), REACH_PX)
+
+
+def error(fit: AlignedPatches) -> Array:
+    return (fit.pixels - CENTRES)[fit.found] - SHIFT
 
 
 def test_a_shift_is_found_to_hundredths_under_another_gain_and_offset() -> None:
     for gain, offset in ((1.0, 0.0), (0.7, 10.0), (1.3, -30.0)):
-        fit = fit_patches(*patches(400, SHIFT, gain=gain, offset=offset), ONE_IMAGE, 1.0)
-        assert fit.fits.mean() > 0.95
+        fit = fitted(*patches(400, SHIFT, gain=gain, offset=offset))
+        assert fit.found.mean() > 0.95
         assert np.sqrt((error(fit) ** 2).mean()) < 0.02
         assert np.abs(error(fit).mean(axis=0)).max() < 0.01
 
@@ -57,7 +66,7 @@ def test_the_covariance_is_that_of_the_errors() -> None:
             np.clip(np.rint(image + n), 0, 255).astype(np.uint8)
             for image, n in zip((templates, cells), smooth, strict=True)
         ]
-        fit = fit_patches(noisy[0], noisy[1], ONE_IMAGE, sigma)
-        squared = np.einsum("ni,nij,nj->n", error(fit), np.linalg.inv(fit.covariance[fit.fits]), error(fit))
-        assert fit.fits.mean() > 0.8
+        fit = fitted(noisy[0], noisy[1], sigma)
+        squared = np.einsum("ni,nij,nj->n", error(fit), np.linalg.inv(fit.covariance[fit.found]), error(fit))
+        assert fit.found.mean() > 0.8
         assert 0.5 < np.sqrt(np.median(squared) / 1.386) < 1.5  # the median of chi^2 with two degrees is 1.386

@@ -78,7 +78,7 @@ def seen_at(points: Array, upper: bool) -> Array:
     return view(se3.apply(T_CURR_REF, points), CYLINDER, MODEL.baseline_m)[:, [0, 2] if upper else [0, 1]]
 
 
-def templates_of(surfaces: tuple[Array, Array], pixels: Array, seen: Array, *, upper: bool) -> NDArray[np.uint8]:
+def templates_of(surfaces: tuple[Array, Array], pixels: Array, seen: Array, *, upper: bool) -> NDArray[np.float32]:
     T, keys = np.tile(T_CURR_REF, (len(pixels), 1, 1)), np.full(len(pixels), 7)
     return plane_templates({7: panorama(np.eye(4))}, keys, pixels, surfaces, T, MODEL, seen, upper=upper)
 
