@@ -1,8 +1,16 @@
-"""Local map: prediction, tracking and alignment of the landmarks near the robot, and their depths a frame later."""
+"""Local map: landmarks relative to the keyframes that saw them first, their prediction, tracking and alignment.
+
+A landmark is anchored in the keyframe that saw it first. Its position is kept in that keyframe's rectified frame, so
+that its error is that of one pair, and that of the keyframe's pose comes in once.
+
+Bounds: at most max_keyframes keyframes K; a keyframe adds at most as many landmarks as the caller passes (F, the
+features wanted), so N <= K F landmarks. A landmark leaves with its anchor or after max_misses frames without it; a
+keyframe leaves when it is the oldest of too many or anchors no landmark any more.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,22 +18,61 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.odometry.estimates import PoseEstimate
 from omnid.core.odometry.exposure_times import RigVelocity
-from omnid.core.odometry.first_depths import FirstDepths
-from omnid.core.odometry.landmarks import Keyframe, LandmarkStore, NewLandmarks
+from omnid.core.odometry.landmarks import NewLandmarks
 from omnid.core.odometry.plane_patches import AlignedPatches, align, moved_slopes, plane_templates
 from omnid.core.odometry.tracking import KltSettings, track
-from omnid.core.stereo.triangulation import view
+from omnid.core.stereo.triangulation import MIN_RADIUS2_M2, point_covariance, triangulate, view
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
+CORRELATED_FRAMES = 4.0  # frames whose disparities of one landmark count as one
+OUTLIER_SQUARED = 9.0  # squared distance (3 sigma) from which a disparity is not used, so that 0.3 % of right ones are
 COARSE_ITERATIONS = 8  # Iterations of Lucas-Kanade on each level, few because the patches are aligned afterwards.
 # Reach of the alignment, because a new landmark, whose depth is uncertain, may be off by more than a pixel.
 REACH_PX = 2
 # Px: a landmark predicted nearer to the panorama's upper or lower edge is not tracked.
 EDGE_ROWS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Keyframe:
+    """Panorama in which landmarks are anchored; T_odom_rect is the pose of its rectified frame, covariance its own."""
+
+    seq: int
+    lower: PaddedPanorama
+    T_odom_rect: Array
+    covariance: Array  # (6, 6) [t; r] in the rectified frame
+
+
+@dataclass(frozen=True, slots=True)
+class LandmarkTable:
+    """One row for each landmark.
+
+    points and covariance in odom follow from those in the anchor, which stays where it is.
+    """
+
+    id: Indices  # (N,) unique, in the order of addition
+    anchor: Indices  # (N,) seq of the keyframe that saw the landmark first
+    anchor_points: Array  # (N, 3) m in the rectified frame of the anchor
+    anchor_covariance: Array  # (N, 3, 3) m^2 in the same axes
+    views: Array  # (N, 3) px in the anchor, at its stamp: column, lower row, upper row
+    anchor_pixels: Array  # (N, 2) px where the anchor's lower panorama shows it
+    slopes: Array  # (N, 2) px/px of the disparity about the view, along column and row
+    points: Array  # (N, 3) m in odom
+    covariance: Array  # (N, 3, 3) m^2 in odom
+    pixels: Array  # (N, 2) px in the last accepted panorama, NaN: not found there
+    misses: Indices  # (N,) consecutive accepted frames in which the landmark was no inlier
+
+    @staticmethod
+    def empty() -> LandmarkTable:
+        """Return a table without rows."""
+        none, vectors, matrices = np.zeros(0, np.intp), np.zeros((0, 3)), np.zeros((0, 3, 3))
+        pixels = np.zeros((0, 2))
+        return LandmarkTable(none, none, vectors, matrices, vectors, pixels, pixels, vectors, matrices, pixels, none)
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,45 +94,155 @@ class Tracks:
 
 
 class LocalMap:
-    """Landmarks in a store, and the last panorama in which they were found."""
+    """Keyframes by seq, their landmarks, and the last panorama in which these were found."""
 
     def __init__(self, model: StereoModel, klt: KltSettings, max_keyframes: int = 8, max_misses: int = 3) -> None:
-        self._model, self._klt = model, klt
+        self._model, self._max_keyframes, self._max_misses = model, max_keyframes, max_misses
         self._coarse_klt = replace(klt, iterations=min(klt.iterations, COARSE_ITERATIONS))
         self._near_klt = replace(self._coarse_klt, levels=0)
-        self.store = LandmarkStore(model, max_keyframes, max_misses)
-        self.late_depths = LateDepths(self.store)
-        self.first_depths: FirstDepths | None = None  # of the only keyframe; None: its depths are not in doubt
-        self._last: PaddedPanorama | None = None
+        self._next_id = 0
+        self.late_depths = LateDepths(self)
         self.lost: NDArray[np.bool_] | None = None  # (H, W) of the frame, in which no landmark is searched; None: none
+        self.clear()
 
     def __len__(self) -> int:
-        return len(self.store)
+        return len(self.table.id)
 
     def clear(self) -> None:
         """Remove all landmarks and keyframes."""
-        self.store.clear()
+        self.keyframes: dict[int, Keyframe] = {}
+        self.table = LandmarkTable.empty()
         self.late_depths.clear()
-        self.first_depths = self._last = None
+        self.last: PaddedPanorama | None = None  # the last accepted lower panorama; None: there is no map
 
     def add_keyframe(
         self, keyframe: Keyframe, views: Array, slopes: Array, noise: Array | None = None, pixels: Array | None = None
     ) -> Indices:
-        """Add a keyframe at the last panorama with new landmarks: see LandmarkStore.add_keyframe."""
-        self._last = keyframe.lower
-        return self.store.add_keyframe(keyframe, views, slopes, noise, pixels)
+        """Add a keyframe at the last panorama with new landmarks, and remove the oldest keyframe beyond the bound.
 
-    def decide_first_depths(self, lower: PaddedPanorama, step_m: tuple[float, float]) -> None:
-        """Let a new panorama decide among the depths of the first keyframe; step_m: see FirstDepths.decide."""
-        if self.first_depths is not None:
-            self.first_depths.decide(lower, self._coarse_klt, self.store, step_m)
-            if not self.first_depths.is_open:
-                self.first_depths = None
+        views (N, 3) [px]: those of the landmarks. slopes (N, 2): those of the disparity. noise: covariance (N, 3, 3)
+        [px^2] of the views in addition to that of the model; None: none. pixels (N, 2): those in the keyframe's
+        panorama, which differ from the views where it was exposed at several times; None: those of the views. Return
+        the ids (N,) of the landmarks; -1 for views that cannot be triangulated, which are left out.
+        """
+        self.last = keyframe.lower
+        points = triangulate(views, self._model.cylinder, self._model.baseline_m)
+        finite = np.isfinite(points).all(axis=1)
+        pixels = (views[:, :2] if pixels is None else pixels)[finite]
+        views, slopes, points = views[finite], slopes[finite], points[finite]
+        covariance = point_covariance(
+            points,
+            self._model.cylinder,
+            self._model.baseline_m,
+            self._model.sigma_px,
+            None if noise is None else noise[finite],
+        )
+        count = len(points)
+        ids = np.arange(self._next_id, self._next_id + count)
+        self._next_id += count
+        new = LandmarkTable(
+            ids,
+            np.full(count, keyframe.seq),
+            points,
+            covariance,
+            views,
+            pixels,
+            slopes,
+            np.empty(points.shape),
+            np.empty(covariance.shape),
+            pixels=pixels.copy(),
+            misses=np.zeros(count, np.intp),
+        )
+        self.keyframes[keyframe.seq] = keyframe
+        self.table = _joined(self.table, new)
+        self._place(np.arange(len(self) - count, len(self)), points, covariance)
+        while len(self.keyframes) > self._max_keyframes:
+            self.keyframes.pop(min(self.keyframes))
+        self._select(np.isin(self.table.anchor, list(self.keyframes)))
+        given = np.full(finite.shape, -1)
+        given[finite] = ids
+        return given
 
-    def update_tracked(self, lower: PaddedPanorama, landmarks: Indices, pixels: Array) -> None:
-        """Record the inliers (rows of the table) of an accepted panorama with their pixels (M, 2)."""
-        self.store.update_tracked(landmarks, pixels)
-        self._last = lower
+    def rows(self, ids: Indices) -> tuple[Indices, Flags]:
+        """Return the rows (M,) of those landmarks that are still kept, and which (N,) of the ids these are."""
+        rows = np.searchsorted(self.table.id, ids)
+        known = np.isin(ids, self.table.id)
+        return rows[known], known
+
+    def replace_views(self, ids: Indices, views: Array, noise: Array) -> None:
+        """Set the views (N, 3) [px] of landmarks (ids) in their anchors, and their noise as in `add_keyframe`.
+
+        Where a view cannot be triangulated the landmark stays as it is.
+        """
+        rows, known = self.rows(ids)
+        points = triangulate(views[known], self._model.cylinder, self._model.baseline_m)
+        finite = np.isfinite(points).all(axis=1)
+        rows, points, views, noise = rows[finite], points[finite], views[known][finite], noise[known][finite]
+        spread = point_covariance(points, self._model.cylinder, self._model.baseline_m, self._model.sigma_px, noise)
+        self.table.views[rows] = views
+        self._place(rows, points, spread)
+
+    def update_depths(self, rows: Indices, disparity: Array, variance: Array, T_odom_rect: Array) -> None:
+        """Correct the points of landmarks (rows (M,) of the table) by disparities (M,) [px] measured at a pose.
+
+        variance (M,) [px^2] of the disparities; NaN disparities are ignored. A Kalman update of each point in its
+        anchor's frame, by the disparity alone: that depends on the depth, and hardly on the error of the pose. The
+        errors of one texture are alike from frame to frame, so each counts as several times as uncertain.
+        """
+        known = np.isfinite(disparity)
+        rows, disparity, variance = rows[known], disparity[known], variance[known]
+        # 1. The disparity f t / r as predicted, and its derivatives by the point in the anchor.
+        T_curr_anchor, points = self.from_anchors(se3.inverse(T_odom_rect), rows), self.table.anchor_points[rows]
+        P = self.table.anchor_covariance[rows]
+        seen = (T_curr_anchor[:, :3, :3] @ points[:, :, None])[:, :, 0] + T_curr_anchor[:, :3, 3]
+        r2 = np.maximum((seen[:, :2] ** 2).sum(axis=1), MIN_RADIUS2_M2)
+        predicted = self._model.cylinder.focal_px * self._model.baseline_m / np.sqrt(r2)
+        H = np.einsum("ni,nij->nj", -(predicted / r2)[:, None] * seen[:, :2], T_curr_anchor[:, :2, :3])
+        # 2. The update, without outliers.
+        PH = np.einsum("nij,nj->ni", P, H)
+        S = (H * PH).sum(axis=1) + CORRELATED_FRAMES * (variance + 2 * self._model.sigma_px**2)
+        innovation = disparity - predicted
+        right = innovation**2 < OUTLIER_SQUARED * S
+        rows, gain = rows[right], (PH / S[:, None])[right]
+        points = points[right] + gain * innovation[right, None]
+        self._place(rows, points, P[right] - gain[:, :, None] * PH[right, None])
+
+    def _place(self, rows: Indices, points: Array, covariance: Array) -> None:
+        """Set points (M, 3) and covariances (M, 3, 3) of landmarks (rows) in their anchors, and so in odom."""
+        table, T_odom_anchor = self.table, self.from_anchors(np.eye(4), rows)
+        table.anchor_points[rows], table.anchor_covariance[rows] = points, covariance
+        R = T_odom_anchor[:, :3, :3]
+        table.points[rows] = (R @ points[:, :, None])[:, :, 0] + T_odom_anchor[:, :3, 3]
+        table.covariance[rows] = R @ covariance @ np.swapaxes(R, 1, 2)
+
+    def update_tracked(self, lower: PaddedPanorama, rows: Indices, pixels: Array) -> None:
+        """Record the inliers (rows of the table) of an accepted panorama with their pixels (M, 2).
+
+        Landmarks that were no inliers in max_misses consecutive frames are removed.
+        """
+        table, self.last = self.table, lower
+        table.pixels[:] = np.nan
+        table.pixels[rows] = pixels
+        table.misses[:] += 1
+        table.misses[rows] = 0
+        if (table.misses >= self._max_misses).any():
+            self._select(table.misses < self._max_misses)
+
+    def give_up(self, rows: Indices) -> None:
+        """Let landmarks (rows of the table) be removed at the next `update_tracked`, unless they are inliers in it."""
+        self.table.misses[rows] = self._max_misses
+
+    def from_anchors(self, T_rect_odom: Array, rows: Indices) -> Array:
+        """Return the transforms (M, 4, 4) into a rectified frame from the anchors of landmarks (rows of the table)."""
+        seqs = sorted(self.keyframes)
+        poses = np.array([self.keyframes[seq].T_odom_rect for seq in seqs]).reshape(-1, 4, 4)
+        return np.asarray((T_rect_odom @ poses)[np.searchsorted(np.array(seqs, np.intp), self.table.anchor[rows])])
+
+    def _select(self, kept: Flags) -> None:
+        """Keep some landmarks (flags (N,)) and the keyframes that anchor them."""
+        self.table = _selected(self.table, kept)
+        anchors = set(self.table.anchor.tolist())
+        self.keyframes = {seq: keyframe for seq, keyframe in self.keyframes.items() if seq in anchors}
 
     def track(
         self, lower: PaddedPanorama, T_odom_rect: Array, most: int | None = None, *, turn: int = 0, near: bool = False
@@ -96,27 +253,27 @@ class LocalMap:
         good to a few pixels, so that no pyramid is needed; where it is not, wrong tracks pass the check.
         """
         rows, predicted = self.visible(T_odom_rect)
-        known = np.isfinite(self.store.table.pixels[rows, 0])
+        known = np.isfinite(self.table.pixels[rows, 0])
         rows, predicted = rows[known], predicted[known]
         count = len(rows)
         if most is not None:
             every = max(1, -(-count // most))
-            chosen = np.flatnonzero((self.store.table.id[rows] + turn) % every == 0)
+            chosen = np.flatnonzero((self.table.id[rows] + turn) % every == 0)
             rows, predicted = rows[chosen], predicted[chosen]
-        if self._last is None:
+        if self.last is None:
             return Tracks(rows[:0], np.zeros((0, 2)), predicted[:0], 0)
-        before = self.store.table.pixels[rows]
-        pixels, found = track(self._last, lower, before, predicted[:, :2], self._near_klt if near else self._coarse_klt)
+        before = self.table.pixels[rows]
+        pixels, found = track(self.last, lower, before, predicted[:, :2], self._near_klt if near else self._coarse_klt)
         return Tracks(rows[found], pixels[found], predicted[found], len(rows), count / max(1, len(rows)))
 
     def last_seen(self, most: int) -> tuple[PaddedPanorama | None, Indices]:
         """Return the last panorama, and about `most` evenly chosen landmarks (M,) that were found in it."""
-        rows = np.flatnonzero(np.isfinite(self.store.table.pixels[:, 0]))
-        return self._last, rows[:: max(1, -(-len(rows) // most))]
+        rows = np.flatnonzero(np.isfinite(self.table.pixels[:, 0]))
+        return self.last, rows[:: max(1, -(-len(rows) // most))]
 
     def visible(self, T_odom_rect: Array) -> tuple[Indices, Array]:
         """Return the landmarks (M,) that a pose predicts in live parts of the panorama, and their views (M, 3) [px]."""
-        points = se3.apply(se3.inverse(T_odom_rect), self.store.table.points)
+        points = se3.apply(se3.inverse(T_odom_rect), self.table.points)
         predicted = view(points, self._model.cylinder, self._model.baseline_m)
         bottom = self._model.cylinder.height - 1 - EDGE_ROWS
         is_inside = (predicted[:, 1] > EDGE_ROWS) & (predicted[:, 1] < bottom)
@@ -134,9 +291,9 @@ class LocalMap:
 
         predicted (M, 2): their pixels by that pose. A patch is found where it has texture and moved little from there.
         """
-        table, keyframes = self.store.table, self.store.keyframes
+        table, keyframes = self.table, self.keyframes
         anchors = table.anchor[landmarks]
-        T_curr_ref = self.store.from_anchors(se3.inverse(T_odom_rect), landmarks)
+        T_curr_ref = self.from_anchors(se3.inverse(T_odom_rect), landmarks)
         surfaces = table.anchor_points[landmarks], table.slopes[landmarks]
         images = {seq: keyframe.lower for seq, keyframe in keyframes.items()}
         templates = plane_templates(
@@ -146,27 +303,27 @@ class LocalMap:
 
     def slopes(self, T_odom_rect: Array, landmarks: Indices) -> Array:
         """Return the slopes (M, 2) of the disparity of landmarks (M,) [px/px] in a panorama with that pose."""
-        table, T_curr_ref = self.store.table, self.store.from_anchors(se3.inverse(T_odom_rect), landmarks)
+        table, T_curr_ref = self.table, self.from_anchors(se3.inverse(T_odom_rect), landmarks)
         return moved_slopes((table.anchor_points[landmarks], table.slopes[landmarks]), T_curr_ref, self._model)
 
     def covariance_of(self, estimate: PoseEstimate) -> Array:
         """Return the covariance (6, 6) that the keyframes in which the inliers are anchored pass on to a pose."""
-        shares = self.store.anchor_shares(estimate.landmarks)
-        if not shares:
+        anchors, counts = np.unique(self.table.anchor[estimate.landmarks], return_counts=True)
+        if not len(anchors):
             return np.zeros((6, 6))
-        keyframes = [self.store.keyframes[seq] for seq in shares]
+        keyframes = [self.keyframes[seq] for seq in anchors.tolist()]
         poses = np.array([keyframe.T_odom_rect for keyframe in keyframes])
         covariance = np.array([keyframe.covariance for keyframe in keyframes])
         A = se3.adjoint(se3.inverse(estimate.T_odom_rect) @ poses)
-        weighted = np.array(list(shares.values()))[:, None, None] * A
+        weighted = (counts / counts.sum())[:, None, None] * A
         return np.asarray((weighted @ covariance @ np.swapaxes(A, 1, 2)).sum(axis=0))
 
 
 class LateDepths:
-    """Measurements of the last frame of the landmarks in a store; at most one frame waits."""
+    """Measurements of the last frame of the landmarks of a map; at most one frame waits."""
 
-    def __init__(self, store: LandmarkStore) -> None:
-        self._store = store
+    def __init__(self, local_map: LocalMap) -> None:
+        self._map = local_map
         self.clear()
 
     def clear(self) -> None:
@@ -178,7 +335,7 @@ class LateDepths:
         """Correct the depths of the landmarks (N,) of an estimate, at once or when the velocity is known."""
         if estimate.assumed.is_final:
             disparity = estimate.views[:, 2] - estimate.views[:, 1]
-            self._store.update_depths(estimate.landmarks, disparity, estimate.variance, estimate.T_odom_rect)
+            self._map.update_depths(estimate.landmarks, disparity, estimate.variance, estimate.T_odom_rect)
         else:
             self._seen = ids, estimate
 
@@ -192,13 +349,25 @@ class LateDepths:
             ids, new = self._added
             assumed, J = new.assumed
             views = new.views + J @ (velocity.twist - assumed.twist)
-            self._store.replace_views(ids, views, new.noise + J @ velocity.covariance @ np.swapaxes(J, 1, 2))
+            self._map.replace_views(ids, views, new.noise + J @ velocity.covariance @ np.swapaxes(J, 1, 2))
         if self._seen is not None:
             ids, estimate = self._seen
             assumed, J = estimate.assumed
             known = assumed if velocity is None else velocity
             disparity = estimate.views[:, 2] - estimate.views[:, 1] + J @ (known.twist - assumed.twist)
             variance = estimate.variance + np.einsum("ni,ij,nj->n", J, known.covariance, J)
-            rows, kept = self._store.rows(ids)
-            self._store.update_depths(rows, disparity[kept], variance[kept], estimate.T_odom_rect)
+            rows, kept = self._map.rows(ids)
+            self._map.update_depths(rows, disparity[kept], variance[kept], estimate.T_odom_rect)
         self.clear()
+
+
+def _selected(table: LandmarkTable, kept: Flags) -> LandmarkTable:
+    """Return the rows of a table for which kept (N,) is true."""
+    return LandmarkTable(*(getattr(table, column.name)[kept] for column in fields(table)))
+
+
+def _joined(first: LandmarkTable, second: LandmarkTable) -> LandmarkTable:
+    """Return the rows of two tables."""
+    return LandmarkTable(
+        *(np.concatenate([getattr(first, column.name), getattr(second, column.name)]) for column in fields(first))
+    )

@@ -10,7 +10,7 @@ import numpy as np
 
 from calib import se3
 from omnid.core.odometry.estimates import PoseEstimate
-from omnid.core.odometry.landmarks import Keyframe
+from omnid.core.odometry.local_map import Keyframe
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.features import FEATURES, describe
 from omnid.core.places.place_map import PlaceFeatures

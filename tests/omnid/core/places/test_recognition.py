@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.landmarks import Keyframe
+from omnid.core.odometry.local_map import Keyframe
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.features import (
     FEATURES,
