@@ -20,7 +20,7 @@ landmarks that were seen since agree with it, and nothing shows it. So it stays 
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Final, Literal, NamedTuple
 
@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.local_map import LocalMap
-from omnid.core.odometry.plane_patches import AlignedPatches, align, plane_templates
+from omnid.core.odometry.plane_patches import align, plane_templates
 from omnid.core.odometry.tracking import KltSettings, track
 from omnid.core.stereo.triangulation import view, view_jacobian
 from omnid.core.types.panorama import PaddedPanorama
@@ -47,55 +47,44 @@ LAG_S: Final = 0.003  # standard deviation of the time between the exposures of 
 OUTLIER_SQUARED: Final = 32.0
 MOST_SCALE: Final = 25.0  # of the variance of flows: half a pixel; where it is larger, flows are displaced
 GOOD_SHARE: Final = 0.2  # of the flows, that no break displaces: of one camera, or up to a line
-GOOD_SQUARED: Final = -2 * math.log(1 - GOOD_SHARE)  # below which so many sums of two squares of unit variance are
-LINES: Final = 24  # lines that are tried: each has some ten landmarks between it and the next
-NEXT: Final = 4  # lines between two of these that are tried of a break that was found
+LINES, BETWEEN = 24, 4  # lines that are tried, and those between two of them, of a break that was found
 STEADY_PX: Final = 64  # spread of lines that are one line in the words about them
-LEAST, LEAST_EACH = 8, 3  # landmarks on either side of a line in the cameras, and in each
-# Flows that count as one, as landmarks' errors do in the covariance of a pose.
-CORRELATED: Final = 4.0
+LEAST: Final = 8  # flows on either side of a line in the cameras of a break
+CORRELATED: Final = 4.0  # flows that count as one, as landmarks' errors do in the covariance of a pose
 # Cost of a landmark (`PoseEstimate.cost`) whose view has the noise that is expected: the mean of the Cauchy kernel's.
 RIGHT_COST: Final = 0.31
-FOLLOWED: Final = 0.1  # part of a new pair in the mean of the costs
+FOLLOWED: Final = 0.2  # part of a new pair in the mean of the costs
 SURE: Final = math.log(1e6)  # least logarithm of the ratio of likelihoods: a false one in some days of driving
-# Landmarks whose patch is not near the prediction, as a share, from which on they are searched farther away. In right
-# images it is below 0.1.
-SEARCHED_SHARE: Final = 0.15
 FAR: Final = KltSettings(levels=2)  # 28 px
 EDGE_PX: Final = 8  # of the panorama, in which patches are cut
-REACH_PX: Final = 2
-SURE_PX: Final = 0.5  # by which a patch is off at most where no other place is tried
-KERNEL_WIDTH: Final = 2.0
 LEAST_PX: Final = 0.5  # by which what is beyond a line is displaced: less harms no pose
-LEAST_PART: Final = 0.5  # of a step, by which a part is displaced that is of another image
+LEAST_PART: Final = 0.5  # of a step, by which a part is displaced that is of another image; 1 / LEAST_PART at most
 LEAST_SHARE: Final = 0.2  # of the other camera's displacement, below which a camera has none
 ROUNDS: Final = 6
 RIDGE: Final = 1e-6
-LAG: Final = 6  # number of the lag among the parameters of the null hypothesis
 CAMERAS: Final = ("lower", "upper")
-SETS: Final[tuple[tuple[int, ...], ...]] = ((0,), (1,), (0, 1))
-BOTH_STEPS: Final = 2  # number of the difference of two steps among the parts of steps
+ONE, EACH = ((0,), (1,)), ((0,), (1,), (0, 1))  # cameras of a break
 
 
 class _Form(NamedTuple):
-    """A form that a break may have."""
+    """A form that a break may have: displacements along some of the columns of `_Flow.columns`."""
 
     kind: Kind
     axis: int  # of its line, 0: a row
-    lines: int  # that are tried
-    sets: tuple[tuple[int, ...], ...] = SETS
-    others: tuple[tuple[int, ...], ...] = ()  # cameras of which what is before the line may be displaced instead
-    column: int = 0  # of the parts of steps
+    columns: tuple[int, ...]
+    has_line: bool
+    sets: tuple[tuple[int, ...], ...] = EACH
 
 
+SHIFT, TURN, STEP, BEFORE, BOTH = (0, 1), 2, 3, 4, 5  # columns of flows
 # A torn image shows a step less where it begins, one more where it ends, and both where it lasts. Both images turned
-# alike are a turn of the rig.
+# alike are a turn of the rig. A rolling shutter makes a slope over rows (or columns) of both steps.
 FORMS: Final = (
-    *(_Form("torn", axis, LINES, SETS, SETS[:2], column) for axis in (0, 1) for column in range(BOTH_STEPS + 1)),
-    *(_Form("displaced", axis, LINES, SETS, SETS[:2]) for axis in (0, 1)),
-    *(_Form("rolling", axis, 1) for axis in (0, 1)),
-    _Form("displaced", 0, 1),
-    _Form("turned", 0, 1, SETS[:2]),
+    *(_Form("torn", axis, (part,), True) for axis in (0, 1) for part in (STEP, BEFORE, BOTH)),
+    *(_Form("displaced", axis, SHIFT, True) for axis in (0, 1)),
+    *(_Form("rolling", axis, (6 + 2 * axis, 7 + 2 * axis), False) for axis in (0, 1)),
+    _Form("displaced", 0, SHIFT, False),
+    _Form("turned", 0, (*SHIFT, TURN), False, ONE),
 )
 
 
@@ -128,9 +117,8 @@ class Break(NamedTuple):
     cameras: tuple[int, ...]  # 0: lower, 1: upper
     axis: int  # 0: the line is a row, 1: a column
     line_px: int  # of the raw image; 0: the whole image
-    amount: Array  # (C, 2) raw px, or parts of the step to this pair and of the one before; (C, 3): and turn, rad
+    amount: Array  # (C, K) raw px, and turn, rad; or parts of the step to this pair or of the one before
     angle_rad: float  # by which what is beyond is displaced in view, mean
-    evidence: float  # logarithm of the ratio of likelihoods
     is_before: bool = False  # what is before the line is displaced, and not what is beyond
     late: float = 0.0  # steps by which what is beyond is earlier now, and was not in the pair before
 
@@ -156,15 +144,15 @@ class _View(NamedTuple):
 
 
 class _Flow(NamedTuple):
-    """Flows of landmarks that are not explained by the step, whitened; rows of all cameras."""
+    """Flows of landmarks that are not explained by the step, in standard deviations; rows of all cameras."""
 
     y: Array  # (N, 2)
     null: Array  # (N, 2, 7) derivatives by the step's error, and by the lag of the upper camera
-    shift: Array  # (N, 2, 2) by a shift in the raw image
-    steps: Array  # (N, 2, 3) by parts of the step, of that before, and of their difference
-    turn: Array  # (N, 2, 1) by a turn of the raw image about its middle
+    # (N, 2, 10) by a shift and a turn of the raw image, by parts of the step, of that before, and of their difference,
+    # and by both steps over the rows and columns of the raw image
+    columns: Array
     camera: Indices  # (N,)
-    raw: Array  # (N, 2) px
+    place: Array  # (N, 2) in parts of the raw image: column, row
     px: Array  # (N,) standard deviations
 
 
@@ -180,8 +168,7 @@ class ImageBreaks:
     _confirmed: Indices = field(default_factory=lambda: np.zeros(0, np.intp))  # ids of landmarks
     _open: list[Break] = field(default_factory=list)
     _usual_cost: float = RIGHT_COST  # of a landmark in whole images
-    _pairs: Counter[tuple[Kind, tuple[int, ...], int]] = field(default_factory=Counter)
-    _lines: dict[tuple[Kind, tuple[int, ...], int], list[Break]] = field(default_factory=dict)
+    _found: dict[tuple[Kind, tuple[int, ...], int], list[Break]] = field(default_factory=dict)
 
     def add(
         self,
@@ -191,8 +178,8 @@ class ImageBreaks:
         local_map: LocalMap,
         dt_s: float,
         cost: tuple[float, int] | None,
-    ) -> Break | None:
-        """Use a pair (seq: its number) with its pose, dt_s after the one before; return the break that it shows.
+    ) -> None:
+        """Use a pair (seq: its number) with its pose, dt_s after the one before.
 
         cost: mean of the landmarks in view, and their number, None: no pose was found. A break costs at least as much
         as it must explain to be believed: where the views fit as usual there is none, and no flow is measured.
@@ -208,7 +195,7 @@ class ImageBreaks:
             self._usual_cost = min(usual, RIGHT_COST)  # a run whose images are broken from the start is not usual
         self._spread(last, step, found)
         # Landmarks that were an inlier after they were added: of others the depth may be wrong, and so the flow.
-        table = local_map.store.table
+        table = local_map.table
         is_confirmed = ((table.misses == 0) & (table.anchor != seq)) | np.isin(table.id, self._confirmed)
         self._confirmed = table.id[is_confirmed]
         rows, _ = local_map.visible(T_odom_rect)
@@ -216,12 +203,11 @@ class ImageBreaks:
         rows = rows[:: max(1, -(-len(rows) // MOST))]
         slopes = local_map.slopes(T_odom_rect, rows)
         self._last = _View(pair, T_odom_rect, table.points[rows], table.covariance[rows], slopes, step)
-        return found
 
     @property
     def words(self) -> list[str]:
         """One line for each kind of break and the cameras that showed it."""
-        return [_words(breaks, self._pairs[key]) for key, breaks in self._lines.items()]
+        return [_words(breaks) for breaks in self._found.values()]
 
     def _spread(self, last: _View | None, step: Array, found: Break | None) -> None:
         """Add what a break makes uncertain.
@@ -231,15 +217,14 @@ class ImageBreaks:
         """
         if found is not None:
             key = found.kind, found.cameras, found.axis if found.line_px else 0
-            self._pairs[key] += 1
-            self._lines.setdefault(key, []).append(found)
-            undone = [earlier for earlier in self._open if earlier.is_undone_by(found)]
-            for earlier in undone:
-                self._open.remove(earlier)
-            if not undone and not any(_is_same(earlier, found) for earlier in self._open):
+            self._found.setdefault(key, []).append(found)
+            before = self._open
+            self._open = [earlier for earlier in before if not earlier.is_undone_by(found)]
+            is_known = any((each.kind, each.cameras) == ("torn", found.cameras) == key[:2] for each in self._open)
+            if len(self._open) == len(before) and not is_known:
                 self._open.append(found)
         now = [*self._open, *([] if found is None else [found])]
-        self.fault = _words(now[-1:], 1) if now else ""
+        self.fault = _words(now[-1:]) if now else ""
         if last is None or not (now or self.covariance.any()):
             return
         A = se3.adjoint(se3.exp(-step))
@@ -256,41 +241,41 @@ class ImageBreaks:
     ) -> _Flow | None:
         """Return the flows of the last pair's landmarks; None: too few. lag: standard deviation in parts of a step."""
         cylinder, baseline_m = self.model.cylinder, self.model.baseline_m
-        T_last = last.T_odom_rect
-        before, now = (se3.apply(se3.inverse(T), last.points) for T in (T_last, T_now))
+        before, now = (se3.apply(se3.inverse(T), last.points) for T in (last.T_odom_rect, T_now))
         views = tuple(view(points, cylinder, baseline_m) for points in (before, now))
         J_before, J_now = (view_jacobian(points, cylinder, baseline_m) for points in (before, now))
         of_step = np.concatenate([np.broadcast_to(-np.eye(3), (len(now), 3, 3)), se3.hat(now)], axis=2)
-        of_point = J_now @ T_now[:3, :3].T - J_before @ T_last[:3, :3].T
+        of_point = J_now @ T_now[:3, :3].T - J_before @ last.T_odom_rect[:3, :3].T
         parts = []
-        for camera in (0, 1):
-            # 1. Landmarks that both pairs show, and where the step puts them.
+        for camera, raw_image in enumerate(self.raws):
+            # 1. Landmarks that both pairs show, and where they are instead of where the step puts them.
             own = [0, 1 + camera]
             start, end = views[0][:, own], views[1][:, own]
-            raw, by_raw = self.raws[camera].at(end)
+            raw, by_raw = raw_image.at(end)
             inside = np.isfinite(raw).all(axis=1)
             for pixels in (start, end):
                 inside &= (pixels[:, 1] > EDGE_PX) & (pixels[:, 1] < cylinder.height - EDGE_PX)
                 inside &= cylinder.shows(pixels[:, 0])
             rows = np.flatnonzero(inside)
-            # 2. Where they are.
-            there, found = self._found(camera, last, pair, T_now, before, rows, (start, end))
+            there, found = self._found_at(camera, last, pair, T_now, before[rows], rows, (start[rows], end[rows]))
             rows, d = rows[found], there[found] - end[rows[found]]
             d[:, 0] = cylinder.wrap(d[:, 0])
-            # 3. Derivatives, in standard deviations.
+            # 2. Derivatives, in standard deviations.
             noise = np.einsum("nij,njk,nik->ni", of_point[rows][:, own], last.covariance[rows], of_point[rows][:, own])
             px = np.sqrt(SIGMA_PX**2 + noise.mean(axis=1))
-            J = J_now[rows][:, own] @ of_step[rows] / px[:, None, None]
-            shift = by_raw[rows] / px[:, None, None]
+            J, shift = J_now[rows][:, own] @ of_step[rows] / px[:, None, None], by_raw[rows] / px[:, None, None]
             steps = np.stack([J @ step, J @ last.step, J @ (step - last.step)], axis=2)
-            arm = raw[rows] - (np.array(self.raws[camera].size) - 1) / 2
+            size = np.array(raw_image.size)
+            arm, place = raw[rows] - (size - 1) / 2, raw[rows] / size
             turn = shift @ np.column_stack([-arm[:, 1], arm[:, 0]])[:, :, None]
+            over = [(place[:, 1 - axis] - 0.5)[:, None, None] * steps[:, :, :2] for axis in (0, 1)]
             null = np.concatenate([J, lag * camera * steps[:, :, :1]], axis=2)
-            parts.append(_Flow(d / px[:, None], null, shift, steps, turn, np.full(len(rows), camera), raw[rows], px))
+            columns = np.concatenate([shift, turn, steps, *over], axis=2)
+            parts.append(_Flow(d / px[:, None], null, columns, np.full(len(rows), camera), place, px))
         flow = _Flow(*(np.concatenate(part) for part in zip(*parts, strict=True)))
         return flow if len(flow.y) >= 3 * LEAST else None
 
-    def _found(
+    def _found_at(
         self,
         camera: int,
         last: _View,
@@ -298,288 +283,197 @@ class ImageBreaks:
         T_now: Array,
         before: Array,
         rows: Indices,
-        views: tuple[Array, Array],
+        seen: tuple[Array, Array],
     ) -> tuple[Array, Flags]:
         """Return the pixels (M, 2) of landmarks (rows (M,)) in a camera's panorama, and flags (M,): they were found.
 
-        Their patches in the last one are bent as the step bends them. The upper camera is like a lower one whose frame
-        is higher by the baseline, in which slopes are those over its own rows.
+        before (M, 3) [m]: in the last rectified frame; seen (M, 2), (M, 2): before, and as the step predicts. They are
+        tracked from there, else as if the rig had stood, as torn images show it. Then their patches are aligned, bent
+        as the step bends them; those that were not tracked where the step predicts them.
         """
-        there, off_px = np.full((len(rows), 2), np.nan), np.full(len(rows), np.inf)
-        T_as_before = last.T_odom_rect @ se3.exp(last.step)
-        # 1. As the step predicts; else as if the rig had stood, or gone on as before: what a torn image shows.
-        for T in (T_now, last.T_odom_rect, T_as_before):
-            rest = np.flatnonzero(off_px > SURE_PX)
-            if len(rest) < LEAST:
-                break
-            end, aligned = self._aligned(camera, last, pair, T, before, rows[rest])
-            by_px = np.where(aligned.found, np.linalg.norm(aligned.pixels - end, axis=1), np.inf)
-            nearer = by_px < off_px[rest]
-            there[rest[nearer]], off_px[rest[nearer]] = aligned.pixels[nearer], by_px[nearer]
-        found = np.isfinite(off_px)
-        # 2. Else farther away: what a displaced image shows.
-        for T in (T_now, T_as_before):
+        start, end = seen
+        there, found = end.copy(), np.zeros(len(rows), bool)
+        for guess in (end, start):
             rest = np.flatnonzero(~found)
-            if len(rest) > SEARCHED_SHARE * len(rows):
-                own = [0, 1 + camera]
-                end = self._views(se3.apply(se3.inverse(T), last.points[rows[rest]]))[:, own]
-                tracked, is_good = track(last.pair[camera], pair[camera], views[0][rows[rest]], end, FAR)
-                there[rest[is_good]], found[rest[is_good]] = tracked[is_good], True
-        return there, found
-
-    def _aligned(
-        self,
-        camera: int,
-        last: _View,
-        pair: tuple[PaddedPanorama, PaddedPanorama],
-        T_now: Array,
-        before: Array,
-        rows: Indices,
-    ) -> tuple[Array, AlignedPatches]:
-        """Return where patches of landmarks (rows (M,)) are in a camera's panorama if the rig is at T_now: (M, 2) px.
-
-        Also where they are found near by.
-        """
+            tracked, found[rest] = track(last.pair[camera], pair[camera], start[rest], guess[rest], FAR)
+            there[found & np.isin(np.arange(len(rows)), rest)] = tracked[found[rest]]
+        # The upper camera is like a lower one whose frame is higher, in which slopes are those over its own rows.
         up, slopes = np.eye(4), last.slopes[rows]
         if camera:
             up[2, 3] = -self.model.baseline_m
             slopes = slopes / (1.0 + slopes[:, 1:])
-        T_now_last = up @ se3.inverse(T_now) @ last.T_odom_rect @ se3.inverse(up)
-        one, points = np.zeros(len(rows), np.intp), se3.apply(up, before[rows])
-        start, end = (self.model.cylinder.pixels(each) for each in (points, se3.apply(T_now_last, points)))
-        moved, surfaces = np.tile(T_now_last, (len(rows), 1, 1)), (points, slopes)
-        templates = plane_templates({0: last.pair[camera]}, one, start, surfaces, moved, self.model, end)
-        return end, align(templates, pair[camera], end, one, REACH_PX)
-
-    def _views(self, points: Array) -> Array:
-        return view(points, self.model.cylinder, self.model.baseline_m)
+        T_now_last = np.tile(up @ se3.inverse(T_now) @ last.T_odom_rect @ se3.inverse(up), (len(rows), 1, 1))
+        one, surfaces = np.zeros(len(rows), np.intp), (se3.apply(up, before), slopes)
+        templates = plane_templates({0: last.pair[camera]}, one, start, surfaces, T_now_last, self.model, there)
+        aligned = align(templates, pair[camera], there, one)
+        return np.where(aligned.found[:, None], aligned.pixels, there), aligned.found | found
 
 
 def likeliest_break(flow: _Flow, raws: tuple[RawImage, RawImage], focal_px: float) -> Break | None:
     """Return the break that flows show beyond doubt; None: there is none."""
+    # 1. The null hypothesis, robustly, from no error and from that of all flows; the scale of what it leaves.
     y, null = flow.y, flow.null
-    # 1. The null hypothesis, robustly; the scale of what it leaves.
-    size = null.shape[2]
-    weak = null.reshape(-1, size)
-    information = weak.T @ weak + np.diag(_prior(size))
-    everywhere: Array = np.asarray(np.linalg.solve(information, weak.T @ y.ravel()), float)
-    nowhere: Array = np.zeros(size)
-    solutions = [_robust(null, y, start) for start in (nowhere, everywhere)]
-    lefts = [y - null @ solution for solution in solutions]
-    costs = [np.minimum((each**2).sum(axis=1), OUTLIER_SQUARED * MOST_SCALE).sum() for each in lefts]
-    x, left = (each[int(np.argmin(costs))] for each in (solutions, lefts))
-    squared = (left**2).sum(axis=1)
-    scale = float(np.clip(np.quantile(squared, GOOD_SHARE) / GOOD_SQUARED, 1.0, MOST_SCALE))
+    starts = (np.zeros(null.shape[2]), _least_squares(null, y, np.ones(len(y))))
+    lefts = [y - null @ _robust(null, y, start) for start in starts]
+    squares = [(left**2).sum(axis=1) for left in lefts]
+    # A step that is wrong must explain much more to be believed.
+    costs = [np.minimum(each, OUTLIER_SQUARED * MOST_SCALE).sum() for each in squares]
+    best = int(costs[1] < costs[0] / 2)
+    left, squared = lefts[best], squares[best]
+    # So many sums of two squares of unit variance are below -2 log(1 - GOOD_SHARE).
+    scale = float(np.clip(np.quantile(squared, GOOD_SHARE) / (-2 * math.log(1 - GOOD_SHARE)), 1.0, MOST_SCALE))
     outlier = OUTLIER_SQUARED * scale
-    used = squared < outlier
-    most_off = int(np.bincount(flow.camera[~used], minlength=2).argmax())
-    least_cost = _cost(2, len(y))
-    if np.minimum(squared, outlier).sum() / (2 * scale * CORRELATED) < SURE + least_cost:
+    if np.minimum(squared, outlier).sum() / (2 * scale * CORRELATED) < SURE + _cost(2, len(y)):
         return None  # no break explains more than all that is left
     # 2. Of its outliers, those that one other motion explains belong to a part; others, as people, to none.
-    for cameras in SETS:
+    used = squared < outlier
+    most_off = int(np.bincount(flow.camera[~used], minlength=2).argmax())
+    for cameras in EACH:
         rest = np.flatnonzero((squared >= outlier) & np.isin(flow.camera, cameras))
         if len(rest) < LEAST:
             continue
-        each = np.linalg.solve(flow.shift[rest] + RIDGE * np.eye(2), left[rest][:, :, None])[:, :, 0]
-        starts = [(flow.shift[rest], np.median(each, axis=0))]
-        for other in (*np.moveaxis(flow.steps[rest], 2, 0), flow.turn[rest][:, :, 0]):
-            along = (other * left[rest]).sum(axis=1) / np.maximum((other**2).sum(axis=1), RIDGE)
-            starts.append((other[:, :, None], np.array([np.median(along)])))
-        for columns, start in starts:
-            amount = _robust(columns, left[rest], start)
-            used[rest] |= ((left[rest] - columns @ amount) ** 2).sum(axis=1) < outlier
-    # 3. The likeliest line of each kind, by least squares.
-    likely = [candidate for candidate in _candidates(flow, used, left, scale, raws) if candidate.gain >= SURE]
-    # One image displaced is the other one displaced the other way, and a step: it is that in which the step is not.
-    likely = [each for each in likely if each.part or each.form.lines > 1 or each.cameras != (1 - most_off,)]
-    if not any(candidate.form.kind != "rolling" for candidate in likely):
-        return None
-    # 4. The robust likelihood of each, also at the lines next to it.
-    gained, columns, both, best = -math.inf, null, x, likely[0]
+        for own in (SHIFT, (TURN,), (STEP,), (BEFORE,), (BOTH,)):
+            F, off = flow.columns[rest][:, :, own], left[rest]
+            along = np.swapaxes(F, 1, 2)
+            each = np.linalg.solve(along @ F + RIDGE * np.eye(len(own)), along @ off[:, :, None])[:, :, 0]
+            amount = _robust(F, off, np.median(each, axis=0))
+            used[rest] |= ((off - F @ amount) ** 2).sum(axis=1) < outlier
+    # 3. The likeliest line of each form, by least squares; the robust likelihood of each, also at the lines next to it.
+    found: tuple[float, _Candidate, Array, Array] | None = None
     for form in FORMS:
-        first = max((candidate for candidate in likely if candidate.form == form), key=_gain, default=None)
-        between = np.arange(-NEXT, NEXT + 1) / (LINES * NEXT)
-        if first is None:
-            continue
-        for part in first.part + between if first.part else [0.0]:
-            candidate = first._replace(part=float(part))
-            tried = np.concatenate([null, *candidate.columns(flow, raws)], axis=2)
-            size = tried.shape[2]
-            start = np.linalg.lstsq(tried[used].reshape(-1, size), y[used].ravel(), rcond=None)[0]
-            solution = _robust(tried, y, start)
-            rest = ((y - tried @ solution) ** 2).sum(axis=1)
-            gain = float((np.minimum(squared, outlier) - np.minimum(rest, outlier)).sum())
-            gain = gain / (2 * scale * CORRELATED) - candidate.cost
-            if gain > gained:
-                gained, columns, both, best = gain, tried, solution, candidate
-    amount = both[null.shape[2] :].reshape(len(best.cameras), -1)
-    form = best.form
-    if gained < SURE or form.kind == "rolling" or (form.kind == "torn" and not _is_a_step(amount)):
+        likely = [each for each in _candidates(form, flow, used, left, scale) if each.gain >= SURE]
+        # One image displaced is the other one displaced the other way, and a step: it is that in which the step is not.
+        likely = [each for each in likely if each.line or form.has_line or each.cameras != (1 - most_off,)]
+        first = max(likely, key=lambda each: each.gain, default=None)
+        for line in () if first is None else first.near_lines():
+            assert first is not None
+            candidate = first._replace(line=line)
+            tried = np.concatenate([null, candidate.columns(flow)], axis=2)
+            solution = _robust(tried, y, _least_squares(tried, y, used.astype(float)))
+            rest_squared = ((y - tried @ solution) ** 2).sum(axis=1)
+            gained = float((np.minimum(squared, outlier) - np.minimum(rest_squared, outlier)).sum())
+            gain = gained / (2 * scale * CORRELATED) - _cost(tried.shape[2] - null.shape[2], int(used.sum()))
+            if found is None or gain > found[0]:
+                found = gain, candidate, solution[null.shape[2] :], tried[:, :, null.shape[2] :]
+    return None if found is None or found[0] < SURE else _break(flow, raws, focal_px, *found[1:])
+
+
+def _break(
+    flow: _Flow, raws: tuple[RawImage, RawImage], focal_px: float, best: _Candidate, solution: Array, columns: Array
+) -> Break | None:
+    """Return the break of the likeliest candidate; None: it is a rolling shutter, or too small to harm a pose."""
+    form, amount = best.form, solution.reshape(len(best.cameras), -1)
+    if form.kind == "rolling" or (form.kind == "torn" and not _is_a_step(np.abs(amount).max(keepdims=True)).all()):
         return None
-    # 5. Cameras that have a share in it.
-    moved = (columns[:, :, null.shape[2] :] @ both[null.shape[2] :]) * flow.px[:, None]
-    moved_px = np.linalg.norm(moved, axis=1)
+    # Cameras that have a share in it.
+    moved_px = np.linalg.norm((columns @ solution) * flow.px[:, None], axis=1)
     mean_px = [float(moved_px[(flow.camera == camera) & (moved_px > 0)].mean()) for camera in best.cameras]
     shares = [number for number, px in enumerate(mean_px) if px > LEAST_SHARE * max(mean_px)]
-    cameras = tuple(best.cameras[number] for number in shares)
     if max(mean_px) < LEAST_PX:
         return None
-    line_px = round(best.part * raws[cameras[0]].size[1 - form.axis])
-    angle_rad = max(mean_px) / focal_px
-    late = (0.0 if form.column == BOTH_STEPS else -float(amount[shares].mean())) if form.kind == "torn" else 0.0
-    return Break(form.kind, cameras, form.axis, line_px, amount[shares], angle_rad, gained, best.is_before, late)
+    cameras, is_late = tuple(best.cameras[number] for number in shares), form.columns[0] in (STEP, BEFORE)
+    line_px = round(best.line * raws[cameras[0]].size[1 - form.axis])
+    late = -float(amount[shares].mean()) if form.kind == "torn" and is_late else 0.0
+    return Break(form.kind, cameras, form.axis, line_px, amount[shares], max(mean_px) / focal_px, best.is_before, late)
 
 
-def _is_a_step(amount: Array) -> bool:
-    """True if a part is displaced by about a step in one of the cameras: a rolling shutter displaces it by less."""
-    return LEAST_PART < float(np.abs(amount).max()) < 1.0 / LEAST_PART
+def _is_a_step(parts: Array) -> Flags:
+    """True where a part (M,) of a step is about a step: a rolling shutter displaces by less."""
+    return np.asarray((parts > LEAST_PART) & (parts < 1.0 / LEAST_PART))
 
 
 class _Candidate(NamedTuple):
     gain: float
     form: _Form
     cameras: tuple[int, ...]
-    part: float  # of the raw image that is before the line; 0: the break is of the whole image
-    cost: float
+    line: float  # part of the raw image that is before the line; 0: the break is of the whole image
     is_before: bool = False  # what is before the line is displaced
 
-    def columns(self, flow: _Flow, raws: tuple[RawImage, RawImage]) -> list[Array]:
-        """Return the derivatives (N, 2, K) of flows by the amount of each camera."""
-        of = _columns(flow, raws)[:, :, _own_columns(self.form)]
-        sizes = np.array([raw.size[1 - self.form.axis] for raw in raws])
-        where = (flow.raw[:, 1 - self.form.axis] >= self.part * sizes[flow.camera]) != self.is_before
-        return [of * (where & (flow.camera == camera))[:, None, None] for camera in self.cameras]
+    def columns(self, flow: _Flow) -> Array:
+        """Return the derivatives (N, 2, C K) of flows by the amounts of each camera."""
+        where = (flow.place[:, 1 - self.form.axis] >= self.line) != self.is_before
+        return np.asarray(_of_cameras(flow, self.form, self.cameras) * where[:, None, None])
+
+    def near_lines(self) -> list[float]:
+        """Return the line and those up to the next ones that were tried."""
+        if not self.form.has_line:
+            return [self.line]
+        return [self.line + k / (LINES * BETWEEN) for k in range(1 - BETWEEN, BETWEEN)]
 
 
-def _gain(candidate: _Candidate) -> float:
-    return candidate.gain
+def _of_cameras(flow: _Flow, form: _Form, cameras: tuple[int, ...]) -> Array:
+    """Return the derivatives (N, 2, C K) of flows in the whole image by the amounts of a form in each camera."""
+    F = flow.columns[:, :, form.columns]
+    return np.concatenate([F * (flow.camera == camera)[:, None, None] for camera in cameras], axis=2)
 
 
-def _columns(flow: _Flow, raws: tuple[RawImage, RawImage]) -> Array:
-    """Return the derivatives (N, 2, 10) of flows: by shift and turn, parts of steps, slopes over rows and columns."""
-    slopes = []
-    for axis in (0, 1):
-        along = np.array([raw.size[1 - axis] for raw in raws])[flow.camera]
-        slopes.append((flow.raw[:, 1 - axis] / along - 0.5)[:, None, None] * flow.steps[:, :, :2])
-    return np.concatenate([flow.shift, flow.turn, flow.steps, *slopes], axis=2)
-
-
-def _own_columns(form: _Form) -> slice:
-    """Return which of these columns the amount of a form of break has."""
-    match form.kind:
-        case "displaced":
-            return slice(2)
-        case "turned":
-            return slice(3)
-        case "torn":
-            return slice(3 + form.column, 4 + form.column)
-        case "rolling":
-            return slice(6 + 2 * form.axis, 8 + 2 * form.axis)
-
-
-def _candidates(
-    flow: _Flow, used: Flags, left: Array, scale: float, raws: tuple[RawImage, RawImage]
-) -> list[_Candidate]:
-    """Return the likeliest line of each form and set of cameras, by least squares over the flows that are used.
+def _candidates(form: _Form, flow: _Flow, used: Flags, left: Array, scale: float) -> Iterator[_Candidate]:
+    """Yield the likeliest line of a form for each set of cameras and side, by least squares over the flows used.
 
     What a break explains beyond the null hypothesis is b^T S^-1 b, b the products of its columns with what that leaves,
     S those of the columns with each other, without what the null hypothesis explains of them.
     """
-    found: list[_Candidate] = []
-    m, count = flow.null.shape[2], int(used.sum())
+    m, lines = flow.null.shape[2], np.arange(LINES if form.has_line else 1) / LINES
     null = flow.null[used].reshape(-1, m)
     information = np.linalg.inv(null.T @ null + np.diag(_prior(m)))
     left = left - flow.null @ (information @ (null.T @ left[used].ravel()))
-    # 1. Sums of products of all columns for the landmarks beyond each line, by axis.
-    columns = _columns(flow, raws)
-    products = np.swapaxes(columns, 1, 2) @ np.concatenate([columns, flow.null, left[:, :, None]], axis=2)
-    sums = [_beyond_lines(flow, used, products, axis, raws) for axis in (0, 1)]
-    width = columns.shape[2]
-    for form in FORMS:
-        own_columns = _own_columns(form)
-        k = own_columns.stop - (own_columns.start or 0)
-        beyond, after = (part[:, : form.lines] for part in sums[form.axis])
-        enough = {cameras: _enough(after[list(cameras)]) for cameras in SETS}
-        systems: dict[bool, tuple[Array, Array]] = {}  # normal equations of both cameras: what is beyond, or before
-        # 2. What each break explains. One of both cameras alike is the same on either side of its line, but for a step.
-        for is_before, cameras in [(False, each) for each in form.sets] + [(True, each) for each in form.others]:
-            if not enough[cameras].any():
-                continue
-            if is_before not in systems:
-                own = beyond[:, :, own_columns]
-                own = own[:, :1] - own if is_before else own
-                with_null = np.moveaxis(own[..., width : width + m], 0, 1).reshape(form.lines, 2 * k, m)
-                S = RIDGE * np.eye(2 * k) - with_null @ information @ np.swapaxes(with_null, 1, 2)
-                for camera, block in enumerate((slice(k), slice(k, 2 * k))):
-                    S[:, block, block] += own[camera][:, :, own_columns]
-                systems[is_before] = S, np.moveaxis(own[..., -1], 0, 1).reshape(form.lines, 2 * k)
-            S, b = systems[is_before]
-            chosen, is_good = slice(k * cameras[0], k * (cameras[-1] + 1)), enough[cameras]
-            b, size = b[:, chosen], k * len(cameras)
-            amount = np.linalg.solve(S[:, chosen, chosen], b[:, :, None])[:, :, 0]
+    beyond = flow.place[:, 1 - form.axis] >= lines[:, None]
+    for cameras in form.sets:
+        F = _of_cameras(flow, form, cameras)
+        size, own = F.shape[2], np.isin(flow.camera, cameras)
+        products = np.swapaxes(F, 1, 2) @ np.concatenate([F, flow.null, left[:, :, None]], axis=2)
+        for is_before in (False, True) if form.has_line else (False,):
+            # 1. Sums of the products of all columns for the flows of each side.
+            side = (beyond != is_before) & used
+            sums = (side.astype(float) @ products.reshape(len(own), -1)).reshape(len(lines), size, -1)
+            with_null, b = sums[:, :, size : size + m], sums[:, :, -1:]
+            S = sums[:, :, :size] - with_null @ information @ np.swapaxes(with_null, 1, 2) + RIDGE * np.eye(size)
+            # 2. What each line explains.
+            amount = np.linalg.solve(S, b)
+            most = np.linalg.norm(amount.reshape(len(lines), len(cameras), -1), axis=2).max(axis=1)
+            good = np.ones(len(lines), bool)
+            for camera in cameras:
+                in_camera = flow.camera == camera
+                here, elsewhere = (side & in_camera).sum(axis=1), (~side & used & in_camera).sum(axis=1)
+                enough = LEAST // len(cameras)
+                good &= (here >= enough) & ((elsewhere >= enough) | (not form.has_line))
             if form.kind == "torn":
-                most = np.abs(amount).max(axis=1)
-                is_good = is_good & (most > LEAST_PART) & (most < 1.0 / LEAST_PART)
-            if form.kind == "displaced" and form.lines > 1:  # lines that are twice or missing are whole ones
-                is_good = is_good & (np.linalg.norm(amount.reshape(form.lines, -1, 2), axis=2).max(axis=1) > LEAST_PX)
-            cost = _cost(size, count)
-            gain = np.where(is_good, (b * amount).sum(axis=1) / (2 * scale * CORRELATED) - cost, -np.inf)
-            line = int(gain.argmax())
-            if is_good[line]:
-                found.append(_Candidate(float(gain[line]), form, cameras, line / form.lines, cost, is_before))
-    return found
-
-
-def _enough(beyond: Array) -> Flags:
-    """True (L,) for the lines that have enough flows on either side, by the numbers (C, L) beyond them by camera."""
-    before = beyond[:, :1] - beyond if beyond.shape[1] > 1 else beyond
-    sides = [(side.sum(axis=0) >= LEAST) & (side.min(axis=0) >= LEAST_EACH) for side in (beyond, before)]
-    return np.asarray(sides[0] & sides[1])
-
-
-def _beyond_lines(
-    flow: _Flow, used: Flags, products: Array, axis: int, raws: tuple[RawImage, RawImage]
-) -> tuple[Array, Array]:
-    """Return sums of products (2, LINES, K, M) and numbers (2, LINES) of the flows beyond each line, by camera."""
-    beyond, after = np.zeros((2, LINES, *products.shape[1:])), np.zeros((2, LINES))
-    for camera, raw in enumerate(raws):
-        rows = np.flatnonzero(used & (flow.camera == camera))
-        place = (flow.raw[rows, 1 - axis] * LINES / raw.size[1 - axis]).astype(np.intp)
-        order = np.argsort(place, kind="stable")
-        starts = np.flatnonzero(np.diff(place[order], prepend=-1))
-        if len(rows):
-            beyond[camera, place[order][starts]] = np.add.reduceat(products[rows[order]], starts)
-        after[camera] = np.bincount(place, minlength=LINES)
-    return beyond[:, ::-1].cumsum(axis=1)[:, ::-1], after[:, ::-1].cumsum(axis=1)[:, ::-1]
+                good &= _is_a_step(most)
+            if form.kind == "displaced" and form.has_line:  # lines that are twice or missing are whole ones
+                good &= most > LEAST_PX
+            gain = (b * amount).sum(axis=(1, 2)) / (2 * scale * CORRELATED) - _cost(size, int(used.sum()))
+            line = int(np.where(good, gain, -np.inf).argmax())
+            if good[line]:
+                yield _Candidate(float(gain[line]), form, cameras, float(lines[line]), is_before)
 
 
 def _cost(parameters: int, flows: int) -> float:
     """Return the penalty of a break with so many parameters by so many flows of two components, and of the choice."""
-    return 0.5 * parameters * math.log(2 * flows) + math.log(len(FORMS) * len(SETS) * LINES)
+    return 0.5 * parameters * math.log(2 * flows) + math.log(len(FORMS) * len(EACH) * LINES)
 
 
 def _robust(A: Array, y: Array, x: Array) -> Array:
     """Return x (K,) that minimises the Geman-McClure cost of y - A x, A (N, 2, K), from a start."""
-    size = A.shape[2]
     for _ in range(ROUNDS):
-        weight = 1.0 / (1.0 + ((y - A @ x) ** 2).sum(axis=1) / KERNEL_WIDTH**2) ** 2
-        weighted = (weight[:, None, None] * A).reshape(-1, size)
-        H = weighted.T @ A.reshape(-1, size) + np.diag(_prior(size))
-        x = np.linalg.solve(H, weighted.T @ y.ravel())
+        x = _least_squares(A, y, 1.0 / (1.0 + ((y - A @ x) ** 2).sum(axis=1) / 4.0) ** 2)
     return x
+
+
+def _least_squares(A: Array, y: Array, weight: Array) -> Array:
+    """Return x (K,) that minimises the sum of weights (N,) times |y - A x|^2, with the prior of the null hypothesis."""
+    size = A.shape[2]
+    weighted = (weight[:, None, None] * A).reshape(-1, size)
+    return np.asarray(np.linalg.solve(weighted.T @ A.reshape(-1, size) + np.diag(_prior(size)), weighted.T @ y.ravel()))
 
 
 def _prior(size: int) -> Array:
     """Return the information (K,) that there is on parameters: of those of the null hypothesis, on the lag."""
-    return np.where((np.arange(size) == LAG) & (size > LAG), 1.0, RIDGE)
+    prior = np.full(size, RIDGE)
+    prior[6:7] = 1.0
+    return prior
 
 
-def _is_same(one: Break, other: Break) -> bool:
-    return one.kind == other.kind and one.cameras == other.cameras and one.kind == "torn"
-
-
-def _words(breaks: list[Break], pairs: int) -> str:
+def _words(breaks: list[Break]) -> str:
     """Return what breaks of one kind in the same cameras were, and what to do."""
     newest = breaks[0]
     names = [CAMERAS[camera] for camera in newest.cameras]
@@ -587,7 +481,7 @@ def _words(breaks: list[Break], pairs: int) -> str:
     line, beyond, before = ("row", "below", "above") if newest.axis == 0 else ("column", "right of", "left of")
     low, middle, high = (round(px) for px in np.quantile([found.line_px for found in breaks], (0.2, 0.5, 0.8)))
     place = f"{line} {middle}" if high - low < STEADY_PX else f"{line}s {low} to {high}"
-    shown = "1 pair shows" if pairs == 1 else f"{pairs} pairs show"
+    shown = "1 pair shows" if len(breaks) == 1 else f"{len(breaks)} pairs show"
     if newest.kind == "torn":
         return (
             f"images of the {cameras} are torn at {place}: what is {beyond} is of another moment than what is "
