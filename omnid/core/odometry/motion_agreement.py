@@ -84,34 +84,19 @@ LEAST_STEPS: Final = 8  # Steps that are needed for a comparison, because fewer 
 EVERY_S: Final = 0.1  # Time between two comparisons, because each takes a millisecond.
 
 
-class _Step(NamedTuple):
-    """Motion of the base from pair to pair, by the cameras."""
-
-    start_s: float
-    end_s: float
-    distance_m: float
-    turn_rad: float
-    aside_m: float
-
-
-class _Spans(NamedTuple):
-    """Steps of the cameras, from the oldest to the newest: arrays (N,)."""
+class _Steps(NamedTuple):
+    """Motion of the base from pair to pair by the cameras, from the oldest to the newest: arrays (N,)."""
 
     starts_s: Array
     ends_s: Array
     ways_m: Array
+    turns_rad: Array
+    aside_m: Array
 
-
-class _Quantity(NamedTuple):
-    """Limits of a distance [m] or a turn [rad] that is compared."""
-
-    step_noise: float
-    least: float  # sum that is a fault
-
-
-DISTANCE: Final = _Quantity(STEP_M, LEAST_M)
-WHEEL_TURN: Final = _Quantity(STEP_RAD, WHEEL_TURN_RAD)
-GYRO_TURN: Final = _Quantity(STEP_RAD, TURN_RAD)
+    @property
+    def is_long(self) -> bool:
+        """True if they fill the window of time."""
+        return bool(self.ends_s[-1] - self.starts_s[0] >= WINDOW_S - LEAST_STEPS * EVERY_S)
 
 
 class _Finding(NamedTuple):
@@ -123,48 +108,47 @@ class _Finding(NamedTuple):
     difference: Difference = Difference()  # empty where the images are late
 
     @property
+    def is_late(self) -> bool:
+        """True if the images are late by more than is allowed."""
+        return abs(self.lag_s) > ALLOWED_LAG_S
+
+    @property
     def differs(self) -> bool:
         """True if it is at least a doubt."""
-        return abs(self.lag_s) > ALLOWED_LAG_S or self.excess >= DOUBT_SHARE
+        return self.is_late or self.excess >= DOUBT_SHARE
 
 
 class _Travel:
     """Integral of one rate over the newest MOST_KEPT samples."""
 
     def __init__(self) -> None:
-        self._times: deque[float] = deque(maxlen=MOST_KEPT)
-        self._totals: deque[float] = deque(maxlen=MOST_KEPT)
+        self._samples: deque[tuple[float, float]] = deque(maxlen=MOST_KEPT)  # times, and the integral until then
         self._rate = 0.0
 
     def add(self, time_s: float, rate: float) -> None:
         """Add a sample; late ones are left out."""
         if not np.isfinite(rate):
             return
-        if self._times and time_s - self._times[-1] > LONGEST_GAP_S:
-            self.clear()
-        if self._times and time_s - self._times[-1] < LEAST_SAMPLE_S:
+        if self._samples and time_s - self._samples[-1][0] > LONGEST_GAP_S:
+            self._samples.clear()
+        before_s, total = self._samples[-1] if self._samples else (-math.inf, 0.0)
+        if time_s - before_s < LEAST_SAMPLE_S:
             return
-        before_s = self._times[-1] if self._times else time_s
-        total = self._totals[-1] if self._totals else 0.0
-        self._times.append(time_s)
-        self._totals.append(total + (rate + self._rate) / 2 * (time_s - before_s))
+        if self._samples:
+            total += (rate + self._rate) / 2 * (time_s - before_s)
+        self._samples.append((time_s, total))
         self._rate = rate
 
     @property
     def is_unknown(self) -> bool:
         """True while there are too few samples for any motion."""
-        return len(self._times) < 2
-
-    def clear(self) -> None:
-        """Forget everything."""
-        self._times.clear()
-        self._totals.clear()
+        return len(self._samples) < 2
 
     def between(self, starts_s: Array, ends_s: Array) -> Array:
         """Return the motion from starts to ends, arrays of one shape; NaN where no samples cover it."""
         if self.is_unknown:
             return np.full(starts_s.shape, np.nan)
-        times, totals = np.array(self._times), np.array(self._totals)
+        times, totals = np.array(self._samples).T
         start, end = (np.interp(when, times, totals, np.nan, np.nan) for when in (starts_s, ends_s))
         return np.asarray(end - start)
 
@@ -173,7 +157,7 @@ class MotionAgreement:
     """Follows the accounts; memory and work are bounded."""
 
     def __init__(self) -> None:
-        self._steps: deque[_Step] = deque(maxlen=MOST_KEPT)
+        self._steps: deque[tuple[float, float, float, float, float]] = deque(maxlen=MOST_KEPT)  # see _Steps
         self._wheels_m, self._wheels_rad, self._gyro_rad = _Travel(), _Travel(), _Travel()
         self._lags_s = np.arange(LEAST_LAG_S, MOST_LAG_S + LAG_STEP_S / 2, LAG_STEP_S)
         self._clock = SecondsSinceFirst()
@@ -196,34 +180,33 @@ class MotionAgreement:
 
         aside_m: along its y axis.
         """
-        step = _Step(self._clock.seconds(start_ns), self._clock.seconds(end_ns), distance_m, turn_rad, aside_m)
-        self._steps.append(step)
-        while self._steps and self._steps[0].end_s < step.end_s - WINDOW_S:
-            self._steps.popleft()
-        if step.end_s - self._compared_s < EVERY_S:
+        end_s = self._clock.seconds(end_ns)
+        self._steps.append((self._clock.seconds(start_ns), end_s, distance_m, turn_rad, aside_m))
+        self._forget_before(end_s - WINDOW_S)
+        if end_s - self._compared_s < EVERY_S:
             return
-        self._compared_s = step.end_s
-        if self._is_at_rest():
-            while self._steps and self._steps[0].end_s < step.end_s - STILL_S:
-                self._steps.popleft()
+        self._compared_s = end_s
+        steps = _Steps(*np.array(self._steps).T)
+        if self._is_at_rest(steps):
+            self._forget_before(end_s - STILL_S)
             self._late_since_s, self.result = None, AGREE
         elif len(self._steps) >= LEAST_STEPS:
-            self.result = self._compare(step.end_s)
+            self.result = self._compare(steps)
 
-    def _compare(self, now_s: float) -> Witness:
+    def _forget_before(self, time_s: float) -> None:
+        while self._steps and self._steps[0][1] < time_s:
+            self._steps.popleft()
+
+    def _compare(self, steps: _Steps) -> Witness:
         """Return the account that differs, and whether it is a fault."""
-        starts_s, ends_s, seen_m, seen_rad, aside_m = np.array(self._steps).T
-        spans = _Spans(starts_s, ends_s, seen_m)
-        distance = self._finding(spans, seen_m, self._wheels_m, DISTANCE)
-        of_wheels = self._finding(spans, seen_rad, self._wheels_rad, WHEEL_TURN)
-        of_gyro = self._finding(spans, seen_rad, self._gyro_rad, GYRO_TURN)
-        by_gyro = self._gyro_rad.between(starts_s, ends_s)
-        between = self._finding(spans, by_gyro, self._wheels_rad, WHEEL_TURN)
+        distance = self._finding(steps, steps.ways_m, self._wheels_m, STEP_M, LEAST_M)
+        of_wheels = self._finding(steps, steps.turns_rad, self._wheels_rad, STEP_RAD, WHEEL_TURN_RAD)
+        of_gyro = self._finding(steps, steps.turns_rad, self._gyro_rad, STEP_RAD, TURN_RAD)
         # The larger one of distance and turn of the wheels; a lag counts as a fault.
         wheels = max((distance, of_wheels), key=lambda found: (found.differs, found.excess, abs(found.lag_s)))
         if not wheels.differs and not of_gyro.differs:
             self._late_since_s = None
-            aside = _UNKNOWN if distance is _UNKNOWN else self._aside(spans, seen_rad, aside_m)
+            aside = _UNKNOWN if distance is _UNKNOWN else self._aside(steps)
             return Witness(IMAGES_ASIDE, aside.text, aside.excess >= 1.0) if aside.differs else AGREE
         if wheels.differs and of_gyro.differs:
             reason, found = IMAGES_DIFFER, max(wheels, of_gyro, key=lambda found: found.excess)
@@ -232,94 +215,98 @@ class MotionAgreement:
             reason = WHEELS_DIFFER if of_wheels.differs and of_gyro is not _UNKNOWN else IMAGES_OR_WHEELS
             found = wheels
         else:
+            by_gyro = self._gyro_rad.between(steps.starts_s, steps.ends_s)
+            between = self._finding(steps, by_gyro, self._wheels_rad, STEP_RAD, WHEEL_TURN_RAD)
             is_alone = of_wheels is not _UNKNOWN and between.excess >= of_wheels.excess
             reason, found = GYRO_DIFFERS if is_alone else IMAGES_OR_GYRO, of_gyro
-        is_late = abs(found.lag_s) > ALLOWED_LAG_S
-        self._late_since_s = (self._late_since_s or now_s) if is_late else None
+        now_s = float(steps.ends_s[-1])
+        self._late_since_s = (self._late_since_s or now_s) if found.is_late else None
         is_long = self._late_since_s is not None and now_s - self._late_since_s >= LATE_S
         # Wheels that turn otherwise than images and gyro are explained by themselves: a weak motor, another radius. The
         # pose is right, so the base drives on slowly. Their distance, and a delay, nobody else confirms.
-        is_explained = reason == WHEELS_DIFFER and not is_late and distance.excess < 1.0
+        is_explained = reason == WHEELS_DIFFER and not found.is_late and distance.excess < 1.0
         is_fault = bool(is_long or (found.excess >= 1.0 and not is_explained))
         turn = of_gyro if of_gyro.differs else of_wheels
         differences = (each.difference if each.differs else Difference() for each in (distance, turn))
-        cause = self._cause(reason, spans, Steps(seen_m.tolist(), seen_rad.tolist()))
-        detail = f"{'by a factor' if cause and is_late else found.text}{cause and ': '}{cause}"
+        cause = self._cause(reason, steps)
+        detail = f"{'by a factor' if cause and found.is_late else found.text}{cause and ': '}{cause}"
         return Witness(reason, detail, is_fault, *differences)
 
-    def _cause(self, reason: str, spans: _Spans, seen: Steps) -> str:
+    def _cause(self, reason: str, steps: _Steps) -> str:
         """Return what makes the accounts differ as they do; empty where that is not known."""
         ways, turns, gyro = (
-            travel.between(spans.starts_s, spans.ends_s).tolist()
+            travel.between(steps.starts_s, steps.ends_s).tolist()
             for travel in (self._wheels_m, self._wheels_rad, self._gyro_rad)
         )
+        seen = Steps(steps.ways_m.tolist(), steps.turns_rad.tolist())
         if reason == IMAGES_DIFFER:
             return likely_cause.of_images(seen.turns, gyro)
         if reason in (GYRO_DIFFERS, IMAGES_OR_GYRO):
             return likely_cause.of_gyro(seen.turns, gyro)
         return likely_cause.of_wheels(seen, Steps(ways, turns))
 
-    def _finding(self, spans: _Spans, seen: Array, travel: _Travel, quantity: _Quantity) -> _Finding:
-        """Compare the motion seen (N,) in steps with that of a sensor, both in metres or radians."""
+    def _finding(self, steps: _Steps, seen: Array, travel: _Travel, noise: float, least: float) -> _Finding:
+        """Compare the motion seen (N,) in steps with that of a sensor, both in metres or radians.
+
+        noise: standard deviation of a step; least: difference of the sums that is a fault.
+        """
         if travel.is_unknown:
             return _UNKNOWN
-        by_lag = travel.between(spans.starts_s - self._lags_s[:, None], spans.ends_s - self._lags_s[:, None])
+        by_lag = travel.between(steps.starts_s - self._lags_s[:, None], steps.ends_s - self._lags_s[:, None])
         near = int(np.argmin(np.abs(self._lags_s)))
         # 1. Delay; the newest steps have no samples of later times yet.
         known = np.isfinite(by_lag).all(axis=0) & np.isfinite(seen)
         if known.sum() >= LEAST_STEPS:
-            best, near, is_late = self._lag(by_lag[:, known], seen[known], quantity.step_noise)
+            best, near, is_late = self._lag(by_lag[:, known], seen[known], noise)
             if is_late:
                 lag_s = float(self._lags_s[best])
                 return _Finding(lag_s, 0.0, f"by {abs(lag_s):.1f} s")
         # 2. Scale, at the likeliest of the allowed lags.
-        return self._scale(spans, seen, by_lag[near], quantity)
+        return self._scale(steps, seen, by_lag[near], least)
 
     @staticmethod
-    def _scale(spans: _Spans, seen: Array, moved: Array, quantity: _Quantity) -> _Finding:
+    def _scale(steps: _Steps, seen: Array, moved: Array, least: float) -> _Finding:
         """Compare the sums of the motion seen (N,) and of that of a sensor (N,), over the newest WINDOW_M."""
-        starts_s, ends_s, ways_m = spans
-        is_distance = quantity is DISTANCE
+        is_distance = seen is steps.ways_m
         known = np.isfinite(moved) & np.isfinite(seen)
         if known.sum() < LEAST_STEPS:
             return _UNKNOWN
         # 1. Both sums, of the newest steps.
-        moved, seen = moved[known][::-1], seen[known][::-1]
+        newest = np.flatnonzero(known)[::-1]
+        moved, seen, ends_s = moved[newest], seen[newest], steps.ends_s[newest]
+        times_s = ends_s - steps.starts_s[newest]
         path = np.cumsum(np.abs(moved))
-        count = int(np.searchsorted(path if is_distance else np.cumsum(np.abs(ways_m[known][::-1])), WINDOW_M)) + 1
-        length = float(path[min(count, len(path)) - 1])
-        apart = float((moved[:count] - seen[:count]).sum())
-        difference = abs(apart)
+        along = path if is_distance else np.cumsum(np.abs(steps.ways_m[newest]))
+        count = int(np.searchsorted(along, WINDOW_M)) + 1
+        length, apart = float(path[:count][-1]), float((moved[:count] - seen[:count]).sum())
+        difference = Difference(apart, float(times_s[:count].sum()))
         # 2. The limit: a share of the way, and the motion within the lag that is in order.
-        is_whole = count <= len(path) or ends_s[-1] - starts_s[0] >= WINDOW_S - LEAST_STEPS * EVERY_S
-        limit = max(SCALE_SHARE * (length if is_whole or not is_distance else WINDOW_M), quantity.least)
-        steps_s = ends_s[known] - starts_s[known]
-        duration_s = float(steps_s[::-1][:count].sum())
-        limit += LAG_SIGMA_S * float((np.abs(seen[::-1]) / np.maximum(steps_s, LEAST_SAMPLE_S)).max())
+        is_whole = count <= len(path) or steps.is_long or not is_distance
+        limit = max(SCALE_SHARE * (length if is_whole else WINDOW_M), least)
+        limit += LAG_SIGMA_S * float((np.abs(seen) / np.maximum(times_s, LEAST_SAMPLE_S)).max())
         # 3. Of a distance the newest second alone as well, which may show a doubt sooner.
         if is_distance:
-            soon = int(np.searchsorted(ends_s[-1] - ends_s[known][::-1], SOON_S))
+            soon = int(np.searchsorted(steps.ends_s[-1] - ends_s, SOON_S))
             lacking = abs(float((moved[:soon] - seen[:soon]).sum()))
-            if lacking > max(SOON_M, SOON_SHARE * float(np.abs(moved[:soon]).sum())) and difference < limit:
+            if lacking > max(SOON_M, SOON_SHARE * float(np.abs(moved[:soon]).sum())) and abs(apart) < limit:
                 text = f"by {lacking:.2f} m in {SOON_S:.0f} s"
-                return _Finding(0.0, max(DOUBT_SHARE, difference / limit), text, Difference(apart, duration_s))
-        shown = f"{difference:.2f} m in {length:.1f} m" if is_distance else f"{np.degrees(difference):.0f} degrees"
-        return _Finding(0.0, difference / limit, f"by {shown}", Difference(apart, duration_s))
+                return _Finding(0.0, max(DOUBT_SHARE, abs(apart) / limit), text, difference)
+        shown = f"{abs(apart):.2f} m in {length:.1f} m" if is_distance else f"{np.degrees(abs(apart)):.0f} degrees"
+        return _Finding(0.0, abs(apart) / limit, f"by {shown}", difference)
 
     @staticmethod
-    def _aside(spans: _Spans, turns: Array, aside: Array) -> _Finding:
+    def _aside(steps: _Steps) -> _Finding:
         """Return the motion to the side (N,) in the straight part of the newest WINDOW_M."""
-        starts_s, ends_s, ways_m = spans
-        straight = (np.abs(turns) <= STRAIGHT_RADPM * np.abs(ways_m)) & (np.abs(aside) < np.abs(ways_m))
-        path_m = np.cumsum(np.abs(ways_m[straight][::-1]))
+        ways, aside = steps.ways_m, steps.aside_m
+        straight = (np.abs(steps.turns_rad) <= STRAIGHT_RADPM * np.abs(ways)) & (np.abs(aside) < np.abs(ways))
+        path_m = np.cumsum(np.abs(ways[straight][::-1]))
         count = min(len(path_m), int(np.searchsorted(path_m, WINDOW_M)) + 1)
         if count < LEAST_STEPS:
             return _UNKNOWN
-        moved_m = float((aside * np.sign(ways_m))[straight][::-1][:count].sum())
-        is_whole = count < len(path_m) or ends_s[-1] - starts_s[0] >= WINDOW_S - LEAST_STEPS * EVERY_S
-        length_m = float(path_m[count - 1])
+        moved_m, length_m = abs(float((aside * np.sign(ways))[straight][::-1][:count].sum())), float(path_m[count - 1])
+        is_whole = count < len(path_m) or steps.is_long
         limit_m = max(ASIDE_SHARE * (length_m if is_whole else WINDOW_M), LEAST_M)
-        return _Finding(0.0, abs(moved_m) / limit_m, f"by {np.degrees(np.arctan2(abs(moved_m), length_m)):.0f} degrees")
+        return _Finding(0.0, moved_m / limit_m, f"by {np.degrees(np.arctan2(moved_m, length_m)):.0f} degrees")
 
     def _lag(self, by_lag: Array, seen: Array, noise: float) -> tuple[int, int, bool]:
         """Return the best lag, the best one that is allowed, and whether the evidence for the other is strong."""
@@ -335,15 +322,15 @@ class MotionAgreement:
         is_strong = squares[near] - squares[best] > EVIDENCE * variance and squares[near] > WORSE * squares[best]
         return best, near, bool(is_strong and not is_allowed[best])
 
-    def _is_at_rest(self) -> bool:
+    def _is_at_rest(self, steps: _Steps) -> bool:
         """True if images and wheels have shown no motion for STILL_S."""
-        now_s = self._steps[-1].end_s
-        if self._steps[0].start_s > now_s - STILL_S:
+        now_s = float(steps.ends_s[-1])
+        if steps.starts_s[0] > now_s - STILL_S:
             return False
-        newest = [step for step in self._steps if step.end_s > now_s - STILL_S]
+        newest = steps.ends_s > now_s - STILL_S
         starts_s, ends_s = np.array([now_s - STILL_S]), np.array([now_s - LAG_STEP_S])
-        ways_m = (sum(step.distance_m for step in newest), *self._wheels_m.between(starts_s, ends_s))
-        turns_rad = (sum(step.turn_rad for step in newest), *self._wheels_rad.between(starts_s, ends_s))
+        ways_m = (steps.ways_m[newest].sum(), *self._wheels_m.between(starts_s, ends_s))
+        turns_rad = (steps.turns_rad[newest].sum(), *self._wheels_rad.between(starts_s, ends_s))
         # Wheels that say nothing (NaN) have not moved.
         return not any(abs(way) > STILL_M for way in ways_m) and not any(abs(turn) > STILL_RAD for turn in turns_rad)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,12 +18,10 @@ from calib import se3
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.core.kalman_filter import kalman_filter
 from omnid.core.nanoseconds import SecondsSinceFirst
-from omnid.core.odometry.motion_filter import RateHistory, RateIntegral, SensedMotion
+from omnid.core.odometry.motion_filter import RateHistory, SensedMotion
 
 Array = NDArray[np.float64]
 
-# States: scales of the wheels' distance and turn, offsets [s] that are added to the stamps of wheels and gyro, and bias
-# (3,) [rad/s] of the gyro; their start, its standard deviations, and those of their random walks over one second.
 # States: scales of the wheels' distance and turn, offsets [s] that are added to the stamps of wheels and gyro, and bias
 # (3,) [rad/s] of the gyro, in the order of a vector so that each has an index.
 DISTANCE, TURN, WHEEL_OFFSET, GYRO_OFFSET, BIAS = 0, 1, 2, 3, slice(4, 7)
@@ -65,6 +63,17 @@ SANE_SCALE = (0.5, 2.0)  # Limits of the wheels' scales, because beyond them the
 UNKNOWN_M, UNKNOWN_RAD = 1e3, 1e2
 
 
+AHEAD, YAW = 0, 5  # components of the twist of the base that wheels measure
+
+
+class _Measured(NamedTuple):
+    """One component of the twist of the base in a step, by a sensor."""
+
+    value: float  # m, rad
+    slopes: Array  # (7,) by the states
+    variance: float  # by errors that are independent from step to step
+
+
 class MotionSensors:
     """The samples of wheels and gyro, and the estimate of their errors. The base moves along arcs, on a plane.
 
@@ -82,7 +91,7 @@ class MotionSensors:
         self.slips = self.refused = self.steps = 0
         self.is_slipping = False  # True if the wheels slipped in the last steps that the cameras saw
         self._disagreements = 0  # consecutive steps in which the turns of wheels and gyro differ
-        self._noise_factors = {DISTANCE: 1.0, TURN: 1.0}
+        self._noise_factors = {AHEAD: 1.0, YAW: 1.0}
 
     @property
     def values(self) -> Array:
@@ -121,116 +130,69 @@ class MotionSensors:
         """
         # 1. What the sensors measured in this time; the wheels only while they can be trusted.
         start_s, end_s = self._clock.seconds(start_ns), self._clock.seconds(end_ns)
-        dt_s = end_s - start_s
         trusted = self.wheels_are_sane and not self.is_slipping
-        wheels = self._of_wheels(start_s, end_s) if trusted else None
-        gyro = self._of_gyro(start_s, end_s)
-        if wheels is None and gyro is None:
+        wheels = self._by_wheels(start_s, end_s) if trusted else {}
+        gyro = self._by_gyro(start_s, end_s)
+        if not wheels and not gyro:
             return None
         # 2. At rest the motion is zero.
-        if wheels is not None and self._is_at_rest(start_s, end_s):
+        if wheels and self._is_at_rest(start_s, end_s):
             return self._in_rect(np.zeros(6), np.repeat([STILL_M, STILL_RAD], 3), np.zeros((6, 7)), complete=True)
         # 3. Wheels whose turn differs from that of the gyro slip.
-        disagree = wheels is not None and gyro is not None and self._disagree(wheels, gyro, dt_s)
+        disagree = AHEAD in wheels and YAW in wheels and YAW in gyro and self._disagree(wheels[YAW], gyro[YAW])
         self._disagreements = self._disagreements + 1 if disagree else 0
         if self._disagreements >= SLIPPING:
-            wheels = None
+            wheels = {}
             self.slips += 1
-        # 4. The twist (6,) of the base with independent errors (6,) and slopes (6, 7) by the states. The rotation is
-        # that of the gyro where there is one.
+        # 4. The twist (6,) of the base with independent errors (6,) and slopes (6, 7) by the states; errors of the
+        #    clocks do not add up from step to step. The rotation is that of the gyro where there is one.
         twist, sigma, slopes = np.zeros(6), np.repeat([UNKNOWN_M, UNKNOWN_RAD], 3), np.zeros((6, 7))
-        if wheels is not None:
-            distance, turn = wheels.amounts
-            twist[0], slopes[0, DISTANCE] = self.values[DISTANCE] * distance, distance
-            rough = math.sqrt(self._noise_factors[DISTANCE])
-            missing_s = self._wheels.missing_s(end_s - self.values[WHEEL_OFFSET])
-            sigma[:5] = (
-                math.hypot(rough * math.hypot(DISTANCE_SHARE * distance, WHEEL_M), NOT_YET_MPS2 * missing_s**2 / 2),
-                math.hypot(SIDE_SHARE * distance, SIDE_M),
-                HEIGHT_M,
-                TILT_RAD,
-                TILT_RAD,
-            )
-            if math.isfinite(turn):
-                twist[5], slopes[5, TURN] = self.values[TURN] * turn, turn
-                of_wheels = math.sqrt(self._noise_factors[TURN]) * math.hypot(TURN_SHARE * turn, WHEEL_RAD)
-                sigma[5] = math.hypot(of_wheels, NOT_YET_RADPS2 * missing_s**2 / 2)
-        if gyro is not None:
-            twist[3:] = gyro.amounts - self.values[BIAS] * dt_s
-            missing_s = self._gyro.missing_s(end_s - self.values[GYRO_OFFSET])
-            sigma[3:] = math.hypot(GYRO_RADPS_SQRT_S * math.sqrt(dt_s), NOT_YET_RADPS2 * missing_s**2 / 2)
-            slopes[3:], slopes[3:, BIAS] = 0.0, -dt_s * np.eye(3)
-        return self._in_rect(twist, sigma, slopes, complete=wheels is not None and sigma[5] < UNKNOWN_RAD)
+        if wheels:
+            aside_m = math.hypot(SIDE_SHARE * wheels[AHEAD].value, SIDE_M)
+            sigma[1:5] = aside_m, HEIGHT_M, TILT_RAD, TILT_RAD
+        for axis, found in (wheels | gyro).items():
+            twist[axis], sigma[axis], slopes[axis] = found.value, math.sqrt(found.variance), found.slopes
+        slopes[:, [WHEEL_OFFSET, GYRO_OFFSET]] = 0.0
+        return self._in_rect(twist, sigma, slopes, complete=bool(wheels) and sigma[YAW] < UNKNOWN_RAD)
 
-    def _disagree(self, wheels: RateIntegral, gyro: RateIntegral, dt_s: float) -> bool:
+    def _disagree(self, wheels: _Measured, gyro: _Measured) -> bool:
         """True if wheels and gyro measure turns in a step that differ by more than their errors: a wheel slips."""
-        turn, turned = wheels.amounts[1], gyro.amounts[2]
-        if not math.isfinite(turn):
-            return False
-        H = np.zeros(len(START))
-        H[TURN], H[BIAS.stop - 1] = turn, dt_s
-        difference = self.values[TURN] * turn - (turned - self.values[BIAS][2] * dt_s)
-        of_wheels = self._noise_factors[TURN] * ((TURN_SHARE * turn) ** 2 + WHEEL_RAD**2)
-        variance = of_wheels + GYRO_RADPS_SQRT_S**2 * dt_s + H @ self._filter.P @ H
-        # The offsets of both clocks are not known exactly either: a turn begins in one before it does in the other.
-        of_clocks = self.sigmas[WHEEL_OFFSET] * wheels.changes[1], self.sigmas[GYRO_OFFSET] * gyro.changes[2]
-        variance += of_clocks[0] ** 2 + of_clocks[1] ** 2
-        return bool(difference**2 > OUTLIER_SIGMA**2 * variance)
+        H = wheels.slopes - gyro.slopes
+        variance = wheels.variance + gyro.variance + float(H @ self._filter.P @ H)
+        return (wheels.value - gyro.value) ** 2 > OUTLIER_SIGMA**2 * variance
 
     def observe(self, T_prev_curr: Array, covariance: Array, start_ns: int, end_ns: int) -> None:
         """Estimate the states by a step of the rectified frame that the cameras measured, with covariance (6, 6)."""
         # 1. The step and its variances in the frame of the base.
         start_s, end_s = self._clock.seconds(start_ns), self._clock.seconds(end_ns)
-        dt_s = end_s - start_s
         seen = self._to_base @ se3.log(T_prev_curr)
         variance = np.diag(self._to_base @ covariance @ self._to_base.T)
         variance = variance + np.repeat([CAMERA_M**2, CAMERA_RAD**2], 3)
         # 2. Predict the states: they change by random walks.
-        self._filter.predict(F=np.eye(len(START)), Q=np.diag(WALK_SIGMA**2 * dt_s))
+        self._filter.predict(F=np.eye(len(START)), Q=np.diag(WALK_SIGMA**2 * (end_s - start_s)))
         self.steps += 1
         # 3. Update them by the differences between cameras and sensors.
-        wheels, gyro = self._of_wheels(start_s, end_s), self._of_gyro(start_s, end_s)
-        if wheels is not None:
-            self._learn_wheels(wheels, seen, variance)
-        if gyro is not None:
-            self._learn_gyro(gyro, seen[3:], variance[3:], dt_s)
+        if wheels := self._by_wheels(start_s, end_s):
+            agree = self._learn(wheels, seen, variance, follows_noise=True)
+            self.slips += not agree
+            self._count(WheelSample, agree, np.array([DISTANCE, TURN, WHEEL_OFFSET]))
+            self.is_slipping = self._outliers[WheelSample] >= SLIPPING
+        if gyro := self._by_gyro(start_s, end_s):
+            agree = self._learn(gyro, seen, variance, follows_noise=False)
+            self.refused += not agree
+            self._count(GyroSample, agree, np.array([GYRO_OFFSET, 4, 5, 6]))
 
-    def _learn_wheels(self, wheels: RateIntegral, seen: Array, variance: Array) -> None:
-        """Learn scales and offset of the wheels from the cameras' twist (6,) with variances (6,)."""
+    def _learn(self, measured: dict[int, _Measured], seen: Array, variance: Array, *, follows_noise: bool) -> bool:
+        """Learn from the cameras' twist (6,) with variances (6,); return whether the sensor agrees with it."""
         agree = True
-        rows = (
-            (DISTANCE, seen[0], variance[0], DISTANCE_SHARE, WHEEL_M),
-            (TURN, seen[5], variance[5], TURN_SHARE, WHEEL_RAD),
-        )
-        for number, (state, truth, noise, share, least) in enumerate(rows):
-            amount, change = wheels.amounts[number], wheels.changes[number]
-            if not math.isfinite(amount):
-                continue
-            H = np.zeros(len(START))
-            H[state], H[WHEEL_OFFSET] = amount, -self.values[state] * change
-            error = truth - self.values[state] * amount
-            of_wheels = self._noise_factors[state] * ((share * amount) ** 2 + least**2)
-            self._follow_noise(state, error**2 / (float(H @ self._filter.P @ H) + noise + of_wheels))
-            agree &= self._update(error, H, noise + of_wheels)
-        self.slips += not agree
-        self._count(WheelSample, agree, np.array([DISTANCE, TURN, WHEEL_OFFSET]))
-        self.is_slipping = self._outliers[WheelSample] >= SLIPPING
-
-    def _follow_noise(self, state: int, ratio: float) -> None:
-        """Follow the noise of distance or turn by the square of a difference, divided by its expected value."""
-        if ratio < RATIO_LIMIT:
-            self._noise_factors[state] = max(1.0, self._noise_factors[state] * (1.0 + NOISE_GAIN * (ratio - 1.0)))
-
-    def _learn_gyro(self, gyro: RateIntegral, seen: Array, variance: Array, dt_s: float) -> None:
-        """Learn bias and offset of the gyro from the cameras' rotation (3,) with variances (3,)."""
-        agree = True
-        for axis in range(3):
-            H = np.zeros(len(START))
-            H[BIAS.start + axis], H[GYRO_OFFSET] = -dt_s, -gyro.changes[axis]
-            error = seen[axis] - (gyro.amounts[axis] - self.values[BIAS][axis] * dt_s)
-            agree &= self._update(error, H, variance[axis] + GYRO_RADPS_SQRT_S**2 * dt_s)
-        self.refused += not agree
-        self._count(GyroSample, agree, np.array([GYRO_OFFSET, 4, 5, 6]))
+        for axis, (value, H, own) in measured.items():
+            error, noise = float(seen[axis] - value), float(variance[axis] + own)
+            ratio = error**2 / (float(H @ self._filter.P @ H) + noise)
+            if follows_noise and ratio < RATIO_LIMIT:
+                factor = self._noise_factors[axis] * (1.0 + NOISE_GAIN * (ratio - 1.0))
+                self._noise_factors[axis] = max(1.0, factor)
+            agree &= self._update(error, H, noise)
+        return agree
 
     def _update(self, error: float, H: Array, variance: float) -> bool:
         """Update the states with one error, of which H (7,) are the derivatives; False if it is an outlier."""
@@ -249,15 +211,37 @@ class MotionSensors:
             self._filter.P[states] = self._filter.P[:, states] = 0.0
             self._filter.P[states, states] = LOST_SIGMA[states] ** 2
 
-    def _of_wheels(self, start_s: float, end_s: float) -> RateIntegral | None:
-        """Return distance and turn of the wheels in a time."""
-        offset_s = self.values[WHEEL_OFFSET]
-        return self._wheels.integral(start_s - offset_s, end_s - offset_s)
+    def _by_wheels(self, start_s: float, end_s: float) -> dict[int, _Measured]:
+        """Return the components of the base's twist that the wheels measure in a time."""
+        offset_s, found = self.values[WHEEL_OFFSET], {}
+        integral = self._wheels.integral(start_s - offset_s, end_s - offset_s)
+        missing_s = self._wheels.missing_s(end_s - offset_s)
+        limits = (
+            (AHEAD, DISTANCE, DISTANCE_SHARE, WHEEL_M, NOT_YET_MPS2),
+            (YAW, TURN, TURN_SHARE, WHEEL_RAD, NOT_YET_RADPS2),
+        )
+        for number, (axis, state, share, least, change) in enumerate(limits if integral else ()):
+            assert integral is not None
+            amount, slopes = float(integral.amounts[number]), np.zeros(len(START))
+            if math.isfinite(amount):
+                slopes[state], slopes[WHEEL_OFFSET] = amount, -self.values[state] * integral.changes[number]
+                noise = self._noise_factors[axis] * ((share * amount) ** 2 + least**2)
+                value, late = float(self.values[state] * amount), change * missing_s**2 / 2
+                found[axis] = _Measured(value, slopes, noise + late**2)
+        return found
 
-    def _of_gyro(self, start_s: float, end_s: float) -> RateIntegral | None:
-        """Return the rotation vector (3,) of the gyro in a time."""
-        offset_s = self.values[GYRO_OFFSET]
-        return self._gyro.integral(start_s - offset_s, end_s - offset_s)
+    def _by_gyro(self, start_s: float, end_s: float) -> dict[int, _Measured]:
+        """Return the components of the base's twist that the gyro measures in a time."""
+        offset_s, dt_s, found = self.values[GYRO_OFFSET], end_s - start_s, {}
+        integral = self._gyro.integral(start_s - offset_s, end_s - offset_s)
+        late = NOT_YET_RADPS2 * self._gyro.missing_s(end_s - offset_s) ** 2 / 2
+        for axis in range(3 if integral else 0):
+            assert integral is not None
+            slopes = np.zeros(len(START))
+            slopes[BIAS.start + axis], slopes[GYRO_OFFSET] = -dt_s, -integral.changes[axis]
+            value = float(integral.amounts[axis] - self.values[BIAS][axis] * dt_s)
+            found[3 + axis] = _Measured(value, slopes, GYRO_RADPS_SQRT_S**2 * dt_s + late**2)
+        return found
 
     def _is_at_rest(self, start_s: float, end_s: float) -> bool:
         """True if wheels, and the gyro if there is one, are at rest in a step and STILL_BEFORE_S before it."""
