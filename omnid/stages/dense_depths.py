@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.config import StereoConfig
+from omnid.core.odometry.dense_correction import DenseCorrection
 from omnid.core.odometry.earlier_view import EarlierView, contradicted
 from omnid.core.odometry.exposure_times import Exposure
-from omnid.core.odometry.frame_exposures import DenseCorrection
 from omnid.core.stereo.matcher import Matcher, MatchingSettings
 from omnid.core.stereo.triangulation import triangulate
 from omnid.engine.threads import Lock

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
@@ -67,7 +67,6 @@ JUMP_M, JUMP_RAD = 0.5, math.radians(30)
 SAME_VIEW_M, SAME_VIEW_RAD = 0.1, math.radians(10)
 ROOM_M = 2.0  # median distance of landmarks that are not known: in a room
 SAME_M = 0.02  # Poses that differ less are one, because four sigmas of a pose that few landmarks support are as large.
-# Sigmas of a pose of which nothing is known any more; larger ones would leave no digits to differences of covariances.
 # Sigmas of a pose of which nothing is known any more, m and rad, because larger ones would leave no digits to
 # differences of covariances.
 MOST_SIGMA = np.repeat([1000.0, math.pi], 3)
@@ -110,18 +109,6 @@ class PoseEstimate:
     def is_sure(self) -> bool:
         """True if no other motion or depths explain the images nearly as well."""
         return self.runner_up is None and not self.doubtful_depths
-
-    @property
-    def without_landmarks(self) -> PoseEstimate:
-        """The pose alone, where its landmarks are no longer in the map."""
-        return replace(
-            self,
-            landmarks=self.landmarks[:0],
-            views=self.views[:0],
-            pixels=self.pixels[:0],
-            variance=self.variance[:0],
-            assumed=NOTHING_ASSUMED,
-        )
 
     def distance_m(self, T_odom_rect: Array) -> float:
         """Return the distance [m] of the pose from another one (4, 4)."""

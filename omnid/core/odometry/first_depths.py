@@ -25,18 +25,20 @@ Pairs whose pixels were not exposed at once are left as they are (keyframes.py).
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.estimates import SAME_M
-from omnid.core.odometry.landmarks import Keyframe, LandmarkStore
 from omnid.core.odometry.tracking import KltSettings, track
 from omnid.core.odometry.wrong_periods import disparities_alike
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.stereo_model import StereoModel
+
+if TYPE_CHECKING:
+    from omnid.core.odometry.local_map import Keyframe, LocalMap
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -122,9 +124,7 @@ class FirstDepths:
         displacement = self._larger_share * np.concatenate([moved[:3], np.zeros(3)])
         return displacement if np.linalg.norm(displacement) > SAME_M else None
 
-    def decide(
-        self, lower: PaddedPanorama, klt: KltSettings, store: LandmarkStore, step_m: tuple[float, float]
-    ) -> None:
+    def decide(self, lower: PaddedPanorama, klt: KltSettings, local_map: LocalMap, step_m: tuple[float, float]) -> None:
         """Follow the landmarks into the next panorama, and correct their depths where it shows how far it is.
 
         step_m: the most that a vehicle can move since the last panorama, and the step by wheels, NaN: not known.
@@ -156,8 +156,8 @@ class FirstDepths:
         self._taken = np.where(is_decided, chosen, self._taken)
         views = self._views[moved]
         views[:, 2] = views[:, 1] + self._disparities[each, chosen][moved]
-        store.replace_views(self._ids[moved], views, np.tile(VIEW_NOISE, (len(views), 1, 1)))
-        store.keep(self._ids[is_right])
+        local_map.replace_views(self._ids[moved], views, np.tile(VIEW_NOISE, (len(views), 1, 1)))
+        local_map.keep(self._ids[is_right])
 
     def _largest_share(self) -> float:
         """Return by which share of a motion it may be larger or smaller; 0: enough landmarks do not repeat."""

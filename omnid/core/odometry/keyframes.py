@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from omnid.core.odometry.corners import clear_around, corners
 from omnid.core.odometry.estimates import OdometryLimits, PoseEstimate
 from omnid.core.odometry.exposure_times import Exposure
+from omnid.core.odometry.first_depths import FirstDepths
 from omnid.core.odometry.landmarks import located
 from omnid.core.odometry.local_map import Keyframe, LocalMap
 from omnid.core.odometry.plane_patches import WINDOW_PX
@@ -78,8 +79,12 @@ class Keyframes:
         points = corners(frame.lower, free, self._wanted() - len(request.pixels))
         new = located(frame, points, self._model, self._klt, request.exposure, request.views)
         keyframe = Keyframe(frame.seq, frame.lower, request.T_odom_rect, request.covariance)
+        is_first = not len(self._map)
         ids = self._map.add_keyframe(keyframe, new.views, new.slopes, new.whole_noise, new.pixels)
         self._map.late_depths.added(ids, new)
+        if is_first and frame.times.is_at_once:
+            pair = frame.lower, frame.upper
+            self._map.first_depths = FirstDepths.of(pair, keyframe, ids, new.views, self._model)
         if len(self._map) >= self._limits.min_inliers:
             self._relocaliser.add(replace(frame, exposure=request.exposure), keyframe)
         self._most_inliers, self._tracked_s = 0, 0.0

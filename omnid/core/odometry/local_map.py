@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.odometry.estimates import PoseEstimate
 from omnid.core.odometry.exposure_times import RigVelocity
+from omnid.core.odometry.first_depths import FirstDepths
 from omnid.core.odometry.landmarks import NewLandmarks
 from omnid.core.odometry.plane_patches import AlignedPatches, align, moved_slopes, plane_templates
 from omnid.core.odometry.tracking import KltSettings, track
@@ -113,6 +114,7 @@ class LocalMap:
         self.keyframes: dict[int, Keyframe] = {}
         self.table = LandmarkTable.empty()
         self.late_depths.clear()
+        self.first_depths: FirstDepths | None = None  # of the only keyframe; None: its depths are not in doubt
         self.last: PaddedPanorama | None = None  # the last accepted lower panorama; None: there is no map
 
     def add_keyframe(
@@ -232,6 +234,10 @@ class LocalMap:
         """Let landmarks (rows of the table) be removed at the next `update_tracked`, unless they are inliers in it."""
         self.table.misses[rows] = self._max_misses
 
+    def keep(self, ids: Indices) -> None:
+        """Remove all landmarks but these."""
+        self._select(np.isin(self.table.id, ids))
+
     def from_anchors(self, T_rect_odom: Array, rows: Indices) -> Array:
         """Return the transforms (M, 4, 4) into a rectified frame from the anchors of landmarks (rows of the table)."""
         seqs = sorted(self.keyframes)
@@ -243,6 +249,13 @@ class LocalMap:
         self.table = _selected(self.table, kept)
         anchors = set(self.table.anchor.tolist())
         self.keyframes = {seq: keyframe for seq, keyframe in self.keyframes.items() if seq in anchors}
+
+    def decide_first_depths(self, lower: PaddedPanorama, step_m: tuple[float, float]) -> None:
+        """Let a new panorama decide among the depths of the first keyframe; step_m: see FirstDepths.decide."""
+        if self.first_depths is not None:
+            self.first_depths.decide(lower, self._coarse_klt, self, step_m)
+            if not self.first_depths.is_open:
+                self.first_depths = None
 
     def track(
         self, lower: PaddedPanorama, T_odom_rect: Array, most: int | None = None, *, turn: int = 0, near: bool = False

@@ -61,14 +61,6 @@ class MotionFilter:
         P = F @ self._filter.P @ F.T
         return F @ self._filter.x[:, 0], np.asarray((P + P.T) / 2)
 
-    def after(self, T_prev_curr: Array, covariance: Array, dt_s: float) -> tuple[Array, Array]:
-        """Return the `motion` after an update with a measurement; the filter itself is not updated."""
-        kept = self._filter.x.copy(), self._filter.P.copy()
-        self.update(T_prev_curr, covariance, dt_s)
-        found = self.motion(dt_s)
-        self._filter.x, self._filter.P = kept
-        return found
-
     def predict(self, dt_s: float) -> Array:
         """Predict the state dt_s later and return the expected motion T_prev_curr (4, 4)."""
         F, Q, velocity, acceleration = np.eye(12), np.zeros((12, 12)), np.arange(6), np.arange(6, 12)

@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.estimates import OdometryLimits
-from omnid.core.odometry.exposure_times import ExposureVelocity, RigVelocity
-from omnid.core.odometry.motion_filter import MotionFilter, SensedMotion
+from omnid.core.odometry.exposure_times import RigVelocity
+from omnid.core.odometry.motion_filter import START_ACCELERATION_VARIANCE, MotionFilter, SensedMotion
 
 Array = NDArray[np.float64]
 
-SLOWING_S = 0.3  # time constant of the predicted velocity's decay while poses are refused.
 # Rotation by which two steps of a robot do not differ, because 4 rad/s^2, the most that controller.limits allows by
 # default, make 0.04 rad in steps of 0.1 s.
 SUDDEN_RAD = 0.14
+SLOWING_S = 0.3  # time constant of the predicted velocity's decay while poses are refused.
 
 
 class MotionModel:
@@ -25,10 +25,10 @@ class MotionModel:
 
     def __init__(self, limits: OdometryLimits, motion_filter: MotionFilter | None = None) -> None:
         """motion_filter: None for a new one."""
-        self._longest_s = limits.max_gap_s
+        self._limits = limits
         self._filter = motion_filter or MotionFilter()
-        self._exposures = ExposureVelocity(self._filter)
-        self._bridge = Bridge(limits)
+        self._last_step: tuple[Array, float] | None = None  # T_prev_curr that was accepted last, and its time
+        self.found()
 
     @property
     def velocity(self) -> Array:
@@ -45,99 +45,67 @@ class MotionModel:
 
         What wheels and gyro say is a measurement of the filter; they also know what happened in a long gap.
         """
-        T_prev_curr = self._filter.predict(min(dt_s, self._longest_s))
+        T_prev_curr = self._filter.predict(min(dt_s, self._limits.max_gap_s))
         if sensed is not None and dt_s > 0:
             T_prev_curr = self._filter.update(sensed.T_prev_curr, sensed.covariance, dt_s)
         return T_prev_curr
 
-    def now(self) -> RigVelocity:
-        """Return the velocity at the last frame."""
-        return RigVelocity(*self._filter.motion(0.0))
-
-    def at_exposure(self, dt_s: float) -> RigVelocity:
-        """Return the velocity at the frame to which a step of dt_s was predicted, before it is seen."""
-        return self._exposures.predicted(dt_s)
-
-    def after(self, T_prev_curr: Array, covariance: Array, dt_s: float) -> RigVelocity:
-        """Return the velocity at the end of a step with its covariance (6, 6)."""
-        return self._exposures.after(T_prev_curr, covariance, dt_s)
+    def at_exposure(self, dt_s: float = 0.0) -> RigVelocity:
+        """Return the velocity at the last frame, or at the one to which a step of dt_s was predicted."""
+        return RigVelocity(*self._filter.motion(dt_s))
 
     def accept(
         self, T_prev_curr: Array, covariance: Array, dt_s: float, *, exposed_at_once: bool
     ) -> RigVelocity | None:
-        """Update the filter with the step that the cameras found (eq. 11); after a sudden one begin from standstill.
+        """Update the filter with the step that the cameras found (eq. 11), with its covariance (6, 6).
 
-        Returns the velocity at the pair before the step, where the steps around it determine it.
+        Returns the velocity at the pair before the step, from the steps around it. A velocity that changes evenly is
+        exact there; how far it changes unevenly in a step, no step shows. A sudden turn shows no velocity during the
+        exposures: where it matters, the filter begins from standstill.
         """
-        is_sudden = not exposed_at_once and self.is_sudden(T_prev_curr, dt_s)
-        self._filter.update(T_prev_curr, covariance, dt_s)
-        at_previous = self._exposures.accept(T_prev_curr, covariance, dt_s)
-        if is_sudden:
+        turned = se3.log(T_prev_curr)[3:] - self.velocity[3:] * dt_s
+        if not exposed_at_once and np.linalg.norm(turned) > SUDDEN_RAD:
             self.reset()
-        return None if is_sudden else at_previous
+            return None
+        self._filter.update(T_prev_curr, covariance, dt_s)
+        now, before, self._last_step = self.of_step(T_prev_curr, dt_s), self._last_step, (T_prev_curr, dt_s)
+        if before is None:
+            return now
+        before_rate, before_s = se3.log(before[0]) / before[1], before[1]
+        at_previous = (before_s * now.twist + dt_s * before_rate) / (before_s + dt_s)
+        uneven = np.diag(((now.twist - before_rate) / 2) ** 2)
+        return RigVelocity(at_previous, covariance / (2 * dt_s**2) + uneven)
+
+    @staticmethod
+    def of_step(T_prev_curr: Array, dt_s: float) -> RigVelocity:
+        """Return the velocity at either end of a single step, which changes by an acceleration that is not known."""
+        return RigVelocity(se3.log(T_prev_curr) / dt_s, START_ACCELERATION_VARIANCE * (dt_s / 2) ** 2 * np.eye(6))
 
     def found(self) -> None:
-        """Note that the cameras have found a pose: nothing is to be bridged."""
-        self._bridge.end()
+        """Note that the cameras have found a pose: nothing is to be bridged, and no error has grown."""
+        self._bridged_s = 0.0
+        self._systematic = np.zeros(6)  # sum of the standard deviations of the steps since then
+        self._variance_m2 = 0.0  # variance of the position
 
     def carry(self, sensed: SensedMotion | None, dt_s: float) -> Array | None:
         """Return the covariance (6, 6) of a step that nothing was seen in, by wheels and gyro; None where they end.
 
-        Then the velocity decays.
+        They end at the limits of time and uncertainty; then the velocity decays. Errors of scale and bias are the same
+        in all steps: their standard deviations add up, and not their variances.
         """
-        if sensed is not None and self._bridge.carries(sensed, dt_s):
-            return self._bridge.step(sensed, dt_s)
+        self._last_step = None
+        if sensed is not None and sensed.is_complete:
+            sigma = np.sqrt(np.diag(sensed.systematic))
+            growth = sensed.noise + sensed.systematic + np.diag(2 * self._systematic * sigma)
+            variance_m2 = self._variance_m2 + float(np.diag(growth)[:3].max())
+            if self._bridged_s + dt_s <= self._limits.bridge_s and variance_m2 <= self._limits.bridge_sigma_m**2:
+                self._bridged_s, self._variance_m2 = self._bridged_s + dt_s, variance_m2
+                self._systematic += sigma
+                return growth
         self._filter.slow_down(math.exp(-dt_s / SLOWING_S))
         return None
 
     def reset(self) -> None:
         """Begin from standstill."""
         self._filter.reset()
-        self._exposures.reset()
-
-    def is_sudden(self, T_prev_curr: Array, dt_s: float) -> bool:
-        """True if a motion differs too much from the predicted one to give the velocity during the exposures."""
-        change = se3.log(T_prev_curr) - self._filter.velocity * dt_s
-        return bool(np.linalg.norm(change[3:]) > SUDDEN_RAD)
-
-
-class Bridge:
-    """The error that has grown since the cameras gave the last pose.
-
-    Errors of scale and bias are the same in all steps: their standard deviations add up, and not their variances.
-    """
-
-    def __init__(self, limits: OdometryLimits) -> None:
-        self._limits = limits
-        self.end()
-
-    def end(self) -> None:
-        """Begin again from a pose of the cameras."""
-        self._time_s = 0.0
-        self._systematic = np.zeros(6)  # sum of the standard deviations
-        self._variance_m2 = 0.0  # variance of the position
-
-    def carries(self, sensed: SensedMotion, dt_s: float) -> bool:
-        """True if the pose may go on by a sensed step of dt_s, within the limits of time and uncertainty."""
-        limits = self._limits
-        return (
-            sensed.is_complete
-            and self._time_s + dt_s <= limits.bridge_s
-            and self._variance_m2 + self._largest_m2(self._growth(sensed)) <= limits.bridge_sigma_m**2
-        )
-
-    def step(self, sensed: SensedMotion, dt_s: float) -> Array:
-        """Take a step; return the covariance (6, 6) that it adds to the pose, in the axes of the frame."""
-        growth = self._growth(sensed)
-        self._time_s += dt_s
-        self._systematic += np.sqrt(np.diag(sensed.systematic))
-        self._variance_m2 += self._largest_m2(growth)
-        return growth
-
-    def _growth(self, sensed: SensedMotion) -> Array:
-        sigma = np.sqrt(np.diag(sensed.systematic))
-        return sensed.noise + sensed.systematic + np.diag(2 * self._systematic * sigma)
-
-    @staticmethod
-    def _largest_m2(growth: Array) -> float:
-        return float(np.diag(growth)[:3].max())
+        self._last_step = None

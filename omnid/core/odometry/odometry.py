@@ -24,25 +24,25 @@ from omnid.core.odometry.estimates import (
     supports,
 )
 from omnid.core.odometry.exposure_times import Exposure, RigVelocity
-from omnid.core.odometry.frame_exposures import FrameExposures
-from omnid.core.odometry.frame_to_map import OUTLIER_COST, FrameToMap
 from omnid.core.odometry.image_breaks import ImageBreaks, RawImage
 from omnid.core.odometry.keyframes import KeyframeLocaliser, KeyframeRequest, Keyframes
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.motion_model import MotionModel
-from omnid.core.odometry.pose_search import LastFrame, PoseSearch
+from omnid.core.odometry.pose_search import OUTLIER_COST, PoseSearch
 from omnid.core.odometry.runner_up_motions import REACH_SIGMAS, Doubt, UntrackedMotion, doubt_after
 from omnid.core.odometry.static_mask import StaticMask
 from omnid.core.odometry.stereo_frame import Features, StereoFrame
 from omnid.core.odometry.tracking import KltSettings
-from omnid.core.odometry.tracking_state_machine import FrameFacts, FrameOutcome, TrackingStatus, next_status
-from omnid.core.types.panorama import PaddedPanorama
+from omnid.core.odometry.tracking_state_machine import TrackingStatus
 from omnid.core.types.stereo_model import StereoModel
 from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
+# Rounds of starting the map again, because the depths of the first frame are measured as if the rig were at rest, so
+# that the motion is wrong by a few per cent of what happens between two exposures, and each reduces it by this ratio.
+START_ROUNDS = 2
 SHORTEST_STEP_S = 0.05  # the speed limit counts at least this time, so that two close stamps refuse no pose
 # Corners per landmark of the smallest map: two make a frame textured, since not all will be located; four are sought.
 TEXTURED_CORNERS, COUNTED_CORNERS = 2, 4
@@ -70,28 +70,19 @@ class VisualOdometry:
         self._limits, self._model, self._relocaliser = limits, model, relocaliser
         self._map = LocalMap(model, klt, limits.keyframes)
         self._keyframes = Keyframes(self._map, model, replace(klt, levels=1), limits, relocaliser, features)
-        self._frame_to_map = FrameToMap(self._map, model, klt)
         self._motion = MotionModel(limits)
         self._static_mask = StaticMask(model.cylinder.edges_rad)
         self._T_odom_rect, self._covariance = np.eye(4), np.zeros((6, 6))
         self._untracked = UntrackedMotion(self._T_odom_rect)  # since the map was in view last
-        self._previous: PaddedPanorama | None = None  # the last accepted lower panorama; None: there is no map
         self._status = TrackingStatus()
         self._doubt: Doubt | None = None  # other motions that may have been made in place of the chosen ones
         self._step: tuple[Array, Array] | None = None  # last step by the cameras, and its covariance
+        self._first: StereoFrame | None = None  # started the map before its velocity was known
         self._requested: KeyframeRequest | None = None  # keyframe that the last frame asked for, see complete
         self._added: int | None = None  # seq of the keyframe that the last frame became
         self._distance_m = ROOM_M  # median of the landmarks by which the last pose was found
         self._cost: tuple[float, int] | None = None  # of those in view, and their number; None: no pose was found
-        self._exposures = FrameExposures(
-            self._motion,
-            model,
-            max_gap_s=limits.max_gap_s,
-            local_map=self._map,
-            keyframes=self._keyframes,
-            frame_to_map=self._frame_to_map,
-        )
-        self._search = PoseSearch(self._map, model, limits, frame_to_map=self._frame_to_map, exposures=self._exposures)
+        self._search = PoseSearch(self._map, model, limits, klt)
         self.breaks = None if raw_images is None else ImageBreaks(model, raw_images)
 
     def process(self, frame: StereoFrame, dt_s: float) -> OdometryEstimate:
@@ -119,7 +110,7 @@ class VisualOdometry:
         self._step = self._cost = None
         self._map.lost = frame.lost
         usable = self._static_mask.without(frame.usable)
-        if self._previous is None:
+        if self._map.last is None:
             return self._start_without_map(frame, usable, dt_s)
 
         # 1. Predict: v <- v + dt a, T <- T exp(v dt) (section IV.D, eq. 10), with wheels and gyro where there are some.
@@ -130,12 +121,14 @@ class VisualOdometry:
         after_refusal = self._status.is_refused
         searched = not after_refusal or self._is_textured(frame, usable)
         tracked = estimate = self._find(frame, usable, T_predicted, dt_s) if searched else None
+        if self._first is not None:
+            tracked = estimate = self._start_again(frame, usable, estimate, dt_s)
 
         # 5. Accept or refuse, by the inliers and the speed that the pose implies; after a break, relocalise.
         after_break = after_refusal or dt_s > self._limits.max_gap_s
         too_fast_mps = self._too_fast_mps(estimate, dt_s) if estimate and self._has_support(estimate) else 0.0
         if searched and after_break and self._is_doubtful(estimate, dt_s):
-            estimate = self.relocalise(frame, self._exposures.predicted(frame, dt_s))
+            estimate = self.relocalise(frame, self._exposure(frame, dt_s))
         # Predicted poses were published: one in a place far from them does not close the gap, as odom would jump.
         gap = GapStep.between(T_predicted, estimate.T_odom_rect) if estimate and after_refusal else GapStep()
         if estimate is None or gap.is_far or not self._is_plausible(estimate, dt_s):
@@ -145,27 +138,23 @@ class VisualOdometry:
             stayed = self._untracked.keeps_view(T_predicted) and not supports(tracked, T_predicted)
             refused = self._refuse(frame, usable, T_predicted, dt_s, stayed=stayed, gap=gap if known else None)
             return replace(refused, refused_mps=too_fast_mps)
-        estimate = self._exposures.start_again(
-            frame, usable, estimate, dt_s, request=self._request, tracked=self._search.tracked
-        )
         estimate = self._untracked.in_doubt(estimate, self._since_fix_s(dt_s))
 
         # 6. Update the filter (eq. 11), the pose, the mask of what is fixed to the rig, and the map.
         self._accept(frame, estimate, dt_s, turned=gap.is_turned)
-        new = estimate.pixels[self._map.store.table.anchor[estimate.landmarks] == self._added]
+        new = estimate.pixels[self._map.table.anchor[estimate.landmarks] == self._added]
         self._added = None
-        exposure = self._exposures.predicted(frame, dt_s)
+        exposure = self._exposure(frame, dt_s)
         self._requested = self._update_map(frame, usable, estimate, exposure, dt_s)
         features, is_keyframe = Features(estimate.pixels, estimate.rejected, new), self._requested is not None
-        exposure = exposure if is_keyframe else self._exposures.now(frame)
+        exposure = exposure if is_keyframe else self._exposure(frame)
         result = self._result(estimate.tracked, estimate.inliers, features, exposure)
         return replace(result, is_keyframe=is_keyframe)
 
     def _find(self, frame: StereoFrame, usable: Flags, T_predicted: Array, dt_s: float) -> PoseEstimate | None:
         """Return the likeliest pose of a frame in the map, with its runner-up; None: no landmarks were found."""
-        assert self._previous is not None
-        last = LastFrame(self._T_odom_rect, self._previous)
-        estimate = self._search.find(frame, usable, last, T_predicted, dt_s)
+        exposure = self._exposure(frame, dt_s)
+        estimate = self._search.find(frame, usable, self._T_odom_rect, T_predicted, exposure, dt_s)
         if estimate is None or self._status.is_refused:
             return estimate  # displacements from an unknown place lead anywhere: relocalisation decides
         # How far the vehicle may be from where it was predicted, by the velocity's covariance, for which the errors of
@@ -176,12 +165,34 @@ class VisualOdometry:
         of_runner_up_mps = doubt.runner_up_distance_mps if doubt else 0.0
         most_mps = min(REACH_SIGMAS * sigma_mps + of_runner_up_mps, self._limits.max_speed_mps)
         reach_m = most_mps * self._since_fix_s(dt_s)
-        return self._search.with_runner_up(frame, estimate, last, T_predicted, dt_s, reach_m=reach_m)
+        return self._search.with_runner_up(frame, estimate, T_predicted, exposure, reach_m)
+
+    def _start_again(
+        self, frame: StereoFrame, usable: Flags, estimate: PoseEstimate | None, dt_s: float
+    ) -> PoseEstimate | None:
+        """Start the map again at its first frame, whose velocity this one shows; return the pose in that map."""
+        first, self._first = self._first, None
+        if first is None or not 0 < dt_s <= self._limits.max_gap_s:
+            return estimate
+        for _ in range(START_ROUNDS):
+            if estimate is None or not self._is_plausible(estimate, dt_s):
+                break
+            velocity = self._motion.of_step(se3.inverse(self._T_odom_rect) @ estimate.T_odom_rect, dt_s)
+            self._map.clear()
+            exposure = Exposure.of(first.times, velocity, self._model)
+            self._keyframes.add(self._request(first, usable & first.usable, exposure))
+            exposure = Exposure.of(frame.times, velocity, self._model)
+            estimate = self._search.estimate(frame, estimate.T_odom_rect, exposure, is_near=True)
+        return estimate
+
+    def _exposure(self, frame: StereoFrame, dt_s: float = 0.0) -> Exposure:
+        """Return the exposure of a frame by the filter's velocity, after a step of dt_s was predicted to it."""
+        return Exposure.of(frame.times, self._motion.at_exposure(dt_s), self._model)
 
     def relocalise(self, frame: StereoFrame, exposure: Exposure) -> PoseEstimate | None:
         """Return the pose of a frame among the newest keyframes, refined by the patches of the local map in view."""
         found = self._relocaliser.locate(frame)
-        return None if found is None else self._frame_to_map.refine_recognised(frame, found, exposure)
+        return None if found is None else self._search.refine_recognised(frame, found, exposure)
 
     def complete(self) -> None:
         """Make the last frame a keyframe if the map needs one; the next `process` does so where this is not called.
@@ -238,15 +249,16 @@ class VisualOdometry:
         self._motion.found()
         self._covariance = estimate.covariance + (self._map.covariance_of(estimate) if len(estimate.landmarks) else 0.0)
         self._doubt = doubt_after(self._doubt, self._T_odom_rect, estimate, self._since_fix_s(dt_s))
-        self._T_odom_rect, self._previous = estimate.T_odom_rect, frame.lower
+        self._T_odom_rect = estimate.T_odom_rect
         # What the upper camera does not show where it must be is an outlier there.
         self._cost = estimate.cost + OUTLIER_COST * (1.0 - estimate.upper_ratio), estimate.in_view
         if len(estimate.landmarks):
-            away = self._map.store.table.points[estimate.landmarks] - self._T_odom_rect[:3, 3]
+            away = self._map.table.points[estimate.landmarks] - self._T_odom_rect[:3, 3]
             self._distance_m = float(np.median(np.linalg.norm(away, axis=1)))
-        in_doubt = self._in_doubt or estimate.doubtful_depths
-        facts = FrameFacts(FrameOutcome.ACCEPTED, dt_s, estimate.inliers, runner_up=in_doubt, turned=turned)
-        self._advance(replace(facts, lower_only=estimate.upper_ratio < self._limits.good_inlier_ratio))
+        limits = self._limits
+        is_doubtful = not estimate.is_sure or self._in_doubt or estimate.inliers < limits.good_inliers
+        is_doubtful |= estimate.upper_ratio < limits.good_inlier_ratio
+        self._advance(self._status.accepted(dt_s, limits, doubtful=is_doubtful, turned=turned))
         self._static_mask.observe(frame.lower.panorama, self._T_odom_rect)
 
     @property
@@ -259,27 +271,24 @@ class VisualOdometry:
     ) -> OdometryEstimate:
         """Continue with the predicted pose, with a growing covariance; start the map again if need be.
 
-        stayed: see FrameFacts; gap: from the predicted to the recognised pose, None: it was not recognised elsewhere.
+        stayed: see TrackingStatus; gap: from the predicted to the recognised pose, None: not recognised elsewhere.
         """
         known = gap is not None
-        self._exposures.forget_first()
         carried = self._move(T_predicted, self._motion.carry(frame.sensed, dt_s)) and not known
         textured = self._is_textured(frame, usable)
-        facts = FrameFacts(
-            FrameOutcome.REFUSED, dt_s, textured=textured, elsewhere=known, carried=carried, stayed=stayed
+        status = self._status.refused(
+            dt_s, self._limits, textured=textured, elsewhere=known, carried=carried, stayed=stayed
         )
-        self._advance(facts)
+        self._advance(status, carried=carried)
         if not self._status.restart:
-            return self._result(0, 0, exposure=self._exposures.now(frame))
+            return self._result(0, 0, exposure=self._exposure(frame))
         self._map.clear()
-        self._previous = None
         self._relocaliser.clear()
         if gap is not None:
             self._covariance = self._covariance + gap.covariance
         if self._status.unknown_motion:
             self._motion.reset()
-        facts = FrameFacts(FrameOutcome.NOT_STARTED, 0.0, elsewhere=known, carried=carried)
-        return self._start_map(frame, usable, facts)
+        return self._start_map(frame, usable, 0.0, elsewhere=known, carried=carried)
 
     def _start_without_map(self, frame: StereoFrame, usable: Flags, dt_s: float) -> OdometryEstimate:
         """Start a map where there is none, after the motion that wheels and gyro measured."""
@@ -287,7 +296,7 @@ class VisualOdometry:
         if frame.sensed is not None and dt_s > 0:
             T_predicted = self._T_odom_rect @ self._motion.predict(frame.sensed, dt_s)
             carried = self._move(T_predicted, self._motion.carry(frame.sensed, dt_s))
-        return self._start_map(frame, usable, FrameFacts(FrameOutcome.NOT_STARTED, dt_s, carried=carried))
+        return self._start_map(frame, usable, dt_s, carried=carried)
 
     def _move(self, T_predicted: Array, growth: Array | None) -> bool:
         """Go on to the predicted pose, with the covariance (6, 6) that it adds where wheels and gyro carry it."""
@@ -297,28 +306,28 @@ class VisualOdometry:
             self._covariance = self._covariance + growth
         return growth is not None
 
-    def _start_map(self, frame: StereoFrame, usable: Flags, failed: FrameFacts) -> OdometryEstimate:
-        """Start a map at the current pose if the frame has enough landmarks; failed: the facts where it has not."""
-        exposure = self._exposures.now(frame)
+    def _start_map(
+        self, frame: StereoFrame, usable: Flags, dt_s: float, *, carried: bool, elsewhere: bool = False
+    ) -> OdometryEstimate:
+        """Start a map at the current pose if the frame has enough landmarks; the facts: see TrackingStatus."""
+        exposure = self._exposure(frame)
         new = self._keyframes.add(self._request(frame, usable, exposure))
         if len(self._map) < self._limits.min_inliers:
             self._map.clear()
-            self._advance(failed)
+            self._advance(self._status.without_map(dt_s, carried=carried), carried=carried)
             return self._result(0, 0, exposure=exposure)
-        self._previous = frame.lower
-        self._exposures.map_started(frame)
+        self._first = None if frame.times.is_at_once else frame
         self._motion.found()
-        self._advance(replace(failed, outcome=FrameOutcome.STARTED))
+        self._advance(self._status.started(carried=carried, elsewhere=elsewhere), carried=carried)
         return replace(self._result(len(self._map), len(self._map), Features(new=new), exposure), is_keyframe=True)
 
-    def _advance(self, facts: FrameFacts) -> None:
+    def _advance(self, status: TrackingStatus, *, carried: bool = False) -> None:
         """Advance the tracking state; while it has no fix the covariance grows as under an unknown steady velocity."""
         before_s, was_known = self._status.time_since_fix_s, not self._status.unknown_motion
-        self._status = next_status(self._status, facts, self._limits)
-        after_s = self._status.time_since_fix_s
-        if facts.carried and was_known and self._status.unknown_motion:
+        self._status, after_s = status, status.time_since_fix_s
+        if carried and was_known and status.unknown_motion:
             before_s = 0.0  # What carried the pose is contradicted now, and has measured nothing since the last fix.
-        elif facts.carried:
+        elif carried:
             before_s = after_s
         if after_s > before_s:
             self._covariance = bounded(
@@ -331,10 +340,9 @@ class VisualOdometry:
         self, frame: StereoFrame, usable: Flags, estimate: PoseEstimate, exposure: Exposure, dt_s: float
     ) -> KeyframeRequest | None:
         """Remove lost landmarks; return the keyframe that is to be added, where too few are left."""
-        store = self._map.store
-        ids = store.table.id[estimate.landmarks]
+        ids = self._map.table.id[estimate.landmarks]
         self._map.late_depths.seen(ids, estimate)
-        self._map.store.give_up(estimate.contradicting)
+        self._map.give_up(estimate.contradicting)
         self._map.update_tracked(frame.lower, estimate.landmarks, estimate.pixels)
         if not self._keyframes.is_due(len(estimate.landmarks), dt_s):
             return None

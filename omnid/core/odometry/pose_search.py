@@ -6,28 +6,63 @@ Equations and sections are those of Dang et al. 2012.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import replace
-from typing import NamedTuple
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
+from omnid.core.odometry.corners import pixels_in_upper
 from omnid.core.odometry.estimates import OdometryLimits, PoseEstimate, with_more_inliers
-from omnid.core.odometry.exposure_times import Exposure
-from omnid.core.odometry.frame_exposures import FrameExposures
-from omnid.core.odometry.frame_to_map import FrameToMap
-from omnid.core.odometry.local_map import LocalMap
+from omnid.core.odometry.exposure_times import AssumedMotion, Exposure, ViewShift
+from omnid.core.odometry.local_map import LocalMap, Tracks
+from omnid.core.odometry.plane_patches import align_rows, view_noise
+from omnid.core.odometry.pose_estimation import (
+    CONVERGED,
+    KERNEL_WIDTH,
+    GaussNewtonResult,
+    SharedError,
+    gauss_newton,
+    ransac,
+)
 from omnid.core.odometry.runner_up_motions import displacements, likeliest
 from omnid.core.odometry.stereo_frame import StereoFrame
-from omnid.core.odometry.tracking import correlation_peaks, steps
-from omnid.core.types.panorama import PaddedPanorama
+from omnid.core.odometry.tracking import KltSettings, correlation_peaks, steps
 from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+Indices = NDArray[np.intp]
 
+# Fewer landmarks are no estimate of six unknowns, because three determine them, and as many must confirm it.
+MIN_LANDMARKS = 6
+# Squared Mahalanobis distance from which a view is an outlier: 4 sigma in one of its three components. Of views with
+# normal errors one in a thousand is farther away, so that hardly any is lost.
+OUTLIER_SQUARED = 16.0
+# Steps of Gauss-Newton in each round at most; a round takes the inliers of the one before. Measured on `rooms` 6 and
+# `struts` 5 at 384 px: in 99 % of the frames the last round ends within 0.02 sigmas of where 50 steps lead, and the
+# coarse one within 0.24.
+COARSE_STEPS, STEPS = (3,), (2, 4)
+# Refinements of a recognised pose, because the first one brings most patches into reach, the second one aligns them
+# all.
+RECOGNISED_ROUNDS = 2
+# Landmarks tracked for each yaw hypothesis, because the share that is kept is then known to 4 %: sqrt(0.5^2 / 150).
+YAW_SAMPLE = 150
+LIKELY_RATIO = 0.15  # share of them that a wrong hypothesis hardly reaches
+ENOUGH_RATIO = 0.5  # share of them, tracked, that ends the search; as in section IV.F
+# M and rad; a smaller step of the coarse pose is the last one, because it moves no track by 0.05 px.
+COARSE_CONVERGED = 1e-4
+# Standard deviation of a track whose patch was not yet warped to the new viewpoint.
+COARSE_SIGMA_PX = 0.3
+# Landmarks that count as one in the covariance: neighbours have texture, depth and keyframe in common, so that their
+# errors are correlated.
+CORRELATED_LANDMARKS = 4.0
+# Expected value of the squared Mahalanobis distance of a view, because that is a sum of three squares, each with an
+# expected value of 1.
+VIEW_DIMENSIONS = 3
+# Cost of a landmark that is no inlier: that of the last one.
+OUTLIER_COST = KERNEL_WIDTH**2 / 2 * math.log1p(OUTLIER_SQUARED / KERNEL_WIDTH**2) / CORRELATED_LANDMARKS
 # Share of the predicted landmarks, inliers, below which they are also searched with a pyramid, because without one, in
 # noise, tracks stay near a wrong prediction and confirm it.
 NEAR_RATIO = 0.5
@@ -38,45 +73,38 @@ GOOD_TRACKED_RATIO = 0.5
 TRACKED_SHARE = 0.6
 
 
-class LastFrame(NamedTuple):
-    """The last accepted frame."""
+@dataclass(frozen=True, slots=True)
+class CoarsePose:
+    """Pose from the tracks, and the inliers among them."""
 
-    T_odom_rect: Array  # (4, 4)
-    panorama: PaddedPanorama  # the lower one
+    T_curr_odom: Array  # (4, 4)
+    landmarks: Indices  # (M,) rows of the local map
+    disparity: Array  # (M,) px between the images of this frame, NaN: not found in the upper panorama
+    variance: Array  # (M,) px^2 of the disparity by noise
+    tracks: Tracks
 
 
 class PoseSearch:
     """Finds a frame in the local map."""
 
-    def __init__(
-        self,
-        local_map: LocalMap,
-        model: StereoModel,
-        limits: OdometryLimits,
-        *,
-        frame_to_map: FrameToMap,
-        exposures: FrameExposures,
-    ) -> None:
+    def __init__(self, local_map: LocalMap, model: StereoModel, limits: OdometryLimits, klt: KltSettings) -> None:
         self._map, self._model, self._limits = local_map, model, limits
-        self._frame_to_map, self._exposures = frame_to_map, exposures
-
-    @property
-    def tracked(self) -> int:
-        """Number of landmarks that are tracked at most."""
-        return max(2 * self._limits.good_inliers, round(TRACKED_SHARE * self._limits.features))
+        self._coarse_model = replace(model, sigma_px=COARSE_SIGMA_PX)
+        self._stereo_klt = replace(klt, levels=0)  # the predicted disparity is good to a few pixels
+        # Number of landmarks that are tracked at most.
+        self._tracked = max(2 * limits.good_inliers, round(TRACKED_SHARE * limits.features))
 
     def find(
-        self, frame: StereoFrame, usable: Flags, last: LastFrame, T_predicted: Array, dt_s: float
+        self, frame: StereoFrame, usable: Flags, T_last: Array, T_predicted: Array, exposure: Exposure, dt_s: float
     ) -> PoseEstimate | None:
         """Return the best estimate from the guesses, or the first good one; None: no landmarks were found."""
         sensed_m = math.nan
         if frame.sensed is not None and frame.sensed.is_complete:
-            sensed_m = float(np.linalg.norm(T_predicted[:3, 3] - last.T_odom_rect[:3, 3]))
+            sensed_m = float(np.linalg.norm(T_predicted[:3, 3] - T_last[:3, 3]))
         self._map.decide_first_depths(frame.lower, (self._limits.max_speed_mps * dt_s, sensed_m))
         best: PoseEstimate | None = None
-        exposure = self._exposures.predicted(frame, dt_s)
-        for T_guess, is_near in self._guesses(frame, usable, last, T_predicted):
-            estimate = self._estimate(frame, T_guess, exposure, last, dt_s, is_near=is_near)
+        for T_guess, is_near in self._guesses(frame, usable, T_last, T_predicted):
+            estimate = self.estimate(frame, T_guess, exposure, is_near=is_near)
             best = with_more_inliers(best, estimate)
             if is_good_enough(best, self._limits, is_near=is_near):
                 break
@@ -86,29 +114,26 @@ class PoseSearch:
         self,
         frame: StereoFrame,
         estimate: PoseEstimate,
-        last: LastFrame,
         T_predicted: Array,
-        dt_s: float,
-        *,
+        exposure: Exposure,
         reach_m: float,
     ) -> PoseEstimate:
         """Return the likeliest pose within reach_m of the prediction, with its runner-up: runner_up_motions.py."""
         # 1. Displacements within reach from which the scene has the same appearance, and the poses to which they lead.
         off_m = estimate.distance_m(T_predicted)
         peaks = displacements(self._map, self._model, frame.lower, estimate.T_odom_rect, reach_m + off_m)
-        exposure = self._exposures.predicted(frame, dt_s)
         is_good, others = is_good_enough(estimate, self._limits, is_near=False), []
         for x, y in peaks:
             if is_good and x == y == 0:
                 continue
             T_guess = estimate.T_odom_rect @ se3.exp([x, y, 0.0, 0.0, 0.0, 0.0])
-            other = self._estimate(frame, T_guess, exposure, last, dt_s, is_near=True)
+            other = self.estimate(frame, T_guess, exposure, is_near=True)
             others += [other] if other is not None and other.distance_m(T_predicted) < reach_m else []
         # 2. Where many tracks are outliers, the pose by these: their depths may be right, and the inliers' wrong. The
         #    same where the inliers show no motion of a vehicle: they may be on a person who walks along, and what is
         #    nearer to the prediction is right.
         if estimate.inlier_ratio < self._limits.good_inlier_ratio or off_m > reach_m:
-            other = self._by_outliers(frame, estimate, exposure, last, dt_s)
+            other = self.by_outliers(frame, estimate, exposure)
             others += [other] if other is not None else []
         # 3. The likeliest one, and whether another one is nearly as likely.
         return self._with_doubtful_depths(likeliest(estimate, others, T_predicted, max(reach_m, off_m)))
@@ -123,33 +148,29 @@ class PoseSearch:
         covariance = estimate.covariance + np.diag(np.repeat([float(other[:3] @ other[:3]), 0.0], 3))
         return replace(estimate, covariance=covariance, doubtful_depths=True)
 
-    def _by_outliers(
-        self, frame: StereoFrame, estimate: PoseEstimate, exposure: Exposure, last: LastFrame, dt_s: float
-    ) -> PoseEstimate | None:
+    def by_outliers(self, frame: StereoFrame, estimate: PoseEstimate, exposure: Exposure) -> PoseEstimate | None:
         """Return the pose by the tracks that are outliers of an estimate; None: too few of them agree."""
-        tracks = self._map.track(frame.lower, estimate.T_odom_rect, self.tracked, turn=frame.seq)
+        tracks = self._map.track(frame.lower, estimate.T_odom_rect, self._tracked, turn=frame.seq)
         outliers = tracks.without(estimate.landmarks)
-        coarse = self._frame_to_map.estimate(frame, outliers, estimate.T_odom_rect, exposure)
-        return None if coarse is None else self._exposures.refine(frame, coarse, exposure, last.T_odom_rect, dt_s)
+        coarse = self.coarse(frame, outliers, estimate.T_odom_rect, exposure)
+        return None if coarse is None else self.refine(frame, coarse, exposure)
 
-    def _estimate(
-        self, frame: StereoFrame, T_guess: Array, exposure: Exposure, last: LastFrame, dt_s: float, *, is_near: bool
-    ) -> PoseEstimate | None:
+    def estimate(self, frame: StereoFrame, T_guess: Array, exposure: Exposure, *, is_near: bool) -> PoseEstimate | None:
         """Return the pose from one guess; None: no landmarks were found."""
         # 1. Track the landmarks of the last panorama by KLT, forward and backward (section IV.A).
-        tracks = self._map.track(frame.lower, T_guess, self.tracked, turn=frame.seq, near=is_near)
+        tracks = self._map.track(frame.lower, T_guess, self._tracked, turn=frame.seq, near=is_near)
 
         # 2. Estimate: find them in the upper panorama as well, then RANSAC on three points (IV.B) and Gauss-Newton on
         #    the bearings in both panoramas (IV.C, in place of eq. 9).
-        coarse = self._frame_to_map.estimate(frame, tracks, T_guess, exposure)
+        coarse = self.coarse(frame, tracks, T_guess, exposure)
         if coarse is None:
             return None
 
         # 3. Refine: align the keyframes' patches, warped to the estimated viewpoint; Gauss-Newton again.
-        return self._exposures.refine(frame, coarse, exposure, last.T_odom_rect, dt_s)
+        return self.refine(frame, coarse, exposure)
 
     def _guesses(
-        self, frame: StereoFrame, usable: Flags, last: LastFrame, T_predicted: Array
+        self, frame: StereoFrame, usable: Flags, T_last: Array, T_predicted: Array
     ) -> Iterator[tuple[Array, bool]]:
         """Yield guesses of the pose, and whether they count as near: the prediction, which nearly always is near.
 
@@ -159,10 +180,195 @@ class PoseSearch:
         """
         yield T_predicted, True
         yield T_predicted, False
-        peaks = correlation_peaks(last.panorama.panorama, frame.lower.panorama, usable, turn_px=frame.lower.period_px)
-        T_unturned = last.T_odom_rect.copy()
+        assert self._map.last is not None
+        before, now = self._map.last.panorama, frame.lower.panorama
+        peaks = correlation_peaks(before, now, usable, turn_px=frame.lower.period_px)
+        T_unturned = T_last.copy()
         T_unturned[:3, 3] = T_predicted[:3, 3]
-        yield self._frame_to_map.best_yaw(frame, T_unturned, peaks + steps(), likely=len(peaks)), False
+        yield self.best_yaw(frame, T_unturned, peaks + steps(), likely=len(peaks)), False
+
+    def coarse(self, frame: StereoFrame, tracks: Tracks, T_odom_guess: Array, exposure: Exposure) -> CoarsePose | None:
+        """Return the pose that most tracks support, None where fewer than MIN_LANDMARKS do.
+
+        RANSAC on three points (Dang et al. 2012, section IV.B), then Gauss-Newton on the bearings in both cameras, in
+        place of the paper's eq. (9).
+        """
+        if len(tracks.landmarks) < MIN_LANDMARKS:
+            return None
+        T_guess_odom = se3.inverse(T_odom_guess)
+        in_guess = se3.apply(T_guess_odom, self._map.table.points[tracks.landmarks])
+        slopes = self._map.slopes(T_odom_guess, tracks.landmarks)
+        shift = exposure.shift(in_guess)
+        views, variance = self._views(frame, tracks, slopes, shift, 2 * shift.column_sigma(exposure.motion))
+        disparity = views[:, 2] - views[:, 1]
+        views += np.column_stack([shift.lower, shift.upper[:, 1]])
+        T_curr_guess, is_inlier = ransac(in_guess, views, self._model, np.random.default_rng(frame.seq))
+        landmarks = tracks.landmarks[is_inlier]
+        noise = shift.noise(exposure.motion)[is_inlier]
+        solution, kept = self._solve(
+            landmarks,
+            views[is_inlier],
+            T_curr_guess @ T_guess_odom,
+            self._coarse_model,
+            noise,
+            SharedError.none(len(landmarks)),
+            converged=COARSE_CONVERGED,
+        )
+        if solution is None:
+            return None
+        chosen = np.flatnonzero(is_inlier)[kept]
+        return CoarsePose(solution.T, landmarks[kept], disparity[chosen], variance[chosen], tracks)
+
+    def refine(self, frame: StereoFrame, coarse: CoarsePose, exposure: Exposure) -> PoseEstimate | None:
+        """Return the pose from the keyframes' patches of all landmarks in view, None where too few are aligned.
+
+        The disparity of the tracked landmarks was measured between the images of this frame, so it is kept and goes
+        along with the aligned lower row. Tracks from the last panorama and patches of the keyframes are two independent
+        supports of the pose: the number of inliers is the smaller one of both.
+        """
+        # 1. Align the patches of the keyframes in the lower panorama.
+        T_odom_curr = se3.inverse(coarse.T_curr_odom)
+        landmarks, predicted = self._map.visible(T_odom_curr)
+        in_view = len(landmarks)
+        in_curr = se3.apply(coarse.T_curr_odom, self._map.table.points[landmarks])
+        shift = exposure.shift(in_curr)
+        aligned = self._map.align(frame.lower, T_odom_curr, landmarks, predicted[:, :2] - shift.lower)
+        landmarks, pixels = landmarks[aligned.found], aligned.pixels[aligned.found]
+        # 2. The views: aligned pixels, with the disparities of the tracks, corrected to the stamp of the pair.
+        disparity, variance = np.full(len(self._map), np.nan), np.zeros(len(self._map))
+        disparity[coarse.landmarks], variance[coarse.landmarks] = coarse.disparity, coarse.variance
+        views = np.column_stack([pixels, pixels[:, 1] + disparity[landmarks]])
+        noise = view_noise(aligned.covariance[aligned.found], variance[landmarks])
+        views += np.column_stack([shift.lower, shift.upper[:, 1]])[aligned.found]
+        # 3. Solve for the pose and the velocity. The prior of the velocity is one measurement: unlike the landmarks'
+        # errors it is not correlated with others.
+        covariance = exposure.motion.covariance / CORRELATED_LANDMARKS
+        by_motion = SharedError(shift.by_motion[aligned.found, :3], covariance)
+        solution, kept = self._solve(landmarks, views, coarse.T_curr_odom, self._model, noise, by_motion)
+        if solution is None:
+            return None
+        # 4. The covariance: errors larger than expected enlarge it, smaller ones never reduce it.
+        scale = CORRELATED_LANDMARKS * max(1.0, float(solution.squared.mean()) / VIEW_DIMENSIONS)
+        variance = variance[landmarks]
+        # 5. The motion by which later frames correct depths is the one before this pair. The velocity found here agrees
+        # with the depths in the map, so it must not correct them: a vertical one has the effect of another baseline,
+        # and the scale would drift.
+        of_depth = by_motion.derivatives[:, 2] - by_motion.derivatives[:, 1]
+        assumed = AssumedMotion(exposure.motion, of_depth[kept])
+        landmarks, views, pixels, tracks = landmarks[kept], views[kept], pixels[kept], coarse.tracks
+        is_kept = np.zeros(len(self._map), bool)
+        is_kept[landmarks] = True
+        rejected = tracks.pixels[~is_kept[tracks.landmarks]]
+        visible, tracked, supporting = (
+            round(tracks.each_counts * n) for n in (tracks.visible, len(tracks.landmarks), len(coarse.landmarks))
+        )
+        return PoseEstimate(
+            se3.inverse(solution.T),
+            scale * solution.covariance,
+            visible,
+            tracked,
+            min(supporting, len(landmarks)),
+            landmarks,
+            views,
+            pixels,
+            variance[kept],
+            rejected,
+            assumed,
+            _cost(solution.squared[solution.squared < OUTLIER_SQUARED], in_view),
+            in_view,
+            upper_ratio=_upper_ratio(frame, coarse),
+        )
+
+    def refine_recognised(
+        self, frame: StereoFrame, recognised: PoseEstimate, exposure: Exposure
+    ) -> PoseEstimate | None:
+        """Return the pose of a frame that was recognised, by the keyframes' patches; None where too few agree.
+
+        Places are recognised by corners, whose pose errs by centimetres. Corners and patches are two independent
+        supports of the pose: the number of inliers is the smaller one of both.
+        """
+        none = np.zeros(0, np.intp)
+        untracked = Tracks(none, np.zeros((0, 2)), np.zeros((0, 3)), 0)
+        refined = recognised
+        for _ in range(RECOGNISED_ROUNDS):
+            start = CoarsePose(se3.inverse(refined.T_odom_rect), none, np.zeros(0), np.zeros(0), untracked)
+            again = self.refine(frame, start, exposure)
+            if again is None:
+                return None
+            refined = again
+        inliers = min(recognised.inliers, len(refined.landmarks))
+        return replace(refined, visible=recognised.visible, tracked=recognised.tracked, inliers=inliers)
+
+    def best_yaw(self, frame: StereoFrame, T_odom_rect: Array, yaws_rad: Iterable[float], likely: int = 0) -> Array:
+        """Return the pose, turned by that hypothesis of the yaw which keeps most landmarks through the KLT check.
+
+        The search ends at the first hypothesis that keeps more than ENOUGH_RATIO (section IV.F), and after the first
+        `likely` hypotheses if one of them keeps more than LIKELY_RATIO: then the view has changed by more than a turn,
+        and no other yaw would keep many.
+        """
+        best, highest = T_odom_rect, -1.0
+        for count, yaw_rad in enumerate(yaws_rad):
+            if count == likely and highest > LIKELY_RATIO:
+                break
+            turned = T_odom_rect @ se3.exp([0, 0, 0, 0, 0, yaw_rad])
+            tracks = self._map.track(frame.lower, turned, most=YAW_SAMPLE)
+            ratio = len(tracks.landmarks) / max(1, tracks.visible)
+            if ratio > highest:
+                best, highest = turned, ratio
+            if highest > ENOUGH_RATIO:
+                break
+        return best
+
+    def _views(
+        self, frame: StereoFrame, tracks: Tracks, slopes: Array, shift: ViewShift, spread_px: Array
+    ) -> tuple[Array, Array]:
+        """Return the views (M, 3) [px] of tracks: pixels, and the rows in the upper panorama where they match there.
+
+        slopes (M, 2) of their disparities; spread_px: standard deviations (M,) of the columns there, twice. Also
+        returns the variances (M,) [px^2] of the rows by noise.
+        """
+        pair = frame.lower, frame.upper
+        guess = tracks.pixels.copy()
+        guess[:, 1] += tracks.predicted[:, 2] - tracks.predicted[:, 1]
+        guess += shift.lower - shift.upper
+        # Not checked backward: a patch must fit there, and a wrong row is an outlier of the pose.
+        near = pixels_in_upper(pair, tracks.pixels, guess, self._stereo_klt, spread_px, checked=False)
+        rows, variance = align_rows(pair, tracks.pixels, near, slopes, self._model)
+        return np.column_stack([tracks.pixels, rows]), variance
+
+    def _solve(
+        self,
+        landmarks: Indices,
+        views: Array,
+        T_curr_odom: Array,
+        model: StereoModel,
+        noise: Array,
+        shared: SharedError,
+        converged: float = CONVERGED,
+    ) -> tuple[GaussNewtonResult | None, Flags]:
+        """Return the solution of Gauss-Newton in rounds, and flags (M,) of the inliers; None where they are too few."""
+        kept = np.ones(len(landmarks), bool)
+        solution = None
+        for most_steps in COARSE_STEPS if model is self._coarse_model else STEPS:
+            if kept.sum() < MIN_LANDMARKS:
+                return None, kept
+            rows, table = landmarks[kept], self._map.table
+            solution = gauss_newton(
+                table.points[rows],
+                table.covariance[rows],
+                views[kept],
+                T_curr_odom,
+                model,
+                noise[kept],
+                most_steps,
+                shared.of(kept),
+                converged,
+            )
+            T_curr_odom = solution.T
+            squared = np.full(len(landmarks), np.inf)
+            squared[kept] = solution.squared
+            kept = squared < OUTLIER_SQUARED
+        return (solution if kept.sum() >= MIN_LANDMARKS else None), kept
 
 
 def is_good_enough(estimate: PoseEstimate | None, limits: OdometryLimits, *, is_near: bool) -> bool:
@@ -174,3 +380,24 @@ def is_good_enough(estimate: PoseEstimate | None, limits: OdometryLimits, *, is_
         and estimate.inlier_ratio >= limits.good_inlier_ratio
         and estimate.inliers >= limits.good_inliers
     )
+
+
+def _upper_ratio(frame: StereoFrame, coarse: CoarsePose) -> float:
+    """Return the share of the inliers among the tracks that were found in the upper panorama.
+
+    Where the cameras expose at several times it is 1: an acceleration that is not known hides rows as well.
+    """
+    if not frame.times.is_at_once or not len(coarse.disparity):
+        return 1.0
+    return float(np.isfinite(coarse.disparity).mean())
+
+
+def _cost(squared: Array, in_view: int) -> float:
+    """Return the mean cost of a landmark in view, by the squared errors (M,) of those that are inliers.
+
+    It is the negative logarithm of the likelihood with the Cauchy kernel, k^2 / 2 log(1 + e^2 / k^2), by the landmarks
+    that count as one; an outlier costs what the last inlier does.
+    """
+    width2 = KERNEL_WIDTH**2
+    inliers = width2 / 2 * float(np.log1p(squared / width2).sum()) / CORRELATED_LANDMARKS
+    return (inliers + (in_view - len(squared)) * OUTLIER_COST) / max(1, in_view)

@@ -199,7 +199,7 @@ def displacements(
     before, rows = local_map.last_seen(LANDMARKS)
     if before is None or not len(rows):
         return []
-    table = local_map.store.table
+    table = local_map.table
     points = se3.apply(se3.inverse(T_odom_rect), table.points[rows])
     step_px = STEP_PX / model.cylinder.focal_px
     step_m = max(step_px * float(np.median(np.hypot(points[:, 0], points[:, 1]))), reach_m / MOST_STEPS)

@@ -1,4 +1,4 @@
-"""State machine of the tracking state: all its transitions are in one pure function.
+"""State machine of the tracking state: all its transitions are methods that return the next status.
 
 NOT_STARTED ----------------------------------------------> LOST
 STARTED, ACCEPTED ----------------------------------------> TRACKING
@@ -19,41 +19,19 @@ moved: the old map would be in view, so the base was carried away, or its wheels
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from enum import Enum, auto
+from dataclasses import dataclass, replace
 
 from omnid.core.odometry.estimates import OdometryLimits
 from omnid.tracking_state import TrackingState
 
 
-class FrameOutcome(Enum):
-    """Result of the odometry for one frame."""
-
-    STARTED = auto()  # a map was started at this frame
-    NOT_STARTED = auto()  # there is no map, and the frame has too few landmarks to start one
-    ACCEPTED = auto()  # a pose was found and accepted
-    REFUSED = auto()  # no pose was found, or it was refused
-
-
-@dataclass(frozen=True, slots=True)
-class FrameFacts:
-    """Facts of one frame that the tracking state depends on."""
-
-    outcome: FrameOutcome
-    dt_s: float  # since the previous frame
-    inliers: int = 0
-    lower_only: bool = False  # the upper camera does not show many of the inliers
-    runner_up: bool = False  # another motion explains the images nearly as well
-    textured: bool = True  # the frame has enough corners for a map
-    elsewhere: bool = False  # it was recognised at a place to which the predicted motion does not lead
-    turned: bool = False  # an accepted pose has another heading than was published
-    carried: bool = False  # wheels and gyro carry the pose on
-    stayed: bool = False  # the pose has hardly changed since the last fix, and no landmark of the map shows it
-
-
 @dataclass(frozen=True, slots=True)
 class TrackingStatus:
-    """Tracking state after a frame, with the counters that lead to the next one."""
+    """Tracking state after a frame, with the counters that lead to the next one; dt_s: since the frame before.
+
+    carried: wheels and gyro carry the pose on. elsewhere: the frame was recognised at a place to which the predicted
+    motion does not lead.
+    """
 
     state: TrackingState = TrackingState.LOST
     refused_s: float | None = None  # from the first of consecutive refused frames to this one; None: it was not refused
@@ -69,56 +47,68 @@ class TrackingStatus:
         """True if the frame was refused."""
         return self.refused_s is not None
 
-
-def next_status(status: TrackingStatus, facts: FrameFacts, limits: OdometryLimits) -> TrackingStatus:
-    """Return the status after a frame."""
-    unknown_motion = status.unknown_motion or (status.has_begun and not facts.carried)
-
-    if facts.outcome is FrameOutcome.STARTED:
+    def started(self, *, carried: bool = False, elsewhere: bool = False) -> TrackingStatus:
+        """Return the status after a frame at which a map was started."""
         # A map that takes the place of a lost one says nothing about the motion between the two.
-        state = TrackingState.DEGRADED if unknown_motion and not facts.elsewhere else TrackingState.TRACKING
-        return TrackingStatus(state, has_begun=True, resets=status.resets + unknown_motion)
+        unknown_motion = self._is_unknown(carried)
+        state = TrackingState.DEGRADED if unknown_motion and not elsewhere else TrackingState.TRACKING
+        return TrackingStatus(state, has_begun=True, resets=self.resets + unknown_motion)
 
-    if facts.outcome is FrameOutcome.ACCEPTED:
-        few_inliers = facts.inliers < limits.good_inliers
-        after_gap = status.is_refused or facts.dt_s > limits.max_gap_s
-        is_doubtful = few_inliers or after_gap or facts.lower_only or facts.runner_up
-        state = TrackingState.DEGRADED if is_doubtful else TrackingState.TRACKING
-        return TrackingStatus(state, has_begun=True, resets=status.resets + facts.turned)
+    def without_map(self, dt_s: float, *, carried: bool = False) -> TrackingStatus:
+        """Return the status after a frame that has too few landmarks to start a map, where there is none."""
+        return TrackingStatus(
+            TrackingState.DEGRADED if carried else TrackingState.LOST,
+            time_since_fix_s=self.time_since_fix_s + dt_s,
+            has_begun=self.has_begun,
+            unknown_motion=self._is_unknown(carried),
+            resets=self.resets,
+        )
 
-    if facts.outcome is FrameOutcome.REFUSED:
-        return _after_refusal(status, facts, limits, unknown_motion=unknown_motion)
+    def accepted(
+        self, dt_s: float, limits: OdometryLimits, *, doubtful: bool = False, turned: bool = False
+    ) -> TrackingStatus:
+        """Return the status after a frame whose pose was accepted; turned: its heading is not what was published.
 
-    return TrackingStatus(
-        TrackingState.DEGRADED if facts.carried else TrackingState.LOST,
-        time_since_fix_s=status.time_since_fix_s + facts.dt_s,
-        has_begun=status.has_begun,
-        unknown_motion=unknown_motion,
-        resets=status.resets,
-    )
+        doubtful: few inliers, few of them in the upper camera, or another motion that explains the images as well.
+        """
+        doubtful = doubtful or self.is_refused or dt_s > limits.max_gap_s
+        state = TrackingState.DEGRADED if doubtful else TrackingState.TRACKING
+        return TrackingStatus(state, has_begun=True, resets=self.resets + turned)
 
+    def refused(
+        self,
+        dt_s: float,
+        limits: OdometryLimits,
+        *,
+        textured: bool = True,
+        elsewhere: bool = False,
+        carried: bool = False,
+        stayed: bool = False,
+    ) -> TrackingStatus:
+        """Return the status after a frame without a pose; textured: it has enough corners for a map.
 
-def _after_refusal(
-    status: TrackingStatus, facts: FrameFacts, limits: OdometryLimits, *, unknown_motion: bool
-) -> TrackingStatus:
-    """Return the status after a frame that was refused; unknown_motion: before it is known that it stayed."""
-    # Nothing is seen in a time without frames: no more of it counts than goes without a doubt.
-    step_s = min(facts.dt_s, limits.max_gap_s)
-    refused_s, unmatched_s = _longer(status.refused_s, step_s), status.unmatched_s
-    is_lost = refused_s >= limits.lost_s
-    if is_lost and facts.textured:
-        unmatched_s = _longer(unmatched_s, step_s)
-    restart = is_lost and (facts.elsewhere or (unmatched_s is not None and unmatched_s >= limits.restart_s))
-    return TrackingStatus(
-        TrackingState.LOST if is_lost and not facts.carried else TrackingState.DEGRADED,
-        refused_s,
-        unmatched_s,
-        status.time_since_fix_s + facts.dt_s,
-        restart,
-        has_begun=True,
-        unknown_motion=unknown_motion or (restart and facts.stayed),
-        resets=status.resets,
-    )
+        stayed: the predicted pose has hardly changed since the last fix, and no landmark of the map shows it.
+        """
+        # Nothing is seen in a time without frames: no more of it counts than goes without a doubt.
+        step_s = min(dt_s, limits.max_gap_s)
+        refused_s, unmatched_s = _longer(self.refused_s, step_s), self.unmatched_s
+        is_lost = refused_s >= limits.lost_s
+        if is_lost and textured:
+            unmatched_s = _longer(unmatched_s, step_s)
+        restart = is_lost and (elsewhere or (unmatched_s is not None and unmatched_s >= limits.restart_s))
+        return replace(
+            self,
+            state=TrackingState.LOST if is_lost and not carried else TrackingState.DEGRADED,
+            refused_s=refused_s,
+            unmatched_s=unmatched_s,
+            time_since_fix_s=self.time_since_fix_s + dt_s,
+            restart=restart,
+            has_begun=True,
+            unknown_motion=self._is_unknown(carried) or (restart and stayed),
+        )
+
+    def _is_unknown(self, carried: bool) -> bool:
+        return self.unknown_motion or (self.has_begun and not carried)
 
 
 def _longer(since_s: float | None, step_s: float) -> float:

@@ -64,23 +64,19 @@ def test_wheels_tell_which_motion_it_was(alike: RenderedCameras) -> None:
         assert estimate.covariance[0, 0] < 0.02**2, k
 
 
-def pose(x_m: float, cost: float, inliers: int = 100, runner_up: Array | None = None) -> PoseEstimate:
+def pose(x_m: float, cost: float, inliers: int) -> PoseEstimate:
     T = se3.exp([x_m, 0, 0, 0, 0, 0])
-    return PoseEstimate(
-        T, 1e-6 * np.eye(6), 100, 100, inliers, np.arange(inliers), cost=cost, in_view=100, runner_up=runner_up
-    )
+    return PoseEstimate(T, 1e-6 * np.eye(6), 100, 100, inliers, np.arange(inliers), cost=cost, in_view=100)
 
 
 @pytest.mark.parametrize(("reach_m", "expected_m"), [(0.002, 0.028), (0.05, 0.0)])
 def test_the_pose_by_outliers_is_sought_where_the_inliers_show_no_motion_of_a_vehicle(
     alike: RenderedCameras, monkeypatch: pytest.MonkeyPatch, reach_m: float, expected_m: float
 ) -> None:
+    """They may be on a person who follows the robot."""
     monkeypatch.setattr(pose_search, "displacements", lambda *_: [])
-    monkeypatch.setattr(pose_search.PoseSearch, "_by_outliers", lambda *_: pose(0.028, 0.5, inliers=91))
-    search = pose_search.PoseSearch(
-        Mock(first_depths=None), alike.model, OdometryLimits(), frame_to_map=Mock(), exposures=Mock()
-    )
-    frame, T_predicted = alike.frame(0, np.eye(4)), pose(0.020, 0.0).T_odom_rect
-    last = pose_search.LastFrame(np.eye(4), frame.lower)
-    found = search.with_runner_up(frame, pose(0.0, 0.6, inliers=70), last, T_predicted, 0.1, reach_m=reach_m)
+    monkeypatch.setattr(pose_search.PoseSearch, "by_outliers", lambda *_: pose(0.028, 0.5, inliers=91))
+    search = pose_search.PoseSearch(Mock(first_depths=None), alike.model, OdometryLimits(), KltSettings())
+    T_predicted = pose(0.020, 0.0, 0).T_odom_rect
+    found = search.with_runner_up(alike.frame(0, np.eye(4)), pose(0.0, 0.6, 70), T_predicted, Mock(), reach_m)
     assert found.T_odom_rect[0, 3] == expected_m

@@ -8,11 +8,10 @@ import pytest
 from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.odometry.corners import corners
-from omnid.core.odometry.estimates import PoseEstimate
-from omnid.core.odometry.exposure_times import UNKNOWN_VELOCITY, Exposure
-from omnid.core.odometry.frame_to_map import FrameToMap
-from omnid.core.odometry.landmarks import Keyframe
-from omnid.core.odometry.local_map import LocalMap
+from omnid.core.odometry.estimates import OdometryLimits, PoseEstimate
+from omnid.core.odometry.exposure_times import NO_VELOCITY, Exposure
+from omnid.core.odometry.local_map import Keyframe, LocalMap
+from omnid.core.odometry.pose_search import PoseSearch
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings
 from omnid.core.types.pixel_times import AT_ONCE
@@ -40,15 +39,15 @@ def map_of(lower: Image, keyframe_image: Image) -> LocalMap:
     keyframe = Keyframe(0, wrapped(keyframe_image), np.eye(4), np.zeros((6, 6)))
     views = np.column_stack([points, points[:, 1] + DISPARITY_PX])
     local_map.add_keyframe(keyframe, views, np.zeros((len(views), 2)))
-    local_map.update_tracked(wrapped(lower), np.arange(len(local_map)), local_map.store.table.views[:, :2])
+    local_map.update_tracked(wrapped(lower), np.arange(len(local_map)), local_map.table.views[:, :2])
     return local_map
 
 
 def located(local_map: LocalMap, frame: StereoFrame) -> PoseEstimate | None:
     """The estimate from a guess at the origin."""
-    steps = FrameToMap(local_map, MODEL, KltSettings())
-    exposure = Exposure.of(AT_ONCE, UNKNOWN_VELOCITY, MODEL)
-    coarse = steps.estimate(frame, local_map.track(frame.lower, np.eye(4)), np.eye(4), exposure)
+    steps = PoseSearch(local_map, MODEL, OdometryLimits(), KltSettings())
+    exposure = Exposure.of(AT_ONCE, NO_VELOCITY, MODEL)
+    coarse = steps.coarse(frame, local_map.track(frame.lower, np.eye(4)), np.eye(4), exposure)
     return steps.refine(frame, coarse, exposure) if coarse else None
 
 
@@ -80,5 +79,5 @@ def test_a_recognised_pose_is_refined_and_supported_by_the_patches(columns_shown
 def refined(shown: Image) -> PoseEstimate | None:
     """The pose from one that is a centimetre off; the keyframe shows an image."""
     found = PoseEstimate(se3.exp(RECOGNISED_OFF), 1e-4 * np.eye(6), 80, 80, 60)
-    steps = FrameToMap(map_of(texture(1), shown), MODEL, KltSettings())
-    return steps.refine_recognised(stereo_frame(texture(1)), found, Exposure.of(AT_ONCE, UNKNOWN_VELOCITY, MODEL))
+    steps = PoseSearch(map_of(texture(1), shown), MODEL, OdometryLimits(), KltSettings())
+    return steps.refine_recognised(stereo_frame(texture(1)), found, Exposure.of(AT_ONCE, NO_VELOCITY, MODEL))
