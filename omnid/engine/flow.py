@@ -39,31 +39,25 @@ class Sink(Protocol[In_contra]):
         """Take a message out of the graph."""
 
 
-class Reader(Protocol):
-    """Receiving end of a stream."""
-
-    def put(self, message: object) -> None:
-        """Take one message."""
-
-    def end(self) -> None:
-        """Count one writer less; after the last one comes the end of the stream."""
-
-
 class Stream(Generic[T_co]):
     """Output of a source or a stage, with any number of readers, which get each message in the order of the wiring."""
 
     def __init__(self) -> None:
-        self.readers: list[Reader] = []
+        self._readers: list[tuple[Callable[[object], None], Callable[[], None]]] = []
+
+    def add(self, put: Callable[[object], None], end: Callable[[], None]) -> None:
+        """Add a reader. put: takes a message. end: counts one writer less."""
+        self._readers.append((put, end))
 
     def push(self, message: object) -> None:
         """Pass the message to every reader."""
-        for reader in self.readers:
-            reader.put(message)
+        for put, _ in self._readers:
+            put(message)
 
     def end(self) -> None:
         """Pass the end of the stream to every reader."""
-        for reader in self.readers:
-            reader.end()
+        for _, end in self._readers:
+            end()
 
 
 class Slot(Generic[T]):
@@ -86,50 +80,53 @@ def nothing(*_: object) -> None:
 
 
 class Node:
-    """A stage or a sink with its counters and its output stream."""
+    """A stage or a sink with its counters and its output stream; after an error it takes no more messages."""
 
-    def __init__(self, stats: StageStats, work: object) -> None:
-        self.stats = stats
+    def __init__(
+        self,
+        stats: StageStats,
+        work: object,
+        writers: int,
+        succeeds: Callable[..., bool],
+        is_aborting: Callable[[], bool],
+    ) -> None:
+        """writers: number of streams that it reads. succeeds: calls its second argument with the others; True where
+        that raised no error; the first one is the name of the stage. is_aborting: True where nothing is finished.
+        """
+        self.stats, self._writers = stats, writers
+        self._succeeds, self._is_aborting = succeeds, is_aborting
         self.stream: Stream[Any] = Stream()
+        self.alive = True
         self._process: Callable[[object], object | None] = getattr(work, "process", nothing)
         self._finish: Callable[[], Iterable[object] | None] = getattr(work, "finish", nothing)
 
-    def handle(self, message: object) -> None:
-        """Process the message, and pass its result on."""
+    def put(self, message: object) -> None:
+        """Process the message, and pass its result on; after an error it is counted as dropped."""
+        if self.alive:
+            self.alive = self._succeeds(self.stats.name, self._handle, message)
+        else:
+            self.stats.dropped += 1
+
+    def end(self) -> None:
+        """Count one writer less; after the last one the results that remain are passed on, and the stream ends."""
+        self._writers -= 1
+        if self._writers == 0:
+            self.close()
+
+    def close(self) -> None:
+        """End the stream, after the results that remain."""
+        if self.alive and not self._is_aborting():
+            self._succeeds(self.stats.name, self._pass_on_rest)
+        self.stream.end()
+
+    def _handle(self, message: object) -> None:
         result = self.stats.timed(self._process, message)
         if result is not None:
             self.stream.push(result)
 
-    def finish(self) -> None:
-        """Pass on the results that remain at the end of the stream."""
+    def _pass_on_rest(self) -> None:
         for result in self._finish() or ():
             self.stream.push(result)
-
-
-class Direct:
-    """Inline reader: the work happens within the writer's call.
-
-    `succeeds(name, work, *args)` does the work and is True if no error was raised; `finish(node)` finishes the node.
-    """
-
-    def __init__(self, node: Node, writers: int, succeeds: Callable[..., bool], finish: Callable[[Node], None]) -> None:
-        self._node, self._writers, self._succeeds, self._finish = node, writers, succeeds, finish
-        self._alive = True
-
-    def put(self, message: object) -> None:
-        """Handle the message; after a failure of the node it is counted as dropped instead."""
-        if self._alive:
-            self._alive = self._succeeds(self._node.stats.name, self._node.handle, message)
-        else:
-            self._node.stats.dropped += 1
-
-    def end(self) -> None:
-        """Count one writer less; the last one finishes the node and ends its stream."""
-        self._writers -= 1
-        if self._writers == 0:
-            if self._alive:
-                self._succeeds(self._node.stats.name, self._finish, self._node)
-            self._node.stream.end()
 
 
 class Source:

@@ -12,16 +12,15 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from contextlib import suppress
+from functools import partial
 from queue import Empty, SimpleQueue
 from typing import Any, Final, TypeVar
 
 from omnid.engine.flow import (
     LOSSLESS,
     NEWEST,
-    Direct,
     Node,
     Policy,
-    Reader,
     Sink,
     Slot,
     Source,
@@ -122,18 +121,6 @@ class Inbox:
             self._messages.clear()
             self._stats.busy_since_ns = 0
             self._changed.notify_all()
-
-
-class Port:
-    """The end of one writer's stream at an inbox; a Reader."""
-
-    def __init__(self, inbox: Inbox, writer: int) -> None:
-        self._inbox, self._writer = inbox, writer
-        self.end = inbox.end
-
-    def put(self, message: object) -> None:
-        """Add a message of the writer."""
-        self._inbox.put(self._writer, message)
 
 
 class Ticker:
@@ -315,15 +302,16 @@ class Graph:
     ) -> Stream[Any]:
         if not inputs or depth < 1:
             raise OmnidError(f"'{name}': expected inputs and a depth above 0, found {len(inputs)} and {depth}")
-        node = Node(self._add(StageStats(name)), work)
-        readers: list[Reader] = [Direct(node, len(inputs), self._succeeds, self._finish)] * len(inputs)
+        node = Node(self._add(StageStats(name)), work, len(inputs), self._succeeds, lambda: self._aborting)
         if self._threaded and not direct:
             inbox = Inbox(node.stats, len(inputs), depth, policy, self._in_flight)
             self._inboxes.append(inbox)
             self._thread(name, self._run_node, node, inbox)
-            readers = [Port(inbox, writer) for writer in range(len(inputs))]
-        for stream, reader in zip(inputs, readers, strict=True):
-            stream.readers.append(reader)
+            for writer, stream in enumerate(inputs):
+                stream.add(partial(inbox.put, writer), inbox.end)
+        else:
+            for stream in inputs:
+                stream.add(node.put, node.end)
         return node.stream
 
     def _thread(self, name: str, body: Callable[..., None], *args: object) -> None:
@@ -361,18 +349,10 @@ class Graph:
         return False
 
     def _run_node(self, node: Node, inbox: Inbox) -> None:
-        self._succeeds(node.stats.name, self._drain, node, inbox)
+        while node.alive and (message := inbox.get()) is not _END:
+            node.put(message)
         inbox.close()
-        node.stream.end()
-
-    def _drain(self, node: Node, inbox: Inbox) -> None:
-        while (message := inbox.get()) is not _END:
-            node.handle(message)
-        self._finish(node)
-
-    def _finish(self, node: Node) -> None:
-        if not self._aborting:
-            node.finish()
+        node.close()
 
     def _run_inline(self) -> None:
         active = deque(self._sources)
