@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
-from collections import Counter, defaultdict
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
@@ -18,17 +17,14 @@ from omnid.commands.replay import Output, replay_and_print
 from omnid.errors import OmnidError
 
 if TYPE_CHECKING:  # the help and other commands do not load these
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from calib.rig import Rig
-    from drivers.cameras.log_camera import LogCamera, LogMotion
+    from drivers.cameras.log_camera import LogCamera
     from drivers.frame import Camera
     from drivers.motors.simulated.simulated_base import Pose
     from omnid.config import Config
-    from omnid.runs.live import OpenCamera
-
-
-RUNNING = 2  # time that the cameras are opened: first for the masks, then for the run
+    from omnid.runs.live import LiveRobot, LiveRun
 
 
 @command(
@@ -64,50 +60,62 @@ RUNNING = 2  # time that the cameras are opened: first for the masks, then for t
 )
 def run(args: argparse.Namespace) -> int:
     """Run until a signal comes."""
-    from omnid.config import unused_settings
-    from omnid.engine.logging_setup import HANDLER, log
-    from omnid.runs.live import ConnectedRobot, LiveRun
+    from omnid.runs.live import ConnectedRobot
 
     devices = {"cameras.lower": args.lower, "cameras.upper": args.upper}
-    config = settings_of(args, devices if args.log is None else {})
-    for warning in unused_settings(config, "run", args.overrides):
-        log(logging.WARNING, warning)
-    show = HANDLER.show if sys.stderr.isatty() else None
+    config = _settings(args, devices if args.log is None else {})
     if args.log is None:
         if args.once or args.pace != 1.0:
             raise OmnidError("--once and --pace need the images of a log: add --log, or leave them out")
-        return LiveRun(config, ConnectedRobot(device_opener(config)), log, show=show).run()
-    config = replace(config, controller=config.controller.of_log)
-    opener, motion = _recorded(args, config)
-    robot = ConnectedRobot(opener, motion)
-    return LiveRun(config, robot, log, None if args.rig else _attached_rig(args), show).run()
+        return _live_run(config, ConnectedRobot(device_opener(config))).run()
+    return _run_log(args, replace(config, controller=config.controller.of_log))
 
 
-def _attached_rig(args: argparse.Namespace) -> Rig:
-    from drivers.logs.log_reader import LogReader
-    from omnid.runs.session import attached_rig
-
-    with closing(LogReader(args.log, args.lower, args.upper)) as reader:
-        return attached_rig(reader, args.log)
-
-
-def _recorded(args: argparse.Namespace, config: Config) -> tuple[OpenCamera, LogMotion]:
-    """Return what opens the cameras of a log, and its wheels and gyro: no others fit its images."""
-    from drivers.cameras.log_camera import LogCamera, LogClock, LogImages, LogMotion
+def _settings(args: argparse.Namespace, shortcuts: Mapping[str, object] | None = None) -> Config:
+    """Return the settings of a live run; warn of those that it does not use."""
+    from omnid.config import unused_settings
     from omnid.engine.logging_setup import log
-    from omnid.runs.session import motion_topics
+
+    config = settings_of(args, shortcuts or {})
+    for warning in unused_settings(config, "run", args.overrides):
+        log(logging.WARNING, warning)
+    return config
+
+
+def _live_run(config: Config, robot: LiveRobot, rig: Rig | None = None) -> LiveRun:
+    """Return a live run that reports on stderr."""
+    from omnid.engine.logging_setup import HANDLER, log
+    from omnid.runs.live import LiveRun
+
+    return LiveRun(config, robot, log, rig, HANDLER.show if sys.stderr.isatty() else None)
+
+
+def _run_log(args: argparse.Namespace, config: Config) -> int:
+    """Run on the images of a log, and on its wheels and gyro: no others fit these images."""
+    from drivers.cameras.log_camera import LogCamera, LogClock, LogImages, LogMotion
+    from drivers.logs.log_reader import LogReader
+    from omnid.engine.logging_setup import log
+    from omnid.runs.live import ConnectedRobot
+    from omnid.runs.session import attached_rig, motion_topics
 
     images = LogImages.load(args.log, args.lower, args.upper, motion_topics(config), config.cameras.bits)
     for warning in images.warnings:
         log(logging.WARNING, warning)
-    clocks: defaultdict[int, LogClock] = defaultdict(LogClock)  # one for each time that both cameras are opened
-    opened: Counter[Camera] = Counter()
+    clocks: list[LogClock] = []  # one for each time that both cameras are opened, the lower one first
 
     def open_camera(camera: Camera) -> LogCamera:
-        opened[camera] += 1
-        return LogCamera(images, camera, clocks[opened[camera]], pace=args.pace, once=args.once)
+        if camera == "lower":
+            clocks.append(LogClock())
+        return LogCamera(images, camera, clocks[-1], pace=args.pace, once=args.once)
 
-    return open_camera, LogMotion(images, clocks[RUNNING], pace=args.pace, once=args.once)
+    def open_motion() -> LogMotion:
+        return LogMotion(images, clocks[-1], pace=args.pace, once=args.once)
+
+    rig = None
+    if not args.rig:
+        with closing(LogReader(args.log, args.lower, args.upper)) as reader:
+            rig = attached_rig(reader, args.log)
+    return _live_run(config, ConnectedRobot(open_camera, open_motion), rig).run()
 
 
 @command(
@@ -135,10 +143,8 @@ def _recorded(args: argparse.Namespace, config: Config) -> tuple[OpenCamera, Log
 def simulate(args: argparse.Namespace) -> int:
     """Run until a signal comes."""
     from calib.rig_file import read_rig
-    from omnid.config import unused_settings
     from omnid.controller.motor import SIMULATED
-    from omnid.engine.logging_setup import HANDLER, log
-    from omnid.runs.live import LiveRun
+    from omnid.engine.logging_setup import log
     from omnid.simulation.paced_robot import PacedRobot
     from omnid.simulation.robot import make_robot
     from omnid.simulation.world_file import WorldOptions, load_world
@@ -146,9 +152,7 @@ def simulate(args: argparse.Namespace) -> int:
 
     # 1. Check the options.
     check_outputs([("--truth", args.truth)] if args.truth else [], [])
-    config = settings_of(args)
-    for warning in unused_settings(config, "run", args.overrides):
-        log(logging.WARNING, warning)
+    config = _settings(args)
     if args.seed < 0:
         raise OmnidError(f"--seed {args.seed}: expected 0 or more")
     if not 64 <= args.size <= 2048:
@@ -160,7 +164,7 @@ def simulate(args: argparse.Namespace) -> int:
     config = replace(config, motor=replace(config.motor, port=SIMULATED))
     warn = partial(log, logging.WARNING)
     paced = PacedRobot(world, robot, config, args.seed, warn, keeps_truth=args.truth is not None)
-    run = LiveRun(config, paced, log, paced.rig, HANDLER.show if sys.stderr.isatty() else None)
+    run = _live_run(config, paced, paced.rig)
     code = run.run()
     # 3. Write the truth, and report contacts.
     if args.truth:

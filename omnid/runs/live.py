@@ -163,10 +163,12 @@ class ConnectedRobot:
 
     waits: Final = False
 
-    def __init__(self, open_camera: OpenCamera, motion: MotionSource | None = None) -> None:
-        """motion: wheels and gyro where the images are those of a log; None: those of the robot."""
-        self._open_camera, self._motion = open_camera, motion
-        self.brings_samples = motion is not None
+    def __init__(self, open_camera: OpenCamera, open_motion: Callable[[], MotionSource] | None = None) -> None:
+        """open_motion: of wheels and gyro where the images are those of a log, called when the cameras were opened for
+        the run; None: those of the robot.
+        """
+        self._open_camera, self._open_motion = open_camera, open_motion
+        self.brings_samples = open_motion is not None
         self._cameras: dict[Camera, LiveCamera] = {}
 
     def clock_ns(self) -> int:
@@ -185,8 +187,9 @@ class ConnectedRobot:
 
     def sources(self, graph: Graph, take: Callable[[MotionSample], None]) -> list[Stream[Frame]]:
         """Add the cameras, and the samples of a log."""
-        if self._motion is not None:
-            graph.source("motion", partial(map, take, self._motion.samples()), wake=self._motion.close)
+        if self._open_motion is not None:
+            motion = self._open_motion()
+            graph.source("motion", partial(map, take, motion.samples()), wake=motion.close)
         return [graph.source(name, camera.frames, wake=camera.close) for name, camera in self._cameras.items()]
 
     def states(self) -> Mapping[Camera, CameraState]:
