@@ -6,6 +6,7 @@ import math
 import threading
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
@@ -47,12 +48,17 @@ class LogImages:
         motion: topics of wheels and IMU; None: they are not read. bits: see Frame. Raises DriverError where a camera
         has fewer than two images, and beyond MAX_LOG_BYTES.
         """
-        reader = LogReader(path, lower, upper, motion=motion, bits=bits)
-        samples: list[MotionSample] = []
-        try:
-            frames = list(_limited(reader.messages(), samples, path))
-        finally:
-            reader.close()
+        frames, samples, total_bytes = list[Frame](), list[MotionSample](), 0
+        with closing(LogReader(path, lower, upper, motion=motion, bits=bits)) as reader:
+            for message in reader.messages():
+                if not isinstance(message, Frame):
+                    samples.append(message)
+                    continue
+                frames.append(message)
+                total_bytes += len(message.data)  # LogReader delivers bytes
+                if total_bytes > MAX_LOG_BYTES:
+                    most = MAX_LOG_BYTES >> 20
+                    raise DriverError(f"{path}: more than {most} MiB of images: cut the log into shorter ones")
         timed = [(frame.stamp_ns - frames[0].stamp_ns, frame) for frame in frames]
         images = LogImages(
             lower=tuple(entry for entry in timed if entry[1].camera == "lower"),
@@ -76,19 +82,6 @@ class LogImages:
     def pass_ns(self) -> int:
         """Time from one pass to the next [ns]: the log and one period, the same for both cameras."""
         return self.last_ns + max(1, self.last_ns // (max(len(self.lower), len(self.upper)) - 1))
-
-
-def _limited(messages: Iterator[Frame | MotionSample], samples: list[MotionSample], path: Path) -> Iterator[Frame]:
-    """Yield the frames, whose bytes are limited, and add the samples to the list."""
-    total_bytes = 0
-    for message in messages:
-        if not isinstance(message, Frame):
-            samples.append(message)
-        else:
-            total_bytes += len(message.data)  # LogReader delivers bytes
-            yield message
-        if total_bytes > MAX_LOG_BYTES:
-            raise DriverError(f"{path}: more than {MAX_LOG_BYTES >> 20} MiB of images: cut the log into shorter ones")
 
 
 class LogClock:

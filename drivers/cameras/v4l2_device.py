@@ -6,9 +6,10 @@ import errno
 import mmap
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -88,7 +89,7 @@ class V4l2Stream:
             self._maps = [self._mapped(index) for index in range(_request_buffers(self.fd, settings.buffers))]
             apply_controls(self.fd, plan_controls(settings, list_controls(self.fd)))
             self.exposure = ExposureControls(self.fd, with_gain=settings.gain < 0 and settings.auto_gain == "keep")
-            self._resources.callback(_release, self.exposure)
+            self._resources.callback(_quietly, self.exposure.release)
             self._start()
         except OSError as error:
             self._resources.close()
@@ -129,7 +130,8 @@ class V4l2Stream:
     def _start(self) -> None:
         for index in range(len(self._maps)):
             v4l2.call(self.fd, v4l2.QBUF, v4l2.V4l2Buffer(index=index, type=v4l2.CAPTURE, memory=v4l2.MMAP))
-        self._resources.callback(_stop, self.fd)
+        off = partial(v4l2.call, self.fd, v4l2.STREAMOFF, v4l2.Int32(v4l2.CAPTURE))
+        self._resources.callback(_quietly, off)
         v4l2.call(self.fd, v4l2.STREAMON, v4l2.Int32(v4l2.CAPTURE))
 
 
@@ -200,20 +202,15 @@ def _image_in_force(fd: int, settings: V4l2Settings, pixel_format: str) -> Strea
         with suppress(OSError):  # the rate in force is read next
             v4l2.call(fd, v4l2.S_PARM, rate)
     # 3. What is in force.
+    found, rate_hz = v4l2.StreamParameters(type=v4l2.CAPTURE), 0.0
+    with suppress(OSError):  # a device need not state it
+        v4l2.call(fd, v4l2.G_PARM, found)
+        interval = found.timeperframe
+        rate_hz = interval.denominator / interval.numerator if interval.numerator else 0.0
     pix = in_force.fmt.pix
     name = v4l2.fourcc(pix.pixelformat)
     row_bytes = _BYTES_PER_PIXEL.get(name, 0) * pix.width
-    return StreamFormat(name, pix.width, pix.height, max(row_bytes, pix.bytesperline) if row_bytes else 0, _rate(fd))
-
-
-def _rate(fd: int) -> float:
-    found = v4l2.StreamParameters(type=v4l2.CAPTURE)
-    try:
-        v4l2.call(fd, v4l2.G_PARM, found)
-    except OSError:
-        return 0.0
-    interval = found.timeperframe
-    return float(interval.denominator / interval.numerator) if interval.numerator else 0.0
+    return StreamFormat(name, pix.width, pix.height, max(row_bytes, pix.bytesperline) if row_bytes else 0, rate_hz)
 
 
 def _request_buffers(fd: int, count: int) -> int:
@@ -230,14 +227,10 @@ def _request_buffers(fd: int, count: int) -> int:
     return int(request.count)
 
 
-def _release(exposure: ExposureControls) -> None:
-    with suppress(OSError):  # a device that is gone starts with its automatic modes
-        exposure.release()
-
-
-def _stop(fd: int) -> None:
-    with suppress(OSError):  # a device that is gone streams no more
-        v4l2.call(fd, v4l2.STREAMOFF, v4l2.Int32(v4l2.CAPTURE))
+def _quietly(release: Callable[[], None]) -> None:
+    """Release a part of a device; one that is gone has released it, and starts with its automatic modes."""
+    with suppress(OSError):
+        release()
 
 
 @dataclass(frozen=True, slots=True)
