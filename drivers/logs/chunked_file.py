@@ -212,14 +212,15 @@ class ChunkedFile(ABC):
         return content(source, head.offset, head.size)
 
     def _of_chunk(self, chunk: Record, index: Sequence[Record]) -> Entries:
-        """Return the entries of a chunk, by the index behind it or by its content."""
+        """Return the entries of a chunk, by the index behind it or, without a valid one, by its content."""
+        with suppress(RecordError):
+            if index:
+                found = np.concatenate([self._index(record, chunk.begin) for record in index])
+                self._indexed[chunk.begin] = len(found)
+                self._undefined.update(set(found["channel"].tolist()) - self.topics.keys())
+                return found[np.argsort(found["offset"])]
         try:
-            if not index:
-                return _entries([(head, chunk.begin, offset) for offset, head in self._chunk(chunk.begin)[1].items()])
-            found = np.concatenate([self._index(record, chunk.begin) for record in index])
-            self._indexed[chunk.begin] = len(found)
-            self._undefined.update(set(found["channel"].tolist()) - self.topics.keys())
-            return found[np.argsort(found["offset"])]
+            return _entries([(head, chunk.begin, offset) for offset, head in self._chunk(chunk.begin)[1].items()])
         except RecordError as error:
             self.faults[str(error)] += 1
             return _entries([])

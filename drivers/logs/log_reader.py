@@ -206,7 +206,7 @@ class LogReader:
         return min(counts.get(topic, 0) for topic in self._cameras.values())
 
     def attachments(self) -> dict[str, bytes]:
-        """Return name -> bytes of the attachments, such as a rig; at most 32 of up to 16 MiB each, 64 MiB in all."""
+        """Return name -> bytes of the attachments, such as a rig; up to 16 MiB each, 64 MiB in all."""
         return self._log.attachments()
 
     def _reset(self) -> None:

@@ -75,7 +75,7 @@ class LogInfo:
     fault: str  # one line that says what of the log, or of its images, is missing; empty for a complete log
     topics: Mapping[str, tuple[str, int]]  # topic -> type ('' where it cannot be decoded), number of messages
     span_ns: tuple[int, int] | None  # first and last log time; None without messages
-    attachments: Mapping[str, int]  # name -> bytes of the readable ones, up to 32
+    attachments: Mapping[str, int]  # name -> bytes of the readable ones
 
     @property
     def messages(self) -> int:
