@@ -11,8 +11,8 @@ from calib import se3
 from omnid.core.mapping.range_scan import SECTORS, azimuths
 from omnid.core.obstacles.settings import RingSettings
 from omnid.messages import DensePoints, ObstacleRing
-from omnid.stages.keyframe_scan import keyframe_free, keyframe_scan
 from omnid.stages.obstacles import CameraFloor
+from omnid.stages.places import keyframe_free, keyframe_scan
 from tests.omnid.core.test_floor import HEIGHT_M, plane, walls
 from tests.simulation.rigs import make_rig
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from calib import se3
-from omnid.core.mapping.point_scan import ScanLimits, point_scan
-from omnid.core.mapping.range_scan import SECTORS, azimuths, fill_gaps, seen_from
+from omnid.core.mapping.range_scan import SECTORS, ScanLimits, azimuths, fill_gaps, point_scan, seen_from
 from tests.omnid.core.mapping.rooms import box, pose, scan_of
 
 FLOOR_M = -1.2
