@@ -7,6 +7,7 @@ its range. The same checks come before a map is written, so that none is replace
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 from stat import S_ISFIFO
 from typing import Any, Final
@@ -86,8 +87,10 @@ def write_places(path: str | Path, places: PlaceMap, rig: PlaceRig) -> None:
     path, arrays = Path(path), _to_arrays(places, rig)
     try:
         _check(arrays)
-        with replacement(path) as partial, partial.open("wb") as file:
-            np.savez(file, allow_pickle=False, **arrays)
+        with replacement(path) as partial, zipfile.ZipFile(partial, "w") as archive:
+            for name, array in arrays.items():
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+                    np.lib.format.write_array(file, array, allow_pickle=False)
     except (OSError, ValueError) as error:
         raise OmnidError(f"{path}: cannot write the map: {error}: choose another file") from error
 
