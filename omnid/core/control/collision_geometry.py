@@ -69,10 +69,6 @@ class Outline(NamedTuple):
         # A speed, not its product with the distance: a point at the edge is approached as any other.
         return -(dx * vx + dy * vy) / math.hypot(dx, dy)
 
-    def is_approached(self, x_m: float, y_m: float, motion: Twist) -> bool:
-        """True if the motion takes the outline nearer to a point, or a point inside it deeper."""
-        return self.approach_mps(x_m, y_m, motion) > TINY
-
 
 def contact_s(outline: Outline, motion: Twist, points: Iterable[Point]) -> float:
     """Return the time until the outline first touches one of the points outside it, inf if it never does."""

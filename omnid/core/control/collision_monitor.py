@@ -381,7 +381,7 @@ class CollisionMonitor:
             ]
             for obstacle, (x, y) in zip(self._moving, seen_from(pose, places), strict=True):
                 gap_m = stop.gap_m(x, y) - obstacle.radius_m
-                if not step and not self._outline.is_approached(x, y, motion):
+                if not step and self._outline.approach_mps(x, y, motion) <= TINY:
                     continue
                 if gap_m <= 0.0:
                     share = 0.0 if ahead_s <= MOVING_STOP_S else ahead_s / MOVING_S

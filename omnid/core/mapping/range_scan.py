@@ -129,7 +129,8 @@ def _nearest(sector: Counts, ranges: Array, limits: ScanLimits) -> tuple[RangeSc
     counts = np.bincount(index, minlength=SECTORS * bins).reshape(SECTORS, bins).astype(float)
     inverse = np.bincount(index, 1 / ranges, SECTORS * bins).reshape(SECTORS, bins).astype(float)
     pair = _with_next(counts)
-    supported = (_of_neighbours(pair) >= limits.min_points) & (pair > 0)
+    of_neighbours = pair + np.roll(pair, 1, axis=0) + np.roll(pair, -1, axis=0)
+    supported = (of_neighbours >= limits.min_points) & (pair > 0)
     limit = bins - 1 - math.floor(1 / (limits.max_range_m * INVERSE_STEP))  # bins from here on lie beyond
     near = supported[:, : limit + 1]
     first = np.argmax(near, axis=1)
@@ -148,8 +149,3 @@ def _with_next(sums: Array) -> Array:
     total = sums.astype(float)
     total[:, :-1] += sums[:, 1:]
     return total
-
-
-def _of_neighbours(sums: Array) -> Array:
-    """Return the sums over each sector and its two neighbours."""
-    return np.asarray(sums + np.roll(sums, 1, axis=0) + np.roll(sums, -1, axis=0))

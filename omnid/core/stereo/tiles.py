@@ -200,7 +200,9 @@ class TileMonitor:
             grey, square = found.grey / self._counts, found.square / self._counts
             contrast = np.sqrt(np.maximum(square - grey**2, 0.0))
             saturated, change = found.saturated / self._counts, found.change / self._counts
-            blind[side] = self._dark_or_glaring(grey, contrast, saturated, noise_grey[side])
+            is_dark = contrast < DARK_CONTRAST * max(noise_grey[side], MEASURED_NOISE_GREY)
+            is_dark &= grey < BLACK_GREY
+            blind[side] = np.asarray(self._judged & (is_dark | (saturated > SATURATED_SHARE)))
             dead[side] = self._dead(side, change, contrast, blind[side], noise_grey[side], is_first=found.is_first)
         # 2. What one camera does not show that the other one does.
         energy = {side: self._energy(images[side]) for side in SIDES}
@@ -234,10 +236,6 @@ class TileMonitor:
         # While a tile is still, its liveliness stays as it was before.
         self._lively[side] = np.where(self._still[side] > 0, lively, lively + LIVELY_GAIN * (~is_still - lively))
         return np.asarray(self._still[side] >= IN_A_ROW)
-
-    def _dark_or_glaring(self, grey: Array, contrast: Array, saturated: Array, noise_grey: float) -> Flags:
-        is_dark = (grey < BLACK_GREY) & (contrast < DARK_CONTRAST * max(noise_grey, MEASURED_NOISE_GREY))
-        return np.asarray(self._judged & (is_dark | (saturated > SATURATED_SHARE)))
 
     def _energy(self, image: Image) -> Array:
         """Return the gradient energy (C,) of columns of tiles at half resolution, grey levels squared.
