@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.config import MappingConfig
 from omnid.core.mapping.scan_grid import KeyframeGrid
-from omnid.core.mapping.thinned_path import ThinnedPath
+from omnid.core.mapping.thinned_path import ThinnedPath, Vertex
 from omnid.core.mapping.voxel_map import VoxelMap
 from omnid.load_level import LoadLevel
 from omnid.messages import GridUpdate, MapUpdate, OdometryUpdate, PlaceUpdate
@@ -19,7 +18,6 @@ from omnid.stages.dense_depths import DenseDepths
 from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]
-Position: TypeAlias = tuple[float, float]  # x, y [m]
 
 MIN_VOXEL_FRAMES = 2  # frames that must have seen a voxel, also in a short run; one where there are fewer than 4
 FRAMES_PER_VOXEL_FRAME = 10  # frames of the run for each frame required, up to mapping.min_frames
@@ -30,10 +28,6 @@ STANDING_NS = 1_000_000_000  # Least time between two pairs of the same view tha
 FINEST_STEP_M = 0.001  # Least distance between two vertices of the path: a robot at rest adds none.
 SPARSE_NS = 1_000_000_000  # Time between two pairs that enter the map at LoadLevel.SPARSE_MAP.
 STAMP_JITTER_NS = 5_000_000  # Tolerance of stamps: a period of the cameras that divides that of the map then does so.
-
-
-def _is_step(last: Position, new: Position, step_m: float) -> bool:
-    return math.dist(last, new) >= step_m
 
 
 class Mapping:
@@ -47,7 +41,7 @@ class Mapping:
         self._config, self._dense = config, dense
         self._every_ns, self._given_ns = round(every_s * 1e9), 0
         self._map = VoxelMap(config.voxel_m, config.max_voxels)
-        self._path = ThinnedPath(config.path_poses, FINEST_STEP_M, _is_step)
+        self._path = ThinnedPath(config.path_poses, FINEST_STEP_M)
         self._newest: tuple[int, int] | None = None
         self._min_gap_ns = round(1e9 / config.rate_hz) if config.rate_hz else 0
         self._mapped: tuple[int, Array] | None = None  # stamp and pose of the last pair that entered the map
@@ -62,7 +56,7 @@ class Mapping:
         """Add the points of a pair; return the map when it is due."""
         # 1. The path has all poses, the map the points of those pairs that are due.
         self._newest = odometry.seq, odometry.stamp_ns
-        self._path.add((float(odometry.T_odom_rig[0, 3]), float(odometry.T_odom_rig[1, 3])))
+        self._path.add(Vertex(*odometry.T_odom_rig[:2, 3].tolist()))
         if odometry.state == TrackingState.TRACKING and self._is_due(odometry):
             self._mapped = odometry.stamp_ns, odometry.T_odom_rig
             self._frames += 1
@@ -103,7 +97,8 @@ class Mapping:
         """Return the voxels that enough frames have seen: false matches seldom repeat in the same place."""
         least = min(MIN_VOXEL_FRAMES, max(1, self._frames // 2))
         enough = min(self._config.min_frames, max(least, self._frames // FRAMES_PER_VOXEL_FRAME))
-        return MapUpdate(seq, stamp_ns, self._map.points(enough), np.array(self._path.with_end(), float).reshape(-1, 2))
+        path_xy = np.array([vertex[:2] for vertex in self._path.with_end()], float).reshape(-1, 2)
+        return MapUpdate(seq, stamp_ns, self._map.points(enough), path_xy)
 
 
 class MapGrid:

@@ -16,7 +16,7 @@ from bisect import bisect
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
@@ -24,7 +24,7 @@ from starlette.responses import PlainTextResponse, Response
 from drivers.errors import FrameDecodeError
 from drivers.logs.ros_messages import COMPRESSED_IMAGE, parse_image
 from omnid.client import Diagnostics, Map, NavigationReport, Robot, Unreachable
-from omnid.core.mapping.thinned_path import ThinnedPath
+from omnid.core.mapping.thinned_path import ThinnedPath, Vertex
 from omnid.errors import OmnidError
 from omnid.monitor.robot_state import Inbox, RobotState
 from omnid.transport.bus_config import BusConfig
@@ -54,29 +54,17 @@ NO_NAVIGATION: Final = NavigationReport(0, "", "", "", 0, math.nan, "", "")
 Receiver = Callable[[str, bytes, bytes], None]
 
 
-class _PathPoint(NamedTuple):
-    x_m: float
-    y_m: float
-    after_gap: bool  # the robot was put elsewhere before it
-    version: int  # of the news that it came with
-
-
 class LivePath:
     """The path of the robot; a browser is sent the points that it has not seen."""
 
     def __init__(self) -> None:
         self._since = 0  # version since which points are only added
-        self._path = ThinnedPath[_PathPoint](
-            MOST_POINTS,
-            _FINEST_M,
-            lambda last, new, step_m: new.after_gap or math.dist(last[:2], new[:2]) >= step_m,
-            lambda dropped, new: new._replace(after_gap=dropped.after_gap or new.after_gap),
-        )
+        self._path = ThinnedPath(MOST_POINTS, _FINEST_M)
 
     def add(self, x_m: float, y_m: float, version: int, *, gap: bool = False) -> None:
         """Add a position, m. version: of the news that it comes with. gap: the robot was put elsewhere."""
         path, times_thinned = self._path, self._path.thinned
-        path.add(_PathPoint(x_m, y_m, gap and bool(path.vertices), version))
+        path.add(Vertex(x_m, y_m, gap and bool(path.vertices), version))
         if path.thinned != times_thinned:
             self._since = version  # all are sent again
 
