@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from html import escape
@@ -299,24 +298,8 @@ def _rounded(text: str) -> str:
 
 
 def _against_truth(truth: _Truth) -> list[str]:
-    """Return the section with the errors of the path."""
-    m = truth.metrics
-
-    def mm(metres: float) -> str:
-        return f"{1e3 * metres:.2f} mm" if abs(metres) < 1 else f"{metres:.3f} m"
-
-    def deg(rad: float) -> str:
-        return f"{math.degrees(rad):.3f}°"
-
-    ratio = "" if math.isnan(m.length_error_ratio) else f" ({100 * m.length_error_ratio:+.3f} %)"
-    heading = f"rmse {deg(m.heading_rmse_rad)}, maximum {deg(m.heading_max_rad)}, at the end {deg(m.heading_end_rad)}"
-    rows = [
-        ("compared poses", f"{m.pairs}, {m.coverage:.1%} of the truth"),
-        ("length", f"{m.length_estimate_m:.4f} m, true {m.length_truth_m:.4f} m{ratio}"),
-        ("position (ATE)", f"rmse {mm(m.ate_rmse_m)}, maximum {mm(m.ate_max_m)}, at the end {mm(m.end_error_m)}"),
-        ("heading", heading),
-        ("from pose to pose (RPE)", f"rmse {mm(m.rpe_translation_rmse_m)}, {deg(m.rpe_rotation_rmse_rad)}"),
-    ]
+    """Return the section with the errors of the path, as `omnid eval` prints them."""
+    rows = [(escape(line[:21]), escape(line[21:])) for line in str(truth.metrics).splitlines()]
     figures = [
         chart("Error of the position", [Curve("", truth.t_s, 1e3 * truth.position_m)], unit="mm"),
         chart("Error of the heading, to the left", [Curve("", truth.t_s, np.rad2deg(truth.heading_rad))], unit="deg"),
