@@ -7,7 +7,7 @@ import select
 import sys
 import time
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from typing import Final
 
 from omnid.client import CONNECT_S, HERE, Answer, Diagnostics, Driver, NavigationReport, Robot, Subscription
@@ -140,7 +140,7 @@ def stop(bus: BusConfig, answer_s: float = ANSWER_S, connection: Robot | None = 
     answered: over a connection that there is, else over a new one. Raise OmnidError where the robot cannot be reached.
     """
     deadline_s = time.monotonic() + answer_s
-    with StopSender(bus.robot, bus.connect or (HERE,)) as datagrams:
+    with closing(StopSender(bus.robot, bus.connect or (HERE,))) as datagrams:
         if datagrams.ask(_DATAGRAM_S):
             return datagrams.ask(deadline_s - time.monotonic()) == STOPPED
         with (

@@ -15,8 +15,7 @@ import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final
 
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.session import needs_proof
@@ -117,14 +116,6 @@ class StopSender:
         """Close the sockets."""
         for sender in self._sockets:
             sender.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _answer(self, sender: socket.socket) -> str:
         """Return the newest answer that has come, "" where there is none."""

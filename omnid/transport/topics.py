@@ -50,7 +50,6 @@ STOP: Final = "cmd/stop"
 ARM: Final = "cmd/arm"
 BUMPER: Final = "cmd/bumper"
 CLIFF: Final = "cmd/cliff"
-CONTACT_TOPICS: Final = {BUMPER: codec.BOOL_SCHEMA, CLIFF: codec.BOOL_SCHEMA}
 GOAL: Final = "cmd/goal"
 PATH: Final = "cmd/path"
 NAVIGATION: Final = "cmd/navigation"
@@ -90,10 +89,10 @@ def setpoint_topics(sources: Sequence[str]) -> dict[str, tuple[str, str]]:
 
 def command_topics(sources: Sequence[str]) -> dict[str, str]:
     """Return the topics of commands with their types; sources: as of setpoint_topics."""
-    short = {f"cmd/{kind}": schema for kind, schema in _SETPOINTS.items()}
+    setpoints = {topic: _SETPOINTS[kind] for topic, (_, kind) in setpoint_topics(sources).items()}
     stops = {STOP: EMPTY_SCHEMA, ARM: codec.HEADER_SCHEMA}
-    named = {topic: _SETPOINTS[kind] for topic, (_, kind) in setpoint_topics(sources).items()}
-    return short | stops | CONTACT_TOPICS | NAVIGATION_TOPICS | MAP_TOPICS | SENSOR_TOPICS | named
+    contacts = dict.fromkeys((BUMPER, CLIFF), codec.BOOL_SCHEMA)
+    return setpoints | stops | contacts | NAVIGATION_TOPICS | MAP_TOPICS | SENSOR_TOPICS
 
 
 def request_key(topic: str) -> str:

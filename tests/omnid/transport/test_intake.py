@@ -127,11 +127,11 @@ def test_a_stop_is_confirmed_only_where_the_robot_says_so() -> None:
     with contextlib.closing(Bus(BusConfig(robot="rover", listen=(endpoint,)))) as bus:
         commands: list[str] = []
         bus.subscribe_commands(lambda request: commands.append(request.topic), {})
-        with StopSender("rover", (endpoint,)) as sender:
+        with contextlib.closing(StopSender("rover", (endpoint,))) as sender:
             wait_until(lambda: sender.ask(0.1) == ASKED)
         assert commands
         commands.clear()
-        with StopSender("other", (endpoint,)) as sender:
+        with contextlib.closing(StopSender("other", (endpoint,))) as sender:
             assert sender.ask(0.3) == "" and not commands, "it is for another robot"
 
 
