@@ -9,6 +9,7 @@ this one clock. The daemon's messages reach the controller at its ticks, and are
 from __future__ import annotations
 
 import copy
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping
@@ -102,32 +103,6 @@ RECENT: Final = 30  # pairs over which the real-time factor is measured: three s
 POLL_S: Final = 0.05  # longest wait, so that `close` takes effect soon
 
 
-class RealTimeFactor:
-    """Simulated time over time on the wall, of the last pairs; it is never let above 1."""
-
-    def __init__(self, period_s: float) -> None:
-        self._period_s = period_s
-        self._at_s: deque[float] = deque(maxlen=RECENT)  # when the last pairs were given
-        self._due_s = 0.0
-
-    @property
-    def left_s(self) -> float:
-        """Time until the next pair is due [s]; 0 or less: now."""
-        return self._due_s - time.monotonic()
-
-    def count(self) -> None:
-        """Note that a pair is given now. One that comes late is not made up for."""
-        now_s = time.monotonic()
-        self._at_s.append(now_s)
-        self._due_s = max(self._due_s, now_s - self._period_s) + self._period_s
-
-    @property
-    def value(self) -> float:
-        """The factor; NaN before the second pair."""
-        at_s = list(self._at_s)
-        return (len(at_s) - 1) * self._period_s / (at_s[-1] - at_s[0]) if len(at_s) > 1 else float("nan")
-
-
 class PacedRobot:
     """A LiveRobot in simulated time."""
 
@@ -154,7 +129,8 @@ class PacedRobot:
         self._vehicle: Vehicle | None = None
         self._link: PacedLink | None = None
         self._states = {camera: CameraState(mode="simulated") for camera in CAMERAS}
-        self._pace = RealTimeFactor(1.0 / robot.rate_hz)
+        self._given_s: deque[float] = deque(maxlen=RECENT)  # when the last pairs were given
+        self._due_s = 0.0  # not before this time the next pair is given
         self._closed = self._ends = False
         self.truth: dict[int, Pose] = {}  # true poses of the base in the world by the stamps of the pairs, where kept
         self.contacts, self._touches = 0, False
@@ -195,15 +171,21 @@ class PacedRobot:
 
     def words(self) -> str:
         """Return the real-time factor."""
-        return f", {self._pace.value:.2f} x real time"
+        return f", {self._real_time_factor:.2f} x real time"
 
     def close(self) -> None:
         """End the images; from any thread."""
         self._closed = True
 
+    @property
+    def _real_time_factor(self) -> float:
+        """Simulated time over time on the wall, of the last pairs, at most 1; NaN before the second pair."""
+        at_s = list(self._given_s)
+        return (len(at_s) - 1) / self._robot.rate_hz / (at_s[-1] - at_s[0]) if len(at_s) > 1 else math.nan
+
     def _status(self) -> DiagnosticStatus:
         values = {
-            Key.REAL_TIME_FACTOR: f"{self._pace.value:.2f}",
+            Key.REAL_TIME_FACTOR: f"{self._real_time_factor:.2f}",
             "time_s": (self.clock_ns() - self._start_ns) * 1e-9,
             "contacts": self.contacts,
         }
@@ -229,11 +211,13 @@ class PacedRobot:
                     if self._is_given(sample):
                         take(sample)
                 # 4. The images, not before their time.
-                while not self._closed and (left_s := self._pace.left_s) > 0:
+                while not self._closed and (left_s := self._due_s - time.monotonic()) > 0:
                     time.sleep(min(left_s, POLL_S))
                 if self._closed:
                     return
-                self._pace.count()
+                self._given_s.append(time.monotonic())
+                # A pair that comes late is not made up for.
+                self._due_s = max(self._due_s + 1.0 / self._robot.rate_hz, self._given_s[-1])
                 yield from pair
         finally:
             self._ends = True

@@ -69,7 +69,7 @@ def test_shipped_worlds_are_drawn_from_a_seed(name: str) -> None:
         ("schema = 1", "schema = 2", "schema"),
         ('texture = "white"', 'texture = "whit"', "wall\\[0\\].texture: expected one of"),
         ("at_m = 0.5", "at = 0.5", "unknown key"),
-        ("high = [4.0, 2.0]", "high = [400.0, 2.0]", "space.high"),
+        ("high = [4.0, 2.0]", "high = [-1.9, 2.0]", "space.high"),
         ("size_m = [0.4, 0.2, 0.5]", "size_m = [0.4, 0.2]", "box\\[0\\].size_m"),
         (
             "path = [[3.0, 1.5], [3.0, 0.5]]",
