@@ -57,7 +57,7 @@ from omnid.runs.session import BUS_POINTS, LOG_POINTS, OPENCV_THREADS, Session, 
 from omnid.runs.systemd import Service, StatusLine, TerminalStatus, print_stacks_when_killed
 from omnid.runs.wiring import NavigationParts, Outputs, Parts, wheel_state, wire
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
-from omnid.sinks.drive import LiveDrive, PlannerDrive, RingToController
+from omnid.sinks.drive import PlannerDrive, RingToController
 from omnid.sinks.encoder import status_report
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry
@@ -334,8 +334,7 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
             navigation = NavigationParts(requests, wheels, planner, config.places.map)
         else:
             warn(NO_PLANNER)
-        drive = LiveDrive(controller, rig.T_base_rig, requests.end)
-        parts = replace(parts, drive=drive, navigation=navigation)
+        parts = replace(parts, controller=controller, navigation=navigation)
     frames = robot.sources(graph, motion.add)
     stages = wire(graph, frames, front_end, config, outputs, run_places.known_to(parts))
 

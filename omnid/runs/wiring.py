@@ -10,10 +10,12 @@ from drivers.frame import Frame
 from drivers.motion import MotionSample
 from drivers.motor import VelocityCommand
 from omnid.config import Config
+from omnid.controller.link import DriveLink
 from omnid.controller.statistics import ControllerState
 from omnid.core.navigation.requests import NavigationCommand
 from omnid.core.navigation.situation import WheelState
 from omnid.core.places.place_map import PlaceMap
+from omnid.engine.flow import nothing
 from omnid.engine.graph import NEWEST, Graph, Sink, Stream
 from omnid.messages import FramePair, MapUpdate, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
 from omnid.sinks.drive import LiveDrive
@@ -75,7 +77,7 @@ class Parts:
 
     known_places: PlaceMap | None = None  # the map to begin with; None: the run's own, where it is consumed
     localize_only: bool = False  # the known map stays as it is
-    drive: LiveDrive | None = None  # the controller process; None: the law in lock-step gives the commands
+    controller: DriveLink | None = None  # that drives; None: the law in lock-step gives the commands
     navigation: NavigationParts | None = None
     map_every_s: float = 0.0  # between two maps; 0: one, at the end
 
@@ -133,9 +135,10 @@ def wire(
     poses = graph.stage("odometry", front_end.poses, panoramas, direct=graph.policy is NEWEST)
 
     # 2. Poses go to the controller, which waits for no stage.
-    if parts.drive is not None:
-        graph.sink("controller", parts.drive, poses, policy=NEWEST, depth=1)
-        commands = graph.source("drive", parts.drive.commands, wake=parts.drive.end)
+    if parts.controller is not None:
+        ended = nothing if parts.navigation is None else parts.navigation.requests.end
+        graph.sink("controller", LiveDrive(parts.controller, T_base_rig, ended), poses, policy=NEWEST, depth=1)
+        commands = graph.source("drive", parts.controller.commands, wake=parts.controller.end)
     else:
         law = LockstepDrive(config.controller, 1.0 / config.motor.rate_hz, T_base_rig)
         commands = graph.stage("drive", law, poses)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
@@ -54,14 +54,6 @@ class LiveDrive:
         """Have the wheels slow down to a stop: there will be no more poses."""
         self._link.end()
         self._ended()
-
-    def commands(self) -> Iterator[VelocityCommand]:
-        """Yield the commands that the controller sends; OmnidError where its process ends unasked."""
-        return self._link.commands()
-
-    def end(self) -> None:
-        """Have the wheels slow down to a stop and `commands` end; from any thread."""
-        self._link.end()
 
 
 class PlannerDrive:
