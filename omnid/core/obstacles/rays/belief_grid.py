@@ -41,6 +41,7 @@ VIEW_CELLS: Final = 90  # on either side of the base that a pair changes
 OWN_CELLS: Final = 3  # on either side of the base that nothing else can be in
 CROSS: Final = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
 SQUARE: Final = np.ones((3, 3), np.uint8)
+NEVER_NS: Final = -(1 << 62)
 
 
 class BeliefRing(NamedTuple):
@@ -83,6 +84,7 @@ class BeliefGrid:
         self.odds = np.full((CELLS, CELLS), self._p.prior, np.float32)
         self._before = np.zeros((CELLS, CELLS), np.float32)
         self._shown = np.zeros((CELLS, CELLS), np.float32)
+        self._free_ns = np.full((CELLS, CELLS), NEVER_NS, np.int64)
         self.known = np.zeros((CELLS, CELLS), np.uint8)
         self._floor_was_behind = np.zeros((CELLS, CELLS), np.uint8)
         self._corner: NDArray[np.int64] | None = None
@@ -108,11 +110,6 @@ class BeliefGrid:
         found, states = self._gathered(T_odom_base, first_m, belief)
         in_view, past = states == kernels.IN_VIEW, states == kernels.SEEN_PAST
         observed = in_view & (found[kernels.VIEW] > 0.5)
-        # Who comes onto floor that was free is seen by one pair.
-        was_free = (self._taken() < p.was_free).view(np.uint8)
-        changed = np.zeros((CELLS, CELLS), np.uint8)
-        was_seen = self._before[rows, columns] < -p.was_seen
-        changed[rows, columns] = (found[kernels.RATIO] > p.comes) & was_seen & in_view & (was_free[rows, columns] > 0)
         # 2. What is new of it.
         odds, before = self.odds[rows, columns], self._before[rows, columns]
         change = found[kernels.RATIO] - np.float32(rho) * before
@@ -145,14 +142,19 @@ class BeliefGrid:
         watched |= ((every == kernels.HIDDEN) & (self.known > 0)).view(np.uint8)
         if not is_first:
             self._who_comes(passed_s, watched)
-        hides = flooded & was_free
         self._floor_was_behind = (every == kernels.SEEN_PAST).view(np.uint8)
         self.known[flooded > 0] = 0
+        # Who comes is now where floor was free a short while ago.
+        taken = self._taken()
+        lately = (stamp_ns - self._free_ns < p.lately_s * 1e9).view(np.uint8)
+        came = (((taken > 0.5) & (taken <= 1.0)) | (flooded > 0)).view(np.uint8)
+        shows = np.zeros((CELLS, CELLS), np.uint8)
+        shows[rows, columns] = in_view & (found[kernels.RATIO] > p.comes)
+        came |= np.asarray(cv2.morphologyEx(shows, cv2.MORPH_OPEN, SQUARE), np.uint8)
+        self._free_ns[(taken < p.was_free)] = stamp_ns
         arrived = np.empty(len(self._azimuths))
         view = np.array([*eye, self._max_range_m, CELL_M])
-        # Who comes is wider than a speck of noise.
-        wide = np.asarray(cv2.morphologyEx(changed | hides, cv2.MORPH_OPEN, SQUARE), np.uint8)
-        kernels.first_changed(wide, was_free, view, self._azimuths + yaw, p.behind_m, arrived)
+        kernels.first_changed(came, lately, view, self._azimuths + yaw, p.behind_m, self._at_1m, arrived)
         for run in _runs(np.isfinite(arrived)):
             if len(run) * float(arrived[run].mean()) * math.tau / SECTORS < p.comes_m:
                 arrived[run] = np.nan
@@ -296,7 +298,7 @@ class BeliefGrid:
         x, y = np.clip(at - CELLS // 2, -CELLS, CELLS).tolist()
         gone = np.ones((CELLS, CELLS), bool)
         gone[max(-y, 0) : CELLS - max(y, 0), max(-x, 0) : CELLS - max(x, 0)] = False
-        for layer, unknown in ((self.odds, self._p.prior), (self._before, 0), (self._shown, 0), (self.known, 0)):
+        for layer, unknown in ((self.odds, self._p.prior), (self._before, 0), (self._shown, 0), (self.known, 0), (self._free_ns, NEVER_NS)):
             layer[:] = np.roll(layer, (-y, -x), axis=(0, 1))
             layer[gone] = unknown
         self._corner = self._corner + np.array([x, y])

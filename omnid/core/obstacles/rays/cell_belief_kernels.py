@@ -182,30 +182,32 @@ def too_near(taken: Floats, states: Bytes, flooded: Bytes, origin: Doubles, angl
             r += 0.5 * cell
 
 
-@compiled("(u1[:, ::1], u1[:, ::1], f8[::1], f8[::1], f8, f8[::1])", writes=("ranges",))
+@compiled("(u1[:, ::1], u1[:, ::1], f8[::1], f8[::1], f8, f8, f8[::1])", writes=("ranges",))
 def first_changed(
-    changed: Bytes, was_free: Bytes, origin: Doubles, angles: Doubles, behind_m: float, ranges: Doubles
+    taken: Bytes, lately: Bytes, origin: Doubles, angles: Doubles, width_m: float, at_1m: float, ranges: Doubles
 ) -> None:
-    """Write the ranges (N,) from the viewpoint to the first cell that is changed along directions (N,), NaN: none.
+    """Write the ranges (N,) from the viewpoint to what has come onto floor along directions (N,), NaN: nothing has.
 
-    changed, was_free (H, W): 1 where so; what comes hides floor that was free for behind_m. origin (4,): viewpoint in
-    cells, longest way [m], size of a cell [m].
+    taken, lately (H, W): 1 where a cell is taken, and where it was free a short while ago. What comes stands before
+    floor that was free for width_m, and by the noise of stereo, three sigmas of a disparity. origin (4,): viewpoint in
+    cells, longest way [m], size of a cell [m]; at_1m: disparity at 1 m.
     """
-    height, width = changed.shape
+    height, width = taken.shape
     cell = origin[3]
     for n in range(len(angles)):
         dx, dy = math.cos(angles[n]) / cell, math.sin(angles[n]) / cell
         ranges[n] = np.nan
-        r, begin = cell, -1.0
+        r, begin, end = cell, -1.0, 0.0
         while r < origin[2]:
             i, j = math.floor(origin[1] + r * dy), math.floor(origin[0] + r * dx)
             if i < 0 or j < 0 or i >= height or j >= width:
                 break
-            if begin < 0.0 and changed[i, j]:
-                begin = r
-            if begin >= 0.0 and not was_free[i, j]:
-                break
-            if begin >= 0.0 and r - begin >= behind_m:
-                ranges[n] = begin
-                break
+            if begin < 0.0 and taken[i, j]:
+                begin, end = r, r + width_m + 1.5 * r * r / at_1m
+            if begin >= 0.0:
+                if not lately[i, j]:
+                    break
+                if r >= end:
+                    ranges[n] = begin
+                    break
             r += 0.5 * cell
