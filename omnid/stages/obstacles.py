@@ -17,13 +17,10 @@ from omnid.core.control.collision_monitor import ControllerRing, MovingPoint
 from omnid.core.floor import Floor, FloorEstimator
 from omnid.core.frames import of_base
 from omnid.core.mapping.range_scan import SECTORS, FreeRanges
-from omnid.core.obstacles.column import NEAREST_M, ColumnEvidence, Columns, floor_plane
 from omnid.core.obstacles.fixed_parts import FixedParts
-from omnid.core.obstacles.grid import GridRing, ObstacleGrid
 from omnid.core.obstacles.moving_tracker import MovingTracker
 from omnid.core.obstacles.narrow import narrow_m, nothing_narrow
-from omnid.core.obstacles.pair_views import FOCAL_PX
-from omnid.core.obstacles.rays.pair_rings import RayRings
+from omnid.core.obstacles.ray_rings import RayRings
 from omnid.core.obstacles.settings import RingSettings
 from omnid.core.obstacles.unwatched import Unwatched, without
 from omnid.load_level import LoadLevel
@@ -95,15 +92,12 @@ class PairRings:
     """The obstacle grid of a run, the obstacles that move in it, and its ring at each pair that is added."""
 
     def __init__(self, geometry: Geometry, settings: RingSettings) -> None:
-        self._geometry, self._settings = geometry, settings
-        self._of_floor: Floor | None = None  # floor for which the columns were made
+        self._geometry = geometry
+        self._of_floor: Floor | None = None  # for which the tables of the rings were made
         self.fixed = FixedParts(geometry.cylinder)
-        self._left_out = self.fixed.pixels  # those of the columns
+        self._left_out = self.fixed.pixels  # those of the tables
         self._is_misled = False  # whether the grid holds what fixed parts have shown
-        self._columns: Columns | None = None
-        self._evidence: ColumnEvidence | None = None  # of the newest pair
-        self._grid = ObstacleGrid(FOCAL_PX * geometry.rig.baseline_m, settings)
-        self._rays = RayRings(geometry.cylinder, geometry.rig.baseline_m, settings) if settings.rays else None
+        self.rings = RayRings(geometry.cylinder, geometry.rig.baseline_m, settings)
         self._tracker = MovingTracker()
         self._unwatched = Unwatched(geometry.cylinder, geometry.rig.T_base_rig @ geometry.T_rig_rect)
         self._resets = 0
@@ -112,12 +106,9 @@ class PairRings:
         """Add the evidence of a pair; return the ring at it, which is unknown while the floor or the pose is."""
         # 1. Forget the grid and the tracks where odometry has begun again.
         if odometry.reset_counter != self._resets:
-            self._grid.begin_again()
-            if self._rays is not None:
-                self._rays.grid.clear()
-            self._tracker.clear()
-            self._resets, self._is_misled = odometry.reset_counter, False
-        panoramas, self._evidence = odometry.depth.panoramas, None
+            self._begin_again()
+            self._resets = odometry.reset_counter
+        panoramas, self.rings.evidence = odometry.depth.panoramas, None
         T_odom_base = of_base(odometry, self._geometry.rig.T_base_rig)[0]
         unwatched = self._unwatched.sectors(panoramas.tiles.unknown)
         unknown = ObstacleRing(odometry.seq, odometry.stamp_ns, UNKNOWN, UNKNOWN, NOT_FREE, T_odom_base, (), unwatched)
@@ -126,25 +117,15 @@ class PairRings:
             self._tracker.clear()
             return unknown
         self._leave_out_fixed_parts(panoramas, T_odom_base)
-        columns = self._columns_of(camera_floor, panoramas)
-        if columns is None:
+        if not self._has_tables(camera_floor, panoramas):
             return unknown
-        # 2. The evidence of the images, without their dead and blind parts.
+        # 2. The ring by the images, without their dead and blind parts.
         lost = panoramas.tiles.lost_pixels(panoramas.visible.shape)
         pose = transform(planar(T_odom_base))
-        if self._rays is not None:
-            new = GridRing(*self._rays.add(odometry.stamp_ns, pose, panoramas.lower, panoramas.upper, lost))
-            self._evidence = self._rays.evidence
-            new = without(new, unwatched, self._unwatched.directions(panoramas.tiles.unknown))
-            moving = self._tracker.update(odometry.stamp_ns, self._rays.grid.viewpoint(pose), new.arrivals)
-            return ObstacleRing(
-                odometry.seq, odometry.stamp_ns, new.ranges_m, new.sigma_m, new.free_m, T_odom_base, moving, unwatched
-            )
-        evidence = self._evidence = columns.evidence(panoramas.lower, panoramas.upper, lost)
-        # 3. The grid, its ring, and the moving obstacles.
-        unseen = self._unwatched.directions(panoramas.tiles.unknown)
-        ring = without(self._grid.update(odometry.stamp_ns, pose, evidence), unwatched, unseen)
-        moving = self._tracker.update(odometry.stamp_ns, self._grid.viewpoint(pose), ring.arrivals)
+        ring = self.rings.add(odometry.stamp_ns, pose, panoramas.lower, panoramas.upper, lost)
+        ring = without(ring, unwatched, self._unwatched.directions(panoramas.tiles.unknown))
+        # 3. The moving obstacles.
+        moving = self._tracker.update(odometry.stamp_ns, self.rings.grid.viewpoint(pose), ring.arrivals)
         return ObstacleRing(
             odometry.seq, odometry.stamp_ns, ring.ranges_m, ring.sigma_m, ring.free_m, T_odom_base, moving, unwatched
         )
@@ -155,9 +136,14 @@ class PairRings:
 
         Sectors are those of the rectified frame.
         """
-        if self._evidence is None or self._columns is None:
+        if self.rings.evidence is None:
             return nothing_narrow()
-        return narrow_m(self._evidence.floor, self._columns.at_1m)
+        return narrow_m(self.rings.evidence.floor, self.rings.columns.at_1m)
+
+    def _begin_again(self) -> None:
+        self.rings.grid.begin_again()
+        self._tracker.clear()
+        self._is_misled = False
 
     def _leave_out_fixed_parts(self, panoramas: Panoramas, T_odom_base: Array) -> None:
         """Learn what is fixed to a camera, and leave it out; frozen parts are the same at all headings, too."""
@@ -169,32 +155,16 @@ class PairRings:
             self._left_out, self._of_floor, self._is_misled = self.fixed.pixels, None, True
         if self._is_misled and self.fixed.is_on_the_spot:
             # The floor too near to be seen is taken to be free again: a base that came here might know better.
-            self._grid.begin_again()
-            if self._rays is not None:
-                self._rays.grid.clear()
-            self._tracker.clear()
-            self._is_misled = False
+            self._begin_again()
 
-    def _columns_of(self, camera_floor: CameraFloor, panoramas: Panoramas) -> Columns | None:
-        """Return the columns for the floor and what is left out, None without a floor."""
+    def _has_tables(self, camera_floor: CameraFloor, panoramas: Panoramas) -> bool:
+        """Make the tables of the floor and of what is left out; return False without a floor."""
         floor = camera_floor.floor
         if floor is not None and floor is not self._of_floor:
-            geometry, settings = self._geometry, self._settings
-            T_rect_floor = geometry.rig.T_rect_rig @ se3.inverse(camera_floor.T_floor_rig(floor))
-            plane = floor_plane(T_rect_floor)
             self._of_floor = floor
-            self._columns = Columns(
-                geometry.cylinder,
-                geometry.rig.baseline_m,
-                plane,
-                settings.heights_m,
-                (NEAREST_M, settings.max_range_m),
-                panoramas.visible & ~self._left_out,
-            )
-            self._grid.set_floor(T_rect_floor, plane.height_m)
-            if self._rays is not None:
-                self._rays.set_floor(T_rect_floor, panoramas.visible & ~self._left_out)
-        return self._columns
+            T_rect_floor = self._geometry.rig.T_rect_rig @ se3.inverse(camera_floor.T_floor_rig(floor))
+            self.rings.set_floor(T_rect_floor, panoramas.visible & ~self._left_out)
+        return floor is not None
 
 
 # Least time between two rings; with the time from images to ring it stays below controller.collision.stale_s.

@@ -1,4 +1,7 @@
-"""Compiled loops of the obstacle grid: evidence of directions and ranges, gathered by cells; ways along directions."""
+"""Compiled loops of the belief grid: rays gathered by cells, and ways along directions.
+
+Squares (H, W) hold cells, windows (N, N) parts of them. Steps are those of belief_grid.py.
+"""
 
 from __future__ import annotations
 
@@ -13,285 +16,198 @@ Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
-
-LANES = 64  # Cells of a row that are computed at once, because the compiler makes vector instructions of a known count.
-# Where the numbers of those cells begin in `found` of `places`: multiples of LANES, because it holds so many of each
-# kind.
-X, Y, RANGE, AT, HALF, NEAR, FAR, LAST_SURFACE, FIRST_SURFACE = 0, 64, 128, 192, 256, 320, 384, 448, 512
-PLACES = 576
-# Directions by which a cell is off a border of one, so that `azimuth` is enough: its 2e-8 rad are 2e-6 directions.
-SURE = 1e-5
-FLOOR, ABOVE, BELOW, SURFACE = 0, 1, 2, 3  # numbers of a direction and disparity in the table
+RATIO, VIEW, SURFACE = 0, 1, 2  # layers of what `gather` writes
+UNSEEN, IN_VIEW, SEEN_PAST, HIDDEN, MOSTLY_PAST = 0, 1, 2, 3, 4  # states of a cell in a pair
+MOST_BESIDE = 60  # directions of a cell on either side, that of one next to the viewpoint
 
 
 @inner
-def azimuth(x: float, y: float) -> float:
-    """Return atan2(y, x) within 2e-8 (Abramowitz and Stegun 1964, 4.4.49), without branches."""
-    a, b = abs(x), abs(y)
-    share = min(a, b) / max(a, b)
-    z = share * share
-    angle = z * (z * (0.0429096138 + z * (-0.0161657367 + z * 0.0028662257)) - 0.0752896400)
-    angle = share * (1.0 + z * (z * (0.1999355085 + z * (z * (0.1065626393 + angle) - 0.1420889944)) - 0.3333314528))
-    angle = 0.5 * math.pi - angle if b > a else angle
-    angle = math.pi - angle if x < 0.0 else angle
-    return -angle if y < 0.0 else angle
+def bin_at(ends: Doubles, at_1m: float, range_m: float) -> int:
+    """Return the bin of a range; ends (N + 1,): that of half disparities, from near to far; -1: nearer, N: farther."""
+    n = math.ceil(2.0 * (at_1m / ends[0] - at_1m / range_m) - 1e-9) - 1 if range_m > 0.0 else -1
+    return -1 if n < 0 else (n if n < len(ends) - 1 else len(ends) - 1)
 
 
-@inner
-def places(i: int, begin: int, origin: Doubles, scale: tuple[float, float, float, float], found: Doubles) -> None:
-    """Write where the cells of row i from `begin` on are among directions and disparities.
-
-    scale: disparity at 1 m, last disparity, size of a cell [m], directions in a radian. found (PLACES,): x, y and
-    range [m]; direction, by `azimuth`, and half a cell in directions; disparities of the near and the far end of the
-    cell, and of the ends of what a surface in it may have.
-    """
-    at_1m, last_bin, cell_m, by_angle = scale
-    x0, y0, c, s, lean_x, lean_y = origin[0], origin[1], origin[2], origin[3], origin[4], origin[5]
-    for n in range(LANES):
-        j = np.float64(np.int32(begin + n))
-        x = x0 + cell_m * (c * j - s * i)
-        y = y0 + cell_m * (s * j + c * i)
-        r = math.sqrt(x * x + y * y)
-        # A surface counts in the cell of its foot, whichever of its heights is seen.
-        lean = (lean_x * x + lean_y * y) / r
-        nearest = r - 0.5 * cell_m - (lean if lean > 0.0 else 0.0)
-        farthest = r + 0.5 * cell_m - (lean if lean < 0.0 else 0.0)
-        last_surface = at_1m / nearest + 0.5 if nearest > 0.0 else last_bin
-        found[X + n], found[Y + n], found[RANGE + n] = x, y, r
-        found[AT + n] = (math.pi - azimuth(x, y)) * by_angle - 0.5
-        found[HALF + n] = 0.5 * cell_m / r * by_angle
-        found[NEAR + n] = min(np.floor(at_1m / (r - 0.5 * cell_m)), last_bin)
-        found[FAR + n] = np.floor(at_1m / (r + 0.5 * cell_m))
-        found[LAST_SURFACE + n] = min(np.floor(last_surface), last_bin)
-        found[FIRST_SURFACE + n] = np.floor(at_1m / farthest + 0.5)
-
-
-@inner
-def directions(x: float, y: float, at: float, half: float, by_angle: float) -> tuple[int, int]:
-    """Return the first and the last direction of a cell at x, y [m]; at, half: of `places`."""
-    first, last = math.ceil(at - half), math.floor(at + half)
-    before, after = first - (at - half), (at + half) - last
-    if last < first or min(before, after) < SURE or max(before, after) > 1.0 - SURE:
-        at = (math.pi - math.atan2(y, x)) * by_angle - 0.5
-        first, last = math.ceil(at - half), math.floor(at + half)
-        if last < first:
-            first = last = round(at)
-    return first, last
-
-
-@inner
-def evidence_table(floor: Floats, surface: Floats, level: Floats, table: Floats) -> None:
-    """Write what `gather` adds up (W, K, 4), in the order in which it reads: a surface as its likelihood."""
-    for k in range(floor.shape[0]):
-        for u in range(floor.shape[1]):
-            table[u, k, FLOOR], table[u, k, ABOVE], table[u, k, BELOW] = floor[k, u], level[0, k, u], level[1, k, u]
-            table[u, k, SURFACE] = math.exp(surface[k, u]) if surface[k, u] != 0.0 else 1.0
-
-
-@inner
-def mean_surface(table: Floats, ends: tuple[int, int], disparities: tuple[int, int]) -> float:
-    """Return the log of the mean likelihood of a surface in a cell: `log mean exp` of the evidence.
-
-    table (W, K, 4): of `evidence_table`; ends: first and last direction; disparities: first and last.
-    """
-    width, likelihood = len(table), 0.0
-    for u in range(ends[0], ends[1] + 1):
-        at_u = wrapped(u, width)
-        for k in range(disparities[0], disparities[1] + 1):
-            likelihood += table[at_u, k, SURFACE]
-    count = (ends[1] - ends[0] + 1) * (disparities[1] - disparities[0] + 1)
-    return math.log(likelihood / count) if likelihood != count else 0.0
-
-
-@inner
-def wrapped(u: int, width: int) -> int:
-    """Return the direction u, which may lie up to a turn outside, as an index of the table."""
-    return u + width if u < 0 else (u - width if u >= width else u)
-
-
-@compiled("(f4[:, ::1], f4[:, ::1], f4[:, :, ::1], f8[::1], f8, f8, f8, f8, f4[:, :, ::1])", writes=("cells",))
+@compiled(
+    "(f4[:, ::1], f4[:, ::1], f4[:, ::1], u1[::1], f8[::1], f8, f8[::1], f8, f8, f8, f4[:, :, ::1], u1[:, ::1])",
+    writes=("cells", "states"),
+)
 def gather(
-    floor: Floats,
+    ratios: Floats,
+    view: Floats,
     surface: Floats,
-    level: Floats,
-    origin: Doubles,
+    near: Bytes,
+    ends: Doubles,
     at_1m: float,
+    origin: Doubles,
     cell_m: float,
     reach_m: float,
     thin_m: float,
     cells: Floats,
+    states: Bytes,
 ) -> None:
-    """Write the evidence (5, N, N) of cells: floor where it is weakest, NaN where none can be seen; the means of the
-    floor against planes above and below it; an upright surface anywhere in it; the mean of the floor.
+    """Write the evidence (3, N, N) of cells, and their states (N, N).
 
-    floor, surface (K, W), level (2, K, W): log-likelihood ratios by disparity and direction, NaN where nothing is
-    compared. origin (6,): place of the middle of cell (0, 0) in the frame of the columns, cosine and sine of its axes
-    there, and by how much [m] a surface at the viewpoint's height appears nearer than its foot along x and y, as the
-    rig leans. at_1m: disparity at 1 m; reach_m: farther cells are left out; thin_m: width of the thinnest obstacle,
-    whose directions are judged together.
+    ratios, view, surface (D, K): of a RayBelief; near (D,): 1 where the nearest floor in view is seen, 2 where
+    something hides it, 0 where nothing is in view; ends (K + 1,): ranges of the bins; at_1m: disparity at 1 m.
+    origin (4,): place of the middle of cell (0, 0) about the viewpoint, cosine and sine of the axes there; thin_m:
+    width of the thinnest thing.
+    A cell is as taken as the most taken of the bins and directions in it: a pole fills no cell.
     """
-    bins, width = floor.shape
-    table, found = np.empty((width, bins, 4), np.float32), np.empty(PLACES, np.float64)
-    evidence_table(floor, surface, level, table)
-    by_angle = width / math.tau
-    scale = at_1m, bins - 1.0, cell_m, by_angle
+    directions, bins = ratios.shape
+    by_angle, row = directions / math.tau, np.empty(2 * MOST_BESIDE + 2)
     for i in range(cells.shape[1]):
         for j in range(cells.shape[2]):
-            n = j % LANES
-            if n == 0:
-                places(i, j, origin, scale, found)
-            cells[0, i, j] = cells[4, i, j] = np.nan
-            cells[1, i, j] = cells[2, i, j] = cells[3, i, j] = 0.0
-            r = found[RANGE + n]
-            # At the viewpoint, too far away, and nearer than the last disparity that is compared nothing is known.
-            if r < cell_m or r > reach_m or found[FAR + n] > found[NEAR + n]:
+            cells[RATIO, i, j] = cells[VIEW, i, j] = cells[SURFACE, i, j] = 0.0
+            states[i, j] = UNSEEN
+            x = origin[0] + cell_m * (origin[2] * j - origin[3] * i)
+            y = origin[1] + cell_m * (origin[3] * j + origin[2] * i)
+            r = math.sqrt(x * x + y * y)
+            if r > reach_m or r < 0.5 * cell_m:
                 continue
-            ends = directions(found[X + n], found[Y + n], found[AT + n], found[HALF + n], by_angle)
-            count = ends[1] - ends[0] + 1
-            # Floor and planes: the mean of the disparities. Evidence of the floor is that of something thin, which lies
-            # in the cell if it begins before the last directions.
-            far, near = int(found[FAR + n]), int(found[NEAR + n])
-            run = max(min(round(thin_m / r * by_angle), count), 1)
-            weakest, sum_floor, above, below = np.inf, 0.0, 0.0, 0.0
-            for u in range(ends[0], ends[1] + 1):
-                at_u, total = wrapped(u, width), 0.0
-                for k in range(far, near + 1):
-                    above += table[at_u, k, ABOVE]
-                    below += table[at_u, k, BELOW]
-                    sum_floor += table[at_u, k, FLOOR]
-                    total += table[at_u, k, FLOOR]
-                # One direction in which nothing can be seen makes the cell such, whichever it is.
-                if u + run <= ends[1] + 1 and not math.isnan(weakest) and not total >= weakest:
-                    weakest = total
-            patches = count * (near - far + 1)
-            cells[0, i, j], cells[4, i, j] = weakest / (near - far + 1), sum_floor / patches
-            cells[1, i, j], cells[2, i, j] = above / patches, below / patches
-            # A surface: at the disparities that it has at any of its heights.
-            last_surface = int(found[LAST_SURFACE + n])
-            first_surface = min(int(found[FIRST_SURFACE + n]), last_surface)
-            cells[3, i, j] = mean_surface(table, ends, (first_surface, last_surface))
+            at = (math.pi - math.atan2(y, x)) * by_angle - 0.5
+            half = min(0.5 * cell_m / r * by_angle, MOST_BESIDE)
+            first, last = math.ceil(at - half), math.floor(at + half)
+            if last < first:
+                first = last = round(at)
+            begin, end = bin_at(ends, at_1m, r - 0.5 * cell_m), bin_at(ends, at_1m, r + 0.5 * cell_m)
+            if begin < 0:
+                # Too near to be seen: known by what is seen past it.
+                hidden, past = 0, 0
+                for u in range(first, last + 1):
+                    state = near[u % directions]
+                    hidden += state == 2
+                    past += state == 1
+                # The thinnest thing there would hide so many directions.
+                if hidden >= min(0.6 * thin_m / r * by_angle, last - first + 1.0):
+                    states[i, j] = HIDDEN
+                elif past + hidden == last - first + 1:
+                    states[i, j] = SEEN_PAST if hidden == 0 else MOSTLY_PAST
+                continue
+            if end >= bins:
+                continue
+            # A thin thing hides so many directions together: their mean counts, as one alone is noise.
+            run = max(min(round(thin_m / r * by_angle), last - first + 1), 1)
+            most, least, total, together = -99.0, 1.0, 0.0, 0.0
+            for u in range(first, last + 1):
+                at_u, taken, shown = u % directions, -99.0, 0.0
+                for k in range(begin, end + 1):
+                    taken = max(taken, ratios[at_u, k])
+                    shown = max(shown, surface[at_u, k])
+                    least = min(least, view[at_u, k])
+                total += min(max(shown - 0.4, 0.0), 1.5)
+                row[u - first] = taken
+                together += taken
+                if u - first >= run:
+                    together -= row[u - first - run]
+                if u - first >= run - 1:
+                    most = max(most, together / run)
+            cells[RATIO, i, j], cells[VIEW, i, j] = most, least
+            cells[SURFACE, i, j] = total / (last - first + 1)
+            states[i, j] = IN_VIEW
 
 
-@compiled("(u1[:, ::1], f8[::1], f8[::1], f8[::1], f8[::1])", writes=("hit", "free"))
-def march(state: Bytes, origin: Doubles, azimuths: Doubles, hit: Doubles, free: Doubles) -> None:
-    """Write, along directions (N,), the way to the first cell that is taken, inf without one, and that to the end of
-    the free floor.
+@compiled("(f4[:, ::1], f8[::1], f8[::1], f8, f8[::1], f8[::1], f8[::1])", writes=("hit", "sigma", "free"))
+def ways(
+    taken: Floats, origin: Doubles, angles: Doubles, risk: float, hit: Doubles, sigma: Doubles, free: Doubles
+) -> None:
+    """Write, along directions (N,), the range of the first thing and its sigma, NaN without one, and the way up to
+    which the probability of a thing is at most `risk`.
 
-    state (H, W): 0 unknown, 1 free, 2 taken. origin (7,): place in cells, way per step and longest way [m], size of a
-    cell [m], share of the range over which a gap in the floor is passed, and the least gap [m] that is.
+    taken (H, W): probability of a thing in a cell, 2 where nothing is known. origin (4,): place in cells, longest way
+    [m], size of a cell [m].
     """
-    height, width = state.shape
-    step, longest, cell, gap_share, least_gap = origin[2], origin[3], origin[4], origin[5], origin[6]
-    for n in range(len(azimuths)):
-        dx, dy = math.cos(azimuths[n]) / cell, math.sin(azimuths[n]) / cell
-        hit[n], free[n] = np.inf, 0.0
-        ended = False
-        r = 0.0
+    height, width = taken.shape
+    cell, longest = origin[3], origin[2]
+    for n in range(len(angles)):
+        dx, dy = math.cos(angles[n]) / cell, math.sin(angles[n]) / cell
+        hit[n], sigma[n], free[n] = np.nan, np.nan, longest
+        clear, ended, inside = 1.0, False, False
+        weight, mean, square = 0.0, 0.0, 0.0
+        r, step = 0.5 * cell, cell
         while r < longest:
             i, j = math.floor(origin[1] + r * dy), math.floor(origin[0] + r * dx)
             if i < 0 or j < 0 or i >= height or j >= width:
+                if not ended:
+                    free[n], ended = r - 0.5 * cell, True
                 break
-            if state[i, j] == 2:
-                hit[n] = r
+            value = taken[i, j]
+            if not ended:
+                clear *= 1.0 - min(value, 1.0)
+                if 1.0 - clear > risk:
+                    free[n], ended = r - 0.5 * cell, True
+            if 0.5 < value <= 1.0:
+                inside = True
+                weight += value
+                mean += value * r
+                square += value * r * r
+            elif inside:
                 break
-            if state[i, j] == 1 and not ended:
-                free[n] = r + step
-            elif r - free[n] > max(gap_share * r, least_gap):
-                ended = True
             r += step
+        if inside:
+            hit[n] = mean / weight
+            sigma[n] = math.sqrt(max(square / weight - hit[n] * hit[n], 0.0) + cell * cell / 12.0)
 
 
-@compiled("(f8[::1], f8[::1], f8[::1], f8, f8, f8[::1])", writes=("closed",))
-def close_openings(
-    hit: Doubles, free: Doubles, in_view: Doubles, width: float, least_gap: float, closed: Doubles
-) -> None:
-    """Write the ways `hit` (N,) along all directions of a turn, where those through narrow openings end at them.
+@compiled("(f4[:, ::1], u1[:, ::1], u1[:, ::1], f8[::1], f8[::1], f8)", writes=("flooded",))
+def too_near(taken: Floats, states: Bytes, flooded: Bytes, origin: Doubles, angles: Doubles, reach_m: float) -> None:
+    """Set the cells (H, W) to 1 on ways too near to be seen, behind which floor is hidden and nothing is known that
+    hides it.
 
-    A way that passes between two surfaces nearer than its own, whose ends are less than `width` [m] apart, ends at the
-    farther one of both, unless floor is known up to its own within `least_gap` [m], beyond both, or to where it is in
-    view. free, in_view (N,): known floor, and the nearest in view.
+    taken: as for `ways`; states: of `gather`. origin (3,): viewpoint in cells, size of a cell [m].
     """
-    count = len(hit)
-    apart = np.empty(count // 2 + 1, np.float64)
-    for m in range(len(apart)):
-        apart[m] = 2.0 * math.cos(m * math.tau / count)
-    for k in range(count):
-        closed[k] = hit[k]
-        if math.isinf(hit[k]) or hit[k] - free[k] <= least_gap or free[k] >= in_view[k]:
-            continue
-        most = min(int(width / max(free[k], width) * count / math.tau), count // 4)
-        for a in range(1, most + 1):
-            left = hit[(k - a) % count]
-            for b in range(1, most + 1):
-                right = hit[(k + b) % count]
-                end = max(left, right)
-                if free[k] <= end < closed[k] and left * left + right * right - left * right * apart[a + b] < width**2:
-                    closed[k] = end
-
-
-@compiled(
-    "(f4[:, ::1], f4[:, ::1], u1[:, ::1], u1[:, ::1], f8[::1], f8[::1], f8[::1], f8[::1], f4[::1], u1[:, ::1])",
-    writes=("found", "near", "behind"),
-)
-def hidden_from(
-    hidden: Floats,
-    usual: Floats,
-    was_floor: Bytes,
-    taken: Bytes,
-    origin: Doubles,
-    azimuths: Doubles,
-    bounds: Doubles,
-    found: Doubles,
-    near: Floats,
-    behind: Bytes,
-) -> None:
-    """Write, along directions (N,), the range from which on all floor that was free is hidden, NaN where none is; 1 for
-    the cells (H, W) from there on; and the log-odds (N,) that what hides it stands nearer than all of it.
-
-    The sum of log-odds from a range to the end of the way is that of all less that of what is nearer: it is largest
-    from where the latter is least. Each disparity counts once, however many cells it has. That it stands nearer than
-    all of the floor in view has the sum S of all, against the larger one of 0 (nothing is hidden) and of the largest
-    sum from farther away: `min(S, least sum up to there)`.
-    Floor is hidden where its sum is a share of what it would be without any evidence, m^2 / 4 in each cell: a little
-    less evidence than usual in all of a direction is none of that.
-    hidden, usual (H, W): log-odds of cells, and usual evidence m; was_floor, taken (H, W): 1 where so. origin (5,):
-    viewpoint in cells, size of a cell [m], longest way [m], disparity at 1 m. bounds (4,): least sum, gap [m] in what
-    was free that ends a way, as the floor behind an object there may be hidden by it; range [m] to which floor is the
-    nearest in view; and the share.
-    """
-    height, width = hidden.shape
-    cell, longest, at_1m = origin[2], origin[3], origin[4]
-    step = 0.5 * cell
-    for n in range(len(azimuths)):
-        dx, dy = math.cos(azimuths[n]) / cell, math.sin(azimuths[n]) / cell
-        total, least, begin, last, before = 0.0, 0.0, math.nan, math.nan, math.inf
-        full, full_before = 0.0, 0.0  # sum without any evidence, of all and up to the least sum
-        r = cell
-        while r < longest:
+    height, width = taken.shape
+    cell, count = origin[2], len(angles)
+    explained = np.full(count, -1.0)
+    for n in range(count):
+        dx, dy, r = math.cos(angles[n]) / cell, math.sin(angles[n]) / cell, cell
+        while r < reach_m + 3.0 * cell and explained[n] < 0.0:
             i, j = math.floor(origin[1] + r * dy), math.floor(origin[0] + r * dx)
-            if i < 0 or j < 0 or i >= height or j >= width or taken[i, j] > 0:
+            if i < 0 or j < 0 or i >= height or j >= width:
                 break
-            # Nearer than the floor in view nothing is known by floor: what is not free there ends no way.
-            if r > bounds[2] and r - last > bounds[1]:
+            if 0.3 < taken[i, j] <= 1.0:
+                explained[n] = r
+            r += 0.5 * cell
+    for n in range(count):
+        dx, dy, r = math.cos(angles[n]) / cell, math.sin(angles[n]) / cell, cell
+        end = -1.0
+        for other in range(n - 2, n + 3):
+            end = max(end, explained[other % count])
+        while r < reach_m and end < 0.0:
+            i, j = math.floor(origin[1] + r * dy), math.floor(origin[0] + r * dx)
+            if i < 0 or j < 0 or i >= height or j >= width:
                 break
-            if was_floor[i, j] > 0:
-                weight = at_1m * step / (r * r)
-                total += hidden[i, j] * weight
-                full += 0.25 * usual[i, j] * usual[i, j] * weight if hidden[i, j] != 0.0 else 0.0
-                last = r
-                if total <= least:
-                    least, begin, full_before = total, math.nan, full
-                elif math.isnan(begin):
-                    begin = r
-                if r >= bounds[2]:
-                    before = min(before, total)
-            r += step
-        found[n] = math.nan
-        nearer = min(total, before)
-        near[n] = nearer if nearer <= -bounds[0] or total >= max(bounds[0], bounds[3] * full) else 0.0
-        if total - least < max(bounds[0], bounds[3] * (full - full_before)):
-            continue
-        found[n] = r = begin
-        while r <= last:
-            behind[math.floor(origin[1] + r * dy), math.floor(origin[0] + r * dx)] = 1
-            r += step
+            if states[i, j] == HIDDEN:
+                flooded[i, j] = 1
+            r += 0.5 * cell
+
+
+@compiled("(u1[:, ::1], u1[:, ::1], f8[::1], f8[::1], f8, f8, f8[::1])", writes=("ranges",))
+def first_changed(
+    taken: Bytes, lately: Bytes, origin: Doubles, angles: Doubles, width_m: float, at_1m: float, ranges: Doubles
+) -> None:
+    """Write the ranges (N,) from the viewpoint to what has come onto floor along directions (N,), NaN: nothing has.
+
+    taken, lately (H, W): 1 where a cell is taken, and where it was free a short while ago. What comes stands before
+    floor that was free for width_m, and by the noise of stereo, three sigmas of a disparity. origin (4,): viewpoint in
+    cells, longest way [m], size of a cell [m]; at_1m: disparity at 1 m.
+    """
+    height, width = taken.shape
+    cell = origin[3]
+    for n in range(len(angles)):
+        dx, dy = math.cos(angles[n]) / cell, math.sin(angles[n]) / cell
+        ranges[n] = np.nan
+        r, begin, end = cell, -1.0, 0.0
+        while r < origin[2]:
+            i, j = math.floor(origin[1] + r * dy), math.floor(origin[0] + r * dx)
+            if i < 0 or j < 0 or i >= height or j >= width:
+                break
+            if begin < 0.0 and taken[i, j]:
+                begin, end = r, r + width_m + 1.5 * r * r / at_1m
+            if begin >= 0.0:
+                if not lately[i, j]:
+                    break
+                if r >= end:
+                    ranges[n] = begin
+                    break
+            r += 0.5 * cell

@@ -8,14 +8,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.kalman_filter import kalman_filter
 from omnid.core.mapping.range_scan import SECTORS, RangeScan, azimuths
-from omnid.core.obstacles.usual_floor import Arrivals
+
+
+class Arrivals(NamedTuple):
+    """Ranges from the viewpoint of what has come onto floor that was free, by one pair."""
+
+    ranges_m: RangeScan  # (SECTORS,) of its front, NaN where nothing has come
+    sigma_m: RangeScan  # (SECTORS,)
+    is_nearer: NDArray[np.bool_]  # (SECTORS,) the nearest floor in view is hidden: the range is the most that it may be
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.mapping.range_scan import SECTORS, FreeRanges
-from omnid.core.obstacles.cell_kernels import MOST_RATIO
 from omnid.core.obstacles.column import THIN_M
 
 Floats = NDArray[np.float32]
@@ -21,6 +20,7 @@ Floats = NDArray[np.float32]
 # Directions on either side whose floor is compared, because nearer ones may show a thing of 10 cm at 1 m, and farther
 # ones another floor.
 BESIDE: Final = range(5, 13)
+MOST_RATIO: Final = 3.0  # of the floor by one patch, because the errors of neighbours are alike
 # Log-odds of a direction from which something narrow stands there. By trial on development seeds: with 4 less floor of
 # maps is free, with 6 twice as many cells of poles are.
 NARROW_SUM: Final = 5.0

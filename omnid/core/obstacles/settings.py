@@ -34,7 +34,6 @@ class RingSettings:
         Meta(ge=1.5, le=50),
         "longest range of an obstacle, m; it must reach beyond the nearest floor that both cameras see",
     ] = 6.0
-    rays: Annotated[bool, "floor and obstacles by one posterior for each ray: on trial, not for driving"] = False
     min_points: int = 6  # matched points that make an obstacle of the map, within 3 degrees and the noise of the range
 
     def __post_init__(self) -> None:

@@ -16,8 +16,7 @@ from omnid.core.navigation.navigator import Navigator
 from omnid.core.navigation.path import DrivePath, straight_leg
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.situation import Situation
-from omnid.core.obstacles.moving_tracker import MovingObstacle, MovingTracker
-from omnid.core.obstacles.usual_floor import Arrivals
+from omnid.core.obstacles.moving_tracker import Arrivals, MovingObstacle, MovingTracker
 from omnid.navigation_state import NavigationState
 from tests.omnid.core.navigation.test_local_planner import AZIMUTHS, OUTLINE, SETTINGS, BaseAmongBoxes, Boxes
 

@@ -70,8 +70,17 @@ class Pole:
     grey: float = 190.0
 
 
+@dataclass(frozen=True)
+class Bar:
+    """A bar around the robot, of one grey level, over floor that is seen below and beyond it."""
+
+    range_m: float
+    heights_m: tuple[float, float]
+    grey: float = 190.0
+
+
 def panoramas(
-    floor: Pattern, wall_m: float, wall: Pattern, drop_m: float = 0.0, pole: Pole | None = None, seed: int = 4
+    floor: Pattern, wall_m: float, wall: Pattern, drop_m: float = 0.0, thing: Pole | Bar | None = None, seed: int = 4
 ) -> tuple[PaddedPanorama, PaddedPanorama]:
     """Return the lower and the upper panorama of a floor with a round wall; wall: grey of azimuth and height.
 
@@ -79,7 +88,7 @@ def panoramas(
     """
     rng = np.random.default_rng(seed)
     lower, upper = (
-        _exposed(_drawn(height + drop_m, floor, wall_m, wall, pole), rng)
+        _exposed(_drawn(height + drop_m, floor, wall_m, wall, thing), rng)
         for height in (HEIGHT_M, HEIGHT_M + BASELINE_M)
     )
     return lower, upper
@@ -93,7 +102,7 @@ def _exposed(grey: np.ndarray, rng: np.random.Generator) -> PaddedPanorama:
 
 
 @lru_cache(maxsize=16)  # most pairs differ in their noise only
-def _drawn(height_m: float, floor: Pattern, wall_m: float, wall: Pattern, pole: Pole | None) -> np.ndarray:
+def _drawn(height_m: float, floor: Pattern, wall_m: float, wall: Pattern, thing: Pole | Bar | None) -> np.ndarray:
     """Return the grey levels of a panorama without noise."""
     columns, rows = np.meshgrid(np.arange(CYLINDER.width), np.arange(CYLINDER.height))
     rays = CYLINDER.rays(np.column_stack([columns.ravel(), rows.ravel()]).astype(float))
@@ -103,7 +112,10 @@ def _drawn(height_m: float, floor: Pattern, wall_m: float, wall: Pattern, pole: 
     x, y, z = (near * rays.T[i] for i in range(3))
     azimuth = np.arctan2(y, x)
     grey = np.where(r < wall_m, floor(x, y), wall(azimuth, height_m + z))
-    if pole is not None:
-        hidden = (np.abs(azimuth) < pole.width_m / pole.range_m / 2) & (r > pole.range_m)
-        grey = np.where(hidden, pole.grey, grey)
+    if isinstance(thing, Pole):
+        hidden = (np.abs(azimuth) < thing.width_m / thing.range_m / 2) & (r > thing.range_m)
+        grey = np.where(hidden, thing.grey, grey)
+    elif thing is not None:
+        height = height_m + thing.range_m * rays[:, 2]
+        grey = np.where((height > thing.heights_m[0]) & (height < thing.heights_m[1]), thing.grey, grey)
     return np.asarray(grey.reshape(columns.shape))

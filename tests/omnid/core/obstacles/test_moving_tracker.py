@@ -9,8 +9,7 @@ import pytest
 
 from calib import se3
 from omnid.core.mapping.range_scan import SECTORS, azimuths
-from omnid.core.obstacles.moving_tracker import MovingObstacle, MovingTracker, surfaces
-from omnid.core.obstacles.usual_floor import Arrivals
+from omnid.core.obstacles.moving_tracker import Arrivals, MovingObstacle, MovingTracker, surfaces
 
 S = 1_000_000_000
 PERIOD_S = 0.2

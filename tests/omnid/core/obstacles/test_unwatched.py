@@ -8,8 +8,8 @@ from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.mapping.range_scan import SECTORS
 from omnid.core.obstacles.grid import GridRing
+from omnid.core.obstacles.moving_tracker import Arrivals
 from omnid.core.obstacles.unwatched import Unwatched, without
-from omnid.core.obstacles.usual_floor import Arrivals
 from omnid.core.stereo.tiles import TILE_COLUMNS
 
 CYLINDER = Cylinder(width=900, height=250, row0=80.0)

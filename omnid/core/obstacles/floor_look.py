@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.obstacles.rays.parameters import RayParameters
+from omnid.core.obstacles.parameters import RayParameters
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]

@@ -26,11 +26,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from omnid.core.obstacles import ray_kernels as kernels
 from omnid.core.obstacles.column import ColumnEvidence, Columns
+from omnid.core.obstacles.floor_look import LEAST_STEP, floor_look, floor_steps
 from omnid.core.obstacles.pair_views import DIRECTIONS
-from omnid.core.obstacles.rays import ray_kernels as kernels
-from omnid.core.obstacles.rays.floor_look import LEAST_STEP, floor_look, floor_steps
-from omnid.core.obstacles.rays.parameters import RayParameters
+from omnid.core.obstacles.parameters import RayParameters
 from omnid.core.types.panorama import PaddedPanorama
 
 Array = NDArray[np.float64]

@@ -77,12 +77,11 @@ class GridParameters:
     hidden: float = 0.5  # probability of a thing in the nearest bins by which they are hidden,
     near_m: float = 0.06  # and the length of these bins
     leaves_m: float = 0.6  # from the nearest floor in view, within which a wall leaves the view
-    lately_s: float = 3.0
-    was_free: float = 0.01  # probability of a thing in a cell that was free
-    was_seen: float = 0.5  # by which one pair has seen floor,
-    comes: float = 2.0  # and the next one a thing [nats]
+    comes: float = 2.0  # by which one pair shows a thing that has come [nats]
+    was_free: float = 0.01  # probability of a thing in a cell that was free,
+    lately_s: float = 3.0  # and for how long that counts
     comes_m: float = 0.2  # least width of who comes,
-    behind_m: float = 0.15  # and of floor that was free behind
+    behind_m: float = 0.15  # and of floor that was free behind its front, beside three sigmas of a disparity
     near_sigma: float = 0.3  # of the range of what hides the nearest floor in view, as a share
     hanging: float = -5.0  # log-odds of something that hangs over floor in view
     shown_rate: float = 0.15  # of the mean of single pairs

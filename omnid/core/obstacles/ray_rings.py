@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from calib.panorama import Cylinder
 from omnid.core.obstacles.column import NEAREST_M, ColumnEvidence, Columns, FloorPlane, floor_plane
+from omnid.core.obstacles.grid import GridRing, ObstacleGrid, unknown_ring
+from omnid.core.obstacles.lean import LEAST_RAD, Lean
 from omnid.core.obstacles.pair_views import DIRECTIONS, FOCAL_PX
-from omnid.core.obstacles.rays.belief_grid import BeliefGrid, BeliefRing, unknown_ring
-from omnid.core.obstacles.rays.lean import LEAST_RAD, Lean
-from omnid.core.obstacles.rays.parameters import GridParameters, RayParameters
-from omnid.core.obstacles.rays.posterior import RayPosterior
+from omnid.core.obstacles.parameters import GridParameters, RayParameters
+from omnid.core.obstacles.posterior import RayPosterior
 from omnid.core.obstacles.settings import RingSettings
 from omnid.core.types.panorama import PaddedPanorama
 
@@ -28,17 +28,10 @@ SURE_RAD: Final = math.radians(0.3)  # sigma of a tilt that is used
 class RayRings:
     """Rings of a run by the rays of its pairs."""
 
-    def __init__(
-        self,
-        cylinder: Cylinder,
-        baseline_m: float,
-        settings: RingSettings,
-        rays: RayParameters | None = None,
-        grid: GridParameters | None = None,
-    ) -> None:
+    def __init__(self, cylinder: Cylinder, baseline_m: float, settings: RingSettings) -> None:
         self._cylinder, self._baseline_m, self._settings = cylinder, baseline_m, settings
-        self._rays = rays or RayParameters()
-        self.grid = BeliefGrid(FOCAL_PX * baseline_m, settings.max_range_m, grid or GridParameters())
+        self._rays = RayParameters()
+        self.grid = ObstacleGrid(FOCAL_PX * baseline_m, settings.max_range_m, GridParameters())
         self._lean, self._tilt = Lean(), np.zeros(2)  # of the floor beyond what the rig states; of the tables
         self._plane: FloorPlane | None = None
         self._visible: Flags | None = None
@@ -52,7 +45,7 @@ class RayRings:
 
     def add(
         self, stamp_ns: int, T_odom_base: Array, lower: PaddedPanorama, upper: PaddedPanorama, lost: Flags | None
-    ) -> BeliefRing:
+    ) -> GridRing:
         """Return the ring at a pair, whose base has the planar pose T_odom_base (4, 4).
 
         lost (H, W): pixels that are no evidence, None: all in view are.
