@@ -43,6 +43,7 @@ OWN_CELLS: Final = 3  # on either side of the base that nothing else can be in
 CROSS: Final = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
 SQUARE: Final = np.ones((3, 3), np.uint8)
 NEVER_NS: Final = -(1 << 62)
+SPECK_CELLS: Final = 4
 OPEN_SHARE: Final = 0.9  # of the longest range, from which on a direction is open: few pairs show the last cells
 
 
@@ -102,6 +103,7 @@ class ObstacleGrid:
         self._before = np.zeros((CELLS, CELLS), np.float32)
         self._shown = np.zeros((CELLS, CELLS), np.float32)
         self._free_ns = np.full((CELLS, CELLS), NEVER_NS, np.int64)
+        self._past_views = np.zeros((CELLS, CELLS), np.float32)
         self.known = np.zeros((CELLS, CELLS), np.uint8)
         self._floor_was_behind = np.zeros((CELLS, CELLS), np.uint8)
         self._corner = None
@@ -146,7 +148,12 @@ class ObstacleGrid:
         watched[rows, columns] = observed | past | (states == kernels.MOSTLY_PAST)
         known = self.known[rows, columns]
         known[observed] = 1
-        known[past] = 1
+        # What was hidden from the start may look like floor in some pairs: it is known after so many views past it.
+        past_views = self._past_views[rows, columns]
+        past_views[past] += np.float32(1 - rho)
+        past_views[observed] = p.views
+        past_views[(states == kernels.HIDDEN) & (past_views < p.views)] = 0.0
+        known[past & (past_views >= p.views)] = 1
         self._eye_m, self._near_m = self.viewpoint(T_odom_base)[:2, 3], float(belief.ends_m[0])
         eye = self._eye_m / CELL_M - corner
         yaw = float(se3.yaw(T_odom_base))
@@ -156,7 +163,7 @@ class ObstacleGrid:
         #    What hides it from the start may stand where it did.
         flooded = np.zeros((CELLS, CELLS), np.uint8)
         kernels.too_near(self._taken(), every, flooded, np.array([*eye, CELL_M]), self._azimuths + yaw, self._near_m)
-        flooded &= self._floor_was_behind
+        flooded = _without_specks(flooded & self._floor_was_behind)
         watched |= ((every == kernels.HIDDEN) & (self.known > 0)).view(np.uint8)
         if not is_first:
             self._who_comes(passed_s, watched)
@@ -190,7 +197,10 @@ class ObstacleGrid:
         ranges_m, view = np.empty(SECTORS), np.array([*eye, self._max_range_m, CELL_M])
         kernels.first_changed(came, lately, view, self._azimuths + yaw_rad, p.behind_m, self._at_1m, ranges_m)
         for run in _runs(np.isfinite(ranges_m)):
-            if len(run) * max(float(ranges_m[run].mean()), self._near_m) * math.tau / SECTORS < p.comes_m:
+            # Who hides the nearest floor in view stands next to the base.
+            range_m = float(ranges_m[run].mean())
+            least_rad = p.comes_m / range_m if range_m > self._near_m else p.person_rad
+            if len(run) * math.tau / SECTORS < least_rad:
                 ranges_m[run] = np.nan
         is_nearer = ranges_m < self._near_m
         sigma_m = np.where(is_nearer, p.near_sigma * self._near_m, 0.5 * ranges_m**2 / self._at_1m)
@@ -198,28 +208,12 @@ class ObstacleGrid:
         return Arrivals(ranges_m.astype(np.float32), sigma_m.astype(np.float32), is_nearer)
 
     def _assume_free(self, eye: Array, yaw_rad: float, belief: RayBelief) -> None:
-        """Take the floor too near to be seen for free at the start, up to what hides the nearest floor in view.
+        """Take the floor too near to be seen for free at the start, but where something hides the nearest in view.
 
-        That is where a surface is seen. A wall that leaves the view goes on straight from where it is in view on both
-        sides. Anything else may stand anywhere before the floor that it hides.
+        That may stand anywhere before the floor that it hides.
         """
-        p, near_m = self._p, float(belief.ends_m[0])
-        hides, count = self._hides(belief), len(belief.first)
-        reach_m = np.where(hides, 0.0, near_m + 2 * CELL_M)
-        first_m = belief.ends_m[
-            np.minimum((np.cumsum(belief.first, axis=1) > 0.5).argmax(axis=1), len(belief.ends_m) - 1)
-        ]
-        surface_m = belief.nearer_m - CELL_M
-        step = math.tau / count
-        for run in _runs(hides):
-            reach_m[run] = np.where(np.isfinite(surface_m[run]), surface_m[run], 0.0)
-            before, after = (run[0] - 1) % count, (run[-1] + 1) % count
-            if max(first_m[before], first_m[after]) < near_m + p.leaves_m and len(run) < count // 2:
-                # The chord between both ends.
-                wide, here = (len(run) + 1) * step, np.arange(1, len(run) + 1) * step
-                near, far = first_m[before], first_m[after]
-                chord = near * far * math.sin(wide) / (near * np.sin(here) + far * np.sin(wide - here))
-                reach_m[run] = np.maximum(reach_m[run], chord - 2 * CELL_M)
+        p, count = self._p, len(belief.first)
+        reach_m = np.where(self._hides(belief), 0.0, self._near_m + 2 * CELL_M)
         reach_m = np.min([np.roll(reach_m, shift) for shift in range(-3, 4)], axis=0)
         y, x = np.indices((CELLS, CELLS)) + 0.5
         x, y = x - eye[0], y - eye[1]
@@ -227,7 +221,7 @@ class ObstacleGrid:
         turn = math.atan2(T[1, 0], T[0, 0]) - yaw_rad
         at = np.floor((math.pi - np.arctan2(y, x) - turn) / math.tau * count).astype(np.intp) % count
         free = np.hypot(x, y) * CELL_M < reach_m[at]
-        self.known[free] = 1
+        self.known[free], self._past_views[free] = 1, p.views
         self.odds[free & (self.odds < 0)] = p.arrival
 
     def _hides(self, belief: RayBelief) -> Flags:
@@ -246,7 +240,7 @@ class ObstacleGrid:
         unit = np.column_stack([np.cos(azimuth), np.sin(azimuth)]) @ T[:2, :2].T
         cells = np.floor((T[:2, 3] + ranges_m[:, None, None] * unit) / CELL_M).astype(np.intp) - self._corner
         x, y = np.clip(cells[..., 0], 0, CELLS - 1), np.clip(cells[..., 1], 0, CELLS - 1)
-        return np.asarray((self.known[y, x] > 0) & (self.odds[y, x] < self._p.prior))
+        return np.asarray((self.known[y, x] > 0) & (self.odds[y, x] < self._p.floor))
 
     def _taken(self) -> Floats:
         """Return the probability of a thing in cells, 2 where nothing is known."""
@@ -324,6 +318,14 @@ class ObstacleGrid:
             layer[gone] = unknown
         self._corner = self._corner + np.array([x, y])
         return self._corner
+
+
+def _without_specks(flags: Bytes) -> Bytes:
+    """Return flags (H, W) without patches of few cells, as what hides floor from the viewpoint hides a long way."""
+    _, labels, of_patch, _ = cv2.connectedComponentsWithStats(flags)
+    is_kept = of_patch[:, cv2.CC_STAT_AREA] > SPECK_CELLS
+    is_kept[0] = False
+    return is_kept[labels].view(np.uint8)
 
 
 def _runs(flags: Flags) -> list[NDArray[np.intp]]:

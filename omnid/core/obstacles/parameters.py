@@ -65,6 +65,7 @@ class GridParameters:
     """The grid of cells; log-odds in nats."""
 
     prior: float = -4.6  # of a thing in a cell
+    floor: float = -7.0  # of a cell by whose look floor is known
     arrival: float = -9.0  # least log-odds, as something may come into each cell in each pair
     most: float = 6.0
     views: float = 3.0  # n: views of a place that count
@@ -73,10 +74,10 @@ class GridParameters:
     risk: float = 0.1  # probability of a thing on a way that is free
     walk_mps: float = 1.6  # of who may come where nobody sees
     person_cells: int = 5  # width of who may
+    person_rad: float = 0.65  # angle of a person nearer than the floor in view: 0.4 m at 0.6 m
     thin_m: float = 0.035  # width of the thinnest thing
     hidden: float = 0.5  # probability of a thing in the nearest bins by which they are hidden,
     near_m: float = 0.06  # and the length of these bins
-    leaves_m: float = 0.6  # from the nearest floor in view, within which a wall leaves the view
     comes: float = 2.0  # by which one pair shows a thing that has come [nats]
     was_free: float = 0.01  # probability of a thing in a cell that was free,
     lately_s: float = 3.0  # and for how long that counts

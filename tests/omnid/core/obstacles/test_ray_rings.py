@@ -136,7 +136,7 @@ def test_who_steps_onto_free_floor_is_found_in_two_pairs(floor: Pattern, ahead_m
 def test_who_hides_the_nearest_floor_in_view_may_be_anywhere_before_it() -> None:
     base = Standing(stains)
     base.ring(pairs=8)
-    ring = base.ring(Pole(0.6, 0.4, 60.0))
+    ring = base.ring(Pole(0.5, 0.4, 60.0))
     assert ring.arrivals.is_nearer[AHEAD].all() and ring.free_m[AHEAD].max() < 0.7
 
 
