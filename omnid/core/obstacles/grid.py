@@ -325,7 +325,7 @@ def _without_specks(flags: Bytes) -> Bytes:
     _, labels, of_patch, _ = cv2.connectedComponentsWithStats(flags)
     is_kept = of_patch[:, cv2.CC_STAT_AREA] > SPECK_CELLS
     is_kept[0] = False
-    return is_kept[labels].view(np.uint8)
+    return np.asarray(is_kept[labels], np.uint8)
 
 
 def _runs(flags: Flags) -> list[NDArray[np.intp]]:
