@@ -27,10 +27,6 @@ Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 Tables = NDArray[np.int32]
 
-# Directions without floor in view side by side, 15 degrees, in which nothing is assumed about it, because struts and
-# masts are narrower, and the robot sees past them as it moves.
-UNSEEN_RUN: Final = 20
-
 NEAREST_M: Final = 0.5  # Least range at which surfaces are searched.
 # Rows of panoramas in a radian; by trial: with 104 all of 4 goals were reached, with 87 not.
 FLOOR_FOCAL_PX: Final = 100.0
@@ -95,8 +91,6 @@ class ColumnEvidence(NamedTuple):
     floor: Floats
     surface: Floats  # (K, DIRECTIONS) of the best run of rows within the robot's heights, where k fits best
     level: Floats  # (2, K, DIRECTIONS) of the floor against planes that are just above and below it
-    nearest_floor_m: float  # nearest floor that both cameras see, 0: none
-    shown: Flags  # (DIRECTIONS,) that show anything: what hides others is wide
 
 
 def floor_plane(T_rect_floor: Array) -> FloorPlane:
@@ -131,14 +125,11 @@ class Columns:
         in_view = self._visible[:, self._panoramas.shown].mean(axis=1) > 0.5
         self._first_row, self._last_row = _rows_in_use(in_view, round(self._row0))
         self._live = self._visible * np.uint8(255)
-        self._unseen = _wide_runs(np.asarray(~self._visible[max(0, round(self._row0)) :].any(axis=0)))
         self._floor_bins, self._strips = self._made_floor_bins(), self._made_strips()
         self._offsets = self._made_offsets()
         self._leave_out_cut_planes()
         self._prior = np.exp(-np.arange(self.bins) / ADJACENT_PX).astype(np.float32) + np.float32(DISTANT_SHARE)
-        tested = np.flatnonzero(self._floor_bins[:, kernels.FLOOR_END])
         self._compared = self._made_compared()
-        self.nearest_floor_m = self.at_1m / (float(tested[-1]) + 1.0) if len(tested) else 0.0
 
     def evidence(self, lower: PaddedPanorama, upper: PaddedPanorama, lost: Flags | None = None) -> ColumnEvidence:
         """Return the evidence of a pair; lost (H, W): pixels that are no evidence, None: all in view are."""
@@ -147,7 +138,7 @@ class Columns:
             live = np.where(self._panoramas.sized(lost * np.uint8(255)) == 0, live, np.uint8(0))
         surfaces, floor = self._panoramas.views(lower, upper, live)
         ratios = self._floor(floor), self._surface(surfaces), self._level(floor)
-        return ColumnEvidence(*ratios, self.nearest_floor_m, ~self._unseen)
+        return ColumnEvidence(*ratios)
 
     @property
     def panoramas(self) -> WorkingPanoramas:
@@ -287,9 +278,3 @@ def _rows_in_use(shown: Flags, horizon: int) -> tuple[int, int]:
         return int(rows[0]), int(rows[-1])
     gaps = np.flatnonzero(np.diff(below) > 1)
     return int(rows[0]), int(below[gaps[0]] if gaps.size else below[-1])
-
-
-def _wide_runs(flags: Flags) -> Flags:
-    """Return the flags (DIRECTIONS,) of a circle that stand in runs of UNSEEN_RUN or more."""
-    starts = np.logical_and.reduce([np.roll(flags, -shift) for shift in range(UNSEEN_RUN)])
-    return np.asarray(np.logical_or.reduce([np.roll(starts, shift) for shift in range(UNSEEN_RUN)]))

@@ -210,10 +210,14 @@ class ObstacleGrid:
     def _assume_free(self, eye: Array, yaw_rad: float, belief: RayBelief) -> None:
         """Take the floor too near to be seen for free at the start, but where something hides the nearest in view.
 
-        That may stand anywhere before the floor that it hides.
+        That may stand anywhere before the floor that it hides. Nothing is assumed where no floor is in view, in wider
+        directions than a strut or a mast hides.
         """
         p, count = self._p, len(belief.first)
         reach_m = np.where(self._hides(belief), 0.0, self._near_m + 2 * CELL_M)
+        for run in _runs(belief.view[:, 0] <= 0):
+            if len(run) * math.tau / count >= p.strut_rad:
+                reach_m[run] = 0.0
         reach_m = np.min([np.roll(reach_m, shift) for shift in range(-3, 4)], axis=0)
         y, x = np.indices((CELLS, CELLS)) + 0.5
         x, y = x - eye[0], y - eye[1]

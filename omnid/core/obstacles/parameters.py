@@ -54,7 +54,6 @@ class RayParameters:
     # Surfaces: where the mean over so many directions is largest, it counts so much more than one direction.
     wide_columns: int = 11
     wide_weight: float = 5.0
-    sure_surface: float = 5.0  # by which one is surely nearer than the floor in view [nats]
     # Look of the floor: learned up to this range [m], from so many bins at least.
     look_m: float = 1.8
     look_bins: int = 100
@@ -74,6 +73,7 @@ class GridParameters:
     risk: float = 0.1  # probability of a thing on a way that is free
     walk_mps: float = 1.6  # of who may come where nobody sees
     person_cells: int = 5  # width of who may
+    strut_rad: float = 0.26  # widest part of the view that a strut or a mast hides
     person_rad: float = 0.65  # angle of a person nearer than the floor in view: 0.4 m at 0.6 m
     thin_m: float = 0.035  # width of the thinnest thing
     hidden: float = 0.5  # probability of a thing in the nearest bins by which they are hidden,

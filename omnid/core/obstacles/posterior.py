@@ -50,7 +50,6 @@ class RayBelief(NamedTuple):
     ratios: Floats  # (DIRECTIONS, N) log-ratio of a thing in the bin to its prior, weighted by the view of it
     view: Floats  # (DIRECTIONS, N) probability that the bin's floor is in view, 0 where it is out of sight
     surface: Floats  # (DIRECTIONS, N) log-likelihood ratio of surfaces
-    nearer_m: Array  # (DIRECTIONS,) range of a sure surface nearer than all floor in view, NaN without one
     ends_m: Array  # (N + 1,) range at which the bins begin, from near to far, and the end of the last
 
 
@@ -145,7 +144,7 @@ class RayPosterior:
             cells,
         )
         surfaces = np.ascontiguousarray(evidence.surface[of_bin].T)
-        return RayBelief(first, cells[0], cells[1], surfaces, self._nearer(surface), self.ends_m)
+        return RayBelief(first, cells[0], cells[1], surfaces, self.ends_m)
 
     def _known(self, known: Flags | None, seen: Flags) -> tuple[Flags, Flags]:
         """Return the bins (N, DIRECTIONS) in view that are known to be floor, and those that show its look."""
@@ -161,7 +160,7 @@ class RayPosterior:
         count = len(self._bins)
         first, zero = np.zeros((DIRECTIONS, count + 1), np.float32), np.zeros((DIRECTIONS, count), np.float32)
         first[:, -1] = 1.0
-        return RayBelief(first, zero, zero, zero, np.full(DIRECTIONS, np.nan), self.ends_m)
+        return RayBelief(first, zero, zero, zero, self.ends_m)
 
     def _of_bins(self, pixels: Flags, *, every: bool) -> Flags:
         """Return the bins (DIRECTIONS, N) whose pixels (H, DIRECTIONS) of both views are set; or any of them."""
@@ -170,15 +169,6 @@ class RayPosterior:
         upper = np.rint((self._rows + self._shifts)[:count]).astype(int)
         one, two = (pixels[np.clip(rows, 0, len(pixels) - 1)] for rows in (lower, upper))
         return np.ascontiguousarray((one & two if every else one | two).T)
-
-    def _nearer(self, surface: Floats) -> Array:
-        """Return the ranges (DIRECTIONS,) of sure surfaces (K, DIRECTIONS) nearer than all floor in view, else NaN."""
-        begin = int(self._bins[0]) // BINS_PER_PX + 1
-        if begin >= len(surface):
-            return np.full(DIRECTIONS, np.nan)
-        best = surface[begin:].argmax(axis=0)
-        is_sure = np.take_along_axis(surface[begin:], best[None], axis=0)[0] >= self._p.sure_surface
-        return np.where(is_sure, self._columns.at_1m / (best + begin + 0.5), np.nan)
 
     def _surfaces(self, surface: Floats) -> Floats:
         """Return ratios (K, DIRECTIONS) of surfaces, where one fits best at least the weighted mean of neighbours."""
