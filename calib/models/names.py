@@ -24,20 +24,25 @@ NAMES: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "equirectangular": PINHOLE_NAMES,
     }
 )
+MODELS: Mapping[type, str] = MappingProxyType(
+    {
+        UnifiedCamera: "omni",
+        OcamCamera: "ocam",
+        DoubleSphereCamera: "ds",
+        ExtendedUnifiedCamera: "eucm",
+        EquidistantCamera: "equidistant",
+        EquirectangularCamera: "equirectangular",
+    }
+)
+LENSES = (DoubleSphereCamera, ExtendedUnifiedCamera, EquidistantCamera, EquirectangularCamera)
 OCAM_NAMES = ("center_row", "center_column", "c", "d", "e", *TANGENTIAL_NAMES, *ASTIGMATISM_NAMES, *WAVEFRONT_NAMES)
 
 
 def model_name(camera: OmniCamera) -> str:
-    """Return the name of a camera's model, as the key `model` of files."""
-    if isinstance(camera, OcamCamera):
-        return "ocam"
-    if isinstance(camera, DoubleSphereCamera):
-        return "ds"
-    if isinstance(camera, ExtendedUnifiedCamera):
-        return "eucm"
-    if isinstance(camera, EquirectangularCamera):
-        return "equirectangular"
-    return "equidistant" if isinstance(camera, EquidistantCamera) else "omni"
+    """Return the name of a camera's model, as the key `model` of files; CalibError for a camera of no known model."""
+    if type(camera) not in MODELS:
+        raise CalibError(f"expected a camera of a known model, found {type(camera).__name__}")
+    return MODELS[type(camera)]
 
 
 def values_of(camera: OmniCamera) -> dict[str, float]:
@@ -46,20 +51,18 @@ def values_of(camera: OmniCamera) -> dict[str, float]:
         polynomial = {f"a{power}": value for power, value in enumerate(camera.polynomial)}
         others = (*camera.center_row_column, *camera.affine, *camera.tangential, *camera.astigmatism, *camera.wavefront)
         return polynomial | dict(zip(OCAM_NAMES, others, strict=True))
-    values: tuple[float, ...]
+    own: tuple[float, ...] = ()
     if isinstance(camera, UnifiedCamera):
-        values = (camera.xi, *camera.focal, *camera.center, *camera.distortion)
-    elif isinstance(camera, DoubleSphereCamera):
-        values = (camera.xi, camera.alpha, *camera.focal, *camera.center)
+        return dict(zip(OMNI_NAMES, (camera.xi, *camera.focal, *camera.center, *camera.distortion), strict=True))
+    if isinstance(camera, DoubleSphereCamera):
+        own = (camera.xi, camera.alpha)
     elif isinstance(camera, ExtendedUnifiedCamera):
-        values = (camera.alpha, camera.beta, *camera.focal, *camera.center)
+        own = (camera.alpha, camera.beta)
     elif isinstance(camera, EquidistantCamera):
-        values = (*camera.coefficients, *camera.focal, *camera.center)
-    elif isinstance(camera, EquirectangularCamera):
-        values = (*camera.focal, *camera.center)
-    else:
-        raise CalibError(f"expected a camera of a known model, found {type(camera).__name__}")
-    return dict(zip(NAMES[model_name(camera)], values, strict=True))
+        own = camera.coefficients
+    names = NAMES[model_name(camera)]
+    assert isinstance(camera, LENSES)
+    return dict(zip(names, (*own, *camera.focal, *camera.center), strict=True))
 
 
 def camera_of(
