@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from calib.fit.boards.rig_fit import RigCalibration
 from calib.models.camera import Array, OmniCamera, inside_image
 from calib.rig import MountedCamera, Rig
-from omnid.calibration.live_boards import HOURS, listed
+from omnid.calibration.live_boards import HOURS, hours_of, listed
 
 BIN_DEG: Final = 10
 IMAGE_STEP_PX: Final = 4  # Between the pixels by which the parts of an image are told.
@@ -84,11 +84,9 @@ def _places(camera: OmniCamera, pixels: Array) -> tuple[NDArray[np.int64], NDArr
     """Return the bins of angles and the hours (N,) of pixels (N, 2); -1 for those without a ray."""
     rays, axis = camera.lift(pixels), camera.lift(np.array([camera.center]))[0]
     angle_deg = np.rad2deg(np.arctan2(np.linalg.norm(np.cross(rays, axis), axis=1), rays @ axis))
-    offset = pixels - camera.center
-    clockwise = np.arctan2(offset[:, 0], -offset[:, 1]) / (2 * math.pi)
     known = np.isfinite(angle_deg)
     bins = np.where(known, np.nan_to_num(angle_deg) // BIN_DEG, -1).astype(np.int64)
-    return bins, np.where(known, np.round(np.nan_to_num(clockwise) * HOURS) % HOURS, -1).astype(np.int64)
+    return bins, np.where(known, hours_of(pixels - camera.center), -1)
 
 
 def _visible_pixels(mounted: MountedCamera) -> Array:

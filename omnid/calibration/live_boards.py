@@ -42,10 +42,6 @@ class CameraCoverage:
     rim: Mask
     views: list[Array] = field(default_factory=list)  # (N, 2) px each, finite
 
-    def add(self, view: BoardView) -> None:
-        """Count a view."""
-        self.views.append(finite_corners(view))
-
     def counts(self) -> NDArray[np.int64]:
         """Return the number of views (RINGS, HOURS) that have a corner there; hour 0 is at 12 o'clock."""
         total = np.zeros((RINGS, HOURS), np.int64)
@@ -53,9 +49,7 @@ class CameraCoverage:
             seen = np.zeros((RINGS, HOURS), bool)
             offset = pixels - self.rim.center
             ring = (np.hypot(*offset.T) - self.rim.inner_px) / (self.rim.outer_px - self.rim.inner_px)
-            clockwise = np.arctan2(offset[:, 0], -offset[:, 1])  # from the top of the image, v points down
-            hour = np.round(clockwise / (2 * math.pi) * HOURS).astype(int) % HOURS
-            seen[np.clip((ring * RINGS).astype(int), 0, RINGS - 1), hour] = True
+            seen[np.clip((ring * RINGS).astype(int), 0, RINGS - 1), hours_of(offset)] = True
             total += seen
         return total
 
@@ -70,9 +64,10 @@ class CameraCoverage:
         return found
 
 
-def finite_corners(view: BoardView) -> Array:
-    """Return the known corners (N, 2) px."""
-    return view.pixels[np.isfinite(view.pixels).all(axis=1)]
+def hours_of(offset: Array) -> NDArray[np.int64]:
+    """Return the hours (N,) of offsets (N, 2) px from the centre of an image, 0 at 12 o'clock; v points down."""
+    clockwise = np.arctan2(offset[:, 0], -offset[:, 1]) / (2 * math.pi)
+    return np.round(np.nan_to_num(clockwise) * HOURS).astype(np.int64) % HOURS
 
 
 def moved(a: BoardView | None, b: BoardView | None) -> float:
@@ -157,7 +152,7 @@ class LiveBoards:
         # 3. Keep the pair, and count what it covers.
         self._kept.append((lower, upper))
         for coverage, view in zip(self._covered(), (lower, upper), strict=True):
-            coverage.add(view)
+            coverage.views.append(view.pixels[np.isfinite(view.pixels).all(axis=1)])
         return PairOutcome.KEPT
 
     def close(self) -> None:

@@ -195,27 +195,31 @@ class _BoardProblem:
 
     def result(self, state: _State) -> BoardFit:
         """Return the result, in whose covariance the misfit of the model is counted."""
+        # 1. The variance of a coordinate.
         residual, weight = _huber_weights(state.residuals, self.kernel_px)
         units = self._units(state.rig)
         freedom = 2 * float(weight.sum()) - len(units) - 6 * len(residual)
         variance = float((weight[..., None] * residual**2).sum()) / max(freedom, 1.0)
+        # 2. The covariance. The radii of the mirrors are no parameters of a rig.
         K, C, N, _ = self.pixels.shape
         fields = smooth_fields(self.pixels.reshape(K, C * N, 2), C).reshape(K, C, N, 2, -1)
         system = self.normal_equations(state, self.kernel_px, fields).reduced()
         covariance = covariance_with_misfit(*system, len(units), variance) * np.outer(units, units)
-        # The radii of the mirrors are no parameters of a rig.
-        radii = [(len(state.rig.names) + 1) * (side + 1) - 1 for side in range(C)]
-        covariance = np.delete(np.delete(covariance, radii, axis=0), radii, axis=1)
-        wavefronts = [
-            side * (len(state.rig.names) + 1) + k
-            for side in range(C)
-            for k, name in enumerate((*state.rig.names, "radius"))
-            if name in (*WAVEFRONT_NAMES, "radius")
-        ]
-        prior = self._prior_jacobian(state.rig)[:, wavefronts]
+        own = [(*state.rig.names, "radius")] * C
+        names = [name for side in own for name in side] + [""] * (len(units) - C * len(own[0]))
+        kept = [k for k, name in enumerate(names) if name != "radius"]
+        # 3. How much the images narrow the priors of wavefronts and radii, which differ between the models of mirrors.
+        mirror = [k for k, name in enumerate(names) if name in (*WAVEFRONT_NAMES, "radius")]
+        prior = self._prior_jacobian(state.rig)[:, mirror]
         complexity = np.linalg.slogdet(system[0][: len(units), : len(units)])[1] - np.linalg.slogdet(prior.T @ prior)[1]
-        cost = self.cost(state, self.kernel_px)
-        return BoardFit(state.rig, state.residuals, covariance, cost, variance, float(complexity))
+        return BoardFit(
+            state.rig,
+            state.residuals,
+            covariance[np.ix_(kept, kept)],
+            self.cost(state, self.kernel_px),
+            variance,
+            float(complexity),
+        )
 
     def _units(self, rig: BoardRig) -> Array:
         """Return one step (P,) of each common unknown in its own unit; a step moves the image by about a pixel."""
