@@ -64,8 +64,11 @@ def read_pairs(source: Path, cameras: LogCameras = BY_NAME) -> PairedImages:
         raise OmnidError(f"{source}: only a log has topics; found a folder of images")
     faults, loss = tuple[str, ...](), ""
     if of_log:
-        sides, topics, read = _of_log(source, cameras)
-        faults, loss = read.notes, str(read.loss)
+        with closing(cameras.reader(source)) as reader:
+            read, images = decoded_pairs(reader)
+            topics = reader.topics["lower"], reader.topics["upper"]
+        lower, upper = ({f"pair{number:05d}": pair[side] for number, pair in images.items()} for side in (0, 1))
+        sides, faults, loss = (lower, upper), tuple(read.notes), str(read.loss)
     else:
         sides, topics = _of_folder(source, cameras.bits), ("", "")
     if not sides[0].keys() & sides[1].keys():
@@ -152,18 +155,11 @@ def _require_one_size(images: Images) -> None:
 
 
 class LogPairs(NamedTuple):
-    """Which pairs of a log are used, and what of it is not."""
+    """What of a log's pairs is not used."""
 
-    number: int  # pairs with nearly equal stamps
-    within_ns: float  # largest difference of the stamps of a pair in a run: half a period
     loss: ImageLoss
-    notes: tuple[str, ...]  # of the reader
+    notes: list[str]  # of the reader, and about pairs that were left out
     arrived: tuple[int, ...]  # images of the lower and the upper camera
-
-    @property
-    def stride(self) -> int:
-        """Each pair of this number is used."""
-        return max(1, self.number // LOG_PAIRS)
 
 
 def decoded_pairs(reader: LogReader, *, keep: bool = True) -> tuple[LogPairs, dict[int, tuple[Image, Image]]]:
@@ -172,7 +168,7 @@ def decoded_pairs(reader: LogReader, *, keep: bool = True) -> tuple[LogPairs, di
     keep: return these. What is lost is counted as in a run: of all images without a partner, and of those that were
     decoded.
     """
-    # 1. Stamps of all images.
+    # 1. Stamps of all images. In a run a pair may differ by half a period.
     frames = [replace(frame, data=b"") for frame in reader.frames()]
     stamps = {camera: [frame.stamp_ns for frame in frames if frame.camera == camera] for camera in CAMERAS}
     periods = {camera: float(np.median(np.diff(own))) if len(own) > 1 else None for camera, own in stamps.items()}
@@ -180,48 +176,32 @@ def decoded_pairs(reader: LogReader, *, keep: bool = True) -> tuple[LogPairs, di
     joined = sum(1 for _ in paired(iter(frames), within_ns))
     arrived = {camera: len(own) for camera, own in stamps.items()}
     unpaired = unpaired_by_chance(arrived, {camera: count - joined for camera, count in arrived.items()}, periods)
-    found = LogPairs(
-        sum(1 for _ in paired(iter(frames))), within_ns, image_loss(reader.counts), (), tuple(arrived.values())
-    )
+    stride = max(1, sum(1 for _ in paired(iter(frames))) // LOG_PAIRS)
     # 2. Images of some pairs; those of another size than most are of no use.
-    images, broken, fault = dict[int, tuple[Image, Image]](), 0, ""
+    images, faults = dict[int, tuple[Image, Image]](), list[str]()
     sizes = Counter[tuple[tuple[int, ...], ...]]()
     for number, (lower, upper) in enumerate(paired(reader.frames())):
-        if number % found.stride == 0:
+        if number % stride == 0:
             try:
                 pair = gray(lower), gray(upper)
             except FrameDecodeError as error:
-                broken, fault = broken + 2, fault or str(error)
+                faults.append(str(error))
                 continue
             sizes[pair[0].shape, pair[1].shape] += 1
             images |= {number: pair} if keep else {}
-    usual = sizes.most_common(1)[0] if sizes else ((), 0)
-    images = {number: pair for number, pair in images.items() if (pair[0].shape, pair[1].shape) == usual[0]}
-    other_size = 2 * (sizes.total() - usual[1])
+    usual, count = sizes.most_common(1)[0] if sizes else ((), 0)
+    images = {number: pair for number, pair in images.items() if (pair[0].shape, pair[1].shape) == usual}
+    others = sizes.total() - count
+    # 3. What is lost.
     loss = image_loss(
-        reader.counts,
-        unpaired=unpaired,
-        undecodable=broken * found.stride,
-        other_size=other_size * found.stride,
+        reader.counts, unpaired=unpaired, undecodable=2 * len(faults) * stride, other_size=2 * others * stride
     )
     notes = list(reader.warnings)
-    if broken:
-        notes.append(f"left out {broken // 2} pairs with an image that cannot be decoded; the first: {fault}")
-    if other_size:
-        notes.append(f"left out {other_size // 2} pairs with an image of another size than most")
-    return found._replace(loss=loss, notes=tuple(notes)), images
-
-
-def _of_log(log: Path, cameras: LogCameras) -> tuple[tuple[Images, Images], tuple[str, str], LogPairs]:
-    """Return LOG_PAIRS pairs of a log, without those that cannot be decoded, its topics, and what is not used."""
-    sides: tuple[Images, Images] = ({}, {})
-    with closing(cameras.reader(log)) as reader:
-        found, images = decoded_pairs(reader)
-        topics = reader.topics
-    for number, pair in images.items():
-        for side, image in zip(sides, pair, strict=True):
-            side[f"pair{number:05d}"] = image
-    return sides, (topics["lower"], topics["upper"]), found
+    if faults:
+        notes.append(f"left out {len(faults)} pairs with an image that cannot be decoded; the first: {faults[0]}")
+    if others:
+        notes.append(f"left out {others} pairs with an image of another size than most")
+    return LogPairs(loss, notes, tuple(arrived.values())), images
 
 
 def paired(frames: Iterator[Frame], tolerance_ns: float = TOLERANCE_NS) -> Iterator[tuple[Frame, Frame]]:
