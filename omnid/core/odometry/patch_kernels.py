@@ -17,7 +17,7 @@ Indices = NDArray[np.intp]
 
 # Enough: 98 % of the patches of test_plane_patches.py end before; a last step is below the hundredths that noise
 # leaves.
-ITERATIONS, CONVERGED_PX = 12, 0.004
+ITERATIONS, CONVERGED_PX = 12, 0.01
 # Scatter of the gains of the patches of an image, by vignetting and slanted light.
 GAIN_SIGMA = 0.05
 LEAST_GAIN, LARGEST_GAIN = 0.25, 4.0  # Limits; exposures were made equal before.
@@ -29,6 +29,7 @@ MIN_DETERMINANT = 1e-3
 NOISE_CORRELATION = 3.0
 # Variance of a gradient of the panorama's noise per variance of the noise, which enlarges the gradients' matrix.
 GRADIENT_NOISE = 0.12
+FARTHEST_PX = 1e6  # more than the columns and rows of any panorama
 MIDDLE_GREY = np.float32(128)  # is subtracted, so that sums of float32 lose less
 MIN_TRUE_GRADIENT = 0.2  # least share of the gradients' matrix that counts as texture.
 
@@ -54,59 +55,84 @@ def sample(
     """
     side, half = templates.shape[1], templates.shape[1] // 2
     columns, rows, rays = np.empty((side, side)), np.empty((side, side)), np.empty((3, side))
+    cell = np.empty((4 * side + 8, 4 * side + 8), np.float32)  # what a template reaches, and the cubic kernel
     for n in chosen:
+        # 1. Where the image shows the template's pixels, as offsets from the patch.
         for j in range(side):
             # Azimuth falls from column to column.
             azimuth = (half - j - shift[n, 0]) / focal_px
             c, s = math.cos(azimuth), math.sin(azimuth)
             for a in range(3):
                 rays[a, j] = H[n, a, 0] * c + H[n, a, 1] * s
-        outside = 0
         for i in range(side):
             h = heights[n, 1] - (i - half + shift[n, 1]) / focal_px
             x, y, z = H[n, 0, 2] * h, H[n, 1, 2] * h, H[n, 2, 2] * h
+            to_columns, to_rows = columns[i], rows[i]
             for j in range(side):
                 per_ahead = 1 / (rays[0, j] + x)
                 tangent = (rays[1, j] + y) * per_ahead
                 square = tangent * tangent
                 # The arctangent is its series: of 15 degrees it is exact to 1e-7 rad, and a patch is smaller.
                 arc = tangent * (1 - square * (1 / 3 - square * (1 / 5 - square * (1 / 7 - square / 9))))
-                down = focal_px * (heights[n, 0] - (rays[2, j] + z) * per_ahead / math.sqrt(1 + square))
-                columns[i, j], rows[i, j] = -focal_px * arc, down
-                is_inside = (per_ahead > 0) & (abs(focal_px * arc) < 2 * side) & (abs(down) < 2 * side)  # false for NaN
-                outside += not is_inside
+                to_columns[j] = -focal_px * arc
+                to_rows[j] = focal_px * (heights[n, 0] - (rays[2, j] + z) * per_ahead / math.sqrt(1 + square))
+        is_bent = True
+        for i in (0, side - 1):
+            for j in (0, side - 1):
+                ahead = rays[0, j] + H[n, 0, 2] * (heights[n, 1] - (i - half + shift[n, 1]) / focal_px)
+                is_bent &= (ahead > 0) & (abs(columns[i, j]) < 2 * side) & (abs(rows[i, j]) < 2 * side)  # false for NaN
+        if not is_bent:
+            for i in range(side):
+                for j in range(side):
+                    columns[i, j], rows[i, j] = j - half + shift[n, 0], i - half + shift[n, 1]
+        # 2. The pixels around these places; a place that is NaN or absurd has no template.
+        is_near = abs(centres[n, 0]) < FARTHEST_PX and abs(centres[n, 1]) < FARTHEST_PX
+        if not (is_near and abs(shift[n, 0]) <= 1 and abs(shift[n, 1]) <= 1):
+            templates[n] = 0.0
+            continue
+        low, high = corner_bounds(columns)
+        left, right = math.floor(centres[n, 0] + low) - 2, math.floor(centres[n, 0] + high) + 4
+        low, high = corner_bounds(rows)
+        top, bottom = math.floor(centres[n, 1] + low) - 2, math.floor(centres[n, 1] + high) + 4
+        copy_cell(image, left, top, right - left, bottom - top, cell)
+        # 3. The greys there.
+        across, along = np.float32(centres[n, 0] - left), np.float32(centres[n, 1] - top)
         for i in range(side):
             for j in range(side):
-                across, down = columns[i, j], rows[i, j]
-                if outside:
-                    across, down = j - half + shift[n, 0], i - half + shift[n, 1]
-                templates[n, i, j] = cubic(image, centres[n, 0] + across, centres[n, 1] + down)
+                templates[n, i, j] = cubic(cell, across + np.float32(columns[i, j]), along + np.float32(rows[i, j]))
 
 
 @inner
-def cubic(image: Image, x: float, y: float) -> float:
-    """Return the grey between pixels by cubic convolution (Keys 1981, a = -1/2); the border is repeated.
+def corner_bounds(offsets: Array) -> tuple[float, float]:
+    """Return the least and the largest offset (T, T) of a template: those of its corners, to less than a pixel."""
+    a, b, c, d = offsets[0, 0], offsets[0, -1], offsets[-1, 0], offsets[-1, -1]
+    return min(a, b, c, d), max(a, b, c, d)
+
+
+@inner
+def cubic(cell: Floats, x: np.float32, y: np.float32) -> float:
+    """Return the grey between pixels of a cell (S, W) by cubic convolution (Keys 1981, a = -1/2).
 
     Bilinear interpolation shifts fine texture by up to 0.02 px, depending on the place between the pixels.
     """
-    (height, width), left, top = image.shape, math.floor(x), math.floor(y)
-    u, v = x - left, y - top
-    p, q = 1 - u, 1 - v
-    a, d = -0.5 * u * p * p, -0.5 * p * u * u
-    b, c = 1 + u * u * (1.5 * u - 2.5), 1 + p * p * (1.5 * p - 2.5)
-    left, before, right, after = (
-        within(left, width),
-        within(left - 1, width),
-        within(left + 1, width),
-        within(left + 2, width),
-    )
-    grey = 0.0
-    for k, weight in enumerate(
-        (-0.5 * v * q * q, 1 + v * v * (1.5 * v - 2.5), 1 + q * q * (1.5 * q - 2.5), -0.5 * q * v * v)
-    ):
-        row = within(top + k - 1, height)
-        grey += weight * (a * image[row, before] + b * image[row, left] + c * image[row, right] + d * image[row, after])
+    left, top = np.uint32(x), np.uint32(y)
+    u, v = x - np.float32(left), y - np.float32(top)
+    a, b, c, d = keys(u)
+    grey = np.float32(0)
+    for row, weight in enumerate(keys(v)):
+        line = cell[top + row - 1, left - 1 :]
+        grey += weight * (a * line[0] + b * line[1] + c * line[2] + d * line[3])
     return grey
+
+
+@inner
+def keys(u: np.float32) -> tuple[np.float32, np.float32, np.float32, np.float32]:
+    """Return the weights of four pixels, between the second and third of which a place lies at u."""
+    half, p = np.float32(0.5), np.float32(1) - u
+    inner_square, inner_cube = np.float32(2.5), np.float32(1.5)
+    b = np.float32(1) + u * u * (inner_cube * u - inner_square)
+    c = np.float32(1) + p * p * (inner_cube * p - inner_square)
+    return -half * u * p * p, b, c, -half * p * u * u
 
 
 @inner
@@ -173,7 +199,9 @@ def fit(
         trace, determinant = normal[0, 0] + normal[1, 1], normal[0, 0] * normal[1, 1] - normal[0, 1] ** 2
         if normal[2, 2] <= pixels * MIN_CONTRAST**2 or determinant <= MIN_DETERMINANT * trace**2:
             continue
-        copy_cell(image, centres[n], side + 2 * reach_px + 1, cell)
+        reach = side // 2 + reach_px
+        left, top = math.floor(centres[n, 0] + 0.5) - reach, math.floor(centres[n, 1] + 0.5) - reach
+        copy_cell(image, left, top, side + 2 * reach_px + 1, side + 2 * reach_px + 1, cell)
         x, y, gain, variance, residual = 0.0, 0.0, 1.0, noise, 0.0
         for _ in range(ITERATIONS):
             # 2. The window at the shift, and its products with the design and with itself.
@@ -231,7 +259,7 @@ def write_design(template: Floats, design: Floats) -> None:
                 3 * (below[j] + below[j + 2]) + 10 * below[j + 1],
             )
             design[0, i, j], design[1, i, j] = (left - right) / 32, (up - down) / 32
-            design[2, i, j] = here[j + 1] - MIDDLE_GREY
+            design[2, i, j] = here[j + 1]
     for a in range(3, size):
         for i in range(side):
             for j in range(side):
@@ -239,14 +267,17 @@ def write_design(template: Floats, design: Floats) -> None:
 
 
 @inner
-def copy_cell(image: Image, centre: Array, side: int, cell: Floats) -> None:
-    """Write the pixels of an image around a pixel (2,) into a cell (S, S or wider); the border is repeated."""
-    (height, width), half = image.shape, (side - 1) // 2
-    left, top = math.floor(centre[0] + 0.5) - half, math.floor(centre[1] + 0.5) - half
-    for i in range(side):
-        line, to = image[within(top + i, height)], cell[i]
-        for j in range(side):
-            to[j] = np.float32(line[within(left + j, width)]) - MIDDLE_GREY
+def copy_cell(image: Image, left: int, top: int, width: int, height: int, cell: Floats) -> None:
+    """Write pixels of an image, less the middle grey, into a cell (S, W or more); the border is repeated."""
+    for i in range(height):
+        line, to = image[within(top + i, image.shape[0])], cell[i]
+        if left >= 0 and left + width <= image.shape[1]:
+            source = line[left:]
+            for j in range(width):
+                to[j] = np.float32(source[j]) - MIDDLE_GREY
+        else:
+            for j in range(width):
+                to[j] = np.float32(line[within(left + j, image.shape[1])]) - MIDDLE_GREY
 
 
 @inner

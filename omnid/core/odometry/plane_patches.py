@@ -70,7 +70,7 @@ def plane_templates(
     upper: bool = False,
     window_px: int = WINDOW_PX,
 ) -> Floats:
-    """Return templates (N, T, T) of patches at pixels (N, 2) of images, as the current view shows them.
+    """Return templates (N, T, T) of patches at pixels (N, 2) of images, less grey 128, as the current view shows them.
 
     anchors (N,): the key of the image of each, one of the images. surfaces: points (N, 3) [m] at the patches' centres
     and slopes (N, 2) of the disparity there, both in the rectified frames of the images; T_curr_ref (N, 4, 4) from
@@ -222,10 +222,13 @@ def _fit(
     slopes (N, 2): prior of their change, which is written; slope_sigma: its standard deviation, 0: they do not change.
     """
     count, centres = len(templates), _padded(current, at)
-    ratio, gains = np.empty(count), np.empty(count)
+    ratio = np.empty(count)
     patch_kernels.contrast_ratios(templates, current.image, centres, ratio)
-    for group in np.unique(groups):
-        gains[groups == group] = np.median(ratio[groups == group])
+    # The median of each group.
+    order = np.lexsort((ratio, groups))
+    _, first, group, size = np.unique(groups[order], return_index=True, return_inverse=True, return_counts=True)
+    gains = np.empty(count)
+    gains[order] = ratio[order][first + size // 2][group]
     gains = gains.clip(patch_kernels.LEAST_GAIN, patch_kernels.LARGEST_GAIN)
     found = AlignedPatches(np.empty((count, 2)), np.empty((count, 2, 2)), np.empty(count, bool))
     noise_grey, results = current.noise_grey, (found.pixels, slopes, found.covariance, found.found)

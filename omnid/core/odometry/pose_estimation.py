@@ -21,6 +21,7 @@ RANSAC_THRESHOLD_PX = 2.0
 # Hypotheses that are drawn at once and at most, and the probability that none of them was free of outliers at which the
 # search ends: half a day's drive misses one. The most are enough where 31 % of the landmarks are right.
 RANSAC_BATCH, RANSAC_MOST, RANSAC_MISSED = 16, 480, 1e-6
+GOOD_GUESS = 0.8  # share of the landmarks that agree with no motion, above which none is sought
 GAUSS_NEWTON_STEPS = 6  # enough: 305 of 306 fits of test_pose_estimation.py converge in 5
 CONVERGED = 1e-5  # m and rad: a smaller step is the last one, because it moves no view by a hundredth of a pixel
 # Standard deviations at which the Cauchy kernel halves the weight of an error, so that of normal errors 96 % of the
@@ -65,17 +66,18 @@ def ransac(
     """Return the motion T_curr_ref with the largest consensus set of landmarks (N, 3), and the set's flags (N,).
 
     Three of the points seen in both cameras give a hypothesis; the errors of the views [px] give its consensus set:
-    Dang et al. 2012, section IV.B, with the distance measured in the images, where the noise is even. Hypotheses are
-    drawn in batches until three inliers have almost certainly been among them.
+    Dang et al. 2012, section IV.B, with the distance measured in the images, where the noise is even. No motion is the
+    first hypothesis: nothing is drawn where nearly all agree with it, as where the landmarks are those of a good guess.
+    Others are drawn in batches until three inliers have almost certainly been among them.
     """
     seen = triangulate(views, model.cylinder, model.baseline_m)
     usable = np.flatnonzero(np.isfinite(seen).all(axis=1))
-    best, consensus = np.eye(4), np.zeros(len(landmarks), bool)
-    if len(usable) < 3:
-        return best, consensus
-    for drawn in range(RANSAC_BATCH, RANSAC_MOST + 1, RANSAC_BATCH):
-        triples = usable[rng.random((RANSAC_BATCH, len(usable))).argpartition(2, axis=1)[:, :3]]
-        motions = rigid_fit(landmarks[triples], seen[triples])
+    motions = np.eye(4)[None]
+    best, consensus = motions[0], np.zeros(len(landmarks), bool)
+    for drawn in range(0, RANSAC_MOST + 1, RANSAC_BATCH):
+        if drawn:
+            triples = usable[rng.random((RANSAC_BATCH, len(usable))).argpartition(2, axis=1)[:, :3]]
+            motions = rigid_fit(landmarks[triples], seen[triples])
         moved = se3.apply(motions, landmarks)
         error = views - view(moved.reshape(-1, 3), model.cylinder, model.baseline_m).reshape(moved.shape)
         error[..., 0] = model.cylinder.wrap(error[..., 0])
@@ -84,7 +86,8 @@ def ransac(
         most = int(agree.sum(axis=1).argmax())
         if agree[most].sum() > consensus.sum():
             best, consensus = motions[most], agree[most]
-        if (1 - consensus.mean() ** 3) ** drawn < RANSAC_MISSED:
+        share = float(consensus.mean()) if len(consensus) else 0.0
+        if len(usable) < 3 or (share > GOOD_GUESS if not drawn else (1 - share**3) ** drawn < RANSAC_MISSED):
             break
     return best, consensus
 
