@@ -26,10 +26,9 @@ from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.codec import Cloud, Diagnostics, Map, Pose, PoseAttachment, Scan
 from omnid.transport.driver import CONNECT_S, Driver, RobotTime
-from omnid.transport.requests import Answer
 from omnid.transport.session import ALIVE, HERE, QUERY_S, Unreachable, open_client, robots_there
 from omnid.transport.status_names import NavigationReport
-from omnid.transport.topics import PUBLISHED
+from omnid.transport.topics import PUBLISHED, Answer
 
 __all__ = [
     "CONNECT_S",

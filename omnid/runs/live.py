@@ -65,7 +65,6 @@ from omnid.stages.obstacles import ADVICE
 from omnid.transport.bus import Bus
 from omnid.transport.codec import DiagnosticStatus, compile_serialisers
 from omnid.transport.commands import CommandReceiver, Freshness, NavigationReceiver, RequestQueue, SensorReceiver
-from omnid.transport.requests import Answer, Request
 from omnid.transport.status_names import DISARMED_BY_STOP, with_remedy
 from omnid.transport.topics import (
     ARM,
@@ -78,6 +77,8 @@ from omnid.transport.topics import (
     SENSOR_TOPICS,
     TIME,
     WHEEL_ODOM,
+    Answer,
+    Request,
     command_topics,
 )
 

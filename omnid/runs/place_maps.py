@@ -23,9 +23,8 @@ from omnid.sinks.files import check_outputs
 from omnid.stages.geometry import Geometry
 from omnid.stages.places import Places
 from omnid.transport.codec import ERROR, OK, DiagnosticStatus, string_from_cdr
-from omnid.transport.requests import MOST_OPEN, Answer, Request
 from omnid.transport.status_names import MAP_FILE, Key
-from omnid.transport.topics import SAVE_MAP
+from omnid.transport.topics import MOST_OPEN, SAVE_MAP, Answer, Request
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -21,7 +21,7 @@ from omnid.errors import OmnidError
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import NavigationUpdate
 from omnid.stages.routes import refusal_of_name
-from omnid.transport.requests import MOST_OPEN
+from omnid.transport.topics import MOST_OPEN
 
 LONGEST_WAIT_S: Final = 5.0  # A robot that sets out later than this after the request surprises people.
 

@@ -24,7 +24,7 @@ from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate
 from omnid.navigation_state import NavigationState
 from omnid.stages.lockstep_drive import controller_pose
 from omnid.stages.obstacles import controller_ring
-from omnid.transport.requests import Answer
+from omnid.transport.topics import Answer
 
 NAVIGATION_SENDER: Final = "navigation"  # identity of the sender: no other program drives on its source meanwhile
 GRANTED: Final = {

@@ -23,10 +23,9 @@ from omnid.transport import ros2, status_names
 from omnid.transport.bus_config import BusConfig, checked
 from omnid.transport.codec import ERROR, OK, WARN, DiagnosticStatus
 from omnid.transport.intake import PERIOD_S, QUERY, CommandIntake, Intake, OpenRequests, RequestCallback
-from omnid.transport.requests import Request
 from omnid.transport.session import ALIVE, EndpointTaken, has_receiver, open_session, reason, router_in_place
 from omnid.transport.stop_datagram import StopListener
-from omnid.transport.topics import CLOCK, PUBLISHED, STOP, Topic, plain_key, ros_name
+from omnid.transport.topics import CLOCK, PUBLISHED, STOP, Request, Topic, plain_key, ros_name
 
 __all__ = ["Bus", "BusConfig"]
 

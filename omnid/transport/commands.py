@@ -65,9 +65,9 @@ from omnid.errors import OmnidError
 from omnid.plain_text import plain
 from omnid.transport import codec, topics
 from omnid.transport.codec import OK, DiagnosticStatus
-from omnid.transport.requests import MOST_OPEN, Answer, Request
 from omnid.transport.sensor_codec import sample_from_cdr
 from omnid.transport.status_names import REFUSED_PREFIX, REQUESTS
+from omnid.transport.topics import MOST_OPEN, Answer, Request
 
 LONGEST_PAYLOAD, LONGEST_PATH = 4096, 1 << 20  # bytes
 # Larger numbers are faults of the sender.

@@ -13,9 +13,22 @@ import zenoh
 from omnid.errors import OmnidError
 from omnid.transport import codec, ros2
 from omnid.transport.codec import PlanarGoal, goal_cdr, string_cdr
-from omnid.transport.requests import Answer, answer_of
 from omnid.transport.session import QUERY_S, has_receiver, robots_there
-from omnid.transport.topics import ARM, GOAL, HEADING, MAP, NAVIGATION, ROUTE, SAVE_MAP, STOP, TIME, TWIST, request_key
+from omnid.transport.topics import (
+    ARM,
+    GOAL,
+    HEADING,
+    MAP,
+    NAVIGATION,
+    ROUTE,
+    SAVE_MAP,
+    STOP,
+    TIME,
+    TWIST,
+    Answer,
+    answer_of,
+    request_key,
+)
 
 CONNECT_S: Final = 2.0  # A connection is complete within this time.
 ANSWER_S: Final = 10.0  # more than a disk takes for a map or a route

@@ -20,8 +20,7 @@ import zenoh
 
 from omnid.transport import ros2
 from omnid.transport.bus_config import BusConfig
-from omnid.transport.requests import MOST_OPEN, Answer, Request
-from omnid.transport.topics import ARM, PATH, REQUEST_TOPICS, STOP, request_key
+from omnid.transport.topics import ARM, MOST_OPEN, PATH, REQUEST_TOPICS, STOP, Answer, Request, request_key
 
 T = TypeVar("T")
 RequestCallback: TypeAlias = Callable[[Request], None]

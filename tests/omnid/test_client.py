@@ -30,7 +30,7 @@ from omnid.transport.codec import (
     decode_pose,
 )
 from omnid.transport.commands import Freshness
-from omnid.transport.requests import Request
+from omnid.transport.topics import Request
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, script
 from tests.waiting import wait_until
 

@@ -29,8 +29,8 @@ from omnid.stages.synchronise import Synchronise
 from omnid.transport import codec
 from omnid.transport.codec import ERROR, OK, WARN, DiagnosticStatus, diagnostics_cdr
 from omnid.transport.commands import CommandReceiver, Freshness
-from omnid.transport.requests import Request
 from omnid.transport.status_names import Key, short_name
+from omnid.transport.topics import Request
 from tests.omnid.small_pair import small_depth
 from tests.simulation import build
 

@@ -18,10 +18,9 @@ from omnid.monitor.navigation import stop
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import DiagnosticStatus, string_from_cdr
-from omnid.transport.requests import Answer, Request
 from omnid.transport.status_names import DISARMED_BY_STOP, NAVIGATION, WHEELS, Key
 from omnid.transport.topics import NAVIGATION as NAVIGATION_TOPIC
-from omnid.transport.topics import command_topics
+from omnid.transport.topics import Answer, Request, command_topics
 from tests.omnid.transport.bus_fixtures import free_endpoint, script
 from tests.waiting import wait_until
 

@@ -23,7 +23,7 @@ from omnid.messages import NavigationUpdate
 from omnid.navigation_state import NavigationState
 from omnid.runs import route_files
 from omnid.runs.route_files import RouteFiles
-from omnid.transport.requests import MOST_OPEN
+from omnid.transport.topics import MOST_OPEN
 from tests.omnid.stages.test_navigation import Robot
 
 TEACH, FINISH = RouteRequest(RouteAction.TEACH, "hall"), RouteRequest(RouteAction.FINISH)

@@ -21,7 +21,7 @@ from omnid.messages import NavigationUpdate, OdometryUpdate, RequestAnswer
 from omnid.navigation_state import NavigationState
 from omnid.sinks.drive import PlannerDrive, ReplayDrive, SimulatedWheels
 from omnid.tracking_state import TrackingState
-from omnid.transport.requests import Answer
+from omnid.transport.topics import Answer
 
 AHEAD = Setpoint(0.3, 0.0)
 START_NS, PERIOD_NS = 10**18, 10**8

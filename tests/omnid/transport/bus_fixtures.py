@@ -16,8 +16,7 @@ from calib import se3
 from omnid.client import Robot
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.requests import Request
-from omnid.transport.topics import command_topics
+from omnid.transport.topics import Request, command_topics
 from tests.ports import free_port
 
 DEADLINE_S = 30.0

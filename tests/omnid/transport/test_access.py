@@ -18,7 +18,7 @@ from omnid.errors import OmnidError
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import OK
-from omnid.transport.requests import Request
+from omnid.transport.topics import Request
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, script, session
 from tests.waiting import wait_until
 

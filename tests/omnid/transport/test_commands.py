@@ -47,9 +47,8 @@ from omnid.transport.commands import (
     NavigationReceiver,
     SensorReceiver,
 )
-from omnid.transport.requests import Answer, Request
 from omnid.transport.sensor_codec import gyro_cdr, wheel_cdr
-from omnid.transport.topics import IMU, JOINT_STATES, SENSOR_TOPICS, WHEEL_ODOM
+from omnid.transport.topics import IMU, JOINT_STATES, SENSOR_TOPICS, WHEEL_ODOM, Answer, Request
 from tests.set_clock import SetClock
 
 STALE_S = 0.5

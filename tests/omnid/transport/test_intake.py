@@ -18,9 +18,8 @@ from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import WARN
 from omnid.transport.intake import UNKNOWN, budget_of
-from omnid.transport.requests import Request
 from omnid.transport.stop_datagram import ASKED, STOPPED, StopListener, StopSender, addresses
-from omnid.transport.topics import REQUEST_TOPICS, command_topics, request_key
+from omnid.transport.topics import REQUEST_TOPICS, Request, command_topics, request_key
 from tests.omnid.transport.bus_fixtures import free_endpoint, robot, script
 from tests.waiting import wait_until
 

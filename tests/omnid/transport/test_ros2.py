@@ -18,8 +18,7 @@ from omnid.client import Pose, Robot
 from omnid.errors import OmnidError
 from omnid.transport import codec, ros2
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.requests import Request
-from omnid.transport.topics import PUBLISHED, command_topics, ros_name
+from omnid.transport.topics import PUBLISHED, Request, command_topics, ros_name
 from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, odometry, script, session
 from tests.waiting import wait_until
 

@@ -24,8 +24,7 @@ from omnid.monitor.teleop import FIRST_SHARE, limits_of
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import PoseAttachment
-from omnid.transport.requests import Answer, Request
-from omnid.transport.topics import command_topics
+from omnid.transport.topics import Answer, Request, command_topics
 from omnid.web import robot, snapshot
 from omnid.web.feed import RobotFeed
 from omnid.web.robot import RobotPage

@@ -15,9 +15,8 @@ from omnid.monitor.teleop import FIRST_SHARE
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import DiagnosticStatus, PlanarGoal, goal_from_cdr, string_from_cdr
-from omnid.transport.requests import Answer, Request
 from omnid.transport.status_names import NAVIGATION, WHEELS, Key
-from omnid.transport.topics import command_topics
+from omnid.transport.topics import Answer, Request, command_topics
 from tests.omnid.transport.bus_fixtures import free_endpoint
 from tests.omnid.web.servers import Shown, WebServer, served
 from tests.waiting import wait_until
