@@ -37,19 +37,9 @@ def abi(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> tupl
     return runpy.run_path(v4l2_ioctl.__file__), request.param
 
 
-def test_the_structures_have_the_kernels_sizes(abi: tuple[dict[str, Any], int]) -> None:
+def test_structures_and_requests_are_the_kernels(abi: tuple[dict[str, Any], int]) -> None:
     names, bits = abi
     assert {name: ctypes.sizeof(names[name]) for name in SIZES} == {name: sizes[bits] for name, sizes in SIZES.items()}
-
-
-def test_the_members_have_the_kernels_offsets(abi: tuple[dict[str, Any], int]) -> None:
-    names, bits = abi
     found = {(struct, member): getattr(names[struct], member).offset for struct, member in OFFSETS}
     assert found == {member: offsets[bits] for member, offsets in OFFSETS.items()}
-
-
-def test_the_requests_have_the_kernels_numbers(abi: tuple[dict[str, Any], int]) -> None:
-    names, bits = abi
-    assert {name: hex(names[name]) for name in REQUESTS} == {
-        name: hex(numbers[bits]) for name, numbers in REQUESTS.items()
-    }
+    assert {name: names[name] for name in REQUESTS} == {name: numbers[bits] for name, numbers in REQUESTS.items()}
