@@ -262,7 +262,7 @@ def steps_back(times: NDArray[np.int64]) -> NDArray[np.int64]:
         run = times[at:end]  # which ascends
         within = run[np.searchsorted(run, low) : np.searchsorted(run, high, "right")]
         is_step = bool(run[-1] < low - FAR_STEPS * period)
-        if within.size and run.size >= FEWEST_IN_ORDER:
+        if within.size > 1 or (within.size and run.size >= FEWEST_IN_ORDER):
             segment = times[starts[-1] : at]
             before = np.sort(segment[segment > within[0] - LONGEST_STEP * period])
             behind = np.searchsorted(before, within)
