@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 from drivers.logs.ros_messages import (
     IMAGE_TYPES,
     JointWheels,
-    MotionReading,
     RosImage,
     cdr_of_ros1,
     parse_image,
     parse_motion,
 )
+from drivers.motion import MotionSample
 
 # Bounds of what is kept in memory, whatever a file states.
 MAX_RECORD_BYTES: Final = 256 * 2**20  # of a message, of an image and of an unpacked chunk
@@ -102,8 +102,8 @@ class LoggedMessage:
         """Return the image of an image message; raise FrameDecodeError or RecordError where there is none."""
         return parse_image(self.kind, self.data(), aligned=self.aligned)
 
-    def motion(self, joints: JointWheels | None) -> MotionReading:
-        """Return the rates of a message of wheels or an IMU; raise FrameDecodeError or RecordError."""
+    def motion(self, joints: JointWheels | None) -> MotionSample | None:
+        """Return the sample of wheels or an IMU, None of other joints; raise FrameDecodeError or RecordError."""
         return parse_motion(self.kind, self.data(), aligned=self.aligned, joints=joints)
 
 

@@ -19,7 +19,7 @@ from drivers.frame import CAMERAS, SAMPLE_BITS, Camera, Frame, gray, is_deep
 from drivers.logs.image_times import MAX_HELD_BYTES, STEP_NS, ImageTimes, TimedImage, TimeSource
 from drivers.logs.log import LoggedMessage, RecordError
 from drivers.logs.open_log import open_log
-from drivers.logs.ros_messages import MotionReading, RosImage
+from drivers.logs.ros_messages import RosImage
 from drivers.logs.topics import MotionChoice, MotionTopics, choose_motion_topics, choose_topics
 from drivers.motion import MotionSample, WheelSample
 
@@ -144,14 +144,14 @@ class LogReader:
                 image = self._image(message)
                 if image is not None:
                     yield TimedImage(cameras[message.topic], image, log_ns)
-            elif (reading := self._reading(message)) is not None:
-                self._unstamped.append((log_ns, reading))
+            elif (sample := self._sample(message)) is not None:
+                self._unstamped.append((log_ns, sample))
 
     def _add_samples(self, waiting: _Waiting, until_ns: int | None) -> None:
         """Stamp the samples that were logged until then, None: all."""
         while self._unstamped and (until_ns is None or self._unstamped[0][0] <= until_ns):
-            log_ns, reading = self._unstamped.popleft()
-            sample = reading._replace(stamp_ns=self._times.sample_ns(reading.stamp_ns, log_ns)).sample(log_ns)
+            log_ns, sample = self._unstamped.popleft()
+            sample = replace(sample, stamp_ns=self._times.sample_ns(sample.stamp_ns, log_ns))
             self._widen("wheels" if isinstance(sample, WheelSample) else "gyro", sample.stamp_ns)
             waiting.add(sample.stamp_ns, 0, sample)
 
@@ -220,7 +220,7 @@ class LogReader:
         self._spans: dict[str, tuple[int, int]] = {}  # first and last stamp of images, each camera, wheels and gyro
         self._times = ImageTimes(self._time)
         # Samples with their times of logging; no stage waits for more.
-        self._unstamped: deque[tuple[int, MotionReading]] = deque(maxlen=MAX_WAITING_SAMPLES)
+        self._unstamped: deque[tuple[int, MotionSample]] = deque(maxlen=MAX_WAITING_SAMPLES)
 
     def _image(self, logged: LoggedMessage) -> RosImage | None:
         """Return an image, None of a broken one.
@@ -255,16 +255,16 @@ class LogReader:
                     "or 12 bits? State cameras.bits, or --bits"
                 )
 
-    def _reading(self, logged: LoggedMessage) -> MotionReading | None:
-        """Return the rates in a message of wheels or IMU, None of a broken one, and of joints without the wheels."""
+    def _sample(self, logged: LoggedMessage) -> MotionSample | None:
+        """Return the sample in a message of wheels or IMU, None of a broken one, and of joints without the wheels."""
         try:
-            reading = logged.motion(self._joints)
+            sample = logged.motion(self._joints)
         except (FrameDecodeError, RecordError) as error:
             self.counts["broken_motion"] += 1
             self._motion_fault = self._motion_fault or str(error)
             return None
-        self._other_joints += not reading.rates
-        return reading if reading.rates else None
+        self._other_joints += sample is None
+        return sample
 
     def _widen(self, what: str, stamp_ns: int) -> None:
         first_ns, last_ns = self._spans.get(what, (stamp_ns, stamp_ns))

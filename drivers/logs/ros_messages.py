@@ -115,44 +115,31 @@ class JointWheels(NamedTuple):
         return (left + right) / 2, (right - left) / self.track_m
 
 
-class MotionReading(NamedTuple):
-    """Rates in one message: forward velocity and yaw rate of wheels, or three angular velocities of an IMU."""
-
-    stamp_ns: int  # stamp of the header, 0 if unset
-    rates: tuple[float, ...]  # m/s and rad/s; empty: it is of other joints
-    frame: str = ""  # frame of the header
-
-    def sample(self, log_time_ns: int) -> MotionSample:
-        """Return the sample; log_time_ns: its stamp where the header has none."""
-        stamp_ns = self.stamp_ns or log_time_ns
-        if len(self.rates) == 2:
-            return WheelSample(stamp_ns, *self.rates)
-        x, y, z = self.rates
-        return GyroSample(stamp_ns, x, y, z, of_base=self.frame == BASE_FRAME)
-
-
 def parse_motion(
     kind: str, message: memoryview, *, aligned: bool = True, joints: JointWheels | None = None
-) -> MotionReading:
-    """Return the rates in a message of type ODOMETRY, IMU or JOINT_STATE; raise FrameDecodeError where it is invalid.
+) -> MotionSample | None:
+    """Return the sample in a message of type ODOMETRY, IMU or JOINT_STATE, None where it is of other joints.
 
-    aligned: True for CDR (ROS 2), False for the serialisation of ROS 1. joints: the wheels in a JOINT_STATE.
+    Its stamp is that of the header, 0 if unset. Raise FrameDecodeError where the message is invalid. aligned: True for
+    CDR (ROS 2), False for the serialisation of ROS 1. joints: the wheels in a JOINT_STATE.
     """
     found = _decoded(kind, message, aligned)
-    stamp_ns, frame = _stamp_ns(found.header.stamp.sec, found.header.stamp.nanosec), found.header.frame_id
+    stamp_ns = _stamp_ns(found.header.stamp.sec, found.header.stamp.nanosec)
     if kind == JOINT_STATE:
         velocities = dict.fromkeys(found.name, math.nan) | dict(zip(found.name, found.velocity.tolist(), strict=False))
-        return MotionReading(stamp_ns, joints.rates(velocities) if joints is not None else (), frame)
+        rates = joints.rates(velocities) if joints is not None else ()
+        return WheelSample(stamp_ns, *rates) if rates else None
     if kind == ODOMETRY:
-        rates: tuple[float, ...] = found.twist.twist.linear.x, found.twist.twist.angular.z
-    else:
-        rates = found.angular_velocity.x, found.angular_velocity.y, found.angular_velocity.z
-        if found.angular_velocity_covariance[0] == NOT_MEASURED:
-            raise FrameDecodeError(f"a {IMU} has no angular velocity: its covariance begins with -1")
-    must_be_known = rates[:1] if kind == ODOMETRY else rates  # wheels may not report their turn
-    if not all(map(math.isfinite, must_be_known)) or any(map(math.isinf, rates)):
+        velocity_mps, yaw_rate_radps = found.twist.twist.linear.x, found.twist.twist.angular.z
+        if not math.isfinite(velocity_mps) or math.isinf(yaw_rate_radps):  # wheels may not report their turn
+            raise FrameDecodeError(f"a {kind} has rates that are not finite")
+        return WheelSample(stamp_ns, velocity_mps, yaw_rate_radps)
+    if found.angular_velocity_covariance[0] == NOT_MEASURED:
+        raise FrameDecodeError(f"a {IMU} has no angular velocity: its covariance begins with -1")
+    x, y, z = found.angular_velocity.x, found.angular_velocity.y, found.angular_velocity.z
+    if not all(map(math.isfinite, (x, y, z))):
         raise FrameDecodeError(f"a {kind} has rates that are not finite")
-    return MotionReading(stamp_ns, rates, frame)
+    return GyroSample(stamp_ns, x, y, z, of_base=found.header.frame_id == BASE_FRAME)
 
 
 def cdr_of_ros1(kind: str, message: memoryview) -> bytes:

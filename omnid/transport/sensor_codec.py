@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import astuple, replace
 from typing import Final
 
 import numpy as np
@@ -53,16 +54,16 @@ def sample_from_cdr(
     Rates that are absurd or not finite are refused.
     """
     try:
-        reading = parse_motion(schema, memoryview(payload), joints=joints)
+        sample = parse_motion(schema, memoryview(payload), joints=joints)
     except FrameDecodeError as error:
         raise OmnidError(str(error)) from error
-    if not reading.rates:
+    if sample is None:
         return None
-    if not reading.stamp_ns:
+    if not sample.stamp_ns:
         raise OmnidError(f"a {schema} has no stamp; fill in header.stamp")
-    if any(abs(rate) > LARGEST_RATE for rate in reading.rates if math.isfinite(rate)):
+    if any(abs(rate) > LARGEST_RATE for rate in astuple(sample)[1:] if math.isfinite(rate)):
         raise OmnidError(f"a {schema} has rates above {LARGEST_RATE:.0f} m/s or rad/s: check its units")
-    return reading._replace(stamp_ns=stamp_ns(reading.stamp_ns)).sample(0)
+    return replace(sample, stamp_ns=stamp_ns(sample.stamp_ns))
 
 
 COMPRESSED: Final = ("jpeg", "png")

@@ -203,10 +203,10 @@ def test_messages_of_ros_1_and_2_are_read(aligned: bool) -> None:
     )
     imu = t[IMU](header, quaternion, np.ones(9), vector(0.1, -0.2, 0.3), np.ones(9), vector(9.0, 9.0, 9.0), np.ones(9))
     serialize = store.serialize_cdr if aligned else store.serialize_ros1
-    for message, kind, rates in ((odometry, ODOMETRY, (0.5, -0.25)), (imu, IMU, (0.1, -0.2, 0.3))):
+    samples = WheelSample(5_000_000_007, 0.5, -0.25), GyroSample(5_000_000_007, 0.1, -0.2, 0.3)
+    for message, kind, sample in zip((odometry, imu), (ODOMETRY, IMU), samples, strict=True):
         data = memoryview(bytes(serialize(message, kind)))
-        reading = parse_motion(kind, data, aligned=aligned)
-        assert reading.rates == rates and reading.stamp_ns == 5_000_000_007
+        assert parse_motion(kind, data, aligned=aligned) == sample
         for size in range(0, len(data) - 8 * 36, 7):
             with pytest.raises(FrameDecodeError):
                 parse_motion(kind, data[:size], aligned=aligned)

@@ -16,11 +16,10 @@ from drivers.logs.ros_messages import (
     JOINT_STATE,
     ODOMETRY,
     JointWheels,
-    MotionReading,
     parse_image,
     parse_motion,
 )
-from drivers.motion import GyroSample, WheelSample
+from drivers.motion import GyroSample, MotionSample, WheelSample
 from tests.drivers.logs.mcap_logs import COMPRESSED, IMAGE, LOWER, STORE, TYPES, header, image, image_message
 
 VECTOR, QUATERNION, ZEROS = TYPES["geometry_msgs/msg/Vector3"], TYPES["geometry_msgs/msg/Quaternion"], np.zeros(36)
@@ -56,18 +55,20 @@ def serialised(message: Any, kind: str) -> bytes:
     return bytes(STORE.serialize_cdr(message, kind))
 
 
-def read(kind: str, data: bytes) -> MotionReading:
+def read(kind: str, data: bytes) -> MotionSample | None:
     return parse_motion(kind, memoryview(data), joints=WHEELS)
 
 
 def test_the_rates_are_those_of_the_base() -> None:
-    assert read(ODOMETRY, odometry(0.3, -0.2)).sample(7) == WheelSample(5, 0.3, -0.2)
-    assert read(IMU, imu((0.1, 0.2, 0.3))).sample(7) == GyroSample(5, 0.1, 0.2, 0.3)
-    assert read(IMU, imu((0.1, 0.2, 0.3), "base_link")).sample(7) == GyroSample(5, 0.1, 0.2, 0.3, of_base=True)
-    assert read(JOINT_STATE, joints(["arm", "left", "right"], [9.0, 2.0, 4.0])).rates == pytest.approx((0.3, 0.5))
-    assert read(JOINT_STATE, joints(["arm"], [9.0])).rates == ()
-    assert MotionReading(0, (0.3, 0.1)).sample(7).stamp_ns == 7, "the log time stands for a missing stamp"
-    assert math.isnan(read(ODOMETRY, odometry(0.3, math.nan)).rates[1]), "wheels may not report their turn"
+    assert read(ODOMETRY, odometry(0.3, -0.2)) == WheelSample(5, 0.3, -0.2)
+    assert read(IMU, imu((0.1, 0.2, 0.3))) == GyroSample(5, 0.1, 0.2, 0.3)
+    assert read(IMU, imu((0.1, 0.2, 0.3), "base_link")) == GyroSample(5, 0.1, 0.2, 0.3, of_base=True)
+    assert read(JOINT_STATE, joints(["arm", "left", "right"], [9.0, 2.0, 4.0])) == WheelSample(
+        5, pytest.approx(0.3), 0.5
+    )
+    assert read(JOINT_STATE, joints(["arm"], [9.0])) is None
+    without_turn = read(ODOMETRY, odometry(0.3, math.nan))
+    assert isinstance(without_turn, WheelSample) and math.isnan(without_turn.yaw_rate_radps)
 
 
 @pytest.mark.parametrize(

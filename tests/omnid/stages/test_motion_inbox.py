@@ -44,5 +44,7 @@ def test_the_axes_of_a_recorded_gyro_are_not_turned_again() -> None:
     (sample,) = live.take(10)
     assert isinstance(sample, GyroSample) and (sample.x_radps, sample.y_radps, sample.z_radps) == (0.1, -0.2, -0.5)
     again = MotionInbox(UPSIDE_DOWN)
-    again.add(parse_motion(IMU_SCHEMA, memoryview(gyro_cdr(sample, 5))).sample(5))
+    recorded = parse_motion(IMU_SCHEMA, memoryview(gyro_cdr(sample, 5)))
+    assert recorded is not None
+    again.add(recorded)
     assert again.take(10) == (sample,)
