@@ -136,7 +136,7 @@ class ScanGrid:
 
         It is not where the views that something narrow ends are two more than those that pass it near by.
         """
-        odds = np.maximum(self._odds, self._floor_odds)
+        odds = self._floor_odds.copy()
         odds[(self._narrow_odds > MISS) & (odds < 0)] = 0
         # A cell next to an occupied one is never free, as an obstacle is known to a cell only.
         cells = np.full(self._odds.shape, UNKNOWN, np.int8)
