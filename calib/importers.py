@@ -105,7 +105,7 @@ def parse_chain(
 def _chain_rig(cameras: Mapping[str, ChainCamera], named: tuple[str, str], frame: str, warn: Warn) -> Rig:
     # 1. The poses of the cameras, and which of them is lower.
     poses, has_rig_frame = _chain_poses(cameras, warn)
-    low, up = _lower_and_upper(cameras, named, poses if has_rig_frame else {}, warn)
+    low, up = _lower_and_upper(cameras, named, poses, warn, has_rig_frame=has_rig_frame)
     if not {low, up} <= poses.keys():
         raise CalibError(f"no transform between {low} and {up}; expected T_cam_imu of both, or T_cn_cnm1")
     # 2. Their models. Nothing in the file tells lenses from mirrors whose images were flipped.
@@ -252,11 +252,15 @@ def _require_consistency(camera: str, one: Array, other: Array, keys: tuple[str,
 
 
 def _lower_and_upper(
-    cameras: Mapping[str, ChainCamera], named: tuple[str, str], poses: Mapping[str, Array], warn: Warn
+    cameras: Mapping[str, ChainCamera],
+    named: tuple[str, str],
+    poses: Mapping[str, Array],
+    warn: Warn,
+    *,
+    has_rig_frame: bool,
 ) -> tuple[str, str]:
-    """Return the names of the lower and the upper camera: as named, else by topic, else by height in the rig frame.
-
-    poses (4, 4): T_cam_rig of the cameras; empty where the frame is not the rig's.
+    """Return the names of the lower and the upper camera: as named, else by topic, else by height in the rig frame, or
+    by what is below in their images.
     """
     names = list(cameras)
     for name in filter(None, named):
@@ -275,14 +279,28 @@ def _lower_and_upper(
     first, second = (bool(found & LOWER_WORDS) - bool(found & UPPER_WORDS) for found in words)
     if first != second:
         return (names[0], names[1]) if first > second else (names[1], names[0])
-    # 2. By height.
-    heights = [float(se3.inverse(poses[name])[2, 3]) for name in names if name in poses]
-    if len(heights) < 2 or abs(heights[0] - heights[1]) < MAX_DISAGREEMENT_M:
+    # 2. By height, or by the order in which the upper camera is not below the lower one in the images.
+    orders = [(names[0], names[1]), (names[1], names[0])] if len(poses) == 2 else []
+    if has_rig_frame:
+        heights = {name: float(se3.inverse(T)[2, 3]) for name, T in poses.items()}
+        orders = [(low, up) for low, up in orders if heights[up] - heights[low] >= MAX_DISAGREEMENT_M]
+    else:
+        models = {name: _chain_model(name, cameras[name], silent) for name in names}
+        T_between = {order: poses[order[0]] @ se3.inverse(poses[order[1]]) for order in orders}
+        orders = [
+            (low, up)
+            for (low, up), T in T_between.items()
+            if not is_turned_over(rig_between(models[low], models[up], T))
+        ]
+    if len(orders) != 1:
         raise CalibError(
             f"neither topics nor heights identify the lower camera; name it, --lower {names[0]} or --lower {names[1]}"
         )
-    low, up = (names[0], names[1]) if heights[0] < heights[1] else (names[1], names[0])
-    warn(f"lower is {low} by z of the IMU, which must point up; if it does not, give --lower {up}")
+    ((low, up),) = orders
+    if has_rig_frame:
+        warn(f"lower is {low} by z of the IMU, which must point up; if it does not, give --lower {up}")
+    else:
+        warn(f"lower is {low} by what is below in the images; if the cameras stand upside down, give --lower {up}")
     return low, up
 
 

@@ -12,8 +12,9 @@ from calib.boards.corner_candidates import Grey, sample
 from calib.boards.corner_grid import Grid
 from calib.models.camera import Array
 
-# Least share of known corners of the board.
-MIN_FILLED = 0.8
+# Least share of known corners in the whole board, and in each of its four borders: a row that is missing belongs to a
+# board of another size.
+MIN_FILLED, MIN_BORDER = 0.8, 0.6
 # A row just outside with at least this share of corners belongs to a larger board.
 BEYOND = 0.7
 
@@ -55,7 +56,9 @@ def _are_isolated(around: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the mask (J, I) of windows with their surroundings (J, I, rows + 2, columns + 2) that show a board."""
     inside = around[..., 1:-1, 1:-1]
     beyond = [around[..., 0, 1:-1], around[..., -1, 1:-1], around[..., 1:-1, 0], around[..., 1:-1, -1]]
+    borders = [inside[..., 0, :], inside[..., -1, :], inside[..., 0], inside[..., -1]]
     filled = inside.mean(axis=(-2, -1)) >= MIN_FILLED
+    filled &= np.min([border.mean(axis=-1) for border in borders], axis=0) >= MIN_BORDER
     return np.asarray(filled & (np.max([row.mean(axis=-1) for row in beyond], axis=0) < BEYOND))
 
 

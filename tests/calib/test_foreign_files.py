@@ -109,15 +109,15 @@ def test_names_an_inverted_transform() -> None:
     assert read.upper.viewpoint == pytest.approx([0, 0, 0.2012], abs=1e-4) and "is the inverse" in lines[-1]
 
 
-def test_x_of_a_rig_whose_cameras_look_ahead_is_ahead() -> None:
+@pytest.mark.parametrize(("T", "lower"), [(T_AHEAD, "cam0"), (se3.inverse(T_AHEAD), "cam1")])
+def test_images_tell_the_lower_of_two_cameras_that_look_ahead(T: Array, lower: str) -> None:
     camera = (
         "\n  camera_model: pinhole\n  intrinsics: [225.0, 228.0, 380.0, 390.0]\n  distortion_model: radtan\n"
         "  distortion_coeffs: [-0.1, 0.01, 0.001, 0.0002]\n  resolution: [768, 770]\n"
     )
-    text = f"cam0:{camera}cam1:{camera}  T_cn_cnm1: {T_AHEAD.tolist()}\n"
-    with pytest.raises(CalibError, match="neither topics nor heights identify the lower camera; name it"):
-        parse_chain(text)
-    rig = parse_chain(text, lower="cam0")
+    lines = list[str]()
+    rig = parse_chain(f"cam0:{camera}cam1:{camera}  T_cn_cnm1: {T.tolist()}\n", warn=lines.append)
+    assert len(lines) == 1 and f"lower is {lower} by what is below in the images" in lines[0]
     assert rig.lower.T_cam_rig[2, 0] > 0.99, "x of the rig is ahead, along the optical axes"
     assert rig.lower.T_cam_rig[0, 1] < -0.99, "y is to the left"
 
