@@ -16,8 +16,6 @@ Flags = NDArray[np.bool_]
 # Side, at scale 1, of the cells among which the corners are shared out evenly: in a panorama of 1300 x 380 px there are
 # about 200 cells, so that each has two or three of the 500 landmarks wanted.
 CELL_PX = 48
-# More cells than a row of any panorama has, so that one index encodes row and column.
-MAX_CELLS = 4096
 BLOCK_PX = 5  # window over which the gradients of a corner are summed.
 # Side of the square in which a corner is the maximum: that of LANDMARK_SPACING_PX, because nearer corners would be two
 # landmarks of one piece of texture. At all scales, because patches have as many pixels at each.
@@ -46,7 +44,7 @@ def corners(lower: PaddedPanorama, usable: Flags, most: int) -> Array:
     strongest = np.lexsort((columns, rows, -response[rows, columns + lower.pad_px]))
     rows, columns = rows[strongest], columns[strongest]
     cell_px = at_scale(CELL_PX, lower.scale)
-    rank = _rank_within((rows // cell_px) * MAX_CELLS + columns // cell_px)
+    rank = _rank_within((rows // cell_px) * lower.width + columns // cell_px)
     chosen = np.argsort(rank, kind="stable")[: max(0, most)]
     return np.column_stack([columns[chosen], rows[chosen]]).astype(float)
 

@@ -30,6 +30,8 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.plane_patches import align, plane_templates
+from omnid.core.odometry.pose_search import CORRELATED_LANDMARKS
+from omnid.core.odometry.runner_up_motions import RUNNER_UP_COST
 from omnid.core.odometry.tracking import KltSettings, track
 from omnid.core.stereo.triangulation import view, view_jacobian
 from omnid.core.types.panorama import PaddedPanorama
@@ -50,11 +52,9 @@ GOOD_SHARE: Final = 0.2  # of the flows, that no break displaces: of one camera,
 LINES, BETWEEN = 24, 4  # lines that are tried, and those between two of them, of a break that was found
 STEADY_PX: Final = 64  # spread of lines that are one line in the words about them
 LEAST: Final = 8  # flows on either side of a line in the cameras of a break
-CORRELATED: Final = 4.0  # flows that count as one, as landmarks' errors do in the covariance of a pose
 # Cost of a landmark (`PoseEstimate.cost`) whose view has the noise that is expected: the mean of the Cauchy kernel's.
 RIGHT_COST: Final = 0.31
 FOLLOWED: Final = 0.2  # part of a new pair in the mean of the costs
-SURE: Final = math.log(1e6)  # least logarithm of the ratio of likelihoods: a false one in some days of driving
 FAR: Final = KltSettings(levels=2)  # 28 px
 EDGE_PX: Final = 8  # of the panorama, in which patches are cut
 LEAST_PX: Final = 0.5  # by which what is beyond a line is displaced: less harms no pose
@@ -186,7 +186,7 @@ class ImageBreaks:
         """
         last, found = self._last, None
         step = np.zeros(6) if last is None else se3.log(se3.inverse(last.T_odom_rect) @ T_odom_rect)
-        is_usual = cost is not None and cost[1] * (cost[0] - self._usual_cost) < SURE and not self._open
+        is_usual = cost is not None and cost[1] * (cost[0] - self._usual_cost) < RUNNER_UP_COST and not self._open
         if last is not None and dt_s > 0 and not is_usual:
             flow = self._flow(last, pair, T_odom_rect, step, LAG_S / dt_s)
             found = None if flow is None else likeliest_break(flow, self.raws, self.model.cylinder.focal_px)
@@ -323,7 +323,7 @@ def likeliest_break(flow: _Flow, raws: tuple[RawImage, RawImage], focal_px: floa
     # So many sums of two squares of unit variance are below -2 log(1 - GOOD_SHARE).
     scale = float(np.clip(np.quantile(squared, GOOD_SHARE) / (-2 * math.log(1 - GOOD_SHARE)), 1.0, MOST_SCALE))
     outlier = OUTLIER_SQUARED * scale
-    if np.minimum(squared, outlier).sum() / (2 * scale * CORRELATED) < SURE + _cost(2, len(y)):
+    if np.minimum(squared, outlier).sum() / (2 * scale * CORRELATED_LANDMARKS) < RUNNER_UP_COST + _cost(2, len(y)):
         return None  # no break explains more than all that is left
     # 2. Of its outliers, those that one other motion explains belong to a part; others, as people, to none.
     used = squared < outlier
@@ -341,7 +341,7 @@ def likeliest_break(flow: _Flow, raws: tuple[RawImage, RawImage], focal_px: floa
     # 3. The likeliest line of each form, by least squares; the robust likelihood of each, also at the lines next to it.
     found: tuple[float, _Candidate, Array, Array] | None = None
     for form in FORMS:
-        likely = [each for each in _candidates(form, flow, used, left, scale) if each.gain >= SURE]
+        likely = [each for each in _candidates(form, flow, used, left, scale) if each.gain > RUNNER_UP_COST]
         # One image displaced is the other one displaced the other way, and a step: it is that in which the step is not.
         likely = [each for each in likely if each.line or form.has_line or each.cameras != (1 - most_off,)]
         first = max(likely, key=lambda each: each.gain, default=None)
@@ -352,10 +352,10 @@ def likeliest_break(flow: _Flow, raws: tuple[RawImage, RawImage], focal_px: floa
             solution = _robust(tried, y, _least_squares(tried, y, used.astype(float)))
             rest_squared = ((y - tried @ solution) ** 2).sum(axis=1)
             gained = float((np.minimum(squared, outlier) - np.minimum(rest_squared, outlier)).sum())
-            gain = gained / (2 * scale * CORRELATED) - _cost(tried.shape[2] - null.shape[2], int(used.sum()))
+            gain = gained / (2 * scale * CORRELATED_LANDMARKS) - _cost(tried.shape[2] - null.shape[2], int(used.sum()))
             if found is None or gain > found[0]:
                 found = gain, candidate, solution[null.shape[2] :], tried[:, :, null.shape[2] :]
-    return None if found is None or found[0] < SURE else _break(flow, raws, focal_px, *found[1:])
+    return None if found is None or found[0] < RUNNER_UP_COST else _break(flow, raws, focal_px, *found[1:])
 
 
 def _break(
@@ -441,7 +441,7 @@ def _candidates(form: _Form, flow: _Flow, used: Flags, left: Array, scale: float
                 good &= _is_a_step(most)
             if form.kind == "displaced" and form.has_line:  # lines that are twice or missing are whole ones
                 good &= most > LEAST_PX
-            gain = (b * amount).sum(axis=(1, 2)) / (2 * scale * CORRELATED) - _cost(size, int(used.sum()))
+            gain = (b * amount).sum(axis=(1, 2)) / (2 * scale * CORRELATED_LANDMARKS) - _cost(size, int(used.sum()))
             line = int(np.where(good, gain, -np.inf).argmax())
             if good[line]:
                 yield _Candidate(float(gain[line]), form, cameras, float(lines[line]), is_before)

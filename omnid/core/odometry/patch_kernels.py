@@ -122,7 +122,7 @@ def cubic(cell: Floats, x: np.float32, y: np.float32) -> float:
     for row, weight in enumerate(keys(v)):
         line = cell[top + row - 1, left - 1 :]
         grey += weight * (a * line[0] + b * line[1] + c * line[2] + d * line[3])
-    return grey
+    return float(grey)
 
 
 @inner

@@ -18,7 +18,6 @@ Array = NDArray[np.float64]
 
 
 CONVERGED_PX = 0.01  # OpenCV's default: an iteration that moves the window less is the last one
-MIN_EIGENVALUE = 1e-4  # Of the window's gradients; OpenCV's default: below it the window has no texture.
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +66,6 @@ def flow(
         maxLevel=klt.levels,
         criteria=criteria,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        minEigThreshold=MIN_EIGENVALUE,
     )
     moved = there.reshape(-1, 2).astype(float)
     inside = (moved[:, 1] >= 0) & (moved[:, 1] <= b.image.shape[0] - 1)
