@@ -27,6 +27,7 @@ from calib import se3
 from omnid.core.odometry.estimates import SAME_M, GapStep, PoseEstimate
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.motion_filter import JERK_PSD, START_ACCELERATION_VARIANCE
+from omnid.core.odometry.wrong_periods import normalised_patches
 from omnid.core.stereo.triangulation import view
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.stereo_model import StereoModel
@@ -207,13 +208,15 @@ def displacements(
         return []
     steps = math.ceil(reach_m / step_m)
     offsets: Array = np.arange(-steps, steps + 1, dtype=float) * step_m
-    patches, textured = _normalised(_sampled(_blurred(before), before, table.pixels[rows]))
+    patches, contrast = normalised_patches(before, table.pixels[rows], SAMPLES, SAMPLE_PX, _blurred(before))
+    textured = contrast > MIN_PATCH_GREY
     if not textured.any():
         return []
     blurred, scores = _blurred(current), np.empty((len(offsets), len(offsets)))
     for a, x in enumerate(offsets):
         moved = np.concatenate([points - (x, y, 0.0) for y in offsets])
-        seen, _ = _normalised(_sampled(blurred, current, view(moved, model.cylinder, model.baseline_m)[:, :2]))
+        pixels = view(moved, model.cylinder, model.baseline_m)[:, :2]
+        seen, _ = normalised_patches(current, pixels, SAMPLES, SAMPLE_PX, blurred)
         each = np.einsum("gns,ns->gn", seen.reshape(len(offsets), *patches.shape), patches)
         scores[a] = each[:, textured].mean(axis=1)
     return [peak.displacement for peak in _peaks(scores, offsets) if peak.score > PEAK_SHARE * scores[steps, steps]]
@@ -229,22 +232,6 @@ def _peaks(scores: Array, offsets: Array) -> list[Peak]:
 
 def _blurred(panorama: PaddedPanorama) -> NDArray[np.float32]:
     return np.asarray(cv2.GaussianBlur(panorama.image.astype(np.float32), (0, 0), BLUR_PX), np.float32)
-
-
-def _sampled(image: NDArray[np.float32], panorama: PaddedPanorama, pixels: Array) -> Array:
-    """Return patches (N, S) of a blurred padded image about pixels (N, 2)."""
-    side = (np.arange(SAMPLES) - SAMPLES // 2) * SAMPLE_PX
-    columns = np.rint(panorama.padded(pixels[:, 0])).astype(np.intp)[:, None] + np.tile(side, SAMPLES)
-    rows = np.rint(pixels[:, 1]).astype(np.intp)[:, None] + np.repeat(side, SAMPLES)
-    return np.asarray(image[rows.clip(0, image.shape[0] - 1), columns.clip(0, image.shape[1] - 1)], float)
-
-
-def _normalised(patches: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return patches (N, S) of zero mean and unit length, and flags (N,) of those with texture."""
-    patches = patches - patches.mean(axis=1, keepdims=True)
-    length = np.sqrt((patches**2).sum(axis=1))
-    textured = length > MIN_PATCH_GREY * SAMPLES
-    return patches / np.maximum(length, 1e-9)[:, None], textured
 
 
 # Sigma of the velocity while poses are refused [m/s, rad/s], because indoor vehicles are seldom faster than twice that.

@@ -16,6 +16,7 @@ from omnid.core.types.panorama import PaddedPanorama
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+Floats = NDArray[np.float32]
 
 NEIGHBOURS = 5  # known landmarks whose median disparity counts, because two of them may be of another surface
 # Two disparities whose ratio is larger are of two surfaces, because the slope of one surface changes them by 0.15
@@ -93,13 +94,24 @@ def _disparity_around(lower: PaddedPanorama, pixels: Array, known: Array) -> Arr
     return np.asarray(np.median((known[:, 2] - known[:, 1])[nearest], axis=1))
 
 
-def _patches(panorama: PaddedPanorama, columns: Array, rows: Array) -> NDArray[np.float32]:
-    """Return patches (N, SIDE_PX^2) about pixels with columns and rows (N,), of zero mean and unit length."""
-    side = np.arange(SIDE_PX) - SIDE_PX // 2
-    image = panorama.image
-    across = np.rint(panorama.padded(columns)).astype(np.intp)[:, None] + side
-    down = np.rint(rows).astype(np.intp)[:, None] + side
-    at = down.clip(0, len(image) - 1)[:, :, None], across.clip(0, image.shape[1] - 1)[:, None, :]
-    patches = image[at].reshape(len(rows), SIDE_PX**2).astype(np.float32)
+def normalised_patches(
+    panorama: PaddedPanorama, pixels: Array, side: int, step_px: int = 1, image: Floats | None = None
+) -> tuple[Floats, Floats]:
+    """Return patches (N, side^2) of zero mean and unit length about pixels (N, 2), and their standard deviations (N,).
+
+    step_px: between two of their samples. image: a padded one that is sampled in place of the panorama's.
+    """
+    source = panorama.image if image is None else image
+    offsets = (np.arange(side) - side // 2) * step_px
+    across = np.rint(panorama.padded(pixels[:, 0])).astype(np.intp)[:, None] + offsets
+    down = np.rint(pixels[:, 1]).astype(np.intp)[:, None] + offsets
+    at = down.clip(0, source.shape[0] - 1)[:, :, None], across.clip(0, source.shape[1] - 1)[:, None, :]
+    patches = source[at].reshape(len(pixels), side**2).astype(np.float32)
     patches -= patches.mean(axis=1, keepdims=True)
-    return np.asarray(patches / np.maximum(np.linalg.norm(patches, axis=1), 1e-9)[:, None], np.float32)
+    length = np.linalg.norm(patches, axis=1)
+    return np.asarray(patches / np.maximum(length, 1e-9)[:, None], np.float32), np.asarray(length / side, np.float32)
+
+
+def _patches(panorama: PaddedPanorama, columns: Array, rows: Array) -> Floats:
+    """Return the patches (N, SIDE_PX^2) about pixels with columns and rows (N,)."""
+    return normalised_patches(panorama, np.column_stack([columns, rows]), SIDE_PX)[0]
