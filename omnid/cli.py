@@ -69,7 +69,7 @@ COMMANDS: Final[Mapping[str, Entry]] = MappingProxyType(
         "map show": Entry("map:show", "keyframes, sessions, loops, size, and the rig that made the map; plan and grid"),
         "map export": Entry("map:export", "write a map for other programs"),
         "map save": Entry("map:save", "ask a robot to save its map now, before it is switched off"),
-        "doctor": Entry("machine:doctor", "check cameras, motor, rig, clock, rights, bus and disk"),
+        "doctor": Entry("machine:doctor", "check cameras, motor, rig, rights, bus and disk"),
         "motor test": Entry("machine:test_motor", "turn each wheel, ask what moved, print the settings for that"),
         "config": Entry("tools:print_config", "print or check settings"),
         "install-service": Entry("machine:install_service", "install omnid as a systemd service"),
