@@ -58,7 +58,7 @@ def test_a_base_stops_within_a_second_where_half_of_the_images_freezes_ahead() -
     assert speeds[-20:].max() < 1e-4
     # Landmarks in the dead half would say that the base stands.
     np.testing.assert_allclose(run.T_odom_base[-1, :2, 3], run.truth_in_odom[-1, :2, 3], atol=0.03)
-    assert set(run.states[5:]) == {"tracking"}
+    assert set(run.states[5:]) <= {"tracking", "degraded"}
 
 
 @pytest.mark.hazard("H22")
