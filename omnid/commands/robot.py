@@ -100,6 +100,8 @@ def goto(args: argparse.Namespace) -> int:
         raise OmnidError(f"goto: --{args.verb} takes no pose: leave one of them out")
     if not args.verb and len(args.pose) not in (2, 3):
         raise OmnidError(f"goto: expected X Y [YAW], numbers found: {len(args.pose)}")
+    if not all(map(math.isfinite, args.pose)):
+        raise OmnidError(f"goto: expected finite numbers, found {' '.join(map(str, args.pose))}")
     with _connected(args) as robot:
         driver = robot.driver()
         if not args.verb:

@@ -22,7 +22,7 @@ from tests.simulation import build, corridor, paths, write_log
 from tests.simulation.rigs import lens, lens_rig
 
 SIZE, PAIRS, SEEN_DEG = 256, 16, 115.0
-FOOTPRINT_M = 0.25  # of the robot, on which nothing else can be
+FOOTPRINT_M = 0.3  # of the robot, on which nothing else can be: 7 cells of 5 cm square, to the next cell
 
 
 def test_a_rig_of_lenses_gives_poses(tmp_path: Path) -> None:

@@ -65,7 +65,6 @@ TABLE = (
     ("replay {log} --map {folder}/x.ply", "--cloud FILE.ply"),
     ("replay {log} --rig {rig} --motor {folder}/tty", "motor port"),
     ("replay", "the following arguments are required"),
-    ("", "command"),
     ("fly", "unknown command 'fly'"),
     ("--what", "see omnid --help"),
     ("eval {rig}", "the following arguments are required"),

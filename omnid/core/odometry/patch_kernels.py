@@ -77,10 +77,11 @@ def sample(
                 to_columns[j] = -focal_px * arc
                 to_rows[j] = focal_px * (heights[n, 0] - (rays[2, j] + z) * per_ahead / math.sqrt(1 + square))
         is_bent = True
-        for i in (0, side - 1):
-            for j in (0, side - 1):
-                ahead = rays[0, j] + H[n, 0, 2] * (heights[n, 1] - (i - half + shift[n, 1]) / focal_px)
-                is_bent &= (ahead > 0) & (abs(columns[i, j]) < 2 * side) & (abs(rows[i, j]) < 2 * side)  # false for NaN
+        for i in range(side):
+            ahead = H[n, 0, 2] * (heights[n, 1] - (i - half + shift[n, 1]) / focal_px)
+            is_bent &= (rays[0, 0] + ahead > 0) & (rays[0, -1] + ahead > 0)
+            for j in range(side):
+                is_bent &= (abs(columns[i, j]) < 2 * side) & (abs(rows[i, j]) < 2 * side)  # false for NaN
         if not is_bent:
             for i in range(side):
                 for j in range(side):
@@ -90,9 +91,9 @@ def sample(
         if not (is_near and abs(shift[n, 0]) <= 1 and abs(shift[n, 1]) <= 1):
             templates[n] = 0.0
             continue
-        low, high = corner_bounds(columns)
+        low, high = bounds(columns)
         left, right = math.floor(centres[n, 0] + low) - 2, math.floor(centres[n, 0] + high) + 4
-        low, high = corner_bounds(rows)
+        low, high = bounds(rows)
         top, bottom = math.floor(centres[n, 1] + low) - 2, math.floor(centres[n, 1] + high) + 4
         copy_cell(image, left, top, right - left, bottom - top, cell)
         # 3. The greys there.
@@ -103,10 +104,13 @@ def sample(
 
 
 @inner
-def corner_bounds(offsets: Array) -> tuple[float, float]:
-    """Return the least and the largest offset (T, T) of a template: those of its corners, to less than a pixel."""
-    a, b, c, d = offsets[0, 0], offsets[0, -1], offsets[-1, 0], offsets[-1, -1]
-    return min(a, b, c, d), max(a, b, c, d)
+def bounds(offsets: Array) -> tuple[float, float]:
+    """Return the least and the largest offset (T, T) of a template."""
+    low = high = offsets[0, 0]
+    for line in offsets:
+        for offset in line:
+            low, high = min(low, offset), max(high, offset)
+    return low, high
 
 
 @inner
