@@ -88,13 +88,16 @@ def gather(
                 continue
             # A thin thing hides so many directions together: their mean counts, as one alone is noise.
             run = max(min(round(thin_m / r * by_angle), last - first + 1), 1)
-            most, least, total, together = -99.0, 1.0, 0.0, 0.0
+            most, least, total, together, seen = -99.0, 1.0, 0.0, 0.0, 0
             for u in range(first, last + 1):
-                at_u, taken, shown = u % directions, -99.0, 0.0
+                at_u, taken, shown, is_seen = u % directions, 0.0, 0.0, False
                 for k in range(begin, end + 1):
-                    taken = max(taken, ratios[at_u, k])
+                    if view[at_u, k] > 0:
+                        taken = max(taken, ratios[at_u, k]) if is_seen else ratios[at_u, k]
+                        is_seen = True
                     shown = max(shown, surface[at_u, k])
                     least = min(least, view[at_u, k])
+                seen += is_seen
                 total += min(max(shown - 0.4, 0.0), 1.5)
                 row[u - first] = taken
                 together += taken
@@ -102,6 +105,8 @@ def gather(
                     together -= row[u - first - run]
                 if u - first >= run - 1:
                     most = max(most, together / run)
+            if seen == 0:  # out of sight, as beside a sector
+                continue
             cells[RATIO, i, j], cells[VIEW, i, j] = most, least
             cells[SURFACE, i, j] = total / (last - first + 1)
             states[i, j] = IN_VIEW
