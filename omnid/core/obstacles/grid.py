@@ -316,6 +316,8 @@ class ObstacleGrid:
             (self._before, 0),
             (self._shown, 0),
             (self.known, 0),
+            (self._past_views, 0),
+            (self._floor_was_behind, 0),
             (self._free_ns, NEVER_NS),
         ):
             layer[:] = np.roll(layer, (-y, -x), axis=(0, 1))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from calib import se3
+from omnid.core.obstacles import grid as obstacle_grid
 from omnid.core.obstacles.grid import CELLS
 from omnid.core.obstacles.settings import RingSettings
 from omnid.core.stereo.tiles import TILE_COLUMNS, TILE_ROWS, TileStates
@@ -173,3 +174,16 @@ def test_a_frozen_part_of_the_images_is_not_learned() -> None:
     for heading in np.arange(13) * math.tau / 16:
         base.ring(replace(_turned(heading, 60.0), tiles=tiles), heading_rad=heading)
     assert not base.rings.fixed.share
+
+
+def test_where_the_square_of_the_grid_is_moved_is_all_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pole hides the nearest floor at the start: how often floor was seen past it moves along with its cells."""
+    seen, hidden = (
+        Panoramas(0, 0, *panoramas(stains, 3.0, striped, thing=thing), SHOWN) for thing in (None, Pole(0.8, 0.2))
+    )
+    free_m = []
+    for margin_cells in (92, 126):
+        monkeypatch.setattr(obstacle_grid, "MARGIN_CELLS", margin_cells)
+        base, pairs = Standing(HEIGHT_M), [hidden] * 3 + [seen] * 14
+        free_m.append([base.ring(pair, x_m=0.02 + 0.1 * n).free_m for n, pair in enumerate(pairs)])
+    np.testing.assert_array_equal(*free_m)
