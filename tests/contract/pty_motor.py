@@ -5,10 +5,12 @@ from __future__ import annotations
 import contextlib
 import os
 import select
+import tempfile
 import threading
 import time
 import tty
 from collections import deque
+from pathlib import Path
 
 from drivers.motors.simulated.simulated_base import STEP_S, Pose, SimulatedBase
 from drivers.motors.simulated.simulated_controllers import SimulatedLine
@@ -34,7 +36,11 @@ class PtyMotor:
         tty.setraw(self._host)  # kept open: without an open host side, reads of the device side fail
         os.set_blocking(device, False)
         self._device: int | None = device  # None: unplugged
-        self.port = os.ttyname(self._host)
+        # A name of its own, as udev gives it: the system gives the number of a closed pty to the next one that opens.
+        self._folder = tempfile.TemporaryDirectory(prefix="omnid-motor-")
+        os.chmod(self._folder.name, 0o755)  # other users may try to open it
+        self.port = str(Path(self._folder.name, "tty"))
+        os.symlink(os.ttyname(self._host), self.port)
         self._expiring, self._unplugging = threading.Event(), threading.Event()
         self._wake_read, self._wake_write = os.pipe()
         self._thread = threading.Thread(target=self._serve, name="simulated-motor", daemon=True)
@@ -76,6 +82,7 @@ class PtyMotor:
 
     def _close_pty(self) -> None:
         if self._device is not None:
+            self._folder.cleanup()
             os.close(self._device)
             os.close(self._host)
             self._device = None
