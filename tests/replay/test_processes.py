@@ -10,6 +10,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -119,6 +120,29 @@ def test_another_process_receives_the_poses(tmp_path: Path, scene: Path) -> None
     truth = {int(stamp): T for stamp, T in zip(read_tum(tum).stamps_ns, read_tum(tum).T, strict=True)}
     for record in poses:
         np.testing.assert_allclose(record.T_odom_base, truth[record.stamp_ns], atol=1e-8)
+
+
+def test_the_ten_lines_of_the_document_hear_a_robot_without_omnid(scene: Path) -> None:
+    """docs/bus.md begins with a program of zenoh and rosbags alone; only its endpoint is changed here."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    lines = (ROOT / "docs/bus.md").read_text("utf-8").split("```python\n")[1].split("```")[0]
+    assert "tcp/127.0.0.1:7447" in lines and "omnid." not in lines
+    program = [sys.executable, "-u", "-c", lines.replace("tcp/127.0.0.1:7447", endpoint)]
+    config = zenoh.Config()
+    for key, value in (
+        ("mode", '"router"'),
+        ("listen/endpoints", f'["{endpoint}"]'),
+        ("scouting/multicast/enabled", "false"),
+    ):
+        config.insert_json5(key, value)
+    sets = ("--set", "bus.listen=[]", "--set", f'bus.connect=["{endpoint}"]')
+    with zenoh.open(config) as session, started(program) as hears:
+        publisher: Any = session.declare_publisher("omnid/odom")  # zenoh's stub takes its status for a bool
+        wait_until(lambda: publisher.matching_status.matching)
+        with started(replaying(scene, "--publish", "--quiet", *sets)) as process:
+            assert hears.stdout is not None
+            assert "Point(x=" in hears.stdout.readline()
+            assert process.wait(PATIENCE_S) == 0
 
 
 def test_motor_gets_the_commands_and_stops_at_the_end(omnid: Command, scene: Path) -> None:
