@@ -37,8 +37,8 @@ Flags = NDArray[np.bool_]
 
 CELL_M: Final = 0.05
 CELLS: Final = 256
-MARGIN_CELLS: Final = 110  # nearer to the border than this, the square is moved
-VIEW_CELLS: Final = 90  # on either side of the base that a pair changes
+REACH_CELLS: Final = 90  # on either side of the base: what a pair changes, and how far the ring goes
+MARGIN_CELLS: Final = REACH_CELLS + 2  # nearer to the border than this, the square is moved
 OWN_CELLS: Final = 3  # on either side of the base that nothing else can be in
 CROSS: Final = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
 SQUARE: Final = np.ones((3, 3), np.uint8)
@@ -67,7 +67,7 @@ class ObstacleGrid:
 
     def __init__(self, at_1m: float, max_range_m: float, parameters: GridParameters) -> None:
         self._p, self._at_1m = parameters, at_1m
-        self._max_range_m = min(max_range_m, (MARGIN_CELLS - 2) * CELL_M)
+        self._max_range_m = min(max_range_m, REACH_CELLS * CELL_M)
         self._azimuths = azimuths()
         self._T_rect_base = np.eye(4)
         self._corner: NDArray[np.int64] | None = None  # of the square, in cells of odom
@@ -120,7 +120,7 @@ class ObstacleGrid:
         place = T_odom_base[:2, 3] / CELL_M
         corner = self._follow(place)
         at = np.floor(place).astype(np.int64) - corner
-        rows, columns = (slice(int(n) - VIEW_CELLS, int(n) + VIEW_CELLS + 1) for n in (at[1], at[0]))
+        rows, columns = (slice(int(n) - REACH_CELLS, int(n) + REACH_CELLS + 1) for n in (at[1], at[0]))
         way_m = math.inf if self._place_m is None else math.dist(T_odom_base[:2, 3], self._place_m)
         self._place_m = T_odom_base[:2, 3].copy()
         rho = p.same_place * max(1.0 - way_m / p.apart_m, 0.0)
@@ -279,7 +279,7 @@ class ObstacleGrid:
         x, y = (T_rect_odom @ np.array([first_m[0], first_m[1], 0.0, 1.0]))[:2]
         c, s = T_rect_odom[0, 0], T_rect_odom[1, 0]
         norm = math.hypot(c, s)
-        side = 2 * VIEW_CELLS + 1
+        side = 2 * REACH_CELLS + 1
         cells, states = np.empty((3, side, side), np.float32), np.empty((side, side), np.uint8)
         hides = self._hides(belief)
         near = np.where(belief.view[:, 0] > 0, np.where(hides, 2, 1), 0).astype(np.uint8)
