@@ -6,6 +6,7 @@ Bytes are represented by length and SHA-256, clouds also by their points, as rea
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,8 @@ PERIOD_NS = 33_333_333
 COUNT = 7
 ATTACHED = {"rig.toml": b"schema = 1\n", "omnid.toml": b"a = 1\n"}
 CLOUD = "sensor_msgs/msg/PointCloud2"
+
+NOT_FINITE = {"nan": "NaN", "inf": "Infinity", "-inf": "-Infinity"}  # JavaScript's words: JSON has no such numbers
 
 Expected = dict[str, list[dict[str, Any]]]  # topic -> its messages, in order
 
@@ -51,9 +54,11 @@ def digest(data: bytes) -> dict[str, Any]:
 def plain(value: Any) -> Any:
     """Return a message of rosbags as nested dicts and lists."""
     if isinstance(value, np.ndarray):
-        return digest(value.tobytes()) if value.dtype == np.uint8 else value.tolist()
+        return digest(value.tobytes()) if value.dtype == np.uint8 else plain(value.tolist())
     if isinstance(value, list):
         return [plain(entry) for entry in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return NOT_FINITE[str(value)]
     if not hasattr(value, "__dataclass_fields__"):
         return value
     fields = [name for name in value.__dataclass_fields__ if not name.isupper()]  # constants are upper case

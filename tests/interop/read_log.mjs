@@ -16,6 +16,7 @@ const digest = (bytes) => ({ bytes: bytes.length, sha256: createHash("sha256").u
 function plain(name, value) {
   if (value instanceof Uint8Array) return digest(value);
   if (ArrayBuffer.isView(value)) return Array.from(value);
+  if (typeof value === "number" && !Number.isFinite(value)) return String(value);
   return typeof value === "bigint" ? value.toString() : value;
 }
 
