@@ -7,6 +7,8 @@ PGM image and a YAML file that describes it.
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -42,22 +44,29 @@ free_thresh: 0.196
 """
 
 
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file whole. Raises OmnidError if that is impossible."""
+@contextmanager
+def replaced(path: Path, content: str = "file") -> Iterator[Path]:
+    """Yield a temporary file that takes the place of the file at the end of the block, see `calib.atomic_file`.
+
+    content: for the error. Raises OmnidError where the file cannot be written.
+    """
     try:
         with replacement(path) as partial:
-            partial.write_bytes(content)
-    except (OSError, ValueError) as error:
-        raise OmnidError(f"{path}: cannot write the file: {error}: choose another file") from error
+            yield partial
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name, or content that is refused
+        raise OmnidError(f"{path}: cannot write the {content}: {error}: choose another file") from error
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file whole. Raises OmnidError if that is impossible."""
+    with replaced(path) as partial:
+        partial.write_bytes(content)
 
 
 def write_ply(path: str | Path, points: MapPoints) -> None:
-    """Write the points as binary little-endian PLY; the file is replaced at once, never written in part.
-
-    Raises OmnidError if the file cannot be written.
-    """
+    """Write the points as binary little-endian PLY. Raises OmnidError if the file cannot be written."""
     vertices = np.empty(len(points.xyz), dtype=_VERTEX)
-    for name in ("xyz", "confidence", "frames", "age"):
+    for name in _VERTEX.names or ():
         vertices[name] = getattr(points, name)
     write_whole(Path(path), _HEADER.format(count=len(vertices)).encode("ascii") + vertices.tobytes())
 
@@ -78,18 +87,13 @@ def write_grid(path: Path, grid: Grid) -> None:
         raise OmnidError(
             f"{path}: this name is no UTF-8, so the file cannot name its image: give another name"
         ) from None
-    image = np.full(grid.cells.shape, _GREY, np.uint8)
-    image[grid.cells == FREE] = _WHITE
-    image[grid.cells == OCCUPIED] = _BLACK
-    height, width = grid.cells.shape
-    rows = image[::-1].tobytes()  # the first row is the highest y
-    try:
-        # Both are on the disk before one takes its name: an image next to the text of another map would be shifted.
-        with replacement(pixels) as new_image, replacement(path) as new_text:
-            new_image.write_bytes(b"P5\n%d %d\n255\n" % (width, height) + rows)
-            new_text.write_bytes(described)
-    except (OSError, ValueError) as error:
-        raise OmnidError(f"{path}: cannot write the map: {error}: choose another file") from error
+    image = np.select([grid.cells == FREE, grid.cells == OCCUPIED], [_WHITE, _BLACK], _GREY).astype(np.uint8)
+    height, width = image.shape
+    # Both are on the disk before one takes its name: an image next to the text of another map would be shifted.
+    with replaced(pixels, "map") as new_image, replaced(path, "map") as new_text:
+        # The first row is the highest y.
+        new_image.write_bytes(b"P5\n%d %d\n255\n" % (width, height) + image[::-1].tobytes())
+        new_text.write_bytes(described)
 
 
 def _quoted(name: str) -> str:

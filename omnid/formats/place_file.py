@@ -7,15 +7,15 @@ its range. The same checks come before a map is written, so that none is replace
 
 from __future__ import annotations
 
+import math
 import zipfile
 from pathlib import Path
 from stat import S_ISFIFO
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.atomic_file import replacement
 from calib.panorama import Cylinder
 from omnid.core.mapping.range_scan import MAX_RANGE_M, SECTORS
 from omnid.core.places.features import COLUMNS, ROWS
@@ -30,47 +30,57 @@ from omnid.core.places.place_map import (
     PlaceRig,
 )
 from omnid.errors import OmnidError
+from omnid.formats.exports import replaced
 
 FORMAT: Final = 7  # to be raised where thumbnails or features of a place are computed otherwise: old maps fit no more
 # Maps up to version 6 were SQLite databases.
 EARLIER: Final = b"SQLite format 3\0"
 MAX_FILE_BYTES: Final = 1 << 30
-MAX_PIXELS: Final = 1 << 15  # width and height of a panorama
 MAX_INTEGER: Final = 1 << 62
-MAX_POSITION_M: Final = 1e5
-MAX_VARIANCE: Final = 1e8  # m^2 and rad^2
 LEAST_VARIANCE: Final = 1e-16  # of a loop in any direction, so that its covariance can be inverted
-RIGID: Final = 1e-6  # largest difference of an element of R R^T from the identity
+ROUNDING: Final = 1e-6  # of the elements of a rotation times its transpose
+_POSE: Final = (3, 4)  # the upper rows of a transform
 
-# Names are those of the attributes; transforms are the upper rows of the 4x4 matrix.
-_POSE: Final = ("<f8", (3, 4))
-_HEAD_NUMBERS: Final = [(name, "<i8") for name in ("format", "dropped", "width", "height")]
-_KEYFRAME_NUMBERS: Final = [(name, "<i8") for name in ("id", "session", "stamp_ns", "found", "missed", "features")]
+
+class _Field(NamedTuple):
+    """A field of an array: its type, and the bounds of each value."""
+
+    kind: str
+    low: float
+    high: float
+    shape: tuple[int, ...] = ()
+
+
+_COUNT: Final = _Field("<i8", 0, MAX_INTEGER)
+_TRANSFORM: Final = _Field("<f8", -1e5, 1e5, _POSE)  # metres
+_COVARIANCE: Final = _Field("<f8", -1e8, 1e8, (6, 6))  # m^2 and rad^2
+_SIZE: Final = _Field("<i8", 1, 1 << 15)  # of a panorama, px
+_RANGE: Final = _Field("<f2", -MAX_RANGE_M, MAX_RANGE_M, (SECTORS,))
+# Names are those of the attributes.
+_FIELDS: Final[dict[str, dict[str, _Field]]] = {
+    "map": {
+        **dict.fromkeys(("format", "dropped"), _COUNT),
+        **dict.fromkeys(("width", "height"), _SIZE),
+        "row0": _Field("<f8", -1e6, 1e6),
+        "baseline_m": _Field("<f8", 1e-3, 1e2),
+        **dict.fromkeys(("T_rig_rect", "T_base_rig"), _TRANSFORM),
+        "rig_hash": _Field("S64", 0, 0),
+    },
+    "keyframes": {
+        **dict.fromkeys(("id", "session", "stamp_ns", "found", "missed", "features"), _COUNT),
+        **dict.fromkeys(("T_map_rect", "T_odom_rect"), _TRANSFORM),
+        "covariance": _COVARIANCE,
+        "thumbnail": _Field("i1", -math.inf, math.inf, (ROWS, COLUMNS)),
+        "scan": _RANGE._replace(low=0.0),
+        "free_m": _RANGE,
+    },
+    "links": {**dict.fromkeys(("a", "b", "inliers"), _COUNT), "T_a_b": _TRANSFORM, "covariance": _COVARIANCE},
+}
 _ARRAYS: Final[dict[str, np.dtype[Any]]] = {
-    "map": np.dtype(
-        [
-            *_HEAD_NUMBERS,
-            ("row0", "<f8"),
-            ("baseline_m", "<f8"),
-            ("T_rig_rect", *_POSE),
-            ("T_base_rig", *_POSE),
-            ("rig_hash", "S64"),
-        ]
-    ),
-    "keyframes": np.dtype(
-        [
-            *_KEYFRAME_NUMBERS,
-            ("T_map_rect", *_POSE),
-            ("T_odom_rect", *_POSE),
-            ("covariance", "<f8", (6, 6)),
-            ("thumbnail", "i1", (ROWS, COLUMNS)),
-            ("scan", "<f2", (SECTORS,)),
-            ("free_m", "<f2", (SECTORS,)),
-        ]
-    ),
-    "links": np.dtype(
-        [("a", "<i8"), ("b", "<i8"), ("inliers", "<i8"), ("T_a_b", *_POSE), ("covariance", "<f8", (6, 6))]
-    ),
+    **{
+        name: np.dtype([(field, kind, shape) for field, (kind, _, _, shape) in fields.items()])
+        for name, fields in _FIELDS.items()
+    },
     # Features of one keyframe after the other.
     "views": np.dtype(("<f4", (3,))),
     "descriptors": np.dtype(("u1", (DESCRIPTOR,))),
@@ -84,15 +94,13 @@ class _BadMapError(ValueError):
 
 def write_places(path: str | Path, places: PlaceMap, rig: PlaceRig) -> None:
     """Write a map; the same map gives the same bytes. Raises OmnidError if that is impossible."""
-    path, arrays = Path(path), _to_arrays(places, rig)
-    try:
+    arrays = _to_arrays(places, rig)
+    with replaced(Path(path), "map") as partial:
         _check(arrays)
-        with replacement(path) as partial, zipfile.ZipFile(partial, "w") as archive:
+        with zipfile.ZipFile(partial, "w") as archive:
             for name, array in arrays.items():
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
                     np.lib.format.write_array(file, array, allow_pickle=False)
-    except (OSError, ValueError) as error:
-        raise OmnidError(f"{path}: cannot write the map: {error}: choose another file") from error
 
 
 def read_places(path: str | Path, into: PlaceMap | None = None) -> tuple[PlaceMap, PlaceRig]:
@@ -141,29 +149,23 @@ def _require_map(path: Path) -> None:
 
 
 def _to_arrays(places: PlaceMap, rig: PlaceRig) -> _Arrays:
-    """Return the arrays of a map."""
-    ids = sorted(places.keyframes)
-    found, uses = [places.keyframes[id] for id in ids], [places.uses.get(id, UNUSED) for id in ids]
-    head, keyframes, links = (
-        np.zeros(count, _ARRAYS[name])
-        for name, count in (("map", 1), ("keyframes", len(ids)), ("links", len(places.links)))
-    )
-    head["format"], head["dropped"], head["rig_hash"] = FORMAT, places.dropped, rig.rig_hash.encode()
-    head["width"], head["height"], head["row0"] = rig.cylinder.width, rig.cylinder.height, rig.cylinder.row0
-    head["baseline_m"], head["T_rig_rect"], head["T_base_rig"] = rig.baseline_m, rig.T_rig_rect[:3], rig.T_base_rig[:3]
-    for n, (id, keyframe, use) in enumerate(zip(ids, found, uses, strict=True)):
-        row = keyframes[n]
-        for name in ("id", "session", "stamp_ns", "covariance", "thumbnail", "scan", "free_m"):
-            row[name] = getattr(keyframe, name)
-        row["found"], row["missed"], row["features"] = use.found, use.missed, len(keyframe.features.views)
-        row["T_map_rect"], row["T_odom_rect"] = places.poses[id][:3], keyframe.T_odom_rect[:3]
-    for n, link in enumerate(places.links):
-        links[n] = (link.a, link.b, link.inliers, link.T_a_b[:3], link.covariance)
-    views, descriptors = (
-        np.concatenate([np.zeros(0, _ARRAYS[name]), *(getattr(one.features, name) for one in found)])
-        for name in ("views", "descriptors")
-    )
-    return {"map": head, "keyframes": keyframes, "links": links, "views": views, "descriptors": descriptors}
+    """Return the arrays of a map; of transforms (4, 4) the upper rows."""
+    ids, upper = sorted(places.keyframes), _POSE[0]
+    cylinder, poses = rig.cylinder, (rig.T_rig_rect[:upper], rig.T_base_rig[:upper])
+    head = FORMAT, places.dropped, cylinder.width, cylinder.height, cylinder.row0, rig.baseline_m, *poses
+    keyframes = []
+    for id in ids:
+        its, use = places.keyframes[id], places.uses.get(id, UNUSED)
+        numbers = id, its.session, its.stamp_ns, use.found, use.missed, len(its.features.views)
+        poses = places.poses[id][:upper], its.T_odom_rect[:upper]
+        keyframes.append((*numbers, *poses, its.covariance, its.thumbnail, its.scan, its.free_m))
+    links = [(link.a, link.b, link.inliers, link.T_a_b[:upper], link.covariance) for link in places.links]
+    rows = {"map": [(*head, rig.rig_hash.encode())], "keyframes": keyframes, "links": links}
+    arrays = {name: np.array(found, _ARRAYS[name]) for name, found in rows.items()}
+    for name in ("views", "descriptors"):
+        features = [getattr(places.keyframes[id].features, name) for id in ids]
+        arrays[name] = np.concatenate([np.zeros(0, _ARRAYS[name]), *features])
+    return arrays
 
 
 def _from_arrays(arrays: _Arrays, places: PlaceMap) -> PlaceRig:
@@ -171,16 +173,15 @@ def _from_arrays(arrays: _Arrays, places: PlaceMap) -> PlaceRig:
     head, keyframes, links = arrays["map"][0], arrays["keyframes"], arrays["links"]
     T_map_rect, T_odom_rect = _transforms(keyframes["T_map_rect"]), _transforms(keyframes["T_odom_rect"])
     ends = np.cumsum(keyframes["features"]).tolist()
-    for n, (row, end) in enumerate(zip(keyframes, ends, strict=True)):
+    for row, T, T_odom, end in zip(keyframes, T_map_rect, T_odom_rect, ends, strict=True):
         id, its = int(row["id"]), slice(end - int(row["features"]), end)
         features = PlaceFeatures(arrays["descriptors"][its].copy(), arrays["views"][its].copy())
         covariance, thumbnail, scan, free_m = (
             np.array(row[name]) for name in ("covariance", "thumbnail", "scan", "free_m")
         )
-        places.keyframes[id] = PlaceKeyframe(
-            id, int(row["session"]), int(row["stamp_ns"]), T_odom_rect[n], covariance, thumbnail, scan, free_m, features
-        )
-        places.poses[id] = T_map_rect[n]
+        numbers = int(row["session"]), int(row["stamp_ns"])
+        places.keyframes[id] = PlaceKeyframe(id, *numbers, T_odom, covariance, thumbnail, scan, free_m, features)
+        places.poses[id] = T
         if row["found"] or row["missed"]:
             places.uses[id] = KeyframeUse(int(row["found"]), int(row["missed"]))
     places.links = [
@@ -207,56 +208,42 @@ def _check(arrays: _Arrays) -> None:
         has_type = arrays[name].dtype == dtype.base and arrays[name].shape == (count, *dtype.shape)
         _require(has_type, f"the array {name} has another type or size")
     _require(len(head) == 1 and head["format"][0] == FORMAT, f"expected version {FORMAT} of the format")
-    # 2. The rig.
-    for name in ("width", "height"):
-        _require((head[name] >= 1) & (head[name] <= MAX_PIXELS), "the panorama has another size")
-    _require((np.abs(head["row0"]) <= 1e6) & (head["baseline_m"] >= 1e-3) & (head["baseline_m"] <= 1e2), "no such rig")
     _require(head["rig_hash"][0].isalnum(), "the hash of the rig is none")
-    # 3. Numbers.
+    # 2. Bounds. The range of a scan is NaN where it is unknown.
+    for name, fields in _FIELDS.items():
+        for field, (_, low, high, shape) in fields.items():
+            values = arrays[name][field]
+            if values.dtype.kind != "S":
+                is_inside = ((values >= low) & (values <= high)) | (field == "scan" and np.isnan(values))
+                _require(is_inside, f"{field} of {name} is outside {low:g} to {high:g}")
+            if shape == _POSE:
+                R, transposed = values[:, :, :-1], np.swapaxes(values[:, :, :-1], 1, 2)
+                is_rotation = np.abs(R @ transposed - np.eye(_POSE[0])) <= ROUNDING
+                _require(np.all(is_rotation) & (np.linalg.det(R) > 0), f"{field} of {name} is no rotation")
+            elif field == "covariance":
+                least = np.where(arrays[name]["inliers"] > 0, LEAST_VARIANCE, -np.inf) if name == "links" else -np.inf
+                _check_covariances(values, least)
+    # 3. References.
     ids = keyframes["id"]
     _require(np.diff(ids) > 0, "the keyframes are not in the order of their ids")
-    counts = [keyframes[name] for name in ("id", "session", "found", "missed", "features")]
-    for numbers in (*counts, links["inliers"], head["dropped"]):
-        _require((numbers >= 0) & (numbers < MAX_INTEGER), "a number is outside its range")
-    _require(np.abs(keyframes["stamp_ns"]) < MAX_INTEGER, "a stamp is outside its range")
-    _require(np.array(len(views) == keyframes["features"].sum()), "the features are not those of the keyframes")
-    for ranges, is_unknown in ((keyframes["scan"], np.isnan(keyframes["scan"])), (np.abs(keyframes["free_m"]), False)):
-        _require(is_unknown | ((ranges >= 0) & (ranges <= MAX_RANGE_M)), f"a range is outside 0 to {MAX_RANGE_M:g} m")
+    _require(len(views) == keyframes["features"].sum(), "the features are not those of the keyframes")
     joins = np.isin(links["a"], ids) & np.isin(links["b"], ids) & (links["a"] != links["b"])
     _require(joins, "a link joins no two keyframes")
-    # The upper camera may show a point at a row below the end of the lower one's panorama.
+    # 4. Views. The upper camera may show a point at a row below the end of the lower one's panorama.
     (column, lower, upper), width, height = views.T, head["width"][0], head["height"][0]
     is_inside = (np.abs(column) <= 2 * width) & (np.abs(lower) <= 2 * height) & (upper > lower) & (upper <= 3 * height)
     _require(is_inside, "a view of a keyframe is outside the panorama")
-    # 4. Poses and covariances.
-    for array, name in (
-        (head, "T_rig_rect"),
-        (head, "T_base_rig"),
-        (keyframes, "T_map_rect"),
-        (keyframes, "T_odom_rect"),
-        (links, "T_a_b"),
-    ):
-        T = array[name]
-        _require(np.isfinite(T) & (np.abs(T) <= MAX_POSITION_M), "a pose is not finite, or too far away")
-        R = T[:, :, :3]
-        is_rigid = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)) <= RIGID
-        _require(np.all(is_rigid, axis=(1, 2)) & (np.linalg.det(R) > 0), "a pose is no rotation")
-    is_loop = links["inliers"] > 0
-    _check_covariances(keyframes["covariance"], 0.0)
-    _check_covariances(links["covariance"][~is_loop], 0.0)
-    _check_covariances(links["covariance"][is_loop], LEAST_VARIANCE)
 
 
-def _check_covariances(P: NDArray[np.float64], least: float) -> None:
-    """Check that (N, 6, 6) are symmetric, without an eigenvalue below `least` [m^2, rad^2]."""
-    _require(np.isfinite(P) & (np.abs(P) <= MAX_VARIANCE), "a covariance is not finite, or too large")
+def _check_covariances(P: NDArray[np.float64], least: NDArray[np.float64] | float) -> None:
+    """Check that (N, 6, 6) are symmetric, without an eigenvalue below `least` [m^2, rad^2], nor below 0."""
     rounding = 1e-9 * np.abs(P).max(axis=(1, 2), initial=0.0)  # an eigenvalue that is 0 may be less by this
     asymmetry = np.abs(P - np.swapaxes(P, 1, 2)).max(axis=(1, 2), initial=0.0)
     _require(asymmetry <= rounding, "a covariance is not symmetric")
-    _require(np.linalg.eigvalsh(P)[:, 0] >= (least or -rounding), "a covariance is not positive")
+    _require(np.linalg.eigvalsh(P)[:, 0] >= np.maximum(least, -rounding), "a covariance is not positive")
 
 
-def _require(holds: bool | NDArray[np.bool_], text: str) -> None:
+def _require(holds: bool | NDArray[np.bool_] | np.bool_, text: str) -> None:
     """Raise _BadMapError where a condition does not hold for all values."""
     if not np.all(holds):
         raise _BadMapError(text)

@@ -18,6 +18,7 @@ Image = NDArray[np.uint8]
 Colour = tuple[int, int, int]  # BGR
 
 MARGIN_PX = 64
+MARK_PX = 11  # size of marks and distance of labels
 SIDE_LIMIT_PX = 2000
 WHITE, BLACK, RED, BLUE, LIGHT_GREY = (255, 255, 255), (0, 0, 0), (0, 0, 190), (200, 100, 0), (205, 205, 205)
 _CELL_M = 0.05  # default voxel: at a finer scale cells are drawn as squares, not as scattered dots
@@ -44,6 +45,11 @@ class Sheet:
         """Return image coordinates (N, 2) of points (N, 2); y grows downwards there."""
         corner = np.array([MARGIN_PX, MARGIN_PX + self.area_px[1] - 1])
         return np.asarray(np.rint(corner + (xy_m - self.low_m) * self.px_per_m * [1, -1]), dtype=np.int32)
+
+    def pixel(self, xy_m: Array) -> tuple[int, int]:
+        """Return image coordinates of a point (2,)."""
+        x, y = self.pixels(xy_m[None])[0].tolist()
+        return x, y
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,15 +140,14 @@ def draw_plan(sheet: Sheet, xy_m: Array, confidence: NDArray[np.float32], lines:
 def draw_ends(image: Image, sheet: Sheet, start: Array, end: Array | None = None) -> None:
     """Draw a circle with its name at the start of a path, and a square with its name at its end."""
     if end is not None:
-        x, y = (int(v) for v in sheet.pixels(end[None])[0])
-        for colour, half_px in ((WHITE, 7), (BLACK, 6)):
+        x, y = sheet.pixel(end)
+        for colour, half_px in ((WHITE, MARK_PX // 2 + 1), (BLACK, MARK_PX // 2)):
             cv2.rectangle(image, (x - half_px, y - half_px), (x + half_px, y + half_px), colour, cv2.FILLED)
-    at = tuple(int(v) for v in sheet.pixels(start[None])[0])
-    cv2.circle(image, at, 9, BLACK, cv2.FILLED, cv2.LINE_AA)
-    cv2.circle(image, at, 6, WHITE, cv2.FILLED, cv2.LINE_AA)
-    write(image, "start", (at[0], at[1] - 14))
-    if end is not None:
-        write(image, "end", (x, y + 24))
+        write(image, "end", (x, y + 2 * MARK_PX))
+    x, y = sheet.pixel(start)
+    for colour, radius_px in ((BLACK, MARK_PX - 2), (WHITE, MARK_PX // 2)):
+        cv2.circle(image, (x, y), radius_px, colour, cv2.FILLED, cv2.LINE_AA)
+    write(image, "start", (x, y - MARK_PX))
 
 
 def _cells(sheet: Sheet, xy_m: Array, confidence: NDArray[np.float32]) -> Image:
@@ -163,26 +168,27 @@ def _cells(sheet: Sheet, xy_m: Array, confidence: NDArray[np.float32]) -> Image:
 
 def _draw_frame(image: Image, sheet: Sheet) -> None:
     """Draw the border, ticks in metres on two sides, the names of the axes and a scale bar."""
-    # The longest tick of 1, 2 or 5 times a power of ten whose spacing is at most 110 px.
-    longest_m = 110.0 / sheet.px_per_m
+    # The longest tick of 1, 2 or 5 times a power of ten whose spacing is not much more than a label's width.
+    longest_m = 2 * MARGIN_PX / sheet.px_per_m
     decade = 10.0 ** np.floor(np.log10(longest_m))
     step_m = float(decade * max(digit for digit in (1, 2, 5) if digit * decade <= longest_m))
-    (left, bottom), (right, top) = ((int(x), int(y)) for x, y in sheet.pixels(np.array([sheet.low_m, sheet.high_m])))
+    (left, bottom), (right, top) = sheet.pixel(sheet.low_m), sheet.pixel(sheet.high_m)
+    half_px = MARK_PX // 2
     for axis in (0, 1):
         first, last = np.ceil(sheet.low_m[axis] / step_m), np.floor(sheet.high_m[axis] / step_m)
         for value_m in step_m * np.arange(first, last + 1):
             at, label = sheet.low_m.copy(), f"{value_m + 0.0:g}"  # no -0
             at[axis] = value_m
-            x, y = (int(v) for v in sheet.pixels(at[None])[0])
-            to = (x, y + 6) if axis == 0 else (x - 6, y)
+            x, y = sheet.pixel(at)
+            to, label_at = ((x, y + half_px), (x, y + 2 * MARK_PX)) if axis == 0 else ((x - half_px, y), None)
             cv2.line(image, (x, y), to, BLACK, 1)
-            write(image, label, (x, y + 22) if axis == 0 else (x - 12 - 5 * len(label), y + 5))
+            write(image, label, label_at or (x - MARK_PX - half_px * len(label), y + half_px))
     cv2.rectangle(image, (left, top), (right, bottom), BLACK, 1)
-    write(image, "x forward [m]", ((left + right) // 2, bottom + 44))
-    write(image, "y left [m]", (left, top - 10))
-    bar, y = right - round(step_m * sheet.px_per_m), MARGIN_PX - 14
-    cv2.rectangle(image, (bar, y - 3), (right, y + 3), BLACK, cv2.FILLED)
-    write(image, f"{step_m:g} m", ((bar + right) // 2, y - 10))
+    write(image, "x forward [m]", ((left + right) // 2, bottom + MARGIN_PX - 2 * MARK_PX))
+    write(image, "y left [m]", (left, top - MARK_PX))
+    bar, y = right - round(step_m * sheet.px_per_m), MARGIN_PX - MARK_PX
+    cv2.rectangle(image, (bar, y - half_px), (right, y), BLACK, cv2.FILLED)
+    write(image, f"{step_m:g} m", ((bar + right) // 2, y - MARK_PX))
 
 
 def with_legend(image: Image, lines: Sequence[tuple[str, Colour, int]]) -> Image:

@@ -1,6 +1,6 @@
 """Trajectories in the TUM format: one pose a line, `t x y z qx qy qz qw` (seconds, metres, unit quaternion).
 
-A head that names the columns, as `#timestamp [ns], p_RS_R_x [m], ..., q_RS_w [], ...` of EuRoC's CSV files, tells the
+A head that names the columns, as `#timestamp [ns], p_RS_R_x [m], ..., q_RS_w [], ...` of EuRoC's CSV files, states the
 order of the quaternion and the unit of the stamps.
 """
 
@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from io import BytesIO, TextIOWrapper
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,14 +19,17 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.errors import OmnidError
 
-FILE_LIMIT_BYTES = 1 << 28  # about 2.5 million poses, days of driving; a log given by mistake is refused
-POSITION_LIMIT_M = 1e9  # Largest coordinate, so that squares and sums cannot overflow.
-STAMP_LIMIT_NS = 1 << 62  # Largest stamp, so that the difference of two stamps fits int64.
-_DECIMALS = 9  # nanoseconds, nanometres
-# Decimal places by which the point of a stamp moves to nanoseconds, by its unit. Where the file does not name it, it is
-# the first unit that gives a time within the limit.
-_TO_NANOSECONDS = {"s": 9, "ms": 6, "us": 3, "ns": 0}
-_MIN_QUATERNION = 1e-9  # largest component below which a quaternion counts as zero
+Array = NDArray[np.float64]
+FILE_LIMIT_BYTES: Final = 1 << 28  # about 2.5 million poses, days of driving; a log given by mistake is refused
+POSITION_LIMIT_M: Final = 1e9  # Largest coordinate, so that squares and sums cannot overflow.
+STAMP_LIMIT_NS: Final = 1 << 62  # Largest stamp, so that the difference of two stamps fits int64.
+_DECIMALS: Final = 9  # nanoseconds, nanometres
+_AXES: Final = ["x", "y", "z"]
+_QUATERNION: Final = [*_AXES, "w"]
+# The power of ten from a stamp to nanoseconds, by its unit. Where the file does not name the unit, it is the first that
+# gives a time within the limit.
+_TO_NANOSECONDS: Final = {"s": 9, "ms": 6, "us": 3, "ns": 0}
+_SHOWN: Final = 60  # characters of a wrong line
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +37,12 @@ class Trajectory:
     """Poses T_odom_rig (or T_world_rig) over time; stamps increase strictly; both arrays are read-only."""
 
     stamps_ns: NDArray[np.int64]  # (N,)
-    T: NDArray[np.float64]  # (N, 4, 4)
+    T: Array  # (N, 4, 4)
+
+
+def parts(T: Array) -> tuple[Array, Array]:
+    """Return rotations (..., 3, 3) and positions (..., 3) of transforms (..., 4, 4)."""
+    return T[..., :3, :3], T[..., :3, 3]
 
 
 def read_tum(path: str | Path) -> Trajectory:
@@ -44,19 +53,20 @@ def read_tum(path: str | Path) -> Trajectory:
     """
     # 1. Stamps and numbers of each line.
     raw, stamps, poses, lines, line = _read(Path(path)), list[int](), list[list[float]](), list[int](), 0
-    layout = _Layout()
+    order, unit = _QUATERNION, ""
     try:
         for line, content in enumerate(TextIOWrapper(BytesIO(raw), "utf-8-sig"), start=1):
             data, _, comment = content.partition("#")
             words = data.replace(",", " ").split()
-            if words and (lines or not _is_head(words)):
-                layout = layout if lines else layout.of_first_stamp(words[0])
-                stamp_ns, pose = _row(words[:8] if "," in data else words, layout)
+            is_head = len(words) > 1 and not any(re.match(r"[-+.]?[0-9]", word) for word in words)
+            if words and (lines or not is_head):
+                unit = unit or _unit_of(words[0])
+                stamp_ns, pose = _row(words[:8] if "," in data else words, unit)
                 stamps.append(stamp_ns)
                 poses.append(pose)
                 lines.append(line)
             elif not lines:
-                layout = layout.of_head(data if words else comment)
+                order, unit = _columns(data if words else comment) or (order, unit)
     except UnicodeDecodeError:
         raise OmnidError(f"{path}: expected 't x y z qx qy qz qw' in each line, found bytes that are no text") from None
     except ValueError as error:
@@ -64,27 +74,30 @@ def read_tum(path: str | Path) -> Trajectory:
     if not lines:
         raise OmnidError(f"{path}: no pose found: expected lines 't x y z qx qy qz qw'")
     # 2. Sorted by stamp, each once.
-    order = np.argsort(stamps, kind="stable")
-    stamps_ns, pose_of = np.array(stamps, np.int64)[order], np.array(poses)[order]
+    by_time = np.argsort(stamps, kind="stable")
+    stamps_ns = np.array(stamps, np.int64)[by_time]
     for n in np.flatnonzero(np.diff(stamps_ns) == 0).tolist():
-        first, second = lines[order[n]], lines[order[n + 1]]
+        first, second = lines[by_time[n]], lines[by_time[n + 1]]
         raise OmnidError(
             f"{path}, line {second}: expected each stamp once, found that of line {first} again: remove one of the two"
         )
-    q = pose_of[:, 3:] / np.abs(pose_of[:, 3:]).max(axis=1, keepdims=True)  # so that squares in se3 cannot overflow
-    T = se3.transform(se3.rotation(q), pose_of[:, :3])
+    xyz, q = np.split(np.array(poses)[by_time], [len(_AXES)], axis=1)
+    q = q[:, [order.index(name) for name in _QUATERNION]]
+    # The division keeps squares in se3 from overflowing.
+    T = se3.transform(se3.rotation(q / np.abs(q).max(axis=1, keepdims=True)), xyz)
     stamps_ns.setflags(write=False)
     T.setflags(write=False)
     return Trajectory(stamps_ns, T)
 
 
-def tum_row(stamp_ns: int, T: NDArray[np.float64]) -> str:
+def tum_row(stamp_ns: int, T: Array) -> str:
     """Return a TUM line without newline: 9 decimals, w >= 0, never '-0', so the same bytes for the same pose."""
     sign, (whole_s, rest_ns) = "-" if stamp_ns < 0 else "", divmod(abs(int(stamp_ns)), 10**9)
-    q = se3.quaternion(T[:3, :3])
+    R, xyz = parts(T)
+    q = se3.quaternion(R)
     # The last component that prints as non-zero (w, else z, y, x) is positive.
     visible = np.round(q, _DECIMALS)[np.round(q, _DECIMALS) != 0.0]
-    pose = np.round(np.concatenate([T[:3, 3], -q if visible.size and visible[-1] < 0.0 else q]), _DECIMALS) + 0.0
+    pose = np.round(np.concatenate([xyz, -q if visible.size and visible[-1] < 0.0 else q]), _DECIMALS) + 0.0
     return " ".join([f"{sign}{whole_s}.{rest_ns:09d}", *(f"{float(value):.{_DECIMALS}f}" for value in pose)])
 
 
@@ -99,57 +112,45 @@ def _read(path: Path) -> bytes:
     return raw
 
 
-@dataclass(frozen=True, slots=True)
-class _Layout:
-    """What the head of a file tells about its columns."""
-
-    quaternion: tuple[int, int, int, int] = (0, 1, 2, 3)  # places of x, y, z, w among the last four columns
-    unit: str = ""  # of the stamps, a key of _TO_NANOSECONDS
-
-    def of_head(self, text: str) -> _Layout:
-        """Return the layout by the names of the columns, as far as these are time, x, y, z and a quaternion."""
-        unit = re.match(r"[^,]*\[(s|ms|us|ns)\]", text)
-        names = re.sub(r"\[[^\]]*\]", "", text).replace(",", " ").lower().split()
-        axes = [name[-1] for name in names[1:8]]
-        if axes[:3] != ["x", "y", "z"] or sorted(axes[3:]) != ["w", "x", "y", "z"]:
-            return self
-        x, y, z, w = (axes[3:].index(axis) for axis in "xyzw")
-        return _Layout((x, y, z, w), unit[1] if unit else "")
-
-    def of_first_stamp(self, word: str) -> _Layout:
-        """Return the layout with the unit of the stamps, if the head does not name it: by the first one's size."""
-        if self.unit or not re.fullmatch(r"\d{10,19}", word):
-            return self
-        fitting = [unit for unit, places in _TO_NANOSECONDS.items() if int(word) * 10**places < STAMP_LIMIT_NS]
-        return _Layout(self.quaternion, fitting[0] if fitting else "")
+def _columns(head: str) -> tuple[list[str], str] | None:
+    """Return the order of the quaternion and the unit of the stamps; None unless time, position, quaternion follow."""
+    unit = re.match(r"[^,]*\[(s|ms|us|ns)\]", head)
+    names = re.sub(r"\[[^\]]*\]", "", head).replace(",", " ").lower().split()
+    axes = [name[-1] for name in names[1:8]]
+    order = axes[len(_AXES) :]
+    if axes[: len(_AXES)] != _AXES or sorted(order) != sorted(_QUATERNION):
+        return None
+    return order, unit[1] if unit else ""
 
 
-def _is_head(words: list[str]) -> bool:
-    """True for words of which none is a number: names of columns."""
-    return all(re.match(r"[-+.]?[0-9]", word) is None for word in words) and len(words) > 1
+def _unit_of(stamp: str) -> str:
+    """Return the unit of a stamp by its size; whole numbers of ten digits or more may be other units than seconds."""
+    whole = int(stamp) if re.fullmatch(r"\d{10,19}", stamp) else 0
+    return next((unit for unit, places in _TO_NANOSECONDS.items() if whole * 10**places < STAMP_LIMIT_NS), "s")
 
 
-def _row(words: list[str], layout: _Layout) -> tuple[int, list[float]]:
-    """Return the stamp [ns] and x y z qx qy qz qw of a line. Raises ValueError with what was found."""
-    found = repr(" ".join(words[:9])[:60])
+def _row(words: list[str], unit: str) -> tuple[int, list[float]]:
+    """Return the stamp [ns] and the seven numbers of a line. Raises ValueError with what was found."""
+    found = repr(" ".join(words[:9])[:_SHOWN])
     if len(words) != 8:
         raise ValueError(f"expected 8 numbers separated by spaces (t x y z qx qy qz qw), found {len(words)}: {found}")
     # Not by float64, whose resolution at Unix times is 238 ns. adjusted() comes first: 1e999999999 has no end.
-    places = _TO_NANOSECONDS[layout.unit or "s"]
+    places = _TO_NANOSECONDS[unit]
     try:
         stamp = Decimal(words[0])
     except InvalidOperation:
         stamp = Decimal("nan")
-    if not stamp.is_finite() or stamp.adjusted() > 21 - places or abs(stamp.scaleb(places)) >= STAMP_LIMIT_NS:
-        raise ValueError(f"expected a stamp in seconds, found {words[0][:60]!r}")
+    if not stamp.is_finite() or stamp.adjusted() + places > 21 or abs(stamp.scaleb(places)) >= STAMP_LIMIT_NS:
+        raise ValueError(f"expected a stamp in seconds, found {words[0][:_SHOWN]!r}")
     try:
-        pose = [float(word) for word in words[1:]]
+        pose = np.array([float(word) for word in words[1:]])
     except ValueError:
-        pose = [float("nan")]
+        pose = np.array(np.nan)
     if not np.isfinite(pose).all():
         raise ValueError(f"expected finite numbers, found {found}")
-    if max(map(abs, pose[:3])) > POSITION_LIMIT_M:
+    xyz, q = np.split(np.abs(pose), [len(_AXES)])
+    if xyz.max() > POSITION_LIMIT_M:
         raise ValueError(f"expected a position within {POSITION_LIMIT_M:g} m, found {found}")
-    if max(map(abs, pose[3:])) < _MIN_QUATERNION:
+    if q.max() < 1 / POSITION_LIMIT_M:
         raise ValueError(f"expected a unit quaternion, found zero: {found}")
-    return int(stamp.scaleb(places).to_integral_value()), [*pose[:3], *(pose[3 + place] for place in layout.quaternion)]
+    return int(stamp.scaleb(places).to_integral_value()), pose.tolist()

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.errors import OmnidError
-from omnid.formats.tum import Trajectory
+from omnid.formats.tum import Trajectory, parts
 
 Array = NDArray[np.float64]
 ALIGNMENTS: Final = ("origin", "rigid", "scale")
@@ -102,23 +102,25 @@ def _span(trajectory: Trajectory) -> str:
     return f"spans {stamps_ns[0] / 1e9:.3f} to {stamps_ns[-1] / 1e9:.3f} s" if stamps_ns.size else "holds no pose"
 
 
-def _metrics(T_est: NDArray[np.float64], scale: float, T_true: NDArray[np.float64], coverage: float) -> Metrics:
+def _metrics(T_est: Array, scale: float, T_true: Array, coverage: float) -> Metrics:
     """Return metrics of poses (N, 4, 4), row by row at the same time and in the same world."""
-    position_m = np.linalg.norm(T_est[:, :3, 3] - T_true[:, :3, 3], axis=1)
+    (_, est_xyz), (_, true_xyz) = parts(T_est), parts(T_true)
+    position_m = np.linalg.norm(est_xyz - true_xyz, axis=1)
     heading_rad = se3.yaw(se3.inverse(T_true) @ T_est)
-    steps = se3.inverse(_steps(T_true)) @ _steps(T_est)
-    length_est_m, length_true_m = _length_m(T_est), _length_m(T_true)
+    est_steps, true_steps = (se3.inverse(T[:-1]) @ T[1:] for T in (T_est, T_true))
+    step_R, step_xyz = parts(se3.inverse(true_steps) @ est_steps)
+    est_m, true_m = (float(np.linalg.norm(np.diff(xyz, axis=0), axis=1).sum()) for xyz in (est_xyz, true_xyz))
     return Metrics(
         pairs=len(T_est),
         coverage=coverage,
-        length_estimate_m=length_est_m,
-        length_truth_m=length_true_m,
-        length_error_ratio=(length_est_m - length_true_m) / length_true_m if length_true_m > 0.0 else math.nan,
+        length_estimate_m=est_m,
+        length_truth_m=true_m,
+        length_error_ratio=(est_m - true_m) / true_m if true_m > 0.0 else math.nan,
         ate_rmse_m=_rms(position_m),
         ate_max_m=float(position_m.max()),
         end_error_m=float(position_m[-1]),
-        rpe_translation_rmse_m=_rms(np.linalg.norm(steps[:, :3, 3], axis=1)),
-        rpe_rotation_rmse_rad=_rms(np.linalg.norm(se3.rotation_log(steps[:, :3, :3]), axis=1)),
+        rpe_translation_rmse_m=_rms(np.linalg.norm(step_xyz, axis=1)),
+        rpe_rotation_rmse_rad=_rms(np.linalg.norm(se3.rotation_log(step_R), axis=1)),
         heading_rmse_rad=_rms(heading_rad),
         heading_max_rad=float(np.abs(heading_rad).max()),
         heading_end_rad=float(heading_rad[-1]),
@@ -126,41 +128,36 @@ def _metrics(T_est: NDArray[np.float64], scale: float, T_true: NDArray[np.float6
     )
 
 
-def _steps(T: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the motions T_i_next (N-1, 4, 4) between consecutive poses."""
-    return se3.inverse(T[:-1]) @ T[1:]
-
-
-def _length_m(T: NDArray[np.float64]) -> float:
-    return float(np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1).sum())
-
-
-def _rms(values: NDArray[np.float64]) -> float:
+def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
+
+
+def rotation_between(a: Array, b: Array) -> tuple[Array, Array]:
+    """Return the rotation R (3, 3) with b = R a for vectors (N, 3), by least squares, and how far it is determined.
+
+    Kabsch's method: the second result (3,) holds the singular values of the covariance of both, the largest first, with
+    the sign of the reflection that was excluded.
+    """
+    U, spread, Vt = np.linalg.svd(b.T @ a / len(a))
+    signs = np.sign([1.0, 1.0, np.linalg.det(U @ Vt)])
+    return np.asarray(U * signs @ Vt), spread * signs
 
 
 def aligned(T_est: Array, T_true: Array, alignment: str) -> tuple[Array, float]:
     """Return the estimates (N, 4, 4) in the world of the truth, row by row at the same times, and their scale.
 
     alignment: "origin": the first poses agree; "rigid": the positions agree best (least squares); "scale": these after
-    the estimate is scaled as well. Raise OmnidError for a path that is straight or shorter than three poses, which
-    determines no rotation.
+    the estimate is scaled as well (Umeyama 1991). Raise OmnidError for a path that is straight or shorter than three
+    poses, which determines no rotation.
     """
     if alignment == "origin":
         return np.asarray(T_true[0] @ se3.inverse(T_est[0]) @ T_est), 1.0
-    estimate, truth = T_est[:, :3, 3], T_true[:, :3, 3]
-    middle_est, middle_true = estimate.mean(axis=0), truth.mean(axis=0)
-    covariance = (truth - middle_true).T @ (estimate - middle_est) / len(truth)
-    U, spread, Vt = np.linalg.svd(covariance)
-    if len(truth) < 3 or spread[1] <= _LEAST_SPREAD**2 * spread[0]:
+    (est_R, est_xyz), (_, true_xyz) = parts(T_est), parts(T_true)
+    from_middle = est_xyz - est_xyz.mean(axis=0)
+    R, spread = rotation_between(from_middle, true_xyz - true_xyz.mean(axis=0))
+    if len(T_true) <= 2 or spread[1] <= _LEAST_SPREAD**2 * spread[0]:
         raise OmnidError(
             f"--align {alignment}: the associated positions lie on a line and determine no rotation; use --align origin"
         )
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
-    R = U * signs @ Vt
-    variance = float(((estimate - middle_est) ** 2).sum() / len(truth))
-    scale = float(spread @ signs) / variance if alignment == "scale" else 1.0
-    T = T_est.copy()
-    T[:, :3, :3] = R @ T_est[:, :3, :3]
-    T[:, :3, 3] = scale * (estimate - middle_est) @ R.T + middle_true
-    return T, scale
+    scale = float(spread.sum() / np.square(from_middle).sum(axis=1).mean()) if alignment == "scale" else 1.0
+    return se3.transform(R @ est_R, scale * from_middle @ R.T + true_xyz.mean(axis=0)), scale
