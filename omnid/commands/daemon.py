@@ -119,7 +119,7 @@ def _run_log(args: argparse.Namespace, config: Config) -> int:
 
 
 @command(
-    option("world", help="room, corridor, building, hall, a file *.toml, or another name (docs/drive.md)"),
+    option("world", help="room, corridor, building, hall, office, clutter, door_80, person_passes, or a file *.toml"),
     option("--seed", type=int, default=1, help="of textures and noise; default %(default)s"),
     option("--rig", type=Path, help="the rig.toml of the cameras; default: a straight rig"),
     option("--size", type=int, default=512, metavar="PX", help="of the images without --rig; default %(default)s"),

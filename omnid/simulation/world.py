@@ -81,8 +81,6 @@ class World:
     panes: tuple[Rectangle, ...] = ()  # of glass: seen by what they mirror, and touched
     sun: tuple[SunPatch, ...] = ()
     lights: tuple[tuple[float, float], ...] = ()  # time [s] from which on a factor on all greys holds
-    way_m: float = 8.0  # that is free straight ahead of the start of a world like a building
-    goal: Pose | None = None  # x, y [m], heading [rad] from the start, where such a world has a place to drive to
 
     def light_at(self, time_s: float) -> float:
         """Return the factor on the grey of all images."""

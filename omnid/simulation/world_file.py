@@ -22,15 +22,15 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeAlias
 
 import numpy as np
 from msgspec import Meta, Struct
+from msgspec.structs import asdict
 
 from calib.models.camera import Array
 from calib.typed_toml import bytes_of, convert, table_of
 from omnid.errors import OmnidError
-from omnid.simulation.building_worlds import building_world
 from omnid.simulation.people import Person
 from omnid.simulation.rendering import textures
-from omnid.simulation.rendering.shapes import CEILING_M, Point, Random, box, painted, posters
-from omnid.simulation.rendering.surfaces import Rectangle
+from omnid.simulation.rendering.shapes import CEILING_M, Point, Random, box, painted, poster_paint, posters, solid
+from omnid.simulation.rendering.surfaces import Rectangle, Texture
 from omnid.simulation.world import World
 
 MAX_BYTES: Final = 1 << 18
@@ -75,10 +75,11 @@ class Wall(Struct, frozen=True):
 
 
 class Box(Struct, frozen=True):
-    """A box on the floor."""
+    """A box on the floor, or over it."""
 
     at: Point
     size_m: Size
+    bottom_m: Annotated[float, Meta(ge=0.0, le=20.0)] = 0.0  # over the floor
     yaw_deg: float = 0.0
     texture: Literal["brick", "plaster", "granite", "tiles", "plain", "white", "poster"] = "poster"
 
@@ -163,14 +164,7 @@ def shipped_worlds() -> list[str]:
 
 
 def load_world(name: str, seed: int = 0, options: WorldOptions | None = None) -> World:
-    """Return a shipped world or that of a file (a name that ends in .toml); raise OmnidError for wrong ones.
-
-    Other names are those of worlds like buildings (building_worlds.py).
-    """
-    options = options or WorldOptions()
-    if (made := building_world(name, seed)) is not None:
-        people = made.people if options.people else ()
-        return replace(made, people=people, brightness=made.brightness * options.brightness)
+    """Return a shipped world or that of a file (a name that ends in .toml); raise OmnidError for wrong ones."""
     try:
         if name in shipped_worlds():
             data = (files("omnid.simulation.worlds") / f"{name}.toml").read_bytes()
@@ -178,17 +172,15 @@ def load_world(name: str, seed: int = 0, options: WorldOptions | None = None) ->
             data = bytes_of(name, MAX_BYTES)
         else:
             raise OmnidError(
-                f"world {name!r} is not known; name a file *.toml, a world like a building "
-                f"(docs/drive.md), or one of {', '.join(shipped_worlds())}"
+                f"world {name!r} is not known; name a file *.toml, or one of {', '.join(shipped_worlds())}"
             )
-        return parse_world(data.decode(errors="surrogateescape"), name, seed, options)
+        return _painted_world(convert(WorldTable, table_of(data)), name, seed, options or WorldOptions())
     except ValueError as error:
         raise OmnidError(f"{name}: {error}") from None
 
 
-def parse_world(text: str, name: str, seed: int, options: WorldOptions) -> World:
-    """Return the world of a text; same text, seed and options, same world. Raises ValueError for a wrong text."""
-    world = convert(WorldTable, table_of(text.encode(errors="surrogateescape")))
+def _painted_world(world: WorldTable, name: str, seed: int, options: WorldOptions) -> World:
+    """Return the world of a table; same table, seed and options, same world. Raise ValueError for an impossible one."""
     space, (x_m, y_m, heading_deg) = world.space, world.start
     rng = np.random.default_rng([seed, 41])
     # 1. Refuse what cannot be, before textures are painted, which takes time and memory.
@@ -200,7 +192,7 @@ def parse_world(text: str, name: str, seed: int, options: WorldOptions) -> World
         surfaces += _wall(rng, wall, wall.height_below(space.ceiling_m))
     for entry in world.box:
         surfaces += _box(rng, entry)
-    people = tuple(_person(rng, walker) for walker in world.person)
+    people = tuple(_person(rng, walker) for walker in world.person)  # painted also where they are left out
     if options.other_posters:
         surfaces = _exchanged(surfaces, options)
     start = x_m, y_m, math.radians(heading_deg)
@@ -287,22 +279,17 @@ def _other_side(side: Rectangle) -> Rectangle:
 
 
 def _box(rng: Random, entry: Box) -> list[Rectangle]:
-    faces = box(rng, entry.at, entry.size_m, math.radians(entry.yaw_deg))
-    if entry.texture == "poster":
-        return faces
-    return [replace(face, texture=painted(rng, entry.texture, (face.width_m, face.height_m))) for face in faces]
+    def paint(sides_m: Point) -> Texture:
+        return painted(rng, entry.texture, sides_m)
+
+    at, yaw_rad = (*entry.at, entry.bottom_m), math.radians(entry.yaw_deg)
+    is_poster = entry.texture == "poster"
+    return solid(at, entry.size_m, yaw_rad, poster_paint(rng) if is_poster else paint, is_raised=entry.bottom_m > 0)
 
 
 def _person(rng: Random, walker: Walker) -> Person:
-    return Person(
-        tuple(box(rng, (0.0, 0.0), walker.size_m, 0.0)),
-        walker.path,
-        walker.speed_mps,
-        walker.repeat,
-        walker.start_s,
-        walker.starts_within_m,
-        walker.waits_within_m,
-    )
+    walk = asdict(walker)
+    return Person(tuple(box(rng, (0.0, 0.0), walk.pop("size_m"), 0.0)), **walk)
 
 
 def _exchanged(surfaces: list[Rectangle], options: WorldOptions) -> list[Rectangle]:

@@ -31,7 +31,6 @@ from numpy.typing import NDArray
 from omnid.config import load_config
 from omnid.core.control.heading_controller import Setpoint, wrap_angle
 from omnid.core.navigation.requests import GoalRequest, NavigationFrame
-from omnid.simulation.building_worlds import FLOORS
 from omnid.simulation.clearance import clearance_m, footprints
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun, simulate
 from omnid.simulation.people import Walkers
@@ -40,7 +39,8 @@ from omnid.simulation.robot import SimulatedRobot
 from tests.bench.fine_robot import BUILDS, USUAL, fine_robot
 from tests.bench.real_lenses import with_real_lenses
 from tests.bench.results import ROOT, Column, ResultTable, commit
-from tests.simulation.hazard_worlds import HARMLESS, HAZARDS, Trial, trial
+from tests.simulation.harmless_worlds import FLOORS, Trial
+from tests.simulation.hazard_worlds import HARMLESS, HAZARDS, trial
 from tests.simulation.photographs import with_photographs
 
 Array = NDArray[np.float64]

@@ -19,9 +19,7 @@ def test_a_drive_through_a_near_box_is_a_contact_and_has_a_row(
 ) -> None:
     monkeypatch.setenv("OMNID_RESULTS", str(tmp_path))
     asked, robot = obstacles.prepared(NEAR)
-    monkeypatch.setattr(
-        obstacles, "prepared", lambda planned: (replace(asked, world=replace(asked.world, way_m=0.8)), robot)
-    )
+    monkeypatch.setattr(obstacles, "prepared", lambda planned: (replace(asked, way_m=0.8), robot))
     made = obstacles.drive(NEAR)
     assert made.own == made.contacts >= 1 and made.clearance_m < -0.1
     assert 0.76 < made.driven_m < 1.0 and not made.ended and made.pairs > 25

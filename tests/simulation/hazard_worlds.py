@@ -8,16 +8,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 
-from drivers.motors.simulated.simulated_base import Pose
 from omnid.errors import OmnidError
-from omnid.simulation import building_worlds
-from omnid.simulation.building_parts import (
+from omnid.simulation.people import Person, moved
+from omnid.simulation.rendering.shapes import Paint, Point, painted, solid
+from omnid.simulation.rendering.surfaces import Rectangle
+from omnid.simulation.robot import Push, Slip, WheelErrors
+from omnid.simulation.world import Ground
+from tests.simulation import harmless_worlds
+from tests.simulation.building_parts import (
     BEHIND_M,
     THING_PX_PER_M,
     Builder,
@@ -30,57 +34,18 @@ from omnid.simulation.building_parts import (
     put_thing,
     trolley,
 )
-from omnid.simulation.building_worlds import Makers, building_world, built, made
-from omnid.simulation.people import Person, moved
-from omnid.simulation.rendering.ray_caster import AS_NEEDED
-from omnid.simulation.rendering.sensor import Sensor
-from omnid.simulation.rendering.shapes import Paint, Point, painted, solid
-from omnid.simulation.rendering.surfaces import Rectangle
-from omnid.simulation.robot import Push, SimulatedRobot, Slip, WheelErrors, make_robot
-from omnid.simulation.world import Ground, World
+from tests.simulation.harmless_worlds import Makers, Trial, built, made
 
 PRINTED: Final = ("box", "low_box", "block", "shelf", "drawer", "table")  # things with pictures on them
 LENGTH_M: Final = 12.0
 WALKER_MPS: Final = 0.5  # of the robot whose way people cross
-SENSOR: Final = Sensor(vignette=0.25, flicker=0.005, is_compressed=True)
-
-
-@dataclass(frozen=True, slots=True)
-class Trial:
-    """A world, the robot in it, and what is asked: the way straight on, or the goal of the world.
-
-    At a hazard, `things` and the edges of the floor are what must not be touched, and may end the way.
-    """
-
-    world: World
-    things: tuple[Rectangle, ...] | None = None  # None: nothing is in the way
-    motion: Literal["ahead", "back", "turn left", "at random"] = "ahead"  # that is asked for
-    changes: tuple[tuple[str, object], ...] = ()  # of fields of the robot
-
-    @property
-    def way_m(self) -> float:
-        """The way that is asked for straight on."""
-        return self.world.way_m
-
-    @property
-    def goal(self) -> Pose | None:
-        """The goal: x, y [m], heading [rad] in odom, which begins at the start."""
-        return self.world.goal
-
-    def robot(self, size_px: int = 512) -> SimulatedRobot:
-        """Return the robot, with images of a size that come as JPEG from a lens with vignetting."""
-        usual = replace(make_robot(size_px), sensor=SENSOR, samples=AS_NEEDED)
-        return replace(usual, **dict(self.changes))  # type: ignore[arg-type]
 
 
 def trial(name: str, seed: int, floor: str | None = None) -> Trial:
-    """Return the trial of a name: same name and seed, same world; floor: another one of building_worlds.FLOORS."""
-    if (world := building_world(name, seed, floor)) is not None:
-        return Trial(world)
-    found = made(MAKERS, name, seed, floor)
-    if found is None:
+    """Return the trial of a name: same name and seed, same world; floor: another one of FLOORS."""
+    if (found := made(MAKERS, name, seed, floor)) is None:
         raise OmnidError(f"world {name!r} is not known; the worlds are {', '.join((*HARMLESS, *HAZARDS))}")
-    return replace(found, world=replace(found.world, name=name))
+    return found
 
 
 # Things on the floor, or over it, from the middle of what is in the way: their parts, each drawn by `u` from a range,
@@ -260,7 +225,7 @@ def _steep_ramp(b: Builder) -> Trial:
     for a, c in (((at_m, 1.2), (LENGTH_M, 1.2)), ((LENGTH_M, -1.2), (at_m, -1.2)), ((LENGTH_M, 1.2), (LENGTH_M, -1.2))):
         b.upright(a, c, (-down_m, 0.0), b.wall_grey)
     ground = Ground(((at_m, 0.0), (at_m + 2.0, -down_m)))
-    return Trial(built(b, ground=ground, way_m=at_m + 3.0), things=())
+    return Trial(built(b, ground=ground), things=(), way_m=at_m + 3.0)
 
 
 def _white_wall(b: Builder) -> Trial:
@@ -446,15 +411,16 @@ USUAL: Final = WheelErrors()
 CROSSING: Final = ("straight", "diagonally", "like_the_floor", "two", "from_a_door", "turns_round")
 NEAR: Final = ("white_pole", "textured_pole", "box", "person")
 ALL_THINGS: Final = (*THINGS, "trolley")
-# Worlds in which nothing is in the way, but for those of building_worlds.
-OF_ROBOT: Final[Makers[Trial]] = {
+# Worlds in which nothing is in the way, but for those of harmless_worlds.
+OF_ROBOT: Final[Makers] = {
     "lean_1deg": (None, partial(_robot, lean_rad=(0.0, math.radians(1.0)))),
     "pushed": (None, partial(_robot, pushes=(Push(5.0, 5.5, 0.3, 0.15), Push(11.0, 11.5, -0.3, -0.15)))),
     "slip_20": (None, partial(_robot, wheels=WheelErrors(slips=(Slip(5.0, 7.0, 0.2), Slip(12.0, 14.0, 0.2))))),
     "slip_40": (None, partial(_robot, wheels=WheelErrors(slips=(Slip(8.0, 10.0, 0.4),)))),
     "weak_motor": (None, partial(_robot, wheels=replace(USUAL, left=USUAL.left - 0.08))),
 }
-MAKERS: Final[Makers[Trial]] = {
+MAKERS: Final[Makers] = {
+    **harmless_worlds.MAKERS,
     **OF_ROBOT,
     rf"(plain_|)({'|'.join(ALL_THINGS)})": (None, _thing),
     r"(pole|box|leg|edge)_(\d+)percent": ("linoleum", _contrast),
@@ -473,7 +439,7 @@ MAKERS: Final[Makers[Trial]] = {
     rf"near_({'|'.join(NEAR)})_(ahead|behind|beside)": (None, _near),
     r"room_(of_things|with_people|at_an_edge)": (None, _room),
 }
-HARMLESS: Final = (*building_worlds.NAMES, *OF_ROBOT)
+HARMLESS: Final = (*harmless_worlds.NAMES, *OF_ROBOT)
 HAZARDS: Final = (
     *ALL_THINGS,
     *(f"plain_{name}" for name in ALL_THINGS),

@@ -19,8 +19,13 @@ Paint = Callable[[Point], Texture]  # of a face, by its sides [m]
 
 def painted(rng: Random, kind: str, size_m: Point, px_per_m: float = PX_PER_M) -> Texture:
     """Return a texture of a kind (textures.PAINTERS) for a surface of the given size [m]."""
-    size = (max(8, round(size_m[0] * px_per_m)), max(8, round(size_m[1] * px_per_m)))
-    return textures.PAINTERS[kind](rng, size, px_per_m)
+    return textures.PAINTERS[kind](rng, pixels_of(size_m, px_per_m), px_per_m)
+
+
+def pixels_of(sides_m: Point, px_per_m: float) -> textures.Size:
+    """Return the width and height [px] of the texture of a surface, at least 8 px each."""
+    width, height = (max(8, round(side_m * px_per_m)) for side_m in sides_m)
+    return width, height
 
 
 def posters(rng: Random, on: Rectangle, count: int, first: int = 0) -> list[Rectangle]:
@@ -38,7 +43,7 @@ def posters(rng: Random, on: Rectangle, count: int, first: int = 0) -> list[Rect
 
 def box(rng: Random, centre: Point, size_m: tuple[float, float, float], yaw_rad: float) -> list[Rectangle]:
     """Return a box on the floor: four sides and the top, each with a texture of its own."""
-    return solid((*centre, 0.0), size_m, yaw_rad, lambda sides: _face(rng, sides), is_raised=False)
+    return solid((*centre, 0.0), size_m, yaw_rad, poster_paint(rng), is_raised=False)
 
 
 def solid(
@@ -64,6 +69,6 @@ def _length(edge: Array) -> float:
     return float(np.linalg.norm(edge))
 
 
-def _face(rng: Random, sides_m: Point) -> Texture:
-    width, height = (max(8, round(side_m * PX_PER_M)) for side_m in sides_m)
-    return textures.poster(rng, (width, height))
+def poster_paint(rng: Random, px_per_m: float = PX_PER_M) -> Paint:
+    """Return what paints a face as a printed page, a drawing or a photograph."""
+    return lambda sides_m: textures.poster(rng, pixels_of(sides_m, px_per_m))

@@ -53,6 +53,8 @@ def test_walls_have_doors_and_boxes_have_outlines(tmp_path: Path) -> None:
     assert clearance_m(segments, (2.0, 0.8), 0.2) == pytest.approx(-0.2)  # in the wall
     assert clearance_m(segments, (0.0, 0.0), 0.2) == pytest.approx(0.7)
     assert clearance_m(footprints(world.standing, 2.5), (2.0, 0.05), 0.2) == pytest.approx(-0.2)  # the lintel
+    raised = load_world(write(tmp_path, HALL.replace("[0.4, 0.2, 0.5]", "[0.4, 0.2, 0.5]\nbottom_m = 1.3")), 1)
+    assert clearance_m(footprints(raised.standing, 1.2), (0.0, 1.0), 0.2) > 0.5  # below the box
 
 
 @pytest.mark.parametrize("name", shipped_worlds())
@@ -94,7 +96,7 @@ def test_wrong_worlds_are_refused(tmp_path: Path, old: str, new: str, message: s
 
 
 def test_unknown_worlds_and_options_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(OmnidError, match=r"world 'castle' is not known; name a file \*.toml, .* or one of .*room"):
+    with pytest.raises(OmnidError, match=r"world 'castle' is not known; name a file \*.toml, or one of .*room"):
         load_world("castle", 1)
     with pytest.raises(OmnidError, match="cannot be read"):
         load_world(str(tmp_path / "none.toml"), 1)

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 from omnid.errors import OmnidError
-from omnid.simulation.building_worlds import FLOORS, NAMES, building_world, can_drive
 from omnid.simulation.clearance import clearance_m, footprints, obstacles_of
 from omnid.simulation.rendering.shapes import box
 from omnid.simulation.rendering.surfaces import Rectangle
-from omnid.simulation.world_file import load_world
 from tests.bench.open_loop import ranges_m
+from tests.simulation.harmless_worlds import FLOORS, NAMES, can_drive
 from tests.simulation.hazard_worlds import HAZARDS, OF_ROBOT, trial
 
 ROBOT_M = 0.2, 1.2  # radius and height
@@ -47,11 +46,10 @@ def test_something_is_in_the_way_of_hazards(name: str) -> None:
 
 
 def test_unknown_names_are_refused_and_floors_can_be_exchanged() -> None:
-    assert building_world("plain_box", 1) is None and building_world("ramp_x", 1) is None
     with pytest.raises(OmnidError, match=r"world 'sofa_10percent' is not known"):
         trial("sofa_10percent", 1)
-    on_carpet, own = (building_world("lift_gap", 1, floor) for floor in ("carpet", None))
-    assert on_carpet is not None and own is not None and on_carpet.name == "lift_gap"
+    on_carpet, own = (trial("lift_gap", 1, floor).world for floor in ("carpet", None))
+    assert on_carpet.name == "lift_gap"
     assert not np.array_equal(on_carpet.standing[0].texture, own.standing[0].texture)
 
 
@@ -66,7 +64,7 @@ def test_a_thing_of_a_contrast_has_it_in_the_image(percent: int) -> None:
 
 
 def test_a_ramp_lifts_and_pitches_the_base() -> None:
-    ground = load_world("ramp_5", 1).ground
+    ground = trial("ramp_5", 1).world.ground
     middle_m = float(np.mean([x_m for x_m, _ in ground.profile]))
     for heading_rad, sign in ((0.0, 1), (math.pi, -1)):
         T = ground.T_world_base((middle_m, 0.0, heading_rad))

@@ -1,7 +1,7 @@
-"""Worlds like buildings, in which nothing is in the way of what is asked: `building_world(name, seed)`.
+"""Trials in worlds like buildings in which nothing is in the way of what is asked.
 
 A corridor or hall is along x, and the robot starts at the origin. Whatever floor, light and people do, the way straight
-on is free (`World.way_m`), or a way leads to the goal (`World.goal`).
+on is free (`Trial.way_m`), or a way leads to the goal (`Trial.goal`).
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ import math
 import re
 import zlib
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
-from typing import Final, TypeAlias, TypeVar
+from typing import Final, Literal, TypeAlias
 
 import cv2
 import numpy as np
@@ -21,7 +21,15 @@ import numpy as np
 from calib.models.camera import Array
 from drivers.motors.simulated.simulated_base import Pose
 from omnid.errors import OmnidError
-from omnid.simulation.building_parts import (
+from omnid.simulation.clearance import obstacles_of
+from omnid.simulation.people import Person
+from omnid.simulation.rendering.ray_caster import AS_NEEDED
+from omnid.simulation.rendering.sensor import Sensor
+from omnid.simulation.rendering.shapes import Point
+from omnid.simulation.rendering.surfaces import Rectangle
+from omnid.simulation.robot import SimulatedRobot, make_robot
+from omnid.simulation.world import Ground, SunPatch, World
+from tests.simulation.building_parts import (
     BEHIND_M,
     Builder,
     Opening,
@@ -31,10 +39,6 @@ from omnid.simulation.building_parts import (
     put_thing,
     trolley,
 )
-from omnid.simulation.clearance import obstacles_of
-from omnid.simulation.people import Person
-from omnid.simulation.rendering.shapes import Point
-from omnid.simulation.world import Ground, SunPatch, World
 
 # Names of floors, with the kinds of their textures.
 FLOORS: Final = {
@@ -52,24 +56,44 @@ FLOORS: Final = {
 PATTERNED: Final = ("marbled", "carpet", "parquet_across")  # floors of worlds in which something else is tried
 FREE_M: Final = 0.36  # from the middle of a base to what stands beside a way that it can surely drive
 CELL_M: Final = 0.05
-T = TypeVar("T")
-# By a pattern of names: the kind of the floor, None: one with a pattern, and what makes the world of a match.
-Makers: TypeAlias = Mapping[str, tuple[str | None, Callable[..., T]]]
+SENSOR: Final = Sensor(vignette=0.25, flicker=0.005, is_compressed=True)
 
 
-def building_world(name: str, seed: int, floor: str | None = None) -> World | None:
-    """Return the world of a name; None: there is none. Same name and seed, same world; floor: another one of FLOORS."""
-    world = made(MAKERS, name, seed, floor)
-    return None if world is None else replace(world, name=name)
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """A world, the robot in it, and what is asked: the way straight on, or the goal.
+
+    At a hazard, `things` and the edges of the floor are what must not be touched, and may end the way.
+    """
+
+    world: World
+    things: tuple[Rectangle, ...] | None = None  # None: nothing is in the way
+    motion: Literal["ahead", "back", "turn left", "at random"] = "ahead"  # that is asked for
+    changes: tuple[tuple[str, object], ...] = ()  # of fields of the robot
+    way_m: float = 8.0  # that is asked for straight on
+    goal: Pose | None = None  # x, y [m], heading [rad] in odom, which begins at the start
+
+    def robot(self, size_px: int = 512) -> SimulatedRobot:
+        """Return the robot, with images of a size that come as JPEG from a lens with vignetting."""
+        usual = replace(make_robot(size_px), sensor=SENSOR, samples=AS_NEEDED)
+        return replace(usual, **dict(self.changes))  # type: ignore[arg-type]
 
 
-def made(makers: Makers[T], name: str, seed: int, floor: str | None = None) -> T | None:
-    """Return what the first maker whose pattern fits a name makes; None: there is none."""
+# By a pattern of names: the kind of the floor, None: one with a pattern, and what makes the trial of a match.
+Makers: TypeAlias = Mapping[str, tuple[str | None, Callable[..., Trial]]]
+
+
+def made(makers: Makers, name: str, seed: int, floor: str | None = None) -> Trial | None:
+    """Return what the first maker whose pattern fits a name makes; None: there is none.
+
+    Same name and seed, same world; floor: another one of FLOORS.
+    """
     for pattern, (kind, make) in makers.items():
         if found := re.fullmatch(pattern, name):
             rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
             kind = kind or str(rng.choice(PATTERNED))
-            return make(Builder(rng, kind if floor is None else FLOORS[floor]), *found.groups())
+            asked = make(Builder(rng, kind if floor is None else FLOORS[floor]), *found.groups())
+            return replace(asked, world=replace(asked.world, name=name))
     return None
 
 
@@ -82,23 +106,23 @@ def built(b: Builder, **fields: object) -> World:
 # Straight on
 
 
-def _floor(b: Builder, *, in_hall: bool = False) -> World:
+def _floor(b: Builder, *, in_hall: bool = False) -> Trial:
     (hall if in_hall else corridor)(b)
-    return built(b)
+    return Trial(built(b))
 
 
-def _polished_corridor(b: Builder) -> World:
+def _polished_corridor(b: Builder) -> Trial:
     """Windows in one wall, which the floor mirrors."""
     b.space((-BEHIND_M, -0.9), (12.0, 0.9), doors=3, windows=5)
-    return built(b)
+    return Trial(built(b))
 
 
-def _lights(b: Builder, *lights: Point) -> World:
+def _lights(b: Builder, *lights: Point) -> Trial:
     corridor(b)
-    return built(b, lights=lights)
+    return Trial(built(b, lights=lights))
 
 
-def _ramp(b: Builder, degrees: str) -> World:
+def _ramp(b: Builder, degrees: str) -> Trial:
     """A level metre, a ramp up, and a landing."""
     slope, begin_m, long_m = math.tan(math.radians(float(degrees))), b.rng.uniform(1.4, 2.0), 4.0
     top_m, low, high = slope * long_m, (-BEHIND_M, -0.9), (11.0, 0.9)
@@ -108,10 +132,10 @@ def _ramp(b: Builder, degrees: str) -> World:
     b.floor((begin_m + long_m, low[1]), high, (top_m, top_m))
     b.ceiling(low, high)
     b.room(low, high, doors=0, pictures=4)
-    return built(b, ground=Ground(((begin_m, 0.0), (begin_m + long_m, top_m))), way_m=7.0)
+    return Trial(built(b, ground=Ground(((begin_m, 0.0), (begin_m + long_m, top_m)))), way_m=7.0)
 
 
-def _lift_gap(b: Builder) -> World:
+def _lift_gap(b: Builder) -> Trial:
     """A corridor that ends at a lift, whose floor is another one beyond a gap of 2 cm."""
     at_m, low = b.rng.uniform(1.6, 2.2), (-BEHIND_M, -0.9)
     end_m = at_m + 2.3
@@ -127,43 +151,43 @@ def _lift_gap(b: Builder) -> World:
     corners = ((at_m, 0.8), (end_m, 0.8), (end_m, -0.8), (at_m, -0.8))
     for a, c in pairwise(corners):
         b.wall(a, c, skirting=False, grey=150.0)
-    return built(b, way_m=at_m + 1.0)
+    return Trial(built(b), way_m=at_m + 1.0)
 
 
-def _door_step(b: Builder, height_cm: str) -> World:
+def _door_step(b: Builder, height_cm: str) -> Trial:
     """A sill across the way."""
     corridor(b)
     at_m, high_m = b.rng.uniform(1.8, 2.6), float(height_cm) / 100
     b.thing([(0.0, 0.0, 0.0, 0.12, 1.9, high_m)], (at_m, 0.0), 0.0, plain_paint(b.rng, 150.0, 2.0), "floor")
     profile = ((at_m - 0.06, 0.0), (at_m - 0.06, high_m), (at_m + 0.06, high_m), (at_m + 0.06, 0.0))
-    return built(b, ground=Ground(profile))
+    return Trial(built(b, ground=Ground(profile)))
 
 
-def _sun_moving(b: Builder) -> World:
+def _sun_moving(b: Builder) -> Trial:
     b.space((-BEHIND_M, -1.0), (12.0, 1.0), doors=2, windows=5)
     sun = []
     for x_m in np.arange(1.5, 10.0, 2.4):
         at, yaw_rad = (x_m, b.rng.uniform(-0.4, 0.6)), b.rng.uniform(-0.4, 0.4)
         sun.append(SunPatch(at, (1.3, 0.8), yaw_rad, (b.rng.uniform(-0.06, 0.06), 0.02), 0.7))
-    return built(b, sun=tuple(sun))
+    return Trial(built(b, sun=tuple(sun)))
 
 
-def _trolley_leaves(b: Builder) -> World:
+def _trolley_leaves(b: Builder) -> Trial:
     """A trolley stands in the way; after a while it is pulled on."""
     _, high = corridor(b, width_m=2.0, length_m=20.0)
     first = len(b.faces)
     b.thing(trolley(b), (0.0, 0.0), 0.0, plain_paint(b.rng, b.rng.uniform(60, 170), 3.0))
     cart, b.faces = tuple(b.faces[first:]), b.faces[:first]
     path = ((2.2, 0.0), (high[0] - 1.2, 0.0))
-    return built(b, people=(Person(cart, path, 0.9, start_s=b.rng.uniform(9.0, 11.0)),))
+    return Trial(built(b, people=(Person(cart, path, 0.9, start_s=b.rng.uniform(9.0, 11.0)),)))
 
 
-def _person_passes(b: Builder) -> World:
+def _person_passes(b: Builder) -> Trial:
     """Somebody comes towards the robot, and passes it."""
     corridor(b, width_m=3.0)
     side = float(b.rng.choice([-1, 1]))
     path = ((9.0, side * 0.95), (-1.5, side * 0.95))
-    return built(b, people=(Person(b.adult(), path, b.rng.uniform(0.9, 1.2), start_s=3.0),))
+    return Trial(built(b, people=(Person(b.adult(), path, b.rng.uniform(0.9, 1.2), start_s=3.0),)))
 
 
 # To a goal
@@ -179,13 +203,14 @@ def _two_rooms(b: Builder, door_m: float, at_y_m: float) -> float:
     return x_m
 
 
-def _door(b: Builder, aslant: str) -> World:
+def _door(b: Builder, aslant: str) -> Trial:
     """A door of 0.8 m, straight ahead or 30 degrees aside."""
     door_y_m = 0.0 if not aslant else float(b.rng.choice([-1, 1])) * math.tan(math.radians(30.0)) * 2.0
-    return built(b, goal=(_two_rooms(b, 0.8, door_y_m) + 1.8, door_y_m, 0.0))
+    wall_m = _two_rooms(b, 0.8, door_y_m)
+    return Trial(built(b), goal=(wall_m + 1.8, door_y_m, 0.0))
 
 
-def _office(b: Builder) -> World:
+def _office(b: Builder) -> Trial:
     """Desks with star-legged chairs along both walls, and one chair on the way."""
     b.space((-1.4, -2.2), (6.2, 2.4), doors=1, windows=3, pictures=2)
     b.thing([(0.0, 0.0, 0.0, 0.28, 0.28, 0.33)], (0.4, -1.8), 0.0, plain_paint(b.rng, 60.0))
@@ -201,7 +226,7 @@ def _office(b: Builder) -> World:
     return _with_a_way(b, (5.2, 0.2, 0.0), put)
 
 
-def _clutter(b: Builder) -> World:
+def _clutter(b: Builder) -> Trial:
     """A room full of things, through which a way is left."""
     b.space((-1.4, -2.4), (5.6, 2.4), doors=1, windows=2, pictures=1)
 
@@ -216,14 +241,14 @@ def _clutter(b: Builder) -> World:
     return _with_a_way(b, (4.6, float(b.rng.uniform(-1.0, 1.0)), 0.0), put)
 
 
-def _with_a_way(b: Builder, goal: Pose, put: Callable[[], None]) -> World:
-    """Return the world with things put at random, again and again until a way leads to the goal."""
+def _with_a_way(b: Builder, goal: Pose, put: Callable[[], None]) -> Trial:
+    """Return the trial with things put at random, again and again until a way leads to the goal."""
     empty = len(b.faces)
     for _ in range(200):
         put()
-        world = built(b, goal=goal)
+        world = built(b)
         if can_drive(obstacles_of(world, 1.2), (0.0, 0.0), goal[:2]):
-            return world
+            return Trial(world, goal=goal)
         del b.faces[empty:]
     raise OmnidError("no way leads through what was put here 200 times; take another seed")
 
@@ -242,7 +267,7 @@ def can_drive(segments: Array, start: Point, goal: Point) -> bool:
     return bool(at[0] and at[0] == at[1])
 
 
-def _dead_end_and_back(b: Builder) -> World:
+def _dead_end_and_back(b: Builder) -> Trial:
     """The robot stands in a dead end 1.2 m wide, nose to its end; the goal is in the corridor outside, aside."""
     left_m, end_m, top_m = -3.2, 0.75, 3.6
     b.floor((left_m, -1.6), (end_m, top_m))
@@ -251,19 +276,19 @@ def _dead_end_and_back(b: Builder) -> World:
     corners = ((-1.4, 0.6), (end_m, 0.6), (end_m, -0.6), (left_m, -0.6), (left_m, top_m), (-1.4, top_m), (-1.4, 0.6))
     for a, c in pairwise(corners):
         b.wall(a, c, doors=int(math.dist(a, c) > 2.0), pictures=int(math.dist(a, c) > 2.0))
-    return built(b, goal=(-2.3, 2.6, math.pi / 2))
+    return Trial(built(b), goal=(-2.3, 2.6, math.pi / 2))
 
 
-def _doorway_with_person(b: Builder) -> World:
+def _doorway_with_person(b: Builder) -> Trial:
     """Somebody stands in a door of 0.9 m, sees the robot come, and walks on into its room, and aside."""
     x_m = _two_rooms(b, 0.9, 0.0)
     aside_m = float(b.rng.choice([-1, 1])) * 1.4
     path = ((x_m + 0.1, 0.0), (x_m - 0.5, aside_m * 0.5), (x_m - 0.7, aside_m))
     walker = Person(b.adult(), path, 0.8, start_s=b.rng.uniform(7.0, 9.0))
-    return built(b, people=(walker,), goal=(x_m + 1.8, 0.0, 0.0))
+    return Trial(built(b, people=(walker,)), goal=(x_m + 1.8, 0.0, 0.0))
 
 
-MAKERS: Final[Makers[World]] = {
+MAKERS: Final[Makers] = {
     **{name: (kind, _floor) for name, kind in FLOORS.items() if name != "polished"},
     "polished": ("slabs", _polished_corridor),
     **{f"{name}_hall": (kind, partial(_floor, in_hall=True)) for name, kind in FLOORS.items()},
