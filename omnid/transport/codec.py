@@ -1,6 +1,7 @@
 """Messages of the bus and of recordings: types of ROS 2 (Humble) as CDR bytes, by rosbags, both ways.
 
-Types of rosbags stay in this file. Arrays are in SI units and not to be written to; p_a = T_a_b @ p_b; covariances are
+A message is encoded from the values of its fields, in the order of its definition; a message among them is the tuple of
+its own fields. Arrays are in SI units and not to be written to; p_a = T_a_b @ p_b; covariances are
 in the order x y z rx ry rz, row-major (nav_msgs/msg/Odometry). Attachments of zenoh are JSON with what a message has no
 field for. Bytes that are decoded may be anything: all decoders raise OmnidError for those that are no such message.
 Encoders raise it for a stamp that is no ROS time.
@@ -15,17 +16,17 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cache
 from struct import calcsize
-from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple, Protocol, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from calib import se3
 from omnid.errors import OmnidError
-from omnid.transport import ros_types as ros
 
 if TYPE_CHECKING:
     from omnid.core.obstacles.moving_tracker import MovingObstacle
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Frames = tuple[str, str]
+Values: TypeAlias = tuple[object, ...]  # of the fields of a message
 ODOMETRY_SCHEMA = "nav_msgs/msg/Odometry"
 IMU_SCHEMA = "sensor_msgs/msg/Imu"
 JOINT_SCHEMA = "sensor_msgs/msg/JointState"
@@ -42,6 +44,7 @@ TRANSFORM_SCHEMA = "tf2_msgs/msg/TFMessage"
 POINT_CLOUD_SCHEMA = "sensor_msgs/msg/PointCloud2"
 DIAGNOSTICS_SCHEMA = "diagnostic_msgs/msg/DiagnosticArray"
 TWIST_SCHEMA = "geometry_msgs/msg/TwistStamped"
+PLAIN_TWIST_SCHEMA = "geometry_msgs/msg/Twist"
 VECTOR_SCHEMA = "geometry_msgs/msg/Vector3Stamped"
 GRID_SCHEMA = "nav_msgs/msg/OccupancyGrid"
 HEADER_SCHEMA = "std_msgs/msg/Header"
@@ -56,14 +59,6 @@ NS_PER_S = 1_000_000_000
 # makes, and less than a quaternion of zeros or one that was scaled.
 QUATERNION_TOLERANCE = 1e-3
 
-
-class RosMessage(Protocol):
-    """A message in the type of rosbags."""
-
-    __msgtype__: ClassVar[str]  # such as "nav_msgs/msg/Odometry"
-
-
-M = TypeVar("M", bound=RosMessage)
 
 # Bytes, stamps and geometry.
 
@@ -80,58 +75,74 @@ def compile_serialisers(schemas: Iterable[str]) -> None:
         _typestore().get_msgdef(schema)
 
 
-def message_cdr(message: RosMessage) -> bytes:
-    """Encode a message in the type of rosbags."""
-    return bytes(_typestore().serialize_cdr(message, message.__msgtype__))
+def encoded(schema: str, *values: object) -> bytes:
+    """Return the CDR bytes of a message, such as encoded("std_msgs/msg/Header", (2, 500), "odom")."""
+    return bytes(_typestore().serialize_cdr(_message(schema, values), schema))
 
 
-def message_from_cdr(payload: bytes, kind: type[M]) -> M:
-    """Decode a message into a type of rosbags."""
-    schema = kind.__msgtype__
+@cache
+def _parts(schema: str) -> tuple[tuple[bool, str], ...]:
+    """Return for each field of a message whether it is a list of messages, and their type; "" for another field."""
+    parts = []
+    kind: Any  # of a field: a type, or a sequence or an array of one type and its length
+    for _, kind in _typestore().fielddefs[schema][1]:
+        is_list = kind[0] in (Nodetype.SEQUENCE, Nodetype.ARRAY)
+        node, content = kind[1][0] if is_list else kind
+        parts.append((is_list, content if node == Nodetype.NAME else ""))
+    return tuple(parts)
+
+
+def _message(schema: str, values: Any) -> Any:
+    """Return a message in the type of rosbags."""
+    fields: list[Any] = [
+        value if not part else [_message(part, one) for one in value] if is_list else _message(part, value)
+        for value, (is_list, part) in zip(values, _parts(schema), strict=True)
+    ]
+    return _typestore().types[schema](*fields)
+
+
+def decoded(payload: bytes, schema: str) -> Any:
+    """Return a message in the type of rosbags."""
     try:
-        message = _typestore().deserialize_cdr(bytes(payload), schema)
+        return _typestore().deserialize_cdr(bytes(payload), schema)
     except SerdeError as error:
         raise OmnidError(f"{len(payload)} bytes are not a {schema} in CDR ({error}); check the sender") from error
-    assert isinstance(message, kind)
-    return message
 
 
-def time_message(stamp_ns: int) -> ros.builtin_interfaces__msg__Time:
-    """Return a stamp."""
+def ros_time(stamp_ns: int) -> tuple[int, int]:
+    """Return the fields of a Time: seconds and nanoseconds."""
     seconds, nanoseconds = divmod(int(stamp_ns), NS_PER_S)
     if not 0 <= seconds < 1 << 31:  # an int32
         raise OmnidError(f"stamp {stamp_ns} ns does not fit a ROS time (1970 to 2038); give nanoseconds of Unix time")
-    return ros.builtin_interfaces__msg__Time(seconds, nanoseconds)
+    return seconds, nanoseconds
 
 
-def header_message(stamp_ns: int, frame: str) -> ros.std_msgs__msg__Header:
-    """Return a header."""
-    return ros.std_msgs__msg__Header(time_message(stamp_ns), frame)
+def header(stamp_ns: int, frame: str) -> Values:
+    """Return the fields of a Header."""
+    return ros_time(stamp_ns), frame
 
 
-def _stamp_ns(header: ros.std_msgs__msg__Header) -> int:
-    """Return a stamp that may be invalid; those who rely on it check it."""
-    return int(header.stamp.sec) * NS_PER_S + int(header.stamp.nanosec)
+def _stamp_ns(message: Any) -> int:
+    """Return the stamp of a message with a header, which may be invalid; those who rely on it check it."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
 
 
-def _vector(xyz: ArrayLike) -> ros.geometry_msgs__msg__Vector3:
-    return ros.geometry_msgs__msg__Vector3(*(float(v) for v in np.asarray(xyz)))
+def _vector(xyz: ArrayLike) -> list[float]:
+    return [float(value) for value in np.asarray(xyz)]
 
 
-def _quaternion(R: Array) -> ros.geometry_msgs__msg__Quaternion:
-    return ros.geometry_msgs__msg__Quaternion(*se3.quaternion(R).tolist())
+def _pose(T: Array) -> Values:
+    """Return the fields of a Pose, and of a Transform, which has the same: position and quaternion."""
+    return T[:3, 3].tolist(), se3.quaternion(T[:3, :3]).tolist()
 
 
-def _pose(T: Array) -> ros.geometry_msgs__msg__Pose:
-    return ros.geometry_msgs__msg__Pose(ros.geometry_msgs__msg__Point(*T[:3, 3].tolist()), _quaternion(T[:3, :3]))
+def _pose_with_covariance(T: Array, covariance: Array) -> Values:
+    return _pose(T), np.ravel(covariance)
 
 
-def _pose_with_covariance(T: Array, covariance: Array) -> ros.geometry_msgs__msg__PoseWithCovariance:
-    return ros.geometry_msgs__msg__PoseWithCovariance(_pose(T), np.ravel(covariance))
-
-
-def _rigid_transform(pose: ros.geometry_msgs__msg__Pose) -> Array:
-    """Return the transform (4, 4) of a pose, which must be finite and rigid."""
+def _rigid_transform(pose: Any) -> Array:
+    """Return the transform (4, 4) of a Pose, which must be finite and rigid."""
     q, p = pose.orientation, pose.position
     xyzw, position = (q.x, q.y, q.z, q.w), (p.x, p.y, p.z)
     if not abs(math.hypot(*xyzw) - 1.0) < QUATERNION_TOLERANCE or not all(map(math.isfinite, position)):
@@ -221,14 +232,9 @@ def odometry_cdr(
 ) -> bytes:
     """Encode a nav_msgs/msg/Odometry: pose in the parent frame, velocity (6,) [m/s, rad/s] in the child frame."""
     parent, child = frames
-    twist = ros.geometry_msgs__msg__Twist(_vector(velocity[:3]), _vector(velocity[3:]))
-    message = ros.nav_msgs__msg__Odometry(
-        header_message(stamp_ns, parent),
-        child,
-        _pose_with_covariance(T_odom_base, covariance),
-        ros.geometry_msgs__msg__TwistWithCovariance(twist, np.ravel(velocity_covariance)),
-    )
-    return message_cdr(message)
+    twist = (_vector(velocity[:3]), _vector(velocity[3:])), np.ravel(velocity_covariance)
+    pose = _pose_with_covariance(T_odom_base, covariance)
+    return encoded(ODOMETRY_SCHEMA, header(stamp_ns, parent), child, pose, twist)
 
 
 def decode_pose(payload: bytes, attachment: bytes = b"", received_ns: int | None = None) -> Pose:
@@ -236,12 +242,12 @@ def decode_pose(payload: bytes, attachment: bytes = b"", received_ns: int | None
 
     received_ns: time of arrival, of Unix time; default: now.
     """
-    message = message_from_cdr(payload, ros.nav_msgs__msg__Odometry)
+    message = decoded(payload, ODOMETRY_SCHEMA)
     stamp, twist = message.header.stamp, message.twist.twist
     if stamp.sec < 0 or stamp.nanosec >= NS_PER_S:
         raise OmnidError(f"odometry stamp {stamp.sec} s {stamp.nanosec} ns: expected Unix time; check the sender")
     return Pose(
-        stamp_ns=_stamp_ns(message.header),
+        stamp_ns=_stamp_ns(message),
         T_odom_base=_rigid_transform(message.pose.pose),
         covariance=message.pose.covariance.reshape(6, 6),
         velocity=np.array([getattr(part, axis) for part in (twist.linear, twist.angular) for axis in "xyz"]),
@@ -254,7 +260,7 @@ def decode_pose(payload: bytes, attachment: bytes = b"", received_ns: int | None
 
 def pose_stamped_cdr(stamp_ns: int, T_odom_body: Array) -> bytes:
     """Encode a geometry_msgs/msg/PoseStamped: the pose of a body in odom."""
-    return message_cdr(ros.geometry_msgs__msg__PoseStamped(header_message(stamp_ns, "odom"), _pose(T_odom_body)))
+    return encoded(POSE_SCHEMA, header(stamp_ns, "odom"), _pose(T_odom_body))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -268,15 +274,13 @@ class PoseInMap:
 
 def pose_with_covariance_cdr(stamp_ns: int, T_map_body: Array, covariance: Array) -> bytes:
     """Encode a geometry_msgs/msg/PoseWithCovarianceStamped: the pose of a body in the map, covariance in its axes."""
-    pose = _pose_with_covariance(T_map_body, covariance)
-    return message_cdr(ros.geometry_msgs__msg__PoseWithCovarianceStamped(header_message(stamp_ns, "map"), pose))
+    return encoded(MAP_POSE_SCHEMA, header(stamp_ns, "map"), _pose_with_covariance(T_map_body, covariance))
 
 
 def decode_map_pose(payload: bytes, _: bytes = b"") -> PoseInMap:
     """Decode a PoseWithCovarianceStamped with a finite, rigid pose."""
-    message = message_from_cdr(payload, ros.geometry_msgs__msg__PoseWithCovarianceStamped)
-    covariance = message.pose.covariance.reshape(6, 6)
-    return PoseInMap(_stamp_ns(message.header), _rigid_transform(message.pose.pose), covariance)
+    message = decoded(payload, MAP_POSE_SCHEMA)
+    return PoseInMap(_stamp_ns(message), _rigid_transform(message.pose.pose), message.pose.covariance.reshape(6, 6))
 
 
 @dataclass(frozen=True, slots=True)
@@ -290,13 +294,8 @@ class FrameTransform:
 
 def transform_cdr(stamp_ns: int, transforms: Sequence[FrameTransform]) -> bytes:
     """Encode a tf2_msgs/msg/TFMessage: edges of the frame tree, all of one instant."""
-    edges = []
-    for edge in transforms:
-        T = edge.T_parent_child
-        motion = ros.geometry_msgs__msg__Transform(_vector(T[:3, 3]), _quaternion(T[:3, :3]))
-        header = header_message(stamp_ns, edge.parent)
-        edges.append(ros.geometry_msgs__msg__TransformStamped(header, edge.child, motion))
-    return message_cdr(ros.tf2_msgs__msg__TFMessage(edges))
+    edges = [(header(stamp_ns, edge.parent), edge.child, _pose(edge.T_parent_child)) for edge in transforms]
+    return encoded(TRANSFORM_SCHEMA, edges)
 
 
 # Status.
@@ -333,26 +332,23 @@ class Diagnostics:
 
 def diagnostics_cdr(stamp_ns: int, statuses: Sequence[DiagnosticStatus]) -> bytes:
     """Encode a diagnostic_msgs/msg/DiagnosticArray."""
-    entries = []
-    for status in statuses:
-        pairs = [ros.diagnostic_msgs__msg__KeyValue(key, value) for key, value in status.values.items()]
-        entry = ros.diagnostic_msgs__msg__DiagnosticStatus(status.level, status.name, status.message, "", pairs)
-        entries.append(entry)
-    return message_cdr(ros.diagnostic_msgs__msg__DiagnosticArray(header_message(stamp_ns, ""), entries))
+    entries = [(status.level, status.name, status.message, "", list(status.values.items())) for status in statuses]
+    return encoded(DIAGNOSTICS_SCHEMA, header(stamp_ns, ""), entries)
 
 
 def decode_diagnostics(payload: bytes, _: bytes = b"") -> Diagnostics:
     """Decode a DiagnosticArray."""
-    message = message_from_cdr(payload, ros.diagnostic_msgs__msg__DiagnosticArray)
+    message = decoded(payload, DIAGNOSTICS_SCHEMA)
     statuses = tuple(
         DiagnosticStatus(entry.name, int(entry.level), entry.message, {pair.key: pair.value for pair in entry.values})
         for entry in message.status
     )
-    return Diagnostics(_stamp_ns(message.header), statuses)
+    return Diagnostics(_stamp_ns(message), statuses)
 
 
 # Maps and obstacles.
 
+POINT_FIELD_FLOAT32: Final = 7  # the constant FLOAT32 of sensor_msgs/msg/PointField
 CLOUD_FIELDS = ("x", "y", "z", "confidence")
 # m, m/s; sigma and sigma_v: of position and velocity along the axis in which they are largest.
 MOVING_FIELDS: Final = ("x", "y", "z", "vx", "vy", "radius", "sigma", "sigma_v")
@@ -393,24 +389,16 @@ def moving_cdr(stamp_ns: int, frame: str, moving: Sequence[MovingObstacle]) -> b
 
 def _cloud_cdr(stamp_ns: int, frame: str, names: Sequence[str], rows: Floats) -> bytes:
     """Encode a PointCloud2 of rows (N, F), little-endian float32, whose F fields have these names."""
-    number = ros.sensor_msgs__msg__PointField.FLOAT32
-    message = ros.sensor_msgs__msg__PointCloud2(
-        header=header_message(stamp_ns, frame),
-        height=1,
-        width=len(rows),
-        fields=[ros.sensor_msgs__msg__PointField(name, 4 * i, number, 1) for i, name in enumerate(names)],
-        is_bigendian=False,
-        point_step=4 * len(names),
-        row_step=4 * len(names) * len(rows),
-        data=rows.reshape(-1).view(np.uint8),
-        is_dense=bool(np.isfinite(rows).all()),
-    )
-    return message_cdr(message)
+    number, step = np.dtype("<f4").itemsize, np.dtype("<f4").itemsize * len(names)
+    fields = [(name, number * i, POINT_FIELD_FLOAT32, 1) for i, name in enumerate(names)]
+    data, is_dense = rows.reshape(-1).view(np.uint8), bool(np.isfinite(rows).all())
+    head = header(stamp_ns, frame)
+    return encoded(POINT_CLOUD_SCHEMA, head, 1, len(rows), fields, False, step, step * len(rows), data, is_dense)
 
 
 def decode_cloud(payload: bytes, _: bytes = b"") -> Cloud:
     """Decode a PointCloud2 with omnid's fields."""
-    message = message_from_cdr(payload, ros.sensor_msgs__msg__PointCloud2)
+    message = decoded(payload, POINT_CLOUD_SCHEMA)
     step = 4 * len(CLOUD_FIELDS)
     fields = [(entry.name, entry.offset) for entry in message.fields]
     own = fields == [(name, 4 * i) for i, name in enumerate(CLOUD_FIELDS)] and not message.is_bigendian
@@ -420,7 +408,7 @@ def decode_cloud(payload: bytes, _: bytes = b"") -> Cloud:
             f"expected the fields {', '.join(CLOUD_FIELDS)} in {step} bytes"
         )
     packed = message.data.view("<f4").reshape(-1, len(CLOUD_FIELDS))
-    return Cloud(_stamp_ns(message.header), message.header.frame_id, packed[:, :3], packed[:, 3])
+    return Cloud(_stamp_ns(message), message.header.frame_id, packed[:, :3], packed[:, 3])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -438,13 +426,13 @@ def grid_cdr(stamp_ns: int, frame: str, cells: NDArray[np.int8], cell_m: float, 
     """Encode a nav_msgs/msg/OccupancyGrid of cells (H, W), z = 0 in `frame`; corner: x, y of cell (0, 0), m."""
     height, width = cells.shape
     corner_pose = _pose(se3.transform(np.eye(3), (*corner, 0.0)))
-    info = ros.nav_msgs__msg__MapMetaData(time_message(stamp_ns), cell_m, width, height, corner_pose)
-    return message_cdr(ros.nav_msgs__msg__OccupancyGrid(header_message(stamp_ns, frame), info, cells.reshape(-1)))
+    info = ros_time(stamp_ns), cell_m, width, height, corner_pose
+    return encoded(GRID_SCHEMA, header(stamp_ns, frame), info, cells.reshape(-1))
 
 
 def decode_map(payload: bytes, _: bytes = b"") -> Map:
     """Decode an OccupancyGrid that is parallel to its frame's axes."""
-    message = message_from_cdr(payload, ros.nav_msgs__msg__OccupancyGrid)
+    message = decoded(payload, GRID_SCHEMA)
     info, T_frame_grid = message.info, _rigid_transform(message.info.origin)
     is_parallel = np.allclose(T_frame_grid[:3, :3], np.eye(3), atol=QUATERNION_TOLERANCE)
     if message.data.size != info.width * info.height or not (info.resolution > 0 and is_parallel):
@@ -453,7 +441,7 @@ def decode_map(payload: bytes, _: bytes = b"") -> Map:
             f"{info.width} x {info.height} cells of a positive size, parallel to the frame's axes"
         )
     cells, corner = message.data.reshape(info.height, info.width), (info.origin.position.x, info.origin.position.y)
-    return Map(_stamp_ns(message.header), message.header.frame_id, cells, float(info.resolution), corner)
+    return Map(_stamp_ns(message), message.header.frame_id, cells, float(info.resolution), corner)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -476,18 +464,17 @@ def scan_cdr(stamp_ns: int, frame: str, ranges_m: Floats, sigma_m: Floats, limit
     """
     step, arrays = 2 * math.pi / len(ranges_m), [np.ascontiguousarray(one, "<f4") for one in (ranges_m, sigma_m)]
     angles = (step / 2 - math.pi, math.pi - step / 2, step)
-    message = ros.sensor_msgs__msg__LaserScan(header_message(stamp_ns, frame), *angles, 0.0, 0.0, *limits_m, *arrays)
-    return message_cdr(message)
+    return encoded(SCAN_SCHEMA, header(stamp_ns, frame), *angles, 0.0, 0.0, *limits_m, *arrays)
 
 
 def decode_scan(payload: bytes, _: bytes = b"") -> Scan:
     """Decode a LaserScan with finite angles."""
-    message = message_from_cdr(payload, ros.sensor_msgs__msg__LaserScan)
+    message = decoded(payload, SCAN_SCHEMA)
     start_rad, step_rad = message.angle_min, message.angle_increment
     if not (math.isfinite(start_rad) and math.isfinite(step_rad)):
         raise OmnidError(f"a scan from {start_rad} rad by {step_rad} rad was found; expected finite angles")
     return Scan(
-        _stamp_ns(message.header),
+        _stamp_ns(message),
         message.header.frame_id,
         start_rad + step_rad * np.arange(len(message.ranges)),
         message.ranges,
@@ -534,74 +521,74 @@ class PlanarPath(NamedTuple):
 
 def twist_stamped_cdr(stamp_ns: int, frame: str, linear_mps: float, yaw_rate_radps: float) -> bytes:
     """Encode a geometry_msgs/msg/TwistStamped of a ground robot: forward speed and yaw rate in `frame`."""
-    twist = ros.geometry_msgs__msg__Twist(_vector((linear_mps, 0, 0)), _vector((0, 0, yaw_rate_radps)))
-    return message_cdr(ros.geometry_msgs__msg__TwistStamped(header_message(stamp_ns, frame), twist))
+    twist = (linear_mps, 0.0, 0.0), (0.0, 0.0, yaw_rate_radps)
+    return encoded(TWIST_SCHEMA, header(stamp_ns, frame), twist)
 
 
 def twist_from_cdr(payload: bytes) -> TwistRecord:
     """Decode a TwistStamped, or a Twist, whose length no TwistStamped has; its numbers need not be finite."""
     if len(payload) == _PLAIN_TWIST_BYTES:
-        stamp_ns, frame, twist = 0, "", message_from_cdr(payload, ros.geometry_msgs__msg__Twist)
+        stamp_ns, frame, twist = 0, "", decoded(payload, PLAIN_TWIST_SCHEMA)
     else:
-        message = message_from_cdr(payload, ros.geometry_msgs__msg__TwistStamped)
-        stamp_ns, frame, twist = _stamp_ns(message.header), message.header.frame_id, message.twist
+        message = decoded(payload, TWIST_SCHEMA)
+        stamp_ns, frame, twist = _stamp_ns(message), message.header.frame_id, message.twist
     linear, angular = twist.linear, twist.angular
     return TwistRecord(stamp_ns, frame, linear.x, angular.z, (linear.y, linear.z, angular.x, angular.y))
 
 
 def heading_cdr(stamp_ns: int, velocity_mps: float, heading_rad: float) -> bytes:
     """Encode a heading command, a geometry_msgs/msg/Vector3Stamped in odom: x is the speed, z the heading."""
-    vector = _vector((velocity_mps, 0, heading_rad))
-    return message_cdr(ros.geometry_msgs__msg__Vector3Stamped(header_message(stamp_ns, "odom"), vector))
+    return encoded(VECTOR_SCHEMA, header(stamp_ns, "odom"), (velocity_mps, 0.0, heading_rad))
 
 
 def heading_from_cdr(payload: bytes) -> tuple[int, str, float, float]:
     """Decode a heading command: its stamp [ns], frame, speed [m/s] and heading [rad], which need not be finite."""
-    message = message_from_cdr(payload, ros.geometry_msgs__msg__Vector3Stamped)
-    return _stamp_ns(message.header), message.header.frame_id, message.vector.x, message.vector.z
+    message = decoded(payload, VECTOR_SCHEMA)
+    return _stamp_ns(message), message.header.frame_id, message.vector.x, message.vector.z
 
 
 def header_cdr(stamp_ns: int) -> bytes:
     """Encode a std_msgs/msg/Header, which is the message of cmd/arm."""
-    return message_cdr(header_message(stamp_ns, ""))
+    return encoded(HEADER_SCHEMA, *header(stamp_ns, ""))
 
 
 def stamp_from_cdr(payload: bytes) -> int:
     """Decode the stamp of a Header, ns; it may be invalid."""
-    return _stamp_ns(message_from_cdr(payload, ros.std_msgs__msg__Header))
+    stamp = decoded(payload, HEADER_SCHEMA).stamp
+    return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
 
 
 def bool_from_cdr(payload: bytes) -> bool:
     """Decode a std_msgs/msg/Bool, which is the message of cmd/bumper and cmd/cliff."""
-    return bool(message_from_cdr(payload, ros.std_msgs__msg__Bool).data)
+    return bool(decoded(payload, BOOL_SCHEMA).data)
 
 
 def string_cdr(text: str) -> bytes:
     """Encode a std_msgs/msg/String."""
-    return message_cdr(ros.std_msgs__msg__String(text))
+    return encoded(STRING_SCHEMA, text)
 
 
 def string_from_cdr(payload: bytes) -> str:
     """Decode a String."""
-    return message_from_cdr(payload, ros.std_msgs__msg__String).data
+    return str(decoded(payload, STRING_SCHEMA).data)
 
 
 def clock_cdr(stamp_ns: int) -> bytes:
     """Encode the time of a run, for programs that follow it."""
-    return message_cdr(ros.rosgraph_msgs__msg__Clock(time_message(stamp_ns)))
+    return encoded(CLOCK_SCHEMA, ros_time(stamp_ns))
 
 
 def goal_cdr(goal: PlanarGoal) -> bytes:
     """Encode a goal as a PoseStamped."""
     pose = _planar_pose(goal.x_m, goal.y_m, goal.heading_rad)
-    return message_cdr(ros.geometry_msgs__msg__PoseStamped(header_message(goal.stamp_ns, goal.frame), pose))
+    return encoded(POSE_SCHEMA, header(goal.stamp_ns, goal.frame), pose)
 
 
 def goal_from_cdr(payload: bytes) -> PlanarGoal:
     """Decode a PoseStamped that is finite and not tilted."""
-    message = message_from_cdr(payload, ros.geometry_msgs__msg__PoseStamped)
+    message = decoded(payload, POSE_SCHEMA)
     x_m, y_m = _planar_position(message.pose)
-    return PlanarGoal(_stamp_ns(message.header), message.header.frame_id, x_m, y_m, _planar_heading(message.pose))
+    return PlanarGoal(_stamp_ns(message), message.header.frame_id, x_m, y_m, _planar_heading(message.pose))
 
 
 def path_cdr(stamp_ns: int, frame: str, xy: ArrayLike, heading_rad: float | None = None) -> bytes:
@@ -610,37 +597,35 @@ def path_cdr(stamp_ns: int, frame: str, xy: ArrayLike, heading_rad: float | None
     steps = np.diff(points, axis=0, append=points[-1:])
     headings: list[float | None] = [float(math.atan2(dy, dx)) for dx, dy in steps]
     headings[-1:] = [heading_rad]
-    header = header_message(stamp_ns, frame)
+    head = header(stamp_ns, frame)
     poses = [
-        ros.geometry_msgs__msg__PoseStamped(header, _planar_pose(float(x), float(y), heading))
-        for (x, y), heading in zip(points, headings, strict=True)
+        (head, _planar_pose(float(x), float(y), heading)) for (x, y), heading in zip(points, headings, strict=True)
     ]
-    return message_cdr(ros.nav_msgs__msg__Path(header, poses))
+    return encoded(PATH_SCHEMA, head, poses)
 
 
 def path_from_cdr(payload: bytes) -> PlanarPath:
     """Decode a path of 1 to MAX_PATH_POSES poses that are finite; the last one is not tilted."""
-    message = message_from_cdr(payload, ros.nav_msgs__msg__Path)
+    message = decoded(payload, PATH_SCHEMA)
     if not 1 <= len(message.poses) <= MAX_PATH_POSES:
         raise OmnidError(f"a path of {len(message.poses)} poses: expected 1 to {MAX_PATH_POSES}")
     xy = np.array([_planar_position(entry.pose) for entry in message.poses])
-    return PlanarPath(_stamp_ns(message.header), message.header.frame_id, xy, _planar_heading(message.poses[-1].pose))
+    return PlanarPath(_stamp_ns(message), message.header.frame_id, xy, _planar_heading(message.poses[-1].pose))
 
 
-def _planar_pose(x_m: float, y_m: float, heading_rad: float | None) -> ros.geometry_msgs__msg__Pose:
+def _planar_pose(x_m: float, y_m: float, heading_rad: float | None) -> Values:
     half_rad = 0.0 if heading_rad is None else 0.5 * heading_rad
     w = 0.0 if heading_rad is None else math.cos(half_rad)
-    quaternion = ros.geometry_msgs__msg__Quaternion(0.0, 0.0, math.sin(half_rad), w)
-    return ros.geometry_msgs__msg__Pose(ros.geometry_msgs__msg__Point(x_m, y_m, 0.0), quaternion)
+    return (x_m, y_m, 0.0), (0.0, 0.0, math.sin(half_rad), w)
 
 
-def _planar_position(pose: ros.geometry_msgs__msg__Pose) -> tuple[float, float]:
+def _planar_position(pose: Any) -> tuple[float, float]:
     if not (math.isfinite(pose.position.x) and math.isfinite(pose.position.y)):
         raise OmnidError("a position is not finite; check the sender")
     return pose.position.x, pose.position.y
 
 
-def _planar_heading(pose: ros.geometry_msgs__msg__Pose) -> float | None:
+def _planar_heading(pose: Any) -> float | None:
     q = pose.orientation
     if not any((q.x, q.y, q.z, q.w)):
         return None

@@ -17,8 +17,7 @@ from drivers.frame import Frame
 from drivers.logs.ros_messages import BASE_FRAME, COMPRESSED_IMAGE, IMAGE, JointWheels, parse_motion
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.errors import OmnidError
-from omnid.transport import ros_types as ros
-from omnid.transport.codec import header_message, message_cdr, odometry_cdr
+from omnid.transport.codec import IMU_SCHEMA, encoded, header, odometry_cdr
 
 LARGEST_RATE: Final = 100.0  # m/s and rad/s: larger ones are faults of the sender
 _UNKNOWN_VARIANCE: Final = 1e9  # Variance of the parts of a pose that wheels do not measure.
@@ -33,16 +32,10 @@ def wheel_cdr(sample: WheelSample, stamp_ns: int) -> bytes:
 def gyro_cdr(sample: GyroSample, stamp_ns: int, frame: str = BASE_FRAME) -> bytes:
     """Encode angular velocities about the axes of a frame as an Imu."""
     unknown = np.array([-1.0, *[0.0] * 8])  # REP 145: the message has no orientation, and no acceleration
-    message = ros.sensor_msgs__msg__Imu(
-        header_message(stamp_ns, frame),
-        ros.geometry_msgs__msg__Quaternion(0.0, 0.0, 0.0, 1.0),
-        unknown,
-        ros.geometry_msgs__msg__Vector3(sample.x_radps, sample.y_radps, sample.z_radps),
-        np.zeros(9),
-        ros.geometry_msgs__msg__Vector3(0.0, 0.0, 0.0),
-        unknown,
-    )
-    return message_cdr(message)
+    rates = sample.x_radps, sample.y_radps, sample.z_radps
+    orientation, acceleration = (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0)
+    parts = orientation, unknown, rates, np.zeros(9), acceleration, unknown
+    return encoded(IMU_SCHEMA, header(stamp_ns, frame), *parts)
 
 
 def sample_from_cdr(
@@ -82,12 +75,11 @@ def image_cdr(frame: Frame, stamp_ns: int) -> tuple[str, bytes]:
 
     A driver's buffer may be longer than its image, which ROS does not accept: the rest is left out.
     """
-    header, data = header_message(stamp_ns, frame.camera), np.frombuffer(frame.data, np.uint8)
+    head, data = header(stamp_ns, frame.camera), np.frombuffer(frame.data, np.uint8)
     if frame.encoding in COMPRESSED:
-        return COMPRESSED_IMAGE, message_cdr(ros.sensor_msgs__msg__CompressedImage(header, frame.encoding, data))
+        return COMPRESSED_IMAGE, encoded(COMPRESSED_IMAGE, head, frame.encoding, data)
     step = frame.step or frame.width * _PIXEL_BYTES.get(frame.encoding, 1)
     rows = frame.height * 3 // 2 if frame.encoding == "nv12" else frame.height  # the colour planes follow as rows
     name = _ROS_NAMES.get(frame.encoding, frame.encoding)
     data = data[: step * rows]
-    message = ros.sensor_msgs__msg__Image(header, frame.height, frame.width, name, int(frame.bigendian), step, data)
-    return IMAGE, message_cdr(message)
+    return IMAGE, encoded(IMAGE, head, frame.height, frame.width, name, int(frame.bigendian), step, data)

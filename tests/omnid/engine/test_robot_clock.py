@@ -72,7 +72,7 @@ def test_a_time_that_no_message_can_hold_is_not_followed(step_s: float) -> None:
         computer.set_forwards(change_s)
         clock.follow()
         time_ns = clock.unix_ns(computer.monotonic_ns)
-        assert codec.time_message(time_ns).sec >= 0
+        assert codec.ros_time(time_ns)[0] >= 0
     assert time_ns == computer.unix_ns == START_NS + 10 * S and clock.steps == 1
     assert len(lines) == 2 and "outside 1970 to 2038" in lines[0] and "forwards by 7 s" in lines[1]
     begun = SetClock(START_NS + round(step_s * 1e9))

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
-from rosbags.typesys.stores import ros2_humble as ros
 
 from drivers.logs.ros_messages import JointWheels
 from drivers.motion import GyroSample, MotionSample, WheelSample
@@ -28,12 +27,14 @@ from omnid.engine.robot_clock import RobotClock
 from omnid.errors import OmnidError
 from omnid.transport import codec
 from omnid.transport.codec import (
+    BOOL_SCHEMA,
     IMU_SCHEMA,
+    JOINT_SCHEMA,
     PlanarGoal,
+    encoded,
     goal_cdr,
     goal_from_cdr,
-    header_message,
-    message_cdr,
+    header,
     path_cdr,
     path_from_cdr,
     string_cdr,
@@ -129,7 +130,7 @@ def arm(later_s: float = 0.0) -> bytes:
 
 
 def bool_cdr(value: bool) -> bytes:
-    return message_cdr(ros.std_msgs__msg__Bool(value))
+    return encoded(BOOL_SCHEMA, value)
 
 
 def stamped(stamp: bytes) -> bytes:
@@ -581,10 +582,8 @@ def test_an_imu_that_measures_no_rates_is_no_gyro_that_stands(lines: list[str]) 
 
 
 def joint_cdr(names: list[str], velocities: list[float], stamp_ns: int = OFFSET_NS + 7) -> bytes:
-    message = ros.sensor_msgs__msg__JointState(
-        header_message(stamp_ns, ""), names, np.zeros(len(names)), np.array(velocities), np.zeros(0)
-    )
-    return message_cdr(message)
+    parts = names, np.zeros(len(names)), np.array(velocities), np.zeros(0)
+    return encoded(JOINT_SCHEMA, header(stamp_ns, ""), *parts)
 
 
 def test_wheels_are_joints_where_these_are_named(lines: list[str]) -> None:
