@@ -1,9 +1,11 @@
-"""Collision monitor: slows down and stops the motion that the control law is about to give, before obstacles.
+"""Collision monitor: the part of a motion that the control law is about to give after which the base can still stop.
 
-The model is the collision monitor of nav2 (Macenski et al. 2023, "From the desks of ROS maintainers", 5): a polygon in
-which nothing may be (stop), one in which the base drives slowly, and the time to collision on the commanded arc. Here
-the polygons lie on the side to which the base is commanded: a motion that leads away from an obstacle is free.
-Unknown directions are not free. Plain Python: it runs in the process that steers.
+Passive safety (Macek, Vasquez, Fraichard, Siegwart 2009, "Towards safe vehicle navigation in dynamic urban scenarios"):
+whatever the base would reach, it must be at rest before. What the ring shows are kinds of one thing, points in the way:
+obstacles, ends of the floor that was seen, parts of the images that show nothing, and moving obstacles where they will
+be. One test judges each kind: the outline with the distance to keep, on the side to which the base is commanded, along
+the commanded arc (as the collision monitor of nav2: Macenski et al. 2023); a motion that leads away is free. Plain
+Python: it runs in the process that steers.
 """
 
 from __future__ import annotations
@@ -168,21 +170,29 @@ def remedy(reason: str) -> str:
     return {RING_STALE: RING_REMEDY, UNWATCHED: IMAGES_REMEDY, UNSEEN: IMAGES_REMEDY}.get(reason, REMEDY)
 
 
+class Kind(NamedTuple):
+    """Places of a ring that the base must not reach, in the frame of the ring."""
+
+    reason: str
+    policy: str  # STOP, SLOW or IGNORE
+    points: list[Point]
+    is_known: bool = False  # something is there; else nothing is known of what is there
+    is_gap: bool = False  # a surface is seen beyond: it counts ahead of the base only
+
+
 class CollisionMonitor:
     """Follows rings and commands; not thread-safe. Memory and work of a tick are bounded by the ring's size."""
 
     def __init__(self, settings: CollisionSettings, braking_mps2: float, turn_braking_radps2: float = math.inf) -> None:
         """braking_mps2, turn_braking_radps2: with which the base can brake its speed and its turn."""
-        self._settings, self._deceleration, self._turn_deceleration = settings, braking_mps2, turn_braking_radps2
+        self._settings = settings
+        self._deceleration, self._turn_deceleration = BRAKING_SHARE * braking_mps2, BRAKING_SHARE * turn_braking_radps2
         self._outline = Outline(settings.front_m, settings.rear_m, settings.half_width_m)
         side_m = settings.half_width_m + settings.side_m + BESIDE_M  # room for turns where the images show nothing
         self._around = Outline(settings.front_m + settings.stop_m, settings.rear_m + settings.stop_m, side_m)
         self._stamp_ns: int | None = None
-        self._points: list[Point] = []  # obstacles in the frame of the ring
-        self._unknown: list[Point] = []  # ends of the way that was seen to be free: nothing is known beyond
-        self._gaps: list[Point] = []  # the same where a surface is seen beyond
-        self._unwatched: list[Point] = []  # around the outline, where the images show nothing
-        self._is_blind = False  # they show nothing at all
+        self._kinds: tuple[Kind, ...] = ()  # what the newest ring shows
+        self._is_blind = False  # its images show nothing at all
         self._moving: tuple[MovingPoint, ...] = ()
         self._motions = DrivenMotions()
         self.reason = ""  # why the last step changed the motion
@@ -194,18 +204,23 @@ class CollisionMonitor:
         if (self._stamp_ns is not None and ring.stamp_ns < self._stamp_ns) or not ring.ranges_m:
             return
         self._stamp_ns, self._moving = ring.stamp_ns, ring.moving[:MOST_MOVING]
-        count, directions = len(ring.ranges_m), sector_directions(len(ring.ranges_m))
-        self._points = [
-            (r * c, r * s) for r, (_, c, s) in zip(ring.ranges_m, directions, strict=True) if math.isfinite(r)
-        ]
-        self._unknown, self._gaps, self._unwatched = [], [], []
+        settings, count = self._settings, len(ring.ranges_m)
         unwatched = ring.unwatched if len(ring.unwatched) == count else (False,) * count
         self._is_blind = all(unwatched)
         edges_m, around_m = sector_edges_m(self._outline, count), sector_edges_m(self._around, count)
-        for k, free_m, is_gap in unknown_ends(ring.ranges_m, ring.free_m, self._settings.stop_m):
+        directions = sector_directions(count)
+        seen = [(r * c, r * s) for r, (_, c, s) in zip(ring.ranges_m, directions, strict=True) if math.isfinite(r)]
+        ends: tuple[list[Point], ...] = ([], [], [])
+        for k, free_m, is_gap in unknown_ends(ring.ranges_m, ring.free_m, settings.stop_m):
             begins_m = around_m[k] if unwatched[k] else max(free_m, edges_m[k])
-            ends = self._unwatched if unwatched[k] else self._gaps if is_gap else self._unknown
-            ends.append((begins_m * directions[k][1], begins_m * directions[k][2]))
+            which = ends[0] if unwatched[k] else ends[1] if is_gap else ends[2]
+            which.append((begins_m * directions[k][1], begins_m * directions[k][2]))
+        self._kinds = (
+            Kind(BLOCKED, STOP, seen, is_known=True),
+            Kind(UNKNOWN, settings.unknown, ends[2]),
+            Kind(UNKNOWN, settings.unknown, ends[1], is_gap=True),
+            Kind(UNWATCHED, settings.stale, ends[0]),
+        )
 
     def step(self, now_ns: int, motion: Twist, *, to_heading: bool = False) -> Twist:
         """Return the part of a motion that is allowed now; speed and yaw rate are reduced together, as on one arc.
@@ -213,116 +228,111 @@ class CollisionMonitor:
         to_heading: the yaw rate leads to a heading, to which the base turns on the spot where it may not drive.
         Otherwise it would never move again where the arc to a free direction is closed.
         """
-        # 1. Judge the motion by the obstacles; a base that was stopped stays so while it could only creep on.
-        allowance = self._held(self._judged(now_ns, motion), motion)
-        self.share, self.reason = allowance
-        self._stopped_mps = motion.velocity_mps if allowance.share == 0.0 else 0.0
+        # 1. Judge the motion; a base that was stopped stays so while it could only creep on.
+        share, reason = self._judged(now_ns, motion)
+        speed_mps = abs(motion.velocity_mps)
+        creeps = share < 1.0 and share * speed_mps < min(RESUME_MPS, speed_mps / 2)
+        if creeps and self._stopped_mps * motion.velocity_mps > 0.0 and share > 0.0:
+            share, reason = 0.0, self.reason
+        self.share, self.reason = share, reason
+        self._stopped_mps = motion.velocity_mps if share == 0.0 else 0.0
         # 2. Where it may not drive, it may turn.
-        share = allowance.share
         if share == 0.0 and to_heading:
             motion = Twist(0.0, motion.yaw_rate_radps)
             share = self._judged(now_ns, motion).share
         # 3. Scale both speeds alike.
         return motion if share >= 1.0 else Twist(share * motion.velocity_mps, share * motion.yaw_rate_radps)
 
-    def _held(self, allowance: Allowance, motion: Twist) -> Allowance:
-        """Return the allowance, none as long as a base that was stopped could only creep on."""
-        speed_mps = abs(motion.velocity_mps)
-        if not 0.0 < allowance.share < 1.0 or self._stopped_mps * motion.velocity_mps <= 0.0:
-            return allowance
-        creeps = allowance.share * speed_mps < min(RESUME_MPS, speed_mps / 2)
-        return Allowance(0.0, self.reason) if creeps else allowance
-
     def follow(self, now_ns: int, motion: Twist) -> None:
         """Take the motion that the base follows from now on."""
         self._motions.add(now_ns, motion)
 
     def _judged(self, now_ns: int, motion: Twist) -> Allowance:
-        """Return the strictest allowance of all rules."""
-        settings = self._settings
-        if not settings.check or (motion.velocity_mps == 0.0 and motion.yaw_rate_radps == 0.0):
+        """Return the strictest allowance of all kinds of what is known."""
+        settings, is_driving = self._settings, motion.velocity_mps != 0.0
+        if not settings.check or not (is_driving or motion.yaw_rate_radps):
             return FREE
         # 1. Without a recent ring nothing is known.
         age_s = math.inf if self._stamp_ns is None else (now_ns - self._stamp_ns) * S_PER_NS
-        without_ring = self._without_ring(age_s, motion)
-        if without_ring is not None:
-            return without_ring
-        # 2. What the base has driven over since the ring's images is not passed as if it were free.
-        moved, is_driving = self._motions.since(self._stamp_ns or now_ns, now_ns), motion.velocity_mps != 0.0
-        reason = self._driven_over(moved, motion.velocity_mps) if is_driving else ""
-        if reason:
-            return Allowance(0.0, reason)
-        # 3. Each rule by itself: obstacles, unknown and unwatched directions, moving obstacles.
-        reach_m = self._reach_m(abs(motion.velocity_mps))
-        points = within_reach(self._points, moved, reach_m)
-        allowances = [self._before(points, motion), self._near(points, motion)]
-        if settings.unknown != IGNORE:
-            # Gaps count ahead only: next to or behind the base a person would hide the surface that ends a gap, and
-            # the front of the base has already passed where a thin object could be.
-            gaps = self._ahead(within_reach(self._gaps, moved, reach_m), motion)
-            ends = within_reach(self._unknown, moved, reach_m) + gaps
-            allowances.append(self._into_unknown(ends, motion, settings.unknown, UNKNOWN))
-        if settings.stale != IGNORE and self._unwatched and is_driving:
-            ends = within_reach(self._unwatched, moved, reach_m)
-            allowances.append(self._into_unknown(ends, motion, settings.stale, UNWATCHED))
-        if self._moving:
-            allowances += [self._before_moving(moved, age_s, motion), self._beside_moving(moved, age_s, motion)]
-        return min(allowances)
-
-    def _without_ring(self, age_s: float, motion: Twist) -> Allowance | None:
-        """Return the allowance that the settings give where no recent ring shows anything; None: a ring does.
-
-        age_s: of the ring's images.
-        """
-        settings = self._settings
         is_stale = not abs(age_s) <= settings.stale_s or not self._motions.reach_back_to(self._stamp_ns or 0)
-        if settings.stale == IGNORE:
-            return FREE if is_stale else None
-        if not is_stale and not self._is_blind:
-            return None
-        most_mps = 0.0 if settings.stale == STOP else settings.slow_mps
-        return self._capped(motion, most_mps, RING_STALE if is_stale else UNSEEN)
-
-    def _driven_over(self, moved: Pose2, velocity_mps: float) -> str:
-        """Return the reason to stop if the base drove over what the ring shows ahead of it, else an empty string."""
-        settings = self._settings
-        for points, policy, reason in (
-            (self._points, STOP, BLOCKED),
-            (self._unknown + self._gaps, settings.unknown, UNKNOWN),
-            (self._unwatched, settings.stale, UNWATCHED),
-        ):
-            if policy == STOP and driven_over(self._outline, points, moved, velocity_mps):
-                return reason
-        return ""
+        if settings.stale == IGNORE and is_stale:
+            return FREE
+        if settings.stale != IGNORE and (is_stale or self._is_blind):
+            most_mps = 0.0 if settings.stale == STOP else settings.slow_mps
+            return self._capped(motion, most_mps, RING_STALE if is_stale else UNSEEN)
+        # 2. What the base has driven over since the ring's images is not passed as if it were free.
+        moved = self._motions.since(self._stamp_ns or now_ns, now_ns)
+        for kind in self._kinds:
+            over = is_driving and kind.policy == STOP
+            if over and driven_over(self._outline, kind.points, moved, motion.velocity_mps):
+                return Allowance(0.0, kind.reason)
+        # 3. The way before each kind, and before what moves.
+        reach_m = self._reach_m(abs(motion.velocity_mps))
+        allowances = [
+            self._before(kind, within_reach(kind.points, moved, reach_m), motion)
+            for kind in self._kinds
+            if kind.policy != IGNORE and kind.points
+        ]
+        allowances += [self._before_moving(one, moved, age_s, motion) for one in self._moving]
+        return min(allowances, default=FREE)
 
     def _reach_m(self, speed_mps: float) -> float:
         """Return the distance within which obstacles matter: of the way to a stop, or of time_s if that is longer."""
         settings = self._settings
-        way_m = max(speed_mps * settings.time_s, speed_mps**2 / (2 * BRAKING_SHARE * self._deceleration))
+        way_m = max(speed_mps * settings.time_s, speed_mps**2 / (2 * self._deceleration))
         reach_m = max(settings.stop_m + settings.slow_m, settings.side_m, settings.slow_side_m)
         return reach_m + (way_m + self._outline.radius_m)
 
-    def _before(self, points: list[Point], motion: Twist) -> Allowance:
-        """Keep the time to collision, and stop before what is in the stop polygon."""
-        share = self._share_before(points, motion)
-        return FREE if share >= 1.0 else Allowance(share, BLOCKED if share == 0.0 else NEAR)
+    def _before(self, kind: Kind, points: list[Point], motion: Twist) -> Allowance:
+        """Return the allowance before points of a kind, in the axes of the base now."""
+        settings, outline, speed_mps = self._settings, self._outline, abs(motion.velocity_mps)
+        side = math.copysign(1.0, motion.velocity_mps)
+        edge_m = outline.front_m if side > 0.0 else outline.rear_m
+        # 1. What is there: its distance, and a low speed near it.
+        if kind.is_known:
+            share = self._share_before(points, motion)
+            allowance = FREE if share >= 1.0 else Allowance(share, BLOCKED if share == 0.0 else NEAR)
+            wide_m = outline.half_width_m + settings.slow_side_m
+            if speed_mps > settings.slow_mps and any(
+                0.0 <= side * x <= edge_m + settings.slow_m and abs(y) <= wide_m for x, y in points
+            ):
+                allowance = min(allowance, self._capped(motion, settings.slow_mps, NEAR))
+            return allowance
+        # 2. Where nothing is known, a way along it is free, and one into it is driven slowly, or not at all. Gaps count
+        #    ahead only: next to or behind the base a person would hide the surface that ends a gap, and the front of
+        #    the base has already passed where a thin object could be.
+        if speed_mps > 0.0:
+            if kind.is_gap:
+                points = [(x, y) for x, y in points if side * x > edge_m]
+        elif kind.reason == UNWATCHED:
+            return FREE
+        else:
+            # Corners may swing as far as floor was seen. An unknown region at the outline itself does not count: it
+            # would keep the base from turning away.
+            points = self._stop_polygon(motion).parted(points)[1]
+            speed_mps = abs(motion.yaw_rate_radps) * outline.radius_m
+        least = 0.0 if kind.policy == STOP else min(1.0, settings.slow_mps / speed_mps)
+        share = max(self._share_before(points, motion, ALONG_SLOPE), least)
+        return FREE if share >= 1.0 else Allowance(share, kind.reason)
 
     def _share_before(self, points: list[Point], motion: Twist, slope: float = 0.0) -> float:
-        """Return the share before points; slope: those in the stop polygon count where the way to them is steeper."""
-        settings, least_mps = self._settings, max(slope * abs(motion.velocity_mps), TINY)
+        """Return the share of a motion that keeps the time to a collision, and from which the base still stops.
+
+        slope: points at the distance to keep already count where the way to them is steeper.
+        """
+        speed_mps = abs(motion.velocity_mps)
         stop = self._stop_polygon(motion)
         inside, outside = stop.parted(points)
+        least_mps = max(slope * speed_mps, TINY)
         if any(self._outline.approach_mps(x, y, motion) > least_mps for x, y in inside):
             return 0.0
         first_s = contact_s(stop, motion, outside)
         if first_s == math.inf:
             return 1.0
-        share, speed_mps = first_s / settings.time_s, abs(motion.velocity_mps)
         turn_radps = max(abs(motion.yaw_rate_radps), TINY)
-        share = min(share, math.sqrt(2 * BRAKING_SHARE * self._turn_deceleration * first_s / turn_radps))
+        share = min(first_s / self._settings.time_s, math.sqrt(2 * self._turn_deceleration * first_s / turn_radps))
         if speed_mps > 0.0:
-            way_m = speed_mps * first_s
-            share = min(share, math.sqrt(2 * BRAKING_SHARE * self._deceleration * way_m) / speed_mps)
+            share = min(share, math.sqrt(2 * self._deceleration * speed_mps * first_s) / speed_mps)
             if share < 1.0 and share * speed_mps < LEAST_MPS:
                 return 0.0
         return min(1.0, share)
@@ -334,81 +344,34 @@ class CollisionMonitor:
         behind_m = settings.stop_m if motion.velocity_mps < 0.0 else 0.0
         return Outline(front_m + ahead_m, rear_m + behind_m, half_width_m + settings.side_m)
 
-    def _near(self, points: list[Point], motion: Twist) -> Allowance:
-        """Drive slowly while something is in the slow polygon, on the side to which the base moves."""
-        settings, outline = self._settings, self._outline
-        if abs(motion.velocity_mps) <= settings.slow_mps:
-            return FREE
-        wide_m = outline.half_width_m + settings.slow_side_m
-        side = math.copysign(1.0, motion.velocity_mps)
-        far_m = (outline.front_m if side > 0 else outline.rear_m) + settings.slow_m
-        is_near = any(0.0 <= side * x <= far_m and abs(y) <= wide_m for x, y in points)
-        return self._capped(motion, settings.slow_mps, NEAR) if is_near else FREE
+    def _before_moving(self, one: MovingPoint, moved: Pose2, age_s: float, motion: Twist) -> Allowance:
+        """Slow down by the time until a moving obstacle, at its predicted place, is where the base would then be.
 
-    def _ahead(self, points: list[Point], motion: Twist) -> list[Point]:
-        """Return the points beyond the edge that leads; all of them for a turn on the spot."""
-        (front_m, rear_m, _), v = self._outline, motion.velocity_mps
-        return [(x, y) for x, y in points if v == 0.0 or (x > front_m if v > 0.0 else x < -rear_m)]
-
-    def _into_unknown(self, unknown: list[Point], motion: Twist, policy: str, reason: str) -> Allowance:
-        """Slow down towards the end of what was seen to be free, and drive into what was not slowly, or not at all.
-
-        policy: STOP or SLOW.
+        A new one may be anywhere within one sigma: two pairs show roughly where it goes. And a person who is passed may
+        turn round: the base is at rest before that person, or a hidden one, reaches it across a gap g, with
+        `g = WALK_MPS (TURN_S + v / a)`. Persons behind the base do not count.
         """
-        edge_mps = abs(motion.velocity_mps)
-        if motion.velocity_mps == 0.0:
-            # Corners may swing as far as floor was seen. An unknown region at the outline itself does not count: it
-            # would keep the base from turning away.
-            unknown = self._stop_polygon(motion).parted(unknown)[1]
-            edge_mps = abs(motion.yaw_rate_radps) * self._outline.radius_m
-        least = 0.0 if policy == STOP else min(1.0, self._settings.slow_mps / edge_mps)
-        share = max(self._share_before(unknown, motion, ALONG_SLOPE), least)
-        return FREE if share >= 1.0 else Allowance(share, reason)
-
-    def _before_moving(self, moved: Pose2, age_s: float, motion: Twist) -> Allowance:
-        """Slow down by the time until a moving obstacle, at its predicted place, is where the base would then be, and
-        to slow_mps where a new one may be there, within one sigma: two pairs show roughly where it goes.
-        """
-        settings, stop = self._settings, self._stop_polygon(motion)
-        slow = FREE
+        settings, stop, speed_mps = self._settings, self._stop_polygon(motion), abs(motion.velocity_mps)
+        allowance = FREE
         for step in range(round(MOVING_S / MOVING_STEP_S)):
             ahead_s = step * MOVING_STEP_S
             pose = composed(moved, along_arc(motion.velocity_mps, motion.yaw_rate_radps, ahead_s))
             at_s = age_s + ahead_s
-            places = [
-                (obstacle.x_m + obstacle.vx_mps * at_s, obstacle.y_m + obstacle.vy_mps * at_s)
-                for obstacle in self._moving
-            ]
-            for obstacle, (x, y) in zip(self._moving, seen_from(pose, places), strict=True):
-                gap_m = stop.gap_m(x, y) - obstacle.radius_m
-                if not step and self._outline.approach_mps(x, y, motion) <= TINY:
+            [(x, y)] = seen_from(pose, [(one.x_m + one.vx_mps * at_s, one.y_m + one.vy_mps * at_s)])
+            if step == 0:
+                limit_mps = self._deceleration * ((self._outline.gap_m(x, y) - one.radius_m) / WALK_MPS - TURN_S)
+                if speed_mps > limit_mps and x * motion.velocity_mps > 0.0:
+                    allowance = self._capped(motion, max(settings.slow_mps, limit_mps), MOVING)
+                if self._outline.approach_mps(x, y, motion) <= TINY:
                     continue
-                if gap_m <= 0.0:
-                    share = 0.0 if ahead_s <= MOVING_STOP_S else ahead_s / MOVING_S
-                    return min(slow, Allowance(share, MOVING))
-                spread_m = math.hypot(obstacle.sigma_m, at_s * obstacle.sigma_mps)
-                if slow is FREE and obstacle.sigma_mps > NEW_MPS and gap_m <= spread_m:
-                    slow = self._capped(
-                        motion, max(settings.slow_mps, abs(motion.velocity_mps) * ahead_s / MOVING_S), MOVING
-                    )
-        return slow
-
-    def _beside_moving(self, moved: Pose2, age_s: float, motion: Twist) -> Allowance:
-        """Drive so slowly next to a person that the base is at rest before that person, or a hidden one, reaches it.
-
-        The person may turn round. With a gap g: `g = WALK_MPS (TURN_S + v / a)`. Persons behind the base do not count.
-        """
-        side, braking_mps2 = math.copysign(1.0, motion.velocity_mps), BRAKING_SHARE * self._deceleration
-        now = [(one.x_m + one.vx_mps * age_s, one.y_m + one.vy_mps * age_s) for one in self._moving]
-        gaps_m = [
-            self._outline.gap_m(x, y) - obstacle.radius_m
-            for obstacle, (x, y) in zip(self._moving, seen_from(moved, now), strict=True)
-            if side * x > 0.0
-        ]
-        limit_mps = braking_mps2 * (min(gaps_m, default=math.inf) / WALK_MPS - TURN_S)
-        if motion.velocity_mps == 0.0 or abs(motion.velocity_mps) <= limit_mps:
-            return FREE
-        return self._capped(motion, max(self._settings.slow_mps, limit_mps), MOVING)
+            gap_m = stop.gap_m(x, y) - one.radius_m
+            if gap_m <= 0.0:
+                share = 0.0 if ahead_s <= MOVING_STOP_S else ahead_s / MOVING_S
+                return min(allowance, Allowance(share, MOVING))
+            if one.sigma_mps > NEW_MPS and gap_m <= math.hypot(one.sigma_m, at_s * one.sigma_mps):
+                most_mps = max(settings.slow_mps, speed_mps * ahead_s / MOVING_S)
+                allowance = min(allowance, self._capped(motion, most_mps, MOVING))
+        return allowance
 
     def _capped(self, motion: Twist, speed_mps: float, reason: str) -> Allowance:
         """Return the share at which the speed is at most so high; turns on the spot slow down alike."""
