@@ -7,19 +7,20 @@ pairs of images the controller ticks. A pose reaches it robot.pose_delay_s after
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
-from typing import Generic, Literal, TypeAlias, TypeVar
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from drivers.frame import CAMERAS, Frame
+from drivers.frame import Frame
 from drivers.motion import MotionSample
 from omnid.config import Config
-from omnid.controller.statistics import ControllerState, TickReport
+from omnid.controller.statistics import ControllerState
 from omnid.core.control.arming import ArmRequest
 from omnid.core.control.command_sources import PLANNER, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
@@ -34,17 +35,14 @@ from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate, Place
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.route_files import RouteFiles
 from omnid.runs.wiring import NavigationParts, Outputs, Parts, WiredStages, wheel_state, wire
-from omnid.simulation.cameras import SimulatedCameras
 from omnid.simulation.robot import SimulatedRobot, with_masks
-from omnid.simulation.vehicle import START_NS, Tick, Vehicle
+from omnid.simulation.vehicle import Fault, Tick, Vehicle
 from omnid.simulation.world import World
 from omnid.sinks.drive import NAVIGATION_SENDER
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry
 from omnid.stages.lockstep_drive import controller_pose
 from omnid.stages.obstacles import controller_ring
-
-T = TypeVar("T")
 
 
 class LockstepRequests:
@@ -69,15 +67,15 @@ class LockstepRequests:
             yield taken
 
 
-class Take(Generic[T]):
+class _Into:
     """A sink that calls a function."""
 
-    def __init__(self, take: Callable[[T], None]) -> None:
-        self._take = take
+    def __init__(self, call: Callable[[Any], object]) -> None:
+        self._call = call
 
-    def process(self, message: T, /) -> None:
-        """Take a message."""
-        self._take(message)
+    def process(self, message: Any, /) -> None:
+        """Call the function."""
+        self._call(message)
 
 
 Array = NDArray[np.float64]
@@ -105,30 +103,52 @@ Drive: TypeAlias = Callable[[Moment], Iterable[Request]]
 Tamper: TypeAlias = Callable[[float, Frame], Frame]
 
 
-@dataclass(frozen=True, slots=True)
-class Fault:
-    """A fault of the surroundings or of the hardware, between two times [s] since the start of the drive."""
+class EstimatedPose(NamedTuple):
+    """A pose of odometry, with the truth."""
 
-    kind: Literal["dark", "no lower image", "no upper image", "motor cut"]
-    start_s: float
-    end_s: float
+    stamp_ns: int
+    T_world_base: Array  # (4, 4) true
+    T_odom_base: Array  # (4, 4) estimated
+    state: str  # of the tracking
+    is_slipping: bool  # the daemon reports that the wheels slip
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class SimulatedRun:
     """The truth and the estimates of a drive; odom is the frame of the base at the first pair."""
 
-    stamps_ns: NDArray[np.int64]  # (N,) stamps of the poses
-    T_world_base: Array  # (N, 4, 4) true
-    T_odom_base: Array  # (N, 4, 4) estimated
-    states: tuple[str, ...]  # tracking states of the poses
-    slipping: NDArray[np.bool_]  # (N,) True where the daemon reports that the wheels slip
-    ticks: tuple[Tick, ...]
-    lines: tuple[tuple[float, str], ...]  # time [s] and text: what the controller reported
-    rings: tuple[ObstacleRing, ...]
-    navigation: tuple[NavigationUpdate, ...]
-    places: tuple[PlaceUpdate, ...]
     T_base_rig: Array  # (4, 4)
+    poses: list[EstimatedPose] = field(default_factory=list)
+    ticks: list[Tick] = field(default_factory=list)
+    lines: list[tuple[float, str]] = field(default_factory=list)  # time [s] and text: what the controller reported
+    rings: list[ObstacleRing] = field(default_factory=list)
+    navigation: list[NavigationUpdate] = field(default_factory=list)
+    places: list[PlaceUpdate] = field(default_factory=list)
+
+    @property
+    def stamps_ns(self) -> NDArray[np.int64]:
+        """The stamps (N,) of the poses."""
+        return np.array([pose.stamp_ns for pose in self.poses], np.int64)
+
+    @property
+    def T_world_base(self) -> Array:
+        """The true poses (N, 4, 4)."""
+        return np.array([pose.T_world_base for pose in self.poses]).reshape(-1, 4, 4)
+
+    @property
+    def T_odom_base(self) -> Array:
+        """The estimated poses (N, 4, 4)."""
+        return np.array([pose.T_odom_base for pose in self.poses]).reshape(-1, 4, 4)
+
+    @property
+    def states(self) -> list[str]:
+        """The tracking states of the poses."""
+        return [pose.state for pose in self.poses]
+
+    @property
+    def slipping(self) -> NDArray[np.bool_]:
+        """The poses (N,) with which the daemon reports that the wheels slip."""
+        return np.array([pose.is_slipping for pose in self.poses], bool)
 
     @property
     def truth_in_odom(self) -> Array:
@@ -173,7 +193,7 @@ def simulate(
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        return _Lockstep(world, robot, drive, seed, config or Config(), tuple(faults), tamper).run(seconds)
+        return _Lockstep(world, robot, drive, seed, config or Config(), faults, tamper).run(seconds)
     finally:
         cv2.setNumThreads(threads)
 
@@ -186,41 +206,41 @@ class _Lockstep:
         drive: Drive,
         seed: int,
         config: Config,
-        faults: tuple[Fault, ...],
+        faults: Iterable[Fault],
         tamper: Tamper | None,
     ) -> None:
-        self._robot, self._drive, self._config, self._faults, self._tamper = robot, drive, config, faults, tamper
+        self._robot, self._drive, self._config, self._tamper = robot, drive, config, tamper
         self._rig = with_masks(robot.rig)
-        self._cameras = SimulatedCameras(self._rig, robot.sensor, world, seed, robot.samples)
-        self._ticks: list[Tick] = []
-        self._lines: list[tuple[float, str]] = []
-        self._vehicle = Vehicle(world, robot, config, seed, self._take_tick, self._take_line)
+        self._run = run = SimulatedRun(self._rig.T_base_rig)
+        self._vehicle = Vehicle(
+            world,
+            robot,
+            config,
+            seed,
+            lambda tick, _: run.ticks.append(tick),
+            lambda time_s, line: run.lines.append((time_s, line)),
+            faults=faults,
+        )
         self._delay_ns = round(robot.pose_delay_s * 1e9)
         self._requests = LockstepRequests()
         self._files = RouteFiles(RouteFolder(Path(config.navigation.routes)), self._requests.put)
         self._ends = False
         self._truth: dict[int, Array] = {}  # T_world_base by the stamp of a pair [ns]
         self._odometry: OdometryUpdate | None = None
-        # Stamp [ns], T_odom_base, tracking state, whether the wheels slip.
-        self._poses: list[tuple[int, Array, str, bool]] = []
-        self._rings: list[ObstacleRing] = []
-        self._navigation: list[NavigationUpdate] = []
-        self._places: list[PlaceUpdate] = []
         self._stages: WiredStages | None = None
 
     def run(self, seconds: float) -> SimulatedRun:
         """Drive; return the run."""
-        config = self._config
-        # 1. The stages of the daemon between the simulated cameras and the lists of results.
-        graph = Graph(threaded=False)
+        # The stages of the daemon, between the simulated cameras and the lists of results.
+        config, graph = self._config, Graph(threaded=False)
         frames = graph.source("cameras", lambda: self._messages(seconds))
         shape = geometry(self._rig, config.panorama)
         run_places = RunPlaces(config, shape, nothing)
-        navigation = NavigationParts(self._requests, self._wheels, Take(self._take_navigation), config.places.map)
+        navigation = NavigationParts(self._requests, self._wheels, _Into(self._take_navigation), config.places.map)
         outputs = Outputs(
-            poses={"poses": Take(self._take_pose)},
-            rings={"rings": Take(self._take_ring)},
-            places={"in map": Take(self._places.append)} if config.places.map else {},
+            poses={"poses": _Into(self._take_pose)},
+            rings={"rings": _Into(self._take_ring)},
+            places={"in map": _Into(self._run.places.append)} if config.places.map else {},
         )
         self._stages = wire(
             graph,
@@ -230,79 +250,45 @@ class _Lockstep:
             outputs,
             run_places.known_to(Parts(navigation=navigation)),
         )
-        # 2. The drive: the stages take what `_messages` yields.
         graph.run()
         run_places.finish()
-        # 3. Truth and estimates, at the stamps of the poses.
-        stamps_ns, poses, states, slipping = zip(*self._poses, strict=True) if self._poses else ((), (), (), ())
-        return SimulatedRun(
-            np.array(stamps_ns, np.int64),
-            np.array([self._truth[stamp_ns] for stamp_ns in stamps_ns]).reshape(-1, 4, 4),
-            np.array(poses).reshape(-1, 4, 4),
-            states,
-            np.array(slipping, bool),
-            tuple(self._ticks),
-            tuple(self._lines),
-            tuple(self._rings),
-            tuple(self._navigation),
-            tuple(self._places),
-            self._rig.T_base_rig,
-        )
+        return self._run
 
     def _messages(self, seconds: float) -> Iterator[Frame | MotionSample]:
         """Advance the robot from pair to pair; the stages work while frames and samples are yielded."""
-        vehicle, period_s = self._vehicle, 1.0 / self._robot.rate_hz
-        for seq in range(int(seconds / period_s)):
-            # 1. The robot moves until this pair is exposed.
-            stamp_ns = START_NS + round(seq * period_s * 1e9)
-            vehicle.motor.cut = self._has("motor cut")
-            vehicle.advance(stamp_ns)
-            # 2. The drive sees the newest estimates, and asks for what it wants.
+        vehicle = self._vehicle
+        for stamp_ns, frames, samples in islice(vehicle.pairs(nothing), int(seconds * self._robot.rate_hz)):
+            # 1. The drive sees the newest estimates, and asks for what it wants.
             self._send()
             if self._ends:
                 break
-            # 3. What the sensors have measured goes through the stages.
+            # 2. What the sensors have measured goes through the stages.
             self._truth[stamp_ns] = vehicle.T_world_base
-            yield from vehicle.take_samples()
-            yield from self._pair(seq, stamp_ns)
+            yield from samples
+            yield from (frame if self._tamper is None else self._tamper(vehicle.time_s, frame) for frame in frames)
         vehicle.come_to_rest()
         self._requests.end()
 
-    def _pair(self, seq: int, stamp_ns: int) -> Iterator[Frame]:
-        """Yield the frames of a pair, without those that a fault takes away."""
-        T_world_rig = self._vehicle.T_world_rig
-        brightness = 0.0 if self._has("dark") else 1.0
-        for camera in CAMERAS:
-            if not self._has(f"no {camera} image"):
-                frame = self._cameras.frame(
-                    camera, seq, stamp_ns, T_world_rig, self._vehicle.people, brightness=brightness
-                )
-                yield frame if self._tamper is None else self._tamper(self._vehicle.time_s, frame)
-
-    def _has(self, kind: str) -> bool:
-        """True while there is a fault of this kind."""
-        return any(fault.kind == kind and fault.start_s <= self._vehicle.time_s < fault.end_s for fault in self._faults)
-
     def _send(self) -> None:
         """Send what the drive asks for now."""
-        vehicle, controller = self._vehicle, self._vehicle.controller
+        vehicle, run = self._vehicle, self._run
         moment = Moment(
             vehicle.time_s,
             vehicle.T_world_base,
-            controller.state,
+            vehicle.controller.state,
             self._odometry,
-            self._poses[-1][1] if self._poses else np.eye(4),
-            self._navigation[-1] if self._navigation else None,
-            self._places[-1] if self._places else None,
+            run.poses[-1].T_odom_base if run.poses else np.eye(4),
+            run.navigation[-1] if run.navigation else None,
+            run.places[-1] if run.places else None,
         )
         arrival_ns = vehicle.now_ns + 1  # after the tick at this time, which has passed
         for request in self._drive(moment):
             if isinstance(request, Setpoint):
-                controller.take(TimedSetpoint(arrival_ns, request))
+                vehicle.post(TimedSetpoint(arrival_ns, request))
             elif request == "arm":
-                controller.take(ArmRequest(arrival_ns))
+                vehicle.post(ArmRequest(arrival_ns))
             elif request == "stop":
-                controller.stop(arrival_ns)
+                vehicle.post("stop")
             elif request == "end":
                 self._ends = True
             else:
@@ -312,25 +298,20 @@ class _Lockstep:
     def _wheels(self) -> WheelState:
         return wheel_state(self._vehicle.controller.state)
 
-    def _take_tick(self, tick: Tick, _: TickReport) -> None:
-        self._ticks.append(tick)
-
-    def _take_line(self, time_s: float, line: str) -> None:
-        self._lines.append((time_s, line))
-
     def _take_pose(self, odometry: OdometryUpdate) -> None:
-        T_base_rig = self._rig.T_base_rig
+        T_base_rig, stamp_ns = self._rig.T_base_rig, odometry.stamp_ns
         self._odometry = odometry
         is_slipping = self._stages is not None and self._stages.front_end.odometry.sensors.is_slipping
-        self._poses.append((odometry.stamp_ns, of_base(odometry, T_base_rig)[0], odometry.state, is_slipping))
-        self._vehicle.post(controller_pose(odometry, T_base_rig), odometry.stamp_ns + self._delay_ns)
+        T_odom_base = of_base(odometry, T_base_rig)[0]
+        self._run.poses.append(EstimatedPose(stamp_ns, self._truth[stamp_ns], T_odom_base, odometry.state, is_slipping))
+        self._vehicle.post(controller_pose(odometry, T_base_rig), stamp_ns + self._delay_ns)
 
     def _take_ring(self, ring: ObstacleRing) -> None:
-        self._rings.append(ring)
+        self._run.rings.append(ring)
         self._vehicle.post(controller_ring(ring), ring.stamp_ns + self._delay_ns)
 
     def _take_navigation(self, update: NavigationUpdate) -> None:
-        self._navigation.append(update)
+        self._run.navigation.append(update)
         self._files.process(update)
         if update.setpoint is not None:
             due_ns = self._vehicle.now_ns + self._delay_ns

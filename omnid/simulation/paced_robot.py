@@ -1,8 +1,6 @@
-"""A simulated robot whose time waits for the daemon: a busy computer slows it down, and changes nothing else.
+"""A simulated robot in place of the cameras and the motor of a live run.
 
-Between two pairs of images the controller ticks, in the thread that renders. Its ticks up to the next pair need no
-answer to the last one, since a pose takes that long to reach the wheels: so the next pair is rendered while the daemon
-works on the last. Then time is stopped until the daemon has answered. Deadlines, ramps and watchdogs are judged by
+Its time waits for the daemon, and does not run faster than the computer's. Deadlines, ramps and watchdogs are judged by
 this one clock. The daemon's messages reach the controller at its ticks, and are dated by this clock.
 """
 
@@ -14,7 +12,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import replace
-from itertools import count
 from queue import Empty, Full, Queue
 from typing import Final
 
@@ -33,7 +30,6 @@ from omnid.engine.flow import nothing
 from omnid.engine.graph import Graph, Stream
 from omnid.engine.telemetry import StageStats
 from omnid.runs.session import Session
-from omnid.simulation.cameras import SimulatedCameras
 from omnid.simulation.robot import SimulatedRobot, with_masks
 from omnid.simulation.vehicle import Tick, Vehicle
 from omnid.simulation.world import World
@@ -123,12 +119,10 @@ class PacedRobot:
         self._report, self._keeps_truth = report, keeps_truth
         self.rig = with_masks(robot.rig)
         self._world, self._robot, self._config, self._seed = world, robot, config, seed
-        self._rendered = SimulatedCameras(self.rig, robot.sensor, world, seed, samples=1)
-        self._period_ns = round(1e9 / robot.rate_hz)
         self._start_ns = time.monotonic_ns()
         self._vehicle: Vehicle | None = None
         self._link: PacedLink | None = None
-        self._states = {camera: CameraState(mode="simulated") for camera in CAMERAS}
+        self._states = {camera: CameraState(mode="simulated", status="streaming") for camera in CAMERAS}
         self._given_s: deque[float] = deque(maxlen=RECENT)  # when the last pairs were given
         self._due_s = 0.0  # not before this time the next pair is given
         self._closed = self._ends = False
@@ -152,8 +146,10 @@ class PacedRobot:
             if not self._ends:  # no more poses come then, which needs no line
                 session.warn(line)
 
-        self._vehicle = Vehicle(self._world, self._robot, config, self._seed, self._take_tick, warn, self._start_ns)
-        self._link = PacedLink(self._vehicle, stats, self._period_ns)
+        self._vehicle = Vehicle(
+            self._world, self._robot, config, self._seed, self._take_tick, warn, self._start_ns, samples=1
+        )
+        self._link = PacedLink(self._vehicle, stats, round(1e9 / self._robot.rate_hz))
         return self._link
 
     def sources(self, graph: Graph, take: Callable[[MotionSample], None]) -> list[Stream[Frame]]:
@@ -196,29 +192,22 @@ class PacedRobot:
         vehicle, link = self._vehicle, self._link
         assert vehicle is not None and link is not None
         try:
-            for seq in count():
-                # 1. Up to the exposure, by what the controller knows.
-                stamp_ns = self._start_ns + (seq + 1) * self._period_ns
-                vehicle.advance(stamp_ns, ticks_then=False)
-                # 2. The images, while the daemon works on those before.
-                pair = [self._frame(vehicle, camera, seq, stamp_ns) for camera in CAMERAS]
+            for pair in vehicle.pairs(settle):
                 if self._keeps_truth:
-                    self.truth[stamp_ns] = vehicle.twin.base.pose
-                # 3. The daemon's answers, which take effect with the tick of now.
-                settle()
-                vehicle.advance(stamp_ns)
-                for sample in vehicle.take_samples():
+                    self.truth[pair.stamp_ns] = vehicle.twin.base.pose
+                for sample in pair.samples:
                     if self._is_given(sample):
                         take(sample)
-                # 4. The images, not before their time.
+                # Images are not given before their time; a pair that comes late is not made up for.
                 while not self._closed and (left_s := self._due_s - time.monotonic()) > 0:
                     time.sleep(min(left_s, POLL_S))
                 if self._closed:
                     return
                 self._given_s.append(time.monotonic())
-                # A pair that comes late is not made up for.
                 self._due_s = max(self._due_s + 1.0 / self._robot.rate_hz, self._given_s[-1])
-                yield from pair
+                for frame in pair.frames:
+                    self._states[frame.camera].frames += 1
+                    yield frame
         finally:
             self._ends = True
             vehicle.come_to_rest()
@@ -228,12 +217,6 @@ class PacedRobot:
         """True if the settings ask for samples of this kind."""
         motion = self._config.motion
         return (motion.imu if isinstance(sample, GyroSample) else motion.wheels) != "off"
-
-    def _frame(self, vehicle: Vehicle, camera: Camera, seq: int, stamp_ns: int) -> Frame:
-        state = self._states[camera]
-        state.status = "streaming"
-        state.frames += 1
-        return self._rendered.frame(camera, seq, stamp_ns, vehicle.T_world_rig, vehicle.people)
 
     def _take_tick(self, tick: Tick, report: TickReport) -> None:
         """Pass a tick on; count and report a contact when it begins."""

@@ -1,11 +1,19 @@
-"""The robot's body in simulated time: wheels, motor controller and the real controller, stepped at its ticks."""
+"""A robot in simulated time: x(k+1) = f(x(k), u(k), dt) of its body, with its cameras and the real controller.
+
+Time passes from pair to pair of images, with the ticks of the controller between them. Before the tick at a pair time
+stands still until the images of the pair before have been answered: `wait` of `Vehicle.pairs`. In lock-step the stages
+run inline, so nothing is waited for. A daemon in other threads is waited for, so that a busy computer slows the robot
+down and changes nothing else: poses take longer than a tick to the wheels, so that the next pair can be rendered while
+the daemon works on the last.
+"""
 
 from __future__ import annotations
 
 import heapq
 import math
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from itertools import count
 from queue import SimpleQueue
 from typing import Final, Literal, NamedTuple, TypeAlias
@@ -14,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
+from drivers.frame import CAMERAS, Frame
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from drivers.motor import VelocityCommand
 from drivers.motors.protocols.protocol_registry import motor_protocol
@@ -26,9 +35,10 @@ from omnid.core.control.arming import ArmRequest
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.contacts import ContactState
 from omnid.core.control.control_law import ControlInput
+from omnid.simulation.cameras import SimulatedCameras
 from omnid.simulation.clearance import clearance_m, footprints, obstacles_of
 from omnid.simulation.people import Walkers
-from omnid.simulation.robot import SimulatedRobot
+from omnid.simulation.robot import SimulatedRobot, with_masks
 from omnid.simulation.world import World
 
 Array = NDArray[np.float64]
@@ -48,8 +58,25 @@ class Tick(NamedTuple):
     clearance_m: float  # of the robot's outline; 0 or less: contact
 
 
+class Exposure(NamedTuple):
+    """What the sensors give at a time: a pair of images, and wheels and gyro since the pair before."""
+
+    stamp_ns: int
+    frames: list[Frame]
+    samples: list[MotionSample]
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """A fault of the surroundings or of the hardware, between two times [s] since the start of the drive."""
+
+    kind: Literal["dark", "no lower image", "no upper image", "motor cut"]
+    start_s: float
+    end_s: float
+
+
 class Vehicle:
-    """A body that is advanced by its caller. Messages to the controller arrive at their times, in order."""
+    """The robot. Messages to the controller arrive at their times, in order."""
 
     def __init__(
         self,
@@ -60,12 +87,20 @@ class Vehicle:
         take_tick: Callable[[Tick, TickReport], None],
         report: Callable[[float, str], None],
         start_ns: int = START_NS,
+        *,
+        samples: int | None = None,
+        faults: Iterable[Fault] = (),
     ) -> None:
-        """take_tick: takes each tick. report: takes lines of the controller, with the time since the start [s]."""
+        """take_tick: takes each tick. report: takes lines of the controller, with the time since the start [s].
+
+        samples: rays of a pixel, per axis; None: those of the robot.
+        """
         self.now_ns = self._start_ns = start_ns
         self.people = Walkers(world.people)
         self._take_tick = take_tick
-        self._ground, self._robot = world.ground, robot
+        self._ground, self._robot, self._faults = world.ground, robot, tuple(faults)
+        rays = robot.samples if samples is None else samples
+        self._cameras = SimulatedCameras(with_masks(robot.rig), robot.sensor, world, seed, rays)
         drive = config.motor.drive.geometry()
         self.twin = simulated_controller(config.motor.protocol, drive)
         base = self.twin.base
@@ -89,7 +124,7 @@ class Vehicle:
         self._wheel_noise, self._gyro_noise = random.Random(seed), random.Random(seed + 1)
         self._rolled_s = 0.0  # time that the wheels have turned or stood
         self._gyro_ns = start_ns
-        self.samples: list[MotionSample] = []  # since they were taken
+        self.samples: list[MotionSample] = []  # since the last pair
         self._standing = obstacles_of(world, robot.height_m)
 
     @property
@@ -114,6 +149,32 @@ class Vehicle:
         """
         self._posted.put((due_ns, next(self._numbers), given))
 
+    def pairs(self, wait: Callable[[], object]) -> Iterator[Exposure]:
+        """Yield pair after pair, without the images that a fault takes away.
+
+        wait: returns when the messages that follow from the pairs before have been posted.
+        """
+        for seq in count():
+            # 1. The body moves by what the controller knows; the images show it there.
+            stamp_ns = self._start_ns + round(seq * 1e9 / self._robot.rate_hz)
+            self.motor.cut = self._has("motor cut")
+            self.advance(stamp_ns, ticks_then=False)
+            brightness = 0.0 if self._has("dark") else 1.0
+            frames = [
+                self._cameras.frame(camera, seq, stamp_ns, self.T_world_rig, self.people, brightness=brightness)
+                for camera in CAMERAS
+                if not self._has(f"no {camera} image")
+            ]
+            # 2. What has been answered meanwhile takes effect with the tick of now.
+            wait()
+            self.advance(stamp_ns)
+            samples, self.samples = self.samples, []
+            yield Exposure(stamp_ns, frames, samples)
+
+    def _has(self, kind: str) -> bool:
+        """True while there is a fault of this kind."""
+        return any(fault.kind == kind and fault.start_s <= self.time_s < fault.end_s for fault in self._faults)
+
     def advance(self, until_ns: int, *, ticks_then: bool = True) -> None:
         """Advance to a time, with all ticks and samples that are due until then.
 
@@ -136,11 +197,6 @@ class Vehicle:
         """Have the controller stop the wheels permanently."""
         self.controller.end()
         self.advance(self.now_ns + STOPPING_NS)
-
-    def take_samples(self) -> list[MotionSample]:
-        """Return the samples of wheels and gyro since the last call."""
-        samples, self.samples = self.samples, []
-        return samples
 
     def _give(self, given: Given) -> None:
         """Give the controller something, which arrives after what it was given before, and after the tick before."""

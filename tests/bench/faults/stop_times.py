@@ -17,11 +17,11 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from tests.bench.faults.trials import FAULTY_DAEMON
 from tests.bench.results import Column, ResultTable
 from tests.replay.live import Base, Daemon, Operator, robot
 from tests.waiting import wait_until
 
+FAULTY_DAEMON: Final = "tests.replay.faulty"
 SPEED_MPS: Final = 0.3
 POLL_S: Final = 0.002
 STILL_S: Final = 0.3  # wheels at rest must stay there for so long, while the cause lasts and after it

@@ -8,7 +8,6 @@ import pytest
 
 from tests.bench.faults import hostile_commands, stop_times
 from tests.bench.faults.hostile_files import FORMATS, attack, short_run
-from tests.bench.faults.trials import TRIALS, Setting
 
 
 def test_mutated_files_give_a_result_or_one_line(tmp_path: Path) -> None:
@@ -28,10 +27,3 @@ def test_mutated_commands_never_move_the_wheels(tmp_path: Path, course: Path, mo
 def test_the_wheels_come_to_rest(tmp_path: Path, course: Path, name: str) -> None:
     times = stop_times.stop_times(course, tmp_path / "stops", name, 2, seed=7)
     assert len(times) == 2
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("fault", TRIALS)
-def test_no_fault_ends_the_daemon_or_moves_the_wheels(tmp_path: Path, course: Path, fault: str) -> None:
-    (tmp_path / "in").mkdir()
-    assert TRIALS[fault](Setting(course, tmp_path / "in")).process
