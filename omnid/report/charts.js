@@ -3,7 +3,8 @@
 (() => {
   const run = JSON.parse(document.querySelector("[data-run]").dataset.run);
   const COLOURS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#666", "#e69f00"], DASHES = [[], [6, 3], [2, 2]];
-  const FILLS = {1: "#e69f0033", 2: "#d55e0044"};  // behind the lines, while degraded and lost
+  const style = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+  const FILLS = {1: `${style("--degraded")}33`, 2: `${style("--lost")}44`};  // behind the lines, while degraded and lost
   const SECONDS = [0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200, 14400];
   const HEIGHT_PX = 190;
   const charts = [];

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Sequence
 from functools import cache
 from html import escape
@@ -29,7 +30,7 @@ class Curve(NamedTuple):
 
 
 def chart(title: str, curves: Sequence[Curve], *, unit: str = "", log: bool = False, note: str = "") -> str:
-    """Return a figure; "" where all curves are empty."""
+    """Return a figure; "" where all curves are empty. Lengths below 0.1 m are shown in mm."""
     shown = []
     for name, t_s, values in curves:
         valid = np.isfinite(values) & ((values > 0) | (not log))
@@ -37,6 +38,8 @@ def chart(title: str, curves: Sequence[Curve], *, unit: str = "", log: bool = Fa
             shown.append(Curve(name, t_s[valid], values[valid]))
     if not shown:
         return ""
+    if unit == "m" and max(np.abs(values).max() for _, _, values in shown) < 0.1:
+        unit, shown = "mm", [Curve(name, t_s, 1e3 * values) for name, t_s, values in shown]
     lines = [{"name": name, "points": thinned(t_s, values)} for name, t_s, values in shown[:MAX_CURVES]]
     data = escape(json.dumps({"lines": lines, "log": log, "unit": unit}, separators=(",", ":")))
     rows = [
@@ -74,6 +77,13 @@ def thinned(t_s: Array, values: Array) -> list[tuple[float, float | None]]:
 def grid(figures: Sequence[str]) -> str:
     """Return figures side by side where there is room."""
     return f"<div class='grid2'>{''.join(figures)}</div>" if any(figures) else ""
+
+
+@cache
+def colours() -> dict[str, tuple[int, int, int]]:
+    """Return the colours of the style sheet by their names, BGR, for what is drawn as an image."""
+    found = re.findall("--([a-z]+):#([0-9a-f]{6})", (files("omnid.report") / "report.css").read_text("utf-8"))
+    return {name: tuple(bytes.fromhex(digits)[::-1]) for name, digits in found}
 
 
 @cache

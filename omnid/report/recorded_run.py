@@ -31,13 +31,13 @@ from omnid.recordings.recording import (
     choose_odometry_topic,
     no_pose,
 )
+from omnid.report.charts import Array, Curve
 from omnid.tracking_state import TrackingState
 from omnid.transport import status_names
 from omnid.transport.codec import Cloud, Diagnostics, DiagnosticStatus, Pose, PoseInMap, TwistRecord
 from omnid.transport.status_names import Key, short_name
 from omnid.transport.topics import MAP_POSE
 
-Array = NDArray[np.float64]
 STATES: Final = tuple(TrackingState)
 UNKNOWN: Final = -1  # rank of a state that is not recorded
 GOOD, WARNING, ERROR = range(3)
@@ -126,6 +126,11 @@ class RecordedRun:
         return np.eye(4) if self.rig is None else self.rig.T_base_rig
 
     @property
+    def xyz(self) -> Array:
+        """Positions of the robot (N, 3) in odom, m."""
+        return self.T_odom_base[:, :-1, -1]
+
+    @property
     def end_s(self) -> float:
         """Time of the last pose."""
         return float(self.t_s[-1])
@@ -145,6 +150,10 @@ class RecordedRun:
         known = sorted((t_s, value) for t_s, value in found if value is not None)
         return np.array([t_s for t_s, _ in known]), np.array([value for _, value in known])
 
+    def curve(self, title: str, name: str, key: str) -> Curve:
+        """Return a number of a part as a curve with that title."""
+        return Curve(title, *self.series(name, key))
+
     def values(self, name: str) -> Mapping[str, str]:
         """Return the newest values of a part."""
         return self.newest[name].values if name in self.newest else {}
@@ -157,7 +166,7 @@ class RecordedRun:
 
     def length_m(self) -> float:
         """Return the length of the path; the step from one odom to the next is no part of it."""
-        steps_m = np.linalg.norm(np.diff(self.T_odom_base[:, :3, 3], axis=0), axis=1)
+        steps_m = np.linalg.norm(np.diff(self.xyz, axis=0), axis=1)
         steps_m[[index - 1 for index in self.restarts]] = 0.0
         return float(steps_m.sum())
 
@@ -244,13 +253,13 @@ def read_run(path: Path, topic: str | None = None) -> RecordedRun:
             case Pose() as pose:
                 offset_ns = message.log_time_ns - pose.stamp_ns if offset_ns is None else offset_ns
                 is_near = abs(message.log_time_ns - pose.stamp_ns - offset_ns) <= MAX_CLOCK_OFFSET_S * 1e9
-                if not (is_near and (np.abs(pose.T_odom_base[:3, 3]) <= POSITION_LIMIT_M).all()):
+                if not (is_near and (np.abs(pose.T_odom_base[:-1, -1]) <= POSITION_LIMIT_M).all()):
                     out_of_range += 1
                 elif poses and pose.stamp_ns <= poses[-1].stamp_ns:
                     late += 1
                 else:
                     poses.append(pose)
-            case PoseInMap() as in_map if (np.abs(in_map.T_map_base[:3, 3]) <= POSITION_LIMIT_M).all():
+            case PoseInMap() as in_map if (np.abs(in_map.T_map_base[:-1, -1]) <= POSITION_LIMIT_M).all():
                 map_poses.append(in_map)
             case Diagnostics(stamp_ns, entries):
                 bounded = [_bounded(status) for status in entries]
@@ -280,7 +289,7 @@ def read_run(path: Path, topic: str | None = None) -> RecordedRun:
     corrections = []
     for in_map in map_poses:
         T_map, T_odom = in_map.T_map_base, by_stamp[in_map.stamp_ns]
-        moved_m, sigma_m = math.dist(T_map[:2, 3], T_odom[:2, 3]), root(np.trace(in_map.covariance[:3, :3]))
+        moved_m, sigma_m = math.dist(T_map[:2, -1], T_odom[:2, -1]), root(np.trace(in_map.covariance[:3, :3]))
         corrections.append((seconds(in_map.stamp_ns), moved_m, se3.yaw(T_map @ se3.inverse(T_odom)), sigma_m))
     return RecordedRun(
         path=path,
@@ -298,7 +307,7 @@ def read_run(path: Path, topic: str | None = None) -> RecordedRun:
         velocity=np.array([pose.velocity for pose in poses]),
         statuses=[(seconds(stamp_ns), entries) for stamp_ns, entries in statuses],
         map_poses=np.array(corrections).reshape(-1, 4),
-        map_xy=np.array([pose.T_map_base[:2, 3] for pose in map_poses]).reshape(-1, 2),
+        map_xy=np.array([pose.T_map_base[:2, -1] for pose in map_poses]).reshape(-1, 2),
         drives={
             name: np.array([(seconds(twist.stamp_ns), twist.velocity_mps, twist.yaw_rate_radps) for twist in twists])
             for name, twists in drives.items()

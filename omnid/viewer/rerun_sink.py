@@ -37,11 +37,23 @@ TIMELINE: Final = "stamp"
 # Drawn in full at first, then every 2nd, 4th, 8th ... after each further so many.
 MOST: Final = {"pose": 20_000, "scan": 20_000, "image": 1_000, "cloud": 50, "places": 200}
 MAP_POINTS, RIG_POINTS = 50_000, 3_000
+AXES_M, LEAST_M = 0.3, 0.05  # of the robot's axes; radius from which an ellipsoid is visible
 SIGMAS: Final = 3.0  # radius of the ellipsoid in standard deviations
-BLUE, ORANGE, RED, YELLOW = (86, 180, 233), (230, 159, 0), (213, 94, 0), (240, 228, 66)
-GREY, DARK, VIOLET = (150, 150, 150), (60, 60, 60), (170, 80, 200)
-# Colour and width in px of the path: the worse the state, the thicker.
-STATES: Final = {"tracking": (BLUE, 1.5), "degraded": (ORANGE, 3.0), "lost": (RED, 5.0), "unknown": (GREY, 1.5)}
+# Colours, and sizes on the screen: the radii of lines and points, which do not depend on the distance [px]; of the path
+# by the state: the worse, the thicker.
+BLUE, GREEN, ORANGE, RED, YELLOW = "#56b4e9", "#009e73", "#e69f00", "#d55e00", "#f0e442"
+GREY, DARK, VIOLET = "#969696", "#3c3c3c", "#aa50c8"
+THIN, MEDIUM, THICK = 1.5, 2.5, 5.0
+STATES: Final = {"tracking": (BLUE, THIN), "degraded": (ORANGE, MEDIUM), "lost": (RED, THICK), "unknown": (GREY, THIN)}
+FEATURES: Final = {"inliers": BLUE, "rejected": RED, "new": YELLOW}
+PLOTS: Final = {
+    "speed": "Speed",
+    "yaw_rate": "Yaw rate",
+    "landmarks": "Landmarks",
+    "sigma": "Standard deviation",
+    "latency": "Latency, ms",
+    "correction": "Correction by the map",
+}
 LEVELS: Final = ("INFO", "WARN", "ERROR", "WARN")  # of Rerun, by the level of a status
 LEGEND: Final = f"""
 **Path**: thin blue tracking, thicker orange degraded, thickest red lost, grey unknown.
@@ -67,18 +79,13 @@ def layout() -> Any:
     images = [rrb.Spatial2DView(origin="panorama", name="Image"), rrb.Spatial2DView(origin="depth", name="Depth")]
     state = rrb.StateTimelineView(origin="state", name="State")
     log, legend = rrb.TextLogView(origin="log", name="Log"), rrb.TextDocumentView(origin="legend", name="Legend")
-    plots = [
-        rrb.Vertical(*(rrb.TimeSeriesView(origin=name, name=title) for name, title in column))
-        for column in (
-            (("speed", "Speed"), ("yaw_rate", "Yaw rate")),
-            (("landmarks", "Landmarks"), ("sigma", "Standard deviation")),
-            (("latency", "Latency, ms"), ("correction", "Correction by the map")),
-        )
-    ]
+    plots = [rrb.TimeSeriesView(origin=name, name=title) for name, title in PLOTS.items()]
     upper = rrb.Horizontal(world, rrb.Vertical(*images, rrb.Tabs(state, log, legend)), column_shares=[5, 4])
     panels = (rrb.TimePanel(timeline=TIMELINE, state="collapsed"), rrb.SelectionPanel(state="collapsed"))
     return rrb.Blueprint(
-        rrb.Vertical(upper, rrb.Horizontal(*plots), row_shares=[5, 3]), *panels, rrb.BlueprintPanel(state="collapsed")
+        rrb.Vertical(upper, rrb.Grid(*plots, grid_columns=3), row_shares=[5, 3]),
+        *panels,
+        rrb.BlueprintPanel(state="collapsed"),
     )
 
 
@@ -120,7 +127,7 @@ class RerunSink:
                 self._status(content)
             case Cloud() if self.wants("cloud"):
                 points = content.points[np.isfinite(content.points).all(axis=1)]
-                self._at(content.stamp_ns).log("odom/map", _points_3d(points, MAP_POINTS, 1.5))
+                self._at(content.stamp_ns).log("odom/map", _points_3d(points, MAP_POINTS, THIN))
             case Scan() if self.wants("scan"):
                 self._scan(content)
             case RosImage() if self.wants("image"):
@@ -138,12 +145,8 @@ class RerunSink:
     def features(self, stamp_ns: int, features: Features) -> None:
         """Draw the features of the panorama."""
         stream = self._at(stamp_ns)
-        for name, pixels, colour in (
-            ("inliers", features.inliers, BLUE),
-            ("rejected", features.rejected, RED),
-            ("new", features.new, YELLOW),
-        ):
-            stream.log(f"panorama/{name}", rr.Points2D(pixels, colors=colour, radii=_px(2.5)))
+        for name, colour in FEATURES.items():
+            stream.log(f"panorama/{name}", rr.Points2D(getattr(features, name), **_style(colour, MEDIUM)))
 
     def depth(self, stamp_ns: int, disparity: NDArray[np.float32], focal_baseline: float, points: Array) -> None:
         """Draw distances from the rig's axis over the panorama, and points (N, 3) [m] around the base.
@@ -157,19 +160,18 @@ class RerunSink:
         image = rr.EncodedDepthImage(png, media_type="image/png", meter=1000.0, depth_range=(0.0, far_mm))
         stream = self._at(stamp_ns)
         stream.log("depth", image)
-        stream.log("odom/base_link/points", _points_3d(points, RIG_POINTS, 2.0))
+        stream.log("odom/base_link/points", _points_3d(points, RIG_POINTS, THIN))
 
     def correction(self, stamp_ns: int, T_map_odom: Array) -> None:
         """Plot by how much the map corrects odometry."""
-        self._plot(stamp_ns, "correction", "position mm", 1e3 * float(np.linalg.norm(T_map_odom[:3, 3])))
-        self._plot(stamp_ns, "correction", "heading mdeg", 1e3 * float(np.rad2deg(se3.yaw(T_map_odom))))
+        self._plot_errors(stamp_ns, "correction", np.linalg.norm(T_map_odom[:-1, -1]), se3.yaw(T_map_odom))
 
     def places(self, stamp_ns: int, keyframes: Array, loops: Array) -> None:
         """Draw keyframes (K, 3) in the order of the drives, the path through them, and loops (L, 2, 3), in odom [m]."""
         stream = self._at(stamp_ns)
-        stream.log("odom/keyframes", rr.Points3D(keyframes, colors=DARK, radii=_px(2.5)))
-        stream.log("odom/keyframes/path", rr.LineStrips3D([keyframes], colors=DARK, radii=_px(1.0)))
-        stream.log("odom/loops", rr.LineStrips3D(list(loops), colors=VIOLET, radii=_px(1.0)))
+        stream.log("odom/keyframes", rr.Points3D(keyframes, **_style(DARK, MEDIUM)))
+        stream.log("odom/keyframes/path", rr.LineStrips3D([keyframes], **_style(DARK, THIN)))
+        stream.log("odom/loops", rr.LineStrips3D(list(loops), **_style(VIOLET, THIN)))
 
     def close(self) -> None:
         """Flush and end the drawing; a second call does nothing."""
@@ -190,10 +192,10 @@ class RerunSink:
         if self._stream is None:
             self._stream = stream = self._open_stream()
             stream.log("odom", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-            axes = rr.Arrows3D(vectors=0.3 * np.eye(3), colors=(RED, (0, 158, 115), (0, 114, 178)), radii=_px(2.5))
+            axes = rr.Arrows3D(vectors=AXES_M * np.eye(3), colors=[*map(_rgb, (RED, GREEN, BLUE))], radii=_px(MEDIUM))
             stream.log("odom/base_link", axes, static=True)
             stream.log("legend", rr.TextDocument(LEGEND, media_type="text/markdown"), static=True)
-            colours = [colour for colour, _ in STATES.values()]
+            colours = [_rgb(colour) for colour, _ in STATES.values()]
             stream.log("state", rr.StateConfiguration(values=list(STATES), colors=colours), static=True)
         return self._stream
 
@@ -206,43 +208,45 @@ class RerunSink:
         if np.isfinite(value):
             self._at(stamp_ns).log([plot, name], rr.Scalars(value))
 
+    def _plot_errors(self, stamp_ns: int, plot: str, position_m: float, heading_rad: float) -> None:
+        """Plot a position and a heading, both small, in thousandths of m and degrees."""
+        self._plot(stamp_ns, plot, "position mm", 1e3 * float(position_m))
+        self._plot(stamp_ns, plot, "heading mdeg", 1e3 * float(np.rad2deg(heading_rad)))
+
     def _pose(self, pose: Pose) -> None:
         """Draw the robot, the newest piece of its path and its covariance; plot speeds and landmarks."""
         if pose.attachment.seq >= 0:
             self._state = pose.state
         self._show_state(pose.stamp_ns)
-        colour, width_px = STATES.get(self._state, STATES["unknown"])
         self._poses.append(pose)
         self.poses += 1
         if not self.wants("pose"):
             return
         # 1. The robot and its path.
-        stamp_ns, T, stream = pose.stamp_ns, pose.T_odom_base, self._at(pose.stamp_ns)
-        stream.log("odom/base_link", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
-        piece = np.array([T[:3, 3] if self._end is None else self._end, T[:3, 3]])
-        self._end = T[:3, 3]
-        stream.log("odom/path", rr.LineStrips3D([piece], colors=colour, radii=_px(width_px)))
-        # 2. The ellipsoid, 1, 10, 100 or 1000 times as large, so that millimetres are visible.
+        stamp_ns, stream, position = pose.stamp_ns, self._at(pose.stamp_ns), pose.T_odom_base[:-1, -1]
+        stream.log("odom/base_link", rr.Transform3D(translation=position, mat3x3=pose.T_odom_base[:-1, :-1]))
+        piece = np.array([position if self._end is None else self._end, position])
+        self._end = position
+        stream.log("odom/path", rr.LineStrips3D([piece], **_style(*STATES.get(self._state, STATES["unknown"]))))
+        # 2. The ellipsoid, magnified by a power of ten, at most 1000, so that millimetres are visible.
         if np.isfinite(pose.covariance).all():
             variances, axes = np.linalg.eigh(pose.covariance[:3, :3])
-            sigma_m = np.sqrt(np.maximum(variances, 0.0))
+            radii_m = SIGMAS * np.sqrt(np.maximum(variances, 0.0))
             axes[:, 2] *= np.sign(np.linalg.det(axes))
-            times = 10 ** int(np.clip(np.ceil(np.log10(0.05 / max(SIGMAS * sigma_m.max(), 1e-9))), 0, 3))
+            times = next(times for times in (1, 10, 100, 1000) if times * radii_m.max() >= LEAST_M or times == 1000)
             shape = rr.Ellipsoids3D(
-                half_sizes=[times * SIGMAS * sigma_m],
-                centers=[T[:3, 3]],
+                half_sizes=[times * radii_m],
+                centers=[position],
                 quaternions=[rr.Quaternion(xyzw=se3.quaternion(axes))],
-                colors=colour,
-                labels=[f"{SIGMAS:g} sigma: {1e3 * SIGMAS * sigma_m.max():.1f} mm, drawn x{times}"],
+                colors=_rgb(STATES.get(self._state, STATES["unknown"])[0]),
+                labels=[f"{SIGMAS:g} sigma: {1e3 * radii_m.max():.1f} mm, drawn x{times}"],
                 show_labels=False,
             )
             stream.log("odom/covariance", shape)
-            self._plot(stamp_ns, "sigma", "position mm", 1e3 * float(sigma_m.max()))
-            heading_rad = float(np.sqrt(max(0.0, pose.covariance[5, 5])))
-            self._plot(stamp_ns, "sigma", "heading mdeg", 1e3 * float(np.rad2deg(heading_rad)))
+            self._plot_errors(stamp_ns, "sigma", radii_m.max() / SIGMAS, np.sqrt(max(0.0, pose.covariance[-1, -1])))
         # 3. The plots.
         self._plot(stamp_ns, "speed", "m/s", float(np.linalg.norm(pose.velocity[:3])))
-        self._plot(stamp_ns, "yaw_rate", "deg/s", float(np.rad2deg(pose.velocity[5])))
+        self._plot(stamp_ns, "yaw_rate", "deg/s", float(np.rad2deg(pose.velocity[-1])))
         if pose.attachment.seq >= 0:
             self._plot(stamp_ns, "landmarks", "tracked", pose.attachment.tracked)
             self._plot(stamp_ns, "landmarks", "inliers", pose.attachment.inliers)
@@ -273,16 +277,12 @@ class RerunSink:
 
     def _scan(self, scan: Scan) -> None:
         """Draw the obstacles around the base, and near it where their directions are unknown."""
-        ranges = np.where(np.isnan(scan.ranges_m), 0.4, scan.ranges_m)
-        rays = np.column_stack([np.cos(scan.azimuths_rad), np.sin(scan.azimuths_rad), np.zeros(len(ranges))])
-        stream, known, unknown = self._at(scan.stamp_ns), np.isfinite(scan.ranges_m), np.isnan(scan.ranges_m)
-        stream.log(
-            "odom/base_link/obstacles",
-            rr.Points3D(ranges[known, None] * rays[known], colors=(213, 40, 40), radii=_px(3.0)),
-        )
-        stream.log(
-            "odom/base_link/unknown", rr.Points3D(ranges[unknown, None] * rays[unknown], colors=GREY, radii=_px(1.5))
-        )
+        stream = self._at(scan.stamp_ns)
+        rays = np.column_stack([np.cos(scan.azimuths_rad), np.sin(scan.azimuths_rad), np.zeros(len(scan.ranges_m))])
+        known, unknown = np.isfinite(scan.ranges_m), np.isnan(scan.ranges_m)
+        obstacles = scan.ranges_m[known, None] * rays[known]
+        stream.log("odom/base_link/obstacles", rr.Points3D(obstacles, **_style(RED, MEDIUM)))
+        stream.log("odom/base_link/unknown", rr.Points3D(AXES_M * rays[unknown], **_style(GREY, THIN)))
 
 
 class ReplayDrawing:
@@ -316,13 +316,22 @@ class ReplayDrawing:
             if keyframes is not None and keyframes is not self._keyframes and sink.wants("places"):
                 self._keyframes = keyframes
                 to_odom = se3.inverse(T_map_odom) @ rig.T_base_rig @ self._geometry.T_rig_rect
-                at = dict(zip(keyframes.scans, (to_odom @ keyframes.T_map_rect)[:, :3, 3], strict=True))
+                at = dict(zip(keyframes.scans, (to_odom @ keyframes.T_map_rect)[:, :-1, -1], strict=True))
                 loops = np.array([(at[a], at[b]) for a, b in keyframes.loops if a in at and b in at])
                 sink.places(message.stamp_ns, np.array(list(at.values())).reshape(-1, 3), loops.reshape(-1, 2, 3))
 
 
 def _jpeg(image: NDArray[np.uint8]) -> bytes:
     return cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, 85))[1].tobytes()
+
+
+def _rgb(colour: str) -> tuple[int, ...]:
+    return tuple(bytes.fromhex(colour.removeprefix("#")))
+
+
+def _style(colour: str, size_px: float) -> dict[str, Any]:
+    """Return colour and radius, on the screen, of points or lines."""
+    return {"colors": _rgb(colour), "radii": _px(size_px)}
 
 
 def _px(size: float) -> Any:
