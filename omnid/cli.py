@@ -248,7 +248,7 @@ def parser_of(words: Sequence[str]) -> Parser:
         entry = COMMANDS[name]
         leaf = parents[first if second else ""].add_parser(second or first, help=entry.help)
         if name == named:
-            command_at(entry).add_to(leaf, entry.help)
+            command_at(entry).add_to(leaf)
     if _completes():
         with suppress(ImportError):  # the extra `completion`
             import argcomplete

@@ -22,10 +22,6 @@ from omnid.errors import OmnidError
 
 ViewChoice = Literal["auto", "mirror", "direct"]
 VIEW_CHOICES: Final[tuple[ViewChoice, ...]] = ("auto", *VIEWS)
-VIEW_HELP: Final = (
-    "the world is seen in a mirror or directly through a lens; auto (default): what markers, or rim and hub of a "
-    "mirror show; else it must be given, as a checkerboard looks the same"
-)
 
 
 def view_of_images(

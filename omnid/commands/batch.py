@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from calib.atomic_file import write_file
-from omnid.commands.options import CONFIG, SET, cameras, command, option, settings_of
+from omnid.commands.options import CAMERAS, FILE_AND_SET, command, settings_of
 from omnid.engine.process import python, python_environment
 from omnid.errors import OmnidError
 from omnid.plain_text import one_line, plain
@@ -53,42 +53,30 @@ class Job:
     key: str  # digest of all that makes the result
 
 
-@command(
-    option("logs", nargs="+", metavar="LOG", help="files, folders, or patterns in quotes"),
-    option("--out", type=Path, required=True, metavar="DIR", help=f"a folder for each log with its {RESULT_FILE}"),
-    option("--rig", type=Path, help="the rig.toml of all logs; default: that attached to each"),
-    *cameras(),
-    CONFIG,
-    SET,
-    option(
-        "--truth",
-        default="truth.txt",
-        metavar="NAME",
-        help="trajectory beside each log, which is compared where it exists; default %(default)s",
-    ),
-    option("--record", action="store_true", help="keep a recording and a report of each log"),
-    option("--jobs", type=int, default=os.cpu_count(), metavar="N", help="logs at a time; default: the cores"),
-    option(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="run on the workers of this dask scheduler, such as tcp://HOST:8786; they need omnid and the same paths",
-    ),
-    option("--timeout-s", type=float, default=3600.0, metavar="S", help="for one log; default %(default)g"),
-    examples=(
-        "batch logs/ --out results --rig rig.toml",
-        "batch 'logs/2026-*/*.mcap' --out results --jobs 2 --record",
-        "batch logs/ --out results --scheduler tcp://HOST:8786",
-    ),
-)
+@command(CAMERAS, FILE_AND_SET)
 def run(args: argparse.Namespace) -> int:
-    """Run the jobs that have no result yet; return 1 where a log failed."""
-    if args.jobs < 1 or not 0 < args.timeout_s <= 1e6:  # the system waits for a program at most 2^31 ms
-        raise OmnidError("batch: expected --jobs of 1 or more, and --timeout-s above 0 and up to 1e6")
+    """Replay many logs; goes on where it was interrupted (extra `fleet`). Exit code 1: a log failed.
+
+    logs LOG...            files, folders, or patterns in quotes
+    --out DIR              a folder for each log with its result.json (required)
+    --rig FILE             the rig.toml of all logs; default: that attached to each
+    --truth NAME=truth.txt  trajectory beside each log, which is compared where it exists
+    --record               keep a recording and a report of each log
+    --jobs N 1..           logs at a time; default: the cores
+    --scheduler ADDRESS    run on the workers of this dask scheduler, such as tcp://HOST:8786; they need omnid and the
+        same paths
+    --timeout-s S=3600 0.001..1e6  for one log
+
+    examples:
+      batch logs/ --out results --rig rig.toml
+      batch 'logs/2026-*/*.mcap' --out results --jobs 2 --record
+      batch logs/ --out results --scheduler tcp://HOST:8786
+    """
     jobs = _jobs(args)
     results = {job: result for job in jobs if (result := _stored(job))}
     if results:
         print(f"{len(results)} of {len(jobs)} logs have their results already", file=sys.stderr)
-    with _client(args.scheduler, args.jobs) as client:
+    with _client(args.scheduler, args.jobs or os.cpu_count() or 1) as client:
         signal.signal(signal.SIGTERM, _interrupt)
         due = [job for job in jobs if job not in results]
         futures = {client.submit(replay, job, pure=False, retries=1): job for job in due}
@@ -160,13 +148,15 @@ def _jobs(args: argparse.Namespace) -> list[Job]:
     if args.out.exists() and not args.out.is_dir():
         raise OmnidError(f"batch: --out {str(args.out)!r}: expected a folder for the results, found a file")
     options = [(f"--{name}", path and path.absolute()) for name, path in (("rig", args.rig), ("config", args.config))]
-    options += [("--lower", args.lower), ("--upper", args.upper), *(("--set", value) for value in args.overrides)]
+    options += [("--lower", args.lower), ("--upper", args.upper), *(("--set", value) for value in args.set)]
     options += [("--record", RECORDING if args.record else None), *OUTPUTS]
     given = tuple(str(word) for option in options if option[1] is not None for word in option)
-    named = [Path(path) for name in args.logs for path in glob.glob(name, recursive=True) or [name]]
+    named = [Path(path) for name in map(str, args.logs) for path in glob.glob(name, recursive=True) or [name]]
     logs = sorted({Path(os.path.abspath(log)) for path in named for log in _below(path)})
     if not logs:
-        raise OmnidError(f"batch: no log in {', '.join(args.logs)}; give files, folders, or patterns in quotes")
+        raise OmnidError(
+            f"batch: no log in {', '.join(map(str, args.logs))}; give files, folders, or patterns in quotes"
+        )
     common = os.path.commonpath([log.parent for log in logs])
     jobs = []
     for log in logs:

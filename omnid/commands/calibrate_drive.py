@@ -3,66 +3,44 @@
 from __future__ import annotations
 
 import argparse
-import math
 import sys
 from contextlib import closing
-from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from calib.rig_file import read_rig, write_rig
-from omnid.commands.calibrate_options import HEIGHT, height, height_of, with_height
-from omnid.commands.options import BITS, LOG_TIME, RATE, cameras, command, log_cameras, option
+from omnid.commands.calibrate_options import height_of, with_height
+from omnid.commands.options import HEIGHT, LOG_CAMERAS, command, log_cameras
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
 
 if TYPE_CHECKING:
     from calib.rig import Rig
 
-PARTS: Final = ("check", "height", "mask")
 
-
-@command(
-    option("logs", type=Path, nargs="+", metavar="LOG", help="drives with turns; 100 to 350 pairs"),
-    option(
-        "--rig",
-        type=Path,
-        metavar="FILE",
-        help="the rig.toml to start from; a nominal one will do: mirror data sheet, centre of the images, baseline by "
-        "ruler; default: the one attached to the first log",
-    ),
-    *cameras("the {camera} camera's topic"),
-    BITS,
-    LOG_TIME,
-    RATE,
-    option(
-        "--only",
-        action="append",
-        choices=PARTS,
-        help="only this, by the first log; may be repeated. check: compare the rig with the images, and correct the "
-        "upper camera's pose; height: height and tilt of the cameras by the floor; mask: hide what is fixed to the "
-        "cameras, by a log in which the robot turns once",
-    ),
-    option(
-        "--distance-m",
-        type=float,
-        metavar="M",
-        help="straight distance from the first to the last "
-        "image of a single log: sets the baseline's length, which is kept otherwise",
-    ),
-    HEIGHT,
-    option("--ruler-m", type=height, metavar="M", help="the height by ruler, as a check of that by the floor"),
-    option("-o", "--output", type=Path, metavar="FILE", help="the rig.toml to write; may be the file of --rig"),
-    examples=(
-        "calibrate drive drive.mcap --rig rig.toml -o better.toml",
-        "calibrate drive drive.mcap --only check",
-        "calibrate drive drive.mcap --only height --ruler-m 0.92 --rig rig.toml -o rig.toml",
-    ),
-    description="Adjust all parameters of a rig to drives with turns; then find the height of the cameras, if the rig "
-    "states none, and what is fixed to them, where the first log shows it. Exit code 1: the rig has drifted (--only "
-    "check), the ruler contradicts, nothing was found that could be written, or a tenth of the images made no pair.",
-)
+@command(LOG_CAMERAS, HEIGHT)
 def run(args: argparse.Namespace) -> int:
-    """Examine the logs, print what was found, and write the rig; see the exit codes above."""
+    """Adjust all parameters of a rig to drives with turns, without a board.
+
+    Then find the height of the cameras, if the rig states none, and what is fixed to them, where the first log shows
+    it. Exit code 1: the rig has drifted (--only check), the ruler contradicts, nothing was found that could be written,
+    or a tenth of the images made no pair.
+
+    logs LOG...        drives with turns; 100 to 350 pairs
+    --rig FILE         the rig.toml to start from; a nominal one will do: mirror data sheet, centre of the images,
+        baseline by ruler; default: the one attached to the first log
+    --only check|height|mask...  only this, by the first log; may be repeated. check: compare the rig with the images,
+        and correct the upper camera's pose; height: height and tilt of the cameras by the floor; mask: hide what is
+        fixed to the cameras, by a log in which the robot turns once
+    --distance-m M 0.001..  straight distance from the first to the last image of a single log: sets the baseline's
+        length, which is kept otherwise
+    --ruler-m M 0.1..10     the height by ruler, as a check of that by the floor
+    -o, --output FILE  the rig.toml to write; may be the file of --rig
+
+    examples:
+      calibrate drive drive.mcap --rig rig.toml -o better.toml
+      calibrate drive drive.mcap --only check
+      calibrate drive drive.mcap --only height --ruler-m 0.92 --rig rig.toml -o rig.toml
+    """
     from omnid.engine.kernel_cache import prepare_kernels
 
     _check(args)
@@ -70,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
     prepare_kernels()
     # 1. Check the rig, or adjust all of it.
     rig, has_drifted = start, False
-    if args.only is None:
+    if not args.only:
         rig = _adjusted(args, rig)
     elif "check" in args.only:
         rig, has_drifted = _checked(args, rig)
@@ -86,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     elif args.output is not None:
         write_rig(args.output, rig)
         print(f"{args.output}: written, {height_of(rig)}")
-    is_found = rig is not start or args.only is not None
+    is_found = rig is not start or bool(args.only)
     return 0 if is_found and not has_drifted and not is_lossy else 1
 
 
@@ -94,11 +72,9 @@ def _check(args: argparse.Namespace) -> None:
     if args.output is not None:
         check_outputs([("--output", args.output)], [("the log that is read", log) for log in args.logs])
     if args.distance_m is not None:
-        if not (math.isfinite(args.distance_m) and args.distance_m > 0):
-            raise OmnidError(f"--distance-m {args.distance_m}: expected a distance above 0 m")
         if len(args.logs) > 1:
             raise OmnidError(f"--distance-m is the length of one drive; found {len(args.logs)} logs")
-        if args.only is not None:
+        if args.only:
             raise OmnidError("--distance-m sets the length of the baseline, which --only leaves as it is")
 
 
@@ -165,8 +141,8 @@ def _at_height(args: argparse.Namespace, rig: Rig) -> tuple[Rig, str]:
 
     if args.height_m is not None:
         return with_height(rig, args), ""
-    is_wanted = args.ruler_m is not None or (args.only is not None and "height" in args.only)
-    if not is_wanted and (args.only is not None or rig.height_m() is not None):
+    is_wanted = args.ruler_m is not None or "height" in args.only
+    if not is_wanted and (args.only or rig.height_m() is not None):
         return rig, ""
     try:
         found = calibrate_height(args.logs[0], rig, log_cameras(args))
@@ -189,14 +165,14 @@ def _masked(args: argparse.Namespace, rig: Rig) -> Rig:
     """Return the rig whose masks hide what is fixed to its cameras. A log without a turn is no error but for --only."""
     from omnid.calibration.mask import calibrate_mask
 
-    if args.only is not None and "mask" not in args.only:
+    if args.only and "mask" not in args.only:
         return rig
     try:
         found = calibrate_mask(args.logs[0], rig, log_cameras(args))
     except OmnidError as error:
-        if args.only is not None:
+        if args.only:
             raise
         print(error)
         return rig
     print(found)
-    return found.rig if found.share or args.only is not None else rig
+    return found.rig if found.share or args.only else rig

@@ -21,67 +21,43 @@ from calib.importers import (
 )
 from calib.models.camera import field_of_view
 from calib.models.names import model_name
-from calib.models.ocam import VIEWS, OcamCamera
+from calib.models.ocam import OcamCamera
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import read_rig, write_rig
 from calib.text_files import MAX_JSON_BYTES, load_mapping
 from calib.typed_toml import shown
 from calib.validation import read_bytes
-from omnid.commands.calibrate_options import HEIGHT, height_of, with_height
-from omnid.commands.options import command, exclusive, option, warn
+from omnid.commands.calibrate_options import height_of, with_height
+from omnid.commands.options import HEIGHT, command, warn
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
 
 
-@command(
-    option(
-        "camchain",
-        nargs="?",
-        type=Path,
-        help="both cameras: Kalibr's camchain.yaml, basalt's or Helvipad's calibration.json",
-    ),
-    option(
-        "--lower",
-        default="",
-        help="the lower camera: its name in the camchain (cam0), or its file: OCamCalib's calib_results.txt, ROS's "
-        "camera_info, OpenCV's, EuRoC's sensor.yaml, camodocal's",
-    ),
-    option("--upper", default="", help="the same for the upper camera"),
-    exclusive(
-        option("--transform", type=Path, help="file with T_lower_upper, 4x4: TOML, YAML or 16 numbers"),
-        option(
-            "--baseline",
-            type=float,
-            metavar="M",
-            help="metres from the lower viewpoint straight up to "
-            "the upper one; both cameras look up and are equally oriented",
-        ),
-    ),
-    option(
-        "--equirectangular",
-        metavar="WIDTHxHEIGHT",
-        help="two 360-degree cameras one above the other, with stitched images of this size; with --baseline",
-    ),
-    option(
-        "--view", choices=VIEWS, help="OCamCalib: the world is seen in a mirror (default) or directly through a lens"
-    ),
-    option(
-        "--frame",
-        choices=("imu", "cameras"),
-        default="imu",
-        help="the rig frame of a file with T_cam_imu: that of the IMU, whose z must point up (default); cameras: the "
-        "origin at the lower viewpoint, z to the upper one, x ahead",
-    ),
-    HEIGHT,
-    option("-o", "--output", type=Path, required=True, help="the rig.toml to write"),
-    option("--replace", action="store_true", help="write it in the place of a rig that states more than the new one"),
-    examples=(
-        "calibrate import camchain.yaml -o rig.toml",
-        "calibrate import --equirectangular 3840x1920 --baseline 0.2 -o rig.toml",
-    ),
-)
+@command(HEIGHT)
 def run(args: argparse.Namespace) -> int:
-    """Write the rig of another program, and print one line about it."""
+    """Make a rig.toml from a Kalibr file, from two OCamCalib files, or of two 360-degree cameras.
+
+    camchain [FILE]  both cameras: Kalibr's camchain.yaml, basalt's or Helvipad's calibration.json
+    --lower CAMERA   the lower camera: its name in the camchain (cam0), or its file: OCamCalib's calib_results.txt,
+        ROS's camera_info, OpenCV's, EuRoC's sensor.yaml, camodocal's
+    --upper CAMERA   the same for the upper camera
+    --equirectangular WIDTHxHEIGHT  two 360-degree cameras one above the other, with stitched images of this size; with
+        --baseline
+    --view mirror|direct        OCamCalib: the world is seen in a mirror (default) or directly through a lens
+    --frame imu|cameras=imu     the rig frame of a file with T_cam_imu: that of the IMU, whose z must point up; cameras:
+        the origin at the lower viewpoint, z to the upper one, x ahead
+    -o, --output FILE           the rig.toml to write (required)
+    --replace                   write it in the place of a rig that states more than the new one
+
+    one of:
+    --transform FILE  file with T_lower_upper, 4x4: TOML, YAML or 16 numbers
+    --baseline M      metres from the lower viewpoint straight up to the upper one; both cameras look up and are equally
+        oriented
+
+    examples:
+      calibrate import camchain.yaml -o rig.toml
+      calibrate import --equirectangular 3840x1920 --baseline 0.2 -o rig.toml
+    """
     check_outputs([("--output", args.output)], [("a file that is read", path) for path in _read_files(args)])
     rig = with_height(_imported(args), args)
     for side, mounted in (("lower", rig.lower), ("upper", rig.upper)):
@@ -136,7 +112,7 @@ def _imported(args: argparse.Namespace) -> Rig:
             f"{args.camchain}: --transform, --baseline and --view go with files of one camera each; this one holds its "
             "transforms"
         )
-    return import_chain(args.camchain, args.lower, args.upper, args.frame, warn)
+    return import_chain(args.camchain, args.lower or "", args.upper or "", args.frame, warn)
 
 
 def _stitched(args: argparse.Namespace) -> Rig:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from omnid.commands.calibrate_options import BOARD, board_of, options_of
-from omnid.commands.options import SETTINGS, cameras, command, device_opener, option, settings_of
+from omnid.commands.options import SETTINGS, command, device_opener, make_folder, settings_of, warn
 from omnid.errors import OmnidError
 
 if TYPE_CHECKING:  # the help and other commands do not load these
@@ -26,33 +26,25 @@ if TYPE_CHECKING:  # the help and other commands do not load these
 PUBLISH_S: Final = 0.5
 
 
-@command(
-    option(
-        "images",
-        type=Path,
-        nargs="?",
-        metavar="DIR",
-        help="folder of the images, lower_*.png and "
-        "upper_*.png; what is there counts, so that it goes on where it ended",
-    ),
-    BOARD,
-    option("--log", type=Path, metavar="LOG", help="take the pairs of a log instead; without DIR they are only judged"),
-    *cameras(
-        "device of the {camera} camera; default: cameras.{camera} of the settings; of --log the topic, default: found "
-        "by name",
-        "DEVICE|TOPIC",
-    ),
-    *SETTINGS,
-    examples=(
-        "calibrate live boards/ --corners 6x7 --square-mm 30 --config /etc/omnid/omnid.toml",
-        "calibrate live --log boards.mcap --corners 6x7 --square-mm 30",
-    ),
-    description="Search the board in the images of both cameras as they come. Pairs in which it stands still at a "
-    "new place are written to DIR; the terminal says what is missing and when it is enough, the page (`omnid web`) "
-    "also shows where it has been. Stop the daemon first: it holds the cameras. Exit code 1: not enough yet.",
-)
+@command(BOARD, SETTINGS)
 def run(args: argparse.Namespace) -> int:
-    """Search until Ctrl-C, or until the end of the log; return 0 if there is enough for a calibration."""
+    """Search the board in the images of both cameras as they come.
+
+    Pairs in which it stands still at a new place are written to DIR; the terminal says what is missing and when it is
+    enough, the page (`omnid web`) also shows where it has been. Stop the daemon first: it holds the cameras. Exit code
+    1: not enough yet.
+
+    images [DIR]           folder of the images, lower_*.png and upper_*.png; what is there counts, so that it goes on
+        where it ended
+    --log LOG              take the pairs of a log instead; without DIR they are only judged
+    --lower DEVICE|TOPIC   device of the lower camera; default: cameras.lower of the settings; of --log the topic,
+        default: found by name
+    --upper DEVICE|TOPIC   the same of the upper camera
+
+    examples:
+      calibrate live boards/ --corners 6x7 --square-mm 30 --config /etc/omnid/omnid.toml
+      calibrate live --log boards.mcap --corners 6x7 --square-mm 30
+    """
     from omnid.calibration.live_boards import LiveBoards
 
     board = board_of(args)
@@ -85,10 +77,7 @@ def _taken_before(folder: Path | None, boards: LiveBoards) -> int:
 
     if folder is None:
         return 0
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OmnidError(f"{folder}: {error.strerror}; name a folder that can be made") from error
+    make_folder("calibrate live: DIR", folder)
     lower, upper = ({path.stem.removeprefix(f"{side}_") for path in folder.glob(f"{side}_*")} for side in SIDES)
     if lower & upper:  # half a pair is left where it was killed between two files
         pairs = read_pairs(folder)
@@ -106,7 +95,7 @@ def _of_log(args: argparse.Namespace) -> Iterator[tuple[Image, Image]]:
     log = config.log
     pairs = read_pairs(args.log, LogCameras(args.lower, args.upper, config.cameras.bits, log.rate_hz, log.time))
     for line in pairs.notes:
-        print(f"omnid: warning: {line}", file=sys.stderr)
+        warn(line)
     return ((pairs.sides[0][name], pairs.sides[1][name]) for name in pairs.names)
 
 

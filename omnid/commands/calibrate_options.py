@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import re
 from typing import Final
 
 from calib.boards.aprilgrid import AprilGrid
 from calib.boards.board import Board
-from calib.rig import LEAST_HEIGHT_M, MAX_HEIGHT_M, Rig
+from calib.rig import Rig
 from omnid.calibration.board_search import AnyBoard
-from omnid.commands.options import group, option
 from omnid.errors import OmnidError
 
 # Options that each kind of board needs.
@@ -18,38 +16,15 @@ NEEDED = {"checkerboard": ("corners", "square_mm"), "aprilgrid": ("tags", "tag_m
 ALL = tuple(name for names in NEEDED.values() for name in names)
 
 
-def two_sides(text: str) -> tuple[int, int]:
-    """Parse the numbers along both sides, like 6x7."""
-    sides = re.fullmatch(r"(\d{1,3})[xX](\d{1,3})", text)
-    if sides is None:
-        raise argparse.ArgumentTypeError(f"expected two numbers like 6x7, found {text!r}")
-    return int(sides[1]), int(sides[2])
-
-
-BOARD: Final = group(
-    "board",
-    option(
-        "--board",
-        choices=sorted(NEEDED),
-        default="checkerboard",
-        help="checkerboard (default); aprilgrid: Kalibr's AprilTags 36h11, which may be half hidden",
-    ),
-    option(
-        "--corners",
-        type=two_sides,
-        metavar="6x7",
-        help="inner corners (points where four squares meet) along both sides",
-    ),
-    option("--square-mm", type=float, metavar="MM", help="side of one square"),
-    option("--tags", type=two_sides, metavar="6x6", help="aprilgrid: tags along x and y (Kalibr's tagCols x tagRows)"),
-    option("--tag-mm", type=float, metavar="MM", help="aprilgrid: side of one tag (tagSize)"),
-    option(
-        "--tag-spacing",
-        type=float,
-        metavar="RATIO",
-        help="aprilgrid: space between tags in parts of a tag's side, like 0.3 (tagSpacing)",
-    ),
-)
+BOARD: Final = """
+board:
+--board checkerboard|aprilgrid=checkerboard  aprilgrid: Kalibr's AprilTags 36h11, which may be half hidden
+--corners 6x7        inner corners (points where four squares meet) along both sides
+--square-mm MM       side of one square
+--tags 6x6           aprilgrid: tags along x and y (Kalibr's tagCols x tagRows)
+--tag-mm MM          aprilgrid: side of one tag (tagSize)
+--tag-spacing RATIO  aprilgrid: space between tags in parts of a tag's side, like 0.3 (tagSpacing)
+"""
 
 
 def board_of(args: argparse.Namespace) -> AnyBoard:
@@ -83,26 +58,6 @@ def options_of(args: argparse.Namespace) -> list[str]:
 
 def _options(names: tuple[str, ...] | list[str]) -> str:
     return ", ".join("--" + name.replace("_", "-") for name in names)
-
-
-def height(text: str) -> float:
-    """Return the height [m] of an option."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not LEAST_HEIGHT_M <= value <= MAX_HEIGHT_M:
-        raise argparse.ArgumentTypeError(f"expected {LEAST_HEIGHT_M:g} to {MAX_HEIGHT_M:g} m, found {text}")
-    return value
-
-
-HEIGHT: Final = option(
-    "--height-m",
-    type=height,
-    metavar="M",
-    help="height of the lower viewpoint (the focus of the lower mirror) above the floor; without it `omnid calibrate "
-    "drive` finds it by the floor",
-)
 
 
 def with_height(rig: Rig, args: argparse.Namespace) -> Rig:

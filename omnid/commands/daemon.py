@@ -12,7 +12,7 @@ from importlib.resources import as_file, files
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omnid.commands.options import MAP, QUIET, SETTINGS, cameras, command, device_opener, option, settings_of
+from omnid.commands.options import MAP, QUIET, SETTINGS, VERBOSE, command, device_opener, make_folder, settings_of
 from omnid.commands.replay import Output, replay_and_print
 from omnid.errors import OmnidError
 
@@ -27,39 +27,26 @@ if TYPE_CHECKING:  # the help and other commands do not load these
     from omnid.runs.live import LiveRobot, LiveRun
 
 
-@command(
-    option(
-        "--rig",
-        type=Path,
-        setting="cameras.rig",
-        help="the rig.toml of the cameras; default: that attached to the log, or without --log cameras.rig of the "
-        "settings",
-    ),
-    option("--motor", metavar="PORT", setting="motor.port", help="serial port of the controller, or 'simulated'"),
-    option(
-        "--log",
-        type=Path,
-        metavar="LOG",
-        help="use the images of a log instead of cameras, for a trial: in real time, forwards and backwards until it "
-        "is stopped",
-    ),
-    *cameras(
-        "device of the {camera} camera; default: cameras.{camera} of the settings; with --log the topic of its images, "
-        "default: found by name",
-        "DEVICE|TOPIC",
-    ),
-    option("--pace", type=float, default=1.0, help="speed of the log relative to its recording; default %(default)s"),
-    option("--once", action="store_true", help="stop at the end of the log"),
-    MAP,
-    *SETTINGS,
-    examples=(
-        "run --config /etc/omnid/omnid.toml",
-        "run --log drive.mcap --rig rig.toml --motor simulated",
-        "run --lower /dev/video0 --upper /dev/video2 --rig rig.toml",
-    ),
-)
+@command(MAP, SETTINGS)
 def run(args: argparse.Namespace) -> int:
-    """Run until a signal comes."""
+    """Run the daemon until a signal comes: live cameras in, poses on the bus, commands to the wheels.
+
+    --rig FILE [cameras.rig]   the rig.toml of the cameras; default: that attached to the log, or without --log
+        cameras.rig of the settings
+    --motor PORT [motor.port]  serial port of the controller, or 'simulated'
+    --log LOG                  use the images of a log instead of cameras, for a trial: in real time, forwards and
+        backwards until it is stopped
+    --lower DEVICE|TOPIC       device of the lower camera; default: cameras.lower of the settings; with --log the topic
+        of its images, default: found by name
+    --upper DEVICE|TOPIC       the same of the upper camera
+    --pace FACTOR=1            speed of the log relative to its recording
+    --once                     stop at the end of the log
+
+    examples:
+      run --config /etc/omnid/omnid.toml
+      run --log drive.mcap --rig rig.toml --motor simulated
+      run --lower /dev/video0 --upper /dev/video2 --rig rig.toml
+    """
     from omnid.runs.live import ConnectedRobot
 
     devices = {"cameras.lower": args.lower, "cameras.upper": args.upper}
@@ -77,7 +64,7 @@ def _settings(args: argparse.Namespace, shortcuts: Mapping[str, object] | None =
     from omnid.engine.logging_setup import log
 
     config = settings_of(args, shortcuts or {})
-    for warning in unused_settings(config, "run", args.overrides):
+    for warning in unused_settings(config, "run", args.set):
         log(logging.WARNING, warning)
     return config
 
@@ -118,30 +105,27 @@ def _run_log(args: argparse.Namespace, config: Config) -> int:
     return _live_run(config, ConnectedRobot(open_camera, open_motion), rig).run()
 
 
-@command(
-    option("world", help="room, corridor, building, hall, office, clutter, door_80, person_passes, or a file *.toml"),
-    option("--seed", type=int, default=1, help="of textures and noise; default %(default)s"),
-    option("--rig", type=Path, help="the rig.toml of the cameras; default: a straight rig"),
-    option("--size", type=int, default=512, metavar="PX", help="of the images without --rig; default %(default)s"),
-    option("--no-people", action="store_true", help="leave the people of the world out"),
-    option("--light", type=float, default=1.0, help="factor on the light; default %(default)s"),
-    option(
-        "--other-posters",
-        type=float,
-        default=0.0,
-        metavar="SHARE",
-        help="share of the posters that is exchanged, 0 to 1; default %(default)s",
-    ),
-    option("--truth", type=Path, metavar="FILE", help="write the true poses in odom, in the TUM format, at the end"),
-    MAP,
-    *SETTINGS,
-    examples=("simulate room", "simulate corridor --light 0.5 --map corridor.omap --set bus.robot=rover"),
-    description="Run the daemon with a simulated robot: cameras, motor controller and gyro (motion.imu=off: none) are "
-    "simulated. Everything else is as in `omnid run`: then `omnid arm`, `omnid drive`, `omnid goto`, `omnid web`. "
-    "Simulated time waits for the daemon: a busy computer slows it down, and loses nothing.",
-)
+@command(MAP, SETTINGS)
 def simulate(args: argparse.Namespace) -> int:
-    """Run until a signal comes."""
+    """Run the daemon with a simulated robot until a signal comes.
+
+    Cameras, motor controller and gyro (motion.imu=off: none) are simulated. Everything else is as in `omnid run`: then
+    `omnid arm`, `omnid drive`, `omnid goto`, `omnid web`. Simulated time waits for the daemon: a busy computer slows it
+    down, and loses nothing.
+
+    world WORLD               room, corridor, building, hall, office, clutter, door_80, person_passes, or a file *.toml
+    --seed N=1 0..            of textures and noise
+    --rig FILE                the rig.toml of the cameras; default: a straight rig
+    --size PX=512 64..2048    of the images without --rig
+    --no-people               leave the people of the world out
+    --light FACTOR=1          factor on the light
+    --other-posters SHARE=0   share of the posters that is exchanged, 0 to 1
+    --truth FILE              write the true poses in odom, in the TUM format, at the end
+
+    examples:
+      simulate room
+      simulate corridor --light 0.5 --map corridor.omap --set bus.robot=rover
+    """
     from calib.rig_file import read_rig
     from omnid.controller.motor import SIMULATED
     from omnid.engine.logging_setup import log
@@ -150,14 +134,9 @@ def simulate(args: argparse.Namespace) -> int:
     from omnid.simulation.world_file import WorldOptions, load_world
     from omnid.sinks.files import check_outputs
 
-    # 1. Check the options.
     check_outputs([("--truth", args.truth)] if args.truth else [], [])
     config = _settings(args)
-    if args.seed < 0:
-        raise OmnidError(f"--seed {args.seed}: expected 0 or more")
-    if not 64 <= args.size <= 2048:
-        raise OmnidError(f"--size {args.size}: expected 64 to 2048 px")
-    # 2. Run in the world.
+    # 1. Run in the world.
     options = WorldOptions(people=not args.no_people, brightness=args.light, other_posters=args.other_posters)
     world = load_world(args.world, args.seed, options)
     robot = make_robot(args.size, read_rig(args.rig) if args.rig else None)
@@ -166,7 +145,7 @@ def simulate(args: argparse.Namespace) -> int:
     paced = PacedRobot(world, robot, config, args.seed, warn, keeps_truth=args.truth is not None)
     run = _live_run(config, paced, paced.rig)
     code = run.run()
-    # 3. Write the truth, and report contacts.
+    # 2. Write the truth, and report contacts.
     if args.truth:
         _write_truth(args.truth, paced.truth, run.clock.unix_ns)
     log(logging.INFO, f"contacts with obstacles: {paced.contacts}")
@@ -190,35 +169,27 @@ def _write_truth(path: Path, truth: dict[int, Pose], unix_ns: Callable[[int], in
 DRIVE_S = 90.0  # Longest drive in simulated time.
 
 
-@command(
-    option(
-        "--output",
-        type=Path,
-        default=Path("omnid-demo"),
-        metavar="FOLDER",
-        help="folder of the output files; default %(default)s",
-    ),
-    option(
-        "--drive",
-        action="store_true",
-        help="a simulated robot is taught a route of 6 m and repeats it; takes a minute or two, and writes drive.png "
-        "with both true paths",
-    ),
-    option("--seed", type=int, default=1, help="with --drive: of the world and its noise; default %(default)s"),
-    option("--verbose", action="store_true", help="print all counters, and the times of all stages"),
-    QUIET,
-    *SETTINGS,
-    examples=("demo", "demo --drive", "demo --output /tmp/demo --quiet"),
-)
+@command(VERBOSE, QUIET, SETTINGS)
 def demo(args: argparse.Namespace) -> int:
-    """Replay the sample and print its errors against the truth; or drive."""
-    if args.drive:
-        return _drive(args)
+    """Replay a sample in real time, with files, bus and a simulated motor, and print its errors; or drive.
+
+    --output FOLDER=omnid-demo  folder of the output files
+    --drive                     a simulated robot is taught a route of 6 m and repeats it; takes a minute or two, and
+        writes drive.png with both true paths
+    --seed N=1 0..              with --drive: of the world and its noise
+
+    examples:
+      demo
+      demo --drive
+      demo --output /tmp/demo --quiet
+    """
     from omnid.formats.tum import read_tum
     from omnid.recordings.evaluation import evaluate
     from omnid.runs.replay import ReplayOptions
 
-    _make_folder(args.output)
+    make_folder("--output", args.output)
+    if args.drive:
+        return _drive(args)
     tum = args.output / "trajectory.tum"
     options = ReplayOptions(
         tum=tum,
@@ -230,7 +201,7 @@ def demo(args: argparse.Namespace) -> int:
         paced=True,
         settings=args.config,
     )
-    args.overrides = ["motor.port=simulated", "controller.setpoint.velocity_mps=0.3", *args.overrides]
+    args.set = ["motor.port=simulated", "controller.setpoint.velocity_mps=0.3", *args.set]
     config = settings_of(args)
     sample = files("omnid.sample")
     with as_file(sample / "log.mcap") as log, as_file(sample / "truth.txt") as truth:
@@ -238,13 +209,6 @@ def demo(args: argparse.Namespace) -> int:
         if code == 0:
             print(f"\nagainst the truth:\n{evaluate(read_tum(tum), read_tum(truth))}")
     return code
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise OmnidError(f"--output {folder}: cannot be made ({error.strerror}); name another folder") from error
 
 
 def _drive(args: argparse.Namespace) -> int:
@@ -259,9 +223,6 @@ def _drive(args: argparse.Namespace) -> int:
     from omnid.simulation.robot import make_robot
     from omnid.simulation.world_file import load_world
 
-    if args.seed < 0:
-        raise OmnidError(f"--seed {args.seed}: expected 0 or more")
-    _make_folder(args.output)
     place_map, routes, image = (args.output / name for name in ("demo.omap", "routes", "drive.png"))
     config = settings_of(args, {"places.map": place_map, "navigation.routes": routes})
     place_map.unlink(missing_ok=True)  # of an earlier demonstration
@@ -284,44 +245,30 @@ def _drive(args: argparse.Namespace) -> int:
     return 0 if script.end == NavigationState.REACHED else 1
 
 
-@command(
-    option(
-        "folder",
-        type=Path,
-        nargs="?",
-        setting="record.folder",
-        help="folder of the files; default: record.folder of the settings",
-    ),
-    option(
-        "--rig",
-        type=Path,
-        setting="cameras.rig",
-        help="a rig.toml to attach; default: cameras.rig of the settings, if it exists",
-    ),
-    *cameras("the {camera} camera; default: cameras.{camera} of the settings", "DEVICE", are_settings=True),
-    *SETTINGS,
-    examples=("record recordings/ --rig rig.toml", "record boards/ --lower /dev/video0 --upper /dev/video2"),
-)
+@command(SETTINGS)
 def record(args: argparse.Namespace) -> int:
-    """Record until a signal comes; return 1 if nothing was recorded."""
+    """Record both cameras to MCAP files until Ctrl-C; exit code 1: nothing was recorded.
+
+    folder [FOLDER] [record.folder]  folder of the files; default: record.folder of the settings
+    --rig FILE [cameras.rig]         a rig.toml to attach; default: cameras.rig of the settings, if it exists
+    --lower DEVICE [cameras.lower]   the lower camera; default: cameras.lower of the settings
+    --upper DEVICE [cameras.upper]   the upper camera; default: cameras.upper of the settings
+
+    examples:
+      record recordings/ --rig rig.toml
+      record boards/ --lower /dev/video0 --upper /dev/video2
+    """
+    from calib.rig_file import read_rig, rig_toml
     from omnid.engine.logging_setup import log
     from omnid.runs.record import record
 
     config = settings_of(args)
-    rig = _rig(config, wanted=args.rig is not None)
+    path, rig = Path(config.cameras.rig), ""
+    if args.rig is not None or path.exists():
+        rig = rig_toml(read_rig(path))
+    else:  # the recording may be for its calibration
+        log(logging.WARNING, f"no rig is attached because {path} does not exist: `omnid replay` will need --rig")
     open_camera = device_opener(config)
     with closing(open_camera("lower")) as lower, closing(open_camera("upper")) as upper:
         state = record({"lower": lower, "upper": upper}, config, rig, log).state
     return 0 if state.messages > state.lost + state.refused else 1
-
-
-def _rig(config: Config, *, wanted: bool) -> str:
-    """Return the rig's TOML; "" if there is none, because the recording may be for its calibration."""
-    from calib.rig_file import read_rig, rig_toml
-    from omnid.engine.logging_setup import log
-
-    path = Path(config.cameras.rig)
-    if not (wanted or path.exists()):
-        log(logging.WARNING, f"no rig is attached because {path} does not exist: `omnid replay` will need --rig")
-        return ""
-    return rig_toml(read_rig(path))

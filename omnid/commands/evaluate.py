@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import asdict
-from pathlib import Path
 from typing import Final
 
-from omnid.commands.options import JSON, command, option, print_json, warn
+from omnid.commands.options import JSON, command, print_json, warn
 from omnid.errors import OmnidError
 
 # Position error (ATE), as a share of the true length, above which the trajectories hardly are of one drive: odometry
@@ -15,51 +14,26 @@ from omnid.errors import OmnidError
 ANOTHER_DRIVE: Final = 0.25
 
 
-@command(
-    option("estimate", type=Path, metavar="EST", help="t x y z qx qy qz qw, T_odom_rig"),
-    option(
-        "truth",
-        type=Path,
-        metavar="TRUTH",
-        help="the same format or EuRoC's CSV, of the same rig frame in any world frame",
-    ),
-    option(
-        "--tolerance-ms",
-        type=float,
-        default=10.0,
-        metavar="MS",
-        help="largest difference between the stamps of two poses; default %(default)s",
-    ),
-    option(
-        "--align",
-        choices=("origin", "rigid", "scale"),
-        default="origin",
-        help="the first pose (default), as evo's --align_origin; rigid: all positions, as its --align; scale: these "
-        "and the estimate's scale, which is printed, as its --align --correct_scale",
-    ),
-    option(
-        "--live",
-        type=Path,
-        metavar="FILE",
-        help="the poses as they were known while driving (replay --map-live-tum), whose errors are printed beside",
-    ),
-    option(
-        "--frame",
-        choices=("rig", "auto"),
-        default="rig",
-        help="the body whose truth it is: the rig (default); auto: fit one constant pose of another body on the robot, "
-        "and unit, delay and convention of the file, and print what was fitted",
-    ),
-    JSON,
-    examples=(
-        "eval est.txt truth.txt",
-        "eval est.txt imu_truth.csv --frame auto",
-        "eval est.txt truth.txt --align rigid --json",
-        "eval map.txt truth.txt --live live.txt",
-    ),
-)
+@command(JSON)
 def run(args: argparse.Namespace) -> int:
-    """Print the errors."""
+    """Compare a trajectory with the truth, both in the TUM format.
+
+    estimate EST           t x y z qx qy qz qw, T_odom_rig
+    truth TRUTH            the same format or EuRoC's CSV, of the same rig frame in any world frame
+    --tolerance-ms MS=10   largest difference between the stamps of two poses
+    --align origin|rigid|scale=origin  the first pose, as evo's --align_origin; rigid: all positions, as its --align;
+        scale: these and the estimate's scale, which is printed, as its --align --correct_scale
+    --live FILE            the poses as they were known while driving (replay --map-live-tum), whose errors are printed
+        beside
+    --frame rig|auto=rig   the body whose truth it is: the rig; auto: fit one constant pose of another body on the
+        robot, and unit, delay and convention of the file, and print what was fitted
+
+    examples:
+      eval est.txt truth.txt
+      eval est.txt imu_truth.csv --frame auto
+      eval est.txt truth.txt --align rigid --json
+      eval map.txt truth.txt --live live.txt
+    """
     from omnid.formats.tum import read_tum
     from omnid.recordings.evaluation import evaluate
     from omnid.recordings.truth_frame import find_truth_frame

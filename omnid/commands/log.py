@@ -5,10 +5,9 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omnid.commands.options import JSON, command, option, print_json
+from omnid.commands.options import JSON, command, print_json
 from omnid.utc import utc
 
 if TYPE_CHECKING:
@@ -19,19 +18,17 @@ _MEND = "`mcap recover`, of mcap's own command line"
 MAX_LINE = 5000  # Most characters of a line: it may contain the path of a file.
 
 
-@command(
-    option(
-        "logs",
-        type=Path,
-        nargs="+",
-        metavar="LOG",
-        help=".mcap, .mcap.part, .db3, .bag, or a folder of these or of images",
-    ),
-    JSON,
-    examples=("log info recordings/*.mcap",),
-)
+@command(JSON)
 def info(args: argparse.Namespace) -> int:
-    """Print the content of each log; return 1 if one is broken, 2 if one is no log."""
+    """Print topics, types, counts, times, attachments, and whether the log is whole.
+
+    Exit code 1: one is broken; 2: one is no log.
+
+    logs LOG...  .mcap, .mcap.part, .db3, .bag, or a folder of these or of images
+
+    examples:
+      log info recordings/*.mcap
+    """
     from drivers.errors import DriverError
     from drivers.logs.open_log import LogState, log_info
 

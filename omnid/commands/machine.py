@@ -9,7 +9,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omnid.commands.options import JSON, SETTINGS, cameras, command, option, print_json, settings_of
+from omnid.commands.options import CAMERAS, JSON, SETTINGS, command, make_folder, print_json, settings_of
 from omnid.commands.tools import require_packages
 from omnid.errors import OmnidError
 
@@ -26,9 +26,13 @@ ROOT = Path("/")  # folder of sys, dev and proc
 BYTES_PER_PIXEL = 0.3  # upper bound for a JPEG of a textured image
 
 
-@command(*SETTINGS, JSON, examples=("doctor --config /etc/omnid/omnid.toml",))
+@command(SETTINGS, JSON)
 def doctor(args: argparse.Namespace) -> int:
-    """Print a line for each check; return 1 if something is wrong."""
+    """Check cameras, motor, rig, rights, bus and disk, a line each; exit code 1: something is wrong.
+
+    examples:
+      doctor --config /etc/omnid/omnid.toml
+    """
     from omnid.doctor.checks import summary
 
     found: list[Finding] = []
@@ -60,7 +64,6 @@ def examine(config: Config) -> Iterator[Finding]:
     yield checks.bus(config.bus)
 
 
-CAMERAS: tuple[Camera, Camera] = ("lower", "upper")
 SETTLE = 10  # images of a camera that are skipped: its exposure adapts in the first ones
 _ADVICE = """
 To name them /dev/omnid/lower and /dev/omnid/upper in whatever order they are plugged in, put this into {file}
@@ -69,22 +72,21 @@ To name them /dev/omnid/lower and /dev/omnid/upper in whatever order they are pl
 """
 
 
-@command(
-    option("--snapshot", type=Path, metavar="DIR", help="write DIR/lower.png and DIR/upper.png"),
-    option("--log", type=Path, metavar="LOG", help="of --snapshot: take the images of a log"),
-    *cameras("of --log: images of the {camera} camera; default: by name"),
-    *SETTINGS,
-    examples=(
-        "cameras",
-        "cameras --snapshot views --config /etc/omnid/omnid.toml",
-        "cameras --snapshot views --log drive.mcap",
-    ),
-    description="List cameras and the udev rule to copy. With --snapshot write an image of each "
-    "configured camera with the mirror's rim, and print a measure of its focus, which is highest where "
-    "the lens is set best.",
-)
+@command(CAMERAS, SETTINGS)
 def show_cameras(args: argparse.Namespace) -> int:
-    """Print the list, or write the snapshots; return 1 if there is no camera, or something to correct."""
+    """List cameras and the udev rule to copy.
+
+    With --snapshot write an image of each configured camera with the mirror's rim, and print a measure of its focus,
+    which is highest where the lens is set best. Exit code 1: there is no camera, or something to correct.
+
+    --snapshot DIR  write DIR/lower.png and DIR/upper.png
+    --log LOG       of --snapshot: take the images of a log, of which --lower and --upper are topics
+
+    examples:
+      cameras
+      cameras --snapshot views --config /etc/omnid/omnid.toml
+      cameras --snapshot views --log drive.mcap
+    """
     if args.snapshot is not None:
         return _snapshot(args)
     for name in ("log", "lower", "upper"):
@@ -119,10 +121,7 @@ def _snapshot(args: argparse.Namespace) -> int:
     from calib.rig_file import png
     from omnid.calibration.snapshot import annotated, described, view_of, warnings
 
-    try:
-        args.snapshot.mkdir(exist_ok=True)
-    except OSError as error:
-        raise OmnidError(f"--snapshot {args.snapshot}: {error.strerror}; name a folder that can be made") from error
+    make_folder("--snapshot", args.snapshot)
     views: dict[str, CameraView] = {name: view_of(images) for name, images in _images(args)}
     for name, view in views.items():
         path = args.snapshot / f"{name}.png"
@@ -141,7 +140,7 @@ def _images(args: argparse.Namespace) -> Iterator[tuple[Camera, list[Image]]]:
     from drivers.frame import gray
     from omnid.calibration.snapshot import IMAGES
 
-    for camera in CAMERAS:
+    for camera in ("lower", "upper"):
         frames = _of_device(args, camera) if args.log is None else _of_log(args, camera)
         with closing(frames):
             found = [gray(frame) for frame in islice(frames, IMAGES)]
@@ -177,32 +176,21 @@ def _of_device(args: argparse.Namespace, camera: Camera) -> Generator[Frame, Non
         yield from islice(source.frames(), SETTLE, None)
 
 
-@command(
-    option(
-        "--motor",
-        metavar="PORT",
-        setting="motor.port",
-        help="serial port of the controller, or 'simulated'; default: motor.port of the settings",
-    ),
-    option("--speed", type=float, default=0.1, metavar="MPS", help="of a wheel, m/s; default %(default)s"),
-    option(
-        "--turns",
-        type=float,
-        default=3.0,
-        metavar="N",
-        help="of the wheels for the scale, 0: do not test it; default %(default)s",
-    ),
-    *SETTINGS,
-    examples=(
-        "motor test --motor /dev/omnid/motor --config /etc/omnid/omnid.toml",
-        "motor test --motor simulated --set motor.protocol=roboteq",
-    ),
-    description="Turn each motor forwards and back, ask which wheel moved and which way, then turn both wheels a "
-    "number of times and ask for the true number. It prints the lines of the configuration that make the wheels turn "
-    "as commanded.",
-)
+@command(SETTINGS)
 def test_motor(args: argparse.Namespace) -> int:
-    """Test the wiring and print the settings."""
+    """Turn each wheel, ask what moved, print the settings for that.
+
+    It turns each motor forwards and back, asks which wheel moved and which way, then turns both wheels a number of
+    times and asks for the true number. It prints the lines of the configuration that make the wheels turn as commanded.
+
+    --motor PORT [motor.port]  serial port of the controller, or 'simulated'; default: motor.port of the settings
+    --speed MPS=0.1            of a wheel, m/s
+    --turns TURNS=3            of the wheels for the scale, 0: do not test it
+
+    examples:
+      motor test --motor /dev/omnid/motor --config /etc/omnid/omnid.toml
+      motor test --motor simulated --set motor.protocol=roboteq
+    """
     from drivers.motors.protocols.protocol_registry import motor_protocol
     from omnid.doctor.wheel_wiring import tested_drive
 
@@ -234,16 +222,20 @@ def _lines(before: DriveSettings, drive: DriveSettings) -> dict[str, str]:
     return wiring | scale
 
 
-@command(
-    option("--page", action="store_true", help="also the unit of the page (`omnid web`), for this machine only"),
-    option("--dry-run", action="store_true", help="list what would be done, change nothing"),
-    option("--yes", action="store_true", help="do not ask"),
-    examples=("install-service --dry-run", "install-service --page"),
-    description="Install the systemd unit for this program, example udev rules, a minimal configuration and the user "
-    "that it runs as. Files that people edit are kept where they exist.",
-)
+@command()
 def install_service(args: argparse.Namespace) -> int:
-    """List the steps, ask, and take them; return 1 where the answer is no."""
+    """Install the systemd unit for this program, example udev rules, a minimal configuration and its user.
+
+    Files that people edit are kept where they exist. Exit code 1: the answer to the question was no.
+
+    --page     also the unit of the page (`omnid web`), for this machine only
+    --dry-run  list what would be done, change nothing
+    --yes      do not ask
+
+    examples:
+      install-service --dry-run
+      install-service --page
+    """
     from omnid.service import install
 
     if args.page:

@@ -9,20 +9,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omnid.commands.options import (
-    JSON,
-    QUIET,
-    REPLACE,
-    RIG,
-    ROBOT,
-    SETTINGS,
-    command,
-    exclusive,
-    option,
-    print_json,
-    settings_of,
-    warn,
-)
+from omnid.commands.options import JSON, QUIET, RIG, ROBOT, SETTINGS, command, print_json, settings_of, warn
+from omnid.commands.robot import ask
 from omnid.errors import OmnidError
 from omnid.utc import utc
 
@@ -32,24 +20,27 @@ if TYPE_CHECKING:
 
 # Suffixes of `map show -o`, and the options of `map export` that write the same.
 KINDS = {".ply": "--ply", ".png": "--plan", ".yaml": "--grid", ".yml": "--grid"}
-MAP = option("map", type=Path, metavar="FILE.omap")
-CELL = option("--cell", type=float, default=0.05, metavar="M", help="edge of a cell of the grid; default %(default)s m")
+MAP = """
+map FILE.omap            a map of places
+--cell M=0.05 0.005..10  edge of a cell of the grid, m
+"""
 
 
-@command(
-    option("logs", type=Path, nargs="+", metavar="LOG", help="as of `omnid replay`, the longest first"),
-    option("-o", "--output", type=Path, required=True, metavar="OUT.omap"),
-    exclusive(option("--extend", action="store_true", help="extend the map OUT.omap"), REPLACE),
-    RIG,
-    QUIET,
-    *SETTINGS,
-    examples=(
-        "map build monday.mcap tuesday.mcap -o place.omap --rig rig.toml",
-        "map build wednesday.mcap -o place.omap --extend",
-    ),
-)
+@command(RIG, QUIET, SETTINGS)
 def build(args: argparse.Namespace) -> int:
-    """Replay the logs one after the other, each in the map of those before; write the map."""
+    """Build a map from logs, of one drive or of several in the same place, each in the map of those before.
+
+    logs LOG...             as of `omnid replay`, the longest first
+    -o, --output OUT.omap   the map (required)
+
+    one of:
+    --extend   extend the map OUT.omap
+    --replace  replace it, with all places that routes refer to
+
+    examples:
+      map build monday.mcap tuesday.mcap -o place.omap --rig rig.toml
+      map build wednesday.mcap -o place.omap --extend
+    """
     from omnid.config import unused_settings
     from omnid.core.places.place_views import summary
     from omnid.diagnostics.run_summary import Progress
@@ -59,7 +50,7 @@ def build(args: argparse.Namespace) -> int:
     from omnid.sinks.files import check_outputs
 
     config = settings_of(args)
-    warnings = unused_settings(config, "replay", args.overrides)
+    warnings = unused_settings(config, "replay", args.set)
     if not config.places.enabled or config.places.map:
         raise OmnidError("map build: places.enabled must be true, and places.map empty: change the configuration")
     check_outputs([("-o", args.output)], [("the log that is read", log) for log in args.logs])
@@ -87,24 +78,17 @@ def build(args: argparse.Namespace) -> int:
     return 0
 
 
-@command(
-    MAP,
-    option(
-        "-o",
-        "--output",
-        type=Path,
-        action="append",
-        default=[],
-        metavar="OUT.png|.yaml|.ply",
-        help="also write the map, as its suffix says: a plan with paths and loops, a grid for nav2, landmarks; may be "
-        "repeated",
-    ),
-    CELL,
-    JSON,
-    examples=("map show place.omap", "map show place.omap -o place.png -o place.yaml"),
-)
+@command(MAP, JSON)
 def show(args: argparse.Namespace) -> int:
-    """Print keyframes, sessions, loops, size and the rig that made the map; write what is asked for."""
+    """Print keyframes, sessions, loops, size, and the rig that made the map; write plan and grid.
+
+    -o, --output OUT.png|.yaml|.ply...  also write the map, as its suffix says: a plan with paths and loops, a grid for
+        nav2, landmarks; may be repeated
+
+    examples:
+      map show place.omap
+      map show place.omap -o place.png -o place.yaml
+    """
     from omnid.core.places.place_views import summary
 
     for path in args.output:
@@ -122,21 +106,17 @@ def show(args: argparse.Namespace) -> int:
     return 0
 
 
-@command(
-    MAP,
-    option("--ply", type=Path, metavar="FILE.ply", help="landmarks with confidence and age"),
-    option("--plan", type=Path, metavar="FILE.png", help="landmarks from above, with the paths and loops"),
-    option(
-        "--grid",
-        type=Path,
-        metavar="FILE.yaml",
-        help="occupancy grid for nav2 and map_server; the image beside it is FILE.pgm",
-    ),
-    CELL,
-    examples=("map export place.omap --grid place.yaml --ply place.ply --plan place.png",),
-)
+@command(MAP)
 def export(args: argparse.Namespace) -> int:
-    """Write the files that are asked for."""
+    """Write a map for other programs.
+
+    --ply FILE.ply    landmarks with confidence and age
+    --plan FILE.png   landmarks from above, with the paths and loops
+    --grid FILE.yaml  occupancy grid for nav2 and map_server; the image beside it is FILE.pgm
+
+    examples:
+      map export place.omap --grid place.yaml --ply place.ply --plan place.png
+    """
     named = (("--ply", args.ply), ("--plan", args.plan), ("--grid", args.grid))
     outputs = [(option, option, path) for option, path in named if path is not None]
     if not outputs:
@@ -146,14 +126,15 @@ def export(args: argparse.Namespace) -> int:
     return 0
 
 
-@command(*ROBOT, *SETTINGS, examples=("map save", "map save --robot rover --connect tcp/robot:7447"))
+@command(ROBOT, SETTINGS)
 def save(args: argparse.Namespace) -> int:
-    """Ask the robot to save its map, and print what became of it."""
-    from omnid.monitor.navigation import connected, granted
+    """Ask a robot to save its map now, before it is switched off, and print what became of it.
 
-    with connected(settings_of(args).bus) as robot:
-        print(granted(robot, robot.driver().save_map()))
-    return 0
+    examples:
+      map save
+      map save --robot rover --connect tcp/robot:7447
+    """
+    return ask(args, lambda driver: driver.save_map())
 
 
 def _exported(
@@ -170,8 +151,6 @@ def _exported(
     from omnid.sinks.files import check_outputs, write_plan
     from omnid.stages.obstacles import ADVICE
 
-    if not 0.005 <= args.cell <= 10:
-        raise OmnidError(f"--cell {args.cell:g}: expected an edge of 0.005 to 10 m")
     inputs = [("the map that is read", args.map)]
     named = [(option, path) for option, _, path in outputs]
     check_outputs(named, inputs)  # before the image of a grid is named: a folder, as ".", can have no other end

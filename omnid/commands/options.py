@@ -1,10 +1,23 @@
-"""Commands and options of the command line: each option is declared once, and a command lists those that it takes.
+"""Commands and options of the command line: the docstring of a command is its help, and declares its options.
 
-    @command(LOG, RIG, option("--seconds", type=float, help="read so many seconds only"), examples=("replay a.mcap",))
-    def run(args: argparse.Namespace) -> int: ...
+    @command(RIG, SETTINGS)
+    def run(args: argparse.Namespace) -> int:
+        '''Describe the command in sentences, which may follow the options, too.
 
-`omnid/cli.py` names the module of each command. An option with `setting="motor.port"` stands for that setting:
-`settings_of(args)` returns the configuration with all of them. At the end: how commands print warnings and JSON.
+        log LOG...                         a positional argument, one or more; [LOG]: may be missing
+        --method default|paper=default     one of these words
+        --size PX=512 64..2048             a number of 64 to 2048; 512 where it is not given
+        --motor PORT [motor.port]          an option that stands for a setting: settings_of(args) contains it
+        -o, --output FILE                  the file to write (required)
+        --replace                          replace it
+
+        examples:
+          replay a.mcap
+        '''
+
+The type follows from the word in capitals (TYPES). A line such as `outputs:` gives the options below it a title, up to
+an empty line; of those below `one of:` at most one may be given. What several commands take is declared once, here, in
+the same way. `omnid/cli.py` names the module of each command. At the end: how commands print warnings and JSON.
 """
 
 from __future__ import annotations
@@ -12,11 +25,13 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import re
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, is_dataclass
 from enum import Enum
 from functools import partial
+from inspect import cleandoc
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, TextIO, TypeAlias
@@ -33,29 +48,39 @@ PROFILES: Final = {
     "small": ("panorama.scale=0.5", "odometry.limits.features=250"),
 }
 _NO_SETTINGS: Final[Mapping[str, object]] = MappingProxyType({})
-_EXAMPLES: Final = "examples:"  # the first line of an epilog
-
+_DECLARED: Final = re.compile(
+    r"(?P<names>-\S+(?:, --\S+)*|[a-z]+)(?: (?!\[[a-z_]+\.)(?P<value>[\[\dA-Za-z]\S*))?"
+    r"(?: (?P<low>[\d.e-]*?)\.\.(?P<high>[\d.e]*))?(?: \[(?P<setting>[a-z_]+\.[a-z_.]+)\])?  +(?P<help>.+)"
+)
+_VALUE: Final = re.compile(r"(?P<optional>\[)?(?P<word>[^\]=]+?)\]?(?P<more>\.\.\.)?(?:=(?P<default>\S+))?")
 
 Run: TypeAlias = Callable[[argparse.Namespace], int]
-Option: TypeAlias = Callable[[argparse._ActionsContainer], None]  # adds an option, or several, to a parser
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A command without subcommands: what it takes and what it does."""
+    """A command without subcommands: what it does, and its help, which declares what it takes."""
 
     run: Run
-    options: tuple[Option, ...]
+    lines: tuple[str, ...]  # of the help up to the examples, each declaration in one line
     examples: tuple[str, ...]  # without `omnid`; a test parses them all
-    description: str  # "": its line in the list of commands
 
-    def add_to(self, parser: argparse.ArgumentParser, help: str) -> None:
-        """Give a parser the options and the help of this command. help: its line in the list of commands."""
-        for add in self.options:
-            add(parser)
+    def add_to(self, parser: argparse.ArgumentParser) -> None:
+        """Give a parser the options and the help of this command."""
+        container, prose = parser, list[str]()
+        for line in self.lines:
+            if found := _DECLARED.fullmatch(line):
+                _add_option(container, found)
+            elif line == "one of:":
+                container = parser.add_mutually_exclusive_group()
+            elif re.fullmatch("[a-z ]+:", line):
+                container = parser.add_argument_group(line.removesuffix(":"))
+            else:
+                container = parser if not line else container
+                prose.append(line)
         parser.formatter_class = _ExamplesFormatter
-        parser.description = self.description or f"{help[:1].upper()}{help[1:]}."
-        parser.epilog = "\n".join((_EXAMPLES, *(f"  omnid {example}" for example in self.examples)))
+        parser.description = " ".join(filter(None, prose))
+        parser.epilog = "\n".join(("examples:", *(f"  omnid {example}" for example in self.examples)))
         parser.set_defaults(command=self, actions=parser._actions)
 
 
@@ -63,40 +88,83 @@ class _ExamplesFormatter(argparse.HelpFormatter):
     """Leaves the lines of the examples as they are, so that they can be copied; wraps all other text."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
-        if text.startswith(_EXAMPLES):
-            return "".join(indent + line for line in text.splitlines(keepends=True))
-        return super()._fill_text(text, width, indent)
+        return text if text.startswith("examples:") else super()._fill_text(text, width, indent)
 
 
-def option(*names: str, setting: str = "", **keywords: Any) -> Option:
-    """Declare an option or a positional argument; the keywords are those of argparse's add_argument.
+def command(*shared: str) -> Callable[[Run], Command]:
+    """Make a command of a function from parsed arguments to the exit code; shared: further declarations."""
 
-    setting: dotted path of the setting that it stands for; "": none.
-    """
+    def make(run: Run) -> Command:
+        text, _, examples = cleandoc(run.__doc__ or "").partition("\nexamples:\n")
+        joined = re.sub(r"\n +", " ", "\n\n".join((text, *shared)))
+        return Command(run, tuple(joined.splitlines()), tuple(line.strip() for line in examples.splitlines()))
 
-    def add(parser: argparse._ActionsContainer) -> None:
-        parser.add_argument(*names, **keywords).setting = setting  # type: ignore[attr-defined]  # read by settings_of
-
-    return add
-
-
-def group(title: str | None, *options: Option) -> Option:
-    """Declare options that stand under a title of their own in the help; None: of which at most one may be given."""
-
-    def add(parser: argparse._ActionsContainer) -> None:
-        below = parser.add_mutually_exclusive_group() if title is None else parser.add_argument_group(title)
-        for add_one in options:
-            add_one(below)
-
-    return add
+    return make
 
 
-exclusive: Final = partial(group, None)
+def _add_option(container: argparse._ActionsContainer, declared: re.Match[str]) -> None:
+    """Add the option or positional argument of a line of the help."""
+    names, text = declared["names"].split(", "), declared["help"]
+    if declared["value"] is None:
+        vars(container.add_argument(*names, action="store_true", help=text))["setting"] = declared["setting"]
+        return
+    value = _VALUE.fullmatch(declared["value"])
+    assert value is not None, declared["value"]
+    word, default, is_option = value["word"], value["default"], names[0].startswith("-")
+    keywords: dict[str, Any] = {"default": default, "metavar": word}
+    kind = TYPES.get(word) or (Path if set(re.split(r"\W", word)) & _PATHS else None)
+    if kind is None and word == word.lower():
+        keywords["choices"] = keywords.pop("metavar").split("|")
+    elif declared["low"] is not None or kind in (int, float):
+        kind = partial(_number, kind or float, *(float(declared[end] or "nan") for end in ("low", "high")))
+    if is_option:
+        keywords |= {"action": "append", "default": []} if value["more"] else {"required": text.endswith("(required)")}
+    elif value["optional"] or value["more"]:
+        keywords["nargs"] = {("[", None): "?", ("[", "..."): "*", (None, "..."): "+"}[value["optional"], value["more"]]
+    shown = text.replace("%", "%%") + (f"; default {default}" if default else "")
+    action = container.add_argument(*names, type=kind or str, help=shown, **keywords)
+    vars(action)["setting"] = declared["setting"]  # read by settings_of
 
 
-def command(*options: Option, examples: tuple[str, ...], description: str = "") -> Callable[[Run], Command]:
-    """Make a command of a function from parsed arguments to the exit code."""
-    return lambda run: Command(run, options, examples, description)
+def _number(kind: type[int] | type[float], low: float, high: float, text: str) -> float:
+    """Return the finite number of an option between bounds, of which NaN is none; ArgumentTypeError for others."""
+    try:
+        value = kind(text)
+    except ValueError:
+        value = math.nan
+    if math.isfinite(value) and not (value < low or value > high):
+        return value
+    most = "" if math.isnan(high) else f" to {high:g}"
+    wanted = "a number" if math.isnan(low) else f"{low:g}{most or ' or more'}"
+    raise argparse.ArgumentTypeError(f"expected {wanted}, found {text!r}")
+
+
+def two_sides(text: str) -> tuple[int, int]:
+    """Parse the numbers along both sides, like 6x7."""
+    sides = re.fullmatch(r"(\d{1,3})[xX](\d{1,3})", text)
+    if sides is None:
+        raise argparse.ArgumentTypeError(f"expected two numbers like 6x7, found {text!r}")
+    return int(sides[1]), int(sides[2])
+
+
+def map_file(text: str) -> Path:
+    """Return the map of places of an option; ArgumentTypeError for the name of another kind of map."""
+    if text.endswith(".ply"):
+        raise argparse.ArgumentTypeError(
+            f"{text}: expected a map of places (.omap) to localise in; the points of the 3-D map are written by "
+            "--cloud FILE.ply"
+        )
+    return Path(text)
+
+
+# Types of values by the word that stands for them in the help; a file or a folder is a path, all others are text.
+TYPES: Final[Mapping[str, Callable[[str], Any]]] = {
+    **dict.fromkeys(("N", "PX", "BITS"), int),
+    **dict.fromkeys(("X", "S", "M", "MM", "MS", "HZ", "MPS", "TURNS", "FACTOR", "SHARE", "RATIO"), float),
+    **dict.fromkeys(("6x7", "6x6"), two_sides),
+    "FILE.omap": map_file,
+}
+_PATHS: Final = {"FILE", "FOLDER", "DIR", "LOG", "EST", "TRUTH", "OUT"}
 
 
 def settings_of(args: argparse.Namespace, more: Mapping[str, object] = _NO_SETTINGS) -> Config:
@@ -111,110 +179,68 @@ def settings_of(args: argparse.Namespace, more: Mapping[str, object] = _NO_SETTI
     given = [
         f"{path}={json.dumps(value) if isinstance(value, bool | list) else value}"
         for path, value in (named | dict(more)).items()
-        if not (value is None or value is False)
+        if not (value is None or value is False or value == [])
     ]
     profile = PROFILES[args.profile] if getattr(args, "profile", None) else ()
-    return load_config(args.config, [*profile, *args.overrides, *given])
+    return load_config(args.config, [*profile, *args.set, *given])
 
 
 # Settings of any command.
-CONFIG: Final = option(
-    "--config", type=Path, metavar="FILE", help="TOML file of settings; `omnid config` prints the defaults"
-)
-SET: Final = option(
-    "--set",
-    action="append",
-    default=[],
-    metavar="SECTION.KEY=VALUE",
-    dest="overrides",
-    help="a setting that replaces that of the file; may be repeated",
-)
-SETTINGS: Final = (
-    CONFIG,
-    option(
-        "--profile",
-        choices=tuple(PROFILES),
-        help="settings that replace those of the file; small: half-size panoramas and half the landmarks, for a small "
-        "computer",
-    ),
-    SET,
-)
-JSON: Final = option("--json", action="store_true", help="print the result as JSON")
-QUIET: Final = option("--quiet", action="store_true", help="do not show the progress")
+FILE_AND_SET: Final = """
+--config FILE     TOML file of settings; `omnid config` prints the defaults
+--set SETTING...  SECTION.KEY=VALUE, a setting that replaces that of the file; may be repeated
+"""
+SETTINGS: Final = f"""{FILE_AND_SET}
+--profile small   settings that replace those of the file; small: half-size panoramas and half the landmarks, for a
+                  small computer
+"""
+JSON: Final = "--json  print the result as JSON"
+QUIET: Final = "--quiet  do not show the progress"
+VERBOSE: Final = "--verbose  print all counters, and the times of all stages"
 
 # A robot on the bus.
-ROBOT: Final = (
-    option("--robot", metavar="NAME", setting="bus.robot", help="its name; default: bus.robot of the settings"),
-    option(
-        "--connect",
-        action="append",
-        metavar="ENDPOINT",
-        setting="bus.connect",
-        help="the robot or a router, such as tcp/robot:7447; default: bus.connect of the settings, without them this "
-        "machine",
-    ),
-)
-SECONDS: Final = option("--seconds", type=float, metavar="N", help="end after N seconds; default: on Ctrl-C")
-
-
-def check_seconds(seconds: float | None) -> None:
-    """Raise OmnidError where the value of --seconds is no duration."""
-    if seconds is not None and not 0 < seconds < 1e9:
-        raise OmnidError(f"--seconds {seconds} is not a duration: expected seconds above 0")
-
+ROBOT: Final = """
+--robot NAME [bus.robot]            its name; default: bus.robot of the settings
+--connect ENDPOINT... [bus.connect]  the robot or a router, such as tcp/robot:7447; default: bus.connect of the
+                                    settings, without them this machine
+"""
+SECONDS: Final = "--seconds S 0.001..1e9  end after S seconds; default: on Ctrl-C"
 
 # A log, its cameras and its rig.
-RIG: Final = option("--rig", type=Path, help="the rig.toml of the cameras; default: that attached to the log")
-RATE: Final = option(
-    "--rate",
-    type=float,
-    metavar="HZ",
-    setting="log.rate_hz",
-    help="images per second of folders of images; default: by their names in nanoseconds, or the seconds in times.txt",
-)
-BITS: Final = option(
-    "--bits",
-    type=int,
-    choices=(8, 10, 12, 16),
-    default=16,
-    help="bits of the cameras in images of 16 bits a sample; default: 16",
-)
-LOG_TIME: Final = option(
-    "--time",
-    choices=("auto", "header", "log"),
-    default="auto",
-    help="when an image was taken: as log.time of the settings; default: auto",
-)
-TRUTH: Final = option("--truth", type=Path, metavar="FILE", help="the true path of the rig, TUM format")
+RIG: Final = "--rig FILE  the rig.toml of the cameras; default: that attached to the log"
+RATE: Final = """
+--rate HZ [log.rate_hz]  images per second of folders of images; default: by their names in nanoseconds, or the seconds
+                         in times.txt
+"""
+CAMERAS: Final = """
+--lower TOPIC  images of the lower camera; default: found by name
+--upper TOPIC  images of the upper camera; default: found by name
+"""
+LOG_CAMERAS: Final = f"""{CAMERAS}
+--bits 8|10|12|16=16         bits of the cameras in images of 16 bits a sample
+--time auto|header|log=auto  when an image was taken: as log.time of the settings
+{RATE}
+"""
+TRUTH: Final = "--truth FILE  the true path of the rig, TUM format"
 
-
-def cameras(
-    text: str = "images of the {camera} camera; default: found by name",
-    metavar: str = "TOPIC",
-    *,
-    are_settings: bool = False,
-) -> tuple[Option, Option]:
-    """Declare --lower and --upper.
-
-    text: the help of each. metavar: what they name. are_settings: they stand for cameras.lower and cameras.upper.
-    """
-    lower, upper = (
-        option(
-            f"--{camera}",
-            metavar=metavar,
-            setting=f"cameras.{camera}" if are_settings else "",
-            help=text.format(camera=camera),
-        )
-        for camera in ("lower", "upper")
-    )
-    return lower, upper
+# Maps of places, and the height of the cameras.
+MAP: Final = """
+map of places:
+--map FILE.omap [places.map]              localise in a map of places and extend it at the end; a file that does not
+    exist is made; the points of the 3-D map are written by `omnid replay --cloud FILE.ply`
+--localize-only [places.localize_only]    leave the map as it is
+"""
+HEIGHT: Final = """
+--height-m M 0.1..10  height of the lower viewpoint (the focus of the lower mirror) above the floor; without it `omnid
+                      calibrate drive` finds it by the floor
+"""
 
 
 def log_cameras(args: argparse.Namespace) -> LogCameras:
     """Return the cameras of a log by --lower, --upper, --bits, --rate and --time."""
     from drivers.logs.log_reader import LogCameras
 
-    return LogCameras(args.lower, args.upper, args.bits, args.rate or 0.0, args.time)
+    return LogCameras(args.lower, args.upper, int(args.bits), args.rate or 0.0, args.time)
 
 
 def device_opener(config: Config) -> Callable[[Camera], V4l2Camera]:
@@ -226,30 +252,14 @@ def device_opener(config: Config) -> Callable[[Camera], V4l2Camera]:
     return lambda camera: V4l2Camera(config.cameras.settings(camera), camera, on_event=log)
 
 
-# Maps of places.
-def map_file(text: str) -> Path:
-    """Return the map of places of an option; ArgumentTypeError for the name of another kind of map."""
-    if text.endswith(".ply"):
-        raise argparse.ArgumentTypeError(
-            f"{text}: expected a map of places (.omap) to localise in; the points of the 3-D map are written by "
-            "--cloud FILE.ply"
-        )
-    return Path(text)
-
-
-MAP: Final = group(
-    "map of places",
-    option(
-        "--map",
-        type=map_file,
-        metavar="FILE.omap",
-        setting="places.map",
-        help="localise in a map of places and extend it at the end; a file that does not exist is made; the points of "
-        "the 3-D map are written by `omnid replay --cloud FILE.ply`",
-    ),
-    option("--localize-only", action="store_true", setting="places.localize_only", help="leave the map as it is"),
-)
-REPLACE: Final = option("--replace", action="store_true", help="replace it, with all places that routes refer to")
+def make_folder(option: str, folder: Path) -> None:
+    """Make a folder and those above it where they are missing. Raise OmnidError where that cannot be."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OmnidError(
+            f"{option} {folder}: cannot be made ({error.strerror}); name a folder that can be made"
+        ) from error
 
 
 def warn(line: str) -> None:
@@ -273,8 +283,6 @@ def _plain(value: Any) -> Any:
         return [_plain(inner) for inner in value]
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
-    if isinstance(value, Path):
-        return str(value)
     if isinstance(value, Enum):
         return value.value
-    return value
+    return str(value) if isinstance(value, Path) else value

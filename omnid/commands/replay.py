@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from pathlib import Path
 from shutil import get_terminal_size
 from typing import TYPE_CHECKING, NamedTuple
 
 from omnid.commands.options import (
+    CAMERAS,
     JSON,
     MAP,
     QUIET,
     RATE,
     RIG,
     SETTINGS,
-    cameras,
+    VERBOSE,
     command,
-    group,
-    option,
     print_json,
     settings_of,
     warn,
@@ -31,98 +31,53 @@ if TYPE_CHECKING:  # the help and other commands do not load these
     from omnid.runs.run_result import RunResult
 
 
-@command(
-    option(
-        "log",
-        type=Path,
-        metavar="LOG",
-        help="an .mcap, .db3 or .bag file, a folder with one or with its parts, or a folder with a folder of stamped "
-        "images for each camera",
-    ),
-    RIG,
-    *cameras(),
-    RATE,
-    option("--start-s", type=float, default=0.0, metavar="S", help="leave out the first S seconds"),
-    option("--seconds", type=float, metavar="S", help="read so many seconds only; default: to the end"),
-    group(
-        "outputs",
-        option("--tum", type=Path, metavar="FILE", help="trajectory, T_odom_rig, one row for every pair"),
-        option(
-            "--map-tum",
-            type=Path,
-            metavar="FILE",
-            help="trajectory in the map, T_map_rig: places that are recognised correct all poses before them",
-        ),
-        option(
-            "--map-live-tum",
-            type=Path,
-            metavar="FILE",
-            help="the same as it was known at each pose, which is what a controller gets: later places correct nothing",
-        ),
-        option("--cloud", type=Path, metavar="FILE.ply", help="the map's points with confidence and age"),
-        option("--plan", type=Path, metavar="FILE.png", help="the map from above with the path"),
-        option("--record", type=Path, metavar="FILE.mcap", help="poses, transforms, commands, states and map"),
-        option(
-            "--rerun",
-            type=Path,
-            metavar="FILE.rrd",
-            help="path, images with features, depth and plots for the viewer Rerun; not beside --record",
-        ),
-        option(
-            "--publish",
-            action="store_true",
-            help="publish on the bus as `<robot>/odom` and so on; off by default, because a robot's daemon publishes "
-            "there",
-        ),
-        option(
-            "--motor",
-            metavar="PORT",
-            setting="motor.port",
-            help="send commands to the motor controller on a serial port (the wheels will turn!), or to a 'simulated' "
-            "one",
-        ),
-    ),
-    group(
-        "computation",
-        option(
-            "--method",
-            choices=("default", "paper"),
-            setting="odometry.method",
-            help="paper: the odometry of the paper on its enhanced SAD, for comparison",
-        ),
-        option(
-            "--tracker",
-            choices=("improved", "klt"),
-            setting="odometry.tracker",
-            help="feature tracker of the paper's method",
-        ),
-        option("--inline", action="store_true", help="one thread, one pair after the other; same results"),
-        option("--realtime", action="store_true", help="at the speed of the recording; late messages are dropped"),
-        option("--verbose", action="store_true", help="print all counters, and the times of all stages"),
-        QUIET,
-    ),
-    MAP,
-    *SETTINGS,
-    JSON,
-    examples=(
-        "replay drive.mcap --rig rig.toml --tum est.txt --cloud map.ply --plan plan.png",
-        "replay drive.mcap --record out.mcap --method paper",
-        "replay drive.mcap --rerun out.rrd",
-        "replay drive.mcap --start-s 60 --seconds 20",
-    ),
-)
+@command(VERBOSE, QUIET, RIG, CAMERAS, RATE, MAP, SETTINGS, JSON)
 def run(args: argparse.Namespace) -> int:
-    """Replay the log and print its summary; return 1 where no pose was found, or a tenth of the images made no pair."""
+    """Run a recorded log through the stages of the daemon, and print a summary.
+
+    Exit code 1: no pose was found, or a tenth of the images made no pair.
+
+    log LOG              an .mcap, .db3 or .bag file, a folder with one or with its parts, or a folder with a folder of
+        stamped images for each camera
+    --start-s S=0 0..    leave out the first S seconds
+    --seconds S 0.001..  read so many seconds only; default: to the end
+
+    outputs:
+    --tum FILE            trajectory, T_odom_rig, one row for every pair
+    --map-tum FILE        trajectory in the map, T_map_rig: places that are recognised correct all poses before them
+    --map-live-tum FILE   the same as it was known at each pose, which is what a controller gets: later places correct
+        nothing
+    --cloud FILE.ply      the map's points with confidence and age
+    --plan FILE.png       the map from above with the path
+    --record FILE.mcap    poses, transforms, commands, states and map
+    --rerun FILE.rrd      path, images with features, depth and plots for the viewer Rerun; not beside --record
+    --publish             publish on the bus as `<robot>/odom` and so on; off by default, because a robot's daemon
+        publishes there
+    --motor PORT [motor.port]  send commands to the motor controller on a serial port (the wheels will turn!), or to a
+        'simulated' one
+
+    computation:
+    --method default|paper [odometry.method]   paper: the odometry of the paper on its enhanced SAD, for comparison
+    --tracker improved|klt [odometry.tracker]  feature tracker of the paper's method
+    --inline    one thread, one pair after the other; same results
+    --realtime  at the speed of the recording; late messages are dropped
+
+    examples:
+      replay drive.mcap --rig rig.toml --tum est.txt --cloud map.ply --plan plan.png
+      replay drive.mcap --record out.mcap --method paper
+      replay drive.mcap --rerun out.rrd
+      replay drive.mcap --start-s 60 --seconds 20
+    """
     from omnid.config import unused_settings
     from omnid.runs.replay import ReplayOptions
 
     config = settings_of(args)
-    for warning in unused_settings(config, "replay", args.overrides):
+    for warning in unused_settings(config, "replay", args.set):
         warn(warning)
     options = ReplayOptions(
         rig=args.rig,
         topics=(args.lower, args.upper),
-        span_s=_span_of(args),
+        span_s=(args.start_s, math.inf if args.seconds is None else args.start_s + args.seconds),
         tum=args.tum,
         map_tum=args.map_tum,
         map_live_tum=args.map_live_tum,
@@ -207,14 +162,3 @@ def _print_result(result: RunResult, options: ReplayOptions, output: Output, *, 
 def _speed(result: RunResult) -> str:
     pairs = result.counters.pairs
     return f"{pairs / max(1e-3, result.elapsed_s):.1f} pairs/s, in {result.elapsed_s:.1f} s"
-
-
-def _span_of(args: argparse.Namespace) -> tuple[float, float]:
-    """Return the part of the log that is read. Raise OmnidError for times that are none."""
-    import math
-
-    if not 0 <= args.start_s < math.inf:
-        raise OmnidError(f"--start-s {args.start_s:g}: expected a time of 0 s or more")
-    if args.seconds is not None and not 0 < args.seconds < math.inf:
-        raise OmnidError(f"--seconds {args.seconds:g}: expected a time above 0 s")
-    return args.start_s, math.inf if args.seconds is None else args.start_s + args.seconds

@@ -7,34 +7,45 @@ import math
 import sys
 from collections.abc import Callable
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from omnid.commands.options import JSON, ROBOT, SETTINGS, command, exclusive, option, print_json, settings_of
+from omnid.commands.options import JSON, ROBOT, SETTINGS, command, print_json, settings_of
 from omnid.errors import OmnidError
 
 if TYPE_CHECKING:  # the help and other commands do not load these
-    from omnid.client import Answer, Driver, Robot
+    from omnid.client import Answer, Driver
     from omnid.core.navigation.route import Route
     from omnid.formats.route_file import RouteFolder
 
-NAME: Final = option("name", metavar="NAME", help="letters, digits, '-' and '_'")
-NO_WAIT: Final = option("--no-wait", action="store_true", help="end as soon as the robot has accepted it")
+NAME: Final = "name NAME  letters, digits, '-' and '_'"
+NO_WAIT: Final = "--no-wait  end as soon as the robot has accepted it"
 
 
-@command(*ROBOT, *SETTINGS, examples=("arm", "arm --robot rover --connect tcp/robot:7447"))
+@command(ROBOT, SETTINGS)
 def arm(args: argparse.Namespace) -> int:
-    """Arm the robot; return 1 if it refuses."""
-    with _connected(args) as robot:
+    """Let the wheels turn, after the robot's start, a stop or a fault; exit code 1: the robot refuses.
+
+    examples:
+      arm
+      arm --robot rover --connect tcp/robot:7447
+    """
+    from omnid.monitor.navigation import connected
+
+    with connected(settings_of(args).bus) as robot:
         answer = robot.driver().arm()
     print(f"{robot.name} is {answer.text}" if answer.done else f"{robot.name} refuses: {answer.text}")
     return int(not answer.done)
 
 
-@command(*ROBOT, *SETTINGS, examples=("stop", "stop --robot rover --connect tcp/robot:7447"))
+@command(ROBOT, SETTINGS)
 def stop(args: argparse.Namespace) -> int:
-    """Stop the robot; return 1 if it has not confirmed that."""
+    """Stop the wheels until `omnid arm`; everyone who can connect may. Exit code 1: it has not confirmed that.
+
+    examples:
+      stop
+      stop --robot rover --connect tcp/robot:7447
+    """
     from omnid.monitor.navigation import stop as stop_robot
 
     bus = settings_of(args).bus
@@ -45,153 +56,124 @@ def stop(args: argparse.Namespace) -> int:
     return 1
 
 
-@command(
-    *ROBOT,
-    *SETTINGS,
-    examples=("drive", "drive --robot rover --connect tcp/robot:7447"),
-    description="Drive a robot by the arrow keys. A motion lasts as long as its key is held: terminals repeat keys, "
-    "and 0.6 s after the last one the wheels stop. Space stops them until `a` arms the robot. Speeds are shares of the "
-    "robot's own limits.",
-)
+@command(ROBOT, SETTINGS)
 def drive(args: argparse.Namespace) -> int:
-    """Drive until `q`."""
+    """Drive a robot by the arrow keys.
+
+    A motion lasts as long as its key is held: terminals repeat keys, and 0.6 s after the last one the wheels stop.
+    Space stops them until `a` arms the robot. Speeds are shares of the robot's own limits.
+
+    examples:
+      drive
+      drive --robot rover --connect tcp/robot:7447
+    """
     from omnid.monitor.teleop import teleoperate
 
     return teleoperate(settings_of(args).bus)
 
 
-@command(
-    option(
-        "pose",
-        type=float,
-        nargs="*",
-        metavar="X Y [YAW]",
-        help="m, m, and deg counter-clockwise; without YAW the heading stays as it comes",
-    ),
-    option(
-        "--frame",
-        choices=("odom", "map"),
-        default="odom",
-        help="frame of the pose: odom begins at the robot's start, map is that of its saved map; default %(default)s",
-    ),
-    exclusive(
-        option("--cancel", action="store_const", dest="verb", const="cancel", help="end what is under way"),
-        option("--pause", action="store_const", dest="verb", const="pause", help="halt"),
-        option(
-            "--resume",
-            action="store_const",
-            dest="verb",
-            const="resume",
-            help="go on after a halt or a fault; it arms the robot, too",
-        ),
-    ),
-    NO_WAIT,
-    *ROBOT,
-    *SETTINGS,
-    examples=("goto 3 1.5 90", "goto -1.2 0.5 --frame map --robot rover --connect tcp/robot:7447", "goto --cancel"),
-    description="Drive an armed robot to a pose of its base and wait for the end; Ctrl-C, or a terminal that closes, "
-    "cancels, and it stops. Exit code 0: reached, 1: not reached.",
-)
+@command(NO_WAIT, ROBOT, SETTINGS)
 def goto(args: argparse.Namespace) -> int:
-    """Drive, or cancel, pause, resume."""
-    from omnid.monitor.navigation import granted
+    """Drive an armed robot to a pose of its base and wait for the end.
 
-    if args.verb and args.pose:
-        raise OmnidError(f"goto: --{args.verb} takes no pose: leave one of them out")
-    if not args.verb and len(args.pose) not in (2, 3):
+    Ctrl-C, or a terminal that closes, cancels, and it stops. Exit code 0: reached, 1: not reached.
+
+    pose [X]...            X Y [YAW]: m, m, and deg counter-clockwise; without YAW the heading stays as it comes
+    --frame odom|map=odom  frame of the pose: odom begins at the robot's start, map is that of its saved map
+
+    one of:
+    --cancel  end what is under way
+    --pause   halt
+    --resume  go on after a halt or a fault; it arms the robot, too
+
+    examples:
+      goto 3 1.5 90
+      goto -1.2 0.5 --frame map --robot rover --connect tcp/robot:7447
+      goto --cancel
+    """
+    verb = next((verb for verb in ("cancel", "pause", "resume") if getattr(args, verb)), None)
+    if verb and args.pose:
+        raise OmnidError(f"goto: --{verb} takes no pose: leave one of them out")
+    if verb is None and len(args.pose) not in (2, 3):
         raise OmnidError(f"goto: expected X Y [YAW], numbers found: {len(args.pose)}")
-    if not all(map(math.isfinite, args.pose)):
-        raise OmnidError(f"goto: expected finite numbers, found {' '.join(map(str, args.pose))}")
-    with _connected(args) as robot:
-        driver = robot.driver()
-        if not args.verb:
-            heading_rad = math.radians(args.pose[2]) if len(args.pose) == 3 else None
-            ask = partial(driver.goal, args.pose[0], args.pose[1], heading_rad, args.frame)
-            return _begin(args, robot, driver, ask)
-        if args.verb == "resume":
-            granted(robot, driver.arm())
-        print(granted(robot, driver.navigate(args.verb)))
-        return 0
+    if verb is None:
+        heading_rad = math.radians(args.pose[2]) if len(args.pose) == 3 else None
+        return _drive(args, lambda driver: driver.goal(args.pose[0], args.pose[1], heading_rad, args.frame))
+    return ask(args, *([lambda driver: driver.arm()] if verb == "resume" else []), lambda driver: driver.navigate(verb))
 
 
-@command(
-    NAME,
-    option(
-        "--replace",
-        action="store_true",
-        help="in the place of a route of that name, which stays until the new one is written; without it an existing "
-        "name is refused",
-    ),
-    option("--no-wait", action="store_true", help="end at once: `omnid route finish` writes it"),
-    *ROBOT,
-    *SETTINGS,
-    examples=("route teach morning", "route teach morning --replace"),
-)
+@command(NAME, ROBOT, SETTINGS)
 def teach(args: argparse.Namespace) -> int:
-    """Record until Enter is pressed; Ctrl-C drops the recording."""
+    """Record a route while somebody drives (`omnid drive`, a joystick): Enter writes it, Ctrl-C drops it.
+
+    --replace  in the place of a route of that name, which stays until the new one is written; without it an existing
+        name is refused
+    --no-wait  end at once: `omnid route finish` writes it
+
+    examples:
+      route teach morning
+      route teach morning --replace
+    """
     from omnid.core.navigation.requests import route_name
-    from omnid.monitor.navigation import granted, record_until_enter
+    from omnid.monitor.navigation import connected, granted, record_until_enter
 
     name = route_name(args.name)
-    with _connected(args) as robot:
+    with connected(settings_of(args).bus) as robot:
         granted(robot, robot.driver().route(f"teach {name} replace" if args.replace else f"teach {name}"))
-        if args.no_wait:
-            print(f"records {name}: drive it, then `omnid route finish`")
-            return 0
-        return record_until_enter(robot, name)
+        if not args.no_wait:
+            return record_until_enter(robot, name)
+    print(f"records {name}: drive it, then `omnid route finish`")
+    return 0
 
 
-@command(
-    NAME,
-    option("--reverse", action="store_true", help="from its end to its start"),
-    option(
-        "--loops",
-        type=int,
-        default=1,
-        metavar="N",
-        help="a closed route is driven in rounds, another there and back, N times in all; default %(default)s",
-    ),
-    option(
-        "--from",
-        choices=("here", "start"),
-        default="here",
-        dest="begin",
-        help="here: from where the robot is on the route, anywhere within 1.5 m of it; start: the whole route, refused "
-        "elsewhere; default %(default)s",
-    ),
-    NO_WAIT,
-    *ROBOT,
-    *SETTINGS,
-    examples=("route repeat morning", "route repeat morning --reverse --loops 5 --no-wait"),
-)
+@command(NAME, NO_WAIT, ROBOT, SETTINGS)
 def repeat(args: argparse.Namespace) -> int:
-    """Repeat a route; return 0 if its end is reached, else 1."""
-    from omnid.core.navigation.requests import MAX_LOOPS, route_name
+    """Repeat a route, from where the robot is on it; exit code 1: its end was not reached.
 
-    if not 1 <= args.loops <= MAX_LOOPS:
-        raise OmnidError(f"--loops {args.loops}: expected 1 to {MAX_LOOPS}")
+    --reverse               from its end to its start
+    --loops N=1 1..10000    a closed route is driven in rounds, another there and back, N times in all
+    --from here|start=here  here: from where the robot is on the route, anywhere within 1.5 m of it; start: the whole
+        route, refused elsewhere
+
+    examples:
+      route repeat morning
+      route repeat morning --reverse --loops 5 --no-wait
+    """
+    from omnid.core.navigation.requests import route_name
+
     words = ["repeat", route_name(args.name), *(["reverse"] if args.reverse else [])]
-    text = " ".join([*words, f"loops={args.loops}", f"from={args.begin}"])
-    with _connected(args) as robot:
-        driver = robot.driver()
-        return _begin(args, robot, driver, partial(driver.route, text))
+    text = " ".join([*words, f"loops={args.loops}", f"from={vars(args)['from']}"])
+    return _drive(args, lambda driver: driver.route(text))
 
 
-@command(*ROBOT, *SETTINGS, examples=("route finish",))
+@command(ROBOT, SETTINGS)
 def finish(args: argparse.Namespace) -> int:
-    """Have the recorded route written, and print the robot's answer."""
-    return _ask_for_route(args, "finish")
+    """End the recording and write the route and the map.
+
+    examples:
+      route finish
+    """
+    return ask(args, lambda driver: driver.route("finish"))
 
 
-@command(*ROBOT, *SETTINGS, examples=("route stop",))
+@command(ROBOT, SETTINGS)
 def end_route(args: argparse.Namespace) -> int:
-    """End the repetition or the recording, and print the robot's answer."""
-    return _ask_for_route(args, "stop")
+    """End the repetition, or the recording without a file.
+
+    examples:
+      route stop
+    """
+    return ask(args, lambda driver: driver.route("stop"))
 
 
-@command(*SETTINGS, JSON, examples=("route list", "route list --json"))
+@command(SETTINGS, JSON)
 def list_routes(args: argparse.Namespace) -> int:
-    """Print the routes; return 2 if a file is damaged."""
+    """List the routes in navigation.routes, here; exit code 2: a file is damaged.
+
+    examples:
+      route list
+      route list --json
+    """
     folder, code, found = _folder(args), 0, []
     for name in folder.names():
         try:
@@ -209,15 +191,15 @@ def list_routes(args: argparse.Namespace) -> int:
     return code
 
 
-@command(
-    NAME,
-    option("--tum", type=Path, metavar="FILE", help="write its poses in the TUM format"),
-    *SETTINGS,
-    JSON,
-    examples=("route show morning --tum morning.txt",),
-)
+@command(NAME, SETTINGS, JSON)
 def show_route(args: argparse.Namespace) -> int:
-    """Print a route; with --tum, write its poses to a file as well."""
+    """Print length, map and points of a route.
+
+    --tum FILE  write its poses in the TUM format
+
+    examples:
+      route show morning --tum morning.txt
+    """
     import numpy as np
 
     from calib.se2_arrays import transform
@@ -238,44 +220,48 @@ def show_route(args: argparse.Namespace) -> int:
         rows = zip(route.poses.tolist(), route.speeds.tolist(), strict=True)
         print_json({**summary, "points": [[*pose, speed] for pose, speed in rows]})
         return 0
-    for key in ("name", "map", "length_m", "points", "keyframes", "closed"):
-        print(f"{key:<12} {summary[key] if key != 'length_m' else round(route.length_m, 2)}")
-    print(f"{'taught':<12} {_time(route)}")
     (x, y, _), (end_x, end_y, _) = route.poses[0], route.poses[-1]
-    print(f"{'from, to':<12} {x:.2f} {y:.2f}, {end_x:.2f} {end_y:.2f} m in the map")
+    summary |= {"length_m": round(route.length_m, 2), "taught": _time(route)}
+    summary["from, to"] = f"{x:.2f} {y:.2f}, {end_x:.2f} {end_y:.2f} m in the map"
+    for key, value in summary.items():
+        if key != "created_s":
+            print(f"{key:<12} {value}")
     return 0
 
 
-@command(NAME, *SETTINGS, examples=("route delete morning",))
+@command(NAME, SETTINGS)
 def delete_route(args: argparse.Namespace) -> int:
-    """Delete a route."""
+    """Delete a route.
+
+    examples:
+      route delete morning
+    """
     _folder(args).delete(args.name)
     print(f"deleted: {args.name}")
     return 0
 
 
-def _connected(args: argparse.Namespace) -> Robot:
-    from omnid.monitor.navigation import connected
+def ask(args: argparse.Namespace, *requests: Callable[[Driver], Answer]) -> int:
+    """Send requests to the robot, one after the other, and print the last answer. Raise OmnidError with a refusal."""
+    from omnid.monitor.navigation import connected, granted
 
-    return connected(settings_of(args).bus)
+    with connected(settings_of(args).bus) as robot:
+        driver = robot.driver()
+        answers = [granted(robot, request(driver)) for request in requests]
+    print(answers[-1])
+    return 0
 
 
-def _begin(args: argparse.Namespace, robot: Robot, driver: Driver, ask: Callable[[], Answer]) -> int:
+def _drive(args: argparse.Namespace, request: Callable[[Driver], Answer]) -> int:
     """Ask for a drive and show it until its end, or with --no-wait until the robot has accepted it."""
-    from omnid.monitor.navigation import drive_to_end, granted
+    from omnid.monitor.navigation import connected, drive_to_end, granted
 
-    if not args.no_wait:
-        return drive_to_end(robot, driver, ask)
-    granted(robot, ask())
-    return 0
-
-
-def _ask_for_route(args: argparse.Namespace, words: str) -> int:
-    from omnid.monitor.navigation import granted
-
-    with _connected(args) as robot:
-        print(granted(robot, robot.driver().route(words)))
-    return 0
+    with connected(settings_of(args).bus) as robot:
+        driver = robot.driver()
+        if not args.no_wait:
+            return drive_to_end(robot, driver, lambda: request(driver))
+        granted(robot, request(driver))
+        return 0
 
 
 def _folder(args: argparse.Namespace) -> RouteFolder:

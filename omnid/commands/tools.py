@@ -4,41 +4,33 @@ from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
 
-from omnid.commands.options import ROBOT, SECONDS, SETTINGS, TRUTH, check_seconds, command, option, settings_of
+from omnid.commands.options import ROBOT, SECONDS, SETTINGS, TRUTH, command, settings_of
 from omnid.errors import OmnidError
 
 
-@command(
-    option("action", nargs="?", choices=("print", "check"), default="print", help="default: print"),
-    option("file", nargs="?", type=Path, metavar="FILE", help="of check"),
-    option(
-        "--minimal",
-        action="store_true",
-        help="print only what differs from the defaults, and what a new robot needs; all other defaults stay those of "
-        "the installed version",
-    ),
-    *SETTINGS,
-    examples=("config --minimal > omnid.toml", "config check omnid.toml"),
-    description="Print all settings with their defaults as TOML; or check a file.",
-)
+@command(SETTINGS)
 def print_config(args: argparse.Namespace) -> int:
-    """Print or check settings."""
+    """Print all settings with their defaults as TOML; or check a file.
+
+    action [print|check]=print  what to do
+    file [FILE]                 of check
+    --minimal                   print only what differs from the defaults, and what a new robot needs; all other
+        defaults stay those of the installed version
+
+    examples:
+      config --minimal > omnid.toml
+      config check omnid.toml
+    """
     from drivers.motors.protocols.protocol_registry import motor_protocol
     from omnid.config import FIRST_SETTINGS, Config
     from omnid.settings import changed, dump, dump_minimal, value_at
     from omnid.transport.bus_config import checked
 
-    if (args.action == "print") != (args.file is None):
-        raise OmnidError(
-            f"omnid config {args.action}: "
-            + (
-                "name the file"
-                if args.file is None
-                else f"takes no file: `omnid config --config {args.file}` prints its settings"
-            )
-        )
+    if args.action == "check" and args.file is None:
+        raise OmnidError("omnid config check: name the file")
+    if args.action == "print" and args.file is not None:
+        raise OmnidError(f"omnid config print: takes no file: `omnid config --config {args.file}` prints its settings")
     args.config = args.file or args.config
     config = settings_of(args)
     if args.action == "print":
@@ -54,64 +46,42 @@ def print_config(args: argparse.Namespace) -> int:
     return 0
 
 
-@command(
-    *ROBOT,
-    SECONDS,
-    *SETTINGS,
-    examples=("listen", "listen --robot rover --connect tcp/robot:7447 --seconds 60"),
-)
+@command(ROBOT, SECONDS, SETTINGS)
 def listen(args: argparse.Namespace) -> int:
-    """Show the robot until the end; return 1 if no pose was received."""
+    """Show pose, state, rates and latencies of a robot; exit code 1: no pose was received.
+
+    examples:
+      listen
+      listen --robot rover --connect tcp/robot:7447 --seconds 60
+    """
     from omnid.monitor.listen import listen
 
-    check_seconds(args.seconds)
     return listen(settings_of(args).bus, args.seconds)
 
 
 PACKAGES = ("prometheus_client", "starlette", "uvicorn")
 
 
-@command(
-    *ROBOT,
-    option(
-        "--listen",
-        default="127.0.0.1:8447",
-        metavar="HOST:PORT",
-        help="where browsers connect; default %(default)s, this machine only; 0.0.0.0:8447 for its network",
-    ),
-    option(
-        "--token-file",
-        type=Path,
-        metavar="FILE",
-        help="the token; the file is made if it is missing; default: a new token at each start",
-    ),
-    option(
-        "--stop-token-file",
-        type=Path,
-        metavar="FILE",
-        help="a second token, which may see and stop, not arm; the file is made if it is missing; default: none",
-    ),
-    option(
-        "--host",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="a further name of this machine, in addresses of browsers; without --listen on the network: "
-        "localhost only",
-    ),
-    option("--tls-certificate", type=Path, metavar="FILE", help="serve over TLS; PEM"),
-    option("--tls-key", type=Path, metavar="FILE", help="the private key of the certificate, PEM"),
-    *SETTINGS,
-    examples=(
-        "web",
-        "web --connect tcp/robot:7447",
-        "web --listen 0.0.0.0:8447 --token-file /etc/omnid/web-token --config /etc/omnid/omnid.toml",
-    ),
-    description="Serve a page about a robot: state, path, map, warnings with their remedy, a stop and an "
-    "arm button; /metrics for Prometheus. It prints the address with a token: who knows it may stop and arm the robot.",
-)
+@command(ROBOT, SETTINGS)
 def web(args: argparse.Namespace) -> int:
-    """Serve until Ctrl-C."""
+    """Serve a page about a robot: state, path, map, warnings with their remedy, a stop and an arm button.
+
+    /metrics is for Prometheus. It prints the address with a token: who knows it may stop and arm the robot.
+
+    --listen HOST:PORT=127.0.0.1:8447  where browsers connect, this machine only; 0.0.0.0:8447 for its network
+    --token-file FILE       the token; the file is made if it is missing; default: a new token at each start
+    --stop-token-file FILE  a second token, which may see and stop, not arm; the file is made if it is missing; default:
+        none
+    --host NAME...          a further name of this machine, in addresses of browsers; without --listen on the network:
+        localhost only
+    --tls-certificate FILE  serve over TLS; PEM
+    --tls-key FILE          the private key of the certificate, PEM
+
+    examples:
+      web
+      web --connect tcp/robot:7447
+      web --listen 0.0.0.0:8447 --token-file /etc/omnid/web-token --config /etc/omnid/omnid.toml
+    """
     require_packages()
     from omnid.web.server import WebSettings, serve
 
@@ -125,7 +95,6 @@ def web(args: argparse.Namespace) -> int:
 
 def require_packages() -> None:
     """Raise OmnidError where a package of the page is missing."""
-    import sys
     from importlib.util import find_spec
 
     missing = [name for name in PACKAGES if find_spec(name) is None]
@@ -135,21 +104,18 @@ def require_packages() -> None:
         )
 
 
-@command(
-    option(
-        "log",
-        type=Path,
-        metavar="LOG",
-        help="what `omnid replay --record` or `omnid run` with record.enabled wrote, or any MCAP with "
-        "nav_msgs/msg/Odometry",
-    ),
-    option("-o", "--output", type=Path, metavar="FILE", default=Path("report.html"), help="default: report.html"),
-    TRUTH,
-    option("--topic", metavar="TOPIC", help="the odometry topic, where there are several"),
-    examples=("report out.mcap -o report.html",),
-)
+@command(TRUTH)
 def report(args: argparse.Namespace) -> int:
-    """Write the page."""
+    """Write one HTML page about a recording: path, events, statistics.
+
+    log LOG                           what `omnid replay --record` or `omnid run` with record.enabled wrote, or any MCAP
+        with nav_msgs/msg/Odometry
+    -o, --output FILE=report.html     the page
+    --topic TOPIC                     the odometry topic, where there are several
+
+    examples:
+      report out.mcap -o report.html
+    """
     from calib.atomic_file import write_file
     from omnid.formats.tum import read_tum
     from omnid.plain_text import plain

@@ -16,17 +16,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from omnid.commands.options import (
-    ROBOT,
-    SECONDS,
-    SETTINGS,
-    check_seconds,
-    command,
-    group,
-    option,
-    settings_of,
-    warn,
-)
+from omnid.commands.options import ROBOT, SECONDS, SETTINGS, command, settings_of, warn
 from omnid.commands.replay import Output, replay_and_print
 from omnid.engine.process import handle_stop_signals, python, python_environment
 from omnid.errors import OmnidError
@@ -42,30 +32,20 @@ if TYPE_CHECKING:  # the help and other commands do not load these
 MAP_EVERY_S: Final = 2.0  # between two maps of a replay
 
 
-@command(
-    option(
-        "log",
-        type=Path,
-        nargs="?",
-        metavar="LOG",
-        help="a recording, which is shown as it stands (of a log of images: `omnid replay LOG --rerun FILE.rrd`); "
-        "without one, a robot is listened to",
-    ),
-    option(
-        "-o",
-        "--output",
-        type=Path,
-        metavar="FILE.rrd",
-        help="a file that `rerun FILE.rrd` opens, here or elsewhere; default: a window",
-    ),
-    option("--topic", metavar="TOPIC", help="the odometry topic of a recording, where there are several"),
-    group("a robot", *ROBOT, SECONDS),
-    *SETTINGS,
-    examples=("view out.mcap", "view out.mcap -o out.rrd", "view --robot rover --connect tcp/robot:7447"),
-)
+@command(ROBOT, SECONDS, SETTINGS)
 def run(args: argparse.Namespace) -> int:
-    """Show the recording or the robot; return 1 if there was no pose to show."""
-    check_seconds(args.seconds)
+    """Show a recording or a robot: path, map, images, plots (needs rerun). Exit code 1: there was no pose to show.
+
+    log [LOG]               a recording, which is shown as it stands (of a log of images: `omnid replay LOG --rerun
+        FILE.rrd`); without one, a robot is listened to
+    -o, --output FILE.rrd   a file that `rerun FILE.rrd` opens, here or elsewhere; default: a window
+    --topic TOPIC           the odometry topic of a recording, where there are several
+
+    examples:
+      view out.mcap
+      view out.mcap -o out.rrd
+      view --robot rover --connect tcp/robot:7447
+    """
     if args.log is None and args.topic:
         raise OmnidError("--topic belongs to a recording: name a LOG as well")
     if args.log is not None and (args.connect or args.seconds):

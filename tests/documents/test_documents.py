@@ -62,7 +62,7 @@ def unknown_words(words: list[str]) -> list[str]:
     if name is None:
         return words[:1]
     known = argparse.ArgumentParser()
-    command_at(COMMANDS[name]).add_to(known, COMMANDS[name].help)
+    command_at(COMMANDS[name]).add_to(known)
     options = {option for action in known._actions for option in action.option_strings}
     return [word for word in words if re.fullmatch("--[a-z-]+", word) and word not in options]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import shlex
 import subprocess
@@ -11,6 +12,8 @@ from pathlib import Path
 import pytest
 
 from omnid.cli import COMMANDS, REMOVED, command_at, main, parser_of
+from omnid.config import Config
+from omnid.settings import value_at
 
 EXAMPLES = {words: command_at(entry).examples for words, entry in COMMANDS.items()}
 
@@ -38,6 +41,16 @@ def test_help_has_a_description_and_examples_to_copy(
 def test_every_example_is_accepted(example: str) -> None:
     words = shlex.split(example.partition(" > ")[0])
     assert parser_of(words).parse_args(words).command
+
+
+@pytest.mark.parametrize("words", COMMANDS)
+def test_options_stand_for_settings_that_exist(words: str) -> None:
+    parser = argparse.ArgumentParser()
+    command_at(COMMANDS[words]).add_to(parser)
+    for action in parser._actions:
+        if setting := getattr(action, "setting", None):
+            value_at(Config(), setting)
+        assert "  " not in (action.help or "") and "[" not in "".join(action.choices or ())
 
 
 @pytest.mark.parametrize("name", REMOVED)
@@ -79,9 +92,17 @@ def test_the_shell_completes_commands_and_options(tmp_path: Path) -> None:
         ),
         (["replay", "x", "--method", "papr"], "--method 'papr': did you mean paper? see omnid replay --help"),
         (["eval", "a", "b", "c"], "unknown argument c: see omnid eval --help"),
+        (
+            ["calibrate", "drive", "a", "--distance-m", "nan"],
+            "argument --distance-m: expected 0.001 or more, found 'nan': see omnid calibrate drive --help",
+        ),
+        (
+            ["calibrate", "rig", "a", "-o", "b", "--expected-baseline-mm", "-4"],
+            "argument --expected-baseline-mm: expected 0.001 or more, found '-4': see omnid calibrate rig --help",
+        ),
     ],
 )
-def test_a_mistyped_word_is_named_with_the_nearest_one(
+def test_a_wrong_word_is_named_with_what_was_expected(
     words: list[str], line: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as ended:

@@ -128,8 +128,8 @@ def test_finds_logs(tmp_path: Path) -> None:
     ("words", "message"),
     [
         (("--set", "no.such=1"), "no.such"),
-        (("--jobs", "0"), "--jobs of 1 or more"),
-        (("--timeout-s", "nan"), "--timeout-s above 0"),
+        (("--jobs", "0"), "--jobs: expected 1 or more"),
+        (("--timeout-s", "nan"), "--timeout-s: expected 0.001 to 1e+06"),
         (("--scheduler", "tcp://127.0.0.1:1"), "no dask scheduler answers"),
         (("--set", "places.map=some.omap"), "extend places.map"),
         (("--out", __file__), "expected a folder for the results, found a file"),

@@ -175,8 +175,6 @@ def bad(folder: Path, made: Path, kind: str) -> list[object]:
             return [made / "none"]
         case "topic":
             return [made, "--lower", "/x"]
-        case "baseline":
-            return [made, "--expected-baseline-mm", "-4"]
         case "output" | "report":
             return [made, "--report" if kind == "report" else "-o", made / "lower_00.png"]
     return [made]
@@ -193,7 +191,6 @@ def bad(folder: Path, made: Path, kind: str) -> list[object]:
         ("unpaired", "found 3 of the lower camera, 3 of the upper camera"),
         ("missing", "found no such file or folder"),
         ("topic", "only a log has topics"),
-        ("baseline", "expected a length above 0"),
         ("output", "which is read"),
         ("report", "which is read"),
     ],

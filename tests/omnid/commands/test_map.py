@@ -62,7 +62,7 @@ def test_show_and_export_write_the_same_files_and_name_them(omap: Path, capsys: 
         (["export", "{}", "--grid", "."], "--grid .: expected a file to write, found a folder"),
         (["export", "{}", "--ply", "{}"], "this is the map that is read as well"),
         (["export", "{}", "--ply", "/none/a.ply"], "there is no folder"),
-        (["export", "{}", "--ply", "{}.ply", "--cell", "0"], "expected an edge of 0.005 to 10 m"),
+        (["export", "{}", "--ply", "{}.ply", "--cell", "0"], "--cell: expected 0.005 to 10"),
         (["show", "{}", "-o", "{}.html"], "expected a name that ends in .png, .yaml or .ply"),
         (["show", "{}.none"], "cannot read the map"),
         (["info", "{}"], "`omnid map info` was removed: `omnid map show FILE.omap`"),
