@@ -67,7 +67,8 @@ class Command:
 
     def add_to(self, parser: argparse.ArgumentParser) -> None:
         """Give a parser the options and the help of this command."""
-        container, prose = parser, list[str]()
+        container: argparse._ActionsContainer = parser
+        prose = list[str]()
         for line in self.lines:
             if found := _DECLARED.fullmatch(line):
                 _add_option(container, found)
@@ -116,7 +117,8 @@ def _add_option(container: argparse._ActionsContainer, declared: re.Match[str]) 
     if kind is None and word == word.lower():
         keywords["choices"] = keywords.pop("metavar").split("|")
     elif declared["low"] is not None or kind in (int, float):
-        kind = partial(_number, kind or float, *(float(declared[end] or "nan") for end in ("low", "high")))
+        low, high = (float(declared[end] or "nan") for end in ("low", "high"))
+        kind = partial(_number, kind or float, low, high)
     if is_option:
         keywords |= {"action": "append", "default": []} if value["more"] else {"required": text.endswith("(required)")}
     elif value["optional"] or value["more"]:
@@ -126,10 +128,10 @@ def _add_option(container: argparse._ActionsContainer, declared: re.Match[str]) 
     vars(action)["setting"] = declared["setting"]  # read by settings_of
 
 
-def _number(kind: type[int] | type[float], low: float, high: float, text: str) -> float:
+def _number(kind: Callable[[str], Any], low: float, high: float, text: str) -> float:
     """Return the finite number of an option between bounds, of which NaN is none; ArgumentTypeError for others."""
     try:
-        value = kind(text)
+        value: float = kind(text)
     except ValueError:
         value = math.nan
     if math.isfinite(value) and not (value < low or value > high):

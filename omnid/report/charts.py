@@ -83,7 +83,8 @@ def grid(figures: Sequence[str]) -> str:
 def colours() -> dict[str, tuple[int, int, int]]:
     """Return the colours of the style sheet by their names, BGR, for what is drawn as an image."""
     found = re.findall("--([a-z]+):#([0-9a-f]{6})", (files("omnid.report") / "report.css").read_text("utf-8"))
-    return {name: tuple(bytes.fromhex(digits)[::-1]) for name, digits in found}
+    rgb = {name: bytes.fromhex(digits) for name, digits in found}
+    return {name: (blue, green, red) for name, (red, green, blue) in rgb.items()}
 
 
 @cache

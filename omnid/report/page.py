@@ -57,7 +57,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return f"<table>{''.join(f'<tr>{line}</tr>' for line in (titles, *lines))}</table>"
 
 
-def facts(rows: Sequence[tuple[str, str]]) -> str:
+def facts(rows: Sequence[Sequence[str]]) -> str:
     """Return a table of names and values; both are HTML."""
     return f"<div class='words facts'>{table(('', ''), rows)}</div>"
 

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable
-from typing import Any, Final, TypeAlias
+from typing import Any, Final, SupportsFloat, TypeAlias
 
 import cv2
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from calib import se3
 from drivers.frame import gray
@@ -208,7 +208,7 @@ class RerunSink:
         if np.isfinite(value):
             self._at(stamp_ns).log([plot, name], rr.Scalars(value))
 
-    def _plot_errors(self, stamp_ns: int, plot: str, position_m: float, heading_rad: float) -> None:
+    def _plot_errors(self, stamp_ns: int, plot: str, position_m: SupportsFloat, heading_rad: ArrayLike) -> None:
         """Plot a position and a heading, both small, in thousandths of m and degrees."""
         self._plot(stamp_ns, plot, "position mm", 1e3 * float(position_m))
         self._plot(stamp_ns, plot, "heading mdeg", 1e3 * float(np.rad2deg(heading_rad)))

@@ -85,6 +85,7 @@ export function wireGoal(plan) {
     showNavigation(report) {
       const before = busy;
       busy = [...DRIVES, "paused"].includes(report.state);
+      if (busy && !before && !choosing) say(""); // the end of an earlier drive
       if (before && !busy && !choosing) {
         plan.setGoal(null);
         const why = report.reason ? `: ${report.reason}` : "";

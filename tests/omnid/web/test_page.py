@@ -33,7 +33,12 @@ from tests.waiting import PATIENCE_S, wait_until
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytestmark = [pytest.mark.browser, pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")]
-SIZES = {"phone": (390, 844), "desk": (1366, 768)}
+SIZES = {"phone": (390, 844), "laptop": (1280, 800), "desk": (1366, 768)}
+# What drives the robot is on the screen without scrolling; on a phone its routes are below.
+CONTROLS = {
+    "phone": ("arm", "goal", "stick", "fit"),
+    "desk": ("arm", "goal", "stick", "fit", "route-name", "route-stop"),
+}
 HOSTILE = "<img src=x onerror=document.title='hacked'><script>document.title='hacked'</script>"
 WAIT_MS = 20_000
 
@@ -114,12 +119,16 @@ def arm(page: Any, press: Callable[..., None]) -> None:
 
 
 def expect_it_fits(page: Any, size: str) -> None:
-    """Expect no horizontal scrolling, and the whole stop button on the screen, big enough for a thumb."""
+    """Expect no horizontal scrolling, and the stop button on the screen, big enough for a thumb, below the controls."""
     width, height = SIZES[size]
     assert page.evaluate("document.documentElement.scrollWidth") <= width
     box = page.locator("#stop").bounding_box()
     assert box["height"] >= 80 and box["width"] >= 0.9 * width
     assert box["x"] >= 0 and box["y"] + box["height"] <= height and box["x"] + box["width"] <= width
+    page.evaluate("window.scrollTo(0, 0)")
+    for name in CONTROLS.get(size, CONTROLS["desk"]):
+        if control := page.locator(f"#{name}").bounding_box():  # it may be hidden
+            assert 0 <= control["y"] <= control["y"] + control["height"] <= box["y"], name
 
 
 def test_the_page_shows_drives_and_stops_a_robot(browser: Any, tmp_path: Path, course: Path) -> None:
