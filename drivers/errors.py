@@ -7,3 +7,7 @@ class DriverError(Exception):
 
 class FrameDecodeError(DriverError):
     """An image that cannot be decoded; the stream that delivered it continues."""
+
+
+class RecordError(FrameDecodeError):
+    """A record or a message with invalid content; those after it may be valid. The text identifies the record."""

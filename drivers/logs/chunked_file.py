@@ -3,41 +3,30 @@
 Both formats are framed here and not by their libraries, whose readers refuse a file that was cut, end at the first
 corrupt chunk, accept a short read as a message and unpack without a bound.
 
-The index behind a chunk says where its messages are; a chunk without one is unpacked to see. When a message is read,
-its chunk is compared with what the index said.
+The index behind a chunk says where its messages are; a chunk without one is unpacked to see. A message is read where
+the index says, and must be of the channel and the time that the index says.
 """
 
 from __future__ import annotations
 
-import bz2
 import os
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from enum import Enum, auto
-from itertools import islice
 from pathlib import Path
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple
 
-import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
-import zstandard
 
-from drivers.errors import DriverError
-from drivers.logs.log import ENTRY, MAX_DEFINITIONS, MAX_RECORD_BYTES, Entries, RecordError, Topic
+from drivers.errors import DriverError, RecordError
+from drivers.logs.compression import MAX_RECORD_BYTES
+from drivers.logs.log import ENTRY, MAX_DEFINITIONS, Entries, Topic
 
 _KEPT_CHUNKS: Final = 4  # that stay unpacked: both cameras, wheels and gyro may have been written one after the other
+CHANGED: Final = "one byte of it was changed"
 _NO_CHUNK: Final = -1  # offset of an entry outside of chunks, whose block is the begin of its record
-
-
-class ByteSource(Protocol):
-    """Bytes of known size: the file or an unpacked chunk."""
-
-    size: int
-
-    def read_bytes(self, offset: int, size: int) -> bytes | memoryview:
-        """Return up to size bytes from offset."""
 
 
 class RecordKind(Enum):
@@ -46,7 +35,8 @@ class RecordKind(Enum):
     CHUNK = auto()
     INDEX = auto()  # of the chunk before it
     MESSAGE = auto()
-    DEFINITION = auto()  # of a channel or a schema
+    SCHEMA = auto()
+    CHANNEL = auto()
     ATTACHMENT = auto()
     END = auto()  # of chunks and messages
     OTHER = auto()
@@ -59,14 +49,13 @@ class Record(NamedTuple):
     begin: int  # of the whole record, bytes
     offset: int  # of its content
     size: int  # of its content
-    opcode: int
     fields: Mapping[bytes, bytes] = {}  # of a bag's record
     is_cut: bool = False  # the source ends within the content
 
     @property
-    def end(self) -> int:
-        """Offset behind the record."""
-        return self.offset + self.size
+    def is_definition(self) -> bool:
+        """True if it defines a channel or the type of one."""
+        return self.kind in (RecordKind.SCHEMA, RecordKind.CHANNEL)
 
 
 class MessageHead(NamedTuple):
@@ -78,20 +67,32 @@ class MessageHead(NamedTuple):
     size: int
 
 
-class Unpacked:
-    """A ByteSource in memory; it returns views."""
+class ByteSource:
+    """Bytes of known size: an unpacked chunk."""
 
-    def __init__(self, data: bytes | memoryview) -> None:
-        self._view = memoryview(data)
+    def __init__(self, data: bytes | memoryview, damaged: Sequence[int] = ()) -> None:
+        """damaged: offsets of bytes of which one was changed."""
+        self._view, self.damaged = memoryview(data), damaged
         self.size = len(self._view)
 
-    def read_bytes(self, offset: int, size: int) -> memoryview:
+    def read_bytes(self, offset: int, size: int) -> bytes | memoryview:
         """Return up to size bytes from offset."""
         return self._view[offset : offset + size]
 
+    def content(self, offset: int, size: int) -> memoryview:
+        """Return bytes from offset; raise RecordError where they are too many, incomplete or damaged."""
+        if size > MAX_RECORD_BYTES:
+            raise RecordError(f"{size} bytes are more than {MAX_RECORD_BYTES}")
+        data = self.read_bytes(offset, size)
+        if len(data) < size:
+            raise RecordError(f"{len(data)} of {size} bytes could be read")
+        if any(offset <= at < offset + size for at in self.damaged):
+            raise RecordError(CHANGED)
+        return memoryview(data)
 
-class ChunkedFile(ABC):
-    """A LogFile, and a ByteSource of its bytes. A format states how records are framed, packed and read."""
+
+class ChunkedFile(ByteSource, ABC):
+    """A LogFile, and the source of its bytes. A format states how records are framed, packed and read."""
 
     is_indexed = True
 
@@ -100,13 +101,14 @@ class ChunkedFile(ABC):
 
         name: for messages, where it is not the path.
         """
+        super().__init__(b"")
         self.name, self._start, self.cut = name, len(magic), ""
         self.topics: dict[int, Topic] = {}
         self.faults: Counter[str] = Counter()
         self._attached: list[Record] = []
         self._indexed: dict[int, int] = {}  # number of messages of a chunk by its index
-        self._undefined: set[int] = set()  # channels that are in an index before their definition is known
-        self._chunks: dict[int, tuple[Unpacked, dict[int, MessageHead]]] = {}  # the last ones that were unpacked
+        self._named: set[int] = set()  # channels that are in an index
+        self._chunks: dict[int, ByteSource] = {}  # the last ones that were unpacked
         try:
             self._file = path.open("rb", buffering=0)
         except OSError as error:
@@ -132,7 +134,7 @@ class ChunkedFile(ABC):
         """Yield the records from offset start on; the last one may be cut. What is no record ends them."""
 
     @abstractmethod
-    def _unpack(self, chunk: Record, data: memoryview) -> bytes | memoryview:
+    def _unpack(self, chunk: Record, data: memoryview) -> ByteSource:
         """Return the records of a chunk; raise RecordError where they are not those that were written.
 
         Of a chunk that is cut, return the first of them.
@@ -163,6 +165,10 @@ class ChunkedFile(ABC):
         """Close the file; may be called twice."""
         self._file.close()
 
+    def attachments(self) -> dict[str, bytes]:
+        """Return none: a format may have no attachments."""
+        return {}
+
     def entries(self) -> Iterator[Entries]:
         """Yield the places of all messages, chunk by chunk."""
         is_closed = self._is_closed()
@@ -171,8 +177,7 @@ class ChunkedFile(ABC):
                 self._define(self, record)
         chunk: Record | None = None  # the newest one, and the index behind it
         index: list[Record] = []
-        loose: list[tuple[MessageHead, int, int]] = []
-        last = Record(RecordKind.OTHER, 0, 0, self._start, 0)
+        last = Record(RecordKind.OTHER, 0, 0, self._start)
         for record in self._records(self, self._start, self.size):
             # A length that exceeds a file which was closed is a corrupt one; in another, its last chunk is cut.
             if record.is_cut and (record.kind is not RecordKind.CHUNK or is_closed):
@@ -184,8 +189,8 @@ class ChunkedFile(ABC):
             if chunk is not None:
                 yield self._of_chunk(chunk, index)
             chunk, index = (record if record.kind is RecordKind.CHUNK else None), []
-            if record.kind in (RecordKind.MESSAGE, RecordKind.DEFINITION):
-                loose += [(head, record.begin, _NO_CHUNK) for head in self._heads(self, [record]).values()]
+            if record.kind is RecordKind.MESSAGE or record.is_definition:
+                yield _entries([(head, at, _NO_CHUNK) for at, head in self._heads(self, [record]).items()])
             elif record.kind is RecordKind.ATTACHMENT and len(self._attached) < MAX_DEFINITIONS:
                 self._attached.append(record)
             elif record.kind is RecordKind.END:
@@ -193,23 +198,30 @@ class ChunkedFile(ABC):
         is_whole = is_closed and self._is_whole(last)
         if chunk is not None:
             yield self._of_chunk(chunk, index if is_whole else [])
-        yield _entries(loose)
-        self._define_all()
+        # Channels that are defined nowhere else are defined in chunks.
+        for begin in self._indexed:
+            if self._named <= self.topics.keys():
+                break
+            with suppress(RecordError):  # which is reported when the chunk is read
+                self._chunk(begin)
         if not is_whole:
-            end = min(last.end, self.size)
+            end = min(last.offset + last.size, self.size)
             self.cut = f"the log {self.name!r} is cut or corrupt after byte {end} of {self.size}: used the data before"
 
     def read(self, channel: int, time_ns: int, block: int, offset: int) -> memoryview:
         """Return the bytes of the message of an entry; raise RecordError where they are not those that were written."""
-        if offset == _NO_CHUNK:
-            source: ByteSource = self
-            head = self._heads(self, islice(self._records(self, block, self.size), 1)).get(block)
-        else:
-            source, heads = self._chunk(block)
-            head = heads.get(offset)
-        if head is None or head[:2] != (channel, time_ns):
-            raise RecordError(f"the chunk at byte {block} has at its byte {offset} not what its index says")
-        return content(source, head.offset, head.size)
+        is_loose = offset == _NO_CHUNK
+        source, begin = (self, block) if is_loose else (self._chunk(block), offset)
+        try:
+            record = next(self._records(source, begin, source.size), None)
+            if record is not None and record.kind is RecordKind.MESSAGE:
+                head = self._head(source, record)
+                if head[:2] == (channel, time_ns):
+                    return source.content(begin, head.offset + head.size - begin)[head.offset - begin :]
+        except RecordError as error:
+            raise RecordError(f"the chunk at byte {block}: {error}") from error
+        fault = f": {CHANGED}" if source.damaged else f" has at its byte {offset} not what its index says"
+        raise RecordError(f"the chunk at byte {block}{fault}")
 
     def _of_chunk(self, chunk: Record, index: Sequence[Record]) -> Entries:
         """Return the entries of a chunk, by the index behind it or, without a valid one, by its content."""
@@ -217,40 +229,31 @@ class ChunkedFile(ABC):
             if index:
                 found = np.concatenate([self._index(record, chunk.begin) for record in index])
                 self._indexed[chunk.begin] = len(found)
-                self._undefined.update(set(found["channel"].tolist()) - self.topics.keys())
+                self._named.update(found["channel"].tolist())
                 return found[np.argsort(found["offset"])]
         try:
-            return _entries([(head, chunk.begin, offset) for offset, head in self._chunk(chunk.begin)[1].items()])
+            source = self._chunk(chunk.begin)
         except RecordError as error:
             self.faults[str(error)] += 1
             return _entries([])
+        heads = self._heads(source, self._records(source, 0, source.size))
+        return _entries([(head, chunk.begin, offset) for offset, head in heads.items()])
 
-    def _define_all(self) -> None:
-        """Unpack chunks until each channel that their indexes name is defined."""
-        for begin in self._indexed:
-            if self._undefined <= self.topics.keys():
-                break
-            with suppress(RecordError):  # which is told when it is read
-                self._chunk(begin)
-
-    def _chunk(self, begin: int) -> tuple[Unpacked, dict[int, MessageHead]]:
-        """Return the content of a chunk, and the heads of its messages by their offsets; raise RecordError.
-
-        Learn the channels that it defines.
-        """
+    def _chunk(self, begin: int) -> ByteSource:
+        """Return the content of a chunk, and learn the channels that it defines; raise RecordError."""
         found = self._chunks.pop(begin, None)
         if found is None:
             chunk = next(self._records(self, begin, self.size), None)
             if chunk is None:
                 raise RecordError(f"the chunk at byte {begin} is gone")
             try:
-                data = content(self, chunk.offset, min(chunk.size, self.size - chunk.offset))
-                source = Unpacked(self._unpack(chunk, data))
+                found = self._unpack(chunk, self.content(chunk.offset, min(chunk.size, self.size - chunk.offset)))
             except RecordError as error:
                 raise RecordError(f"the chunk at byte {begin}: {error}") from error
-            heads = self._heads(source, self._records(source, 0, source.size), of=begin, is_cut=chunk.is_cut)
-            found = source, heads
-            if begin in self._indexed and self._indexed[begin] != len(heads):
+            heads = self._heads(found, self._records(found, 0, found.size), of=begin, is_cut=chunk.is_cut)
+            if found.damaged:  # which may be what _heads has found as well
+                self.faults[f"the chunk at byte {begin}: {CHANGED}"] += 1
+            elif begin in self._indexed and self._indexed[begin] != len(heads):
                 counts = f"{len(heads)} messages, {self._indexed[begin]} by its index"
                 self.faults[f"the chunk at byte {begin} has {counts}"] += 1
         self._chunks[begin] = found
@@ -269,15 +272,16 @@ class ChunkedFile(ABC):
         for record in records:
             if record.is_cut:
                 break
-            end = record.end
+            end = record.offset + record.size
             try:
-                if record.kind is RecordKind.DEFINITION:
+                if record.is_definition:
                     self._define(source, record)
                 elif record.kind is RecordKind.MESSAGE:
                     heads[record.begin] = self._head(source, record)
             except RecordError as error:
-                self.faults[f"the record at byte {record.begin} of the block at byte {of}: {error}"] += 1
-        if not is_cut and end != source.size:
+                if not source.damaged:
+                    self.faults[f"the record at byte {record.begin} of the block at byte {of}: {error}"] += 1
+        if not (is_cut or source.damaged) and end != source.size:
             self.faults[f"the chunk at byte {of}: its last record is not whole"] += 1
         return heads
 
@@ -285,35 +289,3 @@ class ChunkedFile(ABC):
 def _entries(found: list[tuple[MessageHead, int, int]]) -> Entries:
     """Return heads of messages with block and offset as entries."""
     return np.array([(head.channel, head.time_ns, block, offset) for head, block, offset in found], ENTRY)
-
-
-def content(source: ByteSource, offset: int, size: int) -> memoryview:
-    """Return bytes of a source; raise RecordError where they are too many or incomplete."""
-    if size > MAX_RECORD_BYTES:
-        raise RecordError(f"{size} bytes are more than {MAX_RECORD_BYTES}")
-    data = source.read_bytes(offset, size)
-    if len(data) < size:
-        raise RecordError(f"{len(data)} of {size} bytes could be read")
-    return memoryview(data)
-
-
-def unpacked_chunk(compression: bytes, data: memoryview, size: int) -> bytes | memoryview:
-    """Return the content of a chunk that states this size [bytes], at most one byte more; raise RecordError.
-
-    compression: lz4, zstd, bz2 or nothing. The byte more lets the checksum behind the content be compared.
-    """
-    if size > MAX_RECORD_BYTES:
-        raise RecordError(f"it unpacks to {size} bytes, more than {MAX_RECORD_BYTES}")
-    try:
-        match compression:
-            case b"":
-                return data[: size + 1]
-            case b"lz4":
-                return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1))
-            case b"bz2":
-                return bz2.BZ2Decompressor().decompress(data, max_length=size + 1)
-            case b"zstd":
-                return zstandard.ZstdDecompressor().stream_reader(data).read(size + 1)
-    except (RuntimeError, ValueError, EOFError, OSError, MemoryError, zstandard.ZstdError) as error:
-        raise RecordError(f"it does not unpack: {error}") from error
-    raise RecordError(f"its compression {compression!r} is unknown")

@@ -22,9 +22,10 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from drivers.errors import DriverError
+from drivers.errors import DriverError, RecordError
+from drivers.logs.compression import MAX_RECORD_BYTES
 from drivers.logs.image_times import SHORTEST_STEP_NS
-from drivers.logs.log import ENTRY, MAX_ATTACHMENT_BYTES, MAX_RECORD_BYTES, Entries, RecordError, Topic
+from drivers.logs.log import ENTRY, MAX_ATTACHMENT_BYTES, Entries, Topic
 from drivers.logs.ros_messages import COMPRESSED_IMAGE, compressed_image
 
 SUFFIXES: Final = (".png", ".jpg", ".jpeg")

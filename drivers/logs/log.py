@@ -1,7 +1,7 @@
 """A log: the messages of one or more files of any format, in the order of time, and what is wrong with the files.
 
 A format says only where in a file which message is, and what bytes it has (`LogFile`). The places of all messages are
-collected first, some 50 bytes a message. So the order in a file need not be the order in time, and a step of the
+collected first, some 60 bytes a message. So the order in a file need not be the order in time, and a step of the
 recorder's clock is found before anything is read.
 """
 
@@ -15,21 +15,14 @@ from itertools import pairwise
 from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
-import zstandard
 from numpy.typing import NDArray
 
-from drivers.logs.ros_messages import (
-    IMAGE_TYPES,
-    JointWheels,
-    RosImage,
-    cdr_of_ros1,
-    parse_image,
-    parse_motion,
-)
+from drivers.errors import RecordError
+from drivers.logs.compression import unpack_message
+from drivers.logs.ros_messages import IMAGE_TYPES, JointWheels, RosImage, cdr_of_ros1, parse_image, parse_motion
 from drivers.motion import MotionSample
 
 # Bounds of what is kept in memory, whatever a file states.
-MAX_RECORD_BYTES: Final = 256 * 2**20  # of a message, of an image and of an unpacked chunk
 MAX_DEFINITIONS: Final = 4096  # topics, and types
 MAX_DEFINITION_BYTES: Final = 2**20
 MAX_ATTACHMENT_BYTES: Final = 16 * 2**20
@@ -38,16 +31,10 @@ MAX_LISTED: Final = 16  # names in a message
 LATEST_NS: Final = 2**62  # A time beyond is none; the difference of two times fits 64 bits.
 FEWEST_IN_ORDER: Final = 8  # Where fewer messages of a topic follow each other on average, it is written out of order.
 LONGEST_STEP: Final = 1.5  # Where two messages are more periods apart than that, one is missing between them.
-FAR_STEPS: Final = 3  # Times that end so many periods before others are of another clock.
-_ZSTD: Final = b"\x28\xb5\x2f\xfd"  # first bytes of a frame (RFC 8878); no message begins with them
 
 # Where a message is. In a file, messages are in the order of block and offset, whose meaning is the format's own.
 ENTRY: Final = np.dtype([(name, np.int64) for name in ("channel", "time_ns", "block", "offset")])
 Entries = NDArray[Any]  # (N,) of ENTRY
-
-
-class RecordError(Exception):
-    """A record or a message with invalid content; those after it may be valid. The text identifies the record."""
 
 
 class Topic(NamedTuple):
@@ -81,30 +68,37 @@ class LogFile(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class LoggedMessage:
-    """A message as it was logged."""
+    """A message as it was logged; what reads it raises FrameDecodeError where it is invalid."""
 
     topic: str
     kind: str  # ROS type such as sensor_msgs/msg/Image; "" where the message cannot be decoded
     log_time_ns: int
+    run_ns: int  # the log time, which runs on where the recorder's clock was set back
     logged: bytes | memoryview
     aligned: bool = True  # True: CDR (ROS 2); False: the serialisation of ROS 1
 
     def data(self) -> memoryview:
-        """Return the bytes, unpacked where rosbag2 has compressed each message; raise RecordError."""
-        data = memoryview(self.logged)
-        return unpack_zstd(data) if bytes(data[: len(_ZSTD)]) == _ZSTD else data
+        """Return the bytes, unpacked where rosbag2 has compressed each message."""
+        return unpack_message(memoryview(self.logged))
 
     def cdr(self) -> bytes:
-        """Return the bytes in CDR; raise RecordError or FrameDecodeError."""
+        """Return the bytes in CDR."""
         return bytes(self.data()) if self.aligned else cdr_of_ros1(self.kind, self.data())
 
     def image(self) -> RosImage:
-        """Return the image of an image message; raise FrameDecodeError or RecordError where there is none."""
+        """Return the image of an image message."""
         return parse_image(self.kind, self.data(), aligned=self.aligned)
 
     def motion(self, joints: JointWheels | None) -> MotionSample | None:
-        """Return the sample of wheels or an IMU, None of other joints; raise FrameDecodeError or RecordError."""
+        """Return the sample of wheels or an IMU, None of other joints."""
         return parse_motion(self.kind, self.data(), aligned=self.aligned, joints=joints)
+
+
+class ClockStep(NamedTuple):
+    """A clock was set between two messages: the time before, as it runs on, and by how much."""
+
+    before_ns: int
+    size_ns: int  # negative: back
 
 
 class LogDamage(NamedTuple):
@@ -122,7 +116,9 @@ class _Index(NamedTuple):
     topic: NDArray[np.int32]  # (N,) index in topics
     file: NDArray[np.int16]  # (N,) index of the file
     entries: Entries
-    order: NDArray[np.int64]  # (N,) rows in the order of time
+    run_ns: NDArray[np.int64]  # (N,) log times, which run on where the recorder's clock was set back
+    order: NDArray[np.int64]  # (N,) rows in the order of these times, else of the files
+    steps: list[ClockStep]
 
 
 class Log:
@@ -145,10 +141,19 @@ class Log:
         numbers = np.bincount(self._index.topic, minlength=len(self._index.topics))
         return dict(zip(self._index.topics, numbers.tolist(), strict=True))
 
+    def rates_hz(self) -> Mapping[str, float]:
+        """Return the mean rate of each topic from its first message to its last one; none of fewer than two."""
+        times = {name: self._index.run_ns[self._index.topic == n] for n, name in enumerate(self._index.topics)}
+        return {name: (len(ns) - 1) * 1e9 / float(np.ptp(ns)) for name, ns in times.items() if len(ns) and np.ptp(ns)}
+
     def span_ns(self) -> tuple[int, int] | None:
         """Return the first and last log time; None without messages."""
         times = self._index.entries["time_ns"]
         return (int(times.min()), int(times.max())) if times.size else None
+
+    def clock_steps(self) -> Sequence[ClockStep]:
+        """Return the steps of the recorder's clock."""
+        return self._index.steps
 
     @property
     def is_indexed(self) -> bool:
@@ -160,20 +165,22 @@ class Log:
 
         Messages of one time are in the order of the file. Those that cannot be read are left out and counted.
         """
-        names, kinds = [*self._index.topics], [*self._index.topics.values()]
+        index = self._index
+        names, kinds = [*index.topics], [*index.topics.values()]
         wanted = [number for number, name in enumerate(names) if topics is None or name in topics]
-        rows = self._index.order[np.isin(self._index.topic[self._index.order], wanted)]
-        for row, number in zip(rows.tolist(), self._index.topic[rows].tolist(), strict=True):
+        rows = index.order[np.isin(index.topic[index.order], wanted)]
+        columns = (part.tolist() for part in (rows, index.topic[rows], index.run_ns[rows]))
+        for row, number, run_ns in zip(*columns, strict=True):
             if self._closed:
                 return
-            file, entry = self._files[self._index.file[row]], self._index.entries[row].item()
+            file, entry = self._files[index.file[row]], index.entries[row].item()
             try:
                 data = file.read(*entry)
             except RecordError as error:
                 if not self._closed:
                     file.faults[str(error)] += 1
                 continue
-            yield LoggedMessage(names[number], kinds[number], entry[1], data, file.topics[entry[0]].aligned)
+            yield LoggedMessage(names[number], kinds[number], entry[1], run_ns, data, file.topics[entry[0]].aligned)
 
     def attachments(self) -> dict[str, bytes]:
         """Return name -> bytes of the attachments of the first file that has some, such as a rig.
@@ -221,29 +228,39 @@ class Log:
             found.append((entries, numbers) if (known >= 0).all() else (entries[numbers >= 0], numbers[numbers >= 0]))
         entries, topic = found[0] if len(found) == 1 else map(np.concatenate, zip(*found, strict=True))
         of_file = np.repeat(np.arange(len(found), dtype=np.int16), [len(numbers) for _, numbers in found])
-        # 2. Their order: by time within a segment, else by place in the file, as the sort is stable.
+        # 2. Their order.
         images = [place for place, kind in enumerate(topics.values()) if kind in IMAGE_TYPES]
-        segments = _segments(topic, entries["time_ns"], images)
-        return _Index(topics, topic, of_file, entries, np.lexsort((entries["time_ns"], segments)))
+        run_ns, steps = _running_on(topic, entries["time_ns"], images)
+        return _Index(topics, topic, of_file, entries, run_ns, np.argsort(run_ns, kind="stable"), steps)
 
 
-def _segments(topic: NDArray[np.int32], times: NDArray[np.int64], images: Iterable[int]) -> NDArray[np.int64]:
-    """Return the segment of each message (N,): between two of them the recorder's clock was set back.
+def _running_on(
+    topic: NDArray[np.int32], times: NDArray[np.int64], images: Iterable[int]
+) -> tuple[NDArray[np.int64], list[ClockStep]]:
+    """Return log times (N,) that run on where the recorder's clock was set back, and its steps.
 
     topic, times: (N,) in the order of the files. images: the topics that decide; others follow the first of them.
     """
-    cuts = {}
-    for number in images:
-        rows = np.flatnonzero(topic == number)
-        if (steps := steps_back(times[rows])).size:
-            cuts[number] = rows[steps]
+    # 1. The segment of each message: between two of them the clock was set back.
+    rows_of = {number: np.flatnonzero(topic == number) for number in np.unique(topic).tolist()}
+    found = {number: rows_of[number][steps_back(times[rows_of[number]])] for number in images if number in rows_of}
+    cuts = {number: rows for number, rows in found.items() if rows.size}
+    if not cuts:
+        return times, []
+    first = min(cuts, key=lambda number: int(cuts[number][0]))
     segments = np.zeros(len(topic), np.int64)
-    if cuts:
-        first = min(cuts.values(), key=lambda rows: int(rows[0]))
-        for number in np.unique(topic).tolist():
-            rows = np.flatnonzero(topic == number)
-            segments[rows] = np.searchsorted(cuts.get(number, first), rows, "right")
-    return segments
+    for number, rows in rows_of.items():
+        segments[rows] = np.searchsorted(cuts.get(number, cuts[first]), rows, "right")
+    # 2. Each segment begins one period after the one before it has ended.
+    increments, run_ns, steps, before_ns = np.diff(times[rows_of[first]]), times.copy(), [], 0
+    period_ns = round(float(np.median(increments[increments > 0])))
+    for segment in range(1, int(segments.max()) + 1):
+        within, end_ns = segments == segment, int(run_ns[segments < segment].max())
+        shift_ns = min(end_ns + period_ns - int(times[within].min()), LATEST_NS)
+        run_ns[within] += shift_ns
+        steps.append(ClockStep(end_ns, before_ns - shift_ns))
+        before_ns = shift_ns
+    return run_ns, steps
 
 
 def steps_back(times: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -261,7 +278,7 @@ def steps_back(times: NDArray[np.int64]) -> NDArray[np.int64]:
     for at, end in pairwise([*back.tolist(), len(times)]):
         run = times[at:end]  # which ascends
         within = run[np.searchsorted(run, low) : np.searchsorted(run, high, "right")]
-        is_step = bool(run[-1] < low - FAR_STEPS * period)
+        is_step = bool(run[-1] < low - 2 * period)
         if within.size > 1 or (within.size and run.size >= FEWEST_IN_ORDER):
             segment = times[starts[-1] : at]
             before = np.sort(segment[segment > within[0] - LONGEST_STEP * period])
@@ -272,18 +289,3 @@ def steps_back(times: NDArray[np.int64]) -> NDArray[np.int64]:
             starts.append(at)
         low, high = (run[0], run[-1]) if is_step else (min(low, run[0]), max(high, run[-1]))
     return np.array(starts[1:], np.int64)
-
-
-def unpack_zstd(data: bytes | memoryview) -> memoryview:
-    """Return the content of a frame of zstd; raise RecordError where it is damaged or larger than MAX_RECORD_BYTES."""
-    try:
-        stated = zstandard.get_frame_parameters(data).content_size
-        size = MAX_RECORD_BYTES if stated == zstandard.CONTENTSIZE_UNKNOWN else stated
-        if size > MAX_RECORD_BYTES:
-            raise RecordError(f"it unpacks to {size} bytes, more than {MAX_RECORD_BYTES}")
-        unpacked = zstandard.ZstdDecompressor().stream_reader(data).read(size)
-    except (zstandard.ZstdError, MemoryError) as error:
-        raise RecordError(f"it does not unpack: {error}") from error
-    if stated == size and len(unpacked) < size:
-        raise RecordError(f"it unpacks to {len(unpacked)} of {size} bytes")
-    return memoryview(unpacked)

@@ -9,6 +9,7 @@ from collections import Counter, deque
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
+from itertools import chain
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from drivers.errors import DriverError, FrameDecodeError
 from drivers.frame import CAMERAS, SAMPLE_BITS, Camera, Frame, gray, is_deep
 from drivers.logs.image_times import MAX_HELD_BYTES, STEP_NS, ImageTimes, TimedImage, TimeSource
-from drivers.logs.log import LoggedMessage, RecordError
+from drivers.logs.log import LoggedMessage
 from drivers.logs.open_log import open_log
 from drivers.logs.ros_messages import RosImage
 from drivers.logs.topics import MotionChoice, MotionTopics, choose_motion_topics, choose_topics
@@ -37,6 +38,8 @@ MOST_PERCENT = 99.0
 NEUTRAL_GREY, NEAR_NEUTRAL = 128, 16  # grey levels of colourless U and V, and how near those of weak colours are
 _COUNTERS = ("lower", "upper", "unstamped", "repeated", *_WARNINGS)
 WHOLE = (0.0, math.inf)  # span of all of a log [s]
+# Stamp, rank (0: a sample; 1, 2: of the lower and of the upper camera), number of the arrival, item.
+_Entry: TypeAlias = tuple[int, int, int, RosImage | MotionSample]
 
 
 class LogCameras(NamedTuple):
@@ -64,8 +67,7 @@ class LogReader:
     their names do not identify the cameras. window: number of frames that are held back to sort them by stamp. span_s:
     the part of the log that is read, from and until so many seconds after the stamp of its first image. motion: topics
     of wheels and IMU; None: their samples are not read. time: which of its two times an image is stamped with, see
-    `image_times`. Raises DriverError where the path is no such log, or the
-    topics of the two cameras are ambiguous.
+    `image_times`. Raises DriverError where the path is no such log, or the topics of the two cameras are ambiguous.
 
     During and after frames() and messages(), `counts` has 'lower' and 'upper' (frames delivered), 'late', 'duplicate',
     'repeated' (of these, with the same content), 'unstamped' (time of logging used), 'broken' (messages without a valid
@@ -114,24 +116,62 @@ class LogReader:
     def messages(self) -> Iterator[Frame | MotionSample]:
         """Yield frames, and samples of wheels and IMU, in the order of their stamps."""
         self._reset()
-        yield from self._in_span(self._sorted())
+        begin_s, end_s = self._span_s
+        first_ns, at_s = None, 0.0
+        for stamp_ns, rank, _, item in self._in_order():
+            first_ns = stamp_ns if first_ns is None and rank else first_ns
+            at_s = 0.0 if first_ns is None else 1e-9 * (stamp_ns - first_ns)
+            if at_s > end_s:
+                break
+            if at_s < begin_s:
+                continue
+            if isinstance(item, RosImage):
+                camera = CAMERAS[rank - 1]
+                self.counts[camera] += 1
+                yield item.frame(camera, self.counts[camera] - 1, self._bits)
+            else:
+                yield item
+        if first_ns is not None and at_s < begin_s:
+            raise DriverError(
+                f"{self._log.name!r} ends {at_s:.1f} s after its first image: a start before that was "
+                f"expected, {begin_s:g} s found"
+            )
         if not self._closed:
             self._report()
 
-    def _sorted(self) -> Iterator[Frame | MotionSample]:
-        """Yield frames and samples by stamp; the newest frames are held back, as their times of logging may differ."""
-        waiting = _Waiting()
-        for timed in self._times.stamped(self._images()):
-            for what in ("images", timed.camera):
-                self._widen(what, timed.image.stamp_ns)
-            self._add_samples(waiting, timed.log_ns)
-            waiting.add(timed.image.stamp_ns, 1 + CAMERAS.index(timed.camera), timed.image)
-            while waiting.is_full(self._window):
-                yield from self._taken(waiting)
-        if not self._closed:
-            self._add_samples(waiting, None)
-            while waiting.frames:
-                yield from self._taken(waiting)
+    def _in_order(self) -> Iterator[_Entry]:
+        """Yield images and samples by stamp; the newest images are held back, as their times of logging may differ.
+
+        An image that is late, or is there twice, is counted instead.
+        """
+        waiting, newest_ns, last = _Waiting(), 0, dict[int, RosImage]()
+        timed: TimedImage | None
+        for timed in chain(self._times.stamped(self._images()), [None]):
+            # 1. Samples that were logged before an image wait with it.
+            while self._unstamped and (timed is None or self._unstamped[0][0] <= timed.log_ns):
+                log_ns, sample = self._unstamped.popleft()
+                stamp_ns = self._times.sample_ns(sample.stamp_ns, log_ns)
+                self._widen("wheels" if isinstance(sample, WheelSample) else "gyro", stamp_ns)
+                waiting.add(stamp_ns, 0, replace(sample, stamp_ns=stamp_ns))
+            if timed is not None:
+                for what in ("images", timed.camera):
+                    self._widen(what, timed.image.stamp_ns)
+                waiting.add(timed.image.stamp_ns, 1 + CAMERAS.index(timed.camera), timed.image)
+            # 2. The earliest ones.
+            while not self._closed and waiting.frames and (timed is None or waiting.is_full(self._window)):
+                entry = waiting.take()
+                stamp_ns, rank, _, item = entry
+                if isinstance(item, RosImage):
+                    before = last.get(rank)
+                    if before is not None and before.stamp_ns == stamp_ns:
+                        self.counts["duplicate"] += 1
+                        self.counts["repeated"] += before.data == item.data
+                        continue
+                    if stamp_ns < newest_ns:
+                        self.counts["late"] += 1
+                        continue
+                    newest_ns, last[rank] = stamp_ns, item
+                yield entry
 
     def _images(self) -> Iterator[TimedImage]:
         """Yield the images in the order of logging; the samples between them wait."""
@@ -139,59 +179,12 @@ class LogReader:
         for message in self._log.messages({*cameras, *self._motion.names}):
             if self._closed:
                 return
-            log_ns = self._times.logged_ns(message.log_time_ns)
             if message.topic in cameras:
                 image = self._image(message)
                 if image is not None:
-                    yield TimedImage(cameras[message.topic], image, log_ns)
+                    yield TimedImage(cameras[message.topic], image, message.run_ns)
             elif (sample := self._sample(message)) is not None:
-                self._unstamped.append((log_ns, sample))
-
-    def _add_samples(self, waiting: _Waiting, until_ns: int | None) -> None:
-        """Stamp the samples that were logged until then, None: all."""
-        while self._unstamped and (until_ns is None or self._unstamped[0][0] <= until_ns):
-            log_ns, sample = self._unstamped.popleft()
-            sample = replace(sample, stamp_ns=self._times.sample_ns(sample.stamp_ns, log_ns))
-            self._widen("wheels" if isinstance(sample, WheelSample) else "gyro", sample.stamp_ns)
-            waiting.add(sample.stamp_ns, 0, sample)
-
-    def _taken(self, waiting: _Waiting) -> Iterator[Frame | MotionSample]:
-        """Take the earliest entry and yield it; count instead a frame that is late, or is there twice."""
-        stamp_ns, rank, item = waiting.take()
-        if not isinstance(item, RosImage):
-            yield item
-            return
-        camera = CAMERAS[rank - 1]
-        last = waiting.last.get(camera)
-        if last is not None and last.stamp_ns == stamp_ns:
-            self.counts["duplicate"] += 1
-            self.counts["repeated"] += last.data == item.data
-        elif stamp_ns < waiting.newest_ns:
-            self.counts["late"] += 1
-        else:
-            waiting.newest_ns, waiting.last[camera] = stamp_ns, item
-            self.counts[camera] += 1
-            yield item.frame(camera, self.counts[camera] - 1, self._bits)
-
-    def _in_span(self, messages: Iterator[Frame | MotionSample]) -> Iterator[Frame | MotionSample]:
-        """Yield the messages of the part that is read; other frames do not count, so that seq begins at 0 there."""
-        begin_s, end_s = self._span_s
-        first_ns, at_s = None, 0.0
-        for message in messages:
-            if isinstance(message, Frame):
-                first_ns = message.stamp_ns if first_ns is None else first_ns
-            at_s = 0.0 if first_ns is None else 1e-9 * (message.stamp_ns - first_ns)
-            if begin_s <= at_s <= end_s:
-                yield message
-            elif isinstance(message, Frame):
-                self.counts[message.camera] -= 1
-            if at_s > end_s:
-                return
-        if first_ns is not None and at_s < begin_s:
-            raise DriverError(
-                f"{self._log.name!r} ends {at_s:.1f} s after its first image: a start before that was "
-                f"expected, {begin_s:g} s found"
-            )
+                self._unstamped.append((message.run_ns, sample))
 
     def close(self) -> None:
         """End frames() and close the log."""
@@ -218,7 +211,7 @@ class LogReader:
         self._motion_fault = ""  # of the first message of wheels or IMU that is not valid
         self._other_joints = 0  # messages of joints without the wheels
         self._spans: dict[str, tuple[int, int]] = {}  # first and last stamp of images, each camera, wheels and gyro
-        self._times = ImageTimes(self._time)
+        self._times = ImageTimes(self._time, self._log.clock_steps())
         # Samples with their times of logging; no stage waits for more.
         self._unstamped: deque[tuple[int, MotionSample]] = deque(maxlen=MAX_WAITING_SAMPLES)
 
@@ -230,7 +223,7 @@ class LogReader:
         try:
             image = logged.image()
             self._examine(logged.topic, image)
-        except (FrameDecodeError, RecordError) as error:
+        except FrameDecodeError as error:
             self.counts["broken"] += 1
             self._fault = self._fault or str(error)
             return None
@@ -259,7 +252,7 @@ class LogReader:
         """Return the sample in a message of wheels or IMU, None of a broken one, and of joints without the wheels."""
         try:
             sample = logged.motion(self._joints)
-        except (FrameDecodeError, RecordError) as error:
+        except FrameDecodeError as error:
             self.counts["broken_motion"] += 1
             self._motion_fault = self._motion_fault or str(error)
             return None
@@ -309,31 +302,27 @@ def _is_neutral(image: NDArray[np.uint8]) -> bool:
 
 
 class _Waiting:
-    """Frames and samples, the earliest first: of one stamp samples, the lower camera, the upper one, by arrival."""
+    """Images and samples, the earliest first: of one stamp samples, the lower camera, the upper one, by arrival."""
 
     def __init__(self) -> None:
-        self.entries: list[tuple[int, int, int, RosImage | MotionSample]] = []  # stamp, rank, arrival
+        self._entries: list[_Entry] = []
         self.frames = self._arrivals = self._bytes = 0
-        self.newest_ns = 0  # stamp of the newest frame that was delivered
-        self.last: dict[Camera, RosImage] = {}  # image of each camera that was delivered
 
     def add(self, stamp_ns: int, rank: int, item: RosImage | MotionSample) -> None:
-        """Add an entry; rank: 0 for a sample. The data of an image must not change afterwards."""
-        heapq.heappush(self.entries, (stamp_ns, rank, self._arrivals, item))
+        """Add an entry. The data of an image must not change afterwards."""
+        heapq.heappush(self._entries, (stamp_ns, rank, self._arrivals, item))
         self._arrivals += 1
-        self._count(item, 1)
+        if isinstance(item, RosImage):
+            self.frames, self._bytes = self.frames + 1, self._bytes + len(item.data)
 
-    def take(self) -> tuple[int, int, RosImage | MotionSample]:
-        """Take the earliest entry: stamp, rank, item."""
-        stamp_ns, rank, _, item = heapq.heappop(self.entries)
-        self._count(item, -1)
-        return stamp_ns, rank, item
+    def take(self) -> _Entry:
+        """Take the earliest entry."""
+        entry = heapq.heappop(self._entries)
+        if isinstance(entry[-1], RosImage):
+            self.frames, self._bytes = self.frames - 1, self._bytes - len(entry[-1].data)
+        return entry
 
     def is_full(self, window: int) -> bool:
-        """True with more than `window` frames, 256 MiB of them, or more samples than a stage could wait for."""
-        samples = len(self.entries) - self.frames
+        """True with more than `window` images, too many bytes of them, or more samples than a stage could wait for."""
+        samples = len(self._entries) - self.frames
         return self.frames > window or self._bytes > MAX_HELD_BYTES or samples > MAX_WAITING_SAMPLES
-
-    def _count(self, item: RosImage | MotionSample, sign: int) -> None:
-        if isinstance(item, RosImage):
-            self.frames, self._bytes = self.frames + sign, self._bytes + sign * len(item.data)

@@ -19,16 +19,11 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Schema
+from numpy.typing import NDArray
 
-from drivers.logs.chunked_file import (
-    ByteSource,
-    ChunkedFile,
-    MessageHead,
-    Record,
-    RecordKind,
-    content,
-    unpacked_chunk,
-)
+from drivers.errors import RecordError
+from drivers.logs.chunked_file import ByteSource, ChunkedFile, MessageHead, Record, RecordKind
+from drivers.logs.compression import MAX_RECORD_BYTES, unpack_chunk
 from drivers.logs.log import (
     ENTRY,
     LATEST_NS,
@@ -36,14 +31,15 @@ from drivers.logs.log import (
     MAX_DEFINITION_BYTES,
     MAX_DEFINITIONS,
     MAX_NAME,
-    MAX_RECORD_BYTES,
     Entries,
-    RecordError,
     Topic,
 )
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 MAX_ALL_ATTACHMENTS_BYTES: Final = 64 * 2**20
+
+# Of a chunk that was changed at several bytes, one in 16 of this size looks as if one byte was changed.
+MAX_SEARCHED_BYTES: Final = 2**20
 
 _HEAD: Final = struct.Struct("<BQ")  # of a record: opcode, length of the content
 _CHUNK: Final = struct.Struct("<QQQII")  # first and last log time, unpacked size, CRC, length of the compression's name
@@ -58,8 +54,8 @@ _KINDS: Final = {
     Opcode.CHUNK: RecordKind.CHUNK,
     Opcode.MESSAGE_INDEX: RecordKind.INDEX,
     Opcode.MESSAGE: RecordKind.MESSAGE,
-    Opcode.SCHEMA: RecordKind.DEFINITION,
-    Opcode.CHANNEL: RecordKind.DEFINITION,
+    Opcode.SCHEMA: RecordKind.SCHEMA,
+    Opcode.CHANNEL: RecordKind.CHANNEL,
     Opcode.ATTACHMENT: RecordKind.ATTACHMENT,
     Opcode.DATA_END: RecordKind.END,
 }
@@ -83,7 +79,7 @@ class McapFile(ChunkedFile):
                 continue
             left -= record.size
             with suppress(RecordError):
-                body = content(self, record.offset, record.size)
+                body = self.content(record.offset, record.size)
                 attachment, crc = _parsed(Attachment, body), int.from_bytes(body[-_CRC_BYTES:], "little")
                 if not crc or zlib.crc32(body[:-_CRC_BYTES]) == crc:
                     found[attachment.name[:MAX_NAME]] = attachment.data
@@ -111,7 +107,7 @@ class McapFile(ChunkedFile):
             section = self.read_bytes(start, size)
             if len(section) == size and (not crc or zlib.crc32(section + footer[:-_CRC_BYTES]) == crc):
                 records = self._records(self, start, start + size)
-                yield from (record for record in records if record.kind is RecordKind.DEFINITION)
+                yield from (record for record in records if record.is_definition)
 
     def _records(self, source: ByteSource, start: int, end: int) -> Iterator[Record]:
         offset = start
@@ -124,12 +120,12 @@ class McapFile(ChunkedFile):
             if opcode == 0:
                 return
             is_cut = size > end - offset
-            yield Record(_KINDS.get(opcode, RecordKind.OTHER), begin, offset, size, opcode, is_cut=is_cut)
+            yield Record(_KINDS.get(opcode, RecordKind.OTHER), begin, offset, size, is_cut=is_cut)
             if is_cut:
                 return
             offset += size
 
-    def _unpack(self, chunk: Record, data: memoryview) -> bytes | memoryview:
+    def _unpack(self, chunk: Record, data: memoryview) -> ByteSource:
         try:
             _, _, size, crc, name_size = _CHUNK.unpack_from(data)
             name_end = _CHUNK.size + name_size
@@ -137,11 +133,14 @@ class McapFile(ChunkedFile):
         except struct.error as error:
             raise RecordError("its header is truncated") from error
         packed = data[name_end + _SIZE.size :][:packed_size]
-        unpacked = unpacked_chunk(bytes(data[_CHUNK.size : name_end][:MAX_NAME]), packed, size)
-        is_whole = len(packed) == packed_size and len(unpacked) == size and (not crc or zlib.crc32(unpacked) == crc)
-        if not (is_whole or chunk.is_cut):
+        unpacked = unpack_chunk(bytes(data[_CHUNK.size : name_end][:MAX_NAME]), packed, size)
+        found_crc = zlib.crc32(unpacked) if crc else 0
+        if chunk.is_cut or (found_crc == crc and len(packed) == packed_size and len(unpacked) == size):
+            return ByteSource(unpacked)
+        damaged = changed_bytes(found_crc ^ crc, size) if len(unpacked) == size <= MAX_SEARCHED_BYTES else []
+        if not damaged:
             raise RecordError("its content does not match its size and CRC")
-        return unpacked
+        return ByteSource(unpacked, damaged)
 
     def _head(self, source: ByteSource, message: Record) -> MessageHead:
         try:
@@ -152,7 +151,7 @@ class McapFile(ChunkedFile):
         return MessageHead(found[0], time_ns, message.offset + _MESSAGE.size, message.size - _MESSAGE.size)
 
     def _index(self, record: Record, chunk: int) -> Entries:
-        body = content(self, record.offset, record.size)
+        body = self.content(record.offset, record.size)
         try:
             channel, size = _INDEX.unpack_from(body)
         except struct.error as error:
@@ -165,10 +164,10 @@ class McapFile(ChunkedFile):
 
     def _define(self, source: ByteSource, record: Record) -> None:
         """Add a schema or channel. Names are cut and metadata is left out, so that no log can fill the memory."""
-        body = content(source, record.offset, record.size)
+        body = source.content(record.offset, record.size)
         if len(body) > MAX_DEFINITION_BYTES or max(len(self._types), len(self.topics)) >= MAX_DEFINITIONS:
             raise RecordError(f"more than {MAX_DEFINITIONS} channels or schemas, or a large one")
-        if record.opcode == Opcode.SCHEMA:
+        if record.kind is RecordKind.SCHEMA:
             schema = _parsed(Schema, body)
             self._types[schema.id] = ros_name(schema.name[:MAX_NAME])
             return
@@ -177,6 +176,32 @@ class McapFile(ChunkedFile):
             raise RecordError(f"the schema {found.schema_id} of the channel {found.id} is unknown")
         kind = self._types.get(found.schema_id, "") if found.message_encoding in ("cdr", "ros1") else ""
         self.topics[found.id] = Topic(found.topic[:MAX_NAME], kind, found.message_encoding != "ros1")
+
+
+def changed_bytes(difference: int, size: int) -> list[int]:
+    """Return the offsets in data of a size at which one changed byte explains the difference of two CRC-32.
+
+    A CRC is linear: of two messages that differ in one byte the CRCs differ by that byte's entry of the table, advanced
+    by a zero for each byte behind it. The difference is taken back by as many zeros as there are, which is linear as
+    well, so the step of 2 k zeros is that of k zeros twice.
+    """
+    table = np.array([zlib.crc32(bytes([value])) ^ zlib.crc32(b"\0") for value in range(256)], np.uint32)
+    by_last = np.argsort(table >> 24)  # each last byte is that of one entry
+
+    def back(state: NDArray[np.uint32]) -> NDArray[np.uint32]:
+        entry = by_last[state >> 24]
+        return np.asarray((state ^ table[entry]) << 8 | entry.astype(np.uint32), np.uint32)
+
+    # The step as a table for each byte of the state.
+    step = [back(np.arange(256, dtype=np.uint32) << np.uint32(shift)) for shift in (0, 8, 16, 24)]
+    states = np.array([difference], np.uint32)
+    while len(states) < size:
+        after, *rest = [
+            step[0][part & 255] ^ step[1][part >> 8 & 255] ^ step[2][part >> 16 & 255] ^ step[3][part >> 24]
+            for part in (states, *step)
+        ]
+        states, step = np.concatenate([states, after]), rest
+    return (size - 1 - np.flatnonzero(np.isin(states[:size], table[1:]))).tolist()
 
 
 def ros_name(schema_name: str) -> str:

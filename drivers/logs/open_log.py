@@ -9,16 +9,17 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from enum import Enum
+from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
 from drivers.errors import DriverError, FrameDecodeError
 from drivers.logs import mcap_file, ros1_bag, sqlite_bag
+from drivers.logs.compression import PACKED_SUFFIXES, is_packed, scratch_folder, unpack_file
 from drivers.logs.file_lock import is_locked
 from drivers.logs.image_folder import ImageFolder, image_folders
-from drivers.logs.log import MAX_ATTACHMENT_BYTES, MAX_LISTED, Log, LogFile, LoggedMessage, RecordError
+from drivers.logs.log import MAX_ATTACHMENT_BYTES, MAX_LISTED, Log, LogFile, LoggedMessage
 from drivers.logs.mcap_file import McapFile
-from drivers.logs.packed_file import PACKED_SUFFIXES, is_packed, scratch_folder, unpack
 from drivers.logs.ros1_bag import Ros1Bag
 from drivers.logs.ros_messages import IMAGE_TYPES
 from drivers.logs.sqlite_bag import SqliteBag
@@ -29,7 +30,7 @@ LOG_SUFFIXES: Final = (".mcap", ".db3", ".bag")
 _UNFINISHED: Final = (".part", ".active")  # A recording of omnid, or of rosbag, has these until it is complete.
 # A log: name, time of its first message (of omnid's recordings and of ROS 1), number of the part, format.
 _NAME: Final = re.compile(
-    r"(.+?)(_\d{8}T\d{6}Z|_\d{4}(?:-\d{2}){5})?(?:_(\d{1,9}))?(\.(?:mcap|db3|bag))"
+    r"(?P<name>.+?)(?P<time>_\d{8}T\d{6}Z|_\d{4}(?:-\d{2}){5})?(?:_(?P<part>\d{1,9}))?(?P<format>\.(?:mcap|db3|bag))"
     rf"(?:{'|'.join(map(re.escape, (*_UNFINISHED, *PACKED_SUFFIXES)))})*"
 )
 _LISTED_FILES: Final = re.compile(r"^ *relative_file_paths:[ \t]*\n((?:[ \t]*- .*\n)*)", re.M)
@@ -74,6 +75,7 @@ class LogInfo:
     broken: int  # corrupt chunks and records; those that nothing but reading shows are 0 where it was not examined
     fault: str  # one line that says what of the log, or of its images, is missing; empty for a complete log
     topics: Mapping[str, tuple[str, int]]  # topic -> type ('' where it cannot be decoded), number of messages
+    rates_hz: Mapping[str, float]  # topic -> mean rate from its first message to its last one; two are needed
     span_ns: tuple[int, int] | None  # first and last log time; None without messages
     attachments: Mapping[str, int]  # name -> bytes of the readable ones
 
@@ -83,51 +85,48 @@ class LogInfo:
         return sum(count for _, count in self.topics.values())
 
 
-def log_info(path: str | os.PathLike[str], *, examine: bool = False) -> LogInfo:
+def log_info(path: str | os.PathLike[str], *, examine: bool = False, rate_hz: float = 0.0) -> LogInfo:
     """Return the contents of a log of any format.
 
-    examine: read it to its end; otherwise corrupt chunks and images are not noticed. Raise DriverError without a log.
+    examine: read it to its end; otherwise corrupt chunks and images are not noticed. rate_hz: see `ImageFolder`. Raise
+    DriverError without a log.
     """
-    locked = is_locked(path)  # before it is read: the writer may end in the meantime
-    with closing(open_log(path)) as log:
+    locked, given = is_locked(path), Path(path)  # before it is read: the writer may end in the meantime
+    with closing(open_log(path, rate_hz)) as log:
         counts, cut_images = Counter[str]({} if examine else log.counts()), Counter[str]()
         for message in log.messages() if examine else ():
             counts[message.topic] += 1
-            cut_images[message.topic] += not _is_whole_image(message)
+            cut_images[message.topic] += message.kind in IMAGE_TYPES and not _is_whole_image(message)
         damage = log.damage()
         faults = [damage.cut] if damage.cut else []
         faults += [f"{count} images of {topic!r} end too early" for topic, count in (+cut_images).items()]
-        state = LogState.WHOLE if log.is_indexed else LogState.UNINDEXED
         if locked:
             state = LogState.WRITTEN
         elif faults or damage.broken:
             state = LogState.BROKEN
+        else:
+            state = LogState.WHOLE if log.is_indexed else LogState.UNINDEXED
+        files = given.rglob("*") if given.is_dir() else [given]
         return LogInfo(
-            Path(path),
-            _size_bytes(Path(path)),
+            given,
+            sum(file.stat().st_size for file in files if file.is_file()),
             state,
             damage.broken,
             "; ".join(faults),
             {name: (kind, counts.get(name, 0)) for name, kind in sorted(log.topics().items())},
+            log.rates_hz(),
             log.span_ns(),
             {name: len(data) for name, data in log.attachments().items()},
         )
 
 
 def _is_whole_image(message: LoggedMessage) -> bool:
-    """True unless a message is a JPEG without its end of image, as a driver that was killed half-way leaves it."""
-    if message.kind not in IMAGE_TYPES:
-        return True
+    """True unless an image is a JPEG without its end, as a driver that was killed half-way leaves it."""
     try:
         image = message.image()
-    except (FrameDecodeError, RecordError):
+    except FrameDecodeError:
         return False
     return image.encoding != "jpeg" or image.data.tobytes().rfind(_JPEG_END) >= 0
-
-
-def _size_bytes(path: Path) -> int:
-    files = path.rglob("*") if path.is_dir() else [path]
-    return sum(file.stat().st_size for file in files if file.is_file())
 
 
 def _open_file(path: Path, name: str | None = None) -> LogFile:
@@ -145,7 +144,7 @@ def _open_file(path: Path, name: str | None = None) -> LogFile:
             return kind(path, name)
     if is_packed(start) and name == str(path):
         with scratch_folder(name) as folder:
-            inside = unpack(path, folder)
+            inside = unpack_file(path, folder)
             if not inside.stat().st_size:
                 raise DriverError(f"{name!r} is compressed, but cut or corrupt at its start: record it again")
             return _open_file(inside, name)
@@ -196,29 +195,28 @@ def parts_in_order(logs: list[Path], *, with_gaps: bool = False) -> list[Path]:
     They have one name and numbers: `bag_0.mcap`, `bag_1.mcap`, as `ros2 bag record` names them, without a gap unless
     with_gaps. Where their names have times, these rise with the numbers: else the files are of several recordings.
     """
-    found = [(_NAME.fullmatch(log.name), log) for log in logs]
-    numbered = sorted((int(match[3]), match[2] or "", log) for match, log in found if match and match[3])
-    names = {(match[1], match[4]) for match, _ in found if match}
-    numbers, times = [number for number, _, _ in numbered], [time for _, time, _ in numbered]
-    follows = numbers == list(range(numbers[0], numbers[0] + len(logs))) if numbers else False
-    is_one = len(names) == 1 and len(set(numbers)) == len(logs) and times == sorted(times)
-    return [log for _, _, log in numbered] if is_one and (follows or with_gaps) else []
+    found = [(match, log) for log in logs if (match := _NAME.fullmatch(log.name)) and match["part"]]
+    found.sort(key=lambda entry: int(entry[0]["part"]))
+    numbers, times = [int(match["part"]) for match, _ in found], [match["time"] or "" for match, _ in found]
+    is_one = len({(match["name"], match["format"]) for match, _ in found}) == 1 and len(found) == len(logs)
+    rises = all(before < after if with_gaps else before + 1 == after for before, after in pairwise(numbers))
+    return [log for _, log in found] if is_one and rises and times == sorted(times) else []
 
 
 def _missing(folder: Path, logs: Sequence[Path]) -> list[str]:
     """Return the parts of a log that are not there: by metadata.yaml of rosbag2, else by a gap in their numbers."""
     metadata = folder / "metadata.yaml"
-    there = {match[0] for log in logs if (match := _NAME.match(log.name))}
+    there = [match for log in logs if (match := _NAME.fullmatch(log.name))]
     if metadata.is_file() and metadata.stat().st_size <= MAX_ATTACHMENT_BYTES:
         listed = _LISTED_FILES.search(metadata.read_text("utf-8", "replace"))
         # The first versions of rosbag2 listed paths.
         lines = listed[1].splitlines() if listed else []
         names = [Path(line.strip().removeprefix("- ").strip("'\" ")).name for line in lines]
-        plain = {name[: match.end(4)] for name in there if (match := _NAME.match(name))}
-        return [name for name in names if not ((match := _NAME.match(name)) and name[: match.end(4)] in plain)]
-    numbers = {int(match[3]): match for log in logs if (match := _NAME.fullmatch(log.name)) and match[3]}
-    first = next(iter(numbers.values()), None)
-    if first is None or len(numbers) != len(logs):
+        # One file may be compressed or unfinished, and the other not.
+        known = {match[0][: match.end("format")] for match in there}
+        return [name for name in names if not ((m := _NAME.match(name)) and name[: m.end("format")] in known)]
+    numbers = {int(match["part"]) for match in there if match["part"]}
+    if not numbers or len(numbers) != len(logs):
         return []
-    gaps = set(range(min(numbers), max(numbers))) - numbers.keys()
-    return [f"{first[1]}_{number}{first[4]}" for number in sorted(gaps)[:MAX_PARTS]]
+    gaps = sorted(set(range(min(numbers), max(numbers))) - numbers)
+    return [f"{there[0]['name']}_{number}{there[0]['format']}" for number in gaps[:MAX_PARTS]]

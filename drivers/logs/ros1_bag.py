@@ -9,28 +9,22 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from drivers.logs.chunked_file import (
-    ByteSource,
-    ChunkedFile,
-    MessageHead,
-    Record,
-    RecordKind,
-    content,
-    unpacked_chunk,
-)
-from drivers.logs.log import ENTRY, MAX_DEFINITION_BYTES, MAX_DEFINITIONS, MAX_NAME, Entries, RecordError, Topic
+from drivers.errors import RecordError
+from drivers.logs.chunked_file import ByteSource, ChunkedFile, MessageHead, Record, RecordKind
+from drivers.logs.compression import unpack_chunk
+from drivers.logs.log import ENTRY, MAX_DEFINITION_BYTES, MAX_DEFINITIONS, MAX_NAME, Entries, Topic
 
 MAGIC: Final = b"#ROSBAG V2.0\n"
 
 _LENGTH: Final = struct.Struct("<I")
 _ENTRY: Final = np.dtype([(name, "<u4") for name in ("seconds", "nanoseconds", "offset")])  # of an index
-_BAG: Final = 3
-_KINDS: Final = {2: RecordKind.MESSAGE, 4: RecordKind.INDEX, 5: RecordKind.CHUNK, 7: RecordKind.DEFINITION}
+_KINDS: Final = {2: RecordKind.MESSAGE, 4: RecordKind.INDEX, 5: RecordKind.CHUNK, 7: RecordKind.CHANNEL}
 
 
 class Ros1Bag(ChunkedFile):
@@ -39,16 +33,11 @@ class Ros1Bag(ChunkedFile):
     def __init__(self, path: Path, name: str) -> None:
         super().__init__(path, MAGIC, name)
         self._index_begin, self._indexed_records = 0, 0  # as the first record states them
-        bag = next(self._records(self, self._start, self.size), None)
-        if bag is not None and bag.opcode == _BAG:
+        for bag in islice(self._records(self, self._start, self.size), 1):
             with suppress(RecordError):
                 self._indexed_records = _number(bag, b"conn_count") + _number(bag, b"chunk_count")
                 self._index_begin = _numbers(bag, b"index_pos", 1, "Q")[0]
         self.is_indexed = self._is_closed()
-
-    def attachments(self) -> dict[str, bytes]:
-        """Return none: a bag has no attachments."""
-        return {}
 
     def _is_closed(self) -> bool:
         return self._start < self._index_begin < self.size
@@ -59,7 +48,7 @@ class Ros1Bag(ChunkedFile):
 
     def _summary(self) -> Iterator[Record]:
         records = self._records(self, self._index_begin, self.size)
-        yield from (record for record in records if record.kind is RecordKind.DEFINITION and not record.is_cut)
+        yield from (record for record in records if record.is_definition and not record.is_cut)
 
     def _records(self, source: ByteSource, start: int, end: int) -> Iterator[Record]:
         offset = start
@@ -74,24 +63,24 @@ class Ros1Bag(ChunkedFile):
                 return
             size, offset = _length(source, offset), offset + _LENGTH.size
             is_cut = size > end - offset
-            yield Record(_KINDS.get(opcode[0], RecordKind.OTHER), begin, offset, size, opcode[0], fields, is_cut)
+            yield Record(_KINDS.get(opcode[0], RecordKind.OTHER), begin, offset, size, fields, is_cut)
             if is_cut:
                 return
             offset += size
 
-    def _unpack(self, chunk: Record, data: memoryview) -> bytes | memoryview:
+    def _unpack(self, chunk: Record, data: memoryview) -> ByteSource:
         compression, size = chunk.fields.get(b"compression", b""), _number(chunk, b"size")
-        unpacked = unpacked_chunk(compression.replace(b"none", b""), data, size or len(data))
+        unpacked = unpack_chunk(compression.replace(b"none", b""), data, size or len(data))
         if len(unpacked) != size and not chunk.is_cut:
             raise RecordError("its content does not match its size")
-        return unpacked
+        return ByteSource(unpacked)
 
     def _head(self, source: ByteSource, message: Record) -> MessageHead:
         seconds, nanoseconds = _numbers(message, b"time", 2)
         return MessageHead(_number(message, b"conn"), seconds * 10**9 + nanoseconds, message.offset, message.size)
 
     def _index(self, record: Record, chunk: int) -> Entries:
-        body = content(self, record.offset, record.size)
+        body = self.content(record.offset, record.size)
         found = np.frombuffer(body[: len(body) // _ENTRY.itemsize * _ENTRY.itemsize], _ENTRY)
         entries = np.empty(len(found), ENTRY)
         entries["channel"], entries["block"], entries["offset"] = _number(record, b"conn"), chunk, found["offset"]
@@ -101,7 +90,7 @@ class Ros1Bag(ChunkedFile):
     def _define(self, source: ByteSource, record: Record) -> None:
         if len(self.topics) >= MAX_DEFINITIONS or record.size > MAX_DEFINITION_BYTES:
             raise RecordError(f"more than {MAX_DEFINITIONS} connections, or a large one")
-        about = _fields(bytes(content(source, record.offset, record.size)))
+        about = _fields(bytes(source.content(record.offset, record.size)))
         found = record.fields.get(b"topic", b""), about.get(b"type", b"")
         topic, kind = (text[:MAX_NAME].decode("utf-8", "replace") for text in found)
         self.topics[_number(record, b"conn")] = Topic(topic, kind.replace("/", "/msg/", 1), aligned=False)

@@ -18,9 +18,9 @@ from urllib.parse import quote
 
 import numpy as np
 
-from drivers.errors import DriverError
-from drivers.logs.log import ENTRY, MAX_DEFINITIONS, MAX_RECORD_BYTES, Entries, RecordError, Topic
-from drivers.logs.packed_file import scratch_folder
+from drivers.errors import DriverError, RecordError
+from drivers.logs.compression import MAX_RECORD_BYTES, scratch_folder
+from drivers.logs.log import ENTRY, MAX_DEFINITIONS, Entries, Topic
 
 MAGIC: Final = b"SQLite format 3\0"
 _BESIDE: Final = ("-wal", "-journal")

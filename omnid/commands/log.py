@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from omnid.commands.options import JSON, command, print_json
+from omnid.commands.options import JSON, RATE, command, print_json
 from omnid.utc import utc
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ _MEND = "`mcap recover`, of mcap's own command line"
 MAX_LINE = 5000  # Most characters of a line: it may contain the path of a file.
 
 
-@command(JSON)
+@command(RATE, JSON)
 def info(args: argparse.Namespace) -> int:
     """Print topics, types, counts, times, attachments, and whether the log is whole.
 
@@ -28,6 +28,7 @@ def info(args: argparse.Namespace) -> int:
 
     examples:
       log info recordings/*.mcap
+      log info images --rate 20
     """
     from drivers.errors import DriverError
     from drivers.logs.open_log import LogState, log_info
@@ -35,7 +36,7 @@ def info(args: argparse.Namespace) -> int:
     code, logs = 0, []
     for number, path in enumerate(args.logs):
         try:
-            found = log_info(path, examine=True)
+            found = log_info(path, examine=True, rate_hz=args.rate or 0.0)
         except DriverError as error:
             print(f"omnid: {_shown(str(error))}", file=sys.stderr)
             code = 2
@@ -64,20 +65,20 @@ def _described(found: LogInfo) -> Iterator[str]:
     yield f"log          {_shown(str(found.path))}"
     yield f"size         {_bytes(found.size_bytes)}"
     yield f"state        {found.state.value}{states.get(found.state, '')}"
-    duration_s = 0.0
     if found.span_ns is not None:
         first_ns, last_ns = found.span_ns
-        duration_s = max(0.0, (last_ns - first_ns) / 1e9)
-        yield f"time         {utc(first_ns)} to {utc(last_ns)}, {duration_s:.3f} s"
+        yield f"time         {utc(first_ns)} to {utc(last_ns)}, {(last_ns - first_ns) / 1e9:.3f} s"
     yield f"messages     {found.messages}"
     listed = ", ".join(f"{_shown(name)} ({_bytes(size)})" for name, size in found.attachments.items())
     yield f"attachments  {listed or 'none'}"
-    rows = [(_shown(name), _shown(kind) or "-", count) for name, (kind, count) in found.topics.items()]
+    rows = [
+        (_shown(name), _shown(kind) or "-", count, f"{found.rates_hz[name]:.2f}" if name in found.rates_hz else "-")
+        for name, (kind, count) in found.topics.items()
+    ]
     if rows:
         wide, wide_kind = (min(MAX_COLUMN, max(map(len, column))) for column in list(zip(*rows, strict=True))[:2])
         yield f"\n{'topic':<{wide}}  {'type':<{wide_kind}}{'messages':>10}{'Hz':>9}"
-    for name, kind, count in rows:
-        rate = f"{(count - 1) / duration_s:.2f}" if count > 1 and duration_s > 0 else "-"
+    for name, kind, count, rate in rows:
         yield f"{name:<{wide}}  {kind:<{wide_kind}}{count:>10}{rate:>9}"
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final, NamedTuple, TypeAlias
 
 from drivers.errors import FrameDecodeError
-from drivers.logs.log import MAX_LISTED, LoggedMessage, RecordError
+from drivers.logs.log import MAX_LISTED, LoggedMessage
 from drivers.logs.open_log import LogInfo, open_log
 from drivers.logs.ros_messages import IMAGE_TYPES, RosImage
 from omnid.errors import OmnidError
@@ -154,7 +154,7 @@ class RecordingReader:
         """Return the content of a message; None, and count it, where it cannot be decoded."""
         try:
             return decoder(message)
-        except (OmnidError, FrameDecodeError, RecordError):
+        except (OmnidError, FrameDecodeError):
             self.unreadable[message.topic] += 1
             return None
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import re
@@ -16,7 +17,8 @@ from mcap.reader import make_reader
 
 from drivers.logs.log_reader import LogReader
 from drivers.logs.mcap_writer import LogWriter
-from tests.drivers.logs.mcap_logs import BARE, LOWER, START_NS, Entry, pairs, text, write_log
+from tests.drivers.logs.bags import write_folders
+from tests.drivers.logs.mcap_logs import BARE, LOWER, START_NS, UPPER, Entry, pairs, text, write_log
 from tests.replay.command import Command
 
 pytestmark = pytest.mark.usefixtures("default_signals")
@@ -108,8 +110,20 @@ def test_info_shows_the_content_of_a_log(omnid: Command, tmp_path: Path) -> None
     assert re.search(r"state +whole\n", out) and re.search(r"messages +23\n", out)
     assert "2023-11-14T22:13:20.000Z to 2023-11-14T22:13:21.001Z, 1.001 s" in out
     assert "rig.toml (2.0 kB)" in out
-    assert re.search(rf"{LOWER} +sensor_msgs/msg/CompressedImage +11 +9.99\n", out)
+    assert re.search(rf"{LOWER} +sensor_msgs/msg/CompressedImage +11 +10.00\n", out)
     assert re.search(r"/chatter +std_msgs/msg/String +1 +-\n", out)
+
+
+def test_info_shows_the_rate_of_each_topic_over_its_own_time(omnid: Command, tmp_path: Path) -> None:
+    """The upper camera was started late. Images without stamps have the rate that is given."""
+    entries = [entry for n, entry in enumerate(pairs(40)) if entry.topic == LOWER or n > 60]
+    write_folders(tmp_path / "images", entries, names=lambda ns: f"{ns % 10**10:06d}")
+    for log, *options in ([write_log(tmp_path / "log.mcap", entries)], [tmp_path / "images", "--rate", "10"]):
+        code, out, err = omnid("log", "info", log, *options)
+        assert (code, err) == (0 if not options else 1, "")
+        assert re.findall(r"CompressedImage +(\d+) +(\S+)\n", out + "\n") == [("40", "10.00"), ("10", "10.00")]
+    code, out, _ = omnid("log", "info", write_log(tmp_path / "log.mcap", entries), "--json")
+    assert json.loads(out)[0]["rates_hz"] == {LOWER: 10.0, UPPER: 10.0}
 
 
 def test_info_shows_the_damage_and_advice(omnid: Command, tmp_path: Path) -> None:
