@@ -1,8 +1,9 @@
 """The graph of stages and its threads: inboxes, tickers, the end of a run. Few other modules import threading.
 
-A stream exists before it is read, so a cycle cannot be wired. Messages flow through bounded inboxes that belong to
-their readers; the end of a stream flows the same way. Inline, the same stages run in the caller's thread, each message
-depth first, with the same results. With several sources, or where streams merge, only the inline order is fixed.
+A stream exists before it is read, so a cycle cannot be wired. A thread has one bounded inbox, from which it serves its
+stages in the order of arrival; between stages of one thread messages pass directly. The end of a stream is the last
+message of it. Inline, the same stages run in the caller's thread, each message depth first, with the same results.
+With several sources, or where streams merge, only the inline order is fixed.
 """
 
 from __future__ import annotations
@@ -10,159 +11,174 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from functools import partial
 from queue import Empty, SimpleQueue
 from typing import Any, Final, TypeVar
 
-from omnid.engine.flow import (
-    LOSSLESS,
-    NEWEST,
-    Node,
-    Policy,
-    Sink,
-    Slot,
-    Source,
-    Stage,
-    Stream,
-    nothing,
-)
+from omnid.engine.flow import LOSSLESS, NEWEST, Policy, Sink, Stage, Stream, nothing
 from omnid.engine.telemetry import StageStats, Telemetry
 from omnid.errors import OmnidError
 
-__all__ = ["LOSSLESS", "NEWEST", "Graph", "Policy", "Sink", "Slot", "Stage", "Stream", "Ticker"]
+__all__ = ["LOSSLESS", "NEWEST", "Graph", "Policy", "Sink", "Stage", "Stream"]
 
 T = TypeVar("T")
 In = TypeVar("In")
 Out = TypeVar("Out")
+TICKS: Final = "ticks"  # the thread of the tickers that name no other
 _POLL_S: Final = 0.1  # a signal handled in another thread does not wake the main one, so it polls
-_END: Final = object()  # what an inbox gives after the last message
+_END: Final = object()  # the last message of a stream
 
 
-class InFlight:
-    """Counts the messages that wait in the inboxes of a graph, or are being processed."""
+class Node:
+    """A stage or a sink with its counters and its output; after an error it drops its messages, and counts them."""
 
-    def __init__(self) -> None:
-        self._count = 0
-        self._changed = threading.Condition()
+    def __init__(self, graph: Graph, stats: StageStats, work: object, writers: int, thread: str) -> None:
+        """writers: number of streams that it reads."""
+        self.stats, self.writers, self._graph = stats, writers, graph
+        self.stream: Stream[Any] = Stream(thread)
+        self._process: Callable[[object], object | None] = getattr(work, "process", nothing)
+        self._finish: Callable[[], Iterable[object] | None] = getattr(work, "finish", nothing)
 
-    def add(self, count: int) -> None:
-        """Add to the number of messages; a negative count: they are done or dropped."""
-        with self._changed:
-            self._count += count
-            if not self._count:
-                self._changed.notify_all()
+    def put(self, message: object) -> None:
+        """Process the message, and pass its result on."""
+        if not self.writers or self.stats.name in self._graph.failed:
+            self.stats.dropped += 1
+            return
+        with self._graph.watched(self.stats.name):
+            result = self.stats.timed(self._process, message)
+            if result is not None:
+                self.stream.push(result)
 
-    def is_none(self, timeout_s: float) -> bool:
-        """True as soon as there is none; False after the timeout."""
-        with self._changed:
-            return self._changed.wait_for(lambda: not self._count, timeout_s)
+    def end(self) -> None:
+        """Take the end of a stream; after the last one the results that remain are passed on, and the output ends."""
+        self.writers -= 1
+        if self.writers:
+            return
+        if self.stats.name not in self._graph.failed and not self._graph.aborting:
+            with self._graph.watched(self.stats.name):
+                for result in self._finish() or ():
+                    self.stream.push(result)
+        self.stream.end()
+
+
+@dataclass(slots=True, eq=False)
+class Link:
+    """One of the streams that a node reads, with the bound of what may wait of it."""
+
+    node: Node
+    depth: int
+    policy: Policy
+    waiting: int = 0
 
 
 class Inbox:
-    """Bounded queue in front of a stage's thread; it ends when all its writers have ended.
+    """Bounded queue in front of a thread, from which it serves its nodes.
 
-    Up to `depth` messages of each writer wait. With the policy NEWEST a writer drops its own oldest message: so none
-    of two cameras takes the place of the other one's image.
+    With the policy NEWEST a stream drops its own oldest message, so none of two cameras takes the place of the other
+    one's image.
     """
 
-    def __init__(self, stats: StageStats, writers: int, depth: int, policy: Policy, in_flight: InFlight) -> None:
-        """in_flight: the count of the graph, in which a message is until its reader asks for the next one."""
-        self._stats, self._writers, self._depth, self._policy = stats, writers, depth, policy
-        self._in_flight, self._is_processing = in_flight, False
-        self._messages: deque[tuple[int, object]] = deque()  # with the number of the writer
-        self._changed = threading.Condition()
+    def __init__(self, lock: threading.Lock, idle: threading.Condition) -> None:
+        """lock: of all inboxes of the graph. idle: notified when the reader has done all that waited."""
+        self.nodes: list[Node] = []
+        self._changed, self._idle = threading.Condition(lock), idle
+        self._messages: deque[tuple[Link, object]] = deque()
+        self._current: Link | None = None  # whose message is processed
         self._closed = False
 
-    def put(self, writer: int, message: object) -> None:
-        """Add a message of a writer."""
+    @property
+    def is_idle(self) -> bool:
+        """True if no message waits or is being processed; to be asked under the lock."""
+        return not self._messages and self._current is None
+
+    def put(self, link: Link, message: object) -> None:
+        """Add a message of a stream; the end of one always has room."""
+        stats = link.node.stats
         with self._changed:
-            own = [entry for entry in self._messages if entry[0] == writer]
-            if self._policy is LOSSLESS:
-                self._changed.wait_for(lambda: self._closed or len(self._messages) < self._depth * self._writers)
-            elif len(own) >= self._depth:
-                self._messages.remove(own[0])
-                self._in_flight.add(-1)
-                self._stats.dropped += 1
-            if self._closed:  # the reader has ended
-                self._stats.dropped += 1
-                return
-            self._messages.append((writer, message))
-            self._in_flight.add(1)
-            self._stats.busy_since_ns = self._stats.busy_since_ns or time.monotonic_ns()
+            if message is not _END:
+                if link.policy is LOSSLESS:
+                    self._changed.wait_for(lambda: self._closed or link.waiting < link.depth)
+                elif link.waiting >= link.depth:
+                    del self._messages[next(k for k, (other, _) in enumerate(self._messages) if other is link)]
+                    link.waiting -= 1
+                    stats.dropped += 1
+                if self._closed:
+                    stats.dropped += 1
+                    return
+                link.waiting += 1
+                stats.busy_since_ns = stats.busy_since_ns or time.monotonic_ns()
+            self._messages.append((link, message))
             self._changed.notify_all()
 
-    def get(self) -> object:
-        """Return the next message, _END after the last one; wait for it. The message before is done."""
-        if self._is_processing:
-            self._in_flight.add(-1)
-        with self._changed:
-            self._stats.busy_since_ns = time.monotonic_ns() if self._messages else 0
-            self._changed.wait_for(lambda: self._messages or not self._writers or self._closed)
-            self._is_processing = bool(self._messages)
-            if not self._messages:
-                return _END
-            self._changed.notify_all()
-            return self._messages.popleft()[1]
-
-    def end(self) -> None:
-        """Count one writer less."""
-        with self._changed:
-            self._writers -= 1
-            self._changed.notify_all()
+    def serve(self) -> None:
+        """Pass the messages to their nodes until all streams of these have ended."""
+        while any(node.writers for node in self.nodes):
+            # 1. The next message.
+            with self._changed:
+                self._changed.wait_for(lambda: self._messages)
+                link, message = self._messages.popleft()
+                self._current = link
+                link.waiting -= message is not _END
+                self._changed.notify_all()
+            # 2. Its node does the work.
+            node = link.node
+            node.end() if message is _END else node.put(message)
+            # 3. It is done.
+            with self._changed:
+                self._current = None
+                waits = any(other.node is node for other, _ in self._messages)
+                node.stats.busy_since_ns = time.monotonic_ns() if waits else 0
+                if not self._messages:
+                    self._idle.notify_all()
 
     def close(self) -> None:
-        """Drop and count all messages, those to come too: the reader has ended."""
+        """Drop and count all messages, those to come too; the ends of streams stay."""
         with self._changed:
             self._closed = True
-            self._stats.dropped += len(self._messages)
-            self._in_flight.add(-len(self._messages))
-            self._messages.clear()
-            self._stats.busy_since_ns = 0
+            for link, message in self._messages:
+                link.node.stats.dropped += message is not _END
+                link.waiting = 0
+            self._messages = deque(entry for entry in self._messages if entry[1] is _END)
             self._changed.notify_all()
 
 
-class Ticker:
-    """Calls an action at a fixed rate, independent of the stages.
+@dataclass(slots=True, eq=False)
+class _Source:
+    """Input of the graph: messages of an iterable."""
 
-    The graph calls the action's optional `close` once, also after an error. `stats.dropped` counts missed deadlines: of
-    those that have passed, the newest is served, without drift and burst.
-    """
+    stats: StageStats
+    open: Callable[[], Iterable[object]]
+    wake: Callable[[], None]
+    stream: Stream[Any]
 
-    def __init__(self, name: str, period_s: float, action: Callable[[], object]) -> None:
-        if not 0.0 < period_s < threading.TIMEOUT_MAX:
-            raise OmnidError(f"ticker '{name}': expected a period above 0 s, found {period_s}")
-        self.stats = StageStats(name, is_ticker=True)
-        self._period_ns = round(period_s * 1e9)
-        self._action = action
-        self._halt = threading.Event()
 
-    def halt(self) -> None:
-        """End `run` before its next tick."""
-        self._halt.set()
+@dataclass(slots=True, eq=False)
+class _Ticker:
+    """An action at a fixed rate. `stats.dropped` counts missed deadlines."""
 
-    def run(self, stopping: Callable[[], bool]) -> None:
-        """Tick until halted or stopping."""
-        deadline_ns = time.monotonic_ns()
-        while not self._halt.wait(max(0.0, (deadline_ns - time.monotonic_ns()) * 1e-9)) and not stopping():
-            now_ns = time.monotonic_ns()
-            skipped = max(0, now_ns - deadline_ns) // self._period_ns
-            self.stats.dropped += skipped
-            self.stats.busy_since_ns = now_ns
-            self.stats.timed(self._action)
-            self.stats.busy_since_ns = 0
-            deadline_ns += (1 + skipped) * self._period_ns
+    stats: StageStats
+    period_ns: int
+    action: Callable[[], object]
+    deadline_ns: int = 0
 
-    def close(self) -> None:
-        """Close the action."""
-        getattr(self._action, "close", nothing)()
+    def tick(self) -> None:
+        """Call the action; of several deadlines that have passed the newest is served, without drift and burst."""
+        now_ns = time.monotonic_ns()
+        skipped = max(0, now_ns - self.deadline_ns) // self.period_ns
+        self.stats.dropped += skipped
+        self.stats.busy_since_ns = now_ns
+        self.stats.timed(self.action)
+        self.stats.busy_since_ns = 0
+        self.deadline_ns += (1 + skipped) * self.period_ns
 
 
 class Graph:
     """The wiring of one run, and the run itself.
 
-    `policy` is that of all inboxes unless a sink has its own; `depth` is the capacity of an inbox.
+    `policy` is that of all inboxes unless a sink has its own; `depth` is the capacity of an inbox for each stream.
     `sinks_wait`: sinks have no policy of their own, so with LOSSLESS no message is ever dropped.
     `on_thread` is called in each thread, with its name, before its work; it must not raise.
     """
@@ -178,15 +194,19 @@ class Graph:
     ) -> None:
         self.telemetry, self.policy = Telemetry(), policy
         self._threaded, self._depth, self._on_thread, self._sinks_wait = threaded, depth, on_thread, sinks_wait
-        self._in_flight = InFlight()
-        self._sources: list[Source] = []
-        self._inboxes: list[Inbox] = []
-        self._tickers: list[Ticker] = []
-        self._threads: list[threading.Thread] = []
-        self._ended: list[str] = []  # names of threads
+        self._lock = threading.Lock()
+        self._idle = threading.Condition(self._lock)
+        self._sources: list[_Source] = []
+        self._open_sources = 0
+        self._inlets: list[Stream[Any]] = []
+        self._inboxes: dict[str, Inbox] = {}  # by thread
+        self._tickers: dict[str, list[_Ticker]] = {}  # by thread
+        self._ended: list[str] = []  # names of threads of sources and stages
+        self.failed: set[str] = set()  # names of stages
         self._errors: list[BaseException] = []
         self._stops: deque[None] = deque(maxlen=2)
         self._wakeup: SimpleQueue[None] = SimpleQueue()  # its put is reentrant, so safe in a signal handler
+        self._no_ticks = threading.Event()
         self._ran = False
 
     def source(
@@ -196,17 +216,28 @@ class Graph:
 
         `wake` is called once to end a threaded run early: it must end the current read and all later ones.
         """
-        source = Source(self._add(StageStats(name)), messages, wake)
-        self._sources.append(source)
-        self._thread(name, self._run_source, source)
-        return source.stream
+        stream: Stream[T] = Stream(name)
+        self._open_sources += 1
+        self._sources.append(_Source(self._add(StageStats(name)), messages, wake, stream))
+        return stream
 
-    def stage(self, name: str, stage: Stage[In, Out], *inputs: Stream[In], direct: bool = False) -> Stream[Out]:
-        """Add a stage, whose inputs merge into its one inbox; return its output.
+    def inlet(self, depth: int) -> Stream[Any]:
+        """Add a stream for messages of any thread, which never waits; it ends when all sources have ended.
 
-        direct: it has no inbox and no thread, and runs in that of the stage before it.
+        depth: number of messages that may wait for each reader; the oldest give way.
         """
-        return self._node(name, stage, inputs, self.policy, self._depth, direct)
+        self._require_fresh()
+        inlet: Stream[Any] = Stream("", depth)
+        self._inlets.append(inlet)
+        return inlet
+
+    def stage(self, name: str, stage: Stage[In, Out], *inputs: Stream[In], thread: str = "") -> Stream[Out]:
+        """Add a stage, whose inputs merge; return its output.
+
+        thread: name of that in which it runs, one of its own where it is empty. What comes from a stage or a source of
+        the same thread is passed on directly, without an inbox.
+        """
+        return self._node(name, stage, inputs, self.policy, self._depth, thread)
 
     def sink(
         self,
@@ -215,32 +246,32 @@ class Graph:
         *inputs: Stream[In],
         policy: Policy | None = None,
         depth: int | None = None,
-        direct: bool = False,
+        thread: str = "",
     ) -> None:
-        """Add a sink, with its own policy or depth if given.
-
-        direct: see `stage`; for work of microseconds, since to wake a thread takes longer.
-        """
+        """Add a sink, with its own policy or depth if given; thread as of a stage."""
         own = None if self._sinks_wait else policy
-        self._node(name, sink, inputs, own or self.policy, self._depth if depth is None else depth, direct)
+        self._node(name, sink, inputs, own or self.policy, self._depth if depth is None else depth, thread)
 
-    def ticker(self, name: str, period_s: float, action: Callable[[], object]) -> Ticker:
-        """Add an action that is called at a fixed rate in its own thread, also inline, until the run ends.
+    def ticker(self, name: str, period_s: float, action: Callable[[], object], thread: str = TICKS) -> None:
+        """Add an action that is called at a fixed rate, also inline, until the run ends; tickers share a thread.
 
-        A stop or a failure ends it at once, before the inboxes are empty.
+        A stop or a failure ends it at once, before the inboxes are empty. The action's optional `close` is called once,
+        also after an error.
         """
-        ticker = Ticker(name, period_s, action)
-        self._add(ticker.stats)
-        self._tickers.append(ticker)
-        return ticker
+        if not 0.0 < period_s < threading.TIMEOUT_MAX:
+            raise OmnidError(f"ticker '{name}': expected a period above 0 s, found {period_s}")
+        stats = self._add(StageStats(name, is_ticker=True))
+        self._tickers.setdefault(thread, []).append(_Ticker(stats, round(period_s * 1e9), action))
 
     def settle(self) -> None:
         """Wait until all messages have been processed, or the run ends: for a source whose time is stopped meanwhile.
 
         Inline, nothing ever waits.
         """
-        while not (self._in_flight.is_none(_POLL_S) or self._stopping):
-            pass
+        with self._idle:
+            while not self._stopping:
+                if self._idle.wait_for(lambda: all(inbox.is_idle for inbox in self._inboxes.values()), _POLL_S):
+                    return
 
     def stop(self) -> None:
         """End the sources and process what is in the inboxes; a second call drops the inboxes and finishes nothing.
@@ -257,37 +288,58 @@ class Graph:
         """
         self._require_fresh()
         self._ran = True
-        tickers = [
-            threading.Thread(target=self._run_ticker, args=(each,), name=each.stats.name) for each in self._tickers
+        # 1. A thread for each source, each group of stages, and each group of tickers.
+        bodies: dict[str, Callable[[], object]] = {
+            source.stats.name: partial(deque, self._steps(source), 0) for source in self._sources
+        }
+        bodies |= {name: inbox.serve for name, inbox in self._inboxes.items()}
+        work = [self._thread(name, body) for name, body in bodies.items()] if self._threaded else []
+        ticks = [
+            threading.Thread(target=self._tick, args=(name, group), name=name) for name, group in self._tickers.items()
         ]
+        # 2. Run, and wait for the end of all.
         try:
-            for thread in tickers + self._threads:
+            for thread in ticks + work:
                 thread.start()
-            self._wait() if self._threaded else self._run_inline()
+            self._wait(work) if self._threaded else self._run_inline()
         except BaseException as error:  # from the caller's signal handler, or no thread could be started
             self._errors.insert(0, error)
             self._stops.extend((None, None))
-            self._wait()
+            self._wait(work)
         finally:
-            for ticker in self._tickers:
-                ticker.halt()
-            for thread in tickers:
+            self._no_ticks.set()
+            for thread in ticks:
                 if thread.ident is not None:
                     thread.join()
+        # 3. What went wrong.
         for later in self._errors[1:]:
             self._errors[0].add_note(f"and then: {later!r}")
         if self._errors:
             raise self._errors[0]
-        if self._aborting:
+        if self.aborting:
             raise KeyboardInterrupt("stopped twice: messages that were still in the inboxes are lost")
+
+    @property
+    def aborting(self) -> bool:
+        """True after a second stop: nothing is finished."""
+        return len(self._stops) > 1
+
+    @contextmanager
+    def watched(self, name: str) -> Iterator[None]:
+        """End the run by an error in this block of a stage, which counts as failed."""
+        try:
+            yield
+        except GeneratorExit:  # of a source that is given up
+            raise
+        except BaseException as error:
+            error.add_note(f"in '{name}'")
+            self.failed.add(name)
+            self._errors.append(error)
+            self._wakeup.put(None)
 
     @property
     def _stopping(self) -> bool:
         return bool(self._stops or self._errors)
-
-    @property
-    def _aborting(self) -> bool:
-        return len(self._stops) > 1
 
     def _require_fresh(self) -> None:
         if self._ran:
@@ -298,89 +350,91 @@ class Graph:
         return self.telemetry.add(stats)
 
     def _node(
-        self, name: str, work: object, inputs: tuple[Stream[Any], ...], policy: Policy, depth: int, direct: bool
+        self, name: str, work: object, inputs: tuple[Stream[Any], ...], policy: Policy, depth: int, thread: str
     ) -> Stream[Any]:
         if not inputs or depth < 1:
             raise OmnidError(f"'{name}': expected inputs and a depth above 0, found {len(inputs)} and {depth}")
-        node = Node(self._add(StageStats(name)), work, len(inputs), self._succeeds, lambda: self._aborting)
-        if self._threaded and not direct:
-            inbox = Inbox(node.stats, len(inputs), depth, policy, self._in_flight)
-            self._inboxes.append(inbox)
-            self._thread(name, self._run_node, node, inbox)
-            for writer, stream in enumerate(inputs):
-                stream.add(partial(inbox.put, writer), inbox.end)
-        else:
-            for stream in inputs:
+        thread = thread or name
+        node = Node(self, self._add(StageStats(name)), work, len(inputs), thread)
+        for stream in inputs:
+            if not self._threaded or stream.thread == thread:
                 stream.add(node.put, node.end)
+                continue
+            inbox = self._inboxes.setdefault(thread, Inbox(self._lock, self._idle))
+            if node not in inbox.nodes:
+                inbox.nodes.append(node)
+            link = Link(node, stream.depth, NEWEST) if stream.depth else Link(node, depth, policy)
+            stream.add(partial(inbox.put, link), partial(inbox.put, link, _END))
         return node.stream
 
-    def _thread(self, name: str, body: Callable[..., None], *args: object) -> None:
+    def _thread(self, name: str, body: Callable[[], object]) -> threading.Thread:
         def run() -> None:
             self._on_thread(name)
-            body(*args)
+            body()
             self._ended.append(name)
             self._wakeup.put(None)
 
-        if self._threaded:
-            self._threads.append(threading.Thread(target=run, name=name))
+        return threading.Thread(target=run, name=name)
 
-    def _succeeds(self, name: str, work: Callable[..., object], *args: object) -> bool:
-        """True if the work raised no error; an error ends the run."""
-        try:
-            work(*args)
-        except BaseException as error:
-            error.add_note(f"in '{name}'")
-            self._errors.append(error)
-            self._wakeup.put(None)
-            return False
-        return True
-
-    def _run_source(self, source: Source) -> None:
-        while self._advances(source):
-            pass
-
-    def _advances(self, source: Source) -> bool:
-        """True if the source took a step; otherwise it is closed and its stream ends."""
-        name = source.stats.name
-        if not self._stopping and self._succeeds(name, source.step) and not source.ended:
-            return True
-        self._succeeds(name, source.close)
+    def _steps(self, source: _Source) -> Iterator[None]:
+        """Pass on the messages of a source, one a step; then its stream ends, with the last one the inlets."""
+        stats, messages = source.stats, iter(tuple[object]())
+        with self.watched(stats.name):
+            try:
+                if not self._stopping:
+                    start_ns, messages = time.perf_counter_ns(), iter(source.open())
+                    for message in messages:
+                        stats.add(start_ns)
+                        source.stream.push(message)
+                        yield
+                        if self._stopping:
+                            break
+                        start_ns = time.perf_counter_ns()
+            finally:
+                getattr(messages, "close", nothing)()
         source.stream.end()
-        return False
-
-    def _run_node(self, node: Node, inbox: Inbox) -> None:
-        while node.alive and (message := inbox.get()) is not _END:
-            node.put(message)
-        inbox.close()
-        node.close()
+        with self._lock:
+            self._open_sources -= 1
+            is_last = not self._open_sources
+        for inlet in self._inlets if is_last else ():
+            inlet.end()
 
     def _run_inline(self) -> None:
-        active = deque(self._sources)
+        active = deque(map(self._steps, self._sources))
         while active:  # round robin
-            source = active.popleft()
-            if self._advances(source):
-                active.append(source)
+            steps = active.popleft()
+            if next(steps, _END) is not _END:
+                active.append(steps)
 
-    def _run_ticker(self, ticker: Ticker) -> None:
-        name = ticker.stats.name
+    def _tick(self, name: str, group: list[_Ticker]) -> None:
+        """Call the actions of a thread, each at its rate, until the end; then close them."""
         self._on_thread(name)
-        self._succeeds(name, ticker.run, lambda: self._stopping)
-        self._succeeds(name, ticker.close)
+        for ticker in group:
+            ticker.deadline_ns = time.monotonic_ns()
+        while True:
+            ticker = min(group, key=lambda each: each.deadline_ns)
+            if self._no_ticks.wait(max(0.0, (ticker.deadline_ns - time.monotonic_ns()) * 1e-9)) or self._stopping:
+                break
+            with self.watched(ticker.stats.name):
+                ticker.tick()
+        for ticker in group:
+            with self.watched(ticker.stats.name):
+                getattr(ticker.action, "close", nothing)()
 
-    def _wait(self) -> None:
+    def _wait(self, threads: list[threading.Thread]) -> None:
         """Wait for the threads that were started; pass a stop or a failure on to sources, tickers and inboxes."""
-        started = [thread for thread in self._threads if thread.ident is not None]
+        started = [thread for thread in threads if thread.ident is not None]
         while len(self._ended) < len(started):
             with suppress(Empty):
                 self._wakeup.get(timeout=_POLL_S)
             if self._stopping:
-                for ticker in self._tickers:
-                    ticker.halt()
+                self._no_ticks.set()
                 for source in self._sources:
                     wake, source.wake = source.wake, nothing
-                    self._succeeds(source.stats.name, wake)
-            if self._aborting:
-                for inbox in self._inboxes:
+                    with self.watched(source.stats.name):
+                        wake()
+            if self.aborting:
+                for inbox in self._inboxes.values():
                     inbox.close()
         for thread in started:
             thread.join()

@@ -75,9 +75,13 @@ class StageStats:
         """Return `call(*args)`, counted and timed; a call that raises is not counted."""
         start_ns = time.perf_counter_ns()
         result = call(*args)
+        self.add(start_ns)
+        return result
+
+    def add(self, start_ns: int) -> None:
+        """Count a message whose work began then, by time.perf_counter_ns()."""
         self.wall.add((time.perf_counter_ns() - start_ns) * 1e-9)
         self.processed += 1
-        return result
 
 
 class SummaryRow(NamedTuple):

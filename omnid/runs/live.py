@@ -252,7 +252,7 @@ class LiveRun:
                 words = lambda: line() + self._robot.words()  # noqa: E731
                 say = partial(self._report, logging.INFO)
                 terminal = TerminalStatus(self._show, words, say, session.statistics, _ready(self._config))
-                self._graph.ticker("terminal", terminal.period_s, terminal)
+                self._graph.ticker("terminal", terminal.period_s, terminal, thread="terminal")
             # 3. The run, until a signal or a failure ends it.
             cv2.setNumThreads(OPENCV_THREADS)
             if not self._robot.waits:
@@ -352,9 +352,9 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
     saver = None
     if stages.places is not None and run_places.is_extended:
         saver = MapSaver(run_places, stages.places, config.places.save_s, bus.answer)
-        graph.ticker("save", saver.PERIOD_S, saver)
+        graph.ticker("save", saver.PERIOD_S, saver, thread="files")
     if controller is not None:
-        graph.ticker("routes", files.PERIOD_S, files)
+        graph.ticker("routes", files.PERIOD_S, files, thread="files")
     if stages.places is not None:
         files.save_map = stages.places.want_copy
 

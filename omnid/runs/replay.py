@@ -24,13 +24,12 @@ from omnid.controller.motor import SIMULATED
 from omnid.core.places.place_map import PlaceMap
 from omnid.core.rig.rig_health import RigContradictedError
 from omnid.diagnostics.run_summary import RunStatistics
-from omnid.engine.flow import Slot
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Sink, Stream
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.realtime import RealtimeSettings
 from omnid.engine.telemetry import Telemetry
 from omnid.errors import OmnidError
-from omnid.messages import MapUpdate, OdometryUpdate
+from omnid.messages import OdometryUpdate
 from omnid.runs.place_maps import RigPlaces, RunPlaces
 from omnid.runs.rig_checks import examined_rig
 from omnid.runs.run_result import RunFailedError, RunReport, RunResult
@@ -41,7 +40,7 @@ from omnid.sinks.bus_sink import BusSink
 from omnid.sinks.drive import ReplayDrive, SimulatedWheels
 from omnid.sinks.encoder import Outgoing
 from omnid.sinks.files import MapFile, PlanFile, TrajectoryFile, check_outputs, write_known
-from omnid.sinks.pose_collector import PlaceCollector, PoseCollector
+from omnid.sinks.pose_collector import Newest, PlaceCollector, PoseCollector
 from omnid.sinks.recorder import Recorder, SingleLog
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry
@@ -118,7 +117,7 @@ class _Replay:
     def __init__(self, log: Path, config: Config, options: ReplayOptions) -> None:
         self._log, self._config, self._options = log, config, options
         self._poses, self._in_map = PoseCollector(), PlaceCollector()
-        self._map: Slot[MapUpdate] = Slot()
+        self._map = Newest()
         self._wheels: ReplayDrive | SimulatedWheels | None = None
         self._warnings: list[str] = []
         self._begun_s = 0.0
@@ -251,7 +250,7 @@ class _Replay:
         elif config.motor.port:
             controller = session.start_controller(UNPRIVILEGED, of_replay=True)
             setpoint = config.controller.setpoint.setpoint()
-            outputs.poses["controller"] = self._wheels = ReplayDrive(controller, setpoint, geometry.rig.T_base_rig)
+            outputs.counters["controller"] = self._wheels = ReplayDrive(controller, setpoint, geometry.rig.T_base_rig)
         return replace(outputs, bus=self._bus(session, geometry) if options.publish else None, recorder=recorder)
 
     def _bus(self, session: Session, geometry: Geometry) -> BusSink | None:
@@ -283,7 +282,7 @@ class _Replay:
         if path := options.map_live_tum:
             self._warnings += write_known(path, stamps_ns, live, np.array([each.is_known for each in updates], bool))
         # 2. All that was found.
-        newest = self._map.get()
+        newest = self._map.update
         return RunResult(
             *self._poses.arrays(),
             counters,

@@ -28,6 +28,7 @@ from omnid.stages.obstacles import CameraFloor, Obstacles
 from omnid.stages.places import Places
 from omnid.stages.routes import RouteMap, Routes
 
+BUS, BUS_OF_MAPS, BACKGROUND = "bus", "bus-maps", "background"  # threads that several stages and sinks share
 RECORDED_DEPTH = 20  # messages of each kind that may wait for the disk of a live recording
 
 
@@ -37,11 +38,11 @@ class Outputs:
 
     pairs: dict[str, Sink[FramePair]] = field(default_factory=dict)  # each takes the newest
     poses: dict[str, Sink[OdometryUpdate]] = field(default_factory=dict)
-    counters: dict[str, Sink[OdometryUpdate]] = field(default_factory=dict)  # of poses, in the thread of the odometry
+    counters: dict[str, Sink[OdometryUpdate]] = field(default_factory=dict)  # in the thread of the poses: never wait
     commands: dict[str, Sink[VelocityCommand]] = field(default_factory=dict)
     maps: dict[str, Sink[MapUpdate]] = field(default_factory=dict)
     places: dict[str, Sink[PlaceUpdate]] = field(default_factory=dict)
-    rings: dict[str, Sink[ObstacleRing]] = field(default_factory=dict)
+    rings: dict[str, Sink[ObstacleRing]] = field(default_factory=dict)  # in the thread of the rings
     bus: Sink[Outgoing] | None = None  # takes all messages that leave the run
     recorder: Sink[Any] | None = None  # takes them as well
     records_images: bool = False  # the recorder of a live run takes the images, too
@@ -121,8 +122,9 @@ def wire(
 ) -> WiredStages:
     """Join the stages to the images and to the outputs; return those that are asked for counts.
 
-    Live (policy NEWEST), one thread makes a pose of the newest images, so that what is old is dropped before any work;
-    the stages behind it have an inbox each. Else decoding and dewarping are one bounded inbox ahead of the odometry.
+    Live (policy NEWEST), one thread makes a pose of the newest images, so that what is old is dropped before any work.
+    Else decoding and dewarping are one bounded inbox ahead of the odometry. Places, obstacles and navigation have a
+    thread each. What no wheel waits for shares one: the map, what draws or encodes it, and sinks that write.
     """
     parts, geometry = parts or Parts(), front_end.geometry
     T_base_rig = geometry.rig.T_base_rig
@@ -131,29 +133,29 @@ def wire(
 
     # 1. Images give pairs, pairs give panoramas, and these give poses.
     pairs = graph.stage("pair", front_end.pairing, *frames)
-    panoramas = graph.stage("dewarp", front_end.dewarp, pairs, direct=True)
-    poses = graph.stage("odometry", front_end.poses, panoramas, direct=graph.policy is NEWEST)
+    panoramas = graph.stage("dewarp", front_end.dewarp, pairs, thread="pair")
+    poses = graph.stage("odometry", front_end.poses, panoramas, thread="pair" if graph.policy is NEWEST else "")
 
     # 2. Poses go to the controller, which waits for no stage.
     if parts.controller is not None:
         ended = nothing if parts.navigation is None else parts.navigation.requests.end
-        graph.sink("controller", LiveDrive(parts.controller, T_base_rig, ended), poses, policy=NEWEST, depth=1)
+        graph.sink("controller", LiveDrive(parts.controller, T_base_rig, ended), poses, thread=poses.thread)
         commands = graph.source("drive", parts.controller.commands, wake=parts.controller.end)
     else:
         law = LockstepDrive(config.controller, 1.0 / config.motor.rate_hz, T_base_rig)
-        commands = graph.stage("drive", law, poses)
+        commands = graph.stage("drive", law, poses, thread=poses.thread)
 
     # 3. They give the map, the pose in it, and the obstacles, where these are consumed.
     if outputs.maps or outputs.take_all:
         mapping = Mapping(config.mapping, front_end.dense, parts.map_every_s)
-        maps = graph.stage("mapping", mapping, poses)
+        maps = graph.stage("mapping", mapping, poses, thread=BACKGROUND)
     needs_places = outputs.places or outputs.take_all or parts.navigation or parts.known_places is not None
     if config.places.enabled and needs_places:
         places = Places(geometry, config, front_end.dense, parts.known_places, localize_only=parts.localize_only)
         in_map = graph.stage("places", places, poses)
     if in_map is not None and outputs.take_all:
         grid = MapGrid(config.mapping.voxel_m, T_base_rig @ geometry.T_rig_rect, parts.map_every_s)
-        grids = graph.stage("grid", grid, in_map)
+        grids = graph.stage("grid", grid, in_map, thread=BACKGROUND)
     if config.obstacles.enabled and (outputs.rings or outputs.take_all or parts.navigation):
         obstacles = Obstacles(geometry, config.obstacles, front_end.dense)
         rings = graph.stage("obstacles", obstacles, poses)
@@ -169,41 +171,44 @@ def wire(
         asked = graph.source("requests", requests.batches, wake=requests.end)
         seen: list[Stream[Any]] = [poses, *(stream for stream in (in_map, rings) if stream is not None), asked]
         ways = graph.stage("navigation", navigation, *seen)
-        graph.sink("planner", drive, ways, policy=NEWEST, depth=1)
+        graph.sink("planner", drive, ways, thread=ways.thread)
 
     # 5. What is made leaves the run.
-    taken: list[tuple[dict[str, Any], Stream[Any] | None, bool]] = [
-        (outputs.poses, poses, False),
-        (outputs.counters, poses, True),
-        (outputs.commands, commands, False),
-        (outputs.maps, maps, False),
-        (outputs.places, in_map, False),
-        (outputs.rings, rings, False),
-    ]
+    for name, counter in outputs.counters.items():
+        graph.sink(name, counter, poses, thread=poses.thread)
+    for name, to_wheels in outputs.rings.items():
+        if rings is not None:
+            graph.sink(name, to_wheels, rings, thread=rings.thread)
     for name, pair_sink in outputs.pairs.items():
-        graph.sink(name, pair_sink, pairs, policy=NEWEST, depth=1)
-    for sinks, stream, direct in taken:
+        graph.sink(name, pair_sink, pairs, policy=NEWEST, depth=1, thread=BACKGROUND)
+    taken: list[tuple[dict[str, Any], Stream[Any] | None]] = [
+        (outputs.poses, poses),
+        (outputs.commands, commands),
+        (outputs.maps, maps),
+        (outputs.places, in_map),
+    ]
+    for sinks, stream in taken:
         for name, sink in sinks.items():
             if stream is not None:
-                graph.sink(name, sink, stream, direct=direct)
-    named: dict[str, Stream[Any] | None] = {
-        "bus": poses,
-        "bus-drive": commands,
-        "bus-map": maps,
-        "bus-places": in_map,
-        "bus-grid": grids,
-        "bus-scan": rings,
-        "bus-navigation": ways,
-    }
-    outgoing = {name: stream for name, stream in named.items() if stream is not None}
+                graph.sink(name, sink, stream, thread=BACKGROUND)
+    made: list[tuple[str, Stream[Any] | None, str]] = [
+        ("bus", poses, BUS),
+        ("bus-drive", commands, BUS),
+        ("bus-map", maps, BUS_OF_MAPS),  # to encode a map takes longer than a pose may wait
+        ("bus-places", in_map, BUS),
+        ("bus-grid", grids, BUS_OF_MAPS),
+        ("bus-scan", rings, BUS),
+        ("bus-navigation", ways, BUS),
+    ]
+    outgoing = [(name, stream, thread) for name, stream, thread in made if stream is not None]
     if outputs.recorder is not None:
         images = frames if outputs.records_images else ()
         depth = RECORDED_DEPTH if outputs.records_images else None
-        graph.sink("record", outputs.recorder, *images, *outgoing.values(), depth=depth)
+        graph.sink("record", outputs.recorder, *images, *(stream for _, stream, _ in outgoing), depth=depth)
     if outputs.bus is not None:
-        for name, stream in outgoing.items():  # an inbox each: to encode a map takes longer than a pose may wait
-            graph.sink(name, outputs.bus, stream, policy=NEWEST)
+        for name, stream, thread in outgoing:
+            graph.sink(name, outputs.bus, stream, policy=NEWEST, thread=thread)
 
     # 6. The keyframe of a pair is made when its pose has been passed on: this reader of poses is the last one.
-    graph.sink("keyframes", Keyframes(front_end.odometry), poses, direct=True)
+    graph.sink("keyframes", Keyframes(front_end.odometry), poses, thread=poses.thread)
     return WiredStages(front_end, mapping, places, obstacles)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.messages import OdometryUpdate, PlaceUpdate
+from omnid.messages import MapUpdate, OdometryUpdate, PlaceUpdate
 from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]
@@ -43,3 +43,13 @@ class PlaceCollector(list[PlaceUpdate]):
     def process(self, update: PlaceUpdate) -> None:
         """Keep a pose."""
         self.append(update)
+
+
+class Newest:
+    """A sink that keeps the newest map."""
+
+    update: MapUpdate | None = None
+
+    def process(self, update: MapUpdate) -> None:
+        """Keep a map."""
+        self.update = update

@@ -6,6 +6,7 @@ import os
 import signal
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator
 from functools import partial
 from itertools import count
@@ -13,7 +14,7 @@ from typing import NoReturn
 
 import pytest
 
-from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Ticker
+from omnid.engine.graph import LOSSLESS, NEWEST, Graph
 from omnid.errors import OmnidError
 from tests.omnid.engine.graph_parts import LONG_S, Action, Apply, Collect, Sums, both, fail_at, stopped_at
 
@@ -59,7 +60,7 @@ def test_a_source_settles_until_all_that_follows_is_done(threaded: bool) -> None
 
     passed = graph.stage("pass", Apply(lambda message: message), graph.source("numbers", numbers))
     graph.sink("slow", slow, passed, policy=NEWEST, depth=1)
-    graph.sink("later", Apply(later), passed, direct=True)  # the last reader, in the thread of its stage
+    graph.sink("later", Apply(later), passed, thread=passed.thread)  # the last reader, in the thread of its stage
     graph.run()
     assert slow.got == list(range(20))
     assert behind == 20 * [0]
@@ -255,12 +256,11 @@ def test_a_ticker_runs_beside_a_slow_stage(threaded: bool) -> None:
         return message
 
     graph.sink("sink", sink, graph.stage("hold", Apply(hold), graph.source("one", lambda: [7])))
-    ticker = graph.ticker("motor", 1e-3, action)
+    graph.ticker("motor", 1e-3, action)
     graph.run()
     assert sink.got == [7]
     assert action.closed == 1
-    assert ticker.stats.processed == action.calls >= 20
-    assert ticker.stats in graph.telemetry.stages
+    assert graph.telemetry.of("motor").processed == action.calls >= 20
 
 
 @both
@@ -274,18 +274,65 @@ def test_a_failing_ticker_is_closed_and_ends_the_run(threaded: bool) -> None:
     assert (action.calls, action.closed, sink.finished) == (3, 1, 1)
 
 
-def test_a_stalled_ticker_counts_missed_deadlines_without_a_burst() -> None:
-    stalled, period_s = threading.Event(), 2e-3
+@both
+def test_a_stalled_ticker_counts_missed_deadlines_without_a_burst(threaded: bool) -> None:
+    graph, stalled, done, period_s = Graph(threaded=threaded), threading.Event(), threading.Event(), 2e-3
 
     def action() -> None:
         if not stalled.is_set():
             threading.Event().wait(25 * period_s)
             stalled.set()
-        elif ticker.stats.processed >= 5:
-            ticker.halt()
+        elif stats.processed >= 5:
+            done.set()
 
-    ticker, start_s = Ticker("motor", period_s, action), time.monotonic()
-    ticker.run(lambda: False)
-    assert ticker.stats.processed == 6
-    assert ticker.stats.dropped >= 23  # of the deadlines within the stall the newest is served
-    assert ticker.stats.processed + ticker.stats.dropped <= (time.monotonic() - start_s) / period_s + 1
+    def numbers() -> Iterator[int]:
+        yield 1
+        assert done.wait(LONG_S)
+
+    graph.sink("sink", Collect(), graph.source("numbers", numbers))
+    graph.ticker("motor", period_s, action)
+    stats, start_s = graph.telemetry.of("motor"), time.monotonic()
+    graph.run()
+    assert stats.dropped >= 23  # of the deadlines within the stall the newest is served
+    assert 6 <= stats.processed <= (time.monotonic() - start_s) / period_s + 1 - stats.dropped
+
+
+def test_stages_of_one_thread_share_it_and_pass_messages_directly() -> None:
+    graph, seen = Graph(policy=NEWEST, depth=1), Counter[tuple[str, str]]()
+    last, beside = Collect(), Collect()
+
+    def noted(name: str) -> Apply:
+        def note(message: int) -> int:
+            seen[name, threading.current_thread().name] += 1
+            return message
+
+        return Apply(note)
+
+    numbers = graph.source("numbers", lambda: range(100))
+    first = graph.stage("first", noted("first"), numbers, thread="shared")
+    graph.sink("last", last, graph.stage("second", noted("second"), first, thread="shared"), thread="shared")
+    graph.stage("other", noted("other"), numbers, thread="shared")
+    graph.sink("beside", beside, first, policy=LOSSLESS)
+    graph.run()
+    of_first = graph.telemetry.of("first")
+    assert of_first.processed + of_first.dropped == 100 and last.got[-1] == 99
+    assert last.got == beside.got and last.finished == beside.finished == 1, "nothing is dropped between the two"
+    assert {thread for _, thread in seen} == {"shared"} and seen["first", "shared"] == seen["second", "shared"]
+    assert {name for name, _ in seen} == {"first", "second", "other"}
+
+
+@both
+def test_messages_from_outside_are_taken_until_the_sources_end(threaded: bool) -> None:
+    graph, sink = Graph(threaded=threaded), Collect()
+    inlet = graph.inlet(3)
+
+    def numbers() -> Iterator[int]:
+        for number in range(3):
+            inlet.push(10 + number)
+            yield number
+
+    stage = graph.stage("both", Apply(lambda message: message), inlet, graph.source("numbers", numbers))
+    graph.sink("sink", sink, stage)
+    graph.run()
+    inlet.push(99)
+    assert sorted(sink.got) == [0, 1, 2, 10, 11, 12] and sink.finished == 1
