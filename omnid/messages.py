@@ -22,6 +22,7 @@ from omnid.core.obstacles.moving_tracker import MovingObstacle
 from omnid.core.odometry.earlier_view import EarlierView
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.stereo_frame import Features
+from omnid.core.places.place_map import PlaceMap
 from omnid.core.stereo.photometry import Light
 from omnid.core.stereo.tiles import ALL_LIVE, TileStates
 from omnid.core.types.panorama import PaddedPanorama
@@ -149,6 +150,20 @@ class MapKeyframes:
     T_map_rect: Mapping[int, Array]  # (4, 4) of the rectified frame
 
 
+class SaveMap(NamedTuple):
+    """A request to write the map."""
+
+    id: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapCopy:
+    """A copy of the map that is to be written, and the ids of the newest requests for it."""
+
+    places: PlaceMap
+    ids: tuple[int, ...] = ()
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaceUpdate:
     """Pose in the map after a pair: odom stays smooth, and T_map_odom carries the corrections (REP 105)."""
@@ -166,6 +181,7 @@ class PlaceUpdate:
     keyframes: MapKeyframes | None = None  # the same object while the map stays
     # False: in a saved map or after a gap no place has been recognised yet, so it is unknown where odom lies in the map
     is_known: bool = True
+    copy: MapCopy | None = None  # the newest one that is to be written; the same object until the next one
 
 
 @dataclass(frozen=True, slots=True, eq=False)

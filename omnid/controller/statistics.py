@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
@@ -16,7 +16,7 @@ from omnid.core.control.collision_monitor import remedy
 from omnid.core.control.motion_monitor import ADVICE, COMPARED, DISAGREEMENTS, WITNESSES, Witness
 from omnid.core.control.safety_rules import ENDS, IDLE
 from omnid.core.control.trust import MOTION_DOUBTFUL
-from omnid.engine.flow import nothing
+from omnid.engine.flow import Stream
 from omnid.engine.telemetry import Histogram, StageStats
 
 UNTIL_ARMED: Final = "they stay stopped until cmd/arm (`omnid arm`)"
@@ -112,16 +112,15 @@ class ControllerStatistics:
     def __init__(self, stats: StageStats) -> None:
         """stats: the counters of the tick, among those of the stages; busy from one report to the next."""
         self.state = ControllerState()
-        self.take_arm_answer: Callable[[ArmAnswer], object] = nothing  # called with each new answer
+        self.states: Stream[ControllerState] = Stream("")  # of each tick
         self.to_wheel = Histogram()
         self.lateness = Histogram()
         self._stats = stats
 
     def add(self, tick: TickReport) -> None:
         """Add the report of one tick."""
-        before, self.state = self.state.arm_answer, tick.state
-        if self.state.arm_answer != before:
-            self.take_arm_answer(self.state.arm_answer)
+        self.state = tick.state
+        self.states.push(tick.state)
         self.lateness.add(tick.late_s)
         if math.isfinite(tick.to_wheel_s):
             self.to_wheel.add(tick.to_wheel_s)

@@ -221,13 +221,14 @@ class Graph:
         self._sources.append(_Source(self._add(StageStats(name)), messages, wake, stream))
         return stream
 
-    def inlet(self, depth: int) -> Stream[Any]:
-        """Add a stream for messages of any thread, which never waits; it ends when all sources have ended.
+    def inlet(self, depth: int, thread: str = "") -> Stream[Any]:
+        """Add a stream for messages from outside, which never waits; it ends when all sources have ended.
 
-        depth: number of messages that may wait for each reader; the oldest give way.
+        depth: number of messages that may wait for each reader; the oldest give way. thread: name of the thread that
+        pushes them, whose stages then run there; empty: any.
         """
         self._require_fresh()
-        inlet: Stream[Any] = Stream("", depth)
+        inlet: Stream[Any] = Stream(thread, depth)
         self._inlets.append(inlet)
         return inlet
 

@@ -23,10 +23,11 @@ from drivers.motion import MotionSample
 from drivers.motor import VelocityCommand
 from omnid.config import Config
 from omnid.controller.link import DriveLink
-from omnid.core.control.arming import MANUAL, ArmAnswer
+from omnid.controller.statistics import ControllerState
+from omnid.core.control.arming import MANUAL, NO_ANSWER
 from omnid.core.control.command_sources import PLANNER
 from omnid.core.control.safety_rules import AWAITED, NO_POSE
-from omnid.core.navigation.situation import WheelState
+from omnid.core.navigation.requests import NavigationCommand
 from omnid.core.rig.rig_health import RigHealth
 from omnid.diagnostics.load_ladder import PERIOD_S, LoadLadder
 from omnid.diagnostics.status import (
@@ -52,10 +53,10 @@ from omnid.light.exposure import ExposureControl, UsefulArea
 from omnid.runs.place_maps import MapSaver, RunPlaces
 from omnid.runs.record import open_recorder
 from omnid.runs.rig_checks import RigViews
-from omnid.runs.route_files import RouteFiles
+from omnid.runs.route_files import Requests
 from omnid.runs.session import BUS_POINTS, LOG_POINTS, OPENCV_THREADS, Session, joint_wheels
 from omnid.runs.systemd import Service, StatusLine, TerminalStatus, print_stacks_when_killed
-from omnid.runs.wiring import NavigationParts, Outputs, Parts, wheel_state, wire
+from omnid.runs.wiring import NavigationParts, Outputs, Parts, wire
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
 from omnid.sinks.drive import PlannerDrive, RingToController
 from omnid.sinks.encoder import status_report
@@ -64,7 +65,7 @@ from omnid.stages.geometry import Geometry
 from omnid.stages.obstacles import ADVICE
 from omnid.transport.bus import Bus
 from omnid.transport.codec import DiagnosticStatus, compile_serialisers
-from omnid.transport.commands import CommandReceiver, Freshness, NavigationReceiver, RequestQueue, SensorReceiver
+from omnid.transport.commands import CommandReceiver, Freshness, NavigationReceiver, SensorReceiver
 from omnid.transport.status_names import DISARMED_BY_STOP, with_remedy
 from omnid.transport.topics import (
     ARM,
@@ -72,6 +73,7 @@ from omnid.transport.topics import (
     JOINT_STATES,
     MAP,
     MAP_TOPICS,
+    MOST_OPEN,
     NAVIGATION_TOPICS,
     PUBLISHED,
     SENSOR_TOPICS,
@@ -315,31 +317,30 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
         outputs.rings["controller-ring"] = RingToController(controller)
 
     # 3. The stages, and the navigation with its requests and files.
-    requests = RequestQueue()
-    files = RouteFiles(
-        RouteFolder(Path(config.navigation.routes)),
-        requests.put,
-        halts=lambda: controller.statistics.state.halts if controller else 0,
-    )
+    requests = Requests(graph)
     if rig.height_m(config.obstacles.ring.floor_m) is None:
         warn(
             "the rig states no height of the cameras: the floor is looked for in the images; "
             f"until it is found, map, grid and obstacles call nothing free; {ADVICE}"
         )
-    parts = Parts(map_every_s=config.live.cloud_s)
+    saver = None
+    if config.places.enabled and run_places.is_extended:
+        saver = MapSaver(run_places, config.places.save_s, graph.inlet(MOST_OPEN), bus.answer)
+    parts = Parts(saver=saver, map_every_s=config.live.cloud_s)
     if controller is not None:
+        states = controller.statistics.states = graph.inlet(1, thread="drive")
+        graph.sink("arming", ArmAnswers(session, bus), states, thread=states.thread)
         navigation = None
         if PLANNER in config.controller.sources.names:
-            planner = PlannerDrive(controller, bus.answer, files)
-            wheels = partial(_wheel_state, controller)
-            navigation = NavigationParts(requests, wheels, planner, config.places.map)
+            planner, folder = PlannerDrive(controller, bus.answer), RouteFolder(Path(config.navigation.routes))
+            navigation = NavigationParts(requests, states, folder, planner, config.places.map)
         else:
             warn(NO_PLANNER)
         parts = replace(parts, controller=controller, navigation=navigation)
     frames = robot.sources(graph, motion.add)
     stages = wire(graph, frames, front_end, config, outputs, run_places.known_to(parts))
 
-    # 4. What is done from time to time: shedding of load, files of maps and routes.
+    # 4. What is done from time to time: shedding of load.
     ladder = LoadLadder()
 
     def observe() -> None:
@@ -349,26 +350,21 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
             stages.mapping.is_read = recorder is not None or bus.is_received("cloud")
 
     graph.ticker("load", PERIOD_S, observe)
-    saver = None
-    if stages.places is not None and run_places.is_extended:
-        saver = MapSaver(run_places, stages.places, config.places.save_s, bus.answer)
-        graph.ticker("save", saver.PERIOD_S, saver, thread="files")
-    if controller is not None:
-        graph.ticker("routes", files.PERIOD_S, files, thread="files")
-    if stages.places is not None:
-        files.save_map = stages.places.want_copy
 
     # 5. What comes from the bus: commands, requests, samples.
     samples = _sample_receiver(config, motion.add, clock, controller, report, with_images=robot.brings_samples)
     clocks = (RobotClock(), clock) if robot.waits else (clock,)
     freshness = Freshness(config.controller.deadlines.command_s, *clocks)
     bus.serve(TIME, freshness.own_time)
-    received = NavigationReceiver(files.put, freshness, report=warn)
+
+    def ask(command: NavigationCommand) -> None:
+        requests.put(command._replace(halts=controller.statistics.state.halts if controller else 0))
+
+    received = NavigationReceiver(ask, freshness, report=warn)
     commands = None
     if controller is not None:
         sources = config.controller.sources.names
         commands = CommandReceiver(controller, freshness, sources=sources, is_unique=lambda: bus.is_unique, report=warn)
-        controller.statistics.take_arm_answer = partial(_answer_arm, session, bus, controller)
     _subscribe(config, bus, controller, commands, received, samples, saver)
 
     # 6. The status of all of them.
@@ -410,10 +406,6 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
     line = StatusLine(session.statistics, graph.telemetry)
     service = Service(graph.telemetry, line, config.service.stall_timeout_s)
     graph.ticker("watchdog", service.period_s, service)
-
-
-def _wheel_state(controller: DriveLink) -> WheelState:
-    return wheel_state(controller.statistics.state)
 
 
 def _sample_receiver(
@@ -476,17 +468,27 @@ def _subscribe(
     bus.subscribe_commands(receive, topics, is_stopped)
 
 
-def _answer_arm(session: Session, bus: Bus, controller: DriveLink, answer: ArmAnswer) -> None:
-    """Pass on the controller's answer; of several requests at once it answers the newest."""
-    text = answer.refusal or "armed: it obeys commands from now on"
-    if answer.refusal == AWAITED:
-        text = f"{AWAITED}: {controller.statistics.state.problem}"
-    if answer.refusal == NO_POSE:
-        if session.graph.telemetry.of("pair").processed:
-            text += ": the first images are being processed: try again in a moment (`omnid listen` shows the state)"
-        else:
-            text += ": no images have come from the cameras (`omnid listen`, `omnid doctor`)"
-    bus.answer(answer.id, Answer(not answer.refusal, text), also_before=ARM)
+class ArmAnswers:
+    """A sink of the controller's states that gives its answers; of several requests at once it answers the newest."""
+
+    def __init__(self, session: Session, bus: Bus) -> None:
+        self._session, self._bus, self._given = session, bus, NO_ANSWER
+
+    def process(self, state: ControllerState) -> None:
+        """Give the answer of a state, if it is a new one."""
+        answer, before = state.arm_answer, self._given
+        self._given = answer
+        if answer == before:
+            return
+        text = answer.refusal or "armed: it obeys commands from now on"
+        if answer.refusal == AWAITED:
+            text = f"{AWAITED}: {state.problem}"
+        if answer.refusal == NO_POSE:
+            if self._session.graph.telemetry.of("pair").processed:
+                text += ": the first images are being processed: try again in a moment (`omnid listen` shows the state)"
+            else:
+                text += ": no images have come from the cameras (`omnid listen`, `omnid doctor`)"
+        self._bus.answer(answer.id, Answer(not answer.refusal, text), also_before=ARM)
 
 
 def _ready(config: Config) -> str:

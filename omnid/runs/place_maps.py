@@ -1,9 +1,8 @@
-"""Maps of places of a run: read at its start, saved now and then by a thread, and at its end."""
+"""Maps of places of a run: read at its start, saved now and then, and at its end."""
 
 from __future__ import annotations
 
 import hashlib
-from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -16,15 +15,16 @@ from calib.rig import MountedCamera
 from calib.rig_file import rig_toml
 from omnid.config import Config, PlacesConfig
 from omnid.core.places.place_map import PlaceMap, PlaceRig
+from omnid.engine.flow import Stream
 from omnid.errors import OmnidError
 from omnid.formats.place_file import read_places, write_places
+from omnid.messages import MapCopy, PlaceUpdate, SaveMap
 from omnid.runs.wiring import Parts
 from omnid.sinks.files import check_outputs
 from omnid.stages.geometry import Geometry
-from omnid.stages.places import Places
 from omnid.transport.codec import ERROR, OK, DiagnosticStatus, string_from_cdr
 from omnid.transport.status_names import MAP_FILE, Key
-from omnid.transport.topics import MOST_OPEN, SAVE_MAP, Answer, Request
+from omnid.transport.topics import SAVE_MAP, Answer, Request
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -189,44 +189,37 @@ _LONGEST_REQUEST: Final = 64  # bytes
 
 
 class MapSaver:
-    """Saves the map of a live run now and then, so that a robot that is switched off loses little of it.
+    """A sink that writes the copies of the map that come with poses, and answers the requests for them.
 
-    A ticker calls it each PERIOD_S in a thread of its own: the stage copies the map after a pose, some 0.2 ms for 1,000
-    keyframes, and this thread writes the copy and answers the requests.
+    So a robot that is switched off loses little of its map. Copying 1,000 keyframes takes the stage some 0.2 ms.
     """
 
-    PERIOD_S: Final = 1.0
-
     def __init__(
-        self, run_places: RunPlaces, places: Places, every_s: float, answer: Callable[[int, Answer], object]
+        self, run_places: RunPlaces, every_s: float, requests: Stream[SaveMap], answer: Callable[[int, Answer], object]
     ) -> None:
-        """answer: takes the id of a request."""
-        self._run_places, self._places, self._answer = run_places, places, answer
-        self._every, self._ticks = max(1, round(every_s / self.PERIOD_S)), 0
-        self._asked: deque[int] = deque(maxlen=MOST_OPEN)  # ids of requests of which the copy was not asked for
-        self._waiting: deque[int] = deque(maxlen=MOST_OPEN)  # ids of requests for the copy that comes
+        """every_s: between two copies. requests: takes those of the bus. answer: takes the id of a request; a second
+        call for it does nothing.
+        """
+        self.every_s, self.requests = every_s, requests
+        self._run_places, self._answer = run_places, answer
+        self._seen: MapCopy | None = None
         self._saves = self._failed = self._refused = 0
         self._error = ""  # of the last save; empty: it succeeded
 
-    def __call__(self) -> None:
-        """Write the copy of the map that has come; ask for the next one when it is due or requested."""
-        copy = self._places.take_copy()
-        if copy is not None:
-            answer = self._save(copy)
-            for id in self._waiting:
+    def process(self, update: PlaceUpdate) -> None:
+        """Write the copy of the map, if it is a new one."""
+        copy = update.copy
+        if copy is not None and copy is not self._seen:
+            self._seen = copy
+            answer = self._save(copy.places)
+            for id in copy.ids:
                 self._answer(id, answer)
-            self._waiting.clear()
-        self._ticks += 1
-        if self._ticks >= self._every or self._asked:
-            self._ticks = 0
-            self._waiting.extend(self._asked.popleft() for _ in range(len(self._asked)))
-            self._places.want_copy()
 
     def receive(self, request: Request) -> Answer | None:
         """Take a request from the bus, a String "save", from any thread; return the refusal of any other."""
         with suppress(OmnidError):
             if string_from_cdr(request.payload[:_LONGEST_REQUEST]) == SAVE_MAP:
-                self._asked.append(request.id)
+                self.requests.push(SaveMap(request.id))
                 return None
         self._refused += 1
         return Answer(False, f'a String "{SAVE_MAP}" was expected')

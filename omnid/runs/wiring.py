@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
@@ -12,12 +12,12 @@ from drivers.motor import VelocityCommand
 from omnid.config import Config
 from omnid.controller.link import DriveLink
 from omnid.controller.statistics import ControllerState
-from omnid.core.navigation.requests import NavigationCommand
 from omnid.core.navigation.situation import WheelState
 from omnid.core.places.place_map import PlaceMap
-from omnid.engine.flow import nothing
 from omnid.engine.graph import NEWEST, Graph, Sink, Stream
-from omnid.messages import FramePair, MapUpdate, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
+from omnid.formats.route_file import RouteFolder
+from omnid.messages import FramePair, MapUpdate, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate, SaveMap
+from omnid.runs.route_files import Requests, RouteFiles, TaughtRoutes
 from omnid.sinks.drive import LiveDrive
 from omnid.sinks.encoder import Outgoing
 from omnid.stages.front_end import FrontEnd, Keyframes
@@ -28,7 +28,12 @@ from omnid.stages.obstacles import CameraFloor, Obstacles
 from omnid.stages.places import Places
 from omnid.stages.routes import RouteMap, Routes
 
-BUS, BUS_OF_MAPS, BACKGROUND = "bus", "bus-maps", "background"  # threads that several stages and sinks share
+BUS, BUS_OF_MAPS, FILES, BACKGROUND = (
+    "bus",
+    "bus-maps",
+    "files",
+    "background",
+)  # threads that several stages and sinks share
 RECORDED_DEPTH = 20  # messages of each kind that may wait for the disk of a live recording
 
 
@@ -53,23 +58,24 @@ class Outputs:
         return self.bus is not None or self.recorder is not None
 
 
-class RequestSource(Protocol):
-    """Requests to the navigation; `end` ends `batches`."""
-
-    def batches(self) -> Iterator[Iterable[NavigationCommand]]:
-        """Yield requests."""
-
-    def end(self) -> None:
-        """End `batches`; from any thread."""
-
-
 class NavigationParts(NamedTuple):
     """The surroundings of the navigation of a run with wheels."""
 
-    requests: RequestSource
-    wheels: Callable[[], WheelState]
+    requests: Requests
+    states: Stream[ControllerState]  # of the controller; an inlet of the thread that gives the commands
+    routes: RouteFolder
     drive: Sink[NavigationUpdate]
     map_name: str  # of the file of the map; empty: it is not saved
+
+
+class Saver(Protocol):
+    """A sink of poses in the map that writes the copies of the map that they carry."""
+
+    every_s: float  # between two copies
+    requests: Stream[SaveMap]
+
+    def process(self, update: PlaceUpdate, /) -> None:
+        """Write the copy, if there is a new one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +86,7 @@ class Parts:
     localize_only: bool = False  # the known map stays as it is
     controller: DriveLink | None = None  # that drives; None: the law in lock-step gives the commands
     navigation: NavigationParts | None = None
+    saver: Saver | None = None  # of the known map
     map_every_s: float = 0.0  # between two maps; 0: one, at the end
 
 
@@ -95,6 +102,18 @@ def wheel_state(state: ControllerState) -> WheelState:
         state.halts,
         state.halted_by,
     )
+
+
+class WheelStates:
+    """A stage that gives the part of the controller's state that the navigation needs, where it has changed."""
+
+    def __init__(self) -> None:
+        self._given: WheelState | None = None
+
+    def process(self, state: ControllerState) -> WheelState | None:
+        """Return the state of the wheels; None where it is as before."""
+        before, self._given = self._given, wheel_state(state)
+        return None if self._given == before else self._given
 
 
 class WiredStages(NamedTuple):
@@ -129,7 +148,7 @@ def wire(
     parts, geometry = parts or Parts(), front_end.geometry
     T_base_rig = geometry.rig.T_base_rig
     mapping, places, obstacles = None, None, None
-    maps, in_map, grids, rings, ways = None, None, None, None, None
+    maps, in_map, grids, rings, written, ways = None, None, None, None, None, None
 
     # 1. Images give pairs, pairs give panoramas, and these give poses.
     pairs = graph.stage("pair", front_end.pairing, *frames)
@@ -138,21 +157,38 @@ def wire(
 
     # 2. Poses go to the controller, which waits for no stage.
     if parts.controller is not None:
-        ended = nothing if parts.navigation is None else parts.navigation.requests.end
-        graph.sink("controller", LiveDrive(parts.controller, T_base_rig, ended), poses, thread=poses.thread)
+        graph.sink("controller", LiveDrive(parts.controller, T_base_rig), poses, thread=poses.thread)
         commands = graph.source("drive", parts.controller.commands, wake=parts.controller.end)
     else:
         law = LockstepDrive(config.controller, 1.0 / config.motor.rate_hz, T_base_rig)
         commands = graph.stage("drive", law, poses, thread=poses.thread)
 
-    # 3. They give the map, the pose in it, and the obstacles, where these are consumed.
+    # 3. Requests about routes pass through the thread of the files.
+    if parts.navigation is not None:
+        files = RouteFiles(parts.navigation.routes)
+        written = graph.stage("routes", files, parts.navigation.requests.of_routes, thread=FILES)
+
+    # 4. Poses give the map, the pose in it, and the obstacles, where these are consumed.
     if outputs.maps or outputs.take_all:
         mapping = Mapping(config.mapping, front_end.dense, parts.map_every_s)
         maps = graph.stage("mapping", mapping, poses, thread=BACKGROUND)
     needs_places = outputs.places or outputs.take_all or parts.navigation or parts.known_places is not None
     if config.places.enabled and needs_places:
-        places = Places(geometry, config, front_end.dense, parts.known_places, localize_only=parts.localize_only)
-        in_map = graph.stage("places", places, poses)
+        saver = parts.saver
+        places = Places(
+            geometry,
+            config,
+            front_end.dense,
+            parts.known_places,
+            localize_only=parts.localize_only,
+            copy_s=0.0 if saver is None else saver.every_s,
+        )
+        asked: list[Stream[Any]] = [
+            stream for stream in (written, None if saver is None else saver.requests) if stream is not None
+        ]
+        in_map = graph.stage("places", places, poses, *asked)
+        if saver is not None:
+            graph.sink("save", saver, in_map, thread=FILES)
     if in_map is not None and outputs.take_all:
         grid = MapGrid(config.mapping.voxel_m, T_base_rig @ geometry.T_rig_rect, parts.map_every_s)
         grids = graph.stage("grid", grid, in_map, thread=BACKGROUND)
@@ -160,20 +196,18 @@ def wire(
         obstacles = Obstacles(geometry, config.obstacles, front_end.dense)
         rings = graph.stage("obstacles", obstacles, poses)
 
-    # 4. All of them, and requests, give the way to drive.
-    if parts.navigation is not None:
-        requests, wheels, drive, map_name = parts.navigation
+    # 5. All of them, and requests, give the way to drive.
+    if parts.navigation is not None and written is not None:
+        requests, states, _, drive, map_name = parts.navigation
         is_new = parts.known_places is None or not parts.known_places.keyframes
         route_map = RouteMap(map_name, T_base_rig, geometry.T_rig_rect, is_new=is_new) if places else None
-        navigation = NavigationStage(
-            config.navigation, config.controller.collision, T_base_rig, wheels, Routes(route_map)
-        )
-        asked = graph.source("requests", requests.batches, wake=requests.end)
-        seen: list[Stream[Any]] = [poses, *(stream for stream in (in_map, rings) if stream is not None), asked]
-        ways = graph.stage("navigation", navigation, *seen)
+        navigation = NavigationStage(config.navigation, config.controller.collision, T_base_rig, Routes(route_map))
+        wheels = graph.stage("wheel-states", WheelStates(), states, thread=states.thread)
+        seen: list[Stream[Any]] = [stream for stream in (poses, in_map, rings) if stream is not None]
+        ways = graph.stage("navigation", navigation, *seen, wheels, requests.direct, written)
         graph.sink("planner", drive, ways, thread=ways.thread)
 
-    # 5. What is made leaves the run.
+    # 6. What is made leaves the run.
     for name, counter in outputs.counters.items():
         graph.sink(name, counter, poses, thread=poses.thread)
     for name, to_wheels in outputs.rings.items():
@@ -209,6 +243,9 @@ def wire(
         for name, stream, thread in outgoing:
             graph.sink(name, outputs.bus, stream, policy=NEWEST, thread=thread)
 
-    # 6. The keyframe of a pair is made when its pose has been passed on: this reader of poses is the last one.
+    if parts.navigation is not None and ways is not None:
+        graph.sink("taught", TaughtRoutes(parts.navigation.requests), ways, thread=ways.thread)
+
+    # 7. The keyframe of a pair is made when its pose has been passed on: this reader of poses is the last one.
     graph.sink("keyframes", Keyframes(front_end.odometry), poses, thread=poses.thread)
     return WiredStages(front_end, mapping, places, obstacles)

@@ -26,15 +26,14 @@ from omnid.core.control.command_sources import PLANNER, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.frames import of_base
 from omnid.core.navigation.requests import NavigationCommand, NavigationRequest
-from omnid.core.navigation.situation import WheelState
 from omnid.engine.flow import nothing
 from omnid.engine.graph import Graph
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
 from omnid.runs.place_maps import RunPlaces
-from omnid.runs.route_files import RouteFiles
-from omnid.runs.wiring import NavigationParts, Outputs, Parts, WiredStages, wheel_state, wire
+from omnid.runs.route_files import Requests
+from omnid.runs.wiring import NavigationParts, Outputs, Parts, WiredStages, wire
 from omnid.simulation.robot import SimulatedRobot, with_masks
 from omnid.simulation.vehicle import Fault, Tick, Vehicle
 from omnid.simulation.world import World
@@ -43,28 +42,6 @@ from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry
 from omnid.stages.lockstep_drive import controller_pose
 from omnid.stages.obstacles import controller_ring
-
-
-class LockstepRequests:
-    """Requests to the navigation, as a source that never waits: each turn yields the requests since the last one."""
-
-    def __init__(self) -> None:
-        self._waiting: list[NavigationCommand] = []
-        self._ended = False
-
-    def put(self, command: NavigationCommand) -> None:
-        """Add a request."""
-        self._waiting.append(command)
-
-    def end(self) -> None:
-        """End `batches`."""
-        self._ended = True
-
-    def batches(self) -> Iterator[list[NavigationCommand]]:
-        """Yield the requests of each turn, mostly none."""
-        while not self._ended:
-            taken, self._waiting = self._waiting, []
-            yield taken
 
 
 class _Into:
@@ -222,8 +199,8 @@ class _Lockstep:
             faults=faults,
         )
         self._delay_ns = round(robot.pose_delay_s * 1e9)
-        self._requests = LockstepRequests()
-        self._files = RouteFiles(RouteFolder(Path(config.navigation.routes)), self._requests.put)
+        self._graph = Graph(threaded=False)
+        self._requests, self._states = Requests(self._graph), self._graph.inlet(1)
         self._ends = False
         self._truth: dict[int, Array] = {}  # T_world_base by the stamp of a pair [ns]
         self._odometry: OdometryUpdate | None = None
@@ -232,11 +209,12 @@ class _Lockstep:
     def run(self, seconds: float) -> SimulatedRun:
         """Drive; return the run."""
         # The stages of the daemon, between the simulated cameras and the lists of results.
-        config, graph = self._config, Graph(threaded=False)
+        config, graph, routes = self._config, self._graph, RouteFolder(Path(self._config.navigation.routes))
         frames = graph.source("cameras", lambda: self._messages(seconds))
         shape = geometry(self._rig, config.panorama)
         run_places = RunPlaces(config, shape, nothing)
-        navigation = NavigationParts(self._requests, self._wheels, _Into(self._take_navigation), config.places.map)
+        drive = _Into(self._take_navigation)
+        navigation = NavigationParts(self._requests, self._states, routes, drive, config.places.map)
         outputs = Outputs(
             poses={"poses": _Into(self._take_pose)},
             rings={"rings": _Into(self._take_ring)},
@@ -267,7 +245,6 @@ class _Lockstep:
             yield from samples
             yield from (frame if self._tamper is None else self._tamper(vehicle.time_s, frame) for frame in frames)
         vehicle.come_to_rest()
-        self._requests.end()
 
     def _send(self) -> None:
         """Send what the drive asks for now."""
@@ -292,11 +269,10 @@ class _Lockstep:
             elif request == "end":
                 self._ends = True
             else:
-                self._files.put(NavigationCommand(request, arrival_ns, arrival_ns))
-        self._files()
-
-    def _wheels(self) -> WheelState:
-        return wheel_state(self._vehicle.controller.state)
+                state = vehicle.controller.state
+                self._states.push(state)
+                self._requests.put(NavigationCommand(request, arrival_ns, arrival_ns, halts=state.halts))
+        self._states.push(vehicle.controller.state)
 
     def _take_pose(self, odometry: OdometryUpdate) -> None:
         T_base_rig, stamp_ns = self._rig.T_base_rig, odometry.stamp_ns
@@ -312,7 +288,6 @@ class _Lockstep:
 
     def _take_navigation(self, update: NavigationUpdate) -> None:
         self._run.navigation.append(update)
-        self._files.process(update)
         if update.setpoint is not None:
             due_ns = self._vehicle.now_ns + self._delay_ns
             self._vehicle.post(TimedSetpoint(due_ns, update.setpoint, PLANNER, NAVIGATION_SENDER), due_ns)

@@ -19,7 +19,6 @@ from omnid.controller.motor_settings import MotorSettings
 from omnid.core.control.command_sources import PLANNER, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.nanoseconds import S_PER_NS
-from omnid.engine.flow import Sink, nothing
 from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate
 from omnid.navigation_state import NavigationState
 from omnid.stages.lockstep_drive import controller_pose
@@ -42,9 +41,8 @@ FAILED_S: Final = 3.0  # a motor controller that has failed for this time ends a
 class LiveDrive:
     """Pass the poses of `omnid run` on; setpoints come from the network."""
 
-    def __init__(self, link: DriveLink, T_base_rig: NDArray[np.float64], ended: Callable[[], object] = nothing) -> None:
-        """ended: called after the last pose."""
-        self._link, self._T_base_rig, self._ended = link, T_base_rig, ended
+    def __init__(self, link: DriveLink, T_base_rig: NDArray[np.float64]) -> None:
+        self._link, self._T_base_rig = link, T_base_rig
 
     def process(self, odometry: OdometryUpdate) -> None:
         """Send a pose."""
@@ -53,21 +51,19 @@ class LiveDrive:
     def finish(self) -> None:
         """Have the wheels slow down to a stop: there will be no more poses."""
         self._link.end()
-        self._ended()
 
 
 class PlannerDrive:
-    """Pass on the setpoints of the navigation, which a source of higher priority keeps out, its answers and routes."""
+    """Pass on the setpoints of the navigation, which a source of higher priority keeps out, and its answers."""
 
-    def __init__(self, link: DriveLink, answer: Callable[[int, Answer], object], files: Sink[NavigationUpdate]) -> None:
-        """answer: takes the id of a request; a second call for it does nothing. Neither it nor the files wait."""
-        self._link, self._answer, self._files = link, answer, files
+    def __init__(self, link: DriveLink, answer: Callable[[int, Answer], object]) -> None:
+        """answer: takes the id of a request and never waits; a second call for an id does nothing."""
+        self._link, self._answer = link, answer
 
     def process(self, update: NavigationUpdate) -> None:
-        """Send a setpoint, if there is one, the answers, and a route that is to be written."""
+        """Send a setpoint, if there is one, and the answers."""
         if update.setpoint is not None:
             self._link.send(TimedSetpoint(time.monotonic_ns(), update.setpoint, PLANNER, NAVIGATION_SENDER))
-        self._files.process(update)
         for answer in update.answers:
             words = answer.refusal or granted_words(answer.request, update.state, update.reason)
             self._answer(answer.id, Answer(not answer.refusal, words))

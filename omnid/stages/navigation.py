@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterable
 from typing import TypeAlias
 
 import numpy as np
@@ -41,9 +40,7 @@ from omnid.messages import NavigationPlan, NavigationUpdate, ObstacleRing, Odome
 from omnid.stages.routes import KeyframeTie, Routes, refusal_while_teaching
 
 Array = NDArray[np.float64]
-NavigationInput: TypeAlias = (
-    OdometryUpdate | PlaceUpdate | ObstacleRing | NavigationCommand | Iterable[NavigationCommand]
-)
+NavigationInput: TypeAlias = OdometryUpdate | PlaceUpdate | ObstacleRing | WheelState | NavigationCommand
 
 REPEAT_NS = 1_000_000_000  # the state is given again after that time, while nothing changes
 # Ends of the seen floor nearer than this are obstacles to a base that was stopped by one; at farther ones the floor is
@@ -51,6 +48,7 @@ REPEAT_NS = 1_000_000_000  # the state is given again after that time, while not
 UNKNOWN_M = 1.2
 RING_NS = 2_000_000_000  # older rings show nothing of now: the collision monitor then stops the base
 MOST_ANSWERS = 64  # An update repeats as many answers as requests may wait: a sink may miss updates.
+OVERTAKEN = "a later request has ended it: ask again"
 FIRST_LEG_M = 1.0  # A path that begins farther from the robot is refused.
 
 
@@ -62,15 +60,12 @@ class NavigationStage:
         settings: NavigationSettings,
         collision: CollisionSettings,
         T_base_rig: Array,
-        wheels: Callable[[], WheelState],
         routes: Routes,
     ) -> None:
-        """collision: the outline of the base.
-
-        wheels: returns the controller's state; called at each pose and request."""
+        """collision: the outline of the base."""
         self._settings, self._T_base_rig, self._routes = settings, T_base_rig, routes
         self._T_rig_base = se3.inverse(T_base_rig)
-        self._wheels = wheels
+        self._wheels = WheelState(False, False)
         self._navigator = Navigator(settings, collision)
         self._outline = Outline(collision.front_m, collision.rear_m, collision.half_width_m)
         self._stop_m = collision.stop_m
@@ -82,7 +77,9 @@ class NavigationStage:
         self._ring_points: Array = NOWHERE  # (N, 2) positions in odom of what the ring shows
         self._unknown: Array = NOWHERE  # (N, 2) the same of near ends of the floor that it shows
         self._seq = 0
-        self._halted = 0  # id of the newest request to halt: those from before it that come later begin nothing
+        # Ids of the newest request to halt, and of that which began the newest drive: a request that waited for a file
+        # may come after later ones.
+        self._halted = self._begun = 0
         self._answers: deque[RequestAnswer] = deque(maxlen=MOST_ANSWERS)
         self._plan: NavigationPlan | None = None  # plan that is not yet part of a message
         self._given: tuple[object, ...] = ()  # the state that was given last
@@ -100,12 +97,11 @@ class NavigationStage:
                 self._ring, self._ring_points = message, _positions(message, message.ranges_m)
                 self._unknown = _positions(message, self._near_ends(message))
                 return None
+            case WheelState():
+                self._wheels = message
+                return None
             case NavigationCommand():
                 return self._request(message)
-        update = None
-        for command in message:
-            update = self._request(command)
-        return update
 
     def _at_pose(self, odometry: OdometryUpdate) -> NavigationUpdate | None:
         # 1. After a reset forget the pose in the map: it leads from another odom.
@@ -128,7 +124,7 @@ class NavigationStage:
             float(velocity[5]),
             odometry.state,
             odometry.reset_counter,
-            self._wheels(),
+            self._wheels,
             self._in_map,
             obstacles,
             moving,
@@ -190,11 +186,15 @@ class NavigationStage:
         if is_halt(request):
             self._halted = max(self._halted, command.id)
         elif 0 < command.id < self._halted and not isinstance(request, TaughtRoute):
-            raise OmnidError("a later request has ended it: ask again")
+            raise OmnidError(OVERTAKEN)
         elif not isinstance(request, RouteRequest | TaughtRoute):
             _raise_if(command.refusal)
         if may_begin_motion(request):
             _raise_if(command.void)
+            if command.halts < self._wheels.halts:
+                raise OmnidError("a stop or a fault has come since: ask again")
+            if 0 < command.id < self._begun:
+                raise OmnidError(OVERTAKEN)
         match request:
             case NavigationVerb.CANCEL:
                 navigator.cancel("by a request")
@@ -236,6 +236,7 @@ class NavigationStage:
     def _start(self, task: str, frame: NavigationFrame, paths: list[DrivePath], command: NavigationCommand) -> None:
         self._require_ready(frame)
         self._navigator.start(task, frame, paths, self._situation(), command.stamp_ns)
+        self._begun = max(self._begun, command.id)
         xy = np.vstack([leg.xy for leg in paths[0].legs])
         self._plan = NavigationPlan(frame, xy, paths[0].final_heading_rad)
 
@@ -267,7 +268,7 @@ class NavigationStage:
     def _situation(self) -> Situation:
         if self._now is None:
             raise OmnidError(refusal_to_drive(None, NavigationFrame.ODOM, 0.0))
-        return self._now._replace(in_map=self._in_map, wheels=self._wheels())
+        return self._now._replace(in_map=self._in_map, wheels=self._wheels)
 
     def _update(self, now: Navigation, *, always: bool = False) -> NavigationUpdate | None:
         navigator, routes, answers = self._navigator, self._routes, tuple(self._answers)

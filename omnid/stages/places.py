@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Sequence
 from typing import Final
 
@@ -20,12 +21,22 @@ from omnid.core.mapping.range_scan import (
     point_scan,
     seen_from,
 )
+from omnid.core.navigation.requests import NavigationCommand, TaughtRoute
 from omnid.core.obstacles.settings import RingSettings
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.localisation import MapLocaliser, OdometryFrame
 from omnid.core.places.place_map import PlaceMap
 from omnid.load_level import LoadLevel
-from omnid.messages import DensePoints, MapKeyframes, ObstacleRing, OdometryUpdate, PlaceUpdate, StereoDepth
+from omnid.messages import (
+    DensePoints,
+    MapCopy,
+    MapKeyframes,
+    ObstacleRing,
+    OdometryUpdate,
+    PlaceUpdate,
+    SaveMap,
+    StereoDepth,
+)
 from omnid.stages.dense_depths import DenseDepths
 from omnid.stages.geometry import Geometry
 from omnid.stages.obstacles import CameraFloor, PairRings
@@ -36,13 +47,13 @@ Array = NDArray[np.float64]
 
 # Time between two counts, which take 1 ms for 1,000 keyframes; the status comes no oftener.
 COUNTED_NS: Final = 1_000_000_000
+MOST_ASKED: Final = 64  # ids of requests that a copy repeats: a sink may miss updates
 
 
 class Places:
     """Localise the poses of odometry in a map of places, which grows with them.
 
-    The map belongs to the thread of this stage until the run ends. It leaves it by copies: those of `take_copy`, and
-    what updates carry.
+    The map belongs to the thread of this stage until the run ends. It leaves it by the copies that updates carry.
     """
 
     def __init__(
@@ -53,9 +64,10 @@ class Places:
         places: PlaceMap | None = None,
         *,
         localize_only: bool = False,
+        copy_s: float = 0.0,
     ) -> None:
         """dense: computes the depth of keyframes. places: a map to be extended, None: a new one. localize_only: the map
-        stays as it is.
+        stays as it is. copy_s: time between two copies of the map that are to be written, by the stamps; 0: none.
 
         Nothing is recognised or kept from LoadLevel.NO_MAP on.
         """
@@ -73,30 +85,40 @@ class Places:
         self.counts = self._localiser.counts  # sizes and counters of the map; each second, and at the end
         self._counted_ns = 0
         self._keyframes: tuple[object, MapKeyframes] | None = None  # what they depend on, and they
+        self._copy_ns, self._copied_ns = round(copy_s * 1e9), 0
         self._copy_wanted = False
-        self._copy: PlaceMap | None = None
-
-    def want_copy(self) -> None:
-        """Ask for a copy of the map after the next pose; any thread may ask."""
-        self._copy_wanted = True
-
-    def take_copy(self) -> PlaceMap | None:
-        """Return the copy that was asked for, once; None while there is none. Its keyframes are those of the map."""
-        copy, self._copy = self._copy, None
-        return copy
+        self._copy: MapCopy | None = None
+        self._asked: deque[int] = deque(maxlen=MOST_ASKED)  # ids of requests for a copy
 
     def map(self) -> PlaceMap:
         """Return the places whose poses are known relative to the first one: what can be saved."""
         return self._localiser.map()
 
-    def process(self, odometry: OdometryUpdate) -> PlaceUpdate:
-        """Return the pose in the map at a pair."""
+    def process(self, message: OdometryUpdate | SaveMap | NavigationCommand) -> PlaceUpdate | None:
+        """Return the pose in the map at a pair.
+
+        Requests to write the map, and routes that were written, for which the map must be, have it copied then.
+        """
+        match message:
+            case SaveMap():
+                self._copy_wanted = True
+                self._asked.append(message.id)
+                return None
+            case NavigationCommand():
+                self._copy_wanted |= isinstance(message.request, TaughtRoute) and not message.refusal
+                return None
+        return self._localised(message)
+
+    def _localised(self, odometry: OdometryUpdate) -> PlaceUpdate:
         # 1. The pose in the map.
         pose = self._localiser.process(self._frame(odometry), idle=odometry.load >= LoadLevel.NO_MAP)
         self.state = pose.state
         # 2. Copies for other threads, which never read the map itself.
-        if self._copy_wanted:
-            self._copy_wanted, self._copy = False, self._localiser.places.part(self._localiser.places.keyframes)
+        self._copied_ns = self._copied_ns or odometry.stamp_ns
+        if self._copy_wanted or (self._copy_ns and odometry.stamp_ns - self._copied_ns >= self._copy_ns):
+            self._copy_wanted, self._copied_ns = False, odometry.stamp_ns
+            places = self._localiser.places
+            self._copy = MapCopy(places.part(places.keyframes), tuple(self._asked))
         if odometry.stamp_ns >= self._counted_ns + COUNTED_NS:
             self._counted_ns, self.counts = odometry.stamp_ns, self._localiser.counts
         # 3. The message, in the frame of the rig.
@@ -117,6 +139,7 @@ class Places:
             scans,
             self._copied_keyframes(scans),
             pose.is_known,
+            self._copy,
         )
 
     def finish(self) -> list[PlaceUpdate]:

@@ -34,10 +34,9 @@ import math
 import re
 import secrets
 import time
-from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence
 from functools import partial
-from queue import SimpleQueue
 from typing import Final, Protocol
 
 from drivers.logs.ros_messages import JointWheels
@@ -67,7 +66,7 @@ from omnid.transport import codec, topics
 from omnid.transport.codec import OK, DiagnosticStatus
 from omnid.transport.sensor_codec import sample_from_cdr
 from omnid.transport.status_names import REFUSED_PREFIX, REQUESTS
-from omnid.transport.topics import MOST_OPEN, Answer, Request
+from omnid.transport.topics import Answer, Request
 
 LONGEST_PAYLOAD, LONGEST_PATH = 4096, 1 << 20  # bytes
 # Larger numbers are faults of the sender.
@@ -344,7 +343,9 @@ class NavigationReceiver:
                 self._report(f"a request on {message.topic} is refused: {error}")
             return Answer(False, str(error))
         self.accepted += 1
-        self._target(NavigationCommand(request, time.time_ns(), stamp_ns or message.sent_ns, message.id))
+        asked_ns = time.monotonic_ns()
+        stamp_ns = stamp_ns or message.sent_ns
+        self._target(NavigationCommand(request, time.time_ns(), stamp_ns, message.id, asked_ns=asked_ns))
         return None
 
 
@@ -376,35 +377,6 @@ def _frame(name: str) -> NavigationFrame:
 def _check_near(*positions_m: float) -> None:
     if not all(abs(value) <= FARTHEST_M for value in positions_m):
         raise OmnidError(f"a position beyond {FARTHEST_M:g} m: check the sender")
-
-
-class RequestQueue:
-    """Requests from threads of the bus to the graph: a source that loses none but the oldest of too many."""
-
-    def __init__(self) -> None:
-        self._waiting: deque[NavigationCommand] = deque(maxlen=MOST_OPEN)
-        self._wake: SimpleQueue[bool] = SimpleQueue()  # True: there is a request; False: the end
-
-    def put(self, command: NavigationCommand) -> None:
-        """Add a request; from any thread."""
-        self._waiting.append(command)
-        self._wake.put(True)
-
-    def end(self) -> None:
-        """End `batches`; from any thread."""
-        self._wake.put(False)
-
-    def batches(self) -> Iterator[Iterable[NavigationCommand]]:
-        """Yield for each request all that wait; taking them removes them.
-
-        An inbox may drop a batch: the next one has its requests.
-        """
-        while self._wake.get():
-            yield self._taken()
-
-    def _taken(self) -> Iterator[NavigationCommand]:
-        while self._waiting:
-            yield self._waiting.popleft()
 
 
 # Samples of wheels and gyro.

@@ -97,6 +97,8 @@ class NavigationCommand(NamedTuple):
     id: int = 0  # id of the request; the answer has the same
     refusal: str = ""  # why it is refused already, as by a file that is missing
     void: str = ""  # why it may begin no motion any more; empty: it may
+    halts: int = 0  # stops and faults that had made cmd/arm necessary before it: it begins no motion after a later one
+    asked_ns: int = 0  # arrival by CLOCK_MONOTONIC; 0: it may wait for its file as long as that takes
 
 
 def may_begin_motion(request: NavigationRequest) -> bool:

@@ -1,8 +1,7 @@
-"""Files of routes and the stage: nothing waits for a disk, halts overtake, and a full disk loses no recording."""
+"""Files of routes and the navigation: nothing waits for a disk, halts overtake, and a full disk loses no recording."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,25 +16,37 @@ from omnid.core.navigation.requests import (
     RouteAction,
     RouteRequest,
 )
-from omnid.core.navigation.route import Route
+from omnid.core.navigation.situation import WheelState
+from omnid.engine.graph import Graph
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import NavigationUpdate
 from omnid.navigation_state import NavigationState
-from omnid.runs import route_files
-from omnid.runs.route_files import RouteFiles
-from omnid.transport.topics import MOST_OPEN
+from omnid.runs.route_files import Requests, RouteFiles, TaughtRoutes
 from tests.omnid.stages.test_navigation import Robot
 
 TEACH, FINISH = RouteRequest(RouteAction.TEACH, "hall"), RouteRequest(RouteAction.FINISH)
 REPEAT = RouteRequest(RouteAction.REPEAT, "hall")
 
 
+class Queue:
+    """A sink that keeps what waits for a thread."""
+
+    def __init__(self) -> None:
+        self.waiting: list[NavigationCommand] = []
+
+    def process(self, command: NavigationCommand) -> None:
+        self.waiting.append(command)
+
+
 class Site:
-    """A robot whose route is being taught; messages go from files to stage and back when the test says so."""
+    """A robot whose route is being taught; requests wait for the files, or for the stage, until the test says so."""
 
     def __init__(self, folder: Path) -> None:
-        self.robot = Robot(folder)
-        self.files, self.asked, self.id = self.robot.files, self.robot.asked, 0
+        graph = Graph(threaded=False)
+        self.robot, self.requests, self.id = Robot(folder), Requests(graph), 0
+        self.direct, self.of_routes, self.taught = Queue(), Queue(), TaughtRoutes(self.requests)
+        graph.sink("direct", self.direct, self.requests.direct)
+        graph.sink("of-routes", self.of_routes, self.requests.of_routes)
         self.robot.pass_on()
         self.robot.send(TEACH)
         for _ in range(30):
@@ -44,37 +55,41 @@ class Site:
         self.robot.velocity = np.zeros(2)
         self.robot.pass_on()
 
-    def ask(self, request: NavigationRequest) -> int:
+    def ask(self, request: NavigationRequest, **values: int) -> int:
         """Send a request; return its id."""
         self.id += 1
-        self.files.put(NavigationCommand(request, 1_800_000_000 * 10**9, id=self.id))
+        self.requests.put(NavigationCommand(request, 1_800_000_000 * 10**9, id=self.id, **values))
         return self.id
 
+    def pass_on(self, queue: Queue) -> NavigationUpdate:
+        """Let the stage take what has reached it, by way of the files or directly; return its newest update."""
+        while queue.waiting:
+            command = queue.waiting.pop(0)
+            self.robot.take(self.robot.files.process(command) if queue is self.of_routes else command)
+            self.taught.process(self.robot.updates[-1])
+        return self.robot.updates[-1]
+
     def work(self) -> NavigationUpdate:
-        """Let the stage take what has reached it; return its newest update."""
-        while self.asked:
-            update = self.robot.stage.process(self.asked.pop(0))
-            assert update is not None
-            self.newest = update
-        return self.newest
+        """Let the files and the stage do all that waits."""
+        self.pass_on(self.of_routes)
+        return self.pass_on(self.direct)
 
     def answers(self) -> dict[int, str]:
         """Return the refusals by the ids of the requests."""
-        return {answer.id: answer.refusal for answer in self.newest.answers if answer.id}
+        return {answer.id: answer.refusal for answer in self.robot.updates[-1].answers if answer.id}
 
 
 def test_a_route_can_be_repeated_before_it_is_written_and_is_the_same_after(tmp_path: Path) -> None:
     site = Site(tmp_path)
-    finish, again = site.ask(FINISH), site.ask(REPEAT)
-    site.files()  # finds no file yet
-    update = site.work()
+    finish = site.ask(FINISH)
+    again = site.ask(REPEAT)
+    for _ in range(2):
+        site.robot.take(site.robot.files.process(site.of_routes.waiting.pop(0)))  # finds no file yet
+    update = site.robot.updates[-1]
     assert update.task == "route hall" and update.state is NavigationState.DRIVING and not update.teaching
     assert site.answers() == {again: ""}, "it is not written yet"
     assert update.taught is not None and not RouteFolder(tmp_path).names()
-    site.files.process(update)
-    site.files()
-    site.files()
-    assert len(site.asked) == 1 and site.robot.places.saves == 1, "it is written once, and the map with it"
+    site.taught.process(update)
     assert site.work().taught is None and site.answers() == {again: "", finish: ""}
     read = RouteFolder(tmp_path).read("hall")
     for name in ("poses", "speeds", "in_keyframe", "keyframes"):
@@ -86,94 +101,54 @@ def test_a_full_disk_loses_no_recording(tmp_path: Path) -> None:
     folder.write_text("in the way")
     site = Site(folder)
     first = site.ask(FINISH)
-    site.files.process(site.work())
-    site.files()
     assert site.work().teaching == "hall" and "navigation.routes" in site.answers()[first]
-    assert site.robot.places.saves == 0
     folder.unlink()
     second = site.ask(FINISH)
-    site.files.process(site.work())
-    site.files()
     assert not site.work().teaching and site.answers()[second] == "" and RouteFolder(folder).names() == ["hall"]
-
-
-class SlowFolder(RouteFolder):
-    """A disk that takes so long to read that requests come meanwhile."""
-
-    meanwhile: Callable[[], object]
-
-    def read(self, name: str) -> Route:
-        self.meanwhile()
-        return super().read(name)
 
 
 @pytest.mark.hazard("H50")
 def test_a_halt_overtakes_what_waits_for_a_disk_and_ends_it(tmp_path: Path) -> None:
     site = Site(tmp_path)
     site.robot.send(FINISH)
-    folder = site.files._folder = SlowFolder(tmp_path)
-    ids: list[int] = []
-
-    def cancel() -> None:
-        ids.extend((site.ask(GoalRequest(NavigationFrame.ODOM, 2.0, 0.0)), site.ask(NavigationVerb.CANCEL)))
-        assert [command.request for command in site.asked] == [NavigationVerb.CANCEL], "nothing else overtakes"
-
-    folder.meanwhile = cancel
-    repeat = site.ask(REPEAT)
-    site.files()
-    update = site.work()
-    goal, halt = ids
+    repeat, halt = site.ask(REPEAT), site.ask(NavigationVerb.CANCEL)
+    site.pass_on(site.direct)
+    update = site.pass_on(site.of_routes)
     assert update.state is not NavigationState.DRIVING and (update.setpoint is None or not update.setpoint.velocity_mps)
-    refusals = site.answers()
-    assert refusals[halt] == "" and all("a later request has ended it" in refusals[id] for id in (repeat, goal))
-    folder.meanwhile = lambda: None
+    assert site.answers()[halt] == "" and "a later request has ended it" in site.answers()[repeat]
     site.ask(REPEAT)
-    site.files()
     assert site.work().state is NavigationState.DRIVING, "a request after the halt is granted"
 
 
+def test_a_drive_that_has_begun_meanwhile_is_not_replaced_by_what_waited_for_a_disk(tmp_path: Path) -> None:
+    site = Site(tmp_path)
+    site.robot.send(FINISH)
+    repeat, goal = site.ask(REPEAT), site.ask(GoalRequest(NavigationFrame.ODOM, 2.0, 0.0))
+    site.pass_on(site.direct)
+    assert site.pass_on(site.of_routes).task == "goal"
+    assert site.answers()[goal] == "" and "a later request has ended it" in site.answers()[repeat]
+
+
 @pytest.mark.hazard("H26")
-def test_what_waits_for_a_disk_begins_nothing_after_a_stop_or_a_long_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    site, halts = Site(tmp_path), list[str]()
-    monkeypatch.setattr(site.files, "_halts", lambda: len(halts))
+def test_what_waits_for_a_disk_begins_nothing_after_a_stop_or_a_long_time(tmp_path: Path) -> None:
+    site = Site(tmp_path)
     site.ask(FINISH)
     site.work()
-    site.files()
     repeated = site.ask(REPEAT)
-    halts.append("a bumper")
-    site.files()
+    site.robot.stage.process(WheelState(True, False, halts=1))  # a bumper; then it was armed again
     site.work()
     assert "a stop or a fault has come since" in site.answers()[repeated]
-    monkeypatch.setattr(route_files, "LONGEST_WAIT_S", -1.0)
-    again = site.ask(REPEAT)
-    site.files()
+    again = site.ask(REPEAT, halts=1, asked_ns=1)
     assert site.work().state is not NavigationState.DRIVING
     assert "waited too long" in site.answers()[again]
-    monkeypatch.setattr(route_files, "LONGEST_WAIT_S", 5.0)
-    third = site.ask(REPEAT)
-    site.files()
+    third = site.ask(REPEAT, halts=1)
     site.work()
     assert site.answers()[third] == ""
-
-
-def test_requests_that_wait_for_a_disk_are_bounded(tmp_path: Path) -> None:
-    passed: list[NavigationCommand] = []
-    files = RouteFiles(RouteFolder(tmp_path), passed.append)
-    for id in range(MOST_OPEN + 3):
-        files.put(NavigationCommand(REPEAT, 0, id=id))
-    assert [command.id for command in passed] == list(range(MOST_OPEN, MOST_OPEN + 3))
-    assert all("ask again" in command.refusal for command in passed)
-    files()
-    assert len(passed) == MOST_OPEN + 3 and "no route hall" in passed[-1].refusal
 
 
 @pytest.mark.parametrize("replace", [False, True])
 def test_an_existing_route_is_replaced_only_where_that_is_asked_for(tmp_path: Path, replace: bool) -> None:
     (tmp_path / "hall.route.json").write_text("damaged, but there")
-    passed: list[NavigationCommand] = []
-    files = RouteFiles(RouteFolder(tmp_path), passed.append)
-    files.put(NavigationCommand(RouteRequest(RouteAction.TEACH, "hall", replace=replace), 0))
-    files()
-    assert ("--replace" in passed[0].refusal) is not replace
+    request = RouteRequest(RouteAction.TEACH, "hall", replace=replace)
+    command = RouteFiles(RouteFolder(tmp_path)).process(NavigationCommand(request, 0))
+    assert ("--replace" in command.refusal) is not replace

@@ -86,25 +86,14 @@ def test_a_motor_controller_that_failed_ends_a_replay(link: Any, monkeypatch: py
         drive.finish()
 
 
-def test_the_answers_of_the_navigation_are_given_and_its_route_is_handed_on(link: Any) -> None:
+def test_the_answers_of_the_navigation_are_given(link: Any) -> None:
     answered: list[tuple[int, Answer]] = []
-    files = Files()
-    drive = PlannerDrive(link, lambda id, answer: answered.append((id, answer)), files)
+    drive = PlannerDrive(link, lambda id, answer: answered.append((id, answer)))
     answers = (RequestAnswer(4, "pause", ""), RequestAnswer(5, "repeat lost", "no route lost"))
     update = NavigationUpdate(1, 1, AHEAD, NavigationState.PAUSED, "by a request", answers=answers)
     drive.process(update)
     assert answered == [(4, Answer(True, "paused: by a request")), (5, Answer(False, "no route lost"))]
-    assert files.updates == [update] and [setpoint for setpoint, _ in link.setpoints] == [AHEAD]
-
-
-class Files:
-    """A sink that keeps what it gets."""
-
-    def __init__(self) -> None:
-        self.updates: list[NavigationUpdate] = []
-
-    def process(self, update: NavigationUpdate) -> None:
-        self.updates.append(update)
+    assert [setpoint for setpoint, _ in link.setpoints] == [AHEAD]
 
 
 def test_the_base_drives_as_long_as_the_stamps_say() -> None:

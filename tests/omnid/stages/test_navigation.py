@@ -48,7 +48,6 @@ class FixedMap:
     """A map of keyframes that stand still."""
 
     name = "site.omap"
-    saves = 0
 
     def __init__(self, stamp_ns: int = 5, *, is_new: bool = False) -> None:
         self._stamp_ns, self.is_new = stamp_ns, is_new
@@ -59,21 +58,15 @@ class FixedMap:
     def noted(self) -> Mapping[int, int]:
         return {3: self._stamp_ns}
 
-    def save(self) -> None:
-        self.saves += 1
-
 
 class Robot:
     """A base that follows setpoints exactly, seen through the stage's messages."""
 
     def __init__(self, folder: Path, places: FixedMap | None = None) -> None:
-        self.wheels = WheelState(True, False)
         self.places = FixedMap() if places is None else places
-        self.stage = NavigationStage(
-            NavigationSettings(), CollisionSettings(), T_BASE_RIG, lambda: self.wheels, Routes(self.places)
-        )
-        self.asked: list[NavigationCommand] = []
-        self.files = RouteFiles(RouteFolder(folder), self.asked.append, self.places.save)
+        self.stage = NavigationStage(NavigationSettings(), CollisionSettings(), T_BASE_RIG, Routes(self.places))
+        self.stage.process(WheelState(True, False))
+        self.files = RouteFiles(RouteFolder(folder))
         self.pose, self.velocity = np.zeros(3), np.zeros(2)
         self.seq = 0
         self.updates: list[NavigationUpdate] = []
@@ -82,15 +75,17 @@ class Robot:
 
     def send(self, request: NavigationRequest, stamp_ns: int = 0, id: int = 0) -> NavigationUpdate:
         """Return the state after a request and what the files bring."""
-        self.files.put(NavigationCommand(request, 1_800_000_000 * 10**9, stamp_ns, id))
-        self.files()
-        while self.asked:
-            update = self.stage.process(self.asked.pop(0))
-            assert update is not None
-            self.updates.append(update)
-            self.files.process(update)
-            self.files()
+        self.take(self.files.process(NavigationCommand(request, 1_800_000_000 * 10**9, stamp_ns, id)))
+        taught = self.updates[-1].taught
+        if taught is not None:
+            self.take(self.files.process(NavigationCommand(taught, 0, id=taught.id)))
         return self.updates[-1]
+
+    def take(self, command: NavigationCommand) -> None:
+        """Give a request to the stage."""
+        update = self.stage.process(command)
+        assert update is not None
+        self.updates.append(update)
 
     def pass_on(self) -> NavigationUpdate | None:
         """Advance by a period."""
@@ -179,7 +174,7 @@ def test_refuses_with_the_remedy_and_sends_nothing(tmp_path: Path) -> None:
     assert "begins 5.0 m away" in refusal(PathRequest(ODOM, np.array([[5.0, 0.0], [6.0, 0.0]])))
     assert "nothing is under way" in refusal(NavigationVerb.RESUME)
     assert "no route is being taught" in refusal(RouteRequest(RouteAction.FINISH))
-    robot.wheels = WheelState(False, True, "a stop was asked for")
+    robot.stage.process(WheelState(False, True, "a stop was asked for"))
     assert "omnid arm" in refusal(GoalRequest(ODOM, 1.0, 0.0))
     assert "no route nowhere in" in refusal(RouteRequest(RouteAction.REPEAT, "nowhere"))
     assert len(robot.updates[-1].answers) == 9
@@ -234,10 +229,10 @@ def test_unknown_floor_that_stops_the_wheels_is_passed_where_it_is_near(
     ranges, free = np.full(360, np.inf, np.float32), np.full(360, 6.0, np.float32)
     free[165:195] = free_m
     robot.stage.process(ObstacleRing(1, robot.seq * PERIOD_NS, ranges, ranges, free, np.eye(4)))
-    robot.wheels = WheelState(True, False, held_by=UNKNOWN)
+    robot.stage.process(WheelState(True, False, held_by=UNKNOWN))
     robot.pass_on()
     assert robot.updates[-1].state is NavigationState.BLOCKED
-    robot.wheels = WheelState(True, False)
+    robot.stage.process(WheelState(True, False))
     robot.pass_on()
     assert (robot.updates[-1].state is NavigationState.AVOIDING) == avoids
 

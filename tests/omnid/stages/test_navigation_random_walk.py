@@ -34,7 +34,6 @@ from omnid.core.navigation.requests import (
     RouteRequest,
 )
 from omnid.core.navigation.settings import NavigationSettings
-from omnid.core.navigation.situation import WheelState
 from omnid.core.obstacles.moving_tracker import MovingObstacle
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
@@ -63,11 +62,8 @@ class Walk:
     def __init__(self, seed: int, folder: Path) -> None:
         self.rng, self.seen, self.t_s = random.Random(seed), Counter[str](), 1000.0
         self.law = ControlLaw(SETTINGS, -1)
-        self.stage = NavigationStage(
-            NAVIGATION, SETTINGS.collision, np.eye(4), self.wheels, Routes(FixedMap(is_new=True))
-        )
-        self.asked: list[NavigationCommand] = []
-        self.files = RouteFiles(RouteFolder(folder), self.asked.append)
+        self.stage = NavigationStage(NAVIGATION, SETTINGS.collision, np.eye(4), Routes(FixedMap(is_new=True)))
+        self.files = RouteFiles(RouteFolder(folder))
         self.pose, self.motion = np.zeros(3), (0.0, 0.0)
         self.seq = self.resets = 0
         self.state, self.map_state, self.kind = TrackingState.TRACKING, MapState.LOCALIZED, "free"
@@ -84,10 +80,6 @@ class Walk:
     def arrival_ns(self) -> int:
         """Arrival of a message now: after the tick at this time."""
         return self.now_ns + 1
-
-    def wheels(self) -> WheelState:
-        """Return the state of the wheels, as the daemon reads it from the controller."""
-        return wheel_state(self.law)
 
     def run(self, poses: int) -> Counter[str]:
         """Return how often what happened."""
@@ -146,14 +138,10 @@ class Walk:
     def ask(self, request: NavigationRequest) -> None:
         """Send a request, and take its answer into the oracle."""
         teaching = self.seen_teaching
-        self.files.put(NavigationCommand(request, self.now_ns, self.now_ns))
-        self.files()
-        update = self.stage.process(self.asked.pop(0))
-        assert update is not None
-        self.files.process(update)
-        self.files()
-        if self.asked:  # the route is written
-            update = self.stage.process(self.asked.pop(0))
+        self.stage.process(wheel_state(self.law))
+        update = self.stage.process(self.files.process(NavigationCommand(request, self.now_ns, self.now_ns)))
+        if update is not None and update.taught is not None:
+            update = self.stage.process(self.files.process(NavigationCommand(update.taught, self.now_ns)))
         assert update is not None and update.answer is not None
         accepted = not update.answer.refusal
         word = (
@@ -200,6 +188,7 @@ class Walk:
             )
         )
         self.stage.process(PlaceUpdate(self.seq, self.now_ns, np.eye(4), T, UNIT, self.map_state, 3, T))
+        self.stage.process(wheel_state(self.law))
         self.posed_s = self.t_s if self.state is not TrackingState.LOST else -math.inf
         self.take(
             self.stage.process(

@@ -41,7 +41,6 @@ def test_a_route_is_taught_and_repeated(tmp_path: Path) -> None:
     assert robot.updates[-1].teaching == "hall" and robot.updates[-1].taught_m == pytest.approx(4.5, abs=0.2)
     update = robot.send(RouteRequest(RouteAction.FINISH))
     assert update.answer is not None and not update.answer.refusal and not update.teaching
-    assert robot.places.saves == 1, "the map is saved with it"
     update = robot.send(RouteRequest(RouteAction.TEACH, "hall"))
     assert update.answer is not None and "there is a route hall already" in update.answer.refusal
     assert robot.send(RouteRequest(RouteAction.TEACH, "hall", replace=True)).teaching == "hall"
