@@ -83,6 +83,46 @@ def farther(distance: Floats, limit: np.float32) -> int:
 
 
 @inner
+def meet(
+    candidates: Whole, hits: Whole, surfaces: Floats, rays: Rows, origins: Rows, nearest: Numbers, distance: Floats
+) -> int:
+    """Set the nearest of candidate rectangles for each ray, -1: none, and its distance; return how many were tried.
+
+    hits: set to the number of rays that met each of these first. Candidates are sorted by their least distance: none
+    can be met any more once one is farther than all rays reach.
+    """
+    for i in range(len(nearest)):
+        nearest[i], distance[i] = -1, FAR_M
+    for n in range(len(candidates)):
+        k = candidates[n]
+        if farther(distance, surfaces[k, 14]) == 0:
+            return n
+        hits[n] = take_nearer(np.int32(k), surfaces[k], rays, origins, nearest, distance)
+    return len(candidates)
+
+
+@inner
+def only_one(tried: Whole, surfaces: Floats, rays: Rows, nearest: Numbers, distance: Floats) -> int:
+    """Return the one rectangle that all rays from the origin meet, with all others that were tried behind it, or -1."""
+    only = int(nearest[0])
+    for i in range(1, len(nearest)):
+        only = only if nearest[i] == only else -1
+    for n in range(len(tried)):
+        if only >= 0 and tried[n] != only and not is_behind(surfaces[tried[n]], rays, distance):
+            only = -1
+    return only
+
+
+@inner
+def is_beyond(sides: Floats, axis: Floats, sine: np.float32) -> bool:
+    """Return whether a cone lies wholly beyond one of the four sides of a pyramid."""
+    outside = 0
+    for n in range(4):
+        outside += axis[0] * sides[n, 0] + axis[1] * sides[n, 1] + axis[2] * sides[n, 2] < -sine
+    return outside > 0
+
+
+@inner
 def place_on(
     number: np.int32,
     surface: Floats,
@@ -216,80 +256,9 @@ def shade_one(
 
 
 @compiled(
-    "(f4[:, ::1], f4[::1], i4[:, ::1], i8[::1], f4[:, ::1], f4[::1], i8[::1], b1[:, ::1], f4[:, :, ::1], f4[:, ::1], "
-    "i8[:, ::1], i8[:, ::1], u1[::1], f4, b1[:, ::1], f4[::1])",
-    writes=("seen", "image"),
-)
-def cast_plain_tiles(
-    rays: Floats,
-    spacing: Floats,
-    index: Numbers,
-    starts: Whole,
-    axes: Floats,
-    sines: Floats,
-    parents: Whole,
-    seen_by_parents: NDArray[np.bool_],
-    sides: Floats,
-    surfaces: Floats,
-    pyramids: Whole,
-    levels: Whole,
-    texels: NDArray[np.uint8],
-    weight: np.float32,
-    seen: NDArray[np.bool_],
-    image: Floats,
-) -> None:
-    """Add the greys of a central camera in M tiles that show one rectangle only, each times a weight.
-
-    One ray a pixel: rays (3, N), spacing (N,), index (2, N) of the pixel. axes (M, 3) and sines (M,): the tiles' cones;
-    parents (M,): larger tiles, and the rectangles that they may see (P, R). sides (R, 4, 3): normals, to the inside, of
-    the planes through the origin and an edge. seen (M, R): set to what the other tiles may see, for `cast`.
-    """
-    largest, surface_count = 0, len(surfaces)
-    for tile in range(len(starts) - 1):
-        largest = max(largest, starts[tile + 1] - starts[tile])
-    zeros = np.zeros(largest, np.float32)
-    nearest, distance = np.empty(largest, np.int32), np.empty(largest, np.float32)
-    tried = np.empty(surface_count, np.int64)
-    for tile in range(len(starts) - 1):
-        low, high = starts[tile], starts[tile + 1]
-        count = high - low
-        ray = rays[0, low:high], rays[1, low:high], rays[2, low:high]
-        origin = zeros[:count], zeros[:count], zeros[:count]
-        for i in range(count):
-            nearest[i], distance[i] = -1, FAR_M
-        # 1. The rectangles whose pyramids the tile's cone meets, up to those behind all that was met.
-        number = 0
-        for k in range(surface_count):
-            seen[tile, k] = False
-            if not seen_by_parents[parents[tile], k]:
-                continue
-            outside = 0
-            for n in range(4):
-                x, y, z = sides[k, n, 0], sides[k, n, 1], sides[k, n, 2]
-                outside += axes[tile, 0] * x + axes[tile, 1] * y + axes[tile, 2] * z < -sines[tile]
-            if outside:
-                continue
-            seen[tile, k] = True
-            if farther(distance[:count], surfaces[k, 14]) > 0:
-                take_nearer(np.int32(k), surfaces[k], ray, origin, nearest[:count], distance[:count])
-                tried[number] = k
-                number += 1
-        # 2. Is it the same one for all rays, with all others behind it?
-        only = nearest[0]
-        for i in range(1, count):
-            only = only if nearest[i] == only else -1
-        for n in range(number):
-            if only >= 0 and tried[n] != only and not is_behind(surfaces[tried[n]], ray, distance[:count]):
-                only = -1
-        if only >= 0:
-            seen[tile] = False
-            part = spacing[low:high], distance[:count]
-            shade_one(only, surfaces[only], ray, part, pyramids, levels, texels, weight, index[0, low:high], image)
-
-
-@compiled(
-    "(f4[:, ::1], f4[:, ::1], f4[::1], i4[:, ::1], i8[::1], f8[:, :, ::1], b1[:, ::1], f4[:, ::1], "
-    "i8[:, ::1], i8[:, ::1], u1[::1], f4[::1])",
+    "(f4[:, ::1], f4[:, ::1], f4[::1], i4[:, ::1], i8[::1], f4[:, ::1], f4[::1], i4[:, ::1], i8[::1], f4[:, ::1], "
+    "f4[::1], f8[:, :, ::1], i8[::1], b1[:, ::1], f4[:, :, ::1], f4[:, ::1], i8[:, ::1], i8[:, ::1], u1[::1], f4, "
+    "f4[::1])",
     writes=("image",),
 )
 def cast(
@@ -298,66 +267,82 @@ def cast(
     spacing: Floats,
     index: Numbers,
     starts: Whole,
+    plain_rays: Floats,
+    plain_spacing: Floats,
+    plain_index: Numbers,
+    plain_starts: Whole,
+    axes: Floats,
+    sines: Floats,
     poses: Doubles,
+    parents: Whole,
     seen: NDArray[np.bool_],
+    sides: Floats,
     surfaces: Floats,
     pyramids: Whole,
     levels: Whole,
     texels: NDArray[np.uint8],
+    weight: np.float32,
     image: Floats,
 ) -> None:
-    """Add the grey of N samples in M tiles to an image.
+    """Add the greys of N samples in M tiles to an image.
 
     rays (3, N), origins (3, N) [m] in the camera frame, (3, 1) where all are the same; spacing (N,) [rad]; index (2, N)
-    of pixel and pose; starts (M + 1,) of the tiles; poses (H, 3, 4) of the camera in the frame of the first one,
-    (1, 3, 4) where all are the same; seen (M, R): tile may see rectangle. surfaces (R, SURFACE_COLUMNS), in that frame,
-    by their least distance. pyramids (R, 2): first level, number of levels; levels (L, 3): first texel, height, width.
+    of pixel and pose; starts (M + 1,) of the tiles. plain_...: one ray a pixel of the same tiles of a central camera at
+    rest, which is cast where it shows one rectangle only, with a weight that makes up for the samples; without any all
+    samples are cast. axes (M, 3) and sines (M,): the cones of these tiles. poses (H, 3, 4) of the camera in the frame
+    of the first one, (1, 3, 4) where all are the same. parents (M,): row of a tile in seen (P, R), the rectangles that
+    larger tiles may see; sides (R, 4, 3): normals, to the inside, of the planes through the origin and an edge.
+    surfaces (R, SURFACE_COLUMNS), in that frame, by their least distance. pyramids (R, 2): first level, number of
+    levels; levels (L, 3): first texel, height, width.
     """
-    largest = starts[0]
-    for tile in range(len(starts) - 1):
+    tiles, surface_count, has_plain = len(starts) - 1, len(surfaces), len(plain_starts) > 1
+    largest = 0
+    for tile in range(tiles):
         largest = max(largest, starts[tile + 1] - starts[tile])
     moving = len(poses) > 1 or origins.shape[1] > 1
-    turned, moved = np.empty((3, largest), np.float32), np.empty((3, largest), np.float32)
+    turned, moved = np.empty((3, largest), np.float32), np.zeros((3, largest), np.float32)
     nearest, distance = np.empty(largest, np.int32), np.empty(largest, np.float32)
     places = np.empty((3, largest), np.float32)
-    for k in range(3):
-        for i in range(largest):
-            moved[k, i] = ZERO
-    found = np.empty(len(surfaces), np.int64)
-    for tile in range(len(starts) - 1):
+    candidates, hits = np.empty(surface_count, np.int64), np.empty(surface_count, np.int64)
+    for tile in range(tiles):
         low, high = starts[tile], starts[tile + 1]
         count = high - low
-        # 1. The rays in the frame of the first pose.
+        if not count:
+            continue
+        # 1. The rectangles that the tile may see.
+        number = 0
+        for k in range(surface_count):
+            if seen[parents[tile], k] and not (has_plain and is_beyond(sides[k], axes[tile], sines[tile])):
+                candidates[number] = k
+                number += 1
+        # 2. Is it one only?
+        if has_plain:
+            first, last = plain_starts[tile], plain_starts[tile + 1]
+            plain = last - first
+            if not plain:
+                continue
+            ray = plain_rays[0, first:last], plain_rays[1, first:last], plain_rays[2, first:last]
+            origin = moved[0, :plain], moved[1, :plain], moved[2, :plain]
+            near, far = nearest[:plain], distance[:plain]
+            tried = meet(candidates[:number], hits, surfaces, ray, origin, near, far)
+            only = only_one(candidates[:tried], surfaces, ray, near, far)
+            if only >= 0:
+                part, pixels = (plain_spacing[first:last], far), plain_index[0, first:last]
+                shade_one(only, surfaces[only], ray, part, pyramids, levels, texels, weight, pixels, image)
+                continue
+        # 3. The rays in the frame of the first pose.
         ray = rays[0, low:high], rays[1, low:high], rays[2, low:high]
         origin = moved[0, :count], moved[1, :count], moved[2, :count]
         if moving:
             begin = origins[:, low:high] if origins.shape[1] > 1 else origins
             turn(poses, index[1, low:high], rays[:, low:high], begin, turned, moved)
             ray = turned[0, :count], turned[1, :count], turned[2, :count]
-        # 2. The nearest rectangle of each ray, and the place on it.
-        for i in range(count):
-            nearest[i], distance[i] = -1, FAR_M
-        hit = 0
-        for k in range(len(surfaces)):
-            if not seen[tile, k]:
-                continue
-            # Rectangles are sorted by least distance: none can be met any more once it is farther than all rays reach.
-            if farther(distance[:count], surfaces[k, 14]) == 0:
-                break
-            if take_nearer(np.int32(k), surfaces[k], ray, origin, nearest[:count], distance[:count]) > 0:
-                found[hit] = k
-                hit += 1
+        # 4. The nearest rectangle of each ray, the place on it, and its grey there.
+        near, far = nearest[:count], distance[:count]
+        tried = meet(candidates[:number], hits, surfaces, ray, origin, near, far)
         place = places[0, :count], places[1, :count], places[2, :count]
-        for n in range(hit):
-            place_on(
-                np.int32(found[n]),
-                surfaces[found[n]],
-                ray,
-                origin,
-                spacing[low:high],
-                nearest[:count],
-                distance[:count],
-                place,
-            )
-        # 3. Its grey there.
-        shade(nearest[:count], place, surfaces, pyramids, levels, texels, index[0, low:high], image)
+        for n in range(tried):
+            if hits[n]:
+                k = candidates[n]
+                place_on(np.int32(k), surfaces[k], ray, origin, spacing[low:high], near, far, place)
+        shade(near, place, surfaces, pyramids, levels, texels, index[0, low:high], image)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Protocol, runtime_checkable
+from typing import Final, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.models.camera import Array, Mask, OmniCamera
 from calib.rig import MountedCamera
-from omnid.simulation.rendering.caster_kernels import SURFACE_COLUMNS, cast, cast_plain_tiles
+from omnid.simulation.rendering.caster_kernels import SURFACE_COLUMNS, cast
 from omnid.simulation.rendering.surfaces import Rectangle, Scene, Texture
 
 Floats = NDArray[np.float32]
@@ -47,64 +47,44 @@ class NonCentralCamera(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class RayTable:
-    """The rays of one camera's visible samples, sorted by tile; N samples, M tiles."""
+    """The rays of one camera's visible samples by square tiles, row by row; N samples, M tiles, some of them empty."""
 
-    shape: tuple[int, int]  # (height, width) of the image without supersampling
     supersample: int
+    columns: int  # of tiles
     rays: Floats  # (3, N) unit, camera frame
     origins: Floats  # (3, N) [m] camera frame; (3, 1) zero where all rays start at the camera's origin
     spacing: Floats  # (N,) [rad] to the next sample, the root of the sample's solid angle
     index: NDArray[np.int32]  # (2, N) of the pixel in the flattened image, and of the row of samples
     starts: NDArray[np.int64]  # (M + 1,) first sample of each tile
-    axes: Array  # (M, 3) unit
+    axes: Array  # (M, 3) unit; zero for an empty tile
     angles: Array  # (M,) [rad] from the axis to the farthest ray of a tile
     reach_m: float  # of the farthest origin from the camera's
-    tiles: NDArray[np.int64]  # (M,) row by row over all tiles of the image
-
-    def kept(self, tiles: NDArray[np.int64]) -> RayTable:
-        """Return the table of some of the tiles, in their order."""
-        rows = np.searchsorted(self.tiles, tiles)
-        spans = [np.arange(self.starts[row], self.starts[row + 1]) for row in rows]
-        chosen = np.concatenate(spans)
-        return replace(
-            self,
-            rays=np.ascontiguousarray(self.rays[:, chosen]),
-            spacing=self.spacing[chosen],
-            index=np.ascontiguousarray(self.index[:, chosen]),
-            starts=np.concatenate([[0], np.cumsum([len(span) for span in spans])]),
-            axes=self.axes[rows],
-            angles=self.angles[rows],
-            tiles=tiles,
-        )
 
 
 def ray_table(mounted: MountedCamera, supersample: int, tile_samples: int = TILE_PX) -> RayTable:
     """Return the rays of all samples (supersample^2 per pixel) inside the camera's mask, by tiles of a side."""
-    width, height = mounted.camera.size
+    width, height = (side * supersample for side in mounted.camera.size)
+    columns, lines = -(-width // tile_samples), -(-height // tile_samples)
     rays, spacing = _lift_grid(mounted, supersample)
-    ss_height, ss_width = height * supersample, width * supersample
-    rows, columns = np.divmod(np.arange(ss_height * ss_width), ss_width)
-    tile = rows // tile_samples * (-(-ss_width // tile_samples)) + columns // tile_samples
+    row, column = np.divmod(np.arange(height * width), width)
+    tile = row // tile_samples * columns + column // tile_samples
     index = np.flatnonzero(np.isfinite(rays[:, 0]) & np.isfinite(spacing))
     index = index[np.argsort(tile[index], kind="stable")]
-    tiles, starts = np.unique(tile[index], return_index=True)
-    starts = np.append(starts, len(index))
+    starts = np.searchsorted(tile[index], np.arange(lines * columns + 1))
     axes, angles = _cones(rays[index], starts)
     origins = _origins(mounted, supersample, index)
-    reach_m = float(np.linalg.norm(origins, axis=0).max())
-    pixel = rows[index] // supersample * width + columns[index] // supersample
+    pixel = row[index] // supersample * (width // supersample) + column[index] // supersample
     return RayTable(
-        (height, width),
         supersample,
+        columns,
         np.ascontiguousarray(rays[index].T),
         origins,
         spacing[index],
-        np.stack([pixel, rows[index]]).astype(np.int32),
+        np.stack([pixel, row[index]]).astype(np.int32),
         starts,
         axes,
         angles,
-        reach_m,
-        tiles,
+        float(np.linalg.norm(origins, axis=0).max()),
     )
 
 
@@ -144,44 +124,71 @@ def _lifted(camera: OmniCamera, supersample: int) -> tuple[Floats, Floats]:
 
 
 def _cones(rays: Floats, starts: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Return axis (M, 3) and half angle (M,) of the cone around each tile's rays."""
-    axes = np.add.reduceat(rays.astype(float), starts[:-1])
-    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-    cosines = np.einsum("ij,ij->i", rays, np.repeat(axes, np.diff(starts), axis=0))
-    return axes, np.arccos(np.clip(np.minimum.reduceat(cosines, starts[:-1]), -1, 1)) + CONE_MARGIN_RAD
+    """Return axis (M, 3) and half angle (M,) of the cone around each tile's rays; 0 for an empty tile."""
+    axes, angles, counts = np.zeros((len(starts) - 1, 3)), np.zeros(len(starts) - 1), np.diff(starts)
+    full, first = counts > 0, starts[:-1][counts > 0]
+    axes[full] = np.add.reduceat(rays.astype(float), first)
+    axes[full] /= np.linalg.norm(axes[full], axis=1, keepdims=True)
+    cosines = np.einsum("ij,ij->i", rays, np.repeat(axes, counts, axis=0))
+    angles[full] = np.arccos(np.clip(np.minimum.reduceat(cosines, first), -1, 1)) + CONE_MARGIN_RAD
+    return axes, angles
 
 
-_tables: list[tuple[OmniCamera, Mask, int, tuple[RayTable, ...]]] = []  # the one made last at the end
+_NONE: Final = np.zeros((3, 0), np.float32)
+NO_RAYS: Final = RayTable(
+    1,
+    0,
+    _NONE,
+    _NONE,
+    _NONE[0],
+    _NONE[:2].astype(np.int32),
+    np.zeros(1, np.int64),
+    _NONE.T.astype(float),
+    _NONE[0],
+    0.0,
+)
 
 
-def cached_tables(mounted: MountedCamera, supersample: int) -> tuple[RayTable, ...]:
-    """Return the camera's table, computed once for equal cameras and masks.
+@dataclass(frozen=True, slots=True)
+class CameraRays:
+    """The tables of a camera: all samples; one ray a pixel in the same tiles, or none; the tiles that are culled."""
 
-    AS_NEEDED: of all fine rays; of one ray a pixel, in the same tiles; of one ray a pixel in large tiles.
-    """
+    samples: RayTable
+    plain: RayTable | None
+    culled: RayTable  # the samples', or larger tiles of one ray a pixel
+
+    @property
+    def parents(self) -> NDArray[np.int64]:
+        """The culled tile in which each tile (M,) of the samples is."""
+        tiles = np.arange(len(self.samples.angles))
+        if self.plain is None:
+            return tiles
+        rows, columns = np.divmod(tiles, self.samples.columns)
+        times = TILE_PX // NEEDED_PX
+        return np.asarray(rows // times * self.culled.columns + columns // times)
+
+
+_kept: list[tuple[OmniCamera, Mask, int, CameraRays]] = []  # the one made last at the end
+
+
+def cached_rays(mounted: MountedCamera, supersample: int) -> CameraRays:
+    """Return the camera's tables, computed once for equal cameras and masks."""
     mask = mounted.visible
     ring = mask.center, mask.inner_px, mask.outer_px
-    for camera, kept, samples, tables in _tables:
+    for camera, kept, samples, rays in _kept:
         is_ring = (kept.center, kept.inner_px, kept.outer_px) == ring and kept.image is mask.image
         if samples == supersample and is_ring and camera == mounted.camera:
-            return tables
+            return rays
     if supersample == AS_NEEDED:
         finest = -(-SIDE_RAYS // max(mounted.camera.size))
-        fine, single = (ray_table(mounted, samples, NEEDED_PX * samples) for samples in (finest, 1))
-        common = np.intersect1d(fine.tiles, single.tiles)
-        made: tuple[RayTable, ...] = fine.kept(common), single.kept(common), ray_table(mounted, 1)
+        fine, plain = (ray_table(mounted, samples, NEEDED_PX * samples) for samples in (finest, 1))
+        made = CameraRays(fine, plain, ray_table(mounted, 1))
     else:
-        made = (ray_table(mounted, supersample),)
-    del _tables[: len(_tables) - MAX_TABLES + 1]
-    _tables.append((mounted.camera, mask, supersample, made))
+        table = ray_table(mounted, supersample)
+        made = CameraRays(table, None, table)
+    del _kept[: len(_kept) - MAX_TABLES + 1]
+    _kept.append((mounted.camera, mask, supersample, made))
     return made
-
-
-def _parents(small: RayTable, large: RayTable) -> NDArray[np.int64]:
-    """Return in which of the large tiles each small one (M,) is."""
-    times, width = TILE_PX // NEEDED_PX, small.shape[1]
-    rows, columns = np.divmod(small.tiles, -(-width // NEEDED_PX))
-    return np.asarray(np.searchsorted(large.tiles, rows // times * (-(-width // TILE_PX)) + columns // times))
 
 
 # Guards against division by zero at a rectangle through the viewpoint [m].
@@ -201,72 +208,55 @@ def render_grey(
     supersample: rays of a pixel, per axis, or AS_NEEDED.
     row_twist (6,): motion of the rig in its own frame from one image row to the next (rolling shutter).
     """
-    table, *single = cached_tables(mounted, supersample)
-    poses, turned_rad = _row_poses(table, T_world_rig, np.zeros(6) if row_twist is None else row_twist)
+    rays, (width, height) = cached_rays(mounted, supersample), mounted.camera.size
+    table, plain = rays.samples, rays.plain
+    # 1. The poses of the camera, and the rectangles in the frame of the first one, by their least distance.
+    poses, turned_rad = _row_poses(height, table, T_world_rig, np.zeros(6) if row_twist is None else row_twist)
     poses = poses @ se3.inverse(mounted.T_cam_rig)
     reach_m = table.reach_m + float(np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1).max())
+    if plain is not None and reach_m:
+        raise ValueError("as many rays as needed: for central cameras that take all rows at once only")
     corners = se3.apply(se3.inverse(poses[0]), corners_of(scene.rectangles))
     distance_m = _distances_m(corners)
     order = np.argsort(distance_m, kind="stable")
-    atlas = cached_atlas([r.texture for r in scene.rectangles])
-    image = np.zeros(table.shape[0] * table.shape[1], np.float32)
-    surfaces = _surfaces([scene.rectangles[i] for i in order], poses[0], distance_m[order] - reach_m)
-    painted = surfaces, atlas.pyramids[order], atlas.levels, atlas.texels
-    if single:
-        seen = _plain_tiles(single[0], single[1], corners[order], reach_m, table.supersample**2, painted, image)
-    else:
-        aside_rad = turned_rad + np.arcsin(np.clip(reach_m / distance_m, 0, 1))
-        seen = np.ascontiguousarray(tiles_that_see(table, corners, aside_rad)[:, order])
+    corners, distance_m = corners[order], distance_m[order]
+    surfaces = _surfaces([scene.rectangles[i] for i in order], poses[0], distance_m - reach_m)
+    # 2. The rectangles that tiles may see.
+    sides = sides_of(corners)
+    seen = tiles_that_see(rays.culled, sides, turned_rad + np.arcsin(np.clip(reach_m / distance_m, 0, 1)))
+    # 3. The greys of all samples.
+    atlas, image = cached_atlas([r.texture for r in scene.rectangles]), np.zeros(width * height, np.float32)
+    one = plain or NO_RAYS
     cast(
         table.rays,
         table.origins,
         table.spacing,
         table.index,
         table.starts,
+        one.rays,
+        one.spacing,
+        one.index,
+        one.starts,
+        one.axes.astype(np.float32),
+        np.sin(np.minimum(one.angles, np.pi / 2)).astype(np.float32),
         np.ascontiguousarray((se3.inverse(poses[:1]) @ poses)[:, :3]),
-        seen,
-        *painted,
+        rays.parents,
+        np.ascontiguousarray(seen),
+        sides.astype(np.float32),
+        surfaces,
+        atlas.pyramids[order],
+        atlas.levels,
+        atlas.texels,
+        np.float32(table.supersample**2),
         image,
     )
-    return np.asarray(image.reshape(table.shape) / np.float32(table.supersample**2), np.float32)
+    return np.asarray(image.reshape(height, width) / np.float32(table.supersample**2), np.float32)
 
 
-def _plain_tiles(
-    single: RayTable,
-    large: RayTable,
-    corners: Array,
-    reach_m: float,
-    weight: int,
-    painted: tuple[Floats, NDArray[np.int64], NDArray[np.int64], NDArray[np.uint8]],
-    image: Floats,
-) -> NDArray[np.bool_]:
-    """Add the greys of the tiles that show one rectangle of corners (R, 4, 3) only; return what the others see."""
-    if reach_m:
-        raise ValueError("as many rays as needed: for central cameras that take all rows at once only")
-    seen = np.empty((len(single.tiles), len(corners)), bool)
-    cast_plain_tiles(
-        single.rays,
-        single.spacing,
-        single.index,
-        single.starts,
-        single.axes.astype(np.float32),
-        np.sin(np.minimum(single.angles, np.pi / 2)).astype(np.float32),
-        _parents(single, large),
-        np.ascontiguousarray(tiles_that_see(large, corners, np.zeros(len(corners)))),
-        sides_of(corners).astype(np.float32),
-        *painted,
-        np.float32(weight),
-        seen,
-        image,
-    )
-    return seen
-
-
-def _row_poses(table: RayTable, T_world_rig: Array, row_twist: Array) -> tuple[Array, float]:
+def _row_poses(height: int, table: RayTable, T_world_rig: Array, row_twist: Array) -> tuple[Array, float]:
     """Return the poses (S, 4, 4) of the rig at the S rows of samples, one if it rests, and its largest turn [rad]."""
     if not np.any(row_twist):
         return T_world_rig[None], 0.0
-    height = table.shape[0]
     rows = (np.arange(height * table.supersample) + 0.5) / table.supersample - 0.5
     return T_world_rig @ se3.exp(rows[:, None] * row_twist), height * float(np.linalg.norm(row_twist[3:]))
 
@@ -288,15 +278,14 @@ def _surfaces(rectangles: Sequence[Rectangle], T_world_cam: Array, nearest_m: Ar
     return rows.astype(np.float32)
 
 
-def tiles_that_see(table: RayTable, corners: Array, aside_rad: Array) -> NDArray[np.bool_]:
-    """Return the mask (M, R) of tiles that may see the rectangles with corners (R, 4, 3) in the camera frame.
+def tiles_that_see(table: RayTable, sides: Array, aside_rad: Array) -> NDArray[np.bool_]:
+    """Return the mask (M, R) of tiles that may see the rectangles with sides (R, 4, 3) of their pyramids.
 
     A tile sees none of what lies between the sides of a pyramid if its whole cone is beyond one of them. aside_rad
     (R,): largest angle between a ray and the direction from the camera's origin of what it meets.
     """
-    normals = sides_of(corners)
     # The least sine, of all four, of the angle from a side to the tile's axis.
-    sines = np.min([table.axes @ normals[:, side].T for side in range(4)], axis=0)
+    sines = np.min([table.axes @ sides[:, side].T for side in range(4)], axis=0)
     reach_rad = np.minimum(table.angles[:, None] + aside_rad, np.pi / 2)
     return np.asarray(sines >= -np.sin(reach_rad))
 
