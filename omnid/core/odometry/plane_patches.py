@@ -79,39 +79,17 @@ def plane_templates(
     anchor without an image.
     """
     templates = np.empty((len(pixels), window_px + 2, window_px + 2), np.float32)
-    H, heights = homographies(surfaces, T_curr_ref, model.baseline_m, model.baseline_m if upper else 0.0)
+    focal_px = model.cylinder.focal_px
+    points, normals = np.ascontiguousarray(surfaces[0]), _normals(surfaces, model.baseline_m)
     shift = np.ascontiguousarray(np.rint(predicted) - predicted)
+    height_m = model.baseline_m if upper else 0.0
     for key in np.unique(anchors).tolist():
         image, chosen = images[key], np.flatnonzero(anchors == key)
-        centres, focal_px = _padded(image, pixels), model.cylinder.focal_px
-        patch_kernels.sample(image.image, chosen, centres, H, heights, shift, focal_px, templates)
+        centres = _padded(image, pixels)
+        patch_kernels.sample(
+            image.image, chosen, centres, points, normals, T_curr_ref, height_m, shift, focal_px, templates
+        )
     return templates
-
-
-def homographies(
-    surfaces: tuple[Array, Array], T_curr_ref: Array, baseline_m: float, height_m: float
-) -> tuple[Array, Array]:
-    """Return the homographies (N, 3, 3) from rays of the current view to those of the keyframes; arguments as above.
-
-    The current viewpoint is height_m above the lower one. Both rays have their azimuth 0 at the patch. Also returns the
-    heights z / r (N, 2) of the patches in the keyframes, and in the current view.
-    """
-    (points, _), R = surfaces, T_curr_ref[:, :3, :3]
-    t = T_curr_ref[:, :3, 3] - (0.0, 0.0, height_m)
-    n = _turned(R, _normals(surfaces, baseline_m))
-    seen, back = _turned(R, points) + t, _turned(np.swapaxes(R, 1, 2), t)
-    scale = 1 + (n * t).sum(axis=1)
-    H = scale[:, None, None] * np.swapaxes(R, 1, 2) - back[:, :, None] * n[:, None]
-    r, seen_r = np.hypot(points[:, 0], points[:, 1]), np.hypot(seen[:, 0], seen[:, 1])
-    H = _azimuth_zero(points, r) @ H @ np.swapaxes(_azimuth_zero(seen, seen_r), 1, 2)
-    return np.ascontiguousarray(H), np.column_stack([points[:, 2] / r, seen[:, 2] / seen_r])
-
-
-def _azimuth_zero(points: Array, r: Array) -> Array:
-    """Return the rotations (N, 3, 3) about z that turn points (N, 3) at distances r (N,) from the axis to azimuth 0."""
-    turns, (c, s) = np.zeros((len(points), 3, 3)), points[:, :2].T / r
-    turns[:, 0, 0], turns[:, 0, 1], turns[:, 1, 0], turns[:, 1, 1], turns[:, 2, 2] = c, s, -s, c, 1.0
-    return turns
 
 
 def _normals(surfaces: tuple[Array, Array], baseline_m: float) -> Array:

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.pose_kernels import normal_equations
-from omnid.core.stereo.triangulation import triangulate, view, view_jacobian
+from omnid.core.odometry.pose_kernels import solve
+from omnid.core.stereo.triangulation import triangulate, view
 from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
@@ -123,27 +123,12 @@ def gauss_newton(
     """
     shared = SharedError.none(len(views)) if shared is None else shared
     size = 6 + len(shared.covariance)
-    prior, error = np.diag(np.full(size, DAMPING)), np.zeros(size)
+    prior = np.diag(np.full(size, DAMPING))
     prior[6:, 6:] += np.linalg.inv(shared.covariance)
-    # 1. The information of the views, at the start. An upper row that is not known has none.
-    J = view_jacobian(se3.apply(T, landmarks), model.cylinder, model.baseline_m) @ T[:3, :3]
-    S = J @ covariance @ np.swapaxes(J, 1, 2) + model.sigma_px**2 * np.eye(3) + (0.0 if noise is None else noise)
-    lower_only = np.isnan(views[:, 2])
-    S[lower_only, 2] = S[lower_only, :, 2] = 0.0
-    S[lower_only, 2, 2] = 1.0
-    P: Array = np.asarray(np.linalg.inv(S), float)
-    P[lower_only, 2, 2] = 0.0
-    # 2. Steps, until one is short; then the last equations hold after it as well.
-    H, g, squared = np.empty((size, size)), np.empty(size), np.empty(len(views))
-    for step_number in range(steps + 1):
-        normal_equations(
-            landmarks, views, P, shared.derivatives, model.camera, T, error[6:], KERNEL_WIDTH, H, g, squared
-        )
-        H += prior
-        if step_number == steps:
-            break
-        step = np.linalg.solve(H, g - prior @ error)
-        T, error[6:] = se3.exp(step[:6]) @ T, error[6:] + step[6:]
-        if np.abs(step[:6]).max() < converged:
-            break
-    return GaussNewtonResult(T, np.asarray(np.linalg.inv(H)[:6, :6], float), squared, error[6:])
+    S = np.tile(model.sigma_px**2 * np.eye(3), (len(views), 1, 1))
+    if noise is not None:
+        S += noise
+    T, error, squared, inverse = np.array(T), np.zeros(size - 6), np.empty(len(views)), np.empty((size, size))
+    inputs = (np.ascontiguousarray(each) for each in (landmarks, covariance, views, S, shared.derivatives))
+    solve(*inputs, prior, model.camera, KERNEL_WIDTH, steps, converged, T, error, squared, inverse)
+    return GaussNewtonResult(T, inverse[:6, :6], squared, error)

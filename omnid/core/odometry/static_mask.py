@@ -41,7 +41,7 @@ class StaticMask:
         self._edges_rad = azimuths_rad
         self._reference: tuple[Image, Flags, Array] | None = None  # panorama at half resolution, structure, pose
         self._streak: NDArray[np.uint8] | None = None
-        self._blocked: Flags | None = None  # None: nothing is known to be fixed
+        self._free: Flags | None = None  # (H, W) None: nothing is known to be fixed
 
     def observe(self, panorama: Image, T_odom_rect: Array) -> None:
         """Compare the panorama (H, W) at an accepted pose with the last one, once the view should have moved."""
@@ -60,7 +60,7 @@ class StaticMask:
 
     def without(self, usable: Flags) -> Flags:
         """Return usable (H, W) without what is known to be fixed, and a margin around it."""
-        return usable if self._blocked is None else usable & ~self._blocked
+        return usable if self._free is None else usable & self._free
 
     def _compare(self, half: Image, structured: Flags, moving: Flags, shape: tuple[int, ...]) -> None:
         """Count one comparison; columns (W/2,) that should not have moved keep their evidence."""
@@ -74,10 +74,10 @@ class StaticMask:
         margin = np.ones((2 * REACH_PX + 1, 2 * REACH_PX + 1), np.uint8)
         fixed = cv2.dilate((self._streak >= EVIDENCE).view(np.uint8), margin)
         # Mostly nothing is: a mask of the whole size would be made, and taken off each frame, for nothing.
-        self._blocked = None
+        self._free = None
         if fixed.any():
-            blocked = cv2.resize(fixed, shape[::-1], interpolation=cv2.INTER_NEAREST)
-            self._blocked = np.asarray(blocked, np.uint8).view(bool)
+            free = cv2.resize(1 - fixed, shape[::-1], interpolation=cv2.INTER_NEAREST)
+            self._free = np.asarray(free, np.uint8).view(bool)
 
 
 def expected_flow(T_before_after: Array, columns: int, edges_rad: tuple[float, float]) -> Array:
