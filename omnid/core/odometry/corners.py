@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.panorama import at_scale
-from omnid.core.odometry.tracking import KltSettings, flow, track
+from omnid.core.odometry.tracking import KltSettings, track
 from omnid.core.types.panorama import PaddedPanorama
 
 Array = NDArray[np.float64]
@@ -73,17 +73,15 @@ def pixels_in_upper(
     guess: Array,
     klt: KltSettings,
     spread_px: Array | float = 0.0,
-    *,
-    checked: bool = True,
 ) -> Array:
     """Return pixels (N, 2) in the upper panorama of points (N, 2) of the lower one; NaN without a match.
 
-    guess (N, 2) pixels. A match passes the forward-backward check, if checked, and lies in the guessed column within
-    CROSS_PX and spread_px (N,), below the point.
+    guess (N, 2) pixels. A match passes the forward-backward check, and lies in the guessed column within CROSS_PX and
+    spread_px (N,), below the point.
     """
     lower, upper = pair
     finite = np.flatnonzero(np.isfinite(guess).all(axis=1))
-    there, good = (track if checked else flow)(lower, upper, points[finite], guess[finite], klt)
+    there, good = track(lower, upper, points[finite], guess[finite], klt)
     shift = lower.apart(there[:, 0] - guess[finite, 0])
     largest = CROSS_PX + np.broadcast_to(spread_px, len(points))[finite]
     good &= (np.abs(shift) < largest) & (there[:, 1] > points[finite, 1])

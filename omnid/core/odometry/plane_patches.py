@@ -4,10 +4,10 @@ A wall seen aslant is stretched more on its near side than on its far side, and 
 window of 13 px the quadratic part of the map shifts a patch by some hundredths of a pixel, in the same direction for a
 whole wall, so that no number of landmarks averages it out: an affine map is not enough.
 
-A plane n . p = 1 is seen from a motion p' = R p + t as n' . p' = 1 + n' . t with n' = R n. A ray u' from the origin o'
-meets it at the scale (1 + n' . t - n' . o') / (n' . u'), so that the point in the first frame is in the direction of
-R^T ((1 + n' . t - n' . o') u' + (o' - t) (n' . u')): a linear map of u', the homography of the plane (Hartley and
-Zisserman 2004, 13.1), here between cylinders.
+A plane n . p = 1 is seen from a motion p' = R p + t as n' . (p' - t) = 1 with n' = R n. A ray o' + s u' of the current
+view meets it at s = (1 + n' . (t - o')) / (n' . u'), and the first view shows that point at R^T (o' + s u' - t): the
+homography of the plane (Hartley and Zisserman 2004, 13.1), here between cylinders. It is evaluated at nine pixels of a
+window; between them it is a quadratic polynomial to hundredths of a pixel.
 """
 
 from __future__ import annotations
@@ -215,12 +215,19 @@ def _fit(
 
 
 def align_rows(
-    pair: tuple[PaddedPanorama, PaddedPanorama], points: Array, near: Array, slopes: Array, model: StereoModel
+    pair: tuple[PaddedPanorama, PaddedPanorama],
+    points: Array,
+    near: Array,
+    slopes: Array,
+    model: StereoModel,
+    reach_px: int = REACH_PX,
+    spread_px: Array | float = 0.0,
 ) -> tuple[Array, Array]:
     """Align patches of the lower panorama at points (N, 2) with the upper one near pixels (N, 2), NaN where unknown.
 
-    slopes (N, 2) of the disparity. Returns the rows (N,), NaN where no patch fits, and their variances (N,) [px^2] by
-    the noise. Gain and offset of the two cameras may differ.
+    slopes (N, 2) of the disparity; reach_px: from the pixels; spread_px: standard deviations (N,) of their columns,
+    twice. Returns the rows (N,), NaN where no patch fits, and their variances (N,) [px^2] by the noise. Gain and offset
+    of the two cameras may differ.
     """
     known = np.flatnonzero(near[:, 1] > points[:, 1])
     pixels, predicted = points[known], near[known]
@@ -229,8 +236,10 @@ def align_rows(
     templates = plane_templates(
         {0: pair[0]}, one, pixels, (in_space, slopes[known]), still, model, predicted, upper=True
     )
-    found = align(templates, pair[1], predicted, one)
-    fits = found.found & (np.abs(found.pixels[:, 0] - predicted[:, 0]) < CROSS_PX)
+    found = align(templates, pair[1], predicted, one, reach_px)
+    largest_px = CROSS_PX + np.broadcast_to(spread_px, len(points))[known]
+    fits = found.found & (np.abs(found.pixels[:, 0] - predicted[:, 0]) < largest_px)
+    fits &= found.pixels[:, 1] > pixels[:, 1]
     aligned, variance = np.full(len(points), np.nan), np.zeros(len(points))
     aligned[known[fits]], variance[known[fits]] = found.pixels[fits, 1], found.covariance[fits, 1, 1]
     return aligned, variance

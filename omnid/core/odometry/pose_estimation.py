@@ -129,6 +129,22 @@ def gauss_newton(
     if noise is not None:
         S += noise
     T, error, squared, inverse = np.array(T), np.zeros(size - 6), np.empty(len(views)), np.empty((size, size))
-    inputs = (np.ascontiguousarray(each) for each in (landmarks, covariance, views, S, shared.derivatives))
-    solve(*inputs, prior, model.camera, KERNEL_WIDTH, steps, converged, T, error, squared, inverse)
+    landmarks, covariance, views = map(np.ascontiguousarray, (landmarks, covariance, views))
+    derivatives = np.ascontiguousarray(shared.derivatives)
+    solve(
+        landmarks,
+        covariance,
+        views,
+        S,
+        derivatives,
+        prior,
+        model.camera,
+        KERNEL_WIDTH,
+        steps,
+        converged,
+        T,
+        error,
+        squared,
+        inverse,
+    )
     return GaussNewtonResult(T, inverse[:6, :6], squared, error)

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.corners import pixels_in_upper
 from omnid.core.odometry.estimates import OdometryLimits, PoseEstimate, with_more_inliers
 from omnid.core.odometry.exposure_times import AssumedMotion, Exposure, ViewShift
 from omnid.core.odometry.local_map import LocalMap, Tracks
@@ -68,6 +67,8 @@ OUTLIER_COST = KERNEL_WIDTH**2 / 2 * math.log1p(OUTLIER_SQUARED / KERNEL_WIDTH**
 NEAR_RATIO = 0.5
 # Share of the predicted landmarks, tracked, below which other yaw angles are tried.
 GOOD_TRACKED_RATIO = 0.5
+# From where a landmark's depth puts it in the upper panorama: a depth that is farther off is an outlier.
+UPPER_REACH_PX = 3
 # Landmarks tracked from the last panorama at most, as a share of those wanted, others in the next frame: enough for the
 # start of the refinement, which aligns the patches of all landmarks.
 TRACKED_SHARE = 0.6
@@ -90,7 +91,6 @@ class PoseSearch:
     def __init__(self, local_map: LocalMap, model: StereoModel, limits: OdometryLimits, klt: KltSettings) -> None:
         self._map, self._model, self._limits = local_map, model, limits
         self._coarse_model = replace(model, sigma_px=COARSE_SIGMA_PX)
-        self._stereo_klt = replace(klt, levels=0)  # the predicted disparity is good to a few pixels
         # Number of landmarks that are tracked at most.
         self._tracked = max(2 * limits.good_inliers, round(TRACKED_SHARE * limits.features))
 
@@ -331,9 +331,8 @@ class PoseSearch:
         guess = tracks.pixels.copy()
         guess[:, 1] += tracks.predicted[:, 2] - tracks.predicted[:, 1]
         guess += shift.lower - shift.upper
-        # Not checked backward: a patch must fit there, and a wrong row is an outlier of the pose.
-        near = pixels_in_upper(pair, tracks.pixels, guess, self._stereo_klt, spread_px, checked=False)
-        rows, variance = align_rows(pair, tracks.pixels, near, slopes, self._model)
+        # A patch must fit there, and a wrong row is an outlier of the pose.
+        rows, variance = align_rows(pair, tracks.pixels, guess, slopes, self._model, UPPER_REACH_PX, spread_px)
         return np.column_stack([tracks.pixels, rows]), variance
 
     def _solve(
