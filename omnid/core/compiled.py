@@ -55,7 +55,7 @@ class Kernel(Generic[P, R]):
 
         if folder is not None:
             numba.config.CACHE_DIR = str(folder)  # where another module has imported numba before
-        types = eval(self.signature, {}, vars(numba.types))
+        types = eval(self.signature, dict(self.function.__globals__), vars(numba.types))
         names = inspect.signature(self.function).parameters
         wanted = [
             # Arrays that are not written may be read-only ones.

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.obstacles import column_kernels as kernels
-from omnid.core.obstacles.pair_views import DIRECTIONS, FOCAL_PX, UNITS, Views, WorkingPanoramas
+from omnid.core.obstacles.pair_views import DIRECTIONS, FOCAL_PX, UNITS, Views, WorkingPair, WorkingPanoramas
 from omnid.core.obstacles.surface_kernels import surface_evidence
-from omnid.core.types.panorama import PaddedPanorama
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -115,30 +114,25 @@ class Columns:
         and farthest; visible (H, W): pixels of a panorama that both cameras see."""
         self._baseline_m, self._plane, self._heights_m = baseline_m, plane, heights_m
         self._floor_slope = baseline_m / plane.height_m
-        self._panoramas = WorkingPanoramas(cylinder, (plane.a, plane.b), self._floor_slope)
+        self._panoramas = WorkingPanoramas(cylinder, (plane.a, plane.b), self._floor_slope, visible)
         self._height, self._row0 = self._panoramas.height, self._panoramas.row0
         self._plane_rows = self._panoramas.plane_rows
         self.at_1m = FOCAL_PX * baseline_m  # disparity
         self.bins = math.ceil(self.at_1m / ranges_m[0])
         self._first_bin = max(1, math.floor(self.at_1m / ranges_m[1]))
-        self._visible = self._panoramas.sized(visible * np.uint8(255)) > 127
+        self._visible = self._panoramas.visible
         in_view = self._visible[:, self._panoramas.shown].mean(axis=1) > 0.5
         self._first_row, self._last_row = _rows_in_use(in_view, round(self._row0))
-        self._live = self._visible * np.uint8(255)
         self._floor_bins, self._strips = self._made_floor_bins(), self._made_strips()
         self._offsets = self._made_offsets()
         self._leave_out_cut_planes()
         self._prior = np.exp(-np.arange(self.bins) / ADJACENT_PX).astype(np.float32) + np.float32(DISTANT_SHARE)
         self._compared = self._made_compared()
 
-    def evidence(self, lower: PaddedPanorama, upper: PaddedPanorama, lost: Flags | None = None) -> ColumnEvidence:
-        """Return the evidence of a pair; lost (H, W): pixels that are no evidence, None: all in view are."""
-        live = self._live
-        if lost is not None:
-            live = np.where(self._panoramas.sized(lost * np.uint8(255)) == 0, live, np.uint8(0))
-        surfaces, floor = self._panoramas.views(lower, upper, live)
-        ratios = self._floor(floor), self._surface(surfaces), self._level(floor)
-        return ColumnEvidence(*ratios)
+    def evidence(self, pair: WorkingPair) -> ColumnEvidence:
+        """Return the evidence of a pair."""
+        surfaces, floor = self._panoramas.views(pair)
+        return ColumnEvidence(self._floor(floor), self._surface(surfaces), self._level(floor))
 
     @property
     def panoramas(self) -> WorkingPanoramas:

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.obstacles.parameters import RayParameters
+from omnid.core.obstacles.ray_kernels import RayParameters
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -31,6 +31,14 @@ def sigma_of(values: Floats | Array) -> float:
     return MAD * float(np.median(np.abs(values)))
 
 
+def row_medians(values: Floats, chosen: Flags) -> Floats:
+    """Return the medians (N,) of the chosen values of each row of (N, D), inf where none is chosen."""
+    ordered = np.sort(np.where(chosen, values, np.float32(np.inf)), axis=1)
+    return np.asarray(
+        ordered[np.arange(len(values)), chosen.sum(axis=1) // 2 - (chosen.sum(axis=1) == values.shape[1])]
+    )
+
+
 def floor_steps(steps: Floats, near: Flags, known: Flags, p: RayParameters) -> tuple[Floats, float]:
     """Return the sigmas (N,) of steps (N, D) of the floor, and its rate of marks.
 
@@ -38,9 +46,10 @@ def floor_steps(steps: Floats, near: Flags, known: Flags, p: RayParameters) -> t
     """
     least = max(sigma_of(steps[near]), LEAST_STEP)
     sigmas, last = np.empty(len(steps)), least
+    of_rows, counts = MAD * row_medians(np.abs(steps), known), known.sum(axis=1)
     for n in range(len(steps)):
-        if known[n].sum() >= ROW_BINS:
-            last += ROW_SHARE * (sigma_of(steps[n, known[n]]) - last)
+        if counts[n] >= ROW_BINS:
+            last += ROW_SHARE * (of_rows[n] - last)
         sigmas[n] = last
     # The floor there, at most what it may be by the near floor.
     sigmas = np.clip(sigmas, max(0.5 * least, LEAST_STEP), 2.0 * least)
@@ -81,9 +90,9 @@ def _by_grey(greys: Floats, near: Flags, p: RayParameters) -> tuple[Floats, Flag
     sigma = max(sigma_of(greys[near] - grey), p.grey_share * grey)
     middles, sigmas = np.full(len(greys), grey, np.float32), np.full(len(greys), sigma, np.float32)
     is_known = near.sum(axis=1) > GREY_BINS
-    for n in np.flatnonzero(is_known):
-        middles[n] = np.median(greys[n, near[n]])
-        sigmas[n] = min(max(sigma_of(greys[n, near[n]] - middles[n]), p.near_grey_share * grey), sigma)
+    middles[is_known] = row_medians(greys[is_known], near[is_known])
+    of_rows = MAD * row_medians(np.abs(greys[is_known] - middles[is_known, None]), near[is_known])
+    sigmas[is_known] = np.clip(of_rows, p.near_grey_share * grey, sigma)
     z, sigmas = greys - middles[:, None], sigmas[:, None]
     scale = 1.5 * p.contrast * max(grey, 20.0)
     anything = np.exp(-np.abs(z) / scale) / (2 * scale)

@@ -1,6 +1,7 @@
 """The grid of a run: what is known of cells of floor around the base, by the rays of all pairs.
 
-Cells of 5 cm in odom hold the log-odds L of a thing that stands, hangs or steps there, and whether they are known.
+Cells of 5 cm, in the axes of odom and around the cell of the base, hold the log-odds L of a thing that stands, hangs or
+steps there, and whether they are known.
 1. Evidence of a pair: e = r log [q / (1 - q)] / [q_0 / (1 - q_0)] of each bin, q the probability that the first thing
    is there where the ray comes with the probability r; q_0 its prior. So the prior of the rays does not count twice.
 2. Errors of pairs from one place are alike: noise with the correlation rho, that falls to 0 over 5 cm of way. Of a pair
@@ -34,15 +35,14 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
+Indices = NDArray[np.intp]
 
 CELL_M: Final = 0.05
-CELLS: Final = 256
-REACH_CELLS: Final = 90  # on either side of the base: what a pair changes, and how far the ring goes
-MARGIN_CELLS: Final = REACH_CELLS + 2  # nearer to the border than this, the square is moved
-OWN_CELLS: Final = 3  # on either side of the base that nothing else can be in
+REACH_CELLS: Final = 90  # of the grid, on either side of the cell of the base
+SIDE: Final = 2 * REACH_CELLS + 1
+OWN: Final = slice(REACH_CELLS - 3, REACH_CELLS + 4)  # cells that nothing but the base can be in
 CROSS: Final = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
 SQUARE: Final = np.ones((3, 3), np.uint8)
-NEVER_NS: Final = -(1 << 62)
 SPECK_CELLS: Final = 4
 OPEN_SHARE: Final = 0.9  # of the longest range, from which on a direction is open: few pairs show the last cells
 
@@ -63,21 +63,20 @@ def unknown_ring() -> GridRing:
 
 
 class ObstacleGrid:
-    """Log-odds of cells, in a square that follows the base."""
+    """Cells (SIDE, SIDE) around that of the base, with which they move; row 0 at the lowest y."""
 
     def __init__(self, at_1m: float, max_range_m: float, parameters: GridParameters) -> None:
         self._p, self._at_1m = parameters, at_1m
         self._max_range_m = min(max_range_m, REACH_CELLS * CELL_M)
-        self._azimuths = azimuths()
         self._T_rect_base = np.eye(4)
-        self._corner: NDArray[np.int64] | None = None  # of the square, in cells of odom
-        self._eye_m, self._near_m = np.zeros(2), 0.0  # viewpoint in odom, and the nearest floor in view
+        self._cell: NDArray[np.int64] | None = None  # of the base, in odom
+        self._eye, self._near_m = np.zeros(2), 0.0  # viewpoint in cells of the grid, and the nearest floor in view
         self._forget()
 
     def viewpoint(self, T_odom_base: Array) -> Array:
         """Return the pose (4, 4) of axes parallel to the base's at the viewpoint."""
         T = np.eye(4)
-        T[:2, 3] = self._T_base_rect[:2, 3]
+        T[:2, 3] = se3.inverse(self._T_rect_base)[:2, 3]
         return np.asarray(T_odom_base @ T)
 
     def set_floor(self, T_rect_base: Array) -> None:
@@ -89,113 +88,133 @@ class ObstacleGrid:
 
         No pair would show these again, and a base whose odometry is lost stops, so that they are still about there.
         """
-        if self._corner is None:
+        if self._cell is None:
             return
-        odds, corner, eye = self.odds, self._corner, self._eye_m / CELL_M
-        y, x = np.indices((CELLS, CELLS)) + 0.5
-        kept = (np.hypot(x + corner[0] - eye[0], y + corner[1] - eye[1]) * CELL_M < self._near_m) & (odds > 0)
+        cell, odds = self._cell, self.odds
+        kept = (self._ranges_m(self._eye) < self._near_m) & (odds > 0)
         self._forget()
-        self.odds[kept], self.known[kept], self._corner = odds[kept], 1, corner
+        self.odds[kept], self._known[kept], self._cell = odds[kept], 1, cell
 
     def _forget(self) -> None:
         """Forget everything."""
-        self.odds = np.full((CELLS, CELLS), self._p.prior, np.float32)
-        self._before = np.zeros((CELLS, CELLS), np.float32)
-        self._shown = np.zeros((CELLS, CELLS), np.float32)
-        self._free_ns = np.full((CELLS, CELLS), NEVER_NS, np.int64)
-        self._past_views = np.zeros((CELLS, CELLS), np.float32)
-        self.known = np.zeros((CELLS, CELLS), np.uint8)
-        self._floor_was_behind = np.zeros((CELLS, CELLS), np.uint8)
-        self._corner = None
-        self._place_m: Array | None = None
-        self._last_ns: int | None = None
+        self._empty = np.array([self._p.prior, 0, 0, 0, 0, 0, np.inf], np.float32)
+        self._layers = np.tile(self._empty[:, None, None], (1, SIDE, SIDE))
+        # Log-odds of a thing; evidence of the pair before; mean of what single pairs show; whether a cell is known;
+        # views past it; whether the last pair saw floor behind it; time since it was free [s].
+        self.odds, self._before, self._shown, self._known, self._past_views, self._was_past, self._free_s = self._layers
+        self._cell = None
+        self._last: tuple[int, Array] | None = None  # stamp and place [m] of the pair before
         self._carry = 0.0
 
     def update(self, stamp_ns: int, T_odom_base: Array, belief: RayBelief) -> GridRing:
         """Add a pair, whose base has the planar pose T_odom_base (4, 4); return what is known."""
-        p = self._p
-        is_first = self._last_ns is None
-        passed_s = 0.0 if self._last_ns is None else max(stamp_ns - self._last_ns, 0) * 1e-9
-        self._last_ns = stamp_ns
-        place = T_odom_base[:2, 3] / CELL_M
-        corner = self._follow(place)
-        at = np.floor(place).astype(np.int64) - corner
-        rows, columns = (slice(int(n) - REACH_CELLS, int(n) + REACH_CELLS + 1) for n in (at[1], at[0]))
-        way_m = math.inf if self._place_m is None else math.dist(T_odom_base[:2, 3], self._place_m)
-        self._place_m = T_odom_base[:2, 3].copy()
+        p, place_m, yaw = self._p, T_odom_base[:2, 3].copy(), float(se3.yaw(T_odom_base))
+        passed_s, way_m = 0.0, math.inf
+        if self._last is not None:
+            passed_s, way_m = max(stamp_ns - self._last[0], 0) * 1e-9, math.dist(place_m, self._last[1])
+        is_first, self._last = self._last is None, (stamp_ns, place_m)
         rho = p.same_place * max(1.0 - way_m / p.apart_m, 0.0)
+        self._follow(place_m)
+        self._eye, self._near_m = self._in_cells(self.viewpoint(T_odom_base)[:2, 3]), float(belief.ends_m[0])
         # 1. Evidence and state of each cell.
-        first_m = np.asarray(CELL_M * (corner + (columns.start, rows.start) + 0.5), float)
-        found, states = self._gathered(T_odom_base, first_m, belief)
-        in_view, past = states == kernels.IN_VIEW, states == kernels.SEEN_PAST
+        found, states = self._gathered(T_odom_base, belief)
+        in_view, past, hidden = (states == one for one in (kernels.IN_VIEW, kernels.SEEN_PAST, kernels.HIDDEN))
         observed = in_view & (found[kernels.VIEW] > 0.5)
         # 2. What is new of it.
-        odds, before = self.odds[rows, columns], self._before[rows, columns]
-        change = found[kernels.RATIO] - np.float32(rho) * before
-        keep = np.float32(1 - (1 - rho) / p.views)
-        updated = np.clip(p.prior + keep * (odds - p.prior) + change, p.arrival, p.most)
-        odds[in_view] = updated[in_view]
-        self._before[:] = 0
-        self._before[rows, columns] = np.where(in_view, found[kernels.RATIO], 0)
+        keep, change = 1 - (1 - rho) / p.views, found[kernels.RATIO] - np.float32(rho) * self._before
+        updated = np.clip(p.prior + np.float32(keep) * (self.odds - p.prior) + change, p.arrival, p.most)
+        self.odds[:] = np.where(in_view, updated, self.odds)
+        self._before[:] = np.where(in_view, found[kernels.RATIO], 0)
         shown = cv2.blur(found[kernels.SURFACE], (5, 5))
-        self._shown[rows, columns] += np.where(
-            in_view, np.float32(p.shown_rate * (1 - rho)) * (shown - self._shown[rows, columns]), 0
-        )
-        # 3. What is known: seen, or seen past; who comes where nobody sees.
-        every = np.zeros((CELLS, CELLS), np.uint8)
-        every[rows, columns] = states
-        watched = np.zeros((CELLS, CELLS), np.uint8)
-        watched[rows, columns] = observed | past | (states == kernels.MOSTLY_PAST)
-        known = self.known[rows, columns]
-        known[observed] = 1
-        # What was hidden from the start may look like floor in some pairs: it is known after so many views past it.
-        past_views = self._past_views[rows, columns]
-        past_views[past] += np.float32(1 - rho)
-        past_views[observed] = p.views
-        past_views[(states == kernels.HIDDEN) & (past_views < p.views)] = 0.0
-        known[past & (past_views >= p.views)] = 1
-        self._eye_m, self._near_m = self.viewpoint(T_odom_base)[:2, 3], float(belief.ends_m[0])
-        eye = self._eye_m / CELL_M - corner
-        yaw = float(se3.yaw(T_odom_base))
+        self._shown += np.where(in_view, np.float32(p.shown_rate * (1 - rho)) * (shown - self._shown), 0)
+        # 3. What is known: seen, or seen past. What was hidden from the start may look like floor in some pairs: it is
+        #    known after so many views past it.
+        self._past_views[past] += np.float32(1 - rho)
+        self._past_views[observed] = p.views
+        self._past_views[hidden & (self._past_views < p.views)] = 0
+        self._known[observed | (past & (self._past_views >= p.views))] = 1
         if is_first:
-            self._assume_free(eye, yaw, belief)
+            self._assume_free(yaw, belief)
         # 4. What hides the nearest floor in view, behind which floor was seen before, may stand anywhere before it.
-        #    What hides it from the start may stand where it did.
-        flooded = np.zeros((CELLS, CELLS), np.uint8)
-        kernels.too_near(self._taken(), every, flooded, np.array([*eye, CELL_M]), self._azimuths + yaw, self._near_m)
-        flooded = _without_specks(flooded & self._floor_was_behind)
-        watched |= ((every == kernels.HIDDEN) & (self.known > 0)).view(np.uint8)
+        #    What hides it from the start may stand where it did. And who comes where nobody sees.
+        flooded = self._flooded(hidden, yaw)
         if not is_first:
+            watched = observed | past | (states == kernels.MOSTLY_PAST) | (hidden & (self._known > 0))
             self._who_comes(passed_s, watched)
-        self._floor_was_behind[:] = every == kernels.SEEN_PAST
-        self.known[flooded > 0] = 0
+        self._was_past[:] = past
+        self._known[flooded > 0] = 0
         # 5. Who has come, and the ring.
-        shows = np.zeros((CELLS, CELLS), np.uint8)
-        shows[rows, columns] = in_view & (found[kernels.RATIO] > p.comes)
-        arrivals = self._arrivals(stamp_ns, eye, yaw, shows, flooded)
-        own_rows, own_columns = (slice(int(n) - OWN_CELLS, int(n) + OWN_CELLS + 1) for n in (at[1], at[0]))
-        for layer, value in ((self.odds, p.arrival), (self.known, 1), (self._shown, 0.0)):
-            layer[own_rows, own_columns] = value
-        hit, sigma, free = np.empty((3, len(self._azimuths)))
-        view = np.array([*(place - corner), self._max_range_m, CELL_M])
-        kernels.ways(self._taken(), view, self._azimuths + yaw, p.risk, hit, sigma, free)
-        free = np.minimum(free, np.nan_to_num(hit, nan=np.inf))
-        hit[np.isnan(hit) & (free >= OPEN_SHARE * self._max_range_m)] = np.inf
-        return GridRing(hit.astype(np.float32), sigma.astype(np.float32), free.astype(np.float32), arrivals)
+        arrivals = self._arrivals(passed_s, yaw, in_view & (found[kernels.RATIO] > p.comes), flooded)
+        self.odds[OWN, OWN], self._known[OWN, OWN], self._shown[OWN, OWN] = p.arrival, 1, 0
+        return GridRing(*self._ways(self._in_cells(place_m), yaw), arrivals)
 
-    def _arrivals(self, stamp_ns: int, eye: Array, yaw_rad: float, shows: Bytes, flooded: Bytes) -> Arrivals:
+    def is_floor(self, T_odom_base: Array, ranges_m: Array, directions: int) -> Flags:
+        """Return the bins (N, directions) about the viewpoint, at ranges (N,), whose cells are floor by all pairs."""
+        if self._cell is None:
+            return np.zeros((len(ranges_m), directions), bool)
+        T = T_odom_base @ se3.inverse(self._T_rect_base)
+        azimuth = math.pi - (np.arange(directions) + 0.5) * (math.tau / directions)
+        unit = np.column_stack([np.cos(azimuth), np.sin(azimuth)]) @ T[:2, :2].T / CELL_M
+        # OpenCV has integers at the middles of cells.
+        at = (self._in_cells(T[:2, 3]) - 0.5)[:, None, None] + ranges_m[:, None] * unit.T[:, None]
+        x, y = np.asarray(at, np.float32)
+        floor = ((self._known > 0) & (self.odds < self._p.floor)).view(np.uint8)
+        return np.asarray(cv2.remap(floor, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT) > 0)
+
+    def _ways(self, place: Array, yaw_rad: float) -> tuple[Floats, Floats, Floats]:
+        """Return the range of the first thing from a place [cells] in each sector, its sigma, and the free way [m]."""
+        ranges_m, taken = self._taken_along(place, yaw_rad)
+        # 1. Free is up to where the probability that a thing stands on the way is at most the risk.
+        has_ended = 1 - np.cumprod(1 - np.minimum(taken, 1), axis=1) > self._p.risk
+        free_m = np.where(has_ended.any(axis=1), has_ended.argmax(axis=1) * CELL_M, self._max_range_m)
+        # 2. The first cells in a row in which a thing is more likely than not.
+        is_thing = (taken > 0.5) & (taken <= 1)
+        has_passed = np.logical_or.accumulate(is_thing, axis=1) & ~is_thing
+        weight = np.where(is_thing & ~np.logical_or.accumulate(has_passed, axis=1), taken, 0.0)
+        total = weight.sum(axis=1)
+        with np.errstate(invalid="ignore"):
+            hit_m = weight @ ranges_m / total
+            variance = (weight * (ranges_m - hit_m[:, None]) ** 2).sum(axis=1) / total
+        free_m = np.minimum(free_m, np.nan_to_num(hit_m, nan=np.inf))
+        hit_m[np.isnan(hit_m) & (free_m >= OPEN_SHARE * self._max_range_m)] = np.inf
+        sigma_m = np.sqrt(variance + CELL_M**2 / 12)
+        return hit_m.astype(np.float32), sigma_m.astype(np.float32), free_m.astype(np.float32)
+
+    def _flooded(self, hidden: Flags, yaw_rad: float) -> Bytes:
+        """Return the cells (1) before the nearest floor in view, hidden (SIDE, SIDE) where it was seen, of ways on
+        which nothing is known that hides it."""
+        flooded = np.zeros((SIDE, SIDE), np.uint8)
+        candidates = hidden & (self._was_past > 0)
+        if not candidates.any():
+            return flooded
+        ranges_m, taken = self._taken_along(self._eye, yaw_rad)
+        explained = ((taken > 0.3) & (taken <= 1) & (ranges_m < self._near_m + 3 * CELL_M)).any(axis=1)
+        explained = np.any([np.roll(explained, shift) for shift in range(-2, 3)], axis=0)
+        rows, columns = (of[~explained][:, ranges_m < self._near_m] for of in _along(self._eye, yaw_rad))
+        flooded[rows, columns] = candidates[rows, columns]
+        return _without_specks(flooded)
+
+    def _arrivals(self, passed_s: float, yaw_rad: float, shows: Flags, flooded: Bytes) -> Arrivals:
         """Return who has come onto floor that was free a short while ago.
 
-        shows (CELLS, CELLS): 1 where this pair shows a thing; flooded: where one may that hides the nearest floor.
+        shows (SIDE, SIDE): where this pair shows a thing; flooded: 1 where one may that hides the nearest floor.
         """
         p, taken = self._p, self._taken()
-        lately = (stamp_ns - self._free_ns < p.lately_s * 1e9).view(np.uint8)
-        self._free_ns[taken < p.was_free] = stamp_ns
+        self._free_s += np.float32(passed_s)
+        lately = self._free_s < p.lately_s
+        self._free_s[taken < p.was_free] = 0
         # Who comes is wider than a speck of noise.
-        came = ((taken > 0.5) & (taken <= 1.0)).view(np.uint8) | flooded
-        came |= np.asarray(cv2.morphologyEx(shows, cv2.MORPH_OPEN, SQUARE), np.uint8)
-        ranges_m, view = np.empty(SECTORS), np.array([*eye, self._max_range_m, CELL_M])
-        kernels.first_changed(came, lately, view, self._azimuths + yaw_rad, p.behind_m, self._at_1m, ranges_m)
+        came = ((taken > 0.5) & (taken <= 1)) | (flooded > 0)
+        came |= cv2.morphologyEx(shows.view(np.uint8), cv2.MORPH_OPEN, SQUARE) > 0
+        # The first one of each direction, before floor that was free, by the noise of stereo and more.
+        rays, step_m = _along(self._eye, yaw_rad), CELL_M * (np.arange(REACH_CELLS) + 0.5)
+        first = came[rays].argmax(axis=1)
+        ranges_m = np.where(came[rays].any(axis=1), step_m[first], np.nan)
+        before_m = p.behind_m + 1.5 * ranges_m**2 / self._at_1m
+        end = np.nan_to_num(first + np.ceil(before_m / CELL_M), nan=SIDE).astype(np.intp)
+        others = np.cumsum(np.pad(~lately[rays], ((0, 0), (1, 0))), axis=1)
+        every = np.arange(SECTORS)
+        ranges_m[(end > REACH_CELLS) | (others[every, np.minimum(end, REACH_CELLS)] > others[every, first])] = np.nan
         for run in _runs(np.isfinite(ranges_m)):
             # Who hides the nearest floor in view stands next to the base.
             range_m = float(ranges_m[run].mean())
@@ -207,7 +226,7 @@ class ObstacleGrid:
         ranges_m[is_nearer] = self._near_m
         return Arrivals(ranges_m.astype(np.float32), sigma_m.astype(np.float32), is_nearer)
 
-    def _assume_free(self, eye: Array, yaw_rad: float, belief: RayBelief) -> None:
+    def _assume_free(self, yaw_rad: float, belief: RayBelief) -> None:
         """Take the floor too near to be seen for free at the start, but where something hides the nearest in view.
 
         That may stand anywhere before the floor that it hides. Nothing is assumed where no floor is in view, in wider
@@ -219,13 +238,12 @@ class ObstacleGrid:
             if len(run) * math.tau / count >= p.strut_rad:
                 reach_m[run] = 0.0
         reach_m = np.min([np.roll(reach_m, shift) for shift in range(-3, 4)], axis=0)
-        y, x = np.indices((CELLS, CELLS)) + 0.5
-        x, y = x - eye[0], y - eye[1]
+        y, x = np.indices((SIDE, SIDE)) + 0.5 - self._eye[::-1, None, None]
         T = self._T_rect_base
         turn = math.atan2(T[1, 0], T[0, 0]) - yaw_rad
         at = np.floor((math.pi - np.arctan2(y, x) - turn) / math.tau * count).astype(np.intp) % count
-        free = np.hypot(x, y) * CELL_M < reach_m[at]
-        self.known[free], self._past_views[free] = 1, p.views
+        free = self._ranges_m(self._eye) < reach_m[at]
+        self._known[free], self._past_views[free] = 1, p.views
         self.odds[free & (self.odds < 0)] = p.arrival
 
     def _hides(self, belief: RayBelief) -> Flags:
@@ -235,106 +253,91 @@ class ObstacleGrid:
         three = (np.roll(hidden, 1) + hidden + np.roll(hidden, -1)) / 3
         return np.asarray((three > self._p.hidden) & (belief.view[:, 0] > 0))
 
-    def is_floor(self, T_odom_base: Array, ranges_m: Array, directions: int) -> Flags:
-        """Return the bins (N, directions) about the viewpoint, at ranges (N,), whose cells are floor by all pairs."""
-        if self._corner is None:
-            return np.zeros((len(ranges_m), directions), bool)
-        T = T_odom_base @ self._T_base_rect
-        azimuth = math.pi - (np.arange(directions) + 0.5) * (math.tau / directions)
-        unit = np.column_stack([np.cos(azimuth), np.sin(azimuth)]) @ T[:2, :2].T
-        cells = np.floor((T[:2, 3] + ranges_m[:, None, None] * unit) / CELL_M).astype(np.intp) - self._corner
-        x, y = np.clip(cells[..., 0], 0, CELLS - 1), np.clip(cells[..., 1], 0, CELLS - 1)
-        return np.asarray((self.known[y, x] > 0) & (self.odds[y, x] < self._p.floor))
-
     def _taken(self) -> Floats:
         """Return the probability of a thing in cells, 2 where nothing is known."""
         p = self._p
         hanging = np.clip(p.shown_weight * (self._shown - p.shown_least), -9.0, 6.0) + np.float32(p.hanging)
-        odds = np.maximum(self.odds, hanging)
-        taken = 1 / (1 + np.exp(-odds))
-        return np.where((self.known > 0) | (self.odds > 0), taken, np.float32(2)).astype(np.float32)
+        taken = 1 / (1 + np.exp(-np.maximum(self.odds, hanging)))
+        return np.where((self._known > 0) | (self.odds > 0), taken, np.float32(2))
 
-    def _who_comes(self, passed_s: float, watched: Bytes) -> None:
+    def _taken_along(self, place: Array, yaw_rad: float) -> tuple[Array, Array]:
+        """Return ranges (R,) [m] from a place [cells], and the probability (SECTORS, R) of a thing there."""
+        count = round(self._max_range_m / CELL_M)
+        taken = self._taken()[_along(place, yaw_rad)][:, :count]
+        return CELL_M * np.linspace(0.5, count - 0.5, count), np.asarray(taken, np.float64)
+
+    def _who_comes(self, passed_s: float, watched: Flags) -> None:
         """Spread what is not known through cells that nobody sees."""
         p = self._p
-        open_ = (1 - watched) & (self.odds <= 0)
-        person = np.ones((p.person_cells, p.person_cells), np.uint8)
-        wide = np.asarray(cv2.morphologyEx(open_, cv2.MORPH_OPEN, person), np.uint8)
-        source = wide & (1 - self.known)
         self._carry += p.walk_mps * passed_s / CELL_M
         steps = int(self._carry)
         self._carry -= steps
-        for step in range(min(steps, CELLS)):
-            source = np.asarray(cv2.dilate(source, CROSS if step % 2 else SQUARE), np.uint8) & wide
-        self.known[source > 0] = 0
-
-    @property
-    def _T_base_rect(self) -> Array:
-        return se3.inverse(self._T_rect_base)
-
-    def _gathered(self, T_odom_base: Array, first_m: Array, belief: RayBelief) -> tuple[Floats, Bytes]:
-        """Return evidence (3, N, N) and states (N, N) of the cells in view, the first with its middle at first_m."""
-        p = self._p
-        T_rect_odom = self._T_rect_base @ se3.inverse(T_odom_base)
-        x, y = (T_rect_odom @ np.array([first_m[0], first_m[1], 0.0, 1.0]))[:2]
-        c, s = T_rect_odom[0, 0], T_rect_odom[1, 0]
-        norm = math.hypot(c, s)
-        side = 2 * REACH_CELLS + 1
-        cells, states = np.empty((3, side, side), np.float32), np.empty((side, side), np.uint8)
-        hides = self._hides(belief)
-        near = np.where(belief.view[:, 0] > 0, np.where(hides, 2, 1), 0).astype(np.uint8)
-        kernels.gather(
-            belief.ratios,
-            belief.view,
-            belief.surface,
-            near,
-            belief.ends_m,
-            self._at_1m,
-            np.array([x, y, c / norm, s / norm]),
-            CELL_M,
-            float(belief.ends_m[-2]),
-            p.thin_m,
-            cells,
-            states,
+        person = np.ones((p.person_cells, p.person_cells), np.uint8)
+        wide = np.asarray(
+            cv2.morphologyEx((~watched & (self.odds <= 0)).view(np.uint8), cv2.MORPH_OPEN, person), np.uint8
         )
+        source = wide & (self._known == 0)
+        for step in range(min(steps, SIDE)):
+            source = np.asarray(cv2.dilate(source, CROSS if step % 2 else SQUARE), np.uint8) & wide
+        self._known[source > 0] = 0
+
+    def _gathered(self, T_odom_base: Array, belief: RayBelief) -> tuple[Floats, Bytes]:
+        """Return evidence (3, SIDE, SIDE) and states (SIDE, SIDE) of the cells."""
+        T = self._T_rect_base @ se3.inverse(T_odom_base)
+        turn = math.atan2(T[1, 0], T[0, 0])
+        y, x = np.indices((SIDE, SIDE), np.float32) + np.float32(0.5) - self._eye[::-1, None, None].astype(np.float32)
+        directions = ((math.pi - turn) - np.arctan2(y, x)) * (len(belief.first) / math.tau) - 0.5
+        cells, states = np.empty((3, SIDE, SIDE), np.float32), np.empty((SIDE, SIDE), np.uint8)
+        near = np.where(belief.view[:, 0] > 0, np.where(self._hides(belief), 2, 1), 0).astype(np.uint8)
+        reach_m = min(float(belief.ends_m[-2]), self._max_range_m)
+        of_belief, of_cells = (
+            (belief.ratios, belief.view, belief.surface, near, belief.ends_m),
+            (np.hypot(x, y) * np.float32(CELL_M), directions),
+        )
+        kernels.gather(*of_belief, self._at_1m, *of_cells, CELL_M, reach_m, self._p.thin_m, cells, states)
         return cells, states
 
-    def _follow(self, place: Array) -> NDArray[np.int64]:
-        """Move the square where the base comes near its border; return its corner, in cells of odom."""
-        cell = np.floor(place).astype(np.int64)
-        if self._corner is None:
-            self._corner = cell - CELLS // 2
-            return self._corner
-        at = cell - self._corner
-        if ((at >= MARGIN_CELLS) & (at < CELLS - MARGIN_CELLS)).all():
-            return self._corner
-        x, y = np.clip(at - CELLS // 2, -CELLS, CELLS).tolist()
-        gone = np.ones((CELLS, CELLS), bool)
-        gone[max(-y, 0) : CELLS - max(y, 0), max(-x, 0) : CELLS - max(x, 0)] = False
-        for layer, unknown in (
-            (self.odds, self._p.prior),
-            (self._before, 0),
-            (self._shown, 0),
-            (self.known, 0),
-            (self._past_views, 0),
-            (self._floor_was_behind, 0),
-            (self._free_ns, NEVER_NS),
-        ):
-            layer[:] = np.roll(layer, (-y, -x), axis=(0, 1))
-            layer[gone] = unknown
-        self._corner = self._corner + np.array([x, y])
-        return self._corner
+    def _follow(self, place_m: Array) -> None:
+        """Move the cells along with the base; those that come into the grid are unknown."""
+        cell = np.floor(place_m / CELL_M).astype(np.int64)
+        x, y = np.clip(cell - cell if self._cell is None else cell - self._cell, -SIDE, SIDE).tolist()
+        self._cell = cell
+        if x or y:
+            self._layers[:] = np.roll(self._layers, (-y, -x), axis=(1, 2))
+            new = np.ones((SIDE, SIDE), bool)
+            new[max(-y, 0) : SIDE - max(y, 0), max(-x, 0) : SIDE - max(x, 0)] = False
+            self._layers[:, new] = self._empty[:, None]
+
+    def _in_cells(self, place_m: Array) -> Array:
+        """Return a place (2,) in odom in cells of the grid."""
+        assert self._cell is not None
+        return np.asarray(place_m / CELL_M - self._cell + REACH_CELLS)
+
+    def _ranges_m(self, place: Array) -> Array:
+        """Return the distances (SIDE, SIDE) of cells from a place [cells]."""
+        y, x = np.indices((SIDE, SIDE)) + 0.5 - place[::-1, None, None]
+        return np.asarray(np.hypot(x, y) * CELL_M)
+
+
+def _along(place: Array, yaw_rad: float) -> tuple[Indices, Indices]:
+    """Return rows and columns (SECTORS, REACH_CELLS) of cells along the sectors, from a place [cells], a cell apart."""
+    angle, steps = azimuths() + yaw_rad, np.arange(REACH_CELLS) + 0.5
+    unit = np.column_stack([np.sin(angle), np.cos(angle)])
+    rows, columns = np.floor(place[::-1] + steps[:, None, None] * unit).astype(np.intp).T
+    return np.clip(rows, 0, SIDE - 1), np.clip(columns, 0, SIDE - 1)
 
 
 def _without_specks(flags: Bytes) -> Bytes:
     """Return flags (H, W) without patches of few cells, as what hides floor from the viewpoint hides a long way."""
+    if not flags.any():
+        return flags
     _, labels, of_patch, _ = cv2.connectedComponentsWithStats(flags)
     is_kept = of_patch[:, cv2.CC_STAT_AREA] > SPECK_CELLS
     is_kept[0] = False
     return np.asarray(is_kept[labels], np.uint8)
 
 
-def _runs(flags: Flags) -> list[NDArray[np.intp]]:
+def _runs(flags: Flags) -> list[Indices]:
     """Return the runs of directions (D,) of a turn that are set."""
     if flags.all() or not flags.any():
         return [np.flatnonzero(flags)] if flags.any() else []

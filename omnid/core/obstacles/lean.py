@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.obstacles.pair_views import DIRECTIONS, WorkingPanoramas
+from omnid.core.obstacles.pair_views import DIRECTIONS, WorkingPair
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -41,10 +41,8 @@ class Lean:
         """Standard deviations (2,) of the tilt [rad]."""
         return np.asarray(np.sqrt(np.diag(self._P)))
 
-    def observe(
-        self, panoramas: WorkingPanoramas, lower: Floats, upper: Floats, known: Flags, px_per_rad: float, used: Array
-    ) -> None:
-        """Take a pair: panoramas (H, DIRECTIONS) in the working size over a plane with the tilt `used` (2,).
+    def observe(self, pair: WorkingPair, plane_rows: Floats, known: Flags, px_per_rad: float, used: Array) -> None:
+        """Take a pair over a plane with the tilt `used` (2,); plane_rows (H,): row of the upper view that shows a row.
 
         known (H, DIRECTIONS): rows of the lower one that show near floor; px_per_rad: change of the disparity by tilt.
         """
@@ -52,22 +50,26 @@ class Lean:
         rows = np.flatnonzero(known.any(axis=1))
         if not len(rows):
             return
-        # 1. Difference and gradient of both views on the plane.
-        one, two = (image - cv2.blur(image, (1, BAND_ROWS)) for image in (lower, upper))
+        # 1. Difference and gradient of both views on the plane, of the rows that are needed.
+        at, upto = plane_rows[rows], len(pair.upper)
+        begin, end = max(int(at[0]) - BAND_ROWS, 0), min(int(at[-1]) + 2 + BAND_ROWS, upto)
+        one, two = (
+            image - cv2.blur(image, (1, BAND_ROWS))
+            for image in (pair.lower[rows[0] : rows[-1] + 1], pair.upper[begin:end])
+        )
         slope = (np.roll(two, -1, 0) - np.roll(two, 1, 0)) / 2
-        at = panoramas.plane_rows[rows]
-        above = np.minimum(np.floor(at).astype(int), len(two) - 2)
-        share = (at - above)[:, None].astype(np.float32)
+        above = np.minimum(np.floor(at).astype(int), upto - 2) - begin
+        share = (at - np.floor(at))[:, None].astype(np.float32)
         there = two[above] * (1 - share) + two[above + 1] * share
         gradient = slope[above] * (1 - share) + slope[above + 1] * share
-        difference, counts = one[rows] - there, known[rows]
+        difference, counts = one[rows - rows[0]] - there, known[rows]
         # 2. Normal equations of the two slopes; single pixels that differ by much count little.
         sigma = max(1.48 * float(np.median(np.abs(difference[counts]))), 0.3)
         weight = counts / (1.0 + (difference / (1.5 * sigma)) ** 2)
         squares, products = (weight * gradient * gradient).sum(0), (weight * gradient * difference).sum(0)
         # The gradient has noise of its own: without that share a plain floor would seem to measure something.
-        share = max(1.0 - float(weight.sum()) * sigma**2 / 4 / max(float(squares.sum()), 1e-6), 0.0)
-        squares, products = share * share * squares, share * products
+        textured = max(1.0 - float(weight.sum()) * sigma**2 / 4 / max(float(squares.sum()), 1e-6), 0.0)
+        squares, products = textured * textured * squares, textured * products
         scale = px_per_rad / (sigma * math.sqrt(ALIKE))
         H = scale**2 * np.einsum("u,ui,uj->ij", squares, self._way, self._way)
         y = scale**2 / px_per_rad * (self._way.T @ products)

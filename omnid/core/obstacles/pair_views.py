@@ -20,6 +20,7 @@ from omnid.core.types.panorama import PaddedPanorama
 
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
+Flags = NDArray[np.bool_]
 
 DIRECTIONS: Final = 480  # columns of the working panorama, 0.75 degrees, because a pole of 3 cm is as wide at 2 m
 FOCAL_PX: Final = 139.0  # rows of the working panorama in a radian, because images of 512 px have that resolution
@@ -47,6 +48,16 @@ BOUNDED_ROWS: Final = COARSE_ROWS  # Rows with which a pixel of the floor is com
 BOUNDED_SIGMAS: Final = 5.5
 
 
+class WorkingPair(NamedTuple):
+    """A pair in the working size, with the floor's horizon level."""
+
+    lower: Floats  # (H, DIRECTIONS) grey levels
+    upper: Floats
+    seen: Flags  # (H, DIRECTIONS) pixels that both cameras see, and that are evidence
+    sensor_grey: float  # noise of the difference of two pixels, by the sensors,
+    noise_grey: float  # and of smoothed ones, by sensors and JPEGs
+
+
 class Views(NamedTuple):
     """Normalised panoramas (H, DIRECTIONS) of a pair, as the kernels compare them."""
 
@@ -60,8 +71,11 @@ class Views(NamedTuple):
 class WorkingPanoramas:
     """Brings panoramas to the working size, with the floor's horizon level."""
 
-    def __init__(self, cylinder: Cylinder, tilt: tuple[float, float], floor_slope: float) -> None:
-        """tilt: slopes of the floor in the rectified frame; floor_slope: change of its disparity from row to row."""
+    def __init__(self, cylinder: Cylinder, tilt: tuple[float, float], floor_slope: float, visible: Flags) -> None:
+        """tilt: slopes of the floor in the rectified frame; floor_slope: change of its disparity from row to row.
+
+        visible (H, W): pixels of a panorama that both cameras see.
+        """
         # A sector has a whole number of directions (calib.panorama.SECTOR_STEPS); in the others nothing is seen.
         self.shown = (
             np.arange(DIRECTIONS * cylinder.width // cylinder.turn_px) + DIRECTIONS * cylinder.first // cylinder.turn_px
@@ -73,8 +87,34 @@ class WorkingPanoramas:
         self.plane_rows = (rows + floor_slope * np.maximum(rows - self.row0, 0.0)).astype(np.float32)
         self._plane_steps = np.rint(self.plane_rows * kernels.STEPS_PER_ROW).astype(np.int32)
         self._maps = self._made_maps(*tilt) if any(tilt) else None
+        self.visible = self._sized(visible * np.uint8(255)) > 127  # (H, DIRECTIONS)
 
-    def sized(self, image: Bytes) -> Bytes:
+    def pair(self, lower: PaddedPanorama, upper: PaddedPanorama, lost: Flags | None = None) -> WorkingPair:
+        """Return a pair in the working size; lost (H, W): pixels that are no evidence, None: all in view are."""
+        seen = self.visible
+        if lost is not None and lost.any():
+            seen = seen & (self._sized(lost * np.uint8(255)) == 0)
+        both = lower, upper
+        images = [self._level(self._sized(np.ascontiguousarray(one.panorama)).astype(np.float32)) for one in both]
+        coding_grey = (one.gain * coding_sigma(one.jpeg_steps, self._coding_frequencies) for one in both)
+        sensor_grey = math.hypot(lower.noise_grey, upper.noise_grey)
+        noise_grey = math.hypot(BAND_NOISE * sensor_grey, *coding_grey)
+        return WorkingPair(images[0], images[1], seen, sensor_grey, noise_grey)
+
+    def views(self, pair: WorkingPair) -> tuple[Views, Views]:
+        """Return the views of a pair for surfaces, and for the floor."""
+        one, two = (_smoothed(image) for image in (pair.lower, pair.upper))
+        surfaces = self._views(_band_pass(one), _band_pass(two), pair)
+        bounded = [_bounded_band_pass(image, pair.noise_grey) for image in (one, two)]
+        return surfaces, self._views(bounded[0], bounded[1], pair)
+
+    def _level(self, image: Floats) -> Floats:
+        """Return an image (H, DIRECTIONS) in which the horizon of the floor is level."""
+        if self._maps is None:
+            return image
+        return np.asarray(cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
+
+    def _sized(self, image: Bytes) -> Bytes:
         """Return a panorama (H, W) in the working size of a full turn, 0 in directions that it does not show."""
         shown = cv2.resize(image, (len(self.shown), self.height), interpolation=cv2.INTER_AREA)
         if len(self.shown) == DIRECTIONS:
@@ -83,46 +123,15 @@ class WorkingPanoramas:
         whole[:, self.shown] = shown
         return whole
 
-    def grey(self, panorama: PaddedPanorama) -> Floats:
-        """Return a panorama (H, DIRECTIONS) in the working size, with the floor's horizon level."""
-        image = self.sized(np.ascontiguousarray(panorama.panorama)).astype(np.float32)
-        if self._maps is None:
-            return image
-        return np.asarray(cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
-
-    def views(self, lower: PaddedPanorama, upper: PaddedPanorama, live: Bytes) -> tuple[Views, Views]:
-        """Return the views of a pair for surfaces, and for the floor; live (H, DIRECTIONS): 255 where it is seen."""
-        noise_grey = math.hypot(self._noise_grey(lower), self._noise_grey(upper))  # of their difference
-        one, two = self._smooth(lower), self._smooth(upper)
-        surfaces = self._views(_band_pass(one), _band_pass(two), noise_grey, live)
-        floor = self._views(_bounded_band_pass(one, noise_grey), _bounded_band_pass(two, noise_grey), noise_grey, live)
-        return surfaces, floor
-
-    def _noise_grey(self, panorama: PaddedPanorama) -> float:
-        """Return the noise of a smooth image: of its sensor, and of its JPEG, whose errors extend over blocks."""
-        coding_grey = panorama.gain * coding_sigma(panorama.jpeg_steps, self._coding_frequencies)
-        return math.hypot(BAND_NOISE * panorama.noise_grey, coding_grey)
-
-    def _smooth(self, panorama: PaddedPanorama) -> Floats:
-        """Return a panorama (H, DIRECTIONS) in the working size, smoothed along columns."""
-        image = self.sized(np.ascontiguousarray(panorama.panorama)).astype(np.float32)
-        return np.asarray(cv2.GaussianBlur(image, (1, 5), sigmaX=0.1, sigmaY=FINE_PX), np.float32)
-
-    def _views(self, lower: Floats, upper: Floats, noise_grey: float, live: Bytes) -> Views:
+    def _views(self, lower: Floats, upper: Floats, pair: WorkingPair) -> Views:
         """Return the views of the band-passes of a pair (H, DIRECTIONS)."""
-        one, two = (self._normalised(band, noise_grey) for band in (lower, upper))
+        one, two = np.empty((2, *lower.shape), np.uint8)
+        for band, into in ((lower, one), (upper, two)):
+            kernels.normalise(band, CONTRAST_ROWS, TEXTURE_SHARE**2, pair.noise_grey**2, UNITS, ZERO, into)
         upright, plane = np.empty((2, 2, *two.shape), np.uint8)
         kernels.bounds(two, upright)
         kernels.bounds_on_plane(two, self._plane_steps, plane)
-        return Views(one, two, upright, plane, live)
-
-    def _normalised(self, band: Floats, noise_grey: float) -> Bytes:
-        """Return a band-pass (H, DIRECTIONS) in units of what two views differ by, with the floor's horizon level."""
-        into = np.empty(band.shape, np.uint8)
-        kernels.normalise(band, CONTRAST_ROWS, TEXTURE_SHARE**2, noise_grey**2, UNITS, ZERO, into)
-        if self._maps is None:
-            return into
-        return np.asarray(cv2.remap(into, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+        return Views(one, two, upright, plane, pair.seen * np.uint8(255))
 
     def _made_maps(self, a: float, b: float) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
         """Return the maps to a panorama in which the horizon of a floor with the slopes a, b is level."""
@@ -132,6 +141,11 @@ class WorkingPanoramas:
         columns = np.broadcast_to(np.arange(DIRECTIONS, dtype=np.float32), (self.height, DIRECTIONS))
         places, shares = cv2.convertMaps(columns, (rows - FOCAL_PX * tilt).astype(np.float32), cv2.CV_16SC2)
         return np.asarray(places, np.int16), np.asarray(shares, np.uint16)
+
+
+def _smoothed(image: Floats) -> Floats:
+    """Return a panorama (H, DIRECTIONS) smoothed along columns."""
+    return np.asarray(cv2.GaussianBlur(image, (1, 5), sigmaX=0.1, sigmaY=FINE_PX), np.float32)
 
 
 def _band_pass(smooth: Floats) -> Floats:

@@ -9,57 +9,6 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True)
-class RayParameters:
-    """The posterior of rays; log-likelihood ratios in nats."""
-
-    # Rates of the prior, per metre of a ray.
-    things_per_m: float = 0.1
-    hanging_per_m: float = 0.05
-    steps_per_m: float = 0.005
-    slopes_per_m: float = 0.05
-    changes_per_m: float = 0.02  # of borders behind which the floor looks otherwise
-    # Probabilities.
-    alike: float = 0.1  # something looks like the floor
-    invisible: float = 0.005  # the end of the floor beyond the last bin shows no foot
-    nearer: float = 0.02  # something begins nearer than the view and looks like the floor,
-    nearer_other: float = 0.03  # or otherwise
-    marks: float = 0.02  # m: an edge in a bin of the floor, before any was seen; worth so many bins:
-    marks_bins: float = 40.0
-    seen_bins: float = 100.0  # what bins are worth that were seen
-    marks_behind: float = 0.2  # an edge in a bin of what hides the floor,
-    marks_plain: float = 0.01  # and of something plain
-    plain_behind: float = 0.3  # what hides the floor has no texture
-    tail: float = 0.05  # a step of the floor has 2.5 times its sigma
-    # Noises and scales.
-    contrast: float = 0.15  # b: of the difference of grey between a thing and the floor, by the floor's grey
-    surface_noise: float = 0.4  # of the best surface where there is none [nats]
-    noise_share: float = 0.4  # sigma of a step by noise alone, by the noise of a pixel of both views
-    grey_share: float = 0.06  # least sigma of the floor's grey, by the grey,
-    near_grey_share: float = 0.01  # and where it is known at that range
-    # Temperatures, as neighbouring bins and directions are not independent.
-    w_floor: float = 0.15
-    w_edge: float = 0.5
-    w_level: float = 0.3
-    w_look: float = 0.2
-    # Bounds of what one bin says [nats].
-    floor_low: float = -12.0
-    floor_high: float = 8.0
-    level_most: float = 4.0
-    surface_most: float = 8.0
-    look_low: float = -2.5
-    look_high: float = 1.0
-    grey_low: float = -5.0  # of a grey where the floor's is known at that range
-    cell_low: float = -3.0
-    cell_high: float = 4.0
-    # Surfaces: where the mean over so many directions is largest, it counts so much more than one direction.
-    wide_columns: int = 11
-    wide_weight: float = 5.0
-    # Look of the floor: learned up to this range [m], from so many bins at least.
-    look_m: float = 1.8
-    look_bins: int = 100
-
-
-@dataclass(frozen=True, slots=True)
 class GridParameters:
     """The grid of cells; log-odds in nats."""
 

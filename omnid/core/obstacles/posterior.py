@@ -29,9 +29,8 @@ from numpy.typing import NDArray
 from omnid.core.obstacles import ray_kernels as kernels
 from omnid.core.obstacles.column import ColumnEvidence, Columns
 from omnid.core.obstacles.floor_look import LEAST_STEP, floor_look, floor_steps
-from omnid.core.obstacles.pair_views import DIRECTIONS
-from omnid.core.obstacles.parameters import RayParameters
-from omnid.core.types.panorama import PaddedPanorama
+from omnid.core.obstacles.pair_views import DIRECTIONS, WorkingPair
+from omnid.core.obstacles.ray_kernels import RayParameters
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -39,6 +38,8 @@ Flags = NDArray[np.bool_]
 
 BINS_PER_PX: Final = 2
 STEP_ROWS: Final = 4.0  # of a step below its bin, which must be in view
+ROOT: Final = math.sqrt(math.tau)
+LEAST: Final = 1e-30  # density, so that logarithms are finite
 SATURATED: Final = 250.0  # grey from which a pixel shows nothing
 ALONG_RAD: Final = math.radians(35.0)  # about ahead and behind: floor there is assumed before any is known
 
@@ -59,7 +60,6 @@ class RayPosterior:
     def __init__(self, columns: Columns, height_m: float, baseline_m: float, parameters: RayParameters) -> None:
         """height_m: of the viewpoint over the floor."""
         self._columns, self._p = columns, parameters
-        self._values = np.array([getattr(parameters, name) for name in kernels.PARAMETERS], np.float64)
         # Bins from near to far: the nearest whose step is in view, to the last that stereo compares.
         numbers = np.arange(BINS_PER_PX * columns.bins)
         middle = (numbers + 0.5) / BINS_PER_PX
@@ -68,7 +68,8 @@ class RayPosterior:
         self._bins = np.flatnonzero(in_view)[::-1]
         # What lies beyond them shows the foot of what ends the floor.
         every = np.concatenate([self._bins, np.arange(1, BINS_PER_PX * columns.first_bin)[::-1]])
-        self._rows, self._shifts = rows[every].astype(np.float32), middle[every].astype(np.float32)
+        self._rows = np.stack([rows[every], rows[every] + middle[every]])  # (2, N + far ones) in both views
+        self._step_weights, self._grey_weights = _step_weights(self._rows, columns.panoramas.height)
         self.ranges_m = columns.at_1m / middle[self._bins]  # (N,) of the bins
         begins = (self._bins + 1) / BINS_PER_PX
         self.ends_m = columns.at_1m / np.append(begins, begins[-1:] - 1 / BINS_PER_PX)
@@ -76,75 +77,84 @@ class RayPosterior:
         azimuth = math.pi - (np.arange(DIRECTIONS) + 0.5) * (math.tau / DIRECTIONS)
         along = np.abs(np.sin(azimuth)) < math.sin(ALONG_RAD)
         self._assumed = (self.ranges_m < parameters.look_m)[:, None] & along
-        self._seen = self._of_bins(columns.visible, every=True)
+        self.shows_floor = bool(self._of_bins(columns.visible).any())  # whether any floor is in view
 
-    @property
-    def shows_floor(self) -> bool:
-        """Whether any floor is in view."""
-        return bool(self._seen.any())
-
-    def belief(
-        self,
-        lower: PaddedPanorama,
-        upper: PaddedPanorama,
-        evidence: ColumnEvidence,
-        lost: Flags | None = None,
-        known: Flags | None = None,
-    ) -> RayBelief:
+    def belief(self, pair: WorkingPair, evidence: ColumnEvidence, known: Flags | None = None) -> RayBelief:
         """Return the belief by a pair and its stereo evidence.
 
-        lost (H, W): pixels that are no evidence; known (N, DIRECTIONS): bins that are known to be floor, None: the
-        nearest ahead and behind are taken for it.
+        known (N, DIRECTIONS): bins that are known to be floor, None: the nearest ahead and behind are taken for it.
         """
-        p, count, panoramas = self._p, len(self._bins), self._columns.panoramas
-        seen = self._seen
-        if lost is not None:
-            seen = seen & ~self._of_bins(panoramas.sized(lost * np.uint8(255)) > 0, every=False)
+        p, count, seen = self._p, len(self._bins), self._of_bins(pair.seen)
         known, near = self._known(known, seen)
         if near.sum() < p.look_bins:
             return self._nothing()
         # 1. Steps of grey, pooled over three directions.
-        steps, greys = np.empty((2, len(self._rows), DIRECTIONS), np.float32)
-        kernels.grey_steps(panoramas.grey(lower), panoramas.grey(upper), self._rows, self._shifts, steps, greys)
+        steps, greys = np.zeros((2, self._rows.shape[1], DIRECTIONS), np.float32)
+        for weights, into in ((self._step_weights, steps), (self._grey_weights, greys)):
+            for of_view, image in zip(weights, (pair.lower, pair.upper), strict=True):
+                kernels.add_weighted_rows(of_view, image, into)
         pooled = np.asarray((np.roll(steps, 1, axis=1) + 2 * steps + np.roll(steps, -1, axis=1)) / 4, np.float32)
         sigmas, marks = floor_steps(pooled[:count], near, known, p)
-        plain = max(p.noise_share * math.hypot(lower.noise_grey, upper.noise_grey), LEAST_STEP)
+        plain = max(p.noise_share * pair.sensor_grey, LEAST_STEP)
         far = np.abs(pooled[count:]).max(axis=0, initial=0.0) / max(float(sigmas[-1]), float(sigmas.min()))
         # 2. Stereo, by bins. Noise without texture fits other disparities a little better: the ratio of known floor
         #    says by how much.
-        of_bin, surface = self._bins // BINS_PER_PX, self._surfaces(evidence.surface)
-        ratios = evidence.floor[of_bin]
-        bias = np.nan_to_num(ratios[near]).mean() if not np.isfinite(ratios[near]).any() else np.nanmedian(ratios[near])
-        stereo = ratios - np.float32(min(max(float(bias), -1.0), 0.0)), *(a[of_bin] for a in (surface, *evidence.level))
-        # 3. The look of floor.
+        of_bin = self._bins // BINS_PER_PX
+        floor = evidence.floor[of_bin]
+        bias = float(np.median(np.nan_to_num(floor[near])))
+        floor = p.w_floor * np.clip(
+            np.nan_to_num(floor - np.float32(min(max(bias, -1.0), 0.0))), p.floor_low, p.floor_high
+        )
+        levels = floor - p.w_level * np.clip(evidence.level[:, of_bin], -p.level_most, p.level_most)
+        fits = np.minimum(self._surfaces(evidence.surface)[of_bin], p.surface_most) - p.surface_noise
+        # 3. The look of floor, and the edges.
         look = floor_look(steps[:count], greys[:count], self.ranges_m, near & (self.ranges_m < 1.6)[:, None], p)
+        edges = self._edges(np.abs(pooled[:count]), greys[:count], sigmas[:, None], marks, plain)
         # 4. The posterior.
         seen = seen & (greys[:count].T < SATURATED)
+        terms = np.where(seen.T, np.stack([floor, *levels, look, *edges, fits]).astype(np.float32), 0)
+        terms[kernels.FITS] = fits
         first = np.empty((DIRECTIONS, count + 1), np.float32)
-        cells = np.empty((2, DIRECTIONS, count), np.float32)
-        by_direction = [np.ascontiguousarray(a.T) for a in (*stereo, pooled[:count], greys[:count], look)]
-        floor, surfaces, above, below, steps, greys, look = by_direction
-        kernels.posterior(
-            floor,
-            surfaces,
-            above,
-            below,
-            steps,
-            greys,
-            look,
-            seen.view(np.uint8),
-            sigmas,
-            self._lengths_m,
-            far.astype(np.float32),
-            marks,
-            float(self.ends_m[0]),
-            plain,
-            self._values,
-            first,
-            cells,
-        )
+        ratios = np.empty((DIRECTIONS, count), np.float32)
+        view = np.empty((DIRECTIONS, count), np.float32)
+        kernels.posterior(terms, self._lengths_m, far.astype(np.float32), float(self.ends_m[0]), p, first, ratios, view)
         surfaces = np.ascontiguousarray(evidence.surface[of_bin].T)
-        return RayBelief(first, cells[0], cells[1], surfaces, self.ends_m)
+        return RayBelief(first, ratios, np.where(seen, view, np.float32(0)), surfaces, self.ends_m)
+
+    def _edges(self, steps: Floats, greys: Floats, sigmas: Floats, marks: float, plain: float) -> tuple[Floats, ...]:
+        """Return log-ratios (N, D) to something hidden, by steps: of floor, of something plain, and of what begins.
+
+        sigmas (N, 1) of steps of the floor; marks: its rate of edges; plain: sigma of steps without any texture.
+        """
+        p, scale = self._p, np.asarray(self._p.contrast * np.maximum(greys, 20.0), np.float32)
+
+        def noise(step: Floats, sigma: Floats | float) -> Floats:
+            """Return the density of steps within one material: normal, a share with 2.5 times the sigma."""
+            z2 = np.square(step / sigma)
+            density = (1 - p.tail) * np.exp(-0.5 * z2) + 0.4 * p.tail * np.exp(-0.08 * z2)
+            return np.asarray(density / (ROOT * sigma), np.float32)
+
+        def laplace(step: Floats) -> Floats:
+            """Return the density of steps between two materials."""
+            return np.asarray(np.exp(-step / scale) / (2 * scale) + LEAST, np.float32)
+
+        def behind(step: Floats, other: Floats) -> tuple[Floats, Floats, Floats]:
+            """Return the densities of steps of the floor, and of what is behind something, by texture and marks."""
+            textured = noise(step, sigmas)
+            even = (1 - p.plain_behind) * textured + p.plain_behind * noise(step, plain)
+            return textured, even, (1 - p.marks_behind) * even + p.marks_behind * other
+
+        begins = laplace(steps)
+        hidden = behind(steps, begins)[2]
+        # Windows of neighbouring bins overlap: an edge is one event, where it is largest.
+        largest = cv2.dilate(steps, np.ones((5, 1), np.uint8), borderType=cv2.BORDER_REPLICATE)
+        once = np.asarray(np.where((steps < largest) & (steps > 2 * sigmas), 2 * sigmas, steps), np.float32)
+        other = laplace(once)
+        textured, even, other_hidden = behind(once, other)
+        floor = np.log(((1 - marks) * textured + marks * other) / other_hidden)
+        bare = np.log(((1 - p.marks_plain) * even + p.marks_plain * other) / other_hidden)
+        ratios = p.w_edge * floor, p.w_edge * bare, np.log(begins / hidden)
+        return tuple(np.asarray(ratio, np.float32) for ratio in ratios)
 
     def _known(self, known: Flags | None, seen: Flags) -> tuple[Flags, Flags]:
         """Return the bins (N, DIRECTIONS) in view that are known to be floor, and those that show its look."""
@@ -162,21 +172,36 @@ class RayPosterior:
         first[:, -1] = 1.0
         return RayBelief(first, zero, zero, zero, self.ends_m)
 
-    def _of_bins(self, pixels: Flags, *, every: bool) -> Flags:
-        """Return the bins (DIRECTIONS, N) whose pixels (H, DIRECTIONS) of both views are set; or any of them."""
-        count = len(self._bins)
-        lower = np.rint(self._rows[:count]).astype(int)
-        upper = np.rint((self._rows + self._shifts)[:count]).astype(int)
-        one, two = (pixels[np.clip(rows, 0, len(pixels) - 1)] for rows in (lower, upper))
-        return np.ascontiguousarray((one & two if every else one | two).T)
+    def _of_bins(self, pixels: Flags) -> Flags:
+        """Return the bins (DIRECTIONS, N) whose pixels (H, DIRECTIONS) of both views are set."""
+        rows = np.clip(np.rint(self._rows[:, : len(self._bins)]).astype(int), 0, len(pixels) - 1)
+        return np.ascontiguousarray((pixels[rows[0]] & pixels[rows[1]]).T)
 
     def _surfaces(self, surface: Floats) -> Floats:
         """Return ratios (K, DIRECTIONS) of surfaces, where one fits best at least the weighted mean of neighbours."""
         p = self._p
         most = np.minimum(surface, p.surface_most)
         three = np.maximum(most, np.maximum(np.roll(most, 1, 0), np.roll(most, -1, 0)))
-        half = p.wide_columns // 2
+        half = int(p.wide_columns) // 2
         turned = np.concatenate([three[:, -half:], three, three[:, :half]], axis=1)
-        wide = cv2.blur(turned, (p.wide_columns, 1), borderType=cv2.BORDER_REPLICATE)[:, half:-half]
+        wide = cv2.blur(turned, (2 * half + 1, 1), borderType=cv2.BORDER_REPLICATE)[:, half:-half]
         is_best = wide >= np.maximum(np.roll(wide, 1, 0), np.roll(wide, -1, 0))
         return np.asarray(np.where(is_best, np.maximum(most, p.wide_weight * wide), most))
+
+
+def _step_weights(rows: Array, height: int) -> tuple[Floats, Floats]:
+    """Return the weights (2, N, H) of the rows of both views for steps of grey at rows (2, N), and for greys there.
+
+    A step is the difference of the means of 2.6 rows on either side, less the trend of the rows beyond: a shading is no
+    edge.
+    """
+    edges = np.arange(height)
+
+    def mean(first: float, end: float) -> Array:
+        low, high = (np.clip(rows[..., None] + at, 0, height - 1) for at in (first, end))
+        part = np.clip(np.minimum(high, edges + 1) - np.maximum(low, edges), 0, None)
+        return np.asarray(part / np.maximum(part.sum(axis=-1, keepdims=True), 1e-6))
+
+    above, below, before, beyond = mean(-3.6, -1.0), mean(1.0, 3.6), mean(-8.0, -3.6), mean(3.6, 8.0)
+    step = above - below - 0.575 * (before - above + below - beyond)
+    return (step / 2).astype(np.float32), (mean(-1.1, 1.1) / 2).astype(np.float32)

@@ -12,9 +12,10 @@ from calib.panorama import Cylinder
 from omnid.core.obstacles.column import NEAREST_M, ColumnEvidence, Columns, FloorPlane, floor_plane
 from omnid.core.obstacles.grid import GridRing, ObstacleGrid, unknown_ring
 from omnid.core.obstacles.lean import LEAST_RAD, Lean
-from omnid.core.obstacles.pair_views import DIRECTIONS, FOCAL_PX
-from omnid.core.obstacles.parameters import GridParameters, RayParameters
+from omnid.core.obstacles.pair_views import DIRECTIONS, FOCAL_PX, WorkingPair
+from omnid.core.obstacles.parameters import GridParameters
 from omnid.core.obstacles.posterior import RayPosterior
+from omnid.core.obstacles.ray_kernels import RayParameters
 from omnid.core.obstacles.settings import RingSettings
 from omnid.core.types.panorama import PaddedPanorama
 
@@ -22,6 +23,7 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 LEAN_M: Final = 1.7  # Range up to which floor tells the lean: farther away a step down looks like one.
+LEAN_NS: Final = 500_000_000  # between two pairs by which a lean that is known is followed
 SURE_RAD: Final = math.radians(0.3)  # sigma of a tilt that is used
 
 
@@ -33,6 +35,7 @@ class RayRings:
         self._rays = RayParameters()
         self.grid = ObstacleGrid(FOCAL_PX * baseline_m, settings.max_range_m, GridParameters())
         self._lean, self._tilt = Lean(), np.zeros(2)  # of the floor beyond what the rig states; of the tables
+        self._leaned_ns: int | None = None  # stamp of the last pair by which the lean was followed
         self._plane: FloorPlane | None = None
         self._visible: Flags | None = None
         self.evidence: ColumnEvidence | None = None  # of the newest pair
@@ -51,30 +54,29 @@ class RayRings:
         lost (H, W): pixels that are no evidence, None: all in view are.
         """
         # 1. Evidence, with the look of floor that is known.
-        evidence = self.evidence = self.columns.evidence(lower, upper, lost)
+        pair = self.columns.panoramas.pair(lower, upper, lost)
+        evidence = self.evidence = self.columns.evidence(pair)
         if not self.posterior.shows_floor:
             return unknown_ring()
         known = self.grid.is_floor(T_odom_base, self.posterior.ranges_m, DIRECTIONS)
-        belief = self.posterior.belief(lower, upper, evidence, lost, known)
+        belief = self.posterior.belief(pair, evidence, known)
         # 2. The grid.
         ring = self.grid.update(stamp_ns, T_odom_base, belief)
         # 3. The lean of the rig, for the next pair.
-        self._observe_lean(T_odom_base, lower, upper, lost)
+        is_due = self._leaned_ns is None or not 0 <= stamp_ns - self._leaned_ns < LEAN_NS
+        if is_due or self._lean.sigma.max() > SURE_RAD:
+            self._leaned_ns = stamp_ns
+            self._observe_lean(T_odom_base, pair)
         return ring
 
-    def _observe_lean(
-        self, T_odom_base: Array, lower: PaddedPanorama, upper: PaddedPanorama, lost: Flags | None
-    ) -> None:
+    def _observe_lean(self, T_odom_base: Array, pair: WorkingPair) -> None:
         """Follow the lean by floor that is known; make the tables again where it has changed."""
         assert self._plane is not None
-        panoramas = self.columns.panoramas
+        panoramas, near = self.columns.panoramas, self._lean_rows
         known = np.zeros((panoramas.height, DIRECTIONS), bool)
-        near = self._lean_rows
-        known[near] = self.grid.is_floor(T_odom_base, self._row_ranges_m[near], DIRECTIONS) & self.columns.visible[near]
-        if lost is not None:
-            known &= panoramas.sized(lost * np.uint8(255)) == 0
+        known[near] = self.grid.is_floor(T_odom_base, self._row_ranges_m[near], DIRECTIONS) & pair.seen[near]
         px_per_rad = FOCAL_PX * self._baseline_m / self._plane.height_m
-        self._lean.observe(panoramas, panoramas.grey(lower), panoramas.grey(upper), known, px_per_rad, self._tilt)
+        self._lean.observe(pair, panoramas.plane_rows, known, px_per_rad, self._tilt)
         tilt = np.where(self._lean.sigma < SURE_RAD, self._lean.tilt, self._tilt)
         if np.abs(tilt - self._tilt).max() > LEAST_RAD:
             self._tilt = tilt

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from calib import se3
-from omnid.core.obstacles import grid as obstacle_grid
-from omnid.core.obstacles.grid import CELLS
+from omnid.core.obstacles.grid import REACH_CELLS
 from omnid.core.obstacles.settings import RingSettings
 from omnid.core.stereo.tiles import TILE_COLUMNS, TILE_ROWS, TileStates
 from omnid.messages import ObstacleRing, OdometryUpdate, Panoramas, StereoDepth
@@ -21,7 +20,6 @@ from tests.omnid.core.obstacles.drawn_floor import (
     BASELINE_M,
     CYLINDER,
     HEIGHT_M,
-    Pattern,
     Pole,
     panoramas,
     plain,
@@ -75,7 +73,7 @@ def test_what_is_known_is_known_again_when_odometry_has_found_its_place_again() 
     for seq in range(20):
         base.ring(pairs[seq % 3])
     grid = base.rings.rings.grid
-    middle = CELLS // 2  # the base has not moved
+    middle = REACH_CELLS
     grid.odds[middle - 6 : middle + 6, middle + 8 : middle + 11] = 6.0
     grid.odds[middle + 39 : middle + 42, middle - 3 : middle + 3] = 6.0  # 2 m to the left
     ranges_m = []
@@ -177,17 +175,28 @@ def test_a_frozen_part_of_the_images_is_not_learned() -> None:
     assert not base.rings.fixed.share
 
 
-@pytest.mark.parametrize(("wall_m", "wall", "thing"), [(3.0, striped, Pole(0.8, 0.2)), (0.9, plain, None)])
-def test_where_the_square_of_the_grid_is_moved_is_all_one(
-    monkeypatch: pytest.MonkeyPatch, wall_m: float, wall: Pattern, thing: Pole | None
-) -> None:
-    """Something hides the nearest floor at the start, or plain walls are nearer than that: all moves with the cells."""
-    hidden = Panoramas(0, 0, *panoramas(stains, wall_m, wall, thing=thing), SHOWN)
-    seen = Panoramas(0, 0, *panoramas(stains, 3.0, striped), SHOWN)
-    free_m = []
-    for margin_cells in (obstacle_grid.MARGIN_CELLS, 110, 126):
-        monkeypatch.setattr(obstacle_grid, "MARGIN_CELLS", margin_cells)
-        base, pairs = Standing(HEIGHT_M), [hidden] * 3 + [seen] * 14
-        free_m.append([base.ring(pair, x_m=0.02 + 0.1 * n).free_m for n, pair in enumerate(pairs)])
-    for other in free_m[1:]:
-        np.testing.assert_array_equal(free_m[0], other)
+@pytest.mark.parametrize(("x_m", "y_m"), [(0.2, 0.0), (0.0, 0.24), (0.15, 0.2), (-0.15, -0.1)])
+def test_what_is_known_stays_at_its_place_in_odom_as_the_base_moves(x_m: float, y_m: float) -> None:
+    """A low thing nearer than the floor in view, one beside the base, and the free floor too near to be seen."""
+    base, pairs = (
+        Standing(HEIGHT_M),
+        [Panoramas(0, 0, *panoramas(stains, 3.0, striped, seed=seed), SHOWN) for seed in range(3)],
+    )
+    for seq in range(6):
+        base.ring(pairs[seq % 3])
+    odds = base.rings.rings.grid.odds
+    odds[REACH_CELLS - 6 : REACH_CELLS + 6, REACH_CELLS + 10 : REACH_CELLS + 13] = 6.0  # 0.5 m ahead
+    odds[REACH_CELLS + 14 : REACH_CELLS + 17, REACH_CELLS - 6 : REACH_CELLS + 6] = 6.0  # 0.7 m to the left
+    ring = base.ring(pairs[0], x_m=x_m, y_m=y_m)
+    assert ring.ranges_m[180] == pytest.approx(0.575 - x_m, abs=0.04)
+    assert ring.ranges_m[270] == pytest.approx(0.775 - y_m, abs=0.04)
+    assert min(ring.free_m[0], ring.free_m[90]) > 1.5
+
+
+def test_the_ring_goes_as_far_as_pairs_change_cells_in_all_directions() -> None:
+    """Nothing is in the way up to there, whatever the heading of the base in odom."""
+    pair = Panoramas(0, 0, *panoramas(worn, 9.0, plain), SHOWN)
+    for heading_rad in (0.0, math.pi / 4):
+        base = Standing(HEIGHT_M)
+        free_m = [base.ring(pair, heading_rad=heading_rad).free_m for _ in range(6)][-1]
+        assert free_m.max() == pytest.approx(4.5) and np.median(free_m) > 3.5

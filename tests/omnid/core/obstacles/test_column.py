@@ -35,7 +35,7 @@ def columns() -> Columns:
 
 
 def evidence(columns: Columns, floor: Pattern, wall: Pattern, drop_m: float = 0.0) -> ColumnEvidence:
-    return columns.evidence(*panoramas(floor, WALL_M, wall, drop_m))
+    return columns.evidence(columns.panoramas.pair(*panoramas(floor, WALL_M, wall, drop_m)))
 
 
 def floor_at(columns: Columns, found: ColumnEvidence, near_m: float, far_m: float) -> np.ndarray:
@@ -62,7 +62,7 @@ def test_wall_and_the_floor_before_it_are_found_in_all_directions(columns: Colum
 
 def test_wall_of_courses_that_are_all_alike_is_none_farther_away_below_the_floor(columns: Columns) -> None:
     """By another number of courses it fits farther away, but not near its foot: there the floor would be above it."""
-    found = columns.evidence(*panoramas(stains, 1.2, courses))
+    found = columns.evidence(columns.panoramas.pair(*panoramas(stains, 1.2, courses)))
     at = round(columns.at_1m / 1.2)
     assert (found.surface[at - 2 : at + 3].max(axis=0) > 2).mean() > 0.95
     assert (found.surface[at + 3 :] > 2).mean() < 0.01
@@ -128,7 +128,7 @@ def test_noise_of_a_plain_floor_shows_no_step(columns: Columns) -> None:
 def test_lost_pixels_are_no_evidence(columns: Columns) -> None:
     lost = np.zeros((CYLINDER.height, CYLINDER.width), bool)
     lost[:, 400:] = True
-    found = columns.evidence(*panoramas(stains, WALL_M, striped), lost)
+    found = columns.evidence(columns.panoramas.pair(*panoramas(stains, WALL_M, striped), lost))
     first = int(400 / CYLINDER.width * DIRECTIONS) + 2
     gone = slice(first, DIRECTIONS - 2)
     assert not found.surface[:, gone].any() and not found.level[:, :, first + 3 : DIRECTIONS - 5].any()
@@ -140,7 +140,7 @@ def test_cameras_that_see_no_floor_have_no_evidence_of_it() -> None:
     visible = np.zeros_like(VISIBLE)
     visible[8:90] = True
     columns = Columns(CYLINDER, BASELINE_M, floor_plane(T_RECT_BASE), (0.06, 1.3), (NEAREST_M, 6.0), visible)
-    found = columns.evidence(*panoramas(stains, WALL_M, striped))
+    found = columns.evidence(columns.panoramas.pair(*panoramas(stains, WALL_M, striped)))
     assert np.isnan(found.floor).all()
 
 
@@ -168,4 +168,4 @@ def test_floor_nearer_than_a_ring_that_no_direction_shows_is_not_used() -> None:
 
 def _floor_of(columns: Columns) -> np.ndarray:
     """Return the evidence (K, DIRECTIONS) of a floor with stains."""
-    return columns.evidence(*panoramas(stains, WALL_M, striped)).floor
+    return columns.evidence(columns.panoramas.pair(*panoramas(stains, WALL_M, striped))).floor

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from drivers.frame import Frame, coding_steps
 from omnid.config import PanoramaConfig
 from omnid.core.obstacles.column import Columns, FloorPlane
-from omnid.core.obstacles.pair_views import DIRECTIONS, UNITS, WorkingPanoramas
+from omnid.core.obstacles.pair_views import UNITS, WorkingPanoramas
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.messages import FramePair
 from omnid.simulation.robot import make_robot
@@ -34,8 +34,10 @@ def test_two_views_of_nothing_but_noise_differ_by_one_sigma_in_the_rows_of_the_f
     rng = np.random.default_rng(5)
     images = (np.clip(np.rint(120 + rng.normal(0, NOISE_GREY, (size_px, size_px))), 0, 255) for _ in range(2))
     pair = Dewarp(place, PanoramaConfig()).process(FramePair(0, 0, *(image.astype(np.uint8) for image in images)))
-    working = WorkingPanoramas(place.cylinder, (0.0, 0.0), 0.2)
-    for views in working.views(pair.lower, pair.upper, np.full((working.height, DIRECTIONS), 255, np.uint8)):
+    working = WorkingPanoramas(
+        place.cylinder, (0.0, 0.0), 0.2, np.ones((place.cylinder.height, place.cylinder.width), bool)
+    )
+    for views in working.views(working.pair(pair.lower, pair.upper)):
         difference = (views.lower.astype(float) - views.upper)[round(working.row0) :][FLOOR_ROWS]
         assert least < difference.std() / UNITS < 1.05
 
@@ -53,7 +55,7 @@ def test_a_floor_in_jpegs_is_no_evidence_against_itself() -> None:
 def _floor(lower: PaddedPanorama, upper: PaddedPanorama) -> NDArray[np.float32]:
     """Return the evidence of the floor from 1 to 2.5 m."""
     ranges_m = COLUMNS.at_1m / (np.arange(COLUMNS.bins) + 0.5)
-    floor = COLUMNS.evidence(lower, upper).floor[(ranges_m > 1.0) & (ranges_m < 2.5)]
+    floor = COLUMNS.evidence(COLUMNS.panoramas.pair(lower, upper)).floor[(ranges_m > 1.0) & (ranges_m < 2.5)]
     return np.asarray(floor[np.isfinite(floor)])
 
 
