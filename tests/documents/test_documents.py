@@ -19,6 +19,8 @@ from omnid.transport.topics import PUBLISHED, command_topics, ros_name
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 GIF_BYTES, STILL_BYTES = 1_000_000, 60_000
+PARTS = ("omnid", "drivers", "calib", "tests", "docs")
+OF_THE_PAST = ("CHANGELOG.md", "decisions.md")
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 
 
@@ -77,6 +79,18 @@ def test_links_lead_to_files_and_headings(path: Path) -> None:
             if "://" not in target and not (aim.exists() and (not anchor or anchor in anchors(aim))):
                 lost.append(target)
     assert lost == []
+
+
+def test_files_that_documents_name_exist() -> None:
+    files = [f"/{path.relative_to(ROOT).as_posix()}" for part in PARTS for path in (ROOT / part).rglob("*.py")]
+    named = [
+        (path.name, name)
+        for path in documents()
+        if path.name not in OF_THE_PAST
+        for name in re.findall(r"`([\w/]+\.py)`", path.read_text("utf-8"))
+    ]
+    assert len(named) > 100
+    assert [entry for entry in named if not any(file.endswith(f"/{entry[1]}") for file in files)] == []
 
 
 def test_commands_in_documents_and_their_options_exist() -> None:
