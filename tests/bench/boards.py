@@ -137,7 +137,7 @@ def _painted(rng: Random, kind: str, radius_m: float) -> Image:
         "chequers": lambda: _chequers(rng, side, px_per_m),
         "stripes": lambda: _stripes(rng, side, px_per_m),
         "page": lambda: textures._page(rng, (side, side)),
-        "clouds": lambda: textures.plaster(rng, (side, side), px_per_m),
+        "clouds": lambda: textures.PAINTERS["plaster"](rng, (side, side), px_per_m),
     }
     return own[kind]() if kind in own else textures.PAINTERS[kind](rng, (side, side), px_per_m)
 

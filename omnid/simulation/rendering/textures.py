@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Final
 
 import cv2
 import numpy as np
@@ -39,6 +40,15 @@ def value_noise(rng: Random, size: Size, coarsest_px: float, persistence: float 
     return total
 
 
+def clouds(greys: tuple[float, float], sigma: float, coarsest_m: float, persistence: float) -> Painter:
+    """Return the painter of noise of a standard deviation and a spectrum about a grey of a range."""
+
+    def paint(rng: Random, size: Size, px_per_m: float) -> Texture:
+        return _grey(rng.uniform(*greys) + sigma * value_noise(rng, size, coarsest_m * px_per_m, persistence))
+
+    return paint
+
+
 def brick(rng: Random, size: Size, px_per_m: float) -> Texture:
     """Return a running bond of identical bricks: one pair of courses, repeated."""
     length, course = round(px_per_m * rng.uniform(0.22, 0.32)), round(px_per_m * rng.uniform(0.075, 0.11))
@@ -49,16 +59,6 @@ def brick(rng: Random, size: Size, px_per_m: float) -> Texture:
     courses = np.vstack([one, np.roll(one, length // 2, axis=1)])
     times = (-(-size[1] // courses.shape[0]), -(-size[0] // length))
     return _grey(np.tile(courses, times)[: size[1], : size[0]])
-
-
-def plaster(rng: Random, size: Size, px_per_m: float) -> Texture:
-    """Return a soft cloudy wall with fine grain."""
-    return _grey(rng.uniform(115, 165) + 11 * value_noise(rng, size, px_per_m * 0.5, 0.7))
-
-
-def granite(rng: Random, size: Size, px_per_m: float) -> Texture:
-    """Return a texture of strong contrast at every scale."""
-    return _grey(rng.uniform(100, 140) + 42 * value_noise(rng, size, px_per_m * 0.4, 0.75))
 
 
 def tiles(rng: Random, size: Size, px_per_m: float) -> Texture:
@@ -72,24 +72,9 @@ def tiles(rng: Random, size: Size, px_per_m: float) -> Texture:
     return _grey(image)
 
 
-def plain(rng: Random, size: Size, px_per_m: float) -> Texture:
-    """Return nearly textureless paint: a few grey levels of very coarse clouds."""
-    return _grey(rng.uniform(130, 180) + 1.2 * value_noise(rng, size, px_per_m * 1.0, 0.35))
-
-
 def white(_: Random, size: Size, __: float) -> Texture:
     """Return fresh white paint: one grey level, in which stereo finds nothing."""
     return np.full(size[::-1], 225, np.uint8)
-
-
-def linoleum(rng: Random, size: Size, px_per_m: float) -> Texture:
-    """Return a floor of one grey, with a little dirt and grain."""
-    return _grey(rng.uniform(115, 175) + 0.8 * value_noise(rng, size, px_per_m * 1.5, 0.8))
-
-
-def epoxy(rng: Random, size: Size, px_per_m: float) -> Texture:
-    """Return a cast floor: a light grey with the broad waves of the trowel."""
-    return _grey(rng.uniform(150, 190) + 0.9 * value_noise(rng, size, px_per_m * 0.8, 0.4))
 
 
 def marbled(rng: Random, size: Size, px_per_m: float) -> Texture:
@@ -132,21 +117,6 @@ def carpet(rng: Random, size: Size, px_per_m: float) -> Texture:
     return _grey(rng.uniform(75, 120) + np.tile(motif, times)[: size[1], : size[0]] + 6 * value_noise(rng, size, 4.0))
 
 
-def parquet_along(rng: Random, size: Size, px_per_m: float) -> Texture:
-    """Return staggered oak staves along u."""
-    return _boards(rng, size, px_per_m, (0.6, 0.07), 7.0, 3.0)
-
-
-def parquet_across(rng: Random, size: Size, px_per_m: float) -> Texture:
-    """Return staggered oak staves along v."""
-    return np.ascontiguousarray(parquet_along(rng, size[::-1], px_per_m).T)
-
-
-def laminate(rng: Random, size: Size, px_per_m: float) -> Texture:
-    """Return printed planks along u with fine joints."""
-    return _boards(rng, size, px_per_m, (1.28, 0.19), 2.0, 2.5)
-
-
 def _stretched(rng: Random, size: Size, coarsest_px: float, times: float) -> NDArray[np.float32]:
     """Return value noise (H, W) whose structures are longer along u."""
     short = max(8, round(size[0] / times))
@@ -183,30 +153,49 @@ def _flags(
     return _grey(image)
 
 
-def _boards(
-    rng: Random, size: Size, px_per_m: float, board_m: tuple[float, float], spread: float, grain: float
-) -> Texture:
-    """Return boards (length, width) along u, each course beginning elsewhere; spread: of their greys."""
-    length, width = (side_m * px_per_m for side_m in board_m)
-    base = rng.uniform(105, 150)
-    image = base + grain * _stretched(rng, size, px_per_m * 0.03, 14.0)
-    for top in np.arange(0, size[1], width):
-        course = image[round(top) : round(top + width)]
-        first = rng.uniform(0, length)
-        ends = np.rint(np.arange(first, size[0] + length, length)).astype(int)
-        for begin, end in zip([0, *ends], ends, strict=False):
-            course[:, begin:end] += spread * rng.standard_normal()
-        _joints(course, 1, int(ends[0]), length, 0.0015 * px_per_m, base - 45)
-    _joints(image, 0, 0, width, 0.0015 * px_per_m, base - 45)
-    return _grey(image)
+def boards(board_m: tuple[float, float], spread: float, grain: float) -> Painter:
+    """Return the painter of boards (length, width) along u, each course beginning elsewhere; spread: of their greys."""
+
+    def paint(rng: Random, size: Size, px_per_m: float) -> Texture:
+        length, width = (side_m * px_per_m for side_m in board_m)
+        base = rng.uniform(105, 150)
+        image = base + grain * _stretched(rng, size, px_per_m * 0.03, 14.0)
+        for top in np.arange(0, size[1], width):
+            course = image[round(top) : round(top + width)]
+            first = rng.uniform(0, length)
+            ends = np.rint(np.arange(first, size[0] + length, length)).astype(int)
+            for begin, end in zip([0, *ends], ends, strict=False):
+                course[:, begin:end] += spread * rng.standard_normal()
+            _joints(course, 1, int(ends[0]), length, 0.0015 * px_per_m, base - 45)
+        _joints(image, 0, 0, width, 0.0015 * px_per_m, base - 45)
+        return _grey(image)
+
+    return paint
 
 
-PAINTERS: dict[str, Painter] = {
-    painter.__name__: painter
-    for painter in (
-        *(brick, plaster, granite, tiles, plain, white, linoleum, epoxy, marbled, concrete, glazed, slabs, carpet),
-        *(parquet_along, parquet_across, laminate),
-    )
+def across(painter: Painter) -> Painter:
+    """Return the painter of a texture along v instead of u."""
+    return lambda rng, size, px_per_m: np.ascontiguousarray(painter(rng, size[::-1], px_per_m).T)
+
+
+PARQUET: Final = boards((0.6, 0.07), 7.0, 3.0)
+PAINTERS: Final[dict[str, Painter]] = {
+    "brick": brick,
+    "plaster": clouds((115, 165), 11, 0.5, 0.7),  # a soft cloudy wall with fine grain
+    "granite": clouds((100, 140), 42, 0.4, 0.75),  # strong contrast at every scale
+    "tiles": tiles,
+    "plain": clouds((130, 180), 1.2, 1.0, 0.35),  # paint with nearly no texture: a few grey levels of coarse clouds
+    "white": white,
+    "linoleum": clouds((115, 175), 0.8, 1.5, 0.8),  # one grey, with a little dirt and grain
+    "epoxy": clouds((150, 190), 0.9, 0.8, 0.4),  # a cast floor with the broad waves of the trowel
+    "marbled": marbled,
+    "concrete": concrete,
+    "glazed": glazed,
+    "slabs": slabs,
+    "carpet": carpet,
+    "parquet_along": PARQUET,  # staggered oak staves
+    "parquet_across": across(PARQUET),
+    "laminate": boards((1.28, 0.19), 2.0, 2.5),  # printed planks with fine joints
 }
 
 
