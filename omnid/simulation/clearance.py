@@ -43,11 +43,15 @@ def obstacles_of(world: World, height_m: float) -> Array:
     return np.concatenate([footprints((*world.standing, *world.panes), height_m, world.ground), world.edges])
 
 
+def distances_m(segments: Array, places: Array) -> Array:
+    """Return the distances (M,) [m] of places (M, 2) from the nearest of segments (N, 2, 2); inf without any."""
+    a, along = segments[:, 0], segments[:, 1] - segments[:, 0]
+    to_place = places[:, None] - a
+    share = np.clip((to_place * along).sum(axis=2) / np.maximum((along**2).sum(axis=1), 1e-12), 0.0, 1.0)
+    distances = np.linalg.norm(to_place - share[..., None] * along, axis=2)
+    return np.asarray(distances.min(axis=1, initial=np.inf))
+
+
 def clearance_m(segments: Array, place: tuple[float, float], radius_m: float) -> float:
     """Return the distance [m] from a disc to the nearest of segments (N, 2, 2); 0 or less: contact."""
-    if not len(segments):
-        return float("inf")
-    a, along = segments[:, 0], segments[:, 1] - segments[:, 0]
-    to_place = np.asarray(place) - a
-    share = np.clip((to_place * along).sum(axis=1) / np.maximum((along**2).sum(axis=1), 1e-12), 0.0, 1.0)
-    return float(np.linalg.norm(to_place - share[:, None] * along, axis=1).min()) - radius_m
+    return float(distances_m(segments, np.array([place]))[0]) - radius_m

@@ -15,7 +15,7 @@ from omnid.core.navigation.requests import NavigationFrame, PathRequest, RouteAc
 from omnid.formats.plan import BLACK, LIGHT_GREY, RED, Lines, Sheet, draw_ends, draw_plan, with_legend
 from omnid.messages import NavigationUpdate, ObstacleRing, PlaceUpdate
 from omnid.navigation_state import NavigationState
-from omnid.simulation.clearance import footprints
+from omnid.simulation.clearance import distances_m, footprints
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun
 from omnid.simulation.world import World
 from omnid.tracking_state import MapState
@@ -110,13 +110,7 @@ def both_paths(run: SimulatedRun, repeated_s: float) -> tuple[Array, Array]:
 
 def cross_track_m(first: Array, second: Array) -> Array:
     """Return the distances (M,) [m] of positions (M, 2) from the line through others (N, 2)."""
-    a, along = first[:-1], np.diff(first, axis=0)
-    a, along = a[np.any(along != 0, axis=1)], along[np.any(along != 0, axis=1)]
-    if not len(a):
-        return np.asarray(np.linalg.norm(second - first[:1], axis=1))
-    to = second[:, None] - a
-    share = np.clip((to * along).sum(axis=2) / (along**2).sum(axis=1), 0.0, 1.0)
-    return np.asarray(np.linalg.norm(to - share[..., None] * along, axis=2).min(axis=1))
+    return distances_m(np.stack([first, np.vstack([first[1:], first[-1:]])], axis=1), second)
 
 
 def seen_obstacles(run: SimulatedRun) -> Array:

@@ -1,9 +1,8 @@
-"""zenoh sessions with the settings of the configuration, and the rules that hold where it names no file of zenoh.
+"""zenoh sessions with the settings of the configuration.
 
-Every connected program may subscribe, query, and stop the wheels; without rules of one's own it may command, too.
-Nothing else can be written, and only the robot answers requests. zenoh applies the rules where a link enters the
-session, so that refused messages never reach the daemon. Who may connect, and who may command, is said in zenoh's own
-file `bus.config`; `site.json5` is an example.
+Rules, limits and timing are those of zenoh's own file `bus.config`, of which `site.json5` is an example, and where that
+says nothing those of `default.json5`. zenoh applies the rules where a link enters the session, so that refused messages
+never reach the daemon.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ import os
 import re
 import time
 from dataclasses import replace
+from importlib.resources import files
 from typing import Any, Final
 
 import zenoh
@@ -20,7 +20,6 @@ import zenoh
 from omnid.errors import OmnidError
 from omnid.plain_text import plain
 from omnid.transport.bus_config import BusConfig, checked, text_of_file
-from omnid.transport.topics import PATH, REQUEST_TOPICS, STOP, command_topics, request_key
 
 HERE: Final = "tcp/127.0.0.1:7447"
 ALIVE: Final = "alive"  # key of the liveliness token below the robot's name
@@ -33,25 +32,14 @@ _USERS: Final = "transport/auth/usrpwd/dictionary_file"
 _CERTIFICATES: Final = "transport/link/tls/enable_mtls"
 _RETRY_S: Final = 0.5  # between two attempts of a client to connect
 QUERY_S: Final = 1.0  # A query without an answer ends after this time, which a slow network must not exceed.
-_MAX_COMMAND_BYTES: Final = 16_384  # Limit of all commands but paths.
-_DEFAULTS: Final[dict[str, Any]] = {  # where zenoh's own file leaves zenoh's
-    "connect/retry": {"period_init_ms": 500, "period_max_ms": 2000, "period_increase_factor": 2},
-    "scouting/multicast/enabled": False,
-    "scouting/gossip/enabled": False,  # else a peer makes this one connect to endpoints of its choice
-    "transport/shared_memory/enabled": False,  # faster above 100 kB only, and leaves files behind
-    "transport/link/tx/queue/size/real_time": 16,  # 2 are soon full on a busy host, and poses are dropped
-}
-_ALWAYS: Final = (
-    "declare_subscriber",
-    "declare_queryable",
-    "query",
-    "reply",
-    "liveliness_token",
-    "liveliness_query",
-    "declare_liveliness_subscriber",
+_DEFAULTS: Final = (  # what zenoh's own file may leave to default.json5
+    "connect/retry",
+    "scouting/multicast/enabled",
+    "scouting/gossip/enabled",
+    "transport/shared_memory/enabled",
+    "transport/link/tx/queue/size/real_time",
 )
-# A star does not match parts that begin with @; @adv is the history that zenoh keeps for ROS 2's late subscribers.
-_EVERYTHING: Final = ("**", "@/**", "@/*/@ros2_lv/**", "@ros2_lv/**", "**/@adv/**")
+_GUARDS: Final = ("transport/link/rx/max_message_size", "low_pass_filter", "access_control")
 
 
 class EndpointTaken(OmnidError):  # noqa: N818 - a state that may pass, as the errors of sockets
@@ -145,15 +133,12 @@ def zenoh_config(config: BusConfig, *, guarded: bool = True) -> zenoh.Config:
     for key, value in endpoints.items():
         result.insert_json5(key, json.dumps(value))
     # 2. omnid's defaults, where the file says nothing.
-    defaults = dict(_DEFAULTS)
-    if guarded:
-        # zenoh collects fragments up to 1 GiB before access rules apply.
-        defaults["transport/link/rx/max_message_size"] = 1 << 20
-        defaults["low_pass_filter"] = _size_limits(config)
-        defaults["access_control"] = _access_control(config)
-    for key, value in defaults.items():
+    text = (files("omnid.transport") / "default.json5").read_text("utf-8")
+    names = {"ROBOT": config.robot, "DOMAIN": str(config.ros2_domain)}
+    defaults = zenoh.Config.from_json5(re.sub("ROBOT|DOMAIN", lambda found: names[found[0]], text))
+    for key in (*_DEFAULTS, *(_GUARDS if guarded else ())):
         if result.get_json(key) == untouched.get_json(key):
-            result.insert_json5(key, json.dumps(value))
+            result.insert_json5(key, defaults.get_json(key))
     # 3. No links of other protocols than those of the endpoints.
     if json.loads(result.get_json(_PROTOCOLS)) is None:
         used = _PROTOCOL.findall(json.dumps([*config.listen, *config.connect]))
@@ -183,35 +168,3 @@ def _of_file(config: BusConfig) -> zenoh.Config:
     except zenoh.ZError as error:
         message = f"bus.config: {config.config!r} is not a zenoh configuration: {reason(error)}; correct the file"
         raise OmnidError(message) from error
-
-
-def _size_limits(config: BusConfig) -> list[dict[str, Any]]:
-    """Return the rule that bounds commands and requests in size: many of them wait at once."""
-    short = [f"{config.robot}/{topic}" for topic in command_topics(()) if topic != PATH]
-    plain_keys = [*short, f"{config.robot}/cmd/*/*"]
-    ros = [f"{config.ros2_domain}/{key}/*/*" for key in plain_keys] if config.ros2 != "off" else []
-    requests = [f"{config.robot}/{request_key(topic)}" for topic in sorted(REQUEST_TOPICS - {PATH})]
-    rule = {"id": "commands", "flows": ["ingress"], "messages": ["put", "query"], "size_limit": _MAX_COMMAND_BYTES}
-    return [{**rule, "key_exprs": [*plain_keys, *ros, *requests]}]
-
-
-def _access_control(config: BusConfig) -> dict[str, Any]:
-    """Return the rules of a bus without a file of zenoh, as JSON."""
-    commands, stops, requests = f"{config.robot}/cmd/**", f"{config.robot}/{STOP}", f"{config.robot}/{request_key('*')}"
-    by_ros = [f"{config.ros2_domain}/{commands}", f"{config.ros2_domain}/{stops}/**"] if config.ros2 != "off" else []
-    rules = (
-        ("subscribe", "egress", (*_ALWAYS, "put", "delete"), [*_EVERYTHING, requests]),
-        ("query", "ingress", _ALWAYS, list(_EVERYTHING)),
-        ("command", "ingress", ("put",), [commands, stops, *by_ros]),
-        ("request", "ingress", ("query",), [requests]),
-    )
-    return {
-        "enabled": True,
-        "default_permission": "deny",
-        "rules": [
-            {"id": name, "permission": "allow", "flows": [flow], "messages": list(messages), "key_exprs": keys}
-            for name, flow, messages, keys in rules
-        ],
-        "subjects": [{"id": "everybody"}],
-        "policies": [{"id": "all", "rules": [name for name, *_ in rules], "subjects": ["everybody"]}],
-    }

@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 
 from omnid.errors import OmnidError
+from omnid.simulation.clearance import distances_m
 from omnid.simulation.people import Person, moved
 from omnid.simulation.rendering.shapes import Paint, Point, painted, solid
 from omnid.simulation.rendering.surfaces import Rectangle
@@ -383,7 +384,7 @@ def _room(b: Builder, what: str) -> Trial:
         path = tuple(
             (float(b.rng.uniform(0.4 - x_m, x_m - 0.4)), float(b.rng.uniform(0.4 - y_m, y_m - 0.4))) for _ in "ab"
         )
-        clear = all(_apart_m(place, *path) > 0.6 for place in places[1:])
+        clear = (distances_m(np.array([path]), np.array(places[1:])) > 0.6).all()
         if what == "with_people" and len(people) < 2 and clear and math.dist(*path) > 2.0:
             speed_mps, start_s = b.rng.uniform(0.8, 1.6), b.rng.uniform(3.0, 6.0)
             people.append(Person(b.adult(), path, speed_mps, "back and forth", start_s, waits_within_m=1.0))
@@ -391,14 +392,6 @@ def _room(b: Builder, what: str) -> Trial:
         b, start=(0.0, 0.0, b.rng.uniform(-math.pi, math.pi)), people=tuple(people), ground=ground, edges=edges
     )
     return Trial(world, things=tuple(b.faces[first:]), motion="at random")
-
-
-def _apart_m(point: Point, first: Point, last: Point) -> float:
-    """Return the distance of a point from the line between two others."""
-    x, y = last[0] - first[0], last[1] - first[1]
-    along = ((point[0] - first[0]) * x + (point[1] - first[1]) * y) / (x * x + y * y)
-    along = min(max(along, 0.0), 1.0)
-    return math.dist(point, (first[0] + along * x, first[1] + along * y))
 
 
 def _robot(b: Builder, **changes: object) -> Trial:

@@ -15,7 +15,7 @@ from typing import Final
 from omnid.engine.kernel_cache import prepare_kernels
 from tests.bench.paper import measures
 from tests.bench.paper.povray import INSTALL, PovrayError, available, shoot, write_world
-from tests.bench.paper.scenes import EXPERIMENTS, RigOptions
+from tests.bench.paper.scenes import EXPERIMENTS
 from tests.bench.paper.views import DESCRIPTION, RENDERERS, Experiment
 from tests.bench.results import Column, ResultTable
 from tests.simulation.logs import pack_log, write_log
@@ -101,10 +101,9 @@ def render(arguments: argparse.Namespace) -> None:
     """Render the scene for every seed."""
     if arguments.renderer == "povray" and not available():
         raise PovrayError(f"povray is not installed: {INSTALL}")
-    options = RigOptions(arguments.scale, arguments.baseline_m, arguments.misaligned, arguments.xi)
     for seed in arguments.seed:
         pairs = arguments.pairs or EXPERIMENTS[arguments.name][1]
-        experiment = Experiment(arguments.name, seed, arguments.size, pairs, options, arguments.renderer)
+        experiment = Experiment(arguments.name, seed, arguments.size, pairs, arguments.renderer)
         folder, run = arguments.out / experiment.label, experiment.run
         experiment.write(folder)
         if arguments.renderer == "povray":
@@ -125,10 +124,6 @@ def main() -> None:
     add.add_argument("--size", type=int, default=768, help="width and height of the images [px]")
     add.add_argument("--pairs", type=int, help="number of stereo pairs")
     add.add_argument("--supersample", type=int, default=2, help="samples per pixel and axis")
-    add.add_argument("--scale", type=float, help="mirror scale: radius of the horizon, 1 = 27 %% of the width")
-    add.add_argument("--baseline-m", type=float, help="height of the upper viewpoint above the lower one [m]")
-    add.add_argument("--misaligned", type=float, help="misalignment of the rig: 0 none, 1 up to 1.2 deg and 4 mm")
-    add.add_argument("--xi", type=float, default=1.0, help="1: parabolic mirrors; below: hyperbolic ones")
     add.set_defaults(run=render)
     add = commands.add_parser("measure", help="measure the rendered logs and print tables")
     add.add_argument("logs", type=Path, help="the folder given to render as --out")

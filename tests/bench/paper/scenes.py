@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,7 +11,6 @@ from calib.rig import Rig
 from omnid.simulation.rendering.shapes import CEILING_M
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
 from omnid.simulation.rendering.textures import PAINTERS, value_noise
-from omnid.simulation.robot import RIM
 from omnid.simulation.world_file import load_world
 from tests.bench.route_series import lap
 from tests.simulation import paths
@@ -31,59 +30,28 @@ MOVED_TURNS_DEG = (18, 45, 90, 135, 180)  # yaw of the last pairs, which are tra
 MOVED_M = (0.05, 0.03)  # their translation, x and y
 
 
-@dataclass(frozen=True, slots=True)
-class RigOptions:
-    """Properties of a rig; the seed decides those that are None."""
-
-    scale: float | None = None  # radius of the horizon in the image, 1 = 27 % of its width
-    baseline_m: float | None = None
-    misaligned: float | None = None  # misalignment: 0 none, 1 up to 1.2 deg and 4 mm
-    xi: float = 1.0  # 1: parabolic mirrors; below: hyperbolic ones under perspective cameras
-
-
-def seeded_rig(seed: int, size: int, options: RigOptions) -> Rig:
-    """Return a rig whose mirror scale, baseline and misalignment are random where the options are None."""
+def seeded_rig(seed: int, size: int) -> Rig:
+    """Return a rig whose mirror scale, baseline and misalignment are random."""
     rng = np.random.default_rng([seed, 23])
     scale, baseline, tilt = rng.uniform((0.9, 0.17, 0.3), (1.05, 0.24, 1.2))
     axis, yaw, x, y = rng.uniform(0, 2 * np.pi), *rng.uniform((-1, -3, -3), (1, 3, 3))
-    misaligned = 1.0 if options.misaligned is None else options.misaligned
-    turned = misaligned * np.array([tilt * np.cos(axis), tilt * np.sin(axis), yaw])
-    # A hyperbolic mirror shows less above the horizon in an image of the same size: a smaller rim keeps all rays valid.
-    rim = RIM if options.xi == 1 else min(RIM, 0.45)
-    return make_rig(
-        size=size,
-        scale=options.scale or scale,
-        baseline_m=options.baseline_m or baseline,
-        rim=rim,
-        xi=options.xi,
-        misaligned_deg=tuple(turned),
-        offset_mm=(misaligned * x, misaligned * y),
-    )
+    turned = tilt * np.cos(axis), tilt * np.sin(axis), yaw
+    return make_rig(size=size, scale=scale, baseline_m=baseline, misaligned_deg=turned, offset_mm=(x, y))
 
 
-def _paper_rig(seed: int, size: int, options: RigOptions) -> Rig:
-    """Return the paper's rig where the options are None: viewpoints at 1.2 m and 1.4 m, no misalignment."""
-    misaligned = 0.0 if options.misaligned is None else options.misaligned
-    return seeded_rig(
-        seed,
-        size,
-        replace(options, scale=options.scale or 1.0, baseline_m=options.baseline_m or 0.2, misaligned=misaligned),
-    )
-
-
-def brick(seed: int, size: int, pairs: int, options: RigOptions) -> SimulatedRun:
+def brick(seed: int, size: int, pairs: int) -> SimulatedRun:
     """Return a run before a wall of identical bricks (section V.B)."""
-    return _facing(seed, size, pairs, options, "brick")
+    return _facing(seed, size, pairs, "brick")
 
 
-def control(seed: int, size: int, pairs: int, options: RigOptions) -> SimulatedRun:
+def control(seed: int, size: int, pairs: int) -> SimulatedRun:
     """Return the run of `brick` with a wall texture that does not repeat."""
-    return _facing(seed, size, pairs, options, "granite")
+    return _facing(seed, size, pairs, "granite")
 
 
-def smooth(seed: int, size: int, pairs: int, options: RigOptions) -> SimulatedRun:
+def smooth(seed: int, size: int, pairs: int) -> SimulatedRun:
     """Return the run of `brick` with a smooth wall: soft clouds without edges, the weakness named in section III.C."""
-    run = _facing(seed, size, pairs, options, "plain")
+    run = _facing(seed, size, pairs, "plain")
     rng = np.random.default_rng([seed, 25])
     mean, sigma = SMOOTH_GREY
     texture_size = (round(WALL_SIZE_M[0] * SMOOTH_PX_PER_M), round(WALL_SIZE_M[1] * SMOOTH_PX_PER_M))
@@ -93,7 +61,7 @@ def smooth(seed: int, size: int, pairs: int, options: RigOptions) -> SimulatedRu
     return replace(run, scene=Scene((replace(front, texture=texture), *others)))
 
 
-def _facing(seed: int, size: int, pairs: int, options: RigOptions, kind: str) -> SimulatedRun:
+def _facing(seed: int, size: int, pairs: int, kind: str) -> SimulatedRun:
     """Return a run WALL_M before a wall named 'wall'; other walls are plaster. The pairs are 7 cm apart, sideways."""
     rng = np.random.default_rng([seed, 24])
     half = WALL_SIZE_M[0] / 2
@@ -109,16 +77,16 @@ def _facing(seed: int, size: int, pairs: int, options: RigOptions, kind: str) ->
     )
     scene = Scene((replace(front, name="wall"), *others, floor))
     aside = np.column_stack([np.zeros(pairs), 0.07 * (np.arange(pairs) - (pairs - 1) / 2)])
-    return SimulatedRun(_paper_rig(seed, size, options), paths.planar_poses(aside, np.zeros(pairs)), scene)
+    return SimulatedRun(make_rig(size=size), paths.planar_poses(aside, np.zeros(pairs)), scene)
 
 
-def two_walls(seed: int, size: int, pairs: int, options: RigOptions) -> SimulatedRun:
+def two_walls(seed: int, size: int, pairs: int) -> SimulatedRun:
     """Return 5 cm steps along a spline between two walls, with a turn of 94 degrees just before the end (V.C)."""
     poses = paths.spline_path(seed, pairs, 0.05, turn=(max(1, pairs - 2), TURN_DEG))
-    return SimulatedRun(seeded_rig(seed, size, options), poses, corridor(seed, max(8.0, 0.05 * pairs + 3.2)))
+    return SimulatedRun(seeded_rig(seed, size), poses, corridor(seed, max(8.0, 0.05 * pairs + 3.2)))
 
 
-def turns(seed: int, size: int, pairs: int, options: RigOptions) -> SimulatedRun:
+def turns(seed: int, size: int, pairs: int) -> SimulatedRun:
     """Return a first pair with yaw 0, pairs turned left by TURNS_DEG, and pairs turned by MOVED_TURNS_DEG and moved.
 
     Section IV.F. Tracking from the first pair to another is a turn to the left, the other way a turn to the right.
@@ -126,10 +94,10 @@ def turns(seed: int, size: int, pairs: int, options: RigOptions) -> SimulatedRun
     angles = np.deg2rad([0, *TURNS_DEG, *MOVED_TURNS_DEG])
     xy = np.zeros((len(angles), 2))
     xy[-len(MOVED_TURNS_DEG) :] = MOVED_M
-    return SimulatedRun(seeded_rig(seed, size, options), paths.planar_poses(xy, angles)[:pairs], corridor(seed))
+    return SimulatedRun(seeded_rig(seed, size), paths.planar_poses(xy, angles)[:pairs], corridor(seed))
 
 
-def building(seed: int, size: int, pairs: int, options: RigOptions) -> SimulatedRun:
+def building(seed: int, size: int, pairs: int) -> SimulatedRun:
     """Return one round through the corridor of the shipped world `building`, back to its start (section V.D)."""
     line = lap(100.0)
     ahead = np.roll(line, -1, axis=0) - line
@@ -137,10 +105,10 @@ def building(seed: int, size: int, pairs: int, options: RigOptions) -> Simulated
     at, places = np.linspace(0, len(line) - 1, pairs), np.arange(len(line))
     x, y, turned = (np.interp(at, places, values) for values in (*line.T, heading))
     scene = Scene(load_world("building", seed).standing)
-    return SimulatedRun(seeded_rig(seed, size, options), paths.planar_poses(np.column_stack([x, y]), turned), scene)
+    return SimulatedRun(seeded_rig(seed, size), paths.planar_poses(np.column_stack([x, y]), turned), scene)
 
 
-Recipe = Callable[[int, int, int, RigOptions], SimulatedRun]
+Recipe = Callable[[int, int, int], SimulatedRun]
 EXPERIMENTS: dict[str, tuple[Recipe, int]] = {  # recipe and number of pairs
     "brick": (brick, 3),
     "control": (control, 3),
@@ -151,9 +119,7 @@ EXPERIMENTS: dict[str, tuple[Recipe, int]] = {  # recipe and number of pairs
 }
 
 
-def build(
-    name: str, seed: int, size: int = 768, pairs: int | None = None, options: RigOptions | None = None
-) -> SimulatedRun:
+def build(name: str, seed: int, size: int = 768, pairs: int | None = None) -> SimulatedRun:
     """Return the run of a name; pairs None: as many as the paper has."""
     recipe, default_pairs = EXPERIMENTS[name]
-    return recipe(seed, size, pairs or default_pairs, options or RigOptions())
+    return recipe(seed, size, pairs or default_pairs)

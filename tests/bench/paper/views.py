@@ -18,7 +18,7 @@ from omnid.messages import Panoramas
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry, geometry
 from omnid.stages.synchronise import Synchronise
-from tests.bench.paper.scenes import RigOptions, build
+from tests.bench.paper.scenes import build
 from tests.simulation.recipes import SimulatedRun
 
 DESCRIPTION = "experiment.json"
@@ -27,19 +27,18 @@ RENDERERS = ("povray", "ray_caster")
 
 @dataclass(frozen=True, slots=True)
 class Experiment:
-    """The origin of a rendered log: scene, seed, size, rig and renderer."""
+    """The origin of a rendered log: scene, seed, size and renderer."""
 
     name: str
     seed: int
     size: int
     pairs: int
-    options: RigOptions
     renderer: str = "povray"  # one of RENDERERS
 
     @property
     def run(self) -> SimulatedRun:
         """Rig, path and scene."""
-        return build(self.name, self.seed, self.size, self.pairs, self.options)
+        return build(self.name, self.seed, self.size, self.pairs)
 
     @property
     def label(self) -> str:
@@ -55,8 +54,7 @@ class Experiment:
     @staticmethod
     def read(folder: Path) -> Experiment:
         """Read the description in a folder."""
-        values = json.loads((folder / DESCRIPTION).read_text())
-        return Experiment(**(values | {"options": RigOptions(**values["options"])}))
+        return Experiment(**json.loads((folder / DESCRIPTION).read_text()))
 
 
 @dataclass(frozen=True, slots=True)

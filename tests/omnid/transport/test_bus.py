@@ -25,7 +25,7 @@ from omnid.transport import codec, ros2
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import ERROR, OK, WARN, PoseAttachment
 from omnid.transport.session import open_client, open_session, zenoh_config
-from omnid.transport.topics import PUBLISHED
+from omnid.transport.topics import PUBLISHED, REQUEST_TOPICS, command_topics, request_key
 from tests.omnid.transport.bus_fixtures import ROUTER, SUBSCRIBER, free_endpoint, numbers, odometry, script, session
 from tests.waiting import wait_until
 
@@ -77,6 +77,11 @@ def test_the_default_is_this_machine_only() -> None:
     assert setting(config, "listen/endpoints") == ["tcp/127.0.0.1:7447"] and setting(config, protocols) == ["tcp"]
     assert not setting(config, "scouting/multicast/enabled") and not setting(config, "scouting/gossip/enabled")
     assert setting(config, "access_control")["default_permission"] == "deny"
+    limited = setting(BusConfig(robot="rover", ros2_domain=3), "low_pass_filter")[0]["key_exprs"]
+    topics = command_topics(("planner",)).keys() - {"cmd/path"}
+    keys = [f"rover/{topic}" for topic in topics] + [f"3/rover/{topic}/type/hash" for topic in topics]
+    keys += [f"rover/{request_key(topic)}" for topic in REQUEST_TOPICS - {"cmd/path"}]
+    assert all(any(zenoh.KeyExpr(bound).includes(zenoh.KeyExpr(key)) for bound in limited) for key in keys)
     both = BusConfig(listen=("tls/[::]:7447",), connect=("quic/site:1", "tls/site:1"))
     assert setting(both, protocols) == ["quic", "tls"] and setting(both, "mode") == "peer"
     limit = "transport/link/rx/max_message_size"

@@ -15,7 +15,6 @@ import zenoh
 from zenoh import ext
 
 from omnid.client import Pose, Robot
-from omnid.errors import OmnidError
 from omnid.transport import codec, ros2
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.topics import PUBLISHED, Request, command_topics, ros_name
@@ -117,11 +116,6 @@ def test_joins_the_router_of_ros_where_that_holds_the_endpoint(mode: str) -> Non
         )
         odom.undeclare()
     assert received[0][:2] == ("cmd/twist", twist) and poses[0] == odometry(1)
-
-
-def test_a_name_that_ros_does_not_allow_is_refused() -> None:
-    with pytest.raises(OmnidError, match="ROS 2 takes"):
-        Bus(BusConfig(robot="robot-1", listen=(), ros2="rmw_zenoh"))
 
 
 SDK = os.environ.get("OMNID_ZENOH_ROS2", "")  # the folder of a virtual environment with zenoh-ros2-sdk
