@@ -20,6 +20,7 @@ from calib import se3
 from omnid.core.control.heading_controller import wrap_angle
 from omnid.core.navigation.requests import GoalRequest, NavigationFrame
 from omnid.navigation_state import NavigationState
+from omnid.simulation.demonstration import cross_track_m
 from omnid.simulation.lockstep import Fault, Moment, Request, SimulatedRun, simulate
 from omnid.simulation.robot import Slip, WheelErrors, make_robot
 from omnid.simulation.vehicle import START_NS
@@ -91,27 +92,18 @@ CASES: dict[str, Case] = {
 }
 
 
-def legs_offset_m(truth: np.ndarray, goals: list[Goal]) -> float:
-    """Return the largest distance [m] of true positions (N, 4, 4) from the straight legs between goals."""
-    corners = np.array([(0.0, 0.0), *((x, y) for x, y, _ in goals)])
-    a, along = corners[:-1], np.diff(corners, axis=0)
-    to = truth[:, None, :2, 3] - a
-    share = np.clip((to * along).sum(axis=2) / (along**2).sum(axis=1), 0.0, 1.0)
-    return float(np.linalg.norm(to - share[..., None] * along, axis=2).min(axis=1).max())
-
-
 def row(case: Case, run: SimulatedRun) -> list[Cell]:
     """Return the figures of a drive."""
     x_m, y_m, heading_rad = run.ticks[-1].pose
     end = se3.inverse(run.T_world_base[0]) @ se3.transform(se3.rotation_exp([0, 0, heading_rad]), [x_m, y_m, 0.0])
     ends: list[Cell] = [None, None, None]
     if case.goals:
-        goal = case.goals[-1]
+        goal, legs = case.goals[-1], np.array([(0.0, 0.0), *((x, y) for x, y, _ in case.goals)])
         error_deg = math.degrees(wrap_angle(float(se3.yaw(end)) - math.radians(goal[2])))
         ends = [
             100 * math.dist(end[:2, 3], goal[:2]),
             abs(error_deg),
-            100 * legs_offset_m(run.truth_in_odom, case.goals),
+            100 * cross_track_m(legs, run.truth_in_odom[:, :2, 3]).max(),
         ]
     state = f"{run.navigation[-1].state} {run.navigation[-1].reason}".strip() if case.goals and run.navigation else ""
     moved = np.diff([tick.pose[:2] for tick in run.ticks], axis=0)

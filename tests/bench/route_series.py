@@ -14,7 +14,7 @@ import math
 import random
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -118,12 +118,12 @@ class Lesson:
                 yield RouteRequest(RouteAction.FINISH)
 
 
-class AskedOnceLocalised:
-    """A script: somebody drives slowly until the robot knows where it is, then it is asked for something."""
+class Repetition:
+    """A script: somebody drives slowly until the robot knows where it is, then it is asked to repeat the route."""
 
-    def __init__(self, line: Array, begin: int, asked: Callable[[Moment], Request]) -> None:
-        """line: (N, 2) [m] in the world, driven by hand from point number begin on; asked: returns the request."""
-        self._driver, self._asked, self._asked_s = Driver(line, begin), asked, math.inf
+    def __init__(self, line: Array, begin: int) -> None:
+        """line: (N, 2) [m] in the world, driven by hand from point number begin on."""
+        self._driver, self._asked_s = Driver(line, begin), math.inf
         self.end = ""
 
     def __call__(self, moment: Moment) -> Iterator[Request]:
@@ -136,7 +136,7 @@ class AskedOnceLocalised:
             if moment.place.state is MapState.LOCALIZED:
                 self._asked_s = moment.time_s
                 yield Setpoint(0.0)
-                yield self._asked(moment)
+                yield RouteRequest(RouteAction.REPEAT, ROUTE)
             elif moment.time_s > UNRECOGNISED_S:
                 self.end = "not recognised"
                 yield "end"
@@ -149,11 +149,6 @@ class AskedOnceLocalised:
             if refusal or navigation.state.is_end:
                 self.end = f"refused: {refusal}" if refusal else f"{navigation.state} {navigation.reason}".strip()
                 yield "end"
-
-
-def repetition(line: Array, begin: int) -> AskedOnceLocalised:
-    """Return the script of a repetition."""
-    return AskedOnceLocalised(line, begin, lambda moment: RouteRequest(RouteAction.REPEAT, ROUTE))
 
 
 def changed_world(seed: int, number: int, rng: random.Random, people: bool) -> World:
@@ -236,7 +231,7 @@ def series(seed: int, length_m: float, repeats: int, robot: SimulatedRobot, peop
                 math.atan2(ahead_y - y, ahead_x - x) + rng.uniform(-ASIDE_RAD, ASIDE_RAD),
             )
             world = replace(changed_world(seed, number, rng, people), start=start)
-            script = repetition(line, begin)
+            script = Repetition(line, begin)
             run = simulate(world, robot, script, seconds=LONGEST_S, seed=100 * seed + number, config=config)
             yield [
                 seed,
