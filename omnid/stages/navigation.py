@@ -17,9 +17,8 @@ from omnid.core.frames import base_pose, in_outer_axes, of_base
 from omnid.core.mapping.range_scan import azimuths
 from omnid.core.navigation.follower import STAND
 from omnid.core.navigation.forecast import forecast
-from omnid.core.navigation.local_planner import room_ahead
 from omnid.core.navigation.navigator import RESUME, Navigation, Navigator
-from omnid.core.navigation.path import DrivePath, drive_path, straight_leg
+from omnid.core.navigation.path import DrivePath, drive_path, goal_path
 from omnid.core.navigation.requests import (
     GoalRequest,
     NavigationCommand,
@@ -49,6 +48,7 @@ UNKNOWN_M = 1.2
 RING_NS = 2_000_000_000  # older rings show nothing of now: the collision monitor then stops the base
 MOST_ANSWERS = 64  # An update repeats as many answers as requests may wait: a sink may miss updates.
 OVERTAKEN = "a later request has ended it: ask again"
+BEHIND_SHARE = -0.17  # cosine of the direction beyond which an obstacle is behind; 100 degrees
 FIRST_LEG_M = 1.0  # A path that begins farther from the robot is refused.
 
 
@@ -244,7 +244,7 @@ class NavigationStage:
         self._require_ready(goal.frame)
         pose = self._situation().pose_in(goal.frame)
         self._require_near(math.dist(pose[:2], (goal.x_m, goal.y_m)))
-        return DrivePath((straight_leg(pose, (goal.x_m, goal.y_m)),), goal.heading_rad)
+        return goal_path(pose, (goal.x_m, goal.y_m), goal.heading_rad)
 
     def _given_path(self, path: PathRequest) -> DrivePath:
         self._require_ready(path.frame)
@@ -297,6 +297,15 @@ class NavigationStage:
             answers,
             plan,
         )
+
+
+def room_ahead(pose: Array, speed_mps: float, obstacles: Array) -> float:
+    """Return the distance from a pose (3,) to the nearest obstacle (N, 2) that is not behind the moving base."""
+    sign = -1.0 if speed_mps < 0 else 1.0
+    dx, dy = obstacles[:, 0] - pose[0], obstacles[:, 1] - pose[1]
+    distance = np.hypot(dx, dy)
+    forward = sign * (math.cos(pose[2]) * dx + math.sin(pose[2]) * dy)
+    return float(distance[forward > BEHIND_SHARE * distance].min(initial=math.inf))
 
 
 def _positions(ring: ObstacleRing, ranges_m: NDArray[np.float32]) -> Array:

@@ -39,13 +39,13 @@ class Approach(NamedTuple):
 class Pursuit:
     """Follow one leg; pose and path are in one frame."""
 
-    def __init__(self, leg: PathLeg, settings: PursuitSettings, s_m: float = 0.0) -> None:
-        """s_m: way on the leg to begin at."""
+    def __init__(self, leg: PathLeg, settings: PursuitSettings, s_m: float = 0.0, speed_mps: float = 0.0) -> None:
+        """s_m: way on the leg to begin at. speed_mps: of the base, in the direction of the leg."""
         self.leg = leg
         self.s_m = s_m
         self._settings = settings
         self._turning = True  # True until the first step finds that no turn is needed
-        self._speed_mps = 0.0
+        self._speed_mps = speed_mps
         self._last_ns: int | None = None
 
     def step(
@@ -113,8 +113,6 @@ SETTLED_MPS: Final = 0.03
 CORNER_M: Final = 0.03  # A leg ends this far from its end, unless it is the last one.
 CORRECTIONS: Final = 3  # Most short drives that correct the distance left to the goal.
 BEHIND_RAD: Final = math.pi / 2  # A goal in a direction beyond this is behind: the base drives backwards to it.
-SKIP_M: Final = 2.0  # Length before and after a corner within which a detour may cut it.
-SKIP_BESIDE_M: Final = 0.15
 STAND: Final = Setpoint(0.0, None, 0.0)  # exact zeros: no motion
 
 
@@ -129,63 +127,70 @@ class Following(NamedTuple):
     missed_m: float = 0.0  # distance to the goal, where done
 
 
+class PathAhead(NamedTuple):
+    """Points of a path, in its frame."""
+
+    xy: Array  # (N, 2)
+    legs: NDArray[np.intp]  # (N,) numbers of their legs
+    s: Array  # (N,) way on the leg
+
+
 class Follower:
     """Drive a path to its end; poses are in the frame of the path."""
 
-    def __init__(self, path: DrivePath, settings: NavigationSettings, leg: int = 0, s_m: float = 0.0) -> None:
-        """leg, s_m: where on the path to begin."""
+    def __init__(
+        self, path: DrivePath, settings: NavigationSettings, leg: int = 0, s_m: float = 0.0, speed_mps: float = 0.0
+    ) -> None:
+        """leg, s_m: where on the path to begin. speed_mps: of the base, ahead."""
         self.path = path
-        self._settings = settings
+        self.settings = settings
         self._legs = list(path.legs)
-        self._number = leg
-        at_goal = path.length_m <= settings.goal_cm * 0.01
-        self._pursuit = None if at_goal else Pursuit(self._legs[leg], settings.pursuit, s_m)
+        self._number = min(leg, len(self._legs) - 1)
+        at_goal = path.length_m <= settings.goal_cm * 0.01 or leg >= len(self._legs)
+        along_mps = max(0.0, -speed_mps if self._legs[self._number].backwards else speed_mps)
+        self._pursuit = None if at_goal else Pursuit(self._legs[leg], settings.pursuit, s_m, along_mps)
         self._settled = 0
         self._corrections = 0
 
     @property
-    def pursuit(self) -> Pursuit | None:
-        """The leg that is followed; None while the base turns at the end."""
-        return self._pursuit
+    def aligns(self) -> bool:
+        """True while the base turns at the end of the path."""
+        return self._pursuit is None
 
-    def path_ahead(self, way_m: float) -> Array:
-        """Return the path (N, 2) from the nearest point on, of at least a length, through the next legs if need be."""
+    def ahead(self, way_m: float) -> PathAhead:
+        """Return the path from the nearest point on, of at least a length, through the next legs if need be."""
         if self._pursuit is None:
-            return self.path.goal[None]
-        leg = self._pursuit.leg
-        s_m = self._pursuit.s_m
-        pieces = [leg.at(s_m)[None, :2], leg.xy[(leg.s > s_m) & (leg.s <= s_m + way_m)]]
-        left_m = leg.length_m - s_m
-        for leg in self._legs[self._number + 1 :]:
-            if left_m >= way_m:
+            return PathAhead(
+                self.path.goal[None], np.array([self._number]), np.array([self._legs[self._number].length_m])
+            )
+        pieces: list[tuple[Array, NDArray[np.intp], Array]] = []
+        s_m, left_m = self._pursuit.s_m, way_m
+        for number in range(self._number, len(self._legs)):
+            leg = self._legs[number]
+            within = (leg.s > s_m) & (leg.s <= s_m + left_m)
+            s = np.append(s_m, leg.s[within])
+            pieces.append((np.vstack([leg.at(s_m)[None, :2], leg.xy[within]]), np.full(len(s), number), s))
+            left_m, s_m = left_m - (leg.length_m - s_m), 0.0
+            if left_m <= 0:
                 break
-            pieces.append(leg.xy[(leg.s > 0) & (leg.s <= way_m)])
-            left_m += leg.length_m
-        return np.vstack(pieces)
+        return PathAhead(*(np.concatenate(parts) for parts in zip(*pieces, strict=True)))
+
+    @property
+    def place(self) -> tuple[int, float]:
+        """The leg and the way on it."""
+        return self._number, self._legs[self._number].length_m if self._pursuit is None else self._pursuit.s_m
 
     @property
     def leg_left_m(self) -> float:
         """Way to the end of the leg."""
         return 0.0 if self._pursuit is None else self._pursuit.leg.length_m - self._pursuit.s_m
 
-    def skip_corner(self, pose: Array) -> None:
-        """Continue with the next leg where the base, on a detour, has reached it without the end of this one."""
-        pursuit = self._pursuit
-        if pursuit is None or self._number + 1 >= len(self._legs) or self.leg_left_m > SKIP_M:
-            return
-        leg = self._legs[self._number + 1]
-        near_m = np.hypot(leg.xy[:, 0] - pose[0], leg.xy[:, 1] - pose[1])
-        k = int(np.argmin(np.where(leg.s <= SKIP_M, near_m, np.inf)))
-        if near_m[k] < SKIP_BESIDE_M < abs(pursuit.leg.offset_m(pose, pursuit.s_m)):
-            self._number += 1
-            self._pursuit = Pursuit(leg, self._settings.pursuit, float(leg.s[k]))
-
     def step(
         self, stamp_ns: int, pose: Array, speed_mps: float, yaw_rate_radps: float, obstacle_m: float = math.inf
     ) -> Following:
         """Return the motion at a pose (3,) with its measured speeds."""
         # 1. Predict the pose at which the command takes effect.
-        at_effect = predicted(pose, speed_mps, yaw_rate_radps, self._settings.pursuit.delay_s)
+        at_effect = predicted(pose, speed_mps, yaw_rate_radps, self.settings.pursuit.delay_s)
         # 2. Follow the legs.
         if self._pursuit is not None:
             following = self._follow(self._pursuit, stamp_ns, at_effect, speed_mps, obstacle_m)
@@ -200,7 +205,7 @@ class Follower:
         """Follow the leg; None at the end of the last one."""
         approach = pursuit.step(stamp_ns, pose, speed_mps, obstacle_m=obstacle_m)
         is_last = self._number == len(self._legs) - 1
-        end_m = 0.25 * self._settings.goal_cm * 0.01 if is_last else CORNER_M
+        end_m = 0.25 * self.settings.goal_cm * 0.01 if is_last else CORNER_M
         if approach.left_m > end_m or approach.turning:
             left_m = approach.left_m + sum(leg.length_m for leg in self._legs[self._number + 1 :])
             return Following(approach.setpoint, left_m, approach.offset_m, approach.turning)
@@ -208,7 +213,7 @@ class Follower:
             self._pursuit = None
             return None
         self._number += 1
-        self._pursuit = Pursuit(self._legs[self._number], self._settings.pursuit)
+        self._pursuit = Pursuit(self._legs[self._number], self.settings.pursuit)
         left_m = sum(leg.length_m for leg in self._legs[self._number :])
         return Following(STAND, left_m, approach.offset_m, True)
 
@@ -218,16 +223,17 @@ class Follower:
         missing_m = float(np.hypot(*missing))
         error_rad = 0.0 if goal_rad is None else wrap_angle(goal_rad - float(pose[2]))
         is_at_rest = abs(speed_mps) < SETTLED_MPS and abs(yaw_rate_radps) < SETTLED_RADPS
-        within = abs(error_rad) <= math.radians(self._settings.goal_deg)
+        within = abs(error_rad) <= math.radians(self.settings.goal_deg)
         self._settled = self._settled + 1 if is_at_rest and within else 0
         setpoint = STAND if goal_rad is None else Setpoint(0.0, goal_rad)
         if self._settled < SETTLED:
             return Following(setpoint, missing_m, 0.0, True)
-        if missing_m <= self._settings.goal_cm * 0.01 or self._corrections >= CORRECTIONS:
+        if missing_m <= self.settings.goal_cm * 0.01 or self._corrections >= CORRECTIONS:
             return Following(STAND, 0.0, 0.0, False, True, missing_m)
         self._corrections += 1
         self._settled = 0
         aside_rad = abs(wrap_angle(math.atan2(missing[1], missing[0]) - float(pose[2])))
-        self._legs = [straight_leg(pose, self.path.goal, backwards=aside_rad > BEHIND_RAD)]
-        self._number, self._pursuit = 0, Pursuit(self._legs[0], self._settings.pursuit)
+        self._legs.append(straight_leg(pose, self.path.goal, backwards=aside_rad > BEHIND_RAD))
+        self._number += 1
+        self._pursuit = Pursuit(self._legs[-1], self.settings.pursuit)
         return Following(STAND, missing_m, 0.0, True)

@@ -6,7 +6,8 @@ Every end is a stop. Time is that of the poses. A drive in the frame map follows
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections import deque
+from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -18,9 +19,9 @@ from omnid.core.control.command_sources import PLANNER
 from omnid.core.control.heading_controller import Setpoint, wrap_angle
 from omnid.core.control.safety_rules import ASKED
 from omnid.core.navigation.follower import STAND, Follower, Following
-from omnid.core.navigation.giving_way import GivingWay, Phase, Trail, closed, give_way, is_free
-from omnid.core.navigation.local_planner import Detour, LocalPlanner
-from omnid.core.navigation.path import DrivePath
+from omnid.core.navigation.forecast import Pace, yielding
+from omnid.core.navigation.path import DrivePath, drive_path, goal_path
+from omnid.core.navigation.planner import BACK_MPS, NoWay, Planner, distances
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import NOWHERE, UNKNOWN_M, Situation, refusal_of_map, refusal_to_drive
@@ -30,6 +31,62 @@ from omnid.tracking_state import MapState, TrackingState
 Array = NDArray[np.float64]
 
 PROGRESS_M, PROGRESS_RAD = 0.05, math.radians(5)  # A smaller motion is no progress; by trial on development seeds.
+ARRIVED_M: Final = 0.1  # A detour or a way back ends this far from its last point.
+STOPS: Final = 5  # A stop is sent at so many poses after the end of a drive, because one might be lost.
+BESIDE_M: Final = 0.3  # The path counts as left this far beyond the corridor; by trial on development seeds.
+PLANNED_M: Final = 4.0  # Length of the path in which a place behind an obstacle is searched.
+LOOK_M: Final = 2.0  # Length of the way ahead in which obstacles are searched.
+REJOIN_M: Final = 0.3  # Free length of the path behind an obstacle, at which a detour ends.
+BEFORE_M: Final = 0.35  # Distance of the outline from an obstacle on the path at which the base waits.
+WAIT_MPS2: Final = 0.2  # Deceleration towards an obstacle at which the base waits.
+AGAIN_NS: Final = 500_000_000  # between two searches
+MOST_WAYS: Final = 12  # Most ways that are tried without coming AGAIN_M nearer to the end.
+LONGEST_STEP_S: Final = 1.0  # A longer time between two poses counts as this, because a gap is no wait.
+AGAIN_M: Final = 1.0  # After this progress the next block is a new one; by trial on development seeds.
+NEARER_M: Final = 0.005  # Least change of the room between two points of a way: more than rounding.
+# Giving way: spacing of the places that are kept; least way back, so that it makes room for somebody, and least way to
+# a wider place; room beside the outline in which a person passes; of the way ahead that must be free to go on.
+SPACING_M, SHORTEST_M, CLEAR_M, PASS_M, PAST_M = 0.1, 0.3, 1.0, 0.8, 1.0
+REST_S, SPREAD_S, FREE_S = 3.0, 4, 1.0  # least wait, its spread, time for which the way ahead must be free
+# It goes on after this time in any case, to look; after twice the time when it is blocked again; at most so long.
+RETRY_S, LONGEST_RETRY_S = 10.0, 300.0
+
+RESUME: Final = "`omnid goto --resume` (it arms, too)"  # the one command after a fault or a pause
+AROUND: Final = "it looks for a way around an obstacle"
+GIVES_WAY: Final = "it drives back to let others pass"
+WAITS: Final = "it goes on by itself when the way is free"
+STANDS: Final = "something stands on the path"
+CROSSES: Final = "somebody or something crosses the path"
+
+
+class Place(NamedTuple):
+    """Where the base was, in odom, and where that is on its path."""
+
+    xy: tuple[float, float]
+    is_back: bool  # it came backwards
+    leg: int
+    s_m: float
+
+
+class Detour(NamedTuple):
+    """A way around something on the path."""
+
+    follower: Follower  # in odom
+    leg: int  # of the path, to which it leads back
+    s_m: float  # on that leg
+
+
+@dataclass(slots=True)
+class Retreat:
+    """A blocked base drives back along the way that it came, lets others pass, and goes on (Place as in the trail)."""
+
+    follower: Follower | None  # the way back, in odom; None: it waits
+    ahead: Array  # (N, 2) in odom, from the end of the way back to the block and past it
+    spread_s: float  # added to the least wait, so that two robots that met move at different times
+    waits_s: float  # it goes on after this time in any case, to look
+    end: Place
+    rested_s: float = 0.0
+    free_s: float = 0.0  # for which the way ahead has been free
 
 
 @dataclass(slots=True)
@@ -47,33 +104,49 @@ class Drive:
     halts: int = 0  # WheelState.halts at the start, or when a person let it go on
     unlocalised_m: float = 0.0  # distance driven since the pose in the map was known
     localised_ns: int = -1  # stamp of that pose
-    nearest_m: float = math.inf  # length of the path that was left at the last progress
+    nearest_m: float = math.inf  # length of the way that was left at the last progress
     heading_rad: float = 0.0  # heading at the last progress
     stuck_s: float = 0.0  # time since the last progress
+    blocked_s: float = 0.0  # time for which no way was found since the base has come nearer to the end
     last_xy: Array | None = None  # last position in odom
-    giving_way: GivingWay | None = None  # None unless the base gives way now
+    detour: Detour | None = None  # None: it follows the path
+    retreat: Retreat | None = None  # None unless the base gives way now
     gave_way: int = 0  # number of times that the base gave way at the last block
     gave_way_m: float = math.inf  # length of the path that was left at that block
     around_unknown: bool = False  # floor that was not seen has stopped the base: it is an obstacle until it is passed
+    least_m: float = math.inf  # least way that was left, in steps of AGAIN_M
+    ways: int = 0  # number of ways that were found since then, each of which was blocked again
+    searched_ns: int = -AGAIN_NS  # stamp of the last search
+    no_way: str = ""  # why it was in vain
 
-    def obstacles(self, now: Situation) -> Array:
-        """Return what the base must not come near (N, 2), in odom."""
-        known = NOWHERE if now.obstacles is None else now.obstacles
-        return np.vstack([known, now.unknown]) if self.around_unknown else known
-
-    def path_ahead(self, now: Situation, way_m: float) -> Array:
-        """Return the path (N, 2) ahead, in odom."""
+    def in_odom(self, xy: Array, now: Situation) -> Array:
+        """Return points (N, 2) of the path in odom."""
         T_odom_frame = relative(now.T_frame_odom(self.frame), np.zeros(3))
-        ahead = self.follower.path_ahead(way_m)
-        path = composed(np.repeat(T_odom_frame[None], len(ahead), 0), np.column_stack([ahead, np.zeros(len(ahead))]))
+        path = composed(np.repeat(T_odom_frame[None], len(xy), 0), np.column_stack([xy, np.zeros(len(xy))]))
         return np.asarray(path[:, :2])
 
-    def in_odom(self, setpoint: Setpoint, now: Situation) -> Setpoint:
-        """Return a setpoint whose heading is in odom."""
-        if setpoint.heading_rad is None:
-            return setpoint
+    def step(self, now: Situation) -> Following:
+        """Return the motion along the path or the detour, in odom; at its end the path goes on."""
+        motion = now.speed_mps, now.yaw_rate_radps, now.obstacle_m
+        if self.detour is not None:
+            following = self.detour.follower.step(now.stamp_ns, now.pose, *motion)
+            if not following.done and following.left_m >= ARRIVED_M:
+                return following
+            self.rejoin(now, self.detour.leg, self.detour.s_m)
+        following = self.follower.step(now.stamp_ns, now.pose_in(self.frame), *motion)
+        heading_rad = following.setpoint.heading_rad
+        if heading_rad is None:
+            return following
         turned_rad = float(now.T_frame_odom(self.frame)[2])
-        return Setpoint(setpoint.velocity_mps, wrap_angle(setpoint.heading_rad - turned_rad))
+        setpoint = replace(following.setpoint, heading_rad=wrap_angle(heading_rad - turned_rad))
+        return following._replace(setpoint=setpoint)
+
+    def rejoin(self, now: Situation, leg: int, s_m: float) -> None:
+        """Follow the path from a place on it; to a goal straight on."""
+        path, self.detour, self.nearest_m = self.paths[0], None, math.inf
+        if path.is_goal:
+            path, leg, s_m = goal_path(now.pose_in(self.frame), path.goal, path.final_heading_rad), 0, 0.0
+        self.follower = Follower(path, self.follower.settings, leg, s_m, now.speed_mps)
 
     def stands_since_s(self, pose: Array, left_m: float, dt_s: float) -> float:
         """Return the time since the last progress, which is a shorter way left or a turn; dt_s: since the last call."""
@@ -95,19 +168,6 @@ class Navigation(NamedTuple):
     offset_m: float = math.nan  # distance of the base to the left of the path
 
 
-STOPS: Final = 5  # A stop is sent at so many poses after the end of a drive, because one might be lost.
-BESIDE_M: Final = 0.3  # The path counts as left this far beyond the corridor; by trial on development seeds.
-PLANNED_M: Final = 4.0  # Length of the path that the local planner is given, because its grid ends at 3.2 m.
-LONGEST_STEP_S: Final = 1.0  # A longer time between two poses counts as this, because a gap is no wait.
-RESUME: Final = "`omnid goto --resume` (it arms, too)"  # the one command after a fault or a pause
-AROUND: Final = "it looks for a way around an obstacle"
-GIVES_WAY: Final = "it drives back to let others pass"
-WAITS: Final = "it goes on by itself when the way is free"
-AGAIN_M: Final = 1.0  # After this progress the next block is a new one; by trial on development seeds.
-MOST_DOUBLINGS: Final = 6  # Most doublings of the time until the base gives way again: to four minutes by default.
-PAST_M: Final = 1.0  # Length of the path past the block that must be free, too; by trial on development seeds.
-
-
 class Navigator:
     """Holds the present drive, if there is one."""
 
@@ -115,9 +175,9 @@ class Navigator:
         """collision: the outline of the base; None: the default one."""
         self._settings = settings
         collision = collision or CollisionSettings()
-        self._planner = LocalPlanner(settings, collision)
-        self._half_width_m = collision.half_width_m + collision.side_m
-        self._trail = Trail(settings.give_way_m)
+        self._planner = Planner(settings, collision)
+        self._front_m, self._rear_m, self._stop_m = collision.front_m, collision.rear_m, collision.stop_m
+        self._trail: deque[Place] = deque(maxlen=max(2, math.ceil(settings.give_way_m / SPACING_M) + 1))
         self._last_ns: int | None = None
         self._stops = 0  # number of stops that are still to be sent
         self.drive: Drive | None = None
@@ -135,8 +195,7 @@ class Navigator:
         self, task: str, frame: NavigationFrame, paths: list[DrivePath], now: Situation, command_ns: int = 0
     ) -> None:
         """Begin a drive, which replaces the one before."""
-        self._planner.restart()
-        self._trail.restart()
+        self._trail.clear()
         self.drive = Drive(
             task,
             frame,
@@ -189,36 +248,35 @@ class Navigator:
         if halt is not None:
             return self._wait(drive, *halt, dt_s)
         # 3. Giving way, while it lasts.
-        if drive.giving_way is not None:
-            return self._give_way(drive, drive.giving_way, now, dt_s)
-        # 4. The path.
-        pose = now.pose_in(drive.frame)
-        following = drive.follower.step(now.stamp_ns, pose, now.speed_mps, now.yaw_rate_radps, now.obstacle_m)
+        if drive.retreat is not None:
+            return self._give_way(drive, drive.retreat, now, dt_s)
+        # 4. The way.
+        following = drive.step(now)
         if following.done:
             return self._finished(drive, following.missed_m)
         if self._is_beside(following):
             return self._taken_away(following)
-        setpoint = drive.in_odom(following.setpoint, now)
-        # 5. Obstacles, and a safety rule that holds the wheels because of one.
-        drive.around_unknown |= now.wheels.held_by == UNKNOWN
-        path, leg_m = drive.path_ahead(now, PLANNED_M), drive.follower.leg_left_m
-        plan = self._around_obstacles(drive, path, leg_m, now, setpoint)
-        drive.around_unknown &= plan.avoiding or bool(now.wheels.held_by)
-        if plan.avoiding:
-            drive.follower.skip_corner(pose)
-        if plan.setpoint is None:
-            return self._blocked(drive, plan.reason, now, following, dt_s)
-        if now.wheels.held_by:  # the setpoint is still sent: the monitor lets go by itself
-            return self._blocked(drive, now.wheels.held_by, now, following, dt_s)._replace(setpoint=plan.setpoint)
+        # 5. Obstacles on it, and a safety rule that holds the wheels because of one.
+        held_by = now.wheels.held_by
+        drive.around_unknown |= held_by == UNKNOWN
+        following, setpoint, reason = self._around_obstacles(drive, now, following)
+        drive.around_unknown &= drive.detour is not None or bool(held_by)
+        if setpoint is None or held_by:  # where it is held, the setpoint is still sent: the monitor lets go by itself
+            return self._blocked(drive, reason if setpoint is None else held_by, now, following, dt_s, setpoint)
         # 6. Progress: where it is missing for too long, the base gives way or the drive fails.
+        avoids = drive.detour is not None
         if self._is_stuck(drive, now, following, dt_s):
-            if plan.avoiding and not drive.gave_way and self._begins_to_give_way(drive, now, following.left_m):
+            if avoids and not drive.gave_way and self._begins_to_give_way(drive, now, following.left_m):
                 return self._wait(drive, NavigationState.BLOCKED, AROUND, dt_s)
-            return self._no_progress(now, AROUND if plan.avoiding else "")
-        self.state = NavigationState.AVOIDING if plan.avoiding else NavigationState.DRIVING
-        self.reason = now.wheels.reason if now.wheels.is_held else plan.reason
+            return self._no_progress(now, AROUND if avoids else "")
+        self.state = NavigationState.AVOIDING if avoids else NavigationState.DRIVING
+        self.reason = now.wheels.reason if now.wheels.is_held else reason
         drive.waits.clear()
-        return Navigation(plan.setpoint, self.state, self.reason, following.left_m, following.offset_m)
+        if following.left_m < drive.gave_way_m - AGAIN_M:
+            drive.blocked_s = 0.0
+        if following.left_m < drive.least_m - AGAIN_M:
+            drive.least_m, drive.ways = following.left_m, 0
+        return Navigation(setpoint, self.state, self.reason, following.left_m, following.offset_m)
 
     def _idle(self) -> Navigation:
         if self._stops:
@@ -240,14 +298,15 @@ class Navigator:
         moved_m = 0.0 if drive.last_xy is None else float(np.hypot(*(now.pose[:2] - drive.last_xy)))
         drive.last_xy = now.pose[:2].copy()
         drive.unlocalised_m += moved_m
-        if drive.giving_way is None:
-            self._trail.add(now.pose, now.speed_mps)
         if drive.resets != now.resets:
-            self._trail.restart()
-            drive.giving_way = None
+            self._trail.clear()
+            drive.retreat = drive.detour = None
             drive.resets, drive.unlocalised_m = now.resets, math.inf
             if drive.frame is NavigationFrame.ODOM:
                 self._end(NavigationState.FAILED, "odometry has lost its map and begun again: ask again")
+        xy = float(now.pose[0]), float(now.pose[1])
+        if drive.retreat is None and (not self._trail or math.dist(xy, self._trail[-1].xy) >= SPACING_M):
+            self._trail.append(Place(xy, now.speed_mps < 0, *drive.follower.place))
         in_map = now.in_map
         if in_map is None or in_map.stamp_ns <= drive.localised_ns:  # no new pose in the map has come
             return
@@ -283,81 +342,191 @@ class Navigator:
         setpoint = None if state is NavigationState.PAUSED else STAND
         return Navigation(setpoint, state, reason)
 
-    def _blocked(self, drive: Drive, reason: str, now: Situation, following: Following, dt_s: float) -> Navigation:
-        """Wait for a free way, and give way where that takes too long."""
+    def _around_obstacles(
+        self, drive: Drive, now: Situation, following: Following
+    ) -> tuple[Following, Setpoint | None, str]:
+        """Return progress, motion and the reason why it is slower than wanted; no motion where no way is free."""
+        wanted, on_way = following.setpoint, drive.detour.follower if drive.detour else drive.follower
+        if now.obstacles is None or on_way.aligns:
+            return following, wanted, ""
+        # 1. What moves: the speed at which it has passed; who comes to where the base would wait counts as standing.
+        obstacles, share = now.obstacles, 1.0
+        path = self._ahead(drive, now, LOOK_M)
+        pursuit = self._settings.pursuit
+        if now.moving is not None and wanted.velocity_mps > 0:
+            standing_m = max(self._planner.room_m, self._front_m, self._rear_m)
+            moving_m = max(self._planner.room_m + self._settings.clearance_m, self._front_m + self._stop_m)
+            speed_mps = max(now.speed_mps, 0.0)
+            pace = Pace(speed_mps, pursuit.velocity_mps, pursuit.acceleration_mps2, moving_m, standing_m)
+            share, coming = yielding(self._ahead(drive, now, PLANNED_M), on_way.leg_left_m, now.moving, pace)
+            outlines = now.moving.outlines(coming, now.pose[:2], pursuit.velocity_mps)
+            obstacles = np.vstack([now.moving.others(obstacles), outlines])
+        # 2. The way is left where it is blocked, also by floor that was not seen, if there is a way around that.
+        room_m = self._planner.room_m + (0.0 if drive.detour else self._settings.clearance_m)
+        around = np.vstack([obstacles, now.unknown]) if drive.around_unknown else obstacles
+        first_m = first_blocked_m(path, obstacles, room_m)
+        is_held = drive.detour is not None and bool(now.wheels.held_by)
+        is_blocked = is_held or first_m < math.inf or first_blocked_m(path, around, room_m) < math.inf
+        if is_blocked and now.stamp_ns - drive.searched_ns >= AGAIN_NS:
+            drive.searched_ns = now.stamp_ns
+            found = self._search(drive, now, around)
+            if found is None and drive.around_unknown and first_m < math.inf:
+                found = self._search(drive, now, obstacles)
+            if found is not None:
+                drive.detour, drive.nearest_m, drive.ways = found, math.inf, drive.ways + 1
+                following = drive.step(now)
+                return following, following.setpoint, CROSSES if share < 1.0 else ""
+        elif not is_blocked and drive.detour is not None and self._can_go_straight(drive, now, around):
+            drive.rejoin(now, *drive.detour[1:])
+            following = drive.step(now)
+            wanted = following.setpoint
+        # 3. Without a way around it, drive up to the obstacle and wait.
+        left_m = first_m - self._front_m - BEFORE_M
+        if left_m <= 0 and wanted.velocity_mps > 0:
+            return following, None, STANDS
+        if share == 0.0:
+            return following, None, CROSSES
+        if share < 1.0:
+            return following, _slower(wanted, share * pursuit.velocity_mps), CROSSES
+        return following, _slower(wanted, math.sqrt(2 * WAIT_MPS2 * max(left_m, 0.0))), ""
+
+    def _ahead(self, drive: Drive, now: Situation, way_m: float) -> Array:
+        """Return the points (N, 2) of the way ahead, in odom."""
+        if drive.detour is not None:
+            return drive.detour.follower.ahead(way_m).xy
+        return drive.in_odom(drive.follower.ahead(way_m).xy, now)
+
+    def _search(self, drive: Drive, now: Situation, obstacles: Array) -> Detour | None:
+        """Return a way around what is on the path; None without one."""
+        settings, path = self._settings, drive.paths[0]
+        if not settings.corridor_m:
+            return None
+        # 1. Where it leads: to the goal, or to the path behind the obstacle.
+        if path.is_goal:
+            goal, corridor, heading_rad = drive.in_odom(path.goal[None], now)[0], None, math.nan
+            place = 0, 0.0
+        else:
+            ahead = drive.follower.ahead(PLANNED_M)
+            corridor = drive.in_odom(ahead.xy, now)
+            k = _behind(corridor, obstacles, self._planner.room_m + settings.clearance_m)
+            if k is None:
+                drive.no_way = "the path is not free within sight"
+                return None
+            goal, place = corridor[k], (int(ahead.legs[k]), float(ahead.s[k]))
+            leg = path.legs[min(place[0], len(path.legs) - 1)]
+            heading_rad = leg.at(place[1])[2] + (math.pi if leg.backwards else 0.0)
+            heading_rad -= float(now.T_frame_odom(drive.frame)[2])
+        # 2. The way.
+        if drive.ways >= MOST_WAYS:
+            drive.no_way = f"{drive.ways} ways were tried"
+            return None
+        found = self._planner.way(now.pose, goal, obstacles, corridor, heading_rad)
+        if isinstance(found, NoWay):
+            drive.no_way = found.reason
+            return None
+        return Detour(Follower(found, settings, speed_mps=now.speed_mps), *place)
+
+    def _can_go_straight(self, drive: Drive, now: Situation, obstacles: Array) -> bool:
+        """True if the goal is ahead and nothing is on the straight way to it."""
+        path = drive.paths[0]
+        if not path.is_goal:
+            return False
+        straight = goal_path(now.pose, drive.in_odom(path.goal[None], now)[0]).legs[0]
+        aside_rad = abs(wrap_angle(float(straight.heading[0] - now.pose[2])))
+        room_m = self._planner.room_m + self._settings.clearance_m
+        return aside_rad < math.pi / 4 and math.isinf(first_blocked_m(straight.xy, obstacles, room_m))
+
+    def _blocked(
+        self, drive: Drive, reason: str, now: Situation, following: Following, dt_s: float, setpoint: Setpoint | None
+    ) -> Navigation:
+        """Wait for a free way, and give way where that takes too long; end where no way leads to a goal."""
+        if self._gives_up(drive, dt_s):
+            why = reason if setpoint is not None else drive.no_way or reason
+            return self._failed(f"no way to the goal, {following.left_m:.1f} m are left: {why}")
         waiting = self._wait(drive, NavigationState.BLOCKED, f"{reason}: {WAITS}", dt_s)
         if following.left_m < drive.gave_way_m - AGAIN_M:
             drive.gave_way = 0
-        patience_s = self._settings.give_way_s * 2.0 ** min(drive.gave_way, MOST_DOUBLINGS)
-        if drive.waits[NavigationState.BLOCKED] > patience_s:
+        if drive.waits[NavigationState.BLOCKED] > self._settings.give_way_s:
             self._begins_to_give_way(drive, now, following.left_m)
+        if setpoint is not None:
+            waiting = waiting._replace(setpoint=setpoint)
         return waiting._replace(left_m=following.left_m, offset_m=following.offset_m)
+
+    def _gives_up(self, drive: Drive, dt_s: float) -> bool:
+        """True if for too long no way leads to a goal; paths and routes never give up."""
+        drive.blocked_s += dt_s
+        return drive.paths[0].is_goal and 0 < self._settings.give_up_s < drive.blocked_s
 
     def _begins_to_give_way(self, drive: Drive, now: Situation, left_m: float) -> bool:
         """Begin to drive back; False where there is no free way back, or it is switched off."""
         drive.waits[NavigationState.BLOCKED] = drive.stuck_s = 0.0
         if now.obstacles is None or not self._settings.give_way_m:
             return False
-        obstacles = drive.obstacles(now)
-        drive.giving_way = give_way(self._trail, self._settings, now.pose, now.stamp_ns, obstacles, self._half_width_m)
-        if drive.giving_way is not None:
+        ahead = self._ahead(drive, now, PAST_M)
+        drive.retreat = self._way_back(now, ahead, now.obstacles, drive.gave_way)
+        if drive.retreat is not None:
             drive.gave_way, drive.gave_way_m, drive.nearest_m = drive.gave_way + 1, left_m, math.inf
-        return drive.giving_way is not None
+        return drive.retreat is not None
 
-    def _give_way(self, drive: Drive, giving: GivingWay, now: Situation, dt_s: float) -> Navigation:
-        """Drive back, rest, and come again to the place where the base was blocked. All in odom."""
-        obstacles = drive.obstacles(now)
-        motion = now.stamp_ns, now.pose, now.speed_mps, now.yaw_rate_radps
-        following = None if giving.phase is Phase.REST else giving.drive(*motion)
-        if following is not None and self._is_beside(following):
-            return self._taken_away(following)
+    def _way_back(self, now: Situation, ahead: Array, obstacles: Array, times: int) -> Retreat | None:
+        """Return the way back along the trail, up to where others can pass; None where there is none."""
+        room_m = self._planner.room_m
+        places = [*reversed(self._trail)]
+        xy = np.array([now.pose[:2], *(place.xy for place in places)])
+        ways = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
+        # 1. As far as it is free now, and no farther than is wanted.
+        free_m = first_blocked_m(xy, obstacles, room_m)
+        last = int(np.searchsorted(ways, min(free_m - NEARER_M, self._settings.give_way_m), side="right"))
+        # 2. Up to the next place where others can pass.
+        is_wide = (distances(xy[:last], obstacles) > room_m + PASS_M) & (ways[:last] >= CLEAR_M)
+        last = int(np.argmax(is_wide)) + 1 if is_wide.any() else last
+        if last < 2 or ways[last - 1] < SHORTEST_M:
+            return None
+        came_back = [places[0].is_back, *(place.is_back for place in places)][:last]
+        backwards = [not back for back in (came_back[:1] + came_back)[:last]]
+        path = drive_path(xy[:last], speeds=np.full(last, BACK_MPS), backwards=backwards)
+        return Retreat(
+            Follower(path, self._settings),
+            np.vstack([xy[:last][::-1], ahead]),
+            float(now.stamp_ns // 1_000_000_000 % SPREAD_S),
+            min(RETRY_S * 2.0**times, LONGEST_RETRY_S),
+            places[last - 2],
+        )
+
+    def _give_way(self, drive: Drive, retreat: Retreat, now: Situation, dt_s: float) -> Navigation:
+        """Drive back, wait, and go on. All in odom."""
+        if self._gives_up(drive, dt_s):
+            return self._failed(f"no way to the goal, {drive.gave_way_m:.1f} m are left: {drive.no_way or STANDS}")
+        obstacles = NOWHERE if now.obstacles is None else now.obstacles
         # 1. Back, as far as it is seen to be free now.
-        if giving.phase is Phase.BACK:
-            is_closed = now.obstacles is None or closed(giving.look_back(), obstacles, self._half_width_m).any()
-            if following is not None and not is_closed and not now.wheels.held_by:
+        if retreat.follower is not None:
+            following = retreat.follower.step(now.stamp_ns, now.pose, now.speed_mps, now.yaw_rate_radps)
+            if self._is_beside(following):
+                return self._taken_away(following)
+            is_there = following.done or following.left_m < ARRIVED_M
+            path = retreat.follower.ahead(CLEAR_M).xy
+            is_free = math.isinf(first_blocked_m(path, obstacles, self._planner.room_m))
+            if not is_there and is_free and now.obstacles is not None and not now.wheels.held_by:
                 if self._is_stuck(drive, now, following, dt_s):
                     return self._no_progress(now, GIVES_WAY)
                 self.state, self.reason = NavigationState.AVOIDING, GIVES_WAY
                 return Navigation(following.setpoint, self.state, self.reason, drive.gave_way_m)
-            giving.rest()
-            drive.nearest_m = math.inf
-        # 2. Wait until the way is free, or it is time to search for another one.
-        if giving.phase is Phase.REST:
-            way = np.vstack([giving.way_to_block(now.pose), drive.path_ahead(now, PAST_M)])
-            room_m = self._half_width_m + self._settings.clearance_m
-            if giving.move_on(now.pose, dt_s, is_free(way, obstacles, room_m)):
-                return self._wait(drive, NavigationState.BLOCKED, f"it gives way: {WAITS}", dt_s)
-        # 3. To the place where it was blocked.
-        elif following is not None:
-            path, leg_m = giving.follower.path_ahead(PLANNED_M), giving.follower.leg_left_m
-            plan = self._around_obstacles(drive, path, leg_m, now, following.setpoint)
-            if plan.setpoint is None or now.wheels.held_by:
-                giving.rest()
-                drive.nearest_m = math.inf
-                return self._wait(drive, NavigationState.BLOCKED, plan.reason or now.wheels.held_by, dt_s)
-            if self._is_stuck(drive, now, following, dt_s):
-                return self._no_progress(now, AROUND if plan.avoiding else "")
-            self.state = NavigationState.AVOIDING if plan.avoiding else NavigationState.DRIVING
-            self.reason = plan.reason
-            return Navigation(plan.setpoint, self.state, self.reason, drive.gave_way_m)
-        drive.giving_way, drive.nearest_m = None, math.inf
+            retreat.follower = None
+        # 2. Wait until the way is free, or it is time to look again.
+        retreat.rested_s += dt_s
+        nearest = int(np.argmin(np.hypot(*(retreat.ahead - now.pose[:2]).T)))
+        room_m = self._planner.room_m + self._settings.clearance_m
+        is_free = bool((distances(retreat.ahead[nearest:], obstacles) >= room_m).all())
+        retreat.free_s = retreat.free_s + dt_s if is_free else 0.0
+        goes_on = retreat.free_s >= FREE_S and retreat.rested_s >= REST_S + retreat.spread_s
+        if not goes_on and retreat.rested_s < retreat.waits_s:
+            return self._wait(drive, NavigationState.BLOCKED, f"it gives way: {WAITS}", dt_s)
+        # 3. Go on from there.
+        nearest_place = min(self._trail, key=lambda place: math.dist(place.xy, now.pose[:2]))
+        drive.rejoin(now, nearest_place.leg, nearest_place.s_m)
+        drive.retreat = None
         drive.waits.clear()
         return Navigation(STAND, self.state, self.reason, drive.gave_way_m)
-
-    def _around_obstacles(self, drive: Drive, path: Array, leg_m: float, now: Situation, wanted: Setpoint) -> Detour:
-        """Return the motion, by way of a detour where the path (N, 2) in odom is blocked; leg_m: to its next corner."""
-        if now.obstacles is None:
-            return Detour(wanted, False)
-        return self._planner.plan(
-            now.pose,
-            path,
-            now.obstacles,
-            wanted,
-            unknown=now.unknown if drive.around_unknown else NOWHERE,
-            moving=now.moving,
-            leg_left_m=leg_m,
-            speed_mps=now.speed_mps,
-        )
 
     def _is_stuck(self, drive: Drive, now: Situation, following: Following, dt_s: float) -> bool:
         """True if for too long the base has neither come nearer to the end nor turned."""
@@ -394,3 +563,40 @@ class Navigator:
     def _end(self, state: NavigationState, reason: str) -> None:
         self.drive, self._stops = None, STOPS
         self.state, self.reason = state, reason
+
+
+def first_blocked_m(path: Array, obstacles: Array, room_m: float) -> float:
+    """Return the way along a path (N, 2) to where it is nearer than a room to an obstacle (M, 2); inf without one.
+
+    What the base is near to already, and drives away from, does not count.
+    """
+    near_m = distances(path, obstacles)
+    is_blocked = near_m < room_m
+    if is_blocked[0]:
+        leaves = np.minimum.accumulate(np.append(True, np.diff(near_m) > -NEARER_M))
+        is_blocked &= ~(leaves & np.minimum.accumulate(is_blocked))
+    if not is_blocked.any():
+        return math.inf
+    k = int(np.argmax(is_blocked))
+    return float(np.hypot(*np.diff(path[: k + 1], axis=0).T).sum())
+
+
+def _behind(path: Array, obstacles: Array, room_m: float) -> int | None:
+    """Return the first point of a path (N, 2) behind an obstacle about which REJOIN_M of it are free; None without."""
+    ways = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
+    is_blocked = distances(path, obstacles) < room_m
+    free_from = int(np.argmax(is_blocked))
+    for k in range(free_from, len(path)):
+        if is_blocked[k]:
+            free_from = k + 1
+        elif ways[k] - ways[min(free_from, k)] >= REJOIN_M or k == len(path) - 1:
+            return k
+    return None
+
+
+def _slower(wanted: Setpoint, speed_mps: float) -> Setpoint:
+    """Return the motion on the same arc, limited to a speed ahead."""
+    if wanted.velocity_mps <= speed_mps:
+        return wanted
+    share = speed_mps / wanted.velocity_mps
+    return Setpoint(speed_mps, wanted.heading_rad, wanted.yaw_rate_radps * share)

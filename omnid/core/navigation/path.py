@@ -86,6 +86,7 @@ class DrivePath:
 
     legs: tuple[PathLeg, ...]
     final_heading_rad: float | None = None  # None: any heading
+    is_goal: bool = False  # only its end matters: any way there will do
 
     @property
     def length_m(self) -> float:
@@ -126,6 +127,11 @@ def drive_path(
     ends = [0, *_corners(given, back), len(given) - 1]
     legs = tuple(_leg(given[a : b + 1], limits[a : b + 1], bool(back[b])) for a, b in itertools.pairwise(ends))
     return DrivePath(legs, None if final_heading_rad is None else wrap_angle(final_heading_rad))
+
+
+def goal_path(pose: ArrayLike, goal: ArrayLike, heading_rad: float | None = None) -> DrivePath:
+    """Return the straight way from a pose (3,) to a goal (2,), which any other way may replace."""
+    return DrivePath((straight_leg(pose, goal),), heading_rad, True)
 
 
 def straight_leg(start: ArrayLike, goal: ArrayLike, *, backwards: bool = False) -> PathLeg:

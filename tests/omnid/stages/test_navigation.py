@@ -13,7 +13,7 @@ import pytest
 from calib import se3
 from calib.se2_arrays import planar, transform
 from omnid.core.control.collision_monitor import UNKNOWN, CollisionSettings
-from omnid.core.navigation.local_planner import CROSSES
+from omnid.core.navigation.navigator import CROSSES
 from omnid.core.navigation.requests import (
     GoalRequest,
     NavigationCommand,

@@ -8,14 +8,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from omnid.core.navigation.giving_way import REST_S, RETRY_S, Phase, Trail, give_way
 from omnid.core.navigation.navigator import GIVES_WAY, Navigation, Navigator
 from omnid.core.navigation.path import DrivePath, drive_path, straight_leg
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import Situation
 from omnid.navigation_state import NavigationState
-from tests.omnid.core.navigation.test_local_planner import BaseAmongBoxes, Boxes, clearance_m
+from tests.omnid.core.navigation.test_planner import BaseAmongBoxes, Boxes, clearance_m
 
 SETTINGS = NavigationSettings()
 DOOR = ((2.4, 0.45, 2.6, 4.0), (2.4, -4.0, 2.6, -0.45))
@@ -100,43 +99,6 @@ def test_what_stands_there_for_good_is_looked_at_again_and_again_more_rarely() -
     assert all(answer.setpoint is not None and answer.setpoint.velocity_mps >= 0 for answer in driving), "face ahead"
     gone[0] = True
     assert base.run(120).state is NavigationState.REACHED
-
-
-def trail_to(x_m: float) -> Trail:
-    """Return the trail of a straight drive from x = 0."""
-    trail = Trail(3.0)
-    for x in np.arange(0.0, x_m, 0.02):
-        trail.add(np.array([x, 0.0, 0.0]), 0.3)
-    return trail
-
-
-def ends_at(obstacles: list[tuple[float, float]]) -> float | None:
-    """Return where the way back from x = 4 m ends; None without one."""
-    points = np.array(obstacles, float).reshape(-1, 2)
-    found = give_way(trail_to(4.0), SETTINGS, np.array([4.0, 0.0, 0.0]), 0, points, 0.3)
-    return None if found is None else float(found.follower.path.goal[0])
-
-
-@pytest.mark.hazard("H32")
-def test_the_way_back_ends_before_what_is_seen_beside_it_and_after_three_metres() -> None:
-    walls = [(x, side) for x in np.arange(-1.0, 5.0, 0.05) for side in (-0.6, 0.6)]
-    assert ends_at(walls) == pytest.approx(1.0, abs=0.11)
-    assert ends_at([*walls, (4.2, 0.0)]) == pytest.approx(1.0, abs=0.11), "that before the base does not matter"
-    assert ends_at([*walls, (2.0, 0.2)]) == pytest.approx(2.3, abs=0.11)
-    assert ends_at([*walls, (3.6, 0.2)]) is None
-    assert ends_at([(4.5, 0.0)]) == pytest.approx(3.0, abs=0.11), "one metre, where others can pass"
-
-
-@pytest.mark.parametrize(("is_open", "expected_s"), [(True, REST_S), (False, RETRY_S)])
-def test_comes_again_when_the_way_is_free_or_to_look(is_open: bool, expected_s: float) -> None:
-    giving = give_way(trail_to(4.0), SETTINGS, np.array([4.0, 0.0, 0.0]), 0, np.zeros((0, 2)), 0.3)
-    assert giving is not None
-    giving.rest()
-    waited_s = 0.0
-    while giving.phase is Phase.REST and waited_s < 2 * RETRY_S:
-        assert giving.move_on(np.array([3.0, 0.0, 0.0]), 0.1, is_open)
-        waited_s += 0.1
-    assert giving.phase is Phase.RETURN and waited_s == pytest.approx(expected_s, abs=0.11)
 
 
 @pytest.mark.hazard("H32")

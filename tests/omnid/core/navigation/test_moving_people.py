@@ -18,7 +18,7 @@ from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.situation import Situation
 from omnid.core.obstacles.moving_tracker import Arrivals, MovingObstacle, MovingTracker
 from omnid.navigation_state import NavigationState
-from tests.omnid.core.navigation.test_local_planner import AZIMUTHS, OUTLINE, SETTINGS, BaseAmongBoxes, Boxes
+from tests.omnid.core.navigation.test_planner import AZIMUTHS, OUTLINE, SETTINGS, BaseAmongBoxes, Boxes
 
 Array = NDArray[np.float64]
 RADIUS_M = 0.2

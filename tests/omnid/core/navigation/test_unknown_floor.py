@@ -11,7 +11,7 @@ from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.situation import Situation
 from omnid.navigation_state import NavigationState
 from tests.omnid.core.navigation.driven_base import DrivenBase
-from tests.omnid.core.navigation.test_local_planner import AZIMUTHS, OUTLINE, SETTINGS, Boxes, clearance_m
+from tests.omnid.core.navigation.test_planner import AZIMUTHS, OUTLINE, SETTINGS, Boxes, clearance_m
 
 SEEN_M = 2.0  # Floor is seen so far.
 

@@ -8,17 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calib.se2_arrays import composed, predicted, relative
 from omnid.core.control.collision_monitor import CollisionSettings, ControllerRing
-from omnid.core.control.heading_controller import Setpoint
-from omnid.core.navigation.forecast import forecast
-from omnid.core.navigation.local_planner import ARC_S, ARC_STEPS, MARGIN_M, NEARER_M, LocalPlanner
 from omnid.core.navigation.navigator import WAITS, Navigator
-from omnid.core.navigation.path import DrivePath, drive_path, straight_leg
+from omnid.core.navigation.path import DrivePath, drive_path, goal_path, straight_leg
+from omnid.core.navigation.planner import NoWay, Planner
 from omnid.core.navigation.requests import NavigationFrame
-from omnid.core.navigation.settings import NavigationSettings, PursuitSettings
+from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import Situation
-from omnid.core.obstacles.moving_tracker import MovingObstacle
 from omnid.navigation_state import NavigationState
 from tests.omnid.core.navigation.driven_base import DrivenBase
 
@@ -153,15 +149,6 @@ def test_a_base_that_stands_too_near_drives_away() -> None:
     assert base.run(60).state is NavigationState.REACHED
 
 
-def test_a_thing_that_the_base_leaves_hides_no_other_on_its_path() -> None:
-    path = np.column_stack([np.arange(0, 4, 0.05), np.zeros(80)])
-    beside, ahead = np.array([[-0.1, 0.3]]), np.array([[1.0, y] for y in np.linspace(-0.3, 0.3, 13)])
-    both = LocalPlanner(SETTINGS, OUTLINE).plan(np.zeros(3), path, np.vstack([beside, ahead]), Setpoint(0.4))
-    assert both.avoiding
-    alone = LocalPlanner(SETTINGS, OUTLINE).plan(np.zeros(3), path, beside, Setpoint(0.4))
-    assert not alone.avoiding and alone.setpoint == Setpoint(0.4)
-
-
 def test_goes_around_a_box_behind_a_curve_and_a_corner() -> None:
     base = BaseAmongBoxes(Navigator(SETTINGS), 6)
     base.boxes = Boxes((2.8, 1.2, 3.2, 1.6))
@@ -171,51 +158,81 @@ def test_goes_around_a_box_behind_a_curve_and_a_corner() -> None:
     assert clearance_m(base) > 0.02
 
 
-def arcs(planner: LocalPlanner) -> tuple[Array, Array]:
-    """Return the speeds and yaw rates (A, 2) of the arcs and places (A, T, 3) on them, of a base at the origin."""
-    motions = np.column_stack([planner._v, planner._w])
-    times = np.linspace(0.0, ARC_S, ARC_STEPS + 1)
-    return motions, np.array([[predicted(np.zeros(3), v, w, t) for t in times] for v, w in motions])
+def ring_points(boxes: Boxes, pose: Array) -> Array:
+    """Return what a ring shows of boxes (N, 2), from a pose (3,)."""
+    ranges = boxes.ring(pose)
+    seen = np.isfinite(ranges)
+    directions = AZIMUTHS[seen] + pose[2]
+    return np.asarray(pose[:2] + ranges[seen, None] * np.column_stack([np.cos(directions), np.sin(directions)]))
 
 
-def touches(motion: Array, places: Array, obstacle: Array) -> bool:
-    """True if an obstacle (2,) comes into the room that the collision monitor demands at places (T, 3) of an arc."""
-    front_m = OUTLINE.front_m + (OUTLINE.stop_m if motion[0] > 0 else 0.0) + MARGIN_M
-    rear_m = OUTLINE.rear_m + (OUTLINE.stop_m if motion[0] < 0 else 0.0) + MARGIN_M
-    x, y = np.array([relative(place, np.array([*obstacle, 0.0]))[:2] for place in places]).T
-    return bool(((-rear_m < x) & (x < front_m) & (abs(y) < OUTLINE.half_width_m + OUTLINE.side_m + MARGIN_M)).any())
+DEAD_END = Boxes((0.75, -0.7, 0.85, 0.7), (-1.4, 0.6, 0.85, 0.7), (-3.3, -0.7, 0.85, -0.6), (-3.3, -0.7, -3.2, 3.6))
+DOOR = Boxes((1.5, 0.4, 1.7, 4.0), (1.5, -4.0, 1.7, -0.4))
+ROOM = Boxes((-2.2, -2.2, 2.2, -2.0), (-2.2, 2.0, 2.2, 2.2), (-2.2, -2.2, -2.0, 2.2), (2.0, -2.2, 2.2, 2.2))
 
 
-@pytest.mark.parametrize(("velocity_mps", "heading"), [(0.4, 0.0), (0.4, 2.2), (1.0, math.pi / 2)])
-def test_arcs_keep_the_room_that_the_collision_monitor_demands(velocity_mps: float, heading: float) -> None:
-    planner = LocalPlanner(NavigationSettings(pursuit=PursuitSettings(velocity_mps=velocity_mps)), OUTLINE)
-    motions, places = arcs(planner)
-    pose = np.array([3.0, -1.0, heading])
-    for obstacle in ((0.43, 0.1), (-0.3, 0.1), (-0.43, -0.2), (0.2, 0.4), (0.6, 0.5), (1.45, 0.0)):
-        seen = composed(pose[None], np.array([*obstacle, 0.0]))[:, :2]
-        expected = [not touches(motion, arc, np.array(obstacle)) for motion, arc in zip(motions, places, strict=True)]
-        np.testing.assert_array_equal(planner._keeps_clear(pose, seen), expected)
+@pytest.mark.hazard("H31")
+@pytest.mark.parametrize(
+    ("boxes", "start", "goal", "backwards"),
+    [
+        (Boxes(), (0.0, 0.0, 0.0), (3.0, 0.5), [False]),
+        (DOOR, (0.0, 0.8, 0.0), (4.0, 0.0), [False]),
+        (DOOR, (0.0, -0.9, 0.6), (4.0, 1.0), [False]),
+        (DEAD_END, (0.0, 0.0, 0.0), (-2.3, 2.6), [True, False]),
+        (Boxes(), (0.0, 0.0, 0.0), (30.0, 15.0), [False]),
+    ],
+)
+def test_a_way_can_be_driven_and_leads_to_the_goal_or_to_the_edge_of_the_grid(
+    boxes: Boxes, start: tuple[float, float, float], goal: tuple[float, float], backwards: list[bool]
+) -> None:
+    pose = np.array(start)
+    way = Planner(SETTINGS, OUTLINE).way(pose, np.array(goal), ring_points(boxes, pose))
+    assert isinstance(way, DrivePath)
+    assert list(dict.fromkeys(leg.backwards for leg in way.legs)) == backwards
+    xy = np.vstack([leg.xy for leg in way.legs])
+    assert min(boxes.clearance_m(place) for place in xy) > OUTLINE.half_width_m + OUTLINE.side_m - 0.02
+    left_m = math.dist(way.goal, goal)
+    assert left_m < 0.01 if math.hypot(*goal) < 6.0 else left_m < math.hypot(*goal) - 5.5
 
 
-@pytest.mark.parametrize(("x_m", "sign"), [(0.26, 1.0), (-0.26, -1.0)])
-def test_an_obstacle_at_the_outline_may_be_left_but_not_approached(x_m: float, sign: float) -> None:
-    planner = LocalPlanner(SETTINGS, OUTLINE)
-    may = planner._keeps_clear(np.zeros(3), np.array([[x_m, 0.0]]))
-    straight = planner._w == 0
-    towards = sign * planner._v > 0
-    assert not may[straight & towards].any()
-    assert may[straight & (sign * planner._v < 0)].all()
+@pytest.mark.parametrize(
+    ("goal", "reason"),
+    [((4.0, 0.0), "closes every way"), ((30.0, 15.0), "closes every way"), ((2.1, 0.0), "0.1 m from the goal")],
+)
+def test_where_no_way_leads_it_says_what_is_in_the_way(goal: tuple[float, float], reason: str) -> None:
+    pose = np.zeros(3)
+    found = Planner(SETTINGS, OUTLINE).way(pose, np.array(goal), ring_points(ROOM, pose))
+    assert isinstance(found, NoWay) and reason in found.reason
 
 
-def test_arcs_keep_clear_of_somebody_who_walks_at_each_moment() -> None:
-    planner = LocalPlanner(SETTINGS, OUTLINE)
-    _, places = arcs(planner)
-    P = np.diag([1e-4, 1e-4, 1e-4, 1e-4])
-    moving = forecast([MovingObstacle(0.7, 0.9, 0.0, -0.4, P, 0.2), MovingObstacle(-0.6, 0.1, 0.1, 0.0, P, 0.2)], 0.0)
-    assert moving is not None
-    others, radii = moving.at(np.linspace(0.0, ARC_S, ARC_STEPS + 1))
-    away_m = np.hypot(*np.moveaxis(places[None, :, :, :2] - others[:, None], -1, 0))
-    room_m = radii[:, None] + OUTLINE.half_width_m + OUTLINE.side_m - NEARER_M
-    expected = (away_m >= room_m).all(axis=(0, 2))
-    assert 0.1 < expected.mean() < 0.9
-    np.testing.assert_array_equal(planner._lets_pass(places[..., :2], moving), expected)
+def to_goal(boxes: Boxes, x_m: float, y_m: float, settings: NavigationSettings = SETTINGS) -> BaseAmongBoxes:
+    """Begin to drive to a goal, by any way."""
+    base = BaseAmongBoxes(Navigator(settings), 1)
+    base.boxes = boxes
+    base.navigator.start("goal", NavigationFrame.ODOM, [goal_path(base.pose, (x_m, y_m), 0.0)], base.seen())
+    return base
+
+
+@pytest.mark.hazard("H31")
+@pytest.mark.parametrize(
+    ("boxes", "goal"), [(DOOR, (4.0, 1.0)), (DEAD_END, (-2.3, 2.6)), (Boxes((1.5, -1.6, 1.7, 1.6)), (3.5, 0.0))]
+)
+def test_a_goal_is_reached_through_a_door_out_of_a_dead_end_and_around_a_wall(
+    boxes: Boxes, goal: tuple[float, float]
+) -> None:
+    base = to_goal(boxes, *goal)
+    assert base.run(90).state is NavigationState.REACHED
+    assert base.error((*goal, 0.0))[0] < 0.03 and clearance_m(base) > 0.02
+
+
+@pytest.mark.hazard("H31")
+@pytest.mark.parametrize("goal", [(4.0, 0.0), (30.0, 15.0)])
+@pytest.mark.parametrize("settings", [SETTINGS, NavigationSettings()])
+def test_a_goal_that_cannot_be_reached_ends_with_what_is_in_the_way(
+    goal: tuple[float, float], settings: NavigationSettings
+) -> None:
+    base = to_goal(ROOM, *goal, settings)
+    answer = base.run(60)
+    assert answer.state is NavigationState.FAILED and base.t_s < 45.0
+    assert answer.reason.startswith("no way to the goal, ") and "closes every way" in answer.reason
+    assert clearance_m(base) > 0.02
