@@ -39,8 +39,10 @@ PX_PER_M, FLOOR_PX_PER_M = 200.0, 120.0  # Textures of walls, and of floor and c
 ROUNDING_M: Final = 1e-6
 KINDS: Final = ("brick", "plaster", "granite", "plaster")  # Textures of a random wall.
 Side: TypeAlias = Annotated[float, Meta(ge=0.02, le=20.0)]  # m
+Distance: TypeAlias = Annotated[float, Meta(ge=0.0, le=100.0)]  # m
 Size: TypeAlias = tuple[Side, Side, Side]
 Path: TypeAlias = Annotated[tuple[Point, ...], Meta(min_length=2, max_length=100)]
+Many: Final = Meta(max_length=200)
 if TYPE_CHECKING:
     Painted: TypeAlias = str
 else:
@@ -50,9 +52,9 @@ else:
 class Door(Struct, frozen=True, order=True):
     """An opening in a wall, by its distance from the wall's beginning."""
 
-    at_m: Annotated[float, Meta(ge=0.0)]
-    width_m: Annotated[float, Meta(ge=0.3, le=10.0)]
-    height_m: Annotated[float, Meta(ge=0.3, le=20.0)] = 2.1
+    at_m: Distance
+    width_m: Side
+    height_m: Side = 2.1
 
 
 class Wall(Struct, frozen=True):
@@ -60,10 +62,10 @@ class Wall(Struct, frozen=True):
 
     points: Path
     texture: Literal["brick", "plaster", "granite", "tiles", "plain", "white", "random"] = "random"
-    height_m: Annotated[float, Meta(ge=0.05, le=20.0)] | None = None  # None: up to the ceiling
+    height_m: Side | None = None  # None: up to the ceiling
     posters_per_m: Annotated[float, Meta(ge=0.0, le=4.0)] = 0.0
     poster_sides: Literal["front", "both"] = "front"
-    doors: Annotated[tuple[Door, ...], Meta(max_length=8)] = ()
+    doors: Annotated[tuple[Door, ...], Many] = ()
 
     def height_below(self, ceiling_m: float) -> float:
         """Return the height [m]."""
@@ -79,7 +81,7 @@ class Box(Struct, frozen=True):
 
     at: Point
     size_m: Size
-    bottom_m: Annotated[float, Meta(ge=0.0, le=20.0)] = 0.0  # over the floor
+    bottom_m: Distance = 0.0  # over the floor
     yaw_deg: float = 0.0
     texture: Literal["brick", "plaster", "granite", "tiles", "plain", "white", "poster"] = "poster"
 
@@ -90,9 +92,9 @@ class Walker(Struct, frozen=True):
     path: Path
     speed_mps: Annotated[float, Meta(ge=0.0, le=5.0)] = 1.0
     repeat: Literal["once", "loop", "back and forth"] = "once"
-    start_s: Annotated[float, Meta(ge=0.0, le=1e5)] = 0.0
-    starts_within_m: Annotated[float, Meta(ge=0.0, le=100.0)] = 0.0
-    waits_within_m: Annotated[float, Meta(ge=0.0, le=100.0)] = 0.0
+    start_s: Annotated[float, Meta(ge=0.0)] = 0.0
+    starts_within_m: Distance = 0.0
+    waits_within_m: Distance = 0.0
     size_m: Size = (0.25, 0.45, 1.7)  # depth, width, height
 
 
@@ -136,9 +138,9 @@ class WorldTable(Struct, frozen=True):
     start: tuple[float, float, float]
     space: Space
     light: Annotated[float, Meta(ge=0.05, le=3.0)] = 1.0
-    wall: Annotated[tuple[Wall, ...], Meta(max_length=200)] = ()
-    box: Annotated[tuple[Box, ...], Meta(max_length=200)] = ()
-    person: Annotated[tuple[Walker, ...], Meta(max_length=20)] = ()
+    wall: Annotated[tuple[Wall, ...], Many] = ()
+    box: Annotated[tuple[Box, ...], Many] = ()
+    person: Annotated[tuple[Walker, ...], Many] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,9 +23,8 @@ SHORT = np.float32(1e-4)
 # Texels across a footprint above which a smaller level is read, and below which one place across is enough.
 WIDEST, NARROW = np.float32(1.6), np.float32(0.8)
 MOST_STEPS = 24  # along a footprint
-# Columns of a surface: unit normal (3), fractions u and v per metre (3 each); distance along the normal, u and v of the
-# frame's origin; brightness, texels per m^2, least distance from the origin of any ray.
-SURFACE_COLUMNS = 15
+# Rows of a surface (4, 4): distance from its plane [m], fraction u and fraction v of a point, each by the gradient (3)
+# and the value at the frame's origin; then brightness, texels per m^2, least distance from the origin of any ray, 0.
 ZERO, HALF, ONE, FAR_M = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(np.inf)
 # Fractions u, v of a rectangle: it reaches beyond its outline by the rounding, so that no ray passes between two walls.
 LEAST, MOST = np.float32(-2e-6), np.float32(1.0 + 2e-6)
@@ -54,10 +53,9 @@ def take_nearer(
     number: np.int32, surface: Floats, rays: Rows, origins: Rows, nearest: Numbers, distance: Floats
 ) -> int:
     """Note a rectangle where it is the nearest one so far: distance (N,) [m] along the rays; return for how many."""
-    n0, n1, n2 = surface[0], surface[1], surface[2]
-    u0, u1, u2 = surface[3], surface[4], surface[5]
-    v0, v1, v2 = surface[6], surface[7], surface[8]
-    n, u, v = surface[9], surface[10], surface[11]
+    n0, n1, n2, n = surface[0, 0], surface[0, 1], surface[0, 2], surface[0, -1]
+    u0, u1, u2, u = surface[1, 0], surface[1, 1], surface[1, 2], surface[1, -1]
+    v0, v1, v2, v = surface[2, 0], surface[2, 1], surface[2, 2], surface[2, -1]
     (x, y, z), (a, b, c) = rays, origins
     hits = 0
     for i in range(len(x)):
@@ -95,7 +93,7 @@ def meet(
         nearest[i], distance[i] = -1, FAR_M
     for n in range(len(candidates)):
         k = candidates[n]
-        if farther(distance, surfaces[k, 14]) == 0:
+        if farther(distance, surfaces[k, -1, 2]) == 0:
             return n
         hits[n] = take_nearer(np.int32(k), surfaces[k], rays, origins, nearest, distance)
     return len(candidates)
@@ -134,10 +132,9 @@ def place_on(
     places: Rows,
 ) -> None:
     """Set u, v and the footprint [texels] (3, N) of the rays whose nearest rectangle this is."""
-    n0, n1, n2 = surface[0], surface[1], surface[2]
-    u0, u1, u2 = surface[3], surface[4], surface[5]
-    v0, v1, v2 = surface[6], surface[7], surface[8]
-    u, v, density = surface[10], surface[11], surface[13]
+    n0, n1, n2, density = surface[0, 0], surface[0, 1], surface[0, 2], surface[-1, 1]
+    u0, u1, u2, u = surface[1, 0], surface[1, 1], surface[1, 2], surface[1, -1]
+    v0, v1, v2, v = surface[2, 0], surface[2, 1], surface[2, 2], surface[2, -1]
     (x, y, z), (a, b, c) = rays, origins
     across, down, footprint = places
     for i in range(len(x)):
@@ -184,7 +181,7 @@ def shade(
         while footprint > FOOTPRINT and level < last:
             footprint, level = footprint * QUARTER, level + 1
         size = (levels[level, 1], levels[level, 2])
-        image[pixels[i]] += surfaces[k, 12] * bilinear(texels, levels[level, 0], size, (across[i], down[i]))
+        image[pixels[i]] += surfaces[k, -1, 0] * bilinear(texels, levels[level, 0], size, (across[i], down[i]))
 
 
 @inner
@@ -192,7 +189,7 @@ def is_behind(surface: Floats, rays: Rows, distance: Floats) -> bool:
     """Return whether the plane of a rectangle lies behind what rays from the origin meet, or is not met at all."""
     (x, y, z), count = rays, 0
     for i in range(len(x)):
-        s = -surface[9] / (surface[0] * x[i] + surface[1] * y[i] + surface[2] * z[i])
+        s = -surface[0, -1] / (surface[0, 0] * x[i] + surface[0, 1] * y[i] + surface[0, 2] * z[i])
         count += (s > ZERO) & (s < distance[i])
     return count == 0
 
@@ -215,7 +212,8 @@ def shade_one(
     A footprint is a square across the ray, drawn out along the ray's projection on the surface; its grey is the mean of
     places that cover it.
     """
-    n0, n1, n2 = surface[0], surface[1], surface[2]
+    n0, n1, n2 = surface[0, 0], surface[0, 1], surface[0, 2]
+    u0, u1, u2, v0, v1, v2 = surface[1, 0], surface[1, 1], surface[1, 2], surface[2, 0], surface[2, 1], surface[2, 2]
     (x, y, z), (spacing, distance) = rays, spacing_and_distance
     for i in range(len(x)):
         cosine = n0 * x[i] + n1 * y[i] + n2 * z[i]
@@ -224,14 +222,14 @@ def shade_one(
         ax, ay, az = x[i] - cosine * n0, y[i] - cosine * n1, z[i] - cosine * n2
         length = np.float32(np.sqrt(ax * ax + ay * ay + az * az))
         if length < SHORT:
-            ax, ay, az = surface[3], surface[4], surface[5]
+            ax, ay, az = u0, u1, u2
             length = np.float32(np.sqrt(ax * ax + ay * ay + az * az))
         ax, ay, az = ax / length, ay / length, az / length
         bx, by, bz = n1 * az - n2 * ay, n2 * ax - n0 * az, n0 * ay - n1 * ax
         slant = ONE / max(abs(cosine), MIN_SLANT)
         # 2. The level whose texels are about as large as the square, and the places that cover the footprint there.
         level, last = pyramids[k, 0], pyramids[k, 0] + pyramids[k, 1] - 1
-        texels_across = side * np.float32(np.sqrt(surface[13]))
+        texels_across = side * np.float32(np.sqrt(surface[-1, 1]))
         while texels_across > WIDEST and level < last:
             texels_across, level = texels_across * HALF, level + 1
         steps = min(int(np.ceil(texels_across * slant)), MOST_STEPS)
@@ -239,12 +237,12 @@ def shade_one(
         along, across = side * slant / np.float32(steps), side / np.float32(ways)
         # 3. Place, and a step along and across, as fractions of the outline.
         px, py, pz = distance[i] * x[i], distance[i] * y[i], distance[i] * z[i]
-        u = surface[10] + surface[3] * px + surface[4] * py + surface[5] * pz
-        v = surface[11] + surface[6] * px + surface[7] * py + surface[8] * pz
-        ua = along * (surface[3] * ax + surface[4] * ay + surface[5] * az)
-        va = along * (surface[6] * ax + surface[7] * ay + surface[8] * az)
-        ub = across * (surface[3] * bx + surface[4] * by + surface[5] * bz)
-        vb = across * (surface[6] * bx + surface[7] * by + surface[8] * bz)
+        u = surface[1, -1] + u0 * px + u1 * py + u2 * pz
+        v = surface[2, -1] + v0 * px + v1 * py + v2 * pz
+        ua = along * (u0 * ax + u1 * ay + u2 * az)
+        va = along * (v0 * ax + v1 * ay + v2 * az)
+        ub = across * (u0 * bx + u1 * by + u2 * bz)
+        vb = across * (v0 * bx + v1 * by + v2 * bz)
         # 4. The mean grey.
         size, total = (levels[level, 1], levels[level, 2]), ZERO
         for n in range(steps):
@@ -252,12 +250,12 @@ def shade_one(
             for way in range(ways):
                 w = np.float32(way) - np.float32(ways - 1) * HALF
                 total += bilinear(texels, levels[level, 0], size, (u + m * ua + w * ub, v + m * va + w * vb))
-        image[pixels[i]] += weight * surface[12] * total / np.float32(steps * ways)
+        image[pixels[i]] += weight * surface[-1, 0] * total / np.float32(steps * ways)
 
 
 @compiled(
     "(f4[:, ::1], f4[:, ::1], f4[::1], i4[:, ::1], i8[::1], f4[:, ::1], f4[::1], i4[:, ::1], i8[::1], f4[:, ::1], "
-    "f4[::1], f8[:, :, ::1], i8[::1], b1[:, ::1], f4[:, :, ::1], f4[:, ::1], i8[:, ::1], i8[:, ::1], u1[::1], f4, "
+    "f4[::1], f8[:, :, ::1], i8[::1], b1[:, ::1], f4[:, :, ::1], f4[:, :, ::1], i8[:, ::1], i8[:, ::1], u1[::1], f4, "
     "f4[::1])",
     writes=("image",),
 )
@@ -292,7 +290,7 @@ def cast(
     samples are cast. axes (M, 3) and sines (M,): the cones of these tiles. poses (H, 3, 4) of the camera in the frame
     of the first one, (1, 3, 4) where all are the same. parents (M,): row of a tile in seen (P, R), the rectangles that
     larger tiles may see; sides (R, 4, 3): normals, to the inside, of the planes through the origin and an edge.
-    surfaces (R, SURFACE_COLUMNS), in that frame, by their least distance. pyramids (R, 2): first level, number of
+    surfaces (R, 4, 4), in that frame, by their least distance. pyramids (R, 2): first level, number of
     levels; levels (L, 3): first texel, height, width.
     """
     tiles, surface_count, has_plain = len(starts) - 1, len(surfaces), len(plain_starts) > 1

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.models.camera import Array, Mask, OmniCamera
 from calib.rig import MountedCamera
-from omnid.simulation.rendering.caster_kernels import SURFACE_COLUMNS, cast
+from omnid.simulation.rendering.caster_kernels import cast
 from omnid.simulation.rendering.surfaces import Rectangle, Scene, Texture
 
 Floats = NDArray[np.float32]
@@ -262,19 +262,19 @@ def _row_poses(height: int, table: RayTable, T_world_rig: Array, row_twist: Arra
 
 
 def _surfaces(rectangles: Sequence[Rectangle], T_world_cam: Array, nearest_m: Array) -> Floats:
-    """Return what the caster knows of rectangles (R, SURFACE_COLUMNS), in the camera frame.
+    """Return what the caster knows of rectangles (R, 4, 4), in the camera frame; see caster_kernels.
 
     nearest_m (R,): least distance of each from the origin of any ray.
     """
-    rows = np.empty((len(rectangles), SURFACE_COLUMNS))
-    edges = np.array([(r.edge_u, r.edge_v, r.normal) for r in rectangles]).transpose(0, 2, 1)
+    edges = np.array([(r.normal, r.edge_u, r.edge_v) for r in rectangles])
     from_origin = T_world_cam[:3, 3] - np.array([r.origin for r in rectangles])
-    u_v_n = np.linalg.inv(edges)
-    rows[:, :9] = (u_v_n @ T_world_cam[:3, :3])[:, [2, 0, 1]].reshape(-1, 9)
-    rows[:, 9:12] = np.einsum("rij,rj->ri", u_v_n, from_origin)[:, [2, 0, 1]]
-    rows[:, 12] = [r.brightness for r in rectangles]
-    rows[:, 13] = [r.texture.size for r in rectangles] / np.linalg.norm(edges[:, :, :2], axis=1).prod(axis=1)
-    rows[:, 14] = nearest_m - MARGIN_M
+    n_u_v = np.linalg.inv(edges.transpose(0, 2, 1))
+    rows = np.zeros((len(rectangles), 4, 4))
+    rows[:, :-1, :-1] = n_u_v @ T_world_cam[:3, :3]
+    rows[:, :-1, -1] = np.einsum("rij,rj->ri", n_u_v, from_origin)
+    rows[:, -1, 0] = [r.brightness for r in rectangles]
+    rows[:, -1, 1] = [r.texture.size for r in rectangles] / np.linalg.norm(edges[:, 1:], axis=2).prod(axis=1)
+    rows[:, -1, 2] = nearest_m - MARGIN_M
     return rows.astype(np.float32)
 
 
