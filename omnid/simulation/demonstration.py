@@ -29,9 +29,12 @@ RECOGNISED_S: Final = 5.0  # Within this time after the first drive the robot mu
 SHOWN_S: Final = 5.0  # Time between two lines of progress.
 PX_PER_M: Final = 90.0
 BORDER_M: Final = 0.25  # around the world
-WALL_PX, SEEN_PX = 3, 9  # widths of lines
-SEEN: Final = (60, 60, 60)  # BGR: a cell in which much was seen
-LINES: Final = (("taught path", BLACK, 5), ("repeated path", RED, 2))
+LEGEND: Final = (  # colour (BGR) and width [px]
+    ("taught path", BLACK, 5),
+    ("repeated path", RED, 2),
+    ("seen obstacles", (60, 60, 60), 9),  # a cell in which much was seen
+    ("walls and boxes", LIGHT_GREY, 3),
+)
 
 
 def oval() -> Array:
@@ -135,12 +138,12 @@ def draw(world: World, obstacles: Array, first: Array, second: Array) -> NDArray
     segments = footprints(world.standing, 1.2)
     corners = segments.reshape(-1, 2)
     sheet = Sheet(corners.min(axis=0) - BORDER_M, corners.max(axis=0) + BORDER_M, PX_PER_M)
-    lines = [Lines(list(segments), LIGHT_GREY, WALL_PX)]
-    lines += [Lines([path], colour, width) for path, (_, colour, width) in zip((first, second), LINES, strict=True)]
+    taught, repeated, _, walls = LEGEND
+    lines = [Lines(list(segments), *walls[1:]), Lines([first], *taught[1:]), Lines([second], *repeated[1:])]
     image = draw_plan(sheet, obstacles, np.ones(len(obstacles), np.float32), lines)
     if len(first):
         draw_ends(image, sheet, first[0])
-    return with_legend(image, (*LINES, ("seen obstacles", SEEN, SEEN_PX), ("walls and boxes", LIGHT_GREY, WALL_PX)))
+    return with_legend(image, LEGEND)
 
 
 def drift_m(run: SimulatedRun) -> float:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Final, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -31,8 +31,8 @@ TILE_PX = 32
 AS_NEEDED, NEEDED_PX, SIDE_RAYS = 0, 8, 3 * 512
 # Pixels lifted at once, which bounds memory.
 RAY_CHUNK = 1 << 18
-# Number of ray tables that are cached.
-MAX_TABLES = 6
+# Number of cameras whose rays are kept, and of scenes whose textures are.
+KEPT = 6
 # Added to the half angle of a tile's cone: rounding of float32 rays.
 CONE_MARGIN_RAD = 1e-3
 
@@ -134,21 +134,6 @@ def _cones(rays: Floats, starts: NDArray[np.int64]) -> tuple[Array, Array]:
     return axes, angles
 
 
-_NONE: Final = np.zeros((3, 0), np.float32)
-NO_RAYS: Final = RayTable(
-    1,
-    0,
-    _NONE,
-    _NONE,
-    _NONE[0],
-    _NONE[:2].astype(np.int32),
-    np.zeros(1, np.int64),
-    _NONE.T.astype(float),
-    _NONE[0],
-    0.0,
-)
-
-
 @dataclass(frozen=True, slots=True)
 class CameraRays:
     """The tables of a camera: all samples; one ray a pixel in the same tiles, or none; the tiles that are culled."""
@@ -186,16 +171,14 @@ def cached_rays(mounted: MountedCamera, supersample: int) -> CameraRays:
     else:
         table = ray_table(mounted, supersample)
         made = CameraRays(table, None, table)
-    del _kept[: len(_kept) - MAX_TABLES + 1]
+    del _kept[: len(_kept) - KEPT + 1]
     _kept.append((mounted.camera, mask, supersample, made))
     return made
 
 
 # Guards against division by zero at a rectangle through the viewpoint [m].
-MIN_DISTANCE_M = 1e-9
+MIN_DISTANCE_M = np.finfo(float).eps
 MARGIN_M = 1e-4  # Subtracted from the least distance of a rectangle: rounding of float32 rays.
-# Number of scenes whose textures are kept.
-MAX_ATLASES = 3
 SMALLEST_PX = 8
 _atlases: list[Atlas] = []  # the one used last at the end
 
@@ -226,7 +209,7 @@ def render_grey(
     seen = tiles_that_see(rays.culled, sides, turned_rad + np.arcsin(np.clip(reach_m / distance_m, 0, 1)))
     # 3. The greys of all samples.
     atlas, image = cached_atlas([r.texture for r in scene.rectangles]), np.zeros(width * height, np.float32)
-    one = plain or NO_RAYS
+    one = plain or table
     cast(
         table.rays,
         table.origins,
@@ -236,7 +219,7 @@ def render_grey(
         one.rays,
         one.spacing,
         one.index,
-        one.starts,
+        one.starts if plain else one.starts[:1],
         one.axes.astype(np.float32),
         np.sin(np.minimum(one.angles, np.pi / 2)).astype(np.float32),
         np.ascontiguousarray((se3.inverse(poses[:1]) @ poses)[:, :3]),
@@ -358,6 +341,6 @@ def cached_atlas(textures: Sequence[Texture]) -> Atlas:
         if all(id(texture) in rows for texture in textures):
             _atlases.append(_atlases.pop(number))
             return replace(atlas, pyramids=atlas.pyramids[[rows[id(texture)] for texture in textures]])
-    del _atlases[: len(_atlases) - MAX_ATLASES + 1]
+    del _atlases[: len(_atlases) - KEPT + 1]
     _atlases.append(make_atlas(textures))
     return _atlases[-1]
