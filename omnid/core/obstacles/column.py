@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from typing import Final, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -131,8 +132,8 @@ class Columns:
 
     def evidence(self, pair: WorkingPair) -> ColumnEvidence:
         """Return the evidence of a pair."""
-        surfaces, floor = self._panoramas.views(pair)
-        return ColumnEvidence(self._floor(floor), self._surface(surfaces), self._level(floor))
+        views = self._panoramas.views(pair)
+        return ColumnEvidence(self._floor(views), self._surface(views), self._level(views))
 
     @property
     def panoramas(self) -> WorkingPanoramas:
@@ -171,7 +172,9 @@ class Columns:
         limits = np.float32(STRIP_BOUND), np.float32(STRIP_PRIOR)
         compared = views.lower, views.upright, views.plane, views.live
         surface_evidence(*compared, self._strips, OUTLIER, scale, *weights, *limits, surface)
-        return surface
+        # A surface fits a little at the next disparities, too.
+        beside = cv2.dilate(surface, np.ones((3, 1), np.uint8))
+        return np.where(surface >= beside, surface, np.float32(0))
 
     def _level(self, views: Views) -> Floats:
         """Return the log-likelihood ratios (2, K, DIRECTIONS) of the floor against planes just above and below it."""

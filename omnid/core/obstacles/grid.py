@@ -300,7 +300,7 @@ class ObstacleGrid:
     def _follow(self, place_m: Array) -> None:
         """Move the cells along with the base; those that come into the grid are unknown."""
         cell = np.floor(place_m / CELL_M).astype(np.int64)
-        x, y = np.clip(cell - cell if self._cell is None else cell - self._cell, -SIDE, SIDE).tolist()
+        x, y = np.clip(cell - (cell if self._cell is None else self._cell), -SIDE, SIDE).tolist()
         self._cell = cell
         if x or y:
             self._layers[:] = np.roll(self._layers, (-y, -x), axis=(1, 2))
