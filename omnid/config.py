@@ -55,7 +55,9 @@ class LiveConfig:
 
     cloud_s: Annotated[float, Meta(ge=0, le=3600), "period of the maps on the bus, s; 0: only at the end"] = 2.0
 
-    REMOVED = MappingProxyType({"shed_load": "the map, then half the landmarks, are given up on a slow computer"})
+    REMOVED = MappingProxyType(
+        {"shed_load": "a slow computer computes the newest images only; --profile small costs less"}
+    )
 
 
 @dataclass(frozen=True, slots=True)

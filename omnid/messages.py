@@ -27,7 +27,6 @@ from omnid.core.stereo.photometry import Light
 from omnid.core.stereo.tiles import ALL_LIVE, TileStates
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.pixel_times import AT_ONCE, PixelTimes
-from omnid.load_level import LoadLevel
 from omnid.navigation_state import NavigationState
 from omnid.tracking_state import MapState, TrackingState
 
@@ -45,7 +44,6 @@ class FramePair:
     skew_s: float = 0.0  # upper minus lower exposure
     motion: tuple[MotionSample, ...] = ()  # samples of wheels and gyro since the last pair
     jpeg_steps: tuple[Steps, Steps] = ((), ())  # of the quantisation of both JPEGs (drivers.jpeg), (): none
-    load: LoadLevel = LoadLevel.FULL  # the work that is left out for it
 
 
 @dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
@@ -61,7 +59,6 @@ class Panoramas:
     light: Light = field(default_factory=Light)
     motion: tuple[MotionSample, ...] = ()  # samples of wheels and gyro since the last pair
     tiles: TileStates = ALL_LIVE  # the parts of the images that are dead or blind
-    load: LoadLevel = LoadLevel.FULL  # the work that is left out for it
 
     @property
     def usable(self) -> NDArray[np.bool_]:
@@ -125,11 +122,6 @@ class OdometryUpdate:
             f"<pose {self.seq}: {self.state}, x {x_m:+.3f} y {y_m:+.3f} z {z_m:+.3f} m, "
             f"heading {math.degrees(se3.yaw(self.T_odom_rig)):+.2f} deg, sigma {sigma_mm:.1f} mm>"
         )
-
-    @property
-    def load(self) -> LoadLevel:
-        """The work that the stages leave out for this pair."""
-        return self.depth.panoramas.load
 
     @property
     def position(self) -> Array:

@@ -26,7 +26,7 @@ from omnid.core.odometry.motion_sensors import BIAS, DISTANCE, GYRO_OFFSET, TURN
 from omnid.core.rig.column_finding import RigState
 from omnid.core.rig.rig_health import VIEWS, RigHealth
 from omnid.core.stereo.tiles import SIDES, Side, TileStates
-from omnid.diagnostics.run_summary import RunCounters, RunStatistics
+from omnid.diagnostics.run_summary import NOTABLE_SHARE, RunCounters, RunStatistics
 from omnid.engine.robot_clock import RobotClock
 from omnid.engine.telemetry import Histogram, StageStats, Telemetry
 from omnid.messages import OdometryUpdate
@@ -156,6 +156,10 @@ class StatusCollector:
     def _pairing(self) -> DiagnosticStatus:
         pair, skew = self.pair, self.pair.skew
         rate_hz, broken_hz = (self._rate_hz(name, pair.counts[name]) for name in ("pairs", "broken"))
+        images = self.telemetry.of("pair")
+        taken_hz, dropped_hz = (
+            self._rate_hz(f"pair {name}", getattr(images, name)) for name in ("processed", "dropped")
+        )
         missing = [name for name, stamp_ns in pair.newest_ns.items() if not self._age_s(stamp_ns) <= TIMEOUT_S]
         frozen = " and the ".join(pair.frozen)
         tolerance_ms, skew_ms = pair.tolerance_ms, skew.mean_ns * 1e-6
@@ -178,6 +182,12 @@ class StatusCollector:
                 WARN,
                 f"the images of the {frozen} camera are frozen: all pixels are as before; check the camera and its "
                 "driver",
+            ),
+            (
+                dropped_hz > NOTABLE_SHARE * (taken_hz + dropped_hz),
+                WARN,
+                "too slow: the computer leaves images out; close other programs on it, or start omnid with "
+                "--profile small",
             ),
             (rate_hz == 0, WARN, apart),
             (pair.has_fixed_tolerance and abs(skew_ms) > tolerance_ms / 2, WARN, nearly),

@@ -29,7 +29,6 @@ from omnid.core.control.command_sources import PLANNER
 from omnid.core.control.safety_rules import AWAITED, NO_POSE
 from omnid.core.navigation.requests import NavigationCommand
 from omnid.core.rig.rig_health import RigHealth
-from omnid.diagnostics.load_ladder import PERIOD_S, LoadLadder
 from omnid.diagnostics.status import (
     ImagesStatus,
     Latency,
@@ -340,18 +339,7 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
     frames = robot.sources(graph, motion.add)
     stages = wire(graph, frames, front_end, config, outputs, run_places.known_to(parts))
 
-    # 4. What is done from time to time: shedding of load.
-    ladder = LoadLadder()
-
-    def observe() -> None:
-        if not robot.waits:
-            front_end.pairing.load = ladder.observe(graph.telemetry.of("pair"))
-        if stages.mapping is not None:
-            stages.mapping.is_read = recorder is not None or bus.is_received("cloud")
-
-    graph.ticker("load", PERIOD_S, observe)
-
-    # 5. What comes from the bus: commands, requests, samples.
+    # 4. What comes from the bus: commands, requests, samples.
     samples = _sample_receiver(config, motion.add, clock, controller, report, with_images=robot.brings_samples)
     clocks = (RobotClock(), clock) if robot.waits else (clock,)
     freshness = Freshness(config.controller.deadlines.command_s, *clocks)
@@ -367,10 +355,9 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
         commands = CommandReceiver(controller, freshness, sources=sources, is_unique=lambda: bus.is_unique, report=warn)
     _subscribe(config, bus, controller, commands, received, samples, saver)
 
-    # 6. The status of all of them.
+    # 5. The status of all of them.
     images = ImagesStatus(geometry, session.statistics, warn, stages.obstacles)
     status: list[Callable[[], DiagnosticStatus]] = [
-        ladder.status,
         images,
         exposure.status,
         partial(rig_status, health),
@@ -395,6 +382,8 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
     )
 
     def give_status() -> None:
+        if stages.mapping is not None:
+            stages.mapping.is_read = recorder is not None or bus.is_received("cloud")
         statuses = collect()
         with suppress(OmnidError):  # the system's clock may be set to a time that no message can hold
             message = status_report(time.time_ns(), [with_remedy(status) for status in statuses])

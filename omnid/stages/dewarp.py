@@ -81,7 +81,6 @@ class Dewarp:
             dimmer,
             pair.motion,
             tiles,
-            pair.load,
         )
 
     def _remapped(

@@ -12,7 +12,6 @@ from omnid.config import MappingConfig
 from omnid.core.mapping.scan_grid import KeyframeGrid
 from omnid.core.mapping.thinned_path import ThinnedPath, Vertex
 from omnid.core.mapping.voxel_map import VoxelMap
-from omnid.load_level import LoadLevel
 from omnid.messages import GridUpdate, MapUpdate, OdometryUpdate, PlaceUpdate
 from omnid.stages.dense_depths import DenseDepths
 from omnid.tracking_state import TrackingState
@@ -26,7 +25,6 @@ FRAMES_PER_VOXEL_FRAME = 10  # frames of the run for each frame required, up to 
 SAME_VIEW_M, SAME_VIEW_TRACE = 0.03, 3 - math.radians(2) ** 2
 STANDING_NS = 1_000_000_000  # Least time between two pairs of the same view that enter the map.
 FINEST_STEP_M = 0.001  # Least distance between two vertices of the path: a robot at rest adds none.
-SPARSE_NS = 1_000_000_000  # Time between two pairs that enter the map at LoadLevel.SPARSE_MAP.
 STAMP_JITTER_NS = 5_000_000  # Tolerance of stamps: a period of the cameras that divides that of the map then does so.
 
 
@@ -79,14 +77,11 @@ class Mapping:
         """
         if not (odometry.is_keyframe or self.is_read):
             return False
-        if odometry.load >= LoadLevel.NO_MAP:
-            return False
-        shed_ns = SPARSE_NS if odometry.load is LoadLevel.SPARSE_MAP else 0
-        if self._mapped is None or not (self._min_gap_ns or shed_ns):
+        if self._mapped is None or not self._min_gap_ns:
             return True
         since_ns, moved = odometry.stamp_ns - self._mapped[0], se3.inverse(self._mapped[1]) @ odometry.T_odom_rig
         is_same_view = np.linalg.norm(moved[:3, 3]) < SAME_VIEW_M and np.trace(moved[:3, :3]) > SAME_VIEW_TRACE
-        wait_ns = max(self._min_gap_ns, shed_ns, STANDING_NS if is_same_view else 0)
+        wait_ns = max(self._min_gap_ns, STANDING_NS if is_same_view else 0)
         return since_ns >= (wait_ns / 2 if odometry.is_keyframe else wait_ns) - STAMP_JITTER_NS
 
     def finish(self) -> list[MapUpdate]:

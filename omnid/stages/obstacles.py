@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
@@ -23,7 +22,6 @@ from omnid.core.obstacles.narrow import narrow_m, nothing_narrow
 from omnid.core.obstacles.ray_rings import RayRings
 from omnid.core.obstacles.settings import RingSettings
 from omnid.core.obstacles.unwatched import Unwatched, without
-from omnid.load_level import LoadLevel
 from omnid.messages import DensePoints, ObstacleRing, OdometryUpdate, Panoramas
 from omnid.stages.dense_depths import DenseDepths
 from omnid.stages.geometry import Geometry
@@ -167,15 +165,6 @@ class PairRings:
         return floor is not None
 
 
-# Least time between two rings; with the time from images to ring it stays below controller.collision.stale_s.
-SHED_PERIOD_NS: Final[Mapping[LoadLevel, int]] = {
-    LoadLevel.FULL: 0,
-    LoadLevel.SPARSE_MAP: 0,
-    LoadLevel.NO_MAP: 250_000_000,
-    LoadLevel.REDUCED: 300_000_000,
-}
-
-
 class Obstacles:
     """Makes a ring of each pair that is due, from the evidence of its columns."""
 
@@ -208,9 +197,8 @@ class Obstacles:
         """True if a pair is to give a ring."""
         if self._last_ns is None:
             return True
-        wait_ns = max(self._period_ns, SHED_PERIOD_NS[odometry.load])
         since_ns = odometry.stamp_ns - self._last_ns
-        return since_ns < 0 or since_ns >= wait_ns - STAMP_JITTER_NS
+        return since_ns < 0 or since_ns >= self._period_ns - STAMP_JITTER_NS
 
 
 def controller_ring(ring: ObstacleRing) -> ControllerRing:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
-from typing import Final, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,15 +24,12 @@ from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.relocalisation import Relocaliser
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.stereo_model import StereoModel
-from omnid.load_level import LoadLevel
 from omnid.messages import OdometryUpdate, Panoramas, StereoDepth
 from omnid.stages.dense_depths import DenseDepths
 from omnid.stages.geometry import Geometry
 from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]
-
-REDUCED_FEATURES: Final = 0.5  # share of the landmarks of a keyframe at LoadLevel.REDUCED
 
 
 class OdometryMethod(Protocol):
@@ -57,8 +53,8 @@ class OdometryStage:
         raw_images: tuple[RawImage, RawImage] | None = None,
     ) -> None:
         """dense: computes the depth of keyframes. raw_images: see VisualOdometry."""
-        self._dense, self._load = dense, LoadLevel.FULL
-        self._method = _method(geometry.model(config.noise_px), config, self._features, raw_images)
+        self._dense = dense
+        self._method = _method(geometry.model(config.noise_px), config, raw_images)
         self._T_rig_rect = geometry.T_rig_rect
         self._to_rig = se3.adjoint(self._T_rig_rect)
         self._last_ns: int | None = None
@@ -69,10 +65,6 @@ class OdometryStage:
         self.last_fault = AGREE  # the last disagreement that was more than a doubt
         self._contradiction: Contradiction | None = None  # of all poses so far by wheels and gyro
         self._rig_error = RigError(motion_errors(geometry.rig))
-
-    def _features(self) -> float:
-        """Return the share of the landmarks that the next keyframe is to have."""
-        return REDUCED_FEATURES if self._load >= LoadLevel.REDUCED else 1.0
 
     @property
     def witness(self) -> Witness:
@@ -89,7 +81,6 @@ class OdometryStage:
         """Return the pose at a pair."""
         # 1. What wheels and gyro have measured since the pair before.
         last_ns, self._last_ns = self._last_ns, pair.stamp_ns
-        self._load = pair.load
         dt_s = 0.0 if last_ns is None else (pair.stamp_ns - last_ns) * 1e-9
         self.sensors.add(pair.motion)
         self._agreement.add(pair.motion, float(self.sensors.values[BIAS][2]))
@@ -201,11 +192,10 @@ def _state(state: TrackingState, pair: Panoramas, witness: Witness) -> TrackingS
 def _method(
     model: StereoModel,
     config: OdometryConfig,
-    features: Callable[[], float],
     raw_images: tuple[RawImage, RawImage] | None,
 ) -> OdometryMethod:
     if config.method == "default":
-        return VisualOdometry(model, config.klt, config.limits, Relocaliser(model), features, raw_images)
+        return VisualOdometry(model, config.klt, config.limits, Relocaliser(model), raw_images=raw_images)
     from omnid.core.odometry.paper.paper_odometry import PaperOdometry  # imported only where it is used
 
     return PaperOdometry(model, config.klt, config.tracker, config.reference)

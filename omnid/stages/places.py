@@ -26,7 +26,6 @@ from omnid.core.obstacles.settings import RingSettings
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.localisation import MapLocaliser, OdometryFrame
 from omnid.core.places.place_map import PlaceMap
-from omnid.load_level import LoadLevel
 from omnid.messages import (
     DensePoints,
     MapCopy,
@@ -68,8 +67,6 @@ class Places:
     ) -> None:
         """dense: computes the depth of keyframes. places: a map to be extended, None: a new one. localize_only: the map
         stays as it is. copy_s: time between two copies of the map that are to be written, by the stamps; 0: none.
-
-        Nothing is recognised or kept from LoadLevel.NO_MAP on.
         """
         self._dense = dense
         self._localiser = MapLocaliser(
@@ -111,7 +108,7 @@ class Places:
 
     def _localised(self, odometry: OdometryUpdate) -> PlaceUpdate:
         # 1. The pose in the map.
-        pose = self._localiser.process(self._frame(odometry), idle=odometry.load >= LoadLevel.NO_MAP)
+        pose = self._localiser.process(self._frame(odometry))
         self.state = pose.state
         # 2. Copies for other threads, which never read the map itself.
         self._copied_ns = self._copied_ns or odometry.stamp_ns

@@ -18,7 +18,6 @@ from drivers.frame import Camera, Frame, coding_steps, gray
 from drivers.motion import MotionSample
 from omnid.camera_config import PairConfig
 from omnid.errors import OmnidError
-from omnid.load_level import LoadLevel
 from omnid.messages import FramePair
 from omnid.stages.image_loss import ImageLoss, image_loss, unpaired_by_chance
 from omnid.stages.motion_inbox import MotionInbox
@@ -224,7 +223,6 @@ class Synchronise:
         self._use_repeated = config.repeated_images == "use"
         self.skew = Skew()
         self.motion = MotionInbox(R_base_imu)
-        self.load = LoadLevel.FULL  # of the next pairs: a live run sets it
 
     @property
     def fault(self) -> str:
@@ -335,7 +333,6 @@ class Synchronise:
             self.skew.exposure_ns * 1e-9,
             self.motion.take(lower.stamp_ns),
             (coding_steps(lower), coding_steps(upper)),
-            self.load,
         )
 
 

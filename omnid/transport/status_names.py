@@ -31,7 +31,6 @@ PLACES: Final = f"{PREFIX}places"
 MAP_FILE: Final = f"{PREFIX}map file"
 NAVIGATION: Final = f"{PREFIX}navigation"
 REQUESTS: Final = f"{PREFIX}requests"  # to the navigation
-LOAD: Final = f"{PREFIX}load"
 IMAGES: Final = f"{PREFIX}images"  # parts of them that are frozen or blind
 FLOOR: Final = f"{PREFIX}floor"  # height of the cameras above it
 EXPOSURE: Final = f"{PREFIX}exposure"
@@ -70,8 +69,6 @@ class Key(StrEnum):
     PROCESSED = "processed"
     DROPPED = "dropped"  # messages
     MISSED = "missed"  # deadlines of a ticker
-    # Load
-    LEVEL = "level"  # of load shedding, 0: all is computed
     # Cameras and pairing
     DROPS = "drops"
     ERRORS = "errors"
@@ -135,7 +132,6 @@ REMEDIES: Final = {
     WHEELS: "remove the cause, then arm; on the robot: omnid doctor",
     BUS: "see bus.robot and bus.connect in the robot's configuration",
     RECORDING: "make room on the disk, or change record.folder",
-    LOAD: "close other programs on the robot, or start it with --profile small",
     EXPOSURE: "switch lights on, or set cameras.exposure_limit_ms",
     FLOOR: "state the height of the cameras in the rig: omnid calibrate drive --only height",
     IMAGES: "clean the mirrors, look for glare and darkness, check the cameras and their driver",

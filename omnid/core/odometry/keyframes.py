@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
@@ -50,13 +49,10 @@ class Keyframes:
         klt: KltSettings,
         limits: OdometryLimits,
         relocaliser: KeyframeLocaliser,
-        features: Callable[[], float],
     ) -> None:
-        """features: called for each keyframe, the share of limits.features that it is to have. klt: from the lower
-        panorama to the upper one.
-        """
+        """klt: from the lower panorama to the upper one."""
         self._map, self._model, self._klt, self._limits = local_map, model, klt, limits
-        self._relocaliser, self._features = relocaliser, features
+        self._relocaliser = relocaliser
         self._most_inliers, self._tracked_s = 0, 0.0  # since the last keyframe
 
     def is_due(self, inliers: int, dt_s: float) -> bool:
@@ -69,14 +65,14 @@ class Keyframes:
             return True
         self._most_inliers = max(self._most_inliers, inliers)
         self._tracked_s += dt_s
-        sparse = inliers < limits.refresh * self._wanted() and self._tracked_s >= limits.sparse_s
+        sparse = inliers < limits.refresh * self._limits.features and self._tracked_s >= limits.sparse_s
         return sparse or inliers < limits.refresh * self._most_inliers or inliers < limits.good_inliers
 
     def add(self, request: KeyframeRequest) -> Array:
         """Add a keyframe with new landmarks between the known ones; return the pixels (M, 2) of the new ones."""
         frame = request.frame
         free = clear_around(request.usable, request.pixels, LANDMARK_SPACING_PX)
-        points = corners(frame.lower, free, self._wanted() - len(request.pixels))
+        points = corners(frame.lower, free, self._limits.features - len(request.pixels))
         new = located(frame, points, self._model, self._klt, request.exposure, request.views)
         keyframe = Keyframe(frame.seq, frame.lower, request.T_odom_rect, request.covariance)
         is_first = not len(self._map)
@@ -89,11 +85,6 @@ class Keyframes:
             self._relocaliser.add(replace(frame, exposure=request.exposure), keyframe)
         self._most_inliers, self._tracked_s = 0, 0.0
         return new.pixels
-
-    def _wanted(self) -> int:
-        """Return the number of landmarks wanted in a keyframe."""
-        limits = self._limits
-        return max(min(limits.features, limits.good_inliers), round(self._features() * limits.features))
 
 
 class KeyframeLocaliser(Protocol):

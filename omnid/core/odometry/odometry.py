@@ -6,7 +6,6 @@ VisualOdometry.process is the algorithm, one frame at a time. Equations and sect
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -60,16 +59,12 @@ class VisualOdometry:
         klt: KltSettings,
         limits: OdometryLimits,
         relocaliser: KeyframeLocaliser,
-        features: Callable[[], float] = lambda: 1.0,
         raw_images: tuple[RawImage, RawImage] | None = None,
     ) -> None:
-        """features: called for each keyframe, the share of limits.features that it is to have.
-
-        raw_images: where the raw images of both cameras show the panoramas; None: they are not tested for breaks.
-        """
+        """raw_images: where the raw images of both cameras show the panoramas; None: they are not tested for breaks."""
         self._limits, self._model, self._relocaliser = limits, model, relocaliser
         self._map = LocalMap(model, klt, limits.keyframes)
-        self._keyframes = Keyframes(self._map, model, replace(klt, levels=1), limits, relocaliser, features)
+        self._keyframes = Keyframes(self._map, model, replace(klt, levels=1), limits, relocaliser)
         self._motion = MotionModel(limits)
         self._static_mask = StaticMask(model.cylinder.edges_rad)
         self._T_odom_rect, self._covariance = np.eye(4), np.zeros((6, 6))

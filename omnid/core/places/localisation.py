@@ -180,13 +180,13 @@ class MapLocaliser:
         self._part: frozenset[int] | None = None  # keyframes that links join to the newest one; None: not known
         self._scans: KeyframeScans | None = None  # of this part; None: it has changed
 
-    def process(self, frame: OdometryFrame, *, idle: bool = False) -> MapPose:
-        """Return the pose of odom in the map after a frame; idle: only by odometry, to save time."""
+    def process(self, frame: OdometryFrame) -> MapPose:
+        """Return the pose of odom in the map after a frame."""
         self._advance(frame)
         if frame.lost:
             return self._pose(frame, MapState.LOST)
-        is_keyframe = not idle and self._keyframe_is_due(frame)
-        if is_keyframe or (not idle and self._search_is_due(frame)):
+        is_keyframe = self._keyframe_is_due(frame)
+        if is_keyframe or self._search_is_due(frame):
             small, features = thumbnail(frame.stereo.lower), describe(frame.stereo)
             # 1. Recognise: a shortlist by thumbnails, matches, RANSAC, Gauss-Newton; not what is ambiguous.
             found = self._recognise(frame, small, features)

@@ -1,4 +1,4 @@
-"""Entries of the status of all parts, load shedding, and the summary of a run."""
+"""Entries of the status of all parts, and the summary of a run."""
 
 from __future__ import annotations
 
@@ -26,11 +26,9 @@ from omnid.core.control.control_law import ControllerSettings
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.rig.rig_health import RigHealth
 from omnid.core.stereo.tiles import ALL_LIVE, TILE_COLUMNS, TILE_ROWS, TileStates
-from omnid.diagnostics.load_ladder import PATIENCE, LoadLadder
 from omnid.diagnostics.run_summary import RunCounters, RunStatistics, run_summary
 from omnid.diagnostics.status import LIVE, TIMEOUT_S, ImagesStatus, Latency, StatusCollector, floor_status, rig_status
 from omnid.engine.telemetry import StageStats, Telemetry
-from omnid.load_level import LoadLevel
 from omnid.messages import OdometryUpdate, StereoDepth
 from omnid.simulation.robot import make_robot
 from omnid.stages.geometry import geometry
@@ -70,7 +68,7 @@ class Daemon:
 
     def __init__(self, rig: Rig) -> None:
         self.telemetry, self.statistics, self.latency = Telemetry(), RunStatistics(), Latency()
-        self.stages = [self.telemetry.add(StageStats(name)) for name in ("stereo", "motor")]
+        self.stages = [self.telemetry.add(StageStats(name)) for name in ("pair", "motor")]
         self.cameras: dict[Camera, CameraState] = {"lower": CameraState(), "upper": CameraState()}
         self.pair = Synchronise(rig, PairConfig())
         self.motor = AcceptingMotor()
@@ -167,6 +165,16 @@ def test_images_without_a_partner_and_images_that_cannot_be_decoded(daemon: Daem
     daemon.shoot("lower", "upper", data=b"no image")
     status = daemon.collected()["pairing"]
     assert status.level == WARN and "cannot be decoded" in status.message and status.values["broken"] == "2"
+
+
+def test_a_computer_that_is_too_slow_is_named_with_what_to_do(daemon: Daemon) -> None:
+    daemon.collected()
+    for dropped in (5, 20):
+        daemon.shoot("lower", "upper")
+        daemon.stages[0].processed += 100
+        daemon.stages[0].dropped += dropped
+        status = daemon.collected()["pairing"]
+        assert ("too slow" in status.message and status.level == WARN) == (dropped > 10)
 
 
 def test_wheels_driving_stopped_and_faulty(daemon: Daemon) -> None:
@@ -280,44 +288,6 @@ def test_names_camera_directions_and_time_and_reports_changes_once() -> None:
     assert (status().level, status().message) == (OK, LIVE)
     assert lines == [f"images: {text}", "images: the upper camera is frozen all around", f"images: {LIVE}"]
     assert statistics.lost_parts == {"upper": 3}
-
-
-class Observed:
-    """A ladder, and the counters that it observes."""
-
-    def __init__(self) -> None:
-        self.ladder, self._stats = LoadLadder(), StageStats("pair")
-
-    def level_after(self, count: int, *, dropped: int) -> int:
-        """Return the level after so many observations, with so many of 60 images dropped in each."""
-        for _ in range(count):
-            self._stats.processed += 60 - dropped
-            self._stats.dropped += dropped
-            self.ladder.observe(self._stats)
-        return self.ladder.level
-
-
-def test_under_lasting_overload_everything_is_given_up_in_order() -> None:
-    observed = Observed()
-    assert observed.level_after(1, dropped=30) == 0
-    assert [observed.level_after(1, dropped=30)] + [observed.level_after(2, dropped=30) for _ in range(4)] == [
-        1,
-        2,
-        3,
-        3,
-        3,
-    ]
-    assert observed.ladder.level is LoadLevel.REDUCED
-
-
-def test_it_waits_longer_each_time_that_was_too_soon() -> None:
-    observed = Observed()
-    waits = []
-    for _ in range(8):
-        observed.level_after(2, dropped=30)
-        waits.append(next(k for k in range(1, 1000) if observed.level_after(1, dropped=0) == 0))
-    assert waits[:3] == [PATIENCE[0], 2 * PATIENCE[0], 4 * PATIENCE[0]]
-    assert waits[-1] == waits[-2] == PATIENCE[1]
 
 
 def test_what_everybody_wants_to_know_comes_last_and_zeros_are_left_out() -> None:
