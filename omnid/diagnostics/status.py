@@ -11,9 +11,6 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, TypeAlias
 
-import numpy as np
-from numpy.typing import NDArray
-
 from drivers.cameras.camera_state import CameraState
 from drivers.frame import Camera
 from omnid.controller.statistics import ControllerStatistics
@@ -30,9 +27,8 @@ from omnid.diagnostics.run_summary import NOTABLE_SHARE, RunCounters, RunStatist
 from omnid.engine.robot_clock import RobotClock
 from omnid.engine.telemetry import Histogram, StageStats, Telemetry
 from omnid.messages import OdometryUpdate
-from omnid.stages.geometry import Geometry
 from omnid.stages.motion_inbox import MotionInbox
-from omnid.stages.obstacles import CameraFloor, Obstacles
+from omnid.stages.obstacles import CameraFloor
 from omnid.stages.odometry import OdometryStage
 from omnid.stages.places import Places
 from omnid.stages.synchronise import Synchronise
@@ -62,7 +58,7 @@ RIG_STATES: Final = {
 }
 LIVE: Final = "all parts are live"
 FIXED: Final = (
-    "a part of the panoramas ({:.0%}) shows what is fixed to a camera, such as the reflection of its lens: "
+    "a part of the panoramas shows what is fixed to a camera, such as the reflection of its lens: "
     "obstacles are judged without it; `omnid calibrate drive --only mask` on a log of a turn makes a mask of it"
 )
 WRONG_WHEELS: Final = "wheels contradict the cameras: check motor.drive (radius, track, reversed, swapped)"
@@ -364,58 +360,38 @@ def clock_status(clock: RobotClock) -> DiagnosticStatus:
     return entry(status_names.CLOCK, values, (since_s < STEP_S, WARN, words), words=words)
 
 
-class ImagesStatus:
-    """The entry of the images: parts of the newest pair that are frozen or blind, or show what is fixed to a camera."""
+def simulation_status(values: Mapping[str, float]) -> DiagnosticStatus:
+    """Return the numbers of a simulated robot."""
+    return entry(status_names.SIMULATION, values, words="its time waits for the daemon")
 
-    def __init__(
-        self,
-        geometry: Geometry,
-        statistics: RunStatistics,
-        report: Callable[[str], object],
-        obstacles: Obstacles | None = None,
-    ) -> None:
-        """report: takes a line for the log where the message changes, and where fixed parts are found first.
 
-        obstacles: knows what part of the panoramas shows what is fixed to a camera.
-        """
-        self._unwatched = Unwatched(geometry.cylinder, geometry.rig.T_base_rig @ geometry.T_rig_rect)
-        self._statistics, self._report, self._message = statistics, report, LIVE
-        self._obstacles, self._has_fixed = obstacles, False
+def images_status(unwatched: Unwatched, newest: OdometryUpdate | None, fixed_share: float) -> DiagnosticStatus:
+    """Return the parts of the newest pair that are frozen or blind, and how long.
 
-    def __call__(self) -> DiagnosticStatus:
-        """Return the entry."""
-        newest = self._statistics.newest
-        if newest is None:
-            return entry(status_names.IMAGES, {}, (True, STALE, "no pose yet"))
-        tiles = newest.depth.panoramas.tiles
-        lost = [side for side in SIDES if side in tiles.columns and tiles.columns[side].any()]
-        message = "; ".join(self._named(side, tiles) for side in lost) or LIVE
-        if message != self._message:
-            self._report(f"images: {message}")
-        self._message = message
-        fixed = 0.0 if self._obstacles is None else self._obstacles.fixed_share
-        if fixed and not self._has_fixed:
-            self._report(f"images: {FIXED.format(fixed)}")
-        self._has_fixed = fixed > 0
-        values: dict[str, object] = {
-            lost_parts_key(side): round((newest.stamp_ns - tiles.since_ns[side]) * 1e-9) for side in lost
-        }
-        if fixed:
-            values[status_names.FIXED_PERCENT] = round(100 * fixed)
-        return entry(status_names.IMAGES, values, (lost, ERROR, message), words=message)
+    fixed_share: of the panoramas, which shows what is fixed to a camera.
+    """
+    if newest is None:
+        return entry(status_names.IMAGES, {}, (True, STALE, "no pose yet"))
+    tiles = newest.depth.panoramas.tiles
+    lost = [side for side in SIDES if side in tiles.columns and tiles.columns[side].any()]
+    values: dict[str, object] = {
+        lost_parts_key(side): round((newest.stamp_ns - tiles.since_ns[side]) * 1e-9) for side in lost
+    }
+    if fixed_share:
+        values[status_names.FIXED_PERCENT] = round(100 * fixed_share)
+    message = "; ".join(_lost_parts(unwatched, side, tiles) for side in lost)
+    return entry(status_names.IMAGES, values, (lost, ERROR, message), (fixed_share, OK, FIXED), words=LIVE)
 
-    def _named(self, side: Side, tiles: TileStates) -> str:
-        """Return what a camera does not show, such as "the upper camera is blind from 300 to 40 degrees"."""
-        columns, is_dead = tiles.columns[side], tiles.dead[side].any(axis=0)
-        both = (("frozen", columns & is_dead), ("blind", columns & ~is_dead))
-        parts = [f"{word} {self._directions(found)}" for word, found in both if found.any()]
-        return f"the {side} camera is {' and '.join(parts)}"
 
-    def _directions(self, columns: NDArray[np.bool_]) -> str:
-        spans = self._unwatched.spans_deg(columns)
-        if spans == [(0, 360)]:
-            return "all around"
-        return " and ".join(f"from {begin} to {end} degrees" for begin, end in spans)
+def _lost_parts(unwatched: Unwatched, side: Side, tiles: TileStates) -> str:
+    """Return what a camera does not show, such as "the upper camera is blind from 300 to 40 degrees"."""
+    columns, is_dead = tiles.columns[side], tiles.dead[side].any(axis=0)
+    parts = []
+    for word, found in (("frozen", columns & is_dead), ("blind", columns & ~is_dead)):
+        spans = unwatched.spans_deg(found) if found.any() else []
+        where = " and ".join(f"from {begin} to {end} degrees" for begin, end in spans)
+        parts += [f"{word} {'all around' if spans == [(0, 360)] else where}"] if spans else []
+    return f"the {side} camera is {' and '.join(parts)}"
 
 
 class Latency:

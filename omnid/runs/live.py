@@ -28,16 +28,19 @@ from omnid.core.control.arming import MANUAL, NO_ANSWER
 from omnid.core.control.command_sources import PLANNER
 from omnid.core.control.safety_rules import AWAITED, NO_POSE
 from omnid.core.navigation.requests import NavigationCommand
+from omnid.core.obstacles.unwatched import Unwatched
 from omnid.core.rig.rig_health import RigHealth
 from omnid.diagnostics.status import (
-    ImagesStatus,
+    LIVE,
     Latency,
     StatusCollector,
     clock_status,
     floor_status,
+    images_status,
     motion_status,
     places_status,
     rig_status,
+    simulation_status,
 )
 from omnid.engine.flow import nothing
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Stream
@@ -65,7 +68,7 @@ from omnid.stages.obstacles import ADVICE
 from omnid.transport.bus import Bus
 from omnid.transport.codec import DiagnosticStatus, compile_serialisers
 from omnid.transport.commands import CommandReceiver, Freshness, NavigationReceiver, SensorReceiver
-from omnid.transport.status_names import DISARMED_BY_STOP, with_remedy
+from omnid.transport.status_names import DISARMED_BY_STOP, IMAGES, with_remedy
 from omnid.transport.topics import (
     ARM,
     IMU,
@@ -137,27 +140,26 @@ class LiveRobot(Protocol):
     def brings_samples(self) -> bool:
         """True if wheels and gyro come with the images: no others fit them."""
 
+    @property
+    def states(self) -> Mapping[Camera, CameraState]:
+        """The states of the cameras, once they are open."""
+
     def clock_ns(self) -> int:
         """Return the time, by the clock of the stamps of images, poses and ticks [ns]."""
 
     def first_frames(self) -> Generator[Frame, None, None]:
         """Yield the first frames of both cameras in turn, for the rims of the mirrors."""
 
-    def connect(self, session: Session) -> DriveLink | None:
-        """Open the cameras and start the controller; None without wheels. Outputs of the session close them."""
+    def connect(
+        self, session: Session, take: Callable[[MotionSample], None]
+    ) -> tuple[list[Stream[Frame]], DriveLink | None]:
+        """Open the cameras and start the controller; return the sources of the images, and None without wheels.
 
-    def sources(self, graph: Graph, take: Callable[[MotionSample], None]) -> list[Stream[Frame]]:
-        """Add the sources of the images to a graph. take: takes the samples that come with them, from any thread."""
+        Outputs of the session close them. take: takes the samples that come with the images, from any thread.
+        """
 
-    def states(self) -> Mapping[Camera, CameraState]:
-        """Return the states of the cameras."""
-
-    def words(self) -> str:
-        """Return what the line on a terminal ends with."""
-
-    @property
-    def status(self) -> tuple[Callable[[], DiagnosticStatus], ...]:
-        """Functions that make the entries of the status that only this kind of robot has."""
+    def stats(self) -> dict[str, float]:
+        """Return the numbers that only this kind of robot has."""
 
 
 class ConnectedRobot:
@@ -171,7 +173,7 @@ class ConnectedRobot:
         """
         self._open_camera, self._open_motion = open_camera, open_motion
         self.brings_samples = open_motion is not None
-        self._cameras: dict[Camera, LiveCamera] = {}
+        self.states: dict[Camera, CameraState] = {}
 
     def clock_ns(self) -> int:
         """Return CLOCK_MONOTONIC."""
@@ -181,31 +183,22 @@ class ConnectedRobot:
         """Open the cameras for their first frames."""
         return first_frames(self._open_camera)
 
-    def connect(self, session: Session) -> DriveLink | None:
+    def connect(
+        self, session: Session, take: Callable[[MotionSample], None]
+    ) -> tuple[list[Stream[Frame]], DriveLink | None]:
         """Open the cameras, and start the controller process where there is a motor."""
-        outputs: ExitStack = session.outputs
-        self._cameras = {name: outputs.enter_context(closing(self._open_camera(name))) for name in CAMERAS}
-        return session.start_controller(session.config.realtime) if session.config.motor.port else None
-
-    def sources(self, graph: Graph, take: Callable[[MotionSample], None]) -> list[Stream[Frame]]:
-        """Add the cameras, and the samples of a log."""
+        graph, outputs = session.graph, session.outputs
+        cameras = {name: outputs.enter_context(closing(self._open_camera(name))) for name in CAMERAS}
+        self.states = {name: camera.state for name, camera in cameras.items()}
         if self._open_motion is not None:
             motion = self._open_motion()
             graph.source("motion", partial(map, take, motion.samples()), wake=motion.close)
-        return [graph.source(name, camera.frames, wake=camera.close) for name, camera in self._cameras.items()]
+        frames = [graph.source(name, camera.frames, wake=camera.close) for name, camera in cameras.items()]
+        return frames, session.start_controller(session.config.realtime) if session.config.motor.port else None
 
-    def states(self) -> Mapping[Camera, CameraState]:
-        """Return the states of the cameras."""
-        return {name: camera.state for name, camera in self._cameras.items()}
-
-    def words(self) -> str:
-        """Return nothing."""
-        return ""
-
-    @property
-    def status(self) -> tuple[Callable[[], DiagnosticStatus], ...]:
-        """Nothing: all its parts have entries of their own."""
-        return ()
+    def stats(self) -> dict[str, float]:
+        """Return none: all its parts have entries of their own."""
+        return {}
 
 
 class LiveRun:
@@ -249,10 +242,8 @@ class LiveRun:
             run_places = RunPlaces(self._config, geometry, warn)
             _join(session, geometry, self._robot, self._report, run_places)
             if self._show is not None:
-                line = StatusLine(session.statistics, self._graph.telemetry)
-                words = lambda: line() + self._robot.words()  # noqa: E731
-                say = partial(self._report, logging.INFO)
-                terminal = TerminalStatus(self._show, words, say, session.statistics, _ready(self._config))
+                line = StatusLine(session.statistics, self._graph.telemetry, self._robot.stats)
+                terminal = TerminalStatus(self._show, line, partial(self._report, logging.INFO), _ready(self._config))
                 self._graph.ticker("terminal", terminal.period_s, terminal, thread="terminal")
             # 3. The run, until a signal or a failure ends it.
             cv2.setNumThreads(OPENCV_THREADS)
@@ -282,10 +273,12 @@ class LiveRun:
 def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report, run_places: RunPlaces) -> None:
     """Connect robot, bus and files, wire the stages between them, and add what is done from time to time."""
     config, graph, clock, warn = session.config, session.graph, session.clock, session.warn
-    rig = geometry.rig
+    rig, health = geometry.rig, RigHealth(geometry.cylinder, config.rig.check, config.rig.check_s)
+    front_end = FrontEnd(geometry, config, health)
+    motion = front_end.pairing.motion
 
     # 1. What is outside: cameras and wheels, the bus, the recording.
-    controller = robot.connect(session)
+    frames, controller = robot.connect(session, motion.add)
     bus = session.open_bus(rig, gives_time=robot.waits)
     recorder = None
     if config.record.enabled:
@@ -293,13 +286,10 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
         encode = session.encoder(rig, LOG_POINTS, times.unix_ns)
         recorder = open_recorder(config, rig_toml(rig), report, encode=encode, time=times)
         session.outputs.callback(recorder.close)
-    health = RigHealth(geometry.cylinder, config.rig.check, config.rig.check_s)
-    front_end = FrontEnd(geometry, config, health)
-    motion = front_end.pairing.motion
 
     # 2. Who takes what the stages make.
     latency = Latency(clock.monotonic_ns)
-    exposure = ExposureControl(UsefulArea(rig, geometry.cylinder), config.cameras, robot.states())
+    exposure = ExposureControl(UsefulArea(rig, geometry.cylinder), config.cameras, robot.states)
     outputs = Outputs(
         pairs={"exposure": exposure},
         counters={"statistics": session.statistics, "latency": latency},
@@ -336,7 +326,6 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
         else:
             warn(NO_PLANNER)
         parts = replace(parts, controller=controller, navigation=navigation)
-    frames = robot.sources(graph, motion.add)
     stages = wire(graph, frames, front_end, config, outputs, run_places.known_to(parts))
 
     # 4. What comes from the bus: commands, requests, samples.
@@ -356,9 +345,11 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
     _subscribe(config, bus, controller, commands, received, samples, saver)
 
     # 5. The status of all of them.
-    images = ImagesStatus(geometry, session.statistics, warn, stages.obstacles)
+    unwatched = Unwatched(geometry.cylinder, rig.T_base_rig @ geometry.T_rig_rect)
     status: list[Callable[[], DiagnosticStatus]] = [
-        images,
+        lambda: images_status(
+            unwatched, session.statistics.newest, stages.obstacles.fixed_share if stages.obstacles else 0.0
+        ),
         exposure.status,
         partial(rig_status, health),
         *([received.status] if controller is not None else ()),
@@ -366,12 +357,12 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
         partial(motion_status, front_end.odometry, motion, samples),
         *([partial(places_status, stages.places)] if stages.places else ()),
         *([partial(floor_status, stages.floor)] if stages.floor else ()),
-        *robot.status,
+        *([lambda: simulation_status(robot.stats())] if robot.stats() else ()),
         *(part.status for part in (bus, recorder, saver) if part is not None),
     ]
     collect = StatusCollector(
         graph.telemetry,
-        robot.states(),
+        robot.states,
         front_end.pairing,
         session.statistics,
         latency.to_pose,
@@ -381,10 +372,16 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
         clock.monotonic_ns,
     )
 
+    reported = {IMAGES: LIVE}  # messages in the log
+
     def give_status() -> None:
         if stages.mapping is not None:
             stages.mapping.is_read = recorder is not None or bus.is_received("cloud")
         statuses = collect()
+        for status in statuses:
+            if status.message != reported.get(status.name, status.message):
+                warn(f"images: {status.message}")
+                reported[status.name] = status.message
         with suppress(OmnidError):  # the system's clock may be set to a time that no message can hold
             message = status_report(time.time_ns(), [with_remedy(status) for status in statuses])
             bus.publish(message.topic, message.payload)  # where the bus is slow, only this ticker waits

@@ -19,6 +19,7 @@ from typing import Final
 from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.logging_setup import log
 from omnid.engine.telemetry import StageStats, Telemetry
+from omnid.transport.status_names import Key
 
 STATUS_PERIOD_S: Final = 1.0
 _FEEDS_PER_TIMEOUT: Final = 3
@@ -107,18 +108,23 @@ class Service:
 class StatusLine:
     """One line about the run: state, poses per second since the last call, dropped messages, missed deadlines."""
 
-    def __init__(self, statistics: RunStatistics, telemetry: Telemetry) -> None:
-        self._statistics, self._telemetry = statistics, telemetry
+    def __init__(
+        self, statistics: RunStatistics, telemetry: Telemetry, stats: Callable[[], dict[str, float]] = dict
+    ) -> None:
+        """stats: numbers of a simulated robot."""
+        self.statistics, self._telemetry, self._stats = statistics, telemetry, stats
         self._poses, self._called_ns = statistics.poses, time.monotonic_ns()
 
     def __call__(self) -> str:
         """Return the line."""
-        now_ns, poses, newest = time.monotonic_ns(), self._statistics.poses, self._statistics.newest
+        now_ns, poses, newest = time.monotonic_ns(), self.statistics.poses, self.statistics.newest
         rate_hz = (poses - self._poses) / max(1e-3, (now_ns - self._called_ns) * 1e-9)
         self._poses, self._called_ns = poses, now_ns
         state = newest.state if newest is not None and rate_hz > 0 else "waiting for images"
         dropped, late = self._telemetry.dropped_messages, self._telemetry.missed_deadlines
-        return f"{state}, {rate_hz:.1f} poses/s, {dropped} messages dropped, {late} deadlines missed"
+        factor = self._stats().get(Key.REAL_TIME_FACTOR)
+        pace = "" if factor is None else f", {factor:.2f} x real time"
+        return f"{state}, {rate_hz:.1f} poses/s, {dropped} messages dropped, {late} deadlines missed{pace}"
 
 
 class TerminalStatus:
@@ -127,30 +133,22 @@ class TerminalStatus:
     period_s: Final = 0.5
 
     def __init__(
-        self,
-        show: Callable[[str], None],
-        line: Callable[[], str],
-        report: Callable[[str], None],
-        statistics: RunStatistics,
-        ready: str,
+        self, show: Callable[[str], None], line: StatusLine, report: Callable[[str], None], ready: str
     ) -> None:
-        """show: rewrites the line. line: its text. report: takes lines that stay. ready: of the start."""
-        self._show, self._line, self._report = show, line, report
-        self._statistics, self._ready = statistics, ready
+        """show: rewrites the line. report: takes lines that stay. ready: that of the start."""
+        self._show, self._line, self._report, self._ready = show, line, report, ready
 
     def __call__(self) -> None:
         """Report that the run is ready, once, and show the line."""
         if self._ready:
             self._report(self._ready)
             self._ready = ""
-        self._show(f"{self._statistics.length_m:8.2f} m  {self._line()}")
+        self._show(f"{self._line.statistics.length_m:8.2f} m  {self._line()}")
 
     def close(self) -> None:
         """Remove the line, and report the summary."""
         self._show("")
-        statistics = self._statistics
-        states = ", ".join(f"{state} {count / statistics.poses:.1%}" for state, count in statistics.states.items())
-        self._report(
-            f"ended: {statistics.poses} poses, {statistics.length_m:.2f} m, {statistics.resets} resets"
-            f"{f'; {states}' if states else ''}"
-        )
+        found = self._line.statistics
+        states = ", ".join(f"{state} {count / found.poses:.1%}" for state, count in found.states.items())
+        length = f"{found.poses} poses, {found.length_m:.2f} m, {found.resets} resets"
+        self._report(f"ended: {'; '.join([length, states] if states else [length])}")

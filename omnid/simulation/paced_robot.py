@@ -10,13 +10,13 @@ import copy
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import replace
 from queue import Empty, Full, Queue
 from typing import Final
 
 from drivers.cameras.camera_state import CameraState
-from drivers.frame import CAMERAS, Camera, Frame
+from drivers.frame import CAMERAS, Frame
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from drivers.motor import VelocityCommand
 from drivers.motors.simulated.simulated_base import Pose
@@ -27,14 +27,13 @@ from omnid.core.control.collision_monitor import ControllerRing
 from omnid.core.control.contacts import NO_CONTACT
 from omnid.core.control.control_law import ControlInput, ControllerPose
 from omnid.engine.flow import nothing
-from omnid.engine.graph import Graph, Stream
+from omnid.engine.graph import Stream
 from omnid.engine.telemetry import StageStats
 from omnid.runs.session import Session
 from omnid.simulation.robot import SimulatedRobot, with_masks
 from omnid.simulation.vehicle import Tick, Vehicle
 from omnid.simulation.world import World
-from omnid.transport.codec import OK, DiagnosticStatus
-from omnid.transport.status_names import SIMULATION, Key
+from omnid.transport.status_names import Key
 
 MOST_COMMANDS: Final = 64  # If this number of commands waits for the stages, the simulated time waits, too.
 
@@ -122,7 +121,7 @@ class PacedRobot:
         self._start_ns = time.monotonic_ns()
         self._vehicle: Vehicle | None = None
         self._link: PacedLink | None = None
-        self._states = {camera: CameraState(mode="simulated", status="streaming") for camera in CAMERAS}
+        self.states = {camera: CameraState(mode="simulated", status="streaming") for camera in CAMERAS}
         self._given_s: deque[float] = deque(maxlen=RECENT)  # when the last pairs were given
         self._due_s = 0.0  # not before this time the next pair is given
         self._closed = self._ends = False
@@ -137,8 +136,8 @@ class PacedRobot:
         """Yield none: the rig has its masks."""
         yield from ()
 
-    def connect(self, session: Session) -> DriveLink:
-        """Set the robot up, with the controller of the settings."""
+    def connect(self, session: Session, take: Callable[[MotionSample], None]) -> tuple[list[Stream[Frame]], DriveLink]:
+        """Set the robot up, with the controller of the settings; one source of both cameras advances the time."""
         config = replace(session.config, controller=session.with_obstacles_known(session.config.controller))
         stats = session.graph.telemetry.add(StageStats("motor", is_ticker=True))
 
@@ -150,24 +149,13 @@ class PacedRobot:
             self._world, self._robot, config, self._seed, self._take_tick, warn, self._start_ns, samples=1
         )
         self._link = PacedLink(self._vehicle, stats, round(1e9 / self._robot.rate_hz))
-        return self._link
+        graph = session.graph
+        return [graph.source("cameras", lambda: self._frames(graph.settle, take), wake=self.close)], self._link
 
-    def sources(self, graph: Graph, take: Callable[[MotionSample], None]) -> list[Stream[Frame]]:
-        """Add the one source of both cameras, which advances the time."""
-        return [graph.source("cameras", lambda: self._frames(graph.settle, take), wake=self.close)]
-
-    def states(self) -> Mapping[Camera, CameraState]:
-        """Return the states of the cameras."""
-        return self._states
-
-    @property
-    def status(self) -> tuple[Callable[[], DiagnosticStatus], ...]:
-        """The entry of the simulation."""
-        return (self._status,)
-
-    def words(self) -> str:
-        """Return the real-time factor."""
-        return f", {self._real_time_factor:.2f} x real time"
+    def stats(self) -> dict[str, float]:
+        """Return the real-time factor, the time since the start [s] and the contacts with obstacles."""
+        time_s = (self.clock_ns() - self._start_ns) * 1e-9
+        return {Key.REAL_TIME_FACTOR: round(self._real_time_factor, 2), "time_s": time_s, "contacts": self.contacts}
 
     def close(self) -> None:
         """End the images; from any thread."""
@@ -178,14 +166,6 @@ class PacedRobot:
         """Simulated time over time on the wall, of the last pairs, at most 1; NaN before the second pair."""
         at_s = list(self._given_s)
         return (len(at_s) - 1) / self._robot.rate_hz / (at_s[-1] - at_s[0]) if len(at_s) > 1 else math.nan
-
-    def _status(self) -> DiagnosticStatus:
-        values = {
-            Key.REAL_TIME_FACTOR: f"{self._real_time_factor:.2f}",
-            "time_s": (self.clock_ns() - self._start_ns) * 1e-9,
-            "contacts": self.contacts,
-        }
-        return DiagnosticStatus.of(SIMULATION, OK, "its time waits for the daemon", values)
 
     def _frames(self, settle: Callable[[], None], take: Callable[[MotionSample], None]) -> Iterator[Frame]:
         """Advance from pair to pair; settle: returns when the daemon has answered."""
@@ -206,7 +186,7 @@ class PacedRobot:
                 self._given_s.append(time.monotonic())
                 self._due_s = max(self._due_s + 1.0 / self._robot.rate_hz, self._given_s[-1])
                 for frame in pair.frames:
-                    self._states[frame.camera].frames += 1
+                    self.states[frame.camera].frames += 1
                     yield frame
         finally:
             self._ends = True

@@ -24,10 +24,11 @@ from omnid.core.control.arming import ArmRequest
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControllerSettings
 from omnid.core.control.heading_controller import Setpoint
+from omnid.core.obstacles.unwatched import Unwatched
 from omnid.core.rig.rig_health import RigHealth
 from omnid.core.stereo.tiles import ALL_LIVE, TILE_COLUMNS, TILE_ROWS, TileStates
 from omnid.diagnostics.run_summary import RunCounters, RunStatistics, run_summary
-from omnid.diagnostics.status import LIVE, TIMEOUT_S, ImagesStatus, Latency, StatusCollector, floor_status, rig_status
+from omnid.diagnostics.status import LIVE, TIMEOUT_S, Latency, StatusCollector, floor_status, images_status, rig_status
 from omnid.engine.telemetry import StageStats, Telemetry
 from omnid.messages import OdometryUpdate, StereoDepth
 from omnid.simulation.robot import make_robot
@@ -39,7 +40,7 @@ from omnid.tracking_state import TrackingState
 from omnid.transport import codec
 from omnid.transport.codec import ERROR, OK, STALE, WARN, DiagnosticStatus, diagnostics_cdr
 from omnid.transport.commands import CommandReceiver, Freshness
-from omnid.transport.status_names import Key, lost_parts_key, short_name
+from omnid.transport.status_names import FIXED_PERCENT, Key, lost_parts_key, short_name
 from omnid.transport.topics import Request
 from tests.omnid.small_pair import small_depth
 from tests.omnid.stages.test_keyframe_scan import depth
@@ -269,25 +270,23 @@ def lost(first: int, last: int, *, is_dead: bool) -> TileStates:
     )
 
 
-def test_names_camera_directions_and_time_and_reports_changes_once() -> None:
+def test_names_camera_directions_and_time() -> None:
     """Degrees count counter-clockwise from ahead, and columns from left to right."""
-    statistics, lines = RunStatistics(), []  # type: ignore[var-annotated]
-    status = ImagesStatus(geometry(make_robot(256).rig, Config().panorama), statistics, lines.append)
-    assert status().level == STALE
-    for number in range(2):
-        statistics.process(update(lost(23, 40, is_dead=False), (112 + number) * S))
-        entry = status()
+    place = geometry(make_robot(256).rig, Config().panorama)
+    unwatched = Unwatched(place.cylinder, place.rig.T_base_rig @ place.T_rig_rect)
+    assert images_status(unwatched, None, 0.0).level == STALE
+    entry = images_status(unwatched, update(lost(23, 40, is_dead=False), 113 * S), 0.0)
     assert entry.level == ERROR and entry.values == {lost_parts_key("upper"): "13"}
     text = entry.message
     assert text.startswith("the upper camera is blind from ") and text.endswith(" degrees")
     begin, end = (int(word) for word in text.split() if word.isdigit())
     assert 298 <= begin <= 300 and 41 <= end <= 43
-    statistics.process(update(lost(0, TILE_COLUMNS, is_dead=True), 114 * S))
-    assert status().message == "the upper camera is frozen all around"
-    statistics.process(update(ALL_LIVE, 115 * S))
-    assert (status().level, status().message) == (OK, LIVE)
-    assert lines == [f"images: {text}", "images: the upper camera is frozen all around", f"images: {LIVE}"]
-    assert statistics.lost_parts == {"upper": 3}
+    frozen = images_status(unwatched, update(lost(0, TILE_COLUMNS, is_dead=True), 114 * S), 0.0)
+    assert frozen.message == "the upper camera is frozen all around"
+    fixed = images_status(unwatched, update(ALL_LIVE, 115 * S), 0.04)
+    assert fixed.level == OK and fixed.values == {FIXED_PERCENT: "4"} and "fixed to a camera" in fixed.message
+    live = images_status(unwatched, update(ALL_LIVE, 115 * S), 0.0)
+    assert (live.level, live.message) == (OK, LIVE)
 
 
 def test_what_everybody_wants_to_know_comes_last_and_zeros_are_left_out() -> None:

@@ -17,10 +17,13 @@ from drivers.logs.log_reader import LogReader
 from omnid.config import load_config
 from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.graph import Graph
+from omnid.engine.telemetry import Telemetry
 from omnid.errors import OmnidError
-from omnid.runs.live import MASK_FRAMES, ConnectedRobot, TerminalStatus, first_frames
+from omnid.runs.live import MASK_FRAMES, ConnectedRobot, first_frames
 from omnid.runs.session import Session, attached_rig
+from omnid.runs.systemd import StatusLine, TerminalStatus
 from omnid.simulation.robot import with_masks
+from omnid.transport.status_names import Key
 from tests.drivers.logs.mcap_logs import pairs, write_log
 from tests.simulation.rigs import make_rig
 
@@ -115,11 +118,13 @@ def test_the_first_images_come_in_turn_and_the_cameras_are_closed() -> None:
 
 def test_a_run_is_ready_once_and_ends_with_a_summary() -> None:
     shown, reported, statistics = list[str](), list[str](), RunStatistics()
-    terminal = TerminalStatus(shown.append, lambda: "10 Hz", reported.append, statistics, "ready: go")
+    line = StatusLine(statistics, Telemetry(), lambda: {Key.REAL_TIME_FACTOR: 0.5})
+    terminal = TerminalStatus(shown.append, line, reported.append, "ready: go")
     terminal()
     statistics.length_m = 12.345
     terminal()
-    assert shown == ["    0.00 m  10 Hz", "   12.35 m  10 Hz"] and reported == ["ready: go"]
+    words = "waiting for images, 0.0 poses/s, 0 messages dropped, 0 deadlines missed, 0.50 x real time"
+    assert shown == [f"    0.00 m  {words}", f"   12.35 m  {words}"] and reported == ["ready: go"]
     statistics.poses, statistics.resets, statistics.states = 4, 1, Counter({"tracking": 3, "lost": 1})
     terminal.close()
     assert shown[-1] == ""
