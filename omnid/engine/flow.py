@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from enum import Enum
-from typing import Final, Generic, Protocol, TypeVar
+from typing import Final, Generic, Protocol, TypeAlias, TypeVar
 
 T_co = TypeVar("T_co", covariant=True)
 Out_co = TypeVar("Out_co", covariant=True)
@@ -34,6 +34,11 @@ class Sink(Protocol[In_contra]):
 
     def process(self, message: In_contra, /) -> None:
         """Take a message out of the graph."""
+
+
+# A stage or a sink without a state, and without results at the end, is a function.
+Step: TypeAlias = Stage[In_contra, Out_co] | Callable[[In_contra], Out_co | None]
+End: TypeAlias = Sink[In_contra] | Callable[[In_contra], None]
 
 
 class Stream(Generic[T_co]):

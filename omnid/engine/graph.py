@@ -18,11 +18,11 @@ from functools import partial
 from queue import Empty, SimpleQueue
 from typing import Any, Final, TypeVar
 
-from omnid.engine.flow import LOSSLESS, NEWEST, Policy, Sink, Stage, Stream, nothing
+from omnid.engine.flow import LOSSLESS, NEWEST, End, Policy, Sink, Stage, Step, Stream, nothing
 from omnid.engine.telemetry import StageStats, Telemetry
 from omnid.errors import OmnidError
 
-__all__ = ["LOSSLESS", "NEWEST", "Graph", "Policy", "Sink", "Stage", "Stream"]
+__all__ = ["LOSSLESS", "NEWEST", "End", "Graph", "Policy", "Sink", "Stage", "Stream"]
 
 T = TypeVar("T")
 In = TypeVar("In")
@@ -35,11 +35,11 @@ _END: Final = object()  # the last message of a stream
 class Node:
     """A stage or a sink with its counters and its output; after an error it drops its messages, and counts them."""
 
-    def __init__(self, graph: Graph, stats: StageStats, work: object, writers: int, thread: str) -> None:
+    def __init__(self, graph: Graph, stats: StageStats, work: Any, writers: int, thread: str) -> None:
         """writers: number of streams that it reads."""
         self.stats, self.writers, self._graph = stats, writers, graph
         self.stream: Stream[Any] = Stream(thread)
-        self._process: Callable[[object], object | None] = getattr(work, "process", nothing)
+        self._process: Callable[[object], object | None] = getattr(work, "process", work)
         self._finish: Callable[[], Iterable[object] | None] = getattr(work, "finish", nothing)
 
     def put(self, message: object) -> None:
@@ -232,7 +232,7 @@ class Graph:
         self._inlets.append(inlet)
         return inlet
 
-    def stage(self, name: str, stage: Stage[In, Out], *inputs: Stream[In], thread: str = "") -> Stream[Out]:
+    def stage(self, name: str, stage: Step[In, Out], *inputs: Stream[In], thread: str = "") -> Stream[Out]:
         """Add a stage, whose inputs merge; return its output.
 
         thread: name of that in which it runs, one of its own where it is empty. What comes from a stage or a source of
@@ -243,7 +243,7 @@ class Graph:
     def sink(
         self,
         name: str,
-        sink: Sink[In],
+        sink: End[In],
         *inputs: Stream[In],
         policy: Policy | None = None,
         depth: int | None = None,
@@ -351,7 +351,7 @@ class Graph:
         return self.telemetry.add(stats)
 
     def _node(
-        self, name: str, work: object, inputs: tuple[Stream[Any], ...], policy: Policy, depth: int, thread: str
+        self, name: str, work: Any, inputs: tuple[Stream[Any], ...], policy: Policy, depth: int, thread: str
     ) -> Stream[Any]:
         if not inputs or depth < 1:
             raise OmnidError(f"'{name}': expected inputs and a depth above 0, found {len(inputs)} and {depth}")

@@ -54,17 +54,16 @@ from omnid.formats.route_file import RouteFolder
 from omnid.light.exposure import ExposureControl, UsefulArea
 from omnid.runs.place_maps import MapSaver, RunPlaces
 from omnid.runs.record import open_recorder
-from omnid.runs.rig_checks import RigViews
 from omnid.runs.route_files import Requests
 from omnid.runs.session import BUS_POINTS, LOG_POINTS, OPENCV_THREADS, Session, joint_wheels
 from omnid.runs.systemd import Service, StatusLine, TerminalStatus, print_stacks_when_killed
 from omnid.runs.wiring import NavigationParts, Outputs, Parts, wire
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
-from omnid.sinks.drive import PlannerDrive, RingToController
+from omnid.sinks.drive import PlannerDrive
 from omnid.sinks.encoder import status_report
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry
-from omnid.stages.obstacles import ADVICE
+from omnid.stages.obstacles import ADVICE, controller_ring
 from omnid.transport.bus import Bus
 from omnid.transport.codec import DiagnosticStatus, compile_serialisers
 from omnid.transport.commands import CommandReceiver, Freshness, NavigationReceiver, SensorReceiver
@@ -301,9 +300,9 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
     if config.bus.panorama_hz:
         outputs.poses["panorama"] = PanoramaSink(bus, config.bus.panorama_hz, clock.unix_ns)
     if health.uses_views:
-        outputs.poses["rig"] = RigViews(health)
+        outputs.poses["rig"] = lambda pose: health.drive(pose.depth.panoramas, pose.depth.exposure)
     if controller is not None:
-        outputs.rings["controller-ring"] = RingToController(controller)
+        outputs.rings["controller-ring"] = lambda ring: controller.send(controller_ring(ring))
 
     # 3. The stages, and the navigation with its requests and files.
     requests = Requests(graph)

@@ -29,7 +29,7 @@ from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.realtime import RealtimeSettings
 from omnid.engine.telemetry import Telemetry
 from omnid.errors import OmnidError
-from omnid.messages import OdometryUpdate
+from omnid.messages import OdometryUpdate, PlaceUpdate
 from omnid.runs.place_maps import RigPlaces, RunPlaces
 from omnid.runs.rig_checks import examined_rig
 from omnid.runs.run_result import RunFailedError, RunReport, RunResult
@@ -40,7 +40,7 @@ from omnid.sinks.bus_sink import BusSink
 from omnid.sinks.drive import ReplayDrive, SimulatedWheels
 from omnid.sinks.encoder import Outgoing
 from omnid.sinks.files import MapFile, PlanFile, TrajectoryFile, check_outputs, write_known
-from omnid.sinks.pose_collector import Newest, PlaceCollector, PoseCollector
+from omnid.sinks.pose_collector import Newest, PoseCollector
 from omnid.sinks.recorder import Recorder, SingleLog
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry
@@ -116,7 +116,7 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
 class _Replay:
     def __init__(self, log: Path, config: Config, options: ReplayOptions) -> None:
         self._log, self._config, self._options = log, config, options
-        self._poses, self._in_map = PoseCollector(), PlaceCollector()
+        self._poses, self._in_map = PoseCollector(), list[PlaceUpdate]()
         self._map = Newest()
         self._wheels: ReplayDrive | SimulatedWheels | None = None
         self._warnings: list[str] = []
@@ -231,7 +231,7 @@ class _Replay:
         if options.tum:
             outputs.poses["trajectory"] = TrajectoryFile(options.tum)
         if options.map_tum or options.map_live_tum or options.collect:
-            outputs.places["collect-places"] = self._in_map
+            outputs.places["collect-places"] = self._in_map.append
         if options.cloud:
             outputs.maps["map"] = MapFile(options.cloud)
         if options.plan:

@@ -1,4 +1,4 @@
-"""Drivers of the rig's state machine: the first pairs of a log before a replay, and the pairs of a live run."""
+"""Check of the rig of a log by its first pairs, before a replay."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from omnid.calibration.drive_observations import tracked_updates
 from omnid.config import Config
 from omnid.core.rig.rig_health import RigContradictedError, RigHealth
 from omnid.errors import OmnidError
-from omnid.messages import OdometryUpdate
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry
 
@@ -39,14 +38,3 @@ def examined_rig(reader: LogReader, log: Path, place: Geometry, config: Config) 
         pass  # A damaged log, or poses that are lost too often: the run reports them, after the poses that there are.
     # Where too little was seen, the run checks from its beginning.
     return RigHealth(place.cylinder, mode) if health.is_checking else health
-
-
-class RigViews:
-    """A sink of poses that shows their pairs to the rig's state, with the motion during their exposures."""
-
-    def __init__(self, health: RigHealth) -> None:
-        self._health = health
-
-    def process(self, odometry: OdometryUpdate) -> None:
-        """Pass a pair on."""
-        self._health.drive(odometry.depth.panoramas, odometry.depth.exposure)

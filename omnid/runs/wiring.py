@@ -14,13 +14,13 @@ from omnid.controller.link import DriveLink
 from omnid.controller.statistics import ControllerState
 from omnid.core.navigation.situation import WheelState
 from omnid.core.places.place_map import PlaceMap
-from omnid.engine.graph import NEWEST, Graph, Sink, Stream
+from omnid.engine.graph import NEWEST, End, Graph, Stream
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import FramePair, MapUpdate, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate, SaveMap
 from omnid.runs.route_files import Requests, RouteFiles, TaughtRoutes
 from omnid.sinks.drive import LiveDrive
 from omnid.sinks.encoder import Outgoing
-from omnid.stages.front_end import FrontEnd, Keyframes
+from omnid.stages.front_end import FrontEnd
 from omnid.stages.lockstep_drive import LockstepDrive
 from omnid.stages.mapping import MapGrid, Mapping
 from omnid.stages.navigation import NavigationStage
@@ -41,15 +41,15 @@ RECORDED_DEPTH = 20  # messages of each kind that may wait for the disk of a liv
 class Outputs:
     """The consumers of a run; a map that none of them takes is not computed, nor are places."""
 
-    pairs: dict[str, Sink[FramePair]] = field(default_factory=dict)  # each takes the newest
-    poses: dict[str, Sink[OdometryUpdate]] = field(default_factory=dict)
-    counters: dict[str, Sink[OdometryUpdate]] = field(default_factory=dict)  # in the thread of the poses: never wait
-    commands: dict[str, Sink[VelocityCommand]] = field(default_factory=dict)
-    maps: dict[str, Sink[MapUpdate]] = field(default_factory=dict)
-    places: dict[str, Sink[PlaceUpdate]] = field(default_factory=dict)
-    rings: dict[str, Sink[ObstacleRing]] = field(default_factory=dict)  # in the thread of the rings
-    bus: Sink[Outgoing] | None = None  # takes all messages that leave the run
-    recorder: Sink[Any] | None = None  # takes them as well
+    pairs: dict[str, End[FramePair]] = field(default_factory=dict)  # each takes the newest
+    poses: dict[str, End[OdometryUpdate]] = field(default_factory=dict)
+    counters: dict[str, End[OdometryUpdate]] = field(default_factory=dict)  # in the thread of the poses: never wait
+    commands: dict[str, End[VelocityCommand]] = field(default_factory=dict)
+    maps: dict[str, End[MapUpdate]] = field(default_factory=dict)
+    places: dict[str, End[PlaceUpdate]] = field(default_factory=dict)
+    rings: dict[str, End[ObstacleRing]] = field(default_factory=dict)  # in the thread of the rings
+    bus: End[Outgoing] | None = None  # takes all messages that leave the run
+    recorder: End[Any] | None = None  # takes them as well
     records_images: bool = False  # the recorder of a live run takes the images, too
 
     @property
@@ -64,7 +64,7 @@ class NavigationParts(NamedTuple):
     requests: Requests
     states: Stream[ControllerState]  # of the controller; an inlet of the thread that gives the commands
     routes: RouteFolder
-    drive: Sink[NavigationUpdate]
+    drive: End[NavigationUpdate]
     map_name: str  # of the file of the map; empty: it is not saved
 
 
@@ -247,5 +247,5 @@ def wire(
         graph.sink("taught", TaughtRoutes(parts.navigation.requests), ways, thread=ways.thread)
 
     # 7. The keyframe of a pair is made when its pose has been passed on: this reader of poses is the last one.
-    graph.sink("keyframes", Keyframes(front_end.odometry), poses, thread=poses.thread)
+    graph.sink("keyframes", lambda _: front_end.odometry.complete(), poses, thread=poses.thread)
     return WiredStages(front_end, mapping, places, obstacles)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import cv2
 import numpy as np
@@ -42,18 +42,6 @@ from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry
 from omnid.stages.lockstep_drive import controller_pose
 from omnid.stages.obstacles import controller_ring
-
-
-class _Into:
-    """A sink that calls a function."""
-
-    def __init__(self, call: Callable[[Any], object]) -> None:
-        self._call = call
-
-    def process(self, message: Any, /) -> None:
-        """Call the function."""
-        self._call(message)
-
 
 Array = NDArray[np.float64]
 
@@ -213,12 +201,12 @@ class _Lockstep:
         frames = graph.source("cameras", lambda: self._messages(seconds))
         shape = geometry(self._rig, config.panorama)
         run_places = RunPlaces(config, shape, nothing)
-        drive = _Into(self._take_navigation)
+        drive = self._take_navigation
         navigation = NavigationParts(self._requests, self._states, routes, drive, config.places.map)
         outputs = Outputs(
-            poses={"poses": _Into(self._take_pose)},
-            rings={"rings": _Into(self._take_ring)},
-            places={"in map": _Into(self._run.places.append)} if config.places.map else {},
+            poses={"poses": self._take_pose},
+            rings={"rings": self._take_ring},
+            places={"in map": self._run.places.append} if config.places.map else {},
         )
         self._stages = wire(
             graph,

@@ -19,10 +19,9 @@ from omnid.controller.motor_settings import MotorSettings
 from omnid.core.control.command_sources import PLANNER, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.nanoseconds import S_PER_NS
-from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate
+from omnid.messages import NavigationUpdate, OdometryUpdate
 from omnid.navigation_state import NavigationState
 from omnid.stages.lockstep_drive import controller_pose
-from omnid.stages.obstacles import controller_ring
 from omnid.transport.topics import Answer
 
 NAVIGATION_SENDER: Final = "navigation"  # identity of the sender: no other program drives on its source meanwhile
@@ -79,17 +78,6 @@ def granted_words(request: str, state: NavigationState, reason: str = "") -> str
     if state.is_end and state is not NavigationState.CANCELLED:
         words = f"nothing is under way ({words})"
     return GRANTED.get(verb, words).format(name)
-
-
-class RingToController:
-    """Passes the obstacle rings of `omnid run` to the controller process."""
-
-    def __init__(self, link: DriveLink) -> None:
-        self._link = link
-
-    def process(self, ring: ObstacleRing) -> None:
-        """Send a ring."""
-        self._link.send(controller_ring(ring))
 
 
 class ReplayDrive:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.messages import MapUpdate, OdometryUpdate, PlaceUpdate
+from omnid.messages import MapUpdate, OdometryUpdate
 from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]
@@ -35,14 +35,6 @@ class PoseCollector:
             np.array(covariances, np.float64).reshape(-1, 6, 6),
             tuple(self._states),
         )
-
-
-class PlaceCollector(list[PlaceUpdate]):
-    """A sink that keeps every pose in the map: about 1 kB a pose."""
-
-    def process(self, update: PlaceUpdate) -> None:
-        """Keep a pose."""
-        self.append(update)
 
 
 class Newest:

@@ -64,14 +64,3 @@ class CheckedOdometry:
         if is_contradicted and update.state is TrackingState.TRACKING:
             return replace(update, state=TrackingState.DEGRADED)
         return update
-
-
-class Keyframes:
-    """A sink of poses that makes the keyframe of a pair. As their last reader it does so once the pose is passed on."""
-
-    def __init__(self, odometry: OdometryStage) -> None:
-        self._odometry = odometry
-
-    def process(self, _: OdometryUpdate) -> None:
-        """Complete the newest pair."""
-        self._odometry.complete()
