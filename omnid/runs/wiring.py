@@ -28,12 +28,7 @@ from omnid.stages.obstacles import CameraFloor, Obstacles
 from omnid.stages.places import Places
 from omnid.stages.routes import RouteMap, Routes
 
-BUS, BUS_OF_MAPS, FILES, BACKGROUND = (
-    "bus",
-    "bus-maps",
-    "files",
-    "background",
-)  # threads that several stages and sinks share
+BUS, FILES, BACKGROUND = "bus", "files", "background"  # threads that several stages and sinks share
 RECORDED_DEPTH = 20  # messages of each kind that may wait for the disk of a live recording
 
 
@@ -228,9 +223,9 @@ def wire(
     made: list[tuple[str, Stream[Any] | None, str]] = [
         ("bus", poses, BUS),
         ("bus-drive", commands, BUS),
-        ("bus-map", maps, BUS_OF_MAPS),  # to encode a map takes longer than a pose may wait
+        ("bus-map", maps, FILES),  # to encode a map takes longer than a pose may wait
         ("bus-places", in_map, BUS),
-        ("bus-grid", grids, BUS_OF_MAPS),
+        ("bus-grid", grids, FILES),
         ("bus-scan", rings, BUS),
         ("bus-navigation", ways, BUS),
     ]

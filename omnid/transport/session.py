@@ -32,6 +32,8 @@ _USERS: Final = "transport/auth/usrpwd/dictionary_file"
 _CERTIFICATES: Final = "transport/link/tls/enable_mtls"
 _RETRY_S: Final = 0.5  # between two attempts of a client to connect
 QUERY_S: Final = 1.0  # A query without an answer ends after this time, which a slow network must not exceed.
+# zenoh's threads (zenoh-runtime): what one robot receives needs one, and accepting links none of its own.
+_THREADS: Final = "(rx: (worker_threads: 1), acc: (handover: app))"
 _DEFAULTS: Final = (  # what zenoh's own file may leave to default.json5
     "connect/retry",
     "scouting/multicast/enabled",
@@ -57,6 +59,7 @@ def open_session(config: BusConfig, *, guarded: bool = True) -> zenoh.Session:
     messages of a robot may be larger.
     """
     prepared = zenoh_config(config, guarded=guarded)
+    os.environ.setdefault("ZENOH_RUNTIME", _THREADS)
     try:
         return zenoh.open(prepared)
     except zenoh.ZError as error:
