@@ -392,16 +392,3 @@ def _lost_parts(unwatched: Unwatched, side: Side, tiles: TileStates) -> str:
         where = " and ".join(f"from {begin} to {end} degrees" for begin, end in spans)
         parts += [f"{word} {'all around' if spans == [(0, 360)] else where}"] if spans else []
     return f"the {side} camera is {' and '.join(parts)}"
-
-
-class Latency:
-    """A sink of poses; `to_pose` holds the latencies [s]."""
-
-    def __init__(self, clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
-        """clock_ns: the clock of the poses' stamps."""
-        self._clock_ns = clock_ns
-        self.to_pose = Histogram()
-
-    def process(self, odometry: OdometryUpdate) -> None:
-        """Add the latency of a pose."""
-        self.to_pose.add((self._clock_ns() - odometry.stamp_ns) * 1e-9)

@@ -32,7 +32,6 @@ from omnid.core.obstacles.unwatched import Unwatched
 from omnid.core.rig.rig_health import RigHealth
 from omnid.diagnostics.status import (
     LIVE,
-    Latency,
     StatusCollector,
     clock_status,
     floor_status,
@@ -48,6 +47,7 @@ from omnid.engine.kernel_cache import prepare_kernels, read_kept_kernels
 from omnid.engine.logging_setup import Report
 from omnid.engine.realtime import ThreadStart, name_thread, prepare
 from omnid.engine.robot_clock import RobotClock, SegmentTime, fixed_offset, log_time
+from omnid.engine.telemetry import Histogram
 from omnid.engine.threads import started
 from omnid.errors import OmnidError
 from omnid.formats.route_file import RouteFolder
@@ -287,11 +287,14 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
         session.outputs.callback(recorder.close)
 
     # 2. Who takes what the stages make.
-    latency = Latency(clock.monotonic_ns)
+    to_pose = Histogram()  # time from the images to their pose [s]
     exposure = ExposureControl(UsefulArea(rig, geometry.cylinder), config.cameras, robot.states)
     outputs = Outputs(
         pairs={"exposure": exposure},
-        counters={"statistics": session.statistics, "latency": latency},
+        counters={
+            "statistics": session.statistics,
+            "latency": lambda pose: to_pose.add((clock.monotonic_ns() - pose.stamp_ns) * 1e-9),
+        },
         # The ticks of wheels that wait give the time.
         bus=BusSink(bus, session.encoder(rig, BUS_POINTS), clock=VelocityCommand if robot.waits else None),
         recorder=recorder,
@@ -364,7 +367,7 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
         robot.states,
         front_end.pairing,
         session.statistics,
-        latency.to_pose,
+        to_pose,
         controller.statistics if controller is not None else None,
         commands,
         status,

@@ -18,10 +18,10 @@ from drivers.logs.image_folder import IMAGE_SUFFIXES
 from drivers.logs.open_log import is_log_name
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.errors import OmnidError
-from omnid.formats.exports import write_ply, write_whole
-from omnid.formats.plan import NO_LOOPS, drawn_heights, plan_view
+from omnid.formats.exports import write_whole
+from omnid.formats.plan import NO_LOOPS, plan_view
 from omnid.formats.tum import tum_row
-from omnid.messages import MapUpdate, OdometryUpdate
+from omnid.messages import OdometryUpdate
 
 Named: TypeAlias = Sequence[tuple[str, Path]]
 REPLACED: Final = ("--cloud", "--plan", "--ply", "--grid")  # options of files that are replaced at once
@@ -154,29 +154,6 @@ def write_known(
 
 def _no_longer_written(path: Path, error: OSError) -> OmnidError:
     return OmnidError(f"{path}: can no longer be written: {error.strerror or error}")
-
-
-class MapFile:
-    """The map as PLY; each map replaces the previous one."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def process(self, update: MapUpdate) -> None:
-        """Write the map."""
-        write_ply(self._path, update.points)
-
-
-class PlanFile:
-    """The plan view of the map with the path, as PNG; each map replaces the previous one."""
-
-    def __init__(self, path: Path, height_m: float) -> None:
-        """height_m: of the lower viewpoint above the floor, 0: not known."""
-        self._path, self._heights_m = path, drawn_heights(height_m)
-
-    def process(self, update: MapUpdate) -> None:
-        """Write the image."""
-        write_plan(self._path, update.points, update.path_xy, self._heights_m)
 
 
 def write_plan(

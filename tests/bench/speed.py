@@ -27,10 +27,11 @@ from drivers.logs.log_reader import LogReader
 from omnid.config import load_config
 from omnid.engine.graph import Graph
 from omnid.engine.kernel_cache import prepare_kernels
+from omnid.formats.exports import write_ply
 from omnid.messages import OdometryUpdate
 from omnid.runs.session import OPENCV_THREADS
 from omnid.runs.wiring import Outputs, wire
-from omnid.sinks.files import MapFile, TrajectoryFile
+from omnid.sinks.files import TrajectoryFile
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry, with_rims
 from tests.bench.accuracy import rig_of
@@ -101,8 +102,11 @@ def measure(folder: Path, pairs: int, hz: float, overrides: Sequence[str]) -> di
     cv2.setNumThreads(OPENCV_THREADS)
     with TemporaryDirectory() as work, clock.timed_stages():
         graph = Graph(threaded=False)
-        trajectory, cloud = TrajectoryFile(Path(work) / "t"), MapFile(Path(work) / "m")
-        outputs = Outputs(poses={"trajectory": trajectory, "measured": clock}, maps={"map": cloud})
+        trajectory, cloud = TrajectoryFile(Path(work) / "t"), Path(work) / "m"
+        outputs = Outputs(
+            poses={"trajectory": trajectory, "measured": clock},
+            maps={"map": lambda update: write_ply(cloud, update.points)},
+        )
         read = graph.source("read", lambda: to_and_fro(frames, pairs, round(1e9 / hz)))
         wire(graph, [read], FrontEnd(place, config), config, outputs)
         graph.run()

@@ -17,9 +17,10 @@ from drivers.logs.log_reader import LogReader
 from omnid.config import Config
 from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.graph import Graph
+from omnid.formats.exports import write_ply
 from omnid.messages import OdometryUpdate
 from omnid.runs.wiring import Outputs, wire
-from omnid.sinks.files import MapFile, TrajectoryFile
+from omnid.sinks.files import TrajectoryFile
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry, with_rims
 
@@ -58,7 +59,7 @@ def test_memory_stays_constant(tmp_path: Path, threaded: bool) -> None:
     monitor, statistics = MemoryMonitor(), RunStatistics()
     poses = {"monitor": monitor, "statistics": statistics, "trajectory": TrajectoryFile(tmp_path / "est.txt")}
     graph = Graph(threaded=threaded)
-    ends = Outputs(poses=poses, maps={"map": MapFile(tmp_path / "map.ply")})
+    ends = Outputs(poses=poses, maps={"map": lambda update: write_ply(tmp_path / "map.ply", update.points)})
     read = graph.source("read", lambda: to_and_fro(frames, PAIRS))
     wire(graph, [read], FrontEnd(place, config), config, ends)
     graph.run()

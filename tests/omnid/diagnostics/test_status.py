@@ -28,8 +28,8 @@ from omnid.core.obstacles.unwatched import Unwatched
 from omnid.core.rig.rig_health import RigHealth
 from omnid.core.stereo.tiles import ALL_LIVE, TILE_COLUMNS, TILE_ROWS, TileStates
 from omnid.diagnostics.run_summary import RunCounters, RunStatistics, run_summary
-from omnid.diagnostics.status import LIVE, TIMEOUT_S, Latency, StatusCollector, floor_status, images_status, rig_status
-from omnid.engine.telemetry import StageStats, Telemetry
+from omnid.diagnostics.status import LIVE, TIMEOUT_S, StatusCollector, floor_status, images_status, rig_status
+from omnid.engine.telemetry import Histogram, StageStats, Telemetry
 from omnid.messages import OdometryUpdate, StereoDepth
 from omnid.simulation.robot import make_robot
 from omnid.stages.geometry import geometry
@@ -68,7 +68,7 @@ class Daemon:
     """The parts of a daemon whose status is collected."""
 
     def __init__(self, rig: Rig) -> None:
-        self.telemetry, self.statistics, self.latency = Telemetry(), RunStatistics(), Latency()
+        self.telemetry, self.statistics, self.to_pose = Telemetry(), RunStatistics(), Histogram()
         self.stages = [self.telemetry.add(StageStats(name)) for name in ("pair", "motor")]
         self.cameras: dict[Camera, CameraState] = {"lower": CameraState(), "upper": CameraState()}
         self.pair = Synchronise(rig, PairConfig())
@@ -81,7 +81,7 @@ class Daemon:
             self.cameras,
             self.pair,
             self.statistics,
-            self.latency.to_pose,
+            self.to_pose,
             self.controller_statistics,
             self.commands,
         )
@@ -122,7 +122,7 @@ class Daemon:
             small_depth(),
         )
         self.statistics.process(odometry)
-        self.latency.process(odometry)
+        self.to_pose.add(age_s)
         self.controller.take(controller_pose(odometry, np.eye(4)))
 
     def tick(self) -> None:
