@@ -65,7 +65,7 @@ from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry
 from omnid.stages.obstacles import ADVICE, controller_ring
 from omnid.transport.bus import Bus
-from omnid.transport.codec import DiagnosticStatus, compile_serialisers
+from omnid.transport.codec import STALE, DiagnosticStatus, compile_serialisers
 from omnid.transport.commands import CommandReceiver, Freshness, NavigationReceiver, SensorReceiver
 from omnid.transport.status_names import DISARMED_BY_STOP, IMAGES, with_remedy
 from omnid.transport.topics import (
@@ -381,7 +381,7 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
             stages.mapping.is_read = recorder is not None or bus.is_received("cloud")
         statuses = collect()
         for status in statuses:
-            if status.message != reported.get(status.name, status.message):
+            if status.level != STALE and status.message != reported.get(status.name, status.message):
                 warn(f"images: {status.message}")
                 reported[status.name] = status.message
         with suppress(OmnidError):  # the system's clock may be set to a time that no message can hold
