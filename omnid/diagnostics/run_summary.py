@@ -20,6 +20,7 @@ from omnid.core.stereo.tiles import Side
 from omnid.engine.logging_setup import HANDLER, log
 from omnid.engine.telemetry import SummaryRow
 from omnid.messages import OdometryUpdate
+from omnid.stages.image_loss import LOSSY_SHARE
 from omnid.stages.synchronise import FROZEN_IMAGES, Synchronise
 from omnid.tracking_state import TrackingState
 
@@ -192,7 +193,7 @@ class Progress:
 
 # Share of the pairs that were dark, had lost parts or no sure pose, from which there is a warning. Fewer pairs without
 # a sure pose are a gap, whose first pose may imply any speed.
-NOTABLE_SHARE: Final = 0.1
+NOTABLE_SHARE: Final = LOSSY_SHARE
 REPEATED: Final = {
     "drop": "their pairs were left out; a simulator without noise needs pair.repeated_images = 'use'",
     "use": "they were used, as pair.repeated_images says",

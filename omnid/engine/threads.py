@@ -11,26 +11,19 @@ from collections.abc import Callable
 Lock = threading.Lock
 
 
-def returns_within(action: Callable[[], None], timeout_s: float, name: str) -> bool:
-    """Call an action in a thread; return whether it has returned in time.
+def started(action: Callable[[], None], name: str) -> Callable[[float | None], bool]:
+    """Call an action in a thread; return a function that waits for its end for so long [s], None: for any time.
 
-    Otherwise it continues in its thread, which does not keep the program from ending. For the end of a run: what the
-    action uses must not be used afterwards.
+    It returns whether the action has ended. The thread does not keep the program from ending; what it raises is lost.
     """
     thread = threading.Thread(target=action, name=name, daemon=True)
     thread.start()
-    thread.join(timeout_s)
-    return not thread.is_alive()
 
+    def has_ended(timeout_s: float | None) -> bool:
+        thread.join(timeout_s)
+        return not thread.is_alive()
 
-def started(action: Callable[[], None], name: str) -> Callable[[], None]:
-    """Call an action in a thread; return a function that waits for its end.
-
-    The thread does not keep the program from ending. What the action raises is lost.
-    """
-    thread = threading.Thread(target=action, name=name, daemon=True)
-    thread.start()
-    return thread.join
+    return has_ended
 
 
 class Poller:

@@ -9,7 +9,6 @@ from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
-from itertools import islice
 from pathlib import Path
 from typing import Final, Protocol, TypeAlias
 
@@ -103,9 +102,6 @@ class MotionSource(Protocol):
         """End samples(); from any thread."""
 
 
-MASK_FRAMES: Final = 60  # images of each camera in which the rim is searched, where the rig has no mask
-
-
 class LiveCamera(FrameSource, Protocol):
     """A source of frames with a state for the status."""
 
@@ -123,7 +119,7 @@ def first_frames(open_camera: OpenCamera) -> Generator[Frame, None, None]:
             camera = cameras.enter_context(closing(open_camera(name)))
             frames = iter(camera.frames())
             cameras.callback(getattr(frames, "close", nothing))  # a generator holds the device until it is closed
-            streams.append(islice(frames, MASK_FRAMES))
+            streams.append(frames)
         for pair in zip(*streams, strict=False):
             yield from pair
 
@@ -234,7 +230,7 @@ class LiveRun:
             rig = self._rig or read_rig(Path(self._config.cameras.rig))
             with closing(self._robot.first_frames()) as frames:
                 geometry = session.geometry(rig, frames)
-            loaded()
+            loaded(None)
             prepare_kernels()
             # 2. The connections, and the stages between them.
             self._connected = True

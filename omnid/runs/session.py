@@ -27,7 +27,7 @@ from omnid.engine.process import handle_stop_signals
 from omnid.engine.realtime import RealtimeSettings
 from omnid.engine.robot_clock import RobotClock, log_time
 from omnid.engine.telemetry import StageStats
-from omnid.engine.threads import returns_within
+from omnid.engine.threads import started
 from omnid.errors import OmnidError
 from omnid.settings import dump
 from omnid.sinks.encoder import Encoder, UnixTime
@@ -115,7 +115,7 @@ class Session:
 
     def _close_bus(self, bus: Bus) -> None:
         """Close the bus. zenoh waits for subscribers that do not read, for 10 s and more; a service has less time."""
-        if not returns_within(bus.close, BUS_END_S, "bus-close"):
+        if not started(bus.close, "bus-close")(BUS_END_S):
             self.warn(f"the bus has not closed within {BUS_END_S:g} s, for a subscriber does not read: it is given up")
 
     def start_controller(self, realtime: RealtimeSettings, *, of_replay: bool = False) -> ControllerLink:

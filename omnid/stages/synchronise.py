@@ -22,7 +22,6 @@ from omnid.messages import FramePair
 from omnid.stages.image_loss import ImageLoss, image_loss, unpaired_by_chance
 from omnid.stages.motion_inbox import MotionInbox
 
-SKEW_GAIN: Final = 0.02  # weight of a new skew in the running mean: a memory of about 50 pairs
 RECENT: Final = 30  # pairs to which a line is fitted
 MIN_FITTED: Final = 8  # Of fewer pairs the median is taken.
 JUMP_NS: Final = 5_000_000  # A larger distance from the line means a lost image, or a camera that was started again.
@@ -36,19 +35,19 @@ class Skew:
     """Statistics of the skew, the upper camera's stamp minus the lower's, in ns."""
 
     def __init__(self) -> None:
-        self.mean_ns = math.nan  # running mean
         self.max_ns = 0  # largest absolute value
-        self._pairs = 0
         self._recent: deque[int] = deque(maxlen=RECENT)
         self.exposure_ns = 0.0  # upper minus lower exposure of the newest pair
 
     def add(self, skew_ns: int) -> None:
         """Add the skew of a pair."""
-        self._pairs += 1
-        gain = max(SKEW_GAIN, 1 / self._pairs)
-        self.mean_ns = skew_ns if self._pairs == 1 else self.mean_ns + gain * (skew_ns - self.mean_ns)
         self.max_ns = max(self.max_ns, abs(skew_ns))
         self.exposure_ns = self._between_exposures(skew_ns)
+
+    @property
+    def mean_ns(self) -> float:
+        """Mean of the recent skews, NaN before the first."""
+        return float(np.mean(self._recent)) if self._recent else math.nan
 
     def _between_exposures(self, skew_ns: int) -> float:
         """Return the skew without the scatter of the stamps; 0 where the exposures may be simultaneous.

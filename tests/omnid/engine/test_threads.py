@@ -14,7 +14,7 @@ import pytest
 
 from omnid.engine.process import STOP_SIGNALS, handle_stop_signals, python, python_environment
 from omnid.engine.telemetry import Histogram, StageStats, Telemetry
-from omnid.engine.threads import Poller, returns_within, started
+from omnid.engine.threads import Poller, started
 from omnid.errors import OmnidError
 
 LONG_S = 20.0  # a timeout that only a defect reaches
@@ -22,19 +22,17 @@ LONG_S = 20.0  # a timeout that only a defect reaches
 
 def test_a_caller_goes_on_after_its_time_and_may_wait_later() -> None:
     called, release, done = threading.Event(), threading.Event(), list[bool]()
-    assert returns_within(called.set, LONG_S, "quick") and called.is_set()
-    assert not returns_within(lambda: bool(release.wait(LONG_S)) and None, 0.01, "slow")
-    wait = started(lambda: done.append(release.wait(LONG_S)), "test")
-    assert not done
+    assert started(called.set, "quick")(LONG_S) and called.is_set()
+    has_ended = started(lambda: done.append(release.wait(LONG_S)), "test")
+    assert not has_ended(0.01) and not done
     release.set()
-    wait()
-    assert done == [True]
+    assert has_ended(None) and done == [True]
 
 
 def test_a_call_that_blocks_for_ever_does_not_keep_the_program_from_ending() -> None:
     code = (
-        "import threading; from omnid.engine.threads import returns_within; "
-        "print(returns_within(threading.Event().wait, 0.01, 'blocked'))"
+        "import threading; from omnid.engine.threads import started; "
+        "print(started(threading.Event().wait, 'blocked')(0.01))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout == "False\n"

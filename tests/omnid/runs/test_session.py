@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
+from itertools import islice
 from pathlib import Path
 
 import pytest
@@ -19,7 +20,7 @@ from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.graph import Graph
 from omnid.engine.telemetry import Telemetry
 from omnid.errors import OmnidError
-from omnid.runs.live import MASK_FRAMES, ConnectedRobot, first_frames
+from omnid.runs.live import ConnectedRobot, first_frames
 from omnid.runs.session import Session, attached_rig
 from omnid.runs.systemd import StatusLine, TerminalStatus
 from omnid.simulation.robot import with_masks
@@ -102,14 +103,14 @@ def test_the_first_images_come_in_turn_and_the_cameras_are_closed() -> None:
         opened.append(Images(camera))
         return opened[-1]
 
-    frames = list(first_frames(open_camera))
+    frames = list(islice(first_frames(open_camera), 100))
     assert [(frame.camera, frame.seq) for frame in frames[:4]] == [
         ("lower", 0),
         ("upper", 0),
         ("lower", 1),
         ("upper", 1),
     ]
-    assert len(frames) == 2 * MASK_FRAMES and [camera.closed for camera in opened] == [1, 1]
+    assert [camera.closed for camera in opened] == [1, 1]
     begun = ConnectedRobot(open_camera).first_frames()
     next(begun)
     begun.close()
