@@ -5,18 +5,21 @@ from __future__ import annotations
 import threading
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from calib import se3
 from drivers.frame import CAMERAS, Camera, Frame
+from omnid.core.navigation.requests import NavigationCommand, TaughtRoute
 from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.graph import NEWEST, Graph
 from omnid.formats.tum import read_tum
-from omnid.messages import DensePoints, MapUpdate, OdometryUpdate
+from omnid.messages import DensePoints, MapUpdate, OdometryUpdate, SaveMap
 from omnid.runs.wiring import Outputs, Parts, wire
 from omnid.stages.geometry import Geometry, geometry
+from omnid.stages.places import Places
 from tests.conftest import PAIRS
 from tests.omnid.stages.scene_parts import CONFIG, depth_of, front_end, run_pairs
 from tests.simulation import make_rig
@@ -103,6 +106,19 @@ def dropped(rig_geometry: Geometry, frames: list[Frame], slow: type) -> dict[str
     graph.run()
     assert statistics.poses == PAIRS
     return {stage.name: stage.dropped for stage in graph.telemetry.stages}
+
+
+def test_the_map_is_copied_for_a_route_that_was_written_and_for_requests(
+    rig_geometry: Geometry, frames: list[Frame]
+) -> None:
+    stages, route = front_end(rig_geometry), Any
+    places = Places(rig_geometry, CONFIG, stages.dense)
+    poses = [stages.process(pair) for pair in run_pairs(rig_geometry, frames[:8])[0]]
+    failed = NavigationCommand(TaughtRoute(route, 7), 0, refusal="the disk is full")  # type: ignore[arg-type]
+    assert places.process(failed) is None and places.process(poses[0]).copy is None
+    assert places.process(failed._replace(refusal="")) is None and places.process(SaveMap(9)) is None
+    copied = places.process(poses[1]).copy
+    assert copied is not None and copied.ids == (9,) and places.process(poses[2]).copy is copied
 
 
 def test_live_old_images_are_dropped_before_any_work(rig_geometry: Geometry, frames: list[Frame]) -> None:
