@@ -58,7 +58,7 @@ def examine(config: Config) -> Iterator[Finding]:
     yield from checks.rig(Path(camera.rig), (camera.width_px, camera.height_px), config.obstacles.ring.floor_m)
     yield from checks.motor(config.motor, ROOT)
     yield from checks.rights(max(wanted.motor_priority, wanted.capture_priority), wanted.lock_memory)
-    yield checks.compiled_functions()
+    yield from checks.compiled_functions()
     rate = 2 * camera.width_px * camera.height_px * BYTES_PER_PIXEL * (camera.rate_hz or 30.0)
     yield from checks.disk(checks.STATE / config.record.folder, config.record, rate)
     yield checks.bus(config.bus)

@@ -20,6 +20,7 @@ from omnid.engine.flow import Stream
 from omnid.engine.telemetry import Histogram, StageStats
 
 UNTIL_ARMED: Final = "they stay stopped until cmd/arm (`omnid arm`)"
+ARMED: Final = "armed by cmd/arm"
 
 
 @dataclass(slots=True)
@@ -68,7 +69,7 @@ def transitions(before: ControllerState, after: ControllerState, witness: Witnes
     # 1. Arming: each time, and a refusal where its reason is another one.
     answer, last = after.arm_answer, before.arm_answer
     if answer != last and (not answer.refusal or answer.refusal != last.refusal):
-        yield f"arming is refused: {answer.refusal}" if answer.refusal else "armed by cmd/arm"
+        yield f"arming is refused: {answer.refusal}" if answer.refusal else ARMED
     # 2. A fault while the wheels are at rest, which ends no drive.
     if before.armed and after.needs_request and before.reason:
         yield f"disarmed while the wheels stand: {after.disarmed_by}; {UNTIL_ARMED}"

@@ -1,4 +1,8 @@
-"""Checks of `omnid doctor`: cameras and motor, the rights of this user and of the service, the machine, rig and bus."""
+"""Checks of `omnid doctor`: cameras and motor, the rights of this user and of the service, the machine, rig and bus.
+
+A check is a table of what may be wrong, each with what was found and what to do; the findings are those that apply, or
+else the one that all is well.
+"""
 
 from __future__ import annotations
 
@@ -30,6 +34,10 @@ from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig, checked
 
 Level = Literal["ok", "warning", "error"]
+GROUPS: Final = ("video", "dialout")  # the unit's SupplementaryGroups
+OWN_NAME: Final = "omnid"  # Name of the daemon's processes.
+STATE: Final = Path("/var/lib/omnid")  # StateDirectory and working directory of the unit
+_ENDPOINT: Final = re.compile(r"[a-z-]+/\[?(?P<host>[^\]/]+?)\]?:\d{1,5}(?:[?#].*)?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,19 +53,8 @@ class Finding:
         return f"{self.level:<8} {self.subject:<13} {self.found}" + (f"; {self.advice}" if self.advice else "")
 
 
-def ok(subject: str, found: str) -> Finding:
-    """Return a finding that needs nothing."""
-    return Finding("ok", subject, found)
-
-
-def warning(subject: str, found: str, advice: str) -> Finding:
-    """Return a finding that a person should think about."""
-    return Finding("warning", subject, found, advice)
-
-
-def error(subject: str, found: str, advice: str = "") -> Finding:
-    """Return a finding with which the daemon does not do its work."""
-    return Finding("error", subject, found, advice)
+# What is wrong where a condition holds: the condition, the level, what was found, what to do.
+Case = tuple[object, Level, str, str]
 
 
 def summary(findings: Sequence[Finding]) -> str:
@@ -68,8 +65,10 @@ def summary(findings: Sequence[Finding]) -> str:
     return f"{errors} errors, {warnings} warnings, {len(findings) - errors - warnings} ok"
 
 
-GROUPS: Final = ("video", "dialout")  # the unit's SupplementaryGroups
-OWN_NAME: Final = "omnid"  # Name of the daemon's processes.
+def _applying(subject: str, cases: Sequence[Case], good: str = "") -> list[Finding]:
+    """Return the findings of the cases that apply; where there are none that all is well, unless good is empty."""
+    found = [Finding(level, subject, what, advice) for applies, level, what, advice in cases if applies]
+    return found or ([Finding("ok", subject, good)] if good else [])
 
 
 def cameras(wanted: Mapping[str, V4l2Settings], known: list[CaptureDevice], root: Path) -> Iterator[Finding]:
@@ -77,91 +76,88 @@ def cameras(wanted: Mapping[str, V4l2Settings], known: list[CaptureDevice], root
 
     known: the cameras that are connected. root: folder of dev and proc.
     """
+    names = {name: root / settings.device.lstrip("/") for name, settings in wanted.items()}
+    nodes = {(root / device.node.lstrip("/")).resolve(): device for device in known}
     for name, settings in wanted.items():
-        subject, path = f"camera {name}", root / settings.device.lstrip("/")
-        device = next((one for one in known if (root / one.node.lstrip("/")).resolve() == path.resolve()), None)
-        if not path.exists():
-            yield error(
-                subject,
-                f"{settings.device} does not exist",
-                "connect the camera; `omnid cameras` lists the cameras and the udev rule for this name",
-            )
-        elif device is None:
-            yield error(subject, f"{settings.device} is no camera", "choose a device that `omnid cameras` lists")
-        else:
+        subject, path = f"camera {name}", names[name]
+        connect = "connect the camera; `omnid cameras` lists the cameras and the udev rule for this name"
+        choose, device = "choose a device that `omnid cameras` lists", nodes.get(path.resolve())
+        missing: list[Case] = [
+            (not path.exists(), "error", f"{settings.device} does not exist", connect),
+            (path.exists() and device is None, "error", f"{settings.device} is no camera", choose),
+        ]
+        yield from _applying(subject, missing)
+        if device is not None:
             yield from _camera(subject, settings, device, path, root)
-    if len({(root / settings.device.lstrip("/")).resolve() for settings in wanted.values()}) < len(wanted):
-        yield error("cameras", "both names lead to one device", "configure one for each, see `omnid cameras`")
+    if len({path.resolve() for path in names.values()}) < len(names):
+        yield Finding(
+            "error", "cameras", "both names lead to one device", "configure one for each, see `omnid cameras`"
+        )
 
 
-def _camera(subject: str, settings: V4l2Settings, device: CaptureDevice, path: Path, root: Path) -> Iterator[Finding]:
-    """Yield ok if a connected camera can be used as configured, else all reasons against it."""
-    problems = list(access(subject, path))
-    if others := holders(path, root):
-        found = f"{settings.device} is open in {', '.join(others)}"
-        problems.append(warning(subject, found, "end that program"))
-    image = "in use, so that its image was not tried"
-    try:
-        if device.problem:
-            raise DriverError(device.problem)
-        if not problems:
+def _camera(subject: str, settings: V4l2Settings, device: CaptureDevice, path: Path, root: Path) -> list[Finding]:
+    """Return ok if a connected camera can be used as configured, else all reasons against it."""
+    others, image, fault = holders(path, root), "in use, so that its image was not tried", device.problem
+    problems = access(subject, path)
+    cases: list[Case] = [(others, "warning", f"{settings.device} is open in {', '.join(others)}", "end that program")]
+    problems += _applying(subject, cases)
+    if not fault and not problems:
+        try:
             image = str(offered_image(settings) or image)
-    except DriverError as fault:
-        problems.append(error(subject, str(fault), "change section [cameras] of the configuration"))
+        except DriverError as error:
+            fault = str(error)
+    if fault:
+        problems.append(Finding("error", subject, fault, "change section [cameras] of the configuration"))
     exposure = ""
     if settings.is_regulated:
         exposure = f", {device.exposure} set by omnid run" if device.exposure else ", exposure left to it"
-    yield from problems or [ok(subject, f"{device.name} at {device.node}, {image}{exposure}")]
+    return problems or [Finding("ok", subject, f"{device.name} at {device.node}, {image}{exposure}")]
 
 
-def motor(settings: MotorSettings, root: Path = Path("/")) -> Iterator[Finding]:
+def motor(settings: MotorSettings, root: Path = Path("/")) -> list[Finding]:
     """Check protocol and port: that it exists, may be opened and is free; opening it would restart some boards."""
-    subject, port = "motor", settings.port
+    subject, port, path = "motor", settings.port, root / settings.port.lstrip("/")
+    found: list[Finding] = []
     try:
         motor_protocol(settings.protocol)
     except DriverError as fault:
-        yield error(subject, str(fault), "set motor.protocol")
-    path = root / port.lstrip("/")
+        found.append(Finding("error", subject, str(fault), "set motor.protocol"))
     if port in ("", SIMULATED):
-        yield ok(subject, "simulated" if port else "none is configured: motor.port is empty")
-    elif not path.exists():
-        yield error(
-            subject,
-            f"{port} does not exist",
-            "connect it; `ls -l /dev/serial/by-id` lists the ports, 90-omnid.rules gives it a name",
-        )
-    elif not stat.S_ISCHR(path.stat().st_mode):
-        yield error(subject, f"{port} is no serial port", "set motor.port")
-    elif problems := [*access(subject, path), *_occupied(subject, port, path, root)]:
-        yield from problems
-    else:
-        yield ok(subject, f"{settings.protocol} on {port}")
+        good = "simulated" if port else "none is configured: motor.port is empty"
+        return [*found, Finding("ok", subject, good)]
+    ports = "connect it; `ls -l /dev/serial/by-id` lists the ports, 90-omnid.rules gives it a name"
+    if not path.exists():
+        return [*found, Finding("error", subject, f"{port} does not exist", ports)]
+    if not stat.S_ISCHR(path.stat().st_mode):
+        return [*found, Finding("error", subject, f"{port} is no serial port", "set motor.port")]
+    others, away = holders(path, root), "end that program; 90-omnid.rules keeps ModemManager away from the port"
+    used: list[Case] = [(others, "error", f"{port} is in use by {', '.join(others)}", away)]
+    problems = access(subject, path) + _applying(subject, used)
+    return found + (problems or [Finding("ok", subject, f"{settings.protocol} on {port}")])
 
 
-def _occupied(subject: str, port: str, path: Path, root: Path) -> Iterator[Finding]:
-    if others := holders(path, root):
-        advice = "end that program; 90-omnid.rules keeps ModemManager away from the port"
-        yield error(subject, f"{port} is in use by {', '.join(others)}", advice)
-
-
-def access(subject: str, device: Path) -> Iterator[Finding]:
-    """Yield a finding if this user or the service may not open the device."""
+def access(subject: str, device: Path) -> list[Finding]:
+    """Return a finding if this user or the service may not open the device."""
     found = device.stat()
     group = str(found.st_gid)
     with suppress(KeyError):  # a group without a name
         group = grp.getgrgid(found.st_gid).gr_name
-    if group not in GROUPS and found.st_mode & 0o006 != 0o006:
-        yield warning(
-            subject,
+    is_open_to_service = group in GROUPS or (found.st_mode & stat.S_IROTH and found.st_mode & stat.S_IWOTH)
+    cases: list[Case] = [
+        (
+            not is_open_to_service,
+            "warning",
             f"{device} is of group {group}, the service is in {' and '.join(GROUPS)}",
             'set GROUP="video" or GROUP="dialout" in its udev rule, see 90-omnid.rules',
-        )
-    elif not os.access(device, os.R_OK | os.W_OK):
-        yield error(
-            subject,
+        ),
+        (
+            is_open_to_service and not os.access(device, os.R_OK | os.W_OK),
+            "error",
             f"no permission for {device} of group {group}",
             f"`sudo usermod -aG {group} $USER`, then log in again",
-        )
+        ),
+    ]
+    return _applying(subject, cases)
 
 
 def holders(device: Path, root: Path = Path("/")) -> list[str]:
@@ -182,64 +178,59 @@ def _target(entry: Path) -> str:
     return ""
 
 
-_ENDPOINT = re.compile(r"[a-z-]+/\[?(?P<host>[^\]/]+?)\]?:\d{1,5}(?:[?#].*)?")
-STATE: Final = Path("/var/lib/omnid")  # StateDirectory and working directory of the unit
-
-
-def rights(priority: int, lock_memory: bool) -> Iterator[Finding]:
+def rights(priority: int, lock_memory: bool) -> list[Finding]:
     """Check that this user may have the real-time priority, and may lock memory."""
-    highest = highest_priority()
-    if priority > highest:
-        yield warning(
-            "real time",
-            f"priority {priority} is not allowed, this user may have {highest}; the unit sets LimitRTPRIO",
-            priority_advice(priority),
-        )
-    else:
-        yield ok("real time", f"priorities up to {highest} are allowed")
-    if lock_memory and not may_lock():
-        yield warning("memory", "this user may not lock memory; the unit sets LimitMEMLOCK", LOCK_ADVICE)
-    else:
-        yield ok("memory", "may be locked" if may_lock() else "not locked: realtime.lock_memory = false")
+    highest, locks = highest_priority(), may_lock()
+    refused = f"priority {priority} is not allowed, this user may have {highest}; the unit sets LimitRTPRIO"
+    unlocked = "this user may not lock memory; the unit sets LimitMEMLOCK"
+    time: list[Case] = [(priority > highest, "warning", refused, priority_advice(priority))]
+    memory: list[Case] = [(lock_memory and not locks, "warning", unlocked, LOCK_ADVICE)]
+    return [
+        *_applying("real time", time, f"priorities up to {highest} are allowed"),
+        *_applying("memory", memory, "may be locked" if locks else "not locked: realtime.lock_memory = false"),
+    ]
 
 
-def disk(folder: Path, config: RecordConfig, bytes_per_s: float) -> Iterator[Finding]:
+def disk(folder: Path, config: RecordConfig, bytes_per_s: float) -> list[Finding]:
     """Check the space for recordings in the folder (or where it will be), and that the service may write there."""
     place = next(path for path in (folder, *folder.parents) if path.exists())
     free = shutil.disk_usage(place).free
     room = min(free - config.free_mb * 10**6, config.keep_mb * 10**6)
-    if room <= 0:
-        yield Finding(
-            "error" if config.enabled else "warning",
-            "disk",
-            f"{free / 1e9:.1f} GB free at {place}: nothing is recorded below record.free_mb = {config.free_mb}",
-            "delete files, or change record.folder",
-        )
-    else:
-        yield ok(
-            "disk",
-            f"{free / 1e9:.1f} GB free at {place}: the newest {room / 1e9:.1f} GB, about "
-            f"{room / bytes_per_s / 3600:.1f} h, are kept of what is recorded",
-        )
-    if not folder.is_relative_to(STATE):
-        yield warning(
-            "disk",
+    is_full, minutes = room <= 0, room / bytes_per_s / 60
+    where = f"{free / 1e9:.1f} GB free at {place}"
+    kept = (
+        f"{where}: the newest {room / 1e9:.1f} GB of recordings are kept, some {minutes:.0f} min at "
+        f"{bytes_per_s / 1e6:.0f} MB/s (record.keep_mb, cameras.rate_hz)"
+    )
+    full = f"{where}: nothing is recorded below record.free_mb = {config.free_mb}"
+    space: list[Case] = [
+        (is_full, "error" if config.enabled else "warning", full, "delete files, or change record.folder")
+    ]
+    place_of: list[Case] = [
+        (
+            not folder.is_relative_to(STATE),
+            "warning",
             f"the service may write in {STATE} only, record.folder is {folder}",
             f"`systemctl edit omnid`: [Service], ReadWritePaths={folder}",
         )
+    ]
+    return _applying("disk", space, kept) + _applying("disk", place_of)
 
 
-def compiled_functions() -> Finding:
+def compiled_functions() -> list[Finding]:
     """Check that functions can be compiled, and that they can be kept for the next start."""
-    if problem := why_no_code():
-        return error("compiled code", problem, "remove MemoryDenyWriteExecute= from the unit, or what else denies it")
-    if reason := why_unusable(folder := cache_folder()):
-        found = f"cannot be kept in {folder}: {reason}: every start takes half a minute longer"
-        return warning("compiled code", found, "make that folder writable, or set OMNID_CACHE_DIR to another one")
-    return ok("compiled code", f"kept in {folder}; the first start compiles it, which takes half a minute")
+    problem, folder = why_no_code(), cache_folder()
+    reason = "" if problem else why_unusable(folder)
+    lost = f"cannot be kept in {folder}: {reason}: every start takes half a minute longer"
+    cases: list[Case] = [
+        (problem, "error", problem, "remove MemoryDenyWriteExecute= from the unit, or what else denies it"),
+        (reason, "warning", lost, "make that folder writable, or set OMNID_CACHE_DIR to another one"),
+    ]
+    good = f"kept in {folder}; the first start compiles it, which takes half a minute"
+    return _applying("compiled code", cases, good)
 
 
-def rig(path: Path, size_px: tuple[int, int], floor_m: float = 0.0) -> Iterator[Finding]:
+def rig(path: Path, size_px: tuple[int, int], floor_m: float = 0.0) -> list[Finding]:
     """Check that the rig can be read, is of images of this size (width, height), states its height, and has masks.
 
     floor_m: height of the floor in the base frame.
@@ -248,38 +239,36 @@ def rig(path: Path, size_px: tuple[int, int], floor_m: float = 0.0) -> Iterator[
         found = read_rig(path)
     except CalibError as fault:
         advice = "" if "omnid calibrate" in str(fault) else "create one with `omnid calibrate`"
-        yield error("rig", str(fault), advice)
-        return
-    cameras = {"lower": found.lower, "upper": found.upper}
-    for name, mounted in cameras.items():
-        width, height = mounted.camera.size
-        if (width, height) != size_px:
-            yield error(
-                "rig",
-                f"{path}: the {name} camera was calibrated with {width}x{height} px, "
-                f"[cameras] asks for {size_px[0]}x{size_px[1]}",
+        return [Finding("error", "rig", str(fault), advice)]
+    cameras, height_m = {"lower": found.lower, "upper": found.upper}, found.height_m(floor_m)
+    sizes = {name: "x".join(map(str, mounted.camera.size)) for name, mounted in cameras.items()}
+    wanted = "x".join(map(str, size_px))
+    bare = [name for name, mounted in cameras.items() if mounted.mask is None]
+    cases: list[Case] = [
+        *(
+            (
+                size != wanted,
+                "error",
+                f"{path}: the {name} camera was calibrated with {size} px, [cameras] asks for {wanted}",
                 "set cameras.width_px and height_px",
             )
-    height_m = found.height_m(floor_m)
-    if height_m is None:
-        yield warning(
-            "rig",
+            for name, size in sizes.items()
+        ),
+        (
+            height_m is None,
+            "warning",
             f"{path} does not state the height of the cameras: nothing is free until the images show the floor",
             "state it by `omnid calibrate drive LOG --only height`, with --ruler-m as a check",
-        )
-    bare = [name for name, mounted in cameras.items() if mounted.mask is None]
-    if bare:
-        yield warning(
-            "rig",
+        ),
+        (
+            bare,
+            "warning",
             f"{path} has no mask for {' and '.join(bare)}, the rim is searched at each start",
-            f"add [{bare[0]}.mask] with center, inner_px and outer_px",
-        )
-    else:
-        yield ok(
-            "rig",
-            f"{path}, {found.baseline_m:.3f} m between the viewpoints"
-            + ("" if height_m is None else f", {height_m:.3f} m above the floor"),
-        )
+            f"add [{'.mask] and ['.join(bare)}.mask] with center, inner_px and outer_px",
+        ),
+    ]
+    height = "" if height_m is None else f", {height_m:.3f} m above the floor"
+    return _applying("rig", cases, f"{path}, {found.baseline_m:.3f} m between the viewpoints{height}")
 
 
 def bus(config: BusConfig) -> Finding:
@@ -287,17 +276,15 @@ def bus(config: BusConfig) -> Finding:
     try:
         checked(config)
     except OmnidError as fault:
-        return error("bus", str(fault), "the daemon does not start with these settings")
+        return Finding("error", "bus", str(fault), "the daemon does not start with these settings")
     endpoints = ", ".join(endpoint for endpoint in (*config.listen, *config.connect) if not _is_local(endpoint))
     if endpoints and not config.config:
-        return warning(
-            "bus",
-            f"anyone who reaches {endpoints} can drive the robot",
-            "name a file with users in bus.config (omnid/transport/site.json5), or listen on tcp/127.0.0.1:7447 only",
+        advice = (
+            "name a file with users in bus.config (omnid/transport/site.json5), or listen on tcp/127.0.0.1:7447 only"
         )
-    if endpoints:
-        return ok("bus", f"reachable at {endpoints}; who may command it is said in {config.config}")
-    return ok("bus", "reachable from this machine only")
+        return Finding("warning", "bus", f"anyone who reaches {endpoints} can drive the robot", advice)
+    allowed = f"reachable at {endpoints}; who may command it is said in {config.config}"
+    return Finding("ok", "bus", allowed if endpoints else "reachable from this machine only")
 
 
 def _is_local(endpoint: str) -> bool:

@@ -40,18 +40,18 @@ def granted(robot: Robot, answer: Answer) -> str:
 def follow(robot: Robot, command_ns: int, show: Callable[[NavigationReport], None]) -> NavigationReport:
     """Show the progress of the drive that a request with this stamp began, until its end; return the last report.
 
-    Raise OmnidError where the robot is silent for SILENCE_S, or another request has taken its place.
+    It is that of another request where that has taken the place of this one. Raise OmnidError where the robot is silent
+    for SILENCE_S.
     """
     begun, deadline_s = False, time.monotonic() + SILENCE_S
     with robot.subscribe(NavigationReport) as reports:
         while (report := reports.wait(deadline_s - time.monotonic())) is not None:
-            if report.command_ns == command_ns and NavigationState(report.state).is_end:
+            is_own = report.command_ns == command_ns
+            if (begun and not is_own) or (is_own and NavigationState(report.state).is_end):
                 return report
-            if report.command_ns == command_ns:
+            if is_own:
                 begun, deadline_s = True, time.monotonic() + SILENCE_S
                 show(report)
-            elif begun:
-                raise OmnidError(f"{robot.name} follows another request now: {report.task}")
     raise OmnidError(
         f"{robot.name} has been silent for {SILENCE_S:g} s: look at it; if only the network between is gone, it drives "
         "on (`omnid stop`, `omnid listen`)"
@@ -101,6 +101,9 @@ def drive_to_end(robot: Robot, driver: Driver, ask: Callable[[], Answer]) -> int
         print(words)
         return 1
     line.end()
+    if report.command_ns != driver.asked_ns:
+        print(f"not reached: {robot.name} follows another request now: {report.task}")
+        return 1
     print(f"{report.state}: {report.reason}" if report.reason else report.state)
     return int(report.state != NavigationState.REACHED)
 

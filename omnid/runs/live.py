@@ -22,7 +22,7 @@ from drivers.motion import MotionSample
 from drivers.motor import VelocityCommand
 from omnid.config import Config
 from omnid.controller.link import DriveLink
-from omnid.controller.statistics import ControllerState
+from omnid.controller.statistics import ARMED, ControllerState
 from omnid.core.control.arming import MANUAL, NO_ANSWER
 from omnid.core.control.command_sources import PLANNER
 from omnid.core.control.safety_rules import AWAITED, NO_POSE
@@ -221,7 +221,11 @@ class LiveRun:
         """Run until a signal comes, or the cameras end; return the exit code."""
         print_stacks_when_killed()
         loaded = started(_load, "imports")
-        clock_ns, warn = self._robot.clock_ns, partial(self._report, logging.WARNING)
+        clock_ns = self._robot.clock_ns
+
+        def warn(line: str) -> None:
+            self._report(logging.INFO if line == ARMED else logging.WARNING, line)
+
         self.clock = fixed_offset(clock_ns) if self._robot.waits else RobotClock(clock_ns, report=warn)
         with ExitStack() as outputs:
             session = Session(self._config, self._graph, outputs, warn, clock=self.clock)

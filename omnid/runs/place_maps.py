@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -16,6 +17,7 @@ from calib.rig_file import rig_toml
 from omnid.config import Config, PlacesConfig
 from omnid.core.places.place_map import PlaceMap, PlaceRig
 from omnid.engine.flow import Stream
+from omnid.engine.logging_setup import log
 from omnid.errors import OmnidError
 from omnid.formats.place_file import read_places, write_places
 from omnid.messages import MapCopy, PlaceUpdate, SaveMap
@@ -68,13 +70,14 @@ class RunPlaces:
             if self.is_extended:
                 check_outputs([("--map", self._path)], [])
             if self.is_extended and not self._path.exists():
-                warn(f"{self._path}: there is no such map: this run begins a new one")
+                log(logging.INFO, f"{self._path}: there is no such map: this run begins a new one")
             else:
                 given = RigPlaces(*read_places(self._path, new_places(settings)))
         self.places: PlaceMap | None = None
         if given is not None or build or self._path is not None:
             self.places = new_places(settings) if given is None else given.places
         self._saved = frozenset[int]()  # keyframes in the file
+        self._asks = False  # whether the place is another one
         self._known = frozenset(given.places.keyframes) if given else frozenset[int]()
         # 2. It must fit the rig, and is adapted to the panoramas of this run.
         if given is not None and self._known:
@@ -99,6 +102,9 @@ class RunPlaces:
         Raises OmnidError if the file cannot be written.
         """
         joined = self._joined(places)
+        if self._known and not joined - self._known and places.keyframes.keys() - self._known and not self._asks:
+            self._asks = True
+            self._warn(f"{self._path}: no place of it is recognised so far: is this another place? Name another map")
         if self._path is None or not joined - self._known or joined == self._saved:
             return False
         self._write(self._path, places.part(joined))

@@ -176,11 +176,14 @@ def repeated_paths(
     """Return the paths that repeat a route from the nearest point on it to a pose (3,) of the base in the map.
 
     A closed route is driven in rounds, any other there and back, `loops` times in all. from_start: the whole route.
-    Raise OmnidError where the robot is not near it, or not near its start.
+    Raise OmnidError where the robot is not near it, or not near its start, or at the end of the only way.
     """
     there = route.reversed() if reverse else route
     poses = there.in_map(keyframe)
     first = _start(poses, pose) if from_start else _joined(poses, there.speeds, _entry(poses, pose), pose)
+    left_m = float(np.hypot(*np.diff(poses[first:, :2], axis=0).T).sum())
+    if loops == 1 and left_m <= BESIDE_M:
+        raise OmnidError("the robot is at the end of the route: repeat it in reverse, or drive to its start first")
     paths = [_path(there, poses, first, pose)]
     if loops == 1:
         return paths

@@ -96,13 +96,27 @@ def test_a_silent_robot_is_not_reported_to_stop(monkeypatch: pytest.MonkeyPatch)
     endpoint = free_endpoint()
     shown: list[NavigationReport] = []
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
-        values = {Key.STATE: "driving", Key.COMMAND_NS: str(COMMAND_NS)}
-        entry = DiagnosticStatus(NAVIGATION, 0, "", {str(key): value for key, value in values.items()})
-        bus.publish("navigation", codec.diagnostics_cdr(time.time_ns(), [entry]))
+        publish_driving(bus, COMMAND_NS)
         with Robot("omnid", endpoint, timeout_s=30.0) as robot, pytest.raises(OmnidError, match="silent") as caught:
             navigation.follow(robot, COMMAND_NS, shown.append)
     assert [report.state for report in shown] == ["driving"]
     assert "it drives on (`omnid stop`" in str(caught.value)
+
+
+def publish_driving(bus: Bus, command_ns: int) -> None:
+    """Publish a report of a drive that a request with this stamp began."""
+    values = {str(Key.STATE): "driving", str(Key.COMMAND_NS): str(command_ns)}
+    entry = DiagnosticStatus(NAVIGATION, 0, "", values)
+    bus.publish("navigation", codec.diagnostics_cdr(time.time_ns(), [entry]))
+
+
+def test_a_drive_that_another_request_replaces_has_ended() -> None:
+    endpoint = free_endpoint()
+    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
+        publish_driving(bus, COMMAND_NS)
+        with Robot("omnid", endpoint, timeout_s=30.0) as robot:
+            last = navigation.follow(robot, COMMAND_NS, lambda _: publish_driving(bus, COMMAND_NS + 1))
+    assert last.command_ns == COMMAND_NS + 1
 
 
 @pytest.mark.hazard("H25")

@@ -181,6 +181,8 @@ def test_the_whole_route_is_driven_from_its_start_only() -> None:
     with pytest.raises(OmnidError, match=r"3\.\d m away from the start of the route: .*from=here"):
         repeated_paths(route, places, far, loops=1, reverse=False, from_start=True)
     repeated_paths(route, places, poses[-10], loops=1, reverse=True, from_start=True)
+    with pytest.raises(OmnidError, match="the robot is at the end of the route: repeat it in reverse"):
+        repeated_paths(route, places, poses[-1], loops=1, reverse=False)
 
 
 def test_is_driven_back_and_there_again_and_in_rounds() -> None:
