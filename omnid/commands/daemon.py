@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omnid.commands.options import MAP, QUIET, SETTINGS, VERBOSE, command, device_opener, make_folder, settings_of
-from omnid.commands.replay import Output, replay_and_print
 from omnid.errors import OmnidError
 
 if TYPE_CHECKING:  # the help and other commands do not load these
@@ -183,6 +182,7 @@ def demo(args: argparse.Namespace) -> int:
       demo --drive
       demo --output /tmp/demo --quiet
     """
+    from omnid.commands.replay import Output, replay_and_print
     from omnid.formats.tum import read_tum
     from omnid.recordings.evaluation import evaluate
     from omnid.runs.replay import ReplayOptions

@@ -8,6 +8,9 @@ from typing import Final
 
 from omnid.commands.options import JSON, command, print_json, warn
 from omnid.errors import OmnidError
+from omnid.formats.tum import read_tum
+from omnid.recordings.evaluation import evaluate
+from omnid.recordings.truth_frame import find_truth_frame
 
 # Position error (ATE), as a share of the true length, above which the trajectories hardly are of one drive: odometry
 # that is lost half of the way is below.
@@ -34,10 +37,6 @@ def run(args: argparse.Namespace) -> int:
       eval est.txt truth.txt --align rigid --json
       eval map.txt truth.txt --live live.txt
     """
-    from omnid.formats.tum import read_tum
-    from omnid.recordings.evaluation import evaluate
-    from omnid.recordings.truth_frame import find_truth_frame
-
     estimate, truth, tolerance_s = read_tum(args.estimate), read_tum(args.truth), args.tolerance_ms * 1e-3
     frame = find_truth_frame(estimate, truth)
     of_rig = truth if frame is None else frame.rig_poses(truth, estimate)

@@ -4,23 +4,40 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Final
 
-from omnid.commands.options import JSON, QUIET, RIG, ROBOT, SETTINGS, command, print_json, settings_of, warn
+from omnid.commands.options import (
+    JSON,
+    QUIET,
+    RIG,
+    ROBOT,
+    SETTINGS,
+    command,
+    print_entries,
+    print_json,
+    settings_of,
+    warn,
+)
 from omnid.commands.robot import ask
+from omnid.config import unused_settings
+from omnid.core.places import place_views
+from omnid.core.places.place_map import PlaceMap, PlaceRig
+from omnid.diagnostics.run_summary import Progress
 from omnid.errors import OmnidError
+from omnid.formats.exports import write_grid, write_ply
+from omnid.formats.place_file import read_places, write_places
+from omnid.formats.plan import drawn_heights
+from omnid.runs.place_maps import RigPlaces, new_places
+from omnid.runs.replay import ReplayOptions, run_log
+from omnid.sinks.files import check_outputs, write_plan
+from omnid.stages.obstacles import ADVICE
 from omnid.utc import utc
 
-if TYPE_CHECKING:
-    from omnid.core.places.place_map import PlaceMap, PlaceRig
-    from omnid.core.places.place_views import PlaceSummary
-
 # Suffixes of `map show -o`, and the options of `map export` that write the same.
-KINDS = {".ply": "--ply", ".png": "--plan", ".yaml": "--grid", ".yml": "--grid"}
-MAP = """
+KINDS: Final = {".ply": "--ply", ".png": "--plan", ".yaml": "--grid", ".yml": "--grid"}
+MAP: Final = """
 map FILE.omap            a map of places
 --cell M=0.05 0.005..10  edge of a cell of the grid, m
 """
@@ -41,23 +58,16 @@ def build(args: argparse.Namespace) -> int:
       map build monday.mcap tuesday.mcap -o place.omap --rig rig.toml
       map build wednesday.mcap -o place.omap --extend
     """
-    from omnid.config import unused_settings
-    from omnid.core.places.place_views import summary
-    from omnid.diagnostics.run_summary import Progress
-    from omnid.formats.place_file import read_places, write_places
-    from omnid.runs.place_maps import RigPlaces, new_places
-    from omnid.runs.replay import ReplayOptions, run_log
-    from omnid.sinks.files import check_outputs
-
+    # 1. Check the options.
     config = settings_of(args)
-    warnings = unused_settings(config, "replay", args.set)
     if not config.places.enabled or config.places.map:
         raise OmnidError("map build: places.enabled must be true, and places.map empty: change the configuration")
     check_outputs([("-o", args.output)], [("the log that is read", log) for log in args.logs])
     if args.output.exists() and not (args.extend or args.replace):
         raise OmnidError(f"map build: {args.output} exists: --extend adds these logs to it, --replace makes a new one")
-    for warning in warnings:
+    for warning in unused_settings(config, "replay", args.set):
         warn(warning)
+    # 2. Replay the logs.
     built = RigPlaces(*read_places(args.output, new_places(config.places))) if args.extend else None
     for log in args.logs:
         options = ReplayOptions(
@@ -70,11 +80,12 @@ def build(args: argparse.Namespace) -> int:
             print(f"omnid: interrupted: {args.output} was not written", file=sys.stderr)
             return 128 + result.signal
         built = result.rig_places
+    # 3. Write the map.
     if built is None or not built.places.keyframes:
         print("omnid: no keyframe was found: no map was written", file=sys.stderr)
         return 1
     write_places(args.output, built.places, built.rig)
-    print(*_described(args.output, summary(built.places, built.rig), built.rig), sep="\n")
+    print_entries(_described(args.output, built.places, built.rig))
     return 0
 
 
@@ -89,20 +100,16 @@ def show(args: argparse.Namespace) -> int:
       map show place.omap
       map show place.omap -o place.png -o place.yaml
     """
-    from omnid.core.places.place_views import summary
-
     for path in args.output:
         if path.suffix not in KINDS:
             raise OmnidError(f"-o {path}: expected a name that ends in .png, .yaml or .ply")
-    places, rig, files = _exported(args, [("-o", KINDS[path.suffix], path) for path in args.output])
-    sizes = summary(places, rig)
+    places, rig, written = _exported(args, [("-o", KINDS[path.suffix], path) for path in args.output])
     if args.json:
+        sizes = asdict(place_views.summary(places, rig))
         size_bytes = args.map.stat().st_size
-        print_json({"path": args.map, "size_bytes": size_bytes, "rig_hash": rig.rig_hash, **asdict(sizes)})
+        print_json({"path": args.map, "size_bytes": size_bytes, "rig_hash": rig.rig_hash, **sizes})
     else:
-        print(*_described(args.map, sizes, rig), sep="\n")
-        if files:
-            print("written     ", ", ".join(map(str, files)))
+        print_entries(_described(args.map, places, rig) | {"written": written})
     return 0
 
 
@@ -117,12 +124,11 @@ def export(args: argparse.Namespace) -> int:
     examples:
       map export place.omap --grid place.yaml --ply place.ply --plan place.png
     """
-    named = (("--ply", args.ply), ("--plan", args.plan), ("--grid", args.grid))
-    outputs = [(option, option, path) for option, path in named if path is not None]
+    named = {"--ply": args.ply, "--plan": args.plan, "--grid": args.grid}
+    outputs = [(option, option, path) for option, path in named.items() if path is not None]
     if not outputs:
         raise OmnidError("map export: nothing to write: give --ply FILE.ply, --plan FILE.png or --grid FILE.yaml")
-    _, _, files = _exported(args, outputs)
-    print("written     ", ", ".join(map(str, files)))
+    print_entries({"written": _exported(args, outputs)[2]})
     return 0
 
 
@@ -137,20 +143,11 @@ def save(args: argparse.Namespace) -> int:
     return ask(args, lambda driver: driver.save_map())
 
 
-def _exported(
-    args: argparse.Namespace, outputs: Sequence[tuple[str, str, Path]]
-) -> tuple[PlaceMap, PlaceRig, list[Path]]:
-    """Write a map to files; return it and all files that were written.
+def _exported(args: argparse.Namespace, outputs: list[tuple[str, str, Path]]) -> tuple[PlaceMap, PlaceRig, str]:
+    """Write a map to files; return it and the names of all files that were written.
 
     outputs: for each file the option that names it, its kind (that of an option of `map export`), and its path.
     """
-    from omnid.core.places import place_views
-    from omnid.formats.exports import write_grid, write_ply
-    from omnid.formats.place_file import read_places
-    from omnid.formats.plan import drawn_heights
-    from omnid.sinks.files import check_outputs, write_plan
-    from omnid.stages.obstacles import ADVICE
-
     inputs = [("the map that is read", args.map)]
     named = [(option, path) for option, _, path in outputs]
     check_outputs(named, inputs)  # before the image of a grid is named: a folder, as ".", can have no other end
@@ -173,22 +170,21 @@ def _exported(
             low_m, high_m = (height_m + at_m for at_m in drawn_heights(height_m))
             paths, loops = place_views.paths_xy(places, rig), place_views.loops_xy(places, rig)
             write_plan(path, place_views.landmarks(places, rig), paths, (low_m, high_m), loops)
-    return places, rig, [path for _, path in named]
+    return places, rig, ", ".join(str(path) for _, path in named)
 
 
-def _described(path: Path, sizes: PlaceSummary, rig: PlaceRig) -> Iterator[str]:
-    """Yield a line for each property: its name, padded to 12 characters, and its value."""
-    per_keyframe = path.stat().st_size / max(1, sizes.keyframes)
-    yield f"map          {path}"
-    yield f"size         {path.stat().st_size / 1e6:.1f} MB, {per_keyframe / 1e3:.0f} kB a keyframe"
-    yield f"time         {utc(sizes.first_stamp_ns)} to {utc(sizes.last_stamp_ns)}"
-    yield f"sessions     {sizes.sessions}"
-    yield f"keyframes    {sizes.keyframes}, with {sizes.features} features; {sizes.dropped} were dropped"
-    yield f"loops        {sizes.loops}"
-    yield f"path         {sizes.path_m:.1f} m, within {sizes.extent_m[0]:.1f} x {sizes.extent_m[1]:.1f} m"
-    if sizes.parts > 1:
-        yield f"parts        {sizes.parts}, between which no pose is known"
-    yield (
-        f"rig          {rig.rig_hash[:12]}, baseline {rig.baseline_m:.4f} m, panoramas of "
-        f"{rig.cylinder.width} x {rig.cylinder.height} px"
-    )
+def _described(path: Path, places: PlaceMap, rig: PlaceRig) -> dict[str, str]:
+    """Return the properties of a map, as they are printed."""
+    sizes, size = place_views.summary(places, rig), path.stat().st_size
+    return {
+        "map": str(path),
+        "size": f"{size / 1e6:.1f} MB, {size / max(1, sizes.keyframes) / 1e3:.0f} kB a keyframe",
+        "time": f"{utc(sizes.first_stamp_ns)} to {utc(sizes.last_stamp_ns)}",
+        "sessions": str(sizes.sessions),
+        "keyframes": f"{sizes.keyframes}, with {sizes.features} features; {sizes.dropped} were dropped",
+        "loops": str(sizes.loops),
+        "path": f"{sizes.path_m:.1f} m, within {sizes.extent_m[0]:.1f} x {sizes.extent_m[1]:.1f} m",
+        "parts": f"{sizes.parts}, between which no pose is known" if sizes.parts > 1 else "",
+        "rig": f"{rig.rig_hash[:12]}, baseline {rig.baseline_m:.4f} m, panoramas of {rig.cylinder.width} x "
+        f"{rig.cylinder.height} px",
+    }

@@ -269,6 +269,13 @@ def warn(line: str) -> None:
     print(f"omnid: warning: {line}", file=sys.stderr)
 
 
+def print_entries(entries: Mapping[str, object]) -> None:
+    """Print a line for each entry that is not empty: its name, padded, and its value."""
+    for name, value in entries.items():
+        if value != "":
+            print(f"{name:<12} {value}")
+
+
 def print_json(value: object, stream: TextIO | None = None) -> None:
     """Print dataclasses, mappings, sequences and numbers; a number that is not finite becomes null."""
     print(json.dumps(_plain(value), indent=2, allow_nan=False), file=stream or sys.stdout)

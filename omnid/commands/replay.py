@@ -5,9 +5,10 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 from shutil import get_terminal_size
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from omnid.commands.options import (
     CAMERAS,
@@ -23,12 +24,12 @@ from omnid.commands.options import (
     settings_of,
     warn,
 )
+from omnid.config import Config, unused_settings
+from omnid.diagnostics.run_summary import Progress, folded_entry, run_summary
 from omnid.errors import OmnidError
-
-if TYPE_CHECKING:  # the help and other commands do not load these
-    from omnid.config import Config
-    from omnid.runs.replay import ReplayOptions
-    from omnid.runs.run_result import RunResult
+from omnid.runs.replay import ReplayOptions, run_log
+from omnid.runs.run_result import RunFailedError, RunResult
+from omnid.sinks.files import on_stdout
 
 
 @command(VERBOSE, QUIET, RIG, CAMERAS, RATE, MAP, SETTINGS, JSON)
@@ -68,9 +69,6 @@ def run(args: argparse.Namespace) -> int:
       replay drive.mcap --rerun out.rrd
       replay drive.mcap --start-s 60 --seconds 20
     """
-    from omnid.config import unused_settings
-    from omnid.runs.replay import ReplayOptions
-
     config = settings_of(args)
     for warning in unused_settings(config, "replay", args.set):
         warn(warning)
@@ -110,12 +108,6 @@ class Output(NamedTuple):
 
 def replay_and_print(log: Path, config: Config, options: ReplayOptions, output: Output) -> int:
     """Replay a log, print its warnings and its summary, and return the exit code."""
-    from dataclasses import replace
-
-    from omnid.diagnostics.run_summary import Progress
-    from omnid.runs.replay import run_log
-    from omnid.runs.run_result import RunFailedError
-
     try:
         result = run_log(log, config, options if output.quiet else replace(options, progress=Progress))
     except RunFailedError as error:
@@ -130,9 +122,6 @@ def _print_result(result: RunResult, options: ReplayOptions, output: Output, *, 
 
     failed: by an error, which is reported later; of the files only those that exist are named.
     """
-    from omnid.diagnostics.run_summary import folded_entry, run_summary
-    from omnid.sinks.files import on_stdout
-
     for warning in result.warnings:
         warn(warning)
     stream = sys.stderr if on_stdout(options.files) else sys.stdout
@@ -150,15 +139,12 @@ def _print_result(result: RunResult, options: ReplayOptions, output: Output, *, 
         return
     columns = get_terminal_size().columns if stream.isatty() else 0
     print(run_summary(result.counters, result.timings.values(), columns, verbose=output.verbose), file=stream)
-    print(*folded_entry("speed", _speed(result), columns), sep="\n", file=stream)
+    speed = f"{result.counters.pairs / max(1e-3, result.elapsed_s):.1f} pairs/s, in {result.elapsed_s:.1f} s"
     files = [path for _, path in options.files] + ([result.map_file] if result.map_file else [])
-    if failed:
-        files = [path for path in files if path.exists()]
-    if files:
-        name, listed = "cut short" if failed else "written", ", ".join(map(str, files))
-        print("\n".join(folded_entry(name, listed, columns)), file=stream)
-
-
-def _speed(result: RunResult) -> str:
-    pairs = result.counters.pairs
-    return f"{pairs / max(1e-3, result.elapsed_s):.1f} pairs/s, in {result.elapsed_s:.1f} s"
+    entries = {
+        "speed": speed,
+        "cut short" if failed else "written": ", ".join(str(path) for path in files if not failed or path.exists()),
+    }
+    for name, words in entries.items():
+        if words:
+            print(*folded_entry(name, words, columns), sep="\n", file=stream)

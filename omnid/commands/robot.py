@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from omnid.commands.options import JSON, ROBOT, SETTINGS, command, print_json, settings_of
+from omnid.commands.options import JSON, ROBOT, SETTINGS, command, print_entries, print_json, settings_of
 from omnid.errors import OmnidError
 
 if TYPE_CHECKING:  # the help and other commands do not load these
@@ -223,9 +223,7 @@ def show_route(args: argparse.Namespace) -> int:
     (x, y, _), (end_x, end_y, _) = route.poses[0], route.poses[-1]
     summary |= {"length_m": round(route.length_m, 2), "taught": _time(route)}
     summary["from, to"] = f"{x:.2f} {y:.2f}, {end_x:.2f} {end_y:.2f} m in the map"
-    for key, value in summary.items():
-        if key != "created_s":
-            print(f"{key:<12} {value}")
+    print_entries(summary | {"created_s": ""})
     return 0
 
 

@@ -9,25 +9,29 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
+from drivers.errors import FrameDecodeError
+from drivers.logs.open_log import log_info
+from omnid.client import Cloud, Diagnostics, Robot
 from omnid.commands.options import ROBOT, SECONDS, SETTINGS, command, settings_of, warn
 from omnid.commands.replay import Output, replay_and_print
+from omnid.config import Config
 from omnid.engine.process import handle_stop_signals, python, python_environment
 from omnid.errors import OmnidError
+from omnid.monitor.robot_state import Inbox
+from omnid.recordings.recording import CLOUD, ODOMETRY, STATUS, RecordingReader, choose_odometry_topic, no_pose
+from omnid.runs.replay import ReplayOptions
+from omnid.sinks.files import check_outputs
+from omnid.stages.front_end import FrontEnd
+from omnid.transport.topics import MAP_POSE, SCAN
 
-if TYPE_CHECKING:  # the help and other commands do not load these
-    import rerun
-
-    from omnid.config import Config
-    from omnid.runs.replay import ReplayOptions
-    from omnid.stages.front_end import FrontEnd
-    from omnid.viewer.rerun_sink import RerunSink
+if TYPE_CHECKING:  # it imports rerun, which may be missing
+    from omnid.viewer.rerun_sink import ReplayDrawing, RerunSink
 
 MAP_EVERY_S: Final = 2.0  # between two maps of a replay
 
@@ -53,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     config, sink = settings_of(args), sink_of(args.output, args.log)
     try:
         if args.log is None:
-            _draw_robot(sink, config, args.seconds)
+            _draw_robot(sink, config, math.inf if args.seconds is None else args.seconds)
         else:
             _draw_recording(sink, args.log, args.topic, args.robot)
     finally:
@@ -73,32 +77,29 @@ def sink_of(output: Path | None, log: Path | None) -> RerunSink:
             f"this draws with rerun, which is not installed: {sys.executable} -m pip install 'rerun-sdk>=0.41'"
         )
     os.environ.setdefault("RUST_LOG", "off")  # omnid reports errors of rerun itself
-    from omnid.sinks.files import check_outputs
+    import rerun
+
     from omnid.viewer.rerun_sink import RerunSink, layout
 
-    if output is None:
-        return RerunSink(_window)
-    check_outputs([("the drawing", output)], [] if log is None else [("the log that is read", log)])
+    if output is not None:
+        check_outputs([("the drawing", output)], [] if log is None else [("the log that is read", log)])
 
-    def file() -> rerun.RecordingStream:
-        import rerun
-
+    def opened() -> Any:
         stream = rerun.RecordingStream("omnid")
+        if output is None:
+            stream.connect_grpc(_viewer(), default_blueprint=layout())  # it waits for the viewer
+            return stream
         try:
             stream.save(str(output), layout())
         except (OSError, RuntimeError) as error:
             raise OmnidError(f"{output}: cannot be written: {error}; name another file") from error
         return stream
 
-    return RerunSink(file)
+    return RerunSink(opened)
 
 
-def _window() -> rerun.RecordingStream:
-    """Start Rerun's viewer and return its stream; unlike `rerun.spawn`, it is served to this machine only."""
-    import rerun
-
-    from omnid.viewer.rerun_sink import layout
-
+def _viewer() -> str:
+    """Start Rerun's viewer and return its address; unlike `rerun.spawn`, it is served to this machine only."""
     if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY") or sys.platform == "darwin"):
         raise OmnidError(
             "there is no display for a window: use -o FILE.rrd, which `rerun --serve-web FILE.rrd` shows in a browser"
@@ -108,38 +109,15 @@ def _window() -> rerun.RecordingStream:
         port = probe.getsockname()[1]
     # The viewer would report its use to its makers; `rerun analytics enable` turns that on again.
     subprocess.run(python("-m", "rerun_cli", "analytics", "disable"), capture_output=True, env=python_environment())
-    words = (
-        "-m",
-        "rerun_cli",
-        "--bind",
-        "127.0.0.1",
-        "--port",
-        str(port),
-        "--hide-welcome-screen",
-        "--expect-data-soon",
-    )
+    words = f"-m rerun_cli --bind 127.0.0.1 --port {port} --hide-welcome-screen --expect-data-soon".split()
     # In a session of its own: Ctrl-C does not end a window.
     environment = python_environment(RUST_LOG="warn")
     subprocess.Popen(python(*words), stdin=subprocess.DEVNULL, start_new_session=True, env=environment)
-    stream = rerun.RecordingStream("omnid")
-    stream.connect_grpc(f"rerun+http://127.0.0.1:{port}/proxy", default_blueprint=layout())  # it waits for the viewer
-    return stream
+    return f"rerun+http://127.0.0.1:{port}/proxy"
 
 
 def _draw_recording(sink: RerunSink, log: Path, topic: str | None, robot: str | None) -> None:
     """Draw what is recorded. Raise OmnidError where there is no pose in it."""
-    from drivers.errors import FrameDecodeError
-    from drivers.logs.open_log import log_info
-    from omnid.recordings.recording import (
-        CLOUD,
-        ODOMETRY,
-        STATUS,
-        RecordingReader,
-        choose_odometry_topic,
-        no_pose,
-    )
-    from omnid.transport.topics import MAP_POSE, SCAN
-
     found = log_info(log)
     reader = RecordingReader(found, choose_odometry_topic(found, topic, robot))
     broken_images = 0
@@ -167,17 +145,15 @@ def draw_replay(sink: RerunSink, log: Path, config: Config, options: ReplayOptio
         sink.close()
 
 
-def _draw_robot(sink: RerunSink, config: Config, seconds: float | None) -> None:
+def _draw_robot(sink: RerunSink, config: Config, seconds: float) -> None:
     """Draw a live robot until a signal, or for a number of seconds."""
-    from drivers.errors import FrameDecodeError
-    from omnid.client import Cloud, Diagnostics, Robot
-    from omnid.monitor.robot_state import Inbox
     from omnid.viewer.rerun_sink import decoded
 
-    end_s, signals = time.monotonic() + (math.inf if seconds is None else seconds), list[int]()
-    stopping: Callable[..., None] = lambda number, _: signals.append(number)  # noqa: E731
-    with handle_stop_signals(stopping), Robot(settings=config.bus, timeout_s=2.0) as robot:
-        inbox = Inbox()
+    end_s, signals, inbox = time.monotonic() + seconds, list[int](), Inbox()
+    with (
+        handle_stop_signals(lambda number, _: signals.append(number)),
+        Robot(settings=config.bus, timeout_s=2.0) as robot,
+    ):
         robot.on_message(inbox.put)
         # What was published before.
         with robot.subscribe(Diagnostics) as reports, robot.subscribe(Cloud) as clouds:
@@ -185,8 +161,7 @@ def _draw_robot(sink: RerunSink, config: Config, seconds: float | None) -> None:
                 if newest is not None:
                     sink.draw(newest)
         while time.monotonic() < end_s and not signals:
-            message = inbox.get(0.5)
-            if message is None:
+            if (message := inbox.get(0.5)) is None:
                 continue
             with suppress(OmnidError, FrameDecodeError):  # a message of another program
                 content = decoded(message.topic, message.payload, message.attachment, message.received_ns)
