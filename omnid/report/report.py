@@ -330,10 +330,11 @@ def _uncertainty(run: RecordedRun) -> list[str]:
     (t_s, tracked), (_, inliers) = (run.series(ODOMETRY, key) for key in (Key.TRACKED, Key.INLIERS))
     if not len(tracked):
         missing.append(note("The log holds no numbers of landmarks."))
-    elif len(tracked) == len(inliers):
+    elif len(tracked) > 2 and len(tracked) == len(inliers):
         curves = [Curve("tracked", t_s, tracked), Curve("inliers of the pose", t_s, inliers)]
-        rate = "report" if run.reports else "change of the state"
-        figures.append(chart("Landmarks", curves, note=f"One value per {rate}, not per pose."))
+        figures.append(chart("Landmarks", curves, note="One value per report, not per pose."))
+    else:
+        missing.append(note(f"Landmarks at the last report: {tracked[-1]:.0f}."))
     return ["<h2>Uncertainty</h2>", grid(figures), *missing]
 
 
@@ -358,9 +359,10 @@ def _in_map(run: RecordedRun) -> list[str]:
 
 
 def _counters(run: RecordedRun, name: str) -> list[str]:
-    """Return the newest values of a part as a table; nothing where there are none."""
-    rows = [(escape(key.replace("_", " ")), escape(value)) for key, value in run.values(name).items()]
-    return [facts(rows)] if rows else []
+    """Return the newest values of a part that are not 0 as a table; nothing where it has no values."""
+    values = {key: value for key, value in run.values(name).items() if value != "0"}
+    rows = [(escape(key.replace("_", " ")), escape(value)) for key, value in values.items()]
+    return [facts(rows), "<small>All other counters are 0.</small>"] if run.values(name) else []
 
 
 def _timing(run: RecordedRun) -> list[str]:
