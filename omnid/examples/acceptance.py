@@ -10,6 +10,7 @@ Exit code 1: a length or the end of a round is off by more than 0.5 % and 10 mm,
 Exit code 2: there is nothing to judge, and one line says why.
 """
 
+import math
 import sys
 from itertools import pairwise
 from pathlib import Path
@@ -34,7 +35,7 @@ def stands(stamps_s: Array, T: Array) -> list[int]:
     """Return the indices of the middle poses of all stands; T (N, 4, 4): T_odom_base."""
     middles, first, yaw_rad = [], 0, np.unwrap(se3.yaw(T))
     while first < len(T):
-        moved = np.linalg.norm(T[first:, :3, 3] - T[first, :3, 3], axis=1) > STAND_M
+        moved = np.linalg.norm((T[first:] - T[first])[:, :, -1], axis=1) > STAND_M
         moved |= np.abs(yaw_rad[first:] - yaw_rad[first]) > STAND_RAD
         end = first + int(moved.argmax()) if moved.any() else len(T)
         if is_stand := stamps_s[end - 1] - stamps_s[first] >= STAND_S:
@@ -43,11 +44,11 @@ def stands(stamps_s: Array, T: Array) -> list[int]:
     return middles
 
 
-def visits(T: Array, rests: list[int], distance_m: float) -> list[int]:
+def visits(xyz: Array, rests: list[int], distance_m: float) -> list[int]:
     """Return the poses on A, B, A, ...: of several stands on one mark the last one of the first A, else the first."""
     found: list[int] = []
     for pose in rests:
-        from_a_m = np.linalg.norm(T[pose, :3, 3] - T[rests[0], :3, 3])
+        from_a_m = math.dist(xyz[pose], xyz[rests[0]])
         if min(from_a_m, abs(from_a_m - distance_m)) > 0.2 * distance_m:
             continue  # a pause on the way
         is_a = from_a_m < distance_m / 2
@@ -60,17 +61,18 @@ def visits(T: Array, rests: list[int], distance_m: float) -> list[int]:
 
 def judge(stamps_s: Array, T: Array, distance_m: float) -> int:
     """Print the errors of each round; return 1 where one is not accepted."""
-    marks = visits(T, stands(stamps_s, T), distance_m)
+    xyz = T[:, :-1, -1]
+    marks = visits(xyz, stands(stamps_s, T), distance_m)
     if len(marks) < 3:
         found = f"on B {distance_m:g} m away, and on A; found {len(marks)}"
         raise OmnidError(f"expected stands of {STAND_S:g} s on A, {found}")
-    legs_m = np.array([np.linalg.norm(T[b, :3, 3] - T[a, :3, 3]) for a, b in pairwise(marks)])
+    legs_m = np.array([math.dist(xyz[a], xyz[b]) for a, b in pairwise(marks)])
     for leg, length_m in enumerate(legs_m):
         print(f"{'AB'[leg % 2]} to {'BA'[leg % 2]} {length_m:.4f} m, {length_m / distance_m - 1:+.2%}")
     accepted = bool((abs(legs_m - distance_m) <= ACCEPTED * distance_m + PLACING_M).all())
     for start, end in zip(marks[:-2:2], marks[2::2], strict=False):
-        way_m = np.linalg.norm(np.diff(T[start : end + 1, :3, 3], axis=0), axis=1).sum()
-        off_m = np.linalg.norm(T[end, :3, 3] - T[start, :3, 3])
+        way_m = np.linalg.norm(np.diff(xyz[start : end + 1], axis=0), axis=1).sum()
+        off_m = math.dist(xyz[end], xyz[start])
         print(f"round of {way_m:.2f} m: ends {1e3 * off_m:.0f} mm from its start, {off_m / way_m:.2%}")
         accepted &= bool(off_m <= ACCEPTED * way_m + PLACING_M)
     print("accepted" if accepted else "not accepted")

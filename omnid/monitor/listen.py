@@ -13,7 +13,7 @@ import numpy as np
 
 from omnid.client import Diagnostics, Robot
 from omnid.engine.process import handle_stop_signals
-from omnid.monitor.robot_state import Inbox, RobotState, importance
+from omnid.monitor.robot_state import LEVELS, Inbox, RobotState, importance
 from omnid.plain_text import plain
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.codec import Pose
@@ -23,7 +23,6 @@ from omnid.transport.status_names import short_name
 SHOW_PERIOD_S: Final = 1.0
 POLL_S: Final = 0.5  # between two checks for the end, and two attempts to connect
 CLEAR: Final = "\x1b[H\x1b[J"
-_LEVELS: Final = ("", "warning", "ERROR", "stale")
 
 
 def listen(bus: BusConfig, seconds: float | None) -> int:
@@ -113,7 +112,9 @@ def status_table(robot: str, state: RobotState, dropped: int) -> Iterator[str]:
         yield f"  {_latencies(state)}  missed {state.missed}  unreadable {state.broken}  not shown here {dropped}"
     for status in sorted(state.statuses.values(), key=importance):
         values = "  ".join(f"{key} {value}" for key, value in status.values.items())
-        yield plain(f"  {_LEVELS[status.level % 4]:7s} {short_name(status.name):16s} {status.message}  {values}")
+        yield plain(
+            f"  {LEVELS[status.level % len(LEVELS)]:7s} {short_name(status.name):16s} {status.message}  {values}"
+        )
 
 
 def fitted(lines: Iterable[str], columns: int, rows: int) -> list[str]:

@@ -16,6 +16,7 @@ from omnid.plain_text import plain
 from omnid.transport.codec import Diagnostics, DiagnosticStatus, Pose, decode_diagnostics, decode_pose
 from omnid.transport.status_names import SIMULATION, STAGE_PREFIX, Key
 
+LEVELS: Final = ("", "warning", "ERROR", "stale")  # of a status, by its number
 NO_POSE_S: Final = 2.0  # Without a pose for this time, state and rate of the last poses are no longer shown.
 _INBOX_DEPTH: Final = 2000
 _MAX_STATUSES: Final = 100
@@ -154,4 +155,4 @@ class RobotState:
 
 def importance(status: DiagnosticStatus) -> tuple[int, bool, str]:
     """Return a key by which entries are sorted: the worst first, stages last, then by name."""
-    return -(status.level % 4), status.name.startswith(STAGE_PREFIX), status.name
+    return -(status.level % len(LEVELS)), status.name.startswith(STAGE_PREFIX), status.name

@@ -13,11 +13,13 @@ import ipaddress
 import os
 import re
 import secrets
+import stat
 from collections import Counter
 from collections.abc import Awaitable, Callable, MutableMapping
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
+from http import HTTPStatus
 from pathlib import Path
 from typing import Any, Final
 
@@ -45,14 +47,14 @@ _HEADERS: Final = (
     (b"cross-origin-resource-policy", b"same-origin"),
     (b"cache-control", b"no-store"),
 )
-# Status and text of the answer to a request that is refused, by the reason that is counted.
+# Text of the answer to a request that is refused, by the reason that is counted.
 REFUSALS: Final = {
-    "unknown host": (403, "this server is not known by that name: start omnid web with --host NAME, or its address"),
-    "cross-site": (403, "requests of other sites are refused"),
-    "no origin": (403, "a change needs the header Origin of this page, or Authorization: Bearer TOKEN"),
-    "no token": (401, "a token is needed: open the address that `omnid web` printed"),
-    "wrong token": (401, "the token is not that of this server"),
-    "stop only": (403, "this token may see and stop, nothing else"),
+    "unknown host": "this server is not known by that name: start omnid web with --host NAME, or its address",
+    "cross-site": "requests of other sites are refused",
+    "no origin": "a change needs the header Origin of this page, or Authorization: Bearer TOKEN",
+    "no token": "a token is needed: open the address that `omnid web` printed",
+    "wrong token": "the token is not that of this server",
+    "stop only": "this token may see and stop, nothing else",
 }
 
 Scope = MutableMapping[str, Any]
@@ -85,7 +87,7 @@ def token_of(path: Path | None, option: str = "--token-file") -> str:
         mode, text = path.stat().st_mode, path.read_text("ascii", "replace").strip()
     except OSError as error:
         raise OmnidError(f"{option} {path}: cannot be used: {error.strerror}; name another file") from error
-    if mode & 0o007:
+    if mode & stat.S_IRWXO:
         raise OmnidError(f"{option} {path}: every user of this machine may read or write it: chmod 600 {path}")
     if not _TOKEN.fullmatch(text):
         raise OmnidError(
@@ -195,6 +197,6 @@ class Guard:
         app, reason = self._app, self._access.refusal(HTTPConnection(scope))
         if reason:
             self.refused[reason] += 1
-            status, text = REFUSALS[reason]
-            app = PlainTextResponse(f"omnid web: {text}\n", status, {"connection": "close"})
+            status = HTTPStatus.UNAUTHORIZED if reason.endswith(" token") else HTTPStatus.FORBIDDEN
+            app = PlainTextResponse(f"omnid web: {REFUSALS[reason]}\n", status, {"connection": "close"})
         await app(scope, receive, send_protected)

@@ -16,6 +16,7 @@ from bisect import bisect
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from http import HTTPStatus
 from typing import Any, Final
 
 from starlette.requests import Request
@@ -124,7 +125,9 @@ class RobotFeed:
         """Answer a browser as soon as there are news: `seen` is the version of its last, `panorama` 1 asks for it."""
         seen = request.query_params.get("seen", "")
         if not (seen.isascii() and seen.isdigit() and len(seen) < 16):
-            return PlainTextResponse("omnid web: the page names the version of the news that it has seen\n", 400)
+            return PlainTextResponse(
+                "omnid web: the page names the version of the news that it has seen\n", HTTPStatus.BAD_REQUEST
+            )
         if request.query_params.get("panorama") == "1":
             self._wanted_until_s = time.monotonic() + WANTED_S
         if int(seen) == self.version:
@@ -137,7 +140,7 @@ class RobotFeed:
         """Return the cells of the map, a byte each as `map_cells` makes them, or the newest panorama."""
         kind = request.path_params["kind"]
         if kind not in self._images:
-            return PlainTextResponse("omnid web: there is none\n", 404)
+            return PlainTextResponse("omnid web: there is none\n", HTTPStatus.NOT_FOUND)
         is_map = kind == "map"
         headers = {"content-encoding": "deflate"} if is_map else {}
         media_type = "application/octet-stream" if is_map else "image/jpeg"

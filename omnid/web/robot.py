@@ -15,6 +15,7 @@ import time
 from collections.abc import Awaitable, Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from http import HTTPStatus
 from typing import Final
 
 from starlette.requests import Request
@@ -222,7 +223,7 @@ def _command_route(path: str, act: Callable[[Request], Awaitable[Answer]]) -> Ro
             answer = await act(request)
         except OmnidError as error:
             answer = Answer(False, str(error))
-        return JSONResponse(answer._asdict(), 200 if answer.done else 409)
+        return JSONResponse(answer._asdict(), HTTPStatus.OK if answer.done else HTTPStatus.CONFLICT)
 
     return Route(path, respond, methods=["POST"])
 

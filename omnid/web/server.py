@@ -13,6 +13,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
+from http import HTTPStatus
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import parse_qs
@@ -109,29 +110,29 @@ def site(page: RobotPage, access: Access, *, secure: bool) -> Guard:
             return FileResponse(STATIC / "index.html")
         if is_of_other_site(request):
             return HTMLResponse(_AGAIN)
-        return FileResponse(STATIC / "login.html", status_code=401)
+        return FileResponse(STATIC / "login.html", status_code=HTTPStatus.UNAUTHORIZED)
 
     async def login(request: Request) -> Response:
         """Let a browser in that sends the token in a form."""
         try:
             fields = parse_qs(await text_of(request), max_num_fields=4)
         except (OmnidError, ValueError):  # too long, too slow, or more fields
-            return PlainTextResponse("omnid web: this is no token\n", 413)
+            return PlainTextResponse("omnid web: this is no token\n", HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
         return let_in(fields.get("token", [""])[0])
 
     def let_in(token: str) -> Response:
         role = access.role_of(token)
         if role is None:
             guard.refused["wrong token"] += 1
-            return FileResponse(STATIC / "login.html", status_code=401)
-        response = RedirectResponse("/", 303)
+            return FileResponse(STATIC / "login.html", status_code=HTTPStatus.UNAUTHORIZED)
+        response = RedirectResponse("/", HTTPStatus.SEE_OTHER)
         value = access.new_cookie(role)
         response.set_cookie(access.cookie, value, COOKIE_S, httponly=True, samesite="strict", secure=secure)
         return response
 
     async def logout(_: Request) -> Response:
         """Let the browser forget the cookie."""
-        response = RedirectResponse("/", 303)
+        response = RedirectResponse("/", HTTPStatus.SEE_OTHER)
         response.delete_cookie(access.cookie, httponly=True, samesite="strict", secure=secure)
         return response
 

@@ -6,14 +6,15 @@ import math
 import time
 import zlib
 from collections.abc import Iterable, Mapping
+from itertools import islice
 from typing import Any, Final
 
 import numpy as np
 
 from calib import se3
-from omnid.monitor.robot_state import RobotState, importance
+from omnid.monitor.robot_state import LEVELS, RobotState, importance
 from omnid.plain_text import plain
-from omnid.transport.codec import OK, Map, Pose, PoseInMap, Scan
+from omnid.transport.codec import Map, Pose, PoseInMap, Scan
 from omnid.transport.status_names import PLACES, WHEELS, Key, NavigationReport, short_name
 
 PATH_FRAME: Final = "odom"
@@ -41,25 +42,39 @@ def state_news(robot: str, state: RobotState, link: str, extra: Mapping[str, Any
 
     link: why there is no connection to the robot; empty with one. extra: further entries.
     """
-    return {
-        "robot": plain(robot),
-        "link": plain(link),
+    quantiles = (0.5, 0.99)
+    found = {
+        "robot": robot,
+        "link": link,
         "alive": state.alive,
         "state": state.state,
         "fresh": state.rate_hz > 0,
-        "rate_hz": finite(state.rate_hz),
+        "rate_hz": state.rate_hz,
         "missed": state.missed,
         "broken": state.broken,
         "pose": None if state.pose is None else _pose(state.pose),
-        "age_ms": [finite(1e3 * state.age.p(q)) for q in (0.5, 0.99)],
-        "network_ms": [finite(1e3 * state.network.p(q)) for q in (0.5, 0.99)],
+        "age_ms": [1e3 * state.age.p(q) for q in quantiles],
+        "network_ms": [1e3 * state.network.p(q) for q in quantiles],
         "wheels": _wheels(state),
-        "in_map": None if PLACES not in state.statuses else plain(state.statuses[PLACES].message),
-        "pace": plain(state.real_time_factor),
+        "in_map": None if PLACES not in state.statuses else state.statuses[PLACES].message,
+        "pace": state.real_time_factor,
         "warnings": _warnings(state, link),
-        "server_ms": server_ms(),
-        **extra,
     }
+    return {**browsable(found), "server_ms": server_ms(), **extra}
+
+
+def browsable(value: Any) -> Any:
+    """Return a value as browsers are sent it: text is plain, a number has 6 digits, None stands for what JSON lacks."""
+    match value:
+        case dict():
+            return {key: browsable(inner) for key, inner in value.items()}
+        case list():
+            return [browsable(inner) for inner in value]
+        case str():
+            return plain(value)
+        case float():
+            return float(f"{value:.6g}") if math.isfinite(value) else None
+    return value
 
 
 def map_in_odom(in_map: PoseInMap, poses: Iterable[Pose]) -> list[float | None] | None:
@@ -68,7 +83,8 @@ def map_in_odom(in_map: PoseInMap, poses: Iterable[Pose]) -> list[float | None] 
     if pose is None:
         return None
     T_odom_map = pose.T_odom_base @ se3.inverse(in_map.T_map_base)
-    return [finite(float(T_odom_map[0, 3])), finite(float(T_odom_map[1, 3])), finite(float(se3.yaw(T_odom_map)))]
+    found: list[float | None] = browsable([*T_odom_map[:2, -1].tolist(), float(se3.yaw(T_odom_map))])
+    return found
 
 
 def parts_news(state: RobotState) -> list[dict[str, Any]]:
@@ -76,11 +92,11 @@ def parts_news(state: RobotState) -> list[dict[str, Any]]:
     return [
         {
             "name": plain(short_name(part.name)),
-            "level": part.level % 4,
+            "level": part.level % len(LEVELS),
             "message": plain(part.message),
             "values": [
-                [plain(key)[:LONGEST_VALUE], plain(value)[:LONGEST_VALUE]]
-                for key, value in list(part.values.items())[:MOST_VALUES]
+                [plain(key, LONGEST_VALUE), plain(value, LONGEST_VALUE)]
+                for key, value in islice(part.values.items(), MOST_VALUES)
             ],
         }
         for part in sorted(state.statuses.values(), key=importance)
@@ -128,23 +144,17 @@ def scan_news(scan: Scan, poses: Iterable[Pose]) -> dict[str, Any]:
     nearest, angles = int(ranges_m.argmin()), azimuths_rad + place.yaw_rad
     points = np.column_stack([place.x_m + ranges_m * np.cos(angles), place.y_m + ranges_m * np.sin(angles)])
     turn_deg = math.degrees(math.remainder(float(azimuths_rad[nearest]), 2 * math.pi))
-    return {
-        "points": [[finite(x), finite(y)] for x, y in points.round(3)],
-        "nearest": [finite(float(ranges_m[nearest])), finite(turn_deg)],
+    found: dict[str, Any] = {
+        "points": points.round(3).tolist(),
+        "nearest": [float(ranges_m[nearest]), turn_deg],
     }
+    return dict(browsable(found))
 
 
 def navigation_news(report: NavigationReport) -> dict[str, Any]:
     """Return what is driven or taught, and what became of the newest request."""
-    return {
-        "state": plain(report.state),
-        "reason": plain(report.reason),
-        "task": plain(report.task),
-        "left_m": finite(report.left_m),
-        "teaching": plain(report.teaching),
-        "taught_m": finite(report.taught_m),
-        "refusal": plain(report.refusal),
-    }
+    names = ("state", "reason", "task", "left_m", "teaching", "taught_m", "refusal")
+    return {name: browsable(getattr(report, name)) for name in names}
 
 
 def _reduced(cells: np.ndarray[Any, np.dtype[np.uint8]], step: int) -> np.ndarray[Any, np.dtype[np.uint8]]:
@@ -162,17 +172,16 @@ def _pose(pose: Pose) -> dict[str, Any]:
     sigma = np.sqrt(np.maximum(0.0, pose.covariance.diagonal()))
     found = pose.attachment
     return {
-        "x_m": finite(pose.x_m),
-        "y_m": finite(pose.y_m),
-        "z_m": finite(pose.z_m),
-        "yaw_rad": finite(pose.yaw_rad),
-        "speed_mps": finite(float(pose.velocity[0])),
-        "sigma_mm": finite(1e3 * float(sigma[:3].max())),
-        "sigma_deg": finite(math.degrees(sigma[3:].max())),
+        "x_m": pose.x_m,
+        "y_m": pose.y_m,
+        "z_m": pose.z_m,
+        "yaw_rad": pose.yaw_rad,
+        "speed_mps": float(pose.velocity[0]),
+        "sigma_mm": 1e3 * float(sigma[:3].max()),
+        "sigma_deg": math.degrees(sigma[3:].max()),
         "inliers": found.inliers,
         "tracked": found.tracked,
         "resets": found.resets,
-        "sent_ms": found.sent_ns * 1e-6 if 0 < found.sent_ns < 2**63 else None,
     }
 
 
@@ -183,9 +192,9 @@ def _wheels(state: RobotState) -> dict[str, Any] | None:
         return None
     return {
         "armed": status.values.get(Key.ARMED) == "1",
-        "message": plain(status.message),
-        "level": status.level % 4,
-        "source": plain(status.values.get(Key.SOURCE, "")),
+        "message": status.message,
+        "level": status.level % len(LEVELS),
+        "source": status.values.get(Key.SOURCE, ""),
     }
 
 
@@ -193,20 +202,10 @@ def _warnings(state: RobotState, link: str) -> list[dict[str, Any]]:
     """Return what is wrong, the worst first, each with its remedy."""
     found = []
     if link:
-        found.append(_warning(2, "connection", link, "is the robot on, and on this network? check --connect"))
+        found.append((2, "connection", link, "is the robot on, and on this network? check --connect"))
     elif state.alive is False:
-        found.append(_warning(2, "robot", "its daemon has ended or cannot be reached", _ROBOT_GONE))
-    parts = sorted((part for part in state.statuses.values() if part.level % 4 != OK), key=importance)
-    found += [
-        _warning(part.level % 4, short_name(part.name), part.message, part.values.get(Key.REMEDY, "")) for part in parts
-    ]
-    return found
-
-
-def _warning(level: int, name: str, message: str, remedy: str) -> dict[str, Any]:
-    return {"level": level, "name": plain(name), "message": plain(message), "remedy": plain(remedy)}
-
-
-def finite(value: float) -> float | None:
-    """Return the number in 6 digits; None for one that JSON does not have."""
-    return float(f"{value:.6g}") if math.isfinite(value) else None
+        found.append((2, "robot", "its daemon has ended or cannot be reached", _ROBOT_GONE))
+    for part in sorted(state.statuses.values(), key=importance):
+        if level := part.level % len(LEVELS):
+            found.append((level, short_name(part.name), part.message, part.values.get(Key.REMEDY, "")))
+    return [dict(zip(("level", "name", "message", "remedy"), row, strict=True)) for row in found]
