@@ -37,14 +37,11 @@ COMMANDS: Final[Mapping[str, Entry]] = MappingProxyType(
         "replay": Entry("replay", "run a recorded log through the stages of the daemon"),
         "demo": Entry("daemon:demo", "replay a sample in real time: files, bus and a simulated motor"),
         "eval": Entry("evaluate", "compare a trajectory with the truth, both in the TUM format"),
-        "calibrate live": Entry("calibrate_live", "images of a board, with its coverage so far and what is missing"),
-        "calibrate rig": Entry("calibrate_rig", "a rig.toml from images of a board that both cameras saw at once"),
-        "calibrate drive": Entry(
-            "calibrate_drive", "what drives say about a rig, without a board, and the rig that they make"
-        ),
+        "calibrate live": Entry("calibrate_board:live", "images of a board, with its coverage and what is missing"),
+        "calibrate rig": Entry("calibrate_board:rig", "a rig.toml from images of a board that both cameras saw"),
+        "calibrate drive": Entry("calibrate_drive", "what drives say about a rig, and the rig that they make"),
         "calibrate import": Entry(
-            "calibrate_import",
-            "a rig.toml from a Kalibr file, from two OCamCalib files, or of two 360-degree cameras",
+            "calibrate_import", "a rig.toml from files of other programs, or of two 360-degree cameras"
         ),
         "cameras": Entry("machine:show_cameras", "list cameras and the udev rule to copy, or show what they see"),
         "arm": Entry("robot:arm", "let the wheels turn, after the robot's start, a stop or a fault"),

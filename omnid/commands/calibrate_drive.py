@@ -8,8 +8,7 @@ from contextlib import closing
 from typing import TYPE_CHECKING
 
 from calib.rig_file import read_rig, write_rig
-from omnid.commands.calibrate_options import height_of, with_height
-from omnid.commands.options import HEIGHT, LOG_CAMERAS, command, log_cameras
+from omnid.commands.options import HEIGHT, LOG_CAMERAS, command, height_of, log_cameras
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
 
@@ -140,7 +139,7 @@ def _at_height(args: argparse.Namespace, rig: Rig) -> tuple[Rig, str]:
     from omnid.calibration.height import calibrate_height
 
     if args.height_m is not None:
-        return with_height(rig, args), ""
+        return rig.at_height(args.height_m), ""
     is_wanted = args.ruler_m is not None or "height" in args.only
     if not is_wanted and (args.only or rig.height_m() is not None):
         return rig, ""

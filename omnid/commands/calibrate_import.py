@@ -27,8 +27,7 @@ from calib.rig_file import read_rig, write_rig
 from calib.text_files import MAX_JSON_BYTES, load_mapping
 from calib.typed_toml import shown
 from calib.validation import read_bytes
-from omnid.commands.calibrate_options import height_of, with_height
-from omnid.commands.options import HEIGHT, command, warn
+from omnid.commands.options import HEIGHT, command, height_of, warn
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
 
@@ -59,7 +58,9 @@ def run(args: argparse.Namespace) -> int:
       calibrate import --equirectangular 3840x1920 --baseline 0.2 -o rig.toml
     """
     check_outputs([("--output", args.output)], [("a file that is read", path) for path in _read_files(args)])
-    rig = with_height(_imported(args), args)
+    rig = _imported(args)
+    if args.height_m is not None:
+        rig = rig.at_height(args.height_m)
     for side, mounted in (("lower", rig.lower), ("upper", rig.upper)):
         if np.isnan(field_of_view(mounted.camera, mounted.visible)[0]):
             width, height = mounted.camera.size

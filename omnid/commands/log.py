@@ -7,7 +7,7 @@ import sys
 
 from drivers.errors import DriverError
 from drivers.logs.open_log import LogInfo, LogState, log_info
-from omnid.commands.options import JSON, command, print_entries, print_json
+from omnid.commands.options import JSON, RATE, command, print_entries, print_json
 from omnid.plain_text import plain
 from omnid.utc import utc
 
@@ -16,7 +16,7 @@ _MEND = "; for other programs: `mcap recover`, of mcap's own command line"
 MAX_LINE = 5000  # Most characters of a line: it may contain the path of a file.
 
 
-@command(JSON)
+@command(RATE, JSON)
 def info(args: argparse.Namespace) -> int:
     """Print topics, types, counts, times, attachments, and whether the log is whole.
 
@@ -26,11 +26,12 @@ def info(args: argparse.Namespace) -> int:
 
     examples:
       log info recordings/*.mcap
+      log info images --rate 20
     """
     code, logs = 0, []
     for number, path in enumerate(args.logs):
         try:
-            found = log_info(path, examine=True)
+            found = log_info(path, examine=True, rate_hz=args.rate or 0.0)
         except DriverError as error:
             print(f"omnid: {plain(str(error), MAX_LINE)}", file=sys.stderr)
             code = 2
@@ -53,21 +54,27 @@ def _show(found: LogInfo) -> None:
     state = found.state.value + states.get(found.state, "")
     if found.state in states and found.path.suffix in (".mcap", ".part"):
         state += _MEND
-    duration_s, time = 0.0, ""
+    time = ""
     if found.span_ns is not None:
         first_ns, last_ns = found.span_ns
-        duration_s = max(0.0, (last_ns - first_ns) / 1e9)
-        time = f"{utc(first_ns)} to {utc(last_ns)}, {duration_s:.3f} s"
+        time = f"{utc(first_ns)} to {utc(last_ns)}, {(last_ns - first_ns) / 1e9:.3f} s"
     listed = ", ".join(f"{name} ({_bytes(size)})" for name, size in found.attachments.items())
     entries = {"log": str(found.path), "size": _bytes(found.size_bytes), "state": state, "time": time}
     entries |= {"messages": str(found.messages), "attachments": listed or "none"}
     print_entries({name: plain(text, MAX_LINE) for name, text in entries.items()})
-    rows = [(plain(name, MAX_LINE), plain(kind) or "-", count) for name, (kind, count) in found.topics.items()]
+    rows = [
+        (
+            plain(name, MAX_LINE),
+            plain(kind) or "-",
+            count,
+            f"{found.rates_hz[name]:.2f}" if name in found.rates_hz else "-",
+        )
+        for name, (kind, count) in found.topics.items()
+    ]
     if rows:
         wide, wide_kind = (min(MAX_COLUMN, max(map(len, column))) for column in list(zip(*rows, strict=True))[:2])
         print(f"\n{'topic':<{wide}}  {'type':<{wide_kind}}{'messages':>10}{'Hz':>9}")
-    for name, kind, count in rows:
-        rate = f"{(count - 1) / duration_s:.2f}" if count > 1 and duration_s > 0 else "-"
+    for name, kind, count, rate in rows:
         print(f"{name:<{wide}}  {kind:<{wide_kind}}{count:>10}{rate:>9}")
 
 

@@ -185,7 +185,7 @@ def test_motor(args: argparse.Namespace) -> int:
 
     --motor PORT [motor.port]  serial port of the controller, or 'simulated'; default: motor.port of the settings
     --speed MPS=0.1            of a wheel, m/s
-    --turns TURNS=3            of the wheels for the scale, 0: do not test it
+    --turns TURNS=3 0..1000    of the wheels for the scale, 0: do not test it
 
     examples:
       motor test --motor /dev/omnid/motor --config /etc/omnid/omnid.toml

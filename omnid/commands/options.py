@@ -39,6 +39,7 @@ from typing import TYPE_CHECKING, Any, Final, TextIO, TypeAlias
 from omnid.errors import OmnidError
 
 if TYPE_CHECKING:  # the help and other commands do not load these
+    from calib.rig import Rig
     from drivers.cameras.v4l2_camera import V4l2Camera
     from drivers.frame import Camera
     from drivers.logs.log_reader import LogCameras
@@ -236,6 +237,13 @@ HEIGHT: Final = """
 --height-m M 0.1..10  height of the lower viewpoint (the focus of the lower mirror) above the floor; without it `omnid
                       calibrate drive` finds it by the floor
 """
+
+
+def height_of(rig: Rig) -> str:
+    """Return the height that a rig states, in words."""
+    if (height_m := rig.height_m()) is None:
+        return "no height of the cameras (--height-m, or `omnid calibrate drive LOG --only height`)"
+    return f"cameras {height_m:.3f} m above the floor"
 
 
 def log_cameras(args: argparse.Namespace) -> LogCameras:

@@ -33,7 +33,7 @@ FIRST_SHARE: Final = 0.4  # Share of the highest speeds at the start.
 SHARE_STEP: Final = 0.1
 READ_BYTES: Final = 256
 HELP: Final = "arrows: drive  space: stop  a: arm  +/-: speed  q: quit"
-_SIDES: Final = {b"A": (1, 0), b"B": (-1, 0), b"D": (0, 1), b"C": (0, -1)}
+_SIDES: Final = {b"A": (0, 1), b"B": (0, -1), b"D": (1, 1), b"C": (1, -1)}  # axis of the stick, and its side
 # A terminal sends ESC [ A or, in its application mode, ESC O A.
 ARROWS: Final = {begin + letter: side for letter, side in _SIDES.items() for begin in (b"\x1b[", b"\x1bO")}
 # One key: a whole escape sequence (ECMA-48, 5.4, without intermediate bytes, of which the space is one), or a byte.
@@ -60,9 +60,18 @@ class Stick:
         self._begun = begun[0] if begun else b""
         for key in _KEY.findall(data, 0, len(data) - len(self._begun)):
             if key in ARROWS:
-                self._push(*ARROWS[key], now_s)
-            else:
-                self._letter(key)
+                axis, side = ARROWS[key]
+                self._axes[axis] = side, now_s
+            elif key in (b"+", b"=", b"-"):
+                step = -SHARE_STEP if key == b"-" else SHARE_STEP
+                self.share = min(1.0, max(SHARE_STEP, self.share + step))
+            elif key in b"aA":
+                self.arm_asked = True
+            elif key in b"qQ\x04":
+                self.quit = True
+            else:  # space, and any key that means nothing: in doubt the wheels stop
+                self.stop_asked |= key == b" "
+                self._release()
         if begun:
             self._release()  # It may be the key Esc, which means nothing.
 
@@ -75,27 +84,8 @@ class Stick:
         """Return True if there is a motion, or was one until a moment ago."""
         return any(now_s - pressed_s <= HOLD_S + REST_S for _, pressed_s in self._axes)
 
-    def _push(self, forward: int, turn: int, now_s: float) -> None:
-        if forward:
-            self._axes[0] = forward, now_s
-        else:
-            self._axes[1] = turn, now_s
-
     def _release(self) -> None:
         self._axes = [(0, pressed_s) for _, pressed_s in self._axes]
-
-    def _letter(self, letter: bytes) -> None:
-        if letter in (b"+", b"="):
-            self.share = min(1.0, self.share + SHARE_STEP)
-        elif letter == b"-":
-            self.share = max(SHARE_STEP, self.share - SHARE_STEP)
-        elif letter in (b"a", b"A"):
-            self.arm_asked = True
-        elif letter in (b"q", b"Q", b"\x04"):
-            self.quit = True
-        else:  # space, and any key that means nothing: in doubt the wheels stop
-            self.stop_asked = self.stop_asked or letter == b" "
-            self._release()
 
 
 def teleoperate(bus: BusConfig) -> int:

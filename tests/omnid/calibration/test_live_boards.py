@@ -13,7 +13,7 @@ import pytest
 from calib.boards.board import BoardView
 from calib.models.camera import Mask
 from omnid.calibration.live_boards import HOURS, LiveBoards, PairOutcome, status
-from tests.omnid.commands.test_calibrate_rig import BOARD, render_pairs, rig_of
+from tests.omnid.commands.test_calibrate_board import BOARD, render_pairs, rig_of
 
 PAIRS = 2  # of different places
 

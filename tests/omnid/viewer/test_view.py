@@ -1,19 +1,24 @@
-"""`omnid view` and `omnid replay --rerun`: drawings of logs and of a robot, read back with rerun's own reader."""
+"""`omnid view` and `omnid replay --rerun`, read back with rerun's own reader; the layout for Foxglove."""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import os
+import re
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from importlib.resources import files
 from itertools import count
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from calib import se3
 from drivers.frame import Frame
@@ -24,11 +29,59 @@ from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import DiagnosticStatus, PoseAttachment, features_to_bytes
 from omnid.transport.sensor_codec import image_cdr
 from omnid.transport.status_names import ODOMETRY, stage_name
+from omnid.transport.topics import PUBLISHED, ros_name
 from tests.conftest import PAIRS
 from tests.omnid.transport.bus_fixtures import DEADLINE_S, free_endpoint
-from tests.omnid.viewer.rrd import entities, need_rerun, positions, rows, verified
 from tests.replay.command import Command
 from tests.simulation import build, write_log
+
+WITHOUT = "needs rerun: pip install 'rerun-sdk>=0.41'"
+
+
+class Row(NamedTuple):
+    """A value of an entity and its stamp."""
+
+    stamp_ns: int
+    value: Any  # a list, one element per instance
+
+
+def need_rerun() -> None:
+    """Skip the calling test where rerun is not installed."""
+    pytest.importorskip("rerun", reason=WITHOUT)
+
+
+def rows(path: Path, entity: str, component: str) -> list[Row]:
+    """Return all values of a component in the order of their stamps, without static ones."""
+    from rerun.chunk import RrdReader
+
+    found = []
+    for chunk in RrdReader(str(path)).stream():
+        if chunk.entity_path == entity and not chunk.is_static:
+            table = chunk.to_record_batch()
+            if component in table.schema.names:
+                stamps_ns = table.column("stamp").cast("int64").to_pylist()
+                found += map(Row, stamps_ns, table.column(component).to_pylist())
+    return sorted(found, key=lambda row: row.stamp_ns)
+
+
+def entities(path: Path) -> set[str]:
+    """Return the paths of all entities."""
+    from rerun.chunk import RrdReader
+
+    return {chunk.entity_path for chunk in RrdReader(str(path)).stream()}
+
+
+def positions(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return stamps [ns] and positions (N, 3) [m] of the robot."""
+    found = rows(path, "/odom/base_link", "Transform3D:translation")
+    return np.array([row.stamp_ns for row in found]), np.array([row.value[0] for row in found])
+
+
+def verified(path: Path) -> bool:
+    """True if rerun's own program finds no fault in the file."""
+    words = [sys.executable, "-c", "import sys; from rerun_cli.__main__ import main; sys.exit(main())"]
+    return subprocess.run([*words, "rrd", "verify", str(path)], capture_output=True, check=False).returncode == 0
+
 
 START_NS = 10**18
 pytestmark = pytest.mark.usefixtures("default_signals")
@@ -199,3 +252,16 @@ def test_without_a_display_the_way_to_a_browser_is_named(tmp_path: Path) -> None
     with viewing(tmp_path, made(tmp_path / "made.mcap")) as it:
         _, err = it.communicate(timeout=DEADLINE_S)
     assert it.returncode == 2 and "rerun --serve-web" in err and "Traceback" not in err
+
+
+def panels(node: Any) -> list[str]:
+    """Return the panels of a layout tree."""
+    return [node] if isinstance(node, str) else panels(node["first"]) + panels(node["second"])
+
+
+def test_the_layout_shows_topics_of_the_robot() -> None:
+    text = (files("omnid.viewer") / "foxglove.json").read_text()
+    layout = json.loads(text)
+    assert sorted(panels(layout["layout"])) == sorted(layout["configById"])
+    named = {name.partition(".")[0] for name in re.findall(r'"(/omnid/[^"]+)"', text)}
+    assert named and named <= {ros_name("omnid", topic) for topic in PUBLISHED}

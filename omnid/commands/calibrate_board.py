@@ -1,4 +1,4 @@
-"""`omnid calibrate live`: boards before the cameras, with the coverage so far and what is missing."""
+"""Calibration with a board: `omnid calibrate live` collects its images, `omnid calibrate rig` makes a rig of them."""
 
 from __future__ import annotations
 
@@ -10,27 +10,135 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 from calib.atomic_file import write_file
+from calib.boards.aprilgrid import AprilGrid
+from calib.boards.board import Board
 from calib.rig_file import png
 from drivers.logs.log_reader import LogCameras
+from omnid.calibration.board_search import AnyBoard, silent
 from omnid.calibration.images import SIDES, Image, read_pairs
 from omnid.calibration.live_boards import LiveBoards, PairOutcome, newest_pairs, status
-from omnid.commands.calibrate_options import BOARD, board_of, options_of
-from omnid.commands.options import SETTINGS, command, device_opener, make_folder, settings_of, warn
+from omnid.calibration.rig import calibrate_rig
+from omnid.commands.options import (
+    HEIGHT,
+    LOG_CAMERAS,
+    QUIET,
+    SETTINGS,
+    command,
+    device_opener,
+    height_of,
+    log_cameras,
+    make_folder,
+    settings_of,
+    warn,
+)
 from omnid.config import Config
 from omnid.engine.logging_setup import log
 from omnid.errors import OmnidError
+from omnid.sinks.files import check_outputs
 from omnid.transport.bus import Bus
 from omnid.transport.codec import diagnostics_cdr
 
 PUBLISH_S: Final = 0.5
+# Options that each kind of board needs.
+NEEDED = {"checkerboard": ("corners", "square_mm"), "aprilgrid": ("tags", "tag_mm", "tag_spacing")}
+ALL = tuple(name for names in NEEDED.values() for name in names)
+
+
+BOARD: Final = """
+board:
+--board checkerboard|aprilgrid=checkerboard  aprilgrid: Kalibr's AprilTags 36h11, which may be half hidden
+--corners 6x7        inner corners (points where four squares meet) along both sides
+--square-mm MM       side of one square
+--tags 6x6           aprilgrid: tags along x and y (Kalibr's tagCols x tagRows)
+--tag-mm MM          aprilgrid: side of one tag (tagSize)
+--tag-spacing RATIO  aprilgrid: space between tags in parts of a tag's side, like 0.3 (tagSpacing)
+"""
+
+
+def board_of(args: argparse.Namespace) -> AnyBoard:
+    """Return the board that the options describe; OmnidError for missing or unused ones, CalibError for wrong sizes."""
+    given = [name for name in ALL if getattr(args, name) is not None]
+    needed = NEEDED[args.board]
+    missing = [name for name in needed if name not in given]
+    if missing:
+        raise OmnidError(f"--board {args.board}: expected {_options(needed)}, found no {_options(missing)}")
+    unused = [name for name in given if name not in needed]
+    if unused:
+        raise OmnidError(
+            f"--board {args.board}: {_options(unused)} belongs to another kind of board; leave it out, or "
+            "choose the --board that was printed"
+        )
+    if args.board == "aprilgrid":
+        columns, rows = args.tags
+        return AprilGrid(columns, rows, args.tag_mm / 1e3, args.tag_spacing)
+    columns, rows = args.corners
+    return Board(columns, rows, args.square_mm / 1e3)
+
+
+def options_of(args: argparse.Namespace) -> list[str]:
+    """Return the options that describe the board, as words of a command line."""
+    words = [] if args.board == "checkerboard" else ["--board", args.board]
+    for name in NEEDED[args.board]:
+        value = getattr(args, name)
+        words += [_options([name]), "x".join(map(str, value)) if isinstance(value, tuple) else f"{value:g}"]
+    return words
+
+
+def _options(names: tuple[str, ...] | list[str]) -> str:
+    return ", ".join("--" + name.replace("_", "-") for name in names)
+
+
+@command(BOARD, LOG_CAMERAS, HEIGHT, QUIET)
+def rig(args: argparse.Namespace) -> int:
+    """Make a rig.toml from images of a board that both cameras saw at once.
+
+    Warnings go to stderr. Exit code 1: more than a tenth of a log's images made no pair.
+
+    images LOG|DIR    a log of both cameras, or a folder with lower_*.png, upper_*.png of the same names
+    -o, --output FILE  the rig.toml to write (required)
+    --expected-baseline-mm MM 0.001..  the measured distance of the mirrors: a result that differs by more than a tenth
+        is refused
+    --view auto|mirror|direct=auto     the world is seen in a mirror or directly through a lens; auto: what markers, or
+        rim and hub of a mirror show; else it must be given, as a checkerboard looks the same
+    --report FILE     write an HTML report with residuals and panoramas
+
+    examples:
+      calibrate rig boards.mcap --corners 6x7 --square-mm 30 -o rig.toml
+      calibrate rig DIR --board aprilgrid --tags 6x6 --tag-mm 88 --tag-spacing 0.3 -o rig.toml
+    """
+    board = board_of(args)
+    named = [("--output", args.output), ("--report", args.report)]
+    read = [("a file that is read", args.images)]
+    check_outputs([(name, path) for name, path in named if path is not None], read)
+    expected_mm = args.expected_baseline_mm
+    found = calibrate_rig(
+        args.images,
+        board,
+        topics=log_cameras(args),
+        view=args.view,
+        expected_baseline_m=None if expected_mm is None else expected_mm / 1e3,
+        progress=silent if args.quiet else lambda line: print(line, file=sys.stderr),
+    )
+    found = replace(found, rig=found.rig if args.height_m is None else found.rig.at_height(args.height_m))
+    found.save(args.output)
+    if args.report:
+        found.save_report(args.report)
+    for line in found.warnings:
+        print(f"warning: {line}", file=sys.stderr)
+    for line in found.tables:
+        print(line)
+    print(f"{args.output}: {found}")
+    print(f"{args.output}: {height_of(found.rig)}")
+    return int(bool(found.images.loss))
 
 
 @command(BOARD, SETTINGS)
-def run(args: argparse.Namespace) -> int:
+def live(args: argparse.Namespace) -> int:
     """Search the board in the images of both cameras as they come.
 
     Pairs in which it stands still at a new place are written to DIR; the terminal says what is missing and when it is

@@ -1,4 +1,4 @@
-"""`omnid calibrate rig`: rig.toml and report from rendered pairs of images; options of boards; one-line errors."""
+"""`omnid calibrate rig|live`: rig.toml and report from rendered pairs of images; options of boards; one-line errors."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from omnid.calibration.images import read_pairs
 from omnid.calibration.rig import RigResult
 from omnid.cli import main
 from omnid.simulation.rendering.sensor import Sensor
+from tests.replay.command import Command
 from tests.simulation.boards import BoardRenderer, board_poses_around_rig
 
 BOARD = Board(7, 6, 0.03)
@@ -219,3 +220,54 @@ def test_names_what_is_wrong_with_the_board(
     assert main(["calibrate", "rig", str(tmp_path), *words, "-o", str(tmp_path / "rig.toml")]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
+
+
+OPTIONS = ("--corners", "7x6", "--square-mm", "30")
+LIVE_PAIRS = 2  # of different places
+
+
+def image(folder: Path, name: str) -> Array:
+    """Return an image of a folder."""
+    found: Array = cv2.imread(str(folder / f"{name}.png"), cv2.IMREAD_GRAYSCALE)
+    return found
+
+
+@pytest.fixture(scope="module")
+def larger(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return render_pairs(rig_of(640), tmp_path_factory.mktemp("pairs"), LIVE_PAIRS)
+
+
+def test_live_writes_what_it_keeps_and_goes_on_where_it_ended(
+    larger: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    omnid, kept = Command(capsys), tmp_path / "kept"
+    first = omnid("calibrate", "live", kept, "--log", larger, *OPTIONS)
+    assert first.code == 1 and f"{LIVE_PAIRS} pairs, not enough yet: {15 - LIVE_PAIRS} more positions" in first.err
+    assert first.out.splitlines()[0].startswith("1: 14 more positions; both cameras: ")
+    assert sorted(path.name for path in kept.iterdir())[::LIVE_PAIRS] == ["lower_001.png", "upper_001.png"]
+    np.testing.assert_array_equal(image(kept, "upper_002"), image(larger, "upper_01"))
+    again = omnid("calibrate", "live", kept, "--log", larger, *OPTIONS)
+    assert (
+        again.out == ""
+        and f"{LIVE_PAIRS} pairs, not enough yet" in again.err
+        and len(list(kept.iterdir())) == 2 * LIVE_PAIRS
+    )
+
+
+def test_live_refuses_images_of_another_size(larger: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for path in larger.iterdir():
+        if path.stem.startswith("upper_"):
+            cv2.imwrite(str(tmp_path / path.name), image(larger, path.stem)[:600, :500])
+        elif path.stem.startswith("lower_"):
+            (tmp_path / path.name).write_bytes(path.read_bytes())
+    error = Command(capsys).refused("calibrate", "live", tmp_path, "--log", larger, *OPTIONS)
+    assert "upper camera: expected images of 500x600 px as the first ones, found 640x640 px; " in error
+
+
+def test_wrong_use_of_live_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    omnid = Command(capsys)
+    assert "name a folder" in omnid.refused("calibrate", "live", *OPTIONS)
+    assert "--square-mm" in omnid.refused("calibrate", "live", tmp_path, "--corners", "7x6")
+    assert "/dev/no-camera" in omnid("calibrate", "live", tmp_path, *OPTIONS, "--lower", "/dev/no-camera").err
+    (tmp_path / "file").touch()
+    assert "name a folder" in omnid.refused("calibrate", "live", tmp_path / "file", *OPTIONS)
