@@ -11,7 +11,7 @@ from collections.abc import Callable
 Lock = threading.Lock
 
 
-def started(action: Callable[[], None], name: str) -> Callable[[float | None], bool]:
+def started(action: Callable[[], object], name: str) -> Callable[[float | None], bool]:
     """Call an action in a thread; return a function that waits for its end for so long [s], None: for any time.
 
     It returns whether the action has ended. The thread does not keep the program from ending; what it raises is lost.

@@ -249,7 +249,8 @@ class LiveRun:
             if not self._robot.waits:
                 for refused in prepare(self._config.realtime):
                     warn(refused)
-            started(_import_rarely_used, "imports")
+            # What the first loop needs is imported while the first poses are computed.
+            started(partial(import_module, "scipy.sparse.linalg"), "imports")
             try:
                 self._graph.run()
             except BaseException:
@@ -496,10 +497,3 @@ def _load() -> None:
     for load in (partial(compile_serialisers, schemas), read_kept_kernels):
         with suppress(Exception):
             load()
-
-
-def _import_rarely_used() -> None:
-    """Import what the first loop and the first goal need while the first poses are computed."""
-    with suppress(Exception):
-        for name in ("scipy.sparse.linalg", "scipy.spatial"):
-            import_module(name)
