@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Iterable
 from itertools import pairwise
@@ -12,11 +13,15 @@ import pytest
 
 from calib.rig import Rig
 from drivers.frame import Camera, Frame
-from drivers.motion import GyroSample, WheelSample
+from drivers.logs.ros_messages import parse_motion
+from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.camera_config import PairConfig
 from omnid.errors import OmnidError
 from omnid.messages import FramePair
+from omnid.stages.motion_inbox import MotionInbox
 from omnid.stages.synchronise import FROZEN_IMAGES, KEPT, MAX_WAITING, Decoder, RepeatedImages, Skew, Synchronise
+from omnid.transport.codec import IMU_SCHEMA
+from omnid.transport.sensor_codec import gyro_cdr
 from tests.simulation import build
 from tests.simulation.rigs import make_rig
 
@@ -313,3 +318,40 @@ def test_the_first_image_must_have_the_size_of_the_rig_and_later_ones_are_left_o
         decode(small)
     assert decode(frame()) is not None and decode(small) is None
     assert decode.fault == "lower frame 3 is 32x32 px, unlike those before"
+
+
+UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])
+
+
+def test_samples_of_another_clock_and_too_many_are_dropped_and_counted() -> None:
+    inbox = MotionInbox()
+    for k in range(5000):
+        inbox.add(WheelSample(k, 0.0, 0.0))
+    assert inbox.dropped == 5000 - 4096 and len(inbox.take(10**4)) == 4096
+    inbox.add(WheelSample(10**12, 0.0, 0.0))
+    assert not inbox.take(10**4) and not inbox.take(10**12)
+    assert inbox.dropped == 5000 - 4096 + 1
+
+
+@pytest.mark.parametrize(
+    "sample", [WheelSample(5, math.nan, 0.0), WheelSample(5, math.inf, 0.0), GyroSample(5, 0.0, math.nan, 0.0)]
+)
+def test_a_sample_that_is_not_finite_makes_no_pose_so(sample: MotionSample) -> None:
+    inbox = MotionInbox()
+    inbox.add(sample)
+    kept = WheelSample(6, 0.5, math.nan)  # wheels need not know their turn
+    inbox.add(kept)
+    (taken,) = inbox.take(10)
+    assert taken is kept and inbox.dropped == 1 and inbox.gyro == 0
+
+
+def test_the_axes_of_a_recorded_gyro_are_not_turned_again() -> None:
+    live = MotionInbox(UPSIDE_DOWN)
+    live.add(GyroSample(5, 0.1, 0.2, 0.5))
+    (sample,) = live.take(10)
+    assert isinstance(sample, GyroSample) and (sample.x_radps, sample.y_radps, sample.z_radps) == (0.1, -0.2, -0.5)
+    again = MotionInbox(UPSIDE_DOWN)
+    recorded = parse_motion(IMU_SCHEMA, memoryview(gyro_cdr(sample, 5)))
+    assert recorded is not None
+    again.add(recorded)
+    assert again.take(10) == (sample,)
