@@ -15,10 +15,9 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import takewhile
-from typing import Annotated, Final, NamedTuple
+from typing import Annotated, Final, NamedTuple, TypeAlias
 
 from msgspec import Meta
 
@@ -106,20 +105,8 @@ class Motion(NamedTuple):
     yaw_rate_sigma_radps: float = 0.0
 
 
-class _TimedMotion(NamedTuple):
-    """A motion at a time."""
-
-    at_ns: int
-    velocity_mps: float
-    yaw_rate_radps: float
-
-
-class _Beyond(NamedTuple):
-    """By how far a speed lies beyond what is plausible."""
-
-    axis: int  # 0: velocity, 1: yaw rate
-    speed: float  # 0: it is plausible
-    falls_short: bool  # too little of the plausible motion, or the other way
+# A motion that was commanded or reported: its time [ns], velocity and yaw rate.
+_Account: TypeAlias = tuple[int, float, float]
 
 
 class MotionMonitor:
@@ -130,8 +117,8 @@ class MotionMonitor:
 
     def __init__(self, settings: MotionSettings) -> None:
         self._settings = settings
-        self._commanded: deque[_TimedMotion] = deque(maxlen=MOST_ACCOUNTS)
-        self._reported: deque[_TimedMotion] = deque(maxlen=MOST_ACCOUNTS)
+        self._commanded: deque[_Account] = deque(maxlen=MOST_ACCOUNTS)
+        self._reported: deque[_Account] = deque(maxlen=MOST_ACCOUNTS)
         self._driven_ns: int | None = None  # the newest tick with a commanded motion
         self._last_seen_ns = self._last_report_ns = 0
         self._wheels_report = False  # they have reported a motion: some controllers never do
@@ -153,7 +140,7 @@ class MotionMonitor:
         """Add the motion that was commanded at this tick."""
         if not self._settings.check:
             return
-        self._commanded.append(_TimedMotion(now_ns, motion.velocity_mps, motion.yaw_rate_radps))
+        self._commanded.append((now_ns, motion.velocity_mps, motion.yaw_rate_radps))
         if motion != STOP:
             self._driven_ns = now_ns
         if self._driven_ns is None or (now_ns - self._driven_ns) * S_PER_NS > REST_S:
@@ -168,9 +155,7 @@ class MotionMonitor:
         commanded = self._recent(self._commanded, stamp_ns)
         self._last_seen = seen
         self._steps.append(tuple(dt_s * speed for speed in (seen.velocity_mps, seen.yaw_rate_radps, *_mean(commanded))))
-        for found in self._beyond([*commanded, *self._recent(self._reported, stamp_ns)], seen):
-            self._add(NOT_SEEN, found.axis, found.speed if found.falls_short else 0.0, dt_s)
-            self._add(NOT_COMMANDED, found.axis, 0.0 if found.falls_short else found.speed, dt_s)
+        self._compare(seen, [*commanded, *self._recent(self._reported, stamp_ns)], dt_s, NOT_SEEN, NOT_COMMANDED)
 
     def add_report(self, now_ns: int, reported: Motion) -> None:
         """Compare what the wheels report with what was commanded; a yaw rate of NaN is not compared."""
@@ -181,51 +166,47 @@ class MotionMonitor:
         self._wheels_report |= reported.velocity_mps != 0.0 or turn_radps != 0.0
         if not self._wheels_report or not math.isfinite(reported.velocity_mps):
             return
-        self._reported.append(_TimedMotion(now_ns, reported.velocity_mps, turn_radps))
+        self._reported.append((now_ns, reported.velocity_mps, turn_radps))
         if not self._drives_at(now_ns):
             return
-        dt_s = _passed_s(before_ns, now_ns)
-        for found in self._beyond(self._recent(self._commanded, now_ns), reported):
-            self._add(NOT_FOLLOWED, found.axis, found.speed, dt_s)
+        explained, dt_s = self._recent(self._commanded, now_ns), _passed_s(before_ns, now_ns)
+        self._compare(reported, explained, dt_s, NOT_FOLLOWED, NOT_FOLLOWED)
 
     def _drives_at(self, at_ns: int) -> bool:
         """True if a motion was commanded within the delay before a time."""
-        return any(entry.velocity_mps or entry.yaw_rate_radps for entry in self._recent(self._commanded, at_ns))
+        return any(velocity_mps or turn_radps for _, velocity_mps, turn_radps in self._recent(self._commanded, at_ns))
 
-    def _recent(self, accounts: deque[_TimedMotion], at_ns: int) -> list[_TimedMotion]:
+    def _recent(self, accounts: deque[_Account], at_ns: int) -> list[_Account]:
         """Return the accounts within the delay before a time, the newest first."""
         since_ns = at_ns - self._settings.delay_s / S_PER_NS
         return [
-            entry
-            for entry in takewhile(lambda entry: entry.at_ns >= since_ns, reversed(accounts))
-            if entry.at_ns <= at_ns
+            entry for entry in takewhile(lambda entry: entry[0] >= since_ns, reversed(accounts)) if entry[0] <= at_ns
         ]
 
-    def _beyond(self, explained: list[_TimedMotion], found: Motion) -> Iterator[_Beyond]:
-        """Yield by how far a motion lies beyond what others explain; nothing for a speed of NaN.
+    def _compare(self, found: Motion, explained: list[_Account], dt_s: float, too_little: str, too_much: str) -> None:
+        """Add by how far a motion lies beyond what others explain, to the reason; a speed of NaN is not compared.
 
-        A slip of the slowest speed never changes its sign.
+        A slip of the slowest speed never changes its sign. too_little, too_much: the reasons by the side on which it
+        lies beyond; where nothing does, the sums fall.
         """
         limits = self._settings
         axes = (
-            (found.velocity_mps, limits.speed_mps + SIGMAS * found.velocity_sigma_mps),
-            (found.yaw_rate_radps, limits.yaw_rate_radps + SIGMAS * found.yaw_rate_sigma_radps),
+            (found.velocity_mps, limits.speed_mps + SIGMAS * found.velocity_sigma_mps, limits.stop_m),
+            (found.yaw_rate_radps, limits.yaw_rate_radps + SIGMAS * found.yaw_rate_sigma_radps, limits.stop_rad),
         )
-        for axis, (value, tolerance) in enumerate(axes):
+        for axis, (value, tolerance, limit) in enumerate(axes):
             if not math.isfinite(value):
                 continue
-            speeds = [(one.velocity_mps, one.yaw_rate_radps)[axis] for one in explained]
+            speeds = [account[1 + axis] for account in explained]
             low, high = min(speeds), max(speeds)
             low, high = low - limits.slip * abs(low) - tolerance, high + limits.slip * abs(high) + tolerance
             beyond = max(0.0, value - high) - max(0.0, low - value)
-            yield _Beyond(axis, abs(beyond), beyond * (low + high) < 0.0)
-
-    def _add(self, reason: str, axis: int, speed: float, dt_s: float) -> None:
-        """Add an unexplained speed; 0 lets the sum fall."""
-        sums, limit = self._unexplained[reason], (self._settings.stop_m, self._settings.stop_rad)[axis]
-        sums[axis] = max(0.0, sums[axis] + dt_s * (speed if speed > 0.0 else -RECOVERY * limit))
-        if sums[axis] > limit and not self.reason:
-            self.reason, self.detail = reason, self._measured(reason)
+            of = too_little if beyond * (low + high) < 0.0 else too_much
+            for reason in {too_little: None, too_much: None}:
+                sums, adds = self._unexplained[reason], beyond != 0.0 and reason == of
+                sums[axis] = max(0.0, sums[axis] + dt_s * (abs(beyond) if adds else -RECOVERY * limit))
+                if sums[axis] > limit and not self.reason:
+                    self.reason, self.detail = reason, self._measured(reason)
 
     def _measured(self, reason: str) -> str:
         """Return the motion of all accounts in the last moments, and what may have made the difference."""
@@ -248,11 +229,10 @@ class MotionMonitor:
             sums[:] = 0.0, 0.0
 
 
-def _mean(accounts: list[_TimedMotion]) -> tuple[float, float]:
+def _mean(accounts: list[_Account]) -> tuple[float, float]:
     """Return the mean velocity and yaw rate of accounts."""
     count = max(1, len(accounts))
-    velocity_mps = sum(one.velocity_mps for one in accounts) / count
-    return velocity_mps, sum(one.yaw_rate_radps for one in accounts) / count
+    return sum(account[1] for account in accounts) / count, sum(account[2] for account in accounts) / count
 
 
 def _words(velocity_mps: float, yaw_rate_radps: float) -> str:
