@@ -18,9 +18,9 @@ from omnid.core.control.collision_monitor import UNKNOWN, CollisionSettings
 from omnid.core.control.command_sources import PLANNER
 from omnid.core.control.heading_controller import Setpoint, wrap_angle
 from omnid.core.control.safety_rules import ASKED
-from omnid.core.navigation.follower import STAND, Follower, Following
+from omnid.core.navigation.follower import BRAKE_SHARE, STAND, Follower, Following
 from omnid.core.navigation.forecast import Pace, yielding
-from omnid.core.navigation.path import DrivePath, drive_path, goal_path
+from omnid.core.navigation.path import SHORTEST_M, DrivePath, drive_path, goal_path
 from omnid.core.navigation.planner import BACK_MPS, NoWay, Planner, distances
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.settings import NavigationSettings
@@ -31,23 +31,21 @@ from omnid.tracking_state import MapState, TrackingState
 Array = NDArray[np.float64]
 
 PROGRESS_M, PROGRESS_RAD = 0.05, math.radians(5)  # A smaller motion is no progress; by trial on development seeds.
-ARRIVED_M: Final = 0.1  # A detour or a way back ends this far from its last point.
 STOPS: Final = 5  # A stop is sent at so many poses after the end of a drive, because one might be lost.
-BESIDE_M: Final = 0.3  # The path counts as left this far beyond the corridor; by trial on development seeds.
-PLANNED_M: Final = 4.0  # Length of the path in which a place behind an obstacle is searched.
-LOOK_M: Final = 2.0  # Length of the way ahead in which obstacles are searched.
+LOOK_M: Final = 2.0  # Length of the way ahead in which obstacles are searched; a free place behind them in twice that.
 REJOIN_M: Final = 0.3  # Free length of the path behind an obstacle, at which a detour ends.
-BEFORE_M: Final = 0.35  # Distance of the outline from an obstacle on the path at which the base waits.
-WAIT_MPS2: Final = 0.2  # Deceleration towards an obstacle at which the base waits.
 AGAIN_NS: Final = 500_000_000  # between two searches
-MOST_WAYS: Final = 12  # Most ways that are tried without coming AGAIN_M nearer to the end.
+MOST_WAYS: Final = 12  # Most ways that are tried without coming NEARER_M nearer to the end.
 LONGEST_STEP_S: Final = 1.0  # A longer time between two poses counts as this, because a gap is no wait.
-AGAIN_M: Final = 1.0  # After this progress the next block is a new one; by trial on development seeds.
-NEARER_M: Final = 0.005  # Least change of the room between two points of a way: more than rounding.
-# Giving way: spacing of the places that are kept; least way back, so that it makes room for somebody, and least way to
-# a wider place; room beside the outline in which a person passes; of the way ahead that must be free to go on.
-SPACING_M, SHORTEST_M, CLEAR_M, PASS_M, PAST_M = 0.1, 0.3, 1.0, 0.8, 1.0
-REST_S, SPREAD_S, FREE_S = 3.0, 4, 1.0  # least wait, its spread, time for which the way ahead must be free
+# A person's two steps: after this progress the next block is a new one; least way back to a wider place; length of the
+# way past the block that must be free before the base comes again.
+NEARER_M: Final = 1.0
+ROUNDING_M: Final = 0.005  # Least change of the room between two points of a way.
+PASS_M: Final = 0.8  # room beside the outline in which a person passes
+REST_S, SPREAD_S = (
+    3.0,
+    4,
+)  # least wait after a way back; its spread, so that two robots that met move at different times
 # It goes on after this time in any case, to look; after twice the time when it is blocked again; at most so long.
 RETRY_S, LONGEST_RETRY_S = 10.0, 300.0
 
@@ -82,11 +80,9 @@ class Retreat:
 
     follower: Follower | None  # the way back, in odom; None: it waits
     ahead: Array  # (N, 2) in odom, from the end of the way back to the block and past it
-    spread_s: float  # added to the least wait, so that two robots that met move at different times
-    waits_s: float  # it goes on after this time in any case, to look
-    end: Place
+    least_s: float  # it goes on after this time if the way ahead is free
+    most_s: float  # and after this time in any case, to look
     rested_s: float = 0.0
-    free_s: float = 0.0  # for which the way ahead has been free
 
 
 @dataclass(slots=True)
@@ -111,11 +107,10 @@ class Drive:
     last_xy: Array | None = None  # last position in odom
     detour: Detour | None = None  # None: it follows the path
     retreat: Retreat | None = None  # None unless the base gives way now
-    gave_way: int = 0  # number of times that the base gave way at the last block
-    gave_way_m: float = math.inf  # length of the path that was left at that block
-    around_unknown: bool = False  # floor that was not seen has stopped the base: it is an obstacle until it is passed
-    least_m: float = math.inf  # least way that was left, in steps of AGAIN_M
+    least_m: float = math.inf  # least length of the way that was left, in steps of NEARER_M
+    gave_way: int = 0  # number of times that the base gave way since then
     ways: int = 0  # number of ways that were found since then, each of which was blocked again
+    around_unknown: bool = False  # floor that was not seen has stopped the base: it is an obstacle until it is passed
     searched_ns: int = -AGAIN_NS  # stamp of the last search
     no_way: str = ""  # why it was in vain
 
@@ -130,7 +125,7 @@ class Drive:
         motion = now.speed_mps, now.yaw_rate_radps, now.obstacle_m
         if self.detour is not None:
             following = self.detour.follower.step(now.stamp_ns, now.pose, *motion)
-            if not following.done and following.left_m >= ARRIVED_M:
+            if not following.done and following.left_m >= SHORTEST_M:
                 return following
             self.rejoin(now, self.detour.leg, self.detour.s_m)
         following = self.follower.step(now.stamp_ns, now.pose_in(self.frame), *motion)
@@ -177,7 +172,7 @@ class Navigator:
         collision = collision or CollisionSettings()
         self._planner = Planner(settings, collision)
         self._front_m, self._rear_m, self._stop_m = collision.front_m, collision.rear_m, collision.stop_m
-        self._trail: deque[Place] = deque(maxlen=max(2, math.ceil(settings.give_way_m / SPACING_M) + 1))
+        self._trail: deque[Place] = deque(maxlen=max(2, math.ceil(settings.give_way_m / SHORTEST_M) + 1))
         self._last_ns: int | None = None
         self._stops = 0  # number of stops that are still to be sent
         self.drive: Drive | None = None
@@ -256,6 +251,8 @@ class Navigator:
             return self._finished(drive, following.missed_m)
         if self._is_beside(following):
             return self._taken_away(following)
+        if following.left_m < drive.least_m - NEARER_M:
+            drive.least_m, drive.gave_way, drive.ways, drive.blocked_s = following.left_m, 0, 0, 0.0
         # 5. Obstacles on it, and a safety rule that holds the wheels because of one.
         held_by = now.wheels.held_by
         drive.around_unknown |= held_by == UNKNOWN
@@ -266,16 +263,13 @@ class Navigator:
         # 6. Progress: where it is missing for too long, the base gives way or the drive fails.
         avoids = drive.detour is not None
         if self._is_stuck(drive, now, following, dt_s):
-            if avoids and not drive.gave_way and self._begins_to_give_way(drive, now, following.left_m):
+            if avoids and not drive.gave_way and self._begins_to_give_way(drive, now):
                 return self._wait(drive, NavigationState.BLOCKED, AROUND, dt_s)
             return self._no_progress(now, AROUND if avoids else "")
         self.state = NavigationState.AVOIDING if avoids else NavigationState.DRIVING
         self.reason = now.wheels.reason if now.wheels.is_held else reason
-        drive.waits.clear()
-        if following.left_m < drive.gave_way_m - AGAIN_M:
-            drive.blocked_s = 0.0
-        if following.left_m < drive.least_m - AGAIN_M:
-            drive.least_m, drive.ways = following.left_m, 0
+        if not drive.stuck_s:  # a base that only creeps up to what blocks it waits on
+            drive.waits.clear()
         return Navigation(setpoint, self.state, self.reason, following.left_m, following.offset_m)
 
     def _idle(self) -> Navigation:
@@ -305,7 +299,7 @@ class Navigator:
             if drive.frame is NavigationFrame.ODOM:
                 self._end(NavigationState.FAILED, "odometry has lost its map and begun again: ask again")
         xy = float(now.pose[0]), float(now.pose[1])
-        if drive.retreat is None and (not self._trail or math.dist(xy, self._trail[-1].xy) >= SPACING_M):
+        if drive.retreat is None and (not self._trail or math.dist(xy, self._trail[-1].xy) >= SHORTEST_M):
             self._trail.append(Place(xy, now.speed_mps < 0, *drive.follower.place))
         in_map = now.in_map
         if in_map is None or in_map.stamp_ns <= drive.localised_ns:  # no new pose in the map has come
@@ -358,7 +352,7 @@ class Navigator:
             moving_m = max(self._planner.room_m + self._settings.clearance_m, self._front_m + self._stop_m)
             speed_mps = max(now.speed_mps, 0.0)
             pace = Pace(speed_mps, pursuit.velocity_mps, pursuit.acceleration_mps2, moving_m, standing_m)
-            share, coming = yielding(self._ahead(drive, now, PLANNED_M), on_way.leg_left_m, now.moving, pace)
+            share, coming = yielding(self._ahead(drive, now, 2 * LOOK_M), on_way.leg_left_m, now.moving, pace)
             outlines = now.moving.outlines(coming, now.pose[:2], pursuit.velocity_mps)
             obstacles = np.vstack([now.moving.others(obstacles), outlines])
         # 2. The way is left where it is blocked, also by floor that was not seen, if there is a way around that.
@@ -381,14 +375,14 @@ class Navigator:
             following = drive.step(now)
             wanted = following.setpoint
         # 3. Without a way around it, drive up to the obstacle and wait.
-        left_m = first_m - self._front_m - BEFORE_M
+        left_m = first_m - self._front_m - 2 * self._stop_m
         if left_m <= 0 and wanted.velocity_mps > 0:
             return following, None, STANDS
         if share == 0.0:
             return following, None, CROSSES
         if share < 1.0:
             return following, _slower(wanted, share * pursuit.velocity_mps), CROSSES
-        return following, _slower(wanted, math.sqrt(2 * WAIT_MPS2 * max(left_m, 0.0))), ""
+        return following, _slower(wanted, math.sqrt(2 * BRAKE_SHARE * pursuit.acceleration_mps2 * max(left_m, 0.0))), ""
 
     def _ahead(self, drive: Drive, now: Situation, way_m: float) -> Array:
         """Return the points (N, 2) of the way ahead, in odom."""
@@ -406,7 +400,7 @@ class Navigator:
             goal, corridor, heading_rad = drive.in_odom(path.goal[None], now)[0], None, math.nan
             place = 0, 0.0
         else:
-            ahead = drive.follower.ahead(PLANNED_M)
+            ahead = drive.follower.ahead(2 * LOOK_M)
             corridor = drive.in_odom(ahead.xy, now)
             k = _behind(corridor, obstacles, self._planner.room_m + settings.clearance_m)
             if k is None:
@@ -444,10 +438,8 @@ class Navigator:
             why = reason if setpoint is not None else drive.no_way or reason
             return self._failed(f"no way to the goal, {following.left_m:.1f} m are left: {why}")
         waiting = self._wait(drive, NavigationState.BLOCKED, f"{reason}: {WAITS}", dt_s)
-        if following.left_m < drive.gave_way_m - AGAIN_M:
-            drive.gave_way = 0
         if drive.waits[NavigationState.BLOCKED] > self._settings.give_way_s:
-            self._begins_to_give_way(drive, now, following.left_m)
+            self._begins_to_give_way(drive, now)
         if setpoint is not None:
             waiting = waiting._replace(setpoint=setpoint)
         return waiting._replace(left_m=following.left_m, offset_m=following.offset_m)
@@ -457,15 +449,14 @@ class Navigator:
         drive.blocked_s += dt_s
         return drive.paths[0].is_goal and 0 < self._settings.give_up_s < drive.blocked_s
 
-    def _begins_to_give_way(self, drive: Drive, now: Situation, left_m: float) -> bool:
+    def _begins_to_give_way(self, drive: Drive, now: Situation) -> bool:
         """Begin to drive back; False where there is no free way back, or it is switched off."""
         drive.waits[NavigationState.BLOCKED] = drive.stuck_s = 0.0
         if now.obstacles is None or not self._settings.give_way_m:
             return False
-        ahead = self._ahead(drive, now, PAST_M)
-        drive.retreat = self._way_back(now, ahead, now.obstacles, drive.gave_way)
+        drive.retreat = self._way_back(now, self._ahead(drive, now, NEARER_M), now.obstacles, drive.gave_way)
         if drive.retreat is not None:
-            drive.gave_way, drive.gave_way_m, drive.nearest_m = drive.gave_way + 1, left_m, math.inf
+            drive.gave_way, drive.nearest_m = drive.gave_way + 1, math.inf
         return drive.retreat is not None
 
     def _way_back(self, now: Situation, ahead: Array, obstacles: Array, times: int) -> Retreat | None:
@@ -476,11 +467,11 @@ class Navigator:
         ways = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
         # 1. As far as it is free now, and no farther than is wanted.
         free_m = first_blocked_m(xy, obstacles, room_m)
-        last = int(np.searchsorted(ways, min(free_m - NEARER_M, self._settings.give_way_m), side="right"))
+        last = int(np.searchsorted(ways, min(free_m - ROUNDING_M, self._settings.give_way_m), side="right"))
         # 2. Up to the next place where others can pass.
-        is_wide = (distances(xy[:last], obstacles) > room_m + PASS_M) & (ways[:last] >= CLEAR_M)
+        is_wide = (distances(xy[:last], obstacles) > room_m + PASS_M) & (ways[:last] >= NEARER_M)
         last = int(np.argmax(is_wide)) + 1 if is_wide.any() else last
-        if last < 2 or ways[last - 1] < SHORTEST_M:
+        if last < 2 or ways[last - 1] < self._front_m:
             return None
         came_back = [places[0].is_back, *(place.is_back for place in places)][:last]
         backwards = [not back for back in (came_back[:1] + came_back)[:last]]
@@ -488,45 +479,42 @@ class Navigator:
         return Retreat(
             Follower(path, self._settings),
             np.vstack([xy[:last][::-1], ahead]),
-            float(now.stamp_ns // 1_000_000_000 % SPREAD_S),
+            REST_S + now.stamp_ns // 1_000_000_000 % SPREAD_S,
             min(RETRY_S * 2.0**times, LONGEST_RETRY_S),
-            places[last - 2],
         )
 
     def _give_way(self, drive: Drive, retreat: Retreat, now: Situation, dt_s: float) -> Navigation:
         """Drive back, wait, and go on. All in odom."""
         if self._gives_up(drive, dt_s):
-            return self._failed(f"no way to the goal, {drive.gave_way_m:.1f} m are left: {drive.no_way or STANDS}")
+            return self._failed(f"no way to the goal, {drive.least_m:.1f} m are left: {drive.no_way or STANDS}")
         obstacles = NOWHERE if now.obstacles is None else now.obstacles
         # 1. Back, as far as it is seen to be free now.
         if retreat.follower is not None:
             following = retreat.follower.step(now.stamp_ns, now.pose, now.speed_mps, now.yaw_rate_radps)
             if self._is_beside(following):
                 return self._taken_away(following)
-            is_there = following.done or following.left_m < ARRIVED_M
-            path = retreat.follower.ahead(CLEAR_M).xy
+            is_there = following.done or following.left_m < SHORTEST_M
+            path = retreat.follower.ahead(NEARER_M).xy
             is_free = math.isinf(first_blocked_m(path, obstacles, self._planner.room_m))
             if not is_there and is_free and now.obstacles is not None and not now.wheels.held_by:
                 if self._is_stuck(drive, now, following, dt_s):
                     return self._no_progress(now, GIVES_WAY)
                 self.state, self.reason = NavigationState.AVOIDING, GIVES_WAY
-                return Navigation(following.setpoint, self.state, self.reason, drive.gave_way_m)
+                return Navigation(following.setpoint, self.state, self.reason, drive.least_m)
             retreat.follower = None
         # 2. Wait until the way is free, or it is time to look again.
         retreat.rested_s += dt_s
         nearest = int(np.argmin(np.hypot(*(retreat.ahead - now.pose[:2]).T)))
         room_m = self._planner.room_m + self._settings.clearance_m
         is_free = bool((distances(retreat.ahead[nearest:], obstacles) >= room_m).all())
-        retreat.free_s = retreat.free_s + dt_s if is_free else 0.0
-        goes_on = retreat.free_s >= FREE_S and retreat.rested_s >= REST_S + retreat.spread_s
-        if not goes_on and retreat.rested_s < retreat.waits_s:
+        if retreat.rested_s < (retreat.least_s if is_free else retreat.most_s):
             return self._wait(drive, NavigationState.BLOCKED, f"it gives way: {WAITS}", dt_s)
         # 3. Go on from there.
         nearest_place = min(self._trail, key=lambda place: math.dist(place.xy, now.pose[:2]))
         drive.rejoin(now, nearest_place.leg, nearest_place.s_m)
         drive.retreat = None
         drive.waits.clear()
-        return Navigation(STAND, self.state, self.reason, drive.gave_way_m)
+        return Navigation(STAND, self.state, self.reason, drive.least_m)
 
     def _is_stuck(self, drive: Drive, now: Situation, following: Following, dt_s: float) -> bool:
         """True if for too long the base has neither come nearer to the end nor turned."""
@@ -546,7 +534,7 @@ class Navigator:
 
     def _is_beside(self, following: Following) -> bool:
         """True if the base is no longer near its path, for example because an operator has taken it away."""
-        return abs(following.offset_m) > self._settings.corridor_m + BESIDE_M
+        return abs(following.offset_m) > self._settings.corridor_m + self._planner.room_m
 
     def _taken_away(self, following: Following) -> Navigation:
         return self._failed(f"{abs(following.offset_m):.1f} m beside the path: drive back to it and ask again")
@@ -573,7 +561,7 @@ def first_blocked_m(path: Array, obstacles: Array, room_m: float) -> float:
     near_m = distances(path, obstacles)
     is_blocked = near_m < room_m
     if is_blocked[0]:
-        leaves = np.minimum.accumulate(np.append(True, np.diff(near_m) > -NEARER_M))
+        leaves = np.minimum.accumulate(np.append(True, np.diff(near_m) > -ROUNDING_M))
         is_blocked &= ~(leaves & np.minimum.accumulate(is_blocked))
     if not is_blocked.any():
         return math.inf
