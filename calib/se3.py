@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
-# Angles below this one are computed as this one: their terms differ by less than the rounding of what they are added to.
+# Smaller angles are computed as this one: their terms differ by less than the rounding of what they are added to.
 LEAST_ANGLE_RAD: Final = 1e-9
 
 

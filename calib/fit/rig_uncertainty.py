@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from calib import se3
+from calib.fit.parameters import moved_rig
 from calib.models.camera import Array
-from calib.models.names import changed
 from calib.rig import Rig
-from calib.rig_covariance import TRANSFORM_NAMES, RigCovariance
+from calib.rig_covariance import RigCovariance
 
 # Steps of numeric derivatives, by points [m] and by parameters [sigmas]: small against the curvature of a projection,
 # large against its rounding.
@@ -48,26 +48,6 @@ class DriveUncertainty:
 
     def __str__(self) -> str:
         return f"scale uncertain by {100 * self.scale:.2g} %, heading by {np.rad2deg(self.heading_rad_m):.2g} degree/m"
-
-
-def perturbed_rig(rig: Rig, names: tuple[str, ...], changes: Array) -> Rig:
-    """Return the rig after changes (P,) of its named parameters, in their own units; names as in RigCovariance.
-
-    Raises CalibError if the result is no camera.
-    """
-    change = dict(zip(names, changes.tolist(), strict=True))
-    r_x, r_y, r_z, e_x, e_y, longer = (change.pop(name, 0.0) for name in TRANSFORM_NAMES)
-    moved = rig.with_upper_moved(np.array([r_x, r_y, r_z]), np.array([e_x, e_y]), longer)
-    lower, upper = (
-        replace(
-            mounted,
-            camera=changed(
-                mounted.camera, {name[6:]: value for name, value in change.items() if name.startswith(f"{side} ")}
-            ),
-        )
-        for side, mounted in (("lower", moved.lower), ("upper", moved.upper))
-    )
-    return replace(moved, lower=lower, upper=upper)
 
 
 def drive_uncertainty(rig: Rig) -> DriveUncertainty | None:
@@ -189,7 +169,7 @@ def _pixels_by_parameters(rig: Rig, in_rig: Array, scaled: tuple[tuple[str, ...]
     names, units = scaled
 
     def pixels(changes: Array) -> Array:
-        changed = perturbed_rig(rig, names, changes * units)
+        changed = moved_rig(rig, dict(zip(names, (changes * units).tolist(), strict=True)))
         return np.column_stack(
             [mounted.camera.project(se3.apply(mounted.T_cam_rig, in_rig)) for mounted in (changed.lower, changed.upper)]
         )

@@ -12,17 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.fit.drive.adjustment import (
+from calib.fit.parameters import LINE_TIME, UPPER_DELAY, RigParameters
+from calib.fit.residual_structure import ResidualStructure
+from calib.fit.rig_drift import apply_drift
+from calib.fit.rig_from_drive import (
     OBSERVATIONS_ALIKE,
     DriveAdjustment,
     adjust_drive,
     adjust_pairs,
-    drive_structure,
     observation_sigma,
 )
-from calib.fit.drive.rig_parameters import LINE_TIME, TRANSFORM_NAMES, UPPER_DELAY, RigParameters
-from calib.fit.residual_structure import ResidualStructure
-from calib.fit.rig_drift import apply_drift
 from calib.fit.rig_uncertainty import drive_uncertainty
 from calib.models.ocam import has_wavefront
 from calib.rig import Rig, ShutterTimes
@@ -185,7 +184,7 @@ def calibrate_drive(
         observation_sigma(before, found, drives.fixed),
         # By the rays of the adjustment, and by the length of the baseline.
         scale_change(found, before) + float(np.log(adjusted.baseline_m / before.baseline_m)),
-        drive_structure(found),
+        (found.structure(0), found.structure(1)),
         level_rad,
         drives,
     )
@@ -368,11 +367,10 @@ def require_same_rig(parameters: RigParameters, steps: Array, *, tracked: bool =
 
     tracked: False before the motion is known: an upper camera that is exposed late then appears shifted.
     """
-    first = len(parameters.rig_names) - len(TRANSFORM_NAMES)
-    change = (steps * parameters.units)[first : len(parameters.rig_names)]
+    change = (steps * parameters.units)[parameters.of_transform]
     turn, lean = float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:])) if tracked else 0.0
     limit = MAX_NOMINAL_TURN_RAD if is_nominal(parameters.rig) else MAX_TURN_RAD
-    away = np.abs(steps / parameters.nominal_sigmas)[:first]
+    away = np.abs(steps / parameters.nominal_sigmas)[: parameters.of_transform.start]
     worst = int(np.argmax(away))
     if max(turn, lean) > limit:
         reason = (

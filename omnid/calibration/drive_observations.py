@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.fit.drive.observations import DriveObservations, DriveState, KeyframeMotion
+from calib.fit.rig_from_drive import DriveObservations, DriveState
 from calib.rig import Rig
 from calib.se2_arrays import wrapped
 from drivers.logs.log_reader import LogCameras, LogReader
@@ -73,11 +73,10 @@ def collect(logs: Sequence[Path], rig: Rig, cameras: LogCameras, config: Config)
         np.concatenate([part.camera for part in seen]),
         np.concatenate([part.pixels for part in seen]),
     )
-    motion = KeyframeMotion(
-        np.concatenate([state.motion.twist for state in states]),
-        np.concatenate([state.motion.upper_delay_s for state in states]),
+    points, twist, upper_delay_s = (
+        np.concatenate([getattr(state, name) for state in states]) for name in ("points", "twist", "upper_delay_s")
     )
-    state = DriveState(T_rig_odom, np.concatenate([state.points for state in states]), np.zeros(0), motion)
+    state = DriveState(T_rig_odom, points, twist, upper_delay_s, np.zeros(0))
     return Drives(state, observations, tuple(keyframes[:-1].tolist()), parts[-1].T_last)
 
 
@@ -103,7 +102,7 @@ def observe_pairs(pairs: Sequence[FramePair], rig: Rig, config: Config) -> tuple
     observations = DriveObservations(seen.keyframe, seen.landmark, seen.camera, pixels)
     observations, used = observations.only(known & np.tile(known[:count] & known[count:], 2))
     T = np.tile(np.eye(4), (len(pairs), 1, 1))
-    return DriveState(T, points[used], np.zeros(0), KeyframeMotion.still(len(pairs))), observations
+    return DriveState(T, points[used], np.zeros((len(pairs), 6)), np.zeros(len(pairs)), np.zeros(0)), observations
 
 
 def _drive(log: Path, place: Geometry, cameras: LogCameras, config: Config, most: int) -> Drives:
@@ -150,8 +149,8 @@ class DriveCollector:
         pixels = image_pixels(found, place.rig, place.cylinder)
         observations = DriveObservations(found.keyframe, found.landmark, found.camera, pixels)
         observations, used = observations.only(np.asarray(np.isfinite(pixels).all(axis=1)))
-        motion = KeyframeMotion(np.array(self._twists), np.array(self._delays_s))
-        state = DriveState(np.array(self._T_rig_odom), found.points[used], np.zeros(0), motion)
+        T_rig_odom, twist = np.array(self._T_rig_odom), np.array(self._twists)
+        state = DriveState(T_rig_odom, found.points[used], twist, np.array(self._delays_s), np.zeros(0))
         return Drives(state, observations, (0,), self._T_rig_odom[-1] @ T_odom_last)
 
 

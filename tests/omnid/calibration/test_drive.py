@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from calib import se3
-from calib.fit.drive.adjustment import DriveAdjustment
-from calib.fit.drive.observations import DriveObservations, DriveState, KeyframeMotion
-from calib.fit.drive.rig_parameters import LINE_TIME, UPPER_DELAY, RigParameters
+from calib.fit.parameters import LINE_TIME, UPPER_DELAY, RigParameters
+from calib.fit.rig_from_drive import DriveAdjustment, DriveObservations, DriveState
 from calib.models.camera import Array
 from calib.rig import Rig
 from omnid.calibration.drive import level_turn, require_same_rig, rescaled, turned_about_lower
@@ -28,7 +27,7 @@ def adjusted(rig: Rig, sigma: float = 0.01, **changes: float) -> DriveAdjustment
         steps[named[name]] = change / parameters.units[named[name]]
     none = np.zeros(0, np.intp)
     seen = DriveObservations(none, none, none, np.zeros((0, 2)))
-    state = DriveState(np.eye(4)[None], np.zeros((0, 3)), steps, KeyframeMotion.still(1))
+    state = DriveState(np.eye(4)[None], np.zeros((0, 3)), np.zeros((1, 6)), np.zeros(1), steps)
     return DriveAdjustment(parameters, state, seen, np.diag((sigma / parameters.units) ** 2), 0.05, np.eye(len(steps)))
 
 

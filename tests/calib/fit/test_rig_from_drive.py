@@ -9,10 +9,15 @@ import pytest
 
 from calib import se3
 from calib.errors import CalibError
-from calib.fit.drive.adjustment import adjust_drive, observation_sigma
-from calib.fit.drive.observations import DriveObservations, DriveState, KeyframeMotion, project
-from calib.fit.drive.problem import DriveProblem
-from calib.fit.drive.rig_parameters import LINE_TIME, UPPER_DELAY, RigParameters
+from calib.fit.parameters import LINE_TIME, UPPER_DELAY, RigParameters
+from calib.fit.rig_from_drive import (
+    DriveObservations,
+    DriveProblem,
+    DriveState,
+    adjust_drive,
+    observation_sigma,
+    project,
+)
 from calib.models.camera import Array
 from calib.models.unified import UnifiedCamera
 from calib.rig import Rig
@@ -40,9 +45,8 @@ def drive(truth: Rig, seed: int, noise_px: float = NOISE_PX) -> tuple[DriveState
     in_rig = se3.apply(T_rig_odom, points)[keyframe, landmark]
     pixels = project(truth, camera, in_rig) + noise_px * rng.standard_normal((len(keyframe), 2))
     seen = np.isfinite(pixels).all(axis=1) & (np.linalg.norm(in_rig, axis=1) > 0.7)
-    return DriveState(T_rig_odom, points, np.zeros(0), KeyframeMotion.still(KEYFRAMES)), DriveObservations(
-        keyframe[seen], landmark[seen], camera[seen], pixels[seen]
-    )
+    state = DriveState(T_rig_odom, points, np.zeros((KEYFRAMES, 6)), np.zeros(KEYFRAMES), np.zeros(0))
+    return state, DriveObservations(keyframe[seen], landmark[seen], camera[seen], pixels[seen])
 
 
 def disturbed(rig: Rig, rng: np.random.Generator) -> Rig:
@@ -150,7 +154,6 @@ def test_delay_of_the_upper_camera_and_line_time_are_found(truth: Rig) -> None:
     twist = np.column_stack(
         [rng.uniform(-0.7, 0.7, (KEYFRAMES, 2)), np.zeros((KEYFRAMES, 3)), rng.uniform(-0.8, 0.8, KEYFRAMES)]
     )
-    motion = KeyframeMotion(twist, np.full(KEYFRAMES, 5e-3))
     delay_s = np.where(observations.camera == 1, 12e-3, 0.0) + 30e-6 * observations.pixels[:, 1]
     points = problem_points(truth, state, observations)
     moving = np.array(
@@ -163,7 +166,8 @@ def test_delay_of_the_upper_camera_and_line_time_are_found(truth: Rig) -> None:
     seen = np.isfinite(pixels).all(axis=1)
     kept, used = replace(observations, pixels=pixels).only(seen)
     parameters = RigParameters.about(truth, times=(UPPER_DELAY, LINE_TIME))
-    begin = replace(state, points=state.points[used], steps=np.zeros(17), motion=motion)
+    begin = replace(state, points=state.points[used], steps=np.zeros(17), twist=twist)
+    begin = replace(begin, upper_delay_s=np.full(KEYFRAMES, 5e-3))
     found = adjust_drive(parameters, begin, kept)
     times = parameters.times_at(found.state.steps)
     assert times.upper_delay_s == pytest.approx(7e-3, abs=3e-4)

@@ -1,0 +1,350 @@
+"""Bundle adjustment of a rig from a drive: poses of keyframes, landmarks, both cameras and the transform between them.
+
+What a drive shows of a rig: the centre of each camera and the tilt between them, from the columns; the mapping from
+radius to elevation, because the same landmark is seen from near and from far. A stretch of that mapping along the
+baseline cannot be distinguished from a stretched world as long as the rig moves in one plane and does not tilt; only
+the form of the camera model and the prior hold it. The baseline keeps its length, for images alone do not show it.
+
+Poses and the rig are common unknowns of the least-squares problem; each landmark is a block of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from calib import se3
+from calib.errors import CalibError
+from calib.fit.least_squares import ArrowSystem, Ending, minimise
+from calib.fit.parameters import RigParameters
+from calib.fit.residual_structure import OUTLIER_RATIO, ResidualStructure, systematic_px
+from calib.fit.robust_scale import LOST_PX, robust_sigma
+from calib.models.camera import Array
+from calib.models.ocam import project_near
+from calib.rig import Rig
+
+Indices = NDArray[np.intp]
+Flags = NDArray[np.bool_]
+# Step of numeric derivatives, in steps of a parameter (about a pixel each) or in parts of a point's distance: a model
+# is linear over a ten-thousandth of a pixel, and rounding is 1e-9 of it.
+STEP = 1e-4
+# Cauchy's function counts errors of more sigmas less, so that one of 3 sigmas has half of the weight.
+KERNEL = 3.0
+# Patches are matched to a tenth of a pixel, so that observations that fit no better than to a pixel show no rigid
+# world.
+MAX_SIGMA_PX = 1.0
+# A landmark is not one point of one surface if the RMS of its errors exceeds the first number of sigmas. An
+# observation is a wrong match if its error exceeds the second. The robust kernel alone would leave them some weight.
+LOOSE_LANDMARK, LOOSE_OBSERVATION = 2.0, 6.0
+# Loose landmarks are left out in several rounds, because the rig moves without them, and others become loose.
+SELECTIONS = 3
+# A search ends where a step reduces the cost by less than a share of it: the rough one while landmarks are still
+# selected, because the search goes on with the next selection, the fine one at the end.
+ROUGH_GAIN, FINE_GAIN = 1e-3, 1e-6
+# Information of parameters that stay.
+HELD = 1e12
+# About six times the number of parameters of a rig. Fewer landmarks would not show that a parameter is wrong.
+MIN_LANDMARKS = 100
+# Errors of a patch are alike in both cameras, and from keyframe to keyframe (correlation 0.9 in rendered rooms),
+# so ten of these observations tell about as much as one corner in a calibration by boards.
+OBSERVATIONS_ALIKE = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class DriveObservations:
+    """Pixels (M, 2) in the cameras' images (camera 0 lower, 1 upper) of landmarks, seen from keyframes."""
+
+    keyframe: Indices  # (M,)
+    landmark: Indices  # (M,)
+    camera: Indices  # (M,)
+    pixels: Array  # (M, 2)
+
+    def __len__(self) -> int:
+        return len(self.landmark)
+
+    def only(self, kept: Flags) -> tuple[DriveObservations, Indices]:
+        """Return the chosen observations with landmarks numbered again, and the old numbers of those."""
+        used, landmark = np.unique(self.landmark[kept], return_inverse=True)
+        return DriveObservations(self.keyframe[kept], landmark, self.camera[kept], self.pixels[kept]), used
+
+
+@dataclass(frozen=True, slots=True)
+class DriveState:
+    """Poses of the keyframes at the lower camera's stamps, landmarks in odom, steps of the rig's parameters.
+
+    The motion at each keyframe predicts an exposure at another time.
+    """
+
+    T_rig_odom: Array  # (K, 4, 4)
+    points: Array  # (L, 3) m
+    twist: Array  # (K, 6) [m/s, rad/s] of the rig, in its own frame
+    upper_delay_s: Array  # (K,) upper stamp minus lower stamp
+    steps: Array  # (P,)
+
+
+@dataclass(frozen=True, slots=True)
+class DriveAdjustment:
+    """The rig that fits a drive, and how well."""
+
+    parameters: RigParameters
+    state: DriveState
+    observations: DriveObservations  # those that were used
+    covariance: Array  # (P, P) of the steps
+    sigma_px: float  # of one coordinate of an observation
+    prior: Array  # (P, P) information of the steps about zero
+
+    @property
+    def rig(self) -> Rig:
+        """The adjusted rig."""
+        return self.parameters.at(self.state.steps)
+
+    @property
+    def sigmas(self) -> Array:
+        """Standard deviations (P,) of the steps."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    @property
+    def seen(self) -> Flags:
+        """True (P,) for the parameters whose sigma the drive has reduced to less than half of that of the prior."""
+        return np.asarray(self.sigmas < np.sqrt(np.diag(np.linalg.inv(self.prior))) / 2)
+
+    def structure(self, side: int) -> ResidualStructure:
+        """Return the systematic part and the noise of the residuals in the lower (0) or in the upper (1) image."""
+        problem = DriveProblem(self.parameters, self.observations, self.prior, np.zeros(1, int))
+        seen, mounted = self.observations.camera == side, (self.rig.lower, self.rig.upper)[side]
+        own = problem.residuals(self.state)[seen]
+        systematic = systematic_px(self.observations.pixels[seen], own, mounted.camera.center)
+        length = np.linalg.norm(own, axis=1)
+        usual = own[length < OUTLIER_RATIO * np.median(length)]
+        return ResidualStructure(systematic, float(np.sqrt(max(0.0, float(np.mean(usual**2)) - systematic**2))))
+
+
+def adjust_drive(
+    parameters: RigParameters,
+    state: DriveState,
+    observations: DriveObservations,
+    fixed: Sequence[int] = (0,),
+    *,
+    alike: float = 1.0,
+) -> DriveAdjustment:
+    """Return the rig, poses and landmarks of least robust reprojection error near those given.
+
+    fixed: keyframes whose pose stays, one for each drive. alike: number of observations that tell as much as one
+    independent one; the prior of the parameters gets so many times its weight.
+    CalibError where fewer than MIN_LANDMARKS landmarks agree.
+    """
+    prior = parameters.prior()
+    problem = DriveProblem(parameters, observations, alike * prior, np.asarray(fixed))
+    state, sigma_px = problem.minimised(state, ROUGH_GAIN)
+    for number in range(SELECTIONS):
+        kept, used = observations.only(problem.consistent(state, sigma_px))
+        if sigma_px > MAX_SIGMA_PX:
+            raise CalibError(
+                f"calibrate drive: the landmarks are {sigma_px:.1f} px off any rig and path, expected "
+                f"{MAX_SIGMA_PX:.0f} px at most; is the rig that of these cameras?"
+            )
+        if len(used) < MIN_LANDMARKS:
+            raise CalibError(
+                f"calibrate drive: only {len(used)} landmarks agree with a rigid world, {MIN_LANDMARKS} "
+                "are needed; is the rig that of these cameras, is there enough to see?"
+            )
+        observations, state = kept, replace(state, points=state.points[used])
+        problem = replace(problem, observations=observations)
+        state, sigma_px = problem.minimised(state, FINE_GAIN if number == SELECTIONS - 1 else ROUGH_GAIN)
+    covariance = problem.covariance(state, sigma_px, alike**2 * prior)
+    return DriveAdjustment(parameters, state, observations, covariance, sigma_px, prior)
+
+
+def adjust_pairs(parameters: RigParameters, state: DriveState, observations: DriveObservations) -> Array:
+    """Return the steps (P,) by points that both cameras saw at once, near those of the state: a start for a drive.
+
+    The only condition is that the rays of both cameras meet. It tells the columns of the panoramas, but no lengths. The
+    poses of all keyframes stay; wherever they are, the result is the same.
+    """
+    problem = DriveProblem(parameters, observations, parameters.prior(), np.arange(len(state.T_rig_odom)))
+    return problem.minimised(state, ROUGH_GAIN)[0].steps
+
+
+def observation_sigma(rig: Rig, found: DriveAdjustment, fixed: Sequence[int] = (0,)) -> float:
+    """Return the sigma [px] of one coordinate with another rig, which stays; poses and landmarks are adjusted."""
+    parameters = RigParameters.about(rig)
+    still = np.zeros(len(parameters.names))
+    problem = DriveProblem(parameters, found.observations, np.eye(len(still)) * HELD, np.asarray(fixed))
+    return problem.minimised(replace(found.state, steps=still), ROUGH_GAIN)[1]
+
+
+def project(rig: Rig, camera: Indices, points: Array) -> Array:
+    """Return pixels (M, 2) of points (M, 3) [m] in the rig frame, each in its camera; NaN where there is no image."""
+    pixels = np.full((len(points), 2), np.nan)
+    for side, mounted in enumerate((rig.lower, rig.upper)):
+        pixels[camera == side] = project_near(mounted.camera, se3.apply(mounted.T_cam_rig, points[camera == side]))
+    return pixels
+
+
+@dataclass(frozen=True, slots=True)
+class _Jacobians:
+    """Weighted residuals (2 M,) and their derivatives."""
+
+    error: Array  # (2 M,)
+    by_pose: scipy.sparse.csr_matrix  # (2 M, 6 F) by twists of the free keyframes
+    by_steps: Array  # (2 M, P)
+    of_landmarks: Array  # (M, 2, 3) of each observation by its landmark
+
+
+@dataclass(frozen=True, slots=True)
+class DriveProblem:
+    """The robust reprojection error of landmarks, and the prior of the rig: what an adjustment of a drive minimises."""
+
+    parameters: RigParameters
+    observations: DriveObservations
+    prior: Array  # (P, P) information of the steps, about zero
+    fixed: Indices  # keyframes whose pose stays
+
+    def minimised(self, state: DriveState, gain: float) -> tuple[DriveState, float]:
+        """Return the state of least cost, and the standard deviation [px] of one coordinate there."""
+        found = minimise(self, state, Ending(gain))
+        return found, self.scale(found)
+
+    def consistent(self, state: DriveState, sigma_px: float) -> Flags:
+        """Return True (M,) for observations that are not far off, of landmarks that behave as one point."""
+        landmark, squared = self.observations.landmark, (self.residuals(state) ** 2).sum(axis=1)
+        total = np.bincount(landmark, np.minimum(squared, 1.0), len(state.points))
+        rms = np.sqrt(total / np.maximum(2 * np.bincount(landmark, minlength=len(state.points)), 1))
+        firm = (rms < LOOSE_LANDMARK * sigma_px)[landmark]
+        return np.asarray(firm & (squared < (LOOSE_OBSERVATION * sigma_px) ** 2))
+
+    def residuals(self, state: DriveState) -> Array:
+        """Return measured minus modelled pixels (M, 2); LOST_PX where the model has no image."""
+        seen = self.observations
+        cast = project(self.parameters.at(state.steps), seen.camera, self.in_rig(state, state.steps))
+        return np.where(np.isfinite(cast), seen.pixels - cast, LOST_PX)
+
+    def in_rig(self, state: DriveState, steps: Array) -> Array:
+        """Return the landmark (M, 3) of each observation in the rig frame at the time of its exposure."""
+        seen, times = self.observations, self.parameters.times_at(steps)
+        T = state.T_rig_odom[seen.keyframe]
+        points = (T[:, :3, :3] @ state.points[seen.landmark][:, :, None])[:, :, 0] + T[:, :3, 3]
+        upper = np.where(seen.camera == 1, state.upper_delay_s[seen.keyframe] + times.upper_delay_s, 0.0)
+        delay_s = (upper + times.line_time_s * seen.pixels[:, 1])[:, None]
+        # p(t) = exp(-t xi) p, to second order in t.
+        twist = state.twist[seen.keyframe]
+        first = -delay_s * (twist[:, :3] + np.cross(twist[:, 3:], points))
+        return np.asarray(points + first - delay_s / 2 * np.cross(twist[:, 3:], first))
+
+    def cost(self, state: DriveState, scale: float) -> float:
+        """Return the sum of Cauchy's function over the observations, and the prior's."""
+        squared = (self.residuals(state) ** 2).sum(axis=1) / scale**2
+        return float(KERNEL**2 * np.log1p(squared / KERNEL**2).sum() + state.steps @ self.prior @ state.steps)
+
+    def scale(self, state: DriveState) -> float:
+        """Return the standard deviation [px] of one coordinate, by the median."""
+        return robust_sigma(self.residuals(state))
+
+    def moved(self, state: DriveState, common: Array, blocks: Array) -> DriveState | None:
+        """Return the state after steps of poses and rig (C,) and of landmarks (L, 3); None without such a camera."""
+        P = len(self.prior)
+        T = state.T_rig_odom.copy()
+        free = np.setdiff1d(np.arange(len(T)), self.fixed)
+        T[free] = se3.exp(common[:-P].reshape(-1, 6)) @ T[free]
+        moved = replace(state, T_rig_odom=T, points=state.points + blocks, steps=state.steps + common[-P:])
+        try:
+            self.parameters.at(moved.steps)
+        except CalibError:
+            return None
+        return moved
+
+    def normal_equations(self, state: DriveState, scale: float) -> ArrowSystem:
+        """Return the normal equations of poses and rig, with one block for each landmark."""
+        J, seen = self._jacobians(state, scale), self.observations
+        between = J.by_pose.T @ J.by_steps
+        A = np.block(
+            [[(J.by_pose.T @ J.by_pose).toarray(), between], [between.T, J.by_steps.T @ J.by_steps + self.prior]]
+        )
+        blocks = np.zeros((len(state.points), 3, 3))
+        np.add.at(blocks, seen.landmark, np.swapaxes(J.of_landmarks, 1, 2) @ J.of_landmarks)
+        by_point = _scattered(J.of_landmarks, seen.landmark, len(state.points))
+        coupling = scipy.sparse.vstack(
+            [J.by_pose.T @ by_point, scipy.sparse.csr_matrix((by_point.T @ J.by_steps).T)]
+        ).tocsr()
+        a = np.concatenate([J.by_pose.T @ J.error, J.by_steps.T @ J.error - self.prior @ state.steps])
+        return ArrowSystem(A, coupling, blocks, a, np.asarray(by_point.T @ J.error))
+
+    def covariance(self, state: DriveState, scale: float, prior: Array) -> Array:
+        """Return the covariance (P, P) of the rig's steps, to whose gradient the prior adds the variance (P, P).
+
+        Errors of one landmark's observations depend on each other: its patch, its surface and its slope are the same
+        in all of them. So the variance of the gradient is that of the landmarks' sums (sandwich estimator with
+        clusters; Liang and Zeger 1986).
+        """
+        # 1. The inverse of the rig's information, landmarks eliminated.
+        system = self.normal_equations(state, scale)
+        inverse = np.linalg.inv(system.reduced()[0])
+        # 2. Each landmark's share (C, L) in the gradient, the landmark itself eliminated.
+        J, count = self._jacobians(state, scale), len(state.points)
+        of_landmark = np.repeat(self.observations.landmark, 2)
+        errors = scipy.sparse.csr_matrix((J.error, (np.arange(len(J.error)), of_landmark)), (len(J.error), count))
+        own = scipy.sparse.csr_matrix(
+            (system.c, (np.arange(3 * count), np.repeat(np.arange(count), 3))), (3 * count, count)
+        )
+        shares = np.concatenate([(J.by_pose.T @ errors).toarray(), (errors.T @ J.by_steps).T])
+        shares = shares - (system.B @ system.inverse_blocks() @ own).toarray()
+        # 3. The variance of the gradient between the two inverses.
+        P = len(prior)
+        known = np.zeros_like(inverse)
+        known[-P:, -P:] = prior
+        return np.asarray((inverse @ (shares @ shares.T + known) @ inverse)[-P:, -P:])
+
+    def _jacobians(self, state: DriveState, scale: float) -> _Jacobians:
+        """Return derivatives and residuals in sigmas, with the weights of Cauchy's function."""
+        seen, residual = self.observations, self.residuals(state)
+        squared = (residual**2).sum(axis=1) / scale**2
+        root = np.sqrt(1 / (1 + squared / KERNEL**2))[:, None] / scale
+        in_rig = self.in_rig(state, state.steps)
+        by_rig_point = self._by_point(state.steps, in_rig) * root[:, :, None]
+        by_pose = np.concatenate([by_rig_point, -by_rig_point @ se3.hat(in_rig)], axis=2)
+        by_steps = (self._by_steps(state) * root[:, :, None]).reshape(-1, len(self.prior))
+        J_poses = _scattered(by_pose, seen.keyframe, len(state.T_rig_odom))
+        is_free = np.repeat(~np.isin(np.arange(len(state.T_rig_odom)), self.fixed), 6)
+        return _Jacobians(
+            (residual * root).ravel(),
+            J_poses[:, is_free],
+            by_steps,
+            by_rig_point @ state.T_rig_odom[seen.keyframe][:, :3, :3],
+        )
+
+    def _by_point(self, steps: Array, points: Array) -> Array:
+        """Return the derivative (M, 2, 3) of the pixels by the points in the rig frame."""
+        rig, camera = self.parameters.at(steps), self.observations.camera
+        reach = STEP * np.linalg.norm(points, axis=1, keepdims=True)
+        columns = [
+            (project(rig, camera, points + reach * axis) - project(rig, camera, points - reach * axis)) / (2 * reach)
+            for axis in np.eye(3)
+        ]
+        return np.asarray(np.nan_to_num(np.stack(columns, axis=-1)))
+
+    def _by_steps(self, state: DriveState) -> Array:
+        """Return the derivative (M, 2, P) of the pixels by the rig's steps."""
+        parameters, camera = self.parameters, self.observations.camera
+        J = np.zeros((len(camera), 2, len(state.steps)))
+        in_rig = self.in_rig(state, state.steps)
+        for k, step in enumerate(STEP * np.eye(len(state.steps))):
+            at = np.isin(camera, [side for side in (0, 1) if parameters.moves_camera(side)[k]])
+            is_time = parameters.names[k] in parameters.times
+            ahead, behind = (
+                project(parameters.at(steps), camera[at], (self.in_rig(state, steps) if is_time else in_rig)[at])
+                for steps in (state.steps + step, state.steps - step)
+            )
+            J[at, :, k] = np.nan_to_num((ahead - behind) / (2 * STEP))
+        return J
+
+
+def _scattered(J: Array, index: Indices, count: int) -> scipy.sparse.csr_matrix:
+    """Return the sparse Jacobian (2 M, count * D) of blocks J (M, 2, D) at the unknown of each observation."""
+    M, _, D = J.shape
+    columns = np.broadcast_to(D * index[:, None, None] + np.arange(D), (M, 2, D))
+    rows = np.broadcast_to(np.arange(2 * M).reshape(M, 2, 1), (M, 2, D))
+    return scipy.sparse.csr_matrix((J.ravel(), (rows.ravel(), columns.ravel())), (2 * M, count * D))
