@@ -8,14 +8,18 @@
 
 msgspec checks every value, in `convert` only: a constructor takes any. An error is one line that names the dotted path
 of what is wrong.
+
+A rig or a configuration may come from a log of unknown origin. So the text is bounded before tomllib reads it, whose
+memory grows with the square of the depth; images of masks, which are embedded in rigs, do not count.
 """
 
 from __future__ import annotations
 
 import difflib
 import re
+import tomllib
 from collections.abc import Iterator, Sequence
-from dataclasses import is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from functools import cache
 from os import PathLike
 from types import MappingProxyType, NoneType, UnionType
@@ -36,8 +40,6 @@ from typing import (
 import msgspec
 from msgspec import Meta
 
-from calib.bounded_toml import parse_toml
-
 T = TypeVar("T")
 Path: TypeAlias = tuple[str, ...]
 _NAMES: Final = MappingProxyType(
@@ -51,6 +53,10 @@ _NAMES: Final = MappingProxyType(
 _SHOWN: Final = 60  # characters of a value in a message
 _NAMED: Final = 200  # unknown keys in a message, which may be all of a file of an earlier version
 MAX_NUMBER: Final = 1e300  # larger numbers overflow in products
+# More than any rig needs: the largest covariance has 12,720 correlations of 17 characters, 216 kB.
+MAX_CHARACTERS: Final = 1 << 19
+MAX_DOTS: Final = 64  # of a key; the deepest one of a rig or a configuration has 2
+_UNCOUNTED: Final = re.compile(r"""["']data:image/png;base64,[^"']*+["']|^[ \t]*+#.*+$""", re.MULTILINE)
 
 
 def bytes_of(path: str | PathLike[str], most: int) -> bytes:
@@ -63,6 +69,16 @@ def bytes_of(path: str | PathLike[str], most: int) -> bytes:
     if len(data) > most:
         raise ValueError(f"has more than {most} bytes: is it the right file?")
     return data
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """Parse a TOML text; raise ValueError for a malformed one, and for one beyond the limits of this module."""
+    bare = _UNCOUNTED.sub("", text)
+    if len(bare) > MAX_CHARACTERS:
+        raise ValueError(f"more than {MAX_CHARACTERS} characters beside images of masks")
+    if any(part.count(".") > MAX_DOTS for part in re.split(r"[=,\[\]{}\n]", bare)):
+        raise ValueError(f"a key of more than {MAX_DOTS + 1} parts")
+    return tomllib.loads(text)
 
 
 def table_of(data: bytes) -> dict[str, Any]:
@@ -80,15 +96,53 @@ def convert(root: type[T], table: dict[str, Any], path: Path = ()) -> T:
 
     path: of the table within its file.
     """
-    if unknown := list(_unknown_keys(root, table, path)):
-        text = str(unknown_key(root, *unknown[0]))
+    unknown, wrong = list[tuple[Any, Path]](), list[str]()
+    found = _converted(root, table, path, unknown, wrong)
+    if unknown:
         others = ", ".join(dotted(other) for _, other in unknown[1:_NAMED])
-        raise ValueError(f"{text}; unknown are also {others}" if others else text)
-    _check(root, table, path)
+        raise ValueError(str(unknown_key(root, *unknown[0])) + (f"; unknown are also {others}" if others else ""))
+    if wrong:
+        raise ValueError(wrong[0])
+    return found  # type: ignore[no-any-return]
+
+
+def _converted(kind: Any, value: Any, path: Path, unknown: list[tuple[Any, Path]], wrong: list[str]) -> Any:
+    """Return the value of a type; add what is wrong in it, and section and path of keys that no section has."""
+    bare, _ = _bounded(kind)
+    element = get_args(bare)[0] if get_origin(bare) is tuple else None
+    # 1. A section, key by key.
+    if is_section(kind) and isinstance(value, dict):
+        own, types, faults = dict[str, Any](), types_of(kind), len(wrong) + len(unknown)
+        for name, inner in value.items():
+            if name in types:
+                own[name] = _converted(types[name], inner, (*path, name), unknown, wrong)
+            else:
+                unknown.append((kind, (*path, name)))
+        wrong += [f"{dotted((*path, name))} is missing" for name in _required(kind) if name not in value]
+        try:
+            return kind(**own) if len(wrong) + len(unknown) == faults else None
+        except ValueError as error:
+            wrong.append(f"{dotted(path)}: {error}")
+            return None
+    # 2. A list of sections.
+    if is_section(element) and isinstance(value, list):
+        names = [(*path[:-1], f"{path[-1]}[{number}]") for number in range(len(value))]
+        return tuple(_converted(element, one, name, unknown, wrong) for one, name in zip(value, names, strict=True))
+    # 3. A value.
     try:
-        return msgspec.convert(table, root)
-    except msgspec.ValidationError as error:
-        raise ValueError(_explained(root, table, path, str(error))) from None
+        if _is_finite(value) and not is_section(kind):
+            return msgspec.convert(value, kind)
+    except msgspec.ValidationError:
+        pass
+    wrong.append(f"{dotted(path)}: expected {described(kind)}, found {shown(value)}")
+    return None
+
+
+def _required(section: Any) -> list[str]:
+    """Return the keys of a section that have no default."""
+    if is_dataclass(section):
+        return [one.name for one in fields(section) if one.default is MISSING and one.default_factory is MISSING]
+    return [one.name for one in msgspec.structs.fields(section) if one.required]
 
 
 def dotted(path: Sequence[str]) -> str:
@@ -112,16 +166,12 @@ def is_section(kind: Any) -> bool:
     return isinstance(kind, type) and (is_dataclass(kind) or issubclass(kind, msgspec.Struct))
 
 
+@cache
 def types_of(section: Any) -> dict[str, Any]:
     """Return the types of the keys of a section, with their annotations.
 
     A field of a dataclass without a text in its annotation is no key: a parameter of a method that files do not set.
     """
-    return _hints(section)
-
-
-@cache
-def _hints(section: Any) -> dict[str, Any]:
     hints = get_type_hints(section, include_extras=True)
     present = {name: _unless_absent(kind) for name, kind in hints.items() if get_origin(kind) is not ClassVar}
     if not is_dataclass(section):
@@ -167,7 +217,7 @@ def unknown_key(root: Any, section: Any, path: Path) -> ValueError:
 def described(kind: Any) -> str:
     """Return type and range of a key in words."""
     kind, bounds = _bounded(kind)
-    if get_origin(kind) is dict:
+    if get_origin(kind) is dict or is_section(kind):
         return "a section"
     if get_origin(kind) is Literal:
         return "one of " + ", ".join(repr(choice) for choice in get_args(kind))
@@ -196,62 +246,8 @@ def _bounded(kind: Any) -> tuple[Any, str]:
     return bare, f" from {low} to {high}"
 
 
-def _unknown_keys(kind: Any, value: object, path: Path) -> Iterator[tuple[Any, Path]]:
-    """Yield section and path of each key that its section does not have."""
-    bare, _ = _bounded(kind)
-    element = get_args(bare)[0] if get_origin(bare) is tuple else None
-    if is_section(kind) and isinstance(value, dict):
-        types = types_of(kind)
-        for name, inner in value.items():
-            if name in types:
-                yield from _unknown_keys(types[name], inner, (*path, name))
-            else:
-                yield kind, (*path, name)
-    elif is_section(element) and isinstance(value, list):
-        for number, inner in enumerate(value):
-            yield from _unknown_keys(element, inner, (*path[:-1], f"{path[-1]}[{number}]"))
-
-
-def _check(kind: Any, value: object, path: Path) -> None:
-    """Raise ValueError for values in the place of sections, and numbers that are not finite; all keys are known."""
-    bare, _ = _bounded(kind)
-    element = get_args(bare)[0] if get_origin(bare) is tuple else None
-    if is_section(kind):
-        if not isinstance(value, dict):
-            raise ValueError(f"{dotted(path)}: expected a section, found {shown(value)}")
-        types = types_of(kind)
-        for name, inner in value.items():
-            _check(types[name], inner, (*path, name))
-    elif is_section(element) and isinstance(value, list):
-        for number, inner in enumerate(value):
-            _check(element, inner, (*path[:-1], f"{path[-1]}[{number}]"))
-    elif not _is_finite(value):
-        raise ValueError(f"{dotted(path)}: expected {described(kind)}, found {shown(value)}")
-
-
 def _is_finite(value: object) -> bool:
     """True if all numbers in a value, which may be a list, are finite."""
     if isinstance(value, list):
         return all(map(_is_finite, value))
     return not isinstance(value, int | float) or abs(value) < MAX_NUMBER
-
-
-def _explained(root: Any, table: dict[str, Any], within: Path, message: str) -> str:
-    """Return an error of msgspec as it is shown: with the dotted path, what is expected there, and what is found."""
-    text, _, where = message.partition(" - at `$")
-    kind: Any
-    value: Any
-    kind, value, path = root, table, dotted(within)
-    for part in re.findall(r"\w+|\[\d+\]", where):
-        if part.startswith("["):
-            element = get_args(_bounded(kind)[0])[0]
-            if not is_section(element):
-                break  # what is wrong is shown as the whole list
-            kind, value, path = element, value[int(part[1:-1])], f"{path}{part}"
-        else:
-            kind, value, path = types_of(kind)[part], value[part], f"{path}.{part}".lstrip(".")
-    if missing := re.search(r"required field `(.*)`", text):
-        return f"{path}.{missing[1]} is missing".lstrip(".")
-    if is_section(kind):
-        return f"{path}: {text}"
-    return f"{path}: expected {described(kind)}, found {shown(value)}"

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Final
 
-from calib.bounded_toml import parse_toml
+from calib.typed_toml import parse_toml
 from omnid.client import Diagnostics, Driver, Robot
 from omnid.core.control.velocity_limits import VelocityLimits
 from omnid.errors import OmnidError

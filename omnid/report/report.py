@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 
 from calib import se3
-from calib.bounded_toml import parse_toml
 from calib.errors import CalibError
 from calib.models.names import model_in_words
 from calib.panorama import fit_cylinder, remap_tables
+from calib.typed_toml import parse_toml
 from drivers.errors import DriverError
 from drivers.logs.log_reader import LogReader
 from drivers.logs.open_log import LogState

@@ -40,16 +40,17 @@ def refusal(module: str, function: str, text: str) -> str:
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("'a.' * 20_000 + 'a = 1'", "a key of at most"),
-        ("'a . ' * 3_000_000 + 'a = 1'", "characters beside strings"),
-        ("'[' + '\"\".' * 100_000 + 'a]'", "a key of at most"),
-        ("'schema = 0x' + 'f' * 200_000", "keys and numbers of at most"),
-        ("'a = [' + '1,' * 7_000_000 + ']'", "characters beside strings"),
-        ("'a = [' + '\"\",' * 1_000_000 + ']'", "characters beside strings"),
-        ("'\\n' * 200_000", "lines"),
+        ("'a.' * 20_000 + 'a = 1'", "a key of more than 65 parts"),
+        ("'a . ' * 3_000_000 + 'a = 1'", "characters beside images of masks"),
+        ("'[' + '\"\".' * 100_000 + 'a]'", "a key of more than 65 parts"),
+        ("'schema = 0x' + 'f' * 200_000", "schema: expected version 1, found a huge int"),
+        ("'a = [' + '1,' * 7_000_000 + ']'", "characters beside images of masks"),
+        ("'a = [' + '\"\",' * 1_000_000 + ']'", "characters beside images of masks"),
+        ("'\\n' * 200_000", "schema: expected version 1, found nothing"),
         ("'a = ' + '[' * 100_000", "TOML"),
-        ("'a = \"' + 'x' * 15_000_000", "a string has no end"),
-        ("'a = \"' + '\\\\\\\\' * 1_000_000 + '\"'", "schema: expected version 1"),
+        ("'a = \"' + 'x' * 15_000_000", "characters beside images of masks"),
+        ("'a = \"' + '\\\\\\\\' * 1_000_000 + '\"'", "characters beside images of masks"),
+        ("'# ' + '.' * 400_000 + '\\na = 1'", "schema: expected version 1, found nothing"),
     ],
 )
 def test_refuses_a_rig_that_would_fill_the_memory(text: str, reason: str) -> None:
