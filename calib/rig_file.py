@@ -26,7 +26,7 @@ from calib import se3
 from calib.atomic_file import write_file
 from calib.errors import CalibError
 from calib.models.camera import Mask, OmniCamera
-from calib.models.names import NAMES, OCAM_NAMES, camera_of, is_coefficient, model_name, values_of
+from calib.models.names import MODELS, camera_of, is_coefficient, model_name, names_of, values_of
 from calib.models.ocam import DISTANCE_M, OcamCamera, View
 from calib.models.wavefront import WAVEFRONT_NAMES
 from calib.rig import MountedCamera, Rig, ShutterTimes
@@ -71,7 +71,11 @@ class OcamIntrinsics(Struct, frozen=True):
 
 INTRINSICS: Final[Mapping[str, type[Struct]]] = {
     "ocam": OcamIntrinsics,
-    **{model: defstruct(f"{model}_intrinsics", [(key, float) for key in keys]) for model, keys in NAMES.items()},
+    **{
+        model: defstruct(f"{model}_intrinsics", [(name, float) for name in names_of(model)])
+        for model in MODELS
+        if model != "ocam"
+    },
 }
 
 
@@ -258,7 +262,7 @@ def _covariance(table: CovarianceTable, rig: RigTable) -> RigCovariance:
     _require_version("covariance.version", table.version, COVARIANCE_VERSION)
     known, names = {*TRANSFORM_NAMES}, table.parameters
     for side, camera in (("lower", rig.lower), ("upper", rig.upper)):
-        known |= {f"{side} {name}" for name in NAMES.get(camera.model, OCAM_NAMES)}
+        known |= {f"{side} {name}" for name in names_of(camera.model)}
         if camera.model == "ocam":
             known |= {name for name in names if name.startswith(f"{side} ") and is_coefficient(name.split()[-1])}
     if not names or not known.issuperset(names):

@@ -17,7 +17,7 @@ from calib.errors import CalibError
 from calib.models.camera import Array, OmniCamera
 from calib.models.names import changed, is_coefficient, values_of
 from calib.models.ocam import ASTIGMATISM_NAMES, TANGENTIAL_NAMES, OcamCamera
-from calib.models.unified import OMNI_NAMES, UnifiedCamera
+from calib.models.unified import DISTORTION_NAMES, UnifiedCamera
 from calib.models.wavefront import WAVEFRONT_NAMES
 from calib.rig import Rig, ShutterTimes
 from calib.rig_covariance import TRANSFORM_NAMES as RIG_TRANSFORM_NAMES
@@ -59,7 +59,7 @@ def central_names(camera: OmniCamera, distortion: Collection[str] = ()) -> tuple
     """
     values = values_of(camera)
     if isinstance(camera, UnifiedCamera):
-        return tuple(name for name in OMNI_NAMES if name in (*OMNI_NAMES[:5], *distortion) or values[name] != 0)
+        return tuple(name for name in values if name not in DISTORTION_NAMES or name in distortion or values[name] != 0)
     if not isinstance(camera, OcamCamera):
         raise CalibError(
             f"calibrate: expected an omni or ocam camera, whose parameters can be fitted, found "

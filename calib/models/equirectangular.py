@@ -9,6 +9,7 @@ import numpy as np
 
 from calib.errors import CalibError
 from calib.models.camera import Array
+from calib.models.lens import check_plane
 
 # Columns by which a full turn may differ from the image's width, so that the two ends of the image still meet.
 SEAM_PX = 1e-3
@@ -27,15 +28,7 @@ class EquirectangularCamera:
     size: tuple[int, int]
 
     def __post_init__(self) -> None:
-        if not np.isfinite((*self.focal, *self.center)).all():
-            raise CalibError(
-                f"equirectangular camera: every parameter must be a finite number, found {(*self.focal, *self.center)}"
-            )
-        if min(self.focal) <= 0 or min(self.size) < 1:
-            raise CalibError(
-                "equirectangular camera: expected fu and fv above 0 and a size, found focal "
-                f"{self.focal}, size {self.size}"
-            )
+        check_plane("equirectangular", (), self.focal, self.center, self.size)
         if self.size[0] > 2 * math.pi * self.focal[0] + SEAM_PX:
             raise CalibError(
                 f"equirectangular camera: {self.size[0]} columns are more than a full turn of "

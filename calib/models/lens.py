@@ -9,15 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.errors import CalibError
 from calib.models.camera import Array
 
 NEWTON_STEPS = 20  # enough: lenses with coefficients up to 0.3 take 10 at most
 TOLERANCE_RAD = 1e-10  # Error of an image radius by the focal length at which the search ends: no pixel is so exact.
-# Angles at which the image radius of an equidistant lens is tested for growing: a quarter of a degree, because its
-# polynomial of few terms does not fall and rise again within.
-ANGLES = 720
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +29,7 @@ class DoubleSphereCamera:
     size: tuple[int, int]
 
     def __post_init__(self) -> None:
-        _check("ds", (self.xi, self.alpha), self.focal, self.center, self.size)
+        check_plane("ds", (self.xi, self.alpha), self.focal, self.center, self.size)
         if not (-1 < self.xi < 1 and 0 <= self.alpha <= 1):
             raise CalibError(
                 f"ds camera: expected xi between -1 and 1 and alpha of 0 to 1, found {self.xi} and {self.alpha}"
@@ -42,19 +40,16 @@ class DoubleSphereCamera:
         x, y, z = np.asarray(points, float).T
         d1 = np.sqrt(x * x + y * y + z * z)
         shifted = self.xi * d1 + z
-        d2 = np.sqrt(x * x + y * y + shifted**2)
-        w1 = _slope(self.alpha)
+        w1 = _edge(self.alpha)
         w2 = (w1 + self.xi) / np.sqrt(2 * w1 * self.xi + self.xi**2 + 1)
-        scale = self.alpha * d2 + (1 - self.alpha) * shifted
-        return _pixels(self, x, y, np.where((z > -w2 * d1) & (d1 > 0), scale, np.nan))
+        scale = self.alpha * np.sqrt(x * x + y * y + shifted**2) + (1 - self.alpha) * shifted
+        return _pixels(self, x, y, scale, seen=(z > -w2 * d1) & (d1 > 0))
 
     def lift(self, pixels: Array) -> Array:
         """Return unit rays (N, 3) of pixels (N, 2); NaN where there is none. Eq. (46) to (51)."""
         mx, my, r2 = _plane(self, pixels)
-        root = 1 - (2 * self.alpha - 1) * r2
-        mz = (1 - self.alpha**2 * r2) / (self.alpha * np.sqrt(np.where(root >= 0, root, np.nan)) + 1 - self.alpha)
-        under = mz**2 + (1 - self.xi**2) * r2
-        k = (mz * self.xi + np.sqrt(np.where(under >= 0, under, np.nan))) / (mz**2 + r2)
+        mz = _height(self.alpha, r2)
+        k = (mz * self.xi + _root(mz**2 + (1 - self.xi**2) * r2)) / (mz**2 + r2)
         return np.column_stack([k * mx, k * my, k * mz - self.xi])
 
 
@@ -69,7 +64,7 @@ class ExtendedUnifiedCamera:
     size: tuple[int, int]
 
     def __post_init__(self) -> None:
-        _check("eucm", (self.alpha, self.beta), self.focal, self.center, self.size)
+        check_plane("eucm", (self.alpha, self.beta), self.focal, self.center, self.size)
         if not (0 <= self.alpha <= 1 and self.beta > 0):
             raise CalibError(f"eucm camera: expected alpha of 0 to 1 and beta above 0, found {self.alpha}, {self.beta}")
 
@@ -78,15 +73,12 @@ class ExtendedUnifiedCamera:
         x, y, z = np.asarray(points, float).T
         d = np.sqrt(self.beta * (x * x + y * y) + z * z)
         scale = self.alpha * d + (1 - self.alpha) * z
-        return _pixels(self, x, y, np.where((z > -_slope(self.alpha) * d) & (d > 0), scale, np.nan))
+        return _pixels(self, x, y, scale, seen=(z > -_edge(self.alpha) * d) & (d > 0))
 
     def lift(self, pixels: Array) -> Array:
         """Return unit rays (N, 3) of pixels (N, 2); NaN where there is none. Eq. (12)."""
         mx, my, r2 = _plane(self, pixels)
-        root = 1 - (2 * self.alpha - 1) * self.beta * r2
-        mz = (1 - self.beta * self.alpha**2 * r2) / (
-            self.alpha * np.sqrt(np.where(root >= 0, root, np.nan)) + 1 - self.alpha
-        )
+        mz = _height(self.alpha, self.beta * r2)
         return np.asarray(np.column_stack([mx, my, mz]) / np.sqrt(r2 + mz**2)[:, None])
 
 
@@ -103,14 +95,14 @@ class EquidistantCamera:
     size: tuple[int, int]
 
     def __post_init__(self) -> None:
-        _check("equidistant", self.coefficients, self.focal, self.center, self.size)
+        check_plane("equidistant", self.coefficients, self.focal, self.center, self.size)
 
     @property
     def widest_rad(self) -> float:
         """The angle from the axis up to which the image radius grows."""
-        angles = np.linspace(0, np.pi, ANGLES, endpoint=False)
-        falls = np.flatnonzero(self._slope(angles) <= 0)
-        return float(angles[max(0, falls[0] - 1)]) if falls.size else float(np.pi)
+        roots = np.roots(self._slope.coef[::-1])
+        turns = roots.real[(np.abs(roots.imag) < TOLERANCE_RAD) & (roots.real > 0)]
+        return float(min([np.pi, *np.sqrt(turns)]))
 
     def project(self, points: Array) -> Array:
         """Return pixels (N, 2) of points (N, 3); NaN beyond widest_rad. Eq. (6)."""
@@ -118,44 +110,41 @@ class EquidistantCamera:
         r = np.hypot(x, y)
         angle = np.arctan2(r, z)
         with np.errstate(invalid="ignore", divide="ignore"):
-            scale = np.where(r > 0, self._radius(angle) / r, 1 / z)
-        seen = (angle < self.widest_rad) & ((r > 0) | (z > 0)) & np.isfinite(x + y + z)
-        return _pixels(self, x, y, 1 / np.where(seen, scale, np.nan))
+            scale = np.where(r > 0, r / self._radius(angle), z)
+        return _pixels(self, x, y, scale, seen=(angle < self.widest_rad) & np.isfinite(x + y + z))
 
     def lift(self, pixels: Array) -> Array:
         """Return unit rays (N, 3) of pixels (N, 2), by Newton's method; NaN where there is none."""
         mx, my, r2 = _plane(self, pixels)
-        radius, widest = np.sqrt(r2), self.widest_rad
+        radius, widest, slope = np.sqrt(r2), self.widest_rad, self._slope
         angle = np.minimum(radius, widest)
         with np.errstate(all="ignore"):
             for _ in range(NEWTON_STEPS):
-                angle = np.clip(angle - (self._radius(angle) - radius) / self._slope(angle), 0, widest)
+                angle = np.clip(angle - (self._radius(angle) - radius) / slope(angle * angle), 0, widest)
             angle = np.where(np.abs(self._radius(angle) - radius) < TOLERANCE_RAD, angle, np.nan)
             side = np.where(radius > 0, np.sin(angle) / radius, 1.0)
         return np.column_stack([side * mx, side * my, np.cos(angle)])
 
     def _radius(self, t: Array) -> Array:
-        k1, k2, k3, k4 = self.coefficients
-        t2 = t * t
-        return np.asarray(t * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))))
+        return np.asarray(t * np.polynomial.Polynomial([1.0, *self.coefficients])(t * t))
 
-    def _slope(self, t: Array) -> Array:
-        k1, k2, k3, k4 = self.coefficients
-        t2 = t * t
-        return np.asarray(1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4))))
+    @property
+    def _slope(self) -> np.polynomial.Polynomial:
+        """The derivative of the radius by the angle, as a polynomial of the squared angle."""
+        return np.polynomial.Polynomial([(2 * k + 1) * a for k, a in enumerate((1.0, *self.coefficients))])
 
 
 LensCamera = DoubleSphereCamera | ExtendedUnifiedCamera | EquidistantCamera
 
 
-def _check(
+def check_plane(
     name: str,
     parameters: tuple[float, ...],
     focal: tuple[float, float],
     center: tuple[float, float],
     size: tuple[int, int],
 ) -> None:
-    """Raise CalibError for parameters that no camera has."""
+    """Raise CalibError for parameters that no camera without a flip has."""
     values = (*parameters, *focal, *center)
     if not np.isfinite(values).all():
         raise CalibError(f"{name} camera: every parameter must be a finite number, found {values}")
@@ -163,14 +152,24 @@ def _check(
         raise CalibError(f"{name} camera: expected fu and fv above 0 and a size, found focal {focal}, size {size}")
 
 
-def _slope(alpha: float) -> float:
+def _edge(alpha: float) -> float:
     """Return the bound of z / distance of visible points, its sign changed."""
     return alpha / (1 - alpha) if alpha <= 0.5 else (1 - alpha) / alpha
 
 
-def _pixels(camera: LensCamera, x: Array, y: Array, scale: Array) -> Array:
-    """Return the pixels (N, 2) of (x, y) / scale on the plane."""
-    scale = np.where(scale > 0, scale, np.nan)
+def _height(alpha: float, r2: Array) -> Array:
+    """Return the third component of the ray of a point of the plane at a squared radius; NaN where there is none."""
+    return np.asarray((1 - alpha**2 * r2) / (alpha * _root(1 - (2 * alpha - 1) * r2) + 1 - alpha))
+
+
+def _root(values: Array) -> Array:
+    """Return square roots; NaN of negative values."""
+    return np.asarray(np.sqrt(np.where(values >= 0, values, np.nan)))
+
+
+def _pixels(camera: LensCamera, x: Array, y: Array, scale: Array, seen: NDArray[np.bool_]) -> Array:
+    """Return the pixels (N, 2) of (x, y) / scale on the plane; NaN for what is not seen."""
+    scale = np.where(seen & (scale > 0), scale, np.nan)
     return np.column_stack([x / scale, y / scale]) * camera.focal + camera.center
 
 

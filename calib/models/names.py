@@ -4,65 +4,64 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import Any, Final
+
+import numpy as np
 
 from calib.errors import CalibError
 from calib.models.camera import Mask, OmniCamera, inscribed_mask, whole_image
 from calib.models.equirectangular import EquirectangularCamera
 from calib.models.lens import DoubleSphereCamera, EquidistantCamera, ExtendedUnifiedCamera
 from calib.models.ocam import ASTIGMATISM_NAMES, DISTANCE_M, TANGENTIAL_NAMES, OcamCamera, View
-from calib.models.unified import OMNI_NAMES, UnifiedCamera
+from calib.models.unified import DISTORTION_NAMES, UnifiedCamera
 from calib.models.wavefront import WAVEFRONT_NAMES
 
-PINHOLE_NAMES = ("fu", "fv", "pu", "pv")
-# Parameters of the models in the order of files. Those of an ocam camera: a0, a1 ... of its polynomial, then these.
-NAMES: Mapping[str, tuple[str, ...]] = MappingProxyType(
+_PLANE: Final = {"focal": ("fu", "fv"), "center": ("pu", "pv")}
+# By model: its class, and the names of the numbers of each field, in the order of files. The polynomial of an ocam
+# camera, a0, a1 ..., comes before these.
+MODELS: Final[Mapping[str, tuple[type[Any], Mapping[str, tuple[str, ...]]]]] = MappingProxyType(
     {
-        "omni": OMNI_NAMES,
-        "ds": ("xi", "alpha", *PINHOLE_NAMES),
-        "eucm": ("alpha", "beta", *PINHOLE_NAMES),
-        "equidistant": ("k1", "k2", "k3", "k4", *PINHOLE_NAMES),
-        "equirectangular": PINHOLE_NAMES,
+        "omni": (UnifiedCamera, {"xi": ("xi",), **_PLANE, "distortion": DISTORTION_NAMES}),
+        "ocam": (
+            OcamCamera,
+            {
+                "center_row_column": ("center_row", "center_column"),
+                "affine": ("c", "d", "e"),
+                "tangential": TANGENTIAL_NAMES,
+                "astigmatism": ASTIGMATISM_NAMES,
+                "wavefront": WAVEFRONT_NAMES,
+            },
+        ),
+        "ds": (DoubleSphereCamera, {"xi": ("xi",), "alpha": ("alpha",), **_PLANE}),
+        "eucm": (ExtendedUnifiedCamera, {"alpha": ("alpha",), "beta": ("beta",), **_PLANE}),
+        "equidistant": (EquidistantCamera, {"coefficients": ("k1", "k2", "k3", "k4"), **_PLANE}),
+        "equirectangular": (EquirectangularCamera, _PLANE),
     }
 )
-MODELS: Mapping[type, str] = MappingProxyType(
-    {
-        UnifiedCamera: "omni",
-        OcamCamera: "ocam",
-        DoubleSphereCamera: "ds",
-        ExtendedUnifiedCamera: "eucm",
-        EquidistantCamera: "equidistant",
-        EquirectangularCamera: "equirectangular",
-    }
-)
-LENSES = (DoubleSphereCamera, ExtendedUnifiedCamera, EquidistantCamera, EquirectangularCamera)
-OCAM_NAMES = ("center_row", "center_column", "c", "d", "e", *TANGENTIAL_NAMES, *ASTIGMATISM_NAMES, *WAVEFRONT_NAMES)
+# Fields whose numbers are 0 where none are given.
+OPTIONAL: Final = ("distortion", "coefficients", "tangential", "astigmatism", "wavefront")
+
+
+def names_of(model: str) -> tuple[str, ...]:
+    """Return the names of a model's parameters in the order of files, without those of a polynomial."""
+    return tuple(name for names in MODELS[model][1].values() for name in names)
 
 
 def model_name(camera: OmniCamera) -> str:
     """Return the name of a camera's model, as the key `model` of files; CalibError for a camera of no known model."""
-    if type(camera) not in MODELS:
-        raise CalibError(f"expected a camera of a known model, found {type(camera).__name__}")
-    return MODELS[type(camera)]
+    for model, (kind, _) in MODELS.items():
+        if type(camera) is kind:
+            return model
+    raise CalibError(f"expected a camera of a known model, found {type(camera).__name__}")
 
 
 def values_of(camera: OmniCamera) -> dict[str, float]:
     """Return all parameters of a camera by name, in the order of files; CalibError for a camera of no known model."""
-    if isinstance(camera, OcamCamera):
-        polynomial = {f"a{power}": value for power, value in enumerate(camera.polynomial)}
-        others = (*camera.center_row_column, *camera.affine, *camera.tangential, *camera.astigmatism, *camera.wavefront)
-        return polynomial | dict(zip(OCAM_NAMES, others, strict=True))
-    own: tuple[float, ...] = ()
-    if isinstance(camera, UnifiedCamera):
-        return dict(zip(OMNI_NAMES, (camera.xi, *camera.focal, *camera.center, *camera.distortion), strict=True))
-    if isinstance(camera, DoubleSphereCamera):
-        own = (camera.xi, camera.alpha)
-    elif isinstance(camera, ExtendedUnifiedCamera):
-        own = (camera.alpha, camera.beta)
-    elif isinstance(camera, EquidistantCamera):
-        own = camera.coefficients
-    names = NAMES[model_name(camera)]
-    assert isinstance(camera, LENSES)
-    return dict(zip(names, (*own, *camera.focal, *camera.center), strict=True))
+    polynomial = camera.polynomial if isinstance(camera, OcamCamera) else ()
+    values = {f"a{power}": value for power, value in enumerate(polynomial)}
+    for field, names in MODELS[model_name(camera)][1].items():
+        values |= zip(names, np.ravel(getattr(camera, field)).tolist(), strict=True)
+    return values
 
 
 def camera_of(
@@ -74,35 +73,20 @@ def camera_of(
 ) -> OmniCamera:
     """Return the camera of a model with these parameters; those of distortions and of real mirrors may be missing.
 
-    size (width, height) [px]; view and distance_m: of an ocam camera. Raise CalibError for values of no camera.
+    size (width, height) [px]; view and distance_m: of an ocam camera. Raise CalibError for values of no camera, and
+    KeyError for a missing one.
     """
-    v = {name: float(value) for name, value in values.items()}
-    if model == "ocam":
-        degree = max(int(name[1:]) for name in v if is_coefficient(name))
-        s1, s2, p1, p2 = (v.get(name, 0.0) for name in (*ASTIGMATISM_NAMES, *TANGENTIAL_NAMES))
-        return OcamCamera(
-            tuple(v.get(f"a{power}", 0.0) for power in range(degree + 1)),
-            (v["center_row"], v["center_column"]),
-            (v["c"], v["d"], v["e"]),
-            size,
-            view,
-            (p1, p2),
-            (s1, s2),
-            tuple(v.get(name, 0.0) for name in WAVEFRONT_NAMES),
-            distance_m,
-        )
-    focal, center = (v["fu"], v["fv"]), (v["pu"], v["pv"])
-    k1, k2, k3, k4, p1, p2 = (v.get(name, 0.0) for name in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    match model:
-        case "omni":
-            return UnifiedCamera(v["xi"], focal, center, size, (k1, k2, p1, p2))
-        case "ds":
-            return DoubleSphereCamera(v["xi"], v["alpha"], focal, center, size)
-        case "eucm":
-            return ExtendedUnifiedCamera(v["alpha"], v["beta"], focal, center, size)
-        case "equidistant":
-            return EquidistantCamera((k1, k2, k3, k4), focal, center, size)
-    return EquirectangularCamera(focal, center, size)
+    kind, parts = MODELS[model]
+    fields = dict[str, Any](size=size)
+    for field, names in parts.items():
+        numbers = tuple(float(values.get(name, 0.0) if field in OPTIONAL else values[name]) for name in names)
+        fields[field] = numbers[0] if names == (field,) else numbers
+    if kind is OcamCamera:
+        degree = max(int(name[1:]) for name in values if is_coefficient(name))
+        polynomial = tuple(float(values.get(f"a{power}", 0.0)) for power in range(degree + 1))
+        fields |= {"polynomial": polynomial, "view": view, "distance_m": distance_m}
+    camera: OmniCamera = kind(**fields)
+    return camera
 
 
 def changed(camera: OmniCamera, changes: Mapping[str, float]) -> OmniCamera:

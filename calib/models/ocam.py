@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from calib.errors import CalibError
 from calib.models import wavefront as wavefronts
-from calib.models.camera import Array, OmniCamera
+from calib.models.camera import Array, OmniCamera, undistorted
 
 View = Literal["mirror", "direct"]
 VIEWS: tuple[View, View] = ("mirror", "direct")
@@ -44,9 +44,9 @@ SOLVED_PX = 1e-9
 # A camera with a wavefront is exact for points at this distance; half of it and twice as far have the same error.
 DISTANCE_M, MIN_DISTANCE_M, MAX_DISTANCE_M = 1.5, 0.05, 1e4
 NO_WAVEFRONT = (0.0,) * wavefronts.TERMS
-# Newton steps that invert the tangential and astigmatic terms; measured: terms of 3, 30 and 60 px at a rim of 460 px
-# take 2, 4 and 6. Pixels without convergence, within a millionth of what a corner errs by, have no ray.
-TANGENTIAL_STEPS, TANGENTIAL_TOLERANCE_PX = 8, 1e-8
+# Pixels at which the inverse of the tangential and astigmatic terms does not converge, within a millionth of what a
+# corner errs by, have no ray.
+TANGENTIAL_TOLERANCE_PX = 1e-8
 # Least determinant of the affine: less would squeeze the image to a line.
 MIN_DETERMINANT = 1e-6
 # A root of a polynomial counts as real if its imaginary part is below this part of the image diagonal, as rounding is.
@@ -156,7 +156,8 @@ class OcamCamera:
         row, column = pixels[:, 1] - self.center_row_column[0], pixels[:, 0] - self.center_row_column[1]
         x, y = (row - d * column) / (c - d * e), (c * column - e * row) / (c - d * e)
         if self._is_distorted:
-            x, y = self._undistort(x, y)
+            x, y = undistorted(self.distort, self.distortion_jacobian, (x, y), TANGENTIAL_TOLERANCE_PX)
+            x = np.where(self._is_unfolded(x, y), x, np.nan)
         rho = np.hypot(x, y)
         z = self.height(np.where(rho <= self._radii[-1], rho, np.nan))
         rays = np.column_stack([x, y, self.sign * z])
@@ -210,22 +211,6 @@ class OcamCamera:
             x + 2 * p1 * xy + p2 * (rho2 + 2 * x2) + 4 * s1 * x3 + s2 * (6 * x2 * y + 2 * y3),
             y + p1 * (rho2 + 2 * y2) + 2 * p2 * xy - 4 * s1 * y3 + s2 * (2 * x3 + 6 * x * y2),
         )
-
-    def _undistort(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Invert the tangential and astigmatic terms by Newton steps; NaN for points without convergence."""
-        ideal_x, ideal_y = x.copy(), y.copy()
-        with np.errstate(all="ignore"):
-            for _ in range(TANGENTIAL_STEPS):
-                distorted_x, distorted_y = self.distort(ideal_x, ideal_y)
-                error_x, error_y = distorted_x - x, distorted_y - y
-                xx, xy, yy = self.distortion_jacobian(ideal_x, ideal_y)
-                determinant = xx * yy - xy * xy
-                ideal_x = ideal_x - (yy * error_x - xy * error_y) / determinant
-                ideal_y = ideal_y - (xx * error_y - xy * error_x) / determinant
-            distorted_x, distorted_y = self.distort(ideal_x, ideal_y)
-            converged = np.hypot(distorted_x - x, distorted_y - y) < TANGENTIAL_TOLERANCE_PX
-            found = converged & self._is_unfolded(ideal_x, ideal_y)
-        return np.where(found, ideal_x, np.nan), np.where(found, ideal_y, np.nan)
 
     def _is_unfolded(self, x: Array, y: Array) -> NDArray[np.bool_]:
         """True (N,) up to where the terms turn back, to pixels of other rays: their symmetric Jacobian is positive."""

@@ -13,14 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.errors import CalibError
-from calib.models.camera import Array
+from calib.models.camera import Array, undistorted
 
-# The parameters, as files and results name them.
-OMNI_NAMES = ("xi", "fu", "fv", "pu", "pv", "k1", "k2", "p1", "p2")
-# Newton steps that invert the lens distortion, because a mild one converges in 3 to 5, and pixels without convergence
-# are NaN.
-UNDISTORT_STEPS = 12
-UNDISTORT_TOLERANCE = 1e-9
+DISTORTION_NAMES = ("k1", "k2", "p1", "p2")  # as files and results name them
+UNDISTORT_TOLERANCE = 1e-9  # on the plane of m; pixels without convergence are NaN
 # Smallest denominator of the projection: guards against division by zero.
 MIN_SCALE = 1e-12
 
@@ -52,67 +48,47 @@ class UnifiedCamera:
         # Beyond this plane two rays would have the same pixel (xi > 1), or the denominator changes sign (xi <= 1).
         edge = -self.xi if self.xi <= 1 else -1 / self.xi
         scale = np.where(z > edge, norm * (z + self.xi), np.nan)
-        m = points[:, :2] / np.where(scale > MIN_SCALE, scale, np.nan)[:, None]
-        distorted = self._distort(m)
+        x, y = (points[:, :2] / np.where(scale > MIN_SCALE, scale, np.nan)[:, None]).T
         if any(self.distortion):
-            distorted[~self._is_unfolded(m)] = np.nan
-        return np.asarray(distorted * self.focal + self.center)
+            bent_x, bent_y = self._distort(x, y)
+            is_unfolded = self._is_unfolded(x, y)
+            x, y = np.where(is_unfolded, bent_x, np.nan), np.where(is_unfolded, bent_y, np.nan)
+        return np.column_stack([x, y]) * self.focal + self.center
 
     def lift(self, pixels: Array) -> Array:
         """Return unit rays (N, 3) of pixels (N, 2); NaN outside the sphere's image. Mei and Rives 2007, eq. (5)."""
-        m = self._undistort((np.asarray(pixels, float) - self.center) / self.focal)
-        r2 = (m**2).sum(axis=1)
+        x, y = ((np.asarray(pixels, float) - self.center) / self.focal).T
+        if any(self.distortion):
+            x, y = undistorted(self._distort, self._jacobian, (x, y), UNDISTORT_TOLERANCE)
+            x = np.where(self._is_unfolded(x, y), x, np.nan)
+        r2 = x * x + y * y
         root = 1 + (1 - self.xi**2) * r2
         eta = (self.xi + np.sqrt(np.where(root >= 0, root, np.nan))) / (1 + r2)
-        return np.column_stack([eta[:, None] * m, eta - self.xi])
+        return np.column_stack([eta * x, eta * y, eta - self.xi])
 
-    def _distort(self, m: Array) -> Array:
+    def _distort(self, x: Array, y: Array) -> tuple[Array, Array]:
         k1, k2, p1, p2 = self.distortion
-        if not any(self.distortion):
-            return m
-        x, y = m.T
         r2 = x * x + y * y
         radial = 1 + r2 * (k1 + k2 * r2)
-        return np.column_stack(
-            [x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y]
-        )
+        return x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
 
-    def _undistort(self, distorted: Array) -> Array:
-        if not any(self.distortion):
-            return distorted
-        m = distorted.copy()
-        with np.errstate(all="ignore"):
-            for _ in range(UNDISTORT_STEPS):
-                m -= self._newton_step(m, distorted)
-            found = np.abs(self._distort(m) - distorted).max(axis=1) < UNDISTORT_TOLERANCE
-            m[~(found & self._is_unfolded(m))] = np.nan
-        return m
-
-    def _is_unfolded(self, m: Array) -> NDArray[np.bool_]:
+    def _is_unfolded(self, x: Array, y: Array) -> NDArray[np.bool_]:
         """True (N,) for m up to where the distortion turns back: beyond, it gives the pixels of other rays again."""
-        if not any(self.distortion):
-            return np.ones(len(m), bool)
         k1, k2, _, _ = self.distortion
         # The slope 1 + 3 k1 r^2 + 5 k2 r^4 of the radius has its first root at the larger 1 / r^2 of two.
         square = 9 * k1 * k1 - 20 * k2
         turning = (np.sqrt(square) - 3 * k1) / 2 if square >= 0 else 0.0
         # p1 and p2 move the turn: the Jacobian is symmetric, and positive definite up to there.
-        a, b, d = self._jacobian(m)
-        return np.asarray(((m**2).sum(axis=1) * turning < 1) & (a > 0) & (a * d > b * b))
+        xx, xy, yy = self._jacobian(x, y)
+        return np.asarray(((x * x + y * y) * turning < 1) & (xx > 0) & (xx * yy > xy * xy))
 
-    def _jacobian(self, m: Array) -> tuple[Array, Array, Array]:
-        """Return a, b, d, each (N,), of the Jacobian [a b; b d] of the distortion."""
+    def _jacobian(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
+        """Return xx, xy, yy, each (N,), of the Jacobian [xx xy; xy yy] of the distortion."""
         k1, k2, p1, p2 = self.distortion
-        x, y = m.T
         r2 = x * x + y * y
         radial, slope = 1 + r2 * (k1 + k2 * r2), 2 * k1 + 4 * k2 * r2
-        a = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
-        b = slope * x * y + 2 * p1 * x + 2 * p2 * y
-        d = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
-        return a, b, d
-
-    def _newton_step(self, m: Array, target: Array) -> Array:
-        a, b, d = self._jacobian(m)
-        ex, ey = (self._distort(m) - target).T
-        determinant = a * d - b * b
-        return np.asarray(np.column_stack([d * ex - b * ey, a * ey - b * ex]) / determinant[:, None])
+        return (
+            radial + slope * x * x + 2 * p1 * y + 6 * p2 * x,
+            slope * x * y + 2 * p1 * x + 2 * p2 * y,
+            radial + slope * y * y + 6 * p1 * y + 2 * p2 * x,
+        )
