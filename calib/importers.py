@@ -237,7 +237,7 @@ def _require_consistency(camera: str, one: Array, other: Array, keys: tuple[str,
 
     def apart(T: Array) -> tuple[float, float]:
         gap = se3.rotation_log((se3.inverse(one) @ T)[:3, :3])
-        return float(np.linalg.norm(one[:3, 3] - T[:3, 3])), float(np.linalg.norm(gap))
+        return float(np.linalg.norm(se3.t_of(one) - se3.t_of(T))), float(np.linalg.norm(gap))
 
     limits = (MAX_DISAGREEMENT_M, MAX_DISAGREEMENT_RAD)
     distance_m, angle_rad = apart(other)
@@ -323,7 +323,7 @@ def import_pair(
     lower, upper = (read_camera(path, view, warn) for path in (lower_path, upper_path))
     if T_lower_upper is None and lower.T_body_cam is not None and upper.T_body_cam is not None:
         T_lower_upper = se3.inverse(lower.T_body_cam) @ upper.T_body_cam
-    if T_lower_upper is None or not T_lower_upper[:3, 3].any():
+    if T_lower_upper is None or not se3.t_of(T_lower_upper).any():
         raise CalibError(
             f"{lower_path} and {upper_path} do not contain the transform between the cameras: give --transform FILE or "
             "--baseline METRES"

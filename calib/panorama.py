@@ -273,7 +273,7 @@ def _turn_px(rig: Rig, sector: _Sector, slope: float) -> float:
 
 def _project(rig: Rig, mounted: MountedCamera, rays: Array) -> Array:
     """Return the pixels of rays (N, 3) in the rectified frame that start at the camera's own viewpoint."""
-    R_cam_rect = mounted.T_cam_rig[:3, :3] @ se3.inverse(rig.T_rect_rig)[:3, :3]
+    R_cam_rect = se3.R_of(mounted.T_cam_rig) @ se3.R_of(se3.inverse(rig.T_rect_rig))
     return mounted.camera.project(rays @ R_cam_rect.T)
 
 

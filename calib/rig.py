@@ -47,7 +47,7 @@ class MountedCamera:
     @property
     def viewpoint(self) -> Array:
         """Return the camera's viewpoint (3,) [m] in the rig frame."""
-        return se3.inverse(self.T_cam_rig)[:3, 3]
+        return se3.t_of(se3.inverse(self.T_cam_rig))
 
     @property
     def visible(self) -> Mask:
@@ -93,7 +93,7 @@ class Rig:
 
         floor_m: height of the floor in the base frame.
         """
-        height_m = float((self.T_base_rig[:3, :3] @ self.lower.viewpoint + self.T_base_rig[:3, 3])[2]) - floor_m
+        height_m = float((se3.R_of(self.T_base_rig) @ self.lower.viewpoint + se3.t_of(self.T_base_rig))[2]) - floor_m
         return height_m if height_m >= LEAST_HEIGHT_M else None
 
     def at_height(self, height_m: float) -> Rig:
@@ -113,10 +113,10 @@ class Rig:
         turn (3,): rotation vector [rad], R = exp(turn) R_before; direction (2,): the viewpoint lies along (e_x, e_y, 1)
         at the baseline plus longer_m.
         """
-        R_rig_rect = self.T_rect_rig[:3, :3].T
+        R_rig_rect = se3.R_of(self.T_rect_rig).T
         along = np.array([*direction, 1.0]) / np.linalg.norm([*direction, 1.0])
         viewpoint = self.lower.viewpoint + (self.baseline_m + longer_m) * R_rig_rect @ along
-        R_rig_upper = R_rig_rect @ se3.rotation_exp(turn) @ R_rig_rect.T @ self.upper.T_cam_rig[:3, :3].T
+        R_rig_upper = R_rig_rect @ se3.rotation_exp(turn) @ R_rig_rect.T @ se3.R_of(self.upper.T_cam_rig).T
         T_upper_rig = se3.inverse(se3.transform(R_rig_upper, viewpoint))
         return replace(self, upper=replace(self.upper, T_cam_rig=T_upper_rig))
 

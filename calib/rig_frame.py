@@ -22,12 +22,12 @@ def rig_between(lower: OmniCamera, upper: OmniCamera, T_lower_upper: Array, topi
     Ahead is the part across z of the mean optical axis, if the cameras look to the side. Of cameras that look along z,
     as mirrors and fisheyes that see all around, x is the lower image's u axis.
     """
-    baseline = float(np.linalg.norm(T_lower_upper[:3, 3]))
+    baseline = float(np.linalg.norm(se3.t_of(T_lower_upper)))
     if not baseline >= MIN_BASELINE_M:
         raise CalibError(f"rig: the viewpoints must lie apart, found {baseline * 1e3:.3f} mm between them")
-    z = T_lower_upper[:3, 3] / baseline
+    z = se3.t_of(T_lower_upper) / baseline
     u, v = image_axis(lower, (STEP_PX, 0.0)), image_axis(lower, (0.0, STEP_PX))
-    axes = optical_axis(lower), T_lower_upper[:3, :3] @ optical_axis(upper)
+    axes = optical_axis(lower), se3.R_of(T_lower_upper) @ optical_axis(upper)
     forward = (axes[0] + axes[1]) / 2
     if np.linalg.norm(forward - z * (z @ forward)) < np.sin(np.deg2rad(MAX_LEAN_DEG)):
         forward = u if abs(z @ u) < 0.9 else v

@@ -25,6 +25,16 @@ def transform(R: ArrayLike, t: ArrayLike) -> Array:
     return T
 
 
+def R_of(T: Array) -> Array:
+    """Return the rotation (..., 3, 3) of T (..., 4, 4)."""
+    return T[..., :-1, :-1]
+
+
+def t_of(T: Array) -> Array:
+    """Return the translation (..., 3) of T (..., 4, 4)."""
+    return T[..., :-1, -1]
+
+
 def inverse(T: ArrayLike) -> Array:
     """Return T_b_a of T_a_b: (R^T, -R^T t)."""
     (a, b, c, x), (d, e, f, y), (g, h, i, z), last = _elements(T)
@@ -39,7 +49,7 @@ def inverse(T: ArrayLike) -> Array:
 def apply(T: ArrayLike, points: ArrayLike) -> Array:
     """Transform points (..., N, 3) by T (..., 4, 4)."""
     T = np.asarray(T, float)
-    return np.asarray(np.asarray(points, float) @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3])
+    return np.asarray(np.asarray(points, float) @ np.swapaxes(R_of(T), -1, -2) + t_of(T)[..., None, :])
 
 
 def hat(w: ArrayLike) -> Array:
@@ -81,7 +91,7 @@ def log(T: ArrayLike) -> Array:
 def rotation_exp(w: ArrayLike) -> Array:
     """Return the rotation matrix (..., 3, 3) of a rotation vector (..., 3) [rad]."""
     w = np.asarray(w, float)
-    return exp(np.concatenate([np.zeros_like(w), w], axis=-1))[..., :3, :3]
+    return R_of(exp(np.concatenate([np.zeros_like(w), w], axis=-1)))
 
 
 def rotation_log(R: ArrayLike) -> Array:
@@ -92,10 +102,10 @@ def rotation_log(R: ArrayLike) -> Array:
 def adjoint(T: ArrayLike) -> Array:
     """Return the matrix (..., 6, 6) of T_a_b that maps twists [translation; rotation] from frame b to frame a."""
     T = np.asarray(T, float)
-    R = T[..., :3, :3]
+    R = R_of(T)
     A = np.zeros((*T.shape[:-2], 6, 6))
     A[..., :3, :3] = A[..., 3:, 3:] = R
-    A[..., :3, 3:] = hat(T[..., :3, 3]) @ R
+    A[..., :3, 3:] = hat(t_of(T)) @ R
     return A
 
 
@@ -126,8 +136,8 @@ def is_rigid(T: ArrayLike, tolerance: float = 1e-4) -> bool:
     T = np.asarray(T, float)
     if T.shape != (4, 4) or not np.isfinite(T).all():
         return False
-    rigid, R = np.eye(4), T[:3, :3]
-    off = max(np.abs(R @ R.T - rigid[:3, :3]).max(), np.abs(T[3] - rigid[3]).max())
+    rigid, R = np.eye(4), R_of(T)
+    off = max(np.abs(R @ R.T - R_of(rigid)).max(), np.abs(T[-1] - rigid[-1]).max())
     return bool(off <= tolerance and np.linalg.det(R) > 0)
 
 

@@ -50,8 +50,8 @@ def transform_of(rows: Sequence[Sequence[float]] | None, key: str, warn: Warn = 
     if rows is None or [len(row) for row in rows] != [4, 4, 4, 4]:
         raise CalibError(f"{key}: expected 4 rows of 4 numbers, found {'nothing' if rows is None else shown(rows)}")
     T = np.array(rows, float)
-    R = rigid(T)[:3, :3] if np.isfinite(T).all() else np.eye(3)
-    off = float(np.abs(T[:3, :3] - R).max())
+    R = se3.R_of(rigid(T)) if np.isfinite(T).all() else np.eye(3)
+    off = float(np.abs(se3.R_of(T) - R).max())
     if not (off <= TYPED_TOLERANCE and np.linalg.det(R) > 0 and np.abs(T[3] - np.eye(4)[3]).max() <= 1e-4):
         most = f", up to {off:.2g} off a rotation" if np.isfinite(off) and np.linalg.det(R) > 0 else ""
         raise CalibError(f"{key}: expected a rotation and a translation over 0 0 0 1, found {shown(rows)}{most}")
@@ -64,8 +64,8 @@ def transform_of(rows: Sequence[Sequence[float]] | None, key: str, warn: Warn = 
 
 def rigid(T: Array) -> Array:
     """Return T (4, 4) with an orthonormal rotation; T itself if its rotation is already orthonormal."""
-    R = T[:3, :3]
+    R = se3.R_of(T)
     if np.abs(R @ R.T - np.eye(3)).max() <= ORTHONORMAL_TOLERANCE:
         return T
     left, _, right = np.linalg.svd(R)
-    return se3.transform(left @ right, T[:3, 3])
+    return se3.transform(left @ right, se3.t_of(T))

@@ -208,8 +208,8 @@ class RigParameters:
 
     def transform_steps(self, rig: Rig) -> Array:
         """Return the steps (P,) that give this rig the transform between the cameras of another; all others are 0."""
-        R_rect_rig = self.rig.T_rect_rig[:3, :3]
-        R_rig_upper, own = rig.upper.T_cam_rig[:3, :3].T, self.rig.upper.T_cam_rig[:3, :3]
+        R_rect_rig = se3.R_of(self.rig.T_rect_rig)
+        R_rig_upper, own = se3.R_of(rig.upper.T_cam_rig).T, se3.R_of(self.rig.upper.T_cam_rig)
         turn = se3.rotation_log(R_rect_rig @ R_rig_upper @ own @ R_rect_rig.T)
         x, y, z = R_rect_rig @ (rig.upper.viewpoint - rig.lower.viewpoint)
         steps = np.zeros(len(self.names))

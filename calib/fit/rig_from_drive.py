@@ -227,7 +227,7 @@ class DriveProblem:
         """Return the landmark (M, 3) of each observation in the rig frame at the time of its exposure."""
         seen, times = self.observations, self.parameters.times_at(steps)
         T = state.T_rig_odom[seen.keyframe]
-        points = (T[:, :3, :3] @ state.points[seen.landmark][:, :, None])[:, :, 0] + T[:, :3, 3]
+        points = (se3.R_of(T) @ state.points[seen.landmark][:, :, None])[:, :, 0] + se3.t_of(T)
         upper = np.where(seen.camera == 1, state.upper_delay_s[seen.keyframe] + times.upper_delay_s, 0.0)
         delay_s = (upper + times.line_time_s * seen.pixels[:, 1])[:, None]
         # p(t) = exp(-t xi) p, to second order in t.
@@ -313,7 +313,7 @@ class DriveProblem:
             (residual * root).ravel(),
             J_poses[:, is_free],
             by_steps,
-            by_rig_point @ state.T_rig_odom[seen.keyframe][:, :3, :3],
+            by_rig_point @ se3.R_of(state.T_rig_odom[seen.keyframe]),
         )
 
     def _by_point(self, steps: Array, points: Array) -> Array:

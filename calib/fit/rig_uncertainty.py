@@ -152,7 +152,7 @@ def _motion_by_parameters(
     if seen.sum() < MIN_POINTS:
         return None
     first, last, by_start, by_end, ends = (part[seen] for part in (first, last, by_start, by_end, ends))
-    shift = -T_end_start[:3, :3] @ np.linalg.pinv(by_start) @ first  # (N, 3, P), in the axes of the end
+    shift = -se3.R_of(T_end_start) @ np.linalg.pinv(by_start) @ first  # (N, 3, P), in the axes of the end
     # The pose moves and turns the points the other way: dX_end = -dp - w x X_end.
     by_pose = np.concatenate([-by_end, by_end @ se3.hat(ends)], axis=2)
     right = (by_end @ shift + last).reshape(-1, first.shape[2])

@@ -125,7 +125,7 @@ class DriveCalibration:
         """The straight distance [m] between the first and the last pair of a single log, with the rig."""
         T_rig_odom = self.adjustment.state.T_rig_odom
         T_first_last = T_rig_odom[0] @ se3.inverse(T_rig_odom[-1]) @ self.drives.T_last
-        return float(np.linalg.norm(T_first_last[:3, 3])) * self.rig.baseline_m / self.before.baseline_m
+        return float(np.linalg.norm(se3.t_of(T_first_last))) * self.rig.baseline_m / self.before.baseline_m
 
     def at_distance(self, distance_m: float) -> Rig:
         """Return the rig with the baseline by a known distance from the first to the last pair; OmnidError if odd."""
@@ -313,7 +313,7 @@ def _common_pixels(found: DriveAdjustment) -> tuple[Array, Array]:
 
 def _ranges(rig: Rig, pixels: tuple[Array, Array]) -> Array:
     """Return the distances (N,) from the lower viewpoint of points at pixels (N, 2) of both cameras."""
-    rays = [m.camera.lift(p) @ m.T_cam_rig[:3, :3] for m, p in zip((rig.lower, rig.upper), pixels, strict=True)]
+    rays = [m.camera.lift(p) @ se3.R_of(m.T_cam_rig) for m, p in zip((rig.lower, rig.upper), pixels, strict=True)]
     points = common_perpendicular(rays[0], rays[1], rig.upper.viewpoint - rig.lower.viewpoint)
     return np.asarray(np.linalg.norm(points, axis=1))
 
@@ -321,7 +321,7 @@ def _ranges(rig: Rig, pixels: tuple[Array, Array]) -> Array:
 def rescaled(rig: Rig, ratio: float) -> Rig:
     """Return the rig with a longer or shorter baseline: all lengths of its odometry change by that ratio."""
     viewpoint = rig.lower.viewpoint + ratio * (rig.upper.viewpoint - rig.lower.viewpoint)
-    R_upper_rig = rig.upper.T_cam_rig[:3, :3]
+    R_upper_rig = se3.R_of(rig.upper.T_cam_rig)
     return replace(rig, upper=replace(rig.upper, T_cam_rig=se3.transform(R_upper_rig, -R_upper_rig @ viewpoint)))
 
 
@@ -331,13 +331,13 @@ def level_turn(rig: Rig, T_rig_odom: Array) -> Array | None:
     None where the path (K poses) shows no plane, or one that is too far from the base's.
     """
     T_odom_rig = se3.inverse(T_rig_odom)
-    positions = T_odom_rig[:, :3, 3]
+    positions = se3.t_of(T_odom_rig)
     _, sizes, axes = np.linalg.svd(positions - positions.mean(axis=0))
     sizes = sizes / np.sqrt(len(positions))
     if 2 * sizes[1] < MIN_EXTENT_M or sizes[2] > MAX_ROUGHNESS * sizes[1]:
         return None
-    normal = (T_rig_odom[:, :3, :3] @ axes[2]).mean(axis=0)
-    R_base_rig = rig.T_base_rig[:3, :3]
+    normal = (se3.R_of(T_rig_odom) @ axes[2]).mean(axis=0)
+    R_base_rig = se3.R_of(rig.T_base_rig)
     up = R_base_rig @ normal / np.linalg.norm(normal)
     up = up * np.sign(up[2])
     axis = np.cross(up, [0.0, 0.0, 1.0])
@@ -394,5 +394,5 @@ def require_same_rig(parameters: RigParameters, steps: Array, *, tracked: bool =
 def is_nominal(rig: Rig) -> bool:
     """True if a rig was not measured: no covariance, and one camera exactly above the other without any rotation."""
     T = rig.upper.T_cam_rig @ se3.inverse(rig.lower.T_cam_rig)
-    straight = np.allclose(T[:3, :3], np.eye(3), atol=1e-9) and np.allclose(T[:2, 3], 0, atol=1e-9)
+    straight = np.allclose(se3.R_of(T), np.eye(3), atol=1e-9) and np.allclose(T[:2, 3], 0, atol=1e-9)
     return rig.covariance is None and bool(straight)

@@ -224,7 +224,7 @@ def require_motion(T_rig_odom: Array, drives: int) -> None:
             f"{np.rad2deg(KEYFRAME_RAD):.0f} deg apart, {MIN_KEYFRAMES} are needed; take a longer drive"
         )
     T_odom_rig = se3.inverse(T_rig_odom)
-    path_m = float(np.linalg.norm(np.diff(T_odom_rig[:, :3, 3], axis=0), axis=1).sum())
+    path_m = float(np.linalg.norm(np.diff(se3.t_of(T_odom_rig), axis=0), axis=1).sum())
     if path_m < MIN_PATH_M:
         raise OmnidError(
             f"calibrate drive: the path is {path_m:.1f} m long, {MIN_PATH_M:.0f} m are needed: turns on "

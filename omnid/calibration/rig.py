@@ -62,7 +62,7 @@ class RigResult:
 
     def __str__(self) -> str:
         found = self.calibration
-        rotation_deg = np.rad2deg(np.linalg.norm(se3.rotation_log(found.T_upper_lower[:3, :3])))
+        rotation_deg = np.rad2deg(np.linalg.norm(se3.rotation_log(se3.R_of(found.T_upper_lower))))
         sigma_deg = np.rad2deg(np.linalg.norm(found.motion_sigma[3:]))
         single_views = len(found.views) - found.pairs
         return (

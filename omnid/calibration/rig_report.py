@@ -62,8 +62,8 @@ def rig_report_html(found: RigCalibration, images: PairedImages, rig: Rig, angle
 
 def _motion(found: RigCalibration) -> str:
     """Return the table of T_upper_lower in millimetres and degrees."""
-    turn = se3.rotation_log(found.T_upper_lower[:3, :3])
-    values = np.concatenate([found.T_upper_lower[:3, 3] * 1e3, np.rad2deg(turn)])
+    turn = se3.rotation_log(se3.R_of(found.T_upper_lower))
+    values = np.concatenate([se3.t_of(found.T_upper_lower) * 1e3, np.rad2deg(turn)])
     sigmas = np.concatenate([found.motion_sigma[:3] * 1e3, np.rad2deg(found.motion_sigma[3:])])
     rows = [
         (name, f"{value:.4f} {unit}", f"{sigma:.4f}")

@@ -142,7 +142,7 @@ def _pair(args: argparse.Namespace) -> Rig:
 def describe(rig: Rig) -> str:
     """Return one line about a rig: cameras, topics, baseline, rotation between the cameras, height."""
     T_upper_lower = rig.upper.T_cam_rig @ se3.inverse(rig.lower.T_cam_rig)
-    rotation_deg = np.rad2deg(np.linalg.norm(se3.rotation_log(T_upper_lower[:3, :3])))
+    rotation_deg = np.rad2deg(np.linalg.norm(se3.rotation_log(se3.R_of(T_upper_lower))))
     lower, upper = (
         _describe(mounted, topic) for mounted, topic in zip((rig.lower, rig.upper), rig.topics, strict=True)
     )

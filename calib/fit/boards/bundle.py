@@ -112,7 +112,7 @@ def fit_boards(start: BoardRig, pixels: Array, board: CalibrationBoard, *, telec
 
     telecentric: the cameras look at mirrors by parallel rays, see mirror_prior.py. CalibError where no camera fits.
     """
-    reach_m = float(np.median(np.linalg.norm(start.T_lower_board[:, :3, 3], axis=1)))
+    reach_m = float(np.median(np.linalg.norm(se3.t_of(start.T_lower_board), axis=1)))
     problem = _BoardProblem(pixels, board.points, reach_m, telecentric, np.inf)
     state = problem.state(start)
     sigma, damping = np.inf, START_DAMPING
@@ -254,13 +254,13 @@ class _BoardProblem:
             by_point, by_own = map(_finite, pixel_derivatives(camera, points, rig.names))
             own = slice(side * n, side * n + n - 1)
             J_common[:, side, ..., own] = by_own.reshape(K, N, 2, -1) * units[own]
-            by_mode = np.einsum("kij,njs->knis", T[:, :3, :3], self.modes)
+            by_mode = np.einsum("kij,njs->knis", se3.R_of(T), self.modes)
             J_common[:, side, ..., -len(MODE_NAMES) :] = by_point.reshape(K, N, 2, 3) @ by_mode
             if side:
                 twist = np.concatenate([by_point, -by_point @ se3.hat(points)], axis=-1).reshape(K, N, 2, 6)
                 J_common[:, side, ..., C * n : C * n + 6] = twist * units[C * n : C * n + 6]
-                points = (points - rig.T_upper_lower[:3, 3]) @ rig.T_upper_lower[:3, :3]
-                by_point = by_point @ rig.T_upper_lower[:3, :3]
+                points = (points - se3.t_of(rig.T_upper_lower)) @ se3.R_of(rig.T_upper_lower)
+                by_point = by_point @ se3.R_of(rig.T_upper_lower)
             pose = np.concatenate([by_point, -by_point @ se3.hat(points)], axis=-1)
             J_pose[:, side] = pose.reshape(K, N, 2, 6)
         return J_common, J_pose

@@ -79,7 +79,7 @@ def _with_proper_poses(solution: LinearCamera, view: View) -> LinearCamera:
     first = left @ right
     R = np.concatenate([first, np.cross(first[..., 0], first[..., 1])[..., None]], axis=-1)
     return LinearCamera(
-        solution.coefficients, solution.scale_px, solution.center, se3.transform(R, T[:, :3, 3]), solution.errors_rad
+        solution.coefficients, solution.scale_px, solution.center, se3.transform(R, se3.t_of(T)), solution.errors_rad
     )
 
 

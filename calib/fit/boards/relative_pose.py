@@ -117,8 +117,8 @@ def _consensus(candidates: Array) -> tuple[Array, Array]:
 
 def _pose_distance(T: Array, other: Array) -> Array:
     """Return the distances of transforms (..., 4, 4) from another: angle [rad] plus shift relative to its length."""
-    gap = se3.rotation_log(np.swapaxes(T[..., :3, :3], -1, -2) @ other[:3, :3])
-    shift = np.linalg.norm(T[..., :3, 3] - other[:3, 3], axis=-1)
+    gap = se3.rotation_log(np.swapaxes(se3.R_of(T), -1, -2) @ se3.R_of(other))
+    shift = np.linalg.norm(se3.t_of(T) - se3.t_of(other), axis=-1)
     return np.asarray(
-        np.linalg.norm(gap, axis=-1) + shift / max(float(np.linalg.norm(other[:3, 3])), np.finfo(float).tiny)
+        np.linalg.norm(gap, axis=-1) + shift / max(float(np.linalg.norm(se3.t_of(other))), np.finfo(float).tiny)
     )

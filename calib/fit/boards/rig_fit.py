@@ -79,7 +79,7 @@ class RigCalibration:
     @property
     def baseline_m(self) -> float:
         """Return the distance of the viewpoints [m]."""
-        return float(np.linalg.norm(self.T_upper_lower[:3, 3]))
+        return float(np.linalg.norm(se3.t_of(self.T_upper_lower)))
 
     @property
     def parameters(self) -> list[list[tuple[str, float, float]]]:
@@ -106,7 +106,7 @@ class RigCalibration:
     @property
     def baseline_sigma_m(self) -> float:
         """Return the standard deviation of the distance of the viewpoints [m]."""
-        along = self.T_upper_lower[:3, 3] / self.baseline_m
+        along = se3.t_of(self.T_upper_lower) / self.baseline_m
         return float(np.sqrt(along @ self.motion_covariance[:3, :3] @ along))
 
     @property
@@ -218,15 +218,15 @@ def consistent_views(
 def rig_covariance(found: RigCalibration, rig: Rig) -> RigCovariance:
     """Return the covariance of a calibration's parameters for its rig."""
     names = [f"{side} {name}" for side in SIDES for name in found.fit.rig.names]
-    R_rect_lower = rig.T_rect_rig[:3, :3] @ rig.lower.T_cam_rig[:3, :3].T
-    R_upper_rect = found.T_upper_lower[:3, :3] @ R_rect_lower.T
+    R_rect_lower = se3.R_of(rig.T_rect_rig) @ se3.R_of(rig.lower.T_cam_rig).T
+    R_upper_rect = se3.R_of(found.T_upper_lower) @ R_rect_lower.T
 
     def transform(twist: Array) -> Array:
         """Return the parameters TRANSFORM_NAMES (6,) after a twist of T_upper_lower."""
         T_lower_upper = se3.inverse(se3.exp(twist) @ found.T_upper_lower)
-        turn = se3.rotation_log(R_rect_lower @ T_lower_upper[:3, :3] @ R_upper_rect)
-        x, y, z = R_rect_lower @ T_lower_upper[:3, 3]
-        return np.array([*turn, x / z, y / z, np.linalg.norm(T_lower_upper[:3, 3])])
+        turn = se3.rotation_log(R_rect_lower @ se3.R_of(T_lower_upper) @ R_upper_rect)
+        x, y, z = R_rect_lower @ se3.t_of(T_lower_upper)
+        return np.array([*turn, x / z, y / z, np.linalg.norm(se3.t_of(T_lower_upper))])
 
     count = len(names) + len(TWIST_NAMES)
     J = np.eye(count)
