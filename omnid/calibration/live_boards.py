@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.boards.board import BoardView
-from calib.masks.rim import find_rim
 from calib.models.camera import Array, Mask
+from calib.rim import find_rim
 from drivers.errors import FrameDecodeError
 from drivers.frame import Frame, FrameSource, gray
 from omnid.calibration.board_search import AnyBoard, search_board

@@ -16,11 +16,11 @@ from calib.boards.board import BoardView
 from calib.fit.boards.rig_fit import SIDES, PairView, RigCalibration, calibrate_boards, rig_covariance
 from calib.fit.residual_structure import ResidualStructure
 from calib.fit.rig_uncertainty import DriveUncertainty, drive_uncertainty
-from calib.masks.rim import find_rim
 from calib.models.names import sees_directly
 from calib.rig import MAX_BASELINE_M, MIN_BASELINE_M, Rig
 from calib.rig_file import write_rig
 from calib.rig_frame import mounting_notes, rig_between
+from calib.rim import find_rim
 from drivers.logs.log_reader import AnyCameras, LogCameras
 from omnid.calibration.angle_table import AngleRow, angle_lines, angle_rows
 from omnid.calibration.board_search import AnyBoard, Progress, find_boards, select_diverse_views, silent

@@ -11,8 +11,8 @@ from typing import Final
 import numpy as np
 
 from calib.fit.rig_drift import apply_drift
-from calib.masks.rim_check import RimShift, rim_shift
 from calib.rig import Rig
+from calib.rim import RimShift, rim_shift
 from drivers.logs.log_reader import LogCameras, LogReader
 from omnid.calibration.drive_observations import tracked_updates
 from omnid.calibration.images import SIDES, TOLERANCE_NS, brightest, open_log, paired

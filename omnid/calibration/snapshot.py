@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.masks.rim import find_rim
 from calib.models.camera import Mask
+from calib.rim import find_rim
 from omnid.calibration.images import Image, brightest, middle_px
 
 IMAGES: Final = 10  # Images of each camera: the rim is searched in their maximum.

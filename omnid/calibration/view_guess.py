@@ -13,9 +13,9 @@ import numpy as np
 
 from calib.boards.aprilgrid import AprilGrid
 from calib.boards.board import Board, BoardView
-from calib.masks.rim import find_rim
 from calib.models.camera import Array
 from calib.models.ocam import VIEWS, View
+from calib.rim import find_rim
 from omnid.calibration.board_search import Progress
 from omnid.calibration.images import Images, brightest, middle_px
 from omnid.errors import OmnidError

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.masks.rim import find_rim
 from calib.panorama import Cylinder, fit_cylinder
 from calib.rig import MountedCamera, Rig
+from calib.rim import find_rim
 from drivers.frame import Camera, Frame
 from omnid.config import PanoramaConfig
 from omnid.core.types.stereo_model import StereoModel

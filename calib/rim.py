@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -10,25 +12,19 @@ from calib.models.camera import Array, Mask
 
 AZIMUTHS = 720  # half a degree, INLIER_PX on a rim of 230 px: more would give the same
 MIN_SIDE_PX = 64  # Shorter side of the smallest image.
-# The dark level is measured in corners of this part of the image's smaller side, and this many pixels at least.
-CORNER_PART, MIN_CORNER_PX = 1 / 32, 4
-# Least difference of grey levels between the middle and the corners, and across the edge at one azimuth.
+# The dark level is measured in corners of this part of the image's smaller side.
+CORNER_PART = 1 / 16
+# Least difference of grey levels between the middle and the corners; half of it across the edge at one azimuth.
 MIN_CONTRAST = 25.0
-MIN_STEP = 12.0
 # Threshold between the dark (0) and the light level (1), nearer the dark one, because the world at the rim is often
 # dark too.
 EDGE_FRACTION = 0.25
 # Number of pixels on either side over which the edge is measured, and beyond it that must be dark.
 EDGE_PX = 4
-# RANSAC: an azimuth is an inlier if its edge is this near the circle; least share of inliers on the visible circle.
-INLIER_PX = 2.0
-MIN_SUPPORT = 0.6
+# An azimuth is an inlier if its edge is this near the circle; least share of inliers on the visible circle.
+INLIER_PX, MIN_SUPPORT = 2.0, 0.6
 # Least part of the circle that lies in the image, because less does not determine the centre.
 MIN_ARC = 0.4
-# Enough: if only 3 of 10 azimuths show the rim, 200 draws of three miss it once in 240 images.
-RANSAC_ROUNDS = 200
-# Least squares repetitions on the inliers after RANSAC.
-REFINEMENTS = 3
 # Largest distance of the circle's centre from the guess, in parts of the radius: more than the tenth by which a
 # guess may be off.
 MAX_CENTER_SHIFT = 0.25
@@ -36,9 +32,10 @@ MAX_CENTER_SHIFT = 0.25
 SAFETY_PX = 1.5
 # A hub ends within MAX_HUB of the rim's radius, at a ring that is dark (HUB_EDGE_DARK), after rings that are mostly
 # dark (HUB_INSIDE_DARK; a lens glints). Within HUB_RING_PX the dark share drops by HUB_DROP: the world begins.
-MAX_HUB = 0.4
-HUB_RING_PX = 5
+MAX_HUB, HUB_RING_PX = 0.4, 5
 HUB_EDGE_DARK, HUB_INSIDE_DARK, HUB_DROP = 0.9, 0.65, 0.2
+# Tolerance for a mask that reaches beyond the rim, because masks are also drawn by hand.
+MAX_BEYOND_PX = 4.0
 
 
 def find_rim(image: NDArray[np.uint8], center_guess: tuple[float, float]) -> Mask | None:
@@ -61,11 +58,10 @@ def find_rim(image: NDArray[np.uint8], center_guess: tuple[float, float]) -> Mas
 
 def _levels(image: NDArray[np.uint8]) -> tuple[float, float] | None:
     """Return the dark level, of the corners, and the light level, of the middle; None if they are too close."""
-    side = max(MIN_CORNER_PX, int(min(image.shape) * CORNER_PART))
+    side = int(min(image.shape) * CORNER_PART)
     corners = [image[:side, :side], image[:side, -side:], image[-side:, :side], image[-side:, -side:]]
-    height, width = image.shape
-    dark = float(np.median([np.median(corner) for corner in corners]))
-    light = float(np.median(image[height // 4 : -height // 4, width // 4 : -width // 4]))
+    middle = image[tuple(slice(size // 4, -size // 4) for size in image.shape)]
+    dark, light = float(np.median([np.median(corner) for corner in corners])), float(np.median(middle))
     return (dark, light) if light - dark >= MIN_CONTRAST else None
 
 
@@ -100,7 +96,7 @@ def _last_edges(polar: Array, threshold: float) -> tuple[Array, Array]:
     # 2. Levels on either side of the fall.
     near = polar[rows[:, None], last[rows, None] + np.arange(1 - EDGE_PX, 2 * EDGE_PX)]
     inside, outside = near[:, :EDGE_PX].mean(axis=1), near[:, 2 * EDGE_PX - 1 :].mean(axis=1)
-    steep = inside - outside >= MIN_STEP
+    steep = inside - outside >= MIN_CONTRAST / 2
     rows, near, half = rows[steep], near[steep], (inside + outside)[steep] / 2
     # 3. The radius at which the profile has the level between them.
     at = EDGE_PX - 1 - (near[:, EDGE_PX - 1 :: -1] >= half[:, None]).argmax(axis=1)
@@ -110,19 +106,20 @@ def _last_edges(polar: Array, threshold: float) -> tuple[Array, Array]:
 
 
 def _fit(edges: Array, center: tuple[float, float]) -> Array | None:
-    """Fit a circle (u, v, radius) to edges by RANSAC and least squares over the inliers; None if there is none."""
+    """Fit a circle (u, v, radius) to edges (N, 2) in order of azimuth; None if there is none near the guess.
+
+    The best of the circles through three edges a third of all apart (as RANSAC, without chance), then least squares
+    over its inliers as long as they become more.
+    """
     if len(edges) < AZIMUTHS * MIN_ARC * MIN_SUPPORT:
         return None
-    generator = np.random.default_rng(0)
-    chosen = np.array([generator.choice(len(edges), 3, replace=False) for _ in range(RANSAC_ROUNDS)])
-    circles = circles_through(edges[chosen])
-    inliers = (_distance(edges, circles.T[:, :, None]) < INLIER_PX).sum(axis=1)
-    best = circles[inliers.argmax()]
-    for _ in range(REFINEMENTS):
-        inliers = edges[_distance(edges, best) < INLIER_PX]
-        if len(inliers) < 3:
-            return None
-        best = _circle(inliers)
+    numbers = np.arange(len(edges))
+    triples = np.stack([numbers, numbers + len(edges) // 3, numbers + 2 * len(edges) // 3], axis=1) % len(edges)
+    circles = circles_through(edges[triples])
+    best = circles[(_distance(edges, circles.T[:, :, None]) < INLIER_PX).sum(axis=1).argmax()]
+    inliers = np.zeros(len(edges), bool)
+    while (found := _distance(edges, best) < INLIER_PX).sum() > inliers.sum():
+        inliers, best = found, _circle(edges[found])
     near = np.hypot(best[0] - center[0], best[1] - center[1]) < MAX_CENTER_SHIFT * best[2]
     return best if near else None
 
@@ -173,3 +170,28 @@ def _hub(image: NDArray[np.uint8], center: tuple[float, float], rim_px: float, t
     edge, beyond = dark[HUB_RING_PX - 1 : -HUB_RING_PX], dark[2 * HUB_RING_PX - 1 :]
     ends = np.flatnonzero((edge >= HUB_EDGE_DARK) & (inside >= HUB_INSIDE_DARK) & (beyond <= edge - HUB_DROP))
     return float(ends[-1] + HUB_RING_PX) if ends.size else 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class RimShift:
+    """The rim found in images, relative to a mask: shift (u, v) of its centre and difference of radii [px]."""
+
+    rim: Mask
+    moved_px: tuple[float, float]
+    wider_px: float
+
+    @property
+    def fits(self) -> bool:
+        """True if the mask contains only the mirror, within the tolerance."""
+        return float(np.hypot(*self.moved_px)) - self.wider_px <= MAX_BEYOND_PX
+
+
+def rim_shift(brightest: NDArray[np.uint8], mask: Mask | None) -> RimShift | None:
+    """Compare the rim in the maximum of several images (H, W) with a mask; None if either is not known."""
+    if mask is None or not np.isfinite(mask.outer_px):
+        return None
+    rim = find_rim(brightest, mask.center)
+    if rim is None:
+        return None
+    moved = (rim.center[0] - mask.center[0], rim.center[1] - mask.center[1])
+    return RimShift(rim, moved, rim.outer_px - mask.outer_px)

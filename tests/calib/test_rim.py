@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calib.masks.rim import find_rim
-from calib.masks.rim_check import rim_shift
 from calib.models.camera import Mask
+from calib.rim import find_rim, rim_shift
 
 Image = NDArray[np.uint8]
 CENTER, RADIUS = (391.3, 377.6), 340.7
