@@ -17,7 +17,7 @@ from calib.errors import CalibError
 from calib.models.camera import Array, OmniCamera
 from calib.models.names import camera_of as known_camera
 from calib.models.names import changed, model_name, values_of
-from calib.validation import MAX_PIXELS, MAX_SIDE_PX, Warn, is_image_size, silent
+from calib.validation import Warn, require_image_size, silent
 
 FOCAL: Final = ("fu", "fv", "pu", "pv")
 RADTAN: Final = ("k1", "k2", "p1", "p2")
@@ -113,11 +113,7 @@ def camera_of_names(
 
 def camera_of(model: str, values: Mapping[str, float], size: tuple[int, int], warn: Warn = silent) -> OmniCamera:
     """Return the camera of a model with named values; `warn` takes a line about one that is fitted."""
-    if not is_image_size(*size):
-        raise CalibError(
-            f"resolution: expected [width, height] in pixels, 1 to {MAX_SIDE_PX}, at most {MAX_PIXELS} in all, "
-            f"found {list(size)}"
-        )
+    require_image_size("resolution", *size)
     pinhole = {key: float(values[key]) for key in FOCAL}
     plain = {**pinhole, "xi": 0.0, **{key: values[key] for key in RADTAN if key in values}}
     if model == "ucm":  # the extended model with beta = 1

@@ -22,7 +22,7 @@ import numpy as np
 from msgspec import Struct
 
 from calib import se3
-from calib.errors import CalibError
+from calib.errors import CalibError, within
 from calib.foreign_models import camera_of_lists, camera_of_names
 from calib.models.camera import Array, OmniCamera
 from calib.models.equirectangular import full_turn
@@ -33,7 +33,7 @@ from calib.rig import MAX_BASELINE_M, MIN_BASELINE_M, MountedCamera, Rig, Shutte
 from calib.rig_frame import is_turned_over, mounting_notes, rig_between
 from calib.text_files import MAX_JSON_BYTES, decode, load_mapping
 from calib.typed_toml import convert, shown, table_of
-from calib.validation import MAX_PIXELS, MAX_SIDE_PX, Warn, is_image_size, read_bytes, silent, transform_of
+from calib.validation import Warn, read_bytes, require_image_size, silent, transform_of
 
 # Tolerance between two transforms that a file states: more than rounding, less than any real difference of two rigs.
 MAX_DISAGREEMENT_M, MAX_DISAGREEMENT_RAD = 1e-3, np.deg2rad(0.1)
@@ -94,12 +94,9 @@ def parse_chain(
     warn: Warn = silent,
 ) -> Rig:
     """Parse the rig of a file's text; warn: takes lines about what had to be assumed."""
-    try:
-        return _chain_rig(
-            _chain_cameras(load_mapping(text, name)), (lower, upper), frame, lambda line: warn(f"{name}: {line}")
-        )
-    except (CalibError, ValueError) as error:
-        raise error if str(error).startswith(f"{name}: ") else CalibError(f"{name}: {error}") from error
+    with within(f"{name}: "):
+        cameras = _chain_cameras(load_mapping(text, name))
+        return _chain_rig(cameras, (lower, upper), frame, lambda line: warn(f"{name}: {line}"))
 
 
 def _chain_rig(cameras: Mapping[str, ChainCamera], named: tuple[str, str], frame: str, warn: Warn) -> Rig:
@@ -134,10 +131,8 @@ def _chain_rig(cameras: Mapping[str, ChainCamera], named: tuple[str, str], frame
     # 4. The delay of the upper camera: the difference of both cameras' shifts against the IMU's clock.
     shifts = cameras[low].timeshift_cam_imu, cameras[up].timeshift_cam_imu
     delay_s = 0.0 if shifts[0] is None or shifts[1] is None else shifts[1] - shifts[0]
-    try:
+    with within("timeshift_cam_imu: "):
         return replace(rig, times=ShutterTimes(delay_s if abs(delay_s) >= MIN_DELAY_S else 0.0))
-    except CalibError as error:
-        raise CalibError(f"timeshift_cam_imu: {error}") from error
 
 
 def _chain_cameras(values: Mapping[str, Any]) -> dict[str, ChainCamera]:
@@ -185,14 +180,12 @@ def _basalt_cameras(value: Any) -> dict[str, ChainCamera]:
 def _chain_model(key: str, camera: ChainCamera, warn: Warn) -> OmniCamera:
     """Return a camera of any model that foreign_models.py knows."""
 
-    def say(line: str) -> None:
-        warn(f"{key}: {line}")
-
+    names, size = (camera.camera_model, camera.distortion_model), camera.resolution
     try:
         if camera.basalt is not None:
-            return camera_of_names("camera_type", *camera.basalt, camera.resolution, say)
-        names = (camera.camera_model, camera.distortion_model)
-        return camera_of_lists(names, camera.intrinsics, camera.distortion_coeffs, camera.resolution, say)
+            return camera_of_names("camera_type", *camera.basalt, size, lambda line: warn(f"{key}: {line}"))
+        numbers = camera.intrinsics, camera.distortion_coeffs
+        return camera_of_lists(names, *numbers, size, lambda line: warn(f"{key}: {line}"))
     except CalibError as error:
         dot = "." if re.match(r"[a-z_]+: ", str(error)) else ": "
         raise CalibError(f"{key}{dot}{error}") from error
@@ -348,10 +341,8 @@ def read_camera(path: Path, view: View = "mirror", warn: Warn = silent) -> Camer
             f"{name}: expected one camera as ROS's camera_info, OpenCV, EuRoC's sensor.yaml, camodocal or OCamCalib "
             f"write it, found the keys {shown(sorted(values))}"
         )
-    try:
+    with within(f"{name}: "):
         return read(values, lambda line: warn(f"{name}: {line}"))
-    except (CalibError, ValueError, TypeError) as error:
-        raise error if str(error).startswith(name) else CalibError(f"{name}: {error}") from error
 
 
 def is_one_camera(values: Mapping[str, Any]) -> bool:
@@ -458,13 +449,9 @@ def parse_ocam(text: str | bytes, view: View = "mirror", name: str = "calib_resu
     row, column = numbers(-3, "row and column of the centre", 2)
     c, d, e = numbers(-2, "affine c d e", 3)
     height, width = numbers(-1, "height and width of the image", 2)
-    if not is_image_size(width, height) or (height, width) != (int(height), int(width)):
-        most = f"1 to {MAX_SIDE_PX}, at most {MAX_PIXELS} in all"
-        raise expected(-1, f"the image's height and width in whole pixels, {most}")
-    try:
+    require_image_size(f"{name}, line {lines[-1][0]}", width, height)
+    with within(f"{name}: "):
         return OcamCamera(polynomial, (row, column), (c, d, e), (int(width), int(height)), view)
-    except CalibError as error:
-        raise CalibError(f"{name}: {error}") from error
 
 
 def _word_lines(text: str | bytes, name: str) -> list[tuple[int, list[str]]]:
@@ -484,22 +471,17 @@ class TransformTable(Struct, frozen=True):
 def read_transform(path: Path) -> Array:
     """Read T_lower_upper (4, 4): TOML or YAML with that key (or T_upper_lower), or a text of its 16 numbers."""
     data, name = read_bytes(path, MAX_OCAM_BYTES), str(path)
-    try:
+    with within(f"{name}: "):
         if path.suffix in (".toml", ".yaml", ".yml", ".json"):
             table = table_of(data) if path.suffix == ".toml" else dict(load_mapping(data, name))
             found = _stated(convert(TransformTable, table), "T_lower_upper", name, silent)
             if found is None:
                 raise CalibError("expected either T_lower_upper or T_upper_lower")
             return found
-        try:
-            numbers = [float(word) for _, words in _word_lines(data, name) for word in words]
-        except ValueError as error:
-            raise CalibError(f"expected 16 numbers, the rows of T_lower_upper: {error}") from error
-        if not np.isfinite(numbers).all():
-            raise CalibError("T_lower_upper: expected 16 finite numbers")
-        return transform_of([numbers[start : start + 4] for start in range(0, len(numbers), 4)], "T_lower_upper")
-    except (CalibError, ValueError) as error:
-        raise error if str(error).startswith(name) else CalibError(f"{name}: {error}") from error
+        with within("expected 16 numbers, the 4 rows of T_lower_upper: "):
+            numbers = np.array([float(word) for _, words in _word_lines(data, name) for word in words])
+            rows = numbers.reshape(4, 4).tolist()
+        return transform_of(rows, "T_lower_upper")
 
 
 def straight_up(baseline_m: float) -> Array:

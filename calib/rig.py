@@ -84,6 +84,11 @@ class Rig:
             )
 
     @property
+    def sides(self) -> tuple[tuple[str, MountedCamera], tuple[str, MountedCamera]]:
+        """Return names and cameras, the lower one first."""
+        return ("lower", self.lower), ("upper", self.upper)
+
+    @property
     def baseline_m(self) -> float:
         """Return the distance of the two viewpoints [m]."""
         return float(np.linalg.norm(self.upper.viewpoint - self.lower.viewpoint))

@@ -11,8 +11,7 @@ from __future__ import annotations
 import base64
 import binascii
 import os
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, Literal, TypeAlias
 
@@ -24,7 +23,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.atomic_file import write_file
-from calib.errors import CalibError
+from calib.errors import CalibError, within
 from calib.models.camera import Mask, OmniCamera
 from calib.models.names import MODELS, camera_of, is_coefficient, model_name, names_of, values_of
 from calib.models.ocam import DISTANCE_M, OcamCamera, View
@@ -33,7 +32,7 @@ from calib.rig import MountedCamera, Rig, ShutterTimes
 from calib.rig_covariance import TRANSFORM_NAMES, RigCovariance
 from calib.text_files import decode
 from calib.typed_toml import convert, shown, table_of
-from calib.validation import MAX_PIXELS, MAX_SIDE_PX, is_image_size, read_bytes, transform_of
+from calib.validation import read_bytes, require_image_size, transform_of
 
 SCHEMA: Final = 1  # the first: it rises when an earlier program would misread the file
 COVARIANCE_VERSION: Final = 1  # the same for the table [covariance]
@@ -150,12 +149,12 @@ def read_rig(path: str | os.PathLike[str]) -> Rig:
 def parse_rig(text: str | bytes, folder: Path | None = None, name: str = "rig.toml") -> Rig:
     """Parse the rig of a `rig.toml`'s text; folder contains its mask images, None permits embedded ones only."""
     data = decode(text, name).encode()
-    with _within(f"{name}: "):
+    with within(f"{name}: "):
         values = table_of(data)
         _require_version("schema", values.get("schema"), SCHEMA)  # first, as another one has other keys
         table = convert(RigTable, values)
         lower, upper = (_mounted(side, getattr(table, side), folder) for side in SIDES)
-        with _within("times: "):
+        with within("times: "):
             times = ShutterTimes(*astuple(table.times or TimesTable()))
         return Rig(
             lower,
@@ -165,15 +164,6 @@ def parse_rig(text: str | bytes, folder: Path | None = None, name: str = "rig.to
             None if table.covariance is None else _covariance(table.covariance, table),
             times,
         )
-
-
-@contextmanager
-def _within(place: str) -> Iterator[None]:
-    """Turn errors into CalibError, with the place before their message."""
-    try:
-        yield
-    except (CalibError, ValueError) as error:
-        raise CalibError(f"{place}{error}") from error
 
 
 def _require_version(key: str, found: object, version: int) -> None:
@@ -188,15 +178,11 @@ def _mounted(side: str, table: CameraTable, folder: Path | None) -> MountedCamer
         T_rig_cam, other = other, T_rig_cam
     if other is not None:
         raise CalibError(f"{side}: expected T_rig_{side}, found that of the other camera")
-    if not is_image_size(*table.size):
-        raise CalibError(
-            f"{side}.size: expected [width, height] in pixels, 1 to {MAX_SIDE_PX}, at most {MAX_PIXELS} in all, found "
-            f"{list(table.size)}"
-        )
+    require_image_size(f"{side}.size", *table.size)
     if (table.view is not None) != (table.model == "ocam"):
         raise CalibError(f"{side}.view: expected mirror or direct for the model ocam, and no view for others")
     intrinsics = convert(INTRINSICS[table.model], table.intrinsics, (side, "intrinsics"))
-    with _within(f"{side}.intrinsics: "):
+    with within(f"{side}.intrinsics: "):
         camera = _camera(table, intrinsics)
     mask = None if table.mask is None else _mask(f"{side}.mask", table.mask, table.size, folder)
     return MountedCamera(camera, se3.inverse(transform_of(T_rig_cam, f"{side}.T_rig_{side}")), mask)
@@ -217,7 +203,7 @@ def _mask(path: str, table: MaskTable, size: Size, folder: Path | None) -> Mask:
     outer_px = np.inf if table.outer_px is None else table.outer_px
     if not 0 <= table.inner_px < outer_px:
         raise CalibError(f"{path}.inner_px: expected 0 <= inner_px < outer_px, found {table.inner_px:g}")
-    with _within(f"{path}.image: "):
+    with within(f"{path}.image: "):
         image = None if table.image is None else _mask_image(table.image, size, folder)
     return Mask(table.center, table.inner_px, float(outer_px), image)
 
@@ -277,7 +263,7 @@ def _covariance(table: CovarianceTable, rig: RigTable) -> RigCovariance:
     correlation = np.eye(len(names))
     for k, row in enumerate(table.correlation):
         correlation[k, :k] = correlation[:k, k] = row
-    with _within("covariance: "):
+    with within("covariance: "):
         return RigCovariance(names, np.array(table.sigma), correlation)
 
 

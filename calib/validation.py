@@ -9,7 +9,7 @@ from typing import TypeAlias
 import numpy as np
 
 from calib import se3
-from calib.errors import CalibError
+from calib.errors import CalibError, within
 from calib.models.camera import Array
 from calib.typed_toml import bytes_of, shown
 
@@ -27,15 +27,18 @@ Warn: TypeAlias = Callable[[str], None]
 
 def read_bytes(path: str | PathLike[str], limit: int = MAX_FILE_BYTES) -> bytes:
     """Read a calibration file of at most limit bytes."""
-    try:
+    with within(f"{path}: "):
         return bytes_of(path, limit)
-    except ValueError as error:
-        raise CalibError(f"{path}: {error}") from error
 
 
-def is_image_size(width: float, height: float) -> bool:
-    """True if images of this size [px] are supported."""
-    return min(width, height) >= 1 and max(width, height) <= MAX_SIDE_PX and width * height <= MAX_PIXELS
+def require_image_size(key: str, width: float, height: float) -> None:
+    """Raise CalibError unless images of this size [px] are supported; key: what states it."""
+    whole = (width, height) == (int(width), int(height)) if np.isfinite([width, height]).all() else False
+    if not (whole and min(width, height) >= 1 and max(width, height) <= MAX_SIDE_PX and width * height <= MAX_PIXELS):
+        raise CalibError(
+            f"{key}: expected width and height of images in whole pixels, 1 to {MAX_SIDE_PX}, at most {MAX_PIXELS} in "
+            f"all, found {width:g} and {height:g}"
+        )
 
 
 def silent(line: str) -> None:

@@ -124,7 +124,10 @@ def find_april_grid(image: Image, board: AprilGrid, name: str = "", *, thorough:
     pixels = _grown(smoothed(image, BLUR_PX), points, places, outlines, board.window)
     pixels = without_outliers(points, refined_corners(image, points, pixels, board.window))
     seen = np.isfinite(pixels[:, 0])
-    if seen.sum() < MIN_CORNERS or not _is_spread(points[seen]):
+    if seen.sum() < MIN_CORNERS:
+        return None
+    spread = np.linalg.svd(points[seen] - points[seen].mean(axis=0), compute_uv=False)
+    if spread[1] <= MIN_SPREAD * spread[0]:
         return None
     return BoardView(name, pixels, float(seen.mean()))
 
@@ -262,8 +265,3 @@ def _accepted(image: Grey, mappings: dict[int, LocalMapping], window: float) -> 
     near = np.linalg.norm(refined - start, axis=1) < MAX_MOVE * sizes + MAX_MOVE_PX
     good = inside & near & (seen.quality > MIN_QUALITY)
     return {k: pixel for k, pixel, fine in zip(mappings, refined, good, strict=True) if fine}
-
-
-def _is_spread(points: Array) -> bool:
-    values = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(values[1] > MIN_SPREAD * values[0])

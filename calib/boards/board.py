@@ -34,12 +34,6 @@ class CalibrationBoard(Protocol):
         """Return the half side [squares] of the window about a corner in which grey depends on that corner alone."""
 
 
-def grid_points(columns: int, rows: int, square_m: float) -> Array:
-    """Return the corners (columns * rows, 3) [m] of squares, row by row: x along the columns, y down the rows, z 0."""
-    x, y = np.meshgrid(np.arange(columns), np.arange(rows))
-    return np.asarray(np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]) * square_m, float)
-
-
 @dataclass(frozen=True, slots=True)
 class Board:
     """A flat checkerboard of columns x rows inner corners, one square_m apart."""
@@ -60,7 +54,8 @@ class Board:
     @property
     def points(self) -> Array:
         """Return the corners (N, 3) [m] in the board's frame, row by row: x along the columns, y down the rows, z 0."""
-        return grid_points(self.columns, self.rows, self.square_m)
+        x, y = np.meshgrid(np.arange(self.columns), np.arange(self.rows))
+        return np.asarray(np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]) * self.square_m, float)
 
     @property
     def window(self) -> float:

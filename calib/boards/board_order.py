@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.boards.board import Board
 from calib.boards.corner_candidates import Grey, sample
@@ -46,20 +45,17 @@ def _board_windows(grid: Grid, board: Board) -> Iterator[Array]:
     """Yield every window of the board's size, upright or rotated, that is well filled and has no row beyond it."""
     for upright in (grid_to_array(grid), np.rot90(grid_to_array(grid))):
         known = np.isfinite(upright[..., 0])
-        if known.shape[0] >= board.rows + 2 and known.shape[1] >= board.columns + 2:
-            around = np.lib.stride_tricks.sliding_window_view(known, (board.rows + 2, board.columns + 2))
-            for j, i in np.argwhere(_are_isolated(around)) + 1:
-                yield upright[j : j + board.rows, i : i + board.columns]
-
-
-def _are_isolated(around: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the mask (J, I) of windows with their surroundings (J, I, rows + 2, columns + 2) that show a board."""
-    inside = around[..., 1:-1, 1:-1]
-    beyond = [around[..., 0, 1:-1], around[..., -1, 1:-1], around[..., 1:-1, 0], around[..., 1:-1, -1]]
-    borders = [inside[..., 0, :], inside[..., -1, :], inside[..., 0], inside[..., -1]]
-    filled = inside.mean(axis=(-2, -1)) >= MIN_FILLED
-    filled &= np.min([border.mean(axis=-1) for border in borders], axis=0) >= MIN_BORDER
-    return np.asarray(filled & (np.max([row.mean(axis=-1) for row in beyond], axis=0) < BEYOND))
+        if known.shape[0] < board.rows + 2 or known.shape[1] < board.columns + 2:
+            continue
+        around = np.lib.stride_tricks.sliding_window_view(known, (board.rows + 2, board.columns + 2))
+        inside = around[..., 1:-1, 1:-1]
+        beyond = [around[..., 0, 1:-1], around[..., -1, 1:-1], around[..., 1:-1, 0], around[..., 1:-1, -1]]
+        borders = [inside[..., 0, :], inside[..., -1, :], inside[..., 0], inside[..., -1]]
+        isolated = inside.mean(axis=(-2, -1)) >= MIN_FILLED
+        isolated &= np.min([border.mean(axis=-1) for border in borders], axis=0) >= MIN_BORDER
+        isolated &= np.max([row.mean(axis=-1) for row in beyond], axis=0) < BEYOND
+        for j, i in np.argwhere(isolated) + 1:
+            yield upright[j : j + board.rows, i : i + board.columns]
 
 
 def largest_rectangle(grid: Grid) -> tuple[int, int]:
@@ -83,12 +79,13 @@ def orient_corners(image: Grey, corners: Array, board: Board) -> Array:
     """
     rotated = [np.rot90(corners, turns, axes=(0, 1)) for turns in range(4)]
     fitting = [order for order in rotated if order.shape[:2] == (board.rows, board.columns)]
-    dark = [order for order in fitting if _first_square_is_dark(image, order)] or fitting
+    odd = np.indices((board.rows - 1, board.columns - 1)).sum(axis=0) % 2 == 1
+
+    def is_dark(order: Array) -> bool:
+        """True if the first square, and those of its colour, are darker than the others."""
+        middles = (order[:-1, :-1] + order[1:, :-1] + order[:-1, 1:] + order[1:, 1:]) / 4
+        grey = np.where(np.isfinite(middles[..., 0]), sample(image, np.nan_to_num(middles)), np.nan)
+        return bool(np.nanmean(grey[~odd]) < np.nanmean(grey[odd]))
+
+    dark = [order for order in fitting if is_dark(order)] or fitting
     return min(dark, key=lambda order: float(np.nansum(order[0, 0])) if np.isfinite(order[0, 0, 0]) else np.inf)
-
-
-def _first_square_is_dark(image: Grey, corners: Array) -> bool:
-    middles = (corners[:-1, :-1] + corners[1:, :-1] + corners[:-1, 1:] + corners[1:, 1:]) / 4
-    grey = np.where(np.isfinite(middles[..., 0]), sample(image, np.nan_to_num(middles)), np.nan)
-    odd = np.indices(grey.shape).sum(axis=0) % 2 == 1
-    return bool(np.nanmean(grey[~odd]) < np.nanmean(grey[odd]))

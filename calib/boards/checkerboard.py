@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.boards.board import Board, BoardView
 from calib.boards.board_order import MIN_FILLED, array_to_grid, largest_rectangle, orient_corners, select_board_window
@@ -74,8 +73,11 @@ def _refined(image: Image, blurred: Grey, placed: Array, board: Board) -> Array:
     """Return the corners (N, 2) of a window (rows, columns, 2), refined, with NaN for those that are not accepted."""
     points = board.points[:, :2] / board.square_m
     pixels = refined_corners(image, points, placed.reshape(-1, 2))
-    pixels[~_corner_mask(blurred, pixels.reshape(placed.shape)).ravel()] = np.nan
-    return without_outliers(points, pixels)
+    # The ring of grey levels must be that of a corner.
+    grid, known = array_to_grid(pixels.reshape(placed.shape)), np.isfinite(pixels[:, 0])
+    rings = np.array([max(MIN_RING_PX, RING_PART * spacing(grid, cell)) for cell in grid])
+    known[known] = describe_corners(blurred, pixels[known], rings).quality > 0
+    return without_outliers(points, np.where(known[:, None], pixels, np.nan))
 
 
 def board_score(image: Grey, corners: Array, board: Board) -> float:
@@ -136,13 +138,3 @@ def _grids(searched: DerivedImage, board: Board) -> Iterator[Grid]:
 def _most_corners(board: Board) -> int:
     """Return the number of corners beyond which a grid is no board, and does not grow: a floor has thousands."""
     return 3 * (board.columns + 2) * (board.rows + 2)
-
-
-def _corner_mask(blurred: Grey, corners: Array) -> NDArray[np.bool_]:
-    """Return the mask (rows, columns) of pixels whose ring of grey levels is that of a corner."""
-    grid = array_to_grid(corners)
-    rings = np.array([max(MIN_RING_PX, RING_PART * spacing(grid, cell)) for cell in grid])
-    likely = np.zeros(corners.shape[:2], bool)
-    column, row = np.array(list(grid)).T
-    likely[row, column] = describe_corners(blurred, np.array(list(grid.values())), rings).quality > 0
-    return likely

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
@@ -61,27 +61,30 @@ class CornerCandidates:
 
     def select(self, chosen: NDArray[np.intp] | NDArray[np.bool_]) -> CornerCandidates:
         """Return the candidates of an index or mask."""
-        return CornerCandidates(
-            self.pixels[chosen],
-            self.angles[chosen],
-            self.light[chosen],
-            self.contrast[chosen],
-            self.quality[chosen],
-            self.ring_px[chosen],
-        )
+        return CornerCandidates(*(getattr(self, one.name)[chosen] for one in fields(self)))
 
 
 def find_corners(image: NDArray[np.uint8]) -> CornerCandidates:
     """Find all candidates in an image (H, W) at all scales; of several at one place the best is kept."""
-    return _merge_levels([_at_level(image, level) for level in LEVELS])
+    levels = [_at_level(image, level) for level in LEVELS]
+    parts = [np.concatenate([getattr(level, one.name) for level in levels]) for one in fields(CornerCandidates)]
+    found = CornerCandidates(*parts)
+    found = found.select(np.argsort(-found.quality * found.contrast, kind="stable"))
+    return found.select(_suppress_duplicates(found.pixels, SAME_RING_PART * found.ring_px))
 
 
 def describe_corners(image: Grey, pixels: Array, ring_px: float | Array) -> CornerCandidates:
-    """Describe the rings about pixels (N, 2); quality 0 for a pixel that is not a corner."""
+    """Describe the rings about pixels (N, 2) by even part, odd part and crossing edges; quality 0: not a corner."""
     radius = np.broadcast_to(np.asarray(ring_px, float), (len(pixels),))
-    angle = 2 * np.pi * np.arange(RING) / RING
+    angle, half = 2 * np.pi * np.arange(RING) / RING, RING // 2
     ring = sample(image, pixels[:, None] + radius[:, None, None] * np.column_stack([np.cos(angle), np.sin(angle)]))
-    return _classify_rings(ring, pixels, radius)
+    even, odd = (ring[:, :half] + ring[:, half:]) / 2, (ring[:, :half] - ring[:, half:]) / 2
+    contrast = np.ptp(even, axis=1)
+    ratio = odd.std(axis=1) / np.maximum(even.std(axis=1), 1e-6)
+    angles, light, crossings = _edges(even - ((even.max(axis=1) + even.min(axis=1)) / 2)[:, None])
+    between = np.minimum(angles[:, 1] - angles[:, 0], np.pi - (angles[:, 1] - angles[:, 0]))
+    good = (crossings == 2) & (contrast >= MIN_CONTRAST) & (ratio < MAX_ODD) & (between > MIN_CROSSING_RAD)
+    return CornerCandidates(pixels, angles, light, contrast, np.where(good, 1 - ratio, 0.0), radius)
 
 
 def sample(image: Grey, pixels: Array) -> Array:
@@ -115,7 +118,10 @@ def _at_level(image: NDArray[np.uint8], level: ScaleLevel) -> CornerCandidates:
 
 def _saddles(blurred: Grey, border: int) -> Array:
     """Return pixels (N, 2) of the strongest saddle points, refined by the second-order surface."""
-    strength, derivatives = _saddle_strength(blurred)
+    orders = ((1, 0, 1 / 8), (0, 1, 1 / 8), (2, 0, 1 / 4), (0, 2, 1 / 4), (1, 1, 1 / 4))
+    derivatives = [cv2.Sobel(blurred, cv2.CV_32F, dx, dy, ksize=3, scale=scale) for dx, dy, scale in orders]
+    _, _, xx, yy, xy = derivatives
+    strength = xy * xy - xx * yy  # the negative determinant of the Hessian
     peak = (strength == cv2.dilate(strength, np.ones((3, 3), np.uint8))) & (strength > MIN_SADDLE**2)
     peak[:border], peak[-border:], peak[:, :border], peak[:, -border:] = False, False, False, False
     row, column = np.nonzero(peak)
@@ -125,31 +131,6 @@ def _saddles(blurred: Grey, border: int) -> Array:
     determinant = xx * yy - xy * xy
     step = np.column_stack([xy * y - yy * x, xy * x - xx * y]) / determinant[:, None]
     return np.asarray(np.column_stack([column, row]) + np.clip(step, -1, 1))
-
-
-def _saddle_strength(blurred: Grey) -> tuple[Grey, list[Grey]]:
-    """Return the negative determinant of the Hessian, and the derivatives x, y, xx, yy, xy."""
-    orders = ((1, 0, 1 / 8), (0, 1, 1 / 8), (2, 0, 1 / 4), (0, 2, 1 / 4), (1, 1, 1 / 4))
-    derivatives = [
-        np.asarray(cv2.Sobel(blurred, cv2.CV_32F, dx, dy, ksize=3, scale=scale), np.float32) for dx, dy, scale in orders
-    ]
-    _, _, xx, yy, xy = derivatives
-    return np.asarray(xy * xy - xx * yy, np.float32), derivatives
-
-
-def _classify_rings(ring: Array, pixels: Array, radius: Array) -> CornerCandidates:
-    """Describe corners by their rings (N, RING) of grey levels: even part, odd part, crossing edges."""
-    half = RING // 2
-    even, odd = (ring[:, :half] + ring[:, half:]) / 2, (ring[:, :half] - ring[:, half:]) / 2
-    middle = (even.max(axis=1) + even.min(axis=1)) / 2
-    wave = even - middle[:, None]
-    contrast = np.ptp(even, axis=1)
-    ratio = odd.std(axis=1) / np.maximum(even.std(axis=1), 1e-6)
-    angles, light, crossings = _edges(wave)
-    between = np.minimum(angles[:, 1] - angles[:, 0], np.pi - (angles[:, 1] - angles[:, 0]))
-    good = (crossings == 2) & (contrast >= MIN_CONTRAST) & (ratio < MAX_ODD) & (between > MIN_CROSSING_RAD)
-    quality = np.where(good, 1 - ratio, 0.0)
-    return CornerCandidates(pixels, angles, light, contrast, quality, radius)
 
 
 def _edges(wave: Array) -> tuple[Array, NDArray[np.bool_], NDArray[np.int64]]:
@@ -166,18 +147,6 @@ def _edges(wave: Array) -> tuple[Array, NDArray[np.bool_], NDArray[np.int64]]:
     wrapped = angles[:, 1] >= np.pi
     angles[wrapped] = np.column_stack([angles[wrapped, 1] - np.pi, angles[wrapped, 0]])
     return angles, np.where(wrapped, ~light, light), count
-
-
-def _merge_levels(levels: list[CornerCandidates]) -> CornerCandidates:
-    """Merge the candidates of all scales; of several within a part of their ring's radius the best is kept."""
-    both = CornerCandidates(
-        *(
-            np.concatenate([getattr(level, name) for level in levels])
-            for name in ("pixels", "angles", "light", "contrast", "quality", "ring_px")
-        )
-    )
-    both = both.select(np.argsort(-both.quality * both.contrast, kind="stable"))
-    return both.select(_suppress_duplicates(both.pixels, SAME_RING_PART * both.ring_px))
 
 
 def _suppress_duplicates(pixels: Array, reach: Array) -> NDArray[np.intp]:

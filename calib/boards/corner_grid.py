@@ -90,9 +90,11 @@ def grow_grid(image: Grey, grid: Grid, most: int) -> Grid:
     A grid of more than most corners does not grow any further.
     """
     grid, refused = dict(grid), set[Cell]()
-    contrast = _usual_contrast(image, grid)
+    rings = np.array([max(MIN_RING_PX, RING_PART * spacing(grid, cell)) for cell in grid])
+    contrast = float(np.median(describe_corners(image, np.array(list(grid.values())), rings).contrast))
     while len(grid) <= most:
-        guesses = {cell: guess for cell in _border(grid) - refused if (guess := predict(grid, cell)) is not None}
+        border = {(i + di, j + dj) for i, j in grid for di, dj in STEPS} - set(grid) - refused
+        guesses = {cell: guess for cell in border if (guess := predict(grid, cell)) is not None}
         if not guesses:
             break
         found = _accept_predicted(image, grid, guesses, contrast)
@@ -104,10 +106,6 @@ def grow_grid(image: Grey, grid: Grid, most: int) -> Grid:
         if not found:
             break
     return grid
-
-
-def _border(grid: Grid) -> set[Cell]:
-    return {(i + di, j + dj) for i, j in grid for di, dj in STEPS} - set(grid)
 
 
 def predict(grid: Grid, cell: Cell) -> Array | None:
@@ -172,12 +170,6 @@ def _accept_predicted(image: Grey, grid: Grid, guesses: Grid, contrast: float) -
     good = near & (sizes > MIN_SPACING_PX) & (seen.quality > 0)
     good &= seen.contrast > MIN_CONTRAST_PART * contrast
     return {cell: pixel for cell, pixel, fine in zip(guesses, refined, good, strict=True) if fine}
-
-
-def _usual_contrast(image: Grey, grid: Grid) -> float:
-    """Return the median contrast of the grid's corners."""
-    rings = np.array([max(MIN_RING_PX, RING_PART * spacing(grid, cell)) for cell in grid])
-    return float(np.median(describe_corners(image, np.array(list(grid.values())), rings).contrast))
 
 
 def refine_subpixel(image: Grey, pixels: Array, sizes: Array) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -34,21 +34,12 @@ class DerivedImage:
 def derived_images(image: Image) -> Iterator[DerivedImage]:
     """Yield the image and its derived images, the cheapest first."""
     yield DerivedImage(image, lambda pixels: pixels)
-    yield DerivedImage(contrasted(image), lambda pixels: pixels)
+    local = cv2.createCLAHE(CLAHE_CLIP_LIMIT, (CLAHE_TILES,) * 2).apply(image).astype(np.uint8, copy=False)
+    yield DerivedImage(local, lambda pixels: pixels)
     if image.size <= MAX_ENLARGED_PIXELS:
-        yield enlarged(image)
+        double = cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC).astype(np.uint8, copy=False)
+        yield DerivedImage(double, lambda pixels: (pixels + 0.5) / 2 - 0.5)
     yield unrolled(image)
-
-
-def contrasted(image: Image) -> Image:
-    """Return the image with raised local contrast."""
-    return cv2.createCLAHE(CLAHE_CLIP_LIMIT, (CLAHE_TILES,) * 2).apply(image).astype(np.uint8, copy=False)
-
-
-def enlarged(image: Image) -> DerivedImage:
-    """Return the image at twice its size."""
-    double = cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC).astype(np.uint8, copy=False)
-    return DerivedImage(double, lambda pixels: (pixels + 0.5) / 2 - 0.5)
 
 
 def unrolled(image: Image) -> DerivedImage:
@@ -57,26 +48,21 @@ def unrolled(image: Image) -> DerivedImage:
     It is conformal: squares stay square, and boards near the hub become larger and lose their fan shape.
     """
     height, width = image.shape
-    strip = cv2.remap(image, *_strip_maps((height, width)), cv2.INTER_CUBIC)
-    return DerivedImage(strip.astype(np.uint8, copy=False), partial(_strip_to_source, (height, width)))
+    strip = cv2.remap(image, *_strip_maps((height, width)), cv2.INTER_CUBIC).astype(np.uint8, copy=False)
+    _, outer, scale = _strip_scale((height, width))
+    middle = np.array([width - 1, height - 1]) / 2
+
+    def to_source(pixels: Array) -> Array:
+        azimuth, radius = pixels[:, 0] / scale, outer * np.exp(-pixels[:, 1] / scale)
+        return np.asarray(middle + radius[:, None] * np.column_stack([np.cos(azimuth), np.sin(azimuth)]))
+
+    return DerivedImage(strip, to_source)
 
 
 def _strip_scale(shape: tuple[int, int]) -> tuple[float, float, float]:
     """Return inner and outer radius [px] of a strip, and its pixels per radian; shape: (H, W) of the image."""
     inner, outer = min(shape) * STRIP_INNER_PART, max(shape) / 2
     return inner, outer, min(MAX_STRIP_PX, 2 * np.pi * outer) / (2 * np.pi)
-
-
-def _strip_to_source(shape: tuple[int, int], pixels: Array) -> Array:
-    """Return the pixels (N, 2) of an image of that shape for pixels (N, 2) of its strip."""
-    _, outer, scale = _strip_scale(shape)
-    azimuth, radius = pixels[:, 0] / scale, outer * np.exp(-pixels[:, 1] / scale)
-    return np.asarray(_middle(shape) + radius[:, None] * np.column_stack([np.cos(azimuth), np.sin(azimuth)]))
-
-
-def _middle(shape: tuple[int, int]) -> Array:
-    """Return the middle (2,) of an image (H, W): u, v [px]."""
-    return np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2])
 
 
 @lru_cache(maxsize=2)
@@ -88,7 +74,6 @@ def _strip_maps(shape: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np
     inner, outer, scale = _strip_scale(shape)
     azimuth = np.arange(int(STRIP_TURNS * 2 * np.pi * scale)) / scale
     radius = outer * np.exp(-np.arange(int(np.log(outer / inner) * scale)) / scale)
-    u, v = (
-        middle + np.outer(radius, way(azimuth)) for middle, way in zip(_middle(shape), (np.cos, np.sin), strict=True)
-    )
+    u = (shape[1] - 1) / 2 + np.outer(radius, np.cos(azimuth))
+    v = (shape[0] - 1) / 2 + np.outer(radius, np.sin(azimuth))
     return u.astype(np.float32), v.astype(np.float32)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import closing
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -30,7 +29,7 @@ from calib.rig_file import read_rig
 from drivers.logs.log_reader import AnyCameras, LogCameras
 from omnid.calibration.board_search import Progress, silent
 from omnid.calibration.drive_observations import Drives, collect, observe_pairs
-from omnid.calibration.images import SIDES, open_log
+from omnid.calibration.images import SIDES
 from omnid.calibration.rig_check import check_rig, read_rig_pairs, with_masks
 from omnid.config import Config
 from omnid.core.stereo.triangulation import common_perpendicular
@@ -195,8 +194,7 @@ def straightened(
 ) -> Array:
     """Return steps (P,) to a rig with which columns match, from where tracking works; OmnidError if there is none."""
     rig = parameters.rig
-    with closing(open_log(log, cameras, rig)) as reader:
-        pairs = read_rig_pairs(reader, rig)
+    pairs = read_rig_pairs(log, rig, cameras)
     finding = check_rig(pairs, rig, config.panorama).finding
     progress(finding.summary)
     if finding.drift is None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from contextlib import closing
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -13,7 +12,6 @@ from calib import se3
 from calib.rig import Rig
 from calib.rig_file import read_rig, write_rig
 from drivers.logs.log_reader import AnyCameras, LogCameras
-from omnid.calibration.images import open_log
 from omnid.calibration.rig_check import read_rig_pairs, with_masks
 from omnid.config import Config
 from omnid.core.floor import MOST_PAIRS, Floor, FloorEstimator
@@ -69,8 +67,7 @@ def calibrate_height(
     """
     log, rig = Path(log), rig if isinstance(rig, Rig) else read_rig(Path(rig))
     cameras = LogCameras(*topics)
-    with closing(open_log(log, cameras, rig)) as reader:
-        pairs = read_rig_pairs(reader, rig)
+    pairs = read_rig_pairs(log, rig, cameras)
     config = Config()
     front_end = FrontEnd(geometry(with_masks(log, rig, cameras), config.panorama), config)
     view = se3.apply(rig.T_base_rig, rig.lower.viewpoint[None])[0]

@@ -13,7 +13,7 @@ import numpy as np
 from calib.fit.rig_drift import apply_drift
 from calib.rig import Rig
 from calib.rim import RimShift, rim_shift
-from drivers.logs.log_reader import LogCameras, LogReader
+from drivers.logs.log_reader import LogCameras
 from omnid.calibration.drive_observations import tracked_updates
 from omnid.calibration.images import SIDES, TOLERANCE_NS, brightest, open_log, paired
 from omnid.config import Config, PanoramaConfig
@@ -124,8 +124,7 @@ def _rim(name: str, rim: RimShift | None) -> str:
 
 def check_log(log: Path, rig: Rig, cameras: LogCameras) -> tuple[RigCheckResult, list[FramePair]]:
     """Check a rig by pairs spread over a log; return them as well. OmnidError where they show too little."""
-    with closing(open_log(log, cameras, rig)) as reader:
-        pairs = read_rig_pairs(reader, rig)
+    pairs = read_rig_pairs(log, rig, cameras)
     found = check_rig(pairs, rig, Config().panorama)
     if found.skewed:
         # The motion between the exposures would be taken for a drift.
@@ -158,23 +157,22 @@ def with_upper_corrected(rig: Rig, pairs: Sequence[FramePair], found: RigCheckRe
     return rig, "\n".join([found.finding.summary, NOT_OBSERVABLE, *[RECALIBRATE] * is_doubtful])
 
 
-def read_rig_pairs(reader: LogReader, rig: Rig) -> list[FramePair]:
+def read_rig_pairs(log: Path, rig: Rig, cameras: LogCameras) -> list[FramePair]:
     """Read at most PAIRS pairs, evenly spread over the log; raises OmnidError if none has the rig's size.
 
     Cameras that are not synchronised are paired as in a run: within half a period.
     """
-    stamps = {camera: [frame.stamp_ns for frame in reader.frames() if frame.camera == camera] for camera in SIDES}
-    steps = [step for own in stamps.values() for step in np.diff(sorted(own)).tolist() if step > 0]
-    within_ns = max(TOLERANCE_NS, float(np.median(steps)) / 2 if steps else 0.0)
-    stride = max(1, (min(map(len, stamps.values())) - 1) // PAIRS + 1)
     decode, found = Decoder(rig), list[FramePair]()
-    for number, (lower, upper) in enumerate(paired(reader.frames(), within_ns)):
-        if number % stride:
-            continue
-        images = decode(lower), decode(upper)
-        skew_s = (upper.stamp_ns - lower.stamp_ns) * 1e-9
-        if images[0] is not None and images[1] is not None:
-            found.append(FramePair(number, lower.stamp_ns, images[0], images[1], skew_s))
+    with closing(open_log(log, cameras, rig)) as reader:
+        stamps = {camera: [frame.stamp_ns for frame in reader.frames() if frame.camera == camera] for camera in SIDES}
+        steps = [step for own in stamps.values() for step in np.diff(sorted(own)).tolist() if step > 0]
+        within_ns = max(TOLERANCE_NS, float(np.median(steps)) / 2 if steps else 0.0)
+        stride = max(1, (min(map(len, stamps.values())) - 1) // PAIRS + 1)
+        for number, (lower, upper) in enumerate(paired(reader.frames(), within_ns)):
+            images = (decode(lower), decode(upper)) if number % stride == 0 else (None, None)
+            if images[0] is not None and images[1] is not None:
+                skew_s = (upper.stamp_ns - lower.stamp_ns) * 1e-9
+                found.append(FramePair(number, lower.stamp_ns, images[0], images[1], skew_s))
     if not found:
         raise OmnidError(
             "calibrate drive: no pair of images in the log; "

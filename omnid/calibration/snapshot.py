@@ -9,19 +9,18 @@ from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.models.camera import Mask
 from calib.rim import find_rim
 from omnid.calibration.images import Image, brightest, middle_px
 
 IMAGES: Final = 10  # Images of each camera: the rim is searched in their maximum.
-SATURATED: Final = 250
-DARK_GREY, BRIGHT_SHARE = 25.0, 0.05
+# Grey levels at which a pixel is too bright, and a mean that is too dark; most of the pixels that may be too bright.
+SATURATED, DARK_GREY, BRIGHT_SHARE = 250, 25.0, 0.05
 NOISE_GREY2: Final = 4.0  # of the variance of the grey levels: an image without any content has no focus
 LESS_SHARP: Final = 0.5  # share of the other camera's focus measure
-NEAR_BORDER_PX: Final = 3.0
-_GREEN, _RED = (80, 220, 80), (60, 60, 230)
+EDGE_PX: Final = 3.0  # width of what counts as the edge of the image, of the rim and of the hub
+GREEN, RED = (80, 220, 80), (60, 60, 230)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,39 +38,27 @@ def view_of(images: Sequence[Image]) -> CameraView:
     """Return the measures of one camera's images (H, W), of one size; at least one."""
     newest = images[-1]
     rim = find_rim(brightest(images), middle_px(newest))
-    world = _world(newest, rim)
-    smooth = cv2.GaussianBlur(newest, (3, 3), 0).astype(np.float32)  # the Laplacian sees noise first
-    laplacian = cv2.Laplacian(smooth, cv2.CV_32F)
+    smooth = cv2.GaussianBlur(newest, (0, 0), 0.8).astype(np.float32)  # the Laplacian sees noise first
+    v, u = np.indices(newest.shape)
+    world = np.ones(newest.shape, bool)
+    if rim is not None:
+        world = rim.contains(np.column_stack([u.ravel(), v.ravel()]).astype(float), EDGE_PX).reshape(newest.shape)
+    if not world.any():
+        return CameraView(newest, rim, math.nan, math.nan, math.nan)
     grey = newest[world]
-    focus = float(laplacian[world].var() / (grey.var() + NOISE_GREY2)) if grey.size else math.nan
-    return CameraView(
-        newest,
-        rim,
-        focus,
-        float(grey.mean()) if grey.size else math.nan,
-        float((grey >= SATURATED).mean()) if grey.size else math.nan,
-    )
-
-
-def _world(image: Image, rim: Mask | None) -> NDArray[np.bool_]:
-    """Return which pixels (H, W) show the world, away from the edges of rim and hub; all of them without a rim."""
-    if rim is None:
-        return np.ones(image.shape, bool)
-    v, u = np.indices(image.shape)
-    distance = np.hypot(u - rim.center[0], v - rim.center[1])
-    return np.asarray((distance > rim.inner_px + 4) & (distance < rim.outer_px - 4))
+    focus = float(cv2.Laplacian(smooth, cv2.CV_32F)[world].var() / (grey.var() + NOISE_GREY2))
+    return CameraView(newest, rim, focus, float(grey.mean()), float((grey >= SATURATED).mean()))
 
 
 def described(view: CameraView) -> str:
     """Return the measures in one line."""
     height, width = view.image.shape
-    if view.rim is None:
-        rim = "no rim found"
-    else:
-        (u, v), radius = view.rim.center, view.rim.outer_px
+    rim = "no rim found"
+    if view.rim is not None:
+        (u, v), (middle_u, middle_v) = view.rim.center, middle_px(view.image)
         rim = (
-            f"rim: centre ({u:.0f}, {v:.0f}) px, {u - (width - 1) / 2:+.0f} and {v - (height - 1) / 2:+.0f} px from "
-            f"the middle, radius {radius:.0f} px"
+            f"rim: centre ({u:.0f}, {v:.0f}) px, {u - middle_u:+.0f} and {v - middle_v:+.0f} px from the middle, "
+            f"radius {view.rim.outer_px:.0f} px"
         )
     return (
         f"{width}x{height}, {rim}; focus {1e3 * view.focus:.1f}; brightness {view.level_grey:.0f}, "
@@ -87,7 +74,7 @@ def warnings(views: Mapping[str, CameraView]) -> Iterator[str]:
                 f"{name}: the mirror's rim was not found: light all around, and the whole circle in the image; "
                 "without a rim the mask must be given in the rig; a lens without a mirror has none, and needs no mask"
             )
-        elif _reach_px(view) < NEAR_BORDER_PX:
+        elif _reach_px(view) < EDGE_PX:
             yield f"{name}: the rim leaves the image: move the camera towards the middle of the mirror, or farther away"
         if view.level_grey < DARK_GREY:
             yield f"{name}: it is dark: more light, a longer exposure (cameras.exposure_us) or more gain"
@@ -110,20 +97,14 @@ def _reach_px(view: CameraView) -> float:
     return float(min(u, v, width - 1 - u, height - 1 - v) - radius)
 
 
-def annotated(name: str, view: CameraView) -> Image:
-    """Return the image (H, W, 3) BGR with rim, hub, the middle of the image, and the measures below it."""
+def annotated(view: CameraView) -> Image:
+    """Return the image (H, W, 3) BGR with rim, hub, and the middle of the image."""
     image = cv2.cvtColor(view.image, cv2.COLOR_GRAY2BGR)
     height, width = view.image.shape
     if view.rim is not None:
         center = tuple(round(value) for value in view.rim.center)
         for radius in (view.rim.outer_px, view.rim.inner_px):
-            if radius > 0:
-                cv2.circle(image, center, round(radius), _GREEN, 1, cv2.LINE_AA)
-        cv2.drawMarker(image, center, _GREEN, cv2.MARKER_CROSS, 15)
-    cv2.drawMarker(image, (width // 2, height // 2), _RED, cv2.MARKER_TILTED_CROSS, 15)
-    strip = np.zeros((24, width, 3), np.uint8)
-    text = f"{name}: focus {1e3 * view.focus:.1f}, brightness {view.level_grey:.0f}, " + (
-        "no rim" if view.rim is None else f"radius {view.rim.outer_px:.0f} px"
-    )
-    cv2.putText(strip, text, (6, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA)
-    return np.vstack((image, strip))
+            cv2.circle(image, center, round(radius), GREEN, 1, cv2.LINE_AA)
+        cv2.drawMarker(image, center, GREEN, cv2.MARKER_CROSS)
+    cv2.drawMarker(image, (width // 2, height // 2), RED, cv2.MARKER_TILTED_CROSS)
+    return np.asarray(image, np.uint8)

@@ -125,7 +125,7 @@ def _snapshot(args: argparse.Namespace) -> int:
     views: dict[str, CameraView] = {name: view_of(images) for name, images in _images(args)}
     for name, view in views.items():
         path = args.snapshot / f"{name}.png"
-        write_file(path, png(annotated(name, view)))
+        write_file(path, png(annotated(view)))
         print(f"{path}: {described(view)}")
     problems = list(warnings(views))
     for problem in problems:

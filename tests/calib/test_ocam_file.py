@@ -57,7 +57,7 @@ def test_parses_every_number_as_the_toolbox_defines_it() -> None:
         ("5 -2.315000e+02", "5 231", "c.txt: ocam camera: expected a0 < 0"),
         ("240.378942 318.540278", "240.378942", "line 11: expected 2 finite numbers"),
         ("1.000529 0.000053", "1.000529 one", r"line 15: expected 3 finite numbers \(affine c d e\)"),
-        ("480 640", "480.5 640", "line 19: expected the image's height"),
+        ("480 640", "480.5 640", "line 19: expected width and height"),
         ("480 640", "0 640", "line 19"),
         ("480 640", "", "line 7: expected 2 finite numbers"),
         ("480 640", "480 640\n1", "line 15: expected 2 finite numbers"),
@@ -119,10 +119,10 @@ def test_reads_a_transform_in_every_format(tmp_path: Path, name: str, text: str)
         ("t.toml", "[", "expected TOML"),
         ("t.yml", "T_lower_upper: 3", "expected rows of numbers"),
         ("t.yml", "[", "YAML"),
-        ("t.txt", "1 0 0 0", "4 rows"),
+        ("t.txt", "1 0 0 0", "the 4 rows"),
         ("t.txt", "one", "expected 16 numbers"),
         ("t.txt", "1 " * 16, "expected a rotation"),
-        ("t.txt", "nan " * 16, "finite"),
+        ("t.txt", "nan " * 16, "expected a rotation"),
     ],
 )
 def test_refuses_invalid_transform_files(tmp_path: Path, name: str, text: str, message: str) -> None:

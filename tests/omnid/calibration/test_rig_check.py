@@ -13,7 +13,7 @@ from calib import se3
 from calib.models.camera import Mask
 from calib.models.unified import UnifiedCamera
 from calib.rig_file import read_rig, write_rig
-from omnid.calibration.images import BY_NAME, open_log
+from omnid.calibration.images import BY_NAME
 from omnid.calibration.rig_check import RigCheckResult, check_rig, read_rig_pairs
 from omnid.cli import main
 from omnid.config import PanoramaConfig
@@ -42,7 +42,7 @@ def drive(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def pairs(drive: Path) -> list[FramePair]:
     rig = read_rig(drive / "rig.toml")
-    return read_rig_pairs(open_log(drive / "log.mcap", BY_NAME, rig), rig)
+    return read_rig_pairs(drive / "log.mcap", rig, BY_NAME)
 
 
 def check_rotated(drive: Path, pairs: list[FramePair], turn_deg: Turn) -> RigCheckResult:
