@@ -12,6 +12,7 @@ after 60 evaluations.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
@@ -127,3 +128,8 @@ def _trial(
     except np.linalg.LinAlgError:
         moved = None
     return (state, np.inf) if moved is None else (moved, problem.cost(moved, scale))
+
+
+def central_differences(function: Callable[[Array], Array], steps: Array) -> Array:
+    """Return the derivatives (..., P) of a function about zero, by steps (P,) of its argument."""
+    return np.stack([(function(step) - function(-step)) / (2 * np.abs(step).max()) for step in np.diag(steps)], axis=-1)

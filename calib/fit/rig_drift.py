@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib import se3
+from calib.fit.least_squares import central_differences
 from calib.fit.robust_scale import SIGMA_PER_MAD
 from calib.models.camera import Array
 from calib.rig import Rig
@@ -76,7 +77,11 @@ def estimate_rig_drift(lower: Array, upper: Array) -> RigDrift | None:
     x = np.zeros(5)
     prior = np.diag([0.0, 0, 0, SHIFT_SIGMA_RAD**-2, SHIFT_SIGMA_RAD**-2])
     for _ in range(ITERATIONS):
-        residual, J = _residuals(x, lower, upper), _jacobian(x, lower, upper)
+        residual, about = _residuals(x, lower, upper), x
+        J = central_differences(
+            lambda step, about=about: _residuals(about + step, lower, upper),  # type: ignore[misc]
+            DIFFERENCE_STEP_RAD * np.ones(5),
+        )
         sigma = max(MIN_SIGMA_RAD, SIGMA_PER_MAD * float(np.median(np.abs(residual - np.median(residual)))))
         weight = 1 / (1 + (residual / (KERNEL_WIDTH * sigma)) ** 2) ** 2
         variance = CORRELATED_POINTS * sigma**2
@@ -91,16 +96,6 @@ def _residuals(x: Array, lower: Array, upper: Array) -> Array:
     turned = upper @ se3.rotation_exp(x[:3]).T
     lengths = np.linalg.norm(normal, axis=1) * np.linalg.norm(upper, axis=1)
     return np.asarray((normal * turned).sum(axis=1) / np.maximum(lengths, 1e-12))
-
-
-def _jacobian(x: Array, lower: Array, upper: Array) -> Array:
-    """Return the derivatives (N, 5) of the residuals by rotation and shift."""
-    return np.column_stack(
-        [
-            (_residuals(x + d, lower, upper) - _residuals(x - d, lower, upper)) / (2 * DIFFERENCE_STEP_RAD)
-            for d in DIFFERENCE_STEP_RAD * np.eye(5)
-        ]
-    )
 
 
 def apply_drift(rig: Rig, drift: RigDrift) -> Rig:

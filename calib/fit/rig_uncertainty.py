@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from calib import se3
+from calib.fit.least_squares import central_differences
 from calib.fit.parameters import moved_rig
 from calib.models.camera import Array
 from calib.rig import Rig
@@ -147,7 +147,10 @@ def _motion_by_parameters(
     T_end_start = se3.inverse(se3.exp(motion))
     ends = se3.apply(T_end_start, points)
     first, last = (_pixels_by_parameters(rig, se3.apply(T_rig_rect, at), scaled) for at in (points, ends))
-    by_start, by_end = (_pixels_by_point(rig, at) for at in (points, ends))
+    by_start, by_end = (
+        central_differences(lambda shift, at=at: _pixels(rig, at + shift), POINT_STEP_M * np.ones(3))  # type: ignore[misc]
+        for at in (points, ends)
+    )
     seen = np.all([np.isfinite(part).all(axis=(1, 2)) for part in (first, last, by_start, by_end)], axis=0)
     if seen.sum() < MIN_POINTS:
         return None
@@ -157,11 +160,6 @@ def _motion_by_parameters(
     by_pose = np.concatenate([-by_end, by_end @ se3.hat(ends)], axis=2)
     right = (by_end @ shift + last).reshape(-1, first.shape[2])
     return np.asarray(-np.linalg.lstsq(by_pose.reshape(-1, 6), right, rcond=None)[0])
-
-
-def _pixels_by_point(rig: Rig, points: Array) -> Array:
-    """Return the derivatives (N, 4, 3) of the pixels by points (N, 3) in the rectified frame."""
-    return central_differences(lambda shift: _pixels(rig, points + shift), POINT_STEP_M * np.ones(3))
 
 
 def _pixels_by_parameters(rig: Rig, in_rig: Array, scaled: tuple[tuple[str, ...], Array]) -> Array:
@@ -175,8 +173,3 @@ def _pixels_by_parameters(rig: Rig, in_rig: Array, scaled: tuple[tuple[str, ...]
         )
 
     return central_differences(pixels, SIGMA_STEP * np.ones(len(names)))
-
-
-def central_differences(function: Callable[[Array], Array], steps: Array) -> Array:
-    """Return the derivatives (..., P) of a function about zero, by steps (P,) of its argument."""
-    return np.stack([(function(step) - function(-step)) / (2 * np.abs(step).max()) for step in np.diag(steps)], axis=-1)

@@ -19,7 +19,14 @@ from calib.boards.print_shape import MODE_NAMES, MODE_SIGMAS, MODE_UNITS, PrintS
 from calib.errors import CalibError
 from calib.fit.boards.mirror_prior import mirror_residuals
 from calib.fit.boards.smooth_misfit import covariance_with_misfit, smooth_fields
-from calib.fit.least_squares import DAMPING_FACTOR, START_DAMPING, ArrowSystem, Ending, minimise
+from calib.fit.least_squares import (
+    DAMPING_FACTOR,
+    START_DAMPING,
+    ArrowSystem,
+    Ending,
+    central_differences,
+    minimise,
+)
 from calib.fit.parameters import stepped, units_of
 from calib.fit.robust_scale import LOST_PX, robust_sigma
 from calib.models.camera import Array
@@ -153,7 +160,10 @@ class _BoardProblem:
 
     def state(self, rig: BoardRig) -> _State:
         """Return the iterate of a rig."""
-        return _State(rig, rig.residuals(self.pixels, self.drawn), self._priors(rig))
+        still = np.zeros(len(rig.names) + 1)
+        own = [self._camera_priors(rig, side, still) for side in range(len(rig.cameras))]
+        priors = np.concatenate([*own, np.array(rig.shape.values) / MODE_SIGMAS])
+        return _State(rig, rig.residuals(self.pixels, self.drawn), priors)
 
     def scale(self, state: _State) -> float:
         """Return the width of Huber's kernel [px], which stays during a search."""
@@ -265,23 +275,11 @@ class _BoardProblem:
             J_pose[:, side] = pose.reshape(K, N, 2, 6)
         return J_common, J_pose
 
-    def _priors(self, rig: BoardRig) -> Array:
-        """Return the differences (Q,) of a rig from what is expected of it, in standard deviations."""
-        still = np.zeros(len(rig.names) + 1)
-        own = [self._camera_priors(rig, side, still) for side in range(len(rig.cameras))]
-        return np.concatenate([*own, np.array(rig.shape.values) / MODE_SIGMAS])
-
     def _prior_jacobian(self, rig: BoardRig) -> Array:
         """Return the derivatives (Q, P) of the priors by the common unknowns."""
-        step = 1e-4  # each prior is nearly linear over it
+        step = 1e-4 * np.ones(len(rig.names) + 1)  # each prior is nearly linear over it
         blocks = [
-            np.stack(
-                [
-                    (self._camera_priors(rig, side, one) - self._camera_priors(rig, side, -one)) / (2 * step)
-                    for one in step * np.eye(len(rig.names) + 1)
-                ],
-                axis=-1,
-            )
+            central_differences(lambda steps, side=side: self._camera_priors(rig, side, steps), step)  # type: ignore[misc]
             for side in range(len(rig.cameras))
         ]
         twist = np.zeros((0, 6 * (len(blocks) - 1)))

@@ -96,10 +96,16 @@ class _LinearProblem:
         across = np.linalg.norm(se3.apply(T, self.points)[..., :2], axis=2)
         rho = np.linalg.norm(xy, axis=2)
         height = self.points[:, :2] @ T[:, 2, :2].swapaxes(0, 1)
-        T[:, 2, :2] *= _signs(rho, across, height.T, self.scale_px)[:, None]
-        height = (self.points[:, :2] @ T[:, 2, :2].swapaxes(0, 1)).T
         basis = (rho[..., None] / self.scale_px) ** POWERS
-        coefficients, T[:, 2, 3] = _polynomial(rho, across, height, basis)
+        # The sign of (r31, r32) for which each image's parabola f has a0 < 0; -f fits equally well.
+        A, b, _ = _eliminate_depths(rho, across, height.T, basis[..., :2])
+        T[:, 2, :2] *= np.where((np.linalg.pinv(A) @ b[..., None])[:, 0] > 0, -1.0, 1.0)
+        # f(rho) * across = rho * (height + t3) for the coefficients and t3, eq. (15) to (18).
+        height = (self.points[:, :2] @ T[:, 2, :2].swapaxes(0, 1)).T
+        A, b, shifts = _eliminate_depths(rho, across, height, basis)
+        size = np.linalg.norm(A, axis=(0, 1))
+        coefficients = np.linalg.lstsq(A.reshape(-1, len(size)) / size, b.ravel(), rcond=None)[0] / size
+        T[:, 2, 3] = shifts(coefficients)
         errors = _angles(np.dstack([xy, basis @ coefficients]), se3.apply(T, self.points))
         return LinearCamera(
             coefficients, self.scale_px, (float(center[0]), float(center[1])), T, np.nanmean(errors, axis=1)
@@ -118,35 +124,15 @@ def _partial_poses(xy: Array, points: Array) -> Array:
     T[:, :2, [0, 1, 3]] = h.reshape(-1, 2, 3)
     across = se3.apply(T, points)[..., :2]
     T[:, :2, [0, 1, 3]] *= np.sign(np.nansum(across * xy, axis=(1, 2)))[:, None, None]
-    T[:, 2, :2] = _third_row(T[:, :2, :2])
+    # r31 and r32 make the two columns of the rotation equally long and orthogonal.
+    first, second = T[:, :2, 0], T[:, :2, 1]
+    product = -(first * second).sum(axis=1)
+    gap = (second**2 - first**2).sum(axis=1)
+    root = np.hypot(gap, 2 * product)
+    T[:, 2, 0] = np.sqrt(np.maximum(0, (root + gap) / 2))
+    T[:, 2, 1] = np.sqrt(np.maximum(0, (root - gap) / 2)) * np.where(product < 0, -1, 1)
     T[:, :3, [0, 1, 3]] /= np.linalg.norm(T[:, :3, :1], axis=1, keepdims=True)
     return T
-
-
-def _third_row(R: Array) -> Array:
-    """Return (r31, r32) (K, 2) that make the two columns of R (K, 2, 2) equally long and orthogonal."""
-    product = -(R[:, :, 0] * R[:, :, 1]).sum(axis=1)
-    gap = (R[:, :, 1] ** 2).sum(axis=1) - (R[:, :, 0] ** 2).sum(axis=1)
-    root = np.hypot(gap, 2 * product)
-    first = np.sqrt(np.maximum(0, (root + gap) / 2))
-    second = np.sqrt(np.maximum(0, (root - gap) / 2)) * np.where(product < 0, -1, 1)
-    return np.column_stack([first, second])
-
-
-def _signs(rho: Array, across: Array, height: Array, scale_px: float) -> Array:
-    """Return the sign (K,) of (r31, r32) for which each image's parabola f has a0 < 0; -f fits equally well."""
-    A, b, _ = _eliminate_depths(rho, across, height, (rho[..., None] / scale_px) ** POWERS[:2])
-    parabolas = np.linalg.pinv(A) @ b[..., None]
-    return np.where(parabolas[:, 0, 0] > 0, -1.0, 1.0)
-
-
-def _polynomial(rho: Array, across: Array, height: Array, basis: Array) -> tuple[Array, Array]:
-    """Solve f(rho) * across = rho * (height + t3) for coefficients (D,) and t3 (K,), eq. (15) to (18)."""
-    A, b, shifts = _eliminate_depths(rho, across, height, basis)
-    flat = A.reshape(-1, A.shape[-1])
-    size = np.linalg.norm(flat, axis=0)
-    coefficients = np.linalg.lstsq(flat / size, b.ravel(), rcond=None)[0] / size
-    return coefficients, shifts(coefficients)
 
 
 def _eliminate_depths(

@@ -80,22 +80,19 @@ def _poses_of(
     camera: OmniCamera, views: Sequence[BoardView | None], board: CalibrationBoard, orders: Sequence[NDArray[np.intp]]
 ) -> dict[int, Array]:
     """Return by view the board's poses (S, 4, 4) for each order of its corners; views that do not fit are left out."""
-    found = {k: _pose_hypotheses(camera, seen, board, orders) for k, seen in enumerate(views) if seen is not None}
-    return {k: poses for k, poses in found.items() if poses is not None}
-
-
-def _checked_pose(camera: OmniCamera, pixels: Array, board: CalibrationBoard) -> Array | None:
-    T = board_pose(camera, pixels, board)
-    return T if T is not None and pose_error_rad(camera, T, pixels, board) < MAX_POSE_ERROR_RAD else None
-
-
-def _pose_hypotheses(
-    camera: OmniCamera, seen: BoardView, board: CalibrationBoard, orders: Sequence[NDArray[np.intp]]
-) -> Array | None:
-    """Return the board's poses (S, 4, 4), one for every order of its corners; None if one does not fit."""
-    poses = [_checked_pose(camera, seen.pixels[order], board) for order in orders]
-    fitting = [T for T in poses if T is not None]
-    return np.array(fitting) if len(fitting) == len(poses) else None
+    found = dict[int, Array]()
+    for k, seen in enumerate(views):
+        poses = [] if seen is None else [board_pose(camera, seen.pixels[order], board) for order in orders]
+        fitting = [
+            T
+            for T, order in zip(poses, orders, strict=False)
+            if seen is not None
+            and T is not None
+            and pose_error_rad(camera, T, seen.pixels[order], board) < MAX_POSE_ERROR_RAD
+        ]
+        if len(fitting) == len(orders):
+            found[k] = np.array(fitting)
+    return found
 
 
 def _consensus(candidates: Array) -> tuple[Array, Array]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -12,13 +13,13 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.boards.board import BoardView, CalibrationBoard
 from calib.boards.local_mapping import refine_with_camera
-from calib.boards.print_shape import AS_DRAWN, MODE_NAMES, PrintShape
+from calib.boards.print_shape import AS_DRAWN, PrintShape
 from calib.errors import CalibError
 from calib.fit.boards.bundle import TWIST_NAMES, BoardFit, BoardRig, fit_boards
 from calib.fit.boards.linear_start import LinearCamera, solve_linear
 from calib.fit.boards.relative_pose import initialise_relative_pose
+from calib.fit.least_squares import central_differences
 from calib.fit.residual_structure import ResidualStructure, residual_structure
-from calib.fit.rig_uncertainty import central_differences
 from calib.models.camera import Array
 from calib.models.names import values_of
 from calib.models.ocam import OcamCamera, View
@@ -115,14 +116,9 @@ class RigCalibration:
         return self.fit.rig.shape
 
     @property
-    def shape_sigmas(self) -> Array:
-        """Return the standard deviations (4,) of the shape's values."""
-        return np.sqrt(np.maximum(0, np.diag(self.fit.covariance)[-len(MODE_NAMES) :]))
-
-    @property
     def pairs(self) -> int:
         """Return the number of instants at which all cameras saw the board."""
-        return sum(map(_is_pair, self.views))
+        return _pairs(self.views)
 
     def side_errors_px(self, side: int) -> Array:
         """Return the mean error (K,) of every view in the lower (0) or upper (1) camera; NaN without a view."""
@@ -157,16 +153,21 @@ def calibrate_boards(
     for side, size in enumerate(sizes):
         own = [PairView(one.name, (one.seen[side],)) for one in views if one.seen[side] is not None]
         progress(f"{SIDES[side]} camera: fitting {len(own)} views")
-        found = _fit_camera(own, board, size, view)
+        good, bad, solved = consistent_views(own, board, size, view)
+        start = BoardRig((solved.camera(size, view),), np.eye(4), solved.T_cam_board, AS_DRAWN, np.zeros(1))
+        found = _without_outliers(start, good, board)
+        found = replace(found, rejected=(*bad, *found.rejected))
         alone.append(found)
         where = f"{SIDES[side]} camera: " if len(sizes) > 1 else ""
         rejected += [RejectedView(bad.name, where + bad.reason) for bad in found.rejected]
-        views = _without(views, side, {bad.name for bad in found.rejected})
+        bad_names = {bad.name for bad in found.rejected}
+        views = [_with(one, side, None) if one.name in bad_names else one for one in views]
+        views = [one for one in views if any(one.seen)]
     # 2. The transform between the cameras, and all together.
     if len(sizes) == 1:
         found = replace(alone[0], rejected=())
     else:
-        progress(f"rig: fitting {sum(map(_is_pair, views))} pairs")
+        progress(f"rig: fitting {_pairs(views)} pairs")
         found = _fit_pair(views, board, alone)
     rejected += found.rejected
     # 3. The corners again, by the calibrated cameras: twice, since they are moved by what the cameras lacked.
@@ -175,7 +176,10 @@ def calibrate_boards(
         found = _without_outliers(found.fit.rig, refined_views(found, images), board)
         rejected += found.rejected
     # 4. Mirrors below telecentric lenses, where these are more likely.
-    found = _telecentric_if_likelier(found) if view == "mirror" else found
+    if view == "mirror":
+        with suppress(CalibError, np.linalg.LinAlgError):
+            fit = fit_boards(found.fit.rig, _pixels(found.views, board), board, telecentric=True)
+            found = replace(found, fit=fit, telecentric=True) if fit.is_likelier(found.fit) else found
     return replace(found, rejected=tuple(rejected))
 
 
@@ -234,24 +238,18 @@ def rig_covariance(found: RigCalibration, rig: Rig) -> RigCovariance:
     return RigCovariance.of_matrix([*names, *TRANSFORM_NAMES], J @ found.fit.covariance[:count, :count] @ J.T)
 
 
-def _fit_camera(
-    views: Sequence[PairView], board: CalibrationBoard, size: tuple[int, int], view: View
-) -> RigCalibration:
-    """Fit one camera to its views."""
-    good, rejected, solved = consistent_views(views, board, size, view)
-    start = BoardRig((solved.camera(size, view),), np.eye(4), solved.T_cam_board, AS_DRAWN, np.zeros(1))
-    found = _without_outliers(start, good, board)
-    return replace(found, rejected=(*rejected, *found.rejected))
-
-
 def _fit_pair(views: Sequence[PairView], board: CalibrationBoard, alone: Sequence[RigCalibration]) -> RigCalibration:
     """Fit two cameras and the transform between them."""
-    _require(sum(map(_is_pair, views)), "instants at which both cameras saw the board")
+    _require(_pairs(views), "instants at which both cameras saw the board")
     cameras = (alone[0].cameras[0], alone[1].cameras[0])
     initial = initialise_relative_pose([(view.seen[0], view.seen[1]) for view in views], board, cameras)
     rejected = [RejectedView(views[k].name, reason) for k, reason in initial.rejected]
-    good = [_reordered(views[k], initial.orders.get(k)) for k in initial.T_lower_board]
-    _require(sum(map(_is_pair, good)), "consistent pairs of views", rejected)
+    good = [views[k] for k in initial.T_lower_board]
+    for at, k in enumerate(initial.T_lower_board):
+        upper = good[at].seen[1]
+        if upper is not None and k in initial.orders:
+            good[at] = _with(good[at], 1, replace(upper, pixels=upper.pixels[initial.orders[k]]))
+    _require(_pairs(good), "consistent pairs of views", rejected)
     shape = PrintShape(tuple(np.mean([one.shape.values for one in alone], axis=0).tolist()))
     start = BoardRig(cameras, initial.T_upper_lower, np.array([*initial.T_lower_board.values()]), shape, np.zeros(2))
     found = _without_outliers(start, good, board)
@@ -278,17 +276,8 @@ def _without_outliers(start: BoardRig, views: Sequence[PairView], board: Calibra
             for k in np.flatnonzero(bad)
         ]
         good = [view for view, is_bad in zip(good, bad, strict=True) if not is_bad]
-        _require(sum(map(_is_pair, good)), "consistent pairs of views", rejected)
+        _require(_pairs(good), "consistent pairs of views", rejected)
         start = replace(fit.rig, T_lower_board=fit.rig.T_lower_board[~bad])
-
-
-def _telecentric_if_likelier(found: RigCalibration) -> RigCalibration:
-    """Return the calibration of mirrors below telecentric lenses if the images make it more likely."""
-    try:
-        fit = fit_boards(found.fit.rig, _pixels(found.views, found.board), found.board, telecentric=True)
-    except (CalibError, np.linalg.LinAlgError):
-        return found
-    return replace(found, fit=fit, telecentric=True) if fit.is_likelier(found.fit) else found
 
 
 def _pixels(views: Sequence[PairView], board: CalibrationBoard) -> Array:
@@ -297,27 +286,14 @@ def _pixels(views: Sequence[PairView], board: CalibrationBoard) -> Array:
     return np.array([[none if seen is None else seen.pixels for seen in view.seen] for view in views])
 
 
-def _is_pair(view: PairView) -> bool:
-    return None not in view.seen
+def _pairs(views: Sequence[PairView]) -> int:
+    """Return the number of instants at which all cameras saw the board."""
+    return sum(None not in view.seen for view in views)
 
 
-def _without(views: Sequence[PairView], side: int, names: set[str]) -> list[PairView]:
-    """Remove one camera's views of the named instants; the other camera's views are kept."""
-    kept = [
-        replace(view, seen=tuple(None if k == side else seen for k, seen in enumerate(view.seen)))
-        if view.name in names
-        else view
-        for view in views
-    ]
-    return [view for view in kept if any(view.seen)]
-
-
-def _reordered(view: PairView, order: NDArray[np.intp] | None) -> PairView:
-    """Return a view with the upper corners in the order of the lower ones."""
-    lower, upper = view.seen
-    if upper is None or order is None:
-        return view
-    return replace(view, seen=(lower, replace(upper, pixels=upper.pixels[order])))
+def _with(view: PairView, side: int, seen: BoardView | None) -> PairView:
+    """Return the views of an instant with another one of a camera."""
+    return replace(view, seen=tuple(seen if k == side else own for k, own in enumerate(view.seen)))
 
 
 def _require(count: int, what: str, rejected: Sequence[RejectedView] = ()) -> None:

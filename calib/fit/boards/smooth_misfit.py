@@ -67,14 +67,10 @@ def covariance_with_misfit(normal: Array, gradient: Array, parameters: int, vari
     d, axes = np.linalg.eigh((left + left.T) / 2)
     known = d > LEAST_PART * max(float(d[-1]), 1.0)
     d, y = d[known], (axes.T @ (gradient[P:] - by_field @ gradient[:P]))[known]
-    ratio2 = _mean_ratio2(d, y**2, variance) if len(d) else 0.0
+    # The posterior mean of (tau / sigma)^2.
+    spread = variance * (d + RATIOS[:, None] ** 2 * d**2)
+    cost = (np.log(spread) + y**2 / spread).sum(axis=1)
+    weight = np.exp(-0.5 * (cost - cost.min())) * np.gradient(RATIOS)
+    ratio2 = float(weight @ RATIOS**2 / weight.sum()) if len(d) else 0.0
     # The fit does not know the fields: each shifts the parameters by its row of by_field, which has the prior tau.
     return np.asarray(variance * (inverse + ratio2 * by_field.T @ by_field))
-
-
-def _mean_ratio2(d: Array, squares: Array, variance: float) -> float:
-    """Return the posterior mean of (tau / sigma)^2 by squares (N,) with the variances sigma^2 d + tau^2 d^2, N > 0."""
-    spread = variance * (d + RATIOS[:, None] ** 2 * d**2)
-    cost = (np.log(spread) + squares / spread).sum(axis=1)
-    weight = np.exp(-0.5 * (cost - cost.min())) * np.gradient(RATIOS)
-    return float(weight @ RATIOS**2 / weight.sum())
