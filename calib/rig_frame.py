@@ -10,10 +10,9 @@ from calib.models.camera import Array, OmniCamera
 from calib.models.names import sees_directly
 from calib.rig import MIN_BASELINE_M, MountedCamera, Rig
 
-# Half the distance in pixels over which the image's axis is measured, because it stays inside any mirror or lens.
-STEP_PX = 1.0
-# From the baseline to what is below in an image, because that is half-way to a camera that lies on its side.
-MAX_LEAN_DEG = 45.0
+# Sine and cosine of the largest lean of what is below in an image from the baseline, 45 degrees, because that is
+# half-way to a camera that lies on its side.
+MAX_LEAN = np.sqrt(0.5)
 
 
 def rig_between(lower: OmniCamera, upper: OmniCamera, T_lower_upper: Array, topics: tuple[str, str] = ("", "")) -> Rig:
@@ -26,10 +25,10 @@ def rig_between(lower: OmniCamera, upper: OmniCamera, T_lower_upper: Array, topi
     if not baseline >= MIN_BASELINE_M:
         raise CalibError(f"rig: the viewpoints must lie apart, found {baseline * 1e3:.3f} mm between them")
     z = se3.t_of(T_lower_upper) / baseline
-    u, v = image_axis(lower, (STEP_PX, 0.0)), image_axis(lower, (0.0, STEP_PX))
+    u, v = image_axis(lower, (1.0, 0.0)), image_axis(lower, (0.0, 1.0))
     axes = optical_axis(lower), se3.R_of(T_lower_upper) @ optical_axis(upper)
     forward = (axes[0] + axes[1]) / 2
-    if np.linalg.norm(forward - z * (z @ forward)) < np.sin(np.deg2rad(MAX_LEAN_DEG)):
+    if np.linalg.norm(forward - z * (z @ forward)) < MAX_LEAN:
         forward = u if abs(z @ u) < 0.9 else v
     x = forward - z * (z @ forward)
     x /= np.linalg.norm(x)
@@ -45,8 +44,8 @@ def is_turned_over(rig: Rig) -> bool:
     lower part of its image. A lens that looks along the baseline may look up or down: False.
     """
     camera, z = rig.lower.camera, rig.lower.T_cam_rig[:3, 2]
-    below = image_axis(camera, (0.0, STEP_PX)) if sees_directly(camera) else optical_axis(camera)
-    return bool(z @ below > np.cos(np.deg2rad(MAX_LEAN_DEG)))
+    below = image_axis(camera, (0.0, 1.0)) if sees_directly(camera) else optical_axis(camera)
+    return bool(z @ below > MAX_LEAN)
 
 
 def mounting_notes(rig: Rig) -> list[str]:
@@ -57,8 +56,8 @@ def mounting_notes(rig: Rig) -> list[str]:
             f"the upper camera is found below the lower one: exchange their images, unless the cameras {mounted}; "
             "the rig's z would point down"
         ]
-    along = rig.lower.T_cam_rig[:3, 2] @ image_axis(rig.lower.camera, (STEP_PX, 0.0))
-    if abs(along) > np.cos(np.deg2rad(MAX_LEAN_DEG)):
+    along = rig.lower.T_cam_rig[:3, 2] @ image_axis(rig.lower.camera, (1.0, 0.0))
+    if abs(along) > MAX_LEAN:
         return [
             "the cameras are found side by side, along the rows of their images: one must stand above the other, "
             "unless both lie on their sides; the rig's z would point to the side"

@@ -9,8 +9,6 @@ import math
 from collections.abc import Iterable
 from typing import Final, NamedTuple
 
-# Below this angle the chord of an arc equals the arc to the last digit of a float.
-SMALL_ANGLE_RAD: Final = 1e-9
 Point = tuple[float, float]
 
 
@@ -49,6 +47,6 @@ def along_arc(velocity_mps: float, yaw_rate_radps: float, duration_s: float) -> 
     """Return the motion at constant speeds during a time: along the chord of the arc, at half of the turn."""
     turn_rad = yaw_rate_radps * duration_s
     chord_m = velocity_mps * duration_s
-    if abs(turn_rad) > SMALL_ANGLE_RAD:
+    if turn_rad:
         chord_m *= 2 * math.sin(turn_rad / 2) / turn_rad
     return Pose2(chord_m * math.cos(turn_rad / 2), chord_m * math.sin(turn_rad / 2), turn_rad)

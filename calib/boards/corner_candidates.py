@@ -26,8 +26,6 @@ MIN_CROSSING_RAD = np.deg2rad(18)
 # Least second derivative at a saddle point [grey levels / px^2].
 MIN_SADDLE = 0.6
 MAX_PER_LEVEL = 4000  # Most candidates of a level, so that the largest board fits: 61 x 61 corners.
-# Candidates closer than this part of their ring's radius are the same corner: neighbours are farther than the radius.
-SAME_RING_PART = 0.5
 # cv2.remap expects images, not lists, so that samples are folded into rows of this length.
 REMAP_COLUMNS = 1024
 
@@ -70,7 +68,8 @@ def find_corners(image: NDArray[np.uint8]) -> CornerCandidates:
     parts = [np.concatenate([getattr(level, one.name) for level in levels]) for one in fields(CornerCandidates)]
     found = CornerCandidates(*parts)
     found = found.select(np.argsort(-found.quality * found.contrast, kind="stable"))
-    return found.select(_suppress_duplicates(found.pixels, SAME_RING_PART * found.ring_px))
+    # Candidates closer than half of their ring's radius are the same corner: neighbours are farther than the radius.
+    return found.select(_suppress_duplicates(found.pixels, found.ring_px / 2))
 
 
 def describe_corners(image: Grey, pixels: Array, ring_px: float | Array) -> CornerCandidates:

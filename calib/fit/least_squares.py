@@ -29,6 +29,9 @@ MIN_DAMPING, MAX_DAMPING = 1e-9, 1e8
 # of any observation.
 BLOCK_REGULARISATION = 1e-9
 
+# The best step of central differences of a smooth function of about unit size: the cube root of a double's rounding.
+BEST_STEP = float(np.finfo(float).eps ** (1 / 3))
+
 State = TypeVar("State")
 
 

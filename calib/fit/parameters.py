@@ -6,6 +6,7 @@ tolerance of a nominal rig, whose numbers come from the mirror's data sheet, its
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
@@ -33,8 +34,9 @@ TIME_UNITS: Final = {UPPER_DELAY: 5.0, LINE_TIME: 5.0}
 S_PER_UNIT: Final = {UPPER_DELAY: 1e-3, LINE_TIME: 1e-6}
 # Tolerances of a nominal rig in the parameters' own units, by the name without its camera: of what the mount and the
 # trigger leave open, and of a mirror, by which a ray passes the viewpoint within about a millimetre.
+NOMINAL_TURN_RAD: Final = math.radians(1.5)
 NOMINAL_SIGMAS: Final = {
-    **dict.fromkeys(("r_x", "r_y", "r_z"), np.deg2rad(1.5)),
+    **dict.fromkeys(("r_x", "r_y", "r_z"), NOMINAL_TURN_RAD),
     **dict.fromkeys(("e_x", "e_y"), np.deg2rad(2.0)),
     **dict.fromkeys(("pu", "pv", "center_row", "center_column"), 3.0),
     **{UPPER_DELAY: 15.0, LINE_TIME: 30.0, "xi": 0.02},

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib import se3
-from calib.fit.least_squares import central_differences
+from calib.fit.least_squares import BEST_STEP, central_differences
 from calib.fit.robust_scale import SIGMA_PER_MAD
 from calib.models.camera import Array
 from calib.rig import Rig
@@ -32,9 +32,6 @@ ITERATIONS = 12  # enough: 70 of 72 estimates of test_rig_drift.py end before
 # Width of the weights (Geman and McClure 1987) in standard deviations of the residuals, so that of normal errors 86 %
 # of the efficiency of least squares remains.
 KERNEL_WIDTH = 2.5
-MIN_SIGMA_RAD = 1e-5  # guards against division by zero: residuals of exact points
-# Step of numeric derivatives by central differences: near the cube root of a double's rounding, 6e-6, which is best.
-DIFFERENCE_STEP_RAD = 1e-6
 # Prior of the upper viewpoint's lateral shift: a mirror moves by no more than some degrees of the baseline.
 SHIFT_SIGMA_RAD = np.deg2rad(3.0)
 
@@ -80,9 +77,9 @@ def estimate_rig_drift(lower: Array, upper: Array) -> RigDrift | None:
         residual, about = _residuals(x, lower, upper), x
         J = central_differences(
             lambda step, about=about: _residuals(about + step, lower, upper),  # type: ignore[misc]
-            DIFFERENCE_STEP_RAD * np.ones(5),
+            BEST_STEP * np.ones(5),
         )
-        sigma = max(MIN_SIGMA_RAD, SIGMA_PER_MAD * float(np.median(np.abs(residual - np.median(residual)))))
+        sigma = max(BEST_STEP, SIGMA_PER_MAD * float(np.median(np.abs(residual - np.median(residual)))))
         weight = 1 / (1 + (residual / (KERNEL_WIDTH * sigma)) ** 2) ** 2
         variance = CORRELATED_POINTS * sigma**2
         H = (J * weight[:, None]).T @ J / variance + prior

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.errors import CalibError
-from calib.fit.least_squares import ArrowSystem, Ending, minimise
+from calib.fit.least_squares import BEST_STEP, ArrowSystem, Ending, minimise
 from calib.fit.parameters import RigParameters
 from calib.fit.residual_structure import OUTLIER_RATIO, ResidualStructure, systematic_px
 from calib.fit.robust_scale import LOST_PX, robust_sigma
@@ -29,9 +29,6 @@ from calib.rig import Rig
 
 Indices = NDArray[np.intp]
 Flags = NDArray[np.bool_]
-# Step of numeric derivatives, in steps of a parameter (about a pixel each) or in parts of a point's distance: a model
-# is linear over a ten-thousandth of a pixel, and rounding is 1e-9 of it.
-STEP = 1e-4
 # Cauchy's function counts errors of more sigmas less, so that one of 3 sigmas has half of the weight.
 KERNEL = 3.0
 # Patches are matched to a tenth of a pixel, so that observations that fit no better than to a pixel show no rigid
@@ -319,7 +316,7 @@ class DriveProblem:
     def _by_point(self, steps: Array, points: Array) -> Array:
         """Return the derivative (M, 2, 3) of the pixels by the points in the rig frame."""
         rig, camera = self.parameters.at(steps), self.observations.camera
-        reach = STEP * np.linalg.norm(points, axis=1, keepdims=True)
+        reach = BEST_STEP * np.linalg.norm(points, axis=1, keepdims=True)
         columns = [
             (project(rig, camera, points + reach * axis) - project(rig, camera, points - reach * axis)) / (2 * reach)
             for axis in np.eye(3)
@@ -331,14 +328,14 @@ class DriveProblem:
         parameters, camera = self.parameters, self.observations.camera
         J = np.zeros((len(camera), 2, len(state.steps)))
         in_rig = self.in_rig(state, state.steps)
-        for k, step in enumerate(STEP * np.eye(len(state.steps))):
+        for k, step in enumerate(BEST_STEP * np.eye(len(state.steps))):
             at = np.isin(camera, [side for side in (0, 1) if parameters.moves_camera(side)[k]])
             is_time = parameters.names[k] in parameters.times
             ahead, behind = (
                 project(parameters.at(steps), camera[at], (self.in_rig(state, steps) if is_time else in_rig)[at])
                 for steps in (state.steps + step, state.steps - step)
             )
-            J[at, :, k] = np.nan_to_num((ahead - behind) / (2 * STEP))
+            J[at, :, k] = np.nan_to_num((ahead - behind) / (2 * BEST_STEP))
         return J
 
 

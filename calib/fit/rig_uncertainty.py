@@ -8,15 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib import se3
-from calib.fit.least_squares import central_differences
+from calib.fit.least_squares import BEST_STEP, central_differences
 from calib.fit.parameters import moved_rig
 from calib.models.camera import Array
 from calib.rig import Rig
 from calib.rig_covariance import RigCovariance
 
-# Steps of numeric derivatives, by points [m] and by parameters [sigmas]: small against the curvature of a projection,
-# large against its rounding.
-POINT_STEP_M, SIGMA_STEP = 1e-5, 0.1
+# Step of numeric derivatives by parameters [sigmas]: small against the curvature of a projection, large against its
+# rounding.
+SIGMA_STEP = 0.1
 # The place of the predicted drive: walls around the rig at these distances [m], seen at these slopes z/r.
 WALLS_M, SLOPES, AZIMUTHS = (1.2, 2.0, 4.0), np.linspace(-0.9, 0.6, 11), 16
 # Length [m] and turn [rad] of the predicted motions, short against WALLS_M, and the directions of a drive: the walls
@@ -148,7 +148,7 @@ def _motion_by_parameters(
     ends = se3.apply(T_end_start, points)
     first, last = (_pixels_by_parameters(rig, se3.apply(T_rig_rect, at), scaled) for at in (points, ends))
     by_start, by_end = (
-        central_differences(lambda shift, at=at: _pixels(rig, at + shift), POINT_STEP_M * np.ones(3))  # type: ignore[misc]
+        central_differences(lambda shift, at=at: _pixels(rig, at + shift), BEST_STEP * np.ones(3))  # type: ignore[misc]
         for at in (points, ends)
     )
     seen = np.all([np.isfinite(part).all(axis=(1, 2)) for part in (first, last, by_start, by_end)], axis=0)

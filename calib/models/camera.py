@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-# Newton steps that invert a distortion: mild ones take 3 to 5, terms of 60 px at a rim of 460 px take 6.
-NEWTON_STEPS: Final = 12
+# Newton steps that invert a distortion: mild ones take 3 to 5, strong ones 10. Points whose error is then more than
+# this part of their size, a millionth of what a corner errs by, have no ray.
+NEWTON_STEPS, CONVERGED_PART = 12, 1e-9
 
 
 class OmniCamera(Protocol):
@@ -96,7 +97,6 @@ def undistorted(
     distort: Callable[[Array, Array], tuple[Array, Array]],
     jacobian: Callable[[Array, Array], tuple[Array, Array, Array]],
     target: tuple[Array, Array],
-    tolerance: float,
 ) -> tuple[Array, Array]:
     """Return x, y (N,) that a distortion moves to a target, by Newton steps; NaN for points without convergence.
 
@@ -111,5 +111,5 @@ def undistorted(
             determinant = xx * yy - xy * xy
             x, y = x - (yy * off_x - xy * off_y) / determinant, y - (xx * off_y - xy * off_x) / determinant
         bent_x, bent_y = distort(x, y)
-        found = np.hypot(bent_x - target[0], bent_y - target[1]) < tolerance
+        found = np.hypot(bent_x - target[0], bent_y - target[1]) < CONVERGED_PART * (1 + np.hypot(*target))
     return np.where(found, x, np.nan), np.where(found, y, np.nan)

@@ -12,10 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.errors import CalibError
-from calib.models.camera import Array
-
-NEWTON_STEPS = 20  # enough: lenses with coefficients up to 0.3 take 10 at most
-TOLERANCE_RAD = 1e-10  # Error of an image radius by the focal length at which the search ends: no pixel is so exact.
+from calib.models.camera import CONVERGED_PART, NEWTON_STEPS, Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +98,7 @@ class EquidistantCamera:
     def widest_rad(self) -> float:
         """The angle from the axis up to which the image radius grows."""
         roots = np.roots(self._slope.coef[::-1])
-        turns = roots.real[(np.abs(roots.imag) < TOLERANCE_RAD) & (roots.real > 0)]
+        turns = roots.real[np.isreal(roots) & (roots.real > 0)]
         return float(min([np.pi, *np.sqrt(turns)]))
 
     def project(self, points: Array) -> Array:
@@ -121,7 +118,7 @@ class EquidistantCamera:
         with np.errstate(all="ignore"):
             for _ in range(NEWTON_STEPS):
                 angle = np.clip(angle - (self._radius(angle) - radius) / slope(angle * angle), 0, widest)
-            angle = np.where(np.abs(self._radius(angle) - radius) < TOLERANCE_RAD, angle, np.nan)
+            angle = np.where(np.abs(self._radius(angle) - radius) < CONVERGED_PART, angle, np.nan)
             side = np.where(radius > 0, np.sin(angle) / radius, 1.0)
         return np.column_stack([side * mx, side * my, np.cos(angle)])
 

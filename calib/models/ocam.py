@@ -44,13 +44,6 @@ SOLVED_PX = 1e-9
 # A camera with a wavefront is exact for points at this distance; half of it and twice as far have the same error.
 DISTANCE_M, MIN_DISTANCE_M, MAX_DISTANCE_M = 1.5, 0.05, 1e4
 NO_WAVEFRONT = (0.0,) * wavefronts.TERMS
-# Pixels at which the inverse of the tangential and astigmatic terms does not converge, within a millionth of what a
-# corner errs by, have no ray.
-TANGENTIAL_TOLERANCE_PX = 1e-8
-# Least determinant of the affine: less would squeeze the image to a line.
-MIN_DETERMINANT = 1e-6
-# A root of a polynomial counts as real if its imaginary part is below this part of the image diagonal, as rounding is.
-REAL_ROOT_PART = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +101,7 @@ class OcamCamera:
                 f"ocam camera: expected distance_m of {MIN_DISTANCE_M} to {MAX_DISTANCE_M:g}, found {self.distance_m}"
             )
         c, d, e = self.affine
-        if self.polynomial[0] >= 0 or abs(c - d * e) < MIN_DETERMINANT or min(self.size) < 1 or self.view not in VIEWS:
+        if self.polynomial[0] >= 0 or c == d * e or min(self.size) < 1 or self.view not in VIEWS:
             raise CalibError(
                 "ocam camera: expected a0 < 0, an invertible affine, a size and view mirror or direct, found a0 "
                 f"{self.polynomial[0]}, affine {self.affine}, size {self.size}, view {self.view!r}"
@@ -132,7 +125,7 @@ class OcamCamera:
                 turning = np.roots(self._turning()[::-1])
             except np.linalg.LinAlgError:  # infinite coefficients
                 raise self._not_evaluable() from None
-        real = turning.real[(np.abs(turning.imag) < REAL_ROOT_PART * diagonal) & (turning.real > 0)]
+        real = turning.real[np.isreal(turning) & (turning.real > 0)]
         return min(diagonal, float(real.min())) if real.size else diagonal
 
     def _not_evaluable(self) -> CalibError:
@@ -156,7 +149,7 @@ class OcamCamera:
         row, column = pixels[:, 1] - self.center_row_column[0], pixels[:, 0] - self.center_row_column[1]
         x, y = (row - d * column) / (c - d * e), (c * column - e * row) / (c - d * e)
         if self._is_distorted:
-            x, y = undistorted(self.distort, self.distortion_jacobian, (x, y), TANGENTIAL_TOLERANCE_PX)
+            x, y = undistorted(self.distort, self.distortion_jacobian, (x, y))
             x = np.where(self._is_unfolded(x, y), x, np.nan)
         rho = np.hypot(x, y)
         z = self.height(np.where(rho <= self._radii[-1], rho, np.nan))

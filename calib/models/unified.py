@@ -16,9 +16,6 @@ from calib.errors import CalibError
 from calib.models.camera import Array, undistorted
 
 DISTORTION_NAMES = ("k1", "k2", "p1", "p2")  # as files and results name them
-UNDISTORT_TOLERANCE = 1e-9  # on the plane of m; pixels without convergence are NaN
-# Smallest denominator of the projection: guards against division by zero.
-MIN_SCALE = 1e-12
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +45,7 @@ class UnifiedCamera:
         # Beyond this plane two rays would have the same pixel (xi > 1), or the denominator changes sign (xi <= 1).
         edge = -self.xi if self.xi <= 1 else -1 / self.xi
         scale = np.where(z > edge, norm * (z + self.xi), np.nan)
-        x, y = (points[:, :2] / np.where(scale > MIN_SCALE, scale, np.nan)[:, None]).T
+        x, y = (points[:, :2] / scale[:, None]).T
         if any(self.distortion):
             bent_x, bent_y = self._distort(x, y)
             is_unfolded = self._is_unfolded(x, y)
@@ -59,7 +56,7 @@ class UnifiedCamera:
         """Return unit rays (N, 3) of pixels (N, 2); NaN outside the sphere's image. Mei and Rives 2007, eq. (5)."""
         x, y = ((np.asarray(pixels, float) - self.center) / self.focal).T
         if any(self.distortion):
-            x, y = undistorted(self._distort, self._jacobian, (x, y), UNDISTORT_TOLERANCE)
+            x, y = undistorted(self._distort, self._jacobian, (x, y))
             x = np.where(self._is_unfolded(x, y), x, np.nan)
         r2 = x * x + y * y
         root = 1 + (1 - self.xi**2) * r2

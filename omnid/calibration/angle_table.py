@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from calib.fit.boards.rig_fit import RigCalibration
 from calib.models.camera import Array, OmniCamera, inside_image
-from calib.rig import MountedCamera, Rig
+from calib.rig import Rig
 from omnid.calibration.live_boards import HOURS, hours_of, listed
 
 BIN_DEG: Final = 10
@@ -60,7 +60,9 @@ def angle_rows(found: RigCalibration, rig: Rig, side: int) -> list[AngleRow]:
     bins, hours = _places(camera, pixels[known])
     squares = (residuals[known] ** 2).mean(axis=1)
     # 2. Those of the image.
-    image_bins, image_hours = _places(camera, _visible_pixels(mounted))
+    u, v = (np.arange(0, side, IMAGE_STEP_PX) for side in camera.size)
+    grid = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2).astype(float)
+    image_bins, image_hours = _places(camera, grid[inside_image(camera, grid) & mounted.visible.contains(grid)])
     # 3. One row each.
     rows = []
     for number in range(int(max(bins.max(initial=0), image_bins.max(initial=0))) + 1):
@@ -87,12 +89,3 @@ def _places(camera: OmniCamera, pixels: Array) -> tuple[NDArray[np.int64], NDArr
     known = np.isfinite(angle_deg)
     bins = np.where(known, np.nan_to_num(angle_deg) // BIN_DEG, -1).astype(np.int64)
     return bins, np.where(known, hours_of(pixels - camera.center), -1)
-
-
-def _visible_pixels(mounted: MountedCamera) -> Array:
-    """Return pixels (N, 2), evenly spread over what a camera sees of the world."""
-    width, height = mounted.camera.size
-    u, v = np.meshgrid(np.arange(0, width, IMAGE_STEP_PX), np.arange(0, height, IMAGE_STEP_PX))
-    pixels = np.column_stack([u.ravel(), v.ravel()]).astype(float)
-    seen = inside_image(mounted.camera, pixels) & mounted.visible.contains(pixels)
-    return np.asarray(pixels[seen & np.isfinite(mounted.camera.lift(pixels)).all(axis=1)])

@@ -40,30 +40,25 @@ def find_boards(images: Images, board: AnyBoard, *, thorough: bool, progress: Pr
     """Find the views of a board in images, on all cores; raises OmnidError if there is none, naming other boards."""
     views, other_grids = list[BoardView](), Counter[tuple[int, int]]()
 
-    def search_of(named: tuple[str, Image]) -> tuple[str, BoardSearch]:
-        name, image = named
-        return name, search_board(image, board, name, thorough=thorough)
-
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for number, (name, search) in enumerate(pool.map(search_of, images.items()), 1):
+        searches = pool.map(lambda name: search_board(images[name], board, name, thorough=thorough), images)
+        for number, (name, search) in enumerate(zip(images, searches, strict=True), 1):
+            outcome, (columns, rows) = "no board", search.grid_size
             if search.view is not None:
                 views.append(search.view)
-            if search.grid_size != (0, 0):
-                other_grids[min(search.grid_size), max(search.grid_size)] += 1
-            progress(f"[{number}/{len(images)}] {name}: {_outcome(search)}")
+                corners = search.view.pixels[:, 0]
+                outcome = f"board found, {np.isfinite(corners).sum()} of {len(corners)} corners"
+            elif columns:
+                outcome = f"no board, but a grid of {columns}x{rows}"
+            if columns:
+                other_grids[min(columns, rows), max(columns, rows)] += 1
+            progress(f"[{number}/{len(images)}] {name}: {outcome}")
     if views and max(other_grids.values(), default=0) > len(views):
         progress(f"the board was found in {len(views)}, {_grid_hint(other_grids)}")
     if not views:
         hint = _grid_hint(other_grids) if isinstance(board, Board) else TAGS_HINT
         raise OmnidError(f"calibrate: no {board} in any of {len(images)} images; {hint}")
     return views
-
-
-def _outcome(search: BoardSearch) -> str:
-    view, (columns, rows) = search.view, search.grid_size
-    if view is not None:
-        return f"board found, {int(np.isfinite(view.pixels[:, 0]).sum())} of {len(view.pixels)} corners"
-    return f"no board, but a grid of {columns}x{rows}" if columns else "no board"
 
 
 def _grid_hint(other_grids: Counter[tuple[int, int]]) -> str:

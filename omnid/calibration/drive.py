@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.fit.parameters import LINE_TIME, UPPER_DELAY, RigParameters
+from calib.fit.parameters import LINE_TIME, NOMINAL_TURN_RAD, UPPER_DELAY, RigParameters
 from calib.fit.residual_structure import ResidualStructure
 from calib.fit.rig_drift import apply_drift
 from calib.fit.rig_from_drive import (
@@ -30,7 +30,7 @@ from drivers.logs.log_reader import AnyCameras, LogCameras
 from omnid.calibration.board_search import Progress, silent
 from omnid.calibration.drive_observations import Drives, collect, observe_pairs
 from omnid.calibration.images import SIDES
-from omnid.calibration.rig_check import check_rig, read_rig_pairs, with_masks
+from omnid.calibration.rig_check import MAX_SKEW_S, check_rig, read_rig_pairs, with_masks
 from omnid.config import Config
 from omnid.core.stereo.triangulation import common_perpendicular
 from omnid.errors import OmnidError
@@ -52,13 +52,14 @@ SMALL_GAIN = 0.95
 # Distortion terms of omni cameras that are fitted although the file has none: a camera may be tilted below its mirror.
 DISTORTION = ("p1", "p2")
 TIMES = (UPPER_DELAY, LINE_TIME)
-# Times below these are those of synchronous cameras with global shutters; so are times within four of their sigmas.
-MIN_TIME, TIME_SIGMAS = {UPPER_DELAY: 0.5, LINE_TIME: 1.0}, 4.0
+# Times below these are those of synchronous cameras with global shutters.
+MIN_TIME = {UPPER_DELAY: 0.5, LINE_TIME: 1.0}
+# A time within so many of its sigmas is none, and a camera's parameter that differs by more of those of a nominal rig
+# is that of another camera: 1 of 16,000 normal errors is larger.
+SIGNIFICANT_SIGMAS = 4.0
 # Rounds of matching columns before the first drive: each matches in panoramas that the one before has straightened, so
 # that wrong matches become fewer.
 PAIR_ROUNDS = 3
-# Largest difference of stamps during which no motion counts: 3 ms are 3 mm at walking speed.
-SYNCHRONOUS_S = 3e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,7 +205,7 @@ def straightened(
         )
     # Errors of a centre have the effect of a shifted viewpoint, so only the rotation is a start.
     steps = parameters.transform_steps(apply_drift(rig, replace(finding.drift, shift=np.zeros(2))))
-    if float(np.median([abs(pair.skew_s) for pair in pairs])) > SYNCHRONOUS_S:
+    if float(np.median([abs(pair.skew_s) for pair in pairs])) > MAX_SKEW_S:
         return steps  # the motion between the exposures would be taken for errors of the centres
     for _ in range(PAIR_ROUNDS):
         state, observations = observe_pairs(pairs, parameters.at(steps), config)
@@ -284,7 +285,7 @@ def significant_times(found: DriveAdjustment) -> tuple[str, ...]:
     return tuple(
         name
         for name, value, sigma in zip(names, values, sigmas, strict=True)
-        if name in TIMES and abs(value) > max(MIN_TIME[name], TIME_SIGMAS * sigma)
+        if name in TIMES and abs(value) > max(MIN_TIME[name], SIGNIFICANT_SIGMAS * sigma)
     )
 
 
@@ -354,10 +355,8 @@ def turned_about_lower(rig: Rig, R: Array) -> Rig:
 
 
 # Largest rotation of the upper camera, and of the baseline's direction, against a measured rig. A nominal rig does not
-# know how its cameras were mounted: its limit is three of its sigmas (NOMINAL_SIGMAS in `rig_parameters.py`).
-MAX_TURN_RAD, MAX_NOMINAL_TURN_RAD = np.deg2rad(2.8), np.deg2rad(4.5)
-# Largest change of a camera's parameter, in sigmas of a nominal rig: 1 of 16,000 normal errors is larger.
-MAX_CHANGE_SIGMAS = 4.0
+# know how its cameras were mounted: its limit is three of its sigmas.
+MAX_TURN_RAD, MAX_NOMINAL_TURN_RAD = np.deg2rad(2.8), 3 * NOMINAL_TURN_RAD
 
 
 def require_same_rig(parameters: RigParameters, steps: Array, *, tracked: bool = True) -> None:
@@ -375,7 +374,7 @@ def require_same_rig(parameters: RigParameters, steps: Array, *, tracked: bool =
             f"the upper camera is turned by {np.rad2deg(turn):.1f} deg and its baseline by {np.rad2deg(lean):.1f} deg "
             f"against the rig's file, expected {np.rad2deg(limit):.1f} deg at most"
         )
-    elif away[worst] > MAX_CHANGE_SIGMAS:
+    elif away[worst] > SIGNIFICANT_SIGMAS:
         old, new = parameters.values[worst], (parameters.values + steps * parameters.units)[worst]
         reason = (
             f"{parameters.names[worst]} would change from {old:.5g} to {new:.5g}, more than another calibration of the "

@@ -57,9 +57,10 @@ def read_pairs(source: Path, cameras: LogCameras = BY_NAME) -> PairedImages:
     and would count the same errors again.
     """
     # 1. Read the images of both cameras.
-    of_log = is_log_name(source.name) or (
-        source.is_dir() and (any(is_log_name(path.name) for path in source.iterdir()) or _has_folders(source))
-    )
+    of_log = is_log_name(source.name)
+    if source.is_dir():  # a folder of a log's files, or of folders of images, one for each camera
+        has_folders = not any(source.glob(f"{SIDES[0]}_*")) and len(image_folders(source)) > 1
+        of_log |= has_folders or any(is_log_name(path.name) for path in source.iterdir())
     if not of_log and (cameras.lower or cameras.upper):
         raise OmnidError(f"{source}: only a log has topics; found a folder of images")
     faults, loss = tuple[str, ...](), ""
@@ -70,7 +71,12 @@ def read_pairs(source: Path, cameras: LogCameras = BY_NAME) -> PairedImages:
         lower, upper = ({f"pair{number:05d}": pair[side] for number, pair in images.items()} for side in (0, 1))
         sides, faults, loss = (lower, upper), tuple(read.notes), str(read.loss)
     else:
-        sides, topics = _of_folder(source, cameras.bits), ("", "")
+        if not source.is_dir():
+            raise OmnidError(
+                f"{source}: expected a log (.mcap, .db3, .bag) or a folder with images lower_*, upper_*; "
+                f"found {'a file' if source.exists() else 'no such file or folder'}"
+            )
+        sides, topics = (_of_side(source, SIDES[0], cameras.bits), _of_side(source, SIDES[1], cameras.bits)), ("", "")
     if not sides[0].keys() & sides[1].keys():
         counts = [len(side) for side in sides]
         expected = "pairs like lower_001.png and upper_001.png"
@@ -86,11 +92,6 @@ def read_pairs(source: Path, cameras: LogCameras = BY_NAME) -> PairedImages:
     return PairedImages((kept[0], kept[1]), topics, (*faults, *([loss] if loss else []), *notes), loss)
 
 
-def _has_folders(source: Path) -> bool:
-    """True if a folder is a log of folders of images, one for each camera."""
-    return not any(source.glob(f"{SIDES[0]}_*")) and len(image_folders(source)) > 1
-
-
 def _repeats(sides: Sequence[Images]) -> dict[str, str]:
     """Return the instants whose images have all pixels of those of an earlier one: name -> the earlier name."""
     first, found = dict[tuple[bytes, ...], str](), dict[str, str]()
@@ -100,16 +101,6 @@ def _repeats(sides: Sequence[Images]) -> dict[str, str]:
         if earlier != name:
             found[name] = earlier
     return found
-
-
-def _of_folder(folder: Path, bits: int) -> tuple[Images, Images]:
-    if not folder.is_dir():
-        raise OmnidError(
-            f"{folder}: expected a log (.mcap, .db3, .bag) or a folder with images lower_*, upper_*; "
-            f"found {'a file' if folder.exists() else 'no such file or folder'}"
-        )
-    lower, upper = (_of_side(folder, side, bits) for side in SIDES)
-    return lower, upper
 
 
 def _of_side(folder: Path, side: str, bits: int) -> Images:
@@ -122,9 +113,12 @@ def _of_side(folder: Path, side: str, bits: int) -> Images:
         raise OmnidError(f"{folder}: no images {side}_* in this folder; name them lower_001.png, upper_001.png ...")
     if len(paths) > MAX_IMAGES:
         raise OmnidError(f"calibrate: expected {MAX_IMAGES} images at most, found {len(paths)}; 40 are enough")
-    images = [_read(path, bits) for path in paths.values()]
-    _require_one_size({path.name: image for path, image in zip(paths.values(), images, strict=True)})
-    return dict(zip(paths, images, strict=True))
+    images = {name: _read(path, bits) for name, path in paths.items()}
+    sizes = {image.shape[::-1]: paths[name].name for name, image in reversed(images.items())}
+    if len(sizes) > 1:
+        found = ", ".join(f"{width}x{height} ({name})" for (width, height), name in list(sizes.items())[:4])
+        raise OmnidError(f"calibrate: expected images of one camera, all of one size, found {found}")
+    return images
 
 
 def _read(path: Path, bits: int) -> Image:
@@ -142,16 +136,6 @@ def _read(path: Path, bits: int) -> Image:
             f"{path}: expected an image (PNG, JPEG, TIFF ...) of at most {MAX_PIXELS} pixels, found none; leave it out"
         )
     return np.ascontiguousarray(image if image.dtype == np.uint8 else upper_eight_bits(image, bits), np.uint8)
-
-
-def _require_one_size(images: Images) -> None:
-    """Raise OmnidError unless all images are of one size."""
-    sizes: dict[tuple[int, ...], str] = {}
-    for name, image in images.items():
-        sizes.setdefault(image.shape[::-1], name)
-    if len(sizes) > 1:
-        shown = ", ".join(f"{size[0]}x{size[1]} ({name})" for size, name in list(sizes.items())[:4])
-        raise OmnidError(f"calibrate: expected images of one camera, all of one size, found {shown}")
 
 
 class LogPairs(NamedTuple):

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final
@@ -17,7 +18,7 @@ from calib.boards.board import BoardView
 from calib.models.camera import Array, Mask
 from calib.rim import find_rim
 from drivers.errors import FrameDecodeError
-from drivers.frame import Frame, FrameSource, gray
+from drivers.frame import FrameSource, gray
 from omnid.calibration.board_search import AnyBoard, search_board
 from omnid.calibration.images import SIDES, Image, middle_px
 from omnid.errors import OmnidError
@@ -174,12 +175,15 @@ class LiveBoards:
         """Search the rims in the brightest of all images until both are found; until then use the whole image."""
         if not self._brightest:
             self._brightest = [image.copy() for image in images]
-            self.coverage = CameraCoverage(_whole(images[0])), CameraCoverage(_whole(images[1]))
+            # Until a rim is found, the largest disc in the image.
+            discs = [Mask(middle_px(image), 0.0, (min(image.shape) - 1) / 2) for image in images]
+            self.coverage = CameraCoverage(discs[0]), CameraCoverage(discs[1])
         for name, before, image in zip(SIDES, self._brightest, images, strict=True):
             if image.shape != before.shape:
+                expected, found_px = ("{1}x{0} px".format(*one.shape) for one in (before, image))
                 raise OmnidError(
-                    f"{name} camera: expected images of {_size(before)} px as the first ones, found {_size(image)} px; "
-                    "set the size of the camera, or name another folder"
+                    f"{name} camera: expected images of {expected} as the first ones, found {found_px}; set the size "
+                    "of the camera, or name another folder"
                 )
         for side, image in enumerate(images):
             if self._rims[side] is None:
@@ -187,15 +191,6 @@ class LiveBoards:
                 found = self._rims[side] = find_rim(self._brightest[side], middle_px(image))
                 if found is not None:
                     self._covered()[side].rim = found
-
-
-def _size(image: Image) -> str:
-    return f"{image.shape[1]}x{image.shape[0]}"
-
-
-def _whole(image: Image) -> Mask:
-    """Return the largest disc in an image."""
-    return Mask(middle_px(image), 0.0, (min(image.shape) - 1) / 2)
 
 
 def status(boards: LiveBoards, outcome: PairOutcome) -> DiagnosticStatus:
@@ -219,19 +214,13 @@ def newest_pairs(lower: FrameSource, upper: FrameSource) -> Iterator[tuple[Image
     while True:
         pair = []
         for source in frames:
-            image = _image_after(source, time.monotonic_ns())
-            if image is None:
-                return
+            asked_ns, image = time.monotonic_ns(), None
+            while image is None:
+                frame = next(source, None)
+                if frame is None:
+                    return
+                if frame.stamp_ns >= asked_ns:
+                    with suppress(FrameDecodeError):
+                        image = gray(frame)
             pair.append(image)
         yield pair[0], pair[1]
-
-
-def _image_after(frames: Iterator[Frame], asked_ns: int) -> Image | None:
-    """Return the first image with a stamp not before that; None at the end."""
-    for frame in frames:
-        if frame.stamp_ns >= asked_ns:
-            try:
-                return gray(frame)
-            except FrameDecodeError:
-                continue
-    return None

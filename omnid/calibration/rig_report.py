@@ -7,17 +7,15 @@ from html import escape
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from calib import se3
 from calib.errors import CalibError
 from calib.fit.boards.bundle import TWIST_NAMES
 from calib.fit.boards.rig_fit import RigCalibration
-from calib.models.camera import Array
 from calib.panorama import fit_cylinder, remap_tables
 from calib.rig import Rig
 from omnid.calibration.angle_table import HEAD, AngleRow
-from omnid.calibration.images import SIDES, Image, PairedImages
+from omnid.calibration.images import SIDES, PairedImages
 from omnid.report.page import bar, figure, folded, page, table
 
 # Factor by which residuals are drawn longer.
@@ -78,13 +76,18 @@ def _coverage(found: RigCalibration, images: PairedImages, side: int) -> str:
     views = [(k, view.name, seen) for k, view in enumerate(found.views) if (seen := view.seen[side]) is not None]
     image = images.sides[side][views[0][1]]
     scale = COVERAGE_PX / image.shape[1]
-    canvas = _color(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) // 2)
+    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    canvas = cv2.cvtColor(small // 2, cv2.COLOR_GRAY2BGR)
     for k, _, seen in views:
-        _draw_arrows(canvas, (seen.pixels + 0.5) * scale - 0.5, found.fit.residuals[k, side] * scale)
+        starts, arrows = (seen.pixels + 0.5) * scale - 0.5, ARROW * scale * found.fit.residuals[k, side]
+        known = np.isfinite(starts + arrows).all(axis=1)
+        for start, end in np.rint([starts[known], (starts + arrows)[known]]).astype(int).swapaxes(0, 1).tolist():
+            cv2.circle(canvas, start, 3, MEASURED, 1, cv2.LINE_AA)
+            cv2.line(canvas, start, end, RESIDUAL, 1, cv2.LINE_AA)
     middle = tuple(round(value * scale) for value in camera.center)
     cv2.drawMarker(canvas, middle, CENTER, cv2.MARKER_CROSS)
     text = f"all corners; arrows are the residuals, {ARROW:.0f} times as long; the cross is the centre"
-    return figure(canvas, f"{SIDES[side]}: {text}")
+    return figure(np.asarray(canvas, np.uint8), f"{SIDES[side]}: {text}")
 
 
 def _errors(found: RigCalibration) -> str:
@@ -110,19 +113,10 @@ def _rectified(found: RigCalibration, images: PairedImages, rig: Rig) -> str:
         cv2.remap(side[name], *remap_tables(rig, mounted, cylinder), cv2.INTER_LINEAR)
         for side, mounted in zip(reversed(images.sides), (rig.upper, rig.lower), strict=True)
     ]
-    canvas = _color(np.vstack(rows))
+    canvas = cv2.cvtColor(np.vstack(rows), cv2.COLOR_GRAY2BGR)
     # Lines stand as far apart in a sector, whose panorama is narrower than a full turn.
     canvas[:, PANORAMA_WIDTH // (2 * LINES) :: PANORAMA_WIDTH // LINES] = LINE_COLOR
-    return figure(canvas, f"{name}: the upper panorama above the lower one; a point is in the same column of both")
-
-
-def _color(image: NDArray[np.generic]) -> Image:
-    return np.asarray(cv2.cvtColor(np.asarray(image, np.uint8), cv2.COLOR_GRAY2BGR), np.uint8)
-
-
-def _draw_arrows(canvas: Image, pixels: Array, residuals: Array) -> None:
-    for pixel, residual in zip(pixels, residuals, strict=True):
-        if np.isfinite(pixel).all() and np.isfinite(residual).all():
-            start, end = ((round(u), round(v)) for u, v in (pixel.tolist(), (pixel + ARROW * residual).tolist()))
-            cv2.circle(canvas, start, 3, MEASURED, 1, cv2.LINE_AA)
-            cv2.line(canvas, start, end, RESIDUAL, 1, cv2.LINE_AA)
+    return figure(
+        np.asarray(canvas, np.uint8),
+        f"{name}: the upper panorama above the lower one; a point is in the same column of both",
+    )

@@ -13,7 +13,6 @@ import numpy as np
 
 from calib.boards.aprilgrid import AprilGrid
 from calib.boards.board import Board, BoardView
-from calib.models.camera import Array
 from calib.models.ocam import VIEWS, View
 from calib.rim import find_rim
 from omnid.calibration.board_search import Progress
@@ -64,14 +63,12 @@ def _view_of_camera(images: Images, views: Sequence[BoardView], board: Board | A
         rim = find_rim(image, middle_px(image))
         return "mirror" if rim is not None and rim.inner_px > 0 else None
     # The grid's y points up in an image that is not reflected, the pixels' v down.
-    reflected = [_orientation(board.points[:, :2], view.pixels) > 0 for view in views]
+    reflected = []
+    for view in views:
+        seen = np.isfinite(view.pixels[:, 0])
+        known = np.column_stack([board.points[seen, :2], np.ones(seen.sum())])
+        affine = np.linalg.lstsq(known, view.pixels[seen], rcond=None)[0]
+        reflected.append(np.linalg.det(affine[:2]) > 0)
     if not reflected:
         return None
     return "mirror" if 2 * sum(reflected) > len(reflected) else "direct"
-
-
-def _orientation(points: Array, pixels: Array) -> float:
-    """Return the determinant of the affine mapping from points (N, 2) of the board to pixels (N, 2), NaN for unseen."""
-    seen = np.isfinite(pixels[:, 0])
-    known = np.column_stack([points[seen], np.ones(seen.sum())])
-    return float(np.linalg.det(np.linalg.lstsq(known, pixels[seen], rcond=None)[0][:2]))

@@ -20,6 +20,7 @@ from calib.errors import CalibError
 from calib.fit.boards.mirror_prior import mirror_residuals
 from calib.fit.boards.smooth_misfit import covariance_with_misfit, smooth_fields
 from calib.fit.least_squares import (
+    BEST_STEP,
     DAMPING_FACTOR,
     START_DAMPING,
     ArrowSystem,
@@ -277,7 +278,7 @@ class _BoardProblem:
 
     def _prior_jacobian(self, rig: BoardRig) -> Array:
         """Return the derivatives (Q, P) of the priors by the common unknowns."""
-        step = 1e-4 * np.ones(len(rig.names) + 1)  # each prior is nearly linear over it
+        step = BEST_STEP * np.ones(len(rig.names) + 1)
         blocks = [
             central_differences(lambda steps, side=side: self._camera_priors(rig, side, steps), step)  # type: ignore[misc]
             for side in range(len(rig.cameras))

@@ -18,7 +18,7 @@ from calib.errors import CalibError
 from calib.fit.boards.bundle import TWIST_NAMES, BoardFit, BoardRig, fit_boards
 from calib.fit.boards.linear_start import LinearCamera, solve_linear
 from calib.fit.boards.relative_pose import initialise_relative_pose
-from calib.fit.least_squares import central_differences
+from calib.fit.least_squares import BEST_STEP, central_differences
 from calib.fit.residual_structure import ResidualStructure, residual_structure
 from calib.models.camera import Array
 from calib.models.names import values_of
@@ -234,7 +234,7 @@ def rig_covariance(found: RigCalibration, rig: Rig) -> RigCovariance:
 
     count = len(names) + len(TWIST_NAMES)
     J = np.eye(count)
-    J[len(names) :, len(names) :] = central_differences(transform, 1e-6 * np.ones(6))  # it is nearly linear over it
+    J[len(names) :, len(names) :] = central_differences(transform, BEST_STEP * np.ones(len(TWIST_NAMES)))
     return RigCovariance.of_matrix([*names, *TRANSFORM_NAMES], J @ found.fit.covariance[:count, :count] @ J.T)
 
 
