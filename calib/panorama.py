@@ -20,9 +20,9 @@ from calib.models.camera import Array, inside_image
 from calib.rig import MountedCamera, Rig
 
 Maps = tuple[NDArray[np.float32], NDArray[np.float32]]
-# Grid on which the common field of view is measured, and the least share of the azimuths, of a full turn or of the
-# sector, at which a slope is visible.
-SLOPES, AZIMUTH_STEP_DEG, MIN_VISIBLE = 400, 15, 0.5
+# Numbers of slopes and azimuths by which the common field of view is measured, and the least share of these azimuths at
+# which a slope is visible.
+SLOPES, AZIMUTHS, MIN_VISIBLE = 400, 24, 0.5
 # A sector begins and ends at one of SECTOR_STEPS steps of a full turn, each of a whole number of columns. Steps of 3.75
 # degrees are five directions of the obstacles, so that both share their borders, and a sector is at most two of them
 # wider than what is seen.
@@ -190,8 +190,10 @@ def _shared_view(rig: Rig, elevation_deg: tuple[float, float]) -> tuple[_Sector,
             f"rig: the cameras share no view between {elevation_deg[0]} and {elevation_deg[1]} degrees "
             "of elevation; check the intrinsics, the transforms and the masks"
         )
+    first = 0.0 if sector.is_full else 0.5
+    azimuths = sector.right_rad + (np.arange(AZIMUTHS) + first) * sector.span_rad / AZIMUTHS
     lower, upper = (
-        _seen(rig, mounted, slopes, _azimuths(sector)).mean(axis=1) >= MIN_VISIBLE for mounted in (rig.lower, rig.upper)
+        _seen(rig, mounted, slopes, azimuths).mean(axis=1) >= MIN_VISIBLE for mounted in (rig.lower, rig.upper)
     )
     slopes = slopes[lower & upper]
     if not len(slopes):
@@ -229,14 +231,6 @@ def _shared_sector(rig: Rig, slopes: Array) -> _Sector | None:
     return _Sector(right * step_rad - math.pi, (SECTOR_GRID - int(gaps[widest])) * step_rad)
 
 
-def _azimuths(sector: _Sector) -> Array:
-    """Return the azimuths (N,) at which the slopes of a sector are counted."""
-    if sector.is_full:
-        return np.asarray(np.deg2rad(np.arange(0, 360, AZIMUTH_STEP_DEG)), float)
-    count = max(24, math.ceil(sector.span_rad / math.radians(AZIMUTH_STEP_DEG)))
-    return np.asarray(sector.right_rad + (np.arange(count) + 0.5) * sector.span_rad / count)
-
-
 def _seen(rig: Rig, mounted: MountedCamera, slopes: Array, azimuth: Array) -> NDArray[np.bool_]:
     """Return flags (S, A) of slopes z/r (S,) that a camera sees at azimuths (A,)."""
     grid = np.column_stack(
@@ -252,11 +246,7 @@ def _turn_px(rig: Rig, sector: _Sector, slope: float) -> float:
 
     That of a full circle is the length of the horizon; NaN where a camera does not see it.
     """
-    azimuth = (
-        np.linspace(0, 2 * math.pi, 361)
-        if sector.is_full
-        else (sector.right_rad + np.linspace(0, sector.span_rad, 361))
-    )
+    azimuth = sector.right_rad + np.linspace(0, sector.span_rad, 361)
     ring = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.full_like(azimuth, 0.0 if sector.is_full else slope)])
     with np.errstate(over="ignore", invalid="ignore"):
         around = [np.linalg.norm(np.diff(_project(rig, m, ring), axis=0), axis=1) for m in (rig.lower, rig.upper)]
@@ -283,20 +273,14 @@ def remap_tables(rig: Rig, mounted: MountedCamera, cylinder: Cylinder, pad_px: i
     pad_px columns more lie on either side, those of a full turn repeated, so that windows and pyramids are continuous
     across the seam.
     """
-    shape = cylinder.height, cylinder.width + 2 * pad_px
-    u, v = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    columns = np.arange(-pad_px, cylinder.width + pad_px)
+    u, v = (np.empty((cylinder.height, len(columns)), np.float32) for _ in range(2))
     for top in range(0, cylinder.height, BLOCK_ROWS):
-        rows = np.arange(top, min(top + BLOCK_ROWS, cylinder.height))
-        u[rows], v[rows] = _block_tables(rig, mounted, cylinder, rows, pad_px)
-    return u, v
-
-
-def _block_tables(rig: Rig, mounted: MountedCamera, cylinder: Cylinder, block: NDArray[np.int_], pad_px: int) -> Maps:
-    """Return the tables of some rows (N,), with padding on either side."""
-    columns, rows = np.meshgrid(np.arange(-pad_px, cylinder.width + pad_px), block)
-    pixels = _project(rig, mounted, cylinder.rays(np.column_stack([columns.ravel(), rows.ravel()]).astype(float)))
-    pixels[~inside_image(mounted.camera, pixels)] = -1
-    u, v = pixels.astype(np.float32).T.reshape(2, *columns.shape)
+        block = np.arange(top, min(top + BLOCK_ROWS, cylinder.height))
+        grid = np.stack(np.meshgrid(columns, block), axis=-1).reshape(-1, 2).astype(float)
+        pixels = _project(rig, mounted, cylinder.rays(grid))
+        pixels[~inside_image(mounted.camera, pixels)] = -1
+        u[block], v[block] = pixels.T.reshape(2, len(block), -1)
     return u, v
 
 
