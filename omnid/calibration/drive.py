@@ -57,6 +57,8 @@ MIN_TIME = {UPPER_DELAY: 0.5, LINE_TIME: 1.0}
 # A time within so many of its sigmas is none, and a camera's parameter that differs by more of those of a nominal rig
 # is that of another camera: 1 of 16,000 normal errors is larger.
 SIGNIFICANT_SIGMAS = 4.0
+# Numbers of a nominal rig are this far off at most, in radians and metres, by rounding.
+STRAIGHT = 1e-9
 # Rounds of matching columns before the first drive: each matches in panoramas that the one before has straightened, so
 # that wrong matches become fewer.
 PAIR_ROUNDS = 3
@@ -165,15 +167,16 @@ def calibrate_drive(
     waves = any(has_wavefront(mounted.camera) for mounted in (before.lower, before.upper))
     parameters = RigParameters.about(before, DISTORTION, TIMES, waves=waves)
     # 2. Straighten the panoramas until columns match, so that the odometry can track.
-    steps = straightened(paths[0], parameters, cameras, config, progress)
-    require_same_rig(parameters, steps, tracked=False)
+    start = straightened(paths[0], parameters, cameras, config, progress)
+    require_same_rig(parameters, start, tracked=False)
     # 3. Track and adjust in rounds, until lengths change no more.
-    found, drives = _in_rounds(paths, parameters, steps, cameras, config, progress)
+    found, drives = _in_rounds(paths, parameters, start, cameras, config, progress)
     # 4. Adjust once more without the times of exposure that do not differ from none, and refuse what is another rig.
     times = significant_times(found)
     if times != TIMES:
         parameters = RigParameters.about(_with_times(before, times), DISTORTION, times, waves=waves)
-        found = _adjusted(parameters, _named_steps(parameters, found), drives)
+        steps = dict(zip(found.parameters.names, found.state.steps.tolist(), strict=True))
+        found = _adjusted(parameters, np.array([steps.get(name, 0.0) for name in parameters.names]), drives)
     require_same_rig(parameters, found.state.steps)
     # 5. The length of the baseline by the prior, the covariance, and a level frame of a nominal rig.
     adjusted, level_rad = _finished_rig(before, found, drives)
@@ -247,12 +250,6 @@ def _adjusted(parameters: RigParameters, steps: Array, drives: Drives) -> DriveA
     return adjust_drive(parameters, replace(drives.state, steps=steps), drives.observations, drives.fixed, alike=alike)
 
 
-def _named_steps(parameters: RigParameters, found: DriveAdjustment) -> Array:
-    """Return the steps (P,) of other parameters about the same rig that are nearest to an adjustment's."""
-    steps = dict(zip(found.parameters.names, found.state.steps.tolist(), strict=True))
-    return np.array([steps.get(name, 0.0) for name in parameters.names])
-
-
 def _finished_rig(before: Rig, found: DriveAdjustment, drives: Drives) -> tuple[Rig, float]:
     """Return the rig with baseline and covariance, and the angle [rad] by which a nominal rig's frame was levelled."""
     parameters = found.parameters
@@ -296,21 +293,18 @@ MAX_ROUGHNESS = 0.02  # Most rms distance of a path from its plane, by the short
 
 def scale_change(found: DriveAdjustment, before: Rig) -> float:
     """Return the relative change of lengths from the rig before to the adjusted one, for the same pixels."""
-    pixels = _common_pixels(found)
+    # The pixels of landmarks that both cameras saw at once.
+    seen = found.observations
+    key = seen.keyframe * (seen.landmark.max() + 1) + seen.landmark
+    sides = [seen.camera == side for side in (0, 1)]
+    _, *common = np.intersect1d(key[sides[0]], key[sides[1]], return_indices=True)
+    pixels = [seen.pixels[side][at] for side, at in zip(sides, common, strict=True)]
     ranges, old = _ranges(found.rig, pixels), _ranges(before, pixels)
     known = np.isfinite(ranges) & np.isfinite(old)
     return float(np.average(np.log(ranges[known] / old[known]), weights=ranges[known] ** -2)) if known.any() else np.nan
 
 
-def _common_pixels(found: DriveAdjustment) -> tuple[Array, Array]:
-    """Return the pixels (N, 2) of landmarks that both cameras saw at once, in the lower and in the upper image."""
-    seen = found.observations
-    key = seen.keyframe * (seen.landmark.max() + 1) + seen.landmark
-    _, lower, upper = np.intersect1d(key[seen.camera == 0], key[seen.camera == 1], return_indices=True)
-    return seen.pixels[seen.camera == 0][lower], seen.pixels[seen.camera == 1][upper]
-
-
-def _ranges(rig: Rig, pixels: tuple[Array, Array]) -> Array:
+def _ranges(rig: Rig, pixels: Sequence[Array]) -> Array:
     """Return the distances (N,) from the lower viewpoint of points at pixels (N, 2) of both cameras."""
     rays = [m.camera.lift(p) @ se3.R_of(m.T_cam_rig) for m, p in zip((rig.lower, rig.upper), pixels, strict=True)]
     points = common_perpendicular(rays[0], rays[1], rig.upper.viewpoint - rig.lower.viewpoint)
@@ -366,7 +360,13 @@ def require_same_rig(parameters: RigParameters, steps: Array, *, tracked: bool =
     """
     change = (steps * parameters.units)[parameters.of_transform]
     turn, lean = float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:])) if tracked else 0.0
-    limit = MAX_NOMINAL_TURN_RAD if is_nominal(parameters.rig) else MAX_TURN_RAD
+    # A nominal rig was not measured: it has no covariance, and one camera exactly above the other without any rotation.
+    T, measured = (
+        parameters.rig.upper.T_cam_rig @ se3.inverse(parameters.rig.lower.T_cam_rig),
+        parameters.rig.covariance,
+    )
+    straight = np.abs(np.append(se3.R_of(T) - np.eye(3), se3.t_of(T)[:2])).max() < STRAIGHT
+    limit = MAX_NOMINAL_TURN_RAD if measured is None and straight else MAX_TURN_RAD
     away = np.abs(steps / parameters.nominal_sigmas)[: parameters.of_transform.start]
     worst = int(np.argmax(away))
     if max(turn, lean) > limit:
@@ -386,10 +386,3 @@ def require_same_rig(parameters: RigParameters, steps: Array, *, tracked: bool =
         f"calibrate drive: {reason}; is the rig that of these cameras? Nothing is written for another "
         "one: start from its own or nominal rig"
     )
-
-
-def is_nominal(rig: Rig) -> bool:
-    """True if a rig was not measured: no covariance, and one camera exactly above the other without any rotation."""
-    T = rig.upper.T_cam_rig @ se3.inverse(rig.lower.T_cam_rig)
-    straight = np.allclose(se3.R_of(T), np.eye(3), atol=1e-9) and np.allclose(T[:2, 3], 0, atol=1e-9)
-    return rig.covariance is None and bool(straight)

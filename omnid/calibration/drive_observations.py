@@ -111,7 +111,8 @@ def _drive(log: Path, place: Geometry, cameras: LogCameras, config: Config, most
     collector = DriveCollector(place, front_end.dense)
     newest = np.eye(4)
     with closing(open_log(log, cameras, place.rig)) as reader:
-        choice = KeyframeChoice(_spacing(reader, most))
+        # So many pairs at least lie between two keyframes that there are not too many.
+        choice = KeyframeChoice(max(1, -(-(reader.pair_estimate() or 0) // most)))
         for update, twist in _with_twists(tracked_updates(reader, front_end, config, log)):
             newest = update.T_odom_rig
             if choice.takes(update):
@@ -152,12 +153,6 @@ class DriveCollector:
         T_rig_odom, twist = np.array(self._T_rig_odom), np.array(self._twists)
         state = DriveState(T_rig_odom, found.points[used], twist, np.array(self._delays_s), np.zeros(0))
         return Drives(state, observations, (0,), self._T_rig_odom[-1] @ T_odom_last)
-
-
-def _spacing(reader: LogReader, most: int) -> int:
-    """Return how many pairs at least lie between two keyframes, so that there are not too many."""
-    pairs = reader.pair_estimate() or 0
-    return max(1, -(-pairs // most))
 
 
 class KeyframeChoice:

@@ -104,22 +104,20 @@ class RigCheckResult:
                 f"remaining offset of the columns: {finding.left_px:.2f} px or less in half of all directions",
             ]
             lines += [RECALIBRATE] * self.has_changed_intrinsics
-        lines += [_rim(name, rim) for name, rim in zip(SIDES, self.rims, strict=True)]
+        for name, rim in zip(SIDES, self.rims, strict=True):
+            if rim is None:
+                lines.append(f"{name} rim: not compared, as the mask or the rim in the images is not known")
+                continue
+            fits = "the mask fits"
+            if not rim.fits:
+                fits = "the mask reaches beyond the mirror: it was drawn so, or the camera has moved"
+            lines.append(
+                f"{name} rim: centre moved by {rim.moved_px[0]:+.1f} {rim.moved_px[1]:+.1f} px from the mask's, radius "
+                f"{rim.wider_px:+.1f} px: {fits}"
+            )
         if self.skewed:
             lines.append(f"{self.skewed}: the motion in between, as the odometry sees it, is allowed for")
         return "\n".join(lines)
-
-
-def _rim(name: str, rim: RimShift | None) -> str:
-    if rim is None:
-        return f"{name} rim: not compared, as the mask or the rim in the images is not known"
-    fits = "the mask fits"
-    if not rim.fits:
-        fits = "the mask reaches beyond the mirror: it was drawn so, or the camera has moved"
-    return (
-        f"{name} rim: centre moved by {rim.moved_px[0]:+.1f} {rim.moved_px[1]:+.1f} px from the mask's, radius "
-        f"{rim.wider_px:+.1f} px: {fits}"
-    )
 
 
 def check_log(log: Path, rig: Rig, cameras: LogCameras) -> tuple[RigCheckResult, list[FramePair]]:
