@@ -31,7 +31,7 @@ from calib.models.ocam import MAX_COEFFICIENTS, OcamCamera, View
 from calib.models.unified import UnifiedCamera
 from calib.rig import MAX_BASELINE_M, MIN_BASELINE_M, MountedCamera, Rig, ShutterTimes
 from calib.rig_frame import is_turned_over, mounting_notes, rig_between
-from calib.text_files import MAX_JSON_BYTES, decode, load_mapping
+from calib.text_files import MAX_BYTES, MAX_JSON_BYTES, decode, load_mapping
 from calib.typed_toml import convert, shown, table_of
 from calib.validation import Warn, read_bytes, require_image_size, silent, transform_of
 
@@ -40,7 +40,6 @@ MAX_DISAGREEMENT_M, MAX_DISAGREEMENT_RAD = 1e-3, np.deg2rad(0.1)
 # Largest angle of the baseline from z of the rig, because no rig leans so far, but the axes of an IMU may be others.
 MAX_LEAN_RAD: Final = np.deg2rad(30)
 MIN_DELAY_S: Final = 0.5e-3  # between two cameras: less is no different from none, as for `omnid calibrate drive`
-MAX_OCAM_BYTES: Final = 1 << 16  # more than any file needs: one of OCamCalib has about 2 kB
 LOWER_WORDS, UPPER_WORDS = {"lower", "bottom"}, {"upper", "top"}
 # Keys of the inverse of a transform, which neighbours write instead: OpenVINS, VINS.
 INVERSES: Final = {
@@ -213,30 +212,25 @@ def _chain_poses(cameras: Mapping[str, ChainCamera], warn: Warn) -> tuple[dict[s
 
 def _stated(table: Struct, key: str, place: str, warn: Warn) -> Array | None:
     """Return the transform of a key of INVERSES, from its own key or that of its inverse; None without both."""
-    own, other = (getattr(table, name) for name in (key, INVERSES[key]))
-    found = None if own is None else transform_of(own, f"{place}.{key}", warn)
-    if other is None:
-        return found
-    inverse = se3.inverse(transform_of(other, f"{place}.{INVERSES[key]}", warn))
-    if found is not None:
-        _require_consistency(place, found, inverse, (key, INVERSES[key]))
-        return found
+    own, other = (
+        None if (rows := getattr(table, name)) is None else transform_of(rows, f"{place}.{name}", warn)
+        for name in (key, INVERSES[key])
+    )
+    if own is not None and other is not None:
+        _require_consistency(place, own, se3.inverse(other), (key, INVERSES[key]))
+    if own is not None or other is None:
+        return own
     warn(f"{place}.{INVERSES[key]} is the inverse of {key}, and is read as that")
-    return inverse
+    return se3.inverse(other)
 
 
 def _require_consistency(camera: str, one: Array, other: Array, keys: tuple[str, str]) -> None:
     """Raise CalibError for transforms that differ, and say so where one is the inverse of the other."""
-
-    def apart(T: Array) -> tuple[float, float]:
-        gap = se3.rotation_log((se3.inverse(one) @ T)[:3, :3])
-        return float(np.linalg.norm(se3.t_of(one) - se3.t_of(T))), float(np.linalg.norm(gap))
-
-    limits = (MAX_DISAGREEMENT_M, MAX_DISAGREEMENT_RAD)
-    distance_m, angle_rad = apart(other)
-    if distance_m <= limits[0] and angle_rad <= limits[1]:
+    gaps = [se3.log(se3.inverse(one) @ T) for T in (other, se3.inverse(other))]
+    (distance_m, angle_rad), inverted = (np.linalg.norm(gap.reshape(2, -1), axis=1) for gap in gaps)
+    if distance_m <= MAX_DISAGREEMENT_M and angle_rad <= MAX_DISAGREEMENT_RAD:
         return
-    if all(found <= most for found, most in zip(apart(se3.inverse(other)), limits, strict=True)):
+    if inverted[0] <= MAX_DISAGREEMENT_M and inverted[1] <= MAX_DISAGREEMENT_RAD:
         raise CalibError(f"{camera}: {keys[1]} is the inverse of what {keys[0]} says: invert it, or name it T_cnm1_cn")
     raise CalibError(
         f"{camera}: {keys[0]} and {keys[1]} contradict each other by {distance_m * 1e3:.1f} mm and "
@@ -279,12 +273,8 @@ def _lower_and_upper(
         orders = [(low, up) for low, up in orders if heights[up] - heights[low] >= MAX_DISAGREEMENT_M]
     else:
         models = {name: _chain_model(name, cameras[name], silent) for name in names}
-        T_between = {order: poses[order[0]] @ se3.inverse(poses[order[1]]) for order in orders}
-        orders = [
-            (low, up)
-            for (low, up), T in T_between.items()
-            if not is_turned_over(rig_between(models[low], models[up], T))
-        ]
+        rigs = {(a, b): rig_between(models[a], models[b], poses[a] @ se3.inverse(poses[b])) for a, b in orders}
+        orders = [order for order, rig in rigs.items() if not is_turned_over(rig)]
     if len(orders) != 1:
         raise CalibError(
             f"neither topics nor heights identify the lower camera; name it, --lower {names[0]} or --lower {names[1]}"
@@ -419,8 +409,8 @@ def _numbers(values: Mapping[str, Any], keys: tuple[str, ...], counts: tuple[int
 # 3. OCamCalib's `calib_results.txt`, and the transform between two cameras.
 def parse_ocam(text: str | bytes, view: View = "mirror", name: str = "calib_results.txt") -> OcamCamera:
     """Parse the camera of a calib_results.txt's text; the inverse polynomial, of any length, is not used."""
-    if len(text) > MAX_OCAM_BYTES:
-        raise CalibError(f"{name}: expected at most {MAX_OCAM_BYTES} bytes, found {len(text)}")
+    if len(text) > MAX_BYTES:
+        raise CalibError(f"{name}: expected at most {MAX_BYTES} bytes, found {len(text)}")
     lines = _word_lines(text, name)
     if len(lines) < 4:
         raise CalibError(
@@ -470,7 +460,7 @@ class TransformTable(Struct, frozen=True):
 
 def read_transform(path: Path) -> Array:
     """Read T_lower_upper (4, 4): TOML or YAML with that key (or T_upper_lower), or a text of its 16 numbers."""
-    data, name = read_bytes(path, MAX_OCAM_BYTES), str(path)
+    data, name = read_bytes(path, MAX_BYTES), str(path)
     with within(f"{name}: "):
         if path.suffix in (".toml", ".yaml", ".yml", ".json"):
             table = table_of(data) if path.suffix == ".toml" else dict(load_mapping(data, name))

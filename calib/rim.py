@@ -12,8 +12,6 @@ from calib.models.camera import Array, Mask
 
 AZIMUTHS = 720  # half a degree, INLIER_PX on a rim of 230 px: more would give the same
 MIN_SIDE_PX = 64  # Shorter side of the smallest image.
-# The dark level is measured in corners of this part of the image's smaller side.
-CORNER_PART = 1 / 16
 # Least difference of grey levels between the middle and the corners; half of it across the edge at one azimuth.
 MIN_CONTRAST = 25.0
 # Threshold between the dark (0) and the light level (1), nearer the dark one, because the world at the rim is often
@@ -32,8 +30,7 @@ MAX_CENTER_SHIFT = 0.25
 SAFETY_PX = 1.5
 # A hub ends within MAX_HUB of the rim's radius, at a ring that is dark (HUB_EDGE_DARK), after rings that are mostly
 # dark (HUB_INSIDE_DARK; a lens glints). Within HUB_RING_PX the dark share drops by HUB_DROP: the world begins.
-MAX_HUB, HUB_RING_PX = 0.4, 5
-HUB_EDGE_DARK, HUB_INSIDE_DARK, HUB_DROP = 0.9, 0.65, 0.2
+MAX_HUB, HUB_RING_PX, HUB_EDGE_DARK, HUB_INSIDE_DARK, HUB_DROP = 0.4, 5, 0.9, 0.65, 0.2
 # Tolerance for a mask that reaches beyond the rim, because masks are also drawn by hand.
 MAX_BEYOND_PX = 4.0
 
@@ -58,7 +55,7 @@ def find_rim(image: NDArray[np.uint8], center_guess: tuple[float, float]) -> Mas
 
 def _levels(image: NDArray[np.uint8]) -> tuple[float, float] | None:
     """Return the dark level, of the corners, and the light level, of the middle; None if they are too close."""
-    side = int(min(image.shape) * CORNER_PART)
+    side = min(image.shape) // 16
     corners = [image[:side, :side], image[:side, -side:], image[-side:, :side], image[-side:, -side:]]
     middle = image[tuple(slice(size // 4, -size // 4) for size in image.shape)]
     dark, light = float(np.median([np.median(corner) for corner in corners])), float(np.median(middle))

@@ -18,7 +18,7 @@ from __future__ import annotations
 import difflib
 import re
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import MISSING, fields, is_dataclass
 from functools import cache
 from os import PathLike
@@ -166,8 +166,7 @@ def is_section(kind: Any) -> bool:
     return isinstance(kind, type) and (is_dataclass(kind) or issubclass(kind, msgspec.Struct))
 
 
-@cache
-def types_of(section: Any) -> dict[str, Any]:
+def _types_of(section: Any) -> dict[str, Any]:
     """Return the types of the keys of a section, with their annotations.
 
     A field of a dataclass without a text in its annotation is no key: a parameter of a method that files do not set.
@@ -177,6 +176,9 @@ def types_of(section: Any) -> dict[str, Any]:
     if not is_dataclass(section):
         return present
     return {name: kind for name, kind in present.items() if is_section(kind) or _has_text(kind)}
+
+
+types_of: Callable[[Any], dict[str, Any]] = cache(_types_of)
 
 
 def _has_text(kind: Any) -> bool:

@@ -22,8 +22,7 @@ STEPS: tuple[Cell, ...] = ((1, 0), (0, 1), (-1, 0), (0, -1))
 # Radius, in parts of the corner spacing, in which a predicted corner is searched, and radius of its ring: less than a
 # half, otherwise they would reach the next corner's. A smaller ring than MIN_RING_PX has too few pixels, twelve.
 SEARCH_PART, MIN_SEARCH_PX = 0.3, 1.5
-RING_PART = 0.28
-MIN_RING_PX = 2.0
+RING_PART, MIN_RING_PX = 0.28, 2.0
 # Smaller squares are not resolved.
 MIN_SPACING_PX = 3
 # Least contrast of a predicted corner, in parts of the grid's median contrast.

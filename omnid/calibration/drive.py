@@ -57,8 +57,6 @@ MIN_TIME = {UPPER_DELAY: 0.5, LINE_TIME: 1.0}
 # A time within so many of its sigmas is none, and a camera's parameter that differs by more of those of a nominal rig
 # is that of another camera: 1 of 16,000 normal errors is larger.
 SIGNIFICANT_SIGMAS = 4.0
-# Numbers of a nominal rig are this far off at most, in radians and metres, by rounding.
-STRAIGHT = 1e-9
 # Rounds of matching columns before the first drive: each matches in panoramas that the one before has straightened, so
 # that wrong matches become fewer.
 PAIR_ROUNDS = 3
@@ -286,9 +284,8 @@ def significant_times(found: DriveAdjustment) -> tuple[str, ...]:
     )
 
 
-MAX_LEVEL_RAD = np.deg2rad(3.0)  # Most tilt of a frame that was meant to be level.
-MIN_EXTENT_M = 0.3  # Least shorter side of a path that determines its plane.
-MAX_ROUGHNESS = 0.02  # Most rms distance of a path from its plane, by the shorter side.
+# Least shorter side of a path that determines its plane, and its largest rms distance from that, by this side.
+MIN_EXTENT_M, MAX_ROUGHNESS = 0.3, 0.02
 
 
 def scale_change(found: DriveAdjustment, before: Rig) -> float:
@@ -335,7 +332,7 @@ def level_turn(rig: Rig, T_rig_odom: Array) -> Array | None:
     up = up * np.sign(up[2])
     axis = np.cross(up, [0.0, 0.0, 1.0])
     angle = float(np.arctan2(np.linalg.norm(axis), up[2]))
-    if angle > MAX_LEVEL_RAD:
+    if angle > 2 * NOMINAL_TURN_RAD:
         return None
     turn = se3.rotation_exp(axis * (angle / max(np.linalg.norm(axis), np.finfo(float).tiny)))
     return np.asarray(R_base_rig.T @ turn @ R_base_rig)
@@ -350,7 +347,7 @@ def turned_about_lower(rig: Rig, R: Array) -> Rig:
 
 # Largest rotation of the upper camera, and of the baseline's direction, against a measured rig. A nominal rig does not
 # know how its cameras were mounted: its limit is three of its sigmas.
-MAX_TURN_RAD, MAX_NOMINAL_TURN_RAD = np.deg2rad(2.8), 3 * NOMINAL_TURN_RAD
+MAX_TURN_RAD = np.deg2rad(2.8)
 
 
 def require_same_rig(parameters: RigParameters, steps: Array, *, tracked: bool = True) -> None:
@@ -361,12 +358,10 @@ def require_same_rig(parameters: RigParameters, steps: Array, *, tracked: bool =
     change = (steps * parameters.units)[parameters.of_transform]
     turn, lean = float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:])) if tracked else 0.0
     # A nominal rig was not measured: it has no covariance, and one camera exactly above the other without any rotation.
-    T, measured = (
-        parameters.rig.upper.T_cam_rig @ se3.inverse(parameters.rig.lower.T_cam_rig),
-        parameters.rig.covariance,
-    )
-    straight = np.abs(np.append(se3.R_of(T) - np.eye(3), se3.t_of(T)[:2])).max() < STRAIGHT
-    limit = MAX_NOMINAL_TURN_RAD if measured is None and straight else MAX_TURN_RAD
+    rig = parameters.rig
+    T = rig.upper.T_cam_rig @ se3.inverse(rig.lower.T_cam_rig)
+    is_straight = np.allclose(np.append(se3.R_of(T) - np.eye(3), se3.t_of(T)[:2]), 0)
+    limit = 3 * NOMINAL_TURN_RAD if rig.covariance is None and is_straight else MAX_TURN_RAD
     away = np.abs(steps / parameters.nominal_sigmas)[: parameters.of_transform.start]
     worst = int(np.argmax(away))
     if max(turn, lean) > limit:

@@ -16,13 +16,12 @@ from calib.panorama import fit_cylinder, remap_tables
 from calib.rig import Rig
 from omnid.calibration.angle_table import HEAD, AngleRow
 from omnid.calibration.images import SIDES, PairedImages
+from omnid.calibration.snapshot import GREEN, RED
 from omnid.report.page import bar, figure, folded, page, table
 
 # Factor by which residuals are drawn longer.
 ARROW = 40.0
-# Colours (BGR).
-MEASURED, RESIDUAL, CENTER, LINE_COLOR = (80, 200, 0), (0, 60, 255), (255, 200, 0), (80, 200, 0)
-COVERAGE_PX, PANORAMA_WIDTH = 700, 1400  # widths of the figures
+WIDTH_PX = 1400  # of a panorama, or of two cameras side by side
 # Number of columns drawn through both panoramas.
 LINES = 24
 
@@ -75,17 +74,17 @@ def _coverage(found: RigCalibration, images: PairedImages, side: int) -> str:
     camera = found.cameras[side]
     views = [(k, view.name, seen) for k, view in enumerate(found.views) if (seen := view.seen[side]) is not None]
     image = images.sides[side][views[0][1]]
-    scale = COVERAGE_PX / image.shape[1]
+    scale = WIDTH_PX / 2 / image.shape[1]
     small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     canvas = cv2.cvtColor(small // 2, cv2.COLOR_GRAY2BGR)
     for k, _, seen in views:
         starts, arrows = (seen.pixels + 0.5) * scale - 0.5, ARROW * scale * found.fit.residuals[k, side]
         known = np.isfinite(starts + arrows).all(axis=1)
         for start, end in np.rint([starts[known], (starts + arrows)[known]]).astype(int).swapaxes(0, 1).tolist():
-            cv2.circle(canvas, start, 3, MEASURED, 1, cv2.LINE_AA)
-            cv2.line(canvas, start, end, RESIDUAL, 1, cv2.LINE_AA)
+            cv2.circle(canvas, start, 3, GREEN, 1, cv2.LINE_AA)
+            cv2.line(canvas, start, end, RED, 1, cv2.LINE_AA)
     middle = tuple(round(value * scale) for value in camera.center)
-    cv2.drawMarker(canvas, middle, CENTER, cv2.MARKER_CROSS)
+    cv2.drawMarker(canvas, middle, GREEN, cv2.MARKER_CROSS)
     text = f"all corners; arrows are the residuals, {ARROW:.0f} times as long; the cross is the centre"
     return figure(np.asarray(canvas, np.uint8), f"{SIDES[side]}: {text}")
 
@@ -106,7 +105,7 @@ def _rectified(found: RigCalibration, images: PairedImages, rig: Rig) -> str:
     """Return the figure of both panoramas of one instant, one above the other, with common columns."""
     name = next(view.name for view in found.views if None not in view.seen)
     try:
-        cylinder = fit_cylinder(rig, PANORAMA_WIDTH)
+        cylinder = fit_cylinder(rig, WIDTH_PX)
     except CalibError as error:
         return f"<p class='warn'>{escape(str(error))}</p>"
     rows = [
@@ -115,7 +114,7 @@ def _rectified(found: RigCalibration, images: PairedImages, rig: Rig) -> str:
     ]
     canvas = cv2.cvtColor(np.vstack(rows), cv2.COLOR_GRAY2BGR)
     # Lines stand as far apart in a sector, whose panorama is narrower than a full turn.
-    canvas[:, PANORAMA_WIDTH // (2 * LINES) :: PANORAMA_WIDTH // LINES] = LINE_COLOR
+    canvas[:, WIDTH_PX // (2 * LINES) :: WIDTH_PX // LINES] = GREEN
     return figure(
         np.asarray(canvas, np.uint8),
         f"{name}: the upper panorama above the lower one; a point is in the same column of both",

@@ -77,7 +77,7 @@ def test_refuses_yaml_beyond_its_limits(text: str, reason: str) -> None:
 
 @pytest.mark.parametrize("text", ["'1\\n' * 7_000_000", "'1 ' * 7_000_000"])
 def test_refuses_a_long_ocam_file(text: str) -> None:
-    assert "at most 65536 bytes" in refusal("importers", "parse_ocam", text)
+    assert "at most 32768 bytes" in refusal("importers", "parse_ocam", text)
 
 
 @pytest.mark.parametrize(
