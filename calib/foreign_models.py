@@ -6,7 +6,7 @@ have no equal here: the nearest camera is fitted over the image, and how far it 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 import cv2
@@ -61,9 +61,8 @@ NAMED: Final[Mapping[str, tuple[str, Mapping[str, str]]]] = {
 # A camera that is fitted to another model may be this far off anywhere in the image, a few times the error of a corner.
 MAX_CONVERSION_PX: Final = 0.5
 GRID: Final = 24  # Places along each side of the image at which models are compared.
-# Largest radius on the plane z = 1, at 80 degrees, and number of radii to it, which show a distortion that turns back.
-WIDEST: Final = 5.7
-RADII: Final = 2000
+# Largest angle from the axis, and number of angles to it, which show a distortion that turns back.
+WIDEST_RAD, RADII = np.deg2rad(85), 2000
 LOST_PX: Final = 100.0  # Error of a ray that a trial camera does not see.
 
 
@@ -119,55 +118,55 @@ def camera_of(model: str, values: Mapping[str, float], size: tuple[int, int], wa
     if model == "ucm":  # the extended model with beta = 1
         return known_camera("eucm", {**values, "beta": 1.0}, size)
     if model == "fov":
-        return _nearest(model, known_camera("equidistant", pinhole, size), _fov_rays(values, size), warn)
+        return _nearest(model, known_camera("equidistant", pinhole, size), _seen(_fov_project, values, size), warn)
     if model != "pinhole":
         return known_camera(model, values, size)
-    start, terms = known_camera("omni", plain, size), [float(values.get(key, 0.0)) for key in OPENCV]
-    if not any(terms[4:]):
+    start = known_camera("omni", plain, size)
+    if not any(values.get(key, 0.0) for key in OPENCV if key not in RADTAN):
         return start
-    return _nearest("pinhole with k3 and more", start, _opencv_rays(terms, values, size), warn)
+    return _nearest("pinhole with k3 and more", start, _seen(_opencv_project, values, size), warn)
 
 
-def _fov_rays(values: Mapping[str, float], size: tuple[int, int]) -> tuple[Array, Array]:
-    """Return pixels (N, 2) and rays (N, 3) of the model fov: r_d = atan(2 r_u tan(w / 2)) / w (Devernay, Faugeras)."""
+def _fov_project(m: Array, values: Mapping[str, float]) -> Array:
+    """Return the pixels (N, 2) of points (N, 2) of the plane z = 1 by the model fov: r_d = atan(2 r_u tan(w / 2)) / w.
+
+    Devernay and Faugeras 2001.
+    """
     w = float(values["w"])
     if not 0 < w < np.pi:
         raise CalibError(f"fov camera: expected w between 0 and pi, found {w}")
-    u, v = np.meshgrid(*(np.linspace(0, side - 1, GRID) for side in size))
-    pixels = np.column_stack([u.ravel(), v.ravel()])
-    m = (pixels - (values["pu"], values["pv"])) / (values["fu"], values["fv"])
-    radius = np.linalg.norm(m, axis=1)
-    seen = radius * w < np.deg2rad(88)
-    pixels, m, radius = pixels[seen], m[seen], radius[seen]
-    scale = np.where(radius > 0, np.tan(radius * w) / (2 * np.tan(w / 2)) / np.where(radius > 0, radius, 1), 1.0)
-    return pixels, np.column_stack([m * scale[:, None], np.ones(len(m))])
+    radius = np.maximum(np.linalg.norm(m, axis=1, keepdims=True), np.finfo(float).tiny)
+    bent = m * np.arctan(2 * radius * np.tan(w / 2)) / (w * radius)
+    return np.asarray(bent * (values["fu"], values["fv"]) + (values["pu"], values["pv"]))
 
 
-def _opencv_rays(terms: Sequence[float], values: Mapping[str, float], size: tuple[int, int]) -> tuple[Array, Array]:
-    """Return pixels (N, 2) and rays (N, 3) of a pinhole camera with OpenCV's distortion terms."""
+def _opencv_project(m: Array, values: Mapping[str, float]) -> Array:
+    """Return the pixels (N, 2) of points (N, 2) of the plane z = 1 by OpenCV's distortion."""
+    K = np.array([[values["fu"], 0, values["pu"]], [0, values["fv"], values["pv"]], [0, 0, 1.0]])
+    rays, terms = np.column_stack([m, np.ones(len(m))]), np.array([values.get(key, 0.0) for key in OPENCV], float)
+    return np.asarray(cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, terms)[0].reshape(-1, 2))
+
+
+def _seen(
+    project: Callable[[Array, Mapping[str, float]], Array], values: Mapping[str, float], size: tuple[int, int]
+) -> tuple[Array, Array]:
+    """Return pixels (N, 2), evenly spread over what a camera sees on its image, and their rays (N, 3)."""
     center = (values["pu"], values["pv"])
-    K = np.array([[values["fu"], 0, center[0]], [0, values["fv"], center[1]], [0, 0, 1.0]])
     found_pixels, found_rays = list[Array](), list[Array]()
     for azimuth in np.linspace(0, 2 * np.pi, 2 * GRID, endpoint=False):
         direction = np.array([np.cos(azimuth), np.sin(azimuth)])
         # 1. Outwards as far as the pixels go outwards within the image: where the distortion turns back, rays end.
-        rho = np.linspace(0, WIDEST, RADII)
-        radius = np.linalg.norm(_opencv_project(rho[:, None] * direction, K, terms) - center, axis=1)
+        rho = np.tan(np.linspace(0, WIDEST_RAD, RADII))
+        radius = np.linalg.norm(project(rho[:, None] * direction, values) - center, axis=1)
         ended = np.flatnonzero((np.diff(radius) <= 0) | (radius[1:] > np.hypot(*size)))
         end = int(ended[0]) + 1 if ended.size else RADII
         # 2. Rays of evenly spaced pixels.
         even = np.interp(np.linspace(0, radius[end - 1], 4 * GRID), radius[:end], rho[:end])
-        pixels = _opencv_project(even[:, None] * direction, K, terms)
+        pixels = project(even[:, None] * direction, values)
         inside = ((pixels >= 0) & (pixels <= np.array(size) - 1)).all(axis=1)
         found_pixels.append(pixels[inside])
         found_rays.append(np.column_stack([even[inside, None] * direction, np.ones(inside.sum())]))
     return np.concatenate(found_pixels), np.concatenate(found_rays)
-
-
-def _opencv_project(m: Array, K: Array, terms: Sequence[float]) -> Array:
-    """Return the pixels (N, 2) of points (N, 2) of the plane z = 1 by OpenCV's distortion."""
-    rays = np.column_stack([m, np.ones(len(m))])
-    return np.asarray(cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, np.array(terms, float))[0].reshape(-1, 2))
 
 
 def _nearest(name: str, start: OmniCamera, rays: tuple[Array, Array], warn: Warn) -> OmniCamera:

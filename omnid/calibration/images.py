@@ -114,7 +114,9 @@ def _of_side(folder: Path, side: str, bits: int) -> Images:
     if len(paths) > MAX_IMAGES:
         raise OmnidError(f"calibrate: expected {MAX_IMAGES} images at most, found {len(paths)}; 40 are enough")
     images = {name: _read(path, bits) for name, path in paths.items()}
-    sizes = {image.shape[::-1]: paths[name].name for name, image in reversed(images.items())}
+    sizes = dict[tuple[int, ...], str]()
+    for name, image in images.items():
+        sizes.setdefault(image.shape[::-1], paths[name].name)
     if len(sizes) > 1:
         found = ", ".join(f"{width}x{height} ({name})" for (width, height), name in list(sizes.items())[:4])
         raise OmnidError(f"calibrate: expected images of one camera, all of one size, found {found}")
