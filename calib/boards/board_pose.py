@@ -44,9 +44,14 @@ def _linear_pose(rays: Array, points: Array, square_m: float) -> Array:
     H = np.linalg.svd(A, full_matrices=False)[2][-1].reshape(3, 3) / (square_m, square_m, 1)
     ahead = np.sum(rays * (xy1 * (square_m, square_m, 1) @ H.T))
     H /= np.linalg.norm(H[:, :2], axis=0).mean() * np.sign(ahead)
-    left, _, right = np.linalg.svd(H[:, :2], full_matrices=False)
-    first = left @ right
-    return se3.transform(np.column_stack([first, np.cross(first[:, 0], first[:, 1])]), H[:, 2])
+    return pose_of_columns(H)
+
+
+def pose_of_columns(columns: Array) -> Array:
+    """Return the rigid transform (..., 4, 4) of columns r1, r2, t (..., 3, 3), of which r1 and r2 are nearly unit."""
+    left, _, right = np.linalg.svd(columns[..., :2], full_matrices=False)
+    first, second = np.moveaxis(left @ right, -1, 0)
+    return se3.transform(np.stack([first, second, np.cross(first, second)], axis=-1), columns[..., 2])
 
 
 def pose_error_rad(camera: OmniCamera, T_cam_board: Array, pixels: Array, board: CalibrationBoard) -> float:

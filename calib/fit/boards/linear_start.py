@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib import se3
+from calib.boards.board_pose import pose_of_columns
 from calib.errors import CalibError
 from calib.models.camera import Array
 from calib.models.ocam import OcamCamera, View
@@ -58,81 +58,59 @@ def solve_linear(pixels: Array, points: Array, size: tuple[int, int], view: View
     pixels (K, N, 2): corners of board points (N, 3). size (width, height) [px].
     """
     width, height = size
-    problem = _LinearProblem(pixels, points, min(size) / 2)
-    center, reach = np.array([(height - 1) / 2, (width - 1) / 2]), SEARCH_PART * max(size)
-    side = FIRST_SIDE
+    xy1, scale_px = np.column_stack([points[:, :2], np.ones(len(points))]), min(size) / 2
+    # 1. The centre, by the median view: one bad image does not determine it.
+    center, reach, side = np.array([(height - 1) / 2, (width - 1) / 2]), SEARCH_PART * max(size), FIRST_SIDE
     while reach > SEARCH_END_PX:
         steps = np.linspace(-reach, reach, side)
         trials = [center + np.array([row, column]) for row in steps for column in steps]
-        # By the median view: one bad image does not determine the centre.
-        center = min(trials, key=lambda trial: float(np.nanmedian(problem.solve(trial).errors_rad)))
+        errors = [float(np.nanmedian(_solve(pixels, xy1, scale_px, trial)[2])) for trial in trials]
+        center = trials[int(np.argmin(errors))]
         reach, side = SEARCH_PART_OF_STEP * (steps[1] - steps[0]), SEARCH_SIDE
-    return _with_proper_poses(problem.solve(center), view)
-
-
-def _with_proper_poses(solution: LinearCamera, view: View) -> LinearCamera:
-    """Return the solution with rigid poses in the camera's frame; for a mirror z is negated."""
-    T = solution.T_cam_board.copy()
+    # 2. Rigid poses in the camera's frame; for a mirror z is negated.
+    coefficients, columns, errors_rad = _solve(pixels, xy1, scale_px, center)
     if view == "mirror":
-        T[:, 2, [0, 1, 3]] *= -1
-    left, _, right = np.linalg.svd(T[:, :3, :2], full_matrices=False)
-    first = left @ right
-    R = np.concatenate([first, np.cross(first[..., 0], first[..., 1])[..., None]], axis=-1)
-    return LinearCamera(
-        solution.coefficients, solution.scale_px, solution.center, se3.transform(R, se3.t_of(T)), solution.errors_rad
-    )
+        columns[:, -1] *= -1
+    return LinearCamera(coefficients, scale_px, tuple(center.tolist()), pose_of_columns(columns), errors_rad)
 
 
-@dataclass(frozen=True, slots=True)
-class _LinearProblem:
-    pixels: Array  # (K, N, 2)
-    points: Array  # (N, 3)
-    scale_px: float
+def _solve(pixels: Array, xy1: Array, scale_px: float, center: Array) -> tuple[Array, Array, Array]:
+    """Solve for a camera and poses at a given centre (row, column).
 
-    def solve(self, center: Array) -> LinearCamera:
-        """Solve for poses and polynomial at a given centre (row, column)."""
-        xy = self.pixels[..., ::-1] - center
-        T = _partial_poses(xy, self.points)
-        across = np.linalg.norm(se3.apply(T, self.points)[..., :2], axis=2)
-        rho = np.linalg.norm(xy, axis=2)
-        height = self.points[:, :2] @ T[:, 2, :2].swapaxes(0, 1)
-        basis = (rho[..., None] / self.scale_px) ** POWERS
-        # The sign of (r31, r32) for which each image's parabola f has a0 < 0; -f fits equally well.
-        A, b, _ = _eliminate_depths(rho, across, height.T, basis[..., :2])
-        T[:, 2, :2] *= np.where((np.linalg.pinv(A) @ b[..., None])[:, 0] > 0, -1.0, 1.0)
-        # f(rho) * across = rho * (height + t3) for the coefficients and t3, eq. (15) to (18).
-        height = (self.points[:, :2] @ T[:, 2, :2].swapaxes(0, 1)).T
-        A, b, shifts = _eliminate_depths(rho, across, height, basis)
-        size = np.linalg.norm(A, axis=(0, 1))
-        coefficients = np.linalg.lstsq(A.reshape(-1, len(size)) / size, b.ravel(), rcond=None)[0] / size
-        T[:, 2, 3] = shifts(coefficients)
-        errors = _angles(np.dstack([xy, basis @ coefficients]), se3.apply(T, self.points))
-        return LinearCamera(
-            coefficients, self.scale_px, (float(center[0]), float(center[1])), T, np.nanmean(errors, axis=1)
-        )
-
-
-def _partial_poses(xy: Array, points: Array) -> Array:
-    """Return poses (K, 4, 4) up to t3 and the sign of (r31, r32), from (x, y) || (P1, P2): eq. (11) to (14)."""
-    X, Y = points[:, 0], points[:, 1]
-    known = np.isfinite(xy[..., :1])
-    x, y = np.nan_to_num(xy[..., 0]), np.nan_to_num(xy[..., 1])
-    rows = np.stack([-y * X, -y * Y, -y, x * X, x * Y, x], axis=-1) * known
-    scale = np.linalg.norm(rows, axis=1, keepdims=True)
-    h = np.linalg.svd(rows / scale, full_matrices=False)[2][:, -1] / scale[:, 0]
-    T = np.tile(np.eye(4), (len(h), 1, 1))
-    T[:, :2, [0, 1, 3]] = h.reshape(-1, 2, 3)
-    across = se3.apply(T, points)[..., :2]
-    T[:, :2, [0, 1, 3]] *= np.sign(np.nansum(across * xy, axis=(1, 2)))[:, None, None]
-    # r31 and r32 make the two columns of the rotation equally long and orthogonal.
-    first, second = T[:, :2, 0], T[:, :2, 1]
-    product = -(first * second).sum(axis=1)
-    gap = (second**2 - first**2).sum(axis=1)
+    Returns the coefficients (D,), the columns r1, r2, t of the poses (K, 3, 3), and the mean angles (K,) [rad] between
+    modelled and measured rays. xy1 (N, 3): x, y, 1 of the board's points.
+    """
+    xy = pixels[..., ::-1] - center
+    # 1. The columns up to t3 and the sign of (r31, r32), from (x, y) || (P1, P2): eq. (11) to (14).
+    x, y = np.moveaxis(np.nan_to_num(xy)[..., None], 2, 0)
+    rows = np.concatenate([-y * xy1, x * xy1], axis=-1)
+    size = np.linalg.norm(rows, axis=1, keepdims=True)
+    h = np.linalg.svd(rows / size, full_matrices=False)[2][:, -1] / size[:, 0]
+    columns = np.zeros((len(h), *2 * xy1.shape[1:]))
+    columns[:, :2] = h.reshape(len(h), 2, -1)
+    ahead = xy1 @ columns[:, :2].swapaxes(1, 2)
+    columns *= np.sign(np.nansum(ahead * xy, axis=(1, 2)))[:, None, None]
+    # 2. r31 and r32 make the two columns of the rotation equally long and orthogonal.
+    first, second = columns[:, :2, 0], columns[:, :2, 1]
+    product, gap = -(first * second).sum(axis=1), (second**2 - first**2).sum(axis=1)
     root = np.hypot(gap, 2 * product)
-    T[:, 2, 0] = np.sqrt(np.maximum(0, (root + gap) / 2))
-    T[:, 2, 1] = np.sqrt(np.maximum(0, (root - gap) / 2)) * np.where(product < 0, -1, 1)
-    T[:, :3, [0, 1, 3]] /= np.linalg.norm(T[:, :3, :1], axis=1, keepdims=True)
-    return T
+    columns[:, 2, 0] = np.sqrt(np.maximum(0, (root + gap) / 2))
+    columns[:, 2, 1] = np.sqrt(np.maximum(0, (root - gap) / 2)) * np.where(product < 0, -1, 1)
+    columns /= np.linalg.norm(columns[..., :1], axis=1, keepdims=True)
+    # 3. Their sign, for which each image's parabola f has a0 < 0; -f fits equally well.
+    rho, across = np.linalg.norm(xy, axis=2), np.linalg.norm(xy1 @ columns[:, :2].swapaxes(1, 2), axis=2)
+    basis = (rho[..., None] / scale_px) ** POWERS
+    A, b, _ = _eliminate_depths(rho, across, columns[:, 2] @ xy1.T, basis[..., :2])
+    columns[:, 2] *= np.where((np.linalg.pinv(A) @ b[..., None])[:, 0] > 0, -1.0, 1.0)
+    # 4. f(rho) * across = rho * (height + t3) for the coefficients and t3, eq. (15) to (18).
+    A, b, shifts = _eliminate_depths(rho, across, columns[:, 2] @ xy1.T, basis)
+    size = np.linalg.norm(A, axis=(0, 1))
+    coefficients = np.linalg.lstsq(A.reshape(-1, len(size)) / size, b.ravel(), rcond=None)[0] / size
+    columns[:, 2, 2] = shifts(coefficients)
+    # 5. The angles between rays and points.
+    rays, seen = np.dstack([xy, basis @ coefficients]), xy1 @ columns.swapaxes(1, 2)
+    angles = np.arctan2(np.linalg.norm(np.cross(rays, seen), axis=2), (rays * seen).sum(axis=2))
+    return coefficients, columns, np.nanmean(angles, axis=1)
 
 
 def _eliminate_depths(
@@ -152,8 +130,3 @@ def _eliminate_depths(
         return np.asarray(along_b[:, 0] - along_A @ coefficients)
 
     return A - shift[..., None] * along_A[:, None], b - shift * along_b, shifts
-
-
-def _angles(rays: Array, points: Array) -> Array:
-    """Return angles (K, N) [rad] between rays and points (K, N, 3)."""
-    return np.asarray(np.arctan2(np.linalg.norm(np.cross(rays, points), axis=2), (rays * points).sum(axis=2)))
