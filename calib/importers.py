@@ -29,8 +29,16 @@ from calib.models.equirectangular import full_turn
 from calib.models.names import sees_directly
 from calib.models.ocam import MAX_COEFFICIENTS, OcamCamera, View
 from calib.models.unified import UnifiedCamera
-from calib.rig import MAX_BASELINE_M, MIN_BASELINE_M, MountedCamera, Rig, ShutterTimes
-from calib.rig_frame import is_turned_over, mounting_notes, rig_between
+from calib.rig import (
+    MAX_BASELINE_M,
+    MIN_BASELINE_M,
+    MountedCamera,
+    Rig,
+    ShutterTimes,
+    is_turned_over,
+    mounting_notes,
+    rig_between,
+)
 from calib.text_files import MAX_BYTES, MAX_JSON_BYTES, decode, load_mapping
 from calib.typed_toml import convert, shown, table_of
 from calib.validation import Warn, read_bytes, require_image_size, silent, transform_of

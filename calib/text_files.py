@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any, Final
 
 from ruamel.yaml import YAML
@@ -49,7 +50,10 @@ def load_mapping(data: str | bytes, name: str) -> Mapping[str, Any]:
     values: Any = None
     try:
         if text.lstrip().startswith("{"):
-            values = _json(text)
+            if len(text) > MAX_JSON_BYTES:
+                raise ValueError(f"expected at most {MAX_JSON_BYTES} characters, found {len(text)}")
+            with suppress(ValueError, RecursionError):  # else it may be YAML
+                values = json.loads(text)
         if text.lstrip().startswith("<"):
             raise ValueError("it is XML: write it as .yml, with OpenCV's FileStorage")
         if values is None:
@@ -61,16 +65,6 @@ def load_mapping(data: str | bytes, name: str) -> Mapping[str, Any]:
         found = "nothing" if values is None else type(values).__name__
         raise CalibError(f"{name}: expected a YAML mapping, found {found}")
     return {str(key): _with_rows(value) for key, value in values.items()}
-
-
-def _json(text: str) -> Any:
-    """Return the value of a JSON text; None for another text."""
-    if len(text) > MAX_JSON_BYTES:
-        raise ValueError(f"expected at most {MAX_JSON_BYTES} characters, found {len(text)}")
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError):
-        return None
 
 
 def _yaml(text: str) -> Any:

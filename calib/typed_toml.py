@@ -175,15 +175,13 @@ def _types_of(section: Any) -> dict[str, Any]:
     present = {name: _unless_absent(kind) for name, kind in hints.items() if get_origin(kind) is not ClassVar}
     if not is_dataclass(section):
         return present
-    return {name: kind for name, kind in present.items() if is_section(kind) or _has_text(kind)}
+    texts = {
+        name for name, kind in present.items() if any(isinstance(one, str) for one in getattr(kind, "__metadata__", ()))
+    }
+    return {name: kind for name, kind in present.items() if is_section(kind) or name in texts}
 
 
 types_of: Callable[[Any], dict[str, Any]] = cache(_types_of)
-
-
-def _has_text(kind: Any) -> bool:
-    """True for an annotation with a text."""
-    return get_origin(kind) is Annotated and any(isinstance(found, str) for found in get_args(kind)[1:])
 
 
 def _unless_absent(kind: Any) -> Any:

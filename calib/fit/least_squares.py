@@ -136,3 +136,15 @@ def _trial(
 def central_differences(function: Callable[[Array], Array], steps: Array) -> Array:
     """Return the derivatives (..., P) of a function about zero, by steps (P,) of its argument."""
     return np.stack([(function(step) - function(-step)) / (2 * np.abs(step).max()) for step in np.diag(steps)], axis=-1)
+
+
+# Ratio of the standard deviation to the median absolute deviation of a normal distribution.
+SIGMA_PER_MAD = 1.4826
+# Least standard deviation assumed for a coordinate: exact pixels would make the width of a robust function 0. Residual
+# of what a model cannot project: larger than any residual in an image.
+MIN_SIGMA_PX, LOST_PX = 0.01, 300.0
+
+
+def robust_sigma(residual: Array) -> float:
+    """Return the standard deviation of residuals by the median of their sizes (NaN: none), not less than the least."""
+    return max(MIN_SIGMA_PX, SIGMA_PER_MAD * float(np.nanmedian(np.abs(residual))))

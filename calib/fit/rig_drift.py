@@ -18,8 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib import se3
-from calib.fit.least_squares import BEST_STEP, central_differences
-from calib.fit.robust_scale import SIGMA_PER_MAD
+from calib.fit.least_squares import BEST_STEP, SIGMA_PER_MAD, central_differences
 from calib.models.camera import Array
 from calib.rig import Rig
 

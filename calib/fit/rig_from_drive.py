@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.errors import CalibError
-from calib.fit.least_squares import BEST_STEP, ArrowSystem, Ending, minimise
+from calib.fit.least_squares import BEST_STEP, LOST_PX, ArrowSystem, Ending, minimise, robust_sigma
 from calib.fit.parameters import RigParameters
 from calib.fit.residual_structure import OUTLIER_RATIO, ResidualStructure, systematic_px
-from calib.fit.robust_scale import LOST_PX, robust_sigma
 from calib.models.camera import Array
 from calib.models.ocam import project_near
 from calib.rig import Rig

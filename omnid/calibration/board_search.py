@@ -12,6 +12,7 @@ import numpy as np
 from calib.boards.aprilgrid import AprilGrid, find_april_grid
 from calib.boards.board import Board, BoardView
 from calib.boards.checkerboard import BoardSearch, find_board
+from calib.validation import silent
 from omnid.calibration.images import Image, Images
 from omnid.errors import OmnidError
 
@@ -23,10 +24,6 @@ TAGS_HINT = (
     "check --tags and --tag-spacing, and take images with the board nearer (six pixels a bit of its tags), sharp and "
     "well lit"
 )
-
-
-def silent(line: str) -> None:
-    """Report nothing."""
 
 
 def search_board(image: Image, board: AnyBoard, name: str = "", *, thorough: bool) -> BoardSearch:

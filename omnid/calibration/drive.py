@@ -26,8 +26,9 @@ from calib.models.ocam import has_wavefront
 from calib.rig import Rig, ShutterTimes
 from calib.rig_covariance import RigCovariance
 from calib.rig_file import read_rig
+from calib.validation import silent
 from drivers.logs.log_reader import AnyCameras, LogCameras
-from omnid.calibration.board_search import Progress, silent
+from omnid.calibration.board_search import Progress
 from omnid.calibration.drive_observations import Drives, collect, observe_pairs
 from omnid.calibration.images import SIDES
 from omnid.calibration.rig_check import MAX_SKEW_S, check_rig, read_rig_pairs, with_masks

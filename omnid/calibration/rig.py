@@ -17,13 +17,13 @@ from calib.fit.boards.rig_fit import SIDES, PairView, RigCalibration, calibrate_
 from calib.fit.residual_structure import ResidualStructure
 from calib.fit.rig_uncertainty import DriveUncertainty, drive_uncertainty
 from calib.models.names import sees_directly
-from calib.rig import MAX_BASELINE_M, MIN_BASELINE_M, Rig
+from calib.rig import MAX_BASELINE_M, MIN_BASELINE_M, Rig, mounting_notes, rig_between
 from calib.rig_file import write_rig
-from calib.rig_frame import mounting_notes, rig_between
 from calib.rim import find_rim
+from calib.validation import silent
 from drivers.logs.log_reader import AnyCameras, LogCameras
 from omnid.calibration.angle_table import AngleRow, angle_lines, angle_rows
-from omnid.calibration.board_search import AnyBoard, Progress, find_boards, select_diverse_views, silent
+from omnid.calibration.board_search import AnyBoard, Progress, find_boards, select_diverse_views
 from omnid.calibration.images import PairedImages, brightest, read_pairs
 from omnid.calibration.rig_report import rig_report_html
 from omnid.calibration.view_guess import ViewChoice, view_of_images

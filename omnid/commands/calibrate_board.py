@@ -18,8 +18,9 @@ from calib.atomic_file import write_file
 from calib.boards.aprilgrid import AprilGrid
 from calib.boards.board import Board
 from calib.rig_file import png
+from calib.validation import silent
 from drivers.logs.log_reader import LogCameras
-from omnid.calibration.board_search import AnyBoard, silent
+from omnid.calibration.board_search import AnyBoard
 from omnid.calibration.images import SIDES, Image, read_pairs
 from omnid.calibration.live_boards import LiveBoards, PairOutcome, newest_pairs, status
 from omnid.calibration.rig import calibrate_rig

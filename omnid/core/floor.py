@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.fit.robust_scale import SIGMA_PER_MAD
+from calib.fit.least_squares import SIGMA_PER_MAD
 
 Array = NDArray[np.float64]
 

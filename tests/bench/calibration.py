@@ -40,9 +40,8 @@ from calib.fit.boards.rig_fit import PairView, RigCalibration, calibrate_boards,
 from calib.fit.rig_uncertainty import AZIMUTHS, SLOPES, WALLS_M, drive_uncertainty
 from calib.models.camera import Array
 from calib.models.ocam import project_near
-from calib.rig import Rig
+from calib.rig import Rig, rig_between
 from calib.rig_file import read_rig, write_rig
-from calib.rig_frame import rig_between
 from omnid.calibration.images import BY_NAME
 from omnid.calibration.rig_check import check_log
 from omnid.cli import main as omnid_main

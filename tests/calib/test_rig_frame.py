@@ -7,7 +7,7 @@ import pytest
 
 from calib import se3
 from calib.importers import straight_up
-from calib.rig_frame import is_turned_over, rig_between
+from calib.rig import is_turned_over, rig_between
 from tests.calib.test_rig import parabolic_ocam, parabolic_omni
 from tests.simulation.rigs import LENSES, lens, lens_rig
 

@@ -22,14 +22,15 @@ from calib.fit.boards.smooth_misfit import covariance_with_misfit, smooth_fields
 from calib.fit.least_squares import (
     BEST_STEP,
     DAMPING_FACTOR,
+    LOST_PX,
     START_DAMPING,
     ArrowSystem,
     Ending,
     central_differences,
     minimise,
+    robust_sigma,
 )
 from calib.fit.parameters import stepped, units_of
-from calib.fit.robust_scale import LOST_PX, robust_sigma
 from calib.models.camera import Array
 from calib.models.derivatives import pixel_derivatives
 from calib.models.names import values_of

@@ -21,8 +21,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.fit.least_squares import SIGMA_PER_MAD
 from calib.fit.rig_drift import RigDrift, estimate_rig_drift
-from calib.fit.robust_scale import SIGMA_PER_MAD
 from calib.panorama import Cylinder, at_scale
 from omnid.core.odometry.corners import corners
 from omnid.core.odometry.exposure_times import Exposure

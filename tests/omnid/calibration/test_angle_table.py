@@ -9,8 +9,7 @@ from calib import se3
 from calib.boards.board import Board, BoardView
 from calib.fit.boards.rig_fit import PairView, RigCalibration, calibrate_boards
 from calib.models.ocam import OcamCamera
-from calib.rig import Rig
-from calib.rig_frame import rig_between
+from calib.rig import Rig, rig_between
 from omnid.calibration.angle_table import angle_lines, angle_rows
 from omnid.calibration.images import PairedImages
 from omnid.calibration.rig_report import rig_report_html

@@ -7,7 +7,7 @@ import pytest
 
 from calib.boards.aprilgrid import AprilGrid, find_april_grid
 from calib.boards.board import Board, BoardView
-from omnid.calibration.board_search import silent
+from calib.validation import silent
 from omnid.calibration.images import Images
 from omnid.calibration.view_guess import ViewChoice, view_of_images
 from omnid.errors import OmnidError

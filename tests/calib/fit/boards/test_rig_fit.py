@@ -17,8 +17,7 @@ from calib.fit.boards.rig_fit import PairView, RigCalibration, calibrate_boards,
 from calib.models.camera import Array, Mask, OmniCamera
 from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
-from calib.rig import MountedCamera, Rig
-from calib.rig_frame import rig_between
+from calib.rig import MountedCamera, Rig, rig_between
 from tests.bench.calibration import board_rig, projected_views
 from tests.simulation.boards import board_poses_around_camera, board_poses_around_rig
 
