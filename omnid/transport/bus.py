@@ -11,7 +11,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from itertools import count
 from typing import Any, Final
 
 import zenoh
@@ -34,40 +33,13 @@ QUERY_PERIOD_S: Final = 0.01
 FLOOD_S: Final = 10.0  # The status warns of a flood for this time after its end.
 
 
-class RosGraph:
-    """The entries in the graph of ROS 2: a node, its publishers and subscriptions; none where ROS 2 is off."""
-
-    def __init__(self, session: zenoh.Session, config: BusConfig) -> None:
-        self._session, self._robot, self._is_on = session, config.robot, config.ros2 != "off"
-        self._node = ros2.RmwNode(config.ros2_domain, str(session.zid()), ros2.node_name(config.robot))
-        self._entities = count(1)
-        self._tokens: list[zenoh.LivelinessToken] = []
-        self._declare(self._node.token)
-
-    def publisher(self, topic: str, settings: Topic) -> str:
-        """Declare a publisher and return its token."""
-        quality = ros2.TRANSIENT_LOCAL if settings.transient_local else ros2.RELIABLE_LAST_10
-        return self._declare(self._endpoint("MP", topic, settings.schema, quality))
-
-    def subscription(self, topic: str, schema: str) -> None:
-        """Declare a subscription."""
-        self._declare(self._endpoint("MS", topic, schema, ros2.RELIABLE_LAST_10))
-
-    def _endpoint(self, kind: str, topic: str, schema: str, quality: str) -> str:
-        return self._node.endpoint(kind, next(self._entities), ros_name(self._robot, topic), schema, quality)
-
-    def _declare(self, token: str) -> str:
-        if self._is_on:
-            self._tokens.append(self._session.liveliness().declare_token(token))
-        return token
-
-
 class TopicPublisher:
     """The zenoh publishers of one topic: the plain key, and the key of ROS 2 where that is another."""
 
-    def __init__(self, session: zenoh.Session, config: BusConfig, name: str, graph: RosGraph) -> None:
+    def __init__(self, session: zenoh.Session, config: BusConfig, name: str, node: ros2.RosNode) -> None:
         topic = PUBLISHED[name]
-        self._gid, self._seq = ros2.gid_of(graph.publisher(name, topic)), 0
+        token = node.publisher(name, topic.schema, transient_local=topic.transient_local)
+        self._gid, self._seq = ros2.gid_of(token), 0
         self._plain = _declared_publisher(session, plain_key(config.robot, name), topic)
         self._ros: zenoh.Publisher | ext.AdvancedPublisher | None = None
         if config.ros2 == "rmw_zenoh":
@@ -143,7 +115,7 @@ class Bus:
         self._command_topics: Mapping[str, str] = {}
         self._is_stopped: Callable[[], bool] = lambda: False
         self._stop_listener: StopListener | None = None
-        self._graph: RosGraph | None = None
+        self._node: ros2.RosNode | None = None
         self._declared: list[object] = []  # zenoh undeclares what is no longer referred to
         self._commands: CommandIntake | None = None
         self._queries: dict[str, Intake[zenoh.Query]] = {}  # by name
@@ -271,8 +243,9 @@ class Bus:
     def _open(self) -> None:
         session = open_session(self._config)
         self._watch_for_namesakes(session)
-        self._graph = graph = RosGraph(session, self._config)
-        self._publishers = {name: TopicPublisher(session, self._config, name, graph) for name in self._topics}
+        config = self._config
+        self._node = node = ros2.RosNode(session, config.robot, config.ros2_domain, is_on=config.ros2 != "off")
+        self._publishers = {name: TopicPublisher(session, config, name, node) for name in self._topics}
         for name in {*self._texts, *(name for name, topic in self._topics.items() if topic.latched)}:
             self._declare_queryable(session, name)
         for name, (payload, attached) in self._newest.items():  # published before the router was reached
@@ -332,6 +305,6 @@ class Bus:
         self._pollers.append(Poller(self._commands.process, PERIOD_S, "bus commands"))
         self._stop_listener = StopListener(self._config, lambda: callback(Request(STOP)), self._is_stopped)
         self._pollers.append(Poller(self._stop_listener.process, PERIOD_S, "stop datagrams"))
-        if self._graph is not None:
+        if self._node is not None:
             for name, schema in self._command_topics.items():
-                self._graph.subscription(name, schema)
+                self._node.subscription(name, schema)

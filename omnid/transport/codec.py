@@ -500,23 +500,13 @@ class TwistRecord(NamedTuple):
     aside: tuple[float, float, float, float]  # what no base with two driven sides has: see ASIDE_NAMES
 
 
-class PlanarGoal(NamedTuple):
-    """Content of a PoseStamped on the floor."""
-
-    stamp_ns: int
-    frame: str
-    x_m: float
-    y_m: float
-    heading_rad: float | None  # None: the quaternion is all zeros, which asks for no heading
-
-
 class PlanarPath(NamedTuple):
-    """Content of a Path on the floor."""
+    """Content of a Path on the floor, or of a PoseStamped, a path to one place."""
 
     stamp_ns: int
     frame: str
     xy: Array  # (N, 2) m
-    heading_rad: float | None  # of the last pose; None: its quaternion is all zeros
+    heading_rad: float | None  # of the last pose; None: its quaternion is all zeros, which asks for no heading
 
 
 def twist_stamped_cdr(stamp_ns: int, frame: str, linear_mps: float, yaw_rate_radps: float) -> bytes:
@@ -578,17 +568,14 @@ def clock_cdr(stamp_ns: int) -> bytes:
     return encoded(CLOCK_SCHEMA, ros_time(stamp_ns))
 
 
-def goal_cdr(goal: PlanarGoal) -> bytes:
-    """Encode a goal as a PoseStamped."""
-    pose = _planar_pose(goal.x_m, goal.y_m, goal.heading_rad)
-    return encoded(POSE_SCHEMA, header(goal.stamp_ns, goal.frame), pose)
+def goal_cdr(stamp_ns: int, frame: str, xy: tuple[float, float], heading_rad: float | None) -> bytes:
+    """Encode a goal as a PoseStamped; heading_rad: None for any."""
+    return encoded(POSE_SCHEMA, header(stamp_ns, frame), _planar_pose(*xy, heading_rad))
 
 
-def goal_from_cdr(payload: bytes) -> PlanarGoal:
+def goal_from_cdr(payload: bytes) -> PlanarPath:
     """Decode a PoseStamped that is finite and not tilted."""
-    message = decoded(payload, POSE_SCHEMA)
-    x_m, y_m = _planar_position(message.pose)
-    return PlanarGoal(_stamp_ns(message), message.header.frame_id, x_m, y_m, _planar_heading(message.pose))
+    return _planar_path(message := decoded(payload, POSE_SCHEMA), [message])
 
 
 def path_cdr(stamp_ns: int, frame: str, xy: ArrayLike, heading_rad: float | None = None) -> bytes:
@@ -609,8 +596,13 @@ def path_from_cdr(payload: bytes) -> PlanarPath:
     message = decoded(payload, PATH_SCHEMA)
     if not 1 <= len(message.poses) <= MAX_PATH_POSES:
         raise OmnidError(f"a path of {len(message.poses)} poses: expected 1 to {MAX_PATH_POSES}")
-    xy = np.array([_planar_position(entry.pose) for entry in message.poses])
-    return PlanarPath(_stamp_ns(message), message.header.frame_id, xy, _planar_heading(message.poses[-1].pose))
+    return _planar_path(message, message.poses)
+
+
+def _planar_path(message: Any, poses: Sequence[Any]) -> PlanarPath:
+    """Return the content of a message with a header by its poses, which are stamped."""
+    xy, frame = np.array([_planar_position(one.pose) for one in poses]), message.header.frame_id
+    return PlanarPath(_stamp_ns(message), frame, xy, _planar_heading(poses[-1].pose))
 
 
 def _planar_pose(x_m: float, y_m: float, heading_rad: float | None) -> Values:

@@ -354,29 +354,21 @@ def navigation_request(topic: str, payload: bytes) -> tuple[NavigationRequest, i
     longest = LONGEST_PATH if topic == topics.PATH else LONGEST_PAYLOAD
     if len(payload) > longest:
         raise OmnidError(f"{len(payload)} bytes: expected at most {longest}")
-    if topic == topics.GOAL:
-        goal = codec.goal_from_cdr(payload)
-        _check_near(goal.x_m, goal.y_m)
-        return GoalRequest(_frame(goal.frame), goal.x_m, goal.y_m, goal.heading_rad), goal.stamp_ns
-    if topic == topics.PATH:
-        path = codec.path_from_cdr(payload)
-        _check_near(*path.xy.ravel())
-        return PathRequest(_frame(path.frame), path.xy, path.heading_rad), path.stamp_ns
+    if topic in (topics.GOAL, topics.PATH):
+        decode = codec.goal_from_cdr if topic == topics.GOAL else codec.path_from_cdr
+        stamp_ns, name, xy, heading_rad = decode(payload)
+        if not (abs(xy) <= FARTHEST_M).all():
+            raise OmnidError(f"a position beyond {FARTHEST_M:g} m: check the sender")
+        if name not in list(NavigationFrame):
+            raise OmnidError(f"the frame {name[:40]!a}: expected map or odom")
+        frame = NavigationFrame(name)
+        if topic == topics.PATH:
+            return PathRequest(frame, xy, heading_rad), stamp_ns
+        return GoalRequest(frame, float(xy[0, 0]), float(xy[0, 1]), heading_rad), stamp_ns
     text = codec.string_from_cdr(payload)
     stamped = _STAMPED.fullmatch(text)
     text, stamp_ns = (stamped[1], int(stamped[2])) if stamped else (text, 0)
     return (navigation_verb(text) if topic == topics.NAVIGATION else route_request(text)), stamp_ns
-
-
-def _frame(name: str) -> NavigationFrame:
-    if name not in list(NavigationFrame):
-        raise OmnidError(f"the frame {name[:40]!a}: expected map or odom")
-    return NavigationFrame(name)
-
-
-def _check_near(*positions_m: float) -> None:
-    if not all(abs(value) <= FARTHEST_M for value in positions_m):
-        raise OmnidError(f"a position beyond {FARTHEST_M:g} m: check the sender")
 
 
 # Samples of wheels and gyro.

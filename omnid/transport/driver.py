@@ -12,7 +12,7 @@ import zenoh
 
 from omnid.errors import OmnidError
 from omnid.transport import codec, ros2
-from omnid.transport.codec import PlanarGoal, goal_cdr, string_cdr
+from omnid.transport.codec import goal_cdr, string_cdr
 from omnid.transport.session import QUERY_S, has_receiver, robots_there
 from omnid.transport.topics import (
     ARM,
@@ -149,7 +149,7 @@ class Driver:
 
     def goal(self, x_m: float, y_m: float, heading_rad: float | None = None, frame: str = "odom") -> Answer:
         """Ask the robot to drive to a pose in odom or map; None: with any heading. Raise OmnidError as `ask`."""
-        return self.ask(GOAL, lambda now_ns: goal_cdr(PlanarGoal(now_ns, frame, x_m, y_m, heading_rad)))
+        return self.ask(GOAL, lambda now_ns: goal_cdr(now_ns, frame, (x_m, y_m), heading_rad))
 
     def navigate(self, verb: str) -> Answer:
         """Ask the robot to cancel, pause or resume its drive. Raise OmnidError as `ask`."""

@@ -7,12 +7,15 @@ attachment to every sample, liveliness tokens for the node and each of its publi
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
 from functools import cache
+from itertools import count
 from struct import Struct
 from typing import Final, NamedTuple
 
+import zenoh
 from rosbags.typesys import Stores, get_typestore
+
+from omnid.transport.topics import ros_name
 
 RELIABLE_LAST_10: Final = "::,10:,:,:,,"  # what is empty is rmw_zenoh's default: reliable, volatile, keep last
 TRANSIENT_LOCAL: Final = ":1:,1:,:,:,,"  # the newest message is kept for later subscribers, as of /tf_static
@@ -68,25 +71,31 @@ def gid_of(token: str) -> bytes:
     return hashlib.blake2b(token.encode(), digest_size=GID_BYTES).digest()
 
 
-@dataclass(frozen=True, slots=True)
-class RmwNode:
-    """A node of ROS 2 in rmw_zenoh's liveliness tokens."""
+class RosNode:
+    """A session as a node of ROS 2: the tokens of the node, of its publishers and of its subscriptions."""
 
-    domain: int
-    zid: str  # of the session
-    name: str
+    def __init__(self, session: zenoh.Session, robot: str, domain: int, *, is_on: bool) -> None:
+        """robot: its name, of which the last part is that of the node. is_on: False: tokens are not declared."""
+        self._session, self._robot, self._is_on = session, robot, is_on
+        self._prefix, self._name = f"@ros2_lv/{domain}/{session.zid()}/0", robot.rsplit("/", 1)[-1]
+        self._entities = count(1)
+        self._tokens: list[zenoh.LivelinessToken] = []
+        self._declare(f"{self._prefix}/0/NN/%/%/{self._name}")
 
-    @property
-    def token(self) -> str:
-        """Token of the node itself."""
-        return f"@ros2_lv/{self.domain}/{self.zid}/0/0/NN/%/%/{self.name}"
+    def publisher(self, topic: str, schema: str, *, transient_local: bool) -> str:
+        """Declare a publisher of a robot's topic and return its token."""
+        return self._endpoint("MP", topic, schema, TRANSIENT_LOCAL if transient_local else RELIABLE_LAST_10)
 
-    def endpoint(self, kind: str, entity: int, topic: str, schema: str, quality: str) -> str:
-        """Return the token of a publisher (kind "MP") or subscription ("MS"); entity: a number unique in the node."""
-        where = f"@ros2_lv/{self.domain}/{self.zid}/0/{entity}/{kind}/%/%/{self.name}"
-        return f"{where}/{topic.replace('/', '%')}/{dds_type(schema)}/{type_hash(schema)}/{quality}"
+    def subscription(self, topic: str, schema: str) -> None:
+        """Declare a subscription of a robot's topic."""
+        self._endpoint("MS", topic, schema, RELIABLE_LAST_10)
 
+    def _endpoint(self, kind: str, topic: str, schema: str, quality: str) -> str:
+        name = ros_name(self._robot, topic).replace("/", "%")
+        where = f"{self._prefix}/{next(self._entities)}/{kind}/%/%/{self._name}"
+        return self._declare(f"{where}/{name}/{dds_type(schema)}/{type_hash(schema)}/{quality}")
 
-def node_name(robot: str) -> str:
-    """Return the name of the node: the last part of the robot's name."""
-    return robot.rsplit("/", 1)[-1]
+    def _declare(self, token: str) -> str:
+        if self._is_on:
+            self._tokens.append(self._session.liveliness().declare_token(token))
+        return token

@@ -14,7 +14,7 @@ from omnid.core.control.velocity_limits import VelocityLimits
 from omnid.monitor.teleop import FIRST_SHARE
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.codec import DiagnosticStatus, PlanarGoal, goal_from_cdr, string_from_cdr
+from omnid.transport.codec import DiagnosticStatus, PlanarPath, goal_from_cdr, string_from_cdr
 from omnid.transport.status_names import NAVIGATION, WHEELS, Key
 from omnid.transport.topics import Answer, Request, command_topics
 from tests.omnid.transport.bus_fixtures import free_endpoint
@@ -26,7 +26,7 @@ class Navigator:
     """A robot that grants every request but those for the route `lost`, and whose disk is full at the second save."""
 
     def __init__(self, bus: Bus) -> None:
-        self._bus, self.asked, self.goals = bus, list[str](), list[PlanarGoal]()
+        self._bus, self.asked, self.goals = bus, list[str](), list[PlanarPath]()
         self.twists: list[tuple[float, float]] = []
         self.state = "driving"
         bus.subscribe_commands(self._take, command_topics(("operator",)))
