@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from calib import se3
 from calib.models.camera import Array
@@ -18,19 +19,6 @@ def planar_poses(xy_m: Array, heading_rad: Array) -> Array:
     return se3.transform(R, np.column_stack([xy_m, zero + HEIGHT_M]))
 
 
-def _natural_spline(y: Array, s: Array) -> tuple[Array, Array]:
-    """Return value and slope at s (N,) of the natural cubic spline through y (K,) at 0, 1, 2 ..."""
-    count = len(y)
-    A = np.eye(count)
-    for i in range(1, count - 1):
-        A[i, i - 1 : i + 2] = 1, 4, 1
-    bend = np.linalg.solve(A, np.concatenate([[0], 6 * np.diff(y, 2), [0]]))
-    k = np.clip(s.astype(int), 0, count - 2)
-    a, b, h = bend[k], bend[k + 1], s - k
-    rise = y[k + 1] - y[k] - (2 * a + b) / 6
-    return y[k] + h * (rise + h * (a / 2 + h * (b - a) / 6)), rise + h * (a + h * (b - a) / 2)
-
-
 def spline_path(
     seed: int, pairs: int, step_m: float, *, sway_m: float = 0.3, turn: tuple[int, float] | None = None
 ) -> Array:
@@ -42,7 +30,8 @@ def spline_path(
     knots = int(pairs * step_m) + 4
     y = np.concatenate([[0], rng.uniform(-sway_m, sway_m, knots - 1)])
     x = np.linspace(0, knots - 1.001, 200 * knots)
-    lateral, slope = _natural_spline(y, x)
+    spline = CubicSpline(np.arange(knots), y, bc_type="natural")
+    lateral, slope = spline(x), spline(x, 1)
     arc = np.concatenate([[0], np.cumsum(np.hypot(np.diff(x), np.diff(lateral)))])
     wanted = step_m * np.arange(pairs)
     if turn is not None:
