@@ -71,6 +71,7 @@ RULES = (
         excepted=(
             "omnid/transport/bus.py",
             "omnid/transport/intake.py",
+            "omnid/transport/ros2.py",
             "omnid/transport/session.py",
             "omnid/transport/driver.py",
             "omnid/client.py",
