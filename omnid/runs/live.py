@@ -318,7 +318,8 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
     saver = None
     if config.places.enabled and run_places.is_extended:
         saver = MapSaver(run_places, config.places.save_s, graph.inlet(MOST_OPEN), bus.answer)
-    parts = Parts(saver=saver, map_every_s=config.live.cloud_s)
+    map_is_read = graph.inlet(1)
+    parts = Parts(saver=saver, map_every_s=config.live.cloud_s, map_is_read=map_is_read)
     if controller is not None:
         states = controller.statistics.states = graph.inlet(1, thread="drive")
         graph.sink("arming", ArmAnswers(session, bus), states, thread=states.thread)
@@ -378,8 +379,7 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
     reported = {IMAGES: LIVE}  # messages in the log
 
     def give_status() -> None:
-        if stages.mapping is not None:
-            stages.mapping.is_read = recorder is not None or bus.is_received("cloud")
+        map_is_read.push(recorder is not None or bus.is_received("cloud"))
         statuses = collect()
         for status in statuses:
             if status.level != STALE and status.message != reported.get(status.name, status.message):

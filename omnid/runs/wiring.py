@@ -83,6 +83,7 @@ class Parts:
     navigation: NavigationParts | None = None
     saver: Saver | None = None  # of the known map
     map_every_s: float = 0.0  # between two maps; 0: one, at the end
+    map_is_read: Stream[bool] | None = None  # whether the map has a reader; None: it has one
 
 
 def wheel_state(state: ControllerState) -> WheelState:
@@ -166,7 +167,8 @@ def wire(
     # 4. Poses give the map, the pose in it, and the obstacles, where these are consumed.
     if outputs.maps or outputs.take_all:
         mapping = Mapping(config.mapping, front_end.dense, parts.map_every_s)
-        maps = graph.stage("mapping", mapping, poses, thread=BACKGROUND)
+        noted = () if parts.map_is_read is None else (parts.map_is_read,)
+        maps = graph.stage("mapping", mapping, poses, *noted, thread=BACKGROUND)
     needs_places = outputs.places or outputs.take_all or parts.navigation or parts.known_places is not None
     if config.places.enabled and needs_places:
         saver = parts.saver

@@ -35,7 +35,7 @@ class Mapping:
         """dense: computes the depth of a pair that enters the map. every_s: between two maps, by the stamps; 0: one,
         at the end.
         """
-        self.is_read = True  # whether the map has a reader: a live run notes it from time to time
+        self._is_read = True  # whether the map has a reader
         self._config, self._dense = config, dense
         self._every_ns, self._given_ns = round(every_s * 1e9), 0
         self._map = VoxelMap(config.voxel_m, config.max_voxels)
@@ -50,8 +50,12 @@ class Mapping:
         """Voxels of the map, voxels evicted for space, points that could not be mapped."""
         return {"voxels": len(self._map), "evicted": self._map.evicted, "refused": self._map.refused}
 
-    def process(self, odometry: OdometryUpdate) -> MapUpdate | None:
-        """Add the points of a pair; return the map when it is due."""
+    def process(self, message: OdometryUpdate | bool) -> MapUpdate | None:
+        """Add the points of a pair; return the map when it is due. A bool: whether the map has a reader from now on."""
+        if isinstance(message, bool):
+            self._is_read = message
+            return None
+        odometry = message
         # 1. The path has all poses, the map the points of those pairs that are due.
         self._newest = odometry.seq, odometry.stamp_ns
         self._path.add(Vertex(*odometry.T_odom_rig[:2, 3].tolist()))
@@ -75,7 +79,7 @@ class Mapping:
         stereo the odometry needs anyway, is due after half the time: then another pair can do without. While no client
         reads the map, keyframes are enough: one that reads it later finds all of it, of fewer views.
         """
-        if not (odometry.is_keyframe or self.is_read):
+        if not (odometry.is_keyframe or self._is_read):
             return False
         if self._mapped is None or not self._min_gap_ns:
             return True

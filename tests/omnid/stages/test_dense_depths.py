@@ -63,7 +63,8 @@ def driven(mapping: Mapping, speed_mps: float, is_keyframe: Callable[[int], bool
         T = se3.transform(np.eye(3), np.array([speed_mps * stamp_ns * 1e-9, 0, 0]))
         depth = StereoDepth(Panoramas(seq, stamp_ns, wrapped(IMAGE), wrapped(IMAGE), IMAGE > 0))
         of_pose = seq, stamp_ns, T, np.eye(6), np.zeros(6), np.eye(6), TrackingState.TRACKING
-        mapping.is_read = mapping.is_read or seq > 30
+        if seq == 31:
+            mapping.process(True)
         update = OdometryUpdate(*of_pose, 0, 50, 50, depth, is_keyframe=is_keyframe(seq))
         maps += mapping.process(update) is not None
     return maps
@@ -100,7 +101,7 @@ def test_keyframes_alone_enter_a_map_without_readers(place: Geometry) -> None:
     """Later readers find it; from then on pairs enter it at its rate."""
     dense = CountedDepths(place)
     mapping = Mapping(MappingConfig(rate_hz=15.0), dense, 0.5)
-    mapping.is_read = False
+    mapping.process(False)
     maps = driven(mapping, 1.0, lambda seq: seq % 10 == 0)
     assert dense.computed == [0, 10, 20, 30, *range(32, 60, 2)]
     assert maps == 3, "a query for the newest one finds it"
