@@ -151,8 +151,6 @@ class _Replay:
             sinks = self._outputs(session, front_end)
             stages = wire(graph, [messages], front_end, config, sinks, run_places.known_to(parts))
             report = RunReport(session, reader, stages)
-            if isinstance(sinks.recorder, Recorder):
-                sinks.recorder.final_status = report.final_status
             if options.progress is not None:
                 progress = options.progress(session.statistics, reader.pair_estimate())
                 graph.ticker("progress", progress.period_s, progress)
@@ -162,7 +160,10 @@ class _Replay:
                 with session.signals(self._on_signal):
                     graph.run()
                 extended = run_places.finish()  # before the result is made: it may warn
+                _end_recording(sinks.recorder, report)
             except (OmnidError, DriverError) as error:
+                with suppress(OmnidError, DriverError):  # the error that ended the run is the one that is reported
+                    _end_recording(sinks.recorder, report)
                 if not session.statistics.poses or isinstance(error, RigContradictedError):
                     raise
                 raise RunFailedError(str(error), self._result(session, report, stages)) from error
@@ -279,7 +280,7 @@ class _Replay:
 
     def _result(self, session: Session, report: RunReport, stages: WiredStages) -> RunResult:
         options, places, updates = self._options, stages.places, self._in_map
-        counters = report.counters(session.statistics)
+        counters = report.counters()
         if self._wheels is not None:
             counters = replace(counters, motor=self._wheels.counts())
         # 1. Poses in the map: as it is at the end, whose later loops have corrected them; and as they were known.
@@ -310,6 +311,13 @@ class _Replay:
             places.map() if places is not None and options.collect else None,
             elapsed_s=time.monotonic() - self._begun_s,
         )
+
+
+def _end_recording(recorder: object, report: RunReport) -> None:
+    """Complete a recording with the counters of the run, if it has messages."""
+    if isinstance(recorder, Recorder) and recorder.state.messages:
+        recorder.add(report.final_status(), recorder.newest_ns)
+        recorder.close()
 
 
 @contextmanager

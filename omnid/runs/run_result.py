@@ -16,7 +16,7 @@ from drivers.logs.log_reader import LogReader
 from omnid.core.control.motion_monitor import ADVICE
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.places.place_map import PlaceMap
-from omnid.diagnostics.run_summary import RunCounters, RunStatistics, input_warnings
+from omnid.diagnostics.run_summary import RunCounters, input_warnings
 from omnid.diagnostics.status import motion_status, stage_status, summary_status
 from omnid.engine.telemetry import SummaryRow
 from omnid.errors import OmnidError
@@ -126,8 +126,8 @@ class RunReport:
         self._session, self._reader, self._stages = session, reader, stages
         self._pairing, self._odometry = stages.front_end.pairing, stages.front_end.odometry
 
-    def counters(self, statistics: RunStatistics) -> RunCounters:
-        """Return the counters of the run with the given statistics; all that was lost, by reason, zeros too."""
+    def counters(self) -> RunCounters:
+        """Return the counters of the run; all that was lost, by reason, zeros too."""
         read, paired, telemetry = self._reader.counts, self._pairing.counts, self._session.graph.telemetry
         drops = {name: read[name] for name in ("late", "duplicate", "broken", "broken_records")}
         drops |= {name: count for name, count in paired.items() if name.startswith(("unpaired", "repeated"))}
@@ -135,7 +135,7 @@ class RunReport:
         drops["queue"] = telemetry.dropped_messages
         mapping, places = self._stages.mapping, self._stages.places
         return replace(
-            RunCounters.of(statistics, paired["pairs"], drops),
+            RunCounters.of(self._session.statistics, paired["pairs"], drops),
             map={} if mapping is None else mapping.counts,
             places={} if places is None else places.counts,
             loss=self._loss(),
@@ -165,10 +165,10 @@ class RunReport:
         yield from self._odometry.image_faults
         yield from input_warnings(self._pairing, self._stages.front_end.health, statistics, self._session.config)
 
-    def final_status(self, statistics: RunStatistics) -> list[DiagnosticStatus]:
+    def final_status(self) -> list[DiagnosticStatus]:
         """Return the counters of the run and of its stages, for the log."""
         stages = (stats for stats in self._session.graph.telemetry.stages if stats.name not in BOOKKEEPING)
-        return [summary_status(self.counters(statistics)), *self._motion(), *map(stage_status, stages)]
+        return [summary_status(self.counters()), *self._motion(), *map(stage_status, stages)]
 
     def _loss(self) -> str:
         """Return one line about images that make no pair; empty where these are few, or were dropped on purpose."""

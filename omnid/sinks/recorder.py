@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Final, TypeAlias
@@ -11,7 +11,6 @@ from typing import Final, TypeAlias
 from drivers.frame import Frame
 from drivers.logs.mcap_writer import LogWriter
 from drivers.logs.rotating_log import RotatingLog, RotatingLogState
-from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.robot_clock import SegmentTime, log_time
 from omnid.errors import OmnidError
 from omnid.messages import OdometryUpdate
@@ -22,7 +21,6 @@ from omnid.transport.status_names import RECORDING
 from omnid.transport.topics import ros_name
 
 Recorded: TypeAlias = Frame | Outgoing
-FinalStatus: TypeAlias = Callable[[RunStatistics], Sequence[DiagnosticStatus]]
 
 _PENDING: Final = 256  # messages of other threads that may wait
 
@@ -64,8 +62,8 @@ class Recorder:
     never raises, and skip_invalid=True; then `invalid` counts what could not be encoded. A replay loses nothing: a
     message that cannot be encoded or written raises OmnidError or DriverError.
 
-    Without an encoder only frames are recorded. `final_status` is asked at the end of the run for statuses, which are
-    the last message of the log.
+    Without an encoder only frames are recorded. Who runs the graph closes the recorder, after what is added at the end.
+    newest_ns: latest stamp of the messages.
     """
 
     def __init__(
@@ -83,10 +81,8 @@ class Recorder:
         self._changes = None if encode is None else Changes(encode)
         self._added: deque[tuple[Sequence[DiagnosticStatus], int]] = deque(maxlen=_PENDING)
         self._files = 0
-        self._newest_ns = 0
-        self._statistics = RunStatistics()  # its own: the last messages may reach the other sinks later
+        self.newest_ns = 0
         self.invalid = 0
-        self.final_status: FinalStatus | None = None
 
     @property
     def state(self) -> RotatingLogState:
@@ -113,13 +109,12 @@ class Recorder:
                 self._write([OutgoingMessage(image_topic(message), *image_cdr(message, stamp_ns))], stamp_ns)
             elif encode is not None:
                 self._write(encode(message), stamp_ns)
-                if isinstance(message, OdometryUpdate):
-                    self._statistics.process(message)
-                    if self._files != self.state.files:  # each file has all of what seldom changes
-                        self._files, self._changes = self.state.files, Changes(encode)
+                # Each file has all of what seldom changes.
+                if isinstance(message, OdometryUpdate) and self._files != self.state.files:
+                    self._files, self._changes = self.state.files, Changes(encode)
                 if self._changes is not None:
                     self._write(self._changes(message), stamp_ns)
-            self._newest_ns = max(self._newest_ns, stamp_ns)
+            self.newest_ns = max(self.newest_ns, stamp_ns)
         except OmnidError:  # for example a stamp that is not a time
             if not self._skip_invalid:
                 raise
@@ -128,13 +123,6 @@ class Recorder:
     def add(self, statuses: Sequence[DiagnosticStatus], stamp_ns: int) -> None:
         """Record statuses with a stamp as those of other messages; from any thread."""
         self._added.append((statuses, stamp_ns))
-
-    def finish(self) -> None:
-        """Write the final status and complete the last file."""
-        self._write_added()
-        if self.final_status is not None and self.state.messages:
-            self._write([status_report(self._newest_ns, self.final_status(self._statistics))], self._newest_ns)
-        self.close()
 
     def close(self) -> None:
         """Write the messages that were added and complete the last file; a second call does nothing."""

@@ -13,7 +13,6 @@ from drivers.logs.log_reader import LogReader
 from omnid.config import Config
 from omnid.engine.graph import NEWEST, Graph
 from omnid.runs.record import open_recorder, record
-from omnid.sinks.recorder import Recorder
 from omnid.transport.codec import ERROR, OK
 from tests.omnid.sinks.test_recorder import frame, times
 
@@ -42,15 +41,20 @@ class Given:
 
 def test_a_blocked_disk_stops_no_camera(tmp_path: Path) -> None:
     recorder = open_recorder(settings(tmp_path / "log"), "", lambda *_: None, time=times())
-    late = Late(recorder)
-    graph, seen = Graph(policy=NEWEST, depth=3), Seen()
+    graph, seen_s, until_s = Graph(policy=NEWEST, depth=3), list[float](), time.monotonic() + 0.5
+
+    def late(message: Frame) -> None:
+        time.sleep(max(0.0, until_s - time.monotonic()))
+        recorder.process(message)
+
     stream = graph.source("lower", lambda: iter([frame(n, "lower") for n in range(50)]))
     graph.sink("record", late, stream)
-    graph.sink("odometry", seen, stream)
+    graph.sink("odometry", lambda _: seen_s.append(time.monotonic()), stream)
     graph.run()
-    stats = next(stage for stage in graph.telemetry.stages if stage.name == "record")
+    recorder.close()
+    stats = graph.telemetry.of("record")
     assert stats.dropped >= 40 and stats.dropped + recorder.state.messages == 50
-    assert min(seen.times_s) < late.until_s  # the others went on meanwhile
+    assert min(seen_s) < until_s  # the others went on meanwhile
 
 
 def test_reports_the_state_of_the_recording(tmp_path: Path) -> None:
@@ -66,30 +70,6 @@ def test_reports_the_state_of_the_recording(tmp_path: Path) -> None:
     recorder.process(frame(0, "lower"))
     status = recorder.status()
     assert status.level == ERROR and status.values["lost"] == "1" and "1000001 needed" in status.message
-
-
-class Late:
-    """A recorder whose disk is blocked for half a second."""
-
-    def __init__(self, recorder: Recorder) -> None:
-        self._recorder, self.until_s = recorder, time.monotonic() + 0.5
-        self.finish = recorder.finish
-
-    def process(self, message: Frame) -> None:
-        """Record the message after the disk is free."""
-        time.sleep(max(0.0, self.until_s - time.monotonic()))
-        self._recorder.process(message)
-
-
-class Seen:
-    """A sink that keeps the times of its messages."""
-
-    def __init__(self) -> None:
-        self.times_s: list[float] = []
-
-    def process(self, message: Frame) -> None:
-        """Keep the time."""
-        self.times_s.append(time.monotonic())
 
 
 def test_records_both_cameras_and_reports_the_result(tmp_path: Path) -> None:

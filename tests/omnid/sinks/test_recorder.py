@@ -63,7 +63,7 @@ def test_recorded_images_are_read_unchanged_and_found_by_name(tmp_path: Path, en
     given = [frame(n, camera, encoding) for n in range(3) for camera in ("lower", "upper")]
     for each in given:
         recorder.process(each)
-    recorder.finish()
+    recorder.close()
     (path,) = recorded(tmp_path / "log")
     reader = LogReader(path)
     ending = "/compressed" if encoding == "jpeg" else ""
@@ -89,7 +89,7 @@ def test_all_messages_are_recorded_in_unix_time(tmp_path: Path) -> None:
         recorder.process(VelocityCommand(5 * 10**9 + n, 0.1, math.nan, 0.2))
     recorder.add([DiagnosticStatus("omnid: test", 0, "fine", {})], 5 * 10**9)
     recorder.process(MapUpdate(0, 5 * 10**9, points, np.zeros((0, 2))))
-    recorder.finish()
+    recorder.close()
     (path,) = recorded(tmp_path / "log")
     counts: dict[str, int] = {}
     with AnyReader([path]) as bag:
@@ -137,7 +137,7 @@ def test_a_step_of_the_clock_begins_a_file_and_no_file_has_one_in_it(
         if n in (9, 19):
             computer.set_forwards(step_s)
         recorder.process(replace(odometry(n), stamp_ns=stamp_ns))  # of images of before the step, later than it
-    recorder.finish()
+    recorder.close()
     written = []
     for path in recorded(tmp_path / "log"):
         with path.open("rb") as file:
@@ -168,7 +168,7 @@ def test_every_file_has_the_state_of_the_odometry(tmp_path: Path, monkeypatch: p
     recorder = open_recorder(config, "", lambda *_: None, encode=Encoder(np.eye(4), 0))
     for n in range(30):
         recorder.process(replace(odometry(n), stamp_ns=START_NS + n * 10**8))
-    recorder.finish()
+    recorder.close()
     files = recorded(tmp_path / "log")
     assert len(files) == 3
     for path in files:
