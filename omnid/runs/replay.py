@@ -23,7 +23,6 @@ from drivers.logs.log_reader import WHOLE, LogReader
 from drivers.motion import MotionSample
 from omnid.config import Config
 from omnid.controller.motor import SIMULATED
-from omnid.core.places.place_map import PlaceMap
 from omnid.core.rig.rig_health import RigContradictedError
 from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Sink, Stream
@@ -88,9 +87,7 @@ class ReplayOptions:
     settings: Path | None = None  # file of the configuration, so that no output overwrites it
     progress: Callable[[RunStatistics, int | None], ProgressDisplay] | None = None  # of statistics, expected pairs
     observer: Callable[[FrontEnd, Telemetry], Sink[Outgoing]] | None = None  # of all messages; excludes record
-    places: PlaceMap | None = None  # the map to begin with; it is extended
-    localize_only: bool = False  # the map to begin with is not extended
-    rig_places: RigPlaces | None = None  # such a map with its rig, which is compared with the rig of the log
+    rig_places: RigPlaces | None = None  # the map to begin with, and its rig, which is compared with that of the log
     build: bool = False  # give the result a map with its rig, a new one where there is none to begin with
     map_every_s: float = 0.0  # between two maps, by the stamps; 0: one, at the end
 
@@ -146,7 +143,7 @@ class _Replay:
             front_end = FrontEnd(geometry, config, examined_rig(reader, self._log, geometry, config))
             # 2. The stages, between the log and the outputs; one that cannot be opened ends the run before it begins.
             run_places = RunPlaces(config, geometry, session.warn, options.rig_places, build=options.build)
-            parts = Parts(options.places, options.localize_only, map_every_s=options.map_every_s)
+            parts = Parts(map_every_s=options.map_every_s)
             messages = self._messages(graph, reader, front_end)
             sinks = self._outputs(session, front_end)
             stages = wire(graph, [messages], front_end, config, sinks, run_places.known_to(parts))

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-from copy import deepcopy
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +11,7 @@ from mcap.reader import make_reader
 
 from calib import se3
 from calib.rig_file import read_rig, write_rig
-from omnid.config import Config
+from omnid.config import load_config
 from omnid.core.mapping.scan_grid import FREE, OCCUPIED
 from omnid.formats.tum import read_tum
 from omnid.recordings.evaluation import evaluate
@@ -94,14 +92,14 @@ def _assert_published(log: Path, T_odom_rig: np.ndarray) -> None:
     assert grid.header.frame_id == "map" and {FREE, OCCUPIED} <= set(grid.data.tolist())
 
 
-def test_a_run_begins_in_a_known_map(scene: Path, elsewhere: Path) -> None:
+def test_a_run_begins_in_a_known_map(scene: Path, elsewhere: Path, tmp_path: Path) -> None:
     """It localises within a second, in another world it does not; localize_only leaves the map as it was."""
-    first = run_log(scene / "log.mcap", Config(), ReplayOptions(rig=scene / "rig.toml", collect=True))
+    options, words = ReplayOptions(rig=scene / "rig.toml", collect=True), [f"places.map='{tmp_path / 'a.omap'}'"]
+    first = run_log(scene / "log.mcap", load_config(None, words), options)
     assert first.places is not None and len(first.places) >= 3
     poses = {id: pose.copy() for id, pose in first.places.poses.items()}
-    again = ReplayOptions(rig=scene / "rig.toml", collect=True, places=first.places, localize_only=True)
     for log, known in ((scene, True), (elsewhere, False)):
-        result = run_log(log / "log.mcap", Config(), replace(again, places=deepcopy(first.places)))
+        result = run_log(log / "log.mcap", load_config(None, [*words, "places.localize_only=true"]), options)
         assert (MapState.LOCALIZED in result.map_states[:10]) == known
         assert result.places is not None and result.places.poses.keys() >= poses.keys()
         assert all(np.allclose(result.places.poses[id], pose, atol=1e-9) for id, pose in poses.items())
