@@ -24,7 +24,7 @@ import zenoh
 
 from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig
-from omnid.transport.codec import Cloud, Diagnostics, Map, Pose, PoseAttachment, Scan
+from omnid.transport.codec import Cloud, Diagnostics, Map, PlanarPath, Pose, PoseAttachment, Scan
 from omnid.transport.driver import CONNECT_S, Driver, RobotTime
 from omnid.transport.session import ALIVE, HERE, QUERY_S, Unreachable, open_client, robots_there
 from omnid.transport.status_names import NavigationReport
@@ -54,6 +54,7 @@ _TOPICS: Final[dict[type[Any], str]] = {
     Diagnostics: "status",
     Cloud: "cloud",
     Map: "map",
+    PlanarPath: "path",
     NavigationReport: "navigation",
     Scan: "scan",
 }

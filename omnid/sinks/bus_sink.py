@@ -6,15 +6,20 @@ import time
 
 import cv2
 
+from calib import se3
 from drivers.frame import Frame
 from drivers.motor import VelocityCommand
+from omnid.core.mapping.thinned_path import ThinnedPath, Vertex
 from omnid.messages import OdometryUpdate
 from omnid.sinks.encoder import Changes, Encoder, Outgoing, UnixTime, pose_attachment, same_time
 from omnid.transport.bus import Bus
-from omnid.transport.codec import clock_cdr, features_to_bytes
+from omnid.transport.codec import clock_cdr, features_to_bytes, path_cdr
 from omnid.transport.sensor_codec import image_cdr
 from omnid.transport.status_names import RUN_ID
 from omnid.transport.topics import CLOCK, PANORAMA
+
+# Of the path that is published: most vertices, the least distance between two of them, and the time between two paths.
+PATH_POSES, PATH_STEP_M, PATH_NS = 500, 0.05, 5 * 10**9
 
 
 class BusSink:
@@ -23,6 +28,8 @@ class BusSink:
     def __init__(self, bus: Bus, encode: Encoder, clock: type[OdometryUpdate | VelocityCommand] | None = None) -> None:
         """clock: the kind of message, from one thread, by whose stamps /clock advances, where the bus has it."""
         self._clock, self._time_ns = clock, 0
+        self._path, self._path_ns = ThinnedPath(PATH_POSES, PATH_STEP_M), 0
+        self._path_is_new = False
         self._bus, self._encode, self._changes = bus, encode, Changes(encode, RUN_ID)
 
     def process(self, message: Outgoing) -> None:
@@ -38,6 +45,20 @@ class BusSink:
         # 3. What changes seldom, where it has changed.
         for topic, _, payload in self._changes(message):
             self._bus.publish(topic, payload)
+        if isinstance(message, OdometryUpdate):
+            self._publish_path(message)
+
+    def _publish_path(self, odometry: OdometryUpdate) -> None:
+        """Add a pose to the path of the base, and publish it where it has grown, for those who come after a drive."""
+        vertices = len(self._path.vertices)
+        T_base_rig = self._encode.T_base_rig
+        T_odom_base = T_base_rig @ odometry.T_odom_rig @ se3.inverse(T_base_rig)
+        self._path.add(Vertex(*T_odom_base[:2, -1].tolist()))
+        self._path_is_new |= len(self._path.vertices) != vertices
+        if self._path_is_new and odometry.stamp_ns >= self._path_ns + PATH_NS:
+            self._path_is_new, self._path_ns = False, odometry.stamp_ns
+            xy = [vertex[:2] for vertex in self._path.with_end()]
+            self._bus.publish("path", path_cdr(self._encode.unix_ns(odometry.stamp_ns), "odom", xy))
 
 
 class PanoramaSink:

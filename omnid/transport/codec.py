@@ -591,7 +591,7 @@ def path_cdr(stamp_ns: int, frame: str, xy: ArrayLike, heading_rad: float | None
     return encoded(PATH_SCHEMA, head, poses)
 
 
-def path_from_cdr(payload: bytes) -> PlanarPath:
+def path_from_cdr(payload: bytes, _: bytes = b"") -> PlanarPath:
     """Decode a path of 1 to MAX_PATH_POSES poses that are finite; the last one is not tilted."""
     message = decoded(payload, PATH_SCHEMA)
     if not 1 <= len(message.poses) <= MAX_PATH_POSES:

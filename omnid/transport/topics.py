@@ -48,6 +48,7 @@ PUBLISHED: Final = {
     PANORAMA: Topic(IMAGE_SCHEMA),
     "navigation": Topic(codec.DIAGNOSTICS_SCHEMA, decode_navigation, latched=True),
     "plan": Topic(codec.PATH_SCHEMA, latched=True),
+    "path": Topic(codec.PATH_SCHEMA, codec.path_from_cdr, latched=True),
     "wheel_odom": Topic(codec.ODOMETRY_SCHEMA),
     "imu": Topic(codec.IMU_SCHEMA),
     CLOCK: Topic(codec.CLOCK_SCHEMA, realtime=True),

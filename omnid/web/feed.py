@@ -29,7 +29,7 @@ from omnid.core.mapping.thinned_path import ThinnedPath, Vertex
 from omnid.errors import OmnidError
 from omnid.monitor.robot_state import Inbox, RobotState
 from omnid.transport.bus_config import BusConfig
-from omnid.transport.codec import Pose, decode_map, decode_map_pose, decode_scan
+from omnid.transport.codec import PlanarPath, Pose, decode_map, decode_map_pose, decode_scan
 from omnid.transport.status_names import decode_navigation
 from omnid.transport.topics import MAP_POSE, PANORAMA, SCAN
 from omnid.web.snapshot import (
@@ -176,6 +176,9 @@ class RobotFeed:
             except Unreachable as error:
                 self.link = str(error)
                 await asyncio.sleep(QUIET_S)
+        past = await asyncio.to_thread(_past_path, self.robot)
+        for x_m, y_m in past:
+            self.path.add(x_m, y_m, self.version + 1)
         self.link, receive, end = "", self._receiver(loop), None
         for topic in ("odom", MAP_POSE, "status", "map", SCAN, NAVIGATION):
             self.robot.on_message(receive, topic)
@@ -289,6 +292,13 @@ class RobotFeed:
             yield
         except (OmnidError, FrameDecodeError):
             self.state.broken += 1
+
+
+def _past_path(robot: Robot) -> list[tuple[float, float]]:
+    """Return the path of the robot before the connection was made, m in odom."""
+    with robot.subscribe(PlanarPath) as paths:
+        found = paths.newest()
+    return [] if found is None or found.frame != PATH_FRAME else [(x_m, y_m) for x_m, y_m in found.xy.tolist()]
 
 
 def _latched(robot: Robot) -> tuple[Diagnostics | None, Map | None]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+from dataclasses import replace
 from struct import unpack_from
 from types import SimpleNamespace
 from typing import Any, cast
@@ -21,7 +22,7 @@ from omnid.messages import OdometryUpdate
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
 from omnid.sinks.encoder import Encoder
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.codec import decode_pose, features_from_bytes
+from omnid.transport.codec import PlanarPath, decode_pose, features_from_bytes
 from tests.omnid.transport.bus_fixtures import free_endpoint
 from tests.waiting import wait_until
 
@@ -108,3 +109,16 @@ def test_panoramas_are_published_at_the_configured_rate() -> None:
     assert [message.header.stamp.sec - 10**9 for message in messages] == [100, 102, 104, 106]
     shown = cv2.imdecode(messages[0].data, cv2.IMREAD_GRAYSCALE)
     assert shown.shape == (64, 128) and np.abs(shown.astype(int) - IMAGE[:, 16:-16]).max() < 20
+
+
+def test_who_comes_after_a_drive_gets_its_path() -> None:
+    endpoint = free_endpoint()
+    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
+        sink = BusSink(bus, Encoder(se3.transform(np.eye(3), [0.2, 0.0, 1.0]), 10))
+        for k in range(101):
+            T = se3.transform(np.eye(3), [0.01 * k, 0.0, 0.0])
+            sink.process(replace(odometry(k), T_odom_rig=T))
+        with Robot(connect=(endpoint,)) as robot, robot.subscribe(PlanarPath) as paths:
+            path = paths.newest()
+    assert path is not None and path.frame == "odom" and 15 < len(path.xy) < 25
+    assert path.xy[0] == pytest.approx((0.0, 0.0)) and path.xy[-1] == pytest.approx((1.0, 0.0), abs=0.06)
