@@ -78,18 +78,20 @@ def run(args: argparse.Namespace) -> int:
         print(f"{len(results)} of {len(jobs)} logs have their results already", file=sys.stderr)
     with _client(args.scheduler, args.jobs or os.cpu_count() or 1) as client:
         signal.signal(signal.SIGTERM, _interrupt)
-        due = [job for job in jobs if job not in results]
-        futures = {client.submit(replay, job, pure=False, retries=1): job for job in due}
+        futures = {client.submit(replay, job, pure=False, retries=1): job for job in jobs if job not in results}
         try:
             for future in import_module("distributed").as_completed(futures, raise_errors=False):
                 job = futures[future]
-                finished = future.status == "finished"
-                result = future.result() if finished else {"status": "failed", "error": one_line(future.exception())}
+                if future.status == "finished":
+                    result = future.result()
+                else:
+                    result = {"status": "failed", "error": one_line(future.exception())}
                 results[job] = result
                 outcome = ": ".join(filter(None, (result["status"], result["error"])))
                 print(f"{len(results)}/{len(jobs)}  {plain(str(job.folder))}: {outcome}", file=sys.stderr)
-        finally:
-            _end_programs()
+        finally:  # an interrupted batch leaves no programs
+            for program in import_module("psutil").Process().children():
+                program.terminate()
     counts = Counter(result["status"] for result in results.values())
     print(", ".join(f"{count} {status}" for status, count in counts.most_common()))
     return int(set(counts) != {DONE[0]})
@@ -106,19 +108,20 @@ def replay(job: Job) -> dict[str, Any]:
     code, summary = _omnid(job.words, job)
     if code is not None and code < 0:
         raise RuntimeError(f"{job.log}: the program was ended by signal {-code}")
-    lines = (job.folder / "messages.txt").read_text("utf-8", "replace").strip().splitlines()
-    error = one_line(lines[-1]).removeprefix("omnid: ") if lines else f"exit code {code}"
-    result: dict[str, Any] = {"log": str(job.log), "key": job.key, "status": DONE.get(code, "failed"), "error": ""}
-    if code not in DONE:
-        result["error"] = f"more than {job.timeout_s:g} s" if code is None else error
-    result["replay"] = summary
-    if code == 1 and summary and summary["counters"]["loss"] and summary["counters"]["poses"]:
-        result["status"] = LOSSY
-    has_poses = result["status"] in (DONE[0], LOSSY)
-    if has_poses and job.truth is not None:
-        result["eval"] = _omnid(("eval", "est.txt", str(job.truth), "--json"), job)[1]
-    if has_poses and RECORDING in job.words:
-        _omnid(("report", RECORDING, "-o", "report.html"), job)
+    status, error = DONE.get(code, "failed"), ""
+    if code is None:
+        error = f"more than {job.timeout_s:g} s"
+    elif code not in DONE:
+        lines = (job.folder / "messages.txt").read_text("utf-8", "replace").strip().splitlines()
+        error = one_line(lines[-1]).removeprefix("omnid: ") if lines else f"exit code {code}"
+    elif code == 1 and summary and summary["counters"]["loss"] and summary["counters"]["poses"]:
+        status = LOSSY
+    result = {"log": str(job.log), "key": job.key, "status": status, "error": error, "replay": summary}
+    if status in (DONE[0], LOSSY):
+        if job.truth is not None:
+            result["eval"] = _omnid(("eval", "est.txt", str(job.truth), "--json"), job)[1]
+        if RECORDING in job.words:
+            _omnid(("report", RECORDING, "-o", "report.html"), job)
     result["seconds"] = round(time.monotonic() - started_s, 3)
     write_file(job.folder / RESULT_FILE, json.dumps(result, indent=1).encode() + b"\n")
     return result
@@ -222,9 +225,3 @@ def _client(scheduler: str | None, jobs: int) -> Any:
 
 def _interrupt(*_: object) -> NoReturn:
     raise KeyboardInterrupt
-
-
-def _end_programs() -> None:
-    """End the programs of this process, so that an interrupted batch leaves none."""
-    for program in import_module("psutil").Process().children():
-        program.terminate()

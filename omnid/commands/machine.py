@@ -6,6 +6,7 @@ import argparse
 import sys
 from collections.abc import Generator, Iterator
 from contextlib import closing
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,10 +16,8 @@ from omnid.errors import OmnidError
 
 if TYPE_CHECKING:  # the help and other commands do not load these
     from drivers.frame import Camera, Frame
-    from omnid.calibration.images import Image
     from omnid.calibration.snapshot import CameraView
     from omnid.config import Config
-    from omnid.controller.motor_settings import DriveSettings
     from omnid.doctor.checks import Finding
 
 
@@ -92,10 +91,6 @@ def show_cameras(args: argparse.Namespace) -> int:
     for name in ("log", "lower", "upper"):
         if getattr(args, name) is not None:
             raise OmnidError(f"--{name} belongs to --snapshot DIR: name the folder for the images as well")
-    return _list()
-
-
-def _list() -> int:
     from drivers.cameras.v4l2_device import RULES_FILE, capture_devices, udev_rules
 
     devices = capture_devices(ROOT)
@@ -119,34 +114,26 @@ def _list() -> int:
 def _snapshot(args: argparse.Namespace) -> int:
     from calib.atomic_file import write_file
     from calib.rig_file import png
-    from omnid.calibration.snapshot import annotated, described, view_of, warnings
+    from drivers.frame import CAMERAS as SIDES
+    from drivers.frame import gray
+    from omnid.calibration.snapshot import IMAGES, annotated, described, view_of, warnings
 
     make_folder("--snapshot", args.snapshot)
-    views: dict[str, CameraView] = {name: view_of(images) for name, images in _images(args)}
-    for name, view in views.items():
-        path = args.snapshot / f"{name}.png"
+    views: dict[str, CameraView] = {}
+    for camera in SIDES:
+        frames = _of_device(args, camera) if args.log is None else _of_log(args, camera)
+        with closing(frames):
+            found = [gray(frame) for frame in islice(frames, IMAGES)]
+        if not found:
+            raise OmnidError(f"the {camera} camera gave no image: check its cable, and see `omnid doctor`")
+        views[camera] = view = view_of(found)
+        path = args.snapshot / f"{camera}.png"
         write_file(path, png(annotated(view)))
         print(f"{path}: {described(view)}")
     problems = list(warnings(views))
     for problem in problems:
         print(f"omnid: {problem}", file=sys.stderr)
     return int(bool(problems))
-
-
-def _images(args: argparse.Namespace) -> Iterator[tuple[Camera, list[Image]]]:
-    """Yield the first images of each camera. Raise OmnidError or DriverError for one that gives none."""
-    from itertools import islice
-
-    from drivers.frame import gray
-    from omnid.calibration.snapshot import IMAGES
-
-    for camera in ("lower", "upper"):
-        frames = _of_device(args, camera) if args.log is None else _of_log(args, camera)
-        with closing(frames):
-            found = [gray(frame) for frame in islice(frames, IMAGES)]
-        if not found:
-            raise OmnidError(f"the {camera} camera gave no image: check its cable, and see `omnid doctor`")
-        yield camera, found
 
 
 def _of_log(args: argparse.Namespace, camera: Camera) -> Generator[Frame, None, None]:
@@ -161,8 +148,6 @@ def _of_log(args: argparse.Namespace, camera: Camera) -> Generator[Frame, None, 
 
 def _of_device(args: argparse.Namespace, camera: Camera) -> Generator[Frame, None, None]:
     """Yield frames once the exposure has adapted; they end when the camera gives none within the driver's time."""
-    from itertools import islice
-
     from drivers.cameras.v4l2_camera import V4l2Camera
 
     settings = settings_of(args).cameras.settings(camera)
@@ -199,27 +184,22 @@ def test_motor(args: argparse.Namespace) -> int:
         raise OmnidError("no motor controller is configured: name its port by --motor, or set motor.port")
     motor_protocol(config.protocol)  # known before anybody is asked to raise the robot
     drive = tested_drive(config, ask, speed_mps=args.speed, turns=args.turns)
-    values = _lines(config.drive, drive)
+    # Always the keys of the wiring, that of the scale only where the test changed it.
+    values = {name: str(getattr(drive, name)).lower() for name in ("swapped", "reverse_left", "reverse_right")}
+    values |= {"gear": repr(drive.gear)} if drive.gear != config.drive.gear else {}
     print("\n[motor.drive]", *(f"{key} = {value}" for key, value in values.items()), sep="\n")
     print("as it was set" if drive == config.drive else "different from the settings so far")
     return 0
 
 
-def ask(question: str) -> str:
-    """Print a question and return the answer. Raise OmnidError at the end of the input."""
+def ask(question: str, at_end: str | None = None) -> str:
+    """Print a question and return the answer; at the end of the input at_end. Raise OmnidError where that is None."""
     sys.stdout.write(question)
     sys.stdout.flush()
-    line = sys.stdin.readline()
-    if not line:
+    line = sys.stdin.readline() or at_end
+    if line is None:
         raise OmnidError("no answer: the wheels stand")
     return line.strip()
-
-
-def _lines(before: DriveSettings, drive: DriveSettings) -> dict[str, str]:
-    """Return keys and TOML values: always those of the wiring, those of the scale only where the test changed them."""
-    wiring = {name: str(getattr(drive, name)).lower() for name in ("swapped", "reverse_left", "reverse_right")}
-    scale = {"gear": repr(drive.gear)} if drive.gear != before.gear else {}
-    return wiring | scale
 
 
 @command()
@@ -249,17 +229,10 @@ def install_service(args: argparse.Namespace) -> int:
     if not steps:
         print("nothing to do")
         return 0
-    if not (args.yes or _agrees()):
+    if not args.yes and ask("Do this? [y/N] ", "").lower() not in ("y", "yes"):
         print("nothing was changed")
         return 1
     for step in steps:
         step.act()
     print(install.next_steps(program, page=args.page))
     return 0
-
-
-def _agrees() -> bool:
-    try:
-        return input("Do this? [y/N] ").strip().lower() in ("y", "yes")
-    except EOFError:
-        return False

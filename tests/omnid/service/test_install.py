@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import shutil
 import subprocess
 import sys
@@ -51,10 +52,10 @@ def test_the_command_asks_first(
     def files_only(program: Path, *, page: bool) -> list[install.Step]:
         return [step for step in steps(program, page=page, root=tmp_path) if str(tmp_path) in step.description]
 
-    omnid, answers = Command(capsys), iter("ny")
+    omnid = Command(capsys)
     monkeypatch.setattr(sys, "prefix", "/srv/robot")
     monkeypatch.setattr(install, "steps", files_only)
-    monkeypatch.setattr("builtins.input", lambda _: next(answers))
+    monkeypatch.setattr(sys, "stdin", io.StringIO("n\ny\n"))
     listed = omnid("install-service", "--dry-run").out
     assert [str(tmp_path / name) for name in FILES] == [line.split()[1] for line in listed.splitlines()]
     refused = omnid("install-service")

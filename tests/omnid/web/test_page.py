@@ -34,11 +34,8 @@ from tests.waiting import PATIENCE_S, wait_until
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytestmark = [pytest.mark.browser, pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")]
 SIZES = {"phone": (390, 844), "laptop": (1280, 800), "desk": (1366, 768)}
-# What drives the robot is on the screen without scrolling; on a phone its routes are below.
-CONTROLS = {
-    "phone": ("arm", "goal", "stick", "fit"),
-    "desk": ("arm", "goal", "stick", "fit", "route-name", "route-stop"),
-}
+# What drives the robot is on the screen without scrolling; routes are beside it, on a phone below.
+CONTROLS = ("arm", "goal", "stick", "fit")
 HOSTILE = "<img src=x onerror=document.title='hacked'><script>document.title='hacked'</script>"
 WAIT_MS = 20_000
 
@@ -126,7 +123,7 @@ def expect_it_fits(page: Any, size: str) -> None:
     assert box["height"] >= 80 and box["width"] >= 0.9 * width
     assert box["x"] >= 0 and box["y"] + box["height"] <= height and box["x"] + box["width"] <= width
     page.evaluate("window.scrollTo(0, 0)")
-    for name in CONTROLS.get(size, CONTROLS["desk"]):
+    for name in CONTROLS:
         if control := page.locator(f"#{name}").bounding_box():  # it may be hidden
             assert 0 <= control["y"] <= control["y"] + control["height"] <= box["y"], name
 
