@@ -119,14 +119,14 @@ def report(args: argparse.Namespace) -> int:
     from calib.atomic_file import write_file
     from omnid.formats.tum import read_tum
     from omnid.plain_text import plain
-    from omnid.report.recorded_run import read_run
+    from omnid.report.recorded_run import RecordedRun
     from omnid.report.report import report_html
     from omnid.sinks.files import check_outputs, on_stdout
 
     inputs = [("the log that is read", args.log)] + ([("the truth", args.truth)] if args.truth else [])
     check_outputs([("--output", args.output)], inputs)
     truth = read_tum(args.truth) if args.truth else None
-    recorded = read_run(args.log, args.topic)
+    recorded = RecordedRun(args.log, args.topic)
     html = report_html(recorded, truth)
     write_file(args.output, html.encode("utf-8", "replace"))  # a file's name may be no text
     output = sys.stderr if on_stdout([("--output", args.output)]) else sys.stdout

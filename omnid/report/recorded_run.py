@@ -7,18 +7,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib import se3
 from calib.errors import CalibError
 from calib.rig import Rig
 from calib.rig_file import parse_rig
-from drivers.logs.open_log import LogInfo, log_info
+from drivers.logs.open_log import log_info
 from omnid.formats.tum import POSITION_LIMIT_M
 from omnid.plain_text import plain
 from omnid.recordings.recording import (
@@ -71,54 +70,114 @@ class Event:
     count: int = 0  # by which a counter rose; 0: no counter
 
 
-@dataclass(slots=True)
 class RecordedRun:
-    """Everything that the report shows of a recording. N poses."""
+    """Everything that the report shows of a recording. N poses.
 
-    path: Path
-    info: LogInfo
-    topic: str  # of the odometry
-    robot: str
-    attachments: Mapping[str, bytes]
-    rig: Rig | None
-    rig_fault: str  # why there is no rig
-    start_ns: int  # stamp of the first pose
-    frames: tuple[str, str]  # of the odometry
-    t_s: Array  # (N,) rising
-    T_odom_base: Array  # (N, 4, 4)
-    variances: Array  # (N, 6) of x y z rx ry rz
-    velocity: Array  # (N, 6) m/s, rad/s
-    statuses: list[tuple[float, list[DiagnosticStatus]]]  # messages in the order of the file
-    map_poses: Array  # (M, 4) t, position's and heading's correction by the map [m, rad], sigma [m]
-    map_xy: Array  # (M, 2) m
-    drives: dict[str, Array]  # (K, 3) t, m/s, rad/s by topic: DRIVE, TWIST_COMMAND
-    cloud: Cloud | None  # the newest
-    unreadable: int  # messages left out: not of their type, with a stamp far from the time of logging, out of range
-    late: int  # poses left out: not later than the one before
-    corrupt: int  # chunks and records of the file left out
-    ranks: NDArray[np.int64] = field(init=False)  # (N,) of the state in STATES, UNKNOWN: not recorded
-    newest: dict[str, DiagnosticStatus] = field(init=False)  # of each part, with the newest of all its values
-    by_name: dict[str, list[tuple[float, DiagnosticStatus]]] = field(init=False)  # times and entries of each part
-    restarts: list[int] = field(default_factory=list)  # first poses after each start of the daemon but the first
-    restarted_s: list[float] = field(default_factory=list)  # times of the reports of these starts
-    resets: list[tuple[float, int]] = field(default_factory=list)  # times and numbers of resets of odometry
+    path, info (LogInfo), topic (of the odometry), robot, attachments, frames (of the odometry)
+    rig, or None and why there is none (rig_fault)
+    start_ns: stamp of the first pose; t_s (N,) rising; T_odom_base (N, 4, 4)
+    variances (N, 6) of x y z rx ry rz; velocity (N, 6) m/s, rad/s
+    ranks (N,): of the state in STATES, UNKNOWN where it is not recorded
+    statuses: messages in the order of the file; by_name: times and entries of each part; newest: entries with the
+    newest of all values
+    map_poses (M, 4): t, position's and heading's correction by the map [m, rad], sigma [m]; map_xy (M, 2) m
+    drives: (K, 3) t, m/s, rad/s by topic, DRIVE or TWIST_COMMAND; cloud: the newest
+    restarts: first poses after each start of the daemon but the first; restarted_s: times of the reports of them
+    resets: times and numbers of resets of odometry
+    unreadable: messages left out, not of their type, with a stamp far from the time of logging, out of range; late:
+    poses left out, not later than the one before; corrupt: chunks and records of the file left out
+    """
 
-    def __post_init__(self) -> None:
-        """Find the state of each pose, the newest values of each part, starts and resets."""
-        self.newest, self.by_name = {}, {}
-        for t_s, status in ((t_s, status) for t_s, message in self.statuses for status in message):
+    def __init__(self, path: Path, topic: str | None = None) -> None:
+        """Read a recording; topic: of the odometry, see choose_odometry_topic.
+
+        Raise OmnidError where there is no odometry in it, DriverError where there is no log.
+        """
+        self.path, self.info = path, log_info(path)
+        reader = RecordingReader(self.info, choose_odometry_topic(self.info, topic))
+        self.topic, self.robot, self.attachments = reader.topic, reader.robot, reader.attachments
+        # 1. All messages; poses whose stamps are far from the time of logging, or that are out of range, are left out.
+        poses, map_poses = list[Pose](), list[PoseInMap]()
+        statuses, names = list[Diagnostics](), set[str]()
+        drives: dict[str, list[TwistRecord]] = {}
+        self.cloud: Cloud | None = None
+        offset_ns: int | None = None  # from the stamps of the poses to the times of logging
+        out_of_range = self.late = 0
+        for message in reader.messages((ODOMETRY, MAP_POSE, STATUS, CLOUD, DRIVE, TWIST_COMMAND)):
+            match message.content:
+                case Pose() as pose:
+                    offset_ns = message.log_time_ns - pose.stamp_ns if offset_ns is None else offset_ns
+                    is_near = abs(message.log_time_ns - pose.stamp_ns - offset_ns) <= MAX_CLOCK_OFFSET_S * 1e9
+                    if not (is_near and (np.abs(pose.T_odom_base[:-1, -1]) <= POSITION_LIMIT_M).all()):
+                        out_of_range += 1
+                    elif poses and pose.stamp_ns <= poses[-1].stamp_ns:
+                        self.late += 1
+                    else:
+                        poses.append(pose)
+                case PoseInMap() as in_map if (np.abs(in_map.T_map_base[:-1, -1]) <= POSITION_LIMIT_M).all():
+                    map_poses.append(in_map)
+                case Diagnostics(stamp_ns, entries):
+                    bounded = [_bounded(status) for status in entries]
+                    names |= {status.name for status in bounded[: MOST - len(names)]}
+                    statuses.append(Diagnostics(stamp_ns, tuple(status for status in bounded if status.name in names)))
+                case Cloud():
+                    self.cloud = message.content
+                case TwistRecord():
+                    drives.setdefault(message.name, []).append(message.content)
+        if not poses:
+            raise no_pose(path, reader.topic)
+        self.unreadable, self.corrupt = reader.unreadable.total() + out_of_range, reader.corrupt
+        # 2. The rig.
+        self.rig: Rig | None = None
+        self.rig_fault = "no rig.toml is attached"
+        if (rig_toml := reader.attachments.get("rig.toml")) is not None:
+            try:
+                self.rig = parse_rig(rig_toml)
+            except CalibError as error:
+                self.rig_fault = f"the attached rig.toml cannot be read: {error}"
+        # 3. The arrays.
+        self.start_ns, self.frames = poses[0].stamp_ns, poses[0].frames
+
+        def seconds(stamp_ns: int) -> float:
+            return (stamp_ns - self.start_ns) * 1e-9
+
+        self.t_s = np.array([seconds(pose.stamp_ns) for pose in poses])
+        self.T_odom_base = np.array([pose.T_odom_base for pose in poses])
+        self.variances = np.array([np.diag(pose.covariance) for pose in poses])
+        self.velocity = np.array([pose.velocity for pose in poses])
+        self.statuses = [(seconds(report.stamp_ns), report.statuses) for report in statuses]
+        self.drives = {
+            name: np.array([(seconds(twist.stamp_ns), twist.velocity_mps, twist.yaw_rate_radps) for twist in twists])
+            for name, twists in drives.items()
+        }
+        # 4. The pose in the map relative to that of odometry with the same stamp: map -> odom as seen at the robot.
+        by_stamp = {pose.stamp_ns: pose.T_odom_base for pose in poses}
+        corrections, map_xy = [], []
+        for in_map in map_poses:
+            if (T_odom := by_stamp.get(in_map.stamp_ns)) is not None:
+                T_map, sigma_m = in_map.T_map_base, root(np.trace(in_map.covariance[:3, :3]))
+                moved_m, turned_rad = math.dist(T_map[:2, -1], T_odom[:2, -1]), se3.yaw(T_map @ se3.inverse(T_odom))
+                corrections.append((seconds(in_map.stamp_ns), moved_m, turned_rad, sigma_m))
+                map_xy.append(T_map[:2, -1])
+        self.map_poses, self.map_xy = np.array(corrections).reshape(-1, 4), np.array(map_xy).reshape(-1, 2)
+        # 5. The newest values of each part, the state of each pose, starts and resets.
+        self.newest: dict[str, DiagnosticStatus] = {}
+        self.by_name: dict[str, list[tuple[float, DiagnosticStatus]]] = {}
+        for t_s, status in ((t_s, status) for t_s, report in self.statuses for status in report):
             self.by_name.setdefault(status.name, []).append((t_s, status))
             values = self.newest[status.name].values if status.name in self.newest else {}
             merged = dict([*{**values, **status.values}.items()][:MOST])
             self.newest[status.name] = replace(status, values=merged)
         # An entry with `state` has the stamp of the first pose in it; others tell the state of an earlier pose.
-        entries = self.entries(status_names.ODOMETRY)
-        entries = [(t, status) for t, status in entries if Key.STATE in status.values] or entries
-        found = [(t, status_names.tracking_state(status.message, status.values)) for t, status in entries]
-        known = sorted((t, STATES.index(state)) for t, state in found if state is not None)
+        found = self.entries(status_names.ODOMETRY)
+        found = [(t, status) for t, status in found if Key.STATE in status.values] or found
+        states = [(t, status_names.tracking_state(status.message, status.values)) for t, status in found]
+        known = sorted((t, STATES.index(state)) for t, state in states if state is not None)
         ranks = np.array([UNKNOWN, *(rank for _, rank in known)])
         self.ranks = ranks[np.searchsorted([t for t, _ in known], self.t_s + 1e-9, side="right")]
-        self._starts_and_resets()
+        self.restarts, self.restarted_s = list[int](), list[float]()
+        self.resets = list[tuple[float, int]]()
+        self._find_starts_and_resets()
 
     @property
     def T_base_rig(self) -> Array:
@@ -187,7 +246,7 @@ class RecordedRun:
             found += self._counter_events(name)
         return sorted(found, key=lambda event: event.start_s)
 
-    def _starts_and_resets(self) -> None:
+    def _find_starts_and_resets(self) -> None:
         """Find the starts of the daemon, with a new odom, by the identity of its runs, and the resets of odometry."""
         run, newest = "", -1
         for t_s, status in self.entries(status_names.ODOMETRY):
@@ -232,91 +291,6 @@ class RecordedRun:
                     start_s, end_s = float(t_s[same[0] + 1]), float(t_s[same[-1] + 1])
                     text, count = _COUNTERS.get(key, key), int(rises[same].sum())
                     yield Event(start_s, end_s, WARNING, short_name(name), text, count)
-
-
-def read_run(path: Path, topic: str | None = None) -> RecordedRun:
-    """Read a recording; topic: of the odometry, see choose_odometry_topic.
-
-    Raise OmnidError where there is no odometry in it, DriverError where there is no log.
-    """
-    found = log_info(path)
-    reader = RecordingReader(found, choose_odometry_topic(found, topic))
-    # 1. All messages; poses whose stamps are far from the time of logging, or that are out of range, are left out.
-    poses, map_poses = list[Pose](), list[PoseInMap]()
-    statuses, names = list[tuple[int, list[DiagnosticStatus]]](), set[str]()
-    drives: dict[str, list[TwistRecord]] = {}
-    cloud: Cloud | None = None
-    offset_ns: int | None = None  # from the stamps of the poses to the times of logging
-    out_of_range = late = 0
-    for message in reader.messages((ODOMETRY, MAP_POSE, STATUS, CLOUD, DRIVE, TWIST_COMMAND)):
-        match message.content:
-            case Pose() as pose:
-                offset_ns = message.log_time_ns - pose.stamp_ns if offset_ns is None else offset_ns
-                is_near = abs(message.log_time_ns - pose.stamp_ns - offset_ns) <= MAX_CLOCK_OFFSET_S * 1e9
-                if not (is_near and (np.abs(pose.T_odom_base[:-1, -1]) <= POSITION_LIMIT_M).all()):
-                    out_of_range += 1
-                elif poses and pose.stamp_ns <= poses[-1].stamp_ns:
-                    late += 1
-                else:
-                    poses.append(pose)
-            case PoseInMap() as in_map if (np.abs(in_map.T_map_base[:-1, -1]) <= POSITION_LIMIT_M).all():
-                map_poses.append(in_map)
-            case Diagnostics(stamp_ns, entries):
-                bounded = [_bounded(status) for status in entries]
-                names |= {status.name for status in bounded[: MOST - len(names)]}
-                statuses.append((stamp_ns, [status for status in bounded if status.name in names]))
-            case Cloud():
-                cloud = message.content
-            case TwistRecord():
-                drives.setdefault(message.name, []).append(message.content)
-    if not poses:
-        raise no_pose(path, reader.topic)
-    # 2. Their arrays.
-    start_ns, rig_toml = poses[0].stamp_ns, reader.attachments.get("rig.toml")
-    rig, fault = None, "no rig.toml is attached"
-    if rig_toml is not None:
-        try:
-            rig = parse_rig(rig_toml)
-        except CalibError as error:
-            fault = f"the attached rig.toml cannot be read: {error}"
-
-    def seconds(stamp_ns: int) -> float:
-        return (stamp_ns - start_ns) * 1e-9
-
-    # 3. The pose in the map relative to that of odometry with the same stamp: map -> odom as seen at the robot.
-    by_stamp = {pose.stamp_ns: pose.T_odom_base for pose in poses}
-    map_poses = [pose for pose in map_poses if pose.stamp_ns in by_stamp]
-    corrections = []
-    for in_map in map_poses:
-        T_map, T_odom = in_map.T_map_base, by_stamp[in_map.stamp_ns]
-        moved_m, sigma_m = math.dist(T_map[:2, -1], T_odom[:2, -1]), root(np.trace(in_map.covariance[:3, :3]))
-        corrections.append((seconds(in_map.stamp_ns), moved_m, se3.yaw(T_map @ se3.inverse(T_odom)), sigma_m))
-    return RecordedRun(
-        path=path,
-        info=found,
-        topic=reader.topic,
-        robot=reader.robot,
-        attachments=reader.attachments,
-        rig=rig,
-        rig_fault=fault,
-        start_ns=start_ns,
-        frames=poses[0].frames,
-        t_s=np.array([seconds(pose.stamp_ns) for pose in poses]),
-        T_odom_base=np.array([pose.T_odom_base for pose in poses]),
-        variances=np.array([np.diag(pose.covariance) for pose in poses]),
-        velocity=np.array([pose.velocity for pose in poses]),
-        statuses=[(seconds(stamp_ns), entries) for stamp_ns, entries in statuses],
-        map_poses=np.array(corrections).reshape(-1, 4),
-        map_xy=np.array([pose.T_map_base[:2, -1] for pose in map_poses]).reshape(-1, 2),
-        drives={
-            name: np.array([(seconds(twist.stamp_ns), twist.velocity_mps, twist.yaw_rate_radps) for twist in twists])
-            for name, twists in drives.items()
-        },
-        cloud=cloud,
-        unreadable=reader.unreadable.total() + out_of_range,
-        late=late,
-        corrupt=reader.corrupt,
-    )
 
 
 def root(variances: Array) -> Array:

@@ -9,7 +9,7 @@ from calib.rig import Rig
 from drivers.logs.log_reader import LogReader
 from omnid.formats.tum import Trajectory
 from omnid.report.charts import style_and_script
-from omnid.report.recorded_run import read_run
+from omnid.report.recorded_run import RecordedRun
 from omnid.report.report import report_html
 from omnid.runs.session import attached_rig
 
@@ -50,7 +50,7 @@ class Page(HTMLParser):
 
 
 def html_of(path: Path, truth: Trajectory | None = None) -> str:
-    return report_html(read_run(path), truth)
+    return report_html(RecordedRun(path), truth)
 
 
 def assert_harmless(page: Page) -> None:

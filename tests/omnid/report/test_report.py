@@ -22,7 +22,7 @@ from omnid.cli import main
 from omnid.errors import OmnidError
 from omnid.formats.tum import Trajectory, tum_row
 from omnid.recordings.evaluation import evaluate
-from omnid.report.recorded_run import RecordedRun, read_run
+from omnid.report.recorded_run import RecordedRun
 from omnid.report.report import MAX_EVENTS, _Truth, report_html
 from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.status_names import ODOMETRY, PAIRING, PLACES, SUMMARY, WHEELS, Key, camera_name, stage_name
@@ -140,7 +140,7 @@ def test_a_very_large_log_gives_a_small_page(tmp_path: Path) -> None:
                 )
             )
     entries.append(cloud(2999, np.random.default_rng(1).uniform(-9, 9, (200_000, 3))))
-    found = read_run(save(tmp_path / "log.mcap", entries))
+    found = RecordedRun(save(tmp_path / "log.mcap", entries))
     html = report_html(found)
     assert len(html) < 3_000_000 and len(found.events()) > MAX_EVENTS
     assert re.search(r"and \d+ more", Page(html).text)
@@ -214,7 +214,7 @@ def test_states_gaps_resets_losses_and_messages_are_events(tmp_path: Path) -> No
         ),
         state(4, "tracking"),  # recorded late
     ]
-    found = read_run(save(tmp_path / "log.mcap", entries))
+    found = RecordedRun(save(tmp_path / "log.mcap", entries))
     assert np.unique(found.ranks, return_counts=True)[1].tolist() == [75, 5]
     assert event_texts(found) == [
         ("pairing", "none"),
@@ -256,7 +256,7 @@ def test_a_robot_that_was_started_again_during_the_recording_has_not_jumped_to_i
         *straight(60, 20),
         started(65, "b", after),
     ]
-    found = read_run(save(tmp_path / "a.mcap", entries))
+    found = RecordedRun(save(tmp_path / "a.mcap", entries))
     assert found.length_m() == pytest.approx(2 * 1.9) and found.restarts == [20]
     assert event_texts(found).count(STARTED_AGAIN) == 1 and sum(count for _, count in found.resets) == resets
 
@@ -266,25 +266,25 @@ def test_what_is_invalid_is_left_out_and_counted(tmp_path: Path) -> None:
     far[0, 3] = 1e12
     stray = (at(10), "/omnid/odom", "nav_msgs/msg/Odometry", odom(10**6)[3])
     entries = [*run(10), (at(10), *odom(10, far)[1:]), stray, (at(11), *odom(5, np.eye(4))[1:]), odom(12)]
-    found = read_run(save(tmp_path / "log.mcap", entries))
+    found = RecordedRun(save(tmp_path / "log.mcap", entries))
     assert (len(found.t_s), found.unreadable, found.late) == (11, 2, 1)
     text = Page(report_html(found)).text
     assert "2 messages were left out" in text and "1 poses were left out" in text
     log = save(tmp_path / "a.mcap", run(60))
     corrupt_chunks(log)
-    found = read_run(log)
+    found = RecordedRun(log)
     assert found.corrupt == 2 and 40 < len(found.t_s) < 60
     page = report_html(found)
     assert "2 corrupt chunks or records were skipped." in page and "MB, cut or corrupt. Poses" in page
     single = save(tmp_path / "b.mcap", [odom(0), map_pose(1, np.eye(4))], {"omnid.toml": b"a." * 20_000 + b"a = 1"})
-    assert not len(read_run(single).map_poses) and "settings cannot be read" in html_of(single)
+    assert not len(RecordedRun(single).map_poses) and "settings cannot be read" in html_of(single)
 
 
 def test_the_path_in_the_map_is_drawn_beside_that_of_odometry_and_its_correction_over_time(tmp_path: Path) -> None:
     moved = se3.exp([0.3, 0.4, 0, 0, 0, 0.1])
     poses = [entry for k in range(60) for entry in (odom(k), map_pose(k, np.eye(4) if k < 30 else moved))]
     places = status(59, DiagnosticStatus(PLACES, 0, "localized", {"keyframes": "12", "loops": "3"}))
-    found = read_run(save(tmp_path / "a.mcap", [*poses, places]))
+    found = RecordedRun(save(tmp_path / "a.mcap", [*poses, places]))
     _, moved_m, turned_rad, sigma_m = found.map_poses.T
     assert moved_m[0] == pytest.approx(0, abs=1e-9) and 0.3 < moved_m[-1] < 0.7
     assert turned_rad[-1] == pytest.approx(0.1) and sigma_m[-1] == pytest.approx(np.sqrt(3e-4))
@@ -302,7 +302,7 @@ def test_compares_with_the_truth_as_eval_does(tmp_path: Path, capsys: pytest.Cap
     drift = [se3.exp([0.001 * k, 0, 0, 0, 0, 0.0005 * k]) for k in range(100)]
     T_odom_rig = np.array([se3.inverse(T_base_rig) @ T_odom_base(k) @ T_base_rig for k in range(100)])
     truth = Trajectory(np.array([at(k) for k in range(100)]), T_world_odom @ T_odom_rig @ np.array(drift))
-    found, expected = _Truth(read_run(log), truth), evaluate(Trajectory(truth.stamps_ns, T_odom_rig), truth)
+    found, expected = _Truth(RecordedRun(log), truth), evaluate(Trajectory(truth.stamps_ns, T_odom_rig), truth)
     assert found.metrics.ate_rmse_m == pytest.approx(expected.ate_rmse_m, rel=1e-6)
     assert found.position_m.max() == pytest.approx(expected.ate_max_m, rel=1e-6)
     assert found.heading_rad[-1] == pytest.approx(expected.heading_end_rad, rel=1e-6)
