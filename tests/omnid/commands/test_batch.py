@@ -76,7 +76,7 @@ def test_results_are_those_of_single_runs_and_what_is_done_is_not_done_again(tmp
     assert (folder / "report.html").exists() and (folder / "recording.mcap").exists()
     found = result(folder)
     assert found["status"] == "ok" and found["replay"]["counters"]["pairs"] >= 3 and found["eval"]["ate_rmse_m"] == 0
-    assert result(broken)["status"] == "failed" and "is not an MCAP log" in result(broken)["error"]
+    assert result(broken)["status"] == "failed" and "is no log" in result(broken)["error"]
 
     before_ns = (folder / "result.json").stat().st_mtime_ns
     short_log(tmp_path / "logs" / "broken.mcap")

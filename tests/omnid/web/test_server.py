@@ -16,7 +16,7 @@ import time
 import zlib
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ import numpy as np
 import pytest
 
 from omnid.transport import codec
-from omnid.transport.bus import Bus
+from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import DiagnosticStatus, PoseAttachment
 from omnid.transport.status_names import BUS, WHEELS
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry
@@ -361,3 +361,17 @@ def test_a_signal_ends_it_with_pages_open() -> None:
         assert time.monotonic() - begin_s < PATIENCE_S
         with pytest.raises((OSError, http.client.HTTPException, AssertionError)):
             asking.result()
+
+
+def test_a_page_that_is_opened_after_a_drive_has_its_path() -> None:
+    endpoint, way = free_endpoint(), [[0.0, 0.0], [1.0, 0.0], [2.0, 1.0]]
+    with ExitStack() as ends:
+        bus = ends.enter_context(closing(Bus(BusConfig(listen=(endpoint,)))))
+        bus.publish("path", codec.path_cdr(10**18, "odom", way))
+        server = ends.enter_context(served("--connect", endpoint))
+
+        def shown() -> object:
+            news = json.loads(server.request("/live?seen=0", headers=server.bearer).text)
+            return news.get("path", {}).get("points")
+
+        wait_until(lambda: shown() == way, "the path")
