@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -19,12 +20,11 @@ from drivers.logs.log_reader import LogCameras, LogReader
 from omnid.calibration.images import open_log
 from omnid.config import Config
 from omnid.core.rig.column_finding import RigState, match
-from omnid.core.rig.drive_landmarks import LANDMARKS, DriveLandmarks, PanoramaObservations, View, image_pixels
+from omnid.core.rig.drive_landmarks import DriveLandmarks, PanoramaObservations, View, image_pixels
 from omnid.core.rig.rig_health import RigHealth
 from omnid.core.stereo.triangulation import triangulate
 from omnid.errors import OmnidError
 from omnid.messages import FramePair, OdometryUpdate
-from omnid.stages.dense_depths import DenseDepths
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry, geometry
@@ -108,90 +108,51 @@ def observe_pairs(pairs: Sequence[FramePair], rig: Rig, config: Config) -> tuple
 def _drive(log: Path, place: Geometry, cameras: LogCameras, config: Config, most: int) -> Drives:
     """Return keyframes of one drive, at most the given number, its landmarks, and their pixels in the images."""
     front_end = FrontEnd(place, config, RigHealth(place.cylinder, "warn"))
-    collector = DriveCollector(place, front_end.dense)
-    newest = np.eye(4)
+    landmarks = DriveLandmarks(place.model(NOISE_PX))
+    T_rig_odom, twists, delays_s = list[Array](), list[Array](), list[float]()
+    T_newest, since = np.eye(4), 0
     with closing(open_log(log, cameras, place.rig)) as reader:
         # So many pairs at least lie between two keyframes that there are not too many.
-        choice = KeyframeChoice(max(1, -(-(reader.pair_estimate() or 0) // most)))
-        for update, twist in _with_twists(tracked_updates(reader, front_end, config, log)):
-            newest = update.T_odom_rig
-            if choice.takes(update):
-                collector.add(update, twist)
-    return collector.drives(newest)
+        apart = max(1, -(-(reader.pair_estimate() or 0) // most))
+        for before, update, after in _with_neighbours(tracked_updates(reader, front_end, config, log)):
+            # 1. Choose the poses that are far enough apart to add information.
+            T_newest, since = update.T_odom_rig, since + 1
+            if T_rig_odom:
+                moved = se3.log(T_rig_odom[-1] @ T_newest)
+                still = np.linalg.norm(moved[:3]) < KEYFRAME_M and np.linalg.norm(moved[3:]) < KEYFRAME_RAD
+                if still or since < apart or update.state is TrackingState.LOST:
+                    continue
+            since = 0
+            # 2. Follow the landmarks to this keyframe.
+            seen, disparity = update.depth.panoramas, front_end.dense.of(update.depth).disparity
+            landmarks.add(View(seen.lower, seen.upper, seen.visible, disparity, T_newest @ place.T_rig_rect))
+            T_rig_odom.append(se3.inverse(T_newest))
+            # 3. Its motion: the twist per second from the pose before to the one after, in the rig frame.
+            span_s = 1e-9 * (after.stamp_ns - before.stamp_ns)
+            step = se3.log(se3.inverse(before.T_odom_rig) @ after.T_odom_rig)
+            twists.append(step / span_s if span_s > 0 else np.zeros(6))
+            # Upper minus lower stamp; the rig's delay of the exposures is a parameter of its own.
+            delays_s.append(seen.times.skew_s - place.rig.times.upper_delay_s)
+    # 4. The observations in the images.
+    found = landmarks.observations()
+    pixels = image_pixels(found, place.rig, place.cylinder)
+    observations = DriveObservations(found.keyframe, found.landmark, found.camera, pixels)
+    observations, used = observations.only(np.asarray(np.isfinite(pixels).all(axis=1)))
+    poses, points = np.array(T_rig_odom), found.points[used]
+    state = DriveState(poses, points, np.array(twists), np.array(delays_s), np.zeros(0))
+    return Drives(state, observations, (0,), poses[-1] @ T_newest)
 
 
-class DriveCollector:
-    """Follows the landmarks of one drive from keyframe to keyframe."""
-
-    def __init__(self, place: Geometry, dense: DenseDepths, landmarks: int = LANDMARKS) -> None:
-        self._place, self._dense = place, dense
-        self._landmarks = DriveLandmarks(place.model(NOISE_PX), landmarks)
-        self._T_rig_odom, self._twists, self._delays_s = list[Array](), list[Array](), list[float]()
-
-    @property
-    def keyframes(self) -> int:
-        """Number of keyframes."""
-        return len(self._T_rig_odom)
-
-    def add(self, update: OdometryUpdate, twist: Array) -> None:
-        """Take a keyframe with its twist (6,) per second, in the rig frame."""
-        seen, place = update.depth.panoramas, self._place
-        T_odom_rect = update.T_odom_rig @ place.T_rig_rect
-        disparity = self._dense.of(update.depth).disparity
-        self._landmarks.add(View(seen.lower, seen.upper, seen.visible, disparity, T_odom_rect))
-        self._T_rig_odom.append(se3.inverse(update.T_odom_rig))
-        self._twists.append(twist)
-        # Upper minus lower stamp; the rig's delay of the exposures is a parameter of its own.
-        self._delays_s.append(seen.times.skew_s - place.rig.times.upper_delay_s)
-
-    def drives(self, T_odom_last: Array) -> Drives:
-        """Return the observations; T_odom_last (4, 4): pose of the last pair."""
-        found, place = self._landmarks.observations(), self._place
-        pixels = image_pixels(found, place.rig, place.cylinder)
-        observations = DriveObservations(found.keyframe, found.landmark, found.camera, pixels)
-        observations, used = observations.only(np.asarray(np.isfinite(pixels).all(axis=1)))
-        T_rig_odom, twist = np.array(self._T_rig_odom), np.array(self._twists)
-        state = DriveState(T_rig_odom, found.points[used], twist, np.array(self._delays_s), np.zeros(0))
-        return Drives(state, observations, (0,), self._T_rig_odom[-1] @ T_odom_last)
-
-
-class KeyframeChoice:
-    """Chooses the poses that are far enough apart to add information."""
-
-    def __init__(self, apart: int = 1, apart_m: float = KEYFRAME_M, apart_rad: float = KEYFRAME_RAD) -> None:
-        """Keyframes are at least `apart` pairs apart, and either apart_m or apart_rad."""
-        self._apart, self._apart_m, self._apart_rad = apart, apart_m, apart_rad
-        self._last: Array | None = None
-        self._since = 0
-
-    def takes(self, update: OdometryUpdate) -> bool:
-        """True if a pose becomes a keyframe."""
-        self._since += 1
-        if self._last is not None:
-            moved = se3.log(se3.inverse(self._last) @ update.T_odom_rig)
-            still = np.linalg.norm(moved[:3]) < self._apart_m and np.linalg.norm(moved[3:]) < self._apart_rad
-            if still or self._since < self._apart or update.state is TrackingState.LOST:
-                return False
-        self._last, self._since = update.T_odom_rig, 0
-        return True
-
-
-def _with_twists(updates: Iterator[OdometryUpdate]) -> Iterator[tuple[OdometryUpdate, Array]]:
-    """Yield each pose with the twist (6,) per second from the pose before to the one after, in the rig frame."""
+def _with_neighbours(
+    updates: Iterator[OdometryUpdate],
+) -> Iterator[tuple[OdometryUpdate, OdometryUpdate, OdometryUpdate]]:
+    """Yield each pose between the one before and the one after, which are itself at the ends."""
     before: OdometryUpdate | None = None
     current: OdometryUpdate | None = None
-    for after in updates:
+    for after in chain(updates, [None]):
         if current is not None:
-            yield current, _twist(before or current, after)
+            yield before or current, current, after or current
         before, current = current, after
-    if current is not None:
-        yield current, _twist(before or current, current)
-
-
-def _twist(first: OdometryUpdate, last: OdometryUpdate) -> Array:
-    span_s = 1e-9 * (last.stamp_ns - first.stamp_ns)
-    moved = se3.log(se3.inverse(first.T_odom_rig) @ last.T_odom_rig)
-    return np.asarray(moved / span_s) if span_s > 0 else np.zeros(6)
 
 
 def tracked_updates(reader: LogReader, front_end: FrontEnd, config: Config, log: Path) -> Iterator[OdometryUpdate]:
