@@ -301,10 +301,19 @@ def rig_toml(rig: Rig, images: Mapping[str, str] | None = None) -> str:
         }
         text += _table_text(side, head) + _table_text(f"{side}.intrinsics", _intrinsics(camera))
         if mounted.mask is not None:
-            text += _table_text(f"{side}.mask", _mask_values(mounted.mask, (images or {}).get(side)))
+            mask, image = mounted.mask, (images or {}).get(side)
+            if mask.image is not None and not image:
+                image = EMBEDDED + base64.b64encode(png(mask.image)).decode()
+            outer_px = mask.outer_px if np.isfinite(mask.outer_px) else None
+            text += _table_text(f"{side}.mask", asdict(MaskTable(mask.center, mask.inner_px, outer_px, image)))
     if rig.times != ShutterTimes():
         text += _table_text("times", asdict(TimesTable(rig.times.upper_delay_s, rig.times.line_time_s)))
-    return text if rig.covariance is None else text + covariance_toml(rig.covariance)
+    if (covariance := rig.covariance) is not None:
+        correlation = tuple(tuple(row[:k]) for k, row in enumerate(covariance.correlation.tolist()))
+        sigmas = tuple(covariance.sigmas.tolist())
+        table = CovarianceTable(COVARIANCE_VERSION, covariance.names, sigmas, correlation)
+        text += _table_text("covariance", asdict(table))
+    return text
 
 
 def _intrinsics(camera: OmniCamera) -> Mapping[str, object]:
@@ -316,21 +325,6 @@ def _intrinsics(camera: OmniCamera) -> Mapping[str, object]:
     a, b, x, y, s = camera.wavefront
     waves = ((a, b, x, y, s), camera.distance_m) if any(camera.wavefront) else (None, None)
     return asdict(OcamIntrinsics(camera.polynomial, *camera.center_row_column, *camera.affine, p1, p2, s1, s2, *waves))
-
-
-def _mask_values(mask: Mask, name: str | None) -> Mapping[str, object]:
-    image = name
-    if mask.image is not None and not name:
-        image = EMBEDDED + base64.b64encode(png(mask.image)).decode()
-    outer_px = mask.outer_px if np.isfinite(mask.outer_px) else None
-    return asdict(MaskTable(mask.center, mask.inner_px, outer_px, image))
-
-
-def covariance_toml(covariance: RigCovariance) -> str:
-    """Return the table of a covariance, which parses to the same numbers."""
-    correlation = tuple(tuple(row[:k]) for k, row in enumerate(covariance.correlation.tolist()))
-    sigmas = tuple(covariance.sigmas.tolist())
-    return _table_text("covariance", asdict(CovarianceTable(COVARIANCE_VERSION, covariance.names, sigmas, correlation)))
 
 
 def _table_text(name: str, values: Mapping[str, object]) -> str:

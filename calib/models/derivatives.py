@@ -63,10 +63,10 @@ def _derivatives(camera: OcamCamera, points: Array, names: Sequence[str]) -> tup
     bent_x, bent_y = camera.distort(x, y)
     xx, xy, yy = camera.distortion_jacobian(x, y)
     c, d, e = camera.affine
-    A = np.array([[e, 1.0], [c, d]]) @ _matrices(xx, xy, xy, yy)
+    affine = np.array([[e, 1.0], [c, d]])
+    A = affine @ np.stack([_pairs(xx, xy), _pairs(xy, yy)], axis=1)
     by_ray = A @ ideal_by_ray
     x2, y2, rho2, zero, one = x * x, y * y, x * x + y * y, np.zeros(len(x)), np.ones(len(x))
-    affine = np.array([[e, 1.0], [c, d]])
     columns = {
         "center_row": _pairs(zero, one),
         "center_column": _pairs(one, zero),
@@ -82,7 +82,8 @@ def _derivatives(camera: OcamCamera, points: Array, names: Sequence[str]) -> tup
             columns[name] = np.einsum("nij,nj->ni", A, _pairs(ux, uy) * (-r * rho ** int(name[1:]) / by_rho)[:, None])
     columns |= {name: np.einsum("nij,nj->ni", by_ray, change) for name, change in ray_by_wave.items()}
     by_point = by_ray if ray_by_point is None else by_ray @ ray_by_point
-    return by_point, _stacked(columns, names, len(points))
+    by_name = [columns[name] for name in names]
+    return by_point, np.stack(by_name, axis=2) if by_name else np.zeros((len(points), 2, 0))
 
 
 def _direction_derivatives(
@@ -119,12 +120,3 @@ def _direction_derivatives(
 
 def _pairs(u: Array, v: Array) -> Array:
     return np.stack([u, v], axis=1)
-
-
-def _matrices(a: Array, b: Array, c: Array, d: Array) -> Array:
-    """Return matrices (N, 2, 2) [a b; c d]."""
-    return np.stack([_pairs(a, b), _pairs(c, d)], axis=1)
-
-
-def _stacked(columns: dict[str, Array], names: Sequence[str], count: int) -> Array:
-    return np.stack([columns[name] for name in names], axis=2) if names else np.zeros((count, 2, 0))

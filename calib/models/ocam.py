@@ -122,7 +122,8 @@ class OcamCamera:
         diagonal = float(np.hypot(*self.size))
         with np.errstate(all="ignore"):
             try:
-                turning = np.roots(self._turning()[::-1])
+                # rho f'(rho) - f(rho) is rho^2 times the slope of f(rho) / rho.
+                turning = np.roots([(power - 1) * a for power, a in enumerate(self.polynomial)][::-1])
             except np.linalg.LinAlgError:  # infinite coefficients
                 raise self._not_evaluable() from None
         real = turning.real[np.isreal(turning) & (turning.real > 0)]
@@ -133,10 +134,6 @@ class OcamCamera:
             "ocam camera: the polynomial overflows on the image; check its coefficients, the largest of "
             f"which is {max(self.polynomial, key=abs):g}"
         )
-
-    def _turning(self) -> Array:
-        """Return the coefficients of rho * f'(rho) - f(rho): rho^2 times the slope of f(rho)/rho."""
-        return np.array([(power - 1) * a for power, a in enumerate(self.polynomial)])
 
     def height(self, radius_px: Array) -> Array:
         """Return f(rho) (N,) [px]: the ray's third component before the mirror's sign."""
@@ -261,11 +258,6 @@ def project_near(camera: OmniCamera, points: Array) -> Array:
     return camera.project_near(points) if isinstance(camera, OcamCamera) else camera.project(points)
 
 
-def wavefront_of(camera: OmniCamera) -> tuple[float, ...]:
-    """Return the wavefront [m] of a camera of any model."""
-    return camera.wavefront if isinstance(camera, OcamCamera) else NO_WAVEFRONT
-
-
 def has_wavefront(camera: OmniCamera) -> bool:
     """True if a camera's rays do not meet in one point."""
-    return any(wavefront_of(camera))
+    return isinstance(camera, OcamCamera) and any(camera.wavefront)

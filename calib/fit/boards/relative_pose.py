@@ -98,7 +98,12 @@ def _poses_of(
 def _consensus(candidates: Array) -> tuple[Array, Array]:
     """Return the candidate (4, 4) of (K, S, 4, 4) with the most support, and the distances (K, S) of all from it."""
     flat = candidates.reshape(-1, 4, 4)
-    apart = np.array([_pose_distance(candidates, T) for T in flat])  # (K S, K, S)
+    # The distances (K S, K, S) of all from each: angle [rad] plus shift in parts of the length of the translation.
+    R, t = se3.R_of(flat), se3.t_of(flat)
+    gaps = se3.rotation_log(np.swapaxes(R, -1, -2) @ R[:, None])
+    length = np.maximum(np.linalg.norm(t, axis=-1), np.finfo(float).tiny)[:, None]
+    distances = np.linalg.norm(gaps, axis=-1) + np.linalg.norm(t - t[:, None], axis=-1) / length
+    apart = distances.reshape(-1, *candidates.shape[:2])
     nearest = apart.min(axis=2)
     # Far ones count alike: the cost is that of MSAC (Torr and Zisserman 2000).
     cost = np.minimum(nearest, MAX_INLIER_DISTANCE).mean(axis=1)
@@ -110,12 +115,3 @@ def _consensus(candidates: Array) -> tuple[Array, Array]:
             "ambiguous in these pairs; hold it at more places, or use a board with one odd and one even side"
         )
     return flat[best], apart[best]
-
-
-def _pose_distance(T: Array, other: Array) -> Array:
-    """Return the distances of transforms (..., 4, 4) from another: angle [rad] plus shift relative to its length."""
-    gap = se3.rotation_log(np.swapaxes(se3.R_of(T), -1, -2) @ se3.R_of(other))
-    shift = np.linalg.norm(se3.t_of(T) - se3.t_of(other), axis=-1)
-    return np.asarray(
-        np.linalg.norm(gap, axis=-1) + shift / max(float(np.linalg.norm(se3.t_of(other))), np.finfo(float).tiny)
-    )
