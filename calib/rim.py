@@ -74,23 +74,14 @@ def _polar(image: NDArray[np.uint8], center: tuple[float, float], radius_px: int
 
 def _edges(image: NDArray[np.uint8], center: tuple[float, float], levels: tuple[float, float]) -> Array:
     """Return the pixels (N, 2), at most one per azimuth, beyond which the image is dark, with subpixel accuracy."""
-    threshold = levels[0] + EDGE_FRACTION * (levels[1] - levels[0])
     polar = _polar(image, center, int(np.hypot(*image.shape)))
-    azimuth, radius_px = _last_edges(polar, threshold)
-    return np.column_stack([center[0] + radius_px * np.cos(azimuth), center[1] + radius_px * np.sin(azimuth)])
-
-
-def _last_edges(polar: Array, threshold: float) -> tuple[Array, Array]:
-    """Return azimuths [rad] and radii [px], (N,) each, of the last steep falls below the threshold, where there are.
-
-    polar: profiles (AZIMUTHS, radius); an image is convex, so each is inside it from one radius to another.
-    """
-    # 1. The last light pixel, with enough pixels of the image on either side.
-    known, light = np.isfinite(polar), polar >= threshold
+    # 1. The last light pixel, with enough pixels of the image on either side: an image is convex, so each profile is
+    #    inside it from one radius to another.
+    known, light = np.isfinite(polar), polar >= levels[0] + EDGE_FRACTION * (levels[1] - levels[0])
     first, count = known.argmax(axis=1), known.sum(axis=1)
     last = polar.shape[1] - 1 - light[:, ::-1].argmax(axis=1)
     rows = np.flatnonzero(light.any(axis=1) & (last - first >= EDGE_PX) & (last - first + 2 * EDGE_PX < count))
-    # 2. Levels on either side of the fall.
+    # 2. Levels on either side of the fall, which is steep.
     near = polar[rows[:, None], last[rows, None] + np.arange(1 - EDGE_PX, 2 * EDGE_PX)]
     inside, outside = near[:, :EDGE_PX].mean(axis=1), near[:, 2 * EDGE_PX - 1 :].mean(axis=1)
     steep = inside - outside >= MIN_CONTRAST / 2
@@ -98,8 +89,8 @@ def _last_edges(polar: Array, threshold: float) -> tuple[Array, Array]:
     # 3. The radius at which the profile has the level between them.
     at = EDGE_PX - 1 - (near[:, EDGE_PX - 1 :: -1] >= half[:, None]).argmax(axis=1)
     level, beyond = near[np.arange(len(at)), at], near[np.arange(len(at)), at + 1]
-    radius_px = last[rows] + 1 - EDGE_PX + at + (level - half) / (level - beyond)
-    return 2 * np.pi * rows / AZIMUTHS, radius_px
+    radius_px, azimuth = last[rows] + 1 - EDGE_PX + at + (level - half) / (level - beyond), 2 * np.pi * rows / AZIMUTHS
+    return np.column_stack([center[0] + radius_px * np.cos(azimuth), center[1] + radius_px * np.sin(azimuth)])
 
 
 def _fit(edges: Array, center: tuple[float, float]) -> Array | None:

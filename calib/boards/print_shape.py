@@ -30,11 +30,6 @@ class PrintShape:
     values: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)  # in the order of MODE_NAMES
 
     @property
-    def bends_m(self) -> tuple[float, ...]:
-        """Return bend_x, bend_y and twist [m]."""
-        return self.values[:3]
-
-    @property
     def stretch(self) -> float:
         """Return the part by which y is longer against x."""
         return self.values[3]
@@ -51,7 +46,7 @@ class PrintShape:
         middle, half = _sides(drawn)
         uv = (places[:, :2] - middle) / half
         moved = places + _moves(uv, half) @ (np.array(self.values) / MODE_UNITS)
-        moved[:, :2] -= 2 / 3 * np.array(self.bends_m[:2]) ** 2 * uv**3 / half
+        moved[:, :2] -= 2 / 3 * np.array(self.values[:2]) ** 2 * uv**3 / half
         return np.asarray(moved)
 
     def moved(self, steps: Array) -> PrintShape:
@@ -59,17 +54,14 @@ class PrintShape:
         bend_x, bend_y, twist, stretch = (np.array(self.values) + steps * MODE_UNITS).tolist()
         return PrintShape((bend_x, bend_y, twist, stretch))
 
-    def sag_m(self, drawn: Array) -> float:
-        """Return the range of the heights [m] over the corners, above the plane that fits them best."""
-        heights = self.points(drawn)[:, 2]
-        plane = np.column_stack([drawn[:, :2], np.ones(len(drawn))])
-        return float(np.ptp(heights - plane @ np.linalg.lstsq(plane, heights, rcond=None)[0]))
-
     def described(self, drawn: Array) -> str:
         """Return the difference of the print from its drawing (N, 3) in one line."""
+        # The bend is the range of the heights over the corners, above the plane that fits them best.
+        heights, plane = self.points(drawn)[:, 2], np.column_stack([drawn[:, :2], np.ones(len(drawn))])
+        sag_m = float(np.ptp(heights - plane @ np.linalg.lstsq(plane, heights, rcond=None)[0]))
         longer, other = ("y (down the rows)", "x") if self.stretch > 0 else ("x (along the columns)", "y")
         return (
-            f"the board is bent by {1e3 * self.sag_m(drawn):.2g} mm, and its print {100 * abs(self.stretch):.2g} % "
+            f"the board is bent by {1e3 * sag_m:.2g} mm, and its print {100 * abs(self.stretch):.2g} % "
             f"longer along {longer} than along {other}, which the calibration allows for"
         )
 

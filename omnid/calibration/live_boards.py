@@ -111,7 +111,7 @@ class LiveBoards:
         self._rims: list[Mask | None] = [None, None]
         self._before: Views = (None, None)
         self._kept: list[tuple[BoardView, BoardView]] = []
-        self.coverage: tuple[CameraCoverage, CameraCoverage] | None = None  # after the first pair of images
+        self.coverage: tuple[CameraCoverage, ...] = ()  # of both cameras after the first pair of images
         self.views: Views = (None, None)  # of the newest images
         self._pool = ThreadPoolExecutor(len(SIDES))
 
@@ -123,7 +123,7 @@ class LiveBoards:
     def missing(self) -> list[str]:
         """Return what is missing until a calibration is worth while; empty where there is enough."""
         found = [f"{NEEDED_PAIRS - self.pairs} more positions"] if self.pairs < NEEDED_PAIRS else []
-        if self.coverage is None:
+        if not self.coverage:
             return found
         lower, upper = (coverage.missing() for coverage in self.coverage)
         found += [f"both cameras: {words}" for words in lower if words in upper]
@@ -152,7 +152,7 @@ class LiveBoards:
             return PairOutcome.FULL
         # 3. Keep the pair, and count what it covers.
         self._kept.append((lower, upper))
-        for coverage, view in zip(self._covered(), (lower, upper), strict=True):
+        for coverage, view in zip(self.coverage, (lower, upper), strict=True):
             coverage.views.append(view.pixels[np.isfinite(view.pixels).all(axis=1)])
         return PairOutcome.KEPT
 
@@ -164,12 +164,8 @@ class LiveBoards:
         """True if both boards are nearly at the same places in both views, as parts of the rims' radii."""
         return all(
             moved(one, other) <= part * coverage.rim.outer_px
-            for one, other, coverage in zip(a, b, self._covered(), strict=True)
+            for one, other, coverage in zip(a, b, self.coverage, strict=True)
         )
-
-    def _covered(self) -> tuple[CameraCoverage, CameraCoverage]:
-        assert self.coverage is not None  # since the first images
-        return self.coverage
 
     def _update_rims(self, images: Sequence[Image]) -> None:
         """Search the rims in the brightest of all images until both are found; until then use the whole image."""
@@ -177,7 +173,7 @@ class LiveBoards:
             self._brightest = [image.copy() for image in images]
             # Until a rim is found, the largest disc in the image.
             discs = [Mask(middle_px(image), 0.0, (min(image.shape) - 1) / 2) for image in images]
-            self.coverage = CameraCoverage(discs[0]), CameraCoverage(discs[1])
+            self.coverage = tuple(map(CameraCoverage, discs))
         for name, before, image in zip(SIDES, self._brightest, images, strict=True):
             if image.shape != before.shape:
                 expected, found_px = ("{1}x{0} px".format(*one.shape) for one in (before, image))
@@ -190,13 +186,13 @@ class LiveBoards:
                 np.maximum(self._brightest[side], image, out=self._brightest[side])
                 found = self._rims[side] = find_rim(self._brightest[side], middle_px(image))
                 if found is not None:
-                    self._covered()[side].rim = found
+                    self.coverage[side].rim = found
 
 
 def status(boards: LiveBoards, outcome: PairOutcome) -> DiagnosticStatus:
     """Return the progress as an entry of the status, for the page."""
     values = {Key.PAIRS: str(boards.pairs), Key.NEEDED: str(NEEDED_PAIRS)}
-    for key, coverage in zip((Key.LOWER_COVERAGE, Key.UPPER_COVERAGE), boards.coverage or (), strict=False):
+    for key, coverage in zip((Key.LOWER_COVERAGE, Key.UPPER_COVERAGE), boards.coverage, strict=False):
         values[key] = "".join(str(min(9, count)) for count in coverage.counts().ravel())
     missing = "; ".join(boards.missing())
     if missing:
