@@ -6,6 +6,7 @@ import base64
 import struct
 import zlib
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 
@@ -15,6 +16,8 @@ from calib.models.unified import UnifiedCamera
 from calib.panorama import fit_cylinder
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import parse_rig, rig_toml
+from calib.text_files import decode
+from calib.validation import read_bytes
 from tests.limited import run_limited
 
 MAX_MEMORY_MB = 200
@@ -167,3 +170,14 @@ def test_tables_take_little_more_memory_than_they_need(omni_rig: Rig) -> None:
     """6 million pixels: 49 MB of tables; all at once the projection would take more than 1 GB."""
     printed, memory_mb = run_limited(TABLES)
     assert printed == "(1500, 4096)" and memory_mb < 250
+
+
+def test_files_are_bounded(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"12345")
+    assert read_bytes(tmp_path / "a", 5) == b"12345"
+    with pytest.raises(CalibError, match="more than 4 bytes"):
+        read_bytes(tmp_path / "a", 4)
+    with pytest.raises(CalibError, match="cannot be read: No such file"):
+        read_bytes(tmp_path / "b")
+    with pytest.raises(CalibError, match=r"expected UTF-8 text, found byte .*at 1"):
+        decode(b"\0\xff", "f")

@@ -1,4 +1,4 @@
-"""Axes and signs: mirrors by the law of reflection, misaligned rigs, panoramas seen from inside."""
+"""Axes and signs: mirrors by the law of reflection, misaligned rigs, rigs of two cameras, panoramas seen from inside."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from mcap.reader import make_reader
 from rosbags.typesys import Stores, get_typestore
 
 from calib import se3
-from calib.importers import import_chain
+from calib.importers import import_chain, straight_up
 from calib.models.camera import Array, OmniCamera
 from calib.models.lens import DoubleSphereCamera
 from calib.models.names import sees_directly
 from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
 from calib.panorama import Cylinder, fit_cylinder, remap_tables
-from calib.rig import MountedCamera, Rig
+from calib.rig import MountedCamera, Rig, is_turned_over, rig_between
+from tests.simulation.rigs import LENSES, lens, lens_rig
 
 FOCAL_PX = 200.0
 CENTER = (384.0, 380.0)
@@ -169,3 +170,29 @@ def test_columns_of_a_recorded_pair_are_equal(shared_data: Path) -> None:
     assert abs(np.median(offset[:, 0])) < 0.1
     assert np.median(np.abs(offset[:, 0])) < 0.2
     assert np.mean(offset[:, 1] > 0) > 0.95
+
+
+def test_rig_between_is_upright_with_x_along_the_image_axis() -> None:
+    lower, upper = parabolic_omni().camera, parabolic_ocam().camera
+    for camera, T_down in ((lower, parabolic_omni().T_cam_rig), (upper, parabolic_ocam().T_cam_rig)):
+        rig = rig_between(camera, camera, straight_up(0.25), ("a", "b"))
+        np.testing.assert_allclose(rig.upper.viewpoint, [0, 0, 0.25], rtol=0, atol=1e-15)
+        # The image's u axis runs to the robot's left here, and the rig's x is that axis.
+        np.testing.assert_allclose(rig.lower.T_cam_rig[:3, 0], T_down[:3, 1], rtol=0, atol=1e-12)
+
+
+def test_exchanged_mirror_cameras_turn_the_rig_over() -> None:
+    for camera in (parabolic_omni().camera, parabolic_ocam().camera):
+        assert not is_turned_over(rig_between(camera, camera, straight_up(0.25)))
+        assert is_turned_over(rig_between(camera, camera, se3.inverse(straight_up(0.25))))
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_exchanged_lenses_that_look_ahead_turn_the_rig_over(model: str) -> None:
+    rig = lens_rig(lens(model, 90))
+    camera = rig.lower.camera
+    T_lower_upper = rig.lower.T_cam_rig @ se3.inverse(rig.upper.T_cam_rig)
+    assert not is_turned_over(rig) and not is_turned_over(rig_between(camera, camera, T_lower_upper))
+    assert is_turned_over(rig_between(camera, camera, se3.inverse(T_lower_upper)))
+    up = rig_between(camera, camera, straight_up(0.25))  # such a lens may look up or down
+    assert not is_turned_over(up)
