@@ -16,10 +16,10 @@ import scipy
 from numpy.typing import NDArray
 
 from calib.boards.board import MAX_SQUARE_M, MIN_SQUARE_M, BoardView
-from calib.boards.corner_candidates import BLUR_PX, Grey, describe_corners, smoothed
-from calib.boards.corner_grid import WINDOW_PART, refine_subpixel
+from calib.boards.corner_candidates import BLUR_PX, Grey, smoothed
+from calib.boards.corner_grid import shown_corners
 from calib.boards.derived_images import DerivedImage, Image, derived_images
-from calib.boards.local_mapping import REACH, LocalMapping, local_mapping, refined_corners, without_outliers
+from calib.boards.local_mapping import REACH, local_mapping, refined_corners, without_outliers
 from calib.errors import CalibError
 from calib.models.camera import Array
 
@@ -39,12 +39,6 @@ MIN_PERIMETER_PART, PIXELS_PER_BIT = 0.015, 6
 NEIGHBOUR_SIDES, MAX_OFF_PART = 3.2, 0.45
 # One tag alone may be misread; so many that lie as on the board are not.
 MIN_TAGS, SURE_TAGS = 2, 6
-# A predicted corner may move by a part of its square and pixels.
-MAX_MOVE, MAX_MOVE_PX = 0.12, 1.5
-# Radius of the ring about a corner, in parts of the window, and least radius [px].
-RING_PART, MIN_RING_PX = 1.2, 1.8
-# Half side of the window of the first refinement [px]; a smaller one has fewer than nine pixels, too few.
-MIN_WINDOW_PX = 1.5
 # Least quality of a corner's ring, because the edge of what hides the board crosses others.
 MIN_QUALITY = 0.6
 # Least number of corners, and how far they lie off one line (ratio of the standard deviations), because fewer, or those
@@ -241,7 +235,7 @@ def _grown(image: Grey, points: Array, places: Array, outlines: Array, window: f
         mappings = {int(k): mapping for k in tried if (mapping := local_mapping(points[k], at, where)) is not None}
         if not mappings:
             break
-        found = _accepted(image, mappings, window)
+        found = shown_corners(image, mappings, window, MIN_QUALITY)
         refused[[k for k in mappings if k not in found]] = True
         if not found:
             break
@@ -251,17 +245,3 @@ def _grown(image: Grey, points: Array, places: Array, outlines: Array, window: f
         far = np.linalg.norm(places[:, None] - points[new], axis=2).min(axis=1) > REACH
         at, where = np.vstack([points[new], places[far]]), np.vstack([pixels[new], outlines[far]])
     return pixels
-
-
-def _accepted(image: Grey, mappings: dict[int, LocalMapping], window: float) -> dict[int, Array]:
-    """Return the predicted corners that the image shows, by number."""
-    start = np.array([mapping.coefficients[0] for mapping in mappings.values()])
-    sizes = np.array([mapping.side_px for mapping in mappings.values()])
-    height, width = image.shape
-    inside = ((start > 3) & (start < np.array([width, height]) - 4)).all(axis=1) & (window * sizes > MIN_WINDOW_PX)
-    refined = start.copy()
-    refined[inside] = refine_subpixel(image, start[inside], window / WINDOW_PART * sizes[inside])
-    seen = describe_corners(image, refined, np.maximum(MIN_RING_PX, RING_PART * window * sizes))
-    near = np.linalg.norm(refined - start, axis=1) < MAX_MOVE * sizes + MAX_MOVE_PX
-    good = inside & near & (seen.quality > MIN_QUALITY)
-    return {k: pixel for k, pixel, fine in zip(mappings, refined, good, strict=True) if fine}

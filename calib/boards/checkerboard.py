@@ -15,9 +15,15 @@ import numpy as np
 
 from calib.boards.board import Board, BoardView
 from calib.boards.corner_candidates import BLUR_PX, Grey, describe_corners, find_corners, sample, smoothed
-from calib.boards.corner_grid import MIN_RING_PX, RING_PART, Grid, find_grids, grow_grid, spacing, with_clockwise_axes
+from calib.boards.corner_grid import MIN_RING_PX, WINDOW_PART, Grid, find_grids, grow_grid, with_clockwise_axes
 from calib.boards.derived_images import DerivedImage, Image, derived_images
-from calib.boards.local_mapping import local_mapping, quadratic_terms, refined_corners, without_outliers
+from calib.boards.local_mapping import (
+    local_mapping,
+    mapping_of_others,
+    quadratic_terms,
+    refined_corners,
+    without_outliers,
+)
 from calib.models.camera import Array
 
 # Shorter side of the smallest image that is searched.
@@ -73,9 +79,10 @@ def _refined(image: Image, blurred: Grey, placed: Array, board: Board) -> Array:
     points = board.points[:, :2] / board.square_m
     pixels = refined_corners(image, points, placed.reshape(-1, 2))
     # The ring of grey levels must be that of a corner.
-    grid, known = array_to_grid(pixels.reshape(placed.shape)), np.isfinite(pixels[:, 0])
-    rings = np.array([max(MIN_RING_PX, RING_PART * spacing(grid, cell)) for cell in grid])
-    known[known] = describe_corners(blurred, pixels[known], rings).quality > 0
+    known = np.isfinite(pixels[:, 0])
+    mappings = [mapping_of_others(points, pixels, k) for k in np.flatnonzero(known).tolist()]
+    sizes = np.array([0.0 if mapping is None else mapping.side_px for mapping in mappings])
+    known[known] = describe_corners(blurred, pixels[known], np.maximum(MIN_RING_PX, WINDOW_PART * sizes)).quality > 0
     return without_outliers(points, np.where(known[:, None], pixels, np.nan))
 
 
@@ -162,11 +169,6 @@ def grid_to_array(grid: Grid) -> Array:
     for (i, j), pixel in grid.items():
         corners[j - low[1], i - low[0]] = pixel
     return corners
-
-
-def array_to_grid(corners: Array) -> Grid:
-    """Return the known corners of an array (rows, columns, 2) by (column, row)."""
-    return {(int(i), int(j)): corners[j, i] for j, i in np.argwhere(np.isfinite(corners[..., 0]))}
 
 
 def _board_windows(grid: Grid, board: Board) -> Iterator[Array]:

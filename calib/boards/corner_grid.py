@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Mapping
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -12,23 +12,22 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from calib.boards.corner_candidates import CornerCandidates, Grey, describe_corners, sample
+from calib.boards.local_mapping import LocalMapping, local_mapping
 from calib.models.camera import Array
 
 Cell = tuple[int, int]
+Key = TypeVar("Key")
 # Pixel (2,) of the corner at (column, row). The turn from the column axis to the row axis is clockwise in the image.
 Grid = dict[Cell, Array]
 # To the neighbours along columns and rows: exact.
 STEPS: tuple[Cell, ...] = ((1, 0), (0, 1), (-1, 0), (0, -1))
-# Radius, in parts of the corner spacing, in which a predicted corner is searched, and radius of its ring: less than a
-# half, otherwise they would reach the next corner's. A smaller ring than MIN_RING_PX has too few pixels, twelve.
-SEARCH_PART, MIN_SEARCH_PX = 0.3, 1.5
-RING_PART, MIN_RING_PX = 0.28, 2.0
-# Smaller squares are not resolved.
-MIN_SPACING_PX = 3
-# Least contrast of a predicted corner, in parts of the grid's median contrast.
-MIN_CONTRAST_PART = 0.25
-# cv2.cornerSubPix: half window in parts of the corner spacing, and its limits.
-WINDOW_PART, MIN_WINDOW_PX, MAX_WINDOW_PX = 0.3, 2, 15
+# Half side of the window about a checkerboard's corner, in parts of its square, in which the corner is searched and
+# whose ring describes it: less than a half, otherwise it would reach the next one's.
+WINDOW_PART = 0.3
+# Least distances in which a corner is searched, and radius of its ring: a smaller one has too few pixels, twelve.
+MIN_SEARCH_PX, MIN_RING_PX = 1.5, 2.0
+MIN_SIDE_PX = 1.0  # Least half side of a window; smaller squares are not resolved.
+MIN_WINDOW_PX, MAX_WINDOW_PX = 2, 15  # of cv2.cornerSubPix
 # Its iterations and convergence, as in OpenCV's tutorial of it.
 SUBPIXEL_ITERATIONS, SUBPIXEL_CONVERGED_PX = 40, 1e-3
 
@@ -84,67 +83,41 @@ def _flood_fill(seed: int, neighbour: NDArray[np.int64], back: NDArray[np.int64]
 
 
 def grow_grid(image: Grey, grid: Grid, most: int) -> Grid:
-    """Return the grid with every corner added that its neighbours predict and the image shows.
+    """Return the grid with every corner added that the mapping of its neighbours predicts and the image shows.
 
     A grid of more than most corners does not grow any further.
     """
     grid, refused = dict(grid), set[Cell]()
-    rings = np.array([max(MIN_RING_PX, RING_PART * spacing(grid, cell)) for cell in grid])
-    contrast = float(np.median(describe_corners(image, np.array(list(grid.values())), rings).contrast))
     while len(grid) <= most:
+        at, where = np.array(list(grid), float), np.array(list(grid.values()))
         border = {(i + di, j + dj) for i, j in grid for di, dj in STEPS} - set(grid) - refused
-        guesses = {cell: guess for cell in border if (guess := predict(grid, cell)) is not None}
-        if not guesses:
+        mappings = {cell: local_mapping(np.array(cell, float), at, where) for cell in border}
+        known = {cell: mapping for cell, mapping in mappings.items() if mapping is not None}
+        found = shown_corners(image, known, WINDOW_PART) if known else {}
+        if not found:
             break
-        found = _accept_predicted(image, grid, guesses, contrast)
-        refused |= set(guesses) - set(found)
+        refused |= set(known) - set(found)
         # A refused cell may be predicted better with a new neighbour.
         for cell in found:
             refused -= {(cell[0] + di, cell[1] + dj) for di, dj in STEPS}
         grid |= found
-        if not found:
-            break
     return grid
 
 
-def predict(grid: Grid, cell: Cell) -> Array | None:
-    """Return the position (2,) that the neighbours of a cell predict; None if too few are known."""
-    guesses = list(_extrapolations(grid, cell))
-    return np.median(guesses, axis=0) if guesses else None
+def shown_corners(
+    image: Grey, predicted: Mapping[Key, LocalMapping], window: float, least_quality: float = 0.0
+) -> dict[Key, Array]:
+    """Return the predicted corners that the image shows, refined.
 
-
-def _extrapolations(grid: Grid, cell: Cell) -> Iterator[Array]:
-    """Yield predictions by the middle of two neighbours, along a line, and by a parallelogram."""
-    i, j = cell
-    for di, dj in STEPS:
-        one, two, three = (grid.get((i + n * di, j + n * dj)) for n in (1, 2, 3))
-        behind = grid.get((i - di, j - dj))
-        if one is not None and behind is not None:
-            yield (one + behind) / 2
-        elif one is not None and two is not None:
-            yield 2 * one - two if three is None else 2.5 * one - 2 * two + 0.5 * three
-        side, corner = grid.get((i - dj, j + di)), grid.get((i + di - dj, j + dj + di))
-        if one is not None and side is not None and corner is not None:
-            yield one + side - corner
-
-
-def spacing(grid: Grid, cell: Cell) -> float:
-    """Return the smallest distance [px] of a cell from adjacent corners, measured among its neighbours; 0: unknown."""
-    i, j = cell
-    steps = [
-        math.dist(one, other)
-        for di, dj in STEPS
-        if (one := grid.get((i + di, j + dj))) is not None
-        and (other := grid.get(cell, grid.get((i + 2 * di, j + 2 * dj)))) is not None
-    ]
-    beside = [
-        math.dist(one, other)
-        for di, dj in STEPS
-        for side in (1, -1)
-        if (one := grid.get((i + di, j + dj))) is not None
-        and (other := grid.get((i + di - side * dj, j + dj + side * di))) is not None
-    ]
-    return float(min(steps or beside, default=0.0))
+    window: half side [squares] of the window about a corner in which grey depends on that corner alone.
+    """
+    start = np.array([mapping.coefficients[0] for mapping in predicted.values()])
+    sizes = np.array([mapping.side_px for mapping in predicted.values()])
+    refined = refine_subpixel(image, start, window * sizes)
+    seen = describe_corners(image, refined, np.maximum(MIN_RING_PX, window * sizes))
+    near = np.linalg.norm(refined - start, axis=1) < np.maximum(MIN_SEARCH_PX, window * sizes)
+    good = near & (window * sizes > MIN_SIDE_PX) & (seen.quality > least_quality)
+    return {key: pixel for key, pixel, fine in zip(predicted, refined, good, strict=True) if fine}
 
 
 def with_clockwise_axes(grid: Grid) -> Grid:
@@ -159,22 +132,10 @@ def with_clockwise_axes(grid: Grid) -> Grid:
     return {(row, column): pixel for (column, row), pixel in grid.items()}
 
 
-def _accept_predicted(image: Grey, grid: Grid, guesses: Grid, contrast: float) -> Grid:
-    """Return the predicted corners that the image shows; contrast: the usual one of the grid's corners."""
-    sizes = np.array([spacing(grid, cell) for cell in guesses])
-    start = np.array(list(guesses.values()))
-    refined = refine_subpixel(image, start, sizes)
-    seen = describe_corners(image, refined, np.maximum(MIN_RING_PX, RING_PART * sizes))
-    near = np.linalg.norm(refined - start, axis=1) < np.maximum(MIN_SEARCH_PX, SEARCH_PART * sizes)
-    good = near & (sizes > MIN_SPACING_PX) & (seen.quality > 0)
-    good &= seen.contrast > MIN_CONTRAST_PART * contrast
-    return {cell: pixel for cell, pixel, fine in zip(guesses, refined, good, strict=True) if fine}
-
-
-def refine_subpixel(image: Grey, pixels: Array, sizes: Array) -> Array:
-    """Move pixels (N, 2) to the corner nearby (cv2.cornerSubPix); sizes (N,) [px] of the squares set the window."""
+def refine_subpixel(image: Grey, pixels: Array, reach: Array) -> Array:
+    """Move pixels (N, 2) to the corner nearby (cv2.cornerSubPix); reach (N,) [px]: half sides of the windows."""
     refined = pixels.astype(np.float32).reshape(-1, 1, 2).copy()
-    half = np.clip(np.rint(WINDOW_PART * sizes), MIN_WINDOW_PX, MAX_WINDOW_PX).astype(int)
+    half = np.clip(np.rint(reach), MIN_WINDOW_PX, MAX_WINDOW_PX).astype(int)
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, SUBPIXEL_ITERATIONS, SUBPIXEL_CONVERGED_PX)
     height, width = image.shape
     inside = ((pixels > half[:, None] + 2) & (pixels < np.array([width, height]) - half[:, None] - 3)).all(axis=1)
