@@ -1,4 +1,4 @@
-"""Axes and signs: mirrors by the law of reflection, misaligned rigs, rigs of two cameras, panoramas seen from inside."""
+"""Axes and signs: mirrors by the law of reflection, misaligned rigs, rigs of two cameras, panoramas."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""OCamCalib's results by its file's conventions, and cameras of real mirrors: wavefronts, central and near projection."""
+"""OCamCalib's results by its file's conventions, and cameras of real mirrors: wavefronts, near projection."""
 
 from __future__ import annotations
 
