@@ -162,7 +162,9 @@ NO_NEIGHBOUR = -1
 def link_neighbours(image: Grey, corners: CornerCandidates) -> tuple[Indices, Indices]:
     """Return the neighbour (N, 4) of every corner's arm, and the arm of that neighbour that points back (N, 4).
 
-    Only links that both ends choose are kept; all others are NO_NEIGHBOUR.
+    Neighbours are joined by an edge between light and dark. Every corner has four arms, numbered 0 to 3 by rising angle
+    in the image: both edges, each in both directions. Only links that both ends choose are kept; all others are
+    NO_NEIGHBOUR.
     """
     count = len(corners)
     neighbour, back = (np.full((count, 4), NO_NEIGHBOUR, np.int64) for _ in range(2))
