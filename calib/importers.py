@@ -39,9 +39,18 @@ from calib.rig import (
     mounting_notes,
     rig_between,
 )
-from calib.text_files import MAX_BYTES, MAX_JSON_BYTES, decode, load_mapping
 from calib.typed_toml import convert, shown, table_of
-from calib.validation import Warn, read_bytes, require_image_size, silent, transform_of
+from calib.validation import (
+    MAX_BYTES,
+    MAX_JSON_BYTES,
+    Warn,
+    decode,
+    load_mapping,
+    read_bytes,
+    require_image_size,
+    silent,
+    transform_of,
+)
 
 # Tolerance between two transforms that a file states: more than rounding, less than any real difference of two rigs.
 MAX_DISAGREEMENT_M, MAX_DISAGREEMENT_RAD = 1e-3, np.deg2rad(0.1)

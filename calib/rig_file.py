@@ -30,9 +30,8 @@ from calib.models.ocam import DISTANCE_M, OcamCamera, View
 from calib.models.wavefront import WAVEFRONT_NAMES
 from calib.rig import MountedCamera, Rig, ShutterTimes
 from calib.rig_covariance import TRANSFORM_NAMES, RigCovariance
-from calib.text_files import decode
 from calib.typed_toml import convert, shown, table_of
-from calib.validation import read_bytes, require_image_size, transform_of
+from calib.validation import decode, read_bytes, require_image_size, transform_of
 
 SCHEMA: Final = 1  # the first: it rises when an earlier program would misread the file
 COVARIANCE_VERSION: Final = 1  # the same for the table [covariance]

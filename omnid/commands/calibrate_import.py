@@ -24,9 +24,8 @@ from calib.models.names import model_name
 from calib.models.ocam import OcamCamera
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import read_rig, write_rig
-from calib.text_files import MAX_JSON_BYTES, load_mapping
 from calib.typed_toml import shown
-from calib.validation import read_bytes
+from calib.validation import MAX_JSON_BYTES, load_mapping, read_bytes
 from omnid.commands.options import HEIGHT, command, height_of, warn
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs

@@ -16,8 +16,7 @@ from calib.models.unified import UnifiedCamera
 from calib.panorama import fit_cylinder
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import parse_rig, rig_toml
-from calib.text_files import decode
-from calib.validation import read_bytes
+from calib.validation import decode, read_bytes
 from tests.limited import run_limited
 
 MAX_MEMORY_MB = 200
