@@ -39,6 +39,8 @@ MIN_PERIMETER_PART, PIXELS_PER_BIT = 0.015, 6
 NEIGHBOUR_SIDES, MAX_OFF_PART = 3.2, 0.45
 # One tag alone may be misread; so many that lie as on the board are not.
 MIN_TAGS, SURE_TAGS = 2, 6
+# Half side of the least window [px], because one of fewer than nine pixels does not show the corner alone.
+MIN_WINDOW_PX = 1.5
 # Least quality of a corner's ring, because the edge of what hides the board crosses others.
 MIN_QUALITY = 0.6
 # Least number of corners, and how far they lie off one line (ratio of the standard deviations), because fewer, or those
@@ -232,7 +234,8 @@ def _grown(image: Grey, points: Array, places: Array, outlines: Array, window: f
     refused = np.zeros(len(points), bool)
     while True:
         tried = np.flatnonzero(np.isnan(pixels[:, 0]) & ~refused)
-        mappings = {int(k): mapping for k in tried if (mapping := local_mapping(points[k], at, where)) is not None}
+        predicted = {int(k): local_mapping(points[k], at, where) for k in tried}
+        mappings = {k: m for k, m in predicted.items() if m is not None and window * m.side_px > MIN_WINDOW_PX}
         if not mappings:
             break
         found = shown_corners(image, mappings, window, MIN_QUALITY)
