@@ -34,10 +34,9 @@ def open_motor(config: MotorSettings, closing: ExitStack, *, waits: bool = True)
     protocol = motor_protocol(config.protocol)(drive)
     if config.port == SIMULATED:
         # A real robot's process does not load the simulation.
-        from drivers.motors.simulated.simulated_motor import SimulatedMotor, simulated_controller
+        from drivers.motors.simulated.simulated_motor import SimulatedMotor
 
-        twin = simulated_controller(config.protocol, drive)
-        driver: MotorDriver = SimulatedMotor(protocol, twin, config.watchdog_ms, time.monotonic_ns)
+        driver: MotorDriver = SimulatedMotor(drive, config.watchdog_ms, time.monotonic_ns)
     else:
         driver = SerialMotor(
             config.port,

@@ -174,7 +174,7 @@ class PacedRobot:
         try:
             for pair in vehicle.pairs(settle):
                 if self._keeps_truth:
-                    self.truth[pair.stamp_ns] = vehicle.twin.base.pose
+                    self.truth[pair.stamp_ns] = vehicle.base.pose
                 for sample in pair.samples:
                     if self._is_given(sample):
                         take(sample)

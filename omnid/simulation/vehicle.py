@@ -25,9 +25,8 @@ from calib import se3
 from drivers.frame import CAMERAS, Frame
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from drivers.motor import VelocityCommand
-from drivers.motors.protocols.protocol_registry import motor_protocol
 from drivers.motors.simulated.simulated_base import Pose
-from drivers.motors.simulated.simulated_motor import SimulatedMotor, simulated_controller
+from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from omnid.config import Config
 from omnid.controller.controller import Controller
 from omnid.controller.statistics import TickReport
@@ -102,12 +101,9 @@ class Vehicle:
         rays = robot.samples if samples is None else samples
         self._cameras = SimulatedCameras(with_masks(robot.rig), robot.sensor, world, seed, rays)
         drive = config.motor.drive.geometry()
-        self.twin = simulated_controller(config.motor.protocol, drive)
-        base = self.twin.base
-        base.pose, base.limits, base.traction = world.start, robot.limits, self._over_ground
-        self.motor = SimulatedMotor(
-            motor_protocol(config.motor.protocol)(drive), self.twin, config.motor.watchdog_ms, lambda: self.now_ns
-        )
+        self.motor = SimulatedMotor(drive, config.motor.watchdog_ms, lambda: self.now_ns)
+        self.base = self.motor.base
+        self.base.pose, self.base.limits, self.base.traction = world.start, robot.limits, self._over_ground
         self.controller = Controller(
             self.motor,
             config.controller,
@@ -135,7 +131,7 @@ class Vehicle:
     @property
     def T_world_base(self) -> Array:
         """Return the true pose (4, 4) of the base."""
-        return self._ground.T_world_base(self.twin.base.pose)
+        return self._ground.T_world_base(self.base.pose)
 
     @property
     def T_world_rig(self) -> Array:
@@ -211,7 +207,7 @@ class Vehicle:
             self.controller.take(given)
 
     def _move(self, until_ns: int) -> None:
-        base, begin_s, dt_s = self.twin.base, self.time_s, (until_ns - self.now_ns) * 1e-9
+        base, begin_s, dt_s = self.base, self.time_s, (until_ns - self.now_ns) * 1e-9
         before, self.now_ns = base.pose, until_ns
         self.motor.advance()
         for push in self._robot.pushes:
@@ -234,7 +230,7 @@ class Vehicle:
 
     def _over_ground(self, dt_s: float, left_m: float, right_m: float) -> tuple[float, float]:
         """Return the travel of both wheels over the plane: they slip, and over a slope it is less."""
-        wheels, ground, pose = self._robot.wheels, self._ground, self.twin.base.pose
+        wheels, ground, pose = self._robot.wheels, self._ground, self.base.pose
         noise = self._wheel_noise.gauss
         self._rolled_s += dt_s
         lost = [slip.share for slip in wheels.slips if slip.start_s <= self._rolled_s < slip.end_s]
@@ -262,10 +258,10 @@ class Vehicle:
         if self._robot.has_odometry and status is not None and math.isfinite(status.velocity_mps):
             self.samples.append(WheelSample(self.now_ns, status.velocity_mps, status.yaw_rate_radps))
         self._take_tick(
-            Tick(self.time_s, self.twin.base.pose, report.command, report.state.reason, self._clearance_m()), report
+            Tick(self.time_s, self.base.pose, report.command, report.state.reason, self._clearance_m()), report
         )
 
     def _clearance_m(self) -> float:
-        x_m, y_m, _ = self.twin.base.pose
+        x_m, y_m, _ = self.base.pose
         walking = footprints(self.people.faces(), self._robot.height_m, self._ground)
         return min(clearance_m(segments, (x_m, y_m), self._robot.radius_m) for segments in (self._standing, walking))

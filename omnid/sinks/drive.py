@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from drivers.errors import DriverError
 from drivers.motor import VelocityCommand, is_stop
-from drivers.motors.protocols.protocol_registry import motor_protocol
 from drivers.motors.simulated.simulated_base import SimulatedBase
-from drivers.motors.simulated.simulated_motor import SimulatedMotor, simulated_controller
+from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from omnid.controller.link import ControllerLink, DriveLink
 from omnid.controller.motor_settings import MotorSettings
 from omnid.core.control.command_sources import PLANNER, TimedSetpoint
@@ -121,21 +120,15 @@ class ReplayDrive:
 
 
 class SimulatedWheels:
-    """Sends commands through the configured protocol to a simulated motor controller, and turns its wheels.
+    """Sends commands to a simulated motor controller, and turns its wheels.
 
     A busy computer makes no command late: time passes for this base only from one command's stamp to the next.
     """
 
     def __init__(self, settings: MotorSettings) -> None:
-        drive = settings.drive.geometry()
         self._now_ns, self._moves = 0, False
         self._sent = self._stops = 0
-        self._motor = SimulatedMotor(
-            motor_protocol(settings.protocol)(drive),
-            simulated_controller(settings.protocol, drive),
-            settings.watchdog_ms,
-            lambda: self._now_ns,
-        )
+        self._motor = SimulatedMotor(settings.drive.geometry(), settings.watchdog_ms, lambda: self._now_ns)
 
     @property
     def base(self) -> SimulatedBase:

@@ -13,8 +13,8 @@ from collections import deque
 from pathlib import Path
 
 from drivers.motors.simulated.simulated_base import STEP_S, Pose, SimulatedBase
-from drivers.motors.simulated.simulated_controllers import SimulatedLine
-from drivers.motors.simulated.simulated_motor import SimulatedController
+from drivers.motors.simulated.simulated_line import SimulatedLine
+from tests.contract.simulated_controllers import SimulatedController
 
 READ_LIMIT_BYTES = 4096
 POSES_KEPT = 1000  # Number of poses that are kept with their times: those of some seconds.

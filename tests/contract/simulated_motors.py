@@ -11,9 +11,9 @@ from drivers.motors.protocols.motor_protocol import Framer, T, Transaction
 from drivers.motors.protocols.protocol_registry import PROTOCOLS
 from drivers.motors.serial_motor import SerialMotor
 from drivers.motors.simulated.simulated_base import MotionLimits
-from drivers.motors.simulated.simulated_controllers import SimulatedLine, SimulatedVesc
-from drivers.motors.simulated.simulated_motor import SIMULATED_CONTROLLERS, SimulatedController
+from drivers.motors.simulated.simulated_line import SimulatedLine
 from tests.contract.pty_motor import PtyMotor
+from tests.contract.simulated_controllers import SIMULATED_CONTROLLERS, SimulatedController, SimulatedVesc
 
 NAMES = sorted(PROTOCOLS)
 PATIENCE_S = 20.0  # bounds a wait on a loaded machine; not a measured limit

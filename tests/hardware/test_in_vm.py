@@ -21,7 +21,7 @@ from calib.rig_file import rig_toml
 from drivers.cameras.log_camera import LogImages
 from drivers.frame import Frame
 from drivers.logs.log_reader import LogReader
-from drivers.motors.simulated.simulated_controllers import SimulatedLine
+from drivers.motors.simulated.simulated_line import SimulatedLine
 from omnid.runs.session import attached_rig
 from omnid.stages.geometry import with_rims
 from tests.contract.pty_motor import LONGEST_ABSENCE_S

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import zenoh
 from rosbags.typesys import Stores, get_typestore
 
-from drivers.motors.simulated.simulated_controllers import SimulatedLine
+from drivers.motors.simulated.simulated_line import SimulatedLine
 from omnid.transport import codec
 from omnid.transport.codec import Pose
 from tests.contract.pty_motor import PtyMotor

@@ -1,69 +1,34 @@
-"""Simulated motor controllers as a motor driver, whose time passes by a clock."""
+"""A simulated motor controller as a motor driver, whose time passes by a clock."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Final, Protocol
+from collections.abc import Callable
 
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, stop_command
 from drivers.motors.protocols.differential_drive import DifferentialDrive
-from drivers.motors.protocols.motor_protocol import MotorProtocol, T, Transaction
+from drivers.motors.protocols.line_protocol import LineProtocol
+from drivers.motors.protocols.motor_protocol import T, Transaction
 from drivers.motors.simulated.simulated_base import LONGEST_ADVANCE_S, SimulatedBase
-from drivers.motors.simulated.simulated_controllers import (
-    SimulatedLine,
-    SimulatedODrive,
-    SimulatedRoboteq,
-    SimulatedVesc,
-)
-
-
-class SimulatedController(Protocol):
-    """Simulated firmware: receives and sends bytes, and turns the wheels. Invalid frames are counted as errors."""
-
-    @property
-    def base(self) -> SimulatedBase:
-        """The simulated base."""
-
-    def feed(self, data: bytes) -> bytes:
-        """Return the replies to received bytes."""
-
-
-SIMULATED_CONTROLLERS: Final[Mapping[str, Callable[[DifferentialDrive], SimulatedController]]] = {
-    "line": SimulatedLine,
-    "roboteq": SimulatedRoboteq,
-    "odrive_ascii": SimulatedODrive,
-    "vesc": SimulatedVesc,
-}
-
-
-def simulated_controller(protocol: str, drive: DifferentialDrive) -> SimulatedController:
-    """Return the simulated controller of a protocol; raise DriverError for one that has none."""
-    if protocol not in SIMULATED_CONTROLLERS:
-        raise DriverError(
-            f"motor.protocol {protocol!r} has no simulated controller: one of {', '.join(SIMULATED_CONTROLLERS)} has"
-        )
-    return SIMULATED_CONTROLLERS[protocol](drive)
+from drivers.motors.simulated.simulated_line import SimulatedLine
 
 
 class SimulatedMotor:
     """A MotorDriver whose bytes reach the controller at once, and whose base moves as time passes by a clock.
 
-    Like the serial driver it begins with a stop, and sends one after a pause in which the watchdog may have expired.
+    It speaks the line protocol, whatever that of the robot is: what is simulated is the base. Like the serial driver it
+    begins with a stop, and sends one after a pause in which the watchdog may have expired.
     """
 
-    def __init__(
-        self, protocol: MotorProtocol, controller: SimulatedController, watchdog_ms: int, clock_ns: Callable[[], int]
-    ) -> None:
-        """Connect; DriverError where the controller does not take the watchdog's time."""
-        self._protocol, self._controller, self._clock_ns = protocol, controller, clock_ns
-        self._framer = protocol.framer()
+    def __init__(self, drive: DifferentialDrive, watchdog_ms: int, clock_ns: Callable[[], int]) -> None:
+        self._protocol, self._controller, self._clock_ns = LineProtocol(drive), SimulatedLine(drive), clock_ns
+        self._framer = self._protocol.framer()
         self._longest_pause_ns = watchdog_ms * 1_000_000 // 2
         self._now_ns = self._answered_ns = clock_ns()
         self.status: MotorStatus | None = None  # the last reply
         self.cut = False  # fault: no byte arrives at either end
-        self._run(protocol.connect(watchdog_ms))
-        self._run(protocol.drive(stop_command(0), clock_ns() * 1e-9))
+        self._run(self._protocol.connect(watchdog_ms))
+        self._run(self._protocol.drive(stop_command(0), clock_ns() * 1e-9))
 
     @property
     def base(self) -> SimulatedBase:

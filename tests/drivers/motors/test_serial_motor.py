@@ -20,7 +20,7 @@ from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.line_protocol import LineProtocol, encode
 from drivers.motors.protocols.motor_protocol import NoReplyError, T, Transaction
 from drivers.motors.serial_motor import SerialMotor
-from drivers.motors.simulated.simulated_controllers import SimulatedLine
+from drivers.motors.simulated.simulated_line import SimulatedLine
 from tests.contract.pty_motor import PtyMotor
 
 PATIENCE_S = 20.0  # bounds a wait on a loaded machine; not a measured limit

@@ -16,9 +16,8 @@ from drivers.motors.protocols.line_protocol import crc16
 from drivers.motors.protocols.protocol_registry import PROTOCOLS
 from drivers.motors.serial_motor import SerialMotor
 from drivers.motors.simulated.simulated_base import SimulatedBase
-from drivers.motors.simulated.simulated_controllers import SimulatedODrive, SimulatedRoboteq, SimulatedVesc
-from drivers.motors.simulated.simulated_motor import SimulatedController
 from tests.contract.pty_motor import PtyMotor
+from tests.contract.simulated_controllers import SimulatedController, SimulatedODrive, SimulatedRoboteq, SimulatedVesc
 
 DRIVE = DifferentialDrive(can_id=2)
 NAMES = sorted(PROTOCOLS)

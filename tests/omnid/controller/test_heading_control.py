@@ -12,7 +12,7 @@ import pytest
 from drivers.motor import MotorStatus, VelocityCommand
 from drivers.motors.serial_motor import SerialMotor
 from drivers.motors.simulated.simulated_base import MotionLimits, SimulatedBase
-from drivers.motors.simulated.simulated_controllers import SimulatedLine
+from drivers.motors.simulated.simulated_line import SimulatedLine
 from omnid.controller.controller import Controller
 from omnid.core.control.arming import AUTOMATIC, ArmRequest
 from omnid.core.control.command_sources import TimedSetpoint

@@ -20,7 +20,6 @@ import pytest
 
 from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
-from drivers.motors.simulated.simulated_motor import simulated_controller
 from omnid.controller.link import ControllerLink
 from omnid.controller.messages import ControllerStart
 from omnid.controller.motor_settings import MotorSettings
@@ -37,6 +36,7 @@ from omnid.core.control.velocity_limits import VelocityLimits
 from omnid.engine.realtime import RealtimeSettings
 from omnid.engine.telemetry import StageStats
 from omnid.errors import OmnidError
+from tests.contract.simulated_controllers import SIMULATED_CONTROLLERS
 from tests.replay.live import ROOT, Base
 from tests.waiting import wait_until
 
@@ -355,7 +355,7 @@ class BootingBoard:
 
     def __init__(self, protocol: str, boot_s: float) -> None:
         self._protocol, self._boot_s, self.boots = protocol, boot_s, 0
-        self.controller = simulated_controller(protocol, DRIVE)
+        self.controller = SIMULATED_CONTROLLERS[protocol](DRIVE)
         self._device, host = os.openpty()
         self.port = os.ttyname(host)
         os.close(host)  # so that it shows when another program opens it
@@ -382,7 +382,7 @@ class BootingBoard:
                 time.sleep(0.002)
             elif not is_open:
                 is_open, booted_s, self.boots = True, now_s + self._boot_s, self.boots + 1
-                self.controller = simulated_controller(self._protocol, DRIVE)
+                self.controller = SIMULATED_CONTROLLERS[self._protocol](DRIVE)
             elif events & select.POLLIN:
                 data = os.read(self._device, 4096)
                 os.write(self._device, self.controller.feed(data) if now_s >= booted_s else b"")

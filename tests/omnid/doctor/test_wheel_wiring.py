@@ -13,11 +13,11 @@ from pathlib import Path
 
 import pytest
 
-from drivers.motors.simulated.simulated_motor import SIMULATED_CONTROLLERS, SimulatedController
 from omnid.controller.motor_settings import DriveSettings, MotorSettings
 from omnid.doctor.wheel_wiring import tested_drive as drive_by_answers
 from omnid.errors import OmnidError
 from tests.contract.pty_motor import PtyMotor
+from tests.contract.simulated_controllers import SIMULATED_CONTROLLERS, SimulatedController
 from tests.replay.command import Command
 from tests.waiting import wait_until
 
