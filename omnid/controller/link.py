@@ -78,22 +78,22 @@ class ControllerLink:
             self.close()
             raise
 
-    def send(self, given: ControlInput) -> None:
-        """Send a pose, an obstacle ring, a setpoint, or a request to arm; from any thread.
+    def send(self, given: ControlInput | None) -> None:
+        """Send a pose, an obstacle ring, a setpoint, or a request to arm, with the newest stop; from any thread.
 
-        A request that is lost is not repeated: its sender sees that the robot is not armed.
+        None: the stop alone. A request that is lost is not repeated: its sender sees that the robot is not armed.
         """
-        self._send(given)
+        self._channel.send(ControllerUpdate(self._stop_ns, given, self._contacts))
 
     def stop(self) -> None:
         """Stop the wheels until a request to arm is sent later; from any thread."""
         self._stop_ns = time.monotonic_ns()
-        self._send(None)
+        self.send(None)
 
     def touch(self, contact: str, *, holds: bool) -> None:
         """Report a bumper or a cliff sensor (BUMPER, CLIFF); the base stays at rest while it holds. From one thread."""
         self._contacts = self._contacts.after(contact, holds=holds)
-        self._send(None)
+        self.send(None)
 
     def end(self) -> None:
         """Have the wheels slow down to a stop and the process end; from any thread."""
@@ -127,9 +127,6 @@ class ControllerLink:
             self._process.kill()
             self._process.wait()
         self._channel.close()
-
-    def _send(self, update: ControlInput | None) -> None:
-        self._channel.send(ControllerUpdate(self._stop_ns, update, self._contacts))
 
     def _receive(self, timeout_s: float) -> object:
         """Return the next report, which is counted or logged, or NO_MESSAGE; EOFError once the process has ended."""

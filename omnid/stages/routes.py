@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,12 +58,11 @@ def refusal_while_teaching(name: str) -> str:
     return f"the route {name} is being taught: `omnid route finish` writes it, `omnid route stop` drops it"
 
 
-class KeyframeTie:
+class KeyframeTie(NamedTuple):
     """The newest keyframe, and the pose of the base in the map as that says."""
 
-    def __init__(self, id: int, pose: Array) -> None:
-        """pose: (3,) of the keyframe in the map."""
-        self.id, self.pose = id, pose
+    id: int
+    pose: Array  # (3,) of the keyframe in the map
 
 
 class Routes:

@@ -9,6 +9,7 @@ import math
 from collections import deque
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
+from itertools import groupby
 from typing import Final, NamedTuple
 
 from calib.se2 import IDENTITY, Point, Pose2, along_arc, composed, seen_from
@@ -139,19 +140,10 @@ def driven_over(outline: Outline, points: list[Point], pose: Pose2, velocity_mps
 
 def long_runs(flags: Sequence[bool], least: int) -> list[int]:
     """Return the indices of the true flags in runs of at least so many, around the full turn."""
-    count = len(flags)
-    if all(flags):
-        return list(range(count))
-    start = flags.index(False)
-    found: list[int] = []
-    run: list[int] = []
-    for k in (*range(start, count), *range(start + 1)):
-        if flags[k]:
-            run.append(k)
-            continue
-        found += run if len(run) >= least else []
-        run = []
-    return found
+    start = flags.index(False) if False in flags else 0
+    order = (*range(start, len(flags)), *range(start))
+    runs = [list(run) for is_true, run in groupby(order, flags.__getitem__) if is_true]
+    return [k for run in runs if len(run) >= least for k in run]
 
 
 @lru_cache(maxsize=4)

@@ -21,7 +21,7 @@ from omnid.core.control.safety_rules import ASKED
 from omnid.core.navigation.follower import BRAKE_SHARE, STAND, Follower, Following
 from omnid.core.navigation.forecast import Pace, yielding
 from omnid.core.navigation.path import SHORTEST_M, DrivePath, drive_path, goal_path
-from omnid.core.navigation.planner import BACK_MPS, NoWay, Planner, distances
+from omnid.core.navigation.planner import BACK_MPS, Planner, distances
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import NOWHERE, UNKNOWN_M, Situation, refusal_of_map, refusal_to_drive
@@ -249,8 +249,8 @@ class Navigator:
         following = drive.step(now)
         if following.done:
             return self._finished(drive, following.missed_m)
-        if self._is_beside(following):
-            return self._taken_away(following)
+        if (failed := self._taken_away(following)) is not None:
+            return failed
         if following.left_m < drive.least_m - NEARER_M:
             drive.least_m, drive.gave_way, drive.ways, drive.blocked_s = following.left_m, 0, 0, 0.0
         # 5. Obstacles on it, and a safety rule that holds the wheels because of one.
@@ -415,8 +415,8 @@ class Navigator:
             drive.no_way = f"{drive.ways} ways were tried"
             return None
         found = self._planner.way(now.pose, goal, obstacles, corridor, heading_rad)
-        if isinstance(found, NoWay):
-            drive.no_way = found.reason
+        if isinstance(found, str):
+            drive.no_way = found
             return None
         return Detour(Follower(found, settings, speed_mps=now.speed_mps), *place)
 
@@ -450,38 +450,34 @@ class Navigator:
         return drive.paths[0].is_goal and 0 < self._settings.give_up_s < drive.blocked_s
 
     def _begins_to_give_way(self, drive: Drive, now: Situation) -> bool:
-        """Begin to drive back; False where there is no free way back, or it is switched off."""
+        """Begin to drive back along the trail; False where there is no free way back, or it is switched off."""
         drive.waits[NavigationState.BLOCKED] = drive.stuck_s = 0.0
-        if now.obstacles is None or not self._settings.give_way_m:
+        if now.obstacles is None:
             return False
-        drive.retreat = self._way_back(now, self._ahead(drive, now, NEARER_M), now.obstacles, drive.gave_way)
-        if drive.retreat is not None:
-            drive.gave_way, drive.nearest_m = drive.gave_way + 1, math.inf
-        return drive.retreat is not None
-
-    def _way_back(self, now: Situation, ahead: Array, obstacles: Array, times: int) -> Retreat | None:
-        """Return the way back along the trail, up to where others can pass; None where there is none."""
-        room_m = self._planner.room_m
-        places = [*reversed(self._trail)]
+        room_m, places = self._planner.room_m, [*reversed(self._trail)]
         xy = np.array([now.pose[:2], *(place.xy for place in places)])
         ways = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
         # 1. As far as it is free now, and no farther than is wanted.
-        free_m = first_blocked_m(xy, obstacles, room_m)
+        free_m = first_blocked_m(xy, now.obstacles, room_m)
         last = int(np.searchsorted(ways, min(free_m - ROUNDING_M, self._settings.give_way_m), side="right"))
         # 2. Up to the next place where others can pass.
-        is_wide = (distances(xy[:last], obstacles) > room_m + PASS_M) & (ways[:last] >= NEARER_M)
+        is_wide = (distances(xy[:last], now.obstacles) > room_m + PASS_M) & (ways[:last] >= NEARER_M)
         last = int(np.argmax(is_wide)) + 1 if is_wide.any() else last
         if last < 2 or ways[last - 1] < self._front_m:
-            return None
-        came_back = [places[0].is_back, *(place.is_back for place in places)][:last]
-        backwards = [not back for back in (came_back[:1] + came_back)[:last]]
-        path = drive_path(xy[:last], speeds=np.full(last, BACK_MPS), backwards=backwards)
-        return Retreat(
-            Follower(path, self._settings),
-            np.vstack([xy[:last][::-1], ahead]),
-            REST_S + now.stamp_ns // 1_000_000_000 % SPREAD_S,
-            min(RETRY_S * 2.0**times, LONGEST_RETRY_S),
+            return False
+        # 3. There it waits, the longer the more often it has gone back.
+        came_back = [places[0].is_back] * 2 + [place.is_back for place in places]
+        path = drive_path(
+            xy[:last], speeds=np.full(last, BACK_MPS), backwards=[not is_back for is_back in came_back[:last]]
         )
+        drive.retreat = Retreat(
+            Follower(path, self._settings),
+            np.vstack([xy[:last][::-1], self._ahead(drive, now, NEARER_M)]),
+            REST_S + now.stamp_ns // 1_000_000_000 % SPREAD_S,
+            min(RETRY_S * 2.0**drive.gave_way, LONGEST_RETRY_S),
+        )
+        drive.gave_way, drive.nearest_m = drive.gave_way + 1, math.inf
+        return True
 
     def _give_way(self, drive: Drive, retreat: Retreat, now: Situation, dt_s: float) -> Navigation:
         """Drive back, wait, and go on. All in odom."""
@@ -491,8 +487,8 @@ class Navigator:
         # 1. Back, as far as it is seen to be free now.
         if retreat.follower is not None:
             following = retreat.follower.step(now.stamp_ns, now.pose, now.speed_mps, now.yaw_rate_radps)
-            if self._is_beside(following):
-                return self._taken_away(following)
+            if (failed := self._taken_away(following)) is not None:
+                return failed
             is_there = following.done or following.left_m < SHORTEST_M
             path = retreat.follower.ahead(NEARER_M).xy
             is_free = math.isinf(first_blocked_m(path, obstacles, self._planner.room_m))
@@ -532,12 +528,12 @@ class Navigator:
         self._end(NavigationState.REACHED, "")
         return self._idle()._replace(left_m=0.0)
 
-    def _is_beside(self, following: Following) -> bool:
-        """True if the base is no longer near its path, for example because an operator has taken it away."""
-        return abs(following.offset_m) > self._settings.corridor_m + self._planner.room_m
-
-    def _taken_away(self, following: Following) -> Navigation:
-        return self._failed(f"{abs(following.offset_m):.1f} m beside the path: drive back to it and ask again")
+    def _taken_away(self, following: Following) -> Navigation | None:
+        """Fail where the base is no longer near its path, for example because an operator has taken it away."""
+        offset_m = abs(following.offset_m)
+        if offset_m <= self._settings.corridor_m + self._planner.room_m:
+            return None
+        return self._failed(f"{offset_m:.1f} m beside the path: drive back to it and ask again")
 
     def _no_progress(self, now: Situation, does: str) -> Navigation:
         why = now.wheels.reason if now.wheels.is_held else does

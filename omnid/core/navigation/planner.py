@@ -10,7 +10,7 @@ seen to be occupied counts as free: the collision monitor decides how far the ba
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
+from typing import Final
 
 import cv2
 import numpy as np
@@ -29,12 +29,6 @@ MOVE_CELLS: Final = 3.0  # length of an arc, which leaves its cell in any direct
 BACK_MPS: Final = 0.2  # slower than forwards, because people do not expect a robot to back up
 MARGIN_M: Final = 0.02  # room for errors of the grid and of the base on its way
 FAR_M: Final = 1e3  # distance where there is no obstacle
-
-
-class NoWay(NamedTuple):
-    """Why no way was found."""
-
-    reason: str
 
 
 class Planner:
@@ -75,8 +69,8 @@ class Planner:
 
     def way(
         self, pose: Array, goal: Array, obstacles: Array, along: Array | None = None, heading_rad: float = math.nan
-    ) -> DrivePath | NoWay:
-        """Return the fastest way from a pose (3,) to a goal (2,), or to the edge of the grid towards it.
+    ) -> DrivePath | str:
+        """Return the fastest way from a pose (3,) to a goal (2,), or to the edge of the grid towards it, or why none.
 
         obstacles (N, 2). along (M, 2): a path from which the way is not farther than corridor_m; None: it may lead
         anywhere. heading_rad: at the goal, within a step of the search; NaN: any. All in odom.
@@ -97,7 +91,7 @@ class Planner:
         is_inside = 0 <= row < len(left_s) and 0 <= column < len(left_s)
         if is_inside:
             if math.isinf(cell_s[row, column]):
-                return NoWay(f"something stands {_nearest_m(goal, obstacles):.1f} m from the goal")
+                return f"something stands {_nearest_m(goal, obstacles):.1f} m from the goal"
             left_s[row, column] = 0.0
         elif along is None:
             for edge in (np.s_[0, :], np.s_[-1, :], np.s_[:, 0], np.s_[:, -1]):
@@ -106,7 +100,7 @@ class Planner:
                 left_s[edge] = np.where(np.isinf(cell_s[edge]), np.inf, away_m / pursuit.velocity_mps)
         wave_front(cell_s, left_s)
         if math.isinf(left_s[HALF_CELLS, HALF_CELLS]):
-            return NoWay(f"what stands {_nearest_m(pose[:2], obstacles):.1f} m away closes every way")
+            return f"what stands {_nearest_m(pose[:2], obstacles):.1f} m away closes every way"
         # 3. The way.
         if not is_inside:  # up to the edge of the grid
             edge_s = left_s.copy()
@@ -116,7 +110,7 @@ class Planner:
         start = np.array([HALF_CELLS, HALF_CELLS, pose[2]], np.float64)
         found = search(room_m, cell_s, left_s, start, self._moves, self._discs, np.append(self._limits, heading_rad))
         if len(found) == 0:
-            return NoWay("the base does not fit through")
+            return "the base does not fit through"
         return self._path(pose, goal if is_inside else None, corner, found)
 
     def _path(self, pose: Array, goal: Array | None, corner: Array, found: Array) -> DrivePath:
