@@ -269,7 +269,7 @@ def _covariance(table: CovarianceTable, rig: RigTable) -> RigCovariance:
 # 3. Writing.
 def write_rig(path: Path, rig: Rig) -> None:
     """Write `rig.toml`, and mask images in the same folder as `<stem>.lower.png` and `<stem>.upper.png`."""
-    masks = {side: mounted.mask for side, mounted in zip(SIDES, (rig.lower, rig.upper), strict=True)}
+    masks = {side: mounted.mask for side, mounted in rig.sides}
     painted = {side: mask.image for side, mask in masks.items() if mask is not None and mask.image is not None}
     images = {side: f"{path.stem}.{side}.png" for side in painted}
     text = rig_toml(rig, images).encode()
@@ -288,7 +288,7 @@ def rig_toml(rig: Rig, images: Mapping[str, str] | None = None) -> str:
     text = f"schema = {SCHEMA}\n"
     if not np.array_equal(rig.T_base_rig, np.eye(4)):  # else it is not stated
         text += f"T_base_rig = {_value(rig.T_base_rig.tolist())}\n"
-    for side, mounted, topic in zip(SIDES, (rig.lower, rig.upper), rig.topics, strict=True):
+    for (side, mounted), topic in zip(rig.sides, rig.topics, strict=True):
         camera, T_rig_cam = mounted.camera, se3.inverse(mounted.T_cam_rig)
         T_rig_cam[:3, 3] = np.round(T_rig_cam[:3, 3], TRANSLATION_DECIMALS)
         head = {

@@ -105,7 +105,7 @@ def moved_rig(rig: Rig, changes: Mapping[str, float]) -> Rig:
                 {own: change for name, change in changes.items() for of, _, own in [name.partition(" ")] if of == side},
             ),
         )
-        for side, mounted in (("lower", moved.lower), ("upper", moved.upper))
+        for side, mounted in moved.sides
     )
     return replace(moved, lower=lower, upper=upper)
 
@@ -155,7 +155,7 @@ class RigParameters:
         times = self.rig.times
         known = {UPPER_DELAY: times.upper_delay_s / S_PER_UNIT[UPPER_DELAY]}
         known[LINE_TIME] = times.line_time_s / S_PER_UNIT[LINE_TIME]
-        for side, mounted in (("lower", self.rig.lower), ("upper", self.rig.upper)):
+        for side, mounted in self.rig.sides:
             known |= {f"{side} {name}": value for name, value in values_of(mounted.camera).items()}
         return np.array([known.get(name, 0.0) for name in self.names])
 
@@ -163,7 +163,7 @@ class RigParameters:
     def units(self) -> Array:
         """One step (P,) in the parameters' own units."""
         known = dict.fromkeys(TRANSFORM_NAMES, ANGLE_UNIT_RAD) | TIME_UNITS
-        for side, mounted in (("lower", self.rig.lower), ("upper", self.rig.upper)):
+        for side, mounted in self.rig.sides:
             own = [name.partition(" ")[2] for name in self.names if name.startswith(f"{side} ")]
             units = units_of(mounted.camera, own).tolist()
             known |= {f"{side} {name}": unit for name, unit in zip(own, units, strict=True)}

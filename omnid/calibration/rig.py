@@ -176,7 +176,7 @@ def _masked_rig(found: RigCalibration, images: PairedImages) -> tuple[Rig, list[
     """Return the rig with the rims of its mirrors as masks, and warnings about mirrors without a rim in the images."""
     rig = rig_between(found.cameras[0], found.cameras[1], se3.inverse(found.T_upper_lower), images.topics)
     warnings, mounted = list[str](), []
-    for name, camera, side in zip(SIDES, (rig.lower, rig.upper), images.sides, strict=True):
+    for (name, camera), side in zip(rig.sides, images.sides, strict=True):
         mask = find_rim(brightest(side.values()), camera.camera.center)
         mounted.append(replace(camera, mask=mask))
         if mask is None and not sees_directly(camera.camera):

@@ -186,8 +186,7 @@ def check_rig(pairs: Sequence[FramePair], rig: Rig, config: PanoramaConfig) -> R
     seen = map(dewarp.process, pairs)
     found = [match(panoramas.lower, panoramas.upper, panoramas.visible) for panoramas in seen]
     rims = tuple(
-        rim_shift(brightest(getattr(pair, side) for pair in pairs), mounted.mask)
-        for side, mounted in zip(SIDES, (rig.lower, rig.upper), strict=True)
+        rim_shift(brightest(getattr(pair, side) for pair in pairs), mounted.mask) for side, mounted in rig.sides
     )
     skew_s = float(np.median([pair.skew_s for pair in pairs]))
     return RigCheckResult(judge(together(found), rectification.cylinder), (rims[0], rims[1]), len(pairs), skew_s)

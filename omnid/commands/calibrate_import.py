@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     rig = _imported(args)
     if args.height_m is not None:
         rig = rig.at_height(args.height_m)
-    for side, mounted in (("lower", rig.lower), ("upper", rig.upper)):
+    for side, mounted in rig.sides:
         if np.isnan(field_of_view(mounted.camera, mounted.visible)[0]):
             width, height = mounted.camera.size
             raise OmnidError(
