@@ -30,9 +30,9 @@ _EXTRANEOUS_AT_END = "extraneous bytes before marker 0xd9"
 _PNG_END = b"IEND\xaeB`\x82"
 # Signature, then the chunk IHDR: length, name, width, height, bit depth, colour type (PNG 1.2, 4.1.1).
 _PNG_START = struct.Struct(">8x4x4sIIBB")
-_PNG_FIRST_CHUNK = 8
-_PNG_CHUNK_BYTES = 12  # length, name and CRC
-_MAX_PNG_CHUNKS = 1000
+_PNG_ANIMATION = (
+    b"\0\0\0\x08acTL"  # length and name of the chunk of an animation, for which OpenCV takes 10 bytes a pixel
+)
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by colour type
 _LUMA = {"yuyv": 0, "uyvy": 1}  # index of the luma byte of the two bytes of a pixel
 # Conversions by encoding without the number of bits, which are 8 or 16 a sample.
@@ -106,9 +106,10 @@ def coding_steps(frame: Frame) -> Steps:
 
 def is_deep(frame: Frame) -> bool:
     """True if an image has 16 bits a sample, of which Frame.bits are those of the camera."""
-    if frame.encoding == "png" and len(frame.data) >= _PNG_START.size:
-        return bool(_PNG_START.unpack_from(np.frombuffer(frame.data, np.uint8).data)[3] == int(_DEEP))
-    return frame.encoding.endswith(_DEEP)
+    if frame.encoding != "png":
+        return frame.encoding.endswith(_DEEP)
+    start = np.frombuffer(frame.data, np.uint8)[: _PNG_START.size].tobytes()
+    return bool(_PNG_START.unpack(start.ljust(_PNG_START.size))[-2] == int(_DEEP))
 
 
 def upper_eight_bits(samples: NDArray[Any], bits: int) -> NDArray[np.uint8]:
@@ -140,25 +141,33 @@ def _decoded_jpeg(frame: Frame, data: NDArray[np.uint8]) -> NDArray[np.uint8]:
         if _EXTRANEOUS_AT_END not in str(error):
             raise
         image = simplejpeg.decode_jpeg(_ZEROS_BEFORE_END.sub(b"", data.tobytes()), "GRAY")
-    return _interpolated(frame, image[..., 0]) if colours == "Gray" else np.asarray(image[..., 0])
+    return _interpolated(frame.bayer, image[..., 0]) if colours == "Gray" else np.asarray(image[..., 0])
 
 
 def _decoded_png(frame: Frame, data: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    if data.tobytes().rfind(_PNG_END) < 0:
+    raw = data.tobytes()
+    if raw.rfind(_PNG_END) < 0:
         raise _decode_error(frame, f"its end is missing after {data.size} bytes")
-    width, height, channels = _png_size(data)
-    _require_samples(frame, width, height, channels)
+    name, width, height, _, colours = _PNG_START.unpack_from(raw.ljust(_PNG_START.size, b"\0"))
+    channels = _PNG_CHANNELS.get(colours, 4)
+    is_plain = name == b"IHDR" and _PNG_ANIMATION not in raw
+    _require_samples(frame, width if is_plain else 0, height if is_plain else 0, channels)
     image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH)
     if image is None or image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
         raise _decode_error(frame, "its content is corrupt")
-    image = _interpolated(frame, image) if channels == 1 else image
+    return _upper_eight(frame, _interpolated(frame.bayer, image) if channels == 1 else image)
+
+
+def _interpolated(encoding: str, image: NDArray[Any]) -> NDArray[Any]:
+    """Return the grey image (H, W) of one whose samples are colours or a Bayer pattern, as the encoding says."""
+    name = encoding.removesuffix(_DEEP).removesuffix("8")
+    if name not in _TO_GRAY:
+        return image
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(image, image.dtype.newbyteorder("=")), _TO_GRAY[name]))
+
+
+def _upper_eight(frame: Frame, image: NDArray[Any]) -> NDArray[np.uint8]:
     return np.ascontiguousarray(image if image.dtype == np.uint8 else upper_eight_bits(image, frame.bits))
-
-
-def _interpolated(frame: Frame, image: NDArray[Any]) -> NDArray[Any]:
-    """Return the grey image (H, W) of one that may be a Bayer pattern, as frame.bayer says."""
-    name = frame.bayer.removesuffix(_DEEP).removesuffix("8")
-    return np.asarray(cv2.cvtColor(np.ascontiguousarray(image), _TO_GRAY[name]) if name in _TO_GRAY else image)
 
 
 def _require_samples(frame: Frame, width: int, height: int, channels: int) -> None:
@@ -166,25 +175,6 @@ def _require_samples(frame: Frame, width: int, height: int, channels: int) -> No
     _require_size(frame, width, height)
     if width * height * channels > MAX_SAMPLES:
         raise _decode_error(frame, f"{width} x {height} px of {channels} channels exceed {MAX_SAMPLES} samples")
-
-
-def _png_size(data: NDArray[np.uint8]) -> tuple[int, int, int]:
-    """Return width, height and channels from the IHDR chunk; zeros without it, and for an animation."""
-    if data.size < _PNG_START.size or _is_animated(data):
-        return 0, 0, 0
-    name, width, height, _, colours = _PNG_START.unpack_from(data.data)
-    return (width, height, _PNG_CHANNELS.get(colours, 4)) if name == b"IHDR" else (0, 0, 0)
-
-
-def _is_animated(data: NDArray[np.uint8]) -> bool:
-    """True if a chunk acTL precedes the pixels, or they do not follow: OpenCV takes 10 bytes a pixel for animations."""
-    offset = _PNG_FIRST_CHUNK
-    for _ in range(_MAX_PNG_CHUNKS):
-        length, name = data[offset : offset + 4].tobytes(), data[offset + 4 : offset + 8].tobytes()
-        if name in (b"IDAT", b"acTL", b""):
-            return name != b"IDAT"
-        offset += int.from_bytes(length, "big") + _PNG_CHUNK_BYTES
-    return True
 
 
 def _require_size(frame: Frame, width: int, height: int) -> None:
@@ -199,11 +189,7 @@ def _unpack(frame: Frame) -> NDArray[np.uint8]:
         return np.array(pixels[..., _LUMA[frame.encoding]], np.uint8, order="C")
     if frame.encoding in _LUMA_FIRST:
         return np.array(pixels, np.uint8, order="C") if pixels.flags.writeable else np.ascontiguousarray(pixels)
-    name = frame.encoding.removesuffix(_DEEP).removesuffix("8")
-    if name in _TO_GRAY:
-        native = np.ascontiguousarray(pixels, pixels.dtype.newbyteorder("="))
-        pixels = np.asarray(cv2.cvtColor(native, _TO_GRAY[name]))
-    return np.ascontiguousarray(pixels if pixels.dtype == np.uint8 else upper_eight_bits(pixels, frame.bits))
+    return _upper_eight(frame, _interpolated(frame.encoding, pixels))
 
 
 def _pixels(frame: Frame) -> NDArray[Any]:

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from functools import lru_cache
 from typing import Final, TypeAlias
 
+import numpy as np
+
 _MAX_SEGMENTS: Final = 1000
 _FILL: Final = 0xFF
 _TABLES, _SCAN = 0xDB, 0xDA  # markers DQT: quantisation tables; SOS: the header ends here (table B.1)
@@ -16,8 +18,7 @@ _BLOCK_PX: Final = 8
 _COEFFICIENTS: Final = _BLOCK_PX * _BLOCK_PX
 # Diagonal by diagonal, in turn up and down (figure A.6): row and column of each coefficient of a table.
 _ZIGZAG: Final = sorted(
-    ((i, j) for i in range(_BLOCK_PX) for j in range(_BLOCK_PX)),
-    key=lambda at: (at[0] + at[1], at[1] if (at[0] + at[1]) % 2 == 0 else at[0]),
+    np.ndindex(_BLOCK_PX, _BLOCK_PX), key=lambda at: (sum(at), at[1] if sum(at) % 2 == 0 else at[0])
 )
 
 Steps: TypeAlias = tuple[int, ...]
@@ -28,10 +29,9 @@ def quantisation_steps(data: memoryview) -> Steps:
     tables: dict[int, Steps] = {}
     table, offset = -1, 2  # after the start of image
     for _ in range(_MAX_SEGMENTS):
-        head = bytes(data[offset : offset + 4])
-        if len(head) < 4 or head[0] != _FILL:
+        if data[offset : offset + 1] != bytes((_FILL,)) or offset + 4 > len(data):
             break
-        marker, length = head[1], int.from_bytes(head[2:], "big")
+        marker, length = data[offset + 1], int.from_bytes(data[offset + 2 : offset + 4], "big")
         segment = bytes(data[offset + 4 : offset + 2 + length])
         if marker == _SCAN:
             return tables.get(table, ())
@@ -65,12 +65,11 @@ def _tables(segment: bytes) -> Mapping[int, Steps]:
     A camera sends the same segments with each image.
     """
     found: dict[int, Steps] = {}
-    offset = 0
-    while offset < len(segment):
-        number, size = segment[offset] & 15, 2 if segment[offset] >> 4 else 1
-        steps = segment[offset + 1 : offset + 1 + size * _COEFFICIENTS]
-        if len(steps) < size * _COEFFICIENTS:
+    while segment:
+        number, kind = segment[0] & 15, np.dtype(">u2" if segment[0] >> 4 else "u1")
+        size = 1 + kind.itemsize * _COEFFICIENTS
+        if len(segment) < size:
             break
-        found[number] = tuple(int.from_bytes(steps[k : k + size], "big") for k in range(0, len(steps), size))
-        offset += 1 + len(steps)
+        found[number] = tuple(np.frombuffer(segment[1:size], kind).tolist())
+        segment = segment[size:]
     return found

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import fcntl
-from typing import Final
+from typing import Any, ClassVar, Final, TypeAlias
 
 CAPTURE: Final = 1  # V4L2_BUF_TYPE_VIDEO_CAPTURE
 MMAP: Final = 1  # V4L2_MEMORY_MMAP
@@ -29,44 +29,41 @@ CONTROL_READ_ONLY: Final = 0x04  # V4L2_CTRL_FLAG_READ_ONLY
 CONTROL_INTEGER, CONTROL_BOOLEAN, CONTROL_MENU, CONTROL_INTEGER_MENU = 1, 2, 3, 9  # enum v4l2_ctrl_type
 
 Int32 = ctypes.c_int32
-_u8, _u32, _i32 = ctypes.c_uint8, ctypes.c_uint32, ctypes.c_int32
+_u32 = ctypes.c_uint32
+_Fields: TypeAlias = list[tuple[str, type[Any]]]
+
+
+def _words(names: str, kind: type[Any] = _u32) -> _Fields:
+    """Return fields of 32 bits each."""
+    return [(name, kind) for name in names.split()]
 
 
 class Capability(ctypes.Structure):
     """struct v4l2_capability."""
 
+    _names: ClassVar[_Fields] = [("driver", ctypes.c_char * 16), ("card", ctypes.c_char * 32)]
     _fields_ = (
-        ("driver", ctypes.c_char * 16),
-        ("card", ctypes.c_char * 32),
+        *_names,
         ("bus_info", ctypes.c_char * 32),
-        ("version", _u32),
-        ("capabilities", _u32),
-        ("device_caps", _u32),
-        ("reserved", _u32 * 3),
+        *_words("version capabilities device_caps"),
+        ("others", _u32 * 3),
     )
 
 
 class Fraction(ctypes.Structure):
     """struct v4l2_fract."""
 
-    _fields_ = (("numerator", _u32), ("denominator", _u32))
+    _fields_ = _words("numerator denominator")
 
 
 class PixelFormat(ctypes.Structure):
-    """struct v4l2_pix_format."""
+    """struct v4l2_pix_format; others: size of the image, colours."""
 
-    _fields_ = (
-        ("width", _u32),
-        ("height", _u32),
-        ("pixelformat", _u32),
-        ("field", _u32),
-        ("bytesperline", _u32),
-        ("others", _u32 * 7),  # size of the image, colours
-    )
+    _fields_ = (*_words("width height pixelformat field bytesperline"), ("others", _u32 * 7))
 
 
 class _AnyFormat(ctypes.Union):
-    _fields_ = (("pix", PixelFormat), ("raw_data", _u8 * 200), ("pointer_alignment", ctypes.c_long))
+    _fields_ = (("pix", PixelFormat), ("raw_data", ctypes.c_uint8 * 200), ("pointer_alignment", ctypes.c_long))
 
 
 class Format(ctypes.Structure):
@@ -76,20 +73,15 @@ class Format(ctypes.Structure):
 
 
 class StreamParameters(ctypes.Structure):
-    """struct v4l2_streamparm with the capture branch of its union, struct v4l2_captureparm."""
+    """struct v4l2_streamparm with the capture branch of its union of 200 bytes, struct v4l2_captureparm."""
 
-    _fields_ = (
-        ("type", _u32),
-        ("capability", _u32 * 2),  # and the mode of capture
-        ("timeperframe", Fraction),
-        ("others", _u8 * (200 - 4 * 4)),
-    )
+    _fields_ = (*_words("type capability mode"), ("timeperframe", Fraction), ("others", _u32 * 46))
 
 
 class BufferRequest(ctypes.Structure):
     """struct v4l2_requestbuffers."""
 
-    _fields_ = (("count", _u32), ("type", _u32), ("memory", _u32), ("capabilities", _u32), ("flags", _u32))
+    _fields_ = _words("count type memory capabilities flags")
 
 
 class _Timeval(ctypes.Structure):
@@ -103,20 +95,9 @@ class _BufferMemory(ctypes.Union):
 class V4l2Buffer(ctypes.Structure):
     """struct v4l2_buffer."""
 
-    _fields_ = (
-        ("index", _u32),
-        ("type", _u32),
-        ("bytesused", _u32),
-        ("flags", _u32),
-        ("field", _u32),
-        ("timestamp", _Timeval),
-        ("timecode", _u32 * 4),
-        ("sequence", _u32),
-        ("memory", _u32),
-        ("m", _BufferMemory),
-        ("length", _u32),
-        ("others", _u32 * 2),
-    )
+    _begin: ClassVar[_Fields] = [*_words("index type bytesused flags field"), ("timestamp", _Timeval)]
+    _timecode: ClassVar[_Fields] = [("timecode", _u32 * 4), *_words("sequence memory")]
+    _fields_ = (*_begin, *_timecode, ("m", _BufferMemory), *_words("length reserved request_fd"))
 
     @property
     def stamp_ns(self) -> int:
@@ -127,29 +108,20 @@ class V4l2Buffer(ctypes.Structure):
 class QueryControl(ctypes.Structure):
     """struct v4l2_queryctrl."""
 
-    _fields_ = (
-        ("id", _u32),
-        ("type", _u32),
-        ("name", ctypes.c_char * 32),
-        ("minimum", _i32),
-        ("maximum", _i32),
-        ("step", _i32),
-        ("default_value", _i32),
-        ("flags", _u32),
-        ("reserved", _u32 * 2),
-    )
+    _values: ClassVar[_Fields] = _words("minimum maximum step default_value", Int32)
+    _fields_ = (*_words("id type"), ("name", ctypes.c_char * 32), *_values, *_words("flags reserved1 reserved2"))
 
 
 class QueryMenu(ctypes.Structure):
     """struct v4l2_querymenu; of an integer menu the first 8 bytes of name are a number."""
 
-    _fields_ = (("id", _u32), ("index", _u32), ("name", ctypes.c_char * 32), ("reserved", _u32))
+    _fields_ = (*_words("id index"), ("name", ctypes.c_char * 32), ("reserved", _u32))
 
 
 class V4l2Control(ctypes.Structure):
     """struct v4l2_control."""
 
-    _fields_ = (("id", _u32), ("value", _i32))
+    _fields_ = (("id", _u32), ("value", Int32))
 
 
 _WRITE, _READ = 1, 2  # _IOC_WRITE, _IOC_READ

@@ -10,6 +10,7 @@ When an image was taken is stated in one of three ways:
 from __future__ import annotations
 
 import errno
+import math
 import os
 import re
 import stat
@@ -18,7 +19,8 @@ from collections.abc import Iterator, Sequence
 from decimal import Decimal, InvalidOperation
 from itertools import pairwise
 from pathlib import Path
-from typing import Final, NamedTuple
+from statistics import median_high
+from typing import Final
 
 import numpy as np
 
@@ -36,12 +38,8 @@ ATTACHMENT: Final = "rig.toml"  # The rig's file, in the same folder as the fold
 _MAX_DEPTH: Final = 4  # Folders of images are searched down to this depth below the given one.
 _MAX_VISITED: Final = 10_000
 _MAX_STAMP_NS: Final = 2**31 * 10**9  # of the times of ROS, which end in 2038
+_GIVE_RATE: Final = "give --rate HZ, which is log.rate_hz of the settings"
 _NANOSECONDS: Final = re.compile(r"\d{16,19}")
-
-
-class _StampedFile(NamedTuple):
-    stamp_ns: int
-    path: Path
 
 
 def image_folders(path: Path) -> list[Path]:
@@ -72,8 +70,10 @@ class ImageFolder:
 
     def __init__(self, path: Path, folders: Sequence[Path], rate_hz: float = 0.0) -> None:
         """rate_hz: images a second; 0: their names or times.txt state their stamps."""
+        if not 0.0 <= rate_hz < math.inf:
+            raise DriverError(f"{str(path)!r}: a rate of {rate_hz:g} images a second is given: expected one above 0")
         self._path = path
-        self._files = [sorted(_stamped(folder, rate_hz)) for folder in folders]
+        self._files = [_stamped(folder, rate_hz) for folder in folders]
         names = [folder.relative_to(path).as_posix() for folder in folders]
         self.topics = {number: Topic(name, COMPRESSED_IMAGE) for number, name in enumerate(names)}
         self.faults: Counter[str] = Counter()
@@ -94,7 +94,7 @@ class ImageFolder:
 
     def read(self, channel: int, time_ns: int, block: int, offset: int) -> bytes:
         """Return an image as a message, whose stamp is that of the image; raise RecordError where it is unreadable."""
-        path = self._files[block][offset].path
+        _, path = self._files[block][offset]
         try:
             return compressed_image(time_ns, _read_regular(path, MAX_RECORD_BYTES))
         except OSError as error:
@@ -112,11 +112,11 @@ class ImageFolder:
         """No file stays open."""
 
 
-def _stamped(folder: Path, rate_hz: float) -> list[_StampedFile]:
-    """Return the images of a folder with their stamps; raise DriverError where one has none."""
+def _stamped(folder: Path, rate_hz: float) -> list[tuple[int, Path]]:
+    """Return stamp [ns] and path of the images of a folder; raise DriverError where one has no stamp."""
     paths = sorted((path for path in folder.iterdir() if _is_image(path.name)), key=_numbers_of)
     if rate_hz:
-        return [_StampedFile(round(index * 1e9 / rate_hz), path) for index, path in enumerate(paths)]
+        return [(round(index * 1e9 / rate_hz), path) for index, path in enumerate(paths)]
     lines = _stamp_lines(folder)
     if lines is not None and len(lines) != len(paths):
         raise DriverError(
@@ -124,24 +124,23 @@ def _stamped(folder: Path, rate_hz: float) -> list[_StampedFile]:
             "they must be as many"
         )
     found = []
-    for index, path in enumerate(paths):
-        text = path.stem if lines is None else lines[index]
-        if lines is None and _NANOSECONDS.fullmatch(text):
-            stamp_ns: int | None = int(text)
-        else:
-            stamp_ns = _seconds_ns(text) if lines is not None or "." in text else None
+    for path, text in zip(paths, lines or [path.stem for path in paths], strict=True):
+        is_name = lines is None
+        stamp_ns = int(text) if is_name and _NANOSECONDS.fullmatch(text) else None
+        if stamp_ns is None and ("." in text or not is_name):
+            stamp_ns = _seconds_ns(text)
         if stamp_ns is None or stamp_ns >= _MAX_STAMP_NS:
-            where = "is named" if lines is None else "has the stamp"
             raise DriverError(
-                f"{str(path)!r} {where} {text[:40]!r}: expected nanoseconds of 16 to 19 digits as its name, or seconds "
-                f"in {STAMP_FILES[0]}; else give --rate HZ, which is log.rate_hz of the settings"
+                f"{str(path)!r} {'is named' if is_name else 'has the stamp'} {text[:40]!r}: expected nanoseconds of 16 "
+                f"to 19 digits as its name, or seconds in {STAMP_FILES[0]}; else {_GIVE_RATE}"
             )
-        found.append(_StampedFile(stamp_ns, path))
-    steps_ns = sorted(after.stamp_ns - before.stamp_ns for before, after in pairwise(sorted(found)))
-    if lines is None and steps_ns and 0 < steps_ns[len(steps_ns) // 2] <= SHORTEST_STEP_NS:
+        found.append((stamp_ns, path))
+    found.sort()
+    steps_ns = [after - before for (before, _), (after, _) in pairwise(found)]
+    if lines is None and steps_ns and 0 < (step_ns := median_high(steps_ns)) <= SHORTEST_STEP_NS:
         raise DriverError(
-            f"the images beside {str(paths[0])!r} are {steps_ns[len(steps_ns) // 2] / 1000:g} us apart, as names are "
-            f"nanoseconds; write seconds to {STAMP_FILES[0]}, or give --rate HZ, which is log.rate_hz of the settings"
+            f"the images beside {str(paths[0])!r} are {step_ns / 1000:g} us apart, as names are nanoseconds; write "
+            f"seconds to {STAMP_FILES[0]}, or {_GIVE_RATE}"
         )
     return found
 

@@ -196,9 +196,7 @@ class Log:
         faults = [fault for file in self._files for fault in file.faults]
         cuts = [file.cut for file in self._files if file.cut]
         if self._missing:
-            more = f" and {len(self._missing) - MAX_LISTED} more" if len(self._missing) > MAX_LISTED else ""
-            listed = ascii(", ".join(self._missing[:MAX_LISTED]))[1:-1]
-            cuts.insert(0, f"parts of the log {self.name!r} are missing: {listed}{more}: used the others")
+            cuts.insert(0, f"parts of the log {self.name!r} are missing: {listed(self._missing)}: used the others")
         return LogDamage(len(faults), faults[0] if faults else "", "; ".join(cuts))
 
     def close(self) -> None:
@@ -289,3 +287,11 @@ def steps_back(times: NDArray[np.int64]) -> NDArray[np.int64]:
             starts.append(at)
         low, high = (run[0], run[-1]) if is_step else (min(low, run[0]), max(high, run[-1]))
     return np.array(starts[1:], np.int64)
+
+
+def listed(names: Iterable[str], none: str = "") -> str:
+    """Return names in one line, with unprintable characters escaped; none: what stands for no names."""
+    every = sorted(names)
+    shown = ", ".join(name if name.isprintable() else ascii(name)[1:-1] for name in every[:MAX_LISTED])
+    more = f" and {len(every) - MAX_LISTED} more" if len(every) > MAX_LISTED else ""
+    return (shown or none) + more

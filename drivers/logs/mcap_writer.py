@@ -8,7 +8,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
-from types import TracebackType
 from typing import Literal, Self
 
 from mcap.exceptions import McapError
@@ -41,7 +40,8 @@ class LogWriter:
     Raises DriverError where the file cannot be created or written (a full disk), and for a message type that ROS 2
     does not have.
 
-    messages: number of messages written; persisted: number of those that would survive a crash now.
+    messages: number of messages written; persisted: number of those that would survive a crash now; size_bytes: of the
+    file without the current chunk.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class LogWriter:
         exclusive: bool = False,
     ) -> None:
         self._path = Path(path)
-        self.messages = self.persisted = 0
+        self.messages = self.persisted = self.size_bytes = 0
         self._channels: dict[tuple[str, str], int] = {}
         self._schemas: dict[str, int] = {}
         try:
@@ -64,16 +64,13 @@ class LogWriter:
                 f"cannot create the log {str(self._path)!r}: {error.strerror}; give a path that can be written"
             ) from error
         lock(self._file)
-        self._usable = True
-        self._flushed_bytes = 0
-        self._flushed_ns: int | None = None
+        self._usable, self._flushed_ns = True, -1
         with self._guarded():
             self._writer = Writer(self._file, chunk_bytes, _COMPRESSIONS[compression])
             self._writer.start("ros2", "omnid")
             for name, data in (attachments or {}).items():
                 self._writer.add_attachment(0, 0, name, "application/octet-stream", data)
-            self._file.flush()
-            self._flushed_bytes = self._file.tell()
+            self._note_persisted()
 
     def write(self, topic: str, schema_name: str, data: bytes | memoryview, stamp_ns: int) -> None:
         """Write a message: CDR with its encapsulation header, of a type such as nav_msgs/msg/Odometry.
@@ -87,17 +84,18 @@ class LogWriter:
             channel = self._channels.get((topic, schema_name)) or self._register(topic, schema_name)
             self.messages += 1
             self._writer.add_message(channel, stamp_ns, bytes(data), stamp_ns)
-            self._flush_when_due(stamp_ns)
+            # A chunk ends after half a second of stamps; one that has ended is passed to the kernel at once.
+            self._flushed_ns = stamp_ns if self._flushed_ns < 0 else self._flushed_ns
+            if abs(stamp_ns - self._flushed_ns) >= _FLUSH_NS:
+                self._flushed_ns = stamp_ns
+                self._flush()
+            elif self._file.tell() != self.size_bytes:
+                self._note_persisted()
 
     @property
     def usable(self) -> bool:
         """True until it is closed or fails."""
         return self._usable
-
-    @property
-    def size_bytes(self) -> int:
-        """Size of the file without the current chunk."""
-        return self._flushed_bytes
 
     def sync(self) -> None:
         """End the chunk and write all data to the disk; raise DriverError where that fails or the file was deleted."""
@@ -125,9 +123,7 @@ class LogWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     @contextmanager
@@ -138,7 +134,6 @@ class LogWriter:
         try:
             yield
         except (OSError, McapError) as error:
-            self._usable = False
             self._abandon()
             reason = getattr(error, "strerror", None) or " ".join(str(error).split())
             raise DriverError(
@@ -152,6 +147,7 @@ class LogWriter:
             self._file.close()
 
     def _register(self, topic: str, schema_name: str) -> int:
+        """Return the channel of a topic and a type."""
         if schema_name not in self._schemas:
             text = schema_text(schema_name)
             self._schemas[schema_name] = self._writer.register_schema(schema_name, "ros2msg", text.encode())
@@ -160,24 +156,14 @@ class LogWriter:
         self._channels[topic, schema_name] = channel
         return channel
 
-    def _flush_when_due(self, stamp_ns: int) -> None:
-        """End the chunk after half a second of stamps; pass ended chunks to the kernel at once."""
-        if self._flushed_ns is None:
-            self._flushed_ns = stamp_ns
-        if abs(stamp_ns - self._flushed_ns) >= _FLUSH_NS:
-            self._flushed_ns = stamp_ns
-            self._flush()
-        elif self._file.tell() != self._flushed_bytes:
-            self._file.flush()
-            self._note_persisted()
-
     def _flush(self) -> None:
+        """End the chunk and pass it to the kernel."""
         self._writer.flush()  # type: ignore[no-untyped-call]
         self._note_persisted()
 
     def _note_persisted(self) -> None:
-        self._flushed_bytes = self._file.tell()
-        self.persisted = self.messages
+        self._file.flush()
+        self.size_bytes, self.persisted = self._file.tell(), self.messages
 
     def _reach_disk(self) -> None:
         os.fsync(self._file.fileno())

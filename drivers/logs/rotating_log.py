@@ -114,15 +114,13 @@ class RotatingLog:
 
     def _current(self, stamp_ns: int) -> LogWriter | None:
         """Return the file for a message with this stamp, None where none can be created."""
-        if self._writer is not None and self._is_full(self._writer, stamp_ns):
-            self._end()
+        if self._writer is not None:
+            age_s = abs(stamp_ns - self._start_ns) / 1e9
+            if self._writer.size_bytes >= self._rotation.file_bytes or age_s >= self._rotation.file_s:
+                self._end()
         if self._writer is None and time.monotonic() >= self._retry_at_s:
             self._begin(stamp_ns)
         return self._writer
-
-    def _is_full(self, writer: LogWriter, stamp_ns: int) -> bool:
-        age_s = abs(stamp_ns - self._start_ns) / 1e9
-        return writer.size_bytes >= self._rotation.file_bytes or age_s >= self._rotation.file_s
 
     def _begin(self, stamp_ns: int) -> None:
         """Make room, then create a file; the recording stops where that fails."""
@@ -172,23 +170,20 @@ class RotatingLog:
         writer, self._writer = self._writer, None
         if writer is not None:
             self.state.lost += writer.messages - writer.persisted
-            _drop(writer)
+            with suppress(DriverError):  # which has been reported
+                writer.close()
             if not writer.persisted:
                 _delete(self._path)
         self.state.problem, self.state.file = str(error), ""
         self._retry_at_s = time.monotonic() + self._backoff.next_s()
 
-    def _resume(self) -> None:
-        """Report that a new file is being written."""
-        lost = self.state.lost - self._lost_before
-        self.state.status, self.state.problem = "recording", ""
-        self._backoff.reset()
-        self._on_event(logging.INFO, f"recording: continues in {str(self._path)!r}; {lost} messages were lost")
-
     def _maintain(self, writer: LogWriter) -> None:
-        """Write the file to the disk once per sync_s, and check the free space."""
+        """Report that a recording continues; write the file to the disk once per sync_s, and check the free space."""
         if self.state.status == "stopped" and writer.persisted:
-            self._resume()
+            self.state.status, self.state.problem = "recording", ""
+            self._backoff.reset()
+            lost = self.state.lost - self._lost_before
+            self._on_event(logging.INFO, f"recording: continues in {str(self._path)!r}; {lost} messages were lost")
         if time.monotonic() - self._synced_s < self._rotation.sync_s:
             return
         writer.sync()
@@ -273,9 +268,3 @@ def _delete(path: Path) -> bool:
         path.unlink()
         return True
     return False
-
-
-def _drop(writer: LogWriter) -> None:
-    """Close a file without reporting failures."""
-    with suppress(DriverError):
-        writer.close()

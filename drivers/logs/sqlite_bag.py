@@ -55,9 +55,8 @@ class SqliteBag:
         self._files = [path, *(Path(f"{path}{suffix}") for suffix in _BESIDE)]
         try:
             self._bag = self._opened()
-            is_bag = (
-                self._bag.execute(_TABLES).fetchone()[0] == 2 and self._bag.execute(_COLUMNS).fetchall() == _EXPECTED
-            )
+            has_tables = self._bag.execute(_TABLES).fetchone()[0] == 2
+            is_bag = has_tables and self._bag.execute(_COLUMNS).fetchall() == _EXPECTED
             rows = self._bag.execute(_TOPICS).fetchall() if is_bag else []
         except (*_FAULTS, OSError, ValueError) as error:
             raise DriverError(

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from drivers.errors import DriverError
 from drivers.frame import CAMERAS, Camera
-from drivers.logs.log import MAX_LISTED
+from drivers.logs.log import listed
 from drivers.logs.ros_messages import COMPRESSED_IMAGE, IMAGE, IMAGE_TYPES, IMU, JOINT_STATE, ODOMETRY, JointWheels
 
 _WORDS: dict[str, Camera] = {
@@ -36,16 +36,16 @@ def choose_topics(log: str, topics: Mapping[str, str], wanted: Wanted) -> dict[C
         raise DriverError(f"no messages can be read in {log}: `omnid log info` says whether it was cut")
     if not images:
         raise DriverError(
-            f"no image topics in {log}: found {_listed(topics)}; record {IMAGE} or {COMPRESSED_IMAGE} of both cameras"
+            f"no image topics in {log}: found {listed(topics)}; record {IMAGE} or {COMPRESSED_IMAGE} of both cameras"
         )
     given = {camera: _given(log, topics, wanted[camera]) for camera in CAMERAS}
     free = [name for name in images if name not in given.values()]
     lower, upper = (given[camera] or _guessed(log, free, camera) for camera in CAMERAS)
     if lower is None and upper is None and len(_images(images)) > 1:
-        raise DriverError(f"cannot tell the cameras in {log} apart: found {_listed(images)}; give --lower and --upper")
+        raise DriverError(f"cannot tell the cameras in {log} apart: found {listed(images)}; give --lower and --upper")
     if lower is None or upper is None:
         missing = "lower" if lower is None else "upper"
-        raise DriverError(f"no {missing} camera in {log}: found only {_listed(images)}; give --{missing} TOPIC")
+        raise DriverError(f"no {missing} camera in {log}: found only {listed(images)}; give --{missing} TOPIC")
     if lower == upper:
         raise DriverError(f"topic {lower!r} of {log} is named for both cameras: expected two topics")
     return {"lower": lower, "upper": upper}
@@ -80,7 +80,7 @@ def choose_motion_topics(log: str, topics: Mapping[str, str], wanted: MotionTopi
         if name:
             if topics.get(name) != kind:
                 found = f"holds {topics[name]}" if topics.get(name) else "is not"
-                raise DriverError(f"topic {name!r} {found} in {log}; {knob} must be one of {kind}: {_listed(topics)}")
+                raise DriverError(f"topic {name!r} {found} in {log}; {knob} must be one of {kind}: {listed(topics)}")
             chosen.append(name)
         elif name is None:
             found_names = [
@@ -89,7 +89,7 @@ def choose_motion_topics(log: str, topics: Mapping[str, str], wanted: MotionTopi
                 if found == kind and (kind != ODOMETRY or "wheel" in topic.lower())
             ]
             if len(found_names) > 1:
-                warnings.append(f"{log} has several topics of {kind}: {_listed(found_names)}; none is used: set {knob}")
+                warnings.append(f"{log} has several topics of {kind}: {listed(found_names)}; none is used: set {knob}")
             else:
                 chosen += found_names
     return MotionChoice(frozenset(chosen), "; ".join(warnings))
@@ -102,9 +102,9 @@ def _given(log: str, topics: Mapping[str, str], name: str | None) -> str | None:
     transports = name, f"{name}{_COMPRESSED}", name.removesuffix(_COMPRESSED)
     name = next((topic for topic in transports if topic in topics), name)
     if name not in topics:
-        raise DriverError(f"no topic {name!r} in {log}: found {_listed(topics)}; give one of these")
+        raise DriverError(f"no topic {name!r} in {log}: found {listed(topics)}; give one of these")
     if topics[name] not in IMAGE_TYPES:
-        raise DriverError(f"topic {name!r} in {log} holds {topics[name] or 'no CDR'}; give one of: {_listed(topics)}")
+        raise DriverError(f"topic {name!r} in {log} holds {topics[name] or 'no CDR'}; give one of: {listed(topics)}")
     return name
 
 
@@ -117,17 +117,9 @@ def _guessed(log: str, names: Sequence[str], camera: Camera) -> str | None:
     words = {name: re.split(r"[^a-z0-9]+", name.lower()) for name in names}
     mine = [name for name in names if next((_WORDS[word] for word in words[name] if word in _WORDS), None) == camera]
     if len(_images(mine)) > 1:
-        raise DriverError(f"several {camera} cameras in {log}: found {_listed(mine)}; give one of them by --{camera}")
+        raise DriverError(f"several {camera} cameras in {log}: found {listed(mine)}; give one of them by --{camera}")
     return max(mine, key=lambda name: name.endswith(_COMPRESSED), default=None)
 
 
 def _images(names: Iterable[str]) -> set[str]:
     return {name.removesuffix(_COMPRESSED) for name in names}
-
-
-def _listed(names: Iterable[str]) -> str:
-    """Return the names on one line, with unprintable characters escaped."""
-    every = sorted(names)
-    shown = [name if name.isprintable() else ascii(name) for name in every[:MAX_LISTED]]
-    more = f" and {len(every) - MAX_LISTED} more" if len(every) > MAX_LISTED else ""
-    return ", ".join(shown) + more

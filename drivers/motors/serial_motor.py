@@ -142,8 +142,10 @@ class SerialMotor:
         """Stop the wheels if the controller replies, and release the port; a second call does nothing."""
         self._closed = True
         with contextlib.suppress(DriverError):
-            for _ in range(STOPS_AT_CLOSE):
-                if self._port is None or self._stopped():
+            for _ in range(STOPS_AT_CLOSE if self._port is not None else 0):
+                stop = self._protocol.drive(stop_command(0), time.monotonic())
+                with contextlib.suppress(NoReplyError):
+                    self._run(stop, time.monotonic() + self._timeout_s)
                     break
         self._release()
 
@@ -176,24 +178,21 @@ class SerialMotor:
     def _connect(self, connect_s: float) -> None:
         """Open the port and send stops until one gets a reply; raise DriverError after connect_s."""
         deadline_s = time.monotonic() + connect_s
-        self._open()
         try:
             while self._state is not _State.DRIVING:
-                self._try_to_stop(deadline_s)
+                try:
+                    self._send(stop_command(0), time.monotonic() + 2 * max(CONNECT_TRY_S, self._timeout_s))
+                except NoReplyError:
+                    if time.monotonic() >= deadline_s:
+                        raise
+                    continue
+                if self._state is _State.STOP_FIRST and time.monotonic() >= deadline_s:
+                    raise DriverError(
+                        f"motor on {self._name} stays stopped by its watchdog; switch it off and on again"
+                    )
         except BaseException:
             self._release()
             raise
-
-    def _try_to_stop(self, deadline_s: float) -> None:
-        """Send one stop; ignore a missing reply before the deadline. The last try may end after it."""
-        try:
-            self._send(stop_command(0), time.monotonic() + 2 * max(CONNECT_TRY_S, self._timeout_s))
-        except NoReplyError:
-            if time.monotonic() >= deadline_s:
-                raise
-            return
-        if self._state is _State.STOP_FIRST and time.monotonic() >= deadline_s:
-            raise DriverError(f"motor on {self._name} stays stopped by its watchdog; switch it off and on again")
 
     def _set_up(self, deadline_s: float) -> None:
         """Ask the controller to be set up, or go on to await its answer; ask again after CONNECT_TRY_S."""
@@ -217,25 +216,18 @@ class SerialMotor:
         self._reopening.reset()
         self.connections += 1
 
-    def _stopped(self) -> bool:
-        with contextlib.suppress(NoReplyError):
-            self._run(self._protocol.drive(stop_command(0), time.monotonic()), time.monotonic() + self._timeout_s)
-            return True
-        return False
-
     def _open(self) -> None:
         """Open the port; raise DriverError before the time of the next try, and where it cannot be opened."""
         if self._closed:
             raise DriverError(f"motor on {self._name} is closed; make a new one")
         if time.monotonic() < self._next_open_s:
             raise DriverError(self._problem or f"motor on {self._name} is gone; plug it in, it is tried again")
-        self._next_open_s = time.monotonic() + self._reopening.next_s()
+        self._next_open_s, self._problem = time.monotonic() + self._reopening.next_s(), ""
         try:
             self._port, self._state = _opened(self._name, self._baud), _State.SETTING_UP
         except DriverError as error:
             self._problem = str(error)
             raise
-        self._problem = ""
 
     def _release(self) -> None:
         port, self._port, self._state, self._asking = self._port, None, _State.GONE, None
@@ -318,14 +310,33 @@ class SerialMotor:
 
     def _no_reply(self, transaction: Transaction[T]) -> NoReplyError:
         """Return the error for a missing reply: what the protocol has seen of it, else what came at all."""
-        found = ""
+        seen = ""
         try:
             transaction.throw(NoReplyError())
         except NoReplyError as error:
-            found = "" if _is_echo(self._sent, self._came) else str(error)
+            seen = str(error)
         except StopIteration:
             pass
-        found = f": {found}" if found else f" {_heard(self._sent, self._came, self._baud)}"
+        is_echo = len(self._came) > 3 and self._came[: len(self._sent)] == self._sent[: len(self._came)]
+        # Text, or bytes as another baud rate makes them.
+        is_text = sum(byte in _TEXT for byte in self._came) >= 0.95 * len(self._came)
+        if not self._came:
+            found = f" gave no answer, not a byte; check power, cable, the baud rate ({self._baud}) and motor.protocol"
+        elif is_echo:
+            found = (
+                " gave no answer of its own: what comes back is what was sent; are TX and RX joined, or does the "
+                "adapter echo (RS-485)?"
+            )
+        elif seen:
+            found = f": {seen}"
+        elif is_text:
+            text = self._came.decode("ascii", "replace").strip()[:40]
+            found = f" answers, but not in its protocol: {text!r}; is it another firmware, or another motor.protocol?"
+        else:
+            found = (
+                f" answers, but not in its protocol: bytes as {self._came[:8].hex(' ')}, which are no text; check the "
+                f"baud rate ({self._baud}, motor.baud), motor.protocol and the cable"
+            )
         return NoReplyError(f"motor on {self._name}{found}")
 
 
@@ -349,30 +360,6 @@ def _opened(port: str, baud: int) -> serial.Serial:
             f"motor port {port!r} at {baud} baud cannot be opened: "
             f"{reason or _one_line(error) + '; is it a serial port?'}"
         ) from None
-
-
-def _is_echo(sent: bytes, came: bytes) -> bool:
-    """True if what comes back is what was sent."""
-    return len(came) > 3 and came[: len(sent)] == sent[: len(came)]
-
-
-def _heard(sent: bytes, came: bytes, baud: int) -> str:
-    """Return in words what came from a port instead of an answer, and what makes a port send that."""
-    if not came:
-        return f"gave no answer, not a byte; check power, cable, the baud rate ({baud}) and motor.protocol"
-    if _is_echo(sent, came):
-        return (
-            "gave no answer of its own: what comes back is what was sent; are TX and RX joined, or does the "
-            "adapter echo (RS-485)?"
-        )
-    # Text, or bytes as another baud rate makes them.
-    if sum(byte in _TEXT for byte in came) >= 0.95 * len(came):
-        text = came.decode("ascii", "replace").strip()[:40]
-        return f"answers, but not in its protocol: {text!r}; is it another firmware, or another motor.protocol?"
-    return (
-        f"answers, but not in its protocol: bytes as {came[:8].hex(' ')}, which are no text; check the "
-        f"baud rate ({baud}, motor.baud), motor.protocol and the cable"
-    )
 
 
 def _clock_s() -> float:

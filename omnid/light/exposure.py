@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.panorama import Cylinder, remap_tables, visible
-from calib.rig import MountedCamera, Rig
+from calib.rig import Rig
 from drivers.cameras.camera_state import (
     CameraExposure,
     CameraState,
@@ -34,13 +34,11 @@ from omnid.transport.status_names import EXPOSURE, Key
 
 SAMPLED_COLUMNS: Final = 160  # of the panorama: some thousand samples
 MARGIN_PX: Final = 2.0  # Distance kept from the rim and the hub.
-# Grey levels: the wanted mean, the least mean that bright spots may cause, the wanted level of bright spots, and the
-# level from which they count as saturated; the light is multiplied by SATURATED_FACTOR while they are.
-TARGET, LEAST_MEAN, BRIGHT, SATURATED, SATURATED_FACTOR = 100.0, 60.0, 235.0, 250.0, 0.7
-# Wanted factors between these cause no step: after a step down the factor must not be large enough for a step up.
-LEAST_DOWN, LEAST_UP = 0.77, 1.4
-LARGEST_FACTOR: Final = 2.0  # Largest factor of a step.
-VERY_BRIGHT: Final = 0.6  # If the factor is smaller, the exposure is lowered at once, together with the gain.
+# Grey levels: the wanted mean, the least mean that bright spots may cause, the level from which those are saturated.
+TARGET, LEAST_MEAN, SATURATED = 100.0, 60.0, 250.0
+# Wanted factors of the light within this one cause no step, so that a step down causes none up; twice as much is the
+# largest step. What is saturated is brighter than it shows by at least this factor.
+BAND: Final = math.sqrt(2)
 GAIN_STEPS: Final = 8  # The first step of the gain is its range by this number, since its unit is not known.
 # Time between two steps. A step against the last one doubles it, two steps in one direction reset it, against hunting.
 STEP_S, LONGEST_STEP_S = 0.5, 32.0
@@ -63,19 +61,13 @@ class UsefulArea:
         coarse = cylinder.resized(SAMPLED_COLUMNS)
         sides = [(mounted, remap_tables(rig, mounted, coarse)) for mounted in (rig.lower, rig.upper)]
         both = np.logical_and(*(visible(mounted, maps, MARGIN_PX) for mounted, maps in sides))
-        self._pixels = [_flat(mounted, maps[0][both], maps[1][both]) for mounted, maps in sides]
+        # Rows and columns in each image.
+        self._pixels = [(v[both].round().astype(np.intp), u[both].round().astype(np.intp)) for _, (u, v) in sides]
 
     def levels(self, pair: FramePair) -> tuple[GreyLevels, GreyLevels]:
         """Return the levels of the lower and of the upper image."""
-        lower, upper = (
-            _levels(image.ravel()[pixels]) for image, pixels in zip((pair.lower, pair.upper), self._pixels, strict=True)
-        )
-        return lower, upper
-
-
-def _flat(mounted: MountedCamera, u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArray[np.intp]:
-    """Return indices into the flattened image of pixels (u, v)."""
-    return np.asarray(v.round().astype(np.intp) * mounted.camera.size[0] + u.round().astype(np.intp))
+        lower, upper = (image[at] for image, at in zip((pair.lower, pair.upper), self._pixels, strict=True))
+        return _levels(lower), _levels(upper)
 
 
 def _levels(grey: NDArray[np.uint8]) -> GreyLevels:
@@ -84,10 +76,14 @@ def _levels(grey: NDArray[np.uint8]) -> GreyLevels:
 
 def wanted_factor(lower: GreyLevels, upper: GreyLevels) -> float:
     """Return the factor of the light that the images want, of both cameras together."""
-    mean, bright = max(1.0, math.sqrt(lower.mean * upper.mean)), max(1.0, lower.bright, upper.bright)
-    factor = min(TARGET / mean, SATURATED_FACTOR if bright >= SATURATED else max(1.0, BRIGHT / bright))
+    mean = max(1.0, math.sqrt(lower.mean * upper.mean))
+    factor = TARGET / mean
+    if max(lower.bright, upper.bright) >= SATURATED:
+        factor = min(factor, 1 / BAND)
+    else:
+        factor = min(factor, max(1.0, SATURATED / max(1.0, lower.bright, upper.bright)))
     factor = max(factor, LEAST_MEAN / mean)  # lamps and windows are small: the rest shall be seen
-    return min(max(factor, 1 / LARGEST_FACTOR), LARGEST_FACTOR)
+    return min(max(factor, 1 / BAND**2), BAND**2)
 
 
 class ExposureLaw:
@@ -118,7 +114,7 @@ class ExposureLaw:
             return None
         # 1. The factor on the light that is wanted, with a dead band.
         factor = wanted_factor(lower, upper)
-        direction = (factor >= LEAST_UP) - (factor <= LEAST_DOWN)
+        direction = (factor >= BAND) - (factor <= 1 / BAND)
         self.state = "regulated"
         if not direction:
             return None
@@ -156,7 +152,8 @@ class ExposureLaw:
         has_gain = self._gains is not None and gain is not None and gain > self._gains.low
         if self._gains is not None and gain is not None:
             gain = self._gains.nearest(gain - self._gain_step)
-        if not has_gain or factor < VERY_BRIGHT:
+        # Where the images are very bright, exposure and gain are lowered at once.
+        if not has_gain or factor <= 1 / BAND**2:
             time_us = min(time_us, self._time(time_us * factor))
         return ExposureSetting(time_us, gain)
 
@@ -164,8 +161,8 @@ class ExposureLaw:
 USUAL_HZ: Final = 30.0  # rate of cameras that keep their own
 PERIOD_SHARE: Final = 0.9  # Longest exposure by the images' period: the rest reads the image out.
 AFTER_PERIODS: Final = 1.5  # from a pair to the request: both cameras then carry it out after the same pair
-FLICKER_US: Final[Mapping[str, float]] = {"50": 1e6 / 100, "60": 1e6 / 120}  # lamps shine twice a period of the mains
-DARK_GREY, WHITE_GREY = 25.0, 230.0  # means beyond which images of cameras that regulate themselves are reported
+# Means beyond which images of cameras that regulate themselves are reported.
+DARK_GREY, WHITE_GREY = TARGET / 4, SATURATED - TARGET / 4
 ADVICE: Final[Mapping[str, str]] = {
     "too dark": "switch lights on, drive more slowly and raise cameras.exposure_limit_ms, or clean the mirrors; where "
     'the images are bright enough, set cameras.auto_exposure = "on"',
@@ -202,7 +199,8 @@ class ExposureControl:
         elif self._law is None:  # it starts with what the lower camera has now
             limit_us = min(1e3 * self._config.exposure_limit_ms, PERIOD_SHARE * self._period_ns * 1e-3)
             start = self._exposures[0].in_force or ExposureSetting(int(limit_us))
-            flicker_us = FLICKER_US.get(self._config.power_line, 0.0)
+            mains = self._config.power_line
+            flicker_us = 1e6 / (2 * int(mains)) if mains.isdecimal() else 0.0  # lamps shine twice a period
             self._law = ExposureLaw(_ranges(self._exposures), start, limit_us, flicker_us)
             self._request(self._law.setting, pair.stamp_ns)
         elif (wanted := self._law.step(*self._levels, pair.stamp_ns)) is not None:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final, NamedTuple, TypeAlias
 
 from drivers.errors import FrameDecodeError
-from drivers.logs.log import MAX_LISTED, LoggedMessage
+from drivers.logs.log import LoggedMessage, listed
 from drivers.logs.open_log import LogInfo, open_log
 from drivers.logs.ros_messages import IMAGE_TYPES, RosImage
 from omnid.errors import OmnidError
@@ -43,11 +43,6 @@ Content: TypeAlias = Pose | PoseInMap | Diagnostics | Cloud | Scan | TwistRecord
 Decoder: TypeAlias = Callable[[LoggedMessage], Content]
 
 
-def odometry_topics(found: LogInfo) -> list[str]:
-    """Return the topics that hold odometry messages."""
-    return [name for name, (schema, count) in found.topics.items() if schema == ODOMETRY_SCHEMA and count]
-
-
 def choose_odometry_topic(found: LogInfo, topic: str | None = None, robot: str | None = None) -> str:
     """Return the topic of the poses.
 
@@ -59,21 +54,29 @@ def choose_odometry_topic(found: LogInfo, topic: str | None = None, robot: str |
     topic: the full name, such as /omnid/odom; robot: stands for /<robot>/odom. Raise OmnidError where there is no
     such topic, or several and none is named.
     """
-    known = odometry_topics(found)
+    known = [name for name, (schema, count) in found.topics.items() if schema == ODOMETRY_SCHEMA and count]
     if topic is None and robot is not None:
         topic = f"/{robot.strip('/')}/{ODOMETRY}"
-    if topic is not None:
-        if topic not in known:
-            raise OmnidError(
-                f"{found.path}: no {ODOMETRY_SCHEMA} on {topic!r}: found {_listed(known)}; name one of these topics"
-            )
-        return topic
-    if not known:
-        raise OmnidError(_no_odometry(found))
     own = [name for name in known if name.endswith(f"/{ODOMETRY}")]
-    if len(known) == 1 or len(own) == 1:
-        return known[0] if len(known) == 1 else own[0]
-    raise OmnidError(f"{found.path}: several topics with {ODOMETRY_SCHEMA}: {_listed(known)}; choose one with --topic")
+    if topic in known:
+        return str(topic)
+    if topic is not None:
+        raise OmnidError(
+            f"{found.path}: no {ODOMETRY_SCHEMA} on {topic!r}: found {listed(known, 'none')}; name one of these topics"
+        )
+    if any(schema in IMAGE_TYPES for schema, _ in found.topics.values()) and not known:
+        rig = "" if "rig.toml" in found.attachments else " --rig rig.toml"
+        raise OmnidError(
+            f"{found.path}: images but no {ODOMETRY_SCHEMA}: run `omnid replay {found.path}{rig} --record "
+            "out.mcap` and use out.mcap"
+        )
+    if not known:
+        names = listed(found.topics, "none")
+        raise OmnidError(f"{found.path}: no {ODOMETRY_SCHEMA}: found {names}; expected a recording of a run")
+    if len(known) != 1 and len(own) != 1:
+        names = listed(known, "none")
+        raise OmnidError(f"{found.path}: several topics with {ODOMETRY_SCHEMA}: {names}; choose one with --topic")
+    return own[0] if len(own) == 1 else known[0]
 
 
 def no_pose(path: Path, topic: str) -> OmnidError:
@@ -81,22 +84,6 @@ def no_pose(path: Path, topic: str) -> OmnidError:
     return OmnidError(
         f"{path}: topic {topic!r} has no readable pose; `omnid log info {path}` tells whether the log is complete"
     )
-
-
-def _no_odometry(found: LogInfo) -> str:
-    if any(schema in IMAGE_TYPES for schema, _ in found.topics.values()):
-        rig = "" if "rig.toml" in found.attachments else " --rig rig.toml"
-        return (
-            f"{found.path}: images but no {ODOMETRY_SCHEMA}: run `omnid replay {found.path}{rig} --record "
-            "out.mcap` and use out.mcap"
-        )
-    return f"{found.path}: no {ODOMETRY_SCHEMA}: found {_listed(found.topics)}; expected a recording of a run"
-
-
-def _listed(names: Iterable[str]) -> str:
-    every = sorted(names)
-    shown = ", ".join(ascii(name) for name in every[:MAX_LISTED]) or "none"
-    return shown + (f" and {len(every) - MAX_LISTED} more" if len(every) > MAX_LISTED else "")
 
 
 class RecordedMessage(NamedTuple):

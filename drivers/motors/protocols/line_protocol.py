@@ -37,18 +37,17 @@ from __future__ import annotations
 import binascii
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final, NamedTuple
 
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
 from drivers.motors.protocols.differential_drive import DifferentialDrive
-from drivers.motors.protocols.motor_protocol import NoReplyError, TextFramer, Transaction, request, require_watchdog
+from drivers.motors.protocols.motor_protocol import TextFramer, Transaction, request, require_watchdog
 
 SEQ_COUNT = 65536
 MAX_LINE = 64  # bytes
-_CRC_START = 0xFFFF
 _LINE = re.compile(rb"\$([VSWA](?:,-?[0-9]{1,6}){1,8})\*([0-9A-Fa-f]{4})\r?\n?")
 _BUMPER, _CLIFF = 1, 2  # bits of the contact
 
@@ -72,7 +71,7 @@ _STATE: Final = (
     _Field("battery", "mV", -1, 100_000),
     _Field("fault", "(a number)", 0, 65535),
     _Field("expired", "(a flag)", 0, 1),
-    _Field("contact", "(two bits)", 0, 3),
+    _Field("contact", "(two bits)", 0, _BUMPER | _CLIFF),
 )
 _TIME: Final = (_Field("watchdog time", "ms", 20, 10_000),)
 _FIELDS: Final = {"V": _MOTION, "S": (*_MOTION, *_STATE), "W": _TIME, "A": _TIME}
@@ -112,9 +111,19 @@ def decode(line: bytes) -> tuple[str, tuple[int, ...]]:
     return kind, numbers
 
 
+def _check(kind: str, numbers: Sequence[int]) -> None:
+    """Raise ProtocolError unless a line of a kind has these numbers."""
+    fields = _FIELDS[kind]
+    if len(numbers) != len(fields):
+        raise ProtocolError(f"motor line {kind} has {len(numbers)} numbers, not {len(fields)}; check the firmware")
+    for (name, unit, low, high), number in zip(fields, numbers, strict=True):
+        if not low <= number <= high:
+            raise ProtocolError(f"motor {name} {number:.6g} is outside {low} .. {high} {unit}; keep it inside")
+
+
 def crc16(data: bytes) -> int:
     """Return the CRC-16/CCITT-FALSE of data; that of b"123456789" is 0x29B1."""
-    return binascii.crc_hqx(data, _CRC_START)
+    return binascii.crc_hqx(data, 0xFFFF)
 
 
 def velocity_line(seq: int, command: VelocityCommand) -> bytes:
@@ -124,47 +133,31 @@ def velocity_line(seq: int, command: VelocityCommand) -> bytes:
 
 def status_line(seq: int, status: MotorStatus) -> bytes:
     """Return the line of a status, as the controller writes it."""
-    battery = -1 if math.isnan(status.battery_v) else _milli("battery", status.battery_v)
+    battery_mv = -1 if math.isnan(status.battery_v) else round(status.battery_v * 1000)
     contact = _BUMPER * status.bumper + _CLIFF * status.cliff
-    return encode("S", seq, *_motion(status), battery, status.fault, int(status.watchdog_expired), contact)
+    return encode("S", seq, *_motion(status), battery_mv, status.fault, int(status.watchdog_expired), contact)
 
 
 def command_of(numbers: Sequence[int]) -> VelocityCommand:
     """Return the command in the numbers of a velocity line; its stamp, which is not sent, is 0."""
-    return VelocityCommand(0, *(milli / 1000 for milli in numbers[1:4]))
+    return VelocityCommand(0, *(milli / 1000 for milli in numbers[1:]))
 
 
 def status_of(numbers: Sequence[int]) -> MotorStatus:
     """Return the status in the numbers of a status line."""
-    velocity_mps, heading_rad, yaw_rate_radps = (milli / 1000 for milli in numbers[1:4])
-    battery_mv, fault, expired, contact = numbers[4:]
+    _, velocity, heading, yaw_rate, battery_mv, fault, expired, contact = numbers
     battery_v = math.nan if battery_mv < 0 else battery_mv / 1000
     contacts = bool(contact & _BUMPER), bool(contact & _CLIFF)
-    return MotorStatus(velocity_mps, heading_rad, yaw_rate_radps, bool(expired), fault, battery_v, *contacts)
+    return MotorStatus(velocity / 1000, heading / 1000, yaw_rate / 1000, bool(expired), fault, battery_v, *contacts)
 
 
-def _motion(source: VelocityCommand | MotorStatus) -> tuple[int, int, int]:
-    return (
-        _milli("velocity", source.velocity_mps),
-        _milli("heading", source.heading_rad),
-        _milli("yaw rate", source.yaw_rate_radps),
-    )
-
-
-def _milli(name: str, value: float) -> int:
-    milli = value * 1000
-    if not math.isfinite(milli):
-        raise ProtocolError(f"motor {name} is {value}; only finite numbers can be sent, send a stop instead")
-    return round(milli)
-
-
-def _check(kind: str, numbers: Sequence[int]) -> None:
-    fields = _FIELDS[kind]
-    if len(numbers) != len(fields):
-        raise ProtocolError(f"motor line {kind} has {len(numbers)} numbers, not {len(fields)}; check the firmware")
-    for (name, unit, low, high), number in zip(fields, numbers, strict=True):
-        if not low <= number <= high:
-            raise ProtocolError(f"motor {name} {number:.6g} is outside {low} .. {high} {unit}; keep it inside")
+def _motion(source: VelocityCommand | MotorStatus) -> list[int]:
+    """Return velocity, heading and yaw rate in thousandths; raise ProtocolError for what is not finite."""
+    values = source.velocity_mps * 1000, source.heading_rad * 1000, source.yaw_rate_radps * 1000
+    for (name, *_), value in zip(_MOTION[1:], values, strict=True):
+        if not math.isfinite(value):
+            raise ProtocolError(f"motor {name} is {value}; only finite numbers can be sent, send a stop instead")
+    return list(map(round, values))
 
 
 class LineProtocol:
@@ -181,7 +174,6 @@ class LineProtocol:
         self._seq = 0
         self._zero_rad = 0.0  # heading at which the controller's heading is 0
         self._heading_rad = 0.0  # last reported
-        self._odd = ""  # what the newest line shows that is no reply; empty without one
 
     def framer(self) -> TextFramer:
         """Return a framer of lines."""
@@ -189,7 +181,7 @@ class LineProtocol:
 
     def connect(self, watchdog_ms: int) -> Transaction[float]:
         """Set the watchdog and return the time in force [ms]; raise DriverError where another one is in force."""
-        (in_force_ms,) = yield from self._ask(encode("W", watchdog_ms), lambda numbers: True, "A")
+        (in_force_ms,) = yield from _answer(encode("W", watchdog_ms), "A")
         require_watchdog(watchdog_ms, in_force_ms)
         self._zero_rad = self._heading_rad
         return float(watchdog_ms)
@@ -199,31 +191,25 @@ class LineProtocol:
         velocity_mps, yaw_rate_radps = self._drive.limited(command)
         heading_rad = math.remainder(command.heading_rad - self._zero_rad, math.tau)
         seq, self._seq = self._seq, (self._seq + 1) % SEQ_COUNT
-
-        def is_reply(numbers: Sequence[int]) -> bool:
-            if numbers[0] != seq:
-                found = f"it answers command {seq} with a status of {numbers[0]}"
-                self._odd = f"{found}: does its firmware repeat the number?"
-            return numbers[0] == seq
-
         line = velocity_line(seq, VelocityCommand(0, velocity_mps, heading_rad, yaw_rate_radps))
-        status = status_of((yield from self._ask(line, is_reply, "S")))
+        status = status_of((yield from _answer(line, "S", seq)))
         self._heading_rad = math.remainder(status.heading_rad + self._zero_rad, math.tau)
         return replace(status, heading_rad=self._heading_rad)
 
-    def _ask(self, line: bytes, is_reply: Callable[[Sequence[int]], bool], kind: str) -> Transaction[tuple[int, ...]]:
-        """Send a line and return the numbers of the first line of this kind that is the reply."""
-        self._odd = ""
 
-        def parse(frame: bytes) -> tuple[int, ...] | None:
-            try:
-                found, numbers = decode(frame)
-            except ProtocolError as error:
-                self._odd = str(error) if b"$" in frame else self._odd
-                return None
-            return numbers if found == kind and is_reply(numbers) else None
+def _answer(line: bytes, kind: str, seq: int | None = None) -> Transaction[tuple[int, ...]]:
+    """Send a line and return the numbers of the first line of this kind, with this seq if one is given."""
+    odd = ""  # what the newest line shows that is no reply
 
+    def take(frame: bytes) -> tuple[int, ...] | None:
+        nonlocal odd
         try:
-            return (yield from request(line, parse))
-        except NoReplyError:
-            raise NoReplyError(self._odd) from None
+            found, numbers = decode(frame)
+        except ProtocolError as error:
+            odd = str(error) if b"$" in frame else odd
+            return None
+        if found == kind and seq not in (None, numbers[0]):
+            odd = f"it answers command {seq} with a status of {numbers[0]}: does its firmware repeat the number?"
+        return numbers if found == kind and seq in (None, numbers[0]) else None
+
+    return (yield from request(line, take, lambda: odd))

@@ -62,12 +62,18 @@ class MotorProtocol(Protocol):
         """
 
 
-def request(data: bytes, parse: Callable[[bytes], T | None]) -> Transaction[T]:
-    """Write data and return the first frame that parse accepts (does not return None for)."""
-    frame = yield data
-    while (found := parse(frame)) is None:
-        frame = yield b""
-    return found
+def request(data: bytes, take: Callable[[bytes], T | None], seen: Callable[[], str]) -> Transaction[T]:
+    """Write data, and pass frames to `take` until it returns a result.
+
+    seen: returns what the frames so far show where the time is over; empty: nothing.
+    """
+    try:
+        frame = yield data
+        while (found := take(frame)) is None:
+            frame = yield b""
+        return found
+    except NoReplyError:
+        raise NoReplyError(seen()) from None
 
 
 def require_watchdog(requested_ms: int, in_force_ms: float) -> None:

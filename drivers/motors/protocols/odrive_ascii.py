@@ -25,7 +25,7 @@ from collections.abc import Sequence
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, is_stop
 from drivers.motors.protocols.differential_drive import DifferentialDrive
-from drivers.motors.protocols.motor_protocol import NoReplyError, TextFramer, Transaction, require_watchdog
+from drivers.motors.protocols.motor_protocol import TextFramer, Transaction, request, require_watchdog
 
 AXES = (0, 1)
 WATCHDOG_EXPIRED = 0x800  # AXIS_ERROR_WATCHDOG_TIMER_EXPIRED (firmware 0.5, odrive-interface.yaml)
@@ -38,7 +38,6 @@ _CHECKED_LINE = re.compile(rb"([^*]*)\*([0-9]{1,3})")
 _BARE = re.compile(rb"-?[0-9.]+( -?[0-9.]+){0,2}")
 _STATES = {0: "undefined", 1: "idle", 3: "calibrating", 4: "calibrating its motor", 6: "searching its index",
            7: "calibrating its encoder"}  # fmt: skip
-_BOOLEANS = {b"true": 1.0, b"false": 0.0}
 _MAX_NUMBERS = 3  # parsed of a reply; more than any reply has
 
 
@@ -115,25 +114,25 @@ class ODriveAscii:
         """Write lines and requests, and return the numbers of each reply: two for "f", one for "r"."""
         replies: list[list[float]] = []
         odd = b""  # the newest line that is no reply to its request
-        try:
-            frame = yield b"".join(map(with_checksum, [*lines, *requests]))
-            while True:
-                numbers = self._numbers(frame)
-                if numbers and len(numbers) == (2 if requests[len(replies)][0] == "f" else 1):
-                    replies.append(numbers)
-                else:
-                    odd = frame
-                    replies.clear()  # a reply is missing, so those before cannot be assigned: this ends in the timeout
-                if len(replies) == len(requests):
-                    return replies
-                frame = yield b""
-        except NoReplyError:
-            if odd and _BARE.fullmatch(odd):
-                raise NoReplyError(f"its answers carry no checksum: {odd.decode()!r}; firmware 0.5 is needed") from None
-            if replies and not odd:
-                missing = requests[len(replies)]
-                raise NoReplyError(f"{len(replies)} of {len(requests)} answers came, none to {missing!r}") from None
-            raise
+
+        def take(frame: bytes) -> list[list[float]] | None:
+            nonlocal odd
+            numbers = self._numbers(frame)
+            if numbers and len(numbers) == (2 if requests[len(replies)][0] == "f" else 1):
+                replies.append(numbers)
+            else:
+                odd = frame
+                replies.clear()  # a reply is missing, so those before cannot be assigned: this ends in the timeout
+            return replies if len(replies) == len(requests) else None
+
+        def seen() -> str:
+            if odd:
+                is_bare = _BARE.fullmatch(odd)
+                return f"its answers carry no checksum: {odd.decode()!r}; firmware 0.5 is needed" if is_bare else ""
+            missing = requests[len(replies)]
+            return f"{len(replies)} of {len(requests)} answers came, none to {missing!r}" if replies else ""
+
+        return (yield from request(b"".join(map(with_checksum, [*lines, *requests])), take, seen))
 
     def _numbers(self, frame: bytes) -> list[float] | None:
         """Return the numbers of a reply, None if it is damaged; raise DriverError where it is an error message."""
@@ -143,7 +142,11 @@ class ODriveAscii:
         if match[1].startswith((b"invalid", b"unknown", b"not")):
             reply = match[1].decode("ascii", "replace")
             raise DriverError(f"it answered {reply!r}; a board with two axes and firmware 0.5 is needed")
-        numbers = [_number(word) for word in match[1].split()[:_MAX_NUMBERS]]
+        words = match[1].lower().replace(b"true", b"1").replace(b"false", b"0").split()
+        try:
+            numbers = [float(word) for word in words[:_MAX_NUMBERS]]
+        except ValueError:
+            return None
         return numbers if all(map(math.isfinite, numbers)) else None
 
 
@@ -158,13 +161,6 @@ def _arming(axis: int) -> list[str]:
     """Return the lines that clear the axis' errors and start closed-loop velocity control."""
     return [f"w axis{axis}.controller.config.control_mode {VELOCITY_CONTROL}", f"w axis{axis}.error 0", f"u {axis}",
             f"w axis{axis}.requested_state {CLOSED_LOOP}"]  # fmt: skip
-
-
-def _number(word: bytes) -> float:
-    try:
-        return float(word)
-    except ValueError:
-        return _BOOLEANS.get(word.lower(), math.nan)
 
 
 def _xor(data: bytes) -> int:

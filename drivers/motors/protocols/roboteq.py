@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
 from drivers.motors.protocols.differential_drive import DifferentialDrive
-from drivers.motors.protocols.motor_protocol import NoReplyError, TextFramer, Transaction, require_watchdog
+from drivers.motors.protocols.motor_protocol import TextFramer, Transaction, request, require_watchdog
 
 MAX_RPM = 65535
 
@@ -66,24 +66,22 @@ class Roboteq:
 
     def _query(self, lines: Sequence[bytes], names: set[bytes]) -> Transaction[dict[bytes, list[int]]]:
         """Write lines, and return the replies by name once all commands are confirmed."""
-        commands = unconfirmed = sum(line[:1] in b"!^" for line in lines)
+        commands, confirmed = sum(line[:1] in b"!^" for line in lines), 0
         values: dict[bytes, list[int]] = {}
-        try:
-            frame = yield b"".join(line + b"\r" for line in lines)
-            while True:
-                unconfirmed -= frame == b"+"
-                if frame == b"-":
-                    raise DriverError(f"it rejected one of {b', '.join(lines).decode()}; check its configuration")
-                if reply := _REPLY.fullmatch(frame):
-                    values[reply[1]] = [int(number) for number in reply[2].split(b":")]
-                if unconfirmed <= 0 and names <= values.keys():
-                    return values
-                frame = yield b""
-        except NoReplyError:
+
+        def take(frame: bytes) -> dict[bytes, list[int]] | None:
+            nonlocal confirmed
+            confirmed += frame == b"+"
+            if frame == b"-":
+                raise DriverError(f"it rejected one of {b', '.join(lines).decode()}; check its configuration")
+            if reply := _REPLY.fullmatch(frame):
+                values[reply[1]] = [int(number) for number in reply[2].split(b":")]
+            return values if confirmed >= commands and names <= values.keys() else None
+
+        def seen() -> str:
             missing = b", ".join(sorted(names - values.keys())).decode()
-            if not values and unconfirmed == commands:
-                raise
-            raise NoReplyError(
-                f"it confirmed {commands - unconfirmed} of {commands} commands"
-                f"{f', and says nothing of {missing}' if missing else ''}: is it a Roboteq with two channels?"
-            ) from None
+            silent = f", and says nothing of {missing}" if missing else ""
+            found = f"it confirmed {confirmed} of {commands} commands{silent}: is it a Roboteq with two channels?"
+            return found if values or confirmed else ""
+
+        return (yield from request(b"".join(line + b"\r" for line in lines), take, seen))

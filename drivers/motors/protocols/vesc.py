@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
 from drivers.motors.protocols.differential_drive import DifferentialDrive
-from drivers.motors.protocols.motor_protocol import NoReplyError, T, Transaction
+from drivers.motors.protocols.motor_protocol import T, Transaction, request
 
 SET_RPM, GET_APPCONF, FORWARD_CAN, GET_VALUES_SELECTIVE = 8, 17, 34, 50  # COMM_PACKET_ID in datatypes.h
 MASK = 1 << 7 | 1 << 8 | 1 << 15 | 1 << 17 | 1 << 21  # erpm, input voltage, fault, id, status
@@ -43,7 +43,7 @@ def packet(payload: bytes) -> bytes:
     """Return the packet of a payload of 1 to 512 bytes."""
     size = len(payload)
     head = bytes((SHORT, size)) if size < 256 else bytes((LONG,)) + size.to_bytes(2, "big")
-    return head + payload + binascii.crc_hqx(payload, 0).to_bytes(2, "big") + bytes((END,))
+    return head + payload + _tail(payload)
 
 
 def forwarded(can_id: int, payload: bytes) -> bytes:
@@ -70,13 +70,18 @@ class PacketFramer:
     def feed(self, data: bytes) -> list[bytes]:
         """Return the payloads of the packets that end in data."""
         self._buffer += data
-        payloads = []
-        start = 0
-        while (size := _size(self._buffer, start)) is not None:
-            payload = _payload(self._buffer, start, size) if size else None
-            if payload is not None:
+        payloads, start = [], 0
+        while (head := self._buffer[start : start + LONG]) and (head[0] not in (SHORT, LONG) or len(head) >= head[0]):
+            length = _length(head)
+            end = start + head[0] + length + _TAIL_BYTES
+            if length and end > len(self._buffer):
+                break  # It is incomplete.
+            payload = bytes(self._buffer[start + head[0] : end - _TAIL_BYTES])
+            if length and self._buffer[end - _TAIL_BYTES : end] == _tail(payload):
                 payloads.append(payload)
-            start += 1 if payload is None else size
+                start = end
+            else:
+                start += 1
         del self._buffer[:start]
         return payloads
 
@@ -85,26 +90,17 @@ class PacketFramer:
         self._buffer.clear()
 
 
-def _size(buffer: bytearray, start: int) -> int | None:
-    """Return the size of the packet at start, 0 if there is none, None if it is incomplete."""
-    head = buffer[start : start + LONG]
-    if not head or (head[0] in (SHORT, LONG) and len(head) < head[0]):
-        return None
-    if head[0] not in (SHORT, LONG):
-        return 0
-    length = head[1] if head[0] == SHORT else head[1] << 8 | head[2]
-    if not (1 if head[0] == SHORT else _MIN_LONG_PAYLOAD) <= length <= MAX_PAYLOAD:
-        return 0
-    size = head[0] + length + _TAIL_BYTES
-    return size if len(buffer) - start >= size else None
+def _length(head: bytearray) -> int:
+    """Return the length of the payload by a packet's first bytes, 0 where no packet begins with them."""
+    if head[0] == SHORT:
+        return head[1]
+    length = head[1] << 8 | head[2] if head[0] == LONG else 0
+    return length if _MIN_LONG_PAYLOAD <= length <= MAX_PAYLOAD else 0
 
 
-def _payload(buffer: bytearray, start: int, size: int) -> bytes | None:
-    """Return the payload of a packet, None if its CRC or its end is wrong."""
-    end = start + size
-    payload = bytes(buffer[start + buffer[start] : end - _TAIL_BYTES])
-    crc = int.from_bytes(buffer[end - _TAIL_BYTES : end - 1], "big")
-    return payload if buffer[end - 1] == END and binascii.crc_hqx(payload, 0) == crc else None
+def _tail(payload: bytes) -> bytes:
+    """Return CRC and end of a packet."""
+    return binascii.crc_hqx(payload, 0).to_bytes(2, "big") + bytes((END,))
 
 
 class Vesc:
@@ -152,31 +148,29 @@ class Vesc:
         """Send a query to both controllers, then the commands; return (id, parsed reply) of each."""
         replies: dict[bool, tuple[int, T]] = {}  # the key is True for the controller on CAN
         other = -1  # command of the newest packet that is no reply
-        try:
-            frame = yield packet(query) + packet(forwarded(self._drive.can_id, query)) + commands
-            while True:
-                reply = parse(frame)
-                if reply is None:
-                    other = frame[0]
-                else:
-                    can_id, _ = reply
-                    replies[can_id == self._drive.can_id] = reply
-                if len(replies) == 2:
-                    return replies[False], replies[True]
-                frame = yield b""
-        except NoReplyError:
-            raise NoReplyError(self._missing({key: can_id for key, (can_id, _) in replies.items()}, other)) from None
 
-    def _missing(self, ids: dict[bool, int], other: int) -> str:
-        """Return what the packets show that came while one was missing; ids: of those that replied. Empty: nothing."""
-        can_id = self._drive.can_id
-        if False in ids:
-            return f"VESC {ids[False]} answers, none with id {can_id} on CAN: motor.drive.can_id, or the wires of CAN"
-        if True in ids:
-            return f"VESC {can_id} is on the port itself, and no other one answers: motor.drive.can_id is the other's"
-        return (
-            "" if other < 0 else f"it answers packets of command {other}, which was not asked for: an older firmware?"
-        )
+        def take(frame: bytes) -> tuple[tuple[int, T], tuple[int, T]] | None:
+            nonlocal other
+            reply = parse(frame)
+            if reply is None:
+                other = frame[0]
+            else:
+                replies[reply[0] == self._drive.can_id] = reply
+            return (replies[False], replies[True]) if len(replies) == 2 else None
+
+        def seen() -> str:
+            can_id = self._drive.can_id
+            if False in replies:
+                found = f"VESC {replies[False][0]} answers, none with id {can_id} on CAN"
+                return f"{found}: motor.drive.can_id, or the wires of CAN"
+            if True in replies:
+                found = f"VESC {can_id} is on the port itself, and no other one answers"
+                return f"{found}: motor.drive.can_id is the other's"
+            unasked = f"it answers packets of command {other}, which was not asked for: an older firmware?"
+            return unasked if other >= 0 else ""
+
+        packets = packet(query) + packet(forwarded(self._drive.can_id, query)) + commands
+        return (yield from request(packets, take, seen))
 
 
 def _config(payload: bytes) -> tuple[int, int] | None:

@@ -427,6 +427,25 @@ def test_an_older_release_that_comes_after_a_contact_does_not_release_it(by_echo
     assert [holds for _, holds in accepted.contacts][-2:] == [True, False]
 
 
+@pytest.mark.hazard("H08")
+@pytest.mark.parametrize("off_s", [-3e7, 3e7], ids=["behind", "ahead"])
+def test_a_board_with_a_wrong_clock_releases_its_contact_where_its_messages_come_at_their_pace(off_s: float) -> None:
+    """Not so messages that waited and come all at once, one that overtook the contact, or a recording between them."""
+    accepted = AcceptedCommands()
+
+    def send(holds: bool, wrong_s: float = off_s) -> bool:
+        accepted.receive("cmd/bumper", bool_cdr(holds), "board", now_ns(wrong_s))
+        return accepted.contacts[-1][1]
+
+    # Messages that waited for a time: they come at once, whatever they say.
+    assert all(send(False, off_s + 0.1 * number) for number in range(20))
+    assert send(True) and send(False), "one message of a board says nothing about its clock"
+    time.sleep(STALE_S * 1.1)
+    assert send(True) and send(False, off_s - 0.1 * STALE_S), "sent before the contact"
+    assert not send(False)
+    assert send(True) and send(False, off_s - 60.0) and send(False), "of another clock, as from a recording"
+
+
 # Requests to the navigation.
 
 
