@@ -32,9 +32,8 @@ from omnid.transport.bus_config import BusConfig
 class LogConfig:
     """Reading of logs."""
 
-    REMOVED = MappingProxyType({"reorder_frames": "images may be 32 late in a log"})
+    REMOVED = MappingProxyType({"reorder_frames": "images are sorted by their stamps, however late they are in a log"})
 
-    reorder_frames: int = 32  # images are sorted by their stamps: how late one may be in the log
     rate_hz: Annotated[
         float,
         Meta(ge=0, le=1000),

@@ -14,7 +14,7 @@ from typing import Final, TypeAlias, TypeVar
 
 from drivers.cameras.camera_state import CameraState
 from drivers.errors import DriverError
-from drivers.frame import Camera, Frame
+from drivers.frame import CAMERAS, Camera, Frame
 from drivers.logs.log_reader import LogReader
 from drivers.logs.topics import MotionTopics
 from drivers.motion import GyroSample, MotionSample, WheelSample
@@ -48,30 +48,29 @@ class LogImages:
         motion: topics of wheels and IMU; None: they are not read. bits: see Frame. Raises DriverError where a camera
         has fewer than two images, and beyond MAX_LOG_BYTES.
         """
-        frames, samples, total_bytes = list[Frame](), list[MotionSample](), 0
+        frames, samples, left_bytes = list[Frame](), list[MotionSample](), MAX_LOG_BYTES
         with closing(LogReader(path, lower, upper, motion=motion, bits=bits)) as reader:
             for message in reader.messages():
                 if not isinstance(message, Frame):
                     samples.append(message)
                     continue
                 frames.append(message)
-                total_bytes += len(message.data)  # LogReader delivers bytes
-                if total_bytes > MAX_LOG_BYTES:
+                left_bytes -= len(message.data)  # LogReader delivers bytes
+                if left_bytes < 0:
                     most = MAX_LOG_BYTES >> 20
                     raise DriverError(f"{path}: more than {most} MiB of images: cut the log into shorter ones")
-        timed = [(frame.stamp_ns - frames[0].stamp_ns, frame) for frame in frames]
-        images = LogImages(
-            lower=tuple(entry for entry in timed if entry[1].camera == "lower"),
-            upper=tuple(entry for entry in timed if entry[1].camera == "upper"),
-            motion=tuple((sample.stamp_ns - frames[0].stamp_ns, sample) for sample in samples),
-            warnings=tuple(reader.warnings),
+        first_ns = frames[0].stamp_ns if frames else 0
+        lower_frames, upper_frames = (
+            tuple((frame.stamp_ns - first_ns, frame) for frame in frames if frame.camera == camera)
+            for camera in CAMERAS
         )
-        if min(len(images.lower), len(images.upper)) < 2:
+        if min(len(lower_frames), len(upper_frames)) < 2:
             raise DriverError(
-                f"{path}: {len(images.lower)} images of the lower and {len(images.upper)} of the "
+                f"{path}: {len(lower_frames)} images of the lower and {len(upper_frames)} of the "
                 "upper camera: give a log with two or more of each"
             )
-        return images
+        timed = tuple((sample.stamp_ns - first_ns, sample) for sample in samples)
+        return LogImages(lower_frames, upper_frames, timed, tuple(reader.warnings))
 
     @property
     def last_ns(self) -> int:

@@ -98,24 +98,17 @@ class V4l2Camera:
         deadline_s = time.monotonic() + self._settings.timeout_s
         while not self._closing:
             if self._wake.wait_for(stream.fd, deadline_s - time.monotonic()):
-                filled = stream.take()
+                filled, arrival_ns = stream.take(), time.monotonic_ns()
                 if filled is None:
                     self._wake.wait(_PAUSE_S)
-                elif (stamp_ns := self._accepted(filled[0], stream)) is not None:
-                    return stamp_ns, filled[1]
+                elif self._accounting.accept(filled[0], stream.image.min_bytes):
+                    return self._stamps.validate(filled[0], arrival_ns), filled[1]
             if time.monotonic() > deadline_s and not self._closing:
                 raise DriverError(
                     f"camera {self._settings.device} sent no valid image for "
                     f"{self._settings.timeout_s:g} s; check its cable and power"
                 )
         return None
-
-    def _accepted(self, buffer: v4l2.V4l2Buffer, stream: V4l2Stream) -> int | None:
-        """Return the capture time of a buffer [ns], None if it holds no image."""
-        arrival_ns = time.monotonic_ns()
-        if not self._accounting.accept(buffer, stream.image.min_bytes):
-            return None
-        return self._stamps.validate(buffer, arrival_ns)
 
     def _counted(self) -> int:
         """Return the number of the next frame; the first one after a loss is reported."""
@@ -206,26 +199,21 @@ class BufferAccounting:
         self._last_sequence = None
 
     def accept(self, buffer: v4l2.V4l2Buffer, min_bytes: int) -> bool:
-        """Count a buffer; True if it holds an image.
+        """Count a buffer, and those missing since the last one; True if it holds an image.
 
         min_bytes: size of the smallest complete image. A shorter buffer, or one with the driver's error flag, is
-        counted as an error.
+        counted as an error; a step of the sequence backwards counts as its restart.
         """
-        self._count_missing(buffer.sequence)
-        if buffer.flags & v4l2.BUFFER_ERROR or buffer.bytesused < min_bytes:
-            self._state.errors += 1
-            return False
-        return True
-
-    def _count_missing(self, sequence: int) -> None:
-        """Count the buffers missing since the last one; a step backwards counts as a restart of the sequence."""
         if self._last_sequence is not None:
-            step = (sequence - self._last_sequence) % _SEQUENCE_COUNT
+            step = (buffer.sequence - self._last_sequence) % _SEQUENCE_COUNT
             if 0 < step < _SEQUENCE_COUNT // 2:
                 self._state.drops += step - 1
             else:
                 self._state.restarts += 1
-        self._last_sequence = sequence
+        self._last_sequence = buffer.sequence
+        is_broken = bool(buffer.flags & v4l2.BUFFER_ERROR) or buffer.bytesused < min_bytes
+        self._state.errors += is_broken
+        return not is_broken
 
 
 class StampValidator:

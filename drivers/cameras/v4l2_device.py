@@ -292,7 +292,6 @@ def offered_image(settings: V4l2Settings) -> StreamFormat | None:
 def _device(root: Path, entry: Path) -> CaptureDevice | None:
     """Return the device of an entry in sysfs, None if it is not a capture device."""
     node = root / "dev" / entry.name
-    by_path = _link(root, "by-path", node)
     driver = (entry / "device/driver").resolve().name if (entry / "device/driver").exists() else ""
     bus = problem = exposure = ""
     try:
@@ -305,24 +304,12 @@ def _device(root: Path, entry: Path) -> CaptureDevice | None:
     except OSError as error:
         problem = str(device_error(str(node), error))
     # udev's ID_PATH is a part of the link's name (60-persistent-v4l.rules), which only one node of a port has.
-    siblings = [other for other in entry.parent.glob("video*") if _port(other) == _port(entry) != ""]
-    links = (by_path, *(_link(root, "by-path", root / "dev" / other.name) for other in siblings))
+    port, by_path = (entry / "device").resolve(), _link(root, "by-path", node)
+    siblings = [other.name for other in entry.parent.glob("video*") if (other / "device").resolve() == port]
+    links = (by_path, *(_link(root, "by-path", root / "dev" / name) for name in siblings if port.exists()))
     id_path = re.sub(r"-video-index\d+$", "", next(filter(None, links), "").rpartition("/")[2])
-    return CaptureDevice(
-        _in(root, node),
-        _word(entry / "name"),
-        driver,
-        bus,
-        by_path,
-        _link(root, "by-id", node),
-        id_path,
-        problem,
-        exposure,
-    )
-
-
-def _port(entry: Path) -> str:
-    return str((entry / "device").resolve()) if (entry / "device").exists() else ""
+    names = _in(root, node), _word(entry / "name"), driver, bus, by_path, _link(root, "by-id", node)
+    return CaptureDevice(*names, id_path, problem, exposure)
 
 
 def _link(root: Path, folder: str, node: Path) -> str:

@@ -19,7 +19,15 @@ from numpy.typing import NDArray
 
 from drivers.errors import RecordError
 from drivers.logs.compression import unpack_message
-from drivers.logs.ros_messages import IMAGE_TYPES, JointWheels, RosImage, cdr_of_ros1, parse_image, parse_motion
+from drivers.logs.ros_messages import (
+    IMAGE_TYPES,
+    JointWheels,
+    RosImage,
+    cdr_of_ros1,
+    header_ns,
+    parse_image,
+    parse_motion,
+)
 from drivers.motion import MotionSample
 
 # Bounds of what is kept in memory, whatever a file states.
@@ -85,6 +93,10 @@ class LoggedMessage:
         """Return the bytes in CDR."""
         return bytes(self.data()) if self.aligned else cdr_of_ros1(self.kind, self.data())
 
+    def header_ns(self) -> int:
+        """Return the stamp of the header of images, wheels and IMUs; 0 where it is unset."""
+        return header_ns(self.data(), aligned=self.aligned)
+
     def image(self) -> RosImage:
         """Return the image of an image message."""
         return parse_image(self.kind, self.data(), aligned=self.aligned)
@@ -109,7 +121,7 @@ class LogDamage(NamedTuple):
     cut: str = ""  # one line that says where a log ends too early; empty for a complete log
 
 
-class _Index(NamedTuple):
+class LogIndex(NamedTuple):
     """The places of all N messages, in the order of the files."""
 
     topics: Mapping[str, str]  # name -> type
@@ -134,26 +146,26 @@ class Log:
 
     def topics(self) -> Mapping[str, str]:
         """Return name -> ROS type of all topics, such as sensor_msgs/msg/Image; '' where it cannot be decoded."""
-        return self._index.topics
+        return self.index.topics
 
     def counts(self) -> Mapping[str, int]:
         """Return the number of messages of each topic."""
-        numbers = np.bincount(self._index.topic, minlength=len(self._index.topics))
-        return dict(zip(self._index.topics, numbers.tolist(), strict=True))
+        numbers = np.bincount(self.index.topic, minlength=len(self.index.topics))
+        return dict(zip(self.index.topics, numbers.tolist(), strict=True))
 
     def rates_hz(self) -> Mapping[str, float]:
         """Return the mean rate of each topic from its first message to its last one; none of fewer than two."""
-        times = {name: self._index.run_ns[self._index.topic == n] for n, name in enumerate(self._index.topics)}
+        times = {name: self.index.run_ns[self.index.topic == n] for n, name in enumerate(self.index.topics)}
         return {name: (len(ns) - 1) * 1e9 / float(np.ptp(ns)) for name, ns in times.items() if len(ns) and np.ptp(ns)}
 
     def span_ns(self) -> tuple[int, int] | None:
         """Return the first and last log time; None without messages."""
-        times = self._index.entries["time_ns"]
+        times = self.index.entries["time_ns"]
         return (int(times.min()), int(times.max())) if times.size else None
 
     def clock_steps(self) -> Sequence[ClockStep]:
         """Return the steps of the recorder's clock."""
-        return self._index.steps
+        return self.index.steps
 
     @property
     def is_indexed(self) -> bool:
@@ -165,34 +177,43 @@ class Log:
 
         Messages of one time are in the order of the file. Those that cannot be read are left out and counted.
         """
-        index = self._index
-        names, kinds = [*index.topics], [*index.topics.values()]
-        wanted = [number for number, name in enumerate(names) if topics is None or name in topics]
-        rows = index.order[np.isin(index.topic[index.order], wanted)]
-        columns = (part.tolist() for part in (rows, index.topic[rows], index.run_ns[rows]))
-        for row, number, run_ns in zip(*columns, strict=True):
+        for row in self.rows(topics).tolist():
+            message = self.message(row)
             if self._closed:
                 return
-            file, entry = self._files[index.file[row]], index.entries[row].item()
-            try:
-                data = file.read(*entry)
-            except RecordError as error:
-                if not self._closed:
-                    file.faults[str(error)] += 1
-                continue
-            yield LoggedMessage(names[number], kinds[number], entry[1], run_ns, data, file.topics[entry[0]].aligned)
+            if message is not None:
+                yield message
+
+    def rows(self, topics: Collection[str] | None = None) -> NDArray[np.int64]:
+        """Return the rows of the index (N,) of the messages of these topics (None: all) in the order of log time."""
+        wanted = [number for number, name in enumerate(self.index.topics) if topics is None or name in topics]
+        return np.asarray(self.index.order[np.isin(self.index.topic[self.index.order], wanted)])
+
+    def message(self, row: int) -> LoggedMessage | None:
+        """Return the message of a row of the index; None, and count it, where it cannot be read."""
+        index = self.index
+        file, entry, name = self._files[index.file[row]], index.entries[row].item(), self._names[index.topic[row]]
+        try:
+            data = file.read(*entry)
+        except RecordError as error:
+            if not self._closed:
+                file.faults[str(error)] += 1
+            return None
+        return LoggedMessage(
+            name, index.topics[name], entry[1], int(index.run_ns[row]), data, file.topics[entry[0]].aligned
+        )
 
     def attachments(self) -> dict[str, bytes]:
         """Return name -> bytes of the attachments of the first file that has some, such as a rig.
 
         They have up to 16 MiB each, 64 MiB in all.
         """
-        assert self._index
+        assert self.index
         return next((found for found in (file.attachments() for file in self._files) if found), {})
 
     def damage(self) -> LogDamage:
         """Return the faults that are known: all of them once messages() has ended."""
-        assert self._index
+        assert self.index
         faults = [fault for file in self._files for fault in file.faults]
         cuts = [file.cut for file in self._files if file.cut]
         if self._missing:
@@ -206,8 +227,12 @@ class Log:
             file.close()
 
     @cached_property
-    def _index(self) -> _Index:
-        # 1. Where the messages are.
+    def _names(self) -> list[str]:
+        return [*self.index.topics]
+
+    @cached_property
+    def index(self) -> LogIndex:
+        """Where all messages are, and when they were logged."""
         topics: dict[str, str] = {}
         found: list[tuple[Entries, NDArray[np.int32]]] = []
         for file in self._files:
@@ -226,16 +251,15 @@ class Log:
             found.append((entries, numbers) if (known >= 0).all() else (entries[numbers >= 0], numbers[numbers >= 0]))
         entries, topic = found[0] if len(found) == 1 else map(np.concatenate, zip(*found, strict=True))
         of_file = np.repeat(np.arange(len(found), dtype=np.int16), [len(numbers) for _, numbers in found])
-        # 2. Their order.
         images = [place for place, kind in enumerate(topics.values()) if kind in IMAGE_TYPES]
-        run_ns, steps = _running_on(topic, entries["time_ns"], images)
-        return _Index(topics, topic, of_file, entries, run_ns, np.argsort(run_ns, kind="stable"), steps)
+        run_ns, steps = running_on(topic, entries["time_ns"], images)
+        return LogIndex(topics, topic, of_file, entries, run_ns, np.argsort(run_ns, kind="stable"), steps)
 
 
-def _running_on(
+def running_on(
     topic: NDArray[np.int32], times: NDArray[np.int64], images: Iterable[int]
 ) -> tuple[NDArray[np.int64], list[ClockStep]]:
-    """Return log times (N,) that run on where the recorder's clock was set back, and its steps.
+    """Return times (N,) that run on where their clock was set back, and its steps.
 
     topic, times: (N,) in the order of the files. images: the topics that decide; others follow the first of them.
     """

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import heapq
 import math
 import os
-from collections import Counter, deque
-from collections.abc import Iterator
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from itertools import chain
+from functools import cached_property
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -17,29 +16,25 @@ from numpy.typing import NDArray
 
 from drivers.errors import DriverError, FrameDecodeError
 from drivers.frame import CAMERAS, SAMPLE_BITS, Camera, Frame, gray, is_deep
-from drivers.logs.image_times import MAX_HELD_BYTES, STEP_NS, ImageTimes, TimedImage, TimeSource
+from drivers.logs.image_times import STEP_NS, ImageTimes, LoggedImages, TimeSource
 from drivers.logs.log import LoggedMessage
 from drivers.logs.open_log import open_log
-from drivers.logs.ros_messages import RosImage
+from drivers.logs.ros_messages import IMU, RosImage
 from drivers.logs.topics import MotionChoice, MotionTopics, choose_motion_topics, choose_topics
 from drivers.motion import MotionSample, WheelSample
 
 _WARNINGS = {
-    "late": "dropped {} frames older than others read before, by more than 32 images: record with less delay",
     "duplicate": "dropped {} frames with the same stamp as the frame before of the same camera",
     "carried": "{} stamps have 10^9 nanoseconds or more, which were added to their seconds",
-    "broken_motion": "skipped {} messages of wheels or IMU that are not valid; the first: {motion_fault}",
+    "broken_motion": "skipped {} messages of wheels or IMU that are not valid; the first: {fault}",
     "no_joints": "none of {} messages of joints names the wheels: see motion.wheel_joints",
     "broken": "skipped {} messages of the cameras' topics that hold no valid image; the first: {fault}",
-    "broken_records": "skipped {} corrupt chunks or records of the file; the first: {record_fault}",
+    "broken_records": "skipped {} corrupt chunks or records of the file; the first: {fault}",
 }
-MAX_WAITING_SAMPLES = 65_536  # Samples of wheels and IMU that wait for the next images: some minutes.
 MOST_PERCENT = 99.0
 NEUTRAL_GREY, NEAR_NEUTRAL = 128, 16  # grey levels of colourless U and V, and how near those of weak colours are
 _COUNTERS = ("lower", "upper", "unstamped", "repeated", *_WARNINGS)
 WHOLE = (0.0, math.inf)  # span of all of a log [s]
-# Stamp, rank (0: a sample; 1, 2: of the lower and of the upper camera), number of the arrival, item.
-_Entry: TypeAlias = tuple[int, int, int, RosImage | MotionSample]
 
 
 class LogCameras(NamedTuple):
@@ -64,12 +59,14 @@ class LogReader:
     """A FrameSource that streams a log once per call of frames().
 
     path, rate_hz: as for `open_log`. bits: of the samples of images of 16 bits, see Frame. lower, upper: topics, where
-    their names do not identify the cameras. window: number of frames that are held back to sort them by stamp. span_s:
-    the part of the log that is read, from and until so many seconds after the stamp of its first image. motion: topics
-    of wheels and IMU; None: their samples are not read. time: which of its two times an image is stamped with, see
-    `image_times`. Raises DriverError where the path is no such log, or the topics of the two cameras are ambiguous.
+    their names do not identify the cameras. span_s: the part of the log that is read, from and until so many seconds
+    after the stamp of its first image. motion: topics of wheels and IMU; None: their samples are not read. time: which
+    of its two times an image is stamped with, see `image_times`. Raises DriverError where the path is no such log, or
+    the topics of the two cameras are ambiguous.
 
-    During and after frames() and messages(), `counts` has 'lower' and 'upper' (frames delivered), 'late', 'duplicate',
+    The headers of all messages are read first, so that the order is that of the stamps, whatever that of the file.
+
+    During and after frames() and messages(), `counts` has 'lower' and 'upper' (frames delivered), 'duplicate',
     'repeated' (of these, with the same content), 'unstamped' (time of logging used), 'broken' (messages without a valid
     image), 'broken_motion' and 'broken_records' (chunks or records of the file). After its end `truncated` is True for
     an incomplete log, and `warnings` has one line per kind of fault.
@@ -81,14 +78,13 @@ class LogReader:
         lower: str | None = None,
         upper: str | None = None,
         *,
-        window: int = 32,
         span_s: tuple[float, float] = WHOLE,
         motion: MotionTopics | None = None,
         bits: int = 16,
         rate_hz: float = 0.0,
         time: TimeSource = "auto",
     ) -> None:
-        self._window, self._closed, self._span_s, self._bits, self._time = window, False, span_s, bits, time
+        self._closed, self._span_s, self._bits, self._time = False, span_s, bits, time
         self._log = open_log(path, rate_hz)
         self._motion = MotionChoice(frozenset())
         self._joints = motion.joints if motion else None
@@ -116,75 +112,87 @@ class LogReader:
     def messages(self) -> Iterator[Frame | MotionSample]:
         """Yield frames, and samples of wheels and IMU, in the order of their stamps."""
         self._reset()
+        cameras: dict[str, Camera] = {topic: camera for camera, topic in self._cameras.items()}
+        rows, stamps_ns, is_image = self._order.rows, self._order.stamps_ns, self._order.is_image
+        first_ns = int(stamps_ns[is_image][0]) if is_image.any() else 0
+        at_s = 1e-9 * np.where(is_image, stamps_ns - first_ns, np.maximum(stamps_ns - first_ns, 0))
         begin_s, end_s = self._span_s
-        first_ns, at_s = None, 0.0
-        for stamp_ns, rank, _, item in self._in_order():
-            first_ns = stamp_ns if first_ns is None and rank else first_ns
-            at_s = 0.0 if first_ns is None else 1e-9 * (stamp_ns - first_ns)
-            if at_s > end_s:
-                break
-            if at_s < begin_s:
-                continue
-            if isinstance(item, RosImage):
-                camera = CAMERAS[rank - 1]
-                self.counts[camera] += 1
-                yield item.frame(camera, self.counts[camera] - 1, self._bits)
-            else:
-                yield item
-        if first_ns is not None and at_s < begin_s:
+        if is_image.any() and at_s.max() < begin_s:
             raise DriverError(
-                f"{self._log.name!r} ends {at_s:.1f} s after its first image: a start before that was "
+                f"{self._log.name!r} ends {at_s.max():.1f} s after its first image: a start before that was "
                 f"expected, {begin_s:g} s found"
             )
+        last: dict[Camera, tuple[int, memoryview]] = {}
+        inside = (at_s >= begin_s) & (at_s <= end_s)
+        for row, stamp_ns in zip(rows[inside].tolist(), stamps_ns[inside].tolist(), strict=True):
+            message = self._log.message(row)
+            if self._closed:
+                return
+            if message is None:
+                continue
+            if message.topic not in cameras:
+                sample = self._sample(message)
+                if sample is not None:
+                    yield replace(sample, stamp_ns=stamp_ns)
+                continue
+            camera, image = cameras[message.topic], self._image(message)
+            if image is None:
+                continue
+            before_ns, before = last.get(camera, (-1, image.data))
+            if stamp_ns == before_ns:
+                self.counts["duplicate"] += 1
+                self.counts["repeated"] += before == image.data
+                continue
+            last[camera] = stamp_ns, image.data
+            self.counts[camera] += 1
+            yield replace(image, stamp_ns=stamp_ns).frame(camera, self.counts[camera] - 1, self._bits)
         if not self._closed:
             self._report()
 
-    def _in_order(self) -> Iterator[_Entry]:
-        """Yield images and samples by stamp; the newest images are held back, as their times of logging may differ.
-
-        An image that is late, or is there twice, is counted instead.
-        """
-        waiting, newest_ns, last = _Waiting(), 0, dict[int, RosImage]()
-        timed: TimedImage | None
-        for timed in chain(self._times.stamped(self._images()), [None]):
-            # 1. Samples that were logged before an image wait with it.
-            while self._unstamped and (timed is None or self._unstamped[0][0] <= timed.log_ns):
-                log_ns, sample = self._unstamped.popleft()
-                stamp_ns = self._times.sample_ns(sample.stamp_ns, log_ns)
-                self._widen("wheels" if isinstance(sample, WheelSample) else "gyro", stamp_ns)
-                waiting.add(stamp_ns, 0, replace(sample, stamp_ns=stamp_ns))
-            if timed is not None:
-                for what in ("images", timed.camera):
-                    self._widen(what, timed.image.stamp_ns)
-                waiting.add(timed.image.stamp_ns, 1 + CAMERAS.index(timed.camera), timed.image)
-            # 2. The earliest ones.
-            while not self._closed and waiting.frames and (timed is None or waiting.is_full(self._window)):
-                entry = waiting.take()
-                stamp_ns, rank, _, item = entry
-                if isinstance(item, RosImage):
-                    before = last.get(rank)
-                    if before is not None and before.stamp_ns == stamp_ns:
-                        self.counts["duplicate"] += 1
-                        self.counts["repeated"] += before.data == item.data
-                        continue
-                    if stamp_ns < newest_ns:
-                        self.counts["late"] += 1
-                        continue
-                    newest_ns, last[rank] = stamp_ns, item
-                yield entry
-
-    def _images(self) -> Iterator[TimedImage]:
-        """Yield the images in the order of logging; the samples between them wait."""
-        cameras = {topic: camera for camera, topic in self._cameras.items()}
-        for message in self._log.messages({*cameras, *self._motion.names}):
-            if self._closed:
-                return
-            if message.topic in cameras:
-                image = self._image(message)
-                if image is not None:
-                    yield TimedImage(cameras[message.topic], image, message.run_ns)
-            elif (sample := self._sample(message)) is not None:
-                self._unstamped.append((message.run_ns, sample))
+    @cached_property
+    def _order(self) -> _Order:
+        """Read the headers of all messages of the cameras, the wheels and the IMU, and order them."""
+        log, names = self._log, [*self._log.topics()]
+        rows = log.rows({*self._cameras.values(), *self._motion.names})
+        topic, run_ns = log.index.topic[rows], log.index.run_ns[rows]
+        # 1. Headers; a message without one may be broken.
+        header_ns, repeats, broken = run_ns.copy(), np.zeros(len(rows), np.bool_), dict[int, str]()
+        last: dict[int, tuple[int, LoggedMessage]] = {}
+        for n, (row, number) in enumerate(zip(rows.tolist(), topic.tolist(), strict=True)):
+            message = None if self._time == "log" or self._closed else log.message(row)
+            if message is None:
+                continue
+            try:
+                header_ns[n] = found_ns = message.header_ns()
+                before_ns, before = last.get(number, (0, message))
+                if names[number] in self._cameras.values() and (not found_ns or found_ns == before_ns):
+                    repeats[n] = message.image().data == before.image().data and found_ns == before_ns > 0
+                last[number] = found_ns, message
+            except FrameDecodeError as error:
+                broken[n] = str(error)
+        # 2. Stamps.
+        numbers = [names.index(self._cameras[camera]) for camera in CAMERAS]
+        valid = ~np.isin(np.arange(len(rows)), [*broken])
+        of_cameras = [np.flatnonzero((topic == number) & valid) for number in numbers]
+        images = {
+            camera: LoggedImages(header_ns[at], run_ns[at], repeats[at])
+            for camera, at in zip(CAMERAS, of_cameras, strict=True)
+        }
+        times = ImageTimes(images, self._time, log.clock_steps())
+        is_image = np.isin(topic, numbers)
+        stamps_ns, rank = run_ns.copy(), np.zeros(len(rows), np.int64)
+        stamps_ns[~is_image] = times.sample_ns(header_ns[~is_image], run_ns[~is_image])
+        for camera, at in zip(CAMERAS, of_cameras, strict=True):
+            stamps_ns[at], rank[at] = times.stamps_ns[camera], 1 + CAMERAS.index(camera)
+        # 3. The order: of one stamp samples, the lower camera, the upper one.
+        order = np.lexsort((rank, stamps_ns))
+        order = order[valid[order]]
+        spans: dict[str, tuple[int, int]] = {}
+        for n, name in enumerate(names):
+            ns = stamps_ns[(topic == n) & valid]
+            if ns.size:
+                spans[name] = int(ns.min()), int(ns.max())
+        return _Order(rows[order], stamps_ns[order], is_image[order], times, spans, list(broken.values()))
 
     def close(self) -> None:
         """End frames() and close the log."""
@@ -207,13 +215,9 @@ class LogReader:
         self.warnings: list[str] = [self._motion.warning] if self._motion.warning else []
         self.truncated = False
         self._examined: set[str] = set()  # topics whose first image was
-        self._fault = ""  # of the first message without a valid image
-        self._motion_fault = ""  # of the first message of wheels or IMU that is not valid
+        self._faults: dict[str, str] = {}  # by counter: what is wrong with the first message that is not valid
         self._other_joints = 0  # messages of joints without the wheels
-        self._spans: dict[str, tuple[int, int]] = {}  # first and last stamp of images, each camera, wheels and gyro
-        self._times = ImageTimes(self._time, self._log.clock_steps())
-        # Samples with their times of logging; no stage waits for more.
-        self._unstamped: deque[tuple[int, MotionSample]] = deque(maxlen=MAX_WAITING_SAMPLES)
+        self._has_wheels = False
 
     def _image(self, logged: LoggedMessage) -> RosImage | None:
         """Return an image, None of a broken one.
@@ -224,11 +228,25 @@ class LogReader:
             image = logged.image()
             self._examine(logged.topic, image)
         except FrameDecodeError as error:
-            self.counts["broken"] += 1
-            self._fault = self._fault or str(error)
+            self._count_broken("broken", str(error))
             return None
         self.counts["carried"] += image.carries
         return replace(image, data=memoryview(bytes(image.data)))
+
+    def _sample(self, logged: LoggedMessage) -> MotionSample | None:
+        """Return the sample in a message of wheels or IMU, None of a broken one, and of joints without the wheels."""
+        try:
+            sample = logged.motion(self._joints)
+        except FrameDecodeError as error:
+            self._count_broken("broken_motion", str(error))
+            return None
+        self._other_joints += sample is None
+        self._has_wheels = self._has_wheels or isinstance(sample, WheelSample)
+        return sample
+
+    def _count_broken(self, counter: str, reason: str) -> None:
+        self.counts[counter] += 1
+        self._faults.setdefault(counter, reason)
 
     def _examine(self, topic: str, image: RosImage) -> None:
         """Warn where the first image of a topic would be black, or grey, as it is encoded otherwise than stated."""
@@ -248,24 +266,10 @@ class LogReader:
                     "or 12 bits? State cameras.bits, or --bits"
                 )
 
-    def _sample(self, logged: LoggedMessage) -> MotionSample | None:
-        """Return the sample in a message of wheels or IMU, None of a broken one, and of joints without the wheels."""
-        try:
-            sample = logged.motion(self._joints)
-        except FrameDecodeError as error:
-            self.counts["broken_motion"] += 1
-            self._motion_fault = self._motion_fault or str(error)
-            return None
-        self._other_joints += sample is None
-        return sample
-
-    def _widen(self, what: str, stamp_ns: int) -> None:
-        first_ns, last_ns = self._spans.get(what, (stamp_ns, stamp_ns))
-        self._spans[what] = min(first_ns, stamp_ns), max(last_ns, stamp_ns)
-
     def _of_another_clock(self) -> Iterator[str]:
         """Yield a warning for cameras, and for wheels or gyro, whose stamps are shifted against each other."""
-        images, both = self._spans.get("images"), [self._spans.get(camera) for camera in CAMERAS]
+        spans, topics = self._order.spans_ns, self._log.topics()
+        both = [spans.get(self._cameras[camera]) for camera in CAMERAS]
         if both[0] and both[1]:
             begin_ns, end_ns = (upper_ns - lower_ns for lower_ns, upper_ns in zip(*both, strict=True))
             if min(abs(begin_ns), abs(end_ns)) > STEP_NS > abs(begin_ns - end_ns):
@@ -273,56 +277,44 @@ class LogReader:
                     f"the images of the upper camera begin and end {abs(begin_ns) * 1e-9:.1f} s "
                     f"{'after' if begin_ns > 0 else 'before'} those of the lower one by their stamps: of another clock?"
                 )
-        for what in ("wheels", "gyro"):
-            span = self._spans.get(what)
-            if images and span and (span[0] > images[1] or span[1] < images[0]):
-                apart_s = 1e-9 * (span[0] - images[0])
+        known = [span for span in both if span]
+        for topic in sorted(self._motion.names & spans.keys()):
+            begin_ns, end_ns = spans[topic]
+            what, images_ns = "gyro" if topics[topic] == IMU else "wheels", min(known, default=(0, 0))[0]
+            if known and (begin_ns > max(span[1] for span in known) or end_ns < images_ns):
+                apart_s = 1e-9 * (begin_ns - images_ns)
                 yield (
                     f"no sample of the {what} is used: they begin {abs(apart_s):.1f} s "
                     f"{'after' if apart_s > 0 else 'before'} the images by their stamps: are these of another clock?"
                 )
 
     def _report(self) -> None:
-        damage = self._log.damage()
+        damage, times = self._log.damage(), self._order.times
         self.counts["broken_records"] = damage.broken
         self.truncated = bool(damage.cut)
         if damage.cut:
             self.warnings.append(damage.cut)
-        self.counts["unstamped"] = self._times.by_log.total()
-        self.counts["no_joints"] = 0 if "wheels" in self._spans else self._other_joints
+        self.counts["unstamped"] = times.by_log.total()
+        self.counts["no_joints"] = 0 if self._has_wheels else self._other_joints
+        for reason in self._order.broken:
+            self._count_broken("broken", reason)
+        faults = defaultdict(str, {**self._faults, "broken_records": damage.first})
         found = {name: text for name, text in _WARNINGS.items() if self.counts[name]}
-        faults = {"fault": self._fault, "motion_fault": self._motion_fault, "record_fault": damage.first}
-        self.warnings += [text.format(self.counts[name], **faults) for name, text in found.items()]
-        self.warnings += [*self._times.warnings(), *self._of_another_clock()]
+        self.warnings += [text.format(self.counts[name], fault=faults[name]) for name, text in found.items()]
+        self.warnings += [*times.warnings(), *self._of_another_clock()]
+
+
+class _Order(NamedTuple):
+    """The N messages that are read, by their stamps."""
+
+    rows: NDArray[np.int64]  # (N,) of the log
+    stamps_ns: NDArray[np.int64]  # (N,)
+    is_image: NDArray[np.bool_]  # (N,)
+    times: ImageTimes
+    spans_ns: Mapping[str, tuple[int, int]]  # topic -> first and last stamp
+    broken: Sequence[str]  # what is wrong with images that are not among them
 
 
 def _is_neutral(image: NDArray[np.uint8]) -> bool:
     """True if nearly all grey levels (H, W) are near the middle."""
     return bool(np.percentile(np.abs(image.astype(np.int16) - NEUTRAL_GREY), MOST_PERCENT) <= NEAR_NEUTRAL)
-
-
-class _Waiting:
-    """Images and samples, the earliest first: of one stamp samples, the lower camera, the upper one, by arrival."""
-
-    def __init__(self) -> None:
-        self._entries: list[_Entry] = []
-        self.frames = self._arrivals = self._bytes = 0
-
-    def add(self, stamp_ns: int, rank: int, item: RosImage | MotionSample) -> None:
-        """Add an entry. The data of an image must not change afterwards."""
-        heapq.heappush(self._entries, (stamp_ns, rank, self._arrivals, item))
-        self._arrivals += 1
-        if isinstance(item, RosImage):
-            self.frames, self._bytes = self.frames + 1, self._bytes + len(item.data)
-
-    def take(self) -> _Entry:
-        """Take the earliest entry."""
-        entry = heapq.heappop(self._entries)
-        if isinstance(entry[-1], RosImage):
-            self.frames, self._bytes = self.frames - 1, self._bytes - len(entry[-1].data)
-        return entry
-
-    def is_full(self, window: int) -> bool:
-        """True with more than `window` images, too many bytes of them, or more samples than a stage could wait for."""
-        samples = len(self._entries) - self.frames
-        return self.frames > window or self._bytes > MAX_HELD_BYTES or samples > MAX_WAITING_SAMPLES

@@ -134,7 +134,9 @@ def _open_file(path: Path, name: str | None = None) -> LogFile:
     name = name or str(path)
     try:
         if path.exists() and not path.is_file():
-            raise DriverError(f"cannot read the log {name!r}: it is no regular file; give a log of {LOG_SUFFIXES}")
+            raise DriverError(
+                f"cannot read the log {name!r}: it is no regular file; give one of {', '.join(LOG_SUFFIXES)}"
+            )
         with path.open("rb") as file:
             start = file.read(max(map(len, _FORMATS)))
     except OSError as error:
@@ -148,7 +150,9 @@ def _open_file(path: Path, name: str | None = None) -> LogFile:
             if not inside.stat().st_size:
                 raise DriverError(f"{name!r} is compressed, but cut or corrupt at its start: record it again")
             return _open_file(inside, name)
-    found = f"it starts with {start!r}: give a log of {LOG_SUFFIXES}" if start else "it is empty: record it again"
+    found = (
+        f"it starts with {start!r}: give one of {', '.join(LOG_SUFFIXES)}" if start else "it is empty: record it again"
+    )
     raise DriverError(f"{name!r} is no log: {found}")
 
 

@@ -162,6 +162,16 @@ def _decoded(kind: str, message: memoryview, aligned: bool) -> Any:
         raise FrameDecodeError(f"a {kind} of {len(message)} bytes is truncated or invalid") from error
 
 
+def header_ns(message: memoryview, *, aligned: bool = True) -> int:
+    """Return the stamp of the header with which images, wheels and IMUs begin; 0 where it is unset or cut."""
+    start = bytes(message[:12])
+    if len(start) < 12:
+        return 0
+    # CDR states its byte order; ROS 1 begins with a sequence number, and its seconds have no sign.
+    layout = ("<4xiI" if start[1] & 1 else ">4xiI") if aligned else "<4xII"
+    return _stamp_ns(*struct.unpack(layout, start))
+
+
 typestore = cache(get_typestore)
 
 

@@ -19,7 +19,7 @@ Colour = tuple[int, int, int]  # BGR
 
 MARGIN_PX = 64
 MARK_PX = 11  # size of marks and distance of labels
-SIDE_LIMIT_PX = 2000
+SIDE_PX = 1400  # of an image, at most
 WHITE, BLACK, RED, BLUE, LIGHT_GREY = (255, 255, 255), (0, 0, 0), (0, 0, 190), (200, 100, 0), (205, 205, 205)
 _CELL_M = 0.05  # default voxel: at a finer scale cells are drawn as squares, not as scattered dots
 _FONT, _FONT_SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.5
@@ -76,20 +76,19 @@ def plan_view(
     trajectory_xy: Array,
     *,
     heights_m: tuple[float, float] = (_LOW_M, _HIGH_M),
-    max_side_px: int = 1400,
     loops_xy: Array = NO_LOOPS,
 ) -> Image:
     """Return a BGR image (H, W, 3) of the map's points between two heights [m], and the path (N, 2) [m] over it.
 
     A row of the path that is NaN, or too far away to be drawn, is a gap: what is before and after it is not joined.
     Heights are z of the points' frame. A cell is the darker, the more confident points it has. Neither side exceeds
-    `max_side_px` (at most 2000). The farthest half per cent of the points on each side may be cut off, the path never.
+    SIDE_PX. The farthest half per cent of the points on each side may be cut off, the path never.
     loops_xy: (L, 2, 2) [m] ends of lines between places of the path that were recognised as one.
     """
     drawable = _drawable(trajectory_xy)
     path = trajectory_xy[drawable].astype(np.float64)
     xy_m, confidence = between(points.xyz, points.confidence, heights_m)
-    sheet = sheet_of(xy_m, path, max_side_px)
+    sheet = sheet_of(xy_m, path)
     gaps = np.flatnonzero(np.diff(np.flatnonzero(drawable)) > 1) + 1
     lines = [Lines(list(loops_xy), BLUE, 1), Lines(np.split(path, gaps), RED, 3, rim_px=7)]
     image = draw_plan(sheet, xy_m, confidence, lines)
@@ -111,15 +110,14 @@ def _drawable(points: NDArray[np.floating]) -> NDArray[np.bool_]:
     return np.asarray((np.abs(points) <= POSITION_LIMIT_M).all(axis=1))
 
 
-def sheet_of(xy_m: Array, path: Array, max_side_px: int = 1400) -> Sheet:
+def sheet_of(xy_m: Array, path: Array) -> Sheet:
     """Return the area of the path and of 99 % of the points: a few false far points must not shrink the rest."""
-    side_px = int(np.clip(max_side_px, 4 * MARGIN_PX, SIDE_LIMIT_PX))
     bulk = np.quantile(xy_m, (0.005, 0.995), axis=0) if len(xy_m) else np.empty((0, 2))
     corners = np.vstack([bulk, path]) if len(bulk) or len(path) else np.zeros((1, 2))
     low_m, high_m = corners.min(axis=0), corners.max(axis=0)
     half = np.maximum(1.06 / 2 * (high_m - low_m), 1.0)  # an empty map has 2 m as well
     half = np.maximum(half, 0.1 * half.max())  # a straight path is visible
-    usable_px = side_px - 2 * MARGIN_PX - 2
+    usable_px = SIDE_PX - 2 * MARGIN_PX - 2
     centre = (low_m + high_m) / 2
     return Sheet(centre - half, centre + half, min(usable_px / (2 * float(half.max())), 100.0))
 

@@ -6,6 +6,7 @@ order of the quaternion and the unit of the stamps.
 
 from __future__ import annotations
 
+import codecs
 import re
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -55,20 +56,19 @@ def read_tum(path: str | Path) -> Trajectory:
     raw, stamps, poses, lines, line = _read(Path(path)), list[int](), list[list[float]](), list[int](), 0
     order, unit = _QUATERNION, ""
     try:
-        for line, content in enumerate(TextIOWrapper(BytesIO(raw), "utf-8-sig"), start=1):
+        for line, content in enumerate(_lines(raw), start=1):
             data, _, comment = content.partition("#")
-            words = data.replace(",", " ").split()
+            words = _words(data)
             is_head = len(words) > 1 and not any(re.match(r"[-+.]?[0-9]", word) for word in words)
             if words and (lines or not is_head):
                 unit = unit or _unit_of(words[0])
-                stamp_ns, pose = _row(words[:8] if "," in data else words, unit)
+                # Tables may have more columns, such as velocities.
+                stamp_ns, pose = _row(words[:8] if re.search("[,;]", data) else words, unit)
                 stamps.append(stamp_ns)
                 poses.append(pose)
                 lines.append(line)
             elif not lines:
                 order, unit = _columns(data if words else comment) or (order, unit)
-    except UnicodeDecodeError:
-        raise OmnidError(f"{path}: expected 't x y z qx qy qz qw' in each line, found bytes that are no text") from None
     except ValueError as error:
         raise OmnidError(f"{path}, line {line}: {error}") from error
     if not lines:
@@ -112,10 +112,25 @@ def _read(path: Path) -> bytes:
     return raw
 
 
+def _lines(raw: bytes) -> TextIOWrapper:
+    """Return the lines of a text, in UTF-16 if it begins with its byte order mark; comments may have any encoding."""
+    is_wide = raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    return TextIOWrapper(BytesIO(raw), "utf-16" if is_wide else "utf-8-sig", errors="replace")
+
+
+def _words(data: str) -> list[str]:
+    """Return the words of a line, separated by spaces, commas or semicolons; numbers may have decimal commas."""
+    data = data.replace('"', " ").replace(";", " ")
+    words = data.split()
+    if len(words) > 1 and all(re.fullmatch(r"[-+]?\d+,\d+", word) for word in words):
+        return [word.replace(",", ".") for word in words]
+    return data.replace(",", " ").split()
+
+
 def _columns(head: str) -> tuple[list[str], str] | None:
     """Return the order of the quaternion and the unit of the stamps; None unless time, position, quaternion follow."""
     unit = re.match(r"[^,]*\[(s|ms|us|ns)\]", head)
-    names = re.sub(r"\[[^\]]*\]", "", head).replace(",", " ").lower().split()
+    names = _words(re.sub(r"\[[^\]]*\]", "", head).lower())
     axes = [name[-1] for name in names[1:8]]
     order = axes[len(_AXES) :]
     if axes[: len(_AXES)] != _AXES or sorted(order) != sorted(_QUATERNION):

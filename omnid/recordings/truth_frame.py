@@ -52,12 +52,20 @@ def _with_inverse_rotations(T: Array) -> Array:
     return se3.transform(np.swapaxes(R, 1, 2), xyz)
 
 
+def _mirrored(T: Array) -> Array:
+    """Return poses of a left-handed world and body, as of game engines, whose y axes point the other way."""
+    R, xyz = parts(T)
+    signs = np.array([1.0, -1.0, 1.0])
+    return se3.transform(signs[:, None] * R * signs, signs * xyz)
+
+
 # How a file may be written, in words, and the poses T_world_body of the poses as they were read.
 READINGS: Final[dict[str, Callable[[Array], Array]]] = {
     "": lambda T: T,
     "its quaternions begin with w": _with_w_first,
     "its poses are inverse (T_body_world)": se3.inverse,
     "its rotations are inverse (conjugated quaternions)": _with_inverse_rotations,
+    "its frames are left-handed (y is mirrored)": _mirrored,
     "its quaternions begin with w, its poses are inverse (T_body_world)": lambda T: se3.inverse(_with_w_first(T)),
 }
 

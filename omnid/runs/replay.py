@@ -185,7 +185,6 @@ class _Replay:
         open_log = partial(
             LogReader,
             self._log,
-            window=log.reorder_frames,
             span_s=self._options.span_s,
             motion=motion_topics(self._config),
             bits=self._config.cameras.bits,

@@ -129,7 +129,7 @@ class RunReport:
     def counters(self) -> RunCounters:
         """Return the counters of the run; all that was lost, by reason, zeros too."""
         read, paired, telemetry = self._reader.counts, self._pairing.counts, self._session.graph.telemetry
-        drops = {name: read[name] for name in ("late", "duplicate", "broken", "broken_records")}
+        drops = {name: read[name] for name in ("duplicate", "broken", "broken_records")}
         drops |= {name: count for name, count in paired.items() if name.startswith(("unpaired", "repeated"))}
         drops["broken"] += paired["broken"]
         drops["queue"] = telemetry.dropped_messages

@@ -50,12 +50,11 @@ def image_loss(read: Mapping[str, int], *, unpaired: int = 0, undecodable: int =
     """Return the loss of a log. read: counts of its reader; the others: of its images that the reader delivered."""
     equal = read["duplicate"] - read["repeated"]
     return ImageLoss(
-        read["lower"] + read["upper"] + read["late"] + equal + read["broken"],
+        read["lower"] + read["upper"] + equal + read["broken"],
         {
             "without a partner": unpaired,
             "not decodable": read["broken"] + undecodable,
             "of another size": other_size,
-            "out of order": read["late"],
             "with the stamp of the one before": equal,
         },
     )

@@ -19,6 +19,7 @@ from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
 
 T = TypeVar("T")
+_MAX_LINE = 256  # bytes
 
 
 class NoReplyError(DriverError):
@@ -85,19 +86,16 @@ def require_watchdog(requested_ms: int, in_force_ms: float) -> None:
 
 
 class TextFramer:
-    """Splits text into lines that end in CR or LF; returns them without the end, and drops empty ones.
+    """Splits text into lines that end in CR or LF; returns them without the end, and drops empty and too long ones."""
 
-    max_line: a longer line is dropped [bytes].
-    """
-
-    def __init__(self, max_line: int = 256) -> None:
-        self._max_line, self._rest = max_line, b""
+    def __init__(self) -> None:
+        self._rest = b""
 
     def feed(self, data: bytes) -> list[bytes]:
         """Return the lines that end in data."""
         *lines, rest = (self._rest + data).replace(b"\r", b"\n").split(b"\n")
-        self._rest = rest[: self._max_line + 1]  # which is too long once it ends, if this cuts it
-        return [line for line in lines if 0 < len(line) <= self._max_line]
+        self._rest = rest[: _MAX_LINE + 1]  # which is too long once it ends, if this cuts it
+        return [line for line in lines if 0 < len(line) <= _MAX_LINE]
 
     def reset(self) -> None:
         """Discard the incomplete line."""

@@ -171,7 +171,7 @@ def test_frames_and_contents_are_the_same_in_every_format(tmp_path: Path, name: 
 @pytest.mark.parametrize("order", ["camera by camera", "backwards", "shuffled"])
 @pytest.mark.parametrize("name", [name for name in FORMATS if name != "folder"])
 def test_a_log_is_read_in_the_order_of_time_however_it_was_written(tmp_path: Path, name: str, order: str) -> None:
-    """As by a writer that put all images of one camera first: 60 pairs, more than the window sorts."""
+    """As by a writer that put all images of one camera first."""
     entries = pairs(60)
     if order == "camera by camera":
         entries.sort(key=lambda entry: entry.topic)
@@ -179,7 +179,7 @@ def test_a_log_is_read_in_the_order_of_time_however_it_was_written(tmp_path: Pat
         entries.reverse()
     else:
         random.Random(4).shuffle(entries)
-    found, reader = read(FORMATS[name](tmp_path, entries), window=4)
+    found, reader = read(FORMATS[name](tmp_path, entries))
     assert found == expected(60) and not reader.warnings
 
 
@@ -266,7 +266,7 @@ def test_parts_that_were_written_camera_by_camera_are_read_in_the_order_of_time(
     entries = sorted(pairs(60), key=lambda entry: entry.topic)
     for part in range(6):
         write_log(tmp_path / f"bag_{part}.mcap", entries[20 * part :][:20], **SMALL)
-    found, reader = read(tmp_path, window=4)
+    found, reader = read(tmp_path)
     assert found == expected(60) and not reader.warnings
 
 
@@ -422,7 +422,7 @@ def test_a_cut_mcap_that_was_written_topic_by_topic_is_read_in_the_order_of_time
     entries = sorted(pairs(60), key=lambda entry: entry.topic)
     path = write_log(tmp_path / "log.mcap", entries, **SMALL)
     os.truncate(path, path.stat().st_size - 100)  # its index is gone
-    found, reader = read(path, window=4)
+    found, reader = read(path)
     assert found == expected(60) and reader.truncated
 
 
@@ -493,7 +493,7 @@ def test_a_transaction_that_was_not_ended_is_undone(tmp_path: Path) -> None:
 def test_a_cut_database_that_was_written_topic_by_topic_is_read_in_the_order_of_time(tmp_path: Path) -> None:
     path = write_db3(tmp_path / "bag", sorted(pairs(60), key=lambda entry: entry.topic))
     os.truncate(path, int(0.9 * path.stat().st_size))
-    found, reader = read(path, window=4)
+    found, reader = read(path)
     stamps = [frame[2] for frame in found]
     assert (
         len(found) > 90

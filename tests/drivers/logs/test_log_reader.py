@@ -176,18 +176,36 @@ def test_sorts_frames_within_the_window(tmp_path: Path, seed: int) -> None:
     moved = sorted(range(len(entries)), key=lambda index: index + chance.uniform(0, 16))
     assert moved != sorted(moved)
     logged = [entries[index]._replace(log_time_ns=START_NS + number) for number, index in enumerate(moved)]
-    frames, reader = read(write_log(tmp_path / "log.mcap", logged), window=16)
+    frames, reader = read(write_log(tmp_path / "log.mcap", logged))
     assert places(frames) == in_order(60)
     assert not reader.warnings
 
 
-def test_drops_and_counts_frames_after_their_window(tmp_path: Path) -> None:
-    entries = pairs(20)  # the images of the first pair were logged 2 s after they were taken
-    late = [entry._replace(log_time_ns=START_NS + 2 * 10**9) for entry in entries[:2]]
-    frames, reader = read(write_log(tmp_path / "log.mcap", entries[2:] + late), window=4)
-    assert len(frames) == 38 and reader.counts["late"] == 2
-    assert [f.seq for f in frames if f.camera == "upper"] == list(range(19))
-    assert "dropped 2 frames" in reader.warnings[0]
+@pytest.mark.parametrize("logged", ["never", "fast", "in parts"])
+@pytest.mark.parametrize("step_s", [0, -3])
+def test_a_log_whose_times_were_made_camera_by_camera_is_ordered_by_headers(
+    tmp_path: Path, logged: str, step_s: int
+) -> None:
+    """As a conversion writes it: with no log times, or those of the conversion. The cameras' clock may be set."""
+    entries = pairs(60)
+    moved = [
+        entry._replace(data=compressed(entry.log_time_ns + step_s * 10**9 * (n >= 60), jpeg(n)))
+        for n, entry in enumerate(entries)
+    ]
+    parts = [moved[:80], moved[80:]] if logged == "in parts" else [moved]
+    written = [entry for part in parts for entry in sorted(part, key=lambda entry: entry.topic)]
+    times = [0 if logged == "never" else START_NS + n * 5 * 10**6 for n in range(120)]
+    log = [entry._replace(log_time_ns=ns) for entry, ns in zip(written, times, strict=True)]
+    frames, reader = read(write_log(tmp_path / "log.mcap", log))
+    assert [bytes(frame.data) for frame in frames] == [jpeg(n) for n in range(120)]
+    assert len(reader.warnings) == (step_s != 0) and all("set back by 3.0" in line for line in reader.warnings)
+
+
+def test_frames_that_were_logged_long_after_are_in_order(tmp_path: Path) -> None:
+    entries = pairs(60)  # the images of the first pair were logged 6 s after they were taken
+    late = [entry._replace(log_time_ns=START_NS + 6 * 10**9) for entry in entries[:2]]
+    frames, reader = read(write_log(tmp_path / "log.mcap", entries[2:] + late))
+    assert places(frames) == in_order(60) and not reader.warnings
 
 
 def test_replaces_an_unset_stamp_by_the_log_time(tmp_path: Path) -> None:

@@ -139,7 +139,7 @@ def test_memory_does_not_grow_with_the_log(tmp_path: Path, order: str) -> None:
     path = write_log(tmp_path / "log.mcap", entries, chunk_size=2**20)
     tracemalloc.start()
     try:
-        count = sum(1 for _ in LogReader(path, window=4).frames())
+        count = sum(1 for _ in LogReader(path).frames())
         assert count == 200 and tracemalloc.get_traced_memory()[1] < 16 * 2**20 < path.stat().st_size
     finally:
         tracemalloc.stop()

@@ -117,9 +117,13 @@ def test_names_the_wrong_line(tmp_path: Path, line: str, found: str) -> None:
         "# t tx ty tz qw qx qy qz\n1700000000.1 1 2 3 -.5 -.5 -.5 .5\n1700000000.2 1 2 3 1 0 0 0\n",
         "1700000000100000000 1 2 3 .5 .5 -.5 .5\n1700000000200000000 1 2 3 0 0 0 1\n",
         "1700000000100000 1 2 3 .5 .5 -.5 .5\n1700000000200000 1 2 3 0 0 0 1\n",
+        '"1700000000.1";"1";"2";"3";".5";".5";"-.5";".5"\n1700000000.2;1;2;3;0;0;0;1\n',
+        "1700000000,1 1,0 2,0 3,0 0,5 0,5 -0,5 0,5\n1700000000,2 1,0 2,0 3,0 0,0 0,0 0,0 1,0\n",
+        "# K\xf6ln\n1700000000.1 1 2 3 .5 .5 -.5 .5\n1700000000.2 1 2 3 0 0 0 1\n".encode("latin-1"),
+        "1700000000.1 1 2 3 .5 .5 -.5 .5\n1700000000.2 1 2 3 0 0 0 1\n".encode("utf-16"),
     ],
 )
-def test_reads_columns_as_the_head_names_them(tmp_path: Path, text: str) -> None:
+def test_reads_the_tables_of_other_programs(tmp_path: Path, text: str | bytes) -> None:
     read = read_tum(written(tmp_path, text))
     assert read.stamps_ns.tolist() == [1_700_000_000_100_000_000, 1_700_000_000_200_000_000]
     np.testing.assert_allclose(se3.quaternion(read.T[:, :3, :3]), [[0.5, 0.5, -0.5, 0.5], [0, 0, 0, 1]], atol=1e-12)
@@ -238,12 +242,10 @@ def test_draws_an_image_of_an_almost_empty_map(path: NDArray[np.float64]) -> Non
 
 
 @pytest.mark.parametrize("extent_m", [0.01, 3.0, 250.0, 1e6, 1e9])
-@pytest.mark.parametrize("side_px", [1, 300, 1400, 10**6])
-def test_size_is_bounded_for_any_extent(extent_m: float, side_px: int) -> None:
+def test_size_is_bounded_for_any_extent(extent_m: float) -> None:
     for shape in ([1.0, 0.0], [0.0, 1.0], [1.0, -0.7]):
-        path = np.linspace(0, extent_m, 30)[:, None] * shape
-        image = plan_view(points(box(0, 0)), path, max_side_px=side_px)
-        assert max(image.shape) <= max(256, min(side_px, 2000)) and min(image.shape[:2]) > 2 * MARGIN_PX + 10
+        image = plan_view(points(box(0, 0)), np.linspace(0, extent_m, 30)[:, None] * shape)
+        assert max(image.shape) <= 1400 and min(image.shape[:2]) > 2 * MARGIN_PX + 10
 
 
 CELLS = np.array([[FREE, OCCUPIED, UNKNOWN], [UNKNOWN, FREE, FREE]], np.int8)

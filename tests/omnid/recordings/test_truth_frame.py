@@ -60,6 +60,7 @@ def as_tum(T: Array, stamp_ns: int) -> str:
 
 
 HAND, FLAT = drive(flat=False), drive(flat=True)
+MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
 @pytest.mark.parametrize(
@@ -78,6 +79,7 @@ HAND, FLAT = drive(flat=False), drive(flat=True)
         (HAND, HAND, 0, rewritten([3, 0, 1, 2], [1, 1, 1, 1]), "its quaternions begin with w", 0),
         (HAND, HAND, 0, rewritten([0, 1, 2, 3], [-1, -1, -1, 1]), "its rotations are inverse (conjugated", 0),
         (HAND, se3.inverse(HAND), 0, as_tum, "its poses are inverse (T_body_world)", 0),
+        (HAND, MIRROR @ HAND @ MIRROR, 0, as_tum, "its frames are left-handed (y is mirrored)", 0),
         (HAND, HAND, 0, rewritten([0, 1, 2, 3], [-1, -1, -1, -1]), "", 0),
         (HAND, HAND, 0, as_tum, "", 0),
     ],
