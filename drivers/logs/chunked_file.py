@@ -38,6 +38,7 @@ class RecordKind(Enum):
     SCHEMA = auto()
     CHANNEL = auto()
     ATTACHMENT = auto()
+    PLACE = auto()  # of a chunk, in the summary
     END = auto()  # of chunks and messages
     OTHER = auto()
 
@@ -119,7 +120,11 @@ class ChunkedFile(ByteSource, ABC):
 
     @abstractmethod
     def _summary(self) -> Iterator[Record]:
-        """Yield the definitions behind the data, of a file that is closed; none where they are corrupt."""
+        """Yield the definitions and places of chunks behind the data of a closed file; none where it is corrupt."""
+
+    @abstractmethod
+    def _place(self, record: Record) -> int:
+        """Return where the chunk begins whose place a record of the summary states; raise RecordError."""
 
     @abstractmethod
     def _is_closed(self) -> bool:
@@ -171,17 +176,17 @@ class ChunkedFile(ByteSource, ABC):
 
     def entries(self) -> Iterator[Entries]:
         """Yield the places of all messages, chunk by chunk."""
-        is_closed = self._is_closed()
+        is_closed, places = self._is_closed(), list[int]()
         for record in self._summary() if is_closed else ():
             with suppress(RecordError):  # then the data has the definition
-                self._define(self, record)
+                if record.is_definition:
+                    self._define(self, record)
+                elif record.kind is RecordKind.PLACE:
+                    places.append(self._place(record))
         chunk: Record | None = None  # the newest one, and the index behind it
         index: list[Record] = []
         last = Record(RecordKind.OTHER, 0, 0, self._start)
-        for record in self._records(self, self._start, self.size):
-            # A length that exceeds a file which was closed is a corrupt one; in another, its last chunk is cut.
-            if record.is_cut and (record.kind is not RecordKind.CHUNK or is_closed):
-                break
+        for record in self._with_jumps(sorted(places), is_closed=is_closed):
             last = record
             if record.kind is RecordKind.INDEX:
                 index.append(record)
@@ -193,8 +198,6 @@ class ChunkedFile(ByteSource, ABC):
                 yield _entries([(head, at, _NO_CHUNK) for at, head in self._heads(self, [record]).items()])
             elif record.kind is RecordKind.ATTACHMENT and len(self._attached) < MAX_DEFINITIONS:
                 self._attached.append(record)
-            elif record.kind is RecordKind.END:
-                break
         is_whole = is_closed and self._is_whole(last)
         if chunk is not None:
             yield self._of_chunk(chunk, index if is_whole else [])
@@ -207,6 +210,26 @@ class ChunkedFile(ByteSource, ABC):
         if not is_whole:
             end = min(last.offset + last.size, self.size)
             self.cut = f"the log {self.name!r} is cut or corrupt after byte {end} of {self.size}: used the data before"
+
+    def _with_jumps(self, places: Sequence[int], *, is_closed: bool) -> Iterator[Record]:
+        """Yield the records up to the one that ends them, and behind holes in the file those from the next chunk on.
+
+        places: begins of the chunks by the summary, sorted.
+        """
+        begin: int | None = self._start
+        while begin is not None:
+            end = begin
+            for record in self._records(self, begin, self.size):
+                # A length that exceeds a file which was closed is a corrupt one; in another, its last chunk is cut.
+                if record.is_cut and (record.kind is not RecordKind.CHUNK or is_closed):
+                    break
+                yield record
+                if record.kind is RecordKind.END:
+                    return
+                end = record.offset + record.size
+            begin = next((place for place in places if place > end), None)
+            if begin is not None:
+                self.faults[f"the {begin - end} bytes from byte {end} on are no records"] += 1
 
     def read(self, channel: int, time_ns: int, block: int, offset: int) -> memoryview:
         """Return the bytes of the message of an entry; raise RecordError where they are not those that were written."""

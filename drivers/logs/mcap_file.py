@@ -46,6 +46,7 @@ _CHUNK: Final = struct.Struct("<QQQII")  # first and last log time, unpacked siz
 _SIZE: Final = struct.Struct("<Q")
 _MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _INDEX: Final = struct.Struct("<HI")  # channel, bytes of the entries: log time, offset in the chunk
+_PLACE: Final = struct.Struct("<QQQ")  # first and last log time, begin of the chunk
 _ENTRY: Final = np.dtype([("time_ns", "<u8"), ("offset", "<u8")])
 _FOOTER: Final = struct.Struct("<QQI")  # start of the summary, of its offsets, CRC of the summary and the footer before
 _CRC_BYTES: Final = 4
@@ -57,6 +58,7 @@ _KINDS: Final = {
     Opcode.SCHEMA: RecordKind.SCHEMA,
     Opcode.CHANNEL: RecordKind.CHANNEL,
     Opcode.ATTACHMENT: RecordKind.ATTACHMENT,
+    Opcode.CHUNK_INDEX: RecordKind.PLACE,
     Opcode.DATA_END: RecordKind.END,
 }
 
@@ -106,8 +108,10 @@ class McapFile(ChunkedFile):
         if start and 0 < size <= MAX_RECORD_BYTES:
             section = self.read_bytes(start, size)
             if len(section) == size and (not crc or zlib.crc32(section + footer[:-_CRC_BYTES]) == crc):
-                records = self._records(self, start, start + size)
-                yield from (record for record in records if record.is_definition)
+                yield from self._records(self, start, start + size)
+
+    def _place(self, record: Record) -> int:
+        return int(_PLACE.unpack(self.content(record.offset, _PLACE.size))[2])
 
     def _records(self, source: ByteSource, start: int, end: int) -> Iterator[Record]:
         offset = start

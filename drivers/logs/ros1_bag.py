@@ -24,7 +24,13 @@ MAGIC: Final = b"#ROSBAG V2.0\n"
 
 _LENGTH: Final = struct.Struct("<I")
 _ENTRY: Final = np.dtype([(name, "<u4") for name in ("seconds", "nanoseconds", "offset")])  # of an index
-_KINDS: Final = {2: RecordKind.MESSAGE, 4: RecordKind.INDEX, 5: RecordKind.CHUNK, 7: RecordKind.CHANNEL}
+_KINDS: Final = {
+    2: RecordKind.MESSAGE,
+    4: RecordKind.INDEX,
+    5: RecordKind.CHUNK,
+    6: RecordKind.PLACE,
+    7: RecordKind.CHANNEL,
+}
 
 
 class Ros1Bag(ChunkedFile):
@@ -48,7 +54,10 @@ class Ros1Bag(ChunkedFile):
 
     def _summary(self) -> Iterator[Record]:
         records = self._records(self, self._index_begin, self.size)
-        yield from (record for record in records if record.is_definition and not record.is_cut)
+        yield from (record for record in records if not record.is_cut)
+
+    def _place(self, record: Record) -> int:
+        return _numbers(record, b"chunk_pos", 1, "Q")[0]
 
     def _records(self, source: ByteSource, start: int, end: int) -> Iterator[Record]:
         offset = start

@@ -61,8 +61,9 @@ def ros1_bytes(entry: Entry) -> bytes:
     return bytes(migrated)
 
 
-def write_bag(path: Path, entries: Sequence[Entry], compression: str = "") -> Path:
+def write_bag(path: Path, entries: Sequence[Entry], compression: str = "", chunk_bytes: int = 1 << 20) -> Path:
     writer = Ros1Writer(path)
+    writer.chunk_threshold = chunk_bytes
     if compression:
         writer.set_compression(Ros1Writer.CompressionFormat[compression])
     with writer:

@@ -16,6 +16,7 @@ import zstandard
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
+from rosbags.rosbag1 import Reader
 
 from drivers.errors import RecordError
 from drivers.logs import mcap_file
@@ -23,6 +24,7 @@ from drivers.logs.compression import unpack_message
 from drivers.logs.log_reader import LogReader
 from drivers.logs.mcap_file import MAGIC
 from drivers.logs.open_log import open_log
+from tests.drivers.logs.bags import write_bag
 from tests.drivers.logs.mcap_logs import IMAGE, LOWER, UPPER, compressed, jpeg, pairs, write_log
 from tests.drivers.logs.test_formats import is_one_fault, read, survivors
 
@@ -67,14 +69,25 @@ def test_any_changed_byte_of_a_large_chunk_costs_no_more_than_its_message(tmp_pa
     assert is_one_fault(reader.warnings)
 
 
-def test_reports_a_corrupt_length(tmp_path: Path) -> None:
-    path = write_log(tmp_path / "log.mcap", pairs(30), chunk_size=700)
-    data, place = bytearray(path.read_bytes()), chunk_at(path, 9)
-    data[place.chunk_start_offset + 6] ^= 0x55
+@pytest.mark.parametrize("hole", [(6, 1), (0, 64), (300, 1200)], ids=["a length", "a head", "parts of two chunks"])
+@pytest.mark.parametrize("kind", ["mcap", "bag"])
+def test_behind_a_hole_reading_goes_on_at_the_next_chunk(tmp_path: Path, hole: tuple[int, int], kind: str) -> None:
+    """As a page of the disk that was not written."""
+    if kind == "mcap":
+        path = write_log(tmp_path / "log.mcap", pairs(30), chunk_size=700)
+        begin = chunk_at(path, 9).chunk_start_offset
+    else:
+        path = write_bag(tmp_path / "log.bag", pairs(30), chunk_bytes=1400)
+        with Reader(path) as bag:
+            begin = sorted(chunk.pos for chunk in bag.chunk_infos)[9]
+    expected, data, (offset, size) = read(path)[0], bytearray(path.read_bytes()), hole
+    start = begin + offset
+    data[start : start + size] = bytes([data[start] ^ 0x55]) if size == 1 else bytes(size)
     path.write_bytes(data)
     found = survivors(path)
-    assert found is not None and 8 <= len(found[0]) <= 20
-    assert found[1].truncated and f"after byte {place.chunk_start_offset} of {len(data)}" in found[1].warnings[0]
+    assert found is not None and 52 <= len(found[0]) < 60
+    assert {frame[2] for frame in found[0]} < {frame[2] for frame in expected}  # a bag has no checksums
+    assert found[1].counts["broken_records"] >= 1 and not found[1].truncated
 
 
 def chunk(compression: str, size: int, packed: bytes, crc: int = 0) -> bytes:
