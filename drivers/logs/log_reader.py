@@ -123,7 +123,8 @@ class LogReader:
                 f"expected, {begin_s:g} s found"
             )
         last: dict[Camera, tuple[int, memoryview]] = {}
-        inside = (at_s >= begin_s) & (at_s <= end_s)
+        # Samples behind the last image are of no use.
+        inside = (at_s >= begin_s) & (at_s <= min(end_s, at_s[is_image].max(initial=0.0)))
         for row, stamp_ns in zip(rows[inside].tolist(), stamps_ns[inside].tolist(), strict=True):
             message = self._log.message(row)
             if self._closed:
