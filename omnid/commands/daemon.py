@@ -57,12 +57,12 @@ def run(args: argparse.Namespace) -> int:
     return _run_log(args, replace(config, controller=config.controller.of_log))
 
 
-def _settings(args: argparse.Namespace, shortcuts: Mapping[str, object] | None = None) -> Config:
+def _settings(args: argparse.Namespace, more: Mapping[str, object] | None = None) -> Config:
     """Return the settings of a live run; warn of those that it does not use."""
     from omnid.config import unused_settings
     from omnid.engine.logging_setup import log
 
-    config = settings_of(args, shortcuts or {})
+    config = settings_of(args, more)
     for warning in unused_settings(config, "run", args.set):
         log(logging.WARNING, warning)
     return config

@@ -33,7 +33,6 @@ from enum import Enum
 from functools import partial
 from inspect import cleandoc
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, TextIO, TypeAlias
 
 from omnid.errors import OmnidError
@@ -48,7 +47,6 @@ if TYPE_CHECKING:  # the help and other commands do not load these
 PROFILES: Final = {
     "small": ("panorama.scale=0.5", "odometry.limits.features=250"),
 }
-_NO_SETTINGS: Final[Mapping[str, object]] = MappingProxyType({})
 _DECLARED: Final = re.compile(
     r"(?P<names>-\S+(?:, --\S+)*|[a-z]+)(?: (?!\[[a-z_]+\.)(?P<value>[\[\dA-Za-z]\S*))?"
     r"(?: (?P<low>[\d.e-]*?)\.\.(?P<high>[\d.e]*))?(?: \[(?P<setting>[a-z_]+\.[a-z_.]+)\])?  +(?P<help>.+)"
@@ -170,7 +168,7 @@ TYPES: Final[Mapping[str, Callable[[str], Any]]] = {
 _PATHS: Final = {"FILE", "FOLDER", "DIR", "LOG", "EST", "TRUTH", "OUT"}
 
 
-def settings_of(args: argparse.Namespace, more: Mapping[str, object] = _NO_SETTINGS) -> Config:
+def settings_of(args: argparse.Namespace, more: Mapping[str, object] | None = None) -> Config:
     """Return the configuration of --config, --profile, --set, and of the options that stand for a setting.
 
     more: further settings by their names, None: not given; they win over the options.
@@ -181,7 +179,7 @@ def settings_of(args: argparse.Namespace, more: Mapping[str, object] = _NO_SETTI
     # As --set takes them.
     given = [
         f"{path}={json.dumps(value) if isinstance(value, bool | list) else value}"
-        for path, value in (named | dict(more)).items()
+        for path, value in (named | dict(more or {})).items()
         if not (value is None or value is False or value == [])
     ]
     profile = PROFILES[args.profile] if getattr(args, "profile", None) else ()

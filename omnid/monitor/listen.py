@@ -6,7 +6,8 @@ import math
 import shutil
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
 from typing import IO, Final
 
 import numpy as np
@@ -27,51 +28,38 @@ CLEAR: Final = "\x1b[H\x1b[J"
 
 def listen(bus: BusConfig, seconds: float | None) -> int:
     """Show the robot until a signal or for a number of seconds. Return the exit code, 1 where no pose arrived."""
-    state, inbox, signals = RobotState(), Inbox(), list[int]()
+    state, inbox, signals, reason = RobotState(), Inbox(), list[int](), ""
     end_s = math.inf if seconds is None else time.monotonic() + seconds
-    with handle_stop_signals(lambda number, _: signals.append(number)):
-        robot = connected(bus, end_s, signals)
+    with handle_stop_signals(lambda number, _: signals.append(number)), ExitStack() as connection:
+        # 1. Try to connect until it succeeds, and print each new reason once.
+        robot: Robot | None = None
+        while robot is None and not signals and time.monotonic() < end_s:
+            try:
+                robot = connection.enter_context(Robot(settings=bus))
+            except Unreachable as error:
+                if str(error) != reason:
+                    print(f"omnid: waiting: {error}", file=sys.stderr, flush=True)
+                reason = str(error)
+                time.sleep(POLL_S)
+        # 2. Process and show the messages.
         if robot is not None:
-            with robot:
-                follow(robot, state, inbox, end_s, signals)
+            with robot.subscribe(Diagnostics) as kept:
+                if (report := kept.newest()) is not None:
+                    state.add_diagnostics(report)
+            robot.on_message(inbox.put)
+            robot.on_alive(state.set_alive)
+            state.robots_there = robot.robots_there
+        next_s = time.monotonic() + SHOW_PERIOD_S
+        while robot is not None and not signals and (now_s := time.monotonic()) < end_s:
+            message = inbox.get(min(next_s - now_s, end_s - now_s, POLL_S))
+            state.forget_ended()
+            if message is not None:
+                state.process(message)
+            if time.monotonic() >= next_s:
+                print_state(robot.name, state, inbox.dropped)
+                next_s = max(next_s + SHOW_PERIOD_S, time.monotonic())
     print_state(bus.robot, state, inbox.dropped)
     return int(state.poses == 0)
-
-
-def connected(bus: BusConfig, end_s: float, signals: Sequence[int]) -> Robot | None:
-    """Try to connect until it succeeds, and print each new reason once; return None after end_s or a signal.
-
-    end_s: by time.monotonic(). signals: numbers of the signals that came; a handler of the caller adds to it.
-    """
-    reason = ""
-    while not signals and time.monotonic() < end_s:
-        try:
-            return Robot(settings=bus)
-        except Unreachable as error:
-            if str(error) != reason:
-                print(f"omnid: waiting: {error}", file=sys.stderr, flush=True)
-            reason = str(error)
-        time.sleep(POLL_S)
-    return None
-
-
-def follow(robot: Robot, state: RobotState, inbox: Inbox, end_s: float, signals: Sequence[int]) -> None:
-    """Process and show the robot's messages until end_s, by time.monotonic(), or a signal."""
-    with robot.subscribe(Diagnostics) as kept:
-        if (report := kept.newest()) is not None:
-            state.add_diagnostics(report)
-    robot.on_message(inbox.put)
-    robot.on_alive(state.set_alive)
-    state.robots_there = robot.robots_there
-    next_s = time.monotonic() + SHOW_PERIOD_S
-    while not signals and (now_s := time.monotonic()) < end_s:
-        message = inbox.get(min(next_s - now_s, end_s - now_s, POLL_S))
-        state.forget_ended()
-        if message is not None:
-            state.process(message)
-        if time.monotonic() >= next_s:
-            print_state(robot.name, state, inbox.dropped)
-            next_s = max(next_s + SHOW_PERIOD_S, time.monotonic())
 
 
 def print_state(robot: str, state: RobotState, dropped: int, out: IO[str] | None = None) -> None:
