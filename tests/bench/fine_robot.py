@@ -7,12 +7,10 @@ from dataclasses import replace
 from typing import Final, NamedTuple
 
 from calib import se3
+from omnid.simulation.rendering.ray_caster import SIDE_RAYS
 from omnid.simulation.robot import BASELINE_M, CAMERA_HEIGHT_M, SimulatedRobot
 from tests.simulation.rigs import make_rig
 
-# Least number of rays along a side of an image: with two a pixel and axis at 512 px, joints of tiles come and go from
-# pixel to pixel, as no lens shows them, and a base stood before them for good; with three they do not.
-SIDE_RAYS: Final = 3 * 512
 # Distances of the configured outline from the disc, as those of the default settings from the default robot.
 ALONG_M, ACROSS_M = 0.05, 0.02
 

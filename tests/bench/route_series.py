@@ -248,9 +248,6 @@ def main() -> None:
     parser.add_argument("--length", type=float, default=33.0, help="of the route, m")
     parser.add_argument("--repeats", type=int, default=len(STARTS), choices=range(len(STARTS) + 1))
     parser.add_argument("--size", type=int, default=512, help="of the images, px")
-    parser.add_argument(
-        "--samples", type=int, help="rays of a pixel, per axis; default: enough for a lens (fine_robot.py)"
-    )
     parser.add_argument("--no-people", action="store_true")
     arguments = parser.parse_args()
     columns = (
@@ -271,8 +268,6 @@ def main() -> None:
     )
     table = ResultTable("route_series", f"Repeated route of {arguments.length:g} m", columns)
     robot = fine_robot(arguments.size)
-    if arguments.samples:
-        robot = replace(robot, samples=arguments.samples)
     for seed in arguments.seeds:
         for cells in series(seed, arguments.length, arguments.repeats, robot, not arguments.no_people):
             table.add(*cells, seed=("route", seed))
