@@ -26,7 +26,6 @@ REPEAT_S: Final = 0.05
 MOST_PER_PASS: Final = 16  # Most datagrams that one pass reads during a flood.
 _HEAD: Final = b"omnid stop 1 "
 _LONGEST: Final = 512  # bytes
-_WAIT_MS: Final = 100  # Longest wait of the end of a daemon for its listener.
 _REQUEST: Final = re.compile(rb"omnid stop 1 ([0-9a-f]{16}) ([!-~]{1,256}) *")
 _ENDPOINT: Final = re.compile(r"(?:tcp|tls|ws)/(.+):(\d{1,5})(?:[?#].*)?")  # those whose UDP port is free
 
@@ -57,7 +56,7 @@ class StopListener:
 
     def process(self) -> None:
         """Take the requests that have come, a bounded number, or wait for one."""
-        self._poll.poll(_WAIT_MS)
+        self._poll.poll(1000 * REPEAT_S)
         for listener in self._sockets:
             for _ in range(MOST_PER_PASS):
                 try:

@@ -20,9 +20,8 @@ from calib.models.camera import Array
 from calib.rig import MountedCamera
 from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.sensor import Floats
-from omnid.simulation.rendering.surfaces import Rectangle, Scene, Texture
+from omnid.simulation.rendering.surfaces import POSTER_GAP_M, Rectangle, Scene, Texture
 
-IN_PLANE_M: Final = 1e-3  # What is no farther before a surface is not mirrored.
 REFRACTIVE_INDEX: Final = 1.5  # of glass, glazed tiles, polish and lacquer
 WHITE: Final[Texture] = np.full((8, 8), 255, np.uint8)
 BLACK: Final[Texture] = np.zeros((8, 8), np.uint8)
@@ -80,7 +79,7 @@ class Mirror:
         # 2. The mirror image of all on this side of the surface, seen through it.
         here = T_world_rig[:3, 3] - surface.origin
         side = math.copysign(1.0, float(surface.normal @ here)) * surface.normal
-        before = [face for face in others if ((face.corners - surface.origin) @ side).max() > IN_PLANE_M]
+        before = [face for face in others if ((face.corners - surface.origin) @ side).max() > POSTER_GAP_M]
         below = Scene(tuple(mirrored(face, surface) for face in before))
         seen = render_grey(below, self._mounted, T_world_rig, samples)
         return np.asarray(image + share * (seen - image), np.float32)
