@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
+from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 
-from omnid.core.kalman_filter import kalman_filter
 from omnid.core.mapping.range_scan import SECTORS, RangeScan, azimuths
 
 
@@ -73,7 +73,7 @@ class _Track:
     def __init__(self, stamp_ns: int, cluster: _Cluster) -> None:
         self.stamp_ns = self.seen_ns = stamp_ns
         self.updates, self.radius_m = 1, cluster.radius_m
-        self._filter = kalman_filter(dim_x=4, dim_z=2)
+        self._filter = KalmanFilter(dim_x=4, dim_z=2)
         self._filter.H = np.eye(2, 4)
         self._filter.x = np.concatenate([cluster.middle, [0.0, 0.0]])[:, None]
         self._filter.P = START_MPS**2 * np.eye(4)

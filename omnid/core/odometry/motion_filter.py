@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.kalman_filter import kalman_filter
 
 Array = NDArray[np.float64]
 
@@ -31,7 +31,7 @@ class MotionFilter:
     """
 
     def __init__(self, jerk_psd: tuple[float, float] = JERK_PSD) -> None:
-        self._filter = kalman_filter(dim_x=12, dim_z=6)
+        self._filter = KalmanFilter(dim_x=12, dim_z=6)
         self._filter.H = np.hstack([np.eye(6), np.zeros((6, 6))])
         self._psd = np.repeat(jerk_psd, 3)
         self.reset()

@@ -12,11 +12,11 @@ from collections.abc import Iterable
 from typing import Final, NamedTuple
 
 import numpy as np
+from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 
 from calib import se3
 from drivers.motion import GyroSample, MotionSample, WheelSample
-from omnid.core.kalman_filter import kalman_filter
 from omnid.core.nanoseconds import SecondsSinceFirst
 from omnid.core.odometry.motion_filter import RateHistory, SensedMotion
 
@@ -83,7 +83,7 @@ class MotionSensors:
     def __init__(self, T_rect_base: Array) -> None:
         self._to_rect, self._to_base = se3.adjoint(T_rect_base), se3.adjoint(se3.inverse(T_rect_base))
         self._wheels, self._gyro = RateHistory(2), RateHistory(3)
-        self._filter = kalman_filter(dim_x=len(START), dim_z=1)
+        self._filter = KalmanFilter(dim_x=len(START), dim_z=1)
         self._filter.x = START[:, None].copy()
         self._filter.P = np.diag(START_SIGMA**2)
         self._clock = SecondsSinceFirst()
