@@ -17,7 +17,7 @@ from omnid.core.odometry.estimates import OdometryEstimate
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.image_breaks import RawImage
 from omnid.core.odometry.motion_agreement import Contradiction, MotionAgreement, contradiction_after
-from omnid.core.odometry.motion_sensors import BIAS, MotionSensors
+from omnid.core.odometry.motion_sensors import MotionSensors
 from omnid.core.odometry.odometry import VisualOdometry
 from omnid.core.odometry.rig_error import RigError
 from omnid.core.odometry.stereo_frame import StereoFrame
@@ -61,7 +61,8 @@ class OdometryStage:
         self._keyframe: _LastKeyframe | None = None
         self._T_base_rect = geometry.rig.T_base_rig @ self._T_rig_rect
         self._to_base = se3.adjoint(self._T_base_rect)
-        self.sensors, self._agreement = MotionSensors(se3.inverse(self._T_base_rect)), MotionAgreement()
+        self.sensors = MotionSensors(se3.inverse(self._T_base_rect))
+        self._agreement = MotionAgreement(self.sensors)
         self.last_fault = AGREE  # the last disagreement that was more than a doubt
         self._contradiction: Contradiction | None = None  # of all poses so far by wheels and gyro
         self._rig_error = RigError(motion_errors(geometry.rig))
@@ -83,7 +84,6 @@ class OdometryStage:
         last_ns, self._last_ns = self._last_ns, pair.stamp_ns
         dt_s = 0.0 if last_ns is None else (pair.stamp_ns - last_ns) * 1e-9
         self.sensors.add(pair.motion)
-        self._agreement.add(pair.motion, float(self.sensors.values[BIAS][2]))
         sensed = None if last_ns is None else self.sensors.between(last_ns, pair.stamp_ns)
         # 2. The pose of the rectified frame.
         usable = np.zeros_like(pair.visible) if pair.light.shows_nothing else pair.usable

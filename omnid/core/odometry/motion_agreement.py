@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from drivers.motion import MotionSample, WheelSample
+from drivers.motion import GyroSample, WheelSample
 from omnid.core.control import likely_cause
 from omnid.core.control.likely_cause import Steps
 from omnid.core.control.motion_monitor import (
@@ -44,9 +44,10 @@ from omnid.core.control.motion_monitor import (
     Difference,
     Witness,
 )
-from omnid.core.nanoseconds import SecondsSinceFirst
+from omnid.core.odometry.motion_sensors import MotionSensors
 
 Array = NDArray[np.float64]
+_Motion = Callable[[Array, Array], Array]  # of a sensor, from starts to ends [s]; NaN where no samples cover it
 
 # So much because a delay of 0.3 s is 0.15 m at 0.5 m/s, what the collision monitor keeps as distance; 10 % of 3 m is
 # twice that.
@@ -77,9 +78,8 @@ WORSE: Final = 3.0  # ratio of the sums of squares that the lag must explain, be
 LATE_S: Final = 0.5  # A lag is a fault after this time, because the newest steps are the most noisy.
 SCALES: Final = (0.3, 3.0)  # Scales of the motion in the search of a lag, because images may be slow as well as late.
 STILL_S, STILL_M, STILL_RAD = 2.0, 0.02, 0.04  # Limits of rest, because 1 cm/s and a degree a second are noise.
-LEAST_SAMPLE_S: Final = 0.01  # Samples that follow sooner are dropped, because floods must not shorten the memory.
-LONGEST_GAP_S: Final = 0.3  # Longest gap between two samples, because the motion in a longer one is not known.
-MOST_KEPT: Final = 2048  # samples and steps, because WINDOW_S and MOST_LAG_S at LEAST_SAMPLE_S have 1150
+MOST_KEPT: Final = 2048  # steps, so that memory is bounded: WINDOW_S at 200 Hz
+LEAST_STEP_S: Final = 0.01  # Least time of a step by which its speed is known.
 LEAST_STEPS: Final = 8  # Steps that are needed for a comparison, because fewer show no delay.
 EVERY_S: Final = 0.1  # Time between two comparisons, because each takes a millisecond.
 
@@ -118,70 +118,34 @@ class _Finding(NamedTuple):
         return self.is_late or self.excess >= DOUBT_SHARE
 
 
-class _Travel:
-    """Integral of one rate over the newest MOST_KEPT samples."""
-
-    def __init__(self) -> None:
-        self._samples: deque[tuple[float, float]] = deque(maxlen=MOST_KEPT)  # times, and the integral until then
-        self._rate = 0.0
-
-    def add(self, time_s: float, rate: float) -> None:
-        """Add a sample; late ones are left out."""
-        if not np.isfinite(rate):
-            return
-        if self._samples and time_s - self._samples[-1][0] > LONGEST_GAP_S:
-            self._samples.clear()
-        before_s, total = self._samples[-1] if self._samples else (-math.inf, 0.0)
-        if time_s - before_s < LEAST_SAMPLE_S:
-            return
-        if self._samples:
-            total += (rate + self._rate) / 2 * (time_s - before_s)
-        self._samples.append((time_s, total))
-        self._rate = rate
-
-    @property
-    def is_unknown(self) -> bool:
-        """True while there are too few samples for any motion."""
-        return len(self._samples) < 2
-
-    def between(self, starts_s: Array, ends_s: Array) -> Array:
-        """Return the motion from starts to ends, arrays of one shape; NaN where no samples cover it."""
-        if self.is_unknown:
-            return np.full(starts_s.shape, np.nan)
-        times, totals = np.array(self._samples).T
-        start, end = (np.interp(when, times, totals, np.nan, np.nan) for when in (starts_s, ends_s))
-        return np.asarray(end - start)
-
-
 class MotionAgreement:
     """Follows the accounts; memory and work are bounded."""
 
-    def __init__(self) -> None:
+    def __init__(self, sensors: MotionSensors) -> None:
+        """sensors: the samples of wheels and gyro."""
         self._steps: deque[tuple[float, float, float, float, float]] = deque(maxlen=MOST_KEPT)  # see _Steps
-        self._wheels_m, self._wheels_rad, self._gyro_rad = _Travel(), _Travel(), _Travel()
+        self._sensors = sensors
         self._lags_s = np.arange(LEAST_LAG_S, MOST_LAG_S + LAG_STEP_S / 2, LAG_STEP_S)
-        self._clock = SecondsSinceFirst()
         self._compared_s = -np.inf
         self._late_since_s: float | None = None
         self.result = AGREE
 
-    def add(self, samples: Iterable[MotionSample], gyro_bias_radps: float) -> None:
-        """Add samples of wheels and gyro."""
-        for sample in samples:
-            at_s = self._clock.seconds(sample.stamp_ns)
-            if isinstance(sample, WheelSample):
-                self._wheels_m.add(at_s, sample.velocity_mps)
-                self._wheels_rad.add(at_s, sample.yaw_rate_radps)
-            else:
-                self._gyro_rad.add(at_s, sample.z_radps - gyro_bias_radps)
+    def _wheels_m(self, starts_s: Array, ends_s: Array) -> Array:
+        return self._sensors.motion(WheelSample, starts_s, ends_s)[..., 0]
+
+    def _wheels_rad(self, starts_s: Array, ends_s: Array) -> Array:
+        return self._sensors.motion(WheelSample, starts_s, ends_s)[..., 1]
+
+    def _gyro_rad(self, starts_s: Array, ends_s: Array) -> Array:
+        return self._sensors.motion(GyroSample, starts_s, ends_s)[..., 2]
 
     def add_step(self, start_ns: int, end_ns: int, distance_m: float, turn_rad: float, aside_m: float = 0.0) -> None:
         """Add the motion of the base from one pair to the next, as the cameras saw it; compare.
 
         aside_m: along its y axis.
         """
-        end_s = self._clock.seconds(end_ns)
-        self._steps.append((self._clock.seconds(start_ns), end_s, distance_m, turn_rad, aside_m))
+        end_s = self._sensors.seconds(end_ns)
+        self._steps.append((self._sensors.seconds(start_ns), end_s, distance_m, turn_rad, aside_m))
         self._forget_before(end_s - WINDOW_S)
         if end_s - self._compared_s < EVERY_S:
             return
@@ -215,7 +179,7 @@ class MotionAgreement:
             reason = WHEELS_DIFFER if of_wheels.differs and of_gyro is not _UNKNOWN else IMAGES_OR_WHEELS
             found = wheels
         else:
-            by_gyro = self._gyro_rad.between(steps.starts_s, steps.ends_s)
+            by_gyro = self._gyro_rad(steps.starts_s, steps.ends_s)
             between = self._finding(steps, by_gyro, self._wheels_rad, STEP_RAD, WHEEL_TURN_RAD)
             is_alone = of_wheels is not _UNKNOWN and between.excess >= of_wheels.excess
             reason, found = GYRO_DIFFERS if is_alone else IMAGES_OR_GYRO, of_gyro
@@ -235,8 +199,8 @@ class MotionAgreement:
     def _cause(self, reason: str, steps: _Steps) -> str:
         """Return what makes the accounts differ as they do; empty where that is not known."""
         ways, turns, gyro = (
-            travel.between(steps.starts_s, steps.ends_s).tolist()
-            for travel in (self._wheels_m, self._wheels_rad, self._gyro_rad)
+            motion(steps.starts_s, steps.ends_s).tolist()
+            for motion in (self._wheels_m, self._wheels_rad, self._gyro_rad)
         )
         seen = Steps(steps.ways_m.tolist(), steps.turns_rad.tolist())
         if reason == IMAGES_DIFFER:
@@ -245,14 +209,12 @@ class MotionAgreement:
             return likely_cause.of_gyro(seen.turns, gyro)
         return likely_cause.of_wheels(seen, Steps(ways, turns))
 
-    def _finding(self, steps: _Steps, seen: Array, travel: _Travel, noise: float, least: float) -> _Finding:
+    def _finding(self, steps: _Steps, seen: Array, motion: _Motion, noise: float, least: float) -> _Finding:
         """Compare the motion seen (N,) in steps with that of a sensor, both in metres or radians.
 
         noise: standard deviation of a step; least: difference of the sums that is a fault.
         """
-        if travel.is_unknown:
-            return _UNKNOWN
-        by_lag = travel.between(steps.starts_s - self._lags_s[:, None], steps.ends_s - self._lags_s[:, None])
+        by_lag = motion(steps.starts_s - self._lags_s[:, None], steps.ends_s - self._lags_s[:, None])
         near = int(np.argmin(np.abs(self._lags_s)))
         # 1. Delay; the newest steps have no samples of later times yet.
         known = np.isfinite(by_lag).all(axis=0) & np.isfinite(seen)
@@ -283,7 +245,7 @@ class MotionAgreement:
         # 2. The limit: a share of the way, and the motion within the lag that is in order.
         is_whole = count <= len(path) or steps.is_long or not is_distance
         limit = max(SCALE_SHARE * (length if is_whole else WINDOW_M), least)
-        limit += LAG_SIGMA_S * float((np.abs(seen) / np.maximum(times_s, LEAST_SAMPLE_S)).max())
+        limit += LAG_SIGMA_S * float((np.abs(seen) / np.maximum(times_s, LEAST_STEP_S)).max())
         # 3. Of a distance the newest second alone as well, which may show a doubt sooner.
         if is_distance:
             soon = int(np.searchsorted(steps.ends_s[-1] - ends_s, SOON_S))
@@ -329,8 +291,8 @@ class MotionAgreement:
             return False
         newest = steps.ends_s > now_s - STILL_S
         starts_s, ends_s = np.array([now_s - STILL_S]), np.array([now_s - LAG_STEP_S])
-        ways_m = (steps.ways_m[newest].sum(), *self._wheels_m.between(starts_s, ends_s))
-        turns_rad = (steps.turns_rad[newest].sum(), *self._wheels_rad.between(starts_s, ends_s))
+        ways_m = (steps.ways_m[newest].sum(), *self._wheels_m(starts_s, ends_s))
+        turns_rad = (steps.turns_rad[newest].sum(), *self._wheels_rad(starts_s, ends_s))
         # Wheels that say nothing (NaN) have not moved.
         return not any(abs(way) > STILL_M for way in ways_m) and not any(abs(turn) > STILL_RAD for turn in turns_rad)
 

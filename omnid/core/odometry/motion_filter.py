@@ -1,18 +1,20 @@
 """Kalman filter of the motion: velocity and acceleration, six of each (Dang et al. 2012, eq. (10), (11)).
 
-Below it: the motion that wheels and gyro measure between two stamps.
+Below it: motion from frame to frame, predicted by the filter, corrected and bridged by wheels and gyro.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple
+import math
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 
 from calib import se3
+from omnid.core.odometry.estimates import OdometryLimits
+from omnid.core.odometry.exposure_times import RigVelocity
+from omnid.core.odometry.motion_sensors import SensedMotion
 
 Array = NDArray[np.float64]
 
@@ -86,73 +88,88 @@ class MotionFilter:
         self._filter.x *= factor
 
 
-LONGEST_GAP_S = 0.15  # Longest gap between samples, and before the end of an interval.
-MOST_SAMPLES = 512  # Samples that are kept, so that memory is bounded: two seconds of a sensor of 250 Hz.
+# Rotation by which two steps of a robot do not differ, because 4 rad/s^2, the most that controller.limits allows by
+# default, make 0.04 rad in steps of 0.1 s.
+SUDDEN_RAD = 0.14
+SLOWING_S = 0.3  # time constant of the predicted velocity's decay while poses are refused.
 
 
-class RateIntegral(NamedTuple):
-    """Integral (size,) of the rates of a sensor over an interval, and their change (size,) from start to end."""
+class MotionModel(MotionFilter):
+    """The velocity of the rectified frame, and its next step. Steps are T_prev_curr (4, 4)."""
 
-    amounts: Array
-    changes: Array
+    _last_step: tuple[Array, float] | None  # T_prev_curr that was accepted last, and its time
 
+    def __init__(self, limits: OdometryLimits) -> None:
+        super().__init__()
+        self._limits = limits
+        self.found()
 
-class RateHistory:
-    """The newest samples of one sensor: times [s] and rates, in the order of the times."""
+    def step(self, sensed: SensedMotion | None, dt_s: float) -> Array:
+        """Return the step to a frame dt_s later: v <- v + dt a, T_prev_curr = exp(v dt) (Dang et al. 2012, eq. 10).
 
-    def __init__(self, size: int) -> None:
-        """size: numbers of a sample."""
-        self._times, self._rates = np.zeros(0), np.zeros((0, size))
-
-    def add(self, times_s: Array, rates: Array) -> None:
-        """Add samples at times (N,) with rates (N, size); one at a known time replaces the other."""
-        times, first = np.unique(np.concatenate([times_s, self._times]), return_index=True)
-        rates = np.concatenate([rates, self._rates])[first]
-        self._times, self._rates = times[-MOST_SAMPLES:], rates[-MOST_SAMPLES:]
-
-    def integral(self, start_s: float, end_s: float) -> RateIntegral | None:
-        """Return the integral of the rates over an interval.
-
-        The rates are linear between samples. None where the samples leave a gap.
+        What wheels and gyro say is a measurement of the filter; they also know what happened in a long gap.
         """
-        first = int(np.searchsorted(self._times, start_s, side="right")) - 1
-        last = int(np.searchsorted(self._times, end_s, side="left"))
-        if first < 0 or end_s <= start_s:
+        T_prev_curr = self.predict(min(dt_s, self._limits.max_gap_s))
+        if sensed is not None and dt_s > 0:
+            T_prev_curr = self.update(sensed.T_prev_curr, sensed.covariance, dt_s)
+        return T_prev_curr
+
+    def at_exposure(self, dt_s: float = 0.0) -> RigVelocity:
+        """Return the velocity at the last frame, or at the one to which a step of dt_s was predicted."""
+        return RigVelocity(*self.motion(dt_s))
+
+    def accept(
+        self, T_prev_curr: Array, covariance: Array, dt_s: float, *, exposed_at_once: bool
+    ) -> RigVelocity | None:
+        """Update the filter with the step that the cameras found (eq. 11), with its covariance (6, 6).
+
+        Returns the velocity at the pair before the step, from the steps around it. A velocity that changes evenly is
+        exact there; how far it changes unevenly in a step, no step shows. A sudden turn shows no velocity during the
+        exposures: where it matters, the filter begins from standstill.
+        """
+        turned = se3.log(T_prev_curr)[3:] - self.velocity[3:] * dt_s
+        if not exposed_at_once and np.linalg.norm(turned) > SUDDEN_RAD:
+            self.reset()
             return None
-        inner = slice(first, min(last + 1, len(self._times)))
-        known = self._times[inner]
-        if np.diff(known).max(initial=0.0) > LONGEST_GAP_S or end_s - known[-1] > LONGEST_GAP_S:
-            return None
-        times = np.concatenate([[start_s], known[(known > start_s) & (known < end_s)], [end_s]])
-        rates = np.column_stack([np.interp(times, known, column) for column in self._rates[inner].T])
-        total = ((rates[1:] + rates[:-1]) / 2 * np.diff(times)[:, None]).sum(axis=0)
-        return RateIntegral(total, rates[-1] - rates[0])
+        self.update(T_prev_curr, covariance, dt_s)
+        now, before, self._last_step = self.of_step(T_prev_curr, dt_s), self._last_step, (T_prev_curr, dt_s)
+        if before is None:
+            return now
+        before_rate, before_s = se3.log(before[0]) / before[1], before[1]
+        at_previous = (before_s * now.twist + dt_s * before_rate) / (before_s + dt_s)
+        uneven = np.diag(((now.twist - before_rate) / 2) ** 2)
+        return RigVelocity(at_previous, covariance / (2 * dt_s**2) + uneven)
 
-    def missing_s(self, end_s: float) -> float:
-        """Return the time before the end of an interval over which `integral` holds the rates of the last sample."""
-        return max(0.0, end_s - float(self._times[-1])) if len(self._times) else 0.0
+    @staticmethod
+    def of_step(T_prev_curr: Array, dt_s: float) -> RigVelocity:
+        """Return the velocity at either end of a single step, which changes by an acceleration that is not known."""
+        return RigVelocity(se3.log(T_prev_curr) / dt_s, START_ACCELERATION_VARIANCE * (dt_s / 2) ** 2 * np.eye(6))
 
-    def largest(self, start_s: float, end_s: float, zero: Array) -> Array | None:
-        """Return the largest differences (size,) of the rates in an interval from zero (size,); None if empty."""
-        inner = self._rates[(self._times >= start_s) & (self._times <= end_s)] - zero
-        return np.asarray(np.abs(inner).max(axis=0)) if len(inner) else None
+    def found(self) -> None:
+        """Note that the cameras have found a pose: nothing is to be bridged, and no error has grown."""
+        self._bridged_s = 0.0
+        self._systematic = np.zeros(6)  # sum of the standard deviations of the steps since then
+        self._variance_m2 = 0.0  # variance of the position
 
+    def carry(self, sensed: SensedMotion | None, dt_s: float) -> Array | None:
+        """Return the covariance (6, 6) of a step that nothing was seen in, by wheels and gyro; None where they end.
 
-@dataclass(frozen=True, slots=True)
-class SensedMotion:
-    """Motion of the rectified frame from one pair to the next by wheels and gyro, as a twist over the whole step."""
+        They end at the limits of time and uncertainty; then the velocity decays. Errors of scale and bias are the same
+        in all steps: their standard deviations add up, and not their variances.
+        """
+        self._last_step = None
+        if sensed is not None and sensed.is_complete:
+            sigma = np.sqrt(np.diag(sensed.systematic))
+            growth = sensed.noise + sensed.systematic + np.diag(2 * self._systematic * sigma)
+            variance_m2 = self._variance_m2 + float(np.diag(growth)[:3].max())
+            if self._bridged_s + dt_s <= self._limits.bridge_s and variance_m2 <= self._limits.bridge_sigma_m**2:
+                self._bridged_s, self._variance_m2 = self._bridged_s + dt_s, variance_m2
+                self._systematic += sigma
+                return growth
+        self.slow_down(math.exp(-dt_s / SLOWING_S))
+        return None
 
-    twist: Array  # (6,) [t; r] m, rad: T_prev_curr = exp(twist), an arc for a base on wheels
-    noise: Array  # (6, 6) covariance of the twist by errors that are independent from step to step
-    systematic: Array  # (6, 6) by errors that are the same in all steps, of scales and bias
-    is_complete: bool  # distance and turn are known: the position follows from it
-
-    @property
-    def covariance(self) -> Array:
-        """Covariance (6, 6) of the twist by all errors."""
-        return self.noise + self.systematic
-
-    @property
-    def T_prev_curr(self) -> Array:
-        """The motion (4, 4)."""
-        return se3.exp(self.twist)
+    def reset(self) -> None:
+        """Begin from standstill."""
+        super().reset()
+        self._last_step = None

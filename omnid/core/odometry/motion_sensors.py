@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -18,7 +19,6 @@ from numpy.typing import NDArray
 from calib import se3
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.core.nanoseconds import SecondsSinceFirst
-from omnid.core.odometry.motion_filter import RateHistory, SensedMotion
 
 Array = NDArray[np.float64]
 
@@ -61,6 +61,83 @@ MOST_OUTLIERS = 40  # Consecutive outliers after which the sensor counts as not 
 SANE_SCALE = (0.5, 2.0)  # Limits of the wheels' scales, because beyond them their settings are wrong.
 # Sigma of a motion that no sensor measures in a step, so large that it has no weight, because nothing is known.
 UNKNOWN_M, UNKNOWN_RAD = 1e3, 1e2
+LONGEST_GAP_S = 0.15  # Longest gap between samples, and before the end of an interval.
+MOST_SAMPLES = 4096  # Samples that are kept, so that memory is bounded: 16 seconds of a sensor of 250 Hz.
+
+
+class RateHistory:
+    """The newest samples of one sensor: times [s] and rates, in the order of the times.
+
+    Rates are linear between samples, and after the last one they stay for LONGEST_GAP_S.
+    """
+
+    def __init__(self, size: int) -> None:
+        """size: numbers of a sample."""
+        self._times, self._rates = np.zeros(0), np.zeros((0, size))
+
+    def add(self, times_s: Array, rates: Array) -> None:
+        """Add samples at times (N,) with rates (N, size); one at a known time replaces the other."""
+        times, first = np.unique(np.concatenate([times_s, self._times]), return_index=True)
+        rates = np.concatenate([rates, self._rates])[first]
+        self._times, self._rates = times[-MOST_SAMPLES:], rates[-MOST_SAMPLES:]
+
+    def integrals(self, starts_s: Array, ends_s: Array) -> Array:
+        """Return the integrals (..., size) of the rates over intervals; NaN where the samples leave a gap."""
+        if not len(self._times):
+            return np.full((*starts_s.shape, self._rates.shape[1]), np.nan)
+        first = max(0, int(np.searchsorted(self._times, starts_s.min(), side="right")) - 1)
+        times = np.append(self._times[first:], self._times[-1] + LONGEST_GAP_S)
+        rates = np.concatenate([self._rates[first:], self._rates[-1:]])
+        # 1. Integrals up to the samples, and gaps before them. Rounding makes no gap after the last one.
+        steps = np.diff(times)
+        zero = np.zeros((1, rates.shape[1]))
+        totals = np.concatenate([zero, np.cumsum((rates[1:] + rates[:-1]) / 2 * steps[:, None], axis=0)])
+        gaps = np.append(0, np.cumsum(steps[:-1] > LONGEST_GAP_S))
+        # 2. Those up to the start and the end.
+        at_ends = []
+        for when in (starts_s, ends_s):
+            k = np.clip(np.searchsorted(times, when, side="right") - 1, 0, len(steps) - 1)
+            since = (when - times[k])[..., None]
+            slopes = (rates[k + 1] - rates[k]) / steps[k][..., None]
+            is_known = (when >= times[0]) & (when <= times[-1])
+            at_ends.append(np.where(is_known[..., None], totals[k] + since * (rates[k] + slopes * since / 2), np.nan))
+        last = np.clip(np.searchsorted(times, ends_s, side="left"), 0, len(gaps) - 1)
+        first_at = np.clip(np.searchsorted(times, starts_s, side="right") - 1, 0, len(gaps) - 1)
+        has_gap = gaps[last] > gaps[first_at]
+        return np.where(has_gap[..., None], np.nan, at_ends[1] - at_ends[0])
+
+    def rate(self, when_s: float) -> Array:
+        """Return the rates (size,) at a time."""
+        return np.array([np.interp(when_s, self._times, column) for column in self._rates.T])
+
+    def missing_s(self, end_s: float) -> float:
+        """Return the time before the end of an interval over which `integrals` holds the rates of the last sample."""
+        return max(0.0, end_s - float(self._times[-1])) if len(self._times) else 0.0
+
+    def largest(self, start_s: float, end_s: float, zero: Array) -> Array | None:
+        """Return the largest differences (size,) of the rates in an interval from zero (size,); None if empty."""
+        inner = self._rates[(self._times >= start_s) & (self._times <= end_s)] - zero
+        return np.asarray(np.abs(inner).max(axis=0)) if len(inner) else None
+
+
+@dataclass(frozen=True, slots=True)
+class SensedMotion:
+    """Motion of the rectified frame from one pair to the next by wheels and gyro, as a twist over the whole step."""
+
+    twist: Array  # (6,) [t; r] m, rad: T_prev_curr = exp(twist), an arc for a base on wheels
+    noise: Array  # (6, 6) covariance of the twist by errors that are independent from step to step
+    systematic: Array  # (6, 6) by errors that are the same in all steps, of scales and bias
+    is_complete: bool  # distance and turn are known: the position follows from it
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance (6, 6) of the twist by all errors."""
+        return self.noise + self.systematic
+
+    @property
+    def T_prev_curr(self) -> Array:
+        """The motion (4, 4)."""
+        return se3.exp(self.twist)
 
 
 AHEAD, YAW = 0, 5  # components of the twist of the base that wheels measure
@@ -86,7 +163,7 @@ class MotionSensors:
         self._filter = KalmanFilter(dim_x=len(START), dim_z=1)
         self._filter.x = START[:, None].copy()
         self._filter.P = np.diag(START_SIGMA**2)
-        self._clock = SecondsSinceFirst()
+        self.seconds = SecondsSinceFirst().seconds
         self._outliers = {WheelSample: 0, GyroSample: 0}
         self.slips = self.refused = self.steps = 0
         self.is_slipping = False  # True if the wheels slipped in the last steps that the cameras saw
@@ -114,9 +191,9 @@ class MotionSensors:
         gyro: list[tuple[float, ...]] = []
         for sample in samples:
             if isinstance(sample, WheelSample):
-                wheels.append((self._clock.seconds(sample.stamp_ns), sample.velocity_mps, sample.yaw_rate_radps))
+                wheels.append((self.seconds(sample.stamp_ns), sample.velocity_mps, sample.yaw_rate_radps))
             else:
-                gyro.append((self._clock.seconds(sample.stamp_ns), sample.x_radps, sample.y_radps, sample.z_radps))
+                gyro.append((self.seconds(sample.stamp_ns), sample.x_radps, sample.y_radps, sample.z_radps))
         for history, rows in ((self._wheels, wheels), (self._gyro, gyro)):
             if rows:
                 table = np.array(rows)
@@ -129,7 +206,7 @@ class MotionSensors:
         from that of the gyro twice in a row.
         """
         # 1. What the sensors measured in this time; the wheels only while they can be trusted.
-        start_s, end_s = self._clock.seconds(start_ns), self._clock.seconds(end_ns)
+        start_s, end_s = self.seconds(start_ns), self.seconds(end_ns)
         trusted = self.wheels_are_sane and not self.is_slipping
         wheels = self._by_wheels(start_s, end_s) if trusted else {}
         gyro = self._by_gyro(start_s, end_s)
@@ -164,7 +241,7 @@ class MotionSensors:
     def observe(self, T_prev_curr: Array, covariance: Array, start_ns: int, end_ns: int) -> None:
         """Estimate the states by a step of the rectified frame that the cameras measured, with covariance (6, 6)."""
         # 1. The step and its variances in the frame of the base.
-        start_s, end_s = self._clock.seconds(start_ns), self._clock.seconds(end_ns)
+        start_s, end_s = self.seconds(start_ns), self.seconds(end_ns)
         seen = self._to_base @ se3.log(T_prev_curr)
         variance = np.diag(self._to_base @ covariance @ self._to_base.T)
         variance = variance + np.repeat([CAMERA_M**2, CAMERA_RAD**2], 3)
@@ -211,20 +288,29 @@ class MotionSensors:
             self._filter.P[states] = self._filter.P[:, states] = 0.0
             self._filter.P[states, states] = LOST_SIGMA[states] ** 2
 
+    def motion(self, sensor: type[MotionSample], starts_s: Array, ends_s: Array) -> Array:
+        """Return distance and turn (..., 2) by wheels, or the turns (..., 3) by a gyro without its bias, as reported.
+
+        The times [s] are those of `seconds`; NaN where no samples cover an interval.
+        """
+        if sensor is WheelSample:
+            return self._wheels.integrals(starts_s, ends_s)
+        return np.asarray(self._gyro.integrals(starts_s, ends_s) - self.values[BIAS] * (ends_s - starts_s)[..., None])
+
     def _by_wheels(self, start_s: float, end_s: float) -> dict[int, _Measured]:
         """Return the components of the base's twist that the wheels measure in a time."""
-        offset_s, found = self.values[WHEEL_OFFSET], {}
-        integral = self._wheels.integral(start_s - offset_s, end_s - offset_s)
-        missing_s = self._wheels.missing_s(end_s - offset_s)
+        start_s, end_s = start_s - self.values[WHEEL_OFFSET], end_s - self.values[WHEEL_OFFSET]
+        amounts, found = self.motion(WheelSample, np.array(start_s), np.array(end_s)), {}
+        if np.isfinite(amounts).any():
+            changes, missing_s = self._wheels.rate(end_s) - self._wheels.rate(start_s), self._wheels.missing_s(end_s)
         limits = (
             (AHEAD, DISTANCE, DISTANCE_SHARE, WHEEL_M, NOT_YET_MPS2),
             (YAW, TURN, TURN_SHARE, WHEEL_RAD, NOT_YET_RADPS2),
         )
-        for number, (axis, state, share, least, change) in enumerate(limits if integral else ()):
-            assert integral is not None
-            amount, slopes = float(integral.amounts[number]), np.zeros(len(START))
+        for number, (axis, state, share, least, change) in enumerate(limits):
+            amount, slopes = float(amounts[number]), np.zeros(len(START))
             if math.isfinite(amount):
-                slopes[state], slopes[WHEEL_OFFSET] = amount, -self.values[state] * integral.changes[number]
+                slopes[state], slopes[WHEEL_OFFSET] = amount, -self.values[state] * changes[number]
                 noise = self._noise_factors[axis] * ((share * amount) ** 2 + least**2)
                 value, late = float(self.values[state] * amount), change * missing_s**2 / 2
                 found[axis] = _Measured(value, slopes, noise + late**2)
@@ -232,15 +318,16 @@ class MotionSensors:
 
     def _by_gyro(self, start_s: float, end_s: float) -> dict[int, _Measured]:
         """Return the components of the base's twist that the gyro measures in a time."""
-        offset_s, dt_s, found = self.values[GYRO_OFFSET], end_s - start_s, {}
-        integral = self._gyro.integral(start_s - offset_s, end_s - offset_s)
-        late = NOT_YET_RADPS2 * self._gyro.missing_s(end_s - offset_s) ** 2 / 2
-        for axis in range(3 if integral else 0):
-            assert integral is not None
+        dt_s, start_s, end_s = end_s - start_s, start_s - self.values[GYRO_OFFSET], end_s - self.values[GYRO_OFFSET]
+        amounts, found = self.motion(GyroSample, np.array(start_s), np.array(end_s)), {}
+        if not np.isfinite(amounts).all():
+            return {}
+        changes = self._gyro.rate(end_s) - self._gyro.rate(start_s)
+        late = NOT_YET_RADPS2 * self._gyro.missing_s(end_s) ** 2 / 2
+        for axis in range(3):
             slopes = np.zeros(len(START))
-            slopes[BIAS.start + axis], slopes[GYRO_OFFSET] = -dt_s, -integral.changes[axis]
-            value = float(integral.amounts[axis] - self.values[BIAS][axis] * dt_s)
-            found[3 + axis] = _Measured(value, slopes, GYRO_RADPS_SQRT_S**2 * dt_s + late**2)
+            slopes[BIAS.start + axis], slopes[GYRO_OFFSET] = -dt_s, -changes[axis]
+            found[3 + axis] = _Measured(float(amounts[axis]), slopes, GYRO_RADPS_SQRT_S**2 * dt_s + late**2)
         return found
 
     def _is_at_rest(self, start_s: float, end_s: float) -> bool:

@@ -26,7 +26,7 @@ from omnid.core.odometry.exposure_times import Exposure, RigVelocity
 from omnid.core.odometry.image_breaks import ImageBreaks, RawImage
 from omnid.core.odometry.keyframes import KeyframeLocaliser, KeyframeRequest, Keyframes
 from omnid.core.odometry.local_map import LocalMap
-from omnid.core.odometry.motion_model import MotionModel
+from omnid.core.odometry.motion_filter import MotionModel
 from omnid.core.odometry.pose_search import OUTLIER_COST, PoseSearch
 from omnid.core.odometry.runner_up_motions import REACH_SIGMAS, Doubt, UntrackedMotion, doubt_after
 from omnid.core.odometry.static_mask import StaticMask
@@ -109,7 +109,7 @@ class VisualOdometry:
             return self._start_without_map(frame, usable, dt_s)
 
         # 1. Predict: v <- v + dt a, T <- T exp(v dt) (section IV.D, eq. 10), with wheels and gyro where there are some.
-        T_predicted = self._T_odom_rect @ self._motion.predict(frame.sensed, dt_s)
+        T_predicted = self._T_odom_rect @ self._motion.step(frame.sensed, dt_s)
 
         # 2. to 4. Track, estimate and refine: pose_search.py. Once a frame was refused, those without corners
         #    (darkness, a blank wall) are left out to save time.
@@ -289,7 +289,7 @@ class VisualOdometry:
         """Start a map where there is none, after the motion that wheels and gyro measured."""
         carried = False
         if frame.sensed is not None and dt_s > 0:
-            T_predicted = self._T_odom_rect @ self._motion.predict(frame.sensed, dt_s)
+            T_predicted = self._T_odom_rect @ self._motion.step(frame.sensed, dt_s)
             carried = self._move(T_predicted, self._motion.carry(frame.sensed, dt_s))
         return self._start_map(frame, usable, dt_s, carried=carried)
 

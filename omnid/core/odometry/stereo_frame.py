@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.odometry.exposure_times import Exposure
-from omnid.core.odometry.motion_filter import SensedMotion
+from omnid.core.odometry.motion_sensors import SensedMotion
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.pixel_times import AT_ONCE, PixelTimes
 

@@ -11,6 +11,7 @@ import pytest
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.core.control.motion_monitor import Motion, MotionMonitor, MotionSettings, Twist, Witness
 from omnid.core.odometry.motion_agreement import MotionAgreement
+from omnid.core.odometry.motion_sensors import MotionSensors
 
 START_NS = 10**12
 HALF_TRACK_M = 0.15
@@ -49,7 +50,8 @@ def right_gyro(w: float) -> float:
 
 def witness(path: Path, wheels: Wheels | None, gyro: Gyro | None, seconds: float = 4.0, late_s: float = 0.0) -> Witness:
     """Return what the comparison says after so many seconds; late_s: of the images."""
-    agreement, rng = MotionAgreement(), np.random.default_rng(1)
+    sensors, rng = MotionSensors(np.eye(4)), np.random.default_rng(1)
+    agreement = MotionAgreement(sensors)
     for step in range(1, round(seconds * 10)):
         samples: list[MotionSample] = []
         for sample_s in np.arange(step / 10 - 0.1, step / 10, 0.02):
@@ -57,7 +59,7 @@ def witness(path: Path, wheels: Wheels | None, gyro: Gyro | None, seconds: float
             at_ns = START_NS + round(sample_s * 1e9)
             samples += [WheelSample(at_ns, *wheels(v, w))] if wheels else []
             samples += [GyroSample(at_ns, 0.0, 0.0, gyro(w))] if gyro else []
-        agreement.add(samples, 0.0)
+        sensors.add(samples)
         v, w = path(step / 10 - 0.05 - late_s)
         seen = (0.1 * np.array([v, w]) + rng.normal(0.0, 2e-4, 2)).tolist()
         agreement.add_step(START_NS + step * 10**8 - 10**8, START_NS + step * 10**8, *seen)

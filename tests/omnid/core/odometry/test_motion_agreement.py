@@ -21,6 +21,7 @@ from omnid.core.control.motion_monitor import (
     Witness,
 )
 from omnid.core.odometry.motion_agreement import LATE_S, STILL_S, MotionAgreement, contradiction_after
+from omnid.core.odometry.motion_sensors import MotionSensors
 
 Array = NDArray[np.float64]
 FINE_S = np.arange(-3.0, 40.0, 0.005)
@@ -57,7 +58,8 @@ def driven(
     errors: Errors, seconds: float, *, turns: bool = True, stops_s: float = np.inf, seed: int = 1
 ) -> list[tuple[float, Witness]]:
     """Return the result after each pair of a drive."""
-    rng, agreement = np.random.default_rng(seed), MotionAgreement()
+    rng, sensors = np.random.default_rng(seed), MotionSensors(np.eye(4))
+    agreement = MotionAgreement(sensors)
     speed, rate = speeds(turns)
     speed, rate = (np.where(stops_s > FINE_S, values, 0.0) for values in (speed, rate))
     way, angle = (np.cumsum(values) * 0.005 for values in (speed, rate))
@@ -72,11 +74,11 @@ def driven(
             turn = errors.wheels_turn * at(t_s - errors.wheels_late_s, rate) + rng.normal(0, 0.01)
             turn += errors.wheels_curve * at(t_s - errors.wheels_late_s, speed)
             if errors.has_wheels:
-                agreement.add([WheelSample(ns(t_s), float(shown), float(turn))], 0.0)
+                sensors.add([WheelSample(ns(t_s), float(shown), float(turn))])
         for t_s in np.arange(end_s - PAIR_S, end_s - 1e-9, GYRO_S):
             if errors.has_gyro:
                 shown = errors.gyro_scale * at(t_s, rate) + rng.normal(0, 0.003)
-                agreement.add([GyroSample(ns(t_s), 0.0, 0.0, float(shown))], 0.0)
+                sensors.add([GyroSample(ns(t_s), 0.0, 0.0, float(shown))])
         span = np.array([end_s - PAIR_S, end_s]) - errors.images_late_s
         distance, turn = np.diff(at(span, way))[0], np.diff(at(span, angle))[0]
         way_m, yaw = errors.images_scale * float(distance), np.radians(errors.rig_yaw_deg)
@@ -196,10 +198,11 @@ def test_once_all_have_stood_it_is_forgotten() -> None:
 
 def test_samples_with_gaps_floods_and_numbers_that_are_not_finite_do_no_harm() -> None:
     """Memory stays bounded."""
-    agreement = MotionAgreement()
+    sensors = MotionSensors(np.eye(4))
+    agreement = MotionAgreement(sensors)
     for k in range(6000):
-        agreement.add([WheelSample(ns(k * 1e-3), 0.3, float("nan")), WheelSample(ns(0.5), float("inf"), 0.0)], 0.0)
-    agreement.add([WheelSample(ns(900.0), 0.3, 0.0)], 0.0)
+        sensors.add([WheelSample(ns(k * 1e-3), 0.3, float("nan")), WheelSample(ns(0.5), float("inf"), 0.0)])
+    sensors.add([WheelSample(ns(900.0), 0.3, 0.0)])
     for k in range(30):
         agreement.add_step(ns(900.0 + 0.1 * k), ns(900.1 + 0.1 * k), 0.03, 0.0)
     assert agreement.result == AGREE

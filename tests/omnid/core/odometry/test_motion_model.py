@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.estimates import OdometryEstimate, OdometryLimits
-from omnid.core.odometry.motion_filter import SensedMotion
+from omnid.core.odometry.motion_sensors import SensedMotion
 from omnid.core.odometry.odometry import VisualOdometry
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings

@@ -10,8 +10,15 @@ from numpy.typing import NDArray
 
 from calib import se3
 from drivers.motion import GyroSample, MotionSample, WheelSample
-from omnid.core.odometry.motion_filter import SensedMotion
-from omnid.core.odometry.motion_sensors import BIAS, DISTANCE, GYRO_OFFSET, TURN, WHEEL_OFFSET, MotionSensors
+from omnid.core.odometry.motion_sensors import (
+    BIAS,
+    DISTANCE,
+    GYRO_OFFSET,
+    TURN,
+    WHEEL_OFFSET,
+    MotionSensors,
+    SensedMotion,
+)
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.odometry import pose_search
 from omnid.core.odometry.estimates import OdometryEstimate, OdometryLimits, PoseEstimate
-from omnid.core.odometry.motion_filter import SensedMotion
+from omnid.core.odometry.motion_sensors import SensedMotion
 from omnid.core.odometry.odometry import VisualOdometry
 from omnid.core.odometry.tracking import KltSettings
 from omnid.core.places.relocalisation import Relocaliser
