@@ -50,7 +50,6 @@ OUTLIER_SQUARED: Final = 32.0
 MOST_SCALE: Final = 25.0  # of the variance of flows: half a pixel; where it is larger, flows are displaced
 GOOD_SHARE: Final = 0.2  # of the flows, that no break displaces: of one camera, or up to a line
 LINES, BETWEEN = 24, 4  # lines that are tried, and those between two of them, of a break that was found
-STEADY_PX: Final = 64  # spread of lines that are one line in the words about them
 LEAST: Final = 8  # flows on either side of a line in the cameras of a break
 # Cost of a landmark (`PoseEstimate.cost`) whose view has the noise that is expected: the mean of the Cauchy kernel's.
 RIGHT_COST: Final = 0.31
@@ -479,8 +478,7 @@ def _words(breaks: list[Break]) -> str:
     names = [CAMERAS[camera] for camera in newest.cameras]
     cameras = " and the ".join(names) + (" cameras" if len(names) > 1 else " camera")
     line, beyond, before = ("row", "below", "above") if newest.axis == 0 else ("column", "right of", "left of")
-    low, middle, high = (round(px) for px in np.quantile([found.line_px for found in breaks], (0.2, 0.5, 0.8)))
-    place = f"{line} {middle}" if high - low < STEADY_PX else f"{line}s {low} to {high}"
+    place = f"{line} {round(float(np.median([found.line_px for found in breaks])))}"
     shown = "1 pair shows" if len(breaks) == 1 else f"{len(breaks)} pairs show"
     if newest.kind == "torn":
         return (

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
-from itertools import islice
 from typing import Final
 
 import cv2
@@ -121,49 +120,6 @@ class _View:
     matches: Matches
 
 
-class DrivingViews:
-    """Uses one pair every every_s, by their stamps.
-
-    A view of a new place takes 10 to 20 ms, a check after VIEWS of them 20 to 50 ms more, all other pairs almost
-    nothing.
-    """
-
-    def __init__(self, cylinder: Cylinder, every_s: float) -> None:
-        self._cylinder, self._every_ns = cylinder, every_s * 1e9
-        self._views: deque[_View] = deque(maxlen=VIEWS)
-        self._used_ns: float = math.inf
-        self.new = 0  # views since the last check
-
-    def add(self, pair: PanoramaPair, exposure: Exposure | None = None) -> RigFinding | None:
-        """Use a pair if it is due; return a finding where it completes a check, or shows a broken rig.
-
-        exposure: the motion between the exposures of a pair that is not synchronised, which is used only with it.
-        """
-        # 1. A pair that is due, and whose motion is known.
-        if is_motion_unknown(pair, exposure) or self._used_ns <= pair.stamp_ns < self._used_ns + self._every_ns:
-            return None
-        self._used_ns = pair.stamp_ns
-        # 2. Keep its view, in the place of an older one of this place; not if the last one is of this place.
-        thumbnail = _thumbnail(pair)
-        same_place = [float(thumbnail @ view.thumbnail) > SAME_VIEW_CORRELATION for view in self._views]
-        is_new = thumbnail.any() and not any(same_place[-1:])
-        if is_new:
-            if any(same_place):
-                del self._views[same_place.index(True)]
-            self._views.append(_View(thumbnail, match(pair.lower, pair.upper, pair.visible, exposure)))
-            self.new += 1
-        # 3. A whole check, after enough new views of enough places.
-        if self.new >= VIEWS and len(self._views) >= MIN_PLACES:
-            self.new = 0
-            return judge(together(view.matches for view in self._views), self._cylinder)
-        # 4. The newest views alone may show a broken rig.
-        if not is_new or len(self._views) < RECENT_VIEWS:
-            return None
-        newest = islice(reversed(self._views), RECENT_VIEWS)
-        finding = judge(together(view.matches for view in newest), self._cylinder)
-        return finding if finding.misfit_deg > BROKEN_DEG else None
-
-
 def _thumbnail(pair: PanoramaPair) -> Array:
     """Return the common view of both cameras in the lower panorama as a vector (N,) of mean 0 and norm 1, or all 0."""
     small = cv2.resize(pair.lower.panorama, THUMBNAIL, interpolation=cv2.INTER_AREA).astype(float)
@@ -202,10 +158,13 @@ class RigHealth:
         self._decided = FirstPairs(cylinder)  # the first check, or a later one that has decided
         self._running = None if mode == "off" else self._decided  # the check that needs pairs; None: none does
         self._since = ""  # when the state was found, as a line begins
-        self._views = DrivingViews(cylinder, every_s) if every_s else None
+        self.uses_views = every_s > 0  # True if views of the drive are used
+        self._every_ns, self._used_ns, self._newest_ns = every_s * 1e9, math.inf, 0
+        self._views: deque[_View] = deque(maxlen=VIEWS)
+        self.new_views = 0  # views of the drive since the last whole check
         self._later = RigState.UNCHECKED  # state by the views of the drive
-        self._newest_ns = 0
-        self._found: tuple[RigFinding, int] | None = None  # finding by the views of the drive, with its stamp
+        self.finding: RigFinding | None = None  # the newest finding of the drive; None before the first
+        self._found_ns = 0
 
     @property
     def state(self) -> RigState:
@@ -221,29 +180,14 @@ class RigHealth:
         return self._running is not None
 
     @property
-    def uses_views(self) -> bool:
-        """True if views of the drive are used."""
-        return self._views is not None
-
-    @property
     def start_finding(self) -> RigFinding | None:
         """The newest finding of the first pairs; None before the first."""
         return self._decided.finding
 
     @property
-    def finding(self) -> RigFinding | None:
-        """The newest finding of the drive; None before the first."""
-        return self._found[0] if self._found else None
-
-    @property
     def finding_age_s(self) -> float:
-        """Time since then, by the stamps; NaN before the first."""
-        return (self._newest_ns - self._found[1]) * 1e-9 if self._found else float("nan")
-
-    @property
-    def new_views(self) -> int:
-        """Views of the drive since the last whole check."""
-        return self._views.new if self._views else 0
+        """Time since the newest finding of the drive, by the stamps; NaN before the first."""
+        return (self._newest_ns - self._found_ns) * 1e-9 if self.finding else float("nan")
 
     @property
     def warning(self) -> str:
@@ -308,11 +252,36 @@ class RigHealth:
             self._running = FirstPairs(self._cylinder)
 
     def drive(self, pair: PanoramaPair, exposure: Exposure | None = None) -> None:
-        """Use a pair of the drive if it is due; a finding changes the state unless it saw too little."""
+        """Use a pair of the drive if it is due; a finding changes the state unless it saw too little.
+
+        exposure: as in `begin`. A view of a new place takes 10 to 20 ms, a check after VIEWS of them 20 to 50 ms more,
+        all other pairs almost nothing.
+        """
+        # 1. A pair that is due, and whose motion is known.
         self._newest_ns = pair.stamp_ns
-        finding = self._views.add(pair, exposure) if self._views else None
-        if finding is None:
+        is_due = not self._used_ns <= pair.stamp_ns < self._used_ns + self._every_ns
+        if not self.uses_views or not is_due or is_motion_unknown(pair, exposure):
             return
-        self._found = finding, pair.stamp_ns
+        self._used_ns = pair.stamp_ns
+        # 2. Keep its view, in the place of an older one of this place; not if the last one is of this place.
+        thumbnail = _thumbnail(pair)
+        same_place = [float(thumbnail @ view.thumbnail) > SAME_VIEW_CORRELATION for view in self._views]
+        is_new = thumbnail.any() and not any(same_place[-1:])
+        if is_new:
+            if any(same_place):
+                del self._views[same_place.index(True)]
+            self._views.append(_View(thumbnail, match(pair.lower, pair.upper, pair.visible, exposure)))
+            self.new_views += 1
+        # 3. A whole check, after enough new views of enough places; the newest views alone may show a broken rig.
+        is_whole = self.new_views >= VIEWS and len(self._views) >= MIN_PLACES
+        if not is_whole and not (is_new and len(self._views) >= RECENT_VIEWS):
+            return
+        newest = list(self._views)[0 if is_whole else -RECENT_VIEWS :]
+        finding = judge(together(view.matches for view in newest), self._cylinder)
+        if is_whole:
+            self.new_views = 0
+        elif finding.misfit_deg <= BROKEN_DEG:
+            return
+        self.finding, self._found_ns = finding, pair.stamp_ns
         if finding.state is not RigState.UNCHECKED:
             self._later = finding.state
