@@ -304,7 +304,7 @@ class ImageBreaks:
         T_now_last = np.tile(up @ se3.inverse(T_now) @ last.T_odom_rect @ se3.inverse(up), (len(rows), 1, 1))
         one, surfaces = np.zeros(len(rows), np.intp), (se3.apply(up, before), slopes)
         templates = plane_templates({0: last.pair[camera]}, one, start, surfaces, T_now_last, self.model, there)
-        aligned = align(templates, pair[camera], there, one)
+        aligned = align(templates, pair[camera], there)
         return np.where(aligned.found[:, None], aligned.pixels, there), aligned.found | found
 
 

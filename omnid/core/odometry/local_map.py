@@ -316,7 +316,7 @@ class LocalMap:
         templates = plane_templates(
             images, anchors, table.anchor_pixels[landmarks], surfaces, T_curr_ref, self._model, predicted
         )
-        return align(templates, lower, predicted, anchors, REACH_PX)
+        return align(templates, lower, predicted)
 
     def slopes(self, T_odom_rect: Array, landmarks: Indices) -> Array:
         """Return the slopes (M, 2) of the disparity of landmarks (M,) [px/px] in a panorama with that pose."""

@@ -18,8 +18,6 @@ Indices = NDArray[np.intp]
 # Enough: 98 % of the patches of test_plane_patches.py end before; a last step is below the hundredths that noise
 # leaves.
 ITERATIONS, CONVERGED_PX = 12, 0.01
-# Scatter of the gains of the patches of an image, by vignetting and slanted light.
-GAIN_SIGMA = 0.05
 LEAST_GAIN, LARGEST_GAIN = 0.25, 4.0  # Limits; exposures were made equal before.
 MIN_CONTRAST = 0.5  # grey levels, standard deviation in a window, because less is no texture
 # Determinant of the gradients' matrix by its squared trace, because less is an edge, along which a patch slides.
@@ -201,30 +199,14 @@ def within(index: int, size: int) -> int:
     return min(max(index, 0), size - 1)
 
 
-@compiled("(f4[:, :, ::1], u1[:, ::1], f8[:, ::1], f8[::1])", writes=("ratio",))
-def contrast_ratios(templates: Floats, image: Image, centres: Array, ratio: Array) -> None:
-    """Write the contrasts (N,) of the image's windows about pixels (N, 2), by those of templates (N, S + 2, S + 2)."""
-    (height, width), side = image.shape, templates.shape[1] - 2
-    for n in range(len(templates)):
-        left, top = math.floor(centres[n, 0] + 0.5) - side // 2, math.floor(centres[n, 1] + 0.5) - side // 2
-        a, aa, b, bb = 0.0, 0.0, 0.0, 0.0
-        for i in range(side):
-            line = image[min(max(top + i, 0), height - 1)]
-            for j in range(side):
-                mine, there = float(templates[n, i + 1, j + 1]), float(line[min(max(left + j, 0), width - 1)])
-                a, aa, b, bb = a + mine, aa + mine * mine, b + there, bb + there * there
-        ratio[n] = math.sqrt((bb - b * b / side**2) / max(aa - a * a / side**2, 1.0))
-
-
 @compiled(
-    "(f4[:, :, ::1], u1[:, ::1], f8[:, ::1], f8[::1], f8, i8, f8, f8[:, ::1], f8[:, ::1], f8[:, :, ::1], b1[::1])",
+    "(f4[:, :, ::1], u1[:, ::1], f8[:, ::1], f8, i8, f8, f8[:, ::1], f8[:, ::1], f8[:, :, ::1], b1[::1])",
     writes=("shift", "slopes", "covariance", "fits"),
 )
 def fit(
     templates: Floats,
     image: Image,
     centres: Array,
-    gains: Array,
     noise_grey: float,
     reach_px: int,
     slope_sigma: float,
@@ -235,9 +217,9 @@ def fit(
 ) -> None:
     """Fit shift (N, 2), change of the slopes (N, 2) and gain of templates (N, S + 2, S + 2) to windows of an image.
 
-    centres (N, 2): pixels of the image at which the templates' middles are predicted. gains (N,): expected ones.
-    slopes: their prior on entry, with slope_sigma; 0: they do not change. covariance (N, 2, 2) [px^2] of the shift;
-    fits (N,): textured, and moved by less than reach_px.
+    centres (N, 2): pixels of the image at which the templates' middles are predicted. slopes: their prior on entry,
+    with slope_sigma; 0: they do not change. covariance (N, 2, 2) [px^2] of the shift; fits (N,): textured, and moved by
+    less than reach_px.
     """
     side, size = templates.shape[1] - 2, 5 if slope_sigma > 0 else 3
     width = -(-side // LANES) * LANES  # columns of a window in memory
@@ -269,13 +251,11 @@ def fit(
             write_window(cell, x + reach_px, y + reach_px, inside, window)
             total = dot(window, inside, room)
             residual = dot(window, window, room) - total * total / pixels
-            # 3. The step, with the priors of gain and slopes.
+            # 3. The step, with the prior of the slopes.
             for a in range(size):
                 weighted[a] = right[a] = dot(design[a], window, room) - sums[a] * total / pixels
                 for b in range(size):
                     inverse[a, b] = normal[a, b]
-            inverse[2, 2] += noise / GAIN_SIGMA**2
-            weighted[2] += noise / GAIN_SIGMA**2 * gains[n]
             for a in range(3, size):
                 prior = NOISE_CORRELATION * variance / (gain * slope_sigma) ** 2
                 inverse[a, a] += prior

@@ -166,7 +166,7 @@ def fitted_slopes(
             {0: pair[0]}, one, points, surfaces, still, model, predicted, upper=True, window_px=SLOPE_WINDOW_PX
         )
         change = start[known] - found
-        fitted = _fit(templates, pair[1], pixels_at, one, REACH_PX, change, SLOPE_SIGMA)
+        fitted = _fit(templates, pair[1], pixels_at, REACH_PX, change, SLOPE_SIGMA)
         fits &= fitted.found
         found, predicted = found + change, predicted + fitted.pixels
     fits &= (np.abs(found) < MAX_SLOPE).all(axis=1)
@@ -174,15 +174,12 @@ def fitted_slopes(
     return slopes
 
 
-def align(
-    templates: Floats, current: PaddedPanorama, predicted: Array, groups: Indices, reach_px: int = REACH_PX
-) -> AlignedPatches:
+def align(templates: Floats, current: PaddedPanorama, predicted: Array, reach_px: int = REACH_PX) -> AlignedPatches:
     """Align templates (N, TEMPLATE, TEMPLATE), centred on predicted (N, 2), with the current panorama.
 
-    groups (N,): patches that come from one image have one number, and nearly one gain. reach_px: a patch that has to
-    move this far was predicted wrongly.
+    reach_px: a patch that has to move this far was predicted wrongly.
     """
-    found = _fit(templates, current, np.rint(predicted), groups, reach_px, np.zeros((len(templates), 2)), 0.0)
+    found = _fit(templates, current, np.rint(predicted), reach_px, np.zeros((len(templates), 2)), 0.0)
     return AlignedPatches(predicted + found.pixels, found.covariance, found.found)
 
 
@@ -190,7 +187,6 @@ def _fit(
     templates: Floats,
     current: PaddedPanorama,
     at: Array,
-    groups: Indices,
     reach_px: int,
     slopes: Array,
     slope_sigma: float,
@@ -200,17 +196,9 @@ def _fit(
     slopes (N, 2): prior of their change, which is written; slope_sigma: its standard deviation, 0: they do not change.
     """
     count, centres = len(templates), _padded(current, at)
-    ratio = np.empty(count)
-    patch_kernels.contrast_ratios(templates, current.image, centres, ratio)
-    # The median of each group.
-    order = np.lexsort((ratio, groups))
-    _, first, group, size = np.unique(groups[order], return_index=True, return_inverse=True, return_counts=True)
-    gains = np.empty(count)
-    gains[order] = ratio[order][first + size // 2][group]
-    gains = gains.clip(patch_kernels.LEAST_GAIN, patch_kernels.LARGEST_GAIN)
     found = AlignedPatches(np.empty((count, 2)), np.empty((count, 2, 2)), np.empty(count, bool))
     noise_grey, results = current.noise_grey, (found.pixels, slopes, found.covariance, found.found)
-    patch_kernels.fit(templates, current.image, centres, gains, noise_grey, reach_px, slope_sigma, *results)
+    patch_kernels.fit(templates, current.image, centres, noise_grey, reach_px, slope_sigma, *results)
     return found
 
 
@@ -236,7 +224,7 @@ def align_rows(
     templates = plane_templates(
         {0: pair[0]}, one, pixels, (in_space, slopes[known]), still, model, predicted, upper=True
     )
-    found = align(templates, pair[1], predicted, one, reach_px)
+    found = align(templates, pair[1], predicted, reach_px)
     largest_px = CROSS_PX + np.broadcast_to(spread_px, len(points))[known]
     fits = found.found & (np.abs(found.pixels[:, 0] - predicted[:, 0]) < largest_px)
     fits &= found.pixels[:, 1] > pixels[:, 1]

@@ -13,6 +13,7 @@ from omnid.core.odometry.patch_kernels import invert
 Array = NDArray[np.float64]
 Camera = tuple[float, float, float, float, float]
 
+VIEW, POSE, ROTATION = 3, 6, 3  # numbers of a view and of a step, and the first one of its rotation
 LEAST_R_M = 1e-9  # from the axis, so that no division is by zero
 SMALL_RAD = 1e-4  # below which the series of a rotation are exact to rounding
 
@@ -45,23 +46,23 @@ def solve(
     shared error]; width: of the Cauchy kernel. Also writes the squared errors (N,) of the views, and the inverse
     (6 + K, 6 + K) of the last normal equations.
     """
-    size = len(inverse)
-    J, e, informed, of_a, step = np.empty((3, size)), np.empty(3), np.empty(3), np.empty(3), np.empty(size)
-    g, by_landmark, of_landmark = np.empty(size), np.empty((3, 3)), np.empty((3, 3))
+    size, parts = len(inverse), range(VIEW)
+    J, e, informed, of_a, step = np.empty((VIEW, size)), np.empty(VIEW), np.empty(VIEW), np.empty(VIEW), np.empty(size)
+    g, by_landmark, of_landmark = np.empty(size), np.empty((VIEW, VIEW)), np.empty((VIEW, VIEW))
     # 1. The information of the views, at the start. An upper row that is not known has none.
     for n in range(len(landmarks)):
         write_view(landmarks[n], views[n], T, camera, J, e)
-        for a in range(3):
-            for b in range(3):
+        for a in parts:
+            for b in parts:
                 by_landmark[a, b] = J[a, 0] * T[0, b] + J[a, 1] * T[1, b] + J[a, 2] * T[2, b]
-        for a in range(3):
-            for b in range(3):
+        for a in parts:
+            for b in parts:
                 of_landmark[a, b] = 0.0
-                for c in range(3):
+                for c in parts:
                     of_landmark[a, b] += by_landmark[a, c] * covariance[n, c, b]
-        for a in range(3):
-            for b in range(3):
-                for c in range(3):
+        for a in parts:
+            for b in parts:
+                for c in parts:
                     S[n, a, b] += of_landmark[a, c] * by_landmark[b, c]
         if math.isnan(views[n, 2]):
             S[n, 2, :2], S[n, :2, 2], S[n, 2, 2] = 0.0, 0.0, math.inf
@@ -71,22 +72,22 @@ def solve(
         inverse[:] = prior
         for a in range(size):
             g[a] = 0.0
-            for b in range(6, size):
-                g[a] -= prior[a, b] * shared[b - 6]
+            for b in range(POSE, size):
+                g[a] -= prior[a, b] * shared[b - POSE]
         for n in range(len(landmarks)):
             write_view(landmarks[n], views[n], T, camera, J, e)
-            for row in range(3):
-                for k in range(6, size):
-                    J[row, k] = -derivatives[n, row, k - 6]
-                    e[row] += derivatives[n, row, k - 6] * shared[k - 6]
             squared[n] = 0.0
-            for row in range(3):
+            for row in parts:
+                for k in range(POSE, size):
+                    J[row, k] = -derivatives[n, row, k - POSE]
+                    e[row] += derivatives[n, row, k - POSE] * shared[k - POSE]
+            for row in parts:
                 informed[row] = S[n, row, 0] * e[0] + S[n, row, 1] * e[1] + S[n, row, 2] * e[2]
                 squared[n] += e[row] * informed[row]
             weight = 1 / (1 + squared[n] / width**2)
             for a in range(size):
                 g[a] += weight * (J[0, a] * informed[0] + J[1, a] * informed[1] + J[2, a] * informed[2])
-                for row in range(3):
+                for row in parts:
                     of_a[row] = weight * (S[n, row, 0] * J[0, a] + S[n, row, 1] * J[1, a] + S[n, row, 2] * J[2, a])
                 for b in range(a + 1):
                     inverse[a, b] += of_a[0] * J[0, b] + of_a[1] * J[1, b] + of_a[2] * J[2, b]
@@ -97,17 +98,14 @@ def solve(
         if number == steps:
             break
         # 3. The step. If it is short, the last equations hold after it as well.
-        longest = 0.0
         for a in range(size):
             step[a] = 0.0
             for b in range(size):
                 step[a] += inverse[a, b] * g[b]
-            if a < 6:
-                longest = max(longest, abs(step[a]))
-            else:
-                shared[a - 6] += step[a]
-        move(T, step)
-        if longest < converged:
+        for k in range(POSE, size):
+            shared[k - POSE] += step[k]
+        move(T, step[:ROTATION], step[ROTATION:POSE])
+        if np.abs(step[:POSE]).max() < converged:
             break
 
 
@@ -118,46 +116,49 @@ def write_view(landmark: Array, seen: Array, T: Array, camera: Camera, J: Array,
     The column is f (left - atan2(y, x)) - 1/2, the rows are row0 - f height / r. An upper row that is NaN has no error.
     """
     focal, row0, turn_px, baseline, left = camera
-    x = T[0, 0] * landmark[0] + T[0, 1] * landmark[1] + T[0, 2] * landmark[2] + T[0, 3]
-    y = T[1, 0] * landmark[0] + T[1, 1] * landmark[1] + T[1, 2] * landmark[2] + T[1, 3]
-    z = T[2, 0] * landmark[0] + T[2, 1] * landmark[1] + T[2, 2] * landmark[2] + T[2, 3]
+    x, y, z = T[0, -1], T[1, -1], T[2, -1]
+    for k in range(len(landmark)):
+        x, y, z = x + T[0, k] * landmark[k], y + T[1, k] * landmark[k], z + T[2, k] * landmark[k]
     per_r = 1 / max(math.sqrt(x * x + y * y), LEAST_R_M)
     scale = focal * per_r
     column_error = seen[0] - (left - math.atan2(y, x)) * focal + 0.5
     e[0] = column_error - turn_px * math.floor(column_error / turn_px + 0.5)
-    e[1] = seen[1] - row0 + scale * z
-    e[2] = 0.0 if math.isnan(seen[2]) else seen[2] - row0 + scale * (z - baseline)
-    # A turn about z does not change the rows.
     J[0, 0], J[0, 1], J[0, 2] = scale * y * per_r, -scale * x * per_r, 0.0
-    J[0, 3], J[0, 4], J[0, 5] = -z * J[0, 1], z * J[0, 0], -focal
-    for row in range(1, 3):
-        outward = scale * per_r * per_r * (z if row == 1 else z - baseline)
+    for row in range(1, len(e)):
+        height = z if row == 1 else z - baseline
+        e[row] = 0.0 if math.isnan(seen[row]) else seen[row] - row0 + scale * height
+        outward = scale * per_r * per_r * height
         J[row, 0], J[row, 1], J[row, 2] = outward * x, outward * y, -scale
-        J[row, 3], J[row, 4] = y * J[row, 2] - z * J[row, 1], z * J[row, 0] - x * J[row, 2]
-        J[row, 5] = 0.0
+    # A turn moves the point by r x p.
+    for row in range(len(e)):
+        by_x, by_y, by_z = J[row, 0], J[row, 1], J[row, 2]
+        J[row, ROTATION], J[row, ROTATION + 1], J[row, ROTATION + 2] = (
+            y * by_z - z * by_y,
+            z * by_x - x * by_z,
+            x * by_y - y * by_x,
+        )
 
 
 @inner
-def move(T: Array, step: Array) -> None:
-    """Replace T (4, 4) by exp(step) T, for a step (6 or more) = [t; r]."""
-    # 1. Rotation and translation of the step (Rodrigues), W the cross product with r.
-    squared = step[3] ** 2 + step[4] ** 2 + step[5] ** 2
+def move(T: Array, t: Array, r: Array) -> None:
+    """Replace T (4, 4) by exp([t; r]) T (Rodrigues)."""
+    squared = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
     angle = math.sqrt(squared)
-    if angle < SMALL_RAD:
-        a, b, c = 1 - squared / 6, 0.5 - squared / 24, 1 / 6 - squared / 120
-    else:
+    # sin(a) / a, (1 - cos(a)) / a^2, (a - sin(a)) / a^3
+    a, b, c = 1 - squared / 6, 0.5 - squared / 24, 1 / 6 - squared / 120
+    if angle > SMALL_RAD:
         a, b, c = math.sin(angle) / angle, (1 - math.cos(angle)) / squared, (angle - math.sin(angle)) / angle / squared
-    W = np.array([[0.0, -step[5], step[4]], [step[5], 0.0, -step[3]], [-step[4], step[3], 0.0]])
-    R, before = np.empty((3, 3)), T.copy()
-    for i in range(3):
-        T[i, 3] = step[i]
-        for j in range(3):
-            # W^2 = r r^T - |r|^2 I.
-            WW = step[3 + i] * step[3 + j] - (squared if i == j else 0.0)
-            R[i, j] = (1.0 if i == j else 0.0) + a * W[i, j] + b * WW
-            T[i, 3] += (b * W[i, j] + c * WW) * step[j]
-    # 2. The product.
-    for i in range(3):
-        for j in range(3):
-            T[i, j] = R[i, 0] * before[0, j] + R[i, 1] * before[1, j] + R[i, 2] * before[2, j]
-        T[i, 3] += R[i, 0] * before[0, 3] + R[i, 1] * before[1, 3] + R[i, 2] * before[2, 3]
+    before, parts = T.copy(), range(len(r))
+    for i in parts:
+        T[i, -1] = t[i]
+        for k in range(len(T)):
+            T[i, k] = 0.0 if k < len(r) else t[i]
+        for j in parts:
+            # W = [r]x, W^2 = r r^T - |r|^2 I.
+            k = len(r) - i - j
+            W = 0.0 if i == j else (r[k] if (j - i) % len(r) == 2 else -r[k])
+            WW = r[i] * r[j] - (squared if i == j else 0.0)
+            R = (1.0 if i == j else 0.0) + a * W + b * WW
+            T[i, -1] += (b * W + c * WW) * t[j]
+            for k in range(len(T)):
+                T[i, k] += R * before[j, k]

@@ -176,7 +176,7 @@ class DriveLandmarks:
         views, images = self._views[index], {a: self._keyframes[a].lower for a in known}
         surfaces = triangulate(views, self._model.cylinder, self._model.baseline_m), self._slopes[index]
         templates = plane_templates(images, anchors, views[:, :2], surfaces, T_curr_ref, self._model, near, upper=upper)
-        aligned = align(templates, current.upper if upper else current.lower, near, anchors, REACH_PX)
+        aligned = align(templates, current.upper if upper else current.lower, near, REACH_PX)
         pixels = np.where(aligned.found[:, None], aligned.pixels, near)
         return np.column_stack([current.lower.own(pixels[:, 0]), pixels[:, 1]]), aligned.found
 

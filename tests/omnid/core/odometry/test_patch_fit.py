@@ -39,7 +39,7 @@ def fitted(templates: NDArray[np.uint8], cells: NDArray[np.uint8], noise_grey: f
     image = cells.reshape(20, 20, CELL_PX, CELL_PX).swapaxes(1, 2).reshape(20 * CELL_PX, 20 * CELL_PX)
     middle = np.ascontiguousarray(templates[:, REACH_PX:-REACH_PX, REACH_PX:-REACH_PX], np.float32) - 128
     panorama = PaddedPanorama(np.ascontiguousarray(image), 0, noise_grey)
-    return align(middle, panorama, CENTRES, np.zeros(400, np.intp), REACH_PX)
+    return align(middle, panorama, CENTRES, REACH_PX)
 
 
 def error(fit: AlignedPatches) -> Array:

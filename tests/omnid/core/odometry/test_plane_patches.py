@@ -100,7 +100,7 @@ def test_patches_of_a_wall_are_the_pixels_of_the_other_view(upper: bool) -> None
     # Upright surfaces in the place of the wall are something else, and shift the patches.
     upright = templates_of((points, 0 * slopes), pixels, seen, upper=upper)
     assert np.abs(upright.astype(float) - shown).mean() > 0.12 * contrast
-    found = align(exact, current, seen, np.zeros(150, np.intp))
+    found = align(exact, current, seen)
     assert found.found.sum() > 100
     assert np.abs(np.median((found.pixels - seen)[found.found], axis=0)).max() < 0.003
 
