@@ -5,9 +5,10 @@ their distance: a world that is larger by 1 / (1 - k c / B) explains the pair as
 stereo may have taken any of its disparities d_k, and landmarks of an earlier keyframe, which would decide, there are
 none. The lower panorama alone, followed from the keyframe on, decides:
 
-1. Motion without depths: a world of another size is seen from a motion of another length, with the same turn R and the
-   same direction t / |t|. So both are those of the pose, by whatever depths it was found. A landmark whose bearings
-   (a, b) are off the plane that they span, by |(t x R a) b| / |t x R a|, does not count.
+1. Motion without depths: of directions t at right angles to the baseline and turns R about it, those that most pairs
+   of bearings (a_i, b_i) fit,
+
+       e_i = f (t x R a_i) b_i / |t x R a_i|.
 
 2. The distance |t|: the bearings of a landmark give its range r_i in units of |t|, and each of its disparities a
    distance |t| = f B / (d_k r_i). Each landmark votes once,
@@ -50,6 +51,15 @@ LEAST_SURE = 0.4
 # Landmarks that are compared first, because they take a fifth of the time of all, and two standard deviations of the
 # share that they give.
 SAMPLE, SAMPLE_ERROR = 100, 0.1
+# Directions of the motion and turns that are tried first, rad: such a step moves an epipolar line by TOLERANCE_PX, so
+# that none is missed. The last turn is as far as the tracker reaches, because it searches 30 px at scale 1.
+DIRECTION_STEP, TURN_STEP, MOST_TURN = math.radians(2.5), math.radians(0.5), math.radians(10.0)
+ROUNDS, FINER = 3, 3  # rounds, each so many times as fine, because a tenth of a degree then remains
+# Share of the bearings that the motion explains, because a wrong one, where the turn is too large, explains 0.6.
+FIT_SHARE = 2 / 3
+# Share of the bearings that fit the best turn from which another turn fits as well, and how far apart both are, rad:
+# with a view of 30 degrees on a wall all of 10 degrees do, with a full turn those of 1.5 degrees, as measured.
+ALIKE_SHARE, ALIKE_TURN = 0.9, math.radians(2.5)
 TOLERANCE_PX = 1.5  # distance of a track from its epipolar line, because vehicles roll and pitch by half a degree
 # Parallax from which a landmark votes: with errors of SIGMA_PX, as measured for tracks without warped patches, its
 # range errs by an eighth, so that neighbouring courses differ by two sigmas.
@@ -114,33 +124,23 @@ class FirstDepths:
         displacement = self._larger_share * np.concatenate([moved[:3], np.zeros(3)])
         return displacement if np.linalg.norm(displacement) > SAME_M else None
 
-    def decide(
-        self,
-        lower: PaddedPanorama,
-        klt: KltSettings,
-        local_map: LocalMap,
-        step_m: tuple[float, float],
-        T_odom_rect: Array | None,
-    ) -> Array | None:
+    def decide(self, lower: PaddedPanorama, klt: KltSettings, local_map: LocalMap, step_m: tuple[float, float]) -> None:
         """Follow the landmarks into the next panorama, and correct their depths where it shows how far it is.
 
-        step_m: the most that a vehicle can move since the last panorama, and the step by wheels, NaN: not known;
-        T_odom_rect: pose of the panorama by the depths as they are, None: not found. Returns the pose by the corrected
-        depths; None: nothing was decided, and the map has not changed.
+        step_m: the most that a vehicle can move since the last panorama, and the step by wheels, NaN: not known.
         """
         # 1. Follow them from the keyframe on.
         self._most_m, self._sensed_m = self._most_m + step_m[0], self._sensed_m + step_m[1]
         self._follow(lower, klt)
-        if len(self._ids) < LEAST_VOTES or T_odom_rect is None:
-            return None
-        T_now_first = se3.inverse(T_odom_rect) @ self._T_odom_rect
+        if len(self._ids) < LEAST_VOTES:
+            return
         # 2. Vote for the distance.
-        ranges, parallax_px = self._ranges(T_now_first)
+        ranges, parallax_px = self._ranges()
         distances = self._model.cylinder.focal_px * self._model.baseline_m / (self._disparities * ranges[:, None])
         sigmas = np.hypot(SIGMA_PX / parallax_px[:, None], DISPARITY_SIGMA_PX / self._disparities) + LEAST_SIGMA
         votes = voted(np.log(distances), sigmas, reach_m(self._most_m, self._sensed_m))
         if votes is None:
-            return None
+            return
         self._larger_share = 0.0 if votes.runner_up_m is None else votes.runner_up_m / votes.moved_m - 1.0
         # 3. Landmarks take the disparity of that distance. Those without one are wrong, and so may be those without a
         #    vote, unless nearly all that were decided on had been right.
@@ -158,9 +158,6 @@ class FirstDepths:
         views[:, 2] = views[:, 1] + self._disparities[each, chosen][moved]
         local_map.replace_views(self._ids[moved], views, np.tile(VIEW_NOISE, (len(views), 1, 1)))
         local_map.keep(self._ids[is_right])
-        if moved.any():
-            T_now_first[:3, 3] *= votes.moved_m / np.linalg.norm(T_now_first[:3, 3])
-        return np.asarray(self._T_odom_rect @ se3.inverse(T_now_first))
 
     def _largest_share(self) -> float:
         """Return by which share of a motion it may be larger or smaller; 0: enough landmarks do not repeat."""
@@ -178,22 +175,29 @@ class FirstDepths:
         self._ids, self._views, self._disparities = self._ids[found], self._views[found], self._disparities[found]
         self._taken = self._taken[found]
 
-    def _ranges(self, T_now_first: Array) -> tuple[Array, Array]:
+    def _ranges(self) -> tuple[Array, Array]:
         """Return ranges (N,) of the landmarks from the keyframe, in units of the distance, and parallaxes (N,) [px].
 
         A landmark off its epipolar line, behind the camera, or with too little parallax has none: NaN.
         """
-        cylinder, R = self._model.cylinder, T_now_first[:3, :3]
-        t = T_now_first[:3, 3] / max(float(np.linalg.norm(T_now_first[:3, 3])), 1e-12)
-        turned, now = cylinder.rays(self._views[:, :2]) @ R.T, cylinder.rays(self._pixels)
+        cylinder = self._model.cylinder
+        before, now = cylinder.rays(self._views[:, :2]), cylinder.rays(self._pixels)
         now /= np.linalg.norm(now, axis=1, keepdims=True)
-        normal = np.cross(t, turned)
-        error_px = cylinder.focal_px * (normal * now).sum(axis=1) / np.maximum(np.linalg.norm(normal, axis=1), 1e-12)
-        # r R a + t = q b in the least-squares sense.
+        motion = most_likely_motion(before, now, cylinder.focal_px)
+        if motion is None:
+            return np.full(len(now), np.nan), np.ones(len(now))
+        direction, turn = motion
+        t, turned = (
+            np.array([math.cos(direction), math.sin(direction), 0.0]),
+            before @ se3.rotation_exp([0.0, 0.0, turn]).T,
+        )
+        error_px = cylinder.focal_px * epipolar_errors(turned, now, direction)
+        # r R a + t = q b in the least-squares sense; t points forwards or backwards, whichever leaves most in front.
         a2, ab = (turned**2).sum(axis=1), (turned * now).sum(axis=1)
-        sine2 = np.maximum(a2 - ab**2, 1e-12)
-        ranges = (ab * (now @ t) - turned @ t) / sine2
-        parallax_px = cylinder.focal_px * np.sqrt(sine2 / a2)
+        sine2 = a2 - ab**2
+        ranges = (ab * (now @ t) - turned @ t) / np.maximum(sine2, 1e-12)
+        ranges *= np.sign(np.median(ranges[sine2 >= np.median(sine2)]))
+        parallax_px = cylinder.focal_px * np.sqrt(np.maximum(sine2, 1e-12) / a2)
         known = (np.abs(error_px) < TOLERANCE_PX) & (parallax_px > PARALLAX_PX) & (ranges > 0)
         return np.where(known, ranges, np.nan), parallax_px
 
@@ -214,6 +218,48 @@ def _disparities(pair: Pair, views: Array, model: StereoModel) -> Array:
 def _repeats(disparities: Array) -> Flags:
     """Return the landmarks (N,) of several disparities (N, K)."""
     return np.asarray(np.isfinite(disparities[:, 1:]).any(axis=1))
+
+
+def most_likely_motion(before: Array, now: Array, focal_px: float) -> tuple[float, float] | None:
+    """Return direction and turn [rad] of the horizontal motion that most bearings (N, 3) fit, before and after it.
+
+    None: other turns fit as well, because what fills a narrow view turns as it moves aside, or may do so beyond
+    MOST_TURN; or too few bearings fit.
+    """
+    direction, turn = np.arange(0.0, math.pi, DIRECTION_STEP), np.arange(-MOST_TURN, MOST_TURN + TURN_STEP, TURN_STEP)
+    steps = DIRECTION_STEP, TURN_STEP
+    for _ in range(ROUNDS):
+        scores = np.empty((len(turn), len(direction)))
+        for row, angle in zip(scores, turn, strict=True):
+            errors_px = focal_px * epipolar_errors(_turned(before, angle), now, direction[:, None])
+            row[:] = np.exp(-0.5 * (errors_px / TOLERANCE_PX) ** 2).sum(axis=1)
+        best = np.unravel_index(int(scores.argmax()), scores.shape)
+        at = float(direction[best[1]]), float(turn[best[0]])
+        as_good = scores.max(axis=1) >= ALIKE_SHARE * scores.max()
+        is_shown = scores.max() > FIT_SHARE * len(now) and abs(at[1]) < MOST_TURN - ALIKE_TURN
+        if not is_shown or np.abs(turn[as_good] - at[1]).max() > ALIKE_TURN:
+            return None
+        steps = steps[0] / FINER, steps[1] / FINER
+        direction, turn = (middle + step * np.arange(-FINER, FINER + 1) for middle, step in zip(at, steps, strict=True))
+    return at
+
+
+def _turned(bearings: Array, angle: float) -> Array:
+    """Return bearings (N, 3) turned about the vertical by an angle [rad]."""
+    return np.asarray(bearings @ se3.rotation_exp([0.0, 0.0, angle]).T)
+
+
+def epipolar_errors(turned: Array, now: Array, direction: Array | float) -> Array:
+    """Return the angles (..., N) [rad] of bearings now (N, 3), of unit length, to the planes through turned (N, 3).
+
+    direction (...,) [rad]: that of the horizontal motion, which all planes contain.
+    """
+    c, s = np.cos(direction), np.sin(direction)
+    x, y, z = turned.T
+    across = c * y - s * x
+    return np.asarray(
+        (z * (s * now[:, 0] - c * now[:, 1]) + across * now[:, 2]) / np.maximum(np.hypot(z, across), 1e-12)
+    )
 
 
 def voted(distances: Array, sigmas: Array, reach_m: tuple[float, float]) -> Votes | None:

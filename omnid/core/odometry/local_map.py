@@ -250,16 +250,12 @@ class LocalMap:
         anchors = set(self.table.anchor.tolist())
         self.keyframes = {seq: keyframe for seq, keyframe in self.keyframes.items() if seq in anchors}
 
-    def decide_first_depths(
-        self, lower: PaddedPanorama, step_m: tuple[float, float], T_odom_rect: Array | None
-    ) -> Array | None:
-        """Let a new panorama decide among the depths of the first keyframe; see FirstDepths.decide."""
-        if self.first_depths is None:
-            return None
-        T_corrected = self.first_depths.decide(lower, self._coarse_klt, self, step_m, T_odom_rect)
-        if not self.first_depths.is_open:
-            self.first_depths = None
-        return T_corrected
+    def decide_first_depths(self, lower: PaddedPanorama, step_m: tuple[float, float]) -> None:
+        """Let a new panorama decide among the depths of the first keyframe; step_m: see FirstDepths.decide."""
+        if self.first_depths is not None:
+            self.first_depths.decide(lower, self._coarse_klt, self, step_m)
+            if not self.first_depths.is_open:
+                self.first_depths = None
 
     def track(
         self, lower: PaddedPanorama, T_odom_rect: Array, most: int | None = None, *, turn: int = 0, near: bool = False

@@ -101,17 +101,13 @@ class PoseSearch:
         sensed_m = math.nan
         if frame.sensed is not None and frame.sensed.is_complete:
             sensed_m = float(np.linalg.norm(T_predicted[:3, 3] - T_last[:3, 3]))
+        self._map.decide_first_depths(frame.lower, (self._limits.max_speed_mps * dt_s, sensed_m))
         best: PoseEstimate | None = None
         for T_guess, is_near in self._guesses(frame, usable, T_last, T_predicted):
             estimate = self.estimate(frame, T_guess, exposure, is_near=is_near)
             best = with_more_inliers(best, estimate)
             if is_good_enough(best, self._limits, is_near=is_near):
                 break
-        T_found = None if best is None else best.T_odom_rect
-        step_m = self._limits.max_speed_mps * dt_s, sensed_m
-        T_corrected = self._map.decide_first_depths(frame.lower, step_m, T_found)
-        if T_corrected is not None:
-            best = self.estimate(frame, T_corrected, exposure, is_near=True)
         return None if best is None else self._with_doubtful_depths(best)
 
     def with_runner_up(
