@@ -111,19 +111,6 @@ class LiveCamera(FrameSource, Protocol):
 OpenCamera: TypeAlias = Callable[[Camera], LiveCamera]  # called a second time after the first camera was closed
 
 
-def first_frames(open_camera: OpenCamera) -> Generator[Frame, None, None]:
-    """Yield the first frames of both cameras in turn; the cameras are open until this generator is closed."""
-    with ExitStack() as cameras:
-        streams = []
-        for name in CAMERAS:
-            camera = cameras.enter_context(closing(open_camera(name)))
-            frames = iter(camera.frames())
-            cameras.callback(getattr(frames, "close", nothing))  # a generator holds the device until it is closed
-            streams.append(frames)
-        for pair in zip(*streams, strict=False):
-            yield from pair
-
-
 class LiveRobot(Protocol):
     """A robot, or a simulated one, as a live run sees it."""
 
@@ -175,8 +162,16 @@ class ConnectedRobot:
         return time.monotonic_ns()
 
     def first_frames(self) -> Generator[Frame, None, None]:
-        """Open the cameras for their first frames."""
-        return first_frames(self._open_camera)
+        """Yield the frames of both cameras in turn; they are open until this generator is closed."""
+        with ExitStack() as cameras:
+            streams = []
+            for name in CAMERAS:
+                camera = cameras.enter_context(closing(self._open_camera(name)))
+                streams.append(iter(camera.frames()))
+                # A generator holds the device until it is closed.
+                cameras.callback(getattr(streams[-1], "close", nothing))
+            for pair in zip(*streams, strict=False):
+                yield from pair
 
     def connect(
         self, session: Session, take: Callable[[MotionSample], None]

@@ -20,7 +20,7 @@ from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.graph import Graph
 from omnid.engine.telemetry import Telemetry
 from omnid.errors import OmnidError
-from omnid.runs.live import ConnectedRobot, first_frames
+from omnid.runs.live import ConnectedRobot
 from omnid.runs.session import Session, attached_rig
 from omnid.runs.systemd import StatusLine, TerminalStatus
 from omnid.simulation.robot import with_masks
@@ -103,7 +103,7 @@ def test_the_first_images_come_in_turn_and_the_cameras_are_closed() -> None:
         opened.append(Images(camera))
         return opened[-1]
 
-    frames = list(islice(first_frames(open_camera), 100))
+    frames = list(islice(ConnectedRobot(open_camera).first_frames(), 100))
     assert [(frame.camera, frame.seq) for frame in frames[:4]] == [
         ("lower", 0),
         ("upper", 0),
