@@ -371,10 +371,13 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
         clock.monotonic_ns,
     )
 
-    reported = {IMAGES: LIVE}  # messages in the log
+    reported, is_read = {IMAGES: LIVE}, True  # messages in the log, and what the mapping knows
 
     def give_status() -> None:
-        map_is_read.push(recorder is not None or bus.is_received("cloud"))
+        nonlocal is_read
+        if is_read != (recorder is not None or bus.is_received("cloud")):
+            is_read = not is_read
+            map_is_read.push(is_read)
         statuses = collect()
         for status in statuses:
             if status.level != STALE and status.message != reported.get(status.name, status.message):

@@ -25,7 +25,7 @@ from omnid.runs.route_files import Requests, RouteFiles, TaughtRoutes
 from tests.omnid.stages.test_navigation import Robot
 
 TEACH, FINISH = RouteRequest(RouteAction.TEACH, "hall"), RouteRequest(RouteAction.FINISH)
-REPEAT = RouteRequest(RouteAction.REPEAT, "hall")
+REPEAT = RouteRequest(RouteAction.REPEAT, "hall", reverse=True)  # the robot stands at its end
 
 
 class Queue:
