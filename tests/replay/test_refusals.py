@@ -34,7 +34,7 @@ TABLE = (
     ("replay {log} --rig {folder}/size.toml", "images are 256x256"),
     ("replay {log} --rig {folder}/bare.toml", "images are 256x256"),
     ("replay {log} --rig {folder}/narrow.toml", "share no view between -50.0 and 40.0 degrees of elevation"),
-    ("replay {log} --rig {folder}/number.toml", "keys and numbers of at most 400 characters"),
+    ("replay {log} --rig {folder}/number.toml", "expected a number, found a huge int"),
     ("replay {log} --rig {folder}/deep.toml", "a key of at most 9 parts"),
     ("replay {log} --rig {folder}/huge.toml", "at most 67108864 in all"),
     ("replay {log} --rig {folder}/camchain.yaml", "`omnid calibrate import {folder}/camchain.yaml -o rig.toml`"),
