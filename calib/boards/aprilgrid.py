@@ -39,6 +39,8 @@ MIN_PERIMETER_PART, PIXELS_PER_BIT = 0.015, 6
 NEIGHBOUR_SIDES, MAX_OFF_PART = 3.2, 0.45
 # One tag alone may be misread; so many that lie as on the board are not.
 MIN_TAGS, SURE_TAGS = 2, 6
+# A predicted corner may move by a part of its tag's side and pixels.
+MAX_MOVE, MAX_MOVE_PX = 0.12, 1.5
 # Half side of the least window [px], because one of fewer than nine pixels does not show the corner alone.
 MIN_WINDOW_PX = 1.5
 # Least quality of a corner's ring, because the edge of what hides the board crosses others.
@@ -238,7 +240,8 @@ def _grown(image: Grey, points: Array, places: Array, outlines: Array, window: f
         mappings = {k: m for k, m in predicted.items() if m is not None and window * m.side_px > MIN_WINDOW_PX}
         if not mappings:
             break
-        found = shown_corners(image, mappings, window, MIN_QUALITY)
+        search_px = [MAX_MOVE * mapping.side_px + MAX_MOVE_PX for mapping in mappings.values()]
+        found = shown_corners(image, mappings, window, search_px, MIN_QUALITY)
         refused[[k for k in mappings if k not in found]] = True
         if not found:
             break

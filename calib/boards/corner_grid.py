@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TypeVar
 
 import cv2
@@ -93,7 +93,8 @@ def grow_grid(image: Grey, grid: Grid, most: int) -> Grid:
         border = {(i + di, j + dj) for i, j in grid for di, dj in STEPS} - set(grid) - refused
         mappings = {cell: local_mapping(np.array(cell, float), at, where) for cell in border}
         known = {cell: mapping for cell, mapping in mappings.items() if mapping is not None}
-        found = shown_corners(image, known, WINDOW_PART) if known else {}
+        search_px = [max(MIN_SEARCH_PX, WINDOW_PART * mapping.side_px) for mapping in known.values()]
+        found = shown_corners(image, known, WINDOW_PART, search_px) if known else {}
         if not found:
             break
         refused |= set(known) - set(found)
@@ -105,18 +106,24 @@ def grow_grid(image: Grey, grid: Grid, most: int) -> Grid:
 
 
 def shown_corners(
-    image: Grey, predicted: Mapping[Key, LocalMapping], window: float, least_quality: float = 0.0
+    image: Grey,
+    predicted: Mapping[Key, LocalMapping],
+    window: float,
+    search_px: Sequence[float],
+    least_quality: float = 0.0,
 ) -> dict[Key, Array]:
     """Return the predicted corners that the image shows, refined.
 
-    window: half side [squares] of the window about a corner in which grey depends on that corner alone.
+    window: half side [squares] of the window about a corner in which grey depends on that corner alone. search_px:
+    largest distance of each from its prediction.
     """
     start = np.array([mapping.coefficients[0] for mapping in predicted.values()])
     sizes = np.array([mapping.side_px for mapping in predicted.values()])
     refined = refine_subpixel(image, start, window * sizes)
     seen = describe_corners(image, refined, np.maximum(MIN_RING_PX, window * sizes))
-    near = np.linalg.norm(refined - start, axis=1) < np.maximum(MIN_SEARCH_PX, window * sizes)
-    good = near & (window * sizes > MIN_SIDE_PX) & (seen.quality > least_quality)
+    near = np.linalg.norm(refined - start, axis=1) < search_px
+    inside = ((start > MIN_RING_PX) & (start < np.array(image.shape[::-1]) - 1 - MIN_RING_PX)).all(axis=1)
+    good = inside & near & (window * sizes > MIN_SIDE_PX) & (seen.quality > least_quality)
     return {key: pixel for key, pixel, fine in zip(predicted, refined, good, strict=True) if fine}
 
 
