@@ -85,6 +85,8 @@ class ImageTimes:
             camera_of = np.repeat(np.arange(len(CAMERAS), dtype=np.int32), sizes)
             log_ns = np.concatenate([images[camera].log_ns for camera in CAMERAS])
             header_ns = np.concatenate([images[camera].header_ns for camera in CAMERAS])
+            self.by_log["are 0"] += int(np.count_nonzero(header_ns == 0))
+            header_ns = np.where(header_ns > 0, header_ns, log_ns)
             order = np.argsort(log_ns, kind="stable")
             run_ns, self._steps = running_on(camera_of[order], header_ns[order], range(len(CAMERAS)))
             for number, camera in enumerate(CAMERAS):
@@ -111,7 +113,7 @@ class ImageTimes:
                 'log.time = "log" takes the times of logging'
             )
         if self.by_log.total():
-            reasons = " or ".join(self.by_log)
+            reasons = " or ".join(reason for reason, count in self.by_log.items() if count)
             yield f"used the times of logging for {self.by_log.total()} images: the stamps of their headers {reasons}"
         if self._steps:
             before_ns, size_ns = self._steps[0]
