@@ -51,7 +51,7 @@ DEEP_STEP_PX: Final = 0.375
 # floor. With 3, by trial, bases stood on boards of 10 cm that are nearly alike.
 DEEP_NOISE: Final = 10.0
 # Share of the least height and fall by which a floor is uneven, so that two more planes are floor.
-EVEN_SHARE: Final = 0.17
+EVEN_SHARE: Final = 0.33
 LEVEL_RATIO: Final = 1.5  # log-likelihood by a sigma: that of single directions by three that are no more alike
 # An object often hides the floor near itself: decay of the prior with the disparity, and the share of it that is left
 # far away. Measured: two thirds to 1.5 times as much are alike.
