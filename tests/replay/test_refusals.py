@@ -35,7 +35,7 @@ TABLE = (
     ("replay {log} --rig {folder}/bare.toml", "images are 256x256"),
     ("replay {log} --rig {folder}/narrow.toml", "share no view between -50.0 and 40.0 degrees of elevation"),
     ("replay {log} --rig {folder}/number.toml", "expected a number, found a huge int"),
-    ("replay {log} --rig {folder}/deep.toml", "a key of at most 9 parts"),
+    ("replay {log} --rig {folder}/deep.toml", "a key of more than 65 parts"),
     ("replay {log} --rig {folder}/huge.toml", "at most 67108864 in all"),
     ("replay {log} --rig {folder}/camchain.yaml", "`omnid calibrate import {folder}/camchain.yaml -o rig.toml`"),
     ("replay {log} --rig {log}", "without --rig the one attached to the log is used"),
