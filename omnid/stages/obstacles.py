@@ -15,9 +15,10 @@ from omnid.config import ObstaclesConfig
 from omnid.core.control.collision_monitor import ControllerRing, MovingPoint
 from omnid.core.floor import Floor, FloorEstimator
 from omnid.core.frames import of_base
-from omnid.core.mapping.range_scan import SECTORS
+from omnid.core.mapping.range_scan import SECTORS, FreeRanges
 from omnid.core.obstacles.fixed_parts import FixedParts
 from omnid.core.obstacles.moving_tracker import MovingTracker
+from omnid.core.obstacles.narrow import narrow_m, nothing_narrow
 from omnid.core.obstacles.ray_rings import RayRings
 from omnid.core.obstacles.settings import RingSettings
 from omnid.core.obstacles.unwatched import Unwatched, without
@@ -105,7 +106,7 @@ class PairRings:
         if odometry.reset_counter != self._resets:
             self._begin_again()
             self._resets = odometry.reset_counter
-        panoramas = odometry.depth.panoramas
+        panoramas, self.rings.evidence = odometry.depth.panoramas, None
         T_odom_base = of_base(odometry, self._geometry.rig.T_base_rig)[0]
         unwatched = self._unwatched.sectors(panoramas.tiles.unknown)
         unknown = ObstacleRing(odometry.seq, odometry.stamp_ns, UNKNOWN, UNKNOWN, NOT_FREE, T_odom_base, (), unwatched)
@@ -126,6 +127,16 @@ class PairRings:
         return ObstacleRing(
             odometry.seq, odometry.stamp_ns, ring.ranges_m, ring.sigma_m, ring.free_m, T_odom_base, moving, unwatched
         )
+
+    @property
+    def narrow_m(self) -> FreeRanges:
+        """Least range (SECTORS,) [m] at which something narrow hides floor by the newest pair, inf: nothing does.
+
+        Sectors are those of the rectified frame.
+        """
+        if self.rings.evidence is None:
+            return nothing_narrow()
+        return narrow_m(self.rings.evidence.floor, self.rings.columns.at_1m)
 
     def _begin_again(self) -> None:
         self.rings.grid.begin_again()

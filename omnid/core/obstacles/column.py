@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from typing import Final, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -71,6 +70,8 @@ FLOOR_WEIGHT: Final = 10.0
 # The same of a disparity below the floor, where only holes are, and what a polished floor mirrors. By trial: of walls
 # of bricks, which may be farther ones below the floor, 94 % were found with 0.1 and 0.03, 92 % with 0.3, 66 % with 1.
 BELOW_WEIGHT: Final = 0.1
+# Bound of the mean likelihood of other explanations. Measured: two thirds to 1.5 times as much are alike.
+LEAST_OTHERS: Final = 1e-4
 
 
 class FloorPlane(NamedTuple):
@@ -130,8 +131,8 @@ class Columns:
 
     def evidence(self, pair: WorkingPair) -> ColumnEvidence:
         """Return the evidence of a pair."""
-        views = self._panoramas.views(pair)
-        return ColumnEvidence(self._floor(views), self._surface(views), self._level(views))
+        surfaces, floor = self._panoramas.views(pair)
+        return ColumnEvidence(self._floor(floor), self._surface(surfaces), self._level(floor))
 
     @property
     def panoramas(self) -> WorkingPanoramas:
@@ -159,7 +160,7 @@ class Columns:
         compared = views.lower, views.upright, views.plane, views.live
         kernels.floor_evidence(*compared, self._floor_bins, OUTLIER, scale, self._prior, others)
         together = self._floor_bins[:, kernels.FLOOR_THIN, None].astype(np.float32)
-        floor = -together * np.log(np.maximum(others, np.finfo(np.float32).tiny))
+        floor = -together * np.log(np.maximum(others, np.float32(LEAST_OTHERS)))
         floor[~self._compared] = np.nan
         return floor
 
@@ -170,9 +171,7 @@ class Columns:
         limits = np.float32(STRIP_BOUND), np.float32(STRIP_PRIOR)
         compared = views.lower, views.upright, views.plane, views.live
         surface_evidence(*compared, self._strips, OUTLIER, scale, *weights, *limits, surface)
-        # A surface fits a little at the next disparities, too.
-        beside = cv2.dilate(surface, np.ones((3, 1), np.uint8))
-        return np.where(surface >= beside, surface, np.float32(0))
+        return surface
 
     def _level(self, views: Views) -> Floats:
         """Return the log-likelihood ratios (2, K, DIRECTIONS) of the floor against planes just above and below it."""

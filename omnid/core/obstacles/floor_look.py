@@ -19,8 +19,9 @@ Flags = NDArray[np.bool_]
 
 MAD: Final = 1.48  # sigma of a normal distribution by the median of its magnitudes
 LEAST_STEP: Final = 0.35  # sigma of a step by the rounding of greys
-ROW_BINS: Final = 40  # known bins of one range by which its steps and its grey are known
+ROW_BINS: Final = 20  # known bins of one range by which its steps are known
 ROW_SHARE: Final = 0.4  # by which the sigma follows them from range to range
+GREY_BINS: Final = 60  # known bins of one range by which its grey is known
 TYPICAL_M: Final = 1.3  # range at which the near floor is seen
 SIDE: Final = 3  # directions on either side with which a bin is compared
 
@@ -53,7 +54,8 @@ def floor_steps(steps: Floats, near: Flags, known: Flags, p: RayParameters) -> t
     # The floor there, at most what it may be by the near floor.
     sigmas = np.clip(sigmas, max(0.5 * least, LEAST_STEP), 2.0 * least)
     seen = float((np.abs(steps) > 5 * sigmas[:, None])[near].mean())
-    return sigmas.astype(np.float32), min(max(seen, p.marks), 0.5)
+    marks = (p.marks * p.marks_bins + seen * p.seen_bins) / (p.marks_bins + p.seen_bins)
+    return sigmas.astype(np.float32), min(marks, 0.5)
 
 
 def floor_look(steps: Floats, greys: Floats, ranges_m: Array, near: Flags, p: RayParameters) -> Floats:
@@ -62,7 +64,11 @@ def floor_look(steps: Floats, greys: Floats, ranges_m: Array, near: Flags, p: Ra
     steps, greys (N, D); ranges_m (N,); near (N, D): bins that are known to be floor.
     """
     far = np.maximum(ranges_m / TYPICAL_M, 1.0)[:, None].astype(np.float32)
-    total = _by_contrast(steps, far, near) + _by_outline(greys, far, near, p) + _by_grey(greys, near, p)
+    by_contrast, by_outline = _by_contrast(steps, far, near), _by_outline(greys, far, near, p)
+    by_grey, is_known = _by_grey(greys, near, p)
+    total = np.clip(by_contrast, p.look_low, p.look_high) + np.clip(by_outline, p.look_low, p.look_high)
+    # Far away the light of the near floor is all that is known.
+    total += np.clip(by_grey, np.where(is_known, p.grey_low, p.look_low)[:, None], p.look_high)
     return np.asarray(p.w_look * total, np.float32)
 
 
@@ -78,20 +84,20 @@ def _by_contrast(steps: Floats, far: Floats, near: Flags) -> Floats:
     return np.asarray(np.log(0.9 * np.exp(-0.5 * (z / sigmas) ** 2) / sigmas + 0.1 * anything) - np.log(anything))
 
 
-def _by_grey(greys: Floats, near: Flags, p: RayParameters) -> Floats:
-    """Return the log-ratios (N, D) by grey; far away the light of the near floor is all that is known."""
+def _by_grey(greys: Floats, near: Flags, p: RayParameters) -> tuple[Floats, Flags]:
+    """Return the log-ratios (N, D) by grey, and where (N,) the floor's is known at that range."""
     grey = float(np.median(greys[near]))
     sigma = max(sigma_of(greys[near] - grey), p.grey_share * grey)
     middles, sigmas = np.full(len(greys), grey, np.float32), np.full(len(greys), sigma, np.float32)
-    is_known = near.sum(axis=1) > ROW_BINS
+    is_known = near.sum(axis=1) > GREY_BINS
     middles[is_known] = row_medians(greys[is_known], near[is_known])
     of_rows = MAD * row_medians(np.abs(greys[is_known] - middles[is_known, None]), near[is_known])
-    sigmas[is_known] = np.clip(of_rows, LEAST_STEP, sigma)
+    sigmas[is_known] = np.clip(of_rows, p.near_grey_share * grey, sigma)
     z, sigmas = greys - middles[:, None], sigmas[:, None]
     scale = 1.5 * p.contrast * max(grey, 20.0)
     anything = np.exp(-np.abs(z) / scale) / (2 * scale)
     core = np.exp(-0.5 * (z / sigmas) ** 2) / (sigmas * 2.5066)
-    return np.asarray(np.log(0.9 * core + 0.1 * anything) - np.log(anything))
+    return np.asarray(np.log(0.9 * core + 0.1 * anything) - np.log(anything)), is_known
 
 
 def _by_outline(greys: Floats, far: Floats, near: Flags, p: RayParameters) -> Floats:
@@ -102,7 +108,7 @@ def _by_outline(greys: Floats, far: Floats, near: Flags, p: RayParameters) -> Fl
     outline = np.where(np.abs(outline) < np.abs(wide), outline, wide)
     sigmas = np.float32(max(sigma_of(outline[near]), 0.8)) * np.sqrt(far)
     z2 = (outline / sigmas) ** 2
-    core = np.exp(-0.5 * z2) / (sigmas * 2.5066)
+    core = (np.exp(-0.5 * z2) * (1 - p.tail) + np.exp(-0.08 * z2) * p.tail * 0.4) / (sigmas * 2.5066)
     scale = p.contrast * max(float(np.median(greys[near])), 20.0)
     anything = np.exp(-np.abs(outline) / scale) / (2 * scale)
     # A thing shows an outline in half of its directions.

@@ -18,7 +18,6 @@ steps there, and whether they are known.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import cv2
@@ -29,6 +28,7 @@ from calib import se3
 from omnid.core.mapping.range_scan import SECTORS, azimuths
 from omnid.core.obstacles import grid_kernels as kernels
 from omnid.core.obstacles.moving_tracker import Arrivals
+from omnid.core.obstacles.parameters import GridParameters
 from omnid.core.obstacles.posterior import RayBelief
 
 Array = NDArray[np.float64]
@@ -45,30 +45,6 @@ CROSS: Final = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
 SQUARE: Final = np.ones((3, 3), np.uint8)
 SPECK_CELLS: Final = 4
 OPEN_SHARE: Final = 0.9  # of the longest range, from which on a direction is open: few pairs show the last cells
-
-
-@dataclass(frozen=True, slots=True)
-class GridParameters:
-    """The grid of cells; log-odds in nats."""
-
-    prior: float = -4.6  # of a thing in a cell
-    floor: float = -7.0  # of a cell by whose look floor is known
-    arrival: float = -9.0  # least log-odds, as something may come into each cell in each pair
-    most: float = 6.0
-    views: float = 3.0  # n: views of a place that count
-    same_place: float = 0.9  # rho: correlation of the errors of pairs from one place; a cell farther on they have none
-    risk: float = 0.1  # probability of a thing on a way that is free
-    walk_mps: float = 1.6  # of who may come where nobody sees
-    person_cells: int = 5  # width of who may
-    strut_rad: float = 0.26  # widest part of the view that a strut or a mast hides
-    person_rad: float = 0.65  # angle of a person nearer than the floor in view: 0.4 m at 0.6 m
-    thin_m: float = 0.035  # width of the thinnest thing
-    comes: float = 1.5  # by which one pair shows a thing that has come [nats]
-    lately_s: float = 3.0  # for which it counts that a cell was free
-    comes_m: float = 0.2  # least size of who comes, beside three sigmas of a disparity
-    hanging: float = -7.5  # log-odds of something that hangs over floor in view, without any surface,
-    shown_weight: float = 100.0  # and by the mean of what single pairs show,
-    shown_rate: float = 0.15  # which follows them so fast
 
 
 class GridRing(NamedTuple):
@@ -137,7 +113,7 @@ class ObstacleGrid:
         if self._last is not None:
             passed_s, way_m = max(stamp_ns - self._last[0], 0) * 1e-9, math.dist(place_m, self._last[1])
         is_first, self._last = self._last is None, (stamp_ns, place_m)
-        rho = p.same_place * max(1.0 - way_m / CELL_M, 0.0)
+        rho = p.same_place * max(1.0 - way_m / p.apart_m, 0.0)
         self._follow(place_m)
         self._eye, self._near_m = self._in_cells(self.viewpoint(T_odom_base)[:2, 3]), float(belief.ends_m[0])
         # 1. Evidence and state of each cell.
@@ -226,7 +202,7 @@ class ObstacleGrid:
         p, taken = self._p, self._taken()
         self._free_s += np.float32(passed_s)
         lately = self._free_s < p.lately_s
-        self._free_s[taken < 1 / (1 + math.exp(-p.prior))] = 0
+        self._free_s[taken < p.was_free] = 0
         # Who comes is wider than a speck of noise.
         came = ((taken > 0.5) & (taken <= 1)) | (flooded > 0)
         came |= cv2.morphologyEx(shows.view(np.uint8), cv2.MORPH_OPEN, SQUARE) > 0
@@ -234,7 +210,7 @@ class ObstacleGrid:
         rays, step_m = _along(self._eye, yaw_rad), CELL_M * (np.arange(REACH_CELLS) + 0.5)
         first = came[rays].argmax(axis=1)
         ranges_m = np.where(came[rays].any(axis=1), step_m[first], np.nan)
-        before_m = p.comes_m + 1.5 * ranges_m**2 / self._at_1m
+        before_m = p.behind_m + 1.5 * ranges_m**2 / self._at_1m
         end = np.nan_to_num(first + np.ceil(before_m / CELL_M), nan=SIDE).astype(np.intp)
         others = np.cumsum(np.pad(~lately[rays], ((0, 0), (1, 0))), axis=1)
         every = np.arange(SECTORS)
@@ -246,7 +222,7 @@ class ObstacleGrid:
             if len(run) * math.tau / SECTORS < least_rad:
                 ranges_m[run] = np.nan
         is_nearer = ranges_m < self._near_m
-        sigma_m = np.where(is_nearer, self._near_m / math.sqrt(12), 0.5 * ranges_m**2 / self._at_1m)
+        sigma_m = np.where(is_nearer, p.near_sigma * self._near_m, 0.5 * ranges_m**2 / self._at_1m)
         ranges_m[is_nearer] = self._near_m
         return Arrivals(ranges_m.astype(np.float32), sigma_m.astype(np.float32), is_nearer)
 
@@ -272,15 +248,15 @@ class ObstacleGrid:
 
     def _hides(self, belief: RayBelief) -> Flags:
         """Return the directions (D,) in which the nearest floor in view is hidden."""
-        bins = int(np.searchsorted(belief.ends_m, belief.ends_m[0] + CELL_M))
+        bins = int(np.searchsorted(belief.ends_m, belief.ends_m[0] + self._p.near_m))
         hidden = belief.first[:, :bins].sum(axis=1)
         three = (np.roll(hidden, 1) + hidden + np.roll(hidden, -1)) / 3
-        return np.asarray((three > 0.5) & (belief.view[:, 0] > 0))
+        return np.asarray((three > self._p.hidden) & (belief.view[:, 0] > 0))
 
     def _taken(self) -> Floats:
         """Return the probability of a thing in cells, 2 where nothing is known."""
         p = self._p
-        hanging = np.float32(p.shown_weight) * self._shown + np.float32(p.hanging)
+        hanging = np.clip(p.shown_weight * (self._shown - p.shown_least), -9.0, 6.0) + np.float32(p.hanging)
         taken = 1 / (1 + np.exp(-np.maximum(self.odds, hanging)))
         return np.where((self._known > 0) | (self.odds > 0), taken, np.float32(2))
 
@@ -324,7 +300,7 @@ class ObstacleGrid:
     def _follow(self, place_m: Array) -> None:
         """Move the cells along with the base; those that come into the grid are unknown."""
         cell = np.floor(place_m / CELL_M).astype(np.int64)
-        x, y = np.clip(cell - (cell if self._cell is None else self._cell), -SIDE, SIDE).tolist()
+        x, y = np.clip(cell - cell if self._cell is None else cell - self._cell, -SIDE, SIDE).tolist()
         self._cell = cell
         if x or y:
             self._layers[:] = np.roll(self._layers, (-y, -x), axis=(1, 2))

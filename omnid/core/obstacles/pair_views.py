@@ -1,7 +1,7 @@
 """Panoramas of a pair in one working size, in units of what two views of one place differ by.
 
 Matching compares a pixel with what another view shows there, so an image is given by how it differs from its column
-around.
+around: of surfaces by a band-pass, and of the floor by one in which no strong edge hides the weak texture next to it.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from calib.panorama import Cylinder
 from drivers.jpeg import coding_sigma
+from omnid.core.obstacles import panorama_kernels as kernels
 from omnid.core.types.panorama import PaddedPanorama
 
 Floats = NDArray[np.float32]
@@ -40,8 +41,11 @@ BAND_NOISE: Final = 0.65
 # smoothing halves those above. A coarser panorama shows fewer.
 CODING_FREQUENCIES: Final = 3.0
 UNITS: Final = 12.0  # Units of a normalised image in one sigma, because it has 8 bits and ten sigmas either way.
-LEVEL: Final = 128  # of a normalised image without texture
-THREE_ROWS: Final = np.ones((3, 1), np.uint8)
+ZERO: Final = 128.5  # Its level without texture, and half a level, because kernels cut what they round.
+BOUNDED_ROWS: Final = COARSE_ROWS  # Rows with which a pixel of the floor is compared.
+# Most that one of them counts, in sigmas of the noise, because the edge of a painted line has a hundred and hid the
+# texture of the floor around it. With 3 to 11 bases passed such a line; with no limit they stood before it.
+BOUNDED_SIGMAS: Final = 5.5
 
 
 class WorkingPair(NamedTuple):
@@ -81,10 +85,8 @@ class WorkingPanoramas:
         self._coding_frequencies = max(2, round(CODING_FREQUENCIES * FOCAL_PX / cylinder.focal_px))
         rows = np.arange(self.height)
         self.plane_rows = (rows + floor_slope * np.maximum(rows - self.row0, 0.0)).astype(np.float32)
-        self._of_plane = _maps(np.broadcast_to(self.plane_rows[:, None], (self.height, DIRECTIONS)))
-        azimuth = math.pi - (np.arange(DIRECTIONS) + 0.5) * (math.tau / DIRECTIONS)
-        slope = tilt[0] * np.cos(azimuth) + tilt[1] * np.sin(azimuth)
-        self._of_level = _maps(rows[:, None] - FOCAL_PX * slope) if any(tilt) else None
+        self._plane_steps = np.rint(self.plane_rows * kernels.STEPS_PER_ROW).astype(np.int32)
+        self._maps = self._made_maps(*tilt) if any(tilt) else None
         self.visible = self._sized(visible * np.uint8(255)) > 127  # (H, DIRECTIONS)
 
     def pair(self, lower: PaddedPanorama, upper: PaddedPanorama, lost: Flags | None = None) -> WorkingPair:
@@ -99,19 +101,18 @@ class WorkingPanoramas:
         noise_grey = math.hypot(BAND_NOISE * sensor_grey, *coding_grey)
         return WorkingPair(images[0], images[1], seen, sensor_grey, noise_grey)
 
-    def views(self, pair: WorkingPair) -> Views:
-        """Return the views of a pair."""
-        lower, upper = (_normalised(image, pair.noise_grey) for image in (pair.lower, pair.upper))
-        plane = cv2.remap(upper, *self._of_plane, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return Views(lower, upper, _bounds(upper), _bounds(np.asarray(plane, np.uint8)), pair.seen * np.uint8(255))
+    def views(self, pair: WorkingPair) -> tuple[Views, Views]:
+        """Return the views of a pair for surfaces, and for the floor."""
+        one, two = (_smoothed(image) for image in (pair.lower, pair.upper))
+        surfaces = self._views(_band_pass(one), _band_pass(two), pair)
+        bounded = [_bounded_band_pass(image, pair.noise_grey) for image in (one, two)]
+        return surfaces, self._views(bounded[0], bounded[1], pair)
 
     def _level(self, image: Floats) -> Floats:
         """Return an image (H, DIRECTIONS) in which the horizon of the floor is level."""
-        if self._of_level is None:
+        if self._maps is None:
             return image
-        return np.asarray(
-            cv2.remap(image, *self._of_level, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32
-        )
+        return np.asarray(cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
 
     def _sized(self, image: Bytes) -> Bytes:
         """Return a panorama (H, W) in the working size of a full turn, 0 in directions that it does not show."""
@@ -122,25 +123,40 @@ class WorkingPanoramas:
         whole[:, self.shown] = shown
         return whole
 
+    def _views(self, lower: Floats, upper: Floats, pair: WorkingPair) -> Views:
+        """Return the views of the band-passes of a pair (H, DIRECTIONS)."""
+        one, two = np.empty((2, *lower.shape), np.uint8)
+        for band, into in ((lower, one), (upper, two)):
+            kernels.normalise(band, CONTRAST_ROWS, TEXTURE_SHARE**2, pair.noise_grey**2, UNITS, ZERO, into)
+        upright, plane = np.empty((2, 2, *two.shape), np.uint8)
+        kernels.bounds(two, upright)
+        kernels.bounds_on_plane(two, self._plane_steps, plane)
+        return Views(one, two, upright, plane, pair.seen * np.uint8(255))
 
-def _maps(rows: NDArray[np.floating]) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
-    """Return OpenCV's maps to an image whose pixels are those of the same column at rows (H, DIRECTIONS)."""
-    columns = np.broadcast_to(np.arange(DIRECTIONS, dtype=np.float32), rows.shape)
-    places, shares = cv2.convertMaps(columns, rows.astype(np.float32), cv2.CV_16SC2)
-    return np.asarray(places, np.int16), np.asarray(shares, np.uint16)
+    def _made_maps(self, a: float, b: float) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
+        """Return the maps to a panorama in which the horizon of a floor with the slopes a, b is level."""
+        azimuth = math.pi - (np.arange(DIRECTIONS) + 0.5) * (math.tau / DIRECTIONS)
+        tilt = a * np.cos(azimuth) + b * np.sin(azimuth)
+        rows = np.arange(self.height)[:, None]
+        columns = np.broadcast_to(np.arange(DIRECTIONS, dtype=np.float32), (self.height, DIRECTIONS))
+        places, shares = cv2.convertMaps(columns, (rows - FOCAL_PX * tilt).astype(np.float32), cv2.CV_16SC2)
+        return np.asarray(places, np.int16), np.asarray(shares, np.uint16)
 
 
-def _normalised(image: Floats, noise_grey: float) -> Bytes:
-    """Return how an image (H, DIRECTIONS) differs from its column around, in units of what two views of it differ by.
-
-    The difference of two views has the variance (TEXTURE_SHARE contrast)^2 + noise_grey^2.
-    """
-    smooth = cv2.GaussianBlur(image, (1, 5), sigmaX=0.1, sigmaY=FINE_PX)
-    band = smooth - cv2.blur(cv2.blur(smooth, (1, COARSE_ROWS)), (1, COARSE_ROWS))
-    variance = TEXTURE_SHARE**2 * cv2.blur(band * band, (3, CONTRAST_ROWS)) + np.float32(noise_grey**2)
-    return np.asarray(np.clip(np.rint(np.float32(UNITS) * band / np.sqrt(variance) + LEVEL), 0, 255), np.uint8)
+def _smoothed(image: Floats) -> Floats:
+    """Return a panorama (H, DIRECTIONS) smoothed along columns."""
+    return np.asarray(cv2.GaussianBlur(image, (1, 5), sigmaX=0.1, sigmaY=FINE_PX), np.float32)
 
 
-def _bounds(image: Bytes) -> Bytes:
-    """Return the least and the most (2, H, W) of an image (H, W) within half a row of each pixel."""
-    return np.stack([cv2.addWeighted(image, 0.5, of(image, THREE_ROWS), 0.5, 0.0) for of in (cv2.erode, cv2.dilate)])
+def _band_pass(smooth: Floats) -> Floats:
+    """Return a panorama (H, DIRECTIONS) less its coarse mean along columns."""
+    band = np.empty_like(smooth)
+    kernels.band_pass(smooth, COARSE_ROWS, band)
+    return band
+
+
+def _bounded_band_pass(smooth: Floats, noise_grey: float) -> Floats:
+    """Return by how much a panorama (H, DIRECTIONS) exceeds its columns around, where no row counts much."""
+    band = np.empty_like(smooth)
+    kernels.bounded_band_pass(smooth, BOUNDED_ROWS, np.float32(BOUNDED_SIGMAS * noise_grey), band)
+    return band

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from omnid.core.obstacles import ray_kernels as kernels
 from omnid.core.obstacles.column import ColumnEvidence, Columns
-from omnid.core.obstacles.floor_look import LEAST_STEP, ROW_BINS, floor_look, floor_steps
+from omnid.core.obstacles.floor_look import LEAST_STEP, floor_look, floor_steps
 from omnid.core.obstacles.pair_views import DIRECTIONS, WorkingPair
 from omnid.core.obstacles.ray_kernels import RayParameters
 
@@ -38,7 +38,6 @@ Flags = NDArray[np.bool_]
 
 BINS_PER_PX: Final = 2
 STEP_ROWS: Final = 4.0  # of a step below its bin, which must be in view
-POOLED: Final = np.array([0.25, 0.5, 0.25], np.float32)  # weights of three directions
 ROOT: Final = math.sqrt(math.tau)
 LEAST: Final = 1e-30  # density, so that logarithms are finite
 SATURATED: Final = 250.0  # grey from which a pixel shows nothing
@@ -71,8 +70,6 @@ class RayPosterior:
         every = np.concatenate([self._bins, np.arange(1, BINS_PER_PX * columns.first_bin)[::-1]])
         self._rows = np.stack([rows[every], rows[every] + middle[every]])  # (2, N + far ones) in both views
         self._step_weights, self._grey_weights = _step_weights(self._rows, columns.panoramas.height)
-        # Sigma of a pooled step by noise alone, by the noise of a pixel in both views.
-        self._noise_share = float(np.sqrt((self._step_weights[0] ** 2).sum(axis=1).max() * np.square(POOLED).sum()))
         self.ranges_m = columns.at_1m / middle[self._bins]  # (N,) of the bins
         begins = (self._bins + 1) / BINS_PER_PX
         self.ends_m = columns.at_1m / np.append(begins, begins[-1:] - 1 / BINS_PER_PX)
@@ -89,27 +86,29 @@ class RayPosterior:
         """
         p, count, seen = self._p, len(self._bins), self._of_bins(pair.seen)
         known, near = self._known(known, seen)
-        if near.sum() < ROW_BINS:
+        if near.sum() < p.look_bins:
             return self._nothing()
         # 1. Steps of grey, pooled over three directions.
         steps, greys = np.zeros((2, self._rows.shape[1], DIRECTIONS), np.float32)
         for weights, into in ((self._step_weights, steps), (self._grey_weights, greys)):
             for of_view, image in zip(weights, (pair.lower, pair.upper), strict=True):
                 kernels.add_weighted_rows(of_view, image, into)
-        pooled = sum(part * np.roll(steps, shift, axis=1) for part, shift in zip(POOLED, (-1, 0, 1), strict=True))
+        pooled = np.asarray((np.roll(steps, 1, axis=1) + 2 * steps + np.roll(steps, -1, axis=1)) / 4, np.float32)
         sigmas, marks = floor_steps(pooled[:count], near, known, p)
-        plain = max(self._noise_share * pair.sensor_grey, LEAST_STEP)
+        plain = max(p.noise_share * pair.sensor_grey, LEAST_STEP)
         far = np.abs(pooled[count:]).max(axis=0, initial=0.0) / max(float(sigmas[-1]), float(sigmas.min()))
         # 2. Stereo, by bins. Noise without texture fits other disparities a little better: the ratio of known floor
         #    says by how much.
         of_bin = self._bins // BINS_PER_PX
         floor = evidence.floor[of_bin]
         bias = float(np.median(np.nan_to_num(floor[near])))
-        floor = p.w_floor * np.clip(np.nan_to_num(floor - np.float32(min(max(bias, -1.0), 0.0))), -p.most, p.most)
-        levels = floor - p.w_level * np.clip(evidence.level[:, of_bin], -p.most, p.most)
-        fits = np.minimum(self._surfaces(evidence.surface)[of_bin], p.most) - p.surface_noise
+        floor = p.w_floor * np.clip(
+            np.nan_to_num(floor - np.float32(min(max(bias, -1.0), 0.0))), p.floor_low, p.floor_high
+        )
+        levels = floor - p.w_level * np.clip(evidence.level[:, of_bin], -p.level_most, p.level_most)
+        fits = np.minimum(self._surfaces(evidence.surface)[of_bin], p.surface_most) - p.surface_noise
         # 3. The look of floor, and the edges.
-        look = floor_look(steps[:count], greys[:count], self.ranges_m, near, p)
+        look = floor_look(steps[:count], greys[:count], self.ranges_m, near & (self.ranges_m < 1.6)[:, None], p)
         edges = self._edges(np.abs(pooled[:count]), greys[:count], sigmas[:, None], marks, plain)
         # 4. The posterior.
         seen = seen & (greys[:count].T < SATURATED)
@@ -130,9 +129,10 @@ class RayPosterior:
         p, scale = self._p, np.asarray(self._p.contrast * np.maximum(greys, 20.0), np.float32)
 
         def noise(step: Floats, sigma: Floats | float) -> Floats:
-            """Return the density of steps within one material."""
+            """Return the density of steps within one material: normal, a share with 2.5 times the sigma."""
             z2 = np.square(step / sigma)
-            return np.asarray(np.exp(-0.5 * z2) / (ROOT * sigma), np.float32)
+            density = (1 - p.tail) * np.exp(-0.5 * z2) + 0.4 * p.tail * np.exp(-0.08 * z2)
+            return np.asarray(density / (ROOT * sigma), np.float32)
 
         def laplace(step: Floats) -> Floats:
             """Return the density of steps between two materials."""
@@ -152,7 +152,7 @@ class RayPosterior:
         other = laplace(once)
         textured, even, other_hidden = behind(once, other)
         floor = np.log(((1 - marks) * textured + marks * other) / other_hidden)
-        bare = np.log(((1 - p.marks) * even + p.marks * other) / other_hidden)
+        bare = np.log(((1 - p.marks_plain) * even + p.marks_plain * other) / other_hidden)
         ratios = p.w_edge * floor, p.w_edge * bare, np.log(begins / hidden)
         return tuple(np.asarray(ratio, np.float32) for ratio in ratios)
 
@@ -160,7 +160,7 @@ class RayPosterior:
         """Return the bins (N, DIRECTIONS) in view that are known to be floor, and those that show its look."""
         if known is not None:
             near = known & seen.T & (self.ranges_m < self._p.look_m)[:, None]
-            if near.sum() >= ROW_BINS:
+            if near.sum() >= self._p.look_bins:
                 return known & seen.T, near
         assumed = self._assumed & seen.T
         return assumed, assumed
@@ -180,7 +180,7 @@ class RayPosterior:
     def _surfaces(self, surface: Floats) -> Floats:
         """Return ratios (K, DIRECTIONS) of surfaces, where one fits best at least the weighted mean of neighbours."""
         p = self._p
-        most = np.minimum(surface, p.most)
+        most = np.minimum(surface, p.surface_most)
         three = np.maximum(most, np.maximum(np.roll(most, 1, 0), np.roll(most, -1, 0)))
         half = int(p.wide_columns) // 2
         turned = np.concatenate([three[:, -half:], three, three[:, :half]], axis=1)

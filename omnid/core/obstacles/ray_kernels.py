@@ -18,31 +18,49 @@ class RayParameters(NamedTuple):
 
     # Rates of the prior, per metre of a ray.
     things_per_m: float = 0.1
+    hanging_per_m: float = 0.05
     steps_per_m: float = 0.005
-    others_per_m: float = 0.05  # things that hang, slopes, and borders behind which the floor looks otherwise
+    slopes_per_m: float = 0.05
+    changes_per_m: float = 0.02  # of borders behind which the floor looks otherwise
     # Probabilities.
     alike: float = 0.1  # something looks like the floor
     invisible: float = 0.005  # the end of the floor beyond the last bin shows no foot
-    nearer: float = 0.03  # something begins nearer than the view
-    marks: float = 0.02  # m: an edge in a bin of the floor, at least
+    nearer: float = 0.02  # something begins nearer than the view and looks like the floor,
+    nearer_other: float = 0.03  # or otherwise
+    marks: float = 0.02  # m: an edge in a bin of the floor, before any was seen; worth so many bins:
+    marks_bins: float = 40.0
+    seen_bins: float = 100.0  # what bins are worth that were seen
     marks_behind: float = 0.2  # an edge in a bin of what hides the floor,
+    marks_plain: float = 0.01  # and of something plain
     plain_behind: float = 0.3  # what hides the floor has no texture
+    tail: float = 0.05  # a step of the floor has 2.5 times its sigma
     # Noises and scales.
     contrast: float = 0.15  # b: of the difference of grey between a thing and the floor, by the floor's grey
     surface_noise: float = 0.4  # of the best surface where there is none [nats]
-    grey_share: float = 0.06  # least sigma of the floor's grey, by the grey
+    noise_share: float = 0.4  # sigma of a step by noise alone, by the noise of a pixel of both views
+    grey_share: float = 0.06  # least sigma of the floor's grey, by the grey,
+    near_grey_share: float = 0.01  # and where it is known at that range
     # Temperatures, as neighbouring bins and directions are not independent.
     w_floor: float = 0.15
     w_edge: float = 0.5
     w_level: float = 0.3
     w_look: float = 0.2
     # Bounds of what one bin says [nats].
-    most: float = 8.0
-    cell_most: float = 4.0  # in a cell
+    floor_low: float = -12.0
+    floor_high: float = 8.0
+    level_most: float = 4.0
+    surface_most: float = 8.0
+    look_low: float = -2.5
+    look_high: float = 1.0
+    grey_low: float = -5.0  # of a grey where the floor's is known at that range
+    cell_low: float = -3.0
+    cell_high: float = 4.0
     # Surfaces: where the mean over so many directions is largest, it counts so much more than one direction.
     wide_columns: float = 11.0
     wide_weight: float = 5.0
-    look_m: float = 1.8  # range up to which the look of the floor is learned
+    # Look of the floor: learned up to this range [m], from so many bins at least.
+    look_m: float = 1.8
+    look_bins: float = 100.0
 
 
 FLOOR, ABOVE, BELOW, LOOK, EDGE, BARE, BEGINS, FITS = range(8)  # terms of `posterior`
@@ -77,7 +95,7 @@ def add_weighted_rows(weights: Floats, image: Floats, into: Floats) -> None:
 
 
 @compiled(
-    "(f4[:, :, ::1], f4[::1], f4[::1], f8, NamedUniTuple(f8, 21, RayParameters), f4[:, ::1], f4[:, ::1], f4[:, ::1])",
+    "(f4[:, :, ::1], f4[::1], f4[::1], f8, NamedUniTuple(f8, 38, RayParameters), f4[:, ::1], f4[:, ::1], f4[:, ::1])",
     writes=("first", "ratios", "view"),
 )
 def posterior(
@@ -104,16 +122,16 @@ def posterior(
     # Logarithms of all that does not depend on the direction.
     log_length, log_stays, log_changes, prior_odds = np.log(lengths_m), np.empty(bins), np.empty(bins), np.empty(bins)
     for n in range(bins):
-        change = min(p.others_per_m * lengths_m[n], 0.1)
+        change = min(p.changes_per_m * lengths_m[n], 0.1)
         log_stays[n], log_changes[n] = math.log1p(-change), math.log(change)
-        prior = min((p.things_per_m + p.others_per_m) * lengths_m[n], 0.5)
+        prior = min((p.things_per_m + p.hanging_per_m) * lengths_m[n], 0.5)
         prior_odds[n] = math.log(prior / (1.0 - prior))
-    log_things, log_others = math.log(p.things_per_m), math.log(p.others_per_m)
-    log_steps = math.log(p.steps_per_m)
+    log_things, log_over = math.log(p.things_per_m), math.log(p.hanging_per_m)
+    log_steps, log_slopes = math.log(p.steps_per_m), math.log(p.slopes_per_m)
     log_alike, log_unlike = math.log(p.alike), math.log1p(-p.alike)
-    other_at_start = min(0.1 * p.others_per_m * nearest_m, 0.5)
+    other_at_start = min(0.1 * p.changes_per_m * nearest_m, 0.5)
     log_known, log_other = math.log1p(-other_at_start), math.log(other_at_start)
-    log_nearer = math.log(p.nearer)
+    log_nearer, log_alike_nearer = math.log(p.nearer_other), math.log(p.nearer)
     for u in range(directions):
         # 1. Sums from each bin to the last: planes beside the floor, look, and things behind the first one.
         plain = 0.0
@@ -135,7 +153,7 @@ def posterior(
             here += log_length[n]
             of_class[UPRIGHT, n] = here + terms[FITS, n, u] + log_things
             of_class[STEP, n] = here + log_sum(down[n], up[n]) + log_steps
-            slope = log_sum(slope, before + looks + up[n] + look[n] + log_others + log_length[n])
+            slope = log_sum(slope, before + looks + up[n] + look[n] + log_slopes + log_length[n])
             before += terms[FLOOR, n, u] + terms[EDGE, n, u]
             kept = log_sum(as_known + log_stays[n], other_look + log_changes[n]) + terms[LOOK, n, u]
             other_look = log_sum(other_look + log_stays[n], as_known + log_changes[n])
@@ -143,12 +161,12 @@ def posterior(
         none = log_sum(before + looks + foot - LOG_2, slope + foot)
         # 4. Nearer than the view: the look of floor may have been learned from it, or it has one of its own.
         #    What is plain shows fewer edges.
-        nearer = log_sum(look[0], log_sum(0.0, plain) - LOG_2) + log_nearer
+        nearer = log_sum(look[0] + log_alike_nearer, log_nearer + log_sum(0.0, plain) - LOG_2)
         # 5. Something that hangs over floor in view: all that may begin beyond.
         beyond = high = none
         for n in range(bins - 1, -1, -1):
             begins = log_sum(of_class[UPRIGHT, n], of_class[STEP, n])
-            hanging = beyond + terms[FITS, n, u] - p.surface_noise + log_others + log_length[n]
+            hanging = beyond + terms[FITS, n, u] - p.surface_noise + log_over + log_length[n]
             total[n] = log_sum(begins, hanging)
             beyond = log_sum(beyond, begins)
             if n == 0:
@@ -168,6 +186,6 @@ def posterior(
             if reach > LEAST_REACH:
                 rate = min(max(found / reach, 1e-6), 1.0 - 1e-6)
                 ratio = (math.log(rate / (1.0 - rate)) - prior_odds[n]) * reach
-                ratios[u, n] = min(max(ratio, -p.cell_most), p.cell_most)
+                ratios[u, n] = min(max(ratio, p.cell_low), p.cell_high)
             reach = max(reach - found, 0.0)
         first[u, bins] = last / weight

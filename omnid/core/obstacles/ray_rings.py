@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.panorama import Cylinder
-from omnid.core.obstacles.column import NEAREST_M, Columns, FloorPlane, floor_plane
-from omnid.core.obstacles.grid import GridParameters, GridRing, ObstacleGrid, unknown_ring
+from omnid.core.obstacles.column import NEAREST_M, ColumnEvidence, Columns, FloorPlane, floor_plane
+from omnid.core.obstacles.grid import GridRing, ObstacleGrid, unknown_ring
 from omnid.core.obstacles.lean import LEAST_RAD, Lean
 from omnid.core.obstacles.pair_views import DIRECTIONS, FOCAL_PX, WorkingPair
+from omnid.core.obstacles.parameters import GridParameters
 from omnid.core.obstacles.posterior import RayPosterior
 from omnid.core.obstacles.ray_kernels import RayParameters
 from omnid.core.obstacles.settings import RingSettings
@@ -37,6 +38,7 @@ class RayRings:
         self._leaned_ns: int | None = None  # stamp of the last pair by which the lean was followed
         self._plane: FloorPlane | None = None
         self._visible: Flags | None = None
+        self.evidence: ColumnEvidence | None = None  # of the newest pair
 
     def set_floor(self, T_rect_base: Array, visible: Flags) -> None:
         """Take T_rect_base (4, 4), from the base level on the floor to the panoramas, and their pixels (H, W)."""
@@ -53,7 +55,7 @@ class RayRings:
         """
         # 1. Evidence, with the look of floor that is known.
         pair = self.columns.panoramas.pair(lower, upper, lost)
-        evidence = self.columns.evidence(pair)
+        evidence = self.evidence = self.columns.evidence(pair)
         if not self.posterior.shows_floor:
             return unknown_ring()
         known = self.grid.is_floor(T_odom_base, self.posterior.ranges_m, DIRECTIONS)

@@ -136,6 +136,19 @@ def add_runs(
             add_run(value[d], value[d + 1], value[d + 2], total, blank, bound, prior, run[d], surface[d, part])
 
 
+@inner
+def keep_peaks(surface: Floats) -> None:
+    """Clear ratios (K, W) that are lower than one of the next disparities: a surface fits a little there, too."""
+    bins, width = surface.shape
+    before = np.zeros(width, np.float32)
+    for d in range(bins):
+        mine, after = surface[d], surface[min(d + 1, bins - 1)]
+        for u in range(width):
+            value = mine[u]
+            mine[u] = value if (value >= before[u]) & (value >= after[u]) else NOTHING
+            before[u] = value
+
+
 @compiled(
     "(u1[:, ::1], u1[:, :, ::1], u1[:, :, ::1], u1[:, ::1], i4[:, ::1], u1, f4, f4, f4, f4, f4, f4[:, ::1])",
     writes=("surface",),
@@ -199,3 +212,4 @@ def surface_evidence(
             weights = below * below_weight + (last - below)
             weights += floor_weight if strips[n, STRIP_FLOOR] > 0 else NOTHING
             add_runs(value, total, (mine, last), weights, bound, prior, run, part, surface)
+    keep_peaks(surface)

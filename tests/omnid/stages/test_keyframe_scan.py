@@ -49,13 +49,15 @@ def test_a_low_box_before_a_wall_is_the_nearest_obstacle(height_m: float, tilt_d
 
 
 @pytest.mark.parametrize("height_m", [HEIGHT_M, 0.0])
-def test_free_floor_of_a_keyframe_is_that_of_its_ring_where_the_floor_is_known(height_m: float) -> None:
+def test_free_floor_ends_at_what_is_narrow_and_is_negative_there(height_m: float) -> None:
     stated = se3.transform(np.eye(3), [0.0, 0.0, height_m])
     unknown = np.full(SECTORS, np.nan, np.float32)
-    free_m = np.full(SECTORS, 2.0, np.float32)
+    free_m, narrow_m = np.full(SECTORS, 2.0, np.float32), np.full(SECTORS, np.inf, np.float32)
+    narrow_m[[1, 3]] = 1.5, 3.0
     ring = ObstacleRing(0, 0, unknown, unknown, free_m, np.eye(4), (), unwatched=())
-    found = keyframe_free(ring, CameraFloor(replace(make_rig(), T_base_rig=stated), 0.0), np.eye(4))
-    np.testing.assert_allclose(found, free_m if height_m else 0.0, atol=1e-3)
+    found = keyframe_free(ring, narrow_m, CameraFloor(replace(make_rig(), T_base_rig=stated), 0.0), np.eye(4))
+    expected = [2.0, -1.5, 2.0, -2.0, 2.0] if height_m else [0.0] * 5
+    np.testing.assert_allclose(found[:5], expected, atol=1e-3)
 
 
 def test_without_a_floor_nothing_is_known_and_the_summary_names_it() -> None:

@@ -20,6 +20,7 @@ from tests.omnid.core.obstacles.drawn_floor import (
     BASELINE_M,
     CYLINDER,
     HEIGHT_M,
+    Pole,
     panoramas,
     plain,
     stains,
@@ -92,6 +93,15 @@ def test_floor_between_edges_is_free_where_the_rig_states_its_height_and_nothing
     ring = Standing(height_m).ring(Panoramas(0, 0, *panoramas(worn, 9.0, plain), SHOWN))
     assert np.isnan(ring.ranges_m).all()
     assert np.median(ring.free_m) > 2.0 if height_m else ring.free_m.max() == 0.0
+
+
+def test_the_newest_pair_shows_a_pole_and_none_while_odometry_is_lost() -> None:
+    base, pair = Standing(HEIGHT_M), Panoramas(0, 0, *panoramas(stains, 3.0, striped, thing=Pole(1.3, 0.05)), SHOWN)
+    assert np.isinf(base.rings.narrow_m).all()
+    base.ring(pair)
+    assert 1.0 < base.rings.narrow_m[180] < 1.3 and np.isinf(base.rings.narrow_m[:170]).all()
+    base.ring(pair, TrackingState.LOST)
+    assert np.isinf(base.rings.narrow_m).all()
 
 
 def _turned(heading_rad: float, light_grey: float) -> Panoramas:

@@ -102,6 +102,46 @@ def test_a_pole_thinner_than_a_cell_that_shows_no_range_is_not_free() -> None:
         assert at(grid, 0.2, 0.5) == at(grid, 0.2, 0.0) == FREE
 
 
+def test_views_that_something_narrow_ends_outvote_those_that_have_missed_it() -> None:
+    """A pole at (0.2, 1): three of ten views miss it, and one sees something narrow where nothing stands."""
+    path, scans, free_m = np.array([pose(x, 0, 0) for x in np.arange(-1.3, 1.7, 0.3)]), [], []
+    for n, T in enumerate(path):
+        free = OPEN.copy()
+        if n % 4:
+            range_m = np.hypot(1.0, 0.2 - T[0, 3])
+            hidden = np.abs(np.arctan2(1.0, 0.2 - T[0, 3]) - azimuths()) < 0.02 / range_m + np.deg2rad(0.5)
+            free[hidden] = -(range_m - 0.1)
+        scans.append(scan_of(ROOM, T))
+        free_m.append(free)
+    free_m[5][90] = -1.2  # to the right
+    grid = scan_grid(scans, free_m, path, 0.05).grid()
+    assert {at(grid, 0.2 + dx, 1.0 + dy) for dx in (-0.02, 0.02) for dy in (-0.02, 0.02)} == {UNKNOWN}
+    assert {at(grid, 0.2 + dx, 1.0) for dx in (-0.3, 0.3)} | {at(grid, 0.2, y) for y in (0.7, 1.5)} == {FREE}
+    assert {at(grid, path[5, 0, 3], y) for y in np.arange(-1.6, -0.5, 0.05)} == {FREE}
+
+
+def test_what_is_narrow_is_cleared_by_near_views_that_pass_it_and_not_by_far_ones() -> None:
+    near_view, far_view = pose(0.2, 0, 0), pose(2.4, -0.9, 0)  # 1.2 m and 3 m from a pole at (0.2, 1.2)
+    ended = OPEN.copy()
+    ended[SECTORS * 3 // 4 - 2 : SECTORS * 3 // 4 + 2] = -1.1  # to the left
+    seen = [(near_view, ended)] * 2 + [(far_view, OPEN)] * 9
+    for more, expected in ((0, UNKNOWN), (1, FREE)):
+        views = seen + [(near_view, OPEN)] * more
+        path = np.array([T for T, _ in views])
+        grid = scan_grid([scan_of(ROOM, T) for T in path], [free for _, free in views], path, 0.05).grid()
+        assert at(grid, 0.2, 1.2) == expected and at(grid, 0.2, 0.8) == FREE
+
+
+def test_what_is_narrow_and_hides_the_nearest_floor_in_view_may_stand_anywhere_before_it() -> None:
+    ended, path = OPEN.copy(), np.array([pose(0.225, 0, 0)] * 4)  # in the middle of a cell
+    ended[SECTORS * 3 // 4 - 2 : SECTORS * 3 // 4 + 2] = -0.9  # to the left
+    passed = np.array([pose(-0.4, 0, 0)] * 2)
+    views = np.concatenate([passed, path])
+    grid = scan_grid([scan_of(ROOM, T) for T in views], [OPEN] * 2 + [ended] * 4, views, 0.05).grid()
+    assert {at(grid, 0.2, 0.4), at(grid, 0.2, 0.6), at(grid, 0.2, 0.95)} == {UNKNOWN}
+    assert {at(grid, 0.35, 0.6), at(grid, 0.05, 0.6), at(grid, 0.2, 1.2)} == {FREE}
+
+
 def test_a_direction_that_sees_through_a_wall_beside_others_that_do_not_makes_it_free_nowhere() -> None:
     scan, T = scan_of(ROOM, pose(0, 0, 0)), np.tile(np.eye(4), (4, 1, 1))
     scan[180 + 45] = 10.0  # a false match far behind the wall, at 45.5 degrees

@@ -21,6 +21,7 @@ from tests.omnid.core.obstacles.drawn_floor import (
     stains,
     striped,
     worn,
+    worn_with_line,
 )
 
 WALL_M = 2.0
@@ -78,6 +79,14 @@ def test_directions_together_show_weak_floor_beside_the_base(columns: Columns) -
     found = evidence(columns, worn, striped)
     assert np.percentile(floor_at(columns, found, 1.0, 1.1), 5) > 0.5
     assert np.percentile(floor_at(columns, found, 1.15, 1.6), 5) > 2.0
+
+
+def test_a_line_painted_on_the_floor_hides_no_weak_texture_around_it(columns: Columns) -> None:
+    """Before and behind the line the evidence is that of the floor without it."""
+    bare, painted = (evidence(columns, floor, striped) for floor in (worn, worn_with_line))
+    for near_m, far_m in ((1.2, 1.4), (1.65, 1.8)):
+        without, beside = (floor_at(columns, found, near_m, far_m) for found in (bare, painted))
+        assert beside.mean() > 0.75 * without.mean() > 0.75
 
 
 def test_plain_wall_and_plain_floor_are_no_evidence(columns: Columns) -> None:
