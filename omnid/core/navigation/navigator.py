@@ -72,6 +72,7 @@ class Detour(NamedTuple):
     follower: Follower  # in odom
     leg: int  # of the path, to which it leads back
     s_m: float  # on that leg
+    length_m: float
 
 
 @dataclass(slots=True)
@@ -113,6 +114,7 @@ class Drive:
     around_unknown: bool = False  # floor that was not seen has stopped the base: it is an obstacle until it is passed
     searched_ns: int = -AGAIN_NS  # stamp of the last search
     no_way: str = ""  # why it was in vain
+    is_waiting: bool = False  # a way around is known that is longer than what it has waited is worth
 
     def in_odom(self, xy: Array, now: Situation) -> Array:
         """Return points (N, 2) of the path in odom."""
@@ -366,12 +368,16 @@ class Navigator:
             found = self._search(drive, now, around)
             if found is None and drive.around_unknown and first_m < math.inf:
                 found = self._search(drive, now, obstacles)
-            if found is not None:
+            # A long way round is taken once as much time was lost by waiting: nobody knows when the way is free again,
+            # and so at most twice the least time is lost (the ski rental problem).
+            worth_m = LOOK_M + pursuit.velocity_mps * drive.blocked_s
+            drive.is_waiting = found is not None and found.length_m - following.left_m > worth_m
+            if found is not None and not drive.is_waiting:
                 drive.detour, drive.nearest_m, drive.ways = found, math.inf, drive.ways + 1
                 following = drive.step(now)
                 return following, following.setpoint, CROSSES if share < 1.0 else ""
         elif not is_blocked and drive.detour is not None and self._can_go_straight(drive, now, around):
-            drive.rejoin(now, *drive.detour[1:])
+            drive.rejoin(now, drive.detour.leg, drive.detour.s_m)
             following = drive.step(now)
             wanted = following.setpoint
         # 3. Without a way around it, drive up to the obstacle and wait.
@@ -418,7 +424,7 @@ class Navigator:
         if isinstance(found, str):
             drive.no_way = found
             return None
-        return Detour(Follower(found, settings, speed_mps=now.speed_mps), *place)
+        return Detour(Follower(found, settings, speed_mps=now.speed_mps), *place, found.length_m)
 
     def _can_go_straight(self, drive: Drive, now: Situation, obstacles: Array) -> bool:
         """True if the goal is ahead and nothing is on the straight way to it."""
@@ -447,7 +453,7 @@ class Navigator:
     def _gives_up(self, drive: Drive, dt_s: float) -> bool:
         """True if for too long no way leads to a goal; paths and routes never give up."""
         drive.blocked_s += dt_s
-        return drive.paths[0].is_goal and 0 < self._settings.give_up_s < drive.blocked_s
+        return drive.paths[0].is_goal and not drive.is_waiting and 0 < self._settings.give_up_s < drive.blocked_s
 
     def _begins_to_give_way(self, drive: Drive, now: Situation) -> bool:
         """Begin to drive back along the trail; False where there is no free way back, or it is switched off."""

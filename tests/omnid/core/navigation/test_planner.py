@@ -236,3 +236,17 @@ def test_a_goal_that_cannot_be_reached_ends_with_what_is_in_the_way(
     assert answer.state is NavigationState.FAILED and base.t_s < 45.0
     assert answer.reason.startswith("no way to the goal, ") and "closes every way" in answer.reason
     assert clearance_m(base) > 0.02
+
+
+def test_a_long_way_round_is_taken_once_as_much_was_lost_by_waiting() -> None:
+    wall = (2.5, -3.5, 2.7, -0.5), (2.5, 0.5, 2.7, 3.5)
+    person = Boxes(*wall, (2.3, -0.3, 2.8, 0.3))
+    for leaves in (True, False):
+        base = to_goal(person, 5.0, 0.0)
+        base.run(60, lambda answer: answer.state is NavigationState.BLOCKED, rest_s=3.0)
+        assert abs(float(base.pose[1])) < 0.3, "it waits at the door"
+        base.boxes = Boxes(*wall) if leaves else person
+        assert base.run(90).state is NavigationState.REACHED
+        aside_m = max(abs(float(sample.pose[1])) for sample in base.samples)
+        assert aside_m < 0.3 if leaves else aside_m > 3.0
+        assert clearance_m(base) > 0.0
