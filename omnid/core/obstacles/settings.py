@@ -32,7 +32,8 @@ class RingSettings:
     max_range_m: Annotated[
         float,
         Meta(ge=1.5, le=50),
-        "longest range of an obstacle, m; it must reach beyond the nearest floor that both cameras see",
+        "longest range of an obstacle, m, 4.5 at most in the ring; "
+        "it must reach beyond the nearest floor that both cameras see",
     ] = 6.0
     min_points: int = 6  # matched points that make an obstacle of the map, within 3 degrees and the noise of the range
 
