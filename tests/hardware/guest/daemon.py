@@ -55,7 +55,6 @@ width_px = 512
 height_px = 512
 rate_hz = 0.0
 pixel_format = "MJPG"
-timeout_s = 8.0
 [pair]
 tolerance_ms = 1000.0
 [panorama]
@@ -65,7 +64,7 @@ features = 200
 max_gap_s = 60.0
 [motor]
 port = "/dev/omnid/motor"
-rate_hz = 2.0
+rate_hz = 5.0
 watchdog_ms = 5000
 [controller]
 arming = "automatic"

@@ -15,7 +15,8 @@ LIMIT_S = 400.0  # the clock of a guest on a busy host may run several times too
 
 def run(*command: str) -> str:
     done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
+    journal = ("journalctl", "-u", "omnid", "-n", "40")  # why a unit does not start
+    assert done.returncode == 0, done.stderr + subprocess.run(journal, capture_output=True, text=True).stdout
     return done.stdout.strip()
 
 
