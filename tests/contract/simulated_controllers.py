@@ -19,7 +19,7 @@ from drivers.motors.protocols.vesc import (
     PacketFramer,
     packet,
 )
-from drivers.motors.simulated.simulated_base import SIDES, SimulatedBase, SimulatedFirmware
+from drivers.motors.simulated.simulated_base import LEFT, RIGHT, SIDES, SimulatedBase, SimulatedFirmware
 from drivers.motors.simulated.simulated_line import SimulatedLine
 
 
@@ -32,6 +32,23 @@ class SimulatedController(Protocol):
 
     def feed(self, data: bytes) -> bytes:
         """Return the replies to received bytes."""
+
+
+def side_of(base: SimulatedBase, channel: int) -> int:
+    """Return the wheel, LEFT or RIGHT, of a channel, 0 or 1."""
+    return RIGHT if bool(channel) != base.drive.swapped else LEFT
+
+
+def command_channel(base: SimulatedBase, channel: int, speed_mps: float) -> None:
+    """Command the speed of one channel, 0 or 1."""
+    side = side_of(base, channel)
+    base.command_wheel(side, base.drive.to_sides(speed_mps, speed_mps)[side])
+
+
+def channels_mps(base: SimulatedBase) -> tuple[float, float]:
+    """Return the speeds of the channels."""
+    half_mps = base.yaw_rate_radps * base.drive.track_m / 2
+    return base.drive.to_channels(base.velocity_mps - half_mps, base.velocity_mps + half_mps)
 
 
 class SimulatedRoboteq(SimulatedFirmware):
@@ -53,7 +70,7 @@ class SimulatedRoboteq(SimulatedFirmware):
             if abs(int(command[2])) > MAX_RPM:
                 return None
             base.commands += 1
-            base.command_channel(int(command[1]) - 1, int(command[2]) / rpm_per_mps)
+            command_channel(base, int(command[1]) - 1, int(command[2]) / rpm_per_mps)
             return b"+"
         if setting := re.fullmatch(rb"\^(ECHOF|RWD) ([0-9]{1,5})", line):
             if setting[1] == b"ECHOF":
@@ -62,7 +79,7 @@ class SimulatedRoboteq(SimulatedFirmware):
                 base.watchdog_ms = int(setting[2])
             return b"+"
         return {
-            b"?S": b"S=%d:%d" % tuple(round(mps * rpm_per_mps) for mps in base.channels_mps()),
+            b"?S": b"S=%d:%d" % tuple(round(mps * rpm_per_mps) for mps in channels_mps(base)),
             b"?V 2": b"V=%d" % round(base.battery_v * 10),
             b"?FF": b"FF=%d" % base.fault,
             b"~RWD": b"RWD=%d" % base.watchdog_ms,
@@ -95,7 +112,7 @@ class SimulatedODrive(SimulatedFirmware):
         if not body.isascii() or with_checksum(body).rstrip() != frame:
             return self._reject(b"")
         for axis in SIDES:
-            if self.base.expired[self.base.side_of(axis)]:
+            if self.base.expired[side_of(self.base, axis)]:
                 self._state[axis] = _IDLE
         match = _ODRIVE_LINE.fullmatch(body)
         reply = self._reply(*match.groups()) if match else self._reject(b"unknown command")
@@ -111,21 +128,21 @@ class SimulatedODrive(SimulatedFirmware):
         turns_per_m = self.base.drive.turns_per_m
         if of_axis == "f":
             return b"%.6f %.6f" % (
-                self.base.channels_m()[number] * turns_per_m,
-                self.base.channels_mps()[number] * turns_per_m,
+                self.base.drive.to_channels(*self.base.travel_m)[number] * turns_per_m,
+                channels_mps(self.base)[number] * turns_per_m,
             )
-        self.base.feed(self.base.side_of(number))
+        self.base.feed(side_of(self.base, number))
         if of_axis == "v":  # a disarmed axis does not turn
             self.base.commands += 1
             self._input_vel[number] = float(speed or 0)
             if self._state[number] == CLOSED_LOOP:
-                self.base.command_channel(number, self._input_vel[number] / turns_per_m)
+                command_channel(self.base, number, self._input_vel[number] / turns_per_m)
         return b""
 
     def _read(self, name: str) -> bytes:
         values = {**self._settings, "vbus_voltage": self.base.battery_v}
         for axis in SIDES:
-            expired = self.base.expired[self.base.side_of(axis)]
+            expired = self.base.expired[side_of(self.base, axis)]
             values[f"axis{axis}.current_state"] = self._state[axis]
             values[f"axis{axis}.error"] = self.base.fault | WATCHDOG_EXPIRED * expired
         return b"%g" % values[name] if name in values else self._reject(b"invalid property")
@@ -142,12 +159,12 @@ class SimulatedODrive(SimulatedFirmware):
         return b""
 
     def _arm(self, axis: int, name: str, value: float) -> bytes:
-        side = self.base.side_of(axis)
+        side = side_of(self.base, axis)
         if name == "error":
             self.base.expired[side] = bool(int(value) & WATCHDOG_EXPIRED)
         elif value == CLOSED_LOOP and not self.base.expired[side] and not self.base.fault:
             self._state[axis] = CLOSED_LOOP
-            self.base.command_channel(axis, self._input_vel[axis] / self.base.drive.turns_per_m)
+            command_channel(self.base, axis, self._input_vel[axis] / self.base.drive.turns_per_m)
         return b""
 
 
@@ -183,19 +200,19 @@ class SimulatedVesc(SimulatedFirmware):
             return packet(head + bytes(range(256)) + bytes(150))
         if payload[0] == GET_VALUES_SELECTIVE:
             fields = {  # bit of the mask -> value
-                7: struct.pack(">i", round(base.channels_mps()[channel] * erpm_per_mps)),
+                7: struct.pack(">i", round(channels_mps(base)[channel] * erpm_per_mps)),
                 8: struct.pack(">h", round(base.battery_v * 10)),
                 15: bytes((base.fault,)),
                 17: bytes((can_id,)),
-                21: bytes((base.expired[base.side_of(channel)],)),
+                21: bytes((base.expired[side_of(base, channel)],)),
             }
             (mask,) = struct.unpack(">I", payload[1:])
             return packet(payload + b"".join(data for bit, data in fields.items() if mask >> bit & 1))
         if payload[0] == SET_RPM:
             base.commands += 1
-            base.command_channel(channel, struct.unpack(">i", payload[1:])[0] / erpm_per_mps)
+            command_channel(base, channel, struct.unpack(">i", payload[1:])[0] / erpm_per_mps)
         else:
-            base.feed(base.side_of(channel))
+            base.feed(side_of(base, channel))
         return b""
 
 

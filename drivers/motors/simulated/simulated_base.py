@@ -79,11 +79,6 @@ class SimulatedBase:
         self.command_wheel(LEFT, velocity_mps - half_mps)
         self.command_wheel(RIGHT, velocity_mps + half_mps)
 
-    def command_channel(self, channel: int, speed_mps: float) -> None:
-        """Command the speed of one channel, 0 or 1."""
-        side = self.side_of(channel)
-        self.command_wheel(side, self.drive.to_sides(speed_mps, speed_mps)[side])
-
     def command_wheel(self, side: int, speed_mps: float) -> None:
         """Command the speed of one wheel, forward positive, and feed its watchdog."""
         if self._needs_stop[side] and speed_mps != 0.0:
@@ -96,20 +91,6 @@ class SimulatedBase:
     def feed(self, side: int) -> None:
         """Feed the watchdog of one wheel."""
         self._since_command_s[side] = 0.0
-
-    def side_of(self, channel: int) -> int:
-        """Return the wheel, LEFT or RIGHT, of a channel, 0 or 1."""
-        return RIGHT if bool(channel) != self.drive.swapped else LEFT
-
-    def channels_mps(self) -> tuple[float, float]:
-        """Return the speeds of the channels."""
-        half_mps = self.yaw_rate_radps * self.drive.track_m / 2
-        return self.drive.to_channels(self.velocity_mps - half_mps, self.velocity_mps + half_mps)
-
-    def channels_m(self) -> tuple[float, float]:
-        """Return the distances travelled by the channels."""
-        left_m, right_m = self.travel_m
-        return self.drive.to_channels(left_m, right_m)
 
     def expire(self) -> None:
         """Let both watchdogs stop the wheels now."""

@@ -42,10 +42,8 @@ LONGEST_STEP_S: Final = 1.0  # A longer time between two poses counts as this, b
 NEARER_M: Final = 1.0
 ROUNDING_M: Final = 0.005  # Least change of the room between two points of a way.
 PASS_M: Final = 0.8  # room beside the outline in which a person passes
-REST_S, SPREAD_S = (
-    3.0,
-    4,
-)  # least wait after a way back; its spread, so that two robots that met move at different times
+# Least wait after a way back; its spread, so that two robots that met move at different times.
+REST_S, SPREAD_S = 3.0, 4
 # It goes on after this time in any case, to look; after twice the time when it is blocked again; at most so long.
 RETRY_S, LONGEST_RETRY_S = 10.0, 300.0
 
