@@ -102,10 +102,11 @@ class Daemon:
         return {short_name(status.name): status for status in statuses}
 
     def shoot(self, *cameras: Camera, age_s: float = 0.0, data: bytes = JPEG) -> None:
+        stamp_ns = time.monotonic_ns() - round(age_s * 1e9)
         for camera in cameras:
             self.cameras[camera].status = "streaming"
             self.cameras[camera].frames += 1
-            self.pair.process(Frame(0, time.monotonic_ns() - round(age_s * 1e9), camera, "jpeg", data))
+            self.pair.process(Frame(0, stamp_ns, camera, "jpeg", data))
 
     def pose(self, state: str = "tracking", age_s: float = 0.0) -> None:
         odometry = OdometryUpdate(
