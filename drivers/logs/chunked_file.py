@@ -25,8 +25,7 @@ from drivers.logs.compression import MAX_RECORD_BYTES
 from drivers.logs.log import ENTRY, MAX_DEFINITIONS, Entries, Topic
 
 _KEPT_CHUNKS: Final = 4  # that stay unpacked: both cameras, wheels and gyro may have been written one after the other
-CHANGED: Final = "one byte of it was changed"
-_NO_CHUNK: Final = -1  # offset of an entry outside of chunks, whose block is the begin of its record
+_NO_CHUNK: Final = 0  # block of a message outside of chunks, whose offset is in the file
 
 
 class RecordKind(Enum):
@@ -38,9 +37,13 @@ class RecordKind(Enum):
     SCHEMA = auto()
     CHANNEL = auto()
     ATTACHMENT = auto()
-    PLACE = auto()  # of a chunk, in the summary
     END = auto()  # of chunks and messages
+    PLACE = auto()  # of a chunk, behind that end
     OTHER = auto()
+
+
+_DEFINITIONS: Final = (RecordKind.SCHEMA, RecordKind.CHANNEL)
+_ENDS: Final = (RecordKind.END, RecordKind.PLACE)
 
 
 class Record(NamedTuple):
@@ -53,27 +56,19 @@ class Record(NamedTuple):
     fields: Mapping[bytes, bytes] = {}  # of a bag's record
     is_cut: bool = False  # the source ends within the content
 
-    @property
-    def is_definition(self) -> bool:
-        """True if it defines a channel or the type of one."""
-        return self.kind in (RecordKind.SCHEMA, RecordKind.CHANNEL)
 
+class Summary(NamedTuple):
+    """What a closed file states behind its data; nothing where that is corrupt."""
 
-class MessageHead(NamedTuple):
-    """What a message's record says beside its data."""
-
-    channel: int
-    time_ns: int
-    offset: int  # of its data in the source
-    size: int
+    definitions: Sequence[Record] = ()
+    chunks: Sequence[int] = ()  # where they begin
 
 
 class ByteSource:
     """Bytes of known size: an unpacked chunk."""
 
-    def __init__(self, data: bytes | memoryview, damaged: Sequence[int] = ()) -> None:
-        """damaged: offsets of bytes of which one was changed."""
-        self._view, self.damaged = memoryview(data), damaged
+    def __init__(self, data: bytes | memoryview) -> None:
+        self._view = memoryview(data)
         self.size = len(self._view)
 
     def read_bytes(self, offset: int, size: int) -> bytes | memoryview:
@@ -81,14 +76,12 @@ class ByteSource:
         return self._view[offset : offset + size]
 
     def content(self, offset: int, size: int) -> memoryview:
-        """Return bytes from offset; raise RecordError where they are too many, incomplete or damaged."""
+        """Return bytes from offset; raise RecordError where they are too many or incomplete."""
         if size > MAX_RECORD_BYTES:
             raise RecordError(f"{size} bytes are more than {MAX_RECORD_BYTES}")
         data = self.read_bytes(offset, size)
         if len(data) < size:
             raise RecordError(f"{len(data)} of {size} bytes could be read")
-        if any(offset <= at < offset + size for at in self.damaged):
-            raise RecordError(CHANGED)
         return memoryview(data)
 
 
@@ -109,7 +102,8 @@ class ChunkedFile(ByteSource, ABC):
         self._attached: list[Record] = []
         self._indexed: dict[int, int] = {}  # number of messages of a chunk by its index
         self._named: set[int] = set()  # channels that are in an index
-        self._chunks: dict[int, ByteSource] = {}  # the last ones that were unpacked
+        self._chunks: dict[int, tuple[ByteSource, Entries]] = {}  # the last ones that were unpacked
+        self._plain: dict[int, int] = {}  # by chunk: `_plain_begin`
         try:
             self._file = path.open("rb", buffering=0)
         except OSError as error:
@@ -119,20 +113,8 @@ class ChunkedFile(ByteSource, ABC):
     # What a format states
 
     @abstractmethod
-    def _summary(self) -> Iterator[Record]:
-        """Yield the definitions and places of chunks behind the data of a closed file; none where it is corrupt."""
-
-    @abstractmethod
-    def _place(self, record: Record) -> int:
-        """Return where the chunk begins whose place a record of the summary states; raise RecordError."""
-
-    @abstractmethod
-    def _is_closed(self) -> bool:
-        """True if the writer has completed the file, of which a part may have been lost since."""
-
-    @abstractmethod
-    def _is_whole(self, last: Record) -> bool:
-        """True if the last record of a file that is closed is the one that ends it."""
+    def _summary(self) -> Summary | None:
+        """Return what the writer has stated at the end of the file; None where it has not closed the file."""
 
     @abstractmethod
     def _records(self, source: ByteSource, start: int, end: int) -> Iterator[Record]:
@@ -146,8 +128,12 @@ class ChunkedFile(ByteSource, ABC):
         """
 
     @abstractmethod
-    def _head(self, source: ByteSource, message: Record) -> MessageHead:
-        """Return the head of a message; raise RecordError where it is malformed."""
+    def _plain_begin(self, chunk: Record) -> int:
+        """Return where in the file the records of a chunk begin, 0 where they are compressed."""
+
+    @abstractmethod
+    def _head(self, source: ByteSource, message: Record) -> tuple[int, int, int]:
+        """Return channel, time [ns] and offset of the data of a message; raise RecordError where it is malformed."""
 
     @abstractmethod
     def _index(self, record: Record, chunk: int) -> Entries:
@@ -176,17 +162,13 @@ class ChunkedFile(ByteSource, ABC):
 
     def entries(self) -> Iterator[Entries]:
         """Yield the places of all messages, chunk by chunk."""
-        is_closed, places = self._is_closed(), list[int]()
-        for record in self._summary() if is_closed else ():
+        summary = self._summary()
+        for record in summary.definitions if summary else ():
             with suppress(RecordError):  # then the data has the definition
-                if record.is_definition:
-                    self._define(self, record)
-                elif record.kind is RecordKind.PLACE:
-                    places.append(self._place(record))
+                self._define(self, record)
         chunk: Record | None = None  # the newest one, and the index behind it
-        index: list[Record] = []
-        last = Record(RecordKind.OTHER, 0, 0, self._start)
-        for record in self._with_jumps(sorted(places), is_closed=is_closed):
+        index, last = list[Record](), Record(RecordKind.OTHER, 0, 0, self._start)
+        for record in self._with_jumps(summary):
             last = record
             if record.kind is RecordKind.INDEX:
                 index.append(record)
@@ -194,11 +176,11 @@ class ChunkedFile(ByteSource, ABC):
             if chunk is not None:
                 yield self._of_chunk(chunk, index)
             chunk, index = (record if record.kind is RecordKind.CHUNK else None), []
-            if record.kind is RecordKind.MESSAGE or record.is_definition:
-                yield _entries([(head, at, _NO_CHUNK) for at, head in self._heads(self, [record]).items()])
-            elif record.kind is RecordKind.ATTACHMENT and len(self._attached) < MAX_DEFINITIONS:
+            if record.kind is RecordKind.ATTACHMENT and len(self._attached) < MAX_DEFINITIONS:
                 self._attached.append(record)
-        is_whole = is_closed and self._is_whole(last)
+            elif chunk is None:
+                yield self._scanned(self, [record], _NO_CHUNK, is_cut=True)
+        is_whole = summary is not None and last.kind in _ENDS
         if chunk is not None:
             yield self._of_chunk(chunk, index if is_whole else [])
         # Channels that are defined nowhere else are defined in chunks.
@@ -211,40 +193,51 @@ class ChunkedFile(ByteSource, ABC):
             end = min(last.offset + last.size, self.size)
             self.cut = f"the log {self.name!r} is cut or corrupt after byte {end} of {self.size}: used the data before"
 
-    def _with_jumps(self, places: Sequence[int], *, is_closed: bool) -> Iterator[Record]:
-        """Yield the records up to the one that ends them, and behind holes in the file those from the next chunk on.
-
-        places: begins of the chunks by the summary, sorted.
-        """
-        begin: int | None = self._start
-        while begin is not None:
+    def _with_jumps(self, summary: Summary | None) -> Iterator[Record]:
+        """Yield the records up to the end of the data, and behind holes in the file those from the next chunk on."""
+        places, begin = sorted(summary.chunks) if summary else [], self._start
+        while begin:
             end = begin
             for record in self._records(self, begin, self.size):
                 # A length that exceeds a file which was closed is a corrupt one; in another, its last chunk is cut.
-                if record.is_cut and (record.kind is not RecordKind.CHUNK or is_closed):
+                if record.is_cut and (record.kind is not RecordKind.CHUNK or summary):
                     break
                 yield record
-                if record.kind is RecordKind.END:
+                if record.kind in _ENDS:
                     return
                 end = record.offset + record.size
-            begin = next((place for place in places if place > end), None)
-            if begin is not None:
+            begin = next((place for place in places if place > end), 0)
+            if begin:
                 self.faults[f"the {begin - end} bytes from byte {end} on are no records"] += 1
 
-    def read(self, channel: int, time_ns: int, block: int, offset: int) -> memoryview:
-        """Return the bytes of the message of an entry; raise RecordError where they are not those that were written."""
-        is_loose = offset == _NO_CHUNK
-        source, begin = (self, block) if is_loose else (self._chunk(block), offset)
+    def read(self, channel: int, time_ns: int, block: int, offset: int, most: int = 0) -> memoryview:
+        """Return the bytes of the message of an entry; raise RecordError where they are not those that were written.
+
+        most: so many of the first ones are enough, whether the others are right or not; 0: all.
+        """
+        source, begin = self._where(block, offset, is_all=not most)
         try:
             record = next(self._records(source, begin, source.size), None)
             if record is not None and record.kind is RecordKind.MESSAGE:
-                head = self._head(source, record)
-                if head[:2] == (channel, time_ns):
-                    return source.content(begin, head.offset + head.size - begin)[head.offset - begin :]
+                *head, data = self._head(source, record)
+                if head == [channel, time_ns]:
+                    size = record.offset + record.size - data
+                    return source.content(data, min(size, most) if most else size)
         except RecordError as error:
             raise RecordError(f"the chunk at byte {block}: {error}") from error
-        fault = f": {CHANGED}" if source.damaged else f" has at its byte {offset} not what its index says"
-        raise RecordError(f"the chunk at byte {block}{fault}")
+        raise RecordError(f"the chunk at byte {block} has at its byte {offset} not what its index says")
+
+    def _where(self, block: int, offset: int, *, is_all: bool) -> tuple[ByteSource, int]:
+        """Return the source of a message and where it begins there: in the file, or in a chunk, which is checked."""
+        if block == _NO_CHUNK:
+            return self, offset
+        if not is_all:
+            if block not in self._plain:
+                chunk = next(self._records(self, block, self.size), None)
+                self._plain[block] = 0 if chunk is None else self._plain_begin(chunk)
+            if self._plain[block]:
+                return self, self._plain[block] + offset
+        return self._chunk(block)[0], offset
 
     def _of_chunk(self, chunk: Record, index: Sequence[Record]) -> Entries:
         """Return the entries of a chunk, by the index behind it or, without a valid one, by its content."""
@@ -253,62 +246,52 @@ class ChunkedFile(ByteSource, ABC):
                 found = np.concatenate([self._index(record, chunk.begin) for record in index])
                 self._indexed[chunk.begin] = len(found)
                 self._named.update(found["channel"].tolist())
-                return found[np.argsort(found["offset"])]
+                return found
         try:
-            source = self._chunk(chunk.begin)
+            return self._chunk(chunk.begin)[1]
         except RecordError as error:
             self.faults[str(error)] += 1
-            return _entries([])
-        heads = self._heads(source, self._records(source, 0, source.size))
-        return _entries([(head, chunk.begin, offset) for offset, head in heads.items()])
+            return np.empty(0, ENTRY)
 
-    def _chunk(self, begin: int) -> ByteSource:
-        """Return the content of a chunk, and learn the channels that it defines; raise RecordError."""
+    def _chunk(self, begin: int) -> tuple[ByteSource, Entries]:
+        """Return content and entries of a chunk, and learn the channels that it defines; raise RecordError."""
         found = self._chunks.pop(begin, None)
         if found is None:
             chunk = next(self._records(self, begin, self.size), None)
-            if chunk is None:
-                raise RecordError(f"the chunk at byte {begin} is gone")
             try:
-                found = self._unpack(chunk, self.content(chunk.offset, min(chunk.size, self.size - chunk.offset)))
+                if chunk is None:
+                    raise RecordError("it is gone")
+                source = self._unpack(chunk, self.content(chunk.offset, min(chunk.size, self.size - chunk.offset)))
             except RecordError as error:
                 raise RecordError(f"the chunk at byte {begin}: {error}") from error
-            heads = self._heads(found, self._records(found, 0, found.size), of=begin, is_cut=chunk.is_cut)
-            if found.damaged:  # which may be what _heads has found as well
-                self.faults[f"the chunk at byte {begin}: {CHANGED}"] += 1
-            elif begin in self._indexed and self._indexed[begin] != len(heads):
-                counts = f"{len(heads)} messages, {self._indexed[begin]} by its index"
+            entries = self._scanned(source, self._records(source, 0, source.size), begin, is_cut=chunk.is_cut)
+            if len(entries) != self._indexed.get(begin, len(entries)):
+                counts = f"{len(entries)} messages, {self._indexed[begin]} by its index"
                 self.faults[f"the chunk at byte {begin} has {counts}"] += 1
+            found = source, entries
         self._chunks[begin] = found
         if len(self._chunks) > _KEPT_CHUNKS:
             del self._chunks[next(iter(self._chunks))]
         return found
 
-    def _heads(
-        self, source: ByteSource, records: Iterable[Record], *, of: int = 0, is_cut: bool = True
-    ) -> dict[int, MessageHead]:
-        """Return the heads of the messages among records by their begins, and learn what the others define.
+    def _scanned(self, source: ByteSource, records: Iterable[Record], block: int, *, is_cut: bool) -> Entries:
+        """Return the entries of the messages among records, and learn what the others define.
 
-        of: begin of their chunk. is_cut: the last one need not be whole.
+        is_cut: the last one need not be whole.
         """
-        heads, end = {}, 0
+        found, end = [], 0
         for record in records:
             if record.is_cut:
                 break
             end = record.offset + record.size
             try:
-                if record.is_definition:
+                if record.kind in _DEFINITIONS:
                     self._define(source, record)
                 elif record.kind is RecordKind.MESSAGE:
-                    heads[record.begin] = self._head(source, record)
+                    channel, time_ns, _ = self._head(source, record)
+                    found.append((channel, time_ns, block, record.begin))
             except RecordError as error:
-                if not source.damaged:
-                    self.faults[f"the record at byte {record.begin} of the block at byte {of}: {error}"] += 1
-        if not (is_cut or source.damaged) and end != source.size:
-            self.faults[f"the chunk at byte {of}: its last record is not whole"] += 1
-        return heads
-
-
-def _entries(found: list[tuple[MessageHead, int, int]]) -> Entries:
-    """Return heads of messages with block and offset as entries."""
-    return np.array([(head.channel, head.time_ns, block, offset) for head, block, offset in found], ENTRY)
+                self.faults[f"the record at byte {record.begin} of the block at byte {block}: {error}"] += 1
+        if not is_cut and end != source.size:
+            self.faults[f"the chunk at byte {block}: its last record is not whole"] += 1
+        return np.array(found, ENTRY)

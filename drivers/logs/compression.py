@@ -58,9 +58,14 @@ def unpack_chunk(compression: bytes, data: memoryview, size: int) -> bytes | mem
     raise RecordError(f"its compression {compression!r} is unknown")
 
 
+def is_packed_message(data: bytes | memoryview) -> bool:
+    """True if rosbag2 has compressed this message by itself; its first bytes are enough."""
+    return bytes(data[: len(ZSTD)]) == ZSTD
+
+
 def unpack_message(data: memoryview) -> memoryview:
     """Return a message, unpacked where rosbag2 has compressed each message; raise RecordError where it is damaged."""
-    if bytes(data[: len(ZSTD)]) != ZSTD:
+    if not is_packed_message(data):
         return data
     try:
         stated = zstandard.get_frame_parameters(data).content_size

@@ -92,11 +92,14 @@ class ImageFolder:
             places = [(folder, stamp_ns, folder, number) for number, (stamp_ns, _) in enumerate(files)]
             yield np.array(places, ENTRY)
 
-    def read(self, channel: int, time_ns: int, block: int, offset: int) -> bytes:
-        """Return an image as a message, whose stamp is that of the image; raise RecordError where it is unreadable."""
+    def read(self, channel: int, time_ns: int, block: int, offset: int, most: int = 0) -> bytes:
+        """Return an image as a message, whose stamp is that of the image; raise RecordError where it is unreadable.
+
+        most: above 0 without the image.
+        """
         _, path = self._files[block][offset]
         try:
-            return compressed_image(time_ns, _read_regular(path, MAX_RECORD_BYTES))
+            return compressed_image(time_ns, b"" if most else _read_regular(path, MAX_RECORD_BYTES))
         except OSError as error:
             raise RecordError(f"{str(path)!r} cannot be read: {error.strerror}") from error
 

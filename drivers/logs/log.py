@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import RecordError
-from drivers.logs.compression import unpack_message
+from drivers.logs.compression import is_packed_message, unpack_message
 from drivers.logs.ros_messages import (
     IMAGE_TYPES,
     JointWheels,
@@ -64,8 +64,11 @@ class LogFile(Protocol):
     def entries(self) -> Iterator[Entries]:
         """Yield the places of all messages, in any order."""
 
-    def read(self, channel: int, time_ns: int, block: int, offset: int) -> bytes | memoryview:
-        """Return the bytes of the message of an entry; raise RecordError where they are not those that were written."""
+    def read(self, channel: int, time_ns: int, block: int, offset: int, most: int = 0) -> bytes | memoryview:
+        """Return the bytes of the message of an entry; raise RecordError where they are not those that were written.
+
+        most: so many of the first ones are enough, whether the others are right or not; 0: all.
+        """
 
     def attachments(self) -> dict[str, bytes]:
         """Return name -> bytes of the attachments, such as a rig; known after entries()."""
@@ -189,12 +192,17 @@ class Log:
         wanted = [number for number, name in enumerate(self.index.topics) if topics is None or name in topics]
         return np.asarray(self.index.order[np.isin(self.index.topic[self.index.order], wanted)])
 
-    def message(self, row: int) -> LoggedMessage | None:
-        """Return the message of a row of the index; None, and count it, where it cannot be read."""
+    def message(self, row: int, most: int = 0) -> LoggedMessage | None:
+        """Return the message of a row of the index; None, and count it, where it cannot be read.
+
+        most: so many of its first bytes are enough; 0: all. One that is compressed by itself is whole.
+        """
         index = self.index
         file, entry, name = self._files[index.file[row]], index.entries[row].item(), self._names[index.topic[row]]
         try:
-            data = file.read(*entry)
+            data = file.read(*entry, most)
+            if most and is_packed_message(data):
+                data = file.read(*entry)
         except RecordError as error:
             if not self._closed:
                 file.faults[str(error)] += 1

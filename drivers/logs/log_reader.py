@@ -19,7 +19,7 @@ from drivers.frame import CAMERAS, SAMPLE_BITS, Camera, Frame, gray, is_deep
 from drivers.logs.image_times import STEP_NS, ImageTimes, LoggedImages, TimeSource
 from drivers.logs.log import LoggedMessage
 from drivers.logs.open_log import open_log
-from drivers.logs.ros_messages import IMU, RosImage
+from drivers.logs.ros_messages import HEADER_BYTES, IMU, RosImage
 from drivers.logs.topics import MotionChoice, MotionTopics, choose_motion_topics, choose_topics
 from drivers.motion import MotionSample, WheelSample
 
@@ -158,17 +158,19 @@ class LogReader:
         topic, run_ns = log.index.topic[rows], log.index.run_ns[rows]
         # 1. Headers; a message without one may be broken.
         header_ns, repeats, broken = run_ns.copy(), np.zeros(len(rows), np.bool_), dict[int, str]()
-        last: dict[int, tuple[int, LoggedMessage]] = {}
+        last: dict[int, tuple[int, int]] = {}  # by topic: header and row of the message before
         for n, (row, number) in enumerate(zip(rows.tolist(), topic.tolist(), strict=True)):
-            message = None if self._time == "log" or self._closed else log.message(row)
+            message = None if self._time == "log" or self._closed else log.message(row, HEADER_BYTES)
             if message is None:
                 continue
             try:
                 header_ns[n] = found_ns = message.header_ns()
-                before_ns, before = last.get(number, (0, message))
+                before_ns, row_before = last.get(number, (0, row))
+                last[number] = found_ns, row
                 if names[number] in self._cameras.values() and (not found_ns or found_ns == before_ns):
-                    repeats[n] = message.image().data == before.image().data and found_ns == before_ns > 0
-                last[number] = found_ns, message
+                    here, before = (log.message(one) for one in (row, row_before))
+                    if here and before:
+                        repeats[n] = here.image().data == before.image().data and found_ns == before_ns > 0
             except FrameDecodeError as error:
                 broken[n] = str(error)
         # 2. Stamps.

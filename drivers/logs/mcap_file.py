@@ -19,10 +19,9 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Schema
-from numpy.typing import NDArray
 
 from drivers.errors import RecordError
-from drivers.logs.chunked_file import ByteSource, ChunkedFile, MessageHead, Record, RecordKind
+from drivers.logs.chunked_file import ByteSource, ChunkedFile, Record, RecordKind, Summary
 from drivers.logs.compression import MAX_RECORD_BYTES, unpack_chunk
 from drivers.logs.log import (
     ENTRY,
@@ -37,9 +36,6 @@ from drivers.logs.log import (
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 MAX_ALL_ATTACHMENTS_BYTES: Final = 64 * 2**20
-
-# Of a chunk that was changed at several bytes, one in 16 of this size looks as if one byte was changed.
-MAX_SEARCHED_BYTES: Final = 2**20
 
 _HEAD: Final = struct.Struct("<BQ")  # of a record: opcode, length of the content
 _CHUNK: Final = struct.Struct("<QQQII")  # first and last log time, unpacked size, CRC, length of the compression's name
@@ -69,8 +65,6 @@ class McapFile(ChunkedFile):
     def __init__(self, path: Path, name: str) -> None:
         self._types: dict[int, str] = {}  # by schema
         super().__init__(path, MAGIC, name)
-        footer = self._footer()
-        self.is_indexed = footer is None or _FOOTER.unpack_from(footer, _HEAD.size)[0] != 0
 
     def attachments(self) -> dict[str, bytes]:
         """Return name -> bytes of the attachments that are valid and within the limits."""
@@ -87,31 +81,26 @@ class McapFile(ChunkedFile):
                     found[attachment.name[:MAX_NAME]] = attachment.data
         return found
 
-    def _is_closed(self) -> bool:
-        return self._footer() is not None
-
-    def _is_whole(self, last: Record) -> bool:
-        return last.kind is RecordKind.END
-
-    def _footer(self) -> bytes | None:
-        """Return the footer record of a complete file, None without one."""
+    def _summary(self) -> Summary | None:
+        # 1. The footer, which ends a closed file.
         size = _HEAD.size + _FOOTER.size
         end = self.read_bytes(max(0, self.size - size - len(MAGIC)), size + len(MAGIC))
-        if len(end) < size + len(MAGIC) or not end.endswith(MAGIC):
+        footer = end[:size]
+        if end[size:] != MAGIC or _HEAD.unpack_from(footer) != (Opcode.FOOTER, _FOOTER.size):
             return None
-        return end[:size] if _HEAD.unpack_from(end) == (Opcode.FOOTER, _FOOTER.size) else None
-
-    def _summary(self) -> Iterator[Record]:
-        footer = self._footer() or b""
         start, _, crc = _FOOTER.unpack_from(footer, _HEAD.size)
-        size = self.size - len(MAGIC) - len(footer) - start
-        if start and 0 < size <= MAX_RECORD_BYTES:
-            section = self.read_bytes(start, size)
-            if len(section) == size and (not crc or zlib.crc32(section + footer[:-_CRC_BYTES]) == crc):
-                yield from self._records(self, start, start + size)
-
-    def _place(self, record: Record) -> int:
-        return int(_PLACE.unpack(self.content(record.offset, _PLACE.size))[2])
+        self.is_indexed = start > 0
+        # 2. The summary before it.
+        size = self.size - len(MAGIC) - size - start
+        section = self.read_bytes(start, size) if start and 0 < size <= MAX_RECORD_BYTES else b""
+        if len(section) != size or (crc and zlib.crc32(section + footer[:-_CRC_BYTES]) != crc):
+            return Summary()
+        records = list(self._records(self, start, start + size))
+        places = [record for record in records if record.kind is RecordKind.PLACE and record.size >= _PLACE.size]
+        return Summary(
+            [record for record in records if record.kind in (RecordKind.SCHEMA, RecordKind.CHANNEL)],
+            [_PLACE.unpack(self.content(record.offset, _PLACE.size))[2] for record in places],
+        )
 
     def _records(self, source: ByteSource, start: int, end: int) -> Iterator[Record]:
         offset = start
@@ -138,21 +127,22 @@ class McapFile(ChunkedFile):
             raise RecordError("its header is truncated") from error
         packed = data[name_end + _SIZE.size :][:packed_size]
         unpacked = unpack_chunk(bytes(data[_CHUNK.size : name_end][:MAX_NAME]), packed, size)
-        found_crc = zlib.crc32(unpacked) if crc else 0
-        if chunk.is_cut or (found_crc == crc and len(packed) == packed_size and len(unpacked) == size):
-            return ByteSource(unpacked)
-        damaged = changed_bytes(found_crc ^ crc, size) if len(unpacked) == size <= MAX_SEARCHED_BYTES else []
-        if not damaged:
+        is_right = len(packed) == packed_size and len(unpacked) == size and (not crc or zlib.crc32(unpacked) == crc)
+        if not (is_right or chunk.is_cut):
             raise RecordError("its content does not match its size and CRC")
-        return ByteSource(unpacked, damaged)
+        return ByteSource(unpacked)
 
-    def _head(self, source: ByteSource, message: Record) -> MessageHead:
+    def _plain_begin(self, chunk: Record) -> int:
+        head = self.read_bytes(chunk.offset, _CHUNK.size)
+        is_plain = len(head) == _CHUNK.size and _CHUNK.unpack(head)[-1] == 0
+        return chunk.offset + _CHUNK.size + _SIZE.size if is_plain else 0
+
+    def _head(self, source: ByteSource, message: Record) -> tuple[int, int, int]:
         try:
             found = _MESSAGE.unpack(source.read_bytes(message.offset, min(message.size, _MESSAGE.size)))
         except struct.error as error:
             raise RecordError(f"a message record of {message.size} bytes is too short") from error
-        time_ns = min(found[2], LATEST_NS)
-        return MessageHead(found[0], time_ns, message.offset + _MESSAGE.size, message.size - _MESSAGE.size)
+        return found[0], min(found[2], LATEST_NS), message.offset + _MESSAGE.size
 
     def _index(self, record: Record, chunk: int) -> Entries:
         body = self.content(record.offset, record.size)
@@ -180,32 +170,6 @@ class McapFile(ChunkedFile):
             raise RecordError(f"the schema {found.schema_id} of the channel {found.id} is unknown")
         kind = self._types.get(found.schema_id, "") if found.message_encoding in ("cdr", "ros1") else ""
         self.topics[found.id] = Topic(found.topic[:MAX_NAME], kind, found.message_encoding != "ros1")
-
-
-def changed_bytes(difference: int, size: int) -> list[int]:
-    """Return the offsets in data of a size at which one changed byte explains the difference of two CRC-32.
-
-    A CRC is linear: of two messages that differ in one byte the CRCs differ by that byte's entry of the table, advanced
-    by a zero for each byte behind it. The difference is taken back by as many zeros as there are, which is linear as
-    well, so the step of 2 k zeros is that of k zeros twice.
-    """
-    table = np.array([zlib.crc32(bytes([value])) ^ zlib.crc32(b"\0") for value in range(256)], np.uint32)
-    by_last = np.argsort(table >> 24)  # each last byte is that of one entry
-
-    def back(state: NDArray[np.uint32]) -> NDArray[np.uint32]:
-        entry = by_last[state >> 24]
-        return np.asarray((state ^ table[entry]) << 8 | entry.astype(np.uint32), np.uint32)
-
-    # The step as a table for each byte of the state.
-    step = [back(np.arange(256, dtype=np.uint32) << np.uint32(shift)) for shift in (0, 8, 16, 24)]
-    states = np.array([difference], np.uint32)
-    while len(states) < size:
-        after, *rest = [
-            step[0][part & 255] ^ step[1][part >> 8 & 255] ^ step[2][part >> 16 & 255] ^ step[3][part >> 24]
-            for part in (states, *step)
-        ]
-        states, step = np.concatenate([states, after]), rest
-    return (size - 1 - np.flatnonzero(np.isin(states[:size], table[1:]))).tolist()
 
 
 def ros_name(schema_name: str) -> str:

@@ -8,15 +8,13 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from contextlib import suppress
-from itertools import islice
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from drivers.errors import RecordError
-from drivers.logs.chunked_file import ByteSource, ChunkedFile, MessageHead, Record, RecordKind
+from drivers.logs.chunked_file import ByteSource, ChunkedFile, Record, RecordKind, Summary
 from drivers.logs.compression import unpack_chunk
 from drivers.logs.log import ENTRY, MAX_DEFINITION_BYTES, MAX_DEFINITIONS, MAX_NAME, Entries, Topic
 
@@ -38,26 +36,21 @@ class Ros1Bag(ChunkedFile):
 
     def __init__(self, path: Path, name: str) -> None:
         super().__init__(path, MAGIC, name)
-        self._index_begin, self._indexed_records = 0, 0  # as the first record states them
-        for bag in islice(self._records(self, self._start, self.size), 1):
-            with suppress(RecordError):
-                self._indexed_records = _number(bag, b"conn_count") + _number(bag, b"chunk_count")
-                self._index_begin = _numbers(bag, b"index_pos", 1, "Q")[0]
-        self.is_indexed = self._is_closed()
 
-    def _is_closed(self) -> bool:
-        return self._start < self._index_begin < self.size
-
-    def _is_whole(self, last: Record) -> bool:
-        records = self._records(self, self._index_begin, self.size)
-        return sum(not record.is_cut for record in records) >= self._indexed_records
-
-    def _summary(self) -> Iterator[Record]:
-        records = self._records(self, self._index_begin, self.size)
-        yield from (record for record in records if not record.is_cut)
-
-    def _place(self, record: Record) -> int:
-        return _numbers(record, b"chunk_pos", 1, "Q")[0]
+    def _summary(self) -> Summary | None:
+        try:
+            bag = next(self._records(self, self._start, self.size))
+            (begin,) = _numbers(bag, b"index_pos", 1, "Q")
+            expected = _number(bag, b"conn_count") + _number(bag, b"chunk_count")
+        except (StopIteration, RecordError):
+            return None
+        if not self._start < begin < self.size:
+            return None
+        records = [record for record in self._records(self, begin, self.size) if not record.is_cut]
+        places = [record for record in records if record.kind is RecordKind.PLACE and b"chunk_pos" in record.fields]
+        definitions = [record for record in records if record.kind is RecordKind.CHANNEL]
+        found = Summary(definitions, [int.from_bytes(place.fields[b"chunk_pos"], "little") for place in places])
+        return found if len(records) >= expected else None
 
     def _records(self, source: ByteSource, start: int, end: int) -> Iterator[Record]:
         offset = start
@@ -84,9 +77,12 @@ class Ros1Bag(ChunkedFile):
             raise RecordError("its content does not match its size")
         return ByteSource(unpacked)
 
-    def _head(self, source: ByteSource, message: Record) -> MessageHead:
+    def _plain_begin(self, chunk: Record) -> int:
+        return chunk.offset if chunk.fields.get(b"compression") == b"none" else 0
+
+    def _head(self, source: ByteSource, message: Record) -> tuple[int, int, int]:
         seconds, nanoseconds = _numbers(message, b"time", 2)
-        return MessageHead(_number(message, b"conn"), seconds * 10**9 + nanoseconds, message.offset, message.size)
+        return _number(message, b"conn"), seconds * 10**9 + nanoseconds, message.offset
 
     def _index(self, record: Record, chunk: int) -> Entries:
         body = self.content(record.offset, record.size)

@@ -22,6 +22,7 @@ ODOMETRY: Final = "nav_msgs/msg/Odometry"
 IMU: Final = "sensor_msgs/msg/Imu"
 JOINT_STATE: Final = "sensor_msgs/msg/JointState"
 BASE_FRAME: Final = "base_link"  # Frame of messages whose axes are those of the base (REP 105), as omnid records them.
+HEADER_BYTES: Final = 12  # of a message that begins with a header: those that tell its stamp
 NOT_MEASURED: Final = -1.0  # first number of the covariance of what an IMU does not measure (sensor_msgs/msg/Imu)
 
 # cv_bridge's names for images without declared colours, in OpenCV's order bgr, and image_encodings.hpp's names of YUV
@@ -164,8 +165,8 @@ def _decoded(kind: str, message: memoryview, aligned: bool) -> Any:
 
 def header_ns(message: memoryview, *, aligned: bool = True) -> int:
     """Return the stamp of the header with which images, wheels and IMUs begin; 0 where it is unset or cut."""
-    start = bytes(message[:12])
-    if len(start) < 12:
+    start = bytes(message[:HEADER_BYTES])
+    if len(start) < HEADER_BYTES:
         return 0
     # CDR states its byte order; ROS 1 begins with a sequence number, and its seconds have no sign.
     layout = ("<4xiI" if start[1] & 1 else ">4xiI") if aligned else "<4xII"

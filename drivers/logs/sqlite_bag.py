@@ -38,8 +38,11 @@ _TOPICS: Final = (
     f"SELECT id, substr(name, 1, 256), substr(type, 1, 256), serialization_format FROM topics LIMIT {MAX_DEFINITIONS}"
 )
 # Indexes are not used: a damaged one would leave rows out without an error.
-_ROWS: Final = "SELECT topic_id, timestamp, rowid, length(data) FROM messages NOT INDEXED ORDER BY rowid"
-_DATA: Final = "SELECT data FROM messages WHERE rowid = ?"
+_ROWS: Final = (
+    "SELECT topic_id, timestamp, rowid, length(data) FROM messages NOT INDEXED WHERE rowid >= ? ORDER BY rowid"
+)
+_FIRST_ROW: Final = -(2**63) + 1
+_DATA: Final = "SELECT substr(data, 1, ?) FROM messages WHERE rowid = ?"
 _FAULTS: Final = (sqlite3.Error, OverflowError)
 
 
@@ -76,23 +79,50 @@ class SqliteBag:
         }
 
     def entries(self) -> Iterator[Entries]:
-        """Yield the places of all messages, as far as the file can be read."""
+        """Yield the places of all messages; behind pages that cannot be read, those from the next readable one on."""
         places: list[tuple[int, int, int, int]] = []
-        try:
-            for channel, time_ns, row, size in self._bag.execute(_ROWS):
-                if all(isinstance(value, int) for value in (channel, time_ns, size)):
-                    places.append((channel, time_ns, 0, row))
-                else:
-                    self.faults[f"row {row} of the table messages has no topic, time or data"] += 1
-        except _FAULTS as error:
-            line = f"is cut or corrupt after {len(places)} messages ({_line(error)}): used those before"
-            self.cut = f"the bag {self.name!r} {line}"
+        start, row, count = _FIRST_ROW, _FIRST_ROW - 1, 0
+        while True:
+            try:
+                for channel, time_ns, row, size in self._bag.execute(_ROWS, (start,)):
+                    count += 1
+                    if all(isinstance(value, int) for value in (channel, time_ns, size)):
+                        places.append((channel, time_ns, 0, row))
+                    else:
+                        self.faults[f"row {row} of the table messages has no topic, time or data"] += 1
+                break
+            except _FAULTS as error:
+                found = self._next_readable(row + 1)
+                if found is None or found <= start:
+                    line = f"is cut or corrupt after {count} messages ({_line(error)}): used those before"
+                    self.cut = f"the bag {self.name!r} {line}"
+                    break
+                self.faults[f"rows {row + 1} to {found - 1} of the table messages: {_line(error)}"] += 1
+                start = found
         yield np.array(places, ENTRY)
 
-    def read(self, channel: int, time_ns: int, block: int, offset: int) -> bytes:
-        """Return the bytes of the message of an entry; raise RecordError where they cannot be read."""
+    def _next_readable(self, row: int) -> int | None:
+        """Return the first row from which on rows can be read; None where the last one cannot."""
         try:
-            row = self._bag.execute(_DATA, (offset,)).fetchone()
+            end = int(self._bag.execute("SELECT max(rowid) FROM messages").fetchone()[0])
+        except (*_FAULTS, TypeError):  # TypeError: no row at all
+            return None
+        while row < end:
+            middle = (row + end) // 2
+            try:
+                self._bag.execute(f"{_ROWS} LIMIT 1", (middle,)).fetchone()
+                end = middle
+            except _FAULTS:
+                row = middle + 1
+        return end
+
+    def read(self, channel: int, time_ns: int, block: int, offset: int, most: int = 0) -> bytes:
+        """Return the bytes of the message of an entry; raise RecordError where they cannot be read.
+
+        most: so many of the first ones are enough; 0: all.
+        """
+        try:
+            row = self._bag.execute(_DATA, (most or MAX_RECORD_BYTES, offset)).fetchone()
         except _FAULTS as error:
             raise RecordError(f"row {offset} of the table messages: {_line(error)}") from error
         if row is None or not isinstance(row[0], bytes):

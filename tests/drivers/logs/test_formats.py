@@ -532,6 +532,19 @@ def test_a_cut_database_is_read_up_to_its_end(tmp_path: Path, part: float) -> No
     assert log_info(path).state is LogState.BROKEN
 
 
+@pytest.mark.parametrize("part", [0.6, 0.8])
+def test_behind_a_page_of_a_database_that_was_not_written_reading_goes_on(tmp_path: Path, part: float) -> None:
+    path = write_db3(tmp_path / "bag", pairs(60))
+    data, page = bytearray(path.read_bytes()), 4096
+    at = int(part * len(data)) // page * page
+    data[at : at + page] = bytes(page)
+    path.write_bytes(data)
+    found, reader = read(path)
+    assert 100 < len(found) < 120 and {frame[2:] for frame in found} < {frame[2:] for frame in expected(60)}
+    assert len(reader.warnings) == 1 and re.search(r"rows \d+ to \d+ of the table messages", reader.warnings[0])
+    assert log_info(path).state is LogState.BROKEN and not reader.truncated
+
+
 SQL_OF_OTHER_TABLES: Final = {
     "no bag": ["DROP TABLE messages"],
     "columns in another order": [
