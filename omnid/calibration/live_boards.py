@@ -22,8 +22,8 @@ from drivers.frame import FrameSource, gray
 from omnid.calibration.board_search import AnyBoard, search_board
 from omnid.calibration.images import SIDES, Image, middle_px
 from omnid.errors import OmnidError
-from omnid.transport.codec import OK, DiagnosticStatus
-from omnid.transport.status_names import CALIBRATION, Key
+from omnid.transport.codec import DiagnosticStatus
+from omnid.transport.status_names import CALIBRATION, Key, entry
 
 HOURS: Final = 12  # sectors; hour 12 is the top of the image
 RINGS: Final = 3  # Number of rings of equal width from the hub to the rim.
@@ -194,10 +194,7 @@ def status(boards: LiveBoards, outcome: PairOutcome) -> DiagnosticStatus:
     values = {Key.PAIRS: str(boards.pairs), Key.NEEDED: str(NEEDED_PAIRS)}
     for key, coverage in zip((Key.LOWER_COVERAGE, Key.UPPER_COVERAGE), boards.coverage, strict=False):
         values[key] = "".join(str(min(9, count)) for count in coverage.counts().ravel())
-    missing = "; ".join(boards.missing())
-    if missing:
-        values[Key.MISSING] = missing
-    return DiagnosticStatus(CALIBRATION, OK, str(outcome), {str(k): v for k, v in values.items()})
+    return entry(CALIBRATION, {**values, Key.MISSING: "; ".join(boards.missing()), "_outcome": outcome})
 
 
 def newest_pairs(lower: FrameSource, upper: FrameSource) -> Iterator[tuple[Image, Image]]:

@@ -6,23 +6,24 @@ import logging
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from textwrap import wrap
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.frame import CAMERAS
 from omnid.config import Config
 from omnid.core.rig.rig_health import RigHealth
-from omnid.core.stereo.tiles import Side
+from omnid.core.stereo.tiles import SIDES, Side
 from omnid.engine.logging_setup import HANDLER, log
 from omnid.engine.telemetry import SummaryRow
 from omnid.messages import OdometryUpdate
-from omnid.stages.image_loss import LOSSY_SHARE
 from omnid.stages.synchronise import FROZEN_IMAGES, Synchronise
 from omnid.tracking_state import TrackingState
+from omnid.transport.status_names import NOTABLE_SHARE
 
 
 class RunStatistics:
@@ -191,9 +192,57 @@ class Progress:
             HANDLER.show("")
 
 
-# Share of the pairs that were dark, had lost parts or no sure pose, from which there is a warning. Fewer pairs without
-# a sure pose are a gap, whose first pose may imply any speed.
-NOTABLE_SHARE: Final = LOSSY_SHARE
+# Warnings about the input of a run over a log: a condition on its totals, and words with keys of them in braces.
+WARNINGS: Final[tuple[tuple[Callable[[Mapping[str, Any]], object], str], ...]] = (
+    (lambda s: s["fault"], "{broken} images could not be decoded; the first: {fault}"),
+    (
+        lambda s: not s["pairs"] and s["closest_ms"] is None,
+        "no pair of images: one camera or both have none, see the drops below",
+    ),
+    (
+        lambda s: not s["pairs"] and s["closest_ms"] is not None,
+        "no pair of images: the stamps of the two cameras are at least {closest_ms:.3f} ms apart, pair.tolerance_ms is "
+        "{tolerance_ms:g}: increase it, or correct the clocks of the cameras",
+    ),
+    (
+        lambda s: s["pairs"] and min(s["unpaired_lower"], s["unpaired_upper"]) > s["pairs"],
+        "most images of both cameras found no partner: the closest ones are {closest_ms:.3f} ms apart, "
+        "pair.tolerance_ms is {tolerance_ms:g}; if no images are missing, synchronise the cameras",
+    ),
+    *(
+        (
+            lambda s, camera=camera: s[f"frozen_{camera}"] >= FROZEN_IMAGES,
+            f"the {camera} camera was frozen: {{repeated_{camera}}} of its images had all pixels as before, "
+            f"{{frozen_{camera}}} in a row; {{of_repeated}}",
+        )
+        for camera in CAMERAS
+    ),
+    (lambda s: s["rig"], "{rig}"),
+    (
+        lambda s: s["dark"] > s["poses"] * NOTABLE_SHARE,
+        "it was too dark in {dark} of {poses} pairs: the images have more noise than contrast; more light, a longer "
+        "exposure (cameras.exposure_us) or less gain",
+    ),
+    *(
+        (
+            lambda s, side=side: s[f"lost_{side}"] > s["poses"] * NOTABLE_SHARE,
+            f"a part of the {side} camera's image was frozen, dark, saturated or blurred in {{lost_{side}}} of "
+            "{poses} pairs: it was not used; clean the mirror, check the camera and its driver",
+        )
+        for side in SIDES
+    ),
+    (
+        lambda s: s["too_fast"] and s["unsure"] > s["poses"] * NOTABLE_SHARE,
+        "the pose was lost or degraded in {unsure} of {poses} pairs, and the images show up to {fastest_mps:.1f} m/s: "
+        "poses that imply more than odometry.limits.max_speed_mps = {limit_mps:g} are refused; raise it if the robot "
+        "is that fast",
+    ),
+    (
+        lambda s: not (s["too_fast"] and s["unsure"] > s["poses"] * NOTABLE_SHARE) and s["lost"] > s["poses"] / 2,
+        "the pose was lost in {lost} of {poses} pairs: is the rig that of these cameras, is --lower the lower one, are "
+        "the images bright and sharp?",
+    ),
+)
 REPEATED: Final = {
     "drop": "their pairs were left out; a simulator without noise needs pair.repeated_images = 'use'",
     "use": "they were used, as pair.repeated_images says",
@@ -201,66 +250,23 @@ REPEATED: Final = {
 
 
 def input_warnings(pairing: Synchronise, rig: RigHealth, statistics: RunStatistics, config: Config) -> Iterator[str]:
-    """Yield one line for each problem of the input."""
-    yield from _image_warnings(pairing, config)
-    if rig.warning:
-        yield rig.warning
-    yield from _pose_warnings(statistics, config)
-
-
-def _image_warnings(pairing: Synchronise, config: Config) -> Iterator[str]:
-    """Yield the problems of the images and their stamps."""
-    counts = pairing.counts
-    if pairing.fault:
-        yield f"{counts['broken']} images could not be decoded; the first: {pairing.fault}"
-    if not counts["pairs"]:
-        yield _no_pair(pairing.closest_miss_ms, pairing.tolerance_ms)
-    elif min(counts["unpaired_lower"], counts["unpaired_upper"]) > counts["pairs"]:
-        closest_ms = pairing.closest_miss_ms or 0.0
-        yield (
-            f"most images of both cameras found no partner: the closest ones are {closest_ms:.3f} ms apart, "
-            f"pair.tolerance_ms is {pairing.tolerance_ms:g}; if no images are missing, synchronise the cameras"
-        )
-    for camera, images in pairing.repeated.items():
-        if images.longest >= FROZEN_IMAGES:
-            yield (
-                f"the {camera} camera was frozen: {images.count} of its images had all pixels as before, "
-                f"{images.longest} in a row; {REPEATED[config.pair.repeated_images]}"
-            )
-
-
-def _pose_warnings(statistics: RunStatistics, config: Config) -> Iterator[str]:
-    """Yield the problems that the odometry has met: dark pairs, parts of images without use, lost poses."""
-    if statistics.dark > statistics.poses * NOTABLE_SHARE:
-        yield (
-            f"it was too dark in {statistics.dark} of {statistics.poses} pairs: the images have more noise than "
-            "contrast; more light, a longer exposure (cameras.exposure_us) or less gain"
-        )
-    for camera, pairs in statistics.lost_parts.items():
-        if pairs > statistics.poses * NOTABLE_SHARE:
-            yield (
-                f"a part of the {camera} camera's image was frozen, dark, saturated or blurred in {pairs} of "
-                f"{statistics.poses} pairs: it was not used; clean the mirror, check the camera and its driver"
-            )
+    """Yield one line for each problem of the input: of images and stamps, of the rig, and that odometry has met."""
     lost = statistics.states[TrackingState.LOST]
-    unsure = lost + statistics.states[TrackingState.DEGRADED]
-    if statistics.too_fast and unsure > statistics.poses * NOTABLE_SHARE:
-        yield (
-            f"the pose was lost or degraded in {unsure} of {statistics.poses} pairs, and the images show up to "
-            f"{statistics.fastest_mps:.1f} m/s: poses that imply more than odometry.limits.max_speed_mps = "
-            f"{config.odometry.limits.max_speed_mps:g} are refused; raise it if the robot is that fast"
-        )
-    elif lost > statistics.poses / 2:
-        yield (
-            f"the pose was lost in {lost} of {statistics.poses} pairs: is the rig that of these cameras, "
-            "is --lower the lower one, are the images bright and sharp?"
-        )
-
-
-def _no_pair(closest_ms: float | None, tolerance_ms: float) -> str:
-    if closest_ms is None:
-        return "no pair of images: one camera or both have none, see the drops below"
-    return (
-        f"no pair of images: the stamps of the two cameras are at least {closest_ms:.3f} ms apart, "
-        f"pair.tolerance_ms is {tolerance_ms:g}: increase it, or correct the clocks of the cameras"
-    )
+    totals: dict[str, object] = {
+        **pairing.counts,
+        **{f"frozen_{camera}": images.longest for camera, images in pairing.repeated.items()},
+        **{f"lost_{side}": statistics.lost_parts[side] for side in SIDES},
+        "fault": pairing.fault,
+        "closest_ms": pairing.closest_miss_ms,
+        "tolerance_ms": pairing.tolerance_ms,
+        "of_repeated": REPEATED[config.pair.repeated_images],
+        "rig": rig.warning,
+        "poses": statistics.poses,
+        "dark": statistics.dark,
+        "lost": lost,
+        "unsure": lost + statistics.states[TrackingState.DEGRADED],
+        "too_fast": statistics.too_fast,
+        "fastest_mps": statistics.fastest_mps,
+        "limit_mps": config.odometry.limits.max_speed_mps,
+    }
+    yield from (words.format_map(totals) for holds, words in WARNINGS if holds(totals))

@@ -131,6 +131,15 @@ class RobotClock:
         """Return the time since a Unix time; below 0 where it is to come."""
         return self.monotonic_ns() - self.stamp_ns(unix_ns)
 
+    def stats(self) -> dict[str, object]:
+        """Return the steps of the clock, and of the newest its size and the time since it [s]."""
+        self.follow()
+        stats: dict[str, object] = {"steps": self.steps}
+        if self.steps:
+            change_s, since_s = (ns * S_PER_NS for ns in (self.step.change_ns, self.monotonic_ns() - self.step.at_ns))
+            stats |= {"step_s": f"{change_s:.3f}", "since_s": round(since_s), "_step": self.step.words}
+        return stats
+
     def _measured(self) -> tuple[int, int, int]:
         """Return the offset, its largest error, and the time of the measurement [ns]."""
         readings = []

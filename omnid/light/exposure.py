@@ -29,8 +29,6 @@ from drivers.frame import Camera
 from omnid.camera_config import CamerasConfig
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.messages import FramePair
-from omnid.transport.codec import OK, WARN, DiagnosticStatus
-from omnid.transport.status_names import EXPOSURE, Key
 
 SAMPLED_COLUMNS: Final = 160  # of the panorama: some thousand samples
 MARGIN_PX: Final = 2.0  # Distance kept from the rim and the hub.
@@ -206,29 +204,27 @@ class ExposureControl:
         elif (wanted := self._law.step(*self._levels, pair.stamp_ns)) is not None:
             self._request(wanted, pair.stamp_ns)
 
-    def status(self) -> DiagnosticStatus:
-        """Return the entry: exposure, gain, grey levels; a warning if it is too dark or too bright."""
+    def stats(self) -> dict[str, object]:
+        """Return exposure, gain and grey levels, and whether it is too dark or too bright; empty without images."""
         if self._levels is None:
-            return DiagnosticStatus(EXPOSURE, OK, "no images yet", {})
+            return {}
         lower, upper = self._levels
-        law = None if self._left_to_cameras else self._law
-        values: dict[str, object] = {
+        stats: dict[str, object] = {
             "lower_grey": round(lower.mean),
             "upper_grey": round(upper.mean),
             "lower_bright_grey": round(lower.bright),
             "upper_bright_grey": round(upper.bright),
+            "_reason": self._left_to_cameras,
         }
-        if law is not None:
-            gain = "" if law.setting.gain is None else law.setting.gain
-            values |= {"exposure_ms": law.setting.exposure_us * 1e-3, "steps": law.steps, "gain": gain}
-            state, reason = law.state, "exposure time and gain are at their limits"
+        if self._law is not None and not self._left_to_cameras:
+            state, setting = self._law.state, self._law.setting
+            gain = "" if setting.gain is None else setting.gain
+            stats |= {"exposure_ms": setting.exposure_us * 1e-3, "steps": self._law.steps, "gain": gain}
+            stats["_reason"] = "exposure time and gain are at their limits" if state in ADVICE else ""
         else:
             is_dark, is_white = min(lower.mean, upper.mean) < DARK_GREY, max(lower.mean, upper.mean) > WHITE_GREY
             state = "too dark" if is_dark else "too bright" if is_white else "regulated"
-            reason = self._left_to_cameras
-        if state in ADVICE:
-            return DiagnosticStatus.of(EXPOSURE, WARN, f"{state}: {reason}", values | {Key.REMEDY: ADVICE[state]})
-        return DiagnosticStatus.of(EXPOSURE, OK, self._left_to_cameras or state, values)
+        return stats | {"_state": state, "remedy": ADVICE.get(state, "")}
 
     def _request(self, setting: ExposureSetting | None, stamp_ns: int) -> None:
         """Ask both cameras for a setting; None: they regulate themselves."""

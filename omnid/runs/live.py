@@ -29,17 +29,7 @@ from omnid.core.control.safety_rules import AWAITED, NO_POSE
 from omnid.core.navigation.requests import NavigationCommand
 from omnid.core.obstacles.unwatched import Unwatched
 from omnid.core.rig.rig_health import RigHealth
-from omnid.diagnostics.status import (
-    LIVE,
-    StatusCollector,
-    clock_status,
-    floor_status,
-    images_status,
-    motion_status,
-    places_status,
-    rig_status,
-    simulation_status,
-)
+from omnid.diagnostics.status import StatusCollector, image_stats, rig_stats, wheel_stats
 from omnid.engine.flow import nothing
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Stream
 from omnid.engine.kernel_cache import prepare_kernels, read_kept_kernels
@@ -64,9 +54,28 @@ from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry
 from omnid.stages.obstacles import ADVICE, controller_ring
 from omnid.transport.bus import Bus
-from omnid.transport.codec import STALE, DiagnosticStatus, compile_serialisers
+from omnid.transport.codec import STALE, compile_serialisers
 from omnid.transport.commands import CommandReceiver, Freshness, NavigationReceiver, SensorReceiver
-from omnid.transport.status_names import DISARMED_BY_STOP, IMAGES, with_remedy
+from omnid.transport.status_names import (
+    BUS,
+    CLOCK,
+    DISARMED_BY_STOP,
+    EXPOSURE,
+    FLOOR,
+    IMAGES,
+    LIVE,
+    MAP_FILE,
+    MOTION,
+    PLACES,
+    RECORDING,
+    REFUSED_PREFIX,
+    REQUESTS,
+    RIG,
+    SIMULATION,
+    WHEELS,
+    Stats,
+    by_reason,
+)
 from omnid.transport.topics import (
     ARM,
     IMU,
@@ -345,29 +354,28 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
 
     # 5. The status of all of them.
     unwatched = Unwatched(geometry.cylinder, rig.T_base_rig @ geometry.T_rig_rect)
-    status: list[Callable[[], DiagnosticStatus]] = [
-        lambda: images_status(
-            unwatched, session.statistics.newest, stages.obstacles.fixed_share if stages.obstacles else 0.0
-        ),
-        exposure.status,
-        partial(rig_status, health),
-        *([received.status] if controller is not None else ()),
-        partial(clock_status, clock),
-        partial(motion_status, front_end.odometry, motion, samples),
-        *([partial(places_status, stages.places)] if stages.places else ()),
-        *([partial(floor_status, stages.floor)] if stages.floor else ()),
-        *([lambda: simulation_status(robot.stats())] if robot.stats() else ()),
-        *(part.status for part in (bus, recorder, saver) if part is not None),
-    ]
+    obstacles, places, floor = stages.obstacles, stages.places, stages.floor
+    watched: dict[str, Callable[[], Stats]] = {
+        IMAGES: lambda: image_stats(unwatched, session.statistics.newest, obstacles.fixed_share if obstacles else 0.0),
+        EXPOSURE: exposure.stats,
+        RIG: partial(rig_stats, health),
+        CLOCK: clock.stats,
+        MOTION: lambda: front_end.motion_stats() | by_reason(REFUSED_PREFIX, samples.refused),
+        BUS: bus.stats,
+    }
+    if controller is not None and commands is not None:
+        watched |= {WHEELS: partial(wheel_stats, controller.statistics, commands), REQUESTS: received.stats}
+    if robot.stats():
+        watched[SIMULATION] = robot.stats
+    optional = {PLACES: places, FLOOR: floor, RECORDING: recorder, MAP_FILE: saver}
+    watched |= {name: part.stats for name, part in optional.items() if part is not None}
     collect = StatusCollector(
         graph.telemetry,
         robot.states,
         front_end.pairing,
         session.statistics,
         to_pose,
-        controller.statistics if controller is not None else None,
-        commands,
-        status,
+        watched,
         clock.monotonic_ns,
     )
 
@@ -384,7 +392,7 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
                 warn(f"images: {status.message}")
                 reported[status.name] = status.message
         with suppress(OmnidError):  # the system's clock may be set to a time that no message can hold
-            message = status_report(time.time_ns(), [with_remedy(status) for status in statuses])
+            message = status_report(time.time_ns(), statuses)
             bus.publish(message.topic, message.payload)  # where the bus is slow, only this ticker waits
         if recorder is not None:
             recorder.add(statuses, clock.monotonic_ns())

@@ -24,8 +24,7 @@ from omnid.messages import MapCopy, PlaceUpdate, SaveMap
 from omnid.runs.wiring import Parts
 from omnid.sinks.files import check_outputs
 from omnid.stages.geometry import Geometry
-from omnid.transport.codec import ERROR, OK, DiagnosticStatus, string_from_cdr
-from omnid.transport.status_names import MAP_FILE, Key
+from omnid.transport.codec import string_from_cdr
 from omnid.transport.topics import SAVE_MAP, Answer, Request
 
 
@@ -241,7 +240,6 @@ class MapSaver:
         self._error = ""
         return Answer(True, "the map is saved" if is_new else "the map in the file has all that is known already")
 
-    def status(self) -> DiagnosticStatus:
+    def stats(self) -> dict[str, object]:
         """Return how often the map was saved, and why it is not."""
-        values = {Key.SAVES: str(self._saves), "failed": str(self._failed), "refused": str(self._refused)}
-        return DiagnosticStatus(MAP_FILE, ERROR if self._error else OK, self._error or "saves the map", values)
+        return {"saves": self._saves, "failed": self._failed, "refused": self._refused, "_error": self._error}

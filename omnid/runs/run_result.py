@@ -17,7 +17,7 @@ from omnid.core.control.motion_monitor import ADVICE
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.places.place_map import PlaceMap
 from omnid.diagnostics.run_summary import RunCounters, input_warnings
-from omnid.diagnostics.status import motion_status, stage_status, summary_status
+from omnid.diagnostics.status import stage_stats, summary_stats
 from omnid.engine.telemetry import SummaryRow
 from omnid.errors import OmnidError
 from omnid.formats.exports import write_ply
@@ -28,6 +28,7 @@ from omnid.runs.session import Session
 from omnid.runs.wiring import WiredStages
 from omnid.tracking_state import MapState, TrackingState
 from omnid.transport.codec import DiagnosticStatus
+from omnid.transport.status_names import MOTION, SUMMARY, entry, stage_name
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -168,7 +169,8 @@ class RunReport:
     def final_status(self) -> list[DiagnosticStatus]:
         """Return the counters of the run and of its stages, for the log."""
         stages = (stats for stats in self._session.graph.telemetry.stages if stats.name not in BOOKKEEPING)
-        return [summary_status(self.counters()), *self._motion(), *map(stage_status, stages)]
+        found = [entry(stage_name(stage.name), stage_stats(stage)) for stage in stages]
+        return [entry(SUMMARY, summary_stats(self.counters())), *self._motion(), *found]
 
     def _loss(self) -> str:
         """Return one line about images that make no pair; empty where these are few, or were dropped on purpose."""
@@ -178,4 +180,4 @@ class RunReport:
     def _motion(self) -> list[DiagnosticStatus]:
         """Return the entry of wheels and gyro, if there were any."""
         inbox = self._pairing.motion
-        return [motion_status(self._odometry, inbox)] if inbox.wheels or inbox.gyro else []
+        return [entry(MOTION, self._stages.front_end.motion_stats())] if inbox.wheels or inbox.gyro else []

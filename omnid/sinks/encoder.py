@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Final, NamedTuple, Self, TypeAlias
+from typing import NamedTuple, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,25 +15,16 @@ from drivers.motor import VelocityCommand
 from omnid.core.frames import base_pose, in_outer_axes, of_base
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.messages import GridUpdate, MapUpdate, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
-from omnid.navigation_state import NavigationState
 from omnid.tracking_state import MapState, TrackingState
 from omnid.transport import codec
-from omnid.transport.codec import ERROR, OK, WARN, DiagnosticStatus, FrameTransform, PoseAttachment
+from omnid.transport.codec import DiagnosticStatus, FrameTransform, PoseAttachment
 from omnid.transport.sensor_codec import gyro_cdr, wheel_cdr
-from omnid.transport.status_names import NAVIGATION, ODOMETRY, PLACES, Key
+from omnid.transport.status_names import NAVIGATION, ODOMETRY, PLACES, Key, Stats, entry
 from omnid.transport.topics import MAP_POSE, PUBLISHED, SCAN
 
 Outgoing: TypeAlias = (
     OdometryUpdate | VelocityCommand | MapUpdate | PlaceUpdate | GridUpdate | ObstacleRing | NavigationUpdate
 )
-
-NAVIGATION_LEVELS: Final = {
-    NavigationState.BLOCKED: WARN,
-    NavigationState.NOT_LOCALISED: WARN,
-    NavigationState.PAUSED: WARN,
-    NavigationState.FAILED: ERROR,
-}
-
 
 UnixTime: TypeAlias = Callable[[int], int]  # returns the Unix time of a stamp [ns]
 
@@ -100,7 +91,7 @@ class Encoder:
                 payload = codec.grid_cdr(stamp_ns, "map", grid.cells, grid.cell_m, grid.corner)
                 yield OutgoingMessage.on("map", payload)
             case NavigationUpdate():
-                status = navigation_status(message)
+                status = entry(NAVIGATION, navigation_stats(message))
                 yield OutgoingMessage.on("navigation", codec.diagnostics_cdr(stamp_ns, [status]))
                 if message.plan is not None:
                     plan = message.plan
@@ -170,8 +161,7 @@ class Changes:
             if message.state == self._last_in_map:
                 return
             self._last_in_map = message.state
-            level = ERROR if message.state is MapState.LOST else OK
-            status = DiagnosticStatus(PLACES, level, message.state, {Key.STATE: message.state})
+            status = entry(PLACES, {Key.STATE: message.state})
         elif isinstance(message, OdometryUpdate):
             if self._last is None:
                 yield static_frames(self._encode, message.stamp_ns)
@@ -205,20 +195,20 @@ def _most_confident(points: MapPoints, count: int) -> tuple[NDArray[np.float32],
     return points.xyz[kept], points.confidence[kept]
 
 
-def navigation_status(update: NavigationUpdate) -> DiagnosticStatus:
-    """Return the status entry of an update, for its own topic."""
-    values: dict[str, object] = {
+def navigation_stats(update: NavigationUpdate) -> Stats:
+    """Return the numbers of an update, for its own topic."""
+    stats = {
         Key.STATE: update.state,
         Key.TASK: update.task,
         Key.COMMAND_NS: update.command_ns or "",
         Key.REASON: update.reason,
         Key.LEFT_M: update.left_m,
-        Key.OFFSET_M: update.offset_m,
-        Key.LOOPS_LEFT: update.loops_left if update.loops_left > 1 else "",
+        "offset_m": update.offset_m,  # of the base to the left of the path
+        "loops_left": update.loops_left if update.loops_left > 1 else "",  # of a route, with the one that is driven
+        "_words": f"{update.state}: {update.reason}" if update.reason else update.state,
     }
     if update.teaching:
-        values |= {Key.TEACHING: update.teaching, Key.TAUGHT_M: update.taught_m}
+        stats |= {Key.TEACHING: update.teaching, Key.TAUGHT_M: update.taught_m}
     if update.answer is not None:
-        values |= {Key.REQUEST: update.answer.request, Key.REFUSAL: update.answer.refusal}
-    message = f"{update.state}: {update.reason}" if update.reason else str(update.state)
-    return DiagnosticStatus.of(NAVIGATION, NAVIGATION_LEVELS.get(update.state, OK), message, values)
+        stats |= {Key.REQUEST: update.answer.request, Key.REFUSAL: update.answer.refusal}
+    return stats

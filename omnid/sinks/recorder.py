@@ -15,9 +15,8 @@ from omnid.engine.robot_clock import SegmentTime, log_time
 from omnid.errors import OmnidError
 from omnid.messages import OdometryUpdate
 from omnid.sinks.encoder import Changes, Encoder, Outgoing, OutgoingMessage, status_report
-from omnid.transport.codec import ERROR, OK, DiagnosticStatus
+from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.sensor_codec import image_cdr, image_topic
-from omnid.transport.status_names import RECORDING
 from omnid.transport.topics import ros_name
 
 Recorded: TypeAlias = Frame | Outgoing
@@ -89,12 +88,11 @@ class Recorder:
         """The state of the files."""
         return self._log.state
 
-    def status(self) -> DiagnosticStatus:
-        """Return the state as a diagnostic status, with counts of all that was lost after the inbox."""
+    def stats(self) -> dict[str, object]:
+        """Return the state of the files, with counts of all that was lost after the inbox."""
         state, names = self.state, ("file", "messages", "lost", "refused", "files", "deleted", "stops")
-        values = {name: getattr(state, name) for name in names} | {"invalid": self.invalid}
-        level = ERROR if state.status == "stopped" else OK
-        return DiagnosticStatus.of(RECORDING, level, state.problem or state.status, values)
+        counts = {name: getattr(state, name) for name in names} | {"invalid": self.invalid}
+        return {**counts, "_status": state.status, "_words": state.problem or state.status}
 
     def process(self, message: Recorded) -> None:
         """Record a message and, for a pose, its state where it has changed or a new file has begun."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from omnid.config import Config
+from omnid.core.odometry.motion_sensors import BIAS, DISTANCE, GYRO_OFFSET, TURN, WHEEL_OFFSET
 from omnid.core.rig.rig_health import RigHealth
 from omnid.messages import FramePair, OdometryUpdate, Panoramas, StereoDepth
 from omnid.stages.dense_depths import DenseDepths
@@ -31,6 +32,30 @@ class FrontEnd:
         self.dense = DenseDepths(geometry, config.stereo_settings())
         self.odometry = OdometryStage(geometry, config.odometry, self.dense, self.dewarp.raw_images)
         self.poses = CheckedOdometry(self.odometry, self.health)
+
+    def motion_stats(self) -> dict[str, object]:
+        """Return samples of wheels and gyro, their estimated errors with sigmas, and the sensor that differs."""
+        inbox, sensors, witness = self.pairing.motion, self.odometry.sensors, self.odometry.witness
+        stats: dict[str, object] = {
+            "wheel_samples": inbox.wheels,
+            "gyro_samples": inbox.gyro,
+            "dropped": inbox.dropped,
+            "slips": sensors.slips,
+            "refused_gyro": sensors.refused,
+            "_is_wrong": not sensors.wheels_are_sane,
+            "_is_slipping": sensors.is_slipping,
+            "_differs": f"{witness.reason} {witness.detail}".strip(),
+            "_detail": f": {witness.detail}" if witness.detail else "",
+        }
+        estimated: dict[str, tuple[int, float]] = {}  # state of the filter, and the unit
+        if sensors.steps and inbox.wheels:
+            estimated |= {"wheel_scale": (DISTANCE, 1.0), "turn_scale": (TURN, 1.0)}
+            estimated |= {"wheel_offset_ms": (WHEEL_OFFSET, 1e3)}
+        if sensors.steps and inbox.gyro:
+            estimated |= {"gyro_offset_ms": (GYRO_OFFSET, 1e3)}
+            estimated |= {f"gyro_bias_{axis}_radps": (BIAS.start + k, 1.0) for k, axis in enumerate("xyz")}
+        stats |= {name: unit * float(sensors.values[state]) for name, (state, unit) in estimated.items()}
+        return stats | {f"{name}_sigma": unit * float(sensors.sigmas[k]) for name, (k, unit) in estimated.items()}
 
     def process(self, pair: FramePair) -> OdometryUpdate:
         """Return the pose at a pair."""

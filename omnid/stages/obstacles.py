@@ -64,6 +64,18 @@ class CameraFloor:
         """Return the transform (4, 4) from the rig to the level frame of the base, with the floor at z = 0."""
         return np.asarray(floor.T_floor_base(self.view) @ self._T_base_rig)
 
+    def stats(self) -> dict[str, object]:
+        """Return the figures of the floor, where it is known, and whether the rig states its height."""
+        floor = self.floor
+        figures: dict[str, object] = {}
+        if floor is not None:  # height of the lower viewpoint
+            figures = {
+                "height_m": floor.height_m,
+                "sigma_m": floor.sigma_m,
+                "tilt_deg": math.degrees(floor.tilt_rad),
+            }
+        return figures | {"_is_stated": self.stated is not None}
+
     def summary(self) -> str:
         """Return one sentence about a height that the rig does not state; empty where it does."""
         if self.stated is not None:

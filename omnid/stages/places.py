@@ -139,6 +139,10 @@ class Places:
             self._copy,
         )
 
+    def stats(self) -> dict[str, object]:
+        """Return the state of the pose in the map, and the sizes and counters of the map."""
+        return {"state": self.state, **self.counts}
+
     def finish(self) -> list[PlaceUpdate]:
         """Count at the end."""
         self.counts = self._localiser.counts

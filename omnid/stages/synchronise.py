@@ -234,11 +234,6 @@ class Synchronise:
         return None if self._closest_miss_ns is None else self._closest_miss_ns * 1e-6
 
     @property
-    def has_fixed_tolerance(self) -> bool:
-        """True if the tolerance was set: cameras whose clocks drift apart then make no pairs some day."""
-        return self._fixed_ns > 0
-
-    @property
     def tolerance_ms(self) -> float:
         """Largest difference between the stamps of a pair, ms, as set or as it follows from the period."""
         return self._tolerance_ns * 1e-6
@@ -254,16 +249,24 @@ class Synchronise:
         return {name: camera.repeated for name, camera in self._cameras.items()}
 
     @property
-    def frozen(self) -> list[Camera]:
-        """The cameras whose newest images are repeated ones."""
-        return [name for name, camera in self._cameras.items() if camera.repeated.frozen]
-
-    @property
     def counts(self) -> dict[str, int]:
         """Pairs made, frames without a partner, images that could not be decoded, images that repeat earlier ones."""
         unpaired = {f"unpaired_{name}": camera.unpaired for name, camera in self._cameras.items()}
         repeated = {f"repeated_{name}": camera.repeated.count for name, camera in self._cameras.items()}
         return {"pairs": self._pairs, **unpaired, "broken": self._decode.broken, **repeated}
+
+    def stats(self) -> dict[str, object]:
+        """Return the numbers of the pairing for the status."""
+        return {
+            **self.counts,
+            "skew_ms": self.skew.mean_ns * 1e-6,
+            "max_skew_ms": self.skew.max_ns * 1e-6,
+            "exposure_skew_ms": self.skew.exposure_ns * 1e-6,
+            "tolerance_ms": self.tolerance_ms,
+            "_is_fixed": self._fixed_ns > 0,  # cameras whose clocks drift apart then make no pairs some day
+            "_fault": self.fault,
+            "_frozen": " and the ".join(name for name, each in self._cameras.items() if each.repeated.frozen),
+        }
 
     def loss(self, read: Mapping[str, int]) -> ImageLoss:
         """Return the images of a log that made no pair; read: counts of its reader."""

@@ -18,9 +18,8 @@ from zenoh import ext
 
 from omnid.engine.threads import Poller
 from omnid.errors import OmnidError
-from omnid.transport import ros2, status_names
+from omnid.transport import ros2
 from omnid.transport.bus_config import BusConfig, checked
-from omnid.transport.codec import ERROR, OK, WARN, DiagnosticStatus
 from omnid.transport.intake import PERIOD_S, QUERY, CommandIntake, Intake, OpenRequests, RequestCallback
 from omnid.transport.session import ALIVE, EndpointTaken, has_receiver, open_session, reason, router_in_place
 from omnid.transport.stop_datagram import StopListener
@@ -138,28 +137,23 @@ class Bus:
             with suppress(OmnidError):  # the configuration has been checked, so the router is not there yet
                 self._open()
 
-    def status(self) -> DiagnosticStatus:
+    def stats(self) -> dict[str, object]:
         """Return whether the bus is open and the name unique, and the number of messages lost before that."""
-        level, message = OK, "open"
-        if self._session is None:
-            level, message = WARN, f"no router yet at {', '.join(self._config.connect)}"
-        elif not self.is_unique:
-            level, message = ERROR, self._same_name
         counts: Counter[str] = Counter()
         for intake in (*(self._commands.intakes if self._commands else ()), *self._queries.values()):
             counts[intake.key] += intake.floods
         counts = +counts
         if counts.total() > self._flooded:
             self._flooded, self._flooded_s = counts.total(), time.monotonic()
-        if level == OK and time.monotonic() < self._flooded_s + FLOOD_S:
-            level, message = WARN, f"more messages on {counts.most_common(1)[0][0]} than are taken: end their sender"
-        values = {
+        return {
             "mode": "client" if self._config.is_client else "peer",
             "lost": self.lost,
-            status_names.SAME_NAME_COUNT: len(self._namesakes),
+            "same_name": len(self._namesakes),  # other robots of this name
             **{f"flooded, {key}": count for key, count in sorted(counts.items())},
+            "_awaited_router": "" if self._session is not None else ", ".join(self._config.connect),
+            "_same_name": "" if self.is_unique else self._same_name,
+            "_flood": counts.most_common(1)[0][0] if time.monotonic() < self._flooded_s + FLOOD_S else "",
         }
-        return DiagnosticStatus.of(status_names.BUS, level, message, values)
 
     @property
     def is_unique(self) -> bool:

@@ -64,9 +64,8 @@ from omnid.engine.robot_clock import RobotClock, duration_words
 from omnid.errors import OmnidError
 from omnid.plain_text import plain
 from omnid.transport import codec, topics
-from omnid.transport.codec import OK, DiagnosticStatus
 from omnid.transport.sensor_codec import sample_from_cdr
-from omnid.transport.status_names import REFUSED_PREFIX, REQUESTS
+from omnid.transport.status_names import REFUSED_PREFIX, by_reason
 from omnid.transport.topics import Answer, Request
 
 LONGEST_PAYLOAD, LONGEST_PATH = 4096, 1 << 20  # bytes
@@ -355,10 +354,9 @@ class NavigationReceiver:
         self.accepted = 0
         self.refused: Counter[str] = Counter()  # by topic
 
-    def status(self) -> DiagnosticStatus:
+    def stats(self) -> dict[str, int]:
         """Return how many requests were accepted, and how many were not valid, by topic."""
-        refused = {f"{REFUSED_PREFIX}{key}": str(count) for key, count in sorted(self.refused.items())}
-        return DiagnosticStatus(REQUESTS, OK, "", {"accepted": str(self.accepted), **refused})
+        return {"accepted": self.accepted, **by_reason(REFUSED_PREFIX, self.refused)}
 
     def receive(self, message: Request) -> Answer | None:
         """Handle one message; return the refusal, None where the target answers."""

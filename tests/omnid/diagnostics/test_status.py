@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -28,7 +29,7 @@ from omnid.core.obstacles.unwatched import Unwatched
 from omnid.core.rig.rig_health import RigHealth
 from omnid.core.stereo.tiles import ALL_LIVE, TILE_COLUMNS, TILE_ROWS, TileStates
 from omnid.diagnostics.run_summary import RunCounters, RunStatistics, run_summary
-from omnid.diagnostics.status import LIVE, TIMEOUT_S, StatusCollector, floor_status, images_status, rig_status
+from omnid.diagnostics.status import StatusCollector, image_stats, rig_stats, wheel_stats
 from omnid.engine.telemetry import Histogram, StageStats, Telemetry
 from omnid.messages import OdometryUpdate, StereoDepth
 from omnid.simulation.robot import make_robot
@@ -40,7 +41,7 @@ from omnid.tracking_state import TrackingState
 from omnid.transport import codec
 from omnid.transport.codec import ERROR, OK, STALE, WARN, DiagnosticStatus, diagnostics_cdr
 from omnid.transport.commands import CommandReceiver, Freshness
-from omnid.transport.status_names import FIXED_PERCENT, Key, lost_parts_key, short_name
+from omnid.transport.status_names import FLOOR, IMAGES, LIVE, PARTS, RIG, TIMEOUT_S, WHEELS, Key, entry, short_name
 from omnid.transport.topics import Request
 from tests.omnid.small_pair import small_depth
 from tests.omnid.stages.test_keyframe_scan import depth
@@ -82,8 +83,7 @@ class Daemon:
             self.pair,
             self.statistics,
             self.to_pose,
-            self.controller_statistics,
-            self.commands,
+            {WHEELS: partial(wheel_stats, self.controller_statistics, self.commands)},
         )
 
     def send(self, given: TimedSetpoint | ArmRequest) -> None:
@@ -219,19 +219,19 @@ def health() -> RigHealth:
 
 
 def test_a_rig_that_was_not_checked_says_what_to_do(health: RigHealth) -> None:
-    status = rig_status(health)
+    status = entry(RIG, rig_stats(health))
     assert status.level == OK and status.message.startswith("not checked yet: the robot must drive")
     assert status.values == {"state": "unchecked", "new_views": "0", "needed_views": "16"}
 
 
 def test_the_height_is_published_with_its_origin_and_warns_unless_it_is_stated() -> None:
-    stated = floor_status(CameraFloor(make_rig().at_height(0.9), 0.0))
+    stated = entry(FLOOR, CameraFloor(make_rig().at_height(0.9), 0.0).stats())
     assert stated.level == OK and stated.values == {"height_m": "0.9", "sigma_m": "0", "tilt_deg": "0"}
     camera_floor = CameraFloor(make_rig(), 0.0)
-    unknown = floor_status(camera_floor)
-    assert unknown.level == WARN and "nothing is free" in unknown.message and not unknown.values
+    unknown = entry(FLOOR, camera_floor.stats())
+    assert unknown.level == WARN and "nothing is free" in unknown.message and set(unknown.values) == {Key.REMEDY}
     camera_floor.add(depth(np.eye(4)))
-    found = floor_status(camera_floor)
+    found = entry(FLOOR, camera_floor.stats())
     assert found.level == WARN and abs(float(found.values["height_m"]) - 1.2) < 0.03
     assert 0.005 < float(found.values["sigma_m"]) < 0.05
 
@@ -275,18 +275,18 @@ def test_names_camera_directions_and_time() -> None:
     """Degrees count counter-clockwise from ahead, and columns from left to right."""
     place = geometry(make_robot(256).rig, Config().panorama)
     unwatched = Unwatched(place.cylinder, place.rig.T_base_rig @ place.T_rig_rect)
-    assert images_status(unwatched, None, 0.0).level == STALE
-    entry = images_status(unwatched, update(lost(23, 40, is_dead=False), 113 * S), 0.0)
-    assert entry.level == ERROR and entry.values == {lost_parts_key("upper"): "13"}
-    text = entry.message
+    assert entry(IMAGES, image_stats(unwatched, None, 0.0)).level == STALE
+    found = entry(IMAGES, image_stats(unwatched, update(lost(23, 40, is_dead=False), 113 * S), 0.0))
+    assert found.level == ERROR and found.values == {"upper_since_s": "13", Key.REMEDY: PARTS[IMAGES].remedy}
+    text = found.message
     assert text.startswith("the upper camera is blind from ") and text.endswith(" degrees")
     begin, end = (int(word) for word in text.split() if word.isdigit())
     assert 298 <= begin <= 300 and 41 <= end <= 43
-    frozen = images_status(unwatched, update(lost(0, TILE_COLUMNS, is_dead=True), 114 * S), 0.0)
+    frozen = entry(IMAGES, image_stats(unwatched, update(lost(0, TILE_COLUMNS, is_dead=True), 114 * S), 0.0))
     assert frozen.message == "the upper camera is frozen all around"
-    fixed = images_status(unwatched, update(ALL_LIVE, 115 * S), 0.04)
-    assert fixed.level == OK and fixed.values == {FIXED_PERCENT: "4"} and "fixed to a camera" in fixed.message
-    live = images_status(unwatched, update(ALL_LIVE, 115 * S), 0.0)
+    fixed = entry(IMAGES, image_stats(unwatched, update(ALL_LIVE, 115 * S), 0.04))
+    assert fixed.level == OK and fixed.values == {"fixed_percent": "4"} and "fixed to a camera" in fixed.message
+    live = entry(IMAGES, image_stats(unwatched, update(ALL_LIVE, 115 * S), 0.0))
     assert (live.level, live.message) == (OK, LIVE)
 
 

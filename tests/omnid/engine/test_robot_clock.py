@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from omnid.diagnostics.status import clock_status
 from omnid.engine.robot_clock import RobotClock
 from omnid.transport import codec
 from omnid.transport.codec import OK, WARN
+from omnid.transport.status_names import CLOCK, entry
 from tests.set_clock import SetClock
 
 S = 10**9
@@ -43,10 +43,10 @@ def test_a_step_is_found_and_reported_once_and_stamps_from_before_it_keep_their_
     other_ns = computer.unix_ns - change_ns
     assert clock.age_ns(other_ns) == change_ns
     assert len(lines) == 1 and words in lines[0] and "\n" not in lines[0]
-    status = clock_status(clock)
+    status = entry(CLOCK, clock.stats())
     assert (status.level, status.values["steps"]) == (WARN, "1") and words in status.message
     computer.advance(120.0)
-    assert clock_status(clock).level == OK
+    assert entry(CLOCK, clock.stats()).level == OK
 
 
 @pytest.mark.parametrize("rate", [-500e-6, -40e-6, 40e-6, 500e-6])
@@ -59,7 +59,7 @@ def test_slewing_is_followed_in_silence(rate: float) -> None:
         computer.set_forwards(0.1 * rate)
         before_ns, unix_ns = unix_ns, clock.unix_ns(computer.monotonic_ns)
         assert abs(unix_ns - computer.unix_ns) < 1_100_000 and unix_ns > before_ns
-    assert not lines and clock.steps == 0 and clock_status(clock).level == OK
+    assert not lines and clock.steps == 0 and entry(CLOCK, clock.stats()).level == OK
 
 
 @pytest.mark.parametrize("step_s", [30 * 365.25 * 86400.0, -60 * 365.25 * 86400.0])

@@ -15,6 +15,7 @@ from omnid.camera_config import CamerasConfig
 from omnid.light.exposure import LONGEST_STEP_S, STEP_S, TARGET, ExposureControl, ExposureLaw, GreyLevels, UsefulArea
 from omnid.messages import FramePair
 from omnid.transport.codec import OK, WARN, DiagnosticStatus
+from omnid.transport.status_names import EXPOSURE, entry
 from tests.simulation.recipes import mild_rig
 
 LAW_RANGES = ExposureRanges(ValueRange(100, 200_000, 100), ValueRange(0, 100))
@@ -161,7 +162,7 @@ class Robot:
             self._carry_out(self.cameras["lower"].exposure, stamp_ns)
             self.control.process(FramePair(self.pairs, stamp_ns, *grey))
             self._carry_out(self.cameras["upper"].exposure, stamp_ns)
-        return self.control.status()
+        return entry(EXPOSURE, self.control.stats())
 
     def _grey(self, setting: ExposureSetting | None) -> np.ndarray:
         assert setting is not None

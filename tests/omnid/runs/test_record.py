@@ -14,6 +14,7 @@ from omnid.config import Config
 from omnid.engine.graph import NEWEST, Graph
 from omnid.runs.record import open_recorder, record
 from omnid.transport.codec import ERROR, OK
+from omnid.transport.status_names import RECORDING, entry
 from tests.omnid.sinks.test_recorder import frame, times
 
 START_NS = 1_700_000_000 * 10**9
@@ -60,15 +61,15 @@ def test_a_blocked_disk_stops_no_camera(tmp_path: Path) -> None:
 def test_reports_the_state_of_the_recording(tmp_path: Path) -> None:
     config = settings(tmp_path / "log")
     recorder = open_recorder(config, "", lambda *_: None, time=times())
-    assert (recorder.status().level, recorder.status().message) == (OK, "waiting")
+    assert (entry(RECORDING, recorder.stats()).level, entry(RECORDING, recorder.stats()).message) == (OK, "waiting")
     recorder.process(frame(0, "lower"))
-    status = recorder.status()
+    status = entry(RECORDING, recorder.stats())
     assert status.message == "recording" and status.values["messages"] == "1" and Path(status.values["file"]).exists()
     recorder.close()
     full = replace(config, record=replace(config.record, free_mb=1_000_000))
     recorder = open_recorder(full, "", lambda *_: None, time=times())
     recorder.process(frame(0, "lower"))
-    status = recorder.status()
+    status = entry(RECORDING, recorder.stats())
     assert status.level == ERROR and status.values["lost"] == "1" and "1000001 needed" in status.message
 
 

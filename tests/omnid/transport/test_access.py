@@ -18,6 +18,7 @@ from omnid.errors import OmnidError
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import OK
+from omnid.transport.status_names import BUS, entry
 from omnid.transport.topics import Request
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, script, session
 from tests.waiting import wait_until
@@ -97,7 +98,7 @@ def commands_to(config: BusConfig) -> Iterator[tuple[Bus, list[str]]]:
     """Yield a robot that answers all requests, and the topics of what it receives."""
     received: list[str] = []
     with contextlib.closing(Bus(config)) as bus:
-        wait_until(lambda: bus.connect() is None and bus.status().message == "open")
+        wait_until(lambda: bus.connect() is None and entry(BUS, bus.stats()).message == "open")
 
         def take(request: Request) -> None:
             received.append(request.topic)
@@ -176,7 +177,7 @@ def test_users_need_their_password_and_the_permission_to_drive(site: Path) -> No
         held = bob._session.liveliness().declare_token("omnid/alive/x")
         bob.driver().stop()
         wait_until(lambda: "cmd/stop" in received)
-        assert bus.is_unique and bus.status().level == OK, "only the robot declares tokens below its name"
+        assert bus.is_unique and entry(BUS, bus.stats()).level == OK, "only the robot declares tokens below its name"
         del held
         for name in ("eve", "nobody"):
             with pytest.raises(Unreachable):

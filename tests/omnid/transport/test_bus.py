@@ -25,6 +25,7 @@ from omnid.transport import codec, ros2
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import ERROR, OK, WARN, PoseAttachment
 from omnid.transport.session import open_client, open_session, zenoh_config
+from omnid.transport.status_names import BUS, entry
 from omnid.transport.topics import PUBLISHED, REQUEST_TOPICS, command_topics, request_key
 from tests.omnid.transport.bus_fixtures import ROUTER, SUBSCRIBER, free_endpoint, numbers, odometry, script, session
 from tests.waiting import wait_until
@@ -274,12 +275,12 @@ def test_a_client_waits_for_its_router() -> None:
         bus.serve("config", "robot = 1")
         bus.connect()
         bus.publish("odom", odometry(1))
-        assert bus.status().level == WARN and bus.status().values["lost"] == "1"
-        assert bus.status().message == f"no router yet at {endpoint}"
+        assert entry(BUS, bus.stats()).level == WARN and entry(BUS, bus.stats()).values["lost"] == "1"
+        assert entry(BUS, bus.stats()).message == f"no router yet at {endpoint}"
         with script(ROUTER, endpoint):
-            wait_until(lambda: bus.connect() is None and bus.status().level == OK)
+            wait_until(lambda: bus.connect() is None and entry(BUS, bus.stats()).level == OK)
             bus.publish("odom", odometry(2))
-            assert bus.status().values["lost"] == "1"
+            assert entry(BUS, bus.stats()).values["lost"] == "1"
             wait_until(lambda: appears(endpoint))
             with Robot(connect=(endpoint,)) as robot:
                 wait_until(lambda: robot.query("config") == "robot = 1")  # the router hears of it a moment later
@@ -287,7 +288,7 @@ def test_a_client_waits_for_its_router() -> None:
                 wait_until(lambda: driver.stop() is None and "cmd/stop" in received)
                 pose = robot.subscribe(Pose).newest()
                 assert pose is not None and pose.stamp_ns == 10**9 + 2
-            assert (bus.status().level, bus.status().message) == (OK, "open")
+            assert (entry(BUS, bus.stats()).level, entry(BUS, bus.stats()).message) == (OK, "open")
 
 
 # Robots of one name.
@@ -300,7 +301,7 @@ def test_starts_disarmed_beside_a_robot_of_the_same_name() -> None:
 
         def started(robot: str = "omnid") -> Bus:
             bus = stack.enter_context(contextlib.closing(Bus(BusConfig(robot, (), (router,)), warnings.append)))
-            wait_until(lambda: bus.connect() is None and not bus.status().message.startswith("no router"))
+            wait_until(lambda: bus.connect() is None and not entry(BUS, bus.stats()).message.startswith("no router"))
             return bus
 
         warnings, commands = list[str](), list[str]()
@@ -309,10 +310,12 @@ def test_starts_disarmed_beside_a_robot_of_the_same_name() -> None:
         wait_until(lambda: len(warnings) == 2)
         assert "change bus.robot" in warnings[0] and "\n" not in warnings[0]
         second.subscribe_commands(lambda request: commands.append(request.topic), {})
-        assert second.status().level == ERROR and not second.is_unique and commands == ["cmd/stop"]
-        assert second.status().values["same_name"] == "1" and started("other").status().level == OK
+        assert entry(BUS, second.stats()).level == ERROR and not second.is_unique and commands == ["cmd/stop"]
+        assert (
+            entry(BUS, second.stats()).values["same_name"] == "1" and entry(BUS, started("other").stats()).level == OK
+        )
         first.close()
-        wait_until(lambda: second.status().level == OK and second.is_unique)
+        wait_until(lambda: entry(BUS, second.stats()).level == OK and second.is_unique)
         assert len(warnings) == 2, "each warns once"
 
 
@@ -330,12 +333,12 @@ def test_warns_once_of_a_robot_of_the_same_name_that_appears_later() -> None:
         wait_until(
             lambda: (
                 bool([bus.connect() for bus in (first, second)])
-                and first.status().level == second.status().level == ERROR
+                and entry(BUS, first.stats()).level == entry(BUS, second.stats()).level == ERROR
             )
         )
-        assert "bus.robot" in first.status().message and len(warnings) == 2 and commands == ["cmd/stop"]
+        assert "bus.robot" in entry(BUS, first.stats()).message and len(warnings) == 2 and commands == ["cmd/stop"]
         connection.kill()
-        wait_until(lambda: first.status().level == second.status().level == OK)
+        wait_until(lambda: entry(BUS, first.stats()).level == entry(BUS, second.stats()).level == OK)
         assert len(warnings) == 2, "each warns once"
 
 
@@ -348,9 +351,9 @@ def test_a_token_of_a_stranger_keeps_no_robot_from_starting() -> None:
     ):
         bus.subscribe_commands(lambda request: commands.append(request.topic), {})
         held = stranger.liveliness().declare_token("omnid/alive/x")
-        wait_until(lambda: bus.status().level == ERROR and commands == ["cmd/stop"])
+        wait_until(lambda: entry(BUS, bus.stats()).level == ERROR and commands == ["cmd/stop"])
         del held
-        wait_until(lambda: bus.status().level == OK)
+        wait_until(lambda: entry(BUS, bus.stats()).level == OK)
 
 
 # Crowds and floods.

@@ -540,7 +540,7 @@ def test_what_is_no_request_is_refused(topic: str, payload: bytes) -> None:
     assert received.send(topic, payload) is None
     assert received.answer is not None and not received.answer.done and received.answer.text in received.lines[0]
     assert received.receiver.refused.total() == 1 and len(received.lines) == 1
-    assert received.receiver.status().values[f"refused, cmd/{topic}"] == "1"
+    assert received.receiver.stats()[f"refused, cmd/{topic}"] == 1
 
 
 @pytest.mark.hazard("H33")

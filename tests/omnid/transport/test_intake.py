@@ -18,6 +18,7 @@ from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import WARN
 from omnid.transport.intake import UNKNOWN, budget_of
+from omnid.transport.status_names import BUS, entry
 from omnid.transport.stop_datagram import ASKED, STOPPED, StopListener, StopSender, addresses
 from omnid.transport.topics import REQUEST_TOPICS, Request, command_topics, request_key
 from tests.omnid.transport.bus_fixtures import free_endpoint, robot, script
@@ -97,8 +98,8 @@ def test_a_flood_on_one_key_is_bounded_and_keeps_no_other_key_out(key: str) -> N
         bus.subscribe_commands(count, command_topics(("operator",)))
         with script(FLOOD, endpoint, f"omnid/{key}"), Robot(connect=(endpoint,)) as operator:
             driver = operator.driver()
-            wait_until(lambda: bus.status().level == WARN)
-            assert any(name.startswith("flooded, ") for name in bus.status().values)
+            wait_until(lambda: entry(BUS, bus.stats()).level == WARN)
+            assert any(name.startswith("flooded, ") for name in entry(BUS, bus.stats()).values)
             topic = key.replace("@request", "cmd")
             begin_s, before = time.monotonic(), commands[topic]
             wait_until(lambda: driver.stop() is None and commands["cmd/stop"] > 0)

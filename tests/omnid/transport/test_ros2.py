@@ -17,6 +17,7 @@ from zenoh import ext
 from omnid.client import Pose, Robot
 from omnid.transport import codec, ros2
 from omnid.transport.bus import Bus, BusConfig
+from omnid.transport.status_names import BUS, entry
 from omnid.transport.topics import PUBLISHED, Request, command_topics, ros_name
 from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, odometry, script, session
 from tests.waiting import wait_until
@@ -98,7 +99,7 @@ def test_joins_the_router_of_ros_where_that_holds_the_endpoint(mode: str) -> Non
         session(mode=mode, connect__endpoints=[endpoint]) as node,
     ):
         assert lines == [f"the zenoh router at {endpoint} is joined as a client: who may connect is decided there"]
-        assert bus.status().values["mode"] == "client" and bus.needs_router
+        assert entry(BUS, bus.stats()).values["mode"] == "client" and bus.needs_router
         bus.subscribe_commands(received.append, COMMANDS)
         key, twist = ros2.data_key(3, "/omnid/cmd/twist", "geometry_msgs/msg/Twist"), bytes(52)
         attachment = ros2.attachment(1, 5, bytes(16))

@@ -25,7 +25,7 @@ from omnid.core.rig.rig_health import (
     RigContradictedError,
     RigHealth,
 )
-from omnid.diagnostics.status import rig_status
+from omnid.diagnostics.status import rig_stats
 from omnid.engine.flow import NEWEST
 from omnid.engine.graph import Graph
 from omnid.messages import Panoramas
@@ -34,7 +34,7 @@ from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry, geometry
 from omnid.stages.synchronise import Synchronise
 from omnid.tracking_state import TrackingState
-from omnid.transport.status_names import RIG
+from omnid.transport.status_names import RIG, entry
 from tests.omnid.core.scenery import wrapped
 from tests.simulation import build, write_log
 from tests.simulation.readout import PERIOD_NS
@@ -117,7 +117,7 @@ def started(place: Geometry, pairs: Iterable[Panoramas], mode: str = "warn") -> 
 
 
 def test_a_correct_rig_is_good(true: tuple[RigHealth, Collector]) -> None:
-    status = rig_status(true[0])
+    status = entry(RIG, rig_stats(true[0]))
     assert (status.name, status.level, status.message) == (RIG, 0, "fits")
     assert float(status.values["turn_deg"]) < 0.05 and abs(float(status.values["offset_px"])) < 0.03
     assert status.values["state"] == "fits" and int(status.values["new_views"]) == len(true[1]) - VIEWS
@@ -128,19 +128,19 @@ def test_a_correct_rig_is_good(true: tuple[RigHealth, Collector]) -> None:
 @pytest.mark.parametrize("turn_deg", [(0.5, 0.0, 0.0), (0.0, -0.5, 0.0), (0.0, 0.0, 0.5), (0.3, 0.2, -0.35)])
 def test_half_a_degree_is_a_warning(turned: Turned, turn_deg: tuple[float, float, float]) -> None:
     monitor, _ = turned(turn_deg)
-    status = rig_status(monitor)
+    status = entry(RIG, rig_stats(monitor))
     assert status.level == 1 and status.message.startswith("drifted: ") and monitor.finding and monitor.finding.drift
     assert np.rad2deg(monitor.finding.drift.turn) == pytest.approx(turn_deg, abs=0.05)
     assert float(status.values["turn_deg"]) == pytest.approx(np.linalg.norm(turn_deg), abs=0.05)
 
 
 def test_three_degrees_are_an_error(turned: Turned) -> None:
-    status = rig_status(turned((0.0, 3.0, 0.0))[0])
+    status = entry(RIG, rig_stats(turned((0.0, 3.0, 0.0))[0]))
     assert status.level == 2 and status.message.startswith("broken: ")
 
 
 def test_a_robot_that_stands_gets_no_finding(place: Geometry, true: tuple[RigHealth, Collector]) -> None:
-    status = rig_status(driven(place, true[1][:1] * 100))
+    status = entry(RIG, rig_stats(driven(place, true[1][:1] * 100)))
     assert (status.level, status.values) == (0, {"state": "unchecked", "new_views": "1", "needed_views": str(VIEWS)})
     assert status.message.startswith("not checked yet")
 
@@ -165,7 +165,7 @@ def test_a_mirror_that_is_knocked_makes_the_poses_degraded(place: Geometry, true
         turned = wrapped(np.roll(right.upper.panorama, columns * (number >= 4), axis=1))
         health.drive(replace(right, upper=turned, seq=number, stamp_ns=round(number * PERIOD_S * SECONDS)))
         assert health.state.is_contradicted == (number >= 6), "the newest three views decide"
-    assert rig_status(health).level == 2
+    assert entry(RIG, rig_stats(health)).level == 2
     assert poses.process(true[1][8]).state is TrackingState.DEGRADED
     fits = FrontEnd(place, config, RigHealth(place.cylinder, "refuse", PERIOD_S)).poses
     assert fits.process(true[1][8]).state is TrackingState.TRACKING
@@ -176,16 +176,16 @@ def test_the_status_has_the_result_of_the_start(
 ) -> None:
     """A right rig needs one round of two pairs, a contradiction two rounds that agree."""
     health = started(place, [])
-    assert rig_status(health).message.startswith("not checked yet") and health.state is RigState.UNCHECKED
+    assert entry(RIG, rig_stats(health)).message.startswith("not checked yet") and health.state is RigState.UNCHECKED
     assert started(place, true[1][:1]).state is RigState.UNCHECKED
     health = started(place, true[1][:2])
-    status = rig_status(health)
+    status = entry(RIG, rig_stats(health))
     assert (status.level, status.message, status.values["state"]) == (0, "fits", "fits") and not health.is_checking
     for turn_deg, pairs, level, words in ((0.8, 2, 1, "do not quite fit"), (3.0, 4, 2, "contradict the rig")):
         seen = turned((turn_deg, 0.0, 0.0))[1]
         assert started(place, seen[: pairs - 1]).state is RigState.UNCHECKED
         health = started(place, seen[:pairs])
-        status = rig_status(health)
+        status = entry(RIG, rig_stats(health))
         assert status.level == level and words in status.message
         assert health.state is (RigState.BROKEN if level == 2 else RigState.DRIFTED)
     with pytest.raises(RigContradictedError, match="contradict the rig"):
@@ -220,7 +220,7 @@ def test_the_drive_overrules_the_start_except_for_exchanged_cameras(
         for number, one in enumerate(later[:VIEWS]):
             health.drive(replace(one, seq=number, stamp_ns=round(number * PERIOD_S * SECONDS)))
         assert health.state is state and begun in (state, RigState.BROKEN, RigState.FITS)
-    assert rig_status(health).level == 2 and "exchange" in rig_status(health).message
+    assert entry(RIG, rig_stats(health)).level == 2 and "exchange" in entry(RIG, rig_stats(health)).message
 
 
 def test_after_a_loss_exchanged_cameras_are_noticed_and_end_no_run(
@@ -269,11 +269,11 @@ def darkened(one: Panoramas, gain: float, noise: float) -> Panoramas:
 @pytest.mark.parametrize(("gain", "noise"), [(0.0, 0.0), (0.0, 6.0), (0.02, 12.0)])
 def test_darkness_is_no_alarm(place: Geometry, true: tuple[RigHealth, Collector], gain: float, noise: float) -> None:
     """In the dark, noise gives points without a match."""
-    status = rig_status(driven(place, [darkened(one, gain, noise) for one in true[1]]))
+    status = entry(RIG, rig_stats(driven(place, [darkened(one, gain, noise) for one in true[1]])))
     assert status.level == 0 and status.values["state"] == "unchecked", status
 
 
 def test_a_covered_camera_is_an_error(place: Geometry, true: tuple[RigHealth, Collector]) -> None:
     covered = [replace(one, upper=replace(one.upper, image=np.full_like(one.upper.image, 9))) for one in true[1]]
-    status = rig_status(driven(place, covered))
+    status = entry(RIG, rig_stats(driven(place, covered)))
     assert status.level == 2 and "covered" in status.message
