@@ -46,7 +46,7 @@ SLOW = """[Service]
 ExecStartPre=/usr/bin/python3 -m tests.hardware.guest.probe
 Environment=PYTHONPATH=/opt/omnid
 WatchdogSec=40
-TimeoutStartSec=400
+TimeoutStartSec=1200
 TimeoutStopSec=120
 """
 SETTINGS = """
