@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from omnid.engine.flow import nothing
+from omnid.engine.graph import nothing
 from omnid.engine.robot_clock import RobotClock
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, suppress
@@ -21,7 +22,7 @@ from drivers.logs.image_folder import IMAGE_SUFFIXES, image_folders
 from drivers.logs.log_reader import LogCameras, LogReader
 from drivers.logs.open_log import is_log_name
 from omnid.errors import OmnidError
-from omnid.stages.image_loss import ImageLoss, image_loss, unpaired_by_chance
+from omnid.stages.synchronise import image_loss
 
 Image = NDArray[np.uint8]
 # By name, all of one size.
@@ -69,7 +70,7 @@ def read_pairs(source: Path, cameras: LogCameras = BY_NAME) -> PairedImages:
             read, images = decoded_pairs(reader)
             topics = reader.topics["lower"], reader.topics["upper"]
         lower, upper = ({f"pair{number:05d}": pair[side] for number, pair in images.items()} for side in (0, 1))
-        sides, faults, loss = (lower, upper), tuple(read.notes), str(read.loss)
+        sides, faults, loss = (lower, upper), tuple(read.notes), read.loss
     else:
         if not source.is_dir():
             raise OmnidError(
@@ -143,7 +144,7 @@ def _read(path: Path, bits: int) -> Image:
 class LogPairs(NamedTuple):
     """What of a log's pairs is not used."""
 
-    loss: ImageLoss
+    loss: str  # one line where more than a tenth of the images make no pair
     notes: list[str]  # of the reader, and about pairs that were left out
     arrived: tuple[int, ...]  # images of the lower and the upper camera
 
@@ -157,11 +158,11 @@ def decoded_pairs(reader: LogReader, *, keep: bool = True) -> tuple[LogPairs, di
     # 1. Stamps of all images. In a run a pair may differ by half a period.
     frames = [replace(frame, data=b"") for frame in reader.frames()]
     stamps = {camera: [frame.stamp_ns for frame in frames if frame.camera == camera] for camera in CAMERAS}
-    periods = {camera: float(np.median(np.diff(own))) if len(own) > 1 else None for camera, own in stamps.items()}
-    within_ns = max([TOLERANCE_NS, *(period / 2 for period in periods.values() if period)])
+    periods = {camera: float(np.median(np.diff(own))) if len(own) > 1 else math.nan for camera, own in stamps.items()}
+    within_ns = max([TOLERANCE_NS, *(period / 2 for period in periods.values() if period > 0)])
     joined = sum(1 for _ in paired(iter(frames), within_ns))
     arrived = {camera: len(own) for camera, own in stamps.items()}
-    unpaired = unpaired_by_chance(arrived, {camera: count - joined for camera, count in arrived.items()}, periods)
+    unpaired = {camera: count - joined for camera, count in arrived.items()}
     stride = max(1, sum(1 for _ in paired(iter(frames))) // LOG_PAIRS)
     # 2. Images of some pairs; those of another size than most are of no use.
     images, faults = dict[int, tuple[Image, Image]](), list[str]()
@@ -180,7 +181,12 @@ def decoded_pairs(reader: LogReader, *, keep: bool = True) -> tuple[LogPairs, di
     others = sizes.total() - count
     # 3. What is lost.
     loss = image_loss(
-        reader.counts, unpaired=unpaired, undecodable=2 * len(faults) * stride, other_size=2 * others * stride
+        reader.counts,
+        arrived,
+        unpaired,
+        periods,
+        undecodable=2 * len(faults) * stride,
+        other_size=2 * others * stride,
     )
     notes = list(reader.warnings)
     if faults:

@@ -87,9 +87,9 @@ def _start(args: argparse.Namespace) -> tuple[Rig, bool]:
         with closing(open_log(log, log_cameras(args), start)) as reader:
             start = start or attached_rig(reader, log)
             found, _ = decoded_pairs(reader, keep=False)
-        for line in filter(None, (*found.notes, str(found.loss))):
+        for line in filter(None, (*found.notes, found.loss)):
             print(f"warning: {log}: {line}", file=sys.stderr)
-        is_lossy |= found.loss.is_lossy
+        is_lossy |= bool(found.loss)
     assert start is not None, "there is a log"
     return start, is_lossy
 

@@ -17,7 +17,7 @@ from omnid.controller.statistics import ControllerStatistics, TickReport
 from omnid.core.control.contacts import NO_CONTACT
 from omnid.core.control.control_law import ControlInput
 from omnid.core.nanoseconds import S_PER_NS
-from omnid.engine.flow import nothing
+from omnid.engine.graph import nothing
 from omnid.engine.process import python, python_environment
 from omnid.engine.telemetry import StageStats
 from omnid.errors import OmnidError

@@ -16,7 +16,7 @@ from omnid.core.control.collision_monitor import remedy
 from omnid.core.control.motion_monitor import ADVICE, COMPARED, DISAGREEMENTS, WITNESSES, Witness
 from omnid.core.control.safety_rules import ENDS, IDLE
 from omnid.core.control.trust import MOTION_DOUBTFUL
-from omnid.engine.flow import Stream
+from omnid.engine.graph import Stream
 from omnid.engine.telemetry import Histogram, StageStats
 
 UNTIL_ARMED: Final = "they stay stopped until cmd/arm (`omnid arm`)"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import sys
 import time
 from collections import Counter
@@ -194,26 +195,26 @@ class Progress:
 
 # Warnings about the input of a run over a log: a condition on its totals, and words with keys of them in braces.
 WARNINGS: Final[tuple[tuple[Callable[[Mapping[str, Any]], object], str], ...]] = (
-    (lambda s: s["fault"], "{broken} images could not be decoded; the first: {fault}"),
+    (lambda s: s["_fault"], "{broken} images could not be decoded; the first: {_fault}"),
     (
-        lambda s: not s["pairs"] and s["closest_ms"] is None,
+        lambda s: not s["pairs"] and math.isnan(s["closest_miss_ms"]),
         "no pair of images: one camera or both have none, see the drops below",
     ),
     (
-        lambda s: not s["pairs"] and s["closest_ms"] is not None,
-        "no pair of images: the stamps of the two cameras are at least {closest_ms:.3f} ms apart, pair.tolerance_ms is "
-        "{tolerance_ms:g}: increase it, or correct the clocks of the cameras",
+        lambda s: not s["pairs"] and not math.isnan(s["closest_miss_ms"]),
+        "no pair of images: the stamps of the two cameras are at least {closest_miss_ms:.3f} ms apart, "
+        "pair.tolerance_ms is {tolerance_ms:g}: increase it, or correct the clocks of the cameras",
     ),
     (
         lambda s: s["pairs"] and min(s["unpaired_lower"], s["unpaired_upper"]) > s["pairs"],
-        "most images of both cameras found no partner: the closest ones are {closest_ms:.3f} ms apart, "
+        "most images of both cameras found no partner: the closest ones are {closest_miss_ms:.3f} ms apart, "
         "pair.tolerance_ms is {tolerance_ms:g}; if no images are missing, synchronise the cameras",
     ),
     *(
         (
-            lambda s, camera=camera: s[f"frozen_{camera}"] >= FROZEN_IMAGES,
+            lambda s, camera=camera: s[f"_frozen_{camera}"] >= FROZEN_IMAGES,
             f"the {camera} camera was frozen: {{repeated_{camera}}} of its images had all pixels as before, "
-            f"{{frozen_{camera}}} in a row; {{of_repeated}}",
+            f"{{_frozen_{camera}}} in a row; {{of_repeated}}",
         )
         for camera in CAMERAS
     ),
@@ -253,12 +254,8 @@ def input_warnings(pairing: Synchronise, rig: RigHealth, statistics: RunStatisti
     """Yield one line for each problem of the input: of images and stamps, of the rig, and that odometry has met."""
     lost = statistics.states[TrackingState.LOST]
     totals: dict[str, object] = {
-        **pairing.counts,
-        **{f"frozen_{camera}": images.longest for camera, images in pairing.repeated.items()},
+        **pairing.stats(),
         **{f"lost_{side}": statistics.lost_parts[side] for side in SIDES},
-        "fault": pairing.fault,
-        "closest_ms": pairing.closest_miss_ms,
-        "tolerance_ms": pairing.tolerance_ms,
         "of_repeated": REPEATED[config.pair.repeated_images],
         "rig": rig.warning,
         "poses": statistics.poses,

@@ -14,22 +14,71 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from enum import Enum
 from functools import partial
 from queue import Empty, SimpleQueue
-from typing import Any, Final, TypeVar
+from typing import Any, Final, Generic, Protocol, TypeAlias, TypeVar
 
-from omnid.engine.flow import LOSSLESS, NEWEST, End, Policy, Sink, Stage, Step, Stream, nothing
 from omnid.engine.telemetry import StageStats, Telemetry
 from omnid.errors import OmnidError
-
-__all__ = ["LOSSLESS", "NEWEST", "End", "Graph", "Policy", "Sink", "Stage", "Stream"]
 
 T = TypeVar("T")
 In = TypeVar("In")
 Out = TypeVar("Out")
+T_co = TypeVar("T_co", covariant=True)
+Out_co = TypeVar("Out_co", covariant=True)
+In_contra = TypeVar("In_contra", contravariant=True)
 TICKS: Final = "ticks"  # the thread of the tickers that name no other
-_POLL_S: Final = 0.1  # a signal handled in another thread does not wake the main one, so it polls
-_END: Final = object()  # the last message of a stream
+POLL_S: Final = 0.1  # a signal handled in another thread does not wake the main one, so it polls
+END: Final = object()  # the last message of a stream
+
+
+class Policy(Enum):
+    """Policy of a full inbox: LOSSLESS lets the writer wait, NEWEST drops the oldest message and counts it."""
+
+    LOSSLESS = "lossless"
+    NEWEST = "newest"
+
+
+LOSSLESS: Final = Policy.LOSSLESS
+NEWEST: Final = Policy.NEWEST
+
+
+class Stage(Protocol[In_contra, Out_co]):
+    """A step of the flow; may also have `finish() -> Iterable[Out]` for the results left at the end."""
+
+    def process(self, message: In_contra, /) -> Out_co | None:
+        """Return the result of the message, None without one."""
+
+
+class Sink(Protocol[In_contra]):
+    """An end of the flow; may also have `finish() -> None`."""
+
+    def process(self, message: In_contra, /) -> None:
+        """Take a message out of the graph."""
+
+
+# A stage or a sink without a state, and without results at the end, is a function.
+Step: TypeAlias = Stage[In_contra, Out_co] | Callable[[In_contra], Out_co | None]
+Output: TypeAlias = Sink[In_contra] | Callable[[In_contra], None]
+
+
+def nothing(*_: object) -> None:
+    """Do nothing: used in place of a method that a stage does not have."""
+
+
+class Stream(Generic[T_co]):
+    """Output of a source or a stage, with any number of readers, which get each message in the order of the wiring."""
+
+    def __init__(self, thread: str = "", depth: int = 0) -> None:
+        """thread: name of that in which the messages are pushed; empty: any. depth: see Graph.inlet; 0: of a stage."""
+        self.thread, self.depth = thread, depth
+        self.readers: list[Callable[[object], None]] = []
+
+    def push(self, message: object) -> None:
+        """Pass the message to every reader; END is the last one."""
+        for put in self.readers:
+            put(message)
 
 
 class Node:
@@ -43,25 +92,24 @@ class Node:
         self._finish: Callable[[], Iterable[object] | None] = getattr(work, "finish", nothing)
 
     def put(self, message: object) -> None:
-        """Process the message, and pass its result on."""
-        if not self.writers or self.stats.name in self._graph.failed:
+        """Process the message, and pass its result on; at the end of the last input what remains, and the end."""
+        graph, name = self._graph, self.stats.name
+        if message is END:
+            self.writers -= 1
+            if self.writers:
+                return
+            if name not in graph.failed and not graph.aborting:
+                with graph.watched(name):
+                    for result in self._finish() or ():
+                        self.stream.push(result)
+            self.stream.push(END)
+        elif not self.writers or name in graph.failed:
             self.stats.dropped += 1
-            return
-        with self._graph.watched(self.stats.name):
-            result = self.stats.timed(self._process, message)
-            if result is not None:
-                self.stream.push(result)
-
-    def end(self) -> None:
-        """Take the end of a stream; after the last one the results that remain are passed on, and the output ends."""
-        self.writers -= 1
-        if self.writers:
-            return
-        if self.stats.name not in self._graph.failed and not self._graph.aborting:
-            with self._graph.watched(self.stats.name):
-                for result in self._finish() or ():
+        else:
+            with graph.watched(name):
+                result = self.stats.timed(self._process, message)
+                if result is not None:
                     self.stream.push(result)
-        self.stream.end()
 
 
 @dataclass(slots=True, eq=False)
@@ -86,26 +134,25 @@ class Inbox:
         self.nodes: list[Node] = []
         self._changed, self._idle = threading.Condition(lock), idle
         self._messages: deque[tuple[Link, object]] = deque()
-        self._current: Link | None = None  # whose message is processed
-        self._closed = False
+        self._is_busy = self._is_closed = False
 
     @property
     def is_idle(self) -> bool:
         """True if no message waits or is being processed; to be asked under the lock."""
-        return not self._messages and self._current is None
+        return not self._messages and not self._is_busy
 
     def put(self, link: Link, message: object) -> None:
         """Add a message of a stream; the end of one always has room."""
         stats = link.node.stats
         with self._changed:
-            if message is not _END:
+            if message is not END:
                 if link.policy is LOSSLESS:
-                    self._changed.wait_for(lambda: self._closed or link.waiting < link.depth)
+                    self._changed.wait_for(lambda: self._is_closed or link.waiting < link.depth)
                 elif link.waiting >= link.depth:
                     del self._messages[next(k for k, (other, _) in enumerate(self._messages) if other is link)]
                     link.waiting -= 1
                     stats.dropped += 1
-                if self._closed:
+                if self._is_closed:
                     stats.dropped += 1
                     return
                 link.waiting += 1
@@ -120,28 +167,27 @@ class Inbox:
             with self._changed:
                 self._changed.wait_for(lambda: self._messages)
                 link, message = self._messages.popleft()
-                self._current = link
-                link.waiting -= message is not _END
+                self._is_busy = True
+                link.waiting -= message is not END
                 self._changed.notify_all()
             # 2. Its node does the work.
-            node = link.node
-            node.end() if message is _END else node.put(message)
+            link.node.put(message)
             # 3. It is done.
             with self._changed:
-                self._current = None
-                waits = any(other.node is node for other, _ in self._messages)
-                node.stats.busy_since_ns = time.monotonic_ns() if waits else 0
+                self._is_busy = False
+                waits = any(other.node is link.node for other, _ in self._messages)
+                link.node.stats.busy_since_ns = time.monotonic_ns() if waits else 0
                 if not self._messages:
                     self._idle.notify_all()
 
     def close(self) -> None:
         """Drop and count all messages, those to come too; the ends of streams stay."""
         with self._changed:
-            self._closed = True
+            self._is_closed = True
             for link, message in self._messages:
-                link.node.stats.dropped += message is not _END
+                link.node.stats.dropped += message is not END
                 link.waiting = 0
-            self._messages = deque(entry for entry in self._messages if entry[1] is _END)
+            self._messages = deque(each for each in self._messages if each[1] is END)
             self._changed.notify_all()
 
 
@@ -163,16 +209,6 @@ class _Ticker:
     period_ns: int
     action: Callable[[], object]
     deadline_ns: int = 0
-
-    def tick(self) -> None:
-        """Call the action; of several deadlines that have passed the newest is served, without drift and burst."""
-        now_ns = time.monotonic_ns()
-        skipped = max(0, now_ns - self.deadline_ns) // self.period_ns
-        self.stats.dropped += skipped
-        self.stats.busy_since_ns = now_ns
-        self.stats.timed(self.action)
-        self.stats.busy_since_ns = 0
-        self.deadline_ns += (1 + skipped) * self.period_ns
 
 
 class Graph:
@@ -197,17 +233,19 @@ class Graph:
         self._lock = threading.Lock()
         self._idle = threading.Condition(self._lock)
         self._sources: list[_Source] = []
-        self._open_sources = 0
         self._inlets: list[Stream[Any]] = []
         self._inboxes: dict[str, Inbox] = {}  # by thread
         self._tickers: dict[str, list[_Ticker]] = {}  # by thread
-        self._ended: list[str] = []  # names of threads of sources and stages
+        self._ended: set[str] = set()  # names of threads
         self.failed: set[str] = set()  # names of stages
         self._errors: list[BaseException] = []
         self._stops: deque[None] = deque(maxlen=2)
         self._wakeup: SimpleQueue[None] = SimpleQueue()  # its put is reentrant, so safe in a signal handler
         self._no_ticks = threading.Event()
+        self._open_sources = 0
         self._ran = False
+
+    # The wiring.
 
     def source(
         self, name: str, messages: Callable[[], Iterable[T]], *, wake: Callable[[], None] = nothing
@@ -217,8 +255,8 @@ class Graph:
         `wake` is called once to end a threaded run early: it must end the current read and all later ones.
         """
         stream: Stream[T] = Stream(name)
+        self._sources.append(_Source(self._stats(name), messages, wake, stream))
         self._open_sources += 1
-        self._sources.append(_Source(self._add(StageStats(name)), messages, wake, stream))
         return stream
 
     def inlet(self, depth: int, thread: str = "") -> Stream[Any]:
@@ -227,10 +265,8 @@ class Graph:
         depth: number of messages that may wait for each reader; the oldest give way. thread: name of the thread that
         pushes them, whose stages then run there; empty: any.
         """
-        self._require_fresh()
-        inlet: Stream[Any] = Stream(thread, depth)
-        self._inlets.append(inlet)
-        return inlet
+        self._inlets.append(Stream(thread, depth))
+        return self._inlets[-1]
 
     def stage(self, name: str, stage: Step[In, Out], *inputs: Stream[In], thread: str = "") -> Stream[Out]:
         """Add a stage, whose inputs merge; return its output.
@@ -243,7 +279,7 @@ class Graph:
     def sink(
         self,
         name: str,
-        sink: End[In],
+        sink: Output[In],
         *inputs: Stream[In],
         policy: Policy | None = None,
         depth: int | None = None,
@@ -261,33 +297,41 @@ class Graph:
         """
         if not 0.0 < period_s < threading.TIMEOUT_MAX:
             raise OmnidError(f"ticker '{name}': expected a period above 0 s, found {period_s}")
-        stats = self._add(StageStats(name, is_ticker=True))
-        self._tickers.setdefault(thread, []).append(_Ticker(stats, round(period_s * 1e9), action))
+        ticker = _Ticker(self._stats(name, is_ticker=True), round(period_s * 1e9), action)
+        self._tickers.setdefault(thread, []).append(ticker)
 
-    def settle(self) -> None:
-        """Wait until all messages have been processed, or the run ends: for a source whose time is stopped meanwhile.
+    def _stats(self, name: str, *, is_ticker: bool = False) -> StageStats:
+        if self._ran:
+            raise OmnidError("a graph runs once, and is wired before it runs: create a new one")
+        return self.telemetry.add(StageStats(name, is_ticker))
 
-        Inline, nothing ever waits.
-        """
-        with self._idle:
-            while not self._stopping:
-                if self._idle.wait_for(lambda: all(inbox.is_idle for inbox in self._inboxes.values()), _POLL_S):
-                    return
+    def _node(
+        self, name: str, work: Any, inputs: tuple[Stream[Any], ...], policy: Policy, depth: int, thread: str
+    ) -> Stream[Any]:
+        if not inputs or depth < 1:
+            raise OmnidError(f"'{name}': expected inputs and a depth above 0, found {len(inputs)} and {depth}")
+        thread = thread or name
+        node = Node(self, self._stats(name), work, len(inputs), thread)
+        for stream in inputs:
+            if not self._threaded or stream.thread == thread:
+                stream.readers.append(node.put)
+                continue
+            inbox = self._inboxes.setdefault(thread, Inbox(self._lock, self._idle))
+            if node not in inbox.nodes:
+                inbox.nodes.append(node)
+            link = Link(node, stream.depth, NEWEST) if stream.depth else Link(node, depth, policy)
+            stream.readers.append(partial(inbox.put, link))
+        return node.stream
 
-    def stop(self) -> None:
-        """End the sources and process what is in the inboxes; a second call drops the inboxes and finishes nothing.
-
-        Takes no lock, so any thread or signal handler may call it.
-        """
-        self._stops.append(None)
-        self._wakeup.put(None)
+    # The run.
 
     def run(self) -> None:
         """Run until all sources have ended and all threads have joined; only once.
 
         Raises the first error of any stage with later ones in its notes, and KeyboardInterrupt after a second stop.
         """
-        self._require_fresh()
+        if self._ran:
+            raise OmnidError("a graph runs once, and is wired before it runs: create a new one")
         self._ran = True
         # 1. A thread for each source, each group of stages, and each group of tickers.
         bodies: dict[str, Callable[[], object]] = {
@@ -295,9 +339,7 @@ class Graph:
         }
         bodies |= {name: inbox.serve for name, inbox in self._inboxes.items()}
         work = [self._thread(name, body) for name, body in bodies.items()] if self._threaded else []
-        ticks = [
-            threading.Thread(target=self._tick, args=(name, group), name=name) for name, group in self._tickers.items()
-        ]
+        ticks = [self._thread(name, partial(self._tick, group)) for name, group in self._tickers.items()]
         # 2. Run, and wait for the end of all.
         try:
             for thread in ticks + work:
@@ -319,6 +361,24 @@ class Graph:
             raise self._errors[0]
         if self.aborting:
             raise KeyboardInterrupt("stopped twice: messages that were still in the inboxes are lost")
+
+    def stop(self) -> None:
+        """End the sources and process what is in the inboxes; a second call drops the inboxes and finishes nothing.
+
+        Takes no lock, so any thread or signal handler may call it.
+        """
+        self._stops.append(None)
+        self._wakeup.put(None)
+
+    def settle(self) -> None:
+        """Wait until all messages have been processed, or the run ends: for a source whose time is stopped meanwhile.
+
+        Inline, nothing ever waits.
+        """
+        with self._idle:
+            while not self._stopping:
+                if self._idle.wait_for(lambda: all(inbox.is_idle for inbox in self._inboxes.values()), POLL_S):
+                    return
 
     @property
     def aborting(self) -> bool:
@@ -342,37 +402,11 @@ class Graph:
     def _stopping(self) -> bool:
         return bool(self._stops or self._errors)
 
-    def _require_fresh(self) -> None:
-        if self._ran:
-            raise OmnidError("a graph runs once, and is wired before it runs: create a new one")
-
-    def _add(self, stats: StageStats) -> StageStats:
-        self._require_fresh()
-        return self.telemetry.add(stats)
-
-    def _node(
-        self, name: str, work: Any, inputs: tuple[Stream[Any], ...], policy: Policy, depth: int, thread: str
-    ) -> Stream[Any]:
-        if not inputs or depth < 1:
-            raise OmnidError(f"'{name}': expected inputs and a depth above 0, found {len(inputs)} and {depth}")
-        thread = thread or name
-        node = Node(self, self._add(StageStats(name)), work, len(inputs), thread)
-        for stream in inputs:
-            if not self._threaded or stream.thread == thread:
-                stream.add(node.put, node.end)
-                continue
-            inbox = self._inboxes.setdefault(thread, Inbox(self._lock, self._idle))
-            if node not in inbox.nodes:
-                inbox.nodes.append(node)
-            link = Link(node, stream.depth, NEWEST) if stream.depth else Link(node, depth, policy)
-            stream.add(partial(inbox.put, link), partial(inbox.put, link, _END))
-        return node.stream
-
     def _thread(self, name: str, body: Callable[[], object]) -> threading.Thread:
         def run() -> None:
             self._on_thread(name)
             body()
-            self._ended.append(name)
+            self._ended.add(name)
             self._wakeup.put(None)
 
         return threading.Thread(target=run, name=name)
@@ -393,31 +427,39 @@ class Graph:
                         start_ns = time.perf_counter_ns()
             finally:
                 getattr(messages, "close", nothing)()
-        source.stream.end()
+        source.stream.push(END)
         with self._lock:
             self._open_sources -= 1
             is_last = not self._open_sources
         for inlet in self._inlets if is_last else ():
-            inlet.end()
+            inlet.push(END)
 
     def _run_inline(self) -> None:
         active = deque(map(self._steps, self._sources))
         while active:  # round robin
             steps = active.popleft()
-            if next(steps, _END) is not _END:
+            if next(steps, END) is not END:
                 active.append(steps)
 
-    def _tick(self, name: str, group: list[_Ticker]) -> None:
-        """Call the actions of a thread, each at its rate, until the end; then close them."""
-        self._on_thread(name)
+    def _tick(self, group: list[_Ticker]) -> None:
+        """Call the actions of a thread, each at its rate, until the end; then close them.
+
+        Of several deadlines that have passed the newest is served, without drift and burst.
+        """
         for ticker in group:
             ticker.deadline_ns = time.monotonic_ns()
         while True:
             ticker = min(group, key=lambda each: each.deadline_ns)
             if self._no_ticks.wait(max(0.0, (ticker.deadline_ns - time.monotonic_ns()) * 1e-9)) or self._stopping:
                 break
-            with self.watched(ticker.stats.name):
-                ticker.tick()
+            stats, now_ns = ticker.stats, time.monotonic_ns()
+            skipped = max(0, now_ns - ticker.deadline_ns) // ticker.period_ns
+            ticker.deadline_ns += (1 + skipped) * ticker.period_ns
+            stats.dropped += skipped
+            stats.busy_since_ns = now_ns
+            with self.watched(stats.name):
+                stats.timed(ticker.action)
+            stats.busy_since_ns = 0
         for ticker in group:
             with self.watched(ticker.stats.name):
                 getattr(ticker.action, "close", nothing)()
@@ -425,9 +467,9 @@ class Graph:
     def _wait(self, threads: list[threading.Thread]) -> None:
         """Wait for the threads that were started; pass a stop or a failure on to sources, tickers and inboxes."""
         started = [thread for thread in threads if thread.ident is not None]
-        while len(self._ended) < len(started):
+        while not self._ended.issuperset(thread.name for thread in started):
             with suppress(Empty):
-                self._wakeup.get(timeout=_POLL_S)
+                self._wakeup.get(timeout=POLL_S)
             if self._stopping:
                 self._no_ticks.set()
                 for source in self._sources:

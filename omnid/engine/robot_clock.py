@@ -19,7 +19,7 @@ from collections.abc import Callable
 from typing import Final, NamedTuple
 
 from omnid.core.nanoseconds import S_PER_NS
-from omnid.engine.flow import nothing
+from omnid.engine.graph import nothing
 from omnid.engine.threads import Lock
 
 SLEW: Final = 500e-6  # most by which NTP changes the rate of a clock: MAXFREQ of the kernel's timex.h

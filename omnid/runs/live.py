@@ -30,8 +30,7 @@ from omnid.core.navigation.requests import NavigationCommand
 from omnid.core.obstacles.unwatched import Unwatched
 from omnid.core.rig.rig_health import RigHealth
 from omnid.diagnostics.status import StatusCollector, image_stats, rig_stats, wheel_stats
-from omnid.engine.flow import nothing
-from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Stream
+from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Stream, nothing
 from omnid.engine.kernel_cache import prepare_kernels, read_kept_kernels
 from omnid.engine.logging_setup import Report
 from omnid.engine.realtime import ThreadStart, name_thread, prepare

@@ -16,7 +16,7 @@ from calib.rig import MountedCamera
 from calib.rig_file import rig_toml
 from omnid.config import Config, PlacesConfig
 from omnid.core.places.place_map import PlaceMap, PlaceRig
-from omnid.engine.flow import Stream
+from omnid.engine.graph import Stream
 from omnid.engine.logging_setup import log
 from omnid.errors import OmnidError
 from omnid.formats.place_file import read_places, write_places

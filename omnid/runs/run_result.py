@@ -175,7 +175,7 @@ class RunReport:
     def _loss(self) -> str:
         """Return one line about images that make no pair; empty where these are few, or were dropped on purpose."""
         dropped = self._session.graph.telemetry.dropped_messages
-        return "" if dropped else str(self._pairing.loss(self._reader.counts))
+        return "" if dropped else self._pairing.loss(self._reader.counts)
 
     def _motion(self) -> list[DiagnosticStatus]:
         """Return the entry of wheels and gyro, if there were any."""

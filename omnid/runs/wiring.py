@@ -14,7 +14,7 @@ from omnid.controller.link import DriveLink
 from omnid.controller.statistics import ControllerState
 from omnid.core.navigation.situation import WheelState
 from omnid.core.places.place_map import PlaceMap
-from omnid.engine.graph import NEWEST, End, Graph, Stream
+from omnid.engine.graph import NEWEST, Graph, Output, Stream
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import FramePair, MapUpdate, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate, SaveMap
 from omnid.runs.route_files import Requests, RouteFiles, TaughtRoutes
@@ -36,15 +36,15 @@ RECORDED_DEPTH = 20  # messages of each kind that may wait for the disk of a liv
 class Outputs:
     """The consumers of a run; a map that none of them takes is not computed, nor are places."""
 
-    pairs: dict[str, End[FramePair]] = field(default_factory=dict)  # each takes the newest
-    poses: dict[str, End[OdometryUpdate]] = field(default_factory=dict)
-    counters: dict[str, End[OdometryUpdate]] = field(default_factory=dict)  # in the thread of the poses: never wait
-    commands: dict[str, End[VelocityCommand]] = field(default_factory=dict)
-    maps: dict[str, End[MapUpdate]] = field(default_factory=dict)
-    places: dict[str, End[PlaceUpdate]] = field(default_factory=dict)
-    rings: dict[str, End[ObstacleRing]] = field(default_factory=dict)  # in the thread of the rings
-    bus: End[Outgoing] | None = None  # takes all messages that leave the run
-    recorder: End[Any] | None = None  # takes them as well
+    pairs: dict[str, Output[FramePair]] = field(default_factory=dict)  # each takes the newest
+    poses: dict[str, Output[OdometryUpdate]] = field(default_factory=dict)
+    counters: dict[str, Output[OdometryUpdate]] = field(default_factory=dict)  # in the thread of the poses: never wait
+    commands: dict[str, Output[VelocityCommand]] = field(default_factory=dict)
+    maps: dict[str, Output[MapUpdate]] = field(default_factory=dict)
+    places: dict[str, Output[PlaceUpdate]] = field(default_factory=dict)
+    rings: dict[str, Output[ObstacleRing]] = field(default_factory=dict)  # in the thread of the rings
+    bus: Output[Outgoing] | None = None  # takes all messages that leave the run
+    recorder: Output[Any] | None = None  # takes them as well
     records_images: bool = False  # the recorder of a live run takes the images, too
 
     @property
@@ -59,7 +59,7 @@ class NavigationParts(NamedTuple):
     requests: Requests
     states: Stream[ControllerState]  # of the controller; an inlet of the thread that gives the commands
     routes: RouteFolder
-    drive: End[NavigationUpdate]
+    drive: Output[NavigationUpdate]
     map_name: str  # of the file of the map; empty: it is not saved
 
 

@@ -26,8 +26,7 @@ from omnid.core.control.command_sources import PLANNER, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.frames import of_base
 from omnid.core.navigation.requests import NavigationCommand, NavigationRequest
-from omnid.engine.flow import nothing
-from omnid.engine.graph import Graph
+from omnid.engine.graph import Graph, nothing
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate

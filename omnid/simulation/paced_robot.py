@@ -26,8 +26,7 @@ from omnid.controller.statistics import ControllerStatistics, TickReport
 from omnid.core.control.collision_monitor import ControllerRing
 from omnid.core.control.contacts import NO_CONTACT
 from omnid.core.control.control_law import ControlInput, ControllerPose
-from omnid.engine.flow import nothing
-from omnid.engine.graph import Stream
+from omnid.engine.graph import Stream, nothing
 from omnid.engine.telemetry import StageStats
 from omnid.runs.session import Session
 from omnid.simulation.robot import SimulatedRobot, with_masks

@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 
 from calib.rig import Rig
 from drivers.errors import FrameDecodeError
-from drivers.frame import Camera, Frame, coding_steps, gray
-from drivers.motion import MotionSample
+from drivers.frame import CAMERAS, Camera, Frame, coding_steps, gray
+from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.camera_config import PairConfig
 from omnid.errors import OmnidError
 from omnid.messages import FramePair
-from omnid.stages.image_loss import ImageLoss, image_loss, unpaired_by_chance
-from omnid.stages.motion_inbox import MotionInbox
+from omnid.transport.status_names import NOTABLE_SHARE
+
+Image = NDArray[np.uint8]
 
 RECENT: Final = 30  # pairs to which a line is fitted
 MIN_FITTED: Final = 8  # Of fewer pairs the median is taken.
@@ -29,6 +30,13 @@ JUMP_NS: Final = 5_000_000  # A larger distance from the line means a lost image
 # larger than twice the scatter and than the least that stamps resolve.
 SCATTERS: Final = 2.0
 LEAST_NS, LEAST_AT_START_NS = 1_000_000, 3_000_000
+FROZEN_IMAGES: Final = 5  # repeated images in a row after which a camera counts as frozen: a single one may be a glitch
+MAX_WAITING: Final = 4  # frames of a camera that wait: the other camera may be delivered a few periods later
+PERIOD_STEPS: Final = 16  # recent steps between the stamps of a camera, whose median is its period
+# Largest difference of a pair: while the period is not known, and always. A pause at the start is no period.
+SURE_NS, MOST_NS = 5_000_000, 100_000_000
+MOST_WAITING: Final = 4096  # samples of wheels and gyro: ten seconds of a gyro of 400 Hz
+AHEAD_NS: Final = 5 * 10**9  # a sample that is later than a pair by more has a stamp of another clock
 
 
 class Skew:
@@ -39,39 +47,33 @@ class Skew:
         self._recent: deque[int] = deque(maxlen=RECENT)
         self.exposure_ns = 0.0  # upper minus lower exposure of the newest pair
 
-    def add(self, skew_ns: int) -> None:
-        """Add the skew of a pair."""
-        self.max_ns = max(self.max_ns, abs(skew_ns))
-        self.exposure_ns = self._between_exposures(skew_ns)
-
     @property
     def mean_ns(self) -> float:
         """Mean of the recent skews, NaN before the first."""
         return float(np.mean(self._recent)) if self._recent else math.nan
 
-    def _between_exposures(self, skew_ns: int) -> float:
-        """Return the skew without the scatter of the stamps; 0 where the exposures may be simultaneous.
+    def add(self, skew_ns: int) -> None:
+        """Add the skew of a pair; find it without the scatter of the stamps, 0 where exposures may be simultaneous.
 
         Free-running cameras drift against each other, so a line is fitted to the recent skews.
         """
         recent = self._recent
+        self.max_ns = max(self.max_ns, abs(skew_ns))
         if recent and abs(skew_ns - recent[-1]) > JUMP_NS:
             recent.clear()
         recent.append(skew_ns)
         if len(recent) < MIN_FITTED:
-            median = float(np.median(recent))
-            return median if abs(median) > LEAST_AT_START_NS else 0.0
-        # Least squares in closed form: sums of whole numbers are exact.
-        count, total, moment = len(recent), sum(recent), sum(index * each for index, each in enumerate(recent))
-        indices, squares = count * (count - 1) // 2, count * (count - 1) * (2 * count - 1) // 6
-        slope = (count * moment - indices * total) / (count * squares - indices**2)
-        start = (total - slope * indices) / count
-        newest = start + slope * (count - 1)
-        squared = sum((each - start - slope * index) ** 2 for index, each in enumerate(recent))
-        return newest if abs(newest) > max(SCATTERS * math.sqrt(squared / (count - 2)), LEAST_NS) else 0.0
-
-
-Image = NDArray[np.uint8]
+            newest, least_ns = float(np.median(recent)), float(LEAST_AT_START_NS)
+        else:
+            # Least squares in closed form: sums of whole numbers are exact.
+            count, total, moment = len(recent), sum(recent), sum(index * each for index, each in enumerate(recent))
+            indices, squares = count * (count - 1) // 2, count * (count - 1) * (2 * count - 1) // 6
+            slope = (count * moment - indices * total) / (count * squares - indices**2)
+            start = (total - slope * indices) / count
+            newest = start + slope * (count - 1)
+            squared = sum((each - start - slope * index) ** 2 for index, each in enumerate(recent))
+            least_ns = max(SCATTERS * math.sqrt(squared / (count - 2)), LEAST_NS)
+        self.exposure_ns = newest if abs(newest) > least_ns else 0.0
 
 
 class Decoder:
@@ -115,20 +117,11 @@ class Decoder:
         self.fault = self.fault or fault
 
 
-KEPT: Final = 4  # earlier images compared with: a driver that is stuck may hand out its buffers in turn
-FROZEN_IMAGES: Final = 5  # repeated images in a row after which a camera counts as frozen: a single one may be a glitch
-
-
 class RepeatedImages:
-    """Compare the images of one camera with the KEPT ones before; all pixels must be equal.
-
-    An image repeats if it equals the one before, or if the last images equal those a period of up to KEPT images
-    earlier, all of that period. A log that is played forwards and backwards repeats one image at each end only.
-    """
+    """Counts the images of one camera whose pixels all equal those of the image before."""
 
     def __init__(self) -> None:
-        self._earlier: deque[Image] = deque(maxlen=KEPT)  # the newest first
-        self._equal = [0] * KEPT  # consecutive images that equal the one 1, 2 ... KEPT images earlier
+        self._earlier: Image | None = None
         self.count = 0  # repeated images in all
         self.longest = 0  # most of them in a row
         self._in_a_row = 0
@@ -139,23 +132,61 @@ class RepeatedImages:
         return self._in_a_row >= FROZEN_IMAGES
 
     def add(self, image: Image) -> bool:
-        """Take the next image (H, W); return True if it repeats earlier ones."""
-        for index, earlier in enumerate(self._earlier):
-            # One row decides at once for images that are not equal: the noise of any real image differs there.
-            is_equal = np.array_equal(image[::2, 0], earlier[::2, 0]) and np.array_equal(image, earlier)
-            self._equal[index] = self._equal[index] + 1 if is_equal else 0
-        self._earlier.appendleft(image)
-        repeated = any(count > index for index, count in enumerate(self._equal))
+        """Take the next image (H, W); return True if it repeats the one before."""
+        earlier, self._earlier = self._earlier, image
+        # One row decides at once for images that are not equal: the noise of any real image differs there.
+        repeated = (
+            earlier is not None and np.array_equal(image[::2, 0], earlier[::2, 0]) and np.array_equal(image, earlier)
+        )
         self.count += repeated
         self._in_a_row = self._in_a_row + 1 if repeated else 0
         self.longest = max(self.longest, self._in_a_row)
         return repeated
 
 
-MAX_WAITING: Final = 4  # frames of a camera that wait: the other camera may be delivered a few periods later
-PERIOD_STEPS: Final = 16  # recent steps between the stamps of a camera, whose median is its period
-# Largest difference of a pair: while the period is not known, and always. A pause at the start is no period.
-SURE_NS, MOST_NS = 5_000_000, 100_000_000
+class MotionInbox:
+    """Samples of wheels and gyro on their way to the next pair: a bounded queue, whose oldest samples give way.
+
+    `add` may be called from any thread: samples come faster than images, from several sources, and must not replace
+    each other, as the messages in a stage's inbox do.
+    """
+
+    def __init__(self, R_base_imu: NDArray[np.float64] | None = None) -> None:
+        """R_base_imu: rotation (3, 3) from the axes of the gyro to those of the base; None: they are the same."""
+        self._R_base_imu = R_base_imu
+        self._waiting: deque[MotionSample] = deque(maxlen=MOST_WAITING)
+        self.wheels = self.gyro = 0  # samples that have come
+        self.dropped = 0  # because none took them, their stamps are far ahead, or their rates are not finite
+
+    def add(self, sample: MotionSample) -> None:
+        """Add a sample, unless its rates are not finite, which would make the poses not finite too."""
+        is_wheel = isinstance(sample, WheelSample)
+        rates: tuple[float, ...] = (
+            (sample.velocity_mps,)
+            if isinstance(sample, WheelSample)
+            else (sample.x_radps, sample.y_radps, sample.z_radps)
+        )
+        if not all(map(math.isfinite, rates)):
+            self.dropped += 1
+            return
+        self.wheels += is_wheel
+        self.gyro += not is_wheel
+        if self._R_base_imu is not None and isinstance(sample, GyroSample) and not sample.of_base:
+            x, y, z = (self._R_base_imu @ rates).tolist()
+            sample = GyroSample(sample.stamp_ns, x, y, z, of_base=True)
+        self.dropped += len(self._waiting) == MOST_WAITING
+        self._waiting.append(sample)
+
+    def take(self, stamp_ns: int) -> tuple[MotionSample, ...]:
+        """Return the samples up to a stamp and the first ones after it, which end the step there; others wait."""
+        waiting = sorted((self._waiting.popleft() for _ in range(len(self._waiting))), key=lambda each: each.stamp_ns)
+        sane = [sample for sample in waiting if sample.stamp_ns - stamp_ns <= AHEAD_NS]
+        self.dropped += len(waiting) - len(sane)
+        due = [sample for sample in sane if sample.stamp_ns <= stamp_ns]
+        later = sane[len(due) :]
+        self._waiting.extendleft(reversed(later))
+        first = {type(sample): sample for sample in reversed(later)}
+        return (*due, *(sample for sample in later if sample is first[type(sample)]))
 
 
 class _Camera:
@@ -169,9 +200,9 @@ class _Camera:
         self.repeated = RepeatedImages()
 
     @property
-    def period_ns(self) -> float | None:
-        """Median of the recent steps; None before the second image."""
-        return float(median_low(self.steps_ns)) if self.steps_ns else None
+    def period_ns(self) -> float:
+        """Median of the recent steps; NaN before the second image."""
+        return float(median_low(self.steps_ns)) if self.steps_ns else math.nan
 
     def arrive(self, frame: Frame) -> None:
         """Let a frame wait for a partner."""
@@ -186,12 +217,6 @@ class _Camera:
         self.waiting.popleft()
         self.unpaired += 1
 
-    def take(self, frame: Frame) -> None:
-        """Take a frame that waits into a pair. Those before it can match no later one: they are given up."""
-        while self.waiting[0] is not frame:
-            self.drop_oldest()
-        self.waiting.popleft()
-
 
 class Synchronise:
     """Joins the frames of both cameras that are nearest in time.
@@ -205,7 +230,7 @@ class Synchronise:
     without the other one costs no time. A frame that cannot be decoded counts as `broken` and is treated as if it
     had never come; one that never finds a partner is not decoded and counts as unpaired.
 
-    A pair with an image that repeats an earlier one of its camera is no new evidence: it is counted and not returned,
+    A pair with an image that repeats the one before of its camera is no new evidence: it is counted and not returned,
     unless pair.repeated_images is "use".
 
     Samples of wheels and gyro go along with the next pair. Those of a log come in its order; live ones are added to
@@ -215,38 +240,18 @@ class Synchronise:
     def __init__(self, rig: Rig, config: PairConfig, R_base_imu: NDArray[np.float64] | None = None) -> None:
         """R_base_imu: rotation from the axes of the gyro to those of the base; None: they are the same."""
         self._decode = Decoder(rig)
-        self._cameras: dict[Camera, _Camera] = {"lower": _Camera(), "upper": _Camera()}
+        self._cameras: dict[Camera, _Camera] = {name: _Camera() for name in CAMERAS}
         self._fixed_ns = round(config.tolerance_ms * 1e6)  # 0: none
-        self._closest_miss_ns: int | None = None
+        self._closest_miss_ns = math.nan  # smallest gap between images of both cameras that made no pair
         self._pairs = 0
         self._use_repeated = config.repeated_images == "use"
         self.skew = Skew()
         self.motion = MotionInbox(R_base_imu)
 
     @property
-    def fault(self) -> str:
-        """Reason why the first of the broken images could not be decoded; empty without one."""
-        return self._decode.fault
-
-    @property
-    def closest_miss_ms(self) -> float | None:
-        """Smallest gap between images of both cameras that made no pair, ms; None without such images."""
-        return None if self._closest_miss_ns is None else self._closest_miss_ns * 1e-6
-
-    @property
-    def tolerance_ms(self) -> float:
-        """Largest difference between the stamps of a pair, ms, as set or as it follows from the period."""
-        return self._tolerance_ns * 1e-6
-
-    @property
     def newest_ns(self) -> dict[Camera, int]:
         """Stamp of each camera's newest frame; 0 before the first."""
         return {name: camera.newest_ns for name, camera in self._cameras.items()}
-
-    @property
-    def repeated(self) -> dict[Camera, RepeatedImages]:
-        """The images of each camera that repeat earlier ones."""
-        return {name: camera.repeated for name, camera in self._cameras.items()}
 
     @property
     def counts(self) -> dict[str, int]:
@@ -256,27 +261,34 @@ class Synchronise:
         return {"pairs": self._pairs, **unpaired, "broken": self._decode.broken, **repeated}
 
     def stats(self) -> dict[str, object]:
-        """Return the numbers of the pairing for the status."""
+        """Return the numbers of the pairing, for the status and for warnings at the end of a run."""
+        cameras = self._cameras.items()
         return {
             **self.counts,
             "skew_ms": self.skew.mean_ns * 1e-6,
             "max_skew_ms": self.skew.max_ns * 1e-6,
             "exposure_skew_ms": self.skew.exposure_ns * 1e-6,
-            "tolerance_ms": self.tolerance_ms,
+            "tolerance_ms": self._tolerance_ns * 1e-6,  # largest difference between the stamps of a pair
+            "closest_miss_ms": self._closest_miss_ns * 1e-6,
             "_is_fixed": self._fixed_ns > 0,  # cameras whose clocks drift apart then make no pairs some day
-            "_fault": self.fault,
-            "_frozen": " and the ".join(name for name, each in self._cameras.items() if each.repeated.frozen),
+            "_fault": self._decode.fault,  # reason why the first of the broken images could not be decoded
+            "_frozen": " and the ".join(name for name, camera in cameras if camera.repeated.frozen),
+            **{f"_frozen_{name}": camera.repeated.longest for name, camera in cameras},
         }
 
-    def loss(self, read: Mapping[str, int]) -> ImageLoss:
-        """Return the images of a log that made no pair; read: counts of its reader."""
-        cameras, broken, other_size = self._cameras.items(), self._decode.broken, self._decode.other_size
-        unpaired = unpaired_by_chance(
-            {name: camera.arrived for name, camera in cameras},
-            {name: camera.unpaired for name, camera in cameras},
-            {name: camera.period_ns for name, camera in cameras},
+    def loss(self, read: Mapping[str, int]) -> str:
+        """Return one line about images of a log that made no pair; empty where these are few.
+
+        read: counts of its reader.
+        """
+        arrived, unpaired, periods_ns = (
+            {name: getattr(camera, field) for name, camera in self._cameras.items()}
+            for field in ("arrived", "unpaired", "period_ns")
         )
-        return image_loss(read, unpaired=unpaired, undecodable=broken - other_size, other_size=other_size)
+        other_size = self._decode.other_size
+        return image_loss(
+            read, arrived, unpaired, periods_ns, undecodable=self._decode.broken - other_size, other_size=other_size
+        )
 
     def process(self, message: Frame | MotionSample) -> FramePair | None:
         """Return the pair that a frame completes; None where the frame waits, is broken or shows nothing new."""
@@ -292,7 +304,7 @@ class Synchronise:
             lower, upper = min(product(lower_waiting, upper_waiting), key=_gap_ns)
             gap_ns = _gap_ns((lower, upper))
             if gap_ns > self._tolerance_ns:
-                self._closest_miss_ns = min(gap_ns, self._closest_miss_ns or gap_ns)
+                self._closest_miss_ns = min(gap_ns, self._closest_miss_ns)  # the first where the second is NaN
                 break
             lower_image, upper_image = self._decode(lower), self._decode(upper)
             if lower_image is None:
@@ -315,17 +327,22 @@ class Synchronise:
 
     @property
     def _tolerance_ns(self) -> float:
-        periods_ns = [camera.period_ns for camera in self._cameras.values() if camera.period_ns is not None]
+        periods_ns = [camera.period_ns for camera in self._cameras.values() if camera.steps_ns]
         return self._fixed_ns or min((SURE_NS if not periods_ns else min(periods_ns) / 2), MOST_NS)
 
     def _joined(self, lower: Frame, lower_image: Image, upper: Frame, upper_image: Image) -> FramePair | None:
-        self._cameras["lower"].take(lower)
-        self._cameras["upper"].take(upper)
+        # 1. Frames that waited before these can match no later one: they are given up.
+        for camera, frame in zip(self._cameras.values(), (lower, upper), strict=True):
+            while camera.waiting[0] is not frame:
+                camera.drop_oldest()
+            camera.waiting.popleft()
+        # 2. Images that show nothing new.
         self.skew.add(upper.stamp_ns - lower.stamp_ns)
         images = zip(self._cameras.values(), (lower_image, upper_image), strict=True)
         repeated = [camera.repeated.add(image) for camera, image in images]
         if any(repeated) and not self._use_repeated:
             return None
+        # 3. The pair.
         self._pairs += 1
         return FramePair(
             self._pairs - 1,
@@ -340,3 +357,34 @@ class Synchronise:
 
 def _gap_ns(frames: tuple[Frame, Frame]) -> int:
     return abs(frames[1].stamp_ns - frames[0].stamp_ns)
+
+
+def image_loss(
+    read: Mapping[str, int],
+    arrived: Mapping[Camera, int],
+    unpaired: Mapping[Camera, int],
+    periods_ns: Mapping[Camera, float],
+    *,
+    undecodable: int = 0,
+    other_size: int = 0,
+) -> str:
+    """Return one line about images of a log that make no pair, with the reasons; empty where these are a tenth or less.
+
+    read: counts of the reader; the others: of the images that it delivered, with the usual time between two of them.
+    Images of a faster camera that the other one has no partners for are no loss.
+    """
+    faster: Camera = "lower" if periods_ns["lower"] < periods_ns["upper"] else "upper"
+    surplus = 1 - periods_ns[faster] / max(periods_ns.values())  # NaN: a period is unknown
+    by_chance = 0 if math.isnan(surplus) else min(unpaired[faster], round(surplus * arrived[faster]))
+    equal = read["duplicate"] - read["repeated"]
+    images = read["lower"] + read["upper"] + equal + read["broken"]
+    lost = {
+        "without a partner": sum(unpaired.values()) - by_chance,
+        "not decodable": read["broken"] + undecodable,
+        "of another size": other_size,
+        "with the stamp of the one before": equal,
+    }
+    if sum(lost.values()) <= NOTABLE_SHARE * images:
+        return ""
+    reasons = ", ".join(f"{count} {reason}" for reason, count in lost.items() if count)
+    return f"{sum(lost.values())} of {images} images made no pair: {reasons}"

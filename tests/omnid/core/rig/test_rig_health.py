@@ -26,8 +26,7 @@ from omnid.core.rig.rig_health import (
     RigHealth,
 )
 from omnid.diagnostics.status import rig_stats
-from omnid.engine.flow import NEWEST
-from omnid.engine.graph import Graph
+from omnid.engine.graph import NEWEST, Graph
 from omnid.messages import Panoramas
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.front_end import FrontEnd
