@@ -83,9 +83,10 @@ def _write_job(job: Path, command: Sequence[str], guest: Guest) -> None:
 def _qemu(image: Image, job: Path, guest: Guest) -> list[str]:
     """Return QEMU's command line, without KVM: where it is nested in another machine, Debian's kernel may hang.
 
-    AVX2 is off, since QEMU 7.2 emulates it wrongly: numpy's argsort returns a wrong order with it, or crashes.
+    AVX2 is off, since QEMU 7.2 emulates it wrongly: numpy's argsort returns a wrong order with it, or crashes. So is
+    VAES, of which LLVM concludes that there is AVX2: what numba compiled ended with an illegal instruction.
     """
-    words = ["qemu-system-x86_64", "-accel", "tcg,thread=multi,tb-size=512", "-cpu", "max,-avx2", "-smp", "2"]
+    words = ["qemu-system-x86_64", "-accel", "tcg,thread=multi,tb-size=512", "-cpu", "max,-avx2,-vaes", "-smp", "2"]
     words += ["-m", str(guest.memory_mb), "-nodefaults", "-nic", "none", "-display", "none", "-no-reboot"]
     words += ["-kernel", str(image.kernel), "-initrd", str(image.initramfs), "-serial", "stdio"]
     words += ["-drive", f"file={image.disk},format=raw,if=virtio,snapshot=on,cache=unsafe"]
