@@ -29,7 +29,7 @@ class Curve(NamedTuple):
     values: Array  # (N,); NaN: unknown
 
 
-def chart(title: str, curves: Sequence[Curve], *, unit: str = "", log: bool = False, note: str = "") -> str:
+def chart(title: str, curves: Sequence[Curve], unit: str = "", *, log: bool = False, note: str = "") -> str:
     """Return a figure; "" where all curves are empty. Lengths below 0.1 m are shown in mm."""
     shown = []
     for name, t_s, values in curves:

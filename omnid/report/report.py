@@ -76,12 +76,7 @@ def report_html(run: RecordedRun, true: Trajectory | None = None) -> str:
         *_timeline(spans, events, start_s, end_s),
         *(() if (run.ranks != UNKNOWN).any() else [note("The log does not hold the state of the odometry.")]),
         *_events_table(events, end_s),
-        *(_against_truth(truth) if truth else ()),
-        *_motion(run),
-        *_uncertainty(run),
-        *_in_map(run),
-        *_timing(run),
-        *_parts(run),
+        *(f"<h2>{title}</h2>{''.join(section)}" for title, section in _sections(run, truth)),
         *_images(run, events),
         *_setup(run),
         *_contents(run),
@@ -294,68 +289,75 @@ def _rounded(text: str) -> str:
     return "" if value is None else f"{value:.3g}" if value < 100 else f"{value:.0f}"
 
 
-def _against_truth(truth: _Truth) -> list[str]:
-    """Return the section with the errors of the path, as `omnid eval` prints them."""
-    rows = [re.split(" {2,}", line, maxsplit=1) for line in escape(str(truth.metrics)).splitlines()]
-    figures = [
-        chart("Error of the position", [Curve("", truth.t_s, truth.position_m)], unit="m"),
-        chart("Error of the heading, to the left", [Curve("", truth.t_s, np.rad2deg(truth.heading_rad))], unit="deg"),
-    ]
-    footnote = "<small>Of the rig; the first pose is aligned and nothing else, as `omnid eval` does.</small>"
-    return ["<h2>Against the truth</h2>", facts(rows), footnote, grid(figures)]
-
-
-def _motion(run: RecordedRun) -> list[str]:
-    """Return the section with speed, yaw rate and height, and the commands."""
+def _sections(run: RecordedRun, truth: _Truth | None) -> Iterator[tuple[str, list[str]]]:
+    """Yield title and parts of each section of charts and tables; a part is HTML, "" where the log has nothing."""
+    # 1. Errors of the path, as `omnid eval` prints them.
+    if truth is not None:
+        rows = [re.split(" {2,}", line, maxsplit=1) for line in escape(str(truth.metrics)).splitlines()]
+        footnote = "<small>Of the rig; the first pose is aligned and nothing else, as `omnid eval` does.</small>"
+        figures = [
+            chart("Error of the position", [Curve("", truth.t_s, truth.position_m)], unit="m"),
+            chart("Error of the heading, to the left", [Curve("", truth.t_s, np.rad2deg(truth.heading_rad))], "deg"),
+        ]
+        yield "Against the truth", [facts(rows), footnote, grid(figures)]
+    # 2. Speed, yaw rate and height, and the commands.
     named = {DRIVE: "sent to the wheels", TWIST_COMMAND: "commanded"}
     moved = [("measured", run.t_s, run.velocity[:, 0], run.velocity[:, -1])]
     moved += [(name, *run.drives[topic].T) for topic, name in named.items() if topic in run.drives]
     figures = [
-        chart("Forward speed", [Curve(name, t_s, speed) for name, t_s, speed, _ in moved], unit="m/s"),
-        chart("Yaw rate, to the left", [Curve(name, t_s, np.rad2deg(w)) for name, t_s, _, w in moved], unit="deg/s"),
-        chart("Height of the robot", [Curve("", run.t_s, run.xyz[:, 2])], unit="m"),
+        chart("Forward speed", [Curve(name, t_s, speed) for name, t_s, speed, _ in moved], "m/s"),
+        chart("Yaw rate, to the left", [Curve(name, t_s, np.rad2deg(w)) for name, t_s, _, w in moved], "deg/s"),
+        chart("Height of the robot", [Curve("", run.t_s, run.xyz[:, 2])], "m"),
     ]
-    return ["<h2>Motion</h2>", grid(figures), *([] if run.drives else [note("The log holds no commands.")])]
-
-
-def _uncertainty(run: RecordedRun) -> list[str]:
-    """Return the section with the standard deviations of the covariances, and the landmarks."""
+    yield "Motion", [grid(figures), "" if run.drives else note("The log holds no commands.")]
+    # 3. Standard deviations of the covariances, and the landmarks.
     position_m, heading_rad = root(run.variances[:, :3].sum(axis=1)), root(run.variances[:, -1])
-    title = "Standard deviation of the"
+    title, landmarks = "Standard deviation of the", {"tracked": Key.TRACKED, "inliers of the pose": Key.INLIERS}
     figures = [
-        chart(f"{title} position, all axes", [Curve("", run.t_s, position_m)], unit="m", log=True),
-        chart(f"{title} heading", [Curve("", run.t_s, np.rad2deg(heading_rad))], unit="deg", log=True),
+        chart(f"{title} position, all axes", [Curve("", run.t_s, position_m)], "m", log=True),
+        chart(f"{title} heading", [Curve("", run.t_s, np.rad2deg(heading_rad))], "deg", log=True),
     ]
-    missing = [] if any(figures) else [note("The covariances in the log are zero or negative: they were not set.")]
-    (t_s, tracked), (_, inliers) = (run.series(ODOMETRY, key) for key in (Key.TRACKED, Key.INLIERS))
-    if not len(tracked):
-        missing.append(note("The log holds no numbers of landmarks."))
-    elif len(tracked) > 2 and len(tracked) == len(inliers):
-        curves = [Curve("tracked", t_s, tracked), Curve("inliers of the pose", t_s, inliers)]
-        figures.append(chart("Landmarks", curves, note="One value per report, not per pose."))
-    else:
-        missing.append(note(f"Landmarks at the last report: {tracked[-1]:.0f}."))
-    return ["<h2>Uncertainty</h2>", grid(figures), *missing]
+    unset = "" if any(figures) else note("The covariances in the log are zero or negative: they were not set.")
+    curves = [run.curve(name, ODOMETRY, key) for name, key in landmarks.items()]
+    figures.append(chart("Landmarks", curves, note="One value per report, not per pose."))
+    yield "Uncertainty", [grid(figures), unset, "" if figures[-1] else note("The log holds no numbers of landmarks.")]
+    # 4. The map of places: its sizes, and the correction of odometry, where there was one.
+    if len(_map_path(run)):
+        t_s, moved_m, turned_rad, sigma_m = run.map_poses.T
+        title, what = "From odometry's", "The correction map -> odom, where the robot is: odom does not jump."
+        figures = [
+            chart(f"{title} position to that in the map", [Curve("", t_s, moved_m)], "m", note=what),
+            chart(f"{title} heading to that in the map", [Curve("", t_s, np.rad2deg(turned_rad))], "deg"),
+            chart("Standard deviation of the position in the map, all axes", [Curve("", t_s, sigma_m)], "m", log=True),
+            chart("Keyframes and loops", [run.curve(name, PLACES, name) for name in ("keyframes", "loops")]),
+        ]
+        yield "In the map", [*_counters(run, PLACES), grid(figures)]
+    # 5. Rates, latencies, the stages' times; counters of the other parts at the end.
+    yield "Times and losses", _timing(run)
+    names = [name for name in run.newest if name not in (ODOMETRY, SUMMARY) and not name.startswith(STAGE_PREFIX)]
+    if names:
+        rows = [
+            (short_name(name), run.newest[name].message, ", ".join(f"{k} {v}" for k, v in run.values(name).items()))
+            for name in names
+        ]
+        titles = ("part", "at the last report", "counters")
+        late = [run.curve(p, WHEELS, time_key(TICK_LATE, p)) for p in ("p99", "max")]
+        figures = [
+            chart("Images per second", [run.curve(short_name(name), name, Key.RATE_HZ) for name in names]),
+            chart("Lateness of the wheels' tick, so far", late, "ms"),
+        ]
+        yield "Cameras, pairing, wheels", [_words(titles, rows), grid(figures)]
+
+
+def _words(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table of texts of the log."""
+    cells = [[escape(cell) for cell in row] for row in rows]
+    return f"<div class='words scroll'>{table(titles, cells)}</div>"
 
 
 def _map_path(run: RecordedRun) -> Array:
     """Return the path in the map; empty where it is that of odometry, to a hundredth of a metre."""
     return run.map_xy if len(run.map_poses) and run.map_poses[:, 1].max() >= 0.01 else np.zeros((0, 2))
-
-
-def _in_map(run: RecordedRun) -> list[str]:
-    """Return the section with the map of places: its sizes, and the correction of odometry, where there was one."""
-    if not len(_map_path(run)):
-        return []
-    t_s, moved_m, turned_rad, sigma_m = run.map_poses.T
-    what = "The correction map -> odom, where the robot is: odom does not jump."
-    figures = [
-        chart("From odometry's position to that in the map", [Curve("", t_s, moved_m)], unit="m", note=what),
-        chart("From odometry's heading to that in the map", [Curve("", t_s, np.rad2deg(turned_rad))], unit="deg"),
-        chart("Standard deviation of the position in the map, all axes", [Curve("", t_s, sigma_m)], unit="m", log=True),
-        chart("Keyframes and loops", [Curve(name, *run.series(PLACES, name)) for name in ("keyframes", "loops")]),
-    ]
-    return ["<h2>In the map</h2>", *_counters(run, PLACES), grid(figures)]
 
 
 def _counters(run: RecordedRun, name: str) -> list[str]:
@@ -366,16 +368,11 @@ def _counters(run: RecordedRun, name: str) -> list[str]:
 
 
 def _timing(run: RecordedRun) -> list[str]:
-    """Return the section with rates, latencies and the stages' times."""
-    head = ["<h2>Times and losses</h2>"]
-    if summary := _counters(run, SUMMARY):
-        head += ["<p>Counters at the end of the run:</p>", *summary]
+    """Return the table of stages, and the charts of rates, latencies and losses."""
+    parts = ["<p>Counters at the end of the run:</p>", *summary] if (summary := _counters(run, SUMMARY)) else []
     if not run.reports:
         what = "rates, times of stages, latencies, drops and camera faults are unknown"
-        return [
-            *head,
-            note(f"The log holds no status of the daemon's parts, so {what}; omnid's own recordings hold it."),
-        ]
+        return [*parts, note(f"The log holds no status of the daemon's parts, so {what}; omnid's own recordings do.")]
     # 1. The table of stages.
     stages = {name.removeprefix(STAGE_PREFIX): run.values(name) for name in run.newest if name.startswith(STAGE_PREFIX)}
     rows = []
@@ -386,51 +383,31 @@ def _timing(run: RecordedRun) -> list[str]:
         rows.append((escape(name), *counts, f"<b>{lost}</b>" if lost not in ("", "0") else lost, *times))
     titles = ("stage", "messages", "per second, last", "dropped or missed", "p50 ms", "p99 ms", "max ms")
     if rows:
-        head.append(f"<div class='scroll'>{table(titles, rows)}</div>")
-        head.append("<small>At the last report. The work of a camera's stage is its wait for the next image.</small>")
+        parts.append(f"<div class='scroll'>{table(titles, rows)}</div>")
+        parts.append("<small>At the last report. The work of a camera's stage is its wait for the next image.</small>")
     if run.reports == 1:  # a replay, which reports at its end only
-        return head
+        return parts
     # 2. The charts.
-    of_all = "Of all messages since the start of the run."
-    percentiles = {"median": "p50", "99th percentile": "p99"}
-    latency = [run.curve(name, ODOMETRY, time_key(CAPTURE_TO_POSE, p)) for name, p in percentiles.items()]
+    of_all, by_rank = "Of all messages since the start of the run.", {"median": "p50", "99th percentile": "p99"}
+    latency = [run.curve(name, ODOMETRY, time_key(CAPTURE_TO_POSE, p)) for name, p in by_rank.items()]
     work = [run.curve(name, stage_name(name), time_key(WORK, "p50")) for name in stages]
     losses = [
         run.curve(f"{name}, {key}", stage_name(name), key) for name in stages for key in (Key.DROPPED, Key.MISSED)
     ]
+    lost = [curve for curve in highest(losses) if curve.values[-1] > 0]
     figures = [
         chart("Poses per second", [run.curve("", ODOMETRY, Key.RATE_HZ)]),
-        chart("Age of the newest pose at each report", [run.curve("", ODOMETRY, Key.AGE_S)], unit="s"),
-        chart("From the image to its pose", latency, unit="ms", note=of_all),
-        chart("Median work of a stage", highest(work), unit="ms", log=True, note=of_all),
-        chart(
-            "Messages dropped, deadlines missed, so far", [curve for curve in highest(losses) if curve.values[-1] > 0]
-        ),
+        chart("Age of the newest pose at each report", [run.curve("", ODOMETRY, Key.AGE_S)], "s"),
+        chart("From the image to its pose", latency, "ms", note=of_all),
+        chart("Median work of a stage", highest(work), "ms", log=True, note=of_all),
+        chart("Messages dropped, deadlines missed, so far", lost),
     ]
-    return [*head, grid(figures)]
+    return [*parts, grid(figures)]
 
 
 def highest(curves: Sequence[Curve]) -> list[Curve]:
     """Return the curves that have values, those with the highest last one first."""
     return sorted((curve for curve in curves if len(curve.values)), key=lambda curve: -curve.values[-1])
-
-
-def _parts(run: RecordedRun) -> list[str]:
-    """Return the section with cameras, pairing and wheels: counters at the end, and rates."""
-    names = [name for name in run.newest if name not in (ODOMETRY, SUMMARY) and not name.startswith(STAGE_PREFIX)]
-    if not names:
-        return []
-    rows = []
-    for name in names:
-        counters = ", ".join(f"{escape(key)} {escape(value)}" for key, value in run.values(name).items())
-        rows.append((escape(short_name(name)), escape(run.newest[name].message), counters))
-    parts = table(("part", "at the last report", "counters"), rows)
-    late = [run.curve(p, WHEELS, time_key(TICK_LATE, p)) for p in ("p99", "max")]
-    figures = [
-        chart("Images per second", [run.curve(short_name(name), name, Key.RATE_HZ) for name in names]),
-        chart("Lateness of the wheels' tick, so far", late, unit="ms"),
-    ]
-    return ["<h2>Cameras, pairing, wheels</h2>", f"<div class='words scroll'>{parts}</div>", grid(figures)]
 
 
 def _images(run: RecordedRun, events: Sequence[Event]) -> list[str]:
@@ -479,25 +456,17 @@ def _setup(run: RecordedRun) -> list[str]:
             rows.append((f"{name} camera", f"{model_in_words(one.camera)}, {size} px, {mask}"))
         parts.append(facts([(name, escape(value)) for name, value in (*rows, ("on the robot", place))]))
     settings = run.attachments.get("omnid.toml")
+    if settings is None:
+        return [*parts, note("No settings are attached.")]
     try:
-        found = None if settings is None else _changed(settings)
+        defaults = dict(_flat(parse_toml(dump(Config()))))
+        given = [(name, value, defaults.get(name, "unknown")) for name, value in _flat(parse_toml(settings.decode()))]
     except (ValueError, RecursionError):
         return [*parts, note("The attached settings cannot be read.")]
-    if found:
-        parts.append(f"<div class='words scroll'>{table(('setting', 'value', 'default'), found)}</div>")
-    elif found is None:
-        parts.append(note("No settings are attached."))
-    else:
-        parts.append("<p>All settings are at their defaults.</p>")
-    return parts
-
-
-def _changed(settings: bytes) -> list[list[str]]:
-    """Return name, value and default of the settings that differ from the defaults. Raise ValueError for no TOML."""
-    defaults = dict(_flat(parse_toml(dump(Config()))))
-    given = _flat(parse_toml(settings.decode()))
-    rows = [(name, value, defaults.get(name, "unknown to this omnid")) for name, value in given]
-    return [[escape(plain(str(cell), 120)) for cell in row] for row in rows if row[1] != row[2]][:MAX_ROWS]
+    changed = [[plain(str(cell), 120) for cell in row] for row in given if row[1] != row[2]][:MAX_ROWS]
+    if not changed:
+        return [*parts, "<p>All settings are at their defaults.</p>"]
+    return [*parts, _words(("setting", "value", "default"), changed)]
 
 
 def _flat(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, object]]:
@@ -510,9 +479,8 @@ def _flat(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, obje
 
 def _contents(run: RecordedRun) -> list[str]:
     """Return the section with the topics of the file."""
-    topics = list(run.info.topics.items())
-    rows = [(escape(name), escape(kind), str(count)) for name, (kind, count) in topics[:MAX_ROWS]]
-    more = [note(f"and {len(topics) - MAX_ROWS} more topics")] if len(topics) > MAX_ROWS else []
+    rows = [(name, kind, str(count)) for name, (kind, count) in run.info.topics.items()]
+    more = [note(f"and {len(rows) - MAX_ROWS} more topics")] if len(rows) > MAX_ROWS else []
     attached = ", ".join(f"{name} ({size} bytes)" for name, size in run.info.attachments.items())
-    content = f"<div class='words scroll'>{table(('topic', 'type', 'messages'), rows)}</div>"
+    content = _words(("topic", "type", "messages"), rows[:MAX_ROWS])
     return ["<h2>Content of the file</h2>", content, *more, f"<p>Attached: {escape(attached or 'nothing')}.</p>"]
