@@ -173,11 +173,14 @@ class Robot:
         topic = _TOPICS[kind]
         return Subscription(self._session, f"{self.name}/{topic}", PUBLISHED[topic].decode, on_close)
 
-    def on_message(self, callback: Callable[[str, bytes, bytes], None], topic: str = "*") -> Callable[[], None]:
+    def on_message(
+        self, callback: Callable[[str, bytes, bytes], None], topic: str = "*", *, kept: bool = False
+    ) -> Callable[[], None]:
         """Call callback(topic, payload, attachment) for each message of the robot from now on, in a zenoh thread.
 
         The payload is CDR; `odom` and `panorama` have an attachment. The callback must be quick and never raise.
-        topic: the only one to receive; default: all. Return a function that ends the subscription.
+        topic: the only one to receive; default: all. kept: also for the message of it that the robot has kept, before
+        this returns. Return a function that ends the subscription.
         """
         prefix_length = len(self.name) + 1
 
@@ -186,6 +189,8 @@ class Robot:
 
         subscriber = self._session.declare_subscriber(f"{self.name}/{topic}", on_sample)
         self._declared.append(subscriber)
+        if kept and (sample := _queried(self._session, f"{self.name}/{topic}")) is not None:
+            on_sample(sample)
 
         def end() -> None:
             self._declared.remove(subscriber)

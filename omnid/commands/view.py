@@ -17,18 +17,18 @@ from typing import TYPE_CHECKING, Any, Final
 
 from drivers.errors import FrameDecodeError
 from drivers.logs.open_log import log_info
-from omnid.client import Cloud, Diagnostics, Robot
+from omnid.client import Robot
 from omnid.commands.options import ROBOT, SECONDS, SETTINGS, command, settings_of, warn
 from omnid.commands.replay import Output, replay_and_print
 from omnid.config import Config
 from omnid.engine.process import handle_stop_signals, python, python_environment
 from omnid.errors import OmnidError
-from omnid.monitor.robot_state import Inbox
+from omnid.monitor.robot_state import RobotState
 from omnid.recordings.recording import CLOUD, ODOMETRY, STATUS, RecordingReader, choose_odometry_topic, no_pose
 from omnid.runs.replay import ReplayOptions
 from omnid.sinks.files import check_outputs
 from omnid.stages.front_end import FrontEnd
-from omnid.transport.topics import MAP_POSE, SCAN
+from omnid.transport.topics import MAP_POSE, PANORAMA, SCAN
 
 if TYPE_CHECKING:  # it imports rerun, which may be missing
     from omnid.viewer.rerun_sink import ReplayDrawing, RerunSink
@@ -147,25 +147,17 @@ def draw_replay(sink: RerunSink, log: Path, config: Config, options: ReplayOptio
 
 def _draw_robot(sink: RerunSink, config: Config, seconds: float) -> None:
     """Draw a live robot until a signal, or for a number of seconds."""
-    from omnid.viewer.rerun_sink import decoded
-
-    end_s, signals, inbox = time.monotonic() + seconds, list[int](), Inbox()
+    end_s, signals, state = time.monotonic() + seconds, list[int](), RobotState()
     with (
         handle_stop_signals(lambda number, _: signals.append(number)),
         Robot(settings=config.bus, timeout_s=2.0) as robot,
     ):
-        robot.on_message(inbox.put)
-        # What was published before.
-        with robot.subscribe(Diagnostics) as reports, robot.subscribe(Cloud) as clouds:
-            for newest in (reports.newest(), clouds.newest()):
-                if newest is not None:
-                    sink.draw(newest)
+        for topic in (ODOMETRY, MAP_POSE, SCAN, PANORAMA, STATUS, CLOUD):
+            robot.on_message(state.put, topic, kept=topic in (STATUS, CLOUD))
         while time.monotonic() < end_s and not signals:
-            if (message := inbox.get(0.5)) is None:
-                continue
-            with suppress(OmnidError, FrameDecodeError):  # a message of another program
-                content = decoded(message.topic, message.payload, message.attachment, message.received_ns)
-                if content is not None:
+            message, content = state.next(0.5) or (None, None)
+            if message is not None and content is not None:
+                with suppress(OmnidError, FrameDecodeError):  # a message of another program
                     sink.draw(content, message.attachment, message.received_ns)
     if not sink.poses:
         print(f"omnid: no pose of {config.bus.robot} came: `omnid listen` names those that are there", file=sys.stderr)

@@ -12,9 +12,9 @@ from typing import IO, Final
 
 import numpy as np
 
-from omnid.client import Diagnostics, Robot
+from omnid.client import Robot
 from omnid.engine.process import handle_stop_signals
-from omnid.monitor.robot_state import LEVELS, Inbox, RobotState, importance
+from omnid.monitor.robot_state import LEVELS, RobotState, importance
 from omnid.plain_text import plain
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.codec import Pose
@@ -28,7 +28,7 @@ CLEAR: Final = "\x1b[H\x1b[J"
 
 def listen(bus: BusConfig, seconds: float | None) -> int:
     """Show the robot until a signal or for a number of seconds. Return the exit code, 1 where no pose arrived."""
-    state, inbox, signals, reason = RobotState(), Inbox(), list[int](), ""
+    state, signals, reason = RobotState(), list[int](), ""
     end_s = math.inf if seconds is None else time.monotonic() + seconds
     with handle_stop_signals(lambda number, _: signals.append(number)), ExitStack() as connection:
         # 1. Try to connect until it succeeds, and print each new reason once.
@@ -43,31 +43,27 @@ def listen(bus: BusConfig, seconds: float | None) -> int:
                 time.sleep(POLL_S)
         # 2. Process and show the messages.
         if robot is not None:
-            with robot.subscribe(Diagnostics) as kept:
-                if (report := kept.newest()) is not None:
-                    state.add_diagnostics(report)
-            robot.on_message(inbox.put)
+            robot.on_message(state.put, "odom")
+            robot.on_message(state.put, "status", kept=True)
             robot.on_alive(state.set_alive)
             state.robots_there = robot.robots_there
         next_s = time.monotonic() + SHOW_PERIOD_S
         while robot is not None and not signals and (now_s := time.monotonic()) < end_s:
-            message = inbox.get(min(next_s - now_s, end_s - now_s, POLL_S))
+            state.next(min(next_s - now_s, end_s - now_s, POLL_S))
             state.forget_ended()
-            if message is not None:
-                state.process(message)
             if time.monotonic() >= next_s:
-                print_state(robot.name, state, inbox.dropped)
+                print_state(robot.name, state)
                 next_s = max(next_s + SHOW_PERIOD_S, time.monotonic())
-    print_state(bus.robot, state, inbox.dropped)
+    print_state(bus.robot, state)
     return int(state.poses == 0)
 
 
-def print_state(robot: str, state: RobotState, dropped: int, out: IO[str] | None = None) -> None:
-    """Write a table in place on a terminal, else one line. dropped: messages that the inbox could not hold."""
+def print_state(robot: str, state: RobotState, out: IO[str] | None = None) -> None:
+    """Write a table in place on a terminal, else one line."""
     out = out or sys.stdout
     if out.isatty():
         size = shutil.get_terminal_size()
-        lines = fitted(status_table(robot, state, dropped), size.columns, size.lines)
+        lines = fitted(status_table(robot, state), size.columns, size.lines)
         out.write(CLEAR + "\n".join(lines) + "\n")
     else:
         out.write(summary_line(robot, state) + "\n")
@@ -82,7 +78,7 @@ def summary_line(robot: str, state: RobotState) -> str:
     return f"{robot}: {state.state}  {_position(state.pose)}  {counts}  {_latencies(state)}"
 
 
-def status_table(robot: str, state: RobotState, dropped: int) -> Iterator[str]:
+def status_table(robot: str, state: RobotState) -> Iterator[str]:
     """Yield the state, the pose with its uncertainty, latencies, and a line for each part of the robot.
 
     Parts with a warning or an error come first, stages last: a small terminal shows what matters.
@@ -97,7 +93,7 @@ def status_table(robot: str, state: RobotState, dropped: int) -> Iterator[str]:
             f"  1 sigma {1e3 * sigma[:3].max():.1f} mm, {math.degrees(sigma[3:].max()):.3f} deg; "
             f"inliers {details.inliers} of {details.tracked}; resets {details.resets}"
         )
-        yield f"  {_latencies(state)}  missed {state.missed}  unreadable {state.broken}  not shown here {dropped}"
+        yield f"  {_latencies(state)}  missed {state.missed}  unreadable {state.broken}  not shown here {state.dropped}"
     for status in sorted(state.statuses.values(), key=importance):
         values = "  ".join(f"{key} {value}" for key, value in status.values.items())
         yield plain(

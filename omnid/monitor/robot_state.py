@@ -1,4 +1,4 @@
-"""The state of a robot as its messages show it, and the inbox in which they wait."""
+"""The state of a robot as its messages show it: one inbox and one decoder for terminals, pages and viewers."""
 
 from __future__ import annotations
 
@@ -6,15 +6,17 @@ import math
 import time
 from collections import deque
 from contextlib import suppress
+from dataclasses import replace
 from queue import Empty, SimpleQueue
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.engine.telemetry import Histogram
 from omnid.errors import OmnidError
 from omnid.plain_text import plain
-from omnid.transport.codec import Diagnostics, DiagnosticStatus, Pose, decode_diagnostics, decode_pose
+from omnid.transport.codec import Diagnostics, DiagnosticStatus, Pose
 from omnid.transport.status_names import SIMULATION, STAGE_PREFIX, Key
+from omnid.transport.topics import PUBLISHED
 
 LEVELS: Final = ("", "warning", "ERROR", "stale")  # of a status, by its number
 NO_POSE_S: Final = 2.0  # Without a pose for this time, state and rate of the last poses are no longer shown.
@@ -34,32 +36,15 @@ class ReceivedMessage(NamedTuple):
     arrival_ns: int  # the same by CLOCK_MONOTONIC
 
 
-class Inbox:
-    """Messages that wait to be processed; when full, the oldest is dropped and counted."""
-
-    def __init__(self) -> None:
-        self._messages: SimpleQueue[ReceivedMessage] = SimpleQueue()
-        self.dropped = 0
-
-    def put(self, topic: str, payload: bytes, attachment: bytes) -> None:
-        """Add a message that has just arrived; does not block."""
-        self._messages.put(ReceivedMessage(time.time_ns(), topic, payload, attachment, time.monotonic_ns()))
-        if self._messages.qsize() > _INBOX_DEPTH:
-            with suppress(Empty):
-                self._messages.get_nowait()
-                self.dropped += 1
-
-    def get(self, timeout_s: float) -> ReceivedMessage | None:
-        """Return the oldest message, or None after the timeout."""
-        with suppress(Empty):
-            return self._messages.get(timeout=max(0.0, timeout_s))
-        return None
-
-
 class RobotState:
-    """Newest pose and status of one robot, counters and latencies, in constant memory."""
+    """Newest pose and status of one robot, counters and latencies, in constant memory.
+
+    Messages wait in an inbox, of which the oldest are dropped and counted when it is full.
+    """
 
     def __init__(self) -> None:
+        self._inbox: SimpleQueue[ReceivedMessage] = SimpleQueue()
+        self.dropped = 0  # messages
         self.pose: Pose | None = None
         self.statuses: dict[str, DiagnosticStatus] = {}
         self.alive: bool | None = None  # the daemon's liveliness token; None while it is not known
@@ -72,17 +57,36 @@ class RobotState:
         self._arrivals_s: deque[float] = deque(maxlen=_RATE_WINDOW)
         self._forgotten = 0  # value of `ends` when the statuses were last forgotten
 
-    def process(self, message: ReceivedMessage) -> Pose | None:
-        """Count a message and return the pose in it, if it is one."""
+    def put(self, topic: str, payload: bytes, attachment: bytes) -> None:
+        """Add a message that has just arrived, from any thread; does not block."""
+        self._inbox.put(ReceivedMessage(time.time_ns(), topic, payload, attachment, time.monotonic_ns()))
+        if self._inbox.qsize() > _INBOX_DEPTH:
+            with suppress(Empty):
+                self._inbox.get_nowait()
+                self.dropped += 1
+
+    def next(self, timeout_s: float) -> tuple[ReceivedMessage, Any] | None:
+        """Process the oldest message of the inbox; return it and its content, or None after the timeout."""
         try:
-            if message.topic == "odom":
-                pose = decode_pose(message.payload, message.attachment, message.received_ns)
-                return self._add_pose(pose, message.arrival_ns * S_PER_NS)
-            if message.topic == "status":
-                self.add_diagnostics(decode_diagnostics(message.payload))
+            message = self._inbox.get(timeout=max(0.0, timeout_s))
+        except Empty:
+            return None
+        return message, self.process(message)
+
+    def process(self, message: ReceivedMessage) -> Any:
+        """Return the content of a message, whose pose or status is kept; None, and count it, where it is unreadable."""
+        if message.topic not in PUBLISHED:
+            return None
+        try:
+            content = PUBLISHED[message.topic].decode(message.payload, message.attachment)
         except OmnidError:
             self.broken += 1
-        return None
+            return None
+        if isinstance(content, Pose):
+            content = self._add_pose(replace(content, received_ns=message.received_ns), message.arrival_ns * S_PER_NS)
+        elif isinstance(content, Diagnostics):
+            self.add_diagnostics(content)
+        return content
 
     def set_alive(self, alive: bool) -> None:
         """Keep whether the daemon's liveliness token is there; from any thread."""

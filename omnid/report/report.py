@@ -293,13 +293,13 @@ def _sections(run: RecordedRun, truth: _Truth | None) -> Iterator[tuple[str, lis
     """Yield title and parts of each section of charts and tables; a part is HTML, "" where the log has nothing."""
     # 1. Errors of the path, as `omnid eval` prints them.
     if truth is not None:
-        rows = [re.split(" {2,}", line, maxsplit=1) for line in escape(str(truth.metrics)).splitlines()]
+        errors = [re.split(" {2,}", line, maxsplit=1) for line in escape(str(truth.metrics)).splitlines()]
         footnote = "<small>Of the rig; the first pose is aligned and nothing else, as `omnid eval` does.</small>"
         figures = [
             chart("Error of the position", [Curve("", truth.t_s, truth.position_m)], unit="m"),
             chart("Error of the heading, to the left", [Curve("", truth.t_s, np.rad2deg(truth.heading_rad))], "deg"),
         ]
-        yield "Against the truth", [facts(rows), footnote, grid(figures)]
+        yield "Against the truth", [facts(errors), footnote, grid(figures)]
     # 2. Speed, yaw rate and height, and the commands.
     named = {DRIVE: "sent to the wheels", TWIST_COMMAND: "commanded"}
     moved = [("measured", run.t_s, run.velocity[:, 0], run.velocity[:, -1])]
@@ -394,13 +394,13 @@ def _timing(run: RecordedRun) -> list[str]:
     losses = [
         run.curve(f"{name}, {key}", stage_name(name), key) for name in stages for key in (Key.DROPPED, Key.MISSED)
     ]
-    lost = [curve for curve in highest(losses) if curve.values[-1] > 0]
+    risen = [curve for curve in highest(losses) if curve.values[-1] > 0]
     figures = [
         chart("Poses per second", [run.curve("", ODOMETRY, Key.RATE_HZ)]),
         chart("Age of the newest pose at each report", [run.curve("", ODOMETRY, Key.AGE_S)], "s"),
         chart("From the image to its pose", latency, "ms", note=of_all),
         chart("Median work of a stage", highest(work), "ms", log=True, note=of_all),
-        chart("Messages dropped, deadlines missed, so far", lost),
+        chart("Messages dropped, deadlines missed, so far", risen),
     ]
     return [*parts, grid(figures)]
 

@@ -12,22 +12,27 @@ import json
 from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple
 
+from drivers.logs.ros_messages import COMPRESSED_IMAGE as IMAGE_SCHEMA
 from omnid.transport import codec
+from omnid.transport.sensor_codec import decode_image
 from omnid.transport.status_names import decode_navigation
 
 MAP_POSE: Final = "map_pose"
 SCAN: Final = "scan"
 PANORAMA: Final = "panorama"
 CLOCK: Final = "/clock"  # Time of runs whose clock is not the computer's.
-IMAGE_SCHEMA: Final = "sensor_msgs/msg/CompressedImage"
 EMPTY_SCHEMA: Final = "std_msgs/msg/Empty"
+
+
+def _not_read(payload: bytes, attachment: bytes = b"") -> None:
+    """Return no content, for topics that no program of omnid reads."""
 
 
 class Topic(NamedTuple):
     """A published topic and how it is delivered."""
 
     schema: str  # ROS 2 message type
-    decode: Callable[..., Any] = bytes  # takes payload and attachment; of those that programs of omnid read
+    decode: Callable[..., Any] = _not_read  # takes payload and attachment; of those that programs of omnid read
     realtime: bool = False  # sent before messages of all other topics
     latched: bool = False  # late subscribers can query the newest message
     transient_local: bool = False  # ... and those of ROS 2 receive it
@@ -45,7 +50,7 @@ PUBLISHED: Final = {
     SCAN: Topic(codec.SCAN_SCHEMA, codec.decode_scan),
     "moving": Topic(codec.POINT_CLOUD_SCHEMA),
     "drive": Topic(codec.TWIST_SCHEMA),
-    PANORAMA: Topic(IMAGE_SCHEMA),
+    PANORAMA: Topic(IMAGE_SCHEMA, decode_image),
     "navigation": Topic(codec.DIAGNOSTICS_SCHEMA, decode_navigation, latched=True),
     "plan": Topic(codec.PATH_SCHEMA, latched=True),
     "path": Topic(codec.PATH_SCHEMA, codec.path_from_cdr, latched=True),

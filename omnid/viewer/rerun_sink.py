@@ -19,18 +19,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from calib import se3
 from drivers.frame import gray
-from drivers.logs.ros_messages import COMPRESSED_IMAGE, RosImage, parse_image
+from drivers.logs.ros_messages import RosImage
 from omnid.core.frames import base_pose
 from omnid.core.odometry.stereo_frame import Features
 from omnid.messages import OdometryUpdate, PlaceUpdate
 from omnid.plain_text import plain
-from omnid.recordings.recording import DECODERS, Content
+from omnid.recordings.recording import Content
 from omnid.sinks.encoder import Changes, Encoder, Outgoing, pose_attachment
 from omnid.stages.front_end import FrontEnd
 from omnid.transport import status_names
-from omnid.transport.codec import Cloud, Diagnostics, Pose, PoseInMap, Scan, decode_pose, features_from_bytes
+from omnid.transport.codec import Cloud, Diagnostics, Pose, PoseInMap, Scan, features_from_bytes
 from omnid.transport.status_names import ODOMETRY, STAGE_PREFIX, parsed_time_key, short_name
-from omnid.transport.topics import PANORAMA
+from omnid.transport.topics import PUBLISHED, SCAN
 
 Array: TypeAlias = NDArray[np.float64]
 TIMELINE: Final = "stamp"
@@ -54,6 +54,8 @@ PLOTS: Final = {
     "latency": "Latency, ms",
     "correction": "Correction by the map",
 }
+# Topics of a replay that are drawn; the pose in the map is not, because it may come before that in odom.
+REPLAYED: Final = ("odom", "status", "cloud", SCAN)
 LEVELS: Final = ("INFO", "WARN", "ERROR", "WARN")  # of Rerun, by the level of a status
 LEGEND: Final = f"""
 **Path**: thin blue tracking, thicker orange degraded, thickest red lost, grey unknown.
@@ -87,15 +89,6 @@ def layout() -> Any:
         *panels,
         rrb.BlueprintPanel(state="collapsed"),
     )
-
-
-def decoded(topic: str, payload: bytes, attachment: bytes, received_ns: int) -> Content | None:
-    """Return the content of a message, None for other topics; raise OmnidError or FrameDecodeError if it is broken."""
-    if topic == "odom":
-        return decode_pose(payload, attachment, received_ns)
-    if topic == PANORAMA:
-        return parse_image(COMPRESSED_IMAGE, memoryview(payload))
-    return DECODERS[topic][1](payload) if topic in DECODERS else None
 
 
 class RerunSink:
@@ -298,9 +291,8 @@ class ReplayDrawing:
         """Draw a message."""
         attachment = pose_attachment(message) if isinstance(message, OdometryUpdate) else b""
         for topic, _, payload in (*self._changes(message), *self._encode(message)):
-            content = decoded(topic, payload, attachment if topic == "odom" else b"", 0)
-            if content is not None and not isinstance(content, PoseInMap):  # which may come before the pose in odom
-                self._sink.draw(content)
+            if topic in REPLAYED:
+                self._sink.draw(PUBLISHED[topic].decode(payload, attachment if topic == "odom" else b""))
         sink, rig = self._sink, self._geometry.rig
         if isinstance(message, OdometryUpdate) and sink.wants("image"):
             sink.panorama(message.stamp_ns, _jpeg(message.depth.panoramas.lower.panorama))

@@ -14,23 +14,19 @@ import secrets
 import time
 from bisect import bisect
 from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from http import HTTPStatus
 from typing import Any, Final
 
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 
-from drivers.errors import FrameDecodeError
-from drivers.logs.ros_messages import COMPRESSED_IMAGE, parse_image
-from omnid.client import Diagnostics, Map, NavigationReport, Robot, Unreachable
+from drivers.logs.ros_messages import RosImage
+from omnid.client import Map, NavigationReport, Robot, Scan, Unreachable
 from omnid.core.mapping.thinned_path import ThinnedPath, Vertex
-from omnid.errors import OmnidError
-from omnid.monitor.robot_state import Inbox, RobotState
+from omnid.monitor.robot_state import ReceivedMessage, RobotState
 from omnid.transport.bus_config import BusConfig
-from omnid.transport.codec import PlanarPath, Pose, decode_map, decode_map_pose, decode_scan
-from omnid.transport.status_names import decode_navigation
+from omnid.transport.codec import Diagnostics, PlanarPath, Pose, PoseInMap
 from omnid.transport.topics import MAP_POSE, PANORAMA, SCAN
 from omnid.web.snapshot import (
     PATH_FRAME,
@@ -51,8 +47,8 @@ _FINEST_M: Final = 0.02  # Points of the path are at least this far apart, so th
 NAVIGATION: Final = "navigation"
 LARGEST: Final = 1 << 26  # bytes of a message: a map of 8,000 x 8,000 cells
 _NEWEST_ONLY: Final = (NAVIGATION, SCAN, "map", PANORAMA)
+_KEPT: Final = ("path", "status", "map")  # Topics whose message from before the connection is asked for.
 NO_NAVIGATION: Final = NavigationReport(0, "", "", "", 0, math.nan, "", "")
-Receiver = Callable[[str, bytes, bytes], None]
 
 
 class LivePath:
@@ -95,7 +91,6 @@ class RobotFeed:
         self.state, self.path = RobotState(), LivePath()
         self.robot: Robot | None = None
         self.link = "not connected yet"  # why there is no connection; empty with one
-        self.inbox = Inbox()
         # Of the news: it grows by one each time, from a number of this start, so that pages which were open while this
         # program started again have seen none of them.
         self.version = self._start = secrets.randbits(48)  # of 15 digits at most
@@ -105,14 +100,14 @@ class RobotFeed:
         self._wanted_until_s = -math.inf  # the panorama
         self._poses: deque[Pose] = deque(maxlen=MOST_POSES)
         self._map_in_odom: list[float | None] | None = None
-        self._large: dict[str, bytes] = {}  # newest map, panorama ... that are not processed yet
+        self._large: dict[str, ReceivedMessage] = {}  # newest map, panorama ... that are not processed yet
         self._wake, self._large_wake = asyncio.Event(), asyncio.Event()
 
     def news(self, seen: int) -> dict[str, Any]:
         """Return all that has changed since a version, and the state."""
         seen = seen if self._start <= seen <= self.version else 0
         extra = {
-            "dropped": self.inbox.dropped,
+            "dropped": self.state.dropped,
             "panorama_comes": "panorama" in self._news,
             "map_in_odom": self._map_in_odom,
         }
@@ -141,10 +136,10 @@ class RobotFeed:
         kind = request.path_params["kind"]
         if kind not in self._images:
             return PlainTextResponse("omnid web: there is none\n", HTTPStatus.NOT_FOUND)
-        is_map = kind == "map"
-        headers = {"content-encoding": "deflate"} if is_map else {}
-        media_type = "application/octet-stream" if is_map else "image/jpeg"
-        return Response(self._images[kind], headers=headers, media_type=media_type)
+        if kind == "map":
+            headers = {"content-encoding": "deflate"}
+            return Response(self._images[kind], headers=headers, media_type="application/octet-stream")
+        return Response(self._images[kind], media_type="image/jpeg")
 
     async def run(self) -> None:
         """Connect to the robot as soon as it can be reached, and follow it until this task is cancelled."""
@@ -170,51 +165,41 @@ class RobotFeed:
     async def _connect(self) -> None:
         """Open the connection, take what was published before it, then receive the panorama while browsers show it."""
         loop = asyncio.get_running_loop()
+
+        def receive(topic: str, payload: bytes, attachment: bytes) -> None:
+            """Take a message, in a thread of zenoh."""
+            if len(payload) > LARGEST:
+                self.state.broken += 1
+                return
+            if topic in _NEWEST_ONLY:  # in place of one that was not processed yet
+                self._large[topic] = ReceivedMessage(0, topic, payload, attachment, 0)
+            else:
+                self.state.put(topic, payload, attachment)
+            wake = self._large_wake if topic in self._large else self._wake
+            if not wake.is_set():
+                with suppress(RuntimeError):  # the event loop has ended
+                    loop.call_soon_threadsafe(wake.set)
+
         while self.robot is None:
             try:
                 self.robot = await asyncio.to_thread(Robot, settings=self.bus)
             except Unreachable as error:
                 self.link = str(error)
                 await asyncio.sleep(QUIET_S)
-        past = await asyncio.to_thread(_past_path, self.robot)
-        for x_m, y_m in past:
-            self.path.add(x_m, y_m, self.version + 1)
-        self.link, receive, end = "", self._receiver(loop), None
-        for topic in ("odom", MAP_POSE, "status", "map", SCAN, NAVIGATION):
-            self.robot.on_message(receive, topic)
+        for topic in ("path", "odom", MAP_POSE, "status", "map", SCAN, NAVIGATION):
+            end = await asyncio.to_thread(self.robot.on_message, receive, topic, kept=topic in _KEPT)
+            if topic == "path":  # which grows by the poses from here on
+                await asyncio.to_thread(end)
+        self.link, end_panorama = "", None
         self.robot.on_alive(self.state.set_alive)
-        diagnostics, grid = await asyncio.to_thread(_latched, self.robot)
-        if diagnostics is not None:
-            self.state.add_diagnostics(diagnostics)
-            self._set("parts", parts_news(self.state))
-        if grid is not None and "map" not in self._news:
-            await self._take_map(grid)
         while True:
             await asyncio.sleep(0.1 * WANTED_S)
             is_wanted = time.monotonic() < self._wanted_until_s
-            if is_wanted and end is None:
-                end = self.robot.on_message(receive, PANORAMA)
-            elif not is_wanted and end is not None:
-                await asyncio.to_thread(end)
-                end = None
-
-    def _receiver(self, loop: asyncio.AbstractEventLoop) -> Receiver:
-        """Return the function that zenoh's threads call for each message."""
-
-        def receive(topic: str, payload: bytes, attachment: bytes) -> None:
-            if len(payload) > LARGEST:
-                self.state.broken += 1
-                return
-            if topic in _NEWEST_ONLY:
-                self._large[topic] = payload  # in place of one that was not processed yet
-            else:
-                self.inbox.put(topic, payload, attachment)
-            wake = self._large_wake if topic in self._large else self._wake
-            if not wake.is_set():
-                with suppress(RuntimeError):  # the event loop has ended
-                    loop.call_soon_threadsafe(wake.set)
-
-        return receive
+            if is_wanted and end_panorama is None:
+                end_panorama = self.robot.on_message(receive, PANORAMA)
+            elif not is_wanted and end_panorama is not None:
+                await asyncio.to_thread(end_panorama)
+                end_panorama = None
 
     def _set(self, kind: str, content: Any) -> None:
         """Have a content sent with the next news."""
@@ -222,18 +207,19 @@ class RobotFeed:
 
     def process_inbox(self) -> None:
         """Process the poses and statuses that have come; forget the statuses of a daemon that has ended."""
-        while (message := self.inbox.get(0.0)) is not None:
-            if message.topic == MAP_POSE:
-                with self._counting_broken():
-                    in_map = decode_map_pose(message.payload)
+        before = self.state.pose
+        while (received := self.state.next(0.0)) is not None:
+            match received[1]:
+                case Pose() as pose:
+                    self._add_to_path(pose, before)
+                    before = pose
+                case PoseInMap() as in_map:
                     self._map_in_odom = map_in_odom(in_map, self._poses) or self._map_in_odom
-                continue
-            before = self.state.pose
-            pose = self.state.process(message)
-            if pose is not None:
-                self._add_to_path(pose, before)
-            elif message.topic == "status":
-                self._set("parts", parts_news(self.state))
+                case Diagnostics():
+                    self._set("parts", parts_news(self.state))
+                case PlanarPath(frame=frame, xy=xy) if frame == PATH_FRAME:
+                    for x_m, y_m in xy.tolist():
+                        self.path.add(x_m, y_m, self.version + 1)
         if self.state.forget_ended():
             self._set("parts", parts_news(self.state))
 
@@ -257,51 +243,25 @@ class RobotFeed:
         self.path.add(pose.x_m, pose.y_m, self.version + 1, gap=gap)
 
     async def _process_large(self) -> None:
-        """Encode maps and panoramas; they take longer than a pose may wait."""
+        """Decode and encode maps and panoramas in a thread; they take longer than a pose may wait."""
         while True:
             await self._large_wake.wait()
             self._large_wake.clear()
             for topic in _NEWEST_ONLY:
-                payload = self._large.pop(topic, None)
-                if payload is not None:
-                    await self.take_large(topic, payload)
+                if (message := self._large.pop(topic, None)) is not None:
+                    await self.take_large(message)
             self._wake.set()
 
-    async def take_large(self, topic: str, payload: bytes) -> None:
+    async def take_large(self, message: ReceivedMessage) -> None:
         """Take a scan, a report of the navigation, a map or a panorama."""
-        with self._counting_broken():
-            match topic:
-                case "scan":
-                    self._set(SCAN, scan_news(decode_scan(payload), self._poses))
-                case "navigation":
-                    self._set(NAVIGATION, navigation_news(decode_navigation(payload)))
-                case "map":
-                    await self._take_map(await asyncio.to_thread(decode_map, payload))
-                case _:
-                    self._images[PANORAMA] = bytes(parse_image(COMPRESSED_IMAGE, memoryview(payload)).data)
-                    self._set(PANORAMA, self.version + 1)
-
-    async def _take_map(self, grid: Map) -> None:
-        header, self._images["map"] = await asyncio.to_thread(map_cells, grid)
-        self._set("map", {**header, "version": self.version + 1})
-
-    @contextmanager
-    def _counting_broken(self) -> Iterator[None]:
-        """Count a message that cannot be decoded."""
-        try:
-            yield
-        except (OmnidError, FrameDecodeError):
-            self.state.broken += 1
-
-
-def _past_path(robot: Robot) -> list[tuple[float, float]]:
-    """Return the path of the robot before the connection was made, m in odom."""
-    with robot.subscribe(PlanarPath) as paths:
-        found = paths.newest()
-    return [] if found is None or found.frame != PATH_FRAME else [(x_m, y_m) for x_m, y_m in found.xy.tolist()]
-
-
-def _latched(robot: Robot) -> tuple[Diagnostics | None, Map | None]:
-    """Return the status and the map that were published before the connection was made."""
-    with robot.subscribe(Diagnostics) as reports, robot.subscribe(Map) as maps:
-        return reports.newest(), maps.newest()
+        match await asyncio.to_thread(self.state.process, message):
+            case Scan() as scan:
+                self._set(SCAN, scan_news(scan, self._poses))
+            case NavigationReport() as report:
+                self._set(NAVIGATION, navigation_news(report))
+            case Map() as grid:
+                header, self._images["map"] = await asyncio.to_thread(map_cells, grid)
+                self._set("map", {**header, "version": self.version + 1})
+            case RosImage() as image:
+                self._images[PANORAMA] = bytes(image.data)
+                self._set(PANORAMA, self.version + 1)

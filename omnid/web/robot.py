@@ -80,7 +80,7 @@ class RobotPage:
 
     def metrics(self, refused: Mapping[str, int]) -> bytes:
         """Return the metrics of the robot and of this server; refused: requests by reason."""
-        counts = {"dropped": self.feed.inbox.dropped, "stops": self.stops, "arms": self.arms}
+        counts = {"dropped": self.feed.state.dropped, "stops": self.stops, "arms": self.arms}
         return metrics(self.feed.state, refused, counts)
 
     @property

@@ -156,10 +156,10 @@ def test_the_table_holds_no_control_characters_of_messages() -> None:
     ]
     state.process(ReceivedMessage(time.time_ns(), "status", codec.diagnostics_cdr(1, evil), b"", 0))
     terminal = Terminal()
-    print_state("omnid", state, 0, terminal)
+    print_state("omnid", state, terminal)
     shown = terminal.getvalue()
     assert shown.count("\x1b[") == 2 and "wheels" in shown and "hello" in shown
     assert len(shown.splitlines()) == 6 and "1 sigma 1.0 mm" in shown
     assert shown.index("wheels") < shown.index("bus"), "the error comes first"
     assert summary_line("omnid", RobotState()) == "omnid: no pose yet"
-    assert list(status_table("omnid", RobotState(), 0)) == ["omnid: no pose yet"]
+    assert list(status_table("omnid", RobotState())) == ["omnid: no pose yet"]

@@ -176,7 +176,7 @@ def panorama(data: bytes) -> bytes:
 
 def add_pose(feed: RobotFeed, seq: int, resets: int = 0) -> None:
     """Put a pose at 0.25 m times seq into the inbox."""
-    feed.inbox.put("odom", odometry(seq), PoseAttachment(seq, "tracking", resets, 50, 60, time.time_ns()).to_bytes())
+    feed.state.put("odom", odometry(seq), PoseAttachment(seq, "tracking", resets, 50, 60, time.time_ns()).to_bytes())
 
 
 def test_a_robot_that_has_started_again_is_shown_without_what_belongs_to_its_odom_before() -> None:
@@ -194,12 +194,12 @@ def test_a_robot_that_has_started_again_is_shown_without_what_belongs_to_its_odo
     feed.process_inbox()
     assert not feed.news(0).keys() & large.keys()
     add_pose(feed, 4)
-    feed.inbox.put("map_pose", codec.pose_with_covariance_cdr(10**9 + 4, np.eye(4), np.eye(6)), b"")
+    feed.state.put("map_pose", codec.pose_with_covariance_cdr(10**9 + 4, np.eye(4), np.eye(6)), b"")
     feed.process_inbox()
 
     async def take() -> None:
         for topic, payload in large.items():
-            await feed.take_large(topic, payload)
+            await feed.take_large(ReceivedMessage(0, topic, payload, b"", 0))
 
     asyncio.run(take())
     news = feed.news(0)
