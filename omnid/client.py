@@ -25,7 +25,7 @@ import zenoh
 from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.codec import Cloud, Diagnostics, Map, PlanarPath, Pose, PoseAttachment, Scan
-from omnid.transport.driver import CONNECT_S, Driver, RobotTime
+from omnid.transport.driver import CONNECT_S, POLL_S, Driver, RobotTime
 from omnid.transport.session import ALIVE, HERE, QUERY_S, Unreachable, open_client, robots_there
 from omnid.transport.status_names import NavigationReport
 from omnid.transport.topics import PUBLISHED, Answer
@@ -58,8 +58,6 @@ _TOPICS: Final[dict[type[Any], str]] = {
     NavigationReport: "navigation",
     Scan: "scan",
 }
-# The channel of a subscription has no wait with a timeout, so Subscription.wait polls: this is the delay that it adds.
-_POLL_S: Final = 0.002
 
 
 class Subscription(Generic[T]):
@@ -88,7 +86,7 @@ class Subscription(Generic[T]):
         """Return the next message, or None after the timeout."""
         deadline_s = time.monotonic() + timeout_s
         while (message := self.newest()) is None and time.monotonic() < deadline_s:
-            time.sleep(_POLL_S)
+            time.sleep(POLL_S)  # the channel has no wait with a timeout
         return message
 
     def __iter__(self) -> Iterator[T]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Final
 
 MOST_CHARACTERS: Final = 400
+MOST_ENTRIES: Final = 64  # of parts in a status, and of values in a part
 _NO_UTF8: Final = range(0xDC80, 0xDD00)  # how Python keeps a byte of a file name that is no UTF-8 (PEP 383)
 
 

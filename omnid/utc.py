@@ -6,6 +6,7 @@ from datetime import UTC, datetime
 from typing import Final
 
 UNIX_TIMES_S: Final = (10**9, 2**33)  # 2001 to 2242; the clock of a simulation or of a camera is outside
+OTHER_CLOCK_NS: Final = 3_600 * 10**9  # Stamps that differ by more are of two clocks.
 
 
 def utc(stamp_ns: int) -> str:

@@ -44,7 +44,6 @@ from omnid.sinks.files import check_outputs
 from omnid.transport.bus import Bus
 from omnid.transport.codec import diagnostics_cdr
 
-PUBLISH_S: Final = 0.5
 # Options that each kind of board needs.
 NEEDED = {"checkerboard": ("corners", "square_mm"), "aprilgrid": ("tags", "tag_mm", "tag_spacing")}
 ALL = tuple(name for names in NEEDED.values() for name in names)
@@ -165,7 +164,7 @@ def live(args: argparse.Namespace) -> int:
         closing.callback(boards.close)
         number = _taken_before(args.images, boards)
         pairs = _of_log(args, config) if args.log else _of_cameras(config, closing)
-        bus, published_s = _bus(config, closing), -PUBLISH_S
+        bus, published_s = _bus(config, closing), 0.0
         with suppress(KeyboardInterrupt):
             for pair in pairs:
                 outcome = boards.process(pair, need_still=args.log is None)
@@ -174,7 +173,7 @@ def live(args: argparse.Namespace) -> int:
                     for side, image in zip(SIDES, pair, strict=True):
                         write_file(args.images / f"{side}_{number:03d}.png", png(image))
                 _show(boards, outcome)
-                if bus is not None and time.monotonic() >= published_s + PUBLISH_S:
+                if bus is not None and time.monotonic() >= published_s + config.live.status_s:
                     published_s = time.monotonic()
                     if bus.needs_router:
                         bus.connect()

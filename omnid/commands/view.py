@@ -9,11 +9,10 @@ import socket
 import subprocess
 import sys
 import time
-from contextlib import suppress
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from drivers.errors import FrameDecodeError
 from drivers.logs.open_log import log_info
@@ -32,8 +31,6 @@ from omnid.transport.topics import MAP_POSE, PANORAMA, SCAN
 
 if TYPE_CHECKING:  # it imports rerun, which may be missing
     from omnid.viewer.rerun_sink import ReplayDrawing, RerunSink
-
-MAP_EVERY_S: Final = 2.0  # between two maps of a replay
 
 
 @command(ROBOT, SECONDS, SETTINGS)
@@ -140,7 +137,9 @@ def draw_replay(sink: RerunSink, log: Path, config: Config, options: ReplayOptio
         return ReplayDrawing(sink, front_end)
 
     try:
-        return replay_and_print(log, config, replace(options, map_every_s=MAP_EVERY_S, observer=observer), output)
+        return replay_and_print(
+            log, config, replace(options, map_every_s=config.live.cloud_s, observer=observer), output
+        )
     finally:
         sink.close()
 
@@ -157,7 +156,6 @@ def _draw_robot(sink: RerunSink, config: Config, seconds: float) -> None:
         while time.monotonic() < end_s and not signals:
             message, content = state.next(0.5) or (None, None)
             if message is not None and content is not None:
-                with suppress(OmnidError, FrameDecodeError):  # a message of another program
-                    sink.draw(content, message.attachment, message.received_ns)
+                sink.draw(content, message.received_ns)
     if not sink.poses:
         print(f"omnid: no pose of {config.bus.robot} came: `omnid listen` names those that are there", file=sys.stderr)

@@ -22,7 +22,6 @@ from omnid.transport.session import Unreachable
 from omnid.transport.status_names import short_name
 
 SHOW_PERIOD_S: Final = 1.0
-POLL_S: Final = 0.5  # between two checks for the end, and two attempts to connect
 CLEAR: Final = "\x1b[H\x1b[J"
 
 
@@ -40,7 +39,7 @@ def listen(bus: BusConfig, seconds: float | None) -> int:
                 if str(error) != reason:
                     print(f"omnid: waiting: {error}", file=sys.stderr, flush=True)
                 reason = str(error)
-                time.sleep(POLL_S)
+                time.sleep(SHOW_PERIOD_S)
         # 2. Process and show the messages.
         if robot is not None:
             robot.on_message(state.put, "odom")
@@ -49,7 +48,7 @@ def listen(bus: BusConfig, seconds: float | None) -> int:
             state.robots_there = robot.robots_there
         next_s = time.monotonic() + SHOW_PERIOD_S
         while robot is not None and not signals and (now_s := time.monotonic()) < end_s:
-            state.next(min(next_s - now_s, end_s - now_s, POLL_S))
+            state.next(min(next_s, end_s) - now_s)
             state.forget_ended()
             if time.monotonic() >= next_s:
                 print_state(robot.name, state)

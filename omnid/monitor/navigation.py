@@ -19,10 +19,10 @@ from omnid.transport.driver import ANSWER_S
 from omnid.transport.status_names import DISARMED_BY_STOP, WHEELS, Key
 from omnid.transport.stop_datagram import STOPPED, StopSender
 
-SILENCE_S: Final = 10.0  # A robot that sends no report for this time counts as gone.
+SILENCE_S: Final = ANSWER_S  # A robot that sends no report for this time counts as gone.
 SHOWN_S: Final = 0.5  # Time between two lines of progress.
-_DATAGRAM_S: Final = 0.15  # After this time a stop goes over the bus, too: the robot is behind a router, or far away.
-_REPEAT_S: Final = 0.2  # Time between two stops.
+# Time between two stops over the bus, and until the first: a datagram without an answer by then is behind a router.
+_REPEAT_S: Final = 0.15
 
 
 def connected(bus: BusConfig) -> Robot:
@@ -144,7 +144,7 @@ def stop(bus: BusConfig, answer_s: float = ANSWER_S, connection: Robot | None = 
     """
     deadline_s = time.monotonic() + answer_s
     with closing(StopSender(bus.robot, bus.connect or (HERE,))) as datagrams:
-        if datagrams.ask(_DATAGRAM_S):
+        if datagrams.ask(_REPEAT_S):
             return datagrams.ask(deadline_s - time.monotonic()) == STOPPED
         with (
             nullcontext(connection) if connection else Robot(settings=bus, timeout_s=CONNECT_S) as robot,

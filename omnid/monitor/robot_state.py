@@ -13,17 +13,16 @@ from typing import Any, Final, NamedTuple
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.engine.telemetry import Histogram
 from omnid.errors import OmnidError
-from omnid.plain_text import plain
+from omnid.plain_text import MOST_ENTRIES, plain
 from omnid.transport.codec import Diagnostics, DiagnosticStatus, Pose
 from omnid.transport.status_names import SIMULATION, STAGE_PREFIX, Key
 from omnid.transport.topics import PUBLISHED
+from omnid.utc import OTHER_CLOCK_NS
 
 LEVELS: Final = ("", "warning", "ERROR", "stale")  # of a status, by its number
 NO_POSE_S: Final = 2.0  # Without a pose for this time, state and rate of the last poses are no longer shown.
 _INBOX_DEPTH: Final = 2000
-_MAX_STATUSES: Final = 100
 _RATE_WINDOW: Final = 100  # poses
-_MAX_AGE_NS: Final = 3_600 * 10**9  # a message that is older, or from the future, was stamped by another clock
 
 
 class ReceivedMessage(NamedTuple):
@@ -108,7 +107,7 @@ class RobotState:
     def add_diagnostics(self, diagnostics: Diagnostics) -> None:
         """Keep the newest status of each part of the robot."""
         for status in diagnostics.statuses:
-            if status.name in self.statuses or len(self.statuses) < _MAX_STATUSES:
+            if status.name in self.statuses or len(self.statuses) < MOST_ENTRIES:
                 self.statuses[status.name] = status
         if self.real_time_factor:
             self.age = Histogram()
@@ -124,7 +123,7 @@ class RobotState:
         self._arrivals_s.append(arrival_s)
         of_robot = [] if self.real_time_factor else [(self.age, pose.stamp_ns)]
         for histogram, since_ns in (*of_robot, (self.network, pose.attachment.sent_ns)):
-            if 0 <= pose.received_ns - since_ns < _MAX_AGE_NS:
+            if 0 <= pose.received_ns - since_ns < OTHER_CLOCK_NS:
                 histogram.add((pose.received_ns - since_ns) * 1e-9)
         return pose
 

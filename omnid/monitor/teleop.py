@@ -13,10 +13,11 @@ import tty
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from io import DEFAULT_BUFFER_SIZE
 from typing import Final
 
 from calib.typed_toml import parse_toml
-from omnid.client import Diagnostics, Driver, Robot
+from omnid.client import CONNECT_S, Diagnostics, Driver, Robot
 from omnid.core.control.velocity_limits import VelocityLimits
 from omnid.errors import OmnidError
 from omnid.plain_text import plain
@@ -26,12 +27,11 @@ from omnid.transport.status_names import WHEELS, Key
 from omnid.transport.topics import ARM
 
 PERIOD_S: Final = 0.05  # Period of the commands.
-REST_S: Final = 0.5  # After a motion zero is sent for this time; then nothing, so that others may drive.
-HOLD_S: Final = 0.6  # time for which a key counts as pressed: longer than the pause before a terminal repeats it
-CONNECT_S: Final = 5.0
+# Time for which a key counts as pressed: longer than the pause before a terminal repeats it. Zero is sent as long after
+# a motion; then nothing, so that others may drive.
+HOLD_S: Final = 0.6
 FIRST_SHARE: Final = 0.4  # Share of the highest speeds at the start.
 SHARE_STEP: Final = 0.1
-READ_BYTES: Final = 256
 HELP: Final = "arrows: drive  space: stop  a: arm  +/-: speed  q: quit"
 _SIDES: Final = {b"A": (0, 1), b"B": (0, -1), b"D": (1, 1), b"C": (1, -1)}  # axis of the stick, and its side
 # A terminal sends ESC [ A or, in its application mode, ESC O A.
@@ -82,7 +82,7 @@ class Stick:
 
     def commands(self, now_s: float) -> bool:
         """Return True if there is a motion, or was one until a moment ago."""
-        return any(now_s - pressed_s <= HOLD_S + REST_S for _, pressed_s in self._axes)
+        return any(now_s - pressed_s <= 2 * HOLD_S for _, pressed_s in self._axes)
 
     def _release(self) -> None:
         self._axes = [(0, pressed_s) for _, pressed_s in self._axes]
@@ -141,7 +141,7 @@ def read_keys(keys: int) -> bytes:
     due_s, data = time.monotonic() + PERIOD_S, b""
     while (left_s := due_s - time.monotonic()) > 0:
         if select.select([keys], [], [], left_s)[0]:
-            found = os.read(keys, READ_BYTES)
+            found = os.read(keys, DEFAULT_BUFFER_SIZE)
             if not found:
                 raise OmnidError("the terminal was closed: the wheels stop")
             data += found

@@ -19,7 +19,7 @@ from calib.rig import Rig
 from calib.rig_file import parse_rig
 from drivers.logs.open_log import log_info
 from omnid.formats.tum import POSITION_LIMIT_M
-from omnid.plain_text import plain
+from omnid.plain_text import MOST_ENTRIES, plain
 from omnid.recordings.recording import (
     CLOUD,
     DRIVE,
@@ -36,12 +36,11 @@ from omnid.transport import status_names
 from omnid.transport.codec import Cloud, Diagnostics, DiagnosticStatus, Pose, PoseInMap, TwistRecord
 from omnid.transport.status_names import Key, short_name
 from omnid.transport.topics import MAP_POSE
+from omnid.utc import OTHER_CLOCK_NS
 
 STATES: Final = tuple(TrackingState)
 UNKNOWN: Final = -1  # rank of a state that is not recorded
 GOOD, WARNING, ERROR = range(3)
-MOST: Final = 64  # parts, and values of one, of a log of unknown origin
-MAX_CLOCK_OFFSET_S: Final = 3600.0  # change of the offset between stamps and times of logging
 _COUNTERS: Final[Mapping[str, str]] = {  # of faults, with the text of the event when one rises
     Key.DROPS: "images dropped",
     Key.DROPPED: "messages dropped",
@@ -107,7 +106,7 @@ class RecordedRun:
             match message.content:
                 case Pose() as pose:
                     offset_ns = message.log_time_ns - pose.stamp_ns if offset_ns is None else offset_ns
-                    is_near = abs(message.log_time_ns - pose.stamp_ns - offset_ns) <= MAX_CLOCK_OFFSET_S * 1e9
+                    is_near = abs(message.log_time_ns - pose.stamp_ns - offset_ns) <= OTHER_CLOCK_NS
                     if not (is_near and (np.abs(pose.T_odom_base[:-1, -1]) <= POSITION_LIMIT_M).all()):
                         out_of_range += 1
                     elif poses and pose.stamp_ns <= poses[-1].stamp_ns:
@@ -118,7 +117,7 @@ class RecordedRun:
                     map_poses.append(in_map)
                 case Diagnostics(stamp_ns, entries):
                     bounded = [_bounded(status) for status in entries]
-                    names |= {status.name for status in bounded[: MOST - len(names)]}
+                    names |= {status.name for status in bounded[: MOST_ENTRIES - len(names)]}
                     statuses.append(Diagnostics(stamp_ns, tuple(status for status in bounded if status.name in names)))
                 case Cloud():
                     self.cloud = message.content
@@ -166,7 +165,7 @@ class RecordedRun:
         for t_s, status in ((t_s, status) for t_s, report in self.statuses for status in report):
             self.by_name.setdefault(status.name, []).append((t_s, status))
             values = self.newest[status.name].values if status.name in self.newest else {}
-            merged = dict([*{**values, **status.values}.items()][:MOST])
+            merged = dict([*{**values, **status.values}.items()][:MOST_ENTRIES])
             self.newest[status.name] = replace(status, values=merged)
         # An entry with `state` has the stamp of the first pose in it; others tell the state of an earlier pose.
         found = self.entries(status_names.ODOMETRY)
@@ -300,5 +299,5 @@ def root(variances: Array) -> Array:
 
 def _bounded(status: DiagnosticStatus) -> DiagnosticStatus:
     """Return a status as the report shows it: with short texts, and not too many."""
-    values = {plain(key): plain(value) for key, value in [*status.values.items()][:MOST]}
+    values = {plain(key): plain(value) for key, value in [*status.values.items()][:MOST_ENTRIES]}
     return DiagnosticStatus(plain(status.name), status.level, plain(status.message), values)

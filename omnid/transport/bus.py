@@ -29,7 +29,6 @@ __all__ = ["Bus", "BusConfig"]
 
 _HEARTBEAT_S: Final = 0.5  # rmw_zenoh's
 QUERY_PERIOD_S: Final = 0.01
-FLOOD_S: Final = 10.0  # The status warns of a flood for this time after its end.
 
 
 class TopicPublisher:
@@ -119,8 +118,7 @@ class Bus:
         self._commands: CommandIntake | None = None
         self._queries: dict[str, Intake[zenoh.Query]] = {}  # by name
         self._pollers: list[Poller] = []
-        self._flooded = 0  # floods, when they were counted last
-        self._flooded_s = -FLOOD_S
+        self._flooded = 0  # floods at the last status
         self._closed = False
         self.lost = 0
         if not self.needs_router:
@@ -143,8 +141,7 @@ class Bus:
         for intake in (*(self._commands.intakes if self._commands else ()), *self._queries.values()):
             counts[intake.key] += intake.floods
         counts = +counts
-        if counts.total() > self._flooded:
-            self._flooded, self._flooded_s = counts.total(), time.monotonic()
+        is_flooded, self._flooded = counts.total() > self._flooded, counts.total()
         return {
             "mode": "client" if self._config.is_client else "peer",
             "lost": self.lost,
@@ -152,7 +149,7 @@ class Bus:
             **{f"flooded, {key}": count for key, count in sorted(counts.items())},
             "_awaited_router": "" if self._session is not None else ", ".join(self._config.connect),
             "_same_name": "" if self.is_unique else self._same_name,
-            "_flood": counts.most_common(1)[0][0] if time.monotonic() < self._flooded_s + FLOOD_S else "",
+            "_flood": counts.most_common(1)[0][0] if is_flooded else "",
         }
 
     @property

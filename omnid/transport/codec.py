@@ -53,6 +53,7 @@ BOOL_SCHEMA = "std_msgs/msg/Bool"
 PATH_SCHEMA = "nav_msgs/msg/Path"
 STRING_SCHEMA = "std_msgs/msg/String"
 SCAN_SCHEMA = "sensor_msgs/msg/LaserScan"
+IMAGE_SCHEMA = "sensor_msgs/msg/CompressedImage"
 OK, WARN, ERROR, STALE = range(4)  # levels of diagnostic_msgs/msg/DiagnosticStatus
 NS_PER_S = 1_000_000_000
 # A quaternion whose norm differs from 1 by more than this is refused: more than rounding to float32 or to six decimals
@@ -627,18 +628,17 @@ def _planar_heading(pose: Any) -> float | None:
     return float(se3.yaw(T))
 
 
-# Features of a panorama.
+# A panorama and its features.
 
 FEATURE_KINDS: Final = ("inliers", "rejected", "new")
-MOST_FEATURES: Final = 2000  # features of a kind
 
 
 def features_to_bytes(pixels: Mapping[str, Array]) -> bytes:
     """Encode the zenoh attachment of a panorama: pixels (N, 2) of its features, column and row, by kind.
 
-    They are rounded to whole pixels; at most MOST_FEATURES of each kind.
+    They are rounded to whole pixels.
     """
-    rounded = {kind: np.rint(pixels[kind][:MOST_FEATURES]).astype(int).tolist() for kind in FEATURE_KINDS}
+    rounded = {kind: np.rint(pixels[kind]).astype(int).tolist() for kind in FEATURE_KINDS}
     return json.dumps(rounded, separators=(",", ":")).encode()
 
 
@@ -650,3 +650,19 @@ def features_from_bytes(data: bytes) -> dict[str, Array]:
     except (ValueError, TypeError, KeyError, RecursionError, OverflowError):
         reason = f"the {len(data)} bytes attached to a panorama are not features; check that omnid sent them"
         raise OmnidError(reason) from None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Panorama:
+    """Image of the lower camera as a panorama."""
+
+    stamp_ns: int
+    data: bytes  # JPEG
+    features: Mapping[str, Array]  # pixels (N, 2) by kind; empty where none are attached
+
+
+def decode_panorama(payload: bytes, attachment: bytes = b"") -> Panorama:
+    """Decode a CompressedImage, with its features if they are attached."""
+    message = decoded(payload, IMAGE_SCHEMA)
+    features = features_from_bytes(attachment) if attachment else {}
+    return Panorama(_stamp_ns(message), message.data.tobytes(), features)

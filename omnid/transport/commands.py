@@ -64,13 +64,11 @@ from omnid.engine.robot_clock import RobotClock, duration_words
 from omnid.errors import OmnidError
 from omnid.plain_text import plain
 from omnid.transport import codec, topics
-from omnid.transport.sensor_codec import sample_from_cdr
+from omnid.transport.sensor_codec import LARGEST_VALUE, sample_from_cdr
 from omnid.transport.status_names import REFUSED_PREFIX, by_reason
 from omnid.transport.topics import Answer, Request
 
 LONGEST_PAYLOAD, LONGEST_PATH = 4096, 1 << 20  # bytes
-# Larger numbers are faults of the sender.
-MAX_SPEED_MPS, MAX_YAW_RATE_RADPS, MAX_HEADING_RAD = 20.0, 50.0, 1000.0
 LEAST_SPEED: Final = 1e-3  # m/s, rad/s; less in another direction is noise of a stick, more is another motion
 ASIDE: Final = "not possible with a differential drive"
 MALFORMED: Final = "malformed"
@@ -175,7 +173,7 @@ def twist_command(payload: bytes) -> tuple[int, Setpoint]:
     """Return the stamp [ns], 0 without one, of a speed and a yaw rate. Raise OmnidError for anything else."""
     stamp_ns, frame, velocity_mps, yaw_rate_radps, aside = codec.twist_from_cdr(payload)
     _check_frame(frame, "base_link")
-    setpoint = Setpoint(_within(velocity_mps, MAX_SPEED_MPS), None, _within(yaw_rate_radps, MAX_YAW_RATE_RADPS))
+    setpoint = Setpoint(_bounded(velocity_mps), None, _bounded(yaw_rate_radps))
     for name, speed in zip(codec.ASIDE_NAMES, aside, strict=True):
         if not abs(speed) <= LEAST_SPEED:
             raise Refused(ASIDE, f"twist.{name} = {speed:g} is {ASIDE}; send linear.x and angular.z only")
@@ -186,13 +184,14 @@ def heading_command(payload: bytes) -> tuple[int, Setpoint]:
     """Return the stamp [ns] of a speed and a heading in odom. Raise OmnidError for anything else."""
     stamp_ns, frame, velocity_mps, heading_rad = codec.heading_from_cdr(payload)
     _check_frame(frame, "odom")
-    return stamp_ns, Setpoint(_within(velocity_mps, MAX_SPEED_MPS), _within(heading_rad, MAX_HEADING_RAD))
+    return stamp_ns, Setpoint(_bounded(velocity_mps), _bounded(heading_rad))
 
 
-def _within(value: float, limit: float) -> float:
+def _bounded(value: float) -> float:
+    """Return a speed or an angle in SI units. Raise Refused where its sender must have meant another unit."""
     if not math.isfinite(value):
         raise Refused("not finite")
-    if abs(value) > limit:
+    if abs(value) > LARGEST_VALUE:
         raise Refused("out of range")
     return value
 

@@ -32,7 +32,7 @@ from omnid.transport.topics import (
 
 CONNECT_S: Final = 2.0  # A connection is complete within this time.
 ANSWER_S: Final = 10.0  # more than a disk takes for a map or a route
-_POLL_S: Final = 0.002
+POLL_S: Final = 0.002  # delay that waiting for something that cannot be waited for adds
 # A stop must not be lost, and overtakes all else; requests go the same way.
 _QUALITY: Final[dict[str, Any]] = {
     "congestion_control": zenoh.CongestionControl.BLOCK,
@@ -212,7 +212,7 @@ def _holds_in_time(condition: Callable[[], bool]) -> bool:
     while not condition():
         if time.monotonic() > deadline_s:
             return False
-        time.sleep(_POLL_S)
+        time.sleep(POLL_S)
     return True
 
 

@@ -14,20 +14,12 @@ import numpy as np
 
 from drivers.errors import FrameDecodeError
 from drivers.frame import Frame
-from drivers.logs.ros_messages import (
-    BASE_FRAME,
-    COMPRESSED_IMAGE,
-    IMAGE,
-    JointWheels,
-    RosImage,
-    parse_image,
-    parse_motion,
-)
+from drivers.logs.ros_messages import BASE_FRAME, COMPRESSED_IMAGE, IMAGE, JointWheels, parse_motion
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.errors import OmnidError
 from omnid.transport.codec import IMU_SCHEMA, encoded, header, odometry_cdr
 
-LARGEST_RATE: Final = 100.0  # m/s and rad/s: larger ones are faults of the sender
+LARGEST_VALUE: Final = 100.0  # m/s, rad/s and rad: larger ones are faults of the sender
 _UNKNOWN_VARIANCE: Final = 1e9  # Variance of the parts of a pose that wheels do not measure.
 
 
@@ -62,17 +54,9 @@ def sample_from_cdr(
         return None
     if not sample.stamp_ns:
         raise OmnidError(f"a {schema} has no stamp; fill in header.stamp")
-    if any(abs(rate) > LARGEST_RATE for rate in astuple(sample)[1:] if math.isfinite(rate)):
-        raise OmnidError(f"a {schema} has rates above {LARGEST_RATE:.0f} m/s or rad/s: check its units")
+    if any(abs(rate) > LARGEST_VALUE for rate in astuple(sample)[1:] if math.isfinite(rate)):
+        raise OmnidError(f"a {schema} has rates above {LARGEST_VALUE:.0f} m/s or rad/s: check its units")
     return replace(sample, stamp_ns=stamp_ns(sample.stamp_ns))
-
-
-def decode_image(payload: bytes, _: bytes = b"") -> RosImage:
-    """Decode a CompressedImage."""
-    try:
-        return parse_image(COMPRESSED_IMAGE, memoryview(payload))
-    except FrameDecodeError as error:
-        raise OmnidError(str(error)) from error
 
 
 COMPRESSED: Final = ("jpeg", "png")

@@ -30,8 +30,7 @@ _PROTOCOLS: Final = "transport/link/protocols"
 _PROTOCOL: Final = re.compile(r'"([a-z0-9_-]+)/')
 _USERS: Final = "transport/auth/usrpwd/dictionary_file"
 _CERTIFICATES: Final = "transport/link/tls/enable_mtls"
-_RETRY_S: Final = 0.5  # between two attempts of a client to connect
-QUERY_S: Final = 1.0  # A query without an answer ends after this time, which a slow network must not exceed.
+QUERY_S: Final = 1.0  # A query without an answer ends after this time, and a client tries again to connect.
 # zenoh's threads (zenoh-runtime): what one robot receives needs one, and accepting links none of its own.
 _THREADS: Final = "(rx: (worker_threads: 1), acc: (handover: app))"
 _DEFAULTS: Final = (  # what zenoh's own file may leave to default.json5
@@ -89,7 +88,7 @@ def open_client(given: BusConfig, timeout_s: float = 0.0) -> zenoh.Session:
         except Unreachable:
             if time.monotonic() >= deadline_s:
                 raise
-        time.sleep(_RETRY_S)
+        time.sleep(QUERY_S)
 
 
 def robots_there(session: zenoh.Session) -> str:

@@ -396,14 +396,14 @@ def tracking_state(message: str, values: Mapping[str, str]) -> TrackingState | N
 class NavigationReport:
     """State of goals, paths and routes; see omnid.navigation_state for the states."""
 
-    stamp_ns: int
-    state: str
-    reason: str  # of a halt or an end
-    task: str  # "goal", "path" or "route NAME"
-    command_ns: int  # stamp of the goal or path that it follows from; 0 without
-    left_m: float  # way to the end; NaN unknown
-    request: str  # the newest one
-    refusal: str  # empty where it was accepted
+    stamp_ns: int = 0
+    state: str = ""
+    reason: str = ""  # of a halt or an end
+    task: str = ""  # "goal", "path" or "route NAME"
+    command_ns: int = 0  # stamp of the goal or path that it follows from; 0 without
+    left_m: float = math.nan  # way to the end; NaN unknown
+    request: str = ""  # the newest one
+    refusal: str = ""  # empty where it was accepted
     teaching: str = ""  # name of the route that is recorded
     taught_m: float = 0.0
 

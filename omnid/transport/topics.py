@@ -12,9 +12,7 @@ import json
 from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple
 
-from drivers.logs.ros_messages import COMPRESSED_IMAGE as IMAGE_SCHEMA
 from omnid.transport import codec
-from omnid.transport.sensor_codec import decode_image
 from omnid.transport.status_names import decode_navigation
 
 MAP_POSE: Final = "map_pose"
@@ -50,7 +48,7 @@ PUBLISHED: Final = {
     SCAN: Topic(codec.SCAN_SCHEMA, codec.decode_scan),
     "moving": Topic(codec.POINT_CLOUD_SCHEMA),
     "drive": Topic(codec.TWIST_SCHEMA),
-    PANORAMA: Topic(IMAGE_SCHEMA, decode_image),
+    PANORAMA: Topic(codec.IMAGE_SCHEMA, codec.decode_panorama),
     "navigation": Topic(codec.DIAGNOSTICS_SCHEMA, decode_navigation, latched=True),
     "plan": Topic(codec.PATH_SCHEMA, latched=True),
     "path": Topic(codec.PATH_SCHEMA, codec.path_from_cdr, latched=True),

@@ -28,7 +28,7 @@ from omnid.recordings.recording import Content
 from omnid.sinks.encoder import Changes, Encoder, Outgoing, pose_attachment
 from omnid.stages.front_end import FrontEnd
 from omnid.transport import status_names
-from omnid.transport.codec import Cloud, Diagnostics, Pose, PoseInMap, Scan, features_from_bytes
+from omnid.transport.codec import Cloud, Diagnostics, Panorama, Pose, PoseInMap, Scan
 from omnid.transport.status_names import ODOMETRY, STAGE_PREFIX, parsed_time_key, short_name
 from omnid.transport.topics import PUBLISHED, SCAN
 
@@ -106,8 +106,8 @@ class RerunSink:
         self._messages: dict[str, tuple[int, str]] = {}  # level and message of each status
         self.poses = self.images = 0
 
-    def draw(self, content: Content, attachment: bytes = b"", received_ns: int = 0) -> None:
-        """Draw a decoded message; attachment: of a panorama; received_ns: of a pose by the bus, 0: not known."""
+    def draw(self, content: Content | Panorama, received_ns: int = 0) -> None:
+        """Draw a decoded message; received_ns: of a pose by the bus, 0: not known."""
         match content:
             case Pose():
                 self._pose(content)
@@ -127,8 +127,10 @@ class RerunSink:
                 is_compressed = content.encoding in ("jpeg", "png")
                 data = bytes(content.data) if is_compressed else _jpeg(gray(content.frame()))
                 self.panorama(content.stamp_ns, data, content.encoding if is_compressed else "jpeg")
-                if attachment:
-                    self.features(content.stamp_ns, Features(**features_from_bytes(attachment)))
+            case Panorama(stamp_ns, data, features) if self.wants("image"):
+                self.panorama(stamp_ns, data)
+                if features:
+                    self.features(stamp_ns, Features(**features))
 
     def panorama(self, stamp_ns: int, data: bytes, kind: str = "jpeg") -> None:
         """Draw a compressed image; kind: jpeg or png."""

@@ -21,12 +21,11 @@ from typing import Any, Final
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 
-from drivers.logs.ros_messages import RosImage
 from omnid.client import Map, NavigationReport, Robot, Scan, Unreachable
 from omnid.core.mapping.thinned_path import ThinnedPath, Vertex
 from omnid.monitor.robot_state import ReceivedMessage, RobotState
 from omnid.transport.bus_config import BusConfig
-from omnid.transport.codec import Diagnostics, PlanarPath, Pose, PoseInMap
+from omnid.transport.codec import Diagnostics, Panorama, PlanarPath, Pose, PoseInMap
 from omnid.transport.topics import MAP_POSE, PANORAMA, SCAN
 from omnid.web.snapshot import (
     PATH_FRAME,
@@ -48,7 +47,6 @@ NAVIGATION: Final = "navigation"
 LARGEST: Final = 1 << 26  # bytes of a message: a map of 8,000 x 8,000 cells
 _NEWEST_ONLY: Final = (NAVIGATION, SCAN, "map", PANORAMA)
 _KEPT: Final = ("path", "status", "map")  # Topics whose message from before the connection is asked for.
-NO_NAVIGATION: Final = NavigationReport(0, "", "", "", 0, math.nan, "", "")
 
 
 class LivePath:
@@ -233,7 +231,7 @@ class RobotFeed:
             nothing = {
                 "map": {"frame": PATH_FRAME, "width": 0},
                 SCAN: {"points": [], "nearest": None},
-                NAVIGATION: navigation_news(NO_NAVIGATION),
+                NAVIGATION: navigation_news(NavigationReport()),
                 PANORAMA: 0,
             }
             for kind in nothing.keys() & self._news.keys():
@@ -262,6 +260,6 @@ class RobotFeed:
             case Map() as grid:
                 header, self._images["map"] = await asyncio.to_thread(map_cells, grid)
                 self._set("map", {**header, "version": self.version + 1})
-            case RosImage() as image:
-                self._images[PANORAMA] = bytes(image.data)
+            case Panorama(data=data):
+                self._images[PANORAMA] = data
                 self._set(PANORAMA, self.version + 1)

@@ -13,10 +13,10 @@ from prometheus_client.registry import Collector
 
 from omnid.engine.telemetry import Histogram
 from omnid.monitor.robot_state import RobotState
-from omnid.plain_text import plain
+from omnid.plain_text import MOST_ENTRIES, plain
 from omnid.tracking_state import TrackingState
 from omnid.transport.status_names import number, short_name
-from omnid.web.snapshot import LONGEST_VALUE, MOST_VALUES
+from omnid.web.snapshot import LONGEST_VALUE
 
 _TEXTS: Final = {
     "dropped": "Messages of the robot that the inbox dropped",
@@ -57,7 +57,7 @@ def _of_robot(state: RobotState) -> Iterator[Metric]:
     values = [
         ((short_name(part.name), key), value)
         for part in state.statuses.values()
-        for key, text in list(part.values.items())[:MOST_VALUES]
+        for key, text in list(part.values.items())[:MOST_ENTRIES]
         if (value := number(text)) is not None
     ]
     yield _labelled(Gauge, "omnid_status_value", "Numbers of the status", ["part", "key"], values)

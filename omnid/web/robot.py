@@ -31,14 +31,9 @@ from omnid.monitor.teleop import FIRST_SHARE, limits_of
 from omnid.transport.driver import ANSWER_S
 from omnid.web.feed import RobotFeed
 from omnid.web.metrics import metrics
-from omnid.web.snapshot import is_recent, server_ms
+from omnid.web.snapshot import OLDEST_S, is_recent, server_ms
 
 LONGEST_BODY: Final = 1024  # more than the longest request has, a route with a name of 64 letters and its options
-# A connection whose body has not arrived after this time is ended, so that slow ones do not collect.
-BODY_S: Final = 5.0
-# Other pages are refused for this time after the last request of the page that drives: several of its requests may be
-# lost before another page takes over.
-HELD_S: Final = 1.0
 _NUMBER: Final = r"(-?\d{1,6}(?:\.\d{1,4})?)"
 _GOAL: Final = re.compile(rf"{_NUMBER} {_NUMBER}(?: {_NUMBER})? (\d{{1,15}})")
 _STAMPED: Final = re.compile(r"(.*?)(?: stamp=(\d{1,15}))?", re.DOTALL)
@@ -186,9 +181,9 @@ class RobotPage:
             return Answer(False, "the network is too slow to drive by it: the stick's request is more than 1 s late")
         if self._sending:
             return Answer(False, "the robot does not take the last command: is it overloaded?")
-        # 3. Send it.
+        # 3. Send it. Other pages are refused until a state would be too old: some requests of this one may be lost.
         robot = self._robot()
-        self._page, self._held_until_s = page, time.monotonic() + HELD_S
+        self._page, self._held_until_s = page, time.monotonic() + OLDEST_S
         self._sending = True
         try:
             limits = await self._limits_of(robot)
@@ -241,10 +236,10 @@ def stamp_of(text: str) -> int:
 
 
 async def text_of(request: Request) -> str:
-    """Return the body of a request. Raise OmnidError above LONGEST_BODY bytes, or where it takes longer than BODY_S."""
+    """Return the body of a request. Raise OmnidError above LONGEST_BODY bytes, or after ANSWER_S."""
     body = bytearray()
     try:
-        async with asyncio.timeout(BODY_S):
+        async with asyncio.timeout(ANSWER_S):
             async for chunk in request.stream():
                 body += chunk
                 if len(body) > LONGEST_BODY:

@@ -13,7 +13,7 @@ import numpy as np
 
 from calib import se3
 from omnid.monitor.robot_state import LEVELS, RobotState, importance
-from omnid.plain_text import plain
+from omnid.plain_text import MOST_ENTRIES, plain
 from omnid.transport.codec import Map, Pose, PoseInMap, Scan
 from omnid.transport.status_names import PLACES, WHEELS, Key, NavigationReport, short_name
 
@@ -21,7 +21,6 @@ PATH_FRAME: Final = "odom"
 FRAMES: Final = (PATH_FRAME, "map")  # Frames of a map that is drawn.
 BASE_FRAME: Final = "base_link"
 OLDEST_S: Final = 1.0  # age of the newest state that a page may have when it asks for a motion
-MOST_VALUES: Final = 60  # Most values of a part of the status.
 LONGEST_VALUE: Final = 100  # characters
 LARGEST_MAP_PX: Final = 1024  # edge of the map as it is sent; larger ones are reduced
 _ROBOT_GONE: Final = "start the daemon on the robot: omnid run, or systemctl start omnid"
@@ -96,7 +95,7 @@ def parts_news(state: RobotState) -> list[dict[str, Any]]:
             "message": plain(part.message),
             "values": [
                 [plain(key, LONGEST_VALUE), plain(value, LONGEST_VALUE)]
-                for key, value in islice(part.values.items(), MOST_VALUES)
+                for key, value in islice(part.values.items(), MOST_ENTRIES)
             ],
         }
         for part in sorted(state.statuses.values(), key=importance)

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from omnid.core.control.velocity_limits import VelocityLimits
-from omnid.monitor.teleop import HOLD_S, REST_S, Stick
+from omnid.monitor.teleop import HOLD_S, Stick
 
 LIMITS = VelocityLimits(velocity_mps=1.0, yaw_rate_radps=2.0)
 UP, DOWN, RIGHT, LEFT = b"\x1b[A", b"\x1b[B", b"\x1b[C", b"\x1b[D"
@@ -23,7 +23,7 @@ def test_a_motion_lasts_as_long_as_its_key_is_repeated(stick: Stick) -> None:
     stick.press(UP, 10.0)
     assert stick.twist(10.0 + HOLD_S) == (0.5, 0.0)
     assert stick.twist(10.01 + HOLD_S) == (0.0, 0.0)
-    assert stick.commands(10.0 + HOLD_S + REST_S) and not stick.commands(10.01 + HOLD_S + REST_S)
+    assert stick.commands(10.0 + 2 * HOLD_S) and not stick.commands(10.01 + 2 * HOLD_S)
 
 
 def test_the_share_stays_within_the_limits(stick: Stick) -> None:

@@ -357,8 +357,7 @@ def test_counts_a_thousand_damaged_payloads(accepted: AcceptedCommands, seed: in
     assert accepted.receiver.accepted + sum(refused.values()) == 1000 and accepted.receiver.accepted < 300
     assert len(refused) <= 7 and refused["malformed"] > 400 and refused["not finite"] > 50
     for setpoint in accepted.setpoints:
-        assert abs(setpoint.velocity_mps) <= 20 and abs(setpoint.yaw_rate_radps) <= 50
-        assert setpoint.heading_rad is None or abs(setpoint.heading_rad) <= 1000
+        assert max(map(abs, (setpoint.velocity_mps, setpoint.yaw_rate_radps, setpoint.heading_rad or 0.0))) <= 100
 
 
 @pytest.mark.hazard("H48")
