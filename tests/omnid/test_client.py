@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import random
 import subprocess
 import sys
 import textwrap
@@ -17,17 +16,12 @@ import pytest
 
 import omnid.client
 from calib import se3
-from omnid.client import Answer, Cloud, Diagnostics, Driver, Map, Pose, Robot, subscribe
+from omnid.client import Answer, Driver, Robot, subscribe
 from omnid.errors import OmnidError
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import (
-    DiagnosticStatus,
     PoseAttachment,
-    decode_cloud,
-    decode_diagnostics,
-    decode_map,
-    decode_pose,
 )
 from omnid.transport.commands import Freshness
 from omnid.transport.topics import Request
@@ -57,36 +51,6 @@ def test_keeps_only_the_newest_pose() -> None:
 
         # A busy machine may take longer to deliver: then ten others are sent.
         wait_until(lambda: only_the_last_of_ten_is_read(1000 + 10 * next(numbers)))
-
-
-@pytest.mark.parametrize(
-    ("kind", "topic", "payload", "decode"),
-    [
-        (Pose, "odom", odometry(3), lambda data: decode_pose(data, b"")),
-        (
-            Diagnostics,
-            "status",
-            codec.diagnostics_cdr(5, [DiagnosticStatus("a", 1, "so so", {"k": "v"})]),
-            decode_diagnostics,
-        ),
-        (Cloud, "cloud", codec.point_cloud_cdr(6, "odom", np.ones((4, 3)), np.ones(4)), decode_cloud),
-        (Map, "map", codec.grid_cdr(6, "odom", np.zeros((4, 3), np.int8), 0.1, (0.0, 0.0)), decode_map),
-    ],
-)
-def test_any_bytes_are_decoded_or_refused(kind: type, topic: str, payload: bytes, decode) -> None:
-    rng = random.Random(2)
-    for _ in range(1500):
-        damaged = bytearray(payload)
-        for _ in range(rng.randint(1, 6)):
-            damaged[rng.randrange(len(damaged))] = rng.randrange(256)
-        with contextlib.suppress(OmnidError):
-            assert isinstance(decode(bytes(damaged[: rng.randint(0, len(damaged))])), kind)
-            assert isinstance(decode(bytes(damaged)), kind)
-    with robot() as (bus, endpoint), Robot(connect=(endpoint,)) as connection:
-        messages = connection.subscribe(kind)
-        wait_until(
-            lambda: bus.publish(topic, payload[:9]) is None and messages.newest() is None and messages.broken > 0
-        )
 
 
 def test_imports_nothing_that_only_the_daemon_needs() -> None:

@@ -7,7 +7,6 @@ import json
 import subprocess
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import zenoh
@@ -32,20 +31,6 @@ with zenoh.open(config):
     time.sleep(1000)
 """
 
-SUBSCRIBER = """
-import json, sys, struct, time, zenoh
-config = zenoh.Config()
-config.insert_json5("mode", '"client"')
-config.insert_json5("connect/endpoints", json.dumps([sys.argv[1]]))
-config.insert_json5("scouting/multicast/enabled", "false")
-with zenoh.open(config) as session:
-    samples = session.declare_subscriber(sys.argv[2], zenoh.handlers.FifoChannel(1000))
-    print("ready", flush=True)
-    with open(sys.argv[3], "w", buffering=1) as file:
-        for s in samples:
-            file.write(f"{struct.unpack_from('<I', bytes(s.payload), 8)[0]}\\n")  # nanoseconds of the header's stamp
-"""
-
 
 def free_endpoint(protocol: str = "tcp") -> str:
     return f"{protocol}/127.0.0.1:{free_port()}"
@@ -66,12 +51,6 @@ def script(text: str, *arguments: str) -> Iterator[subprocess.Popen[str]]:
             yield process
         finally:
             process.kill()
-
-
-def numbers(path: Path) -> list[int]:
-    """Return the numbers that a subscriber has written so far."""
-    lines = path.read_text().splitlines(keepends=True) if path.exists() else []
-    return [int(line) for line in lines if line.endswith("\n")]
 
 
 @contextlib.contextmanager

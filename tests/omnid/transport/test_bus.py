@@ -14,7 +14,6 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import zenoh
 from zenoh import ext
@@ -27,7 +26,7 @@ from omnid.transport.codec import ERROR, OK, WARN, PoseAttachment
 from omnid.transport.session import open_client, open_session, zenoh_config
 from omnid.transport.status_names import BUS, entry
 from omnid.transport.topics import PUBLISHED, REQUEST_TOPICS, command_topics, request_key
-from tests.omnid.transport.bus_fixtures import ROUTER, SUBSCRIBER, free_endpoint, numbers, odometry, script, session
+from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, odometry, script, session
 from tests.waiting import wait_until
 
 PEER = """
@@ -230,34 +229,6 @@ def test_closes_although_a_subscriber_is_stopped() -> None:
         bus.close()
 
 
-def test_direct_subscribers_lose_nothing_when_a_router_is_killed(tmp_path: Path) -> None:
-    """Subscribers behind the router receive again once another has taken its place."""
-    here, there = free_endpoint(), free_endpoint()
-    direct, behind = tmp_path / "direct", tmp_path / "behind"
-    sequence = count()
-    with contextlib.ExitStack() as stack:
-        router = stack.enter_context(script(ROUTER, there))
-        bus = stack.enter_context(contextlib.closing(Bus(BusConfig(listen=(here,), connect=(there,)))))
-        stack.enter_context(script(SUBSCRIBER, here, "omnid/odom", str(direct)))
-        stack.enter_context(script(SUBSCRIBER, there, "omnid/odom", str(behind)))
-
-        def publish() -> int:
-            number = next(sequence)
-            bus.publish("odom", odometry(number))
-            return number
-
-        wait_until(lambda: publish() >= 0 and bool(numbers(direct) and numbers(behind)))
-        router.kill()
-        router.wait()
-        last = [publish() for _ in range(100) if time.sleep(0.005) is None][-1]
-        stack.enter_context(script(ROUTER, there))
-        wait_until(lambda: publish() >= 0 and numbers(behind)[-1] > last)
-        wait_until(lambda: numbers(direct)[-1] >= last)
-        received = numbers(direct)
-    assert received == list(range(received[0], received[0] + len(received)))
-    assert max(np.diff(numbers(behind))) > 50, "the router was away"
-
-
 def appears(endpoint: str) -> bool:
     """True if a robot can be reached by the router."""
     try:
@@ -340,20 +311,6 @@ def test_warns_once_of_a_robot_of_the_same_name_that_appears_later() -> None:
         connection.kill()
         wait_until(lambda: entry(BUS, first.stats()).level == entry(BUS, second.stats()).level == OK)
         assert len(warnings) == 2, "each warns once"
-
-
-def test_a_token_of_a_stranger_keeps_no_robot_from_starting() -> None:
-    """It may keep the robot disarmed, and the status says so, where no user needs a password."""
-    endpoint, commands = free_endpoint(), list[str]()
-    with (
-        contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus,
-        session(mode="client", connect__endpoints=[endpoint]) as stranger,
-    ):
-        bus.subscribe_commands(lambda request: commands.append(request.topic), {})
-        held = stranger.liveliness().declare_token("omnid/alive/x")
-        wait_until(lambda: entry(BUS, bus.stats()).level == ERROR and commands == ["cmd/stop"])
-        del held
-        wait_until(lambda: entry(BUS, bus.stats()).level == OK)
 
 
 # Crowds and floods.

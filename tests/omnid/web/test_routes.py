@@ -10,8 +10,6 @@ from typing import Any
 
 import pytest
 
-from omnid.core.control.velocity_limits import VelocityLimits
-from omnid.monitor.teleop import FIRST_SHARE
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import DiagnosticStatus, PlanarPath, goal_from_cdr, string_from_cdr
@@ -19,7 +17,6 @@ from omnid.transport.status_names import NAVIGATION, WHEELS, Key
 from omnid.transport.topics import Answer, Request, command_topics
 from tests.omnid.transport.bus_fixtures import free_endpoint
 from tests.omnid.web.servers import Shown, WebServer, served
-from tests.waiting import wait_until
 
 
 class Navigator:
@@ -87,45 +84,3 @@ def test_requests_reach_the_robot_and_its_answer_the_page(robot: tuple[WebServer
     assert not refused["done"] and refused["text"] == "omnid refuses: that cannot be"
     shown = Shown(server).until("navigation", navigator.publish)
     assert (shown["state"], shown["task"], shown["left_m"]) == ("driving", "route dock", 3.5)
-
-
-@pytest.mark.hazard("H47")
-def test_the_stick_drives_while_the_page_shows_the_state_of_the_robot(robot: tuple[WebServer, Navigator]) -> None:
-    server, navigator = robot
-    limits = VelocityLimits()
-    assert (
-        answer(robot, "/drive", f"1 -0.5 {server.state_ms()} a1")["done"]
-        or answer(robot, "/drive", f"1 -0.5 {server.state_ms()} a1")["done"]
-    )  # the first one may wait for the limits
-    wait_until(lambda: navigator.twists)
-    assert navigator.twists[-1] == pytest.approx(
-        (FIRST_SHARE * limits.velocity_mps, -0.5 * FIRST_SHARE * limits.yaw_rate_radps)
-    )
-    assert "another page drives" in answer(robot, "/drive", f"1 0 {server.state_ms()} b2")["text"]
-    # 1. A request that waited in a network moves nothing; a release always counts.
-    count = len(navigator.twists)
-    assert "too slow" in answer(robot, "/drive", f"1 0 {server.state_ms() - 1500} a1")["text"]
-    assert "too slow" in answer(robot, "/drive", f"1 0 {server.state_ms() + 60_000} a1")["text"]
-    assert answer(robot, "/drive", f"0 0 {server.state_ms() - 1500} a1") == {
-        "done": True,
-        "text": "the stick is released: it stands",
-    }
-    wait_until(lambda: len(navigator.twists) > count)
-    assert navigator.twists[count:] == [(0.0, 0.0)]
-    # 2. Anything else is refused, and so are requests of other sites.
-    now_ms = server.state_ms()
-    for text in (
-        f"1.5 0 {now_ms} a1",
-        f"0 -1.01 {now_ms} a1",
-        f"nan 0 {now_ms} a1",
-        f"1 0 {now_ms}",
-        "1 0 -1 a1",
-        f"1 0 {now_ms} <b>",
-        "",
-        f"1 0 {now_ms} a1 b",
-    ):
-        assert not answer(robot, "/drive", text)["done"], text
-    body = f"1 0 {server.state_ms()} a1"
-    assert server.request("/drive", "POST", body=body).status == 403
-    assert server.request("/drive", "POST", {**server.bearer, "Origin": "http://evil.example"}, body).status == 403
-    assert len(navigator.twists) == count + 1

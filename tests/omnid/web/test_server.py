@@ -195,17 +195,6 @@ def test_hostile_messages_of_the_robot_are_shown_as_text(server: WebServer, bus:
     assert "\x1b" not in metrics and all(line.startswith(("omnid_", "# ")) for line in metrics.splitlines())
 
 
-def test_a_browser_that_asks_late_skips_and_delays_no_other(server: WebServer, bus: Bus) -> None:
-    slow, quick, seq = Shown(server), Shown(server), count(1000)
-    slow.read()
-    for _ in range(30):
-        publish(bus, next(seq))
-        quick.read()
-    last_m = quick.until("state", holds=lambda found: found["pose"]["x_m"] > 250)["pose"]["x_m"]
-    slow.read()
-    assert slow.newest["state"]["pose"]["x_m"] >= last_m
-
-
 @pytest.mark.hazard("H51")
 @pytest.mark.parametrize("first", [b"", b"GET / HTTP/1.1\r\nHost: localhost\r\nX: "])
 def test_two_thousand_silent_connections_keep_no_stop_out(server: WebServer, bus: Bus, first: bytes) -> None:
