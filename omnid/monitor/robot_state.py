@@ -50,7 +50,6 @@ class RobotState:
         self.robots_there = ""  # robots found at the time of connecting, as a part of a sentence
         self.poses = self.missed = self.broken = 0
         self.ends = 0  # number of times that the daemon's token disappeared
-        self.restarts = 0  # number of times that the numbers of its poses began again
         self.age = Histogram()  # s, from the capture of a pose's images to its arrival; empty for a simulated clock
         self.network = Histogram()  # s, from the robot's network to the arrival of a pose
         self._arrivals_s: deque[float] = deque(maxlen=_RATE_WINDOW)
@@ -113,11 +112,9 @@ class RobotState:
             self.age = Histogram()
 
     def _add_pose(self, pose: Pose, arrival_s: float) -> Pose:
-        """Count a pose. Skipped sequence numbers are missed poses; a smaller number means that the daemon restarted."""
-        if self.pose is not None and 0 <= self.pose.attachment.seq < pose.attachment.seq:
-            self.missed += pose.attachment.seq - self.pose.attachment.seq - 1
-        if self.pose is not None and pose.attachment.seq < self.pose.attachment.seq:
-            self.restarts += 1
+        """Count a pose. Skipped sequence numbers of a run are missed poses."""
+        if self.pose is not None and pose.attachment.run == self.run:
+            self.missed += max(0, pose.attachment.seq - self.pose.attachment.seq - 1)
         self.pose = pose
         self.poses += 1
         self._arrivals_s.append(arrival_s)
@@ -126,6 +123,11 @@ class RobotState:
             if 0 <= pose.received_ns - since_ns < OTHER_CLOCK_NS:
                 histogram.add((pose.received_ns - since_ns) * 1e-9)
         return pose
+
+    @property
+    def run(self) -> str:
+        """Identity of the daemon's run, which begins a new odom."""
+        return "" if self.pose is None else self.pose.attachment.run
 
     @property
     def real_time_factor(self) -> str:

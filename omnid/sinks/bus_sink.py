@@ -39,7 +39,7 @@ class BusSink:
             self._time_ns = message.stamp_ns
             self._bus.publish(CLOCK, clock_cdr(self._encode.unix_ns(message.stamp_ns)))
         # 2. The message itself.
-        attachment = pose_attachment(message, time.time_ns()) if isinstance(message, OdometryUpdate) else None
+        attachment = pose_attachment(message, time.time_ns(), RUN_ID) if isinstance(message, OdometryUpdate) else None
         for topic, _, payload in self._encode(message):
             self._bus.publish(topic, payload, attachment if topic == "odom" else None)
         # 3. What changes seldom, where it has changed.

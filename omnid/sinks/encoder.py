@@ -137,10 +137,10 @@ def static_frames(encode: Encoder, stamp_ns: int) -> OutgoingMessage:
     return OutgoingMessage.on("/tf_static", codec.transform_cdr(encode.unix_ns(stamp_ns), edges))
 
 
-def pose_attachment(odometry: OdometryUpdate, sent_ns: int = 0) -> bytes:
-    """Return what is attached to a pose; sent_ns: Unix time at which it is handed to the network."""
+def pose_attachment(odometry: OdometryUpdate, sent_ns: int = 0, run: str = "") -> bytes:
+    """Return what is attached to a pose; sent_ns: Unix time at which it is handed to the network; run: identity."""
     counts = odometry.reset_counter, odometry.inliers, odometry.tracks
-    return PoseAttachment(odometry.seq, odometry.state, *counts, sent_ns).to_bytes()
+    return PoseAttachment(odometry.seq, odometry.state, *counts, sent_ns, run).to_bytes()
 
 
 class Changes:

@@ -156,7 +156,7 @@ def _rigid_transform(pose: Any) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class PoseAttachment:
-    """The zenoh attachment of a pose: sequence number, tracking state and landmark counts."""
+    """The zenoh attachment of a pose: sequence number, tracking state, landmark counts and the run."""
 
     seq: int = -1
     state: str = "unknown"  # tracking | degraded | lost
@@ -164,6 +164,7 @@ class PoseAttachment:
     inliers: int = 0  # landmarks that agree with the pose
     tracked: int = 0  # landmarks found in the images
     sent_ns: int = 0  # Unix time at which it was handed to the network
+    run: str = ""  # identity of the daemon's run; another run has another odom
 
     def to_bytes(self) -> bytes:
         """Encode as JSON."""

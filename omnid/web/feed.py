@@ -222,8 +222,8 @@ class RobotFeed:
             self._set("parts", parts_news(self.state))
 
     def _add_to_path(self, pose: Pose, before: Pose | None) -> None:
-        """Add a pose; a smaller sequence number than before means that the daemon, and so odom, has begun again."""
-        if before is not None and pose.attachment.seq < before.attachment.seq:
+        """Add a pose; another run has another odom."""
+        if before is not None and pose.attachment.run != before.attachment.run:
             self.path.clear(self.version + 1)
             self._poses.clear()
             self._map_in_odom = None

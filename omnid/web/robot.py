@@ -50,7 +50,7 @@ class RobotPage:
         self._stopping: asyncio.Task[Answer] | None = None
         self._again = False  # a stop was asked for since the newest one was sent
         self._busy: set[str] = set()  # kinds of the requests that wait for an answer, each in a thread
-        self._limits: tuple[tuple[int, int], VelocityLimits] | None = None  # ends and restarts before they were read
+        self._limits: tuple[tuple[int, str], VelocityLimits] | None = None  # ends and run when they were read
         self._sending = False  # by the stick
         self._page, self._held_until_s = "", -math.inf  # the page that drives
         # Sending may block while the robot does not read; no request holds up a stop.
@@ -204,7 +204,7 @@ class RobotPage:
     async def _limits_of(self, robot: Robot) -> VelocityLimits:
         """Return the robot's limits, read at the first call after its start."""
         state = self.feed.state
-        start = state.ends, state.restarts
+        start = state.ends, state.run
         if self._limits is None or self._limits[0] != start or state.alive is False:
             self._limits = start, await asyncio.to_thread(limits_of, robot)
         return self._limits[1]

@@ -174,9 +174,9 @@ def panorama(data: bytes) -> bytes:
     return bytes(image_cdr(Frame(1, 10**9, "lower", "jpeg", np.frombuffer(data, np.uint8)), 10**9)[1])
 
 
-def add_pose(feed: RobotFeed, seq: int, resets: int = 0) -> None:
+def add_pose(feed: RobotFeed, seq: int, run: str = "a") -> None:
     """Put a pose at 0.25 m times seq into the inbox."""
-    feed.state.put("odom", odometry(seq), PoseAttachment(seq, "tracking", resets, 50, 60, time.time_ns()).to_bytes())
+    feed.state.put("odom", odometry(seq), PoseAttachment(seq, "tracking", 0, 50, 60, time.time_ns(), run).to_bytes())
 
 
 def test_a_robot_that_has_started_again_is_shown_without_what_belongs_to_its_odom_before() -> None:
@@ -189,11 +189,11 @@ def test_a_robot_that_has_started_again_is_shown_without_what_belongs_to_its_odo
         "panorama": panorama(b"\xff\xd8 bytes"),
         "navigation": codec.diagnostics_cdr(10**18, [navigation]),
     }
-    for seq in (4, 0):  # with nothing to forget there is nothing to send
-        add_pose(feed, seq)
+    for run in "ab":  # with nothing to forget there is nothing to send
+        add_pose(feed, 0, run)
     feed.process_inbox()
     assert not feed.news(0).keys() & large.keys()
-    add_pose(feed, 4)
+    add_pose(feed, 4, "b")
     feed.state.put("map_pose", codec.pose_with_covariance_cdr(10**9 + 4, np.eye(4), np.eye(6)), b"")
     feed.process_inbox()
 
@@ -205,7 +205,7 @@ def test_a_robot_that_has_started_again_is_shown_without_what_belongs_to_its_odo
     news = feed.news(0)
     assert news["state"]["map_in_odom"] is not None and news["map"]["width"] == 3 and news["panorama"]
     assert news["scan"]["points"] and news["navigation"]["task"] == "goal" and len(news["path"]["points"]) == 2
-    add_pose(feed, 0)
+    add_pose(feed, 5)
     feed.process_inbox()
     news = feed.news(0)
     assert news["state"]["map_in_odom"] is None and news["map"] == {"width": 0, "frame": "odom"}
