@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
@@ -24,7 +23,7 @@ from drivers.logs.log_reader import LogReader
 from drivers.logs.open_log import LogState
 from drivers.logs.ros_messages import IMAGE_TYPES
 from omnid.config import Config
-from omnid.formats.plan import BLACK, WHITE, Lines, between, draw_ends, draw_plan, drawn_heights, sheet_of, write
+from omnid.formats.plan import BLACK, WHITE, Lines, between, draw_ends, draw_plan, drawn_heights, sheet_of
 from omnid.formats.tum import Trajectory
 from omnid.plain_text import plain
 from omnid.recordings.evaluation import Metrics, associate, evaluate
@@ -142,7 +141,7 @@ class _Truth:
 
 
 def _plan(run: RecordedRun, events: Sequence[Event], truth: _Truth | None) -> list[str]:
-    """Return the figure of map and path, with dots of time, and crosses where the pose was lost."""
+    """Return the figure of map and path, with crosses where the pose was lost; the pointer relates it to the charts."""
     # 1. The points of the map between the floor and what is above the robot.
     points, confidence = np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
     if run.cloud is not None and run.cloud.frame == run.frames[0]:
@@ -167,19 +166,11 @@ def _plan(run: RecordedRun, events: Sequence[Event], truth: _Truth | None) -> li
     sheet = sheet_of(points_xy, np.vstack([xy, in_map, truth.base_xy if truth else np.zeros((0, 2))]))
     image = draw_plan(sheet, points_xy, confidence, lines)
 
-    def pixel(t_s: float) -> tuple[int, int]:
-        x, y = sheet.pixels(xy[np.searchsorted(run.t_s, t_s)][None])[0]
-        return int(x), int(y)
-
-    # 3. Some six round times, which relate the path to the charts; losses, start and end.
-    step_s = _round_step_s(run.end_s / 6)
-    for t_s in np.arange(step_s, run.end_s, step_s):
-        x, y = pixel(t_s)
-        cv2.circle(image, (x, y), 4, BLACK, cv2.FILLED, cv2.LINE_AA)
-        write(image, _clock(t_s, run.end_s), (x + 22, y - 8))
+    # 3. Losses, start and end.
     losses = [event for event in events if _is_loss(event)]
-    for event in losses[:MAX_ROWS]:
-        cv2.drawMarker(image, pixel(event.start_s), BLACK, cv2.MARKER_TILTED_CROSS, 16, 3)
+    at = np.searchsorted(run.t_s, [event.start_s for event in losses[:MAX_ROWS]])
+    for x, y in sheet.pixels(xy[at]).astype(int).tolist():
+        cv2.drawMarker(image, (x, y), BLACK, cv2.MARKER_TILTED_CROSS, 16, 3)
     draw_ends(image, sheet, xy[0], xy[-1])
     # 4. The figure; the places of at most 1000 poses are for the pointer.
     chosen = np.unique(np.linspace(0, len(xy) - 1, 1000).astype(int))
@@ -208,13 +199,6 @@ def _path_name(rank: int) -> str:
 
 def _key(style: str, name: str) -> str:
     return f"<span class='key'><i class='{style}'></i>{name}</span>"
-
-
-def _round_step_s(least_s: float) -> float:
-    """Return the next 1, 2 or 5 times a power of ten, of seconds or above a minute of minutes."""
-    unit_s = 60.0 if least_s > 50 else 1.0
-    decade = 10.0 ** math.floor(math.log10(max(least_s, 1e-3) / unit_s))
-    return unit_s * decade * next(digit for digit in (1, 2, 5, 10) if digit * decade * unit_s >= 0.999 * least_s)
 
 
 def _spans(run: RecordedRun) -> list[tuple[float, float, int]]:
