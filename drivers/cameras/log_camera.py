@@ -17,7 +17,7 @@ from drivers.errors import DriverError
 from drivers.frame import CAMERAS, Camera, Frame
 from drivers.logs.log_reader import LogReader
 from drivers.logs.topics import MotionTopics
-from drivers.motion import GyroSample, MotionSample, WheelSample
+from drivers.motion import MotionSample
 
 MAX_LOG_BYTES: Final = 1 << 30
 POLL_PERIOD_S: Final = 0.02  # A wait is interrupted with this period to see whether close() was called.
@@ -103,13 +103,15 @@ class LogClock:
 
 
 class _Playback:
-    """A part of a log, played forwards and backwards until it is closed.
+    """A part of a log, played forwards and backwards in turn until it is closed.
 
     clock: start of the log, shared by the cameras and the motion. pace: speed relative to the recording. once: play the
-    log once, forwards.
+    log once, forwards. Raises DriverError for a pace that is none.
     """
 
     def __init__(self, images: LogImages, clock: LogClock, *, pace: float = 1.0, once: bool = False) -> None:
+        if not 0 < pace < math.inf:
+            raise DriverError(f"the pace of a log is {pace:g}; give a number above 0; 2 is twice as fast as recorded")
         self._images, self._clock, self._pace, self._once = images, clock, pace, once
         self._closed = False
 
@@ -133,14 +135,11 @@ class LogCamera(_Playback):
     """One camera of a log.
 
     The stamp of a frame is the time at which it is due; frames that are due before the construction are not delivered.
-    Raises DriverError for a pace that is none.
     """
 
     def __init__(
         self, images: LogImages, camera: Camera, clock: LogClock, *, pace: float = 1.0, once: bool = False
     ) -> None:
-        if not 0 < pace < math.inf:
-            raise DriverError(f"the pace of a log is {pace:g}; give a number above 0; 2 is twice as fast as recorded")
         super().__init__(images, clock, pace=pace, once=once)
         self._frames = images.lower if camera == "lower" else images.upper
         self._created_ns = time.monotonic_ns()
@@ -163,10 +162,10 @@ class LogMotion(_Playback):
 
     def samples(self) -> Iterator[MotionSample]:
         """Yield the samples when they are due, until closed."""
-        if not self._images.motion:
-            return
-        for stamp_ns, sample, direction in self._due(self._images.motion):
-            yield _scaled(sample, stamp_ns, direction * self._pace)
+        for stamp_ns, sample, direction in self._due(self._images.motion) if self._images.motion else ():
+            rates = [name for name in sample.__slots__ if name.endswith("ps")]
+            faster = {name: direction * self._pace * getattr(sample, name) for name in rates}
+            yield replace(sample, stamp_ns=stamp_ns, **faster)
 
 
 def passes_of(entries: Sequence[tuple[int, T]], images: LogImages, once: bool) -> Iterator[tuple[int, T, int]]:
@@ -180,11 +179,3 @@ def passes_of(entries: Sequence[tuple[int, T]], images: LogImages, once: bool) -
             return
         turned_ns = start_ns + images.pass_ns + images.last_ns
         yield from ((turned_ns - at_ns, entry, -1) for at_ns, entry in reversed(entries))
-
-
-def _scaled(sample: MotionSample, stamp_ns: int, factor: float) -> MotionSample:
-    """Return the sample of a log that is played faster by a factor."""
-    if isinstance(sample, WheelSample):
-        return WheelSample(stamp_ns, factor * sample.velocity_mps, factor * sample.yaw_rate_radps)
-    rates = factor * sample.x_radps, factor * sample.y_radps, factor * sample.z_radps
-    return GyroSample(stamp_ns, *rates, of_base=sample.of_base)

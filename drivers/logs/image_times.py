@@ -12,16 +12,16 @@ the header is the better one, unless it is not set, does not advance, or counts 
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from statistics import median
 from typing import Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from drivers.frame import CAMERAS, Camera
-from drivers.logs.log import LATEST_NS, LONGEST_STEP, ClockStep, running_on
+from drivers.logs.log import LONGEST_STEP, ClockStep, running_on
 
 TimeSource: TypeAlias = Literal["auto", "header", "log"]
 Times: TypeAlias = NDArray[np.int64]
@@ -62,22 +62,20 @@ class ImageTimes:
         )
         # 2. The stamps.
         self.stamps_ns: dict[Camera, Times] = {camera: of_camera.log_ns for camera, of_camera in images.items()}
-        self._log_ns, self._shift_ns = np.zeros(1, np.int64), np.zeros(1, np.int64)  # shifts of the lower camera
-        self._delay_ns = 0
+        self._shifts_ns, self._delay_ns = [0], 0  # of the lower camera
         if self.source == "log":
             self.by_log[fault] += sum(map(len, self.stamps_ns.values())) if self._is_auto else 0
         elif has_log:
             self._steps = []
-            shifts: set[int] = set()
+            shared_ns: list[int] = []
             for camera, of_camera in images.items():
-                times = _CameraTimes(of_camera, may_replace=self._is_auto, shifts=shifts)
+                times = _CameraTimes(of_camera, may_replace=self._is_auto, shared_ns=shared_ns)
                 self.stamps_ns[camera] = times.stamps_ns
                 self.by_log += times.faults
                 self._steps += times.steps
-                shifts |= set(times.shifts_ns)
+                shared_ns += times.shifts_ns
                 if camera == "lower":
-                    self._log_ns, self._shift_ns = of_camera.log_ns, np.array(times.shifts_ns, np.int64)
-                    self._delay_ns = _median_ns(times.delays_ns)
+                    self._shifts_ns, self._delay_ns = times.shifts_ns, times.delay_ns
             self._steps.sort()
         else:
             # The times of logging say nothing: headers that step back run on by themselves.
@@ -99,10 +97,8 @@ class ImageTimes:
         if self.source == "log" or not len(header_ns):
             return log_ns
         # Where a clock was set, the one of the samples may be the same.
-        at = np.searchsorted(self._log_ns, log_ns, "right").clip(1, len(self._log_ns)) - 1
-        expected_ns = log_ns + self._delay_ns + self._shift_ns[at]
-        candidates_ns = header_ns + np.unique(np.append(self._shift_ns, 0))[:, None]
-        nearest = np.abs(candidates_ns - expected_ns).argmin(axis=0)
+        candidates_ns = header_ns + np.unique([0, *self._shifts_ns])[:, None]
+        nearest = np.abs(candidates_ns - (log_ns + self._delay_ns)).argmin(axis=0)
         return np.where(header_ns > 0, candidates_ns[nearest, np.arange(len(header_ns))], log_ns)
 
     def warnings(self) -> Iterable[str]:
@@ -142,100 +138,96 @@ def _judged(cameras: Sequence[LoggedImages]) -> tuple[str, bool]:
 
 
 class _CameraTimes:
-    """The stamps of one camera, whose times of logging serve."""
+    """The stamps of one camera, whose times of logging serve.
 
-    def __init__(self, images: LoggedImages, *, may_replace: bool, shifts: Iterable[int]) -> None:
-        """may_replace: by the time of logging. shifts: of the other camera, which may share the clock [ns]."""
-        self._headers, self._logged = images.header_ns.tolist(), images.log_ns.tolist()
-        self._all_ns = [header - log for header, log in zip(self._headers, self._logged, strict=True)]
+    The delay, header minus time of logging, is constant up to the jitter of the recorder, which only makes it smaller;
+    a clock that is set changes it at once, from one regular run of images to the next. A single other delay is that of
+    a wrong header, unless the image was logged late, between others.
+    """
+
+    def __init__(self, images: LoggedImages, *, may_replace: bool, shared_ns: Iterable[int]) -> None:
+        """may_replace: by the time of logging. shared_ns: shifts of the other camera, which may have the same clock."""
+        header_ns, log_ns, repeats = images
         self.faults: Counter[str] = Counter()
         self.steps: list[ClockStep] = []
-        self.shifts_ns: list[int] = []  # from header to stamp
-        self.delays_ns: deque[int] = deque(maxlen=FIRST_IMAGES)  # header minus log time of images that are not late
-        self._periods_ns: deque[int] = deque(maxlen=FIRST_IMAGES)  # between headers
-        self._newest_ns, self._least_ns = 0, -LATEST_NS  # latest header of the segment; least delay of logging in it
-        shift_ns, stamps = 0, list[int]()
-        for n, (header_ns, log_ns) in enumerate(zip(self._headers, self._logged, strict=True)):
-            before_ns = self._headers[n - 1] if n else 0
-            usual_ns = _median_ns(self.delays_ns or [d for d, h in self._behind(n) if h])
-            fault = ""
-            # 1. A header that is not set, or is that of another image.
-            if not header_ns and log_ns:
-                fault = "are 0"
-            elif may_replace and n and header_ns == before_ns and not images.repeats[n]:
-                fault = "do not advance" if header_ns else ""
-            # 2. A step of the clock, after which it runs on; else a time that is far from those of all other images.
-            elif size_ns := self._step_ns(n):
-                half_ns = _median_ns(self._periods_ns) / 2
-                shift_ns -= size_ns
-                # Both cameras are moved alike where one clock was set.
-                shared = [other_ns for other_ns in shifts if abs(other_ns - shift_ns) < half_ns]
-                if not shared:
-                    self.steps.append(ClockStep(stamps[-1], size_ns))
-                shift_ns = shared[0] if shared else shift_ns
-                self._newest_ns, self._least_ns = 0, -LATEST_NS
-                self.delays_ns.clear()
-            elif may_replace and (self._is_ahead(n) or self._is_alone(n)):
-                fault = "lie ahead of the log" if self._all_ns[n] > usual_ns else "lie long before the log"
-            if fault:
-                self.faults[fault] += 1
-            # 3. Late images tell nothing about the usual delay.
-            elif header_ns >= self._newest_ns:
-                self._newest_ns = header_ns
-                self.delays_ns.append(self._all_ns[n])
-                self._least_ns = max(self._least_ns, self._all_ns[n])
-            stamps.append((log_ns + usual_ns if fault else header_ns) + shift_ns)
-            self.shifts_ns.append(shift_ns)
-            if 0 < before_ns < header_ns:
-                self._periods_ns.append(header_ns - before_ns)
-        self.stamps_ns = np.array(stamps, np.int64)
-
-    def _behind(self, n: int) -> list[tuple[int, int]]:
-        """Return delay and header of the images behind one."""
-        some = slice(n + 1, n + 1 + LOOKED_AHEAD)
-        return list(zip(self._all_ns[some], self._headers[some], strict=True))
-
-    def _is_ahead(self, n: int) -> bool:
-        """True if a header has jumped to a time long after that of logging: no image is logged before it is taken."""
-        latest_ns = max(self._newest_ns, self._logged[n] + self._least_ns)
-        return bool(self.delays_ns and self._headers[n] > latest_ns + STEP_NS)
-
-    def _is_alone(self, n: int) -> bool:
-        """True if the header of an image lies far from its time of logging, and those of all others do not.
-
-        An image that was delivered late is logged between others, which are as far apart as always.
-        """
-        behind = [delay_ns for delay_ns, _ in self._behind(n)]
-        if len(behind) < LOOKED_AHEAD:
-            return False
-        if n and self._logged[n + 1] - self._logged[n - 1] < LONGEST_STEP * _median_ns(self._periods_ns):
-            return False
-        others_ns = [*self.delays_ns, *behind]
-        apart_ns = min(abs(self._all_ns[n] - other_ns) for other_ns in others_ns)
-        return bool(max(others_ns) - min(others_ns) < STEP_NS < apart_ns)
-
-    def _step_ns(self, n: int) -> int:
-        """Return by how much a clock was set before an image; 0 where it was not."""
-        headers, logged = (times[n : n + 1 + LOOKED_AHEAD] for times in (self._headers, self._logged))
-        if len(headers) < 2 or not self.delays_ns or not (headers[0] < self._newest_ns or self._is_ahead(n)):
-            return 0
-        # Late images go back as well, but they are logged all at once, or are few, or the next one is not late.
-        passed_ns, logged_ns = headers[-1] - headers[0], max(1, logged[-1] - logged[0])
-        period_ns = _median_ns(self._periods_ns)
-        is_usual = passed_ns < FASTEST * (len(headers) - 1) * (period_ns or passed_ns)
-        if headers != sorted(set(headers)) or not is_usual or not 1 / FASTEST < passed_ns / logged_ns < FASTEST:
-            return 0
-        usual_ns = _median_ns(self.delays_ns)
-        sizes_ns = [delay_ns - usual_ns for delay_ns in self._all_ns[n : n + 1 + LOOKED_AHEAD]]
-        size_ns = _median_ns(sizes_ns)
-        least_ns = max(period_ns, sum(max(some) - min(some) for some in (self.delays_ns, sizes_ns)))
-        return size_ns if all(abs(each) > least_ns and each * size_ns > 0 for each in sizes_ns) else 0
+        self.shifts_ns, self.delay_ns = [0], 0  # from header to stamp; from time of logging to stamp
+        # 1. Headers that are not set, or are those of another image.
+        wrong = {"are 0": (header_ns == 0) & (log_ns != 0)}
+        if may_replace:
+            is_same = np.diff(header_ns, prepend=-1) == 0
+            wrong["do not advance"] = is_same & ~repeats & (header_ns > 0)
+        used = np.flatnonzero(~np.any([*wrong.values()], axis=0))
+        header, log = header_ns[used], log_ns[used]
+        delays, steps = header - log, np.diff(header)
+        period = float(np.median(steps[steps > 0])) if np.any(steps > 0) else 0.0
+        # 2. Steps of the clock, before which and after which images are regular.
+        is_regular = _regular(header, log, period)
+        starts = [0]
+        regular = np.flatnonzero(is_regular)
+        jumps = (np.diff(header[regular]) < 0) | (np.diff(delays[regular]) > STEP_NS)
+        begin = 0
+        for at in (np.flatnonzero(jumps) + 1).tolist():
+            before = delays[regular[max(begin, at - FIRST_IMAGES) : at]]
+            after = delays[regular[at : at + LOOKED_AHEAD + 1]]
+            usual, size_ns = np.median(before), round(np.median(after) - np.median(before))
+            if abs(size_ns) <= max(period, np.ptp(before) + np.ptp(after)):
+                continue
+            between = delays[regular[at - 1] + 1 : regular[at] + 1]  # the last one of these is regular again
+            first = int(regular[at - 1] + 1 + np.argmin(np.abs(between - usual) < np.abs(between - usual - size_ns)))
+            shift_ns = self.shifts_ns[-1] - size_ns
+            # Both cameras are moved alike where one clock was set.
+            known = [other_ns for other_ns in shared_ns if abs(other_ns - shift_ns) < period / 2]
+            if not known:
+                self.steps.append(ClockStep(int(header[first - 1]) + self.shifts_ns[-1], size_ns))
+            self.shifts_ns.append(known[0] if known else shift_ns)
+            starts.append(int(used[first]))
+            begin = at
+        segment = np.searchsorted(starts, np.arange(len(header_ns)), "right") - 1
+        stamps_ns = header_ns + np.array(self.shifts_ns)[segment]
+        # 3. Delays that differ from those of all other images.
+        if len(used):
+            delays = stamps_ns[used] - log
+            self.delay_ns = round(np.median(delays[is_regular] if is_regular.any() else delays))
+            is_ahead, is_behind = _apart(delays, self.delay_ns)
+            around = sliding_window_view(np.pad(delays, LOOKED_AHEAD, "reflect"), 2 * LOOKED_AHEAD + 1)
+            gaps = np.pad(log, 1, "reflect", reflect_type="odd")
+            is_alone = np.abs(np.median(around, axis=1) - self.delay_ns) < STEP_NS
+            is_alone &= gaps[2:] - gaps[:-2] >= LONGEST_STEP * period
+            is_alone[-LOOKED_AHEAD:] = False  # what follows them is not known
+            for fault, is_so in (("lie ahead of the log", is_ahead), ("lie long before the log", is_behind & is_alone)):
+                if may_replace:
+                    wrong[fault] = np.isin(np.arange(len(header_ns)), used[is_so])
+        # 4. The stamps.
+        for fault, is_so in wrong.items():
+            self.faults[fault] += int(np.count_nonzero(is_so))
+        self.stamps_ns = np.where(np.any([*wrong.values()], axis=0), log_ns + self.delay_ns, stamps_ns)
 
 
-def _median_ns(times: Iterable[int]) -> int:
+def _regular(header: Times, log: Times, period: float) -> NDArray[np.bool_]:
+    """Return which images (N,) are among four that were taken and logged one after the other, at about one rate."""
+    found = np.zeros(len(header), np.bool_)
+    if len(header) > LOOKED_AHEAD:
+        passed, logged = (times[LOOKED_AHEAD:] - times[:-LOOKED_AHEAD] for times in (header, log))
+        is_regular = sliding_window_view(np.diff(header) > 0, LOOKED_AHEAD).all(axis=1)
+        is_regular &= passed < FASTEST * LOOKED_AHEAD * period
+        is_regular &= (passed < FASTEST * logged) & (logged < FASTEST * passed)
+        for n in range(LOOKED_AHEAD + 1):
+            found[n : n + len(is_regular)] |= is_regular
+    return found
+
+
+def _apart(delays: Times, usual_ns: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return which delays are larger and which are smaller than those about a usual one, with a gap of STEP_NS."""
+    ascending = np.sort(delays)
+    gaps, middle = np.flatnonzero(np.diff(ascending) > STEP_NS), np.searchsorted(ascending, usual_ns)
+    low = ascending[max(gaps[gaps < middle], default=-1) + 1]
+    high = ascending[min(gaps[gaps >= middle], default=len(delays) - 1)]
+    return delays > high, delays < low
+
+
+def _median_ns(times: Times) -> int:
     """Return the median, 0 of none."""
-    found = list(times)
-    return round(median(found)) if found else 0
+    return round(float(np.median(times))) if len(times) else 0
 
 
 def _step_ns(times: Times) -> float:

@@ -13,7 +13,7 @@ import logging
 import os
 import re
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -113,48 +113,44 @@ class RotatingLog:
         self.state.status, self._retry_at_s = "closed", float("inf")
 
     def _current(self, stamp_ns: int) -> LogWriter | None:
-        """Return the file for a message with this stamp, None where none can be created."""
+        """Return the file for a message with this stamp, None where none can be created: then the recording stops."""
+        keep = self._rotation
         if self._writer is not None:
             age_s = abs(stamp_ns - self._start_ns) / 1e9
-            if self._writer.size_bytes >= self._rotation.file_bytes or age_s >= self._rotation.file_s:
+            if self._writer.size_bytes >= keep.file_bytes or age_s >= keep.file_s:
                 self._end()
-        if self._writer is None and time.monotonic() >= self._retry_at_s:
-            self._begin(stamp_ns)
-        return self._writer
-
-    def _begin(self, stamp_ns: int) -> None:
-        """Make room, then create a file; the recording stops where that fails."""
-        keep = self._rotation
-        self.state.deleted += self._delete_oldest(keep.keep_files - 1, keep.keep_bytes - keep.file_bytes)
+        if self._writer is not None or time.monotonic() < self._retry_at_s:
+            return self._writer
+        self._delete_oldest()
         try:
             self._require_free_space(keep.free_bytes + keep.file_bytes)
             self._writer = self._created(stamp_ns)
         except DriverError as error:
             self._stop(error)
-            return
+            return None
         self._start_ns, self._synced_s = stamp_ns, time.monotonic()
         self.state.files += 1
         self.state.file = str(self._path)
         if self.state.status == "waiting":
             self.state.status = "recording"
+        return self._writer
 
     def _created(self, stamp_ns: int) -> LogWriter:
         """Create a file with the next number that no other program uses."""
         at = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(stamp_ns // 10**9))
         while True:
             self._number += 1
-            self._path = self._folder / f"{self._name}_{at}_{self._number:03}.mcap{_PART}"
-            if os.path.lexists(_complete(self._path)):
-                continue
+            whole = self._folder / f"{self._name}_{at}_{self._number:03}.mcap"
+            self._path = whole.with_name(whole.name + _PART)
             try:
-                writer = LogWriter(self._path, self._attachments, compression="none", exclusive=True)
+                if not os.path.lexists(whole):
+                    self._own[whole.name] = self._number
+                    return LogWriter(self._path, self._attachments, compression="none", exclusive=True)
             except DriverError as error:
-                if isinstance(error.__cause__, FileExistsError):
-                    continue
-                _delete(self._path)
-                raise
-            self._own[_complete(self._path).name] = self._number
-            return writer
+                if not isinstance(error.__cause__, FileExistsError):
+                    with suppress(OSError):
+                        self._path.unlink()
+                    raise
 
     def _refuse(self, reason: str) -> None:
         self.state.refused += 1
@@ -173,7 +169,8 @@ class RotatingLog:
             with suppress(DriverError):  # which has been reported
                 writer.close()
             if not writer.persisted:
-                _delete(self._path)
+                with suppress(OSError):
+                    self._path.unlink()
         self.state.problem, self.state.file = str(error), ""
         self._retry_at_s = time.monotonic() + self._backoff.next_s()
 
@@ -201,7 +198,7 @@ class RotatingLog:
             return
         try:
             writer.close()
-            self._path.rename(_complete(self._path))
+            self._path.rename(self._path.with_suffix(""))
         except DriverError as error:
             self._stop(error)
         except OSError as error:
@@ -209,35 +206,32 @@ class RotatingLog:
             self._stop(DriverError(f"cannot rename the log {str(self._path)!r}: {reason}"))
         self._writer, self.state.file = None, ""
 
-    def _delete_oldest(self, max_files: int, max_bytes: int) -> int:
-        """Delete the oldest recordings until the limits are met, and return the number of deleted files.
+    def _delete_oldest(self) -> None:
+        """Delete the oldest recordings of this name until there is room for one more within the limits.
 
-        Files that are being written, or cannot be deleted, are kept.
+        Those of this run are the newest, in their order: the clock may have been set back meanwhile. Files that are
+        being written, or cannot be deleted, are kept, and links are none.
         """
-        found = sorted(self._recordings())
-        total_bytes, deleted = sum(size for *_, size in found), 0
-        for *_, path, size in found:
-            if len(found) - deleted <= max_files and total_bytes <= max_bytes:
-                break
-            if not is_locked(path) and _delete(path):
-                total_bytes -= size
-                deleted += 1
-        return deleted
-
-    def _recordings(self) -> Iterator[tuple[int, str, int, Path, int]]:
-        """Yield place in this run, time, number, path and size [bytes] of the files with this name; they sort by age.
-
-        Files of this run are the newest, in their order: the computer's clock may have been set back meanwhile.
-        """
-        pattern = re.compile(re.escape(self._name) + r"_(\d{8}T\d{6}Z)_(\d{3,})\.mcap(?:\.part)?")
+        # 1. Place in this run, time, number, path and size of each file, which sort by age.
+        pattern = re.compile(re.escape(self._name) + rf"_(\d{{8}}T\d{{6}}Z)_(\d{{3,}})\.mcap(?:{re.escape(_PART)})?")
+        found: list[tuple[int, str, int, str, int]] = []
         with suppress(OSError), os.scandir(self._folder) as entries:
             for entry in entries:
-                found = pattern.fullmatch(entry.name)
-                if found and entry.is_file(follow_symlinks=False):
-                    path = Path(entry.path)
+                match = pattern.fullmatch(entry.name)
+                if match and entry.is_file(follow_symlinks=False):
                     with suppress(OSError):  # another program may have deleted it
-                        place = self._own.get(_complete(path).name, 0)
-                        yield place, found[1], int(found[2]), path, entry.stat().st_size
+                        place = self._own.get(entry.name.removesuffix(_PART), 0)
+                        found.append((place, match[1], int(match[2]), entry.path, entry.stat().st_size))
+        # 2. From the oldest on.
+        count, total_bytes, keep = len(found), sum(size for *_, size in found), self._rotation
+        for *_, path, size in sorted(found):
+            if count < keep.keep_files and total_bytes <= keep.keep_bytes - keep.file_bytes:
+                break
+            with suppress(OSError):
+                if not is_locked(path):
+                    os.unlink(path)
+                    count, total_bytes = count - 1, total_bytes - size
+                    self.state.deleted += 1
 
     def _require_free_space(self, wanted_bytes: int) -> None:
         """Create the folder; raise DriverError where it cannot be created, or the disk has less free space."""
@@ -255,16 +249,3 @@ class RotatingLog:
                 f"cannot record to {str(self._folder)!r}: {free // _MB} MB are free and "
                 f"{-(-wanted_bytes // _MB)} needed; make room, or keep fewer or smaller files"
             )
-
-
-def _complete(part: Path) -> Path:
-    """Return the path of a file after its completion."""
-    return part.with_name(part.name.removesuffix(_PART))
-
-
-def _delete(path: Path) -> bool:
-    """Delete a file; False where that fails."""
-    with suppress(OSError):
-        path.unlink()
-        return True
-    return False

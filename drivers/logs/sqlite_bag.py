@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
+import sys
 from collections import Counter
 from collections.abc import Iterator
 from functools import partial
@@ -41,7 +42,6 @@ _TOPICS: Final = (
 _ROWS: Final = (
     "SELECT topic_id, timestamp, rowid, length(data) FROM messages NOT INDEXED WHERE rowid >= ? ORDER BY rowid"
 )
-_FIRST_ROW: Final = -(2**63) + 1
 _DATA: Final = "SELECT substr(data, 1, ?) FROM messages WHERE rowid = ?"
 _FAULTS: Final = (sqlite3.Error, OverflowError)
 
@@ -81,7 +81,7 @@ class SqliteBag:
     def entries(self) -> Iterator[Entries]:
         """Yield the places of all messages; behind pages that cannot be read, those from the next readable one on."""
         places: list[tuple[int, int, int, int]] = []
-        start, row, count = _FIRST_ROW, _FIRST_ROW - 1, 0
+        start, row, count = -sys.maxsize, -sys.maxsize - 1, 0
         while True:
             try:
                 for channel, time_ns, row, size in self._bag.execute(_ROWS, (start,)):
