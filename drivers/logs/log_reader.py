@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
@@ -113,7 +113,7 @@ class LogReader:
         """Yield frames, and samples of wheels and IMU, in the order of their stamps."""
         self._reset()
         cameras: dict[str, Camera] = {topic: camera for camera, topic in self._cameras.items()}
-        rows, stamps_ns, is_image = self._order.rows, self._order.stamps_ns, self._order.is_image
+        is_image, stamps_ns = self._order.is_image, self._order.stamps_ns
         first_ns = int(stamps_ns[is_image][0]) if is_image.any() else 0
         at_s = 1e-9 * np.where(is_image, stamps_ns - first_ns, np.maximum(stamps_ns - first_ns, 0))
         begin_s, end_s = self._span_s
@@ -125,20 +125,29 @@ class LogReader:
         last: dict[Camera, tuple[int, memoryview]] = {}
         # Samples behind the last image are of no use.
         inside = (at_s >= begin_s) & (at_s <= min(end_s, at_s[is_image].max(initial=0.0)))
-        for row, stamp_ns in zip(rows[inside].tolist(), stamps_ns[inside].tolist(), strict=True):
+        for row, stamp_ns in zip(self._order.rows[inside].tolist(), stamps_ns[inside].tolist(), strict=True):
             message = self._log.message(row)
             if self._closed:
                 return
             if message is None:
                 continue
-            if message.topic not in cameras:
-                sample = self._sample(message)
-                if sample is not None:
-                    yield replace(sample, stamp_ns=stamp_ns)
+            camera, counter = cameras.get(message.topic), "broken_motion"
+            try:
+                if camera is None:
+                    sample = self._sample(message)
+                    if sample is not None:
+                        yield replace(sample, stamp_ns=stamp_ns)
+                    continue
+                counter = "broken"
+                image = message.image()
+                self._examine(message.topic, image)
+            except FrameDecodeError as error:
+                self.counts[counter] += 1
+                self._faults.setdefault(counter, str(error))
                 continue
-            camera, image = cameras[message.topic], self._image(message)
-            if image is None:
-                continue
+            self.counts["carried"] += image.carries
+            # A copy, so that a frame that is held back does not keep its chunk in memory.
+            image = replace(image, data=memoryview(bytes(image.data)), stamp_ns=stamp_ns)
             before_ns, before = last.get(camera, (-1, image.data))
             if stamp_ns == before_ns:
                 self.counts["duplicate"] += 1
@@ -146,7 +155,7 @@ class LogReader:
                 continue
             last[camera] = stamp_ns, image.data
             self.counts[camera] += 1
-            yield replace(image, stamp_ns=stamp_ns).frame(camera, self.counts[camera] - 1, self._bits)
+            yield image.frame(camera, self.counts[camera] - 1, self._bits)
         if not self._closed:
             self._report()
 
@@ -156,27 +165,26 @@ class LogReader:
         log, names = self._log, [*self._log.topics()]
         rows = log.rows({*self._cameras.values(), *self._motion.names})
         topic, run_ns = log.index.topic[rows], log.index.run_ns[rows]
-        # 1. Headers; a message without one may be broken.
-        header_ns, repeats, broken = run_ns.copy(), np.zeros(len(rows), np.bool_), dict[int, str]()
+        numbers = [names.index(self._cameras[camera]) for camera in CAMERAS]
+        # 1. Headers; an image without one may be broken.
+        header_ns, (repeats, is_broken) = run_ns.copy(), np.zeros((2, len(rows)), np.bool_)
         last: dict[int, tuple[int, int]] = {}  # by topic: header and row of the message before
         for n, (row, number) in enumerate(zip(rows.tolist(), topic.tolist(), strict=True)):
-            message = None if self._time == "log" or self._closed else log.message(row, HEADER_BYTES)
-            if message is None:
+            start = None if self._time == "log" or self._closed else log.message(row, HEADER_BYTES)
+            if start is None:
                 continue
             try:
-                header_ns[n] = found_ns = message.header_ns()
-                before_ns, row_before = last.get(number, (0, row))
+                header_ns[n] = found_ns = start.header_ns()
+                before_ns, row_before = last.get(number, (-1, row))
                 last[number] = found_ns, row
-                if names[number] in self._cameras.values() and (not found_ns or found_ns == before_ns):
+                if number in numbers and found_ns in (0, before_ns):
                     here, before = (log.message(one) for one in (row, row_before))
-                    if here and before:
-                        repeats[n] = here.image().data == before.image().data and found_ns == before_ns > 0
-            except FrameDecodeError as error:
-                broken[n] = str(error)
+                    is_same = here is not None and before is not None and here.image().data == before.image().data
+                    repeats[n] = is_same and found_ns == before_ns > 0
+            except FrameDecodeError:
+                is_broken[n] = True
         # 2. Stamps.
-        numbers = [names.index(self._cameras[camera]) for camera in CAMERAS]
-        valid = ~np.isin(np.arange(len(rows)), [*broken])
-        of_cameras = [np.flatnonzero((topic == number) & valid) for number in numbers]
+        of_cameras = [np.flatnonzero((topic == number) & ~is_broken) for number in numbers]
         images = {
             camera: LoggedImages(header_ns[at], run_ns[at], repeats[at])
             for camera, at in zip(CAMERAS, of_cameras, strict=True)
@@ -185,17 +193,13 @@ class LogReader:
         is_image = np.isin(topic, numbers)
         stamps_ns, rank = run_ns.copy(), np.zeros(len(rows), np.int64)
         stamps_ns[~is_image] = times.sample_ns(header_ns[~is_image], run_ns[~is_image])
-        for camera, at in zip(CAMERAS, of_cameras, strict=True):
-            stamps_ns[at], rank[at] = times.stamps_ns[camera], 1 + CAMERAS.index(camera)
+        for place, (camera, at) in enumerate(zip(CAMERAS, of_cameras, strict=True), 1):
+            stamps_ns[at], rank[at] = times.stamps_ns[camera], place
         # 3. The order: of one stamp samples, the lower camera, the upper one.
         order = np.lexsort((rank, stamps_ns))
-        order = order[valid[order]]
-        spans: dict[str, tuple[int, int]] = {}
-        for n, name in enumerate(names):
-            ns = stamps_ns[(topic == n) & valid]
-            if ns.size:
-                spans[name] = int(ns.min()), int(ns.max())
-        return _Order(rows[order], stamps_ns[order], is_image[order], times, spans, list(broken.values()))
+        stamps_of = {name: stamps_ns[(topic == n) & ~is_broken] for n, name in enumerate(names)}
+        spans = {name: (int(ns.min()), int(ns.max())) for name, ns in stamps_of.items() if ns.size}
+        return _Order(rows[order], stamps_ns[order], (is_image & ~is_broken)[order], times, spans)
 
     def close(self) -> None:
         """End frames() and close the log."""
@@ -222,34 +226,12 @@ class LogReader:
         self._other_joints = 0  # messages of joints without the wheels
         self._has_wheels = False
 
-    def _image(self, logged: LoggedMessage) -> RosImage | None:
-        """Return an image, None of a broken one.
-
-        The image is copied out of its chunk, so that a frame that is held back does not keep the chunk in memory.
-        """
-        try:
-            image = logged.image()
-            self._examine(logged.topic, image)
-        except FrameDecodeError as error:
-            self._count_broken("broken", str(error))
-            return None
-        self.counts["carried"] += image.carries
-        return replace(image, data=memoryview(bytes(image.data)))
-
     def _sample(self, logged: LoggedMessage) -> MotionSample | None:
-        """Return the sample in a message of wheels or IMU, None of a broken one, and of joints without the wheels."""
-        try:
-            sample = logged.motion(self._joints)
-        except FrameDecodeError as error:
-            self._count_broken("broken_motion", str(error))
-            return None
+        """Return the sample in a message of wheels or IMU, None of joints without the wheels."""
+        sample = logged.motion(self._joints)
         self._other_joints += sample is None
         self._has_wheels = self._has_wheels or isinstance(sample, WheelSample)
         return sample
-
-    def _count_broken(self, counter: str, reason: str) -> None:
-        self.counts[counter] += 1
-        self._faults.setdefault(counter, reason)
 
     def _examine(self, topic: str, image: RosImage) -> None:
         """Warn where the first image of a topic would be black, or grey, as it is encoded otherwise than stated."""
@@ -272,38 +254,35 @@ class LogReader:
     def _of_another_clock(self) -> Iterator[str]:
         """Yield a warning for cameras, and for wheels or gyro, whose stamps are shifted against each other."""
         spans, topics = self._order.spans_ns, self._log.topics()
-        both = [spans.get(self._cameras[camera]) for camera in CAMERAS]
-        if both[0] and both[1]:
-            begin_ns, end_ns = (upper_ns - lower_ns for lower_ns, upper_ns in zip(*both, strict=True))
+        images = [spans[topic] for camera in CAMERAS if (topic := self._cameras[camera]) in spans]
+        if len(images) == len(CAMERAS):
+            begin_ns, end_ns = (upper_ns - lower_ns for lower_ns, upper_ns in zip(*images, strict=True))
             if min(abs(begin_ns), abs(end_ns)) > STEP_NS > abs(begin_ns - end_ns):
                 yield (
-                    f"the images of the upper camera begin and end {abs(begin_ns) * 1e-9:.1f} s "
-                    f"{'after' if begin_ns > 0 else 'before'} those of the lower one by their stamps: of another clock?"
+                    f"the images of the upper camera begin and end {_apart(begin_ns)} those of the lower one by their "
+                    "stamps: of another clock?"
                 )
-        known = [span for span in both if span]
-        for topic in sorted(self._motion.names & spans.keys()):
+        for topic in sorted(self._motion.names & spans.keys()) if images else ():
             begin_ns, end_ns = spans[topic]
-            what, images_ns = "gyro" if topics[topic] == IMU else "wheels", min(known, default=(0, 0))[0]
-            if known and (begin_ns > max(span[1] for span in known) or end_ns < images_ns):
-                apart_s = 1e-9 * (begin_ns - images_ns)
+            first_ns, last_ns = min(images)[0], max(last_ns for _, last_ns in images)
+            if begin_ns > last_ns or end_ns < first_ns:
+                what = "gyro" if topics[topic] == IMU else "wheels"
                 yield (
-                    f"no sample of the {what} is used: they begin {abs(apart_s):.1f} s "
-                    f"{'after' if apart_s > 0 else 'before'} the images by their stamps: are these of another clock?"
+                    f"no sample of the {what} is used: they begin {_apart(begin_ns - first_ns)} the images by their "
+                    "stamps: are these of another clock?"
                 )
 
     def _report(self) -> None:
         damage, times = self._log.damage(), self._order.times
-        self.counts["broken_records"] = damage.broken
         self.truncated = bool(damage.cut)
-        if damage.cut:
-            self.warnings.append(damage.cut)
+        self.counts["broken_records"] = damage.broken
         self.counts["unstamped"] = times.by_log.total()
         self.counts["no_joints"] = 0 if self._has_wheels else self._other_joints
-        for reason in self._order.broken:
-            self._count_broken("broken", reason)
         faults = defaultdict(str, {**self._faults, "broken_records": damage.first})
-        found = {name: text for name, text in _WARNINGS.items() if self.counts[name]}
-        self.warnings += [text.format(self.counts[name], fault=faults[name]) for name, text in found.items()]
+        self.warnings += [damage.cut] if damage.cut else []
+        for name, text in _WARNINGS.items():
+            if self.counts[name]:
+                self.warnings.append(text.format(self.counts[name], fault=faults[name]))
         self.warnings += [*times.warnings(), *self._of_another_clock()]
 
 
@@ -315,7 +294,10 @@ class _Order(NamedTuple):
     is_image: NDArray[np.bool_]  # (N,)
     times: ImageTimes
     spans_ns: Mapping[str, tuple[int, int]]  # topic -> first and last stamp
-    broken: Sequence[str]  # what is wrong with images that are not among them
+
+
+def _apart(shift_ns: int) -> str:
+    return f"{abs(shift_ns) * 1e-9:.1f} s {'after' if shift_ns > 0 else 'before'}"
 
 
 def _is_neutral(image: NDArray[np.uint8]) -> bool:
