@@ -22,6 +22,7 @@ CAMERAS: tuple[Camera, Camera] = ("lower", "upper")
 MAX_PIXELS = 64 * 2**20
 # Pixels times channels of a compressed image: decoders of progressive and interlaced ones store all samples at once.
 MAX_SAMPLES = MAX_PIXELS
+SAMPLE_BITS = (8, 10, 12, 16)  # bits of a camera that images of 16 bits a sample may hold
 _START_MARKER = {"jpeg": b"\xff\xd8\xff", "png": b"\x89PNG\r\n\x1a\n"}  # ITU T.81, B.1.1.3; PNG 1.2, 3.1
 _JPEG_CHANNELS = {"Gray": 1, "YCbCr": 3, "RGB": 3}
 # Some webcams write zeros before the end of image, which libjpeg reports as a fault. A zero after 0xFF is none of them.
@@ -30,11 +31,8 @@ _EXTRANEOUS_AT_END = "extraneous bytes before marker 0xd9"
 _PNG_END = b"IEND\xaeB`\x82"
 # Signature, then the chunk IHDR: length, name, width, height, bit depth, colour type (PNG 1.2, 4.1.1).
 _PNG_START = struct.Struct(">8x4x4sIIBB")
-_PNG_ANIMATION = (
-    b"\0\0\0\x08acTL"  # length and name of the chunk of an animation, for which OpenCV takes 10 bytes a pixel
-)
+_PNG_ANIMATION = b"\0\0\0\x08acTL"  # length and name of the chunk of an animation: OpenCV takes 10 bytes a pixel
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by colour type
-_LUMA = {"yuyv": 0, "uyvy": 1}  # index of the luma byte of the two bytes of a pixel
 # Conversions by encoding without the number of bits, which are 8 or 16 a sample.
 _TO_GRAY = {
     "bgr": cv2.COLOR_BGR2GRAY,
@@ -46,14 +44,11 @@ _TO_GRAY = {
     "bayer_gbrg": cv2.COLOR_BayerGBRG2GRAY,
     "bayer_grbg": cv2.COLOR_BayerGRBG2GRAY,
 }
-_LUMA_FIRST = ("mono8", "nv12", "nv21", "nv24")
 _DEEP = "16"  # ends the names of encodings of 16 bits a sample
 # The names are those of sensor_msgs/image_encodings.hpp; of nv12, nv21 and nv24 the plane of luma comes first.
-_CHANNELS = {**dict.fromkeys(_LUMA_FIRST, 1), "mono16": 1, "yuyv": 2, "uyvy": 2} | {
-    f"{name}{bits}": 1 if name.startswith("bayer") else len(name) for name in _TO_GRAY for bits in (8, 16)
-}
-SAMPLE_BITS = (8, 10, 12, 16)  # bits of a camera that images of 16 bits a sample may hold
-_MAX_REASON, _MAX_ENCODING = 120, 40  # characters in an error message
+_CHANNELS = dict.fromkeys(("mono8", "mono16", "nv12", "nv21", "nv24"), 1) | {"yuyv": 2, "uyvy": 2}
+_CHANNELS |= {f"{name}{bits}": 1 if "bayer" in name else len(name) for name in _TO_GRAY for bits in (8, 16)}
+_LUMA = {"yuyv": 0, "uyvy": 1}  # index of the luma byte of the two bytes of a pixel
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,9 +87,17 @@ def gray(frame: Frame) -> NDArray[np.uint8]:
     was lost: with restart markers nearly any, without them what leaves the rest of the image undecodable.
     """
     try:
-        image = _decompress(frame) if frame.encoding in _START_MARKER else _unpack(frame)
+        data = np.frombuffer(frame.data, np.uint8)
+        marker = _START_MARKER.get(frame.encoding, b"")
+        head = data[: len(marker)].tobytes()
+        if head != marker or not data.size:
+            raise ValueError(f"it starts with {head.hex() or 'nothing'}")
+        image = {"jpeg": _of_jpeg, "png": _of_png}.get(frame.encoding, _of_raw)(frame, data)
     except (cv2.error, ValueError, TypeError, BufferError, OverflowError, MemoryError) as error:
-        raise _decode_error(frame, " ".join(str(error).split())[:_MAX_REASON]) from error
+        raise FrameDecodeError(
+            f"{frame.camera} frame {frame.seq} ({frame.encoding[:40]!r}) cannot be decoded: "
+            f"{' '.join(str(error).split())[:300]}"
+        ) from error
     image.setflags(write=False)
     return image
 
@@ -117,101 +120,70 @@ def upper_eight_bits(samples: NDArray[Any], bits: int) -> NDArray[np.uint8]:
     return np.asarray(np.minimum(samples >> (bits - 8), 255), np.uint8)
 
 
-def _decode_error(frame: Frame, reason: str) -> FrameDecodeError:
-    encoding = frame.encoding[:_MAX_ENCODING]
-    return FrameDecodeError(f"{frame.camera} frame {frame.seq} ({encoding!r}) cannot be decoded: {reason}")
+# Each returns the grey image (H, W), and raises ValueError with the reason before anything large is allocated.
 
 
-def _decompress(frame: Frame) -> NDArray[np.uint8]:
-    """Return the grey image (H, W)."""
-    data = np.frombuffer(frame.data, np.uint8)
-    head = data[: len(_START_MARKER[frame.encoding])].tobytes()
-    if head != _START_MARKER[frame.encoding]:
-        raise _decode_error(frame, f"it starts with {head.hex() or 'nothing'}")
-    return _decoded_jpeg(frame, data) if frame.encoding == "jpeg" else _decoded_png(frame, data)
-
-
-def _decoded_jpeg(frame: Frame, data: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the grey image (H, W); what follows the end of image does not count. Raise ValueError with the reason."""
+def _of_jpeg(frame: Frame, data: NDArray[np.uint8]) -> NDArray[np.uint8]:
     height, width, colours, _ = simplejpeg.decode_jpeg_header(data)
-    _require_samples(frame, width, height, _JPEG_CHANNELS.get(colours, 4))
+    _require_samples(width, height, _JPEG_CHANNELS.get(colours, 4))
     try:
         image = simplejpeg.decode_jpeg(data, "GRAY")
     except ValueError as error:
         if _EXTRANEOUS_AT_END not in str(error):
             raise
         image = simplejpeg.decode_jpeg(_ZEROS_BEFORE_END.sub(b"", data.tobytes()), "GRAY")
-    return _interpolated(frame.bayer, image[..., 0]) if colours == "Gray" else np.asarray(image[..., 0])
+    return _interpolated(frame, frame.bayer if colours == "Gray" else "", image[..., 0])
 
 
-def _decoded_png(frame: Frame, data: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _of_png(frame: Frame, data: NDArray[np.uint8]) -> NDArray[np.uint8]:
     raw = data.tobytes()
     if raw.rfind(_PNG_END) < 0:
-        raise _decode_error(frame, f"its end is missing after {data.size} bytes")
+        raise ValueError(f"its end is missing after {data.size} bytes")
     name, width, height, _, colours = _PNG_START.unpack_from(raw.ljust(_PNG_START.size, b"\0"))
-    channels = _PNG_CHANNELS.get(colours, 4)
-    is_plain = name == b"IHDR" and _PNG_ANIMATION not in raw
-    _require_samples(frame, width if is_plain else 0, height if is_plain else 0, channels)
+    channels, is_plain = _PNG_CHANNELS.get(colours, 4), name == b"IHDR" and _PNG_ANIMATION not in raw
+    _require_samples(width if is_plain else 0, height if is_plain else 0, channels)
     image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH)
     if image is None or image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
-        raise _decode_error(frame, "its content is corrupt")
-    return _upper_eight(frame, _interpolated(frame.bayer, image) if channels == 1 else image)
+        raise ValueError("its content is corrupt")
+    return _interpolated(frame, frame.bayer if channels == 1 else "", image)
 
 
-def _interpolated(encoding: str, image: NDArray[Any]) -> NDArray[Any]:
-    """Return the grey image (H, W) of one whose samples are colours or a Bayer pattern, as the encoding says."""
-    name = encoding.removesuffix(_DEEP).removesuffix("8")
-    if name not in _TO_GRAY:
-        return image
-    return np.asarray(cv2.cvtColor(np.ascontiguousarray(image, image.dtype.newbyteorder("=")), _TO_GRAY[name]))
-
-
-def _upper_eight(frame: Frame, image: NDArray[Any]) -> NDArray[np.uint8]:
-    return np.ascontiguousarray(image if image.dtype == np.uint8 else upper_eight_bits(image, frame.bits))
-
-
-def _require_samples(frame: Frame, width: int, height: int, channels: int) -> None:
-    """Raise FrameDecodeError for an empty or excessive compressed image, before it is decoded."""
-    _require_size(frame, width, height)
-    if width * height * channels > MAX_SAMPLES:
-        raise _decode_error(frame, f"{width} x {height} px of {channels} channels exceed {MAX_SAMPLES} samples")
-
-
-def _require_size(frame: Frame, width: int, height: int) -> None:
-    """Raise FrameDecodeError for an empty or excessive size, before anything of that size is allocated."""
-    if width < 1 or height < 1 or width * height > MAX_PIXELS:
-        raise _decode_error(frame, f"its size is {width} x {height} px, not 1 to {MAX_PIXELS} px in all")
-
-
-def _unpack(frame: Frame) -> NDArray[np.uint8]:
-    pixels = _pixels(frame)
-    if frame.encoding in _LUMA:
-        return np.array(pixels[..., _LUMA[frame.encoding]], np.uint8, order="C")
-    if frame.encoding in _LUMA_FIRST:
-        return np.array(pixels, np.uint8, order="C") if pixels.flags.writeable else np.ascontiguousarray(pixels)
-    return _upper_eight(frame, _interpolated(frame.encoding, pixels))
-
-
-def _pixels(frame: Frame) -> NDArray[Any]:
-    """Return a view of the raw pixels, (H, W) or (H, W, channels), without the padding of rows and further planes."""
+def _of_raw(frame: Frame, data: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Use the pixels without the padding of rows and without further planes."""
     channels = _CHANNELS.get(frame.encoding)
-    if not len(frame.data):
-        raise _decode_error(frame, "it is empty")
     if channels is None:
-        raise _decode_error(frame, f"known encodings are {', '.join([*_START_MARKER, *_CHANNELS])}")
-    _require_size(frame, frame.width, frame.height)
-    dtype: np.dtype[Any] = np.dtype(np.uint8)
-    if frame.encoding.endswith(_DEEP):
-        dtype = np.dtype(">u2" if frame.bigendian else "<u2")
+        raise ValueError(f"known encodings are {', '.join([*_START_MARKER, *_CHANNELS])}")
+    _require_samples(frame.width, frame.height, 1)
+    dtype = np.dtype((">u2" if frame.bigendian else "<u2") if frame.encoding.endswith(_DEEP) else "u1")
     pixel_bytes = channels * dtype.itemsize
     row_bytes = frame.width * pixel_bytes
     step = frame.step or row_bytes
-    data = np.frombuffer(frame.data, np.uint8)
     if step < row_bytes:
-        raise _decode_error(frame, f"its step is {step} bytes, a row of {frame.width} px takes {row_bytes}")
+        raise ValueError(f"its step is {step} bytes, a row of {frame.width} px takes {row_bytes}")
     if data.size < step * (frame.height - 1) + row_bytes:
         size = f"{frame.width} x {frame.height} px take {step * frame.height}"
-        raise _decode_error(frame, f"it has {data.size} bytes, {size}")
+        raise ValueError(f"it has {data.size} bytes, {size}")
     shape, strides = (frame.height, frame.width, channels), (step, pixel_bytes, dtype.itemsize)
-    axes = 2 if channels == 1 else 3
-    return np.ndarray(shape[:axes], dtype, buffer=data.data, strides=strides[:axes])
+    pixels: NDArray[Any] = np.ndarray(shape, dtype, buffer=data.data, strides=strides)
+    if channels == 1 or frame.encoding in _LUMA:
+        pixels = pixels[..., _LUMA.get(frame.encoding, 0)]
+    image = _interpolated(frame, frame.encoding, pixels)
+    return image.copy() if pixels.flags.writeable and np.may_share_memory(image, pixels) else image
+
+
+def _interpolated(frame: Frame, encoding: str, samples: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return the grey image of samples, which are grey or, as the encoding says, colours or a Bayer pattern."""
+    name = encoding.removesuffix(_DEEP).removesuffix("8")
+    if name in _TO_GRAY:
+        samples = cv2.cvtColor(np.ascontiguousarray(samples, samples.dtype.newbyteorder("=")), _TO_GRAY[name])
+    if samples.dtype != np.uint8:
+        samples = upper_eight_bits(samples, frame.bits)
+    return np.ascontiguousarray(samples)
+
+
+def _require_samples(width: int, height: int, channels: int) -> None:
+    """Raise ValueError for an empty or excessive image."""
+    if width < 1 or height < 1 or width * height > MAX_PIXELS:
+        raise ValueError(f"its size is {width} x {height} px, not 1 to {MAX_PIXELS} px in all")
+    if width * height * channels > MAX_SAMPLES:
+        raise ValueError(f"{width} x {height} px of {channels} channels exceed {MAX_SAMPLES} samples")
