@@ -269,7 +269,7 @@ class SerialMotor:
         except StopIteration as done:
             result: T = done.value
             return result
-        raise self._no_reply(transaction) if is_over else NoReplyError(f"motor on {self._name} has not answered yet")
+        raise self._no_reply() if is_over else NoReplyError(f"motor on {self._name} has not answered yet")
 
     @contextlib.contextmanager
     def _on_port(self) -> Iterator[None]:
@@ -308,15 +308,8 @@ class SerialMotor:
             time.sleep(min(left_s, POLL_PERIOD_S))
         return os.read(self._port.fileno(), READ_LIMIT_BYTES)
 
-    def _no_reply(self, transaction: Transaction[T]) -> NoReplyError:
+    def _no_reply(self) -> NoReplyError:
         """Return the error for a missing reply: what the protocol has seen of it, else what came at all."""
-        seen = ""
-        try:
-            transaction.throw(NoReplyError())
-        except NoReplyError as error:
-            seen = str(error)
-        except StopIteration:
-            pass
         is_echo = len(self._came) > 3 and self._came[: len(self._sent)] == self._sent[: len(self._came)]
         # Text, or bytes as another baud rate makes them.
         is_text = sum(byte in _TEXT for byte in self._came) >= 0.95 * len(self._came)
@@ -327,8 +320,8 @@ class SerialMotor:
                 " gave no answer of its own: what comes back is what was sent; are TX and RX joined, or does the "
                 "adapter echo (RS-485)?"
             )
-        elif seen:
-            found = f": {seen}"
+        elif self._protocol.seen:
+            found = f": {self._protocol.seen}"
         elif is_text:
             text = self._came.decode("ascii", "replace").strip()[:40]
             found = f" answers, but not in its protocol: {text!r}; is it another firmware, or another motor.protocol?"

@@ -44,7 +44,7 @@ from typing import Final, NamedTuple
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
 from drivers.motors.protocols.differential_drive import DifferentialDrive
-from drivers.motors.protocols.motor_protocol import TextFramer, Transaction, request, require_watchdog
+from drivers.motors.protocols.motor_protocol import TextFramer, Transaction, require_watchdog
 
 SEQ_COUNT = 65536
 MAX_LINE = 64  # bytes
@@ -170,6 +170,7 @@ class LineProtocol:
     baud = 115_200
 
     def __init__(self, drive: DifferentialDrive) -> None:
+        self.seen = ""
         self._drive = drive
         self._seq = 0
         self._zero_rad = 0.0  # heading at which the controller's heading is 0
@@ -181,7 +182,7 @@ class LineProtocol:
 
     def connect(self, watchdog_ms: int) -> Transaction[float]:
         """Set the watchdog and return the time in force [ms]; raise DriverError where another one is in force."""
-        (in_force_ms,) = yield from _answer(encode("W", watchdog_ms), "A")
+        (in_force_ms,) = yield from self._answer(encode("W", watchdog_ms), "A")
         require_watchdog(watchdog_ms, in_force_ms)
         self._zero_rad = self._heading_rad
         return float(watchdog_ms)
@@ -192,24 +193,21 @@ class LineProtocol:
         heading_rad = math.remainder(command.heading_rad - self._zero_rad, math.tau)
         seq, self._seq = self._seq, (self._seq + 1) % SEQ_COUNT
         line = velocity_line(seq, VelocityCommand(0, velocity_mps, heading_rad, yaw_rate_radps))
-        status = status_of((yield from _answer(line, "S", seq)))
+        status = status_of((yield from self._answer(line, "S", seq)))
         self._heading_rad = math.remainder(status.heading_rad + self._zero_rad, math.tau)
         return replace(status, heading_rad=self._heading_rad)
 
-
-def _answer(line: bytes, kind: str, seq: int | None = None) -> Transaction[tuple[int, ...]]:
-    """Send a line and return the numbers of the first line of this kind, with this seq if one is given."""
-    odd = ""  # what the newest line shows that is no reply
-
-    def take(frame: bytes) -> tuple[int, ...] | None:
-        nonlocal odd
-        try:
-            found, numbers = decode(frame)
-        except ProtocolError as error:
-            odd = str(error) if b"$" in frame else odd
-            return None
-        if found == kind and seq not in (None, numbers[0]):
-            odd = f"it answers command {seq} with a status of {numbers[0]}: does its firmware repeat the number?"
-        return numbers if found == kind and seq in (None, numbers[0]) else None
-
-    return (yield from request(line, take, lambda: odd))
+    def _answer(self, line: bytes, kind: str, seq: int | None = None) -> Transaction[tuple[int, ...]]:
+        """Send a line and return the numbers of the first line of this kind, with this seq if one is given."""
+        self.seen = ""
+        frame = yield line
+        while True:
+            try:
+                found, numbers = decode(frame)
+                if found == kind and seq in (None, numbers[0]):
+                    return numbers
+                if found == kind:
+                    self.seen = f"it answers command {seq} with a status of {numbers[0]}: does its firmware repeat it?"
+            except ProtocolError as error:
+                self.seen = str(error) if b"$" in frame else self.seen
+            frame = yield b""

@@ -2,7 +2,7 @@
 
 A protocol does no I/O. It consists of transactions: generators that yield the bytes to write (none: only wait), are
 sent the next complete frame each time, and return the result. The driver runs a transaction up to a deadline;
-the transaction itself waits without a limit, and may say what it has seen when that is over (NoReplyError):
+the transaction itself waits without a limit:
 
     def connect(self, watchdog_ms):
         frame = yield b"^RWD %d\\r" % watchdog_ms
@@ -12,7 +12,7 @@ the transaction itself waits without a limit, and may say what it has seen when 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from typing import Protocol, TypeAlias, TypeVar
 
 from drivers.errors import DriverError
@@ -23,10 +23,7 @@ _MAX_LINE = 256  # bytes
 
 
 class NoReplyError(DriverError):
-    """No reply before the timeout, from a port that is still there.
-
-    It is thrown into a transaction whose time is over, which may raise another one that says what it has seen.
-    """
+    """No reply before the timeout, from a port that is still there."""
 
 
 Transaction: TypeAlias = Generator[bytes, bytes, T]
@@ -46,6 +43,7 @@ class MotorProtocol(Protocol):
     """Commands <-> bytes of one kind of controller; one object serves one connection."""
 
     baud: int  # default of the controller
+    seen: str  # what the frames of the present transaction show so far, for the case that no answer comes; "": nothing
 
     def framer(self) -> Framer:
         """Return a new framer for the controller's replies."""
@@ -61,20 +59,6 @@ class MotorProtocol(Protocol):
 
         now_s: time of any monotonic clock.
         """
-
-
-def request(data: bytes, take: Callable[[bytes], T | None], seen: Callable[[], str]) -> Transaction[T]:
-    """Write data, and pass frames to `take` until it returns a result.
-
-    seen: returns what the frames so far show where the time is over; empty: nothing.
-    """
-    try:
-        frame = yield data
-        while (found := take(frame)) is None:
-            frame = yield b""
-        return found
-    except NoReplyError:
-        raise NoReplyError(seen()) from None
 
 
 def require_watchdog(requested_ms: int, in_force_ms: float) -> None:

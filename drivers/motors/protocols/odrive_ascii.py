@@ -25,7 +25,7 @@ from collections.abc import Sequence
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, is_stop
 from drivers.motors.protocols.differential_drive import DifferentialDrive
-from drivers.motors.protocols.motor_protocol import TextFramer, Transaction, request, require_watchdog
+from drivers.motors.protocols.motor_protocol import TextFramer, Transaction, require_watchdog
 
 AXES = (0, 1)
 WATCHDOG_EXPIRED = 0x800  # AXIS_ERROR_WATCHDOG_TIMER_EXPIRED (firmware 0.5, odrive-interface.yaml)
@@ -52,6 +52,7 @@ class ODriveAscii:
     baud = 115_200
 
     def __init__(self, drive: DifferentialDrive) -> None:
+        self.seen = ""
         self._drive = drive
         self._disarmed = True
         self._still = 0  # consecutive commands to turn that no axis has followed
@@ -113,26 +114,23 @@ class ODriveAscii:
     def _query(self, lines: Sequence[str], requests: Sequence[str]) -> Transaction[list[list[float]]]:
         """Write lines and requests, and return the numbers of each reply: two for "f", one for "r"."""
         replies: list[list[float]] = []
-        odd = b""  # the newest line that is no reply to its request
-
-        def take(frame: bytes) -> list[list[float]] | None:
-            nonlocal odd
+        self.seen = ""
+        frame = yield b"".join(map(with_checksum, [*lines, *requests]))
+        while True:
             numbers = self._numbers(frame)
             if numbers and len(numbers) == (2 if requests[len(replies)][0] == "f" else 1):
                 replies.append(numbers)
+                if len(replies) == len(requests):
+                    return replies
+                missing = requests[len(replies)]
+                self.seen = f"{len(replies)} of {len(requests)} answers came, none to {missing!r}"
             else:
-                odd = frame
                 replies.clear()  # a reply is missing, so those before cannot be assigned: this ends in the timeout
-            return replies if len(replies) == len(requests) else None
-
-        def seen() -> str:
-            if odd:
-                is_bare = _BARE.fullmatch(odd)
-                return f"its answers carry no checksum: {odd.decode()!r}; firmware 0.5 is needed" if is_bare else ""
-            missing = requests[len(replies)]
-            return f"{len(replies)} of {len(requests)} answers came, none to {missing!r}" if replies else ""
-
-        return (yield from request(b"".join(map(with_checksum, [*lines, *requests])), take, seen))
+                is_bare = _BARE.fullmatch(frame)
+                self.seen = (
+                    f"its answers carry no checksum: {frame.decode()!r}; firmware 0.5 is needed" if is_bare else ""
+                )
+            frame = yield b""
 
     def _numbers(self, frame: bytes) -> list[float] | None:
         """Return the numbers of a reply, None if it is damaged; raise DriverError where it is an error message."""

@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
 from drivers.motors.protocols.differential_drive import DifferentialDrive
-from drivers.motors.protocols.motor_protocol import TextFramer, Transaction, request, require_watchdog
+from drivers.motors.protocols.motor_protocol import TextFramer, Transaction, require_watchdog
 
 MAX_RPM = 65535
 
@@ -34,7 +34,7 @@ class Roboteq:
     baud = 115_200
 
     def __init__(self, drive: DifferentialDrive) -> None:
-        self._drive, self._rpm_per_mps = drive, drive.rpm_per_mps
+        self.seen, self._drive, self._rpm_per_mps = "", drive, drive.rpm_per_mps
 
     def framer(self) -> TextFramer:
         """Return a framer of lines."""
@@ -68,20 +68,19 @@ class Roboteq:
         """Write lines, and return the replies by name once all commands are confirmed."""
         commands, confirmed = sum(line[:1] in b"!^" for line in lines), 0
         values: dict[bytes, list[int]] = {}
-
-        def take(frame: bytes) -> dict[bytes, list[int]] | None:
-            nonlocal confirmed
+        self.seen = ""
+        frame = yield b"".join(line + b"\r" for line in lines)
+        while True:
             confirmed += frame == b"+"
             if frame == b"-":
                 raise DriverError(f"it rejected one of {b', '.join(lines).decode()}; check its configuration")
             if reply := _REPLY.fullmatch(frame):
                 values[reply[1]] = [int(number) for number in reply[2].split(b":")]
-            return values if confirmed >= commands and names <= values.keys() else None
-
-        def seen() -> str:
             missing = b", ".join(sorted(names - values.keys())).decode()
-            silent = f", and says nothing of {missing}" if missing else ""
-            found = f"it confirmed {confirmed} of {commands} commands{silent}: is it a Roboteq with two channels?"
-            return found if values or confirmed else ""
-
-        return (yield from request(b"".join(line + b"\r" for line in lines), take, seen))
+            if confirmed >= commands and not missing:
+                return values
+            if values or confirmed:
+                silent = f", and says nothing of {missing}" if missing else ""
+                found = f"it confirmed {confirmed} of {commands} commands{silent}"
+                self.seen = f"{found}: is it a Roboteq with two channels?"
+            frame = yield b""

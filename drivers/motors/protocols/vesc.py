@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
 from drivers.motors.protocols.differential_drive import DifferentialDrive
-from drivers.motors.protocols.motor_protocol import T, Transaction, request
+from drivers.motors.protocols.motor_protocol import T, Transaction
 
 SET_RPM, GET_APPCONF, FORWARD_CAN, GET_VALUES_SELECTIVE = 8, 17, 34, 50  # COMM_PACKET_ID in datatypes.h
 MASK = 1 << 7 | 1 << 8 | 1 << 15 | 1 << 17 | 1 << 21  # erpm, input voltage, fault, id, status
@@ -109,7 +109,7 @@ class Vesc:
     baud = 115_200
 
     def __init__(self, drive: DifferentialDrive) -> None:
-        self._drive = drive
+        self.seen, self._drive = "", drive
 
     def framer(self) -> PacketFramer:
         """Return a framer of packets."""
@@ -147,30 +147,23 @@ class Vesc:
     ) -> Transaction[tuple[tuple[int, T], tuple[int, T]]]:
         """Send a query to both controllers, then the commands; return (id, parsed reply) of each."""
         replies: dict[bool, tuple[int, T]] = {}  # the key is True for the controller on CAN
-        other = -1  # command of the newest packet that is no reply
-
-        def take(frame: bytes) -> tuple[tuple[int, T], tuple[int, T]] | None:
-            nonlocal other
+        can_id, self.seen = self._drive.can_id, ""
+        frame = yield packet(query) + packet(forwarded(can_id, query)) + commands
+        while True:
             reply = parse(frame)
-            if reply is None:
-                other = frame[0]
-            else:
-                replies[reply[0] == self._drive.can_id] = reply
-            return (replies[False], replies[True]) if len(replies) == 2 else None
-
-        def seen() -> str:
-            can_id = self._drive.can_id
+            if reply is not None:
+                replies[reply[0] == can_id] = reply
+            if len(replies) == 2:
+                return replies[False], replies[True]
             if False in replies:
                 found = f"VESC {replies[False][0]} answers, none with id {can_id} on CAN"
-                return f"{found}: motor.drive.can_id, or the wires of CAN"
-            if True in replies:
+                self.seen = f"{found}: motor.drive.can_id, or the wires of CAN"
+            elif True in replies:
                 found = f"VESC {can_id} is on the port itself, and no other one answers"
-                return f"{found}: motor.drive.can_id is the other's"
-            unasked = f"it answers packets of command {other}, which was not asked for: an older firmware?"
-            return unasked if other >= 0 else ""
-
-        packets = packet(query) + packet(forwarded(self._drive.can_id, query)) + commands
-        return (yield from request(packets, take, seen))
+                self.seen = f"{found}: motor.drive.can_id is the other's"
+            else:
+                self.seen = f"it answers packets of command {frame[0]}, which was not asked for: an older firmware?"
+            frame = yield b""
 
 
 def _config(payload: bytes) -> tuple[int, int] | None:
