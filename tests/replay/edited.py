@@ -33,9 +33,9 @@ class Image:
         )
 
 
-def images(log: Path) -> list[Image]:
-    """Return the images of a log, in the order of their stamps."""
-    reader = LogReader(log)
+def images(log: Path, lower: str | None = None, upper: str | None = None) -> list[Image]:
+    """Return the images of a log, in the order of their stamps; lower, upper: topics, None: by their names."""
+    reader = LogReader(log, lower, upper)
     taken = [Image(f.camera, f.seq, f.stamp_ns, bytes(f.data), f.stamp_ns) for f in reader.frames()]
     reader.close()
     return taken

@@ -7,6 +7,7 @@ of the raw image, and what follows it is below; 1: it is a column, as of a senso
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -40,7 +41,8 @@ def shift(images: Sequence[Image], by_px: tuple[int, int], *, since: int) -> lis
 def turn(images: Sequence[Image], angle_deg: float, *, since: int) -> list[Image]:
     """Return images that are turned about their middle from one on, as by a mirror that has moved."""
     height, width = images[0].shape
-    return warp(images, cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), angle_deg, 1.0), since=since)
+    about = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), angle_deg, 1.0)
+    return warp(images, np.asarray(about, float), since=since)
 
 
 def warp(images: Sequence[Image], affine: NDArray[np.float64], *, since: int) -> list[Image]:
@@ -75,3 +77,20 @@ def _joined(parts: tuple[Image, Image], line: int, axis: int) -> Image:
     """Return the lines of the first part before a line, and those of the second one from it on."""
     before, after = (np.split(part, [line], axis=axis)[number] for number, part in enumerate(parts))
     return np.ascontiguousarray(np.concatenate([before, after], axis=axis))
+
+
+def roll(images: Sequence[Image], share: float, *, axis: int = 0, since: int = 1) -> list[Image]:
+    """Return images whose lines are exposed one after the other, the last one by a share of a period before the first.
+
+    They are warped by the dense flow from the image before, from one on.
+    """
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    height, width = images[0].shape
+    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    late = np.float32(share) * (x / np.float32(width) if axis else y / np.float32(height))
+    rolled = list(images[:since])
+    for before, now in pairwise(images[since - 1 :]):
+        back = flow.calc(now, before, np.zeros((height, width, 2), np.float32))
+        at = x - late * back[:, :, 0], y - late * back[:, :, 1]
+        rolled.append(np.asarray(cv2.remap(now, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8))
+    return rolled

@@ -1,20 +1,20 @@
 """Images that are whole, but not of one instant or of one geometry: torn, displaced, with lines missing or twice.
 
-Landmarks flow from one pair to the next as the step of the rig says, and what is left of their flow is noise. In an
-image that breaks at a line it is not: what lies beyond the line is displaced, or moves as the rig did one image before.
-With the flow d_i of landmark i in the panorama of a camera, less the flow that the step predicts,
+Landmarks flow from one pair to the next as the step of the rig says, and what is left of their flow is noise, if the
+images are right. With the flow d_i of landmark i in the panorama of a camera, less the flow that the step predicts,
 
     H0:  d_i = J_i x + noise                                     x (6,): error of the step
     H1:  d_i = J_i x + [i lies beyond the line] F_i a + noise    in one camera, or in both
 
-F_i a is either a shift in the raw image (its window moved, lines repeat or are missing), or a part of the step that led
-to the pair or of the one before (what is beyond is of another image). Lines are rows or columns of the raw image, as a
-sensor may be mounted on its side; a line at the edge is the whole image, which may be turned as well if a mirror moved.
-The likeliest of all is compared with H0 by the Bayesian information criterion (Schwarz 1978). What moves in view, as
-people do, does not end at a raw line; a rolling shutter makes a slope over the rows, not a step, and competes as such.
+F_i a is a shift in the raw image (its window moved, lines repeat or are missing), a shift and a turn of the whole image
+(a mirror moved), or another motion of the rig (what is beyond the line is of another image, as in torn ones, or the
+lines are exposed one after the other). Lines are rows or columns of the raw image, as a sensor may be mounted on its
+side. What moves in view, as people do, does not end at a raw line. H1 is compared with H0 by the generalised likelihood
+ratio, robustly, with the Bayesian information criterion (Schwarz 1978).
 
-A break is an event: the flow shows it in the pair in which it begins, and once more where it ends. In between, the
-landmarks that were seen since agree with it, and nothing shows it. So it stays until its opposite is seen.
+The flow shows a displacement in the pair in which it begins, and once more where it ends: in between, the landmarks
+that were seen since agree with it. So it stays until its opposite is seen. A torn image shows it whenever the rig
+changes its motion; the evidence is summed up, and forgotten within seconds.
 """
 
 from __future__ import annotations
@@ -40,7 +40,8 @@ from omnid.core.types.stereo_model import StereoModel
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
-Kind = Literal["torn", "displaced", "turned", "rolling"]
+Pair = tuple[PaddedPanorama, PaddedPanorama]
+Kind = Literal["torn", "displaced", "turned"]
 
 MOST: Final = 160  # landmarks that are followed in each camera
 SIGMA_PX: Final = 0.1  # of a flow, because patches err by some hundredths, and people and shadows are near by
@@ -49,42 +50,27 @@ LAG_S: Final = 0.003  # standard deviation of the time between the exposures of 
 OUTLIER_SQUARED: Final = 32.0
 MOST_SCALE: Final = 25.0  # of the variance of flows: half a pixel; where it is larger, flows are displaced
 GOOD_SHARE: Final = 0.2  # of the flows, that no break displaces: of one camera, or up to a line
-LINES, BETWEEN = 24, 4  # lines that are tried, and those between two of them, of a break that was found
+LINES: Final = 24  # equal parts of the raw image, at whose borders lines are tried
 LEAST: Final = 8  # flows on either side of a line in the cameras of a break
+LEAST_PART: Final = 0.2  # of the flows in the cameras of a torn image on either side: people hardly cover as many
 # Cost of a landmark (`PoseEstimate.cost`) whose view has the noise that is expected: the mean of the Cauchy kernel's.
 RIGHT_COST: Final = 0.31
 FOLLOWED: Final = 0.2  # part of a new pair in the mean of the costs
 FAR: Final = KltSettings(levels=2)  # 28 px
 EDGE_PX: Final = 8  # of the panorama, in which patches are cut
 LEAST_PX: Final = 0.5  # by which what is beyond a line is displaced: less harms no pose
-LEAST_PART: Final = 0.5  # of a step, by which a part is displaced that is of another image; 1 / LEAST_PART at most
 LEAST_SHARE: Final = 0.2  # of the other camera's displacement, below which a camera has none
 ROUNDS: Final = 6
 RIDGE: Final = 1e-6
 CAMERAS: Final = ("lower", "upper")
-ONE, EACH = ((0,), (1,)), ((0,), (1,), (0, 1))  # cameras of a break
-
-
-class _Form(NamedTuple):
-    """A form that a break may have: displacements along some of the columns of `_Flow.columns`."""
-
-    kind: Kind
-    axis: int  # of its line, 0: a row
-    columns: tuple[int, ...]
-    has_line: bool
-    sets: tuple[tuple[int, ...], ...] = EACH
-
-
-SHIFT, TURN, STEP, BEFORE, BOTH = (0, 1), 2, 3, 4, 5  # columns of flows
-# A torn image shows a step less where it begins, one more where it ends, and both where it lasts. Both images turned
-# alike are a turn of the rig. A rolling shutter makes a slope over rows (or columns) of both steps.
-FORMS: Final = (
-    *(_Form("torn", axis, (part,), True) for axis in (0, 1) for part in (STEP, BEFORE, BOTH)),
-    *(_Form("displaced", axis, SHIFT, True) for axis in (0, 1)),
-    *(_Form("rolling", axis, (6 + 2 * axis, 7 + 2 * axis), False) for axis in (0, 1)),
-    _Form("displaced", 0, SHIFT, False),
-    _Form("turned", 0, (*SHIFT, TURN), False, ONE),
+SETS: Final = ((0,), (1,), (0, 1))  # cameras of a break
+KINDS: Final[tuple[tuple[Kind, tuple[int, ...]], ...]] = (
+    *(("torn", cameras) for cameras in SETS),
+    *(("displaced", cameras) for cameras in SETS),
+    *(("turned", cameras) for cameras in SETS[:2]),  # both images turned alike are a turn of the rig
 )
+MEMORY_S: Final = 1.0  # time after which evidence of a tear counts as a third: vehicles change their motion more often
+CHOICES: Final = 4 * LINES * len(KINDS)  # axes and sides, lines, kinds
 
 
 class RawImage:
@@ -116,17 +102,15 @@ class Break(NamedTuple):
     cameras: tuple[int, ...]  # 0: lower, 1: upper
     axis: int  # 0: the line is a row, 1: a column
     line_px: int  # of the raw image; 0: the whole image
-    amount: Array  # (C, K) raw px, and turn, rad; or parts of the step to this pair or of the one before
-    angle_rad: float  # by which what is beyond is displaced in view, mean
     is_before: bool = False  # what is before the line is displaced, and not what is beyond
-    late: float = 0.0  # steps by which what is beyond is earlier now, and was not in the pair before
+    amount: Array = np.zeros((1, 2))  # (C, K) raw px, and turn, rad; of torn images none
+    angle_rad: float = 0.0  # by which what is beyond is displaced in view, mean
+    gain: float = 0.0  # logarithm of the likelihood ratio, less the cost of the parameters
 
     def is_undone_by(self, other: Break) -> bool:
-        """True if another break ends this one."""
-        if (other.kind == "torn") != (self.kind == "torn") or not set(self.cameras) & set(other.cameras):
+        """True if another displacement ends this one."""
+        if not set(self.cameras) & set(other.cameras):
             return False
-        if self.kind == "torn":  # an image that is torn in both pairs shows one step less and one more
-            return self.late * other.late < 0 and abs(other.late) > 0.5
         mine, others = (found.amount[:, :2].mean(axis=0) for found in (self, other))
         return float(np.linalg.norm(mine + others)) < 0.5 * max(map(float, map(np.linalg.norm, (mine, others))))
 
@@ -134,7 +118,7 @@ class Break(NamedTuple):
 class _View(NamedTuple):
     """A pair, and the landmarks that the map shows in it."""
 
-    pair: tuple[PaddedPanorama, PaddedPanorama]
+    pair: Pair
     T_odom_rect: Array
     points: Array  # (N, 3) m, in odom
     covariance: Array  # (N, 3, 3) m^2
@@ -147,12 +131,24 @@ class _Flow(NamedTuple):
 
     y: Array  # (N, 2)
     null: Array  # (N, 2, 7) derivatives by the step's error, and by the lag of the upper camera
-    # (N, 2, 10) by a shift and a turn of the raw image, by parts of the step, of that before, and of their difference,
-    # and by both steps over the rows and columns of the raw image
-    columns: Array
+    shift: Array  # (N, 2, 3) by a shift and a turn of the raw image
     camera: Indices  # (N,)
     place: Array  # (N, 2) in parts of the raw image: column, row
     px: Array  # (N,) standard deviations
+
+
+class _Whole(NamedTuple):
+    """What right images leave of the flows."""
+
+    left: Array  # (N, 2)
+    squared: Array  # (N,)
+    outlier: float  # squared distance from which on flows cost no more
+    unit: float  # squared distance that counts as 1 in a logarithm of likelihoods
+
+    def gains(self, left: Array) -> Array:
+        """Return by how much likelier flows (N,) are that leave (N, 2)."""
+        squared = (left**2).sum(axis=1)
+        return np.asarray((np.minimum(self.squared, self.outlier) - np.minimum(squared, self.outlier)) / self.unit)
 
 
 @dataclass(slots=True)
@@ -163,16 +159,17 @@ class ImageBreaks:
     raws: tuple[RawImage, RawImage]
     covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))  # [t; r] that breaks add to that of the pose
     fault: str = ""  # how the images of the last pair are broken, in words; empty: they are whole
+    _torn: float = 0.0  # gains of tears, less those forgotten
     _last: _View | None = None
-    _confirmed: Indices = field(default_factory=lambda: np.zeros(0, np.intp))  # ids of landmarks
-    _open: list[Break] = field(default_factory=list)
-    _usual_cost: float = RIGHT_COST  # of a landmark in whole images
+    _last_tear: Break | None = None
+    _open: list[Break] = field(default_factory=list)  # displacements that have not ended
+    _usual_cost: float = 0.0  # of a landmark in whole images: none is known yet, so that the first pairs are tested
     _found: dict[tuple[Kind, tuple[int, ...], int], list[Break]] = field(default_factory=dict)
 
     def add(
         self,
         seq: int,
-        pair: tuple[PaddedPanorama, PaddedPanorama],
+        pair: Pair,
         T_odom_rect: Array,
         local_map: LocalMap,
         dt_s: float,
@@ -185,20 +182,16 @@ class ImageBreaks:
         """
         last, found = self._last, None
         step = np.zeros(6) if last is None else se3.log(se3.inverse(last.T_odom_rect) @ T_odom_rect)
-        is_usual = cost is not None and cost[1] * (cost[0] - self._usual_cost) < RUNNER_UP_COST and not self._open
+        is_usual = cost is not None and cost[1] * (cost[0] - self._usual_cost) < RUNNER_UP_COST and not self.fault
         if last is not None and dt_s > 0 and not is_usual:
             flow = self._flow(last, pair, T_odom_rect, step, LAG_S / dt_s)
             found = None if flow is None else likeliest_break(flow, self.raws, self.model.cylinder.focal_px)
         if cost is not None and found is None:
             usual = self._usual_cost + FOLLOWED * (cost[0] - self._usual_cost)
             self._usual_cost = min(usual, RIGHT_COST)  # a run whose images are broken from the start is not usual
-        self._spread(last, step, found)
-        # Landmarks that were an inlier after they were added: of others the depth may be wrong, and so the flow.
+        self._spread(last, step, found, dt_s)
         table = local_map.table
-        is_confirmed = ((table.misses == 0) & (table.anchor != seq)) | np.isin(table.id, self._confirmed)
-        self._confirmed = table.id[is_confirmed]
         rows, _ = local_map.visible(T_odom_rect)
-        rows = rows[is_confirmed[rows]]
         rows = rows[:: max(1, -(-len(rows) // MOST))]
         slopes = local_map.slopes(T_odom_rect, rows)
         self._last = _View(pair, T_odom_rect, table.points[rows], table.covariance[rows], slopes, step)
@@ -208,36 +201,37 @@ class ImageBreaks:
         """One line for each kind of break and the cameras that showed it."""
         return [_words(breaks) for breaks in self._found.values()]
 
-    def _spread(self, last: _View | None, step: Array, found: Break | None) -> None:
+    def _spread(self, last: _View | None, step: Array, found: Break | None, dt_s: float) -> None:
         """Add what a break makes uncertain.
 
         A torn image shows the rig up to an image too early, and landmarks are misplaced by as much. A displaced one
         turns directions, and moves the rig by as much of the landmarks' range.
         """
+        self._torn *= math.exp(-dt_s / MEMORY_S)
         if found is not None:
-            key = found.kind, found.cameras, found.axis if found.line_px else 0
-            self._found.setdefault(key, []).append(found)
-            before = self._open
-            self._open = [earlier for earlier in before if not earlier.is_undone_by(found)]
-            is_known = any((each.kind, each.cameras) == ("torn", found.cameras) == key[:2] for each in self._open)
-            if len(self._open) == len(before) and not is_known:
-                self._open.append(found)
-        now = [*self._open, *([] if found is None else [found])]
-        self.fault = _words(now[-1:]) if now else ""
-        if last is None or not (now or self.covariance.any()):
+            self._found.setdefault((found.kind, found.cameras, found.axis if found.line_px else 0), []).append(found)
+            if found.kind == "torn":
+                self._torn, self._last_tear = self._torn + found.gain, found
+            else:
+                before = self._open
+                self._open = [earlier for earlier in before if not earlier.is_undone_by(found)]
+                self._open += [found] if len(self._open) == len(before) else []
+        is_torn = self._torn > RUNNER_UP_COST
+        now = [*self._open, *([self._last_tear] if is_torn else []), found]
+        shown = [each for each in now if each is not None]
+        self.fault = _words(shown[-1:]) if shown else ""
+        if last is None or not (shown or self.covariance.any()):
             return
         A = se3.adjoint(se3.exp(-step))
         self.covariance = A @ self.covariance @ A.T
-        if any(broken.kind == "torn" for broken in now):
+        if is_torn:
             self.covariance = self.covariance + np.outer(step, step) + np.outer(last.step, last.step)
-        if found is not None and found.kind != "torn":
+        if found is not None:
             away = se3.apply(se3.inverse(last.T_odom_rect), last.points)
             range_m = float(np.median(np.linalg.norm(away, axis=1)))
             self.covariance = self.covariance + found.angle_rad**2 * np.diag(np.repeat([range_m**2, 1.0], 3))
 
-    def _flow(
-        self, last: _View, pair: tuple[PaddedPanorama, PaddedPanorama], T_now: Array, step: Array, lag: float
-    ) -> _Flow | None:
+    def _flow(self, last: _View, pair: Pair, T_now: Array, step: Array, lag: float) -> _Flow | None:
         """Return the flows of the last pair's landmarks; None: too few. lag: standard deviation in parts of a step."""
         cylinder, baseline_m = self.model.cylinder, self.model.baseline_m
         before, now = (se3.apply(se3.inverse(T), last.points) for T in (last.T_odom_rect, T_now))
@@ -263,14 +257,12 @@ class ImageBreaks:
             noise = np.einsum("nij,njk,nik->ni", of_point[rows][:, own], last.covariance[rows], of_point[rows][:, own])
             px = np.sqrt(SIGMA_PX**2 + noise.mean(axis=1))
             J, shift = J_now[rows][:, own] @ of_step[rows] / px[:, None, None], by_raw[rows] / px[:, None, None]
-            steps = np.stack([J @ step, J @ last.step, J @ (step - last.step)], axis=2)
             size = np.array(raw_image.size)
-            arm, place = raw[rows] - (size - 1) / 2, raw[rows] / size
+            arm = raw[rows] - (size - 1) / 2
             turn = shift @ np.column_stack([-arm[:, 1], arm[:, 0]])[:, :, None]
-            over = [(place[:, 1 - axis] - 0.5)[:, None, None] * steps[:, :, :2] for axis in (0, 1)]
-            null = np.concatenate([J, lag * camera * steps[:, :, :1]], axis=2)
-            columns = np.concatenate([shift, turn, steps, *over], axis=2)
-            parts.append(_Flow(d / px[:, None], null, columns, np.full(len(rows), camera), place, px))
+            null = np.concatenate([J, lag * camera * (J @ step)[:, :, None]], axis=2)
+            shift, of_camera = np.concatenate([shift, turn], axis=2), np.full(len(rows), camera)
+            parts.append(_Flow(d / px[:, None], null, shift, of_camera, raw[rows] / size, px))
         flow = _Flow(*(np.concatenate(part) for part in zip(*parts, strict=True)))
         return flow if len(flow.y) >= 3 * LEAST else None
 
@@ -278,7 +270,7 @@ class ImageBreaks:
         self,
         camera: int,
         last: _View,
-        pair: tuple[PaddedPanorama, PaddedPanorama],
+        pair: Pair,
         T_now: Array,
         before: Array,
         rows: Indices,
@@ -295,7 +287,7 @@ class ImageBreaks:
         for guess in (end, start):
             rest = np.flatnonzero(~found)
             tracked, found[rest] = track(last.pair[camera], pair[camera], start[rest], guess[rest], FAR)
-            there[found & np.isin(np.arange(len(rows)), rest)] = tracked[found[rest]]
+            there[rest] = np.where(found[rest][:, None], tracked, there[rest])
         # The upper camera is like a lower one whose frame is higher, in which slopes are those over its own rows.
         up, slopes = np.eye(4), last.slopes[rows]
         if camera:
@@ -308,9 +300,8 @@ class ImageBreaks:
         return np.where(aligned.found[:, None], aligned.pixels, there), aligned.found | found
 
 
-def likeliest_break(flow: _Flow, raws: tuple[RawImage, RawImage], focal_px: float) -> Break | None:
-    """Return the break that flows show beyond doubt; None: there is none."""
-    # 1. The null hypothesis, robustly, from no error and from that of all flows; the scale of what it leaves.
+def _whole(flow: _Flow) -> _Whole:
+    """Return what right images leave of flows, robustly, from no error of the step and from that of all flows."""
     y, null = flow.y, flow.null
     starts = (np.zeros(null.shape[2]), _least_squares(null, y, np.ones(len(y))))
     lefts = [y - null @ _robust(null, y, start) for start in starts]
@@ -318,137 +309,108 @@ def likeliest_break(flow: _Flow, raws: tuple[RawImage, RawImage], focal_px: floa
     # A step that is wrong must explain much more to be believed.
     costs = [np.minimum(each, OUTLIER_SQUARED * MOST_SCALE).sum() for each in squares]
     best = int(costs[1] < costs[0] / 2)
-    left, squared = lefts[best], squares[best]
     # So many sums of two squares of unit variance are below -2 log(1 - GOOD_SHARE).
-    scale = float(np.clip(np.quantile(squared, GOOD_SHARE) / (-2 * math.log(1 - GOOD_SHARE)), 1.0, MOST_SCALE))
-    outlier = OUTLIER_SQUARED * scale
-    if np.minimum(squared, outlier).sum() / (2 * scale * CORRELATED_LANDMARKS) < RUNNER_UP_COST + _cost(2, len(y)):
+    scale = np.quantile(squares[best], GOOD_SHARE) / (-2 * math.log(1 - GOOD_SHARE))
+    scale = float(np.clip(scale, 1.0, MOST_SCALE))
+    return _Whole(lefts[best], squares[best], OUTLIER_SQUARED * scale, 2 * scale * CORRELATED_LANDMARKS)
+
+
+def likeliest_break(flow: _Flow, raws: tuple[RawImage, RawImage], focal_px: float) -> Break | None:
+    """Return the likeliest break that flows show beyond doubt; None: there is none."""
+    whole = _whole(flow)
+    if np.minimum(whole.squared, whole.outlier).sum() / whole.unit < RUNNER_UP_COST + _cost(2, len(flow.y)):
         return None  # no break explains more than all that is left
-    # 2. Of its outliers, those that one other motion explains belong to a part; others, as people, to none.
-    used = squared < outlier
-    most_off = int(np.bincount(flow.camera[~used], minlength=2).argmax())
-    for cameras in EACH:
-        rest = np.flatnonzero((squared >= outlier) & np.isin(flow.camera, cameras))
-        if len(rest) < LEAST:
-            continue
-        for own in (SHIFT, (TURN,), (STEP,), (BEFORE,), (BOTH,)):
-            F, off = flow.columns[rest][:, :, own], left[rest]
-            along = np.swapaxes(F, 1, 2)
-            each = np.linalg.solve(along @ F + RIDGE * np.eye(len(own)), along @ off[:, :, None])[:, :, 0]
-            amount = _robust(F, off, np.median(each, axis=0))
-            used[rest] |= ((off - F @ amount) ** 2).sum(axis=1) < outlier
-    # 3. The likeliest line of each form, by least squares; the robust likelihood of each, also at the lines next to it.
-    found: tuple[float, _Candidate, Array, Array] | None = None
-    for form in FORMS:
-        likely = [each for each in _candidates(form, flow, used, left, scale) if each.gain > RUNNER_UP_COST]
-        # One image displaced is the other one displaced the other way, and a step: it is that in which the step is not.
-        likely = [each for each in likely if each.line or form.has_line or each.cameras != (1 - most_off,)]
-        first = max(likely, key=lambda each: each.gain, default=None)
-        for line in () if first is None else first.near_lines():
-            assert first is not None
-            candidate = first._replace(line=line)
-            tried = np.concatenate([null, candidate.columns(flow)], axis=2)
-            solution = _robust(tried, y, _least_squares(tried, y, used.astype(float)))
-            rest_squared = ((y - tried @ solution) ** 2).sum(axis=1)
-            gained = float((np.minimum(squared, outlier) - np.minimum(rest_squared, outlier)).sum())
-            gain = gained / (2 * scale * CORRELATED_LANDMARKS) - _cost(tried.shape[2] - null.shape[2], int(used.sum()))
-            if found is None or gain > found[0]:
-                found = gain, candidate, solution[null.shape[2] :], tried[:, :, null.shape[2] :]
-    return None if found is None or found[0] < RUNNER_UP_COST else _break(flow, raws, focal_px, *found[1:])
-
-
-def _break(
-    flow: _Flow, raws: tuple[RawImage, RawImage], focal_px: float, best: _Candidate, solution: Array, columns: Array
-) -> Break | None:
-    """Return the break of the likeliest candidate; None: it is a rolling shutter, or too small to harm a pose."""
-    form, amount = best.form, solution.reshape(len(best.cameras), -1)
-    if form.kind == "rolling" or (form.kind == "torn" and not _is_a_step(np.abs(amount).max(keepdims=True)).all()):
+    found = (each for kind, cameras in KINDS for each in _candidates(flow, whole, kind, cameras))
+    best = max(found, key=lambda each: each.gain, default=None)
+    if best is None or best.gain < RUNNER_UP_COST:
         return None
-    # Cameras that have a share in it.
-    moved_px = np.linalg.norm((columns @ solution) * flow.px[:, None], axis=1)
+    # Cameras that have a share in it; what is too small harms no pose.
+    moved_px = np.linalg.norm(best.displaced, axis=1) * flow.px
     mean_px = [float(moved_px[(flow.camera == camera) & (moved_px > 0)].mean()) for camera in best.cameras]
     shares = [number for number, px in enumerate(mean_px) if px > LEAST_SHARE * max(mean_px)]
     if max(mean_px) < LEAST_PX:
         return None
-    cameras, is_late = tuple(best.cameras[number] for number in shares), form.columns[0] in (STEP, BEFORE)
-    line_px = round(best.line * raws[cameras[0]].size[1 - form.axis])
-    late = -float(amount[shares].mean()) if form.kind == "torn" and is_late else 0.0
-    return Break(form.kind, cameras, form.axis, line_px, amount[shares], max(mean_px) / focal_px, best.is_before, late)
-
-
-def _is_a_step(parts: Array) -> Flags:
-    """True where a part (M,) of a step is about a step: a rolling shutter displaces by less."""
-    return np.asarray((parts > LEAST_PART) & (parts < 1.0 / LEAST_PART))
+    cameras = tuple(best.cameras[number] for number in shares)
+    amount = np.zeros((1, 2)) if best.kind == "torn" else best.amount.reshape(len(best.cameras), -1)[shares]
+    line_px, angle_rad = round(best.line * raws[cameras[0]].size[1 - best.axis]), max(mean_px) / focal_px
+    return Break(best.kind, cameras, best.axis, line_px, best.is_before, amount, angle_rad, best.gain)
 
 
 class _Candidate(NamedTuple):
-    gain: float
-    form: _Form
+    kind: Kind
     cameras: tuple[int, ...]
-    line: float  # part of the raw image that is before the line; 0: the break is of the whole image
-    is_before: bool = False  # what is before the line is displaced
-
-    def columns(self, flow: _Flow) -> Array:
-        """Return the derivatives (N, 2, C K) of flows by the amounts of each camera."""
-        where = (flow.place[:, 1 - self.form.axis] >= self.line) != self.is_before
-        return np.asarray(_of_cameras(flow, self.form, self.cameras) * where[:, None, None])
-
-    def near_lines(self) -> list[float]:
-        """Return the line and those up to the next ones that were tried."""
-        if not self.form.has_line:
-            return [self.line]
-        return [self.line + k / (LINES * BETWEEN) for k in range(1 - BETWEEN, BETWEEN)]
+    axis: int
+    is_before: bool  # what is before the line is displaced
+    line: float  # part of the raw image that is before the line; 0: the whole image is displaced
+    amount: Array  # (K,)
+    displaced: Array  # (N, 2) by it, in standard deviations
+    gain: float
 
 
-def _of_cameras(flow: _Flow, form: _Form, cameras: tuple[int, ...]) -> Array:
-    """Return the derivatives (N, 2, C K) of flows in the whole image by the amounts of a form in each camera."""
-    F = flow.columns[:, :, form.columns]
-    return np.concatenate([F * (flow.camera == camera)[:, None, None] for camera in cameras], axis=2)
+def _candidates(flow: _Flow, whole: _Whole, kind: Kind, cameras: tuple[int, ...]) -> Iterator[_Candidate]:
+    """Yield the likeliest breaks of a kind in some cameras."""
+    y, null, unknowns = flow.y, flow.null, flow.null.shape[2]
+    is_off = whole.squared >= whole.outlier
+    most_off = int(np.bincount(flow.camera[is_off], minlength=2).argmax())
+    own = [flow.camera == camera for camera in cameras]
+    # 1. A motion is one of both cameras, a displacement is one of each.
+    F = null[:, :, :6] if kind == "torn" else flow.shift[:, :, : 3 if kind == "turned" else 2]
+    masks = [np.logical_or.reduce(own)] if kind == "torn" else own
+    columns = np.concatenate([F * mask[:, None, None] for mask in masks], axis=2)
+    # 2. Amounts to start from: of all flows, and of those that right images do not explain.
+    starts = []
+    if kind != "torn":
+        tried = np.concatenate([null, columns], axis=2)
+        starts.append(_robust(tried, y, _least_squares(tried, y, np.ones(len(y)))))
+    parts = [np.flatnonzero(mask & is_off) for mask in masks]
+    if min(map(len, parts)) >= LEAST:
+        amounts = np.concatenate([_common(F[rows], whole.left[rows]) for rows in parts])
+        starts.append(np.concatenate([np.zeros(unknowns), amounts]))
+        if kind == "torn":  # the pose may have followed the part that is torn
+            starts.append(np.concatenate([amounts, [0.0], -amounts]))
+    for start in starts:
+        # 3. The likeliest line, of all axes and sides; 0: the whole image.
+        left = y - null @ start[:unknowns]
+        extra = whole.gains(left - columns @ start[unknowns:]) - whole.gains(left)
+        for axis, side, line in _likely_lines(flow, kind, extra, own):
+            # One image displaced is the other one displaced the other way, and a step.
+            if line == 0 and cameras == (1 - most_off,):
+                continue
+            # 4. The amount and the step together, and the likelihood.
+            beyond = (flow.place[:, 1 - axis] >= line) != side
+            masked = np.concatenate([null, columns * beyond[:, None, None]], axis=2)
+            solution = _robust(masked, y, start)
+            gain = float(whole.gains(y - masked @ solution).sum()) - _cost(columns.shape[2], len(y))
+            amount = solution[unknowns:]
+            yield _Candidate(kind, cameras, axis, bool(side), line, amount, masked[:, :, unknowns:] @ amount, gain)
 
 
-def _candidates(form: _Form, flow: _Flow, used: Flags, left: Array, scale: float) -> Iterator[_Candidate]:
-    """Yield the likeliest line of a form for each set of cameras and side, by least squares over the flows used.
+def _likely_lines(flow: _Flow, kind: Kind, extra: Array, own: list[Flags]) -> list[tuple[int, int, float]]:
+    """Return axis, side and line, a part of the raw image, of the whole image and of the likeliest line in it.
 
-    What a break explains beyond the null hypothesis is b^T S^-1 b, b the products of its columns with what that leaves,
-    S those of the columns with each other, without what the null hypothesis explains of them.
+    extra (N,): by how much likelier a break makes each flow; own: flags (N,) of each camera that may have it.
     """
-    m, lines = flow.null.shape[2], np.arange(LINES if form.has_line else 1) / LINES
-    null = flow.null[used].reshape(-1, m)
-    information = np.linalg.inv(null.T @ null + np.diag(_prior(m)))
-    left = left - flow.null @ (information @ (null.T @ left[used].ravel()))
-    beyond = flow.place[:, 1 - form.axis] >= lines[:, None]
-    for cameras in form.sets:
-        F = _of_cameras(flow, form, cameras)
-        size, own = F.shape[2], np.isin(flow.camera, cameras)
-        products = np.swapaxes(F, 1, 2) @ np.concatenate([F, flow.null, left[:, :, None]], axis=2)
-        for is_before in (False, True) if form.has_line else (False,):
-            # 1. Sums of the products of all columns for the flows of each side.
-            side = (beyond != is_before) & used
-            sums = (side.astype(float) @ products.reshape(len(own), -1)).reshape(len(lines), size, -1)
-            with_null, b = sums[:, :, size : size + m], sums[:, :, -1:]
-            S = sums[:, :, :size] - with_null @ information @ np.swapaxes(with_null, 1, 2) + RIDGE * np.eye(size)
-            # 2. What each line explains.
-            amount = np.linalg.solve(S, b)
-            most = np.linalg.norm(amount.reshape(len(lines), len(cameras), -1), axis=2).max(axis=1)
-            good = np.ones(len(lines), bool)
-            for camera in cameras:
-                in_camera = flow.camera == camera
-                here, elsewhere = (side & in_camera).sum(axis=1), (~side & used & in_camera).sum(axis=1)
-                enough = LEAST // len(cameras)
-                good &= (here >= enough) & ((elsewhere >= enough) | (not form.has_line))
-            if form.kind == "torn":
-                good &= _is_a_step(most)
-            if form.kind == "displaced" and form.has_line:  # lines that are twice or missing are whole ones
-                good &= most > LEAST_PX
-            gain = (b * amount).sum(axis=(1, 2)) / (2 * scale * CORRELATED_LANDMARKS) - _cost(size, int(used.sum()))
-            line = int(np.where(good, gain, -np.inf).argmax())
-            if good[line]:
-                yield _Candidate(float(gain[line]), form, cameras, float(lines[line]), is_before)
+    found, lines = [], np.arange(1, LINES)[:, None] / LINES
+    for axis, side in np.ndindex(2, 2) if kind != "turned" else ():
+        beyond = (flow.place[:, 1 - axis] >= lines) != side
+        counts = np.array([[(beyond & each).sum(axis=1), (~beyond & each).sum(axis=1)] for each in own])
+        least = np.array([LEAST_PART * each.sum() if kind == "torn" else LEAST // len(own) for each in own])
+        gains = np.where((counts >= least[:, None, None]).all(axis=(0, 1)), beyond @ extra, -np.inf)
+        found.append((float(gains.max()), (axis, side, (1 + int(gains.argmax())) / LINES)))
+    likeliest = [max(found)[1]] if found and max(found)[0] > 0 else []
+    return likeliest if kind == "torn" else [(0, 0, 0.0), *likeliest]
 
 
 def _cost(parameters: int, flows: int) -> float:
-    """Return the penalty of a break with so many parameters by so many flows of two components, and of the choice."""
-    return 0.5 * parameters * math.log(2 * flows) + math.log(len(FORMS) * len(EACH) * LINES)
+    """Return the penalty of a displacement with so many parameters by so many flows, and of the choice."""
+    return 0.5 * parameters * math.log(2 * flows) + math.log(CHOICES)
+
+
+def _common(A: Array, y: Array) -> Array:
+    """Return x (K,) that most of y - A x (N, 2) agree with."""
+    along = np.swapaxes(A, 1, 2)
+    each = np.linalg.solve(along @ A + RIDGE * np.eye(A.shape[2]), along @ y[:, :, None])[:, :, 0]
+    return _robust(A, y, np.median(each, axis=0))
 
 
 def _robust(A: Array, y: Array, x: Array) -> Array:
@@ -459,17 +421,11 @@ def _robust(A: Array, y: Array, x: Array) -> Array:
 
 
 def _least_squares(A: Array, y: Array, weight: Array) -> Array:
-    """Return x (K,) that minimises the sum of weights (N,) times |y - A x|^2, with the prior of the null hypothesis."""
+    """Return x (K,) that minimises the sum of weights (N,) times |y - A x|^2; the seventh, the lag, has a prior."""
     size = A.shape[2]
-    weighted = (weight[:, None, None] * A).reshape(-1, size)
-    return np.asarray(np.linalg.solve(weighted.T @ A.reshape(-1, size) + np.diag(_prior(size)), weighted.T @ y.ravel()))
-
-
-def _prior(size: int) -> Array:
-    """Return the information (K,) that there is on parameters: of those of the null hypothesis, on the lag."""
-    prior = np.full(size, RIDGE)
+    weighted, prior = (weight[:, None, None] * A).reshape(-1, size), np.full(size, RIDGE)
     prior[6:7] = 1.0
-    return prior
+    return np.asarray(np.linalg.solve(weighted.T @ A.reshape(-1, size) + np.diag(prior), weighted.T @ y.ravel()))
 
 
 def _words(breaks: list[Break]) -> str:
