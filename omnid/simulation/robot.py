@@ -82,7 +82,7 @@ class SimulatedRobot:
     has_odometry: bool = True  # the daemon is given what the motor controller reports of its wheels
     has_gyro: bool = True
     rate_hz: float = 10.0  # of the cameras
-    samples: int = 2  # in lock-step: rays of a pixel, per axis; 0: as many as needed
+    samples: int = 2  # in lock-step: rays of a pixel, per axis
     pose_delay_s: float = 0.1  # in lock-step: from the exposure to the pose's arrival at the controller
     lean_rad: tuple[float, float] = (0.0, 0.0)  # roll and pitch by which the base leans, which its rig does not say
     pushes: tuple[Push, ...] = ()

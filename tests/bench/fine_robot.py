@@ -7,8 +7,8 @@ from dataclasses import replace
 from typing import Final, NamedTuple
 
 from calib import se3
-from omnid.simulation.rendering.ray_caster import SIDE_RAYS
 from omnid.simulation.robot import BASELINE_M, CAMERA_HEIGHT_M, SimulatedRobot
+from tests.simulation.harmless_worlds import SIDE_RAYS
 from tests.simulation.rigs import make_rig
 
 # Distances of the configured outline from the disc, as those of the default settings from the default robot.

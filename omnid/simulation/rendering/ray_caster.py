@@ -8,7 +8,7 @@ shutter every row has a pose of its own.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Protocol, runtime_checkable
@@ -24,19 +24,17 @@ from omnid.simulation.rendering.caster_kernels import cast
 from omnid.simulation.rendering.surfaces import Rectangle, Scene, Texture
 
 Floats = NDArray[np.float32]
-TILE_PX = 32
-# Number of samples for "as many as needed": one ray a pixel where a tile of NEEDED_PX shows one rectangle, else as many
-# as make SIDE_RAYS along a side of the image. With two a pixel and axis at 512 px, joints of tiles come and go from
-# pixel to pixel, as no lens shows them; with three they do not.
-AS_NEEDED, NEEDED_PX, SIDE_RAYS = 0, 8, 3 * 512
-# Pixels lifted at once, which bounds memory.
-RAY_CHUNK = 1 << 18
-# Number of cameras whose rays are kept, and of scenes whose textures are.
-KEPT = 6
-# Added to the half angle of a tile's cone: rounding of float32 rays.
-CONE_MARGIN_RAD = 1e-3
+TILE_PX = 32  # samples along a tile's side
+RAY_CHUNK = 1 << 18  # Pixels lifted at once, which bounds memory.
+KEPT = 6  # Number of cameras whose rays are kept, and of scenes whose textures are.
+CONE_MARGIN_RAD = 1e-3  # Added to the half angle of a tile's cone: rounding of float32 rays.
+# Guards against division by zero at a rectangle through the viewpoint [m].
+MIN_DISTANCE_M = np.finfo(float).eps
+MARGIN_M = 1e-4  # Subtracted from the least distance of a rectangle: rounding of float32 rays.
+SMALLEST_PX = 8
 
 
+# 1. The rays of a camera.
 @runtime_checkable
 class NonCentralCamera(Protocol):
     """A camera whose rays do not meet in one point."""
@@ -50,7 +48,6 @@ class RayTable:
     """The rays of one camera's visible samples by square tiles, row by row; N samples, M tiles, some of them empty."""
 
     supersample: int
-    columns: int  # of tiles
     rays: Floats  # (3, N) unit, camera frame
     origins: Floats  # (3, N) [m] camera frame; (3, 1) zero where all rays start at the camera's origin
     spacing: Floats  # (N,) [rad] to the next sample, the root of the sample's solid angle
@@ -58,69 +55,67 @@ class RayTable:
     starts: NDArray[np.int64]  # (M + 1,) first sample of each tile
     axes: Array  # (M, 3) unit; zero for an empty tile
     angles: Array  # (M,) [rad] from the axis to the farthest ray of a tile
-    reach_m: float  # of the farthest origin from the camera's
 
 
-def ray_table(mounted: MountedCamera, supersample: int, tile_samples: int = TILE_PX) -> RayTable:
-    """Return the rays of all samples (supersample^2 per pixel) inside the camera's mask, by tiles of a side."""
-    width, height = (side * supersample for side in mounted.camera.size)
-    columns, lines = -(-width // tile_samples), -(-height // tile_samples)
-    rays, spacing = _lift_grid(mounted, supersample)
+_kept: dict[Hashable, tuple[Mask, RayTable]] = {}  # the mask stays, so that the id of its image is its own
+
+
+def cached_rays(mounted: MountedCamera, supersample: int) -> RayTable:
+    """Return the camera's table, made once for equal cameras and masks."""
+    mask = mounted.visible
+    key = mounted.camera, mask.center, mask.inner_px, mask.outer_px, id(mask.image), supersample
+    if key not in _kept:
+        made = mask, ray_table(mounted.camera, mask, supersample)
+        for oldest in list(_kept)[: len(_kept) - KEPT + 1]:
+            del _kept[oldest]
+        _kept[key] = made
+    return _kept[key][1]
+
+
+def ray_table(camera: OmniCamera, mask: Mask, supersample: int) -> RayTable:
+    """Return the rays of all samples (supersample^2 per pixel) inside a camera's mask, by tiles."""
+    width, height = (side * supersample for side in camera.size)
+    columns, lines = -(-width // TILE_PX), -(-height // TILE_PX)
+    rays, origins, spacing = _lifted(camera, supersample)  # type: ignore[arg-type]  # cameras are frozen
+    seen = mask.contains(np.concatenate(_sample_pixels(camera.size, supersample)))
     row, column = np.divmod(np.arange(height * width), width)
-    tile = row // tile_samples * columns + column // tile_samples
-    index = np.flatnonzero(np.isfinite(rays[:, 0]) & np.isfinite(spacing))
+    tile = row // TILE_PX * columns + column // TILE_PX
+    index = np.flatnonzero(seen & np.isfinite(rays[:, 0]) & np.isfinite(spacing))
     index = index[np.argsort(tile[index], kind="stable")]
     starts = np.searchsorted(tile[index], np.arange(lines * columns + 1))
-    axes, angles = _cones(rays[index], starts)
-    origins = _origins(mounted, supersample, index)
     pixel = row[index] // supersample * (width // supersample) + column[index] // supersample
     return RayTable(
         supersample,
-        columns,
         np.ascontiguousarray(rays[index].T),
-        origins,
+        np.ascontiguousarray((origins if len(origins) == 1 else origins[index]).T),
         spacing[index],
         np.stack([pixel, row[index]]).astype(np.int32),
         starts,
-        axes,
-        angles,
-        float(np.linalg.norm(origins, axis=0).max()),
+        *_cones(rays[index], starts),
     )
-
-
-def _origins(mounted: MountedCamera, supersample: int, index: NDArray[np.int64]) -> Floats:
-    """Return the origins (3, N) of the samples' rays of a non-central camera; (3, 1) for a central one."""
-    camera = mounted.camera
-    if not isinstance(camera, NonCentralCamera):
-        return np.zeros((3, 1), np.float32)
-    origins = [camera.rays(pixels)[0] for pixels in _sample_pixels(camera.size, supersample)]
-    return np.ascontiguousarray(np.concatenate(origins)[index].T, np.float32)
 
 
 def _sample_pixels(size: tuple[int, int], supersample: int) -> list[Array]:
     """Return the pixels (N, 2) of all samples, row by row, in chunks of about RAY_CHUNK."""
-    width, height = size
-    u = (np.arange(width * supersample) + 0.5) / supersample - 0.5
-    v = (np.arange(height * supersample) + 0.5) / supersample - 0.5
+    u, v = ((np.arange(side * supersample) + 0.5) / supersample - 0.5 for side in size)
     pixels = np.column_stack([np.tile(u, len(v)), np.repeat(v, len(u))])
     return np.array_split(pixels, -(-len(pixels) // RAY_CHUNK))
 
 
-def _lift_grid(mounted: MountedCamera, supersample: int) -> tuple[Floats, Floats]:
-    """Return rays (N, 3), NaN outside the mask, and the angle between neighbours (N,) of every sample, row by row."""
-    rays, spacing = _lifted(mounted.camera, supersample)  # type: ignore[arg-type]  # cameras are frozen
-    pixels = np.concatenate(_sample_pixels(mounted.camera.size, supersample))
-    return np.where(mounted.visible.contains(pixels)[:, None], rays, np.float32(np.nan)), spacing
-
-
 @lru_cache(1)
-def _lifted(camera: OmniCamera, supersample: int) -> tuple[Floats, Floats]:
-    """Return rays and spacing of every sample without a mask; computed once for the equal lenses of a rig."""
+def _lifted(camera: OmniCamera, supersample: int) -> tuple[Floats, Floats, Floats]:
+    """Return rays (N, 3), origins (N, 3) and the angle between neighbours (N,) of every sample, row by row.
+
+    Origins (1, 3) of a central camera. Computed once for the equal lenses of a rig.
+    """
     width, height = camera.size
-    rays = np.concatenate([camera.lift(chunk) for chunk in _sample_pixels(camera.size, supersample)])
+    chunks = _sample_pixels(camera.size, supersample)
+    rays = np.concatenate([camera.lift(pixels) for pixels in chunks])
     grid = rays.reshape(height * supersample, width * supersample, 3)
     solid_angle = np.linalg.norm(np.cross(np.gradient(grid, axis=0), np.gradient(grid, axis=1)), axis=2)
-    return rays.astype(np.float32), np.sqrt(solid_angle).astype(np.float32).ravel()
+    is_central = not isinstance(camera, NonCentralCamera)
+    origins = np.zeros((1, 3)) if is_central else np.concatenate([camera.rays(pixels)[0] for pixels in chunks])
+    return rays.astype(np.float32), origins.astype(np.float32), np.sqrt(solid_angle).astype(np.float32).ravel()
 
 
 def _cones(rays: Floats, starts: NDArray[np.int64]) -> tuple[Array, Array]:
@@ -134,114 +129,49 @@ def _cones(rays: Floats, starts: NDArray[np.int64]) -> tuple[Array, Array]:
     return axes, angles
 
 
-@dataclass(frozen=True, slots=True)
-class CameraRays:
-    """The tables of a camera: all samples; one ray a pixel in the same tiles, or none; the tiles that are culled."""
-
-    samples: RayTable
-    plain: RayTable | None
-    culled: RayTable  # the samples', or larger tiles of one ray a pixel
-
-    @property
-    def parents(self) -> NDArray[np.int64]:
-        """The culled tile in which each tile (M,) of the samples is."""
-        tiles = np.arange(len(self.samples.angles))
-        if self.plain is None:
-            return tiles
-        rows, columns = np.divmod(tiles, self.samples.columns)
-        times = TILE_PX // NEEDED_PX
-        return np.asarray(rows // times * self.culled.columns + columns // times)
-
-
-_kept: list[tuple[OmniCamera, Mask, int, CameraRays]] = []  # the one made last at the end
-
-
-def cached_rays(mounted: MountedCamera, supersample: int) -> CameraRays:
-    """Return the camera's tables, computed once for equal cameras and masks."""
-    mask = mounted.visible
-    ring = mask.center, mask.inner_px, mask.outer_px
-    for camera, kept, samples, rays in _kept:
-        is_ring = (kept.center, kept.inner_px, kept.outer_px) == ring and kept.image is mask.image
-        if samples == supersample and is_ring and camera == mounted.camera:
-            return rays
-    if supersample == AS_NEEDED:
-        finest = -(-SIDE_RAYS // max(mounted.camera.size))
-        fine, plain = (ray_table(mounted, samples, NEEDED_PX * samples) for samples in (finest, 1))
-        made = CameraRays(fine, plain, ray_table(mounted, 1))
-    else:
-        table = ray_table(mounted, supersample)
-        made = CameraRays(table, None, table)
-    del _kept[: len(_kept) - KEPT + 1]
-    _kept.append((mounted.camera, mask, supersample, made))
-    return made
-
-
-# Guards against division by zero at a rectangle through the viewpoint [m].
-MIN_DISTANCE_M = np.finfo(float).eps
-MARGIN_M = 1e-4  # Subtracted from the least distance of a rectangle: rounding of float32 rays.
-SMALLEST_PX = 8
-_atlases: list[Atlas] = []  # the one used last at the end
-
-
+# 2. An image.
 def render_grey(
     scene: Scene, mounted: MountedCamera, T_world_rig: Array, supersample: int = 2, row_twist: Array | None = None
 ) -> Floats:
     """Return the ideal image (H, W) float32, 0 to 255; 0 outside the mask and for rays that hit no rectangle.
 
-    supersample: rays of a pixel, per axis, or AS_NEEDED.
-    row_twist (6,): motion of the rig in its own frame from one image row to the next (rolling shutter).
+    supersample: rays of a pixel, per axis. row_twist (6,): motion of the rig in its own frame from one image row to the
+    next (rolling shutter).
     """
-    rays, (width, height) = cached_rays(mounted, supersample), mounted.camera.size
-    table, plain = rays.samples, rays.plain
-    # 1. The poses of the camera, and the rectangles in the frame of the first one, by their least distance.
-    poses, turned_rad = _row_poses(height, table, T_world_rig, np.zeros(6) if row_twist is None else row_twist)
+    table, (width, height) = cached_rays(mounted, supersample), mounted.camera.size
+    # 1. The poses of the camera, of which there is one if it rests, and its largest turn.
+    poses, turned_rad = T_world_rig[None], 0.0
+    if row_twist is not None and np.any(row_twist):
+        rows = (np.arange(height * supersample) + 0.5) / supersample - 0.5
+        poses = T_world_rig @ se3.exp(rows[:, None] * row_twist)
+        turned_rad = height * float(np.linalg.norm(row_twist[3:]))
     poses = poses @ se3.inverse(mounted.T_cam_rig)
-    reach_m = table.reach_m + float(np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1).max())
-    if plain is not None and reach_m:
-        raise ValueError("as many rays as needed: for central cameras that take all rows at once only")
+    reach_m = float(np.linalg.norm(table.origins, axis=0).max())
+    reach_m += float(np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1).max())
+    # 2. The rectangles in the frame of the first pose by their least distance, and those that tiles may see.
     corners = se3.apply(se3.inverse(poses[0]), corners_of(scene.rectangles))
     distance_m = _distances_m(corners)
     order = np.argsort(distance_m, kind="stable")
     corners, distance_m = corners[order], distance_m[order]
     surfaces = _surfaces([scene.rectangles[i] for i in order], poses[0], distance_m - reach_m)
-    # 2. The rectangles that tiles may see.
-    sides = sides_of(corners)
-    seen = tiles_that_see(rays.culled, sides, turned_rad + np.arcsin(np.clip(reach_m / distance_m, 0, 1)))
+    seen = tiles_that_see(table, corners, turned_rad + np.arcsin(np.clip(reach_m / distance_m, 0, 1)))
     # 3. The greys of all samples.
     atlas, image = cached_atlas([r.texture for r in scene.rectangles]), np.zeros(width * height, np.float32)
-    one = plain or table
     cast(
         table.rays,
         table.origins,
         table.spacing,
         table.index,
         table.starts,
-        one.rays,
-        one.spacing,
-        one.index,
-        one.starts if plain else one.starts[:1],
-        one.axes.astype(np.float32),
-        np.sin(np.minimum(one.angles, np.pi / 2)).astype(np.float32),
         np.ascontiguousarray((se3.inverse(poses[:1]) @ poses)[:, :3]),
-        rays.parents,
         np.ascontiguousarray(seen),
-        sides.astype(np.float32),
         surfaces,
         atlas.pyramids[order],
         atlas.levels,
         atlas.texels,
-        np.float32(table.supersample**2),
         image,
     )
-    return np.asarray(image.reshape(height, width) / np.float32(table.supersample**2), np.float32)
-
-
-def _row_poses(height: int, table: RayTable, T_world_rig: Array, row_twist: Array) -> tuple[Array, float]:
-    """Return the poses (S, 4, 4) of the rig at the S rows of samples, one if it rests, and its largest turn [rad]."""
-    if not np.any(row_twist):
-        return T_world_rig[None], 0.0
-    rows = (np.arange(height * table.supersample) + 0.5) / table.supersample - 0.5
-    return T_world_rig @ se3.exp(rows[:, None] * row_twist), height * float(np.linalg.norm(row_twist[3:]))
+    return np.asarray(image.reshape(height, width) / np.float32(supersample**2), np.float32)
 
 
 def _surfaces(rectangles: Sequence[Rectangle], T_world_cam: Array, nearest_m: Array) -> Floats:
@@ -261,27 +191,21 @@ def _surfaces(rectangles: Sequence[Rectangle], T_world_cam: Array, nearest_m: Ar
     return rows.astype(np.float32)
 
 
-def tiles_that_see(table: RayTable, sides: Array, aside_rad: Array) -> NDArray[np.bool_]:
-    """Return the mask (M, R) of tiles that may see the rectangles with sides (R, 4, 3) of their pyramids.
+def tiles_that_see(table: RayTable, corners: Array, aside_rad: Array) -> NDArray[np.bool_]:
+    """Return the mask (M, R) of tiles that may see rectangles with corners (R, 4, 3) in the camera frame.
 
-    A tile sees none of what lies between the sides of a pyramid if its whole cone is beyond one of them. aside_rad
-    (R,): largest angle between a ray and the direction from the camera's origin of what it meets.
+    A tile sees none of what lies between the sides of the pyramid from the origin through a rectangle if its whole cone
+    is beyond one of them. aside_rad (R,): largest angle between a ray and the direction from the camera's origin of
+    what it meets.
     """
-    # The least sine, of all four, of the angle from a side to the tile's axis.
-    sines = np.min([table.axes @ sides[:, side].T for side in range(4)], axis=0)
-    reach_rad = np.minimum(table.angles[:, None] + aside_rad, np.pi / 2)
-    return np.asarray(sines >= -np.sin(reach_rad))
-
-
-def sides_of(corners: Array) -> Array:
-    """Return the normals (R, 4, 3), to the inside, of the sides of the pyramids from the origin through rectangles.
-
-    They are 0 where an edge leads to the origin.
-    """
+    # 1. The normals (R, 4, 3) of the sides, to the inside; 0 where an edge leads to the origin.
     normals = np.cross(corners, np.roll(corners, -1, axis=1))
     inwards = np.sign((normals * corners.mean(axis=1, keepdims=True)).sum(axis=(1, 2)))
     normals *= (inwards[:, None] / np.maximum(np.linalg.norm(normals, axis=2), MIN_DISTANCE_M**2))[:, :, None]
-    return np.asarray(normals)
+    # 2. The least sine, of all four, of the angle from a side to the tile's axis.
+    sines = np.min([table.axes @ normals[:, side].T for side in range(4)], axis=0)
+    reach_rad = np.minimum(table.angles[:, None] + aside_rad, np.pi / 2)
+    return np.asarray(sines >= -np.sin(reach_rad))
 
 
 def corners_of(rectangles: Sequence[Rectangle]) -> Array:
@@ -298,6 +222,7 @@ def _distances_m(corners: Array) -> Array:
     return np.asarray(np.maximum(nearest, MIN_DISTANCE_M))
 
 
+# 3. Textures at all sizes.
 @dataclass(frozen=True, slots=True)
 class Atlas:
     """All levels of textures, and where those of R of them are."""
@@ -308,30 +233,7 @@ class Atlas:
     levels: NDArray[np.int64]  # (L, 3) first texel, height, width
 
 
-def pyramid(texture: Texture) -> list[NDArray[np.uint8]]:
-    """Return a texture at halved sizes (box filter), all with the same outline, until a side is below 8 px."""
-    exact, levels = texture.astype(np.float32), [texture]
-    while min(exact.shape) >= SMALLEST_PX:
-        height, width = exact.shape
-        exact = np.asarray(cv2.resize(exact, (width // 2, height // 2), interpolation=cv2.INTER_AREA), np.float32)
-        levels.append(np.rint(exact).astype(np.uint8))
-    return levels
-
-
-def make_atlas(textures: Sequence[Texture]) -> Atlas:
-    """Return the atlas of textures; one that occurs several times is stored once."""
-    first: dict[int, tuple[int, int]] = {}
-    images: list[NDArray[np.uint8]] = []
-    for texture in textures:
-        if id(texture) not in first:
-            made = pyramid(texture)
-            first[id(texture)] = (len(images), len(made))
-            images += made
-    sizes = np.array([image.size for image in images], np.int64)
-    starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
-    levels = np.array([(start, *image.shape) for start, image in zip(starts, images, strict=True)], np.int64)
-    texels = np.concatenate([image.ravel() for image in images])
-    return Atlas(tuple(textures), texels, np.array([first[id(texture)] for texture in textures], np.int64), levels)
+_atlases: list[Atlas] = []  # the one used last at the end
 
 
 def cached_atlas(textures: Sequence[Texture]) -> Atlas:
@@ -342,5 +244,30 @@ def cached_atlas(textures: Sequence[Texture]) -> Atlas:
             _atlases.append(_atlases.pop(number))
             return replace(atlas, pyramids=atlas.pyramids[[rows[id(texture)] for texture in textures]])
     del _atlases[: len(_atlases) - KEPT + 1]
-    _atlases.append(make_atlas(textures))
+    _atlases.append(_make_atlas(textures))
     return _atlases[-1]
+
+
+def _make_atlas(textures: Sequence[Texture]) -> Atlas:
+    """Return the atlas of textures; one that occurs several times is stored once."""
+    first: dict[int, tuple[int, int]] = {}
+    images: list[Texture] = []
+    for texture in textures:
+        if id(texture) not in first:
+            made = _pyramid(texture)
+            first[id(texture)] = (len(images), len(made))
+            images += made
+    starts = np.cumsum([0, *(image.size for image in images[:-1])])
+    levels = np.array([(start, *image.shape) for start, image in zip(starts, images, strict=True)], np.int64)
+    texels = np.concatenate([image.ravel() for image in images])
+    return Atlas(tuple(textures), texels, np.array([first[id(texture)] for texture in textures], np.int64), levels)
+
+
+def _pyramid(texture: Texture) -> list[Texture]:
+    """Return a texture at halved sizes (box filter), all with the same outline, until a side is below SMALLEST_PX."""
+    exact, levels = texture.astype(np.float32), [texture]
+    while min(exact.shape) >= SMALLEST_PX:
+        height, width = exact.shape
+        exact = np.asarray(cv2.resize(exact, (width // 2, height // 2), interpolation=cv2.INTER_AREA), np.float32)
+        levels.append(np.rint(exact).astype(np.uint8))
+    return levels

@@ -116,16 +116,3 @@ def test_a_camera_sees_what_all_tiles_would_show(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(ray_caster, "MARGIN_M", 1e6)
     wanted = [ray_caster.render_grey(run.scene, mounted, run.poses[2], 2, twist) for twist in twists]
     np.testing.assert_array_equal(found, wanted)
-
-
-def test_rays_as_needed_show_what_many_rays_show() -> None:
-    run = build("rooms", 3, SIZE, 5)
-    mounted = run.rig.lower
-    many, needed = (
-        cv2.GaussianBlur(ray_caster.render_grey(run.scene, mounted, run.poses[2], samples), (0, 0), 0.5)
-        for samples in (8, ray_caster.AS_NEEDED)
-    )
-    v, u = np.indices(many.shape)
-    inside = mounted.visible.contains(np.column_stack([u.ravel(), v.ravel()]), 2).reshape(many.shape)
-    assert np.sqrt(np.mean((many - needed)[inside] ** 2)) < 1.5
-    assert np.sqrt(np.mean((many - ray_caster.render_grey(run.scene, mounted, run.poses[2], 1))[inside] ** 2)) > 3.0
