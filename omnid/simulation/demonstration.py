@@ -15,9 +15,8 @@ from omnid.core.navigation.requests import NavigationFrame, PathRequest, RouteAc
 from omnid.formats.plan import BLACK, LIGHT_GREY, RED, Lines, Sheet, draw_ends, draw_plan, with_legend
 from omnid.messages import NavigationUpdate, ObstacleRing, PlaceUpdate
 from omnid.navigation_state import NavigationState
-from omnid.simulation.clearance import distances_m, footprints
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun
-from omnid.simulation.world import World
+from omnid.simulation.world import World, distances_m
 from omnid.tracking_state import MapState
 
 Array = NDArray[np.float64]
@@ -135,7 +134,7 @@ def draw(world: World, obstacles: Array, first: Array, second: Array) -> NDArray
 
     All are positions (N, 2) [m] in the world. A cell is the darker, the more often something was seen there.
     """
-    segments = footprints(world.standing, 1.2)
+    segments = world.obstacles(1.2)
     corners = segments.reshape(-1, 2)
     sheet = Sheet(corners.min(axis=0) - BORDER_M, corners.max(axis=0) + BORDER_M, PX_PER_M)
     taught, repeated, _, walls = LEGEND

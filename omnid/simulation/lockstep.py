@@ -20,7 +20,7 @@ from calib import se3
 from drivers.frame import Frame
 from drivers.motion import MotionSample
 from omnid.config import Config
-from omnid.controller.statistics import ControllerState
+from omnid.controller.statistics import ControllerState, TickReport
 from omnid.core.control.arming import ArmRequest
 from omnid.core.control.command_sources import PLANNER, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
@@ -32,9 +32,9 @@ from omnid.formats.route_file import RouteFolder
 from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.route_files import Requests
-from omnid.runs.wiring import NavigationParts, Outputs, Parts, WiredStages, wire
+from omnid.runs.wiring import NavigationParts, Outputs, Parts, wire
 from omnid.simulation.robot import SimulatedRobot, with_masks
-from omnid.simulation.vehicle import Fault, Tick, Vehicle
+from omnid.simulation.vehicle import Tick, Vehicle
 from omnid.simulation.world import World
 from omnid.sinks.drive import NAVIGATION_SENDER
 from omnid.stages.front_end import FrontEnd
@@ -62,9 +62,10 @@ class Moment:
 Request: TypeAlias = Setpoint | Literal["arm", "stop", "end"] | NavigationRequest
 # Sends requests as a person or a program would; called once for every pair of images.
 Drive: TypeAlias = Callable[[Moment], Iterable[Request]]
-# Changes the pixels of a frame on its way to the stages: a fault of a camera, its driver or its mirror. The first
-# argument is the time of the frame since the start [s].
-Tamper: TypeAlias = Callable[[float, Frame], Frame]
+Takes: TypeAlias = Callable[[Tick, TickReport], None]
+Reports: TypeAlias = Callable[[float, str], None]
+# Makes the robot by its world, its description, the settings and the seed; `Vehicle`, or one with faults.
+MakeVehicle: TypeAlias = Callable[[World, SimulatedRobot, Config, int, Takes, Reports], Vehicle]
 
 
 class EstimatedPose(NamedTuple):
@@ -143,12 +144,9 @@ def simulate(
     seconds: float,
     seed: int = 0,
     config: Config | None = None,
-    faults: Iterable[Fault] = (),
-    tamper: Tamper | None = None,
+    vehicle: MakeVehicle = Vehicle,
 ) -> SimulatedRun:
     """Drive for a number of seconds of simulated time and return the run.
-
-    tamper: changes the images; None: they are as the simulated cameras make them.
 
     A map of places (config.places.map) is read, extended and written as by `omnid run`; the pose in the map is computed
     where there is one. Raises OmnidError as `omnid run` does.
@@ -157,64 +155,45 @@ def simulate(
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        return _Lockstep(world, robot, drive, seed, config or Config(), faults, tamper).run(seconds)
+        return _Lockstep(world, robot, drive, seed, config or Config(), vehicle).run(seconds)
     finally:
         cv2.setNumThreads(threads)
 
 
 class _Lockstep:
     def __init__(
-        self,
-        world: World,
-        robot: SimulatedRobot,
-        drive: Drive,
-        seed: int,
-        config: Config,
-        faults: Iterable[Fault],
-        tamper: Tamper | None,
+        self, world: World, robot: SimulatedRobot, drive: Drive, seed: int, config: Config, vehicle: MakeVehicle
     ) -> None:
-        self._robot, self._drive, self._config, self._tamper = robot, drive, config, tamper
-        self._rig = with_masks(robot.rig)
+        self._drive, self._config, self._rig = drive, config, with_masks(robot.rig)
         self._run = run = SimulatedRun(self._rig.T_base_rig)
-        self._vehicle = Vehicle(
+        self._vehicle = vehicle(
             world,
             robot,
             config,
             seed,
             lambda tick, _: run.ticks.append(tick),
             lambda time_s, line: run.lines.append((time_s, line)),
-            faults=faults,
         )
-        self._delay_ns = round(robot.pose_delay_s * 1e9)
         self._graph = Graph(threaded=False)
         self._requests, self._states = Requests(self._graph), self._graph.inlet(1)
         self._ends = False
         self._truth: dict[int, Array] = {}  # T_world_base by the stamp of a pair [ns]
         self._odometry: OdometryUpdate | None = None
-        self._stages: WiredStages | None = None
+        self._front_end = FrontEnd(geometry(self._rig, config.panorama), config)
 
     def run(self, seconds: float) -> SimulatedRun:
         """Drive; return the run."""
         # The stages of the daemon, between the simulated cameras and the lists of results.
         config, graph, routes = self._config, self._graph, RouteFolder(Path(self._config.navigation.routes))
         frames = graph.source("cameras", lambda: self._messages(seconds))
-        shape = geometry(self._rig, config.panorama)
-        run_places = RunPlaces(config, shape, nothing)
-        drive = self._take_navigation
-        navigation = NavigationParts(self._requests, self._states, routes, drive, config.places.map)
+        run_places = RunPlaces(config, self._front_end.geometry, nothing)
+        navigation = NavigationParts(self._requests, self._states, routes, self._take_navigation, config.places.map)
         outputs = Outputs(
             poses={"poses": self._take_pose},
             rings={"rings": self._take_ring},
             places={"in map": self._run.places.append} if config.places.map else {},
         )
-        self._stages = wire(
-            graph,
-            [frames],
-            FrontEnd(shape, config),
-            config,
-            outputs,
-            run_places.known_to(Parts(navigation=navigation)),
-        )
+        wire(graph, [frames], self._front_end, config, outputs, run_places.known_to(Parts(navigation=navigation)))
         graph.run()
         run_places.finish()
         return self._run
@@ -222,24 +201,24 @@ class _Lockstep:
     def _messages(self, seconds: float) -> Iterator[Frame | MotionSample]:
         """Advance the robot from pair to pair; the stages work while frames and samples are yielded."""
         vehicle = self._vehicle
-        for stamp_ns, frames, samples in islice(vehicle.pairs(nothing), int(seconds * self._robot.rate_hz)):
+        for pair in islice(vehicle.pairs(nothing), int(seconds * vehicle.robot.rate_hz)):
             # 1. The drive sees the newest estimates, and asks for what it wants.
             self._send()
             if self._ends:
                 break
             # 2. What the sensors have measured goes through the stages.
-            self._truth[stamp_ns] = vehicle.T_world_base
-            yield from samples
-            yield from (frame if self._tamper is None else self._tamper(vehicle.time_s, frame) for frame in frames)
+            self._truth[pair.stamp_ns] = vehicle.T_world_base
+            yield from (*pair.samples, *pair.frames)
         vehicle.come_to_rest()
 
     def _send(self) -> None:
         """Send what the drive asks for now."""
         vehicle, run = self._vehicle, self._run
+        state = vehicle.controller.state
         moment = Moment(
             vehicle.time_s,
             vehicle.T_world_base,
-            vehicle.controller.state,
+            state,
             self._odometry,
             run.poses[-1].T_odom_base if run.poses else np.eye(4),
             run.navigation[-1] if run.navigation else None,
@@ -256,25 +235,24 @@ class _Lockstep:
             elif request == "end":
                 self._ends = True
             else:
-                state = vehicle.controller.state
                 self._states.push(state)
                 self._requests.put(NavigationCommand(request, arrival_ns, arrival_ns, halts=state.halts))
-        self._states.push(vehicle.controller.state)
+        self._states.push(state)
 
     def _take_pose(self, odometry: OdometryUpdate) -> None:
         T_base_rig, stamp_ns = self._rig.T_base_rig, odometry.stamp_ns
         self._odometry = odometry
-        is_slipping = self._stages is not None and self._stages.front_end.odometry.sensors.is_slipping
+        is_slipping = self._front_end.odometry.sensors.is_slipping
         T_odom_base = of_base(odometry, T_base_rig)[0]
         self._run.poses.append(EstimatedPose(stamp_ns, self._truth[stamp_ns], T_odom_base, odometry.state, is_slipping))
-        self._vehicle.post(controller_pose(odometry, T_base_rig), stamp_ns + self._delay_ns)
+        self._vehicle.post(controller_pose(odometry, T_base_rig))
 
     def _take_ring(self, ring: ObstacleRing) -> None:
         self._run.rings.append(ring)
-        self._vehicle.post(controller_ring(ring), ring.stamp_ns + self._delay_ns)
+        self._vehicle.post(controller_ring(ring))
 
     def _take_navigation(self, update: NavigationUpdate) -> None:
         self._run.navigation.append(update)
         if update.setpoint is not None:
-            due_ns = self._vehicle.now_ns + self._delay_ns
+            due_ns = self._vehicle.now_ns + round(self._vehicle.robot.pose_delay_s * 1e9)
             self._vehicle.post(TimedSetpoint(due_ns, update.setpoint, PLANNER, NAVIGATION_SENDER), due_ns)

@@ -23,9 +23,10 @@ from drivers.motors.simulated.simulated_base import Pose
 from omnid.config import Config
 from omnid.controller.link import DriveLink
 from omnid.controller.statistics import ControllerStatistics, TickReport
-from omnid.core.control.collision_monitor import ControllerRing
+from omnid.core.control.arming import ArmRequest
+from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.contacts import NO_CONTACT
-from omnid.core.control.control_law import ControlInput, ControllerPose
+from omnid.core.control.control_law import ControlInput
 from omnid.engine.graph import Stream, nothing
 from omnid.engine.telemetry import StageStats
 from omnid.runs.session import Session
@@ -38,27 +39,22 @@ MOST_COMMANDS: Final = 64  # If this number of commands waits for the stages, th
 
 
 class PacedLink:
-    """A DriveLink whose controller is stepped by a simulation.
+    """A DriveLink whose controller is stepped by a simulation: see `Vehicle.post` for when it is given something."""
 
-    Poses and rings reach it `delay_ns` after their images, as on a robot that needs that time; setpoints, stops and
-    requests to arm with the next tick.
-    """
-
-    def __init__(self, vehicle: Vehicle, stats: StageStats, delay_ns: int) -> None:
+    def __init__(self, vehicle: Vehicle, stats: StageStats) -> None:
         """stats: counters of the tick."""
         self.statistics = ControllerStatistics(stats)
         self.take_wheels: Callable[[WheelSample], object] = nothing
-        self._vehicle, self._delay_ns = vehicle, delay_ns
+        self._vehicle = vehicle
         self._commands: Queue[VelocityCommand] = Queue(MOST_COMMANDS)
         self._contacts = NO_CONTACT
         self._ended = False
 
     def send(self, given: ControlInput) -> None:
         """Send a pose, an obstacle ring, a setpoint, or a request to arm."""
-        if isinstance(given, ControllerPose | ControllerRing):
-            self._vehicle.post(given, given.stamp_ns + self._delay_ns)
-        else:
-            self._vehicle.post(given._replace(arrival_ns=0))
+        if isinstance(given, TimedSetpoint | ArmRequest):
+            given = given._replace(arrival_ns=0)
+        self._vehicle.post(given)
 
     def stop(self) -> None:
         """Stop the wheels until a request to arm is sent later."""
@@ -116,7 +112,7 @@ class PacedRobot:
         """report: takes a line at each contact with an obstacle. keeps_truth: the true poses, 250 bytes a pair."""
         self._report, self._keeps_truth = report, keeps_truth
         self.rig = with_masks(robot.rig)
-        self._world, self._robot, self._config, self._seed = world, robot, config, seed
+        self._world, self._robot, self._config, self._seed = world, replace(robot, samples=1), config, seed
         self._start_ns = time.monotonic_ns()
         self._vehicle: Vehicle | None = None
         self._link: PacedLink | None = None
@@ -144,10 +140,8 @@ class PacedRobot:
             if not self._ends:  # no more poses come then, which needs no line
                 session.warn(line)
 
-        self._vehicle = Vehicle(
-            self._world, self._robot, config, self._seed, self._take_tick, warn, self._start_ns, samples=1
-        )
-        self._link = PacedLink(self._vehicle, stats, round(1e9 / self._robot.rate_hz))
+        self._vehicle = Vehicle(self._world, self._robot, config, self._seed, self._take_tick, warn, self._start_ns)
+        self._link = PacedLink(self._vehicle, stats)
         graph = session.graph
         return [graph.source("cameras", lambda: self._frames(graph.settle, take), wake=self.close)], self._link
 

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from calib import se3
-from calib.models.camera import Array, Mask
+from calib.models.camera import Mask
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
 from drivers.motors.simulated.simulated_base import MotionLimits
@@ -26,15 +26,6 @@ R_RIG_CAM = np.array([[0, -1.0, 0], [-1, 0, 0], [0, 0, -1]])
 
 
 @dataclass(frozen=True, slots=True)
-class Slip:
-    """A time [s] in which the driven wheels move the robot by a smaller share of their travel."""
-
-    start_s: float
-    end_s: float
-    share: float  # that is lost
-
-
-@dataclass(frozen=True, slots=True)
 class WheelErrors:
     """Deviation of the wheels from those of the configuration.
 
@@ -46,17 +37,6 @@ class WheelErrors:
     left: float = 0.0135  # share by which the left wheel rolls farther than configured
     right: float = 0.0065
     noise: float = 0.002  # standard deviation of the travel of each wheel, per root of a metre [m]
-    slips: tuple[Slip, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class Push:
-    """A time [s] in which somebody pushes the base aside."""
-
-    start_s: float
-    end_s: float
-    sideways_mps: float
-    yaw_rate_radps: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +48,7 @@ class GyroErrors:
     rate_hz: float = 100.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class SimulatedRobot:
     """A disc with two driven wheels and two cameras; the motor controller is that of the configuration."""
 
@@ -84,13 +64,6 @@ class SimulatedRobot:
     rate_hz: float = 10.0  # of the cameras
     samples: int = 2  # in lock-step: rays of a pixel, per axis
     pose_delay_s: float = 0.1  # in lock-step: from the exposure to the pose's arrival at the controller
-    lean_rad: tuple[float, float] = (0.0, 0.0)  # roll and pitch by which the base leans, which its rig does not say
-    pushes: tuple[Push, ...] = ()
-
-    @property
-    def T_base_leaning(self) -> Array:
-        """Return the pose (4, 4) of the leaning base in the level one."""
-        return se3.transform(se3.rotation_exp([*self.lean_rad, 0.0]), [0.0, 0.0, 0.0])
 
 
 def make_robot(size_px: int = IMAGE_PX, rig: Rig | None = None) -> SimulatedRobot:

@@ -12,16 +12,12 @@ from __future__ import annotations
 import heapq
 import math
 import random
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 from itertools import count
 from queue import SimpleQueue
-from typing import Final, Literal, NamedTuple, TypeAlias
+from typing import ClassVar, Final, Literal, NamedTuple, TypeAlias
 
-import numpy as np
-from numpy.typing import NDArray
-
-from calib import se3
+from calib.models.camera import Array
 from drivers.frame import CAMERAS, Frame
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from drivers.motor import VelocityCommand
@@ -31,16 +27,15 @@ from omnid.config import Config
 from omnid.controller.controller import Controller
 from omnid.controller.statistics import TickReport
 from omnid.core.control.arming import ArmRequest
+from omnid.core.control.collision_monitor import ControllerRing
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.contacts import ContactState
-from omnid.core.control.control_law import ControlInput
+from omnid.core.control.control_law import ControlInput, ControllerPose
 from omnid.simulation.cameras import SimulatedCameras
-from omnid.simulation.clearance import clearance_m, footprints, obstacles_of
 from omnid.simulation.people import Walkers
 from omnid.simulation.robot import SimulatedRobot, with_masks
-from omnid.simulation.world import World
+from omnid.simulation.world import World, clearance_m
 
-Array = NDArray[np.float64]
 START_NS: Final = 1_000_000_000_000  # Start of the simulated clock.
 STOPPING_NS: Final = 2_000_000_000  # At the end the wheels come to rest within this time.
 # What a controller is given; a stop disarms.
@@ -65,17 +60,13 @@ class Exposure(NamedTuple):
     samples: list[MotionSample]
 
 
-@dataclass(frozen=True, slots=True)
-class Fault:
-    """A fault of the surroundings or of the hardware, between two times [s] since the start of the drive."""
-
-    kind: Literal["dark", "no lower image", "no upper image", "motor cut"]
-    start_s: float
-    end_s: float
-
-
 class Vehicle:
-    """The robot. Messages to the controller arrive at their times, in order."""
+    """The robot. Messages to the controller arrive at their times, in order.
+
+    What a subclass may change of it are `images`, `move` and `travel_m`: cameras that fail, pushes, wheels that slip.
+    """
+
+    make_cameras: ClassVar[type[SimulatedCameras]] = SimulatedCameras
 
     def __init__(
         self,
@@ -86,24 +77,16 @@ class Vehicle:
         take_tick: Callable[[Tick, TickReport], None],
         report: Callable[[float, str], None],
         start_ns: int = START_NS,
-        *,
-        samples: int | None = None,
-        faults: Iterable[Fault] = (),
     ) -> None:
-        """take_tick: takes each tick. report: takes lines of the controller, with the time since the start [s].
-
-        samples: rays of a pixel, per axis; None: those of the robot.
-        """
-        self.now_ns = self._start_ns = start_ns
-        self.people = Walkers(world.people)
+        """take_tick: takes each tick. report: takes lines of the controller, with the time since the start [s]."""
+        self.world, self.robot, self.people = world, robot, Walkers(world.people)
+        self.now_ns = self._start_ns = self._tick_ns = self._gyro_ns = start_ns
         self._take_tick = take_tick
-        self._ground, self._robot, self._faults = world.ground, robot, tuple(faults)
-        rays = robot.samples if samples is None else samples
-        self._cameras = SimulatedCameras(with_masks(robot.rig), robot.sensor, world, seed, rays)
+        self.cameras = self.make_cameras(with_masks(robot.rig), robot.sensor, world, seed, robot.samples)
         drive = config.motor.drive.geometry()
         self.motor = SimulatedMotor(drive, config.motor.watchdog_ms, lambda: self.now_ns)
         self.base = self.motor.base
-        self.base.pose, self.base.limits, self.base.traction = world.start, robot.limits, self._over_ground
+        self.base.pose, self.base.limits, self.base.traction = world.start, robot.limits, self.travel_m
         self.controller = Controller(
             self.motor,
             config.controller,
@@ -113,15 +96,12 @@ class Vehicle:
             limited=drive.limited,
         )
         self._period_ns = round(1e9 / config.motor.rate_hz)
-        self._tick_ns = start_ns
         self._posted: SimpleQueue[tuple[int, int, Given]] = SimpleQueue()  # when it is due [ns], number
         self._waiting: list[tuple[int, int, Given]] = []
         self._numbers, self._arrived_ns = count(), 0
         self._wheel_noise, self._gyro_noise = random.Random(seed), random.Random(seed + 1)
-        self._rolled_s = 0.0  # time that the wheels have turned or stood
-        self._gyro_ns = start_ns
         self.samples: list[MotionSample] = []  # since the last pair
-        self._standing = obstacles_of(world, robot.height_m)
+        self._obstacles = world.obstacles(robot.height_m)
 
     @property
     def time_s(self) -> float:
@@ -131,45 +111,40 @@ class Vehicle:
     @property
     def T_world_base(self) -> Array:
         """Return the true pose (4, 4) of the base."""
-        return self._ground.T_world_base(self.base.pose)
+        return self.world.T_world_base(self.base.pose)
 
     @property
     def T_world_rig(self) -> Array:
-        """Return the true pose (4, 4) of the rig, which may lean otherwise than its file says."""
-        return self.T_world_base @ self._robot.T_base_leaning @ self._robot.rig.T_base_rig
+        """Return the true pose (4, 4) of the rig."""
+        return self.T_world_base @ self.robot.rig.T_base_rig
 
     def post(self, given: Given, due_ns: int = 0) -> None:
         """Have the controller given something before its first tick at or after a time; from any thread.
 
-        It is on its way when `advance` is called next. A setpoint or a request without a time of arrival arrives then.
+        A pose or an obstacle ring needs the robot's pose_delay_s from its images. It is on its way when `advance` is
+        called next. A setpoint or a request without a time of arrival arrives then.
         """
+        if isinstance(given, ControllerPose | ControllerRing):
+            due_ns = given.stamp_ns + round(self.robot.pose_delay_s * 1e9)
         self._posted.put((due_ns, next(self._numbers), given))
 
     def pairs(self, wait: Callable[[], object]) -> Iterator[Exposure]:
-        """Yield pair after pair, without the images that a fault takes away.
-
-        wait: returns when the messages that follow from the pairs before have been posted.
-        """
+        """Yield pair after pair. wait: returns when the messages that follow from the pairs before have been posted."""
         for seq in count():
             # 1. The body moves by what the controller knows; the images show it there.
-            stamp_ns = self._start_ns + round(seq * 1e9 / self._robot.rate_hz)
-            self.motor.cut = self._has("motor cut")
+            stamp_ns = self._start_ns + round(seq * 1e9 / self.robot.rate_hz)
             self.advance(stamp_ns, ticks_then=False)
-            brightness = 0.0 if self._has("dark") else 1.0
-            frames = [
-                self._cameras.frame(camera, seq, stamp_ns, self.T_world_rig, self.people, brightness=brightness)
-                for camera in CAMERAS
-                if not self._has(f"no {camera} image")
-            ]
+            frames = self.images(seq, stamp_ns)
             # 2. What has been answered meanwhile takes effect with the tick of now.
             wait()
             self.advance(stamp_ns)
             samples, self.samples = self.samples, []
             yield Exposure(stamp_ns, frames, samples)
 
-    def _has(self, kind: str) -> bool:
-        """True while there is a fault of this kind."""
-        return any(fault.kind == kind and fault.start_s <= self.time_s < fault.end_s for fault in self._faults)
+    def images(self, seq: int, stamp_ns: int) -> list[Frame]:
+        """Return the frames of the cameras now."""
+        T_world_rig = self.T_world_rig
+        return [self.cameras.frame(camera, seq, stamp_ns, T_world_rig, self.people) for camera in CAMERAS]
 
     def advance(self, until_ns: int, *, ticks_then: bool = True) -> None:
         """Advance to a time, with all ticks and samples that are due until then.
@@ -179,20 +154,33 @@ class Vehicle:
         while not self._posted.empty():
             heapq.heappush(self._waiting, self._posted.get())
         while (due_ns := min(self._tick_ns, self._gyro_ns)) < until_ns + ticks_then:
-            self._move(due_ns)
+            self._pass(due_ns)
             if due_ns == self._gyro_ns:
-                self._gyro_ns += round(1e9 / self._robot.gyro.rate_hz)
+                self._gyro_ns += round(1e9 / self.robot.gyro.rate_hz)
             if due_ns == self._tick_ns:
                 while self._waiting and self._waiting[0][0] <= self.now_ns:
                     self._give(heapq.heappop(self._waiting)[2])
                 self._tick()
                 self._tick_ns += self._period_ns
-        self._move(until_ns)
+        self._pass(until_ns)
 
     def come_to_rest(self) -> None:
         """Have the controller stop the wheels permanently."""
         self.controller.end()
         self.advance(self.now_ns + STOPPING_NS)
+
+    def move(self, dt_s: float) -> None:
+        """Move the base by its wheels until now, for a time."""
+        self.motor.advance()
+
+    def travel_m(self, dt_s: float, left_m: float, right_m: float) -> tuple[float, float]:
+        """Return the travel of the left and the right wheel over the ground for that of their rims in a time."""
+        wheels, noise = self.robot.wheels, self._wheel_noise.gauss
+        left_m, right_m = (
+            travel_m * (1.0 + error) + wheels.noise * math.sqrt(abs(travel_m)) * noise(0.0, 1.0)
+            for travel_m, error in ((left_m, wheels.left), (right_m, wheels.right))
+        )
+        return left_m, right_m
 
     def _give(self, given: Given) -> None:
         """Give the controller something, which arrives after what it was given before, and after the tick before."""
@@ -206,62 +194,24 @@ class Vehicle:
         else:
             self.controller.take(given)
 
-    def _move(self, until_ns: int) -> None:
-        base, begin_s, dt_s = self.base, self.time_s, (until_ns - self.now_ns) * 1e-9
-        before, self.now_ns = base.pose, until_ns
-        self.motor.advance()
-        for push in self._robot.pushes:
-            if push.start_s <= begin_s < push.end_s:
-                x_m, y_m, heading_rad = base.pose
-                aside_m = push.sideways_mps * dt_s
-                x_m, y_m = x_m - aside_m * math.sin(heading_rad), y_m + aside_m * math.cos(heading_rad)
-                base.pose = x_m, y_m, heading_rad + push.yaw_rate_radps * dt_s
-        if self._robot.has_gyro and dt_s > 0.0:
-            self._sense_rotation(self._turned(before, base.pose) / dt_s)
-        self.people.advance(self.time_s, base.pose[:2])
-
-    def _turned(self, before: Pose, now: Pose) -> Array:
-        """Return the rotation vector (3,) of the base between two poses, in its own frame."""
-        if not self._ground.profile:
-            return np.array([0.0, 0.0, math.remainder(now[2] - before[2], math.tau)])
-        return se3.rotation_log(
-            (se3.inverse(self._ground.T_world_base(before)) @ self._ground.T_world_base(now))[:3, :3]
-        )
-
-    def _over_ground(self, dt_s: float, left_m: float, right_m: float) -> tuple[float, float]:
-        """Return the travel of both wheels over the plane: they slip, and over a slope it is less."""
-        wheels, ground, pose = self._robot.wheels, self._ground, self.base.pose
-        noise = self._wheel_noise.gauss
-        self._rolled_s += dt_s
-        lost = [slip.share for slip in wheels.slips if slip.start_s <= self._rolled_s < slip.end_s]
-        kept = 1.0 - max(lost, default=0.0)
-        left_m, right_m = (
-            kept * travel_m * (1.0 + error) + wheels.noise * math.sqrt(abs(travel_m)) * noise(0.0, 1.0)
-            for travel_m, error in ((left_m, wheels.left), (right_m, wheels.right))
-        )
-        if not ground.profile:
-            return left_m, right_m
-        cosine = float(ground.T_world_base(pose)[:2, 0] @ np.array([math.cos(pose[2]), math.sin(pose[2])]))
-        return cosine * left_m, cosine * right_m
-
-    def _sense_rotation(self, rates_radps: Array) -> None:
-        """Add a sample of the gyro: the mean over the time since the last one."""
-        errors = self._robot.gyro
-        noise = [errors.noise_radps * self._gyro_noise.gauss(0.0, 1.0) for _ in range(3)]
-        x, y, z = (bias + wrong for bias, wrong in zip(errors.bias_radps, noise, strict=True))
-        about_x, about_y, about_z = rates_radps.tolist()
-        self.samples.append(GyroSample(self.now_ns, x + about_x, y + about_y, z + about_z))
+    def _pass(self, until_ns: int) -> None:
+        """Let the time until a stamp pass: the base moves, the gyro gives the mean of its turn, people walk."""
+        before, dt_s = self.base.pose, (until_ns - self.now_ns) * 1e-9
+        self.now_ns = until_ns
+        self.move(dt_s)
+        if self.robot.has_gyro and dt_s > 0.0:
+            turned_radps = self.world.turned_rad(before, self.base.pose) / dt_s
+            errors, noise = self.robot.gyro, [self._gyro_noise.gauss(0.0, 1.0) for _ in range(3)]
+            parts = zip(errors.bias_radps, noise, turned_radps.tolist(), strict=True)
+            self.samples.append(
+                GyroSample(self.now_ns, *(bias + errors.noise_radps * one + turned for bias, one, turned in parts))
+            )
+        self.people.advance(self.time_s, self.base.pose[:2])
 
     def _tick(self) -> None:
-        report = self.controller.tick()
-        status = self.motor.status
-        if self._robot.has_odometry and status is not None and math.isfinite(status.velocity_mps):
+        report, status, pose = self.controller.tick(), self.motor.status, self.base.pose
+        if self.robot.has_odometry and status is not None and math.isfinite(status.velocity_mps):
             self.samples.append(WheelSample(self.now_ns, status.velocity_mps, status.yaw_rate_radps))
-        self._take_tick(
-            Tick(self.time_s, self.base.pose, report.command, report.state.reason, self._clearance_m()), report
-        )
-
-    def _clearance_m(self) -> float:
-        x_m, y_m, _ = self.base.pose
-        walking = footprints(self.people.faces(), self._robot.height_m, self._ground)
-        return min(clearance_m(segments, (x_m, y_m), self._robot.radius_m) for segments in (self._standing, walking))
+        walking = self.world.footprints(self.people.faces(), self.robot.height_m)
+        nearest_m = min(clearance_m(one, pose[:2], self.robot.radius_m) for one in (self._obstacles, walking))
+        self._take_tick(Tick(self.time_s, pose, report.command, report.state.reason, nearest_m), report)

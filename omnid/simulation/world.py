@@ -1,11 +1,10 @@
-"""A simulated world: what stands and walks in it, the heights of its floor, its light, and what mirrors."""
+"""A simulated world: what stands and walks in it, its light, and how far a robot is from what it may touch."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Final
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,62 +12,17 @@ from calib import se3
 from calib.models.camera import Array
 from drivers.motors.simulated.simulated_base import Pose
 from omnid.simulation.people import Person
-from omnid.simulation.rendering.surfaces import Rectangle, Texture
+from omnid.simulation.rendering.surfaces import Rectangle
 
-HALF_BASE_M: Final = 0.15  # from the middle of the base to where its wheels and castors touch the floor
-WHEEL_M: Final = 0.05  # A wheel rounds off the heights within this distance.
+FLOOR_M = 0.02  # what is lower than this is driven over
 
 
 @dataclass(frozen=True)
-class Ground:
-    """The heights of a floor, which change along x only."""
-
-    profile: tuple[tuple[float, float], ...] = ()  # x, z [m] by x; two of one x are a step; level without any
-
-    @cached_property
-    def _points(self) -> Array:
-        return np.array(self.profile).T
-
-    def heights_m(self, x_m: Array | float) -> Array:
-        """Return the heights at places along x."""
-        x_m = np.asarray(x_m, float)
-        return np.asarray(np.interp(x_m, *self._points)) if self.profile else np.zeros_like(x_m)
-
-    def T_world_base(self, pose: Pose) -> Array:
-        """Return the pose (4, 4) of a base that stands there; x, y and heading are those of its middle."""
-        x_m, y_m, heading_rad = pose
-        R, z_m = se3.rotation_exp([0.0, 0.0, heading_rad]), 0.0
-        if self.profile:
-            c, s = HALF_BASE_M * math.cos(heading_rad), HALF_BASE_M * math.sin(heading_rad)
-            around = x_m + np.array([c, -c, -s, s])[:, None] + np.linspace(-WHEEL_M, WHEEL_M, 5)
-            front, rear, left, right = (float(height_m) for height_m in self.heights_m(around).mean(axis=1))
-            z_m = (front + rear + left + right) / 4
-            pitch_rad, roll_rad = (math.atan2(a - b, 2 * HALF_BASE_M) for a, b in ((front, rear), (left, right)))
-            R = R @ se3.rotation_exp([0.0, -pitch_rad, 0.0]) @ se3.rotation_exp([roll_rad, 0.0, 0.0])
-        return se3.transform(R, [x_m, y_m, z_m])
-
-
-@dataclass(frozen=True, slots=True)
-class SunPatch:
-    """A patch of sun on the level floor, which moves to and fro, and fades behind clouds."""
-
-    at: tuple[float, float]  # its middle at 0 s
-    size_m: tuple[float, float]
-    yaw_rad: float
-    velocity_mps: tuple[float, float]
-    gain: float  # by which the floor is brighter
-
-    def rectangle(self, time_s: float, shape: Texture) -> Rectangle:
-        """Return the patch just above the floor."""
-        c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
-        u, v = np.array([c, s, 0.0]) * self.size_m[0], np.array([s, -c, 0.0]) * self.size_m[1]
-        middle = np.array([*(at + time_s * v_mps for at, v_mps in zip(self.at, self.velocity_mps, strict=True)), 2e-3])
-        return Rectangle(middle - (u + v) / 2, u, v, shape, "sun")
-
-
-@dataclass(frozen=True, slots=True)
 class World:
-    """The floor is at z = 0 where the ground does not say otherwise; the robot starts at x, y [m], heading [rad]."""
+    """A level floor at z = 0 and what is on it; the robot starts at x, y [m], heading [rad].
+
+    What a subclass may change of a world are its methods: ground that is not level, light that changes.
+    """
 
     name: str
     standing: tuple[Rectangle, ...]
@@ -76,13 +30,56 @@ class World:
     start: Pose = (0.0, 0.0, 0.0)
     brightness: float = 1.0  # factor on the grey of all images
     is_polished: bool = False  # the floor mirrors the objects on it
-    ground: Ground = Ground()
-    edges: Array = field(default_factory=lambda: np.zeros((0, 2, 2)))  # [m] where the floor falls
-    panes: tuple[Rectangle, ...] = ()  # of glass: seen by what they mirror, and touched
-    sun: tuple[SunPatch, ...] = ()
-    lights: tuple[tuple[float, float], ...] = ()  # time [s] from which on a factor on all greys holds
+
+    def T_world_base(self, pose: Pose) -> Array:
+        """Return the pose (4, 4) of a base that stands there; x, y and heading are those of its middle."""
+        x_m, y_m, heading_rad = pose
+        return se3.transform(se3.rotation_exp([0.0, 0.0, heading_rad]), [x_m, y_m, 0.0])
+
+    def turned_rad(self, before: Pose, now: Pose) -> Array:
+        """Return the rotation vector (3,) of a base between two poses, in its own frame."""
+        return np.array([0.0, 0.0, math.remainder(now[2] - before[2], math.tau)])
 
     def light_at(self, time_s: float) -> float:
         """Return the factor on the grey of all images."""
-        factors = [factor for begin_s, factor in self.lights if begin_s <= time_s]
-        return self.brightness * (factors[-1] if factors else 1.0)
+        return self.brightness
+
+    def footprints(self, rectangles: Sequence[Rectangle], height_m: float) -> Array:
+        """Return the outlines (N, 2, 2) [m] of rectangles on the floor, see `footprints`."""
+        return footprints(rectangles, height_m)
+
+    def obstacles(self, height_m: float) -> Array:
+        """Return the segments (N, 2, 2) [m] of all that a robot of a height may touch."""
+        return self.footprints(self.standing, height_m)
+
+
+def footprints(rectangles: Sequence[Rectangle], height_m: float) -> Array:
+    """Return the segments (N, 2, 2) [m] on the floor of all that reaches below a height, other than the floor.
+
+    Rectangles named "floor" are never met. Boxes and walls are closed by upright rectangles, so that their outlines are
+    enough.
+    """
+    segments = []
+    for rectangle in rectangles:
+        corners = rectangle.corners
+        low_m, high_m = corners[:, 2].min(), corners[:, 2].max()
+        if rectangle.name != "floor" and high_m - low_m > FLOOR_M and low_m < height_m and high_m > FLOOR_M:
+            spread = corners[:, :2] - corners[0, :2]
+            far = int(np.argmax((spread**2).sum(axis=1)))
+            other = int(np.argmax(((corners[:, :2] - corners[far, :2]) ** 2).sum(axis=1)))
+            segments.append(corners[[far, other], :2])
+    return np.array(segments).reshape(-1, 2, 2)
+
+
+def distances_m(segments: Array, places: Array) -> Array:
+    """Return the distances (M,) [m] of places (M, 2) from the nearest of segments (N, 2, 2); inf without any."""
+    a, along = segments[:, 0], segments[:, 1] - segments[:, 0]
+    to_place = places[:, None] - a
+    share = np.clip((to_place * along).sum(axis=2) / np.maximum((along**2).sum(axis=1), 1e-12), 0.0, 1.0)
+    distances = np.linalg.norm(to_place - share[..., None] * along, axis=2)
+    return np.asarray(distances.min(axis=1, initial=np.inf))
+
+
+def clearance_m(segments: Array, place: tuple[float, float], radius_m: float) -> float:
+    """Return the distance [m] from a disc, the robot's outline, to the nearest of segments; 0 or less: contact."""
+    return float(distances_m(segments, np.array([place]))[0]) - radius_m

@@ -12,7 +12,7 @@ import argparse
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -21,12 +21,13 @@ from omnid.core.control.heading_controller import wrap_angle
 from omnid.core.navigation.requests import GoalRequest, NavigationFrame
 from omnid.navigation_state import NavigationState
 from omnid.simulation.demonstration import cross_track_m
-from omnid.simulation.lockstep import Fault, Moment, Request, SimulatedRun, simulate
-from omnid.simulation.robot import Slip, WheelErrors, make_robot
+from omnid.simulation.lockstep import Moment, Request, SimulatedRun
+from omnid.simulation.robot import make_robot
 from omnid.simulation.vehicle import START_NS
 from omnid.simulation.world import World
 from omnid.simulation.world_file import load_world
 from tests.bench.results import Cell, Column, ResultTable
+from tests.simulation.disturbed import Fault, Slip, disturbed, simulate
 
 Goal = tuple[float, float, float]  # x [m], y [m], heading [deg] in odom
 NOTICED_LATE_S = 0.5  # after its end, within which slip may be noticed
@@ -176,8 +177,7 @@ def main() -> None:
 
 def drive_row(case: Case, seed: int, size_px: int) -> list[Cell]:
     """Drive; return the figures."""
-    wheels = WheelErrors(slips=case.slips)
-    robot = replace(make_robot(size_px), wheels=wheels, has_odometry=case.sensors, has_gyro=case.sensors)
+    robot = disturbed(make_robot(size_px), slips=case.slips, has_odometry=case.sensors, has_gyro=case.sensors)
     started_s = time.process_time()
     run = simulate(case.world(seed), robot, case.drive(), seconds=case.seconds, seed=seed, faults=case.faults)
     return [*row(case, run), (time.process_time() - started_s) / max(1, len(run.stamps_ns))]

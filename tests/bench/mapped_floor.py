@@ -28,7 +28,6 @@ from omnid.config import load_config
 from omnid.core.mapping.scan_grid import FREE, OCCUPIED, Grid
 from omnid.core.places.place_views import grid
 from omnid.formats.place_file import read_places
-from omnid.simulation.lockstep import simulate
 from omnid.simulation.rendering.surfaces import Rectangle
 from omnid.simulation.world import World
 from omnid.simulation.world_file import load_world
@@ -36,6 +35,7 @@ from tests.bench.fine_robot import fine_robot
 from tests.bench.obstacles import RANDOMLY_S, Wanderer
 from tests.bench.pole_rows import ThereAndBack, room_text
 from tests.bench.results import Column, ResultTable
+from tests.simulation.disturbed import simulate
 from tests.simulation.hazard_worlds import trial
 
 Array = NDArray[np.float64]

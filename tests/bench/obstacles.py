@@ -31,14 +31,15 @@ from numpy.typing import NDArray
 from omnid.config import load_config
 from omnid.core.control.heading_controller import Setpoint, wrap_angle
 from omnid.core.navigation.requests import GoalRequest, NavigationFrame
-from omnid.simulation.clearance import clearance_m, footprints
-from omnid.simulation.lockstep import Moment, Request, SimulatedRun, simulate
+from omnid.simulation.lockstep import Moment, Request, SimulatedRun
 from omnid.simulation.people import Walkers
 from omnid.simulation.rendering.surfaces import Scene
 from omnid.simulation.robot import SimulatedRobot
+from omnid.simulation.world import clearance_m
 from tests.bench.fine_robot import BUILDS, USUAL, fine_robot
 from tests.bench.real_lenses import with_real_lenses
 from tests.bench.results import ROOT, Column, ResultTable, commit
+from tests.simulation.disturbed import simulate
 from tests.simulation.harmless_worlds import FLOORS, Trial
 from tests.simulation.hazard_worlds import HARMLESS, HAZARDS, trial
 from tests.simulation.photographs import with_photographs
@@ -274,7 +275,7 @@ def _from_hazard_m(run: SimulatedRun, asked: Trial, robot: SimulatedRobot) -> fl
     for tick in run.ticks:
         people.advance(tick.time_s, tick.pose[:2])
     things = (*(asked.things or ()), *people.faces())
-    segments = np.concatenate([footprints(things, robot.height_m, asked.world.ground), asked.world.edges])
+    segments = np.concatenate([asked.world.footprints(things, robot.height_m), asked.world.edges])
     if asked.world.name == "steep_ramp":  # it begins there
         x_m = asked.world.ground.profile[0][0]
         segments = np.array([[[x_m, -1.2], [x_m, 1.2]]])

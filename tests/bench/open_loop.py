@@ -23,11 +23,12 @@ from drivers.frame import Frame, gray
 from omnid.config import load_config
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.mapping.range_scan import SECTORS, azimuths
-from omnid.simulation.clearance import clearance_m, footprints, obstacles_of
-from omnid.simulation.lockstep import Moment, Request, simulate
+from omnid.simulation.lockstep import Moment, Request
 from omnid.simulation.people import Walkers
 from omnid.simulation.vehicle import START_NS
+from omnid.simulation.world import clearance_m
 from tests.bench.results import Column, ResultTable
+from tests.simulation.disturbed import simulate
 
 if TYPE_CHECKING:
     from tests.bench.obstacles import Planned
@@ -62,7 +63,7 @@ def stored(planned: Planned, folder: Path) -> Path:
     if path.exists():
         return path
     asked, robot = prepared(planned)
-    segments, people, images, kept = obstacles_of(asked.world, robot.height_m), Walkers(asked.world.people), {}, {}
+    segments, people, images, kept = asked.world.obstacles(robot.height_m), Walkers(asked.world.people), {}, {}
 
     def kept_image(_: float, frame: Frame) -> Frame:
         if frame.seq % EVERY == 0:
@@ -74,7 +75,7 @@ def stored(planned: Planned, folder: Path) -> Path:
             yield "arm"
         x_m, y_m = moment.T_world_base[:2, 3].tolist()
         people.advance(moment.time_s, (x_m, y_m))
-        all_segments = np.concatenate([segments, footprints(people.faces(), robot.height_m, asked.world.ground)])
+        all_segments = np.concatenate([segments, asked.world.footprints(people.faces(), robot.height_m)])
         heading_rad = float(np.arctan2(moment.T_world_base[1, 0], moment.T_world_base[0, 0]))
         first_m = ranges_m(all_segments, (x_m, y_m), azimuths() + heading_rad)
         kept[START_NS + round(moment.time_s * 1e9)] = moment.T_world_base, first_m

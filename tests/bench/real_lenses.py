@@ -9,10 +9,10 @@ from typing import Final
 import numpy as np
 
 from drivers.frame import CAMERAS, Frame
-from omnid.simulation.lockstep import Tamper
 from omnid.simulation.rendering.sensor import Sensor
 from omnid.simulation.robot import SimulatedRobot
 from tests.simulation.disturbances import DISTURBANCES, Disturbance, DisturbedCamera
+from tests.simulation.disturbed import Tamper
 
 # What acts on the scene, or within an exposure, is rendered by tests.simulation only.
 OF_SCENES: Final[frozenset[Disturbance]] = frozenset({"gloss", "glass", "windows", "shadows", "motion blur"})

@@ -21,13 +21,11 @@ import numpy as np
 from calib.models.camera import Array
 from drivers.motors.simulated.simulated_base import Pose
 from omnid.errors import OmnidError
-from omnid.simulation.clearance import obstacles_of
 from omnid.simulation.people import Person
 from omnid.simulation.rendering.sensor import Sensor
 from omnid.simulation.rendering.shapes import Point
 from omnid.simulation.rendering.surfaces import Rectangle
 from omnid.simulation.robot import SimulatedRobot, make_robot
-from omnid.simulation.world import Ground, SunPatch, World
 from tests.simulation.building_parts import (
     BEHIND_M,
     Builder,
@@ -38,6 +36,7 @@ from tests.simulation.building_parts import (
     put_thing,
     trolley,
 )
+from tests.simulation.disturbed import BuildingWorld, Ground, SunPatch, disturbed
 
 # Names of floors, with the kinds of their textures.
 FLOORS: Final = {
@@ -68,7 +67,7 @@ class Trial:
     At a hazard, `things` and the edges of the floor are what must not be touched, and may end the way.
     """
 
-    world: World
+    world: BuildingWorld
     things: tuple[Rectangle, ...] | None = None  # None: nothing is in the way
     motion: Literal["ahead", "back", "turn left", "at random"] = "ahead"  # that is asked for
     changes: tuple[tuple[str, object], ...] = ()  # of fields of the robot
@@ -78,7 +77,7 @@ class Trial:
     def robot(self, size_px: int = 512) -> SimulatedRobot:
         """Return the robot, with images of a size that come as JPEG from a lens with vignetting."""
         usual = replace(make_robot(size_px), sensor=SENSOR, samples=math.ceil(SIDE_RAYS / size_px))
-        return replace(usual, **dict(self.changes))  # type: ignore[arg-type]
+        return disturbed(usual, **dict(self.changes))
 
 
 # By a pattern of names: the kind of the floor, None: one with a pattern, and what makes the trial of a match.
@@ -99,10 +98,10 @@ def made(makers: Makers, name: str, seed: int, floor: str | None = None) -> Tria
     return None
 
 
-def built(b: Builder, **fields: object) -> World:
+def built(b: Builder, **fields: object) -> BuildingWorld:
     """Return the world of what was built."""
     polished = {"is_polished": b.floor_kind == "slabs"}
-    return World("", tuple(b.faces), panes=tuple(b.panes), **(polished | fields))  # type: ignore[arg-type]
+    return BuildingWorld("", tuple(b.faces), panes=tuple(b.panes), **(polished | fields))  # type: ignore[arg-type]
 
 
 # Straight on
@@ -249,7 +248,7 @@ def _with_a_way(b: Builder, goal: Pose, put: Callable[[], None]) -> Trial:
     for _ in range(200):
         put()
         world = built(b)
-        if can_drive(obstacles_of(world, 1.2), (0.0, 0.0), goal[:2]):
+        if can_drive(world.obstacles(1.2), (0.0, 0.0), goal[:2]):
             return Trial(world, goal=goal)
         del b.faces[empty:]
     raise OmnidError("no way leads through what was put here 200 times; take another seed")

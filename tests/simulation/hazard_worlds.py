@@ -15,12 +15,11 @@ from typing import Final
 import numpy as np
 
 from omnid.errors import OmnidError
-from omnid.simulation.clearance import distances_m
 from omnid.simulation.people import Person, moved
 from omnid.simulation.rendering.shapes import Paint, Point, painted, solid
 from omnid.simulation.rendering.surfaces import Rectangle
-from omnid.simulation.robot import Push, Slip, WheelErrors
-from omnid.simulation.world import Ground
+from omnid.simulation.robot import WheelErrors
+from omnid.simulation.world import distances_m
 from tests.simulation import harmless_worlds
 from tests.simulation.building_parts import (
     BEHIND_M,
@@ -35,6 +34,7 @@ from tests.simulation.building_parts import (
     put_thing,
     trolley,
 )
+from tests.simulation.disturbed import Ground, Push, Slip
 from tests.simulation.harmless_worlds import Makers, Trial, built, made
 
 PRINTED: Final = ("box", "low_box", "block", "shelf", "drawer", "table")  # things with pictures on them
@@ -408,8 +408,8 @@ ALL_THINGS: Final = (*THINGS, "trolley")
 OF_ROBOT: Final[Makers] = {
     "lean_1deg": (None, partial(_robot, lean_rad=(0.0, math.radians(1.0)))),
     "pushed": (None, partial(_robot, pushes=(Push(5.0, 5.5, 0.3, 0.15), Push(11.0, 11.5, -0.3, -0.15)))),
-    "slip_20": (None, partial(_robot, wheels=WheelErrors(slips=(Slip(5.0, 7.0, 0.2), Slip(12.0, 14.0, 0.2))))),
-    "slip_40": (None, partial(_robot, wheels=WheelErrors(slips=(Slip(8.0, 10.0, 0.4),)))),
+    "slip_20": (None, partial(_robot, slips=(Slip(5.0, 7.0, 0.2), Slip(12.0, 14.0, 0.2)))),
+    "slip_40": (None, partial(_robot, slips=(Slip(8.0, 10.0, 0.4),))),
     "weak_motor": (None, partial(_robot, wheels=replace(USUAL, left=USUAL.left - 0.08))),
 }
 MAKERS: Final[Makers] = {

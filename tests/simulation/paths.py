@@ -7,7 +7,7 @@ from scipy.interpolate import CubicSpline
 
 from calib import se3
 from calib.models.camera import Array
-from omnid.simulation.clearance import clearance_m
+from omnid.simulation.world import clearance_m
 
 HEIGHT_M = 1.2
 

@@ -10,9 +10,9 @@ import numpy as np
 
 from calib.models.camera import Array
 from calib.rig import Rig
-from omnid.simulation.clearance import footprints
 from omnid.simulation.rendering.sensor import Sensor
 from omnid.simulation.rendering.surfaces import Scene
+from omnid.simulation.world import footprints
 from tests.simulation import paths
 from tests.simulation.builders import KEPT, corridor, room
 from tests.simulation.closed_worlds import bricks, ring, symmetric_room, twin_corridor, two_laps_path

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from omnid.errors import OmnidError
-from omnid.simulation.clearance import clearance_m, footprints, obstacles_of
 from omnid.simulation.rendering.shapes import box
 from omnid.simulation.rendering.surfaces import Rectangle
+from omnid.simulation.world import clearance_m, footprints
 from tests.bench.open_loop import ranges_m
 from tests.simulation.harmless_worlds import FLOORS, NAMES, can_drive
 from tests.simulation.hazard_worlds import HAZARDS, OF_ROBOT, trial
@@ -22,7 +22,7 @@ ALIKE = {f"{floor}_hall" for floor in FLOORS if floor != "plain"} | set(OF_ROBOT
 @pytest.mark.parametrize("name", sorted({*NAMES, *OF_ROBOT} - ALIKE))
 def test_nothing_stands_in_the_way_of_harmless_worlds(name: str) -> None:
     asked = trial(name, 1)
-    segments = obstacles_of(asked.world, ROBOT_M[1])
+    segments = asked.world.obstacles(ROBOT_M[1])
     if asked.goal is not None:
         assert can_drive(segments, (0.0, 0.0), asked.goal[:2])
         assert not can_drive(segments, (0.0, 0.0), (30.0, 15.0))
@@ -34,7 +34,7 @@ def test_nothing_stands_in_the_way_of_harmless_worlds(name: str) -> None:
 @pytest.mark.parametrize("name", [name for name in HAZARDS if not name.startswith(("plain_", "room_"))])
 def test_something_is_in_the_way_of_hazards(name: str) -> None:
     asked = trial(name, 1)
-    segments = obstacles_of(asked.world, ROBOT_M[1])
+    segments = asked.world.obstacles(ROBOT_M[1])
     assert clearance_m(segments, (0.0, 0.0), ROBOT_M[0]) > 0.1
     if name == "steep_ramp":
         assert asked.world.ground.heights_m(asked.way_m) < -0.7
@@ -64,10 +64,10 @@ def test_a_thing_of_a_contrast_has_it_in_the_image(percent: int) -> None:
 
 
 def test_a_ramp_lifts_and_pitches_the_base() -> None:
-    ground = trial("ramp_5", 1).world.ground
-    middle_m = float(np.mean([x_m for x_m, _ in ground.profile]))
+    world = trial("ramp_5", 1).world
+    middle_m = float(np.mean([x_m for x_m, _ in world.ground.profile]))
     for heading_rad, sign in ((0.0, 1), (math.pi, -1)):
-        T = ground.T_world_base((middle_m, 0.0, heading_rad))
+        T = world.T_world_base((middle_m, 0.0, heading_rad))
         assert T[2, 3] == pytest.approx(2.0 * math.tan(math.radians(5.0)), abs=1e-6)
         assert math.degrees(math.asin(T[2, 0])) == pytest.approx(sign * 5.0, abs=1e-6)
 

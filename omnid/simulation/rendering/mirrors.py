@@ -1,4 +1,4 @@
-"""What polished floors and panes of glass mirror, and patches of sun on a floor.
+"""What polished floors and panes of glass mirror.
 
 A reflection in a plane is the image of the world mirrored in that plane, seen where the plane is seen. Polished stone,
 lacquered wood and wet tiles reflect by Fresnel's equations for n = 1.5: 4 % straight down, 9 % at 60 degrees from the
@@ -13,7 +13,6 @@ from dataclasses import replace
 from functools import cached_property
 from typing import Final
 
-import cv2
 import numpy as np
 
 from calib.models.camera import Array
@@ -25,16 +24,6 @@ from omnid.simulation.rendering.surfaces import POSTER_GAP_M, Rectangle, Scene, 
 REFRACTIVE_INDEX: Final = 1.5  # of glass, glazed tiles, polish and lacquer
 WHITE: Final[Texture] = np.full((8, 8), 255, np.uint8)
 BLACK: Final[Texture] = np.zeros((8, 8), np.uint8)
-
-
-def _light_of_a_window() -> Texture:
-    """Return the light that falls through a window with a bar each way, its edges soft."""
-    pane = np.pad(np.full((38, 38), 255, np.float32), 2)
-    light = np.pad(np.tile(pane, (2, 2)), 6)
-    return np.rint(cv2.GaussianBlur(light, (0, 0), 2.0)).astype(np.uint8)
-
-
-PANES: Final[Texture] = _light_of_a_window()
 
 
 def reflectance(cosine: Floats) -> Floats:

@@ -113,8 +113,9 @@ def _lifted(camera: OmniCamera, supersample: int) -> tuple[Floats, Floats, Float
     rays = np.concatenate([camera.lift(pixels) for pixels in chunks])
     grid = rays.reshape(height * supersample, width * supersample, 3)
     solid_angle = np.linalg.norm(np.cross(np.gradient(grid, axis=0), np.gradient(grid, axis=1)), axis=2)
-    is_central = not isinstance(camera, NonCentralCamera)
-    origins = np.zeros((1, 3)) if is_central else np.concatenate([camera.rays(pixels)[0] for pixels in chunks])
+    origins = np.zeros((1, 3))
+    if isinstance(camera, NonCentralCamera):
+        origins = np.concatenate([camera.rays(pixels)[0] for pixels in chunks])
     return rays.astype(np.float32), origins.astype(np.float32), np.sqrt(solid_angle).astype(np.float32).ravel()
 
 

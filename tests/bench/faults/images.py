@@ -21,10 +21,11 @@ from numpy.typing import NDArray
 from drivers.frame import Camera, Frame
 from omnid.config import load_config
 from omnid.core.control.collision_monitor import RING_STALE, UNSEEN, UNWATCHED
-from omnid.simulation.lockstep import Fault, Moment, Request, Tamper, simulate
+from omnid.simulation.lockstep import Moment, Request
 from omnid.simulation.robot import make_robot
 from tests.bench.obstacles import ahead
 from tests.bench.results import Column, ResultTable
+from tests.simulation.disturbed import Fault, Tamper, simulate
 from tests.simulation.hazard_worlds import trial
 
 Image = NDArray[np.uint8]

@@ -15,10 +15,11 @@ from omnid.config import load_config
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.navigation.requests import GoalRequest, NavigationFrame
 from omnid.navigation_state import NavigationState
-from omnid.simulation.lockstep import Fault, Moment, Request, SimulatedRun, simulate
-from omnid.simulation.robot import Slip, WheelErrors, make_robot
+from omnid.simulation.lockstep import Moment, Request, SimulatedRun
+from omnid.simulation.robot import make_robot
 from omnid.simulation.world import World
 from omnid.simulation.world_file import load_world
+from tests.simulation.disturbed import Fault, Slip, disturbed, simulate
 
 SIZE = 160
 CONFIG = load_config(None, ["controller.collision.unknown=slow"])  # such small images show little of the floor
@@ -85,7 +86,7 @@ def test_a_goal_is_reached_by_the_true_robot() -> None:
 
 
 def test_slipping_wheels_hardly_move_the_robot_and_are_noticed() -> None:
-    robot = replace(make_robot(SIZE), wheels=WheelErrors(slips=(Slip(1.5, 9.0, 0.9),)))
+    robot = disturbed(make_robot(SIZE), slips=(Slip(1.5, 9.0, 0.9),))
     run = simulate(world(), robot, forward, seconds=2.5, seed=1, config=CONFIG)
     x_m = run.truth_in_odom[:, 0, 3]
     assert x_m[14] - x_m[10] > 0.08 and x_m[24] - x_m[20] < 0.02

@@ -10,12 +10,13 @@ import pytest
 
 from omnid.config import load_config
 from omnid.core.control.collision_monitor import IMAGES_REMEDY, UNSEEN, UNWATCHED
-from omnid.simulation.lockstep import Fault, SimulatedRun, Tamper, simulate
+from omnid.simulation.lockstep import SimulatedRun
 from omnid.simulation.robot import make_robot
 from omnid.simulation.world import World
 from omnid.simulation.world_file import load_world
 from tests.bench.faults.images import Frozen, sector
 from tests.bench.obstacles import ahead
+from tests.simulation.disturbed import Fault, Tamper, simulate
 
 SIZE_PX = 256
 STARTS_S = 1.5

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from omnid.errors import OmnidError
-from omnid.simulation.clearance import clearance_m, footprints
 from omnid.simulation.people import Walkers
 from omnid.simulation.rendering import shapes
+from omnid.simulation.world import clearance_m
 from omnid.simulation.world_file import WorldOptions, load_world, shipped_worlds
 
 HALL = """
@@ -48,13 +48,13 @@ def write(folder: Path, text: str) -> str:
 def test_walls_have_doors_and_boxes_have_outlines(tmp_path: Path) -> None:
     world = load_world(write(tmp_path, HALL), 1)
     assert world.start == pytest.approx((0.0, 0.0, np.pi / 2))
-    segments = footprints(world.standing, 1.2)
+    segments = world.obstacles(1.2)
     assert clearance_m(segments, (2.0, 0.05), 0.2) == pytest.approx(0.25)  # in the door: 0.45 m to either side
     assert clearance_m(segments, (2.0, 0.8), 0.2) == pytest.approx(-0.2)  # in the wall
     assert clearance_m(segments, (0.0, 0.0), 0.2) == pytest.approx(0.7)
-    assert clearance_m(footprints(world.standing, 2.5), (2.0, 0.05), 0.2) == pytest.approx(-0.2)  # the lintel
+    assert clearance_m(world.obstacles(2.5), (2.0, 0.05), 0.2) == pytest.approx(-0.2)  # the lintel
     raised = load_world(write(tmp_path, HALL.replace("[0.4, 0.2, 0.5]", "[0.4, 0.2, 0.5]\nbottom_m = 1.3")), 1)
-    assert clearance_m(footprints(raised.standing, 1.2), (0.0, 1.0), 0.2) > 0.5  # below the box
+    assert clearance_m(raised.obstacles(1.2), (0.0, 1.0), 0.2) > 0.5  # below the box
 
 
 @pytest.mark.parametrize("name", shipped_worlds())
@@ -62,7 +62,7 @@ def test_shipped_worlds_are_drawn_from_a_seed(name: str) -> None:
     one, same, other = load_world(name, 1), load_world(name, 1), load_world(name, 2)
     assert all(np.array_equal(a.texture, b.texture) for a, b in zip(one.standing, same.standing, strict=True))
     assert not all(np.array_equal(a.texture, b.texture) for a, b in zip(one.standing, other.standing, strict=False))
-    assert clearance_m(footprints(one.standing, 1.2), one.start[:2], 0.2) > 0.3
+    assert clearance_m(one.obstacles(1.2), one.start[:2], 0.2) > 0.3
 
 
 @pytest.mark.parametrize(
