@@ -25,7 +25,7 @@ from calib import se3
 from calib.errors import CalibError, within
 from calib.foreign_models import camera_of_lists, camera_of_names
 from calib.models.camera import Array, OmniCamera
-from calib.models.equirectangular import full_turn
+from calib.models.lens import full_turn
 from calib.models.names import sees_directly
 from calib.models.ocam import MAX_COEFFICIENTS, OcamCamera, View
 from calib.models.unified import UnifiedCamera

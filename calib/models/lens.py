@@ -1,4 +1,4 @@
-"""Models of fisheye lenses that Kalibr calibrates: double sphere, extended unified, and pinhole with equidistant lens.
+"""Models of cameras without a mirror: double sphere, extended unified, equidistant, and equirectangular images.
 
 A lens sees the world directly, and nothing is flipped. What belongs to mirrors does not apply to it: a hub in the
 middle of the image, and aberrations of a reflected wavefront.
@@ -6,6 +6,7 @@ middle of the image, and aberrations of a reflected wavefront.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,10 +15,77 @@ from numpy.typing import NDArray
 from calib.errors import CalibError
 from calib.models.camera import CONVERGED_PART, NEWTON_STEPS, Array
 
+# Columns by which a full turn may differ from the image's width, so that the two ends of the image still meet.
+SEAM_PX = 1e-3
+
+
+class _Lens:
+    """What all models have: focal lengths (fu, fv) [px], centre (pu, pv) [px], size."""
+
+    __slots__ = ()
+    focal: tuple[float, float]
+    center: tuple[float, float]
+    size: tuple[int, int]
+
+    def _check(self, name: str, *parameters: float, fits: bool = True, expected: str = "") -> None:
+        """Raise CalibError for parameters that no such camera has."""
+        values = (*parameters, *self.focal, *self.center)
+        if not np.isfinite(values).all():
+            raise CalibError(f"{name} camera: every parameter must be a finite number, found {values}")
+        if min(self.focal) <= 0 or min(self.size) < 1:
+            raise CalibError(
+                f"{name} camera: expected fu and fv above 0 and a size, found focal {self.focal}, size {self.size}"
+            )
+        if not fits:
+            raise CalibError(f"{name} camera: expected {expected}, found {' and '.join(map(str, parameters))}")
+
+    def _pixels(self, x: Array, y: Array, scale: Array, seen: NDArray[np.bool_]) -> Array:
+        """Return the pixels (N, 2) of (x, y) / scale on the plane; NaN for what is not seen."""
+        scale = np.where(seen & (scale > 0), scale, np.nan)
+        return np.column_stack([x / scale, y / scale]) * self.focal + self.center
+
+    def _plane(self, pixels: Array) -> tuple[Array, Array, Array]:
+        """Return mx, my and the square of their radius."""
+        mx, my = ((np.asarray(pixels, float) - self.center) / self.focal).T
+        return mx, my, mx * mx + my * my
+
+
+class _Spheres(_Lens):
+    """What the double sphere and the extended unified model have in common: parameters xi, alpha, beta.
+
+    With z' = xi |p| + z and d = sqrt(beta (x^2 + y^2) + z'^2) the image is (x, y) / (alpha d + (1 - alpha) z').
+    """
+
+    __slots__ = ()
+
+    @property
+    def _parameters(self) -> tuple[float, float, float]:
+        raise NotImplementedError
+
+    def project(self, points: Array) -> Array:
+        """Return pixels (N, 2) of points (N, 3); NaN where the lens does not see them."""
+        x, y, z = np.asarray(points, float).T
+        xi, alpha, beta = self._parameters
+        r2 = beta * (x * x + y * y)
+        d1 = np.sqrt(r2 + z * z)
+        shifted = xi * d1 + z
+        w1 = alpha / (1 - alpha) if alpha <= 0.5 else (1 - alpha) / alpha
+        w2 = (w1 + xi) / np.sqrt(2 * w1 * xi + xi**2 + 1)
+        scale = alpha * np.sqrt(r2 + shifted**2) + (1 - alpha) * shifted
+        return self._pixels(x, y, scale, seen=(z > -w2 * d1) & (d1 > 0))
+
+    def lift(self, pixels: Array) -> Array:
+        """Return unit rays (N, 3) of pixels (N, 2); NaN where there is none."""
+        mx, my, r2 = self._plane(pixels)
+        xi, alpha, beta = self._parameters
+        mz = (1 - alpha**2 * beta * r2) / (alpha * _root(1 - (2 * alpha - 1) * beta * r2) + 1 - alpha)
+        k = (mz * xi + _root(mz**2 + (1 - xi**2) * r2)) / (mz**2 + r2)
+        return np.column_stack([k * mx, k * my, k * mz - xi])
+
 
 @dataclass(frozen=True, slots=True)
-class DoubleSphereCamera:
-    """Model `ds` of Usenko, Demmel, Cremers 2018: xi, alpha, focal lengths (fu, fv) [px], centre (pu, pv) [px]."""
+class DoubleSphereCamera(_Spheres):
+    """Model `ds` of Usenko, Demmel, Cremers 2018, eq. (40) to (51): xi, alpha."""
 
     xi: float
     alpha: float
@@ -26,33 +94,17 @@ class DoubleSphereCamera:
     size: tuple[int, int]
 
     def __post_init__(self) -> None:
-        check_plane("ds", (self.xi, self.alpha), self.focal, self.center, self.size)
-        if not (-1 < self.xi < 1 and 0 <= self.alpha <= 1):
-            raise CalibError(
-                f"ds camera: expected xi between -1 and 1 and alpha of 0 to 1, found {self.xi} and {self.alpha}"
-            )
+        fits = -1 < self.xi < 1 and 0 <= self.alpha <= 1
+        self._check("ds", self.xi, self.alpha, fits=fits, expected="xi between -1 and 1 and alpha of 0 to 1")
 
-    def project(self, points: Array) -> Array:
-        """Return pixels (N, 2) of points (N, 3); NaN where the lens does not see them. Eq. (40) to (45)."""
-        x, y, z = np.asarray(points, float).T
-        d1 = np.sqrt(x * x + y * y + z * z)
-        shifted = self.xi * d1 + z
-        w1 = _edge(self.alpha)
-        w2 = (w1 + self.xi) / np.sqrt(2 * w1 * self.xi + self.xi**2 + 1)
-        scale = self.alpha * np.sqrt(x * x + y * y + shifted**2) + (1 - self.alpha) * shifted
-        return _pixels(self, x, y, scale, seen=(z > -w2 * d1) & (d1 > 0))
-
-    def lift(self, pixels: Array) -> Array:
-        """Return unit rays (N, 3) of pixels (N, 2); NaN where there is none. Eq. (46) to (51)."""
-        mx, my, r2 = _plane(self, pixels)
-        mz = _height(self.alpha, r2)
-        k = (mz * self.xi + _root(mz**2 + (1 - self.xi**2) * r2)) / (mz**2 + r2)
-        return np.column_stack([k * mx, k * my, k * mz - self.xi])
+    @property
+    def _parameters(self) -> tuple[float, float, float]:
+        return self.xi, self.alpha, 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class ExtendedUnifiedCamera:
-    """Model `eucm` of Khomutenko, Garcia, Martinet 2016: alpha, beta, focal lengths (fu, fv), centre (pu, pv) [px]."""
+class ExtendedUnifiedCamera(_Spheres):
+    """Model `eucm` of Khomutenko, Garcia, Martinet 2016, eq. (3) to (5), (12): alpha, beta."""
 
     alpha: float
     beta: float
@@ -61,27 +113,17 @@ class ExtendedUnifiedCamera:
     size: tuple[int, int]
 
     def __post_init__(self) -> None:
-        check_plane("eucm", (self.alpha, self.beta), self.focal, self.center, self.size)
-        if not (0 <= self.alpha <= 1 and self.beta > 0):
-            raise CalibError(f"eucm camera: expected alpha of 0 to 1 and beta above 0, found {self.alpha}, {self.beta}")
+        fits = 0 <= self.alpha <= 1 and self.beta > 0
+        self._check("eucm", self.alpha, self.beta, fits=fits, expected="alpha of 0 to 1 and beta above 0")
 
-    def project(self, points: Array) -> Array:
-        """Return pixels (N, 2) of points (N, 3); NaN where the lens does not see them. Eq. (3) to (5)."""
-        x, y, z = np.asarray(points, float).T
-        d = np.sqrt(self.beta * (x * x + y * y) + z * z)
-        scale = self.alpha * d + (1 - self.alpha) * z
-        return _pixels(self, x, y, scale, seen=(z > -_edge(self.alpha) * d) & (d > 0))
-
-    def lift(self, pixels: Array) -> Array:
-        """Return unit rays (N, 3) of pixels (N, 2); NaN where there is none. Eq. (12)."""
-        mx, my, r2 = _plane(self, pixels)
-        mz = _height(self.alpha, self.beta * r2)
-        return np.asarray(np.column_stack([mx, my, mz]) / np.sqrt(r2 + mz**2)[:, None])
+    @property
+    def _parameters(self) -> tuple[float, float, float]:
+        return 0.0, self.alpha, self.beta
 
 
 @dataclass(frozen=True, slots=True)
-class EquidistantCamera:
-    """Pinhole with an equidistant lens, `pinhole-equi`, of Kannala and Brandt 2006: k1 to k4, (fu, fv), (pu, pv) [px].
+class EquidistantCamera(_Lens):
+    """Pinhole with an equidistant lens, `pinhole-equi`, of Kannala and Brandt 2006: k1 to k4.
 
     The distance from the centre grows with the angle t from the axis: t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8).
     """
@@ -92,7 +134,7 @@ class EquidistantCamera:
     size: tuple[int, int]
 
     def __post_init__(self) -> None:
-        check_plane("equidistant", self.coefficients, self.focal, self.center, self.size)
+        self._check("equidistant", *self.coefficients)
 
     @property
     def widest_rad(self) -> float:
@@ -108,11 +150,11 @@ class EquidistantCamera:
         angle = np.arctan2(r, z)
         with np.errstate(invalid="ignore", divide="ignore"):
             scale = np.where(r > 0, r / self._radius(angle), z)
-        return _pixels(self, x, y, scale, seen=(angle < self.widest_rad) & np.isfinite(x + y + z))
+        return self._pixels(x, y, scale, seen=(angle < self.widest_rad) & np.isfinite(x + y + z))
 
     def lift(self, pixels: Array) -> Array:
         """Return unit rays (N, 3) of pixels (N, 2), by Newton's method; NaN where there is none."""
-        mx, my, r2 = _plane(self, pixels)
+        mx, my, r2 = self._plane(pixels)
         radius, widest, slope = np.sqrt(r2), self.widest_rad, self._slope
         angle = np.minimum(radius, widest)
         with np.errstate(all="ignore"):
@@ -131,46 +173,57 @@ class EquidistantCamera:
         return np.polynomial.Polynomial([(2 * k + 1) * a for k, a in enumerate((1.0, *self.coefficients))])
 
 
-LensCamera = DoubleSphereCamera | ExtendedUnifiedCamera | EquidistantCamera
+@dataclass(frozen=True, slots=True)
+class EquirectangularCamera(_Lens):
+    """Images of 360 degrees as cameras stitch them: columns are azimuths, rows elevations; (fu, fv) of a radian.
+
+    In the camera frame x is to the right, y down, z ahead: u = pu + fu atan2(x, z), v = pv + fv atan2(y, hypot(x, z)).
+    A stitched image of a full turn has fu = width / (2 pi); rows may be cut off at its top and its bottom.
+    """
+
+    focal: tuple[float, float]
+    center: tuple[float, float]
+    size: tuple[int, int]
+
+    def __post_init__(self) -> None:
+        self._check("equirectangular")
+        if self.size[0] > self._turn_px + SEAM_PX:
+            raise CalibError(
+                f"equirectangular camera: {self.size[0]} columns are more than a full turn of {self._turn_px:.1f}"
+            )
+
+    @property
+    def _turn_px(self) -> float:
+        return 2 * math.pi * self.focal[0]
+
+    def project(self, points: Array) -> Array:
+        """Return pixels (N, 2) of points (N, 3); NaN for the origin and for what is not finite.
+
+        Between the middles of the last and of the first column of a full turn, the nearer one is taken.
+        """
+        x, y, z = np.asarray(points, float).T
+        azimuth, elevation = np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))
+        azimuth = np.where(((x == 0) & (y == 0) & (z == 0)) | ~np.isfinite(x + y + z), np.nan, azimuth)
+        u, middle = self.center[0] + self.focal[0] * azimuth, (self.size[0] - 1) / 2
+        u = middle + (u - middle + self._turn_px / 2) % self._turn_px - self._turn_px / 2
+        if abs(self._turn_px - self.size[0]) <= SEAM_PX:
+            u = np.clip(u, 0.0, self.size[0] - 1.0)
+        return np.column_stack([u, self.center[1] + self.focal[1] * elevation])
+
+    def lift(self, pixels: Array) -> Array:
+        """Return unit rays (N, 3) of pixels (N, 2); NaN above the zenith and below the nadir."""
+        azimuth, elevation, _ = self._plane(pixels)
+        elevation = np.where(np.abs(elevation) <= math.pi / 2, elevation, np.nan)
+        level = np.cos(elevation)
+        return np.column_stack([level * np.sin(azimuth), np.sin(elevation), level * np.cos(azimuth)])
 
 
-def check_plane(
-    name: str,
-    parameters: tuple[float, ...],
-    focal: tuple[float, float],
-    center: tuple[float, float],
-    size: tuple[int, int],
-) -> None:
-    """Raise CalibError for parameters that no camera without a flip has."""
-    values = (*parameters, *focal, *center)
-    if not np.isfinite(values).all():
-        raise CalibError(f"{name} camera: every parameter must be a finite number, found {values}")
-    if min(focal) <= 0 or min(size) < 1:
-        raise CalibError(f"{name} camera: expected fu and fv above 0 and a size, found focal {focal}, size {size}")
-
-
-def _edge(alpha: float) -> float:
-    """Return the bound of z / distance of visible points, its sign changed."""
-    return alpha / (1 - alpha) if alpha <= 0.5 else (1 - alpha) / alpha
-
-
-def _height(alpha: float, r2: Array) -> Array:
-    """Return the third component of the ray of a point of the plane at a squared radius; NaN where there is none."""
-    return np.asarray((1 - alpha**2 * r2) / (alpha * _root(1 - (2 * alpha - 1) * r2) + 1 - alpha))
+def full_turn(size: tuple[int, int], top_px: int = 0) -> EquirectangularCamera:
+    """Return the camera of stitched images of a full turn, without the first top_px rows of those of half the width."""
+    per_rad = size[0] / (2 * math.pi)
+    return EquirectangularCamera((per_rad, per_rad), ((size[0] - 1) / 2, (size[0] / 2 - 1) / 2 - top_px), size)
 
 
 def _root(values: Array) -> Array:
     """Return square roots; NaN of negative values."""
     return np.asarray(np.sqrt(np.where(values >= 0, values, np.nan)))
-
-
-def _pixels(camera: LensCamera, x: Array, y: Array, scale: Array, seen: NDArray[np.bool_]) -> Array:
-    """Return the pixels (N, 2) of (x, y) / scale on the plane; NaN for what is not seen."""
-    scale = np.where(seen & (scale > 0), scale, np.nan)
-    return np.column_stack([x / scale, y / scale]) * camera.focal + camera.center
-
-
-def _plane(camera: LensCamera, pixels: Array) -> tuple[Array, Array, Array]:
-    """Return mx, my and the square of their radius."""
-    mx, my = ((np.asarray(pixels, float) - camera.center) / camera.focal).T
-    return mx, my, mx * mx + my * my

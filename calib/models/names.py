@@ -10,8 +10,7 @@ import numpy as np
 
 from calib.errors import CalibError
 from calib.models.camera import Mask, OmniCamera, inscribed_mask, whole_image
-from calib.models.equirectangular import EquirectangularCamera
-from calib.models.lens import DoubleSphereCamera, EquidistantCamera, ExtendedUnifiedCamera
+from calib.models.lens import DoubleSphereCamera, EquidistantCamera, EquirectangularCamera, ExtendedUnifiedCamera
 from calib.models.ocam import ASTIGMATISM_NAMES, DISTANCE_M, TANGENTIAL_NAMES, OcamCamera, View
 from calib.models.unified import DISTORTION_NAMES, UnifiedCamera
 from calib.models.wavefront import WAVEFRONT_NAMES

@@ -30,7 +30,7 @@ from typing import Final
 import numpy as np
 
 import omnid
-from calib.models.equirectangular import full_turn
+from calib.models.lens import full_turn
 from calib.rig import ShutterTimes
 from calib.rig_covariance import RigCovariance
 from calib.rig_file import read_rig

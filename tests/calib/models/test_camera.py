@@ -9,8 +9,7 @@ import pytest
 
 from calib.errors import CalibError
 from calib.models.camera import Array, Mask, OmniCamera, inscribed_mask
-from calib.models.equirectangular import EquirectangularCamera
-from calib.models.lens import DoubleSphereCamera, EquidistantCamera, ExtendedUnifiedCamera
+from calib.models.lens import DoubleSphereCamera, EquidistantCamera, EquirectangularCamera, ExtendedUnifiedCamera
 from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
 
