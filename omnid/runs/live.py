@@ -307,7 +307,9 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
     if config.bus.panorama_hz:
         outputs.poses["panorama"] = PanoramaSink(bus, config.bus.panorama_hz, clock.unix_ns)
     if health.uses_views:
-        outputs.poses["rig"] = lambda pose: health.drive(pose.depth.panoramas, pose.depth.exposure)
+        outputs.poses["rig"] = lambda pose: health.drive(
+            pose.depth.panoramas, pose.T_odom_rig[:3, 3], pose.depth.exposure
+        )
     if controller is not None:
         outputs.rings["controller-ring"] = lambda ring: controller.send(controller_ring(ring))
 

@@ -20,7 +20,7 @@ from omnid.core.odometry.estimates import PoseEstimate
 from omnid.core.odometry.exposure_times import RigVelocity
 from omnid.core.odometry.first_depths import FirstDepths
 from omnid.core.odometry.landmarks import NewLandmarks
-from omnid.core.odometry.plane_patches import AlignedPatches, align, moved_slopes, plane_templates
+from omnid.core.odometry.plane_patches import REACH_PX, AlignedPatches, align, moved_slopes, plane_templates
 from omnid.core.odometry.tracking import KltSettings, track
 from omnid.core.stereo.triangulation import MIN_RADIUS2_M2, point_covariance, triangulate, view
 from omnid.core.types.panorama import PaddedPanorama
@@ -33,8 +33,6 @@ Indices = NDArray[np.intp]
 CORRELATED_FRAMES = 4.0  # frames whose disparities of one landmark count as one
 OUTLIER_SQUARED = 9.0  # squared distance (3 sigma) from which a disparity is not used, so that 0.3 % of right ones are
 COARSE_ITERATIONS = 8  # Iterations of Lucas-Kanade on each level, few because the patches are aligned afterwards.
-# Reach of the alignment, because a new landmark, whose depth is uncertain, may be off by more than a pixel.
-REACH_PX = 2
 # Px: a landmark predicted nearer to the panorama's upper or lower edge is not tracked.
 EDGE_ROWS = 3
 
@@ -299,10 +297,20 @@ class LocalMap:
         rows = np.flatnonzero(is_inside)
         return rows, predicted[rows]
 
-    def align(self, lower: PaddedPanorama, T_odom_rect: Array, landmarks: Indices, predicted: Array) -> AlignedPatches:
+    def align(
+        self,
+        panorama: PaddedPanorama,
+        T_odom_rect: Array,
+        landmarks: Indices,
+        predicted: Array,
+        reach_px: int = REACH_PX,
+        *,
+        upper: bool = False,
+    ) -> AlignedPatches:
         """Align the keyframes' patches of landmarks (M,) with a panorama whose pose is known well.
 
-        predicted (M, 2): their pixels by that pose. A patch is found where it has texture and moved little from there.
+        predicted (M, 2): their pixels by that pose. A patch is found where it has texture and moved by less than
+        reach_px from there. upper: it is the upper panorama.
         """
         table, keyframes = self.table, self.keyframes
         anchors = table.anchor[landmarks]
@@ -310,9 +318,9 @@ class LocalMap:
         surfaces = table.anchor_points[landmarks], table.slopes[landmarks]
         images = {seq: keyframe.lower for seq, keyframe in keyframes.items()}
         templates = plane_templates(
-            images, anchors, table.anchor_pixels[landmarks], surfaces, T_curr_ref, self._model, predicted
+            images, anchors, table.anchor_pixels[landmarks], surfaces, T_curr_ref, self._model, predicted, upper=upper
         )
-        return align(templates, lower, predicted)
+        return align(templates, panorama, predicted, reach_px)
 
     def slopes(self, T_odom_rect: Array, landmarks: Indices) -> Array:
         """Return the slopes (M, 2) of the disparity of landmarks (M,) [px/px] in a panorama with that pose."""

@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
 from typing import Final
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -48,15 +46,10 @@ PATIENT_PAIRS: Final = 5
 # Views that are kept, and new views after which the rig is checked again, because at the default period they take 80 s
 # of driving.
 VIEWS: Final = 16
-# Different places for a check, because walls in fewer directions may all bias it to the same side.
-MIN_PLACES: Final = 6
+VIEW_M: Final = 0.3  # between two views, because one place shows the same points again
 # Newest views that show alone that the rig is broken, because a mirror was knocked, and the wheels must not wait for
 # VIEWS.
 RECENT_VIEWS: Final = 3
-# Least correlation of the thumbnails of two views of one place, because those 15 cm apart in a corridor are so alike.
-SAME_VIEW_CORRELATION: Final = 0.8
-# Columns and rows of a thumbnail: three degrees a column, so that noise and small parts do not make a place new.
-THUMBNAIL: Final = (128, 24)
 
 
 class FirstPairs:
@@ -114,21 +107,6 @@ class FirstPairs:
             self.state = state
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _View:
-    thumbnail: Array  # (N,) of mean 0 and length 1
-    matches: Matches
-
-
-def _thumbnail(pair: PanoramaPair) -> Array:
-    """Return the common view of both cameras in the lower panorama as a vector (N,) of mean 0 and norm 1, or all 0."""
-    small = cv2.resize(pair.lower.panorama, THUMBNAIL, interpolation=cv2.INTER_AREA).astype(float)
-    seen = cv2.resize(pair.visible.astype(np.uint8), THUMBNAIL, interpolation=cv2.INTER_AREA) > 0
-    grey = small[seen] - small[seen].mean() if seen.any() else np.zeros(0)
-    length = float(np.linalg.norm(grey))
-    return np.asarray(grey / length if length > 0 else grey)
-
-
 EXCHANGE: Final = (
     "exchange --lower and --upper, or the cameras in the configuration; if that does not help, the rig "
     "is that of other cameras"
@@ -160,7 +138,8 @@ class RigHealth:
         self._since = ""  # when the state was found, as a line begins
         self.uses_views = every_s > 0  # True if views of the drive are used
         self._every_ns, self._used_ns, self._newest_ns = every_s * 1e9, math.inf, 0
-        self._views: deque[_View] = deque(maxlen=VIEWS)
+        self._views: deque[Matches] = deque(maxlen=VIEWS)
+        self._view_at: Array | None = None  # (3,) m: where the newest of them was seen
         self.new_views = 0  # views of the drive since the last whole check
         self._later = RigState.UNCHECKED  # state by the views of the drive
         self.finding: RigFinding | None = None  # the newest finding of the drive; None before the first
@@ -251,33 +230,27 @@ class RigHealth:
         if self._running is None and self._mode != "off":
             self._running = FirstPairs(self._cylinder)
 
-    def drive(self, pair: PanoramaPair, exposure: Exposure | None = None) -> None:
+    def drive(self, pair: PanoramaPair, position: Array, exposure: Exposure | None = None) -> None:
         """Use a pair of the drive if it is due; a finding changes the state unless it saw too little.
 
-        exposure: as in `begin`. A view of a new place takes 10 to 20 ms, a check after VIEWS of them 20 to 50 ms more,
+        position (3,) [m] of the rig in odom; exposure: as in `begin`. The newest views count, so that older ones are
+        forgotten with the path. A view of a new place takes 10 to 20 ms, a check after VIEWS of them 20 to 50 ms more,
         all other pairs almost nothing.
         """
-        # 1. A pair that is due, and whose motion is known.
+        # 1. A pair that is due, of another place, and whose motion is known.
         self._newest_ns = pair.stamp_ns
         is_due = not self._used_ns <= pair.stamp_ns < self._used_ns + self._every_ns
-        if not self.uses_views or not is_due or is_motion_unknown(pair, exposure):
+        is_new = self._view_at is None or float(np.linalg.norm(position - self._view_at)) >= VIEW_M
+        if not (self.uses_views and is_due and is_new) or is_motion_unknown(pair, exposure):
             return
-        self._used_ns = pair.stamp_ns
-        # 2. Keep its view, in the place of an older one of this place; not if the last one is of this place.
-        thumbnail = _thumbnail(pair)
-        same_place = [float(thumbnail @ view.thumbnail) > SAME_VIEW_CORRELATION for view in self._views]
-        is_new = thumbnail.any() and not any(same_place[-1:])
-        if is_new:
-            if any(same_place):
-                del self._views[same_place.index(True)]
-            self._views.append(_View(thumbnail, match(pair.lower, pair.upper, pair.visible, exposure)))
-            self.new_views += 1
-        # 3. A whole check, after enough new views of enough places; the newest views alone may show a broken rig.
-        is_whole = self.new_views >= VIEWS and len(self._views) >= MIN_PLACES
-        if not is_whole and not (is_new and len(self._views) >= RECENT_VIEWS):
+        self._used_ns, self._view_at = pair.stamp_ns, position
+        self._views.append(match(pair.lower, pair.upper, pair.visible, exposure))
+        self.new_views += 1
+        # 2. A whole check, after enough new views; the newest views alone may show a broken rig.
+        is_whole = self.new_views >= VIEWS
+        if not is_whole and len(self._views) < RECENT_VIEWS:
             return
-        newest = list(self._views)[0 if is_whole else -RECENT_VIEWS :]
-        finding = judge(together(view.matches for view in newest), self._cylinder)
+        finding = judge(together(list(self._views)[0 if is_whole else -RECENT_VIEWS :]), self._cylinder)
         if is_whole:
             self.new_views = 0
         elif finding.misfit_deg <= BROKEN_DEG:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import cache
 from itertools import islice
@@ -55,10 +55,13 @@ def rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Driver:
-    """A sink of panoramas that shows them to the state as views of the drive."""
+    """A sink of panoramas that shows them to the state as views of a drive, 1 m apart."""
 
     def __init__(self, health: RigHealth) -> None:
-        self.process = health.drive
+        self._health = health
+
+    def process(self, panoramas: Panoramas) -> None:
+        self._health.drive(panoramas, np.array([panoramas.seq, 0.0, 0.0]))
 
 
 class Collector(list[Panoramas]):
@@ -99,12 +102,16 @@ def turned(rooms: Path) -> Turned:
     return cache(lambda turn_deg: monitored(rooms, with_upper_rotated(right, turn_deg), VIEWS))
 
 
-def driven(place: Geometry, panoramas: Sequence[Panoramas]) -> RigHealth:
-    """Return the state after these views of a drive, PERIOD_S apart."""
-    health = RigHealth(place.cylinder, "off", PERIOD_S)
+def drive(health: RigHealth, panoramas: Iterable[Panoramas], apart_m: float = 1.0) -> RigHealth:
+    """Return the state after these views of a drive, PERIOD_S and so far apart."""
     for number, one in enumerate(panoramas):
-        health.drive(replace(one, seq=number, stamp_ns=round(number * PERIOD_S * SECONDS)))
+        stamped = replace(one, seq=number, stamp_ns=round(number * PERIOD_S * SECONDS))
+        health.drive(stamped, np.array([number * apart_m, 0.0, 0.0]))
     return health
+
+
+def driven(place: Geometry, panoramas: Iterable[Panoramas], apart_m: float = 1.0) -> RigHealth:
+    return drive(RigHealth(place.cylinder, "off", PERIOD_S), panoramas, apart_m)
 
 
 def started(place: Geometry, pairs: Iterable[Panoramas], mode: str = "warn") -> RigHealth:
@@ -139,7 +146,7 @@ def test_three_degrees_are_an_error(turned: Turned) -> None:
 
 
 def test_a_robot_that_stands_gets_no_finding(place: Geometry, true: tuple[RigHealth, Collector]) -> None:
-    status = entry(RIG, rig_stats(driven(place, true[1][:1] * 100)))
+    status = entry(RIG, rig_stats(driven(place, true[1][:1] * 100, 0.0)))
     assert (status.level, status.values) == (0, {"state": "unchecked", "new_views": "1", "needed_views": str(VIEWS)})
     assert status.message.startswith("not checked yet")
 
@@ -162,7 +169,8 @@ def test_a_mirror_that_is_knocked_makes_the_poses_degraded(place: Geometry, true
     poses = FrontEnd(place, config, health).poses
     for number, right in enumerate(true[1][:8]):
         turned = wrapped(np.roll(right.upper.panorama, columns * (number >= 4), axis=1))
-        health.drive(replace(right, upper=turned, seq=number, stamp_ns=round(number * PERIOD_S * SECONDS)))
+        shown = replace(right, upper=turned, stamp_ns=round(number * PERIOD_S * SECONDS))
+        health.drive(shown, np.array([number, 0.0, 0.0]))
         assert health.state.is_contradicted == (number >= 6), "the newest three views decide"
     assert entry(RIG, rig_stats(health)).level == 2
     assert poses.process(true[1][8]).state is TrackingState.DEGRADED
@@ -216,8 +224,7 @@ def test_the_drive_overrules_the_start_except_for_exchanged_cameras(
     ):
         health = started(place, first[:4])
         begun = health.state
-        for number, one in enumerate(later[:VIEWS]):
-            health.drive(replace(one, seq=number, stamp_ns=round(number * PERIOD_S * SECONDS)))
+        drive(health, later[:VIEWS])
         assert health.state is state and begun in (state, RigState.BROKEN, RigState.FITS)
     assert entry(RIG, rig_stats(health)).level == 2 and "exchange" in entry(RIG, rig_stats(health)).message
 
