@@ -5,16 +5,20 @@ T_rig_body of that body, and the unknown pose T_truth_odom of the estimate's wor
 
     T_truth_body(t + delay) = T_truth_odom T_odom_rig(t) T_rig_body.
 
-Both poses and the delay are fitted by Gauss-Newton in one linearisation: with E = T_odom_rig T_rig_body and the body's
-twist v, the residual r = log((T_truth_odom E)^-1 T_truth_body) changes by -Ad(E^-1) a - x + v delay. The same is done
-for other conventions in which the file may be written. The simplest difference that explains the error is reported, if
-what each half of the drive shows of it explains the error of the other half: drift, jumps and other drives show none.
+With A = R_truth_odom^T this is linear in A, R_rig_body and both translations (robot-world and hand-eye calibration,
+Shah 2013, with the positions in the same system):
+
+    A R_truth_body = R_odom_rig R_rig_body,    A p_truth_body = R_odom_rig t_rig_body + p_odom_rig + c.
+
+Rotations are the nearest ones to the solution. The same is done for other conventions in which the file may be written.
+The simplest difference that explains the error is reported, if what each half of the drive shows of it explains the
+error of the other half: drift, jumps and other drives show none.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
 from typing import Final, NamedTuple
@@ -22,6 +26,7 @@ from typing import Final, NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from calib import se3
@@ -35,10 +40,8 @@ SMALL_ERROR: Final = 0.02  # as a fraction of the path's spread, and rad: that o
 # Units of positions, as the number of them in a metre.
 UNITS: Final = {"m": 1.0, "mm": 1e3, "cm": 1e2, "km": 1e-3, "feet": 1 / 0.3048, "inches": 1 / 0.0254}
 MAX_POSES: Final = 100  # Poses of a fit, evenly spread, for the 13 unknowns.
-STEPS: Final = 12  # Gauss-Newton steps: a bound, the search ends earlier.
 IDENTITY: Final = np.eye(4)
 LEAST_SIGMA: Final = 1e-6  # [m, rad] Residuals of exact poses count as this.
-SIZES: Final = (6, 3, 3, 1)  # numbers of unknowns: T_truth_odom, lever arm and rotation of T_rig_body, delay
 
 
 def _with_w_first(T: Array) -> Array:
@@ -119,31 +122,72 @@ def _turn_words(R: Array) -> str:
 
 
 class _Model(NamedTuple):
-    """What may differ: the convention of the file, and the unknowns that are fitted."""
+    """What may differ: the convention of the file, its clock, and the pose of the body."""
 
     reading: str  # a key of READINGS
     has_delay: bool
     has_lever: bool
     is_turned: bool
 
-    def simpler(self) -> Iterator[_Model]:
-        """Yield this model and those of the same clock and convention with fewer unknowns."""
-        yield from (_Model(self.reading, self.has_delay, *body) for body in product((False, True), repeat=2))
-
     def fit(self, estimate: Trajectory, truth: Trajectory) -> tuple[float, TruthFrame]:
         """Return the error that is left, see `_shown_error`, and the difference; infinite where nothing is fitted."""
-        free = np.repeat([True, self.has_lever, self.is_turned, self.has_delay], SIZES)
         read = _in_metres(truth, self.reading, "m")
-        delay_s = _delay_s(estimate, read) if self.has_delay else 0.0
+        delay_s, step_s = _delay(estimate, read) if self.has_delay else (0.0, 0.0)
         pair = _common(estimate, read, delay_s)
         if pair is None:
             return np.inf, TruthFrame()
         unit = _unit(pair)
         scaled = _in_metres(truth, self.reading, unit)
-        starts = [IDENTITY, *(_rotated_starts(pair) if self.is_turned else [])]
-        fits = [_gauss_newton(estimate, scaled, delay_s, T_rig_body, free) for T_rig_body in starts]
-        error, found = min((fit for fit in fits if fit), key=lambda fit: fit[0], default=(np.inf, None))
-        return error, TruthFrame() if found is None else TruthFrame(self.reading, unit, *found)
+
+        def left(more_s: float) -> float:
+            pair = _common(estimate, scaled, delay_s + more_s)
+            return np.inf if pair is None else self._body(pair)[2]
+
+        if self.has_delay:
+            delay_s += float(minimize_scalar(left, bounds=(-step_s, step_s), method="bounded").x)
+        pair = _common(estimate, scaled, delay_s)
+        if pair is None:
+            return np.inf, TruthFrame()
+        T_rig_body, unknown, _ = self._body(pair)
+        freedom = self.has_delay + 3 * self.is_turned + (3 - len(unknown)) * self.has_lever
+        found = T_rig_body if self.has_lever or self.is_turned else None
+        return _shown_error(pair, T_rig_body), TruthFrame(
+            self.reading, unit, delay_s, found, freedom, ", ".join(unknown)
+        )
+
+    def _body(self, pair: _Pair) -> tuple[Array, str, float]:
+        """Return T_rig_body (4, 4), the axes along which the path does not show its lever arm, and sigma_p sigma_R."""
+        (R, p), (true_R, true_p) = parts(pair.T_odom_rig), parts(pair.T_truth_body)
+        p, true_p, count, eye = p - p.mean(axis=0), true_p - true_p.mean(axis=0), len(R), np.eye(3)
+        # 1. The linear system of A row by row, c, R_rig_body column by column and t_rig_body. A rotation counts as the
+        # movement of a point at the distance of the path's spread, then by the errors that are left.
+        of_A = [np.einsum("ab,nc->nabc", eye, vector).reshape(-1, 9) for vector in (true_p, *np.moveaxis(true_R, 2, 0))]
+        J = np.zeros((4, 3 * count, 24))
+        J[..., :9], J[0, :, 9:12], J[0, :, 21:] = of_A, np.tile(-eye, (count, 1)), -R.reshape(-1, 3)
+        J[1:, :, 12:21] = [np.kron(axis, -R.reshape(-1, 3)) for axis in eye]
+        b = np.concatenate([p[None], np.moveaxis(R, 2, 0)]).reshape(4, -1) * [[1.0], *[[not self.is_turned]] * 3]
+        J = J[..., np.repeat([True, True, self.is_turned, self.has_lever], (9, 3, 9, 3))]
+        radius = _rms(true_p)
+        for _ in range(2):
+            weight = np.array([1.0, radius, radius, radius])[:, None]
+            weighted = (weight[..., None] * J).reshape(-1, J.shape[-1])
+            solution = np.linalg.lstsq(weighted, (weight * b).ravel(), rcond=None)[0]
+            left = J @ solution - b
+            sigmas = np.sqrt(np.square(left).mean(axis=1))
+            radius = sigmas[0] / max(sigmas[1:].mean(), LEAST_SIGMA)
+        # 2. The rotations next to it.
+        A, _ = rotation_between(eye, solution[:9].reshape(3, 3).T)
+        turned = np.swapaxes(R, 1, 2) @ (A @ true_R)
+        R_rig_body = Rotation.from_matrix(turned).mean().as_matrix() if self.is_turned else eye
+        # 3. The lever arm, along axes whose swing exceeds what the errors of the rotations make of it.
+        lever, unknown = np.zeros(3), ""
+        if self.has_lever:
+            swing, moved = R - R.mean(axis=0), true_p @ A.T - p
+            error = se3.rotation_log(turned @ R_rig_body.T)
+            shown = np.square(swing).mean(axis=0).sum(axis=0) > np.square(error).mean(axis=0).sum() / WORTH_PART
+            unknown = "".join(axis for axis, is_shown in zip("xyz", shown, strict=True) if not is_shown)
+            lever[shown] = np.linalg.lstsq(swing[:, :, shown].reshape(3 * count, -1), moved.ravel(), rcond=None)[0]
+        return se3.transform(R_rig_body, lever), unknown, float(sigmas[0] * sigmas[1:].mean())
 
 
 def find_truth_frame(estimate: Trajectory, truth: Trajectory) -> TruthFrame | None:
@@ -157,24 +201,25 @@ def find_truth_frame(estimate: Trajectory, truth: Trajectory) -> TruthFrame | No
         return None
     # 1. For each convention, without and with a delay, fit all that may differ. Other conventions are tried as long as
     # none leaves a small error.
-    general: dict[_Model, float] = {}
+    general: dict[tuple[str, bool], float] = {}
     for reading in READINGS:
         for has_delay in (False, True):
-            model = _Model(reading, has_delay, has_lever=True, is_turned=True)
-            general[model], _ = model.fit(estimate, truth)
+            general[reading, has_delay], _ = _Model(reading, has_delay, has_lever=True, is_turned=True).fit(
+                estimate, truth
+            )
         if min(general.values()) < SMALL_ERROR:
             break
-    least = max(LEAST_SIGMA, min(general.values()))
-    if least == np.inf:
+    most = max(LEAST_SIGMA, min(general.values())) / WORTH_PART
+    if most == np.inf:
         return None
     # 2. Of those that leave little, and of those with fewer unknowns, take the one with the fewest differences.
     good: list[tuple[int, float, _Model, TruthFrame]] = []
-    for model in [
-        simpler for one, error in general.items() if WORTH_PART * error <= least for simpler in one.simpler()
-    ]:
-        error, frame = model.fit(estimate, truth)
-        if WORTH_PART * error <= least:
-            good.append((bool(model.reading) + (frame.unit != "m") + sum(model[1:]), error, model, frame))
+    for file in (file for file, error in general.items() if error <= most):
+        for body in product((False, True), repeat=2):
+            model = _Model(*file, *body)
+            error, frame = model.fit(estimate, truth)
+            if error <= most:
+                good.append((bool(model.reading) + (frame.unit != "m") + sum(model[1:]), error, model, frame))
     changes, _, model, frame = min(good, key=lambda one: one[:2])
     # 3. It must explain the error of each half of the drive by the other half.
     return frame if changes and _is_shown_by_halves(estimate, truth, model) else None
@@ -253,8 +298,8 @@ def _unit(pair: _Pair) -> str:
     return min(UNITS, key=lambda unit: abs(ratio - math.log(UNITS[unit])))
 
 
-def _delay_s(estimate: Trajectory, truth: Trajectory) -> float:
-    """Return how late the truth's stamps are [s], by the best correlation of the rates of turning and of the speeds.
+def _delay(estimate: Trajectory, truth: Trajectory) -> tuple[float, float]:
+    """Return how late the truth's stamps are [s], and how precisely: by the correlation of speeds and rates of turning.
 
     Both are the same for every body fixed to the robot, but for the lever arm's part of the speed. The shorter one
     may exceed the longer one by half of its length at both ends.
@@ -272,7 +317,7 @@ def _delay_s(estimate: Trajectory, truth: Trajectory) -> float:
             score = score + cv2.matchTemplate(padded[None], b.astype(np.float32)[None], cv2.TM_CCOEFF_NORMED)[0]
     shift_ns = (int(np.argmax(score)) - half) * step_ns if np.any(score) else 0
     begins_apart_ns = int(truth.stamps_ns[0] - estimate.stamps_ns[0])
-    return 1e-9 * (begins_apart_ns + (shift_ns if longer is theirs else -shift_ns))
+    return 1e-9 * (begins_apart_ns + (shift_ns if longer is theirs else -shift_ns)), 1e-9 * step_ns
 
 
 def _rates(trajectory: Trajectory, step_ns: int) -> Array:
@@ -281,71 +326,6 @@ def _rates(trajectory: Trajectory, step_ns: int) -> Array:
     translation, rotation = np.split(se3.log(se3.inverse(T[:-1]) @ T[1:]), 2, axis=1)
     rates = [np.linalg.norm(part, axis=1) / (1e-9 * step_ns) for part in (rotation, translation)]
     return np.round(np.column_stack(rates), 6)  # so that rounding is no rate
-
-
-def _rotated_starts(pair: _Pair) -> list[Array]:
-    """Return start values of T_rig_body: its rotation by the positions and by the rotations of the path."""
-    (R, xyz), (true_R, true_xyz) = parts(pair.T_odom_rig), parts(pair.T_truth_body)
-    # 1. The world's rotation by the positions, as without a lever arm; then the mean rotation that is left.
-    R_world, _ = rotation_between(xyz - xyz.mean(axis=0), true_xyz - true_xyz.mean(axis=0))
-    by_positions = Rotation.from_matrix(np.swapaxes(R_world @ R, 1, 2) @ true_R).mean().as_matrix()
-    # 2. The body's rotation by those of the path: log(R_truth) = R_rig_body^T log(R_odom) for each part of it.
-    reach = max(1, len(R) // 8)
-    turns, true_turns = (se3.rotation_log(np.swapaxes(part[:-reach], 1, 2) @ part[reach:]) for part in (R, true_R))
-    by_rotations, _ = rotation_between(true_turns, turns)
-    return [se3.transform(found, np.zeros(len(found))) for found in (by_positions, by_rotations)]
-
-
-def _gauss_newton(
-    estimate: Trajectory, truth: Trajectory, delay_s: float, T_rig_body: Array, free: NDArray[np.bool_]
-) -> tuple[float, tuple[float, Array | None, int, str]] | None:
-    """Return the error that is left, and delay, T_rig_body, number of fitted unknowns and unknown axes.
-
-    free (13,): the unknowns that are fitted: T_truth_odom, lever arm and rotation of T_rig_body, delay.
-    """
-    pair = _common(estimate, truth, delay_s)
-    if pair is None:
-        return None
-    middle, ends, begun_s = len(pair.T_odom_rig) // 2, np.cumsum(SIZES)[:-1], delay_s
-    T_truth_odom = pair.T_truth_body[middle] @ se3.inverse(pair.T_odom_rig[middle] @ T_rig_body)
-    for _ in range(STEPS):
-        # 1. Residuals (N, 6), and their standard deviations in translation and in rotation.
-        E = pair.T_odom_rig @ T_rig_body
-        r = se3.log(se3.inverse(T_truth_odom @ E) @ pair.T_truth_body)
-        sigma = [max(float(np.sqrt(np.square(part).mean())), LEAST_SIGMA) for part in np.split(r, 2, axis=1)]
-        weight = 1 / np.repeat(sigma, r.shape[1] // 2)
-        # 2. The derivatives (N, 6, 13) by T_truth_odom, T_rig_body and the delay. What the path does not show of the
-        # pose and the delay stays near 0 by a prior of 1 m, 1 rad and 1 s. Errors of the rotations would count as a
-        # swing of the lever arm: its prior holds as much against it.
-        by_body = np.broadcast_to(np.eye(r.shape[1]), (len(r), r.shape[1], r.shape[1]))
-        J = np.concatenate([se3.adjoint(se3.inverse(E)), by_body, -pair.twists[:, :, None]], axis=2)
-        J = J[:, :, free] * weight[:, None]
-        lever = 1 + 2 * len(r) * (sigma[1] / sigma[0]) ** 2
-        prior = np.diag(np.repeat([0.0, lever, 1.0, 1.0], SIZES)[free])
-        # 3. The step.
-        state = np.concatenate([np.zeros(SIZES[0]), se3.log(T_rig_body), [delay_s - begun_s]])[free]
-        normal = np.einsum("nri,nrj->ij", J, J) + prior
-        step = np.zeros(len(free))
-        step[free] = np.linalg.pinv(normal, hermitian=True) @ (np.einsum("nri,nr->i", J, r * weight) - prior @ state)
-        world, lever_arm, turn, delay = np.split(step, ends)
-        T_truth_odom, T_rig_body = T_truth_odom @ se3.exp(world), T_rig_body @ se3.exp(np.r_[lever_arm, turn])
-        if free[-1]:
-            delay_s += float(np.clip(delay[0], -0.5, 0.5))
-            moved = _common(estimate, truth, delay_s)
-            if moved is None:
-                return None
-            pair = moved
-        if np.linalg.norm(step) < LEAST_SIGMA:
-            break
-    # 4. The share of each unknown that the path determines, and not the prior.
-    known = np.zeros(len(free))
-    known[free] = 1 - np.diag(np.linalg.pinv(normal, hermitian=True) @ prior)
-    of_world, of_lever, *_ = np.split(known, ends)
-    _, is_lever, is_turn, _ = np.split(free, ends)
-    unknown = [axis for axis, part in zip("xyz", of_lever, strict=True) if is_lever[0] and part < WORTH_PART]
-    T_found = T_rig_body if is_lever[0] or is_turn[0] else None
-    freedom = round(float(known.sum() - of_world.sum()))
-    return _shown_error(pair, T_rig_body), (delay_s, T_found, freedom, ", ".join(unknown))
 
 
 def _shown_error(pair: _Pair, T_rig_body: Array) -> float:
@@ -367,4 +347,4 @@ def _spread(T: Array) -> float:
 
 def _rms(vectors: Array) -> float:
     """Return the root of the mean squared length of vectors (N, 3)."""
-    return float(np.sqrt((vectors**2).sum(axis=1).mean()))
+    return float(np.sqrt(np.square(vectors).sum(axis=1).mean()))
