@@ -29,7 +29,7 @@ from omnid.errors import OmnidError
 from omnid.formats.exports import write_grid, write_ply
 from omnid.formats.place_file import read_places, write_places
 from omnid.formats.plan import drawn_heights
-from omnid.runs.place_maps import RigPlaces, new_places
+from omnid.runs.place_maps import RigPlaces
 from omnid.runs.replay import ReplayOptions, run_log
 from omnid.sinks.files import check_outputs, write_plan
 from omnid.stages.obstacles import ADVICE
@@ -68,7 +68,7 @@ def build(args: argparse.Namespace) -> int:
     for warning in unused_settings(config, "replay", args.set):
         warn(warning)
     # 2. Replay the logs.
-    built = RigPlaces(*read_places(args.output, new_places(config.places))) if args.extend else None
+    built = RigPlaces(*read_places(args.output, PlaceMap(config.places.limits.max_keyframes))) if args.extend else None
     for log in args.logs:
         options = ReplayOptions(
             rig=args.rig, settings=args.config, build=True, rig_places=built, progress=None if args.quiet else Progress

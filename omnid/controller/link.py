@@ -9,7 +9,6 @@ from contextlib import suppress
 from typing import Final, Protocol
 
 from drivers.errors import DriverError
-from drivers.motion import WheelSample
 from drivers.motor import VelocityCommand
 from omnid.controller.ipc import NO_MESSAGE, Channel, socket_pair
 from omnid.controller.messages import LONGEST_RAMP_S, ControllerStart, ControllerUpdate, LogRecord, StartFailed
@@ -17,7 +16,6 @@ from omnid.controller.statistics import ControllerStatistics, TickReport
 from omnid.core.control.contacts import NO_CONTACT
 from omnid.core.control.control_law import ControlInput
 from omnid.core.nanoseconds import S_PER_NS
-from omnid.engine.graph import nothing
 from omnid.engine.process import python, python_environment
 from omnid.engine.telemetry import StageStats
 from omnid.errors import OmnidError
@@ -35,7 +33,6 @@ class DriveLink(Protocol):
     """
 
     statistics: ControllerStatistics
-    take_wheels: Callable[[WheelSample], object]  # called with what the motor controller reports
 
     def send(self, given: ControlInput) -> None:
         """Send a pose, an obstacle ring, a setpoint, or a request to arm."""
@@ -63,7 +60,6 @@ class ControllerLink:
     def __init__(self, start: ControllerStart, stats: StageStats, report: Callable[[str], None]) -> None:
         """Start the process; DriverError where its settings cannot be used, or where it waits in vain."""
         self._report = report
-        self.take_wheels: Callable[[WheelSample], object] = nothing  # called with what the motor controller reports
         self.statistics = ControllerStatistics(stats)
         self._stop_ns, self._contacts = 0, NO_CONTACT
         self._ended_ns = 0  # when the process was asked to end
@@ -133,8 +129,6 @@ class ControllerLink:
         message: object = self._channel.receive(timeout_s)
         if isinstance(message, TickReport):
             self.statistics.add(message)
-            if message.wheels is not None:
-                self.take_wheels(message.wheels)
         elif isinstance(message, LogRecord):
             self._report(message.text)
         return message

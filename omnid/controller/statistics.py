@@ -113,7 +113,8 @@ class ControllerStatistics:
     def __init__(self, stats: StageStats) -> None:
         """stats: the counters of the tick, among those of the stages; busy from one report to the next."""
         self.state = ControllerState()
-        self.states: Stream[ControllerState] = Stream("")  # of each tick
+        self.states: Stream[ControllerState] = Stream()  # of each tick
+        self.wheels: Stream[WheelSample] = Stream()  # as the motor controller reports them
         self.to_wheel = Histogram()
         self.lateness = Histogram()
         self._stats = stats
@@ -122,6 +123,8 @@ class ControllerStatistics:
         """Add the report of one tick."""
         self.state = tick.state
         self.states.push(tick.state)
+        if tick.wheels is not None:
+            self.wheels.push(tick.wheels)
         self.lateness.add(tick.late_s)
         if math.isfinite(tick.to_wheel_s):
             self.to_wheel.add(tick.to_wheel_s)

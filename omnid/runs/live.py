@@ -6,7 +6,6 @@ import logging
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import ExitStack, closing, suppress
-from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -40,7 +39,7 @@ from omnid.engine.threads import started
 from omnid.errors import OmnidError
 from omnid.formats.route_file import RouteFolder
 from omnid.light.exposure import ExposureControl, UsefulArea
-from omnid.runs.place_maps import MapSaver, RunPlaces
+from omnid.runs.place_maps import RunPlaces
 from omnid.runs.record import open_recorder
 from omnid.runs.route_files import Requests
 from omnid.runs.session import BUS_POINTS, LOG_POINTS, OPENCV_THREADS, Session, joint_wheels
@@ -52,45 +51,12 @@ from omnid.sinks.encoder import status_report
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry
 from omnid.stages.obstacles import ADVICE, controller_ring
+from omnid.transport import status_names as names
+from omnid.transport import topics
 from omnid.transport.bus import Bus
 from omnid.transport.codec import STALE, compile_serialisers
 from omnid.transport.commands import CommandReceiver, Freshness, NavigationReceiver, SensorReceiver
-from omnid.transport.status_names import (
-    BUS,
-    CLOCK,
-    DISARMED_BY_STOP,
-    EXPOSURE,
-    FLOOR,
-    IMAGES,
-    LIVE,
-    MAP_FILE,
-    MOTION,
-    PLACES,
-    RECORDING,
-    REFUSED_PREFIX,
-    REQUESTS,
-    RIG,
-    SIMULATION,
-    WHEELS,
-    Stats,
-    by_reason,
-)
-from omnid.transport.topics import (
-    ARM,
-    IMU,
-    JOINT_STATES,
-    MAP,
-    MAP_TOPICS,
-    MOST_OPEN,
-    NAVIGATION_TOPICS,
-    PUBLISHED,
-    SENSOR_TOPICS,
-    TIME,
-    WHEEL_ODOM,
-    Answer,
-    Request,
-    command_topics,
-)
+from omnid.transport.topics import Answer, Request
 
 NO_MOTOR: Final = "the daemon runs without a motor: set motor.port, or start it with --motor"
 NO_PLANNER: Final = f"controller.sources.names lacks {PLANNER!r}: goals, paths and routes are off"
@@ -224,43 +190,42 @@ class LiveRun:
         """Run until a signal comes, or the cameras end; return the exit code."""
         print_stacks_when_killed()
         loaded = started(_load, "imports")
-        clock_ns = self._robot.clock_ns
+        config, graph, robot = self._config, self._graph, self._robot
 
         def warn(line: str) -> None:
             self._report(logging.INFO if line == ARMED else logging.WARNING, line)
 
-        self.clock = fixed_offset(clock_ns) if self._robot.waits else RobotClock(clock_ns, report=warn)
+        self.clock = fixed_offset(robot.clock_ns) if robot.waits else RobotClock(robot.clock_ns, report=warn)
         with ExitStack() as outputs:
-            session = Session(self._config, self._graph, outputs, warn, clock=self.clock)
+            session = Session(config, graph, outputs, warn, clock=self.clock)
             outputs.enter_context(session.signals(self._on_signal))
             # 1. The rig, with masks that are found in the first images; and the compiled functions.
-            rig = self._rig or read_rig(Path(self._config.cameras.rig))
-            with closing(self._robot.first_frames()) as frames:
+            rig = self._rig or read_rig(Path(config.cameras.rig))
+            with closing(robot.first_frames()) as frames:
                 geometry = session.geometry(rig, frames)
             loaded(None)
             prepare_kernels()
             # 2. The connections, and the stages between them.
             self._connected = True
-            run_places = RunPlaces(self._config, geometry, warn)
-            _join(session, geometry, self._robot, self._report, run_places)
+            run_places = RunPlaces(config, geometry, warn)
+            _join(session, geometry, robot, self._report, run_places)
             if self._show is not None:
-                line = StatusLine(session.statistics, self._graph.telemetry, self._robot.stats)
-                terminal = TerminalStatus(self._show, line, partial(self._report, logging.INFO), _ready(self._config))
-                self._graph.ticker("terminal", terminal.period_s, terminal, thread="terminal")
+                line = StatusLine(session.statistics, graph.telemetry, robot.stats)
+                terminal = TerminalStatus(self._show, line, partial(self._report, logging.INFO), _ready(config))
+                graph.ticker("terminal", terminal.period_s, terminal, thread="terminal")
             # 3. The run, until a signal or a failure ends it.
             cv2.setNumThreads(OPENCV_THREADS)
-            if not self._robot.waits:
-                for refused in prepare(self._config.realtime):
-                    warn(refused)
+            for refused in () if robot.waits else prepare(config.realtime):
+                warn(refused)
             # What the first loop needs is imported while the first poses are computed.
             started(partial(import_module, "scipy.sparse.linalg"), "imports")
             try:
-                self._graph.run()
+                graph.run()
             except BaseException:
                 with suppress(OmnidError):  # the error that ended the run is the one that is reported
-                    run_places.finish()
+                    run_places.finish_run()
                 raise
-            run_places.finish()
+            run_places.finish_run()
         return 0
 
     def _on_signal(self, again: bool) -> None:
@@ -314,84 +279,66 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
         outputs.rings["controller-ring"] = lambda ring: controller.send(controller_ring(ring))
 
     # 3. The stages, and the navigation with its requests and files.
-    requests = Requests(graph)
+    requests, map_is_read = Requests(graph), graph.inlet(1)
     if rig.height_m(config.obstacles.ring.floor_m) is None:
         warn(
             "the rig states no height of the cameras: the floor is looked for in the images; "
             f"until it is found, map, grid and obstacles call nothing free; {ADVICE}"
         )
-    saver = None
-    if config.places.enabled and run_places.is_extended:
-        saver = MapSaver(run_places, config.places.save_s, graph.inlet(MOST_OPEN), bus.answer)
-    map_is_read = graph.inlet(1)
-    parts = Parts(saver=saver, map_every_s=config.live.cloud_s, map_is_read=map_is_read)
+    if run_places.is_extended:
+        run_places.save_now_and_then(config.places.save_s, graph.inlet(topics.MOST_OPEN), bus.answer)
+    navigation = None
     if controller is not None:
         states = controller.statistics.states = graph.inlet(1, thread="drive")
         graph.sink("arming", ArmAnswers(session, bus), states, thread=states.thread)
-        navigation = None
+        if config.motion.wheels != "off" and not robot.brings_samples:
+            wheels = controller.statistics.wheels = graph.inlet(1, thread="drive")
+            graph.sink("wheels", motion.add, wheels, thread=wheels.thread)
         if PLANNER in config.controller.sources.names:
             planner, folder = PlannerDrive(controller, bus.answer), RouteFolder(Path(config.navigation.routes))
             navigation = NavigationParts(requests, states, folder, planner, config.places.map)
         else:
             warn(NO_PLANNER)
-        parts = replace(parts, controller=controller, navigation=navigation)
-    stages = wire(graph, frames, front_end, config, outputs, run_places.known_to(parts))
+    parts = Parts(run_places, controller, navigation, config.live.cloud_s, map_is_read)
+    stages = wire(graph, frames, front_end, config, outputs, parts)
 
-    # 4. What comes from the bus: commands, requests, samples.
-    samples = _sample_receiver(config, motion.add, clock, controller, report, with_images=robot.brings_samples)
-    clocks = (RobotClock(), clock) if robot.waits else (clock,)
-    freshness = Freshness(config.controller.deadlines.command_s, *clocks)
-    bus.serve(TIME, freshness.own_time)
-
-    def ask(command: NavigationCommand) -> None:
-        requests.put(command._replace(halts=controller.statistics.state.halts if controller else 0))
-
-    received = NavigationReceiver(ask, freshness, report=warn)
-    commands = None
-    if controller is not None:
-        sources = config.controller.sources.names
-        commands = CommandReceiver(controller, freshness, sources=sources, is_unique=lambda: bus.is_unique, report=warn)
-    _subscribe(config, bus, controller, commands, received, samples, saver)
-
-    # 5. The status of all of them.
-    unwatched = Unwatched(geometry.cylinder, rig.T_base_rig @ geometry.T_rig_rect)
-    obstacles, places, floor = stages.obstacles, stages.places, stages.floor
-    watched: dict[str, Callable[[], Stats]] = {
-        IMAGES: lambda: image_stats(unwatched, session.statistics.newest, obstacles.fixed_share if obstacles else 0.0),
-        EXPOSURE: exposure.stats,
-        RIG: partial(rig_stats, health),
-        CLOCK: clock.stats,
-        MOTION: lambda: front_end.motion_stats() | by_reason(REFUSED_PREFIX, samples.refused),
-        BUS: bus.stats,
+    # 4. What comes from the bus, and the status of all parts.
+    watched = _subscribe(session, bus, robot, controller, requests, run_places, front_end)
+    unwatched, statistics = Unwatched(geometry.cylinder, rig.T_base_rig @ geometry.T_rig_rect), session.statistics
+    obstacles = stages.obstacles
+    watched |= {
+        names.IMAGES: lambda: image_stats(
+            unwatched, statistics.newest, 0.0 if obstacles is None else obstacles.fixed_share
+        ),
+        names.EXPOSURE: exposure.stats,
+        names.RIG: partial(rig_stats, health),
+        names.CLOCK: clock.stats,
+        names.BUS: bus.stats,
     }
-    if controller is not None and commands is not None:
-        watched |= {WHEELS: partial(wheel_stats, controller.statistics, commands), REQUESTS: received.stats}
-    if robot.stats():
-        watched[SIMULATION] = robot.stats
-    optional = {PLACES: places, FLOOR: floor, RECORDING: recorder, MAP_FILE: saver}
+    saver = run_places if run_places.requests else None
+    optional = {
+        names.PLACES: stages.places,
+        names.FLOOR: stages.floor,
+        names.RECORDING: recorder,
+        names.MAP_FILE: saver,
+        names.SIMULATION: robot if robot.stats() else None,
+    }
     watched |= {name: part.stats for name, part in optional.items() if part is not None}
     collect = StatusCollector(
-        graph.telemetry,
-        robot.states,
-        front_end.pairing,
-        session.statistics,
-        to_pose,
-        watched,
-        clock.monotonic_ns,
+        graph.telemetry, robot.states, front_end.pairing, statistics, to_pose, watched, clock.monotonic_ns
     )
-
-    reported, is_read = {IMAGES: LIVE}, True  # messages in the log, and what the mapping knows
+    reported, is_read = names.LIVE, True  # of the images in the log, and what the mapping knows
 
     def give_status() -> None:
-        nonlocal is_read
+        nonlocal is_read, reported
         if is_read != (recorder is not None or bus.is_received("cloud")):
             is_read = not is_read
             map_is_read.push(is_read)
         statuses = collect()
-        for status in statuses:
-            if status.level != STALE and status.message != reported.get(status.name, status.message):
-                warn(f"images: {status.message}")
-                reported[status.name] = status.message
+        images = next(status for status in statuses if status.name == names.IMAGES)
+        if images.level != STALE and images.message != reported:
+            reported = images.message
+            warn(f"images: {reported}")
         with suppress(OmnidError):  # the system's clock may be set to a time that no message can hold
             message = status_report(time.time_ns(), statuses)
             bus.publish(message.topic, message.payload)  # where the bus is slow, only this ticker waits
@@ -399,69 +346,68 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
             recorder.add(statuses, clock.monotonic_ns())
 
     graph.ticker("status", config.live.status_s, give_status)
-    line = StatusLine(session.statistics, graph.telemetry)
-    service = Service(graph.telemetry, line, config.service.stall_timeout_s)
+    service = Service(graph.telemetry, StatusLine(statistics, graph.telemetry), config.service.stall_timeout_s)
     graph.ticker("watchdog", service.period_s, service)
 
 
-def _sample_receiver(
-    config: Config,
-    take: Callable[[MotionSample], None],
-    clock: RobotClock,
-    controller: DriveLink | None,
-    report: Report,
-    *,
-    with_images: bool,
-) -> SensorReceiver:
-    """Return the receiver of samples of the bus: of the gyro, and of the wheels where no motor controller gives them.
-
-    take: takes samples, from any thread. clock: that of the stamps of images. with_images: the samples come with the
-    images of a log or a simulation, since those of another motion would not fit them.
-    """
-    settings, joints = config.motion, joint_wheels(config)
-    topics = set()
-    if settings.wheels != "off" and not with_images:
-        if controller is not None:
-            controller.take_wheels = take
-        else:
-            topics.add(JOINT_STATES if joints else WHEEL_ODOM)
-    if settings.imu != "off" and not with_images:
-        topics.add(IMU)
-    return SensorReceiver(take, clock.stamp_ns, frozenset(topics), partial(report, logging.WARNING), joints)
-
-
 def _subscribe(
-    config: Config,
+    session: Session,
     bus: Bus,
+    robot: LiveRobot,
     controller: DriveLink | None,
-    commands: CommandReceiver | None,
-    navigation: NavigationReceiver,
-    samples: SensorReceiver,
-    saver: MapSaver | None,
-) -> None:
-    """Begin to receive: without a motor only samples and requests to save the map."""
-    sources = config.controller.sources.names
-    topics = {**SENSOR_TOPICS, **MAP_TOPICS}
+    requests: Requests,
+    run_places: RunPlaces,
+    front_end: FrontEnd,
+) -> dict[str, Callable[[], names.Stats]]:
+    """Begin to receive, without a motor only samples and requests to save the map; return the numbers of receivers."""
+    config, clock, warn = session.config, session.clock, session.warn
+    sources, joints = config.controller.sources.names, joint_wheels(config)
+    # 1. Samples of gyro and wheels, unless they come with the images of a log or of a simulation, whose motion others
+    #    would not fit. A motor controller gives those of its wheels.
+    sensors = set()
+    if config.motion.imu != "off" and not robot.brings_samples:
+        sensors.add(topics.IMU)
+    if config.motion.wheels != "off" and not robot.brings_samples and controller is None:
+        sensors.add(topics.JOINT_STATES if joints else topics.WHEEL_ODOM)
+    samples = SensorReceiver(front_end.pairing.motion.add, clock.stamp_ns, frozenset(sensors), warn, joints)
+    # 2. Commands and requests.
+    freshness = Freshness(config.controller.deadlines.command_s, *((RobotClock(), clock) if robot.waits else (clock,)))
+    bus.serve(topics.TIME, freshness.own_time)
+
+    def ask(command: NavigationCommand) -> None:
+        requests.put(command._replace(halts=controller.statistics.state.halts if controller else 0))
+
+    received = NavigationReceiver(ask, freshness, report=warn)
+    taken = {**topics.SENSOR_TOPICS, **topics.MAP_TOPICS}
     table: dict[str, Callable[[Request], Answer | None]] = {}
-    others: Callable[[Request], Answer | None] = lambda _: Answer(False, NO_MOTOR)  # noqa: E731
-    if commands is not None:
-        topics, others = command_topics(sources), commands.receive  # which counts unknown topics
-        refused = Answer(False, NO_PLANNER)
-        table = dict.fromkeys(NAVIGATION_TOPICS, navigation.receive if PLANNER in sources else lambda _: refused)
-    table[MAP] = saver.receive if saver is not None else lambda _: Answer(False, NO_MAP_FILE)
+    stats: dict[str, Callable[[], names.Stats]] = {
+        names.MOTION: lambda: front_end.motion_stats() | names.by_reason(names.REFUSED_PREFIX, samples.refused)
+    }
+    if controller is None:
+        commands: Callable[[Request], Answer | None] = lambda _: Answer(False, NO_MOTOR)  # noqa: E731
+    else:
+        taken = topics.command_topics(sources)
+        drive = CommandReceiver(controller, freshness, sources=sources, is_unique=lambda: bus.is_unique, report=warn)
+        commands = drive.receive  # which counts unknown topics
+        without_planner = Answer(False, NO_PLANNER)
+        navigate = received.receive if PLANNER in sources else lambda _: without_planner
+        table = dict.fromkeys(topics.NAVIGATION_TOPICS, navigate)
+        stats |= {names.WHEELS: partial(wheel_stats, controller.statistics, drive), names.REQUESTS: received.stats}
+    table[topics.MAP] = run_places.receive if run_places.requests else lambda _: Answer(False, NO_MAP_FILE)
 
     def receive(request: Request) -> None:
-        if request.topic in SENSOR_TOPICS:
+        if request.topic in topics.SENSOR_TOPICS:
             samples.receive(request.topic, request.payload)
             return
-        answer = table.get(request.topic, others)(request)
+        answer = table.get(request.topic, commands)(request)
         if answer is not None:
             bus.answer(request.id, answer)
 
     def is_stopped() -> bool:
-        return controller is not None and controller.statistics.state.disarmed_by == DISARMED_BY_STOP
+        return controller is not None and controller.statistics.state.disarmed_by == names.DISARMED_BY_STOP
 
-    bus.subscribe_commands(receive, topics, is_stopped)
+    bus.subscribe_commands(receive, taken, is_stopped)
+    return stats
 
 
 class ArmAnswers:
@@ -484,7 +430,7 @@ class ArmAnswers:
                 text += ": the first images are being processed: try again in a moment (`omnid listen` shows the state)"
             else:
                 text += ": no images have come from the cameras (`omnid listen`, `omnid doctor`)"
-        self._bus.answer(answer.id, Answer(not answer.refusal, text), also_before=ARM)
+        self._bus.answer(answer.id, Answer(not answer.refusal, text), also_before=topics.ARM)
 
 
 def _ready(config: Config) -> str:
@@ -500,7 +446,7 @@ def _ready(config: Config) -> str:
 
 def _load() -> None:
     """Prepare what the stages need while images are awaited; what fails is done, and reported, where it is used."""
-    schemas = {topic.schema for topic in PUBLISHED.values()} | set(command_topics(()).values())
+    schemas = {topic.schema for topic in topics.PUBLISHED.values()} | set(topics.command_topics(()).values())
     for load in (partial(compile_serialisers, schemas), read_kept_kernels):
         with suppress(Exception):
             load()

@@ -143,10 +143,10 @@ class _Replay:
             front_end = FrontEnd(geometry, config, examined_rig(reader, self._log, geometry, config))
             # 2. The stages, between the log and the outputs; one that cannot be opened ends the run before it begins.
             run_places = RunPlaces(config, geometry, session.warn, options.rig_places, build=options.build)
-            parts = Parts(map_every_s=options.map_every_s)
+            parts = Parts(map=run_places, map_every_s=options.map_every_s)
             messages = self._messages(graph, reader, front_end)
             sinks = self._outputs(session, front_end)
-            stages = wire(graph, [messages], front_end, config, sinks, run_places.known_to(parts))
+            stages = wire(graph, [messages], front_end, config, sinks, parts)
             report = RunReport(session, reader, stages)
             if options.progress is not None:
                 progress = options.progress(session.statistics, reader.pair_estimate())
@@ -156,7 +156,7 @@ class _Replay:
             try:
                 with session.signals(self._on_signal):
                     graph.run()
-                extended = run_places.finish()  # before the result is made: it may warn
+                extended = run_places.finish_run()  # before the result is made: it may warn
                 _end_recording(sinks.recorder, report)
             except (OmnidError, DriverError) as error:
                 with suppress(OmnidError, DriverError):  # the error that ended the run is the one that is reported

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from drivers.frame import Frame
 from drivers.motion import MotionSample
@@ -13,10 +13,10 @@ from omnid.config import Config
 from omnid.controller.link import DriveLink
 from omnid.controller.statistics import ControllerState
 from omnid.core.navigation.situation import WheelState
-from omnid.core.places.place_map import PlaceMap
 from omnid.engine.graph import NEWEST, Graph, Output, Stream
 from omnid.formats.route_file import RouteFolder
-from omnid.messages import FramePair, MapUpdate, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate, SaveMap
+from omnid.messages import FramePair, MapUpdate, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
+from omnid.runs.place_maps import RunPlaces
 from omnid.runs.route_files import Requests, RouteFiles, TaughtRoutes
 from omnid.sinks.drive import LiveDrive
 from omnid.sinks.encoder import Outgoing
@@ -63,25 +63,13 @@ class NavigationParts(NamedTuple):
     map_name: str  # of the file of the map; empty: it is not saved
 
 
-class Saver(Protocol):
-    """A sink of poses in the map that writes the copies of the map that they carry."""
-
-    every_s: float  # between two copies
-    requests: Stream[SaveMap]
-
-    def process(self, update: PlaceUpdate, /) -> None:
-        """Write the copy, if there is a new one."""
-
-
 @dataclass(frozen=True, slots=True)
 class Parts:
     """The differences between one run and another: its map of places, its wheels, its rates."""
 
-    known_places: PlaceMap | None = None  # the map to begin with; None: the run's own, where it is consumed
-    localize_only: bool = False  # the known map stays as it is
+    map: RunPlaces | None = None  # of places, to begin with, and its file; None: the run's own, where it is consumed
     controller: DriveLink | None = None  # that drives; None: the law in lock-step gives the commands
     navigation: NavigationParts | None = None
-    saver: Saver | None = None  # of the known map
     map_every_s: float = 0.0  # between two maps; 0: one, at the end
     map_is_read: Stream[bool] | None = None  # whether the map has a reader; None: it has one
 
@@ -145,6 +133,7 @@ def wire(
     T_base_rig = geometry.rig.T_base_rig
     mapping, places, obstacles = None, None, None
     maps, in_map, grids, rings, written, ways = None, None, None, None, None, None
+    run_map, known_places = parts.map, None if parts.map is None else parts.map.places
 
     # 1. Images give pairs, pairs give panoramas, and these give poses.
     pairs = graph.stage("pair", front_end.pairing, *frames)
@@ -169,23 +158,15 @@ def wire(
         mapping = Mapping(config.mapping, front_end.dense, parts.map_every_s)
         noted = () if parts.map_is_read is None else (parts.map_is_read,)
         maps = graph.stage("mapping", mapping, poses, *noted, thread=BACKGROUND)
-    needs_places = outputs.places or outputs.take_all or parts.navigation or parts.known_places is not None
+    needs_places = outputs.places or outputs.take_all or parts.navigation or known_places is not None
     if config.places.enabled and needs_places:
-        saver = parts.saver
-        places = Places(
-            geometry,
-            config,
-            front_end.dense,
-            parts.known_places,
-            localize_only=parts.localize_only,
-            copy_s=0.0 if saver is None else saver.every_s,
-        )
-        asked: list[Stream[Any]] = [
-            stream for stream in (written, None if saver is None else saver.requests) if stream is not None
-        ]
+        localize_only, copy_s = (False, 0.0) if run_map is None else (run_map.localize_only, run_map.copy_s)
+        places = Places(geometry, config, front_end.dense, known_places, localize_only=localize_only, copy_s=copy_s)
+        to_save = None if run_map is None else run_map.requests
+        asked: list[Stream[Any]] = [each for each in (written, to_save) if each is not None]
         in_map = graph.stage("places", places, poses, *asked)
-        if saver is not None:
-            graph.sink("save", saver, in_map, thread=FILES)
+        if run_map is not None and to_save is not None:
+            graph.sink("save", run_map, in_map, thread=FILES)
     if in_map is not None and outputs.take_all:
         grid = MapGrid(config.mapping.voxel_m, T_base_rig @ geometry.T_rig_rect, parts.map_every_s)
         grids = graph.stage("grid", grid, in_map, thread=BACKGROUND)
@@ -196,7 +177,7 @@ def wire(
     # 5. All of them, and requests, give the way to drive.
     if parts.navigation is not None and written is not None:
         requests, states, _, drive, map_name = parts.navigation
-        is_new = parts.known_places is None or not parts.known_places.keyframes
+        is_new = known_places is None or not known_places.keyframes
         route_map = RouteMap(map_name, T_base_rig, geometry.T_rig_rect, is_new=is_new) if places else None
         navigation = NavigationStage(config.navigation, config.controller.collision, T_base_rig, Routes(route_map))
         wheels = graph.stage("wheel-states", WheelStates(), states, thread=states.thread)

@@ -193,9 +193,10 @@ class _Lockstep:
             rings={"rings": self._take_ring},
             places={"in map": self._run.places.append} if config.places.map else {},
         )
-        wire(graph, [frames], self._front_end, config, outputs, run_places.known_to(Parts(navigation=navigation)))
+        parts = Parts(navigation=navigation, map=run_places)
+        wire(graph, [frames], self._front_end, config, outputs, parts)
         graph.run()
-        run_places.finish()
+        run_places.finish_run()
         return self._run
 
     def _messages(self, seconds: float) -> Iterator[Frame | MotionSample]:

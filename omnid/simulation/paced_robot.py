@@ -17,7 +17,7 @@ from typing import Final
 
 from drivers.cameras.camera_state import CameraState
 from drivers.frame import CAMERAS, Frame
-from drivers.motion import GyroSample, MotionSample, WheelSample
+from drivers.motion import GyroSample, MotionSample
 from drivers.motor import VelocityCommand
 from drivers.motors.simulated.simulated_base import Pose
 from omnid.config import Config
@@ -27,7 +27,7 @@ from omnid.core.control.arming import ArmRequest
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.contacts import NO_CONTACT
 from omnid.core.control.control_law import ControlInput
-from omnid.engine.graph import Stream, nothing
+from omnid.engine.graph import Stream
 from omnid.engine.telemetry import StageStats
 from omnid.runs.session import Session
 from omnid.simulation.robot import SimulatedRobot, with_masks
@@ -44,7 +44,6 @@ class PacedLink:
     def __init__(self, vehicle: Vehicle, stats: StageStats) -> None:
         """stats: counters of the tick."""
         self.statistics = ControllerStatistics(stats)
-        self.take_wheels: Callable[[WheelSample], object] = nothing
         self._vehicle = vehicle
         self._commands: Queue[VelocityCommand] = Queue(MOST_COMMANDS)
         self._contacts = NO_CONTACT
