@@ -80,12 +80,6 @@ class RunCounters:
         """True if no pose was measured: there are none, or all are predictions."""
         return self.poses == self.states[TrackingState.LOST]
 
-    @classmethod
-    def of(cls, statistics: RunStatistics, pairs: int, drops: Mapping[str, int]) -> RunCounters:
-        """Return the counters of a run from its statistics."""
-        states = {state: statistics.states[state] for state in TrackingState}
-        return cls(pairs, statistics.poses, statistics.length_m, states, statistics.resets, drops)
-
 
 _NAME_COLUMNS: Final = 9
 

@@ -376,7 +376,7 @@ class Graph:
         Inline, nothing ever waits.
         """
         with self._idle:
-            while not self._stopping:
+            while not self.is_stopping:
                 if self._idle.wait_for(lambda: all(inbox.is_idle for inbox in self._inboxes.values()), POLL_S):
                     return
 
@@ -399,7 +399,8 @@ class Graph:
             self._wakeup.put(None)
 
     @property
-    def _stopping(self) -> bool:
+    def is_stopping(self) -> bool:
+        """True after a stop or a failure."""
         return bool(self._stops or self._errors)
 
     def _thread(self, name: str, body: Callable[[], object]) -> threading.Thread:
@@ -416,13 +417,13 @@ class Graph:
         stats, messages = source.stats, iter(tuple[object]())
         with self.watched(stats.name):
             try:
-                if not self._stopping:
+                if not self.is_stopping:
                     start_ns, messages = time.perf_counter_ns(), iter(source.open())
                     for message in messages:
                         stats.add(start_ns)
                         source.stream.push(message)
                         yield
-                        if self._stopping:
+                        if self.is_stopping:
                             break
                         start_ns = time.perf_counter_ns()
             finally:
@@ -450,7 +451,7 @@ class Graph:
             ticker.deadline_ns = time.monotonic_ns()
         while True:
             ticker = min(group, key=lambda each: each.deadline_ns)
-            if self._no_ticks.wait(max(0.0, (ticker.deadline_ns - time.monotonic_ns()) * 1e-9)) or self._stopping:
+            if self._no_ticks.wait(max(0.0, (ticker.deadline_ns - time.monotonic_ns()) * 1e-9)) or self.is_stopping:
                 break
             stats, now_ns = ticker.stats, time.monotonic_ns()
             skipped = max(0, now_ns - ticker.deadline_ns) // ticker.period_ns
@@ -470,7 +471,7 @@ class Graph:
         while not self._ended.issuperset(thread.name for thread in started):
             with suppress(Empty):
                 self._wakeup.get(timeout=POLL_S)
-            if self._stopping:
+            if self.is_stopping:
                 self._no_ticks.set()
                 for source in self._sources:
                     wake, source.wake = source.wake, nothing

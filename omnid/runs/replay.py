@@ -21,11 +21,14 @@ from drivers.errors import DriverError
 from drivers.frame import Frame
 from drivers.logs.log_reader import WHOLE, LogReader
 from drivers.motion import MotionSample
+from omnid.calibration.drive_observations import tracked_updates
 from omnid.config import Config
 from omnid.controller.motor import SIMULATED
-from omnid.core.rig.rig_health import RigContradictedError
-from omnid.diagnostics.run_summary import RunStatistics
-from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Sink, Stream
+from omnid.core.control.motion_monitor import ADVICE
+from omnid.core.rig.rig_health import RigContradictedError, RigHealth
+from omnid.diagnostics.run_summary import RunCounters, RunStatistics, input_warnings
+from omnid.diagnostics.status import stage_stats, summary_stats
+from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Sink
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.realtime import RealtimeSettings
 from omnid.engine.telemetry import Telemetry
@@ -34,10 +37,9 @@ from omnid.formats.exports import write_ply
 from omnid.formats.plan import drawn_heights
 from omnid.messages import MapUpdate, OdometryUpdate, PlaceUpdate
 from omnid.runs.place_maps import RigPlaces, RunPlaces
-from omnid.runs.rig_checks import examined_rig
-from omnid.runs.run_result import RunFailedError, RunReport, RunResult
+from omnid.runs.run_result import RunFailedError, RunResult
 from omnid.runs.session import LOG_POINTS, OPENCV_THREADS, Session, attached_rig, motion_topics
-from omnid.runs.wiring import Outputs, Parts, WiredStages, wire
+from omnid.runs.wiring import Outputs, Parts, wire
 from omnid.settings import dump
 from omnid.sinks.bus_sink import BusSink
 from omnid.sinks.drive import ReplayDrive, SimulatedWheels
@@ -47,11 +49,18 @@ from omnid.sinks.recorder import Recorder, SingleLog
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry
 from omnid.tracking_state import TrackingState
+from omnid.transport.codec import DiagnosticStatus
+from omnid.transport.status_names import MOTION, SUMMARY, entry, stage_name
 
 Array = NDArray[np.float64]
 Topics: TypeAlias = tuple[str | None, str | None]  # of the lower and the upper camera
 UNPRIVILEGED: Final = RealtimeSettings(lock_memory=False, motor_priority=0)  # of the controller process of a replay
 POLL_S: Final = 0.05  # longest sleep of a paced replay, so that its end takes effect soon
+# Pairs by which the rig is examined: ten seconds of a log at 30 Hz. In the dark the run continues to check.
+MOST_PAIRS: Final = 300
+BOOKKEEPING: Final = frozenset(  # left out of the timings
+    {"progress", "statistics", "collect-poses", "collect-map", "collect-places"}
+)
 
 
 class ProgressDisplay(Protocol):
@@ -134,20 +143,18 @@ class _Replay:
             raise OmnidError(f"{in_map[0]}: places.enabled = false, so that there is no pose in the map; leave one out")
         graph = Graph(policy=NEWEST if options.drops else LOSSLESS, threaded=not options.inline)
         with opencv_threads(OPENCV_THREADS), ExitStack() as outputs:
-            session = Session(config, graph, outputs, self._warnings.append)
+            self._session = session = Session(config, graph, outputs, self._warnings.append)
             # 1. The log and its rig, which the first pairs are compared with.
-            reader = self._reader()
+            self._reader = reader = self._opened()
             outputs.callback(reader.close)
-            geometry = session.geometry(self._rig(reader), reader.frames())
+            geometry = session.geometry(self._rig(), reader.frames())
             prepare_kernels()  # may take a minute: after a log or a rig that is wrong was refused
-            front_end = FrontEnd(geometry, config, examined_rig(reader, self._log, geometry, config))
+            self._front_end = front_end = FrontEnd(geometry, config, self._examined_rig(geometry))
             # 2. The stages, between the log and the outputs; one that cannot be opened ends the run before it begins.
             run_places = RunPlaces(config, geometry, session.warn, options.rig_places, build=options.build)
+            messages, sinks = graph.source("read", self._messages()), self._outputs(geometry)
             parts = Parts(map=run_places, map_every_s=options.map_every_s)
-            messages = self._messages(graph, reader, front_end)
-            sinks = self._outputs(session, front_end)
-            stages = wire(graph, [messages], front_end, config, sinks, parts)
-            report = RunReport(session, reader, stages)
+            self._stages = wire(graph, [messages], front_end, config, sinks, parts)
             if options.progress is not None:
                 progress = options.progress(session.statistics, reader.pair_estimate())
                 graph.ticker("progress", progress.period_s, progress)
@@ -157,15 +164,14 @@ class _Replay:
                 with session.signals(self._on_signal):
                     graph.run()
                 extended = run_places.finish_run()  # before the result is made: it may warn
-                _end_recording(sinks.recorder, report)
+                self._end_recording(sinks.recorder)
             except (OmnidError, DriverError) as error:
                 with suppress(OmnidError, DriverError):  # the error that ended the run is the one that is reported
-                    _end_recording(sinks.recorder, report)
+                    self._end_recording(sinks.recorder)
                 if not session.statistics.poses or isinstance(error, RigContradictedError):
                     raise
-                raise RunFailedError(str(error), self._result(session, report, stages)) from error
-            result = self._result(session, report, stages)
-            return replace(result, rig_places=extended, map_file=run_places.written)
+                raise RunFailedError(str(error), self._result()) from error
+            return replace(self._result(), rig_places=extended, map_file=run_places.written)
 
     def _inputs(self) -> list[tuple[str, Path]]:
         """The files that are read, each with its name for errors."""
@@ -178,7 +184,7 @@ class _Replay:
         in_folder = [("the log that is read", log) for log in sorted(self._log.glob("*.mcap"))]  # also by another name
         return [(what, path) for what, path in named if path is not None] + in_folder
 
-    def _reader(self) -> LogReader:
+    def _opened(self) -> LogReader:
         """Open the log; the topics are those of the options, else of the rig, else found by their names."""
         lower, upper = self._options.topics
         rig, log = self._options.rig, self._config.log
@@ -191,44 +197,63 @@ class _Replay:
             rate_hz=log.rate_hz,
             time=log.time,
         )
-        named = ("", "")
         if rig and not (lower and upper):
             named = (read_rig(rig) if isinstance(rig, Path) else rig).topics
-        if all(named):
-            with suppress(DriverError):  # the topics may have been renamed since the rig was calibrated
-                return open_log(lower or named[0], upper or named[1])
+            if all(named):
+                with suppress(DriverError):  # the topics may have been renamed since the rig was calibrated
+                    return open_log(lower or named[0], upper or named[1])
         return open_log(lower, upper)
 
-    def _rig(self, reader: LogReader) -> Rig:
+    def _rig(self) -> Rig:
         found = self._options.rig
         if found is None:
-            return attached_rig(reader, self._log)
+            return attached_rig(self._reader, self._log)
         return read_rig(found) if isinstance(found, Path) else found
 
-    def _messages(self, graph: Graph, reader: LogReader, front_end: FrontEnd) -> Stream[Frame | MotionSample]:
-        """Add the log as a source; paced, each message comes when its stamp is due."""
-        if not self._options.paced:
-            return graph.source("read", reader.messages)
-        ended: list[None] = []
+    def _examined_rig(self, place: Geometry) -> RigHealth:
+        """Return the rig, decided as far as its first pairs show; RigContradictedError for a wrong rig.
 
-        def frames() -> Iterator[Frame | MotionSample]:
+        It is examined before the replay opens its outputs: a wrong rig leaves no file behind. Odometry finds the motion
+        between the exposures of a pair, where these are not simultaneous.
+        """
+        config, mode = self._config, self._config.rig.check
+        health = RigHealth(place.cylinder, mode)
+        if mode != "refuse":
+            return health
+        try:
+            for update in tracked_updates(self._reader, FrontEnd(place, config, health), config, self._log):
+                if not health.is_checking or update.seq >= MOST_PAIRS:
+                    break
+        except RigContradictedError:
+            raise
+        except (OmnidError, DriverError):
+            pass  # A damaged log, or poses that are lost too often: the run reports them, after the poses there are.
+        # Where too little was seen, the run checks from its beginning.
+        return RigHealth(place.cylinder, mode) if health.is_checking else health
+
+    def _messages(self) -> Callable[[], Iterator[Frame | MotionSample]]:
+        """Return the source of the log; paced, each message comes when its stamp is due."""
+        messages, graph = self._reader.messages, self._session.graph
+        motion = self._front_end.pairing.motion
+
+        def paced() -> Iterator[Frame | MotionSample]:
             offset_ns: int | None = None
-            for message in reader.messages():
+            for message in messages():
                 if offset_ns is None:
                     offset_ns = time.monotonic_ns() - message.stamp_ns
                 due_ns = message.stamp_ns + offset_ns
-                while not ended and (left_s := (due_ns - time.monotonic_ns()) * 1e-9) > 0:
+                while not graph.is_stopping and (left_s := (due_ns - time.monotonic_ns()) * 1e-9) > 0:
                     time.sleep(min(left_s, POLL_S))
                 if isinstance(message, Frame):
                     yield message
                 else:  # in the inbox of the pairing samples would replace frames
-                    front_end.pairing.motion.add(message)
+                    motion.add(message)
 
-        return graph.source("read", frames, wake=lambda: ended.append(None))
+        return paced if self._options.paced else messages
 
-    def _outputs(self, session: Session, front_end: FrontEnd) -> Outputs:
+    def _outputs(self, geometry: Geometry) -> Outputs:
         """Open all outputs."""
-        options, config, geometry = self._options, self._config, front_end.geometry
+        options, config, session = self._options, self._config, self._session
         outputs = Outputs(counters={"statistics": session.statistics})
         if options.collect:
             outputs.poses["collect-poses"] = lambda pose: self._poses.append(
@@ -246,7 +271,7 @@ class _Replay:
             outputs.maps["plan"] = lambda update: write_plan(plan, update.points, update.path_xy, heights_m)
         recorder: Sink[Any] | None = None
         if options.observer:
-            recorder = options.observer(front_end, session.graph.telemetry)
+            recorder = options.observer(self._front_end, session.graph.telemetry)
         if options.record:
             attachments = {"rig.toml": rig_toml(geometry.rig).encode(), "omnid.toml": dump(config).encode()}
             log = SingleLog(options.record, attachments)
@@ -258,9 +283,10 @@ class _Replay:
             controller = session.start_controller(UNPRIVILEGED, of_replay=True)
             setpoint = config.controller.setpoint.setpoint()
             outputs.counters["controller"] = self._wheels = ReplayDrive(controller, setpoint, geometry.rig.T_base_rig)
-        return replace(outputs, bus=self._bus(session, geometry) if options.publish else None, recorder=recorder)
+        return replace(outputs, bus=self._bus(geometry) if options.publish else None, recorder=recorder)
 
-    def _bus(self, session: Session, geometry: Geometry) -> BusSink | None:
+    def _bus(self, geometry: Geometry) -> BusSink | None:
+        session = self._session
         try:
             bus = session.open_bus(geometry.rig, gives_time=True)
         except OmnidError as error:
@@ -274,11 +300,64 @@ class _Replay:
         if again and self._options.inline:  # nothing else interrupts the stage that runs in this thread
             raise KeyboardInterrupt
 
-    def _result(self, session: Session, report: RunReport, stages: WiredStages) -> RunResult:
-        options, places, updates = self._options, stages.places, self._in_map
-        counters = report.counters()
-        if self._wheels is not None:
-            counters = replace(counters, motor=self._wheels.counts())
+    def _counters(self) -> RunCounters:
+        """Return the counters of the run; all that was lost, by reason, zeros too."""
+        found, read, paired = self._session.statistics, self._reader.counts, self._front_end.pairing.counts
+        drops = {name: read[name] for name in ("duplicate", "broken", "broken_records")}
+        drops |= {name: count for name, count in paired.items() if name.startswith(("unpaired", "repeated"))}
+        drops["broken"] += paired["broken"]
+        drops["queue"] = self._session.graph.telemetry.dropped_messages
+        mapping, places = self._stages.mapping, self._stages.places
+        return RunCounters(
+            paired["pairs"],
+            found.poses,
+            found.length_m,
+            {state: found.states[state] for state in TrackingState},
+            found.resets,
+            drops,
+            {} if mapping is None else mapping.counts,
+            {} if places is None else places.counts,
+            {} if self._wheels is None else self._wheels.counts(),
+            "" if drops["queue"] else self._front_end.pairing.loss(read),  # else they were dropped on purpose
+        )
+
+    def _about_input(self, counters: RunCounters) -> Iterator[str]:
+        """Yield warnings about the log and the images."""
+        odometry, floor = self._front_end.odometry, self._stages.floor
+        yield from self._reader.warnings
+        if counters.loss:
+            yield counters.loss
+        if not counters.poses and self._session.signal:
+            return
+        fault = odometry.last_fault
+        if fault.reason:
+            yield f"{fault.reason} {fault.detail}; {ADVICE}"
+        message = "".join(status.message for status in self._motion())
+        if message and not (fault.reason and message.startswith(fault.reason)):
+            yield f"wheels and gyro: {message}"
+        if floor is not None and floor.summary():
+            yield floor.summary()
+        yield from odometry.image_faults
+        yield from input_warnings(
+            self._front_end.pairing, self._front_end.health, self._session.statistics, self._config
+        )
+
+    def _motion(self) -> list[DiagnosticStatus]:
+        """Return the entry of wheels and gyro, if there were any."""
+        inbox = self._front_end.pairing.motion
+        return [entry(MOTION, self._front_end.motion_stats())] if inbox.wheels or inbox.gyro else []
+
+    def _end_recording(self, recorder: object) -> None:
+        """Complete a recording with the counters of the run and of its stages, if it has messages."""
+        if isinstance(recorder, Recorder) and recorder.state.messages:
+            stages = [stage for stage in self._session.graph.telemetry.stages if stage.name not in BOOKKEEPING]
+            found = [entry(stage_name(stage.name), stage_stats(stage)) for stage in stages]
+            summary = replace(self._counters(), motor={})
+            recorder.add([entry(SUMMARY, summary_stats(summary)), *self._motion(), *found], recorder.newest_ns)
+            recorder.close()
+
+    def _result(self) -> RunResult:
+        options, places, updates, session = self._options, self._stages.places, self._in_map, self._session
         # 1. Poses in the map: as it is at the end, whose later loops have corrected them; and as they were known.
         found = [] if places is None else [places.corrected(each) for each in updates]
         known = np.zeros(0, bool) if places is None else places.known(updates)
@@ -289,6 +368,7 @@ class _Replay:
         if path := options.map_live_tum:
             self._warnings += write_known(path, stamps_ns, live, np.array([each.is_known for each in updates], bool))
         # 2. All that was found.
+        counters = self._counters()
         collected = zip(*self._poses, strict=True) if self._poses else ((), (), (), ())
         pose_stamps_ns, poses, covariances, states = collected
         return RunResult(
@@ -297,8 +377,8 @@ class _Replay:
             np.array(covariances, np.float64).reshape(-1, 6, 6),
             tuple(states),
             counters,
-            report.timings(),
-            (*dict.fromkeys(self._warnings), *report.warnings()),
+            {row.stage: row for row in session.graph.telemetry.summary() if row.stage not in BOOKKEEPING},
+            (*dict.fromkeys(self._warnings), *self._about_input(counters)),
             self._map[0].points if self._map else None,
             session.signal,
             in_map,
@@ -307,13 +387,6 @@ class _Replay:
             places.map() if places is not None and options.collect else None,
             elapsed_s=time.monotonic() - self._begun_s,
         )
-
-
-def _end_recording(recorder: object, report: RunReport) -> None:
-    """Complete a recording with the counters of the run, if it has messages."""
-    if isinstance(recorder, Recorder) and recorder.state.messages:
-        recorder.add(report.final_status(), recorder.newest_ns)
-        recorder.close()
 
 
 @contextmanager

@@ -3,32 +3,24 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.logs.log_reader import LogReader
-from omnid.core.control.motion_monitor import ADVICE
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.places.place_map import PlaceMap
-from omnid.diagnostics.run_summary import RunCounters, input_warnings
-from omnid.diagnostics.status import stage_stats, summary_stats
+from omnid.diagnostics.run_summary import RunCounters
 from omnid.engine.telemetry import SummaryRow
 from omnid.errors import OmnidError
 from omnid.formats.exports import write_ply
 from omnid.formats.tum import Trajectory, read_tum, tum_row
 from omnid.recordings.evaluation import Metrics, evaluate
 from omnid.runs.place_maps import RigPlaces
-from omnid.runs.session import Session
-from omnid.runs.wiring import WiredStages
 from omnid.tracking_state import MapState, TrackingState
-from omnid.transport.codec import DiagnosticStatus
-from omnid.transport.status_names import MOTION, SUMMARY, entry, stage_name
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -113,71 +105,3 @@ class RunFailedError(OmnidError):
     def __init__(self, message: str, result: RunResult) -> None:
         super().__init__(message)
         self.result = result
-
-
-BOOKKEEPING: Final = frozenset(  # left out of the timings
-    {"progress", "statistics", "collect-poses", "collect-map", "collect-places"}
-)
-
-
-class RunReport:
-    """Counters, timings, warnings and final status of a run over a log, read from its parts."""
-
-    def __init__(self, session: Session, reader: LogReader, stages: WiredStages) -> None:
-        self._session, self._reader, self._stages = session, reader, stages
-        self._pairing, self._odometry = stages.front_end.pairing, stages.front_end.odometry
-
-    def counters(self) -> RunCounters:
-        """Return the counters of the run; all that was lost, by reason, zeros too."""
-        read, paired, telemetry = self._reader.counts, self._pairing.counts, self._session.graph.telemetry
-        drops = {name: read[name] for name in ("duplicate", "broken", "broken_records")}
-        drops |= {name: count for name, count in paired.items() if name.startswith(("unpaired", "repeated"))}
-        drops["broken"] += paired["broken"]
-        drops["queue"] = telemetry.dropped_messages
-        mapping, places = self._stages.mapping, self._stages.places
-        return replace(
-            RunCounters.of(self._session.statistics, paired["pairs"], drops),
-            map={} if mapping is None else mapping.counts,
-            places={} if places is None else places.counts,
-            loss=self._loss(),
-        )
-
-    def timings(self) -> dict[str, SummaryRow]:
-        """Return the times of the stages."""
-        rows = self._session.graph.telemetry.summary()
-        return {row.stage: row for row in rows if row.stage not in BOOKKEEPING}
-
-    def warnings(self) -> Iterator[str]:
-        """Return warnings about the log and the images."""
-        yield from self._reader.warnings
-        if self._loss():
-            yield self._loss()
-        statistics = self._session.statistics
-        if not statistics.poses and self._session.signal:
-            return
-        fault = self._odometry.last_fault
-        if fault.reason:
-            yield f"{fault.reason} {fault.detail}; {ADVICE}"
-        message = "".join(status.message for status in self._motion())
-        if message and not (fault.reason and message.startswith(fault.reason)):
-            yield f"wheels and gyro: {message}"
-        if self._stages.floor is not None and self._stages.floor.summary():
-            yield self._stages.floor.summary()
-        yield from self._odometry.image_faults
-        yield from input_warnings(self._pairing, self._stages.front_end.health, statistics, self._session.config)
-
-    def final_status(self) -> list[DiagnosticStatus]:
-        """Return the counters of the run and of its stages, for the log."""
-        stages = (stats for stats in self._session.graph.telemetry.stages if stats.name not in BOOKKEEPING)
-        found = [entry(stage_name(stage.name), stage_stats(stage)) for stage in stages]
-        return [entry(SUMMARY, summary_stats(self.counters())), *self._motion(), *found]
-
-    def _loss(self) -> str:
-        """Return one line about images that make no pair; empty where these are few, or were dropped on purpose."""
-        dropped = self._session.graph.telemetry.dropped_messages
-        return "" if dropped else self._pairing.loss(self._reader.counts)
-
-    def _motion(self) -> list[DiagnosticStatus]:
-        """Return the entry of wheels and gyro, if there were any."""
-        inbox = self._pairing.motion
-        return [entry(MOTION, self._stages.front_end.motion_stats())] if inbox.wheels or inbox.gyro else []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
 from dataclasses import replace
 from functools import partial
 
@@ -291,9 +290,8 @@ def test_names_camera_directions_and_time() -> None:
 
 
 def test_what_everybody_wants_to_know_comes_last_and_zeros_are_left_out() -> None:
-    statistics = RunStatistics()
-    statistics.poses, statistics.length_m, statistics.states = 98, 4.82741, Counter({"tracking": 98})
-    brief = run_summary(RunCounters.of(statistics, 99, {"late": 0, "queue": 1}), []).splitlines()
+    counters = RunCounters(99, 98, 4.82741, {TrackingState.TRACKING: 98}, 0, {"late": 0, "queue": 1})
+    brief = run_summary(counters, []).splitlines()
     assert brief == [
         "poses     98 of 99 pairs of images",
         "lost      queue 1",
