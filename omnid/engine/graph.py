@@ -20,7 +20,6 @@ from queue import Empty, SimpleQueue
 from typing import Any, Final, Generic, Protocol, TypeAlias, TypeVar
 
 from omnid.engine.telemetry import StageStats, Telemetry
-from omnid.errors import OmnidError
 
 T = TypeVar("T")
 In = TypeVar("In")
@@ -243,7 +242,6 @@ class Graph:
         self._wakeup: SimpleQueue[None] = SimpleQueue()  # its put is reentrant, so safe in a signal handler
         self._no_ticks = threading.Event()
         self._open_sources = 0
-        self._ran = False
 
     # The wiring.
 
@@ -255,7 +253,7 @@ class Graph:
         `wake` is called once to end a threaded run early: it must end the current read and all later ones.
         """
         stream: Stream[T] = Stream(name)
-        self._sources.append(_Source(self._stats(name), messages, wake, stream))
+        self._sources.append(_Source(self.telemetry.add(StageStats(name)), messages, wake, stream))
         self._open_sources += 1
         return stream
 
@@ -295,23 +293,14 @@ class Graph:
         A stop or a failure ends it at once, before the inboxes are empty. The action's optional `close` is called once,
         also after an error.
         """
-        if not 0.0 < period_s < threading.TIMEOUT_MAX:
-            raise OmnidError(f"ticker '{name}': expected a period above 0 s, found {period_s}")
-        ticker = _Ticker(self._stats(name, is_ticker=True), round(period_s * 1e9), action)
+        ticker = _Ticker(self.telemetry.add(StageStats(name, is_ticker=True)), round(period_s * 1e9), action)
         self._tickers.setdefault(thread, []).append(ticker)
-
-    def _stats(self, name: str, *, is_ticker: bool = False) -> StageStats:
-        if self._ran:
-            raise OmnidError("a graph runs once, and is wired before it runs: create a new one")
-        return self.telemetry.add(StageStats(name, is_ticker))
 
     def _node(
         self, name: str, work: Any, inputs: tuple[Stream[Any], ...], policy: Policy, depth: int, thread: str
     ) -> Stream[Any]:
-        if not inputs or depth < 1:
-            raise OmnidError(f"'{name}': expected inputs and a depth above 0, found {len(inputs)} and {depth}")
         thread = thread or name
-        node = Node(self, self._stats(name), work, len(inputs), thread)
+        node = Node(self, self.telemetry.add(StageStats(name)), work, len(inputs), thread)
         for stream in inputs:
             if not self._threaded or stream.thread == thread:
                 stream.readers.append(node.put)
@@ -330,9 +319,6 @@ class Graph:
 
         Raises the first error of any stage with later ones in its notes, and KeyboardInterrupt after a second stop.
         """
-        if self._ran:
-            raise OmnidError("a graph runs once, and is wired before it runs: create a new one")
-        self._ran = True
         # 1. A thread for each source, each group of stages, and each group of tickers.
         bodies: dict[str, Callable[[], object]] = {
             source.stats.name: partial(deque, self._steps(source), 0) for source in self._sources

@@ -88,18 +88,6 @@ def wheel_state(state: ControllerState) -> WheelState:
     )
 
 
-class WheelStates:
-    """A stage that gives the part of the controller's state that the navigation needs, where it has changed."""
-
-    def __init__(self) -> None:
-        self._given: WheelState | None = None
-
-    def process(self, state: ControllerState) -> WheelState | None:
-        """Return the state of the wheels; None where it is as before."""
-        before, self._given = self._given, wheel_state(state)
-        return None if self._given == before else self._given
-
-
 class WiredStages(NamedTuple):
     """The stages that are asked for counts and warnings."""
 
@@ -180,7 +168,7 @@ def wire(
         is_new = known_places is None or not known_places.keyframes
         route_map = RouteMap(map_name, T_base_rig, geometry.T_rig_rect, is_new=is_new) if places else None
         navigation = NavigationStage(config.navigation, config.controller.collision, T_base_rig, Routes(route_map))
-        wheels = graph.stage("wheel-states", WheelStates(), states, thread=states.thread)
+        wheels = graph.stage("wheel-states", wheel_state, states, thread=states.thread)
         seen: list[Stream[Any]] = [stream for stream in (poses, in_map, rings) if stream is not None]
         ways = graph.stage("navigation", navigation, *seen, wheels, requests.direct, written)
         graph.sink("planner", drive, ways, thread=ways.thread)

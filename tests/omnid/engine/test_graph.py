@@ -16,7 +16,6 @@ from typing import NoReturn
 import pytest
 
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph
-from omnid.errors import OmnidError
 
 LONG_S = 20.0  # a timeout that only a defect reaches
 
@@ -252,25 +251,6 @@ def test_stop_from_a_signal_handler_drains_and_finishes(threaded: bool) -> None:
     assert sink.got == list(range(graph.telemetry.stages[0].processed))
     assert len(sink.got) >= 6
     assert sink.finished == 1
-
-
-def test_refuses_wrong_wiring() -> None:
-    graph = Graph()
-    numbers = graph.source("numbers", lambda: range(3))
-    with pytest.raises(OmnidError, match="'numbers': the name is in use"):
-        graph.sink("numbers", Collect(), numbers)
-    with pytest.raises(OmnidError, match="expected inputs"):
-        graph.sink("nothing", Collect())
-    with pytest.raises(OmnidError, match="depth above 0"):
-        graph.sink("narrow", Collect(), numbers, depth=0)
-    for period_s in (0.0, -1.0, float("nan"), float("inf")):
-        with pytest.raises(OmnidError, match="period above 0"):
-            graph.ticker("action", period_s, print)
-    graph.run()
-    with pytest.raises(OmnidError, match="runs once"):
-        graph.run()
-    with pytest.raises(OmnidError, match="runs once"):
-        graph.source("late", lambda: range(3))
 
 
 def test_lossless_waits_for_a_slow_reader_with_a_bounded_inbox() -> None:
