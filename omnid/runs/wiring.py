@@ -26,7 +26,7 @@ from omnid.stages.mapping import MapGrid, Mapping
 from omnid.stages.navigation import NavigationStage
 from omnid.stages.obstacles import CameraFloor, Obstacles
 from omnid.stages.places import Places
-from omnid.stages.routes import RouteMap, Routes
+from omnid.stages.routes import Routes
 
 BUS, FILES, BACKGROUND = "bus", "files", "background"  # threads that several stages and sinks share
 RECORDED_DEPTH = 20  # messages of each kind that may wait for the disk of a live recording
@@ -166,8 +166,8 @@ def wire(
     if parts.navigation is not None and written is not None:
         requests, states, _, drive, map_name = parts.navigation
         is_new = known_places is None or not known_places.keyframes
-        route_map = RouteMap(map_name, T_base_rig, geometry.T_rig_rect, is_new=is_new) if places else None
-        navigation = NavigationStage(config.navigation, config.controller.collision, T_base_rig, Routes(route_map))
+        taught = Routes(map_name if places else "", T_base_rig @ geometry.T_rig_rect, is_new=is_new)
+        navigation = NavigationStage(config.navigation, config.controller.collision, T_base_rig, taught)
         wheels = graph.stage("wheel-states", wheel_state, states, thread=states.thread)
         seen: list[Stream[Any]] = [stream for stream in (poses, in_map, rings) if stream is not None]
         ways = graph.stage("navigation", navigation, *seen, wheels, requests.direct, written)

@@ -36,7 +36,7 @@ from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import NOWHERE, MapPosition, Situation, WheelState, refusal_to_drive
 from omnid.errors import OmnidError
 from omnid.messages import NavigationPlan, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate, RequestAnswer
-from omnid.stages.routes import KeyframeTie, Routes, refusal_while_teaching
+from omnid.stages.routes import Routes, refusal_while_teaching
 
 Array = NDArray[np.float64]
 NavigationInput: TypeAlias = OdometryUpdate | PlaceUpdate | ObstacleRing | WheelState | NavigationCommand
@@ -71,7 +71,7 @@ class NavigationStage:
         self._stop_m = collision.stop_m
         self._now: Situation | None = None
         self._in_map: MapPosition | None = None
-        self._tie: KeyframeTie | None = None
+        self._tie: tuple[int, Array] | None = None  # id of the newest keyframe, and its pose (3,) in the map
         self._reset_ns = -1  # stamp of the pose at which odometry began again
         self._ring: ObstacleRing | None = None
         self._ring_points: Array = NOWHERE  # (N, 2) positions in odom of what the ring shows
@@ -161,8 +161,8 @@ class NavigationStage:
         sigma_m = math.sqrt(max(float(np.linalg.eigvalsh(in_plane)[-1]), 0.0))  # NaN stays NaN in this order
         self._in_map = MapPosition(planar(T_map_odom), update.state, sigma_m, update.stamp_ns)
         T_map_keyframe = T_map_base @ self._T_base_rig @ se3.inverse(update.T_keyframe_rig) @ self._T_rig_base
-        self._tie = KeyframeTie(update.keyframe, planar(T_map_keyframe))
-        self._routes.follow_map(update.keyframes)
+        self._tie = update.keyframe, planar(T_map_keyframe)
+        self._routes.keyframes = update.keyframes or self._routes.keyframes
 
     def _request(self, command: NavigationCommand) -> NavigationUpdate:
         """Execute a request; return the new state with the answer."""

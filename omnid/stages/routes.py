@@ -1,10 +1,8 @@
-"""Teaching and repeating of routes: the recorder, and the map that routes are tied to."""
+"""Teaching and repeating of routes, tied to the keyframes of the map of places."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,32 +20,6 @@ from omnid.tracking_state import MapState
 Array = NDArray[np.float64]
 
 
-class RouteMap:
-    """The map of places that routes are tied to, as the newest update has it."""
-
-    def __init__(self, name: str, T_base_rig: Array, T_rig_rect: Array, *, is_new: bool) -> None:
-        """name: of the map's file; empty: the map is not saved, so no route can be tied to it.
-
-        is_new: the map was empty before this run, and its frame is odom at the start.
-        """
-        self.name, self.is_new = name, is_new
-        self._T_base_rig, self._T_rig_base = T_base_rig, se3.inverse(T_base_rig)
-        self._T_rig_rect, self._T_rect_rig = T_rig_rect, se3.inverse(T_rig_rect)
-        self.keyframes = MapKeyframes({}, {})
-
-    def keyframe(self, id: int) -> KeyframePose | None:
-        """Return a keyframe, None without one."""
-        T_map_rect = self.keyframes.T_map_rect.get(id)
-        if T_map_rect is None:
-            return None
-        T_map_rig = self._T_rig_rect @ T_map_rect @ self._T_rect_rig
-        return KeyframePose(self.keyframes.stamps_ns[id], planar(self._T_base_rig @ T_map_rig @ self._T_rig_base))
-
-    def noted(self) -> Mapping[int, int]:
-        """Return the stamps of the keyframes, which identify the map."""
-        return self.keyframes.stamps_ns
-
-
 def refusal_of_name(name: str) -> str:
     """Return why a route cannot be taught under a name that there is already."""
     return f"there is a route {name} already: choose another name, or replace it (`omnid route teach {name} --replace`)"
@@ -58,18 +30,20 @@ def refusal_while_teaching(name: str) -> str:
     return f"the route {name} is being taught: `omnid route finish` writes it, `omnid route stop` drops it"
 
 
-class KeyframeTie(NamedTuple):
-    """The newest keyframe, and the pose of the base in the map as that says."""
-
-    id: int
-    pose: Array  # (3,) of the keyframe in the map
-
-
 class Routes:
-    """Record routes, and make paths of those that were read. Files are written and read by others."""
+    """Record routes, and make paths of those that were read. Files are written and read by others.
 
-    def __init__(self, places: RouteMap | None) -> None:
-        self._places = places
+    Routes are tied to the keyframes of the map of places, as the newest update has them.
+    """
+
+    def __init__(self, map_name: str, T_base_rect: Array, *, is_new: bool) -> None:
+        """map_name: of the map's file; empty: the map is not saved, so no route can be tied to it.
+
+        is_new: the map was empty before this run, and its frame is odom at the start.
+        """
+        self.map_name, self._is_new = map_name, is_new
+        self._T_base_rect, self._T_rect_base = T_base_rect, se3.inverse(T_base_rect)
+        self.keyframes = MapKeyframes({}, {})
         self._recorder: RouteRecorder | None = None
         self._resets = 0  # resets of odometry when the recording began
         self._finished: RouteRecorder | None = None  # recorder of the route that is to be written
@@ -90,25 +64,28 @@ class Routes:
 
         replace: a route of that name may exist, and gives way when the recording is finished.
         """
-        places = self._map()
+        self._require_map()
         if self._recorder is not None:
             raise OmnidError(refusal_while_teaching(self._recorder.name))
         if not replace and self.taught is not None and self.taught.route.name == name:
             raise OmnidError(refusal_of_name(name))
         refusal = refusal_of_map(now, math.inf)
-        if refusal and not (places.is_new and now.resets == 0 and now.in_map is not None):
+        if refusal and not (self._is_new and now.resets == 0 and now.in_map is not None):
             raise OmnidError(refusal)
         self._recorder, self._resets = RouteRecorder(name), now.resets
 
-    def record(self, now: Situation, tie: KeyframeTie | None) -> str:
-        """Add the newest pose; return why the recording has ended, empty while it continues."""
+    def record(self, now: Situation, tie: tuple[int, Array] | None) -> str:
+        """Add the newest pose; return why the recording has ended, empty while it continues.
+
+        tie: id of the newest keyframe, and its pose (3,) in the map; None: there is none yet.
+        """
         if self._recorder is None or tie is None or now.in_map is None or now.in_map.state is MapState.LOST:
             return ""
         if now.resets != self._resets and now.in_map.state is not MapState.LOCALIZED:
             name, self._recorder = self._recorder.name, None
             return f"odometry has begun again, so that the way of the route {name} is not known: teach it again"
         try:
-            self._recorder.add(now.map_pose(), now.speed_mps, tie.id, tie.pose)
+            self._recorder.add(now.map_pose(), now.speed_mps, *tie)
         except OmnidError as error:
             self._recorder = None
             return str(error)
@@ -123,8 +100,8 @@ class Routes:
             raise OmnidError("no route is being taught: begin with `omnid route teach NAME`")
         if self.taught is not None:
             raise OmnidError(f"the route {self.taught.route.name} is being written: wait for its end")
-        places = self._map()
-        route = self._recorder.route(places.keyframe, places.noted(), created_s, places.name)
+        self._require_map()
+        route = self._recorder.route(self._keyframe, self.keyframes.stamps_ns, created_s, self.map_name)
         self.taught, self._finished, self._recorder = TaughtRoute(route, id), self._recorder, None
 
     def written(self, refusal: str) -> None:
@@ -142,14 +119,15 @@ class Routes:
 
     def found(self, request: RouteRequest, refusal: str) -> Route:
         """Return the route of a request if it is one of this map. Raise OmnidError else, or with the refusal."""
-        places, taught = self._map(), self.taught
+        self._require_map()
+        taught = self.taught
         if taught is not None and taught.route.name == request.name:
             return taught.route
         if refusal or request.route is None:
             raise OmnidError(refusal or f"the route {request.name} was not read")
-        if not request.route.fits(places.keyframe):
+        if not request.route.fits(self._keyframe):
             taught_in = request.route.map_name
-            other = "built again since" if taught_in == places.name else f"and not in {places.name}"
+            other = "built again since" if taught_in == self.map_name else f"and not in {self.map_name}"
             raise OmnidError(
                 f"the route {request.name} was taught in the map {taught_in}, {other}: start with the map that it was "
                 "taught in (`omnid run --map`), or teach it again"
@@ -158,24 +136,24 @@ class Routes:
 
     def paths(self, route: Route, request: RouteRequest, now: Situation) -> list[DrivePath]:
         """Return the paths of a repetition. Raise OmnidError where it is impossible."""
-        places = self._map()
         return repeated_paths(
             route,
-            places.keyframe,
+            self._keyframe,
             now.map_pose(),
             loops=request.loops,
             reverse=request.reverse,
             from_start=request.from_start,
         )
 
-    def follow_map(self, keyframes: MapKeyframes | None) -> None:
-        """Take the keyframes of the map as they are now."""
-        if self._places is not None and keyframes is not None:
-            self._places.keyframes = keyframes
+    def _keyframe(self, id: int) -> KeyframePose | None:
+        """Return a keyframe of the map, None without one."""
+        T_map_rect = self.keyframes.T_map_rect.get(id)
+        if T_map_rect is None:
+            return None
+        return KeyframePose(self.keyframes.stamps_ns[id], planar(self._T_base_rect @ T_map_rect @ self._T_rect_base))
 
-    def _map(self) -> RouteMap:
-        if self._places is None or not self._places.name:
+    def _require_map(self) -> None:
+        if not self.map_name:
             raise OmnidError(
                 "routes need a map that is saved: start the robot (`omnid run`, `omnid simulate`) with --map FILE.omap"
             )
-        return self._places

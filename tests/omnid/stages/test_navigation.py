@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +23,11 @@ from omnid.core.navigation.requests import (
     RouteAction,
     RouteRequest,
 )
-from omnid.core.navigation.route import KeyframePose
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import WheelState
 from omnid.core.obstacles.moving_tracker import MovingObstacle
 from omnid.formats.route_file import RouteFolder
-from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
+from omnid.messages import MapKeyframes, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
 from omnid.navigation_state import NavigationState
 from omnid.runs.route_files import RouteFiles
 from omnid.stages.navigation import NavigationStage
@@ -44,27 +42,19 @@ DEPTH: Any = None  # the stage reads none
 UNIT = np.eye(6) * 1e-6
 
 
-class FixedMap:
-    """A map of keyframes that stand still."""
-
-    name = "site.omap"
-
-    def __init__(self, stamp_ns: int = 5, *, is_new: bool = False) -> None:
-        self._stamp_ns, self.is_new = stamp_ns, is_new
-
-    def keyframe(self, id: int) -> KeyframePose | None:
-        return KeyframePose(self._stamp_ns, np.zeros(3)) if id == 3 else None
-
-    def noted(self) -> Mapping[int, int]:
-        return {3: self._stamp_ns}
+def fixed_map(stamp_ns: int = 5, *, is_new: bool = False) -> Routes:
+    """Return routes in a map with one keyframe, which stands still."""
+    routes = Routes("site.omap", np.eye(4), is_new=is_new)
+    routes.keyframes = MapKeyframes({3: stamp_ns}, {3: np.eye(4)})
+    return routes
 
 
 class Robot:
     """A base that follows setpoints exactly, seen through the stage's messages."""
 
-    def __init__(self, folder: Path, places: FixedMap | None = None) -> None:
-        self.places = FixedMap() if places is None else places
-        self.stage = NavigationStage(NavigationSettings(), CollisionSettings(), T_BASE_RIG, Routes(self.places))
+    def __init__(self, folder: Path, routes: Routes | None = None) -> None:
+        self.routes = routes or fixed_map()
+        self.stage = NavigationStage(NavigationSettings(), CollisionSettings(), T_BASE_RIG, self.routes)
         self.stage.process(WheelState(True, False))
         self.files = RouteFiles(RouteFolder(folder))
         self.pose, self.velocity = np.zeros(3), np.zeros(2)

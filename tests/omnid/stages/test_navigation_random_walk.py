@@ -40,10 +40,9 @@ from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate, Place
 from omnid.navigation_state import NavigationState
 from omnid.runs.route_files import RouteFiles
 from omnid.stages.navigation import NavigationStage
-from omnid.stages.routes import Routes
 from omnid.tracking_state import MapState, TrackingState
 from tests.omnid.core.navigation.driven_base import wheel_state
-from tests.omnid.stages.test_navigation import FixedMap
+from tests.omnid.stages.test_navigation import fixed_map
 
 Array = NDArray[np.float64]
 TICK_S, TICKS_A_POSE = 0.02, 5
@@ -62,7 +61,7 @@ class Walk:
     def __init__(self, seed: int, folder: Path) -> None:
         self.rng, self.seen, self.t_s = random.Random(seed), Counter[str](), 1000.0
         self.law = ControlLaw(SETTINGS, -1)
-        self.stage = NavigationStage(NAVIGATION, SETTINGS.collision, np.eye(4), Routes(FixedMap(is_new=True)))
+        self.stage = NavigationStage(NAVIGATION, SETTINGS.collision, np.eye(4), fixed_map(is_new=True))
         self.files = RouteFiles(RouteFolder(folder))
         self.pose, self.motion = np.zeros(3), (0.0, 0.0)
         self.seq = self.resets = 0

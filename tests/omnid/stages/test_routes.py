@@ -22,8 +22,8 @@ from tests.omnid.stages.test_navigation import (
     ODOM,
     PERIOD_NS,
     UNIT,
-    FixedMap,
     Robot,
+    fixed_map,
 )
 
 
@@ -53,21 +53,21 @@ def test_a_route_is_taught_and_repeated(tmp_path: Path) -> None:
     robot.send(RouteRequest(RouteAction.REPEAT, "hall"))
     assert robot.run(1200).state is NavigationState.REACHED
     np.testing.assert_allclose(robot.pose[:2], end[:2], atol=0.1)
-    other = Robot(tmp_path, FixedMap(stamp_ns=6))
+    other = Robot(tmp_path, fixed_map(stamp_ns=6))
     other.pass_on()
     update = other.send(RouteRequest(RouteAction.REPEAT, "hall"))
     assert update.answer is not None and "in the map site.omap, built again since" in update.answer.refusal
-    other.places.name = "hall.omap"
+    other.routes.map_name = "hall.omap"
     update = other.send(RouteRequest(RouteAction.REPEAT, "hall"))
     assert update.answer is not None and "in the map site.omap, and not in hall.omap" in update.answer.refusal
-    other.places.name = ""
+    other.routes.map_name = ""
     update = other.send(RouteRequest(RouteAction.TEACH, "x"))
     assert update.answer is not None and "--map FILE.omap" in update.answer.refusal
 
 
 def test_a_route_is_taught_in_a_new_map_while_nothing_is_recognised_yet(tmp_path: Path) -> None:
     for is_new in (True, False):
-        robot = Robot(tmp_path, FixedMap(is_new=is_new))
+        robot = Robot(tmp_path, fixed_map(is_new=is_new))
         robot.map_state = MapState.ODOMETRY_ONLY
         robot.pass_on()
         answer = robot.send(RouteRequest(RouteAction.TEACH, "hall")).answer
