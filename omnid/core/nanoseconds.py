@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 S_PER_NS: Final = 1e-9  # exact, by the definition of the prefix
+NS_PER_S: Final = 10**9
 
 
 class SecondsSinceFirst:

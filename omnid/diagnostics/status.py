@@ -11,6 +11,7 @@ from drivers.frame import Camera
 from omnid.controller.statistics import ControllerStatistics
 from omnid.core.control.collision_monitor import remedy
 from omnid.core.control.safety_rules import NOT_ARMED
+from omnid.core.nanoseconds import S_PER_NS
 from omnid.core.obstacles.unwatched import Unwatched
 from omnid.core.rig.rig_health import VIEWS, RigHealth
 from omnid.core.stereo.tiles import SIDES, Side, TileStates
@@ -64,7 +65,7 @@ class StatusCollector:
         return (count - before) / self._span_s if self._span_s > 0 else math.nan
 
     def _age_s(self, stamp_ns: int) -> float:
-        return (self._clock_ns() - stamp_ns) * 1e-9 if stamp_ns else math.nan
+        return (self._clock_ns() - stamp_ns) * S_PER_NS if stamp_ns else math.nan
 
     def _odometry(self) -> Stats:
         newest = self._statistics.newest
@@ -192,7 +193,7 @@ def image_stats(unwatched: Unwatched, newest: OdometryUpdate | None, fixed_share
         return {}
     tiles = newest.depth.panoramas.tiles
     lost = [side for side in SIDES if side in tiles.columns and tiles.columns[side].any()]
-    since_s = {f"{side}_since_s": round((newest.stamp_ns - tiles.since_ns[side]) * 1e-9) for side in lost}
+    since_s = {f"{side}_since_s": round((newest.stamp_ns - tiles.since_ns[side]) * S_PER_NS) for side in lost}
     words = "; ".join(_lost_parts(unwatched, side, tiles) for side in lost)
     return {**since_s, "fixed_percent": round(100 * fixed_share) if fixed_share else "", "_lost": words}
 

@@ -19,6 +19,7 @@ from functools import partial
 from queue import Empty, SimpleQueue
 from typing import Any, Final, Generic, Protocol, TypeAlias, TypeVar
 
+from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
 from omnid.engine.telemetry import StageStats, Telemetry
 
 T = TypeVar("T")
@@ -293,7 +294,7 @@ class Graph:
         A stop or a failure ends it at once, before the inboxes are empty. The action's optional `close` is called once,
         also after an error.
         """
-        ticker = _Ticker(self.telemetry.add(StageStats(name, is_ticker=True)), round(period_s * 1e9), action)
+        ticker = _Ticker(self.telemetry.add(StageStats(name, is_ticker=True)), round(period_s * NS_PER_S), action)
         self._tickers.setdefault(thread, []).append(ticker)
 
     def _node(
@@ -437,7 +438,7 @@ class Graph:
             ticker.deadline_ns = time.monotonic_ns()
         while True:
             ticker = min(group, key=lambda each: each.deadline_ns)
-            if self._no_ticks.wait(max(0.0, (ticker.deadline_ns - time.monotonic_ns()) * 1e-9)) or self.is_stopping:
+            if self._no_ticks.wait(max(0.0, (ticker.deadline_ns - time.monotonic_ns()) * S_PER_NS)) or self.is_stopping:
                 break
             stats, now_ns = ticker.stats, time.monotonic_ns()
             skipped = max(0, now_ns - ticker.deadline_ns) // ticker.period_ns

@@ -18,15 +18,15 @@ import time
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
-from omnid.core.nanoseconds import S_PER_NS
+from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
 from omnid.engine.graph import nothing
 from omnid.engine.threads import Lock
 
 SLEW: Final = 500e-6  # most by which NTP changes the rate of a clock: MAXFREQ of the kernel's timex.h
 STEP_NS: Final = 1_000_000  # less than two images of a pair are apart
-FOLLOW_NS: Final = 10**9  # time between two offsets that are followed in silence
+FOLLOW_NS: Final = NS_PER_S  # time between two offsets that are followed in silence
 KEPT: Final = 64  # offsets that are remembered: stamps of the last minute, whatever the clock does
-END_NS: Final = 2**31 * 10**9  # of the times of ROS, which begin in 1970 and end in 2038
+END_NS: Final = 2**31 * NS_PER_S  # of the times of ROS, which begin in 1970 and end in 2038
 
 
 class _Offset(NamedTuple):

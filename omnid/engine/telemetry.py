@@ -11,6 +11,8 @@ from dataclasses import dataclass, field
 from itertools import accumulate
 from typing import Any, NamedTuple, TypeVar
 
+from omnid.core.nanoseconds import S_PER_NS
+
 T = TypeVar("T")
 
 _LOW_S = 1e-6
@@ -78,7 +80,7 @@ class StageStats:
 
     def add(self, start_ns: int) -> None:
         """Count a message whose work began then, by time.perf_counter_ns()."""
-        self.wall.add((time.perf_counter_ns() - start_ns) * 1e-9)
+        self.wall.add((time.perf_counter_ns() - start_ns) * S_PER_NS)
         self.processed += 1
 
 

@@ -27,7 +27,7 @@ from drivers.cameras.camera_state import (
 )
 from drivers.frame import Camera
 from omnid.camera_config import CamerasConfig
-from omnid.core.nanoseconds import S_PER_NS
+from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
 from omnid.messages import FramePair
 
 SAMPLED_COLUMNS: Final = 160  # of the panorama: some thousand samples
@@ -178,7 +178,7 @@ class ExposureControl:
         self._area, self._config = area, config
         self._exposures = [state.exposure for state in cameras.values() if state.exposure is not None]
         self._left_to_cameras = _reason(config, cameras)
-        self._period_ns = 1e9 / (config.rate_hz or USUAL_HZ)
+        self._period_ns = NS_PER_S / (config.rate_hz or USUAL_HZ)
         self._law: ExposureLaw | None = None
         self._levels: tuple[GreyLevels, GreyLevels] | None = None  # of the newest measured pair
         self._next_ns: float = -math.inf

@@ -11,8 +11,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import Final, Protocol, TypeAlias
 
-import cv2
-
 from calib.rig import Rig
 from calib.rig_file import read_rig, rig_toml
 from drivers.cameras.camera_state import CameraState
@@ -25,6 +23,7 @@ from omnid.controller.statistics import ARMED, ControllerState
 from omnid.core.control.arming import MANUAL, NO_ANSWER
 from omnid.core.control.command_sources import PLANNER
 from omnid.core.control.safety_rules import AWAITED, NO_POSE
+from omnid.core.nanoseconds import S_PER_NS
 from omnid.core.navigation.requests import NavigationCommand
 from omnid.core.obstacles.unwatched import Unwatched
 from omnid.core.rig.rig_health import RigHealth
@@ -42,7 +41,7 @@ from omnid.light.exposure import ExposureControl, UsefulArea
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.record import open_recorder
 from omnid.runs.route_files import Requests
-from omnid.runs.session import BUS_POINTS, LOG_POINTS, OPENCV_THREADS, Session, joint_wheels
+from omnid.runs.session import BUS_POINTS, LOG_POINTS, Session, joint_wheels, opencv_in_one_thread
 from omnid.runs.systemd import Service, StatusLine, TerminalStatus, print_stacks_when_killed
 from omnid.runs.wiring import NavigationParts, Outputs, Parts, wire
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
@@ -214,7 +213,7 @@ class LiveRun:
                 terminal = TerminalStatus(self._show, line, partial(self._report, logging.INFO), _ready(config))
                 graph.ticker("terminal", terminal.period_s, terminal, thread="terminal")
             # 3. The run, until a signal or a failure ends it.
-            cv2.setNumThreads(OPENCV_THREADS)
+            outputs.enter_context(opencv_in_one_thread())
             for refused in () if robot.waits else prepare(config.realtime):
                 warn(refused)
             # What the first loop needs is imported while the first poses are computed.
@@ -262,7 +261,7 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
         pairs={"exposure": exposure},
         counters={
             "statistics": session.statistics,
-            "latency": lambda pose: to_pose.add((clock.monotonic_ns() - pose.stamp_ns) * 1e-9),
+            "latency": lambda pose: to_pose.add((clock.monotonic_ns() - pose.stamp_ns) * S_PER_NS),
         },
         # The ticks of wheels that wait give the time.
         bus=BusSink(bus, session.encoder(rig, BUS_POINTS), clock=VelocityCommand if robot.waits else None),

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
 from stat import S_ISREG
-from typing import Final
 
 from calib.rig_file import rig_toml
 from omnid.config import Config
@@ -24,8 +23,6 @@ from omnid.sinks.files import check_outputs
 from omnid.stages.geometry import Geometry
 from omnid.transport.codec import string_from_cdr
 from omnid.transport.topics import SAVE_MAP, Answer, Request
-
-LONGEST_REQUEST: Final = 64  # bytes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,7 +110,7 @@ class RunPlaces:
     def receive(self, request: Request) -> Answer | None:
         """Take a request from the bus, a String "save", from any thread; return the refusal of any other."""
         with suppress(OmnidError):
-            if self.requests and string_from_cdr(request.payload[:LONGEST_REQUEST]) == SAVE_MAP:
+            if self.requests and string_from_cdr(request.payload) == SAVE_MAP:
                 self.requests.push(SaveMap(request.id))
                 return None
         self._counts["refused"] += 1

@@ -5,13 +5,12 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, Protocol, TypeAlias
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,6 +24,7 @@ from omnid.calibration.drive_observations import tracked_updates
 from omnid.config import Config
 from omnid.controller.motor import SIMULATED
 from omnid.core.control.motion_monitor import ADVICE
+from omnid.core.nanoseconds import S_PER_NS
 from omnid.core.rig.rig_health import RigContradictedError, RigHealth
 from omnid.diagnostics.run_summary import RunCounters, RunStatistics, input_warnings
 from omnid.diagnostics.status import stage_stats, summary_stats
@@ -38,7 +38,7 @@ from omnid.formats.plan import drawn_heights
 from omnid.messages import MapUpdate, OdometryUpdate, PlaceUpdate
 from omnid.runs.place_maps import RigPlaces, RunPlaces
 from omnid.runs.run_result import RunFailedError, RunResult
-from omnid.runs.session import LOG_POINTS, OPENCV_THREADS, Session, attached_rig, motion_topics
+from omnid.runs.session import LOG_POINTS, Session, attached_rig, motion_topics, opencv_in_one_thread
 from omnid.runs.wiring import Outputs, Parts, wire
 from omnid.settings import dump
 from omnid.sinks.bus_sink import BusSink
@@ -142,7 +142,7 @@ class _Replay:
         if in_map and not config.places.enabled:
             raise OmnidError(f"{in_map[0]}: places.enabled = false, so that there is no pose in the map; leave one out")
         graph = Graph(policy=NEWEST if options.drops else LOSSLESS, threaded=not options.inline)
-        with opencv_threads(OPENCV_THREADS), ExitStack() as outputs:
+        with opencv_in_one_thread(), ExitStack() as outputs:
             self._session = session = Session(config, graph, outputs, self._warnings.append)
             # 1. The log and its rig, which the first pairs are compared with.
             self._reader = reader = self._opened()
@@ -242,7 +242,7 @@ class _Replay:
                 if offset_ns is None:
                     offset_ns = time.monotonic_ns() - message.stamp_ns
                 due_ns = message.stamp_ns + offset_ns
-                while not graph.is_stopping and (left_s := (due_ns - time.monotonic_ns()) * 1e-9) > 0:
+                while not graph.is_stopping and (left_s := (due_ns - time.monotonic_ns()) * S_PER_NS) > 0:
                     time.sleep(min(left_s, POLL_S))
                 if isinstance(message, Frame):
                     yield message
@@ -387,14 +387,3 @@ class _Replay:
             places.map() if places is not None and options.collect else None,
             elapsed_s=time.monotonic() - self._begun_s,
         )
-
-
-@contextmanager
-def opencv_threads(count: int) -> Iterator[None]:
-    """Let OpenCV use so many threads in this block, then as many as before."""
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(count)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(before)

@@ -6,6 +6,7 @@ import time
 from dataclasses import replace
 from typing import Final
 
+from omnid.core.nanoseconds import NS_PER_S
 from omnid.core.navigation.requests import NavigationCommand, RouteAction, RouteRequest, TaughtRoute, is_halt
 from omnid.engine.graph import Graph
 from omnid.errors import OmnidError
@@ -50,7 +51,7 @@ class RouteFiles:
                 return command._replace(refusal=refusal_of_name(name))
         except OmnidError as error:
             return command._replace(refusal=str(error))
-        if command.asked_ns and time.monotonic_ns() - command.asked_ns > LONGEST_WAIT_S * 1e9:
+        if command.asked_ns and time.monotonic_ns() - command.asked_ns > LONGEST_WAIT_S * NS_PER_S:
             return command._replace(void="it waited too long for its file: check the disk, and ask again")
         return command
 
@@ -67,4 +68,4 @@ class TaughtRoutes:
         taught = update.taught
         if taught is not None and taught is not self._asked:
             self._asked = taught
-            self._requests.put(NavigationCommand(taught, taught.route.created_s * 1_000_000_000, id=taught.id))
+            self._requests.put(NavigationCommand(taught, taught.route.created_s * NS_PER_S, id=taught.id))

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.mapping.voxel_map import MapPoints
+from omnid.core.nanoseconds import S_PER_NS
 from omnid.core.places.place_map import PlaceMap
 from omnid.diagnostics.run_summary import RunCounters
 from omnid.engine.telemetry import SummaryRow
@@ -54,7 +55,7 @@ class RunResult:
 
     def __repr__(self) -> str:
         """Return one line: poses, span, length, states, map points and warnings."""
-        span_s = 1e-9 * float(self.stamps_ns[-1] - self.stamps_ns[0]) if len(self.stamps_ns) else 0.0
+        span_s = S_PER_NS * float(self.stamps_ns[-1] - self.stamps_ns[0]) if len(self.stamps_ns) else 0.0
         length_m = float(np.linalg.norm(np.diff(self.T_odom_rig[:, :3, 3], axis=0), axis=1).sum())
         states = ", ".join(f"{count} {state}" for state, count in Counter(self.states).most_common())
         points = "no map" if self.map is None else f"{len(self.map.xyz)} map points"

@@ -8,6 +8,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Final
 
+import cv2
+
 from calib.models.names import sees_directly
 from calib.rig import Rig
 from calib.rig_file import parse_rig, rig_toml
@@ -36,7 +38,6 @@ from omnid.transport.bus import Bus
 
 BUS_END_S: Final = 3.0
 ROUTER_S: Final = 2.0  # Time between two attempts of a client to reach its router for the first time.
-OPENCV_THREADS: Final = 1  # within a stage: the stages are threads themselves
 # Largest number of points of the map, the most confident ones, in one message on the bus and in a log.
 BUS_POINTS: Final = 50_000
 LOG_POINTS: Final = 200_000
@@ -69,6 +70,17 @@ def joint_wheels(config: Config) -> JointWheels | None:
         raise OmnidError(f"motion.wheel_joints = {list(joints)}: expected the names of two joints, or none")
     drive = config.motor.drive.geometry()
     return JointWheels(*joints, drive.wheel_radius_m, drive.track_m)
+
+
+@contextmanager
+def opencv_in_one_thread() -> Iterator[None]:
+    """Let OpenCV use one thread in this block, as the stages are threads themselves; then as many as before."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
 
 
 class Session:

@@ -16,6 +16,7 @@ from collections.abc import Callable, Collection
 from contextlib import suppress
 from typing import Final
 
+from omnid.core.nanoseconds import S_PER_NS
 from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.logging_setup import log
 from omnid.engine.telemetry import StageStats, Telemetry
@@ -57,7 +58,7 @@ def print_stacks_when_killed() -> None:
 
 def stalled_stages(stages: Collection[StageStats], now_ns: int, timeout_s: float) -> dict[str, float]:
     """Return the stages that have worked on one message for longer than timeout_s, with that time [s]."""
-    busy_s = {stats.name: (now_ns - since_ns) * 1e-9 for stats in stages if (since_ns := stats.busy_since_ns)}
+    busy_s = {stats.name: (now_ns - since_ns) * S_PER_NS for stats in stages if (since_ns := stats.busy_since_ns)}
     return {name: duration_s for name, duration_s in busy_s.items() if duration_s > timeout_s}
 
 
@@ -118,7 +119,7 @@ class StatusLine:
     def __call__(self) -> str:
         """Return the line."""
         now_ns, poses, newest = time.monotonic_ns(), self.statistics.poses, self.statistics.newest
-        rate_hz = (poses - self._poses) / max(1e-3, (now_ns - self._called_ns) * 1e-9)
+        rate_hz = (poses - self._poses) / max(1e-3, (now_ns - self._called_ns) * S_PER_NS)
         self._poses, self._called_ns = poses, now_ns
         state = newest.state if newest is not None and rate_hz > 0 else "waiting for images"
         dropped, late = self._telemetry.dropped_messages, self._telemetry.missed_deadlines

@@ -12,7 +12,6 @@ from itertools import islice
 from pathlib import Path
 from typing import Literal, NamedTuple, TypeAlias
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,6 +24,7 @@ from omnid.core.control.arming import ArmRequest
 from omnid.core.control.command_sources import PLANNER, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.frames import of_base
+from omnid.core.nanoseconds import NS_PER_S
 from omnid.core.navigation.requests import NavigationCommand, NavigationRequest
 from omnid.engine.graph import Graph, nothing
 from omnid.engine.kernel_cache import prepare_kernels
@@ -32,6 +32,7 @@ from omnid.formats.route_file import RouteFolder
 from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.route_files import Requests
+from omnid.runs.session import opencv_in_one_thread
 from omnid.runs.wiring import NavigationParts, Outputs, Parts, wire
 from omnid.simulation.robot import SimulatedRobot, with_masks
 from omnid.simulation.vehicle import Tick, Vehicle
@@ -152,12 +153,8 @@ def simulate(
     where there is one. Raises OmnidError as `omnid run` does.
     """
     prepare_kernels(nothing)
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
+    with opencv_in_one_thread():
         return _Lockstep(world, robot, drive, seed, config or Config(), vehicle).run(seconds)
-    finally:
-        cv2.setNumThreads(threads)
 
 
 class _Lockstep:

@@ -27,6 +27,7 @@ from omnid.core.control.arming import ArmRequest
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.contacts import NO_CONTACT
 from omnid.core.control.control_law import ControlInput
+from omnid.core.nanoseconds import S_PER_NS
 from omnid.engine.graph import Stream
 from omnid.engine.telemetry import StageStats
 from omnid.runs.session import Session
@@ -146,7 +147,7 @@ class PacedRobot:
 
     def stats(self) -> dict[str, float]:
         """Return the real-time factor, the time since the start [s] and the contacts with obstacles."""
-        time_s = (self.clock_ns() - self._start_ns) * 1e-9
+        time_s = (self.clock_ns() - self._start_ns) * S_PER_NS
         return {Key.REAL_TIME_FACTOR: round(self._real_time_factor, 2), "time_s": time_s, "contacts": self.contacts}
 
     def close(self) -> None:

@@ -10,6 +10,7 @@ from calib import se3
 from drivers.frame import Frame
 from drivers.motor import VelocityCommand
 from omnid.core.mapping.thinned_path import ThinnedPath, Vertex
+from omnid.core.nanoseconds import NS_PER_S
 from omnid.messages import OdometryUpdate
 from omnid.sinks.encoder import Changes, Encoder, Outgoing, UnixTime, pose_attachment, same_time
 from omnid.transport.bus import Bus
@@ -19,7 +20,7 @@ from omnid.transport.status_names import RUN_ID
 from omnid.transport.topics import CLOCK, PANORAMA
 
 # Of the path that is published: most vertices, the least distance between two of them, and the time between two paths.
-PATH_POSES, PATH_STEP_M, PATH_NS = 500, 0.05, 5 * 10**9
+PATH_POSES, PATH_STEP_M, PATH_NS = 500, 0.05, 5 * NS_PER_S
 
 
 class BusSink:
@@ -66,7 +67,7 @@ class PanoramaSink:
 
     def __init__(self, bus: Bus, rate_hz: float, unix_ns: UnixTime = same_time) -> None:
         """unix_ns: the Encoder's."""
-        self._bus, self._period_ns, self._unix_ns = bus, 1e9 / rate_hz, unix_ns
+        self._bus, self._period_ns, self._unix_ns = bus, NS_PER_S / rate_hz, unix_ns
         self._next_ns = 0.0
 
     def process(self, odometry: OdometryUpdate) -> None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from calib.panorama import Maps, remap_tables, visible
 from drivers.jpeg import Steps
 from omnid.config import PanoramaConfig
+from omnid.core.nanoseconds import NS_PER_S
 from omnid.core.odometry.image_breaks import RawImage
 from omnid.core.stereo.photometry import brightened, gain_of, light, noise_sigma, pair_gains
 from omnid.core.stereo.tiles import SIDES, Side, TileMonitor, tile_columns
@@ -22,7 +23,7 @@ from omnid.errors import OmnidError
 from omnid.messages import FramePair, Panoramas
 from omnid.stages.geometry import Geometry
 
-NOISE_NS = 1_000_000_000  # Time between two measurements of the noise, because exposure changes it slowly.
+NOISE_NS = NS_PER_S  # Time between two measurements of the noise, because exposure changes it slowly.
 BLUR_SHARE = 0.6  # sigma of the blur by the additional pixels that a pixel of the panorama covers
 MIN_SHARED_PART = 0.05  # Least share of the panorama that both cameras must see.
 

@@ -24,7 +24,7 @@ from omnid.core.control.control_law import (
 )
 from omnid.core.control.velocity_limits import STOP
 from omnid.core.frames import of_base
-from omnid.core.nanoseconds import S_PER_NS
+from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
 from omnid.messages import OdometryUpdate
 from omnid.tracking_state import TrackingState
 
@@ -39,7 +39,7 @@ class LockstepDrive:
     def __init__(self, settings: ControllerSettings, period_s: float, T_base_rig: NDArray[np.float64]) -> None:
         """period_s: between two ticks."""
         self._setpoint, self._T_base_rig = settings.setpoint.setpoint(), T_base_rig
-        self._period_ns = round(period_s * 1e9)
+        self._period_ns = round(period_s * NS_PER_S)
         self._law = ControlLaw(settings.of_replay, start_ns=-1)
         self._last_ns: int | None = None
 

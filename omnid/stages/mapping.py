@@ -12,6 +12,7 @@ from omnid.config import MappingConfig
 from omnid.core.mapping.scan_grid import KeyframeGrid
 from omnid.core.mapping.thinned_path import ThinnedPath, Vertex
 from omnid.core.mapping.voxel_map import VoxelMap
+from omnid.core.nanoseconds import NS_PER_S
 from omnid.messages import GridUpdate, MapUpdate, OdometryUpdate, PlaceUpdate
 from omnid.stages.dense_depths import DenseDepths
 from omnid.tracking_state import TrackingState
@@ -23,7 +24,7 @@ FRAMES_PER_VOXEL_FRAME = 10  # frames of the run for each frame required, up to 
 # Less motion shows the same points again. Measured: with 15 cm and 8 degrees half as many pairs enter the map, but of
 # its points up to 2.4 times as many are wrong where as much is seen (`tests.bench.accuracy --cloud`).
 SAME_VIEW_M, SAME_VIEW_TRACE = 0.03, 3 - math.radians(2) ** 2
-STANDING_NS = 1_000_000_000  # Least time between two pairs of the same view that enter the map.
+STANDING_NS = NS_PER_S  # Least time between two pairs of the same view that enter the map.
 FINEST_STEP_M = 0.001  # Least distance between two vertices of the path: a robot at rest adds none.
 STAMP_JITTER_NS = 5_000_000  # Tolerance of stamps: a period of the cameras that divides that of the map then does so.
 
@@ -37,11 +38,11 @@ class Mapping:
         """
         self._is_read = True  # whether the map has a reader
         self._config, self._dense = config, dense
-        self._every_ns, self._given_ns = round(every_s * 1e9), 0
+        self._every_ns, self._given_ns = round(every_s * NS_PER_S), 0
         self._map = VoxelMap(config.voxel_m, config.max_voxels)
         self._path = ThinnedPath(config.path_poses, FINEST_STEP_M)
         self._newest: tuple[int, int] | None = None
-        self._min_gap_ns = round(1e9 / config.rate_hz) if config.rate_hz else 0
+        self._min_gap_ns = round(NS_PER_S / config.rate_hz) if config.rate_hz else 0
         self._mapped: tuple[int, Array] | None = None  # stamp and pose of the last pair that entered the map
         self._frames = 0  # number of pairs that entered the map
 
@@ -106,7 +107,7 @@ class MapGrid:
     def __init__(self, cell_m: float, T_base_rect: Array, every_s: float = 0.0) -> None:
         """cell_m: side of a cell. every_s: time between two grids, by the stamps; 0: one grid, at the end."""
         self._grid, self._T_base_rect = KeyframeGrid(cell_m), T_base_rect
-        self._every_ns, self._given_ns = round(every_s * 1e9), 0
+        self._every_ns, self._given_ns = round(every_s * NS_PER_S), 0
         self._given: object = None  # scans of the last grid
         self._newest: PlaceUpdate | None = None
 

@@ -15,6 +15,7 @@ from omnid.core.control.collision_geometry import Outline, sector_edges_m
 from omnid.core.control.collision_monitor import CollisionSettings, unknown_ends
 from omnid.core.frames import base_pose, in_outer_axes, of_base
 from omnid.core.mapping.range_scan import azimuths
+from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
 from omnid.core.navigation.follower import STAND
 from omnid.core.navigation.forecast import forecast
 from omnid.core.navigation.navigator import RESUME, Navigation, Navigator
@@ -37,16 +38,16 @@ from omnid.core.navigation.situation import NOWHERE, MapPosition, Situation, Whe
 from omnid.errors import OmnidError
 from omnid.messages import NavigationPlan, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate, RequestAnswer
 from omnid.stages.routes import Routes, refusal_while_teaching
+from omnid.transport.topics import MOST_OPEN
 
 Array = NDArray[np.float64]
 NavigationInput: TypeAlias = OdometryUpdate | PlaceUpdate | ObstacleRing | WheelState | NavigationCommand
 
-REPEAT_NS = 1_000_000_000  # the state is given again after that time, while nothing changes
+REPEAT_NS = NS_PER_S  # the state is given again after that time, while nothing changes
 # Ends of the seen floor nearer than this are obstacles to a base that was stopped by one; at farther ones the floor is
 # merely no longer seen well. A base that stops has the end 0.4 m ahead, by the defaults of its outline.
 UNKNOWN_M = 1.2
 RING_NS = 2_000_000_000  # older rings show nothing of now: the collision monitor then stops the base
-MOST_ANSWERS = 64  # An update repeats as many answers as requests may wait: a sink may miss updates.
 OVERTAKEN = "a later request has ended it: ask again"
 BEHIND_SHARE = -0.17  # cosine of the direction beyond which an obstacle is behind; 100 degrees
 FIRST_LEG_M = 1.0  # A path that begins farther from the robot is refused.
@@ -80,7 +81,8 @@ class NavigationStage:
         # Ids of the newest request to halt, and of that which began the newest drive: a request that waited for a file
         # may come after later ones.
         self._halted = self._begun = 0
-        self._answers: deque[RequestAnswer] = deque(maxlen=MOST_ANSWERS)
+        # An update repeats as many answers as requests may wait: a sink may miss updates.
+        self._answers: deque[RequestAnswer] = deque(maxlen=MOST_OPEN)
         self._plan: NavigationPlan | None = None  # plan that is not yet part of a message
         self._given: tuple[object, ...] = ()  # the state that was given last
         self._given_ns = -REPEAT_NS
@@ -113,7 +115,7 @@ class NavigationStage:
         pose, speed_mps = planar(T_odom_base), float(velocity[0])
         ring = self._young_ring(odometry.stamp_ns)
         obstacles = None if ring is None else self._ring_points
-        moving = None if ring is None else forecast(ring.moving, (odometry.stamp_ns - ring.stamp_ns) * 1e-9)
+        moving = None if ring is None else forecast(ring.moving, (odometry.stamp_ns - ring.stamp_ns) * S_PER_NS)
         nearest_m = (
             math.inf if obstacles is None else room_ahead(pose, speed_mps, obstacles) - self._outline.half_width_m
         )
@@ -220,7 +222,7 @@ class NavigationStage:
                 _raise_if(command.refusal)
                 routes.teach(request.name, self._situation(), replace=request.replace)
             case RouteAction.FINISH:
-                routes.finish(command.arrival_ns // 1_000_000_000, command.id)
+                routes.finish(command.arrival_ns // NS_PER_S, command.id)
             case RouteAction.STOP:
                 if not routes.drop():
                     self._navigator.cancel("stopped by a request")

@@ -16,6 +16,7 @@ from omnid.core.control.collision_monitor import ControllerRing, MovingPoint
 from omnid.core.floor import Floor, FloorEstimator
 from omnid.core.frames import of_base
 from omnid.core.mapping.range_scan import SECTORS, FreeRanges
+from omnid.core.nanoseconds import NS_PER_S
 from omnid.core.obstacles.fixed_parts import FixedParts
 from omnid.core.obstacles.moving_tracker import MovingTracker
 from omnid.core.obstacles.narrow import narrow_m, nothing_narrow
@@ -183,7 +184,7 @@ class Obstacles:
     def __init__(self, geometry: Geometry, config: ObstaclesConfig, dense: DenseDepths) -> None:
         """dense: computes the depth of a pair, from which a floor is found that the rig does not state."""
         self._dense = dense
-        self._period_ns = 1e9 / config.rate_hz if config.rate_hz else 0.0
+        self._period_ns = NS_PER_S / config.rate_hz if config.rate_hz else 0.0
         self.floor = CameraFloor(geometry.rig, config.ring.floor_m)
         self._rings = PairRings(geometry, config.ring)
         self._last_ns: int | None = None

@@ -12,6 +12,7 @@ from calib import se3
 from calib.fit.rig_uncertainty import motion_errors
 from omnid.config import OdometryConfig
 from omnid.core.control.motion_monitor import AGREE, Witness
+from omnid.core.nanoseconds import S_PER_NS
 from omnid.core.odometry.earlier_view import EarlierView
 from omnid.core.odometry.estimates import OdometryEstimate
 from omnid.core.odometry.exposure_times import Exposure
@@ -82,7 +83,7 @@ class OdometryStage:
         """Return the pose at a pair."""
         # 1. What wheels and gyro have measured since the pair before.
         last_ns, self._last_ns = self._last_ns, pair.stamp_ns
-        dt_s = 0.0 if last_ns is None else (pair.stamp_ns - last_ns) * 1e-9
+        dt_s = 0.0 if last_ns is None else (pair.stamp_ns - last_ns) * S_PER_NS
         self.sensors.add(pair.motion)
         sensed = None if last_ns is None else self.sensors.between(last_ns, pair.stamp_ns)
         # 2. The pose of the rectified frame.
@@ -159,7 +160,7 @@ class OdometryStage:
     def _contradicted(self, T_odom_rect: Array, stamp_ns: int) -> Array:
         """Return what wheels and gyro that contradict the poses add to the covariance (6, 6) of one."""
         T_odom_base = T_odom_rect @ se3.inverse(self._T_base_rect)
-        self._contradiction = contradiction_after(self._contradiction, self.witness, T_odom_base, stamp_ns * 1e-9)
+        self._contradiction = contradiction_after(self._contradiction, self.witness, T_odom_base, stamp_ns * S_PER_NS)
         if self._contradiction is None:
             return np.zeros((6, 6))
         to_rect = np.linalg.inv(self._to_base)

@@ -21,6 +21,7 @@ from omnid.core.mapping.range_scan import (
     point_scan,
     seen_from,
 )
+from omnid.core.nanoseconds import NS_PER_S
 from omnid.core.navigation.requests import NavigationCommand, TaughtRoute
 from omnid.core.obstacles.settings import RingSettings
 from omnid.core.odometry.stereo_frame import StereoFrame
@@ -40,13 +41,13 @@ from omnid.stages.dense_depths import DenseDepths
 from omnid.stages.geometry import Geometry
 from omnid.stages.obstacles import CameraFloor, PairRings
 from omnid.tracking_state import MapState, TrackingState
+from omnid.transport.topics import MOST_OPEN
 
 Array = NDArray[np.float64]
 
 
 # Time between two counts, which take 1 ms for 1,000 keyframes; the status comes no oftener.
-COUNTED_NS: Final = 1_000_000_000
-MOST_ASKED: Final = 64  # ids of requests that a copy repeats: a sink may miss updates
+COUNTED_NS: Final = NS_PER_S
 
 
 class Places:
@@ -82,10 +83,10 @@ class Places:
         self.counts = self._localiser.counts  # sizes and counters of the map; each second, and at the end
         self._counted_ns = 0
         self._keyframes: tuple[object, MapKeyframes] | None = None  # what they depend on, and they
-        self._copy_ns, self._copied_ns = round(copy_s * 1e9), 0
+        self._copy_ns, self._copied_ns = round(copy_s * NS_PER_S), 0
         self._copy_wanted = False
         self._copy: MapCopy | None = None
-        self._asked: deque[int] = deque(maxlen=MOST_ASKED)  # ids of requests for a copy
+        self._asked: deque[int] = deque(maxlen=MOST_OPEN)  # ids of requests for a copy: a sink may miss updates
 
     def map(self) -> PlaceMap:
         """Return the places whose poses are known relative to the first one: what can be saved."""

@@ -17,26 +17,20 @@ from drivers.errors import FrameDecodeError
 from drivers.frame import CAMERAS, Camera, Frame, coding_steps, gray
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.camera_config import PairConfig
+from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
 from omnid.errors import OmnidError
 from omnid.messages import FramePair
 from omnid.transport.status_names import NOTABLE_SHARE
 
 Image = NDArray[np.uint8]
 
-RECENT: Final = 30  # pairs to which a line is fitted
-MIN_FITTED: Final = 8  # Of fewer pairs the median is taken.
-JUMP_NS: Final = 5_000_000  # A larger distance from the line means a lost image, or a camera that was started again.
-# Cameras that are triggered together have stamps that scatter about each other. Their mean difference is 0 unless it is
-# larger than twice the scatter and than the least that stamps resolve.
-SCATTERS: Final = 2.0
-LEAST_NS, LEAST_AT_START_NS = 1_000_000, 3_000_000
+RECENT: Final = 30  # pairs, and steps between the stamps of a camera, by which skew and period are known
+STAMP_SIGMA_NS: Final = 1_500_000  # scatter of the stamps of cameras that are triggered together, before it is known
 FROZEN_IMAGES: Final = 5  # repeated images in a row after which a camera counts as frozen: a single one may be a glitch
 MAX_WAITING: Final = 4  # frames of a camera that wait: the other camera may be delivered a few periods later
-PERIOD_STEPS: Final = 16  # recent steps between the stamps of a camera, whose median is its period
-# Largest difference of a pair: while the period is not known, and always. A pause at the start is no period.
-SURE_NS, MOST_NS = 5_000_000, 100_000_000
+MOST_APART_NS: Final = 100_000_000  # Largest difference of a pair, because a pause at the start is no period.
 MOST_WAITING: Final = 4096  # samples of wheels and gyro: ten seconds of a gyro of 400 Hz
-AHEAD_NS: Final = 5 * 10**9  # a sample that is later than a pair by more has a stamp of another clock
+AHEAD_NS: Final = 5 * NS_PER_S  # a sample that is later than a pair by more has a stamp of another clock
 
 
 class Skew:
@@ -46,6 +40,7 @@ class Skew:
         self.max_ns = 0  # largest absolute value
         self._recent: deque[int] = deque(maxlen=RECENT)
         self.exposure_ns = 0.0  # upper minus lower exposure of the newest pair
+        self._newest_ns, self._limit_ns = 0.0, math.inf  # of the line at the newest pair, and twice its scatter
 
     @property
     def mean_ns(self) -> float:
@@ -53,27 +48,25 @@ class Skew:
         return float(np.mean(self._recent)) if self._recent else math.nan
 
     def add(self, skew_ns: int) -> None:
-        """Add the skew of a pair; find it without the scatter of the stamps, 0 where exposures may be simultaneous.
+        """Add the skew of a pair; find that of the exposures, 0 where they may be simultaneous.
 
-        Free-running cameras drift against each other, so a line is fitted to the recent skews.
+        Free-running cameras drift against each other, so a line is fitted to the recent skews; its newest value is 0
+        unless it exceeds twice the scatter. A value that is as far from the line means a lost image, or a camera that
+        was started again, and begins another line.
         """
         recent = self._recent
         self.max_ns = max(self.max_ns, abs(skew_ns))
-        if recent and abs(skew_ns - recent[-1]) > JUMP_NS:
+        if recent and abs(skew_ns - self._newest_ns) > 2 * self._limit_ns:
             recent.clear()
         recent.append(skew_ns)
-        if len(recent) < MIN_FITTED:
-            newest, least_ns = float(np.median(recent)), float(LEAST_AT_START_NS)
-        else:
-            # Least squares in closed form: sums of whole numbers are exact.
-            count, total, moment = len(recent), sum(recent), sum(index * each for index, each in enumerate(recent))
-            indices, squares = count * (count - 1) // 2, count * (count - 1) * (2 * count - 1) // 6
-            slope = (count * moment - indices * total) / (count * squares - indices**2)
-            start = (total - slope * indices) / count
-            newest = start + slope * (count - 1)
-            squared = sum((each - start - slope * index) ** 2 for index, each in enumerate(recent))
-            least_ns = max(SCATTERS * math.sqrt(squared / (count - 2)), LEAST_NS)
-        self.exposure_ns = newest if abs(newest) > least_ns else 0.0
+        count = len(recent)
+        self._newest_ns, residuals = float(skew_ns), np.zeros(1)
+        if count > 2:
+            since = np.arange(count) - (count - 1.0)
+            slope, self._newest_ns = np.polyfit(since, recent, 1).tolist()
+            residuals = np.array(recent) - self._newest_ns - slope * since
+        self._limit_ns = 2 * math.sqrt((STAMP_SIGMA_NS**2 + float(residuals @ residuals)) / count)
+        self.exposure_ns = self._newest_ns if abs(self._newest_ns) > self._limit_ns else 0.0
 
 
 class Decoder:
@@ -194,7 +187,7 @@ class _Camera:
 
     def __init__(self) -> None:
         self.waiting: deque[Frame] = deque()
-        self.steps_ns: deque[int] = deque(maxlen=PERIOD_STEPS)  # between the stamps of its frames
+        self.steps_ns: deque[int] = deque(maxlen=RECENT)  # between the stamps of its frames
         self.newest_ns = 0  # stamp of its newest frame
         self.arrived = self.unpaired = 0  # numbers of frames
         self.repeated = RepeatedImages()
@@ -328,7 +321,8 @@ class Synchronise:
     @property
     def _tolerance_ns(self) -> float:
         periods_ns = [camera.period_ns for camera in self._cameras.values() if camera.steps_ns]
-        return self._fixed_ns or min((SURE_NS if not periods_ns else min(periods_ns) / 2), MOST_NS)
+        # Before the period is known, only what the scatter of the stamps explains.
+        return self._fixed_ns or min(min(periods_ns, default=8 * STAMP_SIGMA_NS) / 2, MOST_APART_NS)
 
     def _joined(self, lower: Frame, lower_image: Image, upper: Frame, upper_image: Image) -> FramePair | None:
         # 1. Frames that waited before these can match no later one: they are given up.
@@ -349,7 +343,7 @@ class Synchronise:
             lower.stamp_ns,
             lower_image,
             upper_image,
-            self.skew.exposure_ns * 1e-9,
+            self.skew.exposure_ns * S_PER_NS,
             self.motion.take(lower.stamp_ns),
             (coding_steps(lower), coding_steps(upper)),
         )
