@@ -72,7 +72,7 @@ def replay(
             rig=rig if rig is None or isinstance(rig, Rig) else Path(rig),
             topics=(lower, upper),
             collect=True,
-            progress=None if progress is None else partial(_CallbackProgress, progress),
+            progress=None if progress is None else partial(_report, progress),
         )
         result = run_log(Path(log), loaded, options)
     if result.signal:
@@ -80,24 +80,9 @@ def replay(
     return replace(result, warnings=(*ignored, *result.warnings))
 
 
-class _CallbackProgress:
-    """Hands the progress of a run to the caller's function."""
-
-    period_s = 0.2
-
-    def __init__(
-        self, report: Callable[[int, int | None], object], statistics: RunStatistics, expected: int | None
-    ) -> None:
-        self._report, self._statistics, self._expected = report, statistics, expected
-
-    def __call__(self) -> None:
-        """Report now."""
-        newest = self._statistics.newest
-        self._report(0 if newest is None else newest.seq + 1, self._expected)
-
-    def close(self) -> None:
-        """Report the end."""
-        self()
+def _report(progress: Callable[[int, int | None], object], found: RunStatistics, expected: int | None, _: bool) -> None:
+    """Hand the progress of a run to the caller's function."""
+    progress(0 if found.newest is None else found.newest.seq + 1, expected)
 
 
 class Odometry:

@@ -71,7 +71,11 @@ def build(args: argparse.Namespace) -> int:
     built = RigPlaces(*read_places(args.output, PlaceMap(config.places.limits.max_keyframes))) if args.extend else None
     for log in args.logs:
         options = ReplayOptions(
-            rig=args.rig, settings=args.config, build=True, rig_places=built, progress=None if args.quiet else Progress
+            rig=args.rig,
+            settings=args.config,
+            build=True,
+            rig_places=built,
+            progress=None if args.quiet else Progress(),
         )
         result = run_log(log, config, options)
         for warning in result.warnings:

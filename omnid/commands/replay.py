@@ -109,7 +109,7 @@ class Output(NamedTuple):
 def replay_and_print(log: Path, config: Config, options: ReplayOptions, output: Output) -> int:
     """Replay a log, print its warnings and its summary, and return the exit code."""
     try:
-        result = run_log(log, config, options if output.quiet else replace(options, progress=Progress))
+        result = run_log(log, config, options if output.quiet else replace(options, progress=Progress()))
     except RunFailedError as error:
         _print_result(error.result, options, output, failed=True)
         raise

@@ -152,39 +152,31 @@ def _listed(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{name} {count}" for name, count in counts.items())
 
 
-BAR_COLUMNS = 24
+BAR_COLUMNS: Final = 24
+LINE_S: Final = 5.0  # between two lines where there is no terminal
 
 
 class Progress:
-    """The action of a ticker: shows a bar on a terminal, or logs a line now and then."""
+    """Shows how far a run over a log is: a bar on a terminal, else a line now and then."""
 
-    def __init__(self, statistics: RunStatistics, expected: int | None) -> None:
-        self._statistics, self._expected = statistics, expected
+    def __init__(self) -> None:
         self._is_terminal = sys.stderr.isatty()
-        self.period_s = 0.2 if self._is_terminal else 5.0
-        self._start_s = time.monotonic()
+        self._start_s = self._shown_s = time.monotonic()
 
-    def __call__(self) -> None:
-        """Show the progress now."""
-        newest = self._statistics.newest
-        if newest is None:
-            return
-        done = newest.seq + 1
-        rate = done / max(1e-3, time.monotonic() - self._start_s)
-        share = f"{done}/{self._expected}" if self._expected else f"{done} pairs"
-        if self._is_terminal and self._expected:
-            filled = min(BAR_COLUMNS, BAR_COLUMNS * done // self._expected)
-            share = f"[{'#' * filled}{'.' * (BAR_COLUMNS - filled)}] {share}"
-        line = f"{share} {rate:5.1f} pairs/s  {self._statistics.length_m:8.2f} m  {newest.state}"
-        if self._is_terminal:
-            HANDLER.show(line)
-        else:
-            log(logging.INFO, line)
-
-    def close(self) -> None:
-        """Clear the bar."""
-        if self._is_terminal:
+    def __call__(self, statistics: RunStatistics, expected: int | None, ended: bool) -> None:
+        """Show the progress now; ended: remove the bar."""
+        newest, now_s = statistics.newest, time.monotonic()
+        if self._is_terminal and ended:
             HANDLER.show("")
+        elif newest is not None and (self._is_terminal or now_s >= self._shown_s + LINE_S) and not ended:
+            self._shown_s, done = now_s, newest.seq + 1
+            share = f"{done}/{expected}" if expected else f"{done} pairs"
+            if self._is_terminal and expected:
+                filled = min(BAR_COLUMNS, BAR_COLUMNS * done // expected)
+                share = f"[{'#' * filled}{'.' * (BAR_COLUMNS - filled)}] {share}"
+            rate = done / max(1e-3, now_s - self._start_s)
+            line = f"{share} {rate:5.1f} pairs/s  {statistics.length_m:8.2f} m  {newest.state}"
+            HANDLER.show(line) if self._is_terminal else log(logging.INFO, line)
 
 
 # Warnings about the input of a run over a log: a condition on its totals, and words with keys of them in braces.

@@ -9,7 +9,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, Protocol, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,23 +55,13 @@ from omnid.transport.status_names import MOTION, SUMMARY, entry, stage_name
 Array = NDArray[np.float64]
 Topics: TypeAlias = tuple[str | None, str | None]  # of the lower and the upper camera
 UNPRIVILEGED: Final = RealtimeSettings(lock_memory=False, motor_priority=0)  # of the controller process of a replay
+PROGRESS_S: Final = 0.2  # between two calls that show the progress
 POLL_S: Final = 0.05  # longest sleep of a paced replay, so that its end takes effect soon
 # Pairs by which the rig is examined: ten seconds of a log at 30 Hz. In the dark the run continues to check.
 MOST_PAIRS: Final = 300
 BOOKKEEPING: Final = frozenset(  # left out of the timings
     {"progress", "statistics", "collect-poses", "collect-map", "collect-places"}
 )
-
-
-class ProgressDisplay(Protocol):
-    """An action that shows how far a run is; it is called every period_s and closed at the end."""
-
-    @property
-    def period_s(self) -> float:
-        """Time between two calls."""
-
-    def __call__(self) -> None:
-        """Show the progress now."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +84,8 @@ class ReplayOptions:
     paced: bool = False  # at the pace of the log's stamps, unless the computer is slower; False: as fast as possible
     drops: bool = False  # a late stage drops messages, as on the robot; False: the stages before it wait
     settings: Path | None = None  # file of the configuration, so that no output overwrites it
-    progress: Callable[[RunStatistics, int | None], ProgressDisplay] | None = None  # of statistics, expected pairs
+    # Called each PROGRESS_S and at the end, with statistics, expected pairs, and whether the run has ended.
+    progress: Callable[[RunStatistics, int | None, bool], object] | None = None
     observer: Callable[[FrontEnd, Telemetry], Sink[Outgoing]] | None = None  # of all messages; excludes record
     rig_places: RigPlaces | None = None  # the map to begin with, and its rig, which is compared with that of the log
     build: bool = False  # give the result a map with its rig, a new one where there is none to begin with
@@ -156,8 +147,9 @@ class _Replay:
             parts = Parts(map=run_places, map_every_s=options.map_every_s)
             self._stages = wire(graph, [messages], front_end, config, sinks, parts)
             if options.progress is not None:
-                progress = options.progress(session.statistics, reader.pair_estimate())
-                graph.ticker("progress", progress.period_s, progress)
+                show = partial(options.progress, session.statistics, reader.pair_estimate())
+                graph.ticker("progress", PROGRESS_S, partial(show, False))
+                outputs.callback(show, True)
             # 3. The run; what it has found until an error is part of the error.
             self._begun_s = time.monotonic()
             try:
