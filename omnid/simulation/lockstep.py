@@ -24,7 +24,6 @@ from omnid.core.control.arming import ArmRequest
 from omnid.core.control.command_sources import PLANNER, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.frames import of_base
-from omnid.core.nanoseconds import NS_PER_S
 from omnid.core.navigation.requests import NavigationCommand, NavigationRequest
 from omnid.engine.graph import Graph, nothing
 from omnid.engine.kernel_cache import prepare_kernels
