@@ -29,7 +29,6 @@ from omnid.engine.graph import Graph
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.formats.exports import write_ply
 from omnid.messages import OdometryUpdate
-from omnid.runs.session import OPENCV_THREADS
 from omnid.runs.wiring import Outputs, wire
 from omnid.sinks.files import TrajectoryFile
 from omnid.stages.front_end import FrontEnd
@@ -99,7 +98,7 @@ def measure(folder: Path, pairs: int, hz: float, overrides: Sequence[str]) -> di
     config, clock = load_config(None, overrides), StageClock()
     frames = list(LogReader(folder / "log.mcap").frames())
     place = geometry(with_rims(rig_of(folder), frames), config.panorama)
-    cv2.setNumThreads(OPENCV_THREADS)
+    cv2.setNumThreads(1)  # as a run does
     with TemporaryDirectory() as work, clock.timed_stages():
         graph = Graph(threaded=False)
         trajectory, cloud = TrajectoryFile(Path(work) / "t"), Path(work) / "m"
