@@ -93,22 +93,8 @@ class PoseEstimate:
     # Mean cost of a landmark in view: half of the Cauchy kernel's value, by the landmarks that count as one.
     cost: float = 0.0
     in_view: int = 0  # landmarks by which it is meant
-    runner_up: Array | None = None  # (6,) [t; r] of the step to a pose that explains the images nearly as well
-    through_gap: bool = False  # True if that is a motion through refused poses, on which no later step decides
-    # (K,) rows of the local map whose landmarks support that pose instead
-    contradicting: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
     doubtful_depths: bool = False  # True while the landmarks may all have another depth: it is in the covariance
     upper_ratio: float = 1.0  # share of the inliers among the tracks that the upper panorama shows where they must be
-
-    @property
-    def spread(self) -> Array:
-        """The covariance (6, 6) that covers the runner-up as well."""
-        return self.covariance if self.runner_up is None else self.covariance + np.outer(self.runner_up, self.runner_up)
-
-    @property
-    def is_sure(self) -> bool:
-        """True if no other motion or depths explain the images nearly as well."""
-        return self.runner_up is None and not self.doubtful_depths
 
     def distance_m(self, T_odom_rect: Array) -> float:
         """Return the distance [m] of the pose from another one (4, 4)."""
@@ -188,11 +174,9 @@ def with_more_inliers(a: PoseEstimate | None, b: PoseEstimate | None) -> PoseEst
     return max((estimate for estimate in (a, b) if estimate), key=lambda estimate: estimate.inliers, default=None)
 
 
-def supports(tracked: PoseEstimate | None, T_predicted: Array) -> bool:
+def supports(found: list[PoseEstimate], T_predicted: Array) -> bool:
     """True if most of the landmarks that were tracked, few as they may be, show a predicted pose (4, 4)."""
-    if tracked is None or tracked.inlier_ratio <= 0.5:
-        return False
-    return GapStep.between(T_predicted, tracked.T_odom_rect).keeps_view
+    return bool(found) and found[0].inlier_ratio > 0.5 and GapStep.between(T_predicted, found[0].T_odom_rect).keeps_view
 
 
 def bounded(covariance: Array) -> Array:

@@ -29,9 +29,9 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.local_map import LocalMap
+from omnid.core.odometry.motion_hypotheses import DECIDING_COST
 from omnid.core.odometry.plane_patches import align, plane_templates
 from omnid.core.odometry.pose_search import CORRELATED_LANDMARKS
-from omnid.core.odometry.runner_up_motions import RUNNER_UP_COST
 from omnid.core.odometry.tracking import KltSettings, track
 from omnid.core.stereo.triangulation import view, view_jacobian
 from omnid.core.types.panorama import PaddedPanorama
@@ -182,7 +182,7 @@ class ImageBreaks:
         """
         last, found = self._last, None
         step = np.zeros(6) if last is None else se3.log(se3.inverse(last.T_odom_rect) @ T_odom_rect)
-        is_usual = cost is not None and cost[1] * (cost[0] - self._usual_cost) < RUNNER_UP_COST and not self.fault
+        is_usual = cost is not None and cost[1] * (cost[0] - self._usual_cost) < DECIDING_COST and not self.fault
         if last is not None and dt_s > 0 and not is_usual:
             flow = self._flow(last, pair, T_odom_rect, step, LAG_S / dt_s)
             found = None if flow is None else likeliest_break(flow, self.raws, self.model.cylinder.focal_px)
@@ -216,7 +216,7 @@ class ImageBreaks:
                 before = self._open
                 self._open = [earlier for earlier in before if not earlier.is_undone_by(found)]
                 self._open += [found] if len(self._open) == len(before) else []
-        is_torn = self._torn > RUNNER_UP_COST
+        is_torn = self._torn > DECIDING_COST
         now = [*self._open, *([self._last_tear] if is_torn else []), found]
         shown = [each for each in now if each is not None]
         self.fault = _words(shown[-1:]) if shown else ""
@@ -318,11 +318,11 @@ def _whole(flow: _Flow) -> _Whole:
 def likeliest_break(flow: _Flow, raws: tuple[RawImage, RawImage], focal_px: float) -> Break | None:
     """Return the likeliest break that flows show beyond doubt; None: there is none."""
     whole = _whole(flow)
-    if np.minimum(whole.squared, whole.outlier).sum() / whole.unit < RUNNER_UP_COST + _cost(2, len(flow.y)):
+    if np.minimum(whole.squared, whole.outlier).sum() / whole.unit < DECIDING_COST + _cost(2, len(flow.y)):
         return None  # no break explains more than all that is left
     found = (each for kind, cameras in KINDS for each in _candidates(flow, whole, kind, cameras))
     best = max(found, key=lambda each: each.gain, default=None)
-    if best is None or best.gain < RUNNER_UP_COST:
+    if best is None or best.gain < DECIDING_COST:
         return None
     # Cameras that have a share in it; what is too small harms no pose.
     moved_px = np.linalg.norm(best.displaced, axis=1) * flow.px

@@ -27,8 +27,8 @@ from omnid.core.odometry.image_breaks import ImageBreaks, RawImage
 from omnid.core.odometry.keyframes import KeyframeLocaliser, KeyframeRequest, Keyframes
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.motion_filter import MotionModel
+from omnid.core.odometry.motion_hypotheses import REACH_SIGMAS, MotionHypotheses
 from omnid.core.odometry.pose_search import OUTLIER_COST, PoseSearch
-from omnid.core.odometry.runner_up_motions import REACH_SIGMAS, Doubt, UntrackedMotion, doubt_after
 from omnid.core.odometry.static_mask import StaticMask
 from omnid.core.odometry.stereo_frame import Features, StereoFrame
 from omnid.core.odometry.tracking import KltSettings
@@ -48,6 +48,8 @@ TEXTURED_CORNERS, COUNTED_CORNERS = 2, 4
 # Share of the landmarks in view, inliers, below which a pose after a break is doubtful. Wrong ones at 10 m/s before a
 # limit of 5 had 0.09, 0.24 and 0.27 (set on seed 3 of `honesty`, too fast).
 AGAIN_SHARE = 1 / 3
+# Standard deviation of the velocity while poses are refused, m/s and rad/s: indoor vehicles are seldom twice as fast.
+UNTRACKED_SPEED_SIGMA = 0.5
 
 
 class VisualOdometry:
@@ -68,9 +70,9 @@ class VisualOdometry:
         self._motion = MotionModel(limits)
         self._static_mask = StaticMask(model.cylinder.edges_rad)
         self._T_odom_rect, self._covariance = np.eye(4), np.zeros((6, 6))
-        self._untracked = UntrackedMotion(self._T_odom_rect)  # since the map was in view last
+        self._T_at_fix = self._T_odom_rect  # the last accepted pose
         self._status = TrackingStatus()
-        self._doubt: Doubt | None = None  # other motions that may have been made in place of the chosen ones
+        self._hypotheses = MotionHypotheses()
         self._step: tuple[Array, Array] | None = None  # last step by the cameras, and its covariance
         self._first: StereoFrame | None = None  # started the map before its velocity was known
         self._requested: KeyframeRequest | None = None  # keyframe that the last frame asked for, see complete
@@ -115,70 +117,89 @@ class VisualOdometry:
         #    (darkness, a blank wall) are left out to save time.
         after_refusal = self._status.is_refused
         searched = not after_refusal or self._is_textured(frame, usable)
-        tracked = estimate = self._find(frame, usable, T_predicted, dt_s) if searched else None
+        sigma_mps = math.sqrt(float(np.linalg.eigvalsh(self._motion.velocity_covariance[:3, :3])[-1]))
+        found = self._find(frame, usable, T_predicted, dt_s, sigma_mps) if searched else []
         if self._first is not None:
-            tracked = estimate = self._start_again(frame, usable, estimate, dt_s)
+            found = self._start_again(frame, usable, found, dt_s)
 
         # 5. Accept or refuse, by the inliers and the speed that the pose implies; after a break, relocalise.
-        after_break = after_refusal or dt_s > self._limits.max_gap_s
-        too_fast_mps = self._too_fast_mps(estimate, dt_s) if estimate and self._has_support(estimate) else 0.0
-        if searched and after_break and self._is_doubtful(estimate, dt_s):
-            estimate = self.relocalise(frame, self._exposure(frame, dt_s))
+        plausible = [each for each in found if self._is_plausible(each, dt_s)]
+        too_fast_mps = 0.0
+        if found and not plausible and self._has_support(found[0]):
+            too_fast_mps = self._too_fast_mps(found[0], dt_s)
+        is_doubtful = not plausible or plausible[0].inliers < min(
+            self._limits.good_inliers, AGAIN_SHARE * plausible[0].visible
+        )
+        if searched and is_doubtful and (after_refusal or dt_s > self._limits.max_gap_s):
+            recognised = self.relocalise(frame, self._exposure(frame, dt_s))
+            plausible = [recognised] if recognised is not None and self._is_plausible(recognised, dt_s) else []
         # Predicted poses were published: one in a place far from them does not close the gap, as odom would jump.
-        gap = GapStep.between(T_predicted, estimate.T_odom_rect) if estimate and after_refusal else GapStep()
-        if estimate is None or gap.is_far or not self._is_plausible(estimate, dt_s):
-            if tracked is not None and too_fast_mps:
-                self._untracked = self._untracked.refused(tracked.T_odom_rect, self._since_fix_s(dt_s))
-            known = estimate is not None and gap.is_far and estimate.inliers >= self._limits.good_inliers
-            stayed = self._untracked.keeps_view(T_predicted) and not supports(tracked, T_predicted)
+        gap = GapStep.between(T_predicted, plausible[0].T_odom_rect) if plausible and after_refusal else GapStep()
+        if not plausible or gap.is_far:
+            self._hypotheses.predict(dt_s)
+            if too_fast_mps:
+                self._add_fast(found[0].T_odom_rect, T_predicted, dt_s)
+            known = bool(plausible) and plausible[0].inliers >= self._limits.good_inliers
+            stayed = GapStep.between(self._T_at_fix, T_predicted).keeps_view and not supports(found, T_predicted)
             refused = self._refuse(frame, usable, T_predicted, dt_s, stayed=stayed, gap=gap if known else None)
             return replace(refused, refused_mps=too_fast_mps)
-        estimate = self._untracked.in_doubt(estimate, self._since_fix_s(dt_s))
+        chosen, contradicting = self._hypotheses.choose(plausible, T_predicted, self._since_fix_s(dt_s), sigma_mps)
+        estimate = self._search.with_doubtful_depths(chosen)
 
         # 6. Update the filter (eq. 11), the pose, the mask of what is fixed to the rig, and the map.
         self._accept(frame, estimate, dt_s, turned=gap.is_turned)
         new = estimate.pixels[self._map.table.anchor[estimate.landmarks] == self._added]
         self._added = None
         exposure = self._exposure(frame, dt_s)
+        self._map.give_up(contradicting)
         self._requested = self._update_map(frame, usable, estimate, exposure, dt_s)
         features, is_keyframe = Features(estimate.pixels, estimate.rejected, new), self._requested is not None
         exposure = exposure if is_keyframe else self._exposure(frame)
         result = self._result(estimate.tracked, estimate.inliers, features, exposure)
         return replace(result, is_keyframe=is_keyframe)
 
-    def _find(self, frame: StereoFrame, usable: Flags, T_predicted: Array, dt_s: float) -> PoseEstimate | None:
-        """Return the likeliest pose of a frame in the map, with its runner-up; None: no landmarks were found."""
+    def _find(
+        self, frame: StereoFrame, usable: Flags, T_predicted: Array, dt_s: float, sigma_mps: float
+    ) -> list[PoseEstimate]:
+        """Return the pose of a frame in the map, and those of other motions that it may have been; none: no landmarks.
+
+        sigma_mps: standard deviation of the predicted velocity.
+        """
         exposure = self._exposure(frame, dt_s)
-        estimate = self._search.find(frame, usable, self._T_odom_rect, T_predicted, exposure, dt_s)
-        if estimate is None or self._status.is_refused:
-            return estimate  # displacements from an unknown place lead anywhere: relocalisation decides
-        # How far the vehicle may be from where it was predicted, by the velocity's covariance, for which the errors of
-        # steps are independent. Those of runners-up are not: wheels, which measure each step, are better evidence.
-        sigma_mps = math.sqrt(float(np.linalg.eigvalsh(self._motion.velocity_covariance[:3, :3])[-1]))
-        is_measured = frame.sensed is not None and frame.sensed.is_complete
-        doubt = None if is_measured or not self._in_doubt else self._doubt
-        of_runner_up_mps = doubt.runner_up_distance_mps if doubt else 0.0
-        most_mps = min(REACH_SIGMAS * sigma_mps + of_runner_up_mps, self._limits.max_speed_mps)
-        reach_m = most_mps * self._since_fix_s(dt_s)
-        return self._search.with_runner_up(frame, estimate, T_predicted, exposure, reach_m)
+        found = self._search.find(frame, usable, self._T_odom_rect, T_predicted, exposure, dt_s)
+        if frame.sensed is not None and frame.sensed.is_complete:
+            self._hypotheses.agree()
+        # After a refused frame the displacements from an unknown place lead anywhere: relocalisation decides.
+        if found is None or self._status.is_refused:
+            return [] if found is None else [found]
+        most_mps = REACH_SIGMAS * sigma_mps + float(np.linalg.norm(self._hypotheses.fastest))
+        reach_m = min(most_mps, self._limits.max_speed_mps) * self._since_fix_s(dt_s)
+        return [found, *self._search.others(frame, found, T_predicted, exposure, reach_m)]
+
+    def _add_fast(self, T_refused: Array, T_predicted: Array, dt_s: float) -> None:
+        """Add the motion of a pose that was refused for its speed, since the vehicle may be as fast."""
+        velocity = (T_refused[:3, 3] - self._T_at_fix[:3, 3]) / self._since_fix_s(dt_s)
+        published = self._T_odom_rect[:3, :3] @ self._motion.velocity[:3]
+        self._hypotheses.add(T_predicted, T_refused, velocity - published)
 
     def _start_again(
-        self, frame: StereoFrame, usable: Flags, estimate: PoseEstimate | None, dt_s: float
-    ) -> PoseEstimate | None:
+        self, frame: StereoFrame, usable: Flags, found: list[PoseEstimate], dt_s: float
+    ) -> list[PoseEstimate]:
         """Start the map again at its first frame, whose velocity this one shows; return the pose in that map."""
         first, self._first = self._first, None
         if first is None or not 0 < dt_s <= self._limits.max_gap_s:
-            return estimate
+            return found
         for _ in range(START_ROUNDS):
-            if estimate is None or not self._is_plausible(estimate, dt_s):
+            if not found or not self._is_plausible(found[0], dt_s):
                 break
-            velocity = self._motion.of_step(se3.inverse(self._T_odom_rect) @ estimate.T_odom_rect, dt_s)
+            velocity = self._motion.of_step(se3.inverse(self._T_odom_rect) @ found[0].T_odom_rect, dt_s)
             self._map.clear()
             exposure = Exposure.of(first.times, velocity, self._model)
             self._keyframes.add(self._request(first, usable & first.usable, exposure))
             exposure = Exposure.of(frame.times, velocity, self._model)
-            estimate = self._search.estimate(frame, estimate.T_odom_rect, exposure, is_near=True)
-        return estimate
+            again = self._search.estimate(frame, found[0].T_odom_rect, exposure, is_near=True)
+            found = [] if again is None else [again]
+        return found
 
     def _exposure(self, frame: StereoFrame, dt_s: float = 0.0) -> Exposure:
         """Return the exposure of a frame by the filter's velocity, after a step of dt_s was predicted to it."""
@@ -199,15 +220,9 @@ class VisualOdometry:
             self._keyframes.add(requested)
             self._added = requested.frame.seq
 
-    def _is_plausible(self, estimate: PoseEstimate | None, dt_s: float) -> bool:
+    def _is_plausible(self, estimate: PoseEstimate, dt_s: float) -> bool:
         """True if the pose has enough inliers and implies no impossible speed since the last accepted one."""
-        return estimate is not None and self._has_support(estimate) and not self._too_fast_mps(estimate, dt_s)
-
-    def _is_doubtful(self, estimate: PoseEstimate | None, dt_s: float) -> bool:
-        """True if a pose is not plausible, or has too few inliers to be relied on after an unknown motion."""
-        if estimate is None or not self._is_plausible(estimate, dt_s):
-            return True
-        return estimate.inliers < min(self._limits.good_inliers, AGAIN_SHARE * estimate.visible)
+        return self._has_support(estimate) and not self._too_fast_mps(estimate, dt_s)
 
     def _too_fast_mps(self, estimate: PoseEstimate, dt_s: float) -> float:
         """Return the speed that a pose implies since the last accepted one if it is impossible, else 0."""
@@ -235,31 +250,29 @@ class VisualOdometry:
         if not self._status.is_refused and 0 < dt_s <= self._limits.max_gap_s:
             T_prev_curr = se3.inverse(self._T_odom_rect) @ estimate.T_odom_rect
             is_at_once = frame.times.is_at_once
-            at_previous = self._motion.accept(T_prev_curr, estimate.spread, dt_s, exposed_at_once=is_at_once)
-            if estimate.inliers >= self._limits.good_inliers and estimate.is_sure:
+            at_previous = self._motion.accept(T_prev_curr, estimate.covariance, dt_s, exposed_at_once=is_at_once)
+            if estimate.inliers >= self._limits.good_inliers and not self._is_in_doubt(estimate):
                 self._step = T_prev_curr, estimate.covariance
         elif frame.sensed is None:
             self._motion.reset()
         self._map.late_depths.settle(at_previous)
         self._motion.found()
         self._covariance = estimate.covariance + (self._map.covariance_of(estimate) if len(estimate.landmarks) else 0.0)
-        self._doubt = doubt_after(self._doubt, self._T_odom_rect, estimate, self._since_fix_s(dt_s))
-        self._T_odom_rect = estimate.T_odom_rect
+        self._T_odom_rect = self._T_at_fix = estimate.T_odom_rect
         # What the upper camera does not show where it must be is an outlier there.
         self._cost = estimate.cost + OUTLIER_COST * (1.0 - estimate.upper_ratio), estimate.in_view
         if len(estimate.landmarks):
             away = self._map.table.points[estimate.landmarks] - self._T_odom_rect[:3, 3]
             self._distance_m = float(np.median(np.linalg.norm(away, axis=1)))
         limits = self._limits
-        is_doubtful = not estimate.is_sure or self._in_doubt or estimate.inliers < limits.good_inliers
+        is_doubtful = self._is_in_doubt(estimate) or estimate.inliers < limits.good_inliers
         is_doubtful |= estimate.upper_ratio < limits.good_inlier_ratio
         self._advance(self._status.accepted(dt_s, limits, doubtful=is_doubtful, turned=turned))
         self._static_mask.observe(frame.lower.panorama, self._T_odom_rect)
 
-    @property
-    def _in_doubt(self) -> bool:
-        """True while it is not known which of several motions was made."""
-        return self._doubt is not None and self._doubt.is_open
+    def _is_in_doubt(self, estimate: PoseEstimate) -> bool:
+        """True if it is not known which of several motions was made, or which depths are right."""
+        return estimate.doubtful_depths or not self._hypotheses.is_single
 
     def _refuse(
         self, frame: StereoFrame, usable: Flags, T_predicted: Array, dt_s: float, *, stayed: bool, gap: GapStep | None
@@ -325,11 +338,10 @@ class VisualOdometry:
         elif carried:
             before_s = after_s
         if after_s > before_s:
-            self._covariance = bounded(
-                self._covariance + np.diag(self._untracked.sigma**2) * (after_s**2 - before_s**2)
-            )
+            growth = UNTRACKED_SPEED_SIGMA**2 * (after_s**2 - before_s**2)
+            self._covariance = bounded(self._covariance + growth * np.eye(6))
         if after_s == 0:
-            self._untracked = UntrackedMotion(self._T_odom_rect)
+            self._T_at_fix = self._T_odom_rect
 
     def _update_map(
         self, frame: StereoFrame, usable: Flags, estimate: PoseEstimate, exposure: Exposure, dt_s: float
@@ -337,7 +349,6 @@ class VisualOdometry:
         """Remove lost landmarks; return the keyframe that is to be added, where too few are left."""
         ids = self._map.table.id[estimate.landmarks]
         self._map.late_depths.seen(ids, estimate)
-        self._map.give_up(estimate.contradicting)
         self._map.update_tracked(frame.lower, estimate.landmarks, estimate.pixels)
         if not self._keyframes.is_due(len(estimate.landmarks), dt_s):
             return None
@@ -353,11 +364,12 @@ class VisualOdometry:
     def _result(
         self, tracked: int, inliers: int, features: Features | None = None, exposure: Exposure | None = None
     ) -> OdometryEstimate:
+        others_mps = np.pad(self._T_odom_rect[:3, :3].T @ self._hypotheses.fastest, (0, 3))
         return OdometryEstimate(
             self._T_odom_rect,
-            self._covariance + (self._doubt.covariance(self._T_odom_rect) if self._doubt else 0.0),
+            self._covariance + self._hypotheses.covariance(self._T_odom_rect),
             self._motion.velocity,
-            self._motion.velocity_covariance,
+            self._motion.velocity_covariance + np.outer(others_mps, others_mps),
             self._status.state,
             self._status.resets,
             tracked,

@@ -1,4 +1,4 @@
-"""The search for the pose of a frame in the local map: guesses, each tracked, estimated and refined, and the runner-up.
+"""The search for the pose of a frame in the local map: guesses, each tracked, estimated and refined, and others.
 
 Equations and sections are those of Dang et al. 2012.
 """
@@ -16,6 +16,7 @@ from calib import se3
 from omnid.core.odometry.estimates import OdometryLimits, PoseEstimate, with_more_inliers
 from omnid.core.odometry.exposure_times import AssumedMotion, Exposure, ViewShift
 from omnid.core.odometry.local_map import LocalMap, Tracks
+from omnid.core.odometry.motion_hypotheses import displacements
 from omnid.core.odometry.plane_patches import align_rows, view_noise
 from omnid.core.odometry.pose_estimation import (
     CONVERGED,
@@ -25,7 +26,6 @@ from omnid.core.odometry.pose_estimation import (
     gauss_newton,
     ransac,
 )
-from omnid.core.odometry.runner_up_motions import displacements, likeliest
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings, correlation_peaks, steps
 from omnid.core.types.stereo_model import StereoModel
@@ -108,40 +108,32 @@ class PoseSearch:
             best = with_more_inliers(best, estimate)
             if is_good_enough(best, self._limits, is_near=is_near):
                 break
-        return None if best is None else self._with_doubtful_depths(best)
+        return best
 
-    def with_runner_up(
-        self,
-        frame: StereoFrame,
-        estimate: PoseEstimate,
-        T_predicted: Array,
-        exposure: Exposure,
-        reach_m: float,
-    ) -> PoseEstimate:
-        """Return the likeliest pose within reach_m of the prediction, with its runner-up: runner_up_motions.py."""
+    def others(
+        self, frame: StereoFrame, found: PoseEstimate, T_predicted: Array, exposure: Exposure, reach_m: float
+    ) -> list[PoseEstimate]:
+        """Return estimates of other motions within reach_m of the prediction: see motion_hypotheses.py."""
         # 1. Displacements within reach from which the scene has the same appearance, and the poses to which they lead.
-        off_m = estimate.distance_m(T_predicted)
-        peaks = displacements(self._map, self._model, frame.lower, estimate.T_odom_rect, reach_m + off_m)
-        is_good, others = is_good_enough(estimate, self._limits, is_near=False), []
-        for x, y in peaks:
-            if is_good and x == y == 0:
-                continue
-            T_guess = estimate.T_odom_rect @ se3.exp([x, y, 0.0, 0.0, 0.0, 0.0])
-            other = self.estimate(frame, T_guess, exposure, is_near=True)
-            others += [other] if other is not None and other.distance_m(T_predicted) < reach_m else []
+        off_m = found.distance_m(T_predicted)
+        peaks = displacements(self._map, self._model, frame.lower, found.T_odom_rect, reach_m + off_m)
+        is_good = is_good_enough(found, self._limits, is_near=False)
+        others = [
+            self.estimate(frame, found.T_odom_rect @ se3.exp([x, y, 0.0, 0.0, 0.0, 0.0]), exposure, is_near=True)
+            for x, y in peaks
+            if x or y or not is_good
+        ]
         # 2. Where many tracks are outliers, the pose by these: their depths may be right, and the inliers' wrong. The
         #    same where the inliers show no motion of a vehicle: they may be on a person who walks along, and what is
         #    nearer to the prediction is right.
-        if estimate.inlier_ratio < self._limits.good_inlier_ratio or off_m > reach_m:
-            other = self.by_outliers(frame, estimate, exposure)
-            others += [other] if other is not None else []
-        # 3. The likeliest one, and whether another one is nearly as likely.
-        return self._with_doubtful_depths(likeliest(estimate, others, T_predicted, max(reach_m, off_m)))
+        if found.inlier_ratio < self._limits.good_inlier_ratio or off_m > reach_m:
+            others.append(self.by_outliers(frame, found, exposure))
+        return [each for each in others if each is not None and each.distance_m(T_predicted) < max(reach_m, off_m)]
 
-    def _with_doubtful_depths(self, estimate: PoseEstimate) -> PoseEstimate:
+    def with_doubtful_depths(self, estimate: PoseEstimate) -> PoseEstimate:
         """Return an estimate whose covariance covers other depths of the first keyframe: first_depths.py."""
         first = self._map.first_depths
-        other = None if first is None or estimate.doubtful_depths else first.runner_up(estimate.T_odom_rect)
+        other = None if first is None else first.runner_up(estimate.T_odom_rect)
         if other is None:
             return estimate
         # Of landmarks with several depths a pose may also err to the side.

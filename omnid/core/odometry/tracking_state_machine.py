@@ -4,7 +4,7 @@ NOT_STARTED ----------------------------------------------> LOST
 STARTED, ACCEPTED ----------------------------------------> TRACKING
 STARTED again after an unknown motion --------------------> DEGRADED, and the reset counter rises
 ACCEPTED with few inliers, after a gap or a refused frame -> DEGRADED
-ACCEPTED with a runner-up that is nearly as likely -----------> DEGRADED
+ACCEPTED with more than one hypothesis of the motion -------> DEGRADED
 ACCEPTED with few inliers that the upper camera shows ------> DEGRADED
 REFUSED, less than lost_s after the first such frame -----> DEGRADED
 REFUSED from then on -------------------------------------> LOST, and the map is started again when

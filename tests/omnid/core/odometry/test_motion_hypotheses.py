@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.odometry import pose_search
 from omnid.core.odometry.estimates import OdometryEstimate, OdometryLimits, PoseEstimate
+from omnid.core.odometry.motion_hypotheses import MotionHypotheses
 from omnid.core.odometry.motion_sensors import SensedMotion
 from omnid.core.odometry.odometry import VisualOdometry
 from omnid.core.odometry.tracking import KltSettings
@@ -64,19 +65,59 @@ def test_wheels_tell_which_motion_it_was(alike: RenderedCameras) -> None:
         assert estimate.covariance[0, 0] < 0.02**2, k
 
 
-def pose(x_m: float, cost: float, inliers: int) -> PoseEstimate:
+def pose(x_m: float, cost: float = 0.1, landmarks: range = range(100)) -> PoseEstimate:
+    rows = np.array(landmarks, np.intp)
     T = se3.exp([x_m, 0, 0, 0, 0, 0])
-    return PoseEstimate(T, 1e-6 * np.eye(6), 100, 100, inliers, np.arange(inliers), cost=cost, in_view=100)
+    return PoseEstimate(T, 1e-6 * np.eye(6), 100, 100, len(rows), rows, cost=cost, in_view=100)
 
 
-@pytest.mark.parametrize(("reach_m", "expected_m"), [(0.002, 0.028), (0.05, 0.0)])
+def chosen(
+    hypotheses: MotionHypotheses, *candidates: PoseEstimate, predicted_m: float = 0.0, sigma_mps: float = 0.1
+) -> float:
+    """Return where the chosen pose is, 0.1 s after the last one, by a prediction with a standard deviation."""
+    found, _ = hypotheses.choose(list(candidates), se3.exp([predicted_m, 0, 0, 0, 0, 0]), PERIOD_S, sigma_mps)
+    return float(found.T_odom_rect[0, 3])
+
+
+def sigma_m(hypotheses: MotionHypotheses) -> float:
+    return float(np.sqrt(hypotheses.covariance(np.eye(4))[0, 0]))
+
+
+def test_hypotheses_go_on_at_their_velocities_until_steps_without_another_one_decide() -> None:
+    hypotheses = MotionHypotheses()
+    for k in range(1, 4):
+        assert chosen(hypotheses, pose(0.0), pose(0.3), sigma_mps=1.0 if k == 1 else 0.1) == 0.0
+        assert not hypotheses.is_single and sigma_m(hypotheses) == pytest.approx(0.3 * k, rel=0.01)
+    steps = 0
+    while not hypotheses.is_single:
+        chosen(hypotheses, pose(0.0))
+        steps += 1
+    assert 1 < steps < 6 and sigma_m(hypotheses) < 1e-9
+
+
+def test_the_motion_of_a_vehicle_decides_between_images_that_are_about_as_good() -> None:
+    """Images that are much worse are no candidates, and of landmarks with other depths the costs mean nothing."""
+    assert chosen(MotionHypotheses(), pose(0.0, 0.1), pose(0.05, 0.15), predicted_m=0.05) == 0.05
+    assert chosen(MotionHypotheses(), pose(0.0, 0.1), pose(0.05, 0.5), predicted_m=0.05) == 0.0
+    others = pose(0.05, 0.5, range(40, 90))
+    assert chosen(MotionHypotheses(), pose(0.0, 0.1, range(60)), others, predicted_m=0.05) == 0.05
+
+
+def test_a_motion_that_was_refused_stays_a_hypothesis_at_its_velocity() -> None:
+    hypotheses = MotionHypotheses()
+    hypotheses.add(np.eye(4), se3.exp([1.0, 0, 0, 0, 0, 0]), np.array([10.0, 0, 0]))
+    hypotheses.predict(PERIOD_S)
+    assert not hypotheses.is_single and sigma_m(hypotheses) == pytest.approx(2.0, rel=0.01)
+
+
+@pytest.mark.parametrize(("reach_m", "expected"), [(0.002, 1), (0.05, 0)])
 def test_the_pose_by_outliers_is_sought_where_the_inliers_show_no_motion_of_a_vehicle(
-    alike: RenderedCameras, monkeypatch: pytest.MonkeyPatch, reach_m: float, expected_m: float
+    alike: RenderedCameras, monkeypatch: pytest.MonkeyPatch, reach_m: float, expected: int
 ) -> None:
     """They may be on a person who follows the robot."""
     monkeypatch.setattr(pose_search, "displacements", lambda *_: [])
-    monkeypatch.setattr(pose_search.PoseSearch, "by_outliers", lambda *_: pose(0.028, 0.5, inliers=91))
-    search = pose_search.PoseSearch(Mock(first_depths=None), alike.model, OdometryLimits(), KltSettings())
-    T_predicted = pose(0.020, 0.0, 0).T_odom_rect
-    found = search.with_runner_up(alike.frame(0, np.eye(4)), pose(0.0, 0.6, 70), T_predicted, Mock(), reach_m)
-    assert found.T_odom_rect[0, 3] == expected_m
+    monkeypatch.setattr(pose_search.PoseSearch, "by_outliers", lambda *_: pose(0.028, 0.5))
+    search = pose_search.PoseSearch(Mock(), alike.model, OdometryLimits(), KltSettings())
+    T_predicted = pose(0.020).T_odom_rect
+    found = search.others(alike.frame(0, np.eye(4)), pose(0.0, 0.6, range(70)), T_predicted, Mock(), reach_m)
+    assert len(found) == expected
