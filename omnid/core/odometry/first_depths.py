@@ -48,9 +48,6 @@ Pair = tuple[PaddedPanorama, PaddedPanorama]
 # Landmarks that do not repeat, as a share of all, below which the others decide the scale of the map: rendered rooms
 # with a wall of bricks have 0.42 and more, so that only worlds which repeat nearly everywhere are in doubt.
 LEAST_SURE = 0.4
-# Landmarks that are compared first, because they take a fifth of the time of all, and two standard deviations of the
-# share that they give.
-SAMPLE, SAMPLE_ERROR = 100, 0.1
 # Directions of the motion and turns that are tried first, rad: such a step moves an epipolar line by TOLERANCE_PX, so
 # that none is missed. The last turn is as far as the tracker reaches, because it searches 30 px at scale 1.
 DIRECTION_STEP, TURN_STEP, MOST_TURN = math.radians(2.5), math.radians(0.5), math.radians(10.0)
@@ -107,11 +104,8 @@ class FirstDepths:
     @classmethod
     def of(cls, pair: Pair, keyframe: Keyframe, ids: Indices, views: Array, model: StereoModel) -> FirstDepths | None:
         """Return the disparities of a keyframe, None where enough landmarks do not repeat."""
-        sample = _disparities(pair, views[:: max(1, len(views) // SAMPLE)], model)
-        if not len(views) or 1.0 - _repeats(sample).mean() > LEAST_SURE + SAMPLE_ERROR:
-            return None
-        found = cls(pair, keyframe, ids, views, model)
-        return found if found.is_open else None
+        found = cls(pair, keyframe, ids, views, model) if len(views) else None
+        return found if found is not None and found.is_open else None
 
     @property
     def is_open(self) -> bool:

@@ -58,7 +58,6 @@ class LandmarkTable:
     anchor: Indices  # (N,) seq of the keyframe that saw the landmark first
     anchor_points: Array  # (N, 3) m in the rectified frame of the anchor
     anchor_covariance: Array  # (N, 3, 3) m^2 in the same axes
-    views: Array  # (N, 3) px in the anchor, at its stamp: column, lower row, upper row
     anchor_pixels: Array  # (N, 2) px where the anchor's lower panorama shows it
     slopes: Array  # (N, 2) px/px of the disparity about the view, along column and row
     points: Array  # (N, 3) m in odom
@@ -71,7 +70,7 @@ class LandmarkTable:
         """Return a table without rows."""
         none, vectors, matrices = np.zeros(0, np.intp), np.zeros((0, 3)), np.zeros((0, 3, 3))
         pixels = np.zeros((0, 2))
-        return LandmarkTable(none, none, vectors, matrices, vectors, pixels, pixels, vectors, matrices, pixels, none)
+        return LandmarkTable(none, none, vectors, matrices, pixels, pixels, vectors, matrices, pixels, none)
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +128,7 @@ class LocalMap:
         points = triangulate(views, self._model.cylinder, self._model.baseline_m)
         finite = np.isfinite(points).all(axis=1)
         pixels = (views[:, :2] if pixels is None else pixels)[finite]
-        views, slopes, points = views[finite], slopes[finite], points[finite]
+        slopes, points = slopes[finite], points[finite]
         covariance = point_covariance(
             points,
             self._model.cylinder,
@@ -145,7 +144,6 @@ class LocalMap:
             np.full(count, keyframe.seq),
             points,
             covariance,
-            views,
             pixels,
             slopes,
             np.empty(points.shape),
@@ -179,7 +177,6 @@ class LocalMap:
         finite = np.isfinite(points).all(axis=1)
         rows, points, views, noise = rows[finite], points[finite], views[known][finite], noise[known][finite]
         spread = point_covariance(points, self._model.cylinder, self._model.baseline_m, self._model.sigma_px, noise)
-        self.table.views[rows] = views
         self._place(rows, points, spread)
 
     def update_depths(self, rows: Indices, disparity: Array, variance: Array, T_odom_rect: Array) -> None:

@@ -39,7 +39,7 @@ def map_of(lower: Image, keyframe_image: Image) -> LocalMap:
     keyframe = Keyframe(0, wrapped(keyframe_image), np.eye(4), np.zeros((6, 6)))
     views = np.column_stack([points, points[:, 1] + DISPARITY_PX])
     local_map.add_keyframe(keyframe, views, np.zeros((len(views), 2)))
-    local_map.update_tracked(wrapped(lower), np.arange(len(local_map)), local_map.table.views[:, :2])
+    local_map.update_tracked(wrapped(lower), np.arange(len(local_map)), local_map.table.anchor_pixels)
     return local_map
 
 
