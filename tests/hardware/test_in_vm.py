@@ -123,7 +123,7 @@ def rig_of_the_sample() -> bytes:
 def daemon(tmp_path_factory: pytest.TempPathFactory) -> Result:
     with simulated_board(tmp_path_factory.mktemp("ports")) as base:
         guest = Guest(systemd=True, files={"rig.toml": rig_of_the_sample()}, serial=base.serial, timeout_s=2400)
-        return run_tests("daemon.py", guest, "-x")
+        return run_tests("daemon.py", guest)
 
 
 @pytest.fixture(scope="module")

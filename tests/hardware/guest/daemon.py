@@ -192,7 +192,7 @@ def test_memory_is_locked_and_only_three_threads_have_priority(operator: GuestOp
             threads[(task / "comm").read_text().strip()] = (policy, priority)
     named = {name: threads.pop(name) for name in ("controller", "lower", "upper")}
     assert named == {"controller": (FIFO, 20), "lower": (FIFO, 10), "upper": (FIFO, 10)}
-    assert "odometry" in threads and set(threads.values()) == {(OTHER, 0)}
+    assert "pair" in threads and set(threads.values()) == {(OTHER, 0)}
     status = Path("/proc", show("MainPID"), "status").read_text().splitlines()
     assert next(int(line.split()[1]) for line in status if line.startswith("VmLck")) > 100_000
 
