@@ -153,11 +153,10 @@ def _listed(counts: Mapping[str, int]) -> str:
 
 
 BAR_COLUMNS: Final = 24
-LINE_S: Final = 5.0  # between two lines where there is no terminal
 
 
 class Progress:
-    """Shows how far a run over a log is: a bar on a terminal, else a line now and then."""
+    """Shows how far a run over a log is: a bar on a terminal, else a line each five seconds."""
 
     def __init__(self) -> None:
         self._is_terminal = sys.stderr.isatty()
@@ -168,7 +167,7 @@ class Progress:
         newest, now_s = statistics.newest, time.monotonic()
         if self._is_terminal and ended:
             HANDLER.show("")
-        elif newest is not None and (self._is_terminal or now_s >= self._shown_s + LINE_S) and not ended:
+        elif newest is not None and (self._is_terminal or now_s >= self._shown_s + 5) and not ended:
             self._shown_s, done = now_s, newest.seq + 1
             share = f"{done}/{expected}" if expected else f"{done} pairs"
             if self._is_terminal and expected:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import faulthandler
 import logging
+import math
 import os
 import signal
 import socket
@@ -21,10 +22,6 @@ from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.logging_setup import log
 from omnid.engine.telemetry import StageStats, Telemetry
 from omnid.transport.status_names import Key
-
-STATUS_PERIOD_S: Final = 1.0
-_FEEDS_PER_TIMEOUT: Final = 3
-_MAX_STATUS: Final = 500  # characters
 
 
 def notify(state: str) -> bool:
@@ -76,8 +73,8 @@ class Service:
 
     @property
     def period_s(self) -> float:
-        """Time between two calls."""
-        return min(STATUS_PERIOD_S, (watchdog_s() or STATUS_PERIOD_S * _FEEDS_PER_TIMEOUT) / _FEEDS_PER_TIMEOUT)
+        """Time between two calls: a second at most, and a third of the watchdog's timeout, so that one may be late."""
+        return min(1.0, (watchdog_s() or math.inf) / 3)
 
     def __call__(self) -> None:
         """Notify systemd."""
@@ -93,7 +90,7 @@ class Service:
 
     def _line(self, stalled: dict[str, float]) -> str:
         parts = [f"{name} stalled for {duration_s:.0f} s" for name, duration_s in stalled.items()]
-        return " ".join(", ".join([*parts, self._status()]).split())[:_MAX_STATUS]
+        return " ".join(", ".join([*parts, self._status()]).split())
 
     def _log_changes(self, stalled: dict[str, float]) -> None:
         for name in stalled.keys() - self._stalled:

@@ -25,7 +25,6 @@ from omnid.stages.geometry import Geometry
 Array = NDArray[np.float64]
 
 DISPARITY_STEP_PX = 32  # the semi-global prior searches a multiple of it
-SPARE_ROWS = 16  # rows of a panorama beyond the largest disparity
 
 
 class DenseDepths:
@@ -115,10 +114,10 @@ class DenseDepths:
         """Return the settings with disparities up to those of the nearest points, for panoramas of height rows."""
         step_px, matching = DISPARITY_STEP_PX, self._config.matching
         nearest_px = self._cylinder.focal_px * self._baseline_m / self._config.min_range_m
-        limit = (height - SPARE_ROWS) // step_px * step_px
+        limit = (height - step_px // 2) // step_px * step_px  # rows are left beyond the largest disparity
         if limit < step_px:
             raise OmnidError(
-                f"the panoramas are {height} px high, stereo needs at least {step_px + SPARE_ROWS} px: use "
+                f"the panoramas are {height} px high, stereo needs at least {step_px + step_px // 2} px: use "
                 "larger images, or a rig whose cameras share more of their view"
             )
         return replace(
