@@ -42,7 +42,7 @@ from omnid.runs.place_maps import RunPlaces
 from omnid.runs.record import open_recorder
 from omnid.runs.route_files import Requests
 from omnid.runs.session import BUS_POINTS, LOG_POINTS, Session, joint_wheels, opencv_in_one_thread
-from omnid.runs.systemd import Service, StatusLine, TerminalStatus, print_stacks_when_killed
+from omnid.runs.systemd import Service, StatusLine, print_stacks_when_killed
 from omnid.runs.wiring import NavigationParts, Outputs, Parts, wire
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
 from omnid.sinks.drive import PlannerDrive
@@ -208,10 +208,14 @@ class LiveRun:
             self._connected = True
             run_places = RunPlaces(config, geometry, warn)
             _join(session, geometry, robot, self._report, run_places)
-            if self._show is not None:
+            if (show := self._show) is not None:
                 line = StatusLine(session.statistics, graph.telemetry, robot.stats)
-                terminal = TerminalStatus(self._show, line, partial(self._report, logging.INFO), _ready(config))
-                graph.ticker("terminal", terminal.period_s, terminal, thread="terminal")
+                graph.ticker(
+                    "terminal", 0.5, lambda: show(f"{line.statistics.length_m:8.2f} m  {line()}"), thread="terminal"
+                )
+                outputs.callback(lambda: self._report(logging.INFO, line.summary()))
+                outputs.callback(show, "")
+                self._report(logging.INFO, _ready(config))
             # 3. The run, until a signal or a failure ends it.
             outputs.enter_context(opencv_in_one_thread())
             for refused in () if robot.waits else prepare(config.realtime):

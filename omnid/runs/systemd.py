@@ -15,7 +15,6 @@ import socket
 import time
 from collections.abc import Callable, Collection
 from contextlib import suppress
-from typing import Final
 
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.diagnostics.run_summary import RunStatistics
@@ -124,29 +123,9 @@ class StatusLine:
         pace = "" if factor is None else f", {factor:.2f} x real time"
         return f"{state}, {rate_hz:.1f} poses/s, {dropped} messages dropped, {late} deadlines missed{pace}"
 
-
-class TerminalStatus:
-    """The action of a ticker: shows a line as long as the run lasts."""
-
-    period_s: Final = 0.5
-
-    def __init__(
-        self, show: Callable[[str], None], line: StatusLine, report: Callable[[str], None], ready: str
-    ) -> None:
-        """show: rewrites the line. report: takes lines that stay. ready: that of the start."""
-        self._show, self._line, self._report, self._ready = show, line, report, ready
-
-    def __call__(self) -> None:
-        """Report that the run is ready, once, and show the line."""
-        if self._ready:
-            self._report(self._ready)
-            self._ready = ""
-        self._show(f"{self._line.statistics.length_m:8.2f} m  {self._line()}")
-
-    def close(self) -> None:
-        """Remove the line, and report the summary."""
-        self._show("")
-        found = self._line.statistics
+    def summary(self) -> str:
+        """Return one line about the whole run."""
+        found = self.statistics
         states = ", ".join(f"{state} {count / found.poses:.1%}" for state, count in found.states.items())
         length = f"{found.poses} poses, {found.length_m:.2f} m, {found.resets} resets"
-        self._report(f"ended: {'; '.join([length, states] if states else [length])}")
+        return f"ended: {'; '.join([length, states] if states else [length])}"

@@ -22,7 +22,7 @@ from omnid.engine.telemetry import Telemetry
 from omnid.errors import OmnidError
 from omnid.runs.live import ConnectedRobot
 from omnid.runs.session import Session, attached_rig
-from omnid.runs.systemd import StatusLine, TerminalStatus
+from omnid.runs.systemd import StatusLine
 from omnid.simulation.robot import with_masks
 from omnid.transport.status_names import Key
 from tests.drivers.logs.mcap_logs import pairs, write_log
@@ -117,16 +117,11 @@ def test_the_first_images_come_in_turn_and_the_cameras_are_closed() -> None:
     assert [camera.closed for camera in opened] == [1, 1, 1, 1]
 
 
-def test_a_run_is_ready_once_and_ends_with_a_summary() -> None:
-    shown, reported, statistics = list[str](), list[str](), RunStatistics()
+def test_the_line_and_the_summary_of_a_run() -> None:
+    statistics = RunStatistics()
     line = StatusLine(statistics, Telemetry(), lambda: {Key.REAL_TIME_FACTOR: 0.5})
-    terminal = TerminalStatus(shown.append, line, reported.append, "ready: go")
-    terminal()
-    statistics.length_m = 12.345
-    terminal()
-    words = "waiting for images, 0.0 poses/s, 0 messages dropped, 0 deadlines missed, 0.50 x real time"
-    assert shown == [f"    0.00 m  {words}", f"   12.35 m  {words}"] and reported == ["ready: go"]
-    statistics.poses, statistics.resets, statistics.states = 4, 1, Counter({"tracking": 3, "lost": 1})
-    terminal.close()
-    assert shown[-1] == ""
-    assert reported[-1] == "ended: 4 poses, 12.35 m, 1 resets; tracking 75.0%, lost 25.0%"
+    assert line() == "waiting for images, 0.0 poses/s, 0 messages dropped, 0 deadlines missed, 0.50 x real time"
+    assert line.summary() == "ended: 0 poses, 0.00 m, 0 resets"
+    statistics.poses, statistics.length_m, statistics.resets = 4, 12.345, 1
+    statistics.states = Counter({"tracking": 3, "lost": 1})
+    assert line.summary() == "ended: 4 poses, 12.35 m, 1 resets; tracking 75.0%, lost 25.0%"
