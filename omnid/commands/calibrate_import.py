@@ -15,6 +15,7 @@ from calib.importers import (
     import_chain,
     import_pair,
     is_one_camera,
+    load_table,
     read_transform,
     stacked_rig,
     straight_up,
@@ -25,7 +26,7 @@ from calib.models.ocam import OcamCamera
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import read_rig, write_rig
 from calib.typed_toml import shown
-from calib.validation import MAX_JSON_BYTES, load_mapping, read_bytes
+from calib.validation import MAX_JSON_BYTES, read_bytes
 from omnid.commands.options import HEIGHT, command, height_of, warn
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
@@ -102,7 +103,7 @@ def _imported(args: argparse.Namespace) -> Rig:
         return _pair(args)
     if args.camchain.suffix == ".toml":
         raise OmnidError(f"{args.camchain}: a rig.toml needs no import: use it as it is, --rig {args.camchain}")
-    values = load_mapping(read_bytes(args.camchain, MAX_JSON_BYTES), str(args.camchain))
+    values = load_table(read_bytes(args.camchain, MAX_JSON_BYTES), str(args.camchain))
     if is_one_camera(values):
         raise OmnidError(f"{args.camchain}: it has one camera: give the files of both as --lower FILE --upper FILE")
     if "stereo_baseline" in values:

@@ -72,6 +72,9 @@ def as_json() -> str:
         (PLAIN.replace("\n", "\r\n"), ""),
         (PLAIN.replace("\n  ", "\n\t").replace(": ", ":\t"), ""),
         (as_json(), ""),
+        (PLAIN.replace("[768, 770]", '["768", 770.0]'), ""),  # numbers as text, or with a point
+        (PLAIN.replace(str(BOTH[0].tolist()), str(BOTH[0].ravel().tolist())), ""),  # a matrix as one list
+        (PLAIN.replace(str(BOTH[1].tolist()), str(BOTH[1][:3].tolist())), ""),  # and without its last row
     ],
 )
 def test_reads_one_chain_in_every_dress(data: str | bytes, said: str) -> None:
@@ -220,6 +223,8 @@ K_OPENCV = "!!opencv-matrix\n  rows: 3\n  cols: 3\n  dt: d\n  data: [440., 0., 3
         ("a.yaml", json.dumps(camera_info("plumb_bob", [*RADTAN, 0.0])), PINHOLE),
         ("a.json", json.dumps(message(camera_info("plumb_bob", [*RADTAN, 0.0]))), PINHOLE),
         ("a.yaml", json.dumps(message(camera_info("rational_polynomial", [*RADTAN, 0, 0, 0, 0]))) + "\n---\n", PINHOLE),
+        ("a.yaml", json.dumps({"camera": {"ros__parameters": camera_info("plumb_bob", [*RADTAN, 0.0])}}), PINHOLE),
+        ("a.yaml", json.dumps({key.title(): one for key, one in camera_info("plumb_bob", RADTAN).items()}), PINHOLE),
         ("a.yaml", json.dumps(camera_info("equidistant", [0.01, 0, 0, 0])), EquidistantCamera(
             (0.01, 0, 0, 0), (440.0, 442.0), (320.0, 240.0), (640, 480))),
         ("a.yaml", "# polynomial\n3 -200 0 0.001\n240 320\n1 0 0\n480 640\n", OcamCamera(
@@ -240,7 +245,7 @@ K_OPENCV = "!!opencv-matrix\n  rows: 3\n  cols: 3\n  dt: d\n  data: [440., 0., 3
 )  # fmt: skip
 def test_reads_files_of_one_camera(name: str, text: str, expected: OmniCamera, tmp_path: Path) -> None:
     (tmp_path / name).write_text(text)
-    assert read_camera(tmp_path / name).camera == expected
+    assert read_camera(tmp_path / name)[0] == expected
 
 
 def test_a_rectified_pair_tells_the_transform(tmp_path: Path) -> None:
@@ -272,7 +277,7 @@ def test_distortion_without_an_equal_is_fitted_and_its_error_told(
 ) -> None:
     path, lines = tmp_path / "a.yaml", list[str]()
     path.write_text(json.dumps(camera_info("rational_polynomial" if len(terms) > 5 else "plumb_bob", terms)))
-    camera = read_camera(path, warn=lines.append).camera
+    camera, _ = read_camera(path, warn=lines.append)
     assert len(lines) == 1 and "is read as the nearest omni camera, off by" in lines[0]
     # The same rays by OpenCV's equation, within the image.
     k1, k2, p1, p2, k3, k4, k5, k6 = [*terms, 0, 0, 0, 0][:8]

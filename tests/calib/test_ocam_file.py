@@ -37,7 +37,8 @@ T_LOWER_UPPER = se3.exp([0.02, -0.01, -0.2, 0.02, 0.05, 0.3])
 
 def test_parses_every_number_as_the_toolbox_defines_it() -> None:
     with_notes = TEXT.replace("480 640", "480, 640  # height, width").replace("318.540278", "318.540278 % centre")
-    for text in (TEXT, TEXT.encode(), TEXT.replace("\n", "\r\n"), with_notes):
+    fortran = TEXT.replace("1.540000e-03", "1.54D-03").replace("5 -2.3", "5.0 -2.3").replace("#", "// ")
+    for text in (TEXT, TEXT.encode(), TEXT.replace("\n", "\r\n"), with_notes, fortran):
         assert parse_ocam(text, "direct") == OcamCamera(
             (-231.5, 0.0, 1.54e-3, -5.96e-7, 1.59e-9),
             (240.378942, 318.540278),
@@ -114,10 +115,10 @@ def test_reads_a_transform_in_every_format(tmp_path: Path, name: str, text: str)
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("t.toml", "T_x = 3", "unknown key T_x"),
+        ("t.toml", "T_x = 3", "expected either T_lower_upper or T_upper_lower, found the keys"),
         ("t.toml", "", "expected either T_lower_upper or T_upper_lower"),
         ("t.toml", "[", "expected TOML"),
-        ("t.yml", "T_lower_upper: 3", "expected rows of numbers"),
+        ("t.yml", "T_lower_upper: 3", "T_lower_upper: expected 12 or 16 numbers, found 3"),
         ("t.yml", "[", "YAML"),
         ("t.txt", "1 0 0 0", "the 4 rows"),
         ("t.txt", "one", "expected 16 numbers"),
