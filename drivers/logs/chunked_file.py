@@ -117,6 +117,10 @@ class ChunkedFile(ByteSource, ABC):
         """Return what the writer has stated at the end of the file; None where it has not closed the file."""
 
     @abstractmethod
+    def _is_whole(self, last: Record) -> bool:
+        """True if a closed file is complete, of which this is the record that ends the data, or the last one found."""
+
+    @abstractmethod
     def _records(self, source: ByteSource, start: int, end: int) -> Iterator[Record]:
         """Yield the records from offset start on; the last one may be cut. What is no record ends them."""
 
@@ -180,7 +184,7 @@ class ChunkedFile(ByteSource, ABC):
                 self._attached.append(record)
             elif chunk is None:
                 yield self._scanned(self, [record], _NO_CHUNK, is_cut=True)
-        is_whole = summary is not None and last.kind in _ENDS
+        is_whole = summary is not None and self._is_whole(last)
         if chunk is not None:
             yield self._of_chunk(chunk, index if is_whole else [])
         # Channels that are defined nowhere else are defined in chunks.

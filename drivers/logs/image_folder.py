@@ -167,7 +167,7 @@ def _stamp_lines(folder: Path) -> list[str] | None:
     for path in (place / name for place in (folder, folder.parent) for name in STAMP_FILES):
         try:
             if path.is_file() and path.stat().st_size <= MAX_RECORD_BYTES:
-                lines = path.read_text("utf-8", "replace").splitlines()
+                lines = path.read_text("utf-8-sig", "replace").splitlines()
                 return [line.strip() for line in lines if line.strip() and not line.startswith("#")]
         except OSError as error:
             raise DriverError(f"cannot read the stamps {str(path)!r}: {error.strerror}") from error

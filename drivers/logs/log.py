@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -261,7 +262,21 @@ class Log:
         of_file = np.repeat(np.arange(len(found), dtype=np.int16), [len(numbers) for _, numbers in found])
         images = [place for place, kind in enumerate(topics.values()) if kind in IMAGE_TYPES]
         run_ns, steps = running_on(topic, entries["time_ns"], images)
+        if steps and (kept := ~self._is_repeated(topic, entries, of_file)).sum() < len(kept):
+            topic, entries, of_file = topic[kept], entries[kept], of_file[kept]
+            run_ns, steps = running_on(topic, entries["time_ns"], images)
         return LogIndex(topics, topic, of_file, entries, run_ns, np.argsort(run_ns, kind="stable"), steps)
+
+    def _is_repeated(self, topic: NDArray[np.int32], entries: Entries, of_file: NDArray[np.int16]) -> NDArray[np.bool_]:
+        """Return which messages (N,) have topic, time and bytes of one before, as where a part was written twice."""
+        order = np.lexsort((entries["time_ns"], topic))
+        same = (np.diff(topic[order]) == 0) & (np.diff(entries["time_ns"][order]) == 0)
+        found = np.zeros(len(topic), np.bool_)
+        for before, row in zip(order[:-1][same].tolist(), order[1:][same].tolist(), strict=True):
+            with suppress(RecordError):
+                read = [bytes(self._files[of_file[n]].read(*entries[n].item())) for n in (before, row)]
+                found[row] = read[0] == read[1]
+        return found
 
 
 def running_on(

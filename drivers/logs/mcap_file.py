@@ -102,6 +102,12 @@ class McapFile(ChunkedFile):
             [_PLACE.unpack(self.content(record.offset, _PLACE.size))[2] for record in places],
         )
 
+    def _is_whole(self, last: Record) -> bool:
+        # Where two files were written one after the other, the first one's footer is not at the end.
+        end = last.offset + last.size
+        ends = (record.offset + record.size for record in self._records(self, end, self.size - len(MAGIC)))
+        return last.kind is RecordKind.END and max(ends, default=0) == self.size - len(MAGIC)
+
     def _records(self, source: ByteSource, start: int, end: int) -> Iterator[Record]:
         offset = start
         while offset + _HEAD.size <= end:

@@ -52,6 +52,9 @@ class Ros1Bag(ChunkedFile):
         found = Summary(definitions, [int.from_bytes(place.fields[b"chunk_pos"], "little") for place in places])
         return found if len(records) >= expected else None
 
+    def _is_whole(self, last: Record) -> bool:
+        return last.kind is RecordKind.PLACE
+
     def _records(self, source: ByteSource, start: int, end: int) -> Iterator[Record]:
         offset = start
         while offset + _LENGTH.size <= end:

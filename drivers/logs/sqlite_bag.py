@@ -7,12 +7,16 @@ killed leaves beside the file counts: a write-ahead log, or a journal by which t
 
 from __future__ import annotations
 
+import os
 import shutil
 import sqlite3
+import struct
 import sys
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import partial
+from os import SEEK_CUR
 from pathlib import Path
 from typing import Final
 from urllib.parse import quote
@@ -43,6 +47,8 @@ _ROWS: Final = (
     "SELECT topic_id, timestamp, rowid, length(data) FROM messages NOT INDEXED WHERE rowid >= ? ORDER BY rowid"
 )
 _DATA: Final = "SELECT substr(data, 1, ?) FROM messages WHERE rowid = ?"
+_LOG_HEAD: Final = struct.Struct(">8xI4x8s8x")  # page size, salts
+_FRAME_HEAD: Final = struct.Struct(">4xI8s8x")  # pages of the database where a transaction ends, else 0; salts
 _FAULTS: Final = (sqlite3.Error, OverflowError)
 
 
@@ -77,6 +83,8 @@ class SqliteBag:
             for key, name, kind, encoding in rows
             if isinstance(key, int)
         }
+        if _ends_in_transaction(self._files[1]):
+            self.cut = f"the write-ahead log of the bag {self.name!r} is cut within a transaction: used those before"
 
     def entries(self) -> Iterator[Entries]:
         """Yield the places of all messages; behind pages that cannot be read, those from the next readable one on."""
@@ -168,6 +176,24 @@ class SqliteBag:
             database.close()
             raise
         return database
+
+
+def _ends_in_transaction(log: Path) -> bool:
+    """True if the last frame of a write-ahead log is not whole, or does not end its transaction (sqlite.org/walformat).
+
+    Frames with other salts than the head are of earlier transactions, which have ended.
+    """
+    ends = True
+    with suppress(OSError), log.open("rb") as file:
+        head = file.read(_LOG_HEAD.size)
+        page_bytes, salts = _LOG_HEAD.unpack(head) if len(head) == _LOG_HEAD.size else (0, b"")
+        while page_bytes and len(frame := file.read(_FRAME_HEAD.size)) == _FRAME_HEAD.size:
+            pages, found = _FRAME_HEAD.unpack(frame)
+            if found != salts:
+                break
+            end = file.seek(page_bytes, SEEK_CUR)
+            ends = pages > 0 and end <= os.fstat(file.fileno()).st_size
+    return not ends
 
 
 def _line(error: Exception) -> str:

@@ -11,6 +11,7 @@ import re
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from io import BytesIO, TextIOWrapper
+from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
@@ -52,39 +53,37 @@ def read_tum(path: str | Path) -> Trajectory:
     Blank lines and everything after `#` are skipped; quaternions are normalised. A repeated stamp is refused: two poses
     at one time contradict each other. Raises OmnidError that names the file, the line and what was found.
     """
-    # 1. Stamps and numbers of each line.
-    raw, stamps, poses, lines, line = _read(Path(path)), list[int](), list[list[float]](), list[int](), 0
-    order, unit = _QUATERNION, ""
+    # 1. Stamp, line and numbers of each pose.
+    found, line, order, unit = list[tuple[int, int, list[float]]](), 0, _QUATERNION, ""
     try:
-        for line, content in enumerate(_lines(raw), start=1):
+        for line, content in enumerate(_lines(Path(path)), start=1):
             data, _, comment = content.partition("#")
             words = _words(data)
             is_head = len(words) > 1 and not any(re.match(r"[-+.]?[0-9]", word) for word in words)
-            if words and (lines or not is_head):
+            if words and (found or not is_head):
                 unit = unit or _unit_of(words[0])
                 # Tables may have more columns, such as velocities.
                 stamp_ns, pose = _row(words[:8] if re.search("[,;]", data) else words, unit)
-                stamps.append(stamp_ns)
-                poses.append(pose)
-                lines.append(line)
-            elif not lines:
+                found.append((stamp_ns, line, pose))
+            elif not found:
                 order, unit = _columns(data if words else comment) or (order, unit)
     except ValueError as error:
         raise OmnidError(f"{path}, line {line}: {error}") from error
-    if not lines:
+    if not found:
         raise OmnidError(f"{path}: no pose found: expected lines 't x y z qx qy qz qw'")
     # 2. Sorted by stamp, each once.
-    by_time = np.argsort(stamps, kind="stable")
-    stamps_ns = np.array(stamps, np.int64)[by_time]
-    for n in np.flatnonzero(np.diff(stamps_ns) == 0).tolist():
-        first, second = lines[by_time[n]], lines[by_time[n + 1]]
-        raise OmnidError(
-            f"{path}, line {second}: expected each stamp once, found that of line {first} again: remove one of the two"
-        )
-    xyz, q = np.split(np.array(poses)[by_time], [len(_AXES)], axis=1)
+    found.sort(key=lambda pose: pose[0])
+    for (before_ns, first, _), (stamp_ns, second, _) in pairwise(found):
+        if before_ns == stamp_ns:
+            raise OmnidError(
+                f"{path}, line {second}: expected each stamp once, found that of line {first} again: remove one of the "
+                "two"
+            )
+    xyz, q = np.split(np.array([pose for *_, pose in found]), [len(_AXES)], axis=1)
     q = q[:, [order.index(name) for name in _QUATERNION]]
     # The division keeps squares in se3 from overflowing.
     T = se3.transform(se3.rotation(q / np.abs(q).max(axis=1, keepdims=True)), xyz)
+    stamps_ns = np.array([stamp_ns for stamp_ns, *_ in found], np.int64)
     stamps_ns.setflags(write=False)
     T.setflags(write=False)
     return Trajectory(stamps_ns, T)
@@ -101,7 +100,8 @@ def tum_row(stamp_ns: int, T: Array) -> str:
     return " ".join([f"{sign}{whole_s}.{rest_ns:09d}", *(f"{float(value):.{_DECIMALS}f}" for value in pose)])
 
 
-def _read(path: Path) -> bytes:
+def _lines(path: Path) -> TextIOWrapper:
+    """Return the lines of a text, in UTF-16 if it begins with its byte order mark; comments may have any encoding."""
     try:
         with path.open("rb") as file:
             raw = file.read(FILE_LIMIT_BYTES + 1)
@@ -109,11 +109,6 @@ def _read(path: Path) -> bytes:
         raise OmnidError(f"{path}: cannot read the trajectory: {getattr(error, 'strerror', None) or error}") from error
     if len(raw) > FILE_LIMIT_BYTES:
         raise OmnidError(f"{path}: expected at most {FILE_LIMIT_BYTES >> 20} MiB: split the file")
-    return raw
-
-
-def _lines(raw: bytes) -> TextIOWrapper:
-    """Return the lines of a text, in UTF-16 if it begins with its byte order mark; comments may have any encoding."""
     is_wide = raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     return TextIOWrapper(BytesIO(raw), "utf-16" if is_wide else "utf-8-sig", errors="replace")
 

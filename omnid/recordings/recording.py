@@ -10,12 +10,11 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing
-from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple, TypeAlias
 
 from drivers.errors import FrameDecodeError
-from drivers.logs.log import LoggedMessage, listed
+from drivers.logs.log import listed
 from drivers.logs.open_log import LogInfo, open_log
 from drivers.logs.ros_messages import IMAGE_TYPES, RosImage
 from omnid.errors import OmnidError
@@ -40,7 +39,6 @@ TWIST_COMMAND: Final = "cmd/twist"
 IMAGES: Final = (PANORAMA, "lower/image_raw/compressed", "lower/image_raw")  # in the order of preference
 
 Content: TypeAlias = Pose | PoseInMap | Diagnostics | Cloud | Scan | TwistRecord | RosImage
-Decoder: TypeAlias = Callable[[LoggedMessage], Content]
 
 
 def choose_odometry_topic(found: LogInfo, topic: str | None = None, robot: str | None = None) -> str:
@@ -60,23 +58,19 @@ def choose_odometry_topic(found: LogInfo, topic: str | None = None, robot: str |
     own = [name for name in known if name.endswith(f"/{ODOMETRY}")]
     if topic in known:
         return str(topic)
+    if topic is None and 1 in (len(known), len(own)):
+        return own[0] if len(own) == 1 else known[0]
     if topic is not None:
-        raise OmnidError(
-            f"{found.path}: no {ODOMETRY_SCHEMA} on {topic!r}: found {listed(known, 'none')}; name one of these topics"
-        )
-    if any(schema in IMAGE_TYPES for schema, _ in found.topics.values()) and not known:
+        wrong = f"no {ODOMETRY_SCHEMA} on {topic!r}: found {listed(known, 'none')}; name one of these topics"
+    elif known:
+        wrong = f"several topics with {ODOMETRY_SCHEMA}: {listed(known)}; choose one with --topic"
+    elif any(schema in IMAGE_TYPES for schema, _ in found.topics.values()):
         rig = "" if "rig.toml" in found.attachments else " --rig rig.toml"
-        raise OmnidError(
-            f"{found.path}: images but no {ODOMETRY_SCHEMA}: run `omnid replay {found.path}{rig} --record "
-            "out.mcap` and use out.mcap"
-        )
-    if not known:
-        names = listed(found.topics, "none")
-        raise OmnidError(f"{found.path}: no {ODOMETRY_SCHEMA}: found {names}; expected a recording of a run")
-    if len(known) != 1 and len(own) != 1:
-        names = listed(known, "none")
-        raise OmnidError(f"{found.path}: several topics with {ODOMETRY_SCHEMA}: {names}; choose one with --topic")
-    return own[0] if len(own) == 1 else known[0]
+        command = f"`omnid replay {found.path}{rig} --record out.mcap`"
+        wrong = f"images but no {ODOMETRY_SCHEMA}: run {command} and use out.mcap"
+    else:
+        wrong = f"no {ODOMETRY_SCHEMA}: found {listed(found.topics, 'none')}; expected a recording of a run"
+    raise OmnidError(f"{found.path}: {wrong}")
 
 
 def no_pose(path: Path, topic: str) -> OmnidError:
@@ -129,33 +123,22 @@ class RecordingReader:
         with closing(open_log(self.info.path)) as log:
             for message in log.messages(wanted.keys()):
                 name = wanted[message.topic]
-                decoder = _decoder(name, message.kind)
-                content = None if decoder is None else self._decoded(message, decoder)
-                if content is not None:
-                    yield RecordedMessage(name, message.log_time_ns, content)
+                kind, decode = DECODERS.get(name, ("", None))
+                content: Content
+                try:
+                    if name in IMAGES and message.kind in IMAGE_TYPES:
+                        content = message.image()
+                    elif decode is not None and message.kind == kind:
+                        content = decode(message.cdr())
+                    else:
+                        continue
+                except (OmnidError, FrameDecodeError):
+                    self.unreadable[message.topic] += 1
+                    continue
+                yield RecordedMessage(name, message.log_time_ns, content)
             damage = log.damage()
             self.corrupt = damage.broken
             self.damaged = damage.broken + bool(damage.cut)
-
-    def _decoded(self, message: LoggedMessage, decoder: Decoder) -> Content | None:
-        """Return the content of a message; None, and count it, where it cannot be decoded."""
-        try:
-            return decoder(message)
-        except (OmnidError, FrameDecodeError):
-            self.unreadable[message.topic] += 1
-            return None
-
-
-def _decoder(name: str, kind: str) -> Decoder | None:
-    """Return the decoder of messages of a topic; None where they are of another type than expected."""
-    if name in IMAGES and kind in IMAGE_TYPES:
-        return LoggedMessage.image
-    expected, decoder = DECODERS.get(name, ("", None))
-    return partial(_of_bytes, decoder) if decoder is not None and kind == expected else None
-
-
-def _of_bytes(decoder: Callable[[bytes], Content], message: LoggedMessage) -> Content:
-    return decoder(message.cdr())
 
 
 def _finite_twist(data: bytes) -> TwistRecord:

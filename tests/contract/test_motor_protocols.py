@@ -96,14 +96,6 @@ def test_limiting_the_wheel_speed_keeps_the_curvature(name: str, velocity_mps: f
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_reports_fault_and_battery(name: str) -> None:
-    connection = Connection(name)
-    connection.base.fault, connection.base.battery_v = 16, 9.5
-    status = connection.send(stop_command(0))
-    assert (status.fault, status.battery_v) == (16, 9.5)
-
-
-@pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("field", ["velocity_mps", "yaw_rate_radps", "heading_rad"])
 def test_refuses_numbers_that_are_not_finite(name: str, bad: float, field: str) -> None:
@@ -123,16 +115,6 @@ def test_host_accepts_any_bytes(name: str) -> None:
             with contextlib.suppress(DriverError, StopIteration):
                 for frame in framer.feed(noise):
                     transaction.send(frame)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_simulated_controller_accepts_any_bytes(name: str) -> None:
-    rng, connection = random.Random(12), Connection(name)
-    connection.base.advance(0.1)
-    commands = next(connection.protocol.drive(VelocityCommand(0, 0.3, 0.2, 0.1), 1.0))
-    for noise in noises(rng, commands):
-        assert isinstance(connection.controller.feed(noise), bytes)
-    assert all(map(math.isfinite, connection.base.commanded_mps))
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -20,7 +20,6 @@ from tests.contract.simulated_motors import (
     INSTANT,
     LONG_MS,
     NAMES,
-    PATIENCE_S,
     REPLY_S,
     SHORT_MS,
     connected_motor,
@@ -190,16 +189,6 @@ def test_a_late_reply_is_discarded(name: str) -> None:
         assert motor.send(stop_command(0)).battery_v == 12.0
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_a_missing_reply_at_the_connection_is_an_error(name: str) -> None:
-    with contextlib.closing(PtyMotor(controller_of(name))) as simulated:
-        simulated.drop_input = True
-        with pytest.raises(DriverError, match="gave no answer"):
-            SerialMotor(simulated.port, PROTOCOLS[name](BASE), watchdog_ms=LONG_MS, connect_s=0.1)
-        simulated.drop_input = False
-        SerialMotor(simulated.port, PROTOCOLS[name](BASE), watchdog_ms=LONG_MS, connect_s=PATIENCE_S).close()
-
-
 @pytest.mark.parametrize(("name", "other"), [("line", "roboteq"), ("roboteq", "vesc"), ("vesc", "odrive_ascii")])
 def test_detects_another_protocol(name: str, other: str) -> None:
     controller = controller_of(name)
@@ -226,12 +215,6 @@ def test_an_unplugged_controller_is_an_error_and_reconnects(name: str, tmp_path:
             port.symlink_to(second.port)
             assert until(lambda: first_status(motor) is not None and second.base.commanded_mps != [0.0, 0.0])
             assert motor.connections == 2 and second.base.errors == 0
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_locks_the_port(name: str) -> None:
-    with connected_motor(name) as (_, simulated), pytest.raises(DriverError, match="in use by another program"):
-        SerialMotor(simulated.port, PROTOCOLS[name](BASE), watchdog_ms=LONG_MS)
 
 
 def delayed(motor: SerialMotor) -> MotorStatus:

@@ -545,6 +545,28 @@ def test_behind_a_page_of_a_database_that_was_not_written_reading_goes_on(tmp_pa
     assert log_info(path).state is LogState.BROKEN and not reader.truncated
 
 
+def test_a_part_that_was_written_twice_is_read_once(tmp_path: Path) -> None:
+    """Its times go back, and no clock was set."""
+    entries = pairs(20)
+    found, reader = read(write_log(tmp_path / "log.mcap", entries[:20] + entries[10:], **SMALL))
+    assert found == expected(20) and not reader.warnings
+
+
+def test_a_file_behind_another_one_is_told(tmp_path: Path) -> None:
+    first, second = (write_log(tmp_path / f"{n}.mcap", pairs(20)[20 * n :][:20]).read_bytes() for n in range(2))
+    path = tmp_path / "both.mcap"
+    path.write_bytes(first + second)
+    found, reader = read(path)
+    assert found == expected(10) and reader.truncated and "cut or corrupt after byte" in reader.warnings[0]
+
+
+def test_a_write_ahead_log_that_is_cut_within_a_transaction_is_told(tmp_path: Path) -> None:
+    path = write_killed_db3(tmp_path / "bag", pairs(60))
+    log = Path(f"{path}-wal")
+    os.truncate(log, log.stat().st_size // 2)
+    assert "is cut within a transaction" in log_info(path).fault and log_info(path).state is LogState.BROKEN
+
+
 SQL_OF_OTHER_TABLES: Final = {
     "no bag": ["DROP TABLE messages"],
     "columns in another order": [

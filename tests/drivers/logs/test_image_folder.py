@@ -45,7 +45,7 @@ def test_a_list_holds_the_seconds_of_numbered_images(tmp_path: Path, where: str,
     folder = write_folders(tmp_path / "images", pairs(PAIRS), lambda stamp_ns: f"frame{NUMBERS[stamp_ns]}")
     lines = ["# seconds", "1.7e+09", *(f"1700000000.{number:09d}" for number in range(1, PAIRS))]
     for camera in ["lower", "upper"] if where else [""]:
-        (folder / camera / name).write_text("\n".join(lines) + "\n")
+        (folder / camera / name).write_text("\r\n".join(lines) + "\n", "utf-8-sig")  # as editors of Windows do
     found, _ = read(folder)
     assert [frame[2] for frame in found if frame[0] == "lower"] == [START_NS + number for number in range(PAIRS)]
     assert [frame[3] for frame in found if frame[0] == "lower"] == [frame[3] for frame in expected(PAIRS)[::2]]

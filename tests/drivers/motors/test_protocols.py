@@ -201,11 +201,9 @@ def test_roboteq_reads_back_its_watchdog_and_must_not_mix(in_force: bytes, mixin
         result(Roboteq(DRIVE).connect(500), *replies)
 
 
-def test_roboteq_names_what_was_rejected_and_needs_two_channels() -> None:
+def test_roboteq_names_what_was_rejected() -> None:
     with pytest.raises(DriverError, match=r"rejected one of !S 1 150"):
         result(Roboteq(DRIVE).drive(TURN, 0.0), b"+", b"-")
-    with pytest.raises(DriverError, match="two"):
-        result(Roboteq(DRIVE).drive(TURN, 0.0), b"+", b"+", b"S=150", b"V=246", b"FF=0")
 
 
 def test_roboteq_limits_speeds_to_the_range_of_the_manual() -> None:

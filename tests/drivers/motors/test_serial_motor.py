@@ -157,19 +157,6 @@ def test_a_watchdog_that_stays_expired_is_an_error() -> None:
         SerialMotor(simulated.port, timeout_s=REPLY_S, connect_s=0.1)
 
 
-class Echo(SimulatedLine):
-    """A port that returns all that is sent."""
-
-    def handle(self, frame: bytes) -> bytes:
-        """Return the frame itself."""
-        return frame
-
-
-def test_an_echo_is_no_reply() -> None:
-    with contextlib.closing(PtyMotor(Echo())) as simulated, pytest.raises(DriverError, match="no answer"):
-        SerialMotor(simulated.port, connect_s=0.1)
-
-
 # The protocol's host, without a port
 
 
