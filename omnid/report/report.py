@@ -303,8 +303,15 @@ def _sections(run: RecordedRun, truth: _Truth | None) -> Iterator[tuple[str, lis
     ]
     unset = "" if any(figures) else note("The covariances in the log are zero or negative: they were not set.")
     curves = [run.curve(name, ODOMETRY, key) for name, key in landmarks.items()]
-    figures.append(chart("Landmarks", curves, note="One value per report, not per pose."))
-    yield "Uncertainty", [grid(figures), unset, "" if figures[-1] else note("The log holds no numbers of landmarks.")]
+    tracked = curves[0].values
+    few = (
+        f"Landmarks at the last report: {tracked[-1]:.0f}."
+        if len(tracked)
+        else "The log holds no numbers of landmarks."
+    )
+    if len(tracked) > 2:
+        figures.append(chart("Landmarks", curves, note="One value per report, not per pose."))
+    yield "Uncertainty", [grid(figures), unset, "" if len(tracked) > 2 else note(few)]
     # 4. The map of places: its sizes, and the correction of odometry, where there was one.
     if len(_map_path(run)):
         t_s, moved_m, turned_rad, sigma_m = run.map_poses.T
