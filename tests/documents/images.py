@@ -44,6 +44,7 @@ DRIVE_S: Final = 90.0  # of simulated time at most, as in `omnid demo --drive`
 FRAME_MS: Final = 125  # a GIF's image stands for a second of the drive: eight times as fast
 PAUSE_MS: Final = 2500  # of the last image
 RANGES_M: Final = (0.8, 6.0)  # that the colours of the depth span
+WHITE: Final = (255, 255, 255)
 
 
 def stills() -> None:
@@ -65,15 +66,27 @@ def stills() -> None:
 
 
 def _depth_image(panorama: Image, pixels: NDArray[Any], ranges_m: NDArray[np.float64]) -> Image:
-    """Return the panorama with each located pixel coloured by its range: near is red, far is blue."""
-    near, far = np.log(RANGES_M)
-    shade = np.clip((far - np.log(ranges_m)) / (far - near), 0.0, 1.0)
-    colors = cv2.applyColorMap((255 * shade).astype(np.uint8).reshape(-1, 1), cv2.COLORMAP_TURBO).reshape(-1, 3)
+    """Return the panorama with each located pixel coloured by its range, and a bar with the scale of the colours."""
     image = cv2.cvtColor(panorama // 3, cv2.COLOR_GRAY2BGR)
     columns, rows = np.rint(pixels).astype(int).T
     for down, across in itertools.product((0, 1), repeat=2):  # each pixel as a square of 2 x 2
-        image[np.minimum(rows + down, len(image) - 1), (columns + across) % image.shape[1]] = colors
+        image[np.minimum(rows + down, len(image) - 1), (columns + across) % image.shape[1]] = _colours(ranges_m)
+    height, width = image.shape[:2]
+    bar = np.geomspace(*RANGES_M, width // 4)
+    image[height - 40 : height - 28, 20 : 20 + len(bar)] = _colours(bar)
+    for range_m in (1, 2, 3, 4, 6):
+        at = 20 + int(np.searchsorted(bar, range_m)) - 6
+        cv2.putText(image, f"{range_m}", (at, height - 10), cv2.FONT_HERSHEY_SIMPLEX, 0.6, WHITE, 2, cv2.LINE_AA)
+    cv2.putText(image, "m", (24 + len(bar), height - 28), cv2.FONT_HERSHEY_SIMPLEX, 0.6, WHITE, 2, cv2.LINE_AA)
     return np.asarray(image, np.uint8)
+
+
+def _colours(ranges_m: NDArray[np.float64]) -> Image:
+    """Return a colour (N, 3) for each range: near is red, far is blue."""
+    near, far = np.log(RANGES_M)
+    shade = np.clip((far - np.log(ranges_m)) / (far - near), 0.0, 1.0)
+    colours = cv2.applyColorMap((255 * shade).astype(np.uint8).reshape(-1, 1), cv2.COLORMAP_TURBO)
+    return np.asarray(colours.reshape(-1, 3), np.uint8)
 
 
 def _write(name: str, image: Image, width_px: int) -> None:
