@@ -400,7 +400,7 @@ def _subscribe(
 
     def receive(request: Request) -> None:
         if request.topic in topics.SENSOR_TOPICS:
-            samples.receive(request.topic, request.payload)
+            samples.receive(request)
             return
         answer = table.get(request.topic, commands)(request)
         if answer is not None:

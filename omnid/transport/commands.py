@@ -34,11 +34,12 @@ from __future__ import annotations
 import math
 import re
 import secrets
+import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
-from typing import Final, Protocol
+from typing import Final, NamedTuple, Protocol
 
 from drivers.logs.ros_messages import JointWheels
 from drivers.motion import MotionSample
@@ -70,24 +71,10 @@ from omnid.transport.topics import Answer, Request
 
 LONGEST_PAYLOAD, LONGEST_PATH = 4096, 1 << 20  # bytes
 LEAST_SPEED: Final = 1e-3  # m/s, rad/s; less in another direction is noise of a stick, more is another motion
-ASIDE: Final = "not possible with a differential drive"
-MALFORMED: Final = "malformed"
-SAME_NAME: Final = "another robot has this name"
-UNSTAMPED: Final = "no stamp"
-TOO_OLD, EARLY = "too old", "stamp in the future"
 _CLOCKS: Final = (
     "synchronise the clocks, or stamp with the robot's own time: omnid.client attaches it, another program may repeat "
     "the stamp of the newest odom; controller.deadlines.command_s is the longest age"
 )
-_ADVICE: Final = {
-    MALFORMED: "twist takes TwistStamped or Twist, heading Vector3Stamped, arm Header, bumper and cliff Bool, as CDR",
-    SAME_NAME: "change bus.robot of one of them",
-    "wrong frame": "give base_link for twist, odom for heading, or none",
-    "unknown topic": "see controller.sources.names",
-    UNSTAMPED: "fill in the stamp (ROS 2: `header: auto`; String: last word stamp=NANOSECONDS), or repeat that of odom",
-    TOO_OLD: f"on a busy computer try again; else {_CLOCKS}",
-    EARLY: _CLOCKS,
-}
 _STAMPED: Final = re.compile(r"(.*\S)\s+stamp=(\d{1,19})\s*", re.DOTALL)
 
 
@@ -95,10 +82,52 @@ class Refused(OmnidError):  # noqa: N818 - named after what it reports
     """A message that is not obeyed; reason: in the words that are counted. str() says more, and what to do."""
 
     def __init__(self, reason: str, found: str = "") -> None:
-        """found: what was measured; a sentence of its own, with the remedy, where there is no advice for the reason."""
-        words = f"{reason}: {found}" if found else reason
-        super().__init__(f"{words}; {_ADVICE[reason]}" if reason in _ADVICE else found or reason)
+        """found: what was measured, and the remedy."""
+        super().__init__(f"{reason}: {found}" if found else reason)
         self.reason = reason
+
+
+class Row(NamedTuple):
+    """What is done with the messages of a topic; its type is in omnid.transport.topics."""
+
+    act: Callable[[Request, int], object]  # takes a message and its arrival, ns of CLOCK_MONOTONIC; it may be Refused
+    longest: int = LONGEST_PAYLOAD  # bytes
+    on_refusal: Callable[[], object] = bool  # called where a message is refused; bool does nothing
+
+
+class Receiver:
+    """Handles each message by the row of its topic, counts and reports those that are refused, and never raises.
+
+    It is called from threads of the bus. accepted: number of messages; refused: by reason; refusal: the newest one.
+    """
+
+    def __init__(self, rows: Mapping[str, Row], report: Callable[[str], None] | None, unknown: str) -> None:
+        """report: takes a line for the log where a refusal is another one than before. unknown: advice."""
+        self._rows, self._report, self._unknown = rows, report, Row(self._refuse_unknown, sys.maxsize)
+        self._advice = unknown
+        self.accepted = 0
+        self.refused: Counter[str] = Counter()
+        self.refusal = ""
+
+    def receive(self, request: Request) -> Answer | None:
+        """Handle one message; return the refusal, None where there is none or the target answers."""
+        arrival_ns = time.monotonic_ns()  # before anything else: a stop that arrives meanwhile voids a command
+        row = self._rows.get(request.topic, self._unknown)
+        try:
+            if len(request.payload) > row.longest:
+                raise Refused("too long", f"{len(request.payload)} bytes, expected at most {row.longest}")
+            row.act(request, arrival_ns)
+        except OmnidError as error:
+            row.on_refusal()
+            self.refused[error.reason if isinstance(error, Refused) else "malformed"] += 1
+            before, self.refusal = self.refusal, f"a message on {plain(request.topic)} is refused: {error}"
+            if self._report is not None and self.refusal != before:
+                self._report(self.refusal)
+            return Answer(False, str(error))
+        return None
+
+    def _refuse_unknown(self, *_: object) -> None:
+        raise Refused("unknown topic", self._advice)
 
 
 class Freshness:
@@ -135,12 +164,14 @@ class Freshness:
         if goes_on:
             sent_ns = arrival_ns if sent_ns is None else min(arrival_ns, sent_ns)
         if sent_ns is None:
-            raise Refused(UNSTAMPED)
-        age_ns, by_robot = arrival_ns - sent_ns, "by the robot's clock"
+            how = "ROS 2: `header: auto`; String: last word stamp=NANOSECONDS"
+            raise Refused("no stamp", f"fill in the stamp ({how}), or repeat that of odom")
+        age_ns = arrival_ns - sent_ns
+        by_robot = f"{duration_words(abs(age_ns) * S_PER_NS)} by the robot's clock"
         if age_ns < -self.stale_ns:
-            raise Refused(EARLY, f"by {duration_words(-age_ns * S_PER_NS)} {by_robot}")
+            raise Refused("stamp in the future", f"by {by_robot}; {_CLOCKS}")
         if age_ns > self.stale_ns:
-            raise Refused(TOO_OLD, f"sent {duration_words(age_ns * S_PER_NS)} ago {by_robot}")
+            raise Refused("too old", f"sent before {by_robot}; on a busy computer try again; else {_CLOCKS}")
         return sent_ns
 
 
@@ -155,6 +186,7 @@ class SensorClock:
         self._delays_ns: list[int] = []  # least and largest delay by the stamps, which differ by less than stale_ns
         self._since_ns = 0  # arrival of the first message with these
         self.touched_ns: float = -math.inf  # newest stamp of a contact among them
+        self.newest_ns = 0  # when the newest contact was sent, at most its arrival, whatever the delays
 
     def is_steady(self, sent_ns: int, arrival_ns: int) -> bool:
         """Take a message; True where for stale_ns all messages have come with the same delay."""
@@ -176,7 +208,8 @@ def twist_command(payload: bytes) -> tuple[int, Setpoint]:
     setpoint = Setpoint(_bounded(velocity_mps), None, _bounded(yaw_rate_radps))
     for name, speed in zip(codec.ASIDE_NAMES, aside, strict=True):
         if not abs(speed) <= LEAST_SPEED:
-            raise Refused(ASIDE, f"twist.{name} = {speed:g} is {ASIDE}; send linear.x and angular.z only")
+            found = f"twist.{name} = {speed:g}; send linear.x and angular.z only"
+            raise Refused("not possible with a differential drive", found)
     return stamp_ns, setpoint
 
 
@@ -198,12 +231,7 @@ def _bounded(value: float) -> float:
 
 def _check_frame(frame: str, expected: str) -> None:
     if frame not in ("", expected):
-        raise Refused("wrong frame")
-
-
-def _check_length(payload: bytes) -> None:
-    if len(payload) > LONGEST_PAYLOAD:
-        raise Refused("too long")
+        raise Refused("wrong frame", f"{frame[:40]!a}, expected {expected} or none")
 
 
 class CommandTarget(Protocol):
@@ -219,10 +247,10 @@ class CommandTarget(Protocol):
         """Take the state of a bumper or a cliff sensor."""
 
 
-class CommandReceiver:
-    """Passes valid commands on and counts the others by reason; called from threads of the bus.
+class CommandReceiver(Receiver):
+    """Passes valid commands on. Stops are always obeyed. The controller decides which source and sender drives.
 
-    Stops are always obeyed. The controller decides which of several sources and senders drives.
+    accepted: setpoints; stops, arms: numbers of them.
     """
 
     def __init__(
@@ -236,81 +264,56 @@ class CommandReceiver:
     ) -> None:
         """freshness: the rule for the times of sending.
 
-        sources: names; the first has the short topics cmd/twist and cmd/heading, too. report: takes lines for the log,
-        one for each refusal. is_unique: False while another robot has this one's name, which is then not armed.
+        sources: names; the first has the short topics cmd/twist and cmd/heading, too. is_unique: False while another
+        robot has this one's name, which is then not armed.
         """
-        self._report, self._is_unique = report, is_unique
-        self._target, self._freshness = target, freshness
-        self._stop_ns = 0  # arrival of the newest stop
-        # What is done with each message but a stop, given its time of arrival.
-        self._actions: dict[str, Callable[[Request, int], None]] = {
-            topics.ARM: self._arm,
-            topics.BUMPER: partial(self._touch, BUMPER),
-            topics.CLIFF: partial(self._touch, CLIFF),
-        }
+        self._target, self._freshness, self._is_unique = target, freshness, is_unique
         parsers = {topics.TWIST: twist_command, topics.HEADING: heading_command}
-        for topic, (source, kind) in topics.setpoint_topics(sources).items():
-            self._actions[topic] = partial(self._drive, source, parsers[kind])
+        rows = {
+            topic: Row(partial(self._drive, source, parsers[kind]))
+            for topic, (source, kind) in topics.setpoint_topics(sources).items()
+        }
+        for topic, contact in ((topics.BUMPER, BUMPER), (topics.CLIFF, CLIFF)):
+            clock = SensorClock(freshness.stale_ns)
+            rows[topic] = Row(
+                partial(self._touch, contact, clock), on_refusal=partial(target.touch, contact, holds=True)
+            )
+        rows |= {topics.ARM: Row(self._arm), topics.STOP: Row(self._stop, sys.maxsize)}
+        super().__init__(rows, report, "see controller.sources.names")
+        self._stop_ns = 0  # arrival of the newest stop
         # Sender and newest arrival of the setpoints of each source: the first one begins a motion, the others go on
         # with it. There are none after a stop.
         self._streams: dict[str, tuple[str, int]] = {}
-        self.accepted = self.stops = self.arms = 0
-        self.refused: Counter[str] = Counter()
-        self.refusal = ""  # the newest one, in words
-        self._touched_ns: dict[str, int] = {}  # when the newest contact was sent, by topic
-        self._clocks: dict[str, SensorClock] = {}  # of the boards that report contacts, by topic
+        self.stops = self.arms = 0
 
-    def receive(self, request: Request) -> Answer | None:
-        """Handle one message, never raises; return the refusal, None where there is none or the target decides."""
-        arrival_ns = time.monotonic_ns()  # before anything else: a stop that arrives meanwhile voids the command
-        if request.topic == topics.STOP:
-            self._stop_ns = arrival_ns
-            self._streams.clear()
-            self.stops += 1
-            self._target.stop()
-            return None
-        try:
-            if request.topic not in self._actions:
-                raise Refused("unknown topic")
-            self._actions[request.topic](request, arrival_ns)
-        except OmnidError as error:
-            refusal = error if isinstance(error, Refused) else Refused(MALFORMED)
-            self.refused[refusal.reason] += 1
-            self.refusal = f"a command on {plain(request.topic)} is refused: {refusal}"
-            if self._report is not None:
-                self._report(self.refusal)
-            return Answer(False, str(refusal))
-        return None
+    def _stop(self, _: Request, arrival_ns: int) -> None:
+        self._stop_ns = arrival_ns
+        self._streams.clear()
+        self.stops += 1
+        self._target.stop()
 
-    def _touch(self, contact: str, request: Request, arrival_ns: int) -> None:
-        """Pass the state of a contact on.
+    def _touch(self, contact: str, clock: SensorClock, request: Request, arrival_ns: int) -> None:
+        """Pass the state of a contact on; a message that is refused is a contact.
 
         A contact ends only by a Bool of False that was sent just now, and not before that of the contact, because
         messages may overtake each other. A board whose clock is wrong sends it just now where its messages come at the
         pace of their stamps. All other messages are a contact.
         """
-        holds = True
-        try:
-            _check_length(request.payload)
-            is_contact = codec.bool_from_cdr(request.payload)
-            newest_ns, sent_ns = self._touched_ns.get(request.topic, 0), self._freshness.sent_ns(request, arrival_ns)
-            clock = self._clocks.setdefault(request.topic, SensorClock(self._freshness.stale_ns))
-            is_steady = sent_ns is not None and clock.is_steady(sent_ns, arrival_ns)
-            if is_contact:
-                self._touched_ns[request.topic] = max(newest_ns, min(sent_ns or 0, arrival_ns))
-                clock.touched_ns = max(clock.touched_ns, sent_ns or clock.touched_ns)
-            elif is_steady and sent_ns is not None:
-                holds = sent_ns < clock.touched_ns
-            else:
-                holds = self._freshness.require(request, arrival_ns) < newest_ns
-        finally:
-            self._target.touch(contact, holds=holds)
+        holds, sent_ns = codec.bool_from_cdr(request.payload), self._freshness.sent_ns(request, arrival_ns)
+        is_steady = sent_ns is not None and clock.is_steady(sent_ns, arrival_ns)
+        if holds:
+            clock.newest_ns = max(clock.newest_ns, min(sent_ns or 0, arrival_ns))
+            clock.touched_ns = max(clock.touched_ns, sent_ns or clock.touched_ns)
+        elif is_steady and sent_ns is not None:
+            holds = sent_ns < clock.touched_ns
+        else:
+            holds = self._freshness.require(request, arrival_ns) < clock.newest_ns
+        self._target.touch(contact, holds=holds)
 
     def _arm(self, request: Request, arrival_ns: int) -> None:
-        _check_length(request.payload)
         sent_ns = self._freshness.require(request, arrival_ns, codec.stamp_from_cdr(request.payload))
         if not self._is_unique():
-            raise Refused(SAME_NAME)
+            raise Refused("another robot has this name", "change bus.robot of one of them")
         if sent_ns <= self._stop_ns:
             raise Refused(OLDER_THAN_STOP)
         self._streams.clear()
@@ -320,7 +323,6 @@ class CommandReceiver:
     def _drive(
         self, source: str, parser: Callable[[bytes], tuple[int, Setpoint]], request: Request, arrival_ns: int
     ) -> None:
-        _check_length(request.payload)
         stamp_ns, setpoint = parser(request.payload)
         sender, before_ns = self._streams.get(source, ("", -math.inf))
         goes_on = sender == request.sender and arrival_ns - before_ns <= self._freshness.stale_ns
@@ -334,8 +336,8 @@ class CommandReceiver:
 # Requests to the navigation.
 
 
-class NavigationReceiver:
-    """Passes valid requests on and counts the others; called from threads of the bus, never raises.
+class NavigationReceiver(Receiver):
+    """Passes valid requests on.
 
     What ends a motion (cancel, pause, finish, stop) is obeyed whatever its age. All else needs a fresh stamp: a request
     that waited in a network must not start a drive minutes later.
@@ -348,39 +350,27 @@ class NavigationReceiver:
         *,
         report: Callable[[str], None] | None = None,
     ) -> None:
-        """target: may be called from any thread. freshness: as of CommandReceiver. report: takes lines for the log."""
-        self._target, self._freshness, self._report = target, freshness, report
-        self.accepted = 0
-        self.refused: Counter[str] = Counter()  # by topic
+        """target: may be called from any thread. freshness: as of CommandReceiver."""
+        rows = dict.fromkeys(topics.NAVIGATION_TOPICS, Row(self._ask)) | {topics.PATH: Row(self._ask, LONGEST_PATH)}
+        super().__init__(rows, report, "see omnid.transport.topics")
+        self._target, self._freshness = target, freshness
 
-    def stats(self) -> dict[str, int]:
-        """Return how many requests were accepted, and how many were not valid, by topic."""
+    def stats(self) -> dict[str, object]:
+        """Return how many requests were accepted, and how many were not valid, by reason."""
         return {"accepted": self.accepted, **by_reason(REFUSED_PREFIX, self.refused)}
 
-    def receive(self, message: Request) -> Answer | None:
-        """Handle one message; return the refusal, None where the target answers."""
-        try:
-            request, stamp_ns = navigation_request(message.topic, message.payload)
-            is_finish = isinstance(request, RouteRequest) and request.action is RouteAction.FINISH
-            if not (is_halt(request) or is_finish):
-                self._freshness.require(message, time.monotonic_ns(), stamp_ns)
-        except OmnidError as error:
-            self.refused[message.topic] += 1
-            if self._report is not None:
-                self._report(f"a request on {message.topic} is refused: {error}")
-            return Answer(False, str(error))
+    def _ask(self, message: Request, arrival_ns: int) -> None:
+        request, stamp_ns = navigation_request(message.topic, message.payload)
+        is_finish = isinstance(request, RouteRequest) and request.action is RouteAction.FINISH
+        if not (is_halt(request) or is_finish):
+            self._freshness.require(message, arrival_ns, stamp_ns)
         self.accepted += 1
-        asked_ns = time.monotonic_ns()
         stamp_ns = stamp_ns or message.sent_ns
-        self._target(NavigationCommand(request, time.time_ns(), stamp_ns, message.id, asked_ns=asked_ns))
-        return None
+        self._target(NavigationCommand(request, time.time_ns(), stamp_ns, message.id, asked_ns=arrival_ns))
 
 
 def navigation_request(topic: str, payload: bytes) -> tuple[NavigationRequest, int]:
     """Decode a request and its stamp [ns], 0 where it has none. Raise OmnidError for anything else."""
-    longest = LONGEST_PATH if topic == topics.PATH else LONGEST_PAYLOAD
-    if len(payload) > longest:
-        raise OmnidError(f"{len(payload)} bytes: expected at most {longest}")
     if topic in (topics.GOAL, topics.PATH):
         decode = codec.goal_from_cdr if topic == topics.GOAL else codec.path_from_cdr
         stamp_ns, name, xy, heading_rad = decode(payload)
@@ -401,37 +391,28 @@ def navigation_request(topic: str, payload: bytes) -> tuple[NavigationRequest, i
 # Samples of wheels and gyro.
 
 
-class SensorReceiver:
-    """Passes valid samples on and counts the others; called from threads of the bus, never raises."""
+class SensorReceiver(Receiver):
+    """Passes valid samples on."""
 
     def __init__(
         self,
         target: Callable[[MotionSample], None],
         stamp_ns: Callable[[int], int],
-        topics: frozenset[str],
+        used: Collection[str],
         report: Callable[[str], None],
         joints: JointWheels | None = None,
     ) -> None:
         """target: may be called from any thread. stamp_ns: returns the stamp, as those of images, of a Unix time.
 
-        topics: those that are used. report: takes a line for the log, once for each topic. joints: the wheels.
+        used: topics. joints: the wheels.
         """
-        self._joints = joints
-        self._target, self._stamp_ns, self._topics, self._report = target, stamp_ns, topics, report
-        self.refused: Counter[str] = Counter()  # by topic
+        advice = "it is not used, see motion.wheels, motion.wheel_joints and motion.imu"
+        super().__init__(dict.fromkeys(used, Row(self._take)), report, advice)
+        self._joints, self._target, self._stamp_ns = joints, target, stamp_ns
 
-    def receive(self, key: str, payload: bytes) -> None:
-        """Handle one message."""
-        try:
-            if key not in self._topics:
-                raise OmnidError("it is not used: see motion.wheels, motion.wheel_joints and motion.imu")
-            if len(payload) > LONGEST_PAYLOAD:
-                raise OmnidError(f"it has {len(payload)} bytes, more than {LONGEST_PAYLOAD}")
-            sample = sample_from_cdr(payload, topics.SENSOR_TOPICS[key], self._stamp_ns, self._joints)
-        except OmnidError as error:
-            self.refused[key] += 1
-            if self.refused[key] == 1:
-                self._report(f"a message on {key} is refused: {error}; more of them are counted in the status")
-            return
+    def _take(self, request: Request, _: int) -> None:
+        schema = topics.SENSOR_TOPICS[request.topic]
+        sample = sample_from_cdr(request.payload, schema, self._stamp_ns, self._joints)
         if sample is not None:
+            self.accepted += 1
             self._target(sample)
