@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import logging
 import shlex
-import shutil
 import sys
 import time
 from collections.abc import Iterator
@@ -38,7 +37,7 @@ from omnid.commands.options import (
     warn,
 )
 from omnid.config import Config
-from omnid.engine.logging_setup import log
+from omnid.engine.logging_setup import HANDLER, log
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
 from omnid.transport.bus import Bus
@@ -178,6 +177,7 @@ def live(args: argparse.Namespace) -> int:
                     if bus.needs_router:
                         bus.connect()
                     bus.publish("status", diagnostics_cdr(time.time_ns(), [status(boards, outcome)]))
+    HANDLER.show("")
     if missing := boards.missing():
         print(f"omnid: {boards.pairs} pairs, not enough yet: {'; '.join(missing)}", file=sys.stderr)
         return 1
@@ -229,10 +229,9 @@ def _bus(config: Config, closing: ExitStack) -> Bus | None:
 
 
 def _show(boards: LiveBoards, outcome: PairOutcome) -> None:
-    """Print the newest outcome: one line on a terminal, which the next one replaces, else one for each kept pair."""
+    """Show the newest outcome: one line on a terminal, which the next one replaces, else one for each kept pair."""
     missing = "; ".join(boards.missing()) or "enough"
     if sys.stdout.isatty():
-        width = shutil.get_terminal_size().columns - 1
-        print("\r" + f"{boards.pairs} ({outcome}): {missing}"[:width].ljust(width), end="", flush=True)
+        HANDLER.show(f"{boards.pairs} ({outcome}): {missing}")
     elif outcome == "kept":
         print(f"{boards.pairs}: {missing}", flush=True)

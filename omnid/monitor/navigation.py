@@ -11,6 +11,7 @@ from contextlib import closing, nullcontext
 from typing import Final
 
 from omnid.client import CONNECT_S, HERE, Answer, Diagnostics, Driver, NavigationReport, Robot, Subscription
+from omnid.engine.logging_setup import HANDLER
 from omnid.engine.process import handle_stop_signals
 from omnid.errors import OmnidError
 from omnid.navigation_state import NavigationState
@@ -20,7 +21,7 @@ from omnid.transport.status_names import DISARMED_BY_STOP, WHEELS, Key
 from omnid.transport.stop_datagram import STOPPED, StopSender
 
 SILENCE_S: Final = ANSWER_S  # A robot that sends no report for this time counts as gone.
-SHOWN_S: Final = 0.5  # Time between two lines of progress.
+SHOWN_S: Final = 0.5  # Time between two looks at the keyboard.
 # Time between two stops over the bus, and until the first: a datagram without an answer by then is behind a router.
 _REPEAT_S: Final = 0.15
 
@@ -62,27 +63,20 @@ class ProgressLine:
     """Shows reports: on a terminal one line that is rewritten, else a line for each new state."""
 
     def __init__(self) -> None:
-        self._rewrites = sys.stdout.isatty()
         self._last = ""
-        self._shown_s = -math.inf
 
     def __call__(self, report: NavigationReport) -> None:
         """Show a report."""
         words = f"{report.state}: {report.reason}" if report.reason else report.state
-        if self._rewrites:
-            if time.monotonic() - self._shown_s >= SHOWN_S or words != self._last:
-                left = f", {report.left_m:.2f} m left" if math.isfinite(report.left_m) else ""
-                sys.stdout.write(f"\r\x1b[K{words}{left}")
-                sys.stdout.flush()
-                self._shown_s = time.monotonic()
+        if sys.stdout.isatty():
+            HANDLER.show(f"{words}, {report.left_m:.2f} m left" if math.isfinite(report.left_m) else words)
         elif words != self._last:
             print(words, flush=True)
         self._last = words
 
     def end(self) -> None:
-        """End the line."""
-        if self._rewrites and self._last:
-            print()
+        """Remove the line."""
+        HANDLER.show("")
 
 
 def drive_to_end(robot: Robot, driver: Driver, ask: Callable[[], Answer]) -> int:
@@ -123,15 +117,15 @@ def record_until_enter(robot: Robot, name: str) -> int:
                 continue
             if report.teaching != name:
                 raise OmnidError(f"the recording of {name} has ended: {report.refusal or 'by another program'}")
-            if sys.stdout.isatty():
-                sys.stdout.write(f"\r\x1b[K{report.taught_m:.1f} m")
-                sys.stdout.flush()
+            HANDLER.show(f"{report.taught_m:.1f} m")
         sys.stdin.readline()
         granted(robot, driver.route("finish"))
     except KeyboardInterrupt:
         driver.route("stop")
-        print(f"\n{name} is dropped")
+        HANDLER.show("")
+        print(f"{name} is dropped")
         return 130
+    HANDLER.show("")
     print(f"{name} is written")
     return 0
 

@@ -19,8 +19,8 @@ from typing import Final
 from calib.typed_toml import parse_toml
 from omnid.client import CONNECT_S, Diagnostics, Driver, Robot
 from omnid.core.control.velocity_limits import VelocityLimits
+from omnid.engine.logging_setup import HANDLER
 from omnid.errors import OmnidError
-from omnid.plain_text import plain
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.codec import header_cdr
 from omnid.transport.status_names import WHEELS, Key
@@ -111,7 +111,7 @@ def teleoperate(bus: BusConfig) -> int:
                 _act(driver, stick, status)
         finally:
             driver.twist(0.0, 0.0)
-            print()
+            HANDLER.show("")
     return 0
 
 
@@ -159,8 +159,7 @@ def _act(driver: Driver, stick: Stick, status: str) -> None:
     if stick.commands(now_s):
         driver.twist(velocity_mps, yaw_rate_radps)
     line = f"{velocity_mps:+.2f} m/s {yaw_rate_radps:+.2f} rad/s  {100 * stick.share:.0f} %  {status}"
-    sys.stdout.write(f"\r\x1b[K{plain(line)[: os.get_terminal_size().columns - 1]}")
-    sys.stdout.flush()
+    HANDLER.show(line)
 
 
 def _status_line(report: Diagnostics) -> str:
