@@ -57,7 +57,8 @@ def run(args: argparse.Namespace) -> int:
       calibrate import camchain.yaml -o rig.toml
       calibrate import --equirectangular 3840x1920 --baseline 0.2 -o rig.toml
     """
-    check_outputs([("--output", args.output)], [("a file that is read", path) for path in _read_files(args)])
+    read = [path for path in (args.camchain, args.lower, args.upper, args.transform) if path]
+    check_outputs([("--output", args.output)], [("a file that is read", Path(path)) for path in read])
     rig = _imported(args)
     if args.height_m is not None:
         rig = rig.at_height(args.height_m)
@@ -88,12 +89,6 @@ def _must_lose_nothing(path: Path, rig: Rig) -> None:
             f"--output {path}: it states the {' and the '.join(lost)} of a calibrated rig, which the new one does not: "
             "choose another name, or --replace"
         )
-
-
-def _read_files(args: argparse.Namespace) -> list[Path]:
-    if args.camchain is not None:
-        return [args.camchain]
-    return [Path(path) for path in (args.lower, args.upper, args.transform) if path]
 
 
 def _imported(args: argparse.Namespace) -> Rig:

@@ -121,8 +121,7 @@ def _snapshot(args: argparse.Namespace) -> int:
     make_folder("--snapshot", args.snapshot)
     views: dict[str, CameraView] = {}
     for camera in SIDES:
-        frames = _of_device(args, camera) if args.log is None else _of_log(args, camera)
-        with closing(frames):
+        with closing(_frames(args, camera)) as frames:
             found = [gray(frame) for frame in islice(frames, IMAGES)]
         if not found:
             raise OmnidError(f"the {camera} camera gave no image: check its cable, and see `omnid doctor`")
@@ -136,28 +135,23 @@ def _snapshot(args: argparse.Namespace) -> int:
     return int(bool(problems))
 
 
-def _of_log(args: argparse.Namespace, camera: Camera) -> Generator[Frame, None, None]:
+def _frames(args: argparse.Namespace, camera: Camera) -> Generator[Frame, None, None]:
+    """Yield a camera's frames of a log, or of the device once its exposure has adapted, until it gives none in time."""
+    from drivers.cameras.v4l2_camera import V4l2Camera
     from drivers.logs.log_reader import LogReader
 
     config = settings_of(args)
-    with closing(
-        LogReader(args.log, args.lower, args.upper, bits=config.cameras.bits, rate_hz=config.log.rate_hz)
-    ) as reader:
-        yield from (frame for frame in reader.frames() if frame.camera == camera)
-
-
-def _of_device(args: argparse.Namespace, camera: Camera) -> Generator[Frame, None, None]:
-    """Yield frames once the exposure has adapted; they end when the camera gives none within the driver's time."""
-    from drivers.cameras.v4l2_camera import V4l2Camera
-
-    settings = settings_of(args).cameras.settings(camera)
+    if args.log is not None:
+        bits, rate_hz = config.cameras.bits, config.log.rate_hz
+        with closing(LogReader(args.log, args.lower, args.upper, bits=bits, rate_hz=rate_hz)) as reader:
+            yield from (frame for frame in reader.frames() if frame.camera == camera)
+        return
 
     def end_when_lost(_: int, __: str) -> None:
         if source.state.status == "lost":
             source.close()
 
-    source = V4l2Camera(settings, camera, on_event=end_when_lost)
-    with closing(source):
+    with closing(V4l2Camera(config.cameras.settings(camera), camera, on_event=end_when_lost)) as source:
         yield from islice(source.frames(), SETTLE, None)
 
 

@@ -106,8 +106,9 @@ def teleoperate(bus: BusConfig) -> int:
             while not stick.quit:
                 stick.press(read_keys(keys), pressed_s)
                 pressed_s = time.monotonic()
-                report = statuses.newest()
-                status = status if report is None else _status_line(report)
+                if (report := statuses.newest()) is not None:
+                    disarmed = report.value(WHEELS, Key.DISARMED_BY)
+                    status = f"press a: not armed, {disarmed}" if disarmed else "armed"
                 _act(driver, stick, status)
         finally:
             driver.twist(0.0, 0.0)
@@ -160,9 +161,3 @@ def _act(driver: Driver, stick: Stick, status: str) -> None:
         driver.twist(velocity_mps, yaw_rate_radps)
     line = f"{velocity_mps:+.2f} m/s {yaw_rate_radps:+.2f} rad/s  {100 * stick.share:.0f} %  {status}"
     HANDLER.show(line)
-
-
-def _status_line(report: Diagnostics) -> str:
-    """Return whether the robot is armed, or why it stops."""
-    disarmed = report.value(WHEELS, Key.DISARMED_BY)
-    return f"press a: not armed, {disarmed}" if disarmed else "armed"
