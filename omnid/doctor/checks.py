@@ -65,7 +65,7 @@ def summary(findings: Sequence[Finding]) -> str:
     return f"{errors} errors, {warnings} warnings, {len(findings) - errors - warnings} ok"
 
 
-def _applying(subject: str, cases: Sequence[Case], good: str = "") -> list[Finding]:
+def _applying(subject: str, *cases: Case, good: str = "") -> list[Finding]:
     """Return the findings of the cases that apply; where there are none that all is well, unless good is empty."""
     found = [Finding(level, subject, what, advice) for applies, level, what, advice in cases if applies]
     return found or ([Finding("ok", subject, good)] if good else [])
@@ -82,11 +82,11 @@ def cameras(wanted: Mapping[str, V4l2Settings], known: list[CaptureDevice], root
         subject, path = f"camera {name}", names[name]
         connect = "connect the camera; `omnid cameras` lists the cameras and the udev rule for this name"
         choose, device = "choose a device that `omnid cameras` lists", nodes.get(path.resolve())
-        missing: list[Case] = [
+        yield from _applying(
+            subject,
             (not path.exists(), "error", f"{settings.device} does not exist", connect),
             (path.exists() and device is None, "error", f"{settings.device} is no camera", choose),
-        ]
-        yield from _applying(subject, missing)
+        )
         if device is not None:
             yield from _camera(subject, settings, device, path, root)
     if len({path.resolve() for path in names.values()}) < len(names):
@@ -98,9 +98,8 @@ def cameras(wanted: Mapping[str, V4l2Settings], known: list[CaptureDevice], root
 def _camera(subject: str, settings: V4l2Settings, device: CaptureDevice, path: Path, root: Path) -> list[Finding]:
     """Return ok if a connected camera can be used as configured, else all reasons against it."""
     others, image, fault = holders(path, root), "in use, so that its image was not tried", device.problem
-    problems = access(subject, path)
-    cases: list[Case] = [(others, "warning", f"{settings.device} is open in {', '.join(others)}", "end that program")]
-    problems += _applying(subject, cases)
+    is_open = f"{settings.device} is open in {', '.join(others)}"
+    problems = access(subject, path) + _applying(subject, (others, "warning", is_open, "end that program"))
     if not fault and not problems:
         try:
             image = str(offered_image(settings) or image)
@@ -131,8 +130,8 @@ def motor(settings: MotorSettings, root: Path = Path("/")) -> list[Finding]:
     if not stat.S_ISCHR(path.stat().st_mode):
         return [*found, Finding("error", subject, f"{port} is no serial port", "set motor.port")]
     others, away = holders(path, root), "end that program; 90-omnid.rules keeps ModemManager away from the port"
-    used: list[Case] = [(others, "error", f"{port} is in use by {', '.join(others)}", away)]
-    problems = access(subject, path) + _applying(subject, used)
+    used = f"{port} is in use by {', '.join(others)}"
+    problems = access(subject, path) + _applying(subject, (others, "error", used, away))
     return found + (problems or [Finding("ok", subject, f"{settings.protocol} on {port}")])
 
 
@@ -143,21 +142,14 @@ def access(subject: str, device: Path) -> list[Finding]:
     with suppress(KeyError):  # a group without a name
         group = grp.getgrgid(found.st_gid).gr_name
     is_open_to_service = group in GROUPS or (found.st_mode & stat.S_IROTH and found.st_mode & stat.S_IWOTH)
-    cases: list[Case] = [
-        (
-            not is_open_to_service,
-            "warning",
-            f"{device} is of group {group}, the service is in {' and '.join(GROUPS)}",
-            'set GROUP="video" or GROUP="dialout" in its udev rule, see 90-omnid.rules',
-        ),
-        (
-            is_open_to_service and not os.access(device, os.R_OK | os.W_OK),
-            "error",
-            f"no permission for {device} of group {group}",
-            f"`sudo usermod -aG {group} $USER`, then log in again",
-        ),
-    ]
-    return _applying(subject, cases)
+    closed = f"{device} is of group {group}, the service is in {' and '.join(GROUPS)}"
+    rule = 'set GROUP="video" or GROUP="dialout" in its udev rule, see 90-omnid.rules'
+    denied, join = (
+        f"no permission for {device} of group {group}",
+        f"`sudo usermod -aG {group} $USER`, then log in again",
+    )
+    is_denied = is_open_to_service and not os.access(device, os.R_OK | os.W_OK)
+    return _applying(subject, (not is_open_to_service, "warning", closed, rule), (is_denied, "error", denied, join))
 
 
 def holders(device: Path, root: Path = Path("/")) -> list[str]:
@@ -183,11 +175,11 @@ def rights(priority: int, lock_memory: bool) -> list[Finding]:
     highest, locks = highest_priority(), may_lock()
     refused = f"priority {priority} is not allowed, this user may have {highest}; the unit sets LimitRTPRIO"
     unlocked = "this user may not lock memory; the unit sets LimitMEMLOCK"
-    time: list[Case] = [(priority > highest, "warning", refused, priority_advice(priority))]
-    memory: list[Case] = [(lock_memory and not locks, "warning", unlocked, LOCK_ADVICE)]
+    time: Case = priority > highest, "warning", refused, priority_advice(priority)
+    memory: Case = lock_memory and not locks, "warning", unlocked, LOCK_ADVICE
     return [
-        *_applying("real time", time, f"priorities up to {highest} are allowed"),
-        *_applying("memory", memory, "may be locked" if locks else "not locked: realtime.lock_memory = false"),
+        *_applying("real time", time, good=f"priorities up to {highest} are allowed"),
+        *_applying("memory", memory, good="may be locked" if locks else "not locked: realtime.lock_memory = false"),
     ]
 
 
@@ -203,18 +195,13 @@ def disk(folder: Path, config: RecordConfig, bytes_per_s: float) -> list[Finding
         f"{bytes_per_s / 1e6:.0f} MB/s (record.keep_mb, cameras.rate_hz)"
     )
     full = f"{where}: nothing is recorded below record.free_mb = {config.free_mb}"
-    space: list[Case] = [
-        (is_full, "error" if config.enabled else "warning", full, "delete files, or change record.folder")
+    level: Level = "error" if config.enabled else "warning"
+    elsewhere = f"the service may write in {STATE} only, record.folder is {folder}"
+    allow = f"`systemctl edit omnid`: [Service], ReadWritePaths={folder}"
+    return [
+        *_applying("disk", (is_full, level, full, "delete files, or change record.folder"), good=kept),
+        *_applying("disk", (not folder.is_relative_to(STATE), "warning", elsewhere, allow)),
     ]
-    place_of: list[Case] = [
-        (
-            not folder.is_relative_to(STATE),
-            "warning",
-            f"the service may write in {STATE} only, record.folder is {folder}",
-            f"`systemctl edit omnid`: [Service], ReadWritePaths={folder}",
-        )
-    ]
-    return _applying("disk", space, kept) + _applying("disk", place_of)
 
 
 def compiled_functions() -> list[Finding]:
@@ -222,12 +209,12 @@ def compiled_functions() -> list[Finding]:
     problem, folder = why_no_code(), cache_folder()
     reason = "" if problem else why_unusable(folder)
     lost = f"cannot be kept in {folder}: {reason}: every start takes half a minute longer"
-    cases: list[Case] = [
+    return _applying(
+        "compiled code",
         (problem, "error", problem, "remove MemoryDenyWriteExecute= from the unit, or what else denies it"),
         (reason, "warning", lost, "make that folder writable, or set OMNID_CACHE_DIR to another one"),
-    ]
-    good = f"kept in {folder}; the first start compiles it, which takes half a minute"
-    return _applying("compiled code", cases, good)
+        good=f"kept in {folder}; the first start compiles it, which takes half a minute",
+    )
 
 
 def rig(path: Path, size_px: tuple[int, int], floor_m: float = 0.0) -> list[Finding]:
@@ -244,14 +231,12 @@ def rig(path: Path, size_px: tuple[int, int], floor_m: float = 0.0) -> list[Find
     sizes = {name: "x".join(map(str, mounted.camera.size)) for name, mounted in cameras.items()}
     wanted = "x".join(map(str, size_px))
     bare = [name for name, mounted in cameras.items() if mounted.mask is None]
-    cases: list[Case] = [
+    calibrated = f"{path}: the {{}} camera was calibrated with {{}} px, [cameras] asks for {wanted}"
+    height = "" if height_m is None else f", {height_m:.3f} m above the floor"
+    return _applying(
+        "rig",
         *(
-            (
-                size != wanted,
-                "error",
-                f"{path}: the {name} camera was calibrated with {size} px, [cameras] asks for {wanted}",
-                "set cameras.width_px and height_px",
-            )
+            (size != wanted, "error", calibrated.format(name, size), "set cameras.width_px and height_px")
             for name, size in sizes.items()
         ),
         (
@@ -266,9 +251,8 @@ def rig(path: Path, size_px: tuple[int, int], floor_m: float = 0.0) -> list[Find
             f"{path} has no mask for {' and '.join(bare)}, the rim is searched at each start",
             f"add [{'.mask] and ['.join(bare)}.mask] with center, inner_px and outer_px",
         ),
-    ]
-    height = "" if height_m is None else f", {height_m:.3f} m above the floor"
-    return _applying("rig", cases, f"{path}, {found.baseline_m:.3f} m between the viewpoints{height}")
+        good=f"{path}, {found.baseline_m:.3f} m between the viewpoints{height}",
+    )
 
 
 def bus(config: BusConfig) -> Finding:
