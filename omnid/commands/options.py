@@ -44,9 +44,7 @@ if TYPE_CHECKING:  # the help and other commands do not load these
     from drivers.logs.log_reader import LogCameras
     from omnid.config import Config
 
-PROFILES: Final = {
-    "small": ("panorama.scale=0.5", "odometry.limits.features=250"),
-}
+PROFILES: Final = {"small": ("panorama.scale=0.5", "odometry.limits.features=250")}
 _DECLARED: Final = re.compile(
     r"(?P<names>-\S+(?:, --\S+)*|[a-z]+)(?: (?!\[[a-z_]+\.)(?P<value>[\[\dA-Za-z]\S*))?"
     r"(?: (?P<low>[\d.e-]*?)\.\.(?P<high>[\d.e]*))?(?: \[(?P<setting>[a-z_]+\.[a-z_.]+)\])?  +(?P<help>.+)"

@@ -227,11 +227,7 @@ PARTS: Final[Mapping[str, Part]] = {
         (
             (ERROR, lambda s: s["_warning"] and s[Key.STATE] in ("exchanged", "broken"), "{_warning}"),
             (WARN, "_warning", "{_warning}"),
-            (
-                OK,
-                lambda s: s[Key.STATE] == "unchecked",
-                "not checked yet: the robot must drive past different places",
-            ),
+            (OK, lambda s: s[Key.STATE] == "unchecked", "not checked yet: the robot must drive past different places"),
             (OK, lambda s: s[Key.STATE] == "fits", "fits"),
             (
                 WARN,

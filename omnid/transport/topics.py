@@ -78,11 +78,7 @@ REQUEST_TOPICS: Final = frozenset((ARM, *NAVIGATION_TOPICS, MAP))  # that have a
 WHEEL_ODOM: Final = "cmd/wheel_odom"
 IMU: Final = "cmd/imu"
 JOINT_STATES: Final = "cmd/joint_states"
-SENSOR_TOPICS: Final = {
-    WHEEL_ODOM: codec.ODOMETRY_SCHEMA,
-    IMU: codec.IMU_SCHEMA,
-    JOINT_STATES: codec.JOINT_SCHEMA,
-}
+SENSOR_TOPICS: Final = {WHEEL_ODOM: codec.ODOMETRY_SCHEMA, IMU: codec.IMU_SCHEMA, JOINT_STATES: codec.JOINT_SCHEMA}
 TWIST: Final = "twist"
 HEADING: Final = "heading"
 _SETPOINTS: Final = {TWIST: codec.TWIST_SCHEMA, HEADING: codec.VECTOR_SCHEMA}

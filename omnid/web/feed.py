@@ -27,15 +27,7 @@ from omnid.monitor.robot_state import ReceivedMessage, RobotState
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.codec import Diagnostics, Panorama, PlanarPath, Pose, PoseInMap
 from omnid.transport.topics import MAP_POSE, PANORAMA, SCAN
-from omnid.web.snapshot import (
-    PATH_FRAME,
-    map_cells,
-    map_in_odom,
-    navigation_news,
-    parts_news,
-    scan_news,
-    state_news,
-)
+from omnid.web.snapshot import PATH_FRAME, map_cells, map_in_odom, navigation_news, parts_news, scan_news, state_news
 
 PERIOD_S: Final = 0.03  # least time between two answers to a browser
 QUIET_S: Final = 0.5  # The state is sent after this time even without a message of the robot; between two connections

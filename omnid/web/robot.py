@@ -67,8 +67,7 @@ class RobotPage:
             _command_route("/goal", self.goal),
             _command_route("/route", lambda asked: self._asked_in_words("route", asked, route_request, Driver.route)),
             _command_route(
-                "/navigation",
-                lambda asked: self._asked_in_words("navigation", asked, navigation_verb, Driver.navigate),
+                "/navigation", lambda asked: self._asked_in_words("navigation", asked, navigation_verb, Driver.navigate)
             ),
             _command_route("/map", lambda _: self._asked("map", Driver.save_map)),
         ]

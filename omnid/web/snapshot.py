@@ -143,10 +143,7 @@ def scan_news(scan: Scan, poses: Iterable[Pose]) -> dict[str, Any]:
     nearest, angles = int(ranges_m.argmin()), azimuths_rad + place.yaw_rad
     points = np.column_stack([place.x_m + ranges_m * np.cos(angles), place.y_m + ranges_m * np.sin(angles)])
     turn_deg = math.degrees(math.remainder(float(azimuths_rad[nearest]), 2 * math.pi))
-    found: dict[str, Any] = {
-        "points": points.round(3).tolist(),
-        "nearest": [float(ranges_m[nearest]), turn_deg],
-    }
+    found: dict[str, Any] = {"points": points.round(3).tolist(), "nearest": [float(ranges_m[nearest]), turn_deg]}
     return dict(browsable(found))
 
 

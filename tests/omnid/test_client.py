@@ -20,9 +20,7 @@ from omnid.client import Answer, Driver, Robot, subscribe
 from omnid.errors import OmnidError
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.codec import (
-    PoseAttachment,
-)
+from omnid.transport.codec import PoseAttachment
 from omnid.transport.commands import Freshness
 from omnid.transport.topics import Request
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, script

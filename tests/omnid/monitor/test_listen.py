@@ -110,11 +110,7 @@ def test_a_wrong_name_is_answered_by_those_of_the_robots_there() -> None:
 
 @pytest.mark.parametrize(
     ("words", "expected"),
-    [
-        (("--seconds", "-1"), "--seconds"),
-        (("--connect", "nonsense"), "bus.connect"),
-        (("--robot", "a b"), "bus.robot"),
-    ],
+    [(("--seconds", "-1"), "--seconds"), (("--connect", "nonsense"), "bus.connect"), (("--robot", "a b"), "bus.robot")],
 )
 def test_refuses_invalid_options(words: tuple[str, ...], expected: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert expected in Command(capsys).refused("listen", *words)
@@ -150,10 +146,7 @@ class Terminal(io.StringIO):
 
 def test_the_table_holds_no_control_characters_of_messages() -> None:
     state = received(1, 2)
-    evil = [
-        DiagnosticStatus(WHEELS, 2, "\x1b[2J\nhello", {"sent": "4"}),
-        DiagnosticStatus(BUS, 0, "", {}),
-    ]
+    evil = [DiagnosticStatus(WHEELS, 2, "\x1b[2J\nhello", {"sent": "4"}), DiagnosticStatus(BUS, 0, "", {})]
     state.process(ReceivedMessage(time.time_ns(), "status", codec.diagnostics_cdr(1, evil), b"", 0))
     terminal = Terminal()
     print_state("omnid", state, terminal)

@@ -19,10 +19,7 @@ from omnid.core.control.arming import OLDER_THAN_STOP, ArmRequest
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.contacts import BUMPER, CLIFF
 from omnid.core.control.heading_controller import Setpoint
-from omnid.core.navigation.requests import (
-    GoalRequest,
-    NavigationCommand,
-)
+from omnid.core.navigation.requests import GoalRequest, NavigationCommand
 from omnid.engine.robot_clock import RobotClock
 from omnid.errors import OmnidError
 from omnid.transport import codec

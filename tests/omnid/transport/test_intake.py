@@ -155,11 +155,7 @@ def test_nothing_else_stops_and_no_answer_is_longer_than_its_request() -> None:
 
 @pytest.mark.parametrize(
     ("asked", "proof"),
-    [
-        ("", False),
-        ("auth: {usrpwd: {dictionary_file: 'users'}}", True),
-        ("link: {tls: {enable_mtls: true}}", True),
-    ],
+    [("", False), ("auth: {usrpwd: {dictionary_file: 'users'}}", True), ("link: {tls: {enable_mtls: true}}", True)],
 )
 def test_beyond_this_machine_only_without_users_and_certificates(tmp_path: Path, asked: str, proof: bool) -> None:
     port = int(free_endpoint().rpartition(":")[2])

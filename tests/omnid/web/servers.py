@@ -121,10 +121,7 @@ class Shown:
         self.newest |= news
 
     def until(
-        self,
-        kind: str,
-        action: Callable[[], object] = lambda: None,
-        holds: Callable[[Any], object] = lambda _: True,
+        self, kind: str, action: Callable[[], object] = lambda: None, holds: Callable[[Any], object] = lambda _: True
     ) -> Any:
         """Repeat an action and take news until those of a kind are there for which a condition holds; return them."""
         end_s = time.monotonic() + PATIENCE_S
