@@ -27,7 +27,7 @@ from omnid.monitor.robot_state import ReceivedMessage, RobotState
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.codec import Diagnostics, Panorama, PlanarPath, Pose, PoseInMap
 from omnid.transport.topics import MAP_POSE, PANORAMA, SCAN
-from omnid.web.snapshot import PATH_FRAME, map_cells, map_in_odom, navigation_news, parts_news, scan_news, state_news
+from omnid.web import snapshot
 
 PERIOD_S: Final = 0.03  # least time between two answers to a browser
 QUIET_S: Final = 0.5  # The state is sent after this time even without a message of the robot; between two connections
@@ -66,9 +66,7 @@ class LivePath:
         begin = bisect(vertices, seen, key=lambda point: point.version) if seen >= self._since else 0
         if seen >= self._since and begin == len(vertices):
             return None
-        points = [
-            [round(point.x_m, 3), round(point.y_m, 3), *([1] if point.after_gap else [])] for point in vertices[begin:]
-        ]
+        points = [[point.x_m, point.y_m, *([1] if point.after_gap else [])] for point in vertices[begin:]]
         return {"from": begin, "points": points}
 
 
@@ -89,7 +87,7 @@ class RobotFeed:
         self._changed = asyncio.Condition()
         self._wanted_until_s = -math.inf  # the panorama
         self._poses: deque[Pose] = deque(maxlen=MOST_POSES)
-        self._map_in_odom: list[float | None] | None = None
+        self._map_in_odom: list[float] | None = None
         self._large: dict[str, ReceivedMessage] = {}  # newest map, panorama ... that are not processed yet
         self._wake, self._large_wake = asyncio.Event(), asyncio.Event()
 
@@ -101,10 +99,11 @@ class RobotFeed:
             "panorama_comes": "panorama" in self._news,
             "map_in_odom": self._map_in_odom,
         }
-        found = {"seen": self.version, "state": state_news(self.bus.robot, self.state, self.link, extra)}
+        found = {"seen": self.version, "state": snapshot.state_news(self.bus.robot, self.state, self.link, extra)}
         if (path := self.path.news(seen)) is not None:
             found["path"] = path
-        return found | {kind: content for kind, (version, content) in self._news.items() if version > seen}
+        found |= {kind: content for kind, (version, content) in self._news.items() if version > seen}
+        return dict(snapshot.browsable(found))
 
     async def live(self, request: Request) -> Response:
         """Answer a browser as soon as there are news: `seen` is the version of its last, `panorama` 1 asks for it."""
@@ -204,14 +203,14 @@ class RobotFeed:
                     self._add_to_path(pose, before)
                     before = pose
                 case PoseInMap() as in_map:
-                    self._map_in_odom = map_in_odom(in_map, self._poses) or self._map_in_odom
+                    self._map_in_odom = snapshot.map_in_odom(in_map, self._poses) or self._map_in_odom
                 case Diagnostics():
-                    self._set("parts", parts_news(self.state))
-                case PlanarPath(frame=frame, xy=xy) if frame == PATH_FRAME:
+                    self._set("parts", snapshot.parts_news(self.state))
+                case PlanarPath(frame=frame, xy=xy) if frame == snapshot.PATH_FRAME:
                     for x_m, y_m in xy.tolist():
                         self.path.add(x_m, y_m, self.version + 1)
         if self.state.forget_ended():
-            self._set("parts", parts_news(self.state))
+            self._set("parts", snapshot.parts_news(self.state))
 
     def _add_to_path(self, pose: Pose, before: Pose | None) -> None:
         """Add a pose; another run has another odom."""
@@ -221,9 +220,9 @@ class RobotFeed:
             self._map_in_odom = None
             self._images.clear()
             nothing = {
-                "map": {"frame": PATH_FRAME, "width": 0},
+                "map": {"frame": snapshot.PATH_FRAME, "width": 0},
                 SCAN: {"points": [], "nearest": None},
-                NAVIGATION: navigation_news(NavigationReport()),
+                NAVIGATION: snapshot.navigation_news(NavigationReport()),
                 PANORAMA: 0,
             }
             for kind in nothing.keys() & self._news.keys():
@@ -246,11 +245,11 @@ class RobotFeed:
         """Take a scan, a report of the navigation, a map or a panorama."""
         match await asyncio.to_thread(self.state.process, message):
             case Scan() as scan:
-                self._set(SCAN, scan_news(scan, self._poses))
+                self._set(SCAN, snapshot.scan_news(scan, self._poses))
             case NavigationReport() as report:
-                self._set(NAVIGATION, navigation_news(report))
+                self._set(NAVIGATION, snapshot.navigation_news(report))
             case Map() as grid:
-                header, self._images["map"] = await asyncio.to_thread(map_cells, grid)
+                header, self._images["map"] = await asyncio.to_thread(snapshot.map_cells, grid)
                 self._set("map", {**header, "version": self.version + 1})
             case Panorama(data=data):
                 self._images[PANORAMA] = data

@@ -1,4 +1,4 @@
-"""The state of the robot as browsers are told it. Text from the network is shortened, without control characters."""
+"""The state of the robot as browsers are told it; `browsable` makes it fit to be sent."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def state_news(robot: str, state: RobotState, link: str, extra: Mapping[str, Any
     link: why there is no connection to the robot; empty with one. extra: further entries.
     """
     quantiles = (0.5, 0.99)
-    found = {
+    return {
         "robot": robot,
         "link": link,
         "alive": state.alive,
@@ -58,12 +58,13 @@ def state_news(robot: str, state: RobotState, link: str, extra: Mapping[str, Any
         "in_map": None if PLACES not in state.statuses else state.statuses[PLACES].message,
         "pace": state.real_time_factor,
         "warnings": _warnings(state, link),
+        "server_ms": server_ms(),
+        **extra,
     }
-    return {**browsable(found), "server_ms": server_ms(), **extra}
 
 
 def browsable(value: Any) -> Any:
-    """Return a value as browsers are sent it: text is plain, a number has 6 digits, None stands for what JSON lacks."""
+    """Return a value as browsers are sent it: text is plain, a number has 6 digits, None is what JSON lacks."""
     match value:
         case dict():
             return {key: browsable(inner) for key, inner in value.items()}
@@ -76,26 +77,24 @@ def browsable(value: Any) -> Any:
     return value
 
 
-def map_in_odom(in_map: PoseInMap, poses: Iterable[Pose]) -> list[float | None] | None:
+def map_in_odom(in_map: PoseInMap, poses: Iterable[Pose]) -> list[float] | None:
     """Return where the map's origin lies in odom, x, y [m] and yaw [rad]; None without a pose in odom at its time."""
     pose = next((one for one in poses if one.stamp_ns == in_map.stamp_ns), None)
     if pose is None:
         return None
     T_odom_map = pose.T_odom_base @ se3.inverse(in_map.T_map_base)
-    found: list[float | None] = browsable([*T_odom_map[:2, -1].tolist(), float(se3.yaw(T_odom_map))])
-    return found
+    return [*T_odom_map[:2, -1].tolist(), float(se3.yaw(T_odom_map))]
 
 
 def parts_news(state: RobotState) -> list[dict[str, Any]]:
     """Return all status entries, the worst first, stages last."""
     return [
         {
-            "name": plain(short_name(part.name)),
+            "name": short_name(part.name),
             "level": part.level % len(LEVELS),
-            "message": plain(part.message),
+            "message": part.message,
             "values": [
-                [plain(key, LONGEST_VALUE), plain(value, LONGEST_VALUE)]
-                for key, value in islice(part.values.items(), MOST_ENTRIES)
+                [key[:LONGEST_VALUE], value[:LONGEST_VALUE]] for key, value in islice(part.values.items(), MOST_ENTRIES)
             ],
         }
         for part in sorted(state.statuses.values(), key=importance)
@@ -109,7 +108,7 @@ def map_cells(grid: Map) -> tuple[dict[str, Any], bytes]:
     place in odom is part of the state.
     """
     if not all(map(math.isfinite, (grid.cell_m, *grid.corner))) or not grid.cells.size or grid.frame not in FRAMES:
-        return {"width": 0, "frame": plain(grid.frame)}, b""
+        return {"width": 0, "frame": grid.frame}, b""
     step = -(-max(grid.cells.shape) // LARGEST_MAP_PX)
     cells = _reduced(np.where(grid.cells > 50, 2, np.where(grid.cells >= 0, 1, 0)).astype(np.uint8), step)
     header = {
@@ -143,14 +142,13 @@ def scan_news(scan: Scan, poses: Iterable[Pose]) -> dict[str, Any]:
     nearest, angles = int(ranges_m.argmin()), azimuths_rad + place.yaw_rad
     points = np.column_stack([place.x_m + ranges_m * np.cos(angles), place.y_m + ranges_m * np.sin(angles)])
     turn_deg = math.degrees(math.remainder(float(azimuths_rad[nearest]), 2 * math.pi))
-    found: dict[str, Any] = {"points": points.round(3).tolist(), "nearest": [float(ranges_m[nearest]), turn_deg]}
-    return dict(browsable(found))
+    return {"points": points.tolist(), "nearest": [float(ranges_m[nearest]), turn_deg]}
 
 
 def navigation_news(report: NavigationReport) -> dict[str, Any]:
     """Return what is driven or taught, and what became of the newest request."""
     names = ("state", "reason", "task", "left_m", "teaching", "taught_m", "refusal")
-    return {name: browsable(getattr(report, name)) for name in names}
+    return {name: getattr(report, name) for name in names}
 
 
 def _reduced(cells: np.ndarray[Any, np.dtype[np.uint8]], step: int) -> np.ndarray[Any, np.dtype[np.uint8]]:
