@@ -396,12 +396,10 @@ def _subscribe(
         navigate = received.receive if PLANNER in sources else lambda _: without_planner
         table = dict.fromkeys(topics.NAVIGATION_TOPICS, navigate)
         stats |= {names.WHEELS: partial(wheel_stats, controller.statistics, drive), names.REQUESTS: received.stats}
+    table |= dict.fromkeys(topics.SENSOR_TOPICS, samples.receive)
     table[topics.MAP] = run_places.receive if run_places.requests else lambda _: Answer(False, NO_MAP_FILE)
 
     def receive(request: Request) -> None:
-        if request.topic in topics.SENSOR_TOPICS:
-            samples.receive(request)
-            return
         answer = table.get(request.topic, commands)(request)
         if answer is not None:
             bus.answer(request.id, answer)
