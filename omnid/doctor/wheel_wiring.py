@@ -20,7 +20,7 @@ from omnid.controller.motor_settings import DriveSettings, MotorSettings
 from omnid.errors import OmnidError
 
 MOVE_S, REST_S = 1.0, 0.3  # duration of a motion in each direction, and of the rest after it
-ANSWER_S: Final = 1.0  # A stop is repeated for this time: a busy computer delays answers by parts of it.
+ANSWER_S: Final = MOVE_S  # A stop is repeated for this time: a busy computer delays answers by parts of it.
 LEAST_COMMANDS: Final = 2  # Commands of a motion: the driver may send a stop in place of the first one.
 RIGHT_SCALE: Final = 0.03  # difference of the number of turns that is not corrected
 

@@ -26,6 +26,7 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from calib import se3
+from omnid.core.nanoseconds import NS_PER_S
 from omnid.errors import OmnidError
 
 if TYPE_CHECKING:
@@ -55,7 +56,6 @@ STRING_SCHEMA = "std_msgs/msg/String"
 SCAN_SCHEMA = "sensor_msgs/msg/LaserScan"
 IMAGE_SCHEMA = "sensor_msgs/msg/CompressedImage"
 OK, WARN, ERROR, STALE = range(4)  # levels of diagnostic_msgs/msg/DiagnosticStatus
-NS_PER_S = 1_000_000_000
 # A quaternion whose norm differs from 1 by more than this is refused: more than rounding to float32 or to six decimals
 # makes, and less than a quaternion of zeros or one that was scaled.
 QUATERNION_TOLERANCE = 1e-3
@@ -350,7 +350,6 @@ def decode_diagnostics(payload: bytes, _: bytes = b"") -> Diagnostics:
 
 # Maps and obstacles.
 
-POINT_FIELD_FLOAT32: Final = 7  # the constant FLOAT32 of sensor_msgs/msg/PointField
 CLOUD_FIELDS = ("x", "y", "z", "confidence")
 # m, m/s; sigma and sigma_v: of position and velocity along the axis in which they are largest.
 MOVING_FIELDS: Final = ("x", "y", "z", "vx", "vy", "radius", "sigma", "sigma_v")
@@ -392,7 +391,8 @@ def moving_cdr(stamp_ns: int, frame: str, moving: Sequence[MovingObstacle]) -> b
 def _cloud_cdr(stamp_ns: int, frame: str, names: Sequence[str], rows: Floats) -> bytes:
     """Encode a PointCloud2 of rows (N, F), little-endian float32, whose F fields have these names."""
     number, step = np.dtype("<f4").itemsize, np.dtype("<f4").itemsize * len(names)
-    fields = [(name, number * i, POINT_FIELD_FLOAT32, 1) for i, name in enumerate(names)]
+    point_field: Any = _typestore().types["sensor_msgs/msg/PointField"]
+    fields = [(name, number * i, point_field.FLOAT32, 1) for i, name in enumerate(names)]
     data, is_dense = rows.reshape(-1).view(np.uint8), bool(np.isfinite(rows).all())
     head = header(stamp_ns, frame)
     return encoded(POINT_CLOUD_SCHEMA, head, 1, len(rows), fields, False, step, step * len(rows), data, is_dense)
@@ -488,7 +488,6 @@ def decode_scan(payload: bytes, _: bytes = b"") -> Scan:
 # Commands and requests.
 
 ASIDE_NAMES: Final = ("linear.y", "linear.z", "angular.x", "angular.y")
-MAX_PATH_POSES: Final = 10_000
 _PLAIN_TWIST_BYTES: Final = calcsize("<4x6d")  # encapsulation header, two vectors
 
 
@@ -594,10 +593,10 @@ def path_cdr(stamp_ns: int, frame: str, xy: ArrayLike, heading_rad: float | None
 
 
 def path_from_cdr(payload: bytes, _: bytes = b"") -> PlanarPath:
-    """Decode a path of 1 to MAX_PATH_POSES poses that are finite; the last one is not tilted."""
+    """Decode a path of poses that are finite; the last one is not tilted."""
     message = decoded(payload, PATH_SCHEMA)
-    if not 1 <= len(message.poses) <= MAX_PATH_POSES:
-        raise OmnidError(f"a path of {len(message.poses)} poses: expected 1 to {MAX_PATH_POSES}")
+    if not message.poses:
+        raise OmnidError("a path without poses: expected one or more")
     return _planar_path(message, message.poses)
 
 
