@@ -180,8 +180,8 @@ def _model(values: Table, warn: Warn) -> OmniCamera:
         return camera_of_lists(("pinhole", model), [K[0], K[4], K[2], K[5]], terms, _size(values), warn)
     # 3. The lists of Kalibr and EuRoC.
     names = str(_value(values, "camera_model") or ""), str(_value(values, "distortion_model") or "")
-    lists = (_numbers(values, keys).tolist() for keys in (("intrinsics",), TERMS))
-    return camera_of_lists(names, *lists, _size(values), warn)
+    intrinsics, terms = _numbers(values, ("intrinsics",)).tolist(), _numbers(values, TERMS).tolist()
+    return camera_of_lists(names, intrinsics, terms, _size(values), warn)
 
 
 # 2. Chains of cameras.

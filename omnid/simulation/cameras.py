@@ -8,7 +8,6 @@ from calib.models.camera import Array
 from calib.rig import Rig
 from drivers.frame import CAMERAS, Camera, Frame
 from omnid.simulation.people import Walkers
-from omnid.simulation.rendering.mirrors import Mirror
 from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.sensor import Floats, MountedSensor, Sensor
 from omnid.simulation.rendering.surfaces import Scene
@@ -26,7 +25,6 @@ class SimulatedCameras:
             name: MountedSensor.of(sensor, mounted.visible, mounted.camera.size)
             for name, mounted in self.mounted.items()
         }
-        self.mirrors = {name: Mirror(mounted) for name, mounted in self.mounted.items()}
 
     def frame(self, camera: Camera, seq: int, stamp_ns: int, T_world_rig: Array, people: Walkers) -> Frame:
         """Return the frame of a camera on a rig at T_world_rig (4, 4)."""
@@ -42,7 +40,4 @@ class SimulatedCameras:
     def ideal(self, camera: Camera, T_world_rig: Array, people: Walkers) -> Floats:
         """Return the image (H, W) without the errors of a sensor."""
         scene = Scene((*self.world.standing, *people.faces()))
-        ideal = render_grey(scene, self.mounted[camera], T_world_rig, self.samples)
-        if self.world.is_polished:
-            ideal = self.mirrors[camera].reflected(ideal, scene, scene.named("floor"), T_world_rig, self.samples)
-        return ideal
+        return render_grey(scene, self.mounted[camera], T_world_rig, self.samples)

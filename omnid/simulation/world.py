@@ -29,7 +29,6 @@ class World:
     people: tuple[Person, ...] = ()
     start: Pose = (0.0, 0.0, 0.0)
     brightness: float = 1.0  # factor on the grey of all images
-    is_polished: bool = False  # the floor mirrors the objects on it
 
     def T_world_base(self, pose: Pose) -> Array:
         """Return the pose (4, 4) of a base that stands there; x, y and heading are those of its middle."""

@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from itertools import pairwise
-from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, ClassVar, Final, Literal, TypeAlias
 
 import numpy as np
 from msgspec import Meta, Struct
@@ -106,7 +106,7 @@ class Space(Struct, frozen=True):
     ceiling_m: Annotated[float, Meta(ge=1.5, le=20.0)] = CEILING_M
     floor: Painted = "tiles"
     ceiling: Painted = "tiles"
-    finish: Literal["matt", "polished"] = "matt"
+    REMOVED: ClassVar[dict[str, str]] = {"finish": "floors are matt"}
 
     @property
     def sides_m(self) -> Point:
@@ -199,8 +199,7 @@ def _painted_world(world: WorldTable, name: str, seed: int, options: WorldOption
         surfaces = _exchanged(surfaces, options)
     start = x_m, y_m, math.radians(heading_deg)
     people = people if options.people else ()
-    brightness, is_polished = options.brightness * world.light, space.finish == "polished"
-    return World(name, tuple(surfaces), people, start, brightness, is_polished)
+    return World(name, tuple(surfaces), people, start, options.brightness * world.light)
 
 
 def _errors(world: WorldTable) -> Iterator[str]:

@@ -16,8 +16,9 @@ from numpy.typing import ArrayLike
 
 from calib.models.camera import Array
 from omnid.simulation.rendering import textures
-from omnid.simulation.rendering.shapes import CEILING_M, Paint, Point, Random, painted, solid
+from omnid.simulation.rendering.shapes import CEILING_M, Paint, Point, Random, pixels_of, solid
 from omnid.simulation.rendering.surfaces import Rectangle, Texture
+from tests.simulation.floor_textures import FLOOR_PAINTERS
 
 Point3 = tuple[float, float, float]
 # A box of a thing: the middle of its bottom, x, y, z, from the middle of the thing, then its sides along them [m].
@@ -82,7 +83,8 @@ class Builder:
         """Add a floor between two corners, of two heights at its ends along x."""
         (x0, y0), (x1, y1) = low, high
         px_per_m = min(THING_PX_PER_M, math.sqrt(MOST_FLOOR_PX / ((x1 - x0) * (y1 - y0))))
-        texture = painted(self.rng, kind or self.floor_kind, (x1 - x0, y1 - y0), px_per_m)
+        pixels = pixels_of((x1 - x0, y1 - y0), px_per_m)
+        texture = FLOOR_PAINTERS[kind or self.floor_kind](self.rng, pixels, px_per_m)
         texture = _lit(texture, self._falloff((x1 - x0, y1 - y0), edge_m=0.12))
         along = np.array([x1 - x0, 0.0, heights_m[1] - heights_m[0]])
         self.faces.append(

@@ -20,12 +20,12 @@ from omnid.simulation import lockstep
 from omnid.simulation.cameras import SimulatedCameras
 from omnid.simulation.lockstep import Drive, Reports, SimulatedRun, Takes
 from omnid.simulation.people import Walkers
-from omnid.simulation.rendering.mirrors import seen_part
 from omnid.simulation.rendering.sensor import Floats
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
 from omnid.simulation.robot import SimulatedRobot
 from omnid.simulation.vehicle import Vehicle
 from omnid.simulation.world import World, footprints
+from tests.simulation.reflections import Mirror, seen_part
 
 HALF_BASE_M: Final = 0.15  # from the middle of the base to where its wheels and castors touch the floor
 WHEEL_M: Final = 0.05  # A wheel rounds off the heights within this distance.
@@ -74,6 +74,7 @@ class BuildingWorld(World):
     """A world whose floor is at z = 0 where the ground does not say otherwise."""
 
     ground: Ground = Ground()
+    is_polished: bool = False  # the floor mirrors the objects on it
     edges: Array = field(default_factory=lambda: np.zeros((0, 2, 2)))  # [m] where the floor falls
     panes: tuple[Rectangle, ...] = ()  # of glass: seen by what they mirror, and touched
     sun: tuple[SunPatch, ...] = ()
@@ -121,13 +122,18 @@ class BuildingCameras(SimulatedCameras):
 
     is_dark = False
 
+    @cached_property
+    def mirrors(self) -> dict[str, Mirror]:
+        """What each camera sees in mirrors."""
+        return {name: Mirror(mounted) for name, mounted in self.mounted.items()}
+
     def ideal(self, camera: Camera, T_world_rig: Array, people: Walkers) -> Floats:
         """Return the image (H, W) without the errors of a sensor."""
         ideal, world = super().ideal(camera, T_world_rig, people), self.world
         if isinstance(world, BuildingWorld):
             scene = Scene((*world.standing, *people.faces()))
-            for pane in world.panes:
-                ideal = self.mirrors[camera].reflected(ideal, scene, pane, T_world_rig, self.samples)
+            for mirror in (*[scene.named("floor")][: world.is_polished], *world.panes):
+                ideal = self.mirrors[camera].reflected(ideal, scene, mirror, T_world_rig, self.samples)
             for patch in world.sun:
                 lit = patch.rectangle(people.time_s)
                 shown = seen_part(lit, scene.rectangles, self.mounted[camera], T_world_rig, self.samples)

@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 
 from calib.models.camera import Array
-from omnid.simulation.rendering.mirrors import BLACK, WHITE
 from omnid.simulation.rendering.sensor import Floats
 from omnid.simulation.rendering.surfaces import LIGHT, Rectangle, Scene, Texture
 from tests.simulation.disturbances import Disturbance
+from tests.simulation.reflections import BLACK, WHITE
 
 GLOSS: Final = 0.25  # share of the light that a floor reflects like a mirror
 GLASS: Final = 0.12  # share that a pane of glass reflects at 55 degrees (Fresnel, n = 1.5, both faces)

@@ -19,7 +19,7 @@ Size = tuple[int, int]
 Painter = Callable[[Random, Size, float], Texture]
 
 
-def _grey(values: Array | NDArray[np.float32]) -> Texture:
+def grey_of(values: Array | NDArray[np.float32]) -> Texture:
     rounded = np.rint(values)
     return np.clip(rounded, 0, 255, out=rounded).astype(np.uint8)
 
@@ -44,7 +44,7 @@ def clouds(greys: tuple[float, float], sigma: float, coarsest_m: float, persiste
     """Return the painter of noise of a standard deviation and a spectrum about a grey of a range."""
 
     def paint(rng: Random, size: Size, px_per_m: float) -> Texture:
-        return _grey(rng.uniform(*greys) + sigma * value_noise(rng, size, coarsest_m * px_per_m, persistence))
+        return grey_of(rng.uniform(*greys) + sigma * value_noise(rng, size, coarsest_m * px_per_m, persistence))
 
     return paint
 
@@ -58,7 +58,7 @@ def brick(rng: Random, size: Size, px_per_m: float) -> Texture:
     one[:joint], one[:, :joint] = mortar, mortar
     courses = np.vstack([one, np.roll(one, length // 2, axis=1)])
     times = (-(-size[1] // courses.shape[0]), -(-size[0] // length))
-    return _grey(np.tile(courses, times)[: size[1], : size[0]])
+    return grey_of(np.tile(courses, times)[: size[1], : size[0]])
 
 
 def tiles(rng: Random, size: Size, px_per_m: float) -> Texture:
@@ -69,7 +69,7 @@ def tiles(rng: Random, size: Size, px_per_m: float) -> Texture:
     image = level[np.ix_(rows, columns)] + 7 * value_noise(rng, size, px_per_m * 0.3, 0.75)
     image[np.arange(size[1]) % side < joint] = 85
     image[:, np.arange(size[0]) % side < joint] = 85
-    return _grey(image)
+    return grey_of(image)
 
 
 def white(_: Random, size: Size, __: float) -> Texture:
@@ -79,31 +79,8 @@ def white(_: Random, size: Size, __: float) -> Texture:
 
 def marbled(rng: Random, size: Size, px_per_m: float) -> Texture:
     """Return linoleum with streaks of two greys along its web."""
-    streaks = _stretched(rng, size, px_per_m * 0.06, 3.0)
-    return _grey(rng.uniform(120, 160) + 7 * streaks + 4 * value_noise(rng, size, px_per_m * 0.02))
-
-
-def concrete(rng: Random, size: Size, px_per_m: float) -> Texture:
-    """Return smoothed concrete: clouds, pores, and sawn joints every few metres."""
-    image = rng.uniform(115, 150) + 5 * value_noise(rng, size, px_per_m * 0.8, 0.75)
-    image += 2.5 * value_noise(rng, size, px_per_m * 0.03, 0.9)
-    image -= 25 * (value_noise(rng, size, px_per_m * 0.02) > 3.2)
-    for axis, apart_m in ((0, rng.uniform(2.2, 3.2)), (1, rng.uniform(2.2, 3.2))):
-        _joints(
-            image, axis, round(rng.uniform(0.2, 0.8) * apart_m * px_per_m), apart_m * px_per_m, 0.006 * px_per_m, 70
-        )
-    return _grey(image)
-
-
-def glazed(rng: Random, size: Size, px_per_m: float) -> Texture:
-    """Return glazed tiles: nearly one grey each, with joints."""
-    side_m = rng.choice([0.3, 0.45, 0.6])
-    return _flags(rng, size, px_per_m, side_m, 2.5, 1.2, (0.004, rng.uniform(90, 120)))
-
-
-def slabs(rng: Random, size: Size, px_per_m: float) -> Texture:
-    """Return polished stone: dark slabs with thin joints."""
-    return _flags(rng, size, px_per_m, 0.6, 3.0, 5.0, (0.002, 60.0), base=rng.uniform(85, 120))
+    streaks = stretched(rng, size, px_per_m * 0.06, 3.0)
+    return grey_of(rng.uniform(120, 160) + 7 * streaks + 4 * value_noise(rng, size, px_per_m * 0.02))
 
 
 def carpet(rng: Random, size: Size, px_per_m: float) -> Texture:
@@ -114,71 +91,15 @@ def carpet(rng: Random, size: Size, px_per_m: float) -> Texture:
         corners = side / 2 * (1 + 2 * radius * np.array([(0, 1), (1, 0), (0, -1), (-1, 0)]))
         cv2.fillPoly(motif, [np.rint(corners).astype(np.int32)], float(rng.choice([-1, 1]) * rng.uniform(8, 22)))
     times = (-(-size[1] // side), -(-size[0] // side))
-    return _grey(rng.uniform(75, 120) + np.tile(motif, times)[: size[1], : size[0]] + 6 * value_noise(rng, size, 4.0))
+    return grey_of(rng.uniform(75, 120) + np.tile(motif, times)[: size[1], : size[0]] + 6 * value_noise(rng, size, 4.0))
 
 
-def _stretched(rng: Random, size: Size, coarsest_px: float, times: float) -> NDArray[np.float32]:
+def stretched(rng: Random, size: Size, coarsest_px: float, times: float) -> NDArray[np.float32]:
     """Return value noise (H, W) whose structures are longer along u."""
     short = max(8, round(size[0] / times))
     return np.asarray(cv2.resize(value_noise(rng, (short, size[1]), coarsest_px), size), np.float32)
 
 
-def _joints(image: Array | NDArray[np.float32], axis: int, first: int, apart: float, wide: float, grey: float) -> None:
-    """Draw lines across an axis of an image; one narrower than a pixel has a part of the grey."""
-    lines, part = np.moveaxis(image, axis, 0), min(wide, 1.0)
-    for at in np.rint(np.arange(first, len(lines), apart)).astype(int):
-        lines[at : at + max(1, round(wide))] += part * (grey - lines[at : at + max(1, round(wide))])
-
-
-def _flags(
-    rng: Random,
-    size: Size,
-    px_per_m: float,
-    side_m: float,
-    spread: float,
-    grain: float,
-    joint: tuple[float, float],
-    base: float | None = None,
-) -> Texture:
-    """Return square flags; joint: width [m] and grey."""
-    side = side_m * px_per_m
-    first = rng.uniform(0, side, 2)
-    rows, columns = (
-        ((np.arange(n) + side - offset) // side).astype(int) for n, offset in zip(size[::-1], first, strict=True)
-    )
-    level = (base or rng.uniform(140, 190)) + spread * rng.standard_normal((rows[-1] + 1, columns[-1] + 1))
-    image = level[np.ix_(rows, columns)] + grain * value_noise(rng, size, px_per_m * 0.2, 0.75)
-    for axis in (0, 1):
-        _joints(image, axis, round(first[axis]), side, joint[0] * px_per_m, joint[1])
-    return _grey(image)
-
-
-def boards(board_m: tuple[float, float], spread: float, grain: float) -> Painter:
-    """Return the painter of boards (length, width) along u, each course beginning elsewhere; spread: of their greys."""
-
-    def paint(rng: Random, size: Size, px_per_m: float) -> Texture:
-        length, width = (side_m * px_per_m for side_m in board_m)
-        base = rng.uniform(105, 150)
-        image = base + grain * _stretched(rng, size, px_per_m * 0.03, 14.0)
-        for top in np.arange(0, size[1], width):
-            course = image[round(top) : round(top + width)]
-            first = rng.uniform(0, length)
-            ends = np.rint(np.arange(first, size[0] + length, length)).astype(int)
-            for begin, end in zip([0, *ends], ends, strict=False):
-                course[:, begin:end] += spread * rng.standard_normal()
-            _joints(course, 1, int(ends[0]), length, 0.0015 * px_per_m, base - 45)
-        _joints(image, 0, 0, width, 0.0015 * px_per_m, base - 45)
-        return _grey(image)
-
-    return paint
-
-
-def across(painter: Painter) -> Painter:
-    """Return the painter of a texture along v instead of u."""
-    return lambda rng, size, px_per_m: np.ascontiguousarray(painter(rng, size[::-1], px_per_m).T)
-
-
-PARQUET: Final = boards((0.6, 0.07), 7.0, 3.0)
 PAINTERS: Final[dict[str, Painter]] = {
     "brick": brick,
     "plaster": clouds((115, 165), 11, 0.5, 0.7),  # a soft cloudy wall with fine grain
@@ -189,13 +110,7 @@ PAINTERS: Final[dict[str, Painter]] = {
     "linoleum": clouds((115, 175), 0.8, 1.5, 0.8),  # one grey, with a little dirt and grain
     "epoxy": clouds((150, 190), 0.9, 0.8, 0.4),  # a cast floor with the broad waves of the trowel
     "marbled": marbled,
-    "concrete": concrete,
-    "glazed": glazed,
-    "slabs": slabs,
     "carpet": carpet,
-    "parquet_along": PARQUET,  # staggered oak staves
-    "parquet_across": across(PARQUET),
-    "laminate": boards((1.28, 0.19), 2.0, 2.5),  # printed planks with fine joints
 }
 
 
@@ -229,12 +144,12 @@ def _drawing(rng: Random, size: Size) -> Texture:
 def _blobs(rng: Random, size: Size) -> Texture:
     """Return two tones with wavy outlines."""
     dark, light = rng.uniform(15, 80), rng.uniform(150, 240)
-    return _grey(np.where(value_noise(rng, size, size[0] / 4, 0.5) > 0, light, dark))
+    return grey_of(np.where(value_noise(rng, size, size[0] / 4, 0.5) > 0, light, dark))
 
 
 def _photograph(rng: Random, size: Size) -> Texture:
     """Return noise of strong contrast with a few ellipses in front."""
-    image = _grey(rng.uniform(80, 160) + 45 * value_noise(rng, size, size[0] / 2, 0.6))
+    image = grey_of(rng.uniform(80, 160) + 45 * value_noise(rng, size, size[0] / 2, 0.6))
     for _ in range(int(rng.integers(2, 6))):
         centre = tuple(int(x) for x in rng.uniform(0, size))
         axes = (int(rng.uniform(0.05, 0.2) * size[0]), int(rng.uniform(0.05, 0.2) * size[1]))

@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from omnid.simulation.rendering.mirrors import Mirror, reflectance
 from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
 from omnid.simulation.robot import make_robot, with_masks
+from tests.simulation.reflections import Mirror, reflectance
 
 ROBOT = make_robot(256)
 RIG = with_masks(ROBOT.rig)
@@ -27,17 +27,6 @@ SCENE = Scene(
         ),
     )
 )
-ROOM = """
-schema = 1
-start = [0.0, 0.0, 0.0]
-[space]
-low = [-2.0, -2.0]
-high = [2.0, 2.0]
-finish = "{finish}"
-[[wall]]
-points = [[-2.0, 2.0], [2.0, 2.0], [2.0, -2.0]]
-texture = "brick"
-"""
 
 
 @pytest.mark.parametrize(("angle_deg", "share"), [(0.0, 0.04), (60.0, 0.089), (75.0, 0.253), (90.0, 1.0)])
