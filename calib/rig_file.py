@@ -1,7 +1,7 @@
 """The rig as text: `rig.toml`, schema 1, strict. Rotations are restored exactly, translations to a picometre.
 
 Transforms are stored as T_rig_lower and T_rig_upper (p_rig = T_rig_lower @ p_lower): the poses of the cameras. The
-optional table [covariance] has a version of its own: see rig_covariance.py. The optional table [times] has the times of
+optional table [covariance] has a version of its own: see rig.py. The optional table [times] has the times of
 exposure that `omnid calibrate drive` found: upper_delay_s, line_time_s. The table [refined], which earlier versions of
 omnid wrote, is ignored.
 """
@@ -28,8 +28,7 @@ from calib.models.camera import Mask, OmniCamera
 from calib.models.names import MODELS, camera_of, is_coefficient, model_name, names_of, values_of
 from calib.models.ocam import DISTANCE_M, OcamCamera, View
 from calib.models.wavefront import WAVEFRONT_NAMES
-from calib.rig import MountedCamera, Rig, ShutterTimes
-from calib.rig_covariance import TRANSFORM_NAMES, RigCovariance
+from calib.rig import TRANSFORM_NAMES, MountedCamera, Rig, RigCovariance, ShutterTimes
 from calib.typed_toml import convert, shown, table_of
 from calib.validation import decode, read_bytes, require_image_size, transform_of
 

@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from calib.boards.board import Board
     from omnid.api import Odometry, replay
     from omnid.calibration.drive import calibrate_drive
-    from omnid.calibration.height import calibrate_height
-    from omnid.calibration.mask import calibrate_mask
+    from omnid.calibration.from_log import calibrate_height, calibrate_mask
     from omnid.calibration.rig import calibrate_rig
     from omnid.config import Config, load_config
     from omnid.errors import OmnidError
@@ -58,8 +57,8 @@ _MODULES = {
     "RunResult": "omnid.runs.run_result",
     "TrackingState": "omnid.tracking_state",
     "calibrate_drive": "omnid.calibration.drive",
-    "calibrate_height": "omnid.calibration.height",
-    "calibrate_mask": "omnid.calibration.mask",
+    "calibrate_height": "omnid.calibration.from_log",
+    "calibrate_mask": "omnid.calibration.from_log",
     "calibrate_rig": "omnid.calibration.rig",
     "load_config": "omnid.config",
     "replay": "omnid.api",

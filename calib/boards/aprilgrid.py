@@ -16,9 +16,8 @@ import scipy
 from numpy.typing import NDArray
 
 from calib.boards.board import MAX_SQUARE_M, MIN_SQUARE_M, BoardView
-from calib.boards.corner_candidates import BLUR_PX, Grey, smoothed
+from calib.boards.corner_candidates import BLUR_PX, DerivedImage, Grey, Image, derived_images, smoothed
 from calib.boards.corner_grid import shown_corners
-from calib.boards.derived_images import DerivedImage, Image, derived_images
 from calib.boards.local_mapping import REACH, local_mapping, refined_corners, without_outliers
 from calib.errors import CalibError
 from calib.models.camera import Array

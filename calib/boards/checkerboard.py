@@ -14,9 +14,18 @@ from itertools import islice
 import numpy as np
 
 from calib.boards.board import Board, BoardView
-from calib.boards.corner_candidates import BLUR_PX, Grey, describe_corners, find_corners, sample, smoothed
+from calib.boards.corner_candidates import (
+    BLUR_PX,
+    DerivedImage,
+    Grey,
+    Image,
+    derived_images,
+    describe_corners,
+    find_corners,
+    sample,
+    smoothed,
+)
 from calib.boards.corner_grid import MIN_RING_PX, WINDOW_PART, Grid, find_grids, grow_grid, with_clockwise_axes
-from calib.boards.derived_images import DerivedImage, Image, derived_images
 from calib.boards.local_mapping import (
     local_mapping,
     mapping_of_others,

@@ -20,8 +20,8 @@ from calib.models.names import changed, is_coefficient, values_of
 from calib.models.ocam import ASTIGMATISM_NAMES, TANGENTIAL_NAMES, OcamCamera
 from calib.models.unified import DISTORTION_NAMES, UnifiedCamera
 from calib.models.wavefront import WAVEFRONT_NAMES
+from calib.rig import TRANSFORM_NAMES as RIG_TRANSFORM_NAMES
 from calib.rig import Rig, ShutterTimes
-from calib.rig_covariance import TRANSFORM_NAMES as RIG_TRANSFORM_NAMES
 
 # One step of a wavefront's coefficient [m] moves a board at half a metre by about half a pixel.
 WAVEFRONT_UNIT_M: Final = 1e-3

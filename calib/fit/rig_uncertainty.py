@@ -11,8 +11,7 @@ from calib import se3
 from calib.fit.least_squares import BEST_STEP, central_differences
 from calib.fit.parameters import moved_rig
 from calib.models.camera import Array
-from calib.rig import Rig
-from calib.rig_covariance import RigCovariance
+from calib.rig import Rig, RigCovariance
 
 # Step of numeric derivatives by parameters [sigmas]: small against the curvature of a projection, large against its
 # rounding.

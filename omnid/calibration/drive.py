@@ -23,8 +23,7 @@ from calib.fit.rig_from_drive import (
 )
 from calib.fit.rig_uncertainty import drive_uncertainty
 from calib.models.ocam import has_wavefront
-from calib.rig import Rig, ShutterTimes
-from calib.rig_covariance import RigCovariance
+from calib.rig import Rig, RigCovariance, ShutterTimes
 from calib.rig_file import read_rig
 from calib.validation import silent
 from drivers.logs.log_reader import AnyCameras, LogCameras

@@ -22,11 +22,16 @@ from calib.rig_file import write_rig
 from calib.rim import find_rim
 from calib.validation import silent
 from drivers.logs.log_reader import AnyCameras, LogCameras
-from omnid.calibration.angle_table import AngleRow, angle_lines, angle_rows
-from omnid.calibration.board_search import AnyBoard, Progress, find_boards, select_diverse_views
+from omnid.calibration.board_search import (
+    AnyBoard,
+    Progress,
+    ViewChoice,
+    find_boards,
+    select_diverse_views,
+    view_of_images,
+)
 from omnid.calibration.images import PairedImages, brightest, read_pairs
-from omnid.calibration.rig_report import rig_report_html
-from omnid.calibration.view_guess import ViewChoice, view_of_images
+from omnid.calibration.rig_report import AngleRow, angle_lines, angle_rows, rig_report_html
 from omnid.errors import OmnidError
 
 # Relative difference from the baseline by ruler. A tenth is no error of a ruler; 2 % are 4 mm of 200 mm.
@@ -101,7 +106,7 @@ def calibrate_rig(
     """Calibrate two cameras and the transform between them by images of a board.
 
     source: a log of both cameras with the topics of the lower and the upper one, or a folder with images lower_*,
-    upper_*. view: the world is seen in a mirror or directly; "auto": as the images show, see `view_guess`.
+    upper_*. view: the world is seen in a mirror or directly; "auto": as the images show, see `view_of_images`.
     expected_baseline_m: by ruler; a result that differs by a tenth is refused. progress receives one line for each
     image and each fit. Raises OmnidError or CalibError where the images do not suffice.
     """

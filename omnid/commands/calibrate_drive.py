@@ -136,7 +136,7 @@ def _at_height(args: argparse.Namespace, rig: Rig) -> tuple[Rig, str]:
 
     Without --only, a height that the rig states is kept, and a floor that is not seen is no error.
     """
-    from omnid.calibration.height import calibrate_height
+    from omnid.calibration.from_log import calibrate_height
 
     if args.height_m is not None:
         return rig.at_height(args.height_m), ""
@@ -162,7 +162,7 @@ def _at_height(args: argparse.Namespace, rig: Rig) -> tuple[Rig, str]:
 
 def _masked(args: argparse.Namespace, rig: Rig) -> Rig:
     """Return the rig whose masks hide what is fixed to its cameras. A log without a turn is no error but for --only."""
-    from omnid.calibration.mask import calibrate_mask
+    from omnid.calibration.from_log import calibrate_mask
 
     if args.only and "mask" not in args.only:
         return rig

@@ -31,8 +31,7 @@ import numpy as np
 
 import omnid
 from calib.models.lens import full_turn
-from calib.rig import ShutterTimes
-from calib.rig_covariance import RigCovariance
+from calib.rig import RigCovariance, ShutterTimes
 from calib.rig_file import read_rig
 from omnid.core.rig.rig_health import RigContradictedError
 from omnid.formats.tum import Trajectory, read_tum

@@ -13,8 +13,7 @@ from calib import se3
 from calib.errors import CalibError
 from calib.fit.parameters import central_names
 from calib.models.camera import Array, Mask
-from calib.rig import MountedCamera, Rig, ShutterTimes
-from calib.rig_covariance import TRANSFORM_NAMES, RigCovariance
+from calib.rig import TRANSFORM_NAMES, MountedCamera, Rig, RigCovariance, ShutterTimes
 from calib.rig_file import parse_rig, read_rig, rig_toml, write_rig
 
 

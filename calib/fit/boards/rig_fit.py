@@ -16,15 +16,13 @@ from calib.boards.local_mapping import refine_with_camera
 from calib.boards.print_shape import AS_DRAWN, PrintShape
 from calib.errors import CalibError
 from calib.fit.boards.bundle import TWIST_NAMES, BoardFit, BoardRig, fit_boards
-from calib.fit.boards.linear_start import LinearCamera, solve_linear
-from calib.fit.boards.relative_pose import initialise_relative_pose
+from calib.fit.boards.start import LinearCamera, initialise_relative_pose, solve_linear
 from calib.fit.least_squares import BEST_STEP, central_differences
 from calib.fit.residual_structure import ResidualStructure, residual_structure
 from calib.models.camera import Array
 from calib.models.names import values_of
 from calib.models.ocam import OcamCamera, View
-from calib.rig import Rig
-from calib.rig_covariance import TRANSFORM_NAMES, RigCovariance
+from calib.rig import TRANSFORM_NAMES, Rig, RigCovariance
 
 # With four views the median of their errors still shows which one is wrong; fewer are not enough for that.
 MIN_VIEWS: Final = 4

@@ -34,7 +34,7 @@ from omnid.transport import codec
 from omnid.transport.codec import DiagnosticStatus, PoseAttachment, decode_diagnostics, decode_pose
 from tests.bench.faults.mutation import mutated
 from tests.bench.results import Column, ResultTable
-from tests.calib.test_kalibr import BOTH, NAMED, T_UPPER_LOWER, chain
+from tests.calib.test_importers import BOTH, NAMED, T_UPPER_LOWER, chain
 from tests.drivers.logs.bags import write_bag, write_db3
 from tests.drivers.logs.mcap_logs import pairs
 from tests.omnid.formats.place_maps import RIG, some_places

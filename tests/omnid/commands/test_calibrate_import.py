@@ -9,8 +9,8 @@ import pytest
 from calib import se3
 from calib.rig_file import read_rig
 from omnid.cli import main
-from tests.calib.test_kalibr import BOTH, NAMED, T_UPPER_LOWER, chain
-from tests.calib.test_ocam_file import TEXT as OCAM
+from tests.calib.test_importers import BOTH, NAMED, T_UPPER_LOWER, chain
+from tests.calib.test_importers import TEXT as OCAM
 
 
 def omnid(*words: object) -> int:

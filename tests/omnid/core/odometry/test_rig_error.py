@@ -10,8 +10,7 @@ import pytest
 
 from calib import se3
 from calib.fit.rig_uncertainty import motion_errors
-from calib.rig import Rig
-from calib.rig_covariance import RigCovariance
+from calib.rig import Rig, RigCovariance
 from omnid.core.odometry.rig_error import RigError
 from tests.simulation.rigs import make_rig
 

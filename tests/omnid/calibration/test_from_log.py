@@ -1,4 +1,4 @@
-"""Height and tilt of a rig by the floor of a rendered log: the command, the API, the ruler."""
+"""Height, tilt and masks of a rig by a log."""
 
 from __future__ import annotations
 
@@ -10,14 +10,17 @@ import pytest
 
 import omnid
 from calib import se3
-from calib.rig import Rig
 from calib.rig_file import read_rig
-from omnid.calibration.height import HeightCalibration, on_floor
+from omnid.calibration.from_log import HeightCalibration, MaskCalibration, on_floor
 from omnid.cli import main
 from omnid.core.floor import Floor
+from tests.simulation.disturbances import REFLECTION_RADIUS
+from tests.simulation.logs import write_log
+from tests.simulation.recipes import build
 from tests.simulation.rigs import make_rig
 
 HEIGHT_M = 1.2  # of rendered rigs: tests/simulation/paths.py
+SIZE_PX, PAIRS = 200, 24
 
 
 def command(*words: object) -> int:
@@ -55,11 +58,6 @@ def test_a_rig_is_levelled_where_its_tilt_is_more_than_its_noise(sigma_deg: floa
     np.testing.assert_allclose(found[:3, 3], [0.2, 0.1, HEIGHT_M], atol=0.02)
 
 
-def calibration(rig: Rig, height_m: float) -> HeightCalibration:
-    """Return a result with a floor that is known to a centimetre."""
-    return HeightCalibration(rig, rig.at_height(height_m), Floor(height_m, sigma_m=0.01), 10)
-
-
 def test_the_command_writes_the_rig_unless_the_ruler_contradicts(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], found: HeightCalibration
 ) -> None:
@@ -76,3 +74,45 @@ def test_a_log_without_a_floor_ends_with_one_line(scene: Path, monkeypatch: pyte
     monkeypatch.setattr("omnid.core.floor.LEAST_EVIDENCE", np.inf)
     with pytest.raises(omnid.OmnidError, match="the floor is not seen in"):
         omnid.calibrate_height(scene / "log.mcap", read_rig(scene / "rig.toml"))
+
+
+@pytest.fixture(scope="module")
+def spin(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("spin")
+    run = build("spin", seed=3, size=SIZE_PX, pairs=PAIRS)
+    write_log(folder, run.rig, run.poses, run.scene, seed=3, supersample=1, disturbances=("flare",))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def masks(spin: Path) -> MaskCalibration:
+    return omnid.calibrate_mask(spin / "log.mcap", spin / "rig.toml")
+
+
+def test_the_reflection_is_masked_and_the_world_is_not(spin: Path, masks: MaskCalibration) -> None:
+    assert 0.005 < masks.share < 0.15 and f"{100 * masks.share:.1f} %" in str(masks)
+    before = read_rig(spin / "rig.toml")
+    for was, mounted in ((before.lower, masks.rig.lower), (before.upper, masks.rig.upper)):
+        assert mounted.mask is not None and mounted.mask.image is not None
+        v, u = np.nonzero(mounted.mask.image == 0)
+        rim_px = min(was.visible.outer_px, SIZE_PX / 2)
+        radius = np.hypot(u - was.visible.center[0], v - was.visible.center[1]) / rim_px
+        # Its light lies between 1.5 and 2.5 of REFLECTION_RADIUS of the rim's radius; a band-pass spreads the border.
+        assert radius.size and radius.min() > 1.3 * REFLECTION_RADIUS and radius.max() < 3.2 * REFLECTION_RADIUS
+
+
+def test_the_command_writes_a_rig_that_needs_no_other_mask(
+    spin: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], masks: MaskCalibration
+) -> None:
+    masked = tmp_path / "rig.toml"
+    words = ("drive", spin / "log.mcap", "--only", "mask", "--rig")
+    assert command(*words, spin / "rig.toml", "-o", masked) == 0
+    assert f"{masks}\n{masked}: written" in capsys.readouterr().out
+    assert {path.name for path in tmp_path.iterdir()} == {"rig.toml", "rig.lower.png", "rig.upper.png"}
+    assert command(*words, masked) == 0
+    assert capsys.readouterr().out.startswith("nothing is fixed to the cameras that the masks do not hide")
+
+
+def test_a_robot_that_hardly_turns_is_refused(scene: Path) -> None:
+    with pytest.raises(omnid.OmnidError, match=r"shows \d of 16 headings of a turn, 12 are needed: record a log"):
+        omnid.calibrate_mask(scene / "log.mcap", scene / "rig.toml")

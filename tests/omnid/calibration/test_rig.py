@@ -1,0 +1,153 @@
+"""Rigs by boards: residuals by angle and coverage, the report, the view that images show, what a misfit costs."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from calib import se3
+from calib.boards.aprilgrid import AprilGrid, find_april_grid
+from calib.boards.board import Board, BoardView
+from calib.fit.boards.rig_fit import PairView, RigCalibration, calibrate_boards
+from calib.fit.residual_structure import ResidualStructure
+from calib.fit.rig_uncertainty import DriveUncertainty
+from calib.models.ocam import OcamCamera
+from calib.rig import Rig, rig_between
+from calib.validation import silent
+from omnid.calibration.board_search import ViewChoice, view_of_images
+from omnid.calibration.images import Images, PairedImages
+from omnid.calibration.rig import accuracy_warnings
+from omnid.calibration.rig_report import angle_lines, angle_rows, rig_report_html
+from omnid.errors import OmnidError
+from tests.simulation.april_grids import print_of
+
+BOARD, SIZE = Board(9, 6, 0.025), (640, 480)
+LENS = OcamCamera((-230.0, 0.0, 1.5e-3, -6e-7, 1.6e-9), (238.0, 321.0), (1.0, 0.0, 0.0), SIZE, "direct")
+# x of such a camera is down the rows: the upper one is 8 cm against it.
+T_LOWER_UPPER = se3.exp([-0.08, 0.001, 0.002, 0.01, -0.02, 0.01])
+NOISE_PX = 0.1
+
+
+def calibrated(widest_deg: float) -> tuple[RigCalibration, Rig]:
+    """Return a rig fitted to corners of boards up to an angle from the axes, left and right, but not above."""
+    random, views = np.random.default_rng(2), list[PairView]()
+    while len(views) < 24:
+        angle, azimuth = np.deg2rad(random.uniform(0, widest_deg)), random.uniform(0.6, 2 * np.pi - 0.6)
+        ahead = np.array([-np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth), -np.cos(angle)])
+        turn = se3.rotation_exp(random.normal(0, 0.35, 3)) @ np.diag([1.0, -1.0, -1.0])
+        T = se3.transform(turn, 0.25 * ahead) @ se3.transform(np.eye(3), -BOARD.points.mean(axis=0))
+        pixels = [
+            LENS.project(se3.apply(T_cam_lower @ T, BOARD.points))
+            for T_cam_lower in (np.eye(4), se3.inverse(T_LOWER_UPPER))
+        ]
+        if all(np.isfinite(p).all() and (p > 2).all() and (p < np.array(SIZE) - 3).all() for p in pixels):
+            seen = [BoardView(str(len(views)), p + random.normal(0, NOISE_PX, p.shape), 1.0) for p in pixels]
+            views.append(PairView(str(len(views)), (seen[0], seen[1])))
+    found = calibrate_boards(views, BOARD, [SIZE, SIZE], "direct")
+    return found, rig_between(*found.cameras, se3.inverse(found.T_upper_lower))
+
+
+@pytest.fixture(scope="module")
+def fitted() -> tuple[RigCalibration, Rig]:
+    """Return the rig of boards up to 40 degrees from the axes."""
+    return calibrated(40.0)
+
+
+def test_residuals_are_told_by_the_angle_and_what_no_board_covered(fitted: tuple[RigCalibration, Rig]) -> None:
+    for side in (0, 1):
+        rows = angle_rows(*fitted, side)
+        corners = sum(
+            int(np.isfinite(seen.pixels[:, 0]).sum()) for view in fitted[0].views if (seen := view.seen[side])
+        )
+        assert [row.low_deg for row in rows] == [10 * number for number in range(len(rows))] and len(rows) >= 7
+        assert sum(row.corners for row in rows) == corners
+        assert all(row.rms_px == pytest.approx(NOISE_PX, rel=0.3) for row in rows if row.corners > 60)
+        assert rows[-1].corners == 0 and len(rows[-1].uncovered) == rows[-1].visible
+        assert 12 in rows[4].uncovered and not {3, 9} & set(rows[2].uncovered)
+        lines = angle_lines("upper", rows)
+        assert len(lines) == len(rows) + 2 and "60 to 70 deg" in lines[8] and "o'clock" in "".join(lines)
+
+
+def test_the_report_of_lenses_that_look_ahead_is_written(fitted: tuple[RigCalibration, Rig]) -> None:
+    found, rig = fitted
+    blank = {view.name: np.full(SIZE[::-1], 90, np.uint8) for view in found.views}
+    images = PairedImages((blank, blank))
+    page = rig_report_html(found, images, rig, [angle_rows(found, rig, side) for side in (0, 1)])
+    assert page.count("<td>60 to 70 deg</td>") == 2 and page.count("<img") >= 3
+
+
+CHECKERBOARD = Board(6, 5, 0.03)
+Camera = tuple[Images, list[BoardView]]  # its images, and what was found in them
+
+
+def rim(hub_px: float, side: int = 240) -> Camera:
+    """Return a camera that shows a light circle with a dark hub in a dark image, and no board."""
+    v, u = np.indices((side, side)) - (side - 1) / 2
+    radius = np.hypot(u, v)
+    return {"a": np.where((radius < 0.45 * side) & (radius >= hub_px), 150, 8).astype(np.uint8)}, []
+
+
+PLAIN: Camera = ({"a": np.full((480, 640), 150, np.uint8)}, [])
+
+
+@pytest.mark.parametrize("view", ["mirror", "direct"])
+def test_tags_are_reflected_by_a_mirror(view: str) -> None:
+    board = AprilGrid(5, 4, 0.08, 0.3)
+    sheet = print_of(board)
+    seen: list[Camera] = []
+    for turns in range(2):  # two cameras; the second one sees the board on its side
+        turned = np.ascontiguousarray(np.rot90(sheet if view == "direct" else sheet[:, ::-1], turns))
+        found = find_april_grid(turned, board)
+        assert found is not None
+        seen.append((rim(0.0)[0], [found]))
+    assert view_of_images("auto", seen, board, silent) == (view, [])
+
+
+@pytest.mark.parametrize(
+    ("choice", "cameras", "chosen", "is_warned"),
+    [
+        ("auto", [rim(25.0), rim(25.0)], "mirror", False),
+        ("auto", [rim(25.0), rim(0.0)], "mirror", False),
+        ("mirror", [rim(25.0), PLAIN], "mirror", False),
+        ("direct", [rim(25.0), PLAIN], "direct", True),
+        ("direct", [PLAIN, PLAIN], "direct", False),
+    ],
+)
+def test_rim_and_hub_of_a_mirror_show_it(
+    choice: ViewChoice, cameras: list[Camera], chosen: str, is_warned: bool
+) -> None:
+    found, warnings = view_of_images(choice, cameras, CHECKERBOARD, silent)
+    assert found == chosen and ("given as direct" in "".join(warnings)) == is_warned
+
+
+# A mirror without a hub or a fisheye lens; a part of a mirror or a lens.
+@pytest.mark.parametrize("camera", [rim(0.0), PLAIN])
+def test_what_the_images_leave_open_is_asked_for(camera: Camera) -> None:
+    with pytest.raises(OmnidError, match=r"\(found no markers.*add --view mirror or --view direct"):
+        view_of_images("auto", [camera, camera], CHECKERBOARD, silent)
+
+
+NOISE, MISFIT = ResidualStructure(0.01, 0.2), ResidualStructure(0.14, 0.2)
+
+
+def lines(scale: float | None, *structures: ResidualStructure) -> list[str]:
+    drives = None if scale is None else DriveUncertainty(scale, math.radians(0.01))
+    return accuracy_warnings(structures, drives)
+
+
+@pytest.mark.parametrize(("scale", "part"), [(0.001, "0.2 %"), (0.0015, "0.3 %"), (0.01, "2 %")])
+def test_a_misfit_is_named_by_what_it_costs(scale: float, part: str) -> None:
+    (line,) = lines(scale, NOISE, MISFIT)
+    assert line.startswith("upper camera: ") and "systematic residuals of 0.140 px" in line
+    assert f"wrong by {part} of their length and by 0.02 degree of heading per metre" in line
+    assert line.endswith("do not use it where that matters") == (scale >= 0.0015)
+
+
+def test_errors_that_cost_little_are_no_warning_and_others_ask_for_pairs() -> None:
+    assert lines(0.0005, MISFIT, MISFIT) == lines(0.0005, NOISE, NOISE) == lines(None, NOISE, NOISE) == []
+    assert lines(None, MISFIT, NOISE)[0].startswith("lower camera: the camera model does not describe this camera")
+    (line,) = lines(0.0006, NOISE, NOISE)
+    assert line.startswith("the images leave something open: drives may be wrong by 0.12 %")
+    assert line.endswith("; add pairs where the tables say `no board`")
