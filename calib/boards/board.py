@@ -1,4 +1,10 @@
-"""A checkerboard, its view in one image, and its pose in front of a known camera."""
+"""A checkerboard, its view in one image, its pose in front of a known camera, and the shape of its print.
+
+Paper curls, a plate gives way, a printer stretches one side. The drawing's points lie in a plane. A print differs from
+it to second order: out of the plane by a quadratic surface, in the plane by the ratio of its sides. mrcal models the
+first by two parabolas along the sides ("calobject_warp"); the third term, the twist, holds a board that curls about its
+diagonal.
+"""
 
 from __future__ import annotations
 
@@ -151,3 +157,79 @@ def ambiguous_orders(board: CalibrationBoard) -> list[NDArray[np.intp]]:
         return [grid.ravel()]
     quarters = range(4) if board.columns == board.rows and board.columns % 2 == 0 else (0, 2)
     return [np.rot90(grid, quarter).ravel() for quarter in quarters]
+
+
+MODE_NAMES = ("bend_x", "bend_y", "twist", "stretch")
+# One step of a mode, a millimetre of height and a hundredth of the sides' ratio, because each is about a pixel of a
+# near board; and what prints have before their images are seen.
+MODE_UNITS, MODE_SIGMAS = np.array([1e-3, 1e-3, 1e-3, 1e-2]), np.array([1e-3, 1e-3, 1e-3, 2e-3])
+
+
+@dataclass(frozen=True, slots=True)
+class PrintShape:
+    """Difference of a print from its drawing.
+
+    With u, v from -1 to 1 along the sides x and y of the corners, points are higher by bend_x (1 - u^2) + bend_y
+    (1 - v^2) + twist u v [m]. Lengths along y are longer by the part stretch / 2, those along x shorter.
+    """
+
+    values: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)  # in the order of MODE_NAMES
+
+    @property
+    def stretch(self) -> float:
+        """Return the part by which y is longer against x."""
+        return self.values[3]
+
+    def points(self, drawn: Array) -> Array:
+        """Return the print's corners (N, 3) [m] of those of the drawing (N, 3), z 0."""
+        return self.points_of(drawn, drawn)
+
+    def points_of(self, drawn: Array, places: Array) -> Array:
+        """Return points (M, 3) [m] of the print at places (M, 3), z 0, in a drawing with corners drawn (N, 3).
+
+        A sheet that bends keeps its lengths: points move inwards by the integral of half its squared slope.
+        """
+        middle, half = _sides(drawn)
+        uv = (places[:, :2] - middle) / half
+        moved = places + _moves(uv, half) @ (np.array(self.values) / MODE_UNITS)
+        moved[:, :2] -= 2 / 3 * np.array(self.values[:2]) ** 2 * uv**3 / half
+        return np.asarray(moved)
+
+    def moved(self, steps: Array) -> PrintShape:
+        """Return the shape after steps (4,) of its modes."""
+        bend_x, bend_y, twist, stretch = (np.array(self.values) + steps * MODE_UNITS).tolist()
+        return PrintShape((bend_x, bend_y, twist, stretch))
+
+    def described(self, drawn: Array) -> str:
+        """Return the difference of the print from its drawing (N, 3) in one line."""
+        # The bend is the range of the heights over the corners, above the plane that fits them best.
+        heights, plane = self.points(drawn)[:, 2], np.column_stack([drawn[:, :2], np.ones(len(drawn))])
+        sag_m = float(np.ptp(heights - plane @ np.linalg.lstsq(plane, heights, rcond=None)[0]))
+        longer, other = ("y (down the rows)", "x") if self.stretch > 0 else ("x (along the columns)", "y")
+        return (
+            f"the board is bent by {1e3 * sag_m:.2g} mm, and its print {100 * abs(self.stretch):.2g} % "
+            f"longer along {longer} than along {other}, which the calibration allows for"
+        )
+
+
+AS_DRAWN = PrintShape()
+
+
+def all_modes(drawn: Array) -> Array:
+    """Return the moves (N, 3, 4) [m] of a drawing's corners (N, 3) by one step of every mode."""
+    middle, half = _sides(drawn)
+    return _moves((drawn[:, :2] - middle) / half, half)
+
+
+def _sides(drawn: Array) -> tuple[Array, Array]:
+    """Return the middle (2,) of a board's corners, and half their sides (2,) [m]."""
+    low, high = drawn[:, :2].min(axis=0), drawn[:, :2].max(axis=0)
+    return (low + high) / 2, (high - low) / 2
+
+
+def _moves(uv: Array, half: Array) -> Array:
+    """Return the moves (N, 3, 4) [m] by one step of every mode, of places (N, 2) in parts of half the sides."""
+    moves = np.zeros((len(uv), 3, len(MODE_NAMES)))
+    moves[:, 2, :3] = np.column_stack([1 - uv**2, uv[:, :1] * uv[:, 1:]])
+    moves[:, :2, 3] = uv * half * (-0.5, 0.5)
+    return np.asarray(moves * MODE_UNITS)

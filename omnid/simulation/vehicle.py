@@ -17,8 +17,11 @@ from itertools import count
 from queue import SimpleQueue
 from typing import ClassVar, Final, Literal, NamedTuple, TypeAlias
 
+import numpy as np
+
 from calib.models.camera import Array
-from drivers.frame import CAMERAS, Frame
+from calib.rig import Rig
+from drivers.frame import CAMERAS, Camera, Frame
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from drivers.motor import VelocityCommand
 from drivers.motors.simulated.simulated_base import Pose
@@ -31,10 +34,41 @@ from omnid.core.control.collision_monitor import ControllerRing
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.contacts import ContactState
 from omnid.core.control.control_law import ControlInput, ControllerPose
-from omnid.simulation.cameras import SimulatedCameras
-from omnid.simulation.people import Walkers
+from omnid.simulation.rendering.ray_caster import render_grey
+from omnid.simulation.rendering.sensor import Floats, MountedSensor, Sensor
+from omnid.simulation.rendering.surfaces import Scene
 from omnid.simulation.robot import SimulatedRobot, with_masks
-from omnid.simulation.world import World, clearance_m
+from omnid.simulation.world import Walkers, World, clearance_m
+
+
+class SimulatedCameras:
+    """Renders raw grey frames; an image follows from world, people, pose, sequence number and seed alone."""
+
+    def __init__(self, rig: Rig, sensor: Sensor, world: World, seed: int, samples: int) -> None:
+        """samples: per pixel and axis."""
+        self.world, self.samples, self._seed = world, samples, seed
+        self.mounted = {"lower": rig.lower, "upper": rig.upper}
+        self._sensors = {
+            name: MountedSensor.of(sensor, mounted.visible, mounted.camera.size)
+            for name, mounted in self.mounted.items()
+        }
+
+    def frame(self, camera: Camera, seq: int, stamp_ns: int, T_world_rig: Array, people: Walkers) -> Frame:
+        """Return the frame of a camera on a rig at T_world_rig (4, 4)."""
+        ideal = self.ideal(camera, T_world_rig, people) * np.float32(self.world.light_at(people.time_s))
+        rng = np.random.default_rng([self._seed, 43, CAMERAS.index(camera), seq])
+        width, height = self.mounted[camera].camera.size
+        sensor = self._sensors[camera]
+        image = sensor.expose(ideal, rng)
+        if sensor.sensor.is_compressed:
+            return Frame(seq, stamp_ns, camera, "jpeg", sensor.jpeg(image), width, height)
+        return Frame(seq, stamp_ns, camera, "mono8", image, width, height)
+
+    def ideal(self, camera: Camera, T_world_rig: Array, people: Walkers) -> Floats:
+        """Return the image (H, W) without the errors of a sensor."""
+        scene = Scene((*self.world.standing, *people.faces()))
+        return render_grey(scene, self.mounted[camera], T_world_rig, self.samples)
+
 
 START_NS: Final = 1_000_000_000_000  # Start of the simulated clock.
 STOPPING_NS: Final = 2_000_000_000  # At the end the wheels come to rest within this time.

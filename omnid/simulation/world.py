@@ -1,18 +1,126 @@
-"""A simulated world: what stands and walks in it, its light, and how far a robot is from what it may touch."""
+"""A simulated world: what stands in it, who walks along polylines, its light, and what a robot may touch."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calib import se3
 from calib.models.camera import Array
 from drivers.motors.simulated.simulated_base import Pose
-from omnid.simulation.people import Person
 from omnid.simulation.rendering.surfaces import Rectangle
+
+Point = tuple[float, float]
+
+PATIENCE_S = 4.0  # A person waits this long, then comes nearer, and after as long again turns round if possible.
+IMPATIENT = 0.5  # Distance to which the person then comes, by that at which he waits.
+
+
+@dataclass(frozen=True, slots=True)
+class Person:
+    """A box of a person's size that walks along a path and faces ahead."""
+
+    faces: tuple[Rectangle, ...]  # in a frame on the floor below the middle, x ahead
+    path: tuple[Point, ...]  # m
+    speed_mps: float
+    repeat: str = "once"  # once | loop | back and forth
+    start_s: float = 0.0
+    starts_within_m: float = 0.0  # waits until the robot is this near to the last point of the path; 0: does not wait
+    waits_within_m: float = 0.0  # stops rather than come nearer than this to the robot; 0: walks on
+    rests_s: tuple[float, ...] = ()  # at the points of a path that is walked once; none: does not rest
+
+    def place(self, walked_s: float) -> tuple[float, float, float]:
+        """Return x, y [m] and heading [rad] after a time of walking."""
+        points = np.array(self.path)
+        reached_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+        along_m, back, total_m = self.speed_mps * max(walked_s, 0.0), False, float(reached_m[-1])
+        if self.rests_s:
+            rested_s = np.cumsum(self.rests_s)
+            arrives_s = reached_m / self.speed_mps + rested_s - self.rests_s
+            times_s = np.column_stack([arrives_s, arrives_s + self.rests_s]).ravel()
+            along_m = float(np.interp(walked_s, times_s, np.repeat(reached_m, 2)))
+        if self.repeat != "once" and total_m > 0.0:
+            laps, along_m = divmod(along_m, total_m)
+            back = self.repeat == "back and forth" and laps % 2 == 1
+        along_m = min(along_m, total_m)
+        along_m = total_m - along_m if back else along_m
+        part = min(int(np.searchsorted(reached_m[1:], along_m)), len(points) - 2)
+        ahead = (points[part + 1] - points[part]) * (-1 if back else 1)
+        x_m, y_m = (float(np.interp(along_m, reached_m, points[:, axis])) for axis in (0, 1))
+        return x_m, y_m, math.atan2(ahead[1], ahead[0])
+
+    def turned(self, walked_s: float) -> float:
+        """Return the time of walking, of a path back and forth, that has the same place on the way back."""
+        lengths_m = np.linalg.norm(np.diff(np.array(self.path), axis=0), axis=1)
+        leg_s = float(lengths_m.sum()) / self.speed_mps
+        leg, on_it_s = divmod(walked_s, leg_s)
+        return (leg + 2) * leg_s - on_it_s
+
+
+class Walkers:
+    """The people of a world as time passes; those who wait for the robot begin when it is near enough."""
+
+    def __init__(self, people: tuple[Person, ...]) -> None:
+        self._people = people
+        self._started_s: list[float | None] = [None if person.starts_within_m else person.start_s for person in people]
+        self._waited_s = [0.0] * len(people)
+        self.time_s = 0.0
+
+    def advance(self, time_s: float, robot: Point) -> None:
+        """Set the time, with the robot at a point [m]."""
+        passed_s, self.time_s = time_s - self.time_s, time_s
+        for number, person in enumerate(self._people):
+            started_s = self._started_s[number]
+            if person.waits_within_m and started_s is not None:
+                self._started_s[number] = self._polite(number, started_s, passed_s, robot)
+            if (
+                self._started_s[number] is None
+                and time_s >= person.start_s
+                and (math.dist(robot, person.path[-1]) <= person.starts_within_m)
+            ):
+                self._started_s[number] = time_s
+
+    def _polite(self, number: int, started_s: float, passed_s: float, robot: Point) -> float:
+        """Return the start time of a person: for one who waits for the robot it is delayed by the step."""
+        person, walked_s = self._people[number], self.time_s - started_s
+        before_m, now_m = (math.dist(person.place(at_s)[:2], robot) for at_s in (walked_s - passed_s, walked_s))
+        if now_m >= before_m or now_m >= person.waits_within_m:
+            self._waited_s[number] = 0.0
+            return started_s
+        self._waited_s[number] += passed_s
+        if self._waited_s[number] >= PATIENCE_S and now_m >= IMPATIENT * person.waits_within_m:
+            return started_s
+        if self._waited_s[number] < 2 * PATIENCE_S or person.repeat != "back and forth":
+            return started_s + passed_s
+        self._waited_s[number] = 0.0
+        return self.time_s - person.turned(walked_s - passed_s)
+
+    def faces(self) -> list[Rectangle]:
+        """Return the people's rectangles in the world now."""
+        return [
+            moved(face, place)
+            for person, place in zip(self._people, self.places(), strict=True)
+            for face in person.faces
+        ]
+
+    def places(self) -> list[tuple[float, float, float]]:
+        """Return x, y [m] and heading [rad] of each person now."""
+        return [
+            person.place(0.0 if started_s is None else self.time_s - started_s)
+            for person, started_s in zip(self._people, self._started_s, strict=True)
+        ]
+
+
+def moved(face: Rectangle, place: tuple[float, float, float]) -> Rectangle:
+    """Return a rectangle of a frame on the floor in the world; its texture is shared."""
+    x_m, y_m, heading_rad = place
+    c, s = math.cos(heading_rad), math.sin(heading_rad)
+    R: Array = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return replace(face, origin=R @ face.origin + (x_m, y_m, 0.0), edge_u=R @ face.edge_u, edge_v=R @ face.edge_v)
+
 
 FLOOR_M = 0.02  # what is lower than this is driven over
 

@@ -27,11 +27,10 @@ from msgspec.structs import asdict
 from calib.models.camera import Array
 from calib.typed_toml import bytes_of, convert, table_of
 from omnid.errors import OmnidError
-from omnid.simulation.people import Person
 from omnid.simulation.rendering import textures
 from omnid.simulation.rendering.shapes import CEILING_M, Point, Random, box, painted, poster_paint, posters, solid
 from omnid.simulation.rendering.surfaces import Rectangle, Texture
-from omnid.simulation.world import World
+from omnid.simulation.world import Person, World
 
 MAX_BYTES: Final = 1 << 18
 LARGEST_AREA_M2: Final = 1200.0  # of all painted surfaces, without posters: their textures must fit into memory

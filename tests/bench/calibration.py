@@ -34,8 +34,7 @@ import numpy as np
 import omnid
 from calib import se3
 from calib.boards.aprilgrid import AprilGrid
-from calib.boards.board import Board, BoardView
-from calib.boards.print_shape import AS_DRAWN, PrintShape
+from calib.boards.board import AS_DRAWN, Board, BoardView, PrintShape
 from calib.fit.boards.rig_fit import PairView, RigCalibration, calibrate_boards, rig_covariance
 from calib.fit.rig_uncertainty import AZIMUTHS, SLOPES, WALLS_M, drive_uncertainty
 from calib.models.camera import Array

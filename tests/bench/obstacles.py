@@ -32,10 +32,9 @@ from omnid.config import load_config
 from omnid.core.control.heading_controller import Setpoint, wrap_angle
 from omnid.core.navigation.requests import GoalRequest, NavigationFrame
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun
-from omnid.simulation.people import Walkers
 from omnid.simulation.rendering.surfaces import Scene
 from omnid.simulation.robot import SimulatedRobot
-from omnid.simulation.world import clearance_m
+from omnid.simulation.world import Walkers, clearance_m
 from tests.bench.fine_robot import BUILDS, USUAL, fine_robot
 from tests.bench.real_lenses import with_real_lenses
 from tests.bench.results import ROOT, Column, ResultTable, commit

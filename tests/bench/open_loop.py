@@ -24,9 +24,8 @@ from omnid.config import load_config
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.mapping.range_scan import SECTORS, azimuths
 from omnid.simulation.lockstep import Moment, Request
-from omnid.simulation.people import Walkers
 from omnid.simulation.vehicle import START_NS
-from omnid.simulation.world import clearance_m
+from omnid.simulation.world import Walkers, clearance_m
 from tests.bench.results import Column, ResultTable
 from tests.simulation.disturbed import simulate
 

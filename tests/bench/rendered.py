@@ -36,11 +36,11 @@ from calib.rig_file import read_rig
 from omnid.core.rig.rig_health import RigContradictedError
 from omnid.formats.tum import Trajectory, read_tum
 from omnid.recordings.evaluation import evaluate
-from omnid.simulation.people import Person, Walkers
 from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.sensor import Floats, Sensor
 from omnid.simulation.rendering.shapes import box
 from omnid.simulation.rendering.surfaces import Scene
+from omnid.simulation.world import Person, Walkers
 from omnid.tracking_state import TrackingState
 from tests.bench.accuracy import position_errors, squared_errors
 from tests.bench.results import Cell, Column, ResultTable

@@ -25,13 +25,11 @@ from calib.rig import Rig
 from drivers.frame import gray
 from drivers.logs.log_reader import LogReader
 from omnid.config import load_config
-from omnid.simulation.cameras import SimulatedCameras
 from omnid.simulation.demonstration import TeachAndRepeat, both_paths, draw, seen_obstacles
 from omnid.simulation.lockstep import SimulatedRun, simulate
-from omnid.simulation.people import Walkers
 from omnid.simulation.robot import make_robot, with_masks
-from omnid.simulation.vehicle import START_NS
-from omnid.simulation.world import World
+from omnid.simulation.vehicle import START_NS, SimulatedCameras
+from omnid.simulation.world import Walkers, World
 from omnid.simulation.world_file import load_world
 
 Image = NDArray[np.uint8]

@@ -17,14 +17,12 @@ from drivers.frame import Camera, Frame
 from drivers.motors.simulated.simulated_base import Pose
 from omnid.config import Config
 from omnid.simulation import lockstep
-from omnid.simulation.cameras import SimulatedCameras
 from omnid.simulation.lockstep import Drive, Reports, SimulatedRun, Takes
-from omnid.simulation.people import Walkers
 from omnid.simulation.rendering.sensor import Floats
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
 from omnid.simulation.robot import SimulatedRobot
-from omnid.simulation.vehicle import Vehicle
-from omnid.simulation.world import World, footprints
+from omnid.simulation.vehicle import SimulatedCameras, Vehicle
+from omnid.simulation.world import Walkers, World, footprints
 from tests.simulation.reflections import Mirror, seen_part
 
 HALF_BASE_M: Final = 0.15  # from the middle of the base to where its wheels and castors touch the floor

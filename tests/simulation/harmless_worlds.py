@@ -21,11 +21,11 @@ import numpy as np
 from calib.models.camera import Array
 from drivers.motors.simulated.simulated_base import Pose
 from omnid.errors import OmnidError
-from omnid.simulation.people import Person
 from omnid.simulation.rendering.sensor import Sensor
 from omnid.simulation.rendering.shapes import Point
 from omnid.simulation.rendering.surfaces import Rectangle
 from omnid.simulation.robot import SimulatedRobot, make_robot
+from omnid.simulation.world import Person
 from tests.simulation.building_parts import (
     BEHIND_M,
     Builder,

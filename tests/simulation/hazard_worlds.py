@@ -15,11 +15,10 @@ from typing import Final
 import numpy as np
 
 from omnid.errors import OmnidError
-from omnid.simulation.people import Person, moved
 from omnid.simulation.rendering.shapes import Paint, Point, painted, solid
 from omnid.simulation.rendering.surfaces import Rectangle
 from omnid.simulation.robot import WheelErrors
-from omnid.simulation.world import distances_m
+from omnid.simulation.world import Person, distances_m, moved
 from tests.simulation import harmless_worlds
 from tests.simulation.building_parts import (
     BEHIND_M,

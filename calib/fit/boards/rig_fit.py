@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.boards.board import BoardView, CalibrationBoard
+from calib.boards.board import AS_DRAWN, BoardView, CalibrationBoard, PrintShape
 from calib.boards.local_mapping import refine_with_camera
-from calib.boards.print_shape import AS_DRAWN, PrintShape
 from calib.errors import CalibError
 from calib.fit.boards.bundle import TWIST_NAMES, BoardFit, BoardRig, fit_boards
 from calib.fit.boards.start import LinearCamera, initialise_relative_pose, solve_linear

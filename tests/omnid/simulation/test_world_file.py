@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from omnid.errors import OmnidError
-from omnid.simulation.people import Walkers
 from omnid.simulation.rendering import shapes
-from omnid.simulation.world import clearance_m
+from omnid.simulation.world import Walkers, clearance_m
 from omnid.simulation.world_file import WorldOptions, load_world, shipped_worlds
 
 HALL = """

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from calib import se3
-from calib.boards.board import Board, BoardView, ambiguous_orders
-from calib.boards.print_shape import AS_DRAWN, PrintShape
+from calib.boards.board import AS_DRAWN, Board, BoardView, PrintShape, ambiguous_orders
 from calib.errors import CalibError
 from calib.fit.boards.bundle import fit_boards
 from calib.fit.boards.rig_fit import PairView, RigCalibration, calibrate_boards, rig_covariance
