@@ -46,7 +46,7 @@ from omnid.runs.systemd import Service, StatusLine, print_stacks_when_killed
 from omnid.runs.wiring import NavigationParts, Outputs, Parts, wire
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
 from omnid.sinks.drive import PlannerDrive
-from omnid.sinks.encoder import status_report
+from omnid.sinks.encoder import StatusReport
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry
 from omnid.stages.obstacles import ADVICE, controller_ring
@@ -259,7 +259,7 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
         session.outputs.callback(recorder.close)
 
     # 2. Who takes what the stages make.
-    to_pose = Histogram()  # time from the images to their pose [s]
+    to_pose, reports = Histogram(), graph.inlet(1)  # time from the images to their pose [s], and the status
     exposure = ExposureControl(UsefulArea(rig, geometry.cylinder), config.cameras, robot.states)
     outputs = Outputs(
         pairs={"exposure": exposure},
@@ -271,6 +271,7 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
         bus=BusSink(bus, session.encoder(rig, BUS_POINTS), clock=VelocityCommand if robot.waits else None),
         recorder=recorder,
         records_images=True,
+        reports=reports,
     )
     if config.bus.panorama_hz:
         outputs.poses["panorama"] = PanoramaSink(bus, config.bus.panorama_hz, clock.unix_ns)
@@ -342,11 +343,7 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
         if images.level != STALE and images.message != reported:
             reported = images.message
             warn(f"images: {reported}")
-        with suppress(OmnidError):  # the system's clock may be set to a time that no message can hold
-            message = status_report(time.time_ns(), statuses)
-            bus.publish(message.topic, message.payload)  # where the bus is slow, only this ticker waits
-        if recorder is not None:
-            recorder.add(statuses, clock.monotonic_ns())
+        reports.push(StatusReport(clock.monotonic_ns(), statuses))
 
     graph.ticker("status", config.live.status_s, give_status)
     service = Service(graph.telemetry, StatusLine(statistics, graph.telemetry), config.service.stall_timeout_s)

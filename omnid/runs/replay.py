@@ -43,7 +43,7 @@ from omnid.runs.wiring import Outputs, Parts, wire
 from omnid.settings import dump
 from omnid.sinks.bus_sink import BusSink
 from omnid.sinks.drive import ReplayDrive, SimulatedWheels
-from omnid.sinks.encoder import Outgoing
+from omnid.sinks.encoder import Outgoing, StatusReport
 from omnid.sinks.files import TrajectoryFile, check_outputs, write_known, write_plan
 from omnid.sinks.recorder import Recorder, SingleLog
 from omnid.stages.front_end import FrontEnd
@@ -345,7 +345,8 @@ class _Replay:
             stages = [stage for stage in self._session.graph.telemetry.stages if stage.name not in BOOKKEEPING]
             found = [entry(stage_name(stage.name), stage_stats(stage)) for stage in stages]
             summary = replace(self._counters(), motor={})
-            recorder.add([entry(SUMMARY, summary_stats(summary)), *self._motion(), *found], recorder.newest_ns)
+            statuses = [entry(SUMMARY, summary_stats(summary)), *self._motion(), *found]
+            recorder.process(StatusReport(recorder.newest_ns, statuses))
             recorder.close()
 
     def _result(self) -> RunResult:

@@ -19,7 +19,7 @@ from omnid.messages import FramePair, MapUpdate, NavigationUpdate, ObstacleRing,
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.route_files import Requests, RouteFiles, TaughtRoutes
 from omnid.sinks.drive import LiveDrive
-from omnid.sinks.encoder import Outgoing
+from omnid.sinks.encoder import Outgoing, StatusReport
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.lockstep_drive import LockstepDrive
 from omnid.stages.mapping import MapGrid, Mapping
@@ -46,6 +46,7 @@ class Outputs:
     bus: Output[Outgoing] | None = None  # takes all messages that leave the run
     recorder: Output[Any] | None = None  # takes them as well
     records_images: bool = False  # the recorder of a live run takes the images, too
+    reports: Stream[StatusReport] | None = None  # for bus and recorder
 
     @property
     def take_all(self) -> bool:
@@ -199,6 +200,7 @@ def wire(
         ("bus-grid", grids, FILES),
         ("bus-scan", rings, BUS),
         ("bus-navigation", ways, BUS),
+        ("bus-status", outputs.reports, BUS),
     ]
     outgoing = [(name, stream, thread) for name, stream, thread in made if stream is not None]
     if outputs.recorder is not None:

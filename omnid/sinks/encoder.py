@@ -22,9 +22,25 @@ from omnid.transport.sensor_codec import gyro_cdr, wheel_cdr
 from omnid.transport.status_names import NAVIGATION, ODOMETRY, PLACES, Key, Stats, entry
 from omnid.transport.topics import MAP_POSE, PUBLISHED, SCAN
 
+
+class StatusReport(NamedTuple):
+    """The entries of all parts of a run, or of some."""
+
+    stamp_ns: int
+    statuses: Sequence[DiagnosticStatus]
+
+
 Outgoing: TypeAlias = (
-    OdometryUpdate | VelocityCommand | MapUpdate | PlaceUpdate | GridUpdate | ObstacleRing | NavigationUpdate
+    OdometryUpdate
+    | VelocityCommand
+    | MapUpdate
+    | PlaceUpdate
+    | GridUpdate
+    | ObstacleRing
+    | NavigationUpdate
+    | StatusReport
 )
+
 
 UnixTime: TypeAlias = Callable[[int], int]  # returns the Unix time of a stamp [ns]
 
@@ -90,6 +106,8 @@ class Encoder:
                 grid = message.grid
                 payload = codec.grid_cdr(stamp_ns, "map", grid.cells, grid.cell_m, grid.corner)
                 yield OutgoingMessage.on("map", payload)
+            case StatusReport():
+                yield OutgoingMessage.on("status", codec.diagnostics_cdr(stamp_ns, message.statuses))
             case NavigationUpdate():
                 status = entry(NAVIGATION, navigation_stats(message))
                 yield OutgoingMessage.on("navigation", codec.diagnostics_cdr(stamp_ns, [status]))
@@ -179,12 +197,7 @@ class Changes:
             status = DiagnosticStatus.of(ODOMETRY, level, message.state, values)
         else:
             return
-        yield status_report(self._encode.unix_ns(message.stamp_ns), [status])
-
-
-def status_report(stamp_ns: int, statuses: Sequence[DiagnosticStatus]) -> OutgoingMessage:
-    """Return statuses as one encoded message."""
-    return OutgoingMessage.on("status", codec.diagnostics_cdr(stamp_ns, statuses))
+        yield from self._encode(StatusReport(message.stamp_ns, [status]))
 
 
 def _most_confident(points: MapPoints, count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Final, TypeAlias
+from typing import TypeAlias
 
 from drivers.frame import Frame
 from drivers.logs.mcap_writer import LogWriter
@@ -14,14 +12,11 @@ from drivers.logs.rotating_log import RotatingLog, RotatingLogState
 from omnid.engine.robot_clock import SegmentTime, log_time
 from omnid.errors import OmnidError
 from omnid.messages import OdometryUpdate
-from omnid.sinks.encoder import Changes, Encoder, Outgoing, OutgoingMessage, status_report
-from omnid.transport.codec import DiagnosticStatus
+from omnid.sinks.encoder import Changes, Encoder, Outgoing, OutgoingMessage
 from omnid.transport.sensor_codec import image_cdr, image_topic
 from omnid.transport.topics import ros_name
 
 Recorded: TypeAlias = Frame | Outgoing
-
-_PENDING: Final = 256  # messages of other threads that may wait
 
 
 class SingleLog:
@@ -78,7 +73,6 @@ class Recorder:
         self._log, self._robot, self._encode = log, robot, encode
         self._time, self._skip_invalid = time or SegmentTime(log_time()), skip_invalid
         self._changes = None if encode is None else Changes(encode)
-        self._added: deque[tuple[Sequence[DiagnosticStatus], int]] = deque(maxlen=_PENDING)
         self._files = 0
         self.newest_ns = 0
         self.invalid = 0
@@ -99,7 +93,6 @@ class Recorder:
         # 1. A step of the computer's clock begins a new file: within one, all times are those of one clock.
         if self._time.is_over():
             self._log.end_file()
-        self._write_added()
         # 2. The message, and what changes with it.
         stamp_ns, encode = self._time.unix_ns(message.stamp_ns), self._encode
         try:
@@ -118,21 +111,9 @@ class Recorder:
                 raise
             self.invalid += 1
 
-    def add(self, statuses: Sequence[DiagnosticStatus], stamp_ns: int) -> None:
-        """Record statuses with a stamp as those of other messages; from any thread."""
-        self._added.append((statuses, stamp_ns))
-
     def close(self) -> None:
-        """Write the messages that were added and complete the last file; a second call does nothing."""
-        self._write_added()
+        """Complete the last file; a second call does nothing."""
         self._log.close()
-
-    def _write_added(self) -> None:
-        while self._added:
-            statuses, stamp_ns = self._added.popleft()
-            unix_ns = self._time.unix_ns(stamp_ns)
-            with suppress(OmnidError):  # the computer's clock may be set to a time that no message can hold
-                self._write([status_report(unix_ns, statuses)], unix_ns)
 
     def _write(self, messages: Iterable[OutgoingMessage], stamp_ns: int) -> None:
         for topic, schema, payload in messages:
