@@ -56,14 +56,13 @@ class RealtimeSettings:
     ] = 500
 
 
-def prepare(config: RealtimeSettings) -> list[str]:
-    """Apply the settings of the process, after the wiring and before the run; return a line per refused setting."""
+def prepare(config: RealtimeSettings) -> str:
+    """Apply the settings of the process, after the wiring and before the run; return what is refused, else ""."""
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     gc.collect()
     gc.freeze()  # what exists at the start is not examined again
     limit_realtime_runs(config.longest_run_ms)
-    refused = lock_memory() if config.lock_memory else ""
-    return [refused] if refused else []
+    return lock_memory() if config.lock_memory else ""
 
 
 class ThreadStart:

@@ -161,11 +161,6 @@ PERIOD_SHARE: Final = 0.9  # Longest exposure by the images' period: the rest re
 AFTER_PERIODS: Final = 1.5  # from a pair to the request: both cameras then carry it out after the same pair
 # Means beyond which images of cameras that regulate themselves are reported.
 DARK_GREY, WHITE_GREY = TARGET / 4, SATURATED - TARGET / 4
-ADVICE: Final[Mapping[str, str]] = {
-    "too dark": "switch lights on, drive more slowly and raise cameras.exposure_limit_ms, or clean the mirrors; where "
-    'the images are bright enough, set cameras.auto_exposure = "on"',
-    "too bright": "shade the mirrors, or put a filter before the lenses",
-}
 
 
 class ExposureControl:
@@ -220,11 +215,11 @@ class ExposureControl:
             state, setting = self._law.state, self._law.setting
             gain = "" if setting.gain is None else setting.gain
             stats |= {"exposure_ms": setting.exposure_us * 1e-3, "steps": self._law.steps, "gain": gain}
-            stats["_reason"] = "exposure time and gain are at their limits" if state in ADVICE else ""
+            stats["_reason"] = "" if state == "regulated" else "exposure time and gain are at their limits"
         else:
             is_dark, is_white = min(lower.mean, upper.mean) < DARK_GREY, max(lower.mean, upper.mean) > WHITE_GREY
             state = "too dark" if is_dark else "too bright" if is_white else "regulated"
-        return stats | {"_state": state, "remedy": ADVICE.get(state, "")}
+        return stats | {"_state": state}
 
     def _request(self, setting: ExposureSetting | None, stamp_ns: int) -> None:
         """Ask both cameras for a setting; None: they regulate themselves."""

@@ -218,7 +218,7 @@ class LiveRun:
                 self._report(logging.INFO, _ready(config))
             # 3. The run, until a signal or a failure ends it.
             outputs.enter_context(opencv_in_one_thread())
-            for refused in () if robot.waits else prepare(config.realtime):
+            if not robot.waits and (refused := prepare(config.realtime)):
                 warn(refused)
             # What the first loop needs is imported while the first poses are computed.
             started(partial(import_module, "scipy.sparse.linalg"), "imports")

@@ -299,7 +299,9 @@ PARTS: Final[Mapping[str, Part]] = {
         ),
     ),
     EXPOSURE: Part(
-        "switch lights on, or set cameras.exposure_limit_ms",
+        "in the dark switch lights on, drive more slowly and raise cameras.exposure_limit_ms, or clean the mirrors; in "
+        "glare shade the mirrors, or put a filter before the lenses; where the images are good enough, set "
+        'cameras.auto_exposure = "on"',
         (
             (OK, lambda s: not s, "no images yet"),
             (WARN, lambda s: s["_state"] != "regulated", "{_state}: {_reason}"),
