@@ -16,6 +16,8 @@ import pytest
 from omnid.cli import limit_blas_threads
 from omnid.core.compiled import cache_folder, why_unusable
 from omnid.engine.kernel_cache import prepare_kernels
+from tests.ports import listening
+from tests.replay.command import Command
 from tests.replay.edited import images, save
 from tests.simulation import build, write_log
 
@@ -121,3 +123,16 @@ def default_signals() -> Iterator[None]:
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
+
+
+@pytest.fixture
+def omnid(capsys: pytest.CaptureFixture[str]) -> Command:
+    """Return the command line as a function."""
+    return Command(capsys)
+
+
+@pytest.fixture
+def taken_port() -> Iterator[int]:
+    """Yield a port on which a server listens."""
+    with listening() as port:
+        yield port

@@ -12,16 +12,9 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from omnid.config import Config, load_config
 from tests.omnid.transport.bus_fixtures import free_endpoint
 from tests.replay.command import Command
-
-
-@pytest.fixture
-def omnid(capsys: pytest.CaptureFixture[str]) -> Command:
-    return Command(capsys)
 
 
 def test_a_minimal_file_has_what_a_robot_needs_and_changes_nothing(omnid: Command, tmp_path: Path) -> None:
