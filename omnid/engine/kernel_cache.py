@@ -34,12 +34,17 @@ from omnid.errors import OmnidError
 KEPT_STATES: Final = 20  # other states whose code stays, 3 MB each: of other installations, and of earlier versions
 CHILDREN: Final = 2  # 480 MB with the program that waits, of the 768 that the service may have
 
+_prepared: set[str] = set()  # names of the modules whose functions are ready
+
 
 def prepare_kernels(report: Report = log) -> None:
     """Compile all functions, or read them from the disk; report compilations, and code that is not kept.
 
-    Where that was done, it is quick. Raises OmnidError where the system allows no code that is made at run time.
+    The second call and later ones do nothing. Raises OmnidError where the system allows no code that is made at run
+    time.
     """
+    if all(name in _prepared for name in _modules()):
+        return
     # 1. Without executable memory numba would end the program.
     if problem := why_no_code():
         raise OmnidError(
@@ -63,12 +68,7 @@ def prepare_kernels(report: Report = log) -> None:
             f"the compiled functions are not kept in {cache_folder()}: {reason}: this start took "
             f"{time.monotonic() - started_s:.0f} s longer; make that folder writable, or set OMNID_CACHE_DIR",
         )
-
-
-def read_kept_kernels() -> None:
-    """Read the functions that are on the disk: also in a thread of its own, before `prepare_kernels` does the rest."""
-    if (folder := kept_folder()) is not None:
-        compile_modules(_modules(), folder)
+    _prepared.update(_modules())
 
 
 def why_no_code() -> str:

@@ -20,6 +20,7 @@ from drivers.motor import VelocityCommand
 from omnid.config import Config
 from omnid.controller.link import DriveLink
 from omnid.controller.statistics import ARMED, ControllerState
+from omnid.core.compiled import kept_folder
 from omnid.core.control.arming import MANUAL, NO_ANSWER
 from omnid.core.control.command_sources import PLANNER
 from omnid.core.control.safety_rules import AWAITED, NO_POSE
@@ -29,7 +30,7 @@ from omnid.core.obstacles.unwatched import Unwatched
 from omnid.core.rig.rig_health import RigHealth
 from omnid.diagnostics.status import StatusCollector, image_stats, rig_stats, wheel_stats
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Stream, nothing
-from omnid.engine.kernel_cache import prepare_kernels, read_kept_kernels
+from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.logging_setup import Report
 from omnid.engine.realtime import ThreadStart, name_thread, prepare
 from omnid.engine.robot_clock import RobotClock, SegmentTime, fixed_offset, log_time
@@ -203,7 +204,7 @@ class LiveRun:
             with closing(robot.first_frames()) as frames:
                 geometry = session.geometry(rig, frames)
             loaded(None)
-            prepare_kernels()
+            prepare_kernels()  # which raises what has failed in the other thread
             # 2. The connections, and the stages between them.
             self._connected = True
             run_places = RunPlaces(config, geometry, warn)
@@ -445,6 +446,8 @@ def _ready(config: Config) -> str:
 def _load() -> None:
     """Prepare what the stages need while images are awaited; what fails is done, and reported, where it is used."""
     schemas = {topic.schema for topic in topics.PUBLISHED.values()} | set(topics.command_topics(()).values())
-    for load in (partial(compile_serialisers, schemas), read_kept_kernels):
-        with suppress(Exception):
-            load()
+    with suppress(Exception):
+        compile_serialisers(schemas)
+    with suppress(Exception):
+        if kept_folder() is not None:  # else they are compiled when the rig is known to be right
+            prepare_kernels()
