@@ -175,23 +175,20 @@ def wire(
         graph.sink("planner", drive, ways, thread=ways.thread)
 
     # 6. What is made leaves the run.
-    for name, counter in outputs.counters.items():
-        graph.sink(name, counter, poses, thread=poses.thread)
-    for name, to_wheels in outputs.rings.items():
-        if rings is not None:
-            graph.sink(name, to_wheels, rings, thread=rings.thread)
-    for name, pair_sink in outputs.pairs.items():
-        graph.sink(name, pair_sink, pairs, policy=NEWEST, depth=1, thread=BACKGROUND)
-    taken: list[tuple[dict[str, Any], Stream[Any] | None]] = [
-        (outputs.poses, poses),
-        (outputs.commands, commands),
-        (outputs.maps, maps),
-        (outputs.places, in_map),
+    taken: list[tuple[dict[str, Any], Stream[Any] | None, str]] = [
+        (outputs.counters, poses, poses.thread),
+        (outputs.rings, rings, "" if rings is None else rings.thread),
+        (outputs.poses, poses, BACKGROUND),
+        (outputs.commands, commands, BACKGROUND),
+        (outputs.maps, maps, BACKGROUND),
+        (outputs.places, in_map, BACKGROUND),
     ]
-    for sinks, stream in taken:
-        for name, sink in sinks.items():
-            if stream is not None:
-                graph.sink(name, sink, stream, thread=BACKGROUND)
+    for sinks, stream, thread in taken:
+        if stream is not None:
+            for name, sink in sinks.items():
+                graph.sink(name, sink, stream, thread=thread)
+    for name, sink in outputs.pairs.items():
+        graph.sink(name, sink, pairs, policy=NEWEST, depth=1, thread=BACKGROUND)
     made: list[tuple[str, Stream[Any] | None, str]] = [
         ("bus", poses, BUS),
         ("bus-drive", commands, BUS),
