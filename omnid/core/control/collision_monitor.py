@@ -333,9 +333,8 @@ class CollisionMonitor:
         share = min(first_s / self._settings.time_s, math.sqrt(2 * self._turn_deceleration * first_s / turn_radps))
         if speed_mps > 0.0:
             share = min(share, math.sqrt(2 * self._deceleration * speed_mps * first_s) / speed_mps)
-            if share < 1.0 and share * speed_mps < LEAST_MPS:
-                return 0.0
-        return min(1.0, share)
+        edge_mps = max(speed_mps, abs(motion.yaw_rate_radps) * self._outline.radius_m)
+        return 0.0 if share * edge_mps < min(LEAST_MPS, edge_mps) else min(1.0, share)
 
     def _stop_polygon(self, motion: Twist) -> Outline:
         """Return the outline with the distance to keep on the side to which the base moves, and at its sides."""
@@ -349,9 +348,10 @@ class CollisionMonitor:
 
         A new one may be anywhere within one sigma: two pairs show roughly where it goes. And a person who is passed may
         turn round: the base is at rest before that person, or a hidden one, reaches it across a gap g, with
-        `g = WALK_MPS (TURN_S + v / a)`. Persons behind the base do not count.
+        `g = WALK_MPS (TURN_S + v / a)`; who leaves lets it drive on slowly. Persons behind the base do not count.
         """
         settings, stop, speed_mps = self._settings, self._stop_polygon(motion), abs(motion.velocity_mps)
+        side = math.copysign(1.0, motion.velocity_mps)
         allowance = FREE
         for step in range(round(MOVING_S / MOVING_STEP_S)):
             ahead_s = step * MOVING_STEP_S
@@ -360,8 +360,13 @@ class CollisionMonitor:
             [(x, y)] = seen_from(pose, [(one.x_m + one.vx_mps * at_s, one.y_m + one.vy_mps * at_s)])
             if step == 0:
                 limit_mps = self._deceleration * ((self._outline.gap_m(x, y) - one.radius_m) / WALK_MPS - TURN_S)
-                if speed_mps > limit_mps and x * motion.velocity_mps > 0.0:
-                    allowance = self._capped(motion, max(settings.slow_mps, limit_mps), MOVING)
+                if speed_mps > limit_mps and side * x > -self._outline.rear_m:
+                    later_s = at_s + MOVING_STEP_S
+                    there = (one.x_m + one.vx_mps * later_s, one.y_m + one.vy_mps * later_s)
+                    [(later_x, later_y)] = seen_from(moved, [there])
+                    leaves_mps = (math.hypot(later_x, later_y) - math.hypot(x, y)) / MOVING_STEP_S
+                    least_mps = settings.slow_mps if leaves_mps > one.sigma_mps else 0.0
+                    allowance = self._capped(motion, max(least_mps, limit_mps), MOVING)
                 if self._outline.approach_mps(x, y, motion) <= TINY:
                     continue
             gap_m = stop.gap_m(x, y) - one.radius_m
