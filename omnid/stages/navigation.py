@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.se2_arrays import planar
-from omnid.core.control.collision_geometry import Outline, sector_edges_m
-from omnid.core.control.collision_monitor import CollisionSettings, unknown_ends
+from omnid.core.control.collision_monitor import CollisionSettings
 from omnid.core.frames import base_pose, in_outer_axes, of_base
 from omnid.core.mapping.range_scan import azimuths
 from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
+from omnid.core.navigation.floor_map import FloorMap
 from omnid.core.navigation.follower import STAND
 from omnid.core.navigation.forecast import forecast
 from omnid.core.navigation.navigator import RESUME, Navigation, Navigator
@@ -34,7 +34,7 @@ from omnid.core.navigation.requests import (
     may_begin_motion,
 )
 from omnid.core.navigation.settings import NavigationSettings
-from omnid.core.navigation.situation import NOWHERE, MapPosition, Situation, WheelState, refusal_to_drive
+from omnid.core.navigation.situation import MapPosition, Situation, WheelState, refusal_to_drive
 from omnid.errors import OmnidError
 from omnid.messages import NavigationPlan, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate, RequestAnswer
 from omnid.stages.routes import Routes, refusal_while_teaching
@@ -44,9 +44,7 @@ Array = NDArray[np.float64]
 NavigationInput: TypeAlias = OdometryUpdate | PlaceUpdate | ObstacleRing | WheelState | NavigationCommand
 
 REPEAT_NS = NS_PER_S  # the state is given again after that time, while nothing changes
-# Ends of the seen floor nearer than this are obstacles to a base that was stopped by one; at farther ones the floor is
-# merely no longer seen well. A base that stops has the end 0.4 m ahead, by the defaults of its outline.
-UNKNOWN_M = 1.2
+MAP_NS = 400_000_000  # between two rings that are added to the map of the floor
 RING_NS = 2_000_000_000  # older rings show nothing of now: the collision monitor then stops the base
 OVERTAKEN = "a later request has ended it: ask again"
 BEHIND_SHARE = -0.17  # cosine of the direction beyond which an obstacle is behind; 100 degrees
@@ -68,15 +66,14 @@ class NavigationStage:
         self._T_rig_base = se3.inverse(T_base_rig)
         self._wheels = WheelState(False, False)
         self._navigator = Navigator(settings, collision)
-        self._outline = Outline(collision.front_m, collision.rear_m, collision.half_width_m)
-        self._stop_m = collision.stop_m
+        self._collision = collision
         self._now: Situation | None = None
         self._in_map: MapPosition | None = None
         self._tie: tuple[int, Array] | None = None  # id of the newest keyframe, and its pose (3,) in the map
         self._reset_ns = -1  # stamp of the pose at which odometry began again
         self._ring: ObstacleRing | None = None
-        self._ring_points: Array = NOWHERE  # (N, 2) positions in odom of what the ring shows
-        self._unknown: Array = NOWHERE  # (N, 2) the same of near ends of the floor that it shows
+        self._ring_points: Array = np.zeros((0, 2))  # positions in odom of what the ring shows
+        self._floor, self._mapped_ns = FloorMap(self._collision), -MAP_NS
         self._seq = 0
         # Ids of the newest request to halt, and of that which began the newest drive: a request that waited for a file
         # may come after later ones.
@@ -96,8 +93,7 @@ class NavigationStage:
                 self._place(message)
                 return None
             case ObstacleRing():
-                self._ring, self._ring_points = message, _positions(message, message.ranges_m)
-                self._unknown = _positions(message, self._near_ends(message))
+                self._take_ring(message)
                 return None
             case WheelState():
                 self._wheels = message
@@ -110,6 +106,7 @@ class NavigationStage:
         self._seq = odometry.seq
         if self._now is not None and self._now.resets != odometry.reset_counter:
             self._in_map, self._reset_ns = None, odometry.stamp_ns
+            self._floor, self._mapped_ns = FloorMap(self._collision), -MAP_NS
         # 2. Put together where the base is and what is about it.
         T_odom_base, _, velocity, _ = of_base(odometry, self._T_base_rig)
         pose, speed_mps = planar(T_odom_base), float(velocity[0])
@@ -117,7 +114,7 @@ class NavigationStage:
         obstacles = None if ring is None else self._ring_points
         moving = None if ring is None else forecast(ring.moving, (odometry.stamp_ns - ring.stamp_ns) * S_PER_NS)
         nearest_m = (
-            math.inf if obstacles is None else room_ahead(pose, speed_mps, obstacles) - self._outline.half_width_m
+            math.inf if obstacles is None else room_ahead(pose, speed_mps, obstacles) - self._collision.half_width_m
         )
         self._now = now = Situation(
             odometry.stamp_ns,
@@ -130,7 +127,7 @@ class NavigationStage:
             self._in_map,
             obstacles,
             moving,
-            self._unknown,
+            self._floor,
             nearest_m,
         )
         # 3. Add the pose to a route that is being taught.
@@ -140,19 +137,16 @@ class NavigationStage:
         # 4. Steer.
         return self._update(self._navigator.step(now))
 
+    def _take_ring(self, ring: ObstacleRing) -> None:
+        self._ring, self._ring_points = ring, _positions(ring, ring.ranges_m)
+        if ring.stamp_ns - self._mapped_ns >= MAP_NS:
+            self._floor.add(planar(ring.T_odom_base), ring.ranges_m, ring.free_m)
+            self._mapped_ns = ring.stamp_ns
+
     def _young_ring(self, stamp_ns: int) -> ObstacleRing | None:
         """Return the newest ring; None if it is not young enough at that time."""
         ring = self._ring
         return ring if ring is not None and 0 <= stamp_ns - ring.stamp_ns <= RING_NS else None
-
-    def _near_ends(self, ring: ObstacleRing) -> NDArray[np.float32]:
-        """Return the ranges (SECTORS,) of near ends of the floor that a ring shows, NaN in other sectors."""
-        ends_m = np.full(len(ring.free_m), np.nan, np.float32)
-        edges_m = sector_edges_m(self._outline, len(ends_m))
-        for sector, free_m, _ in unknown_ends(ring.ranges_m.tolist(), ring.free_m.tolist(), self._stop_m):
-            if free_m < UNKNOWN_M:
-                ends_m[sector] = max(free_m, edges_m[sector])
-        return ends_m
 
     def _place(self, update: PlaceUpdate) -> None:
         if update.stamp_ns < self._reset_ns:

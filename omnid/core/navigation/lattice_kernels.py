@@ -49,7 +49,13 @@ def wave_front(cell_s: Doubles, left_s: Doubles) -> None:
 
 @compiled("(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[::1])", writes=())
 def search(
-    room_m: Doubles, cell_s: Doubles, left_s: Doubles, start: Doubles, moves: Doubles, discs_m: Doubles, limits: Doubles
+    room_m: Doubles,
+    cell_s: Doubles,
+    left_s: Doubles,
+    start: Doubles,
+    moves: Doubles,
+    discs_m: Doubles,
+    limits: Doubles,
 ) -> Doubles:
     """Return the fastest way (K, 4) of x, y, heading and move from a pose to where no time is left, empty without one.
 
@@ -57,10 +63,10 @@ def search(
     start (3,): x, y in cells, heading. moves (M, 4): signed way in cells, turn [rad], least time [s], kind (0: ahead,
     1: back, 2: turn). discs_m (3, D): centres ahead of the origin [cells] of the discs that cover what must be free in
     a move of each kind. limits: radius of the discs [m], time of a change of the kind [s], time left that counts as
-    none [s], heading at the end [rad], NaN for any.
+    none [s], heading at the end [rad], NaN for any, kind of the move that cannot be the first one, -1 for none.
     """
     size = len(room_m)
-    radius_m, change_s, done_s, end_rad = limits
+    radius_m, change_s, done_s, end_rad, barred = limits
     nodes = np.empty((MOST_NODES, 3))
     from_node = np.empty(MOST_NODES, np.int64)
     by_move = np.empty(MOST_NODES, np.int64)
@@ -91,6 +97,8 @@ def search(
         # 2. All moves from here.
         for k in range(len(moves)):
             along, turn, least_s, kind = moves[k]
+            if node == 0 and kind == barred:
+                continue
             middle = heading + 0.5 * turn
             to_x, to_y, to_heading = x + along * math.cos(middle), y + along * math.sin(middle), heading + turn
             r, c = round(to_y), round(to_x)

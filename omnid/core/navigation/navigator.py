@@ -1,30 +1,31 @@
 """State machine of the navigation: from requests and poses to setpoints, with the reason for each halt.
 
-Every end is a stop. Time is that of the poses. A drive in the frame map follows the corrections of the map.
+Every end is a stop. Time is that of the poses. A drive in the frame map follows the corrections of the map. A goal is
+driven to straight on where that way is free, a path along itself; else by a way of the planner, to the goal or back to
+the path. What moves is an obstacle where the base would meet it; what closes every way is waited for.
 """
 
 from __future__ import annotations
 
 import math
-from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib.se2_arrays import composed, relative
-from omnid.core.control.collision_monitor import UNKNOWN, CollisionSettings
+from omnid.core.control.collision_monitor import CollisionSettings
 from omnid.core.control.command_sources import PLANNER
 from omnid.core.control.heading_controller import Setpoint, wrap_angle
 from omnid.core.control.safety_rules import ASKED
+from omnid.core.navigation.floor_map import CELL_M
 from omnid.core.navigation.follower import BRAKE_SHARE, STAND, Follower, Following
-from omnid.core.navigation.forecast import Pace, yielding
-from omnid.core.navigation.path import SHORTEST_M, DrivePath, drive_path, goal_path
-from omnid.core.navigation.planner import BACK_MPS, Planner, distances
+from omnid.core.navigation.path import SHORTEST_M, DrivePath, goal_path
+from omnid.core.navigation.planner import Move, Planner, Surroundings, distances
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.settings import NavigationSettings
-from omnid.core.navigation.situation import NOWHERE, UNKNOWN_M, Situation, refusal_of_map, refusal_to_drive
+from omnid.core.navigation.situation import UNKNOWN_M, Situation, refusal_of_map, refusal_to_drive
 from omnid.navigation_state import NavigationState
 from omnid.tracking_state import MapState, TrackingState
 
@@ -34,54 +35,34 @@ PROGRESS_M, PROGRESS_RAD = 0.05, math.radians(5)  # A smaller motion is no progr
 STOPS: Final = 5  # A stop is sent at so many poses after the end of a drive, because one might be lost.
 LOOK_M: Final = 2.0  # Length of the way ahead in which obstacles are searched; a free place behind them in twice that.
 REJOIN_M: Final = 0.3  # Free length of the path behind an obstacle, at which a detour ends.
-AGAIN_NS: Final = 500_000_000  # between two searches
-MOST_WAYS: Final = 12  # Most ways that are tried without coming NEARER_M nearer to the end.
+# Between two searches where the way is blocked, and where it is free.
+AGAIN_NS, SHORTER_NS = 500_000_000, 2_000_000_000
+DOCK_M: Final = 0.5  # The last way to a goal is driven straight on.
+BETTER: Final = 0.8  # A way replaces one that is free only if it takes less than this share of its time.
+MOST_WAYS: Final = 6  # Most ways that are tried without coming NEARER_M nearer to the end.
 LONGEST_STEP_S: Final = 1.0  # A longer time between two poses counts as this, because a gap is no wait.
-# A person's two steps: after this progress the next block is a new one; least way back to a wider place; length of the
-# way past the block that must be free before the base comes again.
-NEARER_M: Final = 1.0
+NEARER_M: Final = 1.0  # After this progress the next block is a new one.
 ROUNDING_M: Final = 0.005  # Least change of the room between two points of a way.
-PASS_M: Final = 0.8  # room beside the outline in which a person passes
-# Least wait after a way back; its spread, so that two robots that met move at different times.
-REST_S, SPREAD_S = 3.0, 4
-# It goes on after this time in any case, to look; after twice the time when it is blocked again; at most so long.
-RETRY_S, LONGEST_RETRY_S = 10.0, 300.0
 
 RESUME: Final = "`omnid goto --resume` (it arms, too)"  # the one command after a fault or a pause
 AROUND: Final = "it looks for a way around an obstacle"
-GIVES_WAY: Final = "it drives back to let others pass"
 WAITS: Final = "it goes on by itself when the way is free"
 STANDS: Final = "something stands on the path"
 CROSSES: Final = "somebody or something crosses the path"
 
 
-class Place(NamedTuple):
-    """Where the base was, in odom, and where that is on its path."""
-
-    xy: tuple[float, float]
-    is_back: bool  # it came backwards
-    leg: int
-    s_m: float
-
-
-class Detour(NamedTuple):
-    """A way around something on the path."""
+@dataclass(slots=True)
+class Detour:
+    """A way of the planner, to the goal or back to the path."""
 
     follower: Follower  # in odom
+    time_s: float  # for all of it
     leg: int  # of the path, to which it leads back
     s_m: float  # on that leg
-    length_m: float
 
-
-@dataclass(slots=True)
-class Retreat:
-    """A blocked base drives back along the way that it came, lets others pass, and goes on (Place as in the trail)."""
-
-    follower: Follower | None  # the way back, in odom; None: it waits
-    ahead: Array  # (N, 2) in odom, from the end of the way back to the block and past it
-    least_s: float  # it goes on after this time if the way ahead is free
-    most_s: float  # and after this time in any case, to look
-    rested_s: float = 0.0
+    def is_at_end(self, following: Following) -> bool:
+        """True if the base has driven it; what is missing is less than the distance of points of a path."""
+        return following.done or following.left_m < SHORTEST_M
 
 
 @dataclass(slots=True)
@@ -95,7 +76,7 @@ class Drive:
     resets: int
     command_ns: int = 0  # stamp of the request
     paused: str = ""  # reason of the pause; empty: it is not paused
-    waits: dict[NavigationState, float] = field(default_factory=dict)  # durations [s] of the waits by their reason
+    waited_s: float = 0.0  # for the pose in the map
     halts: int = 0  # WheelState.halts at the start, or when a person let it go on
     unlocalised_m: float = 0.0  # distance driven since the pose in the map was known
     localised_ns: int = -1  # stamp of that pose
@@ -105,14 +86,16 @@ class Drive:
     blocked_s: float = 0.0  # time for which no way was found since the base has come nearer to the end
     last_xy: Array | None = None  # last position in odom
     detour: Detour | None = None  # None: it follows the path
-    retreat: Retreat | None = None  # None unless the base gives way now
     least_m: float = math.inf  # least length of the way that was left, in steps of NEARER_M
-    gave_way: int = 0  # number of times that the base gave way since then
-    ways: int = 0  # number of ways that were found since then, each of which was blocked again
-    around_unknown: bool = False  # floor that was not seen has stopped the base: it is an obstacle until it is passed
+    ways: int = 0  # number of ways that were taken since then, each of which was blocked again
     searched_ns: int = -AGAIN_NS  # stamp of the last search
     no_way: str = ""  # why it was in vain
-    is_waiting: bool = False  # a way around is known that is longer than what it has waited is worth
+    is_waiting: bool = False  # a way around is known that takes longer than what it has waited is worth
+
+    @property
+    def on_way(self) -> Follower:
+        """Follower of the detour or the path."""
+        return self.follower if self.detour is None else self.detour.follower
 
     def in_odom(self, xy: Array, now: Situation) -> Array:
         """Return points (N, 2) of the path in odom."""
@@ -120,14 +103,19 @@ class Drive:
         path = composed(np.repeat(T_odom_frame[None], len(xy), 0), np.column_stack([xy, np.zeros(len(xy))]))
         return np.asarray(path[:, :2])
 
+    def ahead(self, now: Situation, way_m: float) -> Array:
+        """Return the points (N, 2) of the way ahead, in odom."""
+        xy = self.on_way.ahead(way_m).xy
+        return xy if self.detour is not None else self.in_odom(xy, now)
+
     def step(self, now: Situation) -> Following:
         """Return the motion along the path or the detour, in odom; at its end the path goes on."""
         motion = now.speed_mps, now.yaw_rate_radps, now.obstacle_m
         if self.detour is not None:
             following = self.detour.follower.step(now.stamp_ns, now.pose, *motion)
-            if not following.done and following.left_m >= SHORTEST_M:
+            if not self.detour.is_at_end(following):
                 return following
-            self.rejoin(now, self.detour.leg, self.detour.s_m)
+            self.rejoin(now)
         following = self.follower.step(now.stamp_ns, now.pose_in(self.frame), *motion)
         heading_rad = following.setpoint.heading_rad
         if heading_rad is None:
@@ -136,12 +124,17 @@ class Drive:
         setpoint = replace(following.setpoint, heading_rad=wrap_angle(heading_rad - turned_rad))
         return following._replace(setpoint=setpoint)
 
-    def rejoin(self, now: Situation, leg: int, s_m: float) -> None:
-        """Follow the path from a place on it; to a goal straight on."""
-        path, self.detour, self.nearest_m = self.paths[0], None, math.inf
+    def take(self, found: Detour) -> None:
+        """Follow a way of the planner from now on."""
+        self.detour, self.nearest_m = found, math.inf
+
+    def rejoin(self, now: Situation) -> None:
+        """Follow the path from where the detour leads to; to a goal straight on."""
+        path, detour, self.nearest_m = self.paths[0], self.detour, math.inf
+        leg, s_m = (0, 0.0) if detour is None else (detour.leg, detour.s_m)
         if path.is_goal:
             path, leg, s_m = goal_path(now.pose_in(self.frame), path.goal, path.final_heading_rad), 0, 0.0
-        self.follower = Follower(path, self.follower.settings, leg, s_m, now.speed_mps)
+        self.detour, self.follower = None, Follower(path, self.follower.settings, leg, s_m, now.speed_mps)
 
     def stands_since_s(self, pose: Array, left_m: float, dt_s: float) -> float:
         """Return the time since the last progress, which is a shorter way left or a turn; dt_s: since the last call."""
@@ -171,8 +164,7 @@ class Navigator:
         self._settings = settings
         collision = collision or CollisionSettings()
         self._planner = Planner(settings, collision)
-        self._front_m, self._rear_m, self._stop_m = collision.front_m, collision.rear_m, collision.stop_m
-        self._trail: deque[Place] = deque(maxlen=max(2, math.ceil(settings.give_way_m / SHORTEST_M) + 1))
+        self._stands_m = collision.front_m + 2 * collision.stop_m  # where it waits, from the first point of a block
         self._last_ns: int | None = None
         self._stops = 0  # number of stops that are still to be sent
         self.drive: Drive | None = None
@@ -190,16 +182,9 @@ class Navigator:
         self, task: str, frame: NavigationFrame, paths: list[DrivePath], now: Situation, command_ns: int = 0
     ) -> None:
         """Begin a drive, which replaces the one before."""
-        self._trail.clear()
+        follower, heading_rad = Follower(paths[0], self._settings), float(now.pose[2])
         self.drive = Drive(
-            task,
-            frame,
-            paths,
-            Follower(paths[0], self._settings),
-            now.resets,
-            command_ns,
-            halts=now.wheels.halts,
-            heading_rad=float(now.pose[2]),
+            task, frame, paths, follower, now.resets, command_ns, halts=now.wheels.halts, heading_rad=heading_rad
         )
         self.task, self.command_ns, self._stops = task, command_ns, 0
         self.state, self.reason = NavigationState.DRIVING, ""
@@ -222,8 +207,7 @@ class Navigator:
         refusal = refusal_to_drive(now, NavigationFrame.ODOM, math.inf)
         if not refusal:
             self.drive.paused, self.drive.halts = "", now.wheels.halts
-            self.drive.waits.clear()
-            self.drive.stuck_s = 0.0
+            self.drive.waited_s = self.drive.stuck_s = 0.0
         return refusal
 
     def step(self, now: Situation) -> Navigation:
@@ -242,34 +226,26 @@ class Navigator:
         halt = self._halt(drive, now)
         if halt is not None:
             return self._wait(drive, *halt, dt_s)
-        # 3. Giving way, while it lasts.
-        if drive.retreat is not None:
-            return self._give_way(drive, drive.retreat, now, dt_s)
-        # 4. The way.
+        # 3. The way.
         following = drive.step(now)
         if following.done:
             return self._finished(drive, following.missed_m)
-        if (failed := self._taken_away(following)) is not None:
-            return failed
+        if abs(following.offset_m) > self._settings.corridor_m + self._planner.room_m:
+            return self._failed(f"{abs(following.offset_m):.1f} m beside the path: drive back to it and ask again")
         if following.left_m < drive.least_m - NEARER_M:
-            drive.least_m, drive.gave_way, drive.ways, drive.blocked_s = following.left_m, 0, 0, 0.0
-        # 5. Obstacles on it, and a safety rule that holds the wheels because of one.
-        held_by = now.wheels.held_by
-        drive.around_unknown |= held_by == UNKNOWN
+            drive.least_m, drive.ways, drive.blocked_s = following.left_m, 0, 0.0
+        # 4. Obstacles on it, and a safety rule that holds the wheels because of one.
         following, setpoint, reason = self._around_obstacles(drive, now, following)
-        drive.around_unknown &= drive.detour is not None or bool(held_by)
+        held_by = now.wheels.held_by
         if setpoint is None or held_by:  # where it is held, the setpoint is still sent: the monitor lets go by itself
             return self._blocked(drive, reason if setpoint is None else held_by, now, following, dt_s, setpoint)
-        # 6. Progress: where it is missing for too long, the base gives way or the drive fails.
+        # 5. Progress: where it is missing for too long, the drive fails.
         avoids = drive.detour is not None
-        if self._is_stuck(drive, now, following, dt_s):
-            if avoids and not drive.gave_way and self._begins_to_give_way(drive, now):
-                return self._wait(drive, NavigationState.BLOCKED, AROUND, dt_s)
+        if drive.stands_since_s(now.pose, following.left_m, dt_s) > self._settings.stuck_s:
             return self._no_progress(now, AROUND if avoids else "")
         self.state = NavigationState.AVOIDING if avoids else NavigationState.DRIVING
         self.reason = now.wheels.reason if now.wheels.is_held else reason
-        if not drive.stuck_s:  # a base that only creeps up to what blocks it waits on
-            drive.waits.clear()
+        drive.waited_s = 0.0
         return Navigation(setpoint, self.state, self.reason, following.left_m, following.offset_m)
 
     def _idle(self) -> Navigation:
@@ -288,19 +264,14 @@ class Navigator:
             drive.paused = f"disarmed: {by}: see to it, then {RESUME}"
 
     def _advance(self, drive: Drive, now: Situation) -> None:
-        """Add the pose to the trail, and its way to that without a pose in the map; begin again after a reset."""
+        """Add the way since the last pose to that without a pose in the map; begin again after a reset."""
         moved_m = 0.0 if drive.last_xy is None else float(np.hypot(*(now.pose[:2] - drive.last_xy)))
         drive.last_xy = now.pose[:2].copy()
         drive.unlocalised_m += moved_m
         if drive.resets != now.resets:
-            self._trail.clear()
-            drive.retreat = drive.detour = None
-            drive.resets, drive.unlocalised_m = now.resets, math.inf
+            drive.detour, drive.resets, drive.unlocalised_m = None, now.resets, math.inf
             if drive.frame is NavigationFrame.ODOM:
                 self._end(NavigationState.FAILED, "odometry has lost its map and begun again: ask again")
-        xy = float(now.pose[0]), float(now.pose[1])
-        if drive.retreat is None and (not self._trail or math.dist(xy, self._trail[-1].xy) >= SHORTEST_M):
-            self._trail.append(Place(xy, now.speed_mps < 0, *drive.follower.place))
         in_map = now.in_map
         if in_map is None or in_map.stamp_ns <= drive.localised_ns:  # no new pose in the map has come
             return
@@ -328,10 +299,10 @@ class Navigator:
         """Stand and count the time; fail where the pose in the map is missing for too long."""
         if self.drive is None:
             return self._idle()
-        drive.waits[state] = drive.waits.get(state, 0.0) + dt_s
-        longest_s = self._settings.unlocalised_s
-        if state is NavigationState.NOT_LOCALISED and drive.waits[state] > longest_s:
-            return self._failed(f"{state} for {longest_s:g} s: {reason}")
+        if state is NavigationState.NOT_LOCALISED:
+            drive.waited_s += dt_s
+            if drive.waited_s > self._settings.unlocalised_s:
+                return self._failed(f"{state} for {self._settings.unlocalised_s:g} s: {reason}")
         self.state, self.reason = state, reason
         setpoint = None if state is NavigationState.PAUSED else STAND
         return Navigation(setpoint, state, reason)
@@ -340,185 +311,123 @@ class Navigator:
         self, drive: Drive, now: Situation, following: Following
     ) -> tuple[Following, Setpoint | None, str]:
         """Return progress, motion and the reason why it is slower than wanted; no motion where no way is free."""
-        wanted, on_way = following.setpoint, drive.detour.follower if drive.detour else drive.follower
-        if now.obstacles is None or on_way.aligns:
+        around, wanted = self._surroundings(now), following.setpoint
+        if around is None or drive.on_way.aligns:
             return following, wanted, ""
-        # 1. What moves: the speed at which it has passed; who comes to where the base would wait counts as standing.
-        obstacles, share = now.obstacles, 1.0
-        path = self._ahead(drive, now, LOOK_M)
-        pursuit = self._settings.pursuit
-        if now.moving is not None and wanted.velocity_mps > 0:
-            standing_m = max(self._planner.room_m, self._front_m, self._rear_m)
-            moving_m = max(self._planner.room_m + self._settings.clearance_m, self._front_m + self._stop_m)
-            speed_mps = max(now.speed_mps, 0.0)
-            pace = Pace(speed_mps, pursuit.velocity_mps, pursuit.acceleration_mps2, moving_m, standing_m)
-            share, coming = yielding(self._ahead(drive, now, 2 * LOOK_M), on_way.leg_left_m, now.moving, pace)
-            outlines = now.moving.outlines(coming, now.pose[:2], pursuit.velocity_mps)
-            obstacles = np.vstack([now.moving.others(obstacles), outlines])
-        # 2. The way is left where it is blocked, also by floor that was not seen, if there is a way around that.
-        room_m = self._planner.room_m + (0.0 if drive.detour else self._settings.clearance_m)
-        around = np.vstack([obstacles, now.unknown]) if drive.around_unknown else obstacles
-        first_m = first_blocked_m(path, obstacles, room_m)
-        is_held = drive.detour is not None and bool(now.wheels.held_by)
-        is_blocked = is_held or first_m < math.inf or first_blocked_m(path, around, room_m) < math.inf
-        if is_blocked and now.stamp_ns - drive.searched_ns >= AGAIN_NS:
-            drive.searched_ns = now.stamp_ns
-            found = self._search(drive, now, around)
-            if found is None and drive.around_unknown and first_m < math.inf:
-                found = self._search(drive, now, obstacles)
-            # A long way round is taken once as much time was lost by waiting: nobody knows when the way is free again,
-            # and so at most twice the least time is lost (the ski rental problem).
-            worth_m = LOOK_M + pursuit.velocity_mps * drive.blocked_s
-            drive.is_waiting = found is not None and found.length_m - following.left_m > worth_m
-            if found is not None and not drive.is_waiting:
-                drive.detour, drive.nearest_m, drive.ways = found, math.inf, drive.ways + 1
-                following = drive.step(now)
-                return following, following.setpoint, CROSSES if share < 1.0 else ""
-        elif not is_blocked and drive.detour is not None and self._can_go_straight(drive, now, around):
-            drive.rejoin(now, drive.detour.leg, drive.detour.s_m)
+        # 1. Where the way is blocked another one is searched, and where that to a goal may be shorter by now.
+        room_m = self._planner.room_m + (self._settings.clearance_m if drive.detour is None else 0.0)
+        first_m = first_blocked_m(drive.ahead(now, LOOK_M), around.obstacles, room_m)
+        is_blocked = first_m < math.inf or bool(now.wheels.held_by)
+        if self._takes_other_way(drive, now, around, following, is_blocked=is_blocked):
             following = drive.step(now)
             wanted = following.setpoint
-        # 3. Without a way around it, drive up to the obstacle and wait.
-        left_m = first_m - self._front_m - 2 * self._stop_m
+            first_m = first_blocked_m(drive.ahead(now, LOOK_M), around.obstacles, self._planner.room_m)
+        # 2. Without a way around it, drive up to the obstacle and wait.
+        left_m = first_m - self._stands_m
         if left_m <= 0 and wanted.velocity_mps > 0:
-            return following, None, STANDS
-        if share == 0.0:
-            return following, None, CROSSES
-        if share < 1.0:
-            return following, _slower(wanted, share * pursuit.velocity_mps), CROSSES
-        return following, _slower(wanted, math.sqrt(2 * BRAKE_SHARE * pursuit.acceleration_mps2 * max(left_m, 0.0))), ""
+            return following, None, STANDS if now.moving is None else CROSSES
+        braking_mps = math.sqrt(2 * BRAKE_SHARE * self._settings.pursuit.acceleration_mps2 * max(left_m, 0.0))
+        return following, _slower(wanted, braking_mps), ""
 
-    def _ahead(self, drive: Drive, now: Situation, way_m: float) -> Array:
-        """Return the points (N, 2) of the way ahead, in odom."""
-        if drive.detour is not None:
-            return drive.detour.follower.ahead(way_m).xy
-        return drive.in_odom(drive.follower.ahead(way_m).xy, now)
+    def _takes_other_way(
+        self, drive: Drive, now: Situation, around: Surroundings, following: Following, *, is_blocked: bool
+    ) -> bool:
+        """True if the base takes another way from now on.
 
-    def _search(self, drive: Drive, now: Situation, obstacles: Array) -> Detour | None:
-        """Return a way around what is on the path; None without one."""
-        settings, path = self._settings, drive.paths[0]
-        if not settings.corridor_m:
+        A long way round, where the path or who moves was in the way, is taken once as much time was lost by waiting:
+        nobody knows when the way is free again, and so at most twice the least time is lost (the ski rental problem).
+        """
+        detour, settings = drive.detour, self._settings
+        is_to_goal = detour is not None and drive.paths[0].is_goal
+        if is_to_goal and not is_blocked and self._can_go_straight(drive, now, around):
+            drive.rejoin(now)
+            return True
+        is_due = is_blocked or (is_to_goal and following.left_m > DOCK_M)
+        passed_ns = now.stamp_ns - drive.searched_ns
+        if not is_due or not settings.corridor_m or passed_ns < (AGAIN_NS if is_blocked else SHORTER_NS):
+            return False
+        drive.searched_ns = now.stamp_ns
+        barred = _kind(following.setpoint) if now.wheels.held_by else None
+        found = self._search(drive, now, around, barred)
+        drive.is_waiting = False
+        if not isinstance(found, str) and is_blocked and drive.ways >= MOST_WAYS:
+            found = f"{drive.ways} ways were tried"
+        if isinstance(found, str):
+            drive.no_way = found
+            return False
+        if is_blocked:
+            free_s = self._planner.free_s(now.pose, drive.ahead(now, following.left_m), around)
+            may_leave = detour is None or now.moving is not None
+            worth_s = free_s + LOOK_M / settings.pursuit.velocity_mps + drive.blocked_s
+            drive.is_waiting = may_leave and found.time_s > worth_s
+            if drive.is_waiting:
+                return False
+            drive.ways += 1
+        elif detour is not None:
+            left_s = detour.time_s * following.left_m / max(detour.follower.path.length_m, SHORTEST_M)
+            if found.time_s > BETTER * left_s:
+                return False
+        drive.take(found)
+        return True
+
+    def _surroundings(self, now: Situation) -> Surroundings | None:
+        """Return what is about the base; what moves is an obstacle where the base would meet it."""
+        if now.obstacles is None:
             return None
-        # 1. Where it leads: to the goal, or to the path behind the obstacle.
+        obstacles = now.obstacles
+        if now.moving is not None:
+            meetings = now.moving.meetings(now.pose[:2], self._settings.pursuit.velocity_mps)
+            obstacles = np.vstack([now.moving.others(obstacles), meetings])
+        return Surroundings(obstacles, now.floor)
+
+    def _search(self, drive: Drive, now: Situation, around: Surroundings, barred: Move | None) -> Detour | str:
+        """Return a way to the goal, or to the path behind what is on it; why there is none otherwise."""
+        settings, path = self._settings, drive.paths[0]
+        place, corridor, heading_rad = (0, 0.0), None, math.nan
         if path.is_goal:
-            goal, corridor, heading_rad = drive.in_odom(path.goal[None], now)[0], None, math.nan
-            place = 0, 0.0
+            goal = drive.in_odom(path.goal[None], now)[0]
         else:
             ahead = drive.follower.ahead(2 * LOOK_M)
             corridor = drive.in_odom(ahead.xy, now)
-            k = _behind(corridor, obstacles, self._planner.room_m + settings.clearance_m)
+            k = _behind(corridor, around.obstacles, self._planner.room_m + settings.clearance_m)
             if k is None:
-                drive.no_way = "the path is not free within sight"
-                return None
+                return "the path is not free within sight"
             goal, place = corridor[k], (int(ahead.legs[k]), float(ahead.s[k]))
             leg = path.legs[min(place[0], len(path.legs) - 1)]
             heading_rad = leg.at(place[1])[2] + (math.pi if leg.backwards else 0.0)
             heading_rad -= float(now.T_frame_odom(drive.frame)[2])
-        # 2. The way.
-        if drive.ways >= MOST_WAYS:
-            drive.no_way = f"{drive.ways} ways were tried"
-            return None
-        found = self._planner.way(now.pose, goal, obstacles, corridor, heading_rad)
+        found = self._planner.way(now.pose, goal, around, corridor, heading_rad, barred)
         if isinstance(found, str):
-            drive.no_way = found
-            return None
-        return Detour(Follower(found, settings, speed_mps=now.speed_mps), *place, found.length_m)
+            return found
+        return Detour(Follower(found.path, settings, speed_mps=now.speed_mps), found.time_s, *place)
 
-    def _can_go_straight(self, drive: Drive, now: Situation, obstacles: Array) -> bool:
-        """True if the goal is ahead and nothing is on the straight way to it."""
-        path = drive.paths[0]
-        if not path.is_goal:
-            return False
-        straight = goal_path(now.pose, drive.in_odom(path.goal[None], now)[0]).legs[0]
+    def _can_go_straight(self, drive: Drive, now: Situation, around: Surroundings) -> bool:
+        """True if the goal is ahead and nothing is on the straight way to it, with a cell to spare."""
+        straight = goal_path(now.pose, drive.in_odom(drive.paths[0].goal[None], now)[0]).legs[0]
         aside_rad = abs(wrap_angle(float(straight.heading[0] - now.pose[2])))
-        room_m = self._planner.room_m + self._settings.clearance_m
+        room_m = self._planner.room_m + self._settings.clearance_m + CELL_M
+        obstacles = around.obstacles
+        if around.floor is not None:
+            obstacles = np.vstack([obstacles, around.floor.closed(now.pose)])
         return aside_rad < math.pi / 4 and math.isinf(first_blocked_m(straight.xy, obstacles, room_m))
 
     def _blocked(
         self, drive: Drive, reason: str, now: Situation, following: Following, dt_s: float, setpoint: Setpoint | None
     ) -> Navigation:
-        """Wait for a free way, and give way where that takes too long; end where no way leads to a goal."""
-        if self._gives_up(drive, dt_s):
+        """Wait for a free way; fail if for too long none leads to a goal. Paths and routes never give up."""
+        drive.blocked_s += dt_s
+        if drive.paths[0].is_goal and not drive.is_waiting and 0 < self._settings.give_up_s < drive.blocked_s:
             why = reason if setpoint is not None else drive.no_way or reason
             return self._failed(f"no way to the goal, {following.left_m:.1f} m are left: {why}")
         waiting = self._wait(drive, NavigationState.BLOCKED, f"{reason}: {WAITS}", dt_s)
-        if drive.waits[NavigationState.BLOCKED] > self._settings.give_way_s:
-            self._begins_to_give_way(drive, now)
         if setpoint is not None:
             waiting = waiting._replace(setpoint=setpoint)
         return waiting._replace(left_m=following.left_m, offset_m=following.offset_m)
 
-    def _gives_up(self, drive: Drive, dt_s: float) -> bool:
-        """True if for too long no way leads to a goal; paths and routes never give up."""
-        drive.blocked_s += dt_s
-        return drive.paths[0].is_goal and not drive.is_waiting and 0 < self._settings.give_up_s < drive.blocked_s
-
-    def _begins_to_give_way(self, drive: Drive, now: Situation) -> bool:
-        """Begin to drive back along the trail; False where there is no free way back, or it is switched off."""
-        drive.waits[NavigationState.BLOCKED] = drive.stuck_s = 0.0
-        if now.obstacles is None:
-            return False
-        room_m, places = self._planner.room_m, [*reversed(self._trail)]
-        xy = np.array([now.pose[:2], *(place.xy for place in places)])
-        ways = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
-        # 1. As far as it is free now, and no farther than is wanted.
-        free_m = first_blocked_m(xy, now.obstacles, room_m)
-        last = int(np.searchsorted(ways, min(free_m - ROUNDING_M, self._settings.give_way_m), side="right"))
-        # 2. Up to the next place where others can pass.
-        is_wide = (distances(xy[:last], now.obstacles) > room_m + PASS_M) & (ways[:last] >= NEARER_M)
-        last = int(np.argmax(is_wide)) + 1 if is_wide.any() else last
-        if last < 2 or ways[last - 1] < self._front_m:
-            return False
-        # 3. There it waits, the longer the more often it has gone back.
-        came_back = [places[0].is_back] * 2 + [place.is_back for place in places]
-        path = drive_path(
-            xy[:last], speeds=np.full(last, BACK_MPS), backwards=[not is_back for is_back in came_back[:last]]
-        )
-        drive.retreat = Retreat(
-            Follower(path, self._settings),
-            np.vstack([xy[:last][::-1], self._ahead(drive, now, NEARER_M)]),
-            REST_S + now.stamp_ns // 1_000_000_000 % SPREAD_S,
-            min(RETRY_S * 2.0**drive.gave_way, LONGEST_RETRY_S),
-        )
-        drive.gave_way, drive.nearest_m = drive.gave_way + 1, math.inf
-        return True
-
-    def _give_way(self, drive: Drive, retreat: Retreat, now: Situation, dt_s: float) -> Navigation:
-        """Drive back, wait, and go on. All in odom."""
-        if self._gives_up(drive, dt_s):
-            return self._failed(f"no way to the goal, {drive.least_m:.1f} m are left: {drive.no_way or STANDS}")
-        obstacles = NOWHERE if now.obstacles is None else now.obstacles
-        # 1. Back, as far as it is seen to be free now.
-        if retreat.follower is not None:
-            following = retreat.follower.step(now.stamp_ns, now.pose, now.speed_mps, now.yaw_rate_radps)
-            if (failed := self._taken_away(following)) is not None:
-                return failed
-            is_there = following.done or following.left_m < SHORTEST_M
-            path = retreat.follower.ahead(NEARER_M).xy
-            is_free = math.isinf(first_blocked_m(path, obstacles, self._planner.room_m))
-            if not is_there and is_free and now.obstacles is not None and not now.wheels.held_by:
-                if self._is_stuck(drive, now, following, dt_s):
-                    return self._no_progress(now, GIVES_WAY)
-                self.state, self.reason = NavigationState.AVOIDING, GIVES_WAY
-                return Navigation(following.setpoint, self.state, self.reason, drive.least_m)
-            retreat.follower = None
-        # 2. Wait until the way is free, or it is time to look again.
-        retreat.rested_s += dt_s
-        nearest = int(np.argmin(np.hypot(*(retreat.ahead - now.pose[:2]).T)))
-        room_m = self._planner.room_m + self._settings.clearance_m
-        is_free = bool((distances(retreat.ahead[nearest:], obstacles) >= room_m).all())
-        if retreat.rested_s < (retreat.least_s if is_free else retreat.most_s):
-            return self._wait(drive, NavigationState.BLOCKED, f"it gives way: {WAITS}", dt_s)
-        # 3. Go on from there.
-        nearest_place = min(self._trail, key=lambda place: math.dist(place.xy, now.pose[:2]))
-        drive.rejoin(now, nearest_place.leg, nearest_place.s_m)
-        drive.retreat = None
-        drive.waits.clear()
-        return Navigation(STAND, self.state, self.reason, drive.least_m)
-
-    def _is_stuck(self, drive: Drive, now: Situation, following: Following, dt_s: float) -> bool:
-        """True if for too long the base has neither come nearer to the end nor turned."""
-        return drive.stands_since_s(now.pose, following.left_m, dt_s) > self._settings.stuck_s
+    def _no_progress(self, now: Situation, does: str) -> Navigation:
+        why = now.wheels.reason if now.wheels.is_held else does
+        words = f"no progress for {self._settings.stuck_s:g} s", why, "look at the robot"
+        return self._failed(": ".join(word for word in words if word))
 
     def _finished(self, drive: Drive, missed_m: float) -> Navigation:
         """Begin the next path, or end."""
@@ -531,18 +440,6 @@ class Navigator:
             return self._failed(f"the goal is missed by {100 * missed_m:.1f} cm")
         self._end(NavigationState.REACHED, "")
         return self._idle()._replace(left_m=0.0)
-
-    def _taken_away(self, following: Following) -> Navigation | None:
-        """Fail where the base is no longer near its path, for example because an operator has taken it away."""
-        offset_m = abs(following.offset_m)
-        if offset_m <= self._settings.corridor_m + self._planner.room_m:
-            return None
-        return self._failed(f"{offset_m:.1f} m beside the path: drive back to it and ask again")
-
-    def _no_progress(self, now: Situation, does: str) -> Navigation:
-        why = now.wheels.reason if now.wheels.is_held else does
-        words = f"no progress for {self._settings.stuck_s:g} s", why, "look at the robot"
-        return self._failed(": ".join(word for word in words if word))
 
     def _failed(self, reason: str) -> Navigation:
         self._end(NavigationState.FAILED, reason)
@@ -580,6 +477,13 @@ def _behind(path: Array, obstacles: Array, room_m: float) -> int | None:
         elif ways[k] - ways[min(free_from, k)] >= REJOIN_M or k == len(path) - 1:
             return k
     return None
+
+
+def _kind(setpoint: Setpoint) -> Move:
+    """Return the kind of a motion."""
+    if setpoint.velocity_mps == 0.0:
+        return Move.TURN
+    return Move.AHEAD if setpoint.velocity_mps > 0.0 else Move.BACK
 
 
 def _slower(wanted: Setpoint, speed_mps: float) -> Setpoint:

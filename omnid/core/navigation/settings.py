@@ -32,7 +32,8 @@ class NavigationSettings:
 
     REMOVED = MappingProxyType(
         {
-            "give_way_s": "a blocked robot waits 4 s before it drives back",
+            "give_way_s": "a blocked robot waits where it is, or goes around",
+            "give_way_m": "a blocked robot waits where it is, or goes around",
             "unlocalised_m": "it drives 3 m in the map by odometry alone",
             "reach_m": "goals and paths begin within 100 m",
         }
@@ -48,10 +49,6 @@ class NavigationSettings:
         "monitor demands (controller.collision), m",
     ] = 0.1
     corridor_m: float = 0.8  # how far beside the path it may go around obstacles, m; 0: it stays on it and waits
-    give_way_s: float = 4.0  # wait for a free way before it drives back along its own; then it waits twice as long, s
-    give_way_m: Annotated[
-        float, Meta(ge=0, le=20), "how far it drives back at most, m; 0: it stays where it is blocked"
-    ] = 3.0
     stuck_s: float = 15.0  # wait for progress, with the way free, before it fails, s
     give_up_s: Annotated[
         float, Meta(ge=0, le=86400), "a goal that no way leads to fails after so long, s; 0: it waits for ever"

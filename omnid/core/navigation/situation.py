@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from calib.se2_arrays import composed
 from omnid.core.control.safety_rules import COMMAND_STALE, IDLE
+from omnid.core.navigation.floor_map import FloorMap
 from omnid.core.navigation.forecast import Forecast
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.tracking_state import MapState, TrackingState
 
 Array = NDArray[np.float64]
 
-NOWHERE: Final = np.zeros((0, 2))
 # A larger sigma says that the pose in the map is not known at all, because it is a kilometre then.
 UNKNOWN_M: Final = 100.0
 
@@ -61,7 +61,7 @@ class Situation(NamedTuple):
     in_map: MapPosition | None = None  # None: nothing is known yet
     obstacles: Array | None = None  # (N, 2) positions in odom, m; None: none are known
     moving: Forecast | None = None  # those of them that move
-    unknown: Array = NOWHERE  # (N, 2) near ends of the floor that was seen, in odom
+    floor: FloorMap | None = None  # what is known of it in odom; None: all counts as seen
     obstacle_m: float = math.inf  # distance of the outline from the nearest obstacle that is not behind the base
 
     def T_frame_odom(self, frame: NavigationFrame) -> Array:

@@ -47,7 +47,7 @@ from tests.omnid.stages.test_navigation import fixed_map
 Array = NDArray[np.float64]
 TICK_S, TICKS_A_POSE = 0.02, 5
 SETTINGS = ControllerSettings(arming=MANUAL, motion=MotionSettings(check=False), collision=CollisionSettings())
-NAVIGATION = NavigationSettings(give_way_s=2.0, stuck_s=3.0, unlocalised_m=0.5, unlocalised_s=2.0)
+NAVIGATION = NavigationSettings(stuck_s=3.0, unlocalised_m=0.5, unlocalised_s=2.0)
 DEPTH: Any = None  # the stage reads none
 UNIT = np.eye(6) * 1e-6
 AZIMUTHS = -math.pi + (np.arange(360) + 0.5) * math.tau / 360

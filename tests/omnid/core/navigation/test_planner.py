@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from omnid.core.control.collision_monitor import CollisionSettings, ControllerRing
 from omnid.core.navigation.navigator import WAITS, Navigator
 from omnid.core.navigation.path import DrivePath, drive_path, goal_path, straight_leg
-from omnid.core.navigation.planner import Planner
+from omnid.core.navigation.planner import Planner, Surroundings, Way
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import Situation
@@ -20,7 +20,7 @@ from tests.omnid.core.navigation.driven_base import DrivenBase
 
 Array = NDArray[np.float64]
 AZIMUTHS = -math.pi + (np.arange(360) + 0.5) * math.tau / 360
-SETTINGS = NavigationSettings(give_way_m=0.0)
+SETTINGS = NavigationSettings()
 OUTLINE = CollisionSettings()
 
 
@@ -132,7 +132,7 @@ def test_goes_on_when_the_way_becomes_free() -> None:
 
 
 def test_without_a_corridor_it_stays_on_the_path() -> None:
-    base = drive(Boxes((2.5, -0.2, 2.9, 0.2)), 3, NavigationSettings(give_way_m=0.0, corridor_m=0.0))
+    base = drive(Boxes((2.5, -0.2, 2.9, 0.2)), 3, NavigationSettings(corridor_m=0.0))
     base.run(60, lambda answer: answer.state is NavigationState.BLOCKED, rest_s=20.0)
     assert base.samples[-1].navigation.state is NavigationState.BLOCKED
     assert max(abs(float(sample.pose[1])) for sample in base.samples) < 0.1
@@ -186,8 +186,9 @@ def test_a_way_can_be_driven_and_leads_to_the_goal_or_to_the_edge_of_the_grid(
     boxes: Boxes, start: tuple[float, float, float], goal: tuple[float, float], backwards: list[bool]
 ) -> None:
     pose = np.array(start)
-    way = Planner(SETTINGS, OUTLINE).way(pose, np.array(goal), ring_points(boxes, pose))
-    assert isinstance(way, DrivePath)
+    found = Planner(SETTINGS, OUTLINE).way(pose, np.array(goal), Surroundings(ring_points(boxes, pose)))
+    assert isinstance(found, Way)
+    way = found.path
     assert list(dict.fromkeys(leg.backwards for leg in way.legs)) == backwards
     xy = np.vstack([leg.xy for leg in way.legs])
     assert min(boxes.clearance_m(place) for place in xy) > OUTLINE.half_width_m + OUTLINE.side_m - 0.02
@@ -201,13 +202,13 @@ def test_a_way_can_be_driven_and_leads_to_the_goal_or_to_the_edge_of_the_grid(
 )
 def test_where_no_way_leads_it_says_what_is_in_the_way(goal: tuple[float, float], reason: str) -> None:
     pose = np.zeros(3)
-    found = Planner(SETTINGS, OUTLINE).way(pose, np.array(goal), ring_points(ROOM, pose))
+    found = Planner(SETTINGS, OUTLINE).way(pose, np.array(goal), Surroundings(ring_points(ROOM, pose)))
     assert isinstance(found, str) and reason in found
 
 
-def to_goal(boxes: Boxes, x_m: float, y_m: float, settings: NavigationSettings = SETTINGS) -> BaseAmongBoxes:
+def to_goal(boxes: Boxes, x_m: float, y_m: float) -> BaseAmongBoxes:
     """Begin to drive to a goal, by any way."""
-    base = BaseAmongBoxes(Navigator(settings), 1)
+    base = BaseAmongBoxes(Navigator(SETTINGS), 1)
     base.boxes = boxes
     base.navigator.start("goal", NavigationFrame.ODOM, [goal_path(base.pose, (x_m, y_m), 0.0)], base.seen())
     return base
@@ -227,11 +228,8 @@ def test_a_goal_is_reached_through_a_door_out_of_a_dead_end_and_around_a_wall(
 
 @pytest.mark.hazard("H31")
 @pytest.mark.parametrize("goal", [(4.0, 0.0), (30.0, 15.0)])
-@pytest.mark.parametrize("settings", [SETTINGS, NavigationSettings()])
-def test_a_goal_that_cannot_be_reached_ends_with_what_is_in_the_way(
-    goal: tuple[float, float], settings: NavigationSettings
-) -> None:
-    base = to_goal(ROOM, *goal, settings)
+def test_a_goal_that_cannot_be_reached_ends_with_what_is_in_the_way(goal: tuple[float, float]) -> None:
+    base = to_goal(ROOM, *goal)
     answer = base.run(60)
     assert answer.state is NavigationState.FAILED and base.t_s < 45.0
     assert answer.reason.startswith("no way to the goal, ") and "closes every way" in answer.reason

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from omnid.core.control.collision_monitor import UNKNOWN, ControllerRing, unknown_ends
+from omnid.core.control.collision_monitor import UNKNOWN, ControllerRing
+from omnid.core.navigation.floor_map import FloorMap
 from omnid.core.navigation.navigator import Navigator
-from omnid.core.navigation.path import DrivePath, straight_leg
+from omnid.core.navigation.path import goal_path
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.situation import Situation
 from omnid.navigation_state import NavigationState
 from tests.omnid.core.navigation.driven_base import DrivenBase
-from tests.omnid.core.navigation.test_planner import AZIMUTHS, OUTLINE, SETTINGS, Boxes, clearance_m
+from tests.omnid.core.navigation.test_planner import OUTLINE, SETTINGS, Boxes, clearance_m
 
 SEEN_M = 2.0  # Floor is seen so far.
 
@@ -23,36 +25,31 @@ class BaseAmongPatches(DrivenBase):
 
     def __init__(self, patches: Boxes) -> None:
         super().__init__(Navigator(SETTINGS), 1)
-        self.boxes = patches
-        path = DrivePath((straight_leg((0.0, 0.0), (5.0, 0.0)),), 0.0)
-        self.navigator.start("goal", NavigationFrame.ODOM, [path], self.seen())
+        self.boxes, self.floor = patches, FloorMap(OUTLINE)
+        self.navigator.start("goal", NavigationFrame.ODOM, [goal_path(self.pose, (5.0, 0.0), 0.0)], self.seen())
 
     def seen(self) -> Situation:
         now = super().seen()
-        free_m = np.minimum(self.boxes.ring(self.pose), SEEN_M)
-        ranges_m = np.full(360, np.inf)
+        free_m, ranges_m = np.minimum(self.boxes.ring(self.pose), SEEN_M), np.full(360, np.inf)
         self.law.take(ControllerRing(now.stamp_ns, tuple(ranges_m.tolist()), tuple(free_m.tolist())))
-        near = [end.sector for end in unknown_ends(ranges_m.tolist(), free_m.tolist(), OUTLINE.stop_m)]
-        near = [k for k in near if free_m[k] < 1.2]
-        angles = AZIMUTHS[near] + self.pose[2]
-        ends = self.pose[:2] + free_m[near, None] * np.column_stack([np.cos(angles), np.sin(angles)])
-        return now._replace(obstacles=np.zeros((0, 2)), unknown=ends)
+        self.floor.add(self.pose, ranges_m, free_m)
+        return now._replace(obstacles=np.zeros((0, 2)), floor=self.floor)
 
 
+@pytest.mark.hazard("H31")
 def test_a_patch_that_stays_unknown_is_passed_beside_it() -> None:
     base = BaseAmongPatches(Boxes((2.4, -0.15, 2.7, 0.2)))
     assert base.run(90, rest_s=0.3).state is NavigationState.REACHED
-    answers = [sample.navigation for sample in base.samples]
-    assert any(UNKNOWN in answer.reason for answer in answers), "it was stopped first"
-    assert any(answer.state is NavigationState.AVOIDING for answer in answers)
+    assert any(sample.navigation.state is NavigationState.AVOIDING for sample in base.samples)
     assert clearance_m(base) > 0.0
 
 
-def test_where_no_floor_is_seen_across_the_way_the_base_waits_and_says_so() -> None:
-    base = BaseAmongPatches(Boxes((2.4, -3.0, 2.7, 3.0)))
-    base.run(30, lambda answer: answer.state is NavigationState.BLOCKED, rest_s=5.0)
-    answer = base.samples[-1].navigation
-    assert answer.state is NavigationState.BLOCKED and UNKNOWN in answer.reason
+@pytest.mark.hazard("H31")
+def test_where_no_floor_is_seen_across_the_way_the_drive_ends_and_says_so() -> None:
+    base = BaseAmongPatches(Boxes((2.4, -9.0, 2.7, 9.0)))
+    answer = base.run(150)
+    assert answer.state is NavigationState.FAILED and " m are left" in answer.reason
+    assert UNKNOWN in answer.reason or "ways were tried" in answer.reason
     assert 0.05 < clearance_m(base) < 0.6 and abs(base.v) < 0.01
 
 
@@ -61,3 +58,14 @@ def test_the_base_drives_towards_floor_that_is_not_seen_yet() -> None:
     base = BaseAmongPatches(Boxes())
     assert base.run(60).state is NavigationState.REACHED
     assert not any(sample.navigation.state is NavigationState.AVOIDING for sample in base.samples)
+
+
+@pytest.mark.hazard("H31", "H32")
+def test_does_not_turn_where_the_floor_beside_it_is_unknown_and_backs_out() -> None:
+    """Nose to the end of a dead end whose walls are nearer than the floor in view: only the floor behind was seen."""
+    beside = Boxes((-0.6, 0.34, 0.9, 0.5), (-0.6, -0.5, 0.9, -0.34), (0.3, -0.4, 0.9, 0.4))
+    base = BaseAmongPatches(beside)
+    base.navigator.start("goal", NavigationFrame.ODOM, [goal_path(base.pose, (-2.0, 1.5))], base.seen())
+    assert base.run(60).state is NavigationState.REACHED
+    inside = [sample for sample in base.samples if sample.pose[0] > -0.5]
+    assert max(abs(float(sample.pose[2])) for sample in inside) < 0.2
