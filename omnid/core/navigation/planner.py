@@ -107,16 +107,17 @@ class Planner:
         at = (goal - corner) / CELL_M
         column, row = at.round().astype(int).tolist()
         is_inside = 0 <= row < SIDE and 0 <= column < SIDE
-        if is_inside and math.isinf(cell_s[row, column]):
-            # What looks from afar as if it stood at the goal may be beside it: as near as it is free, to look.
-            rows, columns = np.nonzero(np.isfinite(cell_s))
-            nearest = int(np.argmin(np.hypot(rows - at[1], columns - at[0])))
-            there = corner + CELL_M * np.array([columns[nearest], rows[nearest]])
-            if math.dist(goal, pose[:2]) < math.dist(goal, there) + LOOK_M:
-                return f"something stands {_nearest_m(goal, around):.1f} m from the goal"
-            goal, row, column = there, int(rows[nearest]), int(columns[nearest])
-        if is_inside:
+        is_free = is_inside and math.isfinite(cell_s[row, column])
+        if is_free:
             left_s[row, column] = 0.0
+        elif is_inside:
+            # What looks from afar as if it stood at the goal may be beside it: as near as it is free, to look.
+            rows, columns = np.indices((SIDE, SIDE))
+            away_m = CELL_M * np.hypot(rows - at[1], columns - at[0])
+            least_m = float(away_m[np.isfinite(cell_s)].min())
+            if math.dist(goal, pose[:2]) < least_m + LOOK_M:
+                return f"something stands {_nearest_m(goal, around):.1f} m from the goal"
+            left_s[np.isfinite(cell_s) & (away_m < least_m + 2 * CELL_M)] = 0.0
         elif along is None:
             rows, columns = np.mgrid[:SIDE, :SIDE]
             is_edge = np.zeros((SIDE, SIDE), bool)
@@ -137,7 +138,7 @@ class Planner:
         found = self._search(pose, corner, room_m, cell_s, left_s, heading_rad, barred)
         if len(found) == 0:
             return "the base does not fit through"
-        return self._way(pose, goal if is_inside else None, corner, found, cell_s)
+        return self._way(pose, goal if is_free else None, corner, found, cell_s)
 
     def free_s(self, pose: Array, xy: Array, around: Surroundings) -> float:
         """Return the time along points (N, 2) from a pose (3,) on, if nothing stood on them."""
