@@ -232,14 +232,17 @@ class ImageBreaks:
             self.covariance = self.covariance + found.angle_rad**2 * np.diag(np.repeat([range_m**2, 1.0], 3))
 
     def _flow(self, last: _View, pair: Pair, T_now: Array, step: Array, lag: float) -> _Flow | None:
-        """Return the flows of the last pair's landmarks; None: too few. lag: standard deviation in parts of a step."""
+        """Return the flows of the last pair's landmarks, None: too few, as most of them are not found.
+
+        lag: standard deviation in parts of a step.
+        """
         cylinder, baseline_m = self.model.cylinder, self.model.baseline_m
         before, now = (se3.apply(se3.inverse(T), last.points) for T in (last.T_odom_rect, T_now))
         views = tuple(view(points, cylinder, baseline_m) for points in (before, now))
         J_before, J_now = (view_jacobian(points, cylinder, baseline_m) for points in (before, now))
         of_step = np.concatenate([np.broadcast_to(-np.eye(3), (len(now), 3, 3)), se3.hat(now)], axis=2)
         of_point = J_now @ T_now[:3, :3].T - J_before @ last.T_odom_rect[:3, :3].T
-        parts = []
+        parts, sought = [], 0
         for camera, raw_image in enumerate(self.raws):
             # 1. Landmarks that both pairs show, and where they are instead of where the step puts them.
             own = [0, 1 + camera]
@@ -250,6 +253,7 @@ class ImageBreaks:
                 inside &= (pixels[:, 1] > EDGE_PX) & (pixels[:, 1] < cylinder.height - EDGE_PX)
                 inside &= cylinder.shows(pixels[:, 0])
             rows = np.flatnonzero(inside)
+            sought += len(rows)
             there, found = self._found_at(camera, last, pair, T_now, before[rows], rows, (start[rows], end[rows]))
             rows, d = rows[found], there[found] - end[rows[found]]
             d[:, 0] = cylinder.wrap(d[:, 0])
@@ -264,7 +268,7 @@ class ImageBreaks:
             shift, of_camera = np.concatenate([shift, turn], axis=2), np.full(len(rows), camera)
             parts.append(_Flow(d / px[:, None], null, shift, of_camera, raw[rows] / size, px))
         flow = _Flow(*(np.concatenate(part) for part in zip(*parts, strict=True)))
-        return flow if len(flow.y) >= 3 * LEAST else None
+        return flow if len(flow.y) >= max(3 * LEAST, sought / 2) else None
 
     def _found_at(
         self,
@@ -318,9 +322,15 @@ def _whole(flow: _Flow) -> _Whole:
 def likeliest_break(flow: _Flow, raws: tuple[RawImage, RawImage], focal_px: float) -> Break | None:
     """Return the likeliest break that flows show beyond doubt; None: there is none."""
     whole = _whole(flow)
-    if np.minimum(whole.squared, whole.outlier).sum() / whole.unit < DECIDING_COST + _cost(2, len(flow.y)):
+    all_gain = float(np.minimum(whole.squared, whole.outlier).sum()) / whole.unit
+    if all_gain < DECIDING_COST + _cost(2, len(flow.y)):
         return None  # no break explains more than all that is left
-    found = (each for kind, cameras in KINDS for each in _candidates(flow, whole, kind, cameras))
+    found = (
+        each
+        for kind, cameras in KINDS
+        for each in _candidates(flow, whole, kind, cameras)
+        if kind != "torn" or each.gain > LEAST_PART * all_gain  # six unknowns fit some of many wrong depths
+    )
     best = max(found, key=lambda each: each.gain, default=None)
     if best is None or best.gain < DECIDING_COST:
         return None
