@@ -10,7 +10,7 @@ which later views clear what has gone: Hornung et al. 2013, "OctoMap", section 3
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -83,7 +83,7 @@ SHIFT: Final = 4
 class ScanGrid:
     """Log odds of cells, drawn scan by scan; the oldest first, because later ones count more."""
 
-    def __init__(self, low: Array, high: Array, cell_m: float, max_cells: int = MAX_CELLS) -> None:
+    def __init__(self, low: Array, high: Array, cell_m: float, max_cells: int) -> None:
         """low, high: corners (2,) [m] of the area. The size of a cell is doubled until max_cells suffice."""
         while math.prod(np.floor(high / cell_m) - np.floor(low / cell_m) + 1) > max_cells:
             cell_m *= 2
@@ -155,16 +155,6 @@ class ScanGrid:
         return (int(low[0]), int(low[1]), int(high[0]), int(high[1])) if (low < high).all() else None
 
 
-def scan_grid(scans: Sequence[RangeScan], free_m: Sequence[FreeRanges], poses: Array, cell_m: float) -> ScanGrid:
-    """Return the grid of K scans, the oldest first; poses (K, 4, 4): those of their frames in the map."""
-    reach, xy = np.array([reach_m(scan) + cell_m for scan in scans])[:, None], poses[:, :2, 3]
-    low, high = (xy - reach, xy + reach) if len(scans) else (np.zeros((1, 2)), np.zeros((1, 2)))
-    drawn = ScanGrid(low.min(axis=0), high.max(axis=0), cell_m)
-    for scan, free, pose in zip(scans, free_m, poses, strict=True):
-        drawn.add(scan, free, float(pose[0, 3]), float(pose[1, 3]), math.atan2(pose[1, 0], pose[0, 0]))
-    return drawn
-
-
 def reach_m(scan: NDArray[np.floating]) -> float:
     """Return the largest known range of a scan [m], 0 without one."""
     return float(np.max(scan, where=np.isfinite(scan), initial=0.0))
@@ -234,10 +224,11 @@ class KeyframeScans:
 
 
 class KeyframeGrid:
-    """The grid; new scans are drawn into it, and all again where a keyframe has moved or left."""
+    """The grid; new scans are drawn into it, the oldest first, and all again where a keyframe has moved or left."""
 
-    def __init__(self, cell_m: float) -> None:
-        self._cell_m = cell_m
+    def __init__(self, cell_m: float, max_cells: int = MAX_LIVE_CELLS) -> None:
+        """max_cells: the size of a cell is doubled until they suffice."""
+        self._cell_m, self._max_cells = cell_m, max_cells
         self._drawn: dict[int, tuple[float, float, float]] = {}  # x, y [m], yaw [rad] of the keyframes in it
         self._area = np.array([[np.inf, np.inf], [-np.inf, -np.inf]])  # lowest and highest x, y [m]
         self._grid: ScanGrid | None = None
@@ -254,7 +245,7 @@ class KeyframeGrid:
         fits = bool((needed[0] >= self._area[0]).all() and (needed[1] <= self._area[1]).all())
         if self._grid is None or not fits or any(self._has_moved(id, planar.get(id)) for id in self._drawn):
             self._area = needed + np.array([[-MARGIN_M], [MARGIN_M]])
-            self._grid, self._drawn = ScanGrid(self._area[0], self._area[1], self._cell_m, MAX_LIVE_CELLS), {}
+            self._grid, self._drawn = ScanGrid(self._area[0], self._area[1], self._cell_m, self._max_cells), {}
             self.redrawn += 1
         for id, (x, y, yaw) in planar.items():
             if id not in self._drawn:

@@ -7,7 +7,7 @@ lines to anchors (section III.B); `semiglobal`, the default, searches near a sem
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal, Protocol, TypeVar
+from typing import Annotated, Literal, TypeVar
 
 import cv2
 import numpy as np
@@ -73,22 +73,12 @@ def edge_pixels(smoothed: Image, valid: Flags, threshold: int, limit: int) -> In
     return np.asarray(chosen[:: max(1, -(-len(chosen) // limit))])
 
 
-class CandidateSearch(Protocol):
-    """A method that chooses among candidates."""
-
-    def search(self, lower: Image, upper: Image, pixels: Indices, column_shift: ColumnShift | None) -> Matches:
-        """Return the matches of some pixels of the lower panorama (H, W) in the upper one.
-
-        column_shift: see Matcher.match; a method may ignore it.
-        """
-
-
 class Matcher:
     """Matches edges of the lower panorama in the upper one; keeps its buffers between pairs."""
 
     def __init__(self, shape: tuple[int, int], matching: MatchingSettings) -> None:
         self._matching, m = matching, matching
-        self._search: CandidateSearch
+        self._search: SemiGlobalSearch | ColumnSearch
         if m.method in ("auto", "semiglobal"):
             self._search = SemiGlobalSearch(shape, m.disparities, m.window_px, m.max_cost, LEFT_RIGHT_PX)
         else:
@@ -120,7 +110,7 @@ class ColumnSearch:
         self._volume = SadVolume(shape, matching.disparities, matching.window_px)
 
     def search(self, lower: Image, upper: Image, pixels: Indices, column_shift: ColumnShift | None) -> Matches:
-        """Return the pixels whose match the upper panorama confirms.
+        """Return the pixels whose match the upper panorama confirms; a column shift is ignored.
 
         Where the lines to anchors decided clearly, the match need only be one of the candidates of the upper pixel:
         repeated bricks mislead the SAD from either side.

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from omnid.core.mapping.range_scan import SECTORS, RangeScan, azimuths, seen_from
+from omnid.core.mapping.range_scan import SECTORS, FreeRanges, RangeScan, azimuths, seen_from
 from omnid.core.mapping.scan_grid import (
     FREE,
     MAX_CELLS,
@@ -16,8 +16,6 @@ from omnid.core.mapping.scan_grid import (
     Grid,
     KeyframeGrid,
     KeyframeScans,
-    known_part,
-    scan_grid,
 )
 from tests.omnid.core.mapping.rooms import OPEN, Array, box, pose, scan_of
 
@@ -25,9 +23,15 @@ ROOM = box((-3.0, -2.0), (4.0, 2.5))
 PATH = np.array([pose(x, 0.2 * x, 0.3 * x) for x in np.arange(-1.5, 1.5, 0.3)])
 
 
+def scan_grid(scans: Sequence[RangeScan], free_m: Sequence[FreeRanges], poses: Array, cell_m: float = 0.05) -> Grid:
+    """Return the grid of scans that are drawn at once."""
+    first, second = ({n: each.astype(np.float16) for n, each in enumerate(ranges)} for ranges in (scans, free_m))
+    return KeyframeGrid(cell_m, MAX_CELLS).draw(KeyframeScans(first, second, poses), np.eye(4))
+
+
 def grid_of(scans: Sequence[RangeScan], poses: Array, cell_m: float = 0.05) -> Grid:
     """Return the grid of scans with floor up to what they show."""
-    return scan_grid(scans, [OPEN] * len(scans), poses, cell_m).grid()
+    return scan_grid(scans, [OPEN] * len(scans), poses, cell_m)
 
 
 def at(grid: Grid, x: float, y: float) -> int:
@@ -35,7 +39,8 @@ def at(grid: Grid, x: float, y: float) -> int:
         int(np.floor(value / grid.cell_m)) - round(corner / grid.cell_m)
         for value, corner in zip((x, y), grid.corner, strict=True)
     )
-    return int(grid.cells[row, column])
+    height, width = grid.cells.shape
+    return int(grid.cells[row, column]) if 0 <= row < height and 0 <= column < width else UNKNOWN
 
 
 def near(grid: Grid, x: float, y: float) -> set[int]:
@@ -81,10 +86,10 @@ def test_what_no_scan_shows_is_free_nowhere_as_its_floor_is_not_seen() -> None:
     path = np.array([pose(x, 0, 0) for x in np.arange(-2.5, 7.0, 0.3)])
     walls, low = box((-3.5, -2.0), (8.0, 2.0)), box((0.0, 1.0), (0.4, 1.4))
     free_m = [np.minimum(seen_from(scan_of(np.concatenate([walls, low]), T), np.eye(4)), 3.0) for T in path]
-    grid = scan_grid([scan_of(walls, T) for T in path], free_m, path, 0.05)
+    grid = scan_grid([scan_of(walls, T) for T in path], free_m, path)
     inside = [(x, y) for x in np.arange(0.02, 0.4, 0.05) for y in np.arange(1.02, 1.4, 0.05)]
-    assert {at(grid.grid(), x, y) for x, y in inside} == {UNKNOWN}
-    assert {at(grid.grid(), x, 0.0) for x in np.arange(-2.5, 6.5, 0.1)} == {FREE}
+    assert {at(grid, x, y) for x, y in inside} == {UNKNOWN}
+    assert {at(grid, x, 0.0) for x in np.arange(-2.5, 6.5, 0.1)} == {FREE}
 
 
 def test_a_pole_thinner_than_a_cell_that_shows_no_range_is_not_free() -> None:
@@ -114,7 +119,7 @@ def test_views_that_something_narrow_ends_outvote_those_that_have_missed_it() ->
         scans.append(scan_of(ROOM, T))
         free_m.append(free)
     free_m[5][90] = -1.2  # to the right
-    grid = scan_grid(scans, free_m, path, 0.05).grid()
+    grid = scan_grid(scans, free_m, path)
     assert {at(grid, 0.2 + dx, 1.0 + dy) for dx in (-0.02, 0.02) for dy in (-0.02, 0.02)} == {UNKNOWN}
     assert {at(grid, 0.2 + dx, 1.0) for dx in (-0.3, 0.3)} | {at(grid, 0.2, y) for y in (0.7, 1.5)} == {FREE}
     assert {at(grid, path[5, 0, 3], y) for y in np.arange(-1.6, -0.5, 0.05)} == {FREE}
@@ -128,7 +133,7 @@ def test_what_is_narrow_is_cleared_by_near_views_that_pass_it_and_not_by_far_one
     for more, expected in ((0, UNKNOWN), (1, FREE)):
         views = seen + [(near_view, OPEN)] * more
         path = np.array([T for T, _ in views])
-        grid = scan_grid([scan_of(ROOM, T) for T in path], [free for _, free in views], path, 0.05).grid()
+        grid = scan_grid([scan_of(ROOM, T) for T in path], [free for _, free in views], path)
         assert at(grid, 0.2, 1.2) == expected and at(grid, 0.2, 0.8) == FREE
 
 
@@ -137,7 +142,7 @@ def test_what_is_narrow_and_hides_the_nearest_floor_in_view_may_stand_anywhere_b
     ended[SECTORS * 3 // 4 - 2 : SECTORS * 3 // 4 + 2] = -0.9  # to the left
     passed = np.array([pose(-0.4, 0, 0)] * 2)
     views = np.concatenate([passed, path])
-    grid = scan_grid([scan_of(ROOM, T) for T in views], [OPEN] * 2 + [ended] * 4, views, 0.05).grid()
+    grid = scan_grid([scan_of(ROOM, T) for T in views], [OPEN] * 2 + [ended] * 4, views)
     assert {at(grid, 0.2, 0.4), at(grid, 0.2, 0.6), at(grid, 0.2, 0.95)} == {UNKNOWN}
     assert {at(grid, 0.35, 0.6), at(grid, 0.05, 0.6), at(grid, 0.2, 1.2)} == {FREE}
 
@@ -175,16 +180,16 @@ def test_no_scan_is_no_map_and_a_large_area_gets_larger_cells() -> None:
 
 
 # The grid of keyframes that are added and moved: as one that is drawn at once, and drawn again only if it must be.
-SCANS = [scan_of(ROOM, T).astype(np.float16) for T in PATH]
+SCANS = [scan_of(ROOM, T) for T in PATH]
 T_BASE_RECT = pose(0.1, 0.0, np.pi / 2)
 
 
-def drawn_at_once(scans: list, poses: np.ndarray) -> Grid:
-    return known_part(grid_of([scan.astype(np.float32) for scan in scans], T_BASE_RECT @ poses))
+def drawn_at_once(scans: Sequence[RangeScan], poses: np.ndarray) -> Grid:
+    return grid_of(scans, T_BASE_RECT @ poses)
 
 
 def seen(count: int, poses: np.ndarray = PATH, first: int = 0) -> KeyframeScans:
-    return of({7 + n: SCANS[n] for n in range(first, count)}, poses[first:count])
+    return of({7 + n: SCANS[n].astype(np.float16) for n in range(first, count)}, poses[first:count])
 
 
 def of(scans: dict[int, np.ndarray], poses: np.ndarray) -> KeyframeScans:
