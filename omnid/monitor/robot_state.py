@@ -22,7 +22,7 @@ from omnid.utc import OTHER_CLOCK_NS
 LEVELS: Final = ("", "warning", "ERROR", "stale")  # of a status, by its number
 NO_POSE_S: Final = 2.0  # Without a pose for this time, state and rate of the last poses are no longer shown.
 _INBOX_DEPTH: Final = 2000
-_RATE_WINDOW: Final = 100  # poses
+_RECENT: Final = 100  # poses
 
 
 class ReceivedMessage(NamedTuple):
@@ -52,7 +52,8 @@ class RobotState:
         self.ends = 0  # number of times that the daemon's token disappeared
         self.age = Histogram()  # s, from the capture of a pose's images to its arrival; empty for a simulated clock
         self.network = Histogram()  # s, from the robot's network to the arrival of a pose
-        self._arrivals_s: deque[float] = deque(maxlen=_RATE_WINDOW)
+        self.recent: deque[Pose] = deque(maxlen=_RECENT)  # newest poses of the run: what is seen from one comes later
+        self._arrivals_s: deque[float] = deque(maxlen=_RECENT)
         self._forgotten = 0  # value of `ends` when the statuses were last forgotten
 
     def put(self, topic: str, payload: bytes, attachment: bytes) -> None:
@@ -115,6 +116,9 @@ class RobotState:
         """Count a pose. Skipped sequence numbers of a run are missed poses."""
         if self.pose is not None and pose.attachment.run == self.run:
             self.missed += max(0, pose.attachment.seq - self.pose.attachment.seq - 1)
+        else:
+            self.recent.clear()
+        self.recent.append(pose)
         self.pose = pose
         self.poses += 1
         self._arrivals_s.append(arrival_s)

@@ -13,7 +13,6 @@ import math
 import secrets
 import time
 from bisect import bisect
-from collections import deque
 from contextlib import suppress
 from http import HTTPStatus
 from typing import Any, Final
@@ -32,7 +31,6 @@ from omnid.web import snapshot
 PERIOD_S: Final = 0.03  # least time between two answers to a browser
 QUIET_S: Final = 0.5  # The state is sent after this time even without a message of the robot; between two connections
 WANTED_S: Final = 2.0  # The panorama is received for this time after a browser has asked for it.
-MOST_POSES: Final = 100  # Most poses that are kept: a scan arrives later than the pose of its images.
 MOST_POINTS: Final = 4000  # Most points of the path.
 _FINEST_M: Final = 0.02  # Points of the path are at least this far apart, so that a robot at rest adds none.
 NAVIGATION: Final = "navigation"
@@ -86,7 +84,6 @@ class RobotFeed:
         self._images: dict[str, bytes] = {}  # cells of the map, and the panorama
         self._changed = asyncio.Condition()
         self._wanted_until_s = -math.inf  # the panorama
-        self._poses: deque[Pose] = deque(maxlen=MOST_POSES)
         self._map_in_odom: list[float] | None = None
         self._large: dict[str, ReceivedMessage] = {}  # newest map, panorama ... that are not processed yet
         self._wake, self._large_wake = asyncio.Event(), asyncio.Event()
@@ -203,7 +200,7 @@ class RobotFeed:
                     self._add_to_path(pose, before)
                     before = pose
                 case PoseInMap() as in_map:
-                    self._map_in_odom = snapshot.map_in_odom(in_map, self._poses) or self._map_in_odom
+                    self._map_in_odom = snapshot.map_in_odom(in_map, self.state.recent) or self._map_in_odom
                 case Diagnostics():
                     self._set("parts", snapshot.parts_news(self.state))
                 case PlanarPath(frame=frame, xy=xy) if frame == snapshot.PATH_FRAME:
@@ -216,7 +213,6 @@ class RobotFeed:
         """Add a pose; another run has another odom."""
         if before is not None and pose.attachment.run != before.attachment.run:
             self.path.clear(self.version + 1)
-            self._poses.clear()
             self._map_in_odom = None
             self._images.clear()
             nothing = {
@@ -227,7 +223,6 @@ class RobotFeed:
             }
             for kind in nothing.keys() & self._news.keys():
                 self._set(kind, nothing[kind])
-        self._poses.append(pose)
         gap = before is not None and pose.attachment.resets != before.attachment.resets
         self.path.add(pose.x_m, pose.y_m, self.version + 1, gap=gap)
 
@@ -245,7 +240,7 @@ class RobotFeed:
         """Take a scan, a report of the navigation, a map or a panorama."""
         match await asyncio.to_thread(self.state.process, message):
             case Scan() as scan:
-                self._set(SCAN, snapshot.scan_news(scan, self._poses))
+                self._set(SCAN, snapshot.scan_news(scan, self.state.recent))
             case NavigationReport() as report:
                 self._set(NAVIGATION, snapshot.navigation_news(report))
             case Map() as grid:
