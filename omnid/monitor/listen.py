@@ -17,7 +17,6 @@ from omnid.engine.process import handle_stop_signals
 from omnid.monitor.robot_state import LEVELS, RobotState, importance
 from omnid.plain_text import plain
 from omnid.transport.bus_config import BusConfig
-from omnid.transport.codec import Pose
 from omnid.transport.session import Unreachable
 from omnid.transport.status_names import short_name
 
@@ -65,34 +64,38 @@ def print_state(robot: str, state: RobotState, out: IO[str] | None = None) -> No
         lines = fitted(status_table(robot, state), size.columns, size.lines)
         out.write(CLEAR + "\n".join(lines) + "\n")
     else:
-        out.write(summary_line(robot, state) + "\n")
+        out.write("  ".join(line.strip() for line in pose_lines(robot, state)) + "\n")
     out.flush()
 
 
-def summary_line(robot: str, state: RobotState) -> str:
-    """Return pose, rate, losses and latencies in one line."""
+def pose_lines(robot: str, state: RobotState) -> Iterator[str]:
+    """Yield the state, and where there is a pose its position, uncertainty, losses and latencies."""
     if state.pose is None:
-        return f"{robot}: {state.state}"
-    counts = f"{state.rate_hz:.1f} Hz  missed {state.missed}"
-    return f"{robot}: {state.state}  {_position(state.pose)}  {counts}  {_latencies(state)}"
+        yield f"{robot}: {state.state}"
+        return
+    pose, details = state.pose, state.pose.attachment
+    sigma = np.sqrt(np.maximum(0.0, pose.covariance.diagonal()))
+    yield f"{robot}: {state.state}  {state.rate_hz:.1f} poses/s"
+    yaw_deg = math.degrees(pose.yaw_rad)
+    yield f"  x {pose.x_m:+.3f} y {pose.y_m:+.3f} z {pose.z_m:+.3f} m  yaw {yaw_deg:+.2f} deg"
+    yield (
+        f"  1 sigma {1e3 * sigma[:3].max():.1f} mm, {math.degrees(sigma[3:].max()):.3f} deg; "
+        f"inliers {details.inliers} of {details.tracked}; resets {details.resets}"
+    )
+    # Ages and network latencies, median and 99th percentile; the pace of a simulation.
+    pace = [f"{plain(state.real_time_factor)} x real time"] if state.real_time_factor else []
+    named = (("age", state.age), ("network", state.network))
+    times = [f"{name} {1e3 * t_s.p(0.5):.1f}/{1e3 * t_s.p(0.99):.1f} ms" for name, t_s in named if t_s.count]
+    losses = f"missed {state.missed}  unreadable {state.broken}  not shown here {state.dropped}"
+    yield "  " + "  ".join([*pace, *times, losses])
 
 
 def status_table(robot: str, state: RobotState) -> Iterator[str]:
-    """Yield the state, the pose with its uncertainty, latencies, and a line for each part of the robot.
+    """Yield the lines of the pose, and a line for each part of the robot.
 
     Parts with a warning or an error come first, stages last: a small terminal shows what matters.
     """
-    rate = "" if state.pose is None else f"  {state.rate_hz:.1f} poses/s"
-    yield f"{robot}: {state.state}{rate}"
-    if state.pose is not None:
-        sigma = np.sqrt(np.maximum(0.0, state.pose.covariance.diagonal()))
-        details = state.pose.attachment
-        yield f"  {_position(state.pose)}"
-        yield (
-            f"  1 sigma {1e3 * sigma[:3].max():.1f} mm, {math.degrees(sigma[3:].max()):.3f} deg; "
-            f"inliers {details.inliers} of {details.tracked}; resets {details.resets}"
-        )
-        yield f"  {_latencies(state)}  missed {state.missed}  unreadable {state.broken}  not shown here {state.dropped}"
+    yield from pose_lines(robot, state)
     for status in sorted(state.statuses.values(), key=importance):
         values = "  ".join(f"{key} {value}" for key, value in status.values.items())
         yield plain(
@@ -107,16 +110,3 @@ def fitted(lines: Iterable[str], columns: int, rows: int) -> list[str]:
         return cut
     shown = max(1, rows - 2)
     return [*cut[:shown], f"  ... {len(cut) - shown} more; make the window higher"[:columns]]
-
-
-def _position(pose: Pose) -> str:
-    yaw_deg = math.degrees(pose.yaw_rad)
-    return f"x {pose.x_m:+.3f} y {pose.y_m:+.3f} z {pose.z_m:+.3f} m  yaw {yaw_deg:+.2f} deg"
-
-
-def _latencies(state: RobotState) -> str:
-    """Return ages and network latencies in ms, median and 99th percentile; the pace of a simulation."""
-    pace = [f"{plain(state.real_time_factor)} x real time"] if state.real_time_factor else []
-    named = (("age", state.age), ("network", state.network))
-    times = [f"{name} {1e3 * t_s.p(0.5):.1f}/{1e3 * t_s.p(0.99):.1f} ms" for name, t_s in named if t_s.count]
-    return "  ".join([*pace, *times])
