@@ -38,8 +38,7 @@ TARGET, LEAST_MEAN, SATURATED = 100.0, 60.0, 250.0
 # largest step. What is saturated is brighter than it shows by at least this factor.
 BAND: Final = math.sqrt(2)
 GAIN_STEPS: Final = 8  # The first step of the gain is its range by this number, since its unit is not known.
-# Time between two steps. A step against the last one doubles it, two steps in one direction reset it, against hunting.
-STEP_S, LONGEST_STEP_S = 0.5, 32.0
+STEP_S: Final = 0.5  # between two steps: the images must show the last one
 
 ExposureState = Literal["regulated", "too dark", "too bright"]
 
@@ -102,33 +101,33 @@ class ExposureLaw:
             self._gain_step = max(self._gains.step, (self._gains.high - self._gains.low) // GAIN_STEPS)
         self.setting = ExposureSetting(self._time(start.exposure_us), gain)
         self.state: ExposureState = "regulated"
-        self.steps = 0
+        self.steps = self._direction = 0
         self._next_ns: float = -math.inf
-        self._wait_s, self._direction = STEP_S, 0
 
     def step(self, lower: GreyLevels, upper: GreyLevels, stamp_ns: int) -> ExposureSetting | None:
         """Return the setting from now on; None where it stays. The levels are those of images at the stamp."""
         if stamp_ns < self._next_ns:
             return None
-        # 1. The factor on the light that is wanted, with a dead band.
-        factor = wanted_factor(lower, upper)
+        # 1. The factor on the light that is wanted, and the setting that is nearest to it, with a dead band.
+        factor, before = wanted_factor(lower, upper), self.setting
         direction = (factor >= BAND) - (factor <= 1 / BAND)
+        wanted = before
+        if direction:
+            wanted = self._raised(factor) if direction > 0 else self._lowered(factor)
+        # A coarse step of the time that leads farther beyond the wanted light than it is now would hunt.
+        made = wanted.exposure_us / before.exposure_us
+        hunts = wanted.gain == before.gain and abs(math.log(made)) > 2 * abs(math.log(factor))
         self.state = "regulated"
-        if not direction:
+        if not direction or hunts:
             return None
-        # 2. The setting that gives it; at the end of the range it stays.
-        wanted = self._raised(factor) if direction > 0 else self._lowered(factor)
-        if wanted == self.setting:
+        # 2. At the end of the range it stays.
+        if wanted == before:
             self.state = "too dark" if direction > 0 else "too bright"
             return None
-        # 3. Wait until the images show it; longer, and with smaller steps of the gain, after a step against the last.
-        if direction == -self._direction:
-            self._wait_s = min(2 * self._wait_s, LONGEST_STEP_S)
-            if self._gains is not None:
-                self._gain_step = max(self._gains.step, self._gain_step // 2)
-        elif direction == self._direction:
-            self._wait_s = STEP_S
-        self._direction, self._next_ns = direction, stamp_ns + self._wait_s / S_PER_NS
+        # 3. After a step against the last one, those of the gain, whose unit is not known, become smaller.
+        if direction == -self._direction and self._gains is not None:
+            self._gain_step = max(self._gains.step, self._gain_step // 2)
+        self._direction, self._next_ns = direction, stamp_ns + STEP_S / S_PER_NS
         self.setting, self.steps = wanted, self.steps + 1
         return wanted
 
