@@ -25,7 +25,6 @@ FRAMES_PER_VOXEL_FRAME = 10  # frames of the run for each frame required, up to 
 # its points up to 2.4 times as many are wrong where as much is seen (`tests.bench.accuracy --cloud`).
 SAME_VIEW_M, SAME_VIEW_TRACE = 0.03, 3 - math.radians(2) ** 2
 STANDING_NS = NS_PER_S  # Least time between two pairs of the same view that enter the map.
-FINEST_STEP_M = 0.001  # Least distance between two vertices of the path: a robot at rest adds none.
 STAMP_JITTER_NS = 5_000_000  # Tolerance of stamps: a period of the cameras that divides that of the map then does so.
 
 
@@ -40,7 +39,7 @@ class Mapping:
         self._config, self._dense = config, dense
         self._every_ns, self._given_ns = round(every_s * NS_PER_S), 0
         self._map = VoxelMap(config.voxel_m, config.max_voxels)
-        self._path = ThinnedPath(config.path_poses, FINEST_STEP_M)
+        self._path = ThinnedPath(config.path_poses, config.voxel_m)
         self._newest: tuple[int, int] | None = None
         self._min_gap_ns = round(NS_PER_S / config.rate_hz) if config.rate_hz else 0
         self._mapped: tuple[int, Array] | None = None  # stamp and pose of the last pair that entered the map
