@@ -45,11 +45,10 @@ from omnid.tracking_state import TrackingState
 from tests.bench.accuracy import position_errors, squared_errors
 from tests.bench.results import Cell, Column, ResultTable
 from tests.simulation import SimulatedRun, build, corridor, paths, write_log
-from tests.simulation.closed_worlds import repeating
+from tests.simulation.builders import repeating
 from tests.simulation.disturbances import DISTURBANCES, Disturbance
-from tests.simulation.logs import pack_log
+from tests.simulation.logs import PERIOD_NS, Readout, pack_log
 from tests.simulation.photographs import with_photographs
-from tests.simulation.readout import PERIOD_NS, Readout
 from tests.simulation.recipes import DIM, mild_rig
 from tests.simulation.rigs import lens, lens_rig
 

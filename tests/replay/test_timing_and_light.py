@@ -15,7 +15,7 @@ from omnid.recordings.evaluation import Metrics, evaluate
 from omnid.simulation.rendering.sensor import Sensor
 from omnid.tracking_state import TrackingState
 from tests.simulation import build, write_log
-from tests.simulation.readout import Readout
+from tests.simulation.logs import Readout
 from tests.simulation.recipes import DIM
 
 SEED, SIZE, PAIRS = 3, 512, 24

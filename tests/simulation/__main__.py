@@ -17,9 +17,8 @@ from pathlib import Path
 from calib.rig import ShutterTimes
 from calib.rig_file import write_rig
 from tests.simulation.disturbances import DISTURBANCES
-from tests.simulation.logs import write_log
+from tests.simulation.logs import Readout, write_log
 from tests.simulation.photographs import with_photographs
-from tests.simulation.readout import Readout
 from tests.simulation.recipes import DIM, RECIPES, build
 from tests.simulation.rigs import with_real_mirrors
 

@@ -14,8 +14,7 @@ from omnid.simulation.rendering.sensor import Sensor
 from omnid.simulation.rendering.surfaces import Scene
 from omnid.simulation.world import footprints
 from tests.simulation import paths
-from tests.simulation.builders import KEPT, corridor, room
-from tests.simulation.closed_worlds import bricks, ring, symmetric_room, twin_corridor, two_laps_path
+from tests.simulation.builders import KEPT, bricks, corridor, ring, room, symmetric_room, twin_corridor, two_laps_path
 from tests.simulation.rigs import make_rig
 
 TURN_DEG = 94.0

@@ -21,7 +21,7 @@ from omnid.core.rig.column_finding import RigState
 from omnid.messages import FramePair
 from tests.replay.edited import images, save
 from tests.simulation import build, write_log
-from tests.simulation.readout import Readout
+from tests.simulation.logs import Readout
 from tests.simulation.rigs import with_upper_rotated
 
 Turn = tuple[float, float, float]

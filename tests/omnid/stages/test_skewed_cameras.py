@@ -21,8 +21,8 @@ from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry
 from omnid.tracking_state import TrackingState
 from tests.simulation import MountedSensor, Sensor, build, corridor, render_grey, write_log
+from tests.simulation.logs import Readout
 from tests.simulation.paths import planar_poses
-from tests.simulation.readout import Readout
 from tests.simulation.rigs import make_rig, with_upper_rotated
 
 

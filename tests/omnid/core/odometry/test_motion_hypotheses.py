@@ -20,7 +20,7 @@ from omnid.core.places.relocalisation import Relocaliser
 from omnid.tracking_state import TrackingState
 from tests.omnid.core.scenery import RenderedCameras, motion_errors
 from tests.simulation import make_rig
-from tests.simulation.closed_worlds import repeating
+from tests.simulation.builders import repeating
 from tests.simulation.paths import planar_poses
 
 Array = NDArray[np.float64]

@@ -25,7 +25,7 @@ from omnid.core.places.relocalisation import Relocaliser
 from omnid.core.types.panorama import PaddedPanorama
 from tests.omnid.core.scenery import RenderedCameras, motion_errors, texture, wrapped
 from tests.simulation import corridor
-from tests.simulation.closed_worlds import twin_corridor
+from tests.simulation.builders import twin_corridor
 from tests.simulation.paths import planar_poses
 
 YAWS = np.array([0.0, 2.5, -1.0])

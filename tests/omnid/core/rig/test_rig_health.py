@@ -36,7 +36,7 @@ from omnid.tracking_state import TrackingState
 from omnid.transport.status_names import RIG, entry
 from tests.omnid.core.scenery import wrapped
 from tests.simulation import build, write_log
-from tests.simulation.readout import PERIOD_NS
+from tests.simulation.logs import PERIOD_NS
 from tests.simulation.rigs import with_upper_rotated
 
 # Runs the drive of a rig whose upper camera is turned by degrees about x, y and z.
