@@ -1,8 +1,8 @@
 """Detection of a checkerboard in a mirror image, by linked corner candidates.
 
-Corners are linked in the original image, the image with raised local contrast, the enlarged image, and a log-polar
-strip about the image's middle. A grid of them is accepted by one score: how well the squares alternate within the board
-and in the ring of squares around its corners, minus how well they go on beyond that ring, as brickwork and floors do.
+Corners are linked in the original image, the enlarged image, and a log-polar strip about the image's middle. A grid of
+them is accepted by one score: how well the squares alternate within the board and in the ring of squares around its
+corners, minus how well they go on beyond that ring, as brickwork and floors do.
 """
 
 from __future__ import annotations
@@ -69,9 +69,10 @@ def find_board(image: Image, board: Board, name: str = "", *, thorough: bool = T
         for grid in grids:
             largest = max(largest, largest_rectangle(grid), key=lambda sides: sides[0] * sides[1])
             is_floor = has_floor and len(grid) > board.columns * board.rows
-            placed = None if is_floor else select_board_window(grid, board)
-            if placed is None:
+            windows = [] if is_floor else list(_board_windows(grid, board))
+            if not windows:
                 continue
+            placed = max(windows, key=lambda window: float(np.isfinite(window).mean()))  # the fullest
             # 2. Refine its corners, and leave out those that are none or off the others.
             corners = _refined(image, blurred, orient_corners(blurred, placed, board), board)
             share = float(np.isfinite(corners[:, 0]).mean())
@@ -162,14 +163,6 @@ MIN_FILLED, MIN_BORDER = 0.8, 0.6
 BEYOND = 0.7
 
 
-def select_board_window(grid: Grid, board: Board) -> Array | None:
-    """Return the corners (rows, columns, 2), NaN if hidden, of the grid's fullest isolated window of the board's size.
-
-    None if there is no such window.
-    """
-    return max(_board_windows(grid, board), key=lambda window: float(np.isfinite(window).mean()), default=None)
-
-
 def grid_to_array(grid: Grid) -> Array:
     """Return the grid as an array (rows, columns, 2) with a border of two NaN on all sides."""
     cells = np.array(list(grid))
@@ -181,7 +174,10 @@ def grid_to_array(grid: Grid) -> Array:
 
 
 def _board_windows(grid: Grid, board: Board) -> Iterator[Array]:
-    """Yield every window of the board's size, upright or rotated, that is well filled and has no row beyond it."""
+    """Yield every window of the board's size, upright or rotated, that is well filled and has no row beyond it.
+
+    Its corners (rows, columns, 2), NaN if hidden.
+    """
     for upright in (grid_to_array(grid), np.rot90(grid_to_array(grid))):
         known = np.isfinite(upright[..., 0])
         if known.shape[0] < board.rows + 2 or known.shape[1] < board.columns + 2:

@@ -175,8 +175,6 @@ MAX_ENLARGED_PIXELS = 1_600_000
 MAX_STRIP_PX, STRIP_TURNS = 2400, 1.3
 # Inner radius of a log-polar strip, in parts of the image's smaller side.
 STRIP_INNER_PART = 1 / 16
-# Contrast limited adaptive histogram equalisation (CLAHE): clip limit, and number of tiles along each axis.
-CLAHE_CLIP_LIMIT, CLAHE_TILES = 4.0, 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,8 +188,6 @@ class DerivedImage:
 def derived_images(image: Image) -> Iterator[DerivedImage]:
     """Yield the image and its derived images, the cheapest first."""
     yield DerivedImage(image, lambda pixels: pixels)
-    local = cv2.createCLAHE(CLAHE_CLIP_LIMIT, (CLAHE_TILES,) * 2).apply(image).astype(np.uint8, copy=False)
-    yield DerivedImage(local, lambda pixels: pixels)
     if image.size <= MAX_ENLARGED_PIXELS:
         double = cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC).astype(np.uint8, copy=False)
         yield DerivedImage(double, lambda pixels: (pixels + 0.5) / 2 - 0.5)

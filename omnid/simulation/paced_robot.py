@@ -162,14 +162,14 @@ class PacedRobot:
 
     def _frames(self, settle: Callable[[], None], take: Callable[[MotionSample], None]) -> Iterator[Frame]:
         """Advance from pair to pair; settle: returns when the daemon has answered."""
-        vehicle, link = self._vehicle, self._link
+        vehicle, link, motion = self._vehicle, self._link, self._config.motion
         assert vehicle is not None and link is not None
         try:
             for pair in vehicle.pairs(settle):
                 if self._keeps_truth:
                     self.truth[pair.stamp_ns] = vehicle.base.pose
                 for sample in pair.samples:
-                    if self._is_given(sample):
+                    if (motion.imu if isinstance(sample, GyroSample) else motion.wheels) != "off":
                         take(sample)
                 # Images are not given before their time; a pair that comes late is not made up for.
                 while not self._closed and (left_s := self._due_s - time.monotonic()) > 0:
@@ -185,11 +185,6 @@ class PacedRobot:
             self._ends = True
             vehicle.come_to_rest()
             link.end()
-
-    def _is_given(self, sample: MotionSample) -> bool:
-        """True if the settings ask for samples of this kind."""
-        motion = self._config.motion
-        return (motion.imu if isinstance(sample, GyroSample) else motion.wheels) != "off"
 
     def _take_tick(self, tick: Tick, report: TickReport) -> None:
         """Pass a tick on; count and report a contact when it begins."""

@@ -24,7 +24,6 @@ import numpy as np
 from msgspec import Meta, Struct
 from msgspec.structs import asdict
 
-from calib.models.camera import Array
 from calib.typed_toml import bytes_of, convert, table_of
 from omnid.errors import OmnidError
 from omnid.simulation.rendering import textures
@@ -66,13 +65,10 @@ class Wall(Struct, frozen=True):
     poster_sides: Literal["front", "both"] = "front"
     doors: Annotated[tuple[Door, ...], Many] = ()
 
-    def height_below(self, ceiling_m: float) -> float:
-        """Return the height [m]."""
-        return ceiling_m if self.height_m is None else self.height_m
-
-    def area_m2(self, ceiling_m: float) -> float:
-        """Return the area of a wall, of which doors are a part."""
-        return self.height_below(ceiling_m) * sum(math.dist(a, b) for a, b in pairwise(self.points))
+    @property
+    def length_m(self) -> float:
+        """Return the length of the polyline."""
+        return sum(math.dist(a, b) for a, b in pairwise(self.points))
 
 
 class Box(Struct, frozen=True):
@@ -190,7 +186,7 @@ def _painted_world(world: WorldTable, name: str, seed: int, options: WorldOption
     # 2. Paint the surfaces, always in the same order, because each takes its random numbers from the same generator.
     surfaces = space.floor_and_ceiling(rng)
     for wall in world.wall:
-        surfaces += _wall(rng, wall, wall.height_below(space.ceiling_m))
+        surfaces += _wall(rng, wall, wall.height_m or space.ceiling_m)
     for entry in world.box:
         surfaces += _box(rng, entry)
     people = tuple(_person(rng, walker) for walker in world.person)  # painted also where they are left out
@@ -220,15 +216,11 @@ def _errors(world: WorldTable) -> Iterator[str]:
         if abs(c * dx_m + s * dy_m) <= along_m and abs(c * dy_m - s * dx_m) <= across_m:
             yield f"box[{number}].at: expected a place where the robot does not start inside the box, found {entry.at}"
     sizes = [*(entry.size_m for entry in world.box), *(walker.size_m for walker in world.person)]
-    walls_m2 = sum(wall.area_m2(space.ceiling_m) for wall in world.wall)
-    area_m2 = 2 * math.prod(space.sides_m) + walls_m2 + sum(map(_box_area_m2, sizes))
+    walls_m2 = sum((wall.height_m or space.ceiling_m) * wall.length_m for wall in world.wall)  # with their doors
+    boxes_m2 = sum(2 * (x_m + y_m) * z_m + x_m * y_m for x_m, y_m, z_m in sizes)
+    area_m2 = 2 * math.prod(space.sides_m) + walls_m2 + boxes_m2
     if area_m2 > LARGEST_AREA_M2:
         yield f"the surfaces are {area_m2:.0f} m2; expected at most {LARGEST_AREA_M2:g}"
-
-
-def _box_area_m2(size_m: Size) -> float:
-    x_m, y_m, z_m = size_m
-    return 2 * (x_m + y_m) * z_m + x_m * y_m
 
 
 def _wall(rng: Random, wall: Wall, height_m: float) -> list[Rectangle]:
@@ -240,7 +232,8 @@ def _wall(rng: Random, wall: Wall, height_m: float) -> list[Rectangle]:
     hung: list[Rectangle] = []
     for part in parts:
         if height_m >= CEILING_M - 0.2 and part.height_m > 0.8 * height_m and part.width_m > 0.6:
-            for side in (part, _other_side(part))[: 2 if wall.poster_sides == "both" else 1]:
+            behind = replace(part, origin=part.origin + part.edge_u, edge_u=-part.edge_u)
+            for side in (part, behind)[: 2 if wall.poster_sides == "both" else 1]:
                 hung += posters(rng, side, round(wall.posters_per_m * part.width_m), len(hung))
     return parts + hung
 
@@ -259,23 +252,14 @@ def _pieces(
         pieces.append((door.at_m, end_m, door.height_m))
         begin_m = end_m
     pieces.append((begin_m, length_m, 0.0))
-    return [
-        _upright(rng, kind, a + begin_m * along, a + min(end_m, length_m) * along, low_m, height_m)
-        for begin_m, end_m, low_m in pieces
-        if min(end_m, length_m) - begin_m > 0.01 and height_m - low_m > 0.01
-    ]
-
-
-def _upright(rng: Random, kind: str, a: Array, b: Array, low_m: float, high_m: float) -> Rectangle:
-    """Return the upright rectangle between two points (3,) of the floor, left and right as seen from its front."""
-    size = (float(np.linalg.norm(b - a)), high_m - low_m)
-    up, texture = np.array([0.0, 0.0, 1.0]), painted(rng, kind, size, PX_PER_M)
-    return Rectangle(a + high_m * up, b - a, (low_m - high_m) * up, texture, kind)
-
-
-def _other_side(side: Rectangle) -> Rectangle:
-    """Return the same wall as seen from behind."""
-    return Rectangle(side.origin + side.edge_u, -side.edge_u, side.edge_v, side.texture, side.name)
+    walls, up = [], np.array([0.0, 0.0, 1.0])
+    for begin_m, end_m, low_m in pieces:
+        end_m = min(end_m, length_m)
+        if end_m - begin_m > 0.01 and height_m - low_m > 0.01:
+            texture = painted(rng, kind, (end_m - begin_m, height_m - low_m), PX_PER_M)
+            corner, down = a + begin_m * along + height_m * up, (low_m - height_m) * up
+            walls.append(Rectangle(corner, (end_m - begin_m) * along, down, texture, kind))
+    return walls
 
 
 def _box(rng: Random, entry: Box) -> list[Rectangle]:
