@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import ClassVar, Final, Literal, TypeAlias
+from functools import cached_property, partial
+from typing import Any, ClassVar, Final, Literal, TypeAlias
 
 import cv2
 import numpy as np
@@ -17,7 +17,7 @@ from drivers.frame import Camera, Frame
 from drivers.motors.simulated.simulated_base import Pose
 from omnid.config import Config
 from omnid.simulation import lockstep
-from omnid.simulation.lockstep import Drive, Reports, SimulatedRun, Takes
+from omnid.simulation.lockstep import Drive, SimulatedRun
 from omnid.simulation.rendering.sensor import Floats
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
 from omnid.simulation.robot import SimulatedRobot
@@ -190,15 +190,22 @@ class DisturbedVehicle(Vehicle):
     """A vehicle with what disturbs its robot, and faults."""
 
     make_cameras: ClassVar[type[SimulatedCameras]] = BuildingCameras
-    faults: tuple[Fault, ...] = ()
-    tamper: Tamper | None = None
-    rolled_s = 0.0  # time that the wheels have turned or stood
+    robot: DisturbedRobot
+
+    def __init__(self, faults: Iterable[Fault], tamper: Tamper | None, world: World, robot: SimulatedRobot, *args: Any):
+        """args: as for Vehicle."""
+        self.faults, self.tamper, self.rolled_s = (
+            tuple(faults),
+            tamper,
+            0.0,
+        )  # time that the wheels have turned or stood
+        super().__init__(world, disturbed(robot), *args)
 
     @property
     def T_world_rig(self) -> Array:
         """Return the true pose (4, 4) of the rig, which may lean otherwise than its file says."""
-        lean = [*self.robot.lean_rad, 0.0] if isinstance(self.robot, DisturbedRobot) else np.zeros(3)
-        return self.T_world_base @ se3.transform(se3.rotation_exp(lean), np.zeros(3)) @ self.robot.rig.T_base_rig
+        T_lean = se3.transform(se3.rotation_exp([*self.robot.lean_rad, 0.0]), np.zeros(3))
+        return self.T_world_base @ T_lean @ self.robot.rig.T_base_rig
 
     def _has(self, kind: str) -> bool:
         return any(fault.kind == kind and fault.start_s <= self.time_s < fault.end_s for fault in self.faults)
@@ -214,7 +221,7 @@ class DisturbedVehicle(Vehicle):
         """Move the base by its wheels, and by who pushes it."""
         begin_s = self.time_s - dt_s
         super().move(dt_s)
-        for push in self.robot.pushes if isinstance(self.robot, DisturbedRobot) else ():
+        for push in self.robot.pushes:
             if push.start_s <= begin_s < push.end_s:
                 x_m, y_m, heading_rad = self.base.pose
                 aside_m = push.sideways_mps * dt_s
@@ -224,8 +231,8 @@ class DisturbedVehicle(Vehicle):
     def travel_m(self, dt_s: float, left_m: float, right_m: float) -> tuple[float, float]:
         """Return the travel of both wheels over the plane: they slip, and over a slope it is less."""
         self.rolled_s += dt_s
-        slips = self.robot.slips if isinstance(self.robot, DisturbedRobot) else ()
-        kept = 1.0 - max((one.share for one in slips if one.start_s <= self.rolled_s < one.end_s), default=0.0)
+        slips = [slip for slip in self.robot.slips if slip.start_s <= self.rolled_s < slip.end_s]
+        kept = 1.0 - max((slip.share for slip in slips), default=0.0)
         left_m, right_m = super().travel_m(dt_s, kept * left_m, kept * right_m)
         if not (isinstance(self.world, BuildingWorld) and self.world.ground.profile):
             return left_m, right_m
@@ -246,10 +253,5 @@ def simulate(
     tamper: Tamper | None = None,
 ) -> SimulatedRun:
     """Drive in lock-step as omnid's own `simulate`, with what disturbs robot and world; tamper: changes the images."""
-
-    def make(world: World, robot: SimulatedRobot, config: Config, seed: int, takes: Takes, reports: Reports) -> Vehicle:
-        vehicle = DisturbedVehicle(world, robot, config, seed, takes, reports)
-        vehicle.faults, vehicle.tamper = tuple(faults), tamper
-        return vehicle
-
-    return lockstep.simulate(world, robot, drive, seconds=seconds, seed=seed, config=config, vehicle=make)
+    vehicle = partial(DisturbedVehicle, faults, tamper)
+    return lockstep.simulate(world, robot, drive, seconds=seconds, seed=seed, config=config, vehicle=vehicle)
