@@ -52,14 +52,15 @@ MOST_SCALE: Final = 25.0  # of the variance of flows: half a pixel; where it is 
 GOOD_SHARE: Final = 0.2  # of the flows, that no break displaces: of one camera, or up to a line
 LINES: Final = 24  # equal parts of the raw image, at whose borders lines are tried
 LEAST: Final = 8  # flows on either side of a line in the cameras of a break
-LEAST_PART: Final = 0.2  # of the flows in the cameras of a torn image on either side: people hardly cover as many
+# Part that counts: of the flows of a torn image, on either side of its line, as people hardly cover as many; of all
+# that right images leave; of the displacement of the other camera.
+LEAST_PART: Final = 0.2
 # Cost of a landmark (`PoseEstimate.cost`) whose view has the noise that is expected: the mean of the Cauchy kernel's.
 RIGHT_COST: Final = 0.31
 FOLLOWED: Final = 0.2  # part of a new pair in the mean of the costs
 FAR: Final = KltSettings(levels=2)  # 28 px
 EDGE_PX: Final = 8  # of the panorama, in which patches are cut
 LEAST_PX: Final = 0.5  # by which what is beyond a line is displaced: less harms no pose
-LEAST_SHARE: Final = 0.2  # of the other camera's displacement, below which a camera has none
 ROUNDS: Final = 6
 RIDGE: Final = 1e-6
 CAMERAS: Final = ("lower", "upper")
@@ -217,10 +218,9 @@ class ImageBreaks:
                 self._open = [earlier for earlier in before if not earlier.is_undone_by(found)]
                 self._open += [found] if len(self._open) == len(before) else []
         is_torn = self._torn > DECIDING_COST
-        now = [*self._open, *([self._last_tear] if is_torn else []), found]
-        shown = [each for each in now if each is not None]
-        self.fault = _words(shown[-1:]) if shown else ""
-        if last is None or not (shown or self.covariance.any()):
+        shown = found or (self._last_tear if is_torn else None) or (self._open[-1] if self._open else None)
+        self.fault = "" if shown is None else _words([shown])
+        if last is None or (shown is None and not self.covariance.any()):
             return
         A = se3.adjoint(se3.exp(-step))
         self.covariance = A @ self.covariance @ A.T
@@ -337,7 +337,7 @@ def likeliest_break(flow: _Flow, raws: tuple[RawImage, RawImage], focal_px: floa
     # Cameras that have a share in it; what is too small harms no pose.
     moved_px = np.linalg.norm(best.displaced, axis=1) * flow.px
     mean_px = [float(moved_px[(flow.camera == camera) & (moved_px > 0)].mean()) for camera in best.cameras]
-    shares = [number for number, px in enumerate(mean_px) if px > LEAST_SHARE * max(mean_px)]
+    shares = [number for number, px in enumerate(mean_px) if px > LEAST_PART * max(mean_px)]
     if max(mean_px) < LEAST_PX:
         return None
     cameras = tuple(best.cameras[number] for number in shares)
