@@ -239,7 +239,7 @@ class _Lockstep:
     def _take_pose(self, odometry: OdometryUpdate) -> None:
         T_base_rig, stamp_ns = self._rig.T_base_rig, odometry.stamp_ns
         self._odometry = odometry
-        is_slipping = self._front_end.odometry.sensors.is_slipping
+        is_slipping = self._front_end.odometry.motion.is_slipping
         T_odom_base = of_base(odometry, T_base_rig)[0]
         self._run.poses.append(EstimatedPose(stamp_ns, self._truth[stamp_ns], T_odom_base, odometry.state, is_slipping))
         self._vehicle.post(controller_pose(odometry, T_base_rig))

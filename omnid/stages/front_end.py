@@ -35,7 +35,7 @@ class FrontEnd:
 
     def motion_stats(self) -> dict[str, object]:
         """Return samples of wheels and gyro, their estimated errors with sigmas, and the sensor that differs."""
-        inbox, sensors, witness = self.pairing.motion, self.odometry.sensors, self.odometry.witness
+        inbox, sensors, witness = self.pairing.motion, self.odometry.motion, self.odometry.witness
         stats: dict[str, object] = {
             "wheel_samples": inbox.wheels,
             "gyro_samples": inbox.gyro,

@@ -18,7 +18,7 @@ from omnid.core.odometry.estimates import OdometryEstimate
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.image_breaks import RawImage
 from omnid.core.odometry.motion_agreement import Contradiction, MotionAgreement, contradiction_after
-from omnid.core.odometry.motion_sensors import MotionSensors
+from omnid.core.odometry.motion_filter import MotionFilter
 from omnid.core.odometry.odometry import VisualOdometry
 from omnid.core.odometry.rig_error import RigError
 from omnid.core.odometry.stereo_frame import StereoFrame
@@ -55,15 +55,15 @@ class OdometryStage:
     ) -> None:
         """dense: computes the depth of keyframes. raw_images: see VisualOdometry."""
         self._dense = dense
-        self._method = _method(geometry.model(config.noise_px), config, raw_images)
         self._T_rig_rect = geometry.T_rig_rect
         self._to_rig = se3.adjoint(self._T_rig_rect)
         self._last_ns: int | None = None
         self._keyframe: _LastKeyframe | None = None
         self._T_base_rect = geometry.rig.T_base_rig @ self._T_rig_rect
         self._to_base = se3.adjoint(self._T_base_rect)
-        self.sensors = MotionSensors(se3.inverse(self._T_base_rect))
-        self._agreement = MotionAgreement(self.sensors)
+        self.motion = MotionFilter(T_base_rect=self._T_base_rect)
+        self._method = _method(geometry.model(config.noise_px), config, raw_images, self.motion)
+        self._agreement = MotionAgreement(self.motion)
         self.last_fault = AGREE  # the last disagreement that was more than a doubt
         self._contradiction: Contradiction | None = None  # of all poses so far by wheels and gyro
         self._rig_error = RigError(motion_errors(geometry.rig))
@@ -84,8 +84,9 @@ class OdometryStage:
         # 1. What wheels and gyro have measured since the pair before.
         last_ns, self._last_ns = self._last_ns, pair.stamp_ns
         dt_s = 0.0 if last_ns is None else (pair.stamp_ns - last_ns) * S_PER_NS
-        self.sensors.add(pair.motion)
-        sensed = None if last_ns is None else self.sensors.between(last_ns, pair.stamp_ns)
+        sensors = self.motion.sensors
+        sensors.add(pair.motion)
+        interval_s = None if last_ns is None else (sensors.seconds(last_ns), sensors.seconds(pair.stamp_ns))
         # 2. The pose of the rectified frame.
         usable = np.zeros_like(pair.visible) if pair.light.shows_nothing else pair.usable
         frame = StereoFrame(
@@ -95,14 +96,13 @@ class OdometryStage:
             partial(self._disparity, pair),
             usable,
             pair.times,
-            sensed,
+            interval_s,
             lost=pair.tiles.lost_pixels(pair.visible.shape),
         )
         estimate = self._method.process(frame, dt_s)
-        # 3. Compare its step with wheels and gyro: their scales, biases and delay.
+        # 3. Compare its step with wheels and gyro over seconds.
         if estimate.step is not None and last_ns is not None:
-            self.sensors.observe(*estimate.step, last_ns, pair.stamp_ns)
-            seen = self._to_base @ se3.log(estimate.step[0])
+            seen = self._to_base @ se3.log(estimate.step)
             self._agreement.add_step(last_ns, pair.stamp_ns, *map(float, seen[[0, 5, 1]]))
             if self.witness.is_fault:
                 self.last_fault = self.witness
@@ -194,9 +194,10 @@ def _method(
     model: StereoModel,
     config: OdometryConfig,
     raw_images: tuple[RawImage, RawImage] | None,
+    motion: MotionFilter,
 ) -> OdometryMethod:
     if config.method == "default":
-        return VisualOdometry(model, config.klt, config.limits, Relocaliser(model), raw_images=raw_images)
+        return VisualOdometry(model, config.klt, config.limits, Relocaliser(model), raw_images, motion)
     from omnid.core.odometry.paper.paper_odometry import PaperOdometry  # imported only where it is used
 
     return PaperOdometry(model, config.klt, config.tracker, config.reference)

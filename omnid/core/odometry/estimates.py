@@ -67,9 +67,6 @@ JUMP_M, JUMP_RAD = 0.5, math.radians(30)
 SAME_VIEW_M, SAME_VIEW_RAD = 0.1, math.radians(10)
 ROOM_M = 2.0  # median distance of landmarks that are not known: in a room
 SAME_M = 0.02  # Poses that differ less are one, because four sigmas of a pose that few landmarks support are as large.
-# Sigmas of a pose of which nothing is known any more, m and rad, because larger ones would leave no digits to
-# differences of covariances.
-MOST_SIGMA = np.repeat([1000.0, math.pi], 3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +124,7 @@ class OdometryEstimate:
     tracked: int
     inliers: int
     features: Features = field(default_factory=Features)
-    step: tuple[Array, Array] | None = None  # T_prev_curr and its covariance (6, 6) by the cameras alone; None: a break
+    step: Array | None = None  # T_prev_curr (4, 4) by the cameras alone; None: a break, or it is in doubt
     is_keyframe: bool = False  # dense stereo of the frame is computed for the local map
     refused_mps: float = 0.0  # speed of a pose that was refused for it alone; 0: none was
     image_fault: str = ""  # how the images of a camera are torn or displaced, see image_breaks.py; empty: they are not
@@ -177,9 +174,3 @@ def with_more_inliers(a: PoseEstimate | None, b: PoseEstimate | None) -> PoseEst
 def supports(found: list[PoseEstimate], T_predicted: Array) -> bool:
     """True if most of the landmarks that were tracked, few as they may be, show a predicted pose (4, 4)."""
     return bool(found) and found[0].inlier_ratio > 0.5 and GapStep.between(T_predicted, found[0].T_odom_rect).keeps_view
-
-
-def bounded(covariance: Array) -> Array:
-    """Return a covariance (6, 6), [t; r], whose sigmas are MOST_SIGMA at most; its correlations stay."""
-    share = np.minimum(1.0, MOST_SIGMA / np.sqrt(np.maximum(np.diag(covariance), 1e-30)))
-    return np.asarray(covariance * np.outer(share, share))

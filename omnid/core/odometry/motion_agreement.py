@@ -44,7 +44,7 @@ from omnid.core.control.motion_monitor import (
     Difference,
     Witness,
 )
-from omnid.core.odometry.motion_sensors import MotionSensors
+from omnid.core.odometry.motion_filter import MotionFilter
 
 Array = NDArray[np.float64]
 _Motion = Callable[[Array, Array], Array]  # of a sensor, from starts to ends [s]; NaN where no samples cover it
@@ -121,31 +121,31 @@ class _Finding(NamedTuple):
 class MotionAgreement:
     """Follows the accounts; memory and work are bounded."""
 
-    def __init__(self, sensors: MotionSensors) -> None:
-        """sensors: the samples of wheels and gyro."""
+    def __init__(self, motion: MotionFilter) -> None:
+        """motion: the filter, with the samples of wheels and gyro."""
         self._steps: deque[tuple[float, float, float, float, float]] = deque(maxlen=MOST_KEPT)  # see _Steps
-        self._sensors = sensors
+        self._motion = motion
         self._lags_s = np.arange(LEAST_LAG_S, MOST_LAG_S + LAG_STEP_S / 2, LAG_STEP_S)
         self._compared_s = -np.inf
         self._late_since_s: float | None = None
         self.result = AGREE
 
     def _wheels_m(self, starts_s: Array, ends_s: Array) -> Array:
-        return self._sensors.motion(WheelSample, starts_s, ends_s)[..., 0]
+        return self._motion.motion(WheelSample, starts_s, ends_s)[..., 0]
 
     def _wheels_rad(self, starts_s: Array, ends_s: Array) -> Array:
-        return self._sensors.motion(WheelSample, starts_s, ends_s)[..., 1]
+        return self._motion.motion(WheelSample, starts_s, ends_s)[..., 1]
 
     def _gyro_rad(self, starts_s: Array, ends_s: Array) -> Array:
-        return self._sensors.motion(GyroSample, starts_s, ends_s)[..., 2]
+        return self._motion.motion(GyroSample, starts_s, ends_s)[..., 2]
 
     def add_step(self, start_ns: int, end_ns: int, distance_m: float, turn_rad: float, aside_m: float = 0.0) -> None:
         """Add the motion of the base from one pair to the next, as the cameras saw it; compare.
 
         aside_m: along its y axis.
         """
-        end_s = self._sensors.seconds(end_ns)
-        self._steps.append((self._sensors.seconds(start_ns), end_s, distance_m, turn_rad, aside_m))
+        end_s = self._motion.sensors.seconds(end_ns)
+        self._steps.append((self._motion.sensors.seconds(start_ns), end_s, distance_m, turn_rad, aside_m))
         self._forget_before(end_s - WINDOW_S)
         if end_s - self._compared_s < EVERY_S:
             return

@@ -1,137 +1,236 @@
-"""Kalman filter of the motion: velocity and acceleration, six of each (Dang et al. 2012, eq. (10), (11)).
+"""One error-state Kalman filter of the motion: pose, velocity, acceleration, and the errors of wheels and gyro.
 
-Below it: motion from frame to frame, predicted by the filter, corrected and bridged by wheels and gyro.
+    x = [v, a, s, e],    v <- v + dt a,    T <- T exp(v dt),    e <- Ad(exp(-v dt)) e + dt v_error
+
+v and a (6 each) are those of Dang et al. 2012, eq. (10) and (11), of the rectified frame in its own axes; s (7) scales,
+offsets and bias of wheels and gyro (motion_sensors.py); e (6) is the error of the pose [t; r], which is zero itself:
+only its covariance is followed. Measurements are applied in the order of trust, each with a gate by its Mahalanobis
+distance: the step of the cameras, which also sets the pose's covariance, then what wheels and gyro measured in it. One
+that is refused is none. A frame in which the cameras find nothing is prediction, and the errors of scales and bias add
+up along it by the covariance of e and s. Where nothing measures it, the velocity is unknown, and steady.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.estimates import OdometryLimits
+from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.core.odometry.exposure_times import RigVelocity
-from omnid.core.odometry.motion_sensors import SensedMotion
+from omnid.core.odometry.motion_sensors import AHEAD, DISTANCE, TURN, YAW, MotionSensors, Twist, at_rest, on_a_plane
 
 Array = NDArray[np.float64]
 
+VELOCITY, ACCELERATION, SENSORS, POSE, SIZE = slice(0, 6), slice(6, 12), slice(12, 19), slice(19, 25), 25
 # Spectral density of the jerk for translation and rotation, (m/s^3)^2/Hz and (rad/s^3)^2/Hz, of a wheeled robot.
 # Measured: with 0.67 and 1.5 times as much the odometry errs 0.98 to 1.01 times as much, but for one log at 1152 px
 JERK_PSD = (10.0, 40.0)
 START_VELOCITY_VARIANCE = 1.0  # (m/s)^2 and (rad/s)^2 of a motion that is not known yet.
 START_ACCELERATION_VARIANCE = 4.0  # (m/s^2)^2 and (rad/s^2)^2.
 MIN_VELOCITY_VARIANCE = 1e-10  # added to each measurement, so that its covariance can be inverted
+# Standard deviation of the velocity while nothing measures it, m/s and rad/s: indoor vehicles are seldom twice as fast.
+UNKNOWN_SPEED_SIGMA = 0.5
+SLOWING_S = 0.3  # time constant of the predicted velocity's decay meanwhile
+MOST_SIGMA = np.repeat([1000.0, math.pi], 3)  # of a pose, m and rad: larger ones would leave no digits to differences
+# Errors of wheels and gyro at the start, their standard deviations, those of their random walks over one second, and
+# those after many steps that do not agree, so large that all is learned again.
+START = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+START_SIGMA = np.array([0.05, 0.1, 0.02, 0.02, 0.02, 0.02, 0.02])
+WALK_SIGMA = np.array([2e-4, 5e-4, 1e-5, 1e-5, 5e-5, 5e-5, 5e-5])
+LOST_SIGMA = np.array([1.0, 1.0, 0.1, 0.1, 0.2, 0.2, 0.2])
+STATES_OF = {WheelSample: np.array([0, 1, 2]), GyroSample: np.array([3, 4, 5, 6])}
+SANE_SCALE = (0.5, 2.0)  # limits of the wheels' scales, because beyond them their settings are wrong.
+CAMERA_SIGMA = np.repeat([3e-4, 1e-4], 3)  # of the cameras' step, m and rad, beside what its covariance says
+# A larger difference from the cameras' step means that a sensor slips or is wrong: noise makes one of 16,000 so large.
+GATE_SIGMAS = 4.0
+# Consecutive outliers of wheels that mean slip, because a single one may be a bump. They are counted, and not timed,
+# because each step is another measurement. After the larger number the sensor counts as not calibrated.
+SLIPPING, MOST_OUTLIERS = 2, 40
+# The noise of wheels depends on floor and tyres: its variance is multiplied by a factor of 1 or more, which follows the
+# mean of the squared innovations by their expected values, over 50 steps because a floor is the same for some seconds.
+NOISE_GAIN = 0.02
+# Rotation by which two steps of a robot do not differ, because 4 rad/s^2, the most that controller.limits allows by
+# default, make 0.04 rad in steps of 0.1 s.
+SUDDEN_RAD = 0.14
+
+
+@dataclass(slots=True)
+class Bridge:
+    """What wheels and gyro have carried the pose over since the cameras found it last."""
+
+    time_s: float = 0.0
+    variance_m2: float = 0.0  # of the position, that has grown meanwhile
+    is_over: bool = False  # beyond the limits: wheels and gyro are left out until the cameras find the pose
 
 
 class MotionFilter:
-    """Filter of twists [m/s; rad/s] in the rig frame; state (v, a), v <- v + dt a, measured v = (t, r) / dt.
+    """The filter; without samples of wheels and gyro that of the paper.
 
-    jerk_psd: spectral density of the jerk, for translation and rotation [(m/s^3)^2/Hz, (rad/s^3)^2/Hz].
+    slips counts steps in which the wheels moved otherwise than the cameras; refused, those of the gyro.
     """
 
-    def __init__(self, jerk_psd: tuple[float, float] = JERK_PSD) -> None:
-        self._filter = KalmanFilter(dim_x=12, dim_z=6)
-        self._filter.H = np.hstack([np.eye(6), np.zeros((6, 6))])
+    def __init__(self, jerk_psd: tuple[float, float] = JERK_PSD, T_base_rect: Array | None = None) -> None:
+        """jerk_psd: spectral density of the jerk, for translation and rotation."""
+        self.sensors = MotionSensors()
+        self._to_base = np.eye(6) if T_base_rect is None else se3.adjoint(T_base_rect)
         self._psd = np.repeat(jerk_psd, 3)
+        self._filter = KalmanFilter(dim_x=SIZE, dim_z=6)
+        self._filter.H = np.eye(6, SIZE)
+        self._filter.x = np.zeros((SIZE, 1))
+        self._filter.x[SENSORS, 0] = START
+        self._filter.P = np.zeros((SIZE, SIZE))
+        self._filter.P[SENSORS, SENSORS] = np.diag(START_SIGMA**2)
+        self.slips = self.refused = self.steps = 0
+        self._outliers: dict[type[MotionSample], int] = {WheelSample: 0, GyroSample: 0}
+        self._disagreements = 0  # consecutive steps in which the turns of wheels and gyro differ
+        self._noise_factors = np.ones(2)  # of the wheels' distance and turn
+        self._before_sensing = self._filter.x, self._filter.P
+        self._bridge = Bridge()
         self.reset()
 
     def reset(self) -> None:
         """Reset to standstill, with the uncertainty of what a robot can do."""
-        self._filter.x = np.zeros((12, 1))
-        self._filter.P = np.diag(np.repeat([START_VELOCITY_VARIANCE, START_ACCELERATION_VARIANCE], 6))
+        self._filter.x[:12] = 0.0
+        self._set_covariance(slice(0, 12), np.repeat([START_VELOCITY_VARIANCE, START_ACCELERATION_VARIANCE], 6))
+        self._last_step: tuple[Array, float] | None = None  # T_prev_curr that was accepted last, and its time
+        self._is_unknown = False  # nothing measures the velocity
 
     @property
     def velocity(self) -> Array:
         """Velocity (6,) [m/s; rad/s]."""
-        return np.array(self._filter.x[:6, 0])
+        return np.array(self._filter.x[VELOCITY, 0])
 
     @property
     def velocity_covariance(self) -> Array:
         """Covariance (6, 6) of the velocity."""
-        P = self._filter.P[:6, :6]
-        return np.asarray((P + P.T) / 2)
+        return np.array(self._filter.P[VELOCITY, VELOCITY])
 
-    def motion(self, dt_s: float) -> tuple[Array, Array]:
-        """Return the velocity (6,) at the end of the last step of dt_s, and its covariance (6, 6).
+    @property
+    def pose_covariance(self) -> Array:
+        """Covariance (6, 6) [t; r] of the pose, in its own axes."""
+        return np.array(self._filter.P[POSE, POSE])
+
+    @property
+    def values(self) -> Array:
+        """Scales of distance and turn, offsets of wheels and gyro [s], bias of the gyro [rad/s]: (7,)."""
+        return np.array(self._filter.x[SENSORS, 0])
+
+    @property
+    def sigmas(self) -> Array:
+        """Standard deviations (7,) of the values."""
+        return np.asarray(np.sqrt(np.diag(self._filter.P)[SENSORS]))
+
+    @property
+    def wheels_are_sane(self) -> bool:
+        """False if the wheels' scales are so far from 1 that their settings must be wrong."""
+        return bool(all(SANE_SCALE[0] < scale < SANE_SCALE[1] for scale in self.values[[DISTANCE, TURN]]))
+
+    @property
+    def is_slipping(self) -> bool:
+        """True if the wheels slipped in the last steps that the cameras saw."""
+        return self._outliers[WheelSample] >= SLIPPING
+
+    def at_exposure(self, dt_s: float = 0.0) -> RigVelocity:
+        """Return the velocity at the last frame, or at the one to which a step of dt_s was predicted.
 
         The state holds the mean velocity of the step: at its end, half a step later, it is v + dt/2 a.
         """
         F = np.hstack([np.eye(6), dt_s / 2 * np.eye(6)])
-        P = F @ self._filter.P @ F.T
-        return F @ self._filter.x[:, 0], np.asarray((P + P.T) / 2)
+        return RigVelocity(F @ self._filter.x[:12, 0], F @ self._filter.P[:12, :12] @ F.T)
+
+    @staticmethod
+    def of_step(T_prev_curr: Array, dt_s: float) -> RigVelocity:
+        """Return the velocity at either end of a single step, which changes by an acceleration that is not known."""
+        return RigVelocity(se3.log(T_prev_curr) / dt_s, START_ACCELERATION_VARIANCE * (dt_s / 2) ** 2 * np.eye(6))
 
     def predict(self, dt_s: float) -> Array:
         """Predict the state dt_s later and return the expected motion T_prev_curr (4, 4)."""
-        F, Q, velocity, acceleration = np.eye(12), np.zeros((12, 12)), np.arange(6), np.arange(6, 12)
-        F[velocity, acceleration] = dt_s
-        Q[velocity, velocity] = self._psd * dt_s**3 / 3
-        Q[velocity, acceleration] = Q[acceleration, velocity] = self._psd * dt_s**2 / 2
-        Q[acceleration, acceleration] = self._psd * dt_s
+        F, Q = np.eye(SIZE), np.zeros((SIZE, SIZE))
+        if not self._is_unknown:
+            v, a = np.arange(6), np.arange(6, 12)
+            F[v, a] = dt_s
+            Q[v, v] = self._psd * dt_s**3 / 3
+            Q[v, a] = Q[a, v] = self._psd * dt_s**2 / 2
+            Q[a, a] = self._psd * dt_s
+        Q[SENSORS, SENSORS] = np.diag(WALK_SIGMA**2 * dt_s)
         self._filter.predict(F=F, Q=Q)
         return se3.exp(self.velocity * dt_s)
 
     def update(self, T_prev_curr: Array, covariance: Array, dt_s: float) -> Array:
-        """Update with a measured motion and its covariance (6, 6); return the filtered motion T_prev_curr (4, 4)."""
-        # 1. The measured velocity is the motion over its time.
+        """Update with a motion that the cameras measured, with its covariance (6, 6); return the filtered one (eq. 11).
+
+        The measured velocity is the motion over its time.
+        """
         R = covariance / dt_s**2 + MIN_VELOCITY_VARIANCE * np.eye(6)
         self._filter.update(se3.log(T_prev_curr)[:, None] / dt_s, R=R)
-        # 2. Rounding must not make the covariance unsymmetric.
-        self._filter.P = (self._filter.P + self._filter.P.T) / 2
-        # 3. The filtered velocity gives the motion.
+        self._symmetrise()
         return se3.exp(self.velocity * dt_s)
 
-    def slow_down(self, factor: float) -> None:
-        """Multiply velocity and acceleration by a factor below 1, while no motion is measured."""
-        self._filter.x *= factor
+    def step(self, interval_s: tuple[float, float] | None, dt_s: float, most_s: float) -> tuple[Array, bool]:
+        """Return the step T_prev_curr (4, 4) to a frame dt_s later, and whether wheels and gyro measured all of it.
 
-
-# Rotation by which two steps of a robot do not differ, because 4 rad/s^2, the most that controller.limits allows by
-# default, make 0.04 rad in steps of 0.1 s.
-SUDDEN_RAD = 0.14
-SLOWING_S = 0.3  # time constant of the predicted velocity's decay while poses are refused.
-
-
-class MotionModel(MotionFilter):
-    """The velocity of the rectified frame, and its next step. Steps are T_prev_curr (4, 4)."""
-
-    _last_step: tuple[Array, float] | None  # T_prev_curr that was accepted last, and its time
-
-    def __init__(self, limits: OdometryLimits) -> None:
-        super().__init__()
-        self._limits = limits
-        self.found()
-
-    def step(self, sensed: SensedMotion | None, dt_s: float) -> Array:
-        """Return the step to a frame dt_s later: v <- v + dt a, T_prev_curr = exp(v dt) (Dang et al. 2012, eq. 10).
-
-        What wheels and gyro say is a measurement of the filter; they also know what happened in a long gap.
+        interval_s: start and end by the clock of the samples; None: there are none. most_s: the cameras' velocity holds
+        for this time at most.
         """
-        T_prev_curr = self.predict(min(dt_s, self._limits.max_gap_s))
-        if sensed is not None and dt_s > 0:
-            T_prev_curr = self.update(sensed.T_prev_curr, sensed.covariance, dt_s)
-        return T_prev_curr
-
-    def at_exposure(self, dt_s: float = 0.0) -> RigVelocity:
-        """Return the velocity at the last frame, or at the one to which a step of dt_s was predicted."""
-        return RigVelocity(*self.motion(dt_s))
+        # 1. What wheels and gyro say is a measurement of the filter. Wheels whose turn differs from that of the gyro
+        #    twice in a row slip, as those that the cameras contradict, and are left out.
+        values, wheels, gyro = self.values, Twist(), Twist()
+        if interval_s is not None and dt_s > 0 and not self._bridge.is_over:
+            gyro = self.sensors.by_gyro(interval_s, values)
+            if self.wheels_are_sane and not self.is_slipping:
+                wheels = self.sensors.by_wheels(interval_s, values, self._noise_factors)
+        if interval_s is not None and wheels and self.sensors.are_at_rest(interval_s, values):
+            twist = at_rest(values)
+        else:
+            differ = YAW in wheels and YAW in gyro and self._differ(wheels, gyro)
+            self._disagreements = self._disagreements + 1 if differ else 0
+            if self._disagreements >= SLIPPING:
+                wheels = Twist()
+                self.slips += 1
+            twist = (on_a_plane(wheels, values) if wheels else wheels) | gyro
+        is_complete = AHEAD in twist and YAW in twist
+        # 2. The prediction; a velocity that was not known is learned from its start.
+        if self._is_unknown and is_complete:
+            self.reset()
+        T_prev_curr = self.predict(min(dt_s, most_s))
+        self._before_sensing = self._filter.x.copy(), self._filter.P.copy()
+        for axis in twist:
+            self._measure(twist, axis, values, dt_s)
+        return se3.exp(self.velocity * dt_s) if twist else T_prev_curr, is_complete
 
     def accept(
-        self, T_prev_curr: Array, covariance: Array, dt_s: float, *, exposed_at_once: bool
+        self,
+        T_prev_curr: Array,
+        covariance: Array,
+        dt_s: float,
+        *,
+        interval_s: tuple[float, float] | None,
+        is_sure: bool,
+        exposed_at_once: bool,
     ) -> RigVelocity | None:
         """Update the filter with the step that the cameras found (eq. 11), with its covariance (6, 6).
 
-        Returns the velocity at the pair before the step, from the steps around it. A velocity that changes evenly is
-        exact there; how far it changes unevenly in a step, no step shows. A sudden turn shows no velocity during the
-        exposures: where it matters, the filter begins from standstill.
+        is_sure: the sensors are compared with it. Returns the velocity at the pair before the step, from the steps
+        around it. A velocity that changes evenly is exact there; how far it changes unevenly in a step, no step shows.
+        A sudden turn shows no velocity during the exposures: where it matters, the filter begins from standstill.
         """
         turned = se3.log(T_prev_curr)[3:] - self.velocity[3:] * dt_s
         if not exposed_at_once and np.linalg.norm(turned) > SUDDEN_RAD:
             self.reset()
             return None
+        # 1. The cameras, and then the sensors, each if it agrees.
+        is_compared = is_sure and interval_s is not None
+        if is_compared:
+            self._filter.x, self._filter.P = self._before_sensing
         self.update(T_prev_curr, covariance, dt_s)
+        if is_compared:
+            self._compare(interval_s or (0.0, 0.0), dt_s)
+        # 2. The velocity at the pair before.
         now, before, self._last_step = self.of_step(T_prev_curr, dt_s), self._last_step, (T_prev_curr, dt_s)
         if before is None:
             return now
@@ -140,36 +239,114 @@ class MotionModel(MotionFilter):
         uneven = np.diag(((now.twist - before_rate) / 2) ** 2)
         return RigVelocity(at_previous, covariance / (2 * dt_s**2) + uneven)
 
-    @staticmethod
-    def of_step(T_prev_curr: Array, dt_s: float) -> RigVelocity:
-        """Return the velocity at either end of a single step, which changes by an acceleration that is not known."""
-        return RigVelocity(se3.log(T_prev_curr) / dt_s, START_ACCELERATION_VARIANCE * (dt_s / 2) ** 2 * np.eye(6))
+    def motion(self, sensor: type[MotionSample], starts_s: Array, ends_s: Array) -> Array:
+        """Return the motion by a sensor between times: see MotionSensors.motion."""
+        return self.sensors.motion(sensor, starts_s, ends_s, self.values)
 
-    def found(self) -> None:
-        """Note that the cameras have found a pose: nothing is to be bridged, and no error has grown."""
-        self._bridged_s = 0.0
-        self._systematic = np.zeros(6)  # sum of the standard deviations of the steps since then
-        self._variance_m2 = 0.0  # variance of the position
+    def found(self, covariance: Array) -> None:
+        """Set the covariance (6, 6) of a pose that the cameras have found."""
+        if self._is_unknown:
+            self.reset()
+        self._filter.P[POSE] = self._filter.P[:, POSE] = 0.0
+        self._filter.P[POSE, POSE] = covariance
+        self._bridge = Bridge()
 
-    def carry(self, sensed: SensedMotion | None, dt_s: float) -> Array | None:
-        """Return the covariance (6, 6) of a step that nothing was seen in, by wheels and gyro; None where they end.
+    def carry(self, dt_s: float, *, is_measured: bool, most_s: float, most_sigma_m: float) -> bool:
+        """Move the pose's covariance on by the last step; return whether wheels and gyro carry the pose.
 
-        They end at the limits of time and uncertainty; then the velocity decays. Errors of scale and bias are the same
-        in all steps: their standard deviations add up, and not their variances.
+        They do until the limits of time and of the growth of its uncertainty. Beyond, the velocity is not known.
         """
         self._last_step = None
-        if sensed is not None and sensed.is_complete:
-            sigma = np.sqrt(np.diag(sensed.systematic))
-            growth = sensed.noise + sensed.systematic + np.diag(2 * self._systematic * sigma)
-            variance_m2 = self._variance_m2 + float(np.diag(growth)[:3].max())
-            if self._bridged_s + dt_s <= self._limits.bridge_s and variance_m2 <= self._limits.bridge_sigma_m**2:
-                self._bridged_s, self._variance_m2 = self._bridged_s + dt_s, variance_m2
-                self._systematic += sigma
-                return growth
-        self.slow_down(math.exp(-dt_s / SLOWING_S))
-        return None
+        if is_measured:
+            moved = self._moved(dt_s)
+            self._bridge.time_s += dt_s
+            self._bridge.variance_m2 += float(np.diag(moved - self._filter.P)[POSE][:3].max())
+            self._bridge.is_over = self._bridge.time_s > most_s or self._bridge.variance_m2 > most_sigma_m**2
+            if not self._bridge.is_over:
+                self._filter.P = moved
+                return True
+        if not self._is_unknown:
+            self._is_unknown = True
+            self._set_covariance(slice(0, 12), np.repeat([UNKNOWN_SPEED_SIGMA**2, 0.0], 6))
+        self._filter.P = bounded(self._moved(dt_s), POSE)
+        self._filter.x[:12] *= math.exp(-dt_s / SLOWING_S)
+        return False
 
-    def reset(self) -> None:
-        """Begin from standstill."""
-        super().reset()
-        self._last_step = None
+    def distrust(self, covariance: Array) -> None:
+        """Add a covariance (6, 6) to that of the pose, for what is not measured."""
+        self._filter.P[POSE, POSE] += covariance
+
+    def _moved(self, dt_s: float) -> Array:
+        """Return the covariance after a step: e <- Ad(exp(-v dt)) e + dt v_error."""
+        F = np.eye(SIZE)
+        F[POSE, POSE] = se3.adjoint(se3.exp(-self.velocity * dt_s))
+        F[POSE, VELOCITY] = dt_s * np.eye(6)
+        return np.asarray(F @ self._filter.P @ F.T)
+
+    def _differ(self, wheels: Twist, gyro: Twist) -> bool:
+        """True if wheels and gyro measure turns in a step that differ by more than their errors."""
+        H = wheels[YAW].slopes - gyro[YAW].slopes
+        variance = wheels[YAW].variance + gyro[YAW].variance + H @ self._filter.P[SENSORS, SENSORS] @ H
+        return bool((wheels[YAW].value - gyro[YAW].value) ** 2 > GATE_SIGMAS**2 * variance)
+
+    def _compare(self, interval_s: tuple[float, float], dt_s: float) -> None:
+        """Update with what the sensors measured in a step of the cameras, and count where they disagree with it."""
+        self.steps += 1
+        values = self.values
+        for sensor, twist in (
+            (WheelSample, self.sensors.by_wheels(interval_s, values, self._noise_factors)),
+            (GyroSample, self.sensors.by_gyro(interval_s, values)),
+        ):
+            if not twist:
+                continue
+            ratios = {axis: self._measure(twist, axis, values, dt_s, is_gated=True) for axis in twist}
+            agrees = all(ratio <= GATE_SIGMAS**2 for ratio in ratios.values())
+            if sensor is WheelSample:
+                self.slips += not agrees
+                for number, axis in enumerate((AHEAD, YAW)):
+                    if ratios.get(axis, math.inf) < GATE_SIGMAS**2:
+                        factor = self._noise_factors[number] * (1.0 + NOISE_GAIN * (ratios[axis] - 1.0))
+                        self._noise_factors[number] = max(1.0, factor)
+            else:
+                self.refused += not agrees
+            self._outliers[sensor] = 0 if agrees else self._outliers[sensor] + 1
+            if self._outliers[sensor] > MOST_OUTLIERS:
+                # Its settings may be wrong: they are learned again.
+                self._outliers[sensor] = 0
+                for state in STATES_OF[sensor]:
+                    self._set_covariance(slice(12 + state, 13 + state), LOST_SIGMA[[state]] ** 2)
+
+    def _measure(self, twist: Twist, axis: int, values: Array, dt_s: float, *, is_gated: bool = False) -> float:
+        """Update with one component of the base's twist; return the squared Mahalanobis distance of its innovation.
+
+        values: of the sensors' errors with which it was computed. With a gate, one beyond it is none, and the cameras
+        have given the velocity: their error counts as well.
+        """
+        value, slopes, variance = twist[axis]
+        H = np.zeros((1, SIZE))
+        H[0, VELOCITY], H[0, SENSORS] = self._to_base[axis] * dt_s, -slopes
+        R = variance + (CAMERA_SIGMA[axis] ** 2 if is_gated else 0.0)
+        z = value - slopes @ values
+        innovation = float(z - (H @ self._filter.x)[0, 0])
+        ratio = innovation**2 / float((H @ self._filter.P @ H.T)[0, 0] + R)
+        if not is_gated or ratio <= GATE_SIGMAS**2:
+            self._filter.update(np.array([[z]]), R=np.array([[R]]), H=H)
+            self._symmetrise()
+        return ratio
+
+    def _set_covariance(self, states: slice, variances: Array) -> None:
+        """Set the variances of some states, which are then independent of all others."""
+        self._filter.P[states] = self._filter.P[:, states] = 0.0
+        self._filter.P[states, states] = np.diag(variances)
+
+    def _symmetrise(self) -> None:
+        """Rounding must not make the covariance unsymmetric, nor e anything but zero."""
+        self._filter.P = (self._filter.P + self._filter.P.T) / 2
+        self._filter.x[POSE] = 0.0
+
+
+def bounded(covariance: Array, pose: slice = slice(None)) -> Array:
+    """Return a covariance (N, N) in which the sigmas of a pose are MOST_SIGMA at most; its correlations stay."""
+    share = np.ones(len(covariance))
+    share[pose] = np.minimum(1.0, MOST_SIGMA / np.sqrt(np.maximum(np.diag(covariance)[pose], 1e-30)))
+    return np.asarray(covariance * np.outer(share, share))

@@ -19,14 +19,13 @@ from omnid.core.odometry.estimates import (
     OdometryEstimate,
     OdometryLimits,
     PoseEstimate,
-    bounded,
     supports,
 )
 from omnid.core.odometry.exposure_times import Exposure, RigVelocity
 from omnid.core.odometry.image_breaks import ImageBreaks, RawImage
 from omnid.core.odometry.keyframes import KeyframeLocaliser, KeyframeRequest, Keyframes
 from omnid.core.odometry.local_map import LocalMap
-from omnid.core.odometry.motion_filter import MotionModel
+from omnid.core.odometry.motion_filter import UNKNOWN_SPEED_SIGMA, MotionFilter, bounded
 from omnid.core.odometry.motion_hypotheses import REACH_SIGMAS, MotionHypotheses
 from omnid.core.odometry.pose_search import OUTLIER_COST, PoseSearch
 from omnid.core.odometry.static_mask import StaticMask
@@ -48,8 +47,6 @@ TEXTURED_CORNERS, COUNTED_CORNERS = 2, 4
 # Share of the landmarks in view, inliers, below which a pose after a break is doubtful. Wrong ones at 10 m/s before a
 # limit of 5 had 0.09, 0.24 and 0.27 (set on seed 3 of `honesty`, too fast).
 AGAIN_SHARE = 1 / 3
-# Standard deviation of the velocity while poses are refused, m/s and rad/s: indoor vehicles are seldom twice as fast.
-UNTRACKED_SPEED_SIGMA = 0.5
 
 
 class VisualOdometry:
@@ -62,18 +59,23 @@ class VisualOdometry:
         limits: OdometryLimits,
         relocaliser: KeyframeLocaliser,
         raw_images: tuple[RawImage, RawImage] | None = None,
+        motion: MotionFilter | None = None,
     ) -> None:
-        """raw_images: where the raw images of both cameras show the panoramas; None: they are not tested for breaks."""
+        """motion: the filter with the samples of wheels and gyro; None: there are none.
+
+        raw_images: where the raw images of both cameras show the panoramas; None: they are not tested for breaks.
+        """
         self._limits, self._model, self._relocaliser = limits, model, relocaliser
         self._map = LocalMap(model, klt, limits.keyframes)
         self._keyframes = Keyframes(self._map, model, replace(klt, levels=1), limits, relocaliser)
-        self._motion = MotionModel(limits)
+        self._motion = motion or MotionFilter()
         self._static_mask = StaticMask(model.cylinder.edges_rad)
-        self._T_odom_rect, self._covariance = np.eye(4), np.zeros((6, 6))
+        self._T_odom_rect = np.eye(4)
         self._T_at_fix = self._T_odom_rect  # the last accepted pose
         self._status = TrackingStatus()
         self._hypotheses = MotionHypotheses()
-        self._step: tuple[Array, Array] | None = None  # last step by the cameras, and its covariance
+        self._step: Array | None = None  # last step by the cameras
+        self._is_measured = False  # wheels and gyro have measured the last step
         self._first: StereoFrame | None = None  # started the map before its velocity was known
         self._requested: KeyframeRequest | None = None  # keyframe that the last frame asked for, see complete
         self._added: int | None = None  # seq of the keyframe that the last frame became
@@ -111,7 +113,7 @@ class VisualOdometry:
             return self._start_without_map(frame, usable, dt_s)
 
         # 1. Predict: v <- v + dt a, T <- T exp(v dt) (section IV.D, eq. 10), with wheels and gyro where there are some.
-        T_predicted = self._T_odom_rect @ self._motion.step(frame.sensed, dt_s)
+        T_predicted = self._predicted(frame, dt_s)
 
         # 2. to 4. Track, estimate and refine: pose_search.py. Once a frame was refused, those without corners
         #    (darkness, a blank wall) are left out to save time.
@@ -166,9 +168,12 @@ class VisualOdometry:
         sigma_mps: standard deviation of the predicted velocity.
         """
         exposure = self._exposure(frame, dt_s)
-        found = self._search.find(frame, usable, self._T_odom_rect, T_predicted, exposure, dt_s)
-        if frame.sensed is not None and frame.sensed.is_complete:
+        sensed_m = math.nan
+        if self._is_measured:
             self._hypotheses.agree()
+            sensed_m = float(np.linalg.norm(T_predicted[:3, 3] - self._T_odom_rect[:3, 3]))
+        self._map.decide_first_depths(frame.lower, (self._limits.max_speed_mps * dt_s, sensed_m))
+        found = self._search.find(frame, usable, self._T_odom_rect, T_predicted, exposure)
         # After a refused frame the displacements from an unknown place lead anywhere: relocalisation decides.
         if found is None or self._status.is_refused:
             return [] if found is None else [found]
@@ -250,14 +255,20 @@ class VisualOdometry:
         if not self._status.is_refused and 0 < dt_s <= self._limits.max_gap_s:
             T_prev_curr = se3.inverse(self._T_odom_rect) @ estimate.T_odom_rect
             is_at_once = frame.times.is_at_once
-            at_previous = self._motion.accept(T_prev_curr, estimate.covariance, dt_s, exposed_at_once=is_at_once)
-            if estimate.inliers >= self._limits.good_inliers and not self._is_in_doubt(estimate):
-                self._step = T_prev_curr, estimate.covariance
-        elif frame.sensed is None:
+            is_sure = estimate.inliers >= self._limits.good_inliers and not self._is_in_doubt(estimate)
+            at_previous = self._motion.accept(
+                T_prev_curr,
+                estimate.covariance,
+                dt_s,
+                interval_s=frame.interval_s,
+                is_sure=is_sure,
+                exposed_at_once=is_at_once,
+            )
+            self._step = T_prev_curr if is_sure else None
+        elif not self._is_measured:
             self._motion.reset()
         self._map.late_depths.settle(at_previous)
-        self._motion.found()
-        self._covariance = estimate.covariance + (self._map.covariance_of(estimate) if len(estimate.landmarks) else 0.0)
+        self._motion.found(estimate.covariance + self._map.covariance_of(estimate))
         self._T_odom_rect = self._T_at_fix = estimate.T_odom_rect
         # What the upper camera does not show where it must be is an outlier there.
         self._cost = estimate.cost + OUTLIER_COST * (1.0 - estimate.upper_ratio), estimate.in_view
@@ -282,7 +293,7 @@ class VisualOdometry:
         stayed: see TrackingStatus; gap: from the predicted to the recognised pose, None: not recognised elsewhere.
         """
         known = gap is not None
-        carried = self._move(T_predicted, self._motion.carry(frame.sensed, dt_s)) and not known
+        carried = self._carry(T_predicted, dt_s) and not known
         textured = self._is_textured(frame, usable)
         status = self._status.refused(
             dt_s, self._limits, textured=textured, elsewhere=known, carried=carried, stayed=stayed
@@ -293,26 +304,28 @@ class VisualOdometry:
         self._map.clear()
         self._relocaliser.clear()
         if gap is not None:
-            self._covariance = self._covariance + gap.covariance
+            self._motion.distrust(gap.covariance)
         if self._status.unknown_motion:
             self._motion.reset()
         return self._start_map(frame, usable, 0.0, elsewhere=known, carried=carried)
 
     def _start_without_map(self, frame: StereoFrame, usable: Flags, dt_s: float) -> OdometryEstimate:
         """Start a map where there is none, after the motion that wheels and gyro measured."""
-        carried = False
-        if frame.sensed is not None and dt_s > 0:
-            T_predicted = self._T_odom_rect @ self._motion.step(frame.sensed, dt_s)
-            carried = self._move(T_predicted, self._motion.carry(frame.sensed, dt_s))
+        carried = dt_s > 0 and self._carry(self._predicted(frame, dt_s), dt_s)
         return self._start_map(frame, usable, dt_s, carried=carried)
 
-    def _move(self, T_predicted: Array, growth: Array | None) -> bool:
-        """Go on to the predicted pose, with the covariance (6, 6) that it adds where wheels and gyro carry it."""
-        A = se3.adjoint(se3.inverse(T_predicted) @ self._T_odom_rect)
-        self._T_odom_rect, self._covariance = T_predicted, A @ self._covariance @ A.T
-        if growth is not None:
-            self._covariance = self._covariance + growth
-        return growth is not None
+    def _predicted(self, frame: StereoFrame, dt_s: float) -> Array:
+        """Return the predicted pose (4, 4) at a frame; only wheels and gyro know what happened in a long gap."""
+        T_prev_curr, self._is_measured = self._motion.step(frame.interval_s, dt_s, self._limits.max_gap_s)
+        return self._T_odom_rect @ T_prev_curr
+
+    def _carry(self, T_predicted: Array, dt_s: float) -> bool:
+        """Go on to the predicted pose; return whether wheels and gyro carry it."""
+        limits = self._limits
+        self._T_odom_rect = T_predicted
+        return self._motion.carry(
+            dt_s, is_measured=self._is_measured, most_s=limits.bridge_s, most_sigma_m=limits.bridge_sigma_m
+        )
 
     def _start_map(
         self, frame: StereoFrame, usable: Flags, dt_s: float, *, carried: bool, elsewhere: bool = False
@@ -325,22 +338,17 @@ class VisualOdometry:
             self._advance(self._status.without_map(dt_s, carried=carried), carried=carried)
             return self._result(0, 0, exposure=exposure)
         self._first = None if frame.times.is_at_once else frame
-        self._motion.found()
+        self._motion.found(self._motion.pose_covariance)
         self._advance(self._status.started(carried=carried, elsewhere=elsewhere), carried=carried)
         return replace(self._result(len(self._map), len(self._map), Features(new=new), exposure), is_keyframe=True)
 
     def _advance(self, status: TrackingStatus, *, carried: bool = False) -> None:
-        """Advance the tracking state; while it has no fix the covariance grows as under an unknown steady velocity."""
-        before_s, was_known = self._status.time_since_fix_s, not self._status.unknown_motion
-        self._status, after_s = status, status.time_since_fix_s
-        if carried and was_known and status.unknown_motion:
-            before_s = 0.0  # What carried the pose is contradicted now, and has measured nothing since the last fix.
-        elif carried:
-            before_s = after_s
-        if after_s > before_s:
-            growth = UNTRACKED_SPEED_SIGMA**2 * (after_s**2 - before_s**2)
-            self._covariance = bounded(self._covariance + growth * np.eye(6))
-        if after_s == 0:
+        """Advance the tracking state."""
+        if carried and not self._status.unknown_motion and status.unknown_motion:
+            # What carried the pose is contradicted now, and has measured nothing since the last fix.
+            self._motion.distrust((UNKNOWN_SPEED_SIGMA * status.time_since_fix_s) ** 2 * np.eye(6))
+        self._status = status
+        if status.time_since_fix_s == 0:
             self._T_at_fix = self._T_odom_rect
 
     def _update_map(
@@ -359,7 +367,7 @@ class VisualOdometry:
 
     def _request(self, frame: StereoFrame, usable: Flags, exposure: Exposure) -> KeyframeRequest:
         """Return the request of a keyframe at the current pose, all of whose landmarks are new."""
-        return KeyframeRequest(frame, usable, self._T_odom_rect, self._covariance, exposure)
+        return KeyframeRequest(frame, usable, self._T_odom_rect, self._motion.pose_covariance, exposure)
 
     def _result(
         self, tracked: int, inliers: int, features: Features | None = None, exposure: Exposure | None = None
@@ -367,7 +375,7 @@ class VisualOdometry:
         others_mps = np.pad(self._T_odom_rect[:3, :3].T @ self._hypotheses.fastest, (0, 3))
         return OdometryEstimate(
             self._T_odom_rect,
-            self._covariance + self._hypotheses.covariance(self._T_odom_rect),
+            self._motion.pose_covariance + self._hypotheses.covariance(self._T_odom_rect),
             self._motion.velocity,
             self._motion.velocity_covariance + np.outer(others_mps, others_mps),
             self._status.state,

@@ -95,13 +95,9 @@ class PoseSearch:
         self._tracked = max(2 * limits.good_inliers, round(TRACKED_SHARE * limits.features))
 
     def find(
-        self, frame: StereoFrame, usable: Flags, T_last: Array, T_predicted: Array, exposure: Exposure, dt_s: float
+        self, frame: StereoFrame, usable: Flags, T_last: Array, T_predicted: Array, exposure: Exposure
     ) -> PoseEstimate | None:
         """Return the best estimate from the guesses, or the first good one; None: no landmarks were found."""
-        sensed_m = math.nan
-        if frame.sensed is not None and frame.sensed.is_complete:
-            sensed_m = float(np.linalg.norm(T_predicted[:3, 3] - T_last[:3, 3]))
-        self._map.decide_first_depths(frame.lower, (self._limits.max_speed_mps * dt_s, sensed_m))
         best: PoseEstimate | None = None
         for T_guess, is_near in self._guesses(frame, usable, T_last, T_predicted):
             estimate = self.estimate(frame, T_guess, exposure, is_near=is_near)

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.odometry.exposure_times import Exposure
-from omnid.core.odometry.motion_sensors import SensedMotion
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.pixel_times import AT_ONCE, PixelTimes
 
@@ -26,7 +25,7 @@ class StereoFrame:
     disparities: NDArray[np.float32] | Callable[[Exposure | None], NDArray[np.float32]]
     usable: NDArray[np.bool_]  # (H, W) pixels that show the world in both panoramas
     times: PixelTimes = AT_ONCE
-    sensed: SensedMotion | None = None  # since the frame before, by wheels and gyro; None: not known
+    interval_s: tuple[float, float] | None = None  # since the frame before, by the clock of the motion sensors
     # The motion for which disparities are corrected; None: not known, so that they are as seen.
     exposure: Exposure | None = None
     lost: NDArray[np.bool_] | None = None  # (H, W) pixels in parts that are dead or blind; None: there are none

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.corners import corners, nearby_disparity
-from omnid.core.odometry.estimates import OdometryEstimate, bounded
-from omnid.core.odometry.motion_filter import MotionFilter
+from omnid.core.odometry.estimates import OdometryEstimate
+from omnid.core.odometry.motion_filter import UNKNOWN_SPEED_SIGMA, MotionFilter, bounded
 from omnid.core.odometry.paper.registration import Registration, consensus, register
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings, flow, steps, track
@@ -44,8 +44,6 @@ KEYFRAME_RATIO = 0.5
 # Spectral density of the jerk, (m/s^3)^2/Hz and (rad/s^3)^2/Hz. The turns of section IV.F change the yaw rate by
 # radians per second within 0.1 s; a filter that takes this for impossible would shorten the turn and overshoot.
 JERK_PSD = (10.0, 4000.0)
-# Standard deviation of the velocity while nothing is tracked, m/s and rad/s.
-UNTRACKED_SPEED_SIGMA = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +155,7 @@ class PaperOdometry:
         """
         self._filter.reset()
         before_s, self._untracked_s = self._untracked_s, self._untracked_s + dt_s
-        growth = UNTRACKED_SPEED_SIGMA**2 * (self._untracked_s**2 - before_s**2)
+        growth = UNKNOWN_SPEED_SIGMA**2 * (self._untracked_s**2 - before_s**2)
         self._covariance = bounded(self._covariance + growth * np.eye(6))
         self._set_reference(frame)
         return self._result(TrackingState.LOST, tracked, inliers)

@@ -11,7 +11,7 @@ import pytest
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.core.control.motion_monitor import Motion, MotionMonitor, MotionSettings, Twist, Witness
 from omnid.core.odometry.motion_agreement import MotionAgreement
-from omnid.core.odometry.motion_sensors import MotionSensors
+from omnid.core.odometry.motion_filter import MotionFilter
 
 START_NS = 10**12
 HALF_TRACK_M = 0.15
@@ -50,8 +50,8 @@ def right_gyro(w: float) -> float:
 
 def witness(path: Path, wheels: Wheels | None, gyro: Gyro | None, seconds: float = 4.0, late_s: float = 0.0) -> Witness:
     """Return what the comparison says after so many seconds; late_s: of the images."""
-    sensors, rng = MotionSensors(np.eye(4)), np.random.default_rng(1)
-    agreement = MotionAgreement(sensors)
+    motion, rng = MotionFilter(), np.random.default_rng(1)
+    sensors, agreement = motion.sensors, MotionAgreement(motion)
     for step in range(1, round(seconds * 10)):
         samples: list[MotionSample] = []
         for sample_s in np.arange(step / 10 - 0.1, step / 10, 0.02):

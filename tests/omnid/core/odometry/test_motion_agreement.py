@@ -21,7 +21,7 @@ from omnid.core.control.motion_monitor import (
     Witness,
 )
 from omnid.core.odometry.motion_agreement import LATE_S, STILL_S, MotionAgreement, contradiction_after
-from omnid.core.odometry.motion_sensors import MotionSensors
+from omnid.core.odometry.motion_filter import MotionFilter
 
 Array = NDArray[np.float64]
 FINE_S = np.arange(-3.0, 40.0, 0.005)
@@ -58,8 +58,8 @@ def driven(
     errors: Errors, seconds: float, *, turns: bool = True, stops_s: float = np.inf, seed: int = 1
 ) -> list[tuple[float, Witness]]:
     """Return the result after each pair of a drive."""
-    rng, sensors = np.random.default_rng(seed), MotionSensors(np.eye(4))
-    agreement = MotionAgreement(sensors)
+    rng, motion = np.random.default_rng(seed), MotionFilter()
+    sensors, agreement = motion.sensors, MotionAgreement(motion)
     speed, rate = speeds(turns)
     speed, rate = (np.where(stops_s > FINE_S, values, 0.0) for values in (speed, rate))
     way, angle = (np.cumsum(values) * 0.005 for values in (speed, rate))
@@ -198,8 +198,8 @@ def test_once_all_have_stood_it_is_forgotten() -> None:
 
 def test_samples_with_gaps_floods_and_numbers_that_are_not_finite_do_no_harm() -> None:
     """Memory stays bounded."""
-    sensors = MotionSensors(np.eye(4))
-    agreement = MotionAgreement(sensors)
+    motion = MotionFilter()
+    sensors, agreement = motion.sensors, MotionAgreement(motion)
     for k in range(6000):
         sensors.add([WheelSample(ns(k * 1e-3), 0.3, float("nan")), WheelSample(ns(0.5), float("inf"), 0.0)])
     sensors.add([WheelSample(ns(900.0), 0.3, 0.0)])

@@ -10,10 +10,11 @@ import pytest
 from numpy.typing import NDArray
 
 from calib import se3
+from drivers.motion import WheelSample
 from omnid.core.odometry import pose_search
 from omnid.core.odometry.estimates import OdometryEstimate, OdometryLimits, PoseEstimate
+from omnid.core.odometry.motion_filter import MotionFilter
 from omnid.core.odometry.motion_hypotheses import MotionHypotheses
-from omnid.core.odometry.motion_sensors import SensedMotion
 from omnid.core.odometry.odometry import VisualOdometry
 from omnid.core.odometry.tracking import KltSettings
 from omnid.core.places.relocalisation import Relocaliser
@@ -26,14 +27,21 @@ from tests.simulation.paths import planar_poses
 Array = NDArray[np.float64]
 
 PERIOD_S, PERIOD_M, STEP_M = 0.1, 0.3, 0.28
-NOISE = np.diag(np.repeat([5e-4, 2e-4], 3) ** 2)
 
 
-def driven(cameras: RenderedCameras, poses: Array, sensed: SensedMotion | None = None) -> list[OdometryEstimate]:
-    """Return the estimates at poses (N, 4, 4) of the rig, PERIOD_S apart."""
-    odometry = VisualOdometry(cameras.model, KltSettings(), OdometryLimits(), Relocaliser(cameras.model))
-    frames = [replace(cameras.frame(k, T), sensed=sensed if k else None) for k, T in enumerate(poses)]
-    return [odometry.process(frame, PERIOD_S if k else 0.0) for k, frame in enumerate(frames)]
+def driven(cameras: RenderedCameras, poses: Array, speed_mps: float | None = None) -> list[OdometryEstimate]:
+    """Return the estimates at poses (N, 4, 4) of the rig, PERIOD_S apart; speed_mps: by wheels."""
+    motion = MotionFilter()
+    if speed_mps is not None:
+        stamps_ns = range(10**9, 10**9 + 10**8 * len(poses), 5 * 10**7)
+        motion.sensors.add([WheelSample(stamp_ns, speed_mps, 0.0) for stamp_ns in stamps_ns])
+    odometry = VisualOdometry(cameras.model, KltSettings(), OdometryLimits(), Relocaliser(cameras.model), motion=motion)
+    found = []
+    for k, T in enumerate(poses):
+        ends_s = motion.sensors.seconds(10**9 + (k - 1) * 10**8), motion.sensors.seconds(10**9 + k * 10**8)
+        frame = replace(cameras.frame(k, T), interval_s=ends_s if k else None)
+        found.append(odometry.process(frame, PERIOD_S if k else 0.0))
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -57,9 +65,8 @@ def test_a_world_that_repeats_is_degraded_and_the_covariance_covers_all_motions(
 
 
 def test_wheels_tell_which_motion_it_was(alike: RenderedCameras) -> None:
-    sensed = SensedMotion(np.array([STEP_M, 0, 0, 0, 0, 0]), NOISE, NOISE, is_complete=True)
     poses = ahead(4, STEP_M)
-    for k, estimate in enumerate(driven(alike, poses, sensed)):
+    for k, estimate in enumerate(driven(alike, poses, STEP_M / PERIOD_S)):
         assert estimate.state is TrackingState.TRACKING, k
         assert motion_errors(estimate.T_odom_rect, se3.inverse(poses[0]) @ poses[k])[0] < 0.01, k
         assert estimate.covariance[0, 0] < 0.02**2, k
