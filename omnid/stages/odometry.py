@@ -17,7 +17,7 @@ from omnid.core.odometry.earlier_view import EarlierView
 from omnid.core.odometry.estimates import OdometryEstimate
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.image_breaks import RawImage
-from omnid.core.odometry.motion_agreement import Contradiction, MotionAgreement, contradiction_after
+from omnid.core.odometry.motion_agreement import Contradiction, MotionAgreement
 from omnid.core.odometry.motion_filter import MotionFilter
 from omnid.core.odometry.odometry import VisualOdometry
 from omnid.core.odometry.rig_error import RigError
@@ -65,7 +65,7 @@ class OdometryStage:
         self._method = _method(geometry.model(config.noise_px), config, raw_images, self.motion)
         self._agreement = MotionAgreement(self.motion)
         self.last_fault = AGREE  # the last disagreement that was more than a doubt
-        self._contradiction: Contradiction | None = None  # of all poses so far by wheels and gyro
+        self._contradiction = Contradiction()
         self._rig_error = RigError(motion_errors(geometry.rig))
 
     @property
@@ -159,12 +159,9 @@ class OdometryStage:
 
     def _contradicted(self, T_odom_rect: Array, stamp_ns: int) -> Array:
         """Return what wheels and gyro that contradict the poses add to the covariance (6, 6) of one."""
-        T_odom_base = T_odom_rect @ se3.inverse(self._T_base_rect)
-        self._contradiction = contradiction_after(self._contradiction, self.witness, T_odom_base, stamp_ns * S_PER_NS)
-        if self._contradiction is None:
-            return np.zeros((6, 6))
-        to_rect = np.linalg.inv(self._to_base)
-        return np.asarray(to_rect @ self._contradiction.covariance() @ to_rect.T)
+        T_odom_base, to_rect = T_odom_rect @ se3.inverse(self._T_base_rect), np.linalg.inv(self._to_base)
+        covariance = self._contradiction.add(self.witness, T_odom_base, stamp_ns * S_PER_NS)
+        return np.asarray(to_rect @ covariance @ to_rect.T)
 
     def _in_rig(self, covariance: Array) -> Array:
         """Return the covariance (6, 6) of a small motion of the rectified frame as one of the rig frame."""

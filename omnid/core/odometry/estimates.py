@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import Annotated
 
@@ -10,7 +9,6 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from calib import se3
 from omnid.core.odometry.exposure_times import NOTHING_ASSUMED, AssumedMotion, Exposure
 from omnid.core.odometry.stereo_frame import Features
 from omnid.errors import OmnidError
@@ -59,12 +57,6 @@ class OdometryLimits:
 
 Array = NDArray[np.float64]
 
-# A larger step of odom would be a jump for the readers of published poses, as REP 105 has odom continuous: it raises
-# reset_counter, or the gap stays open.
-JUMP_M, JUMP_RAD = 0.5, math.radians(30)
-# A smaller step keeps the view: landmarks are a metre away and farther, so that they move by 6 degrees at most besides
-# the turn.
-SAME_VIEW_M, SAME_VIEW_RAD = 0.1, math.radians(10)
 ROOM_M = 2.0  # median distance of landmarks that are not known: in a room
 SAME_M = 0.02  # Poses that differ less are one, because four sigmas of a pose that few landmarks support are as large.
 
@@ -131,46 +123,3 @@ class OdometryEstimate:
     # The motion during the exposures, for dense stereo of the frame; None: not known.
     exposure: Exposure | None = None
     distance_m: float = ROOM_M  # median of the landmarks
-
-
-@dataclass(frozen=True, slots=True)
-class GapStep:
-    """Step from the pose that was predicted through a gap, and published, to the one that is then found."""
-
-    xi: Array = field(default_factory=lambda: np.zeros(6))  # [t; r] in the axes of the predicted rectified frame
-
-    @classmethod
-    def between(cls, T_predicted: Array, T_odom_rect: Array) -> GapStep:
-        """Return the step from one pose to the other."""
-        return cls(se3.log(se3.inverse(T_predicted) @ T_odom_rect))
-
-    @property
-    def is_far(self) -> bool:
-        """True if it leads to another place."""
-        return bool(np.linalg.norm(self.xi[:3]) > JUMP_M)
-
-    @property
-    def is_turned(self) -> bool:
-        """True if it leads to another heading."""
-        return bool(np.linalg.norm(self.xi[3:]) > JUMP_RAD)
-
-    @property
-    def keeps_view(self) -> bool:
-        """True if it is so small that the same landmarks are in view."""
-        moved_m, turned_rad = float(np.linalg.norm(self.xi[:3])), float(np.linalg.norm(self.xi[3:]))
-        return moved_m < SAME_VIEW_M and turned_rad < SAME_VIEW_RAD
-
-    @property
-    def covariance(self) -> Array:
-        """The step as a covariance (6, 6) of the predicted pose."""
-        return np.outer(self.xi, self.xi)
-
-
-def with_more_inliers(a: PoseEstimate | None, b: PoseEstimate | None) -> PoseEstimate | None:
-    """Return the estimate with more inliers, the first one of two equal ones."""
-    return max((estimate for estimate in (a, b) if estimate), key=lambda estimate: estimate.inliers, default=None)
-
-
-def supports(found: list[PoseEstimate], T_predicted: Array) -> bool:
-    """True if most of the landmarks that were tracked, few as they may be, show a predicted pose (4, 4)."""
-    return bool(found) and found[0].inlier_ratio > 0.5 and GapStep.between(T_predicted, found[0].T_odom_rect).keeps_view

@@ -84,8 +84,8 @@ class Exposure:
 
     @staticmethod
     def of(times: PixelTimes, motion: RigVelocity, model: StereoModel) -> Exposure:
-        """Return the exposure of a frame; one that corrects nothing where all pixels are exposed at the stamp."""
-        return _AtOnce(times, NO_VELOCITY, model) if times.is_at_once else Exposure(times, motion, model)
+        """Return the exposure of a frame: where all pixels are exposed at the stamp, views are left as seen."""
+        return Exposure(times, NO_VELOCITY if times.is_at_once else motion, model)
 
     @property
     def is_known(self) -> bool:
@@ -94,6 +94,9 @@ class Exposure:
 
     def shift(self, points: Array) -> ViewShift:
         """Return the shifts of points (N, 3) [m] in the rectified frame at the stamp."""
+        if self.times.is_at_once:
+            none = np.zeros((len(points), 2))
+            return ViewShift(none, none, np.zeros((len(points), 4, 0)))
         cylinder, baseline_m = self.model.cylinder, self.model.baseline_m
         seen = view(points, cylinder, baseline_m)
         lower_s, upper_s = self.times.lower(seen[:, :2]), self.times.upper(seen[:, [0, 2]])
@@ -112,10 +115,10 @@ class Exposure:
         return np.asarray(points - tau * rate + tau**2 / 2 * np.cross(turn, rate))
 
     def derivatives(self, views: Array) -> Array:
-        """Return the derivatives (N, 3, 6) of corrected views (N, 3) by the velocity; 0 where they have no point."""
+        """Return the derivatives (N, 3, K) of corrected views (N, 3) by the velocity; 0 where they have no point."""
         points = triangulate(views, self.model.cylinder, self.model.baseline_m)
         known = np.isfinite(points).all(axis=1)
-        found = np.zeros((len(views), 3, 6))
+        found = np.zeros((len(views), 3, len(self.motion.twist)))
         found[known] = self.shift(points[known]).by_motion[:, :3]
         return found
 
@@ -125,6 +128,8 @@ class Exposure:
         The spread (N,) [px] is twice the standard deviation by the uncertainty of the velocity. NaN where the views
         cannot be triangulated.
         """
+        if self.times.is_at_once:
+            return pixels[:, 0].copy(), np.zeros(len(pixels))
         views, _ = self.corrected(pixels, rows)
         points = triangulate(views, self.model.cylinder, self.model.baseline_m)
         known = np.isfinite(points).all(axis=1)
@@ -138,6 +143,8 @@ class Exposure:
 
         Also the spread (N,) of the columns, as `upper_columns`. NaN where the disparity is unknown.
         """
+        if self.times.is_at_once:
+            return np.column_stack([pixels[:, 0], pixels[:, 1] + disparity]), np.zeros(len(pixels))
         known = np.flatnonzero(disparity > 0)
         views = np.column_stack([pixels, pixels[:, 1] + disparity])[known]
         shift = self.shift(triangulate(views, self.model.cylinder, self.model.baseline_m))
@@ -154,7 +161,7 @@ class Exposure:
         """
         views = np.column_stack([pixels, rows])
         noise = np.zeros((len(views), 3, 3))
-        for _ in range(ROUNDS):
+        for _ in range(0 if self.times.is_at_once else ROUNDS):
             points = triangulate(views, self.model.cylinder, self.model.baseline_m)
             known = np.isfinite(points).all(axis=1)
             shift = self.shift(points[known])
@@ -162,30 +169,3 @@ class Exposure:
             views[known] += np.column_stack([shift.lower, shift.upper[:, 1]])
             noise[known] = shift.noise(self.motion)
         return views, noise
-
-
-class _AtOnce(Exposure):
-    """Exposure of all pixels at the stamp: views are left as seen, and no component of a velocity matters."""
-
-    __slots__ = ()
-
-    def shift(self, points: Array) -> ViewShift:
-        """Return shifts of zero."""
-        count = len(points)
-        return ViewShift(np.zeros((count, 2)), np.zeros((count, 2)), np.zeros((count, 4, 0)))
-
-    def derivatives(self, views: Array) -> Array:
-        """Return no derivatives (N, 3, 0)."""
-        return np.zeros((len(views), 3, 0))
-
-    def upper_columns(self, pixels: Array, rows: Array) -> tuple[Array, Array]:
-        """Return the columns (N,) of the pixels, without spread."""
-        return pixels[:, 0].copy(), np.zeros(len(pixels))
-
-    def upper_pixels(self, pixels: Array, disparity: Array) -> tuple[Array, Array]:
-        """Return the pixels (N, 2) that are higher by the disparities (N,), without spread."""
-        return np.column_stack([pixels[:, 0], pixels[:, 1] + disparity]), np.zeros(len(pixels))
-
-    def corrected(self, pixels: Array, rows: Array) -> tuple[Array, Array]:
-        """Return the views (N, 3) as seen, without noise."""
-        return np.column_stack([pixels, rows]), np.zeros((len(pixels), 3, 3))

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.estimates import OdometryLimits, PoseEstimate, with_more_inliers
+from omnid.core.odometry.estimates import OdometryLimits, PoseEstimate
 from omnid.core.odometry.exposure_times import AssumedMotion, Exposure, ViewShift
 from omnid.core.odometry.local_map import LocalMap, Tracks
 from omnid.core.odometry.motion_hypotheses import displacements
@@ -101,7 +101,8 @@ class PoseSearch:
         best: PoseEstimate | None = None
         for T_guess, is_near in self._guesses(frame, usable, T_last, T_predicted):
             estimate = self.estimate(frame, T_guess, exposure, is_near=is_near)
-            best = with_more_inliers(best, estimate)
+            if estimate is not None and (best is None or estimate.inliers > best.inliers):
+                best = estimate
             if is_good_enough(best, self._limits, is_near=is_near):
                 break
         return best

@@ -1,116 +1,84 @@
-"""State machine of the tracking state: all its transitions are methods that return the next status.
+"""Tracking state: what supports the pose, and the counters of a loss.
 
-NOT_STARTED ----------------------------------------------> LOST
-STARTED, ACCEPTED ----------------------------------------> TRACKING
-STARTED again after an unknown motion --------------------> DEGRADED, and the reset counter rises
-ACCEPTED with few inliers, after a gap or a refused frame -> DEGRADED
-ACCEPTED with more than one hypothesis of the motion -------> DEGRADED
-ACCEPTED with few inliers that the upper camera shows ------> DEGRADED
-REFUSED, less than lost_s after the first such frame -----> DEGRADED
-REFUSED from then on -------------------------------------> LOST, and the map is started again when
-                                                            textured frames matched nothing for restart_s,
-                                                            or one was recognised elsewhere
-REFUSED, carried on by wheels and gyro -------------------> DEGRADED, and the map is started again likewise
+A pose by the cameras is TRACKING; DEGRADED with few inliers, few of them in the upper camera, with more than one
+hypothesis of the motion, or after a gap or a refused frame. A frame without one is DEGRADED while wheels and gyro carry
+the pose, and for lost_s after the first such frame; then it is LOST. The map is started again when textured frames have
+matched nothing for restart_s, or one was recognised elsewhere.
 
 The motion since the last fix is unknown from the first frame on to which wheels and gyro carried nothing, or that was
 recognised elsewhere. It is unknown, too, where a map is started again although they say that the base has hardly
-moved: the old map would be in view, so the base was carried away, or its wheels and gyro are wrong.
+moved: the old map would be in view, so the base was carried away, or its wheels and gyro are wrong. A map that is
+started after an unknown motion is DEGRADED at first, and the reset counter rises.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass, replace
 
 from omnid.core.odometry.estimates import OdometryLimits
 from omnid.tracking_state import TrackingState
 
 
-@dataclass(frozen=True, slots=True)
-class TrackingStatus:
-    """Tracking state after a frame, with the counters that lead to the next one; dt_s: since the frame before.
+class Tracking:
+    """Tracking state after a frame. dt_s: since the frame before. carried: wheels and gyro carry the pose."""
 
-    carried: wheels and gyro carry the pose on. elsewhere: the frame was recognised at a place to which the predicted
-    motion does not lead.
-    """
-
-    state: TrackingState = TrackingState.LOST
-    refused_s: float | None = None  # from the first of consecutive refused frames to this one; None: it was not refused
-    unmatched_s: float | None = None  # the same of textured ones after lost_s; None: there was none
-    time_since_fix_s: float = 0.0  # since the last accepted frame
-    restart: bool = False  # the map is to be started again at this frame
-    has_begun: bool = False  # a map was started once
-    unknown_motion: bool = False  # nothing measured the whole motion since the last fix
-    resets: int = 0  # times that odom has lost its relation to what was published
+    def __init__(self, limits: OdometryLimits) -> None:
+        self._limits = limits
+        self.state = TrackingState.LOST
+        self.resets = 0  # times that odom has lost its relation to what was published
+        self.time_since_fix_s = 0.0  # since the last accepted frame
+        self.unknown_motion = False  # nothing measured the whole motion since the last fix
+        self._refused_s: float | None = None  # since the first of consecutive refused frames
+        self._unmatched_s: float | None = None  # since the first textured one of them after lost_s
+        self._has_begun = False  # a map was started once
 
     @property
     def is_refused(self) -> bool:
         """True if the frame was refused."""
-        return self.refused_s is not None
+        return self._refused_s is not None
 
-    def started(self, *, carried: bool = False, elsewhere: bool = False) -> TrackingStatus:
-        """Return the status after a frame at which a map was started."""
-        # A map that takes the place of a lost one says nothing about the motion between the two.
-        unknown_motion = self._is_unknown(carried)
-        state = TrackingState.DEGRADED if unknown_motion and not elsewhere else TrackingState.TRACKING
-        return TrackingStatus(state, has_begun=True, resets=self.resets + unknown_motion)
+    def accept(self, dt_s: float, *, is_doubtful: bool, is_reset: bool) -> None:
+        """Go on after a frame with a pose; is_reset: its heading is not what was published."""
+        is_doubtful |= self.is_refused or dt_s > self._limits.max_gap_s
+        self._fix(TrackingState.DEGRADED if is_doubtful else TrackingState.TRACKING, self.resets + is_reset)
 
-    def without_map(self, dt_s: float, *, carried: bool = False) -> TrackingStatus:
-        """Return the status after a frame that has too few landmarks to start a map, where there is none."""
-        return TrackingStatus(
-            TrackingState.DEGRADED if carried else TrackingState.LOST,
-            time_since_fix_s=self.time_since_fix_s + dt_s,
-            has_begun=self.has_begun,
-            unknown_motion=self._is_unknown(carried),
-            resets=self.resets,
-        )
+    def refuse(
+        self, dt_s: float, *, is_textured: bool, is_elsewhere: bool = False, carried: bool = False, stayed: bool = False
+    ) -> bool:
+        """Go on after a frame without a pose; return whether the map is to be started again.
 
-    def accepted(
-        self, dt_s: float, limits: OdometryLimits, *, doubtful: bool = False, turned: bool = False
-    ) -> TrackingStatus:
-        """Return the status after a frame whose pose was accepted; turned: its heading is not what was published.
-
-        doubtful: few inliers, few of them in the upper camera, or another motion that explains the images as well.
-        """
-        doubtful = doubtful or self.is_refused or dt_s > limits.max_gap_s
-        state = TrackingState.DEGRADED if doubtful else TrackingState.TRACKING
-        return TrackingStatus(state, has_begun=True, resets=self.resets + turned)
-
-    def refused(
-        self,
-        dt_s: float,
-        limits: OdometryLimits,
-        *,
-        textured: bool = True,
-        elsewhere: bool = False,
-        carried: bool = False,
-        stayed: bool = False,
-    ) -> TrackingStatus:
-        """Return the status after a frame without a pose; textured: it has enough corners for a map.
-
-        stayed: the predicted pose has hardly changed since the last fix, and no landmark of the map shows it.
+        is_textured: it has enough corners for a map. is_elsewhere: it was recognised at a place to which the predicted
+        motion does not lead. stayed: the predicted pose has hardly changed since the last fix, and no landmark of the
+        map shows it.
         """
         # Nothing is seen in a time without frames: no more of it counts than goes without a doubt.
-        step_s = min(dt_s, limits.max_gap_s)
-        refused_s, unmatched_s = _longer(self.refused_s, step_s), self.unmatched_s
-        is_lost = refused_s >= limits.lost_s
-        if is_lost and textured:
-            unmatched_s = _longer(unmatched_s, step_s)
-        restart = is_lost and (elsewhere or (unmatched_s is not None and unmatched_s >= limits.restart_s))
-        return replace(
-            self,
-            state=TrackingState.LOST if is_lost and not carried else TrackingState.DEGRADED,
-            refused_s=refused_s,
-            unmatched_s=unmatched_s,
-            time_since_fix_s=self.time_since_fix_s + dt_s,
-            restart=restart,
-            has_begun=True,
-            unknown_motion=self._is_unknown(carried) or (restart and stayed),
-        )
+        step_s = min(dt_s, self._limits.max_gap_s)
+        self._refused_s = 0.0 if self._refused_s is None else self._refused_s + step_s
+        is_lost = self._refused_s >= self._limits.lost_s
+        if is_lost and is_textured:
+            self._unmatched_s = 0.0 if self._unmatched_s is None else self._unmatched_s + step_s
+        is_unmatched = self._unmatched_s is not None and self._unmatched_s >= self._limits.restart_s
+        restarts = is_lost and (is_elsewhere or is_unmatched)
+        self._has_begun = True
+        self._predict(dt_s, is_lost=is_lost, carried=carried)
+        self.unknown_motion |= restarts and stayed
+        return restarts
 
-    def _is_unknown(self, carried: bool) -> bool:
-        return self.unknown_motion or (self.has_begun and not carried)
+    def start(self, *, carried: bool, is_elsewhere: bool = False) -> None:
+        """Go on after a frame at which a map was started."""
+        # A map that takes the place of a lost one says nothing about the motion between the two.
+        is_unknown = self.unknown_motion or (self._has_begun and not carried)
+        is_doubtful = is_unknown and not is_elsewhere
+        self._fix(TrackingState.DEGRADED if is_doubtful else TrackingState.TRACKING, self.resets + is_unknown)
 
+    def miss(self, dt_s: float, *, carried: bool) -> None:
+        """Go on after a frame that has too few landmarks to start a map, where there is none."""
+        self._refused_s = self._unmatched_s = None
+        self._predict(dt_s, is_lost=True, carried=carried)
 
-def _longer(since_s: float | None, step_s: float) -> float:
-    """Return the time since a first frame after one more; None: this is the first one."""
-    return 0.0 if since_s is None else since_s + step_s
+    def _fix(self, state: TrackingState, resets: int) -> None:
+        self.state, self.resets, self.time_since_fix_s, self.unknown_motion = state, resets, 0.0, False
+        self._refused_s, self._unmatched_s, self._has_begun = None, None, True
+
+    def _predict(self, dt_s: float, *, is_lost: bool, carried: bool) -> None:
+        self.state = TrackingState.LOST if is_lost and not carried else TrackingState.DEGRADED
+        self.time_since_fix_s += dt_s
+        self.unknown_motion |= self._has_begun and not carried

@@ -1,110 +1,76 @@
-"""The tracking state: a table of transitions."""
+"""The tracking state along sequences of frames."""
 
 from __future__ import annotations
-
-from dataclasses import replace
-from typing import Any
 
 import pytest
 
 from omnid.core.odometry.estimates import OdometryLimits
-from omnid.core.odometry.tracking_state_machine import TrackingStatus
+from omnid.core.odometry.tracking_state_machine import Tracking
 from omnid.tracking_state import TrackingState
 
 DT_S = 0.125
 # Lost from the third refused frame on, and started again at the second unmatched one.
-LIMITS = OdometryLimits(good_inliers=50, lost_s=0.2, restart_s=0.1, max_gap_s=0.5)
-
+LIMITS = OdometryLimits(lost_s=0.2, restart_s=0.1, max_gap_s=0.5)
 TRACKING, DEGRADED, LOST = TrackingState.TRACKING, TrackingState.DEGRADED, TrackingState.LOST
-STARTED, NOT_STARTED, ACCEPTED, REFUSED = "started", "without_map", "accepted", "refused"
-
-FIRST = TrackingStatus()
-FIX = TrackingStatus(TRACKING, has_begun=True)
-ROUGH = replace(FIX, state=DEGRADED)
 
 
-def refused(state: TrackingState, frames: int, unmatched: int = 0, **facts: Any) -> TrackingStatus:
-    """Return the status after frames that were refused, over which nothing measured the motion where facts say so."""
-    unmatched_s = (unmatched - 1) * DT_S if unmatched else None
-    status = TrackingStatus(state, (frames - 1) * DT_S, unmatched_s, frames * DT_S, has_begun=True, unknown_motion=True)
-    return replace(status, **facts)
+def after(frames: str, limits: OdometryLimits = LIMITS, dt_s: float = DT_S) -> list[tuple[TrackingState, int]]:
+    """Return state and resets after each frame.
+
+    s: a map is started, m: none can be, a: accepted, b: in doubt, g: after a gap, j: with another heading, r: refused,
+    d: dark, e: recognised elsewhere; in capitals where wheels and gyro carry the pose, w: they also say it stands.
+    """
+    tracking, found = Tracking(limits), []
+    for frame in frames:
+        carried = frame.isupper() or frame == "w"
+        if frame in "sS":
+            tracking.start(carried=carried, is_elsewhere=False)
+        elif frame in "mM":
+            tracking.miss(dt_s, carried=carried)
+        elif frame in "abgj":
+            tracking.accept(0.75 if frame == "g" else dt_s, is_doubtful=frame == "b", is_reset=frame == "j")
+        else:
+            restarts = tracking.refuse(
+                dt_s, is_textured=frame not in "dD", is_elsewhere=frame == "e", carried=carried, stayed=frame == "w"
+            )
+            if restarts:
+                tracking.start(carried=carried, is_elsewhere=frame == "e")
+        found.append((tracking.state, tracking.resets))
+    return found
 
 
-REFUSED_ONCE, REFUSED_TWICE = refused(DEGRADED, 1), refused(DEGRADED, 2)
-DARK, UNMATCHED = refused(LOST, 3), refused(LOST, 4, 1)
-BEGINS_AGAIN = refused(LOST, 5, 2, restart=True)
-CARRIED = refused(DEGRADED, 4, 1, unknown_motion=False)
-CARRIED_AND_BEGINS_AGAIN = refused(DEGRADED, 5, 2, restart=True, unknown_motion=False)
-WITHOUT_MAP = replace(FIX, state=LOST, time_since_fix_s=5 * DT_S, unknown_motion=True)
-CARRIED_WITHOUT_MAP = replace(WITHOUT_MAP, state=DEGRADED, unknown_motion=False)
-ONE_RESET = replace(FIX, resets=1)
-
-TRANSITIONS = [
-    # before, frame, after
-    (FIRST, (STARTED, dict()), FIX),
-    (FIRST, (NOT_STARTED, dict(dt_s=DT_S)), TrackingStatus(LOST, time_since_fix_s=DT_S)),
-    (
-        TrackingStatus(LOST, time_since_fix_s=DT_S),
-        (NOT_STARTED, dict(dt_s=DT_S)),
-        TrackingStatus(LOST, time_since_fix_s=2 * DT_S),
-    ),
-    (TrackingStatus(LOST, time_since_fix_s=DT_S), (STARTED, dict()), FIX),
-    (FIX, (ACCEPTED, dict(dt_s=DT_S)), FIX),
-    (FIX, (ACCEPTED, dict(dt_s=DT_S, doubtful=True)), ROUGH),
-    (ROUGH, (ACCEPTED, dict(dt_s=DT_S)), FIX),
-    (FIX, (ACCEPTED, dict(dt_s=DT_S, doubtful=True)), ROUGH),
-    (FIX, (ACCEPTED, dict(dt_s=0.5)), FIX),
-    (FIX, (ACCEPTED, dict(dt_s=0.75)), ROUGH),
-    (FIX, (REFUSED, dict(dt_s=DT_S)), REFUSED_ONCE),
-    (REFUSED_ONCE, (ACCEPTED, dict(dt_s=DT_S)), ROUGH),
-    (REFUSED_ONCE, (ACCEPTED, dict(dt_s=DT_S, turned=True)), replace(ROUGH, resets=1)),
-    (REFUSED_ONCE, (REFUSED, dict(dt_s=DT_S)), REFUSED_TWICE),
-    (REFUSED_TWICE, (REFUSED, dict(dt_s=DT_S, textured=False)), DARK),
-    (DARK, (REFUSED, dict(dt_s=DT_S, textured=False)), refused(LOST, 4)),
-    (DARK, (REFUSED, dict(dt_s=DT_S)), UNMATCHED),
-    (UNMATCHED, (REFUSED, dict(dt_s=DT_S, textured=False)), refused(LOST, 5, 1)),
-    (UNMATCHED, (REFUSED, dict(dt_s=DT_S)), BEGINS_AGAIN),
-    (REFUSED_ONCE, (REFUSED, dict(dt_s=DT_S, elsewhere=True)), REFUSED_TWICE),
-    (DARK, (REFUSED, dict(dt_s=DT_S, elsewhere=True)), replace(UNMATCHED, restart=True)),
-    (UNMATCHED, (ACCEPTED, dict(dt_s=DT_S)), ROUGH),
-    # Wheels and gyro carry the pose on; the motion is known only where they do so from the last fix on.
-    (FIX, (REFUSED, dict(dt_s=DT_S, carried=True)), refused(DEGRADED, 1, unknown_motion=False)),
-    (REFUSED_TWICE, (REFUSED, dict(dt_s=DT_S, textured=False, carried=True)), replace(DARK, state=DEGRADED)),
-    (CARRIED, (REFUSED, dict(dt_s=DT_S, carried=True)), CARRIED_AND_BEGINS_AGAIN),
-    (UNMATCHED, (REFUSED, dict(dt_s=DT_S, carried=True)), replace(BEGINS_AGAIN, state=DEGRADED)),
-    # They say that it has hardly moved, and the images that the map is not in view.
-    (CARRIED, (REFUSED, dict(dt_s=DT_S, carried=True, stayed=True)), replace(BEGINS_AGAIN, state=DEGRADED)),
-    (
-        CARRIED,
-        (REFUSED, dict(dt_s=DT_S, textured=False, carried=True, stayed=True)),
-        refused(DEGRADED, 5, 1, unknown_motion=False),
-    ),
-    # The map is started again.
-    (BEGINS_AGAIN, (STARTED, dict()), replace(ROUGH, resets=1)),
-    (BEGINS_AGAIN, (STARTED, dict(elsewhere=True)), ONE_RESET),
-    (replace(BEGINS_AGAIN, resets=3), (STARTED, dict()), replace(ROUGH, resets=4)),
-    (CARRIED_AND_BEGINS_AGAIN, (STARTED, dict(carried=True)), FIX),
-    (BEGINS_AGAIN, (NOT_STARTED, dict(dt_s=0.0)), WITHOUT_MAP),
-    (CARRIED_AND_BEGINS_AGAIN, (NOT_STARTED, dict(dt_s=0.0, carried=True)), CARRIED_WITHOUT_MAP),
-    (CARRIED_WITHOUT_MAP, (STARTED, dict(carried=True)), FIX),
-    (CARRIED_WITHOUT_MAP, (STARTED, dict()), replace(ROUGH, resets=1)),
-    (WITHOUT_MAP, (STARTED, dict(carried=True)), replace(ROUGH, resets=1)),
-    (WITHOUT_MAP, (NOT_STARTED, dict(dt_s=0.0, carried=True)), replace(WITHOUT_MAP, state=DEGRADED)),
-]
-
-
-@pytest.mark.parametrize(("before", "frame", "after"), TRANSITIONS)
-def test_transition(before: TrackingStatus, frame: tuple[str, dict[str, Any]], after: TrackingStatus) -> None:
-    name, facts = frame
-    limits = {"limits": LIMITS} if name in (ACCEPTED, REFUSED) else {}
-    assert getattr(before, name)(**facts, **limits) == after
+@pytest.mark.parametrize(
+    ("frames", "states", "resets"),
+    [
+        ("saba", [TRACKING, TRACKING, DEGRADED, TRACKING], 0),
+        ("mms", [LOST, LOST, TRACKING], 0),
+        ("sga", [TRACKING, DEGRADED, TRACKING], 0),
+        ("sraa", [TRACKING, DEGRADED, DEGRADED, TRACKING], 0),
+        ("srja", [TRACKING, DEGRADED, DEGRADED, TRACKING], 1),
+        ("sdddda", [TRACKING, DEGRADED, DEGRADED, LOST, LOST, DEGRADED], 0),
+        # Textured frames that match nothing: the map is started again.
+        ("srrrra", [TRACKING, DEGRADED, DEGRADED, LOST, DEGRADED, TRACKING], 1),
+        ("sddrda", [TRACKING, DEGRADED, DEGRADED, LOST, LOST, DEGRADED], 0),
+        # One recognised elsewhere begins at once, and the gap is known.
+        ("srre", [TRACKING, DEGRADED, DEGRADED, TRACKING], 1),
+        # Wheels and gyro carry the pose on; the motion is known only where they do so from the last fix on.
+        ("sDDDDD", [TRACKING, *[DEGRADED] * 5], 0),
+        ("sRRRRa", [TRACKING, DEGRADED, DEGRADED, DEGRADED, TRACKING, TRACKING], 0),
+        ("sRrRR", [TRACKING, DEGRADED, DEGRADED, DEGRADED, DEGRADED], 1),
+        # They say that it has hardly moved, and the images that the map is not in view.
+        ("sRRRw", [TRACKING, DEGRADED, DEGRADED, DEGRADED, DEGRADED], 1),
+        # No map can be started.
+        ("sMMS", [TRACKING, DEGRADED, DEGRADED, TRACKING], 0),
+        ("sMmS", [TRACKING, DEGRADED, LOST, DEGRADED], 1),
+    ],
+)
+def test_states(frames: str, states: list[TrackingState], resets: int) -> None:
+    found = after(frames)
+    assert [state for state, _ in found] == states and found[-1][1] == resets
 
 
 @pytest.mark.parametrize(("dt_s", "lost", "started_again"), [(0.25, 2, 4), (0.125, 3, 7), (0.0625, 5, 13)])
 def test_times_and_not_frames_decide(dt_s: float, lost: int, started_again: int) -> None:
-    limits, status, seen = replace(LIMITS, restart_s=0.5), FIX, []
-    for _ in range(started_again):
-        status = status.refused(dt_s, limits)
-        seen.append(status)
-    assert [status.state for status in seen] == [DEGRADED] * (lost - 1) + [LOST] * (started_again - lost + 1)
-    assert [status.restart for status in seen] == [False] * (started_again - 1) + [True]
+    found = after("s" + started_again * "r", OdometryLimits(lost_s=0.2, restart_s=0.5), dt_s)[1:]
+    assert [state for state, _ in found[:-1]] == [DEGRADED] * (lost - 1) + [LOST] * (started_again - lost)
+    assert [resets for _, resets in found] == [0] * (started_again - 1) + [1]

@@ -10,7 +10,7 @@ from calib import se3
 from omnid.core.odometry.corners import corners
 from omnid.core.odometry.paper.paper_odometry import (
     FEATURES,
-    UNTRACKED_SPEED_SIGMA,
+    UNKNOWN_SPEED_SIGMA,
     PaperOdometry,
     refine,
     turned_track,
@@ -102,7 +102,7 @@ def test_darkness_is_lost_and_keeps_the_pose(cameras: RenderedCameras, frames: l
     # The motion in the gap is not known: odom goes on from another place, which its sigma says.
     again = odometry.process(frames[2], 0.1)
     assert (again.state, again.resets) == (TrackingState.DEGRADED, 1)
-    np.testing.assert_allclose(np.sqrt(again.covariance[0, 0]), UNTRACKED_SPEED_SIGMA * 0.2, rtol=0.05)
+    np.testing.assert_allclose(np.sqrt(again.covariance[0, 0]), UNKNOWN_SPEED_SIGMA * 0.2, rtol=0.05)
     after = odometry.process(frames[3], 0.1)
     assert (after.state, after.resets) == (TrackingState.TRACKING, 1)
     moved = se3.inverse(out.T_odom_rect) @ again.T_odom_rect
