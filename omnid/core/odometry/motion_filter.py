@@ -13,7 +13,6 @@ up along it by the covariance of e and s. Where nothing measures it, the velocit
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
@@ -59,15 +58,6 @@ NOISE_GAIN = 0.02
 SUDDEN_RAD = 0.14
 
 
-@dataclass(slots=True)
-class Bridge:
-    """What wheels and gyro have carried the pose over since the cameras found it last."""
-
-    time_s: float = 0.0
-    variance_m2: float = 0.0  # of the position, that has grown meanwhile
-    is_over: bool = False  # beyond the limits: wheels and gyro are left out until the cameras find the pose
-
-
 class MotionFilter:
     """The filter; without samples of wheels and gyro that of the paper.
 
@@ -90,7 +80,8 @@ class MotionFilter:
         self._disagreements = 0  # consecutive steps in which the turns of wheels and gyro differ
         self._noise_factors = np.ones(2)  # of the wheels' distance and turn
         self._before_sensing = self._filter.x, self._filter.P
-        self._bridge = Bridge()
+        self._bridged_s = self._bridged_m2 = 0.0  # time and variance of the position since the cameras found it
+        self._is_over = False  # they are beyond the limits: wheels and gyro are left out until then
         self.reset()
 
     def reset(self) -> None:
@@ -180,7 +171,7 @@ class MotionFilter:
         # 1. What wheels and gyro say is a measurement of the filter. Wheels whose turn differs from that of the gyro
         #    twice in a row slip, as those that the cameras contradict, and are left out.
         values, wheels, gyro = self.values, Twist(), Twist()
-        if interval_s is not None and dt_s > 0 and not self._bridge.is_over:
+        if interval_s is not None and dt_s > 0 and not self._is_over:
             gyro = self.sensors.by_gyro(interval_s, values)
             if self.wheels_are_sane and not self.is_slipping:
                 wheels = self.sensors.by_wheels(interval_s, values, self._noise_factors)
@@ -249,7 +240,7 @@ class MotionFilter:
             self.reset()
         self._filter.P[POSE] = self._filter.P[:, POSE] = 0.0
         self._filter.P[POSE, POSE] = covariance
-        self._bridge = Bridge()
+        self._bridged_s, self._bridged_m2, self._is_over = 0.0, 0.0, False
 
     def carry(self, dt_s: float, *, is_measured: bool, most_s: float, most_sigma_m: float) -> bool:
         """Move the pose's covariance on by the last step; return whether wheels and gyro carry the pose.
@@ -259,10 +250,10 @@ class MotionFilter:
         self._last_step = None
         if is_measured:
             moved = self._moved(dt_s)
-            self._bridge.time_s += dt_s
-            self._bridge.variance_m2 += float(np.diag(moved - self._filter.P)[POSE][:3].max())
-            self._bridge.is_over = self._bridge.time_s > most_s or self._bridge.variance_m2 > most_sigma_m**2
-            if not self._bridge.is_over:
+            self._bridged_s += dt_s
+            self._bridged_m2 += float(np.diag(moved - self._filter.P)[POSE][:3].max())
+            self._is_over = self._bridged_s > most_s or self._bridged_m2 > most_sigma_m**2
+            if not self._is_over:
                 self._filter.P = moved
                 return True
         if not self._is_unknown:

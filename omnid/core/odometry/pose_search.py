@@ -6,7 +6,7 @@ Equations and sections are those of Dang et al. 2012.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.estimates import OdometryLimits, PoseEstimate
-from omnid.core.odometry.exposure_times import AssumedMotion, Exposure, ViewShift
+from omnid.core.odometry.exposure_times import AssumedMotion, Exposure
 from omnid.core.odometry.local_map import LocalMap, Tracks
 from omnid.core.odometry.motion_hypotheses import displacements
 from omnid.core.odometry.plane_patches import align_rows, view_noise
@@ -97,9 +97,22 @@ class PoseSearch:
     def find(
         self, frame: StereoFrame, usable: Flags, T_last: Array, T_predicted: Array, exposure: Exposure
     ) -> PoseEstimate | None:
-        """Return the best estimate from the guesses, or the first good one; None: no landmarks were found."""
+        """Return the best estimate from guesses of the pose, or the first good one; None: no landmarks were found.
+
+        The guesses: the prediction, which nearly always is near; the prediction, searched with a pyramid; the best yaw
+        hypothesis there (IV.F), by the peaks of the circular correlation with the last panorama, then the paper's
+        steps.
+        """
         best: PoseEstimate | None = None
-        for T_guess, is_near in self._guesses(frame, usable, T_last, T_predicted):
+        for number in range(3):
+            T_guess, is_near = T_predicted, number == 0
+            if number == 2:
+                assert self._map.last is not None
+                before, now = self._map.last.panorama, frame.lower.panorama
+                peaks = correlation_peaks(before, now, usable, turn_px=frame.lower.period_px)
+                T_unturned = T_last.copy()
+                T_unturned[:3, 3] = T_predicted[:3, 3]
+                T_guess = self.best_yaw(frame, T_unturned, peaks + steps(), likely=len(peaks))
             estimate = self.estimate(frame, T_guess, exposure, is_near=is_near)
             if estimate is not None and (best is None or estimate.inliers > best.inliers):
                 best = estimate
@@ -124,7 +137,9 @@ class PoseSearch:
         #    same where the inliers show no motion of a vehicle: they may be on a person who walks along, and what is
         #    nearer to the prediction is right.
         if found.inlier_ratio < self._limits.good_inlier_ratio or off_m > reach_m:
-            others.append(self.by_outliers(frame, found, exposure))
+            tracks = self._map.track(frame.lower, found.T_odom_rect, self._tracked, turn=frame.seq)
+            coarse = self.coarse(frame, tracks.without(found.landmarks), found.T_odom_rect, exposure)
+            others.append(None if coarse is None else self.refine(frame, coarse, exposure))
         return [each for each in others if each is not None and each.distance_m(T_predicted) < max(reach_m, off_m)]
 
     def with_doubtful_depths(self, estimate: PoseEstimate) -> PoseEstimate:
@@ -136,13 +151,6 @@ class PoseSearch:
         # Of landmarks with several depths a pose may also err to the side.
         covariance = estimate.covariance + np.diag(np.repeat([float(other[:3] @ other[:3]), 0.0], 3))
         return replace(estimate, covariance=covariance, doubtful_depths=True)
-
-    def by_outliers(self, frame: StereoFrame, estimate: PoseEstimate, exposure: Exposure) -> PoseEstimate | None:
-        """Return the pose by the tracks that are outliers of an estimate; None: too few of them agree."""
-        tracks = self._map.track(frame.lower, estimate.T_odom_rect, self._tracked, turn=frame.seq)
-        outliers = tracks.without(estimate.landmarks)
-        coarse = self.coarse(frame, outliers, estimate.T_odom_rect, exposure)
-        return None if coarse is None else self.refine(frame, coarse, exposure)
 
     def estimate(self, frame: StereoFrame, T_guess: Array, exposure: Exposure, *, is_near: bool) -> PoseEstimate | None:
         """Return the pose from one guess; None: no landmarks were found."""
@@ -158,24 +166,6 @@ class PoseSearch:
         # 3. Refine: align the keyframes' patches, warped to the estimated viewpoint; Gauss-Newton again.
         return self.refine(frame, coarse, exposure)
 
-    def _guesses(
-        self, frame: StereoFrame, usable: Flags, T_last: Array, T_predicted: Array
-    ) -> Iterator[tuple[Array, bool]]:
-        """Yield guesses of the pose, and whether they count as near: the prediction, which nearly always is near.
-
-        Then, each if what was before was not good: the prediction, searched with a pyramid; the best yaw hypothesis
-        there (IV.F). The hypotheses are the peaks of the circular correlation with the last panorama, then the paper's
-        steps.
-        """
-        yield T_predicted, True
-        yield T_predicted, False
-        assert self._map.last is not None
-        before, now = self._map.last.panorama, frame.lower.panorama
-        peaks = correlation_peaks(before, now, usable, turn_px=frame.lower.period_px)
-        T_unturned = T_last.copy()
-        T_unturned[:3, 3] = T_predicted[:3, 3]
-        yield self.best_yaw(frame, T_unturned, peaks + steps(), likely=len(peaks)), False
-
     def coarse(self, frame: StereoFrame, tracks: Tracks, T_odom_guess: Array, exposure: Exposure) -> CoarsePose | None:
         """Return the pose that most tracks support, None where fewer than MIN_LANDMARKS do.
 
@@ -188,9 +178,15 @@ class PoseSearch:
         in_guess = se3.apply(T_guess_odom, self._map.table.points[tracks.landmarks])
         slopes = self._map.slopes(T_odom_guess, tracks.landmarks)
         shift = exposure.shift(in_guess)
-        views, variance = self._views(frame, tracks, slopes, shift, 2 * shift.column_sigma(exposure.motion))
-        disparity = views[:, 2] - views[:, 1]
-        views += np.column_stack([shift.lower, shift.upper[:, 1]])
+        # 1. The rows in the upper panorama, where the patches must fit; a wrong one is an outlier of the pose.
+        guess = tracks.pixels + shift.lower - shift.upper
+        guess[:, 1] += tracks.predicted[:, 2] - tracks.predicted[:, 1]
+        spread_px = 2 * shift.column_sigma(exposure.motion)
+        pair = frame.lower, frame.upper
+        rows, variance = align_rows(pair, tracks.pixels, guess, slopes, self._model, UPPER_REACH_PX, spread_px)
+        disparity = rows - tracks.pixels[:, 1]
+        views = np.column_stack([tracks.pixels, rows]) + np.column_stack([shift.lower, shift.upper[:, 1]])
+        # 2. RANSAC and Gauss-Newton.
         T_curr_guess, is_inlier = ransac(in_guess, views, self._model, np.random.default_rng(frame.seq))
         landmarks = tracks.landmarks[is_inlier]
         noise = shift.noise(exposure.motion)[is_inlier]
@@ -307,22 +303,6 @@ class PoseSearch:
             if highest > ENOUGH_RATIO:
                 break
         return best
-
-    def _views(
-        self, frame: StereoFrame, tracks: Tracks, slopes: Array, shift: ViewShift, spread_px: Array
-    ) -> tuple[Array, Array]:
-        """Return the views (M, 3) [px] of tracks: pixels, and the rows in the upper panorama where they match there.
-
-        slopes (M, 2) of their disparities; spread_px: standard deviations (M,) of the columns there, twice. Also
-        returns the variances (M,) [px^2] of the rows by noise.
-        """
-        pair = frame.lower, frame.upper
-        guess = tracks.pixels.copy()
-        guess[:, 1] += tracks.predicted[:, 2] - tracks.predicted[:, 1]
-        guess += shift.lower - shift.upper
-        # A patch must fit there, and a wrong row is an outlier of the pose.
-        rows, variance = align_rows(pair, tracks.pixels, guess, slopes, self._model, UPPER_REACH_PX, spread_px)
-        return np.column_stack([tracks.pixels, rows]), variance
 
     def _solve(
         self,

@@ -7,7 +7,6 @@ view of the world should have moved by many pixels.
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -86,16 +85,9 @@ def expected_flow(T_before_after: Array, columns: int, edges_rad: tuple[float, f
     edges_rad: azimuths of its left and right edge.
     """
     twist = se3.log(T_before_after)
-    cosines, sines = _directions(columns, edges_rad)
-    across = np.abs(twist[1] * cosines - twist[0] * sines)
-    return np.asarray(abs(twist[5]) + across / USUAL_RANGE_M)
-
-
-@lru_cache(maxsize=4)
-def _directions(columns: int, edges_rad: tuple[float, float]) -> tuple[Array, Array]:
-    """Return cosines and sines (columns,) of the azimuths of the columns of a panorama with these edges."""
     azimuth = edges_rad[0] - (np.arange(columns) + 0.5) * (edges_rad[0] - edges_rad[1]) / columns
-    return np.cos(azimuth), np.sin(azimuth)
+    across = np.abs(twist[1] * np.cos(azimuth) - twist[0] * np.sin(azimuth))
+    return np.asarray(abs(twist[5]) + across / USUAL_RANGE_M)
 
 
 def _half(panorama: Image) -> Image:

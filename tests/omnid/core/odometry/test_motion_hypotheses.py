@@ -123,7 +123,8 @@ def test_the_pose_by_outliers_is_sought_where_the_inliers_show_no_motion_of_a_ve
 ) -> None:
     """They may be on a person who follows the robot."""
     monkeypatch.setattr(pose_search, "displacements", lambda *_: [])
-    monkeypatch.setattr(pose_search.PoseSearch, "by_outliers", lambda *_: pose(0.028, 0.5))
+    monkeypatch.setattr(pose_search.PoseSearch, "coarse", lambda *_: pose(0.028, 0.5))
+    monkeypatch.setattr(pose_search.PoseSearch, "refine", lambda _, frame, coarse, exposure: coarse)
     search = pose_search.PoseSearch(Mock(), alike.model, OdometryLimits(), KltSettings())
     T_predicted = pose(0.020).T_odom_rect
     found = search.others(alike.frame(0, np.eye(4)), pose(0.0, 0.6, range(70)), T_predicted, Mock(), reach_m)
