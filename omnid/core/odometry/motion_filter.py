@@ -42,7 +42,7 @@ START = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 START_SIGMA = np.array([0.05, 0.1, 0.02, 0.02, 0.02, 0.02, 0.02])
 WALK_SIGMA = np.array([2e-4, 5e-4, 1e-5, 1e-5, 5e-5, 5e-5, 5e-5])
 LOST_SIGMA = np.array([1.0, 1.0, 0.1, 0.1, 0.2, 0.2, 0.2])
-STATES_OF = {WheelSample: np.array([0, 1, 2]), GyroSample: np.array([3, 4, 5, 6])}
+STATES_OF = {WheelSample: slice(0, 3), GyroSample: slice(3, 7)}
 SANE_SCALE = (0.5, 2.0)  # limits of the wheels' scales, because beyond them their settings are wrong.
 CAMERA_SIGMA = np.repeat([3e-4, 1e-4], 3)  # of the cameras' step, m and rad, beside what its covariance says
 # A larger difference from the cameras' step means that a sensor slips or is wrong: noise makes one of 16,000 so large.
@@ -304,8 +304,8 @@ class MotionFilter:
             if self._outliers[sensor] > MOST_OUTLIERS:
                 # Its settings may be wrong: they are learned again.
                 self._outliers[sensor] = 0
-                for state in STATES_OF[sensor]:
-                    self._set_covariance(slice(12 + state, 13 + state), LOST_SIGMA[[state]] ** 2)
+                states = STATES_OF[sensor]
+                self._set_covariance(slice(12 + states.start, 12 + states.stop), LOST_SIGMA[states] ** 2)
 
     def _measure(self, twist: Twist, axis: int, values: Array, dt_s: float, *, is_gated: bool = False) -> float:
         """Update with one component of the base's twist; return the squared Mahalanobis distance of its innovation.
