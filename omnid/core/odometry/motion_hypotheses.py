@@ -113,8 +113,8 @@ class MotionHypotheses:
         moved_m = [each.T_odom_rect[:3, 3] - T_predicted[:3, 3] for each in candidates]
         weights = np.empty((len(self._left), len(candidates)))
         for row, before in zip(weights, self._left, strict=True):
-            variance_m2 = (sigma_mps * dt_s) ** 2
-            variance_m2 += START_ACCELERATION_VARIANCE * dt_s**4 if before.velocity.any() else 0.0
+            is_other = before.velocity.any()
+            variance_m2 = START_ACCELERATION_VARIANCE * dt_s**4 if is_other else (sigma_mps * dt_s) ** 2
             squared = np.array([np.sum((step_m - before.velocity * dt_s) ** 2) for step_m in moved_m]) / variance_m2
             row[:] = before.log_weight - np.minimum(squared / 2, DECIDING_COST)
         likely = np.flatnonzero(costs < DECIDING_COST)
@@ -132,7 +132,11 @@ class MotionHypotheses:
                 for before, weight in zip(self._left, weights[:, m], strict=True)
             ]
         if not self.is_single:
-            after += [_moved(each, moved_m[best], dt_s, MISSED) for each in self._left]
+            after += [
+                _moved(before, moved_m[best], dt_s, MISSED)
+                for before, row in zip(self._left, weights, strict=True)
+                if row[likely].max() < before.log_weight + MISSED
+            ]
         self._keep(after, chosen.T_odom_rect, dt_s)
         # 4. Of estimates of the same pose the one with most inliers.
         wrong = [each.landmarks for each in candidates if contradict(each, chosen)]
