@@ -58,18 +58,19 @@ class RobotPage:
 
     def routes(self) -> list[BaseRoute]:
         """Return the addresses."""
+        commands: dict[str, Callable[[Request], Awaitable[Answer]]] = {
+            "stop": lambda _: self.stop(),
+            "arm": self.arm,
+            "drive": self.drive,
+            "goal": self.goal,
+            "route": partial(self._asked_in_words, "route", route_request, Driver.route),
+            "navigation": partial(self._asked_in_words, "navigation", navigation_verb, Driver.navigate),
+            "map": lambda _: self._asked("map", Driver.save_map),
+        }
         return [
             Route("/live", self.feed.live),
             Route("/image/{kind}", self.feed.image),
-            _command_route("/stop", lambda _: self.stop()),
-            _command_route("/arm", self.arm),
-            _command_route("/drive", self.drive),
-            _command_route("/goal", self.goal),
-            _command_route("/route", lambda asked: self._asked_in_words("route", asked, route_request, Driver.route)),
-            _command_route(
-                "/navigation", lambda asked: self._asked_in_words("navigation", asked, navigation_verb, Driver.navigate)
-            ),
-            _command_route("/map", lambda _: self._asked("map", Driver.save_map)),
+            *(_command_route(f"/{name}", act) for name, act in commands.items()),
         ]
 
     def metrics(self, refused: Mapping[str, int]) -> bytes:
@@ -129,14 +130,10 @@ class RobotPage:
         return await self._asked("goal", lambda driver: driver.goal(float(found[1]), float(found[2]), heading_rad))
 
     async def _asked_in_words(
-        self,
-        kind: str,
-        request: Request,
-        parse: Callable[[str], NavigationRequest],
-        ask: Callable[[Driver, str], Answer],
+        self, kind: str, parse: Callable[[str], NavigationRequest], ask: Callable[[Driver, str], Answer], asked: Request
     ) -> Answer:
         """Pass on a request in the words of cmd/route or cmd/navigation, such as "repeat NAME stamp=STAMP"."""
-        found = _STAMPED.fullmatch(await text_of(request))
+        found = _STAMPED.fullmatch(await text_of(asked))
         text, stamp = ("", None) if found is None else found.groups()
         if may_begin_motion(parse(text)):
             stamp_of(stamp or "")
