@@ -21,13 +21,11 @@ from drivers.logs.ros_messages import typestore
 
 _COMPRESSIONS = {"lz4": CompressionType.LZ4, "none": CompressionType.NONE}
 _KEPT_TOPICS = ("/tf_static",)  # ROS 2 keeps their newest message for late subscribers, also of `ros2 bag play`
-_TRANSIENT_LOCAL = "".join(
-    (  # rosbag2's YAML: keep last, reliable, transient local, automatic liveliness
-        "- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n",
-        *(f"  {name}:\n    sec: 9223372036\n    nsec: 854775807\n" for name in ("deadline", "lifespan")),
-        "  liveliness: 1\n  liveliness_lease_duration:\n    sec: 9223372036\n    nsec: 854775807\n"
-        "  avoid_ros_namespace_conventions: false\n",
-    )
+_FOREVER = "\n    sec: 9223372036\n    nsec: 854775807\n"
+# rosbag2's YAML: keep last, reliable, transient local, automatic liveliness
+_TRANSIENT_LOCAL = (
+    f"- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n  deadline:{_FOREVER}  lifespan:{_FOREVER}"
+    f"  liveliness: 1\n  liveliness_lease_duration:{_FOREVER}  avoid_ros_namespace_conventions: false\n"
 )
 _FLUSH_NS = 5 * 10**8  # A chunk ends after this time, by the stamps.
 
@@ -64,7 +62,7 @@ class LogWriter:
                 f"cannot create the log {str(self._path)!r}: {error.strerror}; give a path that can be written"
             ) from error
         lock(self._file)
-        self._usable, self._flushed_ns = True, -1
+        self.usable, self._flushed_ns = True, -1  # usable: until it is closed or fails
         with self._guarded():
             self._writer = Writer(self._file, chunk_bytes, _COMPRESSIONS[compression])
             self._writer.start("ros2", "omnid")
@@ -81,7 +79,7 @@ class LogWriter:
         if not 0 <= stamp_ns < LATEST_NS:
             raise DriverError(f"cannot log a message on {topic!r}: its stamp {stamp_ns} ns is not a time")
         with self._guarded():
-            channel = self._channels.get((topic, schema_name)) or self._register(topic, schema_name)
+            channel = self._channel(topic, schema_name)
             self.messages += 1
             self._writer.add_message(channel, stamp_ns, bytes(data), stamp_ns)
             # A chunk ends after half a second of stamps; one that has ended is passed to the kernel at once.
@@ -91,11 +89,6 @@ class LogWriter:
                 self._flush()
             elif self._file.tell() != self.size_bytes:
                 self._note_persisted()
-
-    @property
-    def usable(self) -> bool:
-        """True until it is closed or fails."""
-        return self._usable
 
     def sync(self) -> None:
         """End the chunk and write all data to the disk; raise DriverError where that fails or the file was deleted."""
@@ -108,10 +101,8 @@ class LogWriter:
 
         Raises DriverError where that fails or the file was deleted.
         """
-        if self._file.closed:
-            return
         try:
-            if self._usable:
+            if self.usable:
                 with self._guarded():
                     self._flush()
                     self._writer.finish()  # type: ignore[no-untyped-call]
@@ -129,7 +120,7 @@ class LogWriter:
     @contextmanager
     def _guarded(self) -> Iterator[None]:
         """Turn a failure to write into DriverError and close the file, which can be read up to its end."""
-        if not self._usable:
+        if not self.usable:
             raise DriverError(f"cannot write the log {str(self._path)!r}: it is closed or failed before")
         try:
             yield
@@ -142,19 +133,20 @@ class LogWriter:
 
     def _abandon(self) -> None:
         """Close the file; a failure to flush has been reported before."""
-        self._usable = False
+        self.usable = False
         with suppress(OSError):
             self._file.close()
 
-    def _register(self, topic: str, schema_name: str) -> int:
+    def _channel(self, topic: str, schema_name: str) -> int:
         """Return the channel of a topic and a type."""
-        if schema_name not in self._schemas:
-            text = schema_text(schema_name)
-            self._schemas[schema_name] = self._writer.register_schema(schema_name, "ros2msg", text.encode())
-        metadata = {"offered_qos_profiles": _TRANSIENT_LOCAL if topic in _KEPT_TOPICS else ""}
-        channel = self._writer.register_channel(topic, "cdr", self._schemas[schema_name], metadata)
-        self._channels[topic, schema_name] = channel
-        return channel
+        if (topic, schema_name) not in self._channels:
+            if schema_name not in self._schemas:
+                text = schema_text(schema_name)
+                self._schemas[schema_name] = self._writer.register_schema(schema_name, "ros2msg", text.encode())
+            metadata = {"offered_qos_profiles": _TRANSIENT_LOCAL if topic in _KEPT_TOPICS else ""}
+            channel = self._writer.register_channel(topic, "cdr", self._schemas[schema_name], metadata)
+            self._channels[topic, schema_name] = channel
+        return self._channels[topic, schema_name]
 
     def _flush(self) -> None:
         """End the chunk and pass it to the kernel."""

@@ -6,7 +6,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass
 from enum import Enum
 from itertools import pairwise
@@ -18,7 +18,7 @@ from drivers.logs import mcap_file, ros1_bag, sqlite_bag
 from drivers.logs.compression import PACKED_SUFFIXES, is_packed, scratch_folder, unpack_file
 from drivers.logs.file_lock import is_locked
 from drivers.logs.image_folder import ImageFolder, image_folders
-from drivers.logs.log import MAX_ATTACHMENT_BYTES, MAX_LISTED, Log, LogFile, LoggedMessage
+from drivers.logs.log import MAX_ATTACHMENT_BYTES, MAX_LISTED, Log, LogFile
 from drivers.logs.mcap_file import McapFile
 from drivers.logs.ros1_bag import Ros1Bag
 from drivers.logs.ros_messages import IMAGE_TYPES
@@ -96,21 +96,21 @@ def log_info(path: str | os.PathLike[str], *, examine: bool = False, rate_hz: fl
         counts, cut_images = Counter[str]({} if examine else log.counts()), Counter[str]()
         for message in log.messages() if examine else ():
             counts[message.topic] += 1
-            cut_images[message.topic] += message.kind in IMAGE_TYPES and not _is_whole_image(message)
+            with suppress(FrameDecodeError):
+                # A JPEG without its end is left by a driver that was killed half-way.
+                image = message.image() if message.kind in IMAGE_TYPES else None
+                if image and image.encoding == "jpeg" and _JPEG_END not in image.data.tobytes():
+                    cut_images[message.topic] += 1
         damage = log.damage()
         faults = [damage.cut] if damage.cut else []
         faults += [f"{count} images of {topic!r} end too early" for topic, count in (+cut_images).items()]
-        if locked:
-            state = LogState.WRITTEN
-        elif faults or damage.broken:
-            state = LogState.BROKEN
-        else:
-            state = LogState.WHOLE if log.is_indexed else LogState.UNINDEXED
+        is_broken = bool(faults or damage.broken)
+        state = LogState.BROKEN if is_broken else LogState.WHOLE if log.is_indexed else LogState.UNINDEXED
         files = given.rglob("*") if given.is_dir() else [given]
         return LogInfo(
             given,
             sum(file.stat().st_size for file in files if file.is_file()),
-            state,
+            LogState.WRITTEN if locked else state,
             damage.broken,
             "; ".join(faults),
             {name: (kind, counts.get(name, 0)) for name, kind in sorted(log.topics().items())},
@@ -118,15 +118,6 @@ def log_info(path: str | os.PathLike[str], *, examine: bool = False, rate_hz: fl
             log.span_ns(),
             {name: len(data) for name, data in log.attachments().items()},
         )
-
-
-def _is_whole_image(message: LoggedMessage) -> bool:
-    """True unless an image is a JPEG without its end, as a driver that was killed half-way leaves it."""
-    try:
-        image = message.image()
-    except FrameDecodeError:
-        return False
-    return image.encoding != "jpeg" or image.data.tobytes().rfind(_JPEG_END) >= 0
 
 
 def _open_file(path: Path, name: str | None = None) -> LogFile:
@@ -219,8 +210,8 @@ def _missing(folder: Path, logs: Sequence[Path]) -> list[str]:
         # One file may be compressed or unfinished, and the other not.
         known = {match[0][: match.end("format")] for match in there}
         return [name for name in names if not ((m := _NAME.match(name)) and name[: m.end("format")] in known)]
-    numbers = {int(match["part"]) for match in there if match["part"]}
-    if not numbers or len(numbers) != len(logs):
+    numbers = [int(match["part"]) for match in there if match["part"]]
+    if not numbers or len(set(numbers)) != len(logs):
         return []
-    gaps = sorted(set(range(min(numbers), max(numbers))) - numbers)
+    gaps = sorted({*range(min(numbers), max(numbers))}.difference(numbers))
     return [f"{there[0]['name']}_{number}{there[0]['format']}" for number in gaps[:MAX_PARTS]]

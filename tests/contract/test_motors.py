@@ -189,13 +189,6 @@ def test_a_late_reply_is_discarded(name: str) -> None:
         assert motor.send(stop_command(0)).battery_v == 12.0
 
 
-@pytest.mark.parametrize(("name", "other"), [("line", "roboteq"), ("roboteq", "vesc"), ("vesc", "odrive_ascii")])
-def test_detects_another_protocol(name: str, other: str) -> None:
-    controller = controller_of(name)
-    with contextlib.closing(PtyMotor(controller)) as simulated, pytest.raises(DriverError, match="protocol"):
-        SerialMotor(simulated.port, PROTOCOLS[other](BASE), watchdog_ms=LONG_MS, connect_s=0.1)
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_an_unplugged_controller_is_an_error_and_reconnects(name: str, tmp_path: Path) -> None:
     port = tmp_path / "motor"

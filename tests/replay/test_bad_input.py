@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import random
 import shutil
 from collections.abc import Iterator
 from dataclasses import replace
@@ -51,17 +50,6 @@ def test_warns_if_all_jpegs_are_broken(omnid: Command, tmp_path: Path, scene: Pa
     result = omnid.replay(log, "--tum", tmp_path / "t", "--cloud", tmp_path / "m", rig=scene / "rig.toml")
     assert result.code == 1 and result.count("broken") == 2 * PAIRS and result.count("pairs") == 0
     assert "no pair of images" in result.err
-
-
-def test_the_order_in_the_log_changes_nothing(omnid: Command, tmp_path: Path, scene: Path) -> None:
-    taken = images(scene / "log.mcap")
-    delays = random.Random(1)
-    shuffled = sorted(taken, key=lambda p: p.pair + delays.uniform(0, 5))
-    assert [p.stamp_ns for p in shuffled] != sorted(p.stamp_ns for p in shuffled)
-    log = save(tmp_path / "log.mcap", shuffled)
-    for name, source in (("est.txt", scene / "log.mcap"), ("shuffled.txt", log)):
-        assert omnid.replay(source, "--tum", tmp_path / name, rig=scene / "rig.toml").code == 0
-    assert (tmp_path / "est.txt").read_bytes() == (tmp_path / "shuffled.txt").read_bytes()
 
 
 def test_counts_duplicate_images_and_orders_late_ones(omnid: Command, tmp_path: Path, scene: Path) -> None:

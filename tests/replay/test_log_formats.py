@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import struct
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -79,32 +78,6 @@ def test_reports_of_every_format_are_the_same(omnid: Command, tmp_path: Path, sc
         assert ("is cut or corrupt" in text) == (log.suffix == ".active")
         pages.append(re.findall(r"<div class='numbers'>.*?</div>", text))
     assert pages[0] and pages == [pages[0]] * len(logs)
-
-
-def exif(jpeg: bytes) -> bytes:
-    """Return the image with the orientation of a camera that was turned by 90 degrees."""
-    tag = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
-    return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(tag) + 2) + tag + jpeg[2:]
-
-
-def restarting(jpeg: bytes) -> bytes:
-    """Return the image coded again with restart markers, at the quality at which little changes."""
-    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
-    coding = [cv2.IMWRITE_JPEG_QUALITY, 100, cv2.IMWRITE_JPEG_RST_INTERVAL, 2]
-    return cv2.imencode(".jpg", image, coding)[1].tobytes()
-
-
-@pytest.mark.parametrize(
-    "edit",
-    [lambda jpeg: jpeg + bytes(1000), lambda jpeg: jpeg + b"serial 123" * 50, exif, restarting],
-    ids=["zeros behind the end", "text behind the end", "EXIF", "restart markers"],
-)
-def test_jpegs_as_cameras_write_them(
-    omnid: Command, tmp_path: Path, scene: Path, edit: Callable[[bytes], bytes]
-) -> None:
-    log = save(tmp_path / "log.mcap", [replace(i, jpeg=edit(i.jpeg)) for i in images(scene / "log.mcap")])
-    result = omnid.replay(log, *QUICK, rig=scene / "rig.toml")
-    assert result.code == 0 and not result.err and result.count("pairs") == PAIRS
 
 
 SMALL = cv2.imencode(".jpg", np.zeros((64, 64), np.uint8))[1].tobytes()
