@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
@@ -74,36 +74,51 @@ def list_controls(fd: int) -> dict[int, CameraControl]:
             v4l2.call(fd, v4l2.QUERYCTRL, entry)
         except OSError:
             break
-        last = entry.id
+        last, menu = entry.id, list[int]()
         numeric = entry.type in (v4l2.CONTROL_INTEGER, v4l2.CONTROL_BOOLEAN, *_MENUS)
-        if numeric and not entry.flags & (v4l2.CONTROL_DISABLED | v4l2.CONTROL_READ_ONLY):
-            # As v4l2-ctl writes it: exposure_time_absolute for 'Exposure Time, Absolute'.
-            name = re.sub(r"[^a-z0-9]+", "_", entry.name.decode("utf-8", "replace").lower()).strip("_")
-            values = ValueRange(entry.minimum, entry.maximum, max(1, entry.step))
-            found[last] = CameraControl(last, name, values, tuple(_menu(fd, entry)) if entry.type in _MENUS else ())
+        if not numeric or entry.flags & (v4l2.CONTROL_DISABLED | v4l2.CONTROL_READ_ONLY):
+            continue
+        for index in range(max(0, entry.minimum), min(entry.maximum, _MAX_MENU) + 1) if entry.type in _MENUS else ():
+            with suppress(OSError):  # the driver rejects those that it does not offer
+                v4l2.call(fd, v4l2.QUERYMENU, v4l2.QueryMenu(id=entry.id, index=index))
+                menu.append(index)
+        # As v4l2-ctl writes it: exposure_time_absolute for 'Exposure Time, Absolute'.
+        name = re.sub(r"[^a-z0-9]+", "_", entry.name.decode("utf-8", "replace").lower()).strip("_")
+        found[last] = CameraControl(
+            last, name, ValueRange(entry.minimum, entry.maximum, max(1, entry.step)), tuple(menu)
+        )
     return found
-
-
-def _menu(fd: int, entry: v4l2.QueryControl) -> Iterator[int]:
-    """Yield the values of a menu; the driver rejects those that it does not offer."""
-    for index in range(max(0, entry.minimum), min(entry.maximum, _MAX_MENU) + 1):
-        with suppress(OSError):
-            v4l2.call(fd, v4l2.QUERYMENU, v4l2.QueryMenu(id=entry.id, index=index))
-            yield index
 
 
 def plan_controls(settings: V4l2Settings, offered: Mapping[int, CameraControl]) -> list[tuple[CameraControl, int]]:
     """Return the controls to set with their values, automatic modes before the values that they govern.
 
-    Raises DriverError for a control that the device does not offer, and for a value that it does not accept.
+    A fixed value switches its automatic mode off. Raises DriverError for a control that the device does not offer, and
+    for a value that it does not accept.
     """
+    # 1. Those of the settings, by id.
+    wanted: list[tuple[int, int]] = []
+    if settings.auto_exposure != "keep" or settings.exposure_us:
+        mode = MANUAL_EXPOSURE
+        # An exposure that a run regulates is automatic until the run sends its first value.
+        if settings.auto_exposure == "on" or settings.is_regulated:
+            control = offered.get(AUTO_EXPOSURE)
+            mode = APERTURE_PRIORITY if control and AUTOMATIC not in control.menu else AUTOMATIC  # USB cameras; others
+        if AUTO_EXPOSURE in offered or not settings.is_regulated:
+            wanted.append((AUTO_EXPOSURE, mode))
+        wanted += [(EXPOSURE_MAY_SLOW, 0)] if EXPOSURE_MAY_SLOW in offered else []
+    if settings.auto_gain != "keep" or (settings.gain >= 0 and AUTO_GAIN in offered):
+        wanted.append((AUTO_GAIN, int(settings.auto_gain == "on")))
+    wanted += [(EXPOSURE, round(settings.exposure_us / EXPOSURE_UNIT_US))] if settings.exposure_us else []
+    wanted += [(GAIN, settings.gain)] if settings.gain >= 0 else []
+    wanted += [(POWER_LINE_FREQUENCY, _POWER_LINE[settings.power_line])] if settings.power_line != "keep" else []
+    # 2. Others, by name.
     by_name = {control.name: control for control in offered.values()}
     all_names = f"It has: {', '.join(by_name) or 'none'}"
-    plan = []
-    for control_id, value in _wanted(settings, offered):
+    for control_id, _ in wanted:
         if control_id not in offered:
             raise DriverError(f"the device has no control of its {_NAMES[control_id]}; leave it as it is. {all_names}")
-        plan.append((offered[control_id], value))
+    plan = [(offered[control_id], value) for control_id, value in wanted]
     for text in settings.controls:
         name, _, number = text.partition("=")
         if name.strip() not in by_name:
@@ -113,28 +128,6 @@ def plan_controls(settings: V4l2Settings, offered: Mapping[int, CameraControl]) 
         if not control.accepts(value):
             raise DriverError(f"control {control.name}: {value} was requested, it accepts {control.accepted}")
     return plan
-
-
-def _wanted(settings: V4l2Settings, offered: Mapping[int, CameraControl]) -> Iterator[tuple[int, int]]:
-    """Yield (control id, value), automatic modes first; a fixed value switches its automatic mode off."""
-    if settings.auto_exposure != "keep" or settings.exposure_us:
-        mode = MANUAL_EXPOSURE
-        # An exposure that a run regulates is automatic until the run sends its first value.
-        if settings.auto_exposure == "on" or settings.is_regulated:
-            control = offered.get(AUTO_EXPOSURE)
-            mode = APERTURE_PRIORITY if control and AUTOMATIC not in control.menu else AUTOMATIC  # USB cameras; others
-        if AUTO_EXPOSURE in offered or not settings.is_regulated:
-            yield AUTO_EXPOSURE, mode
-        if EXPOSURE_MAY_SLOW in offered:
-            yield EXPOSURE_MAY_SLOW, 0
-    if settings.auto_gain != "keep" or (settings.gain >= 0 and AUTO_GAIN in offered):
-        yield AUTO_GAIN, int(settings.auto_gain == "on")
-    if settings.exposure_us:
-        yield EXPOSURE, round(settings.exposure_us / EXPOSURE_UNIT_US)
-    if settings.gain >= 0:
-        yield GAIN, settings.gain
-    if settings.power_line != "keep":
-        yield POWER_LINE_FREQUENCY, _POWER_LINE[settings.power_line]
 
 
 def apply_controls(fd: int, plan: list[tuple[CameraControl, int]]) -> None:
@@ -179,15 +172,15 @@ class ExposureControls:
         """with_gain: False leaves the gain as it is, also where the device has one."""
         self._fd = fd
         offered = list_controls(fd)
+        gain = offered.get(GAIN) if with_gain else None
         self._modes = [(AUTO_EXPOSURE, MANUAL_EXPOSURE)] if AUTO_EXPOSURE in offered else []
         self._modes += [(AUTO_GAIN, 0)] if AUTO_GAIN in offered and with_gain else []
+        self._restored = [control for control, _ in self._modes] + ([GAIN] if gain else [])
         self.ranges: ExposureRanges | None = None  # None: the device has no exposure time to set
         if EXPOSURE in offered:
             times = offered[EXPOSURE].range
             low, high, step = (value * EXPOSURE_UNIT_US for value in (times.low, times.high, times.step))
-            gains = offered[GAIN].range if GAIN in offered and with_gain else None
-            self.ranges = ExposureRanges(ValueRange(low, high, step), gains)
-        self._has_gain = GAIN in offered and with_gain
+            self.ranges = ExposureRanges(ValueRange(low, high, step), gain.range if gain else None)
         self._before: list[tuple[int, int]] = []  # control and value, while requests are in force
         self._done: ExposureRequest | None = None
 
@@ -230,9 +223,7 @@ class ExposureControls:
     def _set(self, setting: ExposureSetting) -> None:
         # 1. Switch the automatic modes off, and keep what `release` restores: the gain first, then the modes.
         if not self._before:
-            self._before = [(control, _read(self._fd, control)) for control, _ in self._modes]
-            if self._has_gain:
-                self._before.append((GAIN, _read(self._fd, GAIN)))
+            self._before = [(control, _read(self._fd, control)) for control in self._restored]
             for control, value in self._modes:
                 _write(self._fd, control, value)
         # 2. Set the values.

@@ -168,6 +168,7 @@ class LineProtocol:
     """
 
     baud = 115_200
+    framer = TextFramer
 
     def __init__(self, drive: DifferentialDrive) -> None:
         self.seen = ""
@@ -175,10 +176,6 @@ class LineProtocol:
         self._seq = 0
         self._zero_rad = 0.0  # heading at which the controller's heading is 0
         self._heading_rad = 0.0  # last reported
-
-    def framer(self) -> TextFramer:
-        """Return a framer of lines."""
-        return TextFramer()
 
     def connect(self, watchdog_ms: int) -> Transaction[float]:
         """Set the watchdog and return the time in force [ms]; raise DriverError where another one is in force."""

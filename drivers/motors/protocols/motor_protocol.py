@@ -12,7 +12,7 @@ the transaction itself waits without a limit:
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from typing import Protocol, TypeAlias, TypeVar
 
 from drivers.errors import DriverError
@@ -45,8 +45,9 @@ class MotorProtocol(Protocol):
     baud: int  # default of the controller
     seen: str  # what the frames of the present transaction show so far, for the case that no answer comes; "": nothing
 
-    def framer(self) -> Framer:
-        """Return a new framer for the controller's replies."""
+    @property
+    def framer(self) -> Callable[[], Framer]:
+        """What makes a new framer for the controller's replies."""
 
     def connect(self, watchdog_ms: int) -> Transaction[float]:
         """Set up the controller and its watchdog, and return the watchdog's time in force [ms].

@@ -50,16 +50,13 @@ class ODriveAscii:
     """One two-axis board: axis 0 is channel 1."""
 
     baud = 115_200
+    framer = TextFramer
 
     def __init__(self, drive: DifferentialDrive) -> None:
         self.seen = ""
         self._drive = drive
         self._disarmed = True
         self._still = 0  # consecutive commands to turn that no axis has followed
-
-    def framer(self) -> TextFramer:
-        """Return a framer of lines."""
-        return TextFramer()
 
     def connect(self, watchdog_ms: int) -> Transaction[float]:
         """Set both watchdogs and read them back; return the time in force [ms]. The first stop arms the axes.

@@ -32,13 +32,10 @@ class Roboteq:
     """One dual-channel controller in closed-loop speed mode."""
 
     baud = 115_200
+    framer = TextFramer
 
     def __init__(self, drive: DifferentialDrive) -> None:
         self.seen, self._drive, self._rpm_per_mps = "", drive, drive.rpm_per_mps
-
-    def framer(self) -> TextFramer:
-        """Return a framer of lines."""
-        return TextFramer()
 
     def connect(self, watchdog_ms: int) -> Transaction[float]:
         """Set the serial watchdog, read it back and return the time in force [ms].

@@ -107,13 +107,10 @@ class Vesc:
     """Channel 1 is the controller on the port, channel 2 the one with the drive's can_id."""
 
     baud = 115_200
+    framer = PacketFramer
 
     def __init__(self, drive: DifferentialDrive) -> None:
         self.seen, self._drive = "", drive
-
-    def framer(self) -> PacketFramer:
-        """Return a framer of packets."""
-        return PacketFramer()
 
     def connect(self, watchdog_ms: int) -> Transaction[float]:
         """Read the timeouts of both controllers and return the shorter one [ms].
