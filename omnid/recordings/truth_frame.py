@@ -144,7 +144,9 @@ class _Model(NamedTuple):
             return np.inf if pair is None else self._body(pair)[2]
 
         if self.has_delay:
-            delay_s += float(minimize_scalar(left, bounds=(-step_s, step_s), method="bounded").x)
+            delay_s += float(
+                minimize_scalar(left, bounds=(-step_s, step_s), method="bounded", options={"xatol": 1e-4}).x
+            )
         pair = _common(estimate, scaled, delay_s)
         if pair is None:
             return np.inf, TruthFrame()
@@ -167,13 +169,13 @@ class _Model(NamedTuple):
         J[1:, :, 12:21] = [np.kron(axis, -R.reshape(-1, 3)) for axis in eye]
         b = np.concatenate([p[None], np.moveaxis(R, 2, 0)]).reshape(4, -1) * [[1.0], *[[not self.is_turned]] * 3]
         J = J[..., np.repeat([True, True, self.is_turned, self.has_lever], (9, 3, 9, 3))]
+        normal, side = np.swapaxes(J, 1, 2) @ J, np.einsum("krc,kr->kc", J, b)
         radius = _rms(true_p)
         for _ in range(2):
-            weight = np.array([1.0, radius, radius, radius])[:, None]
-            weighted = (weight[..., None] * J).reshape(-1, J.shape[-1])
-            solution = np.linalg.lstsq(weighted, (weight * b).ravel(), rcond=None)[0]
-            left = J @ solution - b
-            sigmas = np.sqrt(np.square(left).mean(axis=1))
+            weights = np.array([1.0, radius, radius, radius]) ** 2
+            inverse = np.linalg.pinv(np.tensordot(weights, normal, 1), hermitian=True)
+            solution = inverse @ (weights @ side)
+            sigmas = np.sqrt(np.square(J @ solution - b).mean(axis=1))
             radius = sigmas[0] / max(sigmas[1:].mean(), LEAST_SIGMA)
         # 2. The rotations next to it.
         A, _ = rotation_between(eye, solution[:9].reshape(3, 3).T)
