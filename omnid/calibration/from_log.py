@@ -23,12 +23,12 @@ from calib.rig import MountedCamera, Rig
 from calib.rig_file import read_rig, write_rig
 from drivers.logs.log_reader import AnyCameras, LogCameras
 from omnid.calibration.drive_observations import tracked_updates
+from omnid.calibration.fixed_parts import HEADINGS, LEAST_HEADINGS, FixedParts
 from omnid.calibration.images import open_log
 from omnid.calibration.rig_check import read_rig_pairs, with_masks
 from omnid.config import Config
 from omnid.core.floor import MOST_PAIRS, Floor, FloorEstimator
 from omnid.core.frames import of_base
-from omnid.core.obstacles.fixed_parts import HEADINGS, LEAST_HEADINGS, FixedParts
 from omnid.errors import OmnidError
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry, geometry
@@ -161,10 +161,10 @@ def calibrate_mask(
             f"calibrate drive: {log}: the robot shows {parts.headings} of {HEADINGS} headings of a turn, "
             f"{LEAST_HEADINGS} are needed: record a log in which it turns once on the spot"
         )
-    parts.judge()
+    pixels = parts.pixels()
     # 2. The same in the images.
-    lower, upper = (_masked(place, mounted, parts.pixels) for mounted in (place.rig.lower, place.rig.upper))
-    return MaskCalibration(replace(place.rig, lower=lower, upper=upper), parts.share, parts.headings)
+    lower, upper = (_masked(place, mounted, pixels) for mounted in (place.rig.lower, place.rig.upper))
+    return MaskCalibration(replace(place.rig, lower=lower, upper=upper), float(pixels.mean()), parts.headings)
 
 
 def _masked(place: Geometry, mounted: MountedCamera, pixels: Flags) -> MountedCamera:

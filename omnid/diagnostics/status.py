@@ -184,18 +184,15 @@ def rig_stats(health: RigHealth) -> Stats:
     return stats
 
 
-def image_stats(unwatched: Unwatched, newest: OdometryUpdate | None, fixed_share: float) -> Stats:
-    """Return the parts of the newest pair that are frozen or blind, and how long.
-
-    fixed_share: of the panoramas, which shows what is fixed to a camera.
-    """
+def image_stats(unwatched: Unwatched, newest: OdometryUpdate | None) -> Stats:
+    """Return the parts of the newest pair that are frozen or blind, and how long."""
     if newest is None:
         return {}
     tiles = newest.depth.panoramas.tiles
     lost = [side for side in SIDES if side in tiles.columns and tiles.columns[side].any()]
     since_s = {f"{side}_since_s": round((newest.stamp_ns - tiles.since_ns[side]) * S_PER_NS) for side in lost}
     words = "; ".join(_lost_parts(unwatched, side, tiles) for side in lost)
-    return {**since_s, "fixed_percent": round(100 * fixed_share) if fixed_share else "", "_lost": words}
+    return {**since_s, "_lost": words}
 
 
 def _lost_parts(unwatched: Unwatched, side: Side, tiles: TileStates) -> str:

@@ -310,11 +310,8 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
     # 4. What comes from the bus, and the status of all parts.
     watched = _subscribe(session, bus, robot, controller, requests, run_places, front_end)
     unwatched, statistics = Unwatched(geometry.cylinder, rig.T_base_rig @ geometry.T_rig_rect), session.statistics
-    obstacles = stages.obstacles
     watched |= {
-        names.IMAGES: lambda: image_stats(
-            unwatched, statistics.newest, 0.0 if obstacles is None else obstacles.fixed_share
-        ),
+        names.IMAGES: lambda: image_stats(unwatched, statistics.newest),
         names.EXPOSURE: exposure.stats,
         names.RIG: partial(rig_stats, health),
         names.CLOCK: clock.stats,

@@ -17,12 +17,11 @@ from omnid.core.floor import Floor, FloorEstimator
 from omnid.core.frames import of_base
 from omnid.core.mapping.range_scan import SECTORS, FreeRanges
 from omnid.core.nanoseconds import NS_PER_S
-from omnid.core.obstacles.fixed_parts import FixedParts
 from omnid.core.obstacles.moving_tracker import MovingTracker
-from omnid.core.obstacles.narrow import narrow_m, nothing_narrow
+from omnid.core.obstacles.posterior import thin_things_m
 from omnid.core.obstacles.ray_rings import RayRings
 from omnid.core.obstacles.settings import RingSettings
-from omnid.core.obstacles.unwatched import Unwatched, without
+from omnid.core.obstacles.unwatched import Unwatched
 from omnid.messages import DensePoints, ObstacleRing, OdometryUpdate, Panoramas
 from omnid.stages.dense_depths import DenseDepths
 from omnid.stages.geometry import Geometry
@@ -105,9 +104,6 @@ class PairRings:
     def __init__(self, geometry: Geometry, settings: RingSettings) -> None:
         self._geometry = geometry
         self._of_floor: Floor | None = None  # for which the tables of the rings were made
-        self.fixed = FixedParts(geometry.cylinder)
-        self._left_out = self.fixed.pixels  # those of the tables
-        self._is_misled = False  # whether the grid holds what fixed parts have shown
         self.rings = RayRings(geometry.cylinder, geometry.rig.baseline_m, settings)
         self._tracker = MovingTracker()
         self._unwatched = Unwatched(geometry.cylinder, geometry.rig.T_base_rig @ geometry.T_rig_rect)
@@ -117,9 +113,10 @@ class PairRings:
         """Add the evidence of a pair; return the ring at it, which is unknown while the floor or the pose is."""
         # 1. Forget the grid and the tracks where odometry has begun again.
         if odometry.reset_counter != self._resets:
-            self._begin_again()
+            self.rings.grid.begin_again()
+            self._tracker.clear()
             self._resets = odometry.reset_counter
-        panoramas, self.rings.evidence = odometry.depth.panoramas, None
+        panoramas, self.rings.belief = odometry.depth.panoramas, None
         T_odom_base = of_base(odometry, self._geometry.rig.T_base_rig)[0]
         unwatched = self._unwatched.sectors(panoramas.tiles.unknown)
         unknown = ObstacleRing(odometry.seq, odometry.stamp_ns, UNKNOWN, UNKNOWN, NOT_FREE, T_odom_base, (), unwatched)
@@ -127,54 +124,38 @@ class PairRings:
             # The grid stays: it holds again once odometry recognises its landmarks.
             self._tracker.clear()
             return unknown
-        self._leave_out_fixed_parts(panoramas, T_odom_base)
         if not self._has_tables(camera_floor, panoramas):
             return unknown
         # 2. The ring by the images, without their dead and blind parts.
         lost = panoramas.tiles.lost_pixels(panoramas.visible.shape)
         pose = transform(planar(T_odom_base))
         ring = self.rings.add(odometry.stamp_ns, pose, panoramas.lower, panoramas.upper, lost)
-        ring = without(ring, unwatched, self._unwatched.directions(panoramas.tiles.unknown))
         # 3. The moving obstacles.
+        ring.arrivals.ranges_m[self._unwatched.directions(panoramas.tiles.unknown)] = np.nan
         moving = self._tracker.update(odometry.stamp_ns, self.rings.grid.viewpoint(pose), ring.arrivals)
-        return ObstacleRing(
-            odometry.seq, odometry.stamp_ns, ring.ranges_m, ring.sigma_m, ring.free_m, T_odom_base, moving, unwatched
+        # Nothing is said of directions in which the images show nothing to rely on.
+        ranges_m, sigma_m, free_m = (
+            np.where(unwatched, none, known)
+            for none, known in ((UNKNOWN, ring.ranges_m), (UNKNOWN, ring.sigma_m), (NOT_FREE, ring.free_m))
         )
+        return ObstacleRing(odometry.seq, odometry.stamp_ns, ranges_m, sigma_m, free_m, T_odom_base, moving, unwatched)
 
     @property
-    def narrow_m(self) -> FreeRanges:
-        """Least range (SECTORS,) [m] at which something narrow hides floor by the newest pair, inf: nothing does.
+    def thin_m(self) -> FreeRanges:
+        """Least range (SECTORS,) [m] at which something thin hides floor by the newest pair, inf: nothing does.
 
         Sectors are those of the rectified frame.
         """
-        if self.rings.evidence is None:
-            return nothing_narrow()
-        return narrow_m(self.rings.evidence.floor, self.rings.columns.at_1m)
-
-    def _begin_again(self) -> None:
-        self.rings.grid.begin_again()
-        self._tracker.clear()
-        self._is_misled = False
-
-    def _leave_out_fixed_parts(self, panoramas: Panoramas, T_odom_base: Array) -> None:
-        """Learn what is fixed to a camera, and leave it out; frozen parts are the same at all headings, too."""
-        if panoramas.tiles.is_frozen:
-            return
-        if not self.fixed.observe(T_odom_base, panoramas.lower, panoramas.upper, panoramas.visible):
-            return
-        if self.fixed.pixels is not self._left_out:
-            self._left_out, self._of_floor, self._is_misled = self.fixed.pixels, None, True
-        if self._is_misled and self.fixed.is_on_the_spot:
-            # The floor too near to be seen is taken to be free again: a base that came here might know better.
-            self._begin_again()
+        belief = self.rings.belief
+        return np.full(SECTORS, np.inf, np.float32) if belief is None else thin_things_m(belief, self.rings.grid.risk)
 
     def _has_tables(self, camera_floor: CameraFloor, panoramas: Panoramas) -> bool:
-        """Make the tables of the floor and of what is left out; return False without a floor."""
+        """Make the tables of the floor; return False without one."""
         floor = camera_floor.floor
         if floor is not None and floor is not self._of_floor:
             self._of_floor = floor
             T_rect_floor = self._geometry.rig.T_rect_rig @ se3.inverse(camera_floor.T_floor_rig(floor))
-            self.rings.set_floor(T_rect_floor, panoramas.visible & ~self._left_out)
+            self.rings.set_floor(T_rect_floor, panoramas.visible)
         return floor is not None
 
 
@@ -188,11 +169,6 @@ class Obstacles:
         self.floor = CameraFloor(geometry.rig, config.ring.floor_m)
         self._rings = PairRings(geometry, config.ring)
         self._last_ns: int | None = None
-
-    @property
-    def fixed_share(self) -> float:
-        """Return the share of the panoramas that shows what is fixed to a camera."""
-        return self._rings.fixed.share
 
     def process(self, odometry: OdometryUpdate) -> ObstacleRing | None:
         """Return the ring at a pair, None where it is not due."""

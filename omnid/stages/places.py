@@ -197,7 +197,7 @@ class Places:
     def _free(self, odometry: OdometryUpdate) -> FreeRanges:
         """Return the free ranges of a pair."""
         ring = self._rings.add(odometry, self.floor)
-        return keyframe_free(ring, self._rings.narrow_m, self.floor, self._T_rig_rect)
+        return keyframe_free(ring, self._rings.thin_m, self.floor, self._T_rig_rect)
 
     def _scan(self, depth: StereoDepth) -> RangeScan:
         """Return the range scan of a pair."""
@@ -222,17 +222,17 @@ def keyframe_scan(
     return np.where(np.isfinite(ranges), ranges, np.float32(np.nan))
 
 
-def keyframe_free(ring: ObstacleRing, narrow_m: FreeRanges, camera_floor: CameraFloor, T_rig_rect: Array) -> FreeRanges:
+def keyframe_free(ring: ObstacleRing, thin_m: FreeRanges, camera_floor: CameraFloor, T_rig_rect: Array) -> FreeRanges:
     """Return up to where the floor is free by the ring at a keyframe, (SECTORS,) as of its scan.
 
-    narrow_m (SECTORS,): where something narrow may begin to hide the floor, inf: nowhere; there they are negative.
+    thin_m (SECTORS,): where something thin may begin to hide the floor, inf: nowhere; there they are negative.
     """
     floor = camera_floor.floor
     if floor is None:
         return np.zeros(SECTORS, np.float32)
     free_m = seen_from(ring.free_m, _T_level_floor(camera_floor.T_floor_rig(floor) @ T_rig_rect))
     free_m = np.minimum(free_m, np.float32(MAX_RANGE_M))
-    return np.where(np.isfinite(narrow_m), -np.minimum(free_m, narrow_m), free_m)
+    return np.where(np.isfinite(thin_m), -np.minimum(free_m, thin_m), free_m)
 
 
 def _T_level_floor(T_floor_rect: Array) -> Array:

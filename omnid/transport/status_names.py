@@ -280,13 +280,6 @@ PARTS: Final[Mapping[str, Part]] = {
         (
             (STALE, lambda s: not s, "no pose yet"),
             (ERROR, "_lost", "{_lost}"),
-            (
-                OK,
-                "fixed_percent",
-                "a part of the panoramas shows what is fixed to a camera, such as the reflection of its lens: "
-                "obstacles are judged without it; `omnid calibrate drive --only mask` on a log of a turn makes a mask "
-                "of it",
-            ),
             (OK, "", LIVE),
         ),
     ),

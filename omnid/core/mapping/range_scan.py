@@ -36,7 +36,7 @@ NEAREST_M: Final = 0.2  # Range of the first bin, from the middle of the base.
 # Ranges (SECTORS,) [m] of the sectors in the order of azimuth, from -pi on. NaN: no obstacle was seen.
 RangeScan = NDArray[np.float32]
 # Ranges (SECTORS,) [m] in the same order, up to which the floor was seen without anything on it; 0: nowhere. Those of
-# keyframes are negative where something narrow, such as a pole, hides the floor from there on (obstacles/narrow.py).
+# keyframes are negative where something thin, such as a pole, hides the floor from there on (obstacles/posterior.py).
 FreeRanges = NDArray[np.float32]
 
 

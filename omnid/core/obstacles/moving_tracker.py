@@ -39,29 +39,28 @@ class MovingObstacle:
 
 Array = NDArray[np.float64]
 
-MOST_TRACKS: Final = 16  # Most tracks, so that the memory is bounded.
-SAME_SURFACE_M: Final = 0.15  # Step in range between sectors of one cluster without noise.
+MOST_TRACKS: Final = 16  # so that the memory is bounded
+SAME_SURFACE_M: Final = 0.15  # step in range between sectors of one cluster without noise
 # Sigmas of a range, so that 0.5 % of the steps within a surface are larger: 2.8 of a difference.
 NOISE_SIGMAS: Final = 4.0
-SECTOR_GAP: Final = 2  # sectors without range within a cluster.
-WIDEST_M: Final = 1.2  # Width of the widest cluster that may be a person or a cart.
+SECTOR_GAP: Final = 2  # sectors without range within a cluster
+WIDEST_M: Final = 1.2  # width of the widest cluster that may be a person or a cart
 LEAST_SECTORS: Final = 3  # because a person is five sectors wide at FARTHEST_M
 FARTHEST_M: Final = 4.0  # Farther clusters are ignored because stereo's noise there appears as motion.
 # Most squared Mahalanobis distance of a cluster from a track, because 99.9 % are below it (chi-squared, 2 dimensions).
 GATE: Final = 13.8
-ACCELERATION_PSD: Final = 0.2  # (m/s^2)^2/Hz of a person.
-SIGMA_M: Final = 0.06  # Least sigma of a cluster's middle, because its visible side changes.
+ACCELERATION_PSD: Final = 0.2  # (m/s^2)^2/Hz of a person
+SIGMA_M: Final = 0.06  # least sigma of a cluster's middle, because its visible side changes
 PERSON_M: Final = 0.4  # width of a person, because the rest of a narrower cluster may be on either side
-START_MPS: Final = 1.0  # sigma of the velocity of a new track.
-LEAST_MPS: Final = 0.2  # Least speed of a moving obstacle.
-SPEED_SIGMAS: Final = 1.5  # Sigmas by which the speed must exceed its noise.
-NEW_UPDATES: Final = 3  # Pairs after which a new object counts as moving at any speed, because it was not there before.
-CONFIRMED: Final = 2  # Pairs that must have seen it, because a single one may be noise.
+START_MPS: Final = 1.0  # sigma of the velocity of a new track
+LEAST_MPS: Final = 0.2  # least speed of a moving obstacle,
+SPEED_SIGMAS: Final = 1.5  # and the sigmas by which it must exceed its noise
+# Pairs after which an object is new no longer: until then it counts as moving at any speed, as it was not there before.
+NEW_UPDATES: Final = 3
 FORGOTTEN_S: Final = 0.9  # A track without a cluster ends after this time.
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Cluster:
+class Cluster(NamedTuple):
     """Neighbouring sectors of one surface."""
 
     middle: Array  # (2,) m in odom
@@ -69,46 +68,39 @@ class _Cluster:
     radius_m: float
 
 
-class _Track:
-    def __init__(self, stamp_ns: int, cluster: _Cluster) -> None:
+class Track:
+    """A Kalman filter of constant velocity of one object."""
+
+    def __init__(self, stamp_ns: int, cluster: Cluster) -> None:
         self.stamp_ns = self.seen_ns = stamp_ns
         self.updates, self.radius_m = 1, cluster.radius_m
-        self._filter = KalmanFilter(dim_x=4, dim_z=2)
-        self._filter.H = np.eye(2, 4)
-        self._filter.x = np.concatenate([cluster.middle, [0.0, 0.0]])[:, None]
-        self._filter.P = START_MPS**2 * np.eye(4)
-        self._filter.P[:2, :2] = cluster.covariance
-
-    @property
-    def place(self) -> Array:
-        return np.array(self._filter.x[:2, 0])
-
-    @property
-    def covariance(self) -> Array:
-        """Covariance (2, 2) of the place."""
-        return np.array(self._filter.P[:2, :2])
+        self.filter = KalmanFilter(dim_x=4, dim_z=2)
+        self.filter.H = np.eye(2, 4)
+        self.filter.x = np.concatenate([cluster.middle, [0.0, 0.0]])[:, None]
+        self.filter.P = START_MPS**2 * np.eye(4)
+        self.filter.P[:2, :2] = cluster.covariance
 
     def predict(self, stamp_ns: int) -> None:
+        """Predict the state at a stamp."""
         dt_s = (stamp_ns - self.stamp_ns) * 1e-9
         self.stamp_ns = stamp_ns
-        F = np.eye(4)
-        F[0, 2] = F[1, 3] = dt_s
-        a, b = dt_s**3 / 3, dt_s**2 / 2
-        Q = np.array([[a, 0.0, b, 0.0], [0.0, a, 0.0, b], [b, 0.0, dt_s, 0.0], [0.0, b, 0.0, dt_s]])
-        self._filter.predict(F=F, Q=ACCELERATION_PSD * Q)
+        one_axis = np.array([[dt_s**3 / 3, dt_s**2 / 2], [dt_s**2 / 2, dt_s]])
+        F, Q = np.kron([[1.0, dt_s], [0.0, 1.0]], np.eye(2)), np.kron(one_axis, np.eye(2))
+        self.filter.predict(F=F, Q=ACCELERATION_PSD * Q)
 
-    def update(self, cluster: _Cluster) -> None:
-        self._filter.update(cluster.middle[:, None], R=cluster.covariance)
+    def update(self, cluster: Cluster) -> None:
+        """Take a cluster at the stamp of the prediction."""
+        self.filter.update(cluster.middle[:, None], R=cluster.covariance)
         self.seen_ns, self.radius_m = self.stamp_ns, 0.7 * self.radius_m + 0.3 * cluster.radius_m
         self.updates += 1
 
     def obstacle(self) -> MovingObstacle | None:
-        """Return the track as a moving obstacle; None where it does not move or is not confirmed."""
-        x, y, vx, vy = self._filter.x[:, 0].tolist()
-        P = (self._filter.P + self._filter.P.T) / 2
-        speed_mps, sigma_mps = math.hypot(vx, vy), math.sqrt(max(P[2, 2], P[3, 3]))
-        is_at_rest = self.updates > NEW_UPDATES and speed_mps < max(LEAST_MPS, SPEED_SIGMAS * sigma_mps)
-        if self.updates < CONFIRMED or is_at_rest:
+        """Return the track as a moving obstacle; None where it does not move, or one pair, maybe noise, has seen it."""
+        x, y, vx, vy = self.filter.x[:, 0].tolist()
+        P = (self.filter.P + self.filter.P.T) / 2
+        least_mps = max(LEAST_MPS, SPEED_SIGMAS * math.sqrt(max(P[2, 2], P[3, 3])))
+        is_at_rest = self.updates > NEW_UPDATES and math.hypot(vx, vy) < least_mps
+        if self.updates == 1 or is_at_rest:
             return None
         return MovingObstacle(x, y, vx, vy, P, self.radius_m)
 
@@ -117,8 +109,7 @@ class MovingTracker:
     """Moving obstacles of the rings of a drive; all memory is bounded."""
 
     def __init__(self) -> None:
-        self._tracks: list[_Track] = []
-        self._directions = np.column_stack([np.cos(azimuths()), np.sin(azimuths())])
+        self._tracks: list[Track] = []
 
     def clear(self) -> None:
         """Forget everything: odom has lost its relation to the past."""
@@ -132,61 +123,52 @@ class MovingTracker:
         # 1. Predict the tracks.
         for track in self._tracks:
             track.predict(stamp_ns)
-        # 2. Give the clusters to tracks, or begin one.
-        clusters = self._clusters(T_odom_eye, arrivals)
-        track_of = assignment(self._tracks, clusters)
-        for n, cluster in enumerate(clusters):
-            if n in track_of:
-                track_of[n].update(cluster)
-            elif len(self._tracks) < MOST_TRACKS:
-                self._tracks.append(_Track(stamp_ns, cluster))
+        # 2. Give the clusters to tracks, of all pairs the likeliest first, or begin one. The cost of a pair is -2 log
+        #    of its likelihood without constants, `v S^-1 v + log |S|` of the innovation v, within the gate of the first
+        #    part.
+        found = clusters(T_odom_eye, arrivals)
+        cost = np.full((len(self._tracks), len(found)), np.inf)
+        for k, track in enumerate(self._tracks):
+            for n, cluster in enumerate(found):
+                S, v = track.filter.P[:2, :2] + cluster.covariance, cluster.middle - track.filter.x[:2, 0]
+                distance2 = float(v @ np.linalg.solve(S, v))
+                if distance2 <= GATE:
+                    cost[k, n] = distance2 + math.log(np.linalg.det(S))
+        tracks, is_new = list(self._tracks), np.ones(len(found), bool)
+        while np.isfinite(cost).any():
+            k, n = divmod(int(cost.argmin()), len(found))
+            tracks[k].update(found[n])
+            is_new[n], cost[k], cost[:, n] = False, np.inf, np.inf
+        room = MOST_TRACKS - len(tracks)
+        tracks += [Track(stamp_ns, found[n]) for n in np.flatnonzero(is_new)[:room]]
         # 3. Forget what was long not seen.
-        self._tracks = [track for track in self._tracks if (stamp_ns - track.seen_ns) * 1e-9 <= FORGOTTEN_S]
-        return tuple(found for track in self._tracks if (found := track.obstacle()) is not None)
-
-    def _clusters(self, T_odom_eye: Array, arrivals: Arrivals) -> list[_Cluster]:
-        """Return the clusters that are narrow enough."""
-        arrived_m, sigma_m = arrivals.ranges_m, arrivals.sigma_m
-        near = np.isfinite(arrived_m) & (arrived_m < FARTHEST_M)
-        found = []
-        for sectors in surfaces(np.where(near, arrived_m, np.nan), sigma_m):
-            if len(sectors) < LEAST_SECTORS:
-                continue
-            # What hides the nearest floor in view is anywhere before it: as near as a person is who fills that angle.
-            most_m = PERSON_M * SECTORS / (math.tau * len(sectors))
-            share = np.where(arrivals.is_nearer[sectors], np.minimum(most_m / arrived_m[sectors], 1.0), 1.0)
-            at = (share * arrived_m[sectors])[:, None] * self._directions[sectors]
-            width_m = float(np.linalg.norm(at[-1] - at[0]))
-            if width_m > WIDEST_M:
-                continue
-            middle = at.mean(axis=0) @ T_odom_eye[:2, :2].T + T_odom_eye[:2, 3]
-            along = (middle - T_odom_eye[:2, 3]) / np.linalg.norm(middle - T_odom_eye[:2, 3])
-            across = np.array([-along[1], along[0]])
-            along2 = SIGMA_M**2 + float(((share * sigma_m[sectors]) ** 2).mean())
-            # Of a person who comes out of a hidden area only a part hides floor that was free.
-            across2 = SIGMA_M**2 + (max(PERSON_M - width_m, 0.0) / 2) ** 2
-            covariance = along2 * np.outer(along, along) + across2 * np.outer(across, across)
-            found.append(_Cluster(middle, covariance, max(0.15, width_m / 2)))
-        return found
+        self._tracks = [track for track in tracks if (stamp_ns - track.seen_ns) * 1e-9 <= FORGOTTEN_S]
+        return tuple(one for track in self._tracks if (one := track.obstacle()) is not None)
 
 
-def assignment(tracks: list[_Track], clusters: list[_Cluster]) -> dict[int, _Track]:
-    """Return the track of each cluster, by its number, that has one: of all pairs the likeliest first.
-
-    The cost of a pair is -2 log of its likelihood without constants, `v S^-1 v + log |S|` of the innovation v; the
-    first part is bounded by the gate.
-    """
-    found: dict[int, _Track] = {}
-    if not tracks or not clusters:
-        return found
-    S = np.array([track.covariance for track in tracks])[:, None] + np.array([one.covariance for one in clusters])
-    v = np.array([one.middle for one in clusters]) - np.array([track.place for track in tracks])[:, None]
-    distance2 = np.einsum("kni,knij,knj->kn", v, np.linalg.inv(S), v)
-    cost = np.where(distance2 <= GATE, distance2 + np.log(np.linalg.det(S)), np.inf)
-    while np.isfinite(cost).any():
-        k, n = np.unravel_index(int(cost.argmin()), cost.shape)
-        found[int(n)] = tracks[k]
-        cost[k], cost[:, n] = np.inf, np.inf
+def clusters(T_odom_eye: Array, arrivals: Arrivals) -> list[Cluster]:
+    """Return the clusters of what has come that are narrow enough."""
+    arrived_m, sigma_m = arrivals.ranges_m, arrivals.sigma_m
+    near = np.isfinite(arrived_m) & (arrived_m < FARTHEST_M)
+    found = []
+    for sectors in surfaces(np.where(near, arrived_m, np.nan), sigma_m):
+        if len(sectors) < LEAST_SECTORS:
+            continue
+        # What hides the nearest floor in view is anywhere before it: as near as a person is who fills that angle.
+        most_m = PERSON_M * SECTORS / (math.tau * len(sectors))
+        share = np.where(arrivals.is_nearer[sectors], np.minimum(most_m / arrived_m[sectors], 1.0), 1.0)
+        azimuth = azimuths()[sectors]
+        at = (share * arrived_m[sectors])[:, None] * np.column_stack([np.cos(azimuth), np.sin(azimuth)])
+        width_m = float(np.linalg.norm(at[-1] - at[0]))
+        if width_m > WIDEST_M:
+            continue
+        away = T_odom_eye[:2, :2] @ at.mean(axis=0)
+        along = away / np.linalg.norm(away)
+        along2 = SIGMA_M**2 + float(((share * sigma_m[sectors]) ** 2).mean())
+        # Of a person who comes out of a hidden area only a part hides floor that was free.
+        across2 = SIGMA_M**2 + (max(PERSON_M - width_m, 0.0) / 2) ** 2
+        covariance = across2 * np.eye(2) + (along2 - across2) * np.outer(along, along)
+        found.append(Cluster(away + T_odom_eye[:2, 3], covariance, max(0.15, width_m / 2)))
     return found
 
 
@@ -195,13 +177,10 @@ def surfaces(ranges_m: RangeScan, sigma_m: RangeScan) -> list[NDArray[np.intp]]:
     known = np.flatnonzero(np.isfinite(ranges_m))
     if not len(known):
         return []
-    following = np.concatenate([known[1:], known[:1]])
-    gap = (following - known) % SECTORS
+    following = np.roll(known, -1)
     largest = SAME_SURFACE_M + NOISE_SIGMAS * np.nan_to_num(sigma_m[known])
-    joined = (gap <= SECTOR_GAP + 1) & (np.abs(ranges_m[following] - ranges_m[known]) <= largest)
-    ends = np.flatnonzero(~joined)
+    is_near = (following - known) % SECTORS <= SECTOR_GAP + 1
+    ends = np.flatnonzero(~(is_near & (np.abs(ranges_m[following] - ranges_m[known]) <= largest)))
     if not len(ends):
         return [known]
-    turned = np.roll(known, -(ends[0] + 1))
-    cuts = (ends - ends[0])[1:]
-    return np.split(turned, cuts)
+    return np.split(np.roll(known, -(ends[0] + 1)), (ends - ends[0])[1:])

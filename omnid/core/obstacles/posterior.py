@@ -9,7 +9,7 @@ down, something that hangs over floor in view, or nothing up to the last bin. Bi
    with its sigma s_r at that range and its rate of marks m; what is behind something: the same with a rate m_h, with
    texture or without; where something begins: Laplace(e; b g). So a plain bin speaks against a beginning.
 2. Ratios of floor, surfaces and planes beside the floor, from stereo (column.py).
-3. Look of the floor: contrast, grey and outline of a bin, by those of floor that is known (floor_look.py). Beyond the
+3. Look of the floor: contrast, grey and outline of a bin, by those of floor that is known. Beyond the
    border of a patch of sun, or of another covering, it may look otherwise.
 4. The posterior (ray_kernels.posterior): sums along the ray. The end of the floor beyond the last bin shows a foot,
    too; and something may begin nearer than the view: then it hides all, and shows no foot.
@@ -26,10 +26,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from omnid.core.mapping.range_scan import SECTORS, FreeRanges
 from omnid.core.obstacles import ray_kernels as kernels
 from omnid.core.obstacles.column import ColumnEvidence, Columns
-from omnid.core.obstacles.floor_look import LEAST_STEP, floor_look, floor_steps
-from omnid.core.obstacles.pair_views import DIRECTIONS, WorkingPair
+from omnid.core.obstacles.panoramas import DIRECTIONS, WorkingPair
 from omnid.core.obstacles.ray_kernels import RayParameters
 
 Array = NDArray[np.float64]
@@ -38,8 +38,12 @@ Flags = NDArray[np.bool_]
 
 BINS_PER_PX: Final = 2
 STEP_ROWS: Final = 4.0  # of a step below its bin, which must be in view
-ROOT: Final = math.sqrt(math.tau)
+MAD: Final = 1.48  # sigma of a normal distribution by the median of its magnitudes
+LEAST_STEP: Final = 0.35  # sigma of a step by the rounding of greys
+TYPICAL_M: Final = 1.3  # range at which the near floor is seen
+SIDE: Final = 3  # directions on either side with which a bin is compared
 LEAST: Final = 1e-30  # density, so that logarithms are finite
+BESIDE: Final = range(5, 13)  # directions on either side of something thin: as wide as a thing of 10 cm at 1 m
 SATURATED: Final = 250.0  # grey from which a pixel shows nothing
 ALONG_RAD: Final = math.radians(35.0)  # about ahead and behind: floor there is assumed before any is known
 
@@ -52,6 +56,27 @@ class RayBelief(NamedTuple):
     view: Floats  # (DIRECTIONS, N) probability that the bin's floor is in view, 0 where it is out of sight
     surface: Floats  # (DIRECTIONS, N) log-likelihood ratio of surfaces
     ends_m: Array  # (N + 1,) range at which the bins begin, from near to far, and the end of the last
+
+
+def thin_things_m(belief: RayBelief, risk: float) -> FreeRanges:
+    """Return the least range (SECTORS,) [m] at which something thin may hide the floor, inf where nothing does.
+
+    The way along such a ray ends by a risk, the probability that something stands on it, while that along the rays 5 to
+    12 directions to the left and to the right goes on. Sectors are those of the rectified frame. For maps, which are
+    seen from many places: floor that a pole hides is seen beside it from the next.
+    """
+    met = np.cumsum(belief.first[:, :-1], axis=1)  # (D, N)
+    beside = [np.mean([np.roll(met, side * shift, axis=0) for shift in BESIDE], axis=0) for side in (-1, 1)]
+    ends = (met > risk) & (np.maximum(*beside) < risk) & (belief.view > 0)
+    # The bin of a foot is known to a disparity.
+    bins = np.maximum(ends.argmax(axis=1) - BINS_PER_PX, 0)
+    begins_m = np.where(ends.any(axis=1), belief.ends_m[bins], np.inf)
+    # A sector has the nearest of the directions in it and next to it.
+    found, at = np.full(SECTORS, np.inf, np.float32), np.arange(len(begins_m)) + 0.5
+    for shift in (-1, 0, 1):
+        sectors = np.floor(SECTORS * (1 - (at + shift) / len(begins_m))).astype(np.intp) % SECTORS
+        np.minimum.at(found, sectors, begins_m)
+    return found
 
 
 class RayPosterior:
@@ -77,7 +102,7 @@ class RayPosterior:
         azimuth = math.pi - (np.arange(DIRECTIONS) + 0.5) * (math.tau / DIRECTIONS)
         along = np.abs(np.sin(azimuth)) < math.sin(ALONG_RAD)
         self._assumed = (self.ranges_m < parameters.look_m)[:, None] & along
-        self.shows_floor = bool(self._of_bins(columns.visible).any())  # whether any floor is in view
+        self.shows_floor = bool(self._of_bins(columns.panoramas.visible).any())  # whether any floor is in view
 
     def belief(self, pair: WorkingPair, evidence: ColumnEvidence, known: Flags | None = None) -> RayBelief:
         """Return the belief by a pair and its stereo evidence.
@@ -85,41 +110,57 @@ class RayPosterior:
         known (N, DIRECTIONS): bins that are known to be floor, None: the nearest ahead and behind are taken for it.
         """
         p, count, seen = self._p, len(self._bins), self._of_bins(pair.seen)
-        known, near = self._known(known, seen)
+        # 1. The floor by which its look is learned: of the cells that are known, or assumed where these are few.
+        known = self._assumed & seen.T if known is None else known & seen.T
+        near = known & (self.ranges_m < p.look_m)[:, None]
+        if near.sum() < p.look_bins:
+            known = near = self._assumed & seen.T
         if near.sum() < p.look_bins:
             return self._nothing()
-        # 1. Steps of grey, pooled over three directions.
+        # 2. Steps of grey, pooled over three directions, and greys.
         steps, greys = np.zeros((2, self._rows.shape[1], DIRECTIONS), np.float32)
         for weights, into in ((self._step_weights, steps), (self._grey_weights, greys)):
             for of_view, image in zip(weights, (pair.lower, pair.upper), strict=True):
                 kernels.add_weighted_rows(of_view, image, into)
         pooled = np.asarray((np.roll(steps, 1, axis=1) + 2 * steps + np.roll(steps, -1, axis=1)) / 4, np.float32)
-        sigmas, marks = floor_steps(pooled[:count], near, known, p)
-        plain = max(p.noise_share * pair.sensor_grey, LEAST_STEP)
-        far = np.abs(pooled[count:]).max(axis=0, initial=0.0) / max(float(sigmas[-1]), float(sigmas.min()))
-        # 2. Stereo, by bins. Noise without texture fits other disparities a little better: the ratio of known floor
+        far_steps, steps, greys, pooled = np.abs(pooled[count:]), steps[:count], greys[:count], pooled[:count]
+        # 3. Stereo, by bins. Noise without texture fits other disparities a little better: the ratio of known floor
         #    says by how much.
         of_bin = self._bins // BINS_PER_PX
         floor = evidence.floor[of_bin]
-        bias = float(np.median(np.nan_to_num(floor[near])))
-        floor = p.w_floor * np.clip(
-            np.nan_to_num(floor - np.float32(min(max(bias, -1.0), 0.0))), p.floor_low, p.floor_high
-        )
+        floor = floor - np.float32(min(max(float(np.median(floor[near])), -1.0), 0.0))
+        floor = p.w_floor * np.clip(floor, p.floor_low, p.floor_high)
         levels = floor - p.w_level * np.clip(evidence.level[:, of_bin], -p.level_most, p.level_most)
         fits = np.minimum(self._surfaces(evidence.surface)[of_bin], p.surface_most) - p.surface_noise
-        # 3. The look of floor, and the edges.
-        look = floor_look(steps[:count], greys[:count], self.ranges_m, near & (self.ranges_m < 1.6)[:, None], p)
-        edges = self._edges(np.abs(pooled[:count]), greys[:count], sigmas[:, None], marks, plain)
-        # 4. The posterior.
-        seen = seen & (greys[:count].T < SATURATED)
+        # 4. Edges and look, by those of the floor.
+        sigmas = self._step_sigmas(pooled, near, known)
+        marks = float((np.abs(pooled) > 5 * sigmas)[near].mean())
+        marks = min((p.marks * p.marks_bins + marks * p.seen_bins) / (p.marks_bins + p.seen_bins), 0.5)
+        plain = max(p.noise_share * pair.sensor_grey, LEAST_STEP)
+        edges = self._edges(np.abs(pooled), greys, sigmas, marks, plain)
+        look = self._look(steps, greys, near & (self.ranges_m < 1.6)[:, None])
+        far = far_steps.max(axis=0, initial=0.0) / max(float(sigmas[-1, 0]), float(sigmas.min()))
+        # 5. The posterior.
+        seen = seen & (greys.T < SATURATED)
         terms = np.where(seen.T, np.stack([floor, *levels, look, *edges, fits]).astype(np.float32), 0)
         terms[kernels.FITS] = fits
         first = np.empty((DIRECTIONS, count + 1), np.float32)
-        ratios = np.empty((DIRECTIONS, count), np.float32)
-        view = np.empty((DIRECTIONS, count), np.float32)
+        ratios, view = np.empty((2, DIRECTIONS, count), np.float32)
         kernels.posterior(terms, self._lengths_m, far.astype(np.float32), float(self.ends_m[0]), p, first, ratios, view)
         surfaces = np.ascontiguousarray(evidence.surface[of_bin].T)
         return RayBelief(first, ratios, np.where(seen, view, np.float32(0)), surfaces, self.ends_m)
+
+    def _step_sigmas(self, steps: Floats, near: Flags, known: Flags) -> Floats:
+        """Return the sigmas (N, 1) of steps (N, D) of the floor at each range, within twice that of near ones."""
+        p = self._p
+        least = max(_sigma_of(steps[near]), LEAST_STEP)
+        followed = np.full(len(steps), least)
+        last, of_rows, counts = least, MAD * _row_medians(np.abs(steps), known), known.sum(axis=1)
+        for n in range(len(steps)):
+            if counts[n] >= p.row_bins:
+                last += p.row_share * (of_rows[n] - last)
+            followed[n] = last
+        return np.asarray(np.clip(followed, max(least / 2, LEAST_STEP), 2 * least)[:, None], np.float32)
 
     def _edges(self, steps: Floats, greys: Floats, sigmas: Floats, marks: float, plain: float) -> tuple[Floats, ...]:
         """Return log-ratios (N, D) to something hidden, by steps: of floor, of something plain, and of what begins.
@@ -128,42 +169,58 @@ class RayPosterior:
         """
         p, scale = self._p, np.asarray(self._p.contrast * np.maximum(greys, 20.0), np.float32)
 
-        def noise(step: Floats, sigma: Floats | float) -> Floats:
-            """Return the density of steps within one material: normal, a share with 2.5 times the sigma."""
-            z2 = np.square(step / sigma)
-            density = (1 - p.tail) * np.exp(-0.5 * z2) + 0.4 * p.tail * np.exp(-0.08 * z2)
-            return np.asarray(density / (ROOT * sigma), np.float32)
+        def behind(step: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+            """Return the densities of steps of texture, of texture or none, of what is hidden, and of edges."""
+            textured, other = _noise(step, sigmas, p.tail), _laplace(step, scale)
+            even = (1 - p.plain_behind) * textured + p.plain_behind * _noise(step, np.float32(plain), p.tail)
+            return textured, even, (1 - p.marks_behind) * even + p.marks_behind * other, other
 
-        def laplace(step: Floats) -> Floats:
-            """Return the density of steps between two materials."""
-            return np.asarray(np.exp(-step / scale) / (2 * scale) + LEAST, np.float32)
-
-        def behind(step: Floats, other: Floats) -> tuple[Floats, Floats, Floats]:
-            """Return the densities of steps of the floor, and of what is behind something, by texture and marks."""
-            textured = noise(step, sigmas)
-            even = (1 - p.plain_behind) * textured + p.plain_behind * noise(step, plain)
-            return textured, even, (1 - p.marks_behind) * even + p.marks_behind * other
-
-        begins = laplace(steps)
-        hidden = behind(steps, begins)[2]
+        *_, hidden, begins = behind(steps)
         # Windows of neighbouring bins overlap: an edge is one event, where it is largest.
         largest = cv2.dilate(steps, np.ones((5, 1), np.uint8), borderType=cv2.BORDER_REPLICATE)
         once = np.asarray(np.where((steps < largest) & (steps > 2 * sigmas), 2 * sigmas, steps), np.float32)
-        other = laplace(once)
-        textured, even, other_hidden = behind(once, other)
-        floor = np.log(((1 - marks) * textured + marks * other) / other_hidden)
-        bare = np.log(((1 - p.marks_plain) * even + p.marks_plain * other) / other_hidden)
-        ratios = p.w_edge * floor, p.w_edge * bare, np.log(begins / hidden)
-        return tuple(np.asarray(ratio, np.float32) for ratio in ratios)
+        textured, even, other_hidden, other = behind(once)
+        floor = p.w_edge * np.log(((1 - marks) * textured + marks * other) / other_hidden)
+        bare = p.w_edge * np.log(((1 - p.marks_plain) * even + p.marks_plain * other) / other_hidden)
+        return np.asarray(floor, np.float32), np.asarray(bare, np.float32), np.log(begins / hidden)
 
-    def _known(self, known: Flags | None, seen: Flags) -> tuple[Flags, Flags]:
-        """Return the bins (N, DIRECTIONS) in view that are known to be floor, and those that show its look."""
-        if known is not None:
-            near = known & seen.T & (self.ranges_m < self._p.look_m)[:, None]
-            if near.sum() >= self._p.look_bins:
-                return known & seen.T, near
-        assumed = self._assumed & seen.T
-        return assumed, assumed
+    def _look(self, steps: Floats, greys: Floats, near: Flags) -> Floats:
+        """Return the log-ratios (N, D) that a bin looks like known floor near to the base, to anything: by contrast, by
+        the difference of its grey to both sides, and by its grey.
+
+        near (N, D): bins that are known to be floor. Far away the same floor shows less contrast, in other light.
+        """
+        p, far = self._p, np.maximum(self.ranges_m / TYPICAL_M, 1.0)[:, None].astype(np.float32)
+        grey = float(np.median(greys[near]))
+        scale = np.float32(p.contrast * max(grey, 20.0))
+        # 1. The size of steps around.
+        size2 = np.asarray(cv2.blur(_turned(steps * steps, 1), (3, 5))[:, 1:-1], np.float32)
+        contrast = np.asarray(np.log(np.sqrt(size2) + np.float32(0.3)), np.float32)
+        z = np.asarray(contrast - np.median(contrast[near]), np.float32)
+        sigma = np.float32(max(_sigma_of(z[near]), 0.25))
+        anything = _noise(contrast - 1, np.float32(1.3), 0.0)
+        by_contrast = _alike(_noise(z, np.where(z < 0, sigma + np.log(far), sigma), 0.0), anything)
+        # 2. The difference to both sides, of a bin or of five, whichever is less. A thing shows an outline in half of
+        #    its directions.
+        side = _turned(greys, SIDE)
+        one = greys - (side[:, : -2 * SIDE] + side[:, 2 * SIDE :]) / 2
+        five = cv2.blur(one, (1, 5))
+        outline = np.asarray(np.where(np.abs(one) < np.abs(five), one, five), np.float32)
+        core = _noise(outline, np.float32(max(_sigma_of(outline[near]), 0.8)) * np.sqrt(far), p.tail)
+        by_outline = _alike(core, np.float32(0.5) * (core + _laplace(np.abs(outline), scale)))
+        # 3. The grey, by that of the floor at the same range where it is known.
+        middles = np.full((len(greys), 1), grey, np.float32)
+        sigmas = np.full_like(middles, max(_sigma_of(greys[near] - grey), p.grey_share * grey))
+        known = near.sum(axis=1) > p.grey_bins
+        middles[known, 0] = _row_medians(greys[known], near[known])
+        of_rows = MAD * _row_medians(np.abs(greys[known] - middles[known]), near[known])
+        sigmas[known, 0] = np.clip(of_rows, p.near_grey_share * grey, sigmas[known, 0])
+        z = greys - middles
+        by_grey = _alike(_noise(z, sigmas, 0.0), _laplace(np.abs(z), 1.5 * scale))
+        # Far away the light of the near floor is all that is known.
+        lowest = np.where(known, p.grey_low, p.look_low)[:, None]
+        total = np.clip(by_contrast, p.look_low, p.look_high) + np.clip(by_outline, p.look_low, p.look_high)
+        return np.asarray(p.w_look * (total + np.clip(by_grey, lowest, p.look_high)), np.float32)
 
     def _nothing(self) -> RayBelief:
         """Return the belief by a pair that shows no floor."""
@@ -183,10 +240,45 @@ class RayPosterior:
         most = np.minimum(surface, p.surface_most)
         three = np.maximum(most, np.maximum(np.roll(most, 1, 0), np.roll(most, -1, 0)))
         half = int(p.wide_columns) // 2
-        turned = np.concatenate([three[:, -half:], three, three[:, :half]], axis=1)
-        wide = cv2.blur(turned, (2 * half + 1, 1), borderType=cv2.BORDER_REPLICATE)[:, half:-half]
+        wide = cv2.blur(_turned(three, half), (2 * half + 1, 1), borderType=cv2.BORDER_REPLICATE)[:, half:-half]
         is_best = wide >= np.maximum(np.roll(wide, 1, 0), np.roll(wide, -1, 0))
         return np.asarray(np.where(is_best, np.maximum(most, p.wide_weight * wide), most))
+
+
+def _noise(values: Floats, sigma: Floats | np.float32, tail: float) -> Floats:
+    """Return the density of values within one material: normal, a share `tail` of them with 2.5 times the sigma."""
+    z2 = np.square(values / sigma)
+    density = np.exp(-0.5 * z2)
+    if tail:
+        density = (1 - tail) * density + 0.4 * tail * np.exp(-0.08 * z2)
+    return np.asarray(density / (math.sqrt(math.tau) * sigma), np.float32)
+
+
+def _laplace(magnitudes: Floats, scale: Floats | np.float32) -> Floats:
+    """Return the density of differences between two materials."""
+    return np.asarray(np.exp(-magnitudes / scale) / (2 * scale) + LEAST, np.float32)
+
+
+def _alike(core: Floats, anything: Floats) -> Floats:
+    """Return the log-ratio of a feature of the floor, of which a tenth shows anything, to that of anything."""
+    return np.asarray(np.log(0.9 * core / anything + 0.1), np.float32)
+
+
+def _sigma_of(values: Floats) -> float:
+    """Return the robust standard deviation of differences that are 0 in the mean."""
+    return MAD * float(np.median(np.abs(values)))
+
+
+def _row_medians(values: Floats, chosen: Flags) -> Floats:
+    """Return the medians (N,) of the chosen values of each row of (N, D), inf where none is chosen."""
+    ordered = np.sort(np.where(chosen, values, np.float32(np.inf)), axis=1)
+    counts = chosen.sum(axis=1)
+    return np.asarray(ordered[np.arange(len(values)), counts // 2 - (counts == values.shape[1])])
+
+
+def _turned(values: Floats, count: int) -> Floats:
+    """Return values (N, D) of a turn with so many directions repeated on either side."""
+    return np.concatenate([values[:, -count:], values, values[:, :count]], axis=1)
 
 
 def _step_weights(rows: Array, height: int) -> tuple[Floats, Floats]:

@@ -61,6 +61,9 @@ class RayParameters(NamedTuple):
     # Look of the floor: learned up to this range [m], from so many bins at least.
     look_m: float = 1.8
     look_bins: float = 100.0
+    row_bins: float = 20.0  # known bins of one range by which its steps,
+    grey_bins: float = 60.0  # and by which its grey is known
+    row_share: float = 0.4  # by which the sigma of steps follows them from range to range
 
 
 FLOOR, ABOVE, BELOW, LOOK, EDGE, BARE, BEGINS, FITS = range(8)  # terms of `posterior`
@@ -95,7 +98,7 @@ def add_weighted_rows(weights: Floats, image: Floats, into: Floats) -> None:
 
 
 @compiled(
-    "(f4[:, :, ::1], f4[::1], f4[::1], f8, NamedUniTuple(f8, 38, RayParameters), f4[:, ::1], f4[:, ::1], f4[:, ::1])",
+    "(f4[:, :, ::1], f4[::1], f4[::1], f8, NamedUniTuple(f8, 41, RayParameters), f4[:, ::1], f4[:, ::1], f4[:, ::1])",
     writes=("first", "ratios", "view"),
 )
 def posterior(

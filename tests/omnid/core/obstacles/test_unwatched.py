@@ -7,9 +7,7 @@ import numpy as np
 from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.mapping.range_scan import SECTORS
-from omnid.core.obstacles.grid import GridRing
-from omnid.core.obstacles.moving_tracker import Arrivals
-from omnid.core.obstacles.unwatched import Unwatched, without
+from omnid.core.obstacles.unwatched import Unwatched
 from omnid.core.stereo.tiles import TILE_COLUMNS
 
 CYLINDER = Cylinder(width=900, height=250, row0=80.0)
@@ -45,19 +43,6 @@ def test_spans_are_named_counter_clockwise_from_ahead() -> None:
     assert begin in (161, 162) and end in (198, 199)
     assert unwatched.spans_deg(np.ones(TILE_COLUMNS, bool)) == [(0, 360)]
     assert unwatched.spans_deg(np.zeros(TILE_COLUMNS, bool)) == []
-
-
-def test_unwatched_sectors_have_neither_range_nor_free_floor() -> None:
-    """No range, no free floor, and the rest as it was."""
-    ranges = np.full(SECTORS, 2.0, np.float32)
-    seen = GridRing(ranges, 0.1 * ranges, ranges, Arrivals(ranges, 0.1 * ranges, np.zeros(SECTORS, bool)))
-    where = np.arange(SECTORS) < 90
-    unseen = np.roll(where, 5)  # from the viewpoint
-    found = without(seen, where, unseen)
-    assert np.isnan(found.ranges_m[:90]).all() and not found.free_m[:90].any()
-    assert (np.isnan(found.arrivals.ranges_m) == unseen).all() and (found.arrivals.ranges_m[~unseen] == 2.0).all()
-    assert (found.ranges_m[90:] == 2.0).all() and (found.free_m[90:] == 2.0).all()
-    assert without(seen, np.zeros(SECTORS, bool), unseen) is seen
 
 
 def test_directions_from_the_viewpoint_are_those_of_the_columns_wherever_it_lies() -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from drivers.frame import Frame, coding_steps
 from omnid.config import PanoramaConfig
 from omnid.core.obstacles.column import Columns, FloorPlane
-from omnid.core.obstacles.pair_views import UNITS, WorkingPanoramas
+from omnid.core.obstacles.panoramas import UNITS, WorkingPanoramas
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.messages import FramePair
 from omnid.simulation.robot import make_robot

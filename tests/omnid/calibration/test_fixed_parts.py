@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 
 import cv2
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from calib import se3
 from calib.panorama import Cylinder
-from omnid.core.obstacles.fixed_parts import HEADINGS, LEAST_HEADINGS, FixedParts
+from omnid.calibration.fixed_parts import HEADINGS, FixedParts
 from omnid.core.types.panorama import PaddedPanorama
 
 CYLINDER = Cylinder(872, 253, 86.0)
@@ -22,7 +22,6 @@ SHOWN = np.ones((CYLINDER.height, CYLINDER.width), bool)
 LIGHT_GREY = 60.0
 PAD_PX, NOISE_GREY = 24, 1.0
 TURN = [(n + 0.5) * math.tau / HEADINGS for n in range(HEADINGS)]
-HALVES = [(n + 0.5) * math.tau / HEADINGS / 2 for n in range(2 * HEADINGS)]  # two pairs of each heading
 
 
 @lru_cache(maxsize=1)
@@ -52,34 +51,32 @@ def turned(heading_rad: float, x_m: float = 0.0) -> NDArray[np.float64]:
     return T
 
 
-def test_a_reflection_is_found_within_a_turn_and_nothing_else() -> None:
+def observed(pairs: Callable[[float], tuple[PaddedPanorama, PaddedPanorama]]) -> NDArray[np.bool_]:
+    """Return the pixels that are fixed by the pairs of a turn."""
     parts = FixedParts(CYLINDER)
-    found = [parts.observe(turned(heading), seen(heading), seen(heading, LIGHT_GREY), SHOWN) for heading in HALVES]
-    assert found.index(True) == 2 * (LEAST_HEADINGS - 1) and sum(found) == 1 and parts.is_on_the_spot
-    rows = parts.pixels.mean(axis=1)
-    assert rows[RING].min() > 0.9 and parts.share == pytest.approx(rows.mean())
+    for heading in TURN:
+        parts.observe(turned(heading), *pairs(heading), SHOWN)
+    assert parts.headings == HEADINGS
+    return parts.pixels()
+
+
+def test_a_reflection_is_found_within_a_turn_and_nothing_else() -> None:
+    pixels = observed(lambda heading: (seen(heading), seen(heading, LIGHT_GREY)))
+    rows = pixels.mean(axis=1)
+    assert rows[RING].min() > 0.9
     # The band-pass spreads a border over its 17 rows of 139 a radian.
     assert not rows[: RING.start - 16].any() and not rows[RING.stop + 16 :].any()
 
 
-def test_a_world_without_fixed_parts_has_none() -> None:
-    parts = FixedParts(CYLINDER)
-    judged = [parts.observe(turned(heading), seen(heading), seen(heading), SHOWN) for heading in TURN * 2]
-    assert any(judged) and not parts.pixels.any()
-
-
-def test_the_horizon_is_at_all_headings_and_no_fixed_part() -> None:
-    """Without its rows a bar as high as the cameras would not be seen."""
-    parts, grey = FixedParts(CYLINDER), np.zeros((CYLINDER.height, CYLINDER.width + 2 * PAD_PX), np.uint8)
+def test_the_world_the_horizon_and_images_that_do_not_follow_the_heading_are_not_fixed() -> None:
+    """Without the rows of the horizon a bar as high as the cameras would not be seen; wheels may carry the pose past
+    images that do not change."""
+    grey, still = np.zeros((CYLINDER.height, CYLINDER.width + 2 * PAD_PX), np.uint8), seen(0.0)
     grey[: round(CYLINDER.row0) + 8] = 60  # the sky, and hills
-    for heading in TURN:
-        pair = [replace(seen(heading), image=seen(heading).image + grey) for _ in range(2)]
-        parts.observe(turned(heading), pair[0], pair[1], SHOWN)
-    assert not parts.pixels.any()
-
-
-def test_images_that_do_not_follow_the_heading_are_not_taken_for_fixed_ones() -> None:
-    """Wheels may carry the pose past images that do not change."""
-    parts, still = FixedParts(CYLINDER), seen(0.0)
-    judged = [parts.observe(turned(heading), still, still, SHOWN) for heading in TURN]
-    assert any(judged) and not parts.pixels.any()
+    before_hills = lambda heading: replace(seen(heading), image=seen(heading).image + grey)  # noqa: E731
+    for pairs in (
+        lambda heading: (seen(heading), seen(heading)),
+        lambda heading: (before_hills(heading), before_hills(heading)),
+        lambda _: (still, still),
+    ):
+        assert not observed(pairs).any()
