@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.mapping.range_scan import SECTORS, azimuths
 from omnid.core.obstacles import grid_kernels as kernels
+from omnid.core.obstacles.column import THIN_M
 from omnid.core.obstacles.moving_tracker import Arrivals
 from omnid.core.obstacles.posterior import RayBelief
 
@@ -47,24 +48,18 @@ class GridParameters:
     arrival: float = -9.0  # least log-odds, as something may come into each cell in each pair
     most: float = 6.0
     views: float = 3.0  # n: views of a place that count
-    same_place: float = 0.9  # rho: correlation of the errors of pairs from one place,
-    apart_m: float = 0.05  # and the way after which they are independent
+    same_place: float = 0.9  # rho: correlation of the errors of pairs from one place, 0 after the way of a cell
     risk: float = 0.1  # probability of a thing on a way that is free
     walk_mps: float = 1.6  # of who may come where nobody sees
     person_cells: int = 5  # width of who may
     strut_rad: float = 0.26  # widest part of the view that a strut or a mast hides
     person_rad: float = 0.65  # angle of a person nearer than the floor in view: 0.4 m at 0.6 m
-    thin_m: float = 0.035  # width of the thinnest thing
-    hidden: float = 0.5  # probability of a thing in the nearest bins by which they are hidden,
-    near_m: float = 0.06  # and the length of these bins
     comes: float = 2.0  # by which one pair shows a thing that has come [nats]
-    was_free: float = 0.01  # probability of a thing in a cell that was free,
-    lately_s: float = 3.0  # and for how long that counts
+    lately_s: float = 3.0  # for how long it counts that a cell was free
     comes_m: float = 0.2  # least width of who comes,
     behind_m: float = 0.15  # and of floor that was free behind its front, beside three sigmas of a disparity
     near_sigma: float = 0.3  # of the range of what hides the nearest floor in view, as a share
-    hanging: float = -5.0  # log-odds of something that hangs over floor in view
-    shown_rate: float = 0.15  # of the mean of single pairs
+    shown_rate: float = 0.15  # of the mean of what single pairs show of something that hangs
     shown_least: float = 0.025  # mean from which something hangs there,
     shown_weight: float = 100.0  # and its log-odds by this mean
 
@@ -150,7 +145,7 @@ class ObstacleGrid:
         if self._last is not None:
             passed_s, way_m = max(stamp_ns - self._last[0], 0) * 1e-9, math.dist(place_m, self._last[1])
         is_first, self._last = self._last is None, (stamp_ns, place_m)
-        rho = p.same_place * max(1.0 - way_m / p.apart_m, 0.0)
+        rho = p.same_place * max(1.0 - way_m / CELL_M, 0.0)
         self._follow(place_m)
         self._eye, self._near_m = self._in_cells(self.viewpoint(T_odom_base)[:2, 3]), float(belief.ends_m[0])
         # 1. Evidence and state of each cell.
@@ -181,9 +176,10 @@ class ObstacleGrid:
         self._was_past[:] = past
         self._known[flooded > 0] = 0
         # 5. Who has come, and the ring.
-        arrivals = self._arrivals(passed_s, yaw, in_view & (found[kernels.RATIO] > p.comes), flooded)
-        self.odds[OWN, OWN], self._known[OWN, OWN], self._shown[OWN, OWN] = p.arrival, 1, 0
-        return GridRing(*self._ways(self._in_cells(place_m), yaw), arrivals)
+        taken = self._taken()
+        arrivals = self._arrivals(passed_s, yaw, taken, in_view & (found[kernels.RATIO] > p.comes), flooded)
+        self.odds[OWN, OWN], self._known[OWN, OWN], self._shown[OWN, OWN], taken[OWN, OWN] = p.arrival, 1, 0, 0
+        return GridRing(*self._ways(taken, self._in_cells(place_m), yaw), arrivals)
 
     def is_floor(self, T_odom_base: Array, ranges_m: Array, directions: int) -> Flags:
         """Return the bins (N, directions) about the viewpoint, at ranges (N,), whose cells are floor by all pairs."""
@@ -198,9 +194,12 @@ class ObstacleGrid:
         floor = ((self._known > 0) & (self.odds < self._p.floor)).view(np.uint8)
         return np.asarray(cv2.remap(floor, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT) > 0)
 
-    def _ways(self, place: Array, yaw_rad: float) -> tuple[Floats, Floats, Floats]:
-        """Return the range of the first thing from a place [cells] in each sector, its sigma, and the free way [m]."""
-        ranges_m, taken = self._taken_along(place, yaw_rad)
+    def _ways(self, cells: Floats, place: Array, yaw_rad: float) -> tuple[Floats, Floats, Floats]:
+        """Return the range of the first thing from a place [cells] in each sector, its sigma, and the free way [m].
+
+        cells (SIDE, SIDE): probability of a thing, 2 where nothing is known.
+        """
+        ranges_m, taken = self._along(cells, place, yaw_rad)
         # 1. Free is up to where the probability that a thing stands on the way is at most the risk.
         has_ended = 1 - np.cumprod(1 - np.minimum(taken, 1), axis=1) > self._p.risk
         free_m = np.where(has_ended.any(axis=1), has_ended.argmax(axis=1) * CELL_M, self._max_range_m)
@@ -224,22 +223,23 @@ class ObstacleGrid:
         candidates = hidden & (self._was_past > 0)
         if not candidates.any():
             return flooded
-        ranges_m, taken = self._taken_along(self._eye, yaw_rad)
+        ranges_m, taken = self._along(self._taken(), self._eye, yaw_rad)
         explained = ((taken > 0.3) & (taken <= 1) & (ranges_m < self._near_m + 3 * CELL_M)).any(axis=1)
         explained = np.any([np.roll(explained, shift) for shift in range(-2, 3)], axis=0)
         rows, columns = (of[~explained][:, ranges_m < self._near_m] for of in _along(self._eye, yaw_rad))
         flooded[rows, columns] = candidates[rows, columns]
         return _without_specks(flooded)
 
-    def _arrivals(self, passed_s: float, yaw_rad: float, shows: Flags, flooded: Bytes) -> Arrivals:
+    def _arrivals(self, passed_s: float, yaw_rad: float, taken: Floats, shows: Flags, flooded: Bytes) -> Arrivals:
         """Return who has come onto floor that was free a short while ago.
 
-        shows (SIDE, SIDE): where this pair shows a thing; flooded: 1 where one may that hides the nearest floor.
+        taken (SIDE, SIDE): probability of a thing; shows: where this pair shows one; flooded: 1 where one may that
+        hides the nearest floor.
         """
-        p, taken = self._p, self._taken()
+        p = self._p
         self._free_s += np.float32(passed_s)
         lately = self._free_s < p.lately_s
-        self._free_s[taken < p.was_free] = 0
+        self._free_s[taken < 1 / (1 + math.exp(-p.prior))] = 0
         # Who comes is wider than a speck of noise.
         came = ((taken > 0.5) & (taken <= 1)) | (flooded > 0)
         came |= cv2.morphologyEx(shows.view(np.uint8), cv2.MORPH_OPEN, SQUARE) > 0
@@ -285,22 +285,22 @@ class ObstacleGrid:
 
     def _hides(self, belief: RayBelief) -> Flags:
         """Return the directions (D,) in which the nearest floor in view is hidden."""
-        bins = int(np.searchsorted(belief.ends_m, belief.ends_m[0] + self._p.near_m))
+        bins = int(np.searchsorted(belief.ends_m, belief.ends_m[0] + CELL_M))
         hidden = belief.first[:, :bins].sum(axis=1)
         three = (np.roll(hidden, 1) + hidden + np.roll(hidden, -1)) / 3
-        return np.asarray((three > self._p.hidden) & (belief.view[:, 0] > 0))
+        return np.asarray((three > 0.5) & (belief.view[:, 0] > 0))
 
     def _taken(self) -> Floats:
         """Return the probability of a thing in cells, 2 where nothing is known."""
         p = self._p
-        hanging = np.clip(p.shown_weight * (self._shown - p.shown_least), -9.0, 6.0) + np.float32(p.hanging)
+        hanging = np.clip(p.shown_weight * (self._shown - p.shown_least), -9.0, 6.0) + np.float32(p.prior)
         taken = 1 / (1 + np.exp(-np.maximum(self.odds, hanging)))
         return np.where((self._known > 0) | (self.odds > 0), taken, np.float32(2))
 
-    def _taken_along(self, place: Array, yaw_rad: float) -> tuple[Array, Array]:
-        """Return ranges (R,) [m] from a place [cells], and the probability (SECTORS, R) of a thing there."""
+    def _along(self, cells: Floats, place: Array, yaw_rad: float) -> tuple[Array, Array]:
+        """Return ranges (R,) [m] from a place [cells], and what cells have along the sectors (SECTORS, R)."""
         count = round(self._max_range_m / CELL_M)
-        taken = self._taken()[_along(place, yaw_rad)][:, :count]
+        taken = cells[_along(place, yaw_rad)][:, :count]
         return CELL_M * np.linspace(0.5, count - 0.5, count), np.asarray(taken, np.float64)
 
     def _who_comes(self, passed_s: float, watched: Flags) -> None:
@@ -331,7 +331,7 @@ class ObstacleGrid:
             (belief.ratios, belief.view, belief.surface, near, belief.ends_m),
             (np.hypot(x, y) * np.float32(CELL_M), directions),
         )
-        kernels.gather(*of_belief, self._at_1m, *of_cells, CELL_M, reach_m, self._p.thin_m, cells, states)
+        kernels.gather(*of_belief, self._at_1m, *of_cells, CELL_M, reach_m, THIN_M, cells, states)
         return cells, states
 
     def _follow(self, place_m: Array) -> None:

@@ -129,13 +129,13 @@ class RayPosterior:
         of_bin = self._bins // BINS_PER_PX
         floor = evidence.floor[of_bin]
         floor = floor - np.float32(min(max(float(np.median(floor[near])), -1.0), 0.0))
-        floor = p.w_floor * np.clip(floor, p.floor_low, p.floor_high)
+        floor = p.w_floor * np.clip(floor, -p.floor_most, p.floor_most)
         levels = floor - p.w_level * np.clip(evidence.level[:, of_bin], -p.level_most, p.level_most)
         fits = np.minimum(self._surfaces(evidence.surface)[of_bin], p.surface_most) - p.surface_noise
         # 4. Edges and look, by those of the floor.
         sigmas = self._step_sigmas(pooled, near, known)
         marks = float((np.abs(pooled) > 5 * sigmas)[near].mean())
-        marks = min((p.marks * p.marks_bins + marks * p.seen_bins) / (p.marks_bins + p.seen_bins), 0.5)
+        marks = min((p.marks + 2 * marks) / 3, 0.5)
         plain = max(p.noise_share * pair.sensor_grey, LEAST_STEP)
         edges = self._edges(np.abs(pooled), greys, sigmas, marks, plain)
         look = self._look(steps, greys, near & (self.ranges_m < 1.6)[:, None])
@@ -157,8 +157,8 @@ class RayPosterior:
         followed = np.full(len(steps), least)
         last, of_rows, counts = least, MAD * _row_medians(np.abs(steps), known), known.sum(axis=1)
         for n in range(len(steps)):
-            if counts[n] >= p.row_bins:
-                last += p.row_share * (of_rows[n] - last)
+            if counts[n] >= p.look_bins:
+                last = (last + of_rows[n]) / 2
             followed[n] = last
         return np.asarray(np.clip(followed, max(least / 2, LEAST_STEP), 2 * least)[:, None], np.float32)
 
@@ -211,14 +211,14 @@ class RayPosterior:
         # 3. The grey, by that of the floor at the same range where it is known.
         middles = np.full((len(greys), 1), grey, np.float32)
         sigmas = np.full_like(middles, max(_sigma_of(greys[near] - grey), p.grey_share * grey))
-        known = near.sum(axis=1) > p.grey_bins
+        known = near.sum(axis=1) > p.look_bins
         middles[known, 0] = _row_medians(greys[known], near[known])
         of_rows = MAD * _row_medians(np.abs(greys[known] - middles[known]), near[known])
         sigmas[known, 0] = np.clip(of_rows, p.near_grey_share * grey, sigmas[known, 0])
         z = greys - middles
         by_grey = _alike(_noise(z, sigmas, 0.0), _laplace(np.abs(z), 1.5 * scale))
         # Far away the light of the near floor is all that is known.
-        lowest = np.where(known, p.grey_low, p.look_low)[:, None]
+        lowest = p.look_low * (1 + known[:, None])
         total = np.clip(by_contrast, p.look_low, p.look_high) + np.clip(by_outline, p.look_low, p.look_high)
         return np.asarray(p.w_look * (total + np.clip(by_grey, lowest, p.look_high)), np.float32)
 

@@ -18,18 +18,14 @@ class RayParameters(NamedTuple):
 
     # Rates of the prior, per metre of a ray.
     things_per_m: float = 0.1
-    hanging_per_m: float = 0.05
+    rare_per_m: float = 0.05  # of things that hang, and of slopes
     steps_per_m: float = 0.005
-    slopes_per_m: float = 0.05
     changes_per_m: float = 0.02  # of borders behind which the floor looks otherwise
     # Probabilities.
     alike: float = 0.1  # something looks like the floor
     invisible: float = 0.005  # the end of the floor beyond the last bin shows no foot
-    nearer: float = 0.02  # something begins nearer than the view and looks like the floor,
-    nearer_other: float = 0.03  # or otherwise
-    marks: float = 0.02  # m: an edge in a bin of the floor, before any was seen; worth so many bins:
-    marks_bins: float = 40.0
-    seen_bins: float = 100.0  # what bins are worth that were seen
+    nearer: float = 0.02  # something begins nearer than the view and looks like the floor; and otherwise
+    marks: float = 0.02  # m: an edge in a bin of the floor, before any was seen
     marks_behind: float = 0.2  # an edge in a bin of what hides the floor,
     marks_plain: float = 0.01  # and of something plain
     plain_behind: float = 0.3  # what hides the floor has no texture
@@ -46,24 +42,18 @@ class RayParameters(NamedTuple):
     w_level: float = 0.3
     w_look: float = 0.2
     # Bounds of what one bin says [nats].
-    floor_low: float = -12.0
-    floor_high: float = 8.0
+    floor_most: float = 10.0
     level_most: float = 4.0
     surface_most: float = 8.0
     look_low: float = -2.5
     look_high: float = 1.0
-    grey_low: float = -5.0  # of a grey where the floor's is known at that range
-    cell_low: float = -3.0
-    cell_high: float = 4.0
+    cell_most: float = 4.0
     # Surfaces: where the mean over so many directions is largest, it counts so much more than one direction.
     wide_columns: float = 11.0
     wide_weight: float = 5.0
     # Look of the floor: learned up to this range [m], from so many bins at least.
     look_m: float = 1.8
-    look_bins: float = 100.0
-    row_bins: float = 20.0  # known bins of one range by which its steps,
-    grey_bins: float = 60.0  # and by which its grey is known
-    row_share: float = 0.4  # by which the sigma of steps follows them from range to range
+    look_bins: float = 60.0
 
 
 FLOOR, ABOVE, BELOW, LOOK, EDGE, BARE, BEGINS, FITS = range(8)  # terms of `posterior`
@@ -98,7 +88,7 @@ def add_weighted_rows(weights: Floats, image: Floats, into: Floats) -> None:
 
 
 @compiled(
-    "(f4[:, :, ::1], f4[::1], f4[::1], f8, NamedUniTuple(f8, 41, RayParameters), f4[:, ::1], f4[:, ::1], f4[:, ::1])",
+    "(f4[:, :, ::1], f4[::1], f4[::1], f8, NamedUniTuple(f8, 31, RayParameters), f4[:, ::1], f4[:, ::1], f4[:, ::1])",
     writes=("first", "ratios", "view"),
 )
 def posterior(
@@ -127,14 +117,14 @@ def posterior(
     for n in range(bins):
         change = min(p.changes_per_m * lengths_m[n], 0.1)
         log_stays[n], log_changes[n] = math.log1p(-change), math.log(change)
-        prior = min((p.things_per_m + p.hanging_per_m) * lengths_m[n], 0.5)
+        prior = min((p.things_per_m + p.rare_per_m) * lengths_m[n], 0.5)
         prior_odds[n] = math.log(prior / (1.0 - prior))
-    log_things, log_over = math.log(p.things_per_m), math.log(p.hanging_per_m)
-    log_steps, log_slopes = math.log(p.steps_per_m), math.log(p.slopes_per_m)
+    log_things, log_over = math.log(p.things_per_m), math.log(p.rare_per_m)
+    log_steps, log_slopes = math.log(p.steps_per_m), math.log(p.rare_per_m)
     log_alike, log_unlike = math.log(p.alike), math.log1p(-p.alike)
     other_at_start = min(0.1 * p.changes_per_m * nearest_m, 0.5)
     log_known, log_other = math.log1p(-other_at_start), math.log(other_at_start)
-    log_nearer, log_alike_nearer = math.log(p.nearer_other), math.log(p.nearer)
+    log_nearer = math.log(p.nearer)
     for u in range(directions):
         # 1. Sums from each bin to the last: planes beside the floor, look, and things behind the first one.
         plain = 0.0
@@ -164,7 +154,7 @@ def posterior(
         none = log_sum(before + looks + foot - LOG_2, slope + foot)
         # 4. Nearer than the view: the look of floor may have been learned from it, or it has one of its own.
         #    What is plain shows fewer edges.
-        nearer = log_sum(look[0] + log_alike_nearer, log_nearer + log_sum(0.0, plain) - LOG_2)
+        nearer = log_nearer + log_sum(look[0], log_sum(0.0, plain) - LOG_2)
         # 5. Something that hangs over floor in view: all that may begin beyond.
         beyond = high = none
         for n in range(bins - 1, -1, -1):
@@ -189,6 +179,6 @@ def posterior(
             if reach > LEAST_REACH:
                 rate = min(max(found / reach, 1e-6), 1.0 - 1e-6)
                 ratio = (math.log(rate / (1.0 - rate)) - prior_odds[n]) * reach
-                ratios[u, n] = min(max(ratio, p.cell_low), p.cell_high)
+                ratios[u, n] = min(max(ratio, -p.cell_most), p.cell_most)
             reach = max(reach - found, 0.0)
         first[u, bins] = last / weight
