@@ -68,8 +68,8 @@ def thin_things_m(belief: RayBelief, risk: float) -> FreeRanges:
     met = np.cumsum(belief.first[:, :-1], axis=1)  # (D, N)
     beside = [np.mean([np.roll(met, side * shift, axis=0) for shift in BESIDE], axis=0) for side in (-1, 1)]
     ends = (met > risk) & (np.maximum(*beside) < risk) & (belief.view > 0)
-    # The bin of a foot is known to a disparity.
-    bins = np.maximum(ends.argmax(axis=1) - BINS_PER_PX, 0)
+    # The bin of a foot is known to two disparities.
+    bins = np.maximum(ends.argmax(axis=1) - 2 * BINS_PER_PX, 0)
     begins_m = np.where(ends.any(axis=1), belief.ends_m[bins], np.inf)
     # A sector has the nearest of the directions in it and next to it.
     found, at = np.full(SECTORS, np.inf, np.float32), np.arange(len(begins_m)) + 0.5
@@ -131,7 +131,9 @@ class RayPosterior:
         floor = floor - np.float32(min(max(float(np.median(floor[near])), -1.0), 0.0))
         floor = p.w_floor * np.clip(floor, -p.floor_most, p.floor_most)
         levels = floor - p.w_level * np.clip(evidence.level[:, of_bin], -p.level_most, p.level_most)
-        fits = np.minimum(self._surfaces(evidence.surface)[of_bin], p.surface_most) - p.surface_noise
+        # A surface that fits at a whole disparity is within half of one of it.
+        of_surface = np.minimum((self._bins + 1) // BINS_PER_PX, len(evidence.surface) - 1)
+        fits = np.minimum(self._surfaces(evidence.surface)[of_surface], p.surface_most) - p.surface_noise
         # 4. Edges and look, by those of the floor.
         sigmas = self._step_sigmas(pooled, near, known)
         marks = float((np.abs(pooled) > 5 * sigmas)[near].mean())
@@ -147,7 +149,7 @@ class RayPosterior:
         first = np.empty((DIRECTIONS, count + 1), np.float32)
         ratios, view = np.empty((2, DIRECTIONS, count), np.float32)
         kernels.posterior(terms, self._lengths_m, far.astype(np.float32), float(self.ends_m[0]), p, first, ratios, view)
-        surfaces = np.ascontiguousarray(evidence.surface[of_bin].T)
+        surfaces = np.ascontiguousarray(evidence.surface[of_surface].T)
         return RayBelief(first, ratios, np.where(seen, view, np.float32(0)), surfaces, self.ends_m)
 
     def _step_sigmas(self, steps: Floats, near: Flags, known: Flags) -> Floats:
