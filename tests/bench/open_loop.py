@@ -3,13 +3,14 @@
 Nothing stops the base: it drives on until it is 0.15 m from what is in the way. Each drive is a file of numpy, which
 any method can be tried on, and what today's ring told of it. Arrays by pair (N): lower, upper (N, H, W) uint8;
 stamps_ns; T_world_base (N, 4, 4), true; first_m (N, 360), the range from the base's origin in its sectors to the first
-thing that the base would touch, of the heights that it sweeps, or to where the floor falls; inf: none; ring_m, free_m
-(N, 360) of the ring, NaN where there was none. Of the world: T_base_rig (4, 4), as its file says; profile (P, 2), the
-heights z of the floor at places x; radius_m and height_m of the base.
+thing that the base would touch, of the heights that it sweeps, or to where the floor falls; inf: none; ring_m, sigma_m,
+free_m (N, 360) of the ring, NaN where there was none. Of the world: T_base_rig (4, 4), as its file says; profile (P,
+2), the heights z of the floor at places x; radius_m and height_m of the base.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -99,6 +100,7 @@ def stored(planned: Planned, folder: Path) -> Path:
         T_world_base=np.array([kept[stamp_ns][0] for stamp_ns in stamps]),
         first_m=np.array([kept[stamp_ns][1] for stamp_ns in stamps], np.float32),
         ring_m=np.array([rings[s].ranges_m if s in rings else none for s in stamps], np.float32),
+        sigma_m=np.array([rings[s].sigma_m if s in rings else none for s in stamps], np.float32),
         free_m=np.array([rings[s].free_m if s in rings else none for s in stamps], np.float32),
         T_base_rig=run.T_base_rig,
         profile=np.array(asked.world.ground.profile or [(0.0, 0.0)]),
@@ -120,6 +122,31 @@ def shares(path: Path, *, backwards: bool) -> tuple[int, float, float]:
     return int(told.sum()), free, float((free_m > first_m + BEYOND_M).mean()) if told.any() else float("nan")
 
 
+def add_scan_table(paths: Sequence[Path]) -> None:
+    """Print and write the errors of ranges against the truth, by metre of it."""
+    names = "ring_m", "first_m", "sigma_m"
+    parts = []
+    for path in paths:
+        with np.load(path) as file:
+            parts.append(np.array([file[name] for name in names], float).reshape(len(names), -1))
+    ring_m, first_m, sigma_m = np.concatenate(parts, axis=1)
+    columns = (
+        Column("range", "m"),
+        Column("ranges"),
+        Column("median error", "m", 3),
+        Column("90 % of the magnitudes", "m", 3),
+        Column("68 % of the magnitudes by sigma", "", 1),
+    )
+    table = ResultTable("obstacles_scan", "Ranges of the ring against the truth", columns)
+    for metre in range(math.ceil(np.nanmax(first_m, where=np.isfinite(first_m), initial=0.0))):
+        chosen = np.isfinite(ring_m) & (first_m >= metre) & (first_m < metre + 1)
+        if chosen.any():
+            error_m = ring_m[chosen] - first_m[chosen]
+            by_sigma = np.quantile(np.abs(error_m) / sigma_m[chosen], 0.68)
+            most_m = np.quantile(np.abs(error_m), 0.9)
+            table.add(f"{metre} to {metre + 1}", int(chosen.sum()), np.median(error_m), most_m, by_sigma)
+
+
 def judge_rings(wanted: Sequence[Planned], folder: Path, jobs: int) -> None:
     """Make the files that are missing, and print a row for each world."""
     columns = (
@@ -130,7 +157,10 @@ def judge_rings(wanted: Sequence[Planned], folder: Path, jobs: int) -> None:
     )
     table = ResultTable("obstacles_open_loop", "The obstacle ring on stored pairs", columns)
     make: Callable[[Planned, Path], Path] = stored
+    paths = []
     with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
         for planned, path in zip(wanted, pool.map(make, wanted, [folder] * len(wanted)), strict=True):
             count, free, false = shares(path, backwards=planned.speed_mps < 0)
             table.add(str(planned), count, 100 * free, 100 * false, seed=("buildings", planned.seed))
+            paths.append(path)
+    add_scan_table(paths)
