@@ -62,12 +62,12 @@ def thin_things_m(belief: RayBelief, risk: float) -> FreeRanges:
     """Return the least range (SECTORS,) [m] at which something thin may hide the floor, inf where nothing does.
 
     The way along such a ray ends by a risk, the probability that something stands on it, while that along the rays 5 to
-    12 directions to the left and to the right goes on. Sectors are those of the rectified frame. For maps, which are
+    12 directions to the left and to the right surely goes on. Sectors are those of the rectified frame. For maps, which are
     seen from many places: floor that a pole hides is seen beside it from the next.
     """
     met = np.cumsum(belief.first[:, :-1], axis=1)  # (D, N)
     beside = [np.mean([np.roll(met, side * shift, axis=0) for shift in BESIDE], axis=0) for side in (-1, 1)]
-    ends = (met > risk) & (np.maximum(*beside) < risk) & (belief.view > 0)
+    ends = (met > risk) & (np.maximum(*beside) < risk**2) & (belief.view > 0)
     # The bin of a foot is known to two disparities.
     bins = np.maximum(ends.argmax(axis=1) - 2 * BINS_PER_PX, 0)
     begins_m = np.where(ends.any(axis=1), belief.ends_m[bins], np.inf)
