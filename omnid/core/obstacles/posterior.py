@@ -62,8 +62,8 @@ def thin_things_m(belief: RayBelief, risk: float) -> FreeRanges:
     """Return the least range (SECTORS,) [m] at which something thin may hide the floor, inf where nothing does.
 
     The way along such a ray ends by a risk, the probability that something stands on it, while that along the rays 5 to
-    12 directions to the left and to the right surely goes on. Sectors are those of the rectified frame. For maps, which are
-    seen from many places: floor that a pole hides is seen beside it from the next.
+    12 directions to the left and to the right surely goes on. Sectors are those of the rectified frame. For maps, which
+    are seen from many places: floor that a pole hides is seen beside it from the next.
     """
     met = np.cumsum(belief.first[:, :-1], axis=1)  # (D, N)
     beside = [np.mean([np.roll(met, side * shift, axis=0) for shift in BESIDE], axis=0) for side in (-1, 1)]
