@@ -15,9 +15,16 @@ from numpy.typing import NDArray
 from omnid.core.types.panorama import PaddedPanorama
 
 Array = NDArray[np.float64]
-
+Image = NDArray[np.uint8]
+Flags = NDArray[np.bool_]
 
 CONVERGED_PX = 0.01  # OpenCV's default: an iteration that moves the window less is the last one
+STEP_RAD = math.radians(18)  # the paper's step, Dang et al. 2012, section IV.F
+PEAKS = 3  # Peaks of the correlation that are tried.
+# Two peaks are at least a 36th of a full turn apart: 10 degrees, because nearer ones would be two samples of one peak.
+PEAKS_APART = 36
+MAX_GRADIENT = 100.0  # grey levels, Sobel: stronger edges are cut, so that none dominates the correlation
+ROW_STEP = 2  # every second row is enough for the correlation
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,9 +37,7 @@ class KltSettings:
     iterations: int = 20  # iterations on each pyramid level
 
 
-def track(
-    a: PaddedPanorama, b: PaddedPanorama, points: Array, guess: Array, klt: KltSettings
-) -> tuple[Array, NDArray[np.bool_]]:
+def track(a: PaddedPanorama, b: PaddedPanorama, points: Array, guess: Array, klt: KltSettings) -> tuple[Array, Flags]:
     """Track points (N, 2) of a into b, from a guess (N, 2), with the forward-backward check.
 
     Returns the pixels (N, 2) in b and flags (N,) of those that the track back leads to where they started. Columns are
@@ -48,9 +53,7 @@ def track(
     return there, found & returned & close
 
 
-def flow(
-    a: PaddedPanorama, b: PaddedPanorama, points: Array, guess: Array, klt: KltSettings
-) -> tuple[Array, NDArray[np.bool_]]:
+def flow(a: PaddedPanorama, b: PaddedPanorama, points: Array, guess: Array, klt: KltSettings) -> tuple[Array, Flags]:
     """Track points (N, 2) of a into b by pyramidal Lucas-Kanade, from a guess (N, 2), without the check.
 
     Returns the pixels (N, 2) in b and flags (N,) of those that ended inside the image.
@@ -77,17 +80,6 @@ def _padded(points: Array, panorama: PaddedPanorama) -> NDArray[np.float32]:
     """Return points (N, 1, 2) float32 in the padded image."""
     columns = panorama.padded(points[:, 0])
     return np.ascontiguousarray(np.stack([columns, points[:, 1]], axis=1)[:, None, :], np.float32)
-
-
-Image = NDArray[np.uint8]
-Flags = NDArray[np.bool_]
-
-STEP_RAD = math.radians(18)  # the paper's step, Dang et al. 2012, section IV.F
-PEAKS = 3  # Peaks of the correlation that are tried.
-# Two peaks are at least a 36th of a full turn apart: 10 degrees, because nearer ones would be two samples of one peak.
-PEAKS_APART = 36
-MAX_GRADIENT = 100.0  # grey levels, Sobel: stronger edges are cut, so that none dominates the correlation
-ROW_STEP = 2  # every second row is enough for the correlation
 
 
 def steps() -> list[float]:
