@@ -149,7 +149,7 @@ class Controller:
         state.slowed_by = law.plausibility.slowed_by
         state.measured = law.plausibility.account.detail
         state.obstacle = "" if law.reason else monitor.reason
-        state.blocked = bool(state.obstacle) and monitor.share == 0.0
+        state.blocked = bool(state.obstacle) and monitor.holds
         # 2. How often it began.
         state.slowed += bool(state.slowed_by and not before.slowed_by)
         state.obstacle_stops += state.blocked and not before.blocked

@@ -196,6 +196,7 @@ class CollisionMonitor:
         self._moving: tuple[MovingPoint, ...] = ()
         self._motions = DrivenMotions()
         self.reason = ""  # why the last step changed the motion
+        self.holds = False  # the motion was stopped, or could only creep
         self.share = 1.0  # share of the motion that was allowed; 0 also where only a turn on the spot was
         self._stopped_mps = 0.0  # motion that the last step stopped
 
@@ -236,6 +237,8 @@ class CollisionMonitor:
             share, reason = 0.0, self.reason
         self.share, self.reason = share, reason
         self._stopped_mps = motion.velocity_mps if share == 0.0 else 0.0
+        edge_mps = max(speed_mps, abs(motion.yaw_rate_radps) * self._outline.radius_m)
+        self.holds = share * edge_mps < min(LEAST_MPS, edge_mps)
         # 2. Where it may not drive, it may turn.
         if share == 0.0 and to_heading:
             motion = Twist(0.0, motion.yaw_rate_radps)
@@ -333,8 +336,9 @@ class CollisionMonitor:
         share = min(first_s / self._settings.time_s, math.sqrt(2 * self._turn_deceleration * first_s / turn_radps))
         if speed_mps > 0.0:
             share = min(share, math.sqrt(2 * self._deceleration * speed_mps * first_s) / speed_mps)
-        edge_mps = max(speed_mps, abs(motion.yaw_rate_radps) * self._outline.radius_m)
-        return 0.0 if share * edge_mps < min(LEAST_MPS, edge_mps) else min(1.0, share)
+            if share < 1.0 and share * speed_mps < LEAST_MPS:
+                return 0.0
+        return min(1.0, share)
 
     def _stop_polygon(self, motion: Twist) -> Outline:
         """Return the outline with the distance to keep on the side to which the base moves, and at its sides."""
@@ -360,7 +364,7 @@ class CollisionMonitor:
             [(x, y)] = seen_from(pose, [(one.x_m + one.vx_mps * at_s, one.y_m + one.vy_mps * at_s)])
             if step == 0:
                 limit_mps = self._deceleration * ((self._outline.gap_m(x, y) - one.radius_m) / WALK_MPS - TURN_S)
-                if speed_mps > limit_mps and side * x > -self._outline.rear_m:
+                if speed_mps > max(limit_mps, 0.0) and side * x > -self._outline.rear_m:
                     later_s = at_s + MOVING_STEP_S
                     there = (one.x_m + one.vx_mps * later_s, one.y_m + one.vy_mps * later_s)
                     [(later_x, later_y)] = seen_from(moved, [there])

@@ -69,11 +69,13 @@ class FloorMap:
         self._follow(pose[:2])
         return self._states
 
-    def closed(self, pose: Array) -> Array:
-        """Return the places (N, 2) in odom of cells that are OCCUPIED, or UNKNOWN next to one that is FREE."""
+    def closed(self, pose: Array, *, at_unknown: bool) -> Array:
+        """Return the places (N, 2) in odom of cells that are OCCUPIED; at_unknown: or next to a FREE one UNKNOWN."""
         states = self.states(pose)
-        edge = cv2.dilate((states == FREE).view(np.uint8), np.ones((3, 3), np.uint8)) > 0
-        rows, columns = np.nonzero((states == OCCUPIED) | ((states == UNKNOWN) & edge))
+        is_closed = states == OCCUPIED
+        if at_unknown:
+            is_closed |= (states == UNKNOWN) & (cv2.dilate((states == FREE).view(np.uint8), np.ones((3, 3))) > 0)
+        rows, columns = np.nonzero(is_closed)
         return np.asarray(self.corner(pose) + CELL_M * np.column_stack([columns, rows]))
 
     @staticmethod

@@ -151,16 +151,6 @@ class Follower:
                 break
         return PathAhead(*(np.concatenate(parts) for parts in zip(*pieces, strict=True)))
 
-    @property
-    def place(self) -> tuple[int, float]:
-        """The leg and the way on it."""
-        return self._number, self._legs[self._number].length_m if self._pursuit is None else self._pursuit.s_m
-
-    @property
-    def leg_left_m(self) -> float:
-        """Way to the end of the leg."""
-        return 0.0 if self._pursuit is None else self._pursuit.leg.length_m - self._pursuit.s_m
-
     def step(
         self, stamp_ns: int, pose: Array, speed_mps: float, yaw_rate_radps: float, obstacle_m: float = math.inf
     ) -> Following:

@@ -389,7 +389,10 @@ class Navigator:
         else:
             ahead = drive.follower.ahead(2 * LOOK_M)
             corridor = drive.in_odom(ahead.xy, now)
-            k = _behind(corridor, around.obstacles, self._planner.room_m + settings.clearance_m)
+            obstacles = around.obstacles
+            if barred is not None and around.floor is not None:  # by floor that is not seen
+                obstacles = np.vstack([obstacles, around.floor.closed(now.pose, at_unknown=False)])
+            k = _behind(corridor, obstacles, self._planner.room_m + settings.clearance_m)
             if k is None:
                 return "the path is not free within sight"
             goal, place = corridor[k], (int(ahead.legs[k]), float(ahead.s[k]))
@@ -408,7 +411,7 @@ class Navigator:
         room_m = self._planner.room_m + self._settings.clearance_m + CELL_M
         obstacles = around.obstacles
         if around.floor is not None:
-            obstacles = np.vstack([obstacles, around.floor.closed(now.pose)])
+            obstacles = np.vstack([obstacles, around.floor.closed(now.pose, at_unknown=True)])
         return aside_rad < math.pi / 4 and math.isinf(first_blocked_m(straight.xy, obstacles, room_m))
 
     def _blocked(

@@ -151,7 +151,7 @@ def test_a_long_base_turns_on_the_spot_as_far_as_floor_was_seen_beside_it() -> N
     free = tuple(0.55 if math.isnan(range_m) else 6.0 for range_m in with_unknown(20, 160))
     for ranges in (with_unknown(20, 160), (4.0,) * 360):  # nothing is seen behind it, or another wall, past a pole
         allowed, reason = after(ranges, turn, settings, free=free)
-        assert allowed.yaw_rate_radps < 0.3 and reason == monitor_module.UNKNOWN
+        assert 0.0 < allowed.yaw_rate_radps < 0.3 and reason == monitor_module.UNKNOWN
         assert after(ranges, turn, SETTINGS, free=free) == (turn, "")
     assert after(with_unknown(20, 160), turn, settings) == (turn, "")
     slow = after(with_unknown(20, 160), turn, replace(settings, unknown="slow", slow_mps=0.2), free=free)[0]

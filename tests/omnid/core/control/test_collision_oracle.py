@@ -343,7 +343,10 @@ def test_without_a_fresh_ring_no_corner_is_faster_than_the_slow_speed(has_ring: 
 
 
 def test_moving_obstacles_are_where_they_will_be() -> None:
-    """Their circles against the outline, every 0.1 s on the arc; what is nearer in time than 0.5 s stops the base."""
+    """Their circles against the outline, every 0.1 s on the arc; what is nearer in time than 0.5 s stops the base.
+
+    And the base is at rest before one that comes nearer could reach it at 1.6 m/s.
+    """
     rng, shares = random.Random(5), []
     for _ in range(300):
         settings, (v, w) = any_settings(rng), any_motion(rng)
@@ -369,11 +372,22 @@ def test_moving_obstacles_are_where_they_will_be() -> None:
             gap_m = float(swept_outline.depth_m(stop_box(settings, v), then)) - obstacle.radius_m
             nears_mps = swept_outline.approach_mps(outline_of(settings), (v, w), then) if step == 0 else 1.0
             margin_m = min(margin_m, abs(gap_m), abs(nears_mps))
+            if step == 0:
+                away_m = max(0.0, float(swept_outline.depth_m(outline_of(settings), now))) - obstacle.radius_m
+                limit_mps = BRAKING_SHARE * 5.0 * (away_m / 1.6 - 0.4)
+                velocity = complex(obstacle.vx_mps, obstacle.vy_mps)
+                [later] = seen_from(place, yaw, [complex(obstacle.x_m, obstacle.y_m) + (at_s + 0.1) * velocity])
+                comes = v != 0.0 and now.real * math.copysign(1.0, v) > -settings.rear_m and abs(later) <= abs(now)
+                edge_mps = max(
+                    abs(v), abs(w) * math.hypot(max(settings.front_m, settings.rear_m), settings.half_width_m)
+                )
+                passive = max(0.0, limit_mps) / edge_mps if comes and abs(v) > limit_mps else 1.0
             if gap_m <= 0.0 and nears_mps > 0.0:
                 expected = 0.0 if step <= 5 else 0.1 * step / 2.0
                 break
         if margin_m < 5e-3:
             continue
+        expected = min(expected, passive)
         monitor.set_ring(ControllerRing(ring_ns, (math.inf,) * SECTORS, (), (obstacle,)))
         allowed = monitor.step(ring_ns + round(age_s * S), Twist(v, w))
         assert (allowed.velocity_mps, allowed.yaw_rate_radps) == pytest.approx((expected * v, expected * w))

@@ -29,7 +29,7 @@ def wheel_state(law: ControlLaw) -> WheelState:
     """Return the state of the wheels, as the daemon reads it from the controller."""
     arming, current = law.arming, law.commands.current
     source = "" if law.reason or current is None else current.source
-    held_by = law.collision.reason if law.collision.share == 0.0 else ""
+    held_by = law.collision.reason if law.collision.holds else ""
     return WheelState(arming.armed, arming.needs_request, arming.reason, law.reason, source, held_by)
 
 

@@ -8,7 +8,7 @@ import pytest
 from omnid.core.control.collision_monitor import UNKNOWN, ControllerRing
 from omnid.core.navigation.floor_map import FloorMap
 from omnid.core.navigation.navigator import Navigator
-from omnid.core.navigation.path import goal_path
+from omnid.core.navigation.path import DrivePath, drive_path, goal_path
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.situation import Situation
 from omnid.navigation_state import NavigationState
@@ -23,10 +23,10 @@ class BaseAmongPatches(DrivenBase):
 
     has_ring = True
 
-    def __init__(self, patches: Boxes) -> None:
+    def __init__(self, patches: Boxes, path: DrivePath | None = None) -> None:
         super().__init__(Navigator(SETTINGS), 1)
         self.boxes, self.floor = patches, FloorMap(OUTLINE)
-        self.navigator.start("goal", NavigationFrame.ODOM, [goal_path(self.pose, (5.0, 0.0), 0.0)], self.seen())
+        self.navigator.start("goal", NavigationFrame.ODOM, [path or goal_path(self.pose, (5.0, 0.0), 0.0)], self.seen())
 
     def seen(self) -> Situation:
         now = super().seen()
@@ -37,8 +37,9 @@ class BaseAmongPatches(DrivenBase):
 
 
 @pytest.mark.hazard("H31")
-def test_a_patch_that_stays_unknown_is_passed_beside_it() -> None:
-    base = BaseAmongPatches(Boxes((2.4, -0.15, 2.7, 0.2)))
+@pytest.mark.parametrize("path", [None, drive_path([(0.0, 0.0), (5.0, 0.0)], 0.0)], ids=["goal", "path"])
+def test_a_patch_that_stays_unknown_is_passed_beside_it(path: DrivePath | None) -> None:
+    base = BaseAmongPatches(Boxes((2.4, -0.15, 2.7, 0.2)), path)
     assert base.run(90, rest_s=0.3).state is NavigationState.REACHED
     assert any(sample.navigation.state is NavigationState.AVOIDING for sample in base.samples)
     assert clearance_m(base) > 0.0
