@@ -36,12 +36,12 @@ class Unwatched:
             sectors[:] = (np.floor(turned).astype(np.intp) % SECTORS).reshape(sectors.shape)
 
     def sectors(self, columns: Flags) -> Flags:
-        """Return the sectors (SECTORS,) of columns of tiles (C,)."""
-        return self._marked(self._sectors[:, columns])
+        """Return the sectors (SECTORS,) of columns of tiles (C,); where all tiles live, C is that of a full turn."""
+        return self._marked(self._sectors[:, np.flatnonzero(columns)])
 
     def directions(self, columns: Flags) -> Flags:
         """Return the directions (SECTORS,) from the viewpoint, about axes parallel to the base's, of columns (C,)."""
-        return self._marked(self._sectors[-1, columns])
+        return self._marked(self._sectors[-1, np.flatnonzero(columns)])
 
     def spans_deg(self, columns: Flags) -> list[tuple[int, int]]:
         """Return from where to where columns of tiles lie about the base, counter-clockwise from ahead [deg]."""
