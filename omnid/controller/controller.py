@@ -21,7 +21,6 @@ from omnid.core.control.safety_rules import AWAITED
 from omnid.core.control.trust import MotorReport
 from omnid.core.control.velocity_limits import STOP
 from omnid.core.nanoseconds import S_PER_NS
-from omnid.engine.graph import nothing
 
 FIRST_TOLD_S, LONGEST_TOLD_S = 2.0, 300.0  # between two lines about a motor controller that does not answer
 
@@ -39,7 +38,7 @@ class Controller:
         driver: MotorDriver,
         settings: ControllerSettings,
         period_s: float,
-        report: Callable[[str], None] = nothing,
+        report: Callable[[str], None] = lambda line: None,
         *,
         clock_ns: Callable[[], int] = time.monotonic_ns,
         limited: Callable[[VelocityCommand], tuple[float, float]] | None = None,

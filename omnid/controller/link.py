@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 import time
 from collections.abc import Callable, Iterator
@@ -9,21 +10,54 @@ from contextlib import suppress
 from typing import Final, Protocol
 
 from drivers.errors import DriverError
+from drivers.motion import WheelSample
 from drivers.motor import VelocityCommand
 from omnid.controller.ipc import NO_MESSAGE, Channel, socket_pair
 from omnid.controller.messages import LONGEST_RAMP_S, ControllerStart, ControllerUpdate, LogRecord, StartFailed
-from omnid.controller.statistics import ControllerStatistics, TickReport
+from omnid.controller.statistics import ControllerState, TickReport
 from omnid.core.control.contacts import NO_CONTACT
 from omnid.core.control.control_law import ControlInput
 from omnid.core.nanoseconds import S_PER_NS
+from omnid.engine.graph import Stream
 from omnid.engine.process import python, python_environment
-from omnid.engine.telemetry import StageStats
+from omnid.engine.telemetry import Histogram, StageStats
 from omnid.errors import OmnidError
 
 START_S: Final = 30.0  # of the process, beyond the time in which the motor controller may boot
 END_S: Final = LONGEST_RAMP_S + 2.0
 RECEIVE_S: Final = 0.5
 PROCESS: Final = "omnid.controller.process"
+
+
+class ControllerStatistics:
+    """The newest state, and histograms of lateness and latency."""
+
+    def __init__(self, stats: StageStats) -> None:
+        """stats: the counters of the tick, among those of the stages; busy from one report to the next."""
+        self.state = ControllerState()
+        self.states: Stream[ControllerState] = Stream()  # of each tick
+        self.wheels: Stream[WheelSample] = Stream()  # as the motor controller reports them
+        self.to_wheel = Histogram()
+        self.lateness = Histogram()
+        self._stats = stats
+
+    def add(self, tick: TickReport) -> None:
+        """Add the report of one tick."""
+        self.state = tick.state
+        self.states.push(tick.state)
+        if tick.wheels is not None:
+            self.wheels.push(tick.wheels)
+        self.lateness.add(tick.late_s)
+        if math.isfinite(tick.to_wheel_s):
+            self.to_wheel.add(tick.to_wheel_s)
+        self._stats.wall.add(tick.work_s)
+        self._stats.processed += 1
+        self._stats.dropped = tick.state.missed
+        self._stats.busy_since_ns = time.monotonic_ns()
+
+    def close(self) -> None:
+        """Note that no more reports come."""
+        self._stats.busy_since_ns = 0
 
 
 class DriveLink(Protocol):

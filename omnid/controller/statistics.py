@@ -1,9 +1,8 @@
-"""Reports of the controller's ticks, and the statistics that the daemon keeps of them."""
+"""State of the controller, and the reports of its ticks."""
 
 from __future__ import annotations
 
 import math
-import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -16,8 +15,6 @@ from omnid.core.control.collision_monitor import remedy
 from omnid.core.control.motion_monitor import ADVICE, COMPARED, DISAGREEMENTS, WITNESSES, Witness
 from omnid.core.control.safety_rules import ENDS, IDLE
 from omnid.core.control.trust import MOTION_DOUBTFUL
-from omnid.engine.graph import Stream
-from omnid.engine.telemetry import Histogram, StageStats
 
 UNTIL_ARMED: Final = "they stay stopped until cmd/arm (`omnid arm`)"
 ARMED: Final = "armed by cmd/arm"
@@ -105,34 +102,3 @@ class TickReport(NamedTuple):
     to_wheel_s: float
     state: ControllerState
     wheels: WheelSample | None = None  # wheels as the motor controller reports them
-
-
-class ControllerStatistics:
-    """The newest state, and histograms of lateness and latency."""
-
-    def __init__(self, stats: StageStats) -> None:
-        """stats: the counters of the tick, among those of the stages; busy from one report to the next."""
-        self.state = ControllerState()
-        self.states: Stream[ControllerState] = Stream()  # of each tick
-        self.wheels: Stream[WheelSample] = Stream()  # as the motor controller reports them
-        self.to_wheel = Histogram()
-        self.lateness = Histogram()
-        self._stats = stats
-
-    def add(self, tick: TickReport) -> None:
-        """Add the report of one tick."""
-        self.state = tick.state
-        self.states.push(tick.state)
-        if tick.wheels is not None:
-            self.wheels.push(tick.wheels)
-        self.lateness.add(tick.late_s)
-        if math.isfinite(tick.to_wheel_s):
-            self.to_wheel.add(tick.to_wheel_s)
-        self._stats.wall.add(tick.work_s)
-        self._stats.processed += 1
-        self._stats.dropped = tick.state.missed
-        self._stats.busy_since_ns = time.monotonic_ns()
-
-    def close(self) -> None:
-        """Note that no more reports come."""
-        self._stats.busy_since_ns = 0

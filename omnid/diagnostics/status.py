@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 
 from drivers.cameras.camera_state import CameraState
 from drivers.frame import Camera
-from omnid.controller.statistics import ControllerStatistics
+from omnid.controller.link import ControllerStatistics
 from omnid.core.control.collision_monitor import remedy
 from omnid.core.control.safety_rules import NOT_ARMED
 from omnid.core.nanoseconds import S_PER_NS

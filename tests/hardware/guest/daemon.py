@@ -77,6 +77,8 @@ tick_s = 5.0
 [live]
 status_s = 2.0
 cloud_s = 0.0
+[obstacles]
+enabled = false
 [record]
 enabled = true
 free_mb = 10

@@ -9,7 +9,7 @@ from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
 from drivers.motors.protocols.differential_drive import DifferentialDrive
 from omnid.controller.controller import Controller
-from omnid.controller.statistics import ControllerStatistics
+from omnid.controller.link import ControllerStatistics
 from omnid.core.control.arming import AUTOMATIC, ArmRequest
 from omnid.core.control.command_sources import OPERATOR, TimedSetpoint
 from omnid.core.control.control_law import ControllerPose, ControllerSettings

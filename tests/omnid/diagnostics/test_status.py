@@ -19,7 +19,7 @@ from drivers.motor import MotorStatus, VelocityCommand
 from omnid.camera_config import PairConfig
 from omnid.config import Config
 from omnid.controller.controller import Controller
-from omnid.controller.statistics import ControllerStatistics
+from omnid.controller.link import ControllerStatistics
 from omnid.core.control.arming import ArmRequest
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControllerSettings

@@ -11,8 +11,8 @@ import pytest
 
 from drivers.errors import DriverError
 from drivers.motor import VelocityCommand, stop_command
+from omnid.controller.link import ControllerStatistics
 from omnid.controller.motor_settings import MotorSettings
-from omnid.controller.statistics import ControllerStatistics
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControllerPose
 from omnid.core.control.heading_controller import Setpoint
