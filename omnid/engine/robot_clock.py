@@ -27,6 +27,7 @@ STEP_NS: Final = 1_000_000  # less than two images of a pair are apart
 FOLLOW_NS: Final = NS_PER_S  # time between two offsets that are followed in silence
 KEPT: Final = 64  # offsets that are remembered: stamps of the last minute, whatever the clock does
 END_NS: Final = 2**31 * NS_PER_S  # of the times of ROS, which begin in 1970 and end in 2038
+READINGS: Final = 3  # of both clocks: the one with the least time between them counts, else stamps jump by its error
 
 
 class _Offset(NamedTuple):
@@ -141,8 +142,12 @@ class RobotClock:
 
     def _measured(self) -> tuple[int, int, int]:
         """Return the offset, its largest error, and the time of the measurement [ns]."""
-        before_ns, unix_ns, after_ns = self.monotonic_ns(), self._unix_ns(), self.monotonic_ns()
-        return unix_ns - (before_ns + after_ns) // 2, after_ns - before_ns, after_ns
+        readings = []
+        for _ in range(READINGS):
+            before_ns, unix_ns, after_ns = self.monotonic_ns(), self._unix_ns(), self.monotonic_ns()
+            readings.append((after_ns - before_ns, unix_ns - (before_ns + after_ns) // 2, after_ns))
+        error_ns, offset_ns, now_ns = min(readings)
+        return offset_ns, error_ns, now_ns
 
 
 def log_time() -> RobotClock:
