@@ -23,7 +23,7 @@ EDGE_PX = 4
 INLIER_PX, MIN_SUPPORT = 2.0, 0.6
 # Least part of the circle that lies in the image, because less does not determine the centre.
 MIN_ARC = 0.4
-# Largest distance of the circle's centre from the guess, in parts of the radius: more than the tenth by which a
+# Largest distance of the circle's centre from the guess, as a fraction of the radius: more than the tenth by which a
 # guess may be off.
 MAX_CENTER_SHIFT = 0.25
 # Margin inside the rim and outside the hub, because blur and the last reflections at the edge.

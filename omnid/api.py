@@ -128,7 +128,7 @@ class Odometry:
         """Return the pose at a pair of grey images (H, W) uint8 that were taken at stamp_ns, in ns of any clock.
 
         upper_stamp_ns: of the upper image, in the same clock, where the cameras are not synchronised; the motion in
-        between is then corrected as in a replay. None: both images were exposed at once.
+        between is then corrected as in a replay. None: both images are synchronised.
 
         Of the result: `T_odom_rig` (4, 4) maps points of the rig frame into odom, which is the rig frame of the first
         pair (m); `covariance` (6, 6) of [x y z; rx ry rz] in the axes of the rig (m^2, rad^2); `velocity` (6,) in them;

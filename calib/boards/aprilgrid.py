@@ -30,7 +30,7 @@ TAGS, TAG_BORDER_BITS, TAG_BITS = 587, 2, 6
 TAG_0 = 0xD5D628584
 
 
-# Least perimeter of a tag in parts of the image's larger side, and pixels per bit when it is read: half and 1.5 of
+# Least perimeter of a tag as a fraction of the image's larger side, and pixels per bit when it is read: half and 1.5 of
 # OpenCV's defaults, because tags are small in a mirror image.
 MIN_PERIMETER_PART, PIXELS_PER_BIT = 0.015, 6
 # Tags whose middles are at most this many sides (of the larger one) apart must predict each other's position,

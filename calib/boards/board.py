@@ -228,7 +228,7 @@ def _sides(drawn: Array) -> tuple[Array, Array]:
 
 
 def _moves(uv: Array, half: Array) -> Array:
-    """Return the moves (N, 3, 4) [m] by one step of every mode, of places (N, 2) in parts of half the sides."""
+    """Return the moves (N, 3, 4) [m] by one step of every mode, of places (N, 2) as a fraction of half the sides."""
     moves = np.zeros((len(uv), 3, len(MODE_NAMES)))
     moves[:, 2, :3] = np.column_stack([1 - uv**2, uv[:, :1] * uv[:, 1:]])
     moves[:, :2, 3] = uv * half * (-0.5, 0.5)

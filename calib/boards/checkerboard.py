@@ -99,7 +99,7 @@ def _refined(image: Image, blurred: Grey, placed: Array, board: Board) -> Array:
 def board_score(image: Grey, corners: Array, board: Board) -> float:
     """Return how much corners (N, 2) look like all of a board: 1 at most, about 0 for a part of a larger pattern.
 
-    Steps of grey between neighbouring squares count from -1 to 1 in parts of the median step within the board. The
+    Steps of grey between neighbouring squares count from -1 to 1 as a fraction of the median step within the board. The
     score is their mean within the board and in the ring of squares around its corners, as far as the image shows it,
     minus the largest mean of a side beyond.
     """

@@ -173,7 +173,7 @@ Image = NDArray[np.uint8]
 MAX_ENLARGED_PIXELS = 1_600_000
 # Largest width of one turn of a log-polar strip, and its width in turns, so that boards across its ends are seen whole.
 MAX_STRIP_PX, STRIP_TURNS = 2400, 1.3
-# Inner radius of a log-polar strip, in parts of the image's smaller side.
+# Inner radius of a log-polar strip, as a fraction of the image's smaller side.
 STRIP_INNER_PART = 1 / 16
 
 

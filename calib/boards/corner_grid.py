@@ -21,8 +21,8 @@ Key = TypeVar("Key")
 Grid = dict[Cell, Array]
 # To the neighbours along columns and rows: exact.
 STEPS: tuple[Cell, ...] = ((1, 0), (0, 1), (-1, 0), (0, -1))
-# Half side of the window about a checkerboard's corner, in parts of its square, in which the corner is searched and
-# whose ring describes it: less than a half, otherwise it would reach the next one's.
+# Half side of the window about a checkerboard's corner, as a fraction of its square, in which the corner is searched
+# and whose ring describes it: less than a half, otherwise it would reach the next one's.
 WINDOW_PART = 0.3
 # Least distances in which a corner is searched, and radius of its ring: a smaller one has too few pixels, twelve.
 MIN_SEARCH_PX, MIN_RING_PX = 1.5, 2.0

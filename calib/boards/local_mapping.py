@@ -35,7 +35,7 @@ MAX_AHEAD = 1.1
 MAX_IRREGULARITY, MAX_IRREGULARITY_PX = 0.1, 0.4
 # Largest half side of the window in pixels, because farther grey levels do not depend on the corner's position.
 REACH_PX = 8
-# Width of the window's Gaussian weight in parts of its half side.
+# Width of the window's Gaussian weight as a fraction of its half side.
 WEIGHT_PART = 0.6
 # A last step is a fifth of the accuracy.
 MAX_ITERATIONS, CONVERGED_PX = 4, 2e-3
@@ -203,8 +203,8 @@ def _corner_offsets(grey: Grey, to_image: ToImage, shift: Array, window: float) 
 
 @cache
 def _window_fit(side: int) -> tuple[Array, Array, Array]:
-    """Return the samples (K, 2) of a window in parts of its half side, their weights (K,), and the matrix (6, K) that
-    maps weighted grey levels to the terms of the surface of second order.
+    """Return the samples (K, 2) of a window as a fraction of its half side, their weights (K,), and the matrix (6, K)
+    that maps weighted grey levels to the terms of the surface of second order.
     """
     grid = np.stack(np.meshgrid(*2 * [np.linspace(-1, 1, side)]), axis=-1).reshape(-1, 2)
     weight = np.exp(-(grid**2).sum(axis=1) / (2 * WEIGHT_PART**2))

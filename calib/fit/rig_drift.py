@@ -2,7 +2,7 @@
 
 With a correct rig, both rays to a point and the line through the viewpoints lie in one plane: on one column of the
 panoramas. In the rectified frame, with azimuth a and slopes z / r of the two rays, a rotation w of the upper camera and
-a lateral shift e of the upper viewpoint, in parts of the baseline, move the upper column by
+a lateral shift e of the upper viewpoint, as a fraction of the baseline, move the upper column by
 
     -w_z + slope_upper (w_x cos a + w_y sin a) + (slope_lower - slope_upper) (e_x sin a - e_y cos a)    [rad]
 
@@ -40,7 +40,7 @@ class RigDrift:
     """Rotation and shift of a rig's upper camera to its true pose, in the rectified frame, with covariance."""
 
     turn: Array  # (3,) rotation vector [rad], R_true = exp(turn) R_assumed
-    shift: Array  # (2,) of the upper viewpoint in x, y, in parts of the baseline [rad]
+    shift: Array  # (2,) of the upper viewpoint in x, y, as a fraction of the baseline [rad]
     covariance: Array  # (5, 5) of turn and shift [rad^2]
     residuals: Array  # (N,) angles [rad] between the upper rays and the planes of the lower ones, afterwards
     points: int

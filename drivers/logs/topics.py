@@ -76,11 +76,11 @@ def choose_motion_topics(log: str, topics: Mapping[str, str], wanted: MotionTopi
     # omnid records the wheels of joints as an Odometry.
     of_joints = wanted.joints and (wanted.wheels or JOINT_STATE in topics.values())
     wheels = JOINT_STATE if of_joints else ODOMETRY
-    for kind, name, knob in ((wheels, wanted.wheels, "motion.wheels"), (IMU, wanted.imu, "motion.imu")):
+    for kind, name, setting in ((wheels, wanted.wheels, "motion.wheels"), (IMU, wanted.imu, "motion.imu")):
         if name:
             if topics.get(name) != kind:
                 found = f"holds {topics[name]}" if topics.get(name) else "is not"
-                raise DriverError(f"topic {name!r} {found} in {log}; {knob} must be one of {kind}: {listed(topics)}")
+                raise DriverError(f"topic {name!r} {found} in {log}; {setting} must be one of {kind}: {listed(topics)}")
             chosen.append(name)
         elif name is None:
             found_names = [
@@ -89,7 +89,9 @@ def choose_motion_topics(log: str, topics: Mapping[str, str], wanted: MotionTopi
                 if found == kind and (kind != ODOMETRY or "wheel" in topic.lower())
             ]
             if len(found_names) > 1:
-                warnings.append(f"{log} has several topics of {kind}: {listed(found_names)}; none is used: set {knob}")
+                warnings.append(
+                    f"{log} has several topics of {kind}: {listed(found_names)}; none is used: set {setting}"
+                )
             else:
                 chosen += found_names
     return MotionChoice(frozenset(chosen), "; ".join(warnings))

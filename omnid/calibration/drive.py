@@ -46,8 +46,8 @@ SETTLED = 1e-3
 # Least length of a known distance, so that an error of a centimetre at its ends is negligible. A
 # baseline that would change by more than MAX_SCALE_CHANGE shows a mistake, because a ruler measures it better.
 MIN_DISTANCE_M, MAX_SCALE_CHANGE = 1.0, 0.05
-# Error of the landmarks with the new rig, in parts of that with the old one. Free parameters always lower the error a
-# little, so a smaller gain does not show a better rig.
+# Error of the landmarks with the new rig, as a fraction of that with the old one. Free parameters always lower the
+# error a little, so a smaller gain does not show a better rig.
 SMALL_GAIN = 0.95
 # Distortion terms of omni cameras that are fitted although the file has none: a camera may be tilted below its mirror.
 DISTORTION = ("p1", "p2")

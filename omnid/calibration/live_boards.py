@@ -29,7 +29,7 @@ HOURS: Final = 12  # sectors; hour 12 is the top of the image
 RINGS: Final = 3  # Number of rings of equal width from the hub to the rim.
 NEEDED_PAIRS: Final = 15
 NEEDED_RINGS: Final = 2  # Rings that need boards at half of the hours: boards that both cameras see reach no more.
-# Two positions of a board differ if their corners are this far apart on average, in parts of the rim's radius.
+# Two positions of a board differ if their corners are this far apart on average, as a fraction of the rim's radius.
 NEW_VIEW_PART: Final = 0.06
 STILL_PART: Final = 0.004  # a board that is held still moves less between two images
 MOST_PAIRS: Final = 200

@@ -55,7 +55,7 @@ board:
 --square-mm MM       side of one square
 --tags 6x6           aprilgrid: tags along x and y (Kalibr's tagCols x tagRows)
 --tag-mm MM          aprilgrid: side of one tag (tagSize)
---tag-spacing RATIO  aprilgrid: space between tags in parts of a tag's side, like 0.3 (tagSpacing)
+--tag-spacing RATIO  aprilgrid: space between tags as a fraction of a tag's side, like 0.3 (tagSpacing)
 """
 
 

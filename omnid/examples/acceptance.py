@@ -26,7 +26,7 @@ from omnid.errors import OmnidError
 from omnid.formats.tum import read_tum
 
 STAND_M, STAND_RAD, STAND_S = 0.02, np.radians(2.0), 2.0  # at rest: the robot stays within these for this time
-PLACING_M, ACCEPTED = 0.01, 0.005  # error of placing a robot by eye; accepted error in parts of the way
+PLACING_M, ACCEPTED = 0.01, 0.005  # error of placing a robot by eye; accepted error as a fraction of the way
 
 Array = NDArray[np.float64]
 

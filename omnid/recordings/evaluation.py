@@ -15,7 +15,7 @@ from omnid.formats.tum import Trajectory, parts
 
 Array = NDArray[np.float64]
 ALIGNMENTS: Final = ("origin", "rigid", "scale")
-_LEAST_SPREAD: Final = 1e-3  # second extent of the path, in parts of the first, that determines a rotation
+_LEAST_SPREAD: Final = 1e-3  # second extent of the path, as a fraction of the first, that determines a rotation
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ from omnid.simulation.rendering.sensor import Sensor
 CAMERA_HEIGHT_M: Final = 0.9  # Height of the lower viewpoint over the floor.
 BASELINE_M: Final = 0.2
 IMAGE_PX: Final = 512
-# Radii of the horizon at scale 1 and of the mirror's rim, in parts of the image's width.
+# Radii of the horizon at scale 1 and of the mirror's rim, as a fraction of the image's width.
 HORIZON = 207.5676 / 768
 RIM = 373.0 / 768
 TOPICS = ("/lower/image_raw/compressed", "/upper/image_raw/compressed")

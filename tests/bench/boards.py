@@ -164,7 +164,7 @@ def _stripes(rng: Random, side: int, px_per_m: float) -> Image:
     return (rng.uniform(60, 110) + 90 * (i % 2) + rng.uniform(0, 25) * (j % 2)).astype(np.uint8)
 
 
-# Tolerance of a corner in parts of its square's narrower side, or in pixels; the next edge is half a side away.
+# Tolerance of a corner as a fraction of its square's narrower side, or in pixels; the next edge is half a side away.
 RIGHT_PART, RIGHT_PX = 0.25, 1.0
 # Returns corners (N, 2) [px], NaN if hidden.
 Detect = Callable[[Image, Board], Array | None]

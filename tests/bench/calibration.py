@@ -8,8 +8,8 @@ degrees. Images and logs that are in --folder already are used again. --drives: 
 by a round through a room and tried on the same drive. --bend-mm, --stretch: the board is not as drawn. Wanted: 0.1 % of
 the length on 10 of 10 rigs.
 
-sigmas: errors of lengths and headings of a short drive among walls, in parts of their stated standard deviations. The
-corners are projected by the true mirrors, with normal noise, and fitted as `omnid calibrate rig` does by default.
+sigmas: errors of lengths and headings of a short drive among walls, as a fraction of their stated standard deviations.
+The corners are projected by the true mirrors, with normal noise, and fitted as `omnid calibrate rig` does by default.
 
 check: what `omnid calibrate drive --only check` says of right rigs, whose upper camera is turned by nothing.
 

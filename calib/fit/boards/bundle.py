@@ -52,9 +52,9 @@ from calib.models.wavefront import WAVEFRONT_NAMES
 # Prior of h: two of three mirrors are between 14 and 46 mm, because mirrors are 5 to 20 cm wide. With 15 or 50 mm as
 # its median the lengths of ten rigs change by less than 0.01 %.
 RADIUS_M, RADIUS_LOG_SIGMA = 0.025, 0.6
-# Prior of what the wavefront differs from the mirror's, in parts of h, because there are pixels that are not square by
-# a thousandth (w_a, w_b), a mirror whose own coma is that of a tilt by 0.06 degree (w_x, w_y), a lens that distorts its
-# rim by a thousandth (w_s).
+# Prior of what the wavefront differs from the mirror's, as a fraction of h, because there are pixels that are not
+# square by a thousandth (w_a, w_b), a mirror whose own coma is that of a tilt by 0.06 degree (w_x, w_y), a lens that distorts
+# its rim by a thousandth (w_s).
 DEVIATIONS = np.array([5e-4, 5e-4, 1e-3, 1e-3, 3.5e-4])
 
 

@@ -16,10 +16,10 @@ import numpy as np
 
 from calib.models.camera import Array
 
-# Grid of the fields: nodes along the diameter of the seen part of an image, and the width of each in parts of their
-# distance, because five nodes follow three waves over the azimuth and a turning point over the radius.
+# Grid of the fields: nodes along the diameter of the seen part of an image, and the width of each as a fraction of
+# their distance, because five nodes follow three waves over the azimuth and a turning point over the radius.
 NODES, WIDTH = 5, 1.0
-# Nodes farther from the centre, in parts of the largest radius, are left out, because no corner determines them.
+# Nodes farther from the centre, as a fraction of the largest radius, are left out, because no corner determines them.
 MAX_RADIUS = 1.3
 # Values of tau / sigma over which the posterior is summed: steps of 4 % are fine enough for any ratio.
 RATIOS = np.concatenate([[0.0], np.geomspace(1e-3, 30.0, 240)])

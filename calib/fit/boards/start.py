@@ -29,7 +29,7 @@ from calib.models.ocam import OcamCamera, View
 # The polynomial of a surface without a tip has even powers of rho.
 POWERS = np.array([0, 2, 4])
 
-# Grid search for the centre: start half width in parts of the image.
+# Grid search for the centre: start half width as a fraction of the image.
 SEARCH_PART = 0.16
 # Points per axis of the first round and of the others. Each goes from the best point of the last one half-way to its
 # neighbours, and a tenth farther.
@@ -224,7 +224,7 @@ def _poses_of(
 def _consensus(candidates: Array) -> tuple[Array, Array]:
     """Return the candidate (4, 4) of (K, S, 4, 4) with the most support, and the distances (K, S) of all from it."""
     flat = candidates.reshape(-1, 4, 4)
-    # The distances (K S, K, S) of all from each: angle [rad] plus shift in parts of the length of the translation.
+    # The distances (K S, K, S) of all from each: angle [rad] plus shift as a fraction of the length of the translation.
     R, t = se3.R_of(flat), se3.t_of(flat)
     gaps = se3.rotation_log(np.swapaxes(R, -1, -2) @ R[:, None])
     length = np.maximum(np.linalg.norm(t, axis=-1), np.finfo(float).tiny)[:, None]

@@ -35,7 +35,7 @@ class RigVelocity:
     covariance: Array
 
 
-# Velocity of frames that are exposed at once: it needs no components, because no view depends on it.
+# Velocity of synchronised frames: it needs no components, because no view depends on it.
 NO_VELOCITY = RigVelocity(np.zeros(0), np.zeros((0, 0)))
 
 

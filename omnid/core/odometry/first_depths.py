@@ -19,7 +19,7 @@ none. The lower panorama alone, followed from the keyframe on, decides:
 3. Of the distances that a vehicle can have made, the one with most votes decides the depths. While another one has
    nearly as many, or too few landmarks have moved far enough to vote, the pose is in doubt by the difference of both.
 
-Pairs whose pixels were not exposed at once are left as they are (keyframes.py).
+Pairs that are not synchronised are left as they are (keyframes.py).
 """
 
 from __future__ import annotations

@@ -134,7 +134,7 @@ class _Flow(NamedTuple):
     null: Array  # (N, 2, 7) derivatives by the step's error, and by the lag of the upper camera
     shift: Array  # (N, 2, 3) by a shift and a turn of the raw image
     camera: Indices  # (N,)
-    place: Array  # (N, 2) in parts of the raw image: column, row
+    place: Array  # (N, 2) as a fraction of the raw image: column, row
     px: Array  # (N,) standard deviations
 
 
@@ -234,7 +234,7 @@ class ImageBreaks:
     def _flow(self, last: _View, pair: Pair, T_now: Array, step: Array, lag: float) -> _Flow | None:
         """Return the flows of the last pair's landmarks, None: too few, as most of them are not found.
 
-        lag: standard deviation in parts of a step.
+        lag: standard deviation as a fraction of a step.
         """
         cylinder, baseline_m = self.model.cylinder, self.model.baseline_m
         before, now = (se3.apply(se3.inverse(T), last.points) for T in (last.T_odom_rect, T_now))

@@ -79,7 +79,7 @@ class _Finding(NamedTuple):
     """Comparison of one account with the images, or of wheels with the gyro."""
 
     is_known: bool = False
-    excess: float = 0.0  # difference of the sums in parts of its limit; 1 and more is a fault
+    excess: float = 0.0  # difference of the sums as a fraction of its limit; 1 and more is a fault
     text: str = ""
     difference: Difference = Difference()  # empty where the images are late
     is_late: bool = False  # by more than is allowed

@@ -21,7 +21,7 @@ class StereoFrame:
     seq: int
     lower: PaddedPanorama
     upper: PaddedPanorama
-    # The image, or the function that returns it for a motion during the exposures; None: unknown, or exposed at once.
+    # The image, or the function that returns it for a motion during the exposures; None: unknown, or synchronised.
     disparities: NDArray[np.float32] | Callable[[Exposure | None], NDArray[np.float32]]
     usable: NDArray[np.bool_]  # (H, W) pixels that show the world in both panoramas
     times: PixelTimes = AT_ONCE

@@ -90,7 +90,7 @@ class Matcher:
         """Return the matches of panoramas (H, W) uint8, padded at the seam, among the valid pixels (H, W).
 
         noise_grey: standard deviation of the noise; where it is large, the threshold of the edges follows it.
-        column_shift: of a pair whose images were not exposed at once; the default method searches there.
+        column_shift: of a pair that is not synchronised; the default method searches there.
         """
         m = self._matching
         lower, upper = smooth(lower, m.sigma_px), smooth(upper, m.sigma_px)

@@ -176,7 +176,7 @@ def render_grey(
 
 
 def _surfaces(rectangles: Sequence[Rectangle], T_world_cam: Array, nearest_m: Array) -> Floats:
-    """Return what the caster knows of rectangles (R, 4, 4), in the camera frame; see caster_kernels.
+    """Return what the ray caster knows of rectangles (R, 4, 4), in the camera frame; see caster_kernels.
 
     nearest_m (R,): least distance of each from the origin of any ray.
     """

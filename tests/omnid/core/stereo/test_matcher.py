@@ -124,7 +124,7 @@ def test_finds_two_depths_side_by_side(method: str) -> None:
 
 
 def test_the_search_follows_columns_that_have_moved() -> None:
-    """A pair that was not exposed at once: near points appear aside in the upper panorama, by a known shift."""
+    """A pair that is not synchronised: near points appear aside in the upper panorama, by a known shift."""
     lower, aside_px = texture(21, SHAPE, 1.2), 2.0
     upper = np.roll(turned(lower, aside_px), SHIFT_PX, axis=0)
     expected = ColumnShift(
