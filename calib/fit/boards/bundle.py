@@ -53,8 +53,8 @@ from calib.models.wavefront import WAVEFRONT_NAMES
 # its median the lengths of ten rigs change by less than 0.01 %.
 RADIUS_M, RADIUS_LOG_SIGMA = 0.025, 0.6
 # Prior of what the wavefront differs from the mirror's, as a fraction of h, because there are pixels that are not
-# square by a thousandth (w_a, w_b), a mirror whose own coma is that of a tilt by 0.06 degree (w_x, w_y), a lens that distorts
-# its rim by a thousandth (w_s).
+# square by a thousandth (w_a, w_b), a mirror whose own coma is that of a tilt by 0.06 degree (w_x, w_y), a lens that
+# distorts its rim by a thousandth (w_s).
 DEVIATIONS = np.array([5e-4, 5e-4, 1e-3, 1e-3, 3.5e-4])
 
 
