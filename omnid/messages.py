@@ -18,6 +18,7 @@ from omnid.core.control.motion_monitor import AGREE, Witness
 from omnid.core.mapping.scan_grid import Grid, KeyframeScans
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.navigation.requests import TaughtRoute
+from omnid.core.obstacles.grid import FloorGrid
 from omnid.core.obstacles.moving_tracker import MovingObstacle
 from omnid.core.odometry.earlier_view import EarlierView
 from omnid.core.odometry.exposure_times import Exposure
@@ -202,6 +203,7 @@ class ObstacleRing:
     moving: tuple[MovingObstacle, ...] = ()
     # (360,) the images show nothing to rely on there: a part of them is frozen, dark, saturated or blurred
     unwatched: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(360, bool))
+    grid: FloorGrid | None = None  # the cells around the base; None: the floor or the pose is unknown, or none in view
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -138,7 +138,8 @@ class PairRings:
             np.where(unwatched, none, known)
             for none, known in ((UNKNOWN, ring.ranges_m), (UNKNOWN, ring.sigma_m), (NOT_FREE, ring.free_m))
         )
-        return ObstacleRing(odometry.seq, odometry.stamp_ns, ranges_m, sigma_m, free_m, T_odom_base, moving, unwatched)
+        found = ranges_m, sigma_m, free_m, T_odom_base, moving, unwatched, ring.grid
+        return ObstacleRing(odometry.seq, odometry.stamp_ns, *found)
 
     @property
     def thin_m(self) -> FreeRanges:

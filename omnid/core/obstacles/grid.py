@@ -74,6 +74,34 @@ SPECK_CELLS: Final = 4
 OPEN_SHARE: Final = 0.9  # of the longest range, from which on a direction is open: few pairs show the last cells
 
 
+UNKNOWN, FREE, OCCUPIED = 0, 1, 2  # states of a cell
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FloorGrid:
+    """What is known of the floor around the base, in cells in the axes of odom; row 0 has the lowest y.
+
+    The base is in the cell (REACH_CELLS, REACH_CELLS). Cells move with it, and what comes into the grid is unknown.
+    """
+
+    corner_m: Array  # (2,) outer corner of the first cell in odom, x and y
+    occupied: Floats  # (SIDE, SIDE) probability that something stands, hangs or steps there; NaN: unknown
+    age_s: Floats  # (SIDE, SIDE) since the pair that showed the cell, or floor past it, last; inf: none did
+
+    @property
+    def states(self) -> Bytes:
+        """State of each cell (SIDE, SIDE): OCCUPIED, FREE up to the risk of a free way, else UNKNOWN."""
+        states = np.full(self.occupied.shape, UNKNOWN, np.uint8)
+        states[self.occupied <= GridParameters().risk] = FREE
+        states[self.occupied > 0.5] = OCCUPIED
+        return states
+
+    def at(self, points_m: Array) -> tuple[Indices, Indices]:
+        """Return rows and columns (N,) of the cells of points (N, 2) in odom; outside of 0 to SIDE: not in the grid."""
+        column, row = np.floor((points_m - self.corner_m) / CELL_M).astype(np.intp).T
+        return row, column
+
+
 class GridRing(NamedTuple):
     """Nearest things and free floor around the base, by sectors about its origin from -pi on."""
 
@@ -81,12 +109,13 @@ class GridRing(NamedTuple):
     sigma_m: Floats  # (SECTORS,) of the ranges
     free_m: Floats  # (SECTORS,) up to which the way is free
     arrivals: Arrivals  # of this pair, about the viewpoint
+    grid: FloorGrid | None  # None: no floor is in view
 
 
 def unknown_ring() -> GridRing:
     """Return the ring of a pair that shows no floor."""
     nan = np.full(SECTORS, np.nan, np.float32)
-    return GridRing(nan, nan, np.zeros(SECTORS, np.float32), Arrivals(nan, nan, np.zeros(SECTORS, bool)))
+    return GridRing(nan, nan, np.zeros(SECTORS, np.float32), Arrivals(nan, nan, np.zeros(SECTORS, bool)), None)
 
 
 class ObstacleGrid:
@@ -129,11 +158,13 @@ class ObstacleGrid:
 
     def _forget(self) -> None:
         """Forget everything."""
-        self._empty = np.array([self._p.prior, 0, 0, 0, 0, 0, np.inf], np.float32)
+        self._empty = np.array([self._p.prior, 0, 0, 0, 0, 0, np.inf, np.inf], np.float32)
         self._layers = np.tile(self._empty[:, None, None], (1, SIDE, SIDE))
         # Log-odds of a thing; evidence of the pair before; mean of what single pairs show; whether a cell is known;
-        # views past it; whether the last pair saw floor behind it; time since it was free [s].
-        self.odds, self._before, self._shown, self._known, self._past_views, self._was_past, self._free_s = self._layers
+        # views past it; whether the last pair saw floor behind it; time since it was free [s]; and
+        # since it was seen.
+        self.odds, self._before, self._shown, self._known, self._past_views, *others = self._layers
+        self._was_past, self._free_s, self._age_s = others
         self._cell = None
         self._last: tuple[int, Array] | None = None  # stamp and place [m] of the pair before
         self._carry = 0.0
@@ -174,12 +205,17 @@ class ObstacleGrid:
             watched = observed | past | (states == kernels.MOSTLY_PAST) | (hidden & (self._known > 0))
             self._who_comes(passed_s, watched)
         self._was_past[:] = past
+        self._age_s += np.float32(passed_s)
+        self._age_s[observed | past] = 0
         self._known[flooded > 0] = 0
         # 5. Who has come, and the ring.
         taken = self._taken()
         arrivals = self._arrivals(passed_s, yaw, taken, in_view & (found[kernels.RATIO] > p.comes), flooded)
         self.odds[OWN, OWN], self._known[OWN, OWN], self._shown[OWN, OWN], taken[OWN, OWN] = p.arrival, 1, 0, 0
-        return GridRing(*self._ways(taken, self._in_cells(place_m), yaw), arrivals)
+        assert self._cell is not None
+        cells = np.where(taken > 1, np.float32(np.nan), taken), self._age_s.copy()
+        grid = FloorGrid(CELL_M * (self._cell - REACH_CELLS), *cells)
+        return GridRing(*self._ways(taken, self._in_cells(place_m), yaw), arrivals, grid)
 
     def is_floor(self, T_odom_base: Array, ranges_m: Array, directions: int) -> Flags:
         """Return the bins (N, directions) about the viewpoint, at ranges (N,), whose cells are floor by all pairs."""

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calib import se3
-from omnid.core.obstacles.grid import REACH_CELLS
+from omnid.core.obstacles.grid import FREE, OCCUPIED, REACH_CELLS, UNKNOWN
 from omnid.core.obstacles.settings import RingSettings
 from omnid.messages import ObstacleRing, OdometryUpdate, Panoramas, StereoDepth
 from omnid.stages.geometry import Geometry
@@ -84,6 +84,18 @@ def test_what_is_known_is_known_again_when_odometry_has_found_its_place_again() 
     begun_again = base.ring(pairs[0], resets=1)
     assert begun_again.ranges_m[180] == pytest.approx(0.475, abs=0.03)
     assert ring.ranges_m[270] == pytest.approx(2.0, abs=0.1) and not begun_again.ranges_m[270] < 2.5
+
+
+def test_grid_has_floor_before_a_wall_the_wall_and_nothing_known_behind() -> None:
+    base, x_m = Standing(HEIGHT_M), 0.33
+    for seed in range(6):
+        ring = base.ring(Panoramas(0, 0, *panoramas(stains, 2.0, striped, seed=seed), SHOWN), x_m=x_m)
+    assert ring.grid is not None
+    ahead = ring.grid.at(np.array([[x_m + away_m, 0.0] for away_m in (0.0, 1.5, 2.6)]))
+    assert ring.grid.states[ahead].tolist() == [FREE, FREE, UNKNOWN]
+    row, columns = ring.grid.at(np.array([[x_m + 1.9, 0.0], [x_m + 2.1, 0.0]]))
+    assert (ring.grid.states[row[0], columns[0] : columns[1] + 1] == OCCUPIED).any()
+    assert ring.grid.age_s[ahead][1] == 0.0 and np.isinf(ring.grid.age_s[ahead][2])
 
 
 @pytest.mark.parametrize("height_m", [HEIGHT_M, 0.0])
