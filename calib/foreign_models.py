@@ -1,7 +1,7 @@
-"""Camera models of other programs, as cameras of omnid: one table of their names, exact where there is the same model.
+"""Camera models of other programs as cameras of omnid, by one table of their names; exact where the model exists here.
 
 Kalibr, EuRoC and ROS name a projection and a distortion; OpenCV's many distortion terms (k3 and more) and the fov model
-have no equal here: the nearest camera is fitted over the image, and how far it is off is told.
+have no equal here: the nearest camera is fitted over the image, and its largest error is reported.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ NAMED: Final[Mapping[str, tuple[str, Mapping[str, str]]]] = {
 # A camera that is fitted to another model may be this far off anywhere in the image, a few times the error of a corner.
 MAX_CONVERSION_PX: Final = 0.5
 GRID: Final = 24  # Places along each side of the image at which models are compared.
-# Largest angle from the axis, and number of angles to it, which show a distortion that turns back.
+# Largest angle from the axis, and number of angles up to it, at which a distortion is tested for turning back.
 WIDEST_RAD, RADII = np.deg2rad(85), 2000
 LOST_PX: Final = 100.0  # Error of a ray that a trial camera does not see.
 
@@ -111,7 +111,7 @@ def camera_of_names(
 
 
 def camera_of(model: str, values: Mapping[str, float], size: tuple[int, int], warn: Warn = silent) -> OmniCamera:
-    """Return the camera of a model with named values; `warn` takes a line about one that is fitted."""
+    """Return the camera of a model with named values; `warn` takes a line if the camera had to be fitted."""
     require_image_size("resolution", *size)
     pinhole = {key: float(values[key]) for key in FOCAL}
     plain = {**pinhole, "xi": 0.0, **{key: values[key] for key in RADTAN if key in values}}
@@ -150,7 +150,7 @@ def _opencv_project(m: Array, values: Mapping[str, float]) -> Array:
 def _seen(
     project: Callable[[Array, Mapping[str, float]], Array], values: Mapping[str, float], size: tuple[int, int]
 ) -> tuple[Array, Array]:
-    """Return pixels (N, 2), evenly spread over what a camera sees on its image, and their rays (N, 3)."""
+    """Return pixels (N, 2), evenly spread over the part of the image with rays, and their rays (N, 3)."""
     center = (values["pu"], values["pv"])
     found_pixels, found_rays = list[Array](), list[Array]()
     for azimuth in np.linspace(0, 2 * np.pi, 2 * GRID, endpoint=False):
@@ -170,7 +170,7 @@ def _seen(
 
 
 def _nearest(name: str, start: OmniCamera, rays: tuple[Array, Array], warn: Warn) -> OmniCamera:
-    """Return the camera near a start that projects rays (N, 3) to pixels (N, 2) best; CalibError if none does well."""
+    """Fit a camera to rays (N, 3) and pixels (N, 2), from a start; CalibError if the largest error is too large."""
     pixels, directions = rays
     if len(pixels) < GRID:
         raise CalibError(f"{name}: it sees too little of its image: calibrate with pinhole-equi or ds")

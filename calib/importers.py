@@ -8,8 +8,8 @@
 - Stitched images of two 360-degree cameras: by their baseline, or of the data set Helvipad (Zayene et al. 2025), whose
   images are the rows 192 to 703 of stitched images of 1920x960, and whose calibration.json has `stereo_baseline` [cm].
 
-Programs write one thing in several ways. So keys count in any case, numbers in a list, in rows, as text or as a matrix
-of OpenCV, and a table within tables of one entry as that table.
+Programs write the same thing in several ways. Keys are therefore compared without regard to case; numbers may stand in
+a list, in rows, in a text or in a matrix of OpenCV; a table that only wraps one other table is unwrapped.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ HELVIPAD_SIZE, HELVIPAD_TOP_PX = (1920, 512), 192
 
 # 1. What tables state.
 def load_table(data: str | bytes, name: str) -> Table:
-    """Return the table of a file of another program, without those around it that have one entry."""
+    """Parse a file of another program; tables that only wrap one other table are unwrapped."""
     values = load_mapping(data, name)
     while len(values) == 1:
         ((key, inner),) = values.items()
@@ -96,13 +96,13 @@ def is_one_camera(values: Table) -> bool:
 
 
 def _value(values: Table, *keys: str) -> Any:
-    """Return what the first of several keys has, in any case; None without them."""
+    """Return the value of the first of these keys that is present (any case), None if none is."""
     known = {key.lower(): value for key, value in values.items()}
     return next((known[key.lower()] for key in keys if known.get(key.lower()) is not None), None)
 
 
 def _numbers(values: Table, keys: tuple[str, ...], counts: Sequence[int] = ()) -> Array:
-    """Return the finite numbers (N,) of several keys that mean the same; counts: how many there may be, () any."""
+    """Return the finite numbers (N,) under one of several equivalent keys; counts: permitted values of N, (): any."""
     value = _value(values, *keys)
     try:
         found = np.array([] if value is None else value, float).ravel()
@@ -124,7 +124,7 @@ def _size(values: Table) -> tuple[int, int]:
 
 
 def _transform(values: Table, key: str, place: str = "", warn: Warn = silent) -> Array | None:
-    """Return the transform (4, 4) of a key of 12 or 16 numbers, None without it; place: before the key in messages."""
+    """Return the transform (4, 4) under a key with 12 or 16 numbers, None without it; place: prefix of messages."""
     if _value(values, key) is None:
         return None
     numbers = _numbers(values, (key,), (12, 16))
@@ -132,7 +132,7 @@ def _transform(values: Table, key: str, place: str = "", warn: Warn = silent) ->
 
 
 def _stated(values: Table, key: str, place: str, warn: Warn) -> Array | None:
-    """Return the transform of a key of INVERSES, from its own key or that of its inverse; None without both."""
+    """Return the transform that a key of INVERSES names, from that key or its inverse's; None without both."""
     with within(f"{place}." if place else ""):
         own, other = (
             _transform(values, name, warn=lambda line: warn(f"{place}.{line}")) for name in (key, INVERSES[key])
@@ -146,7 +146,7 @@ def _stated(values: Table, key: str, place: str, warn: Warn) -> Array | None:
 
 
 def _require_consistency(camera: str, one: Array, other: Array, keys: tuple[str, str]) -> None:
-    """Raise CalibError for transforms that differ, and say so where one is the inverse of the other."""
+    """Raise CalibError for transforms that differ; the message names the case that one is the inverse of the other."""
     gaps = [se3.log(se3.inverse(one) @ T) for T in (other, se3.inverse(other))]
     (distance_m, angle_rad), inverted = (np.linalg.norm(gap.reshape(2, -1), axis=1) for gap in gaps)
     if distance_m <= MAX_DISAGREEMENT_M and angle_rad <= MAX_DISAGREEMENT_RAD:
@@ -160,7 +160,7 @@ def _require_consistency(camera: str, one: Array, other: Array, keys: tuple[str,
 
 
 def _model(values: Table, warn: Warn) -> OmniCamera:
-    """Return the camera of a table of any program. Errors begin with the key that is wrong."""
+    """Return the camera that a table of any program describes; errors begin with the key that is wrong."""
     # 1. Models whose numbers have names: those of basalt, and of camodocal, as VINS-Mono and VINS-Fusion use it.
     if "camera_type" in values:
         numbers = {key: float(value) for key, value in values["intrinsics"].items()}
@@ -287,7 +287,7 @@ def _basalt_cameras(values: Table) -> dict[str, Table]:
 
 
 def _chain_model(key: str, camera: Table, warn: Warn) -> OmniCamera:
-    """Return a camera of a chain; errors begin with its name."""
+    """Return one camera of a chain; errors begin with the name of that camera."""
     try:
         return _model(camera, lambda line: warn(f"{key}: {line}"))
     except (CalibError, ValueError, TypeError) as error:
@@ -296,7 +296,7 @@ def _chain_model(key: str, camera: Table, warn: Warn) -> OmniCamera:
 
 
 def _chain_poses(cameras: Mapping[str, Table], warn: Warn) -> tuple[dict[str, Array], bool]:
-    """Return transforms from one common frame into each camera; True if that frame is the rig's, False if cam0's."""
+    """Return T_cam_common of each camera; True if the common frame is the rig's, False if it is cam0's."""
     own = {key: _stated(camera, "T_cam_imu", key, warn) for key, camera in cameras.items()}
     poses = {key: T for key, T in own.items() if T is not None}
     has_rig_frame = bool(poses)
@@ -316,7 +316,7 @@ def _chain_poses(cameras: Mapping[str, Table], warn: Warn) -> tuple[dict[str, Ar
 
 
 def _named_cameras(names: Sequence[str], named: tuple[str, str]) -> tuple[str, str] | None:
-    """Return the names of the lower and the upper camera as they are given, None without any."""
+    """Return the names of the lower and the upper camera that the user gave, None if none was given."""
     for name in filter(None, named):
         if name not in names:
             raise CalibError(f"there is no camera {name}, found {', '.join(names)}")
@@ -332,7 +332,7 @@ def _named_cameras(names: Sequence[str], named: tuple[str, str]) -> tuple[str, s
 
 
 def _by_topics(topics: Mapping[str, str]) -> tuple[str, str]:
-    """Return the names of the lower and the upper of two cameras by words of their topics; empty ones: undecided."""
+    """Return the names of the lower and the upper camera by words in their topics; two empty names: undecided."""
     words = [set(re.split(r"[^a-z]+", topic.lower())) for topic in topics.values()]
     first, second = (bool(found & LOWER_WORDS) - bool(found & UPPER_WORDS) for found in words)
     one, other = topics
@@ -342,8 +342,9 @@ def _by_topics(topics: Mapping[str, str]) -> tuple[str, str]:
 def _by_height(
     cameras: Mapping[str, Table], poses: Mapping[str, Array], warn: Warn, *, has_rig_frame: bool
 ) -> tuple[str, str]:
-    """Return the names of the lower and the upper of two cameras by height in the rig frame, or by what is below in
-    their images.
+    """Return the names of the lower and the upper camera by their heights in the rig frame.
+
+    Without a rig frame the order counts in which the lower part of their images lies below.
     """
     one, other = cameras
     orders = [(one, other), (other, one)] if len(poses) == 2 else []
@@ -372,7 +373,7 @@ def import_pair(
 ) -> Rig:
     """Read the rig of two files of one camera each; its frame is the lower viewpoint's, see rig_between.
 
-    T_lower_upper: None if the files tell it.
+    T_lower_upper: None if the files state the transform.
     """
     (lower, T_body_lower), (upper, T_body_upper) = (read_camera(path, view, warn) for path in (lower_path, upper_path))
     if T_lower_upper is None and T_body_lower is not None and T_body_upper is not None:
@@ -389,9 +390,9 @@ def import_pair(
 
 
 def read_camera(path: Path, view: View = "mirror", warn: Warn = silent) -> tuple[OmniCamera, Array | None]:
-    """Read the file of one camera, of any of these programs, told by its content, and where the camera is.
+    """Read a file of one camera; its content shows which program wrote it. Return the camera and its pose.
 
-    view: of OCamCalib's. T_body_cam, or T_stereo_cam of a rectified pair; None where the file does not tell.
+    view: for files of OCamCalib. The pose is T_body_cam, or T_stereo_cam of a rectified pair; None if it is not stated.
     """
     data, name = read_bytes(path, MAX_JSON_BYTES), str(path)
     is_named = path.suffix.lower() in (".yaml", ".yml", ".json", ".xml")
@@ -459,14 +460,14 @@ def parse_ocam(text: str | bytes, view: View = "mirror", name: str = "calib_resu
 
 
 def _word_lines(text: str | bytes, name: str) -> list[tuple[int, list[str]]]:
-    """Return number and words of each line that has some, without commas and comments (#, MATLAB's %, C's //)."""
+    """Return number and words of each line with words; commas and comments (#, MATLAB's %, C's //) are removed."""
     lines = enumerate(decode(text, name).splitlines(), 1)
     found = [(number, re.split(r"[#%]|//", line, maxsplit=1)[0].replace(",", " ").split()) for number, line in lines]
     return [(number, words) for number, words in found if words]
 
 
 def _number(word: str) -> float:
-    """Return the number of a word, whose exponent may be Fortran's d; ValueError for others."""
+    """Return the number of a word; its exponent may be written with Fortran's d. ValueError for other words."""
     return float(re.sub(r"(?<=[\d.])[dD](?=[-+\d])", "e", word))
 
 

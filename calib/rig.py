@@ -19,7 +19,7 @@ from calib.models.names import sees_directly, visible_part
 
 # Rotation [rad] and direction of the baseline [rad], in the rectified frame; length of the baseline [m].
 TRANSFORM_NAMES = ("r_x", "r_y", "r_z", "e_x", "e_y", "baseline")
-# Larger sigmas say nothing of any parameter, and their products overflow.
+# Larger sigmas carry no information about any parameter, and their products overflow.
 MAX_SIGMA = 1e6
 # Correlations are rounded, so that their text is exact; a matrix may be negative by the rounding.
 CORRELATION_DECIMALS, MIN_EIGENVALUE = 12, -1e-9
@@ -81,10 +81,10 @@ class RigCovariance:
 
 MIN_BASELINE_M = 1e-3  # because viewpoints that are closer would show no depth
 MAX_BASELINE_M = 5.0  # of two cameras on one robot, because a number beyond it has another unit
-# A T_base_rig with the cameras on the floor states no height: as the identity, which it is where none was measured.
+# A T_base_rig that puts the cameras on the floor states no height; the identity, used without a measurement, does so.
 LEAST_HEIGHT_M = 0.1
 MAX_HEIGHT_M = 10.0  # Of cameras on a robot: a number beyond it is refused, because it has another unit.
-# Numbers beyond these are refused, because they are in ms and us.
+# Larger numbers are refused: they are probably in ms and us.
 MAX_UPPER_DELAY_S, MAX_LINE_TIME_S = 1.0, 1e-3
 
 
@@ -118,7 +118,7 @@ class MountedCamera:
 
     @property
     def visible(self) -> Mask:
-        """Return the mask; if none is known, the whole image of a lens, and the largest disc in that of a mirror."""
+        """Return the measured mask, else the whole image of a lens, or the largest disc in a mirror's image."""
         return self.mask if self.mask is not None else visible_part(self.camera)
 
 
@@ -126,7 +126,7 @@ class MountedCamera:
 class Rig:
     """The lower and the upper camera; T_base_rig is the rig's pose on the robot; covariance None if unknown.
 
-    The base frame is at the floor, unless its user says otherwise; the identity: the pose on the robot is not stated.
+    The base frame lies on the floor unless the user defines it otherwise. T_base_rig = identity: pose not stated.
     """
 
     lower: MountedCamera
@@ -206,16 +206,16 @@ class Rig:
         return se3.transform(R, -R @ self.lower.viewpoint)
 
 
-# Sine and cosine of the largest lean of what is below in an image from the baseline, 45 degrees, because that is
-# half-way to a camera that lies on its side.
+# Sine and cosine of 45 degrees, half-way to a camera that lies on its side: the largest angle between the baseline and
+# the vertical axis of an image.
 MAX_LEAN = np.sqrt(0.5)
 
 
 def rig_between(lower: OmniCamera, upper: OmniCamera, T_lower_upper: Array, topics: tuple[str, str] = ("", "")) -> Rig:
     """Return the rig with its frame at the lower viewpoint: z to the upper one, x ahead (REP 103).
 
-    Ahead is the part across z of the mean optical axis, if the cameras look to the side. Of cameras that look along z,
-    as mirrors and fisheyes that see all around, x is the lower image's u axis.
+    For cameras that look to the side, x is the component of the mean optical axis perpendicular to z. For cameras that
+    look along z, such as mirrors and fisheyes that see all around, x is the lower image's u axis.
     """
     baseline = float(np.linalg.norm(se3.t_of(T_lower_upper)))
     if not baseline >= MIN_BASELINE_M:
@@ -236,8 +236,8 @@ def rig_between(lower: OmniCamera, upper: OmniCamera, T_lower_upper: Array, topi
 def is_turned_over(rig: Rig) -> bool:
     """True if the upper viewpoint lies below the lower one, unless the cameras are mounted upside down.
 
-    A camera below its mirror sees itself below it, and below its horizon an upright camera that looks ahead sees the
-    lower part of its image. A lens that looks along the baseline may look up or down: False.
+    A camera below its mirror sees itself below the mirror. An upright camera that looks ahead has what is below its
+    horizon in the lower part of its image. A lens that looks along the baseline may look up or down: False.
     """
     camera, z = rig.lower.camera, rig.lower.T_cam_rig[:3, 2]
     below = image_axis(camera, (0.0, 1.0)) if sees_directly(camera) else optical_axis(camera)

@@ -1,8 +1,8 @@
-"""The rig as text: `rig.toml`, schema 1, strict. Rotations are restored exactly, translations to a picometre.
+"""Read and write `rig.toml`, schema 1, strictly. Rotations are restored exactly, translations to a picometre.
 
 Transforms are stored as T_rig_lower and T_rig_upper (p_rig = T_rig_lower @ p_lower): the poses of the cameras. The
-optional table [covariance] has a version of its own: see rig.py. The optional table [times] has the times of
-exposure that `omnid calibrate drive` found: upper_delay_s, line_time_s. The table [refined], which earlier versions of
+optional table [covariance] has its own version: see rig.py. The optional table [times] holds the exposure times
+that `omnid calibrate drive` found: upper_delay_s, line_time_s. The table [refined], which earlier versions of
 omnid wrote, is ignored.
 """
 

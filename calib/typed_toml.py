@@ -1,4 +1,4 @@
-"""Settings files, rig files and world files: tables of TOML as dataclasses or structs whose fields state their ranges.
+"""TOML tables of settings, rigs and worlds as dataclasses or structs; their fields state types and ranges.
 
     @dataclass(frozen=True, slots=True)
     class Stereo:
@@ -6,11 +6,11 @@
 
     stereo = convert(Stereo, table_of(b"window_px = 9"))
 
-msgspec checks every value, in `convert` only: a constructor takes any. An error is one line that names the dotted path
-of what is wrong.
+Values are checked in `convert` by msgspec; a constructor checks nothing. An error is one line that names the dotted
+path of the wrong key.
 
-A rig or a configuration may come from a log of unknown origin. So the text is bounded before tomllib reads it, whose
-memory grows with the square of the depth; images of masks, which are embedded in rigs, do not count.
+A rig or a configuration may come from a log of unknown origin, and the memory that tomllib needs grows with the square
+of the nesting depth. The text is therefore bounded before it is parsed; embedded mask images do not count.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ _UNCOUNTED: Final = re.compile(r"""["']data:image/png;base64,[^"']*+["']|^[ \t]*
 
 
 def bytes_of(path: str | PathLike[str], most: int) -> bytes:
-    """Return the content of a file of at most so many bytes. Raise ValueError for any other."""
+    """Return the content of a file of at most `most` bytes; raise ValueError for larger or unreadable files."""
     try:
         with open(path, "rb") as file:
             data = file.read(most + 1)
@@ -82,7 +82,7 @@ def parse_toml(text: str) -> dict[str, Any]:
 
 
 def table_of(data: bytes) -> dict[str, Any]:
-    """Return the table of TOML bytes. Raise ValueError for any others."""
+    """Return the table of TOML bytes; raise ValueError for bytes that are no TOML in UTF-8."""
     try:
         return parse_toml(data.decode())
     except UnicodeDecodeError as error:
@@ -92,9 +92,9 @@ def table_of(data: bytes) -> dict[str, Any]:
 
 
 def convert(root: type[T], table: dict[str, Any], path: Path = ()) -> T:
-    """Return the struct of a table. Raise ValueError for an unknown or missing key and for an unfit value.
+    """Return the struct of a table; raise ValueError for an unknown or missing key and for a value out of its range.
 
-    path: of the table within its file.
+    path: the position of the table within its file, for messages.
     """
     unknown, wrong = list[tuple[Any, Path]](), list[str]()
     found = _converted(root, table, path, unknown, wrong)
@@ -107,7 +107,7 @@ def convert(root: type[T], table: dict[str, Any], path: Path = ()) -> T:
 
 
 def _converted(kind: Any, value: Any, path: Path, unknown: list[tuple[Any, Path]], wrong: list[str]) -> Any:
-    """Return the value of a type; add what is wrong in it, and section and path of keys that no section has."""
+    """Convert a value to a type; collect errors in `wrong`, and section and path of unknown keys in `unknown`."""
     bare, _ = _bounded(kind)
     element = get_args(bare)[0] if get_origin(bare) is tuple else None
     # 1. A section, key by key.
@@ -185,7 +185,7 @@ types_of: Callable[[Any], dict[str, Any]] = cache(_types_of)
 
 
 def _unless_absent(kind: Any) -> Any:
-    """Return the type of a value that is there, for a key that may be absent (X | None)."""
+    """Return X for the type X | None of an optional key, any other type as it is."""
     present = [part for part in get_args(kind) if part is not NoneType]
     return present[0] if get_origin(kind) in (Union, UnionType) and len(present) == 1 else kind
 
@@ -200,9 +200,7 @@ def key_paths(section: Any, path: Path = ()) -> Iterator[Path]:
 
 
 def unknown_key(root: Any, section: Any, path: Path) -> ValueError:
-    """Return the error for a key that its section does not have; it proposes what a section's REMOVED names for it, or
-    a key with a similar name.
-    """
+    """Return the error for an unknown key. It names the replacement of a removed key, or a key with a similar name."""
     if instead := getattr(section, "REMOVED", {}).get(path[-1]):
         return ValueError(f"{dotted(path)} was removed: {instead}")
     neighbours = [(*path[:-1], name) for name in types_of(section)]

@@ -1,4 +1,4 @@
-"""What files state about cameras: texts and their encodings, YAML and JSON, sizes of images, rigid transforms.
+"""Checked values of calibration files: texts and their encodings, YAML and JSON, image sizes, rigid transforms.
 
 YAML of unknown origin is bounded: it is short, and has no anchors.
 """
@@ -26,7 +26,7 @@ from calib.typed_toml import bytes_of, shown
 MAX_FILE_BYTES = 16_000_000
 MAX_SIDE_PX = 32767  # because OpenCV's remap takes no larger images
 MAX_PIXELS = 64 * 2**20  # because a mask of one byte a pixel must fit the memory
-# A rotation typed with few digits is made orthonormal, so that one that a program wrote is not changed.
+# A rotation within this of an orthonormal one is used as a program wrote it; others are made orthonormal.
 ORTHONORMAL_TOLERANCE = 1e-9
 # Numbers of a rotation that are typed with three digits are this far off the nearest one; more are no rotation. Below
 # the second bound, 0.001 degree, nothing is said.
@@ -41,7 +41,7 @@ def read_bytes(path: str | PathLike[str], limit: int = MAX_FILE_BYTES) -> bytes:
 
 
 def require_image_size(key: str, width: float, height: float) -> None:
-    """Raise CalibError unless images of this size [px] are supported; key: what states it."""
+    """Raise CalibError unless images of this size [px] are supported; key: names the value in the message."""
     whole = (width, height) == (int(width), int(height)) if np.isfinite([width, height]).all() else False
     if not (whole and min(width, height) >= 1 and max(width, height) <= MAX_SIDE_PX and width * height <= MAX_PIXELS):
         raise CalibError(
@@ -55,9 +55,9 @@ def silent(line: str) -> None:
 
 
 def transform_of(rows: Sequence[Sequence[float]] | None, key: str, warn: Warn = silent) -> Array:
-    """Return the rigid transform (4, 4) of the finite numbers under a key, with the nearest rotation.
+    """Return the rigid transform (4, 4) with the rotation that is nearest to the numbers under a key.
 
-    `warn` takes a line about numbers that were typed with few digits.
+    `warn` takes a line if the numbers have few digits.
     """
     if rows is None or [len(row) for row in rows] != [4, 4, 4, 4]:
         raise CalibError(f"{key}: expected 4 rows of 4 numbers, found {'nothing' if rows is None else shown(rows)}")
@@ -148,7 +148,7 @@ def _yaml(text: str) -> Any:
 
 
 def _with_rows(value: Any) -> Any:
-    """Return a value in which each mapping of rows, cols and data is a list of rows."""
+    """Replace each mapping with rows, cols and data within a value by a list of rows."""
     if isinstance(value, list):
         return [_with_rows(one) for one in value]
     if not isinstance(value, Mapping):

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-# Newton steps that invert a distortion: mild ones take 3 to 5, strong ones 10. Points whose error is then more than
-# this part of their size, a millionth of what a corner errs by, have no ray.
+# Newton steps that invert a distortion: mild ones take 3 to 5, strong ones 10. Points whose relative error is larger
+# than CONVERGED_PART after them have no ray; a millionth of the error of a corner is allowed.
 NEWTON_STEPS, CONVERGED_PART = 12, 1e-9
 
 
@@ -62,13 +62,13 @@ class Mask:
 
 
 def inscribed_mask(camera: OmniCamera) -> Mask:
-    """Return the largest disc about the camera's axis that lies in its image: the mask if none is known."""
+    """Return the largest disc about the camera's axis within its image: the default mask of a mirror camera."""
     (u, v), (width, height) = camera.center, camera.size
     return Mask((u, v), 0.0, max(0.0, min(u, v, width - 1 - u, height - 1 - v)))
 
 
 def whole_image(camera: OmniCamera) -> Mask:
-    """Return the disc about the camera's axis that holds its image: the mask of a lens if none is known."""
+    """Return the smallest disc about the camera's axis that contains its image: the default mask of a lens."""
     (u, v), (width, height) = camera.center, camera.size
     return Mask((u, v), 0.0, float(np.hypot(max(u, width - 1 - u), max(v, height - 1 - v))) + 1.0)
 

@@ -1,7 +1,7 @@
 """Models of cameras without a mirror: double sphere, extended unified, equidistant, and equirectangular images.
 
-A lens sees the world directly, and nothing is flipped. What belongs to mirrors does not apply to it: a hub in the
-middle of the image, and aberrations of a reflected wavefront.
+A lens sees the world directly, and its image is not flipped. It has no hub in the middle of the image and no
+aberrations of a reflected wavefront, as mirrors have.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ SEAM_PX = 1e-3
 
 
 class _Lens:
-    """What all models have: focal lengths (fu, fv) [px], centre (pu, pv) [px], size."""
+    """Common part of all lens models: focal lengths (fu, fv) [px], centre (pu, pv) [px], size."""
 
     __slots__ = ()
     focal: tuple[float, float]
@@ -51,7 +51,7 @@ class _Lens:
 
 
 class _Spheres(_Lens):
-    """What the double sphere and the extended unified model have in common: parameters xi, alpha, beta.
+    """Common part of the double sphere and the extended unified model, with the parameters xi, alpha, beta.
 
     With z' = xi |p| + z and d = sqrt(beta (x^2 + y^2) + z'^2) the image is (x, y) / (alpha d + (1 - alpha) z').
     """

@@ -1,4 +1,4 @@
-"""Camera models by their names, and their parameters by name: as files state them and as fits change them."""
+"""Camera models and their parameters by name, as files state them and as fits change them."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from calib.models.unified import DISTORTION_NAMES, UnifiedCamera
 from calib.models.wavefront import WAVEFRONT_NAMES
 
 _PLANE: Final = {"focal": ("fu", "fv"), "center": ("pu", "pv")}
-# By model: its class, and the names of the numbers of each field, in the order of files. The polynomial of an ocam
-# camera, a0, a1 ..., comes before these.
+# For each model: its class, and for each field the names of its numbers, in the order of files. The polynomial of an
+# ocam camera (a0, a1 ...) comes before them.
 MODELS: Final[Mapping[str, tuple[type[Any], Mapping[str, tuple[str, ...]]]]] = MappingProxyType(
     {
         "omni": (UnifiedCamera, {"xi": ("xi",), **_PLANE, "distortion": DISTORTION_NAMES}),
@@ -37,7 +37,7 @@ MODELS: Final[Mapping[str, tuple[type[Any], Mapping[str, tuple[str, ...]]]]] = M
         "equirectangular": (EquirectangularCamera, _PLANE),
     }
 )
-# Fields whose numbers are 0 where none are given.
+# Fields whose numbers are 0 by default.
 OPTIONAL: Final = ("distortion", "coefficients", "tangential", "astigmatism", "wavefront")
 
 
@@ -70,7 +70,7 @@ def camera_of(
     view: View = "mirror",
     distance_m: float = DISTANCE_M,
 ) -> OmniCamera:
-    """Return the camera of a model with these parameters; those of distortions and of real mirrors may be missing.
+    """Return the camera of a model with these parameters; the fields in OPTIONAL may be missing.
 
     size (width, height) [px]; view and distance_m: of an ocam camera. Raise CalibError for values of no camera, and
     KeyError for a missing one.
@@ -89,7 +89,7 @@ def camera_of(
 
 
 def changed(camera: OmniCamera, changes: Mapping[str, float]) -> OmniCamera:
-    """Return the camera after changes of named parameters; CalibError for a name or a result of no such camera.
+    """Return the camera with parameters changed by these amounts; CalibError for an unknown name or an invalid result.
 
     d of an ocam camera moves d and e alike, because their difference is a rotation of the camera.
     """
@@ -111,12 +111,12 @@ def is_coefficient(name: str) -> bool:
 
 
 def model_in_words(camera: OmniCamera) -> str:
-    """Return the name of a camera's model, and the view of one that may be a mirror's or a lens's."""
+    """Return the name of a camera's model, for ocam cameras with their view."""
     return f"ocam, {camera.view} view" if isinstance(camera, OcamCamera) else model_name(camera)
 
 
 def sees_directly(camera: OmniCamera) -> bool:
-    """True for a camera without a mirror, of whichever model: its image has no hub and need not have a rim."""
+    """True for a camera without a mirror: its image has no hub and need not have a rim."""
     if isinstance(camera, OcamCamera):
         return camera.view == "direct"
     if isinstance(camera, UnifiedCamera):
