@@ -52,15 +52,15 @@ COMMANDS: Final[Mapping[str, Entry]] = MappingProxyType(
         "route finish": Entry("robot:finish", "end the recording and write the route and the map"),
         "route repeat": Entry("robot:repeat", "drive a route, from where the robot is on it"),
         "route stop": Entry("robot:end_route", "end the repetition, or the recording without a file"),
-        "route list": Entry("robot:list_routes", "the routes in navigation.routes, here"),
-        "route show": Entry("robot:show_route", "length, map and points of a route"),
-        "route delete": Entry("robot:delete_route", "delete a route"),
+        "route list": Entry("routes:list_routes", "the routes in navigation.routes, here"),
+        "route show": Entry("routes:show_route", "length, map and points of a route"),
+        "route delete": Entry("routes:delete_route", "delete a route"),
         "listen": Entry("tools:listen", "show pose, state, rates and latencies of a robot"),
         "view": Entry("view", "show a recording or a robot: path, map, images, plots (needs rerun)"),
         "web": Entry("tools:web", "a page with state, path, warnings, stop and arm"),
         "batch": Entry("batch", "replay many logs; goes on where it was interrupted (extra `fleet`)"),
         "record": Entry("daemon:record", "record both cameras to MCAP files until Ctrl-C"),
-        "report": Entry("tools:report", "one HTML page about a recording: path, events, statistics"),
+        "report": Entry("view:report", "one HTML page about a recording: path, events, statistics"),
         "log info": Entry("log:info", "topics, types, counts, times, attachments, and whether the log is whole"),
         "map build": Entry("map:build", "build a map from logs, of one drive or of several in the same place"),
         "map show": Entry("map:show", "keyframes, sessions, loops, size, and the rig that made the map; plan and grid"),
@@ -82,53 +82,6 @@ GROUPS: Final[Mapping[str, str]] = MappingProxyType(
         "motor": "test the wiring of the motors: sides, directions, scale",
     }
 )
-# Commands that earlier versions had, and options as "COMMAND|COMMAND --OPTION|--OPTION" -> what to use instead.
-_REMOVED: Final = {
-    "accept": "`python -m omnid.examples.acceptance LOG DISTANCE_M` judges a drive between two marks",
-    "batch --dask": "--scheduler ADDRESS",
-    "calibrate board": "print docs/board.pdf (6x7 corners, squares of 25 mm); others: https://calib.io or Kalibr",
-    "calibrate camera": "`omnid calibrate rig` fits both cameras",
-    "calibrate check": "`omnid calibrate drive LOG --only check`; -o FILE stands for --refine -o FILE",
-    "calibrate export": "calibrate with that program, and `omnid calibrate import` its file",
-    "calibrate height": "`omnid calibrate drive LOG --only height`",
-    "calibrate mask": "`omnid calibrate drive LOG --only mask`",
-    "calibrate live|calibrate rig --dictionary": "boards are checkerboards (--corners) or Kalibr's AprilTag grids "
-    "(--tags)",
-    "calibrate rig --lower-area|--upper-area": "omnid is for two cameras: split the images into lower_*.png and "
-    "upper_*.png",
-    "calibrate rig --lower-camera|--upper-camera|--refine-cameras": "`omnid calibrate rig` fits both cameras",
-    "calibrate rig --mask": "`omnid calibrate drive LOG --only mask`, of a log in which the robot turns once",
-    "calibrate rig --model": "one fit with priors holds all terms: leave it out",
-    "config migrate": "`omnid config check FILE` names each setting that this version does not know",
-    "diff": "`cmp` compares files, `omnid eval` and `evo_traj` trajectories",
-    "eval --score": "KITTI's drift: `evo_rpe`; the score of Hilti 2026 is 100 exp(-0.46 ate_rmse_m)",
-    "install-service --root": "install in the system itself, for example in a chroot or a container of that folder",
-    "listen --all": "one program a robot, with --robot NAME; many robots: Grafana on /metrics of `omnid web`",
-    "listen --load": "`top -H` on the robot names its threads",
-    "listen --mcap": "record.enabled on the robot, or `ros2 bag record` with bus.ros2",
-    "listen --tum": "`omnid replay --tum` of the robot's recording; live: `omnid.client.subscribe` (docs/api.md)",
-    "log recover": "omnid reads cut logs as they are; for other programs: `mcap recover`",
-    "map align": "a map keeps the axes of its first drive; nav2 takes the offset to a plan as a transform",
-    "map build --dask|--jobs": "each log is replayed in the map of those before",
-    "map build|replay|run|simulate --tags": "`apriltag_ros`, or the package `pupil-apriltags`, finds AprilTags",
-    "map info": "`omnid map show FILE.omap`",
-    "map merge": "`omnid map build LOG ... -o FILE.omap --extend` adds the logs of one map to the other",
-    "map tags": "`apriltag_ros`, or the package `pupil-apriltags`, finds AprilTags",
-    "motor test --write": "the lines that it prints belong into the section [motor.drive] of the configuration",
-    "simulate --speed": "simulated time waits for the daemon, and is never faster than real time",
-    "view --lower|--rig|--upper": "`omnid replay LOG --rig rig.toml --rerun FILE.rrd` draws a log of images",
-    "view --port|--web": "-o FILE.rrd, which `rerun --serve-web FILE.rrd` shows in a browser",
-    "view --quiet": "nothing: `omnid view` shows no progress",
-    "view --replay": "`omnid replay LOG --rerun FILE.rrd`",
-    "web --all": "one page for each robot, with --robot NAME and --listen HOST:PORT, in tabs of one browser",
-    "web --recordings": "the page lists no recordings; `omnid report LOG` writes the same report",
-}
-REMOVED: Final[Mapping[str, str]] = {
-    f"{name} --{option}" if option else name: instead
-    for names, instead in _REMOVED.items()
-    for name in names.partition(" --")[0].split("|")
-    for option in names.partition(" --")[2].split("|--")
-}
 WRONG_INPUT = 2
 # What argparse says of a word that is not among the choices; Python 3.12 and later do not quote them.
 _CHOICE = re.compile(r"argument (?P<name>.*): invalid choice: '(?P<found>.*)' \(choose from (?P<all>.*)\)", re.DOTALL)
@@ -176,7 +129,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not words and not _completes():
         parser_of(words).print_help()
         return 0
-    _refuse_removed(words)
     return _guarded(parser_of(words).parse_args(words))
 
 
@@ -203,16 +155,6 @@ def limit_blas_threads() -> None:
     `OPENBLAS_NUM_THREADS=2 python -m tests.bench.daemon`.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-
-def _refuse_removed(words: Sequence[str]) -> None:
-    """End the program where the words name a command or an option that earlier versions had."""
-    leading = _leading(words)
-    options = ["", *(f" {word.partition('=')[0]}" for word in words if word.startswith("--"))]
-    for name in [f"{' '.join(leading[:depth])}{option}" for option in options for depth in (1, 2)]:
-        if name in REMOVED:
-            print(f"omnid: `omnid {name}` was removed: {REMOVED[name]}", file=sys.stderr)
-            raise SystemExit(WRONG_INPUT)
 
 
 def _leading(words: Sequence[str]) -> list[str]:

@@ -5,15 +5,19 @@ from __future__ import annotations
 import argparse
 import sys
 from contextlib import closing
-from typing import TYPE_CHECKING
 
+from calib.rig import Rig
 from calib.rig_file import read_rig, write_rig
+from omnid.calibration.drive import calibrate_drive
+from omnid.calibration.from_log import calibrate_height, calibrate_mask
+from omnid.calibration.images import decoded_pairs, open_log
+from omnid.calibration.rig_check import check_log, with_upper_corrected
 from omnid.commands.options import HEIGHT, LOG_CAMERAS, command, height_of, log_cameras
+from omnid.core.rig.column_finding import RigState
+from omnid.engine.kernel_cache import prepare_kernels
 from omnid.errors import OmnidError
+from omnid.runs.session import attached_rig
 from omnid.sinks.files import check_outputs
-
-if TYPE_CHECKING:
-    from calib.rig import Rig
 
 
 @command(LOG_CAMERAS, HEIGHT)
@@ -40,8 +44,6 @@ def run(args: argparse.Namespace) -> int:
       calibrate drive drive.mcap --only check
       calibrate drive drive.mcap --only height --ruler-m 0.92 --rig rig.toml -o rig.toml
     """
-    from omnid.engine.kernel_cache import prepare_kernels
-
     _check(args)
     start, is_lossy = _start(args)
     prepare_kernels()
@@ -79,9 +81,6 @@ def _check(args: argparse.Namespace) -> None:
 
 def _start(args: argparse.Namespace) -> tuple[Rig, bool]:
     """Return the rig to start from, and whether many images of a log make no pair; print the faults of the logs."""
-    from omnid.calibration.images import decoded_pairs, open_log
-    from omnid.runs.session import attached_rig
-
     start, is_lossy = None if args.rig is None else read_rig(args.rig), False
     for log in args.logs:
         with closing(open_log(log, log_cameras(args), start)) as reader:
@@ -96,8 +95,6 @@ def _start(args: argparse.Namespace) -> tuple[Rig, bool]:
 
 def _adjusted(args: argparse.Namespace, rig: Rig) -> Rig:
     """Return the rig that fits the drives best; the same one if none fits them better."""
-    from omnid.calibration.drive import calibrate_drive
-
     found = calibrate_drive(args.logs, rig, log_cameras(args), lambda line: print(line, file=sys.stderr))
     print("\n".join(found.lines()))
     if not found.is_better and not args.distance_m:
@@ -120,9 +117,6 @@ def _adjusted(args: argparse.Namespace, rig: Rig) -> Rig:
 
 def _checked(args: argparse.Namespace, rig: Rig) -> tuple[Rig, bool]:
     """Return the rig, with its upper camera's pose corrected if it is to be written, and whether it had drifted."""
-    from omnid.calibration.rig_check import check_log, with_upper_corrected
-    from omnid.core.rig.column_finding import RigState
-
     found, pairs = check_log(args.logs[0], rig, log_cameras(args))
     print(found)
     if args.output is not None:
@@ -136,8 +130,6 @@ def _at_height(args: argparse.Namespace, rig: Rig) -> tuple[Rig, str]:
 
     Without --only, a height that the rig states is kept, and a floor that is not seen is no error.
     """
-    from omnid.calibration.from_log import calibrate_height
-
     if args.height_m is not None:
         return rig.at_height(args.height_m), ""
     is_wanted = args.ruler_m is not None or "height" in args.only
@@ -162,8 +154,6 @@ def _at_height(args: argparse.Namespace, rig: Rig) -> tuple[Rig, str]:
 
 def _masked(args: argparse.Namespace, rig: Rig) -> Rig:
     """Return the rig whose masks hide what is fixed to its cameras. A log without a turn is no error but for --only."""
-    from omnid.calibration.from_log import calibrate_mask
-
     if args.only and "mask" not in args.only:
         return rig
     try:

@@ -5,25 +5,42 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
+from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from importlib.resources import as_file, files
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import cv2
+import numpy as np
+
+from calib import se3
+from calib.rig import Rig
+from calib.rig_file import read_rig, rig_toml
+from calib.se2_arrays import transform
+from drivers.cameras.log_camera import LogCamera, LogClock, LogImages, LogMotion
+from drivers.frame import Camera
+from drivers.logs.log_reader import LogReader
 from omnid.commands.options import MAP, QUIET, SETTINGS, VERBOSE, command, device_opener, make_folder, settings_of
+from omnid.commands.replay import Output, replay_and_print
+from omnid.config import Config, unused_settings
+from omnid.controller.motor import SIMULATED
+from omnid.engine.kernel_cache import prepare_kernels
+from omnid.engine.logging_setup import HANDLER, log
 from omnid.errors import OmnidError
-
-if TYPE_CHECKING:  # the help and other commands do not load these
-    from collections.abc import Callable, Mapping
-
-    from calib.rig import Rig
-    from drivers.cameras.log_camera import LogCamera
-    from drivers.frame import Camera
-    from drivers.motors.simulated.simulated_base import Pose
-    from omnid.config import Config
-    from omnid.runs.live import LiveRobot, LiveRun
+from omnid.formats.tum import read_tum
+from omnid.navigation_state import NavigationState
+from omnid.recordings.evaluation import evaluate
+from omnid.runs.live import ConnectedRobot, LiveRobot, LiveRun
+from omnid.runs.record import record as record_frames
+from omnid.runs.replay import ReplayOptions
+from omnid.runs.session import attached_rig, motion_topics
+from omnid.simulation import demonstration, lockstep
+from omnid.simulation.paced_robot import PacedRobot
+from omnid.simulation.robot import make_robot
+from omnid.simulation.world_file import WorldOptions, load_world
+from omnid.sinks.files import check_outputs, write_trajectory
 
 
 @command(MAP, SETTINGS)
@@ -46,8 +63,6 @@ def run(args: argparse.Namespace) -> int:
       run --log drive.mcap --rig rig.toml --motor simulated
       run --lower /dev/video0 --upper /dev/video2 --rig rig.toml
     """
-    from omnid.runs.live import ConnectedRobot
-
     devices = {"cameras.lower": args.lower, "cameras.upper": args.upper}
     config = _settings(args, devices if args.log is None else {})
     if args.log is None:
@@ -59,9 +74,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _settings(args: argparse.Namespace, more: Mapping[str, object] | None = None) -> Config:
     """Return the settings of a live run; warn of those that it does not use."""
-    from omnid.config import unused_settings
-    from omnid.engine.logging_setup import log
-
     config = settings_of(args, more)
     for warning in unused_settings(config, "run", args.set):
         log(logging.WARNING, warning)
@@ -70,20 +82,11 @@ def _settings(args: argparse.Namespace, more: Mapping[str, object] | None = None
 
 def _live_run(config: Config, robot: LiveRobot, rig: Rig | None = None) -> LiveRun:
     """Return a live run that reports on stderr."""
-    from omnid.engine.logging_setup import HANDLER, log
-    from omnid.runs.live import LiveRun
-
     return LiveRun(config, robot, log, rig, HANDLER.show if sys.stderr.isatty() else None)
 
 
 def _run_log(args: argparse.Namespace, config: Config) -> int:
     """Run on the images of a log, and on its wheels and gyro: no others fit these images."""
-    from drivers.cameras.log_camera import LogCamera, LogClock, LogImages, LogMotion
-    from drivers.logs.log_reader import LogReader
-    from omnid.engine.logging_setup import log
-    from omnid.runs.live import ConnectedRobot
-    from omnid.runs.session import attached_rig, motion_topics
-
     images = LogImages.load(args.log, args.lower, args.upper, motion_topics(config), config.cameras.bits)
     for warning in images.warnings:
         log(logging.WARNING, warning)
@@ -125,14 +128,6 @@ def simulate(args: argparse.Namespace) -> int:
       simulate room
       simulate corridor --light 0.5 --map corridor.omap --set bus.robot=rover
     """
-    from calib.rig_file import read_rig
-    from omnid.controller.motor import SIMULATED
-    from omnid.engine.logging_setup import log
-    from omnid.simulation.paced_robot import PacedRobot
-    from omnid.simulation.robot import make_robot
-    from omnid.simulation.world_file import WorldOptions, load_world
-    from omnid.sinks.files import check_outputs
-
     check_outputs([("--truth", args.truth)] if args.truth else [], [])
     config = _settings(args)
     # 1. Run in the world.
@@ -145,24 +140,12 @@ def simulate(args: argparse.Namespace) -> int:
     run = _live_run(config, paced, paced.rig)
     code = run.run()
     # 2. Write the truth, and report contacts.
-    if args.truth:
-        _write_truth(args.truth, paced.truth, run.clock.unix_ns)
+    if args.truth:  # the poses of the base since the first one, with the stamps of the poses on the bus
+        T = np.array([transform(pose) for pose in paced.truth.values()]).reshape(-1, 4, 4)
+        stamps_ns = np.array([run.clock.unix_ns(stamp_ns) for stamp_ns in paced.truth], np.int64)
+        write_trajectory(args.truth, stamps_ns, se3.inverse(T[:1]) @ T)
     log(logging.INFO, f"contacts with obstacles: {paced.contacts}")
     return code
-
-
-def _write_truth(path: Path, truth: dict[int, Pose], unix_ns: Callable[[int], int]) -> None:
-    """Write the true poses of the base since the first one, with the stamps of the poses on the bus."""
-    import numpy as np
-
-    from calib import se3
-    from omnid.sinks.files import write_trajectory
-
-    poses = np.array(list(truth.values())).reshape(-1, 3)
-    zero = np.zeros(len(poses))
-    R = se3.rotation_exp(np.column_stack([zero, zero, poses[:, 2]]))
-    T = se3.transform(R, np.column_stack([poses[:, :2], zero]))
-    write_trajectory(path, np.array([unix_ns(stamp_ns) for stamp_ns in truth], np.int64), se3.inverse(T[:1]) @ T)
 
 
 DRIVE_S = 90.0  # Longest drive in simulated time.
@@ -182,11 +165,6 @@ def demo(args: argparse.Namespace) -> int:
       demo --drive
       demo --output /tmp/demo --quiet
     """
-    from omnid.commands.replay import Output, replay_and_print
-    from omnid.formats.tum import read_tum
-    from omnid.recordings.evaluation import evaluate
-    from omnid.runs.replay import ReplayOptions
-
     make_folder("--output", args.output)
     if args.drive:
         return _drive(args)
@@ -213,16 +191,6 @@ def demo(args: argparse.Namespace) -> int:
 
 def _drive(args: argparse.Namespace) -> int:
     """Drive a simulated robot; print the errors against the truth, and draw both paths."""
-    import cv2
-    import numpy as np
-
-    from omnid.engine.kernel_cache import prepare_kernels
-    from omnid.navigation_state import NavigationState
-    from omnid.simulation.demonstration import TeachAndRepeat, both_paths, cross_track_m, draw, drift_m, seen_obstacles
-    from omnid.simulation.lockstep import simulate
-    from omnid.simulation.robot import make_robot
-    from omnid.simulation.world_file import load_world
-
     place_map, routes, image = (args.output / name for name in ("demo.omap", "routes", "drive.png"))
     config = settings_of(args, {"places.map": place_map, "navigation.routes": routes})
     place_map.unlink(missing_ok=True)  # of an earlier demonstration
@@ -230,16 +198,16 @@ def _drive(args: argparse.Namespace) -> int:
     prepare_kernels()  # which says so where it takes long
     if not args.quiet:
         print("a simulated robot is taught an oval and repeats it, in its own\ntime: a minute or two", flush=True)
-    script = TeachAndRepeat(lambda line: None if args.quiet else print(line, flush=True))
-    run = simulate(world, robot, script, seconds=DRIVE_S, seed=args.seed, config=config)
-    first, second = both_paths(run, script.repeated_s)
-    if not cv2.imwrite(str(image), draw(world, seen_obstacles(run), first, second)):
+    script = demonstration.TeachAndRepeat(lambda line: None if args.quiet else print(line, flush=True))
+    run = lockstep.simulate(world, robot, script, seconds=DRIVE_S, seed=args.seed, config=config)
+    first, second = demonstration.both_paths(run, script.repeated_s)
+    if not cv2.imwrite(str(image), demonstration.draw(world, demonstration.seen_obstacles(run), first, second)):
         raise OmnidError(f"{image}: cannot be written; name another folder by --output")
     end = script.end or f"not reached within {DRIVE_S:g} s"
     print(f"end       {end}, contacts with obstacles: {len(run.contacts)}")
-    print(f"pose      {100 * drift_m(run):.1f} cm off at the end")
+    print(f"pose      {100 * demonstration.drift_m(run):.1f} cm off at the end")
     if len(second):
-        off_cm = 100 * cross_track_m(first, second)
+        off_cm = 100 * demonstration.cross_track_m(first, second)
         print(f"repeated  {np.percentile(off_cm, 95):.1f} cm off the taught path (95 %), {off_cm.max():.1f} at most")
     print(f"written   {image}, {place_map}")
     return 0 if script.end == NavigationState.REACHED else 1
@@ -258,10 +226,6 @@ def record(args: argparse.Namespace) -> int:
       record recordings/ --rig rig.toml
       record boards/ --lower /dev/video0 --upper /dev/video2
     """
-    from calib.rig_file import read_rig, rig_toml
-    from omnid.engine.logging_setup import log
-    from omnid.runs.record import record
-
     config = settings_of(args)
     path, rig = Path(config.cameras.rig), ""
     if args.rig is not None or path.exists():
@@ -270,5 +234,5 @@ def record(args: argparse.Namespace) -> int:
         log(logging.WARNING, f"no rig is attached because {path} does not exist: `omnid replay` will need --rig")
     open_camera = device_opener(config)
     with closing(open_camera("lower")) as lower, closing(open_camera("upper")) as upper:
-        state = record({"lower": lower, "upper": upper}, config, rig, log).state
+        state = record_frames({"lower": lower, "upper": upper}, config, rig, log).state
     return 0 if state.messages > state.lost + state.refused else 1

@@ -8,18 +8,23 @@ from collections.abc import Generator, Iterator
 from contextlib import closing
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from calib.atomic_file import write_file
+from calib.rig_file import png
+from drivers.cameras.v4l2_camera import V4l2Camera
+from drivers.cameras.v4l2_device import RULES_FILE, capture_devices, udev_rules
+from drivers.frame import CAMERAS as SIDES
+from drivers.frame import Camera, Frame, gray
+from drivers.logs.log_reader import LogReader
+from drivers.motors.protocols.protocol_registry import motor_protocol
+from omnid.calibration import snapshot
 from omnid.commands.options import CAMERAS, JSON, SETTINGS, command, make_folder, print_json, settings_of
 from omnid.commands.tools import require_packages
+from omnid.config import Config
+from omnid.doctor import checks
+from omnid.doctor.wheel_wiring import tested_drive
 from omnid.errors import OmnidError
-
-if TYPE_CHECKING:  # the help and other commands do not load these
-    from drivers.frame import Camera, Frame
-    from omnid.calibration.snapshot import CameraView
-    from omnid.config import Config
-    from omnid.doctor.checks import Finding
-
+from omnid.service import install
 
 ROOT = Path("/")  # folder of sys, dev and proc
 BYTES_PER_PIXEL = 0.3  # upper bound for a JPEG of a textured image
@@ -32,9 +37,7 @@ def doctor(args: argparse.Namespace) -> int:
     examples:
       doctor --config /etc/omnid/omnid.toml
     """
-    from omnid.doctor.checks import summary
-
-    found: list[Finding] = []
+    found: list[checks.Finding] = []
     for finding in examine(settings_of(args)):
         if not args.json:
             print(finding, flush=True)
@@ -42,15 +45,12 @@ def doctor(args: argparse.Namespace) -> int:
     if args.json:
         print_json(found)
     else:
-        print(summary(found))
+        print(checks.summary(found))
     return int(any(finding.level == "error" for finding in found))
 
 
-def examine(config: Config) -> Iterator[Finding]:
+def examine(config: Config) -> Iterator[checks.Finding]:
     """Return the findings of all checks, the quick ones first."""
-    from drivers.cameras.v4l2_device import capture_devices
-    from omnid.doctor import checks
-
     camera, wanted = config.cameras, config.realtime
     named = {name: camera.settings(name) for name in ("lower", "upper")}
     yield from checks.cameras(named, capture_devices(ROOT), ROOT)
@@ -91,8 +91,6 @@ def show_cameras(args: argparse.Namespace) -> int:
     for name in ("log", "lower", "upper"):
         if getattr(args, name) is not None:
             raise OmnidError(f"--{name} belongs to --snapshot DIR: name the folder for the images as well")
-    from drivers.cameras.v4l2_device import RULES_FILE, capture_devices, udev_rules
-
     devices = capture_devices(ROOT)
     if not devices:
         print(
@@ -112,24 +110,18 @@ def show_cameras(args: argparse.Namespace) -> int:
 
 
 def _snapshot(args: argparse.Namespace) -> int:
-    from calib.atomic_file import write_file
-    from calib.rig_file import png
-    from drivers.frame import CAMERAS as SIDES
-    from drivers.frame import gray
-    from omnid.calibration.snapshot import IMAGES, annotated, described, view_of, warnings
-
     make_folder("--snapshot", args.snapshot)
-    views: dict[str, CameraView] = {}
+    views: dict[str, snapshot.CameraView] = {}
     for camera in SIDES:
         with closing(_frames(args, camera)) as frames:
-            found = [gray(frame) for frame in islice(frames, IMAGES)]
+            found = [gray(frame) for frame in islice(frames, snapshot.IMAGES)]
         if not found:
             raise OmnidError(f"the {camera} camera gave no image: check its cable, and see `omnid doctor`")
-        views[camera] = view = view_of(found)
+        views[camera] = view = snapshot.view_of(found)
         path = args.snapshot / f"{camera}.png"
-        write_file(path, png(annotated(view)))
-        print(f"{path}: {described(view)}")
-    problems = list(warnings(views))
+        write_file(path, png(snapshot.annotated(view)))
+        print(f"{path}: {snapshot.described(view)}")
+    problems = list(snapshot.warnings(views))
     for problem in problems:
         print(f"omnid: {problem}", file=sys.stderr)
     return int(bool(problems))
@@ -137,9 +129,6 @@ def _snapshot(args: argparse.Namespace) -> int:
 
 def _frames(args: argparse.Namespace, camera: Camera) -> Generator[Frame, None, None]:
     """Yield a camera's frames of a log, or of the device once its exposure has adapted, until it gives none in time."""
-    from drivers.cameras.v4l2_camera import V4l2Camera
-    from drivers.logs.log_reader import LogReader
-
     config = settings_of(args)
     if args.log is not None:
         bits, rate_hz = config.cameras.bits, config.log.rate_hz
@@ -170,9 +159,6 @@ def test_motor(args: argparse.Namespace) -> int:
       motor test --motor /dev/omnid/motor --config /etc/omnid/omnid.toml
       motor test --motor simulated --set motor.protocol=roboteq
     """
-    from drivers.motors.protocols.protocol_registry import motor_protocol
-    from omnid.doctor.wheel_wiring import tested_drive
-
     config = settings_of(args).motor
     if not config.port:
         raise OmnidError("no motor controller is configured: name its port by --motor, or set motor.port")
@@ -210,8 +196,6 @@ def install_service(args: argparse.Namespace) -> int:
       install-service --dry-run
       install-service --page
     """
-    from omnid.service import install
-
     if args.page:
         require_packages()
     program = Path(sys.prefix) / "bin" / "omnid"

@@ -28,12 +28,13 @@ import math
 import re
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, is_dataclass
-from enum import Enum
+from dataclasses import dataclass
 from functools import partial
 from inspect import cleandoc
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TextIO, TypeAlias
+
+import msgspec
 
 from omnid.errors import OmnidError
 
@@ -282,20 +283,10 @@ def print_entries(entries: Mapping[str, object]) -> None:
 
 def print_json(value: object, stream: TextIO | None = None) -> None:
     """Print dataclasses, mappings, sequences and numbers; a number that is not finite becomes null."""
-    print(json.dumps(_plain(value), indent=2, allow_nan=False), file=stream or sys.stdout)
+    text = msgspec.json.format(msgspec.json.encode(value, enc_hook=_of_json), indent=2).decode()
+    print(text, file=stream or sys.stdout)
 
 
-def _plain(value: Any) -> Any:
-    if is_dataclass(value) and not isinstance(value, type):
-        return _plain(asdict(value))
-    if hasattr(value, "_asdict"):  # a NamedTuple
-        return _plain(value._asdict())
-    if isinstance(value, Mapping):
-        return {str(key): _plain(inner) for key, inner in value.items()}
-    if isinstance(value, tuple | list):
-        return [_plain(inner) for inner in value]
-    if isinstance(value, float):
-        return float(value) if math.isfinite(value) else None
-    if isinstance(value, Enum):
-        return value.value
-    return str(value) if isinstance(value, Path) else value
+def _of_json(value: object) -> object:
+    """Return what JSON has for a mapping that is no dict, and for a path."""
+    return dict(value) if isinstance(value, Mapping) else str(value)

@@ -129,7 +129,7 @@ def _print_result(result: RunResult, options: ReplayOptions, output: Output, *, 
         print_json(
             {
                 "counters": result.counters,
-                "timings": dict(result.timings),
+                "timings": {stage: row._asdict() for stage, row in result.timings.items()},
                 "warnings": result.warnings,
                 "signal": result.signal,
                 "elapsed_s": result.elapsed_s,

@@ -1,22 +1,19 @@
-"""Commands to a robot over the bus: `omnid arm`, `stop`, `drive`, `goto`, `route`; its routes on this computer."""
+"""Commands to a robot over the bus: `omnid arm`, `stop`, `drive`, `goto`, `route`."""
 
 from __future__ import annotations
 
 import argparse
 import math
-import sys
 from collections.abc import Callable
-from datetime import UTC, datetime
-from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-from omnid.commands.options import JSON, ROBOT, SETTINGS, command, print_entries, print_json, settings_of
+from omnid.client import Answer, Driver
+from omnid.commands.options import ROBOT, SETTINGS, command, settings_of
+from omnid.core.navigation.requests import route_name
 from omnid.errors import OmnidError
-
-if TYPE_CHECKING:  # the help and other commands do not load these
-    from omnid.client import Answer, Driver
-    from omnid.core.navigation.route import Route
-    from omnid.formats.route_file import RouteFolder
+from omnid.monitor import navigation
+from omnid.monitor.navigation import connected, drive_to_end, granted, record_until_enter
+from omnid.monitor.teleop import teleoperate
 
 NAME: Final = "name NAME  letters, digits, '-' and '_'"
 NO_WAIT: Final = "--no-wait  end as soon as the robot has accepted it"
@@ -30,8 +27,6 @@ def arm(args: argparse.Namespace) -> int:
       arm
       arm --robot rover --connect tcp/robot:7447
     """
-    from omnid.monitor.navigation import connected
-
     with connected(settings_of(args).bus) as robot:
         answer = robot.driver().arm()
     print(f"{robot.name} is {answer.text}" if answer.done else f"{robot.name} refuses: {answer.text}")
@@ -46,10 +41,8 @@ def stop(args: argparse.Namespace) -> int:
       stop
       stop --robot rover --connect tcp/robot:7447
     """
-    from omnid.monitor.navigation import stop as stop_robot
-
     bus = settings_of(args).bus
-    if stop_robot(bus):
+    if navigation.stop(bus):
         print(f"{bus.robot} stops: its wheels stay stopped until `omnid arm`")
         return 0
     print(f"{bus.robot} has not confirmed the stop: use the emergency stop if it drives")
@@ -67,8 +60,6 @@ def drive(args: argparse.Namespace) -> int:
       drive
       drive --robot rover --connect tcp/robot:7447
     """
-    from omnid.monitor.teleop import teleoperate
-
     return teleoperate(settings_of(args).bus)
 
 
@@ -114,9 +105,6 @@ def teach(args: argparse.Namespace) -> int:
       route teach morning
       route teach morning --replace
     """
-    from omnid.core.navigation.requests import route_name
-    from omnid.monitor.navigation import connected, granted, record_until_enter
-
     name = route_name(args.name)
     with connected(settings_of(args).bus) as robot:
         granted(robot, robot.driver().route(f"teach {name} replace" if args.replace else f"teach {name}"))
@@ -139,8 +127,6 @@ def repeat(args: argparse.Namespace) -> int:
       route repeat morning
       route repeat morning --reverse --loops 5 --no-wait
     """
-    from omnid.core.navigation.requests import route_name
-
     words = ["repeat", route_name(args.name), *(["reverse"] if args.reverse else [])]
     text = " ".join([*words, f"loops={args.loops}", f"from={vars(args)['from']}"])
     return _drive(args, lambda driver: driver.route(text))
@@ -166,83 +152,8 @@ def end_route(args: argparse.Namespace) -> int:
     return ask(args, lambda driver: driver.route("stop"))
 
 
-@command(SETTINGS, JSON)
-def list_routes(args: argparse.Namespace) -> int:
-    """List the routes in navigation.routes, here; exit code 2: a file is damaged.
-
-    examples:
-      route list
-      route list --json
-    """
-    folder, code, found = _folder(args), 0, []
-    for name in folder.names():
-        try:
-            found.append(folder.read(name))
-        except OmnidError as error:
-            print(f"omnid: {error}", file=sys.stderr)
-            code = 2
-    if args.json:
-        print_json([_summary(route) for route in found])
-    elif not found and not code:
-        print(f"no routes in {folder.folder}: teach one (`omnid route teach NAME`)")
-    else:
-        for route in found:
-            print(f"{route.name:<20} {route.length_m:8.1f} m  {_time(route)}  {route.map_name}")
-    return code
-
-
-@command(NAME, SETTINGS, JSON)
-def show_route(args: argparse.Namespace) -> int:
-    """Print length, map and points of a route.
-
-    --tum FILE  write its poses in the TUM format
-
-    examples:
-      route show morning --tum morning.txt
-    """
-    import numpy as np
-
-    from calib.se2_arrays import transform
-    from omnid.sinks.files import check_outputs, write_trajectory
-
-    folder = _folder(args)
-    route = folder.read(args.name)
-    if args.tum:
-        check_outputs([("--tum", args.tum)], [("the route that is read", folder.path(args.name))])
-        # A route has speeds and no times. Where the robot nearly stood, 0.1 m/s keeps the times finite.
-        steps_m = np.hypot(*np.diff(route.poses[:, :2], axis=0).T)
-        times_s = np.concatenate([[0.0], np.cumsum(steps_m / np.maximum(np.abs(route.speeds[1:]), 0.1))])
-        write_trajectory(
-            args.tum, np.round(times_s * 1e9).astype(np.int64), np.array([transform(pose) for pose in route.poses])
-        )
-    summary = _summary(route)
-    if args.json:
-        rows = zip(route.poses.tolist(), route.speeds.tolist(), strict=True)
-        print_json({**summary, "points": [[*pose, speed] for pose, speed in rows]})
-        return 0
-    (x, y, _), (end_x, end_y, _) = route.poses[0], route.poses[-1]
-    summary |= {"length_m": round(route.length_m, 2), "taught": _time(route)}
-    summary["from, to"] = f"{x:.2f} {y:.2f}, {end_x:.2f} {end_y:.2f} m in the map"
-    print_entries(summary | {"created_s": ""})
-    return 0
-
-
-@command(NAME, SETTINGS)
-def delete_route(args: argparse.Namespace) -> int:
-    """Delete a route.
-
-    examples:
-      route delete morning
-    """
-    _folder(args).delete(args.name)
-    print(f"deleted: {args.name}")
-    return 0
-
-
 def ask(args: argparse.Namespace, *requests: Callable[[Driver], Answer]) -> int:
     """Send requests to the robot, one after the other, and print the last answer. Raise OmnidError with a refusal."""
-    from omnid.monitor.navigation import connected, granted
-
     with connected(settings_of(args).bus) as robot:
         driver = robot.driver()
         answers = [granted(robot, request(driver)) for request in requests]
@@ -252,34 +163,9 @@ def ask(args: argparse.Namespace, *requests: Callable[[Driver], Answer]) -> int:
 
 def _drive(args: argparse.Namespace, request: Callable[[Driver], Answer]) -> int:
     """Ask for a drive and show it until its end, or with --no-wait until the robot has accepted it."""
-    from omnid.monitor.navigation import connected, drive_to_end, granted
-
     with connected(settings_of(args).bus) as robot:
         driver = robot.driver()
         if not args.no_wait:
             return drive_to_end(robot, driver, lambda: request(driver))
         granted(robot, request(driver))
         return 0
-
-
-def _folder(args: argparse.Namespace) -> RouteFolder:
-    from omnid.formats.route_file import RouteFolder
-
-    return RouteFolder(Path(settings_of(args).navigation.routes))
-
-
-def _summary(route: Route) -> dict[str, object]:
-    """Return the values that `list --json` and `show` print of a route."""
-    return {
-        "name": route.name,
-        "map": route.map_name,
-        "created_s": route.created_s,
-        "length_m": route.length_m,
-        "points": len(route.poses),
-        "keyframes": len(route.stamps_ns),
-        "closed": route.is_closed,
-    }
-
-
-def _time(route: Route) -> str:
-    return f"{datetime.fromtimestamp(route.created_s, UTC):%Y-%m-%d %H:%M} UTC"

@@ -1,12 +1,18 @@
-"""Commands about settings and runs: `omnid config`, `listen`, `web`, `report`."""
+"""Commands about settings and runs: `omnid config`, `listen`, `web`."""
 
 from __future__ import annotations
 
 import argparse
 import sys
+from importlib.util import find_spec
 
-from omnid.commands.options import ROBOT, SECONDS, SETTINGS, TRUTH, command, settings_of
+from drivers.motors.protocols.protocol_registry import motor_protocol
+from omnid.commands.options import ROBOT, SECONDS, SETTINGS, command, settings_of
+from omnid.config import FIRST_SETTINGS, Config
 from omnid.errors import OmnidError
+from omnid.monitor.listen import listen as listen_to
+from omnid.settings import changed, dump, dump_minimal, value_at
+from omnid.transport.bus_config import checked
 
 
 @command(SETTINGS)
@@ -22,11 +28,6 @@ def print_config(args: argparse.Namespace) -> int:
       config --minimal > omnid.toml
       config check omnid.toml
     """
-    from drivers.motors.protocols.protocol_registry import motor_protocol
-    from omnid.config import FIRST_SETTINGS, Config
-    from omnid.settings import changed, dump, dump_minimal, value_at
-    from omnid.transport.bus_config import checked
-
     if args.action == "check" and args.file is None:
         raise OmnidError("omnid config check: name the file")
     if args.action == "print" and args.file is not None:
@@ -54,9 +55,7 @@ def listen(args: argparse.Namespace) -> int:
       listen
       listen --robot rover --connect tcp/robot:7447 --seconds 60
     """
-    from omnid.monitor.listen import listen
-
-    return listen(settings_of(args).bus, args.seconds)
+    return listen_to(settings_of(args).bus, args.seconds)
 
 
 PACKAGES = ("prometheus_client", "starlette", "uvicorn")
@@ -95,41 +94,8 @@ def web(args: argparse.Namespace) -> int:
 
 def require_packages() -> None:
     """Raise OmnidError where a package of the page is missing."""
-    from importlib.util import find_spec
-
     missing = [name for name in PACKAGES if find_spec(name) is None]
     if missing:
         raise OmnidError(
             f"omnid web needs {', '.join(missing)}, not installed: {sys.executable} -m pip install {' '.join(missing)}"
         )
-
-
-@command(TRUTH)
-def report(args: argparse.Namespace) -> int:
-    """Write one HTML page about a recording: path, events, statistics.
-
-    log LOG                           what `omnid replay --record` or `omnid run` with record.enabled wrote, or any MCAP
-        with nav_msgs/msg/Odometry
-    -o, --output FILE=report.html     the page
-    --topic TOPIC                     the odometry topic, where there are several
-
-    examples:
-      report out.mcap -o report.html
-    """
-    from calib.atomic_file import write_file
-    from omnid.formats.tum import read_tum
-    from omnid.plain_text import plain
-    from omnid.report.recorded_run import RecordedRun
-    from omnid.report.report import report_html
-    from omnid.sinks.files import check_outputs, on_stdout
-
-    inputs = [("the log that is read", args.log)] + ([("the truth", args.truth)] if args.truth else [])
-    check_outputs([("--output", args.output)], inputs)
-    truth = read_tum(args.truth) if args.truth else None
-    recorded = RecordedRun(args.log, args.topic)
-    html = report_html(recorded, truth)
-    write_file(args.output, html.encode("utf-8", "replace"))  # a file's name may be no text
-    output = sys.stderr if on_stdout([("--output", args.output)]) else sys.stdout
-    line = f"{args.output}: {len(recorded.t_s)} poses of {recorded.topic}, {len(html) / 1e6:.2f} MB"
-    print(plain(line), file=output)
-    return 0

@@ -1,4 +1,4 @@
-"""`omnid view`: show path, map, images with features, depth and plots of a log or a robot in Rerun."""
+"""A recording in images: `omnid report` writes a page about it, `omnid view` draws it, or a robot, in Rerun."""
 
 from __future__ import annotations
 
@@ -14,18 +14,23 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from calib.atomic_file import write_file
 from drivers.errors import FrameDecodeError
 from drivers.logs.open_log import log_info
 from omnid.client import Robot
-from omnid.commands.options import ROBOT, SECONDS, SETTINGS, command, settings_of, warn
+from omnid.commands.options import ROBOT, SECONDS, SETTINGS, TRUTH, command, settings_of, warn
 from omnid.commands.replay import Output, replay_and_print
 from omnid.config import Config
 from omnid.engine.process import handle_stop_signals, python, python_environment
 from omnid.errors import OmnidError
+from omnid.formats.tum import read_tum
 from omnid.monitor.robot_state import RobotState
+from omnid.plain_text import plain
 from omnid.recordings.recording import CLOUD, ODOMETRY, STATUS, RecordingReader, choose_odometry_topic, no_pose
+from omnid.report.recorded_run import RecordedRun
+from omnid.report.report import report_html
 from omnid.runs.replay import ReplayOptions
-from omnid.sinks.files import check_outputs
+from omnid.sinks.files import check_outputs, on_stdout
 from omnid.stages.front_end import FrontEnd
 from omnid.transport.topics import MAP_POSE, PANORAMA, SCAN
 
@@ -159,3 +164,27 @@ def _draw_robot(sink: RerunSink, config: Config, seconds: float) -> None:
                 sink.draw(content, message.received_ns)
     if not sink.poses:
         print(f"omnid: no pose of {config.bus.robot} came: `omnid listen` names those that are there", file=sys.stderr)
+
+
+@command(TRUTH)
+def report(args: argparse.Namespace) -> int:
+    """Write one HTML page about a recording: path, events, statistics.
+
+    log LOG                           what `omnid replay --record` or `omnid run` with record.enabled wrote, or any MCAP
+        with nav_msgs/msg/Odometry
+    -o, --output FILE=report.html     the page
+    --topic TOPIC                     the odometry topic, where there are several
+
+    examples:
+      report out.mcap -o report.html
+    """
+    inputs = [("the log that is read", args.log)] + ([("the truth", args.truth)] if args.truth else [])
+    check_outputs([("--output", args.output)], inputs)
+    truth = read_tum(args.truth) if args.truth else None
+    recorded = RecordedRun(args.log, args.topic)
+    html = report_html(recorded, truth)
+    write_file(args.output, html.encode("utf-8", "replace"))  # a file's name may be no text
+    output = sys.stderr if on_stdout([("--output", args.output)]) else sys.stdout
+    line = f"{args.output}: {len(recorded.t_s)} poses of {recorded.topic}, {len(html) / 1e6:.2f} MB"
+    print(plain(line), file=output)
+    return 0

@@ -14,7 +14,7 @@ from omnid.core.nanoseconds import NS_PER_S
 from omnid.messages import OdometryUpdate
 from omnid.sinks.encoder import Changes, Encoder, Outgoing, UnixTime, pose_attachment, same_time
 from omnid.transport.bus import Bus
-from omnid.transport.codec import clock_cdr, features_to_bytes, path_cdr
+from omnid.transport.codec import CLOCK_SCHEMA, encoded, features_to_bytes, path_cdr
 from omnid.transport.sensor_codec import image_cdr
 from omnid.transport.status_names import RUN_ID
 from omnid.transport.topics import CLOCK, PANORAMA
@@ -38,7 +38,7 @@ class BusSink:
         # 1. The clock, before what is stamped by it.
         if self._clock is not None and isinstance(message, self._clock) and message.stamp_ns > self._time_ns:
             self._time_ns = message.stamp_ns
-            self._bus.publish(CLOCK, clock_cdr(self._encode.unix_ns(message.stamp_ns)))
+            self._bus.publish(CLOCK, encoded(CLOCK_SCHEMA, self._encode.unix_ns(message.stamp_ns)))
         # 2. The message itself.
         attachment = pose_attachment(message, time.time_ns(), RUN_ID) if isinstance(message, OdometryUpdate) else None
         for topic, _, payload in self._encode(message):

@@ -121,7 +121,7 @@ class Encoder:
             stamp_ns, T_odom_base, in_outer_axes(T_odom_base, covariance), velocity, velocity_covariance
         )
         yield OutgoingMessage.on("odom", pose)
-        yield OutgoingMessage.on("pose", codec.pose_stamped_cdr(stamp_ns, T_odom_base))
+        yield OutgoingMessage.on("pose", codec.encoded(codec.POSE_SCHEMA, (stamp_ns, "odom"), T_odom_base))
         edge = FrameTransform("odom", "base_link", T_odom_base)
         yield OutgoingMessage.on("/tf", codec.transform_cdr(stamp_ns, [edge]))
         # Samples of wheels and gyro up to the pair; those after it come with the next one again.
@@ -135,8 +135,9 @@ class Encoder:
 
     def _map_pose(self, update: PlaceUpdate, stamp_ns: int) -> Iterator[OutgoingMessage]:
         T_map_base, covariance = base_pose(update.T_map_rig, update.covariance, self.T_base_rig)
-        pose = codec.pose_with_covariance_cdr(stamp_ns, T_map_base, in_outer_axes(T_map_base, covariance))
-        yield OutgoingMessage.on(MAP_POSE, pose)
+        yield OutgoingMessage.on(
+            MAP_POSE, codec.map_pose_cdr(stamp_ns, T_map_base, in_outer_axes(T_map_base, covariance))
+        )
         if update.is_known:  # a transform has no covariance that could say that it is not
             T_map_odom, _ = base_pose(update.T_map_odom, update.covariance, self.T_base_rig)
             edge = FrameTransform("map", "odom", T_map_odom)

@@ -1,23 +1,23 @@
 """Messages of the bus and of recordings: types of ROS 2 (Humble) as CDR bytes, by rosbags, both ways.
 
 A message is encoded from the values of its fields, in the order of its definition; a message among them is the tuple of
-its own fields. Arrays are in SI units and not to be written to; p_a = T_a_b @ p_b; covariances are
-in the order x y z rx ry rz, row-major (nav_msgs/msg/Odometry). Attachments of zenoh are JSON with what a message has no
-field for. Bytes that are decoded may be anything: all decoders raise OmnidError for those that are no such message.
-Encoders raise it for a stamp that is no ROS time.
+its own fields, a Time its nanoseconds, a Pose or Transform the rigid transform (4, 4). Arrays are in SI units and not
+to be written to; p_a = T_a_b @ p_b; covariances are in the order x y z rx ry rz, row-major (nav_msgs/msg/Odometry).
+Attachments of zenoh are JSON with what a message has no field for. Bytes that are decoded may be anything: all decoders
+raise OmnidError for those that are no such message. Encoders raise it for a stamp that is no ROS time.
 """
 
 from __future__ import annotations
 
-import json
 import math
 import time
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cache
 from struct import calcsize
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self, TypeAlias, TypeVar
 
+import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from rosbags.interfaces import Nodetype
@@ -32,6 +32,7 @@ from omnid.errors import OmnidError
 if TYPE_CHECKING:
     from omnid.core.obstacles.moving_tracker import MovingObstacle
 
+T = TypeVar("T")
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Frames = tuple[str, str]
@@ -77,7 +78,7 @@ def compile_serialisers(schemas: Iterable[str]) -> None:
 
 
 def encoded(schema: str, *values: object) -> bytes:
-    """Return the CDR bytes of a message, such as encoded("std_msgs/msg/Header", (2, 500), "odom")."""
+    """Return the CDR bytes of a message, such as encoded("std_msgs/msg/Header", 2_000_000_500, "odom")."""
     return bytes(_typestore().serialize_cdr(_message(schema, values), schema))
 
 
@@ -93,21 +94,14 @@ def _parts(schema: str) -> tuple[tuple[bool, str], ...]:
     return tuple(parts)
 
 
-def _message(schema: str, values: Any) -> Any:
+def _message(schema: str, value: Any) -> Any:
     """Return a message in the type of rosbags."""
+    values = value if isinstance(value, tuple) else _FIELDS_OF[schema](value)
     fields: list[Any] = [
         value if not part else [_message(part, one) for one in value] if is_list else _message(part, value)
         for value, (is_list, part) in zip(values, _parts(schema), strict=True)
     ]
     return _typestore().types[schema](*fields)
-
-
-def decoded(payload: bytes, schema: str) -> Any:
-    """Return a message in the type of rosbags."""
-    try:
-        return _typestore().deserialize_cdr(bytes(payload), schema)
-    except SerdeError as error:
-        raise OmnidError(f"{len(payload)} bytes are not a {schema} in CDR ({error}); check the sender") from error
 
 
 def ros_time(stamp_ns: int) -> tuple[int, int]:
@@ -118,28 +112,35 @@ def ros_time(stamp_ns: int) -> tuple[int, int]:
     return seconds, nanoseconds
 
 
-def header(stamp_ns: int, frame: str) -> Values:
-    """Return the fields of a Header."""
-    return ros_time(stamp_ns), frame
+def _pose_fields(T: Array) -> Values:
+    """Return the fields of a Pose, and of a Transform, which has the same: position and quaternion."""
+    return tuple(T[:3, 3].tolist()), tuple(se3.quaternion(T[:3, :3]).tolist())
+
+
+# Fields of a message by the value that stands for it.
+_FIELDS_OF: Final[Mapping[str, Callable[[Any], Values]]] = {
+    "builtin_interfaces/msg/Time": ros_time,
+    "geometry_msgs/msg/Pose": _pose_fields,
+    "geometry_msgs/msg/Transform": _pose_fields,
+}
+
+
+def decoded(payload: bytes, schema: str) -> Any:
+    """Return a message in the type of rosbags."""
+    try:
+        return _typestore().deserialize_cdr(bytes(payload), schema)
+    except SerdeError as error:
+        raise OmnidError(f"{len(payload)} bytes are not a {schema} in CDR ({error}); check the sender") from error
 
 
 def _stamp_ns(message: Any) -> int:
-    """Return the stamp of a message with a header, which may be invalid; those who rely on it check it."""
-    stamp = message.header.stamp
-    return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
+    """Return the stamp of a message with a header; it may be invalid, and those who rely on it check it."""
+    return header_stamp_ns(message.header)
 
 
-def _vector(xyz: ArrayLike) -> list[float]:
-    return [float(value) for value in np.asarray(xyz)]
-
-
-def _pose(T: Array) -> Values:
-    """Return the fields of a Pose, and of a Transform, which has the same: position and quaternion."""
-    return T[:3, 3].tolist(), se3.quaternion(T[:3, :3]).tolist()
-
-
-def _pose_with_covariance(T: Array, covariance: Array) -> Values:
-    return _pose(T), np.ravel(covariance)
+def header_stamp_ns(header: Any) -> int:
+    """Return the stamp of a header; it may be invalid."""
+    return int(header.stamp.sec) * NS_PER_S + int(header.stamp.nanosec)
 
 
 def _rigid_transform(pose: Any) -> Array:
@@ -168,21 +169,21 @@ class PoseAttachment:
 
     def to_bytes(self) -> bytes:
         """Encode as JSON."""
-        return json.dumps(asdict(self), separators=(",", ":")).encode()
+        return msgspec.json.encode(self)
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
-        """Decode a JSON object; missing entries, and those of another type, keep their defaults."""
-        try:
-            found = json.loads(data)
-        except (ValueError, RecursionError):
-            found = None
-        if not isinstance(found, dict):
-            raise OmnidError(
-                f"the {len(data)} bytes attached to a pose are not a JSON object; check that omnid sent them"
-            )
-        defaults = asdict(cls())
-        return cls(**{name: found[name] for name, own in defaults.items() if type(found.get(name)) is type(own)})
+        """Decode a JSON object; missing entries keep their defaults."""
+        return _of_json(data, cls, "a pose")
+
+
+def _of_json(data: bytes, kind: type[T], whose: str) -> T:
+    """Return what is attached to a message as JSON."""
+    try:
+        return msgspec.json.decode(data, type=kind)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        what = f"the {len(data)} bytes attached to {whose} are not its JSON ({error}); check that omnid sent them"
+        raise OmnidError(what) from error
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -233,10 +234,9 @@ def odometry_cdr(
     frames: Frames = ("odom", "base_link"),
 ) -> bytes:
     """Encode a nav_msgs/msg/Odometry: pose in the parent frame, velocity (6,) [m/s, rad/s] in the child frame."""
-    parent, child = frames
-    twist = (_vector(velocity[:3]), _vector(velocity[3:])), np.ravel(velocity_covariance)
-    pose = _pose_with_covariance(T_odom_base, covariance)
-    return encoded(ODOMETRY_SCHEMA, header(stamp_ns, parent), child, pose, twist)
+    linear, angular = (tuple(part.tolist()) for part in np.split(velocity, 2))
+    pose, twist = (T_odom_base, np.ravel(covariance)), ((linear, angular), np.ravel(velocity_covariance))
+    return encoded(ODOMETRY_SCHEMA, (stamp_ns, frames[0]), frames[1], pose, twist)
 
 
 def decode_pose(payload: bytes, attachment: bytes = b"", received_ns: int | None = None) -> Pose:
@@ -260,11 +260,6 @@ def decode_pose(payload: bytes, attachment: bytes = b"", received_ns: int | None
     )
 
 
-def pose_stamped_cdr(stamp_ns: int, T_odom_body: Array) -> bytes:
-    """Encode a geometry_msgs/msg/PoseStamped: the pose of a body in odom."""
-    return encoded(POSE_SCHEMA, header(stamp_ns, "odom"), _pose(T_odom_body))
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseInMap:
     """Pose of the robot's base in the map, and its covariance (6, 6) in the map's axes."""
@@ -274,9 +269,9 @@ class PoseInMap:
     covariance: Array
 
 
-def pose_with_covariance_cdr(stamp_ns: int, T_map_body: Array, covariance: Array) -> bytes:
-    """Encode a geometry_msgs/msg/PoseWithCovarianceStamped: the pose of a body in the map, covariance in its axes."""
-    return encoded(MAP_POSE_SCHEMA, header(stamp_ns, "map"), _pose_with_covariance(T_map_body, covariance))
+def map_pose_cdr(stamp_ns: int, T_map_base: Array, covariance: Array) -> bytes:
+    """Encode a geometry_msgs/msg/PoseWithCovarianceStamped: the pose of the base in the map, covariance in its axes."""
+    return encoded(MAP_POSE_SCHEMA, (stamp_ns, "map"), (T_map_base, np.ravel(covariance)))
 
 
 def decode_map_pose(payload: bytes, _: bytes = b"") -> PoseInMap:
@@ -296,7 +291,7 @@ class FrameTransform:
 
 def transform_cdr(stamp_ns: int, transforms: Sequence[FrameTransform]) -> bytes:
     """Encode a tf2_msgs/msg/TFMessage: edges of the frame tree, all of one instant."""
-    edges = [(header(stamp_ns, edge.parent), edge.child, _pose(edge.T_parent_child)) for edge in transforms]
+    edges = [((stamp_ns, edge.parent), edge.child, edge.T_parent_child) for edge in transforms]
     return encoded(TRANSFORM_SCHEMA, edges)
 
 
@@ -335,7 +330,7 @@ class Diagnostics:
 def diagnostics_cdr(stamp_ns: int, statuses: Sequence[DiagnosticStatus]) -> bytes:
     """Encode a diagnostic_msgs/msg/DiagnosticArray."""
     entries = [(status.level, status.name, status.message, "", list(status.values.items())) for status in statuses]
-    return encoded(DIAGNOSTICS_SCHEMA, header(stamp_ns, ""), entries)
+    return encoded(DIAGNOSTICS_SCHEMA, (stamp_ns, ""), entries)
 
 
 def decode_diagnostics(payload: bytes, _: bytes = b"") -> Diagnostics:
@@ -393,8 +388,7 @@ def _cloud_cdr(stamp_ns: int, frame: str, names: Sequence[str], rows: Floats) ->
     number, step = np.dtype("<f4").itemsize, np.dtype("<f4").itemsize * len(names)
     point_field: Any = _typestore().types["sensor_msgs/msg/PointField"]
     fields = [(name, number * i, point_field.FLOAT32, 1) for i, name in enumerate(names)]
-    data, is_dense = rows.reshape(-1).view(np.uint8), bool(np.isfinite(rows).all())
-    head = header(stamp_ns, frame)
+    head, data, is_dense = (stamp_ns, frame), rows.reshape(-1).view(np.uint8), bool(np.isfinite(rows).all())
     return encoded(POINT_CLOUD_SCHEMA, head, 1, len(rows), fields, False, step, step * len(rows), data, is_dense)
 
 
@@ -427,9 +421,8 @@ class Map:
 def grid_cdr(stamp_ns: int, frame: str, cells: NDArray[np.int8], cell_m: float, corner: tuple[float, float]) -> bytes:
     """Encode a nav_msgs/msg/OccupancyGrid of cells (H, W), z = 0 in `frame`; corner: x, y of cell (0, 0), m."""
     height, width = cells.shape
-    corner_pose = _pose(se3.transform(np.eye(3), (*corner, 0.0)))
-    info = ros_time(stamp_ns), cell_m, width, height, corner_pose
-    return encoded(GRID_SCHEMA, header(stamp_ns, frame), info, cells.reshape(-1))
+    info = stamp_ns, cell_m, width, height, se3.transform(np.eye(3), (*corner, 0.0))
+    return encoded(GRID_SCHEMA, (stamp_ns, frame), info, cells.reshape(-1))
 
 
 def decode_map(payload: bytes, _: bytes = b"") -> Map:
@@ -466,7 +459,7 @@ def scan_cdr(stamp_ns: int, frame: str, ranges_m: Floats, sigma_m: Floats, limit
     """
     step, arrays = 2 * math.pi / len(ranges_m), [np.ascontiguousarray(one, "<f4") for one in (ranges_m, sigma_m)]
     angles = (step / 2 - math.pi, math.pi - step / 2, step)
-    return encoded(SCAN_SCHEMA, header(stamp_ns, frame), *angles, 0.0, 0.0, *limits_m, *arrays)
+    return encoded(SCAN_SCHEMA, (stamp_ns, frame), *angles, 0.0, 0.0, *limits_m, *arrays)
 
 
 def decode_scan(payload: bytes, _: bytes = b"") -> Scan:
@@ -513,7 +506,7 @@ class PlanarPath(NamedTuple):
 def twist_stamped_cdr(stamp_ns: int, frame: str, linear_mps: float, yaw_rate_radps: float) -> bytes:
     """Encode a geometry_msgs/msg/TwistStamped of a ground robot: forward speed and yaw rate in `frame`."""
     twist = (linear_mps, 0.0, 0.0), (0.0, 0.0, yaw_rate_radps)
-    return encoded(TWIST_SCHEMA, header(stamp_ns, frame), twist)
+    return encoded(TWIST_SCHEMA, (stamp_ns, frame), twist)
 
 
 def twist_from_cdr(payload: bytes) -> TwistRecord:
@@ -529,7 +522,7 @@ def twist_from_cdr(payload: bytes) -> TwistRecord:
 
 def heading_cdr(stamp_ns: int, velocity_mps: float, heading_rad: float) -> bytes:
     """Encode a heading command, a geometry_msgs/msg/Vector3Stamped in odom: x is the speed, z the heading."""
-    return encoded(VECTOR_SCHEMA, header(stamp_ns, "odom"), (velocity_mps, 0.0, heading_rad))
+    return encoded(VECTOR_SCHEMA, (stamp_ns, "odom"), (velocity_mps, 0.0, heading_rad))
 
 
 def heading_from_cdr(payload: bytes) -> tuple[int, str, float, float]:
@@ -540,18 +533,7 @@ def heading_from_cdr(payload: bytes) -> tuple[int, str, float, float]:
 
 def header_cdr(stamp_ns: int) -> bytes:
     """Encode a std_msgs/msg/Header, which is the message of cmd/arm."""
-    return encoded(HEADER_SCHEMA, *header(stamp_ns, ""))
-
-
-def stamp_from_cdr(payload: bytes) -> int:
-    """Decode the stamp of a Header, ns; it may be invalid."""
-    stamp = decoded(payload, HEADER_SCHEMA).stamp
-    return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
-
-
-def bool_from_cdr(payload: bytes) -> bool:
-    """Decode a std_msgs/msg/Bool, which is the message of cmd/bumper and cmd/cliff."""
-    return bool(decoded(payload, BOOL_SCHEMA).data)
+    return encoded(HEADER_SCHEMA, stamp_ns, "")
 
 
 def string_cdr(text: str) -> bytes:
@@ -564,14 +546,9 @@ def string_from_cdr(payload: bytes) -> str:
     return str(decoded(payload, STRING_SCHEMA).data)
 
 
-def clock_cdr(stamp_ns: int) -> bytes:
-    """Encode the time of a run, for programs that follow it."""
-    return encoded(CLOCK_SCHEMA, ros_time(stamp_ns))
-
-
 def goal_cdr(stamp_ns: int, frame: str, xy: tuple[float, float], heading_rad: float | None) -> bytes:
     """Encode a goal as a PoseStamped; heading_rad: None for any."""
-    return encoded(POSE_SCHEMA, header(stamp_ns, frame), _planar_pose(*xy, heading_rad))
+    return encoded(POSE_SCHEMA, (stamp_ns, frame), _planar_pose(*xy, heading_rad))
 
 
 def goal_from_cdr(payload: bytes) -> PlanarPath:
@@ -585,10 +562,8 @@ def path_cdr(stamp_ns: int, frame: str, xy: ArrayLike, heading_rad: float | None
     steps = np.diff(points, axis=0, append=points[-1:])
     headings: list[float | None] = [float(math.atan2(dy, dx)) for dx, dy in steps]
     headings[-1:] = [heading_rad]
-    head = header(stamp_ns, frame)
-    poses = [
-        (head, _planar_pose(float(x), float(y), heading)) for (x, y), heading in zip(points, headings, strict=True)
-    ]
+    head = stamp_ns, frame
+    poses = [(head, _planar_pose(*point, heading)) for point, heading in zip(points.tolist(), headings, strict=True)]
     return encoded(PATH_SCHEMA, head, poses)
 
 
@@ -631,6 +606,7 @@ def _planar_heading(pose: Any) -> float | None:
 # A panorama and its features.
 
 FEATURE_KINDS: Final = ("inliers", "rejected", "new")
+_Pixels = msgspec.defstruct("_Pixels", [(kind, list[tuple[float, float]]) for kind in FEATURE_KINDS])
 
 
 def features_to_bytes(pixels: Mapping[str, Array]) -> bytes:
@@ -638,18 +614,13 @@ def features_to_bytes(pixels: Mapping[str, Array]) -> bytes:
 
     They are rounded to whole pixels.
     """
-    rounded = {kind: np.rint(pixels[kind]).astype(int).tolist() for kind in FEATURE_KINDS}
-    return json.dumps(rounded, separators=(",", ":")).encode()
+    return msgspec.json.encode({kind: np.rint(pixels[kind]).astype(int).tolist() for kind in FEATURE_KINDS})
 
 
 def features_from_bytes(data: bytes) -> dict[str, Array]:
     """Decode the pixels (N, 2) of features by kind."""
-    try:
-        found = json.loads(data)
-        return {kind: np.asarray(found[kind], np.float64).reshape(-1, 2) for kind in FEATURE_KINDS}
-    except (ValueError, TypeError, KeyError, RecursionError, OverflowError):
-        reason = f"the {len(data)} bytes attached to a panorama are not features; check that omnid sent them"
-        raise OmnidError(reason) from None
+    found = _of_json(data, _Pixels, "a panorama")
+    return {kind: np.array(getattr(found, kind), np.float64).reshape(-1, 2) for kind in FEATURE_KINDS}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

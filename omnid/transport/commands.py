@@ -299,7 +299,8 @@ class CommandReceiver(Receiver):
         messages may overtake each other. A board whose clock is wrong sends it just now where its messages come at the
         pace of their stamps. All other messages are a contact.
         """
-        holds, sent_ns = codec.bool_from_cdr(request.payload), self._freshness.sent_ns(request, arrival_ns)
+        holds = bool(codec.decoded(request.payload, codec.BOOL_SCHEMA).data)
+        sent_ns = self._freshness.sent_ns(request, arrival_ns)
         is_steady = sent_ns is not None and clock.is_steady(sent_ns, arrival_ns)
         if holds:
             clock.newest_ns = max(clock.newest_ns, min(sent_ns or 0, arrival_ns))
@@ -311,7 +312,8 @@ class CommandReceiver(Receiver):
         self._target.touch(contact, holds=holds)
 
     def _arm(self, request: Request, arrival_ns: int) -> None:
-        sent_ns = self._freshness.require(request, arrival_ns, codec.stamp_from_cdr(request.payload))
+        stamp_ns = codec.header_stamp_ns(codec.decoded(request.payload, codec.HEADER_SCHEMA))
+        sent_ns = self._freshness.require(request, arrival_ns, stamp_ns)
         if not self._is_unique():
             raise Refused("another robot has this name", "change bus.robot of one of them")
         if sent_ns <= self._stop_ns:

@@ -17,7 +17,7 @@ from drivers.frame import Frame
 from drivers.logs.ros_messages import BASE_FRAME, COMPRESSED_IMAGE, IMAGE, JointWheels, parse_motion
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.errors import OmnidError
-from omnid.transport.codec import IMU_SCHEMA, encoded, header, odometry_cdr
+from omnid.transport.codec import IMU_SCHEMA, encoded, odometry_cdr
 
 LARGEST_VALUE: Final = 100.0  # m/s, rad/s and rad: larger ones are faults of the sender
 _UNKNOWN_VARIANCE: Final = 1e9  # Variance of the parts of a pose that wheels do not measure.
@@ -35,7 +35,7 @@ def gyro_cdr(sample: GyroSample, stamp_ns: int, frame: str = BASE_FRAME) -> byte
     rates = sample.x_radps, sample.y_radps, sample.z_radps
     orientation, acceleration = (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0)
     parts = orientation, unknown, rates, np.zeros(9), acceleration, unknown
-    return encoded(IMU_SCHEMA, header(stamp_ns, frame), *parts)
+    return encoded(IMU_SCHEMA, (stamp_ns, frame), *parts)
 
 
 def sample_from_cdr(
@@ -75,7 +75,7 @@ def image_cdr(frame: Frame, stamp_ns: int) -> tuple[str, bytes]:
 
     A driver's buffer may be longer than its image, which ROS does not accept: the rest is left out.
     """
-    head, data = header(stamp_ns, frame.camera), np.frombuffer(frame.data, np.uint8)
+    head, data = (stamp_ns, frame.camera), np.frombuffer(frame.data, np.uint8)
     if frame.encoding in COMPRESSED:
         return COMPRESSED_IMAGE, encoded(COMPRESSED_IMAGE, head, frame.encoding, data)
     step = frame.step or frame.width * _PIXEL_BYTES.get(frame.encoding, 1)

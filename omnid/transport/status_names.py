@@ -15,9 +15,12 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Final, NamedTuple, TypeAlias
 
+import msgspec
+
 from omnid.core.control.arming import STARTED
 from omnid.core.control.safety_rules import ASKED, AWAITED, COMMAND_STALE, FAILED, IDLE, NOT_ARMED
 from omnid.engine.telemetry import Histogram
+from omnid.errors import OmnidError
 from omnid.navigation_state import NavigationState
 from omnid.tracking_state import MapState, TrackingState
 from omnid.transport.codec import ERROR, OK, STALE, WARN, DiagnosticStatus, decode_diagnostics
@@ -402,20 +405,8 @@ class NavigationReport:
 def decode_navigation(payload: bytes, _: bytes = b"") -> NavigationReport:
     """Decode the state of the navigation. Raise OmnidError for any other bytes."""
     report = decode_diagnostics(payload)
-    keys = (Key.STATE, Key.REASON, Key.TASK, Key.COMMAND_NS, Key.LEFT_M, Key.REQUEST, Key.REFUSAL, Key.TEACHING)
-    state, reason, task, command, left, request, refusal, teaching = (report.value(NAVIGATION, key) for key in keys)
-    # A stamp has at most 19 digits, which a float does not hold.
-    command_ns = int(command) if command.isascii() and command.isdigit() and len(command) < 20 else 0
-    left_m, taught_m = number(left), number(report.value(NAVIGATION, Key.TAUGHT_M))
-    return NavigationReport(
-        report.stamp_ns,
-        state,
-        reason,
-        task,
-        command_ns,
-        math.nan if left_m is None else left_m,
-        request,
-        refusal,
-        teaching,
-        taught_m or 0.0,
-    )
+    values = next((status.values for status in report.statuses if status.name == NAVIGATION), {})
+    try:
+        return msgspec.convert({**values, "stamp_ns": report.stamp_ns}, NavigationReport, strict=False)
+    except msgspec.ValidationError as error:
+        raise OmnidError(f"no report of the navigation: {error}; check the sender") from error

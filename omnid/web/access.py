@@ -111,9 +111,13 @@ class Access:
     cookie: str
     stop_token: str = ""
 
-    def role_of(self, text: str) -> Role | None:
-        """Return the role of a token, None for any other text; takes the same time for all texts."""
-        return self._matching(text, lambda token: token)
+    def role_of(self, given: str, proof: Callable[[str], str] = str) -> Role | None:
+        """Return the role of a token, or of the proof of one; None for any other text, after the same time."""
+        found = None
+        for role, token in ((Role.STOP, self.stop_token), (Role.DRIVE, self.token)):
+            if hmac.compare_digest(given.strip().encode("utf-8", "replace"), proof(token).encode()) and token:
+                found = role
+        return found
 
     def new_cookie(self, role: Role) -> str:
         """Return the value of the cookie of a browser that knew a token, valid as long as the token."""
@@ -124,7 +128,7 @@ class Access:
         if "authorization" in request.headers:
             scheme, _, token = request.headers["authorization"].partition(" ")
             return self.role_of(token) if scheme.lower() == "bearer" else None
-        return self._matching(request.cookies.get(self.cookie, ""), _proof)
+        return self.role_of(request.cookies.get(self.cookie, ""), _proof)
 
     def refusal(self, request: HTTPConnection) -> str:
         """Return the reason of REFUSALS not to answer a request; "" to answer it."""
@@ -149,21 +153,11 @@ class Access:
             return "wrong token" if has_token or self.cookie in request.cookies else "no token"
         return "stop only" if role is Role.STOP and not reads and path not in _STOPPING else ""
 
-    def _matching(self, given: str, proof: Callable[[str], str]) -> Role | None:
-        found = None
-        for role, token in ((Role.STOP, self.stop_token), (Role.DRIVE, self.token)):
-            if hmac.compare_digest(given.strip().encode("utf-8", "replace"), proof(token).encode()) and token:
-                found = role
-        return found
-
     def _is_host(self, host: str) -> bool:
         found = _HOST.fullmatch(host)
         name = found[1].lower() if found else ""
-        if name in self.hosts or not self.any_address:
-            return name in self.hosts
         with suppress(ValueError):
-            ipaddress.ip_address(name.strip("[]"))
-            return True
+            return name in self.hosts or (self.any_address and bool(ipaddress.ip_address(name.strip("[]"))))
         return False
 
 

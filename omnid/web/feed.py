@@ -1,4 +1,4 @@
-"""The robot's messages from the bus, as the news that browsers ask for.
+"""What browsers show of the robot, as the news that they ask for.
 
 zenoh calls in its own threads: they only put a message into a bounded inbox, or replace the newest one, and wake the
 event loop. Nothing that a browser does can reach that far. A browser asks for what has changed since the news that it
@@ -12,29 +12,38 @@ import json
 import math
 import secrets
 import time
+import zlib
 from bisect import bisect
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from http import HTTPStatus
+from itertools import islice
 from typing import Any, Final
 
+import numpy as np
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 
+from calib import se3
 from omnid.client import Map, NavigationReport, Robot, Scan, Unreachable
 from omnid.core.mapping.thinned_path import ThinnedPath, Vertex
-from omnid.monitor.robot_state import ReceivedMessage, RobotState
+from omnid.monitor.robot_state import LEVELS, ReceivedMessage, RobotState, importance
+from omnid.plain_text import MOST_ENTRIES, plain
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.codec import Diagnostics, Panorama, PlanarPath, Pose, PoseInMap
+from omnid.transport.status_names import PLACES, WHEELS, Key, short_name
 from omnid.transport.topics import MAP_POSE, PANORAMA, SCAN
-from omnid.web import snapshot
 
-PERIOD_S: Final = 0.03  # least time between two answers to a browser
 QUIET_S: Final = 0.5  # The state is sent after this time even without a message of the robot; between two connections
-WANTED_S: Final = 2.0  # The panorama is received for this time after a browser has asked for it.
 MOST_POINTS: Final = 4000  # Most points of the path.
-_FINEST_M: Final = 0.02  # Points of the path are at least this far apart, so that a robot at rest adds none.
-NAVIGATION: Final = "navigation"
+OLDEST_S: Final = 1.0  # age of the newest state that a page may have when it asks for a motion
+LARGEST_MAP_PX: Final = 1024  # edge of the map as it is sent; larger ones are reduced
+LONGEST_VALUE: Final = 100  # characters
 LARGEST: Final = 1 << 26  # bytes of a message: a map of 8,000 x 8,000 cells
+NAVIGATION: Final = "navigation"
+PATH_FRAME: Final = "odom"
+FRAMES: Final = (PATH_FRAME, "map")  # Frames of a map that is drawn.
+# Topics whose newest message alone counts, and what stands for each in a new odom.
 _NEWEST_ONLY: Final = (NAVIGATION, SCAN, "map", PANORAMA)
 _KEPT: Final = ("path", "status", "map")  # Topics whose message from before the connection is asked for.
 
@@ -44,7 +53,7 @@ class LivePath:
 
     def __init__(self) -> None:
         self._since = 0  # version since which points are only added
-        self._path = ThinnedPath(MOST_POINTS, _FINEST_M)
+        self._path = ThinnedPath(MOST_POINTS, 0.02)  # a robot at rest adds none
 
     def add(self, x_m: float, y_m: float, version: int, *, gap: bool = False) -> None:
         """Add a position, m. version: of the news that it comes with. gap: the robot was put elsewhere."""
@@ -81,7 +90,7 @@ class RobotFeed:
         # program started again have seen none of them.
         self.version = self._start = secrets.randbits(48)  # of 15 digits at most
         self._news: dict[str, tuple[int, Any]] = {}  # newest content of each kind, and the version that it came with
-        self._images: dict[str, bytes] = {}  # cells of the map, and the panorama
+        self._images: dict[str, Response] = {}  # cells of the map, and the panorama
         self._changed = asyncio.Condition()
         self._wanted_until_s = -math.inf  # the panorama
         self._map_in_odom: list[float] | None = None
@@ -93,24 +102,21 @@ class RobotFeed:
         seen = seen if self._start <= seen <= self.version else 0
         extra = {
             "dropped": self.state.dropped,
-            "panorama_comes": "panorama" in self._news,
+            "panorama_comes": PANORAMA in self._news,
             "map_in_odom": self._map_in_odom,
         }
-        found = {"seen": self.version, "state": snapshot.state_news(self.bus.robot, self.state, self.link, extra)}
+        found = {"seen": self.version, "state": state_news(self.bus.robot, self.state, self.link, extra)}
         if (path := self.path.news(seen)) is not None:
             found["path"] = path
-        found |= {kind: content for kind, (version, content) in self._news.items() if version > seen}
-        return dict(snapshot.browsable(found))
+        return dict(browsable(found | {k: content for k, (version, content) in self._news.items() if version > seen}))
 
     async def live(self, request: Request) -> Response:
         """Answer a browser as soon as there are news: `seen` is the version of its last, `panorama` 1 asks for it."""
         seen = request.query_params.get("seen", "")
         if not (seen.isascii() and seen.isdigit() and len(seen) < 16):
-            return PlainTextResponse(
-                "omnid web: the page names the version of the news that it has seen\n", HTTPStatus.BAD_REQUEST
-            )
+            return _text("the page names the version of the news that it has seen", HTTPStatus.BAD_REQUEST)
         if request.query_params.get("panorama") == "1":
-            self._wanted_until_s = time.monotonic() + WANTED_S
+            self._wanted_until_s = time.monotonic() + 4 * QUIET_S
         if int(seen) == self.version:
             async with self._changed:
                 await self._changed.wait()
@@ -119,13 +125,7 @@ class RobotFeed:
 
     async def image(self, request: Request) -> Response:
         """Return the cells of the map, a byte each as `map_cells` makes them, or the newest panorama."""
-        kind = request.path_params["kind"]
-        if kind not in self._images:
-            return PlainTextResponse("omnid web: there is none\n", HTTPStatus.NOT_FOUND)
-        if kind == "map":
-            headers = {"content-encoding": "deflate"}
-            return Response(self._images[kind], headers=headers, media_type="application/octet-stream")
-        return Response(self._images[kind], media_type="image/jpeg")
+        return self._images.get(request.path_params["kind"]) or _text("there is none", HTTPStatus.NOT_FOUND)
 
     async def run(self) -> None:
         """Connect to the robot as soon as it can be reached, and follow it until this task is cancelled."""
@@ -146,7 +146,7 @@ class RobotFeed:
             async with self._changed:
                 self.version += 1
                 self._changed.notify_all()
-            await asyncio.sleep(PERIOD_S)
+            await asyncio.sleep(0.03)  # least time between two answers to a browser
 
     async def _connect(self) -> None:
         """Open the connection, take what was published before it, then receive the panorama while browsers show it."""
@@ -176,10 +176,11 @@ class RobotFeed:
             end = await asyncio.to_thread(self.robot.on_message, receive, topic, kept=topic in _KEPT)
             if topic == "path":  # which grows by the poses from here on
                 await asyncio.to_thread(end)
-        self.link, end_panorama = "", None
+        self.link = ""
         self.robot.on_alive(self.state.set_alive)
+        end_panorama: Callable[[], None] | None = None
         while True:
-            await asyncio.sleep(0.1 * WANTED_S)
+            await asyncio.sleep(QUIET_S / 2)
             is_wanted = time.monotonic() < self._wanted_until_s
             if is_wanted and end_panorama is None:
                 end_panorama = self.robot.on_message(receive, PANORAMA)
@@ -193,21 +194,21 @@ class RobotFeed:
 
     def process_inbox(self) -> None:
         """Process the poses and statuses that have come; forget the statuses of a daemon that has ended."""
-        before = self.state.pose
+        before, has_news = self.state.pose, False
         while (received := self.state.next(0.0)) is not None:
             match received[1]:
                 case Pose() as pose:
                     self._add_to_path(pose, before)
                     before = pose
                 case PoseInMap() as in_map:
-                    self._map_in_odom = snapshot.map_in_odom(in_map, self.state.recent) or self._map_in_odom
+                    self._map_in_odom = map_in_odom(in_map, self.state.recent) or self._map_in_odom
                 case Diagnostics():
-                    self._set("parts", snapshot.parts_news(self.state))
-                case PlanarPath(frame=frame, xy=xy) if frame == snapshot.PATH_FRAME:
+                    has_news = True
+                case PlanarPath(frame=frame, xy=xy) if frame == PATH_FRAME:
                     for x_m, y_m in xy.tolist():
                         self.path.add(x_m, y_m, self.version + 1)
-        if self.state.forget_ended():
-            self._set("parts", snapshot.parts_news(self.state))
+        if self.state.forget_ended() or has_news:
+            self._set("parts", parts_news(self.state))
 
     def _add_to_path(self, pose: Pose, before: Pose | None) -> None:
         """Add a pose; another run has another odom."""
@@ -216,9 +217,9 @@ class RobotFeed:
             self._map_in_odom = None
             self._images.clear()
             nothing = {
-                "map": {"frame": snapshot.PATH_FRAME, "width": 0},
+                "map": {"frame": PATH_FRAME, "width": 0},
                 SCAN: {"points": [], "nearest": None},
-                NAVIGATION: snapshot.navigation_news(NavigationReport()),
+                NAVIGATION: navigation_news(NavigationReport()),
                 PANORAMA: 0,
             }
             for kind in nothing.keys() & self._news.keys():
@@ -240,12 +241,180 @@ class RobotFeed:
         """Take a scan, a report of the navigation, a map or a panorama."""
         match await asyncio.to_thread(self.state.process, message):
             case Scan() as scan:
-                self._set(SCAN, snapshot.scan_news(scan, self.state.recent))
+                self._set(SCAN, scan_news(scan, self.state.recent))
             case NavigationReport() as report:
-                self._set(NAVIGATION, snapshot.navigation_news(report))
+                self._set(NAVIGATION, navigation_news(report))
             case Map() as grid:
-                header, self._images["map"] = await asyncio.to_thread(snapshot.map_cells, grid)
+                header, cells = await asyncio.to_thread(map_cells, grid)
+                encoding = {"content-encoding": "deflate"}
+                self._images["map"] = Response(cells, headers=encoding, media_type="application/octet-stream")
                 self._set("map", {**header, "version": self.version + 1})
             case Panorama(data=data):
-                self._images[PANORAMA] = data
+                self._images[PANORAMA] = Response(data, media_type="image/jpeg")
                 self._set(PANORAMA, self.version + 1)
+
+
+def _text(words: str, status: HTTPStatus) -> Response:
+    return PlainTextResponse(f"omnid web: {words}\n", status)
+
+
+def server_ms() -> int:
+    """Return the server's time, which states carry and requests of the stick repeat."""
+    return time.monotonic_ns() // 1_000_000
+
+
+def is_recent(stamp_ms: int) -> bool:
+    """True for the time of a state that was sent a moment ago: its sender has seen what the robot does."""
+    return 0 <= server_ms() - stamp_ms <= 1000 * OLDEST_S
+
+
+def state_news(robot: str, state: RobotState, link: str, extra: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the state: tracking, pose, rates, wheels, warnings.
+
+    link: why there is no connection to the robot; empty with one. extra: further entries.
+    """
+    quantiles = (0.5, 0.99)
+    return {
+        "robot": robot,
+        "link": link,
+        **{name: getattr(state, name) for name in ("alive", "state", "rate_hz", "missed", "broken")},
+        "fresh": state.rate_hz > 0,
+        "pose": None if state.pose is None else _pose(state.pose),
+        "age_ms": [1e3 * state.age.p(q) for q in quantiles],
+        "network_ms": [1e3 * state.network.p(q) for q in quantiles],
+        "wheels": _wheels(state),
+        "in_map": None if PLACES not in state.statuses else state.statuses[PLACES].message,
+        "pace": state.real_time_factor,
+        "warnings": _warnings(state, link),
+        "server_ms": server_ms(),
+        **extra,
+    }
+
+
+def browsable(value: Any) -> Any:
+    """Return a value as browsers are sent it: text is plain, a number has 6 digits, None is what JSON lacks."""
+    match value:
+        case dict():
+            return {key: browsable(inner) for key, inner in value.items()}
+        case list():
+            return [browsable(inner) for inner in value]
+        case str():
+            return plain(value)
+        case float():
+            return float(f"{value:.6g}") if math.isfinite(value) else None
+    return value
+
+
+def map_in_odom(in_map: PoseInMap, poses: Iterable[Pose]) -> list[float] | None:
+    """Return where the map's origin lies in odom, x, y [m] and yaw [rad]; None without a pose in odom at its time."""
+    pose = next((one for one in poses if one.stamp_ns == in_map.stamp_ns), None)
+    if pose is None:
+        return None
+    T_odom_map = pose.T_odom_base @ se3.inverse(in_map.T_map_base)
+    return [*T_odom_map[:2, -1].tolist(), float(se3.yaw(T_odom_map))]
+
+
+def parts_news(state: RobotState) -> list[dict[str, Any]]:
+    """Return all status entries, the worst first, stages last."""
+    return [
+        {
+            "name": short_name(part.name),
+            "level": part.level % len(LEVELS),
+            "message": part.message,
+            "values": [
+                [key[:LONGEST_VALUE], value[:LONGEST_VALUE]] for key, value in islice(part.values.items(), MOST_ENTRIES)
+            ],
+        }
+        for part in sorted(state.statuses.values(), key=importance)
+    ]
+
+
+def map_cells(grid: Map) -> tuple[dict[str, Any], bytes]:
+    """Return a map's size and place, and its cells: 0 unknown, 1 free, 2 occupied, row by row from low to high y.
+
+    The cells are deflated. The size is 0 unless the grid is in odom, which is the frame of the path, or in map, whose
+    place in odom is part of the state.
+    """
+    if not all(map(math.isfinite, (grid.cell_m, *grid.corner))) or not grid.cells.size or grid.frame not in FRAMES:
+        return {"width": 0, "frame": grid.frame}, b""
+    step = -(-max(grid.cells.shape) // LARGEST_MAP_PX)
+    cells = np.where(grid.cells > 50, 2, np.where(grid.cells >= 0, 1, 0)).astype(np.uint8)
+    # The highest value in each square of step x step cells.
+    squares = np.pad(cells, [(0, -edge % step) for edge in cells.shape])
+    cells = squares.reshape(-1, step, squares.shape[1] // step, step).max(axis=(1, 3))
+    header = {
+        "width": cells.shape[1],
+        "height": cells.shape[0],
+        "frame": grid.frame,
+        "cell_m": step * grid.cell_m,
+        "x_m": grid.corner[0],
+        "y_m": grid.corner[1],
+        "known": None,
+    }
+    # Left, low, right and high of what is known, m: a grid is as wide as views may reach.
+    rows, columns = np.nonzero(cells)
+    if rows.size:
+        edges = np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1])
+        header["known"] = (np.tile(grid.corner, 2) + step * grid.cell_m * edges).tolist()
+    return header, zlib.compress(cells.tobytes(), 1)
+
+
+def scan_news(scan: Scan, poses: Iterable[Pose]) -> dict[str, Any]:
+    """Return the nearest obstacles around the robot, in odom, and the nearest of all.
+
+    poses: the newest ones. The scan is drawn at the pose that is nearest in time. There are no points where there is no
+    pose, or where the scan is not in the robot's own frame.
+    """
+    place = min(poses, key=lambda pose: abs(pose.stamp_ns - scan.stamp_ns), default=None)
+    seen = (scan.ranges_m > 0) & (scan.ranges_m <= scan.max_range_m)
+    ranges_m, azimuths_rad = scan.ranges_m[seen].astype(float), scan.azimuths_rad[seen].astype(float)
+    if place is None or scan.frame != "base_link" or not ranges_m.size:
+        return {"points": [], "nearest": None}
+    nearest, angles = int(ranges_m.argmin()), azimuths_rad + place.yaw_rad
+    points = np.column_stack([place.x_m + ranges_m * np.cos(angles), place.y_m + ranges_m * np.sin(angles)])
+    turn_deg = math.degrees(math.remainder(float(azimuths_rad[nearest]), 2 * math.pi))
+    return {"points": points.tolist(), "nearest": [float(ranges_m[nearest]), turn_deg]}
+
+
+def navigation_news(report: NavigationReport) -> dict[str, Any]:
+    """Return what is driven or taught, and what became of the newest request."""
+    names = ("state", "reason", "task", "left_m", "teaching", "taught_m", "refusal")
+    return {name: getattr(report, name) for name in names}
+
+
+def _pose(pose: Pose) -> dict[str, Any]:
+    sigma = np.sqrt(np.maximum(0.0, pose.covariance.diagonal()))
+    return {
+        **{name: getattr(pose, name) for name in ("x_m", "y_m", "z_m", "yaw_rad")},
+        **{name: getattr(pose.attachment, name) for name in ("inliers", "tracked", "resets")},
+        "speed_mps": float(pose.velocity[0]),
+        "sigma_mm": 1e3 * float(sigma[:3].max()),
+        "sigma_deg": math.degrees(sigma[3:].max()),
+    }
+
+
+def _wheels(state: RobotState) -> dict[str, Any] | None:
+    """Return the wheels' entry; None where the robot has reported none, or its daemon has ended."""
+    status = state.statuses.get(WHEELS)
+    if status is None or state.alive is False:
+        return None
+    return {
+        "armed": status.values.get(Key.ARMED) == "1",
+        "message": status.message,
+        "level": status.level % len(LEVELS),
+        "source": status.values.get(Key.SOURCE, ""),
+    }
+
+
+def _warnings(state: RobotState, link: str) -> list[dict[str, Any]]:
+    """Return what is wrong, the worst first, each with its remedy."""
+    found = []
+    remedy = "start the daemon on the robot: omnid run, or systemctl start omnid"
+    if link:
+        found.append((2, "connection", link, "is the robot on, and on this network? check --connect"))
+    elif state.alive is False:
+        found.append((2, "robot", "its daemon has ended or cannot be reached", remedy))
+    for part in sorted(state.statuses.values(), key=importance):
+        if level := part.level % len(LEVELS):
+            found.append((level, short_name(part.name), part.message, part.values.get(Key.REMEDY, "")))
+    return [dict(zip(("level", "name", "message", "remedy"), row, strict=True)) for row in found]

@@ -16,7 +16,7 @@ from omnid.monitor.robot_state import RobotState
 from omnid.plain_text import MOST_ENTRIES, plain
 from omnid.tracking_state import TrackingState
 from omnid.transport.status_names import number, short_name
-from omnid.web.snapshot import LONGEST_VALUE
+from omnid.web.feed import LONGEST_VALUE
 
 _TEXTS: Final = {
     "dropped": "Messages of the robot that the inbox dropped",

@@ -29,9 +29,8 @@ from omnid.errors import OmnidError
 from omnid.monitor.navigation import stop
 from omnid.monitor.teleop import FIRST_SHARE, limits_of
 from omnid.transport.driver import ANSWER_S
-from omnid.web.feed import RobotFeed
+from omnid.web.feed import OLDEST_S, RobotFeed, is_recent, server_ms
 from omnid.web.metrics import metrics
-from omnid.web.snapshot import OLDEST_S, is_recent, server_ms
 
 LONGEST_BODY: Final = 1024  # more than the longest request has, a route with a name of 64 letters and its options
 _NUMBER: Final = r"(-?\d{1,6}(?:\.\d{1,4})?)"

@@ -76,7 +76,7 @@ def _messages(stamp_ns: int, numbers: np.random.Generator) -> Iterator[tuple[str
     pixels = numbers.integers(0, 256, (24, 32), dtype=np.uint8)
     status = DiagnosticStatus(ODOMETRY, 1, "über 90 °C", {Key.INLIERS: "3"})
     yield "/omnid/odom", codec.ODOMETRY_SCHEMA, codec.odometry_cdr(stamp_ns, T, one, twist, other)
-    yield "/omnid/pose", codec.POSE_SCHEMA, codec.pose_stamped_cdr(stamp_ns, T)
+    yield "/omnid/pose", codec.POSE_SCHEMA, codec.encoded(codec.POSE_SCHEMA, (stamp_ns, "odom"), T)
     yield "/tf", codec.TRANSFORM_SCHEMA, codec.transform_cdr(stamp_ns, [FrameTransform("odom", "base_link", T)])
     yield "/omnid/drive", codec.TWIST_SCHEMA, codec.twist_stamped_cdr(stamp_ns, "base_link", twist[0], twist[5])
     yield "/omnid/status", codec.DIAGNOSTICS_SCHEMA, codec.diagnostics_cdr(stamp_ns, [status])

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from omnid.cli import COMMANDS, REMOVED, command_at, main, parser_of
+from omnid.cli import COMMANDS, command_at, main, parser_of
 from omnid.config import Config
 from omnid.settings import value_at
 
@@ -51,13 +51,6 @@ def test_options_stand_for_settings_that_exist(words: str) -> None:
         if setting := getattr(action, "setting", None):
             value_at(Config(), setting)
         assert "  " not in (action.help or "") and "[" not in "".join(action.choices or ())
-
-
-@pytest.mark.parametrize("name", REMOVED)
-def test_what_was_removed_names_what_to_use_instead(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main([*name.split(), "x"])
-    assert ended.value.code == 2 and capsys.readouterr().err == f"omnid: `omnid {name}` was removed: {REMOVED[name]}\n"
 
 
 def test_the_shell_completes_commands_and_options(tmp_path: Path) -> None:

@@ -31,7 +31,6 @@ from omnid.transport.codec import (
     encoded,
     goal_cdr,
     goal_from_cdr,
-    header,
     path_cdr,
     path_from_cdr,
     string_cdr,
@@ -526,7 +525,7 @@ def test_what_begins_a_motion_needs_a_stamp_and_what_ends_one_does_not(topic: st
         ("goal", b""),
         ("goal", b"\0" * 4097),
         ("path", b"\0" * (LONGEST_PATH + 1)),
-        ("path", encoded(PATH_SCHEMA, header(1, "map"), [])),
+        ("path", encoded(PATH_SCHEMA, (1, "map"), [])),
         ("path", path_cdr(1, "map", [[0.0, 0.0], [0.0, math.nan]])),
         ("navigation", string_cdr("dance")),
         ("route", string_cdr("teach ../../etc/passwd")),
@@ -603,7 +602,7 @@ def test_an_imu_that_measures_no_rates_is_no_gyro_that_stands(lines: list[str]) 
 
 def joint_cdr(names: list[str], velocities: list[float], stamp_ns: int = OFFSET_NS + 7) -> bytes:
     parts = names, np.zeros(len(names)), np.array(velocities), np.zeros(0)
-    return encoded(JOINT_SCHEMA, header(stamp_ns, ""), *parts)
+    return encoded(JOINT_SCHEMA, (stamp_ns, ""), *parts)
 
 
 def test_wheels_are_joints_where_these_are_named(lines: list[str]) -> None:

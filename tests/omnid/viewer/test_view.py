@@ -206,7 +206,7 @@ def publish(bus: Bus, number: int) -> None:
         pose if number % 7 else b"nonsense",
         PoseAttachment(number, "degraded", 0, 50, 60, time.time_ns()).to_bytes(),
     )
-    bus.publish("map_pose", codec.pose_with_covariance_cdr(stamp_ns, se3.exp([0.2, 0, 0, 0, 0, 0]) @ T, np.eye(6)))
+    bus.publish("map_pose", codec.map_pose_cdr(stamp_ns, se3.exp([0.2, 0, 0, 0, 0, 0]) @ T, np.eye(6)))
     bus.publish("cloud", codec.point_cloud_cdr(stamp_ns, "odom", np.ones((5, 3)), np.ones(5)))
     statuses = [DiagnosticStatus(stage_name("odometry"), 0, "", {"work_p50_ms": "30.5"})]
     bus.publish("status", codec.diagnostics_cdr(stamp_ns, statuses))

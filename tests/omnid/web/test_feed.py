@@ -21,9 +21,8 @@ from omnid.transport.bus import BusConfig
 from omnid.transport.codec import Diagnostics, DiagnosticStatus, Map, Pose, PoseAttachment, Scan, scan_cdr
 from omnid.transport.sensor_codec import image_cdr
 from omnid.transport.status_names import NAVIGATION, ODOMETRY, PLACES, WHEELS, Key
-from omnid.web.feed import MOST_POINTS, LivePath, RobotFeed
+from omnid.web.feed import LARGEST_MAP_PX, MOST_POINTS, LivePath, RobotFeed, map_cells, scan_news, state_news
 from omnid.web.metrics import metrics
-from omnid.web.snapshot import LARGEST_MAP_PX, map_cells, scan_news, state_news
 from tests.omnid.transport.bus_fixtures import odometry
 
 # The path.
@@ -194,7 +193,7 @@ def test_a_robot_that_has_started_again_is_shown_without_what_belongs_to_its_odo
     feed.process_inbox()
     assert not feed.news(0).keys() & large.keys()
     add_pose(feed, 4, "b")
-    feed.state.put("map_pose", codec.pose_with_covariance_cdr(10**9 + 4, np.eye(4), np.eye(6)), b"")
+    feed.state.put("map_pose", codec.map_pose_cdr(10**9 + 4, np.eye(4), np.eye(6)), b"")
     feed.process_inbox()
 
     async def take() -> None:

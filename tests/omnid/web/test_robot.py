@@ -25,7 +25,7 @@ from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import PoseAttachment
 from omnid.transport.topics import Answer, Request, command_topics
-from omnid.web import robot, snapshot
+from omnid.web import feed, robot
 from omnid.web.feed import RobotFeed
 from omnid.web.robot import RobotPage
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry
@@ -92,7 +92,7 @@ def alone() -> RobotPage:
 def clock_ms(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """The server's time, which stands until a test changes it."""
     now_ms = [NOW_MS]
-    for module in (snapshot, robot):
+    for module in (feed, robot):
         monkeypatch.setattr(module, "server_ms", lambda: now_ms[0])
     return now_ms
 
