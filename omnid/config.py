@@ -155,6 +155,11 @@ class RecordConfig:
     REMOVED = MappingProxyType({"file_mb": "a new file begins at 500 MB"})
 
     enabled: Annotated[bool, "omnid run records images and results"] = False
+    images_hz: Annotated[
+        float,
+        Meta(ge=0, le=1000),
+        "pairs of images a second that omnid run records; 0: all, as omnid record does; 5: two hours in 20 GB",
+    ] = 5.0
     folder: Annotated[str, "folder of the recordings; it is made if it is missing"] = "recordings"
     file_mb: int = 500  # size at which a new file begins, MB
     keep_mb: Annotated[int, Meta(ge=2, le=1_000_000_000), "total size of all files, MB; the oldest are deleted"] = (
@@ -290,5 +295,5 @@ FIRST_SETTINGS: Final = (
     *(f"motor.{key}" for key in ("port", "protocol", "baud", "watchdog_ms")),
     *(f"motor.drive.{key}" for key in ("track_m", "wheel_radius_m", "max_wheel_mps", "gear")),
     *(f"bus.{key}" for key in ("robot", "listen", "connect", "config", "ros2")),
-    *(f"record.{key}" for key in ("enabled", "folder", "keep_mb", "free_mb")),
+    *(f"record.{key}" for key in ("enabled", "images_hz", "folder", "keep_mb", "free_mb")),
 )

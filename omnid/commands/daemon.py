@@ -141,7 +141,7 @@ def simulate(args: argparse.Namespace) -> int:
     code = run.run()
     # 2. Write the truth, and report contacts.
     if args.truth:  # the poses of the base since the first one, with the stamps of the poses on the bus
-        T = np.array([transform(pose) for pose in paced.truth.values()]).reshape(-1, 4, 4)
+        T = np.array([transform(np.array(pose)) for pose in paced.truth.values()]).reshape(-1, 4, 4)
         stamps_ns = np.array([run.clock.unix_ns(stamp_ns) for stamp_ns in paced.truth], np.int64)
         write_trajectory(args.truth, stamps_ns, se3.inverse(T[:1]) @ T)
     log(logging.INFO, f"contacts with obstacles: {paced.contacts}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Generator, Iterator
 from contextlib import closing
@@ -24,10 +25,11 @@ from omnid.config import Config
 from omnid.doctor import checks
 from omnid.doctor.wheel_wiring import tested_drive
 from omnid.errors import OmnidError
+from omnid.light.exposure import USUAL_HZ
 from omnid.service import install
 
 ROOT = Path("/")  # folder of sys, dev and proc
-BYTES_PER_PIXEL = 0.3  # upper bound for a JPEG of a textured image
+BYTES_PER_PIXEL = 0.2  # of a JPEG of quality 90 from below a mirror
 
 
 @command(SETTINGS, JSON)
@@ -58,7 +60,8 @@ def examine(config: Config) -> Iterator[checks.Finding]:
     yield from checks.motor(config.motor, ROOT)
     yield from checks.rights(max(wanted.motor_priority, wanted.capture_priority), wanted.lock_memory)
     yield from checks.compiled_functions()
-    rate = 2 * camera.width_px * camera.height_px * BYTES_PER_PIXEL * (camera.rate_hz or 30.0)
+    images_hz = min(camera.rate_hz or USUAL_HZ, config.record.images_hz or math.inf)
+    rate = 2 * camera.width_px * camera.height_px * BYTES_PER_PIXEL * images_hz
     yield from checks.disk(checks.STATE / config.record.folder, config.record, rate)
     yield checks.bus(config.bus)
 

@@ -188,11 +188,11 @@ def disk(folder: Path, config: RecordConfig, bytes_per_s: float) -> list[Finding
     place = next(path for path in (folder, *folder.parents) if path.exists())
     free = shutil.disk_usage(place).free
     room = min(free - config.free_mb * 10**6, config.keep_mb * 10**6)
-    is_full, minutes = room <= 0, room / bytes_per_s / 60
+    is_full, hours = room <= 0, room / bytes_per_s / 3600
     where = f"{free / 1e9:.1f} GB free at {place}"
     kept = (
-        f"{where}: the newest {room / 1e9:.1f} GB of recordings are kept, some {minutes:.0f} min at "
-        f"{bytes_per_s / 1e6:.0f} MB/s (record.keep_mb, cameras.rate_hz)"
+        f"{where}: the newest {room / 1e9:.1f} GB of recordings are kept, some {hours:.1f} h of JPEG at "
+        f"{bytes_per_s / 1e6:.1f} MB/s (record.keep_mb, record.images_hz)"
     )
     full = f"{where}: nothing is recorded below record.free_mb = {config.free_mb}"
     level: Level = "error" if config.enabled else "warning"

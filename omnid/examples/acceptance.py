@@ -1,7 +1,7 @@
 """The acceptance drive: is the robot as accurate on your floor as its rig promises?
 
 1. Tape two marks A and B on the floor, 10 to 20 m apart, and measure their distance with a tape measure.
-2. Record: `omnid record drive` (stop the daemon first), or `omnid run --set record.enabled=true`.
+2. Record: `omnid record drive` (stop the daemon first), or `omnid run` with record.enabled.
 3. Stand on A for 5 s, drive to B, stand for 5 s, drive back to A, stand: a round. Drive three, with the same point of
    the robot over each mark, and the same heading as before if you can. Pause nowhere within a fifth of their distance.
 4. `python -m omnid.examples.acceptance LOG DISTANCE_M [RIG.toml]`; LOG is the recording, or a trajectory (.txt, TUM).

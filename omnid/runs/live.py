@@ -256,7 +256,8 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
     if config.record.enabled:
         times = SegmentTime(clock)
         encode = session.encoder(rig, LOG_POINTS, times.unix_ns)
-        recorder = open_recorder(config, rig_toml(rig), report, encode=encode, time=times)
+        images_hz = config.record.images_hz
+        recorder = open_recorder(config, rig_toml(rig), report, encode=encode, time=times, images_hz=images_hz)
         session.outputs.callback(recorder.close)
 
     # 2. Who takes what the stages make.

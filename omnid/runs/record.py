@@ -23,17 +23,23 @@ PERIOD_S: Final = 15.0  # Time between two lines about the progress.
 
 
 def open_recorder(
-    config: Config, rig: str, report: EventCallback, *, encode: Encoder | None = None, time: SegmentTime | None = None
+    config: Config,
+    rig: str,
+    report: EventCallback,
+    *,
+    encode: Encoder | None = None,
+    time: SegmentTime | None = None,
+    images_hz: float = 0.0,
 ) -> Recorder:
     """Return a recorder to the folder of the configuration; the first message makes the first file.
 
     rig: the rig's TOML, or "" where there is none; it is attached to every file, as is the configuration.
-    report: takes severity and text of problems. encode, time: see Recorder.
+    report: takes severity and text of problems. encode, time, images_hz: see Recorder.
     """
     attachments = {"omnid.toml": dump(config).encode()} | ({"rig.toml": rig.encode()} if rig else {})
     folder = Path(config.record.folder)
     log = RotatingLog(folder, config.bus.robot, config.record.rotation(), attachments, on_event=report)
-    return Recorder(log, config.bus.robot, encode, time=time, skip_invalid=True)
+    return Recorder(log, config.bus.robot, encode, time=time, skip_invalid=True, images_hz=images_hz)
 
 
 def record(sources: Mapping[Camera, FrameSource], config: Config, rig: str, report: EventCallback) -> Recorder:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TypeAlias
@@ -9,6 +10,7 @@ from typing import TypeAlias
 from drivers.frame import Frame
 from drivers.logs.mcap_writer import LogWriter
 from drivers.logs.rotating_log import RotatingLog, RotatingLogState
+from omnid.core.nanoseconds import NS_PER_S
 from omnid.engine.robot_clock import SegmentTime, log_time
 from omnid.errors import OmnidError
 from omnid.messages import OdometryUpdate
@@ -49,6 +51,32 @@ class SingleLog:
         self.state.status = "closed"
 
 
+class ThinnedPairs:
+    """Passes pairs of images on at a bounded rate: a lower image that is due, and the upper one nearest in time."""
+
+    def __init__(self, rate_hz: float) -> None:
+        """rate_hz: pairs a second; 0: all images."""
+        self._period_ns = round(NS_PER_S / rate_hz) if rate_hz else 0
+        self._periods = -1  # of the newest lower image that was passed on
+        self._wanted_ns: int | None = None  # its stamp, while its partner has not come
+        self._upper: deque[Frame] = deque(maxlen=3)  # the newest ones
+
+    def take(self, frame: Frame) -> list[Frame]:
+        """Take the next image of a camera; return those to pass on."""
+        if not self._period_ns:
+            return [frame]
+        found = []
+        if frame.camera != "lower":
+            self._upper.append(frame)
+        elif frame.stamp_ns // self._period_ns > self._periods:
+            self._periods, self._wanted_ns = frame.stamp_ns // self._period_ns, frame.stamp_ns
+            found.append(frame)
+        if (wanted_ns := self._wanted_ns) is not None and self._upper and self._upper[-1].stamp_ns >= wanted_ns:
+            found.append(min(self._upper, key=lambda upper: abs(upper.stamp_ns - wanted_ns)))
+            self._wanted_ns = None
+        return found
+
+
 class Recorder:
     """A sink that writes every message under `/<robot>/`.
 
@@ -68,11 +96,16 @@ class Recorder:
         *,
         time: SegmentTime | None = None,
         skip_invalid: bool = False,
+        images_hz: float = 0.0,
     ) -> None:
-        """time: that of the files, which the encoder has as well; None: the stamps are Unix time."""
+        """time: that of the files, which the encoder has as well; None: the stamps are Unix time.
+
+        images_hz: pairs of images a second that are recorded; 0: all.
+        """
         self._log, self._robot, self._encode = log, robot, encode
         self._time, self._skip_invalid = time or SegmentTime(log_time()), skip_invalid
         self._changes = None if encode is None else Changes(encode)
+        self._thinned = ThinnedPairs(images_hz)
         self._files = 0
         self.newest_ns = 0
         self.invalid = 0
@@ -97,7 +130,9 @@ class Recorder:
         stamp_ns, encode = self._time.unix_ns(message.stamp_ns), self._encode
         try:
             if isinstance(message, Frame):
-                self._write([OutgoingMessage(image_topic(message), *image_cdr(message, stamp_ns))], stamp_ns)
+                for frame in self._thinned.take(message):
+                    frame_ns = self._time.unix_ns(frame.stamp_ns)
+                    self._write([OutgoingMessage(image_topic(frame), *image_cdr(frame, frame_ns))], frame_ns)
             elif encode is not None:
                 self._write(encode(message), stamp_ns)
                 # Each file has all of what seldom changes.

@@ -563,7 +563,7 @@ def path_cdr(stamp_ns: int, frame: str, xy: ArrayLike, heading_rad: float | None
     headings: list[float | None] = [float(math.atan2(dy, dx)) for dx, dy in steps]
     headings[-1:] = [heading_rad]
     head = stamp_ns, frame
-    poses = [(head, _planar_pose(*point, heading)) for point, heading in zip(points.tolist(), headings, strict=True)]
+    poses = [(head, _planar_pose(x, y, heading)) for (x, y), heading in zip(points.tolist(), headings, strict=True)]
     return encoded(PATH_SCHEMA, head, poses)
 
 

@@ -139,7 +139,10 @@ def test_sends_commands() -> None:
     (twist, a, *_), (heading, b, *_), (stop, *_), (arm, c, _, sent_ns, *_), (planned, d, *_), _ = received
     assert (twist, heading, stop, arm) == ("cmd/twist", "cmd/heading", "cmd/stop", "cmd/arm")
     assert planned == "cmd/planner/twist" and codec.twist_from_cdr(d)[1:4] == ("base_link", 0.5, -0.25)
-    assert codec.header_stamp_ns(codec.decoded(c, codec.HEADER_SCHEMA)) == sent_ns and before_ns <= sent_ns <= time.time_ns()
+    assert (
+        codec.header_stamp_ns(codec.decoded(c, codec.HEADER_SCHEMA)) == sent_ns
+        and before_ns <= sent_ns <= time.time_ns()
+    )
     senders = [request.sender for request in received]
     assert len({senders[0], senders[1], senders[2], senders[4]}) == 1 and senders[5] != senders[0]
     assert all(len(sender) >= 16 for sender in senders)

@@ -12,7 +12,11 @@ from tests.waiting import wait_until
 def recorded_run(scene: Path, folder: Path, poses: int) -> Path:
     """Return a recording of at least so many poses, at half speed so that an idle machine drops no image."""
     port, base, kept = free_port(), Base(folder), folder / "kept"
-    more = ("--pace", "0.5", *patient("record.enabled=true", f"record.folder={kept}", "record.free_mb=0"))
+    more = (
+        "--pace",
+        "0.5",
+        *patient("record.enabled=true", "record.images_hz=0", f"record.folder={kept}", "record.free_mb=0"),
+    )
     with started(command_line(scene, port, base.port, *more), port) as daemon:
         wait_until(lambda: answers(port) or not daemon.alive, "the bus")
         operator = Operator(port)

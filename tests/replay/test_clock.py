@@ -20,7 +20,11 @@ AHEAD_S = (3600, -3600, 30)  # of the daemon's clock, one after the other
 def test_stamps_follow_the_clock_and_an_operator_drives_on_by_the_robots_own_time(course: Path, tmp_path: Path) -> None:
     recordings = tmp_path / "recordings"
     settings = patient(
-        "record.enabled=true", f"record.folder='{recordings}'", "record.free_mb=0", "controller.deadlines.command_s=8"
+        "record.enabled=true",
+        "record.images_hz=0",
+        f"record.folder='{recordings}'",
+        "record.free_mb=0",
+        "controller.deadlines.command_s=8",
     )
     with robot(course, tmp_path, *settings, module=FAULTY) as (daemon, operator, base):
         with Robot(connect=f"tcp/127.0.0.1:{daemon.port}") as client:

@@ -155,8 +155,8 @@ def test_checks_the_rights_of_this_user() -> None:
 
 
 def test_checks_the_space_for_recordings(tmp_path: Path) -> None:
-    (found,) = disk(checks.STATE / "not" / "yet", RecordConfig(keep_mb=10, free_mb=0), 1e6)
-    assert found.level == "ok" and f"free at {checks.STATE.parent}" in found.found and "newest 0.0 GB" in found.found
+    (found,) = disk(checks.STATE / "not" / "yet", RecordConfig(keep_mb=360, free_mb=0), 1e5)
+    assert found.level == "ok" and f"free at {checks.STATE.parent}" in found.found and "some 1.0 h" in found.found
     for enabled, level in ((False, "warning"), (True, "error")):
         (found,) = disk(checks.STATE, RecordConfig(enabled=enabled, free_mb=10**9), 1e6)
         assert found.level == level and "record.free_mb = 1000000000" in found.found

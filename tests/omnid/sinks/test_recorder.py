@@ -73,6 +73,23 @@ def test_recorded_images_are_read_unchanged_and_found_by_name(tmp_path: Path, en
         assert np.array_equal(gray(read), gray(each))
 
 
+@pytest.mark.parametrize("upper_first", [False, True])
+@pytest.mark.parametrize("skew_ns", [-16_000_000, 100_000, 16_000_000])
+def test_a_recording_of_fewer_images_holds_whole_pairs(tmp_path: Path, skew_ns: int, upper_first: bool) -> None:
+    """Of three seconds at 30 Hz 15 pairs at 5 Hz; the images of each are as far apart as the cameras are."""
+    recorder = open_recorder(settings(tmp_path), "", lambda *_: None, time=times(), images_hz=5.0)
+    for n in range(92):
+        lower, upper = frame(n, "lower"), frame(n, "upper")
+        upper = replace(upper, stamp_ns=upper.stamp_ns + skew_ns)
+        for each in (upper, lower) if upper_first else (lower, upper):
+            recorder.process(each)
+    recorder.close()
+    found = list(LogReader(recorded(tmp_path)[0]).frames())
+    stamps = {camera: [one.stamp_ns for one in found if one.camera == camera] for camera in ("lower", "upper")}
+    assert 15 <= len(stamps["lower"]) <= 16
+    assert {b - a for a, b in zip(stamps["lower"], stamps["upper"], strict=False)} == {skew_ns}
+
+
 def odometry(seq: int, state: str = "tracking") -> OdometryUpdate:
     return OdometryUpdate(
         seq, 5 * 10**9 + seq, np.eye(4), np.eye(6), np.zeros(6), np.eye(6), state, 0, 50, 60, small_depth()
