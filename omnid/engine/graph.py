@@ -1,9 +1,9 @@
-"""The graph of stages and its threads: inboxes, tickers, the end of a run. Few other modules import threading.
+"""The graph of stages and its threads: inboxes, tickers, the end of a run.
 
 A stream exists before it is read, so a cycle cannot be wired. A thread has one bounded inbox, from which it serves its
 stages in the order of arrival; between stages of one thread messages pass directly. The end of a stream is the last
 message of it. Inline, the same stages run in the caller's thread, each message depth first, with the same results.
-With several sources, or where streams merge, only the inline order is fixed.
+Where streams of several threads merge, only the inline order is fixed.
 """
 
 from __future__ import annotations
@@ -12,11 +12,10 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import Enum
 from functools import partial
-from queue import Empty, SimpleQueue
 from typing import Any, Final, Generic, Protocol, TypeAlias, TypeVar
 
 from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
@@ -94,16 +93,15 @@ class Node:
     def put(self, message: object) -> None:
         """Process the message, and pass its result on; at the end of the last input what remains, and the end."""
         graph, name = self._graph, self.stats.name
+        is_over = graph.aborting or name in graph.failed
         if message is END:
             self.writers -= 1
-            if self.writers:
-                return
-            if name not in graph.failed and not graph.aborting:
+            if not self.writers:
                 with graph.watched(name):
-                    for result in self._finish() or ():
+                    for result in () if is_over else self._finish() or ():
                         self.stream.push(result)
-            self.stream.push(END)
-        elif not self.writers or name in graph.failed:
+                self.stream.push(END)
+        elif is_over or not self.writers:
             self.stats.dropped += 1
         else:
             with graph.watched(name):
@@ -113,7 +111,7 @@ class Node:
 
 
 @dataclass(slots=True, eq=False)
-class Link:
+class _Link:
     """One of the streams that a node reads, with the bound of what may wait of it."""
 
     node: Node
@@ -122,73 +120,43 @@ class Link:
     waiting: int = 0
 
 
-class Inbox:
+class _Inbox:
     """Bounded queue in front of a thread, from which it serves its nodes.
 
     With the policy NEWEST a stream drops its own oldest message, so none of two cameras takes the place of the other
     one's image.
     """
 
-    def __init__(self, lock: threading.Lock, idle: threading.Condition) -> None:
-        """lock: of all inboxes of the graph. idle: notified when the reader has done all that waited."""
-        self.nodes: list[Node] = []
-        self._changed, self._idle = threading.Condition(lock), idle
-        self._messages: deque[tuple[Link, object]] = deque()
-        self._is_busy = self._is_closed = False
+    def __init__(self, graph: Graph) -> None:
+        self.nodes: set[Node] = set()
+        self._graph, self._changed = graph, threading.Condition(graph.lock)
+        self._messages: deque[tuple[_Link, object]] = deque()
 
-    @property
-    def is_idle(self) -> bool:
-        """True if no message waits or is being processed; to be asked under the lock."""
-        return not self._messages and not self._is_busy
-
-    def put(self, link: Link, message: object) -> None:
+    def put(self, link: _Link, message: object) -> None:
         """Add a message of a stream; the end of one always has room."""
-        stats = link.node.stats
         with self._changed:
-            if message is not END:
-                if link.policy is LOSSLESS:
-                    self._changed.wait_for(lambda: self._is_closed or link.waiting < link.depth)
-                elif link.waiting >= link.depth:
-                    del self._messages[next(k for k, (other, _) in enumerate(self._messages) if other is link)]
-                    link.waiting -= 1
-                    stats.dropped += 1
-                if self._is_closed:
-                    stats.dropped += 1
-                    return
-                link.waiting += 1
-                stats.busy_since_ns = stats.busy_since_ns or time.monotonic_ns()
+            if message is not END and link.policy is LOSSLESS:
+                self._changed.wait_for(lambda: link.waiting < link.depth)
+            elif message is not END and link.waiting >= link.depth:
+                del self._messages[next(k for k, (other, _) in enumerate(self._messages) if other is link)]
+                link.waiting -= 1
+                link.node.stats.dropped += 1
+                self._graph.waiting -= 1
+            link.waiting += message is not END
+            self._graph.waiting += 1
             self._messages.append((link, message))
             self._changed.notify_all()
 
     def serve(self) -> None:
         """Pass the messages to their nodes until all streams of these have ended."""
         while any(node.writers for node in self.nodes):
-            # 1. The next message.
             with self._changed:
                 self._changed.wait_for(lambda: self._messages)
                 link, message = self._messages.popleft()
-                self._is_busy = True
                 link.waiting -= message is not END
                 self._changed.notify_all()
-            # 2. Its node does the work.
             link.node.put(message)
-            # 3. It is done.
-            with self._changed:
-                self._is_busy = False
-                waits = any(other.node is link.node for other, _ in self._messages)
-                link.node.stats.busy_since_ns = time.monotonic_ns() if waits else 0
-                if not self._messages:
-                    self._idle.notify_all()
-
-    def close(self) -> None:
-        """Drop and count all messages, those to come too; the ends of streams stay."""
-        with self._changed:
-            self._is_closed = True
-            for link, message in self._messages:
-                link.node.stats.dropped += message is not END
-                link.waiting = 0
-            self._messages = deque(each for each in self._messages if each[1] is END)
-            self._changed.notify_all()
+            self._graph.done()
 
 
 @dataclass(slots=True, eq=False)
@@ -230,17 +198,16 @@ class Graph:
     ) -> None:
         self.telemetry, self.policy = Telemetry(), policy
         self._threaded, self._depth, self._on_thread, self._sinks_wait = threaded, depth, on_thread, sinks_wait
-        self._lock = threading.Lock()
-        self._idle = threading.Condition(self._lock)
+        self.lock = threading.Lock()  # of all inboxes
+        self._idle = threading.Condition(self.lock)
+        self.waiting = 0  # messages in all inboxes, with those that are processed; under the lock
         self._sources: list[_Source] = []
         self._inlets: list[Stream[Any]] = []
-        self._inboxes: dict[str, Inbox] = {}  # by thread
+        self._inboxes: dict[str, _Inbox] = {}  # by thread
         self._tickers: dict[str, list[_Ticker]] = {}  # by thread
-        self._ended: set[str] = set()  # names of threads
         self.failed: set[str] = set()  # names of stages
         self._errors: list[BaseException] = []
         self._stops: deque[None] = deque(maxlen=2)
-        self._wakeup: SimpleQueue[None] = SimpleQueue()  # its put is reentrant, so safe in a signal handler
         self._no_ticks = threading.Event()
         self._open_sources = 0
 
@@ -251,7 +218,8 @@ class Graph:
     ) -> Stream[T]:
         """Add a source: an iterable that is opened, read and closed in the source's own thread.
 
-        `wake` is called once to end a threaded run early: it must end the current read and all later ones.
+        `wake` is called once to end a threaded run early: it must end the current read and all later ones. Inline,
+        sources are read one after the other.
         """
         stream: Stream[T] = Stream(name)
         self._sources.append(_Source(self.telemetry.add(StageStats(name)), messages, wake, stream))
@@ -306,10 +274,9 @@ class Graph:
             if not self._threaded or stream.thread == thread:
                 stream.readers.append(node.put)
                 continue
-            inbox = self._inboxes.setdefault(thread, Inbox(self._lock, self._idle))
-            if node not in inbox.nodes:
-                inbox.nodes.append(node)
-            link = Link(node, stream.depth, NEWEST) if stream.depth else Link(node, depth, policy)
+            inbox = self._inboxes.setdefault(thread, _Inbox(self))
+            inbox.nodes.add(node)
+            link = _Link(node, stream.depth, NEWEST) if stream.depth else _Link(node, depth, policy)
             stream.readers.append(partial(inbox.put, link))
         return node.stream
 
@@ -321,9 +288,7 @@ class Graph:
         Raises the first error of any stage with later ones in its notes, and KeyboardInterrupt after a second stop.
         """
         # 1. A thread for each source, each group of stages, and each group of tickers.
-        bodies: dict[str, Callable[[], object]] = {
-            source.stats.name: partial(deque, self._steps(source), 0) for source in self._sources
-        }
+        bodies: dict[str, Callable[[], object]] = {each.stats.name: partial(self._read, each) for each in self._sources}
         bodies |= {name: inbox.serve for name, inbox in self._inboxes.items()}
         work = [self._thread(name, body) for name, body in bodies.items()] if self._threaded else []
         ticks = [self._thread(name, partial(self._tick, group)) for name, group in self._tickers.items()]
@@ -331,11 +296,14 @@ class Graph:
         try:
             for thread in ticks + work:
                 thread.start()
-            self._wait(work) if self._threaded else self._run_inline()
+            if not self._threaded:
+                for source in self._sources:
+                    self._read(source)
+            self._join(work)
         except BaseException as error:  # from the caller's signal handler, or no thread could be started
             self._errors.insert(0, error)
             self._stops.extend((None, None))
-            self._wait(work)
+            self._join(work)
         finally:
             self._no_ticks.set()
             for thread in ticks:
@@ -355,7 +323,6 @@ class Graph:
         Takes no lock, so any thread or signal handler may call it.
         """
         self._stops.append(None)
-        self._wakeup.put(None)
 
     def settle(self) -> None:
         """Wait until all messages have been processed, or the run ends: for a source whose time is stopped meanwhile.
@@ -363,44 +330,45 @@ class Graph:
         Inline, nothing ever waits.
         """
         with self._idle:
-            while not self.is_stopping:
-                if self._idle.wait_for(lambda: all(inbox.is_idle for inbox in self._inboxes.values()), POLL_S):
-                    return
+            while not self.is_stopping and not self._idle.wait_for(lambda: not self.waiting, POLL_S):
+                pass
+
+    def done(self) -> None:
+        """Count a message that was in an inbox as processed."""
+        with self._idle:
+            self.waiting -= 1
+            if not self.waiting:
+                self._idle.notify_all()
 
     @property
     def aborting(self) -> bool:
         """True after a second stop: nothing is finished."""
         return len(self._stops) > 1
 
-    @contextmanager
-    def watched(self, name: str) -> Iterator[None]:
-        """End the run by an error in this block of a stage, which counts as failed."""
-        try:
-            yield
-        except GeneratorExit:  # of a source that is given up
-            raise
-        except BaseException as error:
-            error.add_note(f"in '{name}'")
-            self.failed.add(name)
-            self._errors.append(error)
-            self._wakeup.put(None)
-
     @property
     def is_stopping(self) -> bool:
         """True after a stop or a failure."""
         return bool(self._stops or self._errors)
 
+    @contextmanager
+    def watched(self, name: str) -> Iterator[None]:
+        """End the run by an error in this block of a stage, which counts as failed."""
+        try:
+            yield
+        except BaseException as error:
+            error.add_note(f"in '{name}'")
+            self.failed.add(name)
+            self._errors.append(error)
+
     def _thread(self, name: str, body: Callable[[], object]) -> threading.Thread:
         def run() -> None:
             self._on_thread(name)
             body()
-            self._ended.add(name)
-            self._wakeup.put(None)
 
         return threading.Thread(target=run, name=name)
 
-    def _steps(self, source: _Source) -> Iterator[None]:
-        """Pass on the messages of a source, one a step; then its stream ends, with the last one the inlets."""
+    def _read(self, source: _Source) -> None:
+        """Pass on the messages of a source; then its stream ends, and with the last one the inlets."""
         stats, messages = source.stats, iter(tuple[object]())
         with self.watched(stats.name):
             try:
@@ -409,25 +377,17 @@ class Graph:
                     for message in messages:
                         stats.add(start_ns)
                         source.stream.push(message)
-                        yield
                         if self.is_stopping:
                             break
                         start_ns = time.perf_counter_ns()
             finally:
                 getattr(messages, "close", nothing)()
         source.stream.push(END)
-        with self._lock:
+        with self.lock:
             self._open_sources -= 1
             is_last = not self._open_sources
         for inlet in self._inlets if is_last else ():
             inlet.push(END)
-
-    def _run_inline(self) -> None:
-        active = deque(map(self._steps, self._sources))
-        while active:  # round robin
-            steps = active.popleft()
-            if next(steps, END) is not END:
-                active.append(steps)
 
     def _tick(self, group: list[_Ticker]) -> None:
         """Call the actions of a thread, each at its rate, until the end; then close them.
@@ -440,32 +400,23 @@ class Graph:
             ticker = min(group, key=lambda each: each.deadline_ns)
             if self._no_ticks.wait(max(0.0, (ticker.deadline_ns - time.monotonic_ns()) * S_PER_NS)) or self.is_stopping:
                 break
-            stats, now_ns = ticker.stats, time.monotonic_ns()
-            skipped = max(0, now_ns - ticker.deadline_ns) // ticker.period_ns
+            skipped = max(0, time.monotonic_ns() - ticker.deadline_ns) // ticker.period_ns
             ticker.deadline_ns += (1 + skipped) * ticker.period_ns
-            stats.dropped += skipped
-            stats.busy_since_ns = now_ns
-            with self.watched(stats.name):
-                stats.timed(ticker.action)
-            stats.busy_since_ns = 0
+            ticker.stats.dropped += skipped
+            with self.watched(ticker.stats.name):
+                ticker.stats.timed(ticker.action)
         for ticker in group:
             with self.watched(ticker.stats.name):
                 getattr(ticker.action, "close", nothing)()
 
-    def _wait(self, threads: list[threading.Thread]) -> None:
-        """Wait for the threads that were started; pass a stop or a failure on to sources, tickers and inboxes."""
-        started = [thread for thread in threads if thread.ident is not None]
-        while not self._ended.issuperset(thread.name for thread in started):
-            with suppress(Empty):
-                self._wakeup.get(timeout=POLL_S)
-            if self.is_stopping:
-                self._no_ticks.set()
-                for source in self._sources:
-                    wake, source.wake = source.wake, nothing
-                    with self.watched(source.stats.name):
-                        wake()
-            if self.aborting:
-                for inbox in self._inboxes.values():
-                    inbox.close()
-        for thread in started:
-            thread.join()
+    def _join(self, threads: list[threading.Thread]) -> None:
+        """Wait for the threads that were started; pass a stop or a failure on to tickers and sources."""
+        for thread in threads:
+            while thread.is_alive():
+                thread.join(POLL_S)
+                if self.is_stopping:
+                    self._no_ticks.set()
+                    for source in self._sources:
+                        wake, source.wake = source.wake, nothing
+                        with self.watched(source.stats.name):
+                            wake()

@@ -59,8 +59,7 @@ class StageStats:
     """Counters of one stage, source, sink or ticker: written by its own thread, `dropped` under its inbox's lock.
 
     A source's durations are the waits for its next message; a ticker's `dropped` are missed deadlines.
-    `busy_since_ns` (CLOCK_MONOTONIC): since when a message waits or is processed and none has been finished; 0 when
-    idle. Only stages with an inbox and tickers set it.
+    `busy_since_ns` (CLOCK_MONOTONIC): since when a message is processed, or a ticker acts; 0 when idle.
     """
 
     name: str
@@ -72,8 +71,11 @@ class StageStats:
 
     def timed(self, call: Callable[..., T], *args: Any) -> T:
         """Return `call(*args)`, counted and timed; a call that raises is not counted."""
-        start_ns = time.perf_counter_ns()
-        result = call(*args)
+        start_ns, self.busy_since_ns = time.perf_counter_ns(), time.monotonic_ns()
+        try:
+            result = call(*args)
+        finally:
+            self.busy_since_ns = 0
         self.add(start_ns)
         return result
 
