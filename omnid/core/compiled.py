@@ -1,10 +1,10 @@
 """Functions compiled to machine code by numba: the one way in which loops over pixels and landmarks become fast.
 
-A compiled function lies in a file `*_kernels.py`, which imports numpy, this module and other such files only: numba
-keeps the code on disk by the file of the function itself, so it would not notice a change of a function or a constant
-in another file. Therefore the code is kept in a folder that is named by a digest of all these files. There is no second
-version in Python. Results are the same bytes in every run: no reordering of sums (fastmath), no threads inside. The
-global lock of Python is released meanwhile. Indices are not checked. numba is imported with the first compilation.
+A compiled function lies in a file `*_kernels.py`, which imports numpy, this module and other such files only. numba
+keeps its code on disk, and notices a change of that file, but none of the files that it imports: the folder of the code
+is therefore named by a digest of all of them. There is no second version in Python. Results are the same bytes in every
+run: no reordering of sums (fastmath), no threads inside. The global lock of Python is released meanwhile. Indices are
+not checked. numba is imported with the first compilation.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from __future__ import annotations
 import hashlib
 import inspect
 import os
-import platform
+import re
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -42,19 +42,16 @@ class Kernel(Generic[P, R]):
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
         """Call the function, which is compiled first if that was not done; TypeError for other types."""
         if self._compiled is None:
-            self.compile(kept_folder())
+            self.compile(is_kept=is_kept(self.function.__module__))
         return self._compiled(*args, **kwargs)  # type: ignore[misc]  # it is compiled now
 
-    def compile(self, folder: Path | None) -> None:
-        """Compile the function, or read it from a folder, which keeps it; None: nothing is read or kept."""
+    def compile(self, *, is_kept: bool) -> None:
+        """Compile the function. is_kept: read it from the folder of its file's code, or else write it there."""
         if self._compiled is not None:
             return
-        if folder is not None:
-            os.environ["NUMBA_CACHE_DIR"] = str(folder)
         import numba
 
-        if folder is not None:
-            numba.config.CACHE_DIR = str(folder)  # where another module has imported numba before
+        numba.config.CACHE_DIR = str(code_folder(self.function.__module__))
         types = eval(self.signature, dict(self.function.__globals__), vars(numba.types))
         names = inspect.signature(self.function).parameters
         wanted = [
@@ -62,7 +59,7 @@ class Kernel(Generic[P, R]):
             kind.copy(readonly=True) if isinstance(kind, numba.types.Array) and name not in self.writes else kind
             for kind, name in zip(types, names, strict=True)
         ]
-        self._compiled = numba.njit(tuple(wanted), cache=folder is not None, **OPTIONS)(self.function)
+        self._compiled = numba.njit(tuple(wanted), cache=is_kept, **OPTIONS)(self.function)
 
 
 class Inner(Generic[P, R]):
@@ -117,22 +114,37 @@ def cache_folder() -> Path:
     return (Path(base) if Path(base).is_absolute() else Path("~/.cache").expanduser()) / "omnid"
 
 
-def folder_of_state() -> Path:
-    """Return the folder for the code of these files, by these versions, for this processor."""
-    return cache_folder() / f"kernels-{_state()}"
+def kernel_modules() -> list[str]:
+    """Return the names of all modules with compiled functions, the largest files first."""
+    paths = sorted(PACKAGE.rglob(KERNEL_FILES), key=lambda path: path.stat().st_size, reverse=True)
+    return [".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts) for path in paths]
+
+
+def code_folder(module: str) -> Path:
+    """Return the folder for the code of a module: <module>-<digest of this installation>-<digest of its state>."""
+    return cache_folder() / _folder_name(module)
 
 
 @cache
-def _state() -> str:
-    """Return a digest of all that decides about the code, and of what numba compares: the times of the files."""
-    import llvmlite.binding as llvm
+def _folder_name(module: str) -> str:
+    installation = hashlib.sha256(str(PACKAGE).encode()).hexdigest()[:8]
+    # numba compares the time of the module's own file.
+    state = hashlib.sha256(repr((sys.version, version("numba"), _file(module).stat().st_mtime_ns)).encode())
+    for text in (Path(__file__).read_bytes(), *_texts(module)):
+        state.update(text)
+    return f"{module.rpartition('.')[2]}-{installation}-{state.hexdigest()[:20]}"
 
-    settings = sorted(pair for pair in os.environ.items() if pair[0].startswith("NUMBA_") and "CACHE" not in pair[0])
-    processor = platform.machine(), llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
-    digest = hashlib.sha256(repr((sys.version, version("numba"), processor, settings, str(PACKAGE))).encode())
-    for path in (Path(__file__), *sorted(PACKAGE.rglob(KERNEL_FILES))):
-        digest.update(repr((path.name, path.stat().st_mtime_ns, path.read_bytes())).encode())
-    return digest.hexdigest()[:20]
+
+def _file(module: str) -> Path:
+    return PACKAGE.parent.joinpath(*module.split(".")).with_suffix(".py")
+
+
+def _texts(module: str) -> Iterator[bytes]:
+    """Yield the content of the file of a module, and of those that it imports."""
+    text = _file(module).read_bytes()
+    yield text
+    for name in re.findall(rb"^from (\S+_kernels) import", text, re.MULTILINE):
+        yield from _texts(name.decode())
 
 
 def why_unusable(folder: Path) -> str:
@@ -152,7 +164,7 @@ def why_unusable(folder: Path) -> str:
     return ""
 
 
-def kept_folder() -> Path | None:
-    """Return the folder with the code of this state; None where there is none that only this user can write."""
-    folder = folder_of_state()
-    return folder if folder.is_dir() and not (why_unusable(cache_folder()) or why_unusable(folder)) else None
+def is_kept(module: str) -> bool:
+    """True if the code of a module was compiled into a folder that only this user can write."""
+    folder = code_folder(module)
+    return folder.is_dir() and not (why_unusable(cache_folder()) or why_unusable(folder))

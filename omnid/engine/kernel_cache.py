@@ -15,23 +15,13 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib import import_module
-from pathlib import Path
 from typing import Final
 
-from omnid.core.compiled import (
-    DECLARED,
-    KERNEL_FILES,
-    PACKAGE,
-    cache_folder,
-    folder_of_state,
-    kept_folder,
-    why_unusable,
-)
+from omnid.core.compiled import DECLARED, cache_folder, code_folder, is_kept, kernel_modules, why_unusable
 from omnid.engine.logging_setup import Report, log
 from omnid.engine.process import python, python_environment
 from omnid.errors import OmnidError
 
-KEPT_STATES: Final = 20  # other states whose code stays, 3 MB each: of other installations, and of earlier versions
 CHILDREN: Final = 2  # 480 MB with the program that waits, of the 768 that the service may have
 
 _prepared: set[str] = set()  # names of the modules whose functions are ready
@@ -43,7 +33,8 @@ def prepare_kernels(report: Report = log) -> None:
     The second call and later ones do nothing. Raises OmnidError where the system allows no code that is made at run
     time.
     """
-    if all(name in _prepared for name in _modules()):
+    modules = kernel_modules()
+    if _prepared.issuperset(modules):
         return
     # 1. Without executable memory numba would end the program.
     if problem := why_no_code():
@@ -52,23 +43,24 @@ def prepare_kernels(report: Report = log) -> None:
         )
     # 2. Compile what is not on the disk, and read it.
     started_s, reason = time.monotonic(), why_unusable(cache_folder())
-    if not reason and kept_folder() is None:
-        reason = _compile_in_children(report)
+    if not reason:
+        reason = _compile_in_children([name for name in modules if not is_kept(name)], report)
     if not reason:
         try:
-            compile_modules(_modules(), kept_folder())
+            compile_modules(modules, is_kept=True)
         except Exception as error:  # what pickle and LLVM raise for damaged files
-            shutil.rmtree(folder_of_state(), ignore_errors=True)
+            for name in modules:
+                shutil.rmtree(code_folder(name), ignore_errors=True)
             reason = f"what was there is damaged ({type(error).__name__})"
     # 3. Or compile it for this run only.
     if reason:
-        compile_modules(_modules(), None)
+        compile_modules(modules, is_kept=False)
         report(
             logging.WARNING,
             f"the compiled functions are not kept in {cache_folder()}: {reason}: this start took "
             f"{time.monotonic() - started_s:.0f} s longer; make that folder writable, or set OMNID_CACHE_DIR",
         )
-    _prepared.update(_modules())
+    _prepared.update(modules)
 
 
 def why_no_code() -> str:
@@ -80,41 +72,39 @@ def why_no_code() -> str:
     return ""
 
 
-def _modules() -> list[str]:
-    """Return the names of all modules with compiled functions, the largest files first."""
-    paths = sorted(PACKAGE.rglob(KERNEL_FILES), key=lambda path: path.stat().st_size, reverse=True)
-    return [".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts) for path in paths]
-
-
-def compile_modules(names: Sequence[str], folder: Path | None) -> None:
-    """Compile the functions of modules that were not compiled before, or read them from a folder, which keeps them."""
+def compile_modules(names: Sequence[str], *, is_kept: bool) -> None:
+    """Compile the functions of modules that were not compiled before. is_kept: read them, or else write them."""
     for name in names:
         import_module(name)
     for kernel in tuple(DECLARED):
         if kernel.function.__module__ in names:
-            kernel.compile(folder)
+            kernel.compile(is_kept=is_kept)
 
 
-def _compile_in_children(report: Report) -> str:
-    """Compile all functions into the folder of this state by programs of their own; return why that failed, or ""."""
-    folder, names, started_s = folder_of_state(), _modules(), time.monotonic()
-    shutil.rmtree(folder, ignore_errors=True)  # one that others could write to
-    # Remove the oldest folders of other states.
-    others = sorted(cache_folder().glob("kernels-*"), key=lambda path: path.stat().st_mtime)
-    for path in others[:-KEPT_STATES]:
-        shutil.rmtree(path, ignore_errors=True)
-    with suppress(FileExistsError):  # of another program that has just begun
-        folder.mkdir(mode=0o700)
+def _compile_in_children(names: Sequence[str], report: Report) -> str:
+    """Compile modules into their folders by programs of their own; return why that failed, or ""."""
+    if not names:
+        return ""
+    # 1. A new folder for each, in place of those of its earlier states.
+    started_s = time.monotonic()
+    for folder in map(code_folder, names):
+        if why_unusable(folder):  # others could write to it
+            shutil.rmtree(folder, ignore_errors=True)
+            with suppress(FileExistsError):  # of another program that has just begun
+                folder.mkdir(mode=0o700)
+        for earlier in {*folder.parent.glob(f"{folder.name.rpartition('-')[0]}-*")} - {folder}:
+            shutil.rmtree(earlier, ignore_errors=True)
+    # 2. The programs.
     report(logging.INFO, "compiling the loops over pixels and landmarks for this processor, once; takes half a minute")
     children = [
         subprocess.Popen(
-            python("-m", __name__, str(folder), *names[number::CHILDREN]),
+            python("-m", __name__, *names[number::CHILDREN]),
             env=python_environment(),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
-        for number in range(CHILDREN)
+        for number in range(min(CHILDREN, len(names)))
     ]
     try:
         codes = [child.wait() for child in children]
@@ -122,11 +112,12 @@ def _compile_in_children(report: Report) -> str:
         for child in children:
             child.kill()
     if any(codes):
-        shutil.rmtree(folder, ignore_errors=True)
+        for folder in map(code_folder, names):
+            shutil.rmtree(folder, ignore_errors=True)
         return f"the programs that compile them ended with {codes}"
     report(logging.INFO, f"compiled in {time.monotonic() - started_s:.0f} s; kept in {cache_folder()}")
     return ""
 
 
-if __name__ == "__main__":  # a program that fills a folder with the functions of modules
-    compile_modules(sys.argv[2:], Path(sys.argv[1]))
+if __name__ == "__main__":  # a program that compiles modules and keeps their code
+    compile_modules(sys.argv[1:], is_kept=True)

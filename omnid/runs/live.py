@@ -20,7 +20,7 @@ from drivers.motor import VelocityCommand
 from omnid.config import Config
 from omnid.controller.link import DriveLink
 from omnid.controller.statistics import ARMED, ControllerState
-from omnid.core.compiled import kept_folder
+from omnid.core.compiled import is_kept, kernel_modules
 from omnid.core.control.arming import MANUAL, NO_ANSWER
 from omnid.core.control.command_sources import PLANNER
 from omnid.core.control.safety_rules import AWAITED, NO_POSE
@@ -447,5 +447,5 @@ def _load() -> None:
     with suppress(Exception):
         compile_serialisers(schemas)
     with suppress(Exception):
-        if kept_folder() is not None:  # else they are compiled when the rig is known to be right
+        if all(map(is_kept, kernel_modules())):  # else they are compiled when the rig is known to be right
             prepare_kernels()

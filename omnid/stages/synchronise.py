@@ -28,7 +28,7 @@ RECENT: Final = 30  # pairs, and steps between the stamps of a camera, by which 
 STAMP_SIGMA_NS: Final = 1_500_000  # scatter of the stamps of cameras that are triggered together, before it is known
 FROZEN_IMAGES: Final = 5  # repeated images in a row after which a camera counts as frozen: a single one may be a glitch
 MAX_WAITING: Final = 4  # frames of a camera that wait: the other camera may be delivered a few periods later
-MOST_APART_NS: Final = 100_000_000  # Largest difference of a pair, because a pause at the start is no period.
+MOST_APART_NS: Final = NS_PER_S // 10  # Largest difference of a pair, because a pause at the start is no period.
 MOST_WAITING: Final = 4096  # samples of wheels and gyro: ten seconds of a gyro of 400 Hz
 AHEAD_NS: Final = 5 * NS_PER_S  # a sample that is later than a pair by more has a stamp of another clock
 
@@ -127,9 +127,9 @@ class RepeatedImages:
     def add(self, image: Image) -> bool:
         """Take the next image (H, W); return True if it repeats the one before."""
         earlier, self._earlier = self._earlier, image
-        # One row decides at once for images that are not equal: the noise of any real image differs there.
-        repeated = (
-            earlier is not None and np.array_equal(image[::2, 0], earlier[::2, 0]) and np.array_equal(image, earlier)
+        # One column decides at once for images that are not equal: the noise of any real image differs there.
+        repeated = earlier is not None and all(
+            np.array_equal(image[part], earlier[part]) for part in (np.s_[:, 0], ...)
         )
         self.count += repeated
         self._in_a_row = self._in_a_row + 1 if repeated else 0
@@ -153,7 +153,7 @@ class MotionInbox:
 
     def add(self, sample: MotionSample) -> None:
         """Add a sample, unless its rates are not finite, which would make the poses not finite too."""
-        is_wheel = isinstance(sample, WheelSample)
+        gyro = sample if isinstance(sample, GyroSample) else None
         rates: tuple[float, ...] = (
             (sample.velocity_mps,)
             if isinstance(sample, WheelSample)
@@ -162,9 +162,9 @@ class MotionInbox:
         if not all(map(math.isfinite, rates)):
             self.dropped += 1
             return
-        self.wheels += is_wheel
-        self.gyro += not is_wheel
-        if self._R_base_imu is not None and isinstance(sample, GyroSample) and not sample.of_base:
+        self.wheels += gyro is None
+        self.gyro += gyro is not None
+        if gyro is not None and self._R_base_imu is not None and not gyro.of_base:
             x, y, z = (self._R_base_imu @ rates).tolist()
             sample = GyroSample(sample.stamp_ns, x, y, z, of_base=True)
         self.dropped += len(self._waiting) == MOST_WAITING
@@ -175,11 +175,10 @@ class MotionInbox:
         waiting = sorted((self._waiting.popleft() for _ in range(len(self._waiting))), key=lambda each: each.stamp_ns)
         sane = [sample for sample in waiting if sample.stamp_ns - stamp_ns <= AHEAD_NS]
         self.dropped += len(waiting) - len(sane)
-        due = [sample for sample in sane if sample.stamp_ns <= stamp_ns]
-        later = sane[len(due) :]
+        later = [sample for sample in sane if sample.stamp_ns > stamp_ns]
         self._waiting.extendleft(reversed(later))
         first = {type(sample): sample for sample in reversed(later)}
-        return (*due, *(sample for sample in later if sample is first[type(sample)]))
+        return tuple(sample for sample in sane if sample.stamp_ns <= stamp_ns or sample is first[type(sample)])
 
 
 class _Camera:
@@ -205,10 +204,11 @@ class _Camera:
         self.arrived += 1
         self.waiting.append(frame)
 
-    def drop_oldest(self) -> None:
-        """Give a frame up that has found no partner."""
-        self.waiting.popleft()
-        self.unpaired += 1
+    def drop_until(self, count: int) -> None:
+        """Give up the oldest frames, which have found no partner, until this number waits."""
+        while len(self.waiting) > count:
+            self.waiting.popleft()
+            self.unpaired += 1
 
 
 class Synchronise:
@@ -218,10 +218,9 @@ class Synchronise:
     pair by a period. The tolerance is pair.tolerance_ms; 0: half the period of the faster camera, so that every image
     of the slower one finds its nearest partner whatever the phase between the cameras.
 
-    Live cameras and logs need no different policy. A log's frames come in the order of all stamps, a live camera's in
-    that of its own: the first is a case of the second. Images are decoded once they have a partner, so that a camera
-    without the other one costs no time. A frame that cannot be decoded counts as `broken` and is treated as if it
-    had never come; one that never finds a partner is not decoded and counts as unpaired.
+    A log's frames come in the order of all stamps, a live camera's in that of its own: the first is a case of the
+    second. Images are decoded once they have a partner. A frame that cannot be decoded counts as `broken` and is
+    treated as if it had never come; one that never finds a partner counts as unpaired.
 
     A pair with an image that repeats the one before of its camera is no new evidence: it is counted and not returned,
     unless pair.repeated_images is "use".
@@ -289,33 +288,29 @@ class Synchronise:
             self.motion.add(message)
             return None
         # 1. The frame waits for a partner.
-        camera = self._cameras[message.camera]
-        camera.arrive(message)
+        self._cameras[message.camera].arrive(message)
         # 2. The two frames that are nearest in time make a pair, unless one of them is broken.
-        lower_waiting, upper_waiting = (each.waiting for each in self._cameras.values())
-        while lower_waiting and upper_waiting:
-            lower, upper = min(product(lower_waiting, upper_waiting), key=_gap_ns)
-            gap_ns = _gap_ns((lower, upper))
-            if gap_ns > self._tolerance_ns:
-                self._closest_miss_ns = min(gap_ns, self._closest_miss_ns)  # the first where the second is NaN
+        lower, upper = self._cameras.values()
+        while lower.waiting and upper.waiting:
+            frames = min(product(lower.waiting, upper.waiting), key=_gap_ns)
+            if _gap_ns(frames) > self._tolerance_ns:
+                # The first where the second is NaN.
+                self._closest_miss_ns = min(_gap_ns(frames), self._closest_miss_ns)
                 break
-            lower_image, upper_image = self._decode(lower), self._decode(upper)
-            if lower_image is None:
-                lower_waiting.remove(lower)
-            if upper_image is None:
-                upper_waiting.remove(upper)
-            if lower_image is not None and upper_image is not None:
-                return self._joined(lower, lower_image, upper, upper_image)
+            images = [self._decode(frame) for frame in frames]
+            for camera, frame, image in zip((lower, upper), frames, images, strict=True):
+                if image is None:
+                    camera.waiting.remove(frame)
+            if images[0] is not None and images[1] is not None:
+                return self._joined(frames, (images[0], images[1]))
         # 3. Only a few wait.
-        if len(camera.waiting) > MAX_WAITING:
-            camera.drop_oldest()
+        self._cameras[message.camera].drop_until(MAX_WAITING)
         return None
 
     def finish(self) -> tuple[()]:
         """Count the frames that still wait."""
         for camera in self._cameras.values():
-            while camera.waiting:
-                camera.drop_oldest()
+            camera.drop_until(0)
         return ()
 
     @property
@@ -324,28 +319,22 @@ class Synchronise:
         # Before the period is known, only what the scatter of the stamps explains.
         return self._fixed_ns or min(min(periods_ns, default=8 * STAMP_SIGMA_NS) / 2, MOST_APART_NS)
 
-    def _joined(self, lower: Frame, lower_image: Image, upper: Frame, upper_image: Image) -> FramePair | None:
+    def _joined(self, frames: tuple[Frame, Frame], images: tuple[Image, Image]) -> FramePair | None:
         # 1. Frames that waited before these can match no later one: they are given up.
-        for camera, frame in zip(self._cameras.values(), (lower, upper), strict=True):
-            while camera.waiting[0] is not frame:
-                camera.drop_oldest()
+        for camera, frame in zip(self._cameras.values(), frames, strict=True):
+            camera.drop_until(len(camera.waiting) - camera.waiting.index(frame))
             camera.waiting.popleft()
         # 2. Images that show nothing new.
+        lower, upper = frames
         self.skew.add(upper.stamp_ns - lower.stamp_ns)
-        images = zip(self._cameras.values(), (lower_image, upper_image), strict=True)
-        repeated = [camera.repeated.add(image) for camera, image in images]
+        repeated = [camera.repeated.add(image) for camera, image in zip(self._cameras.values(), images, strict=True)]
         if any(repeated) and not self._use_repeated:
             return None
         # 3. The pair.
         self._pairs += 1
+        skew_s, motion = self.skew.exposure_ns * S_PER_NS, self.motion.take(lower.stamp_ns)
         return FramePair(
-            self._pairs - 1,
-            lower.stamp_ns,
-            lower_image,
-            upper_image,
-            self.skew.exposure_ns * S_PER_NS,
-            self.motion.take(lower.stamp_ns),
-            (coding_steps(lower), coding_steps(upper)),
+            self._pairs - 1, lower.stamp_ns, *images, skew_s, motion, (coding_steps(lower), coding_steps(upper))
         )
 
 

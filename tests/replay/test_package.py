@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
-import shutil
 import subprocess
 import sys
 import tarfile
@@ -16,7 +14,6 @@ from pathlib import Path
 import pytest
 
 from drivers.logs.log_reader import LogReader
-from omnid.core.compiled import KERNEL_FILES, PACKAGE, kept_folder
 from omnid.version import __version__
 from tests.replay.command import Command
 
@@ -89,24 +86,9 @@ def test_wheel_and_sdist_are_complete_and_the_wheel_runs_by_itself(tmp_path: Pat
         command = [sys.executable, *words]
         return subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True).stdout
 
-    program = "import omnid; from omnid.core.compiled import folder_of_state; print(omnid.__file__, folder_of_state())"
-    found, folder = python("-c", program).split()
+    environment["OMNID_CACHE_DIR"] = str(tmp_path / "cache")
+    found = python("-c", "import omnid; print(omnid.__file__)")
     assert found.startswith(str(tmp_path / "installed"))
-    lend_kernels(tmp_path / "installed", Path(folder))
     log, tum = tmp_path / "installed/omnid/sample/log.mcap", tmp_path / "path.tum"
     python("-m", "omnid", "replay", str(log), "--quiet", "--tum", str(tum), "--seconds", "1.05")
     assert len(tum.read_text().splitlines()) == 11
-    shutil.rmtree(folder)
-
-
-def lend_kernels(installed: Path, folder: Path) -> None:
-    """Copy the compiled code of the repository for the same files elsewhere, which else take half a minute.
-
-    numba names the code by the folders of the files. Code that does not fit is compiled again.
-    """
-    kept = kept_folder()
-    for package in {path.parent for path in PACKAGE.rglob(KERNEL_FILES)} if kept else ():
-        other = installed / package.relative_to(PACKAGE.parent)
-        names = (f"{path.name}_{hashlib.sha1(str(path).encode()).hexdigest()}" for path in (package, other))
-        shutil.copytree(*(parent / name for parent, name in zip((kept, folder), names, strict=True)))
-    folder.chmod(0o700)
