@@ -7,7 +7,6 @@ named RECIPE_sSEED. A cell of 10 cm is seen if a point within 10 cm of a surface
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,30 +25,22 @@ from omnid.diagnostics.run_summary import summary_entries
 from omnid.formats.tum import Trajectory, read_tum
 from omnid.recordings.evaluation import evaluate
 from tests.bench.paper.truth import surface_distance_m
-from tests.bench.results import Cell, Column, ResultTable
-from tests.bench.seeds import family_and_seed
+from tests.bench.results import Cell, ResultTable, columns, family_and_seed, run
 from tests.simulation.recipes import build
 
-COLUMNS: Final = (
-    Column("log"),
-    Column("pairs"),
-    Column("length", "%", 3),
-    Column("ATE rmse", "mm", 2),
-    Column("end", "mm", 2),
-    Column("heading, max", "deg", 3),
-    Column("RPE", "mm", 2),
-    Column("NEES, median", "", 1),
-    Column("states"),
-)
 CELL_M: Final = 0.1  # of the cells that count as seen, and largest distance of their points from a surface
 FAR_M: Final = 0.2  # a point farther from all surfaces is wrong
-OF_CLOUD: Final = (
-    Column("points of the cloud"),
-    Column("their error p50", "cm", 2),
-    Column("p90", "cm", 2),
-    Column(f"beyond {FAR_M} m", "%", 2),
-    Column("cells seen"),
+OF_POSES = (
+    "log",
+    "pairs",
+    "length|%|3",
+    "ATE rmse|mm|2",
+    "end|mm|2",
+    "heading, max|deg|3",
+    "RPE|mm|2",
+    "NEES, median||1",
 )
+OF_CLOUD = ("points of the cloud", "their error p50|cm|2", "p90|cm|2", f"beyond {FAR_M} m|%|2", "cells seen")
 
 
 def row(folder: Path, overrides: Sequence[str], *, cloud: bool = False) -> list[Cell]:
@@ -115,18 +106,13 @@ def rig_of(folder: Path) -> Rig:
         return read_rig(path)
 
 
-def main() -> None:
+def accuracy(folders: Sequence[Path], *, set_: Sequence[str] = (), cloud: bool = False) -> None:
     """Print the table, each row as soon as it is measured."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folders", type=Path, nargs="+", metavar="FOLDER")
-    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", dest="overrides")
-    parser.add_argument("--cloud", action="store_true", help="errors of the cloud, too")
-    args = parser.parse_args()
-    title = f"Rendered logs, {' '.join(args.overrides) or 'default settings'}"
-    table = ResultTable("accuracy", title, COLUMNS + OF_CLOUD * args.cloud)
-    for folder in args.folders:
-        table.add(*row(folder, args.overrides, cloud=args.cloud), folder=folder)
+    title = f"Rendered logs, {' '.join(set_) or 'default settings'}"
+    table = ResultTable("accuracy", title, columns(*OF_POSES, "states", *OF_CLOUD * cloud))
+    for folder in folders:
+        table.add(*row(folder, set_, cloud=cloud), folder=folder)
 
 
 if __name__ == "__main__":
-    main()
+    run(accuracy)

@@ -8,8 +8,6 @@ is wrong.
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,7 +24,7 @@ from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
 from omnid.simulation.rendering import textures
 from omnid.simulation.rendering.sensor import MountedSensor, Sensor
-from tests.bench.results import Column, ResultTable
+from tests.bench.results import ResultTable, columns, run
 from tests.simulation.boards import BoardRenderer, board_pose, in_view, six_walls
 
 Random = np.random.Generator
@@ -206,16 +204,11 @@ def classify_detection(found: Array | None, rendered: HardBoard) -> str:
     return "found" if off < max(RIGHT_PX, RIGHT_PART * min(sides)) else "wrong"
 
 
-def main(arguments: list[str]) -> int:
+def boards(*, seed: int = 1, first: int = 0, count: int = 50) -> int:
     """Print the outcome of each detector for every image, and the sums; 1 if a board is wrong or too few are found."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--first", type=int, default=0, help="number of the first image")
-    parser.add_argument("--count", type=int, default=50)
-    args = parser.parse_args(arguments)
     sums = {name: Counter[str]() for name in DETECTORS}
-    for number in range(args.first, args.first + args.count):
-        shot = render_hard_board(args.seed, number)
+    for number in range(first, first + count):
+        shot = render_hard_board(seed, number)
         outcomes = {name: classify_detection(find(shot.image, shot.board), shot) for name, find in DETECTORS.items()}
         for name, outcome in outcomes.items():
             sums[name][outcome] += 1
@@ -223,14 +216,14 @@ def main(arguments: list[str]) -> int:
             sums["omnid"]["wrong"] += 1
         print(f"{shot.name}: {', '.join(f'{name} {outcome}' for name, outcome in outcomes.items())}", flush=True)
     kinds = ("found", "wrong", "missed")
-    columns = (Column("detector"), Column("images"), *map(Column, kinds))
-    table = ResultTable("boards_hard", "Board detection in hard renderings", columns, REMARKS)
+    head = columns("detector", "images", *kinds)
+    table = ResultTable("boards_hard", "Board detection in hard renderings", head, REMARKS)
     for name, of in sums.items():
-        table.add(name, args.count, *(of[kind] for kind in kinds), seed=("boards, hard", args.seed))
+        table.add(name, count, *(of[kind] for kind in kinds), seed=("boards, hard", seed))
     # omnid finds as many as OpenCV's best detector, and half of what that misses.
     best = max(sums[name]["found"] for name in DETECTORS if name != "omnid")
-    return int(sums["omnid"]["wrong"] > 0 or sums["omnid"]["found"] < best + (args.count - best) / 2)
+    return int(sums["omnid"]["wrong"] > 0 or sums["omnid"]["found"] < best + (count - best) / 2)
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    run(boards)

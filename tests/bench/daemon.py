@@ -8,12 +8,11 @@ names another: FOLDER:HZ, a folder with log.mcap and its rig.toml, and the rate 
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from importlib.resources import files
 from pathlib import Path
@@ -21,7 +20,7 @@ from typing import Final
 
 import numpy as np
 
-from tests.bench.results import Cell, Column, ResultTable
+from tests.bench.results import Cell, ResultTable, columns, run
 from tests.busy import busy_processes
 from tests.ports import free_port
 from tests.replay.live import Base, Daemon, Operator, answers, started
@@ -29,14 +28,10 @@ from tests.waiting import wait_until
 
 FOLDER, _, HZ = os.environ.get("OMNID_BENCHMARK_LOG", f"{files('omnid.sample')}:10").rpartition(":")
 RIG = ("--rig", f"{FOLDER}/rig.toml") if Path(FOLDER, "rig.toml").exists() else ()  # the sample's is attached
-COLUMNS: Final = (
-    Column("images, busy processes per core"),
-    Column("share of a core", "", 2),
-    *(Column(name, "MB", 0) for name in ("resident", "most")),
-    Column("poses/s", "", 1),
-    *(Column(f"stamp to client, p{percent}", "ms", 1) for percent in (50, 90, 99)),
-    Column("late ticks of the wheels, p99.9", "ms", 1),
-    Column("threads"),
+COLUMNS: Final = columns(
+    *("images, busy processes per core", "share of a core||2", "resident|MB|0", "most|MB|0", "poses/s||1"),
+    *(f"stamp to client, p{percent}|ms|1" for percent in (50, 90, 99)),
+    *("late ticks of the wheels, p99.9|ms|1", "threads"),
 )
 
 
@@ -86,7 +81,7 @@ def received_ms(operator: Operator, seconds: float) -> list[float]:
     return found
 
 
-def measure(rate_hz: float, per_core: int, seconds: float, warm_s: float, settings: list[str]) -> list[Cell]:
+def measure(rate_hz: float, per_core: int, seconds: float, warm_s: float, settings: Sequence[str]) -> list[Cell]:
     """Run the daemon at a rate of pairs beside computing processes, and return its row."""
     with (
         busy_processes(per_core * (os.cpu_count() or 1)),
@@ -112,20 +107,20 @@ def measure(rate_hz: float, per_core: int, seconds: float, warm_s: float, settin
     ]
 
 
-def main() -> None:
-    """Measure and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rates", type=float, nargs="+", default=[10.0, 30.0], metavar="HZ")
-    parser.add_argument("--busy", type=int, nargs="+", default=[0, 1], metavar="PER_CORE")
-    parser.add_argument("--seconds", type=float, default=60.0, help="of each measurement")
-    parser.add_argument("--warm-s", type=float, default=15.0, help="before it: until caches and maps are full")
-    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="a daemon's setting")
-    options = parser.parse_args()
+def whole_daemon(
+    *,
+    rates: Sequence[float] = (10.0, 30.0),
+    busy: Sequence[int] = (0, 1),
+    seconds: float = 60.0,
+    warm_s: float = 15.0,
+    set_: Sequence[str] = (),
+) -> None:
+    """Print a row for each rate [Hz] and number of busy processes a core; warm_s: until caches and maps are full."""
     table = ResultTable("daemon", "The whole daemon", COLUMNS, timed=True)
-    for rate_hz in options.rates:
-        for per_core in options.busy:
-            table.add(*measure(rate_hz, per_core, options.seconds, options.warm_s, options.set))
+    for rate_hz in rates:
+        for per_core in busy:
+            table.add(*measure(rate_hz, per_core, seconds, warm_s, set_))
 
 
 if __name__ == "__main__":
-    main()
+    run(whole_daemon)

@@ -9,10 +9,9 @@ error of more than 5 cm or 1 degree.
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
@@ -28,8 +27,7 @@ from omnid.core.odometry.tracking import KltSettings
 from omnid.core.places.relocalisation import Relocaliser
 from omnid.core.stereo.matcher import Matcher, MatchingSettings
 from omnid.core.types.panorama import PaddedPanorama
-from tests.bench.results import Cell, Column, ResultTable
-from tests.bench.seeds import family_and_seed
+from tests.bench.results import Cell, ResultTable, columns, family_and_seed, run
 from tests.omnid.core.scenery import PAD_PX, RenderedCameras, motion_errors
 from tests.simulation.recipes import RECIPES, build
 
@@ -42,19 +40,10 @@ SEARCHES: Final = 8  # frames after which a view is given up
 WRONG_M, WRONG_RAD = 0.05, math.radians(1)
 OTHER: Final = 7000  # added to a seed for the other world
 LOSSES: Final = ("ahead", "turned", "covered", "another world", "back")
-COLUMNS: Final = (
-    Column("drive"),
-    Column("size", "px"),
-    Column("loss"),
-    Column("views"),
-    Column("recognised", "%", 1),
-    Column("wrong"),
-    Column("in the first frame", "%", 1),
-    Column("error p50", "mm", 1),
-    Column("error p95", "mm", 1),
-    Column("heading p95", "deg", 2),
-    Column("error over sigma, rms", "", 2),
-    Column("longest search, processor time", "ms", 0),
+COLUMNS: Final = columns(
+    *("drive", "size|px", "loss", "views", "recognised|%|1", "wrong", "in the first frame|%|1"),
+    *("error p50|mm|1", "error p95|mm|1", "heading p95|deg|2", "error over sigma, rms||2"),
+    "longest search, processor time|ms|0",
 )
 
 
@@ -144,18 +133,6 @@ def half_covered(frame: StereoFrame, first: int) -> StereoFrame:
     )
 
 
-def rows(name: str, size: int, count: int) -> Iterator[list[Cell]]:
-    """Yield the row of each loss."""
-    named = family_and_seed(name)
-    assert named is not None
-    family, seed = named
-    drive = Drive.of(family, seed, size)
-    for loss in LOSSES:
-        rng = np.random.default_rng([seed, 51, LOSSES.index(loss)])
-        found = [drive.found(loss, number, rng) for number in range(count)]
-        yield [name, size, loss, count, *figures(found)]
-
-
 def figures(found: Sequence[Found]) -> list[Cell]:
     """Return shares, errors and times of all views of a loss."""
     recognised = [each for each in found if each.searches]
@@ -177,18 +154,19 @@ def figures(found: Sequence[Found]) -> list[Cell]:
     ]
 
 
-def main() -> None:
-    """Print the rows as soon as they are measured."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("drives", nargs="+", metavar="FAMILY_sSEED", help=f"of {', '.join(RECIPES)}")
-    parser.add_argument("--size", type=int, default=384, help="width and height of the images [px]")
-    parser.add_argument("--count", type=int, default=40, help="views for each loss")
-    args = parser.parse_args()
+def losses(drives: Sequence[str], *, size: int = 384, count: int = 40) -> None:
+    """Print a row for each loss of each drive FAMILY_sSEED, by so many views."""
     table = ResultTable("losses", "Recognition by the odometry after a loss", COLUMNS)
-    for name in args.drives:
-        for row in rows(name, args.size, args.count):
-            table.add(*row, seed=family_and_seed(name))
+    for name in drives:
+        named = family_and_seed(name)
+        if named is None:
+            raise SystemExit(f"{name}: expected FAMILY_sSEED, a family of {', '.join(RECIPES)}")
+        drive = Drive.of(*named, size)
+        for number, loss in enumerate(LOSSES):
+            rng = np.random.default_rng([named[1], 51, number])
+            found = [drive.found(loss, view, rng) for view in range(count)]
+            table.add(name, size, loss, count, *figures(found), seed=named)
 
 
 if __name__ == "__main__":
-    main()
+    run(losses)

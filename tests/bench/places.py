@@ -7,7 +7,6 @@ camera of the rig about a random axis. kidnapped: the log of such a folder is cu
 
 from __future__ import annotations
 
-import argparse
 import math
 import time
 from collections.abc import Iterator, Sequence
@@ -15,6 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
+from unittest.mock import patch
 
 import numpy as np
 
@@ -31,7 +31,7 @@ from omnid.recordings.evaluation import evaluate
 from omnid.runs.run_result import RunResult
 from omnid.stages.places import Places
 from omnid.tracking_state import MapState
-from tests.bench.results import Cell, Column, ResultTable
+from tests.bench.results import Cell, ResultTable, columns, run
 from tests.omnid.core.scenery import motion_errors
 from tests.replay.edited import images, save
 from tests.simulation.rigs import with_upper_rotated
@@ -39,34 +39,15 @@ from tests.simulation.rigs import with_upper_rotated
 FALSE_M, FALSE_RAD = 0.1, math.radians(2)  # error of a loop that is a false one
 NEAR_M, LEFT_M = 0.5, 4.0  # a revisit: so near to a place that was left so long ago (m of path)
 AFTER_CUT = 50  # pairs of a log after it was cut
-LAPS: Final = (
-    Column("log"),
-    Column("rig off by", "deg", 1),
-    Column("odometry: ATE", "mm", 1),
-    Column("its end", "mm", 1),
-    Column("live in the map: ATE", "mm", 1),
-    Column("its end", "mm", 1),
-    Column("ratio", "", 2),
-    Column("at the end: ATE", "mm", 1),
-    Column("its ratio", "", 2),
-    Column("loops"),
-    Column("false loops"),
-    Column("loop after revisit", "m", 1),
-    Column("keyframes"),
-    Column("processor time of places", "%", 1),
+LAPS: Final = columns(
+    *("log", "rig off by|deg|1", "odometry: ATE|mm|1", "its end|mm|1", "live in the map: ATE|mm|1", "its end|mm|1"),
+    *("ratio||2", "at the end: ATE|mm|1", "its ratio||2", "loops", "false loops", "loop after revisit|m|1"),
+    *("keyframes", "processor time of places|%|1"),
 )
-KIDNAPPED: Final = (
-    Column("log"),
-    Column("carried", "m", 1),
-    Column("localised after", "s", 1),
-    Column("error after that", "mm", 0),
-    Column("wrong after that"),
-    Column("largest step of odom", "mm", 0),
+KIDNAPPED: Final = columns(
+    *("log", "carried|m|1", "localised after|s|1", "error after that|mm|0", "wrong after that"),
+    "largest step of odom|mm|0",
 )
-TABLES: Final = {
-    "laps": ("Loops on closed drives, and places that look alike", LAPS),
-    "kidnapped": ("A log that goes on elsewhere", KIDNAPPED),
-}
 
 
 def disturbed(rig: Rig, degrees: float, seed: int) -> Rig:
@@ -124,11 +105,8 @@ def timed_places() -> Iterator[list[float]]:
         spent.append(time.thread_time() - started)
         return result
 
-    Places.process = process  # type: ignore[method-assign]
-    try:
+    with patch.object(Places, "process", process):
         yield spent
-    finally:
-        Places.process = untimed  # type: ignore[method-assign]
 
 
 def loop_errors(places: PlaceMap, truth: Trajectory, rig: Rig) -> list[tuple[float, float]]:
@@ -177,24 +155,26 @@ def kidnapped_row(folder: Path, seed: int) -> list[Cell]:
     return [folder.name, jump_m, 0.1 * (found - cut), 1e3 * largest_m, wrong, 1e3 * steps_m.max()]
 
 
-def main() -> None:
-    """Print the rows as soon as they are measured."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=TABLES)
-    parser.add_argument("folders", type=Path, nargs="+", metavar="FOLDER", help="named NAME_sSEED")
-    parser.add_argument("--wrong-deg", type=float, nargs="*", default=[0.0, 0.1])
-    args = parser.parse_args()
+def laps(folders: Sequence[Path], *, wrong_deg: Sequence[float] = (0.0, 0.1)) -> None:
+    """Print the errors of closed drives, and of places that look alike, by the error of the rig."""
     prepare_kernels(lambda _level, _text: None)  # their compilation is no part of the shares
-    title, columns = TABLES[args.what]
-    table = ResultTable(f"places_{args.what}", title, columns)
-    for folder in args.folders:
-        seed = int(folder.name.rpartition("_s")[2])
-        if args.what == "kidnapped":
-            table.add(*kidnapped_row(folder, seed), folder=folder)
-            continue
-        for degrees in args.wrong_deg:
-            table.add(*laps_row(folder, degrees, seed), folder=folder)
+    table = ResultTable("places_laps", "Loops on closed drives, and places that look alike", LAPS)
+    for folder in folders:
+        for degrees in wrong_deg:
+            table.add(*laps_row(folder, degrees, seed_of(folder)), folder=folder)
+
+
+def kidnapped(folders: Sequence[Path]) -> None:
+    """Print the errors after the cut of logs that go on elsewhere."""
+    table = ResultTable("places_kidnapped", "A log that goes on elsewhere", KIDNAPPED)
+    for folder in folders:
+        table.add(*kidnapped_row(folder, seed_of(folder)), folder=folder)
+
+
+def seed_of(folder: Path) -> int:
+    """Return the seed of a folder NAME_sSEED."""
+    return int(folder.name.rpartition("_s")[2])
 
 
 if __name__ == "__main__":
-    main()
+    run(laps, kidnapped)

@@ -17,7 +17,6 @@ The error over sigma is that of the position, sqrt(e^T C^-1 e / 3); NEES is the 
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -25,7 +24,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 
@@ -43,7 +42,7 @@ from omnid.simulation.rendering.surfaces import Scene
 from omnid.simulation.world import Person, Walkers
 from omnid.tracking_state import TrackingState
 from tests.bench.accuracy import position_errors, squared_errors
-from tests.bench.results import Cell, Column, ResultTable
+from tests.bench.results import Cell, ResultTable, columns, run
 from tests.simulation import SimulatedRun, build, corridor, paths, write_log
 from tests.simulation.builders import repeating
 from tests.simulation.disturbances import DISTURBANCES, Disturbance
@@ -56,18 +55,10 @@ SIZE: Final = 384
 STEP_M: Final = 0.05
 LINE_US: Final = 52.0  # of a rolling shutter
 EXACT: Final = RigCovariance(("baseline",), np.zeros(1), np.eye(1))  # nothing is added for the rig, which is right
-COLUMNS: Final = (
-    Column("drive"),
-    Column("length", "%", 2),
-    Column("ATE rmse", "mm", 1),
-    Column("error at the end", "mm", 1),
-    Column("largest error", "mm", 1),
-    Column("NEES", "", 1),
-    Column("error over sigma, median", "", 1),
-    Column("largest", "", 1),
-    Column("largest while tracking", "", 1),
-    Column("states"),
-    Column("rig refused"),
+COLUMNS: Final = columns(
+    "drive",
+    *("length|%|2", "ATE rmse|mm|1", "error at the end|mm|1", "largest error|mm|1"),
+    *("NEES||1", "error over sigma, median||1", "largest||1", "largest while tracking||1", "states", "rig refused"),
 )
 
 
@@ -75,7 +66,7 @@ COLUMNS: Final = (
 class Case:
     """A drive of a seed, and how its log is made."""
 
-    run: Callable[[int], SimulatedRun]
+    drive: Callable[[int], SimulatedRun]
     disturbances: tuple[Disturbance, ...] = ()
     line_us: float = 0.0
     has_people: bool = False
@@ -89,10 +80,10 @@ def by_lens(
     """Return a drive with two lenses; beyond_m: from the last pose to the end wall."""
     rig = lens_rig(full_turn(size) if model == "equirectangular" else lens(model, field_deg, size))
 
-    def run(seed: int) -> SimulatedRun:
+    def drive(seed: int) -> SimulatedRun:
         return SimulatedRun(rig, paths.spline_path(seed, pairs, STEP_M), corridor(seed, STEP_M * pairs + 2 + beyond_m))
 
-    return Case(run)
+    return Case(drive)
 
 
 def alike(seed: int) -> SimulatedRun:
@@ -108,9 +99,9 @@ def too_fast(seed: int) -> SimulatedRun:
 
 def rooms(seed: int, pairs: int = 60, sensor: Sensor | None = None, tilt_deg: float = 0.0) -> SimulatedRun:
     """Return a drive in a room, by another sensor, or shaken from pair to pair."""
-    run = build("rooms", seed, SIZE, pairs)
-    poses = paths.vibrate(run.poses, seed + 1, tilt_deg) if tilt_deg else run.poses
-    return replace(run, poses=poses, sensor=sensor or run.sensor)
+    made = build("rooms", seed, SIZE, pairs)
+    poses = paths.vibrate(made.poses, seed + 1, tilt_deg) if tilt_deg else made.poses
+    return replace(made, poses=poses, sensor=sensor or made.sensor)
 
 
 def walkers(seed: int) -> Walkers:
@@ -163,23 +154,23 @@ SEEDS: Final = {"lenses": (1, 2, 600, 608), "honesty": (3, 603, 604), "disturban
 
 def render(folder: Path, case: Case, seed: int) -> None:
     """Write the log of a case."""
-    run = case.run(seed)
+    made = case.drive(seed)
     if case.has_photographs:
-        run = replace(run, scene=with_photographs(run.scene, seed))
+        made = replace(made, scene=with_photographs(made.scene, seed))
     if not case.has_people:
         readout = Readout(line_time_us=(case.line_us, case.line_us))
-        options = {"sensor": run.sensor, "readout": readout, "disturbances": case.disturbances}
-        write_log(folder, run.rig, run.poses, run.scene, seed=seed, **options)  # type: ignore[arg-type]
+        options = {"sensor": made.sensor, "readout": readout, "disturbances": case.disturbances}
+        write_log(folder, made.rig, made.poses, made.scene, seed=seed, **options)  # type: ignore[arg-type]
         return
-    people, cameras = walkers(seed), (run.rig.lower, run.rig.upper)
+    people, cameras = walkers(seed), (made.rig.lower, made.rig.upper)
 
     def ideal_image(pair: int, camera: int) -> Floats:
-        x_m, y_m = run.poses[pair, :2, 3].tolist()
+        x_m, y_m = made.poses[pair, :2, 3].tolist()
         people.advance(1e-9 * PERIOD_NS * pair, (x_m, y_m))
-        scene = Scene((*run.scene.rectangles, *people.faces()))
-        return render_grey(scene, cameras[camera], run.poses[pair], 2, np.zeros(6))
+        scene = Scene((*made.scene.rectangles, *people.faces()))
+        return render_grey(scene, cameras[camera], made.poses[pair], 2, np.zeros(6))
 
-    pack_log(folder, run.rig, run.poses, ideal_image, sensor=run.sensor, seed=seed)
+    pack_log(folder, made.rig, made.poses, ideal_image, sensor=made.sensor, seed=seed)
 
 
 def measured(case: Case, seed: int) -> list[Cell]:
@@ -209,21 +200,18 @@ def measured(case: Case, seed: int) -> list[Cell]:
     ]
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Print the table of a set."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("set", choices=SETS)
-    parser.add_argument("--seeds", type=int, nargs="+", help="default: those of docs/RESULTS.md")
-    parser.add_argument("--only", nargs="+", metavar="CASE", help="default: all of the set")
-    args = parser.parse_args(arguments)
-    cases = SETS[args.set]
-    if unknown := set(args.only or ()) - cases.keys():
-        parser.error(f"--only: {', '.join(sorted(unknown))}: expected some of {', '.join(cases)}")
-    table = ResultTable(args.set, f"Rendered drives: {args.set}", COLUMNS)
-    for name in args.only or cases:
-        for seed in args.seeds or SEEDS[args.set]:
-            table.add(f"{name}, seed {seed}", *measured(cases[name], seed), seed=(args.set, seed))
+def rendered(
+    set: Literal["lenses", "honesty", "disturbances"], *, seeds: Sequence[int] = (), only: Sequence[str] = ()
+) -> None:
+    """Print the table of a set, by default of all its cases and of the seeds of docs/RESULTS.md."""
+    cases = SETS[set]
+    if missing := [name for name in only if name not in cases]:
+        raise SystemExit(f"--only: {', '.join(missing)}: expected some of {', '.join(cases)}")
+    table = ResultTable(set, f"Rendered drives: {set}", COLUMNS)
+    for name in only or cases:
+        for seed in seeds or SEEDS[set]:
+            table.add(f"{name}, seed {seed}", *measured(cases[name], seed), seed=(set, seed))
 
 
 if __name__ == "__main__":
-    main()
+    run(rendered)

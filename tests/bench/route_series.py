@@ -9,12 +9,11 @@ and the metre after them), distance to the lesson's end, way, contacts, least cl
 
 from __future__ import annotations
 
-import argparse
 import math
 import random
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -34,7 +33,7 @@ from omnid.simulation.world import World
 from omnid.simulation.world_file import WorldOptions, load_world
 from omnid.tracking_state import MapState
 from tests.bench.fine_robot import fine_robot
-from tests.bench.results import Cell, Column, ResultTable
+from tests.bench.results import Cell, ResultTable, columns, run
 
 Array = NDArray[np.float64]
 WORLD: Final = "building"
@@ -169,18 +168,18 @@ def changed_world(seed: int, number: int, rng: random.Random, people: bool) -> W
     return replace(load_world(WORLD, seed, options), people=walking if people else ())
 
 
-def row(lesson: Array, run: SimulatedRun, end: str) -> list[Cell]:
+def row(lesson: Array, driven: SimulatedRun, end: str) -> list[Cell]:
     """Return the figures of a drive against the true positions (N, 2) of the lesson."""
-    path = np.array([tick.pose[:2] for tick in run.ticks])
+    path = np.array([tick.pose[:2] for tick in driven.ticks])
     way_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     repeated = way_m > SETTLED_M
     off_cm = 100 * cross_track_m(lesson, path)
-    on_path = repeated & ~on_detour(run, way_m)
+    on_path = repeated & ~on_detour(driven, way_m)
     waits = dict.fromkeys(
-        f"{update.state}: {update.reason}" for update in run.navigation if update.reason and not update.state.is_end
+        f"{update.state}: {update.reason}" for update in driven.navigation if update.reason and not update.state.is_end
     )
-    waits |= dict.fromkeys(line for _, line in run.lines if line.startswith("the wheels stop"))
-    avoided_s = sum(update.state is NavigationState.AVOIDING for update in run.navigation) * 0.1
+    waits |= dict.fromkeys(line for _, line in driven.lines if line.startswith("the wheels stop"))
+    avoided_s = sum(update.state is NavigationState.AVOIDING for update in driven.navigation) * 0.1
     p95, most = (np.percentile(off_cm[repeated], 95), off_cm[repeated].max()) if repeated.any() else (None, None)
     without = np.percentile(off_cm[on_path], 95) if on_path.any() else None
     end_error_cm = 100 * math.dist(path[-1], lesson[-1])
@@ -192,18 +191,18 @@ def row(lesson: Array, run: SimulatedRun, end: str) -> list[Cell]:
         avoided_s,
         end_error_cm,
         float(way_m[-1]),
-        run.ticks[-1].time_s,
-        len(run.contacts),
-        run.clearance_m,
+        driven.ticks[-1].time_s,
+        len(driven.contacts),
+        driven.clearance_m,
         "; ".join(waits)[:300],
     ]
 
 
-def on_detour(run: SimulatedRun, way_m: Array) -> NDArray[np.bool_]:
+def on_detour(driven: SimulatedRun, way_m: Array) -> NDArray[np.bool_]:
     """Return True (N,) at the ticks of a drive on the way around an obstacle, and SETTLED_M after it."""
-    states_ns = np.array([update.stamp_ns - START_NS for update in run.navigation], np.int64)
-    avoids = np.array([False, *(update.state is NavigationState.AVOIDING for update in run.navigation)])
-    times_ns = np.array([tick.time_s for tick in run.ticks]) * 1e9
+    states_ns = np.array([update.stamp_ns - START_NS for update in driven.navigation], np.int64)
+    avoids = np.array([False, *(update.state is NavigationState.AVOIDING for update in driven.navigation)])
+    times_ns = np.array([tick.time_s for tick in driven.ticks]) * 1e9
     now = avoids[np.searchsorted(states_ns, times_ns, side="right")]
     last_m = np.maximum.accumulate(np.where(now, way_m, -np.inf))
     return np.asarray(way_m - last_m <= SETTLED_M)
@@ -218,9 +217,9 @@ def series(seed: int, length_m: float, repeats: int, robot: SimulatedRobot, peop
         )
         world = replace(load_world(WORLD, seed), start=(*START, 0.0))
         started_s, lesson = time.process_time(), Lesson(line)
-        run = simulate(world, robot, lesson, seconds=LONGEST_S, seed=seed, config=config)
-        taught = np.array([tick.pose[:2] for tick in run.ticks])
-        yield [seed, "lesson", *row(taught, run, lesson.end or "time is over"), time.process_time() - started_s]
+        driven = simulate(world, robot, lesson, seconds=LONGEST_S, seed=seed, config=config)
+        taught = np.array([tick.pose[:2] for tick in driven.ticks])
+        yield [seed, "lesson", *row(taught, driven, lesson.end or "time is over"), time.process_time() - started_s]
         for number in range(repeats):
             rng, started_s = random.Random(1000 * seed + number), time.process_time()
             begin = round(STARTS[number] * len(line))
@@ -232,46 +231,34 @@ def series(seed: int, length_m: float, repeats: int, robot: SimulatedRobot, peop
             )
             world = replace(changed_world(seed, number, rng, people), start=start)
             script = Repetition(line, begin)
-            run = simulate(world, robot, script, seconds=LONGEST_S, seed=100 * seed + number, config=config)
+            driven = simulate(world, robot, script, seconds=LONGEST_S, seed=100 * seed + number, config=config)
             yield [
                 seed,
                 f"from {STARTS[number] * SPACING_M * len(line):.0f} m",
-                *row(taught, run, script.end or "time is over"),
+                *row(taught, driven, script.end or "time is over"),
                 time.process_time() - started_s,
             ]
 
 
-def main() -> None:
-    """Print a table."""
-    parser = argparse.ArgumentParser(prog="python -m tests.bench.route_series")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[1])
-    parser.add_argument("--length", type=float, default=33.0, help="of the route, m")
-    parser.add_argument("--repeats", type=int, default=len(STARTS), choices=range(len(STARTS) + 1))
-    parser.add_argument("--size", type=int, default=512, help="of the images, px")
-    parser.add_argument("--no-people", action="store_true")
-    arguments = parser.parse_args()
-    columns = (
-        Column("seed"),
-        Column("drive"),
-        Column("end"),
-        Column("off the lesson p95", "cm", 1),
-        Column("p95 without detours", "cm", 1),
-        Column("most", "cm", 1),
-        Column("around obstacles", "s", 0),
-        Column("end error", "cm", 1),
-        Column("way", "m", 1),
-        Column("time", "s", 0),
-        Column("contacts"),
-        Column("clearance", "m", 2),
-        Column("stood or slowed"),
-        Column("processor time", "s", 0),
+def route_series(
+    *,
+    seeds: Sequence[int] = (1,),
+    length: float = 33.0,
+    repeats: int = len(STARTS),
+    size: int = 512,
+    no_people: bool = False,
+) -> None:
+    """Print a row for each drive on a route of so many metres."""
+    head = columns(
+        *("seed", "drive", "end", "off the lesson p95|cm|1", "p95 without detours|cm|1", "most|cm|1"),
+        *("around obstacles|s|0", "end error|cm|1", "way|m|1", "time|s|0", "contacts", "clearance|m|2"),
+        *("stood or slowed", "processor time|s|0"),
     )
-    table = ResultTable("route_series", f"Repeated route of {arguments.length:g} m", columns)
-    robot = fine_robot(arguments.size)
-    for seed in arguments.seeds:
-        for cells in series(seed, arguments.length, arguments.repeats, robot, not arguments.no_people):
+    table = ResultTable("route_series", f"Repeated route of {length:g} m", head)
+    for seed in seeds:
+        for cells in series(seed, length, min(repeats, len(STARTS)), fine_robot(size), not no_people):
             table.add(*cells, seed=("route", seed))
 
 
 if __name__ == "__main__":
-    main()
+    run(route_series)

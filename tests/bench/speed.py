@@ -7,13 +7,10 @@ that are timed in the same run on the same panoramas: one StereoSGBM, and one Lu
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from functools import wraps
-from importlib import import_module
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
@@ -31,20 +28,23 @@ from omnid.formats.exports import write_ply
 from omnid.messages import OdometryUpdate
 from omnid.runs.wiring import Outputs, wire
 from omnid.sinks.files import TrajectoryFile
+from omnid.stages.dewarp import Dewarp
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry, with_rims
+from omnid.stages.mapping import Mapping
+from omnid.stages.odometry import OdometryStage
+from omnid.stages.synchronise import Synchronise
 from tests.bench.accuracy import rig_of
-from tests.bench.reference_kernels import ReferenceKernels
-from tests.bench.results import Column, ResultTable
+from tests.bench.results import ResultTable, columns, lucas_kanade_ns, run, sgbm_ns
 from tests.replay.test_memory import to_and_fro
 
 REFERENCE_EVERY: Final = 10  # pairs between two runs of the reference kernels
 SKIPPED: Final = 10  # first pairs, in which caches, buffers and the first map are filled
-STAGES: Final = {  # label: the class of a stage, whose method `process` is timed
-    "pair": "omnid.stages.synchronise.Synchronise",
-    "dewarp": "omnid.stages.dewarp.Dewarp",
-    "odometry": "omnid.stages.odometry.OdometryStage",
-    "dense stereo and mapping": "omnid.stages.mapping.Mapping",
+STAGES: Final[dict[str, type]] = {
+    "pair": Synchronise,
+    "dewarp": Dewarp,
+    "odometry": OdometryStage,
+    "dense stereo and mapping": Mapping,
 }
 
 
@@ -53,9 +53,7 @@ class StageClock:
 
     def __init__(self) -> None:
         self.stage_ns: Counter[str] = Counter()
-        self.sgbm_ns: list[int] = []
-        self.lk_ns: list[int] = []
-        self._kernels = ReferenceKernels()
+        self.kernels_ns: dict[str, list[int]] = {"StereoSGBM": [], "Lucas-Kanade": []}
         self._before: NDArray[np.uint8] | None = None
 
     def process(self, odometry: OdometryUpdate) -> None:
@@ -66,26 +64,23 @@ class StageClock:
         lower, before = np.ascontiguousarray(pair.lower.panorama), self._before
         self._before = lower
         if before is not None and odometry.seq % REFERENCE_EVERY == 0:
-            self.sgbm_ns.append(self._kernels.sgbm_ns(lower, pair.upper.panorama))
-            self.lk_ns.append(self._kernels.lucas_kanade_ns(before, lower))
+            self.kernels_ns["StereoSGBM"].append(sgbm_ns(lower, pair.upper.panorama))
+            self.kernels_ns["Lucas-Kanade"].append(lucas_kanade_ns(before, lower))
 
     @contextmanager
     def timed_stages(self) -> Iterator[None]:
-        """Time the stages within the block."""
+        """Time the method `process` of the stages within the block."""
         with ExitStack() as ends:
-            for label, name in STAGES.items():
-                module, _, owner_name = name.rpartition(".")
-                owner = getattr(import_module(module), owner_name)
-                ends.callback(setattr, owner, "process", owner.process)
-                owner.process = self._timed(label, owner.process)
+            for label, stage in STAGES.items():
+                ends.callback(setattr, stage, "process", stage.process)  # type: ignore[attr-defined]
+                stage.process = self._timed(label, stage.process)  # type: ignore[attr-defined]
             yield
 
     def _timed(self, label: str, call: Callable[..., Any]) -> Callable[..., Any]:
-        @wraps(call)
-        def measured(*args: Any, **kwargs: Any) -> Any:
+        def measured(*args: Any) -> Any:
             start_ns = time.thread_time_ns()
             try:
-                return call(*args, **kwargs)
+                return call(*args)
             finally:
                 self.stage_ns[label] += time.thread_time_ns() - start_ns
 
@@ -111,27 +106,20 @@ def measure(folder: Path, pairs: int, hz: float, overrides: Sequence[str]) -> di
         graph.run()
     found = {label: 1e-6 * spent_ns / (pairs - SKIPPED) for label, spent_ns in clock.stage_ns.items()}
     found["all stages"] = sum(found.values())
-    return found | {"StereoSGBM": 1e-6 * median(clock.sgbm_ns), "Lucas-Kanade": 1e-6 * median(clock.lk_ns)}
+    return found | {name: 1e-6 * median(spent_ns) for name, spent_ns in clock.kernels_ns.items()}
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, metavar="FOLDER")
-    parser.add_argument("--pairs", type=int, default=200, help="pairs of a run (default: %(default)s)")
-    parser.add_argument("--hz", type=float, default=10.0, help="pairs a second by their stamps (default: %(default)s)")
-    parser.add_argument("--runs", type=int, default=5, help="runs, of which the medians are printed (default: 5)")
-    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", dest="overrides")
-    args = parser.parse_args()
-    if args.pairs < SKIPPED + 2 * REFERENCE_EVERY or args.runs < 1 or args.hz <= 0:
-        parser.error(f"--pairs is at least {SKIPPED + 2 * REFERENCE_EVERY}, --runs at least 1, --hz above 0")
-    columns = (Column("stage"), Column("time a pair", "ms", 2), Column("of SGBM + LK", "", 3))
-    table = ResultTable("speed", f"Processor time of a pair, {args.hz:g} Hz by the stamps", columns, timed=True)
-    runs = [measure(args.folder, args.pairs, args.hz, args.overrides) for _ in range(args.runs)]
-    for label in runs[0]:
-        ratios = [run[label] / (run["StereoSGBM"] + run["Lucas-Kanade"]) for run in runs]
-        table.add(label, median(run[label] for run in runs), median(ratios))
+def speed(folder: Path, *, pairs: int = 200, hz: float = 10.0, runs: int = 5, set_: Sequence[str] = ()) -> None:
+    """Print the medians of some runs of so many pairs, hz of them a second by their stamps."""
+    if pairs < SKIPPED + 2 * REFERENCE_EVERY:
+        raise SystemExit(f"--pairs is at least {SKIPPED + 2 * REFERENCE_EVERY}")
+    head = columns("stage", "time a pair|ms|2", "of SGBM + LK||3")
+    table = ResultTable("speed", f"Processor time of a pair, {hz:g} Hz by the stamps", head, timed=True)
+    found = [measure(folder, pairs, hz, set_) for _ in range(runs)]
+    for label in found[0]:
+        ratios = [each[label] / (each["StereoSGBM"] + each["Lucas-Kanade"]) for each in found]
+        table.add(label, median(each[label] for each in found), median(ratios))
 
 
 if __name__ == "__main__":
-    main()
+    run(speed)

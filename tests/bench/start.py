@@ -7,21 +7,20 @@ less. `omnid replay` reads 5 pairs of the sample.
 
 from __future__ import annotations
 
-import argparse
 import os
 import pty
 import resource
 import signal
-import statistics
 import subprocess
 import sys
 import tempfile
 import time
 from importlib.resources import files
 from pathlib import Path
+from statistics import median
 
 from omnid.client import Unreachable, subscribe
-from tests.bench.results import Column, ResultTable
+from tests.bench.results import ResultTable, columns, run
 from tests.omnid.transport.bus_fixtures import free_endpoint
 
 SAMPLE = Path(str(files("omnid.sample") / "log.mcap"))
@@ -79,30 +78,22 @@ def command(words: tuple[str, ...]) -> tuple[float, float, float]:
     return time.monotonic() - start_s, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024
 
 
-def main() -> None:
-    """Measure and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--runs", type=int, default=5)
-    count = parser.parse_args().runs
+def start(*, runs: int = 5) -> None:
+    """Print the medians of some runs."""
     with tempfile.TemporaryDirectory() as folder:
-        rows = {"`omnid demo`: first line": [demo_s(Path(folder) / str(run)) for run in range(count)]}
-    rows["`omnid run`: first pose"] = [first_pose_s() for _ in range(count)]
-    columns = (
-        Column("what"),
-        *(Column(name, "s", 2) for name in (f"median of {count}", "smallest", "largest", "processor time")),
-        Column("memory", "MB", 0),
-    )
-    table = ResultTable("start", "Start of a program", columns)
-    middle = statistics.median
+        rows = {"`omnid demo`: first line": [demo_s(Path(folder) / str(number)) for number in range(runs)]}
+    rows["`omnid run`: first pose"] = [first_pose_s() for _ in range(runs)]
+    times = (f"{name}|s|2" for name in (f"median of {runs}", "smallest", "largest", "processor time"))
+    table = ResultTable("start", "Start of a program", columns("what", *times, "memory|MB|0"))
     for name, waited_s in rows.items():
-        table.add(name, middle(waited_s), min(waited_s), max(waited_s), None, None)
+        table.add(name, median(waited_s), min(waited_s), max(waited_s), None, None)
     own_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     for name, words in COMMANDS.items():
         command(words)  # the first run compiles what is missing
-        times_s, used_s, memory_mb = zip(*(command(words) for _ in range(count)), strict=True)
-        memory = middle(memory_mb) if min(memory_mb) > 1.1 * own_mb else None
-        table.add(name, middle(times_s), min(times_s), max(times_s), middle(used_s), memory)
+        times_s, used_s, memory_mb = zip(*(command(words) for _ in range(runs)), strict=True)
+        memory = median(memory_mb) if min(memory_mb) > 1.1 * own_mb else None
+        table.add(name, median(times_s), min(times_s), max(times_s), median(used_s), memory)
 
 
 if __name__ == "__main__":
-    main()
+    run(start)

@@ -7,7 +7,6 @@ images was developed. The frame of the truth is turned into that of the rig by t
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -22,7 +21,7 @@ from calib.rig_file import read_rig
 from omnid.api import replay
 from omnid.core.odometry.pose_estimation import rigid_fit
 from omnid.formats.tum import read_tum
-from tests.bench.results import Column, ResultTable
+from tests.bench.results import ResultTable, columns, run
 from tests.drivers.logs.mcap_logs import LOWER, UPPER
 from tests.replay.edited import images, save
 from tests.simulation.whole_images import Image, repeat_lines, roll, shift, tear, turn, warp
@@ -93,26 +92,21 @@ def _decoded(jpeg: bytes) -> Image:
     return np.asarray(cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE), np.uint8)
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("rig", type=Path)
-    parser.add_argument("log", type=Path)
-    parser.add_argument("truth", type=Path)
-    parser.add_argument("kinds", nargs="*", help="beginnings of kinds; none: all")
-    parser.add_argument("--pairs", type=int, default=33)
-    parser.add_argument("--since", type=int, default=0)
-    given = parser.parse_args()
-    columns = ("log", "kind", "pairs", "tracking", "wrong", "most off, mm", "its sigma, mm", "lines")
-    table = ResultTable("whole_images", "Images that are whole, but not right", [Column(name) for name in columns])
-    rig = read_rig(given.rig)
-    every = images(given.log, *(topic or None for topic in rig.topics))
-    rig = replace(rig, topics=(LOWER, UPPER))
-    taken = [each for each in every if given.since <= each.pair <= given.since + given.pairs]
-    truth, R = read_tum(given.truth), None
+def whole_images(
+    rig: Path, log: Path, truth: Path, kinds: Sequence[str] = (), *, pairs: int = 33, since: int = 0
+) -> None:
+    """Print a row for each kind that begins with one of the given words, or for all."""
+    head = columns("log", "kind", "pairs", "tracking", "wrong", "most off|mm", "its sigma|mm", "lines")
+    table = ResultTable("whole_images", "Images that are whole, but not right", head)
+    read = read_rig(rig)
+    every = images(log, *(topic or None for topic in read.topics))
+    read = replace(read, topics=(LOWER, UPPER))
+    taken = [each for each in every if since <= each.pair <= since + pairs]
+    poses, R = read_tum(truth), None
     for name, kind in KINDS.items():
-        if name != "whole" and given.kinds and not any(name.startswith(each) for each in given.kinds):
+        if name != "whole" and kinds and not name.startswith(tuple(kinds)):
             continue
+        # 1. Edit the images of the kind's cameras. The first pair has no image before it.
         edited = list(taken)
         for camera in ("lower", "upper"):
             own = [number for number, image in enumerate(taken) if image.camera == camera]
@@ -121,22 +115,23 @@ def main() -> None:
                 for number, image in zip(own, kind.edit(pixels), strict=True):
                     jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
                     edited[number] = replace(taken[number], jpeg=jpeg)
-        edited = [image for image in edited if image.pair != given.since]  # it has no image before it
+        edited = [image for image in edited if image.pair != since]
+        # 2. Replay them, and compare with the truth.
         with tempfile.TemporaryDirectory() as folder:
-            result = replay(save(Path(folder) / "log.mcap", edited), rig, overrides=["places.enabled=false"])
-        T_true = truth.T[[int(np.abs(truth.stamps_ns - stamp).argmin()) for stamp in result.stamps_ns]]
+            result = replay(save(Path(folder) / "log.mcap", edited), read, overrides=["places.enabled=false"])
+        T_true = poses.T[[int(np.abs(poses.stamps_ns - stamp).argmin()) for stamp in result.stamps_ns]]
         true_m, found_m = (se3.inverse(T_true[0]) @ T_true)[:, :3, 3], result.T_odom_rig[:, :3, 3]
         R = rigid_fit(true_m, found_m)[:3, :3] if R is None else R
         error_m = np.linalg.norm(found_m - true_m @ R.T, axis=1)
         sigma_m = np.sqrt(np.array([np.linalg.eigvalsh(each[:3, :3])[-1] for each in result.covariances]))
         sure = np.array([state == "tracking" for state in result.states])
         wrong = sure & (error_m > np.maximum(LEAST_M, SIGMAS * sigma_m))
-        worst = int(np.where(wrong, error_m, 0.0).argmax()) if wrong.any() else int(error_m.argmax())
-        told = [line.split(";")[0] for line in result.warnings if line.startswith("images of the ")]
+        worst = int(np.where(wrong, error_m, -1.0).argmax()) if wrong.any() else int(error_m.argmax())
+        reported = [line.split(";")[0] for line in result.warnings if line.startswith("images of the ")]
         of_worst = round(1e3 * error_m[worst], 1), round(1e3 * sigma_m[worst], 1)
-        cells = given.log.parent.name, name, len(sure), int(sure.sum()), int(wrong.sum()), *of_worst
-        table.add(*cells, " / ".join(told))
+        cells = log.parent.name, name, len(sure), int(sure.sum()), int(wrong.sum()), *of_worst
+        table.add(*cells, " / ".join(reported))
 
 
 if __name__ == "__main__":
-    main()
+    run(whole_images)

@@ -11,7 +11,7 @@ from typing import Final
 from omnid.core.control.velocity_limits import VelocityLimits
 from omnid.transport import codec
 from tests.bench.faults.mutation import mutated
-from tests.bench.results import Column, ResultTable
+from tests.bench.results import ResultTable, columns
 from tests.replay.live import Operator, robot
 from tests.waiting import wait_until
 
@@ -58,8 +58,7 @@ def run(recorded: Path, folder: Path, count: int, seed: int) -> int:
     rng, limits = random.Random(seed), VelocityLimits()
     own = folder / "commands"
     own.mkdir()
-    columns = (Column("mutated commands"), Column("sent"), Column("wheels"))
-    table = ResultTable("faults_commands", "Mutated commands", columns)
+    table = ResultTable("faults_commands", "Mutated commands", columns("mutated commands", "sent", "wheels"))
     with robot(recorded, own, *MANUAL) as (daemon, operator, base):
         try:
             operator.drive()

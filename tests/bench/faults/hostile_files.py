@@ -33,7 +33,7 @@ from omnid.settings import dump
 from omnid.transport import codec
 from omnid.transport.codec import DiagnosticStatus, PoseAttachment, decode_diagnostics, decode_pose
 from tests.bench.faults.mutation import mutated
-from tests.bench.results import Column, ResultTable
+from tests.bench.results import ResultTable, columns
 from tests.calib.test_importers import BOTH, NAMED, T_UPPER_LOWER, chain
 from tests.drivers.logs.bags import write_bag, write_db3
 from tests.drivers.logs.mcap_logs import pairs
@@ -45,13 +45,7 @@ MEMORY_BYTES: Final = 1 << 30  # of address space: numpy, OpenCV and zenoh take 
 LONGEST_S: Final = 10.0  # for one file
 MOST_FAILURES: Final = 5
 EXPECTED: Final = (CalibError, DriverError, OmnidError)
-COLUMNS: Final = (
-    Column("mutated files"),
-    Column("number"),
-    Column("most memory", "MB"),
-    Column("time", "s", 0),
-    Column("result"),
-)
+COLUMNS: Final = columns("mutated files", "number", "most memory|MB", "time|s|0", "result")
 OCAM: Final = b"4 -200 0 1e-3 1e-7\n3 1 2 3\n240 320\n1 0 0\n480 640\n"
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Final, NamedTuple
@@ -24,7 +24,7 @@ from omnid.core.control.collision_monitor import RING_STALE, UNSEEN, UNWATCHED
 from omnid.simulation.lockstep import Moment, Request
 from omnid.simulation.robot import make_robot
 from tests.bench.obstacles import ahead
-from tests.bench.results import Column, ResultTable
+from tests.bench.results import ResultTable, columns
 from tests.simulation.disturbed import Fault, Tamper, simulate
 from tests.simulation.hazard_worlds import trial
 
@@ -194,34 +194,22 @@ def named(moment: Moment) -> str:
     return state.slowed_by or ("" if state.armed else state.disarmed_by)
 
 
-def run_all(words: list[str], count: int, seed: int) -> int:
+def run_all(words: Sequence[str], count: int, seed: int) -> int:
     """Print and save a row for each case whose name has one of the words; return the cases with a contact.
 
     Repeated images are left out, and `none` is no fault: these need not be named.
     """
-    columns = (
-        Column("images"),
-        Column("runs"),
-        Column("contacts"),
-        Column("fastest contact", "m/s", 2),
-        Column("least clearance", "m", 2),
-        Column("named"),
-        Column("named after, longest", "s", 2),
-        Column("at rest after, longest", "s", 2),
-        Column("as"),
+    head = columns(
+        *("images", "runs", "contacts", "fastest contact|m/s|2", "least clearance|m|2", "named"),
+        *("named after, longest|s|2", "at rest after, longest|s|2", "as"),
     )
-    table = ResultTable(
-        "faults_images",
-        "Tampered images, in lock-step",
-        columns,
-        remarks=(f"{SIZE_PX} px, 10 Hz, operator ahead at 0.5 m/s, {SECONDS:g} s",),
-    )
+    remark = f"{SIZE_PX} px, 10 Hz, operator ahead at 0.5 m/s, {SECONDS:g} s"
+    table = ResultTable("faults_images", "Tampered images, in lock-step", head, (remark,))
     failed = 0
     for name in (name for name in CASES if not words or any(word in name for word in words)):
-        seeds = range(seed, seed + count)
-        used = [("tampered images", number) for number in seeds]
-        table.seeds += [seed_used for seed_used in used if seed_used not in table.seeds]
-        outcomes = [run(name, number) for number in seeds]
+        used = [("tampered images", number) for number in range(seed, seed + count)]
+        table.seeds += [each for each in used if each not in table.seeds]
+        outcomes = [run(name, number) for _, number in used]
         hits = [outcome.contact_mps for outcome in outcomes if math.isfinite(outcome.contact_mps)]
         times = [outcome.named_s for outcome in outcomes if outcome.text]
         rests = [outcome.rest_s for outcome in outcomes if math.isfinite(outcome.rest_s)]

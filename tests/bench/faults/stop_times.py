@@ -10,14 +10,14 @@ import os
 import random
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
-from tests.bench.results import Column, ResultTable
+from tests.bench.results import ResultTable, columns
 from tests.replay.live import Base, Daemon, Operator, robot
 from tests.waiting import wait_until
 
@@ -27,15 +27,9 @@ POLL_S: Final = 0.002
 STILL_S: Final = 0.3  # wheels at rest must stay there for so long, while the cause lasts and after it
 ARM_PERIOD_S: Final = 0.2
 MANUAL: Final = ("--set", "controller.arming=manual")
-COLUMNS: Final = (
-    Column("cause"),
-    Column("stops"),
-    Column("last command to move, p50", "ms", 0),
-    Column("p99", "ms", 0),
-    Column("max", "ms", 0),
-    Column("at rest, p50", "ms", 0),
-    Column("p99", "ms", 0),
-    Column("max", "ms", 0),
+COLUMNS: Final = columns(
+    *("cause", "stops", "last command to move, p50|ms|0", "p99|ms|0", "max|ms|0"),
+    *("at rest, p50|ms|0", "p99|ms|0", "max|ms|0"),
 )
 PHASE_S: Final = 0.2  # span of the random moments
 
@@ -67,24 +61,19 @@ def _nothing(_: Robot) -> None:
     """Undo nothing."""
 
 
-def _signals(number: int, *, daemon: bool, controller: bool) -> Callable[[Robot], None]:
+def _signals(number: int, *processes: Literal["daemon", "controller"]) -> Callable[[Robot], None]:
     """Return a function that sends a signal to the daemon, its controller process, or both."""
 
     def send(robot: Robot) -> None:
-        controller_pid = robot.daemon.controller_pid
-        if daemon:
-            robot.daemon.process.send_signal(number)
-        if controller:
-            os.kill(controller_pid, number)
+        pids = {"daemon": robot.daemon.process.pid, "controller": robot.daemon.controller_pid}
+        for name in processes:
+            os.kill(pids[name], number)
 
     return send
 
 
 def _hears_nothing(deaf: bool) -> Callable[[Robot], None]:
-    def set_fault(robot: Robot) -> None:
-        robot.base.twin.drop_input = deaf
-
-    return set_fault
+    return lambda robot: setattr(robot.base.twin, "drop_input", deaf)
 
 
 def _images(line: str) -> Callable[[Robot], None]:
@@ -99,16 +88,14 @@ CAUSES: Final[dict[str, Cause]] = {
     "no images at all": Cause(_images("both mute"), _images("both ok")),
     "images frozen": Cause(_images("both frozen"), _images("both ok")),
     "darkness": Cause(_images("both black"), _images("both ok")),
-    "the daemon does not run (SIGSTOP)": Cause(
-        _signals(signal.SIGSTOP, daemon=True, controller=False), _signals(signal.SIGCONT, daemon=True, controller=False)
-    ),
+    "the daemon does not run (SIGSTOP)": Cause(_signals(signal.SIGSTOP, "daemon"), _signals(signal.SIGCONT, "daemon")),
     "nothing of it runs (SIGSTOP)": Cause(
-        _signals(signal.SIGSTOP, daemon=True, controller=True), _signals(signal.SIGCONT, daemon=True, controller=True)
+        _signals(signal.SIGSTOP, "daemon", "controller"), _signals(signal.SIGCONT, "daemon", "controller")
     ),
     "the motor controller hears nothing": Cause(_hears_nothing(True), _hears_nothing(False)),
-    "SIGTERM": Cause(_signals(signal.SIGTERM, daemon=True, controller=False), None),
-    "the daemon killed (SIGKILL)": Cause(_signals(signal.SIGKILL, daemon=True, controller=False), None),
-    "its controller process killed": Cause(_signals(signal.SIGKILL, daemon=False, controller=True), None),
+    "SIGTERM": Cause(_signals(signal.SIGTERM, "daemon"), None),
+    "the daemon killed (SIGKILL)": Cause(_signals(signal.SIGKILL, "daemon"), None),
+    "its controller process killed": Cause(_signals(signal.SIGKILL, "controller"), None),
 }
 
 
@@ -175,29 +162,14 @@ def started(recorded: Path, folder: Path) -> Iterator[Robot]:
         yield Robot(*parts)
 
 
-def cells(name: str, times: list[StopTime]) -> list[Any]:
-    """Return the row of a table, in ms."""
-    figures = [
-        value
-        for column in zip(*times, strict=True)
-        for value in (*np.percentile(1000 * np.array(column), (50, 99)), 1000 * max(column))
-    ]
-    return [name, len(times), *figures]
-
-
-def failed_cells(name: str, error: AssertionError) -> list[Any]:
-    """Return the row of a cause that did not stop the wheels."""
-    return [f"{name}, FAILED: {' '.join(str(error).split())[:200]}", None, *[None] * 6]
-
-
-def run(recorded: Path, folder: Path, words: list[str], count: int, seed: int) -> int:
-    """Measure a row for each cause whose name has one of the words; return the number of causes that did not stop."""
-    table = ResultTable("faults_stops", "From a cause to wheels at rest", COLUMNS)
-    failed = 0
+def run(recorded: Path, folder: Path, words: Sequence[str], count: int, seed: int) -> int:
+    """Measure a row [ms] for each cause whose name has one of the words; return the number that did not stop."""
+    table, failed = ResultTable("faults_stops", "From a cause to wheels at rest", COLUMNS), 0
     for number, name in enumerate(name for name in CAUSES if not words or any(word in name for word in words)):
         try:
-            table.add(*cells(name, stop_times(recorded, folder / f"stop-{number}", name, count, seed)))
+            times = 1e3 * np.array(stop_times(recorded, folder / f"stop-{number}", name, count, seed))
+            table.add(name, count, *np.percentile(times, (50, 99, 100), axis=0).T.ravel())
         except AssertionError as error:
             failed += 1
-            table.add(*failed_cells(name, error))
+            table.add(f"{name}, FAILED: {' '.join(str(error).split())[:200]}", None, *[None] * 6)
     return failed

@@ -1,1 +1,1 @@
-"""The experiments of Dang et al. 2012, section V, rendered by POV-Ray and measured: `python -m tests.bench.paper`."""
+"""The experiments of Dang et al. 2012, section V, rendered and measured: `python -m tests.bench.paper`."""

@@ -24,9 +24,8 @@ from omnid.messages import Panoramas
 from omnid.recordings.evaluation import evaluate
 from omnid.simulation.rendering.surfaces import Rectangle
 from omnid.stages.dense_depths import DenseDepths
-from tests.bench.paper.scenes import MOVED_TURNS_DEG, TURNS_DEG, WALL_M
+from tests.bench.paper.scenes import MOVED_TURNS_DEG, TURNS_DEG, WALL_M, Experiment, Views
 from tests.bench.paper.truth import Flags, cast, sees, surface_distance_m
-from tests.bench.paper.views import Experiment, Views, load_views
 from tests.bench.results import Cell
 from tests.simulation.recipes import SimulatedRun
 
@@ -52,7 +51,7 @@ class WallFigures(NamedTuple):
 
 def walls(folder: Path, experiment: Experiment) -> dict[str, WallFigures]:
     """Return the figures of each method on the matches that truly show the wall."""
-    run, views, stereo = experiment.run, load_views(folder), Config().stereo
+    run, views, stereo = experiment.run, Views.load(folder), Config().stereo
     wall = next(face for face in run.scene.rectangles if face.name == "wall")
     squares = round(2 * WALL_M * np.tan(np.deg2rad(HALF_ANGLE_DEG)) / CELL_M) * round(wall.height_m / CELL_M)
     found = {}
@@ -130,7 +129,7 @@ class Turn:
 
 def turns(folder: Path, experiment: Experiment) -> Iterator[Turn]:
     """Yield the turns from the first pair of the log to each other one, and the ways back."""
-    run, views = experiment.run, load_views(folder)
+    run, views = experiment.run, Views.load(folder)
     frames = [
         StereoFrame(p.seq, p.lower, p.upper, np.full(p.visible.shape, np.nan, np.float32), p.visible)
         for p in views.panoramas

@@ -1,17 +1,30 @@
-"""The scenes of the paper's experiments by name: rig, path and world from one seed."""
+"""The paper's experiments by name: rig, path and world of a seed, and the panoramas of a rendered log."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
-from dataclasses import replace
+from contextlib import closing
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 
+from calib import se3
+from calib.models.camera import Array
 from calib.rig import Rig
+from calib.rig_file import read_rig
+from drivers.logs.log_reader import LogReader
+from omnid.config import Config
+from omnid.messages import Panoramas
 from omnid.simulation.rendering.shapes import CEILING_M
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
 from omnid.simulation.rendering.textures import PAINTERS, value_noise
 from omnid.simulation.world_file import load_world
+from omnid.stages.dewarp import Dewarp
+from omnid.stages.geometry import Geometry, geometry
+from omnid.stages.synchronise import Synchronise
 from tests.bench.route_series import lap
 from tests.simulation import paths
 from tests.simulation.builders import corridor
@@ -19,6 +32,7 @@ from tests.simulation.builders import wall as upright
 from tests.simulation.recipes import TURN_DEG, SimulatedRun
 from tests.simulation.rigs import make_rig
 
+DESCRIPTION = "experiment.json"  # in the folder of a log
 WALL_M = 2.0  # section V.B: distance from the cameras to the wall
 WALL_SIZE_M = (9.0, CEILING_M)
 SMOOTH_PX_PER_M = 200.0  # resolution of the smooth wall's texture
@@ -39,19 +53,9 @@ def seeded_rig(seed: int, size: int) -> Rig:
     return make_rig(size=size, scale=scale, baseline_m=baseline, misaligned_deg=turned, offset_mm=(x, y))
 
 
-def brick(seed: int, size: int, pairs: int) -> SimulatedRun:
-    """Return a run before a wall of identical bricks (section V.B)."""
-    return _facing(seed, size, pairs, "brick")
-
-
-def control(seed: int, size: int, pairs: int) -> SimulatedRun:
-    """Return the run of `brick` with a wall texture that does not repeat."""
-    return _facing(seed, size, pairs, "granite")
-
-
 def smooth(seed: int, size: int, pairs: int) -> SimulatedRun:
-    """Return the run of `brick` with a smooth wall: soft clouds without edges, the weakness named in section III.C."""
-    run = _facing(seed, size, pairs, "plain")
+    """Return a run before a smooth wall: soft clouds without edges, the weakness named in section III.C."""
+    run = facing(seed, size, pairs, "plain")
     rng = np.random.default_rng([seed, 25])
     mean, sigma = SMOOTH_GREY
     texture_size = (round(WALL_SIZE_M[0] * SMOOTH_PX_PER_M), round(WALL_SIZE_M[1] * SMOOTH_PX_PER_M))
@@ -61,8 +65,8 @@ def smooth(seed: int, size: int, pairs: int) -> SimulatedRun:
     return replace(run, scene=Scene((replace(front, texture=texture), *others)))
 
 
-def _facing(seed: int, size: int, pairs: int, kind: str) -> SimulatedRun:
-    """Return a run WALL_M before a wall named 'wall'; other walls are plaster. The pairs are 7 cm apart, sideways."""
+def facing(seed: int, size: int, pairs: int, kind: str) -> SimulatedRun:
+    """Return a run before a wall named 'wall' (V.B); other walls are plaster. The pairs are 7 cm apart, sideways."""
     rng = np.random.default_rng([seed, 24])
     half = WALL_SIZE_M[0] / 2
     front = upright(rng, kind, (WALL_M, half), (WALL_M, -half))
@@ -108,10 +112,9 @@ def building(seed: int, size: int, pairs: int) -> SimulatedRun:
     return SimulatedRun(seeded_rig(seed, size), paths.planar_poses(np.column_stack([x, y]), turned), scene)
 
 
-Recipe = Callable[[int, int, int], SimulatedRun]
-EXPERIMENTS: dict[str, tuple[Recipe, int]] = {  # recipe and number of pairs
-    "brick": (brick, 3),
-    "control": (control, 3),
+EXPERIMENTS: dict[str, tuple[Callable[[int, int, int], SimulatedRun], int]] = {  # recipe and number of pairs
+    "brick": (partial(facing, kind="brick"), 3),
+    "control": (partial(facing, kind="granite"), 3),  # a texture that does not repeat
     "smooth": (smooth, 3),
     "two_walls": (two_walls, 99),
     "turns": (turns, 1 + len(TURNS_DEG) + len(MOVED_TURNS_DEG)),
@@ -123,3 +126,64 @@ def build(name: str, seed: int, size: int = 768, pairs: int | None = None) -> Si
     """Return the run of a name; pairs None: as many as the paper has."""
     recipe, default_pairs = EXPERIMENTS[name]
     return recipe(seed, size, pairs or default_pairs)
+
+
+@dataclass(frozen=True, slots=True)
+class Experiment:
+    """The origin of a rendered log: scene, seed, size and number of pairs."""
+
+    name: str
+    seed: int
+    size: int
+    pairs: int
+
+    @property
+    def run(self) -> SimulatedRun:
+        """Rig, path and scene."""
+        return build(self.name, self.seed, self.size, self.pairs)
+
+    @property
+    def label(self) -> str:
+        """The folder's name, as in two_walls_s11."""
+        return f"{self.name}_s{self.seed}"
+
+    def write(self, folder: Path) -> None:
+        """Write the description into the folder."""
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / DESCRIPTION).write_text(json.dumps(asdict(self), indent=1) + "\n")
+
+    @staticmethod
+    def read(folder: Path) -> Experiment:
+        """Read the description in a folder."""
+        return Experiment(**json.loads((folder / DESCRIPTION).read_text()))
+
+
+@dataclass(frozen=True, slots=True)
+class Views:
+    """The panoramas that omnid's own stages make of a log, and their geometry."""
+
+    geometry: Geometry
+    panoramas: list[Panoramas]
+
+    @staticmethod
+    def load(folder: Path) -> Views:
+        """Return all panoramas of a short log, whose rig has the masks."""
+        config = Config()
+        place = geometry(read_rig(folder / "rig.toml"), config.panorama)
+        pairing, dewarp = Synchronise(place.rig, config.pair), Dewarp(place, config.panorama)
+        with closing(LogReader(folder / "log.mcap")) as reader:
+            pairs = [pair for frame in reader.frames() if (pair := pairing.process(frame)) is not None]
+        return Views(place, [dewarp.process(pair) for pair in pairs])
+
+    def rays(self, pixels: Array) -> Array:
+        """Return rays (N, 3) with r = 1 in the rig frame of panorama pixels (N, 2)."""
+        return np.asarray(self.geometry.cylinder.rays(pixels) @ self.geometry.T_rig_rect[:3, :3].T)
+
+    def viewpoint(self, T_world_rig: Array) -> Array:
+        """Return the position (3,) of the lower camera's viewpoint in the world."""
+        return np.asarray((T_world_rig @ self.geometry.T_rig_rect)[:3, 3])
+
+    def pixels(self, T_world_rig: Array, points: Array) -> Array:
+        """Return the panorama pixels (N, 2) of points (N, 3) in the world."""
+        T_rect_world = se3.inverse(T_world_rig @ self.geometry.T_rig_rect)
+        return self.geometry.cylinder.pixels(se3.apply(T_rect_world, points))
