@@ -1,28 +1,32 @@
-"""The numbers of the parts of a live daemon, for the table of `omnid.transport.status_names`."""
+"""The numbers of the parts of a live daemon, and in words what is wrong (`omnid.transport.status_names`)."""
 
 from __future__ import annotations
 
 import math
 import time
 from collections.abc import Callable, Mapping
+from typing import Any
 
 from drivers.cameras.camera_state import CameraState
 from drivers.frame import Camera
 from omnid.controller.link import ControllerStatistics
+from omnid.core.control.arming import STARTED
 from omnid.core.control.collision_monitor import remedy
-from omnid.core.control.safety_rules import NOT_ARMED
+from omnid.core.control.safety_rules import ASKED, AWAITED, COMMAND_STALE, FAILED, IDLE, NOT_ARMED
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.core.obstacles.unwatched import Unwatched
+from omnid.core.rig.column_finding import RigState
 from omnid.core.rig.rig_health import VIEWS, RigHealth
 from omnid.core.stereo.tiles import SIDES, Side, TileStates
 from omnid.diagnostics.run_summary import RunCounters, RunStatistics
 from omnid.engine.telemetry import Histogram, StageStats, Telemetry
 from omnid.messages import OdometryUpdate
 from omnid.stages.synchronise import Synchronise
+from omnid.tracking_state import TrackingState
 from omnid.transport import status_names
 from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.commands import CommandReceiver
-from omnid.transport.status_names import TIMEOUT_S, Key, Stats, by_reason, entry, time_key, times
+from omnid.transport.status_names import NOTABLE_SHARE, TIMEOUT_S, Key, Stats, by_reason, entry, time_key, times
 
 
 class StatusCollector:
@@ -70,10 +74,16 @@ class StatusCollector:
     def _odometry(self) -> Stats:
         newest = self._statistics.newest
         if newest is None:
-            return {}
+            return {"_stale": "no pose yet"}
+        state, fault = newest.state, newest.image_fault
+        if newest.light.is_too_dark and state != TrackingState.LOST:
+            fault = "it is too dark"
+        severity = {TrackingState.LOST: "_error", TrackingState.DEGRADED: "_warning"}.get(state, "_words")
+        severity = "_warning" if fault and severity == "_words" else severity
+        age_s = self._age_s(newest.stamp_ns)
         return {
             Key.RATE_HZ: self._rate_hz("poses", self._statistics.poses),
-            Key.AGE_S: self._age_s(newest.stamp_ns),
+            Key.AGE_S: age_s,
             Key.INLIERS: newest.inliers,
             Key.TRACKED: newest.tracks,
             Key.RUN: status_names.RUN_ID,
@@ -82,38 +92,71 @@ class StatusCollector:
             "level_grey": newest.light.level_grey,
             "contrast_to_noise": newest.light.contrast_to_noise,
             **times(status_names.CAPTURE_TO_POSE, self._to_pose),
-            "_state": newest.state,
-            "_is_dark": newest.light.is_too_dark,
-            "_fault": newest.image_fault,
+            **({"_stale": "no new pose"} if age_s > TIMEOUT_S else {severity: f"{state}: {fault}" if fault else state}),
         }
 
     def _pairing(self) -> Stats:
         pair, images = self._pair, self._telemetry.of("pair")
+        stats: dict[str, Any] = pair.stats()
         missing = [name for name, stamp_ns in pair.newest_ns.items() if not self._age_s(stamp_ns) <= TIMEOUT_S]
-        return pair.stats() | {
-            "_missing": " and the ".join(missing),
-            "_pairs_hz": self._rate_hz("pairs", pair.counts["pairs"]),
-            "_broken_hz": self._rate_hz("broken", pair.counts["broken"]),
-            "_taken_hz": self._rate_hz("pair processed", images.processed),
-            "_dropped_hz": self._rate_hz("pair dropped", images.dropped),
-        }
+        pairs_hz, broken_hz = (self._rate_hz(name, pair.counts[name]) for name in ("pairs", "broken"))
+        taken_hz, dropped_hz = (
+            self._rate_hz(f"pair {name}", getattr(images, name)) for name in ("processed", "dropped")
+        )
+        apart = "further apart in time than pair.tolerance_ms"
+        warning = ""
+        if missing:
+            warning = f"no images of the {' and the '.join(missing)} camera"
+        elif broken_hz > 0:
+            warning = f"images cannot be decoded; the first: {stats['_fault']}"
+        elif frozen := stats["_frozen"]:
+            what = f"the images of the {frozen} camera are frozen: all pixels are as before"
+            warning = f"{what}; check the camera and its driver"
+        elif dropped_hz > NOTABLE_SHARE * (taken_hz + dropped_hz):
+            warning = (
+                "too slow: the computer leaves images out; close other programs on it, or start omnid with "
+                "--profile small"
+            )
+        elif pairs_hz == 0:
+            warning = f"the cameras' images are {apart}: synchronise them"
+        elif stats["_is_fixed"] and abs(stats["skew_ms"]) > stats["tolerance_ms"] / 2:
+            warning = f"the cameras' images are nearly {apart} allows: synchronise them"
+        is_corrected = bool(stats["exposure_skew_ms"])
+        words = "not synchronised: the motion between the exposures is corrected" if is_corrected else "synchronised"
+        return stats | {"_warning": warning, "_words": words}
 
     def _camera(self, name: Camera) -> Stats:
-        state = self._cameras[name]
+        state, age_s = self._cameras[name], self._age_s(self._pair.newest_ns[name])
         counts = ("frames", Key.DROPS, Key.ERRORS, "restamped", Key.RESTARTS, Key.LOSSES, "reopens")
+        is_late = state.status == "streaming" and not age_s <= TIMEOUT_S
         return {
             "mode": state.mode,
             Key.RATE_HZ: self._rate_hz(f"{name} frames", state.frames),
-            Key.AGE_S: self._age_s(self._pair.newest_ns[name]),
+            Key.AGE_S: age_s,
             **{key: getattr(state, key) for key in counts},
-            "_status": state.status,
-            "_problem": state.problem,
+            "_error": state.problem or "lost" if state.status == "lost" else "no new image" if is_late else "",
+            "_words": state.status,
         }
 
 
 def wheel_stats(controller: ControllerStatistics, commands: CommandReceiver) -> Stats:
     """Return the counters and times of the controller, whether the wheels turn, and why they do not."""
     state, late = controller.state, controller.lateness  # read once, for another thread replaces it
+    # 1. Why they stand or are slow; a controller that has failed is an error, but not while it boots.
+    stop = state.disarmed_by if state.reason == NOT_ARMED else state.reason
+    slow = "" if state.reason else state.slowed_by or state.obstacle
+    words = stop or (f"driving slowly: {slow}" if slow else "driving")
+    if state.reason == NOT_ARMED and stop != STARTED:
+        words = f"not armed: {stop}"
+    elif stop == AWAITED:
+        words = f"{stop}: {state.problem}"
+    elif not stop and state.blocked:
+        words = f"stopped: {state.obstacle}"
+    boots = state.reason == AWAITED and not state.overdue
+    has_failed = (state.reason == FAILED or state.failed or state.fault) and not boots
+    is_unwanted = slow or stop not in ("", IDLE, ASKED, COMMAND_STALE, STARTED)
+    severity = "_error" if has_failed else "_warning" if is_unwanted else "_words"
+    # 2. The numbers.
     counts = ("sent", "late", Key.ERRORS, Key.EXPIRIES, "fault", "lost_reports", "slowed")
     arm = "send cmd/arm: `omnid arm`" if state.needs_request else ""
     return {
@@ -137,12 +180,7 @@ def wheel_stats(controller: ControllerStatistics, commands: CommandReceiver) -> 
         "problem": state.problem,  # why the motor controller took no command
         "measured": state.measured,  # of commands, wheels, gyro and images that differ
         "battery_v": state.battery_v,
-        "_reason": state.reason,
-        "_stop": state.disarmed_by if state.reason == NOT_ARMED else state.reason,
-        "_slow": "" if state.reason else state.slowed_by or state.obstacle,
-        "_is_blocked": state.blocked,
-        "_failed": state.failed,
-        "_overdue": state.overdue,
+        severity: words,
     }
 
 
@@ -168,15 +206,35 @@ def summary_stats(counters: RunCounters) -> Stats:
         "length_m": f"{counters.length_m:.4f}",
         Key.RESETS: counters.resets,
         **{f"{group}_{name}": count for group, counts in groups.items() for name, count in counts.items()},
+        "_words": "the run has ended",
     }
+
+
+RIG_WORDS = {
+    RigState.UNCHECKED: ("_words", "not checked yet: the robot must drive past different places"),
+    RigState.FITS: ("_words", "fits"),
+    RigState.DRIFTED: (
+        "_warning",
+        "drifted: run omnid calibrate drive --only check on a recording; -o corrects the rotation of the upper camera",
+    ),
+    RigState.EXCHANGED: ("_error", "the cameras are exchanged: exchange them in the configuration"),
+    RigState.BROKEN: (
+        "_error",
+        "broken: a camera is covered or has moved by degrees, or the rig's file is of other cameras: run omnid "
+        "calibrate drive --only check on a recording",
+    ),
+}
 
 
 def rig_stats(health: RigHealth) -> Stats:
     """Return the state of the rig, and the evidence of the newest finding."""
     finding, start = health.finding, health.start_finding
     stats = {Key.STATE: health.state, "new_views": health.new_views, "needed_views": VIEWS}
-    # The words of the first pairs count while the drive has shown nothing.
-    stats |= {"_warning": "" if finding else health.warning, Key.AGE_S: health.finding_age_s}
+    stats[Key.AGE_S] = health.finding_age_s
+    severity, words = RIG_WORDS[health.state]
+    if health.warning and not finding:  # the words of the first pairs count while the drive has shown nothing
+        severity, words = "_error" if severity == "_error" else "_warning", health.warning
+    stats[severity] = words
     if start is not None:
         stats["exchanged_matches"] = start.exchanged_matches
     if (newest := finding or start) is not None:
@@ -187,12 +245,12 @@ def rig_stats(health: RigHealth) -> Stats:
 def image_stats(unwatched: Unwatched, newest: OdometryUpdate | None) -> Stats:
     """Return the parts of the newest pair that are frozen or blind, and how long."""
     if newest is None:
-        return {}
+        return {"_stale": "no pose yet"}
     tiles = newest.depth.panoramas.tiles
     lost = [side for side in SIDES if side in tiles.columns and tiles.columns[side].any()]
     since_s = {f"{side}_since_s": round((newest.stamp_ns - tiles.since_ns[side]) * S_PER_NS) for side in lost}
     words = "; ".join(_lost_parts(unwatched, side, tiles) for side in lost)
-    return {**since_s, "_lost": words}
+    return {**since_s, "_error": words, "_words": status_names.LIVE}
 
 
 def _lost_parts(unwatched: Unwatched, side: Side, tiles: TileStates) -> str:

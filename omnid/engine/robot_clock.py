@@ -25,6 +25,7 @@ from omnid.engine.threads import Lock
 SLEW: Final = 500e-6  # most by which NTP changes the rate of a clock: MAXFREQ of the kernel's timex.h
 STEP_NS: Final = 1_000_000  # less than two images of a pair are apart
 FOLLOW_NS: Final = NS_PER_S  # time between two offsets that are followed in silence
+WARNED_S: Final = 60.0  # The status warns of a step of the clock for this time: people look at it now and then.
 KEPT: Final = 64  # offsets that are remembered: stamps of the last minute, whatever the clock does
 END_NS: Final = 2**31 * NS_PER_S  # of the times of ROS, which begin in 1970 and end in 2038
 READINGS: Final = 3  # of both clocks: the one with the least time between them counts, else stamps jump by its error
@@ -134,11 +135,12 @@ class RobotClock:
     def stats(self) -> dict[str, object]:
         """Return the steps of the clock, and of the newest its size and the time since it [s]."""
         self.follow()
-        stats: dict[str, object] = {"steps": self.steps}
-        if self.steps:
-            change_s, since_s = (ns * S_PER_NS for ns in (self.step.change_ns, self.monotonic_ns() - self.step.at_ns))
-            stats |= {"step_s": f"{change_s:.3f}", "since_s": round(since_s), "_step": self.step.words}
-        return stats
+        if not self.steps:
+            return {"steps": 0, "_words": "followed"}
+        change_s, since_s = (ns * S_PER_NS for ns in (self.step.change_ns, self.monotonic_ns() - self.step.at_ns))
+        severity = "_warning" if since_s < WARNED_S else "_words"
+        words = {severity: f"it was set {self.step.words}: the stamps follow it"}
+        return {"steps": self.steps, "step_s": f"{change_s:.3f}", "since_s": round(since_s), **words}
 
     def _measured(self) -> tuple[int, int, int]:
         """Return the offset, its largest error, and the time of the measurement [ns]."""

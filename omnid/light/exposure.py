@@ -199,26 +199,27 @@ class ExposureControl:
             self._request(wanted, pair.stamp_ns)
 
     def stats(self) -> dict[str, object]:
-        """Return exposure, gain and grey levels, and whether it is too dark or too bright; empty without images."""
+        """Return exposure, gain and grey levels, and whether it is too dark or too bright."""
         if self._levels is None:
-            return {}
+            return {"_words": "no images yet"}
         lower, upper = self._levels
         stats: dict[str, object] = {
             "lower_grey": round(lower.mean),
             "upper_grey": round(upper.mean),
             "lower_bright_grey": round(lower.bright),
             "upper_bright_grey": round(upper.bright),
-            "_reason": self._left_to_cameras,
         }
+        reason = self._left_to_cameras
         if self._law is not None and not self._left_to_cameras:
             state, setting = self._law.state, self._law.setting
             gain = "" if setting.gain is None else setting.gain
             stats |= {"exposure_ms": setting.exposure_us * 1e-3, "steps": self._law.steps, "gain": gain}
-            stats["_reason"] = "" if state == "regulated" else "exposure time and gain are at their limits"
+            reason = "" if state == "regulated" else "exposure time and gain are at their limits"
         else:
             is_dark, is_white = min(lower.mean, upper.mean) < DARK_GREY, max(lower.mean, upper.mean) > WHITE_GREY
             state = "too dark" if is_dark else "too bright" if is_white else "regulated"
-        return stats | {"_state": state}
+        words = {"_words": reason or state} if state == "regulated" else {"_warning": f"{state}: {reason}"}
+        return stats | words
 
     def _request(self, setting: ExposureSetting | None, stamp_ns: int) -> None:
         """Ask both cameras for a setting; None: they regulate themselves."""

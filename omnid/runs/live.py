@@ -9,7 +9,7 @@ from contextlib import ExitStack, closing, suppress
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Final, Protocol, TypeAlias
+from typing import Any, Final, Protocol, TypeAlias
 
 from calib.rig import Rig
 from calib.rig_file import read_rig, rig_toml
@@ -114,7 +114,7 @@ class LiveRobot(Protocol):
         Outputs of the session close them. take: takes the samples that come with the images, from any thread.
         """
 
-    def stats(self) -> dict[str, float]:
+    def stats(self) -> dict[str, Any]:
         """Return the numbers that only this kind of robot has."""
 
 
@@ -160,7 +160,7 @@ class ConnectedRobot:
         frames = [graph.source(name, camera.frames, wake=camera.close) for name, camera in cameras.items()]
         return frames, session.start_controller(session.config.realtime) if session.config.motor.port else None
 
-    def stats(self) -> dict[str, float]:
+    def stats(self) -> dict[str, Any]:
         """Return none: all its parts have entries of their own."""
         return {}
 

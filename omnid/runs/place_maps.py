@@ -143,7 +143,7 @@ class RunPlaces:
 
     def stats(self) -> dict[str, object]:
         """Return how often the map was saved, and why it is not."""
-        return {**self._counts, "_error": self._error}
+        return {**self._counts, "_error": self._error, "_words": "saves the map"}
 
     def finish_run(self) -> RigPlaces | None:
         """Return the joined part of the map after the run, and write it to its file if it was extended.

@@ -15,6 +15,7 @@ import socket
 import time
 from collections.abc import Callable, Collection
 from contextlib import suppress
+from typing import Any
 
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.diagnostics.run_summary import RunStatistics
@@ -106,7 +107,7 @@ class StatusLine:
     """One line about the run: state, poses per second since the last call, dropped messages, missed deadlines."""
 
     def __init__(
-        self, statistics: RunStatistics, telemetry: Telemetry, stats: Callable[[], dict[str, float]] = dict
+        self, statistics: RunStatistics, telemetry: Telemetry, stats: Callable[[], dict[str, Any]] = dict
     ) -> None:
         """stats: numbers of a simulated robot."""
         self.statistics, self._telemetry, self._stats = statistics, telemetry, stats

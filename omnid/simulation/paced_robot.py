@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import replace
 from queue import Empty, Full, Queue
-from typing import Final
+from typing import Any, Final
 
 from drivers.cameras.camera_state import CameraState
 from drivers.frame import CAMERAS, Frame
@@ -145,10 +145,11 @@ class PacedRobot:
         graph = session.graph
         return [graph.source("cameras", lambda: self._frames(graph.settle, take), wake=self.close)], self._link
 
-    def stats(self) -> dict[str, float]:
+    def stats(self) -> dict[str, Any]:
         """Return the real-time factor, the time since the start [s] and the contacts with obstacles."""
         time_s = (self.clock_ns() - self._start_ns) * S_PER_NS
-        return {Key.REAL_TIME_FACTOR: round(self._real_time_factor, 2), "time_s": time_s, "contacts": self.contacts}
+        factor, words = round(self._real_time_factor, 2), "its time waits for the daemon"
+        return {Key.REAL_TIME_FACTOR: factor, "time_s": time_s, "contacts": self.contacts, "_words": words}
 
     def close(self) -> None:
         """End the images; from any thread."""

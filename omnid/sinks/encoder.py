@@ -15,6 +15,7 @@ from drivers.motor import VelocityCommand
 from omnid.core.frames import base_pose, in_outer_axes, of_base
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.messages import GridUpdate, MapUpdate, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
+from omnid.navigation_state import NavigationState
 from omnid.tracking_state import MapState, TrackingState
 from omnid.transport import codec
 from omnid.transport.codec import DiagnosticStatus, FrameTransform, PoseAttachment
@@ -211,6 +212,9 @@ def _most_confident(points: MapPoints, count: int) -> tuple[NDArray[np.float32],
 
 def navigation_stats(update: NavigationUpdate) -> Stats:
     """Return the numbers of an update, for its own topic."""
+    hindered = (NavigationState.BLOCKED, NavigationState.NOT_LOCALISED, NavigationState.PAUSED)
+    severity = "_warning" if update.state in hindered else "_words"
+    severity = "_error" if update.state == NavigationState.FAILED else severity
     stats = {
         Key.STATE: update.state,
         Key.TASK: update.task,
@@ -219,7 +223,7 @@ def navigation_stats(update: NavigationUpdate) -> Stats:
         Key.LEFT_M: update.left_m,
         "offset_m": update.offset_m,  # of the base to the left of the path
         "loops_left": update.loops_left if update.loops_left > 1 else "",  # of a route, with the one that is driven
-        "_words": f"{update.state}: {update.reason}" if update.reason else update.state,
+        severity: f"{update.state}: {update.reason}" if update.reason else update.state,
     }
     if update.teaching:
         stats |= {Key.TEACHING: update.teaching, Key.TAUGHT_M: update.taught_m}

@@ -119,7 +119,7 @@ class Recorder:
         """Return the state of the files, with counts of all that was lost after the inbox."""
         state, names = self.state, ("file", "messages", "lost", "refused", "files", "deleted", "stops")
         counts = {name: getattr(state, name) for name in names} | {"invalid": self.invalid}
-        return {**counts, "_status": state.status, "_words": state.problem or state.status}
+        return {**counts, "_error" if state.status == "stopped" else "_words": state.problem or state.status}
 
     def process(self, message: Recorded) -> None:
         """Record a message and, for a pose, its state where it has changed or a new file has begun."""

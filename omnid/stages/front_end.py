@@ -42,11 +42,11 @@ class FrontEnd:
             "dropped": inbox.dropped,
             "slips": sensors.slips,
             "refused_gyro": sensors.refused,
-            "_is_wrong": not sensors.wheels_are_sane,
-            "_is_slipping": sensors.is_slipping,
-            "_differs": f"{witness.reason} {witness.detail}".strip(),
-            "_detail": f": {witness.detail}" if witness.detail else "",
+            "_warning": "wheels slip" if sensors.is_slipping else f"{witness.reason} {witness.detail}".strip(),
         }
+        if not sensors.wheels_are_sane:
+            what = "wheels contradict the cameras: check motor.drive (radius, track, reversed, swapped)"
+            stats["_warning"] = f"{what}: {witness.detail}" if witness.detail else what
         estimated: dict[str, tuple[int, float]] = {}  # state of the filter, and the unit
         if sensors.steps and inbox.wheels:
             estimated |= {"wheel_scale": (DISTANCE, 1.0), "turn_scale": (TURN, 1.0)}

@@ -65,7 +65,7 @@ class CameraFloor:
         return np.asarray(floor.T_floor_base(self.view) @ self._T_base_rig)
 
     def stats(self) -> dict[str, object]:
-        """Return the figures of the floor, where it is known, and whether the rig states its height."""
+        """Return the figures of the floor, where it is known, and where that comes from."""
         floor = self.floor
         figures: dict[str, object] = {}
         if floor is not None:  # height of the lower viewpoint
@@ -74,7 +74,10 @@ class CameraFloor:
                 "sigma_m": floor.sigma_m,
                 "tilt_deg": math.degrees(floor.tilt_rad),
             }
-        return figures | {"_is_stated": self.stated is not None}
+        if self.stated is not None:
+            return figures | {"_words": "the rig states the height of the cameras"}
+        known = "that which the images show" if figures else "not known: nothing is free"
+        return figures | {"_warning": f"the height of the cameras is {known}"}
 
     def summary(self) -> str:
         """Return one sentence about a height that the rig does not state; empty where it does."""

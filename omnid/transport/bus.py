@@ -142,14 +142,19 @@ class Bus:
             counts[intake.key] += intake.floods
         counts = +counts
         is_flooded, self._flooded = counts.total() > self._flooded, counts.total()
+        warning = ""
+        if self._session is None:
+            warning = f"no router yet at {', '.join(self._config.connect)}"
+        elif is_flooded:
+            warning = f"more messages on {counts.most_common(1)[0][0]} than are taken: end their sender"
         return {
             "mode": "client" if self._config.is_client else "peer",
             "lost": self.lost,
             "same_name": len(self._namesakes),  # other robots of this name
             **{f"flooded, {key}": count for key, count in sorted(counts.items())},
-            "_awaited_router": "" if self._session is not None else ", ".join(self._config.connect),
-            "_same_name": "" if self.is_unique else self._same_name,
-            "_flood": counts.most_common(1)[0][0] if is_flooded else "",
+            "_error": "" if self.is_unique else self._same_name,
+            "_warning": warning,
+            "_words": "open",
         }
 
     @property

@@ -1,34 +1,32 @@
-"""The entries of `<robot>/status`: names, keys, and one table that turns numbers into severities and words.
+"""The entries of `<robot>/status`: names, keys, how severe what a part reports is, and what to do.
 
-A part of the robot gives its numbers (`stats()`), with units in their keys. The first of its rules that holds gives
-level and message. Every number is a value of its own, written as a decimal number. Messages are for people: programs
-do not parse them, and they hold no number that changes from one report to the next. Keys that begin with "_" serve the
-rules alone and are not published.
+A part of the robot gives its numbers (`stats()`), with units in their keys, and says in words what is wrong: by the key
+_error, _stale or _warning, which gives the severity, or else _words. Every number is a value of its own, written as a
+decimal number. Messages are for people: programs do not parse them, and they hold no number that changes from one
+report to the next. Keys that begin with "_" are not published.
 """
 
 from __future__ import annotations
 
 import math
 import secrets
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import msgspec
 
-from omnid.core.control.arming import STARTED
-from omnid.core.control.safety_rules import ASKED, AWAITED, COMMAND_STALE, FAILED, IDLE, NOT_ARMED
+from omnid.core.control.safety_rules import ASKED
 from omnid.engine.telemetry import Histogram
 from omnid.errors import OmnidError
-from omnid.navigation_state import NavigationState
 from omnid.tracking_state import MapState, TrackingState
 from omnid.transport.codec import ERROR, OK, STALE, WARN, DiagnosticStatus, decode_diagnostics
 
 PREFIX: Final = "omnid: "
 ODOMETRY: Final = f"{PREFIX}odometry"
 PAIRING: Final = f"{PREFIX}pairing"
-CAMERAS: Final = f"{PREFIX}cameras"  # the rules of both; their entries are named by camera_name
+CAMERAS: Final = f"{PREFIX}cameras"  # the advice for both; their entries are named by camera_name
 WHEELS: Final = f"{PREFIX}wheels"
 BUS: Final = f"{PREFIX}bus"
 CLOCK: Final = f"{PREFIX}clock"  # of the computer, whose steps the stamps follow
@@ -54,11 +52,9 @@ IGNORED_PREFIX: Final = "ignored, "  # begins the keys that count valid commands
 DISARMED_BY_STOP: Final = ASKED  # the value of disarmed_by after a stop
 RUN_ID: Final = secrets.token_hex(4)  # of this program: one that starts again has another, and another odom
 TIMEOUT_S: Final = 1.0  # An older image of a camera, or an older pose, is reported as missing.
-STEP_S: Final = 60.0  # The status warns of a step of the clock for this time: people look at it now and then.
 # Share of the pairs that were dark, had lost parts, no sure pose or no place in a queue, from which there is a warning.
 NOTABLE_SHARE: Final = 0.1
 LIVE: Final = "all parts are live"  # of the images
-HINDERED: Final = (NavigationState.BLOCKED, NavigationState.NOT_LOCALISED, NavigationState.PAUSED)
 
 
 class Key(StrEnum):
@@ -115,215 +111,39 @@ CAPTURE_TO_WHEEL: Final = "capture_to_wheel"
 TICK_LATE: Final = "tick_late"
 _TIME_SUFFIX: Final = "_ms"
 
-Stats: TypeAlias = Mapping[Any, Any]  # the numbers of a part by their keys
-Level: TypeAlias = int | Callable[[Stats], int]
+Stats: TypeAlias = Mapping[Any, Any]  # the numbers of a part by their keys, and words
+SAYS: Final = {"_error": ERROR, "_stale": STALE, "_warning": WARN, "_words": OK}  # severity of words by their key
 
-
-class Part(NamedTuple):
-    """A part of the robot: the usual advice where it is not well, and rules, of which the first that holds counts.
-
-    A rule has a level, a condition on the numbers, and words with keys of the numbers in braces. A condition that is a
-    key holds where that number is there and not 0 or empty; "" always holds.
-    """
-
-    remedy: str
-    rules: tuple[tuple[Level, str | Callable[[Stats], object], str], ...]
-
-
-def _of_pose(s: Stats) -> int:
-    """Return the level of the state of a pose."""
-    return {TrackingState.TRACKING: OK, TrackingState.DEGRADED: WARN, TrackingState.LOST: ERROR}[s["_state"]]
-
-
-def _of_wheels(s: Stats) -> int:
-    """Return ERROR for a motor controller that has failed, but not while it boots; WARN for an unwanted stop."""
-    boots = s["_reason"] == AWAITED and not s["_overdue"]
-    if (s["_reason"] == FAILED or s["_failed"] or s["fault"]) and not boots:
-        return ERROR
-    return WARN if s["_slow"] or s["_stop"] not in ("", IDLE, ASKED, COMMAND_STALE, STARTED) else OK
-
-
-PARTS: Final[Mapping[str, Part]] = {
-    ODOMETRY: Part(
-        "stop, then drive back slowly to a place that it has seen; check light and mirrors",
-        (
-            (STALE, lambda s: not s, "no pose yet"),
-            (STALE, lambda s: s[Key.AGE_S] > TIMEOUT_S, "no new pose"),
-            (WARN, lambda s: s["_is_dark"] and s["_state"] != TrackingState.LOST, "{_state}: it is too dark"),
-            (lambda s: max(WARN, _of_pose(s)), "_fault", "{_state}: {_fault}"),
-            (_of_pose, "", "{_state}"),
-        ),
-    ),
-    PAIRING: Part(
-        "on the robot: omnid doctor",
-        (
-            (WARN, "_missing", "no images of the {_missing} camera"),
-            (WARN, lambda s: s["_broken_hz"] > 0, "images cannot be decoded; the first: {_fault}"),
-            (
-                WARN,
-                "_frozen",
-                "the images of the {_frozen} camera are frozen: all pixels are as before; check the camera and its "
-                "driver",
-            ),
-            (
-                WARN,
-                lambda s: s["_dropped_hz"] > NOTABLE_SHARE * (s["_taken_hz"] + s["_dropped_hz"]),
-                "too slow: the computer leaves images out; close other programs on it, or start omnid with "
-                "--profile small",
-            ),
-            (
-                WARN,
-                lambda s: s["_pairs_hz"] == 0,
-                "the cameras' images are further apart in time than pair.tolerance_ms: synchronise them",
-            ),
-            (
-                WARN,
-                lambda s: s["_is_fixed"] and abs(s["skew_ms"]) > s["tolerance_ms"] / 2,
-                "the cameras' images are nearly as far apart in time as pair.tolerance_ms allows: synchronise them",
-            ),
-            (OK, "exposure_skew_ms", "not synchronised: the motion between the exposures is corrected"),
-            (OK, "", "synchronised"),
-        ),
-    ),
-    CAMERAS: Part(
-        "check its cable and its power; on the robot: omnid doctor",
-        (
-            (ERROR, lambda s: s["_status"] == "lost", "{_problem}"),
-            (ERROR, lambda s: s["_status"] == "streaming" and not s[Key.AGE_S] <= TIMEOUT_S, "no new image"),
-            (OK, "", "{_status}"),
-        ),
-    ),
-    WHEELS: Part(
-        "remove the cause, then arm; on the robot: omnid doctor",
-        (
-            (_of_wheels, lambda s: s["_reason"] == NOT_ARMED and s["_stop"] != STARTED, "not armed: {_stop}"),
-            (_of_wheels, lambda s: s["_stop"] == AWAITED, "{_stop}: {problem}"),
-            (_of_wheels, lambda s: not s["_stop"] and s["_is_blocked"], "stopped: {obstacle}"),
-            (_of_wheels, "_slow", "driving slowly: {_slow}"),
-            (_of_wheels, "_stop", "{_stop}"),
-            (_of_wheels, "", "driving"),
-        ),
-    ),
-    BUS: Part(
-        "see bus.robot and bus.connect in the robot's configuration",
-        (
-            (WARN, "_awaited_router", "no router yet at {_awaited_router}"),
-            (ERROR, "_same_name", "{_same_name}"),
-            (WARN, "_flood", "more messages on {_flood} than are taken: end their sender"),
-            (OK, "", "open"),
-        ),
-    ),
-    CLOCK: Part(
-        "",
-        (
-            (OK, lambda s: not s["steps"], "followed"),
-            (WARN, lambda s: s["since_s"] < STEP_S, "it was set {_step}: the stamps follow it"),
-            (OK, "", "it was set {_step}: the stamps follow it"),
-        ),
-    ),
-    RECORDING: Part(
-        "make room on the disk, or change record.folder",
-        ((ERROR, lambda s: s["_status"] == "stopped", "{_words}"), (OK, "", "{_words}")),
-    ),
-    RIG: Part(
-        "omnid calibrate drive --only check on a recording; name the right rig.toml, or calibrate again",
-        (
-            (ERROR, lambda s: s["_warning"] and s[Key.STATE] in ("exchanged", "broken"), "{_warning}"),
-            (WARN, "_warning", "{_warning}"),
-            (OK, lambda s: s[Key.STATE] == "unchecked", "not checked yet: the robot must drive past different places"),
-            (OK, lambda s: s[Key.STATE] == "fits", "fits"),
-            (
-                WARN,
-                lambda s: s[Key.STATE] == "drifted",
-                "drifted: run omnid calibrate drive --only check on a recording; -o corrects the rotation of the upper "
-                "camera",
-            ),
-            (
-                ERROR,
-                lambda s: s[Key.STATE] == "exchanged",
-                "the cameras are exchanged: exchange them in the configuration",
-            ),
-            (
-                ERROR,
-                "",
-                "broken: a camera is covered or has moved by degrees, or the rig's file is of other cameras: run omnid "
-                "calibrate drive --only check on a recording",
-            ),
-        ),
-    ),
-    MOTION: Part(
-        "check motor.drive in the configuration, and the grip of the wheels",
-        (
-            (
-                WARN,
-                "_is_wrong",
-                "wheels contradict the cameras: check motor.drive (radius, track, reversed, swapped){_detail}",
-            ),
-            (WARN, "_is_slipping", "wheels slip"),
-            (WARN, "_differs", "{_differs}"),
-        ),
-    ),
-    PLACES: Part(
-        "drive slowly to where the map was made; where everything has changed, make a new map",
-        ((ERROR, lambda s: s[Key.STATE] == MapState.LOST, "{state}"), (OK, "", "{state}")),
-    ),
-    MAP_FILE: Part(
-        "make room on the disk, or change places.map", ((ERROR, "_error", "{_error}"), (OK, "", "saves the map"))
-    ),
-    NAVIGATION: Part(
-        "",
-        (
-            (ERROR, lambda s: s[Key.STATE] == NavigationState.FAILED, "{_words}"),
-            (WARN, lambda s: s[Key.STATE] in HINDERED, "{_words}"),
-            (OK, "", "{_words}"),
-        ),
-    ),
-    IMAGES: Part(
-        "clean the mirrors, look for glare and darkness, check the cameras and their driver",
-        (
-            (STALE, lambda s: not s, "no pose yet"),
-            (ERROR, "_lost", "{_lost}"),
-            (OK, "", LIVE),
-        ),
-    ),
-    FLOOR: Part(
-        "state the height of the cameras in the rig: omnid calibrate drive --only height",
-        (
-            (OK, "_is_stated", "the rig states the height of the cameras"),
-            (WARN, "height_m", "the height of the cameras is that which the images show"),
-            (WARN, "", "the height of the cameras is not known: nothing is free"),
-        ),
-    ),
-    EXPOSURE: Part(
-        "in the dark switch lights on, drive more slowly and raise cameras.exposure_limit_ms, or clean the mirrors; in "
-        "glare shade the mirrors, or put a filter before the lenses; where the images are good enough, set "
-        'cameras.auto_exposure = "on"',
-        (
-            (OK, lambda s: not s, "no images yet"),
-            (WARN, lambda s: s["_state"] != "regulated", "{_state}: {_reason}"),
-            (OK, "_reason", "{_reason}"),
-            (OK, "", "{_state}"),
-        ),
-    ),
-    SIMULATION: Part("", ((OK, "", "its time waits for the daemon"),)),
-    SUMMARY: Part("", ((OK, "", "the run has ended"),)),
-    CALIBRATION: Part("", ((OK, "", "{_outcome}"),)),
+# What to do where a part is not well and gives no advice of its own.
+REMEDIES: Final[Mapping[str, str]] = {
+    ODOMETRY: "stop, then drive back slowly to a place that it has seen; check light and mirrors",
+    PAIRING: "on the robot: omnid doctor",
+    CAMERAS: "check its cable and its power; on the robot: omnid doctor",
+    WHEELS: "remove the cause, then arm; on the robot: omnid doctor",
+    BUS: "see bus.robot and bus.connect in the robot's configuration",
+    RECORDING: "make room on the disk, or change record.folder",
+    RIG: "omnid calibrate drive --only check on a recording; name the right rig.toml, or calibrate again",
+    MOTION: "check motor.drive in the configuration, and the grip of the wheels",
+    PLACES: "drive slowly to where the map was made; where everything has changed, make a new map",
+    MAP_FILE: "make room on the disk, or change places.map",
+    IMAGES: "clean the mirrors, look for glare and darkness, check the cameras and their driver",
+    FLOOR: "state the height of the cameras in the rig: omnid calibrate drive --only height",
+    EXPOSURE: "in the dark switch lights on, drive more slowly and raise cameras.exposure_limit_ms, or clean the "
+    "mirrors; in glare shade the mirrors, or put a filter before the lenses; where the images are good enough, set "
+    'cameras.auto_exposure = "on"',
 }
 
 
 def entry(name: str, stats: Stats) -> DiagnosticStatus:
-    """Return the entry of a part: its numbers, and level, words and advice by its rules."""
-    remedy, rules = PARTS.get(CAMERAS if name.endswith(" camera") else name, Part("", ()))
-    level, _, words = next(
-        rule
-        for rule in (*rules, (OK, "", ""))
-        if (rule[1](stats) if callable(rule[1]) else not rule[1] or stats.get(rule[1]))
-    )
-    found = level(stats) if callable(level) else level
+    """Return the entry of a part: its numbers, and level, words and advice; a part with a state alone reports that."""
+    state = str(stats.get(Key.STATE, ""))
+    said = ((level, str(stats[key])) for key, level in SAYS.items() if stats.get(key))
+    level, words = next(said, (ERROR if state == MapState.LOST else OK, state))
     values = {key: value for key, value in stats.items() if not key.startswith("_")}
-    if found != OK and remedy and not values.get(Key.REMEDY):
+    remedy = REMEDIES.get(CAMERAS if name.endswith(" camera") else name)
+    if level != OK and remedy and not values.get(Key.REMEDY):
         values[Key.REMEDY] = remedy
-    return DiagnosticStatus.of(name, found, words.format_map(stats), values)
+    return DiagnosticStatus.of(name, level, words, values)
 
 
 def by_reason(prefix: str, counts: Mapping[str, int]) -> dict[str, int]:

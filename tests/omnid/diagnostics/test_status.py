@@ -40,7 +40,7 @@ from omnid.tracking_state import TrackingState
 from omnid.transport import codec
 from omnid.transport.codec import ERROR, OK, STALE, WARN, DiagnosticStatus, diagnostics_cdr
 from omnid.transport.commands import CommandReceiver, Freshness
-from omnid.transport.status_names import FLOOR, IMAGES, LIVE, PARTS, RIG, TIMEOUT_S, WHEELS, Key, entry, short_name
+from omnid.transport.status_names import FLOOR, IMAGES, LIVE, REMEDIES, RIG, TIMEOUT_S, WHEELS, Key, entry, short_name
 from omnid.transport.topics import Request
 from tests.omnid.small_pair import small_depth
 from tests.omnid.stages.test_keyframe_scan import depth
@@ -276,7 +276,7 @@ def test_names_camera_directions_and_time() -> None:
     unwatched = Unwatched(place.cylinder, place.rig.T_base_rig @ place.T_rig_rect)
     assert entry(IMAGES, image_stats(unwatched, None)).level == STALE
     found = entry(IMAGES, image_stats(unwatched, update(lost(23, 40, is_dead=False), 113 * S)))
-    assert found.level == ERROR and found.values == {"upper_since_s": "13", Key.REMEDY: PARTS[IMAGES].remedy}
+    assert found.level == ERROR and found.values == {"upper_since_s": "13", Key.REMEDY: REMEDIES[IMAGES]}
     text = found.message
     assert text.startswith("the upper camera is blind from ") and text.endswith(" degrees")
     begin, end = (int(word) for word in text.split() if word.isdigit())
