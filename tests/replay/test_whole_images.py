@@ -19,7 +19,7 @@ from calib import se3
 from omnid.api import replay
 from omnid.formats.tum import read_tum
 from tests.replay.edited import images, save
-from tests.simulation.whole_images import Image, repeat_lines, shift, tear, turn
+from tests.simulation.whole_images import Image, repeat_lines, roll, shift, tear, turn
 
 Edit = Callable[[Sequence[Image]], list[Image]]
 SINCE: Final = 8
@@ -63,6 +63,7 @@ CASES: Final = {
         lambda taken: turn(taken, 1.0, since=SINCE),
         r"the lower camera were displaced by .* turned by -(0\.9|1\.0)",
     ),
+    "rolling, both": Case(BOTH, lambda taken: roll(taken, 0.5), "cameras have rows that are read one after another", 1),
 }
 
 

@@ -68,6 +68,10 @@ class ViewShift:
         J = self.by_motion[:, :3]
         return np.asarray(J @ motion.covariance @ np.swapaxes(J, 1, 2))
 
+    def variance(self, motion: RigVelocity) -> Array:
+        """Return the variances (N, 4) [px^2], as in by_motion, by the uncertainty of the velocity."""
+        return np.asarray(np.einsum("nki,ij,nkj->nk", self.by_motion, motion.covariance, self.by_motion))
+
     def column_sigma(self, motion: RigVelocity) -> Array:
         """Return the standard deviation (N,) [px] of the upper column by the uncertainty of the velocity."""
         J = self.by_motion[:, 3]

@@ -28,10 +28,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
+from omnid.core.odometry.exposure_times import Exposure, ViewShift
+from omnid.core.odometry.line_times import LineTimes, ReadOut
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.motion_hypotheses import DECIDING_COST
 from omnid.core.odometry.plane_patches import align, plane_templates
 from omnid.core.odometry.pose_search import CORRELATED_LANDMARKS
+from omnid.core.odometry.raw_image import CAMERAS, LAG_S, LEAST_PX, MEMORY_S, RawImage, camera_names
 from omnid.core.odometry.tracking import KltSettings, track
 from omnid.core.stereo.triangulation import view, view_jacobian
 from omnid.core.types.panorama import PaddedPanorama
@@ -45,7 +48,6 @@ Kind = Literal["torn", "displaced", "turned"]
 
 MOST: Final = 160  # landmarks that are followed in each camera
 SIGMA_PX: Final = 0.1  # of a flow, because patches err by some hundredths, and people and shadows are near by
-LAG_S: Final = 0.003  # standard deviation of the time between the exposures of two cameras that are triggered together
 # Squared Mahalanobis distance of a flow, a sum of two squares, from which on it is an outlier, and costs no more.
 OUTLIER_SQUARED: Final = 32.0
 MOST_SCALE: Final = 25.0  # of the variance of flows: half a pixel; where it is larger, flows are displaced
@@ -60,40 +62,15 @@ RIGHT_COST: Final = 0.31
 FOLLOWED: Final = 0.2  # part of a new pair in the mean of the costs
 FAR: Final = KltSettings(levels=2)  # 28 px
 EDGE_PX: Final = 8  # of the panorama, in which patches are cut
-LEAST_PX: Final = 0.5  # by which what is beyond a line is displaced: less harms no pose
 ROUNDS: Final = 6
 RIDGE: Final = 1e-6
-CAMERAS: Final = ("lower", "upper")
 SETS: Final = ((0,), (1,), (0, 1))  # cameras of a break
 KINDS: Final[tuple[tuple[Kind, tuple[int, ...]], ...]] = (
     *(("torn", cameras) for cameras in SETS),
     *(("displaced", cameras) for cameras in SETS),
     *(("turned", cameras) for cameras in SETS[:2]),  # both images turned alike are a turn of the rig
 )
-MEMORY_S: Final = 1.0  # time after which evidence of a tear counts as a third: vehicles change their motion more often
 CHOICES: Final = 4 * LINES * len(KINDS)  # axes and sides, lines, kinds
-
-
-class RawImage:
-    """Where the raw image of a camera shows the pixels of its panorama."""
-
-    def __init__(self, u: NDArray[np.float32], v: NDArray[np.float32], size: tuple[int, int]) -> None:
-        """u, v (H, W): raw column and row of each pixel, -1: none; size: columns and rows of the raw image."""
-        self._maps, self.size = (u, v), size
-
-    def at(self, pixels: Array) -> tuple[Array, Array]:
-        """Return raw pixels (N, 2) of pixels (N, 2), NaN: none, and the derivatives (N, 2, 2) of pixels by raw ones."""
-        height, width = self._maps[0].shape
-        column = np.clip(np.rint(pixels[:, 0]).astype(np.intp), 2, width - 3)
-        row = np.clip(np.rint(pixels[:, 1]).astype(np.intp), 2, height - 3)
-        raw = np.column_stack([table[row, column] for table in self._maps]).astype(float)
-        across = np.column_stack([table[row, column + 2] - table[row, column - 2] for table in self._maps]) / 4.0
-        down = np.column_stack([table[row + 2, column] - table[row - 2, column] for table in self._maps]) / 4.0
-        determinant = across[:, 0] * down[:, 1] - across[:, 1] * down[:, 0]
-        is_shown = (raw >= 0).all(axis=1) & (np.abs(determinant) > 1e-3)
-        determinant = np.where(is_shown, determinant, 1.0)
-        adjugate = np.array([[down[:, 1], -down[:, 0]], [-across[:, 1], across[:, 0]]])
-        return np.where(is_shown[:, None], raw, np.nan), np.moveaxis(adjugate / determinant, 2, 0)
 
 
 class Break(NamedTuple):
@@ -122,6 +99,7 @@ class _View(NamedTuple):
     pair: Pair
     T_odom_rect: Array
     points: Array  # (N, 3) m, in odom
+    shift: ViewShift  # of their views, to the stamp
     covariance: Array  # (N, 3, 3) m^2
     slopes: Array  # (N, 2) of the disparity, px/px
     step: Array  # (6,) that led to it
@@ -158,6 +136,7 @@ class ImageBreaks:
 
     model: StereoModel
     raws: tuple[RawImage, RawImage]
+    lines: LineTimes  # of the same images
     covariance: Array = field(default_factory=lambda: np.zeros((6, 6)))  # [t; r] that breaks add to that of the pose
     fault: str = ""  # how the images of the last pair are broken, in words; empty: they are whole
     _torn: float = 0.0  # gains of tears, less those forgotten
@@ -166,26 +145,27 @@ class ImageBreaks:
     _open: list[Break] = field(default_factory=list)  # displacements that have not ended
     _usual_cost: float = 0.0  # of a landmark in whole images: none is known yet, so that the first pairs are tested
     _found: dict[tuple[Kind, tuple[int, ...], int], list[Break]] = field(default_factory=dict)
+    _read_out: dict[tuple[tuple[int, ...], int], ReadOut] = field(default_factory=dict)  # newest by cameras and axis
 
     def add(
         self,
-        seq: int,
         pair: Pair,
         T_odom_rect: Array,
+        exposure: Exposure,
         local_map: LocalMap,
         dt_s: float,
         cost: tuple[float, int] | None,
     ) -> None:
-        """Use a pair (seq: its number) with its pose, dt_s after the one before.
+        """Use a pair with its pose, dt_s after the one before.
 
         cost: mean of the landmarks in view, and their number, None: no pose was found. A break costs at least as much
         as it must explain to be believed: where the views fit as usual there is none, and no flow is measured.
         """
         last, found = self._last, None
         step = np.zeros(6) if last is None else se3.log(se3.inverse(last.T_odom_rect) @ T_odom_rect)
-        is_usual = cost is not None and cost[1] * (cost[0] - self._usual_cost) < DECIDING_COST and not self.fault
+        is_usual = cost is not None and cost[1] * (cost[0] - self._usual_cost) < DECIDING_COST and not self._is_broken
         if last is not None and dt_s > 0 and not is_usual:
-            flow = self._flow(last, pair, T_odom_rect, step, LAG_S / dt_s)
+            flow = self._flow(last, pair, T_odom_rect, exposure, step, LAG_S / dt_s)
             found = None if flow is None else likeliest_break(flow, self.raws, self.model.cylinder.focal_px)
         if cost is not None and found is None:
             usual = self._usual_cost + FOLLOWED * (cost[0] - self._usual_cost)
@@ -194,19 +174,28 @@ class ImageBreaks:
         table = local_map.table
         rows, _ = local_map.visible(T_odom_rect)
         rows = rows[:: max(1, -(-len(rows) // MOST))]
-        slopes = local_map.slopes(T_odom_rect, rows)
-        self._last = _View(pair, T_odom_rect, table.points[rows], table.covariance[rows], slopes, step)
+        slopes, points = local_map.slopes(T_odom_rect, rows), table.points[rows]
+        shift = exposure.shift(se3.apply(se3.inverse(T_odom_rect), points))
+        self._last = _View(pair, T_odom_rect, points, shift, table.covariance[rows], slopes, step)
 
     @property
     def words(self) -> list[str]:
         """One line for each kind of break and the cameras that showed it."""
-        return [_words(breaks) for breaks in self._found.values()]
+        read_out = [found.words(self.raws) for found in self._read_out.values()]
+        return [_words(breaks) for breaks in self._found.values()] + read_out
+
+    @property
+    def _is_broken(self) -> bool:
+        """True while a tear has been seen lately, or a displacement has not ended."""
+        return self._torn > DECIDING_COST or bool(self._open)
 
     def _spread(self, last: _View | None, step: Array, found: Break | None, dt_s: float) -> None:
         """Add what a break makes uncertain.
 
         A torn image shows the rig up to an image too early, and landmarks are misplaced by as much. A displaced one
-        turns directions, and moves the rig by as much of the landmarks' range.
+        turns directions, and moves the rig by as much of the landmarks' range. Lines that are read one after another
+        show it within the time that they take: what that is likelier than none adds, and above the odds of a break it
+        is told.
         """
         self._torn *= math.exp(-dt_s / MEMORY_S)
         if found is not None:
@@ -219,19 +208,24 @@ class ImageBreaks:
                 self._open += [found] if len(self._open) == len(before) else []
         is_torn = self._torn > DECIDING_COST
         shown = found or (self._last_tear if is_torn else None) or (self._open[-1] if self._open else None)
+        read_out = self.lines.likeliest() if shown is None else None
+        is_read = read_out is not None and read_out.gain > DECIDING_COST
         self.fault = "" if shown is None else _words([shown])
-        if last is None or (shown is None and not self.covariance.any()):
+        if read_out is not None and is_read:
+            self._read_out[read_out.cameras, read_out.axis] = read_out
+            self.fault = read_out.words(self.raws)
+        if last is None or (shown is None and read_out is None and not self.covariance.any()):
             return
         A = se3.adjoint(se3.exp(-step))
         self.covariance = A @ self.covariance @ A.T
-        if is_torn:
-            self.covariance = self.covariance + np.outer(step, step) + np.outer(last.step, last.step)
+        share = 1.0 if is_torn else min(1.0, abs(read_out.time_s) / dt_s) if read_out is not None and dt_s else 0.0
+        self.covariance = self.covariance + share**2 * (np.outer(step, step) + np.outer(last.step, last.step))
         if found is not None:
             away = se3.apply(se3.inverse(last.T_odom_rect), last.points)
             range_m = float(np.median(np.linalg.norm(away, axis=1)))
             self.covariance = self.covariance + found.angle_rad**2 * np.diag(np.repeat([range_m**2, 1.0], 3))
 
-    def _flow(self, last: _View, pair: Pair, T_now: Array, step: Array, lag: float) -> _Flow | None:
+    def _flow(self, last: _View, pair: Pair, T_now: Array, exposure: Exposure, step: Array, lag: float) -> _Flow | None:
         """Return the flows of the last pair's landmarks, None: too few, as most of them are not found.
 
         lag: standard deviation as a fraction of a step.
@@ -239,6 +233,7 @@ class ImageBreaks:
         cylinder, baseline_m = self.model.cylinder, self.model.baseline_m
         before, now = (se3.apply(se3.inverse(T), last.points) for T in (last.T_odom_rect, T_now))
         views = tuple(view(points, cylinder, baseline_m) for points in (before, now))
+        shift_now = exposure.shift(now)
         J_before, J_now = (view_jacobian(points, cylinder, baseline_m) for points in (before, now))
         of_step = np.concatenate([np.broadcast_to(-np.eye(3), (len(now), 3, 3)), se3.hat(now)], axis=2)
         of_point = J_now @ T_now[:3, :3].T - J_before @ last.T_odom_rect[:3, :3].T
@@ -246,7 +241,8 @@ class ImageBreaks:
         for camera, raw_image in enumerate(self.raws):
             # 1. Landmarks that both pairs show, and where they are instead of where the step puts them.
             own = [0, 1 + camera]
-            start, end = views[0][:, own], views[1][:, own]
+            started, ended = ((each.lower, each.upper)[camera] for each in (last.shift, shift_now))
+            start, end = views[0][:, own] - started, views[1][:, own] - ended
             raw, by_raw = raw_image.at(end)
             inside = np.isfinite(raw).all(axis=1)
             for pixels in (start, end):
@@ -259,6 +255,8 @@ class ImageBreaks:
             d[:, 0] = cylinder.wrap(d[:, 0])
             # 2. Derivatives, in standard deviations.
             noise = np.einsum("nij,njk,nik->ni", of_point[rows][:, own], last.covariance[rows], of_point[rows][:, own])
+            of_motion = [0, 1] if camera == 0 else [3, 2]
+            noise += shift_now.variance(exposure.motion)[rows][:, of_motion]
             px = np.sqrt(SIGMA_PX**2 + noise.mean(axis=1))
             J, shift = J_now[rows][:, own] @ of_step[rows] / px[:, None, None], by_raw[rows] / px[:, None, None]
             size = np.array(raw_image.size)
@@ -441,8 +439,7 @@ def _least_squares(A: Array, y: Array, weight: Array) -> Array:
 def _words(breaks: list[Break]) -> str:
     """Return what breaks of one kind in the same cameras were, and what to do."""
     newest = breaks[0]
-    names = [CAMERAS[camera] for camera in newest.cameras]
-    cameras = " and the ".join(names) + (" cameras" if len(names) > 1 else " camera")
+    cameras = camera_names(newest.cameras)
     line, beyond, before = ("row", "below", "above") if newest.axis == 0 else ("column", "right of", "left of")
     place = f"{line} {round(float(np.median([found.line_px for found in breaks])))}"
     shown = "1 pair shows" if len(breaks) == 1 else f"{len(breaks)} pairs show"
@@ -453,7 +450,7 @@ def _words(breaks: list[Break]) -> str:
         )
     u, v = newest.amount[:, :2].mean(axis=0)
     part = f" {before if newest.is_before else beyond} {line} {newest.line_px}" if newest.line_px else ""
-    if not newest.line_px and len(names) == 1:
+    if not newest.line_px and len(newest.cameras) == 1:
         part = f" against those of the {CAMERAS[1 - newest.cameras[0]]} one"
     turned = f" and turned by {math.degrees(newest.amount[0, 2]):+.2f} deg" if newest.kind == "turned" else ""
     return (

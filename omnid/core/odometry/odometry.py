@@ -15,12 +15,14 @@ from calib import se3
 from omnid.core.odometry.corners import corners
 from omnid.core.odometry.estimates import ROOM_M, OdometryEstimate, OdometryLimits, PoseEstimate
 from omnid.core.odometry.exposure_times import Exposure
-from omnid.core.odometry.image_breaks import ImageBreaks, RawImage
+from omnid.core.odometry.image_breaks import ImageBreaks
 from omnid.core.odometry.keyframes import KeyframeLocaliser, KeyframeRequest, Keyframes
+from omnid.core.odometry.line_times import LineTimes
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.motion_filter import UNKNOWN_SPEED_SIGMA, MotionFilter, bounded
 from omnid.core.odometry.motion_hypotheses import REACH_SIGMAS, MotionHypotheses
 from omnid.core.odometry.pose_search import OUTLIER_COST, PoseSearch
+from omnid.core.odometry.raw_image import RawImage
 from omnid.core.odometry.static_mask import StaticMask
 from omnid.core.odometry.stereo_frame import Features, StereoFrame
 from omnid.core.odometry.tracking import KltSettings
@@ -92,7 +94,7 @@ class VisualOdometry:
         self._added: int | None = None  # seq of the keyframe that the last frame became
         self._distance_m = ROOM_M  # median of the landmarks by which the last pose was found
         self._cost: tuple[float, int] | None = None  # of those in view, and their number; None: no pose was found
-        self.breaks = None if raw_images is None else ImageBreaks(model, raw_images)
+        self.breaks = None if raw_images is None else ImageBreaks(model, raw_images, LineTimes(model, raw_images))
 
     def process(self, frame: StereoFrame, dt_s: float) -> OdometryEstimate:
         """Return the pose at a frame, dt_s [s] after the previous one (0 for the first).
@@ -101,10 +103,10 @@ class VisualOdometry:
         degraded at best while the images are torn or displaced.
         """
         estimate = self._pose(frame, max(dt_s, 0.0))
-        if self.breaks is None or not frame.times.is_at_once:
+        if self.breaks is None:
             return estimate
-        pair = frame.lower, frame.upper
-        self.breaks.add(frame.seq, pair, estimate.T_odom_rect, self._map, dt_s, self._cost)
+        pair, exposure = (frame.lower, frame.upper), self._exposure(frame)
+        self.breaks.add(pair, estimate.T_odom_rect, exposure, self._map, dt_s, self._cost)
         if not self.breaks.fault and not self.breaks.covariance.any():
             return estimate
         is_torn = self.breaks.fault and estimate.state is TrackingState.TRACKING
@@ -273,6 +275,9 @@ class VisualOdometry:
                 exposed_at_once=now.frame.times.is_at_once,
             )
             self._step = T_prev_curr if is_sure else None
+            if is_sure and self.breaks is not None:
+                velocity = se3.log(T_prev_curr) / now.dt_s
+                self.breaks.lines.add(now.frame.seq, estimate, self._map, velocity, now.dt_s)
         elif not now.is_measured:
             self._motion.reset()
         self._map.late_depths.settle(at_previous)

@@ -1,0 +1,149 @@
+"""Are the lines of the images read one after another? Residuals of the landmarks, pooled by image line over a second.
+
+A line at the share s of a raw image (0: the first one, 1: the last one) that is read within the time c is exposed
+c (s - 1/2) after its middle. Landmark x is then seen off by c f(s, x, V), f = -(s - 1/2) J(x) (v + w x x), by the
+velocity V = [v; w] of the rig and the derivative J of a view by a point. So was it in its keyframe k, by which it has
+its place, and its residual at a later pair is
+
+    e = c (f(s, x, V) - J(x) R_k J(x_k)^-1 f(s_k, x_k, V_k)) + J(x) [-1 [x]x] d_k + noise,
+
+d_k (6,) the error of the pose against that keyframe. The times c of rows and of columns of both cameras, and a lag of
+the upper camera, whose prior is that of a trigger's jitter, are one information filter; the d_k are eliminated (Schur
+complement). One c is as likely as its generalised likelihood ratio, with the Bayesian information criterion.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from omnid.core.odometry.estimates import PoseEstimate
+from omnid.core.odometry.local_map import LocalMap
+from omnid.core.odometry.pose_estimation import KERNEL_WIDTH
+from omnid.core.odometry.pose_search import CORRELATED_LANDMARKS, VIEW_DIMENSIONS
+from omnid.core.odometry.raw_image import LAG_S, LEAST_PX, MEMORY_S, RawImage, camera_names
+from omnid.core.stereo.triangulation import view, view_jacobian
+from omnid.core.types.stereo_model import StereoModel
+
+Array = NDArray[np.float64]
+
+LAG: Final = 4  # the unknown behind the times of rows and columns of the lower and the upper camera
+# Cameras whose lines are read in one time, and the line's axis, 0: rows, 1: columns.
+CHOICES: Final = tuple((cameras, axis) for axis in range(2) for cameras in ((0,), (1,), (0, 1)))
+RIDGE: Final = 1e-9  # so that keyframes with few landmarks leave nothing
+
+
+class ReadOut(NamedTuple):
+    """Time in which the lines of images are read, last after first."""
+
+    cameras: tuple[int, ...]  # 0: lower, 1: upper
+    axis: int  # 0: rows, 1: columns
+    time_s: float
+    gain: float  # logarithm of the likelihood ratio, less the cost of the parameter; above 0 it is likelier than none
+
+    def words(self, raws: tuple[RawImage, RawImage]) -> str:
+        """Return what was found of these images, and what to do."""
+        lines = "rows" if self.axis == 0 else "columns"
+        line_us = 1e6 * self.time_s / raws[0].size[1 - self.axis]
+        is_stated = self.axis == 0 and len(self.cameras) == len(raws)
+        advice = "set line_time_s in its table [times]" if is_stated else "check the camera's shutter and its driver"
+        return (
+            f"images of the {camera_names(self.cameras)} have {lines} that are read one after another: line time about "
+            f"{line_us:+.0f} us beside that of the rig's file; {advice}, poses were degraded"
+        )
+
+
+class LineTimes:
+    """Pools the residuals of the landmarks of a run."""
+
+    def __init__(self, model: StereoModel, raws: tuple[RawImage, RawImage]) -> None:
+        self._model, self._raws = model, raws
+        self._velocities: dict[int, Array] = {}  # (6,) of the rig at each keyframe
+        self._information = np.zeros((LAG + 2, LAG + 2))  # of [c, lag], bordered by that of the residuals
+        self._views = 0.0  # that were pooled
+        self._px_per_s = 0.0  # median motion of the landmarks in the last image
+
+    def add(self, seq: int, seen: PoseEstimate, local_map: LocalMap, velocity: Array, dt_s: float) -> None:
+        """Use the inliers of a pair (seq: its number), with the velocity (6,) of the rig in it."""
+        # 1. The velocities at the keyframes: the first one of a map has that of the step after it.
+        known = {key: self._velocities.get(key, velocity) for key in local_map.keyframes}
+        self._velocities = known | {seq: velocity}
+        # 2. Residuals of the views, and their derivatives by [d_k, c, lag].
+        table, rows, cylinder, baseline_m = (
+            local_map.table,
+            seen.landmarks,
+            self._model.cylinder,
+            self._model.baseline_m,
+        )
+        T_curr_anchor, at_anchor = (
+            local_map.from_anchors(se3.inverse(seen.T_odom_rect), rows),
+            table.anchor_points[rows],
+        )
+        R = T_curr_anchor[:, :3, :3]
+        points = (R @ at_anchor[:, :, None])[:, :, 0] + T_curr_anchor[:, :3, 3]
+        error = seen.views - view(points, cylinder, baseline_m)
+        error[:, 0] = cylinder.wrap(error[:, 0])
+        J = view_jacobian(points, cylinder, baseline_m)
+        anchors, group = np.unique(table.anchor[rows], return_inverse=True)
+        velocities = np.array([known[key] for key in anchors.tolist()]).reshape(-1, 6)[group]
+        J_anchor = view_jacobian(at_anchor, cylinder, baseline_m)
+        by_now, moved = self._shifts(points, J, velocity)
+        by_anchor, _ = self._shifts(at_anchor, J_anchor, velocities)
+        by_times = by_now - J @ R @ np.linalg.solve(J_anchor, by_anchor)
+        of_pose = J @ np.concatenate([np.broadcast_to(-np.eye(3), J.shape), se3.hat(points)], axis=2)
+        # 3. Whitened, with the weights of the pose's kernel.
+        S = self._model.sigma_px**2 * np.eye(3) + J @ R @ table.anchor_covariance[rows] @ np.swapaxes(J @ R, 1, 2)
+        S[:, 2, 2] += seen.variance
+        rest = np.concatenate([of_pose, by_times, error[:, :, None]], axis=2)
+        usable = np.isfinite(rest).all(axis=(1, 2))
+        if not usable.any():
+            return
+        rest = np.linalg.solve(np.linalg.cholesky(S[usable]), rest[usable])
+        squared = (rest[:, :, -1] ** 2).sum(axis=1)
+        weights = 1.0 / (1.0 + squared / KERNEL_WIDTH**2)
+        # 4. The information of each keyframe, without its d_k.
+        each, size = np.swapaxes(rest, 1, 2) * weights[:, None, None] @ rest, len(self._information)
+        total = np.zeros((len(anchors), 6 + size, 6 + size))
+        np.add.at(total, group[usable], each)
+        of_d, across = total[:, :6, :6] + RIDGE * np.eye(6), total[:, :6, 6:]
+        left = (total[:, 6:, 6:] - np.swapaxes(across, 1, 2) @ np.linalg.solve(of_d, across)).sum(axis=0)
+        unit = CORRELATED_LANDMARKS * max(1.0, float(squared.mean()) / VIEW_DIMENSIONS)
+        kept = math.exp(-dt_s / MEMORY_S)
+        self._information = kept * self._information + left / unit
+        self._views = kept * self._views + len(squared)
+        self._px_per_s = float(np.median(np.linalg.norm(moved[usable][:, :2], axis=1)))
+
+    def likeliest(self) -> ReadOut | None:
+        """Return the likeliest time of a read-out, None: it is likelier that there is none, or it moves no view."""
+        information = self._information.copy()
+        information[LAG, LAG] += LAG_S**-2
+        information -= np.outer(information[:, LAG], information[LAG]) / information[LAG, LAG]
+        best: ReadOut | None = None
+        cost = 0.5 * math.log(1.0 + VIEW_DIMENSIONS * self._views) + math.log(len(CHOICES))
+        for cameras, axis in CHOICES:
+            chosen = [2 * axis + camera for camera in cameras]
+            A, b = float(information[np.ix_(chosen, chosen)].sum()), float(information[chosen, -1].sum())
+            found = ReadOut(cameras, axis, b / max(A, RIDGE), b**2 / (2 * max(A, RIDGE)) - cost)
+            if best is None or found.gain > best.gain:
+                best = found
+        is_seen = best is not None and abs(best.time_s) * self._px_per_s > LEAST_PX
+        return best if best is not None and best.gain > 0 and is_seen else None
+
+    def _shifts(self, points: Array, J: Array, velocity: Array) -> tuple[Array, Array]:
+        """Return the derivatives (N, 3, 5) of the views of points (N, 3) by [c, lag], and their motion (N, 3) [px/s].
+
+        velocity (6,) or (N, 6).
+        """
+        motion = -(J @ (velocity[..., :3] + np.cross(velocity[..., 3:], points))[:, :, None])[:, :, 0]
+        seen, times = view(points, self._model.cylinder, self._model.baseline_m), np.zeros((len(points), 3, LAG + 1))
+        for camera, of_view in enumerate((slice(0, 2), slice(2, 3))):
+            raw = self._raws[camera]
+            place = raw.at(seen[:, [0, 1 + camera]])[0] / raw.size - 0.5
+            for axis in range(2):
+                times[:, of_view, 2 * axis + camera] = place[:, [1 - axis]]
+        times[:, 2, LAG] = 1.0
+        return motion[:, :, None] * times, motion
