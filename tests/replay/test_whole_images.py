@@ -63,7 +63,10 @@ CASES: Final = {
         lambda taken: turn(taken, 1.0, since=SINCE),
         r"the lower camera were displaced by .* turned by -(0\.9|1\.0)",
     ),
-    "rolling, both": Case(BOTH, lambda taken: roll(taken, 0.5), "cameras have rows that are read one after another", 1),
+    # The first image is not rolled, and left out.
+    "lines of both read one after another": Case(
+        BOTH, lambda taken: roll(taken, 1.0), r"cameras have rows that .* line time about -[345]\d\d us .* set", since=0
+    ),
 }
 
 
@@ -72,7 +75,7 @@ def _decoded(jpeg: bytes) -> Image:
 
 
 def edited(log: Path, case: Case) -> Path:
-    """Write a log with the images of a case beside another one."""
+    """Write a log with the images of a case beside another one; all of its images are edited where since is 0."""
     taken = images(log)
     for camera in case.cameras:
         own = [number for number, image in enumerate(taken) if image.camera == camera]
@@ -80,7 +83,7 @@ def edited(log: Path, case: Case) -> Path:
         for number, image in zip(own, case.edit(pixels), strict=True):
             jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
             taken[number] = replace(taken[number], jpeg=jpeg)
-    return save(log.with_name("edited.mcap"), taken)
+    return save(log.with_name("edited.mcap"), (image for image in taken if case.since or image.pair))
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -91,12 +94,14 @@ def test_a_broken_image_is_named_and_no_pose_of_it_is_sure(course: Path, tmp_pat
     assert any(re.search(case.line, line) for line in told), result.warnings
     assert len(told) <= 4
     truth = read_tum(course / "truth.txt")
-    T_true = se3.inverse(truth.T[0]) @ truth.T
+    T_true = truth.T[len(truth.T) - len(result.T_odom_rig) :]
+    T_true = se3.inverse(T_true[0]) @ T_true
     error_m = np.linalg.norm(result.T_odom_rig[:, :3, 3] - T_true[:, :3, 3], axis=1)
     sigma_m = np.sqrt(np.array([np.linalg.eigvalsh(each[:3, :3])[-1] for each in result.covariances]))
     sure = np.array([state == "tracking" for state in result.states])
     assert not (sure & (error_m > np.maximum(LEAST_M, SIGMAS * sigma_m))).any(), (error_m, sigma_m, result.states)
-    assert sure[: case.since].all()
+    if case.since:
+        assert sure[: case.since].all()
 
 
 def test_whole_images_are_not_suspected(course: Path) -> None:

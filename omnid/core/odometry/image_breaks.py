@@ -145,7 +145,7 @@ class ImageBreaks:
     _open: list[Break] = field(default_factory=list)  # displacements that have not ended
     _usual_cost: float = 0.0  # of a landmark in whole images: none is known yet, so that the first pairs are tested
     _found: dict[tuple[Kind, tuple[int, ...], int], list[Break]] = field(default_factory=dict)
-    _read_out: dict[tuple[tuple[int, ...], int], ReadOut] = field(default_factory=dict)  # newest by cameras and axis
+    _read_out: dict[tuple[tuple[int, ...], int], ReadOut] = field(default_factory=dict)  # likeliest by cameras and axis
 
     def add(
         self,
@@ -212,7 +212,8 @@ class ImageBreaks:
         is_read = read_out is not None and read_out.gain > DECIDING_COST
         self.fault = "" if shown is None else _words([shown])
         if read_out is not None and is_read:
-            self._read_out[read_out.cameras, read_out.axis] = read_out
+            key = read_out.cameras, read_out.axis
+            self._read_out[key] = max(read_out, self._read_out.get(key, read_out), key=lambda each: each.gain)
             self.fault = read_out.words(self.raws)
         if last is None or (shown is None and read_out is None and not self.covariance.any()):
             return

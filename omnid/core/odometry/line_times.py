@@ -107,8 +107,8 @@ class LineTimes:
         weights = 1.0 / (1.0 + squared / KERNEL_WIDTH**2)
         # 4. The information of each keyframe, without its d_k.
         each, size = np.swapaxes(rest, 1, 2) * weights[:, None, None] @ rest, len(self._information)
-        total = np.zeros((len(anchors), 6 + size, 6 + size))
-        np.add.at(total, group[usable], each)
+        is_own = (group[usable] == np.arange(len(anchors))[:, None]).astype(float)
+        total = (is_own @ each.reshape(len(each), -1)).reshape(-1, 6 + size, 6 + size)
         of_d, across = total[:, :6, :6] + RIDGE * np.eye(6), total[:, :6, 6:]
         left = (total[:, 6:, 6:] - np.swapaxes(across, 1, 2) @ np.linalg.solve(of_d, across)).sum(axis=0)
         unit = CORRELATED_LANDMARKS * max(1.0, float(squared.mean()) / VIEW_DIMENSIONS)
