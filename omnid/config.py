@@ -10,7 +10,7 @@ from typing import Annotated, Final, Literal
 
 from msgspec import Meta
 
-from drivers.logs.image_times import TimeSource
+from drivers.logs.stamps import TimeSource
 from drivers.logs.rotating_log import RotationSettings
 from omnid.camera_config import CamerasConfig, PairConfig
 from omnid.controller.motor_settings import MotorSettings

@@ -3,8 +3,11 @@
 When an image was taken is stated in one of three ways:
 
 1. `rate_hz`: so many images a second, in the natural order of their names, from 0 s on;
-2. times.txt (or timestamps.txt), in the folder of the images or the one above: a line of seconds for each image;
+2. a list in the folder of the images or the one above: times.txt or timestamps.txt with a line for each image, or any
+   of STAMP_FILES with the names of the images beside their stamps, as data.csv of EuRoC and rgb.txt of TUM;
 3. its name: nanoseconds, a whole number of 16 to 19 digits (1403636579763555584.png), or seconds with a decimal point.
+
+A stamp in a list is written as one in a name, in whole seconds, or as a date and a time (2011-09-26 13:02:25.96).
 """
 
 from __future__ import annotations
@@ -14,8 +17,7 @@ import math
 import os
 import re
 import stat
-from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from decimal import Decimal, InvalidOperation
 from itertools import pairwise
 from pathlib import Path
@@ -26,20 +28,20 @@ import numpy as np
 
 from drivers.errors import DriverError, RecordError
 from drivers.logs.compression import MAX_RECORD_BYTES
-from drivers.logs.image_times import SHORTEST_STEP_NS
-from drivers.logs.log import ENTRY, MAX_ATTACHMENT_BYTES, Entries, Topic
+from drivers.logs.log import ENTRY, MAX_ATTACHMENT_BYTES, Entries, LogFile, Topic
 from drivers.logs.ros_messages import COMPRESSED_IMAGE, compressed_image
+from drivers.logs.stamps import SHORTEST_STEP_NS
 
 SUFFIXES: Final = (".png", ".jpg", ".jpeg")
 # What OpenCV reads as an image, as of boards: a log has those above.
 IMAGE_SUFFIXES: Final = frozenset({*SUFFIXES, ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp"})
-STAMP_FILES: Final = ("times.txt", "timestamps.txt")
+STAMP_FILES: Final = ("times.txt", "timestamps.txt", "data.csv", "rgb.txt")
 ATTACHMENT: Final = "rig.toml"  # The rig's file, in the same folder as the folders of the cameras.
+NANOSECOND_DIGITS: Final = 16  # Whole numbers of so many digits or more are nanoseconds.
 _MAX_DEPTH: Final = 4  # Folders of images are searched down to this depth below the given one.
 _MAX_VISITED: Final = 10_000
 _MAX_STAMP_NS: Final = 2**31 * 10**9  # of the times of ROS, which end in 2038
 _GIVE_RATE: Final = "give --rate HZ, which is log.rate_hz of the settings"
-_NANOSECONDS: Final = re.compile(r"\d{16,19}")
 
 
 def image_folders(path: Path) -> list[Path]:
@@ -60,46 +62,42 @@ def _is_image(name: str) -> bool:
     return Path(name).suffix.lower() in SUFFIXES and not name.startswith(".")
 
 
-class ImageFolder:
+class ImageFolder(LogFile):
     """A LogFile of folders of images; the topic of each is its path below the given folder.
 
     Raises DriverError where an image has no stamp.
     """
 
-    is_indexed = True
-
     def __init__(self, path: Path, folders: Sequence[Path], rate_hz: float = 0.0) -> None:
-        """rate_hz: images a second; 0: their names or times.txt state their stamps."""
+        """rate_hz: images a second; 0: their names or a list state their stamps."""
+        super().__init__(str(path))
         if not 0.0 <= rate_hz < math.inf:
-            raise DriverError(f"{str(path)!r}: a rate of {rate_hz:g} images a second is given: expected one above 0")
+            raise DriverError(f"{self.name!r}: a rate of {rate_hz:g} images a second is given: expected one above 0")
         self._path = path
-        self._files = [_stamped(folder, rate_hz) for folder in folders]
-        names = [folder.relative_to(path).as_posix() for folder in folders]
-        self.topics = {number: Topic(name, COMPRESSED_IMAGE) for number, name in enumerate(names)}
-        self.faults: Counter[str] = Counter()
-        self.cut = ""
-        counts = [len(files) for files in self._files]
-        if rate_hz and len(set(counts)) > 1:
-            found = ", ".join(f"{count} in {name!r}" for name, count in zip(names, counts, strict=True))
-            self.cut = (
-                f"images of {str(path)!r} are missing: found {found}; by a rate they are paired in the order of their "
+        self._images: list[tuple[int, int, Path]] = []  # folder, stamp [ns], file
+        notes, counts = list[str](), dict[str, int]()
+        for number, folder in enumerate(folders):
+            stamped = _stamped(folder, rate_hz, notes)
+            self._images += ((number, stamp_ns, image) for stamp_ns, image in sorted(stamped))
+            name = folder.relative_to(path).as_posix()
+            self.topics[number], counts[name] = Topic(name, COMPRESSED_IMAGE), len(stamped)
+        if rate_hz and len(set(counts.values())) > 1:
+            found = ", ".join(f"{count} in {name!r}" for name, count in counts.items())
+            notes.append(
+                f"images of {self.name!r} are missing: found {found}; by a rate they are paired in the order of their "
                 "names, wrongly behind a missing one: write times.txt"
             )
+        self.cut = "; ".join(notes)
 
-    def entries(self) -> Iterator[Entries]:
-        """Yield the places of the images."""
-        for folder, files in enumerate(self._files):
-            places = [(folder, stamp_ns, folder, number) for number, (stamp_ns, _) in enumerate(files)]
-            yield np.array(places, ENTRY)
+    def entries(self) -> Entries:
+        """Return the places of the images."""
+        return np.array([(f, ns, ns, 0, number) for number, (f, ns, _) in enumerate(self._images)], ENTRY)
 
-    def read(self, channel: int, time_ns: int, block: int, offset: int, most: int = 0) -> bytes:
-        """Return an image as a message, whose stamp is that of the image; raise RecordError where it is unreadable.
-
-        most: above 0 without the image.
-        """
-        _, path = self._files[block][offset]
+    def read(self, block: int, offset: int) -> bytes:
+        """Return an image as a message, whose stamp is that of the image; raise RecordError where it is unreadable."""
+        _, stamp_ns, path = self._images[offset]
         try:
-            return compressed_image(time_ns, b"" if most else _read_regular(path, MAX_RECORD_BYTES))
+            return compressed_image(stamp_ns, _read_regular(path, MAX_RECORD_BYTES))
         except OSError as error:
             raise RecordError(f"{str(path)!r} cannot be read: {error.strerror}") from error
 
@@ -111,36 +109,42 @@ class ImageFolder:
             return {}
         return {ATTACHMENT: data} if len(data) <= MAX_ATTACHMENT_BYTES else {}
 
-    def close(self) -> None:
-        """No file stays open."""
 
+def _stamped(folder: Path, rate_hz: float, notes: list[str]) -> list[tuple[int, Path]]:
+    """Return stamp [ns] and path of the images of a folder, in the order of names.
 
-def _stamped(folder: Path, rate_hz: float) -> list[tuple[int, Path]]:
-    """Return stamp [ns] and path of the images of a folder; raise DriverError where one has no stamp."""
+    notes: what is missing is added. Raise DriverError where an image has no stamp.
+    """
     paths = sorted((path for path in folder.iterdir() if _is_image(path.name)), key=_numbers_of)
     if rate_hz:
         return [(round(index * 1e9 / rate_hz), path) for index, path in enumerate(paths)]
-    lines = _stamp_lines(folder)
-    if lines is not None and len(lines) != len(paths):
-        raise DriverError(
-            f"{str(folder)!r} contains {len(paths)} images, and its list of stamps {len(lines)} lines; "
-            "they must be as many"
-        )
+    # 1. A list.
+    for listing in (place / name for place in (folder, folder.parent) for name in STAMP_FILES):
+        rows = _rows(listing)
+        named = _named(rows, {path.name: path for path in paths}, folder)
+        named = named or _named(rows, {path.stem: path for path in paths}, folder, is_whole=True)
+        if named:
+            unlisted = len(paths) - len({path for _, path in named})
+            if unlisted:
+                notes.append(f"{unlisted} images of {str(folder)!r} are left out: {listing.name} does not list them")
+            return [(_listed_ns(text, path), path) for text, path in named]
+        if rows and listing.suffix == ".txt" and listing.name != "rgb.txt":
+            if len(rows) != len(paths):
+                raise DriverError(
+                    f"{str(folder)!r} contains {len(paths)} images, and its list of stamps {len(rows)} lines; "
+                    "they must be as many"
+                )
+            return [(_listed_ns(text, path), path) for text, path in zip(_column(rows), paths, strict=True)]
+    # 2. The names.
     found = []
-    for path, text in zip(paths, lines or [path.stem for path in paths], strict=True):
-        is_name = lines is None
-        stamp_ns = int(text) if is_name and _NANOSECONDS.fullmatch(text) else None
-        if stamp_ns is None and ("." in text or not is_name):
-            stamp_ns = _seconds_ns(text)
-        if stamp_ns is None or stamp_ns >= _MAX_STAMP_NS:
-            raise DriverError(
-                f"{str(path)!r} {'is named' if is_name else 'has the stamp'} {text[:40]!r}: expected nanoseconds of 16 "
-                f"to 19 digits as its name, or seconds in {STAMP_FILES[0]}; else {_GIVE_RATE}"
-            )
+    for path in paths:
+        is_stamp = "." in path.stem or (path.stem.isdecimal() and len(path.stem) >= NANOSECOND_DIGITS)
+        stamp_ns = _stamp_ns(path.stem) if is_stamp else None
+        if stamp_ns is None:
+            raise _no_stamp(path, "is named", path.stem)
         found.append((stamp_ns, path))
-    found.sort()
-    steps_ns = [after - before for (before, _), (after, _) in pairwise(found)]
-    if lines is None and steps_ns and 0 < (step_ns := median_high(steps_ns)) <= SHORTEST_STEP_NS:
+    steps_ns = [after - before for before, after in pairwise(sorted(stamp_ns for stamp_ns, _ in found))]
+    if steps_ns and 0 < (step_ns := median_high(steps_ns)) <= SHORTEST_STEP_NS:
         raise DriverError(
             f"the images beside {str(paths[0])!r} are {step_ns / 1000:g} us apart, as names are nanoseconds; write "
             f"seconds to {STAMP_FILES[0]}, or {_GIVE_RATE}"
@@ -148,30 +152,79 @@ def _stamped(folder: Path, rate_hz: float) -> list[tuple[int, Path]]:
     return found
 
 
+def _rows(listing: Path) -> list[list[str]]:
+    """Return the words of the lines of a list, without comments and a head; empty without such a file."""
+    try:
+        if not listing.is_file() or listing.stat().st_size > MAX_RECORD_BYTES:
+            return []
+        lines = listing.read_text("utf-8-sig", "replace").splitlines()
+    except OSError as error:
+        raise DriverError(f"cannot read the stamps {str(listing)!r}: {error.strerror}") from error
+    rows = [re.split(r"[\s,;]+", line.strip(" \t,;")) for line in lines if line.strip() and not line.startswith("#")]
+    is_head = bool(rows) and not any(char.isdecimal() for word in rows[0] for char in word)
+    return rows[1:] if is_head else rows
+
+
+def _named(
+    rows: Sequence[Sequence[str]], images: dict[str, Path], folder: Path, *, is_whole: bool = False
+) -> list[tuple[str, Path]]:
+    """Return stamp and image of the rows that name one, by the column with the most names of images in a folder.
+
+    is_whole: none unless all rows name an image.
+    """
+    best = list[tuple[str, Path]]()
+    for column in range(max(map(len, rows), default=0)):
+        found = {}
+        for row in rows:
+            named = Path(row[column] if column < len(row) else "")
+            # A list above the folders may name the images of all of them.
+            if len(row) > 1 and named.name in images and named.parent.name in ("", folder.name):
+                found[images[named.name]] = " ".join([*row[:column], *row[column + 1 :]])
+        if len(found) > len(best) and (len(found) == len(rows) or not is_whole):
+            best = [(text, path) for path, text in found.items()]
+    return best
+
+
+def _column(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return the stamps in the rows of a list without names: beside them may be a number that counts the images."""
+    for column in range(max(map(len, rows))):
+        numbers = [row[column] if column < len(row) else "" for row in rows]
+        counts = len(rows[0]) > 1 and all(map(str.isdecimal, numbers))
+        if counts and all(int(after) - int(before) == 1 for before, after in pairwise(numbers)):
+            return [" ".join([*row[:column], *row[column + 1 :]]) for row in rows]
+    return [" ".join(row) for row in rows]
+
+
+def _listed_ns(text: str, path: Path) -> int:
+    stamp_ns = _stamp_ns(text)
+    if stamp_ns is None:
+        raise _no_stamp(path, "has the stamp", text)
+    return stamp_ns
+
+
+def _no_stamp(path: Path, found: str, text: str) -> DriverError:
+    return DriverError(
+        f"{str(path)!r} {found} {text[:40]!r}: expected nanoseconds of 16 to 19 digits as its name, or seconds in "
+        f"{STAMP_FILES[0]}; else {_GIVE_RATE}"
+    )
+
+
+def _stamp_ns(text: str) -> int | None:
+    """Return a stamp, exactly: see the head of this file; None for another text."""
+    try:
+        if re.fullmatch(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?Z?", text):
+            return int(np.datetime64(text.rstrip("Z").replace(" ", "T"), "ns").astype(np.int64))
+        stamp = Decimal(text if "_" not in text else "")  # which Python takes for a mark between digits
+    except (InvalidOperation, ValueError):
+        return None
+    places = 0 if text.isdecimal() and len(text) >= NANOSECOND_DIGITS else 9
+    is_time = stamp.is_finite() and 0 <= stamp < _MAX_STAMP_NS // 10**places
+    return int(stamp.scaleb(places)) if is_time else None
+
+
 def _numbers_of(path: Path) -> list[tuple[int, str]]:
     """Return a key that sorts names by the numbers in them: 9.png comes before 10.png."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
-
-
-def _seconds_ns(text: str) -> int | None:
-    """Return seconds such as 1305031102.175304 or 1.036336e-01 as nanoseconds, exactly; None for another text."""
-    try:
-        seconds = Decimal(text if "_" not in text else "")  # which Python takes for a mark between digits
-    except InvalidOperation:
-        return None
-    return int(seconds * 10**9) if seconds.is_finite() and 0 <= seconds < _MAX_STAMP_NS else None
-
-
-def _stamp_lines(folder: Path) -> list[str] | None:
-    """Return the lines of the list of stamps in the folder of the images or above; None without one."""
-    for path in (place / name for place in (folder, folder.parent) for name in STAMP_FILES):
-        try:
-            if path.is_file() and path.stat().st_size <= MAX_RECORD_BYTES:
-                lines = path.read_text("utf-8-sig", "replace").splitlines()
-                return [line.strip() for line in lines if line.strip() and not line.startswith("#")]
-        except OSError as error:
-            raise DriverError(f"cannot read the stamps {str(path)!r}: {error.strerror}") from error
-    return None
 
 
 def _read_regular(path: Path, most_bytes: int) -> bytes:

@@ -1,25 +1,25 @@
-"""A log: the messages of one or more files of any format, in the order of time, and what is wrong with the files.
+"""A log: the messages of one or more files of any format, in the order of time, and what of them is missing.
 
-A format says only where in a file which message is, and what bytes it has (`LogFile`). The places of all messages are
-collected first, some 60 bytes a message. So the order in a file need not be the order in time, and a step of the
-recorder's clock is found before anything is read.
+A format states three things only (`LogFile`): where in a file which message is and when it was stamped, what bytes it
+has, and what is attached. The places of all messages are collected first, some 60 bytes a message. So the order in a
+file need not be the order in time, and a step of a clock is found before anything is delivered.
 """
 
 from __future__ import annotations
 
-from collections import Counter
+from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import RecordError
-from drivers.logs.compression import is_packed_message, unpack_message
+from drivers.logs.compression import unpack_message
 from drivers.logs.ros_messages import (
     IMAGE_TYPES,
     JointWheels,
@@ -41,9 +41,11 @@ LATEST_NS: Final = 2**62  # A time beyond is none; the difference of two times f
 FEWEST_IN_ORDER: Final = 8  # Where fewer messages of a topic follow each other on average, it is written out of order.
 LONGEST_STEP: Final = 1.5  # Where two messages are more periods apart than that, one is missing between them.
 
-# Where a message is. In a file, messages are in the order of block and offset, whose meaning is the format's own.
-ENTRY: Final = np.dtype([(name, np.int64) for name in ("channel", "time_ns", "block", "offset")])
+# When a message was logged, the stamp of its header if it begins with one (0 if unset), and where it is. In a file,
+# messages are in the order of block and offset, whose meaning is the format's own.
+ENTRY: Final = np.dtype([(name, np.int64) for name in ("channel", "time_ns", "header_ns", "block", "offset")])
 Entries = NDArray[Any]  # (N,) of ENTRY
+Times = NDArray[np.int64]  # (N,) [ns]
 
 
 class Topic(NamedTuple):
@@ -54,27 +56,39 @@ class Topic(NamedTuple):
     aligned: bool = True  # True: CDR (ROS 2); False: the serialisation of ROS 1
 
 
-class LogFile(Protocol):
+class LogFile(ABC):
     """An open file of messages, which may be damaged or malicious."""
 
-    topics: dict[int, Topic]  # by channel; complete after entries()
-    faults: Counter[str]  # what is wrong with single records -> number of tries to read one; grows by reading
-    cut: str  # one line that says where the file ends too early, "" of a complete one; known after entries()
-    is_indexed: bool  # other programs can read it without a search for its messages
+    is_indexed = True  # other programs can read it without a search for its messages
 
-    def entries(self) -> Iterator[Entries]:
-        """Yield the places of all messages, in any order."""
+    def __init__(self, name: str) -> None:
+        """name: for messages."""
+        self.name = name
+        self.topics: dict[int, Topic] = {}  # by channel; complete after entries()
+        self.faults: dict[int, str] = {}  # what cannot be read, by block, or by offset without one; grows by reading
+        self.cut = ""  # one line that says what is missing at the end, "" of a complete file; known after entries()
 
-    def read(self, channel: int, time_ns: int, block: int, offset: int, most: int = 0) -> bytes | memoryview:
-        """Return the bytes of the message of an entry; raise RecordError where they are not those that were written.
+    @abstractmethod
+    def entries(self) -> Entries:
+        """Return the places of all messages, in any order."""
 
-        most: so many of the first ones are enough, whether the others are right or not; 0: all.
-        """
+    @abstractmethod
+    def read(self, block: int, offset: int) -> bytes | memoryview:
+        """Return the bytes of the message of an entry; raise RecordError where they are not those that were written."""
 
     def attachments(self) -> dict[str, bytes]:
         """Return name -> bytes of the attachments, such as a rig; known after entries()."""
+        return {}
 
-    def close(self) -> None:
+    def header_ns(self, channel: int, start: bytes | memoryview) -> int:
+        """Return the stamp in the first bytes of a message, or in all of one that is compressed by itself.
+
+        0 where it is unset. Raise RecordError where it does not unpack.
+        """
+        aligned = channel not in self.topics or self.topics[channel].aligned
+        return header_ns(unpack_message(memoryview(start)), aligned=aligned)
+
+    def close(self) -> None:  # noqa: B027  (some keep no file open)
         """Close the file; may be called twice."""
 
 
@@ -85,7 +99,6 @@ class LoggedMessage:
     topic: str
     kind: str  # ROS type such as sensor_msgs/msg/Image; "" where the message cannot be decoded
     log_time_ns: int
-    run_ns: int  # the log time, which runs on where the recorder's clock was set back
     logged: bytes | memoryview
     aligned: bool = True  # True: CDR (ROS 2); False: the serialisation of ROS 1
 
@@ -96,10 +109,6 @@ class LoggedMessage:
     def cdr(self) -> bytes:
         """Return the bytes in CDR."""
         return bytes(self.data()) if self.aligned else cdr_of_ros1(self.kind, self.data())
-
-    def header_ns(self) -> int:
-        """Return the stamp of the header of images, wheels and IMUs; 0 where it is unset."""
-        return header_ns(self.data(), aligned=self.aligned)
 
     def image(self) -> RosImage:
         """Return the image of an image message."""
@@ -132,7 +141,7 @@ class LogIndex(NamedTuple):
     topic: NDArray[np.int32]  # (N,) index in topics
     file: NDArray[np.int16]  # (N,) index of the file
     entries: Entries
-    run_ns: NDArray[np.int64]  # (N,) log times, which run on where the recorder's clock was set back
+    run_ns: Times  # log times, which run on where the recorder's clock was set back
     order: NDArray[np.int64]  # (N,) rows in the order of these times, else of the files
     steps: list[ClockStep]
 
@@ -146,7 +155,7 @@ class Log:
 
     def __init__(self, name: str, files: Sequence[LogFile], missing: Sequence[str] = ()) -> None:
         """name: for messages; files: the parts of the log in order; missing: names of those that are not there."""
-        self.name, self._files, self._missing, self._closed = name, files, missing, False
+        self.name, self.files, self._missing, self._closed = name, files, missing, False
 
     def topics(self) -> Mapping[str, str]:
         """Return name -> ROS type of all topics, such as sensor_msgs/msg/Image; '' where it cannot be decoded."""
@@ -156,25 +165,6 @@ class Log:
         """Return the number of messages of each topic."""
         numbers = np.bincount(self.index.topic, minlength=len(self.index.topics))
         return dict(zip(self.index.topics, numbers.tolist(), strict=True))
-
-    def rates_hz(self) -> Mapping[str, float]:
-        """Return the mean rate of each topic from its first message to its last one; none of fewer than two."""
-        times = {name: self.index.run_ns[self.index.topic == n] for n, name in enumerate(self.index.topics)}
-        return {name: (len(ns) - 1) * 1e9 / float(np.ptp(ns)) for name, ns in times.items() if len(ns) and np.ptp(ns)}
-
-    def span_ns(self) -> tuple[int, int] | None:
-        """Return the first and last log time; None without messages."""
-        times = self.index.entries["time_ns"]
-        return (int(times.min()), int(times.max())) if times.size else None
-
-    def clock_steps(self) -> Sequence[ClockStep]:
-        """Return the steps of the recorder's clock."""
-        return self.index.steps
-
-    @property
-    def is_indexed(self) -> bool:
-        """True if other programs, too, can read all files without a search for their messages."""
-        return all(file.is_indexed for file in self._files)
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[LoggedMessage]:
         """Yield the messages of these topics (None: all) in the order of log time; ends early after close.
@@ -193,24 +183,18 @@ class Log:
         wanted = [number for number, name in enumerate(self.index.topics) if topics is None or name in topics]
         return np.asarray(self.index.order[np.isin(self.index.topic[self.index.order], wanted)])
 
-    def message(self, row: int, most: int = 0) -> LoggedMessage | None:
-        """Return the message of a row of the index; None, and count it, where it cannot be read.
-
-        most: so many of its first bytes are enough; 0: all. One that is compressed by itself is whole.
-        """
+    def message(self, row: int) -> LoggedMessage | None:
+        """Return the message of a row of the index; None, and count it, where it cannot be read."""
         index = self.index
-        file, entry, name = self._files[index.file[row]], index.entries[row].item(), self._names[index.topic[row]]
+        file, name = self.files[index.file[row]], self._names[index.topic[row]]
+        channel, time_ns, _, block, offset = index.entries[row].item()
         try:
-            data = file.read(*entry, most)
-            if most and is_packed_message(data):
-                data = file.read(*entry)
+            data = file.read(block, offset)
         except RecordError as error:
             if not self._closed:
-                file.faults[str(error)] += 1
+                file.faults.setdefault(block or offset, str(error))
             return None
-        return LoggedMessage(
-            name, index.topics[name], entry[1], int(index.run_ns[row]), data, file.topics[entry[0]].aligned
-        )
+        return LoggedMessage(name, index.topics[name], time_ns, data, file.topics[channel].aligned)
 
     def attachments(self) -> dict[str, bytes]:
         """Return name -> bytes of the attachments of the first file that has some, such as a rig.
@@ -218,13 +202,13 @@ class Log:
         They have up to 16 MiB each, 64 MiB in all.
         """
         assert self.index
-        return next((found for found in (file.attachments() for file in self._files) if found), {})
+        return next((found for found in (file.attachments() for file in self.files) if found), {})
 
     def damage(self) -> LogDamage:
         """Return the faults that are known: all of them once messages() has ended."""
         assert self.index
-        faults = [fault for file in self._files for fault in file.faults]
-        cuts = [file.cut for file in self._files if file.cut]
+        faults = [fault for file in self.files for fault in file.faults.values()]
+        cuts = [file.cut for file in self.files if file.cut]
         if self._missing:
             cuts.insert(0, f"parts of the log {self.name!r} are missing: {listed(self._missing)}: used the others")
         return LogDamage(len(faults), faults[0] if faults else "", "; ".join(cuts))
@@ -232,7 +216,7 @@ class Log:
     def close(self) -> None:
         """Close the files; may be called twice."""
         self._closed = True
-        for file in self._files:
+        for file in self.files:
             file.close()
 
     @cached_property
@@ -242,24 +226,24 @@ class Log:
     @cached_property
     def index(self) -> LogIndex:
         """Where all messages are, and when they were logged."""
+        # 1. The entries of each file in its order, with the numbers of their topics.
         topics: dict[str, str] = {}
-        found: list[tuple[Entries, NDArray[np.int32]]] = []
-        for file in self._files:
-            entries = np.concatenate([np.empty(0, ENTRY), *file.entries()])
-            block, offset = entries["block"], entries["offset"]
-            if np.any((block[1:] < block[:-1]) | ((block[1:] == block[:-1]) & (offset[1:] < offset[:-1]))):
-                entries = entries[np.lexsort((offset, block))]
+        parts: list[tuple[Entries, NDArray[np.int32], NDArray[np.int16]]] = []
+        for number, file in enumerate(self.files):
+            entries = file.entries()
+            entries = entries[np.lexsort((entries["offset"], entries["block"]))]
             for name, kind, _ in file.topics.values():
                 topics[name] = topics.get(name) or kind
             places = {name: place for place, name in enumerate(topics)}
             channels, which = np.unique(entries["channel"], return_inverse=True)
             known = np.array([places[file.topics[c].name] if c in file.topics else -1 for c in channels], np.int32)
             for channel in channels[known < 0]:
-                file.faults[f"the channel {channel} of messages is unknown"] += 1
-            numbers = known[which]
-            found.append((entries, numbers) if (known >= 0).all() else (entries[numbers >= 0], numbers[numbers >= 0]))
-        entries, topic = found[0] if len(found) == 1 else map(np.concatenate, zip(*found, strict=True))
-        of_file = np.repeat(np.arange(len(found), dtype=np.int16), [len(numbers) for _, numbers in found])
+                file.faults[-1 - int(channel)] = f"the channel {channel} of messages is unknown"
+            topic = known[which]
+            is_known = topic >= 0
+            parts.append((entries[is_known], topic[is_known], np.full(int(is_known.sum()), number, np.int16)))
+        entries, topic, of_file = map(np.concatenate, zip(*parts, strict=True))
+        # 2. The order of time, in which images decide where the clock was set.
         images = [place for place, kind in enumerate(topics.values()) if kind in IMAGE_TYPES]
         run_ns, steps = running_on(topic, entries["time_ns"], images)
         if steps and (kept := ~self._is_repeated(topic, entries, of_file)).sum() < len(kept):
@@ -274,14 +258,13 @@ class Log:
         found = np.zeros(len(topic), np.bool_)
         for before, row in zip(order[:-1][same].tolist(), order[1:][same].tolist(), strict=True):
             with suppress(RecordError):
-                read = [bytes(self._files[of_file[n]].read(*entries[n].item())) for n in (before, row)]
-                found[row] = read[0] == read[1]
+                places = ((self.files[of_file[n]], entries[["block", "offset"]][n].item()) for n in (before, row))
+                first, second = (bytes(file.read(*place)) for file, place in places)
+                found[row] = first == second
         return found
 
 
-def running_on(
-    topic: NDArray[np.int32], times: NDArray[np.int64], images: Iterable[int]
-) -> tuple[NDArray[np.int64], list[ClockStep]]:
+def running_on(topic: NDArray[np.int32], times: Times, images: Iterable[int]) -> tuple[Times, list[ClockStep]]:
     """Return times (N,) that run on where their clock was set back, and its steps.
 
     topic, times: (N,) in the order of the files. images: the topics that decide; others follow the first of them.
@@ -308,7 +291,7 @@ def running_on(
     return run_ns, steps
 
 
-def steps_back(times: NDArray[np.int64]) -> NDArray[np.int64]:
+def steps_back(times: Times) -> NDArray[np.int64]:
     """Return the indices in the times of one topic, in the order of the file, at which its clock was set back.
 
     A file may also be written out of order: then what comes late fits into holes, or times go back at every

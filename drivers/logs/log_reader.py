@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 
 from drivers.errors import DriverError, FrameDecodeError
 from drivers.frame import CAMERAS, SAMPLE_BITS, Camera, Frame, gray, is_deep
-from drivers.logs.image_times import STEP_NS, ImageTimes, LoggedImages, TimeSource
-from drivers.logs.log import LoggedMessage
 from drivers.logs.open_log import open_log
-from drivers.logs.ros_messages import HEADER_BYTES, IMU, RosImage
+from drivers.logs.ros_messages import IMU, RosImage
+from drivers.logs.stamps import STEP_NS, ImageTimes, LoggedImages, TimeSource
 from drivers.logs.topics import MotionChoice, MotionTopics, choose_motion_topics, choose_topics
 from drivers.motion import MotionSample, WheelSample
 
@@ -131,17 +130,19 @@ class LogReader:
                 return
             if message is None:
                 continue
-            camera, counter = cameras.get(message.topic), "broken_motion"
+            camera = cameras.get(message.topic)
             try:
                 if camera is None:
-                    sample = self._sample(message)
+                    sample = message.motion(self._joints)
+                    self._has_wheels |= isinstance(sample, WheelSample)
+                    self._other_joints += sample is None
                     if sample is not None:
                         yield replace(sample, stamp_ns=stamp_ns)
                     continue
-                counter = "broken"
                 image = message.image()
                 self._examine(message.topic, image)
             except FrameDecodeError as error:
+                counter = "broken" if camera else "broken_motion"
                 self.counts[counter] += 1
                 self._faults.setdefault(counter, str(error))
                 continue
@@ -161,45 +162,41 @@ class LogReader:
 
     @cached_property
     def _order(self) -> _Order:
-        """Read the headers of all messages of the cameras, the wheels and the IMU, and order them."""
+        """The messages of the cameras, the wheels and the IMU, in the order of their stamps."""
         log, names = self._log, [*self._log.topics()]
         rows = log.rows({*self._cameras.values(), *self._motion.names})
-        topic, run_ns = log.index.topic[rows], log.index.run_ns[rows]
-        numbers = [names.index(self._cameras[camera]) for camera in CAMERAS]
-        # 1. Headers; an image without one may be broken.
-        header_ns, (repeats, is_broken) = run_ns.copy(), np.zeros((2, len(rows)), np.bool_)
-        last: dict[int, tuple[int, int]] = {}  # by topic: header and row of the message before
-        for n, (row, number) in enumerate(zip(rows.tolist(), topic.tolist(), strict=True)):
-            start = None if self._time == "log" or self._closed else log.message(row, HEADER_BYTES)
-            if start is None:
-                continue
-            try:
-                header_ns[n] = found_ns = start.header_ns()
-                before_ns, row_before = last.get(number, (-1, row))
-                last[number] = found_ns, row
-                if number in numbers and found_ns in (0, before_ns):
-                    here, before = (log.message(one) for one in (row, row_before))
-                    is_same = here is not None and before is not None and here.image().data == before.image().data
-                    repeats[n] = is_same and found_ns == before_ns > 0
-            except FrameDecodeError:
-                is_broken[n] = True
+        topic, run_ns, header_ns = log.index.topic[rows], log.index.run_ns[rows], log.index.entries["header_ns"][rows]
+        # 1. Of images whose header is not set or is that of the one before, some may be broken or repeat that one.
+        (is_image, is_broken), images = np.zeros((2, len(rows)), np.bool_), dict[Camera, LoggedImages]()
+        rank, at_of = np.zeros(len(rows), np.int64), dict[Camera, NDArray[np.int64]]()
+        for place, camera in enumerate(CAMERAS, 1):
+            at = np.flatnonzero(topic == names.index(self._cameras[camera]))
+            header, repeats = header_ns[at], np.zeros(len(at), np.bool_)
+            same = np.diff(header, prepend=-1) == 0
+            for n in np.flatnonzero(same | (header == 0)).tolist() if self._time != "log" else ():
+                here, before = (self._image(int(rows[at[k]])) for k in (n, max(0, n - 1)))
+                is_broken[at[n]] = here is None
+                repeats[n] = same[n] and header[n] > 0 and here is not None and here == before
+            whole = ~is_broken[at]
+            at_of[camera], is_image[at[whole]], rank[at] = at[whole], True, place
+            images[camera] = LoggedImages(header[whole], run_ns[at][whole], repeats[whole])
         # 2. Stamps.
-        of_cameras = [np.flatnonzero((topic == number) & ~is_broken) for number in numbers]
-        images = {
-            camera: LoggedImages(header_ns[at], run_ns[at], repeats[at])
-            for camera, at in zip(CAMERAS, of_cameras, strict=True)
-        }
-        times = ImageTimes(images, self._time, log.clock_steps())
-        is_image = np.isin(topic, numbers)
-        stamps_ns, rank = run_ns.copy(), np.zeros(len(rows), np.int64)
-        stamps_ns[~is_image] = times.sample_ns(header_ns[~is_image], run_ns[~is_image])
-        for place, (camera, at) in enumerate(zip(CAMERAS, of_cameras, strict=True), 1):
-            stamps_ns[at], rank[at] = times.stamps_ns[camera], place
-        # 3. The order: of one stamp samples, the lower camera, the upper one.
-        order = np.lexsort((rank, stamps_ns))
+        times, stamps_ns, is_motion = ImageTimes(images, self._time, log.index.steps), run_ns.copy(), rank == 0
+        stamps_ns[is_motion] = times.sample_ns(header_ns[is_motion], run_ns[is_motion])
+        for camera, at in at_of.items():
+            stamps_ns[at] = times.stamps_ns[camera]
         stamps_of = {name: stamps_ns[(topic == n) & ~is_broken] for n, name in enumerate(names)}
         spans = {name: (int(ns.min()), int(ns.max())) for name, ns in stamps_of.items() if ns.size}
-        return _Order(rows[order], stamps_ns[order], (is_image & ~is_broken)[order], times, spans)
+        # 3. The order: of one stamp samples, the lower camera, the upper one.
+        order = np.lexsort((rank, stamps_ns))
+        return _Order(rows[order], stamps_ns[order], is_image[order], times, spans)
+
+    def _image(self, row: int) -> bytes | None:
+        """Return the bytes of an image, None of one that is broken."""
+        with suppress(FrameDecodeError):
+            message = self._log.message(row)
+            return None if message is None else bytes(message.image().data)
+        return None
 
     def close(self) -> None:
         """End frames() and close the log."""
@@ -225,13 +222,6 @@ class LogReader:
         self._faults: dict[str, str] = {}  # by counter: what is wrong with the first message that is not valid
         self._other_joints = 0  # messages of joints without the wheels
         self._has_wheels = False
-
-    def _sample(self, logged: LoggedMessage) -> MotionSample | None:
-        """Return the sample in a message of wheels or IMU, None of joints without the wheels."""
-        sample = logged.motion(self._joints)
-        self._other_joints += sample is None
-        self._has_wheels = self._has_wheels or isinstance(sample, WheelSample)
-        return sample
 
     def _examine(self, topic: str, image: RosImage) -> None:
         """Warn where the first image of a topic would be black, or grey, as it is encoded otherwise than stated."""

@@ -13,6 +13,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from drivers.errors import DriverError, FrameDecodeError
 from drivers.logs import mcap_file, ros1_bag, sqlite_bag
 from drivers.logs.compression import PACKED_SUFFIXES, is_packed, scratch_folder, unpack_file
@@ -30,8 +32,8 @@ LOG_SUFFIXES: Final = (".mcap", ".db3", ".bag")
 _UNFINISHED: Final = (".part", ".active")  # A recording of omnid, or of rosbag, has these until it is complete.
 # A log: name, time of its first message (of omnid's recordings and of ROS 1), number of the part, format.
 _NAME: Final = re.compile(
-    r"(?P<name>.+?)(?P<time>_\d{8}T\d{6}Z|_\d{4}(?:-\d{2}){5})?(?:_(?P<part>\d{1,9}))?(?P<format>\.(?:mcap|db3|bag))"
-    rf"(?:{'|'.join(map(re.escape, (*_UNFINISHED, *PACKED_SUFFIXES)))})*"
+    r"(?P<log>(?P<name>.+?)(?P<time>_\d{8}T\d{6}Z|_\d{4}(?:-\d{2}){5})?(?:_(?P<part>\d{1,9}))?"
+    rf"(?P<format>\.(?:mcap|db3|bag)))(?:{'|'.join(map(re.escape, (*_UNFINISHED, *PACKED_SUFFIXES)))})*"
 )
 _LISTED_FILES: Final = re.compile(r"^ *relative_file_paths:[ \t]*\n((?:[ \t]*- .*\n)*)", re.M)
 _FORMATS: Final[dict[bytes, Callable[[Path, str], LogFile]]] = {
@@ -101,21 +103,23 @@ def log_info(path: str | os.PathLike[str], *, examine: bool = False, rate_hz: fl
                 image = message.image() if message.kind in IMAGE_TYPES else None
                 if image and image.encoding == "jpeg" and _JPEG_END not in image.data.tobytes():
                     cut_images[message.topic] += 1
-        damage = log.damage()
+        damage, index = log.damage(), log.index
         faults = [damage.cut] if damage.cut else []
-        faults += [f"{count} images of {topic!r} end too early" for topic, count in (+cut_images).items()]
-        is_broken = bool(faults or damage.broken)
-        state = LogState.BROKEN if is_broken else LogState.WHOLE if log.is_indexed else LogState.UNINDEXED
+        faults += [f"{count} images of {topic!r} end too early" for topic, count in cut_images.items()]
+        is_indexed = all(file.is_indexed for file in log.files)
+        state = LogState.WHOLE if is_indexed else LogState.UNINDEXED
+        logged_ns = index.entries["time_ns"]
+        times = {name: index.run_ns[index.topic == n] for n, name in enumerate(index.topics)}
         files = given.rglob("*") if given.is_dir() else [given]
         return LogInfo(
             given,
             sum(file.stat().st_size for file in files if file.is_file()),
-            LogState.WRITTEN if locked else state,
+            LogState.WRITTEN if locked else LogState.BROKEN if faults or damage.broken else state,
             damage.broken,
             "; ".join(faults),
-            {name: (kind, counts.get(name, 0)) for name, kind in sorted(log.topics().items())},
-            log.rates_hz(),
-            log.span_ns(),
+            {name: (kind, counts.get(name, 0)) for name, kind in sorted(index.topics.items())},
+            {name: (len(ns) - 1) * 1e9 / float(np.ptp(ns)) for name, ns in times.items() if len(ns) and np.ptp(ns)},
+            (int(logged_ns.min()), int(logged_ns.max())) if logged_ns.size else None,
             {name: len(data) for name, data in log.attachments().items()},
         )
 
@@ -133,7 +137,8 @@ def _open_file(path: Path, name: str | None = None) -> LogFile:
     except OSError as error:
         raise DriverError(f"cannot read the log {name!r}: {error.strerror}") from error
     for magic, kind in _FORMATS.items():
-        if start.startswith(magic):
+        # A recorder that was killed early may have left all of a database in its write-ahead log.
+        if start.startswith(magic) or (kind is SqliteBag and not start.strip(b"\0") and Path(f"{path}-wal").is_file()):
             return kind(path, name)
     if is_packed(start) and name == str(path):
         with scratch_folder(name) as folder:
@@ -175,12 +180,15 @@ def logs_in(folder: Path) -> list[Path]:
 
     One that was cut, or is compressed, is one of them, unless it is there completed or unpacked, or is being written.
     """
-    found = sorted(file for file in folder.iterdir() if is_log_name(file.name) and file.is_file())
     return [
         file
-        for file in found
-        if file.suffix in LOG_SUFFIXES
-        or not (file.with_suffix("").exists() or (file.suffix in _UNFINISHED and is_locked(file)))
+        for file in sorted(folder.iterdir())
+        if is_log_name(file.name)
+        and file.is_file()
+        and (
+            file.suffix in LOG_SUFFIXES
+            or not (file.with_suffix("").exists() or (file.suffix in _UNFINISHED and is_locked(file)))
+        )
     ]
 
 
@@ -204,12 +212,11 @@ def _missing(folder: Path, logs: Sequence[Path]) -> list[str]:
     there = [match for log in logs if (match := _NAME.fullmatch(log.name))]
     if metadata.is_file() and metadata.stat().st_size <= MAX_ATTACHMENT_BYTES:
         listed = _LISTED_FILES.search(metadata.read_text("utf-8", "replace"))
-        # The first versions of rosbag2 listed paths.
+        # The first versions of rosbag2 listed paths. One file may be compressed or unfinished, and the other not.
         lines = listed[1].splitlines() if listed else []
         names = [Path(line.strip().removeprefix("- ").strip("'\" ")).name for line in lines]
-        # One file may be compressed or unfinished, and the other not.
-        known = {match[0][: match.end("format")] for match in there}
-        return [name for name in names if not ((m := _NAME.match(name)) and name[: m.end("format")] in known)]
+        known = {match["log"] for match in there}
+        return [name for name in names if not ((match := _NAME.match(name)) and match["log"] in known)]
     numbers = [int(match["part"]) for match in there if match["part"]]
     if not numbers or len(set(numbers)) != len(logs):
         return []

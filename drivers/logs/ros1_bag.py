@@ -8,52 +8,34 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Final
 
-import numpy as np
-
 from drivers.errors import RecordError
-from drivers.logs.chunked_file import ByteSource, ChunkedFile, Record, RecordKind, Summary
-from drivers.logs.compression import unpack_chunk
-from drivers.logs.log import ENTRY, MAX_DEFINITION_BYTES, MAX_DEFINITIONS, MAX_NAME, Entries, Topic
+from drivers.logs.log import MAX_DEFINITION_BYTES, MAX_DEFINITIONS, MAX_NAME, Topic
+from drivers.logs.record_file import ByteSource, Kind, Packing, Record, RecordFile
 
 MAGIC: Final = b"#ROSBAG V2.0\n"
 
 _LENGTH: Final = struct.Struct("<I")
-_ENTRY: Final = np.dtype([(name, "<u4") for name in ("seconds", "nanoseconds", "offset")])  # of an index
-_KINDS: Final = {
-    2: RecordKind.MESSAGE,
-    4: RecordKind.INDEX,
-    5: RecordKind.CHUNK,
-    6: RecordKind.PLACE,
-    7: RecordKind.CHANNEL,
-}
+_KINDS: Final = {2: Kind.MESSAGE, 5: Kind.CHUNK, 6: Kind.PLACE, 7: Kind.CHANNEL}
 
 
-class Ros1Bag(ChunkedFile):
+class Ros1Bag(RecordFile):
     """A LogFile of one .bag file; raises DriverError where it cannot be read."""
 
-    def __init__(self, path: Path, name: str) -> None:
-        super().__init__(path, MAGIC, name)
+    magic = MAGIC
 
-    def _summary(self) -> Summary | None:
+    def _summary_at(self) -> int | None:
         try:
-            bag = next(self._records(self, self._start, self.size))
-            (begin,) = _numbers(bag, b"index_pos", 1, "Q")
-            expected = _number(bag, b"conn_count") + _number(bag, b"chunk_count")
+            bag = next(self._records(self, len(MAGIC), self.size))
+            begin = _field(bag, b"index_pos", "<Q")[0]
+            expected = _field(bag, b"conn_count")[0] + _field(bag, b"chunk_count")[0]
         except (StopIteration, RecordError):
             return None
-        if not self._start < begin < self.size:
+        if not len(MAGIC) < begin < self.size:
             return None
-        records = [record for record in self._records(self, begin, self.size) if not record.is_cut]
-        places = [record for record in records if record.kind is RecordKind.PLACE and b"chunk_pos" in record.fields]
-        definitions = [record for record in records if record.kind is RecordKind.CHANNEL]
-        found = Summary(definitions, [int.from_bytes(place.fields[b"chunk_pos"], "little") for place in places])
-        return found if len(records) >= expected else None
-
-    def _is_whole(self, last: Record) -> bool:
-        return last.kind is RecordKind.PLACE
+        found = sum(not record.is_cut for record in self._records(self, begin, self.size))
+        return begin if found >= expected else None
 
     def _records(self, source: ByteSource, start: int, end: int) -> Iterator[Record]:
         offset = start
@@ -68,40 +50,30 @@ class Ros1Bag(ChunkedFile):
                 return
             size, offset = _length(source, offset), offset + _LENGTH.size
             is_cut = size > end - offset
-            yield Record(_KINDS.get(opcode[0], RecordKind.OTHER), begin, offset, size, fields, is_cut)
+            yield Record(_KINDS.get(opcode[0], Kind.OTHER), begin, offset, size, fields, is_cut)
             if is_cut:
                 return
             offset += size
 
-    def _unpack(self, chunk: Record, data: memoryview) -> ByteSource:
-        compression, size = chunk.fields.get(b"compression", b""), _number(chunk, b"size")
-        unpacked = unpack_chunk(compression.replace(b"none", b""), data, size or len(data))
-        if len(unpacked) != size and not chunk.is_cut:
-            raise RecordError("its content does not match its size")
-        return ByteSource(unpacked)
+    def _packing(self, chunk: Record) -> Packing:
+        compression = chunk.fields.get(b"compression", b"").replace(b"none", b"")
+        # The recorder states the size of a chunk when it ends it.
+        return Packing(compression, chunk.offset, chunk.size, _field(chunk, b"size")[0] or chunk.size)
 
-    def _plain_begin(self, chunk: Record) -> int:
-        return chunk.offset if chunk.fields.get(b"compression") == b"none" else 0
+    def _message(self, source: ByteSource, record: Record) -> tuple[int, int, int]:
+        seconds, nanoseconds = _field(record, b"time", "<II")
+        return _field(record, b"conn")[0], seconds * 10**9 + nanoseconds, record.offset
 
-    def _head(self, source: ByteSource, message: Record) -> tuple[int, int, int]:
-        seconds, nanoseconds = _numbers(message, b"time", 2)
-        return _number(message, b"conn"), seconds * 10**9 + nanoseconds, message.offset
-
-    def _index(self, record: Record, chunk: int) -> Entries:
-        body = self.content(record.offset, record.size)
-        found = np.frombuffer(body[: len(body) // _ENTRY.itemsize * _ENTRY.itemsize], _ENTRY)
-        entries = np.empty(len(found), ENTRY)
-        entries["channel"], entries["block"], entries["offset"] = _number(record, b"conn"), chunk, found["offset"]
-        entries["time_ns"] = found["seconds"].astype(np.int64) * 10**9 + found["nanoseconds"]
-        return entries
-
-    def _define(self, source: ByteSource, record: Record) -> None:
+    def _learn(self, source: ByteSource, record: Record) -> None:
+        if record.kind is Kind.PLACE:
+            self._places += _field(record, b"chunk_pos", "<Q")
+            return
         if len(self.topics) >= MAX_DEFINITIONS or record.size > MAX_DEFINITION_BYTES:
             raise RecordError(f"more than {MAX_DEFINITIONS} connections, or a large one")
         about = _fields(bytes(source.content(record.offset, record.size)))
         found = record.fields.get(b"topic", b""), about.get(b"type", b"")
         topic, kind = (text[:MAX_NAME].decode("utf-8", "replace") for text in found)
-        self.topics[_number(record, b"conn")] = Topic(topic, kind.replace("/", "/msg/", 1), aligned=False)
+        self.topics.setdefault(_field(record, b"conn")[0], Topic(topic, kind.replace("/", "/msg/", 1), aligned=False))
 
 
 def _length(source: ByteSource, offset: int) -> int:
@@ -122,13 +94,9 @@ def _fields(header: bytes) -> dict[bytes, bytes]:
     return found
 
 
-def _numbers(record: Record, name: bytes, count: int, code: str = "I") -> tuple[int, ...]:
+def _field(record: Record, name: bytes, layout: str = "<I") -> tuple[int, ...]:
     """Return the numbers in a field of a record; raise RecordError where there are none."""
     try:
-        return struct.unpack(f"<{count}{code}", record.fields.get(name, b""))
+        return struct.unpack(layout, record.fields.get(name, b""))
     except struct.error as error:
         raise RecordError(f"a record has no valid field {name.decode()}") from error
-
-
-def _number(record: Record, name: bytes) -> int:
-    return _numbers(record, name, 1)[0]

@@ -1,0 +1,258 @@
+"""A file of records, most of which are packed in chunks, whole, cut, corrupt or malicious: MCAP files and ROS 1 bags.
+
+Both formats are framed here and not by their libraries, whose readers refuse a file that was cut, end at the first
+corrupt chunk, accept a short read as a message and unpack without a bound.
+
+What an index says of the messages in a chunk is not used: the head of each message is read where it is, of chunks that
+are not compressed without the rest. A summary only tells what was defined in a corrupt chunk, and where others begin.
+"""
+
+from __future__ import annotations
+
+import os
+import zlib
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from enum import Enum, auto
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from drivers.errors import DriverError, RecordError
+from drivers.logs.compression import MAX_RECORD_BYTES, is_packed_message, unpack_chunk
+from drivers.logs.log import ENTRY, MAX_DEFINITIONS, Entries, LogFile
+from drivers.logs.ros_messages import HEADER_BYTES
+
+_KEPT_CHUNKS: Final = 4  # that stay unpacked: both cameras, wheels and gyro may have been written one after the other
+_NO_CHUNK: Final = 0  # block of a message outside of chunks, whose offset is in the file
+
+
+class Kind(Enum):
+    """What a record is for the reader."""
+
+    CHUNK = auto()
+    MESSAGE = auto()
+    SCHEMA = auto()
+    CHANNEL = auto()
+    ATTACHMENT = auto()
+    END = auto()  # of chunks and messages
+    PLACE = auto()  # of a chunk, behind that end
+    OTHER = auto()
+
+
+_DEFINITIONS: Final = (Kind.SCHEMA, Kind.CHANNEL)
+_ENDS: Final = (Kind.END, Kind.PLACE)
+
+
+class Record(NamedTuple):
+    """Position of a record's content in its source."""
+
+    kind: Kind
+    begin: int  # of the whole record, bytes
+    offset: int  # of its content
+    size: int  # of its content
+    fields: Mapping[bytes, bytes] = {}  # of a bag's record
+    is_cut: bool = False  # the source ends within the content
+
+    @property
+    def end(self) -> int:
+        """Where the record ends, bytes."""
+        return self.offset + self.size
+
+
+class Packing(NamedTuple):
+    """How the records of a chunk are packed."""
+
+    compression: bytes  # lz4, zstd, bz2 or nothing
+    offset: int  # of the packed records in the file
+    packed_bytes: int
+    unpacked_bytes: int
+    crc: int = 0  # of the unpacked records; 0: unknown
+
+
+class ByteSource:
+    """Bytes of known size: an unpacked chunk."""
+
+    def __init__(self, data: bytes | memoryview = b"") -> None:
+        self._view = memoryview(data)
+        self.size = len(self._view)
+
+    def read_bytes(self, offset: int, size: int) -> bytes | memoryview:
+        """Return up to size bytes from offset."""
+        return self._view[offset : offset + size]
+
+    def content(self, offset: int, size: int) -> memoryview:
+        """Return bytes from offset; raise RecordError where they are too many or incomplete."""
+        if size > MAX_RECORD_BYTES:
+            raise RecordError(f"{size} bytes are more than {MAX_RECORD_BYTES}")
+        data = self.read_bytes(offset, size)
+        if len(data) < size:
+            raise RecordError(f"{len(data)} of {size} bytes could be read")
+        return memoryview(data)
+
+
+class RecordFile(LogFile, ByteSource):
+    """A log of records, and the source of its bytes. A format states how records are framed, packed and read."""
+
+    magic = b""  # at the begin of a file
+    end_magic = b""  # at the end of a closed one
+
+    def __init__(self, path: Path, name: str) -> None:
+        """Open a file that begins with the magic; raise DriverError where it cannot be read."""
+        LogFile.__init__(self, name)
+        ByteSource.__init__(self)
+        self._attached: list[Record] = []
+        self._places: list[int] = []  # of chunks, by the summary
+        self._chunks: dict[int, ByteSource] = {}  # the last ones that were unpacked
+        try:
+            self._file = path.open("rb", buffering=0)
+        except OSError as error:
+            raise DriverError(f"cannot read the log {self.name!r}: {error.strerror}") from error
+        self.size = os.fstat(self._file.fileno()).st_size
+
+    # What a format states. All but the first two raise RecordError for a record that is malformed.
+
+    @abstractmethod
+    def _summary_at(self) -> int | None:
+        """Return where a closed file begins its summary, 0 without a valid one; None: it is not closed."""
+
+    @abstractmethod
+    def _records(self, source: ByteSource, start: int, end: int) -> Iterator[Record]:
+        """Yield the records from offset start on; the last one may be cut. What is no record ends them."""
+
+    @abstractmethod
+    def _packing(self, chunk: Record) -> Packing:
+        """Return how a chunk is packed."""
+
+    @abstractmethod
+    def _message(self, source: ByteSource, record: Record) -> tuple[int, int, int]:
+        """Return channel, time [ns] and offset of the data of a message."""
+
+    @abstractmethod
+    def _learn(self, source: ByteSource, record: Record) -> None:
+        """Add a channel, a schema or the place of a chunk, within the limits."""
+
+    # The log file
+
+    def read_bytes(self, offset: int, size: int) -> bytes:
+        """Return up to size bytes of the file from offset; none after close, or where the disk fails."""
+        try:
+            return os.pread(self._file.fileno(), min(size, MAX_RECORD_BYTES), offset)
+        except (OSError, ValueError):
+            return b""
+
+    def close(self) -> None:
+        """Close the file; may be called twice."""
+        self._file.close()
+
+    def entries(self) -> Entries:
+        """Return the places of all messages, chunk by chunk."""
+        summary_at, data_end = self._summary_at(), self.size - len(self.end_magic)
+        for record in self._records(self, summary_at, data_end) if summary_at else ():
+            with suppress(RecordError):  # then the data has the definition
+                if record.kind in (*_DEFINITIONS, Kind.PLACE):
+                    self._learn(self, record)
+        found, last = [np.empty(0, ENTRY)], Record(Kind.OTHER, 0, 0, len(self.magic))
+        for record in self._with_jumps(is_closed=summary_at is not None):
+            last = record
+            if record.kind is Kind.CHUNK:
+                found.append(self._of_chunk(record))
+            elif record.kind is Kind.ATTACHMENT and len(self._attached) < MAX_DEFINITIONS:
+                self._attached.append(record)
+            else:
+                found.append(self._scanned(self, record.begin, record.end, _NO_CHUNK, is_cut=True))
+        # Where two files were written one after the other, the first one's end is not that of the file.
+        ends = [record.end for record in self._records(self, last.end, data_end)] or [last.end]
+        if summary_at is None or last.kind not in _ENDS or ends[-1] != data_end:
+            end = min(last.end, self.size)
+            self.cut = f"the log {self.name!r} is cut or corrupt after byte {end} of {self.size}: used the data before"
+        return np.concatenate(found)
+
+    def _with_jumps(self, *, is_closed: bool) -> Iterator[Record]:
+        """Yield the records up to the end of the data, and behind holes in the file those from the next chunk on."""
+        begin = len(self.magic)
+        while begin:
+            end = begin
+            for record in self._records(self, begin, self.size):
+                # A length that exceeds a file which was closed is a corrupt one; in another, its last chunk is cut.
+                if record.is_cut and (record.kind is not Kind.CHUNK or is_closed):
+                    break
+                yield record
+                if record.kind in _ENDS:
+                    return
+                end = record.end
+            begin = min((place for place in self._places if place > end), default=0)
+            if begin:
+                self.faults[end] = f"the {begin - end} bytes from byte {end} on are no records"
+
+    def read(self, block: int, offset: int) -> memoryview:
+        """Return the bytes of the message of an entry; raise RecordError where they are not those that were written."""
+        try:
+            source = self if block == _NO_CHUNK else self._chunk(block)
+            record = next(self._records(source, offset, source.size), None)
+            if record is None or record.kind is not Kind.MESSAGE:
+                raise RecordError(f"at its byte {offset} is no message any more")
+            at = self._message(source, record)[2]
+            return source.content(at, record.end - at)
+        except RecordError as error:
+            raise RecordError(f"the chunk at byte {block}: {error}" if block else str(error)) from error
+
+    def _of_chunk(self, chunk: Record) -> Entries:
+        """Return the entries of a chunk; one that is not compressed is checked when its messages are read."""
+        try:
+            packing = self._packing(chunk)
+            if packing.compression:
+                source = self._chunk(chunk.begin)
+                return self._scanned(source, 0, source.size, chunk.begin, is_cut=chunk.is_cut)
+            end = min(packing.offset + packing.packed_bytes, self.size)
+            found = self._scanned(self, packing.offset, end, chunk.begin, is_cut=chunk.is_cut)
+        except RecordError as error:
+            self.faults[chunk.begin] = f"the chunk at byte {chunk.begin}: {error}"
+            return np.empty(0, ENTRY)
+        found["offset"] -= packing.offset
+        return found
+
+    def _chunk(self, begin: int) -> ByteSource:
+        """Return the content of a chunk; raise RecordError where it is not the one that was written."""
+        if begin not in self._chunks:
+            chunk = next(self._records(self, begin, self.size), None)
+            if chunk is None:
+                raise RecordError("it is gone")
+            packing = self._packing(chunk)
+            packed = self.content(packing.offset, min(packing.packed_bytes, self.size - packing.offset))
+            data = unpack_chunk(packing.compression, packed, packing.unpacked_bytes)
+            is_whole = len(packed) == packing.packed_bytes and len(data) == packing.unpacked_bytes
+            if not (chunk.is_cut or (is_whole and packing.crc in (0, zlib.crc32(data)))):
+                raise RecordError("its content does not match its size and CRC")
+            self._chunks[begin] = ByteSource(data)
+        self._chunks[begin] = self._chunks.pop(begin)  # the newest one
+        if len(self._chunks) > _KEPT_CHUNKS:
+            del self._chunks[next(iter(self._chunks))]
+        return self._chunks[begin]
+
+    def _scanned(self, source: ByteSource, begin: int, end: int, block: int, *, is_cut: bool) -> Entries:
+        """Return the entries of the messages among records, and learn what the others define.
+
+        is_cut: the last one need not be whole.
+        """
+        found, at = [], begin
+        for record in self._records(source, begin, end):
+            if record.is_cut:
+                break
+            at = record.end
+            try:
+                if record.kind in _DEFINITIONS:
+                    self._learn(source, record)
+                elif record.kind is Kind.MESSAGE:
+                    channel, time_ns, at_data = self._message(source, record)
+                    start = source.read_bytes(at_data, min(record.end - at_data, HEADER_BYTES))
+                    if is_packed_message(start):
+                        start = source.content(at_data, record.end - at_data)
+                    found.append((channel, time_ns, self.header_ns(channel, start), block, record.begin))
+            except RecordError as error:
+                self.faults.setdefault(block or record.begin, f"the record at byte {record.begin}: {error}")
+        if at != end and not is_cut:
+            self.faults.setdefault(block, f"the chunk at byte {block}: its last record is not whole")
+        return np.array(found, ENTRY)
