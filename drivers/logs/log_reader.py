@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -230,7 +230,9 @@ class LogReader:
         self._examined.add(topic)
         frame = image.frame(bits=self._bits)
         with suppress(FrameDecodeError):  # who decodes the image says what is wrong with it
-            if image.width and _is_neutral(gray(frame)):
+            # Of colours that are taken for brightness nearly all are near the middle.
+            colours = np.abs(gray(frame).astype(np.int16) - NEUTRAL_GREY) if image.width else np.array([NEUTRAL_GREY])
+            if np.percentile(colours, MOST_PERCENT) <= NEAR_NEUTRAL:
                 self.warnings.append(
                     f"the first image of {topic!r} ({image.encoding!r}) has grey levels near {NEUTRAL_GREY} only, as "
                     "colours have in YUV: is its encoding right? yuv422 is UYVY, yuv422_yuy2 is YUYV"
@@ -254,12 +256,10 @@ class LogReader:
                 )
         for topic in sorted(self._motion.names & spans.keys()) if images else ():
             begin_ns, end_ns = spans[topic]
-            first_ns, last_ns = min(images)[0], max(last_ns for _, last_ns in images)
-            if begin_ns > last_ns or end_ns < first_ns:
-                what = "gyro" if topics[topic] == IMU else "wheels"
+            if begin_ns > max(last_ns for _, last_ns in images) or end_ns < min(images)[0]:
                 yield (
-                    f"no sample of the {what} is used: they begin {_apart(begin_ns - first_ns)} the images by their "
-                    "stamps: are these of another clock?"
+                    f"no sample of the {'gyro' if topics[topic] == IMU else 'wheels'} is used: they begin "
+                    f"{_apart(begin_ns - min(images)[0])} the images by their stamps: are these of another clock?"
                 )
 
     def _report(self) -> None:
@@ -268,11 +268,11 @@ class LogReader:
         self.counts["broken_records"] = damage.broken
         self.counts["unstamped"] = times.by_log.total()
         self.counts["no_joints"] = 0 if self._has_wheels else self._other_joints
-        faults = defaultdict(str, {**self._faults, "broken_records": damage.first})
+        self._faults["broken_records"] = damage.first
         self.warnings += [damage.cut] if damage.cut else []
         for name, text in _WARNINGS.items():
             if self.counts[name]:
-                self.warnings.append(text.format(self.counts[name], fault=faults[name]))
+                self.warnings.append(text.format(self.counts[name], fault=self._faults.get(name, "")))
         self.warnings += [*times.warnings(), *self._of_another_clock()]
 
 
@@ -288,8 +288,3 @@ class _Order(NamedTuple):
 
 def _apart(shift_ns: int) -> str:
     return f"{abs(shift_ns) * 1e-9:.1f} s {'after' if shift_ns > 0 else 'before'}"
-
-
-def _is_neutral(image: NDArray[np.uint8]) -> bool:
-    """True if nearly all grey levels (H, W) are near the middle."""
-    return bool(np.percentile(np.abs(image.astype(np.int16) - NEUTRAL_GREY), MOST_PERCENT) <= NEAR_NEUTRAL)

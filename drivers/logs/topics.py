@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 from drivers.errors import DriverError
@@ -12,19 +12,13 @@ from drivers.logs.log import listed
 from drivers.logs.ros_messages import COMPRESSED_IMAGE, IMAGE, IMAGE_TYPES, IMU, JOINT_STATE, ODOMETRY, JointWheels
 
 _WORDS: dict[str, Camera] = {
-    "lower": "lower",
-    "bottom": "lower",
-    "down": "lower",
-    "upper": "upper",
-    "top": "upper",
-    "up": "upper",
+    **dict.fromkeys(("lower", "bottom", "down"), CAMERAS[0]),
+    **dict.fromkeys(("upper", "top", "up"), CAMERAS[1]),
 }
 _COMPRESSED = "/compressed"  # ends the names of compressed images (image_transport)
 
-Wanted = Mapping[Camera, str | None]
 
-
-def choose_topics(log: str, topics: Mapping[str, str], wanted: Wanted) -> dict[Camera, str]:
+def choose_topics(log: str, topics: Mapping[str, str], wanted: Mapping[Camera, str | None]) -> dict[Camera, str]:
     """Return the topics of the two cameras.
 
     log: its name for error messages. topics: name -> type. wanted: requested topics, which must exist; a camera
@@ -38,17 +32,43 @@ def choose_topics(log: str, topics: Mapping[str, str], wanted: Wanted) -> dict[C
         raise DriverError(
             f"no image topics in {log}: found {listed(topics)}; record {IMAGE} or {COMPRESSED_IMAGE} of both cameras"
         )
-    given = {camera: _given(log, topics, wanted[camera]) for camera in CAMERAS}
-    free = [name for name in images if name not in given.values()]
-    lower, upper = (given[camera] or _guessed(log, free, camera) for camera in CAMERAS)
-    if lower is None and upper is None and len(_images(images)) > 1:
+    # 1. Requested topics; image_transport publishes an image raw, compressed, or both.
+    found: dict[Camera, str] = {}
+    for camera, name in wanted.items():
+        if name is None:
+            continue
+        transports = name, f"{name}{_COMPRESSED}", name.removesuffix(_COMPRESSED)
+        topic = next((topic for topic in transports if topic in topics), name)
+        if topic not in topics:
+            raise DriverError(f"no topic {topic!r} in {log}: found {listed(topics)}; give one of these")
+        if topics[topic] not in IMAGE_TYPES:
+            holds = topics[topic] or "no CDR"
+            raise DriverError(f"topic {topic!r} in {log} holds {holds}; give one of: {listed(topics)}")
+        found[camera] = topic
+    # 2. Topics named after a camera, by the first word that names one: /upper/down_sampled is the upper camera.
+    free = [name for name in images if name not in found.values()]
+    words = {name: [word for word in re.split(r"[^a-z0-9]+", name.lower()) if word in _WORDS] for name in free}
+    for camera in CAMERAS:
+        mine = [name for name in free if words[name] and _WORDS[words[name][0]] == camera]
+        if camera in found or not mine:
+            continue
+        if len(_images(mine)) > 1:
+            raise DriverError(
+                f"several {camera} cameras in {log}: found {listed(mine)}; give one of them by --{camera}"
+            )
+        found[camera] = max(mine, key=lambda name: name.endswith(_COMPRESSED))
+    if not found and len(_images(images)) > 1:
         raise DriverError(f"cannot tell the cameras in {log} apart: found {listed(images)}; give --lower and --upper")
-    if lower is None or upper is None:
-        missing = "lower" if lower is None else "upper"
-        raise DriverError(f"no {missing} camera in {log}: found only {listed(images)}; give --{missing} TOPIC")
-    if lower == upper:
-        raise DriverError(f"topic {lower!r} of {log} is named for both cameras: expected two topics")
-    return {"lower": lower, "upper": upper}
+    for camera in CAMERAS:
+        if camera not in found:
+            raise DriverError(f"no {camera} camera in {log}: found only {listed(images)}; give --{camera} TOPIC")
+    if found["lower"] == found["upper"]:
+        raise DriverError(f"topic {found['lower']!r} of {log} is named for both cameras: expected two topics")
+    return found
+
+
+def _images(names: Iterable[str]) -> set[str]:
+    return {name.removesuffix(_COMPRESSED) for name in names}
 
 
 class MotionTopics(NamedTuple):
@@ -72,56 +92,20 @@ def choose_motion_topics(log: str, topics: Mapping[str, str], wanted: MotionTopi
     A topic of odometry is that of wheels if its name contains "wheel", because others are results; a topic of joints
     may have any name. Raises DriverError for a requested topic that does not exist or is of another type.
     """
-    chosen, warnings = [], []
+    chosen, warnings = list[str](), list[str]()
     # omnid records the wheels of joints as an Odometry.
     of_joints = wanted.joints and (wanted.wheels or JOINT_STATE in topics.values())
     wheels = JOINT_STATE if of_joints else ODOMETRY
     for kind, name, setting in ((wheels, wanted.wheels, "motion.wheels"), (IMU, wanted.imu, "motion.imu")):
-        if name:
-            if topics.get(name) != kind:
-                found = f"holds {topics[name]}" if topics.get(name) else "is not"
-                raise DriverError(f"topic {name!r} {found} in {log}; {setting} must be one of {kind}: {listed(topics)}")
-            chosen.append(name)
-        elif name is None:
-            found_names = [
-                topic
-                for topic, found in topics.items()
-                if found == kind and (kind != ODOMETRY or "wheel" in topic.lower())
-            ]
-            if len(found_names) > 1:
-                warnings.append(
-                    f"{log} has several topics of {kind}: {listed(found_names)}; none is used: set {setting}"
-                )
-            else:
-                chosen += found_names
+        if name and topics.get(name) != kind:
+            found = f"holds {topics[name]}" if topics.get(name) else "is not"
+            raise DriverError(f"topic {name!r} {found} in {log}; {setting} must be one of {kind}: {listed(topics)}")
+        names = [name] if name else []
+        if name is None:
+            of_kind = (topic for topic, found in topics.items() if found == kind)
+            names = [topic for topic in of_kind if kind != ODOMETRY or "wheel" in topic.lower()]
+        if len(names) > 1:
+            warnings.append(f"{log} has several topics of {kind}: {listed(names)}; none is used: set {setting}")
+        else:
+            chosen += names
     return MotionChoice(frozenset(chosen), "; ".join(warnings))
-
-
-def _given(log: str, topics: Mapping[str, str], name: str | None) -> str | None:
-    """Return the topic of a requested camera; image_transport publishes it raw, compressed, or both."""
-    if name is None:
-        return None
-    transports = name, f"{name}{_COMPRESSED}", name.removesuffix(_COMPRESSED)
-    name = next((topic for topic in transports if topic in topics), name)
-    if name not in topics:
-        raise DriverError(f"no topic {name!r} in {log}: found {listed(topics)}; give one of these")
-    if topics[name] not in IMAGE_TYPES:
-        raise DriverError(f"topic {name!r} in {log} holds {topics[name] or 'no CDR'}; give one of: {listed(topics)}")
-    return name
-
-
-def _guessed(log: str, names: Sequence[str], camera: Camera) -> str | None:
-    """Return the topic named after the camera, preferably the compressed one, None without one.
-
-    Raises DriverError where several cameras have such a name.
-    """
-    # The first word that names a camera counts: /upper/down_sampled is the upper camera.
-    words = {name: re.split(r"[^a-z0-9]+", name.lower()) for name in names}
-    mine = [name for name in names if next((_WORDS[word] for word in words[name] if word in _WORDS), None) == camera]
-    if len(_images(mine)) > 1:
-        raise DriverError(f"several {camera} cameras in {log}: found {listed(mine)}; give one of them by --{camera}")
-    return max(mine, key=lambda name: name.endswith(_COMPRESSED), default=None)
-
-
-def _images(names: Iterable[str]) -> set[str]:
-    return {name.removesuffix(_COMPRESSED) for name in names}
