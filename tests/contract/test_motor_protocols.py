@@ -16,8 +16,8 @@ from drivers.motor import MotorStatus, VelocityCommand, stop_command
 from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.motor_protocol import Framer, MotorProtocol
 from drivers.motors.protocols.protocol_registry import PROTOCOLS
+from tests.contract.pty_motor import BASE, LONG_MS, NAMES, controller_of, run
 from tests.contract.simulated_controllers import SIMULATED_CONTROLLERS, SimulatedController
-from tests.contract.simulated_motors import BASE, LONG_MS, NAMES, controller_of, run
 
 WIRINGS = [
     BASE,

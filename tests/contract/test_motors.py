@@ -14,14 +14,14 @@ from drivers.motor import MotorStatus, VelocityCommand, stop_command
 from drivers.motors.protocols.motor_protocol import NoReplyError
 from drivers.motors.protocols.protocol_registry import PROTOCOLS
 from drivers.motors.serial_motor import LateReplyError, SerialMotor
-from tests.contract.pty_motor import PtyMotor
-from tests.contract.simulated_motors import (
+from tests.contract.pty_motor import (
     BASE,
     INSTANT,
     LONG_MS,
     NAMES,
     REPLY_S,
     SHORT_MS,
+    PtyMotor,
     connected_motor,
     controller_of,
     until,

@@ -1,13 +1,18 @@
-"""The documents: links lead somewhere, commands exist, API and topics are described."""
+"""The documents: links lead somewhere, commands exist, API and topics are described, images and notebook are made."""
 
 from __future__ import annotations
 
 import argparse
+import json
 import re
 from collections.abc import Iterator
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
@@ -15,6 +20,7 @@ import omnid
 from omnid.cli import COMMANDS, command_at
 from omnid.config import Config
 from omnid.transport.topics import PUBLISHED, command_topics, ros_name
+from tests.documents import images
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -140,3 +146,58 @@ def test_nav2_uses_topics_that_exist() -> None:
         assert scan["min_obstacle_height"] < 0 < scan["max_obstacle_height"]
         assert costmap["obstacle_layer"]["min_obstacle_height"] < 0
     assert parameters["controller_server"]["ros__parameters"]["enable_stamped_cmd_vel"] is False
+
+
+def test_the_stills_show_one_pair(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(images, "FOLDER", tmp_path)
+    images.stills()
+    mirror, panorama, depth = (cv2.imread(str(tmp_path / name)) for name in ("mirror.jpg", "panorama.jpg", "depth.jpg"))
+    assert mirror is not None and panorama is not None and depth is not None
+    assert mirror.shape[0] == mirror.shape[1] and panorama.shape == depth.shape
+    colored = np.ptp(depth.astype(int), axis=2) > 60  # a located pixel has a colour
+    assert 0.03 < colored.mean() < 0.6
+
+
+@pytest.mark.slow
+def test_the_drive_becomes_a_moving_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pillow = pytest.importorskip("PIL.Image")
+    monkeypatch.setattr(images, "FOLDER", tmp_path)
+    images.drive(seconds=3.0)
+    with pillow.open(tmp_path / "drive.gif") as image:
+        assert image.n_frames >= 3 and image.width == images.GIF_WIDTH_PX
+
+
+NOTEBOOK = Path(__file__).parents[2] / "omnid" / "examples" / "first_replay.ipynb"
+CELL_S = 300  # generous: a replay of 99 pairs on a busy machine
+HAS_JUPYTER = all(find_spec(name) for name in ("nbclient", "nbformat", "ipykernel"))
+
+
+def test_it_is_small_and_kept_without_outputs() -> None:
+    cells = json.loads(NOTEBOOK.read_text("utf-8"))["cells"]
+    assert NOTEBOOK.stat().st_size < 10_000
+    assert not any(cell.get("outputs") for cell in cells)
+
+
+@pytest.mark.skipif(HAS_JUPYTER, reason="it runs in Jupyter")
+def test_its_cells_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    matplotlib = pytest.importorskip("matplotlib")
+    matplotlib.use("Agg")
+    names: dict[str, Any] = {}
+    for cell in json.loads(NOTEBOOK.read_text("utf-8"))["cells"]:
+        if cell["cell_type"] == "code":
+            exec("".join(cell["source"]), names)
+    names["plt"].close("all")
+    assert names["errors"].ate_rmse_m < 0.01  # of 4.8 m; `omnid demo` prints 1 mm
+    assert names["errors"].pairs == 99
+
+
+@pytest.mark.skipif(not HAS_JUPYTER, reason="needs nbclient and ipykernel: pip install '.[docs]'")
+def test_it_runs_in_jupyter() -> None:
+    import nbformat
+    from nbclient import NotebookClient
+
+    notebook = nbformat.read(NOTEBOOK, as_version=4)
+    NotebookClient(notebook, timeout=CELL_S).execute()
+    outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+    assert any("ATE" in output.get("text", "") for output in outputs)
+    assert sum("image/png" in output.get("data", {}) for output in outputs) == 3

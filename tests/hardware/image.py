@@ -17,7 +17,6 @@ import sys
 import tempfile
 import tomllib
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
@@ -26,38 +25,18 @@ ROOTFS = Path(__file__).with_name("rootfs")
 RECIPE = 1  # raise it when the functions below build another image from the same constants
 SUITE = "bookworm"
 PACKAGES = (
-    "systemd",
-    "systemd-sysv",
-    "udev",
-    "dbus",
-    "libnss-systemd",
-    "python3",
-    "v4l-utils",
-    "kmod",
-    "procps",
-    "busybox-static",
+    *("systemd", "systemd-sysv", "udev", "dbus", "libnss-systemd"),
+    *("python3", "v4l-utils", "kmod", "procps", "busybox-static"),
 )
 GUEST_MODULES = ("v4l2loopback", "vivid", "uvcvideo", "vhci-hcd", "softdog", "9p", "9pnet_virtio", "autofs4")
 BOOT_MODULES = ("virtio_pci", "virtio_blk", "ext4", "crc32c_generic", "9pnet_virtio", "9p")
-# units that only delay a guest without a screen, a time server or a second boot
+# Units that only delay a guest without a screen, a time server or a second boot.
 MASKED = (
-    "systemd-timesyncd.service",
-    "systemd-logind.service",
-    "systemd-random-seed.service",
-    "systemd-update-utmp.service",
-    "systemd-update-utmp-runlevel.service",
-    "systemd-remount-fs.service",
-    "systemd-pcrphase.service",
-    "systemd-pcrphase-sysinit.service",
-    "apt-daily.timer",
-    "apt-daily-upgrade.timer",
-    "dpkg-db-backup.timer",
-    "e2scrub_all.timer",
-    "e2scrub_reap.service",
-    "fstrim.timer",
-    "getty.target",
-    "getty@tty1.service",
-    "serial-getty@ttyS0.service",
+    *("systemd-timesyncd.service", "systemd-logind.service", "systemd-random-seed.service"),
+    *("systemd-update-utmp.service", "systemd-update-utmp-runlevel.service", "systemd-remount-fs.service"),
+    *("systemd-pcrphase.service", "systemd-pcrphase-sysinit.service", "apt-daily.timer", "apt-daily-upgrade.timer"),
+    *("dpkg-db-backup.timer", "e2scrub_all.timer", "e2scrub_reap.service", "fstrim.timer", "getty.target"),
+    *("getty@tty1.service", "serial-getty@ttyS0.service"),
 )
 TOOLS = {"qemu-system-x86_64": "qemu-system-x86"}
 BUILD_TOOLS = {
@@ -80,40 +59,24 @@ class BuildError(Exception):
     """A step of the build failed."""
 
 
-@dataclass(frozen=True, slots=True)
-class Image:
-    """The three files that QEMU starts."""
+def image() -> Path:
+    """Return the folder of the image for this kernel, these dependencies and this recipe, cached or built now.
 
-    folder: Path
-
-    @property
-    def kernel(self) -> Path:
-        """The kernel, unpacked, since the emulator would need seconds to unpack it."""
-        return self.folder / "vmlinux"
-
-    @property
-    def initramfs(self) -> Path:
-        """The initramfs, which mounts the disk."""
-        return self.folder / "initramfs.cpio"
-
-    @property
-    def disk(self) -> Path:
-        """The ext4 file system; guests write to a snapshot of it."""
-        return self.folder / "root.ext4"
-
-
-def image() -> Image:
-    """Return the image for this kernel, these dependencies and this recipe, cached or built now.
-
-    Raises ImageUnavailableError where neither is possible.
+    It holds what QEMU starts: vmlinux, unpacked, since the emulator would need seconds for that; initramfs.cpio, which
+    mounts the disk; and root.ext4, of which guests write to a snapshot. Raises ImageUnavailableError where it is
+    neither cached nor can be built.
     """
     _require(TOOLS)
     pins, kernel = pinned(), kernel_package()
     folder = cache_folder() / f"{kernel.removeprefix('linux-image-')}-{_digest(pins)}"
     if not (folder / "root.ext4").exists():
-        _require_build()
+        _require(BUILD_TOOLS)
+        if os.geteuid() != 0:
+            raise ImageUnavailableError(
+                f"no image in {cache_folder()}: build it once by `sudo {sys.executable} -m tests.hardware.image`"
+            )
         _build(folder, kernel, pins)
-    return Image(folder)
+    return folder
 
 
 def cache_folder() -> Path:
@@ -153,14 +116,6 @@ def _require(tools: dict[str, str]) -> None:
         raise ImageUnavailableError(f"missing tools: apt-get install {' '.join(missing)}")
 
 
-def _require_build() -> None:
-    _require(BUILD_TOOLS)
-    if os.geteuid() != 0:
-        raise ImageUnavailableError(
-            f"no image in {cache_folder()}: build it once by `sudo {sys.executable} -m tests.hardware.image`"
-        )
-
-
 def _build(folder: Path, kernel: str, pins: list[str]) -> None:
     """Build in a temporary folder and rename it, so that an aborted build leaves no incomplete image."""
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -183,18 +138,9 @@ def _kernel_tree(work: Path, kernel: str, release: str) -> Path:
     debs.mkdir()
     common = release.rsplit("-", 1)[0]
     major_minor = ".".join(release.split(".")[:2])
-    _run(
-        "apt-get",
-        "-q",
-        "download",
-        kernel,
-        f"linux-headers-{release}",
-        f"linux-headers-{common}-common",
-        f"linux-kbuild-{major_minor}",
-        "linux-compiler-gcc-12-x86",
-        "v4l2loopback-dkms",
-        cwd=debs,
-    )
+    packages = [kernel, f"linux-headers-{release}", f"linux-headers-{common}-common", f"linux-kbuild-{major_minor}"]
+    packages += ["linux-compiler-gcc-12-x86", "v4l2loopback-dkms"]
+    _run("apt-get", "-q", "download", *packages, cwd=debs)
     for deb in debs.iterdir():
         _run("dpkg", "-x", deb, tree)
     headers = tree / f"usr/src/linux-headers-{release}"
@@ -213,21 +159,8 @@ def _kernel_tree(work: Path, kernel: str, release: str) -> Path:
 def _write_root(root: Path, tree: Path, release: str, pins: list[str]) -> None:
     _run("mmdebstrap", "-q", "--variant=minbase", f"--include={','.join(PACKAGES)}", SUITE, root, _apt_sources())
     packages = root / "usr/local/lib/python3.11/dist-packages"
-    _run(
-        sys.executable,
-        "-m",
-        "pip",
-        "install",
-        "-q",
-        "--only-binary=:all:",
-        "--python-version",
-        "3.11",
-        "--no-compile",
-        "--root-user-action=ignore",
-        "--target",
-        packages,
-        *pins,
-    )
+    pip = [sys.executable, "-m", "pip", "install", "-q", "--only-binary=:all:", "--python-version", "3.11"]
+    _run(*pip, "--no-compile", "--root-user-action=ignore", "--target", packages, *pins)
     _run("chroot", root, "python3", "-m", "compileall", "-q", packages.relative_to(root), check=False)
     for module in _with_needed(tree, release, GUEST_MODULES):
         target = root / module.relative_to(tree)
@@ -294,4 +227,4 @@ def _run(*command: object, cwd: Path | None = None, check: bool = True) -> str:
 
 
 if __name__ == "__main__":
-    print(image().folder)
+    print(image())

@@ -1,24 +1,25 @@
-"""A temporary Debian guest with virtual cameras and UARTs that runs a command on a copy of the project."""
+"""A temporary Debian guest with virtual cameras and UARTs, in which pytest runs on a copy of the project."""
 
 from __future__ import annotations
 
+import ast
 import shlex
 import shutil
 import subprocess
 import tempfile
-import time
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
-from tests.hardware.image import ROOT, Image, image
+from tests.hardware.image import ROOT, image
 
+HERE = Path(__file__).parent
 TREE = ("omnid", "drivers", "calib", "systemd", "tests", "pyproject.toml", "README.md")
 KERNEL_OPTIONS = (
     "console=ttyS0 quiet panic=-1 tsc=reliable no_timer_check mitigations=off random.trust_cpu=on "
     "systemd.unit=guest-job.target systemd.show_status=0"
 )
-PANIC = "Kernel panic - not syncing"
 
 
 class GuestError(Exception):
@@ -26,97 +27,90 @@ class GuestError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Guest:
-    """Configuration of a guest.
-
-    `files` are copied to /mnt/job. /dev/ttyS1, ttyS2 and ttyS3 are connected to `serial`, as QEMU's -serial:
-    "unix:/path" for a socket on which the caller listens, "pty", "null".
-    """
-
-    systemd: bool = False  # PID 1; else only udev runs
-    files: Mapping[str, bytes] = field(default_factory=dict)
-    serial: Sequence[str] = ()
-    timeout_s: float = 240.0
-    memory_mb: int = 2048
-
-
-@dataclass(frozen=True, slots=True)
 class Result:
-    """Result of a command in the guest."""
+    """Result of the tests of a script in the guest."""
 
-    code: int
     output: str  # stdout and stderr
-    console: str  # output of the kernel
     files: Mapping[str, bytes]  # content of /mnt/job/results
-    elapsed_s: float
+
+    def require_passed(self, name: str) -> None:
+        """Raise AssertionError, with the output of the guest, unless a test ran and passed with all parameters."""
+        cases = [
+            case
+            for case in ElementTree.fromstring(self.files["report.xml"]).iter("testcase")
+            if str(case.get("name")).partition("[")[0] == name
+        ]
+        assert cases, f"it was not run:\n{self.output[-4000:]}"
+        faults = [fault.text for case in cases for fault in case if fault.tag in ("failure", "error", "skipped")]
+        assert not faults, "\n".join(map(str, faults))
 
 
-def run_in_vm(command: Sequence[str], guest: Guest | None = None) -> Result:
-    """Run a command in the guest, in /opt/omnid, a copy of the project, and return its result.
+def names_in(script: str) -> list[str]:
+    """Return the tests of a script of the guest, in their order."""
+    tree = ast.parse((HERE / "guest" / script).read_text("utf-8"))
+    return [entry.name for entry in tree.body if isinstance(entry, ast.FunctionDef) and entry.name.startswith("test_")]
 
-    GuestError where the guest panicked or took too long; ImageUnavailableError without QEMU or an image.
+
+def run_tests(
+    script: str,
+    timeout_s: float,
+    *,
+    systemd: bool = False,
+    files: Mapping[str, bytes] | None = None,
+    serial: Sequence[str] = (),
+) -> Result:
+    """Run a script of the folder `guest` with pytest in a guest, in /opt/omnid, a copy of the project.
+
+    systemd: PID 1; else only udev runs. files are copied to /mnt/job. /dev/ttyS1, ttyS2 and ttyS3 are connected to
+    `serial`, as QEMU's -serial: "unix:/path" for a socket on which the caller listens. GuestError where the guest
+    panicked or took too long; ImageUnavailableError without QEMU or an image.
     """
-    guest = guest or Guest()
+    words = ["python3", "-m", "pytest", "--noconftest", "-p", "no:cacheprovider", "--durations=10"]
+    words += ["--junitxml=/mnt/job/results/report.xml", f"tests/hardware/guest/{script}"]
     with tempfile.TemporaryDirectory(prefix="omnid-guest-") as name:
-        job = Path(name)
-        _write_job(job, command, guest)
-        started = time.monotonic()
-        console = _emulate(_qemu(image(), job, guest), guest.timeout_s)
-        elapsed_s = time.monotonic() - started
-        return _result(job, console, elapsed_s)
+        # 1. The job: the project, the command, the caller's files.
+        job, ignored = Path(name), shutil.ignore_patterns("__pycache__", ".*")
+        (job / "tree").mkdir()
+        for part in TREE:
+            copy = shutil.copytree if (ROOT / part).is_dir() else shutil.copy
+            copy(ROOT / part, job / "tree" / part, **({"ignore": ignored} if copy is shutil.copytree else {}))
+        shutil.copy(HERE / "guest" / "job.sh", job / "start")
+        (job / "command").write_text(f"exec {shlex.join(words)}\n", "utf-8")
+        (job / "results").mkdir()
+        for part, data in (files or {}).items():
+            (job / part).write_bytes(data)
+        # 2. The machine.
+        try:
+            done = subprocess.run(
+                _qemu(job, systemd, serial),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                timeout=timeout_s,
+            )
+            console = done.stdout.decode("utf-8", "replace")
+        except subprocess.TimeoutExpired as error:
+            console = (error.stdout or b"").decode("utf-8", "replace")
+        # 3. The result.
+        output = (job / "output").read_text("utf-8", "replace") if (job / "output").exists() else ""
+        if not (job / "code").exists():
+            panicked = "Kernel panic - not syncing" in console
+            reason = "the guest's kernel panicked" if panicked else f"the guest did not end within {timeout_s:g} s"
+            raise GuestError(f"{reason}\n{console[-4000:]}\n{output[-20000:]}")
+        return Result(output, {path.name: path.read_bytes() for path in (job / "results").iterdir() if path.is_file()})
 
 
-def _write_job(job: Path, command: Sequence[str], guest: Guest) -> None:
-    ignored = shutil.ignore_patterns("__pycache__", ".*")
-    for name in TREE:
-        if (ROOT / name).is_dir():
-            shutil.copytree(ROOT / name, job / "tree" / name, ignore=ignored)
-        else:
-            shutil.copy(ROOT / name, job / "tree" / name)
-    shutil.copy(Path(__file__).with_name("guest") / "job.sh", job / "start")
-    (job / "command").write_text(f"exec {shlex.join(command)}\n", "utf-8")
-    (job / "results").mkdir()
-    for name, data in guest.files.items():
-        (job / name).write_bytes(data)
-
-
-def _qemu(image: Image, job: Path, guest: Guest) -> list[str]:
+def _qemu(job: Path, systemd: bool, serial: Sequence[str]) -> list[str]:
     """Return QEMU's command line, without KVM: where it is nested in another machine, Debian's kernel may hang.
 
     AVX2 is off, since QEMU 7.2 emulates it wrongly: numpy's argsort returns a wrong order with it, or crashes. So is
     VAES, of which LLVM concludes that there is AVX2: what numba compiled ended with an illegal instruction.
     """
+    made = image()
     words = ["qemu-system-x86_64", "-accel", "tcg,thread=multi,tb-size=512", "-cpu", "max,-avx2,-vaes", "-smp", "2"]
-    words += ["-m", str(guest.memory_mb), "-nodefaults", "-nic", "none", "-display", "none", "-no-reboot"]
-    words += ["-kernel", str(image.kernel), "-initrd", str(image.initramfs), "-serial", "stdio"]
-    words += ["-drive", f"file={image.disk},format=raw,if=virtio,snapshot=on,cache=unsafe"]
-    words += ["-append", KERNEL_OPTIONS + (" start=/lib/systemd/systemd" if guest.systemd else "")]
+    words += ["-m", "2048", "-nodefaults", "-nic", "none", "-display", "none", "-no-reboot"]
+    words += ["-kernel", str(made / "vmlinux"), "-initrd", str(made / "initramfs.cpio"), "-serial", "stdio"]
+    words += ["-drive", f"file={made / 'root.ext4'},format=raw,if=virtio,snapshot=on,cache=unsafe"]
+    words += ["-append", KERNEL_OPTIONS + (" start=/lib/systemd/systemd" if systemd else "")]
     words += ["-virtfs", f"local,path={job},mount_tag=job,security_model=none"]
-    for port in guest.serial:
-        words += ["-serial", port]
-    return words
-
-
-def _emulate(words: list[str], timeout_s: float) -> str:
-    """Run the machine for at most timeout_s and return the output of its console."""
-    try:
-        done = subprocess.run(
-            words,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            timeout=timeout_s,
-            check=False,
-        )
-        return done.stdout.decode("utf-8", "replace")
-    except subprocess.TimeoutExpired as error:
-        return (error.stdout or b"").decode("utf-8", "replace")
-
-
-def _result(job: Path, console: str, elapsed_s: float) -> Result:
-    output = (job / "output").read_text("utf-8", "replace") if (job / "output").exists() else ""
-    if not (job / "code").exists():
-        reason = "the guest's kernel panicked" if PANIC in console else "the guest did not come to an end"
-        raise GuestError(f"{reason} after {elapsed_s:.0f} s\n{console[-4000:]}\n{output[-20000:]}")
-    files = {path.name: path.read_bytes() for path in (job / "results").iterdir() if path.is_file()}
-    return Result(int((job / "code").read_text("ascii")), output, console, files, elapsed_s)
+    return words + [word for port in serial for word in ("-serial", port)]

@@ -11,8 +11,8 @@ import select
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -25,9 +25,8 @@ from drivers.motors.simulated.simulated_line import SimulatedLine
 from omnid.runs.session import attached_rig
 from omnid.stages.geometry import with_rims
 from tests.contract.pty_motor import LONGEST_ABSENCE_S
-from tests.hardware.guest_report import names_in, passed, run_tests
-from tests.hardware.image import ROOT
-from tests.hardware.machine import Guest, Result
+from tests.hardware.image import ROOT, ImageUnavailableError, image
+from tests.hardware.machine import Result, names_in, run_tests
 
 pytestmark = pytest.mark.vm
 SAMPLE = ROOT / "omnid/sample/log.mcap"
@@ -35,37 +34,46 @@ STEP_S = 0.01
 
 
 class SimulatedBoard:
-    """A simulated controller at the other end of ttyS1; it reports its state for each line received from ttyS2."""
+    """A simulated controller at the other end of ttyS1; it reports its state for each line received from ttyS2.
+
+    A thread serves both within the block, also where no guest is connected.
+    """
 
     def __init__(self, folder: Path) -> None:
-        self.serial = tuple(f"unix:{folder / name}" for name in ("wheels", "questions"))
-        self._line = SimulatedLine()
-        self._fastest_mps = 0.0  # highest commanded speed of a wheel since the last report
-        self._listeners = [_listener(folder / name) for name in ("wheels", "questions")]
+        self._line, self._fastest_mps = SimulatedLine(), 0.0  # highest commanded speed of a wheel since the last report
+        self._listeners: dict[socket.socket, Callable[[bytes], bytes]] = {}
+        self.serial = list[str]()
+        for name, answer in (("wheels", self._receive), ("questions", self._report)):
+            listener = socket.socket(socket.AF_UNIX)
+            listener.bind(str(folder / name))
+            listener.listen()
+            self._listeners[listener] = answer
+            self.serial.append(f"unix:{folder / name}")
         self._halt = threading.Event()
         self._thread = threading.Thread(target=self._serve, daemon=True)
-        self._thread.start()
 
-    def close(self) -> None:
-        """End the thread, also where no guest was connected."""
+    def __enter__(self) -> SimulatedBoard:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
         self._halt.set()
         self._thread.join()
-        for listener in self._listeners:
-            listener.close()
 
     def _serve(self) -> None:
         answers: dict[socket.socket, Callable[[bytes], bytes]] = {}
         last_s = time.monotonic()
-        listeners = dict(zip(self._listeners, (self._receive, self._report), strict=True))
         with ExitStack() as ends:
+            for listener in self._listeners:
+                ends.enter_context(listener)
             while not self._halt.is_set():
-                readable, _, _ = select.select([*listeners, *answers], [], [], STEP_S)
+                readable, _, _ = select.select([*self._listeners, *answers], [], [], STEP_S)
                 now_s = time.monotonic()
                 self._line.base.advance(min(now_s - last_s, LONGEST_ABSENCE_S))
                 last_s = now_s
                 for port in readable:
-                    if port in listeners:
-                        answers[ends.enter_context(port.accept()[0])] = listeners.pop(port)
+                    if port in self._listeners:
+                        answers[ends.enter_context(port.accept()[0])] = self._listeners[port]
                     elif data := port.recv(4096):
                         port.sendall(answers[port](data))
                     else:
@@ -90,23 +98,6 @@ class SimulatedBoard:
         return json.dumps(state).encode() + b"\n"
 
 
-def _listener(path: Path) -> socket.socket:
-    listener = socket.socket(socket.AF_UNIX)
-    listener.bind(str(path))
-    listener.listen()
-    return listener
-
-
-@contextmanager
-def simulated_board(folder: Path) -> Iterator[SimulatedBoard]:
-    """Yield a simulated board and close it."""
-    made = SimulatedBoard(folder)
-    try:
-        yield made
-    finally:
-        made.close()
-
-
 def rig_of_the_sample() -> bytes:
     """Return the rig of the sample log with the rims of the mirrors, which a daemon detects in the first images."""
     reader = LogReader(SAMPLE)
@@ -119,23 +110,32 @@ def rig_of_the_sample() -> bytes:
     return rig_toml(with_rims(rig, frames)).encode()
 
 
+@pytest.fixture(scope="module", autouse=True)
+def guest_image() -> None:
+    """Build the image if necessary; without QEMU the tests are skipped with a message that names the packages."""
+    try:
+        image()
+    except ImageUnavailableError as reason:
+        pytest.skip(str(reason))
+
+
 @pytest.fixture(scope="module")
 def daemon(tmp_path_factory: pytest.TempPathFactory) -> Result:
-    with simulated_board(tmp_path_factory.mktemp("ports")) as base:
-        guest = Guest(systemd=True, files={"rig.toml": rig_of_the_sample()}, serial=base.serial, timeout_s=2400)
-        return run_tests("daemon.py", guest)
+    files = {"rig.toml": rig_of_the_sample()}
+    with SimulatedBoard(tmp_path_factory.mktemp("ports")) as base:
+        return run_tests("daemon.py", 2400, systemd=True, files=files, serial=base.serial)
 
 
 @pytest.fixture(scope="module")
 def cameras() -> Result:
-    return run_tests("cameras.py", Guest(timeout_s=400))
+    return run_tests("cameras.py", 400)
 
 
 @pytest.mark.parametrize(
     ("script", "name"), [(script, name) for script in ("cameras", "daemon") for name in names_in(f"{script}.py")]
 )
 def test_in_the_guest(request: pytest.FixtureRequest, script: str, name: str) -> None:
-    passed(request.getfixturevalue(script), name)
+    request.getfixturevalue(script).require_passed(name)
 
 
 def test_the_recording_of_a_killed_daemon_is_read(daemon: Result, tmp_path: Path) -> None:

@@ -1,7 +1,8 @@
-"""Settings: every value is checked, every error names the dotted path, a dump reads back as the same object."""
+"""Settings: every value is checked, errors name the dotted path, dumps read back; the shipped file is the default."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -9,8 +10,9 @@ from typing import Annotated, Literal
 import pytest
 from msgspec import Meta
 
+from omnid.config import FIRST_SETTINGS, Config, load_config, unused_settings
 from omnid.errors import OmnidError
-from omnid.settings import dump, dump_minimal, load, parse
+from omnid.settings import dump, dump_minimal, load, parse, paths_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +37,7 @@ class Motor:
 
 
 @dataclass(frozen=True, slots=True)
-class Config:
+class Sample:
     robot: Annotated[str, "name on the bus"] = "robot"
     offset_m: Annotated[tuple[float, float, float], "where the rig is, m"] = (0.0, 1e-5, 1e16)
     topics: Annotated[tuple[str, ...], "topics to record"] = ()
@@ -52,15 +54,15 @@ def written(tmp_path: Path, text: str | bytes) -> Path:
 def refusal(text: str | bytes, *overrides: str) -> str:
     data = text if isinstance(text, bytes) else text.encode()
     with pytest.raises(OmnidError) as caught:
-        parse(Config, data, origin="omnid.toml", overrides=overrides)
+        parse(Sample, data, origin="omnid.toml", overrides=overrides)
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 400
     return str(caught.value)
 
 
 def test_a_file_changes_what_it_names_and_nothing_else(tmp_path: Path) -> None:
-    assert load(Config) == Config()
-    settings = load(Config, written(tmp_path, "robot = 'r2'\n[stereo]\nratio = 1\n[motor.serial]\nport = 'x'"))
-    assert settings == Config(robot="r2", stereo=Stereo(ratio=1.0), motor=Motor(serial=Serial("x")))
+    assert load(Sample) == Sample()
+    settings = load(Sample, written(tmp_path, "robot = 'r2'\n[stereo]\nratio = 1\n[motor.serial]\nport = 'x'"))
+    assert settings == Sample(robot="r2", stereo=Stereo(ratio=1.0), motor=Motor(serial=Serial("x")))
     assert isinstance(settings.stereo.ratio, float)
 
 
@@ -69,13 +71,13 @@ def test_a_file_changes_what_it_names_and_nothing_else(tmp_path: Path) -> None:
     [("robot=seven", "seven"), ("robot=7", "7"), ("robot='7'", "7"), ("robot=true", "true"), ("robot=a=b", "a=b")],
 )
 def test_an_override_needs_no_quotes(override: str, value: str) -> None:
-    assert load(Config, None, [override]).robot == value
-    assert load(Config, None, ["stereo.method=census"]).stereo.method == "census"
+    assert load(Sample, None, [override]).robot == value
+    assert load(Sample, None, ["stereo.method=census"]).stereo.method == "census"
 
 
 def test_overrides_win_over_the_file_and_later_ones_over_earlier(tmp_path: Path) -> None:
     path = written(tmp_path, "stereo.window_px = 5")
-    assert load(Config, path, ["stereo.window_px=7", " stereo.window_px = 9 "]).stereo.window_px == 9
+    assert load(Sample, path, ["stereo.window_px=7", " stereo.window_px = 9 "]).stereo.window_px == 9
 
 
 @pytest.mark.parametrize(
@@ -147,7 +149,7 @@ def test_refuses_a_wrong_override(override: str, expected: str) -> None:
 def test_names_a_file_that_cannot_be_read(tmp_path: Path) -> None:
     for path in (tmp_path / "missing.toml", tmp_path, Path("a\0b"), written(tmp_path, b"#" * (1 << 20) + b"#")):
         with pytest.raises(OmnidError, match=r"settings file .*(omnid|missing|test_|a\\x00b)"):
-            load(Config, path)
+            load(Sample, path)
 
 
 @pytest.mark.parametrize(
@@ -159,13 +161,13 @@ def test_names_a_file_that_cannot_be_read(tmp_path: Path) -> None:
     ],
 )
 def test_a_dump_reads_back_as_the_same_object(tmp_path: Path, overrides: list[str]) -> None:
-    settings = load(Config, None, overrides)
+    settings = load(Sample, None, overrides)
     for text in (dump(settings), dump_minimal(settings, ("robot", "stereo.subpixel"))):
-        assert load(Config, written(tmp_path, text)) == settings
+        assert load(Sample, written(tmp_path, text)) == settings
 
 
 def test_a_dump_has_each_key_with_its_range_and_default_and_a_minimal_one_what_differs() -> None:
-    settings = load(Config, None, ["stereo.window_px=5"])
+    settings = load(Sample, None, ["stereo.window_px=5"])
     text = dump(settings)
     assert "[stereo]\n# side of the matching window, px\n# an integer from 3 to 31; default 11\nwindow_px = 5\n" in text
     assert "# a list of 3 numbers; default [0.0, 1e-05, 1e+16]\n" in text
@@ -173,3 +175,63 @@ def test_a_dump_has_each_key_with_its_range_and_default_and_a_minimal_one_what_d
     assert "# a list of integers of at least 1; default [115200, 9600]\n" in text
     assert dump_minimal(settings, ()) == "[stereo]\n# side of the matching window, px\nwindow_px = 5\n"
     assert "# whether to refine\n# subpixel = true\n" in dump_minimal(settings, ("stereo.subpixel",))
+
+
+SHIPPED = Path(__file__).parents[2] / "systemd" / "omnid.toml"
+
+
+def test_the_shipped_configuration_is_the_default() -> None:
+    assert load_config(SHIPPED) == Config()
+    assert SHIPPED.read_text() == dump_minimal(Config(), FIRST_SETTINGS), "run `omnid config --minimal`"
+    assert set(FIRST_SETTINGS) <= set(paths_of(Config))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "matching"),
+    [
+        ([], "auto"),
+        (["odometry.method=paper"], "enhanced"),
+        (["odometry.method=paper", "stereo.matching.method=sad"], "sad"),
+        (["odometry.method=paper", "stereo.matching.method=enhanced"], "enhanced"),
+    ],
+)
+def test_the_papers_method_works_on_the_enhanced_sad_unless_the_matching_is_set(
+    overrides: list[str], matching: str
+) -> None:
+    assert load_config(None, overrides).stereo_settings().matching.method == matching
+
+
+@pytest.mark.parametrize(
+    ("key", "proposed"),
+    [
+        ("controller.limits.velocity_mpss", "controller.limits.velocity_mps"),
+        ("controller.velocity_mps", "controller.limits.velocity_mps"),
+        ("mapping.voxel_mm", "mapping.voxel_m"),
+    ],
+)
+def test_a_wrong_key_is_answered_by_a_similar_one(key: str, proposed: str) -> None:
+    with pytest.raises(OmnidError, match=re.escape(f"unknown key {key}: did you mean {proposed}?")):
+        load_config(None, [f"{key}=1"])
+
+
+@pytest.mark.parametrize(
+    ("command", "override"),
+    [
+        ("run", " controller.setpoint . velocity_mps=0.0"),
+        ("run", "log.rate_hz=8"),
+        ("replay", "cameras.width_px=640"),
+        ("replay", "live.cloud_s=1"),
+        ("replay", "record.enabled=true"),
+    ],
+)
+def test_refuses_an_override_that_the_command_ignores(command: str, override: str) -> None:
+    config = load_config(None, [override])
+    with pytest.raises(OmnidError, match=rf"^override '.*': `omnid {command}` does not use \S+: leave it out$"):
+        unused_settings(config, command, [override])
+
+
+def test_the_daemon_refuses_a_setpoint_in_its_configuration() -> None:
+    config = load_config(None, ["controller.setpoint.velocity_mps=0.3"])
+    with pytest.raises(OmnidError, match="velocity_mps is set, but `omnid run` drives by the setpoints"):
+        unused_settings(config, "run", [])
+    assert unused_settings(config, "replay", ["controller.setpoint.velocity_mps=0.3"]) == []

@@ -5,8 +5,7 @@ from omnid.simulation.rendering.sensor import MountedSensor, Sensor
 from omnid.simulation.rendering.shapes import box, posters
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
 from tests.simulation.builders import corridor, room, wall
-from tests.simulation.images import render
-from tests.simulation.logs import camchain, tum, write_log
+from tests.simulation.logs import camchain, render, tum, write_log
 from tests.simulation.recipes import RECIPES, SimulatedRun, build
 from tests.simulation.rigs import make_rig
 

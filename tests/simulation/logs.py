@@ -1,9 +1,4 @@
-"""Writer of a rendered run as a log with exact ground truth: log.mcap, camchain.yaml, rig.toml, truth.txt.
-
-Times of exposure of a pair's two images: the upper exposure begins at lower exposure + skew + stamp offset; its stamp
-is lower stamp + skew, so the offset is an error that no stamp shows. A camera's stamp is the exposure of its first
-image row; row r is exposed r * line time later.
-"""
+"""Rendered logs with their truth: images in whole grey levels, samples of wheels and gyro, MCAP."""
 
 from __future__ import annotations
 
@@ -26,8 +21,13 @@ from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.sensor import Floats, MountedSensor, Sensor
 from omnid.simulation.rendering.surfaces import Scene
 from tests.simulation.disturbances import Disturbance, DisturbedCamera, light_of
-from tests.simulation.mirrors import MirrorCamera
-from tests.simulation.rigs import nominal_rig
+from tests.simulation.rigs import MirrorCamera, nominal_rig
+
+
+def render(scene: Scene, mounted: MountedCamera, T_world_rig: Array, supersample: int = 2) -> NDArray[np.uint8]:
+    """Return the image (H, W) uint8 of the camera on a rig at T_world_rig; 0 outside the mask."""
+    return np.clip(np.rint(render_grey(scene, mounted, T_world_rig, supersample)), 0, 255).astype(np.uint8)
+
 
 PERIOD_NS = 100_000_000
 # Two steps whose rotations differ by more are not averaged: the smaller one is the motion during the exposures.

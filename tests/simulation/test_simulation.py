@@ -22,9 +22,8 @@ from omnid.simulation.rendering.surfaces import Rectangle, Scene
 from tests.simulation import RECIPES, build, corridor, make_rig, render, render_grey, write_log
 from tests.simulation.disturbances import DISTURBANCES
 from tests.simulation.logs import Readout, body_twists
-from tests.simulation.mirrors import MirrorCamera
 from tests.simulation.photographs import with_photographs
-from tests.simulation.rigs import nominal_rig, with_real_mirrors
+from tests.simulation.rigs import MirrorCamera, nominal_rig, with_real_mirrors
 
 SIZE = 96
 SCHEMA = "sensor_msgs/msg/CompressedImage"

@@ -11,8 +11,7 @@ from calib.models.camera import Mask
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera
 from omnid.simulation.rendering.sensor import Sensor
-from tests.simulation.april_grids import frame_board, print_of, render_april_grid
-from tests.simulation.boards import board_poses_around_camera
+from tests.simulation.boards import board_poses_around_camera, frame_board, print_of, render_april_grid
 
 MASK = Mask((241.3, 237.8), 40.0, 232.0)
 MOUNTED = MountedCamera(UnifiedCamera(0.9, (-150.0, 151.0), MASK.center, (480, 480)), np.eye(4), MASK)

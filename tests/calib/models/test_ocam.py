@@ -15,7 +15,7 @@ from calib.models.camera import Array
 from calib.models.ocam import OcamCamera, View
 from calib.models.wavefront import offsets
 from calib.rig import Rig
-from tests.simulation.mirrors import MirrorCamera
+from tests.simulation.rigs import MirrorCamera
 
 KEYS = ("ocam_std", "ocam_subpix")
 

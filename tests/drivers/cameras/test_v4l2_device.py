@@ -1,15 +1,34 @@
-"""Cameras found in trees with the layout of /sys and /dev, the choice of a format, and errors with advice."""
+"""V4L2 devices: the kernel structures, found cameras, the choice of a format, controls, and errors with advice."""
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import os
+import runpy
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from drivers.cameras import v4l2_ioctl
 from drivers.cameras import v4l2_ioctl as v4l2
+from drivers.cameras.camera_state import (
+    CameraExposure,
+    ExposureRequest,
+    ExposureSetting,
+)
+from drivers.cameras.v4l2_controls import (
+    AUTO_EXPOSURE,
+    AUTO_GAIN,
+    EXPOSURE,
+    EXPOSURE_MAY_SLOW,
+    GAIN,
+    ExposureControls,
+    apply_controls,
+    list_controls,
+    plan_controls,
+)
 from drivers.cameras.v4l2_device import (
     capture_devices,
     device_error,
@@ -20,7 +39,42 @@ from drivers.cameras.v4l2_settings import V4l2Settings
 from drivers.errors import DriverError
 from omnid.cli import main
 from omnid.commands import machine
-from tests.drivers.cameras.fake_camera import FakeCamera
+from tests.drivers.cameras.fake_camera import APERTURE_PRIORITY, FakeCamera
+
+SIZES = {  # struct v4l2_...: (64 bits, 32 bits)
+    "Capability": (104, 104), "PixelFormat": (48, 48), "Format": (208, 204), "StreamParameters": (204, 204),
+    "BufferRequest": (20, 20), "V4l2Buffer": (88, 68), "QueryControl": (68, 68), "QueryMenu": (44, 44),
+    "V4l2Control": (8, 8),
+}  # fmt: skip
+OFFSETS = {
+    ("V4l2Buffer", "flags"): (12, 12), ("V4l2Buffer", "timestamp"): (24, 20), ("V4l2Buffer", "sequence"): (56, 44),
+    ("V4l2Buffer", "m"): (64, 52), ("V4l2Buffer", "length"): (72, 56), ("Format", "fmt"): (8, 4),
+    ("StreamParameters", "capability"): (4, 4), ("StreamParameters", "timeperframe"): (12, 12),
+}  # fmt: skip
+REQUESTS = {
+    "QUERYCAP": (0x80685600, 0x80685600), "G_FMT": (0xC0D05604, 0xC0CC5604),
+    "S_FMT": (0xC0D05605, 0xC0CC5605), "REQBUFS": (0xC0145608, 0xC0145608), "QUERYBUF": (0xC0585609, 0xC0445609),
+    "QBUF": (0xC058560F, 0xC044560F), "DQBUF": (0xC0585611, 0xC0445611), "STREAMON": (0x40045612, 0x40045612),
+    "STREAMOFF": (0x40045613, 0x40045613), "G_PARM": (0xC0CC5615, 0xC0CC5615), "S_PARM": (0xC0CC5616, 0xC0CC5616),
+    "G_CTRL": (0xC008561B, 0xC008561B), "S_CTRL": (0xC008561C, 0xC008561C), "QUERYCTRL": (0xC0445624, 0xC0445624),
+    "QUERYMENU": (0xC02C5625, 0xC02C5625),
+}  # fmt: skip
+
+
+@pytest.fixture(params=[0, 1], ids=["64 bits", "32 bits"])
+def abi(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> tuple[dict[str, Any], int]:
+    """The module's names where a long has 64 or 32 bits, and the index of that case."""
+    monkeypatch.setattr(ctypes, "c_long", (ctypes.c_int64, ctypes.c_int32)[request.param])
+    return runpy.run_path(v4l2_ioctl.__file__), request.param
+
+
+def test_structures_and_requests_are_the_kernels(abi: tuple[dict[str, Any], int]) -> None:
+    names, bits = abi
+    assert {name: ctypes.sizeof(names[name]) for name in SIZES} == {name: sizes[bits] for name, sizes in SIZES.items()}
+    found = {(struct, member): getattr(names[struct], member).offset for struct, member in OFFSETS}
+    assert found == {member: offsets[bits] for member, offsets in OFFSETS.items()}
+    assert {name: names[name] for name in REQUESTS} == {name: numbers[bits] for name, numbers in REQUESTS.items()}
+
 
 PORT = "pci-0000:00:14.0-usb-0:1:1.0"
 
@@ -165,3 +219,128 @@ def test_refuses_settings_that_contradict_each_other_in_one_line(device: str, fi
     with pytest.raises(DriverError, match=rf"^camera {device}: .*give ") as caught:
         V4l2Settings(device, **fields)
     assert "\n" not in str(caught.value)
+
+
+FD = 1000
+
+
+@pytest.fixture
+def camera(monkeypatch: pytest.MonkeyPatch) -> FakeCamera:
+    made = FakeCamera()
+    monkeypatch.setattr(v4l2, "call", made.call)
+    return made
+
+
+def plan(**fields: Any) -> list[tuple[str, int]]:
+    settings = V4l2Settings("/dev/omnid/lower", **fields)
+    return [(control.name, value) for control, value in plan_controls(settings, list_controls(FD))]
+
+
+@pytest.mark.parametrize(
+    ("fields", "expected"),
+    [
+        ({}, []),
+        (
+            {"exposure_us": 10_040, "gain": 15},
+            [
+                ("auto_exposure", 1),
+                ("exposure_dynamic_framerate", 0),
+                ("gain_automatic", 0),
+                ("exposure_time_absolute", 100),
+                ("gain", 15),
+            ],
+        ),
+        ({"auto_exposure": "on"}, [("auto_exposure", 3), ("exposure_dynamic_framerate", 0)]),
+        ({"auto_exposure": "rig"}, [("auto_exposure", 3), ("exposure_dynamic_framerate", 0)]),
+        ({"controls": ("contrast = -3",)}, [("contrast", -3)]),
+    ],
+)
+def test_automatic_modes_come_before_the_values_that_they_govern(
+    camera: FakeCamera, fields: dict[str, Any], expected: list[tuple[str, int]]
+) -> None:
+    assert plan(**fields) == expected
+
+
+def test_what_a_camera_lacks_is_needed_only_where_it_is_asked_for(camera: FakeCamera) -> None:
+    camera.menu = (0, 1, 3)
+    assert plan(auto_exposure="on")[0] == ("auto_exposure", 0)
+    del camera.controls[AUTO_GAIN], camera.controls[AUTO_EXPOSURE], camera.controls[EXPOSURE_MAY_SLOW]
+    assert plan(gain=15) == [("gain", 15)] and plan(auto_exposure="rig") == []
+    for fields, name in (({"auto_gain": "off"}, "automatic gain"), ({"power_line": "50"}, "power line frequency")):
+        with pytest.raises(DriverError, match=f"no control of its {name}"):
+            plan(**fields)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"gain": 300}, "gain: 300 was requested, it accepts 0 to 255 in steps of 5"),
+        ({"gain": 13}, "steps of 5"),
+        ({"exposure_us": 40}, "exposure_time_absolute: 0 was requested, it accepts 3 to 2047"),
+        ({"controls": ("auto_exposure=2",)}, "it accepts 1, 3"),
+        ({"controls": ("contrast=65",)}, "-64 to 64"),
+        ({"controls": ("sharpness=1",)}, "no control 'sharpness'. It has: contrast, gain_automatic"),
+    ],
+)
+def test_refuses_what_the_camera_does_not_accept(camera: FakeCamera, fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(DriverError, match=message) as caught:
+        plan(**fields)
+    assert "\n" not in str(caught.value)
+
+
+def test_controls_are_set_in_order_and_read_back(camera: FakeCamera, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = V4l2Settings("/dev/x", auto_exposure="rig", exposure_us=5000)
+    assert not settings.is_regulated and V4l2Settings("/dev/x", auto_exposure="rig").is_regulated
+    apply_controls(FD, plan_controls(settings, list_controls(FD)))
+    assert camera.values[AUTO_EXPOSURE] == 1 and camera.values[EXPOSURE] == 50
+    contrast = plan_controls(V4l2Settings("/dev/x", controls=("contrast=3",)), list_controls(FD))
+    monkeypatch.setattr(camera, "_set_control", lambda control: None)
+    with pytest.raises(DriverError, match="contrast: 3 was set, the device stays at 1"):
+        apply_controls(FD, contrast)
+    camera.failing = errno.EIO
+    with pytest.raises(DriverError, match=r"contrast: the device refused 3 \(Input/output error\)"):
+        apply_controls(FD, contrast)
+    camera.failing = errno.ENODEV
+    with pytest.raises(OSError, match="No such device"):
+        apply_controls(FD, contrast)
+
+
+def exposure_of(controls: ExposureControls) -> CameraExposure:
+    assert controls.ranges is not None
+    return CameraExposure(controls.ranges, in_force=controls.read())
+
+
+def test_takes_over_sets_once_when_due_and_gives_all_back(camera: FakeCamera) -> None:
+    before, controls = dict(camera.values), ExposureControls(FD)
+    exposure = exposure_of(controls)
+    controls.follow(exposure, 500)
+    exposure.request = ExposureRequest(ExposureSetting(8000, 10), after_ns=1000)
+    controls.follow(exposure, 999)
+    assert camera.written == []
+    for stamp_ns in (1000, 2000):
+        controls.follow(exposure, stamp_ns)
+        assert camera.written == [(AUTO_EXPOSURE, 1), (AUTO_GAIN, 0), (EXPOSURE, 80), (GAIN, 10)]
+        assert exposure.in_force == ExposureSetting(8000, 10)
+    exposure.request = ExposureRequest(ExposureSetting(4000, 5), after_ns=0)
+    controls.follow(exposure, 3000)
+    assert camera.written[4:] == [(EXPOSURE, 40), (GAIN, 5)]
+    controls.release()
+    controls.release()
+    assert camera.written[6:] == [(GAIN, 65), (AUTO_GAIN, 1), (AUTO_EXPOSURE, APERTURE_PRIORITY)]
+    assert {**camera.values, EXPOSURE: before[EXPOSURE]} == before
+
+
+def test_a_refusal_is_kept_and_ends_the_requests_a_lost_device_raises(camera: FakeCamera) -> None:
+    controls = ExposureControls(FD)
+    exposure = exposure_of(controls)
+    exposure.request, camera.failing = ExposureRequest(ExposureSetting(8000, 1), after_ns=0), errno.ERANGE
+    controls.follow(exposure, 1)
+    assert exposure.problem == "it refused an exposure (Numerical result out of range)"
+    camera.failing = 0
+    exposure.request = ExposureRequest(ExposureSetting(8000, 2), after_ns=0)
+    controls.follow(exposure, 2)
+    assert camera.values[GAIN] == 65
+    lost = exposure_of(ExposureControls(FD))
+    lost.request, camera.failing = exposure.request, errno.ENODEV
+    with pytest.raises(OSError, match="No such device"):
+        ExposureControls(FD).follow(lost, 1)

@@ -268,20 +268,6 @@ def test_both_cameras_are_unplugged_and_reconnected(vivid: None) -> None:
     upper.require_events("lost", "back")
 
 
-def test_refuses_another_camera_with_the_old_number(vivid: None) -> None:
-    node = os.path.realpath(LOWER)
-    with CameraReader(node) as watched:
-        watched.more(3)
-        os.rename(node, "/dev/hidden")
-        os.symlink(os.path.realpath(UPPER), node)
-        control("/dev/hidden", FATAL_ERROR, 1)
-        until(lambda: "use a persistent name" in watched.state.problem)
-        assert watched.state.status == "lost"
-        os.rename("/dev/hidden", node)
-        watched.more(3)
-    watched.require_events("lost", "back")
-
-
 def test_reopens_a_camera_that_sends_no_images(loopback: None) -> None:
     device, image = DEVICES[0], bytes(SIZE[0] * SIZE[1])
     with Writer(device, image) as writer:
@@ -332,13 +318,6 @@ def test_every_raw_format_shows_the_same_luma(vivid: None) -> None:
     for name in ("UYVY", "NV12"):
         np.testing.assert_allclose(images[name].astype(int), images["YUYV"], atol=3)
     assert np.corrcoef(images["GREY"].ravel(), images["YUYV"].ravel())[0, 1] > 0.95
-
-
-def test_controls_are_in_force_before_the_first_image(vivid: None) -> None:
-    assert control(LOWER, GAIN) != 33
-    with CameraReader(gain=33, controls=(*STILL, "brightness=40", "hue=-7")):
-        listed = run("v4l2-ctl", "-d", LOWER, "-C", "gain,gain_automatic,brightness,hue")
-    assert listed.splitlines() == ["gain: 33", "gain_automatic: 0", "brightness: 40", "hue: -7"]
 
 
 def test_a_device_has_one_user(vivid: None) -> None:

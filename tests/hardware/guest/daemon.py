@@ -25,8 +25,18 @@ from calib import se3
 from drivers.cameras.log_camera import LogImages
 from tests.hardware.guest.loopback import load_loopback
 from tests.hardware.guest.probe import PORT, REPORT
-from tests.hardware.guest.sample_log import SAMPLE, GuestOperator, SampleLog
-from tests.hardware.guest.unit import DROP_INS, SYSTEMD, journal, restarted, run, show, until
+from tests.hardware.guest.surroundings import (
+    DROP_INS,
+    SAMPLE,
+    SYSTEMD,
+    GuestOperator,
+    SampleLog,
+    journal,
+    restarted,
+    run,
+    show,
+    until,
+)
 
 RESULTS = Path("/mnt/job/results")
 RECORDINGS = Path("/var/lib/omnid/recordings")
@@ -249,20 +259,17 @@ def test_a_killed_daemon_stops_the_wheels_until_it_is_back(operator: GuestOperat
     until(lambda: wheels.commanded_mps == 0.0)
     after = wheels.state()
     assert after["expiries"] == before["expiries"], "the base controller stopped them, long before the watchdog"
-    save_the_recording(killed_ns, killed_ns - operator.poses[-1].stamp_ns)
+    # The recording is for the host, which is faster.
+    (left,) = RECORDINGS.glob("*.part")
+    shutil.copy(left, RESULTS / "killed.mcap.part")
+    ages = {"killed_ns": killed_ns, "newest_age_ns": killed_ns - operator.poses[-1].stamp_ns}
+    (RESULTS / "killed.json").write_text(json.dumps(ages))
     until(lambda: int(show("MainPID")) not in (0, pid))
     assert wheels.state()["fastest_mps"] == 0.0
     restarted(pid)
     operator.more(3)
     until(lambda: wheels.commanded_mps > 0.25)
     assert wheels.state()["unsafe_resumes"] == 0
-
-
-def save_the_recording(killed_ns: int, newest_age_ns: int) -> None:
-    """Save the recording for the host, which is faster."""
-    (left,) = RECORDINGS.glob("*.part")
-    shutil.copy(left, RESULTS / "killed.mcap.part")
-    (RESULTS / "killed.json").write_text(json.dumps({"killed_ns": killed_ns, "newest_age_ns": newest_age_ns}))
 
 
 def test_restarts_a_daemon_that_stalls(operator: GuestOperator, wheels: Wheels) -> None:
@@ -299,18 +306,8 @@ def test_more_of_the_network_is_reached_where_that_is_allowed(operator: GuestOpe
 
 def test_records_a_log_from_the_cameras_alone(operator: GuestOperator, tmp_path: Path) -> None:
     """`omnid record` beside no daemon, ended as Ctrl-C does."""
-    run(
-        "timeout",
-        "--preserve-status",
-        "-s",
-        "INT",
-        "60",
-        "/opt/omnid/bin/omnid",
-        "record",
-        str(tmp_path / "boards"),
-        "--config",
-        "/etc/omnid/omnid.toml",
-    )
+    words = "timeout", "--preserve-status", "-s", "INT", "60", "/opt/omnid/bin/omnid", "record"
+    run(*words, str(tmp_path / "boards"), "--config", "/etc/omnid/omnid.toml")
     (log,) = (tmp_path / "boards").glob("*.mcap")
     assert "rig.toml" in run("/opt/omnid/bin/omnid", "log", "info", str(log))
     images = LogImages.load(log)

@@ -21,7 +21,7 @@ from omnid.calibration.images import Images, PairedImages
 from omnid.calibration.rig import accuracy_warnings
 from omnid.calibration.rig_report import angle_lines, angle_rows, rig_report_html
 from omnid.errors import OmnidError
-from tests.simulation.april_grids import print_of
+from tests.simulation.boards import print_of
 
 BOARD, SIZE = Board(9, 6, 0.025), (640, 480)
 LENS = OcamCamera((-230.0, 0.0, 1.5e-3, -6e-7, 1.6e-9), (238.0, 321.0), (1.0, 0.0, 0.0), SIZE, "direct")

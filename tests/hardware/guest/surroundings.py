@@ -1,10 +1,13 @@
-"""The surroundings of the daemon in the guest: images for its cameras, and an operator who drives."""
+"""The surroundings of the daemon in the guest: its unit, images for its cameras, and an operator who drives."""
 
 from __future__ import annotations
 
 import bisect
+import json
+import subprocess
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,12 +16,43 @@ from drivers.frame import Camera
 from omnid.client import Diagnostics, Pose, Robot
 from omnid.transport.codec import decode_diagnostics, decode_pose
 from tests.hardware.guest.loopback import DEVICES, Loopback
-from tests.hardware.guest.unit import until
 
+SYSTEMD = Path("/opt/omnid/systemd")
+DROP_INS = Path("/etc/systemd/system/omnid.service.d")
+LIMIT_S = 400.0  # The clock of a guest on a busy host may run several times too fast.
 SAMPLE = Path("/opt/omnid/omnid/sample")
 SIZE = 512, 512
 REPEAT_S = 0.5  # period of an image that is repeated
 CAMERAS: tuple[Camera, ...] = ("lower", "upper")
+
+
+def run(*command: str) -> str:
+    done = subprocess.run(command, capture_output=True, text=True)
+    journal = ("journalctl", "-u", "omnid", "-n", "40")  # why a unit does not start
+    assert done.returncode == 0, done.stderr + subprocess.run(journal, capture_output=True, text=True).stdout
+    return done.stdout.strip()
+
+
+def show(what: str) -> str:
+    return run("systemctl", "show", "omnid", "-p", what, "--value")
+
+
+def until(what: Callable[[], object]) -> None:
+    end_s = time.monotonic() + LIMIT_S
+    while not what():
+        assert time.monotonic() < end_s, run("journalctl", "-u", "omnid", "--no-pager", "-n", "60")
+        time.sleep(0.3)
+
+
+def restarted(pid: int) -> None:
+    """Wait until another process is the daemon."""
+    until(lambda: int(show("MainPID")) not in (0, pid) and show("ActiveState") == "active")
+
+
+def journal() -> list[tuple[int, str]]:
+    """Return priority and text of all lines in the journal of the unit."""
+    lines = run("journalctl", "-u", "omnid", "--no-pager", "-o", "json").splitlines()
+    return [(int(entry["PRIORITY"]), entry["MESSAGE"]) for entry in map(json.loads, lines)]
 
 
 class Shown(NamedTuple):
