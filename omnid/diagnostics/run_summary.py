@@ -7,7 +7,7 @@ import math
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from textwrap import wrap
 from typing import Any, Final
@@ -89,34 +89,17 @@ def summary_entries(counters: RunCounters, *, verbose: bool = True) -> dict[str,
 
     verbose: all of them, zeros too; else what everybody wants to know: what was lost, and last the length and states.
     """
-    poses, resets, motor = counters.poses, counters.resets, ""
-    drops = {name: count for name, count in counters.drops.items() if count or verbose}
-    states = {state: count for state, count in counters.states.items() if count or verbose}
-    if counters.motor:
-        motor = "{commands} commands sent, {errors} errors, {stops} stops".format_map(counters.motor)
-    length = {"length": f"{counters.length_m:.4f} m"}
-    shared = {"states": ", ".join(f"{state} {count / (poses or 1):.1%}" for state, count in states.items())}
-    if verbose:
-        found = {
-            "pairs": str(counters.pairs),
-            "poses": str(poses),
-            **length,
-            **shared,
-            "resets": str(resets),
-            "drops": _listed(drops),
-            "map": _listed(counters.map),
-            "places": _listed(counters.places),
-            "motor": motor,
-        }
-    else:
-        found = {
-            "poses": f"{poses} of {counters.pairs} pairs of images",
-            "lost": _listed(drops),
-            "resets": f"{resets}, after gaps in which the motion is unknown" if resets else "",
-            "motor": motor,
-            **length,
-            **shared,
-        }
+    poses, resets = counters.poses, counters.resets
+    drops = _listed({name: count for name, count in counters.drops.items() if count or verbose})
+    states = ((state, count / (poses or 1)) for state, count in counters.states.items() if count or verbose)
+    motor = "{commands} commands sent, {errors} errors, {stops} stops".format_map(counters.motor or Counter())
+    way = {"length": f"{counters.length_m:.4f} m", "states": ", ".join(f"{name} {share:.1%}" for name, share in states)}
+    found = {"pairs": str(counters.pairs), "poses": str(poses), **way, "resets": str(resets), "drops": drops}
+    found |= {"map": _listed(counters.map), "places": _listed(counters.places)}
+    if not verbose:
+        gaps = f"{resets}, after gaps in which the motion is unknown" if resets else ""
+        found = {"poses": f"{poses} of {counters.pairs} pairs of images", "lost": drops, "resets": gaps}
+    found |= {"motor": motor if counters.motor else ""} | ({} if verbose else way)
     return {name: text for name, text in found.items() if text or name == "states"}
 
 
@@ -178,77 +161,64 @@ class Progress:
             HANDLER.show(line) if self._is_terminal else log(logging.INFO, line)
 
 
-# Warnings about the input of a run over a log: a condition on its totals, and words with keys of them in braces.
-WARNINGS: Final[tuple[tuple[Callable[[Mapping[str, Any]], object], str], ...]] = (
-    (lambda s: s["_fault"], "{broken} images could not be decoded; the first: {_fault}"),
-    (
-        lambda s: not s["pairs"] and math.isnan(s["closest_miss_ms"]),
-        "no pair of images: one camera or both have none, see the drops below",
-    ),
-    (
-        lambda s: not s["pairs"] and not math.isnan(s["closest_miss_ms"]),
-        "no pair of images: the stamps of the two cameras are at least {closest_miss_ms:.3f} ms apart, "
-        "pair.tolerance_ms is {tolerance_ms:g}: increase it, or correct the clocks of the cameras",
-    ),
-    (
-        lambda s: s["pairs"] and min(s["unpaired_lower"], s["unpaired_upper"]) > s["pairs"],
-        "most images of both cameras found no partner: the closest ones are {closest_miss_ms:.3f} ms apart, "
-        "pair.tolerance_ms is {tolerance_ms:g}; if no images are missing, synchronise the cameras",
-    ),
-    *(
-        (
-            lambda s, camera=camera: s[f"_frozen_{camera}"] >= FROZEN_IMAGES,
-            f"the {camera} camera was frozen: {{repeated_{camera}}} of its images had all pixels as before, "
-            f"{{_frozen_{camera}}} in a row; {{of_repeated}}",
+def input_warnings(pairing: Synchronise, rig: RigHealth, statistics: RunStatistics, config: Config) -> Iterator[str]:
+    """Yield one line for each problem of the input: of images and stamps, of the rig, and that odometry has met."""
+    stats: dict[str, Any] = pairing.stats()
+    poses, states = statistics.poses, statistics.states
+    lost, notable = states[TrackingState.LOST], NOTABLE_SHARE * poses
+    unsure = lost + states[TrackingState.DEGRADED]
+    tolerance = f"pair.tolerance_ms is {stats['tolerance_ms']:g}"
+    closest_ms = f"{stats['closest_miss_ms']:.3f} ms apart"
+    # 1. Images and their stamps.
+    if stats["_fault"]:
+        yield f"{stats['broken']} images could not be decoded; the first: {stats['_fault']}"
+    if not stats["pairs"] and math.isnan(stats["closest_miss_ms"]):
+        yield "no pair of images: one camera or both have none, see the drops below"
+    elif not stats["pairs"]:
+        yield (
+            f"no pair of images: the stamps of the two cameras are at least {closest_ms}, {tolerance}: increase it, or "
+            "correct the clocks of the cameras"
         )
-        for camera in CAMERAS
-    ),
-    (lambda s: s["rig"], "{rig}"),
-    (
-        lambda s: s["dark"] > s["poses"] * NOTABLE_SHARE,
-        "it was too dark in {dark} of {poses} pairs: the images have more noise than contrast; more light, a longer "
-        "exposure (cameras.exposure_us) or less gain",
-    ),
-    *(
-        (
-            lambda s, side=side: s[f"lost_{side}"] > s["poses"] * NOTABLE_SHARE,
-            f"a part of the {side} camera's image was frozen, dark, saturated or blurred in {{lost_{side}}} of "
-            "{poses} pairs: it was not used; clean the mirror, check the camera and its driver",
+    elif min(stats["unpaired_lower"], stats["unpaired_upper"]) > stats["pairs"]:
+        yield (
+            f"most images of both cameras found no partner: the closest ones are {closest_ms}, {tolerance}; if no "
+            "images are missing, synchronise the cameras"
         )
-        for side in SIDES
-    ),
-    (
-        lambda s: s["too_fast"] and s["unsure"] > s["poses"] * NOTABLE_SHARE,
-        "the pose was lost or degraded in {unsure} of {poses} pairs, and the images show up to {fastest_mps:.1f} m/s: "
-        "poses that imply more than odometry.limits.max_speed_mps = {limit_mps:g} are refused; raise it if the robot "
-        "is that fast",
-    ),
-    (
-        lambda s: not (s["too_fast"] and s["unsure"] > s["poses"] * NOTABLE_SHARE) and s["lost"] > s["poses"] / 2,
-        "the pose was lost in {lost} of {poses} pairs: is the rig that of these cameras, is --lower the lower one, are "
-        "the images bright and sharp?",
-    ),
-)
+    for camera in CAMERAS:
+        if (in_a_row := stats[f"_frozen_{camera}"]) >= FROZEN_IMAGES:
+            yield (
+                f"the {camera} camera was frozen: {stats[f'repeated_{camera}']} of its images had all pixels as "
+                f"before, {in_a_row} in a row; {REPEATED[config.pair.repeated_images]}"
+            )
+    # 2. The rig, the light, dead parts of images.
+    if rig.warning:
+        yield rig.warning
+    if statistics.dark > notable:
+        yield (
+            f"it was too dark in {statistics.dark} of {poses} pairs: the images have more noise than contrast; more "
+            "light, a longer exposure (cameras.exposure_us) or less gain"
+        )
+    for side in SIDES:
+        if (count := statistics.lost_parts[side]) > notable:
+            yield (
+                f"a part of the {side} camera's image was frozen, dark, saturated or blurred in {count} of {poses} "
+                "pairs: it was not used; clean the mirror, check the camera and its driver"
+            )
+    # 3. Poses that are not sure.
+    if statistics.too_fast and unsure > notable:
+        yield (
+            f"the pose was lost or degraded in {unsure} of {poses} pairs, and the images show up to "
+            f"{statistics.fastest_mps:.1f} m/s: poses that imply more than odometry.limits.max_speed_mps = "
+            f"{config.odometry.limits.max_speed_mps:g} are refused; raise it if the robot is that fast"
+        )
+    elif lost > poses / 2:
+        yield (
+            f"the pose was lost in {lost} of {poses} pairs: is the rig that of these cameras, is --lower the lower "
+            "one, are the images bright and sharp?"
+        )
+
+
 REPEATED: Final = {
     "drop": "their pairs were left out; a simulator without noise needs pair.repeated_images = 'use'",
     "use": "they were used, as pair.repeated_images says",
 }
-
-
-def input_warnings(pairing: Synchronise, rig: RigHealth, statistics: RunStatistics, config: Config) -> Iterator[str]:
-    """Yield one line for each problem of the input: of images and stamps, of the rig, and that odometry has met."""
-    lost = statistics.states[TrackingState.LOST]
-    totals: dict[str, object] = {
-        **pairing.stats(),
-        **{f"lost_{side}": statistics.lost_parts[side] for side in SIDES},
-        "of_repeated": REPEATED[config.pair.repeated_images],
-        "rig": rig.warning,
-        "poses": statistics.poses,
-        "dark": statistics.dark,
-        "lost": lost,
-        "unsure": lost + statistics.states[TrackingState.DEGRADED],
-        "too_fast": statistics.too_fast,
-        "fastest_mps": statistics.fastest_mps,
-        "limit_mps": config.odometry.limits.max_speed_mps,
-    }
-    yield from (words.format_map(totals) for holds, words in WARNINGS if holds(totals))

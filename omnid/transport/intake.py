@@ -8,6 +8,7 @@ the rings of all commands, stops first; the queries among them wait for their an
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -58,24 +59,22 @@ class Intake(Generic[T]):
 
     def __init__(self, key: str, next_message: Callable[[], T | None], budget: Budget) -> None:
         self.key, self._next, self._budget = key, next_message, budget
-        self._allowed, self._at_s = float(budget.burst), 0.0
-        self._kept: T | None = None  # taken, and waits until it may be decoded
+        self._allowed, self._at_s = 0.0, -math.inf
         self.floods = 0
 
     def messages(self) -> Iterator[T]:
         """Yield the messages that may be decoded now; the others wait in the ring, until newer ones replace them."""
         now_s = time.monotonic()
-        self._allowed = min(self._budget.burst, self._allowed + (now_s - self._at_s) * self._budget.rate_hz)
+        # One more than the ring holds at once: what comes at once is no flood.
+        self._allowed = min(self._budget.burst + 1, self._allowed + (now_s - self._at_s) * self._budget.rate_hz)
         self._at_s = now_s
-        # An empty ring is the usual case, hundreds of times a second: it costs one call.
-        while (message := self._next() if self._kept is None else self._kept) is not None:
-            if self._allowed < 1.0:
-                self._kept = message
-                self.floods += 1
+        while self._allowed >= 1.0:
+            # An empty ring is the usual case, hundreds of times a second: it costs one call.
+            if (message := self._next()) is None:
                 return
-            self._kept = None
             self._allowed -= 1.0
             yield message
+        self.floods += 1
 
 
 class OpenRequests:
