@@ -23,19 +23,7 @@ from omnid.calibration.board_search import AnyBoard
 from omnid.calibration.images import SIDES, Image, read_pairs
 from omnid.calibration.live_boards import LiveBoards, PairOutcome, newest_pairs, status
 from omnid.calibration.rig import calibrate_rig
-from omnid.commands.options import (
-    HEIGHT,
-    LOG_CAMERAS,
-    QUIET,
-    SETTINGS,
-    command,
-    device_opener,
-    height_of,
-    log_cameras,
-    make_folder,
-    settings_of,
-    warn,
-)
+from omnid.commands import options
 from omnid.config import Config
 from omnid.engine.logging_setup import HANDLER, log
 from omnid.errors import OmnidError
@@ -92,7 +80,7 @@ def _options(names: tuple[str, ...] | list[str]) -> str:
     return ", ".join("--" + name.replace("_", "-") for name in names)
 
 
-@command(BOARD, LOG_CAMERAS, HEIGHT, QUIET)
+@options.command(BOARD, options.LOG_CAMERAS, options.HEIGHT, options.QUIET)
 def rig(args: argparse.Namespace) -> int:
     """Make a rig.toml from images of a board that both cameras saw at once.
 
@@ -118,7 +106,7 @@ def rig(args: argparse.Namespace) -> int:
     found = calibrate_rig(
         args.images,
         board,
-        topics=log_cameras(args),
+        topics=options.log_cameras(args),
         view=args.view,
         expected_baseline_m=None if expected_mm is None else expected_mm / 1e3,
         progress=silent if args.quiet else lambda line: print(line, file=sys.stderr),
@@ -132,11 +120,11 @@ def rig(args: argparse.Namespace) -> int:
     for line in found.tables:
         print(line)
     print(f"{args.output}: {found}")
-    print(f"{args.output}: {height_of(found.rig)}")
+    print(f"{args.output}: {options.height_of(found.rig)}")
     return int(bool(found.images.loss))
 
 
-@command(BOARD, SETTINGS)
+@options.command(BOARD, options.SETTINGS)
 def live(args: argparse.Namespace) -> int:
     """Search the board in the images of both cameras as they come.
 
@@ -158,7 +146,7 @@ def live(args: argparse.Namespace) -> int:
     boards = LiveBoards(board_of(args))
     if args.images is None and args.log is None:
         raise OmnidError("calibrate live: expected the DIR of the images, found none: name a folder, or a --log")
-    config = settings_of(args, {} if args.log else {"cameras.lower": args.lower, "cameras.upper": args.upper})
+    config = options.settings_of(args, {} if args.log else {"cameras.lower": args.lower, "cameras.upper": args.upper})
     with ExitStack() as closing:
         closing.callback(boards.close)
         number = _taken_before(args.images, boards)
@@ -190,7 +178,7 @@ def _taken_before(folder: Path | None, boards: LiveBoards) -> int:
     """Take the pairs that are in the folder, which is made if it is missing; return the highest number of an image."""
     if folder is None:
         return 0
-    make_folder("calibrate live: DIR", folder)
+    options.make_folder("calibrate live: DIR", folder)
     lower, upper = ({path.stem.removeprefix(f"{side}_") for path in folder.glob(f"{side}_*")} for side in SIDES)
     if lower & upper:  # half a pair is left where it was killed between two files
         pairs = read_pairs(folder)
@@ -204,12 +192,12 @@ def _of_log(args: argparse.Namespace, config: Config) -> Iterator[tuple[Image, I
     of_log = LogCameras(args.lower, args.upper, config.cameras.bits, config.log.rate_hz, config.log.time)
     pairs = read_pairs(args.log, of_log)
     for line in pairs.notes:
-        warn(line)
+        options.warn(line)
     return ((pairs.sides[0][name], pairs.sides[1][name]) for name in pairs.names)
 
 
 def _of_cameras(config: Config, closing: ExitStack) -> Iterator[tuple[Image, Image]]:
-    open_camera = device_opener(config)
+    open_camera = options.device_opener(config)
     lower = open_camera("lower")
     closing.callback(lower.close)
     upper = open_camera("upper")

@@ -8,18 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
-from omnid.commands.options import (
-    JSON,
-    QUIET,
-    RIG,
-    ROBOT,
-    SETTINGS,
-    command,
-    print_entries,
-    print_json,
-    settings_of,
-    warn,
-)
+from omnid.commands import options
 from omnid.commands.robot import ask
 from omnid.config import unused_settings
 from omnid.core.places import place_views
@@ -43,7 +32,7 @@ map FILE.omap            a map of places
 """
 
 
-@command(RIG, QUIET, SETTINGS)
+@options.command(options.RIG, options.QUIET, options.SETTINGS)
 def build(args: argparse.Namespace) -> int:
     """Build a map from logs, of one drive or of several in the same place, each in the map of those before.
 
@@ -59,27 +48,27 @@ def build(args: argparse.Namespace) -> int:
       map build wednesday.mcap -o place.omap --extend
     """
     # 1. Check the options.
-    config = settings_of(args)
+    config = options.settings_of(args)
     if not config.places.enabled or config.places.map:
         raise OmnidError("map build: places.enabled must be true, and places.map empty: change the configuration")
     check_outputs([("-o", args.output)], [("the log that is read", log) for log in args.logs])
     if args.output.exists() and not (args.extend or args.replace):
         raise OmnidError(f"map build: {args.output} exists: --extend adds these logs to it, --replace makes a new one")
     for warning in unused_settings(config, "replay", args.set):
-        warn(warning)
+        options.warn(warning)
     # 2. Replay the logs.
     built = RigPlaces(*read_places(args.output, PlaceMap(config.places.limits.max_keyframes))) if args.extend else None
     for log in args.logs:
-        options = ReplayOptions(
+        replayed = ReplayOptions(
             rig=args.rig,
             settings=args.config,
             build=True,
             rig_places=built,
             progress=None if args.quiet else Progress(),
         )
-        result = run_log(log, config, options)
+        result = run_log(log, config, replayed)
         for warning in result.warnings:
-            warn(f"{log}: {warning}")
+            options.warn(f"{log}: {warning}")
         if result.signal:
             print(f"omnid: interrupted: {args.output} was not written", file=sys.stderr)
             return 128 + result.signal
@@ -89,11 +78,11 @@ def build(args: argparse.Namespace) -> int:
         print("omnid: no keyframe was found: no map was written", file=sys.stderr)
         return 1
     write_places(args.output, built.places, built.rig)
-    print_entries(_described(args.output, built.places, built.rig))
+    options.print_entries(_described(args.output, built.places, built.rig))
     return 0
 
 
-@command(MAP, JSON)
+@options.command(MAP, options.JSON)
 def show(args: argparse.Namespace) -> int:
     """Print keyframes, sessions, loops, size, and the rig that made the map; write plan and grid.
 
@@ -111,13 +100,13 @@ def show(args: argparse.Namespace) -> int:
     if args.json:
         sizes = asdict(place_views.summary(places, rig))
         size_bytes = args.map.stat().st_size
-        print_json({"path": args.map, "size_bytes": size_bytes, "rig_hash": rig.rig_hash, **sizes})
+        options.print_json({"path": args.map, "size_bytes": size_bytes, "rig_hash": rig.rig_hash, **sizes})
     else:
-        print_entries(_described(args.map, places, rig) | {"written": written})
+        options.print_entries(_described(args.map, places, rig) | {"written": written})
     return 0
 
 
-@command(MAP)
+@options.command(MAP)
 def export(args: argparse.Namespace) -> int:
     """Write a map for other programs.
 
@@ -132,11 +121,11 @@ def export(args: argparse.Namespace) -> int:
     outputs = [(option, option, path) for option, path in named.items() if path is not None]
     if not outputs:
         raise OmnidError("map export: nothing to write: give --ply FILE.ply, --plan FILE.png or --grid FILE.yaml")
-    print_entries({"written": _exported(args, outputs)[2]})
+    options.print_entries({"written": _exported(args, outputs)[2]})
     return 0
 
 
-@command(ROBOT, SETTINGS)
+@options.command(options.ROBOT, options.SETTINGS)
 def save(args: argparse.Namespace) -> int:
     """Ask a robot to save its map now, before it is switched off, and print what became of it.
 
@@ -161,7 +150,7 @@ def _exported(args: argparse.Namespace, outputs: list[tuple[str, str, Path]]) ->
     for _, kind, path in outputs:
         if kind == "--grid":
             if not any(keyframe.free_m.any() for keyframe in places.keyframes.values()):
-                warn(
+                options.warn(
                     f"{path}: no cell is free: the map was built without the height of the cameras above the floor: "
                     f"{ADVICE}, and build the map again"
                 )

@@ -377,7 +377,7 @@ def _subscribe(
         requests.put(command._replace(halts=controller.statistics.state.halts if controller else 0))
 
     received = NavigationReceiver(ask, freshness, report=warn)
-    taken = {**topics.SENSOR_TOPICS, **topics.MAP_TOPICS}
+    taken = {topic: topics.command_of(topic).schema for topic in (*topics.SENSOR_TOPICS, topics.MAP)}
     table: dict[str, Callable[[Request], Answer | None]] = {}
     stats: dict[str, Callable[[], names.Stats]] = {
         names.MOTION: lambda: front_end.motion_stats() | names.by_reason(names.REFUSED_PREFIX, samples.refused)

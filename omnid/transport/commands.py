@@ -34,12 +34,11 @@ from __future__ import annotations
 import math
 import re
 import secrets
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
-from typing import Final, NamedTuple, Protocol
+from typing import Final, Protocol, TypeAlias
 
 from drivers.logs.ros_messages import JointWheels
 from drivers.motion import MotionSample
@@ -48,19 +47,8 @@ from omnid.core.control.command_sources import OPERATOR, PLANNER, TimedSetpoint
 from omnid.core.control.contacts import BUMPER, CLIFF
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.nanoseconds import S_PER_NS
+from omnid.core.navigation import requests
 from omnid.core.navigation.path import FARTHEST_M
-from omnid.core.navigation.requests import (
-    GoalRequest,
-    NavigationCommand,
-    NavigationFrame,
-    NavigationRequest,
-    PathRequest,
-    RouteAction,
-    RouteRequest,
-    is_halt,
-    navigation_verb,
-    route_request,
-)
 from omnid.engine.robot_clock import RobotClock, duration_words
 from omnid.errors import OmnidError
 from omnid.plain_text import plain
@@ -69,13 +57,16 @@ from omnid.transport.sensor_codec import LARGEST_VALUE, sample_from_cdr
 from omnid.transport.status_names import REFUSED_PREFIX, by_reason
 from omnid.transport.topics import Answer, Request
 
-LONGEST_PAYLOAD, LONGEST_PATH = 4096, 1 << 20  # bytes
 LEAST_SPEED: Final = 1e-3  # m/s, rad/s; less in another direction is noise of a stick, more is another motion
 _CLOCKS: Final = (
     "synchronise the clocks, or stamp with the robot's own time: omnid.client attaches it, another program may repeat "
     "the stamp of the newest odom; controller.deadlines.command_s is the longest age"
 )
 _STAMPED: Final = re.compile(r"(.*\S)\s+stamp=(\d{1,19})\s*", re.DOTALL)
+
+
+Action: TypeAlias = Callable[[Request, int], object]  # takes a message and its arrival, ns of CLOCK_MONOTONIC
+CONTACTS: Final = {topics.BUMPER: BUMPER, topics.CLIFF: CLIFF}  # a message that is refused is one
 
 
 class Refused(OmnidError):  # noqa: N818 - named after what it reports
@@ -87,24 +78,15 @@ class Refused(OmnidError):  # noqa: N818 - named after what it reports
         self.reason = reason
 
 
-class Row(NamedTuple):
-    """What is done with the messages of a topic; its type is in omnid.transport.topics."""
-
-    act: Callable[[Request, int], object]  # takes a message and its arrival, ns of CLOCK_MONOTONIC; it may be Refused
-    longest: int = LONGEST_PAYLOAD  # bytes
-    on_refusal: Callable[[], object] = bool  # called where a message is refused; bool does nothing
-
-
 class Receiver:
-    """Handles each message by the row of its topic, counts and reports those that are refused, and never raises.
+    """Handles each message by the action of its topic, counts and reports those that are refused, and never raises.
 
     It is called from threads of the bus. accepted: number of messages; refused: by reason; refusal: the newest one.
     """
 
-    def __init__(self, rows: Mapping[str, Row], report: Callable[[str], None] | None, unknown: str) -> None:
+    def __init__(self, actions: Mapping[str, Action], report: Callable[[str], None] | None, unknown: str) -> None:
         """report: takes a line for the log where a refusal is another one than before. unknown: advice."""
-        self._rows, self._report, self._unknown = rows, report, Row(self._refuse_unknown, sys.maxsize)
-        self._advice = unknown
+        self._actions, self._report, self._advice = actions, report, unknown
         self.accepted = 0
         self.refused: Counter[str] = Counter()
         self.refusal = ""
@@ -112,13 +94,14 @@ class Receiver:
     def receive(self, request: Request) -> Answer | None:
         """Handle one message; return the refusal, None where there is none or the target answers."""
         arrival_ns = time.monotonic_ns()  # before anything else: a stop that arrives meanwhile voids a command
-        row = self._rows.get(request.topic, self._unknown)
         try:
-            if len(request.payload) > row.longest:
-                raise Refused("too long", f"{len(request.payload)} bytes, expected at most {row.longest}")
-            row.act(request, arrival_ns)
+            if (action := self._actions.get(request.topic)) is None:
+                raise Refused("unknown topic", self._advice)
+            if len(request.payload) > (longest := topics.command_of(request.topic).longest):
+                raise Refused("too long", f"{len(request.payload)} bytes, expected at most {longest}")
+            action(request, arrival_ns)
         except OmnidError as error:
-            row.on_refusal()
+            self._on_refusal(request.topic)
             self.refused[error.reason if isinstance(error, Refused) else "malformed"] += 1
             before, self.refusal = self.refusal, f"a message on {plain(request.topic)} is refused: {error}"
             if self._report is not None and self.refusal != before:
@@ -126,8 +109,8 @@ class Receiver:
             return Answer(False, str(error))
         return None
 
-    def _refuse_unknown(self, *_: object) -> None:
-        raise Refused("unknown topic", self._advice)
+    def _on_refusal(self, topic: str) -> None:
+        """Do what a message that is refused entails."""
 
 
 class Freshness:
@@ -269,17 +252,12 @@ class CommandReceiver(Receiver):
         """
         self._target, self._freshness, self._is_unique = target, freshness, is_unique
         parsers = {topics.TWIST: twist_command, topics.HEADING: heading_command}
-        rows = {
-            topic: Row(partial(self._drive, source, parsers[kind]))
-            for topic, (source, kind) in topics.setpoint_topics(sources).items()
-        }
-        for topic, contact in ((topics.BUMPER, BUMPER), (topics.CLIFF, CLIFF)):
-            clock = SensorClock(freshness.stale_ns)
-            rows[topic] = Row(
-                partial(self._touch, contact, clock), on_refusal=partial(target.touch, contact, holds=True)
-            )
-        rows |= {topics.ARM: Row(self._arm), topics.STOP: Row(self._stop, sys.maxsize)}
-        super().__init__(rows, report, "see controller.sources.names")
+        actions: dict[str, Action] = {topics.ARM: self._arm, topics.STOP: self._stop}
+        for topic, (source, kind) in topics.setpoint_topics(sources).items():
+            actions[topic] = partial(self._drive, source, parsers[kind])
+        for topic, contact in CONTACTS.items():
+            actions[topic] = partial(self._touch, contact, SensorClock(freshness.stale_ns))
+        super().__init__(actions, report, "see controller.sources.names")
         self._stop_ns = 0  # arrival of the newest stop
         # Sender and newest arrival of the setpoints of each source: the first one begins a motion, the others go on
         # with it. There are none after a stop.
@@ -291,6 +269,10 @@ class CommandReceiver(Receiver):
         self._streams.clear()
         self.stops += 1
         self._target.stop()
+
+    def _on_refusal(self, topic: str) -> None:
+        if topic in CONTACTS:
+            self._target.touch(CONTACTS[topic], holds=True)
 
     def _touch(self, contact: str, clock: SensorClock, request: Request, arrival_ns: int) -> None:
         """Pass the state of a contact on; a message that is refused is a contact.
@@ -347,14 +329,13 @@ class NavigationReceiver(Receiver):
 
     def __init__(
         self,
-        target: Callable[[NavigationCommand], None],
+        target: Callable[[requests.NavigationCommand], None],
         freshness: Freshness,
         *,
         report: Callable[[str], None] | None = None,
     ) -> None:
         """target: may be called from any thread. freshness: as of CommandReceiver."""
-        rows = dict.fromkeys(topics.NAVIGATION_TOPICS, Row(self._ask)) | {topics.PATH: Row(self._ask, LONGEST_PATH)}
-        super().__init__(rows, report, "see omnid.transport.topics")
+        super().__init__(dict.fromkeys(topics.NAVIGATION_TOPICS, self._ask), report, "see omnid.transport.topics")
         self._target, self._freshness = target, freshness
 
     def stats(self) -> dict[str, object]:
@@ -363,31 +344,31 @@ class NavigationReceiver(Receiver):
 
     def _ask(self, message: Request, arrival_ns: int) -> None:
         request, stamp_ns = navigation_request(message.topic, message.payload)
-        is_finish = isinstance(request, RouteRequest) and request.action is RouteAction.FINISH
-        if not (is_halt(request) or is_finish):
+        is_finish = isinstance(request, requests.RouteRequest) and request.action is requests.RouteAction.FINISH
+        if not (requests.is_halt(request) or is_finish):
             self._freshness.require(message, arrival_ns, stamp_ns)
         self.accepted += 1
         stamp_ns = stamp_ns or message.sent_ns
-        self._target(NavigationCommand(request, time.time_ns(), stamp_ns, message.id, asked_ns=arrival_ns))
+        self._target(requests.NavigationCommand(request, time.time_ns(), stamp_ns, message.id, asked_ns=arrival_ns))
 
 
-def navigation_request(topic: str, payload: bytes) -> tuple[NavigationRequest, int]:
+def navigation_request(topic: str, payload: bytes) -> tuple[requests.NavigationRequest, int]:
     """Decode a request and its stamp [ns], 0 where it has none. Raise OmnidError for anything else."""
     if topic in (topics.GOAL, topics.PATH):
         decode = codec.goal_from_cdr if topic == topics.GOAL else codec.path_from_cdr
         stamp_ns, name, xy, heading_rad = decode(payload)
         if not (abs(xy) <= FARTHEST_M).all():
             raise OmnidError(f"a position beyond {FARTHEST_M:g} m: check the sender")
-        if name not in list(NavigationFrame):
+        if name not in list(requests.NavigationFrame):
             raise OmnidError(f"the frame {name[:40]!a}: expected map or odom")
-        frame = NavigationFrame(name)
+        frame = requests.NavigationFrame(name)
         if topic == topics.PATH:
-            return PathRequest(frame, xy, heading_rad), stamp_ns
-        return GoalRequest(frame, float(xy[0, 0]), float(xy[0, 1]), heading_rad), stamp_ns
+            return requests.PathRequest(frame, xy, heading_rad), stamp_ns
+        return requests.GoalRequest(frame, float(xy[0, 0]), float(xy[0, 1]), heading_rad), stamp_ns
     text = codec.string_from_cdr(payload)
     stamped = _STAMPED.fullmatch(text)
     text, stamp_ns = (stamped[1], int(stamped[2])) if stamped else (text, 0)
-    return (navigation_verb(text) if topic == topics.NAVIGATION else route_request(text)), stamp_ns
+    return (requests.navigation_verb(text) if topic == topics.NAVIGATION else requests.route_request(text)), stamp_ns
 
 
 # Samples of wheels and gyro.
@@ -409,11 +390,11 @@ class SensorReceiver(Receiver):
         used: topics. joints: the wheels.
         """
         advice = "it is not used, see motion.wheels, motion.wheel_joints and motion.imu"
-        super().__init__(dict.fromkeys(used, Row(self._take)), report, advice)
+        super().__init__(dict.fromkeys(used, self._take), report, advice)
         self._joints, self._target, self._stamp_ns = joints, target, stamp_ns
 
     def _take(self, request: Request, _: int) -> None:
-        schema = topics.SENSOR_TOPICS[request.topic]
+        schema = topics.command_of(request.topic).schema
         sample = sample_from_cdr(request.payload, schema, self._stamp_ns, self._joints)
         if sample is not None:
             self.accepted += 1

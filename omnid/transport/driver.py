@@ -11,24 +11,9 @@ from typing import Any, Final
 import zenoh
 
 from omnid.errors import OmnidError
-from omnid.transport import codec, ros2
+from omnid.transport import codec, ros2, topics
 from omnid.transport.codec import goal_cdr, string_cdr
 from omnid.transport.session import QUERY_S, has_receiver, robots_there
-from omnid.transport.topics import (
-    ARM,
-    GOAL,
-    HEADING,
-    MAP,
-    NAVIGATION,
-    ROUTE,
-    SAVE_MAP,
-    STOP,
-    TIME,
-    TWIST,
-    Answer,
-    answer_of,
-    request_key,
-)
 
 CONNECT_S: Final = 2.0  # A connection is complete within this time.
 ANSWER_S: Final = 10.0  # more than a disk takes for a map or a route
@@ -48,7 +33,7 @@ class RobotTime:
     """
 
     def __init__(self, session: zenoh.Session, robot: str) -> None:
-        self._session, self._key = session, f"{robot}/{TIME}"
+        self._session, self._key = session, f"{robot}/{topics.TIME}"
         self._told: tuple[int, int] | None = None  # the robot's time, and ours when it came
         self._asked_s = -math.inf
 
@@ -110,9 +95,10 @@ class Driver:
     def __init__(self, session: zenoh.Session, robot: str, own_time: RobotTime, source: str = "") -> None:
         prefix = f"cmd/{source}" if source else "cmd"
         self._session, self._robot, self._time = session, robot, own_time
-        self._twist, self._heading = f"{prefix}/{TWIST}", f"{prefix}/{HEADING}"
+        self._twist, self._heading = f"{prefix}/{topics.TWIST}", f"{prefix}/{topics.HEADING}"
         self._publishers = {
-            topic: _command_publisher(session, f"{robot}/{topic}") for topic in (self._twist, self._heading, STOP, ARM)
+            topic: _command_publisher(session, f"{robot}/{topic}")
+            for topic in (self._twist, self._heading, topics.STOP, topics.ARM)
         }
         self._sent, self._gid = 0, ros2.gid_of(str(session.zid()))
         self.asked_ns = 0  # time of sending of the newest request, which the reports of a drive repeat
@@ -138,45 +124,45 @@ class Driver:
 
     def stop(self) -> None:
         """Stop the wheels, whatever else was commanded, until `arm` is called."""
-        self.send(STOP, b"")
+        self.send(topics.STOP, b"")
 
-    def arm(self, timeout_s: float = ANSWER_S) -> Answer:
+    def arm(self, timeout_s: float = ANSWER_S) -> topics.Answer:
         """Ask the robot to arm; it refuses while a fault holds. Only commands that arrive after it move the wheels.
 
         Raise OmnidError as `ask`.
         """
-        return self.ask(ARM, codec.header_cdr, timeout_s)
+        return self.ask(topics.ARM, codec.header_cdr, timeout_s)
 
-    def goal(self, x_m: float, y_m: float, heading_rad: float | None = None, frame: str = "odom") -> Answer:
+    def goal(self, x_m: float, y_m: float, heading_rad: float | None = None, frame: str = "odom") -> topics.Answer:
         """Ask the robot to drive to a pose in odom or map; None: with any heading. Raise OmnidError as `ask`."""
-        return self.ask(GOAL, lambda now_ns: goal_cdr(now_ns, frame, (x_m, y_m), heading_rad))
+        return self.ask(topics.GOAL, lambda now_ns: goal_cdr(now_ns, frame, (x_m, y_m), heading_rad))
 
-    def navigate(self, verb: str) -> Answer:
+    def navigate(self, verb: str) -> topics.Answer:
         """Ask the robot to cancel, pause or resume its drive. Raise OmnidError as `ask`."""
-        return self.ask(NAVIGATION, lambda _: string_cdr(verb))
+        return self.ask(topics.NAVIGATION, lambda _: string_cdr(verb))
 
-    def route(self, text: str) -> Answer:
+    def route(self, text: str) -> topics.Answer:
         """Ask for what a text of cmd/route says, such as "repeat hall". Raise OmnidError as `ask`."""
-        return self.ask(ROUTE, lambda _: string_cdr(text))
+        return self.ask(topics.ROUTE, lambda _: string_cdr(text))
 
-    def save_map(self) -> Answer:
+    def save_map(self) -> topics.Answer:
         """Ask the robot to save its map now. Raise OmnidError as `ask`."""
-        return self.ask(MAP, lambda _: string_cdr(SAVE_MAP))
+        return self.ask(topics.MAP, lambda _: string_cdr(topics.SAVE_MAP))
 
-    def ask(self, topic: str, payload_at: Callable[[int], bytes], timeout_s: float = ANSWER_S) -> Answer:
+    def ask(self, topic: str, payload_at: Callable[[int], bytes], timeout_s: float = ANSWER_S) -> topics.Answer:
         """Send the request that a message on a topic such as cmd/goal is, and wait for the robot's answer.
 
         payload_at: returns the CDR bytes for a time of sending [ns of Unix time]. Raise OmnidError where no robot takes
         such requests within CONNECT_S, or none answers.
         """
-        key = f"{self._robot}/{request_key(topic)}"
+        key = f"{self._robot}/{topics.request_key(topic)}"
         with self._session.declare_querier(key, timeout=timeout_s, **_QUALITY) as querier:
             if not _holds_in_time(lambda: has_receiver(querier)):
                 raise self._absent("takes such requests")
             self._time.ask()
             self.asked_ns = now_ns = time.time_ns()
             for reply in querier.get(payload=payload_at(now_ns), attachment=self._attachment(now_ns)):
-                if reply.ok is not None and (answer := answer_of(reply.ok.payload.to_bytes())) is not None:
+                if reply.ok is not None and (answer := topics.answer_of(reply.ok.payload.to_bytes())) is not None:
                     return answer
         raise OmnidError(
             f"{self._robot} has not answered: either this program must not command it (access_control in "

@@ -21,7 +21,7 @@ import zenoh
 
 from omnid.transport import ros2
 from omnid.transport.bus_config import BusConfig
-from omnid.transport.topics import ARM, MOST_OPEN, PATH, REQUEST_TOPICS, STOP, Answer, Request, request_key
+from omnid.transport.topics import ARM, MOST_OPEN, STOP, Answer, Request, command_of, request_key
 
 T = TypeVar("T")
 RequestCallback: TypeAlias = Callable[[Request], None]
@@ -42,16 +42,13 @@ class Budget:
         return max(4, round(self.rate_hz / 4))
 
 
-STREAM: Final = Budget(1000.0)  # setpoints, samples of wheels and gyro
-REQUEST: Final = Budget(50.0)
-LONG_REQUEST: Final = Budget(2.0)  # A request of up to 1 MiB.
-QUERY = REQUEST
+QUERY: Final = Budget(50.0)
 UNKNOWN: Final = Budget(200.0)  # topics that do not exist; of up to 1 MiB
 
 
 def budget_of(topic: str) -> Budget:
     """Return the budget of a topic from `cmd` on."""
-    return LONG_REQUEST if topic == PATH else REQUEST if topic in REQUEST_TOPICS else STREAM
+    return Budget(command_of(topic).rate_hz)
 
 
 class Intake(Generic[T]):
@@ -209,7 +206,7 @@ class CommandIntake:
                 yield self._ring(
                     session.declare_subscriber, ros, topic, topic if topic == _UNKNOWN_TOPICS else f"{topic}/*/*"
                 )
-            if topic in REQUEST_TOPICS:
+            if command_of(topic).is_request:
                 yield self._ring(session.declare_queryable, own, topic, request_key(topic))
 
     def _ring(self, declare: Callable[..., Any], prefix: str, topic: str, key: str) -> _Ring:

@@ -9,7 +9,9 @@ The time of sending and the identity of the sender are attached, as to a message
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, Final, NamedTuple
 
 from omnid.transport import codec
@@ -65,23 +67,44 @@ GOAL: Final = "cmd/goal"
 PATH: Final = "cmd/path"
 NAVIGATION: Final = "cmd/navigation"
 ROUTE: Final = "cmd/route"
-NAVIGATION_TOPICS: Final = {
-    GOAL: codec.POSE_SCHEMA,
-    PATH: codec.PATH_SCHEMA,
-    NAVIGATION: codec.STRING_SCHEMA,
-    ROUTE: codec.STRING_SCHEMA,
-}
 MAP: Final = "cmd/map"
 SAVE_MAP: Final = "save"  # the request on it
-MAP_TOPICS: Final = {MAP: codec.STRING_SCHEMA}
-REQUEST_TOPICS: Final = frozenset((ARM, *NAVIGATION_TOPICS, MAP))  # that have an answer
 WHEEL_ODOM: Final = "cmd/wheel_odom"
 IMU: Final = "cmd/imu"
 JOINT_STATES: Final = "cmd/joint_states"
-SENSOR_TOPICS: Final = {WHEEL_ODOM: codec.ODOMETRY_SCHEMA, IMU: codec.IMU_SCHEMA, JOINT_STATES: codec.JOINT_SCHEMA}
+NAVIGATION_TOPICS: Final = (GOAL, PATH, NAVIGATION, ROUTE)
+SENSOR_TOPICS: Final = (WHEEL_ODOM, IMU, JOINT_STATES)
 TWIST: Final = "twist"
 HEADING: Final = "heading"
 _SETPOINTS: Final = {TWIST: codec.TWIST_SCHEMA, HEADING: codec.VECTOR_SCHEMA}
+
+
+class Command(NamedTuple):
+    """What is taken on a topic, how often, and how long it may be."""
+
+    schema: str  # ROS 2 message type
+    rate_hz: float = 1000.0  # messages that are decoded a second: of setpoints, samples
+    longest: int = 4096  # bytes
+    is_request: bool = False  # it has an answer: it may be asked by a query as well
+
+
+_request = partial(Command, rate_hz=50.0, is_request=True)
+COMMANDS: Final = {
+    STOP: Command(EMPTY_SCHEMA, longest=sys.maxsize),
+    ARM: _request(codec.HEADER_SCHEMA),
+    **dict.fromkeys((BUMPER, CLIFF), Command(codec.BOOL_SCHEMA)),
+    GOAL: _request(codec.POSE_SCHEMA),
+    PATH: _request(codec.PATH_SCHEMA, rate_hz=2.0, longest=1 << 20),
+    **dict.fromkeys((NAVIGATION, ROUTE, MAP), _request(codec.STRING_SCHEMA)),
+    WHEEL_ODOM: Command(codec.ODOMETRY_SCHEMA),
+    IMU: Command(codec.IMU_SCHEMA),
+    JOINT_STATES: Command(codec.JOINT_SCHEMA),
+}
+
+
+def command_of(topic: str) -> Command:
+    """Return what is taken on a topic of commands or, by its last part, of setpoints."""
+    return COMMANDS.get(topic) or Command(_SETPOINTS.get(topic.rpartition("/")[2], ""))
 
 
 def setpoint_topics(sources: Sequence[str]) -> dict[str, tuple[str, str]]:
@@ -96,10 +119,7 @@ def setpoint_topics(sources: Sequence[str]) -> dict[str, tuple[str, str]]:
 
 def command_topics(sources: Sequence[str]) -> dict[str, str]:
     """Return the topics of commands with their types; sources: as of setpoint_topics."""
-    setpoints = {topic: _SETPOINTS[kind] for topic, (_, kind) in setpoint_topics(sources).items()}
-    stops = {STOP: EMPTY_SCHEMA, ARM: codec.HEADER_SCHEMA}
-    contacts = dict.fromkeys((BUMPER, CLIFF), codec.BOOL_SCHEMA)
-    return setpoints | stops | contacts | NAVIGATION_TOPICS | MAP_TOPICS | SENSOR_TOPICS
+    return {topic: command_of(topic).schema for topic in (*setpoint_topics(sources), *COMMANDS)}
 
 
 def request_key(topic: str) -> str:

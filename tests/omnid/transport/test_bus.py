@@ -25,7 +25,7 @@ from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import ERROR, OK, WARN, PoseAttachment
 from omnid.transport.session import open_client, open_session, zenoh_config
 from omnid.transport.status_names import BUS, entry
-from omnid.transport.topics import PUBLISHED, REQUEST_TOPICS, command_topics, request_key
+from omnid.transport.topics import COMMANDS, PUBLISHED, command_topics, request_key
 from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, odometry, script, session
 from tests.waiting import wait_until
 
@@ -80,7 +80,7 @@ def test_the_default_is_this_machine_only() -> None:
     limited = setting(BusConfig(robot="rover", ros2_domain=3), "low_pass_filter")[0]["key_exprs"]
     topics = command_topics(("planner",)).keys() - {"cmd/path"}
     keys = [f"rover/{topic}" for topic in topics] + [f"3/rover/{topic}/type/hash" for topic in topics]
-    keys += [f"rover/{request_key(topic)}" for topic in REQUEST_TOPICS - {"cmd/path"}]
+    keys += [f"rover/{request_key(topic)}" for topic in COMMANDS if COMMANDS[topic].is_request and topic != "cmd/path"]
     assert all(any(zenoh.KeyExpr(bound).includes(zenoh.KeyExpr(key)) for bound in limited) for key in keys)
     both = BusConfig(listen=("tls/[::]:7447",), connect=("quic/site:1", "tls/site:1"))
     assert setting(both, protocols) == ["quic", "tls"] and setting(both, "mode") == "peer"

@@ -20,9 +20,11 @@ from omnid.transport.codec import WARN
 from omnid.transport.intake import UNKNOWN, budget_of
 from omnid.transport.status_names import BUS, entry
 from omnid.transport.stop_datagram import ASKED, STOPPED, StopListener, StopSender, addresses
-from omnid.transport.topics import REQUEST_TOPICS, Request, command_topics, request_key
+from omnid.transport.topics import COMMANDS, Request, command_topics, request_key
 from tests.omnid.transport.bus_fixtures import free_endpoint, robot, script
 from tests.waiting import wait_until
+
+REQUEST_TOPICS = {topic for topic, command in COMMANDS.items() if command.is_request}
 
 
 @pytest.mark.parametrize("topic", sorted(REQUEST_TOPICS))
