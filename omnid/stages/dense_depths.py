@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.config import StereoConfig
-from omnid.core.odometry.dense_correction import DenseCorrection
 from omnid.core.odometry.earlier_view import EarlierView, contradicted
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.stereo.matcher import Matcher, MatchingSettings
@@ -69,9 +68,8 @@ class DenseDepths:
         """Return the depth of panoramas, corrected for a motion during their exposures."""
         # 1. Match the pixels of the lower panorama along their columns.
         lower, pad = panoramas.lower, panoramas.lower.pad_px
-        correction = None if exposure is None else DenseCorrection.of(exposure, panoramas.visible.shape)
         valid = np.pad(panoramas.usable, ((0, 0), (pad, pad)))
-        shift = None if correction is None else correction.column_shift(pad)
+        shift = None if exposure is None else exposure.column_shift(panoramas.visible.shape, pad)
         try:
             matcher = self._idle.pop()
         except IndexError:
@@ -82,8 +80,9 @@ class DenseDepths:
         columns -= pad
         # 2. Correct rows and disparities to the stamp of the pair.
         views, by_motion = np.column_stack([columns, rows, rows + found]).astype(float), np.zeros(len(found))
-        if correction is not None:
-            views, by_motion = correction.corrected(columns, rows, found)
+        if exposure is not None:
+            views, noise = exposure.corrected(views[:, :2], views[:, 2])
+            by_motion = noise[:, 1, 1] + noise[:, 2, 2] - 2 * noise[:, 1, 2]
         disparity = np.full(panoramas.visible.shape, np.nan, np.float32)
         disparity[rows, columns] = views[:, 2] - views[:, 1]
         # 3. Triangulate, with the variance along the ray: the distance from the axis is r = f t / d, so sigma_r is

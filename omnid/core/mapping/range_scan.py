@@ -52,9 +52,8 @@ def seen_from(free_m: FreeRanges, T_view_base: Array) -> FreeRanges:
     """
     directions = np.column_stack([np.cos(azimuths()), np.sin(azimuths()), np.zeros(SECTORS)])
     x, y, _ = se3.apply(T_view_base, free_m[:, None] * directions).T
-    sector = np.floor((np.arctan2(y, x) + math.pi) * (SECTORS / math.tau)).astype(np.intp) % SECTORS
     nearest = np.full(SECTORS, np.inf)
-    np.minimum.at(nearest, sector, np.where(free_m > 0, np.hypot(x, y), 0.0))
+    np.minimum.at(nearest, _sectors(x, y), np.where(free_m > 0, np.hypot(x, y), 0.0))
     # An end between two sectors belongs to either side.
     nearest = np.minimum(nearest, np.minimum(np.roll(nearest, 1), np.roll(nearest, -1)))
     return np.where(np.isfinite(nearest), nearest, 0.0).astype(np.float32)
@@ -97,55 +96,35 @@ def point_scan(points: Array, sigma_m: Array, view: Array, limits: ScanLimits, f
 
     sigma_m (N,): of the points, along the rays; view (3,): the viewpoint in that frame; floor_sigma_m: of the floor.
     """
-    ranges = np.hypot(points[:, 0], points[:, 1])
-    turned = (np.arctan2(points[:, 1], points[:, 0]) + math.pi) * (SECTORS / (2 * math.pi))
-    sector = np.floor(turned).astype(np.intp) % SECTORS
-    usable = (ranges > NEAREST_M) & np.isfinite(sigma_m)
-    chosen = usable & _is_obstacle(points, sigma_m, view, limits, floor_sigma_m)
-    found, seen_beyond = _nearest(sector[chosen], ranges[chosen], limits)
-    found = fill_gaps(found)
-    return np.where(~np.isfinite(found) & seen_beyond, np.inf, found).astype(np.float32)
-
-
-def _is_obstacle(
-    points: Array, sigma_m: Array, view: Array, limits: ScanLimits, floor_sigma_m: float
-) -> NDArray[np.bool_]:
-    """Return which of points (N, 3) are within the band of heights; the arguments are those of `point_scan`."""
+    # 1. The points within the band of heights, by a margin for the noise of stereo and the tilt of the base.
     low, high = limits.heights_m
-    away = points - view
-    across2 = away[:, 0] ** 2 + away[:, 1] ** 2
-    rise2 = away[:, 2] ** 2
+    across2, rise2 = ((points[:, :2] - view[:2]) ** 2).sum(axis=1), (points[:, 2] - view[2]) ** 2
     of_stereo2 = sigma_m**2 * rise2 / np.maximum(across2 + rise2, 1e-12)
     margin = HEIGHT_SIGMAS * np.sqrt(of_stereo2 + limits.tilt_rad**2 * across2 + floor_sigma_m**2)
-    z = points[:, 2]
-    return np.asarray((z - margin > low) & (z + margin < high))
-
-
-def _nearest(sector: Counts, ranges: Array, limits: ScanLimits) -> tuple[RangeScan, NDArray[np.bool_]]:
-    """Return the ranges (SECTORS,) of the nearest supported obstacles, and where something beyond was seen."""
+    x, y, z = points.T
+    ranges = np.hypot(x, y)
+    chosen = (ranges > NEAREST_M) & np.isfinite(sigma_m) & (z - margin > low) & (z + margin < high)
+    # 2. Sums over bins of inverse range, bin 0 the nearest; an obstacle may lie across the border of two bins.
     bins = math.ceil(1 / (NEAREST_M * INVERSE_STEP))
-    # Bin 0 is the nearest.
-    index = sector * bins + np.clip(bins - 1 - np.floor(1 / (ranges * INVERSE_STEP)).astype(np.intp), 0, bins - 1)
-    counts = np.bincount(index, minlength=SECTORS * bins).reshape(SECTORS, bins).astype(float)
-    inverse = np.bincount(index, 1 / ranges, SECTORS * bins).reshape(SECTORS, bins).astype(float)
-    pair = _with_next(counts)
-    of_neighbours = pair + np.roll(pair, 1, axis=0) + np.roll(pair, -1, axis=0)
-    supported = (of_neighbours >= limits.min_points) & (pair > 0)
-    limit = bins - 1 - math.floor(1 / (limits.max_range_m * INVERSE_STEP))  # bins from here on lie beyond
-    near = supported[:, : limit + 1]
-    first = np.argmax(near, axis=1)
-    rows = np.arange(SECTORS)
-    known = near[rows, first]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        found = np.where(known, pair[rows, first] / _with_next(inverse)[rows, first], np.nan)
+    inverse = 1 / ranges[chosen]
+    far_bin = np.clip(bins - 1 - np.floor(inverse / INVERSE_STEP).astype(np.intp), 0, bins - 1)
+    index = _sectors(x[chosen], y[chosen]) * bins + far_bin
+    sums = [np.bincount(index, weights, SECTORS * bins).reshape(SECTORS, bins) for weights in (None, inverse)]
+    count, inverse = (each + np.pad(each[:, 1:], ((0, 0), (0, 1))) for each in sums)
+    # 3. The nearest bin that enough points support, those of the neighbouring sectors included.
+    of_neighbours = count + np.roll(count, 1, axis=0) + np.roll(count, -1, axis=0)
+    supported = (of_neighbours >= limits.min_points) & (count > 0)
+    limit = bins - math.floor(1 / (limits.max_range_m * INVERSE_STEP))  # bins from here on lie beyond
+    first = supported.argmax(axis=1)[:, None]
+    is_near = supported.any(axis=1) & (first[:, 0] < limit)
+    sums_at = (np.take_along_axis(each, first, axis=1)[:, 0] for each in (count, inverse))
+    found = np.divide(*sums_at, out=np.full(SECTORS, np.nan), where=is_near)
     # The last two bins reach beyond the longest range.
-    is_beyond = found > limits.max_range_m
-    found[is_beyond] = np.nan
-    return found.astype(np.float32), is_beyond | (~known & supported[:, limit + 1 :].any(axis=1))
+    beyond = (found > limits.max_range_m) | (~is_near & supported.any(axis=1))
+    scan = fill_gaps(np.where(beyond, np.nan, found).astype(np.float32))
+    return np.where(beyond & ~np.isfinite(scan), np.float32(np.inf), scan)
 
 
-def _with_next(sums: Array) -> Array:
-    """Return the sums of each bin and the next farther one."""
-    total = sums.astype(float)
-    total[:, :-1] += sums[:, 1:]
-    return total
+def _sectors(x: Array, y: Array) -> Counts:
+    """Return the sectors (N,) of places (N,)."""
+    return np.floor((np.arctan2(y, x) + math.pi) * (SECTORS / math.tau)).astype(np.intp) % SECTORS

@@ -167,7 +167,7 @@ class KeyframeGrid:
         top, left = (int(rows.min()), int(columns.min())) if len(rows) else (0, 0)
         if len(rows):
             cells = cells[top : rows.max() + 1, left : columns.max() + 1]
-        x, y = ((self._first + [left, top]) * self._cell_m).tolist()
+        x, y = ((self._first + np.array([left, top])) * self._cell_m).tolist()
         return Grid(cells, self._cell_m, (x, y))
 
 

@@ -8,12 +8,15 @@ so that all else works with views of one instant. Its error is that of V, which 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
+from calib.panorama import at_scale
+from omnid.core.stereo.semiglobal import ColumnShift
 from omnid.core.stereo.triangulation import triangulate, view, view_jacobian
 from omnid.core.types.pixel_times import PixelTimes
 from omnid.core.types.stereo_model import StereoModel
@@ -25,6 +28,9 @@ ROUNDS = 3
 # Standard deviation, m/s and rad/s, below which a velocity is known well enough to check a rig: in 15 ms between two
 # exposures that is an error of 3 mm and 0.2 degrees of the motion.
 KNOWN_SIGMA = 0.2
+# At scale 1: spacing of the points, and two disparities, at which the shift of columns is computed exactly. It follows
+# azimuth and row smoothly, so that interpolation over 16 px, 5 degrees of a panorama of 1300 columns, loses little.
+GRID_PX, DISPARITIES_PX = 16, (8.0, 40.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,3 +179,22 @@ class Exposure:
             views[known] += np.column_stack([shift.lower, shift.upper[:, 1]])
             noise[known] = shift.noise(self.motion)
         return views, noise
+
+    def column_shift(self, shape: tuple[int, int], pad_px: int) -> ColumnShift:
+        """Return the shift of the upper columns of panoramas (H, W), which are padded by pad_px columns."""
+        cylinder = self.model.cylinder
+        grid_px, near = at_scale(GRID_PX, cylinder.scale), cylinder.scale * np.array(DISPARITIES_PX)
+        rows, columns = (grid_px * (np.arange(-(-size // grid_px)) + 0.5) - 0.5 for size in shape)
+        grid = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+        shifts = [cylinder.wrap(self.upper_columns(grid, grid[:, 1] + d)[0] - grid[:, 0]) for d in near]
+        slope = (shifts[1] - shifts[0]) / (near[1] - near[0])
+        whole, mode = (len(columns) * grid_px, len(rows) * grid_px), self._padding
+        fields = [
+            cv2.resize(np.nan_to_num(field).astype(np.float32).reshape(len(rows), len(columns)), whole)
+            for field in (shifts[0] - slope * near[0], slope)
+        ]
+        return ColumnShift(*(np.pad(f[: shape[0], : shape[1]], ((0, 0), (pad_px, pad_px)), mode=mode) for f in fields))
+
+    @property
+    def _padding(self) -> Literal["wrap", "edge"]:
+        return "wrap" if self.model.cylinder.width == self.model.cylinder.turn_px else "edge"

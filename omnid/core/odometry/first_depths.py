@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.odometry.estimates import SAME_M
 from omnid.core.odometry.tracking import KltSettings, track
-from omnid.core.odometry.wrong_periods import disparities_alike
+from omnid.core.odometry.wrong_periods import matching_disparities
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.stereo_model import StereoModel
 
@@ -112,11 +112,9 @@ class FirstDepths:
         """True while the motion may be larger or smaller than the depths of the map give it."""
         return self._larger_share != 0.0
 
-    def runner_up(self, T_odom_rect: Array) -> Array | None:
-        """Return the displacement (6,) [t; r] from a pose to the runner-up; None: it is small, or there is none."""
-        moved = se3.log(se3.inverse(self._T_odom_rect) @ T_odom_rect)
-        displacement = self._larger_share * np.concatenate([moved[:3], np.zeros(3)])
-        return displacement if np.linalg.norm(displacement) > SAME_M else None
+    def doubt_m(self, T_odom_rect: Array) -> float:
+        """Return the distance [m] from a pose to the runner-up."""
+        return abs(self._larger_share) * float(np.linalg.norm(T_odom_rect[:3, 3] - self._T_odom_rect[:3, 3]))
 
     def decide(self, lower: PaddedPanorama, klt: KltSettings, local_map: LocalMap, step_m: tuple[float, float]) -> None:
         """Follow the landmarks into the next panorama, and correct their depths where it shows how far it is.
@@ -150,7 +148,7 @@ class FirstDepths:
         self._taken = np.where(is_decided, chosen, self._taken)
         views = self._views[moved]
         views[:, 2] = views[:, 1] + self._disparities[each, chosen][moved]
-        local_map.replace_views(self._ids[moved], views, np.tile(VIEW_NOISE, (len(views), 1, 1)))
+        local_map.set_views(self._ids[moved], views, np.tile(VIEW_NOISE, (len(views), 1, 1)))
         local_map.keep(self._ids[is_right])
 
     def _largest_share(self) -> float:
@@ -206,7 +204,7 @@ def reach_m(most_m: float, sensed_m: float) -> tuple[float, float]:
 
 def _disparities(pair: Pair, views: Array, model: StereoModel) -> Array:
     """Return the disparities (N, K) [px] at which views (N, 3) match, up to that of the baseline's distance."""
-    return disparities_alike(pair, views, round(model.cylinder.focal_px))
+    return matching_disparities(pair, views, round(model.cylinder.focal_px))
 
 
 def _repeats(disparities: Array) -> Flags:

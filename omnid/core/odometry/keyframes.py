@@ -76,8 +76,7 @@ class Keyframes:
         new = located(frame, points, self._model, self._klt, request.exposure, request.views)
         keyframe = Keyframe(frame.seq, frame.lower, request.T_odom_rect, request.covariance)
         is_first = not len(self._map)
-        ids = self._map.add_keyframe(keyframe, new.views, new.slopes, new.whole_noise, new.pixels)
-        self._map.late_depths.added(ids, new)
+        ids = self._map.add_located(keyframe, new)
         if is_first and frame.times.is_at_once:
             pair = frame.lower, frame.upper
             self._map.first_depths = FirstDepths.of(pair, keyframe, ids, new.views, self._model)

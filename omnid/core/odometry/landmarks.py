@@ -17,9 +17,6 @@ from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
 
-# Half the distance over which the correction of a slope for the motion is taken.
-SLOPE_STEP_PX = 4.0
-
 
 @dataclass(frozen=True, slots=True)
 class NewLandmarks:
@@ -27,15 +24,9 @@ class NewLandmarks:
 
     pixels: Array  # (N, 2) px in the lower panorama
     views: Array  # (N, 3) px, at the stamp
-    slopes: Array  # (N, 2) px/px of the disparity, at the stamp
+    slopes: Array  # (N, 2) px/px of the disparity
     noise: Array  # (N, 3, 3) px^2 of the views, that of the motion left out
     assumed: AssumedMotion  # motion by which the views were corrected
-
-    @property
-    def whole_noise(self) -> Array:
-        """Covariance (N, 3, 3) [px^2] of the views, also by the uncertain motion."""
-        velocity, J = self.assumed
-        return np.asarray(self.noise + J @ velocity.covariance @ np.swapaxes(J, 1, 2))
 
 
 def located(
@@ -50,7 +41,6 @@ def located(
     dense = replace(frame, exposure=exposure).disparity
     guess, spread_px = exposure.upper_pixels(corners, nearby_disparity(dense, corners))
     pair = frame.lower, frame.upper
-
     # 2. Track into the upper panorama, and align the patch there with the slopes of its surface.
     near = pixels_in_upper(pair, corners, guess, klt, spread_px)
     slopes = disparity_slopes(dense, corners, near[:, 1] - corners[:, 1])
@@ -58,23 +48,7 @@ def located(
     rows, variance = align_rows(pair, corners, near, slopes, model)
     found = np.isfinite(rows)
     found[found] = ~has_wrong_period(pair, corners[found], rows[found], known)
-    pixels, rows, slopes = corners[found], rows[found], slopes[found]
-    noise = view_noise(np.zeros((2, 2)), variance[found])
-
     # 3. Correct the views for the motion during the exposures.
-    views, _ = exposure.corrected(pixels, rows)
+    views, _ = exposure.corrected(corners[found], rows[found])
     assumed = AssumedMotion(exposure.motion, exposure.derivatives(views))
-    return NewLandmarks(pixels, views, _at_stamp(slopes, pixels, rows, exposure), noise, assumed)
-
-
-def _at_stamp(slopes: Array, pixels: Array, rows: Array, exposure: Exposure) -> Array:
-    """Return slopes (N, 2) at the stamp from slopes between the exposures at pixels (N, 2) with upper rows (N,)."""
-    corrected = np.empty(slopes.shape)
-    for axis, step in enumerate(SLOPE_STEP_PX * np.eye(2)):
-        ends = []
-        for sign in (1, -1):
-            there, above = pixels + sign * step, rows + sign * (step[1] + SLOPE_STEP_PX * slopes[:, axis])
-            views, _ = exposure.corrected(there, above)
-            ends.append((views[:, 2] - views[:, 1]) - (above - there[:, 1]))
-        corrected[:, axis] = slopes[:, axis] + (ends[0] - ends[1]) / (2 * SLOPE_STEP_PX)
-    return np.where(np.isfinite(corrected), corrected, slopes)
+    return NewLandmarks(corners[found], views, slopes[found], view_noise(np.zeros((2, 2)), variance[found]), assumed)

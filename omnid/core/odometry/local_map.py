@@ -10,7 +10,8 @@ keyframe leaves when it is the oldest of too many or anchors no landmark any mor
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +37,22 @@ COARSE_ITERATIONS = 8  # Iterations of Lucas-Kanade on each level, few because t
 # Px: a landmark predicted nearer to the panorama's upper or lower edge is not tracked.
 EDGE_ROWS = 3
 
+# One row of the table for each landmark. Points and covariance in odom follow from those in the anchor.
+LANDMARK = np.dtype(
+    [
+        ("id", np.intp),  # unique, in the order of addition
+        ("anchor", np.intp),  # seq of the keyframe that saw the landmark first
+        ("anchor_points", float, 3),  # m in the rectified frame of the anchor
+        ("anchor_covariance", float, (3, 3)),  # m^2 in the same axes
+        ("anchor_pixels", float, 2),  # px where the anchor's lower panorama shows it
+        ("slopes", float, 2),  # px/px of the disparity about the view, along column and row
+        ("points", float, 3),  # m in odom
+        ("covariance", float, (3, 3)),  # m^2 in odom
+        ("pixels", float, 2),  # px in the last accepted panorama, NaN: not found there
+        ("misses", np.intp),  # consecutive accepted frames in which the landmark was no inlier
+    ]
+)
+
 
 @dataclass(frozen=True, slots=True)
 class Keyframe:
@@ -45,32 +62,6 @@ class Keyframe:
     lower: PaddedPanorama
     T_odom_rect: Array
     covariance: Array  # (6, 6) [t; r] in the rectified frame
-
-
-@dataclass(frozen=True, slots=True)
-class LandmarkTable:
-    """One row for each landmark.
-
-    points and covariance in odom follow from those in the anchor, which stays where it is.
-    """
-
-    id: Indices  # (N,) unique, in the order of addition
-    anchor: Indices  # (N,) seq of the keyframe that saw the landmark first
-    anchor_points: Array  # (N, 3) m in the rectified frame of the anchor
-    anchor_covariance: Array  # (N, 3, 3) m^2 in the same axes
-    anchor_pixels: Array  # (N, 2) px where the anchor's lower panorama shows it
-    slopes: Array  # (N, 2) px/px of the disparity about the view, along column and row
-    points: Array  # (N, 3) m in odom
-    covariance: Array  # (N, 3, 3) m^2 in odom
-    pixels: Array  # (N, 2) px in the last accepted panorama, NaN: not found there
-    misses: Indices  # (N,) consecutive accepted frames in which the landmark was no inlier
-
-    @staticmethod
-    def empty() -> LandmarkTable:
-        """Return a table without rows."""
-        none, vectors, matrices = np.zeros(0, np.intp), np.zeros((0, 3)), np.zeros((0, 3, 3))
-        pixels = np.zeros((0, 2))
-        return LandmarkTable(none, none, vectors, matrices, pixels, pixels, vectors, matrices, pixels, none)
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,27 +83,28 @@ class Tracks:
 
 
 class LocalMap:
-    """Keyframes by seq, their landmarks, and the last panorama in which these were found."""
+    """Keyframes by seq, their landmarks, and the last panorama in which these were found: the only writer of them."""
 
     def __init__(self, model: StereoModel, klt: KltSettings, max_keyframes: int = 8, max_misses: int = 3) -> None:
         self._model, self._max_keyframes, self._max_misses = model, max_keyframes, max_misses
         self._coarse_klt = replace(klt, iterations=min(klt.iterations, COARSE_ITERATIONS))
         self._near_klt = replace(self._coarse_klt, levels=0)
         self._next_id = 0
-        self.late_depths = LateDepths(self)
         self.lost: NDArray[np.bool_] | None = None  # (H, W) of the frame, in which no landmark is searched; None: none
         self.clear()
 
     def __len__(self) -> int:
-        return len(self.table.id)
+        return len(self.table)
 
     def clear(self) -> None:
         """Remove all landmarks and keyframes."""
         self.keyframes: dict[int, Keyframe] = {}
-        self.table = LandmarkTable.empty()
-        self.late_depths.clear()
+        self.table: np.recarray[Any, Any] = np.zeros(0, LANDMARK).view(np.recarray)
         self.first_depths: FirstDepths | None = None  # of the only keyframe; None: its depths are not in doubt
         self.last: PaddedPanorama | None = None  # the last accepted lower panorama; None: there is no map
+        # What waits for the velocity at its frame: an estimate with the ids of its landmarks, and new landmarks.
+        self._seen: tuple[Indices, PoseEstimate] | None = None
+        self._added: tuple[Indices, NewLandmarks] | None = None
 
     def add_keyframe(
         self, keyframe: Keyframe, views: Array, slopes: Array, noise: Array | None = None, pixels: Array | None = None
@@ -121,45 +113,60 @@ class LocalMap:
 
         views (N, 3) [px]: those of the landmarks. slopes (N, 2): those of the disparity. noise: covariance (N, 3, 3)
         [px^2] of the views in addition to that of the model; None: none. pixels (N, 2): those in the keyframe's
-        panorama, which differ from the views where it was exposed at several times; None: those of the views. Return
-        the ids (N,) of the landmarks; -1 for views that cannot be triangulated, which are left out.
+        panorama, which differ from the views where it was exposed at several times; None: those of the views.
+        Return the ids (N,) of the landmarks; -1 for views that cannot be triangulated, which are left out.
         """
         self.last = keyframe.lower
-        points = triangulate(views, self._model.cylinder, self._model.baseline_m)
-        finite = np.isfinite(points).all(axis=1)
-        pixels = (views[:, :2] if pixels is None else pixels)[finite]
-        slopes, points = slopes[finite], points[finite]
-        covariance = point_covariance(
-            points,
-            self._model.cylinder,
-            self._model.baseline_m,
-            self._model.sigma_px,
-            None if noise is None else noise[finite],
-        )
-        count = len(points)
-        ids = np.arange(self._next_id, self._next_id + count)
-        self._next_id += count
-        new = LandmarkTable(
-            ids,
-            np.full(count, keyframe.seq),
-            points,
-            covariance,
-            pixels,
-            slopes,
-            np.empty(points.shape),
-            np.empty(covariance.shape),
-            pixels=pixels.copy(),
-            misses=np.zeros(count, np.intp),
-        )
+        finite = np.isfinite(triangulate(views, self._model.cylinder, self._model.baseline_m)).all(axis=1)
+        new = np.zeros(int(finite.sum()), LANDMARK).view(np.recarray)
+        new.id = np.arange(self._next_id, self._next_id + len(new))
+        self._next_id += len(new)
+        new.anchor, new.slopes = keyframe.seq, slopes[finite]
+        new.pixels = new.anchor_pixels = (views[:, :2] if pixels is None else pixels)[finite]
         self.keyframes[keyframe.seq] = keyframe
-        self.table = _joined(self.table, new)
-        self._place(np.arange(len(self) - count, len(self)), points, covariance)
+        self.table = np.concatenate([self.table, new]).view(np.recarray)
+        self.set_views(new.id, views[finite], None if noise is None else noise[finite])
         while len(self.keyframes) > self._max_keyframes:
             self.keyframes.pop(min(self.keyframes))
         self._select(np.isin(self.table.anchor, list(self.keyframes)))
         given = np.full(finite.shape, -1)
-        given[finite] = ids
+        given[finite] = new.id
         return given
+
+    def add_located(self, keyframe: Keyframe, new: NewLandmarks) -> Indices:
+        """Add a keyframe with located landmarks, which are corrected once the velocity is known; return their ids."""
+        motion, J = new.assumed
+        noise = new.noise + J @ motion.covariance @ np.swapaxes(J, 1, 2)
+        ids = self.add_keyframe(keyframe, new.views, new.slopes, noise, new.pixels)
+        self._added = None if new.assumed.is_final else (ids, new)
+        return ids
+
+    def accept(self, lower: PaddedPanorama, estimate: PoseEstimate) -> None:
+        """Record the inliers of an accepted pose, and correct depths, at once or when the velocity is known."""
+        if estimate.assumed.is_final:
+            disparity = estimate.views[:, 2] - estimate.views[:, 1]
+            self.update_depths(estimate.landmarks, disparity, estimate.variance, estimate.T_odom_rect)
+        else:
+            self._seen = self.table.id[estimate.landmarks], estimate
+        self.update_tracked(lower, estimate.landmarks, estimate.pixels)
+
+    def settle(self, velocity: RigVelocity | None) -> None:
+        """Correct the map by what waits, with the velocity at that frame; None: no better one than was assumed."""
+        if self._added is not None and velocity is not None:
+            ids, new = self._added
+            assumed, J = new.assumed
+            views = new.views + J @ (velocity.twist - assumed.twist)
+            noise = new.noise + J @ velocity.covariance @ np.swapaxes(J, 1, 2)
+            self.set_views(ids, views, noise)
+        if self._seen is not None:
+            ids, estimate = self._seen
+            assumed, J = estimate.assumed
+            known = assumed if velocity is None else velocity
+            disparity = estimate.views[:, 2] - estimate.views[:, 1] + J @ (known.twist - assumed.twist)
+            variance = estimate.variance + np.einsum("ni,ij,nj->n", J, known.covariance, J)
+            rows, kept = self.rows(ids)
+            self.update_depths(rows, disparity[kept], variance[kept], estimate.T_odom_rect)
+        self._seen = self._added = None
 
     def rows(self, ids: Indices) -> tuple[Indices, Flags]:
         """Return the rows (M,) of those landmarks that are still kept, and which (N,) of the ids these are."""
@@ -167,17 +174,17 @@ class LocalMap:
         known = np.isin(ids, self.table.id)
         return rows[known], known
 
-    def replace_views(self, ids: Indices, views: Array, noise: Array) -> None:
+    def set_views(self, ids: Indices, views: Array, noise: Array | None) -> None:
         """Set the views (N, 3) [px] of landmarks (ids) in their anchors, and their noise as in `add_keyframe`.
 
-        Where a view cannot be triangulated the landmark stays as it is.
+        Where a view cannot be triangulated the landmark stays as it is; those that have left the map are ignored.
         """
         rows, known = self.rows(ids)
         points = triangulate(views[known], self._model.cylinder, self._model.baseline_m)
         finite = np.isfinite(points).all(axis=1)
-        rows, points, views, noise = rows[finite], points[finite], views[known][finite], noise[known][finite]
-        spread = point_covariance(points, self._model.cylinder, self._model.baseline_m, self._model.sigma_px, noise)
-        self._place(rows, points, spread)
+        camera = self._model.cylinder, self._model.baseline_m, self._model.sigma_px
+        noise = None if noise is None else noise[known][finite]
+        self._place(rows[finite], points[finite], point_covariance(points[finite], *camera, noise))
 
     def update_depths(self, rows: Indices, disparity: Array, variance: Array, T_odom_rect: Array) -> None:
         """Correct the points of landmarks (rows (M,) of the table) by disparities (M,) [px] measured at a pose.
@@ -241,7 +248,7 @@ class LocalMap:
 
     def _select(self, kept: Flags) -> None:
         """Keep some landmarks (flags (N,)) and the keyframes that anchor them."""
-        self.table = _selected(self.table, kept)
+        self.table = self.table[kept].view(np.recarray)
         anchors = set(self.table.anchor.tolist())
         self.keyframes = {seq: keyframe for seq, keyframe in self.keyframes.items() if seq in anchors}
 
@@ -335,57 +342,3 @@ class LocalMap:
         A = se3.adjoint(se3.inverse(estimate.T_odom_rect) @ poses)
         weighted = (counts / counts.sum())[:, None, None] * A
         return np.asarray((weighted @ covariance @ np.swapaxes(A, 1, 2)).sum(axis=0))
-
-
-class LateDepths:
-    """Measurements of the last frame of the landmarks of a map; at most one frame waits."""
-
-    def __init__(self, local_map: LocalMap) -> None:
-        self._map = local_map
-        self.clear()
-
-    def clear(self) -> None:
-        """Forget what waits."""
-        self._seen: tuple[Indices, PoseEstimate] | None = None
-        self._added: tuple[Indices, NewLandmarks] | None = None
-
-    def seen(self, ids: Indices, estimate: PoseEstimate) -> None:
-        """Correct the depths of the landmarks (N,) of an estimate, at once or when the velocity is known."""
-        if estimate.assumed.is_final:
-            disparity = estimate.views[:, 2] - estimate.views[:, 1]
-            self._map.update_depths(estimate.landmarks, disparity, estimate.variance, estimate.T_odom_rect)
-        else:
-            self._seen = ids, estimate
-
-    def added(self, ids: Indices, new: NewLandmarks) -> None:
-        """Correct the landmarks of a new keyframe, whose ids are (N,), when the velocity is known."""
-        self._added = None if new.assumed.is_final else (ids, new)
-
-    def settle(self, velocity: RigVelocity | None) -> None:
-        """Correct the map by what waits, with the velocity at that frame; None: no better one than was assumed."""
-        if self._added is not None and velocity is not None:
-            ids, new = self._added
-            assumed, J = new.assumed
-            views = new.views + J @ (velocity.twist - assumed.twist)
-            self._map.replace_views(ids, views, new.noise + J @ velocity.covariance @ np.swapaxes(J, 1, 2))
-        if self._seen is not None:
-            ids, estimate = self._seen
-            assumed, J = estimate.assumed
-            known = assumed if velocity is None else velocity
-            disparity = estimate.views[:, 2] - estimate.views[:, 1] + J @ (known.twist - assumed.twist)
-            variance = estimate.variance + np.einsum("ni,ij,nj->n", J, known.covariance, J)
-            rows, kept = self._map.rows(ids)
-            self._map.update_depths(rows, disparity[kept], variance[kept], estimate.T_odom_rect)
-        self.clear()
-
-
-def _selected(table: LandmarkTable, kept: Flags) -> LandmarkTable:
-    """Return the rows of a table for which kept (N,) is true."""
-    return LandmarkTable(*(getattr(table, column.name)[kept] for column in fields(table)))
-
-
-def _joined(first: LandmarkTable, second: LandmarkTable) -> LandmarkTable:
-    """Return the rows of two tables."""
-    return LandmarkTable(
-        *(np.concatenate([getattr(first, column.name), getattr(second, column.name)]) for column in fields(first))
-    )

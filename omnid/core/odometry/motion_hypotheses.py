@@ -31,10 +31,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
+from omnid.core.odometry.correlation import normalised_patches
 from omnid.core.odometry.estimates import SAME_M, PoseEstimate
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.motion_filter import START_ACCELERATION_VARIANCE
-from omnid.core.odometry.wrong_periods import normalised_patches
 from omnid.core.stereo.triangulation import view
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.stereo_model import StereoModel
@@ -216,7 +216,7 @@ def displacements(
         return []
     steps = math.ceil(reach_m / step_m)
     offsets: Array = np.arange(-steps, steps + 1, dtype=float) * step_m
-    patches, contrast = normalised_patches(before, table.pixels[rows], SAMPLES, SAMPLE_PX, _blurred(before))
+    patches, contrast = normalised_patches(before, np.rint(table.pixels[rows]), SAMPLES, SAMPLE_PX, _blurred(before))
     textured = contrast > MIN_PATCH_GREY
     if not textured.any():
         return []
@@ -225,7 +225,7 @@ def displacements(
     for a, x in enumerate(offsets):
         moved = np.concatenate([points - (x, y, 0.0) for y in offsets])
         pixels = view(moved, model.cylinder, model.baseline_m)[:, :2]
-        seen, _ = normalised_patches(current, pixels, SAMPLES, SAMPLE_PX, blurred)
+        seen, _ = normalised_patches(current, np.rint(pixels), SAMPLES, SAMPLE_PX, blurred)
         each = np.einsum("gns,ns->gn", seen.reshape(len(offsets), *patches.shape), patches)
         scores[a] = each[:, textured].mean(axis=1)
     # 3. Its peaks.

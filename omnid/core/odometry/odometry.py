@@ -166,10 +166,9 @@ class VisualOdometry:
             is_known = bool(plausible) and plausible[0].inliers >= self._limits.good_inliers
             refused = self._refuse(now, found, gap if is_known else None)
             return replace(refused, refused_mps=too_fast_mps)
-        chosen, contradicting = self._hypotheses.choose(plausible, now.T_odom_rect, now.since_fix_s, now.sigma_mps)
+        estimate, contradicting = self._hypotheses.choose(plausible, now.T_odom_rect, now.since_fix_s, now.sigma_mps)
 
         # 6. Update the filter (eq. 11), the pose, the mask of what is fixed to the rig, and the map.
-        estimate = self._search.with_doubtful_depths(chosen)
         self._accept(now, estimate, is_reset=bool(np.linalg.norm(gap[3:]) > JUMP_RAD))
         new = estimate.pixels[self._map.table.anchor[estimate.landmarks] == self._added]
         self._added = None
@@ -280,7 +279,7 @@ class VisualOdometry:
                 self.breaks.lines.add(now.frame.seq, estimate, self._map, velocity, now.dt_s)
         elif not now.is_measured:
             self._motion.reset()
-        self._map.late_depths.settle(at_previous)
+        self._map.settle(at_previous)
         self._motion.found(estimate.covariance + self._map.covariance_of(estimate))
         self._T_odom_rect = self._T_at_fix = estimate.T_odom_rect
         # What the upper camera does not show where it must be is an outlier there.
@@ -349,8 +348,7 @@ class VisualOdometry:
 
     def _update_map(self, now: _Prediction, estimate: PoseEstimate, exposure: Exposure) -> KeyframeRequest | None:
         """Remove lost landmarks; return the keyframe that is to be added, where too few are left."""
-        self._map.late_depths.seen(self._map.table.id[estimate.landmarks], estimate)
-        self._map.update_tracked(now.frame.lower, estimate.landmarks, estimate.pixels)
+        self._map.accept(now.frame.lower, estimate)
         if not self._keyframes.is_due(len(estimate.landmarks), now.dt_s):
             return None
         request = self._request(now.frame, now.usable, exposure)

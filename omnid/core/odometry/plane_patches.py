@@ -43,6 +43,10 @@ SLOPE_WINDOW_PX, SLOPE_ROUNDS = 21, 2
 MAX_SLOPE = 0.7  # Largest slope of a disparity, because a steeper plane is seen so obliquely that it has no patch.
 # Px/px, of the start, because those of dense stereo are a third too flat, its windows being upright.
 SLOPE_SIGMA = 0.1
+# Nodes of a template farther than so many halves of its side from the middle do not bend it.
+MOST_STRETCH = 4
+# Coefficients of the powers 0, 1, 2 of a polynomial by its values at -1, 0 and 1.
+POWERS = np.array([[0.0, 1.0, 0.0], [-0.5, 0.0, 0.5], [0.5, -1.0, 0.5]])
 # Reach of patches whose pose and depth are known well.
 REACH_PX = 1
 # By which a patch may move sideways in the upper panorama from where it was tracked to.
@@ -78,17 +82,35 @@ def plane_templates(
     which shows the centres at predicted (N, 2). Where a plane is seen edge on, the patch is not bent. KeyError for an
     anchor without an image.
     """
-    templates = np.empty((len(pixels), window_px + 2, window_px + 2), np.float32)
-    focal_px = model.cylinder.focal_px
-    points, normals = np.ascontiguousarray(surfaces[0]), _normals(surfaces, model.baseline_m)
-    shift = np.ascontiguousarray(np.rint(predicted) - predicted)
-    height_m = model.baseline_m if upper else 0.0
+    side, cylinder, half = window_px + 2, model.cylinder, (window_px + 2) // 2
+    templates = np.zeros((len(pixels), side, side), np.float32)
+    # 1. Rays of corners, middles of the sides and middle of the templates, from the current viewpoint o'.
+    origin = np.array([0.0, 0.0, model.baseline_m if upper else 0.0])
+    R, t = T_curr_ref[:, :3, :3], T_curr_ref[:, :3, 3]
+    n, shift = _turned(R, _normals(surfaces, model.baseline_m)), (np.rint(predicted) - predicted)[:, None]
+    steps = half * np.array([(column, row) for row in (-1, 0, 1) for column in (-1, 0, 1)])
+    nodes = cylinder.pixels(_turned(R, surfaces[0]) + t - origin)[:, None] + shift + steps
+    rays = cylinder.rays(nodes.reshape(-1, 2)).reshape(*nodes.shape[:2], 3)
+    # 2. Their points on the plane n' . (p' - o') = scale, and where the image shows these. A template of which the
+    #    plane explains a part alone is not bent.
+    along, scale = (rays * n[:, None]).sum(axis=2), 1 + (n * (t - origin)).sum(axis=1, keepdims=True)
+    there = ((scale / along)[:, :, None] * rays + (origin - t)[:, None]) @ R
+    offsets = cylinder.pixels(there.reshape(-1, 3)).reshape(nodes.shape) - cylinder.pixels(surfaces[0])[:, None]
+    offsets[:, :, 0] = cylinder.wrap(offsets[:, :, 0])
+    is_bent = (scale > 0) & (along > 0) & (np.abs(offsets) < MOST_STRETCH * half).all(axis=2)
+    offsets = np.where(is_bent.all(axis=1)[:, None, None], offsets, steps + shift)
+    # 3. The quadratic polynomials through them, and the greys of the pixels in between.
+    known = np.isfinite(offsets).all(axis=(1, 2)) & np.isfinite(pixels).all(axis=1)
     for key in np.unique(anchors).tolist():
-        image, chosen = images[key], np.flatnonzero(anchors == key)
-        centres = _padded(image, pixels)
-        patch_kernels.sample(
-            image.image, chosen, centres, points, normals, T_curr_ref, height_m, shift, focal_px, templates
-        )
+        image, chosen = images[key], np.flatnonzero(known & (anchors == key))
+        places = offsets[chosen] + _padded(image, pixels[chosen])[:, None]
+        first = np.floor(places.min(axis=1)).astype(np.intp) - 2
+        cells = np.stack([first, np.floor(places.max(axis=1)).astype(np.intp) + 4 - first], axis=1)
+        values = (places - first[:, None]).swapaxes(1, 2).reshape(-1, 2, 3, 3)
+        powers, found = POWERS / half ** np.arange(3)[:, None], np.empty((len(chosen), side, side), np.float32)
+        if len(chosen):
+            patch_kernels.sample(image.image, cells, powers @ values @ powers.T, found)
+        templates[chosen] = found
     return templates
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.estimates import OdometryLimits, PoseEstimate
+from omnid.core.odometry.estimates import SAME_M, OdometryLimits, PoseEstimate
 from omnid.core.odometry.exposure_times import AssumedMotion, Exposure
 from omnid.core.odometry.local_map import LocalMap, Tracks
 from omnid.core.odometry.motion_hypotheses import displacements
@@ -142,16 +142,6 @@ class PoseSearch:
             others.append(None if coarse is None else self.refine(frame, coarse, exposure))
         return [each for each in others if each is not None and each.distance_m(T_predicted) < max(reach_m, off_m)]
 
-    def with_doubtful_depths(self, estimate: PoseEstimate) -> PoseEstimate:
-        """Return an estimate whose covariance covers other depths of the first keyframe: first_depths.py."""
-        first = self._map.first_depths
-        other = None if first is None else first.runner_up(estimate.T_odom_rect)
-        if other is None:
-            return estimate
-        # Of landmarks with several depths a pose may also err to the side.
-        covariance = estimate.covariance + np.diag(np.repeat([float(other[:3] @ other[:3]), 0.0], 3))
-        return replace(estimate, covariance=covariance, doubtful_depths=True)
-
     def estimate(self, frame: StereoFrame, T_guess: Array, exposure: Exposure, *, is_near: bool) -> PoseEstimate | None:
         """Return the pose from one guess; None: no landmarks were found."""
         # 1. Track the landmarks of the last panorama by KLT, forward and backward (section IV.A).
@@ -232,8 +222,12 @@ class PoseSearch:
         solution, kept = self._solve(landmarks, views, coarse.T_curr_odom, self._model, noise, by_motion)
         if solution is None:
             return None
-        # 4. The covariance: errors larger than expected enlarge it, smaller ones never reduce it.
+        # 4. The covariance: errors larger than expected enlarge it, smaller ones never reduce it. It covers other
+        #    depths of the first keyframe (first_depths.py), with which a pose may also err to the side.
+        T_odom_rect = se3.inverse(solution.T)
         scale = CORRELATED_LANDMARKS * max(1.0, float(solution.squared.mean()) / VIEW_DIMENSIONS)
+        first = self._map.first_depths
+        doubt_m = 0.0 if first is None else first.doubt_m(T_odom_rect)
         variance = variance[landmarks]
         # 5. The motion by which later frames correct depths is the one before this pair. The velocity found here agrees
         # with the depths in the map, so it must not correct them: a vertical one has the effect of another baseline,
@@ -248,8 +242,8 @@ class PoseSearch:
             round(tracks.each_counts * n) for n in (tracks.visible, len(tracks.landmarks), len(coarse.landmarks))
         )
         return PoseEstimate(
-            se3.inverse(solution.T),
-            scale * solution.covariance,
+            T_odom_rect,
+            scale * solution.covariance + np.diag(np.repeat([doubt_m**2, 0.0], 3)),
             visible,
             tracked,
             min(supporting, len(landmarks)),
@@ -261,6 +255,7 @@ class PoseSearch:
             assumed,
             _cost(solution.squared[solution.squared < OUTLIER_SQUARED], in_view),
             in_view,
+            doubtful_depths=doubt_m > SAME_M,
             upper_ratio=_upper_ratio(frame, coarse),
         )
 

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.panorama import Cylinder
-from omnid.core.odometry.earlier_kernels import HALF_PX
-from omnid.core.odometry.earlier_view import EarlierView, contradicted
+from omnid.core.odometry.earlier_view import HALF_PX, EarlierView, contradicted
 from omnid.core.odometry.exposure_times import Exposure
 from tests.omnid.core.scenery import texture, wrapped
 
