@@ -567,6 +567,42 @@ def test_a_write_ahead_log_that_is_cut_within_a_transaction_is_told(tmp_path: Pa
     assert "is cut within a transaction" in log_info(path).fault and log_info(path).state is LogState.BROKEN
 
 
+@pytest.mark.parametrize("head", [b"", bytes(4096)], ids=["empty", "zeros"])
+def test_a_database_whose_first_page_is_only_in_its_write_ahead_log_is_read(tmp_path: Path, head: bytes) -> None:
+    """As where power failed before the recorder's first checkpoint."""
+    with (
+        closing(sqlite3.connect(tmp_path / "made.db3")) as bag,
+        closing(sqlite3.connect(write_db3(tmp_path / "bag", pairs(PAIRS)))) as whole,
+    ):
+        bag.execute("PRAGMA journal_mode = WAL")
+        bag.execute("PRAGMA wal_autocheckpoint = 0")
+        bag.executescript("\n".join(whole.iterdump()))
+        bag.commit()
+        path = tmp_path / "killed" / "bag_0.db3"
+        path.parent.mkdir()
+        shutil.copy(tmp_path / "made.db3-wal", f"{path}-wal")
+    path.write_bytes(head)
+    found, reader = read(path)
+    assert found == expected(PAIRS) and not reader.warnings and path.read_bytes() == head
+    assert log_info(path.parent).state is LogState.WHOLE
+
+
+@pytest.mark.parametrize("kept", ["no index", "the index of one topic"])
+def test_an_index_that_lacks_messages_costs_none(tmp_path: Path, kept: str) -> None:
+    """mcap's own reader delivers them all; the records of an index have the opcode 7."""
+    path = write_log(tmp_path / "log.mcap", pairs(PAIRS), chunk_size=700)
+    data, at, left = path.read_bytes(), len(MAGIC), 0
+    changed = bytearray(data)
+    while data[at] != 0x0F:  # the end of the data
+        left = 0 if data[at] == 6 else left + (data[at] == 7)
+        if data[at] == 7 and (kept == "no index" or left == 2):
+            changed[at] = 0x80  # a private record
+        at += 9 + int.from_bytes(data[at + 1 : at + 9], "little")
+    path.write_bytes(changed)
+    found, reader = read(path)
+    assert found == expected(PAIRS) and not reader.warnings
+
+
 SQL_OF_OTHER_TABLES: Final = {
     "no bag": ["DROP TABLE messages"],
     "columns in another order": [

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
+from typing import Final
 
 import pytest
 
@@ -52,6 +54,51 @@ def test_a_list_holds_the_seconds_of_numbered_images(tmp_path: Path, where: str,
     (folder / (where or ".") / name).write_text("1.0\n")
     with pytest.raises(DriverError, match="12 images, and its list of stamps 1 lines"):
         LogReader(folder)
+
+
+# Lines of a list with two columns, by number, stamp [ns] and camera -> name of the file, a line, folder it is in.
+LISTS: Final[dict[str, tuple[str, Callable[[int, int, str], str], str]]] = {
+    "number and seconds": ("times.txt", lambda n, ns, _: f"{n} {ns // 10**9}.{ns % 10**9:09d}", "lower"),
+    "seconds and number": ("times.txt", lambda n, ns, _: f"{ns // 10**9}.{ns % 10**9:09d},{n}", "lower"),
+    "name and seconds": ("timestamps.txt", lambda n, ns, _: f"frame{n}.jpg;{ns // 10**9}.{ns % 10**9:09d}", "lower"),
+    "name without suffix": ("times.txt", lambda n, ns, _: f"frame{n} {ns // 10**9}.{ns % 10**9:09d}", ""),
+    "nanoseconds": ("times.txt", lambda n, ns, _: str(ns), ""),
+    "EuRoC": ("data.csv", lambda n, ns, _: f"{ns},frame{n}.jpg", "lower"),
+    "TUM": ("rgb.txt", lambda n, ns, camera: f"{ns // 10**9}.{ns % 10**9:09d} {camera}/frame{n}.jpg", ""),
+    "KITTI": ("timestamps.txt", lambda n, ns, _: f"2023-11-14 22:13:{20 + n // 10}.{n % 10}00000000", "lower"),
+}
+
+
+@pytest.mark.parametrize("name", LISTS)
+@pytest.mark.parametrize("head", ["", "#timestamp [ns],filename\n", "stamp name\n"])
+def test_a_list_may_have_names_or_numbers_beside_the_stamps(tmp_path: Path, name: str, head: str) -> None:
+    """In any order of lines where it names the images."""
+    folder = write_folders(tmp_path / "images", pairs(PAIRS), lambda stamp_ns: f"frame{NUMBERS[stamp_ns]}")
+    file, line, where = LISTS[name]
+    lines: dict[str, list[str]] = {}
+    for number in range(PAIRS):
+        for camera in ("lower", "upper"):
+            stamp_ns = START_NS + STEP_NS * number
+            lines.setdefault(camera if where else "", []).append(line(number, stamp_ns, camera))
+    for camera, of_camera in lines.items():
+        unique = [*dict.fromkeys(of_camera)]
+        if "frame" in unique[0]:
+            unique.reverse()
+        (folder / camera / file).write_text(head + "\n".join(unique))
+    found, reader = read(folder)
+    assert not reader.warnings
+    for camera in ("lower", "upper"):
+        mine = [frame[2:] for frame in found if frame[0] == camera]
+        assert [stamp_ns for stamp_ns, _ in mine] == [START_NS + STEP_NS * number for number in range(PAIRS)]
+        assert [image for _, image in mine] == [frame[3] for frame in expected(PAIRS) if frame[0] == camera]
+
+
+def test_images_that_a_list_does_not_name_are_told(tmp_path: Path) -> None:
+    folder = write_folders(tmp_path / "images", pairs(PAIRS), lambda stamp_ns: f"frame{NUMBERS[stamp_ns]}")
+    (folder / "rgb.txt").write_text("\n".join(f"{number}.5 frame{number}.jpg" for number in range(PAIRS - 2)))
+    found, reader = read(folder)
+    assert len(found) == 2 * (PAIRS - 2) and reader.truncated
+    assert f"2 images of '{folder}/lower' are left out: rgb.txt does not list them" in reader.warnings[0]
 
 
 def test_numbered_images_have_the_stated_rate(tmp_path: Path) -> None:
