@@ -176,11 +176,14 @@ class _Segments:
             apart, around = stamps - log - self.delay_ns, np.pad(log_ns, 1, "reflect", reflect_type="odd")
             is_alone = (around[2:] - around[:-2] >= LONGEST_STEP * period)[used]
             is_alone[1 - SHORTEST_RUN :] = False  # what follows them is not known
+            # No image was taken long before the first one, nor within half a period of another.
             taken = np.append(np.sort(stamps[is_regular]), [np.iinfo(np.int64).max])
             is_taken = taken[np.searchsorted(taken, stamps - round(period / 2))] < stamps + period / 2
+            is_taken |= stamps < taken[0] - LONGEST_STEP * period
+            usual = min(STEP_NS, max(period, 2 * np.ptp(lateness))) if regular else STEP_NS
             for fault, is_so in (
-                ("lie ahead of the log", apart > STEP_NS),
-                ("lie long before the log", (apart < -STEP_NS) & (is_alone | is_taken)),
+                ("lie ahead of the log", apart > usual),
+                ("lie long before the log", ((apart < -STEP_NS) & is_alone) | ((apart < -usual) & is_taken)),
             ):
                 wrong[fault] = np.isin(np.arange(len(header_ns)), used[is_so & ~is_regular])
         # 4. The stamps.

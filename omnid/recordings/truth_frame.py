@@ -190,7 +190,7 @@ def _body(T_odom_rig: Array, T_truth_body: Array, is_turned: bool, has_lever: bo
     (R, p), (true_R, true_p) = parts(T_odom_rig), parts(T_truth_body)
     p, true_p, swing, eye = p - p.mean(axis=0), true_p - true_p.mean(axis=0), R - R.mean(axis=0), np.eye(3)
     # 1. The linear system of A row by row, R_rig_body column by column and t_rig_body. A rotation counts as the
-    # movement of a point at the distance of the path's spread.
+    # movement of a point at the distance of the path's spread, then by the errors that are left.
     radius = max(_rms(true_p), LEAST_SIGMA)
     J, b = np.zeros((4, 3 * len(R), 21)), np.zeros((4, 3 * len(R)))
     for row, vector in enumerate((true_p, *np.moveaxis(true_R, 2, 0))):
@@ -199,9 +199,13 @@ def _body(T_odom_rig: Array, T_truth_body: Array, is_turned: bool, has_lever: bo
         J[1 + axis, :, 9 + 3 * axis : 12 + 3 * axis] = -R.reshape(-1, 3)
         b[1 + axis] = 0.0 if is_turned else R[:, :, axis].ravel()
     J[0, :, 18:], b[0] = -swing.reshape(-1, 3), p.ravel()
-    J[1:], b[1:] = radius * J[1:], radius * b[1:]
-    J = J[..., np.repeat([True, is_turned, has_lever], (9, 9, 3))].reshape(len(b.ravel()), -1)
-    solution = np.linalg.pinv(J.T @ J, hermitian=True) @ (J.T @ b.ravel())
+    J = J[..., np.repeat([True, is_turned, has_lever], (9, 9, 3))]
+    normal, side = np.swapaxes(J, 1, 2) @ J, np.einsum("krc,kr->kc", J, b)
+    for _ in range(2):
+        weights = np.array([1.0, radius, radius, radius]) ** 2
+        solution = np.linalg.pinv(np.tensordot(weights, normal, 1), hermitian=True) @ (weights @ side)
+        sigmas = np.sqrt(np.square(J @ solution - b).mean(axis=1))
+        radius = sigmas[0] / max(sigmas[1:].mean(), LEAST_SIGMA)
     A, _ = rotation_between(eye, solution[:9].reshape(3, 3).T)
     # 2. The mean of what turns the body's frame into the rig's.
     turned = np.swapaxes(R, 1, 2) @ (A @ true_R)
