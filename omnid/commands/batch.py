@@ -24,7 +24,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from calib.atomic_file import write_file
 from omnid.commands.options import CAMERAS, FILE_AND_SET, command, settings_of
@@ -77,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
     if results:
         print(f"{len(results)} of {len(jobs)} logs have their results already", file=sys.stderr)
     with _client(args.scheduler, args.jobs or os.cpu_count() or 1) as client:
-        signal.signal(signal.SIGTERM, _interrupt)
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
         futures = {client.submit(replay, job, pure=False, retries=1): job for job in jobs if job not in results}
         try:
             for future in import_module("distributed").as_completed(futures, raise_errors=False):
@@ -221,7 +221,3 @@ def _client(scheduler: str | None, jobs: int) -> Any:
         return distributed.Client(scheduler, timeout="10 s")
     except (OSError, TimeoutError, ValueError) as error:
         raise OmnidError(f"no dask scheduler answers at {scheduler!r}: {one_line(error)}") from error
-
-
-def _interrupt(*_: object) -> NoReturn:
-    raise KeyboardInterrupt

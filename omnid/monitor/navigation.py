@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import select
+import signal
 import sys
 import time
 from collections.abc import Callable
@@ -86,7 +87,7 @@ def drive_to_end(robot: Robot, driver: Driver, ask: Callable[[], Answer]) -> int
     """
     line = ProgressLine()
     try:
-        with handle_stop_signals(_interrupt):
+        with handle_stop_signals(signal.default_int_handler):
             granted(robot, ask())
             report = follow(robot, driver.asked_ns, line)
     except KeyboardInterrupt:
@@ -100,10 +101,6 @@ def drive_to_end(robot: Robot, driver: Driver, ask: Callable[[], Answer]) -> int
         return 1
     print(f"{report.state}: {report.reason}" if report.reason else report.state)
     return int(report.state != NavigationState.REACHED)
-
-
-def _interrupt(*_: object) -> None:
-    raise KeyboardInterrupt
 
 
 def record_until_enter(robot: Robot, name: str) -> int:

@@ -193,7 +193,8 @@ class LiveRun:
         config, graph, robot = self._config, self._graph, self._robot
 
         def warn(line: str) -> None:
-            self._report(logging.INFO if line == ARMED else logging.WARNING, line)
+            was_asked = line == ARMED or names.DISARMED_BY_STOP in line
+            self._report(logging.INFO if was_asked else logging.WARNING, line)
 
         self.clock = fixed_offset(robot.clock_ns) if robot.waits else RobotClock(robot.clock_ns, report=warn)
         with ExitStack() as outputs:
