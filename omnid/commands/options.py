@@ -75,6 +75,7 @@ class Command:
             elif re.fullmatch("[a-z ]+:", line):
                 container = parser.add_argument_group(line.removesuffix(":"))
             else:
+                assert not line.startswith("-"), f"no declaration of an option: {line}"
                 container = parser if not line else container
                 prose.append(line)
         parser.formatter_class = _ExamplesFormatter
