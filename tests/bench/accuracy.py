@@ -24,7 +24,7 @@ from calib.rig_file import read_rig, write_rig
 from omnid.diagnostics.run_summary import summary_entries
 from omnid.formats.tum import Trajectory, read_tum
 from omnid.recordings.evaluation import evaluate
-from tests.bench.paper.truth import surface_distance_m
+from tests.bench.paper.measures import surface_distance_m
 from tests.bench.results import Cell, ResultTable, columns, family_and_seed, run
 from tests.simulation.recipes import build
 

@@ -1,14 +1,29 @@
-"""Soak test of the live daemon: `python -m pytest -m slow tests/bench`; OMNID_SOAK_MINUTES: how long (2)."""
+"""Benchmarks can be imported, as most are run by hand only; the soak test of the live daemon runs for minutes."""
 
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 import time
 from pathlib import Path
 
 import pytest
 
 from tests.bench.daemon import daemon, status
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_each_module_can_be_imported() -> None:
+    """In a process of its own: some set what all of a process share."""
+    files = list((ROOT / "tests" / "bench").rglob("*.py"))
+    names = [".".join(file.relative_to(ROOT).with_suffix("").parts) for file in files if not file.stem.startswith("_")]
+    assert len(names) > 20
+    program = "import importlib, sys\nfor name in sys.argv[1:]: importlib.import_module(name)"
+    done = subprocess.run([sys.executable, "-c", program, *names], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr.splitlines()[-1]
+
 
 SOAK_S = 60 * float(os.environ.get("OMNID_SOAK_MINUTES", "2"))
 PERIOD_S = 5.0  # between two samples

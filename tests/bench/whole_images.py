@@ -24,7 +24,7 @@ from omnid.formats.tum import read_tum
 from tests.bench.results import ResultTable, columns, run
 from tests.drivers.logs.mcap_logs import LOWER, UPPER
 from tests.replay.edited import images, save
-from tests.simulation.whole_images import Image, repeat_lines, roll, shift, tear, turn, warp
+from tests.simulation.photographs import Image, repeat_lines, roll, shift, tear, turn, warp
 
 SIGMAS: Final = 3.0
 LEAST_M: Final = 0.005  # of an error beside which a pose may be called sure

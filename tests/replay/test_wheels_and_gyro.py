@@ -34,7 +34,7 @@ from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, UPPER, Entry, compressed, write_log
 from tests.replay.edited import dark, images
 from tests.replay.live import robot
-from tests.simulation.motion_samples import SensorErrors, motion_samples
+from tests.simulation.logs import SensorErrors, motion_samples
 from tests.waiting import wait_until
 
 DARK = range(12, 18)

@@ -19,7 +19,7 @@ from calib import se3
 from omnid.api import replay
 from omnid.formats.tum import read_tum
 from tests.replay.edited import images, save
-from tests.simulation.whole_images import Image, repeat_lines, roll, shift, tear, turn
+from tests.simulation.photographs import Image, repeat_lines, roll, shift, tear, turn
 
 Edit = Callable[[Sequence[Image]], list[Image]]
 SINCE: Final = 8

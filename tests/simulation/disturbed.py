@@ -23,7 +23,7 @@ from omnid.simulation.rendering.surfaces import Rectangle, Scene
 from omnid.simulation.robot import SimulatedRobot
 from omnid.simulation.vehicle import SimulatedCameras, Vehicle
 from omnid.simulation.world import Walkers, World, footprints
-from tests.simulation.reflections import Mirror, seen_part
+from tests.simulation.disturbances import Mirror, seen_part
 
 HALF_BASE_M: Final = 0.15  # from the middle of the base to where its wheels and castors touch the floor
 WHEEL_M: Final = 0.05  # A wheel rounds off the heights within this distance.

@@ -7,7 +7,6 @@ from scipy.interpolate import CubicSpline
 
 from calib import se3
 from calib.models.camera import Array
-from omnid.simulation.world import clearance_m
 
 HEIGHT_M = 1.2
 
@@ -72,46 +71,6 @@ def loop(seed: int, pairs: int, radius_m: float = 0.9) -> Array:
     t = t + 0.35 * np.sin(t + phases[2])
     ahead = place(t + 1e-5) - place(t - 1e-5)
     return planar_poses(place(t), np.arctan2(ahead[:, 1], ahead[:, 0]))
-
-
-def approaches(seed: int, pairs: int, segments: Array, nearest_m: float = 0.3, step_m: float = 0.05) -> Array:
-    """Return a path from the origin up to what stands around it, and back in reverse, in one direction after another.
-
-    segments (N, 2, 2): outlines on the floor. The rig drives ahead until its distance to one of them is nearest_m,
-    turns by 90 degrees to the side that has more room, and drives on for up to half a metre.
-    """
-    rng = np.random.default_rng([seed, 9])
-    heading = float(rng.uniform(0, 2 * np.pi))
-    legs = [np.array([[0.0, 0.0, heading]])]
-    while sum(map(len, legs)) < pairs:
-        turned = _turned(legs[-1][-1], heading)
-        ahead = _driven(turned[-1], 4.0, segments, nearest_m, step_m)
-        sides = [_turned(ahead[-1], heading + side * np.pi / 2) for side in (-1, 1)]
-        along = max((_driven(side[-1], 0.5, segments, nearest_m, step_m) for side in sides), key=len)
-        there = np.concatenate([ahead, _turned(ahead[-1], along[0, 2]), along])
-        legs += [turned, there, there[::-1]]
-        heading += np.deg2rad(137.5)  # the golden angle: all directions are as far from each other as can be
-    places = np.concatenate(legs)[:pairs]
-    return planar_poses(places[:, :2], places[:, 2])
-
-
-def _turned(place: Array, heading_rad: float) -> Array:
-    """Return places (N, 3) of a turn on the spot, 10 degrees each, that ends at a heading."""
-    turn = (heading_rad - place[2] + np.pi) % (2 * np.pi) - np.pi
-    steps = max(1, int(np.ceil(abs(turn) / np.deg2rad(10))))
-    return np.column_stack([np.tile(place[:2], (steps, 1)), place[2] + turn * np.arange(1, steps + 1) / steps])
-
-
-def _driven(place: Array, way_m: float, segments: Array, nearest_m: float, step_m: float) -> Array:
-    """Return places (N, 3) straight ahead from a place on, as long as segments (M, 2, 2) are farther than nearest_m."""
-    ahead = np.array([np.cos(place[2]), np.sin(place[2]), 0.0])
-    places = [place]
-    for way in np.arange(step_m, way_m + 1e-9, step_m):
-        one = place + way * ahead
-        if clearance_m(segments, (float(one[0]), float(one[1])), nearest_m) < 0:
-            break
-        places.append(one)
-    return np.array(places)
 
 
 def vibrate(poses: Array, seed: int, tilt_deg: float = 0.3, shake_mm: float = 1.0) -> Array:

@@ -12,7 +12,6 @@ from calib.models.camera import Array
 from calib.rig import Rig
 from omnid.simulation.rendering.sensor import Sensor
 from omnid.simulation.rendering.surfaces import Scene
-from omnid.simulation.world import footprints
 from tests.simulation import paths
 from tests.simulation.builders import KEPT, bricks, corridor, ring, room, symmetric_room, twin_corridor, two_laps_path
 from tests.simulation.rigs import make_rig
@@ -114,13 +113,6 @@ def rooms(seed: int, size: int, pairs: int) -> SimulatedRun:
     return SimulatedRun(mild_rig(seed, size), paths.vibrate(paths.loop(seed, pairs), seed, 0.2), room(seed))
 
 
-def approaches(seed: int, size: int, pairs: int) -> SimulatedRun:
-    """Return a room with boxes, in which the rig drives up to walls and boxes, along them, and back."""
-    scene = room(seed)
-    path = paths.approaches(seed, pairs, footprints(scene.rectangles, paths.HEIGHT_M))
-    return SimulatedRun(mild_rig(seed, size), paths.vibrate(path, seed, 0.2), scene)
-
-
 def back(seed: int, size: int, pairs: int) -> SimulatedRun:
     """Return a rig that stands, drives, comes back in reverse over the same poses, and stands: the end shows drift."""
     there = paths.spline_path(seed, max(1, pairs // 2 - 4), 0.06)
@@ -178,7 +170,6 @@ RECIPES: dict[str, tuple[Recipe, int]] = {
     "slow": (slow, 60),
     "fast": (fast, 33),
     "rooms": (rooms, 100),
-    "approaches": (approaches, 240),
     "back": (back, 80),
     "plain": (plain, 60),
     "spin": (spin, 31),

@@ -4,7 +4,7 @@ Parts: stops (times from a cause to wheels at rest), commands (mutated commands)
 on tampered images, in lock-step). --only: of stops and images, those whose name has one of the words. --stops: so many
 for each cause; --commands: mutated commands; --files: mutated files of each format; --images: seeds of each case;
 --busy: so many other processes compute meanwhile. Faults of a live robot: `pytest -m slow
-tests/bench/faults/test_live_faults.py`. The campaign is seeded and bounded; by default it takes some hours.
+tests/bench/faults`. The campaign is seeded and bounded; by default it takes some hours.
 """
 
 from __future__ import annotations

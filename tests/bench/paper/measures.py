@@ -1,4 +1,4 @@
-"""Figures of the paper's and omnid's methods on the rendered logs of section V: walls, turns, and paths with maps."""
+"""Figures of the paper's and omnid's methods on the rendered logs of section V, by the exact truth of their scenes."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 import omnid
 from calib import se3
@@ -22,12 +23,60 @@ from omnid.core.stereo.matcher import edge_pixels, smooth
 from omnid.formats.tum import Trajectory, read_tum
 from omnid.messages import Panoramas
 from omnid.recordings.evaluation import evaluate
-from omnid.simulation.rendering.surfaces import Rectangle
+from omnid.simulation.rendering.surfaces import Rectangle, Scene
 from omnid.stages.dense_depths import DenseDepths
 from tests.bench.paper.scenes import MOVED_TURNS_DEG, TURNS_DEG, WALL_M, Experiment, Views
-from tests.bench.paper.truth import Flags, cast, sees, surface_distance_m
 from tests.bench.results import Cell
 from tests.simulation.recipes import SimulatedRun
+
+Indices = NDArray[np.intp]
+Flags = NDArray[np.bool_]
+TOUCHING_M = 1e-6
+
+
+def cast(scene: Scene, origin: Array, rays: Array) -> tuple[Array, Indices]:
+    """Return the distances (N,) and rectangles (N,) that rays (N, 3) from a point (3,) hit first.
+
+    Distances are in units of each ray; inf and -1 where nothing is hit.
+    """
+    nearest, which = np.full(len(rays), np.inf), np.full(len(rays), -1)
+    for number, rectangle in enumerate(scene.rectangles):
+        distance = _intersect(rectangle, origin, rays)
+        nearer = distance < nearest
+        nearest[nearer], which[nearer] = distance[nearer], number
+    return nearest, which
+
+
+def _intersect(r: Rectangle, origin: Array, rays: Array) -> Array:
+    """Return the distance (N,) along the rays to one rectangle, inf where they miss it."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = ((r.origin - origin) @ r.normal) / (rays @ r.normal)
+        uv = _fractions(r, origin + distance[:, None] * rays)
+        hit = (distance > TOUCHING_M) & ((uv >= 0) & (uv <= 1)).all(axis=1)
+    return np.where(hit, distance, np.inf)
+
+
+def _fractions(r: Rectangle, points: Array) -> Array:
+    """Return the positions (N, 2) of points (N, 3) along both edges, as fractions of the edges."""
+    along = points - r.origin
+    return np.column_stack([along @ r.edge_u / r.width_m**2, along @ r.edge_v / r.height_m**2])
+
+
+def sees(scene: Scene, origin: Array, points: Array, slack_m: float = 0.02) -> Flags:
+    """Return which points (N, 3) are visible from a viewpoint (3,)."""
+    rays = points - origin
+    distance, _ = cast(scene, origin, rays)
+    return np.asarray((distance - 1) * np.linalg.norm(rays, axis=1) > -slack_m)
+
+
+def surface_distance_m(scene: Scene, points: Array) -> Array:
+    """Return the distance (N,) of points (N, 3) from the nearest surface."""
+    nearest = np.full(len(points), np.inf)
+    for r in scene.rectangles:
+        uv = np.clip(_fractions(r, points), 0, 1)
+        nearest = np.minimum(nearest, np.linalg.norm(points - r.points(uv), axis=1))
+    return nearest
+
 
 # V.B, fig. 8: SAD, enhanced SAD and omnid's matching on a wall of identical bricks, a control and a smooth wall.
 

@@ -1,7 +1,7 @@
-"""Faults of a live robot: the robot drives, a fault comes, its wheels stop, and its daemon goes on or ends in order.
+"""The campaign in small, and faults of a live robot: its wheels stop, its daemon goes on or ends in order.
 
-Others are in `stop_times` (each cause of a stop), in `tests/replay` (clocks, a motor that is unplugged, taken
-ports) and in `tests/contract` (motor controllers and their line).
+`python -m tests.bench.faults` runs the campaign in full. Other faults are in `tests/replay` (clocks, a motor that is
+unplugged, taken ports) and in `tests/contract` (motor controllers and their line).
 """
 
 from __future__ import annotations
@@ -18,13 +18,34 @@ import pytest
 
 from omnid.core.control.motion_monitor import NOT_COMMANDED, NOT_SEEN
 from omnid.transport.status_names import STOPPED_PREFIX
+from tests.bench.faults import hostile_commands, stop_times
+from tests.bench.faults.hostile_files import FORMATS, attack, short_run
 from tests.bench.faults.stop_times import FAULTY_DAEMON
 from tests.omnid.transport.bus_fixtures import script
 from tests.ports import free_port
 from tests.replay.live import Base, Daemon, Operator, command_line, patient, robot, started
 from tests.waiting import PATIENCE_S, wait_until
 
-pytestmark = pytest.mark.slow
+
+def test_mutated_files_give_a_result_or_one_line(tmp_path: Path) -> None:
+    memory_mb, found = attack(",".join(FORMATS), short_run(tmp_path), 60, seed=7)
+    assert found == [] and 0 < memory_mb < 400
+
+
+@pytest.mark.hazard("H09")
+@pytest.mark.slow
+def test_mutated_commands_never_move_the_wheels(tmp_path: Path, course: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OMNID_RESULTS", str(tmp_path / "results"))
+    assert hostile_commands.run(course, tmp_path, 2000, 7) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", stop_times.CAUSES)
+def test_the_wheels_come_to_rest(tmp_path: Path, course: Path, name: str) -> None:
+    times = stop_times.stop_times(course, tmp_path / "stops", name, 2, seed=7)
+    assert len(times) == 2
+
+
 WATCH_S = 1.5  # time in which stopped wheels must not turn
 
 
@@ -70,6 +91,7 @@ def expect_motion(base: Base) -> None:
 NO_IMAGES, FROZEN = "no images of the", "are frozen"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("line", "part", "word"),
     [
@@ -91,6 +113,7 @@ def test_a_fault_of_cameras_is_named_and_passes(setting: Setting, line: str, par
         expect_motion(base)
 
 
+@pytest.mark.slow
 def test_images_of_another_drive_stop_the_wheels(setting: Setting) -> None:
     """The images go to and fro at 0.5 m/s, as if the lens saw a screen, while 0.3 m/s forwards are commanded."""
     words = patient("controller.motion.check=true")
@@ -102,6 +125,7 @@ def test_images_of_another_drive_stop_the_wheels(setting: Setting) -> None:
         expect_stop(base)
 
 
+@pytest.mark.slow
 def test_of_two_daemons_on_one_serial_device_the_second_waits(setting: Setting) -> None:
     """The second waits for its motor controller; the first drives on."""
     port = free_port()
@@ -118,6 +142,7 @@ def test_of_two_daemons_on_one_serial_device_the_second_waits(setting: Setting) 
         assert code == 0 and "in use" in err, err
 
 
+@pytest.mark.slow
 def test_the_wheels_slow_down_after_a_sigkill(setting: Setting) -> None:
     """The controller process goes on alone."""
     with robot(setting.scene, setting.folder) as (daemon, operator, base):
@@ -131,6 +156,7 @@ def test_the_wheels_slow_down_after_a_sigkill(setting: Setting) -> None:
         assert speeds[-1] < 0.2, "slowed down, not at once"
 
 
+@pytest.mark.slow
 def test_a_killed_controller_process_ends_the_daemon(setting: Setting) -> None:
     """The daemon cannot go on without it: systemd starts both again."""
     with robot(setting.scene, setting.folder) as (daemon, operator, base):
@@ -143,6 +169,7 @@ def test_a_killed_controller_process_ends_the_daemon(setting: Setting) -> None:
     assert "controller process" in err
 
 
+@pytest.mark.slow
 def test_a_router_comes_and_goes(setting: Setting) -> None:
     """The daemon is to connect to a peer that is not there, then is, then is gone again."""
     port = free_port()
