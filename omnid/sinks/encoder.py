@@ -18,7 +18,7 @@ from omnid.messages import GridUpdate, MapUpdate, NavigationUpdate, ObstacleRing
 from omnid.navigation_state import NavigationState
 from omnid.tracking_state import MapState, TrackingState
 from omnid.transport import codec
-from omnid.transport.codec import DiagnosticStatus, FrameTransform, PoseAttachment
+from omnid.transport.codec import DiagnosticStatus, PoseAttachment
 from omnid.transport.sensor_codec import gyro_cdr, wheel_cdr
 from omnid.transport.status_names import NAVIGATION, ODOMETRY, PLACES, Key, Stats, entry
 from omnid.transport.topics import MAP_POSE, PUBLISHED, SCAN
@@ -123,8 +123,7 @@ class Encoder:
         )
         yield OutgoingMessage.on("odom", pose)
         yield OutgoingMessage.on("pose", codec.encoded(codec.POSE_SCHEMA, (stamp_ns, "odom"), T_odom_base))
-        edge = FrameTransform("odom", "base_link", T_odom_base)
-        yield OutgoingMessage.on("/tf", codec.transform_cdr(stamp_ns, [edge]))
+        yield OutgoingMessage.on("/tf", codec.transform_cdr(stamp_ns, [("odom", "base_link", T_odom_base)]))
         # Samples of wheels and gyro up to the pair; those after it come with the next one again.
         for sample in odometry.motion:
             if sample.stamp_ns > odometry.stamp_ns:
@@ -141,8 +140,7 @@ class Encoder:
         )
         if update.is_known:  # a transform has no covariance that could say that it is not
             T_map_odom, _ = base_pose(update.T_map_odom, update.covariance, self.T_base_rig)
-            edge = FrameTransform("map", "odom", T_map_odom)
-            yield OutgoingMessage.on("/tf", codec.transform_cdr(stamp_ns, [edge]))
+            yield OutgoingMessage.on("/tf", codec.transform_cdr(stamp_ns, [("map", "odom", T_map_odom)]))
 
 
 def static_frames(encode: Encoder, stamp_ns: int) -> OutgoingMessage:
@@ -150,10 +148,10 @@ def static_frames(encode: Encoder, stamp_ns: int) -> OutgoingMessage:
 
     stamp_ns: of a pose.
     """
-    edges = [FrameTransform("base_link", "rig", encode.T_base_rig)]
+    edges = [("base_link", "rig", encode.T_base_rig)]
     if encode.rig is not None:
         cameras = {"lower": encode.rig.lower, "upper": encode.rig.upper}
-        edges += [FrameTransform("rig", name, se3.inverse(camera.T_cam_rig)) for name, camera in cameras.items()]
+        edges += [("rig", name, se3.inverse(camera.T_cam_rig)) for name, camera in cameras.items()]
     return OutgoingMessage.on("/tf_static", codec.transform_cdr(encode.unix_ns(stamp_ns), edges))
 
 

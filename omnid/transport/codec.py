@@ -280,19 +280,12 @@ def decode_map_pose(payload: bytes, _: bytes = b"") -> PoseInMap:
     return PoseInMap(_stamp_ns(message), _rigid_transform(message.pose.pose), message.pose.covariance.reshape(6, 6))
 
 
-@dataclass(frozen=True, slots=True)
-class FrameTransform:
-    """One edge of the frame tree: p_parent = T_parent_child @ p_child."""
+def transform_cdr(stamp_ns: int, edges: Iterable[tuple[str, str, Array]]) -> bytes:
+    """Encode a tf2_msgs/msg/TFMessage: edges of the frame tree, all of one instant.
 
-    parent: str
-    child: str
-    T_parent_child: Array  # (4, 4)
-
-
-def transform_cdr(stamp_ns: int, transforms: Sequence[FrameTransform]) -> bytes:
-    """Encode a tf2_msgs/msg/TFMessage: edges of the frame tree, all of one instant."""
-    edges = [((stamp_ns, edge.parent), edge.child, edge.T_parent_child) for edge in transforms]
-    return encoded(TRANSFORM_SCHEMA, edges)
+    edges: parent, child, T_parent_child (4, 4), with p_parent = T_parent_child @ p_child.
+    """
+    return encoded(TRANSFORM_SCHEMA, [((stamp_ns, parent), child, T) for parent, child, T in edges])
 
 
 # Status.
@@ -577,20 +570,16 @@ def path_from_cdr(payload: bytes, _: bytes = b"") -> PlanarPath:
 
 def _planar_path(message: Any, poses: Sequence[Any]) -> PlanarPath:
     """Return the content of a message with a header by its poses, which are stamped."""
-    xy, frame = np.array([_planar_position(one.pose) for one in poses]), message.header.frame_id
-    return PlanarPath(_stamp_ns(message), frame, xy, _planar_heading(poses[-1].pose))
+    xy = np.array([(one.pose.position.x, one.pose.position.y) for one in poses])
+    if not np.isfinite(xy).all():
+        raise OmnidError("a position is not finite; check the sender")
+    return PlanarPath(_stamp_ns(message), message.header.frame_id, xy, _planar_heading(poses[-1].pose))
 
 
 def _planar_pose(x_m: float, y_m: float, heading_rad: float | None) -> Values:
     half_rad = 0.0 if heading_rad is None else 0.5 * heading_rad
     w = 0.0 if heading_rad is None else math.cos(half_rad)
     return (x_m, y_m, 0.0), (0.0, 0.0, math.sin(half_rad), w)
-
-
-def _planar_position(pose: Any) -> tuple[float, float]:
-    if not (math.isfinite(pose.position.x) and math.isfinite(pose.position.y)):
-        raise OmnidError("a position is not finite; check the sender")
-    return pose.position.x, pose.position.y
 
 
 def _planar_heading(pose: Any) -> float | None:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Final
+from types import SimpleNamespace
+from typing import Any, Final
 
-from prometheus_client import CollectorRegistry, Metric, generate_latest
+from prometheus_client import Metric, generate_latest
 from prometheus_client.core import CounterMetricFamily as Counter
 from prometheus_client.core import GaugeMetricFamily as Gauge
-from prometheus_client.registry import Collector
 
 from omnid.engine.telemetry import Histogram
 from omnid.monitor.robot_state import RobotState
@@ -28,17 +28,13 @@ Samples = Iterable[tuple[tuple[str, ...], float]]  # values of the labels, and t
 
 def metrics(state: RobotState, refused: Mapping[str, int], counts: Mapping[str, int]) -> bytes:
     """Return all metrics as text; refused: requests by reason; counts: further counters, by name."""
-
-    class Snapshot(Collector):
-        def collect(self) -> Iterator[Metric]:
-            yield from _of_robot(state)
-            for name, count in counts.items():
-                yield Counter(f"omnid_web_{name}", _TEXTS[name], count)
-            samples = (((reason,), count) for reason, count in refused.items())
-            yield _labelled(Counter, "omnid_web_refused", "Requests that were refused", ["reason"], samples)
-
-    registry = CollectorRegistry(auto_describe=False)
-    registry.register(Snapshot())
+    samples = (((reason,), count) for reason, count in refused.items())
+    families = [
+        *_of_robot(state),
+        *(Counter(f"omnid_web_{name}", _TEXTS[name], count) for name, count in counts.items()),
+        _labelled(Counter, "omnid_web_refused", "Requests that were refused", ["reason"], samples),
+    ]
+    registry: Any = SimpleNamespace(collect=lambda: families)
     return generate_latest(registry)
 
 

@@ -21,7 +21,7 @@ from calib import se3
 from drivers.frame import Frame
 from drivers.logs.mcap_writer import LogWriter
 from omnid.transport import codec
-from omnid.transport.codec import DiagnosticStatus, FrameTransform
+from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.sensor_codec import image_cdr, image_topic
 from omnid.transport.status_names import ODOMETRY, Key
 from tests.drivers.logs.mcap_logs import STORE
@@ -81,7 +81,7 @@ def _messages(stamp_ns: int, numbers: np.random.Generator) -> Iterator[tuple[str
     status = DiagnosticStatus(ODOMETRY, 1, "über 90 °C", {Key.INLIERS: "3"})
     yield "/omnid/odom", codec.ODOMETRY_SCHEMA, codec.odometry_cdr(stamp_ns, T, one, twist, other)
     yield "/omnid/pose", codec.POSE_SCHEMA, codec.encoded(codec.POSE_SCHEMA, (stamp_ns, "odom"), T)
-    yield "/tf", codec.TRANSFORM_SCHEMA, codec.transform_cdr(stamp_ns, [FrameTransform("odom", "base_link", T)])
+    yield "/tf", codec.TRANSFORM_SCHEMA, codec.transform_cdr(stamp_ns, [("odom", "base_link", T)])
     yield "/omnid/drive", codec.TWIST_SCHEMA, codec.twist_stamped_cdr(stamp_ns, "base_link", twist[0], twist[5])
     yield "/omnid/status", codec.DIAGNOSTICS_SCHEMA, codec.diagnostics_cdr(stamp_ns, [status])
     yield "/omnid/cloud", CLOUD, codec.point_cloud_cdr(stamp_ns, "odom", packed[:, :3], packed[:, 3])

@@ -293,6 +293,14 @@ def test_the_path_in_the_map_is_drawn_beside_that_of_odometry_and_its_correction
     assert "In the map" not in html_of(save(tmp_path / "b.mcap", run()))
 
 
+@pytest.mark.parametrize("fastest_mps", [0.6, 50.0])
+def test_a_spike_does_not_flatten_a_chart(tmp_path: Path, fastest_mps: float) -> None:
+    """One pose of 60 is far beyond the others: the chart shows the others, and says so."""
+    speeds = [fastest_mps if k == 30 else 0.5 + 0.004 * k for k in range(60)]
+    html = html_of(save(tmp_path / "log.mcap", [odom(k, speed_mps=speed) for k, speed in enumerate(speeds)]))
+    assert ("Spikes are cut off" in html) == (fastest_mps > 1)
+
+
 def test_compares_with_the_truth_as_eval_does(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The rig is displaced and rotated on its base, and the truth has another world frame."""
     rig = attached_rig_of_sample()

@@ -20,7 +20,6 @@ from omnid.transport import codec
 from omnid.transport.codec import (
     MOVING_FIELDS,
     DiagnosticStatus,
-    FrameTransform,
     Pose,
     PoseAttachment,
     decode_cloud,
@@ -46,7 +45,7 @@ CONFIDENCE = np.arange(50, dtype=np.float32) / 50
 CELLS = np.arange(-1, 11, dtype=np.int8).reshape(3, 4)
 PERSON = MovingObstacle(1.5, -0.25, 0.0, 0.75, np.diag([0.01, 0.04, 0.25, 0.09]), 0.25)
 STATUSES = [DiagnosticStatus("a", 1, "so so", {"k": "v"}), DiagnosticStatus("b", 0, "", {})]
-EDGES = [FrameTransform("map", "odom", np.eye(4)), FrameTransform("odom", "base_link", T_ODOM_BASE)]
+EDGES = [("map", "odom", np.eye(4)), ("odom", "base_link", T_ODOM_BASE)]
 
 
 def odometry(stamp_ns: int = STAMP_NS) -> bytes:
