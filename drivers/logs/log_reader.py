@@ -32,7 +32,7 @@ _WARNINGS = {
 }
 MOST_PERCENT = 99.0
 NEUTRAL_GREY, NEAR_NEUTRAL = 128, 16  # grey levels of colourless U and V, and how near those of weak colours are
-_COUNTERS = ("lower", "upper", "unstamped", "repeated", *_WARNINGS)
+_COUNTERS = ("lower", "upper", "unstamped", "repeated", "unreadable", *_WARNINGS)
 WHOLE = (0.0, math.inf)  # span of all of a log [s]
 
 
@@ -67,8 +67,9 @@ class LogReader:
 
     During and after frames() and messages(), `counts` has 'lower' and 'upper' (frames delivered), 'duplicate',
     'repeated' (of these, with the same content), 'unstamped' (time of logging used), 'broken' (messages without a valid
-    image), 'broken_motion' and 'broken_records' (chunks or records of the file). After its end `truncated` is True for
-    an incomplete log, and `warnings` has one line per kind of fault.
+    image), 'unreadable' (images in corrupt chunks or records), 'broken_motion' and 'broken_records' (chunks or records
+    of the file). After its end `truncated` is True for an incomplete log, and `warnings` has one line per kind of
+    fault.
     """
 
     def __init__(
@@ -124,11 +125,14 @@ class LogReader:
         last: dict[Camera, tuple[int, memoryview]] = {}
         # Samples behind the last image are of no use.
         inside = (at_s >= begin_s) & (at_s <= min(end_s, at_s[is_image].max(initial=0.0)))
-        for row, stamp_ns in zip(self._order.rows[inside].tolist(), stamps_ns[inside].tolist(), strict=True):
+        for row, stamp_ns, of_camera in zip(
+            *(part[inside].tolist() for part in (self._order.rows, stamps_ns, is_image)), strict=True
+        ):
             message = self._log.message(row)
             if self._closed:
                 return
             if message is None:
+                self.counts["unreadable"] += of_camera
                 continue
             camera = cameras.get(message.topic)
             try:

@@ -123,19 +123,21 @@ def find_truth_frame(estimate: Trajectory, truth: Trajectory) -> TruthFrame | No
         return None
     # 1. For each convention, fit a delay, a turn and a lever arm, or none of these. Other conventions are tried as long
     # as none leaves a small error.
-    found: list[tuple[int, float, tuple[str, bool, bool, bool], TruthFrame]] = []
+    found: list[tuple[int, float, tuple[bool, ...], TruthFrame]] = []
     for reading in READINGS:
-        for model in product([reading], *[(False, True)] * 3):
-            frame = _fitted(estimate, truth, *model)
+        for fitted in product((False, True), repeat=3):
+            frame = _fitted(estimate, truth, reading, *fitted)
             if frame is not None:
                 left = _error(estimate, frame.rig_poses(truth, estimate))
-                found.append((bool(reading) + (frame.unit != "m") + sum(model[1:]), left, model, frame))
+                found.append((bool(reading) + (frame.unit != "m") + sum(fitted), left, fitted, frame))
         if found and min(found, key=lambda one: one[1])[1] < SMALL_ERROR:
             break
     # 2. Of those that leave little, the one with the fewest differences.
     most = max(LEAST_SIGMA, min((left for _, left, *_ in found), default=math.inf)) / WORTH_PART
     good = [one for one in found if one[1] <= most < math.inf]
-    changes, _, model, frame = min(good, key=lambda one: one[:2], default=(0, 0.0, ("", False, False, False), None))
+    if not good:
+        return None
+    changes, _, fitted, frame = min(good, key=lambda one: one[:2])
     if not changes:
         return None
     # 3. It must explain the error of each half of the drive by the other half; an error of the spread is the most.
@@ -143,7 +145,7 @@ def find_truth_frame(estimate: Trajectory, truth: Trajectory) -> TruthFrame | No
     halves = [Trajectory(estimate.stamps_ns[part], estimate.T[part]) for part in np.s_[:middle, middle:]]
     left = plain = 0.0
     for one, other in (halves, halves[::-1]):
-        of_half = _fitted(one, truth, *model)
+        of_half = _fitted(one, truth, frame.reading, *fitted)
         left += math.inf if of_half is None else _error(other, of_half.rig_poses(truth, other))
         plain += min(1.0, _error(other, truth))
     return frame if left < WORTH_PART * plain else None

@@ -360,11 +360,12 @@ def image_loss(
     surplus = 1 - periods_ns[faster] / max(periods_ns.values())  # NaN: a period is unknown
     by_chance = 0 if math.isnan(surplus) else min(unpaired[faster], round(surplus * arrived[faster]))
     equal = read["duplicate"] - read["repeated"]
-    images = read["lower"] + read["upper"] + equal + read["broken"]
+    images = read["lower"] + read["upper"] + equal + read["broken"] + read["unreadable"]
     lost = {
         "without a partner": sum(unpaired.values()) - by_chance,
         "not decodable": read["broken"] + undecodable,
         "of another size": other_size,
+        "in corrupt records": read["unreadable"],
         "with the stamp of the one before": equal,
     }
     if sum(lost.values()) <= NOTABLE_SHARE * images:

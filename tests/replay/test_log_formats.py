@@ -112,6 +112,17 @@ def test_loss_is_told_by_the_exit_code(omnid: Command, tmp_path: Path, scene: Pa
     assert len(left_out) == (name in ("an image is cut", "an image is small"))
 
 
+def test_images_in_corrupt_chunks_are_a_loss(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    log = write_log(tmp_path / "log.mcap", entries(scene), chunk_size=30_000)
+    data = bytearray(log.read_bytes())
+    for part in (0.2, 0.4, 0.6, 0.8):
+        data[int(part * len(data))] ^= 1
+    log.write_bytes(data)
+    result = omnid.replay(log, *QUICK, rig=scene / "rig.toml")
+    assert result.code == 1 and "skipped 4 corrupt chunks" in result.err
+    assert re.search(r"(\d+) of 48 images made no pair: \1 in corrupt records", result.err)
+
+
 def test_a_camera_of_half_the_rate_loses_nothing(omnid: Command, tmp_path: Path, scene: Path) -> None:
     taken = [image for image in images(scene / "log.mcap") if image.camera == "lower" or image.pair % 2 == 0]
     log = save(tmp_path / "log.mcap", taken)
