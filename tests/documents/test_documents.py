@@ -11,8 +11,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
@@ -20,7 +18,6 @@ import omnid
 from omnid.cli import COMMANDS, command_at
 from omnid.config import Config
 from omnid.transport.topics import PUBLISHED, command_topics, ros_name
-from tests.documents import images
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -146,25 +143,6 @@ def test_nav2_uses_topics_that_exist() -> None:
         assert scan["min_obstacle_height"] < 0 < scan["max_obstacle_height"]
         assert costmap["obstacle_layer"]["min_obstacle_height"] < 0
     assert parameters["controller_server"]["ros__parameters"]["enable_stamped_cmd_vel"] is False
-
-
-def test_the_stills_show_one_pair(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(images, "FOLDER", tmp_path)
-    images.stills()
-    mirror, panorama, depth = (cv2.imread(str(tmp_path / name)) for name in ("mirror.jpg", "panorama.jpg", "depth.jpg"))
-    assert mirror is not None and panorama is not None and depth is not None
-    assert mirror.shape[0] == mirror.shape[1] and panorama.shape == depth.shape
-    colored = np.ptp(depth.astype(int), axis=2) > 60  # a located pixel has a colour
-    assert 0.03 < colored.mean() < 0.6
-
-
-@pytest.mark.slow
-def test_the_drive_becomes_a_moving_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pillow = pytest.importorskip("PIL.Image")
-    monkeypatch.setattr(images, "FOLDER", tmp_path)
-    images.drive(seconds=3.0)
-    with pillow.open(tmp_path / "drive.gif") as image:
-        assert image.n_frames >= 3 and image.width == images.GIF_WIDTH_PX
 
 
 NOTEBOOK = Path(__file__).parents[2] / "omnid" / "examples" / "first_replay.ipynb"

@@ -55,6 +55,7 @@ class Cause(NamedTuple):
     begin: Callable[[Robot], None]
     end: Callable[[Robot], None] | None  # None: the robot does not survive it
     disarms: bool = True
+    status: tuple[str, str] | None = None  # part of the daemon that names the cause, and how
 
 
 def _nothing(_: Robot) -> None:
@@ -76,18 +77,23 @@ def _hears_nothing(deaf: bool) -> Callable[[Robot], None]:
     return lambda robot: setattr(robot.base.twin, "drop_input", deaf)
 
 
-def _images(line: str) -> Callable[[Robot], None]:
-    return lambda robot: robot.daemon.write_line(line)
+def _images(line: str, part: str, word: str) -> Cause:
+    """Return a fault of cameras; both are faultless again afterwards."""
+    begin, end = (lambda robot, line=each: robot.daemon.write_line(line) for each in (line, "both ok"))
+    return Cause(begin, end, status=(part, word))
 
 
 CAUSES: Final[dict[str, Cause]] = {
     "cmd/stop, the operator goes on sending": Cause(lambda robot: robot.operator.send("cmd/stop", b""), _nothing),
     "the operator sends no more": Cause(lambda robot: robot.operator.stop_sending(), _nothing, disarms=False),
     "the operator leaves the bus": Cause(lambda robot: robot.operator.close(), None),
-    "no images of one camera": Cause(_images("upper mute"), _images("both ok")),
-    "no images at all": Cause(_images("both mute"), _images("both ok")),
-    "images frozen": Cause(_images("both frozen"), _images("both ok")),
-    "darkness": Cause(_images("both black"), _images("both ok")),
+    "no images of one camera": _images("upper mute", "pairing", "no images of the upper camera"),
+    "no images at all": _images("both mute", "pairing", "no images of the lower and the upper camera"),
+    "images that cannot be decoded": _images("lower garbage", "pairing", "cannot be decoded"),
+    "images that are cut": _images("both cut", "pairing", "cannot be decoded"),
+    "images of one camera frozen": _images("upper frozen", "pairing", "images of the upper camera are frozen"),
+    "images frozen": _images("both frozen", "pairing", "images of the lower and the upper camera are frozen"),
+    "darkness": _images("both black", "odometry", "lost"),
     "the daemon does not run (SIGSTOP)": Cause(_signals(signal.SIGSTOP, "daemon"), _signals(signal.SIGCONT, "daemon")),
     "nothing of it runs (SIGSTOP)": Cause(
         _signals(signal.SIGSTOP, "daemon", "controller"), _signals(signal.SIGCONT, "daemon", "controller")
@@ -124,6 +130,9 @@ def measured(robot: Robot, cause: Cause, rng: random.Random, begin: Callable[[Ro
         assert time.monotonic() < begin_s + 20, "the wheels did not come to rest"
         time.sleep(POLL_S)
     rest_s = time.monotonic()
+    if cause.status is not None:
+        part, word = cause.status
+        wait_until(lambda: word in robot.operator.message(part), f"'{word}'")
     time.sleep(STILL_S)
     assert not base.line.moved_since(rest_s), "the wheels turned again while the cause lasted"
     moving = [note.at_s for note in list(base.line.notes) if note.at_s > begin_s and any(note.wheels_mps)]

@@ -88,31 +88,6 @@ def expect_motion(base: Base) -> None:
     wait_until(lambda: base.line.base.velocity_mps > 0.2, "motion again")
 
 
-NO_IMAGES, FROZEN = "no images of the", "are frozen"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("line", "part", "word"),
-    [
-        ("lower mute", "pairing", f"{NO_IMAGES} lower camera"),
-        ("both mute", "pairing", f"{NO_IMAGES} lower and the upper camera"),
-        ("lower garbage", "pairing", "cannot be decoded"),
-        ("both cut", "pairing", "cannot be decoded"),
-        ("both black", "odometry", "lost"),
-        ("upper frozen", "pairing", f"images of the upper camera {FROZEN}"),
-        ("both frozen", "pairing", f"images of the lower and the upper camera {FROZEN}"),
-    ],
-)
-def test_a_fault_of_cameras_is_named_and_passes(setting: Setting, line: str, part: str, word: str) -> None:
-    with driving(setting, module=FAULTY_DAEMON) as (daemon, operator, base):
-        daemon.write_line(line)
-        wait_until(lambda: word in operator.message(part), f"'{word}'")
-        expect_stop(base)
-        daemon.write_line("both ok")
-        expect_motion(base)
-
-
 @pytest.mark.slow
 def test_images_of_another_drive_stop_the_wheels(setting: Setting) -> None:
     """The images go to and fro at 0.5 m/s, as if the lens saw a screen, while 0.3 m/s forwards are commanded."""
