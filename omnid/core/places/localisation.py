@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -87,63 +87,36 @@ class MapPose:
 
 @dataclass(slots=True, eq=False)
 class Hypothesis:
-    """A recognition, and the frame it was made in."""
+    """A frame that was recognised at a place."""
 
-    recognition: Recognition
-    keyframe: int  # id of the newest keyframe of the run at that time
-    T_keyframe_rect: Array  # (4, 4) by odometry
-    covariance: Array  # (6, 6) of T_keyframe_rect
-    T_odom_rect: Array  # (4, 4)
+    place: Recognition
+    T_odom_rect: Array  # (4, 4) of the frame
+    link: Link  # from the place to the keyframe that was the newest one of the run then
     is_counted: bool = False  # it is a loop of the map already
-
-    def T_map_rect(self, poses: Mapping[int, Array]) -> Array:
-        """Return the pose of the frame in the map of these poses of keyframes."""
-        return np.asarray(poses[self.recognition.id] @ self.recognition.T_place_rect)
 
     def T_map_odom(self, poses: Mapping[int, Array]) -> Array:
         """Return the pose of odom in the map of these poses of keyframes."""
-        return np.asarray(self.T_map_rect(poses) @ se3.inverse(self.T_odom_rect))
-
-    def link(self) -> Link:
-        """Return the recognition as an edge from the recognised keyframe to the newest one of the run."""
-        place = self.recognition
-        to_frame = Link(place.id, -1, place.T_place_rect, place.covariance, place.inliers)
-        return to_frame.then(Link(self.keyframe, -1, self.T_keyframe_rect, self.covariance).reversed())
+        return np.asarray(poses[self.place.id] @ self.place.T_place_rect @ se3.inverse(self.T_odom_rect))
 
 
-class Hypotheses:
-    """Recognitions of the last frames, which count once enough of them agree."""
+def agreeing(kept: Iterable[Hypothesis], new: Hypothesis, poses: Mapping[int, Array]) -> list[Hypothesis]:
+    """Return the recognitions that agree with a new one, which is the last of them; none if there are too few.
 
-    def __init__(self) -> None:
-        self._kept: deque[Hypothesis] = deque(maxlen=KEPT)
-
-    def __len__(self) -> int:
-        return len(self._kept)
-
-    def clear(self) -> None:
-        """Forget all recognitions."""
-        self._kept.clear()
-
-    def add(self, new: Hypothesis, poses: Mapping[int, Array]) -> list[Hypothesis]:
-        """Add a recognition; return the consistent ones, the new one last; none if there are fewer than CONSISTENT."""
-        distinct: list[Hypothesis] = []
-        for one in self._kept:
-            if one.recognition.id not in poses or one.keyframe not in poses:
-                continue
-            # 1. Both must place the newer frame at the same pose in the map.
-            moved_m, turned_rad = motion_between(one.T_map_odom(poses) @ new.T_odom_rect, new.T_map_rect(poses))
+    Both must place the newer frame at the same pose in the map. Frames at one place count as one, unless they show
+    much.
+    """
+    T_map_new, distinct = new.T_map_odom(poses) @ new.T_odom_rect, list[Hypothesis]()
+    for one in (*kept, new):
+        if one.place.id in poses and one.link.b in poses:
+            moved_m, turned_rad = motion_between(one.T_map_odom(poses) @ new.T_odom_rect, T_map_new)
             if moved_m < SAME_M and turned_rad < SAME_RAD and _is_distinct(one, distinct):
                 distinct.append(one)
-        # 2. Frames at one place count as one, unless they show much.
-        if _is_distinct(new, distinct):
-            distinct.append(new)
-        self._kept.append(new)
-        return distinct if len(distinct) >= CONSISTENT else []
+    return distinct if len(distinct) >= CONSISTENT else []
 
 
 def _is_distinct(one: Hypothesis, others: list[Hypothesis]) -> bool:
     """True if a recognition counts besides others: it has many inliers, or its frame is apart from theirs."""
-    if one.recognition.inliers >= SURE_INLIERS:
+    if one.place.inliers >= SURE_INLIERS:
         return True
     moved = (motion_between(one.T_odom_rect, other.T_odom_rect) for other in others)
     return all(moved_m > APART_M or turned_rad > APART_RAD for moved_m, turned_rad in moved)
@@ -167,7 +140,7 @@ class MapLocaliser:
         self.search = PlaceSearch(replace(model, cylinder=model.cylinder.full_turn))
         self.correction = MapCorrection(self.places)
         self._session = 1 + max((k.session for k in self.places.keyframes.values()), default=-1)
-        self._hypotheses = Hypotheses()
+        self._hypotheses: deque[Hypothesis] = deque(maxlen=KEPT)
         self._newest: PlaceKeyframe | None = None  # newest keyframe of this part, placed by odometry
         self._T_map_odom = np.eye(4)
         self._resets = 0
@@ -357,9 +330,12 @@ class MapLocaliser:
         # 1. The recognition, with those before it that agree.
         T_keyframe_rect = se3.inverse(newest.T_odom_rect) @ frame.T_odom_rect
         since = relative_covariance(T_keyframe_rect, newest.covariance, frame.covariance)
-        hypothesis = Hypothesis(found, newest.id, T_keyframe_rect, since, frame.T_odom_rect)
-        poses = self.places.poses
-        if not (consistent := self._hypotheses.add(hypothesis, poses)):
+        link = Link(found.id, -1, found.T_place_rect, found.covariance, found.inliers)
+        link = link.then(Link(newest.id, -1, T_keyframe_rect, since).reversed())
+        hypothesis, poses = Hypothesis(found, frame.T_odom_rect, link), self.places.poses
+        consistent = agreeing(self._hypotheses, hypothesis, poses)
+        self._hypotheses.append(hypothesis)
+        if not consistent:
             return
         # 2. A place in another part joins the two; the older one stays where it is.
         part = self._current
@@ -371,7 +347,7 @@ class MapLocaliser:
             part |= other
             self.correction.forget()
         # 3. Loops, and the poses by them.
-        links = [one.link() for one in consistent if not one.is_counted]
+        links = [one.link for one in consistent if not one.is_counted]
         for one in consistent:
             one.is_counted = True
         self.correction.close([link for link in links if link.a != link.b], sorted(part), self._fixed)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.panorama import Cylinder
+from omnid.core.places.pose_graph import connected
 
 Array = NDArray[np.float64]
 
@@ -186,14 +187,7 @@ class PlaceMap:
         A run that extends a saved map begins a part of its own, and so does odometry after a gap of unknown motion. A
         place that is recognised in another part joins the two.
         """
-        part_of = {id: {id} for id in sorted(self.keyframes)}
-        for link in self.links:
-            small, large = sorted((part_of[link.a], part_of[link.b]), key=len)
-            if small is not large:
-                large |= small
-                part_of.update(dict.fromkeys(small, large))
-        different = {id(part): sorted(part) for part in part_of.values()}
-        return sorted(different.values(), key=lambda ids: (-len(ids), ids[0]))
+        return connected(list(self.keyframes), [(link.a, link.b) for link in self.links])
 
     def add(self, keyframe: PlaceKeyframe, T_map_rect: Array, link: Link | None = None) -> None:
         """Add a keyframe with the link of odometry that leads to it; None where there is no such link.

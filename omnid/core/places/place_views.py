@@ -12,6 +12,7 @@ from calib import se3
 from omnid.core.mapping.scan_grid import MAX_CELLS, Grid, KeyframeGrid, KeyframeScans
 from omnid.core.mapping.voxel_map import MapPoints, VoxelMap
 from omnid.core.places.place_map import PlaceMap, PlaceRig
+from omnid.core.places.pose_graph import connected
 from omnid.core.stereo.triangulation import triangulate
 
 Array = NDArray[np.float64]
@@ -62,23 +63,11 @@ def base_poses(places: PlaceMap, rig: PlaceRig) -> Array:
     return _of_base(np.array([places.poses[id] for id in sorted(places.keyframes)]), rig)
 
 
-def drives(places: PlaceMap) -> list[list[int]]:
-    """Return the ids of the keyframes of each drive; one ends with its session, or where odometry lost its pose."""
-    joined = {(min(link.a, link.b), max(link.a, link.b)) for link in places.links if not link.is_loop}
-    found: list[list[int]] = []
-    for id in sorted(places.keyframes):
-        last = found[-1][-1] if found else -1
-        if last >= 0 and places.keyframes[last].session == places.keyframes[id].session and (last, id) in joined:
-            found[-1].append(id)
-        else:
-            found.append([id])
-    return found
-
-
 def paths_xy(places: PlaceMap, rig: PlaceRig) -> Array:
-    """Return the paths (N, 2) [m] of all drives, a row of NaN after each, as nothing drove from one to the next."""
+    """Return the paths (N, 2) [m] of all drives, a row of NaN after each; one ends where odometry does not go on."""
     rows = [np.zeros((0, 2))]
-    for ids in drives(places):
+    by_odometry = [(link.a, link.b) for link in places.links if not link.is_loop]
+    for ids in sorted(connected(list(places.keyframes), by_odometry)):
         rows += [_of_base(np.array([places.poses[id] for id in ids]), rig)[:, :2, 3], np.full((1, 2), np.nan)]
     return np.vstack(rows)
 

@@ -8,12 +8,13 @@ full or not at all.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from calib import se3
 
@@ -87,8 +88,10 @@ def optimise(poses: Array, edges: PoseEdges, fixed: Flags | None = None) -> Pose
         if converged:
             break
         mu *= STEEPER
-    is_known = _connected(edges.pairs[weights > ACCEPTED], fixed)[-1]
-    covariance = graph.last_covariance(J, weights) if is_known else np.full((6, 6), np.inf)
+    last = next(
+        part for part in connected(range(len(poses)), edges.pairs[weights > ACCEPTED]) if part[-1] + 1 == len(poses)
+    )
+    covariance = graph.last_covariance(J, weights) if fixed[last].any() else np.full((6, 6), np.inf)
     return PoseGraphResult(poses, weights, covariance, converged)
 
 
@@ -161,8 +164,11 @@ def _weights(squared: Array, mu: float) -> Array:
     return np.asarray(np.clip(ratio * np.sqrt(mu * (mu + 1)) - mu, 0.0, 1.0))
 
 
-def _connected(pairs: Indices, fixed: Flags) -> Flags:
-    """Return flags (N,) of the nodes that pairs (K, 2) of nodes join to a fixed node."""
-    joins = scipy.sparse.coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(fixed), len(fixed)))
-    _, label = scipy.sparse.csgraph.connected_components(joins, directed=False)
-    return np.isin(label, label[fixed])
+def connected(ids: Sequence[int], pairs: ArrayLike) -> list[list[int]]:
+    """Return the parts of a graph that pairs (K, 2) of its ids join, each ascending, the largest part first."""
+    nodes = np.array(sorted(ids), np.intp)
+    rows = np.searchsorted(nodes, np.asarray(pairs, np.intp).reshape(-1, 2))
+    joins = scipy.sparse.coo_matrix((np.ones(len(rows)), tuple(rows.T)), (len(nodes), len(nodes)))
+    count, label = scipy.sparse.csgraph.connected_components(joins, directed=False)
+    parts = [nodes[label == part].tolist() for part in range(count)]
+    return sorted(parts, key=lambda part: (-len(part), part[0]))

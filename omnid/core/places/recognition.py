@@ -6,9 +6,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,10 +38,6 @@ CORRELATED: Final = 4.0  # features that count as one in the covariance
 # m, rad: least standard deviations, however many features there are.
 FLOOR: Final = np.diag([0.004] * 3 + [0.0007] * 3) ** 2
 SECTORS: Final = 8  # Sectors of azimuth in which inliers are counted, of 45 degrees.
-# Least inliers, and sectors of azimuth that hold them, where odometry agrees ...
-NEAR_INLIERS, NEAR_SECTORS = 20, 4
-# ... and where it gives no pose, because other worlds gave 10 inliers in 600 queries.
-FAR_INLIERS, FAR_SECTORS = 24, 5
 # At most PER_PLACE of the compared keyframes lie within SAME_PLACE_M of each other.
 PER_PLACE, SAME_PLACE_M = 3, 1.5
 RUNNER_UP: Final = 0.6  # Share of the inliers with which another place makes a recognition ambiguous.
@@ -50,12 +46,24 @@ VOTERS: Final = 64  # Features of a frame that vote, evenly spread, the stronges
 BINS: Final = 24  # Bins of the yaw angle; three neighbours count together.
 NEAR_M: Final = 1.5  # Keyframes within this distance of the pose by odometry are searched, besides its error.
 ENOUGH_INLIERS: Final = 50  # Inliers of a place with which the search ends.
-# Most similar thumbnails whose features vote, and those with most votes that are compared: where odometry knows the
-# pose roughly, and where it does not.
-NEAR_EFFORT, FAR_EFFORT = (16, 3), (200, 8)
 # Largest error of odometry, and its growth with the path [m, m/m; rad, rad/m].
 GATE_M, GATE_PER_M = 0.15, 0.05
 GATE_RAD, GATE_RAD_PER_M = math.radians(3), math.radians(0.4)
+
+
+class Effort(NamedTuple):
+    """How far a search goes, and what it takes to count."""
+
+    voted: int  # most similar thumbnails whose features vote
+    compared: int  # of these, those with most votes
+    inliers: int  # least inliers of a recognition
+    sectors: int  # and least sectors of azimuth that hold them
+    enough: int = FEATURES + 1  # inliers with which the search ends
+
+
+# Where odometry knows the pose roughly, and where it gives none: other worlds gave 10 inliers in 600 queries.
+NEAR: Final = Effort(16, 3, 20, 4)
+FAR: Final = Effort(200, 8, 24, 5)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,6 +76,10 @@ class Recognition:
     inliers: int
     matches: int
     sectors: int  # number of SECTORS that hold inliers
+
+    def has(self, effort: Effort) -> bool:
+        """True if its support is that which an effort asks for."""
+        return self.inliers >= effort.inliers and self.sectors >= effort.sectors
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,23 +123,21 @@ class PlaceSearch:
         where: the pose that odometry expects, which must not contradict it; or keyframes (ids) of which odometry does
         not know where they are.
         """
-        is_near = isinstance(where, Expected)
-        ids = where.near(places) if isinstance(where, Expected) else where
-        voted, compared = NEAR_EFFORT if is_near else FAR_EFFORT
-        enough = ENOUGH_INLIERS if isinstance(where, Expected) and where.recognised else FEATURES + 1
+        if isinstance(where, Expected):
+            effort, ids = NEAR._replace(enough=ENOUGH_INLIERS) if where.recognised else NEAR, where.near(places)
+        else:
+            effort, ids = FAR, where
         # 1. The most similar thumbnails.
         if ids:
             others = np.array([self._signature(places, id) for id in ids])
             ranked = np.argsort(-similarities(signature_of(small), others), kind="stable")
-            ids = [ids[n] for n in ranked[:voted].tolist()]
-        # 2. Votes and geometry of these.
+            ids = [ids[n] for n in ranked[: effort.voted].tolist()]
+        # 2. Votes and geometry of these: the best one, unless another place is as similar.
         known = {id: places.keyframes[id].features for id in ids}
-        found = compare(features, known, places.poses, compared, enough, self._model)
+        best, found = search(features, known, places.poses, effort, self._model)
         self.compared = {id: 0 if place is None else place.inliers for id, place in found.items()}
-        # 3. The best one, unless another place is as similar, or odometry contradicts it.
-        candidates = supported(found.values(), near=is_near)
-        best = unambiguous(candidates, places.poses)
-        self.ambiguous += best is None and bool(candidates)
+        self.ambiguous += best is None and any(place is not None and place.has(effort) for place in found.values())
+        # 3. Unless odometry contradicts it.
         if best is None or not isinstance(where, Expected):
             return best
         is_confirmed = where.confirms(best, places.poses)
@@ -145,52 +155,40 @@ class PlaceSearch:
         self._signatures = {id: found for id, found in self._signatures.items() if id in places.keyframes}
 
 
-def compare(
+def search(
     here: PlaceFeatures,
     known: Mapping[int, PlaceFeatures],
     poses: Mapping[int, Array],
-    most: int,
-    enough: int,
+    effort: Effort,
     model: StereoModel,
-) -> dict[int, Recognition | None]:
-    """Compare a frame with the keyframes that most of its features vote for; return the recognition or None of each.
+) -> tuple[Recognition | None, dict[int, Recognition | None]]:
+    """Return the place that a frame shows, None where none has the support or two have it; and all that were compared.
 
-    known: features of each keyframe; poses: (4, 4) of each. At most `most` are compared, best first, until one is
-    recognised with `enough` inliers; at most PER_PLACE near another one, so that a second, similar place is compared as
-    well, although all neighbours of the first are more similar.
+    known: features of each keyframe; poses: (4, 4) of each. Those are compared for which most features of the frame
+    vote, at most PER_PLACE near another one, so that a second, similar place is compared as well, although all
+    neighbours of the first are more similar.
     """
     voted = {id: votes(here, features, model.cylinder.width) for id, features in known.items()}
     found: dict[int, Recognition | None] = {}
     for id in sorted(known, key=lambda id: -voted[id][0]):
-        if len(found) == most:
+        if len(found) == effort.compared:
             break
         beside = sum(np.linalg.norm(poses[id][:3, 3] - poses[other][:3, 3]) < SAME_PLACE_M for other in found)
         if beside >= PER_PLACE:
             continue
         place = found[id] = recognise(here, known[id], id, voted[id][1], model)
-        if place is not None and place.inliers >= enough:
+        if place is not None and place.inliers >= effort.enough:
             break
-    return found
-
-
-def supported(found: Iterable[Recognition | None], *, near: bool = False) -> list[Recognition]:
-    """Return the recognitions with enough support; near: odometry agrees with them."""
-    inliers, sectors = (NEAR_INLIERS, NEAR_SECTORS) if near else (FAR_INLIERS, FAR_SECTORS)
-    return [place for place in found if place and place.inliers >= inliers and place.sectors >= sectors]
-
-
-def unambiguous(found: list[Recognition], poses: Mapping[int, Array]) -> Recognition | None:
-    """Return the recognition with most inliers, None where another place has nearly as many, or none was found."""
-    best = max(found, key=lambda place: place.inliers, default=None)
-    if best is None:
-        return None
-    T = poses[best.id] @ best.T_place_rect
-    for place in found:
-        moved_m, turned_rad = motion_between(T, poses[place.id] @ place.T_place_rect)
+    supported = [each for each in found.values() if each is not None and each.has(effort)]
+    best = max(supported, key=lambda each: each.inliers, default=None)
+    for other in supported:
+        assert best is not None
+        T_best, T_other = (poses[each.id] @ each.T_place_rect for each in (best, other))
+        moved_m, turned_rad = motion_between(T_best, T_other)
         is_elsewhere = moved_m > RUNNER_UP_M or turned_rad > RUNNER_UP_RAD
-        if is_elsewhere and place.inliers > RUNNER_UP * best.inliers:
-            return None
-    return best
+        if is_elsewhere and other.inliers > RUNNER_UP * best.inliers:
+            return None, found
+    return best, found
 
 
 def recognise(

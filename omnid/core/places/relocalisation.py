@@ -12,9 +12,9 @@ from calib import se3
 from omnid.core.odometry.estimates import PoseEstimate
 from omnid.core.odometry.local_map import Keyframe
 from omnid.core.odometry.stereo_frame import StereoFrame
-from omnid.core.places.features import FEATURES, describe
+from omnid.core.places.features import describe
 from omnid.core.places.place_map import PlaceFeatures
-from omnid.core.places.recognition import compare, supported, unambiguous
+from omnid.core.places.recognition import NEAR, search
 from omnid.core.types.stereo_model import StereoModel
 
 MAX_KEYFRAMES: Final = 8  # kept in memory; by trial on development seeds
@@ -31,8 +31,10 @@ class Relocaliser:
 
     def add(self, frame: StereoFrame, keyframe: Keyframe) -> None:
         """Keep a frame and its keyframe; one near the last keyframe replaces it. It is described when it is needed."""
-        if self._kept and _distance_m(self._kept[-1][1], keyframe) < KEYFRAMES_APART_M:
-            self._kept.pop()
+        if self._kept:
+            apart_m = self._kept[-1][1].T_odom_rect[:3, 3] - keyframe.T_odom_rect[:3, 3]
+            if np.linalg.norm(apart_m) < KEYFRAMES_APART_M:
+                self._kept.pop()
         self._kept.append((frame.packed(), keyframe))
 
     def clear(self) -> None:
@@ -45,20 +47,14 @@ class Relocaliser:
         # 1. Describe the frame, and the keyframes that no search has described before.
         here = describe(frame)
         self._features = {kept.seq: self._features.get(kept.seq) or describe(kept) for kept, _ in self._kept}
-        # 2. Compare it with them: votes, matches, RANSAC, Gauss-Newton, as in the map of places.
+        # 2. Search it among them, as in the map of places.
         keyframes = {keyframe.seq: keyframe for _, keyframe in self._kept}
         poses = {seq: keyframe.T_odom_rect for seq, keyframe in keyframes.items()}
-        found = compare(here, self._features, poses, len(keyframes), FEATURES + 1, self._model)
-        # 3. Take the best one, unless another place is as similar.
-        best = unambiguous(supported(found.values(), near=True), poses)
+        effort = NEAR._replace(compared=len(keyframes))
+        best, _ = search(here, self._features, poses, effort, self._model)
         if best is None:
             return None
         A = se3.adjoint(se3.inverse(best.T_place_rect))
         covariance = best.covariance + A @ keyframes[best.id].covariance @ A.T
         matches = max(best.matches, best.inliers)
         return PoseEstimate(poses[best.id] @ best.T_place_rect, covariance, matches, matches, best.inliers)
-
-
-def _distance_m(a: Keyframe, b: Keyframe) -> float:
-    """Return the distance between the poses of two keyframes."""
-    return float(np.linalg.norm(a.T_odom_rect[:3, 3] - b.T_odom_rect[:3, 3]))

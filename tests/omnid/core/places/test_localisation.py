@@ -16,13 +16,13 @@ from omnid.core.places.localisation import (
     CONSISTENT,
     SEARCHES,
     SURE_INLIERS,
-    Hypotheses,
     Hypothesis,
     MapLocaliser,
     MapPose,
     OdometryFrame,
+    agreeing,
 )
-from omnid.core.places.place_map import PlaceLimits
+from omnid.core.places.place_map import Link, PlaceLimits
 from omnid.core.places.recognition import Recognition
 from omnid.tracking_state import MapState
 from tests.omnid.core.mapping.rooms import pose as on_floor
@@ -239,13 +239,12 @@ def hypothesis(x_m: float, error_m: float = 0.0, inliers: int = 12) -> Hypothesi
     T_odom_rect = on_floor(x_m, 0.0, 0.0)
     T_map_rect = T_MAP_ODOM @ T_odom_rect @ on_floor(0.0, error_m, 0.0)
     found = Recognition(PLACE, se3.inverse(KNOWN[PLACE]) @ T_map_rect, BY_FRAME, inliers, 30, 4)
-    return Hypothesis(found, NEWEST, np.eye(4), BY_FRAME, T_odom_rect)
+    return Hypothesis(found, T_odom_rect, Link(PLACE, NEWEST, np.eye(4), BY_FRAME))
 
 
 def consistent(*given: Hypothesis, poses: dict[int, Array] = KNOWN) -> int:
     """Return how many agree at the last one of recognitions that are added in turn."""
-    kept = Hypotheses()
-    return [len(kept.add(one, poses)) for one in given][-1]
+    return len(agreeing(given[:-1], given[-1], poses))
 
 
 def test_recognitions_that_agree_count_once_they_are_enough() -> None:
