@@ -164,7 +164,9 @@ class ImageBreaks:
         last, found = self._last, None
         step = np.zeros(6) if last is None else se3.log(se3.inverse(last.T_odom_rect) @ T_odom_rect)
         is_usual = cost is not None and cost[1] * (cost[0] - self._usual_cost) < DECIDING_COST and not self._is_broken
-        if last is not None and dt_s > 0 and not is_usual:
+        # A pose that was only predicted says too little about the motion between several exposures.
+        is_known = cost is not None or exposure.times.is_at_once
+        if last is not None and dt_s > 0 and is_known and not is_usual:
             flow = self._flow(last, pair, T_odom_rect, exposure, step, LAG_S / dt_s)
             found = None if flow is None else likeliest_break(flow, self.raws, self.model.cylinder.focal_px)
         if cost is not None and found is None:
