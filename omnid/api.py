@@ -20,19 +20,18 @@ from calib.models.camera import OmniCamera
 from calib.rig import Rig
 from calib.rig_file import read_rig
 from drivers.errors import DriverError
-from drivers.frame import Camera, Frame
+from drivers.frame import CAMERAS, Camera, Frame
 from omnid.config import Config, load_config, unused_settings
 from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.threads import Lock
 from omnid.errors import OmnidError
-from omnid.messages import DensePoints, FramePair, OdometryUpdate
+from omnid.messages import DensePoints, OdometryUpdate
 from omnid.runs.replay import ReplayOptions, run_log
 from omnid.runs.run_result import RunResult
 from omnid.settings import dump, parse
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry, with_rims
-from omnid.stages.synchronise import RepeatedImages, Skew
 
 FilePath: TypeAlias = str | PathLike[str]
 GreyImage: TypeAlias = NDArray[np.uint8]  # (H, W)
@@ -113,14 +112,13 @@ class Odometry:
             loaded = rig if isinstance(rig, Rig) else read_rig(Path(rig))
             self._cameras: dict[Camera, OmniCamera] = {"lower": loaded.lower.camera, "upper": loaded.upper.camera}
             place = geometry(with_rims(loaded, self._frames(mask_images)), settings.panorama)
-            self._front_end = FrontEnd(place, settings)
+            # `process` gets both images of a pair at once, whatever the time between their exposures.
+            together = replace(settings.pair, tolerance_ms=1e3 * MAX_SKEW_S)
+            self._front_end = FrontEnd(place, replace(settings, pair=together))
         self.rig = place.rig  # with the masks that were found
         self._lock = Lock()
-        self._pairs = 0
-        self._skew = Skew()
+        self._seq = 0
         self._stamp_ns: int | None = None
-        self._earlier = {"lower": RepeatedImages(), "upper": RepeatedImages()}
-        self._use_repeated = settings.pair.repeated_images == "use"
 
     def process(
         self, stamp_ns: int, lower: InputImage, upper: InputImage, upper_stamp_ns: int | None = None
@@ -150,28 +148,27 @@ class Odometry:
                     f"{stamp_ns}: give the pairs in the order of time, each once"
                 )
             images = (self._checked("lower", lower), self._checked("upper", upper))
-            skew_ns = None if upper_stamp_ns is None else _nanoseconds("upper_stamp_ns", upper_stamp_ns) - stamp_ns
-            if skew_ns is not None and abs(skew_ns) >= MAX_SKEW_S * 1e9:
+            stamps_ns = stamp_ns, stamp_ns if upper_stamp_ns is None else _nanoseconds("upper_stamp_ns", upper_stamp_ns)
+            if abs(stamps_ns[1] - stamp_ns) >= MAX_SKEW_S * 1e9:
                 raise OmnidError(
                     f"upper_stamp_ns: expected a stamp less than {MAX_SKEW_S:g} s from stamp_ns, {stamp_ns}, "
                     f"found {upper_stamp_ns}: give both in nanoseconds of one clock"
                 )
-            # 2. Refuse an image that repeats an earlier one; it counts as an earlier one all the same. It is copied,
-            #    because the caller may read the next images into the same arrays.
-            pairs = zip(self._earlier.items(), images, strict=True)
-            found = [name for (name, earlier), image in pairs if earlier.add(image.copy())]
-            if found and not self._use_repeated:
+            # 2. Pair them; an image that repeats an earlier one gives no pair.
+            pairing, before = self._front_end.pairing, self._front_end.pairing.counts
+            _, pair = [
+                pairing.process(Frame(self._seq, at_ns, name, "mono8", image, image.shape[1], image.shape[0]))
+                for name, at_ns, image in zip(CAMERAS, stamps_ns, images, strict=True)
+            ]
+            self._seq += 1
+            if pair is None:
+                found = [name for name in CAMERAS if pairing.counts[f"repeated_{name}"] > before[f"repeated_{name}"]]
                 raise OmnidError(
                     f"the image of the {' and the '.join(found)} camera is an earlier one, to the last pixel: leave "
                     'such pairs out, as a frozen camera shows no motion, or set pair.repeated_images="use"'
                 )
-            # 3. Follow the time between the exposures, which the stamps give with jitter; None: both at once.
-            if skew_ns is not None:
-                self._skew.add(skew_ns)
-            skew_s = 0.0 if skew_ns is None else self._skew.exposure_ns * 1e-9
-            # 4. Estimate the motion.
-            pair = FramePair(self._pairs, stamp_ns, *images, skew_s)
-            self._pairs, self._stamp_ns = self._pairs + 1, stamp_ns
+            # 3. Estimate the motion.
+            self._stamp_ns = stamp_ns
             return self._front_end.process(pair)
 
     def depth(self, pose: OdometryUpdate) -> DensePoints:

@@ -6,10 +6,11 @@ import hashlib
 import logging
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from stat import S_ISREG
+from typing import NamedTuple
 
 from calib.rig_file import rig_toml
 from omnid.config import Config
@@ -25,8 +26,7 @@ from omnid.transport.codec import string_from_cdr
 from omnid.transport.topics import SAVE_MAP, Answer, Request
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RigPlaces:
+class RigPlaces(NamedTuple):
     """A map of places and the rig that saw them."""
 
     places: PlaceMap
@@ -64,28 +64,27 @@ class RunPlaces:
         # 1. The map: that which was given, that of the file, a new one, or none.
         path = self._path = Path(settings.map) if settings.map and given is None and not build else None
         self.localize_only = path is not None and settings.localize_only
-        self.is_extended = path is not None and settings.enabled and not settings.localize_only  # the file is written
+        self.is_extended = path is not None and not settings.localize_only  # the file is written
         self._version = None if path is None else _version(path)
-        if path is not None:
-            if self.is_extended:
-                check_outputs([("--map", path)], [])
-            if self.is_extended and not path.exists():
-                log(logging.INFO, f"{path}: there is no such map: this run begins a new one")
-            else:
-                given = RigPlaces(*read_places(path, PlaceMap(settings.limits.max_keyframes)))
-        self.places: PlaceMap | None = None if given is None else given.places
+        if path is not None and self.is_extended:
+            check_outputs([("--map", path)], [])
+        if path is not None and self.is_extended and not path.exists():
+            log(logging.INFO, f"{path}: there is no such map: this run begins a new one")
+        elif path is not None:
+            given = RigPlaces(*read_places(path, PlaceMap(settings.limits.max_keyframes)))
+        self.places = None if given is None else given.places
         if given is None and (build or path is not None):
             self.places = PlaceMap(settings.limits.max_keyframes)
         self._known = frozenset(given.places.keyframes) if given else frozenset[int]()
+        self._name = path or "the map"
         # 2. It must fit the rig, and is adapted to the panoramas of this run.
         if given is not None and self._known:
-            name = path or "the map"
             if difference := given.rig.difference(self._rig):
                 raise OmnidError(
-                    f"{name}: this map was made with {difference}: build one with this rig, by `omnid map build`"
+                    f"{self._name}: this map was made with {difference}: build one with this rig, by `omnid map build`"
                 )
             if given.rig.rig_hash != self._rig.rig_hash:
-                warn(f"{name}: the rig was calibrated again since this map was made")
+                warn(f"{self._name}: the rig was calibrated again since this map was made")
             self._rig.adapt(given.places, given.rig)
         # 3. What was saved, and requests for it.
         self.copy_s = 0.0  # time between two copies that are saved; 0: none is
@@ -122,22 +121,20 @@ class RunPlaces:
         if copy is None or copy is self._seen:
             return
         self._seen = copy
-        joined, self._error = self._joined(copy.places), ""
-        is_elsewhere = self._known and not joined - self._known and copy.places.keyframes.keys() - self._known
-        if is_elsewhere and not self._was_elsewhere:
+        joined = self._joined(copy.places)
+        new = joined - self._known
+        if self._known and not new and len(copy.places.keyframes) > len(self._known) and not self._was_elsewhere:
             self._was_elsewhere = True
             self._warn(f"{self._path}: no place of it is recognised so far: is this another place? Name another map")
-        is_new = bool(joined - self._known) and joined != self._saved
-        answer = Answer(True, "the map is saved" if is_new else "the map in the file has all that is known already")
-        try:
-            if is_new:
+        answer, self._error = Answer(True, "the map in the file has all that is known already"), ""
+        if new and joined != self._saved:
+            try:
                 self._write(copy.places.part(joined))
-                self._saved = joined
-            self._counts["saves"] += is_new
-        except OmnidError as error:
-            self._counts["failed"] += 1
-            self._error = str(error)
-            answer = Answer(False, f"the map is not saved: {error}")
+                self._saved, answer = joined, Answer(True, "the map is saved")
+                self._counts["saves"] += 1
+            except OmnidError as error:
+                self._counts["failed"] += 1
+                self._error, answer = str(error), Answer(False, f"the map is not saved: {error}")
         for id in copy.ids:
             self._answer(id, answer)
 
@@ -152,7 +149,7 @@ class RunPlaces:
         """
         if self.places is None:
             return None
-        joined, name = self._joined(self.places), self._path or "the map"
+        joined, name = self._joined(self.places), self._name
         new, unjoined = len(joined - self._known), len(self.places.keyframes.keys() - joined - self._known)
         self.places = self.places.part(joined)
         if self._known and not new and unjoined:
