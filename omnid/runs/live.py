@@ -44,7 +44,7 @@ from omnid.runs.record import open_recorder
 from omnid.runs.route_files import Requests
 from omnid.runs.session import BUS_POINTS, LOG_POINTS, Session, joint_wheels, opencv_in_one_thread
 from omnid.runs.systemd import Service, StatusLine, print_stacks_when_killed
-from omnid.runs.wiring import NavigationParts, Outputs, Parts, wire
+from omnid.runs.wiring import Inputs, Navigation, Outputs, wire
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
 from omnid.sinks.drive import PlannerDrive
 from omnid.sinks.encoder import StatusReport
@@ -303,11 +303,11 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
             graph.sink("wheels", motion.add, wheels, thread=wheels.thread)
         if PLANNER in config.controller.sources.names:
             planner, folder = PlannerDrive(controller, bus.answer), RouteFolder(Path(config.navigation.routes))
-            navigation = NavigationParts(requests, states, folder, planner, config.places.map)
+            navigation = Navigation(requests, states, folder, planner, config.places.map)
         else:
             warn(NO_PLANNER)
-    parts = Parts(run_places, controller, navigation, config.live.cloud_s, map_is_read)
-    stages = wire(graph, frames, front_end, config, outputs, parts)
+    inputs = Inputs(frames, run_places, controller, navigation, map_is_read, config.live.cloud_s)
+    stages = wire(config, inputs, front_end, graph, outputs)
 
     # 4. What comes from the bus, and the status of all parts.
     watched = _subscribe(session, bus, robot, controller, requests, run_places, front_end)

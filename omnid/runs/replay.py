@@ -39,7 +39,7 @@ from omnid.messages import MapUpdate, OdometryUpdate, PlaceUpdate
 from omnid.runs.place_maps import RigPlaces, RunPlaces
 from omnid.runs.run_result import RunFailedError, RunResult
 from omnid.runs.session import LOG_POINTS, Session, attached_rig, motion_topics, opencv_in_one_thread
-from omnid.runs.wiring import Outputs, Parts, wire
+from omnid.runs.wiring import Inputs, Outputs, wire
 from omnid.settings import dump
 from omnid.sinks.bus_sink import BusSink
 from omnid.sinks.drive import ReplayDrive, SimulatedWheels
@@ -94,15 +94,8 @@ class ReplayOptions:
     @property
     def files(self) -> list[tuple[str, Path]]:
         """The files that are written, each with its option."""
-        named = (
-            ("--tum", self.tum),
-            ("--map-tum", self.map_tum),
-            ("--map-live-tum", self.map_live_tum),
-            ("--cloud", self.cloud),
-            ("--plan", self.plan),
-            ("--record", self.record),
-        )
-        return [(name, path) for name, path in named if path is not None]
+        names = ("tum", "map_tum", "map_live_tum", "cloud", "plan", "record")
+        return [(f"--{name.replace('_', '-')}", path) for name in names if (path := getattr(self, name)) is not None]
 
 
 def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> RunResult:
@@ -144,8 +137,8 @@ class _Replay:
             # 2. The stages, between the log and the outputs; one that cannot be opened ends the run before it begins.
             run_places = RunPlaces(config, geometry, session.warn, options.rig_places, build=options.build)
             messages, sinks = graph.source("read", self._messages()), self._outputs(geometry)
-            parts = Parts(map=run_places, map_every_s=options.map_every_s)
-            self._stages = wire(graph, [messages], front_end, config, sinks, parts)
+            inputs = Inputs([messages], run_places, map_every_s=options.map_every_s)
+            self._stages = wire(config, inputs, front_end, graph, sinks)
             if options.progress is not None:
                 show = partial(options.progress, session.statistics, reader.pair_estimate())
                 graph.ticker("progress", PROGRESS_S, partial(show, False))
@@ -167,14 +160,9 @@ class _Replay:
 
     def _inputs(self) -> list[tuple[str, Path]]:
         """The files that are read, each with its name for errors."""
-        rig = self._options.rig if isinstance(self._options.rig, Path) else None
-        named = (
-            ("the log that is read", self._log),
-            ("the rig that is read", rig),
-            ("the configuration that is read", self._options.settings),
-        )
-        in_folder = [("the log that is read", log) for log in sorted(self._log.glob("*.mcap"))]  # also by another name
-        return [(what, path) for what, path in named if path is not None] + in_folder
+        logs = [self._log, *sorted(self._log.glob("*.mcap"))]  # those of a folder also by another name
+        named = [*(("log", log) for log in logs), ("rig", self._options.rig), ("configuration", self._options.settings)]
+        return [(f"the {what} that is read", path) for what, path in named if isinstance(path, Path)]
 
     def _opened(self) -> LogReader:
         """Open the log; the topics are those of the options, else of the rig, else found by their names."""

@@ -6,6 +6,7 @@ pairs of images the controller ticks. A pose reaches it robot.pose_delay_s after
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import islice
@@ -24,15 +25,16 @@ from omnid.core.control.arming import ArmRequest
 from omnid.core.control.command_sources import PLANNER, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.frames import of_base
+from omnid.core.nanoseconds import NS_PER_S
 from omnid.core.navigation.requests import NavigationCommand, NavigationRequest
-from omnid.engine.graph import Graph, nothing
+from omnid.engine.graph import Graph, Output, nothing
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.route_files import Requests
 from omnid.runs.session import opencv_in_one_thread
-from omnid.runs.wiring import NavigationParts, Outputs, Parts, wire
+from omnid.runs.wiring import Inputs, Navigation, Outputs, wire
 from omnid.simulation.robot import SimulatedRobot, with_masks
 from omnid.simulation.vehicle import Tick, Vehicle
 from omnid.simulation.world import World
@@ -152,104 +154,84 @@ def simulate(
     where there is one. Raises OmnidError as `omnid run` does.
     """
     prepare_kernels(nothing)
-    with opencv_in_one_thread():
-        return _Lockstep(world, robot, drive, seed, config or Config(), vehicle).run(seconds)
+    # 1. The robot, and the lists of what it does.
+    config, rig = config or Config(), with_masks(robot.rig)
+    run, truth = SimulatedRun(rig.T_base_rig), dict[int, Array]()  # T_world_base by the stamp of a pair [ns]
+    body = vehicle(
+        world,
+        robot,
+        config,
+        seed,
+        lambda tick, _: run.ticks.append(tick),
+        lambda time_s, line: run.lines.append((time_s, line)),
+    )
+    # 2. The stages of the daemon, which work while frames and samples are yielded, and what they give the robot.
+    graph = Graph(threaded=False)
+    front_end = FrontEnd(geometry(rig, config.panorama), config)
+    requests, states = Requests(graph), graph.inlet(1)
+    newest = deque[OdometryUpdate](maxlen=1)
 
-
-class _Lockstep:
-    def __init__(
-        self, world: World, robot: SimulatedRobot, drive: Drive, seed: int, config: Config, vehicle: MakeVehicle
-    ) -> None:
-        self._drive, self._config, self._rig = drive, config, with_masks(robot.rig)
-        self._run = run = SimulatedRun(self._rig.T_base_rig)
-        self._vehicle = vehicle(
-            world,
-            robot,
-            config,
-            seed,
-            lambda tick, _: run.ticks.append(tick),
-            lambda time_s, line: run.lines.append((time_s, line)),
-        )
-        self._graph = Graph(threaded=False)
-        self._requests, self._states = Requests(self._graph), self._graph.inlet(1)
-        self._ends = False
-        self._truth: dict[int, Array] = {}  # T_world_base by the stamp of a pair [ns]
-        self._odometry: OdometryUpdate | None = None
-        self._front_end = FrontEnd(geometry(self._rig, config.panorama), config)
-
-    def run(self, seconds: float) -> SimulatedRun:
-        """Drive; return the run."""
-        # The stages of the daemon, between the simulated cameras and the lists of results.
-        config, graph, routes = self._config, self._graph, RouteFolder(Path(self._config.navigation.routes))
-        frames = graph.source("cameras", lambda: self._messages(seconds))
-        run_places = RunPlaces(config, self._front_end.geometry, nothing)
-        navigation = NavigationParts(self._requests, self._states, routes, self._take_navigation, config.places.map)
-        outputs = Outputs(
-            poses={"poses": self._take_pose},
-            rings={"rings": self._take_ring},
-            places={"in map": self._run.places.append} if config.places.map else {},
-        )
-        parts = Parts(navigation=navigation, map=run_places)
-        wire(graph, [frames], self._front_end, config, outputs, parts)
-        graph.run()
-        run_places.finish_run()
-        return self._run
-
-    def _messages(self, seconds: float) -> Iterator[Frame | MotionSample]:
-        """Advance the robot from pair to pair; the stages work while frames and samples are yielded."""
-        vehicle = self._vehicle
-        for pair in islice(vehicle.pairs(nothing), int(seconds * vehicle.robot.rate_hz)):
-            # 1. The drive sees the newest estimates, and asks for what it wants.
-            self._send()
-            if self._ends:
+    def messages() -> Iterator[Frame | MotionSample]:
+        for pair in islice(body.pairs(nothing), int(seconds * robot.rate_hz)):
+            if send():
                 break
-            # 2. What the sensors have measured goes through the stages.
-            self._truth[pair.stamp_ns] = vehicle.T_world_base
+            truth[pair.stamp_ns] = body.T_world_base
             yield from (*pair.samples, *pair.frames)
-        vehicle.come_to_rest()
+        body.come_to_rest()
 
-    def _send(self) -> None:
-        """Send what the drive asks for now."""
-        vehicle, run = self._vehicle, self._run
-        state = vehicle.controller.state
+    def send() -> bool:
+        """Send what the drive asks for by the newest estimates; return True if it asks for the end."""
+        state, ends = body.controller.state, False
         moment = Moment(
-            vehicle.time_s,
-            vehicle.T_world_base,
+            body.time_s,
+            body.T_world_base,
             state,
-            self._odometry,
+            newest[-1] if newest else None,
             run.poses[-1].T_odom_base if run.poses else np.eye(4),
             run.navigation[-1] if run.navigation else None,
             run.places[-1] if run.places else None,
         )
-        arrival_ns = vehicle.now_ns + 1  # after the tick at this time, which has passed
-        for request in self._drive(moment):
+        arrival_ns = body.now_ns + 1  # after the tick at this time, which has passed
+        for request in drive(moment):
             if isinstance(request, Setpoint):
-                vehicle.post(TimedSetpoint(arrival_ns, request))
+                body.post(TimedSetpoint(arrival_ns, request))
             elif request == "arm":
-                vehicle.post(ArmRequest(arrival_ns))
+                body.post(ArmRequest(arrival_ns))
             elif request == "stop":
-                vehicle.post("stop")
+                body.post("stop")
             elif request == "end":
-                self._ends = True
+                ends = True
             else:
-                self._states.push(state)
-                self._requests.put(NavigationCommand(request, arrival_ns, arrival_ns, halts=state.halts))
-        self._states.push(state)
+                states.push(state)
+                requests.put(NavigationCommand(request, arrival_ns, arrival_ns, halts=state.halts))
+        states.push(state)
+        return ends
 
-    def _take_pose(self, odometry: OdometryUpdate) -> None:
-        T_base_rig, stamp_ns = self._rig.T_base_rig, odometry.stamp_ns
-        self._odometry = odometry
-        is_slipping = self._front_end.odometry.motion.is_slipping
-        T_odom_base = of_base(odometry, T_base_rig)[0]
-        self._run.poses.append(EstimatedPose(stamp_ns, self._truth[stamp_ns], T_odom_base, odometry.state, is_slipping))
-        self._vehicle.post(controller_pose(odometry, T_base_rig))
+    def take_pose(odometry: OdometryUpdate) -> None:
+        newest.append(odometry)
+        estimate = of_base(odometry, rig.T_base_rig)[0], odometry.state, front_end.odometry.motion.is_slipping
+        run.poses.append(EstimatedPose(odometry.stamp_ns, truth[odometry.stamp_ns], *estimate))
+        body.post(controller_pose(odometry, rig.T_base_rig))
 
-    def _take_ring(self, ring: ObstacleRing) -> None:
-        self._run.rings.append(ring)
-        self._vehicle.post(controller_ring(ring))
+    def take_ring(ring: ObstacleRing) -> None:
+        run.rings.append(ring)
+        body.post(controller_ring(ring))
 
-    def _take_navigation(self, update: NavigationUpdate) -> None:
-        self._run.navigation.append(update)
+    def take_navigation(update: NavigationUpdate) -> None:
+        run.navigation.append(update)
         if update.setpoint is not None:
-            due_ns = self._vehicle.now_ns + round(self._vehicle.robot.pose_delay_s * 1e9)
-            self._vehicle.post(TimedSetpoint(due_ns, update.setpoint, PLANNER, NAVIGATION_SENDER), due_ns)
+            due_ns = body.now_ns + round(robot.pose_delay_s * NS_PER_S)
+            body.post(TimedSetpoint(due_ns, update.setpoint, PLANNER, NAVIGATION_SENDER), due_ns)
+
+    # 3. The run.
+    run_places = RunPlaces(config, front_end.geometry, nothing)
+    routes = RouteFolder(Path(config.navigation.routes))
+    navigation = Navigation(requests, states, routes, take_navigation, config.places.map)
+    inputs = Inputs([graph.source("cameras", messages)], run_places, navigation=navigation)
+    in_map: dict[str, Output[PlaceUpdate]] = {"in map": run.places.append} if config.places.map else {}
+    outputs = Outputs(poses={"poses": take_pose}, rings={"rings": take_ring}, places=in_map)
+    with opencv_in_one_thread():
+        wire(config, inputs, front_end, graph, outputs)
+        graph.run()
+    run_places.finish_run()
+    return run

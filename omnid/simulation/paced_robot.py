@@ -12,7 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import replace
-from queue import Empty, Full, Queue
+from queue import SimpleQueue
 from typing import Any, Final
 
 from drivers.cameras.camera_state import CameraState
@@ -36,7 +36,8 @@ from omnid.simulation.vehicle import Tick, Vehicle
 from omnid.simulation.world import World
 from omnid.transport.status_names import Key
 
-MOST_COMMANDS: Final = 64  # If this number of commands waits for the stages, the simulated time waits, too.
+RECENT: Final = 30  # pairs over which the real-time factor is measured: three seconds
+POLL_S: Final = 0.05  # longest wait, so that `close` takes effect soon
 
 
 class PacedLink:
@@ -46,9 +47,8 @@ class PacedLink:
         """stats: counters of the tick."""
         self.statistics = ControllerStatistics(stats)
         self._vehicle = vehicle
-        self._commands: Queue[VelocityCommand] = Queue(MOST_COMMANDS)
+        self._commands: SimpleQueue[VelocityCommand | None] = SimpleQueue()  # None: the end
         self._contacts = NO_CONTACT
-        self._ended = False
 
     def send(self, given: ControlInput) -> None:
         """Send a pose, an obstacle ring, a setpoint, or a request to arm."""
@@ -67,30 +67,18 @@ class PacedLink:
 
     def end(self) -> None:
         """Let `commands` end when the last ones are taken; the simulation makes sure that the wheels are at rest."""
-        self._ended = True
+        self._commands.put(None)
 
     def commands(self) -> Iterator[VelocityCommand]:
         """Yield the commands of the ticks until the end."""
-        while True:
-            try:
-                yield self._commands.get(timeout=POLL_S)
-            except Empty:
-                if self._ended:
-                    return
+        while (command := self._commands.get()) is not None:
+            yield command
 
     def take(self, report: TickReport) -> None:
-        """Take the report of a tick; wait until its command has room."""
+        """Take the report of a tick."""
         self.statistics.add(report._replace(state=copy.deepcopy(report.state)))  # the controller changes its own
-        while report.command is not None and not self._ended:
-            try:
-                self._commands.put(report.command, timeout=POLL_S)
-                return
-            except Full:
-                pass
-
-
-RECENT: Final = 30  # pairs over which the real-time factor is measured: three seconds
-POLL_S: Final = 0.05  # longest wait, so that `close` takes effect soon
+        if report.command is not None:
+            self._commands.put(report.command)
 
 
 class PacedRobot:

@@ -19,7 +19,7 @@ from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.graph import Graph
 from omnid.formats.exports import write_ply
 from omnid.messages import OdometryUpdate
-from omnid.runs.wiring import Outputs, wire
+from omnid.runs.wiring import Inputs, Outputs, wire
 from omnid.sinks.files import TrajectoryFile
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry, with_rims
@@ -61,7 +61,7 @@ def test_memory_stays_constant(tmp_path: Path, threaded: bool) -> None:
     graph = Graph(threaded=threaded)
     ends = Outputs(poses=poses, maps={"map": lambda update: write_ply(tmp_path / "map.ply", update.points)})
     read = graph.source("read", lambda: to_and_fro(frames, PAIRS))
-    wire(graph, [read], FrontEnd(place, config), config, ends)
+    wire(config, Inputs([read]), FrontEnd(place, config), graph, ends)
     graph.run()
     print(statistics.states, monitor.mib)
     assert statistics.poses == PAIRS

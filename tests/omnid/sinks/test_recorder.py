@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import signal
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -18,11 +20,13 @@ from drivers.logs.rotating_log import RotationSettings
 from drivers.motor import VelocityCommand
 from omnid.config import Config, RecordConfig
 from omnid.core.mapping.voxel_map import MapPoints
+from omnid.engine.graph import NEWEST, Graph
 from omnid.engine.robot_clock import SegmentTime
 from omnid.messages import MapUpdate, OdometryUpdate
-from omnid.runs.record import open_recorder
+from omnid.runs.record import open_recorder, record
 from omnid.sinks.encoder import Encoder, StatusReport
-from omnid.transport.codec import DiagnosticStatus
+from omnid.transport.codec import ERROR, OK, DiagnosticStatus
+from omnid.transport.status_names import RECORDING, entry
 from tests.drivers.logs.mcap_logs import jpeg
 from tests.omnid.small_pair import small_depth
 from tests.set_clock import SetClock
@@ -97,9 +101,9 @@ def odometry(seq: int, state: str = "tracking") -> OdometryUpdate:
 
 
 def test_all_messages_are_recorded_in_unix_time(tmp_path: Path) -> None:
-    time = times()
-    encode = Encoder(np.eye(4), 100, time.unix_ns)
-    recorder = open_recorder(settings(tmp_path / "log"), "version = 1", lambda *_: None, encode=encode, time=time)
+    of_run = times()
+    encode = Encoder(np.eye(4), 100, of_run.unix_ns)
+    recorder = open_recorder(settings(tmp_path / "log"), "version = 1", lambda *_: None, encode=encode, time=of_run)
     points = MapPoints(np.zeros((3, 3), np.float32), np.zeros(3, np.float32), *[np.zeros(3, np.int32)] * 2)
     for n in range(4):
         recorder.process(odometry(n, "lost" if n == 3 else "tracking"))
@@ -140,11 +144,11 @@ def test_a_step_of_the_clock_begins_a_file_and_no_file_has_one_in_it(
     """The oldest files are deleted by their order in the run, whatever their names say."""
     computer = SetClock(OFFSET_NS)
     computer.advance(5.0)
-    time = SegmentTime(computer.clock())
-    encode = Encoder(np.eye(4), 0, time.unix_ns)
+    of_run = SegmentTime(computer.clock())
+    encode = Encoder(np.eye(4), 0, of_run.unix_ns)
     monkeypatch.setattr(RecordConfig, "rotation", lambda _: RotationSettings(keep_files=2, free_bytes=0))
     config = settings(tmp_path / "log")
-    recorder = open_recorder(config, "", lambda *_: None, encode=encode, time=time)
+    recorder = open_recorder(config, "", lambda *_: None, encode=encode, time=of_run)
     for n in range(30):
         stamp_ns = 5 * 10**9 + n * 10**8
         for camera in ("lower", "upper"):
@@ -191,3 +195,71 @@ def test_every_file_has_the_state_of_the_odometry(tmp_path: Path, monkeypatch: p
     for path in files:
         with path.open("rb") as file:
             assert sum(1 for _ in make_reader(file).iter_messages(["/omnid/status"])) == 1
+
+
+class Given:
+    """A source of given frames."""
+
+    def __init__(self, frames: list[Frame]) -> None:
+        self._frames = frames
+        self.frames = lambda: iter(self._frames)
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
+def test_a_blocked_disk_stops_no_camera(tmp_path: Path) -> None:
+    recorder = open_recorder(settings(tmp_path / "log"), "", lambda *_: None, time=times())
+    graph, seen_s, until_s = Graph(policy=NEWEST, depth=3), list[float](), time.monotonic() + 0.5
+
+    def late(message: Frame) -> None:
+        time.sleep(max(0.0, until_s - time.monotonic()))
+        recorder.process(message)
+
+    stream = graph.source("lower", lambda: iter([frame(n, "lower") for n in range(50)]))
+    graph.sink("record", late, stream)
+    graph.sink("odometry", lambda _: seen_s.append(time.monotonic()), stream)
+    graph.run()
+    recorder.close()
+    stats = graph.telemetry.of("record")
+    assert stats.dropped >= 40 and stats.dropped + recorder.state.messages == 50
+    assert min(seen_s) < until_s  # the others went on meanwhile
+
+
+def test_reports_the_state_of_the_recording(tmp_path: Path) -> None:
+    config = settings(tmp_path / "log")
+    recorder = open_recorder(config, "", lambda *_: None, time=times())
+    assert (entry(RECORDING, recorder.stats()).level, entry(RECORDING, recorder.stats()).message) == (OK, "waiting")
+    recorder.process(frame(0, "lower"))
+    status = entry(RECORDING, recorder.stats())
+    assert status.message == "recording" and status.values["messages"] == "1" and Path(status.values["file"]).exists()
+    recorder.close()
+    full = replace(config, record=replace(config.record, free_mb=1_000_000))
+    recorder = open_recorder(full, "", lambda *_: None, time=times())
+    recorder.process(frame(0, "lower"))
+    status = entry(RECORDING, recorder.stats())
+    assert status.level == ERROR and status.values["lost"] == "1" and "1000001 needed" in status.message
+
+
+def test_records_both_cameras_and_reports_the_result(tmp_path: Path) -> None:
+    events: list[tuple[int, str]] = []
+    now_ns = time.monotonic_ns()
+    sources = {
+        camera: Given([replace(frame(n, camera), stamp_ns=now_ns + n) for n in range(10)])
+        for camera in ("lower", "upper")
+    }
+    before = signal.getsignal(signal.SIGTERM)
+    state = record(
+        sources,
+        settings(tmp_path / "log"),
+        "version = 1",  # type: ignore[arg-type]
+        lambda severity, text: events.append((severity, text)),
+    ).state
+    assert signal.getsignal(signal.SIGTERM) is before
+    assert (state.messages, state.lost, state.status) == (20, 0, "closed")
+    assert "20 messages in 1 files" in events[-1][1]
+    (path,) = recorded(tmp_path / "log")
+    reader = LogReader(path)
+    frames = list(reader.frames())
+    assert len(frames) == 20 and abs(frames[0].stamp_ns - time.time_ns()) < 60 * 10**9
+    assert "rig.toml" in reader.attachments()

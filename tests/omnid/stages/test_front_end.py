@@ -1,38 +1,124 @@
-"""The front end: the same poses in one call or as two stages, and a check of the rig that sees each pair once."""
+"""From images to poses and depth: panoramas, the check of the rig, features, dense depth, and what is dropped.
+
+On the frames of a rendered run.
+"""
 
 from __future__ import annotations
 
+import threading
+from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 from calib import se3
+from calib.panorama import remap_tables
 from calib.rig_file import read_rig
+from drivers.frame import CAMERAS, Frame
 from drivers.logs.log_reader import LogReader
 from omnid.config import Config
+from omnid.core.navigation.requests import NavigationCommand, TaughtRoute
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.rig.column_finding import PanoramaPair
 from omnid.core.rig.rig_health import RigHealth
+from omnid.diagnostics.run_summary import RunStatistics
+from omnid.engine.graph import NEWEST, Graph
 from omnid.formats.tum import read_tum
-from omnid.messages import FramePair, Panoramas
+from omnid.messages import DensePoints, FramePair, MapUpdate, OdometryUpdate, Panoramas, SaveMap, StereoDepth
+from omnid.runs.wiring import Inputs, Outputs, wire
+from omnid.stages.dense_depths import DenseDepths
+from omnid.stages.dewarp import Dewarp
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry, geometry
+from omnid.stages.places import Places
 from omnid.stages.synchronise import Synchronise
+from tests.conftest import PAIRS
+from tests.omnid.core.scenery import texture, wrapped
+from tests.simulation import build, make_rig, render_grey
 from tests.simulation.disturbances import DisturbedCamera
 
-PAIRS = 4
+CONFIG = Config()
+CHECKED = 4  # pairs
+
+
+@pytest.fixture(scope="module")
+def frames(scene: Path) -> list[Frame]:
+    return list(LogReader(scene / "log.mcap").frames())
 
 
 @pytest.fixture(scope="module")
 def place(scene: Path) -> Geometry:
-    return geometry(read_rig(scene / "rig.toml"), Config().panorama)
+    return geometry(read_rig(scene / "rig.toml"), CONFIG.panorama)
 
 
 @pytest.fixture(scope="module")
-def pairs(scene: Path, place: Geometry) -> list[FramePair]:
-    pairing = Synchronise(place.rig, Config().pair)
-    return [pair for pair in map(pairing.process, LogReader(scene / "log.mcap").frames()) if pair][:PAIRS]
+def pairs(frames: list[Frame], place: Geometry) -> list[FramePair]:
+    return list(filter(None, map(Synchronise(place.rig, CONFIG.pair).process, frames)))
+
+
+@pytest.fixture(scope="module")
+def poses(place: Geometry, pairs: list[FramePair]) -> list[OdometryUpdate]:
+    front_end, found = FrontEnd(place, CONFIG), []
+    for pair in pairs:
+        found.append(front_end.process(pair))
+        front_end.odometry.complete()
+    return found
+
+
+def test_points_project_to_the_pixels_they_were_matched_at() -> None:
+    """In a misaligned rig, points project into both images where the remap tables have their pixels."""
+    run = build("misaligned", seed=1, size=256, pairs=1)
+    rig_geometry = geometry(run.rig, CONFIG.panorama)
+    pair = FramePair(0, 0, *(render_grey(run.scene, m, run.poses[0]) for m in (run.rig.lower, run.rig.upper)))
+    depth = FrontEnd(rig_geometry, CONFIG).dense.points(Dewarp(rig_geometry, CONFIG.panorama).process(pair))
+    column, row = depth.pixels.astype(int).T
+    below = row + depth.disparity[row, column]
+    assert len(column) > 300
+    for mounted, rows in ((run.rig.lower, row), (run.rig.upper, below)):
+        seen = mounted.camera.project(se3.apply(mounted.T_cam_rig, depth.points))
+        tables = remap_tables(run.rig, mounted, rig_geometry.cylinder)
+        expected = np.column_stack(
+            [cv2.remap(t, column.astype(np.float32), rows.astype(np.float32), cv2.INTER_LINEAR).ravel() for t in tables]
+        )
+        assert np.abs(seen - expected).max() < 0.05
+
+
+def test_a_dim_image_is_brightened_and_its_noise_is_known(place: Geometry, pairs: list[FramePair]) -> None:
+    pair = pairs[0]
+    dewarp = Dewarp(place, Config().panorama)
+    bright = dewarp.process(pair)
+    noise = np.random.default_rng(1).normal(0, 5, pair.lower.shape)
+    dim = np.clip(np.rint(0.25 * pair.lower + 5 + noise), 0, 255).astype(np.uint8)
+    dark = Dewarp(place, Config().panorama).process(replace(pair, lower=dim))
+    assert bright.lower.gain == bright.upper.gain == dark.upper.gain == 1
+    np.testing.assert_array_equal(bright.upper.image, dark.upper.image)
+    shown, other = (one.panorama[dark.visible].mean() for one in (dark.lower, dark.upper))
+    assert dark.lower.gain > 1.5 and abs(shown / other - 1) < 0.1
+    both = np.clip(np.rint(0.25 * pair.upper + 5 + noise), 0, 255).astype(np.uint8)
+    evening = Dewarp(place, Config().panorama).process(replace(pair, lower=dim, upper=both))
+    assert abs(evening.lower.panorama[dark.visible].mean() - 80) < 2
+    assert dark.light.level_grey < 50 < bright.light.level_grey
+    assert dark.light.contrast_to_noise < 0.4 * bright.light.contrast_to_noise
+    assert not dark.light.is_too_dark and not bright.light.is_too_dark
+    night = np.clip(np.rint(0.02 * pair.lower + 5 + noise), 0, 255).astype(np.uint8)
+    assert Dewarp(place, Config().panorama).process(replace(pair, lower=night)).light.is_too_dark
+    assert 2.0 < dark.lower.noise_grey / dark.lower.gain < 6.0  # interpolation makes it less than 5
+    assert bright.lower.noise_grey < 3.0
+
+
+def test_a_coarser_panorama_is_made_of_a_blurred_image(place: Geometry) -> None:
+    """Single pixels of noise are averaged, not picked."""
+    size = place.rig.lower.camera.size[::-1]
+    image = np.random.default_rng(3).integers(100, 200, size).astype(np.uint8)
+    pair, spread = FramePair(0, 0, image, image), []
+    for config in (CONFIG.panorama, replace(CONFIG.panorama, scale=0.5)):
+        seen = Dewarp(geometry(place.rig, config), config).process(pair)
+        spread.append(seen.lower.panorama[seen.visible].std())
+    assert spread[1] < 0.75 * spread[0]
 
 
 class Seen(RigHealth):
@@ -53,10 +139,10 @@ def test_the_rig_is_checked_by_pairs_that_are_not_synchronised_after_odometry_ha
     at_once, skewed = Seen(place), Seen(place)
     for health, skew_s in ((at_once, 0.0), (skewed, 0.015)):
         front_end = FrontEnd(place, Config(), health)
-        for number, pair in enumerate(pairs):
+        for number, pair in enumerate(pairs[:CHECKED]):
             front_end.process(FramePair(number, pair.stamp_ns, pair.lower, pair.upper, skew_s))
-    assert at_once.pairs == [(number, False) for number in range(PAIRS)]
-    assert [number for number, _ in skewed.pairs] == list(range(PAIRS - 1))
+    assert at_once.pairs == [(number, False) for number in range(CHECKED)]
+    assert [number for number, _ in skewed.pairs] == list(range(CHECKED - 1))
     assert all(is_given for number, is_given in skewed.pairs if number > 0)
 
 
@@ -69,14 +155,15 @@ def test_the_stereo_of_the_papers_method_is_chosen_for_all(place: Geometry, pair
     assert not np.array_equal(*disparities)
 
 
-def test_the_reflection_of_a_lens_in_its_mirror_has_no_depth(place: Geometry, scene: Path) -> None:
+def test_the_reflection_of_a_lens_in_its_mirror_has_no_depth(
+    place: Geometry, pairs: list[FramePair], scene: Path
+) -> None:
     """Both panoramas show it at the same pixels, so that stereo puts it far below the floor, which is z = 0."""
     front_end, truth = FrontEnd(place, Config()), read_tum(scene / "truth.txt")
     cameras = place.rig.lower, place.rig.upper
     reflected = [DisturbedCamera.of(["flare"], k, m.visible, m.camera.size, 1) for k, m in enumerate(cameras)]
-    pairing = Synchronise(place.rig, Config().pair)
     below, confirmed = 0, 0
-    for pair in filter(None, map(pairing.process, LogReader(scene / "log.mcap").frames())):
+    for pair in pairs:
         lower, upper = (
             np.clip(camera.shown(image.astype(np.float32), pair.seq, 0.0), 0, 255).astype(np.uint8)
             for camera, image in zip(reflected, (pair.lower, pair.upper), strict=True)
@@ -88,3 +175,143 @@ def test_the_reflection_of_a_lens_in_its_mirror_has_no_depth(place: Geometry, sc
             below += int((se3.apply(T, matched.points)[:, 2] < -0.5).sum())
             confirmed += int((se3.apply(T, front_end.dense.of(update.depth).points)[:, 2] < -0.5).sum())
     assert below > 100 and confirmed < 0.4 * below, (below, confirmed)
+
+
+def test_the_first_pair_has_new_features_only(poses: list[OdometryUpdate]) -> None:
+    first, *others = poses
+    assert len(others) == PAIRS - 1
+    assert len(first.features.new) >= first.tracks > 50  # a few are too far away to be located
+    assert not len(first.features.inliers) and not len(first.features.rejected)
+
+
+def test_inliers_and_rejected_features_are_different_ones(poses: list[OdometryUpdate]) -> None:
+    gaps: list[float] = []
+    for odometry in poses[1:]:
+        seen = odometry.features
+        assert len(seen.inliers) >= odometry.inliers and len(seen.rejected) <= odometry.tracks
+        gaps += np.linalg.norm(seen.rejected[:, None] - seen.inliers[None], axis=2).min(axis=1).tolist()
+    assert gaps and np.mean(np.array(gaps) < 1) < 0.2  # px; a wrongly tracked feature may end on another
+
+
+def test_features_are_pixels_of_the_lower_panorama(poses: list[OdometryUpdate]) -> None:
+    for odometry in poses:
+        height, width = odometry.depth.panoramas.visible.shape
+        for pixels in (odometry.features.inliers, odometry.features.rejected, odometry.features.new):
+            assert pixels.shape[1] == 2 and (pixels >= -1).all() and (pixels <= [width, height]).all()
+
+
+def test_new_features_are_inliers_of_the_keyframe_before(poses: list[OdometryUpdate]) -> None:
+    for before, odometry in pairwise(poses):
+        new = {tuple(pixel) for pixel in odometry.features.new}
+        assert new <= {tuple(pixel) for pixel in odometry.features.inliers}
+        assert not new or (before.is_keyframe and before.features.new.size == 0)
+    assert any(len(odometry.features.new) for odometry in poses[1:])
+
+
+@pytest.mark.parametrize(("min_range_m", "found"), [(0.5, True), (3.0, False)])
+def test_the_search_reaches_the_nearest_points(min_range_m: float, found: bool) -> None:
+    """A wall whose disparity is 60 px stands 0.6 m away."""
+    place = geometry(make_rig(size=768, baseline_m=0.2), CONFIG.panorama)
+    shape = (place.cylinder.height, place.cylinder.width)
+    lower = texture(1, shape, sigma_px=3)
+    upper = np.roll(lower, 60, axis=0)
+    inner = np.zeros(shape, bool)
+    inner[10:-80] = True
+    dense = DenseDepths(place, replace(CONFIG.stereo, min_range_m=min_range_m))
+    depth = dense.points(Panoramas(0, 0, wrapped(lower), wrapped(upper), inner))
+    assert ((np.abs(depth.disparity - 60) < 1).sum() > 5000) == found
+
+
+def test_panoramas_are_scaled_but_not_their_elevations() -> None:
+    rig = make_rig(size=768, baseline_m=0.2)
+    full, half = (geometry(rig, replace(CONFIG.panorama, scale=scale)).cylinder for scale in (1.0, 0.5))
+    assert half.width == pytest.approx(full.width / 2, abs=8)
+    assert half.height == pytest.approx(full.height / 2, rel=0.02)
+    assert half.row0 / half.focal_px == pytest.approx(full.row0 / full.focal_px, abs=0.01)
+    assert geometry(rig, replace(CONFIG.panorama, width_px=800, scale=0.5)).cylinder.width == 800
+
+
+@pytest.fixture(scope="module")
+def depth(place: Geometry, pairs: list[FramePair]) -> DensePoints:
+    front_end = FrontEnd(place, CONFIG)
+    return front_end.dense.of(StereoDepth(front_end.dewarp.process(pairs[0])))
+
+
+def test_points_lie_on_the_surfaces_of_the_world(scene: Path, depth: DensePoints) -> None:
+    """The floor of the rendered corridor is z = 0: no points may lie below it."""
+    points = se3.apply(read_tum(scene / "truth.txt").T[0], depth.points)
+    sure = depth.variance_m2 < 0.05**2
+    assert sure.sum() > 500
+    assert np.quantile(points[sure, 2], 0.02) > -0.1
+    assert len(depth.points) == len(depth.pixels) == len(depth.variance_m2)
+    assert np.isfinite(depth.disparity).sum() >= len(depth.points)
+
+
+def test_the_variance_of_a_point_follows_from_its_disparity(place: Geometry, depth: DensePoints) -> None:
+    """Half a pixel of disparity moves a point by about its standard deviation."""
+    rect = se3.apply(place.rig.T_rect_rig, depth.points)
+    range_m = np.linalg.norm(rect, axis=1)
+    disparity = place.cylinder.focal_px * place.rig.baseline_m / np.hypot(rect[:, 0], rect[:, 1])
+    moved = range_m * CONFIG.stereo.noise_px / disparity
+    np.testing.assert_allclose(np.sqrt(depth.variance_m2), moved, rtol=0.01)
+
+
+def test_a_slow_bus_drops_messages_and_delays_no_pose(place: Geometry, frames: list[Frame]) -> None:
+    drops = dropped(place, frames, object)
+    assert drops["bus"] > PAIRS // 2 and drops["bus-drive"] > PAIRS // 2
+    inboxes = ("bus", "bus-drive", "bus-map", "bus-places", "bus-grid", "bus-scan")
+    assert sum(drops.values()) == sum(drops[name] for name in inboxes)
+
+
+def test_a_slow_map_drops_no_pose(place: Geometry, frames: list[Frame]) -> None:
+    """Maps have their own inbox; a busy machine may still cost a pose or two."""
+    assert dropped(place, frames, MapUpdate)["bus"] <= 2
+
+
+def dropped(place: Geometry, frames: list[Frame], slow: type) -> dict[str, int]:
+    """Return the messages dropped by each stage, with a bus that holds messages of a type until all poses are there."""
+    graph, statistics, complete = Graph(), RunStatistics(), threading.Event()
+
+    class Complete:
+        def process(self, message: OdometryUpdate) -> None:
+            if message.seq == PAIRS - 1:
+                complete.set()
+
+    class SlowBus:
+        def process(self, message: object) -> None:
+            if isinstance(message, slow):
+                assert complete.wait(60.0), "the poses waited for the bus"
+
+    outputs = Outputs(poses={"statistics": statistics, "complete": Complete()}, bus=SlowBus())
+    read = graph.source("read", lambda: frames)
+    wire(CONFIG, Inputs([read], map_every_s=0.5), FrontEnd(place, CONFIG), graph, outputs)
+    graph.run()
+    assert statistics.poses == PAIRS
+    return {stage.name: stage.dropped for stage in graph.telemetry.stages}
+
+
+def test_the_map_is_copied_for_a_route_that_was_written_and_for_requests(
+    place: Geometry, poses: list[OdometryUpdate]
+) -> None:
+    places, route = Places(place, CONFIG, FrontEnd(place, CONFIG).dense), Any
+    failed = NavigationCommand(TaughtRoute(route, 7), 0, refusal="the disk is full")  # type: ignore[arg-type]
+    assert places.process(failed) is None and places.process(poses[0]).copy is None
+    assert places.process(failed._replace(refusal="")) is None and places.process(SaveMap(9)) is None
+    copied = places.process(poses[1]).copy
+    assert copied is not None and copied.ids == (9,) and places.process(poses[2]).copy is copied
+
+
+def test_live_old_images_are_dropped_before_any_work(place: Geometry, frames: list[Frame]) -> None:
+    """One thread makes a pose of the newest images; each that is decoded gets one, however fast images come."""
+    graph, statistics = Graph(policy=NEWEST, depth=1), RunStatistics()
+    stages = FrontEnd(place, CONFIG)
+    cameras = {
+        name: graph.source(name, lambda name=name: [frame for frame in frames if frame.camera == name])  # type: ignore[misc]
+        for name in CAMERAS
+    }
+    wire(CONFIG, Inputs(list(cameras.values())), stages, graph, Outputs(counters={"statistics": statistics}))
+    graph.run()
+    of = graph.telemetry.of
+    assert of("pair").dropped > 0 and of("odometry").dropped == 0
+    assert 0 < statistics.poses == of("dewarp").processed == of("odometry").processed == of("keyframes").processed
+    assert of("pair").dropped + of("pair").processed == 2 * PAIRS

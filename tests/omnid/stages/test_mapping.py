@@ -1,4 +1,4 @@
-"""Dense depth of a pair, which is computed when it is first asked for, and for the pairs that enter the map."""
+"""Pairs that enter the map, and the grid that is drawn of it: at their rates, and only what has changed."""
 
 from __future__ import annotations
 
@@ -10,35 +10,25 @@ import pytest
 
 from calib import se3
 from omnid.config import Config, MappingConfig
+from omnid.core.mapping.scan_grid import KeyframeScans
 from omnid.core.odometry.exposure_times import Exposure
-from omnid.messages import DensePoints, OdometryUpdate, Panoramas, StereoDepth
+from omnid.messages import DensePoints, OdometryUpdate, Panoramas, PlaceUpdate, StereoDepth
 from omnid.stages.dense_depths import DenseDepths
 from omnid.stages.geometry import Geometry, geometry
-from omnid.stages.mapping import Mapping
-from omnid.tracking_state import TrackingState
-from tests.omnid.core.scenery import texture, wrapped
+from omnid.stages.mapping import MapGrid, Mapping
+from omnid.tracking_state import MapState, TrackingState
+from tests.omnid.core.scenery import wrapped
 from tests.simulation import make_rig
 
 CONFIG = Config()
 IMAGE = np.zeros((4, 100), np.uint8)
+SECOND_NS = 10**9
+SCAN = np.full(360, 2.0, np.float16)
 
 
 @pytest.fixture(scope="module")
 def place() -> Geometry:
     return geometry(make_rig(size=768, baseline_m=0.2), CONFIG.panorama)
-
-
-@pytest.mark.parametrize(("min_range_m", "found"), [(0.5, True), (3.0, False)])
-def test_the_search_reaches_the_nearest_points(place: Geometry, min_range_m: float, found: bool) -> None:
-    """A wall whose disparity is 60 px stands 0.6 m away."""
-    shape = (place.cylinder.height, place.cylinder.width)
-    lower = texture(1, shape, sigma_px=3)
-    upper = np.roll(lower, 60, axis=0)
-    inner = np.zeros(shape, bool)
-    inner[10:-80] = True
-    dense = DenseDepths(place, replace(CONFIG.stereo, min_range_m=min_range_m))
-    depth = dense.points(Panoramas(0, 0, wrapped(lower), wrapped(upper), inner))
-    assert ((np.abs(depth.disparity - 60) < 1).sum() > 5000) == found
 
 
 class CountedDepths(DenseDepths):
@@ -105,3 +95,43 @@ def test_keyframes_alone_enter_a_map_without_readers(place: Geometry) -> None:
     maps = driven(mapping, 1.0, lambda seq: seq % 10 == 0)
     assert dense.computed == [0, 10, 20, 30, *range(32, 60, 2)]
     assert maps == 3, "a query for the newest one finds it"
+
+
+def scans(count: int) -> KeyframeScans:
+    return KeyframeScans(
+        dict.fromkeys(range(count), SCAN), dict.fromkeys(range(count), SCAN), np.tile(np.eye(4), (count, 1, 1))
+    )
+
+
+def grid_update(seq: int, seen: KeyframeScans | None) -> PlaceUpdate:
+    return PlaceUpdate(seq, seq * SECOND_NS, np.eye(4), np.eye(4), np.eye(6), MapState.ODOMETRY_ONLY, scans=seen)
+
+
+def given(stage: MapGrid, updates: list[PlaceUpdate]) -> list[int]:
+    return [found.seq for found in map(stage.process, updates) if found is not None]
+
+
+def test_it_is_drawn_when_it_is_due_and_has_changed() -> None:
+    stage, one, two = MapGrid(0.05, np.eye(4), every_s=2.0), scans(1), scans(2)
+    assert given(stage, [grid_update(k, one if k < 7 else two) for k in range(1, 8)]) == [2, 7]
+    assert stage.finish() == []
+    assert stage.process(grid_update(8, scans(3))) is None
+    [last] = stage.finish()
+    assert last.seq == 8 and last.grid.cells.max() == 100
+
+
+def test_without_a_period_it_is_drawn_at_the_end() -> None:
+    stage = MapGrid(0.05, np.eye(4))
+    assert stage.finish() == [] and given(stage, [grid_update(k, scans(1)) for k in range(5)]) == []
+    assert [found.seq for found in stage.finish()] == [4]
+    empty = MapGrid(0.05, np.eye(4))
+    empty.process(grid_update(1, None))
+    assert empty.finish() == []
+
+
+def test_scans_of_unknown_place_are_not_drawn_into_the_map() -> None:
+    """Of a saved map, or after a gap, until a place is recognised; the last grid stays."""
+    stage = MapGrid(0.05, np.eye(4), every_s=1.0)
+    known, elsewhere = grid_update(2, scans(1)), replace(grid_update(4, scans(2)), is_known=False)
+    assert given(stage, [known, elsewhere]) == [2] and stage.finish() == []
+    assert given(stage, [grid_update(6, scans(3))]) == [6]

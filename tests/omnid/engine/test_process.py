@@ -1,0 +1,329 @@
+"""Parts of the engine without a graph: threads, programs, signals, counters, logging, real-time settings.
+
+Real-time settings take effect where the system allows them, and are reported, not raised, where it does not; they are
+those of a whole process, so they are tested in one of their own.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+import math
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from omnid.engine.graph import Graph
+from omnid.engine.logging_setup import LOGGER, StderrHandler
+from omnid.engine.process import STOP_SIGNALS, handle_stop_signals, python, python_environment
+from omnid.engine.realtime import LOCK_ADVICE, ThreadStart, highest_priority
+from omnid.engine.telemetry import Histogram, StageStats, Telemetry
+from omnid.engine.threads import Poller, started
+
+ROOT = Path(__file__).parents[3]
+LONG_S = 20.0  # a timeout that only a defect reaches
+
+
+def test_a_caller_goes_on_after_its_time_and_may_wait_later() -> None:
+    called, release, done = threading.Event(), threading.Event(), list[bool]()
+    assert started(called.set, "quick")(LONG_S) and called.is_set()
+    has_ended = started(lambda: done.append(release.wait(LONG_S)), "test")
+    assert not has_ended(0.01) and not done
+    release.set()
+    assert has_ended(None) and done == [True]
+
+
+def test_a_call_that_blocks_for_ever_does_not_keep_the_program_from_ending() -> None:
+    code = (
+        "import threading; from omnid.engine.threads import started; "
+        "print(started(threading.Event().wait, 'blocked')(0.01))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout == "False\n"
+
+
+@pytest.mark.usefixtures("no_thread_is_left")
+def test_the_calls_of_a_poller_go_on_after_an_error_and_end_with_close(capsys: pytest.CaptureFixture[str]) -> None:
+    calls, made, enough = list[str](), threading.Event(), threading.Event()
+
+    def action() -> None:
+        assert made.wait(LONG_S)  # the first calls may come before the poller has its name here
+        calls.append(threading.current_thread().name)
+        if len(calls) == 1:
+            raise OSError("no link")
+        if len(calls) == 3:
+            enough.set()
+            poller.close()  # an action may close its own poller
+
+    poller = Poller(action, 1e-3, "short work")
+    made.set()
+    assert enough.wait(LONG_S)
+    poller.close()
+    assert set(calls) == {"short work"} and capsys.readouterr().err.count("OSError: no link") == 1
+    assert not threading.Event().wait(0.02) and len(calls) == 3
+
+
+@pytest.mark.usefixtures("default_signals")
+def test_each_signal_reaches_the_handler_and_the_one_before_comes_back() -> None:
+    before, came = {number: signal.getsignal(number) for number in STOP_SIGNALS}, list[int]()
+    with pytest.raises(ValueError), handle_stop_signals(lambda number, _: came.append(number)):
+        for number in STOP_SIGNALS:
+            signal.raise_signal(number)
+        raise ValueError
+    assert came == [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
+    assert {number: signal.getsignal(number) for number in STOP_SIGNALS} == before
+
+
+def test_modules_of_the_current_folder_are_not_imported(tmp_path: Path) -> None:
+    (tmp_path / "omnid.py").write_text("print('planted')")
+    words = python("-c", "import omnid, os; print(omnid.__file__, os.environ['KEY'])")
+    environment = python_environment(KEY="a")
+    done = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout == f"{ROOT / 'omnid' / '__init__.py'} a\n"
+
+
+@pytest.mark.parametrize("centre", [-10.0, -5.0, 4.0])
+def test_quantiles_agree_with_sorting(centre: float) -> None:
+    durations_s = np.random.default_rng(1).lognormal(centre, 0.7, 5000)
+    histogram = Histogram()
+    for duration_s in durations_s.tolist():
+        histogram.add(duration_s)
+    expected = np.quantile(durations_s, [0.0, 0.01, 0.5, 0.9, 0.99], method="inverted_cdf")
+    assert histogram.quantiles(0.0, 0.01, 0.5, 0.9, 0.99) == pytest.approx(expected, rel=0.05)
+    assert histogram.p(1.0) == histogram.max_s == durations_s.max()
+    assert histogram.count == 5000
+
+
+def test_summary_has_a_row_per_stage_in_milliseconds() -> None:
+    telemetry = Telemetry()
+    stats = telemetry.add(StageStats("stereo", processed=2, dropped=1))
+    telemetry.add(StageStats("idle"))
+    stats.wall.add(0.010)
+    stats.wall.add(0.030)
+    stereo, idle = telemetry.summary()
+    assert stereo[:3] == ("stereo", 2, 1) and stereo[3:] == pytest.approx((10.0, 30.0, 30.0), rel=0.05)
+    assert idle[:3] == ("idle", 0, 0) and all(map(math.isnan, idle[3:]))
+
+
+SETUP = "import logging; from omnid.engine.logging_setup import *; configure_logging(); configure_logging()\n"
+LOG_THREE = SETUP + "log(logging.WARNING, 'one'); log(logging.ERROR, 'two'); log(logging.INFO, 'three')"
+OF_A_LIBRARY = SETUP + (
+    "library = logging.getLogger('library'); library.info('detail')\n"
+    "library.warning('careful, %d', 7); library.critical('broken')"
+)
+UNCONFIGURED = "import logging; from omnid.engine.logging_setup import log; log(logging.WARNING, 'one'); log(20, 'two')"
+
+
+@dataclass
+class Log:
+    """A handler that writes into memory."""
+
+    stream: io.StringIO = field(default_factory=io.StringIO)
+
+    def __post_init__(self) -> None:
+        self.handler = StderrHandler(self.stream)
+
+    def __call__(self, level: int, text: str, **attributes: object) -> None:
+        self.handler.handle(logging.makeLogRecord({"name": LOGGER.name, "levelno": level, "msg": text, **attributes}))
+
+    @property
+    def lines(self) -> list[str]:
+        return self.stream.getvalue().splitlines()
+
+
+@pytest.fixture
+def log() -> Log:
+    return Log()
+
+
+@pytest.fixture
+def pipe() -> Iterator[tuple[int, int]]:
+    ends = os.pipe()
+    yield ends
+    for end in ends:
+        os.close(end)
+
+
+def exit_code(environment: dict[str, str], stderr: int, *words: str) -> int:
+    """Return the exit code of a Python process."""
+    clean = {name: value for name, value in os.environ.items() if name != "JOURNAL_STREAM"}
+    return subprocess.run([sys.executable, *words], cwd=ROOT, env=clean | environment, stderr=stderr).returncode
+
+
+def journal(stderr: int) -> dict[str, str]:
+    """Return the environment in which journald reads the file descriptor."""
+    found = os.fstat(stderr)
+    return {"JOURNAL_STREAM": f"{found.st_dev}:{found.st_ino}"}
+
+
+@pytest.mark.parametrize(
+    ("script", "written"),
+    [(LOG_THREE, b"<4>one\n<3>two\n<6>three\n"), (OF_A_LIBRARY, b"<4>library: careful, 7\n<2>library: broken\n")],
+)
+def test_writes_priorities_for_journald(pipe: tuple[int, int], script: str, written: bytes) -> None:
+    assert exit_code(journal(pipe[1]), pipe[1], "-c", script) == 0
+    assert os.read(pipe[0], 1000) == written
+
+
+def test_the_command_line_writes_its_error_with_priority(pipe: tuple[int, int]) -> None:
+    assert exit_code(journal(pipe[1]), pipe[1], "-m", "omnid", "config", "--config", "/nowhere") == 2
+    assert os.read(pipe[0], 1000).startswith(b"<3>the settings file '/nowhere' cannot be read")
+
+
+@pytest.mark.parametrize("environment", [{}, {"JOURNAL_STREAM": "1:2"}, {"JOURNAL_STREAM": "nonsense"}])
+@pytest.mark.parametrize(
+    ("script", "written"), [(LOG_THREE, b"omnid: warning: one\nomnid: two\nomnid: three\n"), (UNCONFIGURED, b"one\n")]
+)
+def test_writes_plain_text_elsewhere(
+    environment: dict[str, str], pipe: tuple[int, int], script: str, written: bytes
+) -> None:
+    """Also under systemd with another stderr."""
+    assert exit_code(environment, pipe[1], "-c", script) == 0
+    assert os.read(pipe[0], 1000) == written
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("two\nlines", "two lines"),
+        ("\x1b[31mred\x00\x07", r"\x1b[31mred\x00\x07"),
+        (" much   room ", "much room"),
+        ("", ""),
+        ("<0>panic", "<0>panic"),
+        ("100 %s", "100 %s"),
+        ("x" * 10**6, "x" * 4000),
+    ],
+)
+def test_writes_one_printable_line_of_bounded_length_per_record(log: Log, text: str, line: str) -> None:
+    log(logging.INFO, text)
+    assert log.lines == [f"omnid: {line}"]
+
+
+def test_a_stream_that_cannot_be_written_is_no_error() -> None:
+    closed = Log()
+    closed.stream.close()
+    closed(logging.ERROR, "lost")
+    with open("/dev/full", "wb", buffering=0) as full:
+        assert exit_code({}, full.fileno(), "-c", LOG_THREE) == 0
+
+
+UNPRIVILEGED = 65534
+allowed = pytest.mark.skipif(highest_priority() < 20, reason="no right to real-time priorities: ulimit -r 20")
+PREAMBLE = """
+import gc, json, os, resource, sys, threading, time
+from pathlib import Path
+from omnid.engine.realtime import RealtimeSettings, ThreadStart, limit_realtime_runs, lock_memory, prepare
+from omnid.engine.realtime import set_realtime_priority
+def locked_kb():
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmLck"))
+"""
+WITHOUT_RIGHTS = f"""
+resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
+resource.setrlimit(resource.RLIMIT_MEMLOCK, (1 << 20, 1 << 20))
+if os.getuid() == 0:
+    os.setgid({UNPRIVILEGED}); os.setuid({UNPRIVILEGED})
+"""
+
+
+def process(script: str) -> subprocess.CompletedProcess[str]:
+    """Run the script in a process of its own."""
+    return subprocess.run(
+        [sys.executable, "-c", PREAMBLE + script], cwd=ROOT, capture_output=True, text=True, timeout=60
+    )
+
+
+def answer(script: str) -> SimpleNamespace:
+    """Return the JSON that the script prints."""
+    done = process(script)
+    assert done.returncode == 0, done.stderr
+    return SimpleNamespace(**json.loads(done.stdout))
+
+
+def seen_in(name: str, start: ThreadStart) -> dict[str, tuple[str, int]]:
+    """Return kernel name and policy of the threads of a graph: a source of this name and its sink."""
+    seen = {}
+
+    def record(whose: str) -> None:
+        task = Path(f"/proc/self/task/{threading.get_native_id()}")
+        seen[whose] = (task.joinpath("comm").read_text().strip(), os.sched_getscheduler(0))
+
+    def numbers() -> range:
+        record("source")
+        return range(1)
+
+    graph = Graph(on_thread=start)
+    graph.sink("sink", SimpleNamespace(process=lambda number: record("sink")), graph.source(name, numbers))
+    graph.run()
+    return seen
+
+
+@allowed
+def test_only_the_named_thread_has_priority() -> None:
+    seen = seen_in("lower", ThreadStart({"lower": 10}))
+    assert seen == {"source": ("lower", os.SCHED_FIFO | os.SCHED_RESET_ON_FORK), "sink": ("sink", os.SCHED_OTHER)}
+
+
+@allowed
+def test_priorities_are_not_inherited() -> None:
+    script = """
+def motor():
+    ThreadStart({"motor": 18})("motor")
+    found["own"] = os.sched_getparam(0).sched_priority
+    child = threading.Thread(target=lambda: found.update(child=os.sched_getscheduler(0)))
+    child.start(); child.join()
+found = {"main": os.sched_getscheduler(0)}
+thread = threading.Thread(target=motor); thread.start(); thread.join()
+print(json.dumps(found))
+"""
+    assert vars(answer(script)) == {"main": os.SCHED_OTHER, "own": 18, "child": os.SCHED_OTHER}
+
+
+def test_reports_a_refused_priority_once_with_advice() -> None:
+    done = answer(
+        WITHOUT_RIGHTS
+        + """
+reported = []
+start = ThreadStart({"motor": 20, "lower": 10}, lambda *words: reported.append(words))
+for name in ("motor", "lower", "stereo"):
+    start(name)
+print(json.dumps({"reported": reported, "policy": os.sched_getscheduler(0)}))
+"""
+    )
+    ((priority, text),) = done.reported
+    assert priority == logging.WARNING and text.startswith("thread 'motor' cannot have real-time priority 20")
+    assert "LimitRTPRIO=20" in text and done.policy == os.SCHED_OTHER
+
+
+def test_does_not_lock_memory_under_a_limit() -> None:
+    done = answer(
+        WITHOUT_RIGHTS
+        + """
+reported = lock_memory()
+grown = len(bytearray(50 << 20))
+print(json.dumps({"reported": reported, "locked": locked_kb()}))
+"""
+    )
+    assert done.reported.endswith(f"swapped out: {LOCK_ADVICE}") and done.locked == 0  # not even tried
+
+
+@allowed
+def test_the_kernel_ends_a_real_time_thread_that_does_not_wait() -> None:
+    done = process("""
+limit_realtime_runs(50)
+assert set_realtime_priority(10)
+until_s = time.monotonic() + 20
+while time.monotonic() < until_s:
+    pass
+""")
+    assert done.returncode == -signal.SIGXCPU
