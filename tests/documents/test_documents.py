@@ -179,3 +179,9 @@ def test_it_runs_in_jupyter() -> None:
     outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
     assert any("ATE" in output.get("text", "") for output in outputs)
     assert sum("image/png" in output.get("data", {}) for output in outputs) == 3
+
+
+def test_the_wiring_beside_the_figure_is_that_of_the_code() -> None:
+    shown = re.findall(r"^.*graph\.(?:stage|sink)\(.*$", (ROOT / "ARCHITECTURE.md").read_text("utf-8"), re.MULTILINE)
+    wiring = [line.strip() for line in (ROOT / "omnid/runs/wiring.py").read_text("utf-8").splitlines()]
+    assert len(shown) > 5 and set(shown) <= set(wiring), set(shown) - set(wiring)
