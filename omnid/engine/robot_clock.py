@@ -73,36 +73,41 @@ class RobotClock:
         self.steps, self.step = 0, ClockStep(0, 0)
 
     def follow(self) -> None:
-        """Measure the offset; while another thread does, nothing is to be done."""
+        """Measure the offset, follow it, and report a step; while another thread does, nothing is to be done."""
         if not self._following.acquire(blocking=False):
             return
         try:
-            # 1. By how much has it changed, and by how much can slewing have changed it since it was right?
-            offset_ns, error_ns, now_ns = self._measured()
-            was_time, self._is_time = self._is_time, 0 <= now_ns + offset_ns < END_NS
-            if not self._is_time:  # no message can hold it
-                if was_time:
-                    self._report("the computer's clock was set to a time outside 1970 to 2038: stamps go on as before")
-                return
-            change_ns = offset_ns - self._offsets[-1].offset_ns
-            if abs(change_ns) <= error_ns:
-                self._right_ns = now_ns
-                return
-            is_step = abs(change_ns) > STEP_NS + error_ns + SLEW * (now_ns - self._right_ns)
-            if not is_step and now_ns - self._adopted_ns < FOLLOW_NS:
-                return
-            # 2. The new offset is in force for stamps from now on.
-            self._right_ns = self._adopted_ns = now_ns
-            self._offsets = (*self._offsets, _Offset(now_ns, offset_ns))[-KEPT:]
-            if is_step:
-                self.steps, self.step = self.steps + 1, ClockStep(now_ns, change_ns)
+            line = self._followed()
         finally:
             self._following.release()
-        if is_step:
-            self._report(
-                f"the computer's clock was set {self.step.words}: stamps on the bus and in recordings follow it, "
-                "a recording goes on in a new file; ages and deadlines do not change"
-            )
+        if line:
+            self._report(line)
+
+    def _followed(self) -> str:
+        """Follow the offset; return what is to be reported."""
+        # 1. By how much has it changed, and by how much can slewing have changed it since it was right?
+        offset_ns, error_ns, now_ns = self._measured()
+        was_time, self._is_time = self._is_time, 0 <= now_ns + offset_ns < END_NS
+        if not self._is_time:  # no message can hold it
+            line = "the computer's clock was set to a time outside 1970 to 2038: stamps go on as before"
+            return line if was_time else ""
+        change_ns = offset_ns - self._offsets[-1].offset_ns
+        if abs(change_ns) <= error_ns:
+            self._right_ns = now_ns
+            return ""
+        is_step = abs(change_ns) > STEP_NS + error_ns + SLEW * (now_ns - self._right_ns)
+        if not is_step and now_ns - self._adopted_ns < FOLLOW_NS:
+            return ""
+        # 2. The new offset is in force for stamps from now on.
+        self._right_ns = self._adopted_ns = now_ns
+        self._offsets = (*self._offsets, _Offset(now_ns, offset_ns))[-KEPT:]
+        if not is_step:
+            return ""
+        self.steps, self.step = self.steps + 1, ClockStep(now_ns, change_ns)
+        return (
+            f"the computer's clock was set {self.step.words}: stamps on the bus and in recordings follow it, "
+            "a recording goes on in a new file; ages and deadlines do not change"
+        )
 
     def offset_ns(self, stamp_ns: int) -> int:
         """Return the offset from a stamp to Unix time, as it was last measured before the stamp."""
@@ -120,13 +125,9 @@ class RobotClock:
         """
         self.follow()
         now_ns, offsets = self.monotonic_ns(), self._offsets
-        ends_ns = [*(one.since_ns for one in offsets[1:]), math.inf]
-        stamps = [
-            unix_ns - one.offset_ns
-            for one, end_ns in zip(offsets, ends_ns, strict=True)
-            if one.since_ns <= unix_ns - one.offset_ns < end_ns
-        ]
-        return min(stamps, key=lambda stamp_ns: abs(now_ns - stamp_ns), default=unix_ns - offsets[-1].offset_ns)
+        stamps = [unix_ns - one.offset_ns for one in offsets]
+        in_force = [stamp for stamp in stamps if stamp + self.offset_ns(stamp) == unix_ns]
+        return min(in_force, key=lambda stamp: abs(now_ns - stamp), default=stamps[-1])
 
     def age_ns(self, unix_ns: int) -> int:
         """Return the time since a Unix time; below 0 where it is to come."""
