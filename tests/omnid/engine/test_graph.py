@@ -9,7 +9,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from functools import partial
 from itertools import count
 from typing import NoReturn
 
@@ -213,9 +212,9 @@ def test_raises_an_error_with_the_name_of_its_stage(threaded: bool, place: str) 
 
 
 @both
-def test_stop_from_another_thread_drains_and_finishes(threaded: bool) -> None:
-    graph, sink, stopped = Graph(threaded=threaded), Collect(), threading.Event()
-    seen = threading.Event()
+@pytest.mark.parametrize("by_signal", [True, False], ids=["signal handler", "another thread"])
+def test_a_stop_drains_and_finishes(threaded: bool, by_signal: bool) -> None:
+    graph, sink, seen, stopped = Graph(threaded=threaded), Collect(), threading.Event(), threading.Event()
 
     def stop() -> None:
         assert seen.wait(LONG_S)
@@ -224,33 +223,24 @@ def test_stop_from_another_thread_drains_and_finishes(threaded: bool) -> None:
 
     def act() -> None:
         seen.set()
-        assert stopped.wait(LONG_S)
+        if by_signal:
+            os.kill(os.getpid(), signal.SIGTERM)
+        assert by_signal or stopped.wait(LONG_S)
 
-    numbers = graph.source("numbers", count)
-    graph.sink("sink", sink, graph.stage("pass", Apply(stopped_at(graph, 5, act)), numbers))
-    stopper = threading.Thread(target=stop)
-    stopper.start()
-    graph.run()
-    stopper.join()
-    assert sink.got == list(range(graph.telemetry.stages[0].processed))  # all messages of the source
-    assert len(sink.got) >= 6
-    assert sink.finished == 1
-
-
-@both
-def test_stop_from_a_signal_handler_drains_and_finishes(threaded: bool) -> None:
-    graph, sink = Graph(threaded=threaded), Collect()
     old = signal.signal(signal.SIGTERM, lambda *_: graph.stop())
+    stopper = threading.Thread(target=stop)
     try:
-        act = partial(os.kill, os.getpid(), signal.SIGTERM)
         numbers = graph.source("numbers", count)
         graph.sink("sink", sink, graph.stage("pass", Apply(stopped_at(graph, 5, act)), numbers))
+        if not by_signal:
+            stopper.start()
         graph.run()
     finally:
         signal.signal(signal.SIGTERM, old)
-    assert sink.got == list(range(graph.telemetry.stages[0].processed))
-    assert len(sink.got) >= 6
-    assert sink.finished == 1
+        if not by_signal:
+            stopper.join()
+    assert sink.got == list(range(graph.telemetry.stages[0].processed))  # all messages of the source
+    assert len(sink.got) >= 6 and sink.finished == 1
 
 
 def test_lossless_waits_for_a_slow_reader_with_a_bounded_inbox() -> None:

@@ -18,7 +18,7 @@ from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.camera_config import PairConfig
 from omnid.errors import OmnidError
 from omnid.messages import FramePair
-from omnid.stages.synchronise import FROZEN_IMAGES, MAX_WAITING, Decoder, MotionInbox, RepeatedImages, Skew, Synchronise
+from omnid.stages.synchronise import MAX_WAITING, Decoder, MotionInbox, Skew, Synchronise
 from omnid.transport.codec import IMU_SCHEMA
 from omnid.transport.sensor_codec import gyro_cdr
 from tests.simulation import build
@@ -187,30 +187,10 @@ def test_a_slower_camera_decides_how_many_pairs_there_are(free: Synchronise) -> 
     assert len(made(free, *sorted(taken, key=lambda frame: frame.stamp_ns))) == 30
 
 
-LIVING = range(1000, 1100)  # numbers of images that differ
-
-
 def image(number: int) -> np.ndarray:
     """Return a grey wall with the noise of the frame with this number."""
     noise = np.random.default_rng(number).integers(-2, 3, (SIZE, SIZE))
     return (90 + noise).astype(np.uint8)
-
-
-def seen(numbers: Iterable[int]) -> tuple[list[bool], RepeatedImages]:
-    repeated = RepeatedImages()
-    return [repeated.add(image(number)) for number in numbers], repeated
-
-
-def test_a_motionless_scene_has_no_repeated_image() -> None:
-    flags, repeated = seen(LIVING)
-    assert not any(flags) and not repeated.frozen and repeated.count == 0
-
-
-def test_a_camera_freezes_and_lives_again() -> None:
-    _, repeated = seen([1, *[2] * (FROZEN_IMAGES + 1)])
-    assert repeated.frozen and repeated.count == FROZEN_IMAGES
-    repeated.add(image(3))
-    assert not repeated.frozen and repeated.longest == FROZEN_IMAGES
 
 
 def frames(lower: Iterable[int], upper: Iterable[int]) -> list[Frame]:
@@ -256,64 +236,46 @@ def test_a_simulator_without_noise_may_use_them(rig: Rig) -> None:
     )
 
 
-def after(skews_ns: list[float]) -> float:
-    """The time between the exposures of the last pair, in ms."""
+TRIGGERED = random.Random(1)
+
+
+def jitter(sigma_ms: float, count: int) -> np.ndarray:
+    return np.random.default_rng(count).normal(0, sigma_ms, count)
+
+
+@pytest.mark.parametrize(
+    ("skews_ms", "expected_ms", "within_ms"),
+    [
+        # Cameras that are triggered together are simultaneous however their stamps scatter.
+        *(([TRIGGERED.uniform(-2, 2) for _ in range(count)], 0.0, 0.0) for count in (1, 5, 8, 20, 100)),
+        # That of free cameras is found below the scatter of the stamps, also where their clocks drift.
+        ([15.0], 15.0, 0.0),
+        (15 + jitter(1.0, 60), 15.0, 1.0),
+        (-9 + jitter(0.1, 60), -9.0, 0.1),
+        (5 + 0.2 * np.arange(100) + jitter(0.1, 100), 24.8, 0.15),
+        # Another one after a lost image counts at once.
+        ([14.0] * 40 + [-19.0], -19.0, 0.0),
+    ],
+)
+def test_the_time_between_the_exposures_of_a_pair(
+    skews_ms: Iterable[float], expected_ms: float, within_ms: float
+) -> None:
     skew = Skew()
-    for value in skews_ns:
-        skew.add(round(value))
-    return skew.exposure_ns / MS
-
-
-def test_cameras_that_are_triggered_together_are_simultaneous_however_their_stamps_scatter() -> None:
-    rng = random.Random(1)
-    for count in (1, 5, 8, 20, 100):
-        assert after([rng.uniform(-2, 2) * MS for _ in range(count)]) == 0.0
-
-
-def test_the_skew_of_free_cameras_is_found_below_the_scatter_of_the_stamps() -> None:
-    rng = random.Random(2)
-    assert after([15 * MS]) == 15.0
-    assert after([15 * MS + rng.gauss(0, MS) for _ in range(60)]) == pytest.approx(15.0, abs=1.0)
-    assert after([-9 * MS + rng.gauss(0, 0.1 * MS) for _ in range(60)]) == pytest.approx(-9.0, abs=0.1)
-
-
-def test_the_skew_of_drifting_clocks_is_followed() -> None:
-    rng = random.Random(3)
-    drifting = [5 * MS + 0.2 * MS * index + rng.gauss(0, 0.1 * MS) for index in range(100)]
-    assert after(drifting) == pytest.approx(5 + 0.2 * 99, abs=0.15)
-
-
-def test_another_skew_after_a_lost_image_counts_at_once() -> None:
-    assert after([14 * MS] * 40 + [-19 * MS]) == -19.0
+    for value_ms in skews_ms:
+        skew.add(round(value_ms * MS))
+    assert skew.exposure_ns / MS == pytest.approx(expected_ms, abs=within_ms)
 
 
 SIDE_PX = 64
 IMAGE = np.arange(SIDE_PX**2, dtype=np.uint8).reshape(SIDE_PX, SIDE_PX).tobytes()
 
 
-def frame(camera: Camera = "lower", side_px: int = SIDE_PX, data: bytes = IMAGE) -> Frame:
-    return Frame(3, 7, camera, "mono8", data, side_px, side_px)
-
-
-def test_images_are_decoded() -> None:
-    decode = Decoder(make_rig(size=SIDE_PX))
-    lower, upper = decode(frame("lower")), decode(frame("upper", data=bytes(IMAGE[::-1])))
-    assert lower is not None and lower.tobytes() == IMAGE
-    assert upper is not None and upper.tobytes() == IMAGE[::-1]
-
-
-def test_damaged_frames_are_counted_with_the_first_reason() -> None:
-    decode = Decoder(make_rig(size=SIDE_PX))
-    assert decode(frame(data=b"short")) is None and decode(frame("upper", data=b"")) is None
-    assert decode.broken == 2 and "5 bytes" in decode.fault
-
-
 def test_the_first_image_must_have_the_size_of_the_rig_and_later_ones_are_left_out() -> None:
     decode, half = Decoder(make_rig(size=SIDE_PX)), SIDE_PX // 2
-    small = frame(side_px=half, data=IMAGE[: half**2])
+    small, whole = (Frame(3, 7, "lower", "mono8", IMAGE[: side**2], side, side) for side in (half, SIDE_PX))
     with pytest.raises(OmnidError, match="lower camera's images are 32x32 px, the rig's are 64x64 px"):
         decode(small)
-    assert decode(frame()) is not None and decode(small) is None
+    assert decode(whole) is not None and decode(small) is None
     assert decode.fault == "lower frame 3 is 32x32 px, unlike those before"
 
 
