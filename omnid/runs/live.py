@@ -36,13 +36,12 @@ from omnid.engine.realtime import ThreadStart, name_thread, prepare
 from omnid.engine.robot_clock import RobotClock, SegmentTime, fixed_offset, log_time
 from omnid.engine.telemetry import Histogram
 from omnid.engine.threads import started
-from omnid.errors import OmnidError
 from omnid.formats.route_file import RouteFolder
 from omnid.light.exposure import ExposureControl, UsefulArea
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.record import open_recorder
 from omnid.runs.route_files import Requests
-from omnid.runs.session import BUS_POINTS, LOG_POINTS, Session, joint_wheels, opencv_in_one_thread
+from omnid.runs.session import BUS_POINTS, LOG_POINTS, Session, joint_wheels, run_to_end
 from omnid.runs.systemd import Service, StatusLine, print_stacks_when_killed
 from omnid.runs.wiring import Inputs, Navigation, Outputs, wire
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
@@ -219,18 +218,11 @@ class LiveRun:
                 outputs.callback(show, "")
                 self._report(logging.INFO, _ready(config))
             # 3. The run, until a signal or a failure ends it.
-            outputs.enter_context(opencv_in_one_thread())
             if not robot.waits and (refused := prepare(config.realtime)):
                 warn(refused)
             # What the first loop needs is imported while the first poses are computed.
             started(partial(import_module, "scipy.sparse.linalg"), "imports")
-            try:
-                graph.run()
-            except BaseException:
-                with suppress(OmnidError):  # the error that ended the run is the one that is reported
-                    run_places.finish_run()
-                raise
-            run_places.finish_run()
+            run_to_end(graph, run_places)
         return 0
 
     def _on_signal(self, again: bool) -> None:

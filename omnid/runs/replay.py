@@ -38,7 +38,7 @@ from omnid.formats.plan import drawn_heights
 from omnid.messages import MapUpdate, OdometryUpdate, PlaceUpdate
 from omnid.runs.place_maps import RigPlaces, RunPlaces
 from omnid.runs.run_result import RunFailedError, RunResult
-from omnid.runs.session import LOG_POINTS, Session, attached_rig, motion_topics, opencv_in_one_thread
+from omnid.runs.session import LOG_POINTS, Session, attached_rig, motion_topics, opencv_in_one_thread, run_to_end
 from omnid.runs.wiring import Inputs, Outputs, wire
 from omnid.settings import dump
 from omnid.sinks.bus_sink import BusSink
@@ -147,8 +147,7 @@ class _Replay:
             self._begun_s = time.monotonic()
             try:
                 with session.signals(self._on_signal):
-                    graph.run()
-                extended = run_places.finish_run()  # before the result is made: it may warn
+                    extended = run_to_end(graph, run_places)  # before the result is made: it may warn
                 self._end_recording(sinks.recorder)
             except (OmnidError, DriverError) as error:
                 with suppress(OmnidError, DriverError):  # the error that ended the run is the one that is reported

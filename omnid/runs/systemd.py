@@ -13,14 +13,14 @@ import os
 import signal
 import socket
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.logging_setup import log
-from omnid.engine.telemetry import StageStats, Telemetry
+from omnid.engine.telemetry import Telemetry
 from omnid.transport.status_names import Key
 
 
@@ -53,12 +53,6 @@ def print_stacks_when_killed() -> None:
         faulthandler.register(signal.SIGXCPU, chain=True)  # sent by the kernel to a real-time thread that never waits
 
 
-def stalled_stages(stages: Collection[StageStats], now_ns: int, timeout_s: float) -> dict[str, float]:
-    """Return the stages that have worked on one message for longer than timeout_s, with that time [s]."""
-    busy_s = {stats.name: (now_ns - since_ns) * S_PER_NS for stats in stages if (since_ns := stats.busy_since_ns)}
-    return {name: duration_s for name, duration_s in busy_s.items() if duration_s > timeout_s}
-
-
 class Service:
     """The action of a ticker: notifies systemd that the daemon is ready, and of its status, and feeds the watchdog.
 
@@ -78,8 +72,13 @@ class Service:
 
     def __call__(self) -> None:
         """Notify systemd."""
-        stalled = stalled_stages(self._telemetry.stages, time.monotonic_ns(), self._stall_timeout_s)
+        # 1. Stages that work on one message for too long, with that time [s].
+        now_ns = time.monotonic_ns()
+        busy = [(stage.name, stage.busy_since_ns) for stage in self._telemetry.stages]
+        busy_s = {name: (now_ns - since_ns) * S_PER_NS for name, since_ns in busy if since_ns}
+        stalled = {name: duration_s for name, duration_s in busy_s.items() if duration_s > self._stall_timeout_s}
         self._log_changes(stalled)
+        # 2. What is told.
         ready = [] if self._ready else ["READY=1"]
         alive = [] if stalled else ["WATCHDOG=1"]
         self._ready = notify("\n".join([*ready, *alive, f"STATUS={self._line(stalled)}"])) or self._ready

@@ -33,7 +33,7 @@ from omnid.formats.route_file import RouteFolder
 from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.route_files import Requests
-from omnid.runs.session import opencv_in_one_thread
+from omnid.runs.session import run_to_end
 from omnid.runs.wiring import Inputs, Navigation, Outputs, wire
 from omnid.simulation.robot import SimulatedRobot, with_masks
 from omnid.simulation.vehicle import Tick, Vehicle
@@ -230,8 +230,6 @@ def simulate(
     inputs = Inputs([graph.source("cameras", messages)], run_places, navigation=navigation)
     in_map: dict[str, Output[PlaceUpdate]] = {"in map": run.places.append} if config.places.map else {}
     outputs = Outputs(poses={"poses": take_pose}, rings={"rings": take_ring}, places=in_map)
-    with opencv_in_one_thread():
-        wire(config, inputs, front_end, graph, outputs)
-        graph.run()
-    run_places.finish_run()
+    wire(config, inputs, front_end, graph, outputs)
+    run_to_end(graph, run_places)
     return run

@@ -18,10 +18,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.graph import NEWEST, Graph
-from omnid.engine.telemetry import StageStats, Telemetry
-from omnid.runs.systemd import Service, notify, stalled_stages, watchdog_s
+from omnid.engine.telemetry import Telemetry
+from omnid.runs.systemd import Service, notify, watchdog_s
 from tests.waiting import wait_until
 
 ROOT = Path(__file__).parents[3]
@@ -94,15 +93,6 @@ def test_reads_the_timeout_of_the_watchdog(
     assert Service(Telemetry(), str, 1.0).period_s == pytest.approx(min(1.0, (expected or 3.0) / 3))
 
 
-def test_only_a_stage_with_one_message_for_too_long_is_stalled() -> None:
-    stages = [
-        StageStats("idle"),
-        StageStats("busy", busy_since_ns=9 * 10**9),
-        StageStats("stalled", busy_since_ns=10**9),
-    ]
-    assert stalled_stages(stages, 10 * 10**9, 2.0) == {"stalled": 9.0}
-
-
 def test_sends_ready_once_then_watchdog_then_stopping(manager: Manager) -> None:
     service = Service(Telemetry(), lambda: "3 poses\nREADY=1", 1.0)
     service()
@@ -146,12 +136,12 @@ class Tap:
 @pytest.fixture
 def running() -> Iterator[SimpleNamespace]:
     """A running graph: tap, valve, sink."""
-    graph, tap, valve, sunk = Graph(policy=NEWEST), Tap(), Valve(), RunStatistics()
+    graph, tap, valve = Graph(policy=NEWEST), Tap(), Valve()
     sink = SimpleNamespace(process=lambda number: None)
     graph.sink("sink", sink, graph.stage("valve", valve, graph.source("tap", tap.numbers, wake=tap.close)))
     thread = threading.Thread(target=graph.run)
     thread.start()
-    yield SimpleNamespace(graph=graph, tap=tap, valve=valve, sunk=sunk)
+    yield SimpleNamespace(graph=graph, tap=tap, valve=valve)
     valve.open.set()
     graph.stop()
     thread.join(TIMEOUT_S)
