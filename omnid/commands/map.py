@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Final
 
 import numpy as np
@@ -26,7 +27,6 @@ from omnid.formats.exports import write_grid, write_ply
 from omnid.formats.place_file import read_places, write_places
 from omnid.formats.plan import drawn_heights
 from omnid.formats.route_file import RouteFolder
-from omnid.runs.place_maps import RigPlaces
 from omnid.runs.replay import ReplayOptions, run_log
 from omnid.sinks.files import check_outputs, write_plan, write_trajectory
 from omnid.stages.obstacles import ADVICE
@@ -64,29 +64,26 @@ def build(args: argparse.Namespace) -> int:
         raise OmnidError(f"map build: {args.output} exists: --extend adds these logs to it, --replace makes a new one")
     for warning in unused_settings(config, "replay", args.set):
         options.warn(warning)
-    # 2. Replay the logs.
-    built = RigPlaces(*read_places(args.output, PlaceMap(config.places.limits.max_keyframes))) if args.extend else None
-    for log in args.logs:
-        replayed = ReplayOptions(
-            rig=args.rig,
-            settings=args.config,
-            build=True,
-            rig_places=built,
-            progress=None if args.quiet else Progress(),
-        )
-        result = run_log(log, config, replayed)
-        for warning in result.warnings:
-            options.warn(f"{log}: {warning}")
-        if result.signal:
-            print(f"omnid: interrupted: {args.output} was not written", file=sys.stderr)
-            return 128 + result.signal
-        built = result.rig_places
-    # 3. Write the map.
-    if built is None or not built.places.keyframes:
-        print("omnid: no keyframe was found: no map was written", file=sys.stderr)
-        return 1
-    write_places(args.output, built.places, built.rig)
-    options.print_entries(_described(args.output, built.places, built.rig))
+    # 2. Replay the logs into a copy of the map.
+    with TemporaryDirectory() as folder:
+        new = Path(folder, args.output.name)
+        if args.extend:
+            write_places(new, *read_places(args.output))
+        config = replace(config, places=replace(config.places, map=str(new)))
+        replayed = ReplayOptions(rig=args.rig, settings=args.config, progress=None if args.quiet else Progress())
+        for log in args.logs:
+            result = run_log(log, config, replayed)
+            for warning in result.warnings:
+                options.warn(f"{log}: {warning}")
+            if result.signal:
+                print(f"omnid: interrupted: {args.output} was not written", file=sys.stderr)
+                return 128 + result.signal
+        if not new.exists():
+            return 1
+        places, rig = read_places(new)
+    # 3. It is whole now.
+    write_places(args.output, places, rig)
+    options.print_entries(_described(args.output, places, rig))
     return 0
 
 

@@ -10,7 +10,6 @@ from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from stat import S_ISREG
-from typing import NamedTuple
 
 from calib.rig_file import rig_toml
 from omnid.config import Config
@@ -26,13 +25,6 @@ from omnid.transport.codec import string_from_cdr
 from omnid.transport.topics import SAVE_MAP, Answer, Request
 
 
-class RigPlaces(NamedTuple):
-    """A map of places and the rig that saw them."""
-
-    places: PlaceMap
-    rig: PlaceRig
-
-
 class RunPlaces:
     """Holds the map that a run localises in; `places` is None where the run has no map but its own.
 
@@ -40,52 +32,37 @@ class RunPlaces:
     loses little of it.
     """
 
-    def __init__(
-        self,
-        config: Config,
-        geometry: Geometry,
-        warn: Callable[[str], None],
-        given: RigPlaces | None = None,
-        *,
-        build: bool = False,
-    ) -> None:
-        """given: a map in the memory, in the place of the file places.map; build: or else an empty one.
+    def __init__(self, config: Config, geometry: Geometry, warn: Callable[[str], None]) -> None:
+        """Read the file places.map. One that does not exist is made by this run, unless it only localises.
 
-        warn: takes a line for the user.
-
-        A file that does not exist is made by this run, unless it only localises.
-        Raises OmnidError for a file that is no map, or that of another rig.
+        warn: takes a line for the user. Raises OmnidError for a file that is no map, or that of another rig.
         """
         settings, self._warn, self._rig = config.places, warn, place_rig(geometry)
         if settings.map and not settings.enabled:
             raise OmnidError("places.map (--map) needs places.enabled = true: leave one of them out")
         if settings.localize_only and not settings.map:
             raise OmnidError("places.localize_only (--localize-only) needs a map: add --map FILE.omap, or leave it out")
-        # 1. The map: that which was given, that of the file, a new one, or none.
-        path = self._path = Path(settings.map) if settings.map and given is None and not build else None
-        self.localize_only = path is not None and settings.localize_only
-        self.is_extended = path is not None and not settings.localize_only  # the file is written
-        self._version = None if path is None else _version(path)
-        if path is not None and self.is_extended:
+        # 1. The map: that of the file, a new one, or none.
+        path = self._path = Path(settings.map)
+        self.localize_only = settings.localize_only
+        self.is_extended = bool(settings.map) and not settings.localize_only  # the file is written
+        self._version = _version(path)
+        self.places = PlaceMap(settings.limits.max_keyframes) if settings.map else None
+        if self.is_extended:
             check_outputs([("--map", path)], [])
-        if path is not None and self.is_extended and not path.exists():
+        if self.is_extended and not path.exists():
             log(logging.INFO, f"{path}: there is no such map: this run begins a new one")
-        elif path is not None:
-            given = RigPlaces(*read_places(path, PlaceMap(settings.limits.max_keyframes)))
-        self.places = None if given is None else given.places
-        if given is None and (build or path is not None):
-            self.places = PlaceMap(settings.limits.max_keyframes)
-        self._known = frozenset(given.places.keyframes) if given else frozenset[int]()
-        self._name = path or "the map"
-        # 2. It must fit the rig, and is adapted to the panoramas of this run.
-        if given is not None and self._known:
-            if difference := given.rig.difference(self._rig):
+        elif self.places is not None:
+            self.places, rig = read_places(path, self.places)
+            # 2. It must fit the rig, and is adapted to the panoramas of this run.
+            if difference := rig.difference(self._rig):
                 raise OmnidError(
-                    f"{self._name}: this map was made with {difference}: build one with this rig, by `omnid map build`"
+                    f"{path}: this map was made with {difference}: build one with this rig, by `omnid map build`"
                 )
-            if given.rig.rig_hash != self._rig.rig_hash:
-                warn(f"{self._name}: the rig was calibrated again since this map was made")
-            self._rig.adapt(given.places, given.rig)
+            if rig.rig_hash != self._rig.rig_hash:
+                warn(f"{path}: the rig was calibrated again since this map was made")
+            self._rig.adapt(self.places, rig)
+        self._known = frozenset(self.places.keyframes if self.places else ())
         # 3. What was saved, and requests for it.
         self.copy_s = 0.0  # time between two copies that are saved; 0: none is
         self.requests: Stream[SaveMap] | None = None
@@ -142,30 +119,27 @@ class RunPlaces:
         """Return how often the map was saved, and why it is not."""
         return {**self._counts, "_error": self._error, "_words": "saves the map"}
 
-    def finish_run(self) -> RigPlaces | None:
-        """Return the joined part of the map after the run, and write it to its file if it was extended.
+    def finish_run(self) -> None:
+        """Write the joined part of the map to its file after the run, if it was extended.
 
         Raises OmnidError if the file cannot be written.
         """
         if self.places is None:
-            return None
-        joined, name = self._joined(self.places), self._name
+            return
+        joined = self._joined(self.places)
         new, unjoined = len(joined - self._known), len(self.places.keyframes.keys() - joined - self._known)
-        self.places = self.places.part(joined)
         if self._known and not new and unjoined:
-            self._warn(f"{name}: no place of it was recognised: nothing was added to it")
+            self._warn(f"{self._path}: no place of it was recognised: nothing was added to it")
         elif unjoined:
-            self._warn(f"{name}: {unjoined} keyframes after a gap were recognised nowhere: they were left out")
+            self._warn(f"{self._path}: {unjoined} keyframes after a gap were recognised nowhere: they were left out")
         if self.is_extended and new:
-            self._write(self.places)
+            self._write(self.places.part(joined))
         elif self.is_extended and not self._known:
             self._warn(f"{self._path}: no keyframe was found: no map was written")
-        return RigPlaces(self.places, self._rig)
 
     def _write(self, places: PlaceMap) -> None:
         """Write the map to its file, or to one next to it where another program has written that file meanwhile."""
         path = self._path
-        assert path is not None
         if _version(path) not in (None, self._version):
             names = (path.with_stem(f"{path.stem}-{number}") for number in count(2))
             other = next(name for name in names if not name.exists())

@@ -36,7 +36,7 @@ from omnid.errors import OmnidError
 from omnid.formats.exports import write_ply
 from omnid.formats.plan import drawn_heights
 from omnid.messages import MapUpdate, OdometryUpdate, PlaceUpdate
-from omnid.runs.place_maps import RigPlaces, RunPlaces
+from omnid.runs.place_maps import RunPlaces
 from omnid.runs.run_result import RunFailedError, RunResult
 from omnid.runs.session import LOG_POINTS, Session, attached_rig, motion_topics, opencv_in_one_thread, run_to_end
 from omnid.runs.wiring import Inputs, Outputs, wire
@@ -87,8 +87,6 @@ class ReplayOptions:
     # Called each PROGRESS_S and at the end, with statistics, expected pairs, and whether the run has ended.
     progress: Callable[[RunStatistics, int | None, bool], object] | None = None
     observer: Callable[[FrontEnd, Telemetry], Sink[Outgoing]] | None = None  # of all messages; excludes record
-    rig_places: RigPlaces | None = None  # the map to begin with, and its rig, which is compared with that of the log
-    build: bool = False  # give the result a map with its rig, a new one where there is none to begin with
     map_every_s: float = 0.0  # between two maps, by the stamps; 0: one, at the end
 
     @property
@@ -135,7 +133,7 @@ class _Replay:
             prepare_kernels()  # may take a minute: after a log or a rig that is wrong was refused
             self._front_end = front_end = FrontEnd(geometry, config, self._examined_rig(geometry))
             # 2. The stages, between the log and the outputs; one that cannot be opened ends the run before it begins.
-            run_places = RunPlaces(config, geometry, session.warn, options.rig_places, build=options.build)
+            run_places = RunPlaces(config, geometry, session.warn)
             messages, sinks = graph.source("read", self._messages()), self._outputs(geometry)
             inputs = Inputs([messages], run_places, map_every_s=options.map_every_s)
             self._stages = wire(config, inputs, front_end, graph, sinks)
@@ -147,7 +145,7 @@ class _Replay:
             self._begun_s = time.monotonic()
             try:
                 with session.signals(self._on_signal):
-                    extended = run_to_end(graph, run_places)  # before the result is made: it may warn
+                    run_to_end(graph, run_places)  # before the result is made: it may warn
                 self._end_recording(sinks.recorder)
             except (OmnidError, DriverError) as error:
                 with suppress(OmnidError, DriverError):  # the error that ended the run is the one that is reported
@@ -155,7 +153,7 @@ class _Replay:
                 if not session.statistics.poses or isinstance(error, RigContradictedError):
                     raise
                 raise RunFailedError(str(error), self._result()) from error
-            return replace(self._result(), rig_places=extended, map_file=run_places.written)
+            return replace(self._result(), map_file=run_places.written)
 
     def _inputs(self) -> list[tuple[str, Path]]:
         """The files that are read, each with its name for errors."""

@@ -20,7 +20,6 @@ from omnid.errors import OmnidError
 from omnid.formats.exports import write_ply
 from omnid.formats.tum import Trajectory, read_tum, tum_row
 from omnid.recordings.evaluation import Metrics, evaluate
-from omnid.runs.place_maps import RigPlaces
 from omnid.tracking_state import MapState, TrackingState
 
 
@@ -49,7 +48,6 @@ class RunResult:
     T_map_rig_live: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 4, 4)))  # (N, 4, 4)
     map_states: tuple[MapState, ...] = ()  # (N,)
     places: PlaceMap | None = None  # keyframes by which the places are recognised; None as above
-    rig_places: RigPlaces | None = None  # the map of places that the run was given, extended
     map_file: Path | None = None  # of places, where the run has written one
     elapsed_s: float = 0.0  # time that the stages took, without the start
 

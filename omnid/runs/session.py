@@ -31,7 +31,7 @@ from omnid.engine.robot_clock import RobotClock, log_time
 from omnid.engine.telemetry import StageStats
 from omnid.engine.threads import started
 from omnid.errors import OmnidError
-from omnid.runs.place_maps import RigPlaces, RunPlaces
+from omnid.runs.place_maps import RunPlaces
 from omnid.settings import dump
 from omnid.sinks.encoder import Encoder, UnixTime
 from omnid.stages.geometry import Geometry, geometry, with_rims
@@ -84,8 +84,8 @@ def opencv_in_one_thread() -> Iterator[None]:
         cv2.setNumThreads(before)
 
 
-def run_to_end(graph: Graph, run_places: RunPlaces) -> RigPlaces | None:
-    """Run until the end, then complete the map of places and return it.
+def run_to_end(graph: Graph, run_places: RunPlaces) -> None:
+    """Run until the end, then complete the map of places.
 
     A run that fails completes it as well: the error that ended the run is the one that is raised.
     """
@@ -96,7 +96,7 @@ def run_to_end(graph: Graph, run_places: RunPlaces) -> RigPlaces | None:
             with suppress(OmnidError):
                 run_places.finish_run()
             raise
-    return run_places.finish_run()
+    run_places.finish_run()
 
 
 class Session:

@@ -68,7 +68,8 @@ def test_a_slowed_daemon_reaches_its_goal_and_loses_nothing(tmp_path: Path, caps
     stages = {entry.name: entry.values for entry in status.statuses if entry.name.startswith(STAGE_PREFIX)}
     dropped = {name: values[Key.DROPPED] for name, values in stages.items() if Key.DROPPED in values}
     assert {f"{STAGE_PREFIX}bus", f"{STAGE_PREFIX}odometry"} <= set(dropped)
-    assert set(dropped.values()) == {"0"}, {k: v for k, v in dropped.items() if v != "0"}
+    lossy = {f"{STAGE_PREFIX}bus-status"}  # it comes by the time on the wall, and the newest counts
+    assert {name for name, count in dropped.items() if count != "0"} <= lossy
     assert status.value(WHEELS, Key.ARMED) == "1"
     # 2. Its time went more slowly than that on the wall.
     assert 0 < float(status.value(SIMULATION, Key.REAL_TIME_FACTOR)) <= 1.0
