@@ -208,12 +208,12 @@ def compiled_functions() -> list[Finding]:
     """Check that functions can be compiled, and that they can be kept for the next start."""
     problem, folder = why_no_code(), cache_folder()
     reason = "" if problem else why_unusable(folder)
-    lost = f"cannot be kept in {folder}: {reason}: every start takes half a minute longer"
+    lost = f"cannot be kept in {folder}: {reason}: every start takes a minute longer"
     return _applying(
         "compiled code",
         (problem, "error", problem, "remove MemoryDenyWriteExecute= from the unit, or what else denies it"),
         (reason, "warning", lost, "make that folder writable, or set OMNID_CACHE_DIR to another one"),
-        good=f"kept in {folder}; the first start compiles it, which takes half a minute",
+        good=f"kept in {folder}; the first start compiles it, which takes a minute",
     )
 
 

@@ -1,6 +1,6 @@
 """Compiled functions (core/compiled.py) made ready before the first image: read from the disk, or compiled and kept.
 
-They are compiled by programs of their own, whose memory ends with them. numba replaces each file at once, so what a
+They are compiled by a program of its own, whose memory ends with it. numba replaces each file at once, so what a
 power cut or a full disk has left is compiled again.
 """
 
@@ -15,14 +15,11 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib import import_module
-from typing import Final
 
 from omnid.core.compiled import DECLARED, cache_folder, code_folder, is_kept, kernel_modules, why_unusable
 from omnid.engine.logging_setup import Report, log
 from omnid.engine.process import python, python_environment
 from omnid.errors import OmnidError
-
-CHILDREN: Final = 2  # 480 MB with the program that waits, of the 768 that the service may have
 
 _prepared: set[str] = set()  # names of the modules whose functions are ready
 
@@ -44,7 +41,7 @@ def prepare_kernels(report: Report = log) -> None:
     # 2. Compile what is not on the disk, and read it.
     started_s, reason = time.monotonic(), why_unusable(cache_folder())
     if not reason:
-        reason = _compile_in_children([name for name in modules if not is_kept(name)], report)
+        reason = _compile_in_child([name for name in modules if not is_kept(name)], report)
     if not reason:
         try:
             compile_modules(modules, is_kept=True)
@@ -81,8 +78,8 @@ def compile_modules(names: Sequence[str], *, is_kept: bool) -> None:
             kernel.compile(is_kept=is_kept)
 
 
-def _compile_in_children(names: Sequence[str], report: Report) -> str:
-    """Compile modules into their folders by programs of their own; return why that failed, or ""."""
+def _compile_in_child(names: Sequence[str], report: Report) -> str:
+    """Compile modules into their folders by a program of its own; return why that failed, or ""."""
     if not names:
         return ""
     # 1. A new folder for each, in place of those of its earlier states.
@@ -94,27 +91,13 @@ def _compile_in_children(names: Sequence[str], report: Report) -> str:
                 folder.mkdir(mode=0o700)
         for earlier in {*folder.parent.glob(f"{folder.name.rpartition('-')[0]}-*")} - {folder}:
             shutil.rmtree(earlier, ignore_errors=True)
-    # 2. The programs.
-    report(logging.INFO, "compiling the loops over pixels and landmarks for this processor, once; takes half a minute")
-    children = [
-        subprocess.Popen(
-            python("-m", __name__, *names[number::CHILDREN]),
-            env=python_environment(),
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        for number in range(min(CHILDREN, len(names)))
-    ]
-    try:
-        codes = [child.wait() for child in children]
-    finally:
-        for child in children:
-            child.kill()
-    if any(codes):
+    # 2. The program.
+    report(logging.INFO, "compiling the loops over pixels and landmarks for this processor, once; takes a minute")
+    child = subprocess.run(python("-m", __name__, *names), env=python_environment(), capture_output=True)
+    if child.returncode:
         for folder in map(code_folder, names):
             shutil.rmtree(folder, ignore_errors=True)
-        return f"the programs that compile them ended with {codes}"
+        return f"the program that compiles them ended with {child.returncode}"
     report(logging.INFO, f"compiled in {time.monotonic() - started_s:.0f} s; kept in {cache_folder()}")
     return ""
 
