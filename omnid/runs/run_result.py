@@ -18,8 +18,9 @@ from omnid.diagnostics.run_summary import RunCounters
 from omnid.engine.telemetry import SummaryRow
 from omnid.errors import OmnidError
 from omnid.formats.exports import write_ply
-from omnid.formats.tum import Trajectory, read_tum, tum_row
+from omnid.formats.tum import Trajectory, read_tum
 from omnid.recordings.evaluation import Metrics, evaluate
+from omnid.sinks.files import write_trajectory
 from omnid.tracking_state import MapState, TrackingState
 
 
@@ -82,11 +83,7 @@ class RunResult:
         """
         if len(self.stamps_ns) < self.counters.poses:
             raise OmnidError(f"{path}: the poses of this run were not collected: run it with collect=True")
-        rows = [tum_row(int(stamp_ns), T) + "\n" for stamp_ns, T in zip(self.stamps_ns, self.T_odom_rig, strict=True)]
-        try:
-            Path(path).write_text("".join(rows), "ascii")
-        except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-            raise OmnidError(f"{path}: cannot be written: {getattr(error, 'strerror', None) or error}") from error
+        write_trajectory(Path(path), self.stamps_ns, self.T_odom_rig)
 
     def save_ply(self, path: str | PathLike[str]) -> None:
         """Write the map as a binary PLY file: x y z [m], confidence, frames and age of every point.

@@ -110,7 +110,7 @@ class TrajectoryFile:
             written = self._file.write(row)
             while written < len(row):  # a full disk takes a part of the row, then nothing
                 written += self._file.write(row[written:])
-        except OSError as error:
+        except (OSError, ValueError) as error:  # ValueError: a NUL in the name
             with suppress(OSError):
                 if self._file is not None:
                     self._file.truncate(self._whole_bytes)  # remove the part of a row
@@ -152,8 +152,8 @@ def write_known(
     return [f"{path}: {left_out}: no place of the map was recognised there, so it is not known where in it they are"]
 
 
-def _no_longer_written(path: Path, error: OSError) -> OmnidError:
-    return OmnidError(f"{path}: can no longer be written: {error.strerror or error}")
+def _no_longer_written(path: Path, error: OSError | ValueError) -> OmnidError:
+    return OmnidError(f"{path}: can no longer be written: {getattr(error, 'strerror', None) or error}")
 
 
 def write_plan(
