@@ -117,8 +117,8 @@ def point_scan(points: Array, sigma_m: Array, view: Array, limits: ScanLimits, f
     limit = bins - math.floor(1 / (limits.max_range_m * INVERSE_STEP))  # bins from here on lie beyond
     first = supported.argmax(axis=1)[:, None]
     is_near = supported.any(axis=1) & (first[:, 0] < limit)
-    sums_at = (np.take_along_axis(each, first, axis=1)[:, 0] for each in (count, inverse))
-    found = np.divide(*sums_at, out=np.full(SECTORS, np.nan), where=is_near)
+    total, of_inverse = (np.take_along_axis(each, first, axis=1)[:, 0] for each in (count, inverse))
+    found = np.divide(total, of_inverse, out=np.full(SECTORS, np.nan), where=is_near)
     # The last two bins reach beyond the longest range.
     beyond = (found > limits.max_range_m) | (~is_near & supported.any(axis=1))
     scan = fill_gaps(np.where(beyond, np.nan, found).astype(np.float32))

@@ -185,7 +185,7 @@ def _polygon(shape: tuple[int, ...], centre: Array, ends: Array, whole: float) -
     cv2.fillPoly(cells, [_fixed_point(ends)], 1, shift=SHIFT)
     cv2.polylines(outline, [_fixed_point(ends)], True, 1, shift=SHIFT)
     cv2.circle(outline, _fixed_point(centre).tolist(), round(whole * 2**SHIFT), 0, cv2.FILLED, shift=SHIFT)
-    return (cells & ~outline & 1).view(np.int8)
+    return np.asarray((cells & ~outline & 1).view(np.int8))
 
 
 def _ends_of_floor(shape: tuple[int, ...], centre: Array, free_m: Ranges, direction: Array) -> NDArray[np.bool_]:

@@ -25,7 +25,7 @@ Pairs that are not synchronised are left as they are (keyframes.py).
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,9 +49,9 @@ Pair = tuple[PaddedPanorama, PaddedPanorama]
 # with a wall of bricks have 0.42 and more, so that only worlds which repeat nearly everywhere are in doubt.
 LEAST_SURE = 0.4
 # Directions of the motion and turns that are tried first, rad: such a step moves an epipolar line by TOLERANCE_PX, so
-# that none is missed. The last turn is as far as the tracker reaches, because it searches 30 px at scale 1.
+# that none is missed; each round is FINER times as fine. The last turn is as far as the tracker reaches.
 DIRECTION_STEP, TURN_STEP, MOST_TURN = math.radians(2.5), math.radians(0.5), math.radians(10.0)
-ROUNDS, FINER = 3, 3  # rounds, each so many times as fine, because a tenth of a degree then remains
+ROUNDS, FINER = 3, 3
 # Share of the bearings that the motion explains, because a wrong one, where the turn is too large, explains 0.6.
 FIT_SHARE = 2 / 3
 # Share of the bearings that fit the best turn from which another turn fits as well, and how far apart both are, rad:
@@ -62,30 +62,17 @@ TOLERANCE_PX = 1.5  # distance of a track from its epipolar line, because vehicl
 # range errs by an eighth, so that neighbouring courses differ by two sigmas.
 PARALLAX_PX, SIGMA_PX = 6.0, 0.7
 DISPARITY_SIGMA_PX = 0.5  # because peaks of the correlation are found among whole pixels
-LOG_STEP = 0.01  # between two distances whose votes are counted, so that it is half of the least sigma
 LEAST_SIGMA = 0.02  # of a vote, because the motion is only known to a tenth of a degree
 LEAST_VOTES = 30.0  # that decide, because fewer are as many as scattered votes of a hundred landmarks give
 # Share of the landmarks with a vote that must agree, because without repetition no two distances can have so many.
 DECIDING_SHARE = 0.5
-# Votes by which a runner-up has fewer, so that it is less likely by a million to one: an outlier costs 1.1, see `_cost`
-# in `frame_to_map.py`.
+# Votes by which a runner-up has fewer, so that it is less likely by a million to one: an outlier costs 1.1 (`_cost` in
+# pose_search.py).
 LEAD_VOTES = math.log(1e6) / 1.1
 # Of the distance that wheels report, because theirs errs by less also before its scale is learned, and periods by more.
 WHEELS_RATIO = 1.2
-OTHER_RATIO = 1.1  # Distances whose ratio is less are one, because the votes for one distance are spread so far.
-# Covariance [px^2] of a view whose upper row was moved to another peak, because only that is known less well.
-VIEW_NOISE = np.diag([0.0, 0.0, DISPARITY_SIGMA_PX**2])
-# Share of the disparities decided on that were those of dense stereo, above which the others are kept as well, because
-# RANSAC leaves out so few wrong ones.
-RIGHT_SHARE = 0.9
+OTHER_RATIO = 1.1  # distances whose ratio is less are one, because the votes for one distance are spread so far
 VOTED_SIGMAS = 3.0  # within which a disparity is the voted one, because three in a thousand of the right ones are not
-
-
-class Votes(NamedTuple):
-    """Distances [m] with most votes."""
-
-    moved_m: float
-    runner_up_m: float | None  # another distance that has nearly as many
 
 
 class FirstDepths:
@@ -94,18 +81,20 @@ class FirstDepths:
     def __init__(self, pair: Pair, keyframe: Keyframe, ids: Indices, views: Array, model: StereoModel) -> None:
         """pair: lower and upper panorama of the keyframe; ids (N,) and views (N, 3) [px] of its landmarks."""
         self._model, self._T_odom_rect, self._ids, self._views = model, keyframe.T_odom_rect, ids, views
-        self._disparities = _disparities(pair, views, model)
-        self._taken = np.zeros(len(ids), np.intp)  # which of its disparities a landmark has
-        self._last, self._pixels = pair[0], views[:, :2]
+        # Those at which they match, up to that of the baseline's distance, and which of them they have now.
+        self._disparities = matching_disparities(pair, views, round(model.cylinder.focal_px))
+        self._taken = np.zeros(len(ids), np.intp)
+        # Those that are followed (M,), and where the last panorama shows them.
+        self._rows, self._last, self._pixels = np.arange(len(ids)), pair[0], views[:, :2]
         # The largest distance from the keyframe that is possible, and the one by wheels; NaN: not known.
-        self._most_m, self._sensed_m = 0.0, 0.0
-        self._larger_share = self._largest_share()
-
-    @classmethod
-    def of(cls, pair: Pair, keyframe: Keyframe, ids: Indices, views: Array, model: StereoModel) -> FirstDepths | None:
-        """Return the disparities of a keyframe, None where enough landmarks do not repeat."""
-        found = cls(pair, keyframe, ids, views, model) if len(views) else None
-        return found if found is not None and found.is_open else None
+        self._reached_m = np.zeros(2)
+        # Share of the motion by which it may be larger or smaller; 0: enough landmarks do not repeat.
+        self._larger_share = 0.0
+        self._repeats = np.asarray(np.isfinite(self._disparities[:, 1:]).any(axis=1))
+        if self._repeats.sum() > (1.0 - LEAST_SURE) * len(ids):
+            ratios = self._disparities[self._repeats, :1] / self._disparities[self._repeats] - 1.0
+            edges = [float(np.median(edge(ratios, axis=1))) for edge in (np.nanmin, np.nanmax)]
+            self._larger_share = max(edges, key=abs)
 
     @property
     def is_open(self) -> bool:
@@ -122,94 +111,68 @@ class FirstDepths:
         step_m: the most that a vehicle can move since the last panorama, and the step by wheels, NaN: not known.
         """
         # 1. Follow them from the keyframe on.
-        self._most_m, self._sensed_m = self._most_m + step_m[0], self._sensed_m + step_m[1]
-        self._follow(lower, klt)
-        if len(self._ids) < LEAST_VOTES:
-            return
-        # 2. Vote for the distance.
-        ranges, parallax_px = self._ranges()
-        distances = self._model.cylinder.focal_px * self._model.baseline_m / (self._disparities * ranges[:, None])
-        sigmas = np.hypot(SIGMA_PX / parallax_px[:, None], DISPARITY_SIGMA_PX / self._disparities) + LEAST_SIGMA
-        votes = voted(np.log(distances), sigmas, reach_m(self._most_m, self._sensed_m))
-        if votes is None:
-            return
-        self._larger_share = 0.0 if votes.runner_up_m is None else votes.runner_up_m / votes.moved_m - 1.0
-        # 3. Landmarks take the disparity of that distance. Those without one are wrong, and so may be those without a
-        #    vote, unless nearly all that were decided on had been right.
-        off = np.abs(np.log(distances / votes.moved_m)) / sigmas
-        off[~np.isfinite(off)] = np.inf
-        chosen, each = off.argmin(axis=1), np.arange(len(off))
-        is_decided = off[each, chosen] < VOTED_SIGMAS
-        repeats = _repeats(self._disparities)
-        own = chosen[is_decided & repeats] == 0
-        were_right = own.sum() > RIGHT_SHARE * len(own)
-        is_right = is_decided | (~np.isfinite(ranges) & (~repeats | were_right))
-        moved = is_decided & (chosen != self._taken)
-        self._taken = np.where(is_decided, chosen, self._taken)
-        views = self._views[moved]
-        views[:, 2] = views[:, 1] + self._disparities[each, chosen][moved]
-        local_map.set_views(self._ids[moved], views, np.tile(VIEW_NOISE, (len(views), 1, 1)))
-        local_map.keep(self._ids[is_right])
-
-    def _largest_share(self) -> float:
-        """Return by which share of a motion it may be larger or smaller; 0: enough landmarks do not repeat."""
-        repeats = _repeats(self._disparities)
-        if 1.0 - repeats.mean() >= LEAST_SURE:
-            return 0.0
-        own, others = self._disparities[repeats, 0], self._disparities[repeats]
-        larger, smaller = (np.median(own / edge(others, axis=1)) - 1.0 for edge in (np.nanmin, np.nanmax))
-        return float(max(larger, smaller, key=abs))
-
-    def _follow(self, lower: PaddedPanorama, klt: KltSettings) -> None:
-        """Track the landmarks from the last panorama into the next one; others are no longer followed."""
+        self._reached_m += step_m
         pixels, found = track(self._last, lower, self._pixels, self._pixels, klt)
-        self._last, self._pixels = lower, pixels[found]
-        self._ids, self._views, self._disparities = self._ids[found], self._views[found], self._disparities[found]
-        self._taken = self._taken[found]
+        self._last, self._pixels, self._rows = lower, pixels[found], self._rows[found]
+        if len(self._rows) < LEAST_VOTES:
+            return
+        # 2. Each of their disparities is a logarithm of the distance. Wheels that hardly move may not have begun to.
+        ranges, parallax_px = self._ranges()
+        disparities = self._disparities[self._rows]
+        distances = np.log(self._model.cylinder.focal_px * self._model.baseline_m / (disparities * ranges[:, None]))
+        sigmas = np.hypot(SIGMA_PX / parallax_px[:, None], DISPARITY_SIGMA_PX / disparities) + LEAST_SIGMA
+        votes = np.isfinite(distances).any(axis=1)
+        if votes.sum() < LEAST_VOTES:
+            return
+        most_m, sensed_m = self._reached_m
+        reach_m = (sensed_m / WHEELS_RATIO, sensed_m * WHEELS_RATIO) if sensed_m > SAME_M else (0.0, most_m)
+        least = max(float(np.nanmin(distances)), math.log(max(reach_m[0], SAME_M / 2)))
+        grid = np.arange(least, min(float(np.nanmax(distances)), math.log(max(reach_m[1], SAME_M))), LEAST_SIGMA / 2)
+        if not len(grid):
+            return
+        # 3. Count the votes, and find another distance that has nearly as many.
+        each = np.exp(-0.5 * ((grid[:, None, None] - distances[votes]) / sigmas[votes]) ** 2)
+        scores = np.nan_to_num(each).max(axis=2).sum(axis=1)
+        best = int(scores.argmax())
+        if scores[best] < max(LEAST_VOTES, DECIDING_SHARE * votes.sum()):
+            return
+        others = np.where(np.abs(grid - grid[best]) > math.log(OTHER_RATIO), scores, 0.0)
+        is_near = others.max() > scores[best] - LEAD_VOTES
+        self._larger_share = math.expm1(grid[others.argmax()] - grid[best]) if is_near else 0.0
+        # 4. Landmarks take the disparity of that distance. Those without one are wrong, and so may be those that repeat
+        #    without a vote.
+        off = np.where(np.isfinite(distances), np.abs(distances - grid[best]) / sigmas, np.inf)
+        chosen, is_decided = off.argmin(axis=1), off.min(axis=1) < VOTED_SIGMAS
+        moved = np.flatnonzero(is_decided & (chosen != self._taken[self._rows]))
+        rows = self._rows[moved]
+        self._taken[rows], views = chosen[moved], self._views[rows]
+        views[:, 2] = views[:, 1] + disparities[moved, chosen[moved]]
+        noise = np.tile(np.diag([0.0, 0.0, DISPARITY_SIGMA_PX**2]), (len(rows), 1, 1))
+        local_map.set_views(self._ids[rows], views, noise)
+        local_map.keep(self._ids[self._rows[is_decided | ~(votes | self._repeats[self._rows])]])
 
     def _ranges(self) -> tuple[Array, Array]:
-        """Return ranges (N,) of the landmarks from the keyframe, in units of the distance, and parallaxes (N,) [px].
+        """Return ranges (M,) of the landmarks from the keyframe, in units of the distance, and parallaxes (M,) [px].
 
         A landmark off its epipolar line, behind the camera, or with too little parallax has none: NaN.
         """
         cylinder = self._model.cylinder
-        before, now = cylinder.rays(self._views[:, :2]), cylinder.rays(self._pixels)
+        before, now = cylinder.rays(self._views[self._rows, :2]), cylinder.rays(self._pixels)
         now /= np.linalg.norm(now, axis=1, keepdims=True)
         motion = most_likely_motion(before, now, cylinder.focal_px)
         if motion is None:
             return np.full(len(now), np.nan), np.ones(len(now))
         direction, turn = motion
-        t, turned = (
-            np.array([math.cos(direction), math.sin(direction), 0.0]),
-            before @ se3.rotation_exp([0.0, 0.0, turn]).T,
-        )
+        t, turned = np.array([math.cos(direction), math.sin(direction), 0.0]), _turned(before, turn)
         error_px = cylinder.focal_px * epipolar_errors(turned, now, direction)
         # r R a + t = q b in the least-squares sense; t points forwards or backwards, whichever leaves most in front.
         a2, ab = (turned**2).sum(axis=1), (turned * now).sum(axis=1)
-        sine2 = a2 - ab**2
-        ranges = (ab * (now @ t) - turned @ t) / np.maximum(sine2, 1e-12)
+        sine2 = np.maximum(a2 - ab**2, 1e-12)
+        ranges = (ab * (now @ t) - turned @ t) / sine2
         ranges *= np.sign(np.median(ranges[sine2 >= np.median(sine2)]))
-        parallax_px = cylinder.focal_px * np.sqrt(np.maximum(sine2, 1e-12) / a2)
+        parallax_px = cylinder.focal_px * np.sqrt(sine2 / a2)
         known = (np.abs(error_px) < TOLERANCE_PX) & (parallax_px > PARALLAX_PX) & (ranges > 0)
         return np.where(known, ranges, np.nan), parallax_px
-
-
-def reach_m(most_m: float, sensed_m: float) -> tuple[float, float]:
-    """Return the least and the largest distance that are possible, by the speed limit and by wheels (NaN: none).
-
-    Wheels that report hardly any motion may not have begun to turn.
-    """
-    return (sensed_m / WHEELS_RATIO, sensed_m * WHEELS_RATIO) if sensed_m > SAME_M else (0.0, most_m)
-
-
-def _disparities(pair: Pair, views: Array, model: StereoModel) -> Array:
-    """Return the disparities (N, K) [px] at which views (N, 3) match, up to that of the baseline's distance."""
-    return matching_disparities(pair, views, round(model.cylinder.focal_px))
-
-
-def _repeats(disparities: Array) -> Flags:
-    """Return the landmarks (N,) of several disparities (N, K)."""
-    return np.asarray(np.isfinite(disparities[:, 1:]).any(axis=1))
 
 
 def most_likely_motion(before: Array, now: Array, focal_px: float) -> tuple[float, float] | None:
@@ -252,27 +215,3 @@ def epipolar_errors(turned: Array, now: Array, direction: Array | float) -> Arra
     return np.asarray(
         (z * (s * now[:, 0] - c * now[:, 1]) + across * now[:, 2]) / np.maximum(np.hypot(z, across), 1e-12)
     )
-
-
-def voted(distances: Array, sigmas: Array, reach_m: tuple[float, float]) -> Votes | None:
-    """Return the distance within reach that has most votes; None: too few agree.
-
-    distances (N, K): logarithms, NaN: no vote; sigmas (N, K) of them; reach_m: least and largest distance.
-    """
-    voting = np.isfinite(distances).any(axis=1)
-    distances, sigmas = distances[voting], sigmas[voting]
-    if len(distances) < LEAST_VOTES:
-        return None
-    least, most = max(math.exp(np.nanmin(distances)), reach_m[0]), min(math.exp(np.nanmax(distances)), reach_m[1])
-    if least >= most:
-        return None
-    grid = np.arange(math.log(least), math.log(most), LOG_STEP)
-    each = np.exp(-0.5 * ((grid[:, None, None] - distances) / sigmas) ** 2)
-    votes = np.nan_to_num(each).max(axis=2).sum(axis=1)
-    best = int(votes.argmax())
-    if votes[best] < max(LEAST_VOTES, DECIDING_SHARE * len(distances)):
-        return None
-    others = np.where(np.abs(grid - grid[best]) > math.log(OTHER_RATIO), votes, 0.0)
-    other = int(others.argmax())
-    is_near = others[other] > votes[best] - LEAD_VOTES
-    return Votes(math.exp(grid[best]), math.exp(grid[other]) if is_near else None)

@@ -78,8 +78,8 @@ class Keyframes:
         is_first = not len(self._map)
         ids = self._map.add_located(keyframe, new)
         if is_first and frame.times.is_at_once:
-            pair = frame.lower, frame.upper
-            self._map.first_depths = FirstDepths.of(pair, keyframe, ids, new.views, self._model)
+            first = FirstDepths((frame.lower, frame.upper), keyframe, ids, new.views, self._model)
+            self._map.first_depths = first if first.is_open else None
         if len(self._map) >= self._limits.min_inliers:
             self._relocaliser.add(replace(frame, exposure=request.exposure), keyframe)
         self._most_inliers, self._tracked_s = 0, 0.0

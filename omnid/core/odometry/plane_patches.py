@@ -178,22 +178,32 @@ def fitted_slopes(
     of a pixel.
     """
     known, slopes = np.flatnonzero(np.isfinite(near).all(axis=1)), start.copy()
-    points, found, fits = pixels[known], start[known], np.ones(len(known), bool)
-    one, still = np.zeros(len(known), np.intp), np.tile(np.eye(4), (len(known), 1, 1))
-    predicted = near[known]
+    found, fits, predicted = start[known], np.ones(len(known), bool), near[known]
     for _ in range(SLOPE_ROUNDS):
-        in_space = triangulate(np.column_stack([points, predicted[:, 1]]), model.cylinder, model.baseline_m)
-        surfaces, pixels_at = (in_space, found), np.rint(predicted)
-        templates = plane_templates(
-            {0: pair[0]}, one, points, surfaces, still, model, predicted, upper=True, window_px=SLOPE_WINDOW_PX
-        )
+        templates = _in_upper(pair, pixels[known], predicted, found, model, SLOPE_WINDOW_PX)
         change = start[known] - found
-        fitted = _fit(templates, pair[1], pixels_at, REACH_PX, change, SLOPE_SIGMA)
+        fitted = _fit(templates, pair[1], np.rint(predicted), REACH_PX, change, SLOPE_SIGMA)
         fits &= fitted.found
         found, predicted = found + change, predicted + fitted.pixels
     fits &= (np.abs(found) < MAX_SLOPE).all(axis=1)
     slopes[known[fits]] = found[fits]
     return slopes
+
+
+def _in_upper(
+    pair: tuple[PaddedPanorama, PaddedPanorama],
+    pixels: Array,
+    predicted: Array,
+    slopes: Array,
+    model: StereoModel,
+    window_px: int = WINDOW_PX,
+) -> Floats:
+    """Return templates of the lower panorama's patches at pixels (N, 2) as the upper one shows them at predicted."""
+    points = triangulate(np.column_stack([pixels, predicted[:, 1]]), model.cylinder, model.baseline_m)
+    one, still = np.zeros(len(pixels), np.intp), np.tile(np.eye(4), (len(pixels), 1, 1))
+    return plane_templates(
+        {0: pair[0]}, one, pixels, (points, slopes), still, model, predicted, upper=True, window_px=window_px
+    )
 
 
 def align(templates: Floats, current: PaddedPanorama, predicted: Array, reach_px: int = REACH_PX) -> AlignedPatches:
@@ -241,12 +251,7 @@ def align_rows(
     """
     known = np.flatnonzero(near[:, 1] > points[:, 1])
     pixels, predicted = points[known], near[known]
-    in_space = triangulate(np.column_stack([pixels, predicted[:, 1]]), model.cylinder, model.baseline_m)
-    one, still = np.zeros(len(known), np.intp), np.tile(np.eye(4), (len(known), 1, 1))
-    templates = plane_templates(
-        {0: pair[0]}, one, pixels, (in_space, slopes[known]), still, model, predicted, upper=True
-    )
-    found = align(templates, pair[1], predicted, reach_px)
+    found = align(_in_upper(pair, pixels, predicted, slopes[known], model), pair[1], predicted, reach_px)
     largest_px = CROSS_PX + np.broadcast_to(spread_px, len(points))[known]
     fits = found.found & (np.abs(found.pixels[:, 0] - predicted[:, 0]) < largest_px)
     fits &= found.pixels[:, 1] > pixels[:, 1]

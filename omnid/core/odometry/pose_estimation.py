@@ -111,15 +111,14 @@ def gauss_newton(
     noise: Array | None = None,
     steps: int = GAUSS_NEWTON_STEPS,
     shared: SharedError | None = None,
-    converged: float = CONVERGED,
 ) -> GaussNewtonResult:
     """Return the motion T_curr_ref (4, 4) that best explains the views (N, 3), from a start T.
 
     Minimises the sum of rho(e^T S^-1 e) over the bearings of both cameras, rho the Cauchy kernel, S the covariance of
     a view by its corner (sigma_px, and noise (N, 3, 3) [px^2] in addition to it; None: none) and by its landmark
     (covariance (N, 3, 3)). A shared error is estimated along with the motion. A view without the upper row (NaN)
-    counts by the lower camera alone. A step shorter than `converged` [m and rad] is the last one. It replaces eq. (9)
-    of Dang et al. 2012, which measures in 3-D and is biased short.
+    counts by the lower camera alone. It replaces eq. (9) of Dang et al. 2012, which measures in 3-D and is biased
+    short.
     """
     shared = SharedError.none(len(views)) if shared is None else shared
     size = 6 + len(shared.covariance)
@@ -141,7 +140,7 @@ def gauss_newton(
         model.camera,
         KERNEL_WIDTH,
         steps,
-        converged,
+        CONVERGED,
         T,
         error,
         squared,

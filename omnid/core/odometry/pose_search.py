@@ -6,7 +6,6 @@ Equations and sections are those of Dang et al. 2012.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +18,6 @@ from omnid.core.odometry.local_map import LocalMap, Tracks
 from omnid.core.odometry.motion_hypotheses import displacements
 from omnid.core.odometry.plane_patches import align_rows, view_noise
 from omnid.core.odometry.pose_estimation import (
-    CONVERGED,
     KERNEL_WIDTH,
     GaussNewtonResult,
     SharedError,
@@ -27,7 +25,7 @@ from omnid.core.odometry.pose_estimation import (
     ransac,
 )
 from omnid.core.odometry.stereo_frame import StereoFrame
-from omnid.core.odometry.tracking import KltSettings, correlation_peaks, steps
+from omnid.core.odometry.tracking import KltSettings, correlation_peaks
 from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
@@ -43,15 +41,10 @@ OUTLIER_SQUARED = 16.0
 # `struts` 5 at 384 px: in 99 % of the frames the last round ends within 0.02 sigmas of where 50 steps lead, and the
 # coarse one within 0.24.
 COARSE_STEPS, STEPS = (3,), (2, 4)
-# Refinements of a recognised pose, because the first one brings most patches into reach, the second one aligns them
-# all.
+# Refinements of a recognised pose: the first one brings most patches into reach, the second one aligns them all.
 RECOGNISED_ROUNDS = 2
 # Landmarks tracked for each yaw hypothesis, because the share that is kept is then known to 4 %: sqrt(0.5^2 / 150).
 YAW_SAMPLE = 150
-LIKELY_RATIO = 0.15  # share of them that a wrong hypothesis hardly reaches
-ENOUGH_RATIO = 0.5  # share of them, tracked, that ends the search; as in section IV.F
-# M and rad; a smaller step of the coarse pose is the last one, because it moves no track by 0.05 px.
-COARSE_CONVERGED = 1e-4
 # Standard deviation of a track whose patch was not yet warped to the new viewpoint.
 COARSE_SIGMA_PX = 0.3
 # Landmarks that count as one in the covariance: neighbours have texture, depth and keyframe in common, so that their
@@ -62,11 +55,9 @@ CORRELATED_LANDMARKS = 4.0
 VIEW_DIMENSIONS = 3
 # Cost of a landmark that is no inlier: that of the last one.
 OUTLIER_COST = KERNEL_WIDTH**2 / 2 * math.log1p(OUTLIER_SQUARED / KERNEL_WIDTH**2) / CORRELATED_LANDMARKS
-# Share of the predicted landmarks, inliers, below which they are also searched with a pyramid, because without one, in
-# noise, tracks stay near a wrong prediction and confirm it.
-NEAR_RATIO = 0.5
-# Share of the predicted landmarks, tracked, below which other yaw angles are tried.
-GOOD_TRACKED_RATIO = 0.5
+# Share of the predicted landmarks, tracked, below which another guess is tried; the same of inliers near a guess, as
+# without a pyramid tracks stay, in noise, near a wrong prediction and confirm it.
+GOOD_RATIO = 0.5
 # From where a landmark's depth puts it in the upper panorama: a depth that is farther off is an outlier.
 UPPER_REACH_PX = 3
 # Landmarks tracked from the last panorama at most, as a share of those wanted, others in the next frame: enough for the
@@ -99,26 +90,30 @@ class PoseSearch:
     ) -> PoseEstimate | None:
         """Return the best estimate from guesses of the pose, or the first good one; None: no landmarks were found.
 
-        The guesses: the prediction, which nearly always is near; the prediction, searched with a pyramid; the best yaw
-        hypothesis there (IV.F), by the peaks of the circular correlation with the last panorama, then the paper's
-        steps.
+        The guesses: the prediction, which nearly always is near; the prediction, searched with a pyramid; there, the
+        peak of the circular correlation with the last panorama, over yaw, that keeps most landmarks (IV.F).
         """
         best: PoseEstimate | None = None
         for number in range(3):
-            T_guess, is_near = T_predicted, number == 0
-            if number == 2:
-                assert self._map.last is not None
-                before, now = self._map.last.panorama, frame.lower.panorama
-                peaks = correlation_peaks(before, now, usable, turn_px=frame.lower.period_px)
-                T_unturned = T_last.copy()
-                T_unturned[:3, 3] = T_predicted[:3, 3]
-                T_guess = self.best_yaw(frame, T_unturned, peaks + steps(), likely=len(peaks))
+            is_near = number == 0
+            T_guess = T_predicted if number < 2 else self._turned(frame, usable, T_last, T_predicted)
             estimate = self.estimate(frame, T_guess, exposure, is_near=is_near)
             if estimate is not None and (best is None or estimate.inliers > best.inliers):
                 best = estimate
             if is_good_enough(best, self._limits, is_near=is_near):
                 break
         return best
+
+    def _turned(self, frame: StereoFrame, usable: Flags, T_last: Array, T_predicted: Array) -> Array:
+        """Return the predicted position, turned from the last pose by the yaw that keeps most landmarks (IV.F)."""
+        assert self._map.last is not None
+        before, now = self._map.last.panorama, frame.lower.panorama
+        guesses = [
+            se3.transform(T_last[:3, :3] @ se3.rotation_exp([0, 0, yaw_rad]), T_predicted[:3, 3])
+            for yaw_rad in correlation_peaks(before, now, usable, turn_px=frame.lower.period_px)
+        ]
+        tracks = [self._map.track(frame.lower, T_guess, most=YAW_SAMPLE) for T_guess in guesses]
+        return guesses[int(np.argmax([len(each.landmarks) / max(1, each.visible) for each in tracks]))]
 
     def others(
         self, frame: StereoFrame, found: PoseEstimate, T_predicted: Array, exposure: Exposure, reach_m: float
@@ -178,20 +173,12 @@ class PoseSearch:
         views = np.column_stack([tracks.pixels, rows]) + np.column_stack([shift.lower, shift.upper[:, 1]])
         # 2. RANSAC and Gauss-Newton.
         T_curr_guess, is_inlier = ransac(in_guess, views, self._model, np.random.default_rng(frame.seq))
-        landmarks = tracks.landmarks[is_inlier]
-        noise = shift.noise(exposure.motion)[is_inlier]
-        solution, kept = self._solve(
-            landmarks,
-            views[is_inlier],
-            T_curr_guess @ T_guess_odom,
-            self._coarse_model,
-            noise,
-            SharedError.none(len(landmarks)),
-            converged=COARSE_CONVERGED,
-        )
+        chosen, noise = np.flatnonzero(is_inlier), shift.noise(exposure.motion)
+        landmarks, views, noise = tracks.landmarks[chosen], views[chosen], noise[chosen]
+        solution, kept = self._solve(landmarks, views, T_curr_guess @ T_guess_odom, self._coarse_model, noise)
         if solution is None:
             return None
-        chosen = np.flatnonzero(is_inlier)[kept]
+        chosen = chosen[kept]
         return CoarsePose(solution.T, landmarks[kept], disparity[chosen], variance[chosen], tracks)
 
     def refine(self, frame: StereoFrame, coarse: CoarsePose, exposure: Exposure) -> PoseEstimate | None:
@@ -267,37 +254,16 @@ class PoseSearch:
         Places are recognised by corners, whose pose errs by centimetres. Corners and patches are two independent
         supports of the pose: the number of inliers is the smaller one of both.
         """
-        none = np.zeros(0, np.intp)
-        untracked = Tracks(none, np.zeros((0, 2)), np.zeros((0, 3)), 0)
-        refined = recognised
+        none, refined = np.zeros(0, np.intp), recognised
+        tracks = Tracks(none, np.zeros((0, 2)), np.zeros((0, 3)), 0)
         for _ in range(RECOGNISED_ROUNDS):
-            start = CoarsePose(se3.inverse(refined.T_odom_rect), none, np.zeros(0), np.zeros(0), untracked)
+            start = CoarsePose(se3.inverse(refined.T_odom_rect), none, np.zeros(0), np.zeros(0), tracks)
             again = self.refine(frame, start, exposure)
             if again is None:
                 return None
             refined = again
         inliers = min(recognised.inliers, len(refined.landmarks))
         return replace(refined, visible=recognised.visible, tracked=recognised.tracked, inliers=inliers)
-
-    def best_yaw(self, frame: StereoFrame, T_odom_rect: Array, yaws_rad: Iterable[float], likely: int = 0) -> Array:
-        """Return the pose, turned by that hypothesis of the yaw which keeps most landmarks through the KLT check.
-
-        The search ends at the first hypothesis that keeps more than ENOUGH_RATIO (section IV.F), and after the first
-        `likely` hypotheses if one of them keeps more than LIKELY_RATIO: then the view has changed by more than a turn,
-        and no other yaw would keep many.
-        """
-        best, highest = T_odom_rect, -1.0
-        for count, yaw_rad in enumerate(yaws_rad):
-            if count == likely and highest > LIKELY_RATIO:
-                break
-            turned = T_odom_rect @ se3.exp([0, 0, 0, 0, 0, yaw_rad])
-            tracks = self._map.track(frame.lower, turned, most=YAW_SAMPLE)
-            ratio = len(tracks.landmarks) / max(1, tracks.visible)
-            if ratio > highest:
-                best, highest = turned, ratio
-            if highest > ENOUGH_RATIO:
-                break
-        return best
 
     def _solve(
         self,
@@ -306,29 +272,17 @@ class PoseSearch:
         T_curr_odom: Array,
         model: StereoModel,
         noise: Array,
-        shared: SharedError,
-        converged: float = CONVERGED,
+        shared: SharedError | None = None,
     ) -> tuple[GaussNewtonResult | None, Flags]:
         """Return the solution of Gauss-Newton in rounds, and flags (M,) of the inliers; None where they are too few."""
-        kept = np.ones(len(landmarks), bool)
-        solution = None
-        for most_steps in COARSE_STEPS if model is self._coarse_model else STEPS:
+        kept, solution, table = np.ones(len(landmarks), bool), None, self._map.table
+        for steps in STEPS if shared is not None else COARSE_STEPS:
             if kept.sum() < MIN_LANDMARKS:
                 return None, kept
-            rows, table = landmarks[kept], self._map.table
-            solution = gauss_newton(
-                table.points[rows],
-                table.covariance[rows],
-                views[kept],
-                T_curr_odom,
-                model,
-                noise[kept],
-                most_steps,
-                shared.of(kept),
-                converged,
-            )
-            T_curr_odom = solution.T
-            squared = np.full(len(landmarks), np.inf)
+            points, covariance = table.points[landmarks[kept]], table.covariance[landmarks[kept]]
+            alike = None if shared is None else shared.of(kept)
+            solution = gauss_newton(points, covariance, views[kept], T_curr_odom, model, noise[kept], steps, alike)
+            T_curr_odom, squared = solution.T, np.full(len(landmarks), np.inf)
             squared[kept] = solution.squared
             kept = squared < OUTLIER_SQUARED
         return (solution if kept.sum() >= MIN_LANDMARKS else None), kept
@@ -338,8 +292,8 @@ def is_good_enough(estimate: PoseEstimate | None, limits: OdometryLimits, *, is_
     """True if no other guess is needed; is_near: it was found near a guess, without a pyramid."""
     return (
         estimate is not None
-        and estimate.inliers >= NEAR_RATIO * is_near * estimate.visible
-        and estimate.tracked >= GOOD_TRACKED_RATIO * estimate.visible
+        and estimate.inliers >= GOOD_RATIO * is_near * estimate.visible
+        and estimate.tracked >= GOOD_RATIO * estimate.visible
         and estimate.inlier_ratio >= limits.good_inlier_ratio
         and estimate.inliers >= limits.good_inliers
     )
