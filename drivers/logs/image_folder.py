@@ -17,7 +17,7 @@ import math
 import os
 import re
 import stat
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from decimal import Decimal, InvalidOperation
 from itertools import pairwise
 from pathlib import Path
@@ -118,23 +118,25 @@ def _stamped(folder: Path, rate_hz: float, notes: list[str]) -> list[tuple[int, 
     paths = sorted((path for path in folder.iterdir() if _is_image(path.name)), key=_numbers_of)
     if rate_hz:
         return [(round(index * 1e9 / rate_hz), path) for index, path in enumerate(paths)]
-    # 1. A list.
+    # 1. A list, in which a name or a number may tell the image.
+    numbered = [{str(number): path for number, path in enumerate(paths, first)} for first in (0, 1)]
     for listing in (place / name for place in (folder, folder.parent) for name in STAMP_FILES):
         rows = _rows(listing)
         named = _named(rows, {path.name: path for path in paths}, folder)
-        named = named or _named(rows, {path.stem: path for path in paths}, folder, is_whole=True)
+        for images in ({path.stem: path for path in paths}, *numbered):
+            named = named or _named(rows, images, folder, is_whole=True)
         if named:
-            unlisted = len(paths) - len({path for _, path in named})
+            unlisted = len(paths) - len(named)
             if unlisted:
                 notes.append(f"{unlisted} images of {str(folder)!r} are left out: {listing.name} does not list them")
-            return [(_listed_ns(text, path), path) for text, path in named]
-        if rows and listing.suffix == ".txt" and listing.name != "rgb.txt":
+            return [(_listed_ns(text, path), path) for path, text in named.items()]
+        if rows and listing.name in STAMP_FILES[:2]:
             if len(rows) != len(paths):
                 raise DriverError(
                     f"{str(folder)!r} contains {len(paths)} images, and its list of stamps {len(rows)} lines; "
                     "they must be as many"
                 )
-            return [(_listed_ns(text, path), path) for text, path in zip(_column(rows), paths, strict=True)]
+            return [(_listed_ns(" ".join(row), path), path) for row, path in zip(rows, paths, strict=True)]
     # 2. The names.
     found = []
     for path in paths:
@@ -166,13 +168,13 @@ def _rows(listing: Path) -> list[list[str]]:
 
 
 def _named(
-    rows: Sequence[Sequence[str]], images: dict[str, Path], folder: Path, *, is_whole: bool = False
-) -> list[tuple[str, Path]]:
-    """Return stamp and image of the rows that name one, by the column with the most names of images in a folder.
+    rows: Sequence[Sequence[str]], images: Mapping[str, Path], folder: Path, *, is_whole: bool = False
+) -> dict[Path, str]:
+    """Return image -> stamp of the rows that name one, by the column that names the most images of a folder.
 
     is_whole: none unless all rows name an image.
     """
-    best = list[tuple[str, Path]]()
+    best = dict[Path, str]()
     for column in range(max(map(len, rows), default=0)):
         found = {}
         for row in rows:
@@ -181,18 +183,8 @@ def _named(
             if len(row) > 1 and named.name in images and named.parent.name in ("", folder.name):
                 found[images[named.name]] = " ".join([*row[:column], *row[column + 1 :]])
         if len(found) > len(best) and (len(found) == len(rows) or not is_whole):
-            best = [(text, path) for path, text in found.items()]
+            best = found
     return best
-
-
-def _column(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return the stamps in the rows of a list without names: beside them may be a number that counts the images."""
-    for column in range(max(map(len, rows))):
-        numbers = [row[column] if column < len(row) else "" for row in rows]
-        counts = len(rows[0]) > 1 and all(map(str.isdecimal, numbers))
-        if counts and all(int(after) - int(before) == 1 for before, after in pairwise(numbers)):
-            return [" ".join([*row[:column], *row[column + 1 :]]) for row in rows]
-    return [" ".join(row) for row in rows]
 
 
 def _listed_ns(text: str, path: Path) -> int:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Final, Literal, TypeAlias
+from typing import Annotated, Any, Final, Literal, TypeAlias
 
 import msgspec
 import numpy as np
@@ -25,16 +26,8 @@ SUFFIX: Final = ".route.json"
 # Limits of what is read, so that any file is refused in bounded time and memory. The longest route that can be taught
 # has MOST_POINTS points and one keyframe at most for each of them, which is less than 4 MB.
 MAX_BYTES: Final = 8 << 20
-COLUMNS: Final = (
-    "x_m",
-    "y_m",
-    "yaw_rad",
-    "speed_mps",
-    "keyframe",
-    "in_keyframe_x_m",
-    "in_keyframe_y_m",
-    "in_keyframe_yaw_rad",
-)
+_PARTS: Final = ("x_m", "y_m", "yaw_rad")
+COLUMNS: Final = [*_PARTS, "speed_mps", "keyframe", *(f"in_keyframe_{part}" for part in _PARTS)]
 _NO_ROUTE: Final = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)  # raised for bytes that are none
 
 _Position: TypeAlias = Annotated[float, Meta(ge=-FARTHEST_M, le=FARTHEST_M)]
@@ -63,24 +56,24 @@ class _Content(_Head, forbid_unknown_fields=True):
     keyframes: Annotated[list[tuple[_Number, _Number]], Meta(max_length=MOST_POINTS)]  # id, stamp [ns]
     crc32: int
 
+    def checksum(self) -> int:
+        """Return the checksum of name, points and keyframes."""
+        return zlib.crc32(_text([self.name, self.points, self.keyframes]))
+
+
+def _text(content: Any) -> bytes:
+    return json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
+
 
 def route_bytes(route: Route) -> bytes:
     """Return the content of a route's file."""
-    rows = np.column_stack([route.poses, route.speeds, route.keyframes, route.in_keyframe]).round(DECIMALS).tolist()
-    points = [[int(v) if k == 4 else v for k, v in enumerate(row)] for row in rows]
-    keyframes = [[int(id), int(stamp)] for id, stamp in sorted(route.stamps_ns.items())]
-    content = {
-        "format": FORMAT,
-        "version": VERSION,
-        "name": route.name,
-        "created_s": route.created_s,
-        "map": route.map_name,
-        "columns": list(COLUMNS),
-        "points": points,
-        "keyframes": keyframes,
-        "crc32": _checksum(route.name, points, keyframes),
-    }
-    return (json.dumps(content, separators=(",", ":"), allow_nan=False) + "\n").encode()
+    numbers = np.column_stack([route.poses, route.speeds, route.keyframes, route.in_keyframe]).round(DECIMALS)
+    points = [(*row[:4], int(row[4]), *row[5:]) for row in numbers.tolist()]
+    keyframes = [(int(id), int(stamp)) for id, stamp in sorted(route.stamps_ns.items())]
+    about = route.name, route.created_s, route.map_name
+    content = _Content("omnid route", VERSION, *about, COLUMNS, points, keyframes, crc32=0)
+    content.crc32 = content.checksum()
+    return _text(msgspec.structs.asdict(content)) + b"\n"
 
 
 def parse_route(content: bytes, name: str) -> Route:
@@ -95,28 +88,15 @@ def parse_route(content: bytes, name: str) -> Route:
         raise OmnidError(f"{name}: this is a route of version {version}, expected {VERSION}: teach it again, or update")
     try:
         found = msgspec.json.decode(content, type=_Content)
-        if tuple(found.columns) != COLUMNS:
+        if found.columns != COLUMNS:
             raise OmnidError(f"expected the columns {', '.join(COLUMNS)}")
-        if found.crc32 != _checksum(found.name, found.points, found.keyframes):
+        if found.crc32 != found.checksum():
             raise OmnidError("the checksum is wrong")
-        numbers = np.array(found.points, np.float64)
-        keyframes = np.array([point[4] for point in found.points], np.int64)
-        return Route(
-            route_name(found.name),
-            numbers[:, :3],
-            numbers[:, 3],
-            keyframes,
-            numbers[:, 5:],
-            dict(found.keyframes),
-            found.created_s,
-            found.map,
-        )
+        numbers, keyframes = np.array(found.points, np.float64), np.array([point[4] for point in found.points])
+        points = numbers[:, :3], numbers[:, 3], keyframes, numbers[:, 5:]
+        return Route(route_name(found.name), *points, dict(found.keyframes), found.created_s, found.map)
     except (*_NO_ROUTE, OmnidError) as error:
         raise OmnidError(f"{name}: the route is damaged: {error}: teach it again") from None
-
-
-def _checksum(name: str, points: Sequence[Sequence[float]], keyframes: Sequence[Sequence[int]]) -> int:
-    return zlib.crc32(json.dumps([name, points, keyframes], separators=(",", ":")).encode())
 
 
 class RouteFolder:
@@ -141,15 +121,10 @@ class RouteFolder:
 
     def read(self, name: str) -> Route:
         """Return a route. Raise OmnidError where there is none, or where its file is damaged."""
-        path = self.path(name)
-        try:
-            with path.open("rb") as file:
-                content = file.read(MAX_BYTES + 1)
-        except FileNotFoundError:
-            known = ", ".join(self.names()[:20]) or "none"
-            raise OmnidError(f"no route {name} in {self.folder}: there are: {known}") from None
-        except OSError as error:
-            raise OmnidError(f"{path}: cannot read the route: {error.strerror or error}") from None
+        path, known = self.path(name), ", ".join(self.names()[:20]) or "none"
+        absent = f"no route {name} in {self.folder}: there are: {known}"
+        with self._reported(path, "read the route", absent), path.open("rb") as file:
+            content = file.read(MAX_BYTES + 1)
         route = parse_route(content, str(path))
         if route.name != name:
             raise OmnidError(f"{path}: this is the route {route.name}: name the file {route.name}{SUFFIX}")
@@ -157,20 +132,21 @@ class RouteFolder:
 
     def write(self, route: Route) -> None:
         """Write a route; one of the same name is replaced. Raise OmnidError where it cannot be written."""
-        try:
+        with self._reported(self.folder, "make the folder of the routes; change navigation.routes"):
             self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OmnidError(
-                f"{self.folder}: cannot make the folder of the routes: {error.strerror or error}: change "
-                "navigation.routes"
-            ) from None
         write_whole(self.path(route.name), route_bytes(route))
 
     def delete(self, name: str) -> None:
         """Delete a route. Raise OmnidError where there is none."""
+        path = self.path(name)
+        with self._reported(path, "delete the route", f"no route {name} in {self.folder}: nothing was deleted"):
+            path.unlink()
+
+    @contextmanager
+    def _reported(self, path: Path, action: str, absent: str = "") -> Iterator[None]:
+        """Turn what the disk says into OmnidError; absent: the error where there is no such file."""
         try:
-            self.path(name).unlink()
-        except FileNotFoundError:
-            raise OmnidError(f"no route {name} in {self.folder}: nothing was deleted") from None
+            yield
         except OSError as error:
-            raise OmnidError(f"{self.path(name)}: cannot delete the route: {error.strerror or error}") from None
+            is_absent = isinstance(error, FileNotFoundError) and absent
+            raise OmnidError(absent if is_absent else f"{path}: cannot {action}: {error.strerror or error}") from None
