@@ -15,11 +15,10 @@ from drivers.motors.serial_motor import LateReplyError
 from omnid.controller.statistics import ControllerState, TickReport, cuts_drive_short, transitions
 from omnid.core.control.contacts import BUS, MOTOR, ContactState
 from omnid.core.control.control_law import ControlInput, ControlLaw, ControllerSettings
-from omnid.core.control.heading_controller import Twist
+from omnid.core.control.heading_controller import STOP, Twist
 from omnid.core.control.motion_monitor import Motion
 from omnid.core.control.safety_rules import AWAITED
 from omnid.core.control.trust import MotorReport
-from omnid.core.control.velocity_limits import STOP
 from omnid.core.nanoseconds import S_PER_NS
 
 FIRST_TOLD_S, LONGEST_TOLD_S = 2.0, 300.0  # between two lines about a motor controller that does not answer
@@ -109,7 +108,9 @@ class Controller:
         # 3. Send its motion, and report to the law whether it was sent.
         command = VelocityCommand(now_ns, output.motion.velocity_mps, output.heading_rad, output.motion.yaw_rate_radps)
         status = self._send(command)
-        self._law.plausibility.add_command(now_ns, STOP if self.state.failed else Twist(*self._limited(command)))
+        self._law.plausibility.monitor.add_command(
+            now_ns, STOP if self.state.failed else Twist(*self._limited(command))
+        )
         if status is not None:
             self._take_status(status, now_ns)
         # 4. Report times, and the motion that the wheels have measured.

@@ -18,7 +18,7 @@ from typing import Final
 
 from calib.typed_toml import parse_toml
 from omnid.client import CONNECT_S, Diagnostics, Driver, Robot
-from omnid.core.control.velocity_limits import VelocityLimits
+from omnid.core.control.heading_controller import VelocityLimits
 from omnid.engine.logging_setup import HANDLER
 from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig

@@ -22,7 +22,7 @@ from omnid.core.control.control_law import (
     ControllerSettings,
     ControlOutput,
 )
-from omnid.core.control.velocity_limits import STOP
+from omnid.core.control.heading_controller import STOP
 from omnid.core.frames import of_base
 from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
 from omnid.messages import OdometryUpdate

@@ -13,11 +13,8 @@ from calib import se3
 from calib.se2_arrays import planar
 from omnid.core.control.collision_monitor import CollisionSettings
 from omnid.core.frames import base_pose, in_outer_axes, of_base
-from omnid.core.mapping.range_scan import azimuths
-from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
-from omnid.core.navigation.floor_map import FloorMap
+from omnid.core.nanoseconds import NS_PER_S
 from omnid.core.navigation.follower import STAND
-from omnid.core.navigation.forecast import forecast
 from omnid.core.navigation.navigator import RESUME, Navigation, Navigator
 from omnid.core.navigation.path import DrivePath, drive_path, goal_path
 from omnid.core.navigation.requests import (
@@ -35,6 +32,7 @@ from omnid.core.navigation.requests import (
 )
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import MapPosition, Situation, WheelState, refusal_to_drive
+from omnid.core.navigation.surroundings import Surroundings
 from omnid.errors import OmnidError
 from omnid.messages import NavigationPlan, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate, RequestAnswer
 from omnid.stages.routes import Routes, refusal_while_teaching
@@ -44,10 +42,8 @@ Array = NDArray[np.float64]
 NavigationInput: TypeAlias = OdometryUpdate | PlaceUpdate | ObstacleRing | WheelState | NavigationCommand
 
 REPEAT_NS = NS_PER_S  # the state is given again after that time, while nothing changes
-MAP_NS = 400_000_000  # between two rings that are added to the map of the floor
 RING_NS = 2_000_000_000  # older rings show nothing of now: the collision monitor then stops the base
 OVERTAKEN = "a later request has ended it: ask again"
-BEHIND_SHARE = -0.17  # cosine of the direction beyond which an obstacle is behind; 100 degrees
 FIRST_LEG_M = 1.0  # A path that begins farther from the robot is refused.
 
 
@@ -66,14 +62,12 @@ class NavigationStage:
         self._T_rig_base = se3.inverse(T_base_rig)
         self._wheels = WheelState(False, False)
         self._navigator = Navigator(settings, collision)
-        self._collision = collision
         self._now: Situation | None = None
         self._in_map: MapPosition | None = None
         self._tie: tuple[int, Array] | None = None  # id of the newest keyframe, and its pose (3,) in the map
         self._reset_ns = -1  # stamp of the pose at which odometry began again
         self._ring: ObstacleRing | None = None
-        self._ring_points: Array = np.zeros((0, 2))  # positions in odom of what the ring shows
-        self._floor, self._mapped_ns = FloorMap(self._collision), -MAP_NS
+        self._around: Surroundings | None = None  # by the newest ring that was used
         self._seq = 0
         # Ids of the newest request to halt, and of that which began the newest drive: a request that waited for a file
         # may come after later ones.
@@ -93,7 +87,7 @@ class NavigationStage:
                 self._place(message)
                 return None
             case ObstacleRing():
-                self._take_ring(message)
+                self._ring = message
                 return None
             case WheelState():
                 self._wheels = message
@@ -102,33 +96,23 @@ class NavigationStage:
                 return self._request(message)
 
     def _at_pose(self, odometry: OdometryUpdate) -> NavigationUpdate | None:
-        # 1. After a reset forget the pose in the map: it leads from another odom.
+        # 1. After a reset forget the pose in the map and what is about the base: they are of another odom.
         self._seq = odometry.seq
         if self._now is not None and self._now.resets != odometry.reset_counter:
             self._in_map, self._reset_ns = None, odometry.stamp_ns
-            self._floor, self._mapped_ns = FloorMap(self._collision), -MAP_NS
+            self._ring = self._around = None
         # 2. Put together where the base is and what is about it.
         T_odom_base, _, velocity, _ = of_base(odometry, self._T_base_rig)
-        pose, speed_mps = planar(T_odom_base), float(velocity[0])
-        ring = self._young_ring(odometry.stamp_ns)
-        obstacles = None if ring is None else self._ring_points
-        moving = None if ring is None else forecast(ring.moving, (odometry.stamp_ns - ring.stamp_ns) * S_PER_NS)
-        nearest_m = (
-            math.inf if obstacles is None else room_ahead(pose, speed_mps, obstacles) - self._collision.half_width_m
-        )
         self._now = now = Situation(
             odometry.stamp_ns,
-            pose,
-            speed_mps,
+            planar(T_odom_base),
+            float(velocity[0]),
             float(velocity[5]),
             odometry.state,
             odometry.reset_counter,
             self._wheels,
             self._in_map,
-            obstacles,
-            moving,
-            self._floor,
-            nearest_m,
+            self._surroundings(odometry.stamp_ns),
         )
         # 3. Add the pose to a route that is being taught.
         ended = self._routes.record(now, self._tie)
@@ -137,16 +121,15 @@ class NavigationStage:
         # 4. Steer.
         return self._update(self._navigator.step(now))
 
-    def _take_ring(self, ring: ObstacleRing) -> None:
-        self._ring, self._ring_points = ring, _positions(ring, ring.ranges_m)
-        if ring.stamp_ns - self._mapped_ns >= MAP_NS:
-            self._floor.add(planar(ring.T_odom_base), ring.ranges_m, ring.free_m)
-            self._mapped_ns = ring.stamp_ns
-
-    def _young_ring(self, stamp_ns: int) -> ObstacleRing | None:
-        """Return the newest ring; None if it is not young enough at that time."""
-        ring = self._ring
-        return ring if ring is not None and 0 <= stamp_ns - ring.stamp_ns <= RING_NS else None
+    def _surroundings(self, now_ns: int) -> Surroundings | None:
+        """Return what the newest ring shows; None if it is too old, or nothing is under way."""
+        ring, before = self._ring, self._around
+        is_young = ring is not None and 0 <= now_ns - ring.stamp_ns <= RING_NS
+        if self._navigator.drive is None or ring is None or ring.grid is None or not is_young:
+            return None
+        if before is None or before.stamp_ns != ring.stamp_ns:
+            self._around = Surroundings(ring.grid, ring.moving, ring.stamp_ns, planar(ring.T_odom_base), before)
+        return self._around
 
     def _place(self, update: PlaceUpdate) -> None:
         if update.stamp_ns < self._reset_ns:
@@ -293,23 +276,6 @@ class NavigationStage:
             answers,
             plan,
         )
-
-
-def room_ahead(pose: Array, speed_mps: float, obstacles: Array) -> float:
-    """Return the distance from a pose (3,) to the nearest obstacle (N, 2) that is not behind the moving base."""
-    sign = -1.0 if speed_mps < 0 else 1.0
-    dx, dy = obstacles[:, 0] - pose[0], obstacles[:, 1] - pose[1]
-    distance = np.hypot(dx, dy)
-    forward = sign * (math.cos(pose[2]) * dx + math.sin(pose[2]) * dy)
-    return float(distance[forward > BEHIND_SHARE * distance].min(initial=math.inf))
-
-
-def _positions(ring: ObstacleRing, ranges_m: NDArray[np.float32]) -> Array:
-    """Return the positions (N, 2) in odom of the obstacles at finite ranges (SECTORS,) [m] of a ring."""
-    seen = np.isfinite(ranges_m)
-    ranges_m, directions = ranges_m[seen].astype(np.float64), azimuths()[seen]
-    points = np.column_stack([ranges_m * np.cos(directions), ranges_m * np.sin(directions), np.zeros(len(ranges_m))])
-    return np.asarray(se3.apply(ring.T_odom_base, points)[:, :2])
 
 
 def _word(request: NavigationRequest) -> str:

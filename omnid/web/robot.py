@@ -23,7 +23,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import BaseRoute, Route
 
 from omnid.client import Answer, Driver, Robot
-from omnid.core.control.velocity_limits import VelocityLimits
+from omnid.core.control.heading_controller import VelocityLimits
 from omnid.core.navigation.requests import NavigationRequest, may_begin_motion, navigation_verb, route_request
 from omnid.errors import OmnidError
 from omnid.monitor.navigation import stop

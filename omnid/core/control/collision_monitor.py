@@ -13,23 +13,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from types import MappingProxyType
 from typing import Annotated, Final, Literal, NamedTuple
 
 from msgspec import Meta
 
 from calib.se2 import Point, Pose2, along_arc, composed, seen_from
-from omnid.core.control.collision_geometry import (
-    TINY,
-    DrivenMotions,
-    Outline,
-    contact_s,
-    driven_over,
-    long_runs,
-    sector_directions,
-    sector_edges_m,
-    within_reach,
-)
+from omnid.core.control.collision_geometry import TINY, DrivenWay, Outline
 from omnid.core.control.heading_controller import BRAKING_SHARE, Twist
 from omnid.core.nanoseconds import S_PER_NS
 
@@ -122,7 +113,11 @@ def unknown_ends(ranges_m: Sequence[float], free_m: Sequence[float], stop_m: flo
     has_gap = [math.isfinite(r) and r - f > stop_m for r, f in zip(ranges_m, free, strict=True)]
     parts = zip(ranges_m, free, has_gap, strict=True)
     unknown = [gap or math.isnan(r) or (math.isinf(r) and 0.0 < f < FAR_M) for r, f, gap in parts]
-    return [UnknownEnd(k, free[k], has_gap[k]) for k in long_runs(unknown, UNKNOWN_SECTORS)]
+    # Runs go around the full turn.
+    start = unknown.index(False) if False in unknown else 0
+    runs = groupby((*range(start, len(unknown)), *range(start)), unknown.__getitem__)
+    long = (run for is_unknown, of in runs if is_unknown and len(run := list(of)) >= UNKNOWN_SECTORS)
+    return [UnknownEnd(k, free[k], has_gap[k]) for run in long for k in run]
 
 
 LEAST_MPS: Final = 0.02  # slower than this the base stops; by trial on development seeds
@@ -188,13 +183,13 @@ class CollisionMonitor:
         self._settings = settings
         self._deceleration, self._turn_deceleration = BRAKING_SHARE * braking_mps2, BRAKING_SHARE * turn_braking_radps2
         self._outline = Outline(settings.front_m, settings.rear_m, settings.half_width_m)
-        side_m = settings.half_width_m + settings.side_m + BESIDE_M  # room for turns where the images show nothing
-        self._around = Outline(settings.front_m + settings.stop_m, settings.rear_m + settings.stop_m, side_m)
+        # Room for turns where the images show nothing.
+        self._around = self._outline.grown(settings.stop_m, settings.stop_m, settings.side_m + BESIDE_M)
         self._stamp_ns: int | None = None
         self._kinds: tuple[Kind, ...] = ()  # what the newest ring shows
         self._is_blind = False  # its images show nothing at all
         self._moving: tuple[MovingPoint, ...] = ()
-        self._motions = DrivenMotions()
+        self._way = DrivenWay()
         self.reason = ""  # why the last step changed the motion
         self.holds = False  # the motion was stopped, or could only creep
         self.share = 1.0  # share of the motion that was allowed; 0 also where only a turn on the spot was
@@ -208,19 +203,19 @@ class CollisionMonitor:
         settings, count = self._settings, len(ring.ranges_m)
         unwatched = ring.unwatched if len(ring.unwatched) == count else (False,) * count
         self._is_blind = all(unwatched)
-        edges_m, around_m = sector_edges_m(self._outline, count), sector_edges_m(self._around, count)
-        directions = sector_directions(count)
-        seen = [(r * c, r * s) for r, (_, c, s) in zip(ring.ranges_m, directions, strict=True) if math.isfinite(r)]
-        ends: tuple[list[Point], ...] = ([], [], [])
+        azimuths = ((k + 0.5) * (math.tau / count) - math.pi for k in range(count))
+        directions = [(math.cos(azimuth), math.sin(azimuth)) for azimuth in azimuths]
+        seen = [(r * c, r * s) for r, (c, s) in zip(ring.ranges_m, directions, strict=True) if math.isfinite(r)]
+        ends: dict[str, list[Point]] = {"unwatched": [], "gap": [], "end": []}
         for k, free_m, is_gap in unknown_ends(ring.ranges_m, ring.free_m, settings.stop_m):
-            begins_m = around_m[k] if unwatched[k] else max(free_m, edges_m[k])
-            which = ends[0] if unwatched[k] else ends[1] if is_gap else ends[2]
-            which.append((begins_m * directions[k][1], begins_m * directions[k][2]))
+            c, s = directions[k]
+            begins_m = self._around.edge_m(c, s) if unwatched[k] else max(free_m, self._outline.edge_m(c, s))
+            ends["unwatched" if unwatched[k] else "gap" if is_gap else "end"].append((begins_m * c, begins_m * s))
         self._kinds = (
             Kind(BLOCKED, STOP, seen, is_known=True),
-            Kind(UNKNOWN, settings.unknown, ends[2]),
-            Kind(UNKNOWN, settings.unknown, ends[1], is_gap=True),
-            Kind(UNWATCHED, settings.stale, ends[0]),
+            Kind(UNKNOWN, settings.unknown, ends["end"]),
+            Kind(UNKNOWN, settings.unknown, ends["gap"], is_gap=True),
+            Kind(UNWATCHED, settings.stale, ends["unwatched"]),
         )
 
     def step(self, now_ns: int, motion: Twist, *, to_heading: bool = False) -> Twist:
@@ -248,7 +243,7 @@ class CollisionMonitor:
 
     def follow(self, now_ns: int, motion: Twist) -> None:
         """Take the motion that the base follows from now on."""
-        self._motions.add(now_ns, motion)
+        self._way.add(now_ns, motion)
 
     def _judged(self, now_ns: int, motion: Twist) -> Allowance:
         """Return the strictest allowance of all kinds of what is known."""
@@ -257,34 +252,30 @@ class CollisionMonitor:
             return FREE
         # 1. Without a recent ring nothing is known.
         age_s = math.inf if self._stamp_ns is None else (now_ns - self._stamp_ns) * S_PER_NS
-        is_stale = not abs(age_s) <= settings.stale_s or not self._motions.reach_back_to(self._stamp_ns or 0)
+        is_stale = not abs(age_s) <= settings.stale_s or not self._way.reaches_back_to(self._stamp_ns or 0)
         if settings.stale == IGNORE and is_stale:
             return FREE
         if settings.stale != IGNORE and (is_stale or self._is_blind):
             most_mps = 0.0 if settings.stale == STOP else settings.slow_mps
             return self._capped(motion, most_mps, RING_STALE if is_stale else UNSEEN)
         # 2. What the base has driven over since the ring's images is not passed as if it were free.
-        moved = self._motions.since(self._stamp_ns or now_ns, now_ns)
+        moved = self._way.since(self._stamp_ns or now_ns, now_ns)
         for kind in self._kinds:
             over = is_driving and kind.policy == STOP
-            if over and driven_over(self._outline, kind.points, moved, motion.velocity_mps):
+            if over and self._outline.driven_over(kind.points, moved, math.copysign(1.0, motion.velocity_mps)):
                 return Allowance(0.0, kind.reason)
         # 3. The way before each kind, and before what moves.
-        reach_m = self._reach_m(abs(motion.velocity_mps))
-        allowances = [
-            self._before(kind, within_reach(kind.points, moved, reach_m), motion)
-            for kind in self._kinds
-            if kind.policy != IGNORE and kind.points
-        ]
+        way_m, speed_mps = abs(motion.velocity_mps) * settings.time_s, abs(motion.velocity_mps)
+        way_m = max(way_m, speed_mps**2 / (2 * self._deceleration))
+        near_m = max(settings.stop_m + settings.slow_m, settings.side_m, settings.slow_side_m)
+        reach2 = (way_m + near_m + self._outline.radius_m) ** 2
+        allowances = [FREE]
+        for kind in self._kinds:
+            if kind.policy != IGNORE and kind.points:
+                near = [(x, y) for x, y in kind.points if (x - moved.x_m) ** 2 + (y - moved.y_m) ** 2 <= reach2]
+                allowances.append(self._before(kind, seen_from(moved, near), motion))
         allowances += [self._before_moving(one, moved, age_s, motion) for one in self._moving]
-        return min(allowances, default=FREE)
-
-    def _reach_m(self, speed_mps: float) -> float:
-        """Return the distance within which obstacles matter: of the way to a stop, or of time_s if that is longer."""
-        settings = self._settings
-        way_m = max(speed_mps * settings.time_s, speed_mps**2 / (2 * self._deceleration))
-        reach_m = max(settings.stop_m + settings.slow_m, settings.side_m, settings.slow_side_m)
-        return reach_m + (way_m + self._outline.radius_m)
+        return min(allowances)
 
     def _before(self, kind: Kind, points: list[Point], motion: Twist) -> Allowance:
         """Return the allowance before points of a kind, in the axes of the base now."""
@@ -312,7 +303,8 @@ class CollisionMonitor:
         else:
             # Corners may swing as far as floor was seen. An unknown region at the outline itself does not count: it
             # would keep the base from turning away.
-            points = self._stop_polygon(motion).parted(points)[1]
+            stop = self._stop_polygon(motion)
+            points = [point for point in points if stop.gap_m(*point) > 0.0]
             speed_mps = abs(motion.yaw_rate_radps) * outline.radius_m
         least = 0.0 if kind.policy == STOP else min(1.0, settings.slow_mps / speed_mps)
         share = max(self._share_before(points, motion, ALONG_SLOPE), least)
@@ -324,12 +316,13 @@ class CollisionMonitor:
         slope: points at the distance to keep already count where the way to them is steeper.
         """
         speed_mps = abs(motion.velocity_mps)
-        stop = self._stop_polygon(motion)
-        inside, outside = stop.parted(points)
-        least_mps = max(slope * speed_mps, TINY)
-        if any(self._outline.approach_mps(x, y, motion) > least_mps for x, y in inside):
-            return 0.0
-        first_s = contact_s(stop, motion, outside)
+        stop, outside, least_mps = self._stop_polygon(motion), [], max(slope * speed_mps, TINY)
+        for point in points:
+            if stop.gap_m(*point) > 0.0:
+                outside.append(point)
+            elif self._outline.approach_mps(*point, motion) > least_mps:
+                return 0.0
+        first_s = stop.contact_s(motion, outside)
         if first_s == math.inf:
             return 1.0
         turn_radps = max(abs(motion.yaw_rate_radps), TINY)
@@ -342,10 +335,8 @@ class CollisionMonitor:
 
     def _stop_polygon(self, motion: Twist) -> Outline:
         """Return the outline with the distance to keep on the side to which the base moves, and at its sides."""
-        (front_m, rear_m, half_width_m), settings = self._outline, self._settings
-        ahead_m = settings.stop_m if motion.velocity_mps > 0.0 else 0.0
-        behind_m = settings.stop_m if motion.velocity_mps < 0.0 else 0.0
-        return Outline(front_m + ahead_m, rear_m + behind_m, half_width_m + settings.side_m)
+        stop_m, v = self._settings.stop_m, motion.velocity_mps
+        return self._outline.grown(stop_m * (v > 0.0), stop_m * (v < 0.0), self._settings.side_m)
 
     def _before_moving(self, one: MovingPoint, moved: Pose2, age_s: float, motion: Twist) -> Allowance:
         """Slow down by the time until a moving obstacle, at its predicted place, is where the base would then be.

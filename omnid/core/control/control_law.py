@@ -18,17 +18,18 @@ from omnid.core.control.command_sources import CommandSelector, SourceSettings, 
 from omnid.core.control.contacts import Contacts
 from omnid.core.control.heading_controller import (
     LONGEST_TICK_S,
+    STOP,
     HeadingController,
+    HeadingGoal,
     HeadingLimits,
     Setpoint,
     Twist,
+    VelocityLimits,
     wrap_angle,
 )
-from omnid.core.control.heading_goal import HeadingGoal
 from omnid.core.control.motion_monitor import AGREE, Motion, MotionSettings, Witness
 from omnid.core.control.safety_rules import FAULTS, IDLE, Deadlines, SafetyInputs, stop_reason
 from omnid.core.control.trust import Plausibility, TrustSettings
-from omnid.core.control.velocity_limits import STOP, VelocityLimits
 from omnid.core.nanoseconds import S_PER_NS
 
 TO_STAND: Final = Setpoint(0.0)

@@ -1,4 +1,7 @@
-"""Heading controller: from a setpoint of speed and heading to a bounded speed and yaw rate, one step a tick."""
+"""The law of motion: from a setpoint of speed and heading to a speed and a yaw rate within all limits, one step a tick.
+
+Whatever its input, a step exceeds no limit of speed, yaw rate and acceleration.
+"""
 
 from __future__ import annotations
 
@@ -12,17 +15,10 @@ LONGEST_TICK_S: Final = 0.2  # a late tick does not allow a larger step; by tria
 HALF_TURN_RAD: Final = 0.2  # closer to half a turn than this, noise would change the side to turn to
 # Share of a deceleration that is planned for braking; the rest is left for the lag of the base.
 BRAKING_SHARE: Final = 0.8
-
-
-@dataclass(frozen=True, slots=True)
-class HeadingLimits:
-    """Limits of the heading controller, in magnitude, and its gain."""
-
-    velocity_mps: Annotated[float, Meta(ge=0.001, le=10), "highest speed, m/s"] = 0.5
-    acceleration_mps2: Annotated[float, Meta(ge=0.001, le=100), "highest acceleration, m/s^2"] = 0.5
-    yaw_rate_radps: Annotated[float, Meta(ge=0.001, le=20), "highest yaw rate, rad/s"] = 1.0
-    yaw_acceleration_radps2: float = 3.0  # highest yaw acceleration, rad/s^2
-    gain_hz: float = 1.5  # yaw rate per heading error, 1/s
+# Between the heading that a motor controller reported and its turn to the next goal; by trial with simulated ones.
+REACTION_S: Final = 0.15
+# Times the yaw rate's limit, reported: the goal is the present heading until it is slower.
+OVERSPEED: Final = 1.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,18 +37,79 @@ class Twist:
     velocity_mps: float = 0.0
     yaw_rate_radps: float = 0.0
 
+    @property
+    def is_finite(self) -> bool:
+        """True if both are numbers."""
+        return math.isfinite(self.velocity_mps) and math.isfinite(self.yaw_rate_radps)
+
+
+STOP: Final = Twist()
+
 
 def wrap_angle(angle_rad: float) -> float:
     """Return the same direction within -pi .. pi; NaN for a number that is not finite."""
     return math.remainder(angle_rad, math.tau) if math.isfinite(angle_rad) else math.nan
 
 
+def clamp(value: float, magnitude: float) -> float:
+    """Return the value, limited to a magnitude."""
+    return max(-magnitude, min(magnitude, value))
+
+
+@dataclass(frozen=True, slots=True)
+class VelocityLimits:
+    """Limits of the commands to the wheels, in magnitude; the deceleration holds for stops as well."""
+
+    velocity_mps: Annotated[float, Meta(ge=0.001, le=10), "highest speed, m/s"] = 0.6
+    acceleration_mps2: Annotated[float, Meta(ge=0.001, le=100), "highest acceleration, m/s^2"] = 0.6
+    deceleration_mps2: Annotated[float, Meta(ge=0.001, le=100), "highest deceleration, at stops as well, m/s^2"] = 1.5
+    yaw_rate_radps: Annotated[float, Meta(ge=0.001, le=20), "highest yaw rate, rad/s"] = 1.2
+    yaw_acceleration_radps2: Annotated[float, Meta(ge=0.001, le=200), "highest yaw acceleration, rad/s^2"] = 4.0
+
+    def step(self, wanted: Twist, last: Twist, dt_s: float) -> Twist:
+        """Return the motion to send dt_s after `last`; a wanted motion that is not finite is a stop.
+
+        A last motion that is not finite counts as the stop, one beyond the limits as at the limits. A time that is not
+        finite or negative counts as 0, one longer than LONGEST_TICK_S as that: a late tick allows no larger step.
+        """
+        wanted, last = (self.within(motion) for motion in (wanted, last))
+        dt_s = min(max(dt_s, 0.0), LONGEST_TICK_S) if math.isfinite(dt_s) else 0.0
+        turn_radps, reach_radps = wanted.yaw_rate_radps - last.yaw_rate_radps, self.yaw_acceleration_radps2 * dt_s
+        # The speed in the direction of the last one: down to 0 where the sign changes, then up in the time left.
+        sign = math.copysign(1.0, last.velocity_mps)
+        speed_mps, goal_mps = sign * last.velocity_mps, sign * wanted.velocity_mps
+        if goal_mps >= speed_mps:
+            speed_mps = min(goal_mps, speed_mps + self.acceleration_mps2 * dt_s)
+        else:
+            left_s = max(0.0, dt_s - speed_mps / self.deceleration_mps2)
+            slowed_mps = max(goal_mps, 0.0, speed_mps - self.deceleration_mps2 * dt_s)
+            speed_mps = max(min(goal_mps, slowed_mps), slowed_mps - self.acceleration_mps2 * left_s)
+        return Twist(sign * speed_mps, last.yaw_rate_radps + clamp(turn_radps, reach_radps))
+
+    def within(self, motion: Twist) -> Twist:
+        """Return a motion within the speeds allowed; the stop for one that is not finite."""
+        if not motion.is_finite:
+            return STOP
+        return Twist(clamp(motion.velocity_mps, self.velocity_mps), clamp(motion.yaw_rate_radps, self.yaw_rate_radps))
+
+
+@dataclass(frozen=True, slots=True)
+class HeadingLimits:
+    """Limits of the heading controller, in magnitude, and its gain."""
+
+    velocity_mps: Annotated[float, Meta(ge=0.001, le=10), "highest speed, m/s"] = 0.5
+    acceleration_mps2: Annotated[float, Meta(ge=0.001, le=100), "highest acceleration, m/s^2"] = 0.5
+    yaw_rate_radps: Annotated[float, Meta(ge=0.001, le=20), "highest yaw rate, rad/s"] = 1.0
+    yaw_acceleration_radps2: float = 3.0  # highest yaw acceleration, rad/s^2
+    gain_hz: float = 1.5  # yaw rate per heading error, 1/s
+
+
 @dataclass(frozen=True, slots=True)
 class HeadingController:
     """A proportional heading controller whose output never exceeds its limits, whatever its input.
 
-    Rate and acceleration are bounded; near the goal the rate is at most sqrt(2 a e) with the acceleration a and the
-    heading error e, from which the base can still brake.
+    Near the goal the yaw rate is at most sqrt(2 a e) with the yaw acceleration a and the heading error e, from which
+    the base can still brake.
     """
 
     limits: HeadingLimits = HeadingLimits()
@@ -63,48 +120,73 @@ class HeadingController:
         Where setpoint or heading are not finite, the base stops as fast as the limits allow. Where the time or the
         previous motion are not finite, it stops at once: there is no speed to slow down from.
         """
-        # 1. Bring the inputs into their limits.
-        if not all(map(math.isfinite, (dt_s, previous.velocity_mps, previous.yaw_rate_radps))):
-            return Twist()
-        limits = self.limits
-        dt_s = min(max(dt_s, 0.0), LONGEST_TICK_S)
-        velocity_mps = clamp(previous.velocity_mps, limits.velocity_mps)
-        yaw_rate_radps = clamp(previous.yaw_rate_radps, limits.yaw_rate_radps)
-        # 2. The motion that turns to the heading.
-        wanted = self._wanted(setpoint, heading_rad, yaw_rate_radps)
-        # 3. Approach it with the accelerations allowed.
-        return Twist(
-            _towards(velocity_mps, wanted.velocity_mps, limits.acceleration_mps2 * dt_s),
-            _towards(yaw_rate_radps, wanted.yaw_rate_radps, limits.yaw_acceleration_radps2 * dt_s),
-        )
-
-    def _wanted(self, setpoint: Setpoint, heading_rad: float, yaw_rate_radps: float) -> Twist:
-        """Return the motion without limits of acceleration; a stop where a number is not finite."""
-        goal_rad = 0.0 if setpoint.heading_rad is None else setpoint.heading_rad
-        numbers = (setpoint.velocity_mps, setpoint.yaw_rate_radps, goal_rad, heading_rad)
-        if not all(map(math.isfinite, numbers)):
-            return Twist()
-        rate_radps = setpoint.yaw_rate_radps
-        if setpoint.heading_rad is not None:
-            rate_radps = self._rate(wrap_angle(wrap_angle(goal_rad) - wrap_angle(heading_rad)), yaw_rate_radps)
-        limits = self.limits
-        return Twist(clamp(setpoint.velocity_mps, limits.velocity_mps), clamp(rate_radps, limits.yaw_rate_radps))
-
-    def _rate(self, error_rad: float, yaw_rate_radps: float) -> float:
-        """Return the yaw rate for a heading error; near half a turn the base keeps the side to which it turns."""
-        size_rad = abs(error_rad)
-        braking_radps = math.sqrt(2 * BRAKING_SHARE * self.limits.yaw_acceleration_radps2 * size_rad)
-        side = error_rad
-        if size_rad > math.pi - HALF_TURN_RAD and yaw_rate_radps != 0.0:
-            side = yaw_rate_radps
-        return math.copysign(min(self.limits.gain_hz * size_rad, braking_radps), side)
+        if not (math.isfinite(dt_s) and previous.is_finite):
+            return STOP
+        of, wanted = self.limits, Twist(setpoint.velocity_mps, setpoint.yaw_rate_radps)
+        if not math.isfinite(heading_rad):
+            wanted = STOP
+        elif setpoint.heading_rad is not None and wanted.is_finite:
+            error_rad = wrap_angle(wrap_angle(setpoint.heading_rad) - wrap_angle(heading_rad))
+            size_rad, side = abs(error_rad), error_rad
+            # Near half a turn the base keeps the side to which it turns.
+            if size_rad > math.pi - HALF_TURN_RAD and previous.yaw_rate_radps != 0.0:
+                side = previous.yaw_rate_radps
+            braking_radps = math.sqrt(2 * BRAKING_SHARE * of.yaw_acceleration_radps2 * size_rad)
+            rate_radps = math.copysign(min(of.gain_hz * size_rad, braking_radps), side)
+            wanted = Twist(setpoint.velocity_mps, rate_radps)
+        both = of.acceleration_mps2, of.acceleration_mps2
+        limits = VelocityLimits(of.velocity_mps, *both, of.yaw_rate_radps, of.yaw_acceleration_radps2)
+        return limits.step(wanted, previous, dt_s)
 
 
-def clamp(value: float, magnitude: float) -> float:
-    """Return the value, limited to a magnitude."""
-    return max(-magnitude, min(magnitude, value))
+def longest_lead_rad(heading: HeadingLimits, velocity: VelocityLimits) -> float:
+    """Return the limit of the lead of the goal over the heading.
+
+    It is the angle that the base turns at the highest rate within the reaction time, and then until it has braked. A
+    motor controller turns the faster, the larger the lead is, by a gain that is not known here.
+    """
+    rate_radps = min(heading.yaw_rate_radps, velocity.yaw_rate_radps)
+    acceleration_radps2 = min(heading.yaw_acceleration_radps2, velocity.yaw_acceleration_radps2)
+    return min(math.pi / 2, rate_radps * REACTION_S + rate_radps**2 / (2 * acceleration_radps2))
 
 
-def _towards(value: float, goal: float, reach: float) -> float:
-    """Return the value, moved towards the goal by at most reach."""
-    return value + clamp(goal - value, reach)
+class HeadingGoal:
+    """The goal for a motor controller that holds a heading by itself, in its own count of headings.
+
+    Yaw rates, which are within the limits, are integrated. The count starts anywhere, and drifts. No heading in odom is
+    converted to it: the pose decides about the yaw rate only, so that a pose that jumps does not move the goal by more
+    than the limits allow in a tick.
+    """
+
+    def __init__(self, heading: HeadingLimits, velocity: VelocityLimits) -> None:
+        self._longest_rad = longest_lead_rad(heading, velocity)
+        self._highest_radps = OVERSPEED * min(heading.yaw_rate_radps, velocity.yaw_rate_radps)
+        self._goal_rad: float | None = None  # goal of the last tick, while the base turns or drives
+        self._counted_rad = self._rate_radps = 0.0  # values of the last report
+
+    def update(self, counted_rad: float, rate_radps: float) -> None:
+        """Take the heading and the yaw rate that the motor controller reported; NaN where it knows none."""
+        if math.isfinite(counted_rad):
+            self._counted_rad = counted_rad
+        self._rate_radps = rate_radps if math.isfinite(rate_radps) else 0.0
+
+    def towards(self, turn_rad: float, error_rad: float | None = None) -> float:
+        """Return the goal after a turn since the last call; the present heading where a number is not finite.
+
+        error_rad: angle to the wanted heading, which the goal does not pass; None where a yaw rate is wanted.
+        """
+        if not math.isfinite(turn_rad) or (error_rad is not None and not math.isfinite(error_rad)):
+            return self.stay()
+        before_rad = self._counted_rad if self._goal_rad is None else self._goal_rad
+        lead_rad = clamp(wrap_angle(before_rad + turn_rad - self._counted_rad), self._longest_rad)
+        if error_rad is not None and abs(error_rad) < self._longest_rad:
+            lead_rad = min(max(lead_rad, min(error_rad, 0.0)), max(error_rad, 0.0))
+        if abs(self._rate_radps) > self._highest_radps and self._rate_radps * lead_rad > 0:
+            lead_rad = 0.0
+        self._goal_rad = wrap_angle(self._counted_rad + lead_rad)
+        return self._goal_rad
+
+    def stay(self) -> float:
+        """Return the present heading as the goal, while the base slows down."""
+        self._goal_rad = None
+        return self._counted_rad

@@ -22,8 +22,7 @@ from typing import Annotated, Final, NamedTuple, TypeAlias
 from msgspec import Meta
 
 from omnid.core.control import likely_cause
-from omnid.core.control.heading_controller import LONGEST_TICK_S, Twist
-from omnid.core.control.velocity_limits import STOP
+from omnid.core.control.heading_controller import LONGEST_TICK_S, STOP, Twist
 from omnid.core.nanoseconds import S_PER_NS
 
 MOST_STEPS: Final = 64  # of images that are kept for the words about a disagreement: two seconds of 30 Hz

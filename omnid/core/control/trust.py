@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Annotated, Final, Literal, NamedTuple
 
 from msgspec import Meta
 
-from omnid.core.control.heading_controller import Twist, clamp
+from omnid.core.control.heading_controller import Twist, VelocityLimits
 from omnid.core.control.motion_monitor import AGREE, Motion, MotionMonitor, MotionSettings, Witness
 from omnid.core.control.safety_rules import SafetyInputs
-from omnid.core.control.velocity_limits import VelocityLimits
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.tracking_state import TrackingState
 
@@ -41,7 +41,6 @@ class TrustSettings:
     yaw_rate_sigma_radps: Annotated[float, Meta(ge=0, le=20), "the same of the yaw rate, rad/s; 0: never"] = 0.4
     sigma_s: float = 0.3  # time for which a standard deviation may be higher, s
     odometry_reset: Annotated[Literal["stop", "ignore"], "when odometry has lost its map and begins again"] = "stop"
-    motor_fault: Literal["stop", "ignore"] = "stop"  # when the motor controller reports a fault
     battery_v: Annotated[
         float, Meta(ge=0, le=1000), "the wheels stop when the battery's voltage stays below, V; 0: never"
     ] = 0.0
@@ -52,7 +51,23 @@ class MotorReport(NamedTuple):
 
     motion: Motion
     fault: int = 0  # its own number; 0: none
-    battery_v: float = float("nan")
+    battery_v: float = math.nan
+
+
+class Lasting:
+    """For how long a condition has held without a break, by the stamps of its samples; NaN: it does not hold."""
+
+    def __init__(self) -> None:
+        self._since_ns: int | None = None
+        self.seconds = math.nan
+
+    def add(self, now_ns: int, *, holds: bool) -> None:
+        """Take a sample."""
+        if not holds:
+            self._since_ns = None
+        elif self._since_ns is None:
+            self._since_ns = now_ns
+        self.seconds = math.nan if self._since_ns is None else (now_ns - self._since_ns) * S_PER_NS
 
 
 class Plausibility:
@@ -60,13 +75,10 @@ class Plausibility:
 
     def __init__(self, trust: TrustSettings, motion: MotionSettings) -> None:
         self._settings, self._checks = trust, motion.check
-        self._monitor = MotionMonitor(motion)
-        self._pose_ns = 0  # stamp of the newest pose
-        self._unsure_since_ns: int | None = None  # stamp of the first pose of those whose velocity is too uncertain
+        self.monitor = MotionMonitor(motion)  # takes the commands
+        self._unsure, self._low = Lasting(), Lasting()  # velocity, battery
         self._resets: int | None = None
-        self._is_degraded = self._is_reset = False
-        self._low_since_ns: int | None = None  # since when the voltage is low
-        self._is_faulty = self._is_battery_empty = False
+        self._is_degraded = self._is_reset = self._is_faulty = False
         self.witness = AGREE  # witness of the newest pose
 
     @property
@@ -74,12 +86,12 @@ class Plausibility:
         """The reason to drive slowly; empty without one."""
         if self._is_degraded:
             return POSE_DEGRADED
-        return MOTION_DOUBTFUL if self._monitor.is_doubtful else self.witness.reason
+        return MOTION_DOUBTFUL if self.monitor.is_doubtful else self.witness.reason
 
     @property
     def account(self) -> Witness:
         """What is measured of the disagreement for which the base stops, or drives slowly."""
-        return Witness(self._monitor.reason, self._monitor.detail, True) if self._monitor.reason else self.witness
+        return Witness(self.monitor.reason, self.monitor.detail, True) if self.monitor.reason else self.witness
 
     def add_pose(self, stamp_ns: int, state: str, seen: Motion, resets: int, witness: Witness = AGREE) -> None:
         """Take the next pose, and how often odometry has begun again; a lost pose says nothing about the motion."""
@@ -91,43 +103,28 @@ class Plausibility:
             (settings.velocity_sigma_mps, seen.velocity_sigma_mps),
             (settings.yaw_rate_sigma_radps, seen.yaw_rate_sigma_radps),
         )
-        if not any(level > 0 and not sigma <= level for level, sigma in levels):
-            self._unsure_since_ns = None
-        elif self._unsure_since_ns is None:
-            self._unsure_since_ns = stamp_ns
-        self._pose_ns = stamp_ns
+        self._unsure.add(stamp_ns, holds=any(level > 0 and not sigma <= level for level, sigma in levels))
         self._is_reset |= self._resets not in (None, resets) and settings.odometry_reset == "stop"
         self._resets = resets
         if state != TrackingState.LOST:
-            self._monitor.add_seen(stamp_ns, seen)
-
-    def add_command(self, now_ns: int, motion: Twist) -> None:
-        """Take the motion that was commanded."""
-        self._monitor.add_command(now_ns, motion)
+            self.monitor.add_seen(stamp_ns, seen)
 
     def add_report(self, now_ns: int, report: MotorReport) -> None:
         """Take a report of the motor controller."""
-        settings = self._settings
-        self._monitor.add_report(now_ns, report.motion)
-        self._is_faulty = report.fault != 0 and settings.motor_fault == "stop"
-        if not report.battery_v < settings.battery_v:
-            self._low_since_ns = None
-        elif self._low_since_ns is None:
-            self._low_since_ns = now_ns
-        low_s = 0.0 if self._low_since_ns is None else (now_ns - self._low_since_ns) * S_PER_NS
-        self._is_battery_empty = low_s >= BATTERY_S
+        self.monitor.add_report(now_ns, report.motion)
+        self._is_faulty = report.fault != 0
+        self._low.add(now_ns, holds=report.battery_v < self._settings.battery_v)
 
     def added_to(self, inputs: SafetyInputs) -> SafetyInputs:
         """Return the inputs of the safety rules with these; a reset counts for one step."""
         is_reset, self._is_reset = self._is_reset, False
-        since_ns = self._unsure_since_ns
         return replace(
             inputs,
             pose_reset=is_reset,
-            pose_unsure=since_ns is not None and (self._pose_ns - since_ns) * S_PER_NS >= self._settings.sigma_s,
+            pose_unsure=self._unsure.seconds >= self._settings.sigma_s,
             motor_faulty=self._is_faulty,
-            battery_empty=self._is_battery_empty,
-            disagreement=self._monitor.reason or (self.witness.reason if self.witness.is_fault else ""),
+            battery_empty=self._low.seconds >= BATTERY_S,
+            disagreement=self.monitor.reason or (self.witness.reason if self.witness.is_fault else ""),
         )
 
     def slowed(self, wanted: Twist, limits: VelocityLimits) -> Twist:
@@ -135,7 +132,5 @@ class Plausibility:
         if not self.slowed_by:
             return wanted
         share = self._settings.degraded_speed
-        return Twist(
-            clamp(wanted.velocity_mps, share * limits.velocity_mps),
-            clamp(wanted.yaw_rate_radps, share * limits.yaw_rate_radps),
-        )
+        top_mps, top_radps = share * limits.velocity_mps, share * limits.yaw_rate_radps
+        return replace(limits, velocity_mps=top_mps, yaw_rate_radps=top_radps).within(wanted)

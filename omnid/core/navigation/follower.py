@@ -1,6 +1,7 @@
-"""Following of a whole path: leg by leg, then the heading of the goal, then what is missing to it.
+"""Following of a path: leg by leg, then the heading of the goal, then what is missing to it.
 
-The speeds along a leg follow from regulated pure pursuit, which stands first.
+Along a leg the speeds are those of regulated pure pursuit (Macenski, Singh, Martin, Gines 2023, "Regulated pure pursuit
+for robot path tracking"): the arc to a point ahead, more slowly in curves, near obstacles and before the end.
 """
 
 from __future__ import annotations
@@ -14,18 +15,19 @@ from numpy.typing import NDArray
 from calib.se2_arrays import predicted
 from omnid.core.control.heading_controller import Setpoint, wrap_angle
 from omnid.core.navigation.path import DrivePath, PathLeg, straight_leg
-from omnid.core.navigation.settings import NavigationSettings, PursuitSettings
+from omnid.core.navigation.settings import NavigationSettings
 
 Array = NDArray[np.float64]
 
-# The base turns on the spot towards a point at a larger angle; by trial on development seeds.
-TURN_RAD: Final = math.radians(45)
-TURNED_RAD: Final = math.radians(4)  # The turn ends below this angle; by trial on development seeds.
+# The base turns on the spot towards a point at a larger angle, until that is small; by trial on development seeds.
+TURN_RAD, TURNED_RAD = math.radians(45), math.radians(4)
 BRAKE_SHARE: Final = 0.7  # Share of the deceleration that is planned, because the base follows with a lag.
 APPROACH_HZ: Final = 1.2  # speed per distance to the end, so that the last centimetres are slow
-LAST_MPS: Final = 0.02  # least speed before the end; by trial on development seeds
-
-
+LAST_MPS: Final = 0.02  # least speed before the end, and most of a base that stands, twice the noise of odometry
+SETTLED: Final = 3  # poses one after the other that must be within the tolerance, standing
+SETTLED_RADPS: Final = 0.1
+CORNER_M: Final = 0.03  # A leg ends this far from its end, unless it is the last one.
+CORRECTIONS: Final = 3  # Most short drives that correct the distance left to the goal.
 STAND: Final = Setpoint(0.0, None, 0.0)  # exact zeros: no motion
 
 
@@ -37,71 +39,6 @@ class Following(NamedTuple):
     offset_m: float = 0.0  # distance to the left of the path
     done: bool = False
     missed_m: float = 0.0  # distance to the goal, where done
-
-
-class Pursuit:
-    """Follow one leg; pose and path are in one frame."""
-
-    def __init__(self, leg: PathLeg, settings: PursuitSettings, s_m: float = 0.0, speed_mps: float = 0.0) -> None:
-        """s_m: way on the leg to begin at. speed_mps: of the base, ahead."""
-        self.leg = leg
-        self.s_m = s_m
-        self._settings = settings
-        self.turns = True  # on the spot, towards the path; True until the first step finds that no turn is needed
-        self._speed_mps = max(0.0, -speed_mps if leg.backwards else speed_mps)
-        self._last_ns: int | None = None
-
-    def step(self, stamp_ns: int, pose: Array, speed_mps: float, obstacle_m: float) -> Following:
-        """Return the motion at a pose x, y, yaw (3,), and what is left of the leg.
-
-        speed_mps: measured, forwards. obstacle_m: from the outline of the base to the nearest obstacle.
-        """
-        s, leg = self._settings, self.leg
-        dt_s = 0.0 if self._last_ns is None else min(max((stamp_ns - self._last_ns) * 1e-9, 0.0), 0.5)
-        self._last_ns = stamp_ns
-        # 1. The nearest point of the path, from where the last one was.
-        self.s_m = leg.project(pose, self.s_m)
-        left_m, offset_m = leg.length_m - self.s_m, leg.offset_m(pose, self.s_m)
-        # 2. The point to drive to, at a distance that grows with the speed; beyond the end the path continues straight.
-        low_m, high_m = s.lookahead_m
-        reach_m = min(max(low_m, abs(speed_mps) * s.lookahead_s), high_m)
-        target = leg.at(self.s_m + reach_m)
-        half_turn_rad = math.pi if leg.backwards else 0.0
-        bearing_rad = math.atan2(target[1] - pose[1], target[0] - pose[0])
-        aside_rad = wrap_angle(bearing_rad - pose[2] - half_turn_rad)
-        # 3. Turn towards it on the spot if its angle is large.
-        self.turns = abs(aside_rad) > TURN_RAD or (self.turns and abs(aside_rad) > TURNED_RAD and dt_s > 0)
-        if self.turns:
-            self._speed_mps = 0.0
-            return Following(Setpoint(0.0, wrap_angle(bearing_rad + half_turn_rad)), left_m, offset_m)
-        # 4. The arc to it (Coulter 1992): curvature 2 sin(bearing) / distance.
-        away_m = math.hypot(target[0] - pose[0], target[1] - pose[1])
-        curvature = 2 * math.sin(aside_rad) / max(away_m, 0.5 * low_m)
-        # 5. The speed: in curves, here and ahead, and near obstacles (equations 5 to 7 of the paper), and so that the
-        #    base still stops at the end.
-        highest_mps = min(s.velocity_mps, leg.speed_at(self.s_m))
-        sharpest = max(abs(curvature), leg.sharpest(self.s_m, reach_m))
-        share = min(1.0, 1.0 / max(sharpest * s.slow_radius_m, 1e-9), max(0.0, obstacle_m) / s.slow_obstacle_m)
-        wanted_mps = max(share * highest_mps, min(s.least_mps, highest_mps))
-        wanted_mps = min(wanted_mps, s.yaw_rate_radps / max(abs(curvature), 1e-9), self._ending(left_m))
-        self._speed_mps = max(0.0, min(wanted_mps, self._speed_mps + s.acceleration_mps2 * dt_s))
-        sign = -1.0 if leg.backwards else 1.0
-        return Following(Setpoint(sign * self._speed_mps, None, self._speed_mps * curvature), left_m, offset_m)
-
-    def _ending(self, left_m: float) -> float:
-        """Return the speed from which the base still stops at the end."""
-        if left_m <= 0:
-            return 0.0
-        braking_mps = math.sqrt(2 * BRAKE_SHARE * self._settings.acceleration_mps2 * left_m)
-        return max(LAST_MPS, min(braking_mps, APPROACH_HZ * left_m))
-
-
-# Set by trial on development seeds, where a line gives no other reason.
-SETTLED: Final = 3  # poses one after the other that must be within the tolerance, standing
-SETTLED_RADPS: Final = 0.1
-SETTLED_MPS: Final = 0.03
-CORNER_M: Final = 0.03  # A leg ends this far from its end, unless it is the last one.
-CORRECTIONS: Final = 3  # Most short drives that correct the distance left to the goal.
 
 
 class PathAhead(NamedTuple):
@@ -118,29 +55,31 @@ class Follower:
     def __init__(
         self, path: DrivePath, settings: NavigationSettings, leg: int = 0, s_m: float = 0.0, speed_mps: float = 0.0
     ) -> None:
-        """leg, s_m: where on the path to begin. speed_mps: of the base, ahead."""
-        self.path = path
-        self.settings = settings
-        self._legs = list(path.legs)
-        self._number = min(leg, len(self._legs) - 1)
-        at_goal = path.length_m <= settings.goal_cm * 0.01 or leg >= len(self._legs)
-        self._pursuit = None if at_goal else Pursuit(self._legs[leg], settings.pursuit, s_m, speed_mps)
-        self._settled = 0
-        self._corrections = 0
+        """leg, s_m: where on the path to begin. speed_mps: of the base, forwards."""
+        self.path, self.settings, self._legs = path, settings, list(path.legs)
+        # True while the base turns at the end of the path.
+        self.aligns = path.length_m <= settings.goal_cm * 0.01 or leg >= len(path.legs)
+        self._begin(min(leg, len(path.legs) - 1), s_m, speed_mps)
+        self._settled = self._corrections = 0
+
+    def _begin(self, number: int, s_m: float = 0.0, speed_mps: float = 0.0) -> None:
+        """Begin a leg at a way on it."""
+        self._number, self._s_m, self._last_ns = number, s_m, None
+        self._turns = True  # until the first step finds that no turn is needed
+        self._speed_mps = max(0.0, -speed_mps if self._leg.backwards else speed_mps)
 
     @property
-    def aligns(self) -> bool:
-        """True while the base turns at the end of the path."""
-        return self._pursuit is None
+    def _leg(self) -> PathLeg:
+        return self._legs[self._number]
+
+    _last_ns: int | None
 
     def ahead(self, way_m: float) -> PathAhead:
         """Return the path from the nearest point on, of at least a length, through the next legs if need be."""
-        if self._pursuit is None:
-            return PathAhead(
-                self.path.goal[None], np.array([self._number]), np.array([self._legs[self._number].length_m])
-            )
+        if self.aligns:
+            return PathAhead(self.path.goal[None], np.array([self._number]), np.array([self._leg.length_m]))
         pieces: list[tuple[Array, NDArray[np.intp], Array]] = []
-        s_m, left_m = self._pursuit.s_m, way_m
+        s_m, left_m = self._s_m, way_m
         for number in range(self._number, len(self._legs)):
             leg = self._legs[number]
             within = (leg.s > s_m) & (leg.s <= s_m + left_m)
@@ -154,38 +93,74 @@ class Follower:
     def step(
         self, stamp_ns: int, pose: Array, speed_mps: float, yaw_rate_radps: float, obstacle_m: float = math.inf
     ) -> Following:
-        """Return the motion at a pose (3,) with its measured speeds."""
-        # 1. Predict the pose at which the command takes effect.
-        at_effect = predicted(pose, speed_mps, yaw_rate_radps, self.settings.pursuit.delay_s)
-        # 2. Follow the legs; each ends a little before its end, the last one as near as the goal has to be reached.
-        pursuit, rest = self._pursuit, self._legs[self._number + 1 :]
-        if pursuit is not None:
-            following = pursuit.step(stamp_ns, at_effect, speed_mps, obstacle_m)
-            end_m = CORNER_M if rest else 0.25 * self.settings.goal_cm * 0.01
+        """Return the motion at a pose (3,) with its measured speeds.
+
+        obstacle_m: from the outline of the base to the nearest obstacle beside the way.
+        """
+        # 1. Follow the legs from the pose at which the command takes effect; each ends a little before its end, the
+        #    last one as near as the goal has to be reached.
+        goal_m, rest = self.settings.goal_cm * 0.01, self._legs[self._number + 1 :]
+        if not self.aligns:
+            at_effect = predicted(pose, speed_mps, yaw_rate_radps, self.settings.pursuit.delay_s)
+            following = self._pursue(stamp_ns, at_effect, speed_mps, obstacle_m)
             left_m = sum(leg.length_m for leg in rest)
-            if following.left_m > end_m or pursuit.turns:
+            if following.left_m > (CORNER_M if rest else 0.25 * goal_m) or self._turns:
                 return following._replace(left_m=following.left_m + left_m)
             if rest:
-                self._number += 1
-                self._pursuit = Pursuit(rest[0], self.settings.pursuit)
+                self._begin(self._number + 1)
                 return Following(STAND, left_m, following.offset_m)
-            self._pursuit = None
-        # 3. At the end, turn to the heading of the goal on the spot.
+            self.aligns = True
+        # 2. At the end, turn to the heading of the goal on the spot.
         goal_rad, missing = self.path.final_heading_rad, self.path.goal - pose[:2]
         missing_m = float(np.hypot(*missing))
         error_rad = 0.0 if goal_rad is None else wrap_angle(goal_rad - float(pose[2]))
-        is_at_rest = abs(speed_mps) < SETTLED_MPS and abs(yaw_rate_radps) < SETTLED_RADPS
+        is_at_rest = abs(speed_mps) < 2 * LAST_MPS and abs(yaw_rate_radps) < SETTLED_RADPS
         within = abs(error_rad) <= math.radians(self.settings.goal_deg)
         self._settled = self._settled + 1 if is_at_rest and within else 0
         if self._settled < SETTLED:
             return Following(STAND if goal_rad is None else Setpoint(0.0, goal_rad), missing_m)
-        # 4. Drive what is missing then, or end.
-        if missing_m <= self.settings.goal_cm * 0.01 or self._corrections >= CORRECTIONS:
+        # 3. Drive what is missing then, or end.
+        if missing_m <= goal_m or self._corrections >= CORRECTIONS:
             return Following(STAND, 0.0, 0.0, True, missing_m)
-        self._corrections += 1
-        self._settled = 0
+        self._corrections, self._settled, self.aligns = self._corrections + 1, 0, False
         aside_rad = abs(wrap_angle(math.atan2(missing[1], missing[0]) - float(pose[2])))
         self._legs.append(straight_leg(pose, self.path.goal, backwards=aside_rad > math.pi / 2))
-        self._number += 1
-        self._pursuit = Pursuit(self._legs[-1], self.settings.pursuit)
+        self._begin(self._number + 1)
         return Following(STAND, missing_m)
+
+    def _pursue(self, stamp_ns: int, pose: Array, speed_mps: float, obstacle_m: float) -> Following:
+        """Return the motion along the present leg, and what is left of it."""
+        s, leg = self.settings.pursuit, self._leg
+        dt_s = 0.0 if self._last_ns is None else min(max((stamp_ns - self._last_ns) * 1e-9, 0.0), 0.5)
+        self._last_ns = stamp_ns
+        # 1. The nearest point of the path, from where the last one was.
+        self._s_m = leg.project(pose, self._s_m)
+        x, y, heading_rad = leg.at(self._s_m)
+        left_m = leg.length_m - self._s_m
+        offset_m = float(math.cos(heading_rad) * (pose[1] - y) - math.sin(heading_rad) * (pose[0] - x))
+        # 2. The point to drive to, at a distance that grows with the speed; beyond the end the path continues straight.
+        reach_m = float(np.clip(abs(speed_mps) * s.lookahead_s, *s.lookahead_m))
+        to_x, to_y = leg.at(self._s_m + reach_m)[:2] - pose[:2]
+        half_turn_rad = math.pi if leg.backwards else 0.0
+        bearing_rad = math.atan2(to_y, to_x)
+        aside_rad = wrap_angle(bearing_rad - pose[2] - half_turn_rad)
+        # 3. Turn towards it on the spot if its angle is large.
+        self._turns = abs(aside_rad) > TURN_RAD or (self._turns and abs(aside_rad) > TURNED_RAD and dt_s > 0)
+        if self._turns:
+            self._speed_mps = 0.0
+            return Following(Setpoint(0.0, wrap_angle(bearing_rad + half_turn_rad)), left_m, offset_m)
+        # 4. The arc to it (Coulter 1992): curvature 2 sin(bearing) / distance.
+        curvature = 2 * math.sin(aside_rad) / max(math.hypot(to_x, to_y), 0.5 * s.lookahead_m[0])
+        # 5. The speed: in curves, here and ahead, and near obstacles (equations 5 to 7 of the paper), and so that the
+        #    base still stops at the end.
+        near = slice(*np.searchsorted(leg.s, (self._s_m, self._s_m + reach_m)))
+        highest_mps = min(s.velocity_mps, float(leg.speed[min(near.start, len(leg.s) - 1)]))
+        sharpest = float(np.abs(leg.curvature[near]).max(initial=abs(curvature)))
+        share = min(1.0, 1.0 / max(sharpest * s.slow_radius_m, 1e-9), max(0.0, obstacle_m) / s.slow_obstacle_m)
+        braking_mps = math.sqrt(2 * BRAKE_SHARE * s.acceleration_mps2 * max(left_m, 0.0))
+        ending_mps = max(LAST_MPS, min(braking_mps, APPROACH_HZ * left_m)) if left_m > 0 else 0.0
+        wanted_mps = max(share * highest_mps, min(s.least_mps, highest_mps))
+        wanted_mps = min(wanted_mps, s.yaw_rate_radps / max(abs(curvature), 1e-9), ending_mps)
+        self._speed_mps = max(0.0, min(wanted_mps, self._speed_mps + s.acceleration_mps2 * dt_s))
+        sign = -1.0 if leg.backwards else 1.0
+        return Following(Setpoint(sign * self._speed_mps, None, self._speed_mps * curvature), left_m, offset_m)

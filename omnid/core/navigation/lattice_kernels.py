@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.compiled import compiled
+from omnid.core.compiled import compiled, inner
 
 Doubles = NDArray[np.float64]
 
@@ -47,39 +47,60 @@ def wave_front(cell_s: Doubles, left_s: Doubles) -> None:
                 heapq.heappush(queue, (there_s, r * size + c))
 
 
-@compiled("(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[::1])", writes=())
+@inner
+def room_at(
+    room_m: Doubles, movers: Doubles, cell_m: float, meeting_s: float, x: float, y: float, at_s: float
+) -> float:
+    """Return the distance [m] of a place [cells] from what stands, and from what moves about a time [s].
+
+    movers (K, 5): place, velocity and radius, in cells and seconds.
+    """
+    size = len(room_m)
+    away_m: float = room_m[min(max(round(y), 0), size - 1), min(max(round(x), 0), size - 1)]
+    for k in range(len(movers)):
+        to_x, to_y = x - movers[k, 0], y - movers[k, 1]
+        vx, vy = movers[k, 2], movers[k, 3]
+        t = (to_x * vx + to_y * vy) / max(vx * vx + vy * vy, 1e-9)
+        t = min(max(t, at_s - meeting_s, 0.0), at_s + meeting_s)
+        away_m = min(away_m, cell_m * (math.hypot(to_x - t * vx, to_y - t * vy) - movers[k, 4]))
+    return away_m
+
+
+@compiled("(f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1])", writes=())
 def search(
     room_m: Doubles,
     cell_s: Doubles,
     left_s: Doubles,
     start: Doubles,
     moves: Doubles,
-    discs_m: Doubles,
+    discs: Doubles,
+    movers: Doubles,
     limits: Doubles,
 ) -> Doubles:
     """Return the fastest way (K, 4) of x, y, heading and move from a pose to where no time is left, empty without one.
 
-    room_m: distance to the nearest obstacle. cell_s: time across a cell. left_s: lower bound of the time left.
+    room_m: distance to what stands nearest. cell_s: time across a cell. left_s: lower bound of the time left.
     start (3,): x, y in cells, heading. moves (M, 4): signed way in cells, turn [rad], least time [s], kind (0: ahead,
-    1: back, 2: turn). discs_m (3, D): centres ahead of the origin [cells] of the discs that cover what must be free in
-    a move of each kind. limits: radius of the discs [m], time of a change of the kind [s], time left that counts as
-    none [s], heading at the end [rad], NaN for any, kind of the move that cannot be the first one, -1 for none.
+    1: back, 2: turn). discs (3, D): centres ahead of the origin [cells] of the discs that cover what must be free in
+    a move of each kind. movers: as in `room_at`. limits: radius of the discs [m], time of a change of the kind [s],
+    time left that counts as none [s], heading at the end [rad], NaN for any, kind of the move that cannot be the first
+    one, -1 for none, size of a cell [m], by which what moves may be early or late [s], up to which it is predicted [s].
     """
     size = len(room_m)
-    radius_m, change_s, done_s, end_rad, barred = limits
-    nodes = np.empty((MOST_NODES, 3))
+    radius_m, change_s, done_s, end_rad, barred, cell_m, meeting_s, horizon_s = limits
+    nodes = np.empty((MOST_NODES, 4))  # x, y, heading, time
     from_node = np.empty(MOST_NODES, np.int64)
     by_move = np.empty(MOST_NODES, np.int64)
     best_s = np.full((size, size, HEADINGS), np.inf)
-    nodes[0], from_node[0], by_move[0] = start, -1, -1
+    nodes[0, :3] = start
+    nodes[0, 3], from_node[0], by_move[0] = 0.0, -1, -1
     count = 1
-    queue = [(left_s[round(start[1]), round(start[0])], 0.0, 0)]
+    queue = [(left_s[round(start[1]), round(start[0])], 0)]
     while len(queue):
-        _, at_s, node = heapq.heappop(queue)
-        x, y, heading = nodes[node]
+        _, node = heapq.heappop(queue)
+        x, y, heading, at_s = nodes[node, 0], nodes[node, 1], nodes[node, 2], nodes[node, 3]
         row, column = round(y), round(x)
-        bin = round(heading * HEADINGS / math.tau) % HEADINGS
-        if at_s > best_s[row, column, bin] + 1e-9:
+        if at_s > best_s[row, column, round(heading * HEADINGS / math.tau) % HEADINGS] + 1e-9:
             continue
         # 1. The end, from the last pose back to the first.
         off_rad = abs((heading - end_rad + math.pi) % math.tau - math.pi)
@@ -90,7 +111,7 @@ def search(
             way = np.empty((length, 4))
             while length > 0:
                 length -= 1
-                way[length, :3] = nodes[node]
+                way[length, :3] = nodes[node, :3]
                 way[length, 3] = by_move[node]
                 node = from_node[node]
             return way
@@ -104,28 +125,33 @@ def search(
             r, c = round(to_y), round(to_x)
             if not (0 <= r < size and 0 <= c < size) or not left_s[r, c] < math.inf:
                 continue
+            there_s = at_s + max(least_s, abs(along) * cell_s[r, c])
+            if node > 0 and moves[by_move[node], 3] != kind:
+                there_s += change_s
+            there_bin = round(to_heading * HEADINGS / math.tau) % HEADINGS
+            if there_s >= best_s[r, c, there_bin] - 1e-9 or count == MOST_NODES:
+                continue
             # 3. The room of the base there; where it begins too near to something, it may get no nearer.
             is_free = True
-            for disc in discs_m[int(kind)]:
-                i = min(max(round(to_y + disc * math.sin(to_heading)), 0), size - 1)
-                j = min(max(round(to_x + disc * math.cos(to_heading)), 0), size - 1)
-                if room_m[i, j] < radius_m:
-                    before_i = min(max(round(y + disc * math.sin(heading)), 0), size - 1)
-                    before_j = min(max(round(x + disc * math.cos(heading)), 0), size - 1)
-                    is_free = (
-                        is_free and room_m[before_i, before_j] < radius_m and room_m[i, j] >= room_m[before_i, before_j]
-                    )
-            if not is_free:
-                continue
-            cost_s = max(least_s, abs(along) * cell_s[r, c])
-            if node > 0 and moves[by_move[node], 3] != kind:
-                cost_s += change_s
-            there_s = at_s + cost_s
-            there_bin = round(to_heading * HEADINGS / math.tau) % HEADINGS
-            if there_s < best_s[r, c, there_bin] - 1e-9 and count < MOST_NODES:
+            for disc in discs[int(kind)]:
+                there = room_at(
+                    room_m,
+                    movers,
+                    cell_m,
+                    meeting_s,
+                    to_x + disc * math.cos(to_heading),
+                    to_y + disc * math.sin(to_heading),
+                    min(there_s, horizon_s),
+                )
+                if there < radius_m:
+                    here_x, here_y = x + disc * math.cos(heading), y + disc * math.sin(heading)
+                    here = room_at(room_m, movers, cell_m, meeting_s, here_x, here_y, min(at_s, horizon_s))
+                    is_free = is_free and here < radius_m and there >= here
+            if is_free:
                 best_s[r, c, there_bin] = there_s
-                nodes[count, 0], nodes[count, 1], nodes[count, 2] = to_x, to_y, to_heading
+                nodes[count, 0], nodes[count, 1] = to_x, to_y
+                nodes[count, 2], nodes[count, 3] = to_heading, there_s
                 from_node[count], by_move[count] = node, k
-                heapq.heappush(queue, (there_s + left_s[r, c], there_s, count))
+                heapq.heappush(queue, (there_s + left_s[r, c], count))
                 count += 1
     return np.empty((0, 4))

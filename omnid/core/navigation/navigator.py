@@ -8,7 +8,8 @@ the path. What moves is an obstacle where the base would meet it; what closes ev
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -19,19 +20,19 @@ from omnid.core.control.collision_monitor import CollisionSettings
 from omnid.core.control.command_sources import PLANNER
 from omnid.core.control.heading_controller import Setpoint, wrap_angle
 from omnid.core.control.safety_rules import ASKED
-from omnid.core.navigation.floor_map import CELL_M
 from omnid.core.navigation.follower import BRAKE_SHARE, STAND, Follower, Following
 from omnid.core.navigation.path import SHORTEST_M, DrivePath, goal_path
-from omnid.core.navigation.planner import Move, Planner, Surroundings, distances
+from omnid.core.navigation.planner import Move, Planner
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import UNKNOWN_M, Situation, refusal_of_map, refusal_to_drive
+from omnid.core.navigation.surroundings import Surroundings
 from omnid.navigation_state import NavigationState
 from omnid.tracking_state import MapState, TrackingState
 
 Array = NDArray[np.float64]
 
-PROGRESS_M, PROGRESS_RAD = 0.05, math.radians(5)  # A smaller motion is no progress; by trial on development seeds.
+PROGRESS_M, PROGRESS_RAD = SHORTEST_M / 2, math.radians(5)  # A smaller motion is no progress.
 STOPS: Final = 5  # A stop is sent at so many poses after the end of a drive, because one might be lost.
 LOOK_M: Final = 2.0  # Length of the way ahead in which obstacles are searched; a free place behind them in twice that.
 REJOIN_M: Final = 0.3  # Free length of the path behind an obstacle, at which a detour ends.
@@ -42,7 +43,6 @@ BETTER: Final = 0.8  # A way replaces one that is free only if it takes less tha
 MOST_WAYS: Final = 6  # Most ways that are tried without coming NEARER_M nearer to the end.
 LONGEST_STEP_S: Final = 1.0  # A longer time between two poses counts as this, because a gap is no wait.
 NEARER_M: Final = 1.0  # After this progress the next block is a new one.
-ROUNDING_M: Final = 0.005  # Least change of the room between two points of a way.
 
 RESUME: Final = "`omnid goto --resume` (it arms, too)"  # the one command after a fault or a pause
 AROUND: Final = "it looks for a way around an obstacle"
@@ -51,18 +51,13 @@ STANDS: Final = "something stands on the path"
 CROSSES: Final = "somebody or something crosses the path"
 
 
-@dataclass(slots=True)
-class Detour:
+class Detour(NamedTuple):
     """A way of the planner, to the goal or back to the path."""
 
     follower: Follower  # in odom
     time_s: float  # for all of it
-    leg: int  # of the path, to which it leads back
-    s_m: float  # on that leg
-
-    def is_at_end(self, following: Following) -> bool:
-        """True if the base has driven it; what is missing is less than the distance of points of a path."""
-        return following.done or following.left_m < SHORTEST_M
+    leg: int = 0  # of the path, to which it leads back
+    s_m: float = 0.0  # on that leg
 
 
 @dataclass(slots=True)
@@ -72,22 +67,23 @@ class Drive:
     task: str  # description in words
     frame: NavigationFrame
     paths: list[DrivePath]  # paths that are driven one after the other
-    follower: Follower
+    follower: Follower  # of the first of them
     resets: int
-    command_ns: int = 0  # stamp of the request
+    halts: int  # WheelState.halts at the start, or when a person let it go on
+    heading_rad: float  # heading at the last progress
+    xy: Array  # last position in odom
+    detour: Detour | None = None  # None: it follows the path
     paused: str = ""  # reason of the pause; empty: it is not paused
     waited_s: float = 0.0  # for the pose in the map
-    halts: int = 0  # WheelState.halts at the start, or when a person let it go on
     unlocalised_m: float = 0.0  # distance driven since the pose in the map was known
     localised_ns: int = -1  # stamp of that pose
     nearest_m: float = math.inf  # length of the way that was left at the last progress
-    heading_rad: float = 0.0  # heading at the last progress
     stuck_s: float = 0.0  # time since the last progress
-    blocked_s: float = 0.0  # time for which no way was found since the base has come nearer to the end
-    last_xy: Array | None = None  # last position in odom
-    detour: Detour | None = None  # None: it follows the path
     least_m: float = math.inf  # least length of the way that was left, in steps of NEARER_M
-    ways: int = 0  # number of ways that were taken since then, each of which was blocked again
+    lost_s: float = 0.0  # time since then for which no way was free
+    tried_s: float = 0.0  # time since then on ways that were blocked again
+    way_s: float = 0.0  # time on the present way
+    ways: int = 0  # number of ways that were taken since then
     searched_ns: int = -AGAIN_NS  # stamp of the last search
     no_way: str = ""  # why it was in vain
     is_waiting: bool = False  # a way around is known that takes longer than what it has waited is worth
@@ -108,12 +104,12 @@ class Drive:
         xy = self.on_way.ahead(way_m).xy
         return xy if self.detour is not None else self.in_odom(xy, now)
 
-    def step(self, now: Situation) -> Following:
+    def step(self, now: Situation, room_m: float) -> Following:
         """Return the motion along the path or the detour, in odom; at its end the path goes on."""
-        motion = now.speed_mps, now.yaw_rate_radps, now.obstacle_m
+        motion = now.speed_mps, now.yaw_rate_radps, room_m
         if self.detour is not None:
             following = self.detour.follower.step(now.stamp_ns, now.pose, *motion)
-            if not self.detour.is_at_end(following):
+            if not following.done and following.left_m >= SHORTEST_M:
                 return following
             self.rejoin(now)
         following = self.follower.step(now.stamp_ns, now.pose_in(self.frame), *motion)
@@ -124,26 +120,25 @@ class Drive:
         setpoint = replace(following.setpoint, heading_rad=wrap_angle(heading_rad - turned_rad))
         return following._replace(setpoint=setpoint)
 
-    def take(self, found: Detour) -> None:
+    def take(self, detour: Detour) -> None:
         """Follow a way of the planner from now on."""
-        self.detour, self.nearest_m = found, math.inf
+        self.detour, self.nearest_m, self.way_s = detour, math.inf, 0.0
 
     def rejoin(self, now: Situation) -> None:
         """Follow the path from where the detour leads to; to a goal straight on."""
-        path, detour, self.nearest_m = self.paths[0], self.detour, math.inf
+        path, detour = self.paths[0], self.detour
         leg, s_m = (0, 0.0) if detour is None else (detour.leg, detour.s_m)
         if path.is_goal:
             path, leg, s_m = goal_path(now.pose_in(self.frame), path.goal, path.final_heading_rad), 0, 0.0
-        self.detour, self.follower = None, Follower(path, self.follower.settings, leg, s_m, now.speed_mps)
+        self.detour, self.nearest_m = None, math.inf
+        self.follower = Follower(path, self.follower.settings, leg, s_m, now.speed_mps)
 
-    def stands_since_s(self, pose: Array, left_m: float, dt_s: float) -> float:
-        """Return the time since the last progress, which is a shorter way left or a turn; dt_s: since the last call."""
-        turned_rad = abs(wrap_angle(float(pose[2]) - self.heading_rad))
+    def advance(self, now: Situation, left_m: float, dt_s: float) -> None:
+        """Count the time since the last progress, which is a shorter way left or a turn, and that on this way."""
+        turned_rad = abs(wrap_angle(float(now.pose[2]) - self.heading_rad))
+        self.stuck_s, self.way_s = self.stuck_s + dt_s, self.way_s + dt_s
         if left_m < self.nearest_m - PROGRESS_M or turned_rad > PROGRESS_RAD:
-            self.nearest_m, self.heading_rad, self.stuck_s = left_m, float(pose[2]), 0.0
-        else:
-            self.stuck_s += dt_s
-        return self.stuck_s
+            self.nearest_m, self.heading_rad, self.stuck_s = left_m, float(now.pose[2]), 0.0
 
 
 class Navigation(NamedTuple):
@@ -156,22 +151,78 @@ class Navigation(NamedTuple):
     offset_m: float = math.nan  # distance of the base to the left of the path
 
 
+class Rule(NamedTuple):
+    """A reason to stand, in the order in which it is looked for, or to end the drive."""
+
+    state: NavigationState
+    words: Callable[[Drive, Situation, NavigationSettings], str]  # empty: it does not hold
+
+
+def _stopped(drive: Drive, now: Situation, settings: NavigationSettings) -> str:
+    return ASKED if _fault(drive, now) == ASKED else ""
+
+
+def _fault(drive: Drive, now: Situation) -> str:
+    """Return the fault that has disarmed; between two poses it may have been armed again, which alone moves nothing."""
+    wheels = now.wheels
+    return wheels.halted_by if wheels.halts != drive.halts else wheels.disarmed_by if wheels.needs_request else ""
+
+
+def _new_odom(drive: Drive, now: Situation, settings: NavigationSettings) -> str:
+    is_lost = drive.resets != now.resets and drive.frame is NavigationFrame.ODOM
+    return "odometry has lost its map and begun again: ask again" if is_lost else ""
+
+
+def _paused(drive: Drive, now: Situation, settings: NavigationSettings) -> str:
+    fault = _fault(drive, now)
+    drive.paused = f"disarmed: {fault}: see to it, then {RESUME}" if fault else drive.paused
+    return drive.paused
+
+
+def _lost(drive: Drive, now: Situation, settings: NavigationSettings) -> str:
+    return "odometry is lost" if now.state is TrackingState.LOST else ""
+
+
+def _not_in_map(drive: Drive, now: Situation, settings: NavigationSettings) -> str:
+    if drive.frame is NavigationFrame.ODOM or drive.unlocalised_m <= settings.unlocalised_m:
+        return ""
+    return refusal_of_map(now, settings.map_sigma_m).partition(":")[0] or "not localised"
+
+
+def _operated(drive: Drive, now: Situation, settings: NavigationSettings) -> str:
+    source = now.wheels.source
+    return "" if source in ("", PLANNER) else f"{source} drives: it goes on when that ends"
+
+
+# The first rule that holds decides: an end is final, everything else is waited for.
+RULES: Final = (
+    Rule(NavigationState.CANCELLED, _stopped),
+    Rule(NavigationState.FAILED, _new_odom),
+    Rule(NavigationState.PAUSED, _paused),
+    Rule(NavigationState.NOT_LOCALISED, _lost),
+    Rule(NavigationState.NOT_LOCALISED, _not_in_map),
+    Rule(NavigationState.PAUSED, _operated),
+)
+
+
+@dataclass(slots=True)
 class Navigator:
     """Holds the present drive, if there is one."""
 
-    def __init__(self, settings: NavigationSettings, collision: CollisionSettings | None = None) -> None:
-        """collision: the outline of the base; None: the default one."""
-        self._settings = settings
-        collision = collision or CollisionSettings()
-        self._planner = Planner(settings, collision)
-        self._stands_m = collision.front_m + 2 * collision.stop_m  # where it waits, from the first point of a block
-        self._last_ns: int | None = None
-        self._stops = 0  # number of stops that are still to be sent
-        self.drive: Drive | None = None
-        self.state = NavigationState.IDLE
-        self.reason = ""
-        self.task = ""  # description of the drive, kept after its end
-        self.command_ns = 0  # stamp of the request for the drive
+    settings: NavigationSettings
+    collision: CollisionSettings = field(default_factory=CollisionSettings)  # the outline of the base
+    drive: Drive | None = None
+    state: NavigationState = NavigationState.IDLE
+    reason: str = ""
+    task: str = ""  # description of the drive, kept after its end
+    command_ns: int = 0  # stamp of the request for the drive
+    _stops: int = field(default=0, init=False)  # number of stops that are still to be sent
+    _last_ns: int | None = field(default=None, init=False)
+    _planner: Planner = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Make the tables of the planner."""
+        self._planner = Planner(self.settings, self.collision)
 
     @property
     def stopping(self) -> bool:
@@ -182,10 +233,8 @@ class Navigator:
         self, task: str, frame: NavigationFrame, paths: list[DrivePath], now: Situation, command_ns: int = 0
     ) -> None:
         """Begin a drive, which replaces the one before."""
-        follower, heading_rad = Follower(paths[0], self._settings), float(now.pose[2])
-        self.drive = Drive(
-            task, frame, paths, follower, now.resets, command_ns, halts=now.wheels.halts, heading_rad=heading_rad
-        )
+        follower, pose = Follower(paths[0], self.settings), now.pose
+        self.drive = Drive(task, frame, paths, follower, now.resets, now.wheels.halts, float(pose[2]), pose[:2].copy())
         self.task, self.command_ns, self._stops = task, command_ns, 0
         self.state, self.reason = NavigationState.DRIVING, ""
 
@@ -213,152 +262,133 @@ class Navigator:
     def step(self, now: Situation) -> Navigation:
         """Return the motion for a new pose, and the state with its reason."""
         dt_s = 0.0 if self._last_ns is None else min(max((now.stamp_ns - self._last_ns) * 1e-9, 0.0), LONGEST_STEP_S)
-        self._last_ns = now.stamp_ns
-        drive = self.drive
+        self._last_ns, drive, settings = now.stamp_ns, self.drive, self.settings
         if drive is None:
-            return self._idle()
-        # 1. The wheels: a stop ends the drive, a fault that needs a person pauses it.
-        self._check_wheels(drive, now)
-        if self.drive is None:
-            return self._idle()
-        # 2. The pose: without it nothing is sent, and the wheels stop.
-        self._advance(drive, now)
-        halt = self._halt(drive, now)
-        if halt is not None:
-            return self._wait(drive, *halt, dt_s)
-        # 3. The way.
-        following = drive.step(now)
+            self._stops, stop = max(self._stops - 1, 0), STAND if self._stops else None
+            return Navigation(stop, self.state, self.reason)
+        # 1. Wheels, pose, and who else drives.
+        self._follow_map(drive, now)
+        for rule in RULES:
+            words = rule.words(drive, now, settings)
+            if words:
+                return self._halt(drive, rule.state, words, dt_s)
+        drive.resets = now.resets
+        # 2. The way.
+        following = drive.step(now, self._room_m(drive, now))
         if following.done:
             return self._finished(drive, following.missed_m)
-        if abs(following.offset_m) > self._settings.corridor_m + self._planner.room_m:
-            return self._failed(f"{abs(following.offset_m):.1f} m beside the path: drive back to it and ask again")
+        if abs(following.offset_m) > settings.corridor_m + self._planner.room_m:
+            return self._end(
+                NavigationState.FAILED,
+                f"{abs(following.offset_m):.1f} m beside the path: drive back to it and ask again",
+            )
         if following.left_m < drive.least_m - NEARER_M:
-            drive.least_m, drive.ways, drive.blocked_s = following.left_m, 0, 0.0
-        # 4. Obstacles on it, and a safety rule that holds the wheels because of one.
+            drive.least_m, drive.ways, drive.lost_s, drive.tried_s = following.left_m, 0, 0.0, 0.0
+        # 3. Obstacles on it, and a safety rule that holds the wheels because of one.
         following, setpoint, reason = self._around_obstacles(drive, now, following)
         held_by = now.wheels.held_by
         if setpoint is None or held_by:  # where it is held, the setpoint is still sent: the monitor lets go by itself
-            return self._blocked(drive, reason if setpoint is None else held_by, now, following, dt_s, setpoint)
-        # 5. Progress: where it is missing for too long, the drive fails.
+            return self._blocked(drive, reason if setpoint is None else held_by, following, dt_s, setpoint)
+        # 4. Progress: where it is missing for too long, the drive fails.
         avoids = drive.detour is not None
-        if drive.stands_since_s(now.pose, following.left_m, dt_s) > self._settings.stuck_s:
-            return self._no_progress(now, AROUND if avoids else "")
+        drive.advance(now, following.left_m, dt_s)
+        if drive.stuck_s > settings.stuck_s:
+            why = now.wheels.reason if now.wheels.is_held else AROUND if avoids else ""
+            parts = f"no progress for {settings.stuck_s:g} s", why, "look at the robot"
+            return self._end(NavigationState.FAILED, ": ".join(part for part in parts if part))
         self.state = NavigationState.AVOIDING if avoids else NavigationState.DRIVING
-        self.reason = now.wheels.reason if now.wheels.is_held else reason
-        drive.waited_s = 0.0
+        self.reason, drive.waited_s = now.wheels.reason if now.wheels.is_held else reason, 0.0
         return Navigation(setpoint, self.state, self.reason, following.left_m, following.offset_m)
 
-    def _idle(self) -> Navigation:
-        if self._stops:
-            self._stops -= 1
-            return Navigation(STAND, self.state, self.reason)
-        return Navigation(None, self.state, self.reason)
-
-    def _check_wheels(self, drive: Drive, now: Situation) -> None:
-        wheels = now.wheels
-        # Between two poses it may have been armed again, which alone moves nothing.
-        by = wheels.halted_by if wheels.halts != drive.halts else wheels.disarmed_by if wheels.needs_request else ""
-        if by == ASKED:
-            self._end(NavigationState.CANCELLED, ASKED)
-        elif by:
-            drive.paused = f"disarmed: {by}: see to it, then {RESUME}"
-
-    def _advance(self, drive: Drive, now: Situation) -> None:
-        """Add the way since the last pose to that without a pose in the map; begin again after a reset."""
-        moved_m = 0.0 if drive.last_xy is None else float(np.hypot(*(now.pose[:2] - drive.last_xy)))
-        drive.last_xy = now.pose[:2].copy()
-        drive.unlocalised_m += moved_m
+    def _follow_map(self, drive: Drive, now: Situation) -> None:
+        """Add the way since the last pose to that without a pose in the map; leave a way of an odom that is lost."""
+        drive.unlocalised_m += float(np.hypot(*(now.pose[:2] - drive.xy)))
+        drive.xy = now.pose[:2].copy()
         if drive.resets != now.resets:
-            drive.detour, drive.resets, drive.unlocalised_m = None, now.resets, math.inf
-            if drive.frame is NavigationFrame.ODOM:
-                self._end(NavigationState.FAILED, "odometry has lost its map and begun again: ask again")
+            drive.detour, drive.unlocalised_m = None, math.inf
         in_map = now.in_map
         if in_map is None or in_map.stamp_ns <= drive.localised_ns:  # no new pose in the map has come
             return
-        if in_map.state is MapState.LOCALIZED and in_map.sigma_m <= self._settings.map_sigma_m:
+        if in_map.state is MapState.LOCALIZED and in_map.sigma_m <= self.settings.map_sigma_m:
             drive.unlocalised_m, drive.localised_ns = 0.0, in_map.stamp_ns
         elif in_map.sigma_m > UNKNOWN_M:
             drive.unlocalised_m = math.inf
 
-    def _halt(self, drive: Drive, now: Situation) -> tuple[NavigationState, str] | None:
-        """Return why the base must wait at this pose."""
-        if self.drive is None:
-            return self.state, self.reason
-        if drive.paused:
-            return NavigationState.PAUSED, drive.paused
-        if now.state is TrackingState.LOST:
-            return NavigationState.NOT_LOCALISED, "odometry is lost"
-        if drive.frame is NavigationFrame.MAP and drive.unlocalised_m > self._settings.unlocalised_m:
-            reason = refusal_of_map(now, self._settings.map_sigma_m)
-            return NavigationState.NOT_LOCALISED, reason.partition(":")[0] or "not localised"
-        if now.wheels.source not in ("", PLANNER):
-            return NavigationState.PAUSED, f"{now.wheels.source} drives: it goes on when that ends"
-        return None
-
-    def _wait(self, drive: Drive, state: NavigationState, reason: str, dt_s: float) -> Navigation:
-        """Stand and count the time; fail where the pose in the map is missing for too long."""
-        if self.drive is None:
-            return self._idle()
+    def _halt(self, drive: Drive, state: NavigationState, reason: str, dt_s: float) -> Navigation:
+        """Stand and count the time, or end; fail where the pose in the map is missing for too long."""
+        if state.is_end:
+            return self._end(state, reason)
         if state is NavigationState.NOT_LOCALISED:
             drive.waited_s += dt_s
-            if drive.waited_s > self._settings.unlocalised_s:
-                return self._failed(f"{state} for {self._settings.unlocalised_s:g} s: {reason}")
+            if drive.waited_s > self.settings.unlocalised_s:
+                return self._end(NavigationState.FAILED, f"{state} for {self.settings.unlocalised_s:g} s: {reason}")
         self.state, self.reason = state, reason
-        setpoint = None if state is NavigationState.PAUSED else STAND
-        return Navigation(setpoint, state, reason)
+        return Navigation(None if state is NavigationState.PAUSED else STAND, state, reason)
+
+    def _room_m(self, drive: Drive, now: Situation) -> float:
+        """Return the distance of the outline from what stands nearest to the base, and its front, on the way."""
+        if now.around is None:
+            return math.inf
+        near = drive.ahead(now, self.collision.front_m)
+        return float(now.around.room_at(near).min()) - self.collision.half_width_m
 
     def _around_obstacles(
         self, drive: Drive, now: Situation, following: Following
     ) -> tuple[Following, Setpoint | None, str]:
         """Return progress, motion and the reason why it is slower than wanted; no motion where no way is free."""
-        around, wanted = self._surroundings(now), following.setpoint
+        around, wanted = now.around, following.setpoint
         if around is None or drive.on_way.aligns:
             return following, wanted, ""
         # 1. Where the way is blocked another one is searched, and where that to a goal may be shorter by now.
-        room_m = self._planner.room_m + (self._settings.clearance_m if drive.detour is None else 0.0)
-        first_m = first_blocked_m(drive.ahead(now, LOOK_M), around.obstacles, room_m)
-        is_blocked = first_m < math.inf or bool(now.wheels.held_by)
-        if self._takes_other_way(drive, now, around, following, is_blocked=is_blocked):
-            following = drive.step(now)
+        pursuit, room_m = self.settings.pursuit, self._planner.room_m
+        look = now.stamp_ns, pursuit.velocity_mps
+        kept_m = room_m + (self.settings.clearance_m if drive.detour is None else 0.0)
+        first_m = around.first_blocked_m(drive.ahead(now, LOOK_M), kept_m, *look)
+        if self._takes_other_way(drive, now, around, following, is_closed=first_m < math.inf):
+            following = drive.step(now, self._room_m(drive, now))
             wanted = following.setpoint
-            first_m = first_blocked_m(drive.ahead(now, LOOK_M), around.obstacles, self._planner.room_m)
+            first_m = around.first_blocked_m(drive.ahead(now, LOOK_M), room_m, *look)
         # 2. Without a way around it, drive up to the obstacle and wait.
-        left_m = first_m - self._stands_m
+        left_m = first_m - self.collision.front_m - 2 * self.collision.stop_m
         if left_m <= 0 and wanted.velocity_mps > 0:
-            return following, None, STANDS if now.moving is None else CROSSES
-        braking_mps = math.sqrt(2 * BRAKE_SHARE * self._settings.pursuit.acceleration_mps2 * max(left_m, 0.0))
-        return following, _slower(wanted, braking_mps), ""
+            return following, None, CROSSES if around.moves else STANDS
+        braking_mps = math.sqrt(2 * BRAKE_SHARE * pursuit.acceleration_mps2 * max(left_m, 0.0))
+        share = min(1.0, braking_mps / wanted.velocity_mps) if wanted.velocity_mps > 0 else 1.0
+        slower = Setpoint(share * wanted.velocity_mps, wanted.heading_rad, share * wanted.yaw_rate_radps)
+        return following, slower, ""
 
     def _takes_other_way(
-        self, drive: Drive, now: Situation, around: Surroundings, following: Following, *, is_blocked: bool
+        self, drive: Drive, now: Situation, around: Surroundings, following: Following, *, is_closed: bool
     ) -> bool:
-        """True if the base takes another way from now on.
+        """True if the base takes another way from now on; is_closed: something stands or comes in the present one.
 
         A long way round, where the path or who moves was in the way, is taken once as much time was lost by waiting:
         nobody knows when the way is free again, and so at most twice the least time is lost (the ski rental problem).
         """
-        detour, settings = drive.detour, self._settings
-        is_to_goal = detour is not None and drive.paths[0].is_goal
-        if is_to_goal and not is_blocked and self._can_go_straight(drive, now, around):
-            drive.rejoin(now)
-            return True
+        detour, settings, path = drive.detour, self.settings, drive.paths[0]
+        is_to_goal, is_blocked = detour is not None and path.is_goal, is_closed or bool(now.wheels.held_by)
+        if is_to_goal and not is_blocked:
+            goal = drive.in_odom(path.goal[None], now)[0]
+            if self._planner.is_straight_free(now.pose, goal, around, now.stamp_ns):
+                drive.rejoin(now)
+                return True
         is_due = is_blocked or (is_to_goal and following.left_m > DOCK_M)
         passed_ns = now.stamp_ns - drive.searched_ns
         if not is_due or not settings.corridor_m or passed_ns < (AGAIN_NS if is_blocked else SHORTER_NS):
             return False
-        drive.searched_ns = now.stamp_ns
-        barred = _kind(following.setpoint) if now.wheels.held_by else None
-        found = self._search(drive, now, around, barred)
-        drive.is_waiting = False
+        drive.searched_ns, drive.is_waiting = now.stamp_ns, False
+        if is_blocked and detour is not None:
+            drive.tried_s, drive.way_s = drive.tried_s + drive.way_s, 0.0
+        found = self._search(drive, now, around, _kind(following.setpoint) if now.wheels.held_by else None)
         if not isinstance(found, str) and is_blocked and drive.ways >= MOST_WAYS:
             found = f"{drive.ways} ways were tried"
         if isinstance(found, str):
             drive.no_way = found
             return False
+        drive.no_way = ""
         if is_blocked:
-            free_s = self._planner.free_s(now.pose, drive.ahead(now, following.left_m), around)
-            may_leave = detour is None or now.moving is not None
-            worth_s = free_s + LOOK_M / settings.pursuit.velocity_mps + drive.blocked_s
+            may_leave = is_closed and (detour is None or around.moves)
+            worth_s = (following.left_m + LOOK_M) / settings.pursuit.velocity_mps + drive.lost_s
             drive.is_waiting = may_leave and found.time_s > worth_s
             if drive.is_waiting:
                 return False
@@ -370,109 +400,63 @@ class Navigator:
         drive.take(found)
         return True
 
-    def _surroundings(self, now: Situation) -> Surroundings | None:
-        """Return what is about the base; what moves is an obstacle where the base would meet it."""
-        if now.obstacles is None:
-            return None
-        obstacles = now.obstacles
-        if now.moving is not None:
-            meetings = now.moving.meetings(now.pose[:2], self._settings.pursuit.velocity_mps)
-            obstacles = np.vstack([now.moving.others(obstacles), meetings])
-        return Surroundings(obstacles, now.floor)
-
     def _search(self, drive: Drive, now: Situation, around: Surroundings, barred: Move | None) -> Detour | str:
         """Return a way to the goal, or to the path behind what is on it; why there is none otherwise."""
-        settings, path = self._settings, drive.paths[0]
+        settings, path = self.settings, drive.paths[0]
         place, corridor, heading_rad = (0, 0.0), None, math.nan
         if path.is_goal:
             goal = drive.in_odom(path.goal[None], now)[0]
         else:
             ahead = drive.follower.ahead(2 * LOOK_M)
             corridor = drive.in_odom(ahead.xy, now)
-            obstacles = around.obstacles
-            if barred is not None and around.floor is not None:  # by floor that is not seen
-                obstacles = np.vstack([obstacles, around.floor.closed(now.pose, at_unknown=False)])
-            k = _behind(corridor, obstacles, self._planner.room_m + settings.clearance_m)
+            of = around.room_m if barred is None else around.closed_m  # by floor that is not seen
+            near_m = around.near_m(corridor, now.stamp_ns, settings.pursuit.velocity_mps, of)
+            k = _behind(corridor, near_m < self._planner.room_m + settings.clearance_m)
             if k is None:
                 return "the path is not free within sight"
             goal, place = corridor[k], (int(ahead.legs[k]), float(ahead.s[k]))
             leg = path.legs[min(place[0], len(path.legs) - 1)]
             heading_rad = leg.at(place[1])[2] + (math.pi if leg.backwards else 0.0)
             heading_rad -= float(now.T_frame_odom(drive.frame)[2])
-        found = self._planner.way(now.pose, goal, around, corridor, heading_rad, barred)
+        found = self._planner.way(
+            now.pose, goal, around, now.stamp_ns, along=corridor, heading_rad=heading_rad, barred=barred
+        )
         if isinstance(found, str):
             return found
         return Detour(Follower(found.path, settings, speed_mps=now.speed_mps), found.time_s, *place)
 
-    def _can_go_straight(self, drive: Drive, now: Situation, around: Surroundings) -> bool:
-        """True if the goal is ahead and nothing is on the straight way to it, with a cell to spare."""
-        straight = goal_path(now.pose, drive.in_odom(drive.paths[0].goal[None], now)[0]).legs[0]
-        aside_rad = abs(wrap_angle(float(straight.heading[0] - now.pose[2])))
-        room_m = self._planner.room_m + self._settings.clearance_m + CELL_M
-        obstacles = around.obstacles
-        if around.floor is not None:
-            obstacles = np.vstack([obstacles, around.floor.closed(now.pose, at_unknown=True)])
-        return aside_rad < math.pi / 4 and math.isinf(first_blocked_m(straight.xy, obstacles, room_m))
-
     def _blocked(
-        self, drive: Drive, reason: str, now: Situation, following: Following, dt_s: float, setpoint: Setpoint | None
+        self, drive: Drive, reason: str, following: Following, dt_s: float, setpoint: Setpoint | None
     ) -> Navigation:
         """Wait for a free way; fail if for too long none leads to a goal. Paths and routes never give up."""
-        drive.blocked_s += dt_s
-        if drive.paths[0].is_goal and not drive.is_waiting and 0 < self._settings.give_up_s < drive.blocked_s:
+        drive.lost_s += dt_s
+        lost_s = drive.lost_s + (drive.tried_s if drive.no_way else 0.0)
+        if drive.paths[0].is_goal and not drive.is_waiting and 0 < self.settings.give_up_s < lost_s:
             why = reason if setpoint is not None else drive.no_way or reason
-            return self._failed(f"no way to the goal, {following.left_m:.1f} m are left: {why}")
-        waiting = self._wait(drive, NavigationState.BLOCKED, f"{reason}: {WAITS}", dt_s)
-        if setpoint is not None:
-            waiting = waiting._replace(setpoint=setpoint)
-        return waiting._replace(left_m=following.left_m, offset_m=following.offset_m)
-
-    def _no_progress(self, now: Situation, does: str) -> Navigation:
-        why = now.wheels.reason if now.wheels.is_held else does
-        words = f"no progress for {self._settings.stuck_s:g} s", why, "look at the robot"
-        return self._failed(": ".join(word for word in words if word))
+            return self._end(NavigationState.FAILED, f"no way to the goal, {following.left_m:.1f} m are left: {why}")
+        self.state, self.reason = NavigationState.BLOCKED, f"{reason}: {WAITS}"
+        return Navigation(setpoint or STAND, self.state, self.reason, following.left_m, following.offset_m)
 
     def _finished(self, drive: Drive, missed_m: float) -> Navigation:
         """Begin the next path, or end."""
         if len(drive.paths) > 1:
             del drive.paths[0]
-            drive.follower = Follower(drive.paths[0], self._settings)
-            drive.nearest_m = math.inf
+            drive.follower, drive.nearest_m = Follower(drive.paths[0], self.settings), math.inf
             return Navigation(STAND, self.state, self.reason, drive.paths[0].length_m, 0.0)
-        if missed_m > self._settings.goal_cm * 0.01:
-            return self._failed(f"the goal is missed by {100 * missed_m:.1f} cm")
-        self._end(NavigationState.REACHED, "")
-        return self._idle()._replace(left_m=0.0)
+        if missed_m > self.settings.goal_cm * 0.01:
+            return self._end(NavigationState.FAILED, f"the goal is missed by {100 * missed_m:.1f} cm")
+        return self._end(NavigationState.REACHED, "")._replace(left_m=0.0)
 
-    def _failed(self, reason: str) -> Navigation:
-        self._end(NavigationState.FAILED, reason)
-        return self._idle()
-
-    def _end(self, state: NavigationState, reason: str) -> None:
+    def _end(self, state: NavigationState, reason: str) -> Navigation:
+        """End the drive, with the first of some stops."""
         self.drive, self._stops = None, STOPS
         self.state, self.reason = state, reason
+        return Navigation(STAND, state, reason)
 
 
-def first_blocked_m(path: Array, obstacles: Array, room_m: float) -> float:
-    """Return the way along a path (N, 2) to where it is nearer than a room to an obstacle (M, 2); inf without one.
-
-    What the base is near to already, and drives away from, does not count.
-    """
-    near_m = distances(path, obstacles)
-    is_blocked = near_m < room_m
-    if is_blocked[0]:
-        leaves = np.minimum.accumulate(np.append(True, np.diff(near_m) > -ROUNDING_M))
-        is_blocked &= ~(leaves & np.minimum.accumulate(is_blocked))
-    if not is_blocked.any():
-        return math.inf
-    k = int(np.argmax(is_blocked))
-    return float(np.hypot(*np.diff(path[: k + 1], axis=0).T).sum())
-
-
-def _behind(path: Array, obstacles: Array, room_m: float) -> int | None:
+def _behind(path: Array, is_blocked: NDArray[np.bool_]) -> int | None:
     """Return the first point of a path (N, 2) behind an obstacle about which REJOIN_M of it are free; None without."""
-    ways = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
-    is_blocked = distances(path, obstacles) < room_m
+    ways = np.append(0.0, np.cumsum(np.hypot(*np.diff(path, axis=0).T)))
     free_from = int(np.argmax(is_blocked))
     for k in range(free_from, len(path)):
         if is_blocked[k]:
@@ -487,11 +471,3 @@ def _kind(setpoint: Setpoint) -> Move:
     if setpoint.velocity_mps == 0.0:
         return Move.TURN
     return Move.AHEAD if setpoint.velocity_mps > 0.0 else Move.BACK
-
-
-def _slower(wanted: Setpoint, speed_mps: float) -> Setpoint:
-    """Return the motion on the same arc, limited to a speed ahead."""
-    if wanted.velocity_mps <= speed_mps:
-        return wanted
-    share = speed_mps / wanted.velocity_mps
-    return Setpoint(speed_mps, wanted.heading_rad, wanted.yaw_rate_radps * share)

@@ -180,68 +180,54 @@ def repeated_paths(
     """
     there = route.reversed() if reverse else route
     poses = there.in_map(keyframe)
-    first = _start(poses, pose) if from_start else _joined(poses, there.speeds, _entry(poses, pose), pose)
-    left_m = float(np.hypot(*np.diff(poses[first:, :2], axis=0).T).sum())
-    if loops == 1 and left_m <= BESIDE_M:
+    # 1. Where on it the robot begins: at the start, or at the nearest point by place and heading.
+    away_m = np.hypot(*(poses[:, :2] - pose[:2]).T)
+    least_m, first = (away_m[0], 0) if from_start else (away_m.min(), _nearest(there, poses, pose, away_m))
+    if least_m > ENTRY_M:
+        where = "the start of the route" if from_start else "the route"
+        to = "or begin where it is on the route (from=here)" if from_start else "anywhere on it"
+        raise OmnidError(
+            f"the robot is {least_m:.1f} m away from {where}: drive it there, to within {ENTRY_M:g} m, {to}"
+        )
+    ways_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[first:, :2], axis=0).T)))
+    if loops == 1 and ways_m[-1] <= BESIDE_M:
         raise OmnidError("the robot is at the end of the route: repeat it in reverse, or drive to its start first")
-    paths = [_path(there, poses, first, pose)]
-    if loops == 1:
-        return paths
-    first_way = other_way = _path(there, poses, 0, None)
-    if not route.is_closed:
-        back = there.reversed()
-        other_way = _path(back, back.in_map(keyframe), 0, None)
-    return paths + [other_way if k % 2 else first_way for k in range(1, loops)]
+    # 2. Off the route it joins it farther on, before the next corner.
+    is_beside = away_m[first] > BESIDE_M
+    if is_beside and not from_start:
+        goes_on = (
+            (ways_m <= JOIN * away_m[first])
+            & (np.abs(wrapped(poses[first:, 2] - poses[first, 2])) < CORNER_RAD)
+            & (there.speeds[first:] * there.speeds[first] > 0)
+        )
+        goes_on[0] = True
+        first += int(np.argmin(np.append(goes_on, False))) - 1
+    # 3. The rest of the round, and the others.
+    paths = [_path(there, poses, first, pose if is_beside else None)]
+    if loops > 1:
+        rounds = [there] if route.is_closed else [there, there.reversed()]
+        ways = [_path(each, each.in_map(keyframe), 0) for each in rounds]
+        paths += [ways[k % len(ways)] for k in range(1, loops)]
+    return paths
 
 
-def _entry(poses: Array, pose: Array) -> int:
-    """Return the point of a route at which the robot begins; at the end of a closed one, a new round begins."""
-    away_m = np.hypot(poses[:, 0] - pose[0], poses[:, 1] - pose[1])
+def _nearest(route: Route, poses: Array, pose: Array, away_m: Array) -> int:
+    """Return the nearest point of a route by place and heading; at the end of a closed one, a new round begins."""
     cost = away_m + ENTRY_M_PER_RAD * np.abs(wrapped(poses[:, 2] - pose[2]))
     near = away_m <= ENTRY_M
-    if not near.any():
-        raise OmnidError(
-            f"the robot is {away_m.min():.1f} m away from the route: drive it there, to within "
-            f"{ENTRY_M:g} m, anywhere on it"
-        )
-    if math.dist(poses[0, :2], poses[-1, :2]) <= CLOSED_M:
+    if route.is_closed:
         way_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
         before_end = near & (way_m < way_m[-1] - CLOSED_M)
         near = before_end if before_end.any() else near
     return int(np.argmin(np.where(near, cost, np.inf)))
 
 
-def _start(poses: Array, pose: Array) -> int:
-    """Return the first point of a route. Raise OmnidError where the robot is not near it."""
-    away_m = math.dist(poses[0, :2], pose[:2])
-    if away_m > ENTRY_M:
-        raise OmnidError(
-            f"the robot is {away_m:.1f} m away from the start of the route: drive it there, to within "
-            f"{ENTRY_M:g} m, or begin where it is on the route (from=here)"
-        )
-    return 0
-
-
-def _joined(poses: Array, speeds: Array, first: int, pose: Array) -> int:
-    """Return the point, before the next corner, to which a robot drives that is off the route."""
-    away_m = math.dist(poses[first, :2], pose[:2])
-    if away_m <= BESIDE_M:
-        return first
-    ways_m = np.cumsum(np.hypot(*np.diff(poses[first:, :2], axis=0).T))
-    goes_on = (
-        (ways_m <= JOIN * away_m)
-        & (np.abs(wrapped(poses[first + 1 :, 2] - poses[first, 2])) < CORNER_RAD)
-        & (speeds[first + 1 :] * speeds[first] > 0)
-    )
-    return first + int(np.argmin(np.append(goes_on, False)))
-
-
-def _path(route: Route, poses: Array, first: int, pose: Array | None) -> DrivePath:
-    """Return the path from a point of the route on, from the pose of the robot if one is given."""
+def _path(route: Route, poses: Array, first: int, pose: Array | None = None) -> DrivePath:
+    """Return the path from a point of the route on, from the pose of a robot beside it if one is given."""
     first = min(first, len(poses) - 2)
     xy, speeds = poses[first:, :2], np.maximum(np.abs(route.speeds[first:]), LEAST_MPS)
     backwards = route.speeds[first:] < 0
-    if pose is not None and math.dist(pose[:2], xy[0]) > BESIDE_M:
+    if pose is not None:
         xy = np.vstack([pose[None, :2], xy])
         speeds, backwards = np.append(speeds[:1], speeds), np.append(backwards[:1], backwards)
         backwards[:2] = False

@@ -52,7 +52,7 @@ class NavigationSettings:
     stuck_s: float = 15.0  # wait for progress, with the way free, before it fails, s
     give_up_s: Annotated[
         float, Meta(ge=0, le=86400), "a goal that no way leads to fails after so long, s; 0: it waits for ever"
-    ] = 25.0
+    ] = 20.0
     unlocalised_m: float = 3.0  # way in the map that it drives by odometry alone before it stops, m
     unlocalised_s: float = 60.0  # wait for the pose in the map before it fails
     map_sigma_m: float = 0.3  # largest sigma of the pose in the map, m

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -10,9 +9,8 @@ from numpy.typing import NDArray
 
 from calib.se2_arrays import composed
 from omnid.core.control.safety_rules import COMMAND_STALE, IDLE
-from omnid.core.navigation.floor_map import FloorMap
-from omnid.core.navigation.forecast import Forecast
 from omnid.core.navigation.requests import NavigationFrame
+from omnid.core.navigation.surroundings import Surroundings
 from omnid.tracking_state import MapState, TrackingState
 
 Array = NDArray[np.float64]
@@ -59,10 +57,7 @@ class Situation(NamedTuple):
     resets: int  # how often odometry has begun again
     wheels: WheelState
     in_map: MapPosition | None = None  # None: nothing is known yet
-    obstacles: Array | None = None  # (N, 2) positions in odom, m; None: none are known
-    moving: Forecast | None = None  # those of them that move
-    floor: FloorMap | None = None  # what is known of it in odom; None: all counts as seen
-    obstacle_m: float = math.inf  # distance of the outline from the nearest obstacle that is not behind the base
+    around: Surroundings | None = None  # what is about the base; None: nothing is known of it now
 
     def T_frame_odom(self, frame: NavigationFrame) -> Array:
         """Return the pose of odom in a frame (3,)."""
@@ -96,15 +91,15 @@ def refusal_to_drive(situation: Situation | None, frame: NavigationFrame, map_si
 def refusal_of_map(situation: Situation, map_sigma_m: float) -> str:
     """Return why the pose in the map cannot be used, with the remedy; empty if it can."""
     in_map = situation.in_map
-    if in_map is None or in_map.state is not MapState.LOCALIZED:
-        if in_map is not None and in_map.state is MapState.ODOMETRY_ONLY:
-            return (
-                "not localised in a map: no place of it has been recognised yet: drive it a little where the map was "
-                "made (in a new map: back to where it has been), or use the frame odom"
-            )
+    if in_map is None or in_map.state is MapState.LOST:
         return (
             "not localised in a map: start it with one (`omnid run --map`) and drive it a little where the map "
             "was made, or use the frame odom"
+        )
+    if in_map.state is MapState.ODOMETRY_ONLY:
+        return (
+            "not localised in a map: no place of it has been recognised yet: drive it a little where the map was "
+            "made (in a new map: back to where it has been), or use the frame odom"
         )
     if not in_map.sigma_m <= map_sigma_m:
         return (

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from omnid.core.control.velocity_limits import VelocityLimits
+from omnid.core.control.heading_controller import VelocityLimits
 from omnid.transport import codec
 from tests.bench.faults.mutation import mutated
 from tests.bench.results import ResultTable, columns

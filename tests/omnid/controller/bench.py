@@ -13,11 +13,10 @@ from omnid.controller.link import ControllerStatistics
 from omnid.core.control.arming import AUTOMATIC, ArmRequest
 from omnid.core.control.command_sources import OPERATOR, TimedSetpoint
 from omnid.core.control.control_law import ControllerPose, ControllerSettings
-from omnid.core.control.heading_controller import HeadingLimits, Setpoint
+from omnid.core.control.heading_controller import HeadingLimits, Setpoint, VelocityLimits
 from omnid.core.control.motion_monitor import AGREE, Witness
 from omnid.core.control.safety_rules import Deadlines
 from omnid.core.control.trust import TrustSettings
-from omnid.core.control.velocity_limits import VelocityLimits
 from omnid.engine.telemetry import StageStats
 
 PERIOD_S = 0.05

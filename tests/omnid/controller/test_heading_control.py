@@ -17,10 +17,13 @@ from omnid.controller.controller import Controller
 from omnid.core.control.arming import AUTOMATIC, ArmRequest
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControllerPose, ControllerSettings
-from omnid.core.control.heading_controller import HeadingLimits, Setpoint
-from omnid.core.control.heading_goal import longest_lead_rad
+from omnid.core.control.heading_controller import (
+    HeadingLimits,
+    Setpoint,
+    VelocityLimits,
+    longest_lead_rad,
+)
 from omnid.core.control.safety_rules import POSE_JUMPED, Deadlines
-from omnid.core.control.velocity_limits import VelocityLimits
 from tests.contract.pty_motor import PtyMotor
 
 PERIOD_S = 0.05

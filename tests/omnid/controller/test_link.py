@@ -30,9 +30,8 @@ from omnid.core.control.collision_monitor import BLOCKED, REMEDY, RING_STALE, Co
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.contacts import BUMPER, CLIFF
 from omnid.core.control.control_law import ControllerPose, ControllerSettings
-from omnid.core.control.heading_controller import Setpoint
+from omnid.core.control.heading_controller import Setpoint, VelocityLimits
 from omnid.core.control.safety_rules import Deadlines
-from omnid.core.control.velocity_limits import VelocityLimits
 from omnid.engine.realtime import RealtimeSettings
 from omnid.engine.telemetry import StageStats
 from omnid.errors import OmnidError

@@ -31,10 +31,15 @@ from omnid.core.control.collision_monitor import (
 from omnid.core.control.command_sources import OPERATOR, PLANNER, TimedSetpoint
 from omnid.core.control.contacts import BUMPER, CLIFF, NO_CONTACT
 from omnid.core.control.control_law import ControllerPose
-from omnid.core.control.heading_controller import LONGEST_TICK_S, Setpoint, Twist, wrap_angle
-from omnid.core.control.heading_goal import longest_lead_rad
+from omnid.core.control.heading_controller import (
+    LONGEST_TICK_S,
+    STOP,
+    Setpoint,
+    Twist,
+    longest_lead_rad,
+    wrap_angle,
+)
 from omnid.core.control.motion_monitor import AGREE, WITNESSES, Witness
-from omnid.core.control.velocity_limits import STOP
 from tests.omnid.controller.bench import LIMITS, PERIOD_NS, PERIOD_S, SETTINGS
 
 TICKS = 6_000

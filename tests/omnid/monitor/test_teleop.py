@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from omnid.core.control.velocity_limits import VelocityLimits
+from omnid.core.control.heading_controller import VelocityLimits
 from omnid.monitor.teleop import HOLD_S, Stick
 
 LIMITS = VelocityLimits(velocity_mps=1.0, yaw_rate_radps=2.0)

@@ -12,9 +12,8 @@ import pytest
 from calib import se3
 from drivers.motor import VelocityCommand
 from omnid.core.control.control_law import ControllerSettings, ReplaySetpoint
-from omnid.core.control.heading_controller import HeadingLimits
+from omnid.core.control.heading_controller import HeadingLimits, VelocityLimits
 from omnid.core.control.safety_rules import Deadlines
-from omnid.core.control.velocity_limits import VelocityLimits
 from omnid.messages import OdometryUpdate
 from omnid.stages.lockstep_drive import LockstepDrive, controller_pose
 from omnid.tracking_state import TrackingState

@@ -12,6 +12,7 @@ import pytest
 from calib import se3
 from calib.se2_arrays import planar, transform
 from omnid.core.control.collision_monitor import UNKNOWN, CollisionSettings
+from omnid.core.mapping.range_scan import RangeScan
 from omnid.core.navigation.navigator import CROSSES
 from omnid.core.navigation.requests import (
     GoalRequest,
@@ -33,6 +34,7 @@ from omnid.runs.route_files import RouteFiles
 from omnid.stages.navigation import NavigationStage
 from omnid.stages.routes import Routes
 from omnid.tracking_state import MapState, TrackingState
+from tests.omnid.core.navigation.driven_base import Floor
 
 T_BASE_RIG = se3.transform(se3.rotation_exp([0.0, 0.0, 0.5]), [0.1, -0.2, 0.9])
 T_MAP_ODOM = transform(np.array([2.0, -1.0, 0.3]))  # of the base's frames
@@ -123,6 +125,13 @@ class Robot:
         )
         return update
 
+    def see(
+        self, ranges: RangeScan, free: RangeScan, moving: tuple[MovingObstacle, ...] = (), *, age_ns: int = 0
+    ) -> None:
+        """Send a ring from the origin."""
+        grid, stamp_ns = Floor().grid(np.zeros(3), ranges, np.minimum(free, 6.0)), self.seq * PERIOD_NS - age_ns
+        self.stage.process(ObstacleRing(1, stamp_ns, ranges, ranges, free, np.eye(4), moving, grid=grid))
+
     def run(self, periods: int = 600) -> NavigationUpdate:
         """Advance until the drive has ended."""
         for _ in range(periods):
@@ -189,7 +198,7 @@ def test_a_ring_makes_it_wait_and_an_old_one_does_not(tmp_path: Path) -> None:
         robot.pass_on()
         robot.send(GoalRequest(ODOM, 3.0, 0.0))
         ranges = np.full(360, 0.5, np.float32)
-        robot.stage.process(ObstacleRing(1, robot.seq * PERIOD_NS - age_ns, ranges, ranges, ranges, np.eye(4)))
+        robot.see(ranges, ranges, age_ns=age_ns)
         for _ in range(8):
             robot.pass_on()
         assert robot.updates[-1].state is expected
@@ -202,7 +211,7 @@ def test_somebody_who_crosses_is_let_pass(tmp_path: Path) -> None:
         robot.pass_on()
         robot.send(GoalRequest(ODOM, 4.0, 0.0))
         ranges = np.full(360, np.inf, np.float32)
-        robot.stage.process(ObstacleRing(1, robot.seq * PERIOD_NS, ranges, ranges, ranges, np.eye(4), moving))
+        robot.see(ranges, ranges, moving)
         for _ in range(8):
             robot.pass_on()
         waits_or_avoids = robot.updates[-1].state is NavigationState.AVOIDING or robot.updates[-1].reason == CROSSES
@@ -215,7 +224,7 @@ def test_unknown_floor_that_stops_the_wheels_is_passed(tmp_path: Path) -> None:
     robot.send(GoalRequest(ODOM, 4.0, 0.0))
     ranges, free = np.full(360, np.inf, np.float32), np.full(360, 6.0, np.float32)
     free[165:195] = 0.6
-    robot.stage.process(ObstacleRing(1, robot.seq * PERIOD_NS, ranges, ranges, free, np.eye(4)))
+    robot.see(ranges, free)
     robot.stage.process(WheelState(True, False, held_by=UNKNOWN))
     robot.pass_on()
     assert robot.updates[-1].state is NavigationState.BLOCKED

@@ -41,7 +41,7 @@ from omnid.navigation_state import NavigationState
 from omnid.runs.route_files import RouteFiles
 from omnid.stages.navigation import NavigationStage
 from omnid.tracking_state import MapState, TrackingState
-from tests.omnid.core.navigation.driven_base import wheel_state
+from tests.omnid.core.navigation.driven_base import Floor, wheel_state
 from tests.omnid.stages.test_navigation import fixed_map
 
 Array = NDArray[np.float64]
@@ -211,11 +211,9 @@ class Walk:
             )
         self.law.take(ControllerRing(self.now_ns, tuple(ranges.tolist())))
         self.ringed_s = self.t_s
-        self.stage.process(
-            ObstacleRing(
-                self.seq, self.now_ns, ranges, np.full(360, 0.01, np.float32), ranges, transform(self.pose), moving
-            )
-        )
+        grid, sigma_m = Floor(all_seen=True).grid(self.pose, ranges), np.full(360, 0.01, np.float32)
+        found = ranges, sigma_m, ranges, transform(self.pose), moving
+        self.stage.process(ObstacleRing(self.seq, self.now_ns, *found, grid=grid))
 
     def tick(self) -> None:
         """Tick, and hold the motion against the oracle."""

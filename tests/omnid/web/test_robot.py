@@ -17,7 +17,7 @@ from starlette.requests import Request as WebRequest
 from starlette.routing import Route
 
 from omnid.client import Robot
-from omnid.core.control.velocity_limits import VelocityLimits
+from omnid.core.control.heading_controller import VelocityLimits
 from omnid.monitor.navigation import stop
 from omnid.monitor.robot_state import ReceivedMessage
 from omnid.monitor.teleop import FIRST_SHARE, limits_of

@@ -12,9 +12,8 @@ from omnid.core.control.arming import AUTOMATIC
 from omnid.core.control.collision_monitor import CollisionSettings, ControllerRing
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControlLaw, ControllerPose, ControllerSettings
-from omnid.core.control.heading_controller import Setpoint
+from omnid.core.control.heading_controller import Setpoint, VelocityLimits
 from omnid.core.control.safety_rules import IDLE, POSE_JUMPED
-from omnid.core.control.velocity_limits import VelocityLimits
 
 TICK_NS, TICK_S = 20_000_000, 0.02
 START_NS = 10**12

@@ -7,9 +7,12 @@ import random
 
 import pytest
 
-from omnid.core.control.heading_controller import HeadingLimits, wrap_angle
-from omnid.core.control.heading_goal import HeadingGoal
-from omnid.core.control.velocity_limits import VelocityLimits
+from omnid.core.control.heading_controller import (
+    HeadingGoal,
+    HeadingLimits,
+    VelocityLimits,
+    wrap_angle,
+)
 
 HEADING = HeadingLimits(yaw_rate_radps=0.8, yaw_acceleration_radps2=4.0)
 LIMITS = VelocityLimits(yaw_rate_radps=1.2, yaw_acceleration_radps2=2.0)

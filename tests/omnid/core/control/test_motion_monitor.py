@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import pytest
 
-from omnid.core.control.heading_controller import Twist
+from omnid.core.control.heading_controller import Twist, VelocityLimits
 from omnid.core.control.motion_monitor import (
     NOT_COMMANDED,
     NOT_FOLLOWED,
@@ -19,7 +19,6 @@ from omnid.core.control.motion_monitor import (
     MotionMonitor,
     MotionSettings,
 )
-from omnid.core.control.velocity_limits import VelocityLimits
 
 TICK_S, POSE_S, DELAY_S = 0.05, 0.1, 0.15  # of the ticks, of the poses, from an image to the arrival of its pose
 NS = 10**9

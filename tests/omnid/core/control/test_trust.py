@@ -7,11 +7,10 @@ from dataclasses import replace
 
 import pytest
 
-from omnid.core.control.heading_controller import Twist
+from omnid.core.control.heading_controller import Twist, VelocityLimits
 from omnid.core.control.motion_monitor import Motion, MotionSettings
 from omnid.core.control.safety_rules import SafetyInputs
 from omnid.core.control.trust import POSE_DEGRADED, MotorReport, Plausibility, TrustSettings
-from omnid.core.control.velocity_limits import VelocityLimits
 
 NS = 10**9
 LIMITS = VelocityLimits(velocity_mps=0.8, yaw_rate_radps=1.5)
@@ -65,12 +64,10 @@ def test_a_battery_is_empty_once_its_voltage_stays_low() -> None:
 
 @pytest.mark.parametrize("fault", [1, -1, 1 << 31])
 def test_a_fault_counts_while_it_is_reported(fault: int) -> None:
-    for mode, expected in (("stop", True), ("ignore", False)):
-        plausibility = Plausibility(replace(TrustSettings(), motor_fault=mode), MotionSettings())
-        plausibility.add_report(0, MotorReport(STILL, fault))
-        assert judged(plausibility).motor_faulty is expected
-        plausibility.add_report(1, MotorReport(STILL, 0))
-        assert not judged(plausibility).motor_faulty
+    plausibility = Plausibility(TrustSettings(), MotionSettings())
+    for reported in (fault, 0, fault):
+        plausibility.add_report(0, MotorReport(STILL, reported))
+        assert judged(plausibility).motor_faulty is bool(reported)
 
 
 @pytest.mark.parametrize("side", [1, -1])

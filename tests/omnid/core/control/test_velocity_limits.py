@@ -7,8 +7,7 @@ import random
 
 import pytest
 
-from omnid.core.control.heading_controller import LONGEST_TICK_S, Twist
-from omnid.core.control.velocity_limits import STOP, VelocityLimits
+from omnid.core.control.heading_controller import LONGEST_TICK_S, STOP, Twist, VelocityLimits
 
 LIMITS = VelocityLimits(velocity_mps=0.8, acceleration_mps2=0.5, deceleration_mps2=2.0, yaw_rate_radps=1.5,
                        yaw_acceleration_radps2=3.0)  # fmt: skip

@@ -16,6 +16,7 @@ from omnid.core.control.control_law import ControlLaw, ControllerPose, Controlle
 from omnid.core.control.motion_monitor import MotionSettings
 from omnid.core.navigation.navigator import Navigation, Navigator
 from omnid.core.navigation.situation import MapPosition, Situation, WheelState
+from omnid.core.obstacles.grid import CELL_M, SIDE, FloorGrid
 from omnid.tracking_state import MapState, TrackingState
 
 Array = NDArray[np.float64]
@@ -23,6 +24,7 @@ TICK_S = 0.02
 TRACK_M = 0.4
 LAG_S = 0.1
 AGE_S = 0.08  # of a pose when it is known
+OWN_M = 0.25  # the base stands on floor
 
 
 def wheel_state(law: ControlLaw) -> WheelState:
@@ -31,6 +33,33 @@ def wheel_state(law: ControlLaw) -> WheelState:
     source = "" if law.reason or current is None else current.source
     held_by = law.collision.reason if law.collision.holds else ""
     return WheelState(arming.armed, arming.needs_request, arming.reason, law.reason, source, held_by)
+
+
+class Floor:
+    """The grid of the obstacles as rings fill it: cells of odom are free as far as a ring says, and stay known."""
+
+    def __init__(self, *, all_seen: bool = False) -> None:
+        """all_seen: what is no obstacle counts as free, everywhere about the base."""
+        self._side, self._all_seen = (SIDE if all_seen else 2 * SIDE), all_seen
+        self._states = np.full((self._side, self._side), 0.0 if all_seen else np.nan, np.float32)
+
+    def grid(self, pose: Array, ranges_m: Array, free_m: Array | None = None) -> FloorGrid:
+        """Return the grid after a ring at a pose (3,)."""
+        middle = np.round(pose[:2] / CELL_M) if self._all_seen else np.zeros(2)
+        corner_m = CELL_M * (middle - self._side // 2)
+        if not self._all_seen:
+            y, x = CELL_M * (np.indices(self._states.shape) + 0.5) + (corner_m - pose[:2])[::-1, None, None]
+            sector = np.floor((np.arctan2(y, x) - (pose[2] - math.pi)) * (360 / math.tau)).astype(int) % 360
+            seen_m = np.where(np.isfinite(ranges_m), ranges_m, 4.0) if free_m is None else free_m
+            self._states[np.hypot(x, y) <= np.maximum(seen_m, OWN_M)[sector]] = 0.0
+        at = np.flatnonzero(np.isfinite(ranges_m))
+        angles = pose[2] - math.pi + (at + 0.5) * (math.tau / 360)
+        points = pose[:2] + ranges_m[at, None] * np.column_stack([np.cos(angles), np.sin(angles)])
+        grid = FloorGrid(corner_m, self._states.copy(), np.zeros(self._states.shape, np.float32))
+        rows, columns = grid.at(points)
+        inside = (np.minimum(rows, columns) >= 0) & (np.maximum(rows, columns) < self._side)
+        grid.occupied[rows[inside], columns[inside]] = 1.0
+        return grid
 
 
 class Sample(NamedTuple):
@@ -75,7 +104,6 @@ class DrivenBase:
         self._every = round(1.0 / pose_hz / TICK_S)
         self._ticks = 0
         self._coming: list[tuple[float, Situation]] = []
-        self.obstacle_m = math.inf
 
     @property
     def wheels(self) -> WheelState:
@@ -94,7 +122,6 @@ class DrivenBase:
             self.resets,
             self.wheels,
             MapPosition(self.T_map_odom, state, 0.02, round(self.t_s * 1e9)),
-            obstacle_m=self.obstacle_m,
         )
 
     def tick(self) -> Navigation | None:

@@ -13,6 +13,7 @@ from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.navigation_state import NavigationState
 from tests.omnid.core.navigation.driven_base import DrivenBase
+from tests.omnid.core.navigation.test_planner import Boxes, drive
 
 GOAL_M, GOAL_RAD = 0.03, math.radians(1)
 
@@ -110,13 +111,11 @@ def test_never_exceeds_the_speeds_and_the_yaw_rate_of_the_settings() -> None:
 
 def test_drives_slowly_beside_obstacles() -> None:
     times = []
-    for obstacle_m in (math.inf, 0.15):
-        base = DrivenBase(Navigator(NavigationSettings()), 4)
-        base.obstacle_m = obstacle_m
-        to_goal(base, 2.0, 0.0, None)
+    for beside_m in (3.0, 0.4):
+        base = drive(Boxes((-1.0, beside_m, 7.0, 3.2), (-1.0, -3.2, 7.0, -beside_m)), 4, length_m=2.0)
         assert base.run(60).state is NavigationState.REACHED
         times.append(base.t_s)
-    assert times[1] > 2 * times[0]
+    assert times[1] > 1.5 * times[0]
 
 
 def test_follows_the_map_when_it_is_corrected() -> None:

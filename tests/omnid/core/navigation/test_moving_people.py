@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.se2_arrays import relative
 from omnid.core.control.collision_monitor import ControllerRing, MovingPoint
-from omnid.core.navigation.forecast import Forecast, forecast
 from omnid.core.navigation.navigator import Navigator
 from omnid.core.navigation.path import DrivePath, straight_leg
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.situation import Situation
+from omnid.core.navigation.surroundings import LARGEST_SIGMA_M, Surroundings
 from omnid.core.obstacles.moving_tracker import Arrivals, MovingObstacle, MovingTracker
 from omnid.navigation_state import NavigationState
+from tests.omnid.core.navigation.driven_base import Floor
 from tests.omnid.core.navigation.test_planner import AZIMUTHS, OUTLINE, SETTINGS, BaseAmongBoxes, Boxes
 
 Array = NDArray[np.float64]
@@ -80,9 +81,8 @@ class BaseAmongPeople(BaseAmongBoxes):
                 for m in self.moving
             )
             self.law.take(ControllerRing(now.stamp_ns, tuple(ranges.tolist()), moving=points))
-        seen = np.isfinite(ranges)
-        obstacles = self.pose[:2] + ranges[seen, None] * directions[seen]
-        return now._replace(obstacles=obstacles, moving=forecast(self.moving, self.t_s - self.ring_s))
+        grid = Floor(all_seen=True).grid(self.pose, ranges)
+        return now._replace(around=Surroundings(grid, self.moving, round(self.ring_s * 1e9), self.pose))
 
 
 @pytest.mark.hazard("H18")
@@ -124,14 +124,36 @@ def test_follows_a_person_who_walks_ahead_more_slowly() -> None:
     assert base.gap_m > 0.1
 
 
-def at(x_m: float, y_m: float, vx_mps: float, vy_mps: float) -> Forecast:
-    found = forecast([MovingObstacle(x_m, y_m, vx_mps, vy_mps, np.diag([1e-4] * 4), 0.2)], 0.0)
-    assert found is not None
-    return found
+def moving(x_m: float, y_m: float, vx_mps: float, vy_mps: float) -> Surroundings:
+    """Return somebody who moves where all is floor but a row of cells at x = 3 m."""
+    rows = Floor(all_seen=True).grid(np.zeros(3), Boxes((3.0, -0.3, 3.1, 0.3)).ring(np.zeros(3)))
+    return Surroundings(rows, [MovingObstacle(x_m, y_m, vx_mps, vy_mps, np.diag([4e-4, 4e-4, 1e-2, 1e-2]), RADIUS_M)])
 
 
-def test_points_of_moving_obstacles_are_left_out() -> None:
-    points = np.array([(1.0, 0.1), (1.0, 0.5), (1.0, -0.4), (3.0, 0.0)])
-    others = at(1.0, 0.0, 0.0, -1.0).others(points)
-    np.testing.assert_array_equal(others, points[[3]])
-    np.testing.assert_array_equal(at(1.0, 0.0, 0.0, 0.0).others(points), points[[1, 3]])
+@pytest.mark.hazard("H18")
+@pytest.mark.parametrize(
+    ("person", "blocks"),
+    [
+        ((1.6, 3.2, 0.0, -0.8), True),  # at the path when the base is
+        ((3.0, 0.5, 0.0, -1.0), False),  # has passed when the base comes
+        ((0.6, 3.9, 0.0, -1.0), False),  # comes when the base has passed
+        ((2.0, 0.0, 0.0, 0.0), True),
+        ((4.0, 0.0, -0.5, 0.0), True),
+        ((-1.5, 0.0, -0.5, 0.0), False),
+        ((3.0, 0.0, 0.0, 0.0), False),  # is the row of cells
+    ],
+)
+def test_the_path_is_blocked_where_the_base_meets_somebody(
+    person: tuple[float, float, float, float], blocks: bool
+) -> None:
+    path = straight_leg((0.0, 0.0), (2.5, 0.0)).xy
+    around = moving(*person)
+    assert math.isfinite(around.first_blocked_m(path, 0.1, 0, 0.4)) is blocks
+    stands = float(around.room_at(np.array([[3.0, 0.0]]))[0])
+    assert stands > 1.0 if person[:2] == (3.0, 0.0) else stands < 0.1
+
+
+@pytest.mark.hazard("H18")
+def test_uncertainty_makes_room_up_to_a_limit() -> None:
+    radius_m = [moving(0.0, 0.0, 0.3, 0.0).movers(round(s * 1e9))[0, 4] for s in (-2.0, 0.0, 9.0)]
+    assert RADIUS_M < radius_m[0] < radius_m[1] <= radius_m[2] == pytest.approx(RADIUS_M + LARGEST_SIGMA_M)

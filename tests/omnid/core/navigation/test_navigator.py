@@ -20,6 +20,7 @@ from omnid.core.navigation.situation import MapPosition, Situation, WheelState
 from omnid.navigation_state import NavigationState
 from omnid.tracking_state import MapState, TrackingState
 from tests.omnid.core.navigation.driven_base import DrivenBase
+from tests.omnid.core.navigation.test_planner import Boxes, around
 
 SETTINGS = NavigationSettings(unlocalised_m=1.0, unlocalised_s=4.0, stuck_s=3.0)
 LOCALISED = MapPosition(np.zeros(3), MapState.LOCALIZED, 0.02)
@@ -145,9 +146,9 @@ def test_gives_up_without_progress() -> None:
 
 def test_says_that_it_stood_before_an_obstacle(monkeypatch: pytest.MonkeyPatch) -> None:
     base = driving()
-    box = base.pose[:2] + np.column_stack([np.full(9, 1.1), np.linspace(-0.15, 0.15, 9)])
+    box = around(base.pose, Boxes((2.1, -0.15, 2.2, 0.15)).ring(base.pose))
     without = base.seen
-    monkeypatch.setattr(base, "seen", lambda: without()._replace(obstacles=box))
+    monkeypatch.setattr(base, "seen", lambda: without()._replace(around=box))
     base.slip = 0.0
     answer = base.run(20)
     assert any(sample.navigation.state is NavigationState.AVOIDING for sample in base.samples)

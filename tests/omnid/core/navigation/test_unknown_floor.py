@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from omnid.core.control.collision_monitor import UNKNOWN, ControllerRing
-from omnid.core.navigation.floor_map import FloorMap
 from omnid.core.navigation.navigator import Navigator
 from omnid.core.navigation.path import DrivePath, drive_path, goal_path
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.situation import Situation
+from omnid.core.navigation.surroundings import Surroundings
 from omnid.navigation_state import NavigationState
-from tests.omnid.core.navigation.driven_base import DrivenBase
-from tests.omnid.core.navigation.test_planner import OUTLINE, SETTINGS, Boxes, clearance_m
+from tests.omnid.core.navigation.driven_base import DrivenBase, Floor
+from tests.omnid.core.navigation.test_planner import SETTINGS, Boxes, clearance_m
 
 SEEN_M = 2.0  # Floor is seen so far.
 
@@ -25,15 +25,16 @@ class BaseAmongPatches(DrivenBase):
 
     def __init__(self, patches: Boxes, path: DrivePath | None = None) -> None:
         super().__init__(Navigator(SETTINGS), 1)
-        self.boxes, self.floor = patches, FloorMap(OUTLINE)
+        self.boxes, self.floor, self.around = patches, Floor(), None
         self.navigator.start("goal", NavigationFrame.ODOM, [path or goal_path(self.pose, (5.0, 0.0), 0.0)], self.seen())
 
     def seen(self) -> Situation:
         now = super().seen()
         free_m, ranges_m = np.minimum(self.boxes.ring(self.pose), SEEN_M), np.full(360, np.inf)
         self.law.take(ControllerRing(now.stamp_ns, tuple(ranges_m.tolist()), tuple(free_m.tolist())))
-        self.floor.add(self.pose, ranges_m, free_m)
-        return now._replace(obstacles=np.zeros((0, 2)), floor=self.floor)
+        grid = self.floor.grid(self.pose, ranges_m, free_m)
+        self.around = Surroundings(grid, (), now.stamp_ns, self.pose, self.around)
+        return now._replace(around=self.around)
 
 
 @pytest.mark.hazard("H31")
