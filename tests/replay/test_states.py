@@ -1,4 +1,4 @@
-"""Tracking states on rendered logs with missing and dark images."""
+"""States of the poses of a replay, its timing, and light that changes."""
 
 from __future__ import annotations
 
@@ -10,9 +10,14 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+import omnid
 from calib import se3
+from calib.rig import ShutterTimes
+from calib.rig_file import read_rig
 from omnid.api import replay
 from omnid.formats.tum import Trajectory, read_tum
+from omnid.recordings.evaluation import Metrics, evaluate
+from omnid.simulation.rendering.sensor import Sensor
 from omnid.tracking_state import TrackingState
 from omnid.transport.codec import Pose, decode_pose
 from omnid.transport.status_names import ODOMETRY
@@ -21,6 +26,8 @@ from tests.drivers.logs.mcap_logs import STORE
 from tests.replay.command import Command, rows
 from tests.replay.edited import Image, dark, images, save
 from tests.simulation import build, write_log
+from tests.simulation.logs import Readout
+from tests.simulation.recipes import DIM
 
 DARK_PAIRS = 20  # pairs, 2 s
 
@@ -131,3 +138,44 @@ def test_the_first_motion_decides_on_depths_that_repeat(tmp_path: Path) -> None:
     found = replay(tmp_path / "log.mcap", tmp_path / "rig.toml")
     moved_m = np.linalg.norm(found.T_odom_rig[:, :3, 3] - found.T_odom_rig[0, :3, 3], axis=1)
     assert moved_m == pytest.approx(np.linalg.norm(run.poses[:pairs, :3, 3] - run.poses[0, :3, 3], axis=1), abs=0.01)
+
+
+SEED, SIZE = 3, 512
+LINE_TIME_US = 40.0  # 20 ms for 512 rows
+
+
+def driven(folder: Path, readout: Readout | None = None, sensor: Sensor | None = None) -> Metrics:
+    """Render the first metre of two_walls, and return the errors of a replay in which no pair was lost."""
+    run = build("two_walls", SEED, SIZE, 99)
+    write_log(
+        folder,
+        run.rig,
+        run.poses[:PAIRS],
+        run.scene,
+        sensor=sensor or run.sensor,
+        seed=SEED,
+        supersample=2,
+        readout=readout or Readout(),
+    )
+    times = ShutterTimes(0.0, 1e-6 * readout.line_time_us[0]) if readout else ShutterTimes()
+    result = omnid.replay(folder / "log.mcap", replace(read_rig(folder / "rig.toml"), times=times))
+    states = result.counters.states
+    assert result.counters.pairs == PAIRS and states[TrackingState.LOST] == 0
+    assert states[TrackingState.TRACKING] > 0.9 * PAIRS
+    return evaluate(Trajectory(result.stamps_ns, result.T_odom_rig), read_tum(folder / "truth.txt"))
+
+
+@pytest.mark.slow
+def test_the_motion_between_the_exposures_is_corrected(tmp_path: Path) -> None:
+    speed = 1.4  # 0.7 m/s
+    skew = driven(tmp_path / "skew", readout=Readout(speed, (15.0, 15.0)))
+    assert abs(skew.length_error_ratio) < 0.0015 and skew.ate_rmse_m < 0.002
+    rolling = Readout(speed, line_time_us=(LINE_TIME_US, LINE_TIME_US))
+    known = driven(tmp_path / "known", readout=rolling)
+    assert abs(known.length_error_ratio) < 0.0015 and known.ate_rmse_m < 0.002
+
+
+@pytest.mark.slow
+def test_dim_images_with_changing_brightness(tmp_path: Path) -> None:
+    dim = driven(tmp_path / "dim", sensor=DIM)
+    assert abs(dim.length_error_ratio) < 0.002 and dim.ate_rmse_m < 0.003
