@@ -38,7 +38,6 @@ IMAGE_SUFFIXES: Final = frozenset({*SUFFIXES, ".bmp", ".pgm", ".ppm", ".tif", ".
 STAMP_FILES: Final = ("times.txt", "timestamps.txt", "data.csv", "rgb.txt")
 ATTACHMENT: Final = "rig.toml"  # The rig's file, in the same folder as the folders of the cameras.
 NANOSECOND_DIGITS: Final = 16  # Whole numbers of so many digits or more are nanoseconds.
-_MAX_DEPTH: Final = 4  # Folders of images are searched down to this depth below the given one.
 _MAX_VISITED: Final = 10_000
 _MAX_STAMP_NS: Final = 2**31 * 10**9  # of the times of ROS, which end in 2038
 _GIVE_RATE: Final = "give --rate HZ, which is log.rate_hz of the settings"
@@ -49,7 +48,7 @@ def image_folders(path: Path) -> list[Path]:
     found: list[Path] = []
     for visited, (folder, inner, files) in enumerate(os.walk(path)):
         here = Path(folder)
-        inner[:] = sorted(inner) if len(here.relative_to(path).parts) < _MAX_DEPTH else []
+        inner.sort()
         if here != path and any(map(_is_image, files)):
             found.append(here)
         if visited >= _MAX_VISITED:

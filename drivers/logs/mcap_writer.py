@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
-from typing import Literal, Self
+from typing import IO, Literal, Self
 
 from mcap.exceptions import McapError
 from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores
 
 from drivers.errors import DriverError
-from drivers.logs.file_lock import lock
 from drivers.logs.log import LATEST_NS
 from drivers.logs.ros_messages import typestore
 
@@ -171,3 +171,26 @@ def schema_text(schema_name: str) -> str:
     if schema_name not in store.fielddefs:
         raise DriverError(f"unknown message type {schema_name!r}: give a type of ROS 2, such as nav_msgs/msg/Odometry")
     return store.generate_msgdef(schema_name, ros_version=2)[0]
+
+
+# Advisory locks that mark a file as being written; the kernel releases them when the program ends.
+
+
+def lock(file: IO[bytes]) -> None:
+    """Mark an open file as being written until it is closed; without effect where the file system has no locks."""
+    with suppress(OSError):
+        fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def is_locked(path: str | os.PathLike[str]) -> bool:
+    """True if a program, this one included, is writing the file; False where it cannot be opened."""
+    if not Path(path).is_file():
+        return False
+    try:
+        with open(path, "rb") as file:
+            fcntl.flock(file.fileno(), fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    return False

@@ -16,14 +16,13 @@ from typing import Final
 import numpy as np
 
 from drivers.errors import DriverError, FrameDecodeError
-from drivers.logs import mcap_file, ros1_bag, sqlite_bag
 from drivers.logs.compression import PACKED_SUFFIXES, is_packed, scratch_folder, unpack_file
-from drivers.logs.file_lock import is_locked
 from drivers.logs.image_folder import ImageFolder, image_folders
 from drivers.logs.log import MAX_ATTACHMENT_BYTES, MAX_LISTED, Log, LogFile
-from drivers.logs.mcap_file import McapFile
-from drivers.logs.ros1_bag import Ros1Bag
+from drivers.logs.mcap_writer import is_locked
+from drivers.logs.record_file import BAG_MAGIC, MCAP_MAGIC, McapFile, Ros1Bag
 from drivers.logs.ros_messages import IMAGE_TYPES
+from drivers.logs.sqlite_bag import MAGIC as SQLITE_MAGIC
 from drivers.logs.sqlite_bag import SqliteBag
 
 MAX_PARTS: Final = 1000
@@ -37,9 +36,9 @@ _NAME: Final = re.compile(
 )
 _LISTED_FILES: Final = re.compile(r"^ *relative_file_paths:[ \t]*\n((?:[ \t]*- .*\n)*)", re.M)
 _FORMATS: Final[dict[bytes, Callable[[Path, str], LogFile]]] = {
-    mcap_file.MAGIC: McapFile,
-    sqlite_bag.MAGIC: SqliteBag,
-    ros1_bag.MAGIC: Ros1Bag,
+    MCAP_MAGIC: McapFile,
+    SQLITE_MAGIC: SqliteBag,
+    BAG_MAGIC: Ros1Bag,
 }
 
 

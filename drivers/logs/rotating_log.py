@@ -22,9 +22,8 @@ from typing import Final, Literal
 from drivers.backoff import Backoff
 from drivers.errors import DriverError
 from drivers.events import EventCallback
-from drivers.logs.file_lock import is_locked
 from drivers.logs.log import LATEST_NS
-from drivers.logs.mcap_writer import LogWriter
+from drivers.logs.mcap_writer import LogWriter, is_locked
 
 _PART: Final = ".part"
 _MB: Final = 10**6

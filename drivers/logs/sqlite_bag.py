@@ -23,10 +23,9 @@ import numpy as np
 
 from drivers.errors import DriverError, RecordError
 from drivers.logs.compression import MAX_RECORD_BYTES, scratch_folder
-from drivers.logs.log import ENTRY, MAX_DEFINITIONS, Entries, LogFile, Topic
+from drivers.logs.log import ENTRY, MAX_DEFINITIONS, MAX_NAME, Entries, LogFile, Topic
 
 MAGIC: Final = b"SQLite format 3\0"
-_MAX_REASON: Final = 120  # characters
 # A file that is shorter than it states is read up to its end with a writable schema only; it is opened read-only.
 _PRAGMAS: Final = ("trusted_schema = OFF", "cell_size_check = ON", "mmap_size = 0", "writable_schema = ON")
 _TABLES: Final = (
@@ -212,4 +211,4 @@ def is_database(path: Path) -> bool:
 
 def _line(error: Exception) -> str:
     """Return an error in one line: SQLite quotes the file, which may contain anything."""
-    return " ".join(str(error).split())[:_MAX_REASON] or type(error).__name__
+    return " ".join(str(error).split())[:MAX_NAME] or type(error).__name__

@@ -23,15 +23,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.frame import CAMERAS, Camera
-from drivers.logs.log import LONGEST_STEP, ClockStep, Times, running_on
+from drivers.logs.log import FEWEST_IN_ORDER, LONGEST_STEP, ClockStep, Times, running_on
 
 TimeSource: TypeAlias = Literal["auto", "header", "log"]
 
-FIRST_IMAGES: Final = 8  # of a camera, by which the headers are judged, and the delays of a run at its ends
+FIRST_IMAGES: Final = FEWEST_IN_ORDER  # by which the headers of a camera are judged, and the delays of a run
 SHORTEST_STEP_NS: Final = 1_000_000  # No camera takes 1,000 images a second, as stamps that hardly advance say.
 STEP_NS: Final = 500_000_000  # Delays between header and logging change by less, unless a clock is set.
 FASTEST: Final = 3.0  # Clocks and images run on at rates that differ by less than this factor.
-SHORTEST_RUN: Final = 4  # images that tell a step of the clock from wrong stamps
+SHORTEST_RUN: Final = FIRST_IMAGES // 2  # images that tell a step of the clock from wrong stamps
 EPOCH_NS: Final = 10**18  # The year 2001: earlier stamps count from a start, as of the computer.
 
 

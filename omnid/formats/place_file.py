@@ -31,12 +31,12 @@ from omnid.core.places.place_map import (
 )
 from omnid.errors import OmnidError
 from omnid.formats.exports import replaced
+from omnid.formats.tum import STAMP_LIMIT_NS
 
 FORMAT: Final = 7  # to be raised where thumbnails or features of a place are computed otherwise: old maps fit no more
 # Maps up to version 6 were SQLite databases.
 EARLIER: Final = b"SQLite format 3\0"
 MAX_FILE_BYTES: Final = 1 << 30
-MAX_INTEGER: Final = 1 << 62
 LEAST_VARIANCE: Final = 1e-16  # of a loop in any direction, so that its covariance can be inverted
 ROUNDING: Final = 1e-6  # of the elements of a rotation times its transpose
 _POSE: Final = (3, 4)  # the upper rows of a transform
@@ -51,7 +51,7 @@ class _Field(NamedTuple):
     shape: tuple[int, ...] = ()
 
 
-_COUNT: Final = _Field("<i8", 0, MAX_INTEGER)
+_COUNT: Final = _Field("<i8", 0, STAMP_LIMIT_NS)
 _TRANSFORM: Final = _Field("<f8", -1e5, 1e5, _POSE)  # metres
 _COVARIANCE: Final = _Field("<f8", -1e8, 1e8, (6, 6))  # m^2 and rad^2
 _SIZE: Final = _Field("<i8", 1, 1 << 15)  # of a panorama, px

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.logs.file_lock import is_locked, lock
 from drivers.logs.image_folder import IMAGE_SUFFIXES
+from drivers.logs.mcap_writer import is_locked, lock
 from drivers.logs.open_log import is_log_name
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.errors import OmnidError

@@ -24,8 +24,8 @@ from mcap.writer import CompressionType
 from drivers.errors import DriverError
 from drivers.frame import Frame
 from drivers.logs.log_reader import LogReader
-from drivers.logs.mcap_file import MAGIC
 from drivers.logs.open_log import LogInfo, LogState, log_info, logs_in, open_log
+from drivers.logs.record_file import MCAP_MAGIC as MAGIC
 from drivers.logs.topics import MotionTopics
 from drivers.motion import GyroSample
 from tests.drivers.logs.bags import (

@@ -20,11 +20,11 @@ from mcap.writer import CompressionType
 from rosbags.rosbag1 import Reader
 
 from drivers.errors import RecordError
-from drivers.logs import mcap_file
+from drivers.logs import record_file
 from drivers.logs.compression import unpack_message
 from drivers.logs.log_reader import LogReader
-from drivers.logs.mcap_file import MAGIC
 from drivers.logs.open_log import open_log
+from drivers.logs.record_file import MCAP_MAGIC as MAGIC
 from tests.drivers.logs.bags import write_bag
 from tests.drivers.logs.mcap_logs import IMAGE, LOWER, UPPER, Entry, compressed, jpeg, pairs, write_log
 from tests.drivers.logs.test_formats import is_one_fault, read, survivors
@@ -168,7 +168,7 @@ def test_before_the_first_image_only_heads_are_read(tmp_path: Path, monkeypatch:
 def test_bounds_the_memory_of_all_attachments(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, with_summary: bool
 ) -> None:
-    monkeypatch.setattr(mcap_file, "MAX_ALL_ATTACHMENTS_BYTES", 5000)
+    monkeypatch.setattr(record_file, "MAX_ALL_ATTACHMENTS_BYTES", 5000)
     files = [(str(number), bytes(2000)) for number in range(4)] + [("rig.toml", b"version = 1")]
     path = write_log(tmp_path / "log.mcap", pairs(2), files)
     if not with_summary:

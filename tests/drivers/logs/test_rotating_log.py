@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from drivers.logs.file_lock import is_locked
+from drivers.logs.mcap_writer import is_locked
 from drivers.logs.open_log import open_log
 from drivers.logs.rotating_log import RotatingLog, RotationSettings
 from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, START_NS
