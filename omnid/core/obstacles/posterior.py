@@ -130,7 +130,12 @@ class RayPosterior:
         floor = evidence.floor[of_bin]
         floor = floor - np.float32(min(max(float(np.median(floor[near])), -1.0), 0.0))
         floor = p.w_floor * np.clip(floor, -p.floor_most, p.floor_most)
-        levels = floor - p.w_level * np.clip(evidence.level[:, of_bin], -p.level_most, p.level_most)
+        # A bin without texture fits a plane beside the floor by noise, of which known floor says how much: a ratio L
+        # counts by the odds that it is more than that.
+        levels = evidence.level[:, of_bin]
+        noise2 = np.square(np.minimum(levels[:, near], 0)).mean(axis=1, keepdims=True)[..., None] + np.float32(LEAST)
+        levels = levels * (1 - np.exp(-np.square(levels) / (2 * noise2)))
+        levels = floor - p.w_level * np.clip(levels, -p.level_most, p.level_most)
         # A surface that fits at a whole disparity is within half of one of it.
         of_surface = np.minimum((self._bins + 1) // BINS_PER_PX, len(evidence.surface) - 1)
         fits = np.minimum(self._surfaces(evidence.surface)[of_surface], p.surface_most) - p.surface_noise
