@@ -8,7 +8,7 @@ down, something that hangs over floor in view, or nothing up to the last bin. Bi
 1. Steps of grey e across the bins of the floor, and its greys. Floor: (1 - m) N(e; s_r) + m Laplace(e; b g),
    with its sigma s_r at that range and its rate of marks m; what is behind something: the same with a rate m_h, with
    texture or without; where something begins: Laplace(e; b g). So a plain bin speaks against a beginning.
-2. Ratios of floor, surfaces and planes beside the floor, from stereo (column.py).
+2. Ratios of floor, surfaces and planes beside the floor, from stereo (stereo.py).
 3. Look of the floor: contrast, grey and outline of a bin, by those of floor that is known. Beyond the
    border of a patch of sun, or of another covering, it may look otherwise.
 4. The posterior (ray_kernels.posterior): sums along the ray. The end of the floor beyond the last bin shows a foot,
@@ -28,9 +28,9 @@ from numpy.typing import NDArray
 
 from omnid.core.mapping.range_scan import SECTORS, FreeRanges
 from omnid.core.obstacles import ray_kernels as kernels
-from omnid.core.obstacles.column import ColumnEvidence, Columns
 from omnid.core.obstacles.panoramas import DIRECTIONS, WorkingPair
 from omnid.core.obstacles.ray_kernels import RayParameters
+from omnid.core.obstacles.stereo import Columns, StereoEvidence
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -104,7 +104,7 @@ class RayPosterior:
         self._assumed = (self.ranges_m < parameters.look_m)[:, None] & along
         self.shows_floor = bool(self._of_bins(columns.panoramas.visible).any())  # whether any floor is in view
 
-    def belief(self, pair: WorkingPair, evidence: ColumnEvidence, known: Flags | None = None) -> RayBelief:
+    def belief(self, pair: WorkingPair, evidence: StereoEvidence, known: Flags | None = None) -> RayBelief:
         """Return the belief by a pair and its stereo evidence.
 
         known (N, DIRECTIONS): bins that are known to be floor, None: the nearest ahead and behind are taken for it.
@@ -124,18 +124,14 @@ class RayPosterior:
                 kernels.add_weighted_rows(of_view, image, into)
         pooled = np.asarray((np.roll(steps, 1, axis=1) + 2 * steps + np.roll(steps, -1, axis=1)) / 4, np.float32)
         far_steps, steps, greys, pooled = np.abs(pooled[count:]), steps[:count], greys[:count], pooled[:count]
-        # 3. Stereo, by bins. Noise without texture fits other disparities a little better: the ratio of known floor
-        #    says by how much.
+        # 3. Stereo, by bins. A bin without texture fits a plane beside the floor by noise, of which known floor says
+        #    how much: a ratio L counts by the odds that it is more than that.
         of_bin = self._bins // BINS_PER_PX
-        floor = evidence.floor[of_bin]
-        floor = floor - np.float32(min(max(float(np.median(floor[near])), -1.0), 0.0))
-        floor = p.w_floor * np.clip(floor, -p.floor_most, p.floor_most)
-        # A bin without texture fits a plane beside the floor by noise, of which known floor says how much: a ratio L
-        # counts by the odds that it is more than that.
         levels = evidence.level[:, of_bin]
         noise2 = np.square(np.minimum(levels[:, near], 0)).mean(axis=1, keepdims=True)[..., None] + np.float32(LEAST)
         levels = levels * (1 - np.exp(-np.square(levels) / (2 * noise2)))
-        levels = floor - p.w_level * np.clip(levels, -p.level_most, p.level_most)
+        levels = p.w_level * np.clip(levels, -p.level_most, p.level_most)
+        floor = p.floor_share * levels.mean(axis=0)
         # A surface that fits at a whole disparity is within half of one of it.
         of_surface = np.minimum((self._bins + 1) // BINS_PER_PX, len(evidence.surface) - 1)
         fits = np.minimum(self._surfaces(evidence.surface)[of_surface], p.surface_most) - p.surface_noise
@@ -149,7 +145,7 @@ class RayPosterior:
         far = far_steps.max(axis=0, initial=0.0) / max(float(sigmas[-1, 0]), float(sigmas.min()))
         # 5. The posterior.
         seen = seen & (greys.T < SATURATED)
-        terms = np.where(seen.T, np.stack([floor, *levels, look, *edges, fits]).astype(np.float32), 0)
+        terms = np.where(seen.T, np.stack([floor, *(floor - levels), look, *edges, fits]).astype(np.float32), 0)
         terms[kernels.FITS] = fits
         first = np.empty((DIRECTIONS, count + 1), np.float32)
         ratios, view = np.empty((2, DIRECTIONS, count), np.float32)

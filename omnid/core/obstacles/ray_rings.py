@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.panorama import Cylinder
-from omnid.core.obstacles.column import NEAREST_M, Columns, FloorPlane, floor_plane
 from omnid.core.obstacles.grid import GridRing, ObstacleGrid, unknown_ring
 from omnid.core.obstacles.panoramas import AROUND_ROWS, DIRECTIONS, FOCAL_PX, WorkingPair
 from omnid.core.obstacles.posterior import RayBelief, RayPosterior
 from omnid.core.obstacles.ray_kernels import RayParameters
 from omnid.core.obstacles.settings import RingSettings
+from omnid.core.obstacles.stereo import NEAREST_M, Columns, FloorPlane, floor_plane
 from omnid.core.types.panorama import PaddedPanorama
 
 Array = NDArray[np.float64]
