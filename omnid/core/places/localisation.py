@@ -42,15 +42,12 @@ TIES: Final = 50  # newest keyframes kept besides a fixed map, so that memory is
 CONTRADICTIONS: Final = 10
 RECENT_M: Final = 15.0  # A pose counts as localised up to this length of path after the last recognition.
 CONSISTENT: Final = 3  # recognitions that give the same pose, before they count
-KEPT: Final = 6  # recognitions that are remembered
 APART_M, APART_RAD = 0.05, math.radians(5)  # least motion between two frames that count as two
 SAME_M, SAME_RAD = 0.12, math.radians(1.5)  # largest difference of poses that agree
 SURE_INLIERS: Final = 24  # Inliers of recognitions that count without motion: a robot may be at rest.
 # Odometry computes dense depth at its own keyframes. Where it makes none, the map waits for this multiple of the
 # distance between its keyframes before it asks for dense depth itself.
 WAIT_FACTOR: Final = 2.0
-CHECK_M, CHECK_RAD = 0.1, math.radians(8)  # A recognition is checked in a frame that has moved by this amount.
-SEARCH_NS: Final = 200_000_000  # At most five searches a second, so that most of the time is left to other stages.
 JITTER_NS: Final = 5_000_000  # Stamps vary, so a rate that divides that of the cameras is reached with this tolerance.
 SEARCHES: Final = 10  # After this number of searches without success only new keyframes are searched for.
 # Covariance in a map of which nothing has been recognised, m^2 and rad^2, because it may be a kilometre away in any
@@ -131,7 +128,7 @@ class MapLocaliser:
         """places: a map to be extended; None: a new one, which begins where odom does. localize_only: the map stays as
         it is; the newest keyframes of the run tie odom to it, and are no places.
         """
-        self._limits = limits
+        self._limits, self._period_ns = limits, 1e9 / limits.rate_hz - JITTER_NS
         self.places = places if places is not None else PlaceMap()
         self._localize_only = localize_only
         self._fixed = frozenset(self.places.keyframes if localize_only else ())  # keyframes (ids) that stay
@@ -140,7 +137,7 @@ class MapLocaliser:
         self.search = PlaceSearch(replace(model, cylinder=model.cylinder.full_turn))
         self.correction = MapCorrection(self.places)
         self._session = 1 + max((k.session for k in self.places.keyframes.values()), default=-1)
-        self._hypotheses: deque[Hypothesis] = deque(maxlen=KEPT)
+        self._hypotheses: deque[Hypothesis] = deque(maxlen=2 * CONSISTENT)
         self._newest: PlaceKeyframe | None = None  # newest keyframe of this part, placed by odometry
         self._T_map_odom = np.eye(4)
         self._resets = 0
@@ -252,7 +249,7 @@ class MapLocaliser:
         newest, limits = self._newest, self._limits
         if newest is None:
             return True
-        if frame.stamp_ns - newest.stamp_ns < 1e9 / limits.rate_hz - JITTER_NS:
+        if frame.stamp_ns - newest.stamp_ns < self._period_ns:
             return False
         moved_m, turned_rad = motion_between(newest.T_odom_rect, frame.T_odom_rect)
         change = max(moved_m / limits.keyframe_m, turned_rad / math.radians(limits.keyframe_deg))
@@ -263,13 +260,13 @@ class MapLocaliser:
         if self._searched is None:
             return True
         searched_ns, T_odom_searched = self._searched
-        if frame.stamp_ns - searched_ns < SEARCH_NS:
+        if frame.stamp_ns - searched_ns < self._period_ns:
             return False
         if self._failed < SEARCHES and self._recognised_at is None and self._elsewhere():
             return True
         moved_m, turned_rad = motion_between(T_odom_searched, frame.T_odom_rect)
         is_pending = len(self._hypotheses) > 0 and self._state() is not MapState.LOCALIZED
-        return is_pending and (moved_m > CHECK_M or turned_rad > CHECK_RAD)
+        return is_pending and (moved_m > APART_M or turned_rad > APART_RAD)
 
     def _recognise(self, frame: OdometryFrame, small: Thumbnail, features: PlaceFeatures) -> Recognition | None:
         """Return the place that the frame shows: near the expected pose, else in parts of the map of unknown pose."""

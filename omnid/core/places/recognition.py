@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.pose_estimation import gauss_newton, ransac
+from omnid.core.odometry.pose_search import CORRELATED_LANDMARKS, OUTLIER_SQUARED, VIEW_DIMENSIONS
 from omnid.core.places.features import FEATURES, Signature, Thumbnail, signature_of, similarities
 from omnid.core.places.place_map import PlaceFeatures, PlaceMap
 from omnid.core.stereo.triangulation import point_covariance, triangulate, view
@@ -32,14 +33,10 @@ THRESHOLD_PX: Final = 4.0  # largest error of a view in the consensus set
 MIN_MATCHES: Final = 8  # matches, and inliers among them, below which there is no pose
 REACH_PX: Final = 3.0  # Reach of the second search about the predicted views, because the next brick is not far.
 LARGEST_SQUARED: Final = 0.35 * 512**2  # Squared distance of descriptors that may match in the second search.
-# Squared Mahalanobis distance (4 sigma) from which a view is an outlier; so that 0.1 % of right ones are lost.
-OUTLIER_SQUARED: Final = 16.0
-CORRELATED: Final = 4.0  # features that count as one in the covariance
 # m, rad: least standard deviations, however many features there are.
 FLOOR: Final = np.diag([0.004] * 3 + [0.0007] * 3) ** 2
 SECTORS: Final = 8  # Sectors of azimuth in which inliers are counted, of 45 degrees.
-# At most PER_PLACE of the compared keyframes lie within SAME_PLACE_M of each other.
-PER_PLACE, SAME_PLACE_M = 3, 1.5
+PER_PLACE: Final = 3  # of the compared keyframes lie within NEAR_M of each other, at most
 RUNNER_UP: Final = 0.6  # Share of the inliers with which another place makes a recognition ambiguous.
 RUNNER_UP_M, RUNNER_UP_RAD = 0.5, math.radians(10)  # Poses farther apart are different places.
 VOTERS: Final = 64  # Features of a frame that vote, evenly spread, the strongest ones first.
@@ -173,7 +170,7 @@ def search(
     for id in sorted(known, key=lambda id: -voted[id][0]):
         if len(found) == effort.compared:
             break
-        beside = sum(np.linalg.norm(poses[id][:3, 3] - poses[other][:3, 3]) < SAME_PLACE_M for other in found)
+        beside = sum(np.linalg.norm(poses[id][:3, 3] - poses[other][:3, 3]) < NEAR_M for other in found)
         if beside >= PER_PLACE:
             continue
         place = found[id] = recognise(here, known[id], id, voted[id][1], model)
@@ -230,7 +227,7 @@ def recognise(
     if count < MIN_MATCHES:
         return None
     azimuth = np.floor(views[b2[kept], 0] * (SECTORS / cylinder.width)).astype(int) % SECTORS
-    covariance = CORRELATED * max(1.0, float(errors[kept].mean()) / 3) * covariance + FLOOR
+    covariance = CORRELATED_LANDMARKS * max(1.0, float(errors[kept].mean()) / VIEW_DIMENSIONS) * covariance + FLOOR
     return Recognition(id, se3.inverse(T), covariance, count, len(a), len(np.unique(azimuth)))
 
 
