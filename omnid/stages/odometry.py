@@ -16,10 +16,10 @@ from omnid.core.nanoseconds import S_PER_NS
 from omnid.core.odometry.earlier_view import EarlierView
 from omnid.core.odometry.estimates import OdometryEstimate
 from omnid.core.odometry.exposure_times import Exposure
+from omnid.core.odometry.line_times import RawImage
 from omnid.core.odometry.motion_agreement import Contradiction, MotionAgreement
 from omnid.core.odometry.motion_filter import MotionFilter
 from omnid.core.odometry.odometry import VisualOdometry
-from omnid.core.odometry.raw_image import RawImage
 from omnid.core.odometry.rig_error import RigError
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.relocalisation import Relocaliser

@@ -29,12 +29,20 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.exposure_times import Exposure, ViewShift
-from omnid.core.odometry.line_times import LineTimes, ReadOut
+from omnid.core.odometry.line_times import (
+    CAMERAS,
+    LAG_S,
+    LEAST_PX,
+    MEMORY_S,
+    LineTimes,
+    RawImage,
+    ReadOut,
+    camera_names,
+)
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.motion_hypotheses import DECIDING_COST
 from omnid.core.odometry.plane_patches import align, plane_templates
 from omnid.core.odometry.pose_search import CORRELATED_LANDMARKS
-from omnid.core.odometry.raw_image import CAMERAS, LAG_S, LEAST_PX, MEMORY_S, RawImage, camera_names
 from omnid.core.odometry.tracking import KltSettings, track
 from omnid.core.stereo.triangulation import view, view_jacobian
 from omnid.core.types.panorama import PaddedPanorama

@@ -17,12 +17,11 @@ from omnid.core.odometry.estimates import ROOM_M, OdometryEstimate, OdometryLimi
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.image_breaks import ImageBreaks
 from omnid.core.odometry.keyframes import KeyframeLocaliser, KeyframeRequest, Keyframes
-from omnid.core.odometry.line_times import LineTimes
+from omnid.core.odometry.line_times import LineTimes, RawImage
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.motion_filter import UNKNOWN_SPEED_SIGMA, MotionFilter, bounded
 from omnid.core.odometry.motion_hypotheses import REACH_SIGMAS, MotionHypotheses
 from omnid.core.odometry.pose_search import OUTLIER_COST, PoseSearch
-from omnid.core.odometry.raw_image import RawImage
 from omnid.core.odometry.static_mask import StaticMask
 from omnid.core.odometry.stereo_frame import Features, StereoFrame
 from omnid.core.odometry.tracking import KltSettings
