@@ -23,8 +23,6 @@ from omnid.simulation.rendering.textures import value_noise
 SQUARE_PX = 24
 # Width of the light margin around the squares.
 MARGIN_SQUARES = 1.0
-# Paints over the edge of a print (H, W).
-Frame = Callable[[Array], Array]
 
 
 @dataclass(frozen=True)
@@ -134,39 +132,37 @@ class BoardRenderer:
         contrast: tuple[float, float] = (25.0, 225.0),
         shadow: float = 1.0,
         walls: Sequence[Rectangle] | None = None,
-        frame: Frame | None = None,
     ) -> BoardImage:
-        """Render the board among walls (noisy ones if None).
-
-        shadow: brightness factor of a part of the board; frame: paints what covers the edge of the print.
-        """
+        """Render the board among walls (noisy ones if None); shadow: brightness factor of a part of the board."""
         rng = np.random.default_rng(seed)
         texture = board_texture(self.board, *contrast).astype(float)
-        if frame is not None:
-            texture = frame(texture)
         texture[:, : round(texture.shape[1] * rng.uniform(0.3, 0.7))] *= shadow
-        board_poses_around_camera = clutter(rng) if walls is None else walls
-        board = print_rectangles(self.board, self.shape, T_rig_board, texture.astype(np.uint8))
-        scene = Scene((*board, *board_poses_around_camera))
-        ideal = render_grey(scene, self.mounted, np.eye(4), supersample)
-        exposure = MountedSensor.of(sensor or Sensor(), self.mounted.visible, self.mounted.camera.size)
-        T_cam_board = self.mounted.T_cam_rig @ T_rig_board
-        corners = self.mounted.camera.project(se3.apply(T_cam_board, self.shape.points(self.board.points)))
-        return BoardImage(exposure.expose(ideal, rng), corners, T_cam_board)
+        around = clutter(rng) if walls is None else walls
+        faces = print_rectangles(self.board, self.shape, T_rig_board, texture.astype(np.uint8))
+        points = self.shape.points(self.board.points)
+        scene, T_cam_board = Scene((*faces, *around)), self.mounted.T_cam_rig @ T_rig_board
+        return exposed(scene, self.mounted, points, T_cam_board, sensor or Sensor(), rng, supersample)
+
+
+def exposed(
+    scene: Scene,
+    mounted: MountedCamera,
+    points: Array,
+    T_cam_board: Array,
+    sensor: Sensor,
+    rng: np.random.Generator,
+    supersample: int = 2,
+) -> BoardImage:
+    """Return the image of a scene with a board that has its points (N, 3) [m] at a pose."""
+    ideal = render_grey(scene, mounted, np.eye(4), supersample)
+    image = MountedSensor.of(sensor, mounted.visible, mounted.camera.size).expose(ideal, rng)
+    return BoardImage(image, mounted.camera.project(se3.apply(T_cam_board, points)), T_cam_board)
 
 
 def in_view(camera: OmniCamera, T_cam_board: Array, board: Board, mask: Mask) -> bool:
     """True if the print without its margin lies inside the mask and faces the camera."""
-    outline = (
-        np.array(
-            [
-                [x, y, 0]
-                for x in np.linspace(-1.3, board.columns + 0.3, 12)
-                for y in np.linspace(-1.3, board.rows + 0.3, 12)
-            ]
-        )
-        * board.square_m
-    )
+    x, y = (np.linspace(-1.3, side + 0.3, 12) for side in (board.columns, board.rows))
+    outline = np.stack([*np.meshgrid(x, y), np.zeros((12, 12))], axis=-1).reshape(-1, 3) * board.square_m
     pixels = camera.project(se3.apply(T_cam_board, outline))
     return bool(np.isfinite(pixels).all() and mask.contains(pixels, 2.0).all())
 
@@ -269,12 +265,8 @@ def render_april_grid(
     ends = np.array([[-edge, -edge, 0], [width + edge, -edge, 0], [-edge, height + edge, 0]])
     origin, right, below = se3.apply(T_rig_frame, ends)
     rectangle = Rectangle(origin, right - origin, below - origin, sheet.astype(np.uint8), "board")
-    ideal = render_grey(Scene((rectangle, *clutter(rng))), mounted, np.eye(4), 2)
-    exposure = MountedSensor.of(sensor or Sensor(), mounted.visible, mounted.camera.size)
-    T_cam_board = mounted.T_cam_rig @ T_rig_frame @ T_frame_board
-    return BoardImage(
-        exposure.expose(ideal, rng), mounted.camera.project(se3.apply(T_cam_board, board.points)), T_cam_board
-    )
+    scene, T_cam_board = Scene((rectangle, *clutter(rng))), mounted.T_cam_rig @ T_rig_frame @ T_frame_board
+    return exposed(scene, mounted, board.points, T_cam_board, sensor or Sensor(), rng)
 
 
 def print_of(board: AprilGrid) -> NDArray[np.uint8]:
