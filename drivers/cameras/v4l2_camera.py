@@ -23,7 +23,6 @@ from drivers.frame import Camera, Frame
 
 _PAUSE_S: Final = 0.005  # Pause where poll() reports a device as ready and no buffer is filled.
 _SEQUENCE_COUNT: Final = 2**32  # v4l2_buffer.sequence is an unsigned 32-bit counter
-_RECENT: Final = 16  # valid stamps by which the usual delay is judged, the least of theirs: half a second at 30 Hz
 _MOST_JITTER_NS: Final = 500_000_000  # no delay of a camera that delivers images varies by more
 _MAX_AGE_NS: Final = 10 * 10**9  # no driver keeps a buffer for longer; an older stamp is from another clock
 
@@ -217,7 +216,7 @@ class BufferAccounting:
 
 
 class StampValidator:
-    """Accept plausible stamps, replace the others by the time of arrival less the usual delay; reads no clock.
+    """Accept plausible stamps, replace the others by the time of arrival less the least delay; reads no clock.
 
     Each kind of fault is reported once by `on_event`, with `name` in front.
     """
@@ -225,7 +224,7 @@ class StampValidator:
     def __init__(self, name: str, state: CameraState, on_event: EventCallback) -> None:
         self._name, self._state, self._on_event = name, state, on_event
         self._last_valid_ns = self._last_ns = -1  # stamps of the kernel and those that were returned
-        self._delays_ns: deque[int] = deque(maxlen=_RECENT)  # from valid stamps to their arrivals
+        self._least_delay_ns: int | None = None  # from valid stamps to their arrivals
         self._reported: set[str] = set()
 
     def validate(self, buffer: v4l2.V4l2Buffer, arrival_ns: int) -> int:
@@ -238,18 +237,18 @@ class StampValidator:
         if buffer.flags & v4l2.TIMESTAMP_MASK != v4l2.TIMESTAMP_MONOTONIC:
             self._report_once("clock", "its driver does not declare a clock for its stamps; CLOCK_MONOTONIC is assumed")
         stamp_ns = buffer.stamp_ns
-        delay_ns, usual_ns = arrival_ns - stamp_ns, min(self._delays_ns, default=0)
+        delay_ns, usual_ns = arrival_ns - stamp_ns, self._least_delay_ns or 0
         # A clock that fell back is later than its own last stamps again some time, but not than those returned since.
         fell_back = stamp_ns <= self._last_ns and delay_ns > usual_ns + _MOST_JITTER_NS
         if max(self._last_valid_ns, arrival_ns - _MAX_AGE_NS) < stamp_ns <= arrival_ns and not fell_back:
             self._last_valid_ns = stamp_ns
-            self._delays_ns.append(delay_ns)
+            self._least_delay_ns = delay_ns if self._least_delay_ns is None else min(self._least_delay_ns, delay_ns)
         else:
             self._state.restamped += 1
             self._report_once(
                 "stamp",
                 f"a stamp is {(stamp_ns - arrival_ns) / 1e6:.3f} ms after the arrival, or not after the stamp before; "
-                "the time of arrival, less the usual delay, is used for such images, which are counted",
+                "the time of arrival, less the least delay, is used for such images, which are counted",
             )
             stamp_ns = arrival_ns - usual_ns
         self._last_ns = max(stamp_ns, self._last_ns + 1)

@@ -37,7 +37,6 @@ _NAMES: Final = {
 EXPOSURE_UNIT_US: Final = 100  # unit of V4L2_CID_EXPOSURE_ABSOLUTE
 AUTOMATIC, MANUAL_EXPOSURE, APERTURE_PRIORITY = 0, 1, 3  # enum v4l2_exposure_auto_type
 _POWER_LINE: Final = {"off": 0, "50": 1, "60": 2, "auto": 3}  # enum v4l2_power_line_frequency
-_MAX_CONTROLS: Final = 512  # bounds the enumeration of a faulty driver
 _MAX_MENU: Final = 64
 _MENUS: Final = (v4l2.CONTROL_MENU, v4l2.CONTROL_INTEGER_MENU)
 _LOST: Final = (errno.ENODEV, errno.EBUSY)  # the camera is opened again, with its settings and its request
@@ -67,13 +66,16 @@ class CameraControl:
 
 def list_controls(fd: int) -> dict[int, CameraControl]:
     """Return the writable numeric controls of an open device by id."""
-    found, last = {}, 0
-    for _ in range(_MAX_CONTROLS):  # the driver returns the control after `last`, and an error after the last one
+    found, last = dict[int, CameraControl](), 0
+    while True:
+        # The driver returns the control after `last`, and an error after the last one; a faulty one may go in circles.
         entry = v4l2.QueryControl(id=last | v4l2.NEXT_CONTROL)
         try:
             v4l2.call(fd, v4l2.QUERYCTRL, entry)
         except OSError:
-            break
+            return found
+        if entry.id <= last:
+            return found
         last, menu = entry.id, list[int]()
         numeric = entry.type in (v4l2.CONTROL_INTEGER, v4l2.CONTROL_BOOLEAN, *_MENUS)
         if not numeric or entry.flags & (v4l2.CONTROL_DISABLED | v4l2.CONTROL_READ_ONLY):
@@ -87,7 +89,6 @@ def list_controls(fd: int) -> dict[int, CameraControl]:
         found[last] = CameraControl(
             last, name, ValueRange(entry.minimum, entry.maximum, max(1, entry.step)), tuple(menu)
         )
-    return found
 
 
 def plan_controls(settings: V4l2Settings, offered: Mapping[int, CameraControl]) -> list[tuple[CameraControl, int]]:
