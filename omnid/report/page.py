@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 Image = NDArray[np.uint8]
 
-JPEG_QUALITY: Final = 80
 # Control characters except tab and newline, which a terminal would obey where the page is printed.
 _CONTROL: Final = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 
@@ -69,8 +68,7 @@ def note(text: str) -> str:
 
 def embedded(image: Image, kind: str = "jpeg") -> str:
     """Return the tag of an image; kind: jpeg, or png for drawings."""
-    options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if kind == "jpeg" else [cv2.IMWRITE_PNG_COMPRESSION, 9]
-    data = cv2.imencode(f".{kind}", image, options)[1]
+    data = cv2.imencode(f".{kind}", image)[1]
     return f"<img src='data:image/{kind};base64,{base64.b64encode(data.tobytes()).decode()}' alt=''>"
 
 

@@ -37,7 +37,6 @@ from omnid.web.robot import RobotPage, text_of
 DEFAULT_LISTEN: Final = "127.0.0.1:8447"
 STATIC: Final = Path(__file__).with_name("static")
 COOKIE_S: Final = 30 * 86_400  # A browser keeps the cookie for this time.
-BACKLOG: Final = 2048  # connections that wait for the event loop
 END_S: Final = 2  # Time that browsers have to finish at the end.
 # A link of another site brings no cookie along (SameSite=Strict); a page that loads itself again does.
 _AGAIN: Final = '<!DOCTYPE html><title>omnid</title><meta http-equiv="refresh" content="0">'
@@ -188,7 +187,6 @@ def _uvicorn_config(guard: Guard, settings: WebSettings) -> uvicorn.Config:
         ws="none",
         interface="asgi3",
         lifespan="off",
-        backlog=BACKLOG,
         log_config=None,
         access_log=False,
         proxy_headers=False,
@@ -217,7 +215,7 @@ def _listening(listen: str) -> Iterator[socket.socket]:
     host, port = found[1].strip("[]"), int(found[2])
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        listener = socket.create_server(address[:2], family=family, backlog=BACKLOG)
+        listener = socket.create_server(address[:2], family=family, backlog=socket.SOMAXCONN)
     except OSError as error:
         raise OmnidError(
             f"--listen {listen}: {error.strerror or error}; stop the other program there, or name another address"
