@@ -116,7 +116,7 @@ def rig(args: argparse.Namespace) -> int:
     if args.report:
         found.save_report(args.report)
     for line in found.warnings:
-        print(f"warning: {line}", file=sys.stderr)
+        options.warn(line)
     for line in found.tables:
         print(line)
     print(f"{args.output}: {found}")
@@ -167,8 +167,7 @@ def live(args: argparse.Namespace) -> int:
                     bus.publish("status", diagnostics_cdr(time.time_ns(), [status(boards, outcome)]))
     HANDLER.show("")
     if missing := boards.missing():
-        print(f"omnid: {boards.pairs} pairs, not enough yet: {'; '.join(missing)}", file=sys.stderr)
-        return 1
+        return options.failed(f"{boards.pairs} pairs, not enough yet: {'; '.join(missing)}")
     words = shlex.join([str(args.images or args.log), *options_of(args)])
     print(f"{boards.pairs} pairs, enough: omnid calibrate rig {words} -o rig.toml")
     return 0

@@ -12,7 +12,7 @@ from omnid.calibration.drive import calibrate_drive
 from omnid.calibration.from_log import calibrate_height, calibrate_mask
 from omnid.calibration.images import decoded_pairs, open_log
 from omnid.calibration.rig_check import check_log, with_upper_corrected
-from omnid.commands.options import HEIGHT, LOG_CAMERAS, command, height_of, log_cameras
+from omnid.commands.options import HEIGHT, LOG_CAMERAS, command, failed, height_of, log_cameras, warn
 from omnid.core.rig.column_finding import RigState
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.errors import OmnidError
@@ -58,8 +58,7 @@ def run(args: argparse.Namespace) -> int:
     rig = _masked(args, rig)
     # 3. Write the rig.
     if contradiction:
-        print(f"omnid: {contradiction}; nothing was written", file=sys.stderr)
-        return 1
+        return failed(f"{contradiction}; nothing was written")
     if args.output is not None and rig is start:
         print("nothing was written")
     elif args.output is not None:
@@ -87,7 +86,7 @@ def _start(args: argparse.Namespace) -> tuple[Rig, bool]:
             start = start or attached_rig(reader, log)
             found, _ = decoded_pairs(reader, keep=False)
         for line in filter(None, (*found.notes, found.loss)):
-            print(f"warning: {log}: {line}", file=sys.stderr)
+            warn(f"{log}: {line}")
         is_lossy |= bool(found.loss)
     assert start is not None, "there is a log"
     return start, is_lossy
@@ -101,10 +100,7 @@ def _adjusted(args: argparse.Namespace, rig: Rig) -> Rig:
         print(f"{args.rig or 'the attached rig'} fits these drives as well as any rig")
         return rig
     if found.is_misfit:
-        print(
-            "warning: the model does not describe these cameras; calibrate with a board, and check the mirrors",
-            file=sys.stderr,
-        )
+        warn("the model does not describe these cameras; calibrate with a board, and check the mirrors")
     if not args.distance_m:
         return found.rig
     scaled = found.at_distance(args.distance_m)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from dataclasses import asdict
 from typing import Final
 
 from drivers.errors import DriverError
 from drivers.logs.open_log import LogInfo, LogState, log_info
-from omnid.commands.options import JSON, RATE, command, print_entries, print_json, warn
+from omnid.commands.options import JSON, RATE, command, failed, print_entries, print_json, warn
 from omnid.errors import OmnidError
 from omnid.formats.tum import read_tum
 from omnid.plain_text import plain
@@ -39,7 +38,7 @@ def info(args: argparse.Namespace) -> int:
         try:
             found = log_info(path, examine=True, rate_hz=args.rate or 0.0)
         except DriverError as error:
-            print(f"omnid: {plain(str(error), MAX_LINE)}", file=sys.stderr)
+            failed(plain(str(error), MAX_LINE))
             code = 2
             continue
         logs.append(found)

@@ -19,7 +19,7 @@ from drivers.frame import Camera, Frame, gray
 from drivers.logs.log_reader import LogReader
 from drivers.motors.protocols.protocol_registry import motor_protocol
 from omnid.calibration import snapshot
-from omnid.commands.options import CAMERAS, JSON, SETTINGS, command, make_folder, print_json, settings_of
+from omnid.commands.options import CAMERAS, JSON, SETTINGS, command, failed, make_folder, print_json, settings_of
 from omnid.commands.tools import require_packages
 from omnid.config import Config
 from omnid.doctor import checks
@@ -96,11 +96,7 @@ def show_cameras(args: argparse.Namespace) -> int:
             raise OmnidError(f"--{name} belongs to --snapshot DIR: name the folder for the images as well")
     devices = capture_devices(ROOT)
     if not devices:
-        print(
-            "omnid: no cameras: the kernel has no capture device; check the cables and the output of `dmesg`",
-            file=sys.stderr,
-        )
-        return 1
+        return failed("no cameras: the kernel has no capture device; check the cables and the output of `dmesg`")
     for device in devices:
         print(f"{device.node}  {device.name}  ({', '.join(filter(None, (device.driver, device.bus)))})")
         exposure = device.exposure or "no exposure time to set"
@@ -124,10 +120,7 @@ def _snapshot(args: argparse.Namespace) -> int:
         path = args.snapshot / f"{camera}.png"
         write_file(path, png(snapshot.annotated(view)))
         print(f"{path}: {snapshot.described(view)}")
-    problems = list(snapshot.warnings(views))
-    for problem in problems:
-        print(f"omnid: {problem}", file=sys.stderr)
-    return int(bool(problems))
+    return max([0, *map(failed, snapshot.warnings(views))])
 
 
 def _frames(args: argparse.Namespace, camera: Camera) -> Generator[Frame, None, None]:

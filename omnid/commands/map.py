@@ -6,7 +6,6 @@ Also the routes on this computer: `omnid route list`, `show`, `delete`.
 from __future__ import annotations
 
 import argparse
-import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -76,7 +75,7 @@ def build(args: argparse.Namespace) -> int:
             for warning in result.warnings:
                 options.warn(f"{log}: {warning}")
             if result.signal:
-                print(f"omnid: interrupted: {args.output} was not written", file=sys.stderr)
+                options.failed(f"interrupted: {args.output} was not written")
                 return 128 + result.signal
         if not new.exists():
             return 1
@@ -201,7 +200,7 @@ def list_routes(args: argparse.Namespace) -> int:
         try:
             found.append(folder.read(name))
         except OmnidError as error:
-            print(f"omnid: {error}", file=sys.stderr)
+            options.failed(str(error))
             code = 2
     if args.json:
         options.print_json([_summary(route) for route in found])

@@ -275,6 +275,12 @@ def warn(line: str) -> None:
     print(f"omnid: warning: {line}", file=sys.stderr)
 
 
+def failed(line: str) -> int:
+    """Print on stderr why the command has no result; return its exit code, 1."""
+    print(f"omnid: {line}", file=sys.stderr)
+    return 1
+
+
 def print_entries(entries: Mapping[str, object]) -> None:
     """Print a line for each entry that is not empty: its name, padded, and its value."""
     for name, value in entries.items():
