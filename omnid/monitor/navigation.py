@@ -7,7 +7,7 @@ import select
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import closing, nullcontext
 from typing import Final
 
@@ -39,67 +39,56 @@ def granted(robot: Robot, answer: Answer) -> str:
     return answer.text
 
 
-def follow(robot: Robot, command_ns: int, show: Callable[[NavigationReport], None]) -> NavigationReport:
-    """Show the progress of the drive that a request with this stamp began, until its end; return the last report.
+def reports_of(robot: Robot, command_ns: int) -> Iterator[NavigationReport]:
+    """Yield the reports of the drive that a request with this stamp began, and last the one with which it ended.
 
-    It is that of another request where that has taken the place of this one. Raise OmnidError where the robot is silent
-    for SILENCE_S.
+    That is one of another request where that has taken the place of this one. Raise OmnidError where the robot is
+    silent for SILENCE_S.
     """
     begun, deadline_s = False, time.monotonic() + SILENCE_S
     with robot.subscribe(NavigationReport) as reports:
         while (report := reports.wait(deadline_s - time.monotonic())) is not None:
             is_own = report.command_ns == command_ns
-            if (begun and not is_own) or (is_own and NavigationState(report.state).is_end):
-                return report
             if is_own:
                 begun, deadline_s = True, time.monotonic() + SILENCE_S
-                show(report)
+            if begun:
+                yield report
+                if not is_own or NavigationState(report.state).is_end:
+                    return
     raise OmnidError(
         f"{robot.name} has been silent for {SILENCE_S:g} s: look at it; if only the network between is gone, it drives "
         "on (`omnid stop`, `omnid listen`)"
     )
 
 
-class ProgressLine:
-    """Shows reports: on a terminal one line that is rewritten, else a line for each new state."""
-
-    def __init__(self) -> None:
-        self._last = ""
-
-    def __call__(self, report: NavigationReport) -> None:
-        """Show a report."""
-        words = f"{report.state}: {report.reason}" if report.reason else report.state
-        if sys.stdout.isatty():
-            HANDLER.show(f"{words}, {report.left_m:.2f} m left" if math.isfinite(report.left_m) else words)
-        elif words != self._last:
-            print(words, flush=True)
-        self._last = words
-
-    def end(self) -> None:
-        """Remove the line."""
-        HANDLER.show("")
-
-
 def drive_to_end(robot: Robot, driver: Driver, ask: Callable[[], Answer]) -> int:
     """Ask for a drive by the driver, and show it until its end. Return 0 if it has reached its goal.
 
-    Ctrl-C, a terminal that closes and other ends of this program cancel it, also while the robot has not answered yet.
+    On a terminal it is one line that is rewritten, else a line for each new state. Ctrl-C, a terminal that closes and
+    other ends of this program cancel it, also while the robot has not answered yet.
     """
-    line = ProgressLine()
+    report, said, is_terminal = NavigationReport(), "", sys.stdout.isatty()
     try:
         with handle_stop_signals(signal.default_int_handler):
             granted(robot, ask())
-            report = follow(robot, driver.asked_ns, line)
+            for report in reports_of(robot, driver.asked_ns):
+                if is_terminal:
+                    left = f", {report.left_m:.2f} m left" if math.isfinite(report.left_m) else ""
+                    HANDLER.show(f"{report.words}{left}")
+                elif report.words != said and report.command_ns == driver.asked_ns:
+                    print(report.words, flush=True)
+                said = report.words
     except KeyboardInterrupt:
         words = granted(robot, driver.navigate("cancel"))  # before a word is printed: the terminal may be gone
-        line.end()
+        HANDLER.show("")
         print(words)
         return 1
-    line.end()
+    HANDLER.show("")
     if report.command_ns != driver.asked_ns:
         print(f"not reached: {robot.name} follows another request now: {report.task}")
         return 1
-    print(f"{report.state}: {report.reason}" if report.reason else report.state)
+    if is_terminal:
+        print(report.words)
     return int(report.state != NavigationState.REACHED)
 
 

@@ -221,6 +221,11 @@ class NavigationReport:
     teaching: str = ""  # name of the route that is recorded
     taught_m: float = 0.0
 
+    @property
+    def words(self) -> str:
+        """The state with the reason."""
+        return f"{self.state}: {self.reason}" if self.reason else self.state
+
 
 def decode_navigation(payload: bytes, _: bytes = b"") -> NavigationReport:
     """Decode the state of the navigation. Raise OmnidError for any other bytes."""

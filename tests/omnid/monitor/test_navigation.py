@@ -98,7 +98,7 @@ def test_a_silent_robot_is_not_reported_to_stop(monkeypatch: pytest.MonkeyPatch)
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
         publish_driving(bus, COMMAND_NS)
         with Robot("omnid", endpoint, timeout_s=30.0) as robot, pytest.raises(OmnidError, match="silent") as caught:
-            navigation.follow(robot, COMMAND_NS, shown.append)
+            shown.extend(navigation.reports_of(robot, COMMAND_NS))
     assert [report.state for report in shown] == ["driving"]
     assert "it drives on (`omnid stop`" in str(caught.value)
 
@@ -115,8 +115,11 @@ def test_a_drive_that_another_request_replaces_has_ended() -> None:
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
         publish_driving(bus, COMMAND_NS)
         with Robot("omnid", endpoint, timeout_s=30.0) as robot:
-            last = navigation.follow(robot, COMMAND_NS, lambda _: publish_driving(bus, COMMAND_NS + 1))
-    assert last.command_ns == COMMAND_NS + 1
+            stamps_ns = []
+            for report in navigation.reports_of(robot, COMMAND_NS):
+                stamps_ns.append(report.command_ns)
+                publish_driving(bus, COMMAND_NS + 1)
+    assert (stamps_ns[0], stamps_ns[-1]) == (COMMAND_NS, COMMAND_NS + 1)
 
 
 @pytest.mark.hazard("H25")
