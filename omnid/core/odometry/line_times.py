@@ -38,7 +38,6 @@ CAMERAS: Final = ("lower", "upper")
 LAG: Final = 4  # the unknown behind the times of rows and columns of the lower and the upper camera
 # Cameras whose lines are read in one time, and the line's axis, 0: rows, 1: columns.
 CHOICES: Final = tuple((cameras, axis) for axis in range(2) for cameras in ((0,), (1,), (0, 1)))
-RIDGE: Final = 1e-9  # so that keyframes with few landmarks leave nothing
 
 
 def camera_names(cameras: Sequence[int]) -> str:
@@ -130,7 +129,7 @@ class LineTimes:
         S = self._model.sigma_px**2 * np.eye(3) + J @ R @ table.anchor_covariance[rows] @ np.swapaxes(J @ R, 1, 2)
         S[:, 2, 2] += seen.variance
         rest = np.concatenate([of_pose, by_times, error[:, :, None]], axis=2)
-        usable = np.isfinite(rest).all(axis=(1, 2))
+        usable = np.isfinite(rest).all(axis=(1, 2)) & np.isfinite(S).all(axis=(1, 2))
         if not usable.any():
             return
         rest = np.linalg.solve(np.linalg.cholesky(S[usable]), rest[usable])
@@ -140,7 +139,8 @@ class LineTimes:
         each, size = np.swapaxes(rest, 1, 2) * weights[:, None, None] @ rest, len(self._information)
         is_own = (group[usable] == np.arange(len(anchors))[:, None]).astype(float)
         total = (is_own @ each.reshape(len(each), -1)).reshape(-1, 6 + size, 6 + size)
-        of_d, across = total[:, :6, :6] + RIDGE * np.eye(6), total[:, :6, 6:]
+        # A prior of a metre and a radian of each pose: a keyframe with one or two landmarks leaves next to nothing.
+        of_d, across = total[:, :6, :6] + np.eye(6), total[:, :6, 6:]
         left = (total[:, 6:, 6:] - np.swapaxes(across, 1, 2) @ np.linalg.solve(of_d, across)).sum(axis=0)
         unit = CORRELATED_LANDMARKS * max(1.0, float(squared.mean()) / VIEW_DIMENSIONS)
         kept = math.exp(-dt_s / MEMORY_S)
@@ -158,8 +158,8 @@ class LineTimes:
         for cameras, axis in CHOICES:
             chosen = [2 * axis + camera for camera in cameras]
             A, b = float(information[np.ix_(chosen, chosen)].sum()), float(information[chosen, -1].sum())
-            found = ReadOut(cameras, axis, b / max(A, RIDGE), b**2 / (2 * max(A, RIDGE)) - cost)
-            if best is None or found.gain > best.gain:
+            found = ReadOut(cameras, axis, b / A, b**2 / (2 * A) - cost) if A > 0 else None
+            if found is not None and (best is None or found.gain > best.gain):
                 best = found
         is_seen = best is not None and abs(best.time_s) * self._px_per_s > LEAST_PX
         return best if best is not None and best.gain > 0 and is_seen else None
