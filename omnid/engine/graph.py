@@ -20,6 +20,7 @@ from typing import Any, Final, Generic, Protocol, TypeAlias, TypeVar
 
 from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
 from omnid.engine.telemetry import StageStats, Telemetry
+from omnid.engine.threads import POLL_S
 
 T = TypeVar("T")
 In = TypeVar("In")
@@ -28,7 +29,6 @@ T_co = TypeVar("T_co", covariant=True)
 Out_co = TypeVar("Out_co", covariant=True)
 In_contra = TypeVar("In_contra", contravariant=True)
 TICKS: Final = "ticks"  # the thread of the tickers that name no other
-POLL_S: Final = 0.1  # a signal handled in another thread does not wake the main one, so it polls
 END: Final = object()  # the last message of a stream
 
 

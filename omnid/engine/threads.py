@@ -7,8 +7,14 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
+from typing import Final
+
+from omnid.core.nanoseconds import S_PER_NS
 
 Lock = threading.Lock
+POLL_S: Final = (
+    0.1  # longest wait without a look at what ends it: a signal in another thread does not wake the main one
+)
 
 
 def started(action: Callable[[], object], name: str) -> Callable[[float | None], bool]:
@@ -24,6 +30,12 @@ def started(action: Callable[[], object], name: str) -> Callable[[float | None],
         return not thread.is_alive()
 
     return has_ended
+
+
+def sleep_until(due_ns: int, is_over: Callable[[], bool]) -> None:
+    """Sleep until a time by CLOCK_MONOTONIC, or until is_over() returns True."""
+    while not is_over() and (left_s := (due_ns - time.monotonic_ns()) * S_PER_NS) > 0:
+        time.sleep(min(left_s, POLL_S))
 
 
 class Poller:

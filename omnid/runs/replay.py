@@ -24,7 +24,6 @@ from omnid.calibration.drive_observations import tracked_updates
 from omnid.config import Config
 from omnid.controller.motor import SIMULATED
 from omnid.core.control.motion_monitor import ADVICE
-from omnid.core.nanoseconds import S_PER_NS
 from omnid.core.rig.rig_health import RigContradictedError, RigHealth
 from omnid.diagnostics.run_summary import RunCounters, RunStatistics, input_warnings
 from omnid.diagnostics.status import stage_stats, summary_stats
@@ -32,6 +31,7 @@ from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Sink
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.realtime import RealtimeSettings
 from omnid.engine.telemetry import Telemetry
+from omnid.engine.threads import sleep_until
 from omnid.errors import OmnidError
 from omnid.formats.exports import write_ply
 from omnid.formats.plan import drawn_heights
@@ -56,7 +56,6 @@ Array = NDArray[np.float64]
 Topics: TypeAlias = tuple[str | None, str | None]  # of the lower and the upper camera
 UNPRIVILEGED: Final = RealtimeSettings(lock_memory=False, motor_priority=0)  # of the controller process of a replay
 PROGRESS_S: Final = 0.2  # between two calls that show the progress
-POLL_S: Final = 0.05  # longest sleep of a paced replay, so that its end takes effect soon
 # Pairs by which the rig is examined: ten seconds of a log at 30 Hz. In the dark the run continues to check.
 MOST_PAIRS: Final = 300
 BOOKKEEPING: Final = frozenset(  # left out of the timings
@@ -218,9 +217,7 @@ class _Replay:
             for message in messages():
                 if offset_ns is None:
                     offset_ns = time.monotonic_ns() - message.stamp_ns
-                due_ns = message.stamp_ns + offset_ns
-                while not graph.is_stopping and (left_s := (due_ns - time.monotonic_ns()) * S_PER_NS) > 0:
-                    time.sleep(min(left_s, POLL_S))
+                sleep_until(message.stamp_ns + offset_ns, lambda: graph.is_stopping)
                 if isinstance(message, Frame):
                     yield message
                 else:  # in the inbox of the pairing samples would replace frames

@@ -27,9 +27,10 @@ from omnid.core.control.arming import ArmRequest
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.contacts import NO_CONTACT
 from omnid.core.control.control_law import ControlInput
-from omnid.core.nanoseconds import S_PER_NS
+from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
 from omnid.engine.graph import Stream
 from omnid.engine.telemetry import StageStats
+from omnid.engine.threads import sleep_until
 from omnid.runs.session import Session
 from omnid.simulation.robot import SimulatedRobot, with_masks
 from omnid.simulation.vehicle import Tick, Vehicle
@@ -37,7 +38,6 @@ from omnid.simulation.world import World
 from omnid.transport.status_names import Key
 
 RECENT: Final = 30  # pairs over which the real-time factor is measured: three seconds
-POLL_S: Final = 0.05  # longest wait, so that `close` takes effect soon
 
 
 class PacedLink:
@@ -105,8 +105,7 @@ class PacedRobot:
         self._vehicle: Vehicle | None = None
         self._link: PacedLink | None = None
         self.states = {camera: CameraState(mode="simulated", status="streaming") for camera in CAMERAS}
-        self._given_s: deque[float] = deque(maxlen=RECENT)  # when the last pairs were given
-        self._due_s = 0.0  # not before this time the next pair is given
+        self._given_ns: deque[int] = deque(maxlen=RECENT)  # when the last pairs were given
         self._closed = self._ends = False
         self.truth: dict[int, Pose] = {}  # true poses of the base in the world by the stamps of the pairs, where kept
         self.contacts, self._touches = 0, False
@@ -146,13 +145,15 @@ class PacedRobot:
     @property
     def _real_time_factor(self) -> float:
         """Simulated time over time on the wall, of the last pairs, at most 1; NaN before the second pair."""
-        at_s = list(self._given_s)
-        return (len(at_s) - 1) / self._robot.rate_hz / (at_s[-1] - at_s[0]) if len(at_s) > 1 else math.nan
+        at_ns = list(self._given_ns)
+        simulated_ns = (len(at_ns) - 1) * NS_PER_S / self._robot.rate_hz
+        return simulated_ns / (at_ns[-1] - at_ns[0]) if len(at_ns) > 1 else math.nan
 
     def _frames(self, settle: Callable[[], None], take: Callable[[MotionSample], None]) -> Iterator[Frame]:
         """Advance from pair to pair; settle: returns when the daemon has answered."""
         vehicle, link, motion = self._vehicle, self._link, self._config.motion
         assert vehicle is not None and link is not None
+        due_ns, period_ns = 0, round(NS_PER_S / self._robot.rate_hz)
         try:
             for pair in vehicle.pairs(settle):
                 if self._keeps_truth:
@@ -161,12 +162,11 @@ class PacedRobot:
                     if (motion.imu if isinstance(sample, GyroSample) else motion.wheels) != "off":
                         take(sample)
                 # Images are not given before their time; a pair that comes late is not made up for.
-                while not self._closed and (left_s := self._due_s - time.monotonic()) > 0:
-                    time.sleep(min(left_s, POLL_S))
+                sleep_until(due_ns, lambda: self._closed)
                 if self._closed:
                     return
-                self._given_s.append(time.monotonic())
-                self._due_s = max(self._due_s + 1.0 / self._robot.rate_hz, self._given_s[-1])
+                self._given_ns.append(time.monotonic_ns())
+                due_ns = max(due_ns + period_ns, self._given_ns[-1])
                 for frame in pair.frames:
                     self.states[frame.camera].frames += 1
                     yield frame
