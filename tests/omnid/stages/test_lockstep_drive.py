@@ -1,22 +1,35 @@
-"""The control law on the stamps of a log: the same limits and safety rules as on the robot, and the same every time."""
+"""What the controller gets: the control law on the stamps of a log; rendered drives with a plausible motion or not."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 from calib import se3
+from calib.rig import Rig
+from calib.rig_file import read_rig
+from drivers.frame import gray
+from drivers.logs.log_reader import LogReader
 from drivers.motor import VelocityCommand
+from omnid import Odometry
 from omnid.core.control.control_law import ControllerSettings, ReplaySetpoint
-from omnid.core.control.heading_controller import HeadingLimits, VelocityLimits
+from omnid.core.control.heading_controller import HeadingLimits, Twist, VelocityLimits
+from omnid.core.control.motion_monitor import NOT_COMMANDED, NOT_SEEN, Motion, MotionSettings
 from omnid.core.control.safety_rules import Deadlines
+from omnid.core.control.trust import MotorReport, Plausibility, TrustSettings
+from omnid.formats.tum import read_tum
 from omnid.messages import OdometryUpdate
 from omnid.stages.lockstep_drive import LockstepDrive, controller_pose
 from omnid.tracking_state import TrackingState
+from tests.conftest import PAIRS
 
 PERIOD_S = 0.05
 POSE_S = 0.1  # between two poses
@@ -85,3 +98,115 @@ def test_the_controllers_pose_is_that_of_the_base() -> None:
     T_base_rig = se3.transform(se3.rotation_exp([0.0, 0.0, 0.5]), [0.1, 0.0, 0.3])
     pose = controller_pose(odometry(0.0, heading_rad=0.2, rate_radps=0.3), T_base_rig)
     assert pose.heading_rad == pytest.approx(0.2) and pose.yaw_rate_radps == pytest.approx(0.3)
+
+
+TICKS = 2  # between two pairs
+PERIOD_NS = 100_000_000
+START_NS = 10**12
+STRAIGHT_PAIRS = PAIRS - 2  # before the turn at the end
+
+
+def image_pairs(log: Path) -> list[tuple[np.ndarray, np.ndarray]]:
+    reader = LogReader(log)
+    images = {"lower": [], "upper": []}
+    for frame in reader.frames():
+        images[frame.camera].append(gray(frame))
+    reader.close()
+    return list(zip(images["lower"], images["upper"], strict=True))[:STRAIGHT_PAIRS]
+
+
+def true_motions(folder: Path) -> list[Twist]:
+    """Return the motion from each pose to the next."""
+    T = read_tum(folder / "truth.txt").T
+    steps = [se3.log(se3.inverse(a) @ b) / (PERIOD_NS * 1e-9) for a, b in pairwise(T)]
+    return [Twist(float(step[0]), float(step[5])) for step in steps]
+
+
+def stops(rig: Rig, images: list[tuple[np.ndarray, np.ndarray]], commands: list[Twist]) -> Iterator[tuple[str, str]]:
+    """Yield the reasons to drive slowly and to stop after each pair of images."""
+    odometry, judged = Odometry(rig), Plausibility(TrustSettings(), MotionSettings())
+    for number, (pair, command) in enumerate(zip(images, commands, strict=False)):
+        stamp_ns = START_NS + number * PERIOD_NS
+        pose = controller_pose(odometry.process(stamp_ns, *pair), np.eye(4))
+        judged.add_pose(stamp_ns, pose.state, pose.motion, pose.resets)
+        yield judged.slowed_by, judged._monitor.reason
+        for tick in range(TICKS):
+            now_ns = stamp_ns + tick * PERIOD_NS // TICKS
+            judged.add_command(now_ns, command)
+            judged.add_report(now_ns, MotorReport(Motion(command.velocity_mps, command.yaw_rate_radps)))
+
+
+def test_the_motion_of_a_right_rig_is_plausible(scene: Path) -> None:
+    found = list(stops(read_rig(scene / "rig.toml"), image_pairs(scene / "log.mcap"), true_motions(scene)))
+    assert found == [("", "")] * STRAIGHT_PAIRS
+
+
+def with_people(
+    rig: Rig, images: list[tuple[np.ndarray, np.ndarray]], T_world_rig: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the images with people who walk past on three sides, 0.9 to 1.8 m away, up to 1.2 m/s fast."""
+    rng = np.random.default_rng(5)
+    cloth = [cv2.GaussianBlur(rng.integers(0, 255, (64, 256)).astype(np.float32), (0, 0), 1.5) for _ in range(3)]
+    start = T_world_rig[0, :3, :2] @ np.array([[0.5, 1.2], [1.5, -1.0], [-1.0, 0.9]]).T + T_world_rig[0, :3, 3:]
+    velocity = T_world_rig[0, :3, :2] @ np.array([[0.4, 0.0], [-1.2, 0.0], [0.9, 0.3]]).T
+    rays = []
+    for side in (rig.lower, rig.upper):
+        width, height = side.camera.size
+        pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2).astype(float)
+        rays.append(side.camera.lift(pixels) @ side.T_cam_rig[:3, :3])
+    crowded = []
+    for number, pair in enumerate(images):
+        people = se3.inverse(T_world_rig[number])[:3] @ np.vstack([start + 0.1 * number * velocity, np.ones((1, 3))])
+        painted = []
+        for image, side, ray in zip(pair, (rig.lower, rig.upper), rays, strict=True):
+            canvas = image.reshape(-1).copy()
+            for person, shirt in zip(people.T, cloth, strict=True):
+                range_m = np.hypot(person[0], person[1])
+                aside = (
+                    np.remainder(np.arctan2(ray[:, 1], ray[:, 0]) - np.arctan2(person[1], person[0]) + np.pi, 2 * np.pi)
+                    - np.pi
+                )
+                height_m = side.viewpoint[2] + range_m * ray[:, 2] / np.hypot(ray[:, 0], ray[:, 1])
+                on = (np.abs(aside) * range_m < 0.25) & (height_m > -1.0) & (height_m < 0.7)
+                rows = ((height_m[on] + 1.0) / 1.7 * 255).astype(int)
+                columns = ((aside[on] * range_m + 0.25) / 0.5 * 63).astype(int)
+                canvas[on] = shirt[columns, rows]
+            painted.append(canvas.reshape(image.shape))
+        crowded.append((painted[0], painted[1]))
+    return crowded
+
+
+def test_people_who_walk_past_are_no_contradiction(scene: Path) -> None:
+    rig, images = read_rig(scene / "rig.toml"), image_pairs(scene / "log.mcap")
+    crowded = with_people(rig, images, read_tum(scene / "truth.txt").T)
+    hidden = np.mean([np.mean(a[0] != b[0]) for a, b in zip(images, crowded, strict=True)])
+    assert hidden > 0.1, "the people cover a tenth of the images"
+    assert list(stops(rig, crowded, true_motions(scene))) == [("", "")] * STRAIGHT_PAIRS
+
+
+@pytest.mark.hazard("H38")
+@pytest.mark.parametrize(("factor", "expected"), [(3.0, NOT_COMMANDED), (0.25, NOT_SEEN)])
+def test_a_rig_of_another_size_stops_the_base(scene: Path, factor: float, expected: str) -> None:
+    """All epipolar lines are right with it; only the wheels can tell."""
+    rig = read_rig(scene / "rig.toml")
+    T_rig_upper = se3.inverse(rig.upper.T_cam_rig)
+    T_rig_upper[:3, 3] = rig.lower.viewpoint + factor * (rig.upper.viewpoint - rig.lower.viewpoint)
+    wrong = replace(rig, upper=replace(rig.upper, T_cam_rig=se3.inverse(T_rig_upper)))
+    found = list(stops(wrong, image_pairs(scene / "log.mcap"), true_motions(scene)))
+    assert found[-1][1] == expected and any(slow and not reason for slow, reason in found)
+
+
+@pytest.mark.hazard("H38")
+def test_images_that_stand_stop_the_base(scene: Path) -> None:
+    """The same scene with other noise: no comparison of pixels finds it."""
+    rng = np.random.default_rng(3)
+    lower, upper = image_pairs(scene / "log.mcap")[0]
+
+    def noisy(image: np.ndarray) -> np.ndarray:
+        return np.clip(image + rng.normal(0, 1.5, image.shape), 0, 255).astype(np.uint8)
+
+    standing = [(noisy(lower), noisy(upper)) for _ in range(STRAIGHT_PAIRS)]
+    found = list(stops(read_rig(scene / "rig.toml"), standing, [Twist(0.5)] * STRAIGHT_PAIRS))
+    assert found[-1][1] == NOT_SEEN
+    at_rest = list(stops(read_rig(scene / "rig.toml"), standing, [Twist()] * STRAIGHT_PAIRS))
+    assert at_rest == [("", "")] * STRAIGHT_PAIRS, "a base at rest before a motionless scene"
