@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.panorama import Cylinder
-from omnid.core.odometry.correlation import normalised_patches
+from omnid.core.odometry.correlation_kernels import correlate
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.types.panorama import PaddedPanorama
 
@@ -53,18 +53,18 @@ def contradicted(
     if earlier.exposure is not None:
         seen -= earlier.exposure.shift(there).lower
     height, width = earlier.usable.shape
-    is_inside = [(at[:, 1] >= HALF_PX) & (at[:, 1] < height - HALF_PX - 1) for at in (pixels, seen)]
-    shown = np.flatnonzero(is_inside[0] & is_inside[1] & cylinder.shows(seen[:, 0]))
-    columns, rows = np.rint(seen[shown]).astype(np.intp).T
-    shown = shown[earlier.usable[rows, columns % width]]
+    columns, rows = np.nan_to_num(np.rint(seen)).astype(np.intp).T
+    shown = earlier.usable[np.clip(rows, 0, height - 1), columns % width] & cylinder.shows(seen[:, 0])
+    chosen = np.flatnonzero(shown & (np.abs(seen[:, 1] - height / 2) < height))
     # 2. The correlations of both hypotheses there; they are one where the point has not moved in the image.
-    now, in_world, at_rig = (
-        normalised_patches(panorama, at[shown], 2 * HALF_PX + 1)[0]
+    now, there, here = (
+        np.column_stack([panorama.padded(at[chosen, 0]), at[chosen, 1]])
         for panorama, at in ((lower, pixels), (earlier.lower, seen), (earlier.lower, pixels))
     )
-    moved = seen[shown] - pixels[shown]
-    has_moved = np.hypot(cylinder.wrap(moved[:, 0]), moved[:, 1]) > HALF_PX
-    of_world, of_rig = ((now * other).sum(axis=1) for other in (in_world, at_rig))
+    of_world, of_rig = np.empty((2, len(chosen)))
+    for found, at in ((of_world, there), (of_rig, here)):
+        correlate(lower.image, earlier.lower.image, now, at, HALF_PX, found)
+    has_moved = np.hypot(lower.apart(there[:, 0] - here[:, 0]), there[:, 1] - here[:, 1]) > HALF_PX
     wrong = np.zeros(len(points), bool)
-    wrong[shown] = (of_world < LEAST) | (has_moved & (of_rig > of_world))
+    wrong[chosen] = (of_world < LEAST) | (has_moved & (of_rig > of_world))
     return wrong

@@ -31,9 +31,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
+from omnid.core.odometry.correlation import matching_disparities
 from omnid.core.odometry.estimates import SAME_M
 from omnid.core.odometry.tracking import KltSettings, track
-from omnid.core.odometry.wrong_periods import matching_disparities
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.stereo_model import StereoModel
 

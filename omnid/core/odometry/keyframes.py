@@ -1,4 +1,4 @@
-"""Keyframes of the local map: when one is needed, and the work that makes it."""
+"""Keyframes of the local map: when one is needed, and its new landmarks."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.odometry.corners import clear_around, corners
+from omnid.core.odometry.corners import clear_around, corners, nearby_disparity, pixels_in_upper
+from omnid.core.odometry.correlation import has_wrong_period
 from omnid.core.odometry.estimates import OdometryLimits, PoseEstimate
-from omnid.core.odometry.exposure_times import Exposure
+from omnid.core.odometry.exposure_times import AssumedMotion, Exposure
 from omnid.core.odometry.first_depths import FirstDepths
-from omnid.core.odometry.landmarks import located
-from omnid.core.odometry.local_map import Keyframe, LocalMap
-from omnid.core.odometry.plane_patches import WINDOW_PX
+from omnid.core.odometry.local_map import Keyframe, LocalMap, NewLandmarks
+from omnid.core.odometry.plane_patches import WINDOW_PX, align_rows, disparity_slopes, fitted_slopes, view_noise
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings
 from omnid.core.types.stereo_model import StereoModel
@@ -84,6 +84,31 @@ class Keyframes:
             self._relocaliser.add(replace(frame, exposure=request.exposure), keyframe)
         self._most_inliers, self._tracked_s = 0, 0.0
         return new.pixels
+
+
+def located(
+    frame: StereoFrame, points: Array, model: StereoModel, klt: KltSettings, exposure: Exposure, known: Array
+) -> NewLandmarks:
+    """Return the corners (N, 2) of the lower panorama that the upper panorama shows too.
+
+    They are located by SAD (eq. 8), and then by KLT and by their patches to a fraction of a pixel. known (M, 3) [px]:
+    views of the map's landmarks.
+    """
+    # 1. Disparity by dense stereo.
+    dense = replace(frame, exposure=exposure).disparity
+    guess, spread_px = exposure.upper_pixels(points, nearby_disparity(dense, points))
+    pair = frame.lower, frame.upper
+    # 2. Track into the upper panorama, and align the patch there with the slopes of its surface.
+    near = pixels_in_upper(pair, points, guess, klt, spread_px)
+    slopes = disparity_slopes(dense, points, near[:, 1] - points[:, 1])
+    slopes = fitted_slopes(pair, points, near, slopes, model)
+    rows, variance = align_rows(pair, points, near, slopes, model)
+    found = np.isfinite(rows)
+    found[found] = ~has_wrong_period(pair, points[found], rows[found], known)
+    # 3. Correct the views for the motion during the exposures.
+    views, _ = exposure.corrected(points[found], rows[found])
+    assumed = AssumedMotion(exposure.motion, exposure.derivatives(views))
+    return NewLandmarks(points[found], views, slopes[found], view_noise(np.zeros((2, 2)), variance[found]), assumed)
 
 
 class KeyframeLocaliser(Protocol):

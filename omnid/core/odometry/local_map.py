@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.estimates import PoseEstimate
-from omnid.core.odometry.exposure_times import RigVelocity
+from omnid.core.odometry.exposure_times import AssumedMotion, RigVelocity
 from omnid.core.odometry.first_depths import FirstDepths
-from omnid.core.odometry.landmarks import NewLandmarks
 from omnid.core.odometry.plane_patches import REACH_PX, AlignedPatches, align, moved_slopes, plane_templates
 from omnid.core.odometry.tracking import KltSettings, track
 from omnid.core.stereo.triangulation import MIN_RADIUS2_M2, point_covariance, triangulate, view
@@ -62,6 +61,17 @@ class Keyframe:
     lower: PaddedPanorama
     T_odom_rect: Array
     covariance: Array  # (6, 6) [t; r] in the rectified frame
+
+
+@dataclass(frozen=True, slots=True)
+class NewLandmarks:
+    """Landmarks that were located in both panoramas of a keyframe."""
+
+    pixels: Array  # (N, 2) px in the lower panorama
+    views: Array  # (N, 3) px, at the stamp
+    slopes: Array  # (N, 2) px/px of the disparity
+    noise: Array  # (N, 3, 3) px^2 of the views, that of the motion left out
+    assumed: AssumedMotion  # motion by which the views were corrected
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,15 +32,17 @@ LANES = 8  # columns that the compiler computes at once
 MIN_TRUE_GRADIENT = 0.2  # least share of the gradients' matrix that counts as texture.
 
 
-@compiled("(u1[:, ::1], i8[:, :, ::1], f8[:, :, :, ::1], f4[:, :, ::1])", writes=("templates",))
-def sample(image: Image, cells: Indices, coefficients: Array, templates: Floats) -> None:
-    """Write the templates (N, T, T) of patches of an image.
+@compiled("(u1[:, ::1], i8[::1], i8[:, :, ::1], f8[:, :, :, ::1], f4[:, :, ::1])", writes=("templates",))
+def sample(image: Image, chosen: Indices, cells: Indices, coefficients: Array, templates: Floats) -> None:
+    """Write the templates (N, T, T) of the chosen patches, whose image this is.
 
     cells (N, 2, 2): first column and row that a template reaches, and their numbers; coefficients (N, 2, 3, 3) of
     powers of row and column from the template's middle: the columns and the rows there of its pixels.
     """
     side, half = templates.shape[1], templates.shape[1] // 2
-    width, most = -(-side // LANES) * LANES, cells[:, 1].max()
+    width, most = -(-side // LANES) * LANES, 0
+    for n in chosen:
+        most = max(most, cells[n, 1, 0], cells[n, 1, 1])
     cell, at = np.empty((most, most), np.float32), np.empty(width, np.int32)
     greys, stride, row_step = cell.reshape(-1), np.int32(most), np.uint64(most)
     across, down, part = (
@@ -48,7 +50,7 @@ def sample(image: Image, cells: Indices, coefficients: Array, templates: Floats)
         np.empty(4 * width, np.float32),
         np.empty(4 * width, np.float32),
     )
-    for n in range(len(templates)):
+    for n in chosen:
         copy_cell(image, cells[n, 0, 0], cells[n, 0, 1], cells[n, 1, 0], cells[n, 1, 1], cell)
         columns, rows = coefficients[n, 0], coefficients[n, 1]
         for i in range(side):

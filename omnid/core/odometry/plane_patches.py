@@ -45,6 +45,8 @@ MAX_SLOPE = 0.7  # Largest slope of a disparity, because a steeper plane is seen
 SLOPE_SIGMA = 0.1
 # Nodes of a template farther than so many halves of its side from the middle do not bend it.
 MOST_STRETCH = 4
+# Columns and rows of the nodes of a template, as halves of its side from the middle.
+STEPS = np.array([[-1, 0, 1] * 3, [-1, -1, -1, 0, 0, 0, 1, 1, 1]])
 # Coefficients of the powers 0, 1, 2 of a polynomial by its values at -1, 0 and 1.
 POWERS = np.array([[0.0, 1.0, 0.0], [-0.5, 0.0, 0.5], [0.5, -1.0, 0.5]])
 # Reach of patches whose pose and depth are known well.
@@ -84,33 +86,36 @@ def plane_templates(
     """
     side, cylinder, half = window_px + 2, model.cylinder, (window_px + 2) // 2
     templates = np.zeros((len(pixels), side, side), np.float32)
-    # 1. Rays of corners, middles of the sides and middle of the templates, from the current viewpoint o'.
+    # 1. Rays (3, N, 9) of corners, middles of the sides and middle of the templates, from the current viewpoint o'.
     origin = np.array([0.0, 0.0, model.baseline_m if upper else 0.0])
-    R, t = T_curr_ref[:, :3, :3], T_curr_ref[:, :3, 3]
-    n, shift = _turned(R, _normals(surfaces, model.baseline_m)), (np.rint(predicted) - predicted)[:, None]
-    steps = half * np.array([(column, row) for row in (-1, 0, 1) for column in (-1, 0, 1)])
-    nodes = cylinder.pixels(_turned(R, surfaces[0]) + t - origin)[:, None] + shift + steps
-    rays = cylinder.rays(nodes.reshape(-1, 2)).reshape(*nodes.shape[:2], 3)
-    # 2. Their points on the plane n' . (p' - o') = scale, and where the image shows these. A template of which the
-    #    plane explains a part alone is not bent.
-    along, scale = (rays * n[:, None]).sum(axis=2), 1 + (n * (t - origin)).sum(axis=1, keepdims=True)
-    there = ((scale / along)[:, :, None] * rays + (origin - t)[:, None]) @ R
-    offsets = cylinder.pixels(there.reshape(-1, 3)).reshape(nodes.shape) - cylinder.pixels(surfaces[0])[:, None]
-    offsets[:, :, 0] = cylinder.wrap(offsets[:, :, 0])
-    is_bent = (scale > 0) & (along > 0) & (np.abs(offsets) < MOST_STRETCH * half).all(axis=2)
-    offsets = np.where(is_bent.all(axis=1)[:, None, None], offsets, steps + shift)
+    R, t = T_curr_ref[:, :3, :3], T_curr_ref[:, :3, 3] - origin
+    n, shift = _turned(R, _normals(surfaces, model.baseline_m)), np.rint(predicted) - predicted
+    middles = cylinder.pixels(_turned(R, surfaces[0]) + t) + shift
+    azimuths = cylinder.azimuth(middles[:, :1] + half * STEPS[0, :3])
+    heights = (cylinder.row0 - middles[:, 1:] - half * STEPS[1]) / cylinder.focal_px
+    rays = np.stack([np.tile(np.cos(azimuths), 3), np.tile(np.sin(azimuths), 3), heights])
+    # 2. Their points on the plane n' . (p' - o') = scale, and where the image shows these, from the patch's middle. A
+    #    template of which the plane explains a part alone is not bent.
+    along, scale = np.einsum("nk,knm->nm", n, rays), 1 + np.einsum("nk,nk->n", n, t)[:, None]
+    x, y, z = np.einsum("nka,knm->anm", R, scale / along * rays - t.T[:, :, None])
+    r = np.hypot(surfaces[0][:, 0], surfaces[0][:, 1])[:, None]
+    c, s, slope = surfaces[0].T[:, :, None] / r
+    offsets = cylinder.focal_px * np.stack(
+        [np.arctan2(s * x - c * y, c * x + s * y), slope - z / np.hypot(x, y)], axis=1
+    )
+    is_bent = (scale > 0) & (along > 0) & (np.abs(offsets) < MOST_STRETCH * half).all(axis=1)
+    offsets = np.where(is_bent.all(axis=1)[:, None, None], offsets, half * STEPS + shift[:, :, None])
     # 3. The quadratic polynomials through them, and the greys of the pixels in between.
-    known = np.isfinite(offsets).all(axis=(1, 2)) & np.isfinite(pixels).all(axis=1)
+    known = np.isfinite(offsets[:, :, 0]).all(axis=1) & np.isfinite(pixels).all(axis=1)
+    first_image = next(iter(images.values()))
+    places = np.where(known[:, None, None], offsets + _padded(first_image, pixels)[:, :, None], 0.0)
+    first = np.floor(places.min(axis=2)).astype(np.intp) - 2
+    cells = np.stack([first, np.floor(places.max(axis=2)).astype(np.intp) + 4 - first], axis=1)
+    powers = POWERS / half ** np.arange(3)[:, None]
+    coefficients = powers @ (places - first[:, :, None]).reshape(-1, 2, 3, 3) @ powers.T
     for key in np.unique(anchors).tolist():
-        image, chosen = images[key], np.flatnonzero(known & (anchors == key))
-        places = offsets[chosen] + _padded(image, pixels[chosen])[:, None]
-        first = np.floor(places.min(axis=1)).astype(np.intp) - 2
-        cells = np.stack([first, np.floor(places.max(axis=1)).astype(np.intp) + 4 - first], axis=1)
-        values = (places - first[:, None]).swapaxes(1, 2).reshape(-1, 2, 3, 3)
-        powers, found = POWERS / half ** np.arange(3)[:, None], np.empty((len(chosen), side, side), np.float32)
-        if len(chosen):
-            patch_kernels.sample(image.image, cells, powers @ values @ powers.T, found)
-        templates[chosen] = found
+        chosen = np.flatnonzero(known & (anchors == key))
+        patch_kernels.sample(images[key].image, chosen, cells, coefficients, templates)
     return templates
 
 
