@@ -1,11 +1,10 @@
 """Normalised correlation of the windows of two panoramas, and the wrong periods of disparity that it shows.
 
-Wrong periods of the disparity: along a column, texture that repeats matches at several rows of the upper panorama.
-
-Courses of bricks of the height c fit the upper panorama at every disparity d (1 - k c / B), B the baseline, whatever
-their distance. Dense stereo chooses by its surroundings, and at the ends of a sector these are few: bricks at 5 m were
-taken for ones at 50 m, twenty in a row. They hardly move with the robot's lateral motion, so that they distinguish it
-from a turn, and moved the pose by seven sigmas.
+Along a column, texture that repeats matches at several rows of the upper panorama. Courses of bricks of the height c
+fit at every disparity d (1 - k c / B), B the baseline, whatever their distance. Dense stereo chooses by its
+surroundings, and at the ends of a sector these are few: bricks at 5 m were taken for ones at 50 m, twenty in a row.
+They hardly move with the robot's lateral motion, so that they distinguish it from a turn, and moved the pose by seven
+sigmas.
 
 The landmarks that the map knows nearby have been seen from several places, which show their depth. A new one whose
 disparity is not theirs, and whose patch matches as well at theirs, is left out; where it matches at its own only it is
@@ -25,7 +24,6 @@ Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 Pair = tuple[PaddedPanorama, PaddedPanorama]
 
-MOST_ROWS = 32_000  # of a map that OpenCV takes
 NEIGHBOURS = 5  # known landmarks whose median disparity counts, because two of them may be of another surface
 # Two disparities whose ratio is larger are of two surfaces, because the slope of one surface changes them by 0.15
 # px/px. A match within the second, as a share of the neighbours' disparity, is at theirs.
@@ -48,17 +46,13 @@ def normalised_patches(
     """
     source = panorama.image if image is None else image
     offsets = ((np.arange(side) - side // 2) * step_px).astype(np.float32)
-    across, down = panorama.padded(pixels[:, 0]).astype(np.float32), pixels[:, 1].astype(np.float32)
-    patches = np.empty((len(pixels), side * side), np.float32)
-    for first in range(0, len(pixels), MOST_ROWS):
-        part = slice(first, first + MOST_ROWS)
-        columns = across[part, None] + np.tile(offsets, side)
-        rows = down[part, None] + np.repeat(offsets, side)
-        patches[part] = cv2.remap(source, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    columns = panorama.padded(pixels[:, :1]).astype(np.float32) + np.tile(offsets, side)
+    rows = pixels[:, 1:].astype(np.float32) + np.repeat(offsets, side)
+    patches = cv2.remap(source, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
     patches -= patches.mean(axis=1, keepdims=True)
     length = np.linalg.norm(patches, axis=1)
     # A patch without contrast divides by no zero.
-    return patches / np.maximum(length, 1e-9)[:, None], length / side
+    return np.asarray(patches / np.maximum(length, 1e-9)[:, None]), np.asarray(length / side)
 
 
 def has_wrong_period(pair: Pair, pixels: Array, rows: Array, known: Array) -> Flags:

@@ -86,6 +86,8 @@ def plane_templates(
     """
     side, cylinder, half = window_px + 2, model.cylinder, (window_px + 2) // 2
     templates = np.zeros((len(pixels), side, side), np.float32)
+    if not len(pixels):
+        return templates
     # 1. Rays (3, N, 9) of corners, middles of the sides and middle of the templates, from the current viewpoint o'.
     origin = np.array([0.0, 0.0, model.baseline_m if upper else 0.0])
     R, t = T_curr_ref[:, :3, :3], T_curr_ref[:, :3, 3] - origin
@@ -97,12 +99,12 @@ def plane_templates(
     # 2. Their points on the plane n' . (p' - o') = scale, and where the image shows these, from the patch's middle. A
     #    template of which the plane explains a part alone is not bent.
     along, scale = np.einsum("nk,knm->nm", n, rays), 1 + np.einsum("nk,nk->n", n, t)[:, None]
-    x, y, z = np.einsum("nka,knm->anm", R, scale / along * rays - t.T[:, :, None])
     r = np.hypot(surfaces[0][:, 0], surfaces[0][:, 1])[:, None]
     c, s, slope = surfaces[0].T[:, :, None] / r
-    offsets = cylinder.focal_px * np.stack(
-        [np.arctan2(s * x - c * y, c * x + s * y), slope - z / np.hypot(x, y)], axis=1
-    )
+    with np.errstate(divide="ignore", invalid="ignore"):  # planes seen edge on
+        x, y, z = np.einsum("nka,knm->anm", R, scale / along * rays - t.T[:, :, None])
+        seen = [np.arctan2(s * x - c * y, c * x + s * y), slope - z / np.hypot(x, y)]
+    offsets = cylinder.focal_px * np.stack(seen, axis=1)
     is_bent = (scale > 0) & (along > 0) & (np.abs(offsets) < MOST_STRETCH * half).all(axis=1)
     offsets = np.where(is_bent.all(axis=1)[:, None, None], offsets, half * STEPS + shift[:, :, None])
     # 3. The quadratic polynomials through them, and the greys of the pixels in between.
