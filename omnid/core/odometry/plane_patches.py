@@ -105,7 +105,7 @@ def plane_templates(
         x, y, z = np.einsum("nka,knm->anm", R, scale / along * rays - t.T[:, :, None])
         seen = [np.arctan2(s * x - c * y, c * x + s * y), slope - z / np.hypot(x, y)]
     offsets = cylinder.focal_px * np.stack(seen, axis=1)
-    is_bent = (scale > 0) & (along > 0) & (np.abs(offsets) < MOST_STRETCH * half).all(axis=1)
+    is_bent = np.asarray((scale > 0) & (along > 0) & (np.abs(offsets) < MOST_STRETCH * half).all(axis=1))
     offsets = np.where(is_bent.all(axis=1)[:, None, None], offsets, half * STEPS + shift[:, :, None])
     # 3. The quadratic polynomials through them, and the greys of the pixels in between.
     known = np.isfinite(offsets[:, :, 0]).all(axis=1) & np.isfinite(pixels).all(axis=1)
