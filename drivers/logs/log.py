@@ -22,6 +22,7 @@ from drivers.errors import RecordError
 from drivers.logs.compression import unpack_message
 from drivers.logs.ros_messages import (
     IMAGE_TYPES,
+    STAMPED_TYPES,
     JointWheels,
     RosImage,
     cdr_of_ros1,
@@ -83,10 +84,12 @@ class LogFile(ABC):
     def header_ns(self, channel: int, start: bytes | memoryview) -> int:
         """Return the stamp in the first bytes of a message, or in all of one that is compressed by itself.
 
-        0 where it is unset. Raise RecordError where it does not unpack.
+        0 where it is unset, or where the type has none that is used. Raise RecordError where it does not unpack.
         """
-        aligned = channel not in self.topics or self.topics[channel].aligned
-        return header_ns(unpack_message(memoryview(start)), aligned=aligned)
+        topic = self.topics.get(channel)
+        if topic is None or topic.kind not in STAMPED_TYPES:
+            return 0
+        return header_ns(unpack_message(memoryview(start)), aligned=topic.aligned)
 
     def close(self) -> None:  # noqa: B027  (some keep no file open)
         """Close the file; may be called twice."""

@@ -21,6 +21,7 @@ IMAGE_TYPES: Final = (IMAGE, COMPRESSED_IMAGE)
 ODOMETRY: Final = "nav_msgs/msg/Odometry"
 IMU: Final = "sensor_msgs/msg/Imu"
 JOINT_STATE: Final = "sensor_msgs/msg/JointState"
+STAMPED_TYPES: Final = (*IMAGE_TYPES, ODOMETRY, IMU, JOINT_STATE)  # which begin with a header, whose stamp is used
 BASE_FRAME: Final = "base_link"  # Frame of messages whose axes are those of the base (REP 105), as omnid records them.
 HEADER_BYTES: Final = 12  # of a message that begins with a header: those that tell its stamp
 NOT_MEASURED: Final = -1.0  # first number of the covariance of what an IMU does not measure (sensor_msgs/msg/Imu)
