@@ -119,6 +119,19 @@ def test_a_clock_that_is_set_begins_a_segment(tmp_path: Path, write: object, siz
     assert "1.900 s after the first one: the images after it are a new segment" in warnings[0]
 
 
+@pytest.mark.parametrize("at", [1, 2, 3, 36, 37, 38, 39])
+@pytest.mark.parametrize("size_s", [-3600, -1, -0.25, 3])
+def test_no_image_beside_a_step_at_either_end_is_sorted_among_the_others(
+    tmp_path: Path, at: int, size_s: float
+) -> None:
+    """Too few images tell a step from wrong stamps: they have the times of logging."""
+    stamp: Times = lambda topic, number, ns: ns + int(size_s * S) * (number >= at)  # noqa: E731
+    frames, warnings = read(write_log(tmp_path / "log.mcap", entries(stamp)))
+    assert shown(frames) == AS_TAKEN and len(warnings) == 1
+    steps = np.diff([frame.stamp_ns for frame in frames if frame.camera == "lower"])
+    assert (np.abs(steps - STEP_NS) <= DELAY_NS).all()
+
+
 def test_a_clock_that_is_set_between_two_parts_begins_a_segment(tmp_path: Path) -> None:
     clock = later(-S)
     written = entries(lambda topic, number, ns: clock(topic, number, ns) - DELAY_NS, clock)
