@@ -8,6 +8,7 @@ file need not be the order in time, and a step of a clock is found before anythi
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -67,6 +68,7 @@ class LogFile(ABC):
         self.name = name
         self.topics: dict[int, Topic] = {}  # by channel; complete after entries()
         self.faults: dict[int, str] = {}  # what cannot be read, by block, or by offset without one; grows by reading
+        self.stated: Counter[int] = Counter()  # messages by channel, by the summary of a closed file, where it has one
         self.cut = ""  # one line that says what is missing at the end, "" of a complete file; known after entries()
 
     @abstractmethod
@@ -147,6 +149,7 @@ class LogIndex(NamedTuple):
     run_ns: Times  # log times, which run on where the recorder's clock was set back
     order: NDArray[np.int64]  # (N,) rows in the order of these times, else of the files
     steps: list[ClockStep]
+    lost: Mapping[str, int]  # topic -> messages that a summary states, and that are nowhere
 
 
 class Log:
@@ -230,7 +233,7 @@ class Log:
     def index(self) -> LogIndex:
         """Where all messages are, and when they were logged."""
         # 1. The entries of each file in its order, with the numbers of their topics.
-        topics: dict[str, str] = {}
+        topics, lost = dict[str, str](), Counter[str]()
         parts: list[tuple[Entries, NDArray[np.int32], NDArray[np.int16]]] = []
         for number, file in enumerate(self.files):
             entries = file.entries()
@@ -238,7 +241,10 @@ class Log:
             for name, kind, _ in file.topics.values():
                 topics[name] = topics.get(name) or kind
             places = {name: place for place, name in enumerate(topics)}
-            channels, which = np.unique(entries["channel"], return_inverse=True)
+            channels, which, counts = np.unique(entries["channel"], return_inverse=True, return_counts=True)
+            missing = file.stated - Counter(dict(zip(channels.tolist(), counts.tolist(), strict=True)))
+            for channel in missing.keys() & file.topics.keys():
+                lost[file.topics[channel].name] += missing[channel]
             known = np.array([places[file.topics[c].name] if c in file.topics else -1 for c in channels], np.int32)
             for channel in channels[known < 0]:
                 file.faults[-1 - int(channel)] = f"the channel {channel} of messages is unknown"
@@ -252,7 +258,7 @@ class Log:
         if steps and (kept := ~self._is_repeated(topic, entries, of_file)).sum() < len(kept):
             topic, entries, of_file = topic[kept], entries[kept], of_file[kept]
             run_ns, steps = running_on(topic, entries["time_ns"], images)
-        return LogIndex(topics, topic, of_file, entries, run_ns, np.argsort(run_ns, kind="stable"), steps)
+        return LogIndex(topics, topic, of_file, entries, run_ns, np.argsort(run_ns, kind="stable"), steps, lost)
 
     def _is_repeated(self, topic: NDArray[np.int32], entries: Entries, of_file: NDArray[np.int16]) -> NDArray[np.bool_]:
         """Return which messages (N,) have topic, time and bytes of one before, as where a part was written twice."""

@@ -271,6 +271,8 @@ class LogReader:
         self.truncated = bool(damage.cut)
         self.counts["broken_records"] = damage.broken
         self.counts["unstamped"] = times.by_log.total()
+        if self._span_s == WHOLE:
+            self.counts["unreadable"] += sum(self._log.index.lost.get(topic, 0) for topic in self._cameras.values())
         self.counts["no_joints"] = 0 if self._has_wheels else self._other_joints
         self._faults["broken_records"] = damage.first
         self.warnings += [damage.cut] if damage.cut else []

@@ -25,7 +25,7 @@ import numpy as np
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Schema
+from mcap.records import Attachment, Channel, Schema, Statistics
 
 from drivers.errors import DriverError, RecordError
 from drivers.logs.compression import MAX_RECORD_BYTES, is_packed_message, unpack_chunk
@@ -56,6 +56,7 @@ class Kind(Enum):
     ATTACHMENT = auto()
     END = auto()  # of chunks and messages
     PLACE = auto()  # of a chunk, behind that end
+    COUNTS = auto()  # of the messages, behind that end
     OTHER = auto()
 
 
@@ -149,7 +150,7 @@ class RecordFile(LogFile, ByteSource):
 
     @abstractmethod
     def _learn(self, source: ByteSource, record: Record) -> None:
-        """Add a channel, a schema or the place of a chunk, within the limits."""
+        """Add a channel, a schema, the place of a chunk or counts of messages, within the limits."""
 
     # The log file
 
@@ -169,7 +170,7 @@ class RecordFile(LogFile, ByteSource):
         summary_at, data_end = self._summary_at(), self.size - len(self.end_magic)
         for record in self._records(self, summary_at, data_end) if summary_at else ():
             with suppress(RecordError):  # then the data has the definition
-                if record.kind in (*_DEFINITIONS, Kind.PLACE):
+                if record.kind in (*_DEFINITIONS, Kind.PLACE, Kind.COUNTS):
                     self._learn(self, record)
         found, last = [np.empty(0, ENTRY)], Record(Kind.OTHER, 0, 0, len(self.magic))
         for record in self._with_jumps(is_closed=summary_at is not None):
@@ -296,6 +297,7 @@ _MCAP_KINDS: Final = {
     Opcode.ATTACHMENT: Kind.ATTACHMENT,
     Opcode.CHUNK_INDEX: Kind.PLACE,
     Opcode.DATA_END: Kind.END,
+    Opcode.STATISTICS: Kind.COUNTS,
 }
 
 
@@ -373,6 +375,9 @@ class McapFile(RecordFile):
         body = source.content(record.offset, record.size)
         if record.kind is Kind.PLACE:
             self._places += _unpacked(_PLACE, body)
+            return
+        if record.kind is Kind.COUNTS:
+            self.stated.update(_parsed(Statistics, body).channel_message_counts)
             return
         if len(body) > MAX_DEFINITION_BYTES or max(len(self._types), len(self.topics)) >= MAX_DEFINITIONS:
             raise RecordError(f"more than {MAX_DEFINITIONS} channels or schemas, or a large one")
@@ -464,6 +469,8 @@ class Ros1Bag(RecordFile):
     def _learn(self, source: ByteSource, record: Record) -> None:
         if record.kind is Kind.PLACE:
             self._places += _field(record, b"chunk_pos", "<Q")
+            counts = np.frombuffer(source.content(record.offset, record.size // 8 * 8), "<u4").reshape(-1, 2)
+            self.stated.update(dict(counts.tolist()))
             return
         if len(self.topics) >= MAX_DEFINITIONS or record.size > MAX_DEFINITION_BYTES:
             raise RecordError(f"more than {MAX_DEFINITIONS} connections, or a large one")

@@ -103,12 +103,23 @@ class RotatingLog:
                 self._stop(error)
 
     def end_file(self) -> None:
-        """Complete the file: the next message begins another one."""
-        self._end()
+        """Complete the file, if there is one, and rename it: the next message begins another one."""
+        writer = self._writer
+        if writer is None:
+            return
+        try:
+            writer.close()
+            self._path.rename(self._path.with_suffix(""))
+        except DriverError as error:
+            self._stop(error)
+        except OSError as error:
+            reason = f"{error.strerror}; is its folder gone?"
+            self._stop(DriverError(f"cannot rename the log {str(self._path)!r}: {reason}"))
+        self._writer, self.state.file = None, ""
 
     def close(self) -> None:
         """Complete the file and end the recording."""
-        self._end()
+        self.end_file()
         self.state.status, self._retry_at_s = "closed", float("inf")
 
     def _current(self, stamp_ns: int) -> LogWriter | None:
@@ -117,7 +128,7 @@ class RotatingLog:
         if self._writer is not None:
             age_s = abs(stamp_ns - self._start_ns) / 1e9
             if self._writer.size_bytes >= keep.file_bytes or age_s >= keep.file_s:
-                self._end()
+                self.end_file()
         if self._writer is not None or time.monotonic() < self._retry_at_s:
             return self._writer
         self._delete_oldest()
@@ -141,10 +152,11 @@ class RotatingLog:
             self._number += 1
             whole = self._folder / f"{self._name}_{at}_{self._number:03}.mcap"
             self._path = whole.with_name(whole.name + _PART)
+            if os.path.lexists(whole):
+                continue
+            self._own[whole.name] = self._number
             try:
-                if not os.path.lexists(whole):
-                    self._own[whole.name] = self._number
-                    return LogWriter(self._path, self._attachments, compression="none", exclusive=True)
+                return LogWriter(self._path, self._attachments, compression="none", exclusive=True)
             except DriverError as error:
                 if not isinstance(error.__cause__, FileExistsError):
                     with suppress(OSError):
@@ -187,23 +199,8 @@ class RotatingLog:
         try:
             self._require_free_space(self._rotation.free_bytes)
         except DriverError as error:
-            self._end()
+            self.end_file()
             self._stop(error)
-
-    def _end(self) -> None:
-        """Complete the file and rename it."""
-        writer = self._writer
-        if writer is None:
-            return
-        try:
-            writer.close()
-            self._path.rename(self._path.with_suffix(""))
-        except DriverError as error:
-            self._stop(error)
-        except OSError as error:
-            reason = f"{error.strerror}; is its folder gone?"
-            self._stop(DriverError(f"cannot rename the log {str(self._path)!r}: {reason}"))
-        self._writer, self.state.file = None, ""
 
     def _delete_oldest(self) -> None:
         """Delete the oldest recordings of this name until there is room for one more within the limits.

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap.writer import CompressionType
 
 from omnid.calibration.images import read_pairs
 from tests.conftest import PAIRS
@@ -112,8 +113,14 @@ def test_loss_is_told_by_the_exit_code(omnid: Command, tmp_path: Path, scene: Pa
     assert len(left_out) == (name in ("an image is cut", "an image is small"))
 
 
-def test_images_in_corrupt_chunks_are_a_loss(omnid: Command, tmp_path: Path, scene: Path) -> None:
-    log = write_log(tmp_path / "log.mcap", entries(scene), chunk_size=30_000)
+@pytest.mark.parametrize("kind", ["", "lz4", "bag"])
+def test_images_in_corrupt_chunks_are_a_loss(omnid: Command, tmp_path: Path, scene: Path, kind: str) -> None:
+    """Of a chunk that does not unpack, the summary of the file tells what was in it."""
+    if kind == "bag":
+        log = write_bag(tmp_path / "log.bag", entries(scene), "BZ2", chunk_bytes=30_000)
+    else:
+        compression = CompressionType.LZ4 if kind else CompressionType.NONE
+        log = write_log(tmp_path / "log.mcap", entries(scene), chunk_size=30_000, compression=compression)
     data = bytearray(log.read_bytes())
     for part in (0.2, 0.4, 0.6, 0.8):
         data[int(part * len(data))] ^= 1
