@@ -20,7 +20,7 @@ from omnid.engine.threads import Poller
 from omnid.errors import OmnidError
 from omnid.transport import ros2
 from omnid.transport.bus_config import BusConfig, checked
-from omnid.transport.intake import PERIOD_S, QUERY, CommandIntake, Intake, OpenRequests, RequestCallback
+from omnid.transport.intake import PERIOD_S, QUERY_HZ, CommandIntake, Intake, OpenRequests, RequestCallback, burst_of
 from omnid.transport.session import ALIVE, EndpointTaken, has_receiver, open_session, reason, router_in_place
 from omnid.transport.stop_datagram import StopListener
 from omnid.transport.topics import CLOCK, PUBLISHED, STOP, Request, Topic, plain_key, ros_name
@@ -278,9 +278,9 @@ class Bus:
 
     def _declare_queryable(self, session: zenoh.Session, name: str) -> None:
         key = plain_key(self._config.robot, name)
-        queryable = session.declare_queryable(key, zenoh.handlers.RingChannel(QUERY.burst))
+        queryable = session.declare_queryable(key, zenoh.handlers.RingChannel(burst_of(QUERY_HZ)))
         self._declared.append(queryable)
-        self._queries[name] = Intake(f"queries for {name}", queryable.try_recv, QUERY)
+        self._queries[name] = Intake(f"queries for {name}", queryable.try_recv, QUERY_HZ)
 
     def _answer_queries(self) -> None:
         """Answer the queries that have come, and the requests that are decided."""

@@ -13,7 +13,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from itertools import count
 from typing import Any, Final, Generic, NamedTuple, TypeAlias, TypeVar
 
@@ -30,32 +29,20 @@ _UNKNOWN_TOPICS: Final = "cmd/**"
 _LAST: Final = (ARM, STOP)
 
 
-@dataclass(frozen=True, slots=True)
-class Budget:
-    """Messages that may be decoded on one key."""
-
-    rate_hz: float
-
-    @property
-    def burst(self) -> int:
-        """Number at once, and in the ring: of a quarter of a second, which is how long a flood can hold one up."""
-        return max(4, round(self.rate_hz / 4))
+QUERY_HZ: Final = 50.0
+UNKNOWN_HZ: Final = 200.0  # of topics that do not exist; of up to 1 MiB
 
 
-QUERY: Final = Budget(50.0)
-UNKNOWN: Final = Budget(200.0)  # topics that do not exist; of up to 1 MiB
-
-
-def budget_of(topic: str) -> Budget:
-    """Return the budget of a topic from `cmd` on."""
-    return Budget(command_of(topic).rate_hz)
+def burst_of(rate_hz: float) -> int:
+    """Return the messages at once, and in the ring: of a quarter of a second, so long a flood can hold one up."""
+    return max(4, round(rate_hz / 4))
 
 
 class Intake(Generic[T]):
-    """Takes messages of one key out of its ring. floods: how often there were more than the budget allows."""
+    """Takes at most so many messages a second of one key out of its ring. floods: how often there were more."""
 
-    def __init__(self, key: str, next_message: Callable[[], T | None], budget: Budget) -> None:
-        self.key, self._next, self._budget = key, next_message, budget
+    def __init__(self, key: str, next_message: Callable[[], T | None], rate_hz: float) -> None:
+        self.key, self._next, self._rate_hz = key, next_message, rate_hz
         self._allowed, self._at_s = 0.0, -math.inf
         self.floods = 0
 
@@ -63,7 +50,7 @@ class Intake(Generic[T]):
         """Yield the messages that may be decoded now; the others wait in the ring, until newer ones replace them."""
         now_s = time.monotonic()
         # One more than the ring holds at once: what comes at once is no flood.
-        self._allowed = min(self._budget.burst + 1, self._allowed + (now_s - self._at_s) * self._budget.rate_hz)
+        self._allowed = min(burst_of(self._rate_hz) + 1, self._allowed + (now_s - self._at_s) * self._rate_hz)
         self._at_s = now_s
         while self._allowed >= 1.0:
             # An empty ring is the usual case, hundreds of times a second: it costs one call.
@@ -210,7 +197,7 @@ class CommandIntake:
                 yield self._ring(session.declare_queryable, own, topic, request_key(topic))
 
     def _ring(self, declare: Callable[..., Any], prefix: str, topic: str, key: str) -> _Ring:
-        budget = UNKNOWN if topic == _UNKNOWN_TOPICS else budget_of(topic)
-        declared = declare(f"{prefix}{key}", zenoh.handlers.RingChannel(budget.burst))
+        rate_hz = UNKNOWN_HZ if topic == _UNKNOWN_TOPICS else command_of(topic).rate_hz
+        declared = declare(f"{prefix}{key}", zenoh.handlers.RingChannel(burst_of(rate_hz)))
         self._declared.append(declared)
-        return _Ring(topic, prefix, Intake(key, declared.try_recv, budget))
+        return _Ring(topic, prefix, Intake(key, declared.try_recv, rate_hz))

@@ -17,10 +17,10 @@ from omnid.errors import OmnidError
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import WARN
-from omnid.transport.intake import UNKNOWN, budget_of
+from omnid.transport.intake import UNKNOWN_HZ, burst_of
 from omnid.transport.status_names import BUS, entry
 from omnid.transport.stop_datagram import ASKED, STOPPED, StopListener, StopSender, addresses
-from omnid.transport.topics import COMMANDS, Request, command_topics, request_key
+from omnid.transport.topics import COMMANDS, Request, command_of, command_topics, request_key
 from tests.omnid.transport.bus_fixtures import free_endpoint, robot, script
 from tests.waiting import wait_until
 
@@ -107,8 +107,8 @@ def test_a_flood_on_one_key_is_bounded_and_keeps_no_other_key_out(key: str) -> N
             wait_until(lambda: driver.stop() is None and commands["cmd/stop"] > 0)
             wait_until(lambda: driver.twist(0.1, 0.0) is None and commands["cmd/twist"] > 0)
             time.sleep(1.0)
-            budget = UNKNOWN if key == "cmd/nothing" else budget_of(topic)
-            most = 2 * budget.burst + budget.rate_hz * (time.monotonic() - begin_s)
+            rate_hz = UNKNOWN_HZ if key == "cmd/nothing" else command_of(topic).rate_hz
+            most = 2 * burst_of(rate_hz) + rate_hz * (time.monotonic() - begin_s)
             assert commands[topic] - before <= most
 
 
