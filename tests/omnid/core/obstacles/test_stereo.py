@@ -1,17 +1,26 @@
-"""Evidence of columns: where the wall and the floor are, and that what shows nothing is no evidence."""
+"""Evidence of columns: where the wall and the floor are, and that what shows nothing, or noise, is no evidence."""
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
-from omnid.core.obstacles.panoramas import DIRECTIONS
+from drivers.frame import Frame, coding_steps
+from omnid.config import PanoramaConfig
+from omnid.core.obstacles.panoramas import DIRECTIONS, UNITS, WorkingPanoramas
 from omnid.core.obstacles.stereo import NEAREST_M, Columns, StereoEvidence, floor_plane
 from omnid.core.obstacles.stereo_kernels import PART
+from omnid.core.types.panorama import PaddedPanorama
+from omnid.messages import FramePair
+from omnid.simulation.robot import make_robot
+from omnid.stages.dewarp import Dewarp
+from omnid.stages.geometry import geometry
 from tests.omnid.core.obstacles.drawn_floor import (
     BASELINE_M,
     CYLINDER,
     HEIGHT_M,
+    PAD_PX,
     T_RECT_BASE,
     Pattern,
     courses,
@@ -24,6 +33,9 @@ from tests.omnid.core.obstacles.drawn_floor import (
 )
 
 WALL_M = 2.0
+QUALITY = 40  # of JPEGs
+NOISE_GREY = 3.0
+FLOOR_ROWS = slice(40, 110)  # below the horizon: 16 to 38 degrees
 VISIBLE = np.zeros((CYLINDER.height, CYLINDER.width), bool)
 VISIBLE[8:-8] = True
 
@@ -136,3 +148,39 @@ def test_floor_nearer_than_a_ring_that_no_direction_shows_is_not_used() -> None:
 def _levels_of(columns: Columns) -> np.ndarray:
     """Return the evidence (2, K, DIRECTIONS) of a floor with stains."""
     return columns.evidence(columns.panoramas.pair(*panoramas(stains, WALL_M, striped))).level
+
+
+@pytest.mark.parametrize(("size_px", "least"), [(512, 0.8), (960, 0.5)])
+def test_two_views_of_nothing_but_noise_differ_by_one_sigma_in_the_rows_of_the_floor(
+    size_px: int, least: float
+) -> None:
+    """Finer images have less noise left, so that the stated share is the largest."""
+    place = geometry(make_robot(size_px).rig, PanoramaConfig())
+    rng = np.random.default_rng(5)
+    images = (np.clip(np.rint(120 + rng.normal(0, NOISE_GREY, (size_px, size_px))), 0, 255) for _ in range(2))
+    pair = Dewarp(place, PanoramaConfig()).process(FramePair(0, 0, *(image.astype(np.uint8) for image in images)))
+    working = WorkingPanoramas(
+        place.cylinder, (0.0, 0.0), 0.2, np.ones((place.cylinder.height, place.cylinder.width), bool)
+    )
+    views = working.views(working.pair(pair.lower, pair.upper))
+    difference = (views.lower.astype(float) - views.upper)[round(working.row0) :][FLOOR_ROWS]
+    assert least < difference.std() / UNITS < 1.05
+
+
+def test_a_floor_in_jpegs_is_no_evidence_against_itself(columns: Columns) -> None:
+    """Their errors extend over blocks and look like another disparity, unless they count as noise."""
+    pair = panoramas(worn, 6.0, striped)
+    pairs = pair, [_coded(one) for one in pair], [_coded(one, known=False) for one in pair]
+    clean, coded, unknown = (columns.evidence(columns.panoramas.pair(*each)).level[0] for each in pairs)
+    near = bins(columns, 1.0, 2.5)
+    against = [float((level[near] < -2).mean()) for level in (clean, coded, unknown)]
+    assert against[0] <= against[1] < 0.02 < against[2]
+    assert np.median(coded[near]) < np.median(clean[near])
+
+
+def _coded(panorama: PaddedPanorama, known: bool = True) -> PaddedPanorama:
+    """Return a panorama whose image was a JPEG; known: with the steps of its quantisation."""
+    data = cv2.imencode(".jpg", panorama.image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
+    steps = coding_steps(Frame(0, 0, "lower", "jpeg", data.tobytes())) if known else ()
+    image = np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), np.uint8)
+    return PaddedPanorama(image, PAD_PX, panorama.noise_grey, jpeg_steps=steps)
