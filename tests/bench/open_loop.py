@@ -4,8 +4,9 @@ Nothing stops the base: it drives on until it is 0.15 m from what is in the way.
 any method can be tried on, and what today's ring told of it. Arrays by pair (N): lower, upper (N, H, W) uint8;
 stamps_ns; T_world_base (N, 4, 4), true; first_m (N, 360), the range from the base's origin in its sectors to the first
 thing that the base would touch, of the heights that it sweeps, or to where the floor falls; inf: none; ring_m, sigma_m,
-free_m (N, 360) of the ring, NaN where there was none. Of the world: T_base_rig (4, 4), as its file says; profile (P,
-2), the heights z of the floor at places x; radius_m and height_m of the base.
+free_m (N, 360) of the ring, NaN where there was none. cells (2, D): cells of the grids of all pairs by their said
+probability of a thing, in steps of DECADES, and those of them that a thing is in. Of the world: T_base_rig (4, 4), as
+its file says; profile (P, 2), the heights z of the floor at places x; radius_m and height_m of the base.
 """
 
 from __future__ import annotations
@@ -17,13 +18,17 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calib import se3
+from calib.se2_arrays import planar, transform
 from drivers.frame import Frame, gray
 from omnid.config import load_config
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.mapping.range_scan import SECTORS, azimuths
+from omnid.core.obstacles.grid import FloorGrid
 from omnid.simulation.lockstep import Moment, Request
 from omnid.simulation.vehicle import START_NS
 from omnid.simulation.world import Walkers, clearance_m
@@ -39,6 +44,18 @@ LONGEST_M: Final = 4.0  # of the way that is stored
 NEAR_M: Final = 0.15  # from the outline to what is in the way, where a drive ends
 LOOK_M, LOOK_RAD = 3.0, np.radians(15.0)  # what counts of a ring
 BEYOND_M: Final = 0.1
+DECADES: Final = (0.0, 3e-4, 1e-3, 1e-2, 0.1, 0.5, 0.9, 1.0)  # probabilities of a cell; none is below 1.2e-4
+
+
+def said_and_true(grid: FloorGrid, segments: Array, T_odom_world: Array) -> NDArray[np.intp]:
+    """Return known cells (2, D) by their probability, and those that segments (M, 2, 2) in the world cross."""
+    points = segments.reshape(-1, 2) @ T_odom_world[:2, :2].T + T_odom_world[:2, 3]
+    ends = np.stack(grid.at(points)[::-1], axis=1).reshape(-1, 2, 2)
+    is_taken = np.zeros(grid.occupied.shape, np.uint8)
+    for first, last in ends.astype(int).tolist():
+        cv2.line(is_taken, first, last, 1)
+    known = np.isfinite(grid.occupied)
+    return np.stack([np.histogram(grid.occupied[part], DECADES)[0] for part in (known, known & (is_taken > 0))])
 
 
 def ranges_m(segments: Array, place: tuple[float, float], azimuths_rad: Array) -> Array:
@@ -78,7 +95,7 @@ def stored(planned: Planned, folder: Path) -> Path:
         all_segments = np.concatenate([segments, asked.world.footprints(people.faces(), robot.height_m)])
         heading_rad = float(np.arctan2(moment.T_world_base[1, 0], moment.T_world_base[0, 0]))
         first_m = ranges_m(all_segments, (x_m, y_m), azimuths() + heading_rad)
-        kept[START_NS + round(moment.time_s * 1e9)] = moment.T_world_base, first_m
+        kept[START_NS + round(moment.time_s * 1e9)] = moment.T_world_base, first_m, all_segments
         is_near = clearance_m(all_segments, (x_m, y_m), robot.radius_m) < NEAR_M
         driven_m = float(np.linalg.norm(np.array([x_m, y_m]) - asked.world.start[:2]))
         yield Setpoint(planned.speed_mps, heading_rad=0.0)
@@ -90,7 +107,12 @@ def stored(planned: Planned, folder: Path) -> Path:
     run = simulate(asked.world, robot, on, seconds=seconds, seed=planned.seed, config=config, tamper=kept_image)
     rings = {ring.stamp_ns: ring for ring in run.rings}
     stamps = [stamp_ns for camera, stamp_ns in images if camera == "lower" and stamp_ns in kept]
-    none = np.full(SECTORS, np.nan)
+    none, cells = np.full(SECTORS, np.nan), np.zeros((2, len(DECADES) - 1), np.intp)
+    for stamp_ns, ring in rings.items():
+        if ring.grid is not None and stamp_ns in kept:
+            T_world_base, _, all_segments = kept[stamp_ns]
+            T_odom_world = transform(planar(ring.T_odom_base)) @ se3.inverse(transform(planar(T_world_base)))
+            cells += said_and_true(ring.grid, all_segments, T_odom_world)
     folder.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(
         path,
@@ -102,6 +124,7 @@ def stored(planned: Planned, folder: Path) -> Path:
         ring_m=np.array([rings[s].ranges_m if s in rings else none for s in stamps], np.float32),
         sigma_m=np.array([rings[s].sigma_m if s in rings else none for s in stamps], np.float32),
         free_m=np.array([rings[s].free_m if s in rings else none for s in stamps], np.float32),
+        cells=cells,
         T_base_rig=run.T_base_rig,
         profile=np.array(asked.world.ground.profile or [(0.0, 0.0)]),
         radius_m=robot.radius_m,
@@ -147,6 +170,15 @@ def add_scan_table(paths: Sequence[Path]) -> None:
             table.add(f"{metre} to {metre + 1}", int(chosen.sum()), np.median(error_m), most_m, by_sigma)
 
 
+def add_reliability_table(paths: Sequence[Path]) -> None:
+    """Print and write the share of cells in which a thing is, by the probability of one that the grid says."""
+    cells = sum(np.load(path)["cells"] for path in paths)
+    columns = Column("said probability"), Column("cells"), Column("true share", "", 5)
+    table = ResultTable("obstacles_reliability", "Cells of the grid against the truth", columns)
+    for low, high, (count, taken) in zip(DECADES, DECADES[1:], np.transpose(cells), strict=False):
+        table.add(f"{low:g} to {high:g}", int(count), float(taken / max(count, 1)))
+
+
 def judge_rings(wanted: Sequence[Planned], folder: Path, jobs: int) -> None:
     """Make the files that are missing, and print a row for each world."""
     columns = (
@@ -164,3 +196,4 @@ def judge_rings(wanted: Sequence[Planned], folder: Path, jobs: int) -> None:
             table.add(str(planned), count, 100 * free, 100 * false, seed=("buildings", planned.seed))
             paths.append(path)
     add_scan_table(paths)
+    add_reliability_table(paths)

@@ -82,9 +82,9 @@ def thin_things_m(belief: RayBelief, risk: float) -> FreeRanges:
 class RayPosterior:
     """Posterior of pairs over one plane of the floor."""
 
-    def __init__(self, columns: Columns, height_m: float, baseline_m: float, parameters: RayParameters) -> None:
+    def __init__(self, columns: Columns, height_m: float, baseline_m: float) -> None:
         """height_m: of the viewpoint over the floor."""
-        self._columns, self._p = columns, parameters
+        self._p = RayParameters()
         # Bins from near to far: the nearest whose step is in view, to the last that stereo compares.
         numbers = np.arange(BINS_PER_PX * columns.bins)
         middle = (numbers + 0.5) / BINS_PER_PX
@@ -101,17 +101,18 @@ class RayPosterior:
         self._lengths_m = np.diff(self.ends_m).astype(np.float32)
         azimuth = math.pi - (np.arange(DIRECTIONS) + 0.5) * (math.tau / DIRECTIONS)
         along = np.abs(np.sin(azimuth)) < math.sin(ALONG_RAD)
-        self._assumed = (self.ranges_m < parameters.look_m)[:, None] & along
+        self._assumed = (self.ranges_m < self._p.look_m)[:, None] & along
         self.shows_floor = bool(self._of_bins(columns.panoramas.visible).any())  # whether any floor is in view
 
-    def belief(self, pair: WorkingPair, evidence: StereoEvidence, known: Flags | None = None) -> RayBelief:
+    def belief(self, pair: WorkingPair, evidence: StereoEvidence, known: Flags) -> RayBelief:
         """Return the belief by a pair and its stereo evidence.
 
-        known (N, DIRECTIONS): bins that are known to be floor, None: the nearest ahead and behind are taken for it.
+        known (N, DIRECTIONS): bins that are known to be floor; where these are few, the nearest ahead and behind are
+        taken for it.
         """
         p, count, seen = self._p, len(self._bins), self._of_bins(pair.seen)
         # 1. The floor by which its look is learned: of the cells that are known, or assumed where these are few.
-        known = self._assumed & seen.T if known is None else known & seen.T
+        known = known & seen.T
         near = known & (self.ranges_m < p.look_m)[:, None]
         if near.sum() < p.look_bins:
             known = near = self._assumed & seen.T

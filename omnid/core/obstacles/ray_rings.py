@@ -19,7 +19,6 @@ from calib.panorama import Cylinder
 from omnid.core.obstacles.grid import GridRing, ObstacleGrid, unknown_ring
 from omnid.core.obstacles.panoramas import AROUND_ROWS, DIRECTIONS, FOCAL_PX, WorkingPair
 from omnid.core.obstacles.posterior import RayBelief, RayPosterior
-from omnid.core.obstacles.ray_kernels import RayParameters
 from omnid.core.obstacles.settings import RingSettings
 from omnid.core.obstacles.stereo import NEAREST_M, Columns, FloorPlane, floor_plane
 from omnid.core.types.panorama import PaddedPanorama
@@ -116,7 +115,7 @@ class RayRings:
         ranges_m = NEAREST_M, self._settings.max_range_m
         cylinder, heights_m = self._cylinder, self._settings.heights_m
         self._columns = Columns(cylinder, self._baseline_m, tilted, heights_m, ranges_m, visible)
-        self._posterior = RayPosterior(self._columns, plane.height_m, self._baseline_m, RayParameters())
+        self._posterior = RayPosterior(self._columns, plane.height_m, self._baseline_m)
         panoramas = self._columns.panoramas
         below = np.maximum(np.arange(panoramas.height) - panoramas.row0, 1e-6)
         self._row_ranges_m = FOCAL_PX * plane.height_m / below
