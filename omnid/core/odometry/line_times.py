@@ -103,17 +103,10 @@ class LineTimes:
         known = {key: self._velocities.get(key, velocity) for key in local_map.keyframes}
         self._velocities = known | {seq: velocity}
         # 2. Residuals of the views, and their derivatives by [d_k, c, lag].
-        table, rows, cylinder, baseline_m = (
-            local_map.table,
-            seen.landmarks,
-            self._model.cylinder,
-            self._model.baseline_m,
-        )
-        T_curr_anchor, at_anchor = (
-            local_map.from_anchors(se3.inverse(seen.T_odom_rect), rows),
-            table.anchor_points[rows],
-        )
-        R = T_curr_anchor[:, :3, :3]
+        cylinder, baseline_m = self._model.cylinder, self._model.baseline_m
+        table, rows = local_map.table, seen.landmarks
+        T_curr_anchor = local_map.from_anchors(se3.inverse(seen.T_odom_rect), rows)
+        at_anchor, R = table.anchor_points[rows], T_curr_anchor[:, :3, :3]
         points = (R @ at_anchor[:, :, None])[:, :, 0] + T_curr_anchor[:, :3, 3]
         error = seen.views - view(points, cylinder, baseline_m)
         error[:, 0] = cylinder.wrap(error[:, 0])
@@ -143,10 +136,11 @@ class LineTimes:
         of_d, across = total[:, :6, :6] + np.eye(6), total[:, :6, 6:]
         left = (total[:, 6:, 6:] - np.swapaxes(across, 1, 2) @ np.linalg.solve(of_d, across)).sum(axis=0)
         unit = CORRELATED_LANDMARKS * max(1.0, float(squared.mean()) / VIEW_DIMENSIONS)
-        kept = math.exp(-dt_s / MEMORY_S)
-        self._information = kept * self._information + left / unit
-        self._views = kept * self._views + len(squared)
+        # 5. The sum over time. Where the view hardly moves, patches err as in the pair before: a pixel is a new sample.
         self._px_per_s = float(np.median(np.linalg.norm(moved[usable][:, :2], axis=1)))
+        kept, new = math.exp(-dt_s / MEMORY_S), min(1.0, self._px_per_s * dt_s)
+        self._information = kept * self._information + new * left / unit
+        self._views = kept * self._views + new * len(squared)
 
     def likeliest(self) -> ReadOut | None:
         """Return the likeliest time of a read-out, None: it is likelier that there is none, or it moves no view."""
