@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import random
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -74,3 +75,11 @@ def robot() -> Iterator[tuple[Bus, Robot, list[Request]]]:
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus, Robot(connect=(endpoint,)) as program:
         bus.subscribe_commands(received.append, command_topics(("operator",)))
         yield bus, program, received
+
+
+def damaged(rng: random.Random, good: bytes) -> bytes:
+    """Return bytes of which some are changed, or the last ones are missing."""
+    data = bytearray(good)
+    for _ in range(rng.randint(0, 8)):
+        data[rng.randrange(len(data))] = rng.randrange(256)
+    return bytes(data[: rng.randint(0, len(data))]) if rng.random() < 0.3 else bytes(data)

@@ -32,6 +32,7 @@ from omnid.transport.codec import (
 )
 from omnid.transport.sensor_codec import image_cdr, image_topic
 from tests.omnid.sinks.test_recorder import frame
+from tests.omnid.transport.bus_fixtures import damaged
 
 STAMP_NS = 1_700_000_123_987_654_321
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -181,10 +182,7 @@ def test_what_is_no_message_is_refused(make: Callable[[], object], words: str) -
 def test_any_bytes_give_a_message_or_one_line(decode: Callable[[bytes], object], good: bytes) -> None:
     rng = random.Random(1)
     for _ in range(2000):
-        damaged = bytearray(good)
-        for _ in range(rng.randint(0, 6)):
-            damaged[rng.randrange(len(damaged))] = rng.randrange(256)
-        payload = bytes(damaged[: rng.randint(0, len(damaged))]) if rng.random() < 0.5 else bytes(damaged)
+        payload = damaged(rng, good)
         if rng.random() < 0.2:
             payload = good[:4] + rng.randbytes(rng.randint(0, 900))
         try:
