@@ -20,14 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import RecordError
+from drivers.frame import Frame
 from drivers.logs.compression import unpack_message
 from drivers.logs.ros_messages import (
     IMAGE_TYPES,
     STAMPED_TYPES,
     JointWheels,
-    RosImage,
     cdr_of_ros1,
-    header_ns,
+    header_stamp,
     parse_image,
     parse_motion,
 )
@@ -68,6 +68,7 @@ class LogFile(ABC):
         self.name = name
         self.topics: dict[int, Topic] = {}  # by channel; complete after entries()
         self.faults: dict[int, str] = {}  # what cannot be read, by block, or by offset without one; grows by reading
+        self.carried: Counter[str] = Counter()  # stamps by topic whose nanoseconds are a second or more
         self.stated: Counter[int] = Counter()  # messages by channel, by the summary of a closed file, where it has one
         self.cut = ""  # one line that says what is missing at the end, "" of a complete file; known after entries()
 
@@ -91,7 +92,9 @@ class LogFile(ABC):
         topic = self.topics.get(channel)
         if topic is None or topic.kind not in STAMPED_TYPES:
             return 0
-        return header_ns(unpack_message(memoryview(start)), aligned=topic.aligned)
+        stamp_ns, carries = header_stamp(unpack_message(memoryview(start)), aligned=topic.aligned)
+        self.carried[topic.name] += carries
+        return stamp_ns
 
     def close(self) -> None:  # noqa: B027  (some keep no file open)
         """Close the file; may be called twice."""
@@ -115,8 +118,8 @@ class LoggedMessage:
         """Return the bytes in CDR."""
         return bytes(self.data()) if self.aligned else cdr_of_ros1(self.kind, self.data())
 
-    def image(self) -> RosImage:
-        """Return the image of an image message."""
+    def image(self) -> Frame:
+        """Return the image of an image message, see `parse_image`."""
         return parse_image(self.kind, self.data(), aligned=self.aligned)
 
     def motion(self, joints: JointWheels | None) -> MotionSample | None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from drivers.errors import DriverError, FrameDecodeError
 from drivers.frame import CAMERAS, SAMPLE_BITS, Camera, Frame, gray, is_deep
 from drivers.logs.open_log import open_log
-from drivers.logs.ros_messages import IMU, RosImage
+from drivers.logs.ros_messages import IMU
 from drivers.logs.stamps import STEP_NS, ImageTimes, LoggedImages, TimeSource
 from drivers.logs.topics import MotionChoice, MotionTopics, choose_motion_topics, choose_topics
 from drivers.motion import MotionSample, WheelSample
@@ -122,7 +122,7 @@ class LogReader:
                 f"{self._log.name!r} ends {at_s.max():.1f} s after its first image: a start before that was "
                 f"expected, {begin_s:g} s found"
             )
-        last: dict[Camera, tuple[int, memoryview]] = {}
+        last: dict[Camera, Frame] = {}
         # Samples behind the last image are of no use.
         inside = (at_s >= begin_s) & (at_s <= min(end_s, at_s[is_image].max(initial=0.0)))
         for row, stamp_ns, of_camera in zip(
@@ -143,24 +143,23 @@ class LogReader:
                     if sample is not None:
                         yield replace(sample, stamp_ns=stamp_ns)
                     continue
-                image = message.image()
+                image = replace(message.image(), stamp_ns=stamp_ns, camera=camera, bits=self._bits)
                 self._examine(message.topic, image)
             except FrameDecodeError as error:
                 counter = "broken" if camera else "broken_motion"
                 self.counts[counter] += 1
                 self._faults.setdefault(counter, str(error))
                 continue
-            self.counts["carried"] += image.carries
             # A copy, so that a frame that is held back does not keep its chunk in memory.
-            image = replace(image, data=memoryview(bytes(image.data)), stamp_ns=stamp_ns)
-            before_ns, before = last.get(camera, (-1, image.data))
-            if stamp_ns == before_ns:
+            image = replace(image, seq=self.counts[camera], data=memoryview(bytes(image.data)))
+            before = last.get(camera)
+            if before is not None and stamp_ns == before.stamp_ns:
                 self.counts["duplicate"] += 1
-                self.counts["repeated"] += before == image.data
+                self.counts["repeated"] += before.data == image.data
                 continue
-            last[camera] = stamp_ns, image.data
+            last[camera] = image
             self.counts[camera] += 1
-            yield image.frame(camera, self.counts[camera] - 1, self._bits)
+            yield image
         if not self._closed:
             self._report()
 
@@ -227,18 +226,17 @@ class LogReader:
         self._other_joints = 0  # messages of joints without the wheels
         self._has_wheels = False
 
-    def _examine(self, topic: str, image: RosImage) -> None:
+    def _examine(self, topic: str, frame: Frame) -> None:
         """Warn where the first image of a topic would be black, or grey, as it is encoded otherwise than stated."""
         if topic in self._examined:
             return
         self._examined.add(topic)
-        frame = image.frame(bits=self._bits)
         with suppress(FrameDecodeError):  # who decodes the image says what is wrong with it
             # Of colours that are taken for brightness nearly all are near the middle.
-            colours = np.abs(gray(frame).astype(np.int16) - NEUTRAL_GREY) if image.width else np.array([NEUTRAL_GREY])
+            colours = np.abs(gray(frame).astype(np.int16) - NEUTRAL_GREY) if frame.width else np.array([NEUTRAL_GREY])
             if np.percentile(colours, MOST_PERCENT) <= NEAR_NEUTRAL:
                 self.warnings.append(
-                    f"the first image of {topic!r} ({image.encoding!r}) has grey levels near {NEUTRAL_GREY} only, as "
+                    f"the first image of {topic!r} ({frame.encoding!r}) has grey levels near {NEUTRAL_GREY} only, as "
                     "colours have in YUV: is its encoding right? yuv422 is UYVY, yuv422_yuy2 is YUYV"
                 )
             if self._bits == SAMPLE_BITS[-1] and is_deep(frame) and gray(frame).max() < 2**12 >> 8:
@@ -270,9 +268,11 @@ class LogReader:
         damage, times = self._log.damage(), self._order.times
         self.truncated = bool(damage.cut)
         self.counts["broken_records"] = damage.broken
+        topics = self._cameras.values()
+        self.counts["carried"] = sum(file.carried[topic] for file in self._log.files for topic in topics)
         self.counts["unstamped"] = times.by_log.total()
         if self._span_s == WHOLE:
-            self.counts["unreadable"] += sum(self._log.index.lost.get(topic, 0) for topic in self._cameras.values())
+            self.counts["unreadable"] += sum(self._log.index.lost.get(topic, 0) for topic in topics)
         self.counts["no_joints"] = 0 if self._has_wheels else self._other_joints
         self._faults["broken_records"] = damage.first
         self.warnings += [damage.cut] if damage.cut else []

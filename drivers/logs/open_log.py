@@ -100,7 +100,7 @@ def log_info(path: str | os.PathLike[str], *, examine: bool = False, rate_hz: fl
             with suppress(FrameDecodeError):
                 # A JPEG without its end is left by a driver that was killed half-way.
                 image = message.image() if message.kind in IMAGE_TYPES else None
-                if image and image.encoding == "jpeg" and _JPEG_END not in image.data.tobytes():
+                if image and image.encoding == "jpeg" and _JPEG_END not in bytes(image.data):
                     cut_images[message.topic] += 1
         damage, index = log.damage(), log.index
         faults = [damage.cut] if damage.cut else []

@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final, NamedTuple
 
 from rosbags.typesys import Stores, get_typestore
 
 from drivers.errors import FrameDecodeError
-from drivers.frame import Camera, Frame
+from drivers.frame import Frame
 from drivers.motion import GyroSample, MotionSample, WheelSample
 
 IMAGE: Final = "sensor_msgs/msg/Image"
@@ -40,48 +39,24 @@ _SYNONYMS: Final = {
 _MAGIC: Final = {b"\xff\xd8\xff": "jpeg", b"\x89PN": "png"}
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RosImage:
-    """One image message; width to bigendian are 0 for compressed images."""
+def parse_image(kind: str, message: memoryview, *, aligned: bool = True) -> Frame:
+    """Return the image in a message of type IMAGE or COMPRESSED_IMAGE, as frame 0 of the lower camera.
 
-    stamp_ns: int  # stamp of the header, 0 if unset
-    encoding: str  # as in drivers.frame.Frame
-    data: memoryview
-    width: int = 0  # px
-    height: int = 0  # px
-    step: int = 0  # bytes from row to row
-    bigendian: bool = False
-    carries: bool = False  # the nanoseconds of the stamp are a second or more
-    bayer: str = ""  # as in drivers.frame.Frame
-
-    def frame(self, camera: Camera = "lower", seq: int = 0, bits: int = 16) -> Frame:
-        """Return the image as a frame of a camera. To decode it, neither the camera nor the number matters.
-
-        bits: see Frame.
-        """
-        layout = self.width, self.height, self.step, self.bigendian, bits, self.bayer
-        return Frame(seq, self.stamp_ns, camera, self.encoding, self.data, *layout)
-
-
-def parse_image(kind: str, message: memoryview, *, aligned: bool = True) -> RosImage:
-    """Return the image in a message of type IMAGE or COMPRESSED_IMAGE; raise FrameDecodeError where it is invalid.
-
-    aligned: True for CDR (ROS 2), False for the serialisation of ROS 1.
+    Its stamp is that of the header, 0 if unset. Raise FrameDecodeError where the message is invalid. aligned: True for
+    CDR (ROS 2), False for the serialisation of ROS 1.
     """
     found = _decoded(kind, message, aligned)
-    stamp = found.header.stamp
-    stamp_ns, carries = _stamp_ns(stamp.sec, stamp.nanosec), stamp.nanosec >= 10**9
-    data = memoryview(found.data)
+    stamp_ns, data = _stamp_ns(found.header.stamp.sec, found.header.stamp.nanosec), memoryview(found.data)
     if kind == IMAGE:
         encoding, is_big = _SYNONYMS.get(found.encoding, found.encoding), bool(found.is_bigendian)
-        return RosImage(stamp_ns, encoding, data, found.width, found.height, found.step, is_big, carries)
+        return Frame(0, stamp_ns, "lower", encoding, data, found.width, found.height, found.step, is_big)
     encoding = found.format
     # image_transport compresses a Bayer pattern as it is, and says so: 'bayer_rggb8; jpeg compressed '.
     source = encoding.partition(";")[0].strip()
     bayer = source if source.startswith("bayer_") else ""
     # The first bytes decide the encoding, else the format, which is free text such as 'bgr8; jpeg compressed bgr8'.
     encoding = next((name for name, part in (("jpeg", "jp"), ("png", "png")) if part in encoding.lower()), encoding)
-    return RosImage(stamp_ns, image_encoding(data, encoding), data, carries=carries, bayer=bayer)
+    return Frame(0, stamp_ns, "lower", image_encoding(data, encoding), data, bayer=bayer)
 
 
 def image_encoding(data: memoryview | bytes, otherwise: str = "") -> str:
@@ -164,14 +139,18 @@ def _decoded(kind: str, message: memoryview, aligned: bool) -> Any:
         raise FrameDecodeError(f"a {kind} of {len(message)} bytes is truncated or invalid") from error
 
 
-def header_ns(message: memoryview, *, aligned: bool = True) -> int:
-    """Return the stamp of the header with which images, wheels and IMUs begin; 0 where it is unset or cut."""
+def header_stamp(message: memoryview, *, aligned: bool = True) -> tuple[int, bool]:
+    """Return the stamp [ns] of the header with which images, wheels and IMUs begin; 0 where it is unset or cut.
+
+    The second result is True where its nanoseconds are a second or more.
+    """
     start = bytes(message[:HEADER_BYTES])
     if len(start) < HEADER_BYTES:
-        return 0
+        return 0, False
     # CDR states its byte order; ROS 1 begins with a sequence number, and its seconds have no sign.
     layout = ("<4xiI" if start[1] & 1 else ">4xiI") if aligned else "<4xII"
-    return _stamp_ns(*struct.unpack(layout, start))
+    seconds, nanoseconds = struct.unpack(layout, start)
+    return _stamp_ns(seconds, nanoseconds), nanoseconds >= 10**9
 
 
 typestore = cache(get_typestore)

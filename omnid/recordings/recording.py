@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import Final, NamedTuple, TypeAlias
 
 from drivers.errors import FrameDecodeError
+from drivers.frame import Frame
 from drivers.logs.log import listed
 from drivers.logs.open_log import LogInfo, open_log
-from drivers.logs.ros_messages import IMAGE_TYPES, RosImage
+from drivers.logs.ros_messages import IMAGE_TYPES
 from omnid.errors import OmnidError
 from omnid.transport.codec import (
     ODOMETRY_SCHEMA,
@@ -38,7 +39,7 @@ DRIVE: Final = "drive"
 TWIST_COMMAND: Final = "cmd/twist"
 IMAGES: Final = (PANORAMA, "lower/image_raw/compressed", "lower/image_raw")  # in the order of preference
 
-Content: TypeAlias = Pose | PoseInMap | Diagnostics | Cloud | Scan | TwistRecord | RosImage
+Content: TypeAlias = Pose | PoseInMap | Diagnostics | Cloud | Scan | TwistRecord | Frame
 
 
 def choose_odometry_topic(found: LogInfo, topic: str | None = None, robot: str | None = None) -> str:

@@ -18,8 +18,7 @@ import rerun.blueprint as rrb
 from numpy.typing import ArrayLike, NDArray
 
 from calib import se3
-from drivers.frame import gray
-from drivers.logs.ros_messages import RosImage
+from drivers.frame import Frame, gray
 from omnid.core.frames import base_pose
 from omnid.core.odometry.stereo_frame import Features
 from omnid.messages import OdometryUpdate, PlaceUpdate
@@ -123,9 +122,9 @@ class RerunSink:
                 self._at(content.stamp_ns).log("odom/map", _points_3d(points, MAP_POINTS, THIN))
             case Scan() if self.wants("scan"):
                 self._scan(content)
-            case RosImage() if self.wants("image"):
+            case Frame() if self.wants("image"):
                 is_compressed = content.encoding in ("jpeg", "png")
-                data = bytes(content.data) if is_compressed else _jpeg(gray(content.frame()))
+                data = bytes(content.data) if is_compressed else _jpeg(gray(content))
                 self.panorama(content.stamp_ns, data, content.encoding if is_compressed else "jpeg")
             case Panorama(stamp_ns, data, features) if self.wants("image"):
                 self.panorama(stamp_ns, data)
