@@ -90,7 +90,7 @@ def plan_view(
     xy_m, confidence = between(points.xyz, points.confidence, heights_m)
     sheet = sheet_of(xy_m, path)
     gaps = np.flatnonzero(np.diff(np.flatnonzero(drawable)) > 1) + 1
-    lines = [Lines(list(loops_xy), BLUE, 1), Lines(np.split(path, gaps), RED, 3, rim_px=7)]
+    lines = [Lines(np.split(path, gaps), RED, 3, rim_px=7), Lines(list(loops_xy), BLUE, 1)]
     image = draw_plan(sheet, xy_m, confidence, lines)
     if len(path):
         draw_ends(image, sheet, path[0], path[-1])
