@@ -382,7 +382,7 @@ def test_images_with_both_stamps_give_the_poses_of_a_replay(skewed: tuple[Path, 
 
 @pytest.mark.parametrize("dark_pairs", [1, 3])
 def test_darkness_after_the_first_pair_costs_nothing(dark_pairs: int) -> None:
-    """The map is made again with the first step only where no pair between was refused: wheels carry the pose there."""
+    """Wheels carry the pose there, and the velocity that the first map waits for is known."""
     rig, scene, period_ns, skew_s, speed_mps = make_rig(size=256), corridor(3), 100_000_000, 0.02, 0.5
     config = load_config(None, ["rig.check=off"])
     front_end = FrontEnd(geometry(rig, config.panorama), config)
