@@ -18,6 +18,8 @@ _LOAD_AFTER_EVICTION = 0.7  # Share of the voxels that an eviction leaves, so th
 # A voxel seen once and not again for this number of frames is most likely a false match; by trial on development seeds.
 # A count and no time, as the age of a point, because each frame is another look.
 _OLD_FRAMES = 30
+# A voxel: its sums are those of information (1 / variance), and of information times x, y, z.
+VOXEL = np.dtype([("key", np.int64), ("sums", float, 4), ("frames", np.int32), ("last_seq", np.int64)])
 _VARIANCE_RANGE_M2 = (1e-8, 1e8)  # standard deviations of 0.1 mm to 10 km, so that sums of weights cannot overflow
 
 
@@ -45,13 +47,10 @@ class VoxelMap:
         self.refused = 0
         self._voxel_m, self._most = voxel_m, most
         self._newest_seq = 0
-        self._keys = np.zeros(0, np.int64)
-        self._sums = np.zeros((0, 4))  # information, and information times x, y, z
-        self._frames = np.zeros(0, np.int32)
-        self._last_seq = np.zeros(0, np.int64)
+        self._voxels = np.zeros(0, VOXEL)
 
     def __len__(self) -> int:
-        return len(self._keys)
+        return len(self._voxels)
 
     def insert(self, points: Array, variance_m2: Array, seq: int) -> None:
         """Fuse the points (N, 3) of frame `seq`, in metres in the world frame, with their isotropic variances (N,)."""
@@ -66,48 +65,44 @@ class VoxelMap:
         x, y, z = np.clip(index, 0, 2 * half_span - 1).T  # rounding at the border
         keys, voxel = np.unique((x << (2 * _AXIS_BITS)) | (y << _AXIS_BITS) | z, return_inverse=True)
         columns = (weight, *(weight[:, None] * points).T)
-        sums = np.stack([np.bincount(voxel, column, len(keys)) for column in columns], axis=1)
+        seen = np.zeros(len(keys), VOXEL)
+        seen["key"], seen["frames"], seen["last_seq"] = keys, 1, seq
+        seen["sums"] = np.stack([np.bincount(voxel, column, len(keys)) for column in columns], axis=1)
         # 2. Those that are known.
-        at = np.searchsorted(self._keys, keys)
-        is_known = np.zeros(len(keys), bool)
-        inside = at < len(self._keys)
-        is_known[inside] = self._keys[at[inside]] == keys[inside]
-        known = at[is_known]
-        self._sums[known] += sums[is_known]
-        self._frames[known] += self._last_seq[known] != seq
-        self._last_seq[known] = np.maximum(self._last_seq[known], seq)
+        at = np.searchsorted(self._voxels["key"], keys)
+        is_known = np.append(self._voxels["key"], -1)[at] == keys
+        known = self._voxels[at[is_known]]
+        known["sums"] += seen["sums"][is_known]
+        known["frames"] += known["last_seq"] != seq
+        known["last_seq"] = np.maximum(known["last_seq"], seq)
+        self._voxels[at[is_known]] = known
         # 3. New ones.
-        new, at = ~is_known, at[~is_known]
-        self._keys = np.insert(self._keys, at, keys[new])
-        self._sums = np.insert(self._sums, at, sums[new], axis=0)
-        self._frames = np.insert(self._frames, at, 1)
-        self._last_seq = np.insert(self._last_seq, at, seq)
+        self._voxels = np.insert(self._voxels, at[~is_known], seen[~is_known])
         if len(self) > self._most:
             self._evict()
 
     def points(self, min_frames: int = 2) -> MapPoints:
         """Return the voxels seen in at least `min_frames` frames, with their mean positions, sorted by key."""
-        rows = np.flatnonzero(self._frames >= min_frames)
-        sums, age = self._sums[rows], self._newest_seq - self._last_seq[rows]
+        rows = np.flatnonzero(self._voxels["frames"] >= min_frames)
+        sums, age = self._voxels["sums"][rows], self._newest_seq - self._voxels["last_seq"][rows]
         return MapPoints(
             (sums[:, 1:] / sums[:, :1]).astype(np.float32),
             self._confidence()[rows].astype(np.float32),
-            self._frames[rows],
+            self._voxels["frames"][rows],
             np.minimum(age, np.iinfo(np.int32).max).astype(np.int32),
         )
 
     def _confidence(self) -> Array:
         """Return confidences 0..1: n / (n + 1) for n frames times 1 / (1 + variance of the mean / voxel^2)."""
-        frames, weight = self._frames.astype(np.float64), self._sums[:, 0]
+        frames, weight = self._voxels["frames"].astype(np.float64), self._voxels["sums"][:, 0]
         return np.asarray(frames / (frames + 1.0) * weight / (weight + self._voxel_m**-2))
 
     def _evict(self) -> None:
         """Drop voxels down to _LOAD_AFTER_EVICTION: those seen once and long ago first, then the least confident."""
-        is_old = (self._frames == 1) & (self._newest_seq - self._last_seq > _OLD_FRAMES)
+        age = self._newest_seq - self._voxels["last_seq"]
+        is_old = (self._voxels["frames"] == 1) & (age > _OLD_FRAMES)
         # The sort is stable, so the key decides about ties.
         order = np.lexsort((self._confidence(), ~is_old))
         dropped = len(order) - int(_LOAD_AFTER_EVICTION * self._most)
-        kept = np.sort(order[dropped:])
         self.evicted += dropped
-        self._keys, self._sums = self._keys[kept], self._sums[kept]
-        self._frames, self._last_seq = self._frames[kept], self._last_seq[kept]
+        self._voxels = self._voxels[np.sort(order[dropped:])]

@@ -48,7 +48,9 @@ def normalised_patches(
     offsets = ((np.arange(side) - side // 2) * step_px).astype(np.float32)
     columns = panorama.padded(pixels[:, :1]).astype(np.float32) + np.tile(offsets, side)
     rows = pixels[:, 1:].astype(np.float32) + np.repeat(offsets, side)
-    patches = cv2.remap(source, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
+    patches = np.zeros(columns.shape, np.float32)
+    if len(pixels):  # OpenCV refuses empty maps
+        patches[:] = cv2.remap(source, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     patches -= patches.mean(axis=1, keepdims=True)
     length = np.linalg.norm(patches, axis=1)
     # A patch without contrast divides by no zero.

@@ -37,8 +37,8 @@ TILE_ROWS: Final = 4  # 63 rows at scale 1.
 # time, where a tile has LEAST_SAMPLES of them: a few may keep their greys by chance, as at 160 px.
 SPACING_PX: Final = 2
 LEAST_SAMPLES: Final = 100
-# Grey level from which a pixel is saturated.
-SATURATED_GREY: Final = 250
+SATURATED_GREY: Final = 250  # grey level from which a pixel is saturated
+JUDGED_SHARE: Final = 0.5  # of a tile that shows the world
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,16 +61,11 @@ class TileSampler:
         tile_pixels = visible.size / (TILE_ROWS * columns)
         self._spacing_px = SPACING_PX if tile_pixels >= LEAST_SAMPLES * SPACING_PX**2 else 1
         self._mask = self._sampled(np.where(visible, np.uint8(255), np.uint8(0)))
-        self._rows, self._columns = (
-            borders(*side) for side in zip(self._mask.shape, (TILE_ROWS, columns), strict=True)
-        )
-        self.pixels = self._sums(np.asarray(self._mask & 1, np.uint8))
+        self._rows, self._columns = borders(self._mask.shape[0], TILE_ROWS), borders(self._mask.shape[1], columns)
         self._before: Image | None = None
-
-    @property
-    def areas(self) -> Numbers:
-        """Pixels (TILE_ROWS, C) of each tile that are counted where all of it shows the world."""
-        return np.asarray(np.diff(self._rows)[:, None] * np.diff(self._columns))
+        self.pixels = self._sums(np.asarray(self._mask & 1, np.uint8))
+        # Tiles that show less of the world are not judged.
+        self.judged = self.pixels >= JUDGED_SHARE * np.diff(self._rows)[:, None] * np.diff(self._columns)
 
     def add(self, panorama: Image) -> TileSums:
         """Return the sums of the next panorama (H, W)."""
@@ -100,8 +95,6 @@ Array = NDArray[np.float64]
 Side = Literal["lower", "upper"]
 SIDES: Final[tuple[Side, Side]] = ("lower", "upper")
 
-# Share of a tile that shows the world; tiles that show less are not judged.
-JUDGED_SHARE: Final = 0.5
 IN_A_ROW: Final = 2  # pairs that find a tile dead or blurred before it counts, because one may be a glitch of a driver
 # Share of the judged tiles that must change before others are dead, because else the whole image is still.
 LEAST_ALIVE: Final = 0.1
@@ -155,11 +148,10 @@ class TileStates:
         """
         if not self.columns:
             return None
-        tiles = np.repeat(self.unknown[None], TILE_ROWS, axis=0)
-        for states in (self.dead, self.blind):
-            for side in SIDES:
-                tiles |= states[side]
-        return of_pixels(tiles, (shape[0], shape[1]))
+        single = [states[side] for states in (self.dead, self.blind) for side in SIDES]
+        tiles = np.logical_or.reduce([np.repeat(self.unknown[None], TILE_ROWS, axis=0), *single])
+        size = shape[1], shape[0]
+        return np.asarray(cv2.resize(tiles.view(np.uint8), size, interpolation=cv2.INTER_NEAREST), np.uint8) > 0
 
 
 ALL_LIVE: Final = TileStates()
@@ -174,7 +166,7 @@ class TileMonitor:
         self._samplers = {side: TileSampler(visible, columns) for side in SIDES}
         sampler = self._samplers["lower"]
         self._counts = np.maximum(sampler.pixels, 1)
-        self._judged = np.asarray(sampler.pixels >= JUDGED_SHARE * sampler.areas)
+        self._judged = sampler.judged
         # Pixels at half resolution, all of which show the world, and so do their neighbours.
         height, width = visible.shape[0] // 2, visible.shape[1] // 2
         shown = cv2.erode(visible.astype(np.uint8), np.ones((5, 5), np.uint8))[: 2 * height, : 2 * width]
@@ -253,29 +245,19 @@ class TileMonitor:
     def _blurred(self, side: Side, energy: Array, other: Array, noise_grey: float) -> Flags:
         """Return the columns (C,) in which a camera shows far less than the other one does."""
         textured = other > LEAST_ENERGY * max(noise_grey, MEASURED_NOISE_GREY) ** 2
-        if textured.sum() < COMPARED_COLUMNS:
-            self._faint[side][:] = 0
-            return np.zeros(self._columns, bool)
         ratio = energy / np.maximum(other, 1e-6)
-        usual = float(np.median(ratio[textured]))
-        is_faint = textured & (ratio < BLURRED_SHARE * usual)
-        if not is_faint.any():
-            self._faint[side][:] = 0
-            return is_faint
-        # The ends of a sector are no neighbours.
-        ends = BLURRED_COLUMNS + 1 if self._columns < TILE_COLUMNS else 0
-        is_faint = np.pad(is_faint, ends)
-        wide = np.logical_and.reduce([np.roll(is_faint, -shift) for shift in range(BLURRED_COLUMNS)])
-        # All of such a run, and the columns next to it, which dirt covers in part.
-        is_faint = np.logical_or.reduce([np.roll(wide, shift) for shift in range(-1, BLURRED_COLUMNS + 1)])
-        is_faint = np.asarray(is_faint)[ends : ends + self._columns]
+        is_faint = np.zeros(self._columns, bool)
+        if textured.sum() >= COMPARED_COLUMNS:
+            is_faint = textured & (ratio < BLURRED_SHARE * float(np.median(ratio[textured])))
+        # Runs of such columns, and those next to them, which dirt covers in part. The ends of a sector are no
+        # neighbours.
+        is_sector = self._columns < TILE_COLUMNS
+        is_faint = np.pad(is_faint, BLURRED_COLUMNS + 1) if is_sector else is_faint
+        is_wide = np.logical_and.reduce([np.roll(is_faint, -shift) for shift in range(BLURRED_COLUMNS)])
+        is_faint = np.logical_or.reduce([np.roll(is_wide, shift) for shift in range(-1, BLURRED_COLUMNS + 1)])
+        is_faint = is_faint[BLURRED_COLUMNS + 1 : -BLURRED_COLUMNS - 1] if is_sector else is_faint
         self._faint[side] = np.where(is_faint, self._faint[side] + 1, 0)
         return np.asarray(self._faint[side] >= IN_A_ROW)
-
-
-def of_pixels(tiles: Flags, shape: tuple[int, int]) -> Flags:
-    """Return flags of the pixels (H, W) of tiles (TILE_ROWS, C)."""
-    return np.asarray(cv2.resize(tiles.view(np.uint8), shape[::-1], interpolation=cv2.INTER_NEAREST), np.uint8) > 0
 
 
 def tile_columns(cylinder: Cylinder) -> int:
