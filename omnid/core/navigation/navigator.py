@@ -388,7 +388,8 @@ class Navigator:
         drive.no_way = ""
         if is_blocked:
             may_leave = is_closed and (detour is None or around.moves)
-            worth_s = (following.left_m + LOOK_M) / settings.pursuit.velocity_mps + drive.lost_s
+            free_s = self._planner.free_s(drive.ahead(now, following.left_m), around)
+            worth_s = free_s + LOOK_M / settings.pursuit.velocity_mps + drive.lost_s
             drive.is_waiting = may_leave and found.time_s > worth_s
             if drive.is_waiting:
                 return False

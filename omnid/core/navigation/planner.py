@@ -85,6 +85,12 @@ class Planner:
             and around.room_at(leg.xy, distances_m(around.is_unknown)).min() >= room_m
         )
 
+    def free_s(self, xy: Array, around: Surroundings) -> float:
+        """Return the time along points (N, 2), if nothing stood on them."""
+        is_known = around.room_at(xy[1:], np.where(around.is_unknown, 0.0, 1.0)) == 1.0
+        speeds_mps = np.where(is_known, self._settings.pursuit.velocity_mps, UNKNOWN_MPS)
+        return float((np.hypot(*np.diff(xy, axis=0).T) / speeds_mps).sum())
+
     def way(
         self,
         pose: Array,

@@ -1,4 +1,4 @@
-"""The heading controller: on a unicycle, and with any numbers."""
+"""The law of motion: heading controller, limits of speed, and goals for motor controllers that hold headings."""
 
 from __future__ import annotations
 
@@ -10,9 +10,13 @@ import pytest
 
 from omnid.core.control.heading_controller import (
     LONGEST_TICK_S,
+    STOP,
     HeadingController,
+    HeadingGoal,
+    HeadingLimits,
     Setpoint,
     Twist,
+    VelocityLimits,
     wrap_angle,
 )
 
@@ -123,3 +127,137 @@ def test_wrapped_angle_is_the_same_direction(angle_rad: float) -> None:
     wrapped = wrap_angle(angle_rad)
     assert -math.pi <= wrapped <= math.pi
     assert (math.cos(wrapped), math.sin(wrapped)) == pytest.approx((math.cos(angle_rad), math.sin(angle_rad)), abs=1e-6)
+
+
+OF_WHEELS = VelocityLimits(velocity_mps=0.8, acceleration_mps2=0.5, deceleration_mps2=2.0, yaw_rate_radps=1.5,
+                       yaw_acceleration_radps2=3.0)  # fmt: skip
+EXTREMES = (0.0, -0.0, math.nan, math.inf, -math.inf, 1e300, -1e300, 5e-324, 1e-9)
+SLACK = 1 + 1e-9
+
+
+def any_speed(rng: random.Random) -> float:
+    return rng.choice(EXTREMES) if rng.random() < 0.3 else rng.gauss(0.0, rng.choice([0.1, 1.0, 10.0]))
+
+
+@pytest.mark.hazard("H10")
+@pytest.mark.parametrize("seed", range(5))
+def test_never_exceeds_a_limit(seed: int) -> None:
+    rng, sent = random.Random(seed), STOP
+    for _ in range(5000):
+        wanted = Twist(any_speed(rng), any_speed(rng))
+        dt_s = abs(rng.gauss(0.05, 0.05)) if rng.random() < 0.8 else any_speed(rng)
+        last, sent = sent, OF_WHEELS.step(wanted, sent, dt_s)
+        assert_within(last, sent, dt_s)
+
+
+def assert_within(last: Twist, sent: Twist, dt_s: float) -> None:
+    passed_s = min(max(dt_s, 0.0), LONGEST_TICK_S) if math.isfinite(dt_s) else 0.0
+    tiny = 1e-12
+    assert abs(sent.velocity_mps) <= 0.8 and abs(sent.yaw_rate_radps) <= 1.5
+    assert abs(sent.yaw_rate_radps - last.yaw_rate_radps) <= 3.0 * passed_s * SLACK + tiny
+    gained_mps = abs(sent.velocity_mps) - abs(last.velocity_mps)
+    assert gained_mps <= 0.5 * passed_s * SLACK + tiny
+    assert abs(sent.velocity_mps - last.velocity_mps) <= 2.0 * passed_s * SLACK + tiny
+    if sent.velocity_mps * last.velocity_mps < 0:  # across zero: the part beyond it is an acceleration
+        braking_s = abs(last.velocity_mps) / 2.0
+        assert abs(sent.velocity_mps) <= 0.5 * (passed_s - braking_s) * SLACK + tiny
+
+
+@pytest.mark.hazard("H10")
+@pytest.mark.parametrize("seed", range(3))
+def test_is_finite_and_bounded_after_any_previous_motion(seed: int) -> None:
+    rng = random.Random(seed)
+    for _ in range(3000):
+        sent = OF_WHEELS.step(*(Twist(any_speed(rng), any_speed(rng)) for _ in range(2)), any_speed(rng))
+        assert abs(sent.velocity_mps) <= 0.8 and abs(sent.yaw_rate_radps) <= 1.5
+
+
+@pytest.mark.parametrize("wanted", [STOP, Twist(math.nan, 1.0), Twist(1.0, math.inf), Twist(-math.inf, 0.0)])
+def test_stops_within_the_deceleration(wanted: Twist) -> None:
+    sent, speeds = Twist(0.8, 1.0), [0.8]
+    for _ in range(5):
+        sent = OF_WHEELS.step(wanted, sent, 0.1)
+        speeds.append(sent.velocity_mps)
+    assert sent == STOP and speeds[:5] == pytest.approx([0.8, 0.6, 0.4, 0.2, 0.0])
+
+
+def integrated(wanted: Twist, last: Twist, dt_s: float, steps: int = 2000) -> Twist:
+    """Return the motion after a time by small steps, each of which may brake, or speed up, or turn faster by a part."""
+    step_s, v, w = dt_s / steps, last.velocity_mps, last.yaw_rate_radps
+    goal_mps, goal_radps = max(-0.8, min(0.8, wanted.velocity_mps)), max(-1.5, min(1.5, wanted.yaw_rate_radps))
+    for _ in range(steps):
+        brakes = v * goal_mps < 0.0 or abs(goal_mps) < abs(v)
+        change = (2.0 if brakes else 0.5) * step_s
+        v = goal_mps if abs(goal_mps - v) <= change else v + math.copysign(change, goal_mps - v)
+        turn = 3.0 * step_s
+        w = goal_radps if abs(goal_radps - w) <= turn else w + math.copysign(turn, goal_radps - w)
+    return Twist(v, w)
+
+
+def test_is_as_fast_as_the_limits_allow_by_small_steps() -> None:
+    rng = random.Random(6)
+    for _ in range(250):
+        last, dt_s = Twist(rng.uniform(-0.8, 0.8), rng.uniform(-1.5, 1.5)), rng.uniform(0.0, LONGEST_TICK_S)
+        wanted = Twist(rng.choice((0.0, rng.uniform(-0.3, 0.3), rng.uniform(-1, 1))), rng.uniform(-2, 2))
+        sent, expected = OF_WHEELS.step(wanted, last, dt_s), integrated(wanted, last, dt_s)
+        assert sent.velocity_mps == pytest.approx(expected.velocity_mps, abs=1e-3), (wanted, last, dt_s)
+        assert sent.yaw_rate_radps == pytest.approx(expected.yaw_rate_radps, abs=1e-3)
+
+
+def test_a_late_tick_allows_no_larger_step_than_one_of_a_fifth_of_a_second() -> None:
+    assert OF_WHEELS.step(Twist(0.8, 1.5), STOP, 9.0) == Twist(pytest.approx(0.1), pytest.approx(0.6))
+
+
+HEADING = HeadingLimits(yaw_rate_radps=0.8, yaw_acceleration_radps2=4.0)
+OF_HOLDER = VelocityLimits(yaw_rate_radps=1.2, yaw_acceleration_radps2=2.0)
+LONGEST_RAD = 0.15 * 0.8 + 0.8**2 / (2 * 2)
+
+
+@pytest.fixture
+def goal() -> HeadingGoal:
+    return HeadingGoal(HEADING, OF_HOLDER)
+
+
+@pytest.mark.hazard("H11")
+def test_a_blocked_base_gets_no_goal_beyond_the_longest_lead(goal: HeadingGoal) -> None:
+    goal.update(2.0, 0.0)
+    for error_rad in (None, 3.0):
+        goals = [goal.towards(0.05, error_rad) for _ in range(100)]
+        assert goals[0] == pytest.approx(2.05) and goals[-1] == pytest.approx(2.0 + LONGEST_RAD)
+        goal.stay()
+    assert [goal.towards(-0.05, -3.0) for _ in range(100)][-1] == pytest.approx(2.0 - LONGEST_RAD)
+
+
+def test_a_goal_moves_by_no_more_than_the_turn(goal: HeadingGoal) -> None:
+    """However far the wanted heading is, and wherever it jumps to."""
+    rng, before_rad = random.Random(1), 0.0
+    for _ in range(500):
+        goal.update(before_rad, 0.0)
+        turn_rad, error_rad = rng.uniform(-0.05, 0.05), rng.uniform(-3.1, 3.1)
+        after_rad = goal.towards(turn_rad, error_rad if abs(error_rad) > LONGEST_RAD else None)
+        assert abs(wrap_angle(after_rad - before_rad)) <= abs(turn_rad) + 1e-12
+        before_rad = after_rad
+
+
+def test_the_goal_does_not_pass_the_wanted_heading(goal: HeadingGoal) -> None:
+    goal.update(1.0, 0.5)
+    for error_rad, turn_rad, expected_rad in ((0.1, 0.5, 1.1), (-0.1, -0.5, 0.9), (0.1, -0.5, 1.0), (0.0, 0.5, 1.0)):
+        goal.stay()
+        assert goal.towards(turn_rad, error_rad) == pytest.approx(expected_rad)
+
+
+def test_a_base_that_turns_too_fast_is_to_hold_its_heading(goal: HeadingGoal) -> None:
+    goal.update(0.0, 0.87)
+    assert goal.towards(0.2) == pytest.approx(0.2), "a little more than the limit is lag"
+    for rate_radps, turn_rad, expected_rad in ((0.89, 0.2, 0.0), (-0.89, -0.2, 0.0), (-1.2, 0.2, 0.2)):
+        goal.stay()
+        goal.update(0.0, rate_radps)
+        assert goal.towards(turn_rad) == pytest.approx(expected_rad)
+
+
+def test_numbers_that_are_not_finite_leave_the_goal_at_the_heading(goal: HeadingGoal) -> None:
+    goal.update(1.0, math.nan)
+    goal.update(math.nan, math.inf)
+    for turn_rad, error_rad in ((math.nan, None), (0.1, math.nan), (math.inf, 0.1)):
+        assert goal.towards(turn_rad, error_rad) == 1.0
+    assert goal.towards(0.1) == pytest.approx(1.1)
