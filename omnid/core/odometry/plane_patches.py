@@ -105,10 +105,11 @@ def plane_templates(
         x, y, z = np.einsum("nka,knm->anm", R, scale / along * rays - t.T[:, :, None])
         seen = [np.arctan2(s * x - c * y, c * x + s * y), slope - z / np.hypot(x, y)]
     offsets = cylinder.focal_px * np.stack(seen, axis=1)
-    is_bent = np.asarray((scale > 0) & (along > 0) & (np.abs(offsets) < MOST_STRETCH * half).all(axis=1))
-    offsets = np.where(is_bent.all(axis=1)[:, None, None], offsets, half * STEPS + shift[:, :, None])
+    is_bent = (scale > 0) & (along > 0) & (np.abs(offsets) < MOST_STRETCH * half).all(axis=1)
+    is_whole = np.asarray(is_bent.all(axis=1))[:, None, None]
+    offsets = np.where(is_whole, offsets, half * STEPS + shift[:, :, None])
     # 3. The quadratic polynomials through them, and the greys of the pixels in between.
-    known = np.isfinite(offsets[:, :, 0]).all(axis=1) & np.isfinite(pixels).all(axis=1)
+    known = np.asarray(np.isfinite(offsets[:, :, 0]).all(axis=1) & np.isfinite(pixels).all(axis=1))
     first_image = next(iter(images.values()))
     places = np.where(known[:, None, None], offsets + _padded(first_image, pixels)[:, :, None], 0.0)
     first = np.floor(places.min(axis=2)).astype(np.intp) - 2
