@@ -32,6 +32,9 @@ from omnid.tracking_state import TrackingState
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
+# Rounds of starting the map again, because the depths of the first frame are measured as if the rig were at rest, so
+# that the motion is wrong by a few per cent of what happens between two exposures, and each reduces it by this ratio.
+START_ROUNDS = 2
 SHORTEST_STEP_S = 0.05  # the speed limit counts at least this time, so that two close stamps refuse no pose
 # Corners per landmark of the smallest map: two make a frame textured, since not all will be located; four are sought.
 TEXTURED_CORNERS, COUNTED_CORNERS = 2, 4
@@ -85,6 +88,7 @@ class VisualOdometry:
         self._T_odom_rect = np.eye(4)
         self._T_at_fix = self._T_odom_rect  # the last accepted pose
         self._step: Array | None = None  # last step by the cameras
+        self._first: StereoFrame | None = None  # started the map before its velocity was known
         self._requested: KeyframeRequest | None = None  # keyframe that the last frame asked for, see complete
         self._added: int | None = None  # seq of the keyframe that the last frame became
         self._distance_m = ROOM_M  # median of the landmarks by which the last pose was found
@@ -141,6 +145,8 @@ class VisualOdometry:
         after_refusal = self._tracking.is_refused
         searched = not after_refusal or self._is_textured(now)
         found = self._find(now) if searched else []
+        if self._first is not None:
+            found = self._start_again(now, found)
 
         # 5. Accept or refuse, by the inliers and the speed that the pose implies; after a break, relocalise.
         plausible = [each for each in found if self._is_plausible(each, now)]
@@ -211,6 +217,23 @@ class VisualOdometry:
         velocity = (T_refused[:3, 3] - self._T_at_fix[:3, 3]) / now.since_fix_s
         published = self._T_odom_rect[:3, :3] @ self._motion.velocity[:3]
         self._hypotheses.add(now.T_odom_rect, T_refused, velocity - published)
+
+    def _start_again(self, now: _Prediction, found: list[PoseEstimate]) -> list[PoseEstimate]:
+        """Start the map again at its first frame, whose velocity this one shows; return the pose in that map."""
+        first, self._first = self._first, None
+        if first is None or not 0 < now.dt_s <= self._limits.max_gap_s:
+            return found
+        for _ in range(START_ROUNDS):
+            if not found or not self._is_plausible(found[0], now):
+                break
+            velocity = self._motion.of_step(se3.inverse(self._T_odom_rect) @ found[0].T_odom_rect, now.dt_s)
+            self._map.clear()
+            exposure = Exposure.of(first.times, velocity, self._model)
+            self._keyframes.add(self._request(first, now.usable & first.usable, exposure))
+            exposure = Exposure.of(now.frame.times, velocity, self._model)
+            again = self._search.estimate(now.frame, found[0].T_odom_rect, exposure, is_near=True)
+            found = [] if again is None else [again]
+        return found
 
     def _is_plausible(self, estimate: PoseEstimate, now: _Prediction) -> bool:
         """True if the pose has enough inliers and implies no impossible speed since the last accepted one."""
@@ -316,6 +339,7 @@ class VisualOdometry:
             self._map.clear()
             self._tracking.miss(now.dt_s, carried=carried)
             return self._result(0, 0, exposure=exposure)
+        self._first = None if now.frame.times.is_at_once else now.frame
         self._motion.found(self._motion.pose_covariance)
         self._tracking.start(carried=carried, is_elsewhere=is_elsewhere)
         self._T_at_fix = self._T_odom_rect
