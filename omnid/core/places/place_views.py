@@ -64,9 +64,10 @@ def base_poses(places: PlaceMap, rig: PlaceRig) -> Array:
 
 
 def paths_xy(places: PlaceMap, rig: PlaceRig) -> Array:
-    """Return the paths (N, 2) [m] of all drives, a row of NaN after each; one ends where odometry does not go on."""
+    """Return the paths (N, 2) [m] of all drives, a row of NaN after each; one ends with its session or the odometry."""
     rows = [np.zeros((0, 2))]
-    by_odometry = [(link.a, link.b) for link in places.links if not link.is_loop]
+    session = {id: keyframe.session for id, keyframe in places.keyframes.items()}
+    by_odometry = [(link.a, link.b) for link in places.links if not link.is_loop and session[link.a] == session[link.b]]
     for ids in sorted(connected(list(places.keyframes), by_odometry)):
         rows += [_of_base(np.array([places.poses[id] for id in ids]), rig)[:, :2, 3], np.full((1, 2), np.nan)]
     return np.vstack(rows)
