@@ -111,7 +111,7 @@ def level_evidence(
                     for u in range(width):
                         mixed = np.uint16(np.uint16(first[u]) * rest + np.uint16(second[u]) * share) >> np.uint16(8)
                         between = np.uint8(mixed)
-                        sums[u] += np.uint16(difference(mine[u], between, between, seen[u]))
+                        sums[u] = np.uint16(sums[u] + np.uint16(difference(mine[u], between, between, seen[u])))
                 spread(sums, spread_sums)
                 lower_to(spread_sums, best[kind])
         for u in range(width):
@@ -124,13 +124,18 @@ def level_evidence(
 
 
 @inner
-def add_strip(lower: Bytes, bounds: Bytes, live: Bytes, first: int, part: slice, sums: Words) -> None:
-    """Write the sums (PART,) of differences over the rows of a strip to the bounds (2, rows, W) of another image."""
+def add_strip(
+    lower: Bytes, bounds: Bytes, live: Bytes, rows: tuple[int, int], shift: int, part: slice, sums: Words
+) -> None:
+    """Write the sums (PART,) of differences over rows to the bounds (2, H, W) of another image, whose rows are shifted.
+
+    Whole arrays are passed: the compiler knows that their rows are contiguous.
+    """
     sums[:] = 0
-    for v in range(bounds.shape[1]):
-        one, least, most, seen = lower[first + v, part], bounds[0, v, part], bounds[1, v, part], live[first + v, part]
+    for v in range(rows[0], rows[1]):
+        one, least, most, seen = lower[v, part], bounds[0, v + shift, part], bounds[1, v + shift, part], live[v, part]
         for u in range(PART):  # the compiler knows this count
-            sums[u] += np.uint16(difference(one[u], least[u], most[u], seen[u]))
+            sums[u] = np.uint16(sums[u] + np.uint16(difference(one[u], least[u], most[u], seen[u])))
 
 
 @inner
@@ -199,16 +204,16 @@ def surface_evidence(
         part = slice(begin, begin + PART)
         run[:], value[0] = NOTHING, NOTHING
         for n in range(len(strips)):
-            first, end = strips[n, STRIP_FIRST], strips[n, STRIP_END]
+            rows = strips[n, STRIP_FIRST], strips[n, STRIP_END]
             mine, last, below = strips[n, STRIP_SURFACE], strips[n, STRIP_SHIFTS], strips[n, STRIP_BELOW]
             # 1. The differences at all disparities, and on the floor.
             best[:], total[:], value[last + 1] = LARGEST, NOTHING, NOTHING
             for d in range(last):
-                add_strip(lower, upright[:, first + d : end + d], live, first, part, sums[d])
+                add_strip(lower, upright, live, rows, d, part, sums[d])
                 lower_to(sums[d], best)
             has_floor = strips[n, STRIP_FLOOR] > 0
             if has_floor:
-                add_strip(lower, plane[:, first:end], live, first, part, sums[bins])
+                add_strip(lower, plane, live, rows, 0, part, sums[bins])
                 lower_to(sums[bins], best)
             # 2. The likelihoods.
             weights = below * BELOW_WEIGHT + (last - below)
