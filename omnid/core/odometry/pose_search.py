@@ -62,7 +62,7 @@ GOOD_RATIO = 0.5
 UPPER_REACH_PX = 3
 # Landmarks tracked from the last panorama at most, as a share of those wanted, others in the next frame: enough for the
 # start of the refinement, which aligns the patches of all landmarks.
-TRACKED_SHARE = 0.5
+TRACKED_SHARE = 0.6
 
 
 @dataclass(frozen=True, slots=True)
