@@ -11,7 +11,7 @@ keyframe leaves when it is the oldest of too many or anchors no landmark any mor
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from types import SimpleNamespace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,12 +104,12 @@ class LocalMap:
         self.clear()
 
     def __len__(self) -> int:
-        return len(self.table)
+        return len(self._rows)
 
     def clear(self) -> None:
         """Remove all landmarks and keyframes."""
         self.keyframes: dict[int, Keyframe] = {}
-        self.table: np.recarray[Any, Any] = np.zeros(0, LANDMARK).view(np.recarray)
+        self._set_rows(np.zeros(0, LANDMARK))
         self.first_depths: FirstDepths | None = None  # of the only keyframe; None: its depths are not in doubt
         self.last: PaddedPanorama | None = None  # the last accepted lower panorama; None: there is no map
         # What waits for the velocity at its frame: an estimate with the ids of its landmarks, and new landmarks.
@@ -128,19 +128,19 @@ class LocalMap:
         """
         self.last = keyframe.lower
         finite = np.isfinite(triangulate(views, self._model.cylinder, self._model.baseline_m)).all(axis=1)
-        new = np.zeros(int(finite.sum()), LANDMARK).view(np.recarray)
-        new.id = np.arange(self._next_id, self._next_id + len(new))
+        new = np.zeros(int(finite.sum()), LANDMARK)
+        new["id"] = np.arange(self._next_id, self._next_id + len(new))
         self._next_id += len(new)
-        new.anchor, new.slopes = keyframe.seq, slopes[finite]
-        new.pixels = new.anchor_pixels = (views[:, :2] if pixels is None else pixels)[finite]
+        new["anchor"], new["slopes"] = keyframe.seq, slopes[finite]
+        new["pixels"] = new["anchor_pixels"] = (views[:, :2] if pixels is None else pixels)[finite]
         self.keyframes[keyframe.seq] = keyframe
-        self.table = np.concatenate([self.table, new]).view(np.recarray)
-        self.set_views(new.id, views[finite], None if noise is None else noise[finite])
+        self._set_rows(np.concatenate([self._rows, new]))
+        self.set_views(new["id"], views[finite], None if noise is None else noise[finite])
         while len(self.keyframes) > self._max_keyframes:
             self.keyframes.pop(min(self.keyframes))
         self._select(np.isin(self.table.anchor, list(self.keyframes)))
         given = np.full(finite.shape, -1)
-        given[finite] = new.id
+        given[finite] = new["id"]
         return given
 
     def add_located(self, keyframe: Keyframe, new: NewLandmarks) -> Indices:
@@ -256,9 +256,13 @@ class LocalMap:
         poses = np.array([self.keyframes[seq].T_odom_rect for seq in seqs]).reshape(-1, 4, 4)
         return np.asarray((T_rect_odom @ poses)[np.searchsorted(np.array(seqs, np.intp), self.table.anchor[rows])])
 
+    def _set_rows(self, rows: NDArray[np.void]) -> None:
+        """Set the rows (N,) of LANDMARK; the columns of the table are views of them."""
+        self._rows, self.table = rows, SimpleNamespace(**{name: rows[name] for name in LANDMARK.fields or ()})
+
     def _select(self, kept: Flags) -> None:
         """Keep some landmarks (flags (N,)) and the keyframes that anchor them."""
-        self.table = self.table[kept].view(np.recarray)
+        self._set_rows(self._rows[kept])
         anchors = set(self.table.anchor.tolist())
         self.keyframes = {seq: keyframe for seq, keyframe in self.keyframes.items() if seq in anchors}
 
