@@ -1,1 +1,9 @@
-"""Logs: reading of MCAP files, bags and folders of images; writing and rotation of MCAP files."""
+"""Logs of any kind as one sequence of messages in the order of time; writing and rotation of MCAP files.
+
+Begin with `log_reader.py`: it gives the frames of both cameras and the samples of wheels and gyro of a log, whatever
+its format. `log.py` joins the parts of a log, puts messages into the order of time and says what is missing;
+`stamps.py` decides between the times of headers and of logging; `topics.py` finds the cameras. The formats stand below:
+`record_file.py` (MCAP and ROS 1 bags, also cut ones), `sqlite_bag.py`, `image_folder.py`, and `compression.py` for
+files that are packed as a whole. `open_log.py` tells them apart by their content. `mcap_writer.py` and
+`rotating_log.py` write recordings within a bound.
+"""

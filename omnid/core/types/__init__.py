@@ -1,1 +1,6 @@
-"""Types that stereo, odometry, places and obstacles share: the panorama image, the camera of a pair."""
+"""Types that stereo, odometry, places and obstacles share.
+
+`panorama.py` is a panorama with its padding across the seam, noise and visible part; `pixel_times.py` says when each
+pixel was exposed against the stamp of the pair; `stereo_model.py` is the cylinder and the baseline by which a pixel and
+a disparity are a point.
+"""
