@@ -16,7 +16,7 @@ from omnid.camera_config import CamerasConfig, PairConfig
 from omnid.controller.motor_settings import MotorSettings
 from omnid.core.control.control_law import ControllerSettings
 from omnid.core.navigation.settings import NavigationSettings
-from omnid.core.obstacles.settings import RingSettings
+from omnid.core.obstacles.settings import ScanSettings
 from omnid.core.odometry.estimates import OdometryLimits
 from omnid.core.odometry.motion_settings import MotionSensorSettings
 from omnid.core.odometry.tracking import KltSettings
@@ -141,11 +141,13 @@ class MappingConfig:
 
 @dataclass(frozen=True, slots=True)
 class ObstaclesConfig:
-    """Ring of the nearest obstacles around the base, published as scan."""
+    """Scan of the nearest obstacles around the base, published as `scan`."""
+
+    REMOVED = MappingProxyType({"ring": "the section is named scan"})
 
     enabled: Annotated[bool, "find obstacles; off: nothing keeps the base from driving against them"] = True
-    rate_hz: Annotated[float, Meta(ge=0, le=100), "rings a second at most; 0: one for each pair"] = 10.0
-    ring: RingSettings = field(default_factory=RingSettings)
+    rate_hz: Annotated[float, Meta(ge=0, le=100), "scans a second at most; 0: one for each pair"] = 10.0
+    scan: ScanSettings = field(default_factory=ScanSettings)
 
 
 @dataclass(frozen=True, slots=True)

@@ -187,7 +187,7 @@ class GridUpdate:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ObstacleRing:
+class ObstacleScan:
     """Nearest obstacle in each direction from the base: sector k is about azimuth -pi + (k + 0.5) 2 pi / 360.
 
     Ranges are from the base's origin, in the plane of its x (forward) and y (left). Unknown is not free: a plain
@@ -196,7 +196,7 @@ class ObstacleRing:
 
     seq: int
     stamp_ns: int
-    ranges_m: NDArray[np.float32]  # (360,) inf: seen to be free up to obstacles.ring.max_range_m; NaN: unknown
+    ranges_m: NDArray[np.float32]  # (360,) inf: seen to be free up to obstacles.scan.max_range_m; NaN: unknown
     sigma_m: NDArray[np.float32]  # (360,) NaN where there is no range
     free_m: NDArray[np.float32]  # (360,) up to which the floor, or something behind, was seen; 0: nothing was
     T_odom_base: Array  # (4, 4)

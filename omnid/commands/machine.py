@@ -56,7 +56,7 @@ def examine(config: Config) -> Iterator[checks.Finding]:
     camera, wanted = config.cameras, config.realtime
     named = {name: camera.settings(name) for name in ("lower", "upper")}
     yield from checks.cameras(named, capture_devices(ROOT), ROOT)
-    yield from checks.rig(Path(camera.rig), (camera.width_px, camera.height_px), config.obstacles.ring.floor_m)
+    yield from checks.rig(Path(camera.rig), (camera.width_px, camera.height_px), config.obstacles.scan.floor_m)
     yield from checks.motor(config.motor, ROOT)
     yield from checks.rights(max(wanted.motor_priority, wanted.capture_priority), wanted.lock_memory)
     yield from checks.compiled_functions()

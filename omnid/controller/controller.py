@@ -71,7 +71,7 @@ class Controller:
         return self._law.motion == STOP or self.state.failed
 
     def take(self, given: ControlInput) -> None:
-        """Take what the daemon gives: a pose, an obstacle ring, a setpoint, or a request to arm."""
+        """Take what the daemon gives: a pose, an obstacle scan, a setpoint, or a request to arm."""
         conflict = self._law.commands.conflict
         self._law.take(given)
         if self._law.commands.conflict != conflict:

@@ -69,7 +69,7 @@ class DriveLink(Protocol):
     statistics: ControllerStatistics
 
     def send(self, given: ControlInput) -> None:
-        """Send a pose, an obstacle ring, a setpoint, or a request to arm."""
+        """Send a pose, an obstacle scan, a setpoint, or a request to arm."""
 
     def stop(self) -> None:
         """Stop the wheels until a request to arm is sent later."""
@@ -109,7 +109,7 @@ class ControllerLink:
             raise
 
     def send(self, given: ControlInput | None) -> None:
-        """Send a pose, an obstacle ring, a setpoint, or a request to arm, with the newest stop; from any thread.
+        """Send a pose, an obstacle scan, a setpoint, or a request to arm, with the newest stop; from any thread.
 
         None: the stop alone. A request that is lost is not repeated: its sender sees that the robot is not armed.
         """

@@ -66,7 +66,7 @@ def drawn_heights(height_m: float) -> tuple[float, float]:
     """Return the lowest and the highest z [m] relative to the lower viewpoint that a plan shows: those above the floor.
 
     height_m: of the viewpoint above the floor; less than LEAST_HEIGHT_M, as 0, where the rig does not state it.
-    Lower surfaces are the floor: obstacles begin at 0.06 m (obstacles.ring.heights_m), and a voxel has 0.05 m.
+    Lower surfaces are the floor: obstacles begin at 0.06 m (obstacles.scan.heights_m), and a voxel has 0.05 m.
     """
     return (max(_LOW_M, 0.1 - height_m) if height_m >= LEAST_HEIGHT_M else _LOW_M), _HIGH_M
 

@@ -49,7 +49,7 @@ from omnid.sinks.drive import PlannerDrive
 from omnid.sinks.encoder import StatusReport
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry
-from omnid.stages.obstacles import ADVICE, controller_ring
+from omnid.stages.obstacles import ADVICE, controller_scan
 from omnid.transport import status_names as names
 from omnid.transport import topics
 from omnid.transport.bus import Bus
@@ -275,11 +275,11 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
             pose.depth.panoramas, pose.T_odom_rig[:3, 3], pose.depth.exposure
         )
     if controller is not None:
-        outputs.rings["controller-ring"] = lambda ring: controller.send(controller_ring(ring))
+        outputs.scans["controller-scan"] = lambda scan: controller.send(controller_scan(scan))
 
     # 3. The stages, and the navigation with its requests and files.
     requests, map_is_read = Requests(graph), graph.inlet(1)
-    if rig.height_m(config.obstacles.ring.floor_m) is None:
+    if rig.height_m(config.obstacles.scan.floor_m) is None:
         warn(
             "the rig states no height of the cameras: the floor is looked for in the images; "
             f"until it is found, map, grid and obstacles call nothing free; {ADVICE}"

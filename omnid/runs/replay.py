@@ -241,7 +241,7 @@ class _Replay:
         if cloud := options.cloud:  # each map replaces the file
             outputs.maps["map"] = lambda update: write_ply(cloud, update.points)
         if plan := options.plan:
-            heights_m = drawn_heights(geometry.rig.height_m(config.obstacles.ring.floor_m) or 0.0)
+            heights_m = drawn_heights(geometry.rig.height_m(config.obstacles.scan.floor_m) or 0.0)
             outputs.maps["plan"] = lambda update: write_plan(plan, update.points, update.path_xy, heights_m)
         recorder: Sink[Any] | None = None
         if options.observer:

@@ -184,7 +184,7 @@ class Session:
 
     def encoder(self, rig: Rig, cloud_points: int, unix_ns: UnixTime | None = None) -> Encoder:
         """Return an encoder that limits the number of points of the map; unix_ns: None for that of the clock."""
-        scan_range_m = self.config.obstacles.ring.max_range_m
+        scan_range_m = self.config.obstacles.scan.max_range_m
         return Encoder(rig.T_base_rig, cloud_points, unix_ns or self.clock.unix_ns, rig, scan_range_m)
 
     @contextmanager

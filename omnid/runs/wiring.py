@@ -15,7 +15,7 @@ from omnid.controller.statistics import ControllerState
 from omnid.core.navigation.situation import WheelState
 from omnid.engine.graph import NEWEST, Graph, Output, Stream
 from omnid.formats.route_file import RouteFolder
-from omnid.messages import FramePair, MapUpdate, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
+from omnid.messages import FramePair, MapUpdate, NavigationUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.route_files import Requests, RouteFiles, TaughtRoutes
 from omnid.sinks.drive import LiveDrive
@@ -64,7 +64,7 @@ class Outputs:
     commands: dict[str, Output[VelocityCommand]] = field(default_factory=dict)
     maps: dict[str, Output[MapUpdate]] = field(default_factory=dict)
     places: dict[str, Output[PlaceUpdate]] = field(default_factory=dict)
-    rings: dict[str, Output[ObstacleRing]] = field(default_factory=dict)  # in the thread of the rings
+    scans: dict[str, Output[ObstacleScan]] = field(default_factory=dict)  # in the thread of the scans
     bus: Output[Outgoing] | None = None  # takes all messages that leave the run
     recorder: Output[Any] | None = None  # takes them as well
     records_images: bool = False  # the recorder of a live run takes the images, too
@@ -92,7 +92,7 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
     known_places = None if run_map is None else run_map.places
     takes_all = outputs.bus is not None or outputs.recorder is not None
     mapping, places, obstacles = None, None, None
-    maps, in_map, grids, rings, written, ways = None, None, None, None, None, None
+    maps, in_map, grids, scans, written, ways = None, None, None, None, None, None
 
     # 1. Images give pairs, pairs give panoramas, and these give poses.
     pairs = graph.stage("pair", front_end.pairing, *inputs.frames)
@@ -125,9 +125,9 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
     if in_map is not None and takes_all:
         grid = MapGrid(config.mapping.voxel_m, T_base_rect, inputs.map_every_s)
         grids = graph.stage("grid", grid, in_map, thread=BACKGROUND)
-    if config.obstacles.enabled and (outputs.rings or takes_all or navigation):
+    if config.obstacles.enabled and (outputs.scans or takes_all or navigation):
         obstacles = Obstacles(geometry, config.obstacles, front_end.dense)
-        rings = graph.stage("obstacles", obstacles, poses)
+        scans = graph.stage("obstacles", obstacles, poses)
 
     # 4. All of them, and requests, give the way to drive.
     if navigation is not None:
@@ -136,7 +136,7 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
         taught = Routes(map_name if places else "", T_base_rect, is_new=is_new)
         stage = NavigationStage(config.navigation, config.controller.collision, T_base_rig, taught)
         wheels = graph.stage("wheel-states", wheel_state, states, thread=states.thread)
-        given = poses, in_map, rings, wheels, requests.direct, written
+        given = poses, in_map, scans, wheels, requests.direct, written
         seen: list[Stream[Any]] = [stream for stream in given if stream is not None]
         ways = graph.stage("navigation", stage, *seen)
         graph.sink("planner", drive, ways, thread=ways.thread)
@@ -144,7 +144,7 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
     # 5. What is made is consumed, and leaves the run.
     consumed: list[tuple[dict[str, Any], Stream[Any] | None, str]] = [
         (outputs.counters, poses, poses.thread),
-        (outputs.rings, rings, "obstacles"),
+        (outputs.scans, scans, "obstacles"),
         (outputs.poses, poses, BACKGROUND),
         (outputs.commands, commands, BACKGROUND),
         (outputs.maps, maps, BACKGROUND),
@@ -162,7 +162,7 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
         ("bus-map", maps, FILES),  # to encode a map takes longer than a pose may wait
         ("bus-places", in_map, BUS),
         ("bus-grid", grids, FILES),
-        ("bus-scan", rings, BUS),
+        ("bus-scan", scans, BUS),
         ("bus-navigation", ways, BUS),
         ("bus-status", outputs.reports, BUS),
     ]

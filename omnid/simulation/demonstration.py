@@ -13,7 +13,7 @@ from calib import se3
 from omnid.core.mapping.range_scan import azimuths
 from omnid.core.navigation.requests import NavigationFrame, PathRequest, RouteAction, RouteRequest
 from omnid.formats.plan import BLACK, LIGHT_GREY, RED, Lines, Sheet, draw_ends, draw_plan, with_legend
-from omnid.messages import NavigationUpdate, ObstacleRing, PlaceUpdate
+from omnid.messages import NavigationUpdate, ObstacleScan, PlaceUpdate
 from omnid.navigation_state import NavigationState
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun
 from omnid.simulation.world import World, distances_m
@@ -116,17 +116,17 @@ def cross_track_m(first: Array, second: Array) -> Array:
 
 
 def seen_obstacles(run: SimulatedRun) -> Array:
-    """Return the obstacles (N, 2) [m] of all rings, where the robot believes them, in the world."""
+    """Return the obstacles (N, 2) [m] of all scans, where the robot believes them, in the world."""
     if not len(run.T_world_base):
         return np.zeros((0, 2))
     directions = np.column_stack([np.cos(azimuths()), np.sin(azimuths()), np.zeros(len(azimuths()))])
 
-    def places(ring: ObstacleRing) -> Array:
-        seen = np.isfinite(ring.ranges_m)
-        at = ring.ranges_m[seen, None] * directions[seen]
-        return np.asarray(se3.apply(run.T_world_base[0] @ ring.T_odom_base, at)[:, :2])
+    def places(scan: ObstacleScan) -> Array:
+        seen = np.isfinite(scan.ranges_m)
+        at = scan.ranges_m[seen, None] * directions[seen]
+        return np.asarray(se3.apply(run.T_world_base[0] @ scan.T_odom_base, at)[:, :2])
 
-    return np.vstack([np.zeros((0, 2)), *(places(ring) for ring in run.rings)])
+    return np.vstack([np.zeros((0, 2)), *(places(scan) for scan in run.scans)])
 
 
 def draw(world: World, obstacles: Array, first: Array, second: Array) -> NDArray[np.uint8]:

@@ -30,7 +30,7 @@ from omnid.core.navigation.requests import NavigationCommand, NavigationRequest
 from omnid.engine.graph import Graph, Output, nothing
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.formats.route_file import RouteFolder
-from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
+from omnid.messages import NavigationUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.route_files import Requests
 from omnid.runs.session import run_to_end
@@ -42,7 +42,7 @@ from omnid.sinks.drive import NAVIGATION_SENDER
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry
 from omnid.stages.lockstep_drive import controller_pose
-from omnid.stages.obstacles import controller_ring
+from omnid.stages.obstacles import controller_scan
 
 Array = NDArray[np.float64]
 
@@ -88,7 +88,7 @@ class SimulatedRun:
     poses: list[EstimatedPose] = field(default_factory=list)
     ticks: list[Tick] = field(default_factory=list)
     lines: list[tuple[float, str]] = field(default_factory=list)  # time [s] and text: what the controller reported
-    rings: list[ObstacleRing] = field(default_factory=list)
+    scans: list[ObstacleScan] = field(default_factory=list)
     navigation: list[NavigationUpdate] = field(default_factory=list)
     places: list[PlaceUpdate] = field(default_factory=list)
 
@@ -213,9 +213,9 @@ def simulate(
         run.poses.append(EstimatedPose(odometry.stamp_ns, truth[odometry.stamp_ns], *estimate))
         body.post(controller_pose(odometry, rig.T_base_rig))
 
-    def take_ring(ring: ObstacleRing) -> None:
-        run.rings.append(ring)
-        body.post(controller_ring(ring))
+    def take_scan(scan: ObstacleScan) -> None:
+        run.scans.append(scan)
+        body.post(controller_scan(scan))
 
     def take_navigation(update: NavigationUpdate) -> None:
         run.navigation.append(update)
@@ -229,7 +229,7 @@ def simulate(
     navigation = Navigation(requests, states, routes, take_navigation, config.places.map)
     inputs = Inputs([graph.source("cameras", messages)], run_places, navigation=navigation)
     in_map: dict[str, Output[PlaceUpdate]] = {"in map": run.places.append} if config.places.map else {}
-    outputs = Outputs(poses={"poses": take_pose}, rings={"rings": take_ring}, places=in_map)
+    outputs = Outputs(poses={"poses": take_pose}, scans={"scans": take_scan}, places=in_map)
     wire(config, inputs, front_end, graph, outputs)
     run_to_end(graph, run_places)
     return run

@@ -51,7 +51,7 @@ class PacedLink:
         self._contacts = NO_CONTACT
 
     def send(self, given: ControlInput) -> None:
-        """Send a pose, an obstacle ring, a setpoint, or a request to arm."""
+        """Send a pose, an obstacle scan, a setpoint, or a request to arm."""
         if isinstance(given, TimedSetpoint | ArmRequest):
             given = given._replace(arrival_ns=0)
         self._vehicle.post(given)

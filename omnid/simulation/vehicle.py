@@ -30,7 +30,7 @@ from omnid.config import Config
 from omnid.controller.controller import Controller
 from omnid.controller.statistics import TickReport
 from omnid.core.control.arming import ArmRequest
-from omnid.core.control.collision_monitor import ControllerRing
+from omnid.core.control.collision_monitor import ControllerScan
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.contacts import ContactState
 from omnid.core.control.control_law import ControlInput, ControllerPose
@@ -155,10 +155,10 @@ class Vehicle:
     def post(self, given: Given, due_ns: int = 0) -> None:
         """Have the controller given something before its first tick at or after a time; from any thread.
 
-        A pose or an obstacle ring needs the robot's pose_delay_s from its images. It is on its way when `advance` is
+        A pose or an obstacle scan needs the robot's pose_delay_s from its images. It is on its way when `advance` is
         called next. A setpoint or a request without a time of arrival arrives then.
         """
-        if isinstance(given, ControllerPose | ControllerRing):
+        if isinstance(given, ControllerPose | ControllerScan):
             due_ns = given.stamp_ns + round(self.robot.pose_delay_s * 1e9)
         self._posted.put((due_ns, next(self._numbers), given))
 

@@ -14,7 +14,7 @@ from drivers.motion import WheelSample
 from drivers.motor import VelocityCommand
 from omnid.core.frames import base_pose, in_outer_axes, of_base
 from omnid.core.mapping.voxel_map import MapPoints
-from omnid.messages import GridUpdate, MapUpdate, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
+from omnid.messages import GridUpdate, MapUpdate, NavigationUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate
 from omnid.navigation_state import NavigationState
 from omnid.tracking_state import MapState, TrackingState
 from omnid.transport import codec
@@ -37,7 +37,7 @@ Outgoing: TypeAlias = (
     | MapUpdate
     | PlaceUpdate
     | GridUpdate
-    | ObstacleRing
+    | ObstacleScan
     | NavigationUpdate
     | StatusReport
 )
@@ -94,7 +94,7 @@ class Encoder:
                 yield OutgoingMessage.on("drive", payload)
             case PlaceUpdate():
                 yield from self._map_pose(message, stamp_ns)
-            case ObstacleRing():
+            case ObstacleScan():
                 limits_m = 0.0, self._scan_range_m
                 scan = codec.scan_cdr(stamp_ns, "base_link", message.ranges_m, message.sigma_m, limits_m)
                 yield OutgoingMessage.on(SCAN, scan)

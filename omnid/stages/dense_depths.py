@@ -30,7 +30,7 @@ class DenseDepths:
     """Dense depths, computed when they are first asked for.
 
     Matching costs as much as the odometry of a pair, and few pairs need it: keyframes, and those that enter the map or
-    the obstacle ring. What was computed is remembered as long as the panoramas of the pair exist. Any thread may ask;
+    the obstacle scan. What was computed is remembered as long as the panoramas of the pair exist. Any thread may ask;
     while one computes, others that ask for the same pair wait for the result.
     """
 

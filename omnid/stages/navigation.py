@@ -34,15 +34,15 @@ from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import MapPosition, Situation, WheelState, refusal_to_drive
 from omnid.core.navigation.surroundings import Surroundings
 from omnid.errors import OmnidError
-from omnid.messages import NavigationPlan, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate, RequestAnswer
+from omnid.messages import NavigationPlan, NavigationUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate, RequestAnswer
 from omnid.stages.routes import Routes, refusal_while_teaching
 from omnid.transport.topics import MOST_OPEN
 
 Array = NDArray[np.float64]
-NavigationInput: TypeAlias = OdometryUpdate | PlaceUpdate | ObstacleRing | WheelState | NavigationCommand
+NavigationInput: TypeAlias = OdometryUpdate | PlaceUpdate | ObstacleScan | WheelState | NavigationCommand
 
 REPEAT_NS = NS_PER_S  # the state is given again after that time, while nothing changes
-RING_NS = 2_000_000_000  # older rings show nothing of now: the collision monitor then stops the base
+SCAN_NS = 2_000_000_000  # older scans show nothing of now: the collision monitor then stops the base
 OVERTAKEN = "a later request has ended it: ask again"
 FIRST_LEG_M = 1.0  # A path that begins farther from the robot is refused.
 
@@ -66,8 +66,8 @@ class NavigationStage:
         self._in_map: MapPosition | None = None
         self._tie: tuple[int, Array] | None = None  # id of the newest keyframe, and its pose (3,) in the map
         self._reset_ns = -1  # stamp of the pose at which odometry began again
-        self._ring: ObstacleRing | None = None
-        self._around: Surroundings | None = None  # by the newest ring that was used
+        self._scan: ObstacleScan | None = None
+        self._around: Surroundings | None = None  # by the newest scan that was used
         self._seq = 0
         # Ids of the newest request to halt, and of that which began the newest drive: a request that waited for a file
         # may come after later ones.
@@ -86,8 +86,8 @@ class NavigationStage:
             case PlaceUpdate():
                 self._place(message)
                 return None
-            case ObstacleRing():
-                self._ring = message
+            case ObstacleScan():
+                self._scan = message
                 return None
             case WheelState():
                 self._wheels = message
@@ -100,7 +100,7 @@ class NavigationStage:
         self._seq = odometry.seq
         if self._now is not None and self._now.resets != odometry.reset_counter:
             self._in_map, self._reset_ns = None, odometry.stamp_ns
-            self._ring = self._around = None
+            self._scan = self._around = None
         # 2. Put together where the base is and what is about it.
         T_odom_base, _, velocity, _ = of_base(odometry, self._T_base_rig)
         self._now = now = Situation(
@@ -122,13 +122,13 @@ class NavigationStage:
         return self._update(self._navigator.step(now))
 
     def _surroundings(self, now_ns: int) -> Surroundings | None:
-        """Return what the newest ring shows; None if it is too old, or nothing is under way."""
-        ring, before = self._ring, self._around
-        is_young = ring is not None and 0 <= now_ns - ring.stamp_ns <= RING_NS
-        if self._navigator.drive is None or ring is None or ring.grid is None or not is_young:
+        """Return what the newest scan shows; None if it is too old, or nothing is under way."""
+        scan, before = self._scan, self._around
+        is_young = scan is not None and 0 <= now_ns - scan.stamp_ns <= SCAN_NS
+        if self._navigator.drive is None or scan is None or scan.grid is None or not is_young:
             return None
-        if before is None or before.stamp_ns != ring.stamp_ns:
-            self._around = Surroundings(ring.grid, ring.moving, ring.stamp_ns, planar(ring.T_odom_base), before)
+        if before is None or before.stamp_ns != scan.stamp_ns:
+            self._around = Surroundings(scan.grid, scan.moving, scan.stamp_ns, planar(scan.T_odom_base), before)
         return self._around
 
     def _place(self, update: PlaceUpdate) -> None:

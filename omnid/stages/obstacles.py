@@ -1,4 +1,4 @@
-"""Obstacles of a run: the floor, the grid around the base at each pair, and the ring that is given out."""
+"""Obstacles of a run: the floor, the grid around the base at each pair, and the scan that is given out."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from calib import se3
 from calib.rig import Rig
 from calib.se2_arrays import planar, transform
 from omnid.config import ObstaclesConfig
-from omnid.core.control.collision_monitor import ControllerRing, MovingPoint
+from omnid.core.control.collision_monitor import ControllerScan, MovingPoint
 from omnid.core.floor import Floor, FloorEstimator
 from omnid.core.frames import of_base
 from omnid.core.mapping.range_scan import SECTORS, FreeRanges
 from omnid.core.nanoseconds import NS_PER_S
 from omnid.core.obstacles.moving_tracker import MovingTracker
 from omnid.core.obstacles.posterior import thin_things_m
-from omnid.core.obstacles.ray_rings import RayRings
-from omnid.core.obstacles.settings import RingSettings
+from omnid.core.obstacles.ray_scans import RayScans
+from omnid.core.obstacles.settings import ScanSettings
 from omnid.core.obstacles.unwatched import Unwatched
-from omnid.messages import DensePoints, ObstacleRing, OdometryUpdate, Panoramas
+from omnid.messages import DensePoints, ObstacleScan, OdometryUpdate, Panoramas
 from omnid.stages.dense_depths import DenseDepths
 from omnid.stages.geometry import Geometry
 from omnid.stages.mapping import STAMP_JITTER_NS
@@ -37,7 +37,7 @@ class CameraFloor:
     """The floor below the cameras; each stage has its own, fed with the depths that it uses: threads change nothing."""
 
     def __init__(self, rig: Rig, floor_m: float) -> None:
-        """floor_m: height of the floor in the base frame (obstacles.ring.floor_m)."""
+        """floor_m: height of the floor in the base frame (obstacles.scan.floor_m)."""
         self._T_base_rig = rig.T_base_rig
         self.view = se3.apply(rig.T_base_rig, rig.lower.viewpoint[None])[0]  # (3,) in the base frame
         height_m = rig.height_m(floor_m)
@@ -96,53 +96,53 @@ class CameraFloor:
         )
 
 
-# Ring of a pair while the floor is not known.
+# Scan of a pair while the floor is not known.
 UNKNOWN: Final = np.full(SECTORS, np.nan, np.float32)
 NOT_FREE: Final = np.zeros(SECTORS, np.float32)
 
 
-class PairRings:
-    """The obstacle grid of a run, the obstacles that move in it, and its ring at each pair that is added."""
+class PairScans:
+    """The obstacle grid of a run, the obstacles that move in it, and its scan at each pair that is added."""
 
-    def __init__(self, geometry: Geometry, settings: RingSettings) -> None:
+    def __init__(self, geometry: Geometry, settings: ScanSettings) -> None:
         self._geometry = geometry
-        self._of_floor: Floor | None = None  # for which the tables of the rings were made
-        self.rings = RayRings(geometry.cylinder, geometry.rig.baseline_m, settings)
+        self._of_floor: Floor | None = None  # for which the tables of the scans were made
+        self.scans = RayScans(geometry.cylinder, geometry.rig.baseline_m, settings)
         self._tracker = MovingTracker()
         self._unwatched = Unwatched(geometry.cylinder, geometry.rig.T_base_rig @ geometry.T_rig_rect)
         self._resets = 0
 
-    def add(self, odometry: OdometryUpdate, camera_floor: CameraFloor) -> ObstacleRing:
-        """Add the evidence of a pair; return the ring at it, which is unknown while the floor or the pose is."""
+    def add(self, odometry: OdometryUpdate, camera_floor: CameraFloor) -> ObstacleScan:
+        """Add the evidence of a pair; return the scan at it, which is unknown while the floor or the pose is."""
         # 1. Forget the grid and the tracks where odometry has begun again.
         if odometry.reset_counter != self._resets:
-            self.rings.grid.begin_again()
+            self.scans.grid.begin_again()
             self._tracker.clear()
             self._resets = odometry.reset_counter
-        panoramas, self.rings.belief = odometry.depth.panoramas, None
+        panoramas, self.scans.belief = odometry.depth.panoramas, None
         T_odom_base = of_base(odometry, self._geometry.rig.T_base_rig)[0]
         unwatched = self._unwatched.sectors(panoramas.tiles.unknown)
-        unknown = ObstacleRing(odometry.seq, odometry.stamp_ns, UNKNOWN, UNKNOWN, NOT_FREE, T_odom_base, (), unwatched)
+        unknown = ObstacleScan(odometry.seq, odometry.stamp_ns, UNKNOWN, UNKNOWN, NOT_FREE, T_odom_base, (), unwatched)
         if odometry.state is TrackingState.LOST:
             # The grid stays: it holds again once odometry recognises its landmarks.
             self._tracker.clear()
             return unknown
         if not self._has_tables(camera_floor, panoramas):
             return unknown
-        # 2. The ring by the images, without their dead and blind parts.
+        # 2. The scan by the images, without their dead and blind parts.
         lost = panoramas.tiles.lost_pixels(panoramas.visible.shape)
         pose = transform(planar(T_odom_base))
-        ring = self.rings.add(odometry.stamp_ns, pose, panoramas.lower, panoramas.upper, lost)
+        scan = self.scans.add(odometry.stamp_ns, pose, panoramas.lower, panoramas.upper, lost)
         # 3. The moving obstacles.
-        ring.arrivals.ranges_m[self._unwatched.directions(panoramas.tiles.unknown)] = np.nan
-        moving = self._tracker.update(odometry.stamp_ns, self.rings.grid.viewpoint(pose), ring.arrivals)
+        scan.arrivals.ranges_m[self._unwatched.directions(panoramas.tiles.unknown)] = np.nan
+        moving = self._tracker.update(odometry.stamp_ns, self.scans.grid.viewpoint(pose), scan.arrivals)
         # Nothing is said of directions in which the images show nothing to rely on.
         ranges_m, sigma_m, free_m = (
             np.where(unwatched, none, known)
-            for none, known in ((UNKNOWN, ring.ranges_m), (UNKNOWN, ring.sigma_m), (NOT_FREE, ring.free_m))
+            for none, known in ((UNKNOWN, scan.ranges_m), (UNKNOWN, scan.sigma_m), (NOT_FREE, scan.free_m))
         )
-        found = ranges_m, sigma_m, free_m, T_odom_base, moving, unwatched, ring.grid
-        return ObstacleRing(odometry.seq, odometry.stamp_ns, *found)
+        found = ranges_m, sigma_m, free_m, T_odom_base, moving, unwatched, scan.grid
+        return ObstacleScan(odometry.seq, odometry.stamp_ns, *found)
 
     @property
     def thin_m(self) -> FreeRanges:
@@ -150,8 +150,8 @@ class PairRings:
 
         Sectors are those of the rectified frame.
         """
-        belief = self.rings.belief
-        return np.full(SECTORS, np.inf, np.float32) if belief is None else thin_things_m(belief, self.rings.grid.risk)
+        belief = self.scans.belief
+        return np.full(SECTORS, np.inf, np.float32) if belief is None else thin_things_m(belief, self.scans.grid.risk)
 
     def _has_tables(self, camera_floor: CameraFloor, panoramas: Panoramas) -> bool:
         """Make the tables of the floor; return False without one."""
@@ -159,7 +159,7 @@ class PairRings:
         if floor is not None and floor is not self._of_floor:
             self._of_floor = floor
             T_rect_floor = self._geometry.rig.T_rect_rig @ se3.inverse(camera_floor.T_floor_rig(floor))
-            self.rings.set_floor(T_rect_floor, panoramas.visible)
+            self.scans.set_floor(T_rect_floor, panoramas.visible)
         return floor is not None
 
 
@@ -170,12 +170,12 @@ class Obstacles:
         """dense: computes the depth of a pair, from which a floor is found that the rig does not state."""
         self._dense = dense
         self._period_ns = NS_PER_S / config.rate_hz if config.rate_hz else 0.0
-        self.floor = CameraFloor(geometry.rig, config.ring.floor_m)
-        self._rings = PairRings(geometry, config.ring)
+        self.floor = CameraFloor(geometry.rig, config.scan.floor_m)
+        self._scans = PairScans(geometry, config.scan)
         self._last_ns: int | None = None
 
-    def process(self, odometry: OdometryUpdate) -> ObstacleRing | None:
-        """Return the ring at a pair, None where it is not due."""
+    def process(self, odometry: OdometryUpdate) -> ObstacleScan | None:
+        """Return the scan at a pair, None where it is not due."""
         if not self._is_due(odometry):
             return None
         self._last_ns = odometry.stamp_ns
@@ -183,31 +183,31 @@ class Obstacles:
         if self.floor.wants_points and odometry.state is not TrackingState.LOST:
             # As they were matched: the fit leaves out by itself what is no floor.
             self.floor.add(self._dense.points(odometry.depth.panoramas, odometry.depth.exposure))
-        # 2. The ring.
-        return self._rings.add(odometry, self.floor)
+        # 2. The scan.
+        return self._scans.add(odometry, self.floor)
 
     def _is_due(self, odometry: OdometryUpdate) -> bool:
-        """True if a pair is to give a ring."""
+        """True if a pair is to give a scan."""
         if self._last_ns is None:
             return True
         since_ns = odometry.stamp_ns - self._last_ns
         return since_ns < 0 or since_ns >= self._period_ns - STAMP_JITTER_NS
 
 
-def controller_ring(ring: ObstacleRing) -> ControllerRing:
-    """Return the part of a ring that the controller needs: ranges less their sigma, moving obstacles in base axes."""
-    nearest = np.where(np.isfinite(ring.ranges_m), ring.ranges_m - np.nan_to_num(ring.sigma_m), ring.ranges_m)
-    T = transform(planar(ring.T_odom_base))
+def controller_scan(scan: ObstacleScan) -> ControllerScan:
+    """Return the part of a scan that the controller needs: ranges less their sigma, moving obstacles in base axes."""
+    nearest = np.where(np.isfinite(scan.ranges_m), scan.ranges_m - np.nan_to_num(scan.sigma_m), scan.ranges_m)
+    T = transform(planar(scan.T_odom_base))
     moving = []
-    for obstacle in ring.moving:
+    for obstacle in scan.moving:
         x, y = (np.array([obstacle.x_m, obstacle.y_m]) - T[:2, 3]) @ T[:2, :2]
         vx, vy = np.array([obstacle.vx_mps, obstacle.vy_mps]) @ T[:2, :2]
         sigmas = (math.sqrt(np.diag(obstacle.covariance)[part].max()) for part in (slice(2), slice(2, 4)))
         moving.append(MovingPoint(float(x), float(y), float(vx), float(vy), obstacle.radius_m, *sigmas))
-    return ControllerRing(
-        ring.stamp_ns,
+    return ControllerScan(
+        scan.stamp_ns,
         tuple(np.maximum(nearest, 0.0).tolist()),
-        tuple(ring.free_m.tolist()),
+        tuple(scan.free_m.tolist()),
         tuple(moving),
-        tuple(ring.unwatched.tolist()) if ring.unwatched.any() else (),
+        tuple(scan.unwatched.tolist()) if scan.unwatched.any() else (),
     )

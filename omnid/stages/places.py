@@ -23,7 +23,7 @@ from omnid.core.mapping.range_scan import (
 )
 from omnid.core.nanoseconds import NS_PER_S
 from omnid.core.navigation.requests import NavigationCommand, TaughtRoute
-from omnid.core.obstacles.settings import RingSettings
+from omnid.core.obstacles.settings import ScanSettings
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.localisation import MapLocaliser, OdometryFrame
 from omnid.core.places.place_map import PlaceMap
@@ -31,7 +31,7 @@ from omnid.messages import (
     DensePoints,
     MapCopy,
     MapKeyframes,
-    ObstacleRing,
+    ObstacleScan,
     OdometryUpdate,
     PlaceUpdate,
     SaveMap,
@@ -39,7 +39,7 @@ from omnid.messages import (
 )
 from omnid.stages.dense_depths import DenseDepths
 from omnid.stages.geometry import Geometry
-from omnid.stages.obstacles import CameraFloor, PairRings
+from omnid.stages.obstacles import CameraFloor, PairScans
 from omnid.tracking_state import MapState, TrackingState
 from omnid.transport.topics import MOST_OPEN
 
@@ -74,9 +74,9 @@ class Places:
             geometry.model(config.odometry.noise_px), config.places.limits, places, localize_only=localize_only
         )
         self._T_rig_rect = geometry.T_rig_rect
-        self._ring = config.obstacles.ring
-        self._rings = PairRings(geometry, config.obstacles.ring)  # at keyframes
-        self.floor = CameraFloor(geometry.rig, config.obstacles.ring.floor_m)
+        self._limits = config.obstacles.scan
+        self._scans = PairScans(geometry, config.obstacles.scan)  # at keyframes
+        self.floor = CameraFloor(geometry.rig, config.obstacles.scan.floor_m)
         self._T_rect_rig = se3.inverse(self._T_rig_rect)
         self._to_rig = se3.adjoint(self._T_rig_rect)
         self.state = MapState.ODOMETRY_ONLY  # state of the newest pose
@@ -196,18 +196,18 @@ class Places:
 
     def _free(self, odometry: OdometryUpdate) -> FreeRanges:
         """Return the free ranges of a pair."""
-        ring = self._rings.add(odometry, self.floor)
-        return keyframe_free(ring, self._rings.thin_m, self.floor, self._T_rig_rect)
+        scan = self._scans.add(odometry, self.floor)
+        return keyframe_free(scan, self._scans.thin_m, self.floor, self._T_rig_rect)
 
     def _scan(self, depth: StereoDepth) -> RangeScan:
         """Return the range scan of a pair."""
         dense = self._dense.of(depth)
         self.floor.add(dense)
-        return keyframe_scan(dense, self.floor, self._T_rig_rect, self._ring)
+        return keyframe_scan(dense, self.floor, self._T_rig_rect, self._limits)
 
 
 def keyframe_scan(
-    depth: DensePoints, camera_floor: CameraFloor, T_rig_rect: Array, settings: RingSettings
+    depth: DensePoints, camera_floor: CameraFloor, T_rig_rect: Array, settings: ScanSettings
 ) -> RangeScan:
     """Return the ranges (SECTORS,) by azimuth in the rectified frame, turned level; all unknown without a floor."""
     floor = camera_floor.floor
@@ -222,15 +222,15 @@ def keyframe_scan(
     return np.where(np.isfinite(ranges), ranges, np.float32(np.nan))
 
 
-def keyframe_free(ring: ObstacleRing, thin_m: FreeRanges, camera_floor: CameraFloor, T_rig_rect: Array) -> FreeRanges:
-    """Return up to where the floor is free by the ring at a keyframe, (SECTORS,) as of its scan.
+def keyframe_free(scan: ObstacleScan, thin_m: FreeRanges, camera_floor: CameraFloor, T_rig_rect: Array) -> FreeRanges:
+    """Return the range up to which the obstacle scan at a keyframe is free, (SECTORS,) as its range scan.
 
     thin_m (SECTORS,): where something thin may begin to hide the floor, inf: nowhere; there they are negative.
     """
     floor = camera_floor.floor
     if floor is None:
         return np.zeros(SECTORS, np.float32)
-    free_m = seen_from(ring.free_m, _T_level_floor(camera_floor.T_floor_rig(floor) @ T_rig_rect))
+    free_m = seen_from(scan.free_m, _T_level_floor(camera_floor.T_floor_rig(floor) @ T_rig_rect))
     free_m = np.minimum(free_m, np.float32(MAX_RANGE_M))
     return np.where(np.isfinite(thin_m), -np.minimum(free_m, thin_m), free_m)
 

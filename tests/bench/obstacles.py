@@ -6,7 +6,7 @@ straight on, to turn towards the hazard (--turning), or to a goal; it ends there
 Each is a line of build/results/obstacles.jsonl; the command goes on where it ended as long as the commit is the same.
 
 With --open-loop FOLDER, pairs along the way are kept there with the truth, made by a base that nothing stops, and what
-today's ring calls free is compared with it (tests/bench/open_loop.py).
+today's scan calls free is compared with it (tests/bench/open_loop.py).
 """
 
 from __future__ import annotations
@@ -398,7 +398,7 @@ def main() -> None:
     parser.add_argument("--real", action="store_true", help="images of real lenses (real_lenses.py)")
     parser.add_argument("--photographs", action="store_true", help="on floors, walls and pictures (scikit-image's)")
     parser.add_argument("--jobs", type=int, default=1, help="drives at a time")
-    parser.add_argument("--open-loop", type=Path, metavar="FOLDER", help="keep pairs there, and judge today's ring")
+    parser.add_argument("--open-loop", type=Path, metavar="FOLDER", help="keep pairs there, and judge today's scan")
     parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE")
     arguments = parser.parse_args()
     lists = {"harmless": HARMLESS, "hazards": HAZARDS}
@@ -412,9 +412,9 @@ def main() -> None:
     ]
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of the processes that follow
     if arguments.open_loop:
-        from tests.bench.open_loop import judge_rings
+        from tests.bench.open_loop import judge_scans
 
-        judge_rings(wanted, arguments.open_loop, arguments.jobs)
+        judge_scans(wanted, arguments.open_loop, arguments.jobs)
         return
     here, drives = commit(), known_drives()
     missing = [planned for planned in wanted if str(planned) not in drives]

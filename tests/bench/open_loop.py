@@ -1,10 +1,10 @@
 """Stored pairs along the ways of worlds like buildings, with the truth: `tests.bench.obstacles --open-loop FOLDER`.
 
 Nothing stops the base: it drives on until it is 0.15 m from what is in the way. Each drive is a file of numpy, which
-any method can be tried on, and what today's ring told of it. Arrays by pair (N): lower, upper (N, H, W) uint8;
+any method can be tried on, and what today's scan told of it. Arrays by pair (N): lower, upper (N, H, W) uint8;
 stamps_ns; T_world_base (N, 4, 4), true; first_m (N, 360), the range from the base's origin in its sectors to the first
-thing that the base would touch, of the heights that it sweeps, or to where the floor falls; inf: none; ring_m, sigma_m,
-free_m (N, 360) of the ring, NaN where there was none. cells (2, D): cells of the grids of all pairs by their said
+thing that the base would touch, of the heights that it sweeps, or to where the floor falls; inf: none; scan_m, sigma_m,
+free_m (N, 360) of the scan, NaN where there was none. cells (2, D): cells of the grids of all pairs by their said
 probability of a thing, in steps of DECADES, and those of them that a thing is in. Of the world: T_base_rig (4, 4), as
 its file says; profile (P, 2), the heights z of the floor at places x; radius_m and height_m of the base.
 """
@@ -42,7 +42,7 @@ Array = NDArray[np.float64]
 EVERY: Final = 3  # pair that is stored
 LONGEST_M: Final = 4.0  # of the way that is stored
 NEAR_M: Final = 0.15  # from the outline to what is in the way, where a drive ends
-LOOK_M, LOOK_RAD = 3.0, np.radians(15.0)  # what counts of a ring
+LOOK_M, LOOK_RAD = 3.0, np.radians(15.0)  # what counts of a scan
 BEYOND_M: Final = 0.1
 DECADES: Final = (0.0, 3e-4, 1e-3, 1e-2, 0.1, 0.5, 0.9, 1.0)  # probabilities of a cell; none is below 1.2e-4
 
@@ -105,14 +105,14 @@ def stored(planned: Planned, folder: Path) -> Path:
     config = load_config(None, [*settings_for(planned), "controller.collision.check=false"])
     seconds = 3.0 + LONGEST_M / abs(planned.speed_mps)
     run = simulate(asked.world, robot, on, seconds=seconds, seed=planned.seed, config=config, tamper=kept_image)
-    rings = {ring.stamp_ns: ring for ring in run.rings}
+    scans = {scan.stamp_ns: scan for scan in run.scans}
     stamps = [stamp_ns for camera, stamp_ns in images if camera == "lower" and stamp_ns in kept]
     none, cells = np.full(SECTORS, np.nan), np.zeros((2, len(DECADES) - 1), np.intp)
-    for stamp_ns, ring in rings.items():
-        if ring.grid is not None and stamp_ns in kept:
+    for stamp_ns, scan in scans.items():
+        if scan.grid is not None and stamp_ns in kept:
             T_world_base, _, all_segments = kept[stamp_ns]
-            T_odom_world = transform(planar(ring.T_odom_base)) @ se3.inverse(transform(planar(T_world_base)))
-            cells += said_and_true(ring.grid, all_segments, T_odom_world)
+            T_odom_world = transform(planar(scan.T_odom_base)) @ se3.inverse(transform(planar(T_world_base)))
+            cells += said_and_true(scan.grid, all_segments, T_odom_world)
     folder.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(
         path,
@@ -121,9 +121,9 @@ def stored(planned: Planned, folder: Path) -> Path:
         stamps_ns=np.array(stamps, np.int64),
         T_world_base=np.array([kept[stamp_ns][0] for stamp_ns in stamps]),
         first_m=np.array([kept[stamp_ns][1] for stamp_ns in stamps], np.float32),
-        ring_m=np.array([rings[s].ranges_m if s in rings else none for s in stamps], np.float32),
-        sigma_m=np.array([rings[s].sigma_m if s in rings else none for s in stamps], np.float32),
-        free_m=np.array([rings[s].free_m if s in rings else none for s in stamps], np.float32),
+        scan_m=np.array([scans[s].ranges_m if s in scans else none for s in stamps], np.float32),
+        sigma_m=np.array([scans[s].sigma_m if s in scans else none for s in stamps], np.float32),
+        free_m=np.array([scans[s].free_m if s in scans else none for s in stamps], np.float32),
         cells=cells,
         T_base_rig=run.T_base_rig,
         profile=np.array(asked.world.ground.profile or [(0.0, 0.0)]),
@@ -134,7 +134,7 @@ def stored(planned: Planned, folder: Path) -> Path:
 
 
 def shares(path: Path, *, backwards: bool) -> tuple[int, float, float]:
-    """Return the number of rings, the share of 3 m ahead that they call free, and of rays that are falsely free."""
+    """Return the number of scans, the share of 3 m ahead that they call free, and of rays that are falsely free."""
     with np.load(path) as file:
         free_m, first_m = (np.asarray(file[name], float) for name in ("free_m", "first_m"))
     told = np.isfinite(free_m).all(axis=1)
@@ -147,12 +147,12 @@ def shares(path: Path, *, backwards: bool) -> tuple[int, float, float]:
 
 def add_scan_table(paths: Sequence[Path]) -> None:
     """Print and write the errors of ranges against the truth, by metre of it."""
-    names = "ring_m", "first_m", "sigma_m"
+    names = "scan_m", "first_m", "sigma_m"
     parts = []
     for path in paths:
         with np.load(path) as file:
             parts.append(np.array([file[name] for name in names], float).reshape(len(names), -1))
-    ring_m, first_m, sigma_m = np.concatenate(parts, axis=1)
+    scan_m, first_m, sigma_m = np.concatenate(parts, axis=1)
     columns = (
         Column("range", "m"),
         Column("ranges"),
@@ -160,11 +160,11 @@ def add_scan_table(paths: Sequence[Path]) -> None:
         Column("90 % of the magnitudes", "m", 3),
         Column("68 % of the magnitudes by sigma", "", 1),
     )
-    table = ResultTable("obstacles_scan", "Ranges of the ring against the truth", columns)
+    table = ResultTable("obstacles_scan", "Ranges of the scan against the truth", columns)
     for metre in range(math.ceil(np.nanmax(first_m, where=np.isfinite(first_m), initial=0.0))):
-        chosen = np.isfinite(ring_m) & (first_m >= metre) & (first_m < metre + 1)
+        chosen = np.isfinite(scan_m) & (first_m >= metre) & (first_m < metre + 1)
         if chosen.any():
-            error_m = ring_m[chosen] - first_m[chosen]
+            error_m = scan_m[chosen] - first_m[chosen]
             by_sigma = np.quantile(np.abs(error_m) / sigma_m[chosen], 0.68)
             most_m = np.quantile(np.abs(error_m), 0.9)
             table.add(f"{metre} to {metre + 1}", int(chosen.sum()), np.median(error_m), most_m, by_sigma)
@@ -179,15 +179,15 @@ def add_reliability_table(paths: Sequence[Path]) -> None:
         table.add(f"{low:g} to {high:g}", int(count), float(taken / max(count, 1)))
 
 
-def judge_rings(wanted: Sequence[Planned], folder: Path, jobs: int) -> None:
+def judge_scans(wanted: Sequence[Planned], folder: Path, jobs: int) -> None:
     """Make the files that are missing, and print a row for each world."""
     columns = (
         Column("world"),
-        Column("rings"),
+        Column("scans"),
         Column("free of what is free up to 3 m, within 15 degrees", "%", 0),
         Column("rays falsely free more than 0.1 m beyond the first thing", "%", 1),
     )
-    table = ResultTable("obstacles_open_loop", "The obstacle ring on stored pairs", columns)
+    table = ResultTable("obstacles_open_loop", "The obstacle scan on stored pairs", columns)
     make: Callable[[Planned, Path], Path] = stored
     paths = []
     with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:

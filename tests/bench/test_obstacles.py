@@ -46,12 +46,12 @@ def test_stored_pairs_have_the_range_of_the_first_thing(tmp_path: Path, monkeypa
     assert open_loop.stored(Planned("white_wall", 1, 0.3, 192), tmp_path) == path
 
 
-def test_ranges_of_the_ring_are_compared_with_the_truth_by_metre(
+def test_ranges_of_the_scan_are_compared_with_the_truth_by_metre(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("OMNID_RESULTS", str(tmp_path))
     first_m = np.full((3, 360), 1.5)
     first_m[:, :100] = np.inf
-    np.savez(tmp_path / "a.npz", ring_m=first_m - 0.04, first_m=first_m, sigma_m=np.full_like(first_m, 0.02))
+    np.savez(tmp_path / "a.npz", scan_m=first_m - 0.04, first_m=first_m, sigma_m=np.full_like(first_m, 0.02))
     open_loop.add_scan_table([tmp_path / "a.npz"])
     assert "| 1 to 2 | 780 | -0.040 | 0.040 | 2.0 |" in capsys.readouterr().out

@@ -214,7 +214,7 @@ def command_line(scene: Path, port: int, motor: Path | None, *words: object, mod
 def patient(*settings: str) -> tuple[str, ...]:
     """Return the words of these settings, and of those with which a robot on a busy machine, late with all, drives on.
 
-    Otherwise each late pose, tick or answer would be a fault, and faults disarm; each late ring of obstacles a stop.
+    Otherwise each late pose, tick or answer would be a fault, and faults disarm; each late scan of obstacles a stop.
     """
     late = (
         "controller.deadlines.pose_s=8",

@@ -19,7 +19,7 @@ from calib.rig import MountedCamera
 from omnid.formats.tum import Trajectory, read_tum
 from omnid.recordings.evaluation import evaluate
 from omnid.simulation.rendering.sensor import MountedSensor, Sensor
-from tests.omnid.stages.test_obstacles import rings_of
+from tests.omnid.stages.test_obstacles import scans_of
 from tests.replay.command import Command
 from tests.simulation import build, corridor, paths, render_grey, tum, write_log
 from tests.simulation.rigs import lens, lens_rig
@@ -87,14 +87,14 @@ def test_a_sector_of_bricks_half_of_which_are_first_seen_too_far_away(tmp_path: 
 
 def test_beside_a_sector_nothing_is_free(sector: Path) -> None:
     """Obstacles and scans know nothing of directions that the cameras do not see, from the first pair to the last."""
-    found = rings_of(sector).rings
+    found = scans_of(sector).scans
     assert len(found) > 10
     azimuths = np.rad2deg(np.pi * (2 * np.arange(360) + 1) / 360 - np.pi)
     aside = np.abs((azimuths + 173 + 180) % 360 - 180)
     beside, ahead = aside > 45 + 15, aside < 45 - 15
-    for ring in found:
-        assert np.isnan(ring.ranges_m[beside]).all()
-        assert (ring.free_m[beside] <= FOOTPRINT_M).all(), np.nanmax(ring.free_m[beside])
+    for scan in found:
+        assert np.isnan(scan.ranges_m[beside]).all()
+        assert (scan.free_m[beside] <= FOOTPRINT_M).all(), np.nanmax(scan.free_m[beside])
     assert (found[2].free_m[ahead] > 0.8).mean() > 0.5  # later it has left floor behind that it never saw
 
 

@@ -105,7 +105,7 @@ def test_record_holds_the_base_in_odom(omnid: Command, tmp_path: Path, scene: Pa
     assert cloud.header.frame_id == "odom"
     points = np.frombuffer(cloud.data, "<f4").reshape(-1, 4)[:, :3]
     np.testing.assert_allclose(points, se3.apply(T_base_rig, read_ply(ply).xyz.astype(float)), atol=1e-5)
-    standing = points[(points[:, 2] > 0.1) & (points[:, 2] < 1.7), :2]  # obstacles.ring.heights_m
+    standing = points[(points[:, 2] > 0.1) & (points[:, 2] < 1.7), :2]  # obstacles.scan.heights_m
     assert grid.frame == "map" and len(standing) > 100
     row, column = np.nonzero(grid.cells > 0)
     occupied = grid.corner + (np.column_stack([column, row]) + 0.5) * grid.cell_m

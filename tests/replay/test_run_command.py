@@ -67,7 +67,7 @@ def test_ends_where_the_cameras_are_exchanged(tmp_path: Path, scene: Path) -> No
     shutil.copy(scene / "rig.toml", tmp_path / "rig.toml")
     save(tmp_path / "log.mcap", exchanged)
     with closing(Base(tmp_path)) as base:
-        command = [*command_line(tmp_path, free_port(), base.port), "--set", "obstacles.ring.floor_m=-1.2"]
+        command = [*command_line(tmp_path, free_port(), base.port), "--set", "obstacles.scan.floor_m=-1.2"]
         done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
         assert not base.line.moved_since(0.0)
     # On a busy computer the motor may answer late meanwhile, which is a warning.
@@ -159,7 +159,7 @@ def test_signals_end_it_without_output_at_any_time(scene: Path, number: int) -> 
         "--set",
         f'bus.listen=["tcp/127.0.0.1:{port}"]',
         "--set",
-        "obstacles.ring.floor_m=-1.2",
+        "obstacles.scan.floor_m=-1.2",
     ]
     with started(command, port) as daemon:
         wait_until(lambda: answers(port), "the bus")  # opened after cameras and motor, before anything runs
@@ -251,7 +251,7 @@ def test_nohup_is_respected(scene: Path) -> None:
         "--set",
         f'bus.listen=["tcp/127.0.0.1:{port}"]',
         "--set",
-        "obstacles.ring.floor_m=-1.2",
+        "obstacles.scan.floor_m=-1.2",
     ]
     pipe = subprocess.PIPE
     with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe, text=True) as process:

@@ -17,7 +17,7 @@ from omnid.core.nanoseconds import S_PER_NS
 # Slower turns count as none; at 0.5 m/s an arc of 500 m, which errs by 4 mm in 2 m: enough.
 STRAIGHT_RADPS: Final = 1e-3
 TINY: Final = 1e-9  # Added to divisors, so that no division is by zero.
-MOST_MOTIONS: Final = 400  # remembered between a ring's images and now, because 2 s at the highest rate of ticks
+MOST_MOTIONS: Final = 400  # remembered between a scan's images and now, because 2 s at the highest rate of ticks
 
 
 class Outline(NamedTuple):

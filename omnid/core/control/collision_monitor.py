@@ -1,7 +1,7 @@
 """Collision monitor: the part of a motion that the control law is about to give after which the base can still stop.
 
 Passive safety (Macek, Vasquez, Fraichard, Siegwart 2009, "Towards safe vehicle navigation in dynamic urban scenarios"):
-whatever the base would reach, it must be at rest before. What the ring shows are kinds of one thing, points in the way:
+whatever the base would reach, it must be at rest before. What the scan shows are kinds of one thing, points in the way:
 obstacles, ends of the floor that was seen, parts of the images that show nothing, and moving obstacles where they will
 be. One test judges each kind: the outline with the distance to keep, on the side to which the base is commanded, along
 the commanded arc (as the collision monitor of nav2: Macenski et al. 2023); a motion that leads away is free. Plain
@@ -56,7 +56,7 @@ class CollisionSettings:
     ] = STOP
     stale: Annotated[
         Literal["stop", "slow", "ignore"],
-        "when nothing fresh is known of the way: the newest ring of obstacles is older than "
+        "when nothing fresh is known of the way: the newest scan of obstacles is older than "
         "stale_s, there is none, or its images are frozen, dark or dirty there",
     ] = STOP
     stale_s: Annotated[
@@ -68,7 +68,7 @@ class CollisionSettings:
 
 
 class MovingPoint(NamedTuple):
-    """A moving obstacle in the base frame of its ring, whose axes do not move; m, m/s."""
+    """A moving obstacle in the base frame of its scan, whose axes do not move; m, m/s."""
 
     x_m: float
     y_m: float
@@ -79,8 +79,8 @@ class MovingPoint(NamedTuple):
     sigma_mps: float = 0.0  # standard deviation of the velocity
 
 
-class ControllerRing(NamedTuple):
-    """The part of an obstacle ring that the monitor needs; sector k is about azimuth -pi + (k + 0.5) 2 pi / N."""
+class ControllerScan(NamedTuple):
+    """The part of an obstacle scan that the monitor needs; sector k is about azimuth -pi + (k + 0.5) 2 pi / N."""
 
     stamp_ns: int  # time of the capture
     ranges_m: tuple[float, ...]  # (N,) inf: free, NaN: unknown
@@ -89,13 +89,13 @@ class ControllerRing(NamedTuple):
     unwatched: tuple[bool, ...] = ()  # (N,) the images show nothing to rely on there; empty: they do everywhere
 
 
-# Floor that is seen so far is open; a ring may end nearer than that, and nothing is known beyond.
+# Floor that is seen so far is open; a scan may end nearer than that, and nothing is known beyond.
 FAR_M: Final = 5.0
 UNKNOWN_SECTORS: Final = 5  # consecutive ones that make a direction unknown; by trial on development seeds
 
 
 class UnknownEnd(NamedTuple):
-    """End of the floor that was seen in a sector of a ring."""
+    """End of the floor that was seen in a sector of a scan."""
 
     sector: int
     free_m: float
@@ -122,10 +122,10 @@ def unknown_ends(ranges_m: Sequence[float], free_m: Sequence[float], stop_m: flo
 
 LEAST_MPS: Final = 0.02  # slower than this the base stops; by trial on development seeds
 # A way that approaches an unknown region at its side by no more than this slope runs along it, because a correction of
-# the heading by three degrees does. The nearest corner is then 5 cm nearer after 1 m, before which newer rings judge.
+# the heading by three degrees does. The nearest corner is then 5 cm nearer after 1 m, before which newer scans judge.
 ALONG_SLOPE: Final = 0.05
 # A base that was stopped resumes in that direction only faster than this (half as fast as a slower command), because
-# free ranges change by a cell of 5 cm from ring to ring: at time_s of 1.5 s it is the speed for 9 cm.
+# free ranges change by a cell of 5 cm from scan to scan: at time_s of 1.5 s it is the speed for 9 cm.
 RESUME_MPS: Final = 0.06
 BESIDE_M: Final = 0.05  # Room beyond the sides' clearance, because corrections of the heading swing no corner farther.
 # Step of the prediction of moving obstacles, short because a person at 1.5 m/s moves 0.15 m in it.
@@ -144,9 +144,9 @@ MOVING: Final = "a moving obstacle comes into the way"
 UNKNOWN: Final = "the way ahead is unknown"
 UNWATCHED: Final = "the images of the way ahead are frozen, dark or dirty"
 UNSEEN: Final = "the images show nothing: they are frozen, dark or dirty"
-RING_STALE: Final = "no new obstacle ring"
+SCAN_STALE: Final = "no new obstacle scan"
 REMEDY: Final = "drive back or turn away, or clear the way"
-RING_REMEDY: Final = "check the cameras and the load; see controller.collision.stale"
+SCAN_REMEDY: Final = "check the cameras and the load; see controller.collision.stale"
 IMAGES_REMEDY: Final = "check light, mirrors and cameras, which the status names"
 
 
@@ -162,11 +162,11 @@ FREE: Final = Allowance(1.0, "")
 
 def remedy(reason: str) -> str:
     """Return what to do about a reason to slow down or stop."""
-    return {RING_STALE: RING_REMEDY, UNWATCHED: IMAGES_REMEDY, UNSEEN: IMAGES_REMEDY}.get(reason, REMEDY)
+    return {SCAN_STALE: SCAN_REMEDY, UNWATCHED: IMAGES_REMEDY, UNSEEN: IMAGES_REMEDY}.get(reason, REMEDY)
 
 
 class Kind(NamedTuple):
-    """Places of a ring that the base must not reach, in the frame of the ring."""
+    """Places of a scan that the base must not reach, in the frame of the scan."""
 
     reason: str
     policy: str  # STOP, SLOW or IGNORE
@@ -176,7 +176,7 @@ class Kind(NamedTuple):
 
 
 class CollisionMonitor:
-    """Follows rings and commands; not thread-safe. Memory and work of a tick are bounded by the ring's size."""
+    """Follows scans and commands; not thread-safe. Memory and work of a tick are bounded by the scan's size."""
 
     def __init__(self, settings: CollisionSettings, braking_mps2: float, turn_braking_radps2: float = math.inf) -> None:
         """braking_mps2, turn_braking_radps2: with which the base can brake its speed and its turn."""
@@ -186,7 +186,7 @@ class CollisionMonitor:
         # Room for turns where the images show nothing.
         self._around = self._outline.grown(settings.stop_m, settings.stop_m, settings.side_m + BESIDE_M)
         self._stamp_ns: int | None = None
-        self._kinds: tuple[Kind, ...] = ()  # what the newest ring shows
+        self._kinds: tuple[Kind, ...] = ()  # what the newest scan shows
         self._is_blind = False  # its images show nothing at all
         self._moving: tuple[MovingPoint, ...] = ()
         self._way = DrivenWay()
@@ -195,19 +195,19 @@ class CollisionMonitor:
         self.share = 1.0  # share of the motion that was allowed; 0 also where only a turn on the spot was
         self._stopped_mps = 0.0  # motion that the last step stopped
 
-    def set_ring(self, ring: ControllerRing) -> None:
-        """Replace the ring, unless it is older."""
-        if (self._stamp_ns is not None and ring.stamp_ns < self._stamp_ns) or not ring.ranges_m:
+    def set_scan(self, scan: ControllerScan) -> None:
+        """Replace the scan, unless it is older."""
+        if (self._stamp_ns is not None and scan.stamp_ns < self._stamp_ns) or not scan.ranges_m:
             return
-        self._stamp_ns, self._moving = ring.stamp_ns, ring.moving[:MOST_MOVING]
-        settings, count = self._settings, len(ring.ranges_m)
-        unwatched = ring.unwatched if len(ring.unwatched) == count else (False,) * count
+        self._stamp_ns, self._moving = scan.stamp_ns, scan.moving[:MOST_MOVING]
+        settings, count = self._settings, len(scan.ranges_m)
+        unwatched = scan.unwatched if len(scan.unwatched) == count else (False,) * count
         self._is_blind = all(unwatched)
         azimuths = ((k + 0.5) * (math.tau / count) - math.pi for k in range(count))
         directions = [(math.cos(azimuth), math.sin(azimuth)) for azimuth in azimuths]
-        seen = [(r * c, r * s) for r, (c, s) in zip(ring.ranges_m, directions, strict=True) if math.isfinite(r)]
+        seen = [(r * c, r * s) for r, (c, s) in zip(scan.ranges_m, directions, strict=True) if math.isfinite(r)]
         ends: dict[str, list[Point]] = {"unwatched": [], "gap": [], "end": []}
-        for k, free_m, is_gap in unknown_ends(ring.ranges_m, ring.free_m, settings.stop_m):
+        for k, free_m, is_gap in unknown_ends(scan.ranges_m, scan.free_m, settings.stop_m):
             c, s = directions[k]
             begins_m = self._around.edge_m(c, s) if unwatched[k] else max(free_m, self._outline.edge_m(c, s))
             ends["unwatched" if unwatched[k] else "gap" if is_gap else "end"].append((begins_m * c, begins_m * s))
@@ -250,15 +250,15 @@ class CollisionMonitor:
         settings, is_driving = self._settings, motion.velocity_mps != 0.0
         if not settings.check or not (is_driving or motion.yaw_rate_radps):
             return FREE
-        # 1. Without a recent ring nothing is known.
+        # 1. Without a recent scan nothing is known.
         age_s = math.inf if self._stamp_ns is None else (now_ns - self._stamp_ns) * S_PER_NS
         is_stale = not abs(age_s) <= settings.stale_s or not self._way.reaches_back_to(self._stamp_ns or 0)
         if settings.stale == IGNORE and is_stale:
             return FREE
         if settings.stale != IGNORE and (is_stale or self._is_blind):
             most_mps = 0.0 if settings.stale == STOP else settings.slow_mps
-            return self._capped(motion, most_mps, RING_STALE if is_stale else UNSEEN)
-        # 2. What the base has driven over since the ring's images is not passed as if it were free.
+            return self._capped(motion, most_mps, SCAN_STALE if is_stale else UNSEEN)
+        # 2. What the base has driven over since the scan's images is not passed as if it were free.
         moved = self._way.since(self._stamp_ns or now_ns, now_ns)
         for kind in self._kinds:
             over = is_driving and kind.policy == STOP

@@ -13,7 +13,7 @@ from typing import Annotated, Final, Literal, NamedTuple, TypeAlias
 from msgspec import Meta
 
 from omnid.core.control.arming import AUTOMATIC, MANUAL, Arming, ArmRequest
-from omnid.core.control.collision_monitor import CollisionMonitor, CollisionSettings, ControllerRing
+from omnid.core.control.collision_monitor import CollisionMonitor, CollisionSettings, ControllerScan
 from omnid.core.control.command_sources import CommandSelector, SourceSettings, TimedSetpoint
 from omnid.core.control.contacts import Contacts
 from omnid.core.control.heading_controller import (
@@ -111,7 +111,7 @@ class ControllerPose(NamedTuple):
 
 
 # What the daemon gives the controller; of each kind the newest counts.
-ControlInput: TypeAlias = ControllerPose | ControllerRing | TimedSetpoint | ArmRequest
+ControlInput: TypeAlias = ControllerPose | ControllerScan | TimedSetpoint | ArmRequest
 
 
 class ControlOutput(NamedTuple):
@@ -150,13 +150,13 @@ class ControlLaw:
         self.reason = IDLE  # reason of the last step
 
     def take(self, given: ControlInput) -> None:
-        """Take a pose, an obstacle ring, a setpoint, or a request to arm, which the next step answers."""
+        """Take a pose, an obstacle scan, a setpoint, or a request to arm, which the next step answers."""
         if isinstance(given, ControllerPose):
             self._pose_jumped |= self.pose is not None and self._jumps(self.pose, given)
             self.pose = given
             self.plausibility.add_pose(given.stamp_ns, given.state, given.motion, given.resets, given.witness)
-        elif isinstance(given, ControllerRing):
-            self.collision.set_ring(given)
+        elif isinstance(given, ControllerScan):
+            self.collision.set_scan(given)
         elif isinstance(given, TimedSetpoint):
             self.commands.offer(given)
         else:
@@ -203,7 +203,7 @@ class ControlLaw:
             self.motion, heading_rad = self._settings.limits.step(STOP, self.motion, dt_s), self.goal.stay()
         else:
             heading_rad = self._drive(command.setpoint, pose.heading_at(now_ns), now_ns, dt_s)
-        # 4. The collision monitor follows the motion, so that it knows where an older ring is now.
+        # 4. The collision monitor follows the motion, so that it knows where an older scan is now.
         self.collision.follow(now_ns, self.motion)
         return ControlOutput(self.motion, heading_rad, self.reason)
 

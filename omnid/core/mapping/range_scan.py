@@ -81,7 +81,7 @@ def fill_gaps(scan: RangeScan) -> RangeScan:
 
 
 class ScanLimits(NamedTuple):
-    """Limits of what is an obstacle, as the settings obstacles.ring give them."""
+    """Limits of what is an obstacle, as the settings obstacles.scan give them."""
 
     heights_m: tuple[float, float]  # range of heights above the floor
     tilt_rad: float  # sigma of the base's tilt against the floor

@@ -16,7 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.obstacles.grid import CELL_M, OCCUPIED, UNKNOWN, FloorGrid
+from omnid.core.obstacles.grid import OCCUPIED, UNKNOWN, FloorGrid
+from omnid.core.obstacles.grid_kernels import CELL_M
 from omnid.core.obstacles.moving_tracker import MovingObstacle
 
 Array = NDArray[np.float64]

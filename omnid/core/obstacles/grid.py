@@ -99,7 +99,7 @@ class FloorGrid:
         return row, column
 
 
-class GridRing(NamedTuple):
+class GridScan(NamedTuple):
     """Nearest things and free floor around the base, by sectors about its origin from -pi on."""
 
     ranges_m: Floats  # (SECTORS,) first thing; inf: floor up to the longest range; NaN: unknown
@@ -109,10 +109,10 @@ class GridRing(NamedTuple):
     grid: FloorGrid | None  # None: no floor is in view
 
 
-def unknown_ring() -> GridRing:
-    """Return the ring of a pair that shows no floor."""
+def unknown_scan() -> GridScan:
+    """Return the scan of a pair that shows no floor."""
     nan = np.full(SECTORS, np.nan, np.float32)
-    return GridRing(nan, nan, np.zeros(SECTORS, np.float32), Arrivals(nan, nan, np.zeros(SECTORS, bool)), None)
+    return GridScan(nan, nan, np.zeros(SECTORS, np.float32), Arrivals(nan, nan, np.zeros(SECTORS, bool)), None)
 
 
 class ObstacleGrid:
@@ -163,7 +163,7 @@ class ObstacleGrid:
         self._last: tuple[int, Array] | None = None  # stamp and place [m] of the pair before
         self._carry = 0.0
 
-    def update(self, stamp_ns: int, T_odom_base: Array, belief: RayBelief) -> GridRing:
+    def update(self, stamp_ns: int, T_odom_base: Array, belief: RayBelief) -> GridScan:
         """Add a pair, whose base has the planar pose T_odom_base (4, 4); return what is known."""
         p, place_m, yaw_rad = self._p, T_odom_base[:2, 3].copy(), float(se3.yaw(T_odom_base))
         is_first, passed_s, way_m = self._last is None, 0.0, math.inf
@@ -201,12 +201,12 @@ class ObstacleGrid:
         self._known[flooded > 0] = 0
         self._age_s += np.float32(passed_s)
         self._age_s[observed | past] = 0
-        # 5. Who has come, and the ring.
+        # 5. Who has come, and the scan.
         taken = self._taken()
         arrivals = self._arrivals(passed_s, yaw_rad, taken, in_view & (found[kernels.RATIO] > p.comes), flooded)
         self.odds[OWN, OWN], self._known[OWN, OWN], self._shown[OWN, OWN], taken[OWN, OWN] = p.arrival, 1, 0, 0
         grid = FloorGrid(corner_m, np.where(taken > 1, np.float32(np.nan), taken), self._age_s.copy())
-        return GridRing(*self._ways(taken, (place_m - corner_m) / CELL_M, yaw_rad), arrivals, grid)
+        return GridScan(*self._ways(taken, (place_m - corner_m) / CELL_M, yaw_rad), arrivals, grid)
 
     def is_floor(self, T_odom_base: Array, ranges_m: Array, directions: int) -> Flags:
         """Return the bins (N, directions) about the viewpoint, at ranges (N,), whose cells are floor by all pairs."""

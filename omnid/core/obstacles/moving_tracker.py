@@ -106,7 +106,7 @@ class Track:
 
 
 class MovingTracker:
-    """Moving obstacles of the rings of a drive; all memory is bounded."""
+    """Moving obstacles of the scans of a drive; all memory is bounded."""
 
     def __init__(self) -> None:
         self._tracks: list[Track] = []
@@ -166,7 +166,7 @@ def clusters(T_odom_eye: Array, arrivals: Arrivals) -> list[Cluster]:
 
 
 def surfaces(ranges_m: RangeScan, sigma_m: RangeScan) -> list[NDArray[np.intp]]:
-    """Return the sectors of each surface of a ring, in order around the turn; NaN: none."""
+    """Return the sectors of each surface of a scan, in order around the turn; NaN: none."""
     known = np.flatnonzero(np.isfinite(ranges_m))
     if not len(known):
         return []

@@ -1,4 +1,4 @@
-"""Settings of the obstacle ring."""
+"""Settings of the obstacle scan."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from omnid.errors import OmnidError
 
 
 @dataclass(frozen=True, slots=True)
-class RingSettings:
-    """Heights and ranges of obstacles of the ring, and of the range scans of keyframes."""
+class ScanSettings:
+    """Heights and ranges of obstacles of the scan, and of the range scans of keyframes."""
 
     floor_m: Annotated[
         float,
@@ -22,7 +22,7 @@ class RingSettings:
     heights_m: Annotated[
         tuple[Annotated[float, Meta(ge=0.02, le=10)], Annotated[float, Meta(ge=0.02, le=10)]],
         "heights above the floor between which a surface is an "
-        "obstacle, of the ring and of the map, m: lower ones are floor, higher ones "
+        "obstacle, of the scan and of the map, m: lower ones are floor, higher ones "
         "are passed below; nothing lower than 0.02 can be told from the floor",
     ] = (0.06, 1.7)
     # sigma of the tilt of the base against the floor: in the map the margin above the floor grows with the range
@@ -30,7 +30,7 @@ class RingSettings:
     max_range_m: Annotated[
         float,
         Meta(ge=1.5, le=50),
-        "longest range of an obstacle, m, 4.5 at most in the ring; "
+        "longest range of an obstacle, m, 4.5 at most in the scan; "
         "it must reach beyond the nearest floor that both cameras see",
     ] = 6.0
     min_points: int = 6  # matched points that make an obstacle of the map, within 3 degrees and the noise of the range
@@ -38,4 +38,4 @@ class RingSettings:
     def __post_init__(self) -> None:
         """Raise OmnidError unless the heights are in order."""
         if self.heights_m[0] >= self.heights_m[1]:
-            raise OmnidError(f"obstacles.ring.heights_m is {list(self.heights_m)}: expected the lower height first")
+            raise OmnidError(f"obstacles.scan.heights_m is {list(self.heights_m)}: expected the lower height first")

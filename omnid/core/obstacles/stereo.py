@@ -148,7 +148,7 @@ class Columns:
 def _rows_in_use(shown: Flags, horizon: int) -> tuple[int, int]:
     """Return the first row that is shown, and the last of the first run of such rows below the horizon.
 
-    Floor nearer than a ring that no direction shows, such as the reflection of a lens, is not used: what comes would be
+    Floor nearer than a scan that no direction shows, such as the reflection of a lens, is not used: what comes would be
     out of view on its way there, and so would the floor on which a base drives.
     """
     rows = np.flatnonzero(shown)

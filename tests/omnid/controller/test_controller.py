@@ -18,7 +18,7 @@ from omnid.controller.controller import Controller
 from omnid.controller.statistics import ControllerState
 from omnid.core.control import safety_rules
 from omnid.core.control.arming import AUTOMATIC
-from omnid.core.control.collision_monitor import BLOCKED, CollisionSettings, ControllerRing
+from omnid.core.control.collision_monitor import BLOCKED, CollisionSettings, ControllerScan
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControllerPose, ControllerSettings
 from omnid.core.control.heading_controller import Setpoint
@@ -295,7 +295,7 @@ def test_counts_commands_and_stops_before_obstacles() -> None:
     def drive(ranges: tuple[float, ...], ticks: int) -> ControllerState:
         for _ in range(ticks):
             bench.send_pose()
-            bench.controller.take(ControllerRing(bench.now_ns, ranges))
+            bench.controller.take(ControllerScan(bench.now_ns, ranges))
             bench.send_setpoint()
             bench.tick()
         return bench.controller.state

@@ -26,7 +26,7 @@ from omnid.controller.motor_settings import MotorSettings
 from omnid.controller.statistics import ControllerState
 from omnid.core.control import safety_rules
 from omnid.core.control.arming import AUTOMATIC, MANUAL, ArmRequest
-from omnid.core.control.collision_monitor import BLOCKED, REMEDY, RING_STALE, CollisionSettings, ControllerRing
+from omnid.core.control.collision_monitor import BLOCKED, REMEDY, SCAN_STALE, CollisionSettings, ControllerScan
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.contacts import BUMPER, CLIFF
 from omnid.core.control.control_law import ControllerPose, ControllerSettings
@@ -46,11 +46,11 @@ AHEAD = Setpoint(0.4, None, 0.0)
 DECELERATION_MPS2 = 0.8
 
 
-def start_message(port: object, arming: str = AUTOMATIC, *, has_rings: bool = False) -> ControllerStart:
+def start_message(port: object, arming: str = AUTOMATIC, *, has_scans: bool = False) -> ControllerStart:
     limits = VelocityLimits(deceleration_mps2=DECELERATION_MPS2)
     motor = MotorSettings(port=str(port), rate_hz=10.0, watchdog_ms=5000)
     settings = ControllerSettings(DEADLINES, limits, arming=arming, collision=CollisionSettings(stale_s=2.0))
-    settings = settings if has_rings else settings.without_obstacles
+    settings = settings if has_scans else settings.without_obstacles
     return ControllerStart(motor, settings, RealtimeSettings(lock_memory=False))
 
 
@@ -61,13 +61,13 @@ def pose(heading_rad: float = 0.0, rate_radps: float = 0.0) -> ControllerPose:
 class Robot:
     """A link, and a thread that reads the commands to the wheels."""
 
-    def __init__(self, base: Base, arming: str = AUTOMATIC, *, has_rings: bool = False) -> None:
+    def __init__(self, base: Base, arming: str = AUTOMATIC, *, has_scans: bool = False) -> None:
         self.base = base
         self.commands: list[VelocityCommand] = []
         self.lines: list[str] = []
         self.error: OmnidError | None = None
         self.stats = StageStats("motor")
-        start = start_message(base.port, arming, has_rings=has_rings)
+        start = start_message(base.port, arming, has_scans=has_scans)
         self.link = ControllerLink(start, self.stats, self.lines.append)
         self._thread = threading.Thread(target=self._read)
         self._thread.start()
@@ -86,10 +86,10 @@ class Robot:
         return True
 
     def drives(self, velocity_mps: float, ranges: tuple[float, ...] | None) -> bool:
-        """Send a command, and a ring unless there is none; True once the wheels turn in that direction."""
+        """Send a command, and a scan unless there is none; True once the wheels turn in that direction."""
         self.link.send(pose())
         if ranges is not None:
-            self.link.send(ControllerRing(time.monotonic_ns(), ranges))
+            self.link.send(ControllerScan(time.monotonic_ns(), ranges))
         self.link.send(TimedSetpoint(time.monotonic_ns(), Setpoint(velocity_mps)))
         return self.base.line.base.velocity_mps * velocity_mps > 0.01
 
@@ -110,9 +110,9 @@ class Robot:
 
 
 @contextlib.contextmanager
-def started(folder: Path, arming: str = AUTOMATIC, *, has_rings: bool = False) -> Iterator[Robot]:
+def started(folder: Path, arming: str = AUTOMATIC, *, has_scans: bool = False) -> Iterator[Robot]:
     with contextlib.closing(Base(folder)) as base:
-        robot = Robot(base, arming, has_rings=has_rings)
+        robot = Robot(base, arming, has_scans=has_scans)
         try:
             yield robot
         finally:
@@ -394,7 +394,7 @@ WALL = tuple(0.38 if 150 <= k < 210 else math.inf for k in range(360))  # ahead,
 @pytest.fixture
 def seeing(tmp_path: Path) -> Iterator[Robot]:
     """Yield a robot that looks for obstacles."""
-    with started(tmp_path, has_rings=True) as robot:
+    with started(tmp_path, has_scans=True) as robot:
         yield robot
 
 
@@ -409,16 +409,16 @@ def test_the_wheels_stop_before_an_obstacle_and_may_back_out(seeing: Robot) -> N
 
 
 @pytest.mark.hazard("H21")
-def test_the_wheels_stop_when_no_more_rings_come(seeing: Robot) -> None:
+def test_the_wheels_stop_when_no_more_scans_come(seeing: Robot) -> None:
     wait_until(lambda: seeing.drives(0.3, FREE), "motion")
     wait_until(lambda: seeing.stands(0.3, None), "the stop")
-    assert seeing.link.statistics.state.obstacle == RING_STALE
+    assert seeing.link.statistics.state.obstacle == SCAN_STALE
     wait_until(lambda: seeing.drives(0.3, FREE), "motion again, without arming")
 
 
 @pytest.mark.hazard("H21")
-def test_without_any_ring_the_wheels_never_turn(seeing: Robot) -> None:
+def test_without_any_scan_the_wheels_never_turn(seeing: Robot) -> None:
     begin_s = time.monotonic()
     wait_until(lambda: seeing.drives(0.3, None) or time.monotonic() > begin_s + 1.5, "1.5 s")
-    wait_until(lambda: seeing.drives(0.3, None) or seeing.link.statistics.state.obstacle == RING_STALE, "the reason")
+    wait_until(lambda: seeing.drives(0.3, None) or seeing.link.statistics.state.obstacle == SCAN_STALE, "the reason")
     assert seeing.base.line.base.velocity_mps == 0.0 and seeing.link.statistics.state.sent > 0

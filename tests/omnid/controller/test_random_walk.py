@@ -22,10 +22,10 @@ from omnid.core.control.collision_monitor import (
     BLOCKED,
     MOVING,
     NEAR,
-    RING_STALE,
+    SCAN_STALE,
     UNKNOWN,
     CollisionSettings,
-    ControllerRing,
+    ControllerScan,
     MovingPoint,
 )
 from omnid.core.control.command_sources import OPERATOR, PLANNER, TimedSetpoint
@@ -52,7 +52,7 @@ SENDERS = (("operator", "a"), ("operator", "a"), ("operator", "b"), ("planner", 
 TINY = 1e-9
 FAULTS = frozenset(rule.reason for rule in safety_rules.FAULTS)
 COLLISION = CollisionSettings()
-RINGS = ("free", "free", "free", "ahead", "behind", "unknown", "random", "person", "none")
+SCANS = ("free", "free", "free", "ahead", "behind", "unknown", "random", "person", "none")
 SLOW_SHARE = SETTINGS.trust.degraded_speed
 # Of some phases, what the motor controller reports and the poses show: its fault, volts, the speed of the wheels (None:
 # as commanded), the speed that is seen (NaN: unknown) and its standard deviation.
@@ -110,7 +110,7 @@ class Oracle:
     stopped: bool = False
     contact: bool = False  # a bumper or a cliff sensor reports one
     pose: ControllerPose | None = None
-    ring: ControllerRing | None = None
+    scan: ControllerScan | None = None
     requests: list[ArmRequest] = field(default_factory=list)  # since the last tick
     current: TimedSetpoint | None = None  # of the source and the sender that own the wheels
 
@@ -121,13 +121,13 @@ class Oracle:
             self.stop_latched = self.stop_latched or asked_ns > self.armed_ns
 
     def blocked(self, now_ns: int, ahead: bool) -> bool:
-        """True if the newest ring is too old, or was taken just now and has an obstacle at the base on that side."""
-        age_s = math.inf if self.ring is None else abs(now_ns - self.ring.stamp_ns) * 1e-9
-        if self.ring is None or age_s > COLLISION.stale_s:
+        """True if the newest scan is too old, or was taken just now and has an obstacle at the base on that side."""
+        age_s = math.inf if self.scan is None else abs(now_ns - self.scan.stamp_ns) * 1e-9
+        if self.scan is None or age_s > COLLISION.stale_s:
             return True
         edge_m = COLLISION.front_m if ahead else COLLISION.rear_m
-        middle = self.ring.ranges_m[180 if ahead else 0]  # within half a degree of the axis
-        # While the ring came the base can have moved by 0.4 m/s.
+        middle = self.scan.ranges_m[180 if ahead else 0]  # within half a degree of the axis
+        # While the scan came the base can have moved by 0.4 m/s.
         return edge_m < middle < edge_m + COLLISION.stop_m - 0.4 * age_s
 
     def take_command(self, command: TimedSetpoint) -> None:
@@ -185,7 +185,7 @@ class Walk:
         self.rng, self.now_ns = random.Random(seed), 10**12
         self.motor, self.oracle = RandomMotor(), Oracle(mode == AUTOMATIC)
         settings = replace(SETTINGS, arming=mode, collision=COLLISION)
-        self.rings = "free"  # kind of the rings of a phase
+        self.scans = "free"  # kind of the scans of a phase
         self.controller = Controller(self.motor, settings, PERIOD_S, clock_ns=lambda: self.now_ns)
         self.motion, self.last_ns = STOP, self.now_ns  # that the base follows, and since when
         self.calm, self.quiet = True, False  # phases with few faults and with many, without commands
@@ -207,7 +207,7 @@ class Walk:
                     self.witness = Witness(rng.choice(WITNESSES), "", rng.random() < 0.7)
                 self.motor.number, self.motor.battery_v, self.motor.wheels_mps, self.seen_mps, self.sigma_mps = oddity
             if tick % 25 == 0:
-                self.rings = self.rng.choice(RINGS)
+                self.scans = self.rng.choice(SCANS)
                 self.quiet, self.main = self.rng.random() < 0.1, self.rng.choice(SENDERS)
             self.events()
             if tick < AWAITED_TICKS:
@@ -225,8 +225,8 @@ class Walk:
         self.now_ns += rng.randrange(1, 1000)
         if self.chance(0.95, 0.7):
             self.send_pose()
-        if self.rings != "none" and self.chance(0.95, 0.7):
-            self.send_ring()
+        if self.scans != "none" and self.chance(0.95, 0.7):
+            self.send_scan()
         for _ in range(0 if self.quiet else rng.choice((0, 1, 1, 1, 2, 3))):
             self.send_command()
         if self.chance(0.01, 0.03):
@@ -276,9 +276,9 @@ class Walk:
         self.oracle.pose = pose
         self.controller.take(pose)
 
-    def send_ring(self) -> None:
-        """Send an obstacle ring of the phase, some of them late."""
-        rng, kind = self.rng, self.rings
+    def send_scan(self) -> None:
+        """Send an obstacle scan of the phase, some of them late."""
+        rng, kind = self.rng, self.scans
         ranges = [math.inf] * 360
         if kind in ("ahead", "behind"):
             middle, nearest_m = 180 if kind == "ahead" else 0, rng.uniform(0.27, 1.2)
@@ -290,15 +290,15 @@ class Walk:
             ranges = [rng.choice((math.inf, math.nan, rng.uniform(0.1, 3.0))) for _ in range(360)]
         moving = (MovingPoint(rng.uniform(0.4, 2), rng.uniform(-1, 1), rng.uniform(-1, 1), rng.uniform(-1, 1), 0.2),)
         age_s = rng.uniform(0.0, 0.15) if self.chance(0.99, 0.9) else rng.uniform(-1, 2)
-        ring = ControllerRing(
+        scan = ControllerScan(
             self.now_ns - round(age_s * 1e9),
             tuple(ranges[:360]),
             (rng.uniform(0, 2),) * 360,
             moving if kind == "person" else (),
         )
-        if self.oracle.ring is None or ring.stamp_ns >= self.oracle.ring.stamp_ns:
-            self.oracle.ring = ring
-        self.controller.take(ring)
+        if self.oracle.scan is None or scan.stamp_ns >= self.oracle.scan.stamp_ns:
+            self.oracle.scan = scan
+        self.controller.take(scan)
 
     def send_command(self) -> None:
         rng = self.rng
@@ -340,7 +340,7 @@ class Walk:
         if abs(now.yaw_rate_radps) < TINY and abs(self.motion.yaw_rate_radps) < TINY and now != STOP:
             assert not self.oracle.blocked(self.now_ns, now.velocity_mps > 0) or nearer(
                 self.motion.velocity_mps, now.velocity_mps
-            ), (self.motion, now, state, self.oracle.ring)
+            ), (self.motion, now, state, self.oracle.scan)
         if now != STOP and permitted:
             self.seen["driven"] += 1
             self.seen[f"driven by {permitted.source}"] += 1
@@ -398,7 +398,7 @@ def walk(seed: int, mode: str, ticks: int) -> None:
     reasons = {rule.reason for rule in safety_rules.RULES} - {safety_rules.ENDS, safety_rules.NO_POSE}
     if mode == AUTOMATIC:
         reasons -= {safety_rules.NOT_ARMED}
-    reasons |= {BLOCKED, MOVING, NEAR, RING_STALE, UNKNOWN}
+    reasons |= {BLOCKED, MOVING, NEAR, SCAN_STALE, UNKNOWN}
     assert reasons <= set(seen), f"not met: {reasons - set(seen)}"
     assert seen["driven"] > 0.1 * ticks and seen["driven by planner"] > 0, seen
 

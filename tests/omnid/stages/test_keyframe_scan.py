@@ -9,8 +9,8 @@ import pytest
 
 from calib import se3
 from omnid.core.mapping.range_scan import SECTORS, azimuths
-from omnid.core.obstacles.settings import RingSettings
-from omnid.messages import DensePoints, ObstacleRing
+from omnid.core.obstacles.settings import ScanSettings
+from omnid.messages import DensePoints, ObstacleScan
 from omnid.stages.obstacles import CameraFloor
 from omnid.stages.places import keyframe_free, keyframe_scan
 from tests.omnid.core.test_floor import HEIGHT_M, plane, walls
@@ -42,7 +42,7 @@ def test_a_low_box_before_a_wall_is_the_nearest_obstacle(height_m: float, tilt_d
     rig = replace(make_rig(), T_base_rig=stated @ se3.inverse(tilt) if height_m else np.eye(4))
     camera_floor, seen = CameraFloor(rig, 0.0), depth(tilt)
     camera_floor.add(seen)
-    scan = keyframe_scan(seen, camera_floor, np.eye(4), RingSettings())
+    scan = keyframe_scan(seen, camera_floor, np.eye(4), ScanSettings())
     np.testing.assert_allclose(scan[AHEAD], BOX_M, atol=0.08)
     np.testing.assert_allclose(scan[np.abs(azimuths()) > 0.5], WALL_M, atol=0.15)
     assert bool(camera_floor.summary()) != bool(height_m)
@@ -54,8 +54,8 @@ def test_free_floor_ends_at_what_is_narrow_and_is_negative_there(height_m: float
     unknown = np.full(SECTORS, np.nan, np.float32)
     free_m, narrow_m = np.full(SECTORS, 2.0, np.float32), np.full(SECTORS, np.inf, np.float32)
     narrow_m[[1, 3]] = 1.5, 3.0
-    ring = ObstacleRing(0, 0, unknown, unknown, free_m, np.eye(4), (), unwatched=())
-    found = keyframe_free(ring, narrow_m, CameraFloor(replace(make_rig(), T_base_rig=stated), 0.0), np.eye(4))
+    scan = ObstacleScan(0, 0, unknown, unknown, free_m, np.eye(4), (), unwatched=())
+    found = keyframe_free(scan, narrow_m, CameraFloor(replace(make_rig(), T_base_rig=stated), 0.0), np.eye(4))
     expected = [2.0, -1.5, 2.0, -2.0, 2.0] if height_m else [0.0] * 5
     np.testing.assert_allclose(found[:5], expected, atol=1e-3)
 
@@ -63,5 +63,5 @@ def test_free_floor_ends_at_what_is_narrow_and_is_negative_there(height_m: float
 def test_without_a_floor_nothing_is_known_and_the_summary_names_it() -> None:
     camera_floor, seen = CameraFloor(make_rig(), 0.0), depth(np.eye(4), with_floor=False)
     camera_floor.add(seen)
-    assert np.isnan(keyframe_scan(seen, camera_floor, np.eye(4), RingSettings())).all()
+    assert np.isnan(keyframe_scan(seen, camera_floor, np.eye(4), ScanSettings())).all()
     assert "call nothing free" in camera_floor.summary()

@@ -28,7 +28,7 @@ from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import WheelState
 from omnid.core.obstacles.moving_tracker import MovingObstacle
 from omnid.formats.route_file import RouteFolder
-from omnid.messages import MapKeyframes, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
+from omnid.messages import MapKeyframes, NavigationUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate
 from omnid.navigation_state import NavigationState
 from omnid.runs.route_files import RouteFiles
 from omnid.stages.navigation import NavigationStage
@@ -128,9 +128,9 @@ class Robot:
     def see(
         self, ranges: RangeScan, free: RangeScan, moving: tuple[MovingObstacle, ...] = (), *, age_ns: int = 0
     ) -> None:
-        """Send a ring from the origin."""
+        """Send a scan from the origin."""
         grid, stamp_ns = Floor().grid(np.zeros(3), ranges, np.minimum(free, 6.0)), self.seq * PERIOD_NS - age_ns
-        self.stage.process(ObstacleRing(1, stamp_ns, ranges, ranges, free, np.eye(4), moving, grid=grid))
+        self.stage.process(ObstacleScan(1, stamp_ns, ranges, ranges, free, np.eye(4), moving, grid=grid))
 
     def run(self, periods: int = 600) -> NavigationUpdate:
         """Advance until the drive has ended."""
@@ -191,7 +191,7 @@ def test_cancel_is_a_stop_at_once(tmp_path: Path) -> None:
     assert update.setpoint is not None and update.setpoint.velocity_mps == 0.0
 
 
-def test_a_ring_makes_it_wait_and_an_old_one_does_not(tmp_path: Path) -> None:
+def test_a_scan_makes_it_wait_and_an_old_one_does_not(tmp_path: Path) -> None:
     for age_ns, expected in ((0, NavigationState.BLOCKED), (3_000_000_000, NavigationState.DRIVING)):
         robot = Robot(tmp_path)
         robot.seq = 40

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from calib.se2_arrays import composed, transform
 from omnid.core.control.arming import MANUAL, ArmRequest
-from omnid.core.control.collision_monitor import CollisionSettings, ControllerRing
+from omnid.core.control.collision_monitor import CollisionSettings, ControllerScan
 from omnid.core.control.command_sources import OPERATOR, PLANNER, TimedSetpoint
 from omnid.core.control.control_law import ControlLaw, ControllerPose, ControllerSettings
 from omnid.core.control.heading_controller import Setpoint
@@ -36,7 +36,7 @@ from omnid.core.navigation.requests import (
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.obstacles.moving_tracker import MovingObstacle
 from omnid.formats.route_file import RouteFolder
-from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
+from omnid.messages import NavigationUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate
 from omnid.navigation_state import NavigationState
 from omnid.runs.route_files import RouteFiles
 from omnid.stages.navigation import NavigationStage
@@ -90,7 +90,7 @@ class Walk:
                 self.kind = rng.choice(("free",) * 5 + ("box", "wall", "person", "stale"))
                 self.operates, self.silent = rng.random() < 0.1, rng.random() < 0.05
                 self.resets += rng.random() < 0.03
-            self.send_ring()
+            self.send_scan()
             self.events()
             self.send_pose()
             for _ in range(TICKS_A_POSE):
@@ -195,7 +195,7 @@ class Walk:
             )
         )
 
-    def send_ring(self) -> None:
+    def send_scan(self) -> None:
         """Send what stands around the base, in a stale phase nothing."""
         if self.kind == "stale":
             return
@@ -209,11 +209,11 @@ class Walk:
                     *to[:2].tolist(), self.rng.uniform(-1, 1), self.rng.uniform(-1, 1), np.eye(4) * 0.01, 0.2
                 ),
             )
-        self.law.take(ControllerRing(self.now_ns, tuple(ranges.tolist())))
+        self.law.take(ControllerScan(self.now_ns, tuple(ranges.tolist())))
         self.ringed_s = self.t_s
         grid, sigma_m = Floor(all_seen=True).grid(self.pose, ranges), np.full(360, 0.01, np.float32)
         found = ranges, sigma_m, ranges, transform(self.pose), moving
-        self.stage.process(ObstacleRing(self.seq, self.now_ns, *found, grid=grid))
+        self.stage.process(ObstacleScan(self.seq, self.now_ns, *found, grid=grid))
 
     def tick(self) -> None:
         """Tick, and hold the motion against the oracle."""

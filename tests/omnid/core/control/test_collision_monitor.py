@@ -1,4 +1,4 @@
-"""The collision monitor: polygons, time to collision, unknown directions, old rings, moving obstacles."""
+"""The collision monitor: polygons, time to collision, unknown directions, old scans, moving obstacles."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from omnid.core.control.collision_monitor import (
     UNKNOWN_SECTORS,
     CollisionMonitor,
     CollisionSettings,
-    ControllerRing,
+    ControllerScan,
     MovingPoint,
     unknown_ends,
 )
@@ -22,7 +22,7 @@ from omnid.core.control.heading_controller import Twist
 
 S = 1_000_000_000
 SETTINGS = CollisionSettings()
-FREE_RING = (math.inf,) * 360
+FREE_SCAN = (math.inf,) * 360
 AHEAD = Twist(0.5)
 
 
@@ -32,7 +32,7 @@ def sector(azimuth_deg: float) -> int:
 
 
 def with_points(*points: tuple[float, float], rest: float = math.inf) -> tuple[float, ...]:
-    """Return the ranges of a ring with obstacles at points, 3 degrees wide."""
+    """Return the ranges of a scan with obstacles at points, 3 degrees wide."""
     ranges = [rest] * 360
     for x, y in points:
         for shift in (-1, 0, 1):
@@ -42,7 +42,7 @@ def with_points(*points: tuple[float, float], rest: float = math.inf) -> tuple[f
 
 
 def with_unknown(low_deg: float, high_deg: float, rest: float = math.inf) -> tuple[float, ...]:
-    """Return the ranges of a ring of which a part is unknown."""
+    """Return the ranges of a scan of which a part is unknown."""
     return tuple(math.nan if low_deg <= k - 179.5 <= high_deg else rest for k in range(360))
 
 
@@ -56,16 +56,16 @@ def after(
     age_s: float = 0.1,
     unwatched: tuple[bool, ...] = (),
 ) -> tuple[Twist, str]:
-    """Return the allowed motion and the reason, before a new ring."""
+    """Return the allowed motion and the reason, before a new scan."""
     monitor = CollisionMonitor(settings, 1.5)
-    monitor.set_ring(ControllerRing(10 * S, ranges, free, moving, unwatched))
+    monitor.set_scan(ControllerScan(10 * S, ranges, free, moving, unwatched))
     allowed = monitor.step(10 * S + round(age_s * S), motion)
     return allowed, monitor.reason
 
 
 def test_free_is_free() -> None:
     for motion in (AHEAD, Twist(-0.5), Twist(0.0, 1.0), Twist(0.3, -0.8)):
-        assert after(FREE_RING, motion) == (motion, "")
+        assert after(FREE_SCAN, motion) == (motion, "")
 
 
 @pytest.mark.hazard("H16")
@@ -88,11 +88,11 @@ def test_the_speed_is_the_distance_by_the_time_to_collision(distance_m: float) -
     )
 
 
-def test_a_stopped_base_does_not_creep_on_when_the_ring_changes_by_a_cell() -> None:
+def test_a_stopped_base_does_not_creep_on_when_the_scan_changes_by_a_cell() -> None:
     monitor = CollisionMonitor(replace(SETTINGS, slow_m=0.0), 1.5)
     speeds, reasons = [], []
     for n, distance_m in enumerate((0.5, 0.44, 0.41, 0.46, 0.41, 0.46, 0.6, 0.46)):
-        monitor.set_ring(ControllerRing((10 + n) * S, with_points((distance_m, 0.0))))
+        monitor.set_scan(ControllerScan((10 + n) * S, with_points((distance_m, 0.0))))
         speeds.append(monitor.step((10 + n) * S, AHEAD).velocity_mps)
         reasons.append(monitor.reason)
     assert [speed > 0 for speed in speeds] == [True, True, False, False, False, False, True, True]
@@ -109,14 +109,14 @@ def test_a_stopped_base_obeys_another_direction_and_a_slow_command() -> None:
         (0.405, AHEAD, False),
         (0.44, Twist(-0.4), True),
     ):
-        monitor.set_ring(ControllerRing(10 * S, with_points((distance_m, 0.0))))
+        monitor.set_scan(ControllerScan(10 * S, with_points((distance_m, 0.0))))
         assert (monitor.step(10 * S, motion).velocity_mps != 0) == moves
 
 
-def test_a_base_that_stands_needs_no_ring() -> None:
+def test_a_base_that_stands_needs_no_scan() -> None:
     monitor = CollisionMonitor(SETTINGS, 1.5)
     assert (monitor.step(S, Twist()), monitor.reason) == (Twist(), "")
-    assert (monitor.step(S, Twist(1.0)), monitor.reason) == (Twist(), monitor_module.RING_STALE)
+    assert (monitor.step(S, Twist(1.0)), monitor.reason) == (Twist(), monitor_module.SCAN_STALE)
 
 
 @pytest.mark.hazard("H16")
@@ -160,12 +160,12 @@ def test_a_long_base_turns_on_the_spot_as_far_as_floor_was_seen_beside_it() -> N
 
 def test_where_a_base_may_not_drive_it_may_turn_to_a_heading() -> None:
     monitor, arc = CollisionMonitor(SETTINGS, 1.5), Twist(0.3, -0.5)
-    monitor.set_ring(ControllerRing(10 * S, with_points((0.38, 0.0))))
+    monitor.set_scan(ControllerScan(10 * S, with_points((0.38, 0.0))))
     assert monitor.step(10 * S, arc) == Twist()
     assert monitor.step(10 * S, arc, to_heading=True) == Twist(0.0, -0.5)
     assert (monitor.share, monitor.reason) == (0.0, monitor_module.BLOCKED)
-    # A corner that would touch something keeps it from turning, as ever, and so does a ring that is stale.
-    monitor.set_ring(ControllerRing(11 * S, with_points((0.38, 0.0), (0.27, 0.2))))
+    # A corner that would touch something keeps it from turning, as ever, and so does a scan that is stale.
+    monitor.set_scan(ControllerScan(11 * S, with_points((0.38, 0.0), (0.27, 0.2))))
     assert abs(monitor.step(11 * S, arc, to_heading=True).yaw_rate_radps) < 0.3
     assert monitor.step(15 * S, arc, to_heading=True) == Twist()
 
@@ -224,7 +224,7 @@ def test_a_base_drives_along_what_is_unknown_beside_it(yaw_rate_radps: float, go
 @pytest.mark.hazard("H22")
 @pytest.mark.parametrize("policy", ["stop", "slow", "ignore"])
 @pytest.mark.parametrize("unknown", ["stop", "ignore"])
-def test_towards_dead_and_blind_parts_of_the_images_counts_as_without_a_fresh_ring(policy: str, unknown: str) -> None:
+def test_towards_dead_and_blind_parts_of_the_images_counts_as_without_a_fresh_scan(policy: str, unknown: str) -> None:
     """The setting for them is `stale`, not `unknown`: something may have come there."""
     ranges, settings = with_unknown(-30, 30), replace(SETTINGS, stale=policy, unknown=unknown)
     unwatched = tuple(math.isnan(range_m) for range_m in ranges)
@@ -243,17 +243,17 @@ def test_in_the_dark_the_base_does_not_even_turn() -> None:
     assert after(ranges, turn) == (turn, "")
     assert after(ranges, turn, unwatched=(True,) * 360) == (Twist(), monitor_module.UNSEEN)
     assert monitor_module.remedy(monitor_module.UNSEEN) == monitor_module.IMAGES_REMEDY
-    assert monitor_module.remedy(monitor_module.RING_STALE) == monitor_module.RING_REMEDY
+    assert monitor_module.remedy(monitor_module.SCAN_STALE) == monitor_module.SCAN_REMEDY
     assert monitor_module.remedy(monitor_module.BLOCKED) == monitor_module.REMEDY
 
 
 @pytest.mark.hazard("H21")
 @pytest.mark.parametrize(("stale", "expected_mps"), [("stop", 0.0), ("slow", SETTINGS.slow_mps), ("ignore", 0.5)])
-def test_a_stale_ring_and_a_missing_one_stop_the_base(stale: str, expected_mps: float) -> None:
+def test_a_stale_scan_and_a_missing_one_stop_the_base(stale: str, expected_mps: float) -> None:
     settings = replace(SETTINGS, stale=stale)
-    allowed, reason = after(FREE_RING, settings=settings, age_s=settings.stale_s + 0.01)
+    allowed, reason = after(FREE_SCAN, settings=settings, age_s=settings.stale_s + 0.01)
     assert allowed.velocity_mps == pytest.approx(expected_mps)
-    assert reason == ("" if stale == "ignore" else monitor_module.RING_STALE)
+    assert reason == ("" if stale == "ignore" else monitor_module.SCAN_STALE)
     missing = CollisionMonitor(settings, 1.5)
     assert missing.step(S, AHEAD).velocity_mps == pytest.approx(expected_mps)
 
@@ -261,13 +261,13 @@ def test_a_stale_ring_and_a_missing_one_stop_the_base(stale: str, expected_mps: 
 @pytest.mark.hazard("H20")
 @pytest.mark.parametrize("age_s", [0.1, 0.2, 0.3, 0.4, 0.5])
 @pytest.mark.parametrize("speed_mps", [0.6, -0.6, 1.5])
-def test_an_older_ring_makes_the_base_no_freer(age_s: float, speed_mps: float) -> None:
+def test_an_older_scan_makes_the_base_no_freer(age_s: float, speed_mps: float) -> None:
     """The end of the floor that was in front of the base is inside its outline by now, or behind it."""
     nothing_ahead = tuple(0.0 if abs(abs(k - 179.5) - 180 * (speed_mps < 0)) < 60 else 6.0 for k in range(360))
     ranges = tuple(math.nan if free == 0.0 else math.inf for free in nothing_ahead)
     for unwatched in ((), tuple(free == 0.0 for free in nothing_ahead)):
         monitor = CollisionMonitor(SETTINGS, 1.5)
-        monitor.set_ring(ControllerRing(10 * S, ranges, nothing_ahead, unwatched=unwatched))
+        monitor.set_scan(ControllerScan(10 * S, ranges, nothing_ahead, unwatched=unwatched))
         for tick in range(round(20 * age_s)):
             monitor.follow(10 * S + tick * S // 20, Twist(speed_mps))
         now_ns = 10 * S + round(age_s * S)
@@ -277,14 +277,14 @@ def test_an_older_ring_makes_the_base_no_freer(age_s: float, speed_mps: float) -
 
 
 @pytest.mark.hazard("H20")
-def test_a_ring_from_before_all_motions_that_are_remembered_is_stale() -> None:
+def test_a_scan_from_before_all_motions_that_are_remembered_is_stale() -> None:
     monitor = CollisionMonitor(replace(SETTINGS, stale_s=10.0), 1.5)
-    monitor.set_ring(ControllerRing(10 * S, FREE_RING))
+    monitor.set_scan(ControllerScan(10 * S, FREE_SCAN))
     for tick in range(MOST_MOTIONS + 1):
         assert monitor.step(10 * S + tick * S // 200, Twist(0.2)) == Twist(0.2)
         monitor.follow(10 * S + tick * S // 200, Twist(0.2))
     assert monitor.step(12 * S + S // 100, Twist(0.2)) == Twist()
-    assert monitor.reason == monitor_module.RING_STALE
+    assert monitor.reason == monitor_module.SCAN_STALE
 
 
 def test_is_off_when_it_is_off() -> None:
@@ -295,21 +295,21 @@ def test_is_off_when_it_is_off() -> None:
 @pytest.mark.hazard("H17")
 def test_a_person_who_comes_from_the_side_stops_the_base_and_one_who_leaves_does_not() -> None:
     crossing = MovingPoint(0.9, 0.9, 0.0, -1.0, 0.25)
-    allowed, reason = after(FREE_RING, moving=(crossing,))
+    allowed, reason = after(FREE_SCAN, moving=(crossing,))
     assert allowed.velocity_mps < 0.35 and reason == monitor_module.MOVING
-    assert after(FREE_RING, moving=(crossing._replace(y_m=1.8, vy_mps=1.0),)) == (AHEAD, "")
+    assert after(FREE_SCAN, moving=(crossing._replace(y_m=1.8, vy_mps=1.0),)) == (AHEAD, "")
     near = MovingPoint(0.9, 0.0, -1.0, 0.0, 0.25)
-    assert after(FREE_RING, moving=(near,)) == (Twist(), monitor_module.MOVING)
+    assert after(FREE_SCAN, moving=(near,)) == (Twist(), monitor_module.MOVING)
 
 
 @pytest.mark.hazard("H17")
 def test_a_new_one_slows_the_base_down_where_it_may_go() -> None:
     """Seen twice, it seems to walk beside the way; three looks make the sigma smaller than 0.4 m/s."""
     new = MovingPoint(1.0, 1.6, 0.0, -0.1, 0.2, 0.1, 0.6)
-    allowed, reason = after(FREE_RING, moving=(new,))
+    allowed, reason = after(FREE_SCAN, moving=(new,))
     assert allowed.velocity_mps == pytest.approx(0.4) and reason == monitor_module.MOVING
-    assert after(FREE_RING, moving=(new._replace(sigma_mps=0.3),)) == (AHEAD, "")
-    assert after(FREE_RING, moving=(new._replace(y_m=3.0),)) == (AHEAD, "")
+    assert after(FREE_SCAN, moving=(new._replace(sigma_mps=0.3),)) == (AHEAD, "")
+    assert after(FREE_SCAN, moving=(new._replace(y_m=3.0),)) == (AHEAD, "")
 
 
 def test_never_gives_more_than_was_asked_nor_another_direction() -> None:
@@ -334,10 +334,10 @@ def test_never_gives_more_than_was_asked_nor_another_direction() -> None:
 
 
 @pytest.mark.parametrize("stamp_ns", [11 * S, 10**6 * S, math.nan])
-def test_a_ring_of_the_future_or_of_no_time_is_stale(stamp_ns: float) -> None:
+def test_a_scan_of_the_future_or_of_no_time_is_stale(stamp_ns: float) -> None:
     monitor = CollisionMonitor(SETTINGS, 1.5)
-    monitor.set_ring(ControllerRing(stamp_ns, FREE_RING))  # type: ignore[arg-type]
-    assert (monitor.step(10 * S, AHEAD), monitor.reason) == (Twist(), monitor_module.RING_STALE)
+    monitor.set_scan(ControllerScan(stamp_ns, FREE_SCAN))  # type: ignore[arg-type]
+    assert (monitor.step(10 * S, AHEAD), monitor.reason) == (Twist(), monitor_module.SCAN_STALE)
 
 
 COUNT = 36
@@ -348,7 +348,7 @@ COUNT = 36
     [
         (math.inf, 6.0, False, False),
         (math.inf, 1.5, True, False),
-        (math.inf, 0.0, False, False),  # the ring holds no free floor
+        (math.inf, 0.0, False, False),  # the scan holds no free floor
         (math.nan, 0.7, True, False),
         (2.0, 1.95, False, False),
         (2.0, 1.0, True, True),
@@ -367,7 +367,7 @@ def test_nothing_is_known_between_seen_floor_and_a_surface(
     assert not unknown_ends(ranges, free, 0.15), "too narrow to be more than noise"
 
 
-def test_a_ring_without_free_floor_is_unknown_where_it_shows_no_range() -> None:
+def test_a_scan_without_free_floor_is_unknown_where_it_shows_no_range() -> None:
     ranges = [2.0] * COUNT
     ranges[: UNKNOWN_SECTORS + 1] = [math.nan] * (UNKNOWN_SECTORS + 1)
     assert [end.free_m for end in unknown_ends(ranges, (), 0.15)] == [0.0] * (UNKNOWN_SECTORS + 1)

@@ -1,4 +1,4 @@
-"""The collision monitor against an outline swept in millimetres, with random rings, motions, settings and brakes.
+"""The collision monitor against an outline swept in millimetres, with random scans, motions, settings and brakes.
 
 The sweep errs by its steps, so the monitor must lie between the results of an outline that is a little larger and of
 one that is a little smaller.
@@ -19,7 +19,7 @@ from omnid.core.control.collision_monitor import (
     MOVING,
     CollisionMonitor,
     CollisionSettings,
-    ControllerRing,
+    ControllerScan,
     MovingPoint,
 )
 from omnid.core.control.heading_controller import Twist
@@ -76,10 +76,10 @@ def stop_box(settings: CollisionSettings, v: float) -> Box:
     )
 
 
-def driven(monitor: CollisionMonitor, rng: random.Random, ring_ns: int, now_ns: int) -> tuple[complex, float]:
-    """Drive any way since the images of the ring; return position and yaw."""
+def driven(monitor: CollisionMonitor, rng: random.Random, scan_ns: int, now_ns: int) -> tuple[complex, float]:
+    """Drive any way since the images of the scan; return position and yaw."""
     place, yaw, forward = 0j, 0.0, rng.uniform(-1.0, 1.0)
-    for at_ns in range(ring_ns, now_ns, S // 10):
+    for at_ns in range(scan_ns, now_ns, S // 10):
         v, w = forward + rng.uniform(-0.2, 0.2), rng.uniform(-1.0, 1.0)
         monitor.follow(at_ns, Twist(v, w))
         place, yaw = travelled((v, w), 0.1, place, yaw)
@@ -180,8 +180,8 @@ def test_the_share_is_that_of_a_sweep_after_any_way_since_the_images() -> None:
     for _ in range(220):
         settings, braking_mps2, motion = any_settings(rng), rng.uniform(0.05, 2.0), any_motion(rng)
         monitor = CollisionMonitor(settings, braking_mps2)
-        ring_ns, now_ns = 50 * S, 50 * S + rng.randrange(0, 2 * S, S // 10)
-        place, yaw = driven(monitor, rng, ring_ns, now_ns)
+        scan_ns, now_ns = 50 * S, 50 * S + rng.randrange(0, 2 * S, S // 10)
+        place, yaw = driven(monitor, rng, scan_ns, now_ns)
         ranges = [math.inf] * SECTORS
         for sector in rng.sample(range(SECTORS), rng.randrange(0, 7)):
             ranges[sector] = rng.uniform(0.2, 3.0)
@@ -190,7 +190,7 @@ def test_the_share_is_that_of_a_sweep_after_any_way_since_the_images() -> None:
         points = seen_from(place, yaw, [cmath.rect(r, azimuth_rad(k)) for k, r in enumerate(ranges) if r < math.inf])
         if not points or not is_clear(settings, motion, points):
             continue
-        monitor.set_ring(ControllerRing(ring_ns, tuple(ranges)))
+        monitor.set_scan(ControllerScan(scan_ns, tuple(ranges)))
         allowed = monitor.step(now_ns, Twist(*motion))
         found = (allowed.velocity_mps + allowed.yaw_rate_radps) / sum(motion)
         assert bool(monitor.reason) == (found < 1.0) and monitor.share == pytest.approx(found)
@@ -237,7 +237,7 @@ def test_the_end_of_what_was_seen_counts_as_a_wall(policy: str) -> None:
         monitor = CollisionMonitor(settings, braking_mps2)
         # What is not unknown is open up to the longest range.
         free_m = tuple(f if one else 6.0 for f, one in zip(free_m, unknown, strict=True))
-        monitor.set_ring(ControllerRing(S, tuple(math.nan if one else math.inf for one in unknown), free_m))
+        monitor.set_scan(ControllerScan(S, tuple(math.nan if one else math.inf for one in unknown), free_m))
         allowed = monitor.step(S, Twist(*motion))
         found = (allowed.velocity_mps + allowed.yaw_rate_radps) / sum(motion)
         edge_mps = abs(motion[0])
@@ -271,7 +271,7 @@ def test_where_the_images_show_nothing_the_way_ends_at_the_distance_to_keep(poli
             continue
         ends = any(y_m < width_m for y_m in across_m)
         monitor = CollisionMonitor(settings, 5.0)
-        monitor.set_ring(ControllerRing(S, tuple(math.nan if one else math.inf for one in unknown), (), (), unknown))
+        monitor.set_scan(ControllerScan(S, tuple(math.nan if one else math.inf for one in unknown), (), (), unknown))
         least = min(1.0, settings.slow_mps / abs(v)) if policy == "slow" else 0.0
         assert monitor.step(S, Twist(v)).velocity_mps == pytest.approx((least if ends else 1.0) * v, abs=1e-6)
         counts[ends] += 1
@@ -290,7 +290,7 @@ def test_beside_parts_where_the_images_show_nothing_there_is_room_of_a_hand() ->
         rays = [cmath.rect(1.0, azimuth_rad(k)) for k in range(SECTORS) if dead[k]]
         walls = [ray * side_m / abs(ray.imag) for ray in rays]
         monitor = CollisionMonitor(settings, braking_mps2)
-        monitor.set_ring(ControllerRing(S, tuple(ranges), (), (), dead))
+        monitor.set_scan(ControllerScan(S, tuple(ranges), (), (), dead))
         found = monitor.step(S, Twist(*motion)).velocity_mps / motion[0]
         shares.append(check(settings, braking_mps2, motion, walls, found))
     assert sum(share < 1.0 for share in shares) > 10 and sum(share == 1.0 for share in shares) > 10
@@ -314,7 +314,7 @@ def test_a_base_is_slow_while_something_is_in_the_slow_polygon() -> None:
         if share_before(settings, 5.0, motion, [point], 0.05) < 1.0:
             continue
         monitor = CollisionMonitor(settings, 5.0)
-        monitor.set_ring(ControllerRing(S, tuple(range_m if k == sector else math.inf for k in range(SECTORS))))
+        monitor.set_scan(ControllerScan(S, tuple(range_m if k == sector else math.inf for k in range(SECTORS))))
         ahead_m = point.real if v > 0 else -point.real
         far_m = settings.slow_m + (settings.front_m if v > 0 else settings.rear_m)
         is_near = (
@@ -328,14 +328,14 @@ def test_a_base_is_slow_while_something_is_in_the_slow_polygon() -> None:
     assert slow > 15
 
 
-@pytest.mark.parametrize("has_ring", [True, False])
-def test_without_a_fresh_ring_no_corner_is_faster_than_the_slow_speed(has_ring: bool) -> None:
+@pytest.mark.parametrize("has_scan", [True, False])
+def test_without_a_fresh_scan_no_corner_is_faster_than_the_slow_speed(has_scan: bool) -> None:
     rng = random.Random(4)
     for _ in range(100):
         settings, (v, w) = any_settings(rng, stale="slow", stale_s=0.5, slow_mps=0.15), any_motion(rng)
         monitor = CollisionMonitor(settings, 1.0)
-        if has_ring:
-            monitor.set_ring(ControllerRing(S, (math.inf,) * SECTORS))
+        if has_scan:
+            monitor.set_scan(ControllerScan(S, (math.inf,) * SECTORS))
         allowed = monitor.step(3 * S, Twist(v, w))
         corner_m = math.hypot(max(settings.front_m, settings.rear_m), settings.half_width_m)
         share = min(1.0, 0.15 / max(abs(v), abs(w) * corner_m))
@@ -351,8 +351,8 @@ def test_moving_obstacles_are_where_they_will_be() -> None:
     for _ in range(300):
         settings, (v, w) = any_settings(rng), any_motion(rng)
         monitor = CollisionMonitor(settings, 5.0)
-        ring_ns, age_s = 50 * S, rng.randrange(0, 10) / 10
-        place, yaw = driven(monitor, rng, ring_ns, ring_ns + round(age_s * S))
+        scan_ns, age_s = 50 * S, rng.randrange(0, 10) / 10
+        place, yaw = driven(monitor, rng, scan_ns, scan_ns + round(age_s * S))
         obstacle = MovingPoint(
             *(rng.uniform(-2.0, 2.0) for _ in range(2)),
             *(rng.uniform(-1.0, 1.0) for _ in range(2)),
@@ -388,8 +388,8 @@ def test_moving_obstacles_are_where_they_will_be() -> None:
         if margin_m < 5e-3:
             continue
         expected = min(expected, passive)
-        monitor.set_ring(ControllerRing(ring_ns, (math.inf,) * SECTORS, (), (obstacle,)))
-        allowed = monitor.step(ring_ns + round(age_s * S), Twist(v, w))
+        monitor.set_scan(ControllerScan(scan_ns, (math.inf,) * SECTORS, (), (obstacle,)))
+        allowed = monitor.step(scan_ns + round(age_s * S), Twist(v, w))
         assert (allowed.velocity_mps, allowed.yaw_rate_radps) == pytest.approx((expected * v, expected * w))
         assert monitor.reason == (MOVING if expected < 1.0 else "")
         shares.append(expected)

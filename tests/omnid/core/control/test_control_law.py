@@ -9,7 +9,7 @@ import random
 import pytest
 
 from omnid.core.control.arming import AUTOMATIC
-from omnid.core.control.collision_monitor import CollisionSettings, ControllerRing
+from omnid.core.control.collision_monitor import CollisionSettings, ControllerScan
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControlLaw, ControllerPose, ControllerSettings
 from omnid.core.control.heading_controller import Setpoint, VelocityLimits
@@ -21,11 +21,11 @@ WALL_M = 1.0
 WALL = tuple(WALL_M / math.cos(math.radians(k - 179.5)) if abs(k - 179.5) < 40 else math.inf for k in range(360))
 
 
-def test_the_way_since_the_images_of_the_ring_counts() -> None:
-    """One ring, a wall 1 m ahead: the base stops before the wall by its own motion, without another ring."""
+def test_the_way_since_the_images_of_the_scan_counts() -> None:
+    """One scan, a wall 1 m ahead: the base stops before the wall by its own motion, without another scan."""
     collision = CollisionSettings(stale_s=10.0)
     law = ControlLaw(ControllerSettings(arming=AUTOMATIC, collision=collision), START_NS)
-    law.take(ControllerRing(START_NS, WALL))
+    law.take(ControllerScan(START_NS, WALL))
     driven_m = fastest_mps = 0.0
     for tick in range(1, 400):
         now_ns = START_NS + tick * TICK_NS
@@ -44,7 +44,7 @@ def test_a_base_before_a_post_turns_to_a_heading_and_drives_on_from_there() -> N
         now_ns, turned = START_NS + tick * TICK_NS, round(math.degrees(heading_rad))
         # A post 0.38 m ahead of the first pose, so that the base may not begin an arc; it stays where it is.
         ranges = tuple(0.38 if abs(k - 179.5 + turned) < 8 else math.inf for k in range(360))
-        law.take(ControllerRing(now_ns, ranges))
+        law.take(ControllerScan(now_ns, ranges))
         law.take(ControllerPose(now_ns, heading_rad, law.motion.yaw_rate_radps, "tracking", 0.0))
         law.take(TimedSetpoint(now_ns, Setpoint(0.3, heading_rad=math.radians(90))))
         motion = law.step(now_ns, TICK_S).motion
@@ -65,7 +65,7 @@ def test_a_stick_that_is_held_leads_no_farther_however_small_the_first_step(
     left_m, tick_ns = 0.15 + 0.25 + 0.002, 10**9 // rate_hz
     ways = [left_m / math.cos(math.radians(k - 179.5)) if abs(k - 179.5) < 40 else math.inf for k in range(360)]
     ranges = tuple(way if is_seen or way == math.inf else math.nan for way in ways)
-    law.take(ControllerRing(START_NS, ranges, tuple(min(way, 6.0) for way in ways)))
+    law.take(ControllerScan(START_NS, ranges, tuple(min(way, 6.0) for way in ways)))
     for tick in range(1, 4 * rate_hz):
         now_ns = START_NS + tick * tick_ns
         law.take(ControllerPose(now_ns, 0.0, 0.0, "tracking", law.motion.velocity_mps))

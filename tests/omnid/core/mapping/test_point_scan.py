@@ -42,9 +42,9 @@ def within(low_deg: float, high_deg: float) -> np.ndarray:
 
 
 def test_a_wall_is_found_at_its_range_and_elsewhere_nothing_is_known() -> None:
-    ring = seen(arc(2.0, (-30, 30), (-0.8, 0.6)))
-    np.testing.assert_allclose(ring[within(-29, 29)], 2.0, atol=1e-3)
-    assert np.isnan(ring[~within(-32, 32)]).all()
+    scan = seen(arc(2.0, (-30, 30), (-0.8, 0.6)))
+    np.testing.assert_allclose(scan[within(-29, 29)], 2.0, atol=1e-3)
+    assert np.isnan(scan[~within(-32, 32)]).all()
 
 
 def test_a_floor_with_noise_and_tilt_is_no_obstacle_at_any_range() -> None:
@@ -53,30 +53,30 @@ def test_a_floor_with_noise_and_tilt_is_no_obstacle_at_any_range() -> None:
     r = np.linalg.norm(ground, axis=1)
     noisy = ground * (1 + 0.01 * r * rng.standard_normal(len(r)))[:, None]
     tilted = noisy + np.outer(np.tan(np.deg2rad(0.7)) * ground[:, 0], [0, 0, 1])
-    ring = seen(tilted)
-    assert np.isfinite(ring).sum() <= 2
+    scan = seen(tilted)
+    assert np.isfinite(scan).sum() <= 2
 
 
 def test_a_box_before_a_wall_is_found_although_most_points_are_of_the_wall() -> None:
-    ring = seen(arc(3.0, (-60, 60), (-0.9, 0.7), 20_000), arc(1.4, (-5, 5), (-0.9, -0.6), 150))
-    np.testing.assert_allclose(ring[within(-4, 4)], 1.4, atol=0.02)
-    np.testing.assert_allclose(ring[within(8, 50)], 3.0, atol=0.02)
+    scan = seen(arc(3.0, (-60, 60), (-0.9, 0.7), 20_000), arc(1.4, (-5, 5), (-0.9, -0.6), 150))
+    np.testing.assert_allclose(scan[within(-4, 4)], 1.4, atol=0.02)
+    np.testing.assert_allclose(scan[within(8, 50)], 3.0, atol=0.02)
 
 
 def test_no_range_is_longer_than_the_longest() -> None:
     """A bin of inverse range may begin before it and end beyond: a map with such a range is refused when it is read."""
     for range_m in np.arange(5.55, 8.0, 0.1):
-        ring = seen(arc(range_m, (-30, 30), (-0.5, 0.5), 20_000))[within(-29, 29)]
+        scan = seen(arc(range_m, (-30, 30), (-0.5, 0.5), 20_000))[within(-29, 29)]
         if range_m <= LIMITS.max_range_m:
-            np.testing.assert_allclose(ring, range_m, atol=0.01)
+            np.testing.assert_allclose(scan, range_m, atol=0.01)
         else:
-            assert np.isposinf(ring).all(), range_m
+            assert np.isposinf(scan).all(), range_m
 
 
 def test_beyond_the_longest_range_is_free_and_above_the_band_is_nothing() -> None:
-    ring = seen(arc(9.0, (-30, 30), (-0.5, 0.5), 20_000), arc(2.0, (90, 120), (1.0, 1.4)))
-    assert np.isposinf(ring[within(-28, 28)]).all()
-    assert np.isnan(ring[within(92, 118)]).all()
+    scan = seen(arc(9.0, (-30, 30), (-0.5, 0.5), 20_000), arc(2.0, (90, 120), (1.0, 1.4)))
+    assert np.isposinf(scan[within(-28, 28)]).all()
+    assert np.isnan(scan[within(92, 118)]).all()
 
 
 @pytest.mark.parametrize(("gap", "far_m", "is_filled"), [(4, 3.0, True), (5, 3.0, False), (4, 5.0, False)])

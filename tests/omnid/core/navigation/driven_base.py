@@ -36,7 +36,7 @@ def wheel_state(law: ControlLaw) -> WheelState:
 
 
 class Floor:
-    """The grid of the obstacles as rings fill it: cells of odom are free as far as a ring says, and stay known."""
+    """The grid of the obstacles as scans fill it: cells of odom are free as far as a scan says, and stay known."""
 
     def __init__(self, *, all_seen: bool = False) -> None:
         """all_seen: what is no obstacle counts as free, everywhere about the base."""
@@ -44,7 +44,7 @@ class Floor:
         self._states = np.full((self._side, self._side), 0.0 if all_seen else np.nan, np.float32)
 
     def grid(self, pose: Array, ranges_m: Array, free_m: Array | None = None) -> FloorGrid:
-        """Return the grid after a ring at a pose (3,)."""
+        """Return the grid after a scan at a pose (3,)."""
         middle = np.round(pose[:2] / CELL_M) if self._all_seen else np.zeros(2)
         corner_m = CELL_M * (middle - self._side // 2)
         if not self._all_seen:
@@ -75,7 +75,7 @@ class Sample(NamedTuple):
 class DrivenBase:
     """Poses in, commands out; odom is the true frame, and the map may lie elsewhere."""
 
-    has_ring = False  # else nothing looks for obstacles
+    has_scan = False  # else nothing looks for obstacles
 
     def __init__(
         self,
@@ -97,7 +97,7 @@ class DrivenBase:
         self.slip = 1.0  # share of the commanded motion that happens
         self.T_map_odom = np.array(T_map_odom)
         settings = ControllerSettings(arming=AUTOMATIC, motion=MotionSettings(check=False))
-        self.law = ControlLaw(settings if self.has_ring else settings.without_obstacles, -1)
+        self.law = ControlLaw(settings if self.has_scan else settings.without_obstacles, -1)
         self.law.take(ControllerPose(0, float(self.pose[2]), 0.0, "tracking", 0.0))
         self.law.step(0, 0.0)
         self._gain = 1.0 + 0.02 * self.rng.standard_normal(2)

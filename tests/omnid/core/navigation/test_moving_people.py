@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.se2_arrays import relative
-from omnid.core.control.collision_monitor import ControllerRing, MovingPoint
+from omnid.core.control.collision_monitor import ControllerScan, MovingPoint
 from omnid.core.navigation.navigator import Navigator
 from omnid.core.navigation.path import DrivePath, straight_leg
 from omnid.core.navigation.requests import NavigationFrame
@@ -24,17 +24,17 @@ from tests.omnid.core.navigation.test_planner import AZIMUTHS, OUTLINE, SETTINGS
 Array = NDArray[np.float64]
 RADIUS_M = 0.2
 CORRIDOR = Boxes((-2.0, 2.2, 9.0, 2.4), (-2.0, -2.4, 9.0, -2.2), (8.0, -3.0, 8.2, 3.0))
-RING_S = 0.2
+SCAN_S = 0.2
 
 
 class BaseAmongPeople(BaseAmongBoxes):
-    """A base whose ring shows a person who walks straight on from a time; the person does not look at the robot."""
+    """A base whose scan shows a person who walks straight on from a time; the person does not look at the robot."""
 
     boxes = CORRIDOR
 
     def __init__(self, seed: int, start: tuple[float, float], velocity: tuple[float, float], begins_s: float) -> None:
         self.person, self.walk, self.begins_s = np.array(start), np.array(velocity), begins_s
-        self.tracker, self.ring_s, self.moving = MovingTracker(), -math.inf, ()
+        self.tracker, self.scan_s, self.moving = MovingTracker(), -math.inf, ()
         self.gap_m, self.contact_mps = math.inf, 0.0  # to the person; forward speed just before a contact ahead
         super().__init__(Navigator(SETTINGS), seed)
         path = DrivePath((straight_leg((0.0, 0.0), (5.0, 0.0)),), 0.0)
@@ -61,10 +61,10 @@ class BaseAmongPeople(BaseAmongBoxes):
         along = directions @ to
         left2 = RADIUS_M**2 - (to @ to - along**2)
         person = np.where((left2 > 0) & (along > 0), along - np.sqrt(np.maximum(left2, 0)), math.inf)
-        walls = self.boxes.ring(self.pose)
+        walls = self.boxes.scan(self.pose)
         ranges = np.minimum(walls, person) + self.rng.normal(0, 0.01, 360)
-        if self.t_s - self.ring_s >= RING_S - 1e-6:
-            self.ring_s = self.t_s
+        if self.t_s - self.scan_s >= SCAN_S - 1e-6:
+            self.scan_s = self.t_s
             T = se3.transform(se3.rotation_exp([0, 0, self.pose[2]]), [*self.pose[:2], 0.0])
             self.moving = self.tracker.update(
                 now.stamp_ns,
@@ -80,9 +80,9 @@ class BaseAmongPeople(BaseAmongBoxes):
                 )
                 for m in self.moving
             )
-            self.law.take(ControllerRing(now.stamp_ns, tuple(ranges.tolist()), moving=points))
+            self.law.take(ControllerScan(now.stamp_ns, tuple(ranges.tolist()), moving=points))
         grid = Floor(all_seen=True).grid(self.pose, ranges)
-        return now._replace(around=Surroundings(grid, self.moving, round(self.ring_s * 1e9), self.pose))
+        return now._replace(around=Surroundings(grid, self.moving, round(self.scan_s * 1e9), self.pose))
 
 
 @pytest.mark.hazard("H18")
@@ -126,7 +126,7 @@ def test_follows_a_person_who_walks_ahead_more_slowly() -> None:
 
 def moving(x_m: float, y_m: float, vx_mps: float, vy_mps: float) -> Surroundings:
     """Return somebody who moves where all is floor but a row of cells at x = 3 m."""
-    rows = Floor(all_seen=True).grid(np.zeros(3), Boxes((3.0, -0.3, 3.1, 0.3)).ring(np.zeros(3)))
+    rows = Floor(all_seen=True).grid(np.zeros(3), Boxes((3.0, -0.3, 3.1, 0.3)).scan(np.zeros(3)))
     return Surroundings(rows, [MovingObstacle(x_m, y_m, vx_mps, vy_mps, np.diag([4e-4, 4e-4, 1e-2, 1e-2]), RADIUS_M)])
 
 

@@ -146,7 +146,7 @@ def test_gives_up_without_progress() -> None:
 
 def test_says_that_it_stood_before_an_obstacle(monkeypatch: pytest.MonkeyPatch) -> None:
     base = driving()
-    box = around(base.pose, Boxes((2.1, -0.15, 2.2, 0.15)).ring(base.pose))
+    box = around(base.pose, Boxes((2.1, -0.15, 2.2, 0.15)).scan(base.pose))
     without = base.seen
     monkeypatch.setattr(base, "seen", lambda: without()._replace(around=box))
     base.slip = 0.0

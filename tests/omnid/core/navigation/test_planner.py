@@ -1,4 +1,4 @@
-"""Ways around obstacles in a closed loop: a ring of ranges as the cameras give it, boxes on and beside the path."""
+"""Ways around obstacles in a closed loop: a scan of ranges as the cameras give it, boxes on and beside the path."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from omnid.core.control.collision_monitor import CollisionSettings, ControllerRing
+from omnid.core.control.collision_monitor import CollisionSettings, ControllerScan
 from omnid.core.navigation.navigator import WAITS, Navigator
 from omnid.core.navigation.path import DrivePath, drive_path, goal_path, straight_leg
 from omnid.core.navigation.planner import Planner, Way
@@ -38,7 +38,7 @@ class Boxes:
         low, high = self.boxes[:, :2] - xy, xy - self.boxes[:, 2:]
         return float(np.hypot(*np.maximum(np.maximum(low, high), 0.0).T).min())
 
-    def ring(self, pose: Array) -> Array:
+    def scan(self, pose: Array) -> Array:
         """Return ranges (360,) from a pose, inf beyond 4 m: slabs of the boxes."""
         directions = np.column_stack([np.cos(AZIMUTHS + pose[2]), np.sin(AZIMUTHS + pose[2])])
         if not len(self.boxes):
@@ -52,20 +52,20 @@ class Boxes:
 
 
 class BaseAmongBoxes(DrivenBase):
-    """A base whose ring shows boxes."""
+    """A base whose scan shows boxes."""
 
     boxes = Boxes()
-    has_ring = True  # the collision monitor of the control law sees it, too
+    has_scan = True  # the collision monitor of the control law sees it, too
 
     def seen(self) -> Situation:
         now = super().seen()
-        ranges = self.boxes.ring(self.pose) + self.rng.normal(0, 0.01, 360)
-        self.law.take(ControllerRing(now.stamp_ns, tuple(ranges.tolist())))
+        ranges = self.boxes.scan(self.pose) + self.rng.normal(0, 0.01, 360)
+        self.law.take(ControllerScan(now.stamp_ns, tuple(ranges.tolist())))
         return now._replace(around=around(self.pose, ranges, now.stamp_ns))
 
 
 def around(pose: Array, ranges_m: Array, stamp_ns: int = 0) -> Surroundings:
-    """Return what a ring shows, where all else is floor."""
+    """Return what a scan shows, where all else is floor."""
     return Surroundings(Floor(all_seen=True).grid(pose, ranges_m), (), stamp_ns, pose)
 
 
@@ -178,7 +178,7 @@ def test_a_way_can_be_driven_and_leads_to_the_goal_or_to_the_edge_of_the_grid(
     boxes: Boxes, start: tuple[float, float, float], goal: tuple[float, float], backwards: list[bool]
 ) -> None:
     pose = np.array(start)
-    found = Planner(SETTINGS, OUTLINE).way(pose, np.array(goal), around(pose, boxes.ring(pose)), 0)
+    found = Planner(SETTINGS, OUTLINE).way(pose, np.array(goal), around(pose, boxes.scan(pose)), 0)
     assert isinstance(found, Way)
     way = found.path
     assert list(dict.fromkeys(leg.backwards for leg in way.legs)) == backwards
@@ -198,7 +198,7 @@ def test_a_way_can_be_driven_and_leads_to_the_goal_or_to_the_edge_of_the_grid(
 )
 def test_where_no_way_leads_it_says_what_is_in_the_way(x_m: float, goal: tuple[float, float], reason: str) -> None:
     pose = np.array([x_m, 0.0, 0.0])
-    found = Planner(SETTINGS, OUTLINE).way(pose, np.array(goal), around(pose, ROOM.ring(pose)), 0)
+    found = Planner(SETTINGS, OUTLINE).way(pose, np.array(goal), around(pose, ROOM.scan(pose)), 0)
     assert isinstance(found, str) and reason in found
 
 

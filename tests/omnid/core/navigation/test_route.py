@@ -196,20 +196,20 @@ def test_is_driven_back_and_there_again_and_in_rounds() -> None:
     assert math.dist(base.pose[:2], route.poses[0, :2]) < 0.03, "there and back"
     assert max(sample.pose[0] for sample in base.samples) > 3.0
     a = np.arange(0, math.tau, 0.01)
-    ring = np.column_stack([2 * np.sin(a), 2 - 2 * np.cos(a), a])
-    closed = taught(ring, Map(ring))
+    scan = np.column_stack([2 * np.sin(a), 2 - 2 * np.cos(a), a])
+    closed = taught(scan, Map(scan))
     assert closed.is_closed
-    rounds = repeated_paths(closed, Map(ring), np.zeros(3), loops=3, reverse=False)
+    rounds = repeated_paths(closed, Map(scan), np.zeros(3), loops=3, reverse=False)
     assert len(rounds) == 3 and rounds[1] is rounds[2] and rounds[1].length_m == pytest.approx(4 * math.pi, abs=0.3)
 
 
 @pytest.mark.parametrize(("short_m", "beside_m"), [(0.0, 0.0), (0.35, 0.1), (0.35, -0.3), (0.9, 0.0)])
 def test_at_the_end_of_a_closed_route_a_new_round_begins(short_m: float, beside_m: float) -> None:
     a = np.arange(0, math.tau - short_m / 2, 0.01)
-    ring = np.column_stack([2 * np.sin(a), 2 - 2 * np.cos(a), a])
-    route, places = taught(ring, Map(ring)), Map(ring)
+    scan = np.column_stack([2 * np.sin(a), 2 - 2 * np.cos(a), a])
+    route, places = taught(scan, Map(scan)), Map(scan)
     for reverse in (False, True):
-        end = composed(ring[:1] if reverse else ring[-1:], np.array([0.0, beside_m, math.pi if reverse else 0.0]))[0]
+        end = composed(scan[:1] if reverse else scan[-1:], np.array([0.0, beside_m, math.pi if reverse else 0.0]))[0]
         (path,) = repeated_paths(route, places, end, loops=1, reverse=reverse)
         assert path.length_m > 4 * math.pi - 2.5
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from omnid.core.control.collision_monitor import UNKNOWN, ControllerRing
+from omnid.core.control.collision_monitor import UNKNOWN, ControllerScan
 from omnid.core.navigation.navigator import Navigator
 from omnid.core.navigation.path import DrivePath, drive_path, goal_path
 from omnid.core.navigation.requests import NavigationFrame
@@ -19,9 +19,9 @@ SEEN_M = 2.0  # Floor is seen so far.
 
 
 class BaseAmongPatches(DrivenBase):
-    """A base whose ring shows floor up to patches that are unknown, and nothing that stands there."""
+    """A base whose scan shows floor up to patches that are unknown, and nothing that stands there."""
 
-    has_ring = True
+    has_scan = True
 
     def __init__(self, patches: Boxes, path: DrivePath | None = None) -> None:
         super().__init__(Navigator(SETTINGS), 1)
@@ -30,8 +30,8 @@ class BaseAmongPatches(DrivenBase):
 
     def seen(self) -> Situation:
         now = super().seen()
-        free_m, ranges_m = np.minimum(self.boxes.ring(self.pose), SEEN_M), np.full(360, np.inf)
-        self.law.take(ControllerRing(now.stamp_ns, tuple(ranges_m.tolist()), tuple(free_m.tolist())))
+        free_m, ranges_m = np.minimum(self.boxes.scan(self.pose), SEEN_M), np.full(360, np.inf)
+        self.law.take(ControllerScan(now.stamp_ns, tuple(ranges_m.tolist()), tuple(free_m.tolist())))
         grid = self.floor.grid(self.pose, ranges_m, free_m)
         self.around = Surroundings(grid, (), now.stamp_ns, self.pose, self.around)
         return now._replace(around=self.around)

@@ -125,8 +125,8 @@ def test_cameras_that_see_no_floor_have_no_evidence_of_it() -> None:
     assert not found.level.any()
 
 
-def test_floor_nearer_than_a_ring_that_no_direction_shows_is_not_used() -> None:
-    """People who cross the ring would be out of view on their way to the base."""
+def test_floor_nearer_than_a_scan_that_no_direction_shows_is_not_used() -> None:
+    """People who cross the scan would be out of view on their way to the base."""
     visible = VISIBLE.copy()
     visible[160:175] = False  # 1.4 to 1.7 m away
     whole, cut = (

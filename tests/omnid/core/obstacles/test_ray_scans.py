@@ -1,4 +1,4 @@
-"""Rings by the posterior of rays: plain floor is free, what stands on it is not, and what is not seen is not free."""
+"""Scans by the posterior of rays: plain floor is free, what stands on it is not, and what is not seen is not free."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import pytest
 
 from calib import se3
 from omnid.core.mapping.range_scan import azimuths
-from omnid.core.obstacles.grid import GridRing
-from omnid.core.obstacles.ray_rings import RayRings
-from omnid.core.obstacles.settings import RingSettings
+from omnid.core.obstacles.grid import GridScan
+from omnid.core.obstacles.ray_scans import RayScans
+from omnid.core.obstacles.settings import ScanSettings
 from tests.omnid.core.obstacles.drawn_floor import (
     BASELINE_M,
     CYLINDER,
@@ -40,10 +40,10 @@ class Standing:
     def __init__(self, floor: Pattern, visible: np.ndarray = SHOWN, ahead_m: float = 0.0) -> None:
         """ahead_m: of the cameras before the origin of the base."""
         self.floor, self.seq = floor, 0
-        self.rings = RayRings(CYLINDER, BASELINE_M, RingSettings())
-        self.rings.set_floor(T_RECT_BASE @ se3.transform(np.eye(3), [-ahead_m, 0.0, 0.0]), visible)
+        self.scans = RayScans(CYLINDER, BASELINE_M, ScanSettings())
+        self.scans.set_floor(T_RECT_BASE @ se3.transform(np.eye(3), [-ahead_m, 0.0, 0.0]), visible)
 
-    def ring(
+    def scan(
         self,
         thing: Pole | Bar | None = None,
         *,
@@ -52,21 +52,21 @@ class Standing:
         wall: Pattern = striped,
         drop_m: float = 0.0,
         lost: np.ndarray | None = None,
-    ) -> GridRing:
-        """Return the ring after some more pairs."""
+    ) -> GridScan:
+        """Return the scan after some more pairs."""
         for _ in range(pairs):
             lower, upper = panoramas(self.floor, wall_m, wall, drop_m, thing, seed=self.seq)
-            ring = self.rings.add(self.seq * PERIOD_NS, np.eye(4), lower, upper, lost)
+            scan = self.scans.add(self.seq * PERIOD_NS, np.eye(4), lower, upper, lost)
             self.seq += 1
-        return ring
+        return scan
 
 
 @pytest.mark.parametrize("floor", [plain, worn, stains, worn_with_line])
 def test_floor_is_free_up_to_the_wall_whatever_it_shows(floor: Pattern) -> None:
     """A plain floor shows nothing, and no edge at which something could begin; a painted line is a mark."""
-    ring = Standing(floor).ring(pairs=PAIRS)
-    assert np.median(ring.free_m) > 0.75 * WALL_M
-    assert (ring.free_m < WALL_M + 0.1).all()
+    scan = Standing(floor).scan(pairs=PAIRS)
+    assert np.median(scan.free_m) > 0.75 * WALL_M
+    assert (scan.free_m < WALL_M + 0.1).all()
 
 
 @dataclass(frozen=True)
@@ -93,18 +93,18 @@ class Case:
 )
 def test_floor_behind_a_plain_thing_is_not_free(case: Case) -> None:
     """What begins nearer than the floor in view shows no foot, and may stand anywhere before what it hides."""
-    ring = Standing(case.floor).ring(case.thing, pairs=PAIRS)
-    assert ring.free_m[AHEAD].max() < max(case.thing.range_m, 0.3) + 0.15
+    scan = Standing(case.floor).scan(case.thing, pairs=PAIRS)
+    assert scan.free_m[AHEAD].max() < max(case.thing.range_m, 0.3) + 0.15
     if isinstance(case.thing, Pole):
-        assert np.median(ring.free_m[BEHIND]) > 0.75 * WALL_M
+        assert np.median(scan.free_m[BEHIND]) > 0.75 * WALL_M
 
 
 @pytest.mark.hazard("H19")
 def test_floor_behind_a_white_wall_is_not_free() -> None:
     """It shows nothing itself but its foot."""
     wall = lambda azimuth, height_m: np.full(np.shape(azimuth), 200.0)  # noqa: E731
-    ring = Standing(worn).ring(pairs=PAIRS, wall_m=1.8, wall=wall)
-    assert np.median(ring.free_m) > 1.2 and ring.free_m.max() < 1.9
+    scan = Standing(worn).scan(pairs=PAIRS, wall_m=1.8, wall=wall)
+    assert np.median(scan.free_m) > 1.2 and scan.free_m.max() < 1.9
 
 
 @pytest.mark.hazard("H19")
@@ -112,9 +112,9 @@ def test_floor_behind_a_white_wall_is_not_free() -> None:
 def test_floor_is_not_free_while_a_pole_that_was_put_there_hides_it(floor: Pattern) -> None:
     """It is known in 1.5 s, also by a base at rest, and a second after it has gone the floor is free again."""
     base = Standing(floor)
-    base.ring(pairs=8)
-    assert base.ring(Pole(1.5, 0.08), pairs=15).free_m[AHEAD].min() < 1.65
-    assert np.median(base.ring(pairs=12).free_m[AHEAD]) > 0.75 * WALL_M
+    base.scan(pairs=8)
+    assert base.scan(Pole(1.5, 0.08), pairs=15).free_m[AHEAD].min() < 1.65
+    assert np.median(base.scan(pairs=12).free_m[AHEAD]) > 0.75 * WALL_M
 
 
 @pytest.mark.hazard("H17")
@@ -123,36 +123,36 @@ def test_floor_is_not_free_while_a_pole_that_was_put_there_hides_it(floor: Patte
 def test_who_steps_onto_free_floor_is_found_in_two_pairs(floor: Pattern, ahead_m: float) -> None:
     """As wide as a person, and where the cameras see it; nothing else has come."""
     base = Standing(floor, ahead_m=ahead_m)
-    before = base.ring(pairs=8)
+    before = base.scan(pairs=8)
     assert np.isnan(before.arrivals.ranges_m).all()
-    found = [base.ring(Pole(1.5, 0.4, 60.0)).arrivals.ranges_m for _ in range(2)]
+    found = [base.scan(Pole(1.5, 0.4, 60.0)).arrivals.ranges_m for _ in range(2)]
     came = np.isfinite(found).any(axis=0)
     assert came[AHEAD].all() and not came[np.abs(azimuths()) > math.radians(15)].any()
     assert np.nanmin(found) > 1.3 and np.nanmax(found) < 1.65
-    assert base.ring(Pole(1.5, 0.4, 60.0)).free_m[AHEAD].max() < 1.65 + ahead_m
+    assert base.scan(Pole(1.5, 0.4, 60.0)).free_m[AHEAD].max() < 1.65 + ahead_m
 
 
 @pytest.mark.hazard("H17")
 def test_who_hides_the_nearest_floor_in_view_may_be_anywhere_before_it() -> None:
     base = Standing(stains)
-    base.ring(pairs=8)
-    ring = base.ring(Pole(0.5, 0.4, 60.0))
-    assert ring.arrivals.is_nearer[AHEAD].all() and ring.free_m[AHEAD].max() < 0.7
+    base.scan(pairs=8)
+    scan = base.scan(Pole(0.5, 0.4, 60.0))
+    assert scan.arrivals.is_nearer[AHEAD].all() and scan.free_m[AHEAD].max() < 0.7
 
 
 @pytest.mark.hazard("H19")
 def test_nothing_is_free_a_while_after_all_images_are_lost() -> None:
     """Somebody may have come from where nothing was known, at 1.6 m/s."""
     base = Standing(stains)
-    assert np.median(base.ring(pairs=PAIRS).free_m) > 0.75 * WALL_M
-    assert base.ring(pairs=25, lost=SHOWN).free_m.max() < 0.5
-    assert np.median(base.ring(pairs=PAIRS).free_m) > 0.6 * WALL_M
+    assert np.median(base.scan(pairs=PAIRS).free_m) > 0.75 * WALL_M
+    assert base.scan(pairs=25, lost=SHOWN).free_m.max() < 0.5
+    assert np.median(base.scan(pairs=PAIRS).free_m) > 0.6 * WALL_M
 
 
 @pytest.mark.parametrize("drop_m", [0.12, -0.12])
 def test_floor_at_another_height_is_not_free(drop_m: float) -> None:
     """The base states a floor that the images show lower or higher, all around: it ends where it is in view."""
-    assert np.median(Standing(stains).ring(pairs=PAIRS, drop_m=drop_m).free_m) < 0.95
+    assert np.median(Standing(stains).scan(pairs=PAIRS, drop_m=drop_m).free_m) < 0.95
 
 
 @pytest.mark.parametrize("is_lost", [False, True])
@@ -161,14 +161,14 @@ def test_what_is_not_in_view_is_not_free(is_lost: bool) -> None:
     visible, middle = SHOWN.copy(), CYLINDER.width // 2
     visible[:, middle - CYLINDER.width // 8 : middle + CYLINDER.width // 8] = False
     base = Standing(plain) if is_lost else Standing(plain, visible)
-    ring = base.ring(pairs=PAIRS, lost=~visible if is_lost else None)
-    assert ring.free_m[np.abs(azimuths()) < math.radians(35)].max() < 0.4
+    scan = base.scan(pairs=PAIRS, lost=~visible if is_lost else None)
+    assert scan.free_m[np.abs(azimuths()) < math.radians(35)].max() < 0.4
 
 
 def test_without_floor_in_view_nothing_is_free() -> None:
     """All rows below the horizon are masked."""
     visible = SHOWN.copy()
     visible[round(CYLINDER.row0) + 5 :] = False
-    ring = Standing(plain, visible).ring(pairs=PAIRS)
-    assert ring.free_m.max() < 0.3
-    assert not np.isinf(ring.ranges_m).any()
+    scan = Standing(plain, visible).scan(pairs=PAIRS)
+    assert scan.free_m.max() < 0.3
+    assert not np.isinf(scan.ranges_m).any()

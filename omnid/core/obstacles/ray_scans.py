@@ -1,4 +1,4 @@
-"""Ring of free floor and things of each pair: stereo, posterior of the rays, grid; over a floor that may lean.
+"""Scan of free floor and things of each pair: stereo, posterior of the rays, grid; over a floor that may lean.
 
 A tilt (a, b) of the floor beyond that which the rig states changes the disparity of all its rows by
 f t / h (a cos u + b sin u), whatever their range. So the difference of both views on the plane, by the gradient along
@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.panorama import Cylinder
-from omnid.core.obstacles.grid import GridRing, ObstacleGrid, unknown_ring
+from omnid.core.obstacles.grid import GridScan, ObstacleGrid, unknown_scan
 from omnid.core.obstacles.panoramas import AROUND_ROWS, DIRECTIONS, FOCAL_PX, WorkingPair
 from omnid.core.obstacles.posterior import RayBelief, RayPosterior
-from omnid.core.obstacles.settings import RingSettings
+from omnid.core.obstacles.settings import ScanSettings
 from omnid.core.obstacles.stereo import NEAREST_M, Columns, FloorPlane, floor_plane
 from omnid.core.types.panorama import PaddedPanorama
 
@@ -35,10 +35,10 @@ LEAST_RAD: Final = math.radians(0.15)  # change of the tilt for which the tables
 CORRELATED: Final = 20.0  # pixels with one error: neighbours are smoothed, and share what is wrong
 
 
-class RayRings:
-    """Rings of a run by the rays of its pairs."""
+class RayScans:
+    """Scans of a run by the rays of its pairs."""
 
-    def __init__(self, cylinder: Cylinder, baseline_m: float, settings: RingSettings) -> None:
+    def __init__(self, cylinder: Cylinder, baseline_m: float, settings: ScanSettings) -> None:
         self._cylinder, self._baseline_m, self._settings = cylinder, baseline_m, settings
         self.grid = ObstacleGrid(FOCAL_PX * baseline_m, settings.max_range_m)
         # Tilt (2,) beyond what the rig states by all pairs, its covariance, and that of the tables.
@@ -56,18 +56,18 @@ class RayRings:
 
     def add(
         self, stamp_ns: int, T_odom_base: Array, lower: PaddedPanorama, upper: PaddedPanorama, lost: Flags | None
-    ) -> GridRing:
-        """Return the ring at a pair, whose base has the planar pose T_odom_base (4, 4).
+    ) -> GridScan:
+        """Return the scan at a pair, whose base has the planar pose T_odom_base (4, 4).
 
         lost (H, W): pixels that are no evidence, None: all in view are.
         """
         if not self._posterior.shows_floor:
-            return unknown_ring()
+            return unknown_scan()
         # 1. The belief, with the look of floor that is known, and the grid.
         pair = self._columns.panoramas.pair(lower, upper, lost)
         known = self.grid.is_floor(T_odom_base, self._posterior.ranges_m, DIRECTIONS)
         self.belief = self._posterior.belief(pair, self._columns.evidence(pair), known)
-        ring = self.grid.update(stamp_ns, T_odom_base, self.belief)
+        scan = self.grid.update(stamp_ns, T_odom_base, self.belief)
         # 2. The tilt, for the next pair.
         is_due = self._leaned_ns is None or not 0 <= stamp_ns - self._leaned_ns < LEAN_NS
         if is_due or np.diag(self._P).max() > SURE_RAD**2:
@@ -77,7 +77,7 @@ class RayRings:
             if np.abs((self._tilt - self._used)[is_sure]).max(initial=0.0) > LEAST_RAD:
                 self._used = np.where(is_sure, self._tilt, self._used)
                 self._make_tables()
-        return ring
+        return scan
 
     def _observe_tilt(self, T_odom_base: Array, pair: WorkingPair) -> None:
         """Take a pair into the filter of the tilt, by near floor that is known."""
