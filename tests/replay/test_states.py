@@ -89,6 +89,24 @@ def test_two_seconds_of_darkness(omnid: Command, tmp_path: Path, scene: Path) ->
     assert errors_m(Trajectory(estimate.stamps_ns[seen], estimate.T[seen]), truth).max() < 0.02
 
 
+@pytest.mark.parametrize("cameras", [("lower", "upper"), ("upper",)])
+def test_images_without_texture_at_the_start(
+    omnid: Command, tmp_path: Path, scene: Path, cameras: tuple[str, ...]
+) -> None:
+    """They differ by a grey level, so that no camera counts as frozen."""
+
+    def blank(image: Image) -> Image:
+        grey = np.full(read_rig(scene / "rig.toml").lower.camera.size[::-1], 8 * image.pair, np.uint8)
+        return replace(image, jpeg=cv2.imencode(".jpg", grey)[1].tobytes())
+
+    taken = images(scene / "log.mcap")
+    log = save(tmp_path / "log.mcap", [blank(p) if p.pair < 5 and p.camera in cameras else p for p in taken])
+    result = omnid.replay(log, "--record", tmp_path / "out.mcap", rig=scene / "rig.toml")
+    assert result.code == 0 and "Traceback" not in result.err
+    found = [state for state, _ in states(tmp_path / "out.mcap")]
+    assert found[0] == "lost" and found[-1] == "tracking"
+
+
 def test_another_scene_after_the_darkness(omnid: Command, tmp_path: Path, scene: Path, elsewhere: Path) -> None:
     before, after = images(scene / "log.mcap"), images(elsewhere / "log.mcap")
     dark_images = [dark(p.later(1 + k)) for k in range(DARK_PAIRS) for p in before[:2]]
