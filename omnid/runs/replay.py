@@ -235,7 +235,7 @@ class _Replay:
             )
             outputs.maps["collect-map"] = self._map.append
         if options.tum:
-            outputs.poses["trajectory"] = TrajectoryFile(options.tum)
+            outputs.poses["trajectory"] = TrajectoryFile(options.tum, lambda: session.graph.is_stopping)
         if options.map_tum or options.map_live_tum or options.collect:
             outputs.places["collect-places"] = self._in_map.append
         if cloud := options.cloud:  # each map replaces the file

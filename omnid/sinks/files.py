@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from io import FileIO
 from pathlib import Path
+from select import select
 from typing import Final, TypeAlias
 
 import cv2
@@ -24,7 +26,8 @@ from omnid.formats.tum import tum_row
 from omnid.messages import OdometryUpdate
 
 Named: TypeAlias = Sequence[tuple[str, Path]]
-REPLACED: Final = ("--cloud", "--plan", "--ply", "--grid")  # options of files that are replaced at once
+# Options of files that are replaced at once -> the ends that their names may have, where they have one.
+REPLACED: Final = {"--cloud": (".ply",), "--plan": (".png",), "--ply": (".ply",), "--grid": (".yaml", ".yml")}
 
 
 def check_outputs(outputs: Named, inputs: Named) -> None:
@@ -43,6 +46,8 @@ def check_outputs(outputs: Named, inputs: Named) -> None:
         is_read = is_log_name(path.name) or (path.suffix.lower() in IMAGE_SUFFIXES and option != "--plan")
         if folders and is_read and path.is_file():
             raise OmnidError(f"{option} {path}: this is a file of {folders[0]}, which is read; name another file")
+        if path.suffix and path.suffix.lower() not in REPLACED.get(option, (path.suffix.lower(),)):
+            raise OmnidError(f"{option} {path}: expected a name that ends in {REPLACED[option][0]}; name another file")
 
 
 def on_stdout(outputs: Named) -> bool:
@@ -88,13 +93,25 @@ def _require_writable(option: str, path: Path) -> None:
 class TrajectoryFile:
     """A trajectory as TUM, one line a pose, written as soon as the pose is known.
 
-    The file is opened for the first pose: a run without poses leaves an existing file as it was.
+    The file is opened for the first pose: a run without poses leaves an existing file as it was. A pipe is opened at
+    once: OmnidError where nobody reads it. A reader that is late is waited for, after a stop for a second.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._file: FileIO | None = None
+    def __init__(self, path: Path, is_over: Callable[[], bool] = lambda: False) -> None:
+        """is_over: whether the run was stopped."""
+        self._path, self._is_over = path, is_over
+        self._file = self._opened() if path.is_fifo() else None
         self._whole_bytes = 0
+
+    def _opened(self) -> FileIO:
+        """Open the file; no call on it waits."""
+        try:
+            number = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
+        except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+            if getattr(error, "errno", 0) == errno.ENXIO:
+                raise OmnidError(f"{self._path}: nobody reads this pipe; start its reader first") from error
+            raise _no_longer_written(self._path, error) from error
+        return FileIO(number, "wb")
 
     def process(self, odometry: OdometryUpdate) -> None:
         """Write the row of a pose T_odom_rig."""
@@ -105,12 +122,14 @@ class TrajectoryFile:
         row = tum_row(stamp_ns, T).encode("ascii") + b"\n"
         try:
             if self._file is None:
-                self._file = self._path.open("wb", buffering=0)
+                self._file = self._opened()
                 lock(self._file)
-            written = self._file.write(row)
-            while written < len(row):  # a full disk takes a part of the row, then nothing
-                written += self._file.write(row[written:])
-        except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+            written = 0
+            while written < len(row):  # a full disk takes a part of the row, then nothing; a full pipe nothing
+                written += self._file.write(row[written:]) or 0
+                if written < len(row) and not select([], [self._file], [], 1.0)[1] and self._is_over():
+                    raise OSError(errno.EAGAIN, "its reader does not read")
+        except OSError as error:
             with suppress(OSError):
                 if self._file is not None:
                     self._file.truncate(self._whole_bytes)  # remove the part of a row

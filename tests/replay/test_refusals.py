@@ -39,7 +39,7 @@ TABLE = (
     # Rigs.
     ("replay {log}", "omnid calibrate import"),
     ("replay {log} --rig {folder}/broken.toml", "broken.toml"),
-    ("replay {log} --rig {folder}/size.toml", "images are 256x256"),
+    ("replay {log} --rig {folder}/size.toml", "name the rig.toml of these"),
     ("replay {log} --rig {folder}/bare.toml", "images are 256x256"),
     ("replay {log} --rig {folder}/narrow.toml", "share no view between -50.0 and 40.0 degrees of elevation"),
     ("replay {log} --rig {folder}/number.toml", "expected a number, found a huge int"),
@@ -57,6 +57,9 @@ TABLE = (
     ("replay {log} --tum {folder}/x --plan {folder}", "folder"),
     ("replay {log} --tum {folder}/x --cloud /proc/x", "--cloud /proc/x"),
     ("replay {log} --tum {folder}/x --cloud {folder}/x", "--tum"),
+    ("replay {log} --cloud {folder}/x.png", "expected a name that ends in .ply"),
+    ("replay {log} --plan {folder}/x.ply", "expected a name that ends in .png"),
+    ("replay {log} --rig {rig} --tum {folder}/pipe", "nobody reads this pipe"),
     ("replay {log} --record {log}", "the log that is read"),
     ("replay {log} --rig {rig} --record {folder}/loop", "loop"),
     # Settings and words.
@@ -124,6 +127,7 @@ def folder(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         (made / f"{name}.toml").write_text(content)
     (made / "camchain.yaml").write_text("cam0: {}\n")
     (made / "loop").symlink_to(made / "loop")
+    os.mkfifo(made / "pipe")
     return made
 
 
