@@ -9,13 +9,14 @@ import os
 import re
 import sys
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from importlib import import_module
 from itertools import dropwhile, takewhile
 from operator import methodcaller
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, NoReturn
 
+from omnid.engine.process import handle_stop_signals
 from omnid.version import __version__
 
 if TYPE_CHECKING:
@@ -114,12 +115,13 @@ class Parser(argparse.ArgumentParser):
 
 def _did_you_mean(word: str, known: Sequence[str]) -> str:
     """Return the question for the nearest of the known words, or an empty text."""
-    nearest = difflib.get_close_matches(word[:80], known, n=1, cutoff=0.6)
-    return f": did you mean {nearest[0]}?" if nearest else ""
+    bare = {name.lstrip("-"): name for name in known}  # that both are options is no likeness
+    nearest = difflib.get_close_matches(word[:80].lstrip("-"), bare, n=1, cutoff=0.6)
+    return f": did you mean {bare[nearest[0]]}?" if nearest else ""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command and return the exit code: 0 good, 1 not good (see the command), 2 wrong input, 130 Ctrl-C."""
+    """Run a command and return the exit code: 0 good, 1 not good (see the command), 2 wrong input, 128 + a signal."""
     _open_closed_streams()
     bound_image_size()
     limit_blas_threads()
@@ -129,7 +131,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not words and not _completes():
         parser_of(words).print_help()
         return 0
-    return _guarded(parser_of(words).parse_args(words))
+    with ExitStack() as handlers:  # of the time in which modules are loaded, when nothing is to be ended
+        with suppress(ValueError):  # outside the main thread signals stay as they are
+            handlers.enter_context(handle_stop_signals(lambda number, _: os._exit(128 + number)))
+        args = parser_of(words).parse_args(words)
+    return _guarded(args)
 
 
 def _open_closed_streams() -> None:

@@ -67,7 +67,8 @@ def drive(args: argparse.Namespace) -> int:
 def goto(args: argparse.Namespace) -> int:
     """Drive an armed robot to a pose of its base and wait for the end.
 
-    Ctrl-C, or a terminal that closes, cancels, and it stops. Exit code 0: reached, 1: not reached.
+    Ctrl-C, or a terminal that closes, cancels, and it stops. Exit code 0: reached, 1: not reached, 2: refused, as
+    by a robot that is not armed.
 
     pose [X]...            X Y [YAW]: m, m, and deg counter-clockwise; without YAW the heading stays as it comes
     --frame odom|map=odom  frame of the pose: odom begins at the robot's start, map is that of its saved map
@@ -116,7 +117,7 @@ def teach(args: argparse.Namespace) -> int:
 
 @command(NAME, NO_WAIT, ROBOT, SETTINGS)
 def repeat(args: argparse.Namespace) -> int:
-    """Repeat a route, from where the robot is on it; exit code 1: its end was not reached.
+    """Repeat a route, from where the robot is on it; exit code 1: its end was not reached, 2: it refuses.
 
     --reverse               from its end to its start
     --loops N=1 1..10000    a closed route is driven in rounds, another there and back, N times in all

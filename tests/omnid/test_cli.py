@@ -85,6 +85,7 @@ def test_the_shell_completes_commands_and_options(tmp_path: Path) -> None:
             "unknown argument --metod: did you mean --method? see omnid replay --help",
         ),
         (["replay", "x", "--method", "papr"], "--method 'papr': did you mean paper? see omnid replay --help"),
+        (["web", "--port", "1"], "unknown argument --port: see omnid web --help"),
         (["eval", "a", "b", "c"], "unknown argument c: see omnid eval --help"),
         (
             ["calibrate", "drive", "a", "--distance-m", "nan"],
@@ -102,6 +103,16 @@ def test_a_wrong_word_is_named_with_what_was_expected(
     with pytest.raises(SystemExit) as ended:
         main(words)
     assert ended.value.code == 2 and capsys.readouterr().err == f"omnid: {line}\n"
+
+
+@pytest.mark.parametrize(("number", "code"), [("SIGINT", 130), ("SIGTERM", 143)])
+def test_a_signal_while_modules_are_loaded_ends_the_program_quietly(number: str, code: int) -> None:
+    script = (
+        f"import signal\nfrom omnid import cli\ncli.import_module = lambda _: signal.raise_signal(signal.{number})\n"
+        "cli.main(['replay', 'log.mcap'])"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (code, "", "")
 
 
 @pytest.mark.parametrize(("wanted", "found"), [(None, "1"), ("2", "2")])
