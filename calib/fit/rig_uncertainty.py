@@ -46,7 +46,8 @@ class DriveUncertainty:
         return 2 * float(np.rad2deg(self.heading_rad_m))
 
     def __str__(self) -> str:
-        return f"scale uncertain by {100 * self.scale:.2g} %, heading by {np.rad2deg(self.heading_rad_m):.2g} degree/m"
+        heading_deg_m = float(np.rad2deg(self.heading_rad_m))
+        return f"scale uncertain by {100 * self.scale:.2g} %, heading by {heading_deg_m:.2g} degree/m (one sigma)"
 
 
 def drive_uncertainty(rig: Rig) -> DriveUncertainty | None:

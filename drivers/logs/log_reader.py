@@ -242,7 +242,7 @@ class LogReader:
             if self._bits == SAMPLE_BITS[-1] and is_deep(frame) and gray(frame).max() < 2**12 >> 8:
                 self.warnings.append(
                     f"the first image of {topic!r} has samples of 16 bits, none above {2**12 - 1}: of a camera of 10 "
-                    "or 12 bits? State cameras.bits, or --bits"
+                    "or 12 bits? Name them: --set cameras.bits=12, in `omnid calibrate rig` and `drive` --bits 12"
                 )
 
     def _of_another_clock(self) -> Iterator[str]:

@@ -215,7 +215,7 @@ def accuracy_warnings(structures: Sequence[ResidualStructure], drives: DriveUnce
         return []
     cost = (
         f"drives may be wrong by {100 * drives.length_part:.2g} % of their length and by {drives.heading_deg_m:.2g} "
-        "degree of heading per metre"
+        "degree of heading per metre (two sigmas)"
     )
     advice = ": do not use it where that matters" if drives.length_part >= MISFIT_PART else ""
     lines = [f"{line}; {cost}{advice}" for line in misfits]

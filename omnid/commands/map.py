@@ -71,9 +71,12 @@ def build(args: argparse.Namespace) -> int:
         config = replace(config, places=replace(config.places, map=str(new)))
         replayed = ReplayOptions(rig=args.rig, settings=args.config, progress=None if args.quiet else Progress())
         for log in args.logs:
-            result = run_log(log, config, replayed)
+            try:
+                result = run_log(log, config, replayed)
+            except OmnidError as error:
+                raise OmnidError(str(error).replace(str(new), str(args.output))) from error
             for warning in result.warnings:
-                options.warn(f"{log}: {warning}")
+                options.warn(f"{log}: {warning.replace(str(new), str(args.output))}")
             if result.signal:
                 options.failed(f"interrupted: {args.output} was not written")
                 return 128 + result.signal

@@ -51,7 +51,7 @@ class RunPlaces:
         if self.is_extended:
             check_outputs([("--map", path)], [])
         if self.is_extended and not path.exists():
-            log(logging.INFO, f"{path}: there is no such map: this run begins a new one")
+            log(logging.INFO, f"{path.name}: there is no such map: this run begins a new one")
         elif self.places is not None:
             self.places, rig = read_places(path, self.places)
             # 2. It must fit the rig, and is adapted to the panoramas of this run.

@@ -99,7 +99,7 @@ class Decoder:
         if frame.camera not in self._fitted:
             raise OmnidError(
                 f"the {frame.camera} camera's images are {found[0]}x{found[1]} px, the rig's are {expected[0]}x"
-                f"{expected[1]} px: give the rig of these cameras with --rig"
+                f"{expected[1]} px: it is that of other cameras; name the rig.toml of these, or calibrate them"
             )
         self.other_size += 1
         self._skip(f"{frame.camera} frame {frame.seq} is {found[0]}x{found[1]} px, unlike those before")

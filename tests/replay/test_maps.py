@@ -7,6 +7,7 @@ import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import gettempdir
 
 import numpy as np
 import pytest
@@ -30,6 +31,7 @@ from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import STORE
 from tests.ports import free_port
 from tests.replay.command import Command
+from tests.replay.edited import dark, images, save
 from tests.replay.live import Daemon, Operator, answers, command_line, started
 from tests.simulation import build, write_log
 from tests.simulation.rigs import with_upper_rotated
@@ -91,8 +93,15 @@ def test_a_second_run_is_localised_from_its_first_second_and_extends_the_map(
 def test_a_map_that_does_not_exist_is_made(omnid: Command, scene: Path, built: Path, tmp_path: Path) -> None:
     new = tmp_path / "new.omap"
     result = omnid.replay(scene / "log.mcap", "--map", new, rig=scene / "rig.toml")
-    assert result.code == 0 and f"{new}: there is no such map: this run begins a new one" in result.err
+    assert result.code == 0 and f"{new.name}: there is no such map: this run begins a new one" in result.err
     assert new.read_bytes() == built.read_bytes()
+
+
+def test_a_build_that_fails_names_the_file_of_the_user(omnid: Command, scene: Path, tmp_path: Path) -> None:
+    log, place = save(tmp_path / "log.mcap", map(dark, images(scene / "log.mcap")[:8])), tmp_path / "place.omap"
+    code, _, err = omnid("map", "build", log, "-o", place, "--rig", scene / "rig.toml", "--quiet")
+    assert code == 1 and f"{place}: no keyframe was found: no map was written" in err
+    assert "place.omap: there is no such map" in err and f"{gettempdir()}/tmp" not in err
 
 
 def test_localize_only_leaves_the_map_as_it_is_and_a_rig_that_was_calibrated_again_warns(

@@ -63,5 +63,5 @@ def test_a_focal_length_changes_the_scale_as_much_as_it_does_in_the_odometry() -
     found = drive_uncertainty(replace(rig, covariance=RigCovariance.of_matrix(("lower fu", "lower fv"), J)))
     assert found is not None
     assert found.scale == pytest.approx(0.0049, rel=0.25)
-    assert str(found).startswith("scale uncertain by 0.") and str(found).endswith("degree/m")
+    assert str(found).startswith("scale uncertain by 0.") and str(found).endswith("degree/m (one sigma)")
     assert drive_uncertainty(rig) is None

@@ -127,6 +127,7 @@ def test_samples_above_the_stated_bits_are_white_and_black_images_are_a_question
     assert [int(gray(frame)[0, 0]) for frame in frames if frame.camera == "upper"] == [250, 255]
     _, reader = read(path)
     assert len(reader.warnings) == 2 and "none above 4095: of a camera of 10 or 12 bits" in reader.warnings[0]
+    assert "--set cameras.bits=12, in `omnid calibrate rig` and `drive` --bits 12" in reader.warnings[0]
 
 
 @pytest.mark.parametrize(

@@ -141,7 +141,7 @@ def lines(scale: float | None, *structures: ResidualStructure) -> list[str]:
 def test_a_misfit_is_named_by_what_it_costs(scale: float, part: str) -> None:
     (line,) = lines(scale, NOISE, MISFIT)
     assert line.startswith("upper camera: ") and "systematic residuals of 0.140 px" in line
-    assert f"wrong by {part} of their length and by 0.02 degree of heading per metre" in line
+    assert f"wrong by {part} of their length and by 0.02 degree of heading per metre (two sigmas)" in line
     assert line.endswith("do not use it where that matters") == (scale >= 0.0015)
 
 
