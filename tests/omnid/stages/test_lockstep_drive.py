@@ -129,10 +129,10 @@ def stops(rig: Rig, images: list[tuple[np.ndarray, np.ndarray]], commands: list[
         stamp_ns = START_NS + number * PERIOD_NS
         pose = controller_pose(odometry.process(stamp_ns, *pair), np.eye(4))
         judged.add_pose(stamp_ns, pose.state, pose.motion, pose.resets)
-        yield judged.slowed_by, judged._monitor.reason
+        yield judged.slowed_by, judged.monitor.reason
         for tick in range(TICKS):
             now_ns = stamp_ns + tick * PERIOD_NS // TICKS
-            judged.add_command(now_ns, command)
+            judged.monitor.add_command(now_ns, command)
             judged.add_report(now_ns, MotorReport(Motion(command.velocity_mps, command.yaw_rate_radps)))
 
 
