@@ -32,7 +32,7 @@ from omnid.core.navigation.requests import (
 )
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import MapPosition, Situation, WheelState, refusal_to_drive
-from omnid.core.navigation.surroundings import Surroundings
+from omnid.core.navigation.surroundings import Surroundings, near_ends
 from omnid.errors import OmnidError
 from omnid.messages import NavigationPlan, NavigationUpdate, ObstacleScan, OdometryUpdate, PlaceUpdate, RequestAnswer
 from omnid.stages.routes import Routes, refusal_while_teaching
@@ -58,7 +58,7 @@ class NavigationStage:
         routes: Routes,
     ) -> None:
         """collision: the outline of the base."""
-        self._settings, self._T_base_rig, self._routes = settings, T_base_rig, routes
+        self._settings, self._collision, self._T_base_rig, self._routes = settings, collision, T_base_rig, routes
         self._T_rig_base = se3.inverse(T_base_rig)
         self._wheels = WheelState(False, False)
         self._navigator = Navigator(settings, collision)
@@ -128,7 +128,9 @@ class NavigationStage:
         if self._navigator.drive is None or scan is None or scan.grid is None or not is_young:
             return None
         if before is None or before.stamp_ns != scan.stamp_ns:
-            self._around = Surroundings(scan.grid, scan.moving, scan.stamp_ns, planar(scan.T_odom_base), before)
+            pose = planar(scan.T_odom_base)
+            ends = near_ends(pose, scan.ranges_m, scan.free_m, self._collision)
+            self._around = Surroundings(scan.grid, scan.moving, scan.stamp_ns, pose, before, ends)
         return self._around
 
     def _place(self, update: PlaceUpdate) -> None:

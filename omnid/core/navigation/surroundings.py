@@ -3,7 +3,9 @@
 What moves keeps its velocity (van den Berg, Lin, Manocha 2008, "Reciprocal velocity obstacles", ICRA: the usual
 assumption over some seconds). It is no part of the grid here, but an obstacle where the base would meet it.
 Floor that is not known has a cost, as it may be seen when the base comes near; where it was not seen from near, as
-behind a plain surface, coming nearer shows no more: that counts as an obstacle until it is seen.
+behind a plain surface, coming nearer shows no more: that counts as an obstacle until it is seen. So does the end of a
+way on which small probabilities of things add up to more than the risk, though each of its cells is free: the collision
+monitor lets nobody pass there.
 """
 
 from __future__ import annotations
@@ -16,11 +18,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from omnid.core.control.collision_geometry import Outline
+from omnid.core.control.collision_monitor import CollisionSettings, unknown_ends
 from omnid.core.obstacles.grid import OCCUPIED, UNKNOWN, FloorGrid
 from omnid.core.obstacles.grid_kernels import CELL_M
 from omnid.core.obstacles.moving_tracker import MovingObstacle
 
 Array = NDArray[np.float64]
+Ranges = NDArray[np.floating]
 Flags = NDArray[np.bool_]
 
 FAR_M: Final = 1e3  # distance where there is no obstacle
@@ -45,8 +50,12 @@ class Surroundings:
         stamp_ns: int = 0,
         pose: Array | None = None,
         before: Surroundings | None = None,
+        ends: Array | None = None,
     ) -> None:
-        """stamp_ns, pose (3,): of the pair. before: surroundings of an earlier pair, in the same odom."""
+        """stamp_ns, pose (3,): of the pair. before: surroundings of an earlier pair, in the same odom.
+
+        ends (N, 2): where near ways end, by `near_ends`.
+        """
         self.grid, self.stamp_ns, states = grid, stamp_ns, grid.states
         self._state = np.array([(m.x_m, m.y_m, m.vx_mps, m.vy_mps) for m in moving]).reshape(-1, 4)
         self._radius_m = np.array([m.radius_m for m in moving])
@@ -66,11 +75,13 @@ class Surroundings:
             y, x = CELL_M * np.indices(states.shape) + middle[::-1, None, None]
             is_vain = np.hypot(x, y) < NEAR_M
         if before is not None:
-            rows, columns = grid.at(before._vain)
-            inside = (np.minimum(rows, columns) >= 0) & (np.maximum(rows, columns) < len(states))
-            is_vain[rows[inside], columns[inside]] = True
+            is_vain |= self._cells(before._vain)
         is_vain &= is_patch
         self._vain: Array = self._places(is_vain)
+        # 3. Where ways end among cells each of which is free.
+        if ends is not None:
+            is_end = self._cells(ends)
+            self.is_unknown, is_vain = self.is_unknown | is_end, is_vain | is_end
         self.closed_m = distances_m(is_taken | is_vain)  # of each cell to what stands, or was not seen from near
 
     @property
@@ -81,6 +92,14 @@ class Surroundings:
     def _places(self, flags: Flags) -> Array:
         """Return the middles (N, 2) of the cells that are set, row by row."""
         return np.asarray(self.grid.corner_m + CELL_M * (np.argwhere(flags)[:, ::-1] + 0.5))
+
+    def _cells(self, points: Array) -> Flags:
+        """Return the cells in which points (N, 2) are."""
+        flags = np.zeros(self.grid.occupied.shape, bool)
+        rows, columns = self.grid.at(points)
+        inside = (np.minimum(rows, columns) >= 0) & (np.maximum(rows, columns) < len(flags))
+        flags[rows[inside], columns[inside]] = True
+        return flags
 
     def room_at(self, points: Array, of: Array | None = None) -> Array:
         """Return the distance of points (N, 2) to what stands nearest, FAR_M outside the grid; of: other distances."""
@@ -126,6 +145,25 @@ class Surroundings:
             leaves = np.minimum.accumulate(np.append(True, np.diff(near_m) > -ROUNDING_M))
             is_blocked &= ~(leaves & np.minimum.accumulate(is_blocked))
         return float(_ways_m(path)[np.argmax(is_blocked)]) if is_blocked.any() else math.inf
+
+
+def near_ends(pose: Array, ranges_m: Ranges, free_m: Ranges, collision: CollisionSettings) -> Array:
+    """Return the places (N, 2) near a pose (3,) where floor in view ends for the collision monitor, without a surface.
+
+    ranges_m, free_m (S,): of a scan from there. collision: the outline, in which nothing ends, and the distance within
+    which an end belongs to a surface, in any direction: along a wall, no ray shows floor up to it.
+    """
+    outline = Outline(collision.front_m, collision.rear_m, collision.half_width_m)
+    ends = unknown_ends(ranges_m.tolist(), free_m.tolist(), collision.stop_m)
+    azimuths = (np.arange(len(ranges_m)) + 0.5) * (math.tau / len(ranges_m)) - math.pi
+    directions = np.column_stack([np.cos(azimuths + pose[2]), np.sin(azimuths + pose[2])])
+    sectors = np.array([end.sector for end in ends], np.intp)
+    edges_m = [outline.edge_m(math.cos(azimuth), math.sin(azimuth)) for azimuth in azimuths[sectors]]
+    away_m = np.maximum([end.free_m for end in ends], edges_m)
+    is_seen, places = np.isfinite(ranges_m), away_m[:, None] * directions[sectors]
+    surfaces = ranges_m[is_seen, None] * directions[is_seen]
+    from_surface_m = np.linalg.norm(places[:, None] - surfaces, axis=2).min(axis=1, initial=math.inf)
+    return np.asarray(pose[:2] + places[(away_m < NEAR_M) & (from_surface_m > collision.stop_m)])
 
 
 def _ways_m(path: Array) -> Array:

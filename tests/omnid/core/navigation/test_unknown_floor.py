@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
@@ -10,10 +12,10 @@ from omnid.core.navigation.navigator import Navigator
 from omnid.core.navigation.path import DrivePath, drive_path, goal_path
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.situation import Situation
-from omnid.core.navigation.surroundings import Surroundings
+from omnid.core.navigation.surroundings import Surroundings, near_ends
 from omnid.navigation_state import NavigationState
 from tests.omnid.core.navigation.driven_base import DrivenBase, Floor
-from tests.omnid.core.navigation.test_planner import SETTINGS, Boxes, clearance_m
+from tests.omnid.core.navigation.test_planner import OUTLINE, SETTINGS, Boxes, clearance_m
 
 SEEN_M = 2.0  # Floor is seen so far.
 
@@ -23,8 +25,10 @@ class BaseAmongPatches(DrivenBase):
 
     has_scan = True
 
-    def __init__(self, patches: Boxes, path: DrivePath | None = None) -> None:
+    def __init__(self, patches: Boxes, path: DrivePath | None = None, occupied: float = math.nan) -> None:
+        """occupied: probability of a thing in each cell that no scan has shown to be free."""
         super().__init__(Navigator(SETTINGS), 1)
+        self.occupied = occupied
         self.boxes, self.floor, self.around = patches, Floor(), None
         self.navigator.start("goal", NavigationFrame.ODOM, [path or goal_path(self.pose, (5.0, 0.0), 0.0)], self.seen())
 
@@ -33,14 +37,18 @@ class BaseAmongPatches(DrivenBase):
         free_m, ranges_m = np.minimum(self.boxes.scan(self.pose), SEEN_M), np.full(360, np.inf)
         self.law.take(ControllerScan(now.stamp_ns, tuple(ranges_m.tolist()), tuple(free_m.tolist())))
         grid = self.floor.grid(self.pose, ranges_m, free_m)
-        self.around = Surroundings(grid, (), now.stamp_ns, self.pose, self.around)
+        grid.occupied[np.isnan(grid.occupied)] = self.occupied
+        ends = near_ends(self.pose, ranges_m, free_m, OUTLINE)
+        self.around = Surroundings(grid, (), now.stamp_ns, self.pose, self.around, ends)
         return now._replace(around=self.around)
 
 
 @pytest.mark.hazard("H31")
+@pytest.mark.parametrize("occupied", [math.nan, 0.05], ids=["unknown", "each cell free"])
 @pytest.mark.parametrize("path", [None, drive_path([(0.0, 0.0), (5.0, 0.0)], 0.0)], ids=["goal", "path"])
-def test_a_patch_that_stays_unknown_is_passed_beside_it(path: DrivePath | None) -> None:
-    base = BaseAmongPatches(Boxes((2.4, -0.15, 2.7, 0.2)), path)
+def test_a_patch_that_closes_the_way_is_passed_beside_it(path: DrivePath | None, occupied: float) -> None:
+    """Its cells are unknown, or each of them is free and only a way across them has more than the risk."""
+    base = BaseAmongPatches(Boxes((2.4, -0.15, 2.7, 0.2)), path, occupied)
     assert base.run(90, rest_s=0.3).state is NavigationState.REACHED
     assert any(sample.navigation.state is NavigationState.AVOIDING for sample in base.samples)
     assert clearance_m(base) > 0.0
