@@ -185,7 +185,8 @@ class RecordFile(LogFile, ByteSource):
         ends = [record.end for record in self._records(self, last.end, data_end)] or [last.end]
         if summary_at is None or last.kind not in _ENDS or ends[-1] != data_end:
             end = min(last.end, self.size)
-            self.cut = f"the log {self.name!r} is cut or corrupt after byte {end} of {self.size}: used the data before"
+            used = ": used the data before" if any(map(len, found)) else ""
+            self.cut = f"the log {self.name!r} is cut or corrupt after byte {end} of {self.size}{used}"
         return np.concatenate(found)
 
     def _with_jumps(self, *, is_closed: bool) -> Iterator[Record]:

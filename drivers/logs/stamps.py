@@ -9,7 +9,8 @@ the header is the better one, unless it is not set, does not advance, or counts 
    minus time of logging) changes where a clock was set. The images after it are a new segment, whose stamps are moved
    so that time runs on, as the times of logging do (`running_on`).
 3. Of other images, those have the time of logging, moved by the usual delay, whose header is not set, repeats the one
-   before, or lies far from that time; one that was logged late, between others, keeps its header.
+   before, or lies far from that time; one that was logged late, between others, keeps its header. Where that is so
+   for most images between two runs, or headers run back there, all of these have it: one clock for a stretch.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from typing import Final, Literal, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.errors import DriverError
 from drivers.frame import CAMERAS, Camera
 from drivers.logs.log import FEWEST_IN_ORDER, LONGEST_STEP, ClockStep, Times, running_on
 
@@ -49,18 +51,26 @@ class ImageTimes:
     def __init__(
         self, images: Mapping[Camera, LoggedImages], source: TimeSource = "auto", log_steps: Sequence[ClockStep] = ()
     ) -> None:
-        """log_steps: those of the times of logging."""
+        """log_steps: those of the times of logging. DriverError where no camera can have taken the images so fast."""
         self.by_log: Counter[str] = Counter()  # images with the time of logging, by what is wrong with their headers
         self.stamps_ns: dict[Camera, Times] = {camera: of_camera.log_ns for camera, of_camera in images.items()}
         self._steps, self._shifts_ns, self._delay_ns = [*log_steps], {0}, 0  # the latter two of the lower camera
+        self._apart_ns = 0.0  # clocks of the cameras, where it is half a period or more
         # 1. What serves as the stamp.
         some = slice(FIRST_IMAGES)
         first = [LoggedImages(one.header_ns[some], one.log_ns[some], one.repeats[some]) for one in images.values()]
         fault, has_log = _judged([one for one in first if len(one.log_ns) > 1])
         is_auto = source == "auto"
+        step_ns = min((_step_ns(one.header_ns) for one in first), default=0.0)
+        log_us = min((_step_ns(one.log_ns) for one in first), default=0.0) / 1000
+        if is_auto and not has_log and 0 < step_ns < SHORTEST_STEP_NS:
+            raise DriverError(
+                f"the images are {step_ns / 1000:g} us apart by their headers, {log_us:g} us by the times of "
+                'logging: were microseconds written as nanoseconds? log.time = "header" reads them as they are'
+            )
         self._source = ("log" if fault and has_log else "header") if is_auto else source
         self._is_old = self._source == "header" and any(
-            0 < np.median(one.header_ns) < EPOCH_NS < one.log_ns.min() for one in first if len(one.log_ns)
+            0 < one.header_ns.max() < EPOCH_NS < one.log_ns.min() for one in first if len(one.log_ns)
         )
         # 2. The stamps.
         if self._source == "log":
@@ -75,6 +85,10 @@ class ImageTimes:
                 if camera == CAMERAS[0]:
                     self._shifts_ns, self._delay_ns = found.shifts_ns, found.delay_ns
             self._steps.sort()
+            delays = [self.stamps_ns[camera] - images[camera].log_ns for camera in CAMERAS]
+            if is_auto and min(map(len, delays)) > 1:  # A recorder can only be late: the least delay counts as well.
+                apart_ns = min(abs(float(usual(delays[1]) - usual(delays[0]))) for usual in (np.median, np.max))
+                self._apart_ns = apart_ns if 2 * apart_ns >= min(map(_step_ns, self.stamps_ns.values())) else 0.0
         else:
             # The times of logging say nothing: headers that step back run on by themselves.
             sizes = [len(images[camera].log_ns) for camera in CAMERAS]
@@ -115,17 +129,29 @@ class ImageTimes:
                 f"the clock of the images was set {way} by {abs(size_ns) * 1e-9:.3f} s {at_s:.3f} s after the first "
                 f"one{more}: the images after it are a new segment, whose stamps are moved so that time runs on"
             )
+        if self._apart_ns:
+            yield (
+                f"the clocks of the cameras differ by {self._apart_ns * 1e-9:.3f} s, half a period or more: images of "
+                'different moments make pairs, which do not fit the rig; correct the clocks, or take log.time = "log"'
+            )
+        lower, upper = (np.sort(self.stamps_ns[camera]) for camera in CAMERAS)
+        steps_ns, period_ns = np.diff(lower), round(_step_ns(lower))
+        is_empty = np.searchsorted(upper, lower[:-1] + period_ns) >= np.searchsorted(upper, lower[1:] - period_ns)
+        for at in np.flatnonzero(is_empty & (steps_ns > max(STEP_NS, FIRST_IMAGES * period_ns)))[:1]:
+            yield f"{steps_ns[at] * 1e-9:.1f} s without images after image {at + 1}: a pause, or a clock set forward"
 
 
 def _judged(cameras: Sequence[LoggedImages]) -> tuple[str, bool]:
     """Return what is wrong with all headers, by the first images of each camera, and whether the log times serve."""
     headers, logged = [images.header_ns for images in cameras], [images.log_ns for images in cameras]
     has_log = bool(cameras) and all(_step_ns(times) >= SHORTEST_STEP_NS for times in logged)
-    delays_ns = [round(float(np.median(images.header_ns - images.log_ns))) for images in cameras]
     if any(np.count_nonzero(header == 0) > len(header) / 2 for header in headers):
         return "are 0", has_log
-    if any(_step_ns(header) < SHORTEST_STEP_NS for header in headers):
-        return "do not advance", has_log
+    if (step_ns := min(map(_step_ns, headers), default=SHORTEST_STEP_NS)) < SHORTEST_STEP_NS:
+        return f"are {step_ns / 1000:g} us apart" if step_ns else "do not advance", has_log
+    if has_log and any(_runs_back(header[header > 0]) for header in headers):
+        return "run back", has_log
+    delays_ns = [round(float(np.median((h - log)[h != 0]))) for h, log in zip(headers, logged, strict=True)]
     if len(cameras) == len(CAMERAS) and abs(delays_ns[0] - delays_ns[1]) > STEP_NS and has_log:
         return f"are {abs(delays_ns[0] - delays_ns[1]) * 1e-9:.3f} s apart between the cameras", has_log
     # Times of logging that run at another rate, as those of a conversion, tell nothing about the headers.
@@ -181,11 +207,17 @@ class _Segments:
             is_taken = taken[np.searchsorted(taken, stamps - round(period / 2))] < stamps + period / 2
             is_taken |= stamps < taken[0] - LONGEST_STEP * period
             usual = min(STEP_NS, max(period, 2 * np.ptp(lateness))) if regular else STEP_NS
-            for fault, is_so in (
-                ("lie ahead of the log", apart > usual),
-                ("lie long before the log", ((apart < -STEP_NS) & is_alone) | ((apart < -usual) & is_taken)),
-            ):
-                wrong[fault] = np.isin(np.arange(len(header_ns)), used[is_so & ~is_regular])
+            is_ahead = ~is_regular & (apart > usual)
+            is_before = ~is_regular & (((apart < -STEP_NS) & is_alone) | ((apart < -usual) & is_taken))
+            replaced, is_mixed = is_ahead | is_before, np.zeros(len(log), np.bool_)
+            mixed = np.where(replaced, log + self.delay_ns, stamps)
+            for begin, end in np.flatnonzero(np.diff(is_regular, prepend=True, append=True)).reshape(-1, 2):
+                part = slice(begin, end)
+                is_most = np.mean(replaced[part]) >= 1 / 2 or _runs_back(header[part])
+                is_mixed[part] = is_most and replaced[part].any() and (np.diff(mixed[part]) < 0).any()
+            for fault, is_so in (("lie ahead of the log", is_ahead), ("lie long before the log", is_before)):
+                wrong[fault] = np.isin(np.arange(len(header_ns)), used[is_so & ~is_mixed])
+            wrong["run back or jump"] = np.isin(np.arange(len(header_ns)), used[is_mixed])
         # 4. The stamps.
         self.faults = Counter({fault: int(np.count_nonzero(is_so)) for fault, is_so in wrong.items()})
         self.stamps_ns = log_ns + self.delay_ns
@@ -200,6 +232,11 @@ def _is_regular(header: Times, log: Times) -> bool:
         return False
     taken_ns, logged_ns = int(header[-1] - header[0]), int(log[-1] - log[0])
     return taken_ns < FASTEST * logged_ns and logged_ns < FASTEST * taken_ns
+
+
+def _runs_back(times: Times) -> bool:
+    """True for times, in the order of logging, most of which are before the one before."""
+    return len(times) > 1 and bool(np.median(np.diff(times)) < 0 and times[-1] < times[0])
 
 
 def _shifted(header_ns: Times, expected_ns: Times, shifts_ns: set[int]) -> Times:

@@ -171,9 +171,9 @@ def input_warnings(pairing: Synchronise, rig: RigHealth, statistics: RunStatisti
     closest_ms = f"{stats['closest_miss_ms']:.3f} ms apart"
     # 1. Images and their stamps.
     if stats["_fault"]:
-        yield f"{stats['broken']} images could not be decoded; the first: {stats['_fault']}"
+        yield f"{stats['broken']} images could not be used; the first: {stats['_fault']}"
     if not stats["pairs"] and math.isnan(stats["closest_miss_ms"]):
-        yield "no pair of images: one camera or both have none, see the drops below"
+        yield "no pair of images: one camera or both have none that can be used, see the drops below"
     elif not stats["pairs"]:
         yield (
             f"no pair of images: the stamps of the two cameras are at least {closest_ms}, {tolerance}: increase it, or "

@@ -120,9 +120,9 @@ class Session:
 
     def geometry(self, rig: Rig, frames: Iterable[Frame]) -> Geometry:
         """Return the geometry of the rig; its missing masks are found in the frames, which are read only for that."""
-        rig = with_rims(rig, frames)
+        given, rig = rig, with_rims(rig, frames)  # the same where no image can be decoded, which the run reports
         for name, camera in (("lower", rig.lower), ("upper", rig.upper)):
-            if camera.mask is None and not sees_directly(camera.camera):
+            if rig is not given and camera.mask is None and not sees_directly(camera.camera):
                 self.warn(
                     f"no mirror rim was found in the first images of the {name} camera: the largest disc is used; "
                     f"the mask can be given in the rig's file under [{name}.mask]"

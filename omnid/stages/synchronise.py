@@ -235,7 +235,7 @@ class Synchronise:
         self._cameras: dict[Camera, _Camera] = {name: _Camera() for name in CAMERAS}
         self._fixed_ns = round(config.tolerance_ms * 1e6)  # 0: none
         self._closest_miss_ns = math.nan  # smallest gap between images of both cameras that made no pair
-        self._pairs = 0
+        self._pairs = self._repeating = 0  # pairs made, images of those that were left out
         self._use_repeated = config.repeated_images == "use"
         self.skew = Skew()
         self.motion = MotionInbox(R_base_imu)
@@ -277,10 +277,8 @@ class Synchronise:
             {name: getattr(camera, field) for name, camera in self._cameras.items()}
             for field in ("arrived", "unpaired", "period_ns")
         )
-        other_size = self._decode.other_size
-        return image_loss(
-            read, arrived, unpaired, periods_ns, undecodable=self._decode.broken - other_size, other_size=other_size
-        )
+        size, broken, repeated = self._decode.other_size, self._decode.broken - self._decode.other_size, self._repeating
+        return image_loss(read, arrived, unpaired, periods_ns, undecodable=broken, other_size=size, repeated=repeated)
 
     def process(self, message: Frame | MotionSample) -> FramePair | None:
         """Return the pair that a frame completes; None where the frame waits, is broken or shows nothing new."""
@@ -329,6 +327,7 @@ class Synchronise:
         self.skew.add(upper.stamp_ns - lower.stamp_ns)
         repeated = [camera.repeated.add(image) for camera, image in zip(self._cameras.values(), images, strict=True)]
         if any(repeated) and not self._use_repeated:
+            self._repeating += len(frames)
             return None
         # 3. The pair.
         self._pairs += 1
@@ -350,6 +349,7 @@ def image_loss(
     *,
     undecodable: int = 0,
     other_size: int = 0,
+    repeated: int = 0,
 ) -> str:
     """Return one line about images of a log that make no pair, with the reasons; empty where these are a tenth or less.
 
@@ -365,6 +365,7 @@ def image_loss(
         "without a partner": sum(unpaired.values()) - by_chance,
         "not decodable": read["broken"] + undecodable,
         "of another size": other_size,
+        "repeated or with a partner that is": repeated,
         "in corrupt records": read["unreadable"],
         "with the stamp of the one before": equal,
     }

@@ -373,6 +373,7 @@ def test_recordings_of_two_runs_are_not_one_log(tmp_path: Path) -> None:
         (b"\x1f\x8b" + bytes(50), "is compressed, but cut or corrupt"),
         (zstandard.compress(b"PK\x03\x04" + bytes(50)), r"starts with b'PK"),
         (MAGIC, "`omnid log info`"),
+        (MAGIC + bytes(4), "is cut or corrupt after byte 8 of 12$"),
     ],
 )
 def test_refuses_other_files_in_one_line(tmp_path: Path, data: bytes, message: str) -> None:

@@ -45,11 +45,11 @@ def test_names_are_nanoseconds_or_seconds_with_a_decimal_point(tmp_path: Path, s
 def test_a_list_holds_the_seconds_of_numbered_images(tmp_path: Path, where: str, name: str) -> None:
     """In the order of numbers, 10 after 9; the seconds are exact."""
     folder = write_folders(tmp_path / "images", pairs(PAIRS), lambda stamp_ns: f"frame{NUMBERS[stamp_ns]}")
-    lines = ["# seconds", "1.7e+09", *(f"1700000000.{number:09d}" for number in range(1, PAIRS))]
+    lines = ["# seconds", "1.7e+09", *(f"1700000000.{number:02d}{number:07d}" for number in range(1, PAIRS))]
     for camera in ["lower", "upper"] if where else [""]:
         (folder / camera / name).write_text("\r\n".join(lines) + "\n", "utf-8-sig")  # as editors of Windows do
     found, _ = read(folder)
-    assert [frame[2] for frame in found if frame[0] == "lower"] == [START_NS + number for number in range(PAIRS)]
+    assert [frame[2] for frame in found if frame[0] == "lower"] == [START_NS + 10_000_001 * n for n in range(PAIRS)]
     assert [frame[3] for frame in found if frame[0] == "lower"] == [frame[3] for frame in expected(PAIRS)[::2]]
     (folder / (where or ".") / name).write_text("1.0\n")
     with pytest.raises(DriverError, match="12 images, and its list of stamps 1 lines"):

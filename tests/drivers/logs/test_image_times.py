@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 import pytest
 
+from drivers.errors import DriverError
 from drivers.frame import Frame
 from drivers.logs.log_reader import LogReader
 from drivers.logs.topics import MotionTopics
@@ -77,7 +78,10 @@ UNUSABLE: Final[dict[str, tuple[Times, str]]] = {
     "all equal": (lambda topic, number, ns: START_NS, "for 80 images: the stamps of their headers do not advance"),
     "two and two equal": (lambda topic, number, ns: ns - number % 2 * STEP_NS, "do not advance"),
     "whole seconds": (lambda topic, number, ns: ns // S * S, "do not advance"),
-    "microseconds for nanoseconds": (lambda topic, number, ns: ns // 1000, "do not advance"),
+    "microseconds for nanoseconds": (lambda topic, number, ns: ns // 1000, "headers are 100 us apart"),
+    "backwards": (lambda topic, number, ns: 2 * START_NS - ns, "for 80 images: the stamps of their headers run back"),
+    "ahead, then back": (lambda topic, n, ns: ns if n < HALF else 2 * taken(topic, HALF) + S - ns, "for 40 .* or jump"),
+    "every third zero": (lambda topic, number, ns: ns * (number % 3 > 0), "for 28 images: .* are 0"),
     "stopped on the way": (lambda topic, number, ns: min(ns, taken(topic, HALF)), "for 38 images"),
     "two clocks": (lambda topic, number, ns: ns - 7 * S * (topic == LOWER), "7.000 s apart between the cameras"),
     "one of the future": (lambda topic, number, ns: ns + 3600 * S * (number == HALF), "for 2 images: .* lie ahead"),
@@ -111,7 +115,8 @@ def test_a_clock_that_is_set_begins_a_segment(tmp_path: Path, write: object, siz
     assert shown(frames) == AS_TAKEN
     steps = np.diff([frame.stamp_ns for frame in frames if frame.camera == "lower"])
     if both and size_s > 0:
-        assert not warnings and steps.max() == size_s * S + STEP_NS, "as where nothing was recorded"
+        assert steps.max() == size_s * S + STEP_NS, "as where nothing was recorded"
+        assert len(warnings) == 1 and f"{size_s}.1 s without images after image 20: " in warnings[0]
         return
     assert (np.abs(steps - STEP_NS) <= DELAY_NS).all()
     way = "back" if size_s < 0 else "forward"
@@ -153,6 +158,15 @@ def test_cameras_with_two_clocks_are_told_where_their_times_of_logging_are_no_be
     clock: Times = lambda topic, number, ns: ns - 3 * S * (topic == UPPER)  # noqa: E731
     _, warnings = read(write_log(tmp_path / "log.mcap", entries(clock, clock)))
     assert len(warnings) == 1 and "upper camera begin and end 3.0 s before those of the lower one" in warnings[0]
+    _, warnings = read(write_log(tmp_path / "log.mcap", entries(lambda topic, number, ns: ns + 60 * SKEW_NS[topic])))
+    assert len(warnings) == 1 and "the clocks of the cameras differ by 0.060 s, half a period or more" in warnings[0]
+
+
+def test_microseconds_in_headers_and_logging_are_refused(tmp_path: Path) -> None:
+    path = write_log(tmp_path / "log.mcap", entries(lambda topic, number, ns: ns // 1000, lambda t, n, ns: ns // 1000))
+    with pytest.raises(DriverError, match="100 us apart by their headers, 100 us by the times of logging"):
+        read(path)
+    assert read(path, time="header")[0]
 
 
 def test_the_clock_of_one_camera_is_set(tmp_path: Path) -> None:
@@ -197,7 +211,7 @@ def test_times_of_a_conversion_tell_nothing_about_the_stamps(tmp_path: Path) -> 
     stamp: Times = lambda topic, number, ns: ns + 3 * S * (number >= HALF)  # noqa: E731
     logged: Times = lambda topic, number, ns: 2 * START_NS + 2_000_000 * number + SKEW_NS[topic]  # noqa: E731
     frames, warnings = read(write_log(tmp_path / "log.mcap", entries(stamp, logged)))
-    assert shown(frames) == AS_TAKEN and not warnings
+    assert shown(frames) == AS_TAKEN and len(warnings) == 1 and "3.1 s without images" in warnings[0]
     assert frames[-1].stamp_ns == taken(UPPER, COUNT - 1) + 3 * S
 
 
