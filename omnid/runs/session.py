@@ -22,7 +22,7 @@ from omnid.controller.link import ControllerLink
 from omnid.controller.messages import ControllerStart
 from omnid.core.control.collision_monitor import STOP
 from omnid.core.control.control_law import ControllerSettings
-from omnid.core.obstacles.panoramas import FLOOR_FOCAL_PX
+from omnid.core.obstacles.column import FLOOR_FOCAL_PX
 from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.graph import Graph
 from omnid.engine.process import handle_stop_signals

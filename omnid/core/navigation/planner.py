@@ -21,7 +21,7 @@ from omnid.core.navigation.lattice_kernels import HEADINGS, search, wave_front
 from omnid.core.navigation.path import DrivePath, drive_path, straight_leg
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.surroundings import FAR_M, HORIZON_S, MEETING_S, Surroundings, distances_m
-from omnid.core.obstacles.grid_kernels import CELL_M
+from omnid.core.obstacles.grid import CELL_M
 
 Array = NDArray[np.float64]
 

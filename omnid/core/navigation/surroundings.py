@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from omnid.core.control.collision_geometry import Outline
 from omnid.core.control.collision_monitor import CollisionSettings, unknown_ends
-from omnid.core.obstacles.grid import OCCUPIED, UNKNOWN, FloorGrid
-from omnid.core.obstacles.grid_kernels import CELL_M
+from omnid.core.obstacles.grid import CELL_M, OCCUPIED, UNKNOWN, FloorGrid
 from omnid.core.obstacles.moving_tracker import MovingObstacle
 
 Array = NDArray[np.float64]

@@ -10,8 +10,8 @@ steps there, and whether they are known.
    pairs show, over 25 cm, has log-odds of its own.
 3. Hidden Markov prediction: something comes into a cell with a small probability in each pair, so L has a lower bound;
    and what nobody sees may be entered from where nothing is known, at 1.6 m/s by a person, 25 cm wide.
-4. Too near to be seen: known by what is seen past a cell, at the start by one pair, later by n views. What hides the
-   nearest floor in view may stand anywhere before it, unless something is known there.
+4. Too near to be seen: known by what is seen past a cell. What hides the nearest floor in view may stand anywhere
+   before it, unless something is known there.
 5. Who comes: the first thing of a direction, where the floor was free a short while ago.
 """
 
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.mapping.range_scan import SECTORS, azimuths
 from omnid.core.obstacles import grid_kernels as kernels
-from omnid.core.obstacles.grid_kernels import CELL_M
+from omnid.core.obstacles.column import THIN_M
 from omnid.core.obstacles.moving_tracker import Arrivals
 from omnid.core.obstacles.posterior import RayBelief
 
@@ -52,7 +52,7 @@ class GridParameters:
     risk: float = 0.1  # probability of a thing on a way that is free
     walk_mps: float = 1.6  # of who may come where nobody sees
     person_cells: int = 5  # width of who may
-    strut_rad: float = 0.26  # widest part of the view that a strut or a mast hides: nobody does behind it
+    strut_rad: float = 0.26  # widest part of the view that a strut or a mast hides
     person_rad: float = 0.65  # angle of a person nearer than the floor in view: 0.4 m at 0.6 m
     comes: float = 2.0  # by which one pair shows a thing that has come [nats]
     lately_s: float = 3.0  # for how long it counts that a cell was free
@@ -64,6 +64,7 @@ class GridParameters:
     shown_weight: float = 100.0  # and its log-odds by this mean
 
 
+CELL_M: Final = 0.05
 REACH_CELLS: Final = 90  # of the grid, on either side of the cell of the base
 SIDE: Final = 2 * REACH_CELLS + 1
 OWN: Final = slice(REACH_CELLS - 3, REACH_CELLS + 4)  # cells that nothing but the base can be in
@@ -71,6 +72,8 @@ CROSS: Final = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
 SQUARE: Final = np.ones((3, 3), np.uint8)
 SPECK_CELLS: Final = 4
 OPEN_SHARE: Final = 0.9  # of the longest range, from which on a direction is open: few pairs show the last cells
+
+
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2  # states of a cell
 
 
@@ -122,8 +125,8 @@ class ObstacleGrid:
         self._p, self._at_1m = GridParameters(), at_1m
         self._max_range_m = min(max_range_m, REACH_CELLS * CELL_M)
         self._T_rect_base = np.eye(4)
-        self._eye, self._near_m = np.zeros(2), 0.0  # viewpoint in cells of the grid, and the nearest floor in view
         self._cell: NDArray[np.int64] | None = None  # of the base, in odom
+        self._eye, self._near_m = np.zeros(2), 0.0  # viewpoint in cells of the grid, and the nearest floor in view
         self._forget()
 
     @property
@@ -146,33 +149,36 @@ class ObstacleGrid:
 
         No pair would show these again, and a base whose odometry is lost stops, so that they are still about there.
         """
-        y, x = np.indices((SIDE, SIDE)) + 0.5 - self._eye[::-1, None, None]
-        kept, cell, odds = (np.hypot(x, y) * CELL_M < self._near_m) & (self.odds > 0), self._cell, self.odds
+        if self._cell is None:
+            return
+        cell, odds = self._cell, self.odds
+        kept = (self._ranges_m(self._eye) < self._near_m) & (odds > 0)
         self._forget()
         self.odds[kept], self._known[kept], self._cell = odds[kept], 1, cell
 
     def _forget(self) -> None:
         """Forget everything."""
-        self._empty = np.array([self._p.prior, 0, 0, 0, 0, np.inf, np.inf], np.float32)
+        self._empty = np.array([self._p.prior, 0, 0, 0, 0, 0, np.inf, np.inf], np.float32)
         self._layers = np.tile(self._empty[:, None, None], (1, SIDE, SIDE))
         # Log-odds of a thing; evidence of the pair before; mean of what single pairs show; whether a cell is known;
-        # views past it; time since it was free, and since it or the floor past it was seen [s].
-        self.odds, self._before, self._shown, self._known, self._past_views, *times_s = self._layers
-        self._free_s, self._age_s = times_s
+        # views past it; whether the last pair saw floor behind it; time since it was free [s]; and
+        # since it was seen.
+        self.odds, self._before, self._shown, self._known, self._past_views, *others = self._layers
+        self._was_past, self._free_s, self._age_s = others
         self._cell = None
         self._last: tuple[int, Array] | None = None  # stamp and place [m] of the pair before
         self._carry = 0.0
 
     def update(self, stamp_ns: int, T_odom_base: Array, belief: RayBelief) -> GridScan:
         """Add a pair, whose base has the planar pose T_odom_base (4, 4); return what is known."""
-        p, place_m, yaw_rad = self._p, T_odom_base[:2, 3].copy(), float(se3.yaw(T_odom_base))
-        is_first, passed_s, way_m = self._last is None, 0.0, math.inf
+        p, place_m, yaw = self._p, T_odom_base[:2, 3].copy(), float(se3.yaw(T_odom_base))
+        passed_s, way_m = 0.0, math.inf
         if self._last is not None:
             passed_s, way_m = max(stamp_ns - self._last[0], 0) * 1e-9, math.dist(place_m, self._last[1])
-        self._last = stamp_ns, place_m
+        is_first, self._last = self._last is None, (stamp_ns, place_m)
         rho = p.same_place * max(1.0 - way_m / CELL_M, 0.0)
-        corner_m = self._follow(place_m)
-        self._eye, self._near_m = (self.viewpoint(T_odom_base)[:2, 3] - corner_m) / CELL_M, float(belief.ends_m[0])
+        self._follow(place_m)
+        self._eye, self._near_m = self._in_cells(self.viewpoint(T_odom_base)[:2, 3]), float(belief.ends_m[0])
         # 1. Evidence and state of each cell.
         found, states = self._gathered(T_odom_base, belief)
         in_view, past, hidden = (states == one for one in (kernels.IN_VIEW, kernels.SEEN_PAST, kernels.HIDDEN))
@@ -186,27 +192,30 @@ class ObstacleGrid:
         self._shown += np.where(in_view, np.float32(p.shown_rate * (1 - rho)) * (shown - self._shown), 0)
         # 3. What is known: seen, or seen past. What was hidden from the start may look like floor in some pairs: it is
         #    known after so many views past it.
-        self._past_views[past] += p.views if is_first else 1 - rho
+        self._past_views[past] += np.float32(1 - rho)
         self._past_views[observed] = p.views
         self._past_views[hidden & (self._past_views < p.views)] = 0
         self._known[observed | (past & (self._past_views >= p.views))] = 1
         if is_first:
-            self.odds[past & (self.odds < 0)] = p.arrival
+            self._assume_free(yaw, belief)
         # 4. What hides the nearest floor in view, behind which floor was seen before, may stand anywhere before it.
         #    What hides it from the start may stand where it did. And who comes where nobody sees.
-        flooded = self._flooded(hidden & (self._age_s == 0), yaw_rad)
+        flooded = self._flooded(hidden, yaw)
         if not is_first:
             watched = observed | past | (states == kernels.MOSTLY_PAST) | (hidden & (self._known > 0))
-            self._spread_unknown(passed_s, watched)
-        self._known[flooded > 0] = 0
+            self._who_comes(passed_s, watched)
+        self._was_past[:] = past
         self._age_s += np.float32(passed_s)
         self._age_s[observed | past] = 0
+        self._known[flooded > 0] = 0
         # 5. Who has come, and the scan.
         taken = self._taken()
-        arrivals = self._arrivals(passed_s, yaw_rad, taken, in_view & (found[kernels.RATIO] > p.comes), flooded)
+        arrivals = self._arrivals(passed_s, yaw, taken, in_view & (found[kernels.RATIO] > p.comes), flooded)
         self.odds[OWN, OWN], self._known[OWN, OWN], self._shown[OWN, OWN], taken[OWN, OWN] = p.arrival, 1, 0, 0
-        grid = FloorGrid(corner_m, np.where(taken > 1, np.float32(np.nan), taken), self._age_s.copy())
-        return GridScan(*self._ways(taken, (place_m - corner_m) / CELL_M, yaw_rad), arrivals, grid)
+        assert self._cell is not None
+        cells = np.where(taken > 1, np.float32(np.nan), taken), self._age_s.copy()
+        grid = FloorGrid(np.asarray(CELL_M * (self._cell - REACH_CELLS), float), *cells)
+        return GridScan(*self._ways(taken, self._in_cells(place_m), yaw), arrivals, grid)
 
     def is_floor(self, T_odom_base: Array, ranges_m: Array, directions: int) -> Flags:
         """Return the bins (N, directions) about the viewpoint, at ranges (N,), whose cells are floor by all pairs."""
@@ -216,8 +225,8 @@ class ObstacleGrid:
         azimuth = math.pi - (np.arange(directions) + 0.5) * (math.tau / directions)
         unit = np.column_stack([np.cos(azimuth), np.sin(azimuth)]) @ T[:2, :2].T / CELL_M
         # OpenCV has integers at the middles of cells.
-        eye = T[:2, 3] / CELL_M - self._cell + REACH_CELLS - 0.5
-        x, y = np.asarray(eye[:, None, None] + ranges_m[:, None] * unit.T[:, None], np.float32)
+        at = (self._in_cells(T[:2, 3]) - 0.5)[:, None, None] + ranges_m[:, None] * unit.T[:, None]
+        x, y = np.asarray(at, np.float32)
         floor = ((self._known > 0) & (self.odds < self._p.floor)).view(np.uint8)
         return np.asarray(cv2.remap(floor, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT) > 0)
 
@@ -247,18 +256,15 @@ class ObstacleGrid:
         """Return the cells (1) before the nearest floor in view, hidden (SIDE, SIDE) where it was seen, of ways on
         which nothing is known that hides it."""
         flooded = np.zeros((SIDE, SIDE), np.uint8)
-        if not hidden.any():
+        candidates = hidden & (self._was_past > 0)
+        if not candidates.any():
             return flooded
         ranges_m, taken = self._along(self._taken(), self._eye, yaw_rad)
         explained = ((taken > 0.3) & (taken <= 1) & (ranges_m < self._near_m + 3 * CELL_M)).any(axis=1)
         explained = np.any([np.roll(explained, shift) for shift in range(-2, 3)], axis=0)
         rows, columns = (of[~explained][:, ranges_m < self._near_m] for of in _along(self._eye, yaw_rad))
-        flooded[rows, columns] = hidden[rows, columns]
-        # What hides floor from the viewpoint hides a long way: patches of few cells are specks.
-        _, labels, of_patch, _ = cv2.connectedComponentsWithStats(flooded)
-        is_kept = of_patch[:, cv2.CC_STAT_AREA] > SPECK_CELLS
-        is_kept[0] = False
-        return np.asarray(is_kept[labels], np.uint8)
+        flooded[rows, columns] = candidates[rows, columns]
+        return _without_specks(flooded)
 
     def _arrivals(self, passed_s: float, yaw_rad: float, taken: Floats, shows: Flags, flooded: Bytes) -> Arrivals:
         """Return who has come onto floor that was free a short while ago.
@@ -293,19 +299,32 @@ class ObstacleGrid:
         ranges_m[is_nearer] = self._near_m
         return Arrivals(ranges_m.astype(np.float32), sigma_m.astype(np.float32), is_nearer)
 
-    def _near(self, belief: RayBelief) -> Bytes:
-        """Return whether the nearest floor in view of each direction (D,) is past, hidden or out of view.
+    def _assume_free(self, yaw_rad: float, belief: RayBelief) -> None:
+        """Take the floor too near to be seen for free at the start, but where something hides the nearest in view.
 
-        Nobody hides behind a strut or a mast: they count as past.
+        That may stand anywhere before the floor that it hides. Nothing is assumed where no floor is in view, in wider
+        directions than a strut or a mast hides.
         """
-        bins = int(np.searchsorted(belief.ends_m, belief.ends_m[0] + CELL_M))
-        hides = belief.first[:, :bins].sum(axis=1)
-        hides = (np.roll(hides, 1) + hides + np.roll(hides, -1)) / 3
-        near = np.where(hides > 0.5, kernels.IS_HIDDEN, kernels.IS_PAST).astype(np.uint8)
+        p, count = self._p, len(belief.first)
+        reach_m = np.where(self._hides(belief), 0.0, self._near_m + 2 * CELL_M)
         for run in _runs(belief.view[:, 0] <= 0):
-            is_strut = len(run) * math.tau < self._p.strut_rad * len(near)
-            near[run] = kernels.IS_PAST if is_strut else kernels.OUT_OF_VIEW
-        return near
+            if len(run) * math.tau / count >= p.strut_rad:
+                reach_m[run] = 0.0
+        reach_m = np.min([np.roll(reach_m, shift) for shift in range(-3, 4)], axis=0)
+        y, x = np.indices((SIDE, SIDE)) + 0.5 - self._eye[::-1, None, None]
+        T = self._T_rect_base
+        turn = math.atan2(T[1, 0], T[0, 0]) - yaw_rad
+        at = np.floor((math.pi - np.arctan2(y, x) - turn) / math.tau * count).astype(np.intp) % count
+        free = self._ranges_m(self._eye) < reach_m[at]
+        self._known[free], self._past_views[free] = 1, p.views
+        self.odds[free & (self.odds < 0)] = p.arrival
+
+    def _hides(self, belief: RayBelief) -> Flags:
+        """Return the directions (D,) in which the nearest floor in view is hidden."""
+        bins = int(np.searchsorted(belief.ends_m, belief.ends_m[0] + CELL_M))
+        hidden = belief.first[:, :bins].sum(axis=1)
+        three = (np.roll(hidden, 1) + hidden + np.roll(hidden, -1)) / 3
+        return np.asarray((three > 0.5) & (belief.view[:, 0] > 0))
 
     def _taken(self) -> Floats:
         """Return the probability of a thing in cells, 2 where nothing is known."""
@@ -320,8 +339,8 @@ class ObstacleGrid:
         taken = cells[_along(place, yaw_rad)][:, :count]
         return CELL_M * np.linspace(0.5, count - 0.5, count), np.asarray(taken, np.float64)
 
-    def _spread_unknown(self, passed_s: float, watched: Flags) -> None:
-        """Spread what is not known through cells that nobody sees, at the speed of a person."""
+    def _who_comes(self, passed_s: float, watched: Flags) -> None:
+        """Spread what is not known through cells that nobody sees."""
         p = self._p
         self._carry += p.walk_mps * passed_s / CELL_M
         steps = int(self._carry)
@@ -338,14 +357,21 @@ class ObstacleGrid:
     def _gathered(self, T_odom_base: Array, belief: RayBelief) -> tuple[Floats, Bytes]:
         """Return evidence (3, SIDE, SIDE) and states (SIDE, SIDE) of the cells."""
         T = self._T_rect_base @ se3.inverse(T_odom_base)
+        turn = math.atan2(T[1, 0], T[0, 0])
+        y, x = np.indices((SIDE, SIDE), np.float32) + np.float32(0.5) - self._eye[::-1, None, None].astype(np.float32)
+        directions = ((math.pi - turn) - np.arctan2(y, x)) * (len(belief.first) / math.tau) - 0.5
         cells, states = np.empty((3, SIDE, SIDE), np.float32), np.empty((SIDE, SIDE), np.uint8)
-        of_belief = belief.ratios, belief.view, belief.surface, self._near(belief), belief.ends_m, self._at_1m
+        near = np.where(belief.view[:, 0] > 0, np.where(self._hides(belief), 2, 1), 0).astype(np.uint8)
         reach_m = min(float(belief.ends_m[-2]), self._max_range_m)
-        kernels.gather(*of_belief, self._eye, math.atan2(T[1, 0], T[0, 0]), reach_m, cells, states)
+        of_belief, of_cells = (
+            (belief.ratios, belief.view, belief.surface, near, belief.ends_m),
+            (np.hypot(x, y) * np.float32(CELL_M), directions),
+        )
+        kernels.gather(*of_belief, self._at_1m, *of_cells, CELL_M, reach_m, THIN_M, cells, states)
         return cells, states
 
-    def _follow(self, place_m: Array) -> Array:
-        """Move the cells along with the base; those that come into the grid are unknown. Return its corner (2,) [m]."""
+    def _follow(self, place_m: Array) -> None:
+        """Move the cells along with the base; those that come into the grid are unknown."""
         cell = np.floor(place_m / CELL_M).astype(np.int64)
         x, y = np.clip(cell - cell if self._cell is None else cell - self._cell, -SIDE, SIDE).tolist()
         self._cell = cell
@@ -354,7 +380,16 @@ class ObstacleGrid:
             new = np.ones((SIDE, SIDE), bool)
             new[max(-y, 0) : SIDE - max(y, 0), max(-x, 0) : SIDE - max(x, 0)] = False
             self._layers[:, new] = self._empty[:, None]
-        return np.asarray(CELL_M * (cell - REACH_CELLS))
+
+    def _in_cells(self, place_m: Array) -> Array:
+        """Return a place (2,) in odom in cells of the grid."""
+        assert self._cell is not None
+        return np.asarray(place_m / CELL_M - self._cell + REACH_CELLS)
+
+    def _ranges_m(self, place: Array) -> Array:
+        """Return the distances (SIDE, SIDE) of cells from a place [cells]."""
+        y, x = np.indices((SIDE, SIDE)) + 0.5 - place[::-1, None, None]
+        return np.asarray(np.hypot(x, y) * CELL_M)
 
 
 def _along(place: Array, yaw_rad: float) -> tuple[Indices, Indices]:
@@ -363,6 +398,16 @@ def _along(place: Array, yaw_rad: float) -> tuple[Indices, Indices]:
     unit = np.column_stack([np.sin(angle), np.cos(angle)])
     rows, columns = np.floor(place[::-1] + steps[:, None, None] * unit).astype(np.intp).T
     return np.clip(rows, 0, SIDE - 1), np.clip(columns, 0, SIDE - 1)
+
+
+def _without_specks(flags: Bytes) -> Bytes:
+    """Return flags (H, W) without patches of few cells, as what hides floor from the viewpoint hides a long way."""
+    if not flags.any():
+        return flags
+    _, labels, of_patch, _ = cv2.connectedComponentsWithStats(flags)
+    is_kept = of_patch[:, cv2.CC_STAT_AREA] > SPECK_CELLS
+    is_kept[0] = False
+    return np.asarray(is_kept[labels], np.uint8)
 
 
 def _runs(flags: Flags) -> list[Indices]:

@@ -13,13 +13,9 @@ Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
-CELL_M = 0.05
-THIN_M = 0.035  # width of the thinnest obstacle. With 0.03, by trial, more bases stood on polished floors.
 RATIO, VIEW, SURFACE = 0, 1, 2  # layers of what `gather` writes
 UNSEEN, IN_VIEW, SEEN_PAST, HIDDEN, MOSTLY_PAST = 0, 1, 2, 3, 4  # states of a cell in a pair
-OUT_OF_VIEW, IS_PAST, IS_HIDDEN = 0, 1, 2  # states of the nearest floor in view of a direction
 MOST_BESIDE = 60  # directions of a cell on either side, that of one next to the viewpoint
-HANGS = 0.4, 1.5  # ratio of a surface that noise reaches, and the most that one direction counts beyond it
 
 
 @inner
@@ -30,7 +26,8 @@ def bin_at(ends: Doubles, at_1m: float, range_m: float) -> int:
 
 
 @compiled(
-    "(f4[:, ::1], f4[:, ::1], f4[:, ::1], u1[::1], f8[::1], f8, f8[::1], f8, f8, f4[:, :, ::1], u1[:, ::1])",
+    "(f4[:, ::1], f4[:, ::1], f4[:, ::1], u1[::1], f8[::1], f8, f4[:, ::1], f4[:, ::1], f8, f8, f8, f4[:, :, ::1],"
+    " u1[:, ::1])",
     writes=("cells", "states"),
 )
 def gather(
@@ -40,51 +37,52 @@ def gather(
     near: Bytes,
     ends: Doubles,
     at_1m: float,
-    eye: Doubles,
-    turn_rad: float,
+    ranges: Floats,
+    at: Floats,
+    cell_m: float,
     reach_m: float,
+    thin_m: float,
     cells: Floats,
     states: Bytes,
 ) -> None:
     """Write the evidence (3, N, N) of cells, and their states (N, N).
 
-    ratios, view, surface (D, K): of a RayBelief; near (D,): whether the nearest floor in view is past, hidden or none;
-    ends (K + 1,): ranges of the bins; at_1m: disparity at 1 m. eye (2,): x and y of the viewpoint in cells; turn_rad:
-    azimuth of the x axis of the grid about it. A cell is as taken as the most taken of the bins and directions in it: a
-    pole fills no cell.
+    ratios, view, surface (D, K): of a RayBelief; near (D,): 1 where the nearest floor in view is seen, 2 where
+    something hides it, 0 where nothing is in view; ends (K + 1,): ranges of the bins; at_1m: disparity at 1 m.
+    ranges [m], at (N, N): ranges and directions of the cells, from the viewpoint; thin_m: width of the thinnest thing.
+    A cell is as taken as the most taken of the bins and directions in it: a pole fills no cell.
     """
     directions, bins = ratios.shape
     by_angle, row = directions / math.tau, np.empty(2 * MOST_BESIDE + 2)
-    cells[:] = 0.0
-    states[:] = UNSEEN
     for i in range(cells.shape[1]):
         for j in range(cells.shape[2]):
-            x, y = j + 0.5 - eye[0], i + 0.5 - eye[1]
-            r = CELL_M * math.hypot(x, y)
-            if r > reach_m or r < 0.5 * CELL_M:
+            cells[RATIO, i, j] = cells[VIEW, i, j] = cells[SURFACE, i, j] = 0.0
+            states[i, j] = UNSEEN
+            r = float(ranges[i, j])
+            if r > reach_m or r < 0.5 * cell_m:
                 continue
-            at = (math.pi - turn_rad - math.atan2(y, x)) * by_angle - 0.5
-            half = min(0.5 * CELL_M / r * by_angle, MOST_BESIDE)
-            first, last = math.ceil(at - half), math.floor(at + half)
+            half = min(0.5 * cell_m / r * by_angle, MOST_BESIDE)
+            first, last = math.ceil(at[i, j] - half), math.floor(at[i, j] + half)
             if last < first:
-                first = last = round(at)
-            count = last - first + 1
-            begin, end = bin_at(ends, at_1m, r - 0.5 * CELL_M), bin_at(ends, at_1m, r + 0.5 * CELL_M)
+                first = last = round(at[i, j])
+            begin, end = bin_at(ends, at_1m, r - 0.5 * cell_m), bin_at(ends, at_1m, r + 0.5 * cell_m)
             if begin < 0:
-                # Too near to be seen: known by what is seen past it. The thinnest thing would hide so many directions.
+                # Too near to be seen: known by what is seen past it.
                 hidden, past = 0, 0
                 for u in range(first, last + 1):
-                    hidden += near[u % directions] == IS_HIDDEN
-                    past += near[u % directions] == IS_PAST
-                if hidden >= min(0.6 * THIN_M / r * by_angle, count):
+                    state = near[u % directions]
+                    hidden += state == 2
+                    past += state == 1
+                # The thinnest thing there would hide so many directions.
+                if hidden >= min(0.6 * thin_m / r * by_angle, last - first + 1.0):
                     states[i, j] = HIDDEN
-                elif past + hidden == count:
+                elif past + hidden == last - first + 1:
                     states[i, j] = SEEN_PAST if hidden == 0 else MOSTLY_PAST
                 continue
             if end >= bins:
                 continue
             # A thin thing hides so many directions together: their mean counts, as one alone is noise.
-            run = max(min(round(THIN_M / r * by_angle), count), 1)
+            run = max(min(round(thin_m / r * by_angle), last - first + 1), 1)
             most, least, total, together, seen = -99.0, 1.0, 0.0, 0.0, 0
             for u in range(first, last + 1):
                 at_u, taken, shown, is_seen = u % directions, 0.0, 0.0, False
@@ -95,13 +93,15 @@ def gather(
                     shown = max(shown, surface[at_u, k])
                     least = min(least, view[at_u, k])
                 seen += is_seen
-                total += min(max(shown - HANGS[0], 0.0), HANGS[1])
+                total += min(max(shown - 0.4, 0.0), 1.5)
                 row[u - first] = taken
                 together += taken
                 if u - first >= run:
                     together -= row[u - first - run]
                 if u - first >= run - 1:
                     most = max(most, together / run)
-            if seen > 0:
-                cells[RATIO, i, j], cells[VIEW, i, j], cells[SURFACE, i, j] = most, least, total / count
-                states[i, j] = IN_VIEW
+            if seen == 0:  # out of sight, as beside a sector
+                continue
+            cells[RATIO, i, j], cells[VIEW, i, j] = most, least
+            cells[SURFACE, i, j] = total / (last - first + 1)
+            states[i, j] = IN_VIEW

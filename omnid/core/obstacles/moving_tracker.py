@@ -1,4 +1,4 @@
-"""Tracks of moving obstacles: clusters of what came onto floor that was free, filtered in odom.
+"""Tracks of moving obstacles: clusters of the scan where it was free before, filtered in odom.
 
 Association to the most likely track within a gate of its innovation; a Kalman filter of constant velocity each
 (Bar-Shalom, Li, Kirubarajan 2001, "Estimation with Applications to Tracking and Navigation", 3.6 and 6.3).
@@ -11,13 +11,10 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
-from filterpy.common import Q_continuous_white_noise
 from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 
 from omnid.core.mapping.range_scan import SECTORS, RangeScan, azimuths
-
-Array = NDArray[np.float64]
 
 
 class Arrivals(NamedTuple):
@@ -36,27 +33,31 @@ class MovingObstacle:
     y_m: float
     vx_mps: float
     vy_mps: float
-    covariance: Array  # (4, 4) of x, y, vx, vy
+    covariance: NDArray[np.float64]  # (4, 4) of x, y, vx, vy
     radius_m: float
 
 
+Array = NDArray[np.float64]
+
 MOST_TRACKS: Final = 16  # so that the memory is bounded
-# Most step in range between sectors of one cluster, without noise and in sigmas: 0.5 % of the steps within a surface
-# are larger.
-SAME_SURFACE_M, NOISE_SIGMAS = 0.15, 4.0
+SAME_SURFACE_M: Final = 0.15  # step in range between sectors of one cluster without noise
+# Sigmas of a range, so that 0.5 % of the steps within a surface are larger: 2.8 of a difference.
+NOISE_SIGMAS: Final = 4.0
 SECTOR_GAP: Final = 2  # sectors without range within a cluster
-LEAST_SECTORS: Final = 3  # of a cluster: a person is five sectors wide at FARTHEST_M,
-FARTHEST_M: Final = 4.0  # beyond which stereo's noise appears as motion
-PERSON_M, WIDEST_M = 0.4, 1.2  # widths of a person, and of the widest cluster that may be a person or a cart
-GATE: Final = (
-    13.8  # squared Mahalanobis distance of a cluster from its track: 99.9 % are less (chi-squared, 2 dimensions)
-)
+WIDEST_M: Final = 1.2  # width of the widest cluster that may be a person or a cart
+LEAST_SECTORS: Final = 3  # because a person is five sectors wide at FARTHEST_M
+FARTHEST_M: Final = 4.0  # Farther clusters are ignored because stereo's noise there appears as motion.
+# Most squared Mahalanobis distance of a cluster from a track, because 99.9 % are below it (chi-squared, 2 dimensions).
+GATE: Final = 13.8
 ACCELERATION_PSD: Final = 0.2  # (m/s^2)^2/Hz of a person
-SIGMA_M: Final = 0.06  # least sigma of a cluster's middle: its visible side changes
+SIGMA_M: Final = 0.06  # least sigma of a cluster's middle, because its visible side changes
+PERSON_M: Final = 0.4  # width of a person, because the rest of a narrower cluster may be on either side
 START_MPS: Final = 1.0  # sigma of the velocity of a new track
-LEAST_MPS, SPEED_SIGMAS = 0.2, 1.5  # least speed of a moving obstacle, and the sigmas by which it exceeds its noise
-NEW_UPDATES: Final = 3  # up to which an object counts as moving at any speed: it was not there before
-FORGOTTEN_S: Final = 0.9  # after which a track without a cluster ends
+LEAST_MPS: Final = 0.2  # least speed of a moving obstacle,
+SPEED_SIGMAS: Final = 1.5  # and the sigmas by which it must exceed its noise
+# Pairs after which an object is new no longer: until then it counts as moving at any speed, as it was not there before.
+NEW_UPDATES: Final = 3
+FORGOTTEN_S: Final = 0.9  # A track without a cluster ends after this time.
 
 
 class Cluster(NamedTuple):
@@ -68,33 +69,30 @@ class Cluster(NamedTuple):
 
 
 class Track:
-    """A Kalman filter of constant velocity of one object: x, y, vx, vy."""
+    """A Kalman filter of constant velocity of one object."""
 
-    def __init__(self, cluster: Cluster) -> None:
-        self.updates, self.unseen_s, self.radius_m = 1, 0.0, cluster.radius_m
+    def __init__(self, stamp_ns: int, cluster: Cluster) -> None:
+        self.stamp_ns = self.seen_ns = stamp_ns
+        self.updates, self.radius_m = 1, cluster.radius_m
         self.filter = KalmanFilter(dim_x=4, dim_z=2)
         self.filter.H = np.eye(2, 4)
         self.filter.x = np.concatenate([cluster.middle, [0.0, 0.0]])[:, None]
         self.filter.P = START_MPS**2 * np.eye(4)
         self.filter.P[:2, :2] = cluster.covariance
 
-    def predict(self, dt_s: float) -> None:
-        """Predict the state after a time."""
-        F = np.kron([[1.0, dt_s], [0.0, 1.0]], np.eye(2))
-        self.filter.predict(F=F, Q=Q_continuous_white_noise(2, dt_s, ACCELERATION_PSD, 2, order_by_dim=False))
-        self.unseen_s += dt_s
-
-    def cost(self, cluster: Cluster) -> float:
-        """Return -2 log of the likelihood of a cluster without constants, inf beyond the gate."""
-        S, v = self.filter.P[:2, :2] + cluster.covariance, cluster.middle - self.filter.x[:2, 0]
-        distance2 = float(v @ np.linalg.solve(S, v))
-        return distance2 + math.log(np.linalg.det(S)) if distance2 <= GATE else math.inf
+    def predict(self, stamp_ns: int) -> None:
+        """Predict the state at a stamp."""
+        dt_s = (stamp_ns - self.stamp_ns) * 1e-9
+        self.stamp_ns = stamp_ns
+        one_axis = np.array([[dt_s**3 / 3, dt_s**2 / 2], [dt_s**2 / 2, dt_s]])
+        F, Q = np.kron([[1.0, dt_s], [0.0, 1.0]], np.eye(2)), np.kron(one_axis, np.eye(2))
+        self.filter.predict(F=F, Q=ACCELERATION_PSD * Q)
 
     def update(self, cluster: Cluster) -> None:
-        """Take a cluster at the time of the prediction."""
+        """Take a cluster at the stamp of the prediction."""
         self.filter.update(cluster.middle[:, None], R=cluster.covariance)
-        self.updates, self.unseen_s = self.updates + 1, 0.0
-        self.radius_m = 0.7 * self.radius_m + 0.3 * cluster.radius_m
+        self.seen_ns, self.radius_m = self.stamp_ns, 0.7 * self.radius_m + 0.3 * cluster.radius_m
+        self.updates += 1
 
     def obstacle(self) -> MovingObstacle | None:
         """Return the track as a moving obstacle; None where it does not move, or one pair, maybe noise, has seen it."""
@@ -102,7 +100,9 @@ class Track:
         P = (self.filter.P + self.filter.P.T) / 2
         least_mps = max(LEAST_MPS, SPEED_SIGMAS * math.sqrt(max(P[2, 2], P[3, 3])))
         is_at_rest = self.updates > NEW_UPDATES and math.hypot(vx, vy) < least_mps
-        return None if self.updates == 1 or is_at_rest else MovingObstacle(x, y, vx, vy, P, self.radius_m)
+        if self.updates == 1 or is_at_rest:
+            return None
+        return MovingObstacle(x, y, vx, vy, P, self.radius_m)
 
 
 class MovingTracker:
@@ -110,7 +110,6 @@ class MovingTracker:
 
     def __init__(self) -> None:
         self._tracks: list[Track] = []
-        self._stamp_ns = 0
 
     def clear(self) -> None:
         """Forget everything: odom has lost its relation to the past."""
@@ -123,28 +122,36 @@ class MovingTracker:
         """
         # 1. Predict the tracks.
         for track in self._tracks:
-            track.predict((stamp_ns - self._stamp_ns) * 1e-9)
-        self._stamp_ns = stamp_ns
-        # 2. Give the clusters to tracks, of all pairs the likeliest first, or begin one.
-        found, tracks = clusters(T_odom_eye, arrivals), self._tracks
-        cost = np.array([[track.cost(cluster) for cluster in found] for track in tracks])
-        cost = cost.reshape(len(tracks), len(found))
-        is_new = np.ones(len(found), bool)
+            track.predict(stamp_ns)
+        # 2. Give the clusters to tracks, of all pairs the likeliest first, or begin one. The cost of a pair is -2 log
+        #    of its likelihood without constants, `v S^-1 v + log |S|` of the innovation v, within the gate of the first
+        #    part.
+        found = clusters(T_odom_eye, arrivals)
+        cost = np.full((len(self._tracks), len(found)), np.inf)
+        for k, track in enumerate(self._tracks):
+            for n, cluster in enumerate(found):
+                S, v = track.filter.P[:2, :2] + cluster.covariance, cluster.middle - track.filter.x[:2, 0]
+                distance2 = float(v @ np.linalg.solve(S, v))
+                if distance2 <= GATE:
+                    cost[k, n] = distance2 + math.log(np.linalg.det(S))
+        tracks, is_new = list(self._tracks), np.ones(len(found), bool)
         while np.isfinite(cost).any():
-            k, n = np.unravel_index(cost.argmin(), cost.shape)
+            k, n = divmod(int(cost.argmin()), len(found))
             tracks[k].update(found[n])
             is_new[n], cost[k], cost[:, n] = False, np.inf, np.inf
-        new = [Track(found[n]) for n in np.flatnonzero(is_new)]
+        room = MOST_TRACKS - len(tracks)
+        tracks += [Track(stamp_ns, found[n]) for n in np.flatnonzero(is_new)[:room]]
         # 3. Forget what was long not seen.
-        self._tracks = [track for track in [*tracks, *new][:MOST_TRACKS] if track.unseen_s <= FORGOTTEN_S]
+        self._tracks = [track for track in tracks if (stamp_ns - track.seen_ns) * 1e-9 <= FORGOTTEN_S]
         return tuple(one for track in self._tracks if (one := track.obstacle()) is not None)
 
 
 def clusters(T_odom_eye: Array, arrivals: Arrivals) -> list[Cluster]:
     """Return the clusters of what has come that are narrow enough."""
     arrived_m, sigma_m = arrivals.ranges_m, arrivals.sigma_m
+    near = np.isfinite(arrived_m) & (arrived_m < FARTHEST_M)
     found = []
-    for sectors in surfaces(np.where(arrived_m < FARTHEST_M, arrived_m, np.nan), sigma_m):
+    for sectors in surfaces(np.where(near, arrived_m, np.nan), sigma_m):
         if len(sectors) < LEAST_SECTORS:
             continue
         # What hides the nearest floor in view is anywhere before it: as near as a person is who fills that angle.

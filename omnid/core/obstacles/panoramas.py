@@ -1,7 +1,8 @@
 """Panoramas of a pair in one working size, in units of what two views of one place differ by.
 
 Matching compares a pixel with what another view shows there, so an image is given by how it differs from its column
-around, divided by `sqrt(noise^2 + (share * contrast)^2)`, the standard deviation of the difference of views.
+around. For the floor no row around counts much: no strong edge, such as that of a painted line, hides the weak texture
+next to it. It is divided by `sqrt(noise^2 + (share * contrast)^2)`, the standard deviation of the difference of views.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from calib.panorama import Cylinder
 from drivers.jpeg import coding_sigma
-from omnid.core.obstacles.stereo_kernels import UNITS
+from omnid.core.obstacles.evidence_kernels import bounded_band_pass
 from omnid.core.types.panorama import PaddedPanorama
 
 Floats = NDArray[np.float32]
@@ -24,20 +25,21 @@ Flags = NDArray[np.bool_]
 
 DIRECTIONS: Final = 480  # columns of the working panorama, 0.75 degrees, because a pole of 3 cm is as wide at 2 m
 FOCAL_PX: Final = 139.0  # rows of the working panorama in a radian, because images of 512 px have that resolution
-# Rows of panoramas in a radian with which obstacles are found; by trial: with 104 all of 4 goals were reached, with 87
-# not.
-FLOOR_FOCAL_PX: Final = 100.0
 FINE_PX: Final = 0.8  # sigma of the smoothing along columns, because views differ by parts of a row
 AROUND_ROWS: Final = 17  # rows with which a pixel is compared
 # Difference between two views of a surface, by the local contrast; noise is added to it. Measured: with 0.2 and 0.45
 # 8.5 and 15.5 % of the directions of things are called free beyond these instead of 11.1 %.
 TEXTURE_SHARE: Final = 0.3
 # Noise of a smooth image by that of a panorama: of white noise in images of 512 px 0.54 to 0.66 in the rows of floor,
-# of 960 px 0.36 to 0.53 (test_stereo.py). With 0.35, by trial, bases stood before free floor in noisy images.
+# of 960 px 0.36 to 0.53 (test_panoramas.py). With 0.35, by trial, bases stood before free floor in noisy images.
 BAND_NOISE: Final = 0.65
 # Frequencies of a JPEG's blocks, of 8, whose errors a working panorama of the image's own resolution shows, because the
 # smoothing halves those above. A coarser panorama shows fewer.
 CODING_FREQUENCIES: Final = 3.0
+UNITS: Final = 12.0  # levels of a normalised image in one sigma, because 8 bits hold ten sigmas either way
+# Most that one row around counts, in sigmas of the noise, because the edge of a painted line has a hundred and hid the
+# texture of the floor around it. With 3 to 11 bases passed such a line; with no limit they stood before it.
+BOUNDED_SIGMAS: Final = 5.5
 
 
 class WorkingPair(NamedTuple):
@@ -97,11 +99,16 @@ class WorkingPanoramas:
         noise_grey = math.hypot(BAND_NOISE * sensor_grey, *coding_grey)
         return WorkingPair(images[0], images[1], seen, sensor_grey, noise_grey)
 
-    def views(self, pair: WorkingPair) -> Views:
-        """Return the normalised views of a pair."""
-        lower, upper = (_normalised(image, pair.noise_grey) for image in (pair.lower, pair.upper))
-        plane = _half_row_bounds(_remapped(upper, self._plane_map))
-        return Views(lower, upper, _half_row_bounds(upper), plane, pair.seen * np.uint8(255))
+    def views(self, pair: WorkingPair) -> tuple[Views, Views]:
+        """Return the views of a pair for surfaces, and for the floor."""
+        live = pair.seen * np.uint8(255)
+        smooth = [cv2.GaussianBlur(image, (1, 5), sigmaX=0.1, sigmaY=FINE_PX) for image in (pair.lower, pair.upper)]
+        found = []
+        for most in (math.inf, BOUNDED_SIGMAS * pair.noise_grey):
+            lower, upper = (_normalised(np.asarray(image, np.float32), most, pair.noise_grey) for image in smooth)
+            plane = _half_row_bounds(_remapped(upper, self._plane_map))
+            found.append(Views(lower, upper, _half_row_bounds(upper), plane, live))
+        return found[0], found[1]
 
     def _sized(self, image: Bytes) -> Bytes:
         """Return a panorama (H, W) in the working size of a full turn, 0 in directions that it does not show."""
@@ -129,14 +136,15 @@ def _remapped(image: Pixels, by: Map) -> Pixels:
     return np.asarray(cv2.remap(image, *by, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), image.dtype)
 
 
-def _normalised(image: Floats, noise_grey: float) -> Bytes:
+def _normalised(smooth: Floats, most: float, noise_grey: float) -> Bytes:
     """Return by how much a panorama (H, DIRECTIONS) exceeds its columns around, in sigmas of the difference of views.
 
-    Levels are UNITS a sigma about the middle of 8 bits.
+    most: that one row around counts. Levels are UNITS a sigma about the middle of 8 bits.
     """
-    smooth = cv2.GaussianBlur(image, (1, 5), sigmaX=0.1, sigmaY=FINE_PX)
-    band = smooth - cv2.blur(smooth, (1, AROUND_ROWS))
-    sigma = np.sqrt(np.float32(noise_grey**2) + np.float32(TEXTURE_SHARE**2) * cv2.blur(band * band, (3, AROUND_ROWS)))
+    band = np.empty_like(smooth)
+    bounded_band_pass(smooth, AROUND_ROWS, np.float32(most), band)
+    contrast2 = cv2.blur(band * band, (3, AROUND_ROWS))
+    sigma = np.sqrt(np.float32(noise_grey**2) + np.float32(TEXTURE_SHARE**2) * contrast2)
     return np.asarray(np.clip(np.float32(UNITS) * band / sigma + np.float32(128.5), 0.0, 255.0), np.uint8)
 
 

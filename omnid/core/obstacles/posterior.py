@@ -8,7 +8,7 @@ down, something that hangs over floor in view, or nothing up to the last bin. Bi
 1. Steps of grey e across the bins of the floor, and its greys. Floor: (1 - m) N(e; s_r) + m Laplace(e; b g),
    with its sigma s_r at that range and its rate of marks m; what is behind something: the same with a rate m_h, with
    texture or without; where something begins: Laplace(e; b g). So a plain bin speaks against a beginning.
-2. Ratios of floor, surfaces and planes beside the floor, from stereo (stereo.py).
+2. Ratios of floor, surfaces and planes beside the floor, from stereo (column.py).
 3. Look of the floor: contrast, grey and outline of a bin, by those of floor that is known. Beyond the
    border of a patch of sun, or of another covering, it may look otherwise.
 4. The posterior (ray_kernels.posterior): sums along the ray. The end of the floor beyond the last bin shows a foot,
@@ -28,9 +28,9 @@ from numpy.typing import NDArray
 
 from omnid.core.mapping.range_scan import SECTORS, FreeRanges
 from omnid.core.obstacles import ray_kernels as kernels
+from omnid.core.obstacles.column import ColumnEvidence, Columns
 from omnid.core.obstacles.panoramas import DIRECTIONS, WorkingPair
 from omnid.core.obstacles.ray_kernels import RayParameters
-from omnid.core.obstacles.stereo import Columns, StereoEvidence
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -82,9 +82,9 @@ def thin_things_m(belief: RayBelief, risk: float) -> FreeRanges:
 class RayPosterior:
     """Posterior of pairs over one plane of the floor."""
 
-    def __init__(self, columns: Columns, height_m: float, baseline_m: float) -> None:
+    def __init__(self, columns: Columns, height_m: float, baseline_m: float, parameters: RayParameters) -> None:
         """height_m: of the viewpoint over the floor."""
-        self._p = RayParameters()
+        self._columns, self._p = columns, parameters
         # Bins from near to far: the nearest whose step is in view, to the last that stereo compares.
         numbers = np.arange(BINS_PER_PX * columns.bins)
         middle = (numbers + 0.5) / BINS_PER_PX
@@ -101,18 +101,17 @@ class RayPosterior:
         self._lengths_m = np.diff(self.ends_m).astype(np.float32)
         azimuth = math.pi - (np.arange(DIRECTIONS) + 0.5) * (math.tau / DIRECTIONS)
         along = np.abs(np.sin(azimuth)) < math.sin(ALONG_RAD)
-        self._assumed = (self.ranges_m < self._p.look_m)[:, None] & along
+        self._assumed = (self.ranges_m < parameters.look_m)[:, None] & along
         self.shows_floor = bool(self._of_bins(columns.panoramas.visible).any())  # whether any floor is in view
 
-    def belief(self, pair: WorkingPair, evidence: StereoEvidence, known: Flags) -> RayBelief:
+    def belief(self, pair: WorkingPair, evidence: ColumnEvidence, known: Flags | None = None) -> RayBelief:
         """Return the belief by a pair and its stereo evidence.
 
-        known (N, DIRECTIONS): bins that are known to be floor; where these are few, the nearest ahead and behind are
-        taken for it.
+        known (N, DIRECTIONS): bins that are known to be floor, None: the nearest ahead and behind are taken for it.
         """
         p, count, seen = self._p, len(self._bins), self._of_bins(pair.seen)
         # 1. The floor by which its look is learned: of the cells that are known, or assumed where these are few.
-        known = known & seen.T
+        known = self._assumed & seen.T if known is None else known & seen.T
         near = known & (self.ranges_m < p.look_m)[:, None]
         if near.sum() < p.look_bins:
             known = near = self._assumed & seen.T
@@ -125,14 +124,18 @@ class RayPosterior:
                 kernels.add_weighted_rows(of_view, image, into)
         pooled = np.asarray((np.roll(steps, 1, axis=1) + 2 * steps + np.roll(steps, -1, axis=1)) / 4, np.float32)
         far_steps, steps, greys, pooled = np.abs(pooled[count:]), steps[:count], greys[:count], pooled[:count]
-        # 3. Stereo, by bins. A bin without texture fits a plane beside the floor by noise, of which known floor says
-        #    how much: a ratio L counts by the odds that it is more than that.
+        # 3. Stereo, by bins. Noise without texture fits other disparities a little better: the ratio of known floor
+        #    says by how much.
         of_bin = self._bins // BINS_PER_PX
+        floor = evidence.floor[of_bin]
+        floor = floor - np.float32(min(max(float(np.median(floor[near])), -1.0), 0.0))
+        floor = p.w_floor * np.clip(floor, -p.floor_most, p.floor_most)
+        # A bin without texture fits a plane beside the floor by noise, of which known floor says how much: a ratio L
+        # counts by the odds that it is more than that.
         levels = evidence.level[:, of_bin]
         noise2 = np.square(np.minimum(levels[:, near], 0)).mean(axis=1, keepdims=True)[..., None] + np.float32(LEAST)
         levels = levels * (1 - np.exp(-np.square(levels) / (2 * noise2)))
-        levels = p.w_level * np.clip(levels, -p.level_most, p.level_most)
-        floor = p.floor_share * levels.mean(axis=0)
+        levels = floor - p.w_level * np.clip(levels, -p.level_most, p.level_most)
         # A surface that fits at a whole disparity is within half of one of it.
         of_surface = np.minimum((self._bins + 1) // BINS_PER_PX, len(evidence.surface) - 1)
         fits = np.minimum(self._surfaces(evidence.surface)[of_surface], p.surface_most) - p.surface_noise
@@ -146,7 +149,7 @@ class RayPosterior:
         far = far_steps.max(axis=0, initial=0.0) / max(float(sigmas[-1, 0]), float(sigmas.min()))
         # 5. The posterior.
         seen = seen & (greys.T < SATURATED)
-        terms = np.where(seen.T, np.stack([floor, *(floor - levels), look, *edges, fits]).astype(np.float32), 0)
+        terms = np.where(seen.T, np.stack([floor, *levels, look, *edges, fits]).astype(np.float32), 0)
         terms[kernels.FITS] = fits
         first = np.empty((DIRECTIONS, count + 1), np.float32)
         ratios, view = np.empty((2, DIRECTIONS, count), np.float32)

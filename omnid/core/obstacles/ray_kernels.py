@@ -37,12 +37,12 @@ class RayParameters(NamedTuple):
     grey_share: float = 0.06  # least sigma of the floor's grey, by the grey,
     near_grey_share: float = 0.01  # and where it is known at that range
     # Temperatures, as neighbouring bins and directions are not independent.
+    w_floor: float = 0.15
     w_edge: float = 0.5
     w_level: float = 0.3
     w_look: float = 0.2
-    # What hides the floor fits planes beside it as well as the floor's: share of the mean of both ratios for floor.
-    floor_share: float = 0.25
     # Bounds of what one bin says [nats].
+    floor_most: float = 10.0
     level_most: float = 4.0
     surface_most: float = 8.0
     look_low: float = -2.5
@@ -88,7 +88,7 @@ def add_weighted_rows(weights: Floats, image: Floats, into: Floats) -> None:
 
 
 @compiled(
-    "(f4[:, :, ::1], f4[::1], f4[::1], f8, NamedUniTuple(f8, 30, RayParameters), f4[:, ::1], f4[:, ::1], f4[:, ::1])",
+    "(f4[:, :, ::1], f4[::1], f4[::1], f8, NamedUniTuple(f8, 31, RayParameters), f4[:, ::1], f4[:, ::1], f4[:, ::1])",
     writes=("first", "ratios", "view"),
 )
 def posterior(

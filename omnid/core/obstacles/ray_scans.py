@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.panorama import Cylinder
+from omnid.core.obstacles.column import NEAREST_M, Columns, FloorPlane, floor_plane
 from omnid.core.obstacles.grid import GridScan, ObstacleGrid, unknown_scan
 from omnid.core.obstacles.panoramas import AROUND_ROWS, DIRECTIONS, FOCAL_PX, WorkingPair
 from omnid.core.obstacles.posterior import RayBelief, RayPosterior
+from omnid.core.obstacles.ray_kernels import RayParameters
 from omnid.core.obstacles.settings import ScanSettings
-from omnid.core.obstacles.stereo import NEAREST_M, Columns, FloorPlane, floor_plane
 from omnid.core.types.panorama import PaddedPanorama
 
 Array = NDArray[np.float64]
@@ -115,7 +116,7 @@ class RayScans:
         ranges_m = NEAREST_M, self._settings.max_range_m
         cylinder, heights_m = self._cylinder, self._settings.heights_m
         self._columns = Columns(cylinder, self._baseline_m, tilted, heights_m, ranges_m, visible)
-        self._posterior = RayPosterior(self._columns, plane.height_m, self._baseline_m)
+        self._posterior = RayPosterior(self._columns, plane.height_m, self._baseline_m, RayParameters())
         panoramas = self._columns.panoramas
         below = np.maximum(np.arange(panoramas.height) - panoramas.row0, 1e-6)
         self._row_ranges_m = FOCAL_PX * plane.height_m / below

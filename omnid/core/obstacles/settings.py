@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Final
 
 from msgspec import Meta
 
 from omnid.errors import OmnidError
+
+LEAST_HEIGHT_M: Final = 0.02  # A plane so little above the floor is the floor, because matching tells no more apart.
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,10 +22,10 @@ class ScanSettings:
         "height of the floor in the base frame, m; used where the rig states the height of its cameras (T_base_rig)",
     ] = 0.0
     heights_m: Annotated[
-        tuple[Annotated[float, Meta(ge=0.02, le=10)], Annotated[float, Meta(ge=0.02, le=10)]],
+        tuple[Annotated[float, Meta(ge=-10, le=10)], Annotated[float, Meta(ge=-10, le=10)]],
         "heights above the floor between which a surface is an "
         "obstacle, of the scan and of the map, m: lower ones are floor, higher ones "
-        "are passed below; nothing lower than 0.02 can be told from the floor",
+        "are passed below",
     ] = (0.06, 1.7)
     # sigma of the tilt of the base against the floor: in the map the margin above the floor grows with the range
     tilt_deg: float = 0.5
@@ -36,6 +38,11 @@ class ScanSettings:
     min_points: int = 6  # matched points that make an obstacle of the map, within 3 degrees and the noise of the range
 
     def __post_init__(self) -> None:
-        """Raise OmnidError unless the heights are in order."""
+        """Raise OmnidError unless the heights are in order, and the lowest can be told from the floor."""
+        if self.heights_m[0] < LEAST_HEIGHT_M:
+            raise OmnidError(
+                f"obstacles.scan.heights_m is {list(self.heights_m)}: expected a lower height of {LEAST_HEIGHT_M} m or "
+                "more, as nothing lower can be told from the floor"
+            )
         if self.heights_m[0] >= self.heights_m[1]:
             raise OmnidError(f"obstacles.scan.heights_m is {list(self.heights_m)}: expected the lower height first")
