@@ -245,7 +245,7 @@ def test_records_both_cameras_and_reports_the_result(tmp_path: Path) -> None:
     events: list[tuple[int, str]] = []
     now_ns = time.monotonic_ns()
     sources = {
-        camera: Given([replace(frame(n, camera), stamp_ns=now_ns + n) for n in range(10)])
+        camera: Given([replace(frame(n, camera), stamp_ns=now_ns + n * 10**7) for n in range(10)])
         for camera in ("lower", "upper")
     }
     before = signal.getsignal(signal.SIGTERM)
