@@ -164,7 +164,7 @@ class PairScans:
 
 
 class Obstacles:
-    """Makes a ring of each pair that is due, from the evidence of its columns."""
+    """Makes a scan of each pair that is due, from the evidence of its columns."""
 
     def __init__(self, geometry: Geometry, config: ObstaclesConfig, dense: DenseDepths) -> None:
         """dense: computes the depth of a pair, from which a floor is found that the rig does not state."""

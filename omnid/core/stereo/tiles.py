@@ -1,6 +1,6 @@
 """Live parts of images: tiles of a panorama that are dead or blind, and the directions in which nothing is known.
 
-A whole image that repeats is left out before (stages/repeated_images.py). A part of one is used in a pair that tracks:
+A whole image that repeats is left out before (stages/synchronise.py). A part of one is used in a pair that tracks:
 a region that a driver no longer writes, dirt or a drop on a mirror, darkness, glare. Each is a property of a tile:
 
     dead      each pixel is as in the image before, or less changed than the noise of a live image changes it,
