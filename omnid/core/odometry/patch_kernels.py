@@ -27,65 +27,157 @@ MIN_DETERMINANT = 1e-3
 NOISE_CORRELATION = 3.0
 # Variance of a gradient of the panorama's noise per variance of the noise, which enlarges the gradients' matrix.
 GRADIENT_NOISE = 0.12
+FARTHEST_PX = 1e6  # more than the columns and rows of any panorama
 MIDDLE_GREY = np.float32(128)  # is subtracted, so that sums of float32 lose less
-LANES = 8  # columns that the compiler computes at once
+LANES, CELL_LANES = 8, 32  # columns that the compiler computes at once, in templates and windows, and in cells
 MIN_TRUE_GRADIENT = 0.2  # least share of the gradients' matrix that counts as texture.
 
 
-@compiled("(u1[:, ::1], i8[::1], i8[:, :, ::1], f8[:, :, :, ::1], f4[:, :, ::1])", writes=("templates",))
-def sample(image: Image, chosen: Indices, cells: Indices, coefficients: Array, templates: Floats) -> None:
+@compiled(
+    "(u1[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8, f8[:, ::1], f8, f4[:, :, ::1])",
+    writes=("templates",),
+)
+def sample(
+    image: Image,
+    chosen: Indices,
+    centres: Array,
+    points: Array,
+    normals: Array,
+    T_curr_ref: Array,
+    height_m: float,
+    shift: Array,
+    focal_px: float,
+    templates: Floats,
+) -> None:
     """Write the templates (N, T, T) of the chosen patches, whose image this is.
 
-    cells (N, 2, 2): first column and row that a template reaches, and their numbers; coefficients (N, 2, 3, 3) of
-    powers of row and column from the template's middle: the columns and the rows there of its pixels.
+    centres (N, 2) [px] in the image; points (N, 3) [m] there on planes with normals (N, 3) [1/m]; T_curr_ref
+    (N, 4, 4); height_m: of the current viewpoint above the lower one; shift (N, 2) [px] of the templates' middle pixels
+    from the centres in the current panorama.
     """
     side, half = templates.shape[1], templates.shape[1] // 2
-    width, most = -(-side // LANES) * LANES, 0
-    for n in chosen:
-        most = max(most, cells[n, 1, 0], cells[n, 1, 1])
-    cell, at = np.empty((most, most), np.float32), np.empty(width, np.int32)
-    greys, stride, row_step = cell.reshape(-1), np.int32(most), np.uint64(most)
+    width = -(-side // LANES) * LANES
+    stride = -(-(4 * side + 8) // CELL_LANES) * CELL_LANES  # what a template reaches, and the cubic kernel
+    cell = np.empty((stride, stride), np.float32)
+    greys, at = cell.reshape(-1), np.empty(width, np.int32)
     across, down, part = (
         np.empty(4 * width, np.float32),
         np.empty(4 * width, np.float32),
         np.empty(4 * width, np.float32),
     )
+    columns, rows = np.empty((3, 3)), np.empty((3, 3))
     for n in chosen:
-        copy_cell(image, cells[n, 0, 0], cells[n, 0, 1], cells[n, 1, 0], cells[n, 1, 1], cell)
-        columns, rows = coefficients[n, 0], coefficients[n, 1]
+        # A place that is NaN or absurd has no template.
+        is_near = abs(centres[n, 0]) < FARTHEST_PX and abs(centres[n, 1]) < FARTHEST_PX
+        if not (is_near and abs(shift[n, 0]) <= 1 and abs(shift[n, 1]) <= 1):
+            templates[n] = 0.0
+            continue
+        # 1. The pixels that the template reaches.
+        write_nodes(points[n], normals[n], T_curr_ref[n], height_m, shift[n], half, focal_px, columns, rows)
+        left, right = math.floor(centres[n, 0] + columns.min()) - 2, math.floor(centres[n, 0] + columns.max()) + 4
+        top, bottom = math.floor(centres[n, 1] + rows.min()) - 2, math.floor(centres[n, 1] + rows.max()) + 4
+        copy_cell(image, left, top, right - left, bottom - top, cell)
+        # 2. The places of the template's pixels in between, by the quadratic polynomials through the nodes.
+        write_coefficients(columns, half)
+        write_coefficients(rows, half)
         for i in range(side):
-            # 1. The places of a line of the template, and the weights of the pixels around them.
             t = float(i - half)
-            x0 = np.float32(columns[0, 0] + t * (columns[1, 0] + t * columns[2, 0]))
+            x0 = np.float32(centres[n, 0] - left + columns[0, 0] + t * (columns[1, 0] + t * columns[2, 0]))
             x1 = np.float32(columns[0, 1] + t * (columns[1, 1] + t * columns[2, 1]))
             x2 = np.float32(columns[0, 2] + t * (columns[1, 2] + t * columns[2, 2]))
-            y0 = np.float32(rows[0, 0] + t * (rows[1, 0] + t * rows[2, 0]))
+            y0 = np.float32(centres[n, 1] - top + rows[0, 0] + t * (rows[1, 0] + t * rows[2, 0]))
             y1 = np.float32(rows[0, 1] + t * (rows[1, 1] + t * rows[2, 1]))
             y2 = np.float32(rows[0, 2] + t * (rows[1, 2] + t * rows[2, 2]))
             for j in range(width):
                 s = np.float32(np.int32(j) - np.int32(half))
                 x, y = x0 + s * (x1 + s * x2), y0 + s * (y1 + s * y2)
                 column, row = np.int32(x), np.int32(y)
-                at[j] = (row - np.int32(1)) * stride + column - np.int32(1)
+                at[j] = (row - np.int32(1)) * np.int32(stride) + column - np.int32(1)
                 a, b, c, d = keys(x - np.float32(column))
                 across[4 * j], across[4 * j + 1], across[4 * j + 2], across[4 * j + 3] = a, b, c, d
                 a, b, c, d = keys(y - np.float32(row))
                 down[4 * j], down[4 * j + 1], down[4 * j + 2], down[4 * j + 3] = a, b, c, d
-            # 2. The greys there, by cubic convolution: bilinear interpolation shifts fine texture by up to 0.02 px.
+            # 3. The greys there, by cubic convolution: bilinear interpolation shifts fine texture by up to 0.02 px.
             for j in range(side):
-                k, first = 4 * j, np.uint64(at[j])
-                a, b, c, d = down[k], down[k + 1], down[k + 2], down[k + 3]
+                k = 4 * j
+                first = np.uint64(at[j])
                 second, third, fourth = (
-                    first + row_step,
-                    first + np.uint64(2) * row_step,
-                    first + np.uint64(3) * row_step,
+                    first + np.uint64(stride),
+                    first + np.uint64(2 * stride),
+                    first + np.uint64(3 * stride),
                 )
+                a, b, c, d = down[k], down[k + 1], down[k + 2], down[k + 3]
                 for m in range(4):
-                    part[k + m] = across[k + m] * (
+                    column_sum = (
                         a * greys[first + m] + b * greys[second + m] + c * greys[third + m] + d * greys[fourth + m]
                     )
+                    part[k + m] = across[k + m] * column_sum
             for j in range(side):
                 templates[n, i, j] = (part[4 * j] + part[4 * j + 1]) + (part[4 * j + 2] + part[4 * j + 3])
+
+
+@inner
+def write_nodes(
+    point: Array,
+    normal: Array,
+    T_curr_ref: Array,
+    height_m: float,
+    shift: Array,
+    half: int,
+    focal_px: float,
+    columns: Array,
+    rows: Array,
+) -> None:
+    """Write where the image shows corners, middles of the sides and middle of a template (3, 3), as offsets [px].
+
+    A template of which the plane explains a part alone is not bent.
+    """
+    R, limit = T_curr_ref[:3, :3], 4 * half + 2
+    # 1. The plane n' . (p' - o') = scale, and the point, from the current viewpoint o'.
+    n, seen, t = np.empty(3), np.empty(3), np.empty(3)
+    for a in range(3):
+        t[a] = T_curr_ref[a, 3] - (height_m if a == 2 else 0.0)
+        n[a] = R[a, 0] * normal[0] + R[a, 1] * normal[1] + R[a, 2] * normal[2]
+        seen[a] = R[a, 0] * point[0] + R[a, 1] * point[1] + R[a, 2] * point[2] + t[a]
+    scale = 1 + n[0] * t[0] + n[1] * t[1] + n[2] * t[2]
+    r, seen_r = math.hypot(point[0], point[1]), math.hypot(seen[0], seen[1])
+    is_bent = scale > 0
+    for i in range(3):
+        z = seen[2] / seen_r - ((i - 1) * half + shift[1]) / focal_px
+        for j in range(3):
+            # 2. The ray of the pixel, of horizontal length 1; azimuth falls from column to column.
+            azimuth = -((j - 1) * half + shift[0]) / focal_px
+            c, s = math.cos(azimuth) / seen_r, math.sin(azimuth) / seen_r
+            x, y = c * seen[0] - s * seen[1], s * seen[0] + c * seen[1]
+            # 3. Its point on the plane, in the frame of the image, with the azimuth of the patch as x axis.
+            along = n[0] * x + n[1] * y + n[2] * z
+            is_bent &= along > 0
+            per = scale / along
+            x, y, up = x * per - t[0], y * per - t[1], z * per - t[2]
+            p = R[0, 0] * x + R[1, 0] * y + R[2, 0] * up
+            q = R[0, 1] * x + R[1, 1] * y + R[2, 1] * up
+            ahead, aside = (point[0] * p + point[1] * q) / r, (point[0] * q - point[1] * p) / r
+            high = R[0, 2] * x + R[1, 2] * y + R[2, 2] * up
+            columns[i, j] = -focal_px * math.atan2(aside, ahead)
+            rows[i, j] = focal_px * (point[2] / r - high / math.hypot(ahead, aside))
+            is_bent &= (ahead > 0) & (abs(columns[i, j]) < limit) & (abs(rows[i, j]) < limit)  # false for NaN
+    if not is_bent:
+        for i in range(3):
+            for j in range(3):
+                columns[i, j], rows[i, j] = (j - 1) * half + shift[0], (i - 1) * half + shift[1]
+
+
+@inner
+def write_coefficients(nodes: Array, half: int) -> None:
+    """Replace values at nodes (3, 3) of a square by the coefficients of powers (row, column) from its middle."""
+    for k in range(3):
+        first, middle, last = nodes[k, 0], nodes[k, 1], nodes[k, 2]
+        nodes[k, 0], nodes[k, 1] = middle, (last - first) / (2 * half)
+        nodes[k, 2] = (first - 2 * middle + last) / (2 * half**2)
+    for k in range(3):
+        first, middle, last = nodes[0, k], nodes[1, k], nodes[2, k]
+        nodes[0, k], nodes[1, k] = middle, (last - first) / (2 * half)
+        nodes[2, k] = (first - 2 * middle + last) / (2 * half**2)
 
 
 @inner
@@ -134,7 +226,8 @@ def fit(
     pixels, noise = side * side, 2 * max(noise_grey, 1.0) ** 2
     design, inside = np.zeros((size, side, width), np.float32), np.zeros((side, width), np.float32)
     window, room = np.zeros((side, width), np.float32), np.empty(width, np.float32)
-    cell = np.zeros((side + 2 * reach_px + 1, width + 2 * reach_px + 1), np.float32)
+    stride = -(-(width + 2 * reach_px + 1) // CELL_LANES) * CELL_LANES
+    cell = np.zeros((side + 2 * reach_px + 1, stride), np.float32)
     normal, inverse, sums = np.empty((size, size)), np.empty((size, size)), np.empty(size)
     right, weighted, solution = np.empty(size), np.empty(size), np.empty(size)
     inside[:, :side] = 1.0
@@ -216,14 +309,16 @@ def write_design(template: Floats, design: Floats) -> None:
 
 @inner
 def copy_cell(image: Image, left: int, top: int, width: int, height: int, cell: Floats) -> None:
-    """Write pixels of an image, less the middle grey, into a cell (S, W); the border is repeated."""
-    is_inside = left >= 0 and left + width <= image.shape[1]
+    """Write pixels of an image, less the middle grey, into a cell (S, W); the border is repeated.
+
+    W is a multiple of CELL_LANES; columns beyond the width are not defined."""
     for i in range(height):
         line, to = image[within(top + i, image.shape[0])], cell[i]
-        if is_inside:
-            source = line[left : left + width]
-            for j in range(width):
-                to[j] = np.float32(source[j]) - MIDDLE_GREY
+        if left >= 0 and left + -(-width // CELL_LANES) * CELL_LANES <= image.shape[1]:
+            for start in range(0, width, CELL_LANES):
+                source, place = line[left + start :], to[start:]
+                for j in range(CELL_LANES):
+                    place[j] = np.float32(source[j]) - MIDDLE_GREY
         else:
             for j in range(width):
                 to[j] = np.float32(line[within(left + j, image.shape[1])]) - MIDDLE_GREY

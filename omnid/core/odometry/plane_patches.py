@@ -43,12 +43,6 @@ SLOPE_WINDOW_PX, SLOPE_ROUNDS = 21, 2
 MAX_SLOPE = 0.7  # Largest slope of a disparity, because a steeper plane is seen so obliquely that it has no patch.
 # Px/px, of the start, because those of dense stereo are a third too flat, its windows being upright.
 SLOPE_SIGMA = 0.1
-# Nodes of a template farther than so many halves of its side from the middle do not bend it.
-MOST_STRETCH = 4
-# Columns and rows of the nodes of a template, as halves of its side from the middle.
-STEPS = np.array([[-1, 0, 1] * 3, [-1, -1, -1, 0, 0, 0, 1, 1, 1]])
-# Coefficients of the powers 0, 1, 2 of a polynomial by its values at -1, 0 and 1.
-POWERS = np.array([[0.0, 1.0, 0.0], [-0.5, 0.0, 0.5], [0.5, -1.0, 0.5]])
 # Reach of patches whose pose and depth are known well.
 REACH_PX = 1
 # By which a patch may move sideways in the upper panorama from where it was tracked to.
@@ -84,41 +78,17 @@ def plane_templates(
     which shows the centres at predicted (N, 2). Where a plane is seen edge on, the patch is not bent. KeyError for an
     anchor without an image.
     """
-    side, cylinder, half = window_px + 2, model.cylinder, (window_px + 2) // 2
-    templates = np.zeros((len(pixels), side, side), np.float32)
-    if not len(pixels):
-        return templates
-    # 1. Rays (3, N, 9) of corners, middles of the sides and middle of the templates, from the current viewpoint o'.
-    origin = np.array([0.0, 0.0, model.baseline_m if upper else 0.0])
-    R, t = T_curr_ref[:, :3, :3], T_curr_ref[:, :3, 3] - origin
-    n, shift = _turned(R, _normals(surfaces, model.baseline_m)), np.rint(predicted) - predicted
-    middles = cylinder.pixels(_turned(R, surfaces[0]) + t) + shift
-    azimuths = cylinder.azimuth(middles[:, :1] + half * STEPS[0, :3])
-    heights = (cylinder.row0 - middles[:, 1:] - half * STEPS[1]) / cylinder.focal_px
-    rays = np.stack([np.tile(np.cos(azimuths), 3), np.tile(np.sin(azimuths), 3), heights])
-    # 2. Their points on the plane n' . (p' - o') = scale, and where the image shows these, from the patch's middle. A
-    #    template of which the plane explains a part alone is not bent.
-    along, scale = np.einsum("nk,knm->nm", n, rays), 1 + np.einsum("nk,nk->n", n, t)[:, None]
-    r = np.hypot(surfaces[0][:, 0], surfaces[0][:, 1])[:, None]
-    c, s, slope = surfaces[0].T[:, :, None] / r
-    with np.errstate(divide="ignore", invalid="ignore"):  # planes seen edge on
-        x, y, z = np.einsum("nka,knm->anm", R, scale / along * rays - t.T[:, :, None])
-        seen = [np.arctan2(s * x - c * y, c * x + s * y), slope - z / np.hypot(x, y)]
-    offsets = cylinder.focal_px * np.stack(seen, axis=1)
-    is_bent = (scale > 0) & (along > 0) & (np.abs(offsets) < MOST_STRETCH * half).all(axis=1)
-    is_whole = np.asarray(is_bent.all(axis=1))[:, None, None]
-    offsets = np.where(is_whole, offsets, half * STEPS + shift[:, :, None])
-    # 3. The quadratic polynomials through them, and the greys of the pixels in between.
-    known = np.asarray(np.isfinite(offsets[:, :, 0]).all(axis=1) & np.isfinite(pixels).all(axis=1))
-    first_image = next(iter(images.values()))
-    places = np.where(known[:, None, None], offsets + _padded(first_image, pixels)[:, :, None], 0.0)
-    first = np.floor(places.min(axis=2)).astype(np.intp) - 2
-    cells = np.stack([first, np.floor(places.max(axis=2)).astype(np.intp) + 4 - first], axis=1)
-    powers = POWERS / half ** np.arange(3)[:, None]
-    coefficients = powers @ (places - first[:, :, None]).reshape(-1, 2, 3, 3) @ powers.T
+    templates = np.empty((len(pixels), window_px + 2, window_px + 2), np.float32)
+    focal_px = model.cylinder.focal_px
+    points, normals = np.ascontiguousarray(surfaces[0]), _normals(surfaces, model.baseline_m)
+    shift = np.ascontiguousarray(np.rint(predicted) - predicted)
+    height_m = model.baseline_m if upper else 0.0
     for key in np.unique(anchors).tolist():
-        chosen = np.flatnonzero(known & (anchors == key))
-        patch_kernels.sample(images[key].image, chosen, cells, coefficients, templates)
+        image, chosen = images[key], np.flatnonzero(anchors == key)
+        centres = _padded(image, pixels)
+        patch_kernels.sample(
+            image.image, chosen, centres, points, normals, T_curr_ref, height_m, shift, focal_px, templates
+        )
     return templates
 
 
