@@ -30,13 +30,13 @@ from calib.models.ocam import DISTANCE_M, OcamCamera, View
 from calib.models.wavefront import WAVEFRONT_NAMES
 from calib.rig import TRANSFORM_NAMES, MountedCamera, Rig, RigCovariance, ShutterTimes
 from calib.typed_toml import convert, shown, table_of
-from calib.validation import decode, read_bytes, require_image_size, transform_of
+from calib.validation import read_bytes, require_image_size, transform_of
 
 SCHEMA: Final = 1  # the first: it rises when an earlier program would misread the file
 COVARIANCE_VERSION: Final = 1  # the same for the table [covariance]
 SIDES: Final = ("lower", "upper")
 LOG_BEGINNINGS: Final = (b"\x89MCAP", b"SQLite format 3", b"#ROSBAG")
-OTHER_CALIBRATIONS: Final = (".yaml", ".yml", ".json", ".txt")  # as of Kalibr, Basalt, OCamCalib
+OTHER_CALIBRATIONS: Final = (".yaml", ".yml", ".txt")  # as of Kalibr, OCamCalib
 # Translations are rounded to 1e-12 m: two inversions round differently, and rounding makes the text reproducible.
 TRANSLATION_DECIMALS: Final = 12
 # Signature, length and name of the first chunk, then width and height. Source: PNG 1.2, sections 3.1 and 4.1.1.
@@ -46,7 +46,7 @@ EMBEDDED: Final = "data:image/png;base64,"
 # 1. The tables of the file.
 Size: TypeAlias = tuple[int, int]
 Matrix: TypeAlias = tuple[tuple[float, ...], ...]
-Model: TypeAlias = Literal["omni", "ocam", "ds", "eucm", "equidistant", "equirectangular"]
+Model: TypeAlias = Literal["omni", "ocam", "ds", "equidistant", "equirectangular"]
 
 
 class OcamIntrinsics(Struct, frozen=True):
@@ -146,9 +146,8 @@ def read_rig(path: str | os.PathLike[str]) -> Rig:
 
 def parse_rig(text: str | bytes, folder: Path | None = None, name: str = "rig.toml") -> Rig:
     """Parse the rig of a `rig.toml`'s text; folder contains its mask images, None permits embedded ones only."""
-    data = decode(text, name).encode()
     with within(f"{name}: "):
-        values = table_of(data)
+        values = table_of(text.encode() if isinstance(text, str) else text)
         _require_version("schema", values.get("schema"), SCHEMA)  # first, as another one has other keys
         table = convert(RigTable, values)
         lower, upper = (_mounted(side, getattr(table, side), folder) for side in SIDES)

@@ -84,7 +84,7 @@ def parse_toml(text: str) -> dict[str, Any]:
 def table_of(data: bytes) -> dict[str, Any]:
     """Return the table of TOML bytes; raise ValueError for bytes that are no TOML in UTF-8."""
     try:
-        return parse_toml(data.decode())
+        return parse_toml(data.decode("utf-8-sig"))
     except UnicodeDecodeError as error:
         raise ValueError(f"expected TOML in UTF-8, found another byte at offset {error.start}") from None
     except (ValueError, RecursionError) as error:

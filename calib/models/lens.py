@@ -1,4 +1,4 @@
-"""Models of cameras without a mirror: double sphere, extended unified, equidistant, and equirectangular images.
+"""Models of cameras without a mirror: double sphere, equidistant, and equirectangular images.
 
 A lens sees the world directly, and its image is not flipped. It has no hub in the middle of the image and no
 aberrations of a reflected wavefront, as mirrors have.
@@ -50,42 +50,12 @@ class _Lens:
         return mx, my, mx * mx + my * my
 
 
-class _Spheres(_Lens):
-    """Common part of the double sphere and the extended unified model, with the parameters xi, alpha, beta.
-
-    With z' = xi |p| + z and d = sqrt(beta (x^2 + y^2) + z'^2) the image is (x, y) / (alpha d + (1 - alpha) z').
-    """
-
-    __slots__ = ()
-
-    @property
-    def _parameters(self) -> tuple[float, float, float]:
-        raise NotImplementedError
-
-    def project(self, points: Array) -> Array:
-        """Return pixels (N, 2) of points (N, 3); NaN where the lens does not see them."""
-        x, y, z = np.asarray(points, float).T
-        xi, alpha, beta = self._parameters
-        r2 = beta * (x * x + y * y)
-        d1 = np.sqrt(r2 + z * z)
-        shifted = xi * d1 + z
-        w1 = alpha / (1 - alpha) if alpha <= 0.5 else (1 - alpha) / alpha
-        w2 = (w1 + xi) / np.sqrt(2 * w1 * xi + xi**2 + 1)
-        scale = alpha * np.sqrt(r2 + shifted**2) + (1 - alpha) * shifted
-        return self._pixels(x, y, scale, seen=(z > -w2 * d1) & (d1 > 0))
-
-    def lift(self, pixels: Array) -> Array:
-        """Return unit rays (N, 3) of pixels (N, 2); NaN where there is none."""
-        mx, my, r2 = self._plane(pixels)
-        xi, alpha, beta = self._parameters
-        mz = (1 - alpha**2 * beta * r2) / (alpha * _root(1 - (2 * alpha - 1) * beta * r2) + 1 - alpha)
-        k = (mz * xi + _root(mz**2 + (1 - xi**2) * r2)) / (mz**2 + r2)
-        return np.column_stack([k * mx, k * my, k * mz - xi])
-
-
 @dataclass(frozen=True, slots=True)
-class DoubleSphereCamera(_Spheres):
-    """Model `ds` of Usenko, Demmel, Cremers 2018, eq. (40) to (51): xi, alpha."""
+class DoubleSphereCamera(_Lens):
+    """Model `ds` of Usenko, Demmel, Cremers 2018, eq. (40) to (51): xi, alpha.
+
+    With z' = xi |p| + z the image is (x, y) / (alpha hypot(x, y, z') + (1 - alpha) z').
+    """
 
     xi: float
     alpha: float
@@ -97,28 +67,25 @@ class DoubleSphereCamera(_Spheres):
         fits = -1 < self.xi < 1 and 0 <= self.alpha <= 1
         self._check("ds", self.xi, self.alpha, fits=fits, expected="xi between -1 and 1 and alpha of 0 to 1")
 
-    @property
-    def _parameters(self) -> tuple[float, float, float]:
-        return self.xi, self.alpha, 1.0
+    def project(self, points: Array) -> Array:
+        """Return pixels (N, 2) of points (N, 3); NaN where the lens does not see them."""
+        x, y, z = np.asarray(points, float).T
+        xi, alpha = self.xi, self.alpha
+        r2 = x * x + y * y
+        d1 = np.sqrt(r2 + z * z)
+        shifted = xi * d1 + z
+        w1 = alpha / (1 - alpha) if alpha <= 0.5 else (1 - alpha) / alpha
+        w2 = (w1 + xi) / np.sqrt(2 * w1 * xi + xi**2 + 1)
+        scale = alpha * np.sqrt(r2 + shifted**2) + (1 - alpha) * shifted
+        return self._pixels(x, y, scale, seen=(z > -w2 * d1) & (d1 > 0))
 
-
-@dataclass(frozen=True, slots=True)
-class ExtendedUnifiedCamera(_Spheres):
-    """Model `eucm` of Khomutenko, Garcia, Martinet 2016, eq. (3) to (5), (12): alpha, beta."""
-
-    alpha: float
-    beta: float
-    focal: tuple[float, float]
-    center: tuple[float, float]
-    size: tuple[int, int]
-
-    def __post_init__(self) -> None:
-        fits = 0 <= self.alpha <= 1 and self.beta > 0
-        self._check("eucm", self.alpha, self.beta, fits=fits, expected="alpha of 0 to 1 and beta above 0")
-
-    @property
-    def _parameters(self) -> tuple[float, float, float]:
-        return 0.0, self.alpha, self.beta
+    def lift(self, pixels: Array) -> Array:
+        """Return unit rays (N, 3) of pixels (N, 2); NaN where there is none."""
+        mx, my, r2 = self._plane(pixels)
+        xi, alpha = self.xi, self.alpha
+        mz = (1 - alpha**2 * r2) / (alpha * _root(1 - (2 * alpha - 1) * r2) + 1 - alpha)
+        k = (mz * xi + _root(mz**2 + (1 - xi**2) * r2)) / (mz**2 + r2)
+        return np.column_stack([k * mx, k * my, k * mz - xi])
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,10 +185,10 @@ class EquirectangularCamera(_Lens):
         return np.column_stack([level * np.sin(azimuth), np.sin(elevation), level * np.cos(azimuth)])
 
 
-def full_turn(size: tuple[int, int], top_px: int = 0) -> EquirectangularCamera:
-    """Return the camera of stitched images of a full turn, without the first top_px rows of those of half the width."""
+def full_turn(size: tuple[int, int]) -> EquirectangularCamera:
+    """Return the camera of whole stitched images: a full turn by half a turn."""
     per_rad = size[0] / (2 * math.pi)
-    return EquirectangularCamera((per_rad, per_rad), ((size[0] - 1) / 2, (size[0] / 2 - 1) / 2 - top_px), size)
+    return EquirectangularCamera((per_rad, per_rad), ((size[0] - 1) / 2, (size[1] - 1) / 2), size)
 
 
 def _root(values: Array) -> Array:

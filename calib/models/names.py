@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.errors import CalibError
 from calib.models.camera import Mask, OmniCamera, inscribed_mask, whole_image
-from calib.models.lens import DoubleSphereCamera, EquidistantCamera, EquirectangularCamera, ExtendedUnifiedCamera
+from calib.models.lens import DoubleSphereCamera, EquidistantCamera, EquirectangularCamera
 from calib.models.ocam import ASTIGMATISM_NAMES, DISTANCE_M, TANGENTIAL_NAMES, OcamCamera, View
 from calib.models.unified import DISTORTION_NAMES, UnifiedCamera
 from calib.models.wavefront import WAVEFRONT_NAMES
@@ -32,7 +32,6 @@ MODELS: Final[Mapping[str, tuple[type[Any], Mapping[str, tuple[str, ...]]]]] = M
             },
         ),
         "ds": (DoubleSphereCamera, {"xi": ("xi",), "alpha": ("alpha",), **_PLANE}),
-        "eucm": (ExtendedUnifiedCamera, {"alpha": ("alpha",), "beta": ("beta",), **_PLANE}),
         "equidistant": (EquidistantCamera, {"coefficients": ("k1", "k2", "k3", "k4"), **_PLANE}),
         "equirectangular": (EquirectangularCamera, _PLANE),
     }

@@ -3,30 +3,18 @@
 from __future__ import annotations
 
 import argparse
-import re
 from pathlib import Path
 
 import numpy as np
 
 from calib import se3
 from calib.errors import CalibError
-from calib.importers import (
-    helvipad_rig,
-    import_chain,
-    import_pair,
-    is_one_camera,
-    load_table,
-    read_transform,
-    stacked_rig,
-    straight_up,
-)
+from calib.importers import import_chain, import_pair, read_transform, stacked_rig, straight_up
 from calib.models.camera import field_of_view
 from calib.models.names import model_name
 from calib.models.ocam import OcamCamera
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import read_rig, write_rig
-from calib.typed_toml import shown
-from calib.validation import MAX_JSON_BYTES, read_bytes
 from omnid.commands.options import HEIGHT, command, height_of, warn
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
@@ -36,11 +24,10 @@ from omnid.sinks.files import check_outputs
 def run(args: argparse.Namespace) -> int:
     """Make a rig.toml from a Kalibr file, from two OCamCalib files, or of two 360-degree cameras.
 
-    camchain [FILE]  both cameras: Kalibr's camchain.yaml, basalt's or Helvipad's calibration.json
-    --lower CAMERA   the lower camera: its name in the camchain (cam0), or its file: OCamCalib's calib_results.txt,
-        ROS's camera_info, OpenCV's, EuRoC's sensor.yaml, camodocal's
+    camchain [FILE]  both cameras: Kalibr's camchain.yaml
+    --lower CAMERA   the lower camera: its name in the camchain (cam0), or its file: OCamCalib's calib_results.txt
     --upper CAMERA   the same for the upper camera
-    --equirectangular WIDTHxHEIGHT  two 360-degree cameras one above the other, with stitched images of this size; with
+    --equirectangular 3840x1920  two 360-degree cameras one above the other, with stitched images of this size; with
         --baseline
     --view mirror|direct        OCamCalib: the world is seen in a mirror (default) or directly through a lens
     --frame imu|cameras=imu     the rig frame of a file with T_cam_imu: that of the IMU, whose z must point up; cameras:
@@ -49,9 +36,9 @@ def run(args: argparse.Namespace) -> int:
     --replace                   write it in the place of a rig that states more than the new one
 
     one of:
-    --transform FILE  file with T_lower_upper, 4x4: TOML, YAML or 16 numbers
-    --baseline M      metres from the lower viewpoint straight up to the upper one; both cameras look up and are equally
-        oriented
+    --transform FILE  the 16 numbers of T_lower_upper, row by row
+    --baseline M 0.001..5  metres from the lower viewpoint straight up to the upper one; both cameras look up and are
+        equally oriented
 
     examples:
       calibrate import camchain.yaml -o rig.toml
@@ -67,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
             width, height = mounted.camera.size
             raise OmnidError(
                 f"the {side} camera sees nothing of its image of {width}x{height} px, whose centre is at "
-                f"{shown(mounted.camera.center)}: are both in the order of its program?"
+                f"{mounted.camera.center}: are both in the order of its program?"
             )
     if args.output.exists() and not args.replace:
         _must_lose_nothing(args.output, rig)
@@ -92,45 +79,21 @@ def _must_lose_nothing(path: Path, rig: Rig) -> None:
 
 
 def _imported(args: argparse.Namespace) -> Rig:
+    files = bool(args.transform or args.view)
     if args.equirectangular:
-        return _stitched(args)
-    if args.camchain is None:
-        return _pair(args)
-    if args.camchain.suffix == ".toml":
-        raise OmnidError(f"{args.camchain}: a rig.toml needs no import: use it as it is, --rig {args.camchain}")
-    values = load_table(read_bytes(args.camchain, MAX_JSON_BYTES), str(args.camchain))
-    if is_one_camera(values):
-        raise OmnidError(f"{args.camchain}: it has one camera: give the files of both as --lower FILE --upper FILE")
-    if "stereo_baseline" in values:
-        return helvipad_rig(values, str(args.camchain))
-    if args.transform or args.baseline is not None or args.view:
+        if args.baseline is None or args.camchain or args.lower or args.upper or files:
+            raise OmnidError("--equirectangular: expected --baseline METRES beside it, and no file")
+        return stacked_rig(args.equirectangular, args.baseline)
+    if args.camchain is not None:
+        if files or args.baseline is not None:
+            raise OmnidError("--transform, --baseline and --view belong to files of OCamCalib: Kalibr's state them")
+        return import_chain(args.camchain, args.lower or "", args.upper or "", args.frame, warn)
+    if not (args.lower and args.upper and (args.transform or args.baseline is not None)):
         raise OmnidError(
-            f"{args.camchain}: --transform, --baseline and --view go with files of one camera each; this one holds its "
-            "transforms"
+            "calibrate import: expected a Kalibr camchain.yaml, or two files of OCamCalib as --lower and --upper with "
+            "--transform FILE or --baseline METRES"
         )
-    return import_chain(args.camchain, args.lower or "", args.upper or "", args.frame, warn)
-
-
-def _stitched(args: argparse.Namespace) -> Rig:
-    size = re.fullmatch(r"(\d{2,5})x(\d{2,5})", args.equirectangular)
-    if size is None:
-        raise OmnidError(f"--equirectangular: expected WIDTHxHEIGHT as 3840x1920, found {args.equirectangular!r}")
-    if args.baseline is None or args.camchain or args.transform or args.lower or args.upper or args.view:
-        raise OmnidError(
-            "--equirectangular goes with --baseline METRES, and with no file, because stitched images "
-            "have no other numbers"
-        )
-    return stacked_rig((int(size[1]), int(size[2])), args.baseline)
-
-
-def _pair(args: argparse.Namespace) -> Rig:
-    if not (args.lower and args.upper):
-        raise OmnidError(
-            "calibrate import: expected a Kalibr camchain.yaml, or two files of one camera each as --lower and --upper"
-        )
-    T_lower_upper = None
-    if args.transform or args.baseline is not None:
-        T_lower_upper = read_transform(args.transform) if args.transform else straight_up(args.baseline)
+    T_lower_upper = read_transform(args.transform) if args.transform else straight_up(args.baseline)
     return import_pair(Path(args.lower), Path(args.upper), T_lower_upper, args.view or "mirror", warn)
 
 

@@ -142,7 +142,7 @@ def _number(kind: Callable[[str], Any], low: float, high: float, text: str) -> f
 
 def two_sides(text: str) -> tuple[int, int]:
     """Parse the numbers along both sides, like 6x7."""
-    sides = re.fullmatch(r"(\d{1,3})[xX](\d{1,3})", text)
+    sides = re.fullmatch(r"(\d{1,5})[xX](\d{1,5})", text)
     if sides is None:
         raise argparse.ArgumentTypeError(f"expected two numbers like 6x7, found {text!r}")
     return int(sides[1]), int(sides[2])
@@ -162,7 +162,7 @@ def map_file(text: str) -> Path:
 TYPES: Final[Mapping[str, Callable[[str], Any]]] = {
     **dict.fromkeys(("N", "PX", "BITS"), int),
     **dict.fromkeys(("X", "S", "M", "MM", "MS", "HZ", "MPS", "TURNS", "FACTOR", "SHARE", "RATIO"), float),
-    **dict.fromkeys(("6x7", "6x6"), two_sides),
+    **dict.fromkeys(("6x7", "6x6", "3840x1920"), two_sides),
     "FILE.omap": map_file,
 }
 _PATHS: Final = {"FILE", "FOLDER", "DIR", "LOG", "EST", "TRUTH", "OUT"}

@@ -125,7 +125,6 @@ SETS: Final[dict[str, dict[str, Case]]] = {
         "pinhole_90": by_lens("pinhole", 90),
         "equidistant_180": by_lens("equidistant", 180),
         "ds_180": by_lens("ds", 180),
-        "eucm_180": by_lens("eucm", 180),
         "equidistant_270": by_lens("equidistant", 270, (800, 480)),
         "pinhole_30_wall": by_lens("pinhole", 30, beyond_m=1.2),
         "pinhole_90_wall": by_lens("pinhole", 90, beyond_m=1.2),

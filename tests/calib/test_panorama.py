@@ -27,7 +27,6 @@ STEP_DEG, CORNERS_DEG = 3.75, 3.0
         ("equidistant", 60, (320, 240)),
         ("equidistant", 150, (640, 120)),
         ("ds", 120, (640, 240)),
-        ("eucm", 120, (640, 240)),
         ("equidistant", 240, (960, 110)),
         ("equidistant", 280, (1200, 110)),
     ],

@@ -90,7 +90,7 @@ ROWS = "[0.0, 0.0, 0.0, 1.0],\n]\n\n[lower]"
         ("xi = 0.93", "xi = -1.0", "lower.intrinsics: omni camera: expected xi > -1"),
         ("xi = 0.93", "xi = 0.93\nk3 = 0.0", "unknown key lower.intrinsics.k3: known are lower.intrinsics.xi, "),
         ("fu = -205.0\n", "", "lower.intrinsics.fu is missing"),
-        ('model = "omni"', 'model = "pinhole"', "lower.model: expected one of 'omni', 'ocam', 'ds', 'eucm', 'equi"),
+        ('model = "omni"', 'model = "pinhole"', "lower.model: expected one of 'omni', 'ocam', 'ds', 'equi"),
         (
             'model = "omni"',
             'model = "omni"\nview = "mirror"',
@@ -155,10 +155,9 @@ def test_unreadable_files_are_one_line_errors(omni_rig: Rig, tmp_path: Path) -> 
         read_rig(tmp_path / "bytes.toml")
 
 
-@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "latin-1"])
-def test_reads_what_other_editors_leave(omni_rig: Rig, tmp_path: Path, encoding: str) -> None:
+def test_reads_what_other_editors_leave(omni_rig: Rig, tmp_path: Path) -> None:
     text = "# K\xe4lte\n" + rig_toml(omni_rig)
-    (tmp_path / "rig.toml").write_bytes(text.replace("\n", "\r\n").encode(encoding))
+    (tmp_path / "rig.toml").write_bytes(text.replace("\n", "\r\n").encode("utf-8-sig"))
     assert rig_toml(read_rig(tmp_path / "rig.toml")) == rig_toml(omni_rig)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from calib import se3
 from calib.models.camera import Array, Mask, OmniCamera
-from calib.models.lens import DoubleSphereCamera, EquidistantCamera, ExtendedUnifiedCamera
+from calib.models.lens import DoubleSphereCamera, EquidistantCamera
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
 from omnid.simulation.robot import HORIZON, R_RIG_CAM, RIM, TOPICS
@@ -189,7 +189,7 @@ def with_upper_rotated(rig: Rig, turn_deg: tuple[float, float, float]) -> Rig:
 
 # A camera that looks ahead: its z is the rig's x, its x the rig's -y, its y the rig's -z.
 R_RIG_AHEAD = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
-LENSES = ("pinhole", "equidistant", "ds", "eucm")
+LENSES = ("pinhole", "equidistant", "ds")
 
 
 def lens(model: str, field_deg: float, size: tuple[int, int] = (640, 480)) -> OmniCamera:
@@ -202,8 +202,6 @@ def lens(model: str, field_deg: float, size: tuple[int, int] = (640, 480)) -> Om
             return UnifiedCamera(0.0, (focal, focal), centre, size, (-0.03, 0.004, 2e-4, -1e-4))
         if model == "ds":
             return DoubleSphereCamera(-0.2, 0.6, (focal, focal), centre, size)
-        if model == "eucm":
-            return ExtendedUnifiedCamera(0.6, 1.1, (focal, focal), centre, size)
         return EquidistantCamera((0.01, -0.002, 0.0, 0.0), (focal, focal), centre, size)
 
     return made(half_px / float(made(1.0).project(edge)[0, 0] - centre[0]))

@@ -93,9 +93,9 @@ FORMATS: Final = {
     "rig.toml": Format(lambda folder: (folder / "rig.toml").read_bytes(), lambda path: parse_rig(path.read_bytes())),
     "camchain.yaml": Format(
         lambda _: chain(BOTH, T_UPPER_LOWER, NAMED).encode(),
-        lambda path: parse_chain(path.read_bytes()),
+        lambda path: parse_chain(path.read_text(errors="replace")),
     ),
-    "calib_results.txt": Format(lambda _: OCAM, lambda path: parse_ocam(path.read_bytes())),
+    "calib_results.txt": Format(lambda _: OCAM, lambda path: parse_ocam(path.read_text(errors="replace"))),
     "omnid.toml": Format(lambda _: dump(Config()).encode(), load_config),
     "place.omap": Format(map_bytes, read_places),
     "truth.txt": Format(lambda folder: (folder / "truth.txt").read_bytes(), read_tum),

@@ -40,14 +40,14 @@ def test_imports_kalibr_files(kalibr: Path, tmp_path: Path, capsys: pytest.Captu
 
 def test_imports_ocam_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "c.txt").write_text(OCAM)
-    (tmp_path / "T.toml").write_text(f"T_upper_lower = {T_UPPER_LOWER.tolist()}")
+    (tmp_path / "T.txt").write_text("\n".join(" ".join(map(str, row)) for row in se3.inverse(T_UPPER_LOWER).tolist()))
     files = ["--lower", tmp_path / "c.txt", "--upper", tmp_path / "c.txt", "-o", tmp_path / "rig.toml"]
-    assert omnid(*files, "--transform", tmp_path / "T.toml") == 0
+    assert omnid(*files, "--transform", tmp_path / "T.txt") == 0
     found = read_rig(tmp_path / "rig.toml")
     assert se3.apply(found.upper.T_cam_rig @ se3.inverse(found.lower.T_cam_rig), [[0.0, 0, 0]])[0] == pytest.approx(
         T_UPPER_LOWER[:3, 3], abs=1e-11
     )
-    assert omnid(*files) == 2 and "give --transform FILE or --baseline METRES" in capsys.readouterr().err
+    assert omnid(*files) == 2 and "--transform FILE or --baseline METRES" in capsys.readouterr().err
     assert omnid(*files, "--baseline", 0.2, "--view", "direct") == 0
     assert "upper ocam direct 640x480, 0 to " in (line := capsys.readouterr().out)
     assert "baseline 200.0 mm, upper rotated by 0.00 deg" in line
@@ -64,11 +64,10 @@ def test_imports_ocam_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
         (("none.yaml", "-o", "rig.toml"), "cannot be read"),
         (("k.yaml", "-o", "k.yaml"), "that is read as well"),
         (("k.yaml", "-o", "k.yaml/rig.toml"), "there is no folder"),
-        (("k.yaml", "--baseline", 0.2, "-o", "rig.toml"), "this one holds its transforms"),
-        (("rig2.toml", "-o", "rig.toml"), "needs no import"),
-        (("-o", "rig.toml"), "expected a Kalibr camchain.yaml, or two files of one camera"),
-        (("--lower", "a", "--upper", "b", "-o", "rig.toml"), "a: cannot be read"),
-        (("--equirectangular", "3840", "-o", "rig.toml"), "expected WIDTHxHEIGHT"),
+        (("k.yaml", "--baseline", 0.2, "-o", "rig.toml"), "Kalibr's state them"),
+        (("-o", "rig.toml"), "expected a Kalibr camchain.yaml, or two files of OCamCalib"),
+        (("--lower", "a", "--upper", "b", "--baseline", 0.2, "-o", "rig.toml"), "a: cannot be read"),
+        (("--equirectangular", "1920x960", "-o", "rig.toml"), "expected --baseline METRES"),
     ],
 )
 def test_invalid_requests_fail_before_files_are_written(
