@@ -1,31 +1,41 @@
-"""Closed-loop drives in lock-step against the truth at the wheels: `python -m tests.bench.drive CASE --seeds 1 2`.
+"""Closed-loop drives in lock-step against the truth at the wheels: `python -m tests.bench.drive goals|routes`.
 
-Every case is a script: it arms the robot and sends goals as a person would. A row for each seed:
+goals: every case is a script that arms the robot and sends goals as a person would. A row for each seed:
 what the navigation said at the end, true distance and heading error to the last goal, largest distance of the true
 path to the straight legs, contacts, least clearance; of a time in the dark the way and the error that it added to
 the pose; when slip was noticed, after it began, and how many pairs noticed it at other times.
+
+routes: in the corridor around the rooms of `building` a route is taught: a round of 33 m, or its first metres. It is
+repeated in the saved map from other starts on it, with other light, a fifth of the posters exchanged, and two people
+who walk across the corridor and wait for a near robot.
 """
 
 from __future__ import annotations
 
 import math
+import random
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Final, Literal
 
 import numpy as np
 
 from calib import se3
-from omnid.core.control.heading_controller import wrap_angle
-from omnid.core.navigation.requests import GoalRequest, NavigationFrame
+from calib.models.camera import Array
+from omnid.config import load_config
+from omnid.core.control.heading_controller import Setpoint, wrap_angle
+from omnid.core.navigation.requests import GoalRequest, NavigationFrame, PathRequest, RouteAction, RouteRequest
 from omnid.navigation_state import NavigationState
-from omnid.simulation.demonstration import cross_track_m
+from omnid.simulation.demonstration import ANSWER_S, cross_track_m
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun
 from omnid.simulation.robot import make_robot
 from omnid.simulation.vehicle import START_NS
 from omnid.simulation.world import World
-from omnid.simulation.world_file import load_world
+from omnid.simulation.world_file import WorldOptions, load_world
+from omnid.tracking_state import MapState
 from tests.bench.results import Cell, ResultTable, columns, run
 from tests.simulation.disturbed import Fault, Slip, disturbed, simulate
 
@@ -146,7 +156,7 @@ def slip(case: Case, driven: SimulatedRun) -> str:
     return "; ".join([*texts, str(int((driven.slipping & ~at_slips).sum()))])
 
 
-def drive(
+def goals(
     cases: Sequence[Literal["straight", "square", "dark", "dark without", "slip", "all"]],
     *,
     seeds: Sequence[int] = (1,),
@@ -164,5 +174,122 @@ def drive(
             table.add(name, seed, *row(case, driven), spent_s, seed=(f"drive {name}", seed))
 
 
+# A route taught once and repeated.
+
+ROUND: Final = np.array([(6.0, 1.05), (11.05, 1.05), (11.05, 7.95), (0.95, 7.95), (0.95, 1.05), (6.0, 1.05)])
+CORNER_M: Final = 0.6  # radius of the corners
+SPACING_M: Final = 0.05
+STARTS: Final = (0.0, 0.3, 0.12, 0.6, 0.45)  # share of the way at which the repetitions begin
+ASIDE_M, ASIDE_RAD = 0.1, math.radians(10)  # largest offset of a start from the route
+SEEK_MPS, SEEK_S = 0.2, 20.0  # of driving by hand until the robot knows where it is
+LONGEST_S: Final = 240.0
+SETTLED_M: Final = 1.0  # way after which a repetition has come from its start to the route
+DOORS: Final = (((8.42, 4.3), (8.42, 0.6)), ((4.95, 2.4), (4.95, 8.4)))  # ways of the people, from rooms
+
+
+def lap(length_m: float) -> Array:
+    """Return the first metres of the round (N, 2) [m] in the world, its corners rounded off."""
+    points = [ROUND[:1]]
+    arc = np.linspace(0.0, math.pi / 2, 15)[:, None]
+    for before, corner, after in zip(ROUND, ROUND[1:], ROUND[2:], strict=False):
+        u, v = (np.sign(other - corner) for other in (before, after))  # the sides are along the axes
+        points.append(corner + CORNER_M * (u * (1 - np.sin(arc)) + v * (1 - np.cos(arc))))
+    corners = np.concatenate([*points, ROUND[-1:]])
+    way_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    at_m = np.arange(0.0, min(length_m, way_m[-1]), SPACING_M)
+    return np.column_stack([np.interp(at_m, way_m, corners[:, axis]) for axis in (0, 1)])
+
+
+@dataclass
+class Route:
+    """A script: arms the robot, then drives along a line while the route is taught, or repeats it where it is known."""
+
+    taught: Array | None  # (N, 2) m in odom; None: the route is repeated
+    end: str = "time is over"
+    _asked_s: float = math.inf
+    _waiting: list[Request] = field(default_factory=list)
+
+    def __call__(self, moment: Moment) -> Iterator[Request]:
+        """Yield the requests at a moment."""
+        if moment.place is None:
+            return
+        if math.isinf(self._asked_s) and not moment.controller.armed:
+            yield "arm"
+        elif math.isinf(self._asked_s):
+            yield from self._begin(moment, moment.place.state)
+        elif moment.navigation is not None and moment.time_s > self._asked_s + ANSWER_S:
+            answer, state = moment.navigation.answer, moment.navigation.state
+            refusal = "" if answer is None else answer.refusal
+            if self._waiting and not refusal and state is NavigationState.REACHED:
+                yield self._waiting.pop(0)
+                self._asked_s = moment.time_s
+            elif refusal or state.is_end:
+                self.end = refusal or f"{state} {moment.navigation.reason}".strip()
+                yield "end"
+
+    def _begin(self, moment: Moment, state: MapState) -> Iterator[Request]:
+        if self.taught is not None:
+            yield RouteRequest(RouteAction.TEACH, "round")
+            yield PathRequest(NavigationFrame.ODOM, self.taught)
+            self._waiting = [RouteRequest(RouteAction.FINISH)]
+            self._asked_s = moment.time_s
+        elif state is MapState.LOCALIZED:
+            yield Setpoint(0.0)
+            yield RouteRequest(RouteAction.REPEAT, "round")
+            self._asked_s = moment.time_s
+        elif moment.time_s > SEEK_S:
+            self.end = "not recognised"
+            yield "end"
+        else:
+            yield Setpoint(SEEK_MPS)
+
+
+def later(seed: int, number: int, rng: random.Random) -> World:
+    """Return the building at another time of the day, with people."""
+    options = WorldOptions(brightness=rng.uniform(0.6, 1.3), other_posters=0.2, posters_seed=number + 1)
+    person = replace(load_world("corridor").people[0], repeat="back and forth", waits_within_m=1.0)
+    walking = tuple(
+        replace(person, path=path, speed_mps=rng.uniform(0.6, 1.0), start_s=rng.uniform(0.0, 10.0)) for path in DOORS
+    )
+    return replace(load_world("building", seed, options), people=walking)
+
+
+def route_row(taught: Array, driven: SimulatedRun) -> list[Cell]:
+    """Return the figures of a drive against the true positions (N, 2) of the lesson."""
+    path = np.array([tick.pose[:2] for tick in driven.ticks])
+    way_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    off_cm = 100 * cross_track_m(taught, path)[way_m > SETTLED_M]
+    p95, most = (np.percentile(off_cm, 95), off_cm.max()) if len(off_cm) else (None, None)
+    end_cm = 100 * math.dist(path[-1], taught[-1])
+    stops = dict.fromkeys(line for _, line in driven.lines if line.startswith("the wheels stop"))
+    return [p95, most, end_cm, way_m[-1], len(driven.contacts), driven.clearance_m, "; ".join(stops)[:300]]
+
+
+def routes(*, seeds: Sequence[int] = (1,), length: float = 33.0, size: int = 512) -> None:
+    """Print a row for the lesson of a route of so many metres, and for each repetition."""
+    head = columns(
+        *("seed", "drive", "end", "off the lesson p95|cm|1", "most|cm|1", "end error|cm|1", "way|m|1", "contacts"),
+        *("clearance|m|2", "stops"),
+    )
+    table, robot = ResultTable("routes", f"Repeated route of {length:g} m", head), make_robot(size)
+    line = lap(length)
+    for seed in seeds:
+        with tempfile.TemporaryDirectory() as folder:
+            files = [f"places.map={Path(folder) / 'building.omap'}", f"navigation.routes={Path(folder) / 'routes'}"]
+            config, world = load_config(None, files), load_world("building", seed)
+            script = Route(line - line[0])
+            world = replace(world, start=(*line[0].tolist(), 0.0))
+            driven = simulate(world, robot, script, seconds=LONGEST_S, seed=seed, config=config)
+            taught = np.array([tick.pose[:2] for tick in driven.ticks])
+            table.add(seed, "lesson", script.end, *route_row(taught, driven), seed=("route", seed))
+            for number, share in enumerate(STARTS):
+                rng, begin, script = random.Random(1000 * seed + number), round(share * len(line)), Route(None)
+                x_m, y_m = line[begin] + (rng.uniform(-ASIDE_M, ASIDE_M), rng.uniform(-ASIDE_M, ASIDE_M))
+                heading_rad = math.atan2(*(line[begin + 2] - line[begin])[::-1]) + rng.uniform(-ASIDE_RAD, ASIDE_RAD)
+                world = replace(later(seed, number, rng), start=(x_m, y_m, heading_rad))
+                driven = simulate(world, robot, script, seconds=LONGEST_S, seed=100 * seed + number, config=config)
+                table.add(seed, f"from {share * length:.0f} m", script.end, *route_row(taught, driven))
+
+
 if __name__ == "__main__":
-    run(drive)
+    run(goals, routes)

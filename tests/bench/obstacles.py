@@ -4,9 +4,6 @@ Two tables follow from the same command. The first: how far the robot drove wher
 what it touched where something was, and whether it stopped 0.05 to 0.8 m before that, or passed. A drive is asked to go
 straight on, to turn towards the hazard (--turning), or to a goal; it ends there, or where it has stood for a while.
 Each is a line of build/results/obstacles.jsonl; the command goes on where it ended as long as the commit is the same.
-
-With --open-loop FOLDER, pairs along the way are kept there with the truth, made by a base that nothing stops, and what
-today's scan calls free is compared with it (tests/bench/open_loop.py).
 """
 
 from __future__ import annotations
@@ -22,7 +19,6 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from multiprocessing import get_context
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -32,16 +28,12 @@ from omnid.config import load_config
 from omnid.core.control.heading_controller import Setpoint, wrap_angle
 from omnid.core.navigation.requests import GoalRequest, NavigationFrame
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun
-from omnid.simulation.rendering.surfaces import Scene
 from omnid.simulation.robot import SimulatedRobot
 from omnid.simulation.world import Walkers, clearance_m
-from tests.bench.fine_robot import BUILDS, USUAL, fine_robot
-from tests.bench.real_lenses import with_real_lenses
 from tests.bench.results import ROOT, Column, ResultTable, commit
 from tests.simulation.disturbed import simulate
 from tests.simulation.harmless_worlds import FLOORS, Trial
 from tests.simulation.hazard_worlds import HARMLESS, HAZARDS, trial
-from tests.simulation.photographs import with_photographs
 
 Array = NDArray[np.float64]
 
@@ -67,17 +59,13 @@ class Planned:
     speed_mps: float = 0.3
     size_px: int = 512
     floor: str | None = None
-    build: str = USUAL
     is_turning: bool = False
-    has_real_lenses: bool = False
-    has_photographs: bool = False  # of floors, walls and pictures
     overrides: tuple[str, ...] = ()  # of settings
 
     def __str__(self) -> str:
         parts = [f"{self.world} seed {self.seed}, {self.speed_mps:g} m/s, {self.size_px} px"]
-        parts += [f"on {self.floor}"] * (self.floor is not None) + [f"{self.build} robot"] * (self.build != USUAL)
-        parts += ["turning"] * self.is_turning + ["real lenses"] * self.has_real_lenses
-        parts += ["photographs"] * self.has_photographs + list(self.overrides)
+        parts += [f"on {self.floor}"] * (self.floor is not None)
+        parts += ["turning"] * self.is_turning + list(self.overrides)
         return ", ".join(parts)
 
 
@@ -189,14 +177,6 @@ def prepared(planned: Planned) -> tuple[Trial, SimulatedRobot]:
     """Return the trial, with the start that the drive needs, and the robot."""
     asked = trial(planned.world, planned.seed, planned.floor)
     robot = asked.robot(planned.size_px)
-    if planned.build != USUAL:
-        build = BUILDS[planned.build]
-        robot = replace(
-            robot, rig=fine_robot(planned.size_px, build).rig, radius_m=build.radius_m, height_m=build.height_m
-        )
-    if planned.has_photographs:
-        standing = with_photographs(Scene(asked.world.standing), planned.seed).rectangles
-        asked = replace(asked, world=replace(asked.world, standing=standing))
     x_m, y_m, heading_rad = asked.world.start
     if asked.motion == "ahead" and asked.goal is None:
         if planned.is_turning:  # an arc to the left, at whose end the base looks along x
@@ -214,17 +194,13 @@ def settings_for(planned: Planned) -> list[str]:
     names = ("controller.limits.velocity_mps", "controller.heading.velocity_mps", "navigation.pursuit.velocity_mps")
     speed_mps = 0.8 if planned.world.startswith("room_") else abs(planned.speed_mps)
     settings = [f"{name}={speed_mps}" for name in names]
-    return ["places.enabled=false", *settings, *BUILDS[planned.build].settings, *planned.overrides]
+    return ["places.enabled=false", *settings, *planned.overrides]
 
 
 def drive(planned: Planned) -> Drive:
     """Make a drive."""
-    cpu_s, tamper = time.process_time(), None
+    cpu_s = time.process_time()
     asked, robot = prepared(planned)
-    if planned.has_real_lenses:
-        robot, tamper = with_real_lenses(
-            replace(robot, sensor=replace(robot.sensor, is_compressed=False)), planned.seed
-        )
     asked_m = asked.way_m if asked.goal is None else math.hypot(*asked.goal[:2])
     asker = Asker(asked, planned)
     script: Callable[[Moment], Iterator[Request]] = asker
@@ -232,7 +208,7 @@ def drive(planned: Planned) -> Drive:
     if asked.motion == "at random":
         script, seconds = Wanderer(planned.seed), RANDOMLY_S
     config = load_config(None, settings_for(planned))
-    run = simulate(asked.world, robot, script, seconds=seconds, seed=planned.seed, config=config, tamper=tamper)
+    run = simulate(asked.world, robot, script, seconds=seconds, seed=planned.seed, config=config)
     began_s = 0.0 if math.isinf(asker.began_s) else asker.began_s
     return judged(run, asked, robot, asked_m, began_s, time.process_time() - cpu_s)
 
@@ -301,7 +277,6 @@ def groups(made: Made) -> Iterator[tuple[str, Made]]:
         lambda one: f"at {one.speed_mps:g} m/s" + " turning" * one.is_turning,
         lambda one: f"{one.size_px} px",
         lambda one: f"on {one.floor or 'its own floor'}",
-        lambda one: f"{one.build} robot" + " with real lenses" * one.has_real_lenses,
     )
     for number, key in enumerate(keys):
         names = list(dict.fromkeys(key(planned) for planned, _ in made))
@@ -393,29 +368,20 @@ def main() -> None:
     parser.add_argument("--speed", type=float, nargs="+", default=[0.3], help="m/s; below 0: backwards")
     parser.add_argument("--px", type=int, nargs="+", default=[512], help="sizes of the images")
     parser.add_argument("--floor", nargs="+", choices=FLOORS, default=[None], help="other floors than the worlds' own")
-    parser.add_argument("--robot", nargs="+", choices=BUILDS, default=[USUAL], help="dimensions (fine_robot.py)")
     parser.add_argument("--turning", action="store_true", help="towards hazards on an arc")
-    parser.add_argument("--real", action="store_true", help="images of real lenses (real_lenses.py)")
-    parser.add_argument("--photographs", action="store_true", help="on floors, walls and pictures (scikit-image's)")
     parser.add_argument("--jobs", type=int, default=1, help="drives at a time")
-    parser.add_argument("--open-loop", type=Path, metavar="FOLDER", help="keep pairs there, and judge today's scan")
     parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE")
     arguments = parser.parse_args()
     lists = {"harmless": HARMLESS, "hazards": HAZARDS}
     names = [name for given in arguments.only or lists for name in lists.get(given, (given,))]
-    changed = arguments.turning, arguments.real, arguments.photographs, tuple(arguments.overrides)
+    changed = arguments.turning, tuple(arguments.overrides)
     wanted = [
-        Planned(name, seed, speed_mps, size_px, floor, build, *changed)
-        for name, speed_mps, size_px, floor, build, seed in product(
-            names, arguments.speed, arguments.px, arguments.floor, arguments.robot, arguments.seeds
+        Planned(name, seed, speed_mps, size_px, floor, *changed)
+        for name, speed_mps, size_px, floor, seed in product(
+            names, arguments.speed, arguments.px, arguments.floor, arguments.seeds
         )
     ]
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of the processes that follow
-    if arguments.open_loop:
-        from tests.bench.open_loop import judge_scans
-
-        judge_scans(wanted, arguments.open_loop, arguments.jobs)
-        return
     here, drives = commit(), known_drives()
     missing = [planned for planned in wanted if str(planned) not in drives]
     LINES.parent.mkdir(parents=True, exist_ok=True)

@@ -6,17 +6,32 @@ import math
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from omnid.errors import OmnidError
 from omnid.simulation.rendering.shapes import box
 from omnid.simulation.rendering.surfaces import Rectangle
 from omnid.simulation.world import clearance_m, footprints
-from tests.bench.open_loop import ranges_m
 from tests.simulation.harmless_worlds import FLOORS, NAMES, can_drive
 from tests.simulation.hazard_worlds import HAZARDS, OF_ROBOT, trial
 
+Array = NDArray[np.float64]
 ROBOT_M = 0.2, 1.2  # radius and height
 ALIKE = {f"{floor}_hall" for floor in FLOORS if floor != "plain"} | set(OF_ROBOT) - {"lean_1deg"}
+
+
+def ranges_m(segments: Array, place: tuple[float, float], azimuths_rad: Array) -> Array:
+    """Return the distances (N,) [m] from a place to the first of segments (M, 2, 2) along azimuths (N,); inf: none."""
+    if not len(segments):
+        return np.full(len(azimuths_rad), np.inf)
+    ray = np.column_stack([np.cos(azimuths_rad), np.sin(azimuths_rad)])
+    start, along = segments[:, 0] - place, segments[:, 1] - segments[:, 0]
+    across = ray[:, None, 0] * along[:, 1] - ray[:, None, 1] * along[:, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance_m = (start[:, 0] * along[:, 1] - start[:, 1] * along[:, 0]) / across
+        share = (start[:, 0] * ray[:, None, 1] - start[:, 1] * ray[:, None, 0]) / across
+    met = (distance_m > 0) & (share >= 0) & (share <= 1)
+    return np.asarray(np.where(met, distance_m, np.inf).min(axis=1))
 
 
 @pytest.mark.parametrize("name", sorted({*NAMES, *OF_ROBOT} - ALIKE))

@@ -25,7 +25,7 @@ from omnid.simulation.world_file import load_world
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry, geometry
 from omnid.stages.synchronise import Synchronise
-from tests.bench.route_series import lap
+from tests.bench.drive import lap
 from tests.simulation import paths
 from tests.simulation.builders import corridor
 from tests.simulation.builders import wall as upright

@@ -30,7 +30,6 @@ from omnid.simulation.robot import make_robot
 from omnid.simulation.world import World
 from omnid.simulation.world_file import load_world
 from tests.bench.faults.images import Frozen, sector
-from tests.bench.fine_robot import fine_robot
 from tests.bench.obstacles import ahead
 from tests.simulation.disturbed import Fault, Slip, Tamper, disturbed, simulate
 
@@ -199,7 +198,11 @@ def test_the_floor_that_was_driven_is_free_and_a_low_box_and_a_white_pole_beside
     (tmp_path / "world.toml").write_text(WORLD)
     hall, map_file = load_world(str(tmp_path / "world.toml"), 1), tmp_path / "m.omap"
     run = lockstep.simulate(
-        hall, fine_robot(384), ahead, seconds=SECONDS, config=load_config(None, [f'places.map="{map_file}"'])
+        hall,
+        replace(make_robot(384), samples=4),
+        ahead,
+        seconds=SECONDS,
+        config=load_config(None, [f'places.map="{map_file}"']),
     )
     assert run.ticks[-1].pose[0] > 1.8 and not run.contacts
     places, rig = read_places(map_file)
