@@ -13,7 +13,6 @@ from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.navigation_state import NavigationState
 from tests.omnid.core.navigation.driven_base import DrivenBase
-from tests.omnid.core.navigation.test_planner import Boxes, drive
 
 GOAL_M, GOAL_RAD = 0.03, math.radians(1)
 
@@ -97,25 +96,6 @@ def test_drives_backwards_where_the_path_was_driven_so() -> None:
     assert base.run(60).state is NavigationState.REACHED
     assert min(sample.speed_mps for sample in base.samples) < -0.2
     assert max(abs(float(sample.pose[2])) for sample in base.samples) < 0.3, "it does not turn round"
-
-
-def test_never_exceeds_the_speeds_and_the_yaw_rate_of_the_settings() -> None:
-    settings = NavigationSettings()
-    base = DrivenBase(Navigator(settings), 3)
-    to_goal(base, 4.0, 3.0, 0.0)
-    base.run(60)
-    wanted = [s.navigation.setpoint for s in base.samples if s.navigation.setpoint is not None]
-    assert max(abs(w.velocity_mps) for w in wanted) <= settings.pursuit.velocity_mps + 1e-9
-    assert max(abs(w.yaw_rate_radps) for w in wanted) <= settings.pursuit.yaw_rate_radps + 1e-9
-
-
-def test_drives_slowly_beside_obstacles() -> None:
-    times = []
-    for beside_m in (3.0, 0.4):
-        base = drive(Boxes((-1.0, beside_m, 7.0, 3.2), (-1.0, -3.2, 7.0, -beside_m)), 4, length_m=2.0)
-        assert base.run(60).state is NavigationState.REACHED
-        times.append(base.t_s)
-    assert times[1] > 1.5 * times[0]
 
 
 def test_follows_the_map_when_it_is_corrected() -> None:

@@ -12,7 +12,7 @@ from omnid.core.control.arming import ArmRequest
 from omnid.core.control.command_sources import OPERATOR, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.control.safety_rules import ASKED
-from omnid.core.navigation.navigator import AROUND, STOPS, WAITS, Navigation, Navigator
+from omnid.core.navigation.navigator import STOPS, WAITS, Navigation, Navigator
 from omnid.core.navigation.path import DrivePath, straight_leg
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.settings import NavigationSettings
@@ -20,7 +20,6 @@ from omnid.core.navigation.situation import MapPosition, Situation, WheelState, 
 from omnid.navigation_state import NavigationState
 from omnid.tracking_state import MapState, TrackingState
 from tests.omnid.core.navigation.driven_base import DrivenBase
-from tests.omnid.core.navigation.test_planner import Boxes, around
 
 SETTINGS = NavigationSettings(unlocalised_m=1.0, unlocalised_s=4.0, stuck_s=3.0)
 LOCALISED = MapPosition(np.zeros(3), MapState.LOCALIZED, 0.02)
@@ -144,25 +143,6 @@ def test_gives_up_without_progress() -> None:
     assert answer.state is NavigationState.FAILED and answer.reason == "no progress for 3 s: look at the robot"
 
 
-def test_says_that_it_stood_before_an_obstacle(monkeypatch: pytest.MonkeyPatch) -> None:
-    base = driving()
-    box = around(base.pose, Boxes((2.1, -0.15, 2.2, 0.15)).scan(base.pose))
-    without = base.seen
-    monkeypatch.setattr(base, "seen", lambda: without()._replace(around=box))
-    base.slip = 0.0
-    answer = base.run(20)
-    assert any(sample.navigation.state is NavigationState.AVOIDING for sample in base.samples)
-    assert answer.reason == f"no progress for 3 s: {AROUND}: look at the robot"
-
-
-def test_a_fault_that_ends_by_itself_does_not_pause_the_drive() -> None:
-    base = driving()
-    base.navigator.step(base.seen()._replace(wheels=WheelState(False, False, "the pose is lost")))
-    answer = base.navigator.step(base.seen())
-    assert answer.state is NavigationState.DRIVING
-    assert answer.setpoint is not None and answer.setpoint.velocity_mps > 0
-
-
 def test_a_new_goal_ends_the_stops_of_the_one_before() -> None:
     base = driving()
     base.navigator.cancel("by a request")
@@ -191,17 +171,6 @@ def test_a_hold_of_the_collision_monitor_is_a_block_with_its_reason() -> None:
     answer = base.navigator.step(base.seen()._replace(wheels=wheels))
     assert answer.state is NavigationState.BLOCKED and answer.reason == f"an obstacle is in the way: {WAITS}"
     assert answer.setpoint is not None and answer.setpoint.velocity_mps > 0, "the monitor lets go by itself"
-
-
-def test_nothing_is_sent_before_a_request() -> None:
-    base = DrivenBase(Navigator(SETTINGS), 2)
-    assert rest(base, 1.0) == Navigation(
-        None, NavigationState.IDLE, "", pytest.approx(math.nan, nan_ok=True), pytest.approx(math.nan, nan_ok=True)
-    )
-    assert base.navigator.resume(base.seen()).startswith("nothing is under way")
-    base.navigator.cancel("x")
-    base.navigator.pause("x")
-    assert base.navigator.state is NavigationState.IDLE
 
 
 class Steps:
@@ -290,12 +259,3 @@ def test_refusals_name_the_remedy(change: dict[str, object], frame: str, words: 
     refusal = refusal_to_drive(now, NavigationFrame(frame), 0.3)
     assert words in refusal and bool(refusal) == bool(words) and "\n" not in refusal
     assert "no pose" in refusal_to_drive(None, NavigationFrame(frame), 0.3)
-
-
-def test_only_a_drive_in_the_map_follows_the_place_of_odom_in_it() -> None:
-    in_map = MapPosition(np.array([1.0, 2.0, math.pi / 2]), MapState.LOCALIZED, 0.02)
-    pose = np.array([0.5, 0.25, 0.1])
-    now = Situation(0, pose, 0.0, 0.0, TrackingState.TRACKING, 0, WheelState(True, False), in_map)
-    np.testing.assert_allclose(now.pose_in(NavigationFrame.ODOM), pose)
-    np.testing.assert_allclose(now.map_pose(), (1.0 - 0.25, 2.0 + 0.5, math.pi / 2 + 0.1))
-    np.testing.assert_allclose(now._replace(in_map=None).map_pose(), pose)

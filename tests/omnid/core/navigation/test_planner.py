@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from omnid.core.control.collision_monitor import CollisionSettings, ControllerScan
 from omnid.core.navigation.navigator import WAITS, Navigator
 from omnid.core.navigation.path import DrivePath, drive_path, goal_path, straight_leg
-from omnid.core.navigation.planner import Planner, Way
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import Situation
@@ -161,45 +160,6 @@ def test_goes_around_a_box_behind_a_curve_and_a_corner() -> None:
 DEAD_END = Boxes((0.75, -0.7, 0.85, 0.7), (-1.4, 0.6, 0.85, 0.7), (-3.3, -0.7, 0.85, -0.6), (-3.3, -0.7, -3.2, 3.6))
 DOOR = Boxes((1.5, 0.4, 1.7, 4.0), (1.5, -4.0, 1.7, -0.4))
 ROOM = Boxes((-2.2, -2.2, 2.2, -2.0), (-2.2, 2.0, 2.2, 2.2), (-2.2, -2.2, -2.0, 2.2), (2.0, -2.2, 2.2, 2.2))
-
-
-@pytest.mark.hazard("H31")
-@pytest.mark.parametrize(
-    ("boxes", "start", "goal", "backwards"),
-    [
-        (Boxes(), (0.0, 0.0, 0.0), (3.0, 0.5), [False]),
-        (DOOR, (0.0, 0.8, 0.0), (4.0, 0.0), [False]),
-        (DOOR, (0.0, -0.9, 0.6), (4.0, 1.0), [False]),
-        (DEAD_END, (0.0, 0.0, 0.0), (-2.3, 2.6), [True, False]),
-        (Boxes(), (0.0, 0.0, 0.0), (30.0, 15.0), [False]),
-    ],
-)
-def test_a_way_can_be_driven_and_leads_to_the_goal_or_to_the_edge_of_the_grid(
-    boxes: Boxes, start: tuple[float, float, float], goal: tuple[float, float], backwards: list[bool]
-) -> None:
-    pose = np.array(start)
-    found = Planner(SETTINGS, OUTLINE).way(pose, np.array(goal), around(pose, boxes.scan(pose)), 0)
-    assert isinstance(found, Way)
-    way = found.path
-    assert list(dict.fromkeys(leg.backwards for leg in way.legs)) == backwards
-    xy = np.vstack([leg.xy for leg in way.legs])
-    assert min(boxes.clearance_m(place) for place in xy) > OUTLINE.half_width_m + OUTLINE.side_m - 0.02
-    left_m = math.dist(way.goal, goal)
-    assert left_m < 0.01 if math.hypot(*goal) < 6.0 else left_m < math.hypot(*goal) - 3.8
-
-
-@pytest.mark.parametrize(
-    ("x_m", "goal", "reason"),
-    [
-        (0.0, (4.0, 0.0), "closes every way"),
-        (0.0, (30.0, 15.0), "closes every way"),
-        (1.0, (2.1, 0.0), "0.1 m from the goal"),
-    ],
-)
-def test_where_no_way_leads_it_says_what_is_in_the_way(x_m: float, goal: tuple[float, float], reason: str) -> None:
-    pose = np.array([x_m, 0.0, 0.0])
-    found = Planner(SETTINGS, OUTLINE).way(pose, np.array(goal), around(pose, ROOM.scan(pose)), 0)
-    assert isinstance(found, str) and reason in found
 
 
 def to_goal(boxes: Boxes, x_m: float, y_m: float) -> BaseAmongBoxes:

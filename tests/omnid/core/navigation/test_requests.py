@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import random
-
 import numpy as np
 import pytest
 
@@ -18,7 +15,6 @@ from omnid.core.navigation.requests import (
     RouteRequest,
     is_halt,
     navigation_verb,
-    route_name,
     route_request,
 )
 from omnid.errors import OmnidError
@@ -98,28 +94,3 @@ def test_verbs(verb: NavigationVerb) -> None:
 )
 def test_only_cancel_pause_and_the_stop_of_a_route_halt(request_: NavigationRequest, halts: bool) -> None:
     assert is_halt(request_) == halts
-
-
-def test_no_text_raises_another_error() -> None:
-    rng = random.Random(3)
-    words = [
-        "teach",
-        "repeat",
-        "stop",
-        "finish",
-        "reverse",
-        "loops=",
-        "loops=2",
-        "a",
-        "..",
-        "/",
-        "\0",
-        "\n",
-        "é",
-        "9" * 400,
-    ]
-    for _ in range(3000):
-        text = " ".join(rng.choices(words, k=rng.randint(0, 6)))
-        for parse in (route_request, navigation_verb, route_name):
-            with contextlib.suppress(OmnidError):
-                parse(text)

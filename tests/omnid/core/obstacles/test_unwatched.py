@@ -8,7 +8,7 @@ from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.mapping.range_scan import SECTORS
 from omnid.core.obstacles.unwatched import Unwatched
-from omnid.core.stereo.tiles import ALL_LIVE, TILE_COLUMNS
+from omnid.core.stereo.tiles import TILE_COLUMNS
 
 CYLINDER = Cylinder(width=900, height=250, row0=80.0)
 AHEAD = np.zeros(TILE_COLUMNS, bool)
@@ -43,15 +43,3 @@ def test_spans_are_named_counter_clockwise_from_ahead() -> None:
     assert begin in (161, 162) and end in (198, 199)
     assert unwatched.spans_deg(np.ones(TILE_COLUMNS, bool)) == [(0, 360)]
     assert unwatched.spans_deg(np.zeros(TILE_COLUMNS, bool)) == []
-
-
-def test_directions_from_the_viewpoint_are_those_of_the_columns_wherever_it_lies() -> None:
-    found = Unwatched(CYLINDER, se3.transform(np.eye(3), [0.6, 0.3, 0.9])).directions(AHEAD)
-    assert (found == Unwatched(CYLINDER, np.eye(4)).directions(AHEAD)).all()
-    assert np.flatnonzero(found).min() in (161, 162) and np.flatnonzero(found).max() in (197, 198)
-
-
-def test_a_sector_whose_tiles_all_live_has_no_such_direction() -> None:
-    cylinder = Cylinder(width=180, height=250, row0=80.0, turn_px=900)
-    unwatched = Unwatched(cylinder, np.eye(4))
-    assert not unwatched.sectors(ALL_LIVE.unknown).any() and not unwatched.directions(ALL_LIVE.unknown).any()
