@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +20,7 @@ from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.sensor import Floats, MountedSensor, Sensor
 from omnid.simulation.rendering.surfaces import Scene
-from tests.simulation.disturbances import Disturbance, DisturbedCamera, light_of
+from tests.simulation.disturbances import Disturbance, DisturbedCamera
 from tests.simulation.rigs import MirrorCamera, nominal_rig
 
 
@@ -122,16 +121,9 @@ def write_log(
         parts = []
         for late_s in delays_s:
             T_world_rig = poses[pair] @ se3.exp(twists[pair] * late_s)
-            rendered = partial(
-                render_grey,
-                mounted=cameras[camera],
-                T_world_rig=T_world_rig,
-                supersample=supersample,
-                row_twist=row_twist,
-            )
-            parts.append(light_of(scene, rendered, disturbances, T_world_rig[:2, 3]))
+            parts.append(render_grey(scene, cameras[camera], T_world_rig, supersample, row_twist))
         time_s = 1e-9 * readout.period_ns * pair + delay_s[pair] * camera
-        return disturbed[camera].shown(np.mean(parts, axis=0, dtype=np.float32), pair, time_s)
+        return disturbed[camera].shown(np.mean(parts, axis=0, dtype=np.float32), time_s)
 
     pack_log(
         folder,
@@ -180,7 +172,7 @@ def pack_log(
 
     def jpeg(pair: int, camera: int) -> bytes:
         exposed = exposures[camera].expose(ideal_image(pair, camera), rng)
-        image = disturbed[camera].digitised(exposed, pair)
+        image = disturbed[camera].digitised(exposed)
         return disturbed[camera].encoded(image, pair) or exposures[camera].jpeg(image)
 
     def images() -> Images:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 
@@ -18,14 +18,16 @@ from calib import se3
 from calib.models.camera import Mask
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera
-from calib.rig_file import read_rig
+from omnid.simulation.rendering.shapes import box
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
 from omnid.simulation.robot import make_robot, with_masks
-from tests.simulation import RECIPES, build, corridor, make_rig, render, render_grey, write_log
-from tests.simulation.disturbances import DISTURBANCES, Mirror, reflectance
+from omnid.simulation.world import clearance_m, footprints
+from tests.simulation import build, corridor, render, render_grey, write_log
+from tests.simulation.disturbances import Mirror, reflectance
+from tests.simulation.harmless_worlds import FLOORS, NAMES, can_drive
+from tests.simulation.hazard_worlds import HAZARDS, OF_ROBOT, trial
 from tests.simulation.logs import Readout, body_twists
-from tests.simulation.photographs import with_photographs
-from tests.simulation.rigs import MirrorCamera, nominal_rig, with_real_mirrors
+from tests.simulation.rigs import MirrorCamera, with_real_mirrors
 
 SIZE = 96
 SCHEMA = "sensor_msgs/msg/CompressedImage"
@@ -56,25 +58,6 @@ def test_same_seed_gives_same_bytes(tmp_path: Path) -> None:
     assert one.read_bytes() != other.read_bytes()
 
 
-def test_each_disturbance_changes_the_images_and_is_that_of_the_seed(tmp_path: Path) -> None:
-    def log(name: str, *disturbances: str) -> bytes:
-        return (write(tmp_path / name, "rooms", disturbances=disturbances) / "log.mcap").read_bytes()
-
-    clean = log("clean")
-    assert [name for name in DISTURBANCES if log(name, name) == clean] == []
-    assert log("once", *DISTURBANCES) == log("again", *DISTURBANCES)
-
-
-@pytest.mark.skipif(find_spec("skimage") is None, reason="needs the files of scikit-image")
-def test_all_but_the_ceiling_shows_photographs_of_the_seed() -> None:
-    scene = build("rooms", 3, SIZE, 3).scene
-    first, again, other = (with_photographs(scene, seed).rectangles for seed in (3, 3, 4))
-    for before, now, same, third in zip(scene.rectangles, first, again, other, strict=True):
-        assert np.array_equal(now.texture, same.texture) and np.array_equal(now.corners, before.corners)
-        is_kept = before.name == "ceiling"
-        assert [np.array_equal(now.texture, one.texture) for one in (before, third)] == [is_kept, is_kept]
-
-
 def test_log_has_both_cameras_and_the_stamps_poses_and_rig_of_the_truth(tmp_path: Path) -> None:
     run, read = build("misaligned", 4, SIZE, 15), messages(write(tmp_path, pairs=15) / "log.mcap")
     lower, upper = (
@@ -92,21 +75,6 @@ def test_log_has_both_cameras_and_the_stamps_poses_and_rig_of_the_truth(tmp_path
         assert isinstance(mounted.camera, UnifiedCamera)
         assert chain[name]["intrinsics"] == [mounted.camera.xi, *mounted.camera.focal, *mounted.camera.center]
     assert np.allclose(np.array(chain["cam1"]["T_cn_cnm1"]) @ run.rig.lower.T_cam_rig, run.rig.upper.T_cam_rig)
-
-
-def test_only_the_masked_rig_excludes_struts(tmp_path: Path) -> None:
-    write(tmp_path, "struts")
-    on_hub = np.full((1, 2), SIZE / 2)
-    assert read_rig(tmp_path / "rig.toml").lower.visible.contains(on_hub).all()
-    assert not read_rig(tmp_path / "rig_masked.toml").lower.visible.contains(on_hub).any()
-
-
-@pytest.mark.parametrize("name", sorted(RECIPES))
-def test_every_recipe_stays_inside_its_walls(name: str) -> None:
-    run = build(name, 9, SIZE, 3)
-    corners = np.concatenate([face.corners for face in run.scene.rectangles])[:, :2]
-    xy = run.poses[:, :2, 3]
-    assert len(xy) == 3 and (xy > corners.min(axis=0) + 0.4).all() and (xy < corners.max(axis=0) - 0.4).all()
 
 
 # Skew, rolling shutters, real mirrors
@@ -141,12 +109,6 @@ CENTER = (384.2, 381.1)
 PIXELS = np.random.default_rng(0).uniform(60, 700, (300, 2))
 
 
-def test_paraboloid_below_an_orthographic_camera_equals_the_unified_model() -> None:
-    origins, rays = MirrorCamera(207.0, CENTER, (768, 768)).rays(PIXELS)
-    np.testing.assert_allclose(rays, UnifiedCamera(1.0, (-207.0, 207.0), CENTER, (768, 768)).lift(PIXELS), atol=1e-12)
-    np.testing.assert_allclose(np.cross(origins, rays), 0, atol=1e-12)
-
-
 def test_project_inverts_the_rays_at_any_distance() -> None:
     tilted = MirrorCamera(207.0, CENTER, (768, 768), tilt_rad=(0.008, -0.006), conic=0.01, ellipticity=0.01)
     origins, rays = tilted.rays(PIXELS)
@@ -167,15 +129,6 @@ def test_a_rendered_spot_near_a_tilted_camera_equals_the_projection() -> None:
     np.testing.assert_allclose(centroid, camera.project(grid).mean(axis=0), atol=0.1)
 
 
-def test_a_nominal_rig_knows_mirror_and_ruler_only() -> None:
-    true = with_real_mirrors(make_rig(baseline_m=0.2003, misaligned_deg=(1, 0.5, 0.7), offset_mm=(3, -2)), 1)
-    nominal = nominal_rig(true)
-    assert nominal.baseline_m == pytest.approx(0.2005)
-    assert nominal.lower.camera.center == nominal.upper.camera.center == (383.5, 383.5)
-    np.testing.assert_array_equal(nominal.upper.T_cam_rig[:3, :3], nominal.lower.T_cam_rig[:3, :3])
-    assert true.lower.camera != true.upper.camera
-
-
 ROBOT = make_robot(256)
 RIG = with_masks(ROBOT.rig)
 WALL_M = 2.0
@@ -193,12 +146,6 @@ SCENE = Scene(
         ),
     )
 )
-
-
-@pytest.mark.parametrize(("angle_deg", "share"), [(0.0, 0.04), (60.0, 0.089), (75.0, 0.253), (90.0, 1.0)])
-def test_the_share_is_that_of_fresnels_equations(angle_deg: float, share: float) -> None:
-    cosine = np.array([math.cos(math.radians(angle_deg))], np.float32)
-    assert reflectance(cosine)[0] == pytest.approx(share, abs=1e-3)
 
 
 @pytest.mark.parametrize("side", ["lower", "upper"])
@@ -222,3 +169,85 @@ def test_a_wall_is_seen_upside_down_where_the_floor_is(side: str) -> None:
 def _grey(image: np.ndarray, pixel: np.ndarray) -> float:
     u, v = np.rint(pixel[0]).astype(int)
     return float(image[v, u])
+
+
+# Worlds like buildings and what stands in them: every name makes a world, whose outlines are where it says.
+Array = NDArray[np.float64]
+ROBOT_M = 0.2, 1.2  # radius and height
+ALIKE = {f"{floor}_hall" for floor in FLOORS if floor != "plain"} | set(OF_ROBOT) - {"lean_1deg"}
+
+
+def ranges_m(segments: Array, place: tuple[float, float], azimuths_rad: Array) -> Array:
+    """Return the distances (N,) [m] from a place to the first of segments (M, 2, 2) along azimuths (N,); inf: none."""
+    if not len(segments):
+        return np.full(len(azimuths_rad), np.inf)
+    ray = np.column_stack([np.cos(azimuths_rad), np.sin(azimuths_rad)])
+    start, along = segments[:, 0] - place, segments[:, 1] - segments[:, 0]
+    across = ray[:, None, 0] * along[:, 1] - ray[:, None, 1] * along[:, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance_m = (start[:, 0] * along[:, 1] - start[:, 1] * along[:, 0]) / across
+        share = (start[:, 0] * ray[:, None, 1] - start[:, 1] * ray[:, None, 0]) / across
+    met = (distance_m > 0) & (share >= 0) & (share <= 1)
+    return np.asarray(np.where(met, distance_m, np.inf).min(axis=1))
+
+
+@pytest.mark.parametrize("name", sorted({*NAMES, *OF_ROBOT} - ALIKE))
+def test_nothing_stands_in_the_way_of_harmless_worlds(name: str) -> None:
+    asked = trial(name, 1)
+    segments = asked.world.obstacles(ROBOT_M[1])
+    if asked.goal is not None:
+        assert can_drive(segments, (0.0, 0.0), asked.goal[:2])
+        assert not can_drive(segments, (0.0, 0.0), (30.0, 15.0))
+        return
+    along = np.arange(0.0, asked.way_m, 0.1)
+    assert min(clearance_m(segments, (x_m, 0.0), ROBOT_M[0]) for x_m in along) > 0.2
+
+
+@pytest.mark.parametrize("name", [name for name in HAZARDS if not name.startswith(("plain_", "room_"))])
+def test_something_is_in_the_way_of_hazards(name: str) -> None:
+    asked = trial(name, 1)
+    segments = asked.world.obstacles(ROBOT_M[1])
+    assert clearance_m(segments, (0.0, 0.0), ROBOT_M[0]) > 0.1
+    if name == "steep_ramp":
+        assert asked.world.ground.heights_m(asked.way_m) < -0.7
+    elif asked.motion == "ahead" and not name.startswith("person"):
+        paths = [place for person in asked.world.people for place in person.path]
+        first_m = min((x_m for x_m, _ in paths), default=math.inf)
+        first_m = min(first_m, float(ranges_m(segments, (0.0, 0.0), np.linspace(-0.1, 0.1, 41)).min()))
+        assert 0.3 < first_m < 4.6 and (paths or asked.things is not None)
+
+
+@pytest.mark.parametrize("percent", [10, 20])
+def test_a_thing_of_a_contrast_has_it_in_the_image(percent: int) -> None:
+    asked = trial(f"box_{percent}percent", 1)
+    floor = asked.world.standing[0]
+    assert asked.things
+    for face in asked.things:
+        share = float(face.texture.mean()) * face.brightness / (float(floor.texture.mean()) * floor.brightness)
+        assert abs(share - 1) == pytest.approx(percent / 100, abs=0.01)
+
+
+def test_a_ramp_lifts_and_pitches_the_base() -> None:
+    world = trial("ramp_5", 1).world
+    middle_m = float(np.mean([x_m for x_m, _ in world.ground.profile]))
+    for heading_rad, sign in ((0.0, 1), (math.pi, -1)):
+        T = world.T_world_base((middle_m, 0.0, heading_rad))
+        assert T[2, 3] == pytest.approx(2.0 * math.tan(math.radians(5.0)), abs=1e-6)
+        assert math.degrees(math.asin(T[2, 0])) == pytest.approx(sign * 5.0, abs=1e-6)
+
+
+def upright(height_m: float, from_m: float = 0.0) -> Rectangle:
+    """Return a wall along x from 0 to 2 at y 1."""
+    top = np.array([0.0, 1.0, from_m + height_m])
+    return Rectangle(top, np.array([2.0, 0, 0]), np.array([0, 0, -height_m]), np.zeros((8, 8), np.uint8), "wall")
+
+
+def test_the_clearance_is_that_of_the_outline_from_what_is_neither_driven_over_nor_under() -> None:
+    for wall in (upright(0.01), upright(1.0, from_m=0.6)):
+        assert footprints([wall], 0.5).shape == (0, 2, 2)
+    assert clearance_m(np.zeros((0, 2, 2)), (1.0, 1.0), 0.2) == np.inf
+    segments = footprints([upright(1.0)], 0.5)
+    assert clearance_m(segments, (1.0, 0.0), 0.2) == pytest.approx(0.8)
+    assert clearance_m(segments, (3.0, 1.0), 0.2) == pytest.approx(0.8) and clearance_m(segments, (1.0, 0.9), 0.2) < 0
+    around = footprints(box(np.random.default_rng(1), (5.0, 5.0), (1.0, 1.0, 0.5), 0.0), 0.4)
+    assert clearance_m(around, (5.0, 3.5), 0.2) == pytest.approx(0.8)

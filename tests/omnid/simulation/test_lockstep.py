@@ -7,6 +7,7 @@ low box or a pole stands.
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
@@ -16,22 +17,29 @@ import numpy as np
 import pytest
 
 from calib import se3
+from omnid.cli import main
+from omnid.client import Diagnostics, Robot
 from omnid.config import load_config
 from omnid.core.control.collision_monitor import IMAGES_REMEDY, UNSEEN, UNWATCHED
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.mapping.scan_grid import FREE, UNKNOWN
-from omnid.core.navigation.requests import GoalRequest, NavigationFrame
 from omnid.core.places.place_views import grid
 from omnid.formats.place_file import read_places
-from omnid.navigation_state import NavigationState
+from omnid.formats.tum import read_tum
 from omnid.simulation import lockstep
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun
 from omnid.simulation.robot import make_robot
 from omnid.simulation.world import World
 from omnid.simulation.world_file import load_world
+from omnid.transport.bus_config import BusConfig
+from omnid.transport.status_names import SIMULATION, STAGE_PREFIX, WHEELS, Key
 from tests.bench.faults.images import Frozen, sector
 from tests.bench.obstacles import ahead
+from tests.busy import stopped_by_turns
+from tests.ports import free_port
+from tests.replay.live import started
 from tests.simulation.disturbed import Fault, Slip, Tamper, disturbed, simulate
+from tests.waiting import wait_until
 
 SIZE = 160
 CONFIG = load_config(None, ["controller.collision.unknown=slow"])  # such small images show little of the floor
@@ -86,21 +94,6 @@ def test_a_motor_that_is_cut_off_stops_by_its_own_watchdog() -> None:
     assert any("no answer" in line for _, line in run.lines)
 
 
-def test_a_goal_is_reached_by_the_true_robot() -> None:
-    asked: list[float] = []
-
-    def to_the_goal(moment: Moment) -> Iterator[Request]:
-        if moment.odometry is not None and not moment.controller.armed:
-            yield "arm"
-        elif moment.controller.armed and not asked:
-            asked.append(moment.time_s)
-            yield GoalRequest(NavigationFrame.ODOM, 0.5, 0.0)
-
-    run = simulate(world(), make_robot(SIZE), to_the_goal, seconds=5.0, seed=1, config=CONFIG)
-    assert run.navigation[-1].state is NavigationState.REACHED
-    assert np.hypot(*(run.truth_in_odom[-1][:2, 3] - (0.5, 0.0))) < 0.05
-
-
 def test_slipping_wheels_hardly_move_the_robot_and_are_noticed() -> None:
     robot = disturbed(make_robot(SIZE), slips=(Slip(1.5, 9.0, 0.9),))
     run = simulate(world(), robot, forward, seconds=2.5, seed=1, config=CONFIG)
@@ -108,26 +101,6 @@ def test_slipping_wheels_hardly_move_the_robot_and_are_noticed() -> None:
     assert x_m[14] - x_m[10] > 0.08 and x_m[24] - x_m[20] < 0.02
     noticed_s = (run.stamps_ns[run.slipping] - run.stamps_ns[0]) * 1e-9
     assert len(noticed_s) >= 5 and noticed_s.min() > 1.5
-
-
-def test_a_robot_that_was_lost_at_rest_finds_back_and_drives_again() -> None:
-    blind = replace(make_robot(SIZE), has_gyro=False, has_odometry=False)  # nothing but the images tells that it stands
-    armed_s: list[float] = []
-
-    def rest_and_drive(moment: Moment) -> Iterator[Request]:
-        if moment.controller.armed:
-            armed_s.append(moment.time_s)
-        if moment.time_s > 4.0:
-            yield from forward(moment)
-
-    run = simulate(world(), blind, rest_and_drive, seconds=5.5, seed=1, config=CONFIG, faults=[Fault("dark", 1.0, 3.0)])
-    at_s = (run.stamps_ns - run.stamps_ns[0]) * 1e-9
-    states = np.array(run.states)
-    assert "lost" in states[(at_s > 1.0) & (at_s < 3.1)]
-    # Images of 160 px leave two motions nearly as likely now and then; such poses are degraded, and right.
-    assert "lost" not in states[at_s > 3.3] and np.mean(states[at_s > 3.3] == "tracking") > 0.7
-    assert armed_s and run.truth_in_odom[-1][0, 3] > 0.2
-    np.testing.assert_allclose(run.T_odom_base[-1][:2, 3], run.truth_in_odom[-1][:2, 3], atol=0.03)
 
 
 def fine_drive(tamper: Tamper | None = None, *faults: Fault) -> SimulatedRun:
@@ -220,3 +193,62 @@ def test_the_floor_that_was_driven_is_free_and_a_low_box_and_a_white_pole_beside
     assert in_pole.any() and (found.cells[in_pole] == UNKNOWN).all()
     # Views from which it is found, each by itself; in so short a drive its floor is also seen too seldom to be free.
     assert sum((keyframe.free_m < 0).any() for keyframe in places.keyframes.values()) >= 2
+
+
+# `omnid simulate` in its own time: a daemon that is slowed down loses nothing, and drives where it is told to.
+STOPPED_S, RUNNING_S = 0.6, 0.3  # longer than the deadlines of poses and commands; share of a computer that is left
+NEAR_M = 0.05
+GOAL = ("0.3", "0.05")
+
+
+def newest(port: int) -> Diagnostics:
+    """Return a whole status of the daemon."""
+    with (
+        Robot(settings=BusConfig(connect=(f"tcp/127.0.0.1:{port}",))) as robot,
+        robot.subscribe(Diagnostics) as statuses,
+    ):
+        while True:
+            report = statuses.wait(20.0)
+            assert report is not None
+            if len(report.statuses) > 1:
+                return report
+
+
+def test_a_slowed_daemon_reaches_its_goal_and_loses_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    port, truth = free_port(), tmp_path / "truth.tum"
+    connect = ["--connect", f"tcp/127.0.0.1:{port}"]
+    command = [
+        *(sys.executable, "-m", "omnid", "simulate", "room", "--no-people", "--size", "320"),
+        *("--truth", str(truth)),
+        *("--set", f'bus.listen=["tcp/127.0.0.1:{port}"]'),
+        *("--set", "live.status_s=0.2"),
+        *("--set", "controller.collision.unknown=slow"),
+    ]  # such small images show little of the floor
+    with started(command, port) as daemon:
+        wait_until(lambda: main(["arm", *connect]) == 0, "arming")
+        assert [
+            main(["goto", *words, *connect]) for words in (["0.2", "0", "--no-wait"], ["--pause"], ["--resume"])
+        ] == [0, 0, 0]
+        assert "paused by a request: `omnid goto --resume`" in capsys.readouterr().out
+        with stopped_by_turns(daemon.process, RUNNING_S, STOPPED_S):
+            reached = main(["goto", *GOAL, *connect])
+        status = newest(port)
+        with Robot(settings=BusConfig(connect=(f"tcp/127.0.0.1:{port}",))) as robot:
+            clocks: list[bytes] = []
+            robot.on_message(lambda _, payload, __: clocks.append(payload), "clock")
+            wait_until(lambda: len(set(clocks)) > 2, "the simulated time on the bus")
+        code, log = daemon.end()
+    assert reached == 0, log
+    # 1. Nothing was lost on the way, and no rule stopped the wheels.
+    stages = {entry.name: entry.values for entry in status.statuses if entry.name.startswith(STAGE_PREFIX)}
+    dropped = {name: values[Key.DROPPED] for name, values in stages.items() if Key.DROPPED in values}
+    assert {f"{STAGE_PREFIX}bus", f"{STAGE_PREFIX}odometry"} <= set(dropped)
+    lossy = {f"{STAGE_PREFIX}bus-status"}  # it comes by the time on the wall, and the newest counts
+    assert {name for name, count in dropped.items() if count != "0"} <= lossy
+    assert status.value(WHEELS, Key.ARMED) == "1"
+    # 2. Its time went more slowly than that on the wall.
+    assert 0 < float(status.value(SIMULATION, Key.REAL_TIME_FACTOR)) <= 1.0
+    # 3. The robot stands at the goal, which is no drive that was cut short.
+    assert "the command is stale" not in log
+    assert code == 0 and "contacts with obstacles: 0" in log
+    assert math.dist(read_tum(truth).T[-1, :2, 3], tuple(map(float, GOAL))) < NEAR_M

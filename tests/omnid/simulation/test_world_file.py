@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
+from calib import se3
+from calib.rig import MountedCamera, Rig
 from omnid.errors import OmnidError
 from omnid.simulation.rendering import shapes
 from omnid.simulation.world import Walkers, clearance_m
-from omnid.simulation.world_file import WorldOptions, load_world, shipped_worlds
+from omnid.simulation.world_file import load_world, shipped_worlds
+from tests.simulation import Rectangle, Scene, make_rig, render
 
 HALL = """
 schema = 1
@@ -94,15 +99,6 @@ def test_wrong_worlds_are_refused(tmp_path: Path, old: str, new: str, message: s
         load_world(write(tmp_path, HALL.replace(old, new)), 1)
 
 
-def test_unknown_worlds_and_options_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(OmnidError, match=r"world 'castle' is not known; name a file \*.toml, or one of .*room"):
-        load_world("castle", 1)
-    with pytest.raises(OmnidError, match="cannot be read"):
-        load_world(str(tmp_path / "none.toml"), 1)
-    with pytest.raises(OmnidError, match="brightness 9"):
-        WorldOptions(brightness=9.0)
-
-
 @pytest.mark.parametrize(
     "text",
     [
@@ -120,17 +116,6 @@ def test_the_area_is_checked_before_anything_is_painted(
         load_world(write(tmp_path, text), 1)
 
 
-def test_polite_people_wait_until_the_robot_has_gone(tmp_path: Path) -> None:
-    polite = HALL.replace('repeat = "back and forth"', "waits_within_m = 0.8")
-    people = Walkers(load_world(write(tmp_path, polite), 1).people)
-    for tenth in range(1, 31):
-        people.advance(0.1 * tenth, (0.5, -1.0))  # in the way
-    assert -0.35 <= people.places()[0][0] <= -0.3
-    for tenth in range(31, 41):
-        people.advance(0.1 * tenth, (-0.5, -0.5))  # behind the person, who goes away from it
-    assert people.places()[0][0] == pytest.approx(0.2, abs=0.06)
-
-
 def test_people_walk_and_some_wait_for_the_robot(tmp_path: Path) -> None:
     people = Walkers(load_world(write(tmp_path, HALL), 1).people)
     people.advance(1.0, (-5.0, 0.0))
@@ -143,3 +128,84 @@ def test_people_walk_and_some_wait_for_the_robot(tmp_path: Path) -> None:
     assert people.places()[1][:2] == pytest.approx((3.0, 1.0))
     people.advance(60.0, (-5.0, 0.0))
     assert people.places()[1][:2] == pytest.approx((3.0, 0.5))
+
+
+# Rendered corners equal the camera model's projection, so that exchanged or inverted transforms are detected.
+SIZE = 192
+SQUARES, SQUARE_M, DISTANCE_M = 4, 0.36, 1.1
+RIGS = {
+    "straight": make_rig(size=SIZE),
+    "misaligned": make_rig(
+        size=SIZE,
+        scale=0.9,
+        baseline_m=0.24,
+        misaligned_deg=(5, -4, 31),
+        offset_mm=(12, -20),
+        lower_misaligned_deg=(-3, 6, -50),
+        lower_offset_mm=(40, 25),
+        centre_px=(2.3, -1.6),
+    ),
+    "xi 0.8, distorted": make_rig(
+        size=SIZE,
+        xi=0.8,
+        distortion=(-0.03, 0.004, 0.002, -0.003),
+        centre_px=(-1.2, 2.7),
+        misaligned_deg=(2, 3, 20),
+        lower_misaligned_deg=(-1, 2, 70),
+    ),
+}
+POSE = se3.exp([0.31, -0.22, 1.17, 0.05, -0.04, 0.7])
+
+
+def chessboards(pose: np.ndarray, count: int = 4) -> Scene:
+    """Return chessboards on all sides of the pose, at its height, each tilted a little."""
+    board = np.kron(np.indices((SQUARES, SQUARES)).sum(axis=0) % 2, np.ones((100, 100)))
+    texture = (40 + 180 * board).astype(np.uint8)
+    sheets = []
+    for i, angle in enumerate(np.linspace(0, 2 * np.pi, count, endpoint=False)):
+        R = se3.rotation_exp([0, 0, angle]) @ se3.rotation_exp([0.1 * (-1) ** i, 0.25, 0.2])
+        u, v = R @ [0, -1.0, 0] * SQUARES * SQUARE_M, R @ [0, 0, -1.0] * SQUARES * SQUARE_M
+        centre = pose[:3, 3] + DISTANCE_M * np.array([np.cos(angle), np.sin(angle), -0.2])
+        sheets.append(Rectangle(centre - (u + v) / 2, u, v, texture))
+    return Scene(tuple(sheets))
+
+
+def inner_corners(sheet: Rectangle) -> np.ndarray:
+    steps = np.arange(1, SQUARES) / SQUARES
+    return sheet.points(np.array(list(itertools.product(steps, steps))))
+
+
+def project(mounted: MountedCamera, points: np.ndarray) -> np.ndarray:
+    return mounted.camera.project(se3.apply(mounted.T_cam_rig @ se3.inverse(POSE), points))
+
+
+def corner_errors_px(mounted: MountedCamera) -> np.ndarray:
+    """Return the distance of every visible corner in the image from its projection."""
+    scene = chessboards(POSE)
+    image = render(scene, mounted, POSE, 3)
+    expected = project(mounted, np.concatenate([inner_corners(s) for s in scene.rectangles]))
+    expected = expected[mounted.visible.contains(expected, 8)]
+    start = np.ascontiguousarray(expected + 0.7, np.float32)
+    enough = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-3)
+    found = cv2.cornerSubPix(image, start, (3, 3), (-1, -1), enough)
+    return np.asarray(np.linalg.norm(found.reshape(-1, 2) - expected, axis=1))
+
+
+@pytest.mark.parametrize("which", ["lower", "upper"])
+@pytest.mark.parametrize("rig", RIGS.values(), ids=RIGS.keys())
+def test_rendered_corners_equal_the_projection(rig: Rig, which: str) -> None:
+    errors = corner_errors_px(getattr(rig, which))
+    assert len(errors) >= 15
+    assert np.median(errors) < 0.1
+    assert errors.max() < 0.3
+
+
+def test_no_ray_passes_between_walls_that_meet() -> None:
+    """The corner lies in a diagonal of the image, on which rays meet it exactly."""
+    white, up = np.full((8, 8), 255, np.uint8), np.array([0, 0, -2.0])
+    origins, edges = ([1.0, -1, 1], [1.0, 1, 1]), ([0, 2.0, 0], [-2.0, 0, 0])
+    walls = tuple(Rectangle(np.array(o), np.array(e), up, white) for o, e in zip(origins, edges, strict=True))
+    image = render(Scene(walls), RIGS["straight"].lower, np.eye(4)).astype(float)
+    seen = cv2.erode((cv2.morphologyEx(image, cv2.MORPH_CLOSE, np.ones((5, 5))) > 0).astype(np.uint8), np.ones((7, 7)))
+    assert (image[seen > 0] > 0.9 * np.median(image[seen > 0])).all()
+    assert seen.sum() > 2000

@@ -165,7 +165,7 @@ def test_the_reflection_of_a_lens_in_its_mirror_has_no_depth(
     below, confirmed = 0, 0
     for pair in pairs:
         lower, upper = (
-            np.clip(camera.shown(image.astype(np.float32), pair.seq, 0.0), 0, 255).astype(np.uint8)
+            np.clip(camera.shown(image.astype(np.float32), 0.0), 0, 255).astype(np.uint8)
             for camera, image in zip(reflected, (pair.lower, pair.upper), strict=True)
         )
         update = front_end.process(FramePair(pair.seq, pair.stamp_ns, lower, upper))
