@@ -14,7 +14,7 @@ from omnid.core.nanoseconds import NS_PER_S
 from omnid.messages import OdometryUpdate
 from omnid.sinks.encoder import Changes, Encoder, Outgoing, UnixTime, pose_attachment, same_time
 from omnid.transport.bus import Bus
-from omnid.transport.codec import CLOCK_SCHEMA, encoded, features_to_bytes, path_cdr
+from omnid.transport.codec import CLOCK_SCHEMA, encoded, path_cdr
 from omnid.transport.sensor_codec import image_cdr
 from omnid.transport.status_names import RUN_ID
 from omnid.transport.topics import CLOCK, PANORAMA
@@ -71,15 +71,10 @@ class PanoramaSink:
         self._next_ns = 0.0
 
     def process(self, odometry: OdometryUpdate) -> None:
-        """Publish the panorama of a pose, with its features as the attachment, when it is due."""
+        """Publish the panorama of a pose when it is due."""
         if odometry.stamp_ns < self._next_ns or not self._bus.is_received(PANORAMA):
             return
-        # 1. Encode the panorama.
         self._next_ns = odometry.stamp_ns + self._period_ns
         _, jpeg = cv2.imencode(".jpg", odometry.depth.panoramas.lower.panorama)
         frame = Frame(odometry.seq, odometry.stamp_ns, "lower", "jpeg", jpeg)
-        # 2. Publish it with its features.
-        features = odometry.features
-        pixels = {"inliers": features.inliers, "rejected": features.rejected, "new": features.new}
-        _, payload = image_cdr(frame, self._unix_ns(odometry.stamp_ns))
-        self._bus.publish(PANORAMA, payload, features_to_bytes(pixels))
+        self._bus.publish(PANORAMA, image_cdr(frame, self._unix_ns(odometry.stamp_ns))[1])

@@ -8,9 +8,9 @@ Each topic has its plain key, and what ROS 2 needs to find and to read it.
 from __future__ import annotations
 
 import time
-from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from operator import attrgetter
 from typing import Any, Final
 
 import zenoh
@@ -21,7 +21,7 @@ from omnid.errors import OmnidError
 from omnid.transport import ros2
 from omnid.transport.bus_config import BusConfig, checked
 from omnid.transport.intake import PERIOD_S, QUERY_HZ, CommandIntake, Intake, OpenRequests, RequestCallback, burst_of
-from omnid.transport.session import ALIVE, EndpointTaken, has_receiver, open_session, reason, router_in_place
+from omnid.transport.session import ALIVE, has_receiver, open_session, reason
 from omnid.transport.stop_datagram import StopListener
 from omnid.transport.topics import CLOCK, PUBLISHED, STOP, Request, Topic, plain_key, ros_name
 
@@ -122,7 +122,7 @@ class Bus:
         self._closed = False
         self.lost = 0
         if not self.needs_router:
-            self._open_peer()
+            self._open()
 
     @property
     def needs_router(self) -> bool:
@@ -137,21 +137,18 @@ class Bus:
 
     def stats(self) -> dict[str, object]:
         """Return whether the bus is open and the name unique, and the number of messages lost before that."""
-        counts: Counter[str] = Counter()
-        for intake in (*(self._commands.intakes if self._commands else ()), *self._queries.values()):
-            counts[intake.key] += intake.floods
-        counts = +counts
-        is_flooded, self._flooded = counts.total() > self._flooded, counts.total()
+        intakes = [*(self._commands.intakes if self._commands else ()), *self._queries.values()]
+        before, self._flooded = self._flooded, sum(intake.floods for intake in intakes)
         warning = ""
         if self._session is None:
             warning = f"no router yet at {', '.join(self._config.connect)}"
-        elif is_flooded:
-            warning = f"more messages on {counts.most_common(1)[0][0]} than are taken: end their sender"
+        elif self._flooded > before:
+            warning = f"more messages on {max(intakes, key=attrgetter('floods')).key} than are taken: end their sender"
         return {
             "mode": "client" if self._config.is_client else "peer",
             "lost": self.lost,
             "same_name": len(self._namesakes),  # other robots of this name
-            **{f"flooded, {key}": count for key, count in sorted(counts.items())},
+            "floods": self._flooded,  # how often a key had more messages than its budget
             "_error": "" if self.is_unique else self._same_name,
             "_warning": warning,
             "_words": "open",
@@ -220,21 +217,6 @@ class Bus:
             f"another robot on the bus has the name {self._config.robot!r}, and both obey the same commands: this "
             "one is not armed before the other has gone; change bus.robot of one of them"
         )
-
-    def _open_peer(self) -> None:
-        """Open the session of a peer; where ROS 2's router (rmw_zenohd) holds the endpoints, that of its client."""
-        try:
-            self._open()
-        except EndpointTaken:
-            client = router_in_place(self._config) if self._config.ros2 == "rmw_zenoh" else None
-            if client is None:
-                raise
-            self._warn(
-                f"the zenoh router at {', '.join(client.connect)} is joined as a client: who "
-                "may connect is decided there"
-            )
-            self._config = client
-            self._open()
 
     def _open(self) -> None:
         session = open_session(self._config)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Annotated, Final, Literal
 
 from msgspec import Meta
@@ -14,20 +13,6 @@ from omnid.errors import OmnidError
 KEY: Final = re.compile(r"[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*")
 _ENDPOINT: Final = re.compile(r"(tcp|udp|tls|quic|ws)/[^/\s]+:\d{1,5}([?#].*)?|unixsock-stream/\S+")
 _ROS_NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
-_IN_ZENOHS_FILE: Final = (
-    "retry_s",
-    "tls_ca",
-    "tls_listen_key",
-    "tls_listen_certificate",
-    "tls_connect_key",
-    "tls_connect_certificate",
-    "tls_mutual",
-    "user",
-    "password_file",
-    "users_file",
-    "command_names",
-    "command_users",
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,13 +34,6 @@ class BusConfig:
     panorama_hz: Annotated[
         float, Meta(ge=0, le=60), "panoramas on the bus per second, as JPEG, made while somebody subscribes; 0: none"
     ] = 2.0
-
-    # Keys of earlier versions, and what takes their place.
-    REMOVED = MappingProxyType(
-        {"mode": "bus.listen = [] makes a client of the router in bus.connect"}
-        | {"command_clock": "a sender with another clock repeats the robot's own time, see docs/bus.md, `Stamps`"}
-        | {name: "zenoh's own file has it, see bus.config and omnid/transport/site.json5" for name in _IN_ZENOHS_FILE}
-    )
 
     @property
     def is_client(self) -> bool:

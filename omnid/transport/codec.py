@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from struct import calcsize
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self, TypeAlias
 
 import msgspec
 import numpy as np
@@ -32,7 +32,6 @@ from omnid.errors import OmnidError
 if TYPE_CHECKING:
     from omnid.core.obstacles.moving_tracker import MovingObstacle
 
-T = TypeVar("T")
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Frames = tuple[str, str]
@@ -174,16 +173,11 @@ class PoseAttachment:
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
         """Decode a JSON object; missing entries keep their defaults."""
-        return _of_json(data, cls, "a pose")
-
-
-def _of_json(data: bytes, kind: type[T], whose: str) -> T:
-    """Return what is attached to a message as JSON."""
-    try:
-        return msgspec.json.decode(data, type=kind)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        what = f"the {len(data)} bytes attached to {whose} are not its JSON ({error}); check that omnid sent them"
-        raise OmnidError(what) from error
+        try:
+            return msgspec.json.decode(data, type=cls)
+        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+            what = f"the {len(data)} bytes attached to a pose are not its JSON ({error}); check that omnid sent them"
+            raise OmnidError(what) from error
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -592,24 +586,7 @@ def _planar_heading(pose: Any) -> float | None:
     return float(se3.yaw(T))
 
 
-# A panorama and its features.
-
-FEATURE_KINDS: Final = ("inliers", "rejected", "new")
-_Pixels = msgspec.defstruct("_Pixels", [(kind, list[tuple[float, float]]) for kind in FEATURE_KINDS])
-
-
-def features_to_bytes(pixels: Mapping[str, Array]) -> bytes:
-    """Encode the zenoh attachment of a panorama: pixels (N, 2) of its features, column and row, by kind.
-
-    They are rounded to whole pixels.
-    """
-    return msgspec.json.encode({kind: np.rint(pixels[kind]).astype(int).tolist() for kind in FEATURE_KINDS})
-
-
-def features_from_bytes(data: bytes) -> dict[str, Array]:
-    """Decode the pixels (N, 2) of features by kind."""
-    found = _of_json(data, _Pixels, "a panorama")
-    return {kind: np.array(getattr(found, kind), np.float64).reshape(-1, 2) for kind in FEATURE_KINDS}
+# Images.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -618,11 +595,9 @@ class Panorama:
 
     stamp_ns: int
     data: bytes  # JPEG
-    features: Mapping[str, Array]  # pixels (N, 2) by kind; empty where none are attached
 
 
-def decode_panorama(payload: bytes, attachment: bytes = b"") -> Panorama:
-    """Decode a CompressedImage, with its features if they are attached."""
+def decode_panorama(payload: bytes, _: bytes = b"") -> Panorama:
+    """Decode a CompressedImage."""
     message = decoded(payload, IMAGE_SCHEMA)
-    features = features_from_bytes(attachment) if attachment else {}
-    return Panorama(_stamp_ns(message), message.data.tobytes(), features)
+    return Panorama(_stamp_ns(message), message.data.tobytes())

@@ -24,9 +24,8 @@ the robot's CLOCK_MONOTONIC. A message says when it was sent by
 
 and the nearer of the two to its arrival counts. What can begin a motion (arm, a goal, the first setpoint of a stream,
 the release of a contact) must say it, and have been sent within stale_s of its arrival: a message that waited in a
-network, or was recorded, begins none. Of the release of a contact, which begins nothing without a request to arm, the
-pace of the board's own stamps says as well that it did not wait (`SensorClock`). What goes on with a motion is as old
-as it says, and at least as its arrival; it need not say anything. What ends a motion is taken in any case.
+network, or was recorded, begins none. What goes on with a motion is as old as it says, and at least as its arrival; it
+need not say anything. What ends a motion is taken in any case.
 """
 
 from __future__ import annotations
@@ -158,29 +157,6 @@ class Freshness:
         return sent_ns
 
 
-class SensorClock:
-    """The clock of a sensor board, which need not be right where its messages come at the pace of their stamps.
-
-    Messages that waited in a network come all at once, and recorded ones differ from those of the board itself.
-    """
-
-    def __init__(self, stale_ns: int) -> None:
-        self._stale_ns = stale_ns
-        self._delays_ns: list[int] = []  # least and largest delay by the stamps, which differ by less than stale_ns
-        self._since_ns = 0  # arrival of the first message with these
-        self.touched_ns: float = -math.inf  # newest stamp of a contact among them
-        self.newest_ns = 0  # when the newest contact was sent, at most its arrival, whatever the delays
-
-    def is_steady(self, sent_ns: int, arrival_ns: int) -> bool:
-        """Take a message; True where for stale_ns all messages have come with the same delay."""
-        delay_ns = arrival_ns - sent_ns
-        delays_ns = [delay_ns, *self._delays_ns]
-        self._delays_ns = [min(delays_ns), max(delays_ns)]
-        if len(delays_ns) == 1 or self._delays_ns[1] - self._delays_ns[0] >= self._stale_ns:
-            self._delays_ns, self._since_ns, self.touched_ns = [delay_ns], arrival_ns, -math.inf
-        return arrival_ns - self._since_ns >= self._stale_ns
-
-
 # Commands.
 
 
@@ -256,9 +232,10 @@ class CommandReceiver(Receiver):
         for topic, (source, kind) in topics.setpoint_topics(sources).items():
             actions[topic] = partial(self._drive, source, parsers[kind])
         for topic, contact in CONTACTS.items():
-            actions[topic] = partial(self._touch, contact, SensorClock(freshness.stale_ns))
+            actions[topic] = partial(self._touch, contact)
         super().__init__(actions, report, "see controller.sources.names")
         self._stop_ns = 0  # arrival of the newest stop
+        self._touched_ns = dict.fromkeys(CONTACTS.values(), 0)  # when the newest contact was sent, or arrived before
         # Sender and newest arrival of the setpoints of each source: the first one begins a motion, the others go on
         # with it. There are none after a stop.
         self._streams: dict[str, tuple[str, int]] = {}
@@ -274,23 +251,18 @@ class CommandReceiver(Receiver):
         if topic in CONTACTS:
             self._target.touch(CONTACTS[topic], holds=True)
 
-    def _touch(self, contact: str, clock: SensorClock, request: Request, arrival_ns: int) -> None:
+    def _touch(self, contact: str, request: Request, arrival_ns: int) -> None:
         """Pass the state of a contact on; a message that is refused is a contact.
 
         A contact ends only by a Bool of False that was sent just now, and not before that of the contact, because
-        messages may overtake each other. A board whose clock is wrong sends it just now where its messages come at the
-        pace of their stamps. All other messages are a contact.
+        messages may overtake each other. All other messages are a contact.
         """
         holds = bool(codec.decoded(request.payload, codec.BOOL_SCHEMA).data)
-        sent_ns = self._freshness.sent_ns(request, arrival_ns)
-        is_steady = sent_ns is not None and clock.is_steady(sent_ns, arrival_ns)
         if holds:
-            clock.newest_ns = max(clock.newest_ns, min(sent_ns or 0, arrival_ns))
-            clock.touched_ns = max(clock.touched_ns, sent_ns or clock.touched_ns)
-        elif is_steady and sent_ns is not None:
-            holds = sent_ns < clock.touched_ns
+            sent_ns = self._freshness.sent_ns(request, arrival_ns) or 0
+            self._touched_ns[contact] = max(self._touched_ns[contact], min(sent_ns, arrival_ns))
         else:
-            holds = self._freshness.require(request, arrival_ns) < clock.newest_ns
+            holds = self._freshness.require(request, arrival_ns) < self._touched_ns[contact]
         self._target.touch(contact, holds=holds)
 
     def _arm(self, request: Request, arrival_ns: int) -> None:

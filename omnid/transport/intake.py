@@ -25,12 +25,7 @@ from omnid.transport.topics import ARM, MOST_OPEN, STOP, Answer, Request, comman
 T = TypeVar("T")
 RequestCallback: TypeAlias = Callable[[Request], None]
 PERIOD_S: Final = 0.004  # Time between two passes.
-_UNKNOWN_TOPICS: Final = "cmd/**"
-_LAST: Final = (ARM, STOP)
-
-
 QUERY_HZ: Final = 50.0
-UNKNOWN_HZ: Final = 200.0  # of topics that do not exist; of up to 1 MiB
 
 
 def burst_of(rate_hz: float) -> int:
@@ -99,7 +94,6 @@ class _Ring(NamedTuple):
     """The messages, or the queries, of one key that wait."""
 
     topic: str
-    prefix: str  # of the key, before the topic
     intake: Intake[Any]
 
 
@@ -114,12 +108,12 @@ class CommandIntake:
         requests: OpenRequests,
         callback: RequestCallback,
     ) -> None:
-        """topics: those with a ring of their own; all others below `cmd` share one. requests: keeps unanswered queries.
+        """topics: those to take beside stops and requests to arm. requests: keeps unanswered queries.
 
         callback: takes each message, in the thread of `process`.
         """
         self._callback, self._open = callback, requests
-        self._topics = frozenset((*topics, *_LAST))
+        self._topics = sorted(set(topics) - {ARM, STOP})
         self._declared: list[object] = []  # zenoh undeclares what is no longer referred to
         self._rings = list(self._declare(session, config))
         self._stops = [ring for ring in self._rings if ring.topic == STOP]
@@ -142,8 +136,9 @@ class CommandIntake:
                 continue
             for message in ring.intake.messages():
                 asked_to_arm |= ring.topic == ARM
-                if topic := self._topic(ring, message):
-                    self._pass_on(topic, message)
+                # A request names one robot and one topic: a query for several keys is none.
+                if isinstance(message, zenoh.Sample) or str(message.key_expr) == ring.intake.key:
+                    self._pass_on(ring.topic, message)
         # 3. After a request to arm: a stop that came in the meantime, or else that of step 1 once more.
         if asked_to_arm and not self._stop() and stopped:
             self._callback(Request(STOP))
@@ -169,35 +164,18 @@ class CommandIntake:
             sender = str(message.source_info.source_id.zid)
         self._callback(Request(topic, payload, sender, sent_ns, self._open.add(topic, query), echo_ns))
 
-    def _topic(self, ring: _Ring, message: zenoh.Sample | zenoh.Query) -> str:
-        """Return the topic of a message; empty for a message that is not passed on.
-
-        These are queries of several keys, since a request names one robot and one topic, and messages in the shared
-        ring whose topic has a ring of its own.
-        """
-        key = str(message.key_expr).removeprefix(ring.prefix)
-        if isinstance(message, zenoh.Query):
-            return ring.topic if key == request_key(ring.topic) else ""
-        if ring.topic != _UNKNOWN_TOPICS:
-            return ring.topic
-        # A key of rmw_zenoh ends with the type of the message and the hash of that type.
-        topic = key if ring.prefix == self._rings[0].prefix else key.rsplit("/", 2)[0]
-        return "" if topic in self._topics else topic
-
     def _declare(self, session: zenoh.Session, config: BusConfig) -> Iterator[_Ring]:
-        """Declare subscribers and queryables; yield their rings."""
-        own, ros = f"{config.robot}/", f"{config.ros2_domain}/{config.robot}/"
-        for topic in (*sorted(self._topics - {*_LAST}), _UNKNOWN_TOPICS, *_LAST):
-            yield self._ring(session.declare_subscriber, own, topic, topic)
-            if config.ros2 == "rmw_zenoh":
-                yield self._ring(
-                    session.declare_subscriber, ros, topic, topic if topic == _UNKNOWN_TOPICS else f"{topic}/*/*"
-                )
+        """Declare subscribers and queryables; yield their rings, those of requests to arm and of stops last."""
+        for topic in (*self._topics, ARM, STOP):
+            yield self._ring(session.declare_subscriber, topic, f"{config.robot}/{topic}")
+            if config.ros2 == "rmw_zenoh":  # a key of it ends with the type of the message and the hash of that type
+                key = f"{config.ros2_domain}/{config.robot}/{topic}/*/*"
+                yield self._ring(session.declare_subscriber, topic, key)
             if command_of(topic).is_request:
-                yield self._ring(session.declare_queryable, own, topic, request_key(topic))
+                yield self._ring(session.declare_queryable, topic, f"{config.robot}/{request_key(topic)}")
 
-    def _ring(self, declare: Callable[..., Any], prefix: str, topic: str, key: str) -> _Ring:
-        rate_hz = UNKNOWN_HZ if topic == _UNKNOWN_TOPICS else command_of(topic).rate_hz
-        declared = declare(f"{prefix}{key}", zenoh.handlers.RingChannel(burst_of(rate_hz)))
+    def _ring(self, declare: Callable[..., Any], topic: str, key: str) -> _Ring:
+        rate_hz = command_of(topic).rate_hz
+        declared = declare(key, zenoh.handlers.RingChannel(burst_of(rate_hz)))
         self._declared.append(declared)
-        return _Ring(topic, prefix, Intake(key, declared.try_recv, rate_hz))
+        return _Ring(topic, Intake(key, declared.try_recv, rate_hz))

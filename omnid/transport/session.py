@@ -11,7 +11,6 @@ import json
 import os
 import re
 import time
-from dataclasses import replace
 from importlib.resources import files
 from typing import Any, Final
 
@@ -23,8 +22,6 @@ from omnid.transport.bus_config import BusConfig, checked, text_of_file
 
 HERE: Final = "tcp/127.0.0.1:7447"
 ALIVE: Final = "alive"  # key of the liveliness token below the robot's name
-_OS_ERROR: Final = re.compile(r"\(os error (\d+)\)")
-_NO_ANSWER: Final = re.compile(r"Unable to connect to any of \[.*\]\. Timeout!")
 _SOURCE_LINE: Final = re.compile(r"\s+at /\S+\.rs:\d+\.?")
 _PROTOCOLS: Final = "transport/link/protocols"
 _PROTOCOL: Final = re.compile(r'"([a-z0-9_-]+)/')
@@ -43,16 +40,12 @@ _DEFAULTS: Final = (  # what zenoh's own file may leave to default.json5
 _GUARDS: Final = ("transport/link/rx/max_message_size", "low_pass_filter", "access_control")
 
 
-class EndpointTaken(OmnidError):  # noqa: N818 - a state that may pass, as the errors of sockets
-    """An endpoint cannot be listened on."""
-
-
 class Unreachable(OmnidError):  # noqa: N818 - a state that may pass, as the errors of sockets
     """No endpoint answers a client, or the answer refuses it."""
 
 
 def open_session(config: BusConfig, *, guarded: bool = True) -> zenoh.Session:
-    """Open a session. Raise EndpointTaken where an endpoint cannot be listened on, Unreachable for a client.
+    """Open a session. Raise OmnidError where an endpoint cannot be listened on, Unreachable for a client.
 
     guarded: other programs may write commands only, and cannot send messages above 1 MiB. Clients are not guarded: the
     messages of a robot may be larger.
@@ -68,9 +61,9 @@ def open_session(config: BusConfig, *, guarded: bool = True) -> zenoh.Session:
                 f"bus cannot reach {', '.join(config.connect)}: start the robot or router there, or change bus.connect "
                 f"({cause})"
             ) from error
-        raise EndpointTaken(
-            f"bus cannot listen on {', '.join(config.listen)}: stop the other program there or change bus.listen "
-            f"({cause})"
+        raise OmnidError(
+            f"bus cannot listen on {', '.join(config.listen)}: stop the other program there or change bus.listen; of a "
+            f"router such as rmw_zenohd be a client: bus.listen = [], bus.connect = its endpoint ({cause})"
         ) from error
 
 
@@ -102,19 +95,6 @@ def has_receiver(declared: zenoh.Publisher | zenoh.Querier) -> bool:
     """Return whether a program takes what a publisher sends, or what a querier asks."""
     status: Any = declared.matching_status  # zenoh's stub takes it for a bool
     return bool(status.matching)
-
-
-def router_in_place(config: BusConfig) -> BusConfig | None:
-    """Return the configuration of a client of the router that holds the endpoints of a peer; None without a router."""
-    client = replace(config, listen=(), connect=config.listen)
-    try:
-        session = open_session(client, guarded=False)
-    except OmnidError:
-        return None
-    try:
-        return client if session.info.routers_zid() else None
-    finally:
-        session.close()  # type: ignore[no-untyped-call]  # the stub has no return type
 
 
 def zenoh_config(config: BusConfig, *, guarded: bool = True) -> zenoh.Config:
@@ -155,11 +135,8 @@ def needs_proof(config: BusConfig) -> bool:
 
 
 def reason(error: zenoh.ZError) -> str:
-    """Return a common cause in a few words, else zenoh's message in one line without references to its sources."""
-    text = " ".join(_SOURCE_LINE.sub("", str(error)).split())
-    if by_system := _OS_ERROR.search(text):
-        return os.strerror(int(by_system[1]))
-    return "no answer" if _NO_ANSWER.fullmatch(text) else text
+    """Return zenoh's message in one line, without references to its sources."""
+    return " ".join(_SOURCE_LINE.sub("", str(error)).split())
 
 
 def _of_file(config: BusConfig) -> zenoh.Config:

@@ -126,10 +126,8 @@ class RerunSink:
                 is_compressed = content.encoding in ("jpeg", "png")
                 data = bytes(content.data) if is_compressed else _jpeg(gray(content))
                 self.panorama(content.stamp_ns, data, content.encoding if is_compressed else "jpeg")
-            case Panorama(stamp_ns, data, features) if self.wants("image"):
+            case Panorama(stamp_ns, data) if self.wants("image"):
                 self.panorama(stamp_ns, data)
-                if features:
-                    self.features(stamp_ns, Features(**features))
 
     def panorama(self, stamp_ns: int, data: bytes, kind: str = "jpeg") -> None:
         """Draw a compressed image; kind: jpeg or png."""

@@ -26,7 +26,6 @@ from omnid.transport.codec import (
     decode_diagnostics,
     decode_map,
     decode_scan,
-    features_from_bytes,
     moving_cdr,
     scan_cdr,
 )
@@ -146,18 +145,6 @@ def overwritten(offset: int, value: bytes) -> bytes:
         (lambda: scan_cdr(-1, "base_link", RANGES, SIGMA, (0.0, 6.0)), "stamp"),
         (lambda: moving_cdr(2**31 * 10**9, "odom", []), "stamp"),
         (lambda: image_cdr(frame(7, "upper", "bgr8"), -1), "-1 ns"),
-        *(
-            (lambda data=data: features_from_bytes(data), "attached to a panorama")
-            for data in (
-                b"",
-                b"{}",
-                b"[]",
-                b"\xff",
-                b"[" * 3000,
-                b'{"inliers":[[1]],"rejected":[],"new":[]}',
-                bytes(1 << 18),
-            )
-        ),
         *(
             (lambda data=data: PoseAttachment.from_bytes(data), f"the {len(data)} bytes attached to a pose")
             for data in (b"", b"[1]", b"{", b"\xff", b"[" * 4000)

@@ -21,20 +21,14 @@ from omnid.core.control.contacts import BUMPER, CLIFF
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.navigation.requests import GoalRequest, NavigationCommand
 from omnid.engine.robot_clock import RobotClock
-from omnid.errors import OmnidError
 from omnid.transport import codec
 from omnid.transport.codec import (
     BOOL_SCHEMA,
-    IMU_SCHEMA,
-    JOINT_SCHEMA,
     PATH_SCHEMA,
     encoded,
     goal_cdr,
-    goal_from_cdr,
     path_cdr,
-    path_from_cdr,
     string_cdr,
-    string_from_cdr,
 )
 from omnid.transport.commands import (
     CommandReceiver,
@@ -43,7 +37,7 @@ from omnid.transport.commands import (
     SensorReceiver,
 )
 from omnid.transport.sensor_codec import gyro_cdr, wheel_cdr
-from omnid.transport.topics import IMU, JOINT_STATES, SENSOR_TOPICS, WHEEL_ODOM, Answer, Request
+from omnid.transport.topics import IMU, SENSOR_TOPICS, WHEEL_ODOM, Answer, Request
 from tests.omnid.transport.bus_fixtures import damaged
 from tests.set_clock import SetClock
 
@@ -157,8 +151,7 @@ def aside(name: str, speed: float, *, is_stamped: bool = True) -> bytes:
     return bytes(STORE.serialize_cdr(message, message.__msgtype__))
 
 
-@pytest.mark.parametrize("name", ["linear.y", "linear.z", "angular.x", "angular.y"])
-@pytest.mark.parametrize("is_stamped", [True, False])
+@pytest.mark.parametrize(("name", "is_stamped"), [("linear.y", True), ("angular.x", False)])
 def test_a_motion_that_the_base_cannot_make_is_named_and_not_made_in_part(name: str, is_stamped: bool) -> None:
     lines: list[str] = []
     accepted = AcceptedCommands()
@@ -224,7 +217,7 @@ def echo(accepted: AcceptedCommands, later_s: float = 0.0) -> int:
     return int(accepted.freshness.own_time()) + round(later_s * 1e9)
 
 
-HOURS = pytest.mark.parametrize("wrong_s", [-3 * 3600.0, 3 * 3600.0, -55 * 365.25 * 86400.0])
+HOURS = pytest.mark.parametrize("wrong_s", [3 * 3600.0, -55 * 365.25 * 86400.0])
 
 
 @pytest.mark.hazard("H06")
@@ -276,7 +269,7 @@ def test_a_setpoint_is_as_old_as_it_says(accepted: AcceptedCommands) -> None:
 
 
 @pytest.mark.hazard("H06")
-@pytest.mark.parametrize("step_s", [-3 * 3600.0, -2.0, 0.1, 2.0, 3 * 3600.0, 3e8])
+@pytest.mark.parametrize("step_s", [-2.0, 0.1, 3 * 3600.0])
 def test_a_step_of_the_robots_clock_makes_no_command_older_or_newer(step_s: float) -> None:
     """Streams go on, with stamps of this computer, or by the echo; what is recorded stays old."""
     computer = SetClock(now_ns() - time.monotonic_ns())
@@ -340,10 +333,9 @@ def worse(rng: random.Random, good: bytes) -> bytes:
 
 
 @pytest.mark.hazard("H09")
-@pytest.mark.parametrize("seed", range(3))
-def test_counts_a_thousand_damaged_payloads(accepted: AcceptedCommands, seed: int) -> None:
+def test_counts_a_thousand_damaged_payloads(accepted: AcceptedCommands) -> None:
     """None raises, each is counted, and numbers of payloads that are still valid are finite and in range."""
-    rng = random.Random(seed)
+    rng = random.Random(1)
     for _ in range(1000):
         key, good = rng.choice((("cmd/twist", twist()), ("cmd/heading", codec.heading_cdr(now_ns(), 0.1, 0.2))))
         accepted.receive(key, worse(rng, good))
@@ -420,25 +412,6 @@ def test_an_older_release_that_comes_after_a_contact_does_not_release_it(by_echo
     assert [holds for _, holds in accepted.contacts][-2:] == [True, False]
 
 
-@pytest.mark.hazard("H08")
-@pytest.mark.parametrize("off_s", [-3e7, 3e7], ids=["behind", "ahead"])
-def test_a_board_with_a_wrong_clock_releases_its_contact_where_its_messages_come_at_their_pace(off_s: float) -> None:
-    """Not so messages that waited and come all at once, one that overtook the contact, or a recording between them."""
-    accepted = AcceptedCommands()
-
-    def send(holds: bool, wrong_s: float = off_s) -> bool:
-        accepted.receive("cmd/bumper", bool_cdr(holds), "board", now_ns(wrong_s))
-        return accepted.contacts[-1][1]
-
-    # Messages that waited for a time: they come at once, whatever they say.
-    assert all(send(False, off_s + 0.1 * number) for number in range(20))
-    assert send(True) and send(False), "one message of a board says nothing about its clock"
-    time.sleep(STALE_S * 1.1)
-    assert send(True) and send(False, off_s - 0.1 * STALE_S), "sent before the contact"
-    assert not send(False)
-    assert send(True) and send(False, off_s - 60.0) and send(False), "of another clock, as from a recording"
-
-
 # Requests to the navigation.
 
 
@@ -461,22 +434,6 @@ class Received:
 
 def goal(stamp_ns: int, x: float = 1.5, y: float = -2.0, heading: float | None = 0.5, frame: str = "map") -> bytes:
     return goal_cdr(stamp_ns, frame, (x, y), heading)
-
-
-def test_messages_of_the_navigation_round_trip() -> None:
-    found = goal_from_cdr(goal(12_000_000_034))
-    assert (
-        found[:2] == (12_000_000_034, "map")
-        and found.xy.tolist() == [[1.5, -2.0]]
-        and found.heading_rad == pytest.approx(0.5)
-    )
-    assert goal_from_cdr(goal(5, heading=None)).heading_rad is None
-    xy = np.array([[0.0, 0.0], [1.0, 0.5], [2.0, 0.0]])
-    path = path_from_cdr(path_cdr(7, "odom", xy, -1.0))
-    assert path[:2] == (7, "odom") and path.heading_rad == pytest.approx(-1.0)
-    np.testing.assert_array_equal(path.xy, xy)
-    assert path_from_cdr(path_cdr(7, "odom", xy)).heading_rad is None
-    assert string_from_cdr(string_cdr("repeat hall")) == "repeat hall"
 
 
 @pytest.mark.hazard("H27")
@@ -554,14 +511,6 @@ def test_damaged_messages_never_raise_and_lead_to_finite_goals() -> None:
     assert received.receiver.refused.total() + received.receiver.accepted == 2000
 
 
-def test_a_tilted_goal_is_refused() -> None:
-    payload = bytearray(goal(1, heading=0.0))
-    payload[-32:-24] = np.float64(0.7071).tobytes()  # x of the quaternion
-    payload[-8:] = np.float64(0.7071).tobytes()
-    with pytest.raises(OmnidError, match="about z"):
-        goal_from_cdr(bytes(payload))
-
-
 # Samples of wheels and gyro.
 
 
@@ -583,36 +532,6 @@ def test_samples_arrive_in_the_time_of_the_images(lines: list[str]) -> None:
     assert taken == [WHEELS, GYRO] and not lines and not sensors.refused
 
 
-def test_an_imu_that_measures_no_rates_is_no_gyro_that_stands(lines: list[str]) -> None:
-    """By sensor_msgs/msg/Imu the first number of a covariance is -1 where nothing is measured."""
-    message = STORE.deserialize_cdr(gyro_cdr(GYRO, OFFSET_NS + 5), IMU_SCHEMA)
-    message.angular_velocity_covariance = np.array([-1.0, *[0.0] * 8])
-    taken: list[MotionSample] = []
-    sensors = receiver(taken, lines)
-    sensors.receive(Request(IMU, bytes(STORE.serialize_cdr(message, IMU_SCHEMA))))
-    assert not taken and sensors.refused.total() == 1 and "no angular velocity" in lines[0]
-
-
-def joint_cdr(names: list[str], velocities: list[float], stamp_ns: int = OFFSET_NS + 7) -> bytes:
-    parts = names, np.zeros(len(names)), np.array(velocities), np.zeros(0)
-    return encoded(JOINT_SCHEMA, (stamp_ns, ""), *parts)
-
-
-def test_wheels_are_joints_where_these_are_named(lines: list[str]) -> None:
-    taken: list[MotionSample] = []
-    joints = JointWheels("left", "right", 0.1, 0.5)
-    sensors = SensorReceiver(taken.append, stamp_of, frozenset([JOINT_STATES]), lines.append, joints)
-    sensors.receive(Request(JOINT_STATES, joint_cdr(["arm", "right", "left"], [9.0, 6.0, 4.0])))
-    assert taken == [WheelSample(7, pytest.approx(0.5), pytest.approx(0.4))]
-    sensors.receive(Request(JOINT_STATES, joint_cdr(["arm"], [9.0])))
-    assert len(taken) == 1 and not lines, "other joints have messages of their own"
-    for names, velocities in ((["left"], [1.0]), (["left", "right"], []), (["left", "right"], [1.0, np.nan])):
-        sensors.receive(Request(JOINT_STATES, joint_cdr(names, velocities)))
-    sensors.receive(Request(JOINT_STATES, joint_cdr(["left", "right"], [1.0, 1.0], stamp_ns=0)))
-    assert len(taken) == 1 and sensors.refused.total() == 4
-    assert len(lines) == 2 and "no velocity of left or of right" in lines[0]
-
-
 @pytest.mark.hazard("H15")
 def test_samples_from_the_network_are_checked(lines: list[str]) -> None:
     """No stamp, absurd or infinite rates, another source in use, damaged bytes: counted, a line for each new one."""
@@ -632,17 +551,3 @@ def test_samples_from_the_network_are_checked(lines: list[str]) -> None:
     only_imu = receiver(taken, lines, IMU)
     only_imu.receive(Request(WHEEL_ODOM, wheel_cdr(WHEELS, OFFSET_NS)))
     assert taken == [] and "motion.wheels" in lines[-1]
-
-
-def test_damaged_bytes_never_raise_and_give_finite_samples(lines: list[str]) -> None:
-    rng, taken = random.Random(3), list[MotionSample]()
-    sensors = receiver(taken, lines)
-    for topic, payload in (
-        (WHEEL_ODOM, wheel_cdr(WHEELS, OFFSET_NS + 1)),
-        (IMU, gyro_cdr(GYRO, OFFSET_NS + 1)),
-        (JOINT_STATES, joint_cdr(["left", "right"], [1.0, 2.0])),
-    ):
-        for _ in range(2000):
-            sensors.receive(Request(topic, damaged(rng, payload)))
-    rates = [sample.velocity_mps if isinstance(sample, WheelSample) else sample.z_radps for sample in taken]
-    assert len(taken) > 500 and np.isfinite(rates).all() and np.abs(rates).max() <= 100
