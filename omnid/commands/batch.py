@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import glob
-import hashlib
 import json
 import logging
 import os
@@ -50,7 +49,7 @@ class Job:
     words: tuple[str, ...]  # of `omnid replay`
     truth: Path | None  # trajectory that the result is compared with
     timeout_s: float
-    key: str  # digest of all that makes the result
+    seen: str  # version of omnid, words, size and date of the log: what is stored is of another job where it differs
 
 
 @command(CAMERAS, FILE_AND_SET)
@@ -116,7 +115,7 @@ def replay(job: Job) -> dict[str, Any]:
         error = one_line(lines[-1]).removeprefix("omnid: ") if lines else f"exit code {code}"
     elif code == 1 and summary and summary["counters"]["loss"] and summary["counters"]["poses"]:
         status = LOSSY
-    result = {"log": str(job.log), "key": job.key, "status": status, "error": error, "replay": summary}
+    result = {"log": str(job.log), "seen": job.seen, "status": status, "error": error, "replay": summary}
     if status in (DONE[0], LOSSY):
         if job.truth is not None:
             result["eval"] = _omnid(("eval", "est.txt", str(job.truth), "--json"), job)[1]
@@ -148,8 +147,6 @@ def _jobs(args: argparse.Namespace) -> list[Job]:
             "batch: each replay would extend places.map, so that results depend on their order: add "
             "--set places.localize_only=true, or make a map of all logs by `omnid map build`"
         )
-    if args.out.exists() and not args.out.is_dir():
-        raise OmnidError(f"batch: --out {str(args.out)!r}: expected a folder for the results, found a file")
     options = [(f"--{name}", path and path.absolute()) for name, path in (("rig", args.rig), ("config", args.config))]
     options += [("--lower", args.lower), ("--upper", args.upper), *(("--set", value) for value in args.set)]
     options += [("--record", RECORDING if args.record else None), *OUTPUTS]
@@ -157,21 +154,15 @@ def _jobs(args: argparse.Namespace) -> list[Job]:
     named = [Path(path) for name in map(str, args.logs) for path in glob.glob(name, recursive=True) or [name]]
     logs = sorted({Path(os.path.abspath(log)) for path in named for log in _below(path)})
     if not logs:
-        raise OmnidError(
-            f"batch: no log in {', '.join(map(str, args.logs))}; give files, folders, or patterns in quotes"
-        )
+        raise OmnidError(f"batch: no log in {', '.join(map(str, args.logs))}")
     common = os.path.commonpath([log.parent for log in logs])
     jobs = []
     for log in logs:
         beside = (log if log.is_dir() else log.parent) / args.truth
         truth = beside if args.truth and beside.is_file() else None
         words = ("replay", str(log), *given, "--inline", "--quiet", "--json")
-        # The result is another one where the words, the version, or one of the files that are read is another.
-        inputs = [log, truth, args.rig, args.config, settings.places.map and Path(settings.places.map)]
-        files = [file for path in inputs if path for file in (sorted(path.rglob("*")) if path.is_dir() else [path])]
-        stats = [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
-        key = hashlib.sha256(json.dumps([__version__, words, str(truth), stats]).encode()).hexdigest()
-        jobs.append(Job(log, args.out.absolute() / log.relative_to(common), words, truth, args.timeout_s, key))
+        seen = f"omnid {__version__} {' '.join(words)} {log.stat().st_size} {log.stat().st_mtime_ns}"
+        jobs.append(Job(log, args.out.absolute() / log.relative_to(common), words, truth, args.timeout_s, seen))
     return jobs
 
 
@@ -197,7 +188,7 @@ def _stored(job: Job) -> dict[str, Any] | None:
     """Return the result of an earlier run of the same job, None without one. Raise OmnidError for another log's."""
     try:
         result: dict[str, Any] = json.loads((job.folder / RESULT_FILE).read_text())
-        log, is_done = result["log"], result["key"] == job.key and result["status"] in (*DONE.values(), LOSSY)
+        log, is_done = result["log"], result["seen"] == job.seen and result["status"] in (*DONE.values(), LOSSY)
     except (OSError, ValueError, TypeError, KeyError):
         return None
     if log != str(job.log):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import asdict
-from typing import Final
 
 from drivers.errors import DriverError
 from drivers.logs.open_log import LogInfo, LogState, log_info
@@ -17,7 +16,6 @@ from omnid.recordings.truth_frame import find_truth_frame
 from omnid.utc import utc
 
 MAX_COLUMN = 60  # Most characters of a topic or a type, so that a line of the table fits a terminal.
-_MEND = "; for other programs: `mcap recover`, of mcap's own command line"
 MAX_LINE = 5000  # Most characters of a line: it may contain the path of a file.
 
 
@@ -57,8 +55,6 @@ def _show(found: LogInfo) -> None:
     faults += [f"{found.broken} corrupt chunks or records, which are skipped"] if found.broken else []
     states = {LogState.BROKEN: f": {'; '.join(faults)}", LogState.UNINDEXED: ": omnid reads it"}
     state = found.state.value + states.get(found.state, "")
-    if found.state in states and found.path.suffix in (".mcap", ".part"):
-        state += _MEND
     time = ""
     if found.span_ns is not None:
         first_ns, last_ns = found.span_ns
@@ -88,11 +84,6 @@ def _bytes(size: int) -> str:
         if size >= factor:
             return f"{size / factor:.1f} {unit}"
     return f"{size} bytes"
-
-
-# Position error (ATE), as a share of the true length, above which the trajectories hardly are of one drive: odometry
-# that is lost half of the way is below.
-ANOTHER_DRIVE: Final = 0.25
 
 
 @command(JSON)
@@ -130,11 +121,6 @@ def evaluate_run(args: argparse.Namespace) -> int:
         warn(
             f"{args.truth}: {frame}: with that the position error is {1e3 * fitted.ate_rmse_m:.1f} mm instead of "
             f"{1e3 * metrics.ate_rmse_m:.1f}: --frame auto"
-        )
-    elif metrics.ate_rmse_m > ANOTHER_DRIVE * metrics.length_truth_m:
-        warn(
-            f"the estimate is off by {metrics.ate_rmse_m:.2f} m on a way of {metrics.length_truth_m:.2f} m: is this "
-            "the truth of the same drive?"
         )
     if args.json:
         known = {"explained_by": None if frame is None else str(frame), "frame": args.frame}

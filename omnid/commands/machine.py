@@ -59,7 +59,6 @@ def examine(config: Config) -> Iterator[checks.Finding]:
     yield from checks.rig(Path(camera.rig), (camera.width_px, camera.height_px), config.obstacles.scan.floor_m)
     yield from checks.motor(config.motor, ROOT)
     yield from checks.rights(max(wanted.motor_priority, wanted.capture_priority), wanted.lock_memory)
-    yield from checks.compiled_functions()
     images_hz = min(camera.rate_hz or USUAL_HZ, config.record.images_hz or math.inf)
     rate = 2 * camera.width_px * camera.height_px * BYTES_PER_PIXEL * images_hz
     yield from checks.disk(checks.STATE / config.record.folder, config.record, rate)

@@ -148,22 +148,11 @@ def two_sides(text: str) -> tuple[int, int]:
     return int(sides[1]), int(sides[2])
 
 
-def map_file(text: str) -> Path:
-    """Return the map of places of an option; ArgumentTypeError for the name of another kind of map."""
-    if text.endswith(".ply"):
-        raise argparse.ArgumentTypeError(
-            f"{text}: expected a map of places (.omap) to localise in; the points of the 3-D map are written by "
-            "--cloud FILE.ply"
-        )
-    return Path(text)
-
-
 # Types of values by the word that stands for them in the help; a file or a folder is a path, all others are text.
 TYPES: Final[Mapping[str, Callable[[str], Any]]] = {
     **dict.fromkeys(("N", "PX", "BITS"), int),
     **dict.fromkeys(("X", "S", "M", "MM", "MS", "HZ", "MPS", "TURNS", "FACTOR", "SHARE", "RATIO"), float),
     **dict.fromkeys(("6x7", "6x6", "3840x1920"), two_sides),
-    "FILE.omap": map_file,
 }
 _PATHS: Final = {"FILE", "FOLDER", "DIR", "LOG", "EST", "TRUTH", "OUT"}
 

@@ -7,7 +7,6 @@ else the one that all is well.
 from __future__ import annotations
 
 import grp
-import ipaddress
 import os
 import re
 import shutil
@@ -27,17 +26,13 @@ from drivers.motors.protocols.protocol_registry import motor_protocol
 from omnid.config import RecordConfig
 from omnid.controller.motor import SIMULATED
 from omnid.controller.motor_settings import MotorSettings
-from omnid.core.compiled import cache_folder, why_unusable
-from omnid.engine.kernel_cache import why_no_code
 from omnid.engine.realtime import LOCK_ADVICE, highest_priority, may_lock, priority_advice
 from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig, checked
 
 Level = Literal["ok", "warning", "error"]
 GROUPS: Final = ("video", "dialout")  # the unit's SupplementaryGroups
-OWN_NAME: Final = "omnid"  # Name of the daemon's processes.
 STATE: Final = Path("/var/lib/omnid")  # StateDirectory and working directory of the unit
-_ENDPOINT: Final = re.compile(r"[a-z-]+/\[?(?P<host>[^\]/]+?)\]?:\d{1,5}(?:[?#].*)?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,18 +83,16 @@ def cameras(wanted: Mapping[str, V4l2Settings], known: list[CaptureDevice], root
             (path.exists() and device is None, "error", f"{settings.device} is no camera", choose),
         )
         if device is not None:
-            yield from _camera(subject, settings, device, path, root)
+            yield from _camera(subject, settings, device, path)
     if len({path.resolve() for path in names.values()}) < len(names):
         yield Finding(
             "error", "cameras", "both names lead to one device", "configure one for each, see `omnid cameras`"
         )
 
 
-def _camera(subject: str, settings: V4l2Settings, device: CaptureDevice, path: Path, root: Path) -> list[Finding]:
+def _camera(subject: str, settings: V4l2Settings, device: CaptureDevice, path: Path) -> list[Finding]:
     """Return ok if a connected camera can be used as configured, else all reasons against it."""
-    others, image, fault = holders(path, root), "in use, so that its image was not tried", device.problem
-    is_open = f"{settings.device} is open in {', '.join(others)}"
-    problems = access(subject, path) + _applying(subject, (others, "warning", is_open, "end that program"))
+    image, fault, problems = "in use, so that its image was not tried", device.problem, access(subject, path)
     if not fault and not problems:
         try:
             image = str(offered_image(settings) or image)
@@ -107,14 +100,11 @@ def _camera(subject: str, settings: V4l2Settings, device: CaptureDevice, path: P
             fault = str(error)
     if fault:
         problems.append(Finding("error", subject, fault, "change section [cameras] of the configuration"))
-    exposure = ""
-    if settings.is_regulated:
-        exposure = f", {device.exposure} set by omnid run" if device.exposure else ", exposure left to it"
-    return problems or [Finding("ok", subject, f"{device.name} at {device.node}, {image}{exposure}")]
+    return problems or [Finding("ok", subject, f"{device.name} at {device.node}, {image}")]
 
 
 def motor(settings: MotorSettings, root: Path = Path("/")) -> list[Finding]:
-    """Check protocol and port: that it exists, may be opened and is free; opening it would restart some boards."""
+    """Check protocol and port: that it exists and may be opened; opening it would restart some boards."""
     subject, port, path = "motor", settings.port, root / settings.port.lstrip("/")
     found: list[Finding] = []
     try:
@@ -129,10 +119,7 @@ def motor(settings: MotorSettings, root: Path = Path("/")) -> list[Finding]:
         return [*found, Finding("error", subject, f"{port} does not exist", ports)]
     if not stat.S_ISCHR(path.stat().st_mode):
         return [*found, Finding("error", subject, f"{port} is no serial port", "set motor.port")]
-    others, away = holders(path, root), "end that program; 90-omnid.rules keeps ModemManager away from the port"
-    used = f"{port} is in use by {', '.join(others)}"
-    problems = access(subject, path) + _applying(subject, (others, "error", used, away))
-    return found + (problems or [Finding("ok", subject, f"{settings.protocol} on {port}")])
+    return found + (access(subject, path) or [Finding("ok", subject, f"{settings.protocol} on {port}")])
 
 
 def access(subject: str, device: Path) -> list[Finding]:
@@ -150,24 +137,6 @@ def access(subject: str, device: Path) -> list[Finding]:
     )
     is_denied = is_open_to_service and not os.access(device, os.R_OK | os.W_OK)
     return _applying(subject, (not is_open_to_service, "warning", closed, rule), (is_denied, "error", denied, join))
-
-
-def holders(device: Path, root: Path = Path("/")) -> list[str]:
-    """Return the programs but omnid that have the device open: "name (pid 12)"; without root those of this user."""
-    target, found = str(device.resolve()), []
-    for process in (root / "proc").glob("[0-9]*"):
-        with suppress(OSError):  # it has ended, or belongs to another user
-            name = (process / "comm").read_text("utf-8", "replace").strip()
-            is_other = process.name != str(os.getpid()) and not name.startswith(OWN_NAME)
-            if is_other and any(_target(entry) == target for entry in (process / "fd").iterdir()):
-                found.append(f"{name} (pid {process.name})")
-    return found
-
-
-def _target(entry: Path) -> str:
-    with suppress(OSError):
-        return os.readlink(entry)
-    return ""
 
 
 def rights(priority: int, lock_memory: bool) -> list[Finding]:
@@ -204,21 +173,8 @@ def disk(folder: Path, config: RecordConfig, bytes_per_s: float) -> list[Finding
     ]
 
 
-def compiled_functions() -> list[Finding]:
-    """Check that functions can be compiled, and that they can be kept for the next start."""
-    problem, folder = why_no_code(), cache_folder()
-    reason = "" if problem else why_unusable(folder)
-    lost = f"cannot be kept in {folder}: {reason}: every start takes a minute longer"
-    return _applying(
-        "compiled code",
-        (problem, "error", problem, "remove MemoryDenyWriteExecute= from the unit, or what else denies it"),
-        (reason, "warning", lost, "make that folder writable, or set OMNID_CACHE_DIR to another one"),
-        good=f"kept in {folder}; the first start compiles it, which takes a minute",
-    )
-
-
 def rig(path: Path, size_px: tuple[int, int], floor_m: float = 0.0) -> list[Finding]:
-    """Check that the rig can be read, is of images of this size (width, height), states its height, and has masks.
+    """Check that the rig can be read, is of images of this size (width, height), and states its height.
 
     floor_m: height of the floor in the base frame.
     """
@@ -230,7 +186,6 @@ def rig(path: Path, size_px: tuple[int, int], floor_m: float = 0.0) -> list[Find
     cameras, height_m = {"lower": found.lower, "upper": found.upper}, found.height_m(floor_m)
     sizes = {name: "x".join(map(str, mounted.camera.size)) for name, mounted in cameras.items()}
     wanted = "x".join(map(str, size_px))
-    bare = [name for name, mounted in cameras.items() if mounted.mask is None]
     calibrated = f"{path}: the {{}} camera was calibrated with {{}} px, [cameras] asks for {wanted}"
     height = "" if height_m is None else f", {height_m:.3f} m above the floor"
     return _applying(
@@ -244,12 +199,6 @@ def rig(path: Path, size_px: tuple[int, int], floor_m: float = 0.0) -> list[Find
             "warning",
             f"{path} does not state the height of the cameras: nothing is free until the images show the floor",
             "state it by `omnid calibrate drive LOG --only height`, with --ruler-m as a check",
-        ),
-        (
-            bare,
-            "warning",
-            f"{path} has no mask for {' and '.join(bare)}, the rim is searched at each start",
-            f"add [{'.mask] and ['.join(bare)}.mask] with center, inner_px and outer_px",
         ),
         good=f"{path}, {found.baseline_m:.3f} m between the viewpoints{height}",
     )
@@ -272,9 +221,4 @@ def bus(config: BusConfig) -> Finding:
 
 
 def _is_local(endpoint: str) -> bool:
-    parts = _ENDPOINT.fullmatch(endpoint)
-    if parts is None:  # a socket in the file system
-        return True
-    with suppress(ValueError):
-        return ipaddress.ip_address(parts["host"]).is_loopback
-    return parts["host"] == "localhost"
+    return re.match(r"unixsock-stream/|[a-z-]+/(127\.|\[::1\]|localhost:)", endpoint) is not None

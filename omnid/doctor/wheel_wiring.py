@@ -75,11 +75,9 @@ def tested_drive(
                 _move(motor, config, velocity_mps, yaw_rate_radps, move_s)
                 time.sleep(rest_s)
 
-        while True:
-            first, second = (_seen(channel, motion, ask) for channel in (1, 2))
-            if first.side != second.side:
-                break
-            ask(f"Both motors turned the {first.side} wheel, which cannot be. Press Enter to see it again: ")
+        first, second = (_seen(channel, motion, ask) for channel in (1, 2))
+    if first.side == second.side:
+        raise OmnidError(f"both motors turned the {first.side} wheel, which cannot be: begin again")
     left, right = (first, second) if first.side == "left" else (second, first)
     drive = replace(
         drive, swapped=first.side == "right", reverse_left=not left.forward, reverse_right=not right.forward

@@ -37,7 +37,7 @@ TARGET, LEAST_MEAN, SATURATED = 100.0, 60.0, 250.0
 # Wanted factors of the light within this one cause no step, so that a step down causes none up; twice as much is the
 # largest step. What is saturated is brighter than it shows by at least this factor.
 BAND: Final = math.sqrt(2)
-GAIN_STEPS: Final = 8  # The first step of the gain is its range by this number, since its unit is not known.
+GAIN_STEPS: Final = 16  # A step of the gain is its range by this number, since its unit is not known.
 STEP_S: Final = 0.5  # between two steps: the images must show the last one
 
 ExposureState = Literal["regulated", "too dark", "too bright"]
@@ -101,7 +101,7 @@ class ExposureLaw:
             self._gain_step = max(self._gains.step, (self._gains.high - self._gains.low) // GAIN_STEPS)
         self.setting = ExposureSetting(self._time(start.exposure_us), gain)
         self.state: ExposureState = "regulated"
-        self.steps = self._direction = 0
+        self.steps = 0
         self._next_ns: float = -math.inf
 
     def step(self, lower: GreyLevels, upper: GreyLevels, stamp_ns: int) -> ExposureSetting | None:
@@ -124,10 +124,7 @@ class ExposureLaw:
         if wanted == before:
             self.state = "too dark" if direction > 0 else "too bright"
             return None
-        # 3. After a step against the last one, those of the gain, whose unit is not known, become smaller.
-        if direction == -self._direction and self._gains is not None:
-            self._gain_step = max(self._gains.step, self._gain_step // 2)
-        self._direction, self._next_ns = direction, stamp_ns + STEP_S / S_PER_NS
+        self._next_ns = stamp_ns + STEP_S / S_PER_NS
         self.setting, self.steps = wanted, self.steps + 1
         return wanted
 
@@ -206,8 +203,6 @@ class ExposureControl:
         stats: dict[str, object] = {
             "lower_grey": round(lower.mean),
             "upper_grey": round(upper.mean),
-            "lower_bright_grey": round(lower.bright),
-            "upper_bright_grey": round(upper.bright),
         }
         reason = self._left_to_cameras
         if self._law is not None and not self._left_to_cameras:

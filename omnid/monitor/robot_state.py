@@ -49,12 +49,10 @@ class RobotState:
         self.alive: bool | None = None  # the daemon's liveliness token; None while it is not known
         self.robots_there = ""  # robots found at the time of connecting, as a part of a sentence
         self.poses = self.missed = self.broken = 0
-        self.ends = 0  # number of times that the daemon's token disappeared
         self.age = Histogram()  # s, from the capture of a pose's images to its arrival; empty for a simulated clock
         self.network = Histogram()  # s, from the robot's network to the arrival of a pose
         self.recent: deque[Pose] = deque(maxlen=_RECENT)  # newest poses of the run: what is seen from one comes later
         self._arrivals_s: deque[float] = deque(maxlen=_RECENT)
-        self._forgotten = 0  # value of `ends` when the statuses were last forgotten
 
     def put(self, topic: str, payload: bytes, attachment: bytes) -> None:
         """Add a message that has just arrived, from any thread; does not block."""
@@ -90,18 +88,15 @@ class RobotState:
     def set_alive(self, alive: bool) -> None:
         """Keep whether the daemon's liveliness token is there; from any thread."""
         self.alive = alive
-        self.ends += not alive
 
     def forget_ended(self) -> bool:
         """Forget the statuses of a daemon that has ended: it may start again in another state. True if there were any.
 
         It is called by the thread that processes the messages.
         """
-        ends = self.ends
-        had_any = bool(self.statuses) and (self.alive is False or ends > self._forgotten)
+        had_any = bool(self.statuses) and self.alive is False
         if had_any:
             self.statuses.clear()
-        self._forgotten = ends
         return had_any
 
     def add_diagnostics(self, diagnostics: Diagnostics) -> None:

@@ -55,7 +55,7 @@
   });
 
   for (const figure of document.querySelectorAll("[data-chart]")) {
-    const {lines, log, unit, limits} = JSON.parse(figure.dataset.chart);
+    const {lines, log, unit} = JSON.parse(figure.dataset.chart);
     const data = uPlot.join(lines.map(({points}) => [points.map((p) => p[0]), points.map((p) => p[1])]));
     const series = lines.map(({name}, k) => ({
       label: name || unit || "value", stroke: COLOURS[k], dash: DASHES[k % 3], width: 1.5, points: {show: data[0].length < 40},
@@ -63,7 +63,7 @@
     }));
     const chart = new uPlot({
       width: figure.clientWidth, height: HEIGHT_PX,
-      scales: {x: {time: false, min: run.start, max: run.end}, y: {distr: log ? 3 : 1, ...(log ? {} : {range: limits ? () => limits : range})}},
+      scales: {x: {time: false, min: run.start, max: run.end}, y: {distr: log ? 3 : 1, ...(log ? {} : {range})}},
       axes: [{size: 32, incrs: SECONDS, values: (_, ticks) => ticks.map(clock), space: 60},
              {size: 68, values: (_, ticks) => ticks.map((v) => v == null ? "" : String(+v.toPrecision(6)))}],
       series: [{label: "time", value: (_, t) => t == null ? "" : clock(t)}, ...series],

@@ -13,7 +13,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
 
 from omnid.report.page import table
 
@@ -42,10 +41,7 @@ def chart(title: str, curves: Sequence[Curve], unit: str = "", *, log: bool = Fa
     if unit == "m" and max(np.abs(values).max() for _, _, values in shown) < 0.1:
         unit, shown = "mm", [Curve(name, t_s, 1e3 * values) for name, t_s, values in shown]
     lines = [{"name": name, "points": thinned(t_s, values)} for name, t_s, values in shown[:MAX_CURVES]]
-    limits = None if log else spike_limits(shown)
-    if limits is not None:
-        note = f"{note} Spikes are cut off; the table of values has them.".strip()
-    data = escape(json.dumps({"lines": lines, "log": log, "unit": unit, "limits": limits}, separators=(",", ":")))
+    data = escape(json.dumps({"lines": lines, "log": log, "unit": unit}, separators=(",", ":")))
     rows = [
         (escape(name), *(f"{value:.4g}" for value in (v[0], v.min(), v.mean(), v.max(), v[-1]))) for name, _, v in shown
     ]
@@ -56,20 +52,6 @@ def chart(title: str, curves: Sequence[Curve], unit: str = "", *, log: bool = Fa
         f"<figure class='chart'><figcaption>{caption}</figcaption><div data-chart=\"{data}\"></div>{footnote}"
         f"<details><summary>values</summary>{summary}</details></figure>"
     )
-
-
-def spike_limits(curves: Sequence[Curve]) -> tuple[float, float] | None:
-    """Return the values that a chart shows where a spike would flatten it: what lasts three values, and as much around.
-
-    None: all values are shown.
-    """
-    smooth = np.concatenate([median_filter(values, 5, mode="nearest") for _, _, values in curves])
-    values = np.concatenate([values for _, _, values in curves])
-    low, high = float(smooth.min()), float(smooth.max())
-    span = high - low
-    if span == 0 or (values.min() >= low - 2 * span and values.max() <= high + 2 * span):
-        return None
-    return max(low - span, float(values.min())), min(high + span, float(values.max()))
 
 
 def thinned(t_s: Array, values: Array) -> list[tuple[float, float | None]]:

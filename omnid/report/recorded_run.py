@@ -79,12 +79,12 @@ class RecordedRun:
     ranks (N,): of the state in STATES, UNKNOWN where it is not recorded
     statuses: messages in the order of the file; by_name: times and entries of each part; newest: entries with the
     newest of all values
-    map_poses (M, 4): t, position's and heading's correction by the map [m, rad], sigma [m]; map_xy (M, 2) m
+    map_poses (M, 3): t, position's and heading's correction by the map [m, rad]; map_xy (M, 2) m
     drives: (K, 3) t, m/s, rad/s by topic, DRIVE or TWIST_COMMAND; cloud: the newest
     restarts: first poses after each start of the daemon but the first; restarted_s: times of the reports of them
     resets: times and numbers of resets of odometry
-    unreadable: messages left out, not of their type, with a stamp far from the time of logging, out of range; late:
-    poses left out, not later than the one before; corrupt: chunks and records of the file left out
+    left_out: messages not of their type, poses out of range, not later than the one before, or stamped far from the
+    time of logging; corrupt: chunks and records of the file left out
     """
 
     def __init__(self, path: Path, topic: str | None = None) -> None:
@@ -95,24 +95,23 @@ class RecordedRun:
         self.path, self.info = path, log_info(path)
         reader = RecordingReader(self.info, choose_odometry_topic(self.info, topic))
         self.topic, self.robot, self.attachments = reader.topic, reader.robot, reader.attachments
-        # 1. All messages; poses whose stamps are far from the time of logging, or that are out of range, are left out.
+        # 1. All messages.
         poses, map_poses = list[Pose](), list[PoseInMap]()
         statuses, names = list[Diagnostics](), set[str]()
         drives: dict[str, list[TwistRecord]] = {}
         self.cloud: Cloud | None = None
         offset_ns: int | None = None  # from the stamps of the poses to the times of logging
-        out_of_range = self.late = 0
+        left_out = 0
         for message in reader.messages((ODOMETRY, MAP_POSE, STATUS, CLOUD, DRIVE, TWIST_COMMAND)):
             match message.content:
                 case Pose() as pose:
                     offset_ns = message.log_time_ns - pose.stamp_ns if offset_ns is None else offset_ns
                     is_near = abs(message.log_time_ns - pose.stamp_ns - offset_ns) <= OTHER_CLOCK_NS
-                    if not (is_near and (np.abs(pose.T_odom_base[:-1, -1]) <= POSITION_LIMIT_M).all()):
-                        out_of_range += 1
-                    elif poses and pose.stamp_ns <= poses[-1].stamp_ns:
-                        self.late += 1
-                    else:
+                    is_later = not poses or pose.stamp_ns > poses[-1].stamp_ns
+                    if is_near and is_later and (np.abs(pose.T_odom_base[:-1, -1]) <= POSITION_LIMIT_M).all():
                         poses.append(pose)
+                    else:
+                        left_out += 1
                 case PoseInMap() as in_map if (np.abs(in_map.T_map_base[:-1, -1]) <= POSITION_LIMIT_M).all():
                     map_poses.append(in_map)
                 case Diagnostics(stamp_ns, entries):
@@ -125,7 +124,7 @@ class RecordedRun:
                     drives.setdefault(message.name, []).append(message.content)
         if not poses:
             raise no_pose(path, reader.topic)
-        self.unreadable, self.corrupt = reader.unreadable.total() + out_of_range, reader.corrupt
+        self.left_out, self.corrupt = reader.unreadable.total() + left_out, reader.corrupt
         # 2. The rig.
         self.rig: Rig | None = None
         self.rig_fault = "no rig.toml is attached"
@@ -154,11 +153,11 @@ class RecordedRun:
         corrections, map_xy = [], []
         for in_map in map_poses:
             if (T_odom := by_stamp.get(in_map.stamp_ns)) is not None:
-                T_map, sigma_m = in_map.T_map_base, root(np.trace(in_map.covariance[:3, :3]))
+                T_map = in_map.T_map_base
                 moved_m, turned_rad = math.dist(T_map[:2, -1], T_odom[:2, -1]), se3.yaw(T_map @ se3.inverse(T_odom))
-                corrections.append((seconds(in_map.stamp_ns), moved_m, turned_rad, sigma_m))
+                corrections.append((seconds(in_map.stamp_ns), moved_m, turned_rad))
                 map_xy.append(T_map[:2, -1])
-        self.map_poses, self.map_xy = np.array(corrections).reshape(-1, 4), np.array(map_xy).reshape(-1, 2)
+        self.map_poses, self.map_xy = np.array(corrections).reshape(-1, 3), np.array(map_xy).reshape(-1, 2)
         # 5. The newest values of each part, the state of each pose, starts and resets.
         self.newest: dict[str, DiagnosticStatus] = {}
         self.by_name: dict[str, list[tuple[float, DiagnosticStatus]]] = {}
@@ -192,11 +191,6 @@ class RecordedRun:
     def end_s(self) -> float:
         """Time of the last pose."""
         return float(self.t_s[-1])
-
-    @property
-    def reports(self) -> int:
-        """Number of messages with the entries of all parts."""
-        return sum(len(message) > 1 for _, message in self.statuses)
 
     def entries(self, name: str) -> Sequence[tuple[float, DiagnosticStatus]]:
         """Return the entries of a part with their times, in the order of the file."""

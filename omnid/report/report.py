@@ -5,23 +5,16 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing
 from html import escape
-from itertools import islice, pairwise
+from itertools import pairwise
 from typing import Any, Final
 
 import cv2
 import numpy as np
 
 from calib import se3
-from calib.errors import CalibError
-from calib.models.names import model_in_words
-from calib.panorama import fit_cylinder, remap_tables
 from calib.typed_toml import parse_toml
-from drivers.errors import DriverError
-from drivers.logs.log_reader import LogReader
 from drivers.logs.open_log import LogState
-from drivers.logs.ros_messages import IMAGE_TYPES
 from omnid.config import Config
 from omnid.formats.plan import BLACK, WHITE, Lines, between, draw_ends, draw_plan, drawn_heights, sheet_of
 from omnid.formats.tum import Trajectory
@@ -29,10 +22,9 @@ from omnid.plain_text import plain
 from omnid.recordings.evaluation import Metrics, associate, evaluate
 from omnid.recordings.recording import DRIVE, TWIST_COMMAND
 from omnid.report.charts import Array, Curve, chart, colours, grid, style_and_script
-from omnid.report.page import embedded, facts, figure, note, page, table
+from omnid.report.page import embedded, facts, note, page, table
 from omnid.report.recorded_run import STATES, UNKNOWN, Event, RecordedRun, root
 from omnid.settings import dump
-from omnid.stages.synchronise import Decoder
 from omnid.transport import status_names
 from omnid.transport.status_names import (
     CAPTURE_TO_POSE,
@@ -40,8 +32,6 @@ from omnid.transport.status_names import (
     PLACES,
     STAGE_PREFIX,
     SUMMARY,
-    TICK_LATE,
-    WHEELS,
     WORK,
     Key,
     short_name,
@@ -51,18 +41,15 @@ from omnid.transport.status_names import (
 from omnid.utc import utc
 from omnid.version import __version__
 
-MAX_BEFORE_S: Final = 30.0  # time before the first pose that is shown, where there are events in it
-MAX_EVENTS, MAX_ROWS, MAX_LANES = 400, 60, 14  # of the table of events, of other tables, of parts with events
+MAX_EVENTS, MAX_ROWS = 400, 60  # of the table of events, of other tables
 LEVELS: Final = ("", "warning", "error")
 
 
 def report_html(run: RecordedRun, true: Trajectory | None = None) -> str:
     """Return the page; true: T_world_rig of the rig. Raise OmnidError where its times are others."""
     events = run.events()
-    start_s = min([0.0, *(event.start_s for event in events if event.start_s >= -MAX_BEFORE_S)])
     end_s = max(run.end_s, 1e-2)
-    spans = _spans(run)
-    shown = {"start": start_s, "end": end_s, "spans": [span for span in spans if span[2] > 0]}
+    shown = {"start": 0.0, "end": end_s, "spans": [span for span in _spans(run) if span[2] > 0]}
     truth = None if true is None else _Truth(run, true)
     parts = [
         f"<main data-run='{json.dumps(shown)}'>",
@@ -72,13 +59,10 @@ def report_html(run: RecordedRun, true: Trajectory | None = None) -> str:
         "<p class='note'>Point at a chart: values, and the place on the plan. Drag across a chart: zoom; double-click: "
         "all.</p>",
         "<h2>Events</h2>",
-        *_timeline(spans, events, start_s, end_s),
         *(() if (run.ranks != UNKNOWN).any() else [note("The log does not hold the state of the odometry.")]),
         *_events_table(events, end_s),
         *(f"<h2>{title}</h2>{''.join(section)}" for title, section in _sections(run, truth)),
-        *_images(run, events),
-        *_setup(run),
-        *_contents(run),
+        *_settings(run),
         f"<p><small>Made by omnid {__version__}.</small></p></main>",
     ]
     style, script = style_and_script()
@@ -115,9 +99,7 @@ def _warnings(run: RecordedRun, true: Trajectory | None) -> list[str]:
     lines = {
         f"The log is cut or corrupt: {found.fault}.": found.state is LogState.BROKEN,
         f"{run.corrupt} corrupt chunks or records were skipped.": run.corrupt,
-        f"{run.unreadable} messages were left out: not of their type, with a stamp far from the time of logging, or "
-        "with a pose out of range.": run.unreadable,
-        f"{run.late} poses were left out: not later than the one before.": run.late,
+        f"{run.left_out} messages were left out: not of their type, out of range, or with a wrong stamp.": run.left_out,
         f"The truth is compared as if the rig's frame were base_link: {run.rig_fault}.": true and run.rig is None,
     }
     return [f"<p class='warn'>{escape(line)}</p>" for line, is_so in lines.items() if is_so]
@@ -217,27 +199,6 @@ def _is_loss(event: Event) -> bool:
     return (event.source, event.text) == ("state", STATES[-1])
 
 
-def _timeline(
-    spans: Sequence[tuple[float, float, int]], events: Sequence[Event], start_s: float, end_s: float
-) -> list[str]:
-    """Return a band with the states, and below it a lane of events for each part that has any."""
-
-    def mark(style: str, from_s: float, to_s: float, title: str) -> str:
-        left, right = ((min(max(t_s, start_s), end_s) - start_s) / (end_s - start_s) for t_s in (from_s, to_s))
-        return f"<i class='{style}' style='left:{left:.2%};width:{right - left:.2%}' title='{escape(title)}'></i>"
-
-    names = (*STATES, "unknown")
-    lanes = {"state": "".join(mark(f"s{rank}", a, b, names[rank]) for a, b, rank in spans[:MAX_EVENTS])}
-    sources = sorted({event.source for event in events} - {"state", "poses"}, key=lambda name: ("stage" in name, name))
-    for source in sources[:MAX_LANES]:
-        own = [event for event in events if event.source == source][:MAX_EVENTS]
-        lanes[source] = "".join(mark(f"e{event.level}", event.start_s, event.end_s, event.text) for event in own)
-    styles = {"s0": "tracking", "s1": "degraded, warning", "s2": "lost, error"}
-    keys = "".join(_key(style, name) for style, name in styles.items())
-    rows = "".join(f"<div class='lane'><b>{escape(name)}</b><div>{marks}</div></div>" for name, marks in lanes.items())
-    return [f"<figure><figcaption><b>States and events</b>{keys}</figcaption>{rows}</figure>"]
-
-
 def _events_table(events: Sequence[Event], end_s: float) -> list[str]:
     """Return the table of events in the order of time."""
     if not events:
@@ -302,25 +263,15 @@ def _sections(run: RecordedRun, truth: _Truth | None) -> Iterator[tuple[str, lis
         chart(f"{title} heading", [Curve("", run.t_s, np.rad2deg(heading_rad))], "deg", log=True),
     ]
     unset = "" if any(figures) else note("The covariances in the log are zero or negative: they were not set.")
-    curves = [run.curve(name, ODOMETRY, key) for name, key in landmarks.items()]
-    tracked = curves[0].values
-    few = (
-        f"Landmarks at the last report: {tracked[-1]:.0f}."
-        if len(tracked)
-        else "The log holds no numbers of landmarks."
-    )
-    if len(tracked) > 2:
-        figures.append(chart("Landmarks", curves, note="One value per report, not per pose."))
-    yield "Uncertainty", [grid(figures), unset, "" if len(tracked) > 2 else note(few)]
-    # 4. The map of places: its sizes, and the correction of odometry, where there was one.
+    figures.append(chart("Landmarks", [run.curve(name, ODOMETRY, key) for name, key in landmarks.items()]))
+    yield "Uncertainty", [grid(figures), unset]
+    # 4. The correction of odometry by the map of places, where there was one.
     if len(_map_path(run)):
-        t_s, moved_m, turned_rad, sigma_m = run.map_poses.T
+        t_s, moved_m, turned_rad = run.map_poses.T
         title, what = "From odometry's", "The correction map -> odom, where the robot is: odom does not jump."
         figures = [
             chart(f"{title} position to that in the map", [Curve("", t_s, moved_m)], "m", note=what),
             chart(f"{title} heading to that in the map", [Curve("", t_s, np.rad2deg(turned_rad))], "deg"),
-            chart("Standard deviation of the position in the map, all axes", [Curve("", t_s, sigma_m)], "m", log=True),
-            chart("Keyframes and loops", [run.curve(name, PLACES, name) for name in ("keyframes", "loops")]),
         ]
         yield "In the map", [*_counters(run, PLACES), grid(figures)]
     # 5. Rates, latencies, the stages' times; counters of the other parts at the end.
@@ -332,12 +283,8 @@ def _sections(run: RecordedRun, truth: _Truth | None) -> Iterator[tuple[str, lis
             for name in names
         ]
         titles = ("part", "at the last report", "counters")
-        late = [run.curve(p, WHEELS, time_key(TICK_LATE, p)) for p in ("p99", "max")]
-        figures = [
-            chart("Images per second", [run.curve(short_name(name), name, Key.RATE_HZ) for name in names]),
-            chart("Lateness of the wheels' tick, so far", late, "ms"),
-        ]
-        yield "Cameras, pairing, wheels", [_words(titles, rows), grid(figures)]
+        rates = chart("Images per second", [run.curve(short_name(name), name, Key.RATE_HZ) for name in names])
+        yield "Cameras, pairing, wheels", [_words(titles, rows), rates]
 
 
 def _words(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -361,9 +308,6 @@ def _counters(run: RecordedRun, name: str) -> list[str]:
 def _timing(run: RecordedRun) -> list[str]:
     """Return the table of stages, and the charts of rates, latencies and losses."""
     parts = ["<p>Counters at the end of the run:</p>", *summary] if (summary := _counters(run, SUMMARY)) else []
-    if not run.reports:
-        what = "rates, times of stages, latencies, drops and camera faults are unknown"
-        return [*parts, note(f"The log holds no status of the daemon's parts, so {what}; omnid's own recordings do.")]
     # 1. The table of stages.
     stages = {name.removeprefix(STAGE_PREFIX): run.values(name) for name in run.newest if name.startswith(STAGE_PREFIX)}
     rows = []
@@ -376,8 +320,6 @@ def _timing(run: RecordedRun) -> list[str]:
     if rows:
         parts.append(f"<div class='scroll'>{table(titles, rows)}</div>")
         parts.append("<small>At the last report. The work of a camera's stage is its wait for the next image.</small>")
-    if run.reports == 1:  # a replay, which reports at its end only
-        return parts
     # 2. The charts.
     of_all, by_rank = "Of all messages since the start of the run.", {"median": "p50", "99th percentile": "p99"}
     latency = [run.curve(name, ODOMETRY, time_key(CAPTURE_TO_POSE, p)) for name, p in by_rank.items()]
@@ -385,79 +327,30 @@ def _timing(run: RecordedRun) -> list[str]:
     losses = [
         run.curve(f"{name}, {key}", stage_name(name), key) for name in stages for key in (Key.DROPPED, Key.MISSED)
     ]
-    risen = [curve for curve in highest(losses) if curve.values[-1] > 0]
+    risen = [curve for curve in losses if len(curve.values) and curve.values[-1] > 0]
     figures = [
         chart("Poses per second", [run.curve("", ODOMETRY, Key.RATE_HZ)]),
-        chart("Age of the newest pose at each report", [run.curve("", ODOMETRY, Key.AGE_S)], "s"),
         chart("From the image to its pose", latency, "ms", note=of_all),
-        chart("Median work of a stage", highest(work), "ms", log=True, note=of_all),
+        chart("Median work of a stage", work, "ms", log=True, note=of_all),
         chart("Messages dropped, deadlines missed, so far", risen),
     ]
     return [*parts, grid(figures)]
 
 
-def highest(curves: Sequence[Curve]) -> list[Curve]:
-    """Return the curves that have values, those with the highest last one first."""
-    return sorted((curve for curve in curves if len(curve.values)), key=lambda curve: -curve.values[-1])
-
-
-def _images(run: RecordedRun, events: Sequence[Event]) -> list[str]:
-    """Return the lower camera's panoramas at the first pose and when the pose was first lost."""
-    head = ["<h2>Images</h2>"]
-    if not any(schema in IMAGE_TYPES for schema, _ in run.info.topics.values()):
-        return [*head, note("The log holds no images.")]
-    if run.rig is None:
-        return [*head, note(f"Images, but {run.rig_fault}.")]
-    wanted = [(run.start_ns, "The lower camera's panorama at the first pose; forward is in the middle.")]
-    for event in [event for event in events if _is_loss(event)][:1]:
-        at_ns = run.start_ns + round(event.start_s * 1e9)
-        wanted.append((at_ns, f"The same when the pose was first lost, at {event.start_s:.2f} s."))
-    shown = []
-    try:
-        maps, decode = remap_tables(run.rig, run.rig.lower, fit_cylinder(run.rig, 1200)), Decoder(run.rig)
-        with closing(LogReader(run.path)) as reader:
-            for frame in islice(reader.frames(), 40_000):  # the first loss in a long log may be hours away
-                is_next = wanted and frame.camera == "lower" and frame.stamp_ns >= wanted[0][0]
-                if is_next and (image := decode(frame)) is not None:
-                    panorama = cv2.remap(image, *maps, cv2.INTER_LINEAR)
-                    shown.append(figure(np.asarray(panorama, np.uint8), wanted.pop(0)[1]))
-                if not wanted:
-                    break
-    except (CalibError, DriverError, cv2.error) as error:
-        shown.append(note(f"The images in the log cannot be shown: {' '.join(str(error).split())}"))
-    return [*head, *(shown or [note("No image could be decoded.")])]
-
-
-def _setup(run: RecordedRun) -> list[str]:
-    """Return the section with the rig and the settings that are not at their defaults."""
-    parts, rig = ["<h2>Rig and settings</h2>"], run.rig
-    if rig is None:
-        parts.append(note(f"{run.rig_fault[:1].upper()}{run.rig_fault[1:]}."))
-    else:
-        place = "not stated: the rig's frame is base_link"
-        if not np.allclose(rig.T_base_rig, np.eye(4)):
-            pose = se3.log(rig.T_base_rig)
-            x_y_z, rotation = rig.T_base_rig[:-1, -1], np.rad2deg(pose[3:])
-            at, turned = (", ".join(f"{value:.3g}" for value in values) for values in (x_y_z, rotation))
-            place = f"at {at} m, rotated by {turned} deg"
-        rows = [("baseline", f"{1e3 * rig.baseline_m:.2f} mm")]
-        for name, one in (("lower", rig.lower), ("upper", rig.upper)):
-            size = "x".join(map(str, one.camera.size))
-            mask = "with a mask" if one.mask else "without a mask"
-            rows.append((f"{name} camera", f"{model_in_words(one.camera)}, {size} px, {mask}"))
-        parts.append(facts([(name, escape(value)) for name, value in (*rows, ("on the robot", place))]))
-    settings = run.attachments.get("omnid.toml")
+def _settings(run: RecordedRun) -> list[str]:
+    """Return the section with the settings that are not at their defaults."""
+    head, settings = "<h2>Settings</h2>", run.attachments.get("omnid.toml")
     if settings is None:
-        return [*parts, note("No settings are attached.")]
+        return [head, note("No settings are attached.")]
     try:
         defaults = dict(_flat(parse_toml(dump(Config()))))
         given = [(name, value, defaults.get(name, "unknown")) for name, value in _flat(parse_toml(settings.decode()))]
     except (ValueError, RecursionError):
-        return [*parts, note("The attached settings cannot be read.")]
+        return [head, note("The attached settings cannot be read.")]
     changed = [[plain(str(cell), 120) for cell in row] for row in given if row[1] != row[2]][:MAX_ROWS]
     if not changed:
-        return [*parts, "<p>All settings are at their defaults.</p>"]
-    return [*parts, _words(("setting", "value", "default"), changed)]
+        return [head, "<p>All settings are at their defaults.</p>"]
+    return [head, _words(("setting", "value", "default"), changed)]
 
 
 def _flat(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, object]]:
@@ -466,12 +359,3 @@ def _flat(table: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, obje
             yield from _flat(value, f"{above}{name}.")
         else:
             yield f"{above}{name}", value
-
-
-def _contents(run: RecordedRun) -> list[str]:
-    """Return the section with the topics of the file."""
-    rows = [(name, kind, str(count)) for name, (kind, count) in run.info.topics.items()]
-    more = [note(f"and {len(rows) - MAX_ROWS} more topics")] if len(rows) > MAX_ROWS else []
-    attached = ", ".join(f"{name} ({size} bytes)" for name, size in run.info.attachments.items())
-    content = _words(("topic", "type", "messages"), rows[:MAX_ROWS])
-    return ["<h2>Content of the file</h2>", content, *more, f"<p>Attached: {escape(attached or 'nothing')}.</p>"]

@@ -85,10 +85,7 @@ def _declared_publisher(
 
 
 class Bus:
-    """An open zenoh session. Remote endpoints may come and go; local endpoints must be free.
-
-    lost: messages that could not be sent because a client has not reached its router yet.
-    """
+    """An open zenoh session. Remote endpoints may come and go; local endpoints must be free."""
 
     def __init__(
         self, config: BusConfig, warn: Callable[[str], None] = lambda _: None, *, gives_time: bool = False
@@ -120,7 +117,6 @@ class Bus:
         self._pollers: list[Poller] = []
         self._flooded = 0  # floods at the last status
         self._closed = False
-        self.lost = 0
         if not self.needs_router:
             self._open()
 
@@ -136,7 +132,7 @@ class Bus:
                 self._open()
 
     def stats(self) -> dict[str, object]:
-        """Return whether the bus is open and the name unique, and the number of messages lost before that."""
+        """Return whether the bus is open, the name unique, and how often others sent too much."""
         intakes = [*(self._commands.intakes if self._commands else ()), *self._queries.values()]
         before, self._flooded = self._flooded, sum(intake.floods for intake in intakes)
         warning = ""
@@ -146,7 +142,6 @@ class Bus:
             warning = f"more messages on {max(intakes, key=attrgetter('floods')).key} than are taken: end their sender"
         return {
             "mode": "client" if self._config.is_client else "peer",
-            "lost": self.lost,
             "same_name": len(self._namesakes),  # other robots of this name
             "floods": self._flooded,  # how often a key had more messages than its budget
             "_error": "" if self.is_unique else self._same_name,
@@ -167,7 +162,6 @@ class Bus:
         if self._topics[topic].latched:
             self._newest[topic] = (payload, attachment)
         if self._session is None:
-            self.lost += 1
             return
         try:
             self._publishers[topic].put(payload, attachment)

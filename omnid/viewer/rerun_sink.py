@@ -1,6 +1,6 @@
 """A run drawn in Rerun: a replay as it computes, a recording, or a live robot by its messages; time is the stamp.
 
-Entities: odom (the world) with path, covariance, map, keyframes, loops, and base_link with obstacles and the points of
+Entities: odom (the world) with path, covariance, map, and base_link with obstacles and the points of
 the newest images; panorama with its features; depth; plots of speed, yaw_rate, landmarks, sigma, latency, correction;
 state; log. Colours are those of Okabe and Ito, which colour-blind people can distinguish.
 """
@@ -34,14 +34,14 @@ from omnid.transport.topics import PUBLISHED, SCAN
 Array: TypeAlias = NDArray[np.float64]
 TIMELINE: Final = "stamp"
 # Drawn in full at first, then every 2nd, 4th, 8th ... after each further so many.
-MOST: Final = {"pose": 20_000, "scan": 20_000, "image": 1_000, "cloud": 50, "places": 200}
+MOST: Final = {"pose": 20_000, "scan": 20_000, "image": 1_000, "cloud": 50}
 MAP_POINTS, RIG_POINTS = 50_000, 3_000
 AXES_M, LEAST_M = 0.3, 0.05  # of the robot's axes; radius from which an ellipsoid is visible
 SIGMAS: Final = 3.0  # radius of the ellipsoid in standard deviations
 # Colours, and sizes on the screen: the radii of lines and points, which do not depend on the distance [px]; of the path
 # by the state: the worse, the thicker.
 BLUE, GREEN, ORANGE, RED, YELLOW = "#56b4e9", "#009e73", "#e69f00", "#d55e00", "#f0e442"
-GREY, DARK, VIOLET = "#969696", "#3c3c3c", "#aa50c8"
+GREY = "#969696"
 THIN, MEDIUM, THICK = 1.5, 2.5, 5.0
 STATES: Final = {"tracking": (BLUE, THIN), "degraded": (ORANGE, MEDIUM), "lost": (RED, THICK), "unknown": (GREY, THIN)}
 FEATURES: Final = {"inliers": BLUE, "rejected": RED, "new": YELLOW}
@@ -64,8 +64,6 @@ LEGEND: Final = f"""
 **Ellipsoid**: {SIGMAS:g} sigma of the position; its label says by how many times it is magnified.
 
 **Obstacles**: red dots around the base; grey ones mark directions that are unknown.
-
-**Keyframes** of the map: dark dots and the path through them, corrected by loops (violet); odometry's path stays.
 
 **Map and points**: dark below, light above. **Depth**: m from the rig's axis.
 """
@@ -157,13 +155,6 @@ class RerunSink:
     def correction(self, stamp_ns: int, T_map_odom: Array) -> None:
         """Plot by how much the map corrects odometry."""
         self._plot_errors(stamp_ns, "correction", np.linalg.norm(T_map_odom[:-1, -1]), se3.yaw(T_map_odom))
-
-    def places(self, stamp_ns: int, keyframes: Array, loops: Array) -> None:
-        """Draw keyframes (K, 3) in the order of the drives, the path through them, and loops (L, 2, 3), in odom [m]."""
-        stream = self._at(stamp_ns)
-        stream.log("odom/keyframes", rr.Points3D(keyframes, **_style(DARK, MEDIUM)))
-        stream.log("odom/keyframes/path", rr.LineStrips3D([keyframes], **_style(DARK, THIN)))
-        stream.log("odom/loops", rr.LineStrips3D(list(loops), **_style(VIOLET, THIN)))
 
     def close(self) -> None:
         """Flush and end the drawing; a second call does nothing."""
@@ -278,13 +269,12 @@ class RerunSink:
 
 
 class ReplayDrawing:
-    """Sink of a replay: draws each message as a robot's subscribers get it, with features, depth, keyframes, loops."""
+    """Sink of a replay: draws each message as a robot's subscribers get it, with features and depth."""
 
     def __init__(self, sink: RerunSink, front_end: FrontEnd) -> None:
         self._sink, self._geometry, self._dense = sink, front_end.geometry, front_end.dense
         self._encode = Encoder(front_end.geometry.rig.T_base_rig, MAP_POINTS)
         self._changes = Changes(self._encode)
-        self._keyframes: object = None  # that were drawn last
 
     def process(self, message: Outgoing) -> None:
         """Draw a message."""
@@ -300,16 +290,8 @@ class ReplayDrawing:
             focal_baseline = self._geometry.cylinder.focal_px * rig.baseline_m
             sink.depth(message.stamp_ns, dense.disparity, focal_baseline, se3.apply(rig.T_base_rig, dense.points))
         elif isinstance(message, PlaceUpdate):
-            # The correction, and keyframes and loops where the map has them now.
             T_map_odom, _ = base_pose(message.T_map_odom, message.covariance, rig.T_base_rig)
             sink.correction(message.stamp_ns, T_map_odom)
-            keyframes = message.scans
-            if keyframes is not None and keyframes is not self._keyframes and sink.wants("places"):
-                self._keyframes = keyframes
-                to_odom = se3.inverse(T_map_odom) @ rig.T_base_rig @ self._geometry.T_rig_rect
-                at = dict(zip(keyframes.scans, (to_odom @ keyframes.T_map_rect)[:, :-1, -1], strict=True))
-                loops = np.array([(at[a], at[b]) for a, b in keyframes.loops if a in at and b in at])
-                sink.places(message.stamp_ns, np.array(list(at.values())).reshape(-1, 3), loops.reshape(-1, 2, 3))
 
 
 def _jpeg(image: NDArray[np.uint8]) -> bytes:

@@ -14,7 +14,6 @@ import os
 import re
 import secrets
 import stat
-from collections import Counter
 from collections.abc import Awaitable, Callable, MutableMapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -33,7 +32,6 @@ OPEN_PATHS: Final = ("/", "/login", "/static/login.css")  # answered without a t
 _ALPHABET: Final = "abcdefghjkmnpqrstuvwxyz23456789"
 _TOKEN: Final = re.compile(r"[!-~]{16,256}")
 _HOST: Final = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)(:\d{1,5})?")
-_STOPPING: Final = ("/stop", "/logout")  # addresses to which the token for stops may post
 _HEADERS: Final = (
     (
         b"content-security-policy",
@@ -47,7 +45,7 @@ _HEADERS: Final = (
     (b"cross-origin-resource-policy", b"same-origin"),
     (b"cache-control", b"no-store"),
 )
-# Text of the answer to a request that is refused, by the reason that is counted.
+# Text of the answer to a request that is refused, by the reason.
 REFUSALS: Final = {
     "unknown host": "this server is not known by that name: start omnid web with --host NAME, or its address",
     "cross-site": "requests of other sites are refused",
@@ -151,7 +149,7 @@ class Access:
         role = self.role(request)
         if role is None:
             return "wrong token" if has_token or self.cookie in request.cookies else "no token"
-        return "stop only" if role is Role.STOP and not reads and path not in _STOPPING else ""
+        return "stop only" if role is Role.STOP and not reads and path != "/stop" else ""
 
     def _is_host(self, host: str) -> bool:
         found = _HOST.fullmatch(host)
@@ -171,14 +169,10 @@ def _proof(token: str) -> str:
 
 
 class Guard:
-    """ASGI middleware: refuses what may not enter, and adds the headers that protect the page.
-
-    refused: number of refused requests by reason.
-    """
+    """ASGI middleware: refuses what may not enter, and adds the headers that protect the page."""
 
     def __init__(self, app: App, access: Access) -> None:
         self._app, self._access = app, access
-        self.refused: Counter[str] = Counter()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, or refuse it."""
@@ -190,7 +184,6 @@ class Guard:
 
         app, reason = self._app, self._access.refusal(HTTPConnection(scope))
         if reason:
-            self.refused[reason] += 1
             status = HTTPStatus.UNAUTHORIZED if reason.endswith(" token") else HTTPStatus.FORBIDDEN
             app = PlainTextResponse(f"omnid web: {REFUSALS[reason]}\n", status, {"connection": "close"})
         await app(scope, receive, send_protected)

@@ -31,7 +31,7 @@ from omnid.monitor.robot_state import LEVELS, ReceivedMessage, RobotState, impor
 from omnid.plain_text import MOST_ENTRIES, plain
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.codec import Diagnostics, Panorama, PlanarPath, Pose, PoseInMap
-from omnid.transport.status_names import PLACES, WHEELS, Key, short_name
+from omnid.transport.status_names import CALIBRATION, MAP_FILE, PLACES, WHEELS, Key, short_name
 from omnid.transport.topics import MAP_POSE, PANORAMA, SCAN
 
 QUIET_S: Final = 0.5  # The state is sent after this time even without a message of the robot; between two connections
@@ -101,7 +101,6 @@ class RobotFeed:
         """Return all that has changed since a version, and the state."""
         seen = seen if self._start <= seen <= self.version else 0
         extra = {
-            "dropped": self.state.dropped,
             "panorama_comes": PANORAMA in self._news,
             "map_in_odom": self._map_in_odom,
         }
@@ -273,15 +272,13 @@ def state_news(robot: str, state: RobotState, link: str, extra: Mapping[str, Any
 
     link: why there is no connection to the robot; empty with one. extra: further entries.
     """
-    quantiles = (0.5, 0.99)
     return {
         "robot": robot,
         "link": link,
         **{name: getattr(state, name) for name in ("alive", "state", "rate_hz", "missed", "broken")},
         "fresh": state.rate_hz > 0,
         "pose": None if state.pose is None else _pose(state.pose),
-        "age_ms": [1e3 * state.age.p(q) for q in quantiles],
-        "network_ms": [1e3 * state.network.p(q) for q in quantiles],
+        "age_ms": [1e3 * state.age.p(q) for q in (0.5, 0.99)],
         "wheels": _wheels(state),
         "in_map": None if PLACES not in state.statuses else state.statuses[PLACES].message,
         "pace": state.real_time_factor,
@@ -315,17 +312,17 @@ def map_in_odom(in_map: PoseInMap, poses: Iterable[Pose]) -> list[float] | None:
 
 
 def parts_news(state: RobotState) -> list[dict[str, Any]]:
-    """Return all status entries, the worst first, stages last."""
+    """Return the status entries of which the page shows the values."""
     return [
         {
             "name": short_name(part.name),
-            "level": part.level % len(LEVELS),
             "message": part.message,
             "values": [
                 [key[:LONGEST_VALUE], value[:LONGEST_VALUE]] for key, value in islice(part.values.items(), MOST_ENTRIES)
             ],
         }
-        for part in sorted(state.statuses.values(), key=importance)
+        for name in (CALIBRATION, MAP_FILE)
+        if (part := state.statuses.get(name)) is not None
     ]
 
 

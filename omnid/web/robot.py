@@ -12,7 +12,7 @@ import asyncio
 import math
 import re
 import time
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from http import HTTPStatus
@@ -30,7 +30,6 @@ from omnid.monitor.navigation import stop
 from omnid.monitor.teleop import FIRST_SHARE, limits_of
 from omnid.transport.driver import ANSWER_S
 from omnid.web.feed import OLDEST_S, RobotFeed, is_recent, server_ms
-from omnid.web.metrics import metrics
 
 LONGEST_BODY: Final = 1024  # more than the longest request has, a route with a name of 64 letters and its options
 _NUMBER: Final = r"(-?\d{1,6}(?:\.\d{1,4})?)"
@@ -40,16 +39,15 @@ _STICK: Final = re.compile(r"(-?[01](?:\.\d{1,4})?) (-?[01](?:\.\d{1,4})?) (\d{1
 
 
 class RobotPage:
-    """The answers about one robot. stops, arms: numbers of requests so far."""
+    """The answers about one robot."""
 
     def __init__(self, feed: RobotFeed) -> None:
         self.feed = feed
-        self.stops = self.arms = 0
         self._stop_ms = 0  # the server's time at the newest request to stop
         self._stopping: asyncio.Task[Answer] | None = None
         self._again = False  # a stop was asked for since the newest one was sent
         self._busy: set[str] = set()  # kinds of the requests that wait for an answer, each in a thread
-        self._limits: tuple[tuple[int, str], VelocityLimits] | None = None  # ends and run when they were read
+        self._limits = VelocityLimits()  # those of the robot, read each time that a page takes the stick
         self._sending = False  # by the stick
         self._page, self._held_until_s = "", -math.inf  # the page that drives
         # Sending may block while the robot does not read; no request holds up a stop.
@@ -72,11 +70,6 @@ class RobotPage:
             *(_command_route(f"/{name}", act) for name, act in commands.items()),
         ]
 
-    def metrics(self, refused: Mapping[str, int]) -> bytes:
-        """Return the metrics of the robot and of this server; refused: requests by reason."""
-        counts = {"dropped": self.feed.state.dropped, "stops": self.stops, "arms": self.arms}
-        return metrics(self.feed.state, refused, counts)
-
     @property
     def is_stopping(self) -> bool:
         """True while a stop is sent and not confirmed."""
@@ -87,7 +80,6 @@ class RobotPage:
 
         A stop is repeated until the robot's status confirms it; any number of browsers may ask for it.
         """
-        self.stops += 1
         self._stop_ms = server_ms()
         self._again = True
         if self._stopping is None or self._stopping.done():
@@ -116,7 +108,6 @@ class RobotPage:
         stamp_ms = stamp_of(await text_of(request))
         if stamp_ms < self._stop_ms:
             return Answer(False, "a stop was asked for since: arm again if it is to move")
-        self.arms += 1
         return await self._asked("arm", Driver.arm)
 
     async def goal(self, request: Request) -> Answer:
@@ -177,12 +168,14 @@ class RobotPage:
         if self._sending:
             return Answer(False, "the robot does not take the last command: is it overloaded?")
         # 3. Send it. Other pages are refused until a state would be too old: some requests of this one may be lost.
-        robot = self._robot()
+        robot, is_held = self._robot(), time.monotonic() < self._held_until_s
         self._page, self._held_until_s = page, time.monotonic() + OLDEST_S
         self._sending = True
         try:
-            limits = await self._limits_of(robot)
-            # The first request reads the robot's limits, which may take so long that the request is no longer recent.
+            if not is_held:
+                self._limits = await asyncio.to_thread(limits_of, robot)
+            limits = self._limits
+            # Reading the robot's limits may take so long that the request is no longer recent.
             if moves and not is_recent(stamp_ms):
                 return Answer(False, "the stick is ready now")
             velocity_mps = FIRST_SHARE * forward * limits.velocity_mps
@@ -195,14 +188,6 @@ class RobotPage:
         if not moves:
             return Answer(True, "the stick is released: it stands")
         return Answer(True, f"it drives by the stick: {velocity_mps:+.2f} m/s, {math.degrees(rate_radps):+.0f}°/s")
-
-    async def _limits_of(self, robot: Robot) -> VelocityLimits:
-        """Return the robot's limits, read at the first call after its start."""
-        state = self.feed.state
-        start = state.ends, state.run
-        if self._limits is None or self._limits[0] != start or state.alive is False:
-            self._limits = start, await asyncio.to_thread(limits_of, robot)
-        return self._limits[1]
 
 
 def _command_route(path: str, act: Callable[[Request], Awaitable[Answer]]) -> Route:

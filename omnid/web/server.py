@@ -32,6 +32,7 @@ from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig, checked
 from omnid.web.access import Access, Guard, is_of_other_site, token_of
 from omnid.web.feed import RobotFeed
+from omnid.web.metrics import metrics
 from omnid.web.robot import RobotPage, text_of
 
 DEFAULT_LISTEN: Final = "127.0.0.1:8447"
@@ -41,7 +42,6 @@ END_S: Final = 2  # Time that browsers have to finish at the end.
 # A link of another site brings no cookie along (SameSite=Strict); a page that loads itself again does.
 _AGAIN: Final = '<!DOCTYPE html><title>omnid</title><meta http-equiv="refresh" content="0">'
 _LISTEN: Final = re.compile(r"(\[[0-9A-Fa-f:.%]+\]|[A-Za-z0-9._-]+):(\d{1,5})")
-_NAME: Final = re.compile(r"[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]")
 _ELSEWHERE: Final = "192.0.2.1"  # an address of documentation (RFC 5737); nothing is sent there
 
 
@@ -60,9 +60,6 @@ def serve(bus: BusConfig, settings: WebSettings) -> None:
     """Serve the page until SIGINT or SIGTERM. Raise OmnidError for settings that cannot be used."""
     # 1. Check the settings, and read the tokens.
     checked(bus)
-    for name in settings.names:
-        if not _NAME.fullmatch(name):
-            raise OmnidError(f"--host {name}: expected a name without scheme and port, such as robot.example.org")
     token = token_of(settings.token_file)
     stop_token = token_of(settings.stop_token_file, "--stop-token-file") if settings.stop_token_file else ""
     if token == stop_token:
@@ -122,31 +119,22 @@ def site(page: RobotPage, access: Access, *, secure: bool) -> Guard:
     def let_in(token: str) -> Response:
         role = access.role_of(token)
         if role is None:
-            guard.refused["wrong token"] += 1
             return FileResponse(STATIC / "login.html", status_code=HTTPStatus.UNAUTHORIZED)
         response = RedirectResponse("/", HTTPStatus.SEE_OTHER)
         value = access.new_cookie(role)
         response.set_cookie(access.cookie, value, COOKIE_S, httponly=True, samesite="strict", secure=secure)
         return response
 
-    async def logout(_: Request) -> Response:
-        """Let the browser forget the cookie."""
-        response = RedirectResponse("/", HTTPStatus.SEE_OTHER)
-        response.delete_cookie(access.cookie, httponly=True, samesite="strict", secure=secure)
-        return response
-
-    async def metrics(_: Request) -> Response:
-        return PlainTextResponse(page.metrics(guard.refused), media_type=CONTENT_TYPE_LATEST)
+    async def numbers(_: Request) -> Response:
+        return PlainTextResponse(metrics(page.feed.state), media_type=CONTENT_TYPE_LATEST)
 
     outer = [
         Route("/", index),
         Route("/login", login, methods=["POST"]),
-        Route("/logout", logout, methods=["POST"]),
-        Route("/metrics", metrics),
+        Route("/metrics", numbers),
         Mount("/static", StaticFiles(directory=STATIC)),
     ]
-    guard = Guard(Starlette(routes=[*outer, *page.routes()]), access)
-    return guard
+    return Guard(Starlette(routes=[*outer, *page.routes()]), access)
 
 
 class _Server(uvicorn.Server):

@@ -150,12 +150,6 @@ CELL_S = 300  # generous: a replay of 99 pairs on a busy machine
 HAS_JUPYTER = all(find_spec(name) for name in ("nbclient", "nbformat", "ipykernel"))
 
 
-def test_it_is_small_and_kept_without_outputs() -> None:
-    cells = json.loads(NOTEBOOK.read_text("utf-8"))["cells"]
-    assert NOTEBOOK.stat().st_size < 10_000
-    assert not any(cell.get("outputs") for cell in cells)
-
-
 @pytest.mark.skipif(HAS_JUPYTER, reason="it runs in Jupyter")
 def test_its_cells_run(monkeypatch: pytest.MonkeyPatch) -> None:
     matplotlib = pytest.importorskip("matplotlib")

@@ -12,7 +12,6 @@ import textwrap
 import time
 from collections.abc import Iterator
 from dataclasses import replace
-from importlib.util import find_spec
 from itertools import count
 from pathlib import Path
 
@@ -26,7 +25,7 @@ from calib import se3
 from calib.rig_file import read_rig, write_rig
 from drivers.frame import gray
 from drivers.logs.log_reader import LogReader
-from omnid.client import Answer, Driver, Robot, subscribe
+from omnid.client import Answer, Driver, Robot
 from omnid.engine.graph import Graph
 from omnid.errors import OmnidError
 from omnid.formats.tum import Trajectory, tum_row
@@ -34,7 +33,7 @@ from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import PoseAttachment
 from omnid.transport.commands import Freshness
-from omnid.transport.topics import Request
+from omnid.transport.topics import Request, command_topics
 from tests.conftest import PAIRS
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, script
 from tests.ply import read_ply
@@ -81,14 +80,6 @@ def test_import_loads_neither_numpy_nor_opencv() -> None:
     assert out == "[]\n"
 
 
-def test_every_public_name_is_found_and_no_other() -> None:
-    for name in omnid.__all__:
-        assert getattr(omnid, name) is not None and name in dir(omnid)
-    with pytest.raises(AttributeError, match="no attribute 'play'"):
-        omnid.play  # type: ignore[attr-defined]  # noqa: B018
-    assert find_spec("omnid.replay") is None, "a submodule of this name would replace the function"
-
-
 def test_replay_gives_what_the_command_writes(
     omnid_command: Command, tmp_path: Path, scene: Path, result: omnid.RunResult
 ) -> None:
@@ -125,12 +116,6 @@ def test_a_result_is_compared_with_the_truth(result: omnid.RunResult, tmp_path: 
     longer = Trajectory(result.stamps_ns, result.T_odom_rig.copy())
     longer.T[:, :3, 3] *= 1.25
     assert result.evaluate(longer).length_error_ratio == pytest.approx(1 / 1.25 - 1)
-
-
-def test_a_replay_reports_its_progress(scene: Path, start: Path) -> None:
-    seen: list[tuple[int, int | None]] = []
-    omnid.replay(start, rig=scene / "rig.toml", progress=lambda *counts: seen.append(counts))
-    assert seen[-1] == (FEW, FEW) and [done for done, _ in seen] == sorted(done for done, _ in seen)
 
 
 def test_replay_takes_settings_a_rig_and_a_method(scene: Path, start: Path, result: omnid.RunResult) -> None:
@@ -220,14 +205,6 @@ def test_one_error_class_for_all_wrong_input(scene: Path, arguments: tuple[str, 
         omnid.Odometry(scene / "rig.toml", overrides=["sterio.noise_px=1"])
 
 
-def test_settings_that_a_replay_ignores_are_warnings_or_errors(tmp_path: Path, scene: Path, start: Path) -> None:
-    (tmp_path / "omnid.toml").write_text("[live]\nstatus_s = 2.0\n")
-    found = omnid.replay(start, scene / "rig.toml", config=tmp_path / "omnid.toml")
-    assert "live.status_s" in found.warnings[0]
-    with pytest.raises(OmnidError, match=r"live\.status_s"):
-        omnid.replay(start, scene / "rig.toml", overrides=["live.status_s=2.0"])
-
-
 def test_ctrl_c_ends_a_replay_with_a_keyboard_interrupt(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = Graph.run
 
@@ -287,23 +264,6 @@ def robot() -> Iterator[tuple[Bus, str]]:
         yield bus, endpoint
 
 
-def test_keeps_only_the_newest_pose() -> None:
-    with robot() as (bus, endpoint), subscribe(connect=endpoint) as poses:
-        assert poses.newest() is None and poses.wait(0.05) is None
-        numbers = count()
-        wait_until(lambda: bus.publish("odom", odometry(next(numbers))) is None and poses.newest() is not None)
-
-        def only_the_last_of_ten_is_read(first: int) -> bool:
-            for i in range(first, first + 10):
-                bus.publish("odom", odometry(i))
-            time.sleep(0.3)
-            pose = poses.newest()
-            return pose is not None and pose.stamp_ns == 10**9 + first + 9 and poses.newest() is None
-
-        # A busy machine may take longer to deliver: then ten others are sent.
-        wait_until(lambda: only_the_last_of_ten_is_read(1000 + 10 * next(numbers)))
-
-
 def test_imports_nothing_that_only_the_daemon_needs() -> None:
     words = [sys.executable, "-c", "import omnid.client, sys; print(*sys.modules)"]
     modules = subprocess.run(words, capture_output=True, text=True, check=True).stdout.split()
@@ -346,7 +306,7 @@ def test_the_waypoint_example_drives_a_robot_to_the_last_waypoint() -> None:
             stops.append(request.topic)
 
     with robot() as (bus, endpoint):
-        bus.subscribe_commands(execute, {})
+        bus.subscribe_commands(execute, command_topics(("operator",)))
         code = docstring_code(Driver.__doc__).replace('Robot("omnid")', f'Robot("omnid", connect=("{endpoint}",))')
         with script(f"print('ready', flush=True)\n{code}") as process:
 
@@ -372,7 +332,7 @@ def test_sends_commands() -> None:
         bus.serve("time", freshness.own_time)
         driver = connection.driver()
         assert not driver.connected
-        bus.subscribe_commands(received.append, {})
+        bus.subscribe_commands(received.append, command_topics(("operator", "planner")))
         wait_until(lambda: driver.connected)
         driver.twist(0.5, -0.25)
         driver.heading(0.75, 1.5)

@@ -98,7 +98,6 @@ def write_rounds(path: Path, scales: tuple[float, ...], aside_m: float) -> None:
     ("scales", "aside_m", "code", "longest"),
     [
         ((1.0, 1.0, 1.0), 0.0, 0, "+0.0"),
-        ((1.02, 1.02), 0.0, 1, "+2.0"),
         ((1.02, 0.98), 0.0, 1, "+2.0"),  # right in the mean only
         ((1.0, 1.0, 1.0), 0.3, 1, "+0.0"),  # ends beside its start
     ],
@@ -128,8 +127,6 @@ def test_errors_of_rounds(
     ("words", "line"),
     [
         (["est.txt", "3.0"], "on B 3 m away"),
-        (["missing.mcap", "3.0"], "cannot read the log 'missing.mcap'"),
-        (["est.txt", "three"], "could not convert"),
         ([], "expected LOG DISTANCE_M"),
     ],
 )

@@ -68,58 +68,36 @@ def test_a_file_changes_what_it_names_and_nothing_else(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("override", "value"),
-    [("robot=seven", "seven"), ("robot=7", "7"), ("robot='7'", "7"), ("robot=true", "true"), ("robot=a=b", "a=b")],
+    [("robot=7", "7"), ("robot='7'", "7"), ("robot=a=b", "a=b")],
 )
 def test_an_override_needs_no_quotes(override: str, value: str) -> None:
     assert load(Sample, None, [override]).robot == value
     assert load(Sample, None, ["stereo.method=census"]).stereo.method == "census"
 
 
-def test_overrides_win_over_the_file_and_later_ones_over_earlier(tmp_path: Path) -> None:
-    path = written(tmp_path, "stereo.window_px = 5")
-    assert load(Sample, path, ["stereo.window_px=7", " stereo.window_px = 9 "]).stereo.window_px == 9
-
-
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
         (f"{'q' * 300} = 1", "unknown key 'qqq"),
-        (f"{'q' * 100_000} = 1", "unknown key 'qqq"),
         ("a." * 20_000 + "a = 1", "a key of more than 65 parts"),
         ("[stereo]\nwindow = 5", "unknown key stereo.window: did you mean stereo.window_px?"),
-        ("window_px = 5", "unknown key window_px: did you mean stereo.window_px?"),
-        ("[stero]\nwindow_px = 5", "unknown key stero: did you mean stereo?"),
-        ("[motor.serial]\nprot = 'x'", "unknown key motor.serial.prot: did you mean motor.serial.port?"),
         ("[stereo]\nzzz = 5", "unknown key stereo.zzz: known are stereo.window_px, "),
-        ("[stereo]\nwindow = 5\n[motor]\nx = 1\n[y]", "did you mean stereo.window_px?; unknown are also motor.x, y"),
-        ('"a\\nb" = 1', "unknown key 'a\\nb': known are robot, "),
         ("stereo = 5", "stereo: expected a section, found 5"),
         ("robot.name = 'x'", "robot: expected a string, found a section"),
         ("stereo.window_px = '11'", "stereo.window_px: expected an integer from 3 to 31, found '11'"),
         ("stereo.window_px = 11.0", "expected an integer from 3 to 31, found 11.0"),
-        ("stereo.window_px = true", "expected an integer from 3 to 31, found True"),
-        ("stereo.window_px = 2", "expected an integer from 3 to 31, found 2"),
         ("stereo.window_px = 32", "expected an integer from 3 to 31, found 32"),
         ("stereo.subpixel = 1", "stereo.subpixel: expected true or false, found 1"),
         ("stereo.ratio = true", "stereo.ratio: expected a number from 0.0 to 1.0, found True"),
-        ("stereo.ratio = nan", "found nan"),
         ("stereo.horizon_s = inf", "found inf"),
         ("motor.limit_mps = 0.5", "motor.limit_mps: expected a number of at most 0, found 0.5"),
         ("stereo.method = 'ncc'", "stereo.method: expected one of 'sad', 'census', found 'ncc'"),
-        ("robot = 1979-05-27", "robot: expected a string, found datetime.date"),
         ("offset_m = [1, 2]", "offset_m: expected a list of 3 numbers, found [1, 2]"),
-        ("offset_m = [1, 2, 'x']", "offset_m: expected a list of 3 numbers, found [1, 2, 'x']"),
-        ("offset_m = [1, 2, 1e999]", "offset_m: expected a list of 3 numbers, found [1, 2, inf]"),
         ("topics = 'a'", "topics: expected a list of strings, found 'a'"),
-        ("motor.serial.bauds = [9600, true]", "expected a list of integers of at least 1, found [9600, True]"),
         ("motor.serial.bauds = [0]", "expected a list of integers of at least 1, found [0]"),
         (f"stereo.ratio = 0x{'f' * 5000}", "expected a number from 0.0 to 1.0, found a huge int"),
-        (f"stereo.window_px = {'9' * 5000}", "expected TOML, found: "),
         (f"topics = {'[' * 20_000}", "expected TOML, found: "),
-        ("stereo.window_px 5", "expected TOML, found: "),
-        ("robot = 1\nrobot = 2", "expected TOML, found: "),
         (b"robot = '\xff'", "expected TOML in UTF-8, found another byte at offset 9"),
-        (bytes(range(256)), "omnid.toml: expected TOML"),
     ],
 )
 def test_refuses_what_is_not_as_declared(text: str | bytes, expected: str) -> None:
@@ -133,11 +111,7 @@ def test_refuses_what_is_not_as_declared(text: str | bytes, expected: str) -> No
         ("stereo.window_px", "expected section.key=value, found no '='"),
         ("stereo=5", "stereo is a section: name one of its keys, such as stereo.window_px"),
         ("stereo.window=5", "did you mean stereo.window_px?"),
-        ("robot.name=5", "robot is a key, not a section: it has no name"),
-        ("stereo.window_px=99", "stereo.window_px: expected an integer from 3 to 31, found 99"),
         ("stereo.window_px=5\nrobot='x'", "expected an integer from 3 to 31, found \"5\\nrobot='x'\""),
-        ("stereo.subpixel=yes", "stereo.subpixel: expected true or false, found 'yes'"),
-        ("=5", "unknown key"),
         ("robot=a\udcff", "robot: expected UTF-8, found 'a\\udcff'"),
     ],
 )
@@ -157,7 +131,6 @@ def test_names_a_file_that_cannot_be_read(tmp_path: Path) -> None:
     [
         [],
         ["stereo.window_px=31", "stereo.subpixel=false", "motor.serial.port=a\\b", "topics=['a', \"it's\"]"],
-        ["motor.serial.bauds=[]", "stereo.horizon_s=2", "offset_m=[1, -2.5e-300, 3]"],
     ],
 )
 def test_a_dump_reads_back_as_the_same_object(tmp_path: Path, overrides: list[str]) -> None:
@@ -204,7 +177,6 @@ def test_the_papers_method_works_on_the_enhanced_sad_unless_the_matching_is_set(
 @pytest.mark.parametrize(
     ("key", "proposed"),
     [
-        ("controller.limits.velocity_mpss", "controller.limits.velocity_mps"),
         ("controller.velocity_mps", "controller.limits.velocity_mps"),
         ("mapping.voxel_mm", "mapping.voxel_m"),
     ],
@@ -218,10 +190,7 @@ def test_a_wrong_key_is_answered_by_a_similar_one(key: str, proposed: str) -> No
     ("command", "override"),
     [
         ("run", " controller.setpoint . velocity_mps=0.0"),
-        ("run", "log.rate_hz=8"),
         ("replay", "cameras.width_px=640"),
-        ("replay", "live.cloud_s=1"),
-        ("replay", "record.enabled=true"),
     ],
 )
 def test_refuses_an_override_that_the_command_ignores(command: str, override: str) -> None:

@@ -276,18 +276,6 @@ def test_a_log_of_two_pairs_gives_its_points(omnid: Command, tmp_path: Path, sce
     assert len(read_ply(ply).xyz) > 100
 
 
-def test_a_truth_of_another_drive_is_asked_about(omnid: Command, tmp_path: Path, scene: Path) -> None:
-    other = tmp_path / "other.txt"
-    other.write_text(
-        "".join(
-            f"{line.split()[0]} {0.5 * row:.3f} 0 0 0 0 0 1\n"
-            for row, line in enumerate((scene / "truth.txt").read_text().splitlines())
-        )
-    )
-    assert "is this the truth of the same drive" in omnid("eval", scene / "truth.txt", other).err
-    assert omnid("eval", scene / "truth.txt", scene / "truth.txt").err == ""
-
-
 POSES = 18
 ODOM = "/omnid/odom"
 IMAGES = ("/omnid/lower/image_raw/compressed", "/omnid/upper/image_raw/compressed")

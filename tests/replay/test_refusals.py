@@ -73,7 +73,6 @@ TABLE = (
     ("replay {log} --start-s=-1", "--start-s: expected 0 or more, found '-1'"),
     ("replay {log} --seconds 0", "--seconds: expected 0.001 or more, found '0'"),
     ("replay {log} --rig {rig} --map {log}", "expected a map of places"),
-    ("replay {log} --map {folder}/x.ply", "--cloud FILE.ply"),
     ("replay {log} --rig {rig} --motor {folder}/tty", "motor port"),
     ("replay", "the following arguments are required"),
     ("fly", "unknown command 'fly'"),

@@ -1,13 +1,12 @@
 // Asks the server for news, and shows them. Text is only ever set as text, never as HTML.
 import { showCalibration } from "./calibration.js";
 import { wireCommands } from "./commands.js";
-import { byId, degrees, element, fixed, inWords, tableRow } from "./elements.js";
+import { byId, degrees, element, fixed, tableRow } from "./elements.js";
 import { Plan } from "./plan.js";
 import { showMapFile, wireGoal, wireMap, wireRoutes } from "./requests.js";
 import { wireStick } from "./stick.js";
 
 const LEVELS = ["good", "warn", "bad", "warn"];
-const LEVEL_NAMES = ["good", "warning", "error", "no news"];
 const STATES = { tracking: "good", degraded: "warn", lost: "bad" };
 
 const RETRY_MS = [300, 1000, 2000];
@@ -54,7 +53,6 @@ async function show(news) {
   if (news.parts) {
     showCalibration(news.parts.find((part) => part.name === "calibration"));
     showMapFile(news.parts.find((part) => part.name === "map file"));
-    showParts(news.parts);
   }
   if (news.navigation) {
     goal.showNavigation(news.navigation);
@@ -152,21 +150,6 @@ function direction(degrees) {
   if (turn < 10) return "ahead";
   if (turn > 170) return "behind";
   return `${turn}° to the ${degrees > 0 ? "left" : "right"}`;
-}
-
-function showParts(parts) {
-  const open = new Set([...byId("parts").querySelectorAll("details[open]")].map((part) => part.dataset.part));
-  byId("parts").replaceChildren(...parts.map((part) => {
-    const title = `${part.name}: ${part.message || LEVEL_NAMES[part.level]}`;
-    const values = part.values.map(([key, value]) => {
-      const [name, unit] = inWords(key);
-      return tableRow(name, unit ? `${value} ${unit}` : value, key);
-    });
-    const found = element("details", { open: open.has(part.name) },
-      element("summary", { className: LEVELS[part.level] }, title), element("table", {}, ...values));
-    found.dataset.part = part.name;
-    return found;
-  }));
 }
 
 // version: 0 where the robot has started again, and sent none yet. One that comes while the last one loads is left out.

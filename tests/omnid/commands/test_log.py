@@ -16,7 +16,6 @@ import pytest
 from mcap.reader import make_reader
 
 from drivers.logs.log_reader import LogReader
-from drivers.logs.mcap_writer import LogWriter
 from tests.drivers.logs.bags import write_folders
 from tests.drivers.logs.mcap_logs import BARE, LOWER, START_NS, UPPER, Entry, pairs, text, write_log
 from tests.replay.command import Command
@@ -88,12 +87,11 @@ def test_a_kill_costs_at_most_a_second_and_the_rest_is_read(tmp_path: Path, scen
     assert 2 * replayed.count("pairs") + alone == len(times) and replayed.count("poses") == replayed.count("pairs") > 50
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_leaves_a_whole_recording(tmp_path: Path, scene: Path, number: int) -> None:
+def test_a_signal_leaves_a_whole_recording(tmp_path: Path, scene: Path) -> None:
     folder = tmp_path / "log"
     with recording(scene, folder) as process:
         printed(process, 20)
-        process.send_signal(number)
+        process.send_signal(signal.SIGTERM)
         rest = process.communicate(timeout=30)[0]
     assert process.returncode == 0
     (path,) = folder.iterdir()
@@ -132,17 +130,9 @@ def test_info_shows_the_damage_and_advice(omnid: Command, tmp_path: Path) -> Non
     os.truncate(path, path.stat().st_size - 1)
     code, out, _ = omnid("log", "info", bare, path)
     assert code == 1 and f"cut or corrupt after byte {path.read_bytes().index(bytes([15, 4, 0, 0])) + 13}" in out
-    assert out.count("`mcap recover`") == 2 and "rig.toml (2.0 kB)" in out and "without an index" in out
+    assert "rig.toml (2.0 kB)" in out and "without an index" in out
     code, out, err = omnid("log", "info", tmp_path / "no.mcap", bare)
     assert code == 2 and "No such file" in err and LOWER in out
-
-
-def test_info_of_a_log_that_is_being_written(omnid: Command, tmp_path: Path) -> None:
-    with LogWriter(tmp_path / "log.mcap") as log:
-        for entry in pairs(20):
-            log.write(*entry)
-        code, out, _ = omnid("log", "info", tmp_path / "log.mcap")
-        assert code == 0 and "being written" in out and "recover" not in out
 
 
 def test_any_bytes_give_no_traceback(omnid: Command, tmp_path: Path) -> None:

@@ -38,17 +38,14 @@ def test_show_prints_the_sizes(omap: Path, capsys: pytest.CaptureFixture[str]) -
     assert (found["keyframes"], found["sessions"], found["loops"], found["parts"]) == (12, 2, 1, 1)
 
 
-def test_show_and_export_write_the_same_files_and_name_them(omap: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    a, b = ({end: omap.parent / f"{name}.{end}" for end in ("ply", "png", "yaml", "pgm")} for name in "ab")
+def test_export_writes_the_files_and_names_them(omap: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    a = {end: omap.parent / f"a.{end}" for end in ("ply", "png", "yaml", "pgm")}
     words = ["--ply", str(a["ply"]), "--plan", str(a["png"]), "--grid", str(a["yaml"]), "--cell", "0.1"]
     assert main(["map", "export", str(omap), *words]) == 0
-    written = [word for end in ("ply", "png", "yaml") for word in ("-o", str(b[end]))]
-    assert main(["map", "show", str(omap), *written, "--cell", "0.1"]) == 0
     printed = capsys.readouterr().out
-    assert all(str(path) in printed for path in (*a.values(), *b.values()))
+    assert all(str(path) in printed for path in a.values())
     assert len(read_ply(a["ply"]).xyz) > 50 and a["pgm"].read_bytes().startswith(b"P5\n")
-    assert "resolution: 0.1\n" in a["yaml"].read_text() and "image: b.pgm\n" in b["yaml"].read_text()
-    assert all(a[end].read_bytes() == b[end].read_bytes() for end in ("ply", "png", "pgm"))
+    assert "resolution: 0.1\n" in a["yaml"].read_text() and "image: a.pgm\n" in a["yaml"].read_text()
     # The loop is a line of its own colour in the plan.
     plan = cv2.imread(str(a["png"])).astype(int)
     assert np.count_nonzero(plan[..., 0] > plan[..., 2] + 100) > 20
@@ -61,11 +58,7 @@ def test_show_and_export_write_the_same_files_and_name_them(omap: Path, capsys: 
         (["export", "{}", "--grid", "{}.png"], "expected a name that ends in .yaml"),
         (["export", "{}", "--grid", "."], "--grid .: expected a file to write, found a folder"),
         (["export", "{}", "--ply", "{}"], "this is the map that is read as well"),
-        (["export", "{}", "--ply", "/none/a.ply"], "there is no folder"),
-        (["export", "{}", "--ply", "{}.ply", "--cell", "0"], "--cell: expected 0.005 to 10"),
-        (["show", "{}", "-o", "{}.html"], "expected a name that ends in .png, .yaml or .ply"),
         (["show", "{}.none"], "cannot read the map"),
-        (["info", "{}"], "unknown command 'info'"),
     ],
 )
 def test_mistakes_are_one_line(omap: Path, words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:

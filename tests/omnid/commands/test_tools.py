@@ -75,18 +75,6 @@ def test_results_of_a_replay_as_json(omnid: Command, scene: Path, tmp_path: Path
     assert info[1]["topics"]["/omnid/odom"] == ["nav_msgs/msg/Odometry", FEW]
 
 
-def test_numbers_that_are_not_finite_are_null(omnid: Command, tmp_path: Path) -> None:
-    still = tmp_path / "still.txt"
-    still.write_text("1.0 0 0 0 0 0 0 1\n2.0 0 0 0 0 0 0 1\n")
-    assert loaded(omnid, "eval", still, still)["length_error_ratio"] is None
-
-
-def test_findings_of_the_doctor_as_json(omnid: Command) -> None:
-    findings = loaded(omnid, "doctor", "--set", "cameras.lower=/dev/none", "--set", "cameras.upper=/dev/none", code=1)
-    assert {"level", "subject", "found", "advice"} == set(findings[0])
-    assert any(entry["level"] == "error" for entry in findings)
-
-
 SAMPLE = Path(str(files("omnid.sample") / "log.mcap"))
 
 
@@ -127,9 +115,3 @@ def _read(master: int) -> bytes:
         return os.read(master, 4096)
     except OSError:  # the program has ended
         return b""
-
-
-def test_a_log_is_read_by_its_topics(omnid: Command) -> None:
-    exchanged = ("--lower", "/upper/image_raw/compressed", "--upper", "/lower/image_raw/compressed")
-    listen = f'bus.listen=["{free_endpoint()}"]'
-    assert "exchange --lower and --upper" in omnid("run", "--log", SAMPLE, "--once", "--set", listen, *exchanged).err

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import grp
 import json
+import math
 import os
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,24 +23,20 @@ from drivers.cameras.v4l2_settings import V4l2Settings
 from drivers.errors import DriverError
 from omnid.cli import main
 from omnid.config import RecordConfig
-from omnid.controller.motor_settings import MotorSettings
+from omnid.controller.motor_settings import DriveSettings, MotorSettings
 from omnid.doctor import checks
 from omnid.doctor.checks import Finding, access, bus, cameras, disk, motor, rig
+from omnid.doctor.wheel_wiring import tested_drive as drive_by_answers
+from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig
+from tests.contract.pty_motor import PtyMotor
+from tests.contract.simulated_controllers import SIMULATED_CONTROLLERS, SimulatedController
+from tests.replay.command import Command
+from tests.waiting import wait_until
 
 ROOT = Path(__file__).parents[3]
 UNPRIVILEGED = 65534
 IMAGE = StreamFormat("MJPG", 1280, 960, 0, 30.0)
-
-
-@contextmanager
-def opened_elsewhere(path: Path | str) -> Iterator[None]:
-    """Another process has the file open."""
-    hold = "import sys; file = open(sys.argv[1], 'rb', buffering=0); print('here', flush=True); sys.stdin.read()"
-    with subprocess.Popen([sys.executable, "-c", hold, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as it:
-        assert it.stdout is not None and it.stdout.readline() == b"here\n"
-        yield
-        it.communicate()
 
 
 class Robot:
@@ -71,9 +69,6 @@ def test_accepts_cameras_with_the_configured_image(robot: Robot, monkeypatch: py
     first, second = robot.examined()
     assert str(first) == "ok       camera lower  HD Webcam at /dev/video0, MJPG 1280x960 at 30 Hz"
     assert second.level == "ok" and "/dev/video2" in second.found
-    assert robot.examined(auto_exposure="rig")[0].found.endswith("30 Hz, exposure left to it")
-    robot.known = [replace(device, exposure="exposure 1 to 9 ms") for device in robot.known]
-    assert robot.examined(auto_exposure="rig")[0].found.endswith("30 Hz, exposure 1 to 9 ms set by omnid run")
     monkeypatch.setattr(checks, "offered_image", lambda _: None)
     assert "in use, so that its image was not tried" in robot.examined()[0].found
 
@@ -87,10 +82,6 @@ def test_finds_faults_of_cameras(robot: Robot, monkeypatch: pytest.MonkeyPatch) 
     assert robot.examined(lower="/dev/video2")[-1].found == "both names lead to one device"
     robot.known[0] = replace(robot.known[0], problem="is broken; mend it")
     assert "is broken" in str(robot.examined()[0]) and robot.examined()[0].level == "error"
-    (robot.root / "proc").symlink_to("/proc")
-    with opened_elsewhere(robot.root / "dev/video2"):
-        assert "is open in python" in robot.examined()[1].found
-    assert robot.examined()[1].level == "ok"
 
     def refuse(_: V4l2Settings) -> StreamFormat:
         raise DriverError("auto 1280x960 at 60 Hz is not offered")
@@ -112,9 +103,6 @@ def test_checks_the_port_of_the_motor(port: str) -> None:
     settings = MotorSettings(port)
     os.chmod(port, 0o666)
     assert [str(finding) for finding in motor(settings)] == [f"ok       motor         line on {port}"]
-    with opened_elsewhere(port):
-        (found,) = motor(settings)
-    assert found.level == "error" and "in use by python" in found.found
     os.chmod(port, 0o660)
     group = grp.getgrgid(os.stat(port).st_gid).gr_name
     (found,) = motor(settings)
@@ -174,15 +162,10 @@ def test_checks_the_rig(scene: Path, tmp_path: Path) -> None:
     found = list(rig(scene / "rig.toml", size))
     assert any(one.level == "warning" and "does not state the height" in one.found for one in found)
     assert not any("does not state" in one.found for one in rig(scene / "rig.toml", size, -1.2))
-    whole = read_rig(scene / "rig.toml").at_height(1.2)
-    write_rig(tmp_path / "masked.toml", whole)
-    bare = replace(whole, lower=replace(whole.lower, mask=None), upper=replace(whole.upper, mask=None))
-    write_rig(tmp_path / "bare.toml", bare)
-    (masked,) = rig(tmp_path / "masked.toml", size)
-    assert masked.level == "ok" and "between the viewpoints, 1.200 m above the floor" in masked.found
-    (without,) = rig(tmp_path / "bare.toml", size)
-    assert without.level == "warning" and "no mask for lower and upper" in without.found
-    for text in (None, "", "nonsense = [", "schema = 99"):
+    write_rig(tmp_path / "whole.toml", read_rig(scene / "rig.toml").at_height(1.2))
+    (whole,) = rig(tmp_path / "whole.toml", size)
+    assert whole.level == "ok" and "between the viewpoints, 1.200 m above the floor" in whole.found
+    for text in (None, "nonsense = ["):
         if text is not None:
             (tmp_path / "rig.toml").write_text(text)
         (unread,) = rig(tmp_path / "rig.toml", size)
@@ -196,9 +179,7 @@ def test_checks_the_rig(scene: Path, tmp_path: Path) -> None:
         ("tcp/[::1]:7447", True),
         ("tcp/localhost:7447", True),
         ("unixsock-stream//run/x", True),
-        ("tcp/0.0.0.0:7447", False),
         ("tcp/[::]:7447", False),
-        ("tcp/192.168.1.2:7447", False),
         ("udp/robot.local:7447", False),
     ],
 )
@@ -215,9 +196,147 @@ def test_the_command_runs_all_checks_and_returns_an_exit_code(
     assert main(["doctor", "--set", missing]) == 1
     *lines, last = capsys.readouterr().out.splitlines()
     assert {line[:9].strip() for line in lines} <= {"ok", "warning", "error"}
-    subjects = "camera lower,camera upper,rig,motor,real time,memory,compiled code,disk,bus"
+    subjects = "camera lower,camera upper,rig,motor,real time,memory,disk,bus"
     assert set(subjects.split(",")) <= {line[9:22].strip() for line in lines} and " errors, " in last
     assert main(["doctor", "--set", missing, "--json"]) == 1
     assert {found["level"] for found in json.loads(capsys.readouterr().out)} <= {"ok", "warning", "error"}
     assert main(["doctor", "--set", "cameras.widht_px=3"]) == 2
     assert "cameras.width_px" in capsys.readouterr().err
+
+
+ROOT = Path(__file__).parents[3]
+RADIUS_M = 0.02
+LATE_S = 0.25  # more than an answer may take
+
+
+class WatchedController:
+    """A simulated controller that keeps the speeds of its wheels after each command."""
+
+    def __init__(self, controller: SimulatedController) -> None:
+        self._controller, self.base = controller, controller.base
+        self.notes: list[tuple[float, float]] = []
+        self.late_stops = 0  # stops of wheels that turn whose answers are still to come late
+
+    def feed(self, data: bytes) -> bytes:
+        """Return the answers of the controller."""
+        did_turn = any(self.base.commanded_mps)
+        answer = self._controller.feed(data)
+        if self.late_stops and did_turn and not any(self.base.commanded_mps):
+            self.late_stops -= 1
+            time.sleep(LATE_S)
+        self.notes.append((self.base.commanded_mps[0], self.base.commanded_mps[1]))
+        return answer
+
+
+class Person:
+    """Looks at the wheels, and answers the questions."""
+
+    def __init__(self, base: WatchedController) -> None:
+        self.base = base
+        self._travel_m = 0.0
+        self.questions: list[str] = []
+
+    def answer(self, question: str) -> str:
+        """Return the answer to a question."""
+        self.questions.append(question)
+        if "wheel that moved" in question:
+            moved = next(note for note in self.base.notes if any(note))
+            self._first, self.base.notes[:] = moved, []
+            left, right = (abs(speed) > 1e-6 for speed in moved)
+            return "b" if left and right else "l" if left else "r"
+        if "forwards first" in question:
+            return "y" if sum(self._first) > 0 else "n"
+        if "How many" in question:
+            wait_until(
+                lambda: (
+                    not any(self.base.base.commanded_mps)
+                    and self.base.base.velocity_mps == 0
+                    and self.base.base.yaw_rate_radps == 0
+                ),
+                "wheels that stand",
+            )
+            return f"{(self.base.base.travel_m[0] - self._travel_m) / (math.tau * RADIUS_M):.3f}"
+        self._travel_m = self.base.base.travel_m[0]
+        return "yes"
+
+
+@contextlib.contextmanager
+def simulated(protocol: str, **wiring: object) -> Iterator[tuple[MotorSettings, Person, PtyMotor]]:
+    """Yield settings that do not know the wiring, a person, and the base."""
+    drive = DriveSettings(wheel_radius_m=RADIUS_M, gear=20.0)
+    true = replace(drive.geometry(), **wiring)  # type: ignore[arg-type]
+    watched = WatchedController(SIMULATED_CONTROLLERS[protocol](true))
+    with contextlib.closing(PtyMotor(watched)) as motor:
+        # At 5 Hz an answer may take 0.16 s: a busy computer is not what is tested here.
+        settings = MotorSettings(motor.port, protocol, rate_hz=5.0, watchdog_ms=1000, drive=drive)
+        yield settings, Person(watched), motor
+
+
+@pytest.mark.parametrize(
+    ("protocol", "true"),
+    [
+        ("roboteq", {"swapped": True, "reverse_left": True, "gear": 10.0}),
+        pytest.param("vesc", {"reverse_left": True, "reverse_right": True, "gear": 10.0}, marks=pytest.mark.slow),
+    ],
+)
+def test_the_settings_follow_from_what_the_wheels_did(protocol: str, true: dict[str, object]) -> None:
+    with simulated(protocol, **true) as (config, person, motor):
+        drive = drive_by_answers(config, person.answer, speed_mps=0.4, turns=4, move_s=0.1, rest_s=0.05)
+        assert not any(motor.base.commanded_mps)
+    expected = {"swapped": False, "reverse_left": False, "reverse_right": False, **true}
+    for name, value in expected.items():
+        found = getattr(drive, name)
+        assert found == value if isinstance(value, bool) else found == pytest.approx(value, rel=0.2), (name, found)
+    assert drive.track_m == config.drive.track_m and "forwards first" in " ".join(person.questions)
+
+
+@pytest.mark.parametrize(
+    ("answers", "message"),
+    [(["n"], "did not move"), (["b"], "moved both"), (["l", "y", "l", "y"], "which cannot be")],
+)
+def test_answers_without_a_result(answers: list[str], message: str) -> None:
+    with simulated("roboteq") as (config, _, motor):
+        given = iter(["yes", *answers])
+        with pytest.raises(OmnidError, match=message):
+            drive_by_answers(config, lambda _: next(given), speed_mps=0.4, turns=0, move_s=0.05, rest_s=0.0)
+        assert not any(motor.base.commanded_mps) and not list(given)
+
+
+def test_the_command_asks_and_prints() -> None:
+    with simulated("roboteq", swapped=True, reverse_left=True, gear=1.0) as (config, person, motor):
+        command = [
+            *(sys.executable, "-m", "omnid", "motor", "test", "--motor", config.port, "--turns", "1", "--speed", "0.4"),
+            *("--set", "motor.protocol=roboteq", "--set", "motor.watchdog_ms=1000", "--set", "motor.rate_hz=5"),
+            *("--set", f"motor.drive.wheel_radius_m={RADIUS_M}"),
+        ]
+        with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+            assert process.stdin is not None and process.stdout is not None
+            shown = ""
+            while letter := process.stdout.read(1):
+                shown += letter
+                if shown.endswith(("? ", ": ")):
+                    process.stdin.write(f"{person.answer(shown)}\n")
+                    process.stdin.flush()
+                    shown = ""
+        assert process.returncode == 0 and not any(motor.base.commanded_mps)
+    assert "[motor.drive]\nswapped = true\nreverse_left = true" in shown and "different from the settings" in shown
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ((), "no motor controller is configured"),
+        (("--motor", "simulated"), "set there"),
+        (("--motor", "simulated", "--set", "motor.protocol=vesc", "--speed", "9"), "--speed"),
+        (("--motor", "simulated", "--set", "motor.protocol=vesc", "--turns", "-1"), "--turns"),
+    ],
+)
+def test_wrong_options_are_refused(words: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert message in Command(capsys).refused("motor", "test", *words)
+
+
+def test_without_yes_nothing_moves(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    for text, message in (("no\n", "not begun"), ("", "no answer")):
+        monkeypatch.setattr("sys.stdin", __import__("io").StringIO(text))
+        code, _, err = Command(capsys)("motor", "test", "--motor", "simulated", "--set", "motor.protocol=vesc")
+        assert code == 2 and message in err

@@ -156,21 +156,9 @@ def test_the_command_asks_first(
 @pytest.mark.parametrize(
     ("program", "message"),
     [
-        *((path, "a folder that the service cannot see") for path in ("/home/me/v/omnid", "/root/omnid", "/tmp/omnid")),
-        *(
-            (f"/srv/{name}", "characters that a systemd unit cannot name")
-            for name in (
-                "with space",
-                "100%n",
-                "two\nExecStartPre=/bin/evil",
-                "tab\t",
-                "\udcff",
-                "\x1b[2J",
-                'a "b"',
-                "a 'b'",
-                "a\\x41",
-            )
-        ),
+        ("/home/me/v/omnid", "a folder that the service cannot see"),
+        ("/srv/100%n", "characters that a systemd unit cannot name"),
+        ("/srv/two\nExecStartPre=/bin/evil", "characters that a systemd unit cannot name"),
     ],
 )
 def test_refuses_a_program_that_the_unit_cannot_start(program: str, message: str) -> None:

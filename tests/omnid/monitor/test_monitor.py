@@ -1,0 +1,348 @@
+"""`omnid listen`, `drive`, `goto`, `route`, `stop`: what is shown, requests until their end, keys as a stick."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib import se3
+from omnid.client import NavigationReport, Robot
+from omnid.core.control.heading_controller import VelocityLimits
+from omnid.errors import OmnidError
+from omnid.monitor import navigation
+from omnid.monitor.listen import pose_lines, print_state, status_table
+from omnid.monitor.navigation import stop
+from omnid.monitor.robot_state import ReceivedMessage, RobotState
+from omnid.monitor.teleop import HOLD_S, Stick
+from omnid.transport import codec
+from omnid.transport.bus import Bus, BusConfig
+from omnid.transport.codec import DiagnosticStatus, PoseAttachment, string_from_cdr
+from omnid.transport.status_names import BUS, DISARMED_BY_STOP, NAVIGATION, WHEELS, Key
+from omnid.transport.topics import NAVIGATION as NAVIGATION_TOPIC
+from omnid.transport.topics import Answer, Request, command_topics
+from tests.omnid.transport.bus_fixtures import DEADLINE_S, free_endpoint, script
+from tests.waiting import wait_until
+
+pytestmark = pytest.mark.usefixtures("default_signals")
+
+
+@contextlib.contextmanager
+def listening(*words: object) -> Iterator[subprocess.Popen[str]]:
+    with subprocess.Popen(
+        [sys.executable, "-m", "omnid", "listen", *map(str, words)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def odometry_at(number: int) -> bytes:
+    T = se3.transform(se3.rotation_exp([0.0, 0.0, 0.1]), [0.5, 0.25, 0.0])
+    return codec.odometry_cdr(10**18 + number, T, 1e-6 * np.eye(6), np.zeros(6), np.eye(6))
+
+
+def publish(bus: Bus, number: int) -> None:
+    bus.publish("odom", odometry_at(number), PoseAttachment(number, "tracking", 0, 50, 60, time.time_ns()).to_bytes())
+    bus.publish("/tf", codec.transform_cdr(10**18, []))
+    bus.publish("status", codec.diagnostics_cdr(10**18, [DiagnosticStatus(WHEELS, 1, "no command", {"sent": "4"})]))
+
+
+def publish_until_it_ends(
+    bus: Bus, process: subprocess.Popen[str], number_of_signal: signal.Signals | None = None
+) -> tuple[str, str]:
+    """Publish, and send the signal where there is one after 150 messages."""
+    deadline_s = time.monotonic() + DEADLINE_S
+    for number in count():
+        publish(bus, number)
+        time.sleep(0.01)
+        if number == 150 and number_of_signal is not None:
+            process.send_signal(number_of_signal)
+        if process.poll() is not None:
+            break
+        assert time.monotonic() < deadline_s
+    return process.communicate()
+
+
+def test_prints_a_line_per_second() -> None:
+    endpoint = free_endpoint()
+    words = ("--robot", "rover", "--connect", endpoint, "--seconds", 2.2)
+    with contextlib.closing(Bus(BusConfig(robot="rover", listen=(endpoint,)))) as bus, listening(*words) as it:
+        out, err = publish_until_it_ends(bus, it)
+    assert it.returncode == 0 and err == ""
+    lines = out.splitlines()
+    assert 2 <= len(lines) <= 3 and all(
+        "x +0.500 y +0.250" in text and text.startswith("rover: tracking  ") for text in lines
+    )
+    assert "missed " in lines[-1] and "network " in lines[-1] and "\x1b" not in out
+
+
+def test_waits_for_the_robot_and_ends_with_a_signal() -> None:
+    endpoint = free_endpoint()
+    with listening("--connect", endpoint) as it:
+        assert it.stderr is not None and endpoint in it.stderr.readline()
+        with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
+            out, err = publish_until_it_ends(bus, it, signal.SIGTERM)
+    assert it.returncode == 0 and "tracking" in out.splitlines()[-1] and err == ""
+
+
+def test_a_wrong_name_is_answered_by_those_of_the_robots_there() -> None:
+    endpoint = free_endpoint()
+    idle = contextlib.closing(Bus(BusConfig(listen=(endpoint,), robot="hall/one")))
+    with idle, listening("--connect", endpoint, "--seconds", 0.5) as it:
+        out, _ = it.communicate(timeout=DEADLINE_S)
+    assert it.returncode == 1 and out == "omnid: no pose yet (robots there: hall/one)\n"
+
+
+def received_message(number: int) -> ReceivedMessage:
+    attachment = PoseAttachment(number, "tracking", 0, 50, 60, time.time_ns()).to_bytes()
+    return ReceivedMessage(time.time_ns(), "odom", odometry_at(number), attachment, time.monotonic_ns())
+
+
+def received(*numbers: int) -> RobotState:
+    state = RobotState()
+    for number in numbers:
+        state.process(received_message(number))
+    return state
+
+
+def test_tells_that_the_daemon_has_ended() -> None:
+    endpoint, state = free_endpoint(), received(1)
+    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus, Robot(connect=(endpoint,)) as robot:
+        robot.on_alive(state.set_alive)
+        wait_until(lambda: state.alive is True)
+        bus.close()
+        wait_until(lambda: state.alive is False)
+    state._arrivals_s[-1] -= 10
+    assert "its daemon has ended" in state.state and state.state in next(pose_lines("omnid", state))
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_the_table_holds_no_control_characters_of_messages() -> None:
+    state = received(1, 2)
+    evil = [DiagnosticStatus(WHEELS, 2, "\x1b[2J\nhello", {"sent": "4"}), DiagnosticStatus(BUS, 0, "", {})]
+    state.process(ReceivedMessage(time.time_ns(), "status", codec.diagnostics_cdr(1, evil), b"", 0))
+    terminal = Terminal()
+    print_state("omnid", state, terminal)
+    shown = terminal.getvalue()
+    assert shown.count("\x1b[") == 2 and "wheels" in shown and "hello" in shown
+    assert len(shown.splitlines()) == 6 and "1 sigma 1.0 mm" in shown
+    assert shown.index("wheels") < shown.index("bus"), "the error comes first"
+    assert list(status_table("omnid", RobotState())) == ["omnid: no pose yet"]
+
+
+STOPPED = DiagnosticStatus(WHEELS, 0, "", {Key.DISARMED_BY: DISARMED_BY_STOP})
+CROWD = """
+import json, sys, time, zenoh
+held = []
+while True:
+    config = zenoh.Config()
+    for name, value in (("mode", "client"), ("connect/endpoints", [sys.argv[1]]), ("scouting/multicast/enabled", False),
+                        ("connect/timeout_ms", 1000)):
+        config.insert_json5(name, json.dumps(value))
+    try:
+        held.append(zenoh.open(config))
+    except zenoh.ZError:
+        break
+print("ready", flush=True)
+time.sleep(1000)
+"""
+
+
+@pytest.mark.hazard("H51")
+def test_a_stop_gets_through_when_all_sessions_are_taken(tmp_path: Path) -> None:
+    endpoint, stopped, few = free_endpoint(), [False], tmp_path / "few.json5"
+    few.write_text("{transport: {unicast: {max_sessions: 4}}}")
+    with contextlib.closing(Bus(BusConfig(listen=(endpoint,), config=str(few)))) as bus:
+        commands: list[str] = []
+
+        def execute(request: Request) -> None:
+            commands.append(request.topic)
+            stopped[0] = request.topic == "cmd/stop"
+
+        bus.subscribe_commands(execute, {}, lambda: stopped[0])
+        with script(CROWD, endpoint):
+            assert stop(BusConfig(connect=(endpoint,)))
+    assert set(commands) == {"cmd/stop"}
+
+
+def test_a_status_from_before_the_stop_does_not_confirm_it() -> None:
+    """The robot has kept that of an earlier stop, and was armed since. As behind a router nothing answers datagrams."""
+    endpoint = free_endpoint()
+    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
+        bus.publish("status", codec.diagnostics_cdr(time.time_ns(), [STOPPED]))
+        stops: list[str] = []
+
+        def execute(request: Request) -> None:
+            stops.append(request.topic)
+            if len(stops) == 3:
+                bus.publish("status", codec.diagnostics_cdr(time.time_ns(), [STOPPED]))
+
+        bus.subscribe_commands(execute, {})
+        assert bus._stop_listener is not None
+        bus._stop_listener.close()
+        assert stop(BusConfig(connect=(endpoint,)))
+    assert stops == ["cmd/stop"] * 3, "it is sent again until a new status confirms it"
+
+
+COMMAND_NS = 7
+GOTO = ("goto", "1", "0")
+REPEAT = ("route", "repeat", "hall")
+# The command omnid. Below nohup commands ignore a terminal that closes, those of tests that are run that way, too.
+HEARS_ALL = """import runpy, signal
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
+signal.signal(signal.SIGINT, signal.default_int_handler)
+runpy.run_module("omnid", run_name="__main__")
+"""
+
+
+@pytest.mark.hazard("H25")
+def test_a_silent_robot_is_not_reported_to_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing on a robot watches the program that has asked for a drive: it goes on without the network."""
+    monkeypatch.setattr(navigation, "SILENCE_S", 0.5)
+    endpoint = free_endpoint()
+    shown: list[NavigationReport] = []
+    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
+        publish_driving(bus, COMMAND_NS)
+        with Robot("omnid", endpoint, timeout_s=30.0) as robot, pytest.raises(OmnidError, match="silent") as caught:
+            shown.extend(navigation.reports_of(robot, COMMAND_NS))
+    assert [report.state for report in shown] == ["driving"]
+    assert "it drives on (`omnid stop`" in str(caught.value)
+
+
+def publish_driving(bus: Bus, command_ns: int) -> None:
+    """Publish a report of a drive that a request with this stamp began."""
+    values = {str(Key.STATE): "driving", str(Key.COMMAND_NS): str(command_ns)}
+    entry = DiagnosticStatus(NAVIGATION, 0, "", values)
+    bus.publish("navigation", codec.diagnostics_cdr(time.time_ns(), [entry]))
+
+
+def test_a_drive_that_another_request_replaces_has_ended() -> None:
+    endpoint = free_endpoint()
+    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
+        publish_driving(bus, COMMAND_NS)
+        with Robot("omnid", endpoint, timeout_s=30.0) as robot:
+            stamps_ns = []
+            for report in navigation.reports_of(robot, COMMAND_NS):
+                stamps_ns.append(report.command_ns)
+                publish_driving(bus, COMMAND_NS + 1)
+    assert (stamps_ns[0], stamps_ns[-1]) == (COMMAND_NS, COMMAND_NS + 1)
+
+
+@pytest.mark.hazard("H25")
+@pytest.mark.parametrize("is_answered", [True, False])
+@pytest.mark.parametrize(("words", "number"), [(GOTO, signal.SIGINT), (REPEAT, signal.SIGHUP)])
+def test_a_drive_is_cancelled_when_its_command_is_ended(
+    words: tuple[str, ...], number: signal.Signals, is_answered: bool
+) -> None:
+    """By Ctrl-C, by its terminal that closes, or by a script; also while the robot has not yet answered."""
+    endpoint, asked, cancelled = free_endpoint(), list[str](), list[str]()
+    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
+
+        def take(request: Request) -> None:
+            if request.topic == NAVIGATION_TOPIC:
+                cancelled.append(string_from_cdr(request.payload))
+                bus.answer(request.id, Answer(True, "cancelled"))
+                return
+            if is_answered:
+                bus.answer(request.id, Answer(True, "it drives"))
+            asked.append(request.topic)
+
+        bus.subscribe_commands(take, command_topics(("operator",)))
+        command = [sys.executable, "-c", HEARS_ALL, *words, "--connect", endpoint]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+            wait_until(lambda: len(asked) == 1)
+            time.sleep(0.5)  # it waits for the answer, or for the end of the drive
+            process.send_signal(number)
+            try:
+                process.communicate(timeout=30.0)
+            finally:
+                process.kill()
+        assert cancelled == ["cancel"] and process.returncode == 1
+
+
+LIMITS = VelocityLimits(velocity_mps=1.0, yaw_rate_radps=2.0)
+UP, DOWN, RIGHT, LEFT = b"\x1b[A", b"\x1b[B", b"\x1b[C", b"\x1b[D"
+
+
+@pytest.fixture
+def stick() -> Stick:
+    return Stick(LIMITS, share=0.5)
+
+
+def test_a_motion_lasts_as_long_as_its_key_is_repeated(stick: Stick) -> None:
+    assert stick.twist(0.0) == (0.0, 0.0) and not stick.commands(0.0)
+    stick.press(UP, 10.0)
+    assert stick.twist(10.0 + HOLD_S) == (0.5, 0.0)
+    assert stick.twist(10.01 + HOLD_S) == (0.0, 0.0)
+    assert stick.commands(10.0 + 2 * HOLD_S) and not stick.commands(10.01 + 2 * HOLD_S)
+
+
+def test_the_share_stays_within_the_limits(stick: Stick) -> None:
+    stick.press(b"+" * 50 + UP, 0.0)
+    assert stick.twist(0.0) == (1.0, 0.0)
+    stick.press(b"-" * 50, 0.0)
+    assert 0.0 < stick.twist(0.0)[0] <= 0.1
+
+
+@pytest.mark.parametrize("key", [b" ", b"x", b"\x1b"])
+def test_any_other_key_ends_the_motion(stick: Stick, key: bytes) -> None:
+    stick.press(UP + key, 0.0)
+    assert stick.twist(0.0) == (0.0, 0.0) and stick.commands(0.0)
+    assert stick.stop_asked == (key == b" ")
+
+
+@pytest.mark.parametrize(
+    "parts", [(b"\x1b", b"[A"), (b"\x1b[", b"A"), (b"x\x1b", b"[A"), (b"\x1bOA",), (b"\x1bO", b"A")]
+)
+def test_an_arrow_that_comes_in_parts_or_in_the_other_mode_of_terminals_drives_and_does_not_arm(
+    stick: Stick, parts: tuple[bytes, ...]
+) -> None:
+    for part in parts:
+        stick.press(part, 0.0)
+    assert stick.twist(0.0) == (0.5, 0.0)
+    assert not (stick.arm_asked or stick.quit or stick.stop_asked)
+
+
+@pytest.mark.parametrize("key", [b"\x1b[1;2A", b"\x1bOQ"])
+def test_other_keys_of_several_bytes_end_the_motion_and_mean_nothing_else(stick: Stick, key: bytes) -> None:
+    stick.press(UP + key, 0.0)
+    assert stick.twist(0.0) == (0.0, 0.0)
+    assert not (stick.arm_asked or stick.quit or stick.stop_asked) and stick.share == 0.5
+
+
+@pytest.mark.parametrize("begun", [b"\x1b", b"\x1b[1;"])
+def test_a_stop_after_a_part_of_a_key_is_a_stop(stick: Stick, begun: bytes) -> None:
+    stick.press(UP + begun, 0.0)
+    assert stick.twist(0.0) == (0.0, 0.0), "the key Esc ends the motion"
+    stick.press(b" ", 0.1)
+    assert stick.stop_asked
+
+
+def test_letters(stick: Stick) -> None:
+    stick.press(b"aq", 0.0)
+    assert stick.arm_asked and stick.quit and not stick.stop_asked
+
+
+def test_keys_that_were_typed_while_it_connected_stop_and_arm_and_move_nothing(stick: Stick) -> None:
+    stick.press(UP + b"a ", -math.inf)
+    assert stick.arm_asked and stick.stop_asked
+    assert stick.twist(0.0) == (0.0, 0.0) and not stick.commands(0.0)
