@@ -50,7 +50,6 @@ COMMANDS: Final[Mapping[str, Entry]] = MappingProxyType(
         "drive": Entry("robot:drive", "drive a robot by the keyboard"),
         "goto": Entry("robot:goto", "drive a robot to a pose, around obstacles"),
         "route teach": Entry("robot:teach", "record a route while somebody drives (`omnid drive`, a joystick)"),
-        "route finish": Entry("robot:finish", "end the recording and write the route and the map"),
         "route repeat": Entry("robot:repeat", "drive a route, from where the robot is on it"),
         "route stop": Entry("robot:end_route", "end the repetition, or the recording without a file"),
         "route list": Entry("map:list_routes", "the routes in navigation.routes, here"),

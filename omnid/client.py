@@ -202,7 +202,8 @@ class Robot:
 
         source: one of controller.sources.names, such as "planner"; empty for that of the highest priority.
         """
-        self._time.refresh(wait=True)
+        if not self._time.now_ns:
+            self._time.ask()
         return Driver(self._session, self.name, self._time, source)
 
     def query(self, name: str) -> str:

@@ -15,7 +15,6 @@ from omnid.recordings.evaluation import evaluate
 from omnid.recordings.truth_frame import find_truth_frame
 from omnid.utc import utc
 
-MAX_COLUMN = 60  # Most characters of a topic or a type, so that a line of the table fits a terminal.
 MAX_LINE = 5000  # Most characters of a line: it may contain the path of a file.
 
 
@@ -73,7 +72,7 @@ def _show(found: LogInfo) -> None:
         for name, (kind, count) in found.topics.items()
     ]
     if rows:
-        wide, wide_kind = (min(MAX_COLUMN, max(map(len, column))) for column in list(zip(*rows, strict=True))[:2])
+        wide, wide_kind = (max(map(len, column)) for column in list(zip(*rows, strict=True))[:2])
         print(f"\n{'topic':<{wide}}  {'type':<{wide_kind}}{'messages':>10}{'Hz':>9}")
     for name, kind, count, rate in rows:
         print(f"{name:<{wide}}  {kind:<{wide_kind}}{count:>10}{rate:>9}")

@@ -100,7 +100,6 @@ def teach(args: argparse.Namespace) -> int:
 
     --replace  in the place of a route of that name, which stays until the new one is written; without it an existing
         name is refused
-    --no-wait  end at once: `omnid route finish` writes it
 
     examples:
       route teach morning
@@ -109,10 +108,7 @@ def teach(args: argparse.Namespace) -> int:
     name = route_name(args.name)
     with connected(settings_of(args).bus) as robot:
         granted(robot, robot.driver().route(f"teach {name} replace" if args.replace else f"teach {name}"))
-        if not args.no_wait:
-            return record_until_enter(robot, name)
-    print(f"records {name}: drive it, then `omnid route finish`")
-    return 0
+        return record_until_enter(robot, name)
 
 
 @command(NAME, NO_WAIT, ROBOT, SETTINGS)
@@ -131,16 +127,6 @@ def repeat(args: argparse.Namespace) -> int:
     words = ["repeat", route_name(args.name), *(["reverse"] if args.reverse else [])]
     text = " ".join([*words, f"loops={args.loops}", f"from={vars(args)['from']}"])
     return _drive(args, lambda driver: driver.route(text))
-
-
-@command(ROBOT, SETTINGS)
-def finish(args: argparse.Namespace) -> int:
-    """End the recording and write the route and the map.
-
-    examples:
-      route finish
-    """
-    return ask(args, lambda driver: driver.route("finish"))
 
 
 @command(ROBOT, SETTINGS)

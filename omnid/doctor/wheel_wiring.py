@@ -22,7 +22,6 @@ from omnid.errors import OmnidError
 MOVE_S, REST_S = 1.0, 0.3  # duration of a motion in each direction, and of the rest after it
 ANSWER_S: Final = MOVE_S  # A stop is repeated for this time: a busy computer delays answers by parts of it.
 LEAST_COMMANDS: Final = 2  # Commands of a motion: the driver may send a stop in place of the first one.
-RIGHT_SCALE: Final = 0.03  # difference of the number of turns that is not corrected
 
 BEFORE: Final = """The wheels will turn. Raise the robot so that none of them touches the ground, keep hands and hair
 away from them, and have the emergency stop at hand. The daemon must not run. Ctrl-C stops the wheels. Type yes to
@@ -93,11 +92,11 @@ def tested_drive(
         time.sleep(rest_s)
     while True:
         answer = ask(f"{commanded:.2f} turns were commanded. How many were there (Enter if as many)? ")
+        if not answer:
+            return drive
         with suppress(ValueError):  # no number: ask again
-            found = float(answer.replace(",", ".")) if answer else commanded
-            if 0 < found < math.inf:
-                is_right = abs(found / commanded - 1) <= RIGHT_SCALE
-                return drive if is_right else replace(drive, gear=float(f"{drive.gear * commanded / found:.4g}"))
+            if 0 < (found := float(answer.replace(",", "."))) < math.inf:
+                return replace(drive, gear=float(f"{drive.gear * commanded / found:.4g}"))
 
 
 def _seen(channel: int, motion: Callable[[int], None], ask: Callable[[str], str]) -> Seen:

@@ -31,7 +31,6 @@ from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
 from omnid.messages import FramePair
 
 SAMPLED_COLUMNS: Final = 160  # of the panorama: some thousand samples
-MARGIN_PX: Final = 2.0  # Distance kept from the rim and the hub.
 # Grey levels: the wanted mean, the least mean that bright spots may cause, the level from which those are saturated.
 TARGET, LEAST_MEAN, SATURATED = 100.0, 60.0, 250.0
 # Wanted factors of the light within this one cause no step, so that a step down causes none up; twice as much is the
@@ -57,7 +56,8 @@ class UsefulArea:
     def __init__(self, rig: Rig, cylinder: Cylinder) -> None:
         coarse = cylinder.resized(SAMPLED_COLUMNS)
         sides = [(mounted, remap_tables(rig, mounted, coarse)) for mounted in (rig.lower, rig.upper)]
-        both = np.logical_and(*(visible(mounted, maps, MARGIN_PX) for mounted, maps in sides))
+        # A sample is rounded to a pixel, which may lie beyond rim and hub without a margin of one.
+        both = np.logical_and(*(visible(mounted, maps, 1.0) for mounted, maps in sides))
         # Rows and columns in each image.
         self._pixels = [(v[both].round().astype(np.intp), u[both].round().astype(np.intp)) for _, (u, v) in sides]
 

@@ -58,7 +58,7 @@
     const {lines, log, unit} = JSON.parse(figure.dataset.chart);
     const data = uPlot.join(lines.map(({points}) => [points.map((p) => p[0]), points.map((p) => p[1])]));
     const series = lines.map(({name}, k) => ({
-      label: name || unit || "value", stroke: COLOURS[k], dash: DASHES[k % 3], width: 1.5, points: {show: data[0].length < 40},
+      label: name || unit || "value", stroke: COLOURS[k % COLOURS.length], dash: DASHES[k % 3], width: 1.5, points: {show: data[0].length < 40},
       value: (_, v) => number(v),
     }));
     const chart = new uPlot({

@@ -18,7 +18,6 @@ from omnid.report.page import table
 
 Array = NDArray[np.float64]
 COLUMNS: Final = 400  # of a chart, in each of which the lowest and the highest value are kept
-MAX_CURVES: Final = 6
 
 
 class Curve(NamedTuple):
@@ -40,7 +39,7 @@ def chart(title: str, curves: Sequence[Curve], unit: str = "", *, log: bool = Fa
         return ""
     if unit == "m" and max(np.abs(values).max() for _, _, values in shown) < 0.1:
         unit, shown = "mm", [Curve(name, t_s, 1e3 * values) for name, t_s, values in shown]
-    lines = [{"name": name, "points": thinned(t_s, values)} for name, t_s, values in shown[:MAX_CURVES]]
+    lines = [{"name": name, "points": thinned(t_s, values)} for name, t_s, values in shown]
     data = escape(json.dumps({"lines": lines, "log": log, "unit": unit}, separators=(",", ":")))
     rows = [
         (escape(name), *(f"{value:.4g}" for value in (v[0], v.min(), v.mean(), v.max(), v[-1]))) for name, _, v in shown

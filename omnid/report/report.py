@@ -18,7 +18,7 @@ from drivers.logs.open_log import LogState
 from omnid.config import Config
 from omnid.formats.plan import BLACK, WHITE, Lines, between, draw_ends, draw_plan, drawn_heights, sheet_of
 from omnid.formats.tum import Trajectory
-from omnid.plain_text import plain
+from omnid.plain_text import MOST_ENTRIES, plain
 from omnid.recordings.evaluation import Metrics, associate, evaluate
 from omnid.recordings.recording import DRIVE, TWIST_COMMAND
 from omnid.report.charts import Array, Curve, chart, colours, grid, style_and_script
@@ -41,7 +41,7 @@ from omnid.transport.status_names import (
 from omnid.utc import utc
 from omnid.version import __version__
 
-MAX_EVENTS, MAX_ROWS = 400, 60  # of the table of events, of other tables
+MAX_EVENTS: Final = 400  # of the table of events
 LEVELS: Final = ("", "warning", "error")
 
 
@@ -150,7 +150,7 @@ def _plan(run: RecordedRun, events: Sequence[Event], truth: _Truth | None) -> li
 
     # 3. Losses, start and end.
     losses = [event for event in events if _is_loss(event)]
-    at = np.searchsorted(run.t_s, [event.start_s for event in losses[:MAX_ROWS]])
+    at = np.searchsorted(run.t_s, [event.start_s for event in losses[:MOST_ENTRIES]])
     for x, y in sheet.pixels(xy[at]).astype(int).tolist():
         cv2.drawMarker(image, (x, y), BLACK, cv2.MARKER_TILTED_CROSS, 16, 3)
     draw_ends(image, sheet, xy[0], xy[-1])
@@ -347,7 +347,7 @@ def _settings(run: RecordedRun) -> list[str]:
         given = [(name, value, defaults.get(name, "unknown")) for name, value in _flat(parse_toml(settings.decode()))]
     except (ValueError, RecursionError):
         return [head, note("The attached settings cannot be read.")]
-    changed = [[plain(str(cell), 120) for cell in row] for row in given if row[1] != row[2]][:MAX_ROWS]
+    changed = [[plain(str(cell), 120) for cell in row] for row in given if row[1] != row[2]][:MOST_ENTRIES]
     if not changed:
         return [head, "<p>All settings are at their defaults.</p>"]
     return [head, _words(("setting", "value", "default"), changed)]

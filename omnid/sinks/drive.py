@@ -28,7 +28,7 @@ GRANTED: Final = {
     "goal": "it drives to the goal",
     "path": "it drives along the path",
     "resume": "it goes on",
-    "teach": "it records the route {0}: drive it, then finish it (`omnid route finish`)",
+    "teach": "it records the route {0}: drive it, then finish it",
     "finish": "the route is written",
     "repeat": "it repeats the route {0}",
     "stop": "the route has ended",

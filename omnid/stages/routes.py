@@ -27,7 +27,7 @@ def refusal_of_name(name: str) -> str:
 
 def refusal_while_teaching(name: str) -> str:
     """Return why nothing else can begin while a route is recorded."""
-    return f"the route {name} is being taught: `omnid route finish` writes it, `omnid route stop` drops it"
+    return f"the route {name} is being taught: finish it, or drop it (`omnid route stop`)"
 
 
 class Routes:

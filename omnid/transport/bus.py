@@ -20,10 +20,10 @@ from omnid.engine.threads import Poller
 from omnid.errors import OmnidError
 from omnid.transport import ros2
 from omnid.transport.bus_config import BusConfig, checked
-from omnid.transport.intake import PERIOD_S, QUERY_HZ, CommandIntake, Intake, OpenRequests, RequestCallback, burst_of
+from omnid.transport.intake import PERIOD_S, CommandIntake, Intake, OpenRequests, RequestCallback, burst_of
 from omnid.transport.session import ALIVE, has_receiver, open_session, reason
 from omnid.transport.stop_datagram import StopListener
-from omnid.transport.topics import CLOCK, PUBLISHED, STOP, Request, Topic, plain_key, ros_name
+from omnid.transport.topics import ARM, CLOCK, PUBLISHED, STOP, Request, Topic, command_of, plain_key, ros_name
 
 __all__ = ["Bus", "BusConfig"]
 
@@ -254,9 +254,10 @@ class Bus:
 
     def _declare_queryable(self, session: zenoh.Session, name: str) -> None:
         key = plain_key(self._config.robot, name)
-        queryable = session.declare_queryable(key, zenoh.handlers.RingChannel(burst_of(QUERY_HZ)))
+        rate_hz = command_of(ARM).rate_hz  # as of requests
+        queryable = session.declare_queryable(key, zenoh.handlers.RingChannel(burst_of(rate_hz)))
         self._declared.append(queryable)
-        self._queries[name] = Intake(f"queries for {name}", queryable.try_recv, QUERY_HZ)
+        self._queries[name] = Intake(f"queries for {name}", queryable.try_recv, rate_hz)
 
     def _answer_queries(self) -> None:
         """Answer the queries that have come, and the requests that are decided."""

@@ -43,15 +43,11 @@ class RobotTime:
         for reply in self._session.get(self._key, timeout=QUERY_S):
             self._take(reply)
 
-    def refresh(self, *, wait: bool = False) -> None:
-        """Ask the robot where that is due; wait: for its answer, where it has told nothing yet."""
-        if time.monotonic() - self._asked_s <= QUERY_S:
-            return
-        if wait and self._told is None:
-            self.ask()
-            return
-        self._asked_s = time.monotonic()
-        self._session.get(self._key, self._take, timeout=QUERY_S)
+    def refresh(self) -> None:
+        """Ask the robot where that is due, and do not wait."""
+        if time.monotonic() - self._asked_s > QUERY_S:
+            self._asked_s = time.monotonic()
+            self._session.get(self._key, self._take, timeout=QUERY_S)
 
     @property
     def now_ns(self) -> int:
@@ -106,7 +102,7 @@ class Driver:
     @property
     def connected(self) -> bool:
         """True if a robot subscribes to the commands."""
-        return has_receiver(self._publishers[self._twist])
+        return has_receiver(self._publishers[topics.STOP])
 
     def require_connected(self) -> None:
         """Return as soon as a robot subscribes to the commands. Raise OmnidError after CONNECT_S."""

@@ -25,7 +25,6 @@ from omnid.transport.topics import ARM, MOST_OPEN, STOP, Answer, Request, comman
 T = TypeVar("T")
 RequestCallback: TypeAlias = Callable[[Request], None]
 PERIOD_S: Final = 0.004  # Time between two passes.
-QUERY_HZ: Final = 50.0
 
 
 def burst_of(rate_hz: float) -> int:

@@ -28,7 +28,7 @@ from calib import se3
 from omnid.client import Map, NavigationReport, Robot, Scan, Unreachable
 from omnid.core.mapping.thinned_path import ThinnedPath, Vertex
 from omnid.monitor.robot_state import LEVELS, ReceivedMessage, RobotState, importance
-from omnid.plain_text import MOST_ENTRIES, plain
+from omnid.plain_text import MOST_CHARACTERS, MOST_ENTRIES, plain
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.codec import Diagnostics, Panorama, PlanarPath, Pose, PoseInMap
 from omnid.transport.status_names import CALIBRATION, MAP_FILE, PLACES, WHEELS, Key, short_name
@@ -38,8 +38,6 @@ QUIET_S: Final = 0.5  # The state is sent after this time even without a message
 MOST_POINTS: Final = 4000  # Most points of the path.
 OLDEST_S: Final = 1.0  # age of the newest state that a page may have when it asks for a motion
 LARGEST_MAP_PX: Final = 1024  # edge of the map as it is sent; larger ones are reduced
-LONGEST_VALUE: Final = 100  # characters
-LARGEST: Final = 1 << 26  # bytes of a message: a map of 8,000 x 8,000 cells
 NAVIGATION: Final = "navigation"
 PATH_FRAME: Final = "odom"
 FRAMES: Final = (PATH_FRAME, "map")  # Frames of a map that is drawn.
@@ -153,9 +151,6 @@ class RobotFeed:
 
         def receive(topic: str, payload: bytes, attachment: bytes) -> None:
             """Take a message, in a thread of zenoh."""
-            if len(payload) > LARGEST:
-                self.state.broken += 1
-                return
             if topic in _NEWEST_ONLY:  # in place of one that was not processed yet
                 self._large[topic] = ReceivedMessage(0, topic, payload, attachment, 0)
             else:
@@ -318,7 +313,8 @@ def parts_news(state: RobotState) -> list[dict[str, Any]]:
             "name": short_name(part.name),
             "message": part.message,
             "values": [
-                [key[:LONGEST_VALUE], value[:LONGEST_VALUE]] for key, value in islice(part.values.items(), MOST_ENTRIES)
+                [key[:MOST_CHARACTERS], value[:MOST_CHARACTERS]]
+                for key, value in islice(part.values.items(), MOST_ENTRIES)
             ],
         }
         for name in (CALIBRATION, MAP_FILE)

@@ -13,7 +13,6 @@ from prometheus_client.core import GaugeMetricFamily as Gauge
 from omnid.monitor.robot_state import RobotState
 from omnid.plain_text import MOST_ENTRIES, plain
 from omnid.transport.status_names import number, short_name
-from omnid.web.feed import LONGEST_VALUE
 
 
 def metrics(state: RobotState) -> bytes:
@@ -43,7 +42,7 @@ def _labelled(name: str, text: str, labels: Sequence[str], samples: Iterable[tup
     """Return a metric with a sample for each set of labels; those that come again are left out."""
     found: dict[tuple[str, ...], float] = {}
     for given, value in samples:
-        found.setdefault(tuple(plain(short_name(label))[:LONGEST_VALUE] for label in given), value)
+        found.setdefault(tuple(plain(short_name(label)) for label in given), value)
     metric = Gauge(name, text, labels=labels)
     for given, value in found.items():
         metric.add_metric(given, value)

@@ -29,9 +29,10 @@ from omnid.errors import OmnidError
 from omnid.monitor.navigation import stop
 from omnid.monitor.teleop import FIRST_SHARE, limits_of
 from omnid.transport.driver import ANSWER_S
+from omnid.transport.topics import ROUTE, command_of
 from omnid.web.feed import OLDEST_S, RobotFeed, is_recent, server_ms
 
-LONGEST_BODY: Final = 1024  # more than the longest request has, a route with a name of 64 letters and its options
+LONGEST_BODY: Final = command_of(ROUTE).longest  # bytes
 _NUMBER: Final = r"(-?\d{1,6}(?:\.\d{1,4})?)"
 _GOAL: Final = re.compile(rf"{_NUMBER} {_NUMBER}(?: {_NUMBER})? (\d{{1,15}})")
 _STAMPED: Final = re.compile(r"(.*?)(?: stamp=(\d{1,15}))?", re.DOTALL)
