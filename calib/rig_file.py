@@ -2,8 +2,7 @@
 
 Transforms are stored as T_rig_lower and T_rig_upper (p_rig = T_rig_lower @ p_lower): the poses of the cameras. The
 optional table [covariance] has its own version: see rig.py. The optional table [times] holds the exposure times
-that `omnid calibrate drive` found: upper_delay_s, line_time_s. The table [refined], which earlier versions of
-omnid wrote, is ignored.
+that `omnid calibrate drive` found: upper_delay_s, line_time_s.
 """
 
 from __future__ import annotations
@@ -35,12 +34,8 @@ from calib.validation import read_bytes, require_image_size, transform_of
 SCHEMA: Final = 1  # the first: it rises when an earlier program would misread the file
 COVARIANCE_VERSION: Final = 1  # the same for the table [covariance]
 SIDES: Final = ("lower", "upper")
-LOG_BEGINNINGS: Final = (b"\x89MCAP", b"SQLite format 3", b"#ROSBAG")
-OTHER_CALIBRATIONS: Final = (".yaml", ".yml", ".txt")  # as of Kalibr, OCamCalib
 # Translations are rounded to 1e-12 m: two inversions round differently, and rounding makes the text reproducible.
 TRANSLATION_DECIMALS: Final = 12
-# Signature, length and name of the first chunk, then width and height. Source: PNG 1.2, sections 3.1 and 4.1.1.
-PNG_HEAD: Final = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
 EMBEDDED: Final = "data:image/png;base64,"
 
 # 1. The tables of the file.
@@ -123,7 +118,6 @@ class RigTable(Struct, frozen=True):
     T_base_rig: Matrix | None = None
     times: TimesTable | None = None
     covariance: CovarianceTable | None = None
-    refined: dict[str, Any] | None = None
 
 
 # 2. Reading.
@@ -132,16 +126,7 @@ def read_rig(path: str | os.PathLike[str]) -> Rig:
     path = Path(path)
     if not path.exists():
         raise CalibError(f"{path}: there is no such rig: `omnid calibrate import` or `omnid calibrate rig` makes one")
-    text = read_bytes(path)
-    if text.startswith(LOG_BEGINNINGS):
-        raise CalibError(
-            f"{path}: a log, but a rig.toml was expected: without --rig the one attached to the log is used"
-        )
-    if path.suffix in OTHER_CALIBRATIONS:
-        raise CalibError(
-            f"{path}: a rig.toml was expected: `omnid calibrate import {path} -o rig.toml` makes one of this file"
-        )
-    return parse_rig(text, path.parent, str(path))
+    return parse_rig(read_bytes(path), path.parent, str(path))
 
 
 def parse_rig(text: str | bytes, folder: Path | None = None, name: str = "rig.toml") -> Rig:
@@ -206,13 +191,8 @@ def _mask(path: str, table: MaskTable, size: Size, folder: Path | None) -> Mask:
 
 
 def _mask_image(source: str, size: Size, folder: Path | None) -> NDArray[np.uint8]:
-    """Return the image of a mask (H, W), whose size is that of the camera's images.
-
-    The header's size is checked first, since few bytes of a PNG can describe an image that fills the memory. An
-    embedded image may come with a log of unknown origin: it must be a PNG. A file may have any format of OpenCV.
-    """
-    is_embedded = source.startswith(EMBEDDED)
-    if is_embedded:
+    """Return the image of a mask (H, W), whose size is that of the camera's images."""
+    if source.startswith(EMBEDDED):
         try:
             data = base64.b64decode(source[len(EMBEDDED) :], validate=True)
         except (binascii.Error, ValueError):
@@ -221,23 +201,15 @@ def _mask_image(source: str, size: Size, folder: Path | None) -> NDArray[np.uint
         raise CalibError("expected an embedded image, because there is no folder to read a file from")
     else:
         data = read_bytes(folder / source)
-    if data.startswith(PNG_HEAD):
-        _require_size(size, (int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")))
-    elif is_embedded:
-        raise CalibError("expected a PNG")
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
     except cv2.error:
         image = None
     if image is None:
         raise CalibError("expected an image")
-    _require_size(size, image.shape[::-1])
+    if image.shape[::-1] != size:
+        raise CalibError(f"expected {size} pixels (width, height) like the camera's images, found {image.shape[::-1]}")
     return image.astype(np.uint8, copy=False)
-
-
-def _require_size(size: Size, found: tuple[int, ...]) -> None:
-    if found != size:
-        raise CalibError(f"expected {size} pixels (width, height) like the camera's images, found {found}")
 
 
 def _covariance(table: CovarianceTable, rig: RigTable) -> RigCovariance:

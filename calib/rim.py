@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -31,8 +29,6 @@ SAFETY_PX = 1.5
 # A hub ends within MAX_HUB of the rim's radius, at a ring that is dark (HUB_EDGE_DARK), after rings that are mostly
 # dark (HUB_INSIDE_DARK; a lens glints). Within HUB_RING_PX the dark share drops by HUB_DROP: the world begins.
 MAX_HUB, HUB_RING_PX, HUB_EDGE_DARK, HUB_INSIDE_DARK, HUB_DROP = 0.4, 5, 0.9, 0.65, 0.2
-# Tolerance for a mask that reaches beyond the rim, because masks are also drawn by hand.
-MAX_BEYOND_PX = 4.0
 
 
 def find_rim(image: NDArray[np.uint8], center_guess: tuple[float, float]) -> Mask | None:
@@ -158,28 +154,3 @@ def _hub(image: NDArray[np.uint8], center: tuple[float, float], rim_px: float, t
     edge, beyond = dark[HUB_RING_PX - 1 : -HUB_RING_PX], dark[2 * HUB_RING_PX - 1 :]
     ends = np.flatnonzero((edge >= HUB_EDGE_DARK) & (inside >= HUB_INSIDE_DARK) & (beyond <= edge - HUB_DROP))
     return float(ends[-1] + HUB_RING_PX) if ends.size else 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class RimShift:
-    """The rim found in images, relative to a mask: shift (u, v) of its centre and difference of radii [px]."""
-
-    rim: Mask
-    moved_px: tuple[float, float]
-    wider_px: float
-
-    @property
-    def fits(self) -> bool:
-        """True if the mask contains only the mirror, within the tolerance."""
-        return float(np.hypot(*self.moved_px)) - self.wider_px <= MAX_BEYOND_PX
-
-
-def rim_shift(brightest: NDArray[np.uint8], mask: Mask | None) -> RimShift | None:
-    """Compare the rim in the maximum of several images (H, W) with a mask; None if either is not known."""
-    if mask is None or not np.isfinite(mask.outer_px):
-        return None
-    rim = find_rim(brightest, mask.center)
-    if rim is None:
-        return None
-    moved = (rim.center[0] - mask.center[0], rim.center[1] - mask.center[1])
-    return RimShift(rim, moved, rim.outer_px - mask.outer_px)

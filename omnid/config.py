@@ -32,8 +32,6 @@ from omnid.transport.bus_config import BusConfig
 class LogConfig:
     """Reading of logs."""
 
-    REMOVED = MappingProxyType({"reorder_frames": "images are sorted by their stamps, however late they are in a log"})
-
     rate_hz: Annotated[
         float,
         Meta(ge=0, le=1000),
@@ -53,10 +51,6 @@ class LiveConfig:
     status_s: Annotated[float, Meta(ge=0.1, le=60), "period of the status, s"] = 1.0
 
     cloud_s: Annotated[float, Meta(ge=0, le=3600), "period of the maps on the bus, s; 0: only at the end"] = 2.0
-
-    REMOVED = MappingProxyType(
-        {"shed_load": "a slow computer computes the newest images only; --profile small costs less"}
-    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,8 +137,6 @@ class MappingConfig:
 class ObstaclesConfig:
     """Scan of the nearest obstacles around the base, published as `scan`."""
 
-    REMOVED = MappingProxyType({"ring": "the section is named scan"})
-
     enabled: Annotated[bool, "find obstacles; off: nothing keeps the base from driving against them"] = True
     rate_hz: Annotated[float, Meta(ge=0, le=100), "scans a second at most; 0: one for each pair"] = 10.0
     scan: ScanSettings = field(default_factory=ScanSettings)
@@ -153,8 +145,6 @@ class ObstaclesConfig:
 @dataclass(frozen=True, slots=True)
 class RecordConfig:
     """Recordings of `omnid run`, `omnid record` and `omnid replay --record`."""
-
-    REMOVED = MappingProxyType({"file_mb": "a new file begins at 500 MB"})
 
     enabled: Annotated[bool, "omnid run records images and results"] = False
     images_hz: Annotated[
@@ -190,10 +180,6 @@ class ServiceConfig:
 @dataclass(frozen=True, slots=True)
 class Config:
     """The whole configuration."""
-
-    REMOVED = MappingProxyType(
-        {"camera": "the table [times] of the rig's file has upper_delay_s and line_time_s (`omnid calibrate drive`)"}
-    )
 
     log: LogConfig = field(default_factory=LogConfig)
     cameras: CamerasConfig = field(default_factory=CamerasConfig)

@@ -8,7 +8,6 @@ corners, minus how well they go on beyond that ring, as brickwork and floors do.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
@@ -45,29 +44,20 @@ MIN_SCORE = 0.4
 MIDDLE = np.linspace(0.3, 0.7, 5)
 
 
-@dataclass(frozen=True, slots=True)
-class BoardSearch:
-    """The result for one image: the board's view, or the size (columns, rows) of another grid, (0, 0) for none."""
-
-    view: BoardView | None
-    grid_size: tuple[int, int] = (0, 0)
-
-
-def find_board(image: Image, board: Board, name: str = "", *, thorough: bool = True) -> BoardSearch:
-    """Find the board in an image (H, W) uint8, its corners refined to a fraction of a pixel.
+def find_board(image: Image, board: Board, name: str = "", *, thorough: bool = True) -> BoardView | None:
+    """Find the board in an image (H, W) uint8, its corners refined to a fraction of a pixel; None if there is none.
 
     thorough=False searches the original image only, about 0.1 s per megapixel: for logs with many frames.
     """
     if min(image.shape) < MIN_SIDE_PX:
-        return BoardSearch(None)
-    largest, blurred, has_floor = (0, 0), smoothed(image, BLUR_PX), False
+        return None
+    blurred, has_floor = smoothed(image, BLUR_PX), False
     for searched in derived_images(image) if thorough else islice(derived_images(image), 1):
         # 1. Grow the grids by corners of the image itself. A floor is torn where its squares do not fit together, so a
         #    part of it may look like a board with a few corners too many.
         grids = [grow_grid(blurred, candidate, _most_corners(board)) for candidate in _grids(searched, board)]
         has_floor |= any(len(grid) > (board.columns + 2) * (board.rows + 2) for grid in grids)
         for grid in grids:
-            largest = max(largest, largest_rectangle(grid), key=lambda sides: sides[0] * sides[1])
             is_floor = has_floor and len(grid) > board.columns * board.rows
             windows = [] if is_floor else list(_board_windows(grid, board))
             if not windows:
@@ -78,10 +68,8 @@ def find_board(image: Image, board: Board, name: str = "", *, thorough: bool = T
             share = float(np.isfinite(corners[:, 0]).mean())
             # 3. Accept it by its score.
             if share >= MIN_FILLED and board_score(blurred, corners, board) >= MIN_SCORE:
-                return BoardSearch(BoardView(name, corners, share))
-    # Bricks and letters form a few squares by chance: smaller grids are no boards of another size.
-    is_hint = min(largest) >= 3 and largest[0] * largest[1] >= 12
-    return BoardSearch(None, largest if is_hint else (0, 0))
+                return BoardView(name, corners, share)
+    return None
 
 
 def _refined(image: Image, blurred: Grey, placed: Array, board: Board) -> Array:
@@ -191,20 +179,6 @@ def _board_windows(grid: Grid, board: Board) -> Iterator[Array]:
         isolated &= np.max([row.mean(axis=-1) for row in beyond], axis=0) < BEYOND
         for j, i in np.argwhere(isolated) + 1:
             yield upright[j : j + board.rows, i : i + board.columns]
-
-
-def largest_rectangle(grid: Grid) -> tuple[int, int]:
-    """Return columns and rows of the largest full rectangle in a grid: the size of a board that may be present."""
-    known = np.isfinite(grid_to_array(grid)[..., 0])
-    heights, best = np.zeros(known.shape[1], int), (0, 0)
-    widths = np.arange(1, known.shape[1] + 1)
-    for row in known:
-        heights = np.where(row, heights + 1, 0)
-        for i in np.flatnonzero(heights):
-            lowest = np.minimum.accumulate(heights[i:])
-            width = int(np.argmax(lowest * widths[: len(lowest)])) + 1
-            best = max(best, (width, int(lowest[width - 1])), key=lambda sides: sides[0] * sides[1])
-    return best
 
 
 def orient_corners(image: Grey, corners: Array, board: Board) -> Array:

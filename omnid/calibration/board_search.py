@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Final, Literal
@@ -12,7 +11,7 @@ import numpy as np
 
 from calib.boards.aprilgrid import AprilGrid, find_april_grid
 from calib.boards.board import Board, BoardView
-from calib.boards.checkerboard import BoardSearch, find_board
+from calib.boards.checkerboard import find_board
 from calib.models.ocam import VIEWS, View
 from calib.rim import find_rim
 from calib.validation import silent
@@ -23,49 +22,36 @@ AnyBoard = Board | AprilGrid
 Progress = Callable[[str], None]  # receives the lines that a long calibration reports while it runs
 # A log shows similar views many times: this number of diverse views is as good as all, in a fraction of the time.
 MAX_LOG_VIEWS = 40
+CORNERS_HINT = "count the inner corners, and take images with the whole board in view, sharp and well lit"
 TAGS_HINT = (
     "check --tags and --tag-spacing, and take images with the board nearer (six pixels a bit of its tags), sharp and "
     "well lit"
 )
 
 
-def search_board(image: Image, board: AnyBoard, name: str = "", *, thorough: bool) -> BoardSearch:
+def search_board(image: Image, board: AnyBoard, name: str = "", *, thorough: bool) -> BoardView | None:
     """Search a board of any kind in an image; name: of the view that is found. thorough: see `find_board`."""
     if isinstance(board, Board):
         return find_board(image, board, name, thorough=thorough)
-    return BoardSearch(find_april_grid(image, board, name, thorough=thorough))
+    return find_april_grid(image, board, name, thorough=thorough)
 
 
 def find_boards(images: Images, board: AnyBoard, *, thorough: bool, progress: Progress = silent) -> list[BoardView]:
-    """Find the views of a board in images, on all cores; raises OmnidError if there is none, naming other boards."""
-    views, other_grids = list[BoardView](), Counter[tuple[int, int]]()
-
+    """Find the views of a board in images, on all cores; raises OmnidError if there is none."""
+    views = list[BoardView]()
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         searches = pool.map(lambda name: search_board(images[name], board, name, thorough=thorough), images)
-        for number, (name, search) in enumerate(zip(images, searches, strict=True), 1):
-            outcome, (columns, rows) = "no board", search.grid_size
-            if search.view is not None:
-                views.append(search.view)
-                corners = search.view.pixels[:, 0]
+        for number, (name, view) in enumerate(zip(images, searches, strict=True), 1):
+            outcome = "no board"
+            if view is not None:
+                views.append(view)
+                corners = view.pixels[:, 0]
                 outcome = f"board found, {np.isfinite(corners).sum()} of {len(corners)} corners"
-            elif columns:
-                outcome = f"no board, but a grid of {columns}x{rows}"
-            if columns:
-                other_grids[min(columns, rows), max(columns, rows)] += 1
             progress(f"[{number}/{len(images)}] {name}: {outcome}")
-    if views and max(other_grids.values(), default=0) > len(views):
-        progress(f"the board was found in {len(views)}, {_grid_hint(other_grids)}")
     if not views:
-        hint = _grid_hint(other_grids) if isinstance(board, Board) else TAGS_HINT
+        hint = CORNERS_HINT if isinstance(board, Board) else TAGS_HINT
         raise OmnidError(f"calibrate: no {board} in any of {len(images)} images; {hint}")
     return views
-
-
-def _grid_hint(other_grids: Counter[tuple[int, int]]) -> str:
-    if not other_grids:
-        return "count the inner corners, and take images with the whole board in view, sharp and well lit"
-    (columns, rows), times = other_grids.most_common(1)[0]
-    return f"a grid of {columns}x{rows} was found in {times}: try --corners {columns}x{rows}"
 
 
 def select_diverse_views(views: Sequence[BoardView]) -> list[BoardView]:

@@ -43,9 +43,6 @@ MAX_ROUNDS = 4
 # Relative change of lengths in a round below which no further round is needed: a third of the scale's sigma after a
 # drive (0.3 % in rendered rooms).
 SETTLED = 1e-3
-# Least length of a known distance, so that an error of a centimetre at its ends is negligible. A
-# baseline that would change by more than MAX_SCALE_CHANGE shows a mistake, because a ruler measures it better.
-MIN_DISTANCE_M, MAX_SCALE_CHANGE = 1.0, 0.05
 # Error of the landmarks with the new rig, as a fraction of that with the old one. Free parameters always lower the
 # error a little, so a smaller gain does not show a better rig.
 SMALL_GAIN = 0.95
@@ -72,7 +69,6 @@ class DriveCalibration:
     first_sigma_px: float  # of an observation with the rig as it was
     scale_change: float  # relative change of lengths against the rig before
     structure: tuple[ResidualStructure, ResidualStructure]  # of the residuals in the lower and the upper image
-    level_rad: float  # by which the rig frame was turned into the plane of the drive
     drives: Drives
 
     def __str__(self) -> str:
@@ -103,11 +99,6 @@ class DriveCalibration:
                 f"times of exposure: upper delay {1e3 * times.upper_delay_s:.3g} ms, line time "
                 f"{1e6 * times.line_time_s:.3g} us: in the table [times] of the file, where runs read them"
             )
-        if self.level_rad:
-            lines.append(
-                f"the rig frame was turned by {np.rad2deg(self.level_rad):.2f} deg, so that the drive lies in "
-                "the x-y plane of the base"
-            )
         return lines
 
     @property
@@ -119,29 +110,6 @@ class DriveCalibration:
     def is_misfit(self) -> bool:
         """True if the model leaves more than the noise explains."""
         return any(structure.is_misfit for structure in self.structure)
-
-    @property
-    def distance_m(self) -> float:
-        """The straight distance [m] between the first and the last pair of a single log, with the rig."""
-        T_rig_odom = self.adjustment.state.T_rig_odom
-        T_first_last = T_rig_odom[0] @ se3.inverse(T_rig_odom[-1]) @ self.drives.T_last
-        return float(np.linalg.norm(se3.t_of(T_first_last))) * self.rig.baseline_m / self.before.baseline_m
-
-    def at_distance(self, distance_m: float) -> Rig:
-        """Return the rig with the baseline by a known distance from the first to the last pair; OmnidError if odd."""
-        if self.distance_m < MIN_DISTANCE_M:
-            raise OmnidError(
-                f"--distance-m: the log ends {self.distance_m:.2f} m from its beginning, expected "
-                f"{MIN_DISTANCE_M:.0f} m at least; measure the distance between two stops farther apart"
-            )
-        ratio = distance_m / self.distance_m
-        if abs(ratio - 1) > MAX_SCALE_CHANGE:
-            raise OmnidError(
-                f"--distance-m {distance_m:g}: the log ends {self.distance_m:.3f} m from its beginning by "
-                f"the baseline of {1e3 * self.rig.baseline_m:.1f} mm; which of the two is wrong?"
-            )
-        rig, covariance = rescaled(self.rig, ratio), self.rig.covariance
-        return replace(rig, covariance=covariance and covariance.select(covariance.names[:-1]))
 
 
 def calibrate_drive(
@@ -176,8 +144,8 @@ def calibrate_drive(
         steps = dict(zip(found.parameters.names, found.state.steps.tolist(), strict=True))
         found = _adjusted(parameters, np.array([steps.get(name, 0.0) for name in parameters.names]), drives)
     require_same_rig(parameters, found.state.steps)
-    # 5. The length of the baseline by the prior, the covariance, and a level frame of a nominal rig.
-    adjusted, level_rad = _finished_rig(before, found, drives)
+    # 5. The length of the baseline by the prior, and the covariance.
+    adjusted = _finished_rig(before, found)
     return DriveCalibration(
         before,
         adjusted,
@@ -186,7 +154,6 @@ def calibrate_drive(
         # By the rays of the adjustment, and by the length of the baseline.
         scale_change(found, before) + float(np.log(adjusted.baseline_m / before.baseline_m)),
         (found.structure(0), found.structure(1)),
-        level_rad,
         drives,
     )
 
@@ -248,21 +215,15 @@ def _adjusted(parameters: RigParameters, steps: Array, drives: Drives) -> DriveA
     return adjust_drive(parameters, replace(drives.state, steps=steps), drives.observations, drives.fixed, alike=alike)
 
 
-def _finished_rig(before: Rig, found: DriveAdjustment, drives: Drives) -> tuple[Rig, float]:
-    """Return the rig with baseline and covariance, and the angle [rad] by which a nominal rig's frame was levelled."""
+def _finished_rig(before: Rig, found: DriveAdjustment) -> Rig:
+    """Return the rig with the length of its baseline and its covariance."""
     parameters = found.parameters
     names, units = parameters.rig_names, parameters.units[: len(parameters.rig_names)]
     change = found.state.steps[: len(names)] * units
     covariance = found.covariance[: len(names), : len(names)] * np.outer(units, units)
     baseline_m, matrix = parameters.baseline(change, covariance)
-    rig, level_rad = rescaled(found.rig, baseline_m / before.baseline_m), 0.0
-    if before.covariance is None:
-        ends = (*drives.fixed, drives.keyframes)
-        longest = int(np.argmax(np.diff(ends)))
-        turn = level_turn(rig, found.state.T_rig_odom[ends[longest] : ends[longest + 1]])
-        if turn is not None:
-            rig, level_rad = turned_about_lower(rig, turn), float(np.linalg.norm(se3.rotation_log(turn)))
-    return replace(rig, covariance=RigCovariance.of_matrix([*names, "baseline"], matrix)), level_rad
+    rig = rescaled(found.rig, baseline_m / before.baseline_m)
+    return replace(rig, covariance=RigCovariance.of_matrix([*names, "baseline"], matrix))
 
 
 def _with_times(rig: Rig, kept: tuple[str, ...]) -> Rig:
@@ -282,10 +243,6 @@ def significant_times(found: DriveAdjustment) -> tuple[str, ...]:
         for name, value, sigma in zip(names, values, sigmas, strict=True)
         if name in TIMES and abs(value) > max(MIN_TIME[name], SIGNIFICANT_SIGMAS * sigma)
     )
-
-
-# Least shorter side of a path that determines its plane, and its largest rms distance from that, by this side.
-MIN_EXTENT_M, MAX_ROUGHNESS = 0.3, 0.02
 
 
 def scale_change(found: DriveAdjustment, before: Rig) -> float:
@@ -313,36 +270,6 @@ def rescaled(rig: Rig, ratio: float) -> Rig:
     viewpoint = rig.lower.viewpoint + ratio * (rig.upper.viewpoint - rig.lower.viewpoint)
     R_upper_rig = se3.R_of(rig.upper.T_cam_rig)
     return replace(rig, upper=replace(rig.upper, T_cam_rig=se3.transform(R_upper_rig, -R_upper_rig @ viewpoint)))
-
-
-def level_turn(rig: Rig, T_rig_odom: Array) -> Array | None:
-    """Return the rotation (3, 3) of the rig frame that puts the plane of a path into the x-y plane of the base.
-
-    None where the path (K poses) shows no plane, or one that is too far from the base's.
-    """
-    T_odom_rig = se3.inverse(T_rig_odom)
-    positions = se3.t_of(T_odom_rig)
-    _, sizes, axes = np.linalg.svd(positions - positions.mean(axis=0))
-    sizes = sizes / np.sqrt(len(positions))
-    if 2 * sizes[1] < MIN_EXTENT_M or sizes[2] > MAX_ROUGHNESS * sizes[1]:
-        return None
-    normal = (se3.R_of(T_rig_odom) @ axes[2]).mean(axis=0)
-    R_base_rig = se3.R_of(rig.T_base_rig)
-    up = R_base_rig @ normal / np.linalg.norm(normal)
-    up = up * np.sign(up[2])
-    axis = np.cross(up, [0.0, 0.0, 1.0])
-    angle = float(np.arctan2(np.linalg.norm(axis), up[2]))
-    if angle > 2 * NOMINAL_TURN_RAD:
-        return None
-    turn = se3.rotation_exp(axis * (angle / max(np.linalg.norm(axis), np.finfo(float).tiny)))
-    return np.asarray(R_base_rig.T @ turn @ R_base_rig)
-
-
-def turned_about_lower(rig: Rig, R: Array) -> Rig:
-    """Return the rig with both cameras rotated by R (3, 3) in the rig frame, about the lower viewpoint."""
-    T = se3.transform(R, rig.lower.viewpoint - R @ rig.lower.viewpoint)
-    lower, upper = (replace(m, T_cam_rig=m.T_cam_rig @ se3.inverse(T)) for m in (rig.lower, rig.upper))
-    return replace(rig, lower=lower, upper=upper)
 
 
 # Largest rotation of the upper camera, and of the baseline's direction, against a measured rig. A nominal rig does not

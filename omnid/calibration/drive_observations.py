@@ -50,7 +50,6 @@ class Drives:
     state: DriveState  # without steps of the rig
     observations: DriveObservations
     fixed: tuple[int, ...]  # the first keyframe of each drive
-    T_last: Array  # (4, 4) pose of the last pair in the frame of the last keyframe
 
     @property
     def keyframes(self) -> int:
@@ -77,7 +76,7 @@ def collect(logs: Sequence[Path], rig: Rig, cameras: LogCameras, config: Config)
         np.concatenate([getattr(state, name) for state in states]) for name in ("points", "twist", "upper_delay_s")
     )
     state = DriveState(T_rig_odom, points, twist, upper_delay_s, np.zeros(0))
-    return Drives(state, observations, tuple(keyframes[:-1].tolist()), parts[-1].T_last)
+    return Drives(state, observations, tuple(keyframes[:-1].tolist()))
 
 
 def observe_pairs(pairs: Sequence[FramePair], rig: Rig, config: Config) -> tuple[DriveState, DriveObservations]:
@@ -110,23 +109,23 @@ def _drive(log: Path, place: Geometry, cameras: LogCameras, config: Config, most
     front_end = FrontEnd(place, config, RigHealth(place.cylinder, "warn"))
     landmarks = DriveLandmarks(place.model(NOISE_PX))
     T_rig_odom, twists, delays_s = list[Array](), list[Array](), list[float]()
-    T_newest, since = np.eye(4), 0
+    since = 0
     with closing(open_log(log, cameras, place.rig)) as reader:
         # So many pairs at least lie between two keyframes that there are not too many.
         apart = max(1, -(-(reader.pair_estimate() or 0) // most))
         for before, update, after in _with_neighbours(tracked_updates(reader, front_end, config, log)):
             # 1. Choose the poses that are far enough apart to add information.
-            T_newest, since = update.T_odom_rig, since + 1
+            T_odom_rig, since = update.T_odom_rig, since + 1
             if T_rig_odom:
-                moved = se3.log(T_rig_odom[-1] @ T_newest)
+                moved = se3.log(T_rig_odom[-1] @ T_odom_rig)
                 still = np.linalg.norm(moved[:3]) < KEYFRAME_M and np.linalg.norm(moved[3:]) < KEYFRAME_RAD
                 if still or since < apart or update.state is TrackingState.LOST:
                     continue
             since = 0
             # 2. Follow the landmarks to this keyframe.
             seen, disparity = update.depth.panoramas, front_end.dense.of(update.depth).disparity
-            landmarks.add(View(seen.lower, seen.upper, seen.visible, disparity, T_newest @ place.T_rig_rect))
-            T_rig_odom.append(se3.inverse(T_newest))
+            landmarks.add(View(seen.lower, seen.upper, seen.visible, disparity, T_odom_rig @ place.T_rig_rect))
+            T_rig_odom.append(se3.inverse(T_odom_rig))
             # 3. Its motion: the twist per second from the pose before to the one after, in the rig frame.
             span_s = 1e-9 * (after.stamp_ns - before.stamp_ns)
             step = se3.log(se3.inverse(before.T_odom_rig) @ after.T_odom_rig)
@@ -138,9 +137,8 @@ def _drive(log: Path, place: Geometry, cameras: LogCameras, config: Config, most
     pixels = image_pixels(found, place.rig, place.cylinder)
     observations = DriveObservations(found.keyframe, found.landmark, found.camera, pixels)
     observations, used = observations.only(np.asarray(np.isfinite(pixels).all(axis=1)))
-    poses, points = np.array(T_rig_odom), found.points[used]
-    state = DriveState(poses, points, np.array(twists), np.array(delays_s), np.zeros(0))
-    return Drives(state, observations, (0,), poses[-1] @ T_newest)
+    state = DriveState(np.array(T_rig_odom), found.points[used], np.array(twists), np.array(delays_s), np.zeros(0))
+    return Drives(state, observations, (0,))
 
 
 def _with_neighbours(

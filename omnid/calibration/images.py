@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-import math
-from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -17,12 +14,11 @@ from numpy.typing import NDArray
 
 from calib.rig import Rig
 from drivers.errors import DriverError, FrameDecodeError
-from drivers.frame import CAMERAS, MAX_PIXELS, Frame, gray, upper_eight_bits
+from drivers.frame import MAX_PIXELS, Frame, gray, upper_eight_bits
 from drivers.logs.image_folder import IMAGE_SUFFIXES, image_folders
 from drivers.logs.log_reader import LogCameras, LogReader
 from drivers.logs.open_log import is_log_name
 from omnid.errors import OmnidError
-from omnid.stages.synchronise import image_loss
 
 Image = NDArray[np.uint8]
 # By name, all of one size.
@@ -43,7 +39,6 @@ class PairedImages:
     sides: tuple[Images, Images]
     topics: tuple[str, str] = ("", "")
     notes: tuple[str, ...] = ()  # about images that were left out, and faults of a log
-    loss: str = ""  # one line where more than a tenth of a log's images make no pair
 
     @property
     def names(self) -> list[str]:
@@ -62,35 +57,50 @@ def read_pairs(source: Path, cameras: LogCameras = BY_NAME) -> PairedImages:
     if source.is_dir():  # a folder of a log's files, or of folders of images, one for each camera
         has_folders = not any(source.glob(f"{SIDES[0]}_*")) and len(image_folders(source)) > 1
         of_log |= has_folders or any(is_log_name(path.name) for path in source.iterdir())
-    if not of_log and (cameras.lower or cameras.upper):
-        raise OmnidError(f"{source}: only a log has topics; found a folder of images")
-    faults, loss = tuple[str, ...](), ""
+    faults, topics = list[str](), ("", "")
     if of_log:
         with closing(cameras.reader(source)) as reader:
-            read, images = decoded_pairs(reader)
+            sides = _of_log(reader, faults)
             topics = reader.topics["lower"], reader.topics["upper"]
-        lower, upper = ({f"pair{number:05d}": pair[side] for number, pair in images.items()} for side in (0, 1))
-        sides, faults, loss = (lower, upper), tuple(read.notes), read.loss
+    elif cameras.lower or cameras.upper:
+        raise OmnidError(f"{source}: only a log has topics; found a folder of images")
+    elif source.is_dir():
+        sides = _of_side(source, SIDES[0], cameras.bits), _of_side(source, SIDES[1], cameras.bits)
     else:
-        if not source.is_dir():
-            raise OmnidError(
-                f"{source}: expected a log (.mcap, .db3, .bag) or a folder with images lower_*, upper_*; "
-                f"found {'a file' if source.exists() else 'no such file or folder'}"
-            )
-        sides, topics = (_of_side(source, SIDES[0], cameras.bits), _of_side(source, SIDES[1], cameras.bits)), ("", "")
+        raise OmnidError(
+            f"{source}: expected a log (.mcap, .db3, .bag) or a folder with images lower_*, upper_*; "
+            f"found {'a file' if source.exists() else 'no such file or folder'}"
+        )
     if not sides[0].keys() & sides[1].keys():
-        counts = [len(side) for side in sides]
         expected = "pairs like lower_001.png and upper_001.png"
         if of_log:
-            counts, expected = list(read.arrived), f"images whose stamps differ by less than {TOLERANCE_NS // 10**6} ms"
-        counted = ", ".join(f"{count} of the {name} camera" for name, count in zip(SIDES, counts, strict=True))
-        found = "; ".join([f"found {counted}", *faults])
-        raise OmnidError(f"{source}: no pair of images: expected {expected}, {found}")
+            expected = f"images whose stamps differ by less than {TOLERANCE_NS // 10**6} ms"
+        raise OmnidError("; ".join([f"{source}: no pair of images: expected {expected}", *faults]))
     # 2. Leave out those that repeat an earlier instant.
     repeated = _repeats(sides)
     kept = [{name: image for name, image in side.items() if name not in repeated} for side in sides]
     notes = tuple(f"left out {name}: the same image as {earlier}" for name, earlier in repeated.items())
-    return PairedImages((kept[0], kept[1]), topics, (*faults, *([loss] if loss else []), *notes), loss)
+    return PairedImages((kept[0], kept[1]), topics, (*faults, *notes))
+
+
+def _of_log(reader: LogReader, faults: list[str]) -> tuple[Images, Images]:
+    """Return the images of both cameras by the names of their pairs, all of one size; add what is wrong to faults."""
+    lower, upper, left_out = Images(), Images(), list[str]()
+    for number, *frames in spread_pairs(reader, LOG_PAIRS, TOLERANCE_NS):
+        try:
+            pair = gray(frames[0]), gray(frames[1])
+        except FrameDecodeError as error:
+            left_out.append(str(error))
+            continue
+        usual = [next(iter(side.values()), image).shape for side, image in zip((lower, upper), pair, strict=True)]
+        if [image.shape for image in pair] != usual:
+            left_out.append("images of another size")
+            continue
+        lower[f"pair{number:05d}"], upper[f"pair{number:05d}"] = pair
+    faults += reader.warnings
+    if left_out:
+        faults.append(f"left out {len(left_out)} pairs; the first: {left_out[0]}")
+    return lower, upper
 
 
 def _repeats(sides: Sequence[Images]) -> dict[str, str]:
@@ -141,62 +151,15 @@ def _read(path: Path, bits: int) -> Image:
     return np.ascontiguousarray(image if image.dtype == np.uint8 else upper_eight_bits(image, bits), np.uint8)
 
 
-class LogPairs(NamedTuple):
-    """What of a log's pairs is not used."""
-
-    loss: str  # one line where more than a tenth of the images make no pair
-    notes: list[str]  # of the reader, and about pairs that were left out
-    arrived: tuple[int, ...]  # images of the lower and the upper camera
-
-
-def decoded_pairs(reader: LogReader, *, keep: bool = True) -> tuple[LogPairs, dict[int, tuple[Image, Image]]]:
-    """Return the pairs of a log, of which up to twice LOG_PAIRS are decoded: number -> images of both cameras.
-
-    keep: return these. What is lost is counted as in a run: of all images without a partner, and of those that were
-    decoded.
-    """
-    # 1. Stamps of all images. In a run a pair may differ by half a period.
-    frames = [replace(frame, data=b"") for frame in reader.frames()]
-    stamps = {camera: [frame.stamp_ns for frame in frames if frame.camera == camera] for camera in CAMERAS}
-    periods = {camera: float(np.median(np.diff(own))) if len(own) > 1 else math.nan for camera, own in stamps.items()}
-    within_ns = max([TOLERANCE_NS, *(period / 2 for period in periods.values() if period > 0)])
-    joined = sum(1 for _ in paired(iter(frames), within_ns))
-    arrived = {camera: len(own) for camera, own in stamps.items()}
-    unpaired = {camera: count - joined for camera, count in arrived.items()}
-    stride = max(1, sum(1 for _ in paired(iter(frames))) // LOG_PAIRS)
-    # 2. Images of some pairs; those of another size than most are of no use.
-    images, faults = dict[int, tuple[Image, Image]](), list[str]()
-    sizes = Counter[tuple[tuple[int, ...], ...]]()
-    for number, (lower, upper) in enumerate(paired(reader.frames())):
+def spread_pairs(reader: LogReader, most: int, tolerance_ns: float) -> Iterator[tuple[int, Frame, Frame]]:
+    """Yield number, lower and upper frame of at most so many pairs, evenly spread over a log, undecoded."""
+    stride = max(1, -(-sum(1 for _ in _paired(reader.frames(), tolerance_ns)) // most))
+    for number, (lower, upper) in enumerate(_paired(reader.frames(), tolerance_ns)):
         if number % stride == 0:
-            try:
-                pair = gray(lower), gray(upper)
-            except FrameDecodeError as error:
-                faults.append(str(error))
-                continue
-            sizes[pair[0].shape, pair[1].shape] += 1
-            images |= {number: pair} if keep else {}
-    usual, count = sizes.most_common(1)[0] if sizes else ((), 0)
-    images = {number: pair for number, pair in images.items() if (pair[0].shape, pair[1].shape) == usual}
-    others = sizes.total() - count
-    # 3. What is lost.
-    loss = image_loss(
-        reader.counts,
-        arrived,
-        unpaired,
-        periods,
-        undecodable=2 * len(faults) * stride,
-        other_size=2 * others * stride,
-    )
-    notes = list(reader.warnings)
-    if faults:
-        notes.append(f"left out {len(faults)} pairs with an image that cannot be decoded; the first: {faults[0]}")
-    if others:
-        notes.append(f"left out {others} pairs with an image of another size than most")
-    return LogPairs(loss, notes, tuple(arrived.values())), images
+            yield number, lower, upper
 
 
-def paired(frames: Iterator[Frame], tolerance_ns: float = TOLERANCE_NS) -> Iterator[tuple[Frame, Frame]]:
+def _paired(frames: Iterator[Frame], tolerance_ns: float) -> Iterator[tuple[Frame, Frame]]:
     """Yield pairs of lower and upper frames with nearly equal stamps, from frames in order of stamps, undecoded."""
     waiting: Frame | None = None
     for frame in frames:

@@ -137,7 +137,7 @@ class LiveBoards:
         """
         # 1. Search the board.
         self._update_rims(images)
-        lower, upper = self._pool.map(lambda image: search_board(image, self._board, thorough=False).view, images)
+        lower, upper = self._pool.map(lambda image: search_board(image, self._board, thorough=False), images)
         before, self._before, self.views = self._before, (lower, upper), (lower, upper)
         # 2. Leave out what says nothing new.
         if lower is None and upper is None:

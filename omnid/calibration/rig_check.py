@@ -12,10 +12,9 @@ import numpy as np
 
 from calib.fit.rig_drift import apply_drift
 from calib.rig import Rig
-from calib.rim import RimShift, rim_shift
 from drivers.logs.log_reader import LogCameras
 from omnid.calibration.drive_observations import tracked_updates
-from omnid.calibration.images import SIDES, TOLERANCE_NS, brightest, open_log, paired
+from omnid.calibration.images import TOLERANCE_NS, open_log, spread_pairs
 from omnid.config import Config, PanoramaConfig
 from omnid.core.rig.column_finding import (
     DRIFTED_PX,
@@ -53,18 +52,16 @@ NOT_OBSERVABLE = (
 
 @dataclass(frozen=True, slots=True)
 class RigCheckResult:
-    """Result of the check: columns of both panoramas, and the rims of the lower and the upper mirror if found."""
+    """Result of the check by the columns of both panoramas."""
 
     finding: RigFinding
-    rims: tuple[RimShift | None, RimShift | None]
     pairs: int  # that were compared
     skew_s: float  # median time from the lower camera's exposure to the upper one's
 
     @property
     def state(self) -> RigState:
-        """The state by the columns; a rig that fits has drifted if a rim has moved."""
-        fits = all(rim is None or rim.fits for rim in self.rims)
-        return RigState.DRIFTED if self.finding.state is RigState.FITS and not fits else self.finding.state
+        """The state by the columns."""
+        return self.finding.state
 
     @property
     def skewed(self) -> str:
@@ -104,17 +101,6 @@ class RigCheckResult:
                 f"remaining offset of the columns: {finding.left_px:.2f} px or less in half of all directions",
             ]
             lines += [RECALIBRATE] * self.has_changed_intrinsics
-        for name, rim in zip(SIDES, self.rims, strict=True):
-            if rim is None:
-                lines.append(f"{name} rim: not compared, as the mask or the rim in the images is not known")
-                continue
-            fits = "the mask fits"
-            if not rim.fits:
-                fits = "the mask reaches beyond the mirror: it was drawn so, or the camera has moved"
-            lines.append(
-                f"{name} rim: centre moved by {rim.moved_px[0]:+.1f} {rim.moved_px[1]:+.1f} px from the mask's, radius "
-                f"{rim.wider_px:+.1f} px: {fits}"
-            )
         if self.skewed:
             lines.append(f"{self.skewed}: the motion in between, as the odometry sees it, is allowed for")
         return "\n".join(lines)
@@ -162,15 +148,13 @@ def read_rig_pairs(log: Path, rig: Rig, cameras: LogCameras) -> list[FramePair]:
     """
     decode, found = Decoder(rig), list[FramePair]()
     with closing(open_log(log, cameras, rig)) as reader:
-        stamps = {camera: [frame.stamp_ns for frame in reader.frames() if frame.camera == camera] for camera in SIDES}
-        steps = [step for own in stamps.values() for step in np.diff(sorted(own)).tolist() if step > 0]
-        within_ns = max(TOLERANCE_NS, float(np.median(steps)) / 2 if steps else 0.0)
-        stride = max(1, (min(map(len, stamps.values())) - 1) // PAIRS + 1)
-        for number, (lower, upper) in enumerate(paired(reader.frames(), within_ns)):
-            images = (decode(lower), decode(upper)) if number % stride == 0 else (None, None)
-            if images[0] is not None and images[1] is not None:
-                skew_s = (upper.stamp_ns - lower.stamp_ns) * 1e-9
-                found.append(FramePair(number, lower.stamp_ns, images[0], images[1], skew_s))
+        lower_ns = [frame.stamp_ns for frame in reader.frames() if frame.camera == "lower"]
+        period_ns = float(np.median(np.diff(lower_ns))) if len(lower_ns) > 1 else 0.0
+        for number, *frames in spread_pairs(reader, PAIRS, max(TOLERANCE_NS, period_ns / 2)):
+            lower, upper = map(decode, frames)
+            if lower is not None and upper is not None:
+                skew_s = (frames[1].stamp_ns - frames[0].stamp_ns) * 1e-9
+                found.append(FramePair(number, frames[0].stamp_ns, lower, upper, skew_s))
     if not found:
         raise OmnidError(
             "calibrate drive: no pair of images in the log; "
@@ -185,11 +169,8 @@ def check_rig(pairs: Sequence[FramePair], rig: Rig, config: PanoramaConfig) -> R
     dewarp = Dewarp(rectification, config)
     seen = map(dewarp.process, pairs)
     found = [match(panoramas.lower, panoramas.upper, panoramas.visible) for panoramas in seen]
-    rims = tuple(
-        rim_shift(brightest(getattr(pair, side) for pair in pairs), mounted.mask) for side, mounted in rig.sides
-    )
     skew_s = float(np.median([pair.skew_s for pair in pairs]))
-    return RigCheckResult(judge(together(found), rectification.cylinder), (rims[0], rims[1]), len(pairs), skew_s)
+    return RigCheckResult(judge(together(found), rectification.cylinder), len(pairs), skew_s)
 
 
 def moving_rig_finding(log: Path, rig: Rig, cameras: LogCameras, config: Config) -> RigFinding:

@@ -10,7 +10,7 @@ from calib.rig import Rig
 from calib.rig_file import read_rig, write_rig
 from omnid.calibration.drive import calibrate_drive
 from omnid.calibration.from_log import calibrate_height, calibrate_mask
-from omnid.calibration.images import decoded_pairs, open_log
+from omnid.calibration.images import open_log
 from omnid.calibration.rig_check import check_log, with_upper_corrected
 from omnid.commands.options import HEIGHT, LOG_CAMERAS, command, failed, height_of, log_cameras, warn
 from omnid.core.rig.column_finding import RigState
@@ -25,8 +25,8 @@ def run(args: argparse.Namespace) -> int:
     """Adjust all parameters of a rig to drives with turns, without a board.
 
     Then find the height of the cameras, if the rig states none, and what is fixed to them, where the first log shows
-    it. Exit code 1: the rig has drifted (--only check), the ruler contradicts, nothing was found that could be written,
-    or a tenth of the images made no pair.
+    it. Exit code 1: the rig has drifted (--only check), the ruler contradicts, or nothing was found that could be
+    written.
 
     logs LOG...        drives with turns; 100 to 350 pairs
     --rig FILE         the rig.toml to start from; a nominal one will do: mirror data sheet, centre of the images,
@@ -34,8 +34,6 @@ def run(args: argparse.Namespace) -> int:
     --only check|height|mask...  only this, by the first log; may be repeated. check: compare the rig with the images,
         and correct the upper camera's pose; height: height and tilt of the cameras by the floor; mask: hide what is
         fixed to the cameras, by a log in which the robot turns once
-    --distance-m M 0.001..  straight distance from the first to the last image of a single log: sets the baseline's
-        length, which is kept otherwise
     --ruler-m M 0.1..10     the height by ruler, as a check of that by the floor
     -o, --output FILE  the rig.toml to write; may be the file of --rig
 
@@ -45,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
       calibrate drive drive.mcap --only height --ruler-m 0.92 --rig rig.toml -o rig.toml
     """
     _check(args)
-    start, is_lossy = _start(args)
+    start = _start(args)
     prepare_kernels()
     # 1. Check the rig, or adjust all of it.
     rig, has_drifted = start, False
@@ -65,50 +63,32 @@ def run(args: argparse.Namespace) -> int:
         write_rig(args.output, rig)
         print(f"{args.output}: written, {height_of(rig)}")
     is_found = rig is not start or bool(args.only)
-    return 0 if is_found and not has_drifted and not is_lossy else 1
+    return 0 if is_found and not has_drifted else 1
 
 
 def _check(args: argparse.Namespace) -> None:
     if args.output is not None:
         check_outputs([("--output", args.output)], [("the log that is read", log) for log in args.logs])
-    if args.distance_m is not None:
-        if len(args.logs) > 1:
-            raise OmnidError(f"--distance-m is the length of one drive; found {len(args.logs)} logs")
-        if args.only:
-            raise OmnidError("--distance-m sets the length of the baseline, which --only leaves as it is")
 
 
-def _start(args: argparse.Namespace) -> tuple[Rig, bool]:
-    """Return the rig to start from, and whether many images of a log make no pair; print the faults of the logs."""
-    start, is_lossy = None if args.rig is None else read_rig(args.rig), False
-    for log in args.logs:
-        with closing(open_log(log, log_cameras(args), start)) as reader:
-            start = start or attached_rig(reader, log)
-            found, _ = decoded_pairs(reader, keep=False)
-        for line in filter(None, (*found.notes, found.loss)):
-            warn(f"{log}: {line}")
-        is_lossy |= bool(found.loss)
-    assert start is not None, "there is a log"
-    return start, is_lossy
+def _start(args: argparse.Namespace) -> Rig:
+    """Return the rig to start from: that of --rig, else the one attached to the first log."""
+    if args.rig is not None:
+        return read_rig(args.rig)
+    with closing(open_log(args.logs[0], log_cameras(args), None)) as reader:
+        return attached_rig(reader, args.logs[0])
 
 
 def _adjusted(args: argparse.Namespace, rig: Rig) -> Rig:
     """Return the rig that fits the drives best; the same one if none fits them better."""
     found = calibrate_drive(args.logs, rig, log_cameras(args), lambda line: print(line, file=sys.stderr))
     print("\n".join(found.lines()))
-    if not found.is_better and not args.distance_m:
+    if not found.is_better:
         print(f"{args.rig or 'the attached rig'} fits these drives as well as any rig")
         return rig
     if found.is_misfit:
         warn("the model does not describe these cameras; calibrate with a board, and check the mirrors")
-    if not args.distance_m:
-        return found.rig
-    scaled = found.at_distance(args.distance_m)
-    print(
-        f"baseline {1e3 * found.rig.baseline_m:.2f} mm -> {1e3 * scaled.baseline_m:.2f} mm by the known distance "
-        f"({found.distance_m:.3f} m before)"
-    )
-    return scaled
+    return found.rig
 
 
 def _checked(args: argparse.Namespace, rig: Rig) -> tuple[Rig, bool]:

@@ -9,6 +9,7 @@ import select
 import sys
 import termios
 import time
+import tomllib
 import tty
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,7 +17,6 @@ from dataclasses import dataclass, field
 from io import DEFAULT_BUFFER_SIZE
 from typing import Final
 
-from calib.typed_toml import parse_toml
 from omnid.client import CONNECT_S, Diagnostics, Driver, Robot
 from omnid.core.control.heading_controller import VelocityLimits
 from omnid.engine.logging_setup import HANDLER
@@ -119,7 +119,7 @@ def teleoperate(bus: BusConfig) -> int:
 def limits_of(robot: Robot) -> VelocityLimits:
     """Return the limits in the robot's configuration; the defaults where it does not answer."""
     try:
-        found = parse_toml(robot.query("config"))["controller"]["limits"]
+        found = tomllib.loads(robot.query("config"))["controller"]["limits"]
         return VelocityLimits(velocity_mps=float(found["velocity_mps"]), yaw_rate_radps=float(found["yaw_rate_radps"]))
     except (ValueError, KeyError, TypeError):
         return VelocityLimits()

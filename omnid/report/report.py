@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from itertools import pairwise
@@ -13,7 +14,6 @@ import cv2
 import numpy as np
 
 from calib import se3
-from calib.typed_toml import parse_toml
 from drivers.logs.open_log import LogState
 from omnid.config import Config
 from omnid.formats.plan import BLACK, WHITE, Lines, between, draw_ends, draw_plan, drawn_heights, sheet_of
@@ -343,8 +343,10 @@ def _settings(run: RecordedRun) -> list[str]:
     if settings is None:
         return [head, note("No settings are attached.")]
     try:
-        defaults = dict(_flat(parse_toml(dump(Config()))))
-        given = [(name, value, defaults.get(name, "unknown")) for name, value in _flat(parse_toml(settings.decode()))]
+        defaults = dict(_flat(tomllib.loads(dump(Config()))))
+        given = [
+            (name, value, defaults.get(name, "unknown")) for name, value in _flat(tomllib.loads(settings.decode()))
+        ]
     except (ValueError, RecursionError):
         return [head, note("The attached settings cannot be read.")]
     changed = [[plain(str(cell), 120) for cell in row] for row in given if row[1] != row[2]][:MOST_ENTRIES]

@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from itertools import pairwise
-from typing import TYPE_CHECKING, Annotated, ClassVar, Final, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeAlias
 
 import numpy as np
 from msgspec import Meta, Struct
@@ -101,7 +101,6 @@ class Space(Struct, frozen=True):
     ceiling_m: Annotated[float, Meta(ge=1.5, le=20.0)] = CEILING_M
     floor: Painted = "tiles"
     ceiling: Painted = "tiles"
-    REMOVED: ClassVar[dict[str, str]] = {"finish": "floors are matt"}
 
     @property
     def sides_m(self) -> Point:

@@ -170,7 +170,7 @@ REMARKS = ("Wrong counts also each board that is found where there is none.",)
 
 def found_corners(image: Image, board: Board) -> Array | None:
     """Return the corners (N, 2) [px] that omnid finds, NaN if hidden; None without a board."""
-    view = find_board(image, board).view
+    view = find_board(image, board)
     return None if view is None else view.pixels
 
 

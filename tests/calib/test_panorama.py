@@ -11,8 +11,10 @@ import pytest
 from calib import se3
 from calib.errors import CalibError
 from calib.models.camera import Mask
+from calib.models.unified import UnifiedCamera
 from calib.panorama import Cylinder, fit_cylinder, remap_tables, visible
 from calib.rig import MountedCamera, Rig
+from tests.limited import run_limited
 from tests.simulation.rigs import R_RIG_AHEAD, lens, lens_rig
 
 # Widest step at which a sector begins or ends, and what misaligned cameras and the corners of an image add or take.
@@ -91,3 +93,40 @@ def test_lenses_back_to_back_side_by_side_need_a_shared_ring(field_deg: float, i
         shared = field_deg - 180
         with pytest.raises(CalibError, match=rf"share {shared - 1}\.\d degrees of elevation.*back to back"):
             fit_cylinder(rig)
+
+
+def enlarged(rig: Rig, factor: float) -> Rig:
+    """Return the rig with images that are larger and have the same field of view."""
+    mounted = []
+    for side in (rig.lower, rig.upper):
+        camera = side.camera
+        assert isinstance(camera, UnifiedCamera)
+        width, height = (round(side_px * factor) for side_px in camera.size)
+        focal, center = (tuple(factor * value for value in values) for values in (camera.focal, camera.center))
+        larger = UnifiedCamera(
+            camera.xi, (focal[0], focal[1]), (center[0], center[1]), (width, height), camera.distortion
+        )
+        mounted.append(MountedCamera(larger, side.T_cam_rig))
+    return Rig(mounted[0], mounted[1])
+
+
+@pytest.mark.parametrize(("factor", "reason"), [(11, "16384 columns"), (1e30, "columns")])
+def test_refuses_a_rig_that_asks_for_a_huge_panorama(omni_rig: Rig, factor: float, reason: str) -> None:
+    with pytest.raises(CalibError, match=reason) as caught:
+        fit_cylinder(enlarged(omni_rig, factor))
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 400
+
+
+TABLES = """
+from tests.calib.conftest import misaligned, omni_cameras
+from calib.panorama import Cylinder, remap_tables
+rig = misaligned(*omni_cameras())
+u, v = remap_tables(rig, rig.lower, Cylinder(4096, 1500, 700.0))
+print(u.shape)
+"""
+
+
+def test_tables_take_little_more_memory_than_they_need(omni_rig: Rig) -> None:
+    """6 million pixels: 49 MB of tables; all at once the projection would take more than 1 GB."""
+    printed, memory_mb = run_limited(TABLES)
+    assert printed == "(1500, 4096)" and memory_mb < 250

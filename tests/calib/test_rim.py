@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from calib.models.camera import Mask
-from calib.rim import find_rim, rim_shift
+from calib.rim import find_rim
 
 Image = NDArray[np.uint8]
 CENTER, RADIUS = (391.3, 377.6), 340.7
@@ -86,18 +86,3 @@ def test_finds_the_rim_of_a_real_mirror(shared_data: Path) -> None:
     rings = np.array([(*mask.center, mask.inner_px, mask.outer_px) for mask in masks])
     assert (np.ptp(rings, axis=0) < (1.0, 1.0, 3.0, 0.6)).all()
     np.testing.assert_allclose(rings.mean(axis=0), (516.7, 384.1, 79.0, 451.7), atol=1.0)
-
-
-@pytest.mark.parametrize(
-    ("moved", "radius", "fits"),
-    [((0.0, 0.0), 100.0, True), ((8.0, 3.0), 100.0, False), ((0.0, 0.0), 94.0, False), ((2.0, 0.0), 110.0, True)],
-)
-def test_detects_a_moved_rim(moved: tuple[float, float], radius: float, fits: bool) -> None:
-    v, u = np.indices((260, 260))
-    center = (130.0 + moved[0], 128.0 + moved[1])
-    grey = np.random.default_rng(0).integers(120, 200, (260, 260))
-    image = np.where(np.hypot(u - center[0], v - center[1]) <= radius, grey, 5).astype(np.uint8)
-    shift = rim_shift(image, Mask((130.0, 128.0), 0.0, 100.0))
-    assert shift is not None and shift.fits == fits
-    assert shift.moved_px == pytest.approx(moved, abs=0.5) and shift.wider_px == pytest.approx(radius - 100, abs=2.5)
-    assert rim_shift(image, None) is None and rim_shift(np.zeros_like(image), Mask((130.0, 128.0), 0, 100)) is None

@@ -43,7 +43,7 @@ def test_every_command_reads_every_format_alike(omnid: Command, tmp_path: Path, 
     assert len(re.findall(rf" +{COMPRESSED} +{PAIRS} ", out)) == 2
     # 2. `calibrate`
     pairs = read_pairs(log)
-    assert len(pairs.names) == PAIRS and not pairs.notes and not pairs.loss
+    assert len(pairs.names) == PAIRS and not pairs.notes
     assert all(map(np.array_equal, pairs.sides[0].values(), read_pairs(scene / "log.mcap").sides[0].values()))
     # 3. `replay`
     rows = []
@@ -107,10 +107,7 @@ def test_loss_is_told_by_the_exit_code(omnid: Command, tmp_path: Path, scene: Pa
     result = omnid.replay(log, *QUICK, rig=scene / "rig.toml")
     assert result.code == code and line in result.err
     assert ("images made no pair" in result.err) == (code == 1)
-    found = read_pairs(log)
-    assert bool(found.loss) == (code == 1)
-    left_out = [note for note in found.notes if note.startswith("left out 6 pairs")]
-    assert len(left_out) == result.err.count("6 images could not be used") == name.endswith(("cut", "small"))
+    assert result.err.count("6 images could not be used") == name.endswith(("cut", "small"))
 
 
 @pytest.mark.parametrize("kind", ["", "lz4", "bag"])
@@ -135,4 +132,3 @@ def test_a_camera_of_half_the_rate_loses_nothing(omnid: Command, tmp_path: Path,
     log = save(tmp_path / "log.mcap", taken)
     result = omnid.replay(log, *QUICK, rig=scene / "rig.toml")
     assert result.code == 0 and result.count("pairs") == PAIRS // 2 and "made no pair" not in result.err
-    assert not read_pairs(log).loss

@@ -46,7 +46,7 @@ TABLE = (
     ("replay {log} --rig {folder}/deep.toml", "a key of more than 65 parts"),
     ("replay {log} --rig {folder}/huge.toml", "at most 67108864 in all"),
     ("replay {log} --rig {folder}/camchain.yaml", "`omnid calibrate import {folder}/camchain.yaml -o rig.toml`"),
-    ("replay {log} --rig {log}", "without --rig the one attached to the log is used"),
+    ("replay {log} --rig {log}", "expected TOML in UTF-8"),
     ("replay {log} --rig {folder}/absent.toml", "`omnid calibrate import` or"),
     ("calibrate import {rig} -o {folder}/x", "use it as it is, --rig {rig}"),
     ("calibrate import {folder}/camchain.yaml -o -", "-"),

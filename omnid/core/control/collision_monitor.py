@@ -14,7 +14,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from types import MappingProxyType
 from typing import Annotated, Final, Literal, NamedTuple
 
 from msgspec import Meta
@@ -32,10 +31,6 @@ IGNORE: Final = "ignore"
 @dataclass(frozen=True, slots=True)
 class CollisionSettings:
     """Outline of the base, distances and times at which it stops and slows down before obstacles."""
-
-    REMOVED = MappingProxyType(
-        {"side_m": "it needs 4 cm of free space at its sides", "time_s": "it keeps 1.5 s to a collision"}
-    )
 
     check: Annotated[bool, "slow down and stop before obstacles, whatever the source of the command"] = True
     front_m: Annotated[

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 from typing import Annotated, Final, Literal, NamedTuple
 
 from msgspec import Meta
@@ -24,13 +23,6 @@ MOTION_DOUBTFUL: Final = "the motion that is seen or reported is not the command
 @dataclass(frozen=True, slots=True)
 class TrustSettings:
     """Levels at which the base slows down or stops."""
-
-    REMOVED = MappingProxyType(
-        {
-            "degraded_speed": "half the speed while the pose is degraded",
-            "motor_fault": "a fault of the motor controller stops the wheels",
-        }
-    )
 
     degraded_speed: float = 0.5  # share of the speeds while the pose is degraded or some motion is unexplained
     velocity_sigma_mps: Annotated[

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import Annotated
 
 from msgspec import Meta
@@ -12,8 +11,6 @@ from msgspec import Meta
 @dataclass(frozen=True, slots=True)
 class PursuitSettings:
     """Regulated pure pursuit (Macenski et al. 2023); the limits of the controller hold after it."""
-
-    REMOVED = MappingProxyType({"acceleration_mps2": "0.3 m/s^2 are planned, within controller.limits"})
 
     velocity_mps: Annotated[float, Meta(ge=0.02, le=5), "highest speed on a path, m/s"] = 0.4
     acceleration_mps2: float = 0.3  # acceleration and deceleration that are planned, below that of controller.heading
@@ -29,15 +26,6 @@ class PursuitSettings:
 @dataclass(frozen=True, slots=True)
 class NavigationSettings:
     """Goals, paths and routes."""
-
-    REMOVED = MappingProxyType(
-        {
-            "give_way_s": "a blocked robot waits where it is, or goes around",
-            "give_way_m": "a blocked robot waits where it is, or goes around",
-            "unlocalised_m": "it drives 3 m in the map by odometry alone",
-            "reach_m": "goals and paths begin within 100 m",
-        }
-    )
 
     pursuit: PursuitSettings = field(default_factory=PursuitSettings)
     goal_cm: Annotated[float, Meta(ge=0.1, le=200), "a goal is reached within that distance, cm"] = 2.0

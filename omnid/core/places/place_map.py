@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Annotated, Final, NamedTuple
 
 import numpy as np
@@ -35,8 +34,6 @@ AGED_MISSES: Final = 3  # Consecutive visits at which a keyframe is missed, befo
 @dataclass(frozen=True, slots=True)
 class PlaceLimits:
     """Distance and number of the keyframes that stay."""
-
-    REMOVED = MappingProxyType({"rate_hz": "at most 5 keyframes a second"})
 
     keyframe_m: Annotated[
         float, Meta(ge=0.05, le=10), "distance after which a keyframe is kept for the recognition of the place, m"

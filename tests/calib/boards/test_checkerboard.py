@@ -50,7 +50,7 @@ def test_finds_boards_on_all_sides(
 ) -> None:
     for seed, T in enumerate(poses(3)):
         rendered = RENDERER.render_board(T, seed=seed, sensor=sensor, contrast=contrast, shadow=shadow)
-        view = find_board(rendered.image, BOARD, "x").view
+        view = find_board(rendered.image, BOARD, "x")
         assert view is not None and view.confidence > 0.7, seed
         off = errors_px(view.pixels, rendered.corners)
         assert np.nanmedian(off) < limit_px / 2 and np.nanpercentile(off, 90) < limit_px, seed
@@ -61,7 +61,7 @@ def test_finds_a_board_through_a_fisheye_lens() -> None:
     mask = Mask(camera.center, 0.0, 232.0)
     T = board_poses_around_camera(camera, BOARD, mask, 1, distance_m=(0.2, 0.3), elevation_deg=(120, 150))[0]
     rendered = BoardRenderer.of(BOARD, camera, mask).render_board(T)
-    view = find_board(rendered.image, BOARD).view
+    view = find_board(rendered.image, BOARD)
     assert view is not None
     assert np.nanmax(errors_px(view.pixels, rendered.corners)) < 0.2
 
@@ -69,24 +69,21 @@ def test_finds_a_board_through_a_fisheye_lens() -> None:
 def test_corner_order_is_clockwise_and_starts_at_a_dark_square() -> None:
     for seed, T in enumerate(poses(3, seed=4)):
         rendered = RENDERER.render_board(T, seed=seed)
-        view = find_board(rendered.image, BOARD).view
+        view = find_board(rendered.image, BOARD)
         assert view is not None
         grid = view.pixels.reshape(BOARD.rows, BOARD.columns, 2)
         along, down = np.diff(grid, axis=1)[:-1], np.diff(grid, axis=0)[:, :-1]
         assert (along[..., 0] * down[..., 1] - along[..., 1] * down[..., 0] > 0).all()
         first, second = (grid[:2, i : i + 2].mean(axis=(0, 1)).round().astype(int) for i in (0, 1))
         assert rendered.image[first[1], first[0]] < rendered.image[second[1], second[0]]
-        flipped = find_board(np.ascontiguousarray(rendered.image[:, ::-1]), BOARD).view
+        flipped = find_board(np.ascontiguousarray(rendered.image[:, ::-1]), BOARD)
         assert flipped is not None
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("asked", [(5, 4), (7, 5), (6, 6)])
-def test_reports_the_grid_size_if_the_requested_count_is_wrong(asked: tuple[int, int]) -> None:
+def test_a_board_of_another_size_is_not_found() -> None:
     rendered = RENDERER.render_board(poses(1, seed=2)[0])
-    search = find_board(rendered.image, Board(*asked, 0.03))
-    assert search.view is None
-    assert sorted(search.grid_size) == [5, 6]
+    for asked in ((5, 4), (7, 5)):
+        assert find_board(rendered.image, Board(*asked, 0.03)) is None, asked
 
 
 @pytest.mark.slow
@@ -104,15 +101,14 @@ def test_finds_no_board_in_images_without_one() -> None:
         np.zeros((50, 40), np.uint8),
     ]
     for number, image in enumerate(images):
-        search = find_board(image, Board(4, 3, 0.03))
-        assert search.view is None, number
+        assert find_board(image, Board(4, 3, 0.03)) is None, number
 
 
 @pytest.mark.slow
 def test_finds_the_board_in_all_ten_real_images(shared_data: Path) -> None:
     for number in range(10):
         image = cv2.imread(str(shared_data / "vmr_board" / f"VMRImage{number}.jpg"), cv2.IMREAD_GRAYSCALE)
-        view = find_board(image.astype(np.uint8), Board(6, 7, 0.03)).view
+        view = find_board(image.astype(np.uint8), Board(6, 7, 0.03))
         assert view is not None and np.isfinite(view.pixels).all() and view.confidence > 0.95, number
 
 
@@ -120,7 +116,7 @@ def test_finds_a_board_whose_outer_squares_are_cut_off_by_the_image() -> None:
     sheet = cv2.resize(board_texture(BOARD), None, fx=3, fy=3, interpolation=cv2.INTER_AREA)
     cut = round(3 * SQUARE_PX * 1.65)
     image = np.asarray(cv2.GaussianBlur(sheet[cut:-cut, cut:-cut], (0, 0), 1.0), np.uint8)
-    view = find_board(image, BOARD).view
+    view = find_board(image, BOARD)
     assert view is not None and np.isfinite(view.pixels).mean() > 0.9
     x, y = np.meshgrid(np.arange(6), np.arange(5))
     truth = np.asarray(3 * SQUARE_PX * (np.column_stack([x.ravel(), y.ravel()]) + 2.0) - 0.5 - cut, float)

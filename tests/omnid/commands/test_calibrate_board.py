@@ -189,7 +189,7 @@ def bad(folder: Path, made: Path, kind: str) -> list[object]:
         ("sizes", "all of one size, found 480x480"),
         ("text", "lower_09.png: expected an image"),
         ("one side", "no images upper_*"),
-        ("unpaired", "found 3 of the lower camera, 3 of the upper camera"),
+        ("unpaired", "no pair of images: expected pairs like"),
         ("missing", "found no such file or folder"),
         ("topic", "only a log has topics"),
         ("output", "which is read"),

@@ -39,12 +39,6 @@ def test_a_short_drive_is_refused(scene: Path, short: Path, tmp_path: Path, caps
     assert not (tmp_path / "rig.toml").exists()
 
 
-def test_the_distance_of_two_drives_is_refused(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    logs = [scene / "log.mcap"] * 2
-    assert calibrate(*logs, "--rig", scene / "rig.toml", "-o", tmp_path / "rig.toml", "--distance-m", "3") == 2
-    assert "is the length of one drive" in capsys.readouterr().err
-
-
 def test_exchanged_cameras_are_refused(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rig = read_rig(scene / "rig.toml")
     lower, upper = rig.topics

@@ -46,7 +46,7 @@ def one_sided(views: list[BoardView]) -> list[PairView]:
 @pytest.mark.slow
 def test_a_real_mirror_is_fitted_to_a_quarter_of_a_pixel(shared_data: Path) -> None:
     images = read_images(shared_data)
-    views = [view for name, image in images.items() if (view := find_board(image, BOARD, name).view) is not None]
+    views = [view for name, image in images.items() if (view := find_board(image, BOARD, name)) is not None]
     assert len(views) == 10
     found = calibrate_boards(one_sided(views), BOARD, [SIZE], "mirror", [images])
     assert found.rejected == () and found.fit.mean_px < 0.25 and not found.structure(0).is_misfit
