@@ -1,4 +1,4 @@
-"""Systematic part of residuals: their mean by radius and azimuth, compared with the noise of single corners."""
+"""Systematic part of residuals: their mean by radius and azimuth, compared with their scatter about it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.boards.local_mapping import quadratic_terms
 from calib.models.camera import Array
 
 # Bins of the image: rings with equal numbers of corners, and sectors of azimuth.
@@ -23,8 +22,8 @@ OUTLIER_RATIO = 5.0
 class ResidualStructure:
     """Systematic part and noise of residuals [px], per coordinate (rms).
 
-    systematic_px: the mean residual as a function of the image position, common to all views. noise_px: the part that
-    differs between neighbouring corners of a view.
+    systematic_px: the mean residual as a function of the image position, common to all views. noise_px: the scatter
+    about that.
     """
 
     systematic_px: float
@@ -39,58 +38,31 @@ class ResidualStructure:
         return f"systematic residuals of {self.systematic_px:.3f} px, noise of {self.noise_px:.3f} px"
 
 
-def residual_structure(
-    pixels: Array, residuals: Array, points: Array, center: tuple[float, float]
-) -> ResidualStructure:
-    """Return the structure of residuals (K, N, 2) at pixels (K, N, 2) of K views of board points (N, 3).
+def residual_structure(pixels: Array, residuals: Array, center: tuple[float, float]) -> ResidualStructure:
+    """Return the structure of residuals (N, 2) at pixels (N, 2) [px], in bins about the center; NaN ones are left out.
 
-    The noise is measured within each view, without a quadratic function of the board's x and y: a misfit of the model
-    is smooth over a board, and would otherwise count as noise where it depends on the board's pose. The systematic part
-    is a one-way analysis of variance with the bins as groups. Unknown (NaN) residuals are left out.
-    """
-    noise_px = _noise_px(residuals, points)
-    return ResidualStructure(systematic_px(pixels.reshape(-1, 2), residuals.reshape(-1, 2), center), noise_px)
-
-
-def _noise_px(residuals: Array, points: Array) -> float:
-    """Return the rms of residuals (K, N, 2) after a quadratic function of the board is removed from every view."""
-    scale = max(float(np.abs(points[:, :2]).max()), np.finfo(float).tiny)
-    terms = quadratic_terms(points[:, 0] / scale, points[:, 1] / scale)
-    squares, freedom = 0.0, 0
-    for view in residuals:
-        length = np.linalg.norm(view, axis=1)
-        known = length < OUTLIER_RATIO * np.nanmedian(length) if np.isfinite(length).any() else np.zeros(0, bool)
-        if known.sum() > terms.shape[1]:
-            coefficients = np.linalg.lstsq(terms[known], view[known], rcond=None)[0]
-            squares += float(((view[known] - terms[known] @ coefficients) ** 2).sum())
-            freedom += 2 * (int(known.sum()) - terms.shape[1])
-    return float(np.sqrt(squares / freedom)) if freedom else float("inf")
-
-
-def systematic_px(pixels: Array, residuals: Array, center: tuple[float, float]) -> float:
-    """Return the rms of the bins' mean residuals, without the share of the variance within the bins.
-
-    pixels (N, 2), residuals (N, 2) [px]: the bins lie about the center.
+    A one-way analysis of variance with the bins as groups.
     """
     length = np.linalg.norm(residuals, axis=1)
-    known = length < OUTLIER_RATIO * np.nanmedian(length)
+    known = length < OUTLIER_RATIO * np.nanmedian(length) if np.isfinite(length).any() else np.zeros(len(length), bool)
     offset, residuals = pixels[known] - center, residuals[known]
     bins = _bins(offset)
     # Radial and tangential components, so that an error that depends on the radius alone is the same in all sectors.
     radial = offset / np.maximum(np.linalg.norm(offset, axis=1, keepdims=True), 1.0)
     tangential = np.column_stack([-radial[:, 1], radial[:, 0]])
     components = np.column_stack([(residuals * radial).sum(axis=1), (residuals * tangential).sum(axis=1)])
-    between, within, groups, used = 0.0, 0.0, 0, 0
+    between, within, groups, used = 0.0, 0.0, 0, len(components)
     for number in np.unique(bins):
         group = components[bins == number]
         mean = group.mean(axis=0)
         between += len(group) * float((mean**2).sum())
         within += float(((group - mean) ** 2).sum())
-        groups, used = groups + 1, used + len(group)
+        groups += 1
     if used <= groups:
-        return 0.0
-    share = groups * within / (used - groups)
-    return float(np.sqrt(max(0.0, between - share) / (2 * used)))
+        return ResidualStructure(0.0, float("inf"))
+    variance = within / (2 * (used - groups))
+    systematic = np.sqrt(max(0.0, between / (2 * used) - groups / used * variance))
+    return ResidualStructure(float(systematic), float(np.sqrt(variance)))
 
 
 def _bins(offset: Array) -> Array:

@@ -21,7 +21,7 @@ from calib import se3
 from calib.errors import CalibError
 from calib.fit.least_squares import BEST_STEP, LOST_PX, ArrowSystem, Ending, minimise, robust_sigma
 from calib.fit.parameters import RigParameters
-from calib.fit.residual_structure import OUTLIER_RATIO, ResidualStructure, systematic_px
+from calib.fit.residual_structure import ResidualStructure, residual_structure
 from calib.models.camera import Array
 from calib.models.ocam import project_near
 from calib.rig import Rig
@@ -113,10 +113,7 @@ class DriveAdjustment:
         problem = DriveProblem(self.parameters, self.observations, self.prior, np.zeros(1, int))
         seen, mounted = self.observations.camera == side, (self.rig.lower, self.rig.upper)[side]
         own = problem.residuals(self.state)[seen]
-        systematic = systematic_px(self.observations.pixels[seen], own, mounted.camera.center)
-        length = np.linalg.norm(own, axis=1)
-        usual = own[length < OUTLIER_RATIO * np.median(length)]
-        return ResidualStructure(systematic, float(np.sqrt(max(0.0, float(np.mean(usual**2)) - systematic**2))))
+        return residual_structure(self.observations.pixels[seen], own, mounted.camera.center)
 
 
 def adjust_drive(

@@ -73,19 +73,6 @@ def whole_image(camera: OmniCamera) -> Mask:
     return Mask((u, v), 0.0, float(np.hypot(max(u, width - 1 - u), max(v, height - 1 - v))) + 1.0)
 
 
-def field_of_view(camera: OmniCamera, mask: Mask) -> tuple[float, float]:
-    """Return the smallest and largest angle [rad] from the ray of the camera's centre within the mask; NaN if empty."""
-    width, height = camera.size
-    (u, v), radius = camera.center, np.arange(0.0, np.hypot(width, height))
-    azimuth = np.deg2rad(np.arange(0, 360, 5))[:, None]
-    pixels = np.stack([u + radius * np.cos(azimuth), v + radius * np.sin(azimuth)], axis=-1).reshape(-1, 2)
-    pixels = pixels[inside_image(camera, pixels) & mask.contains(pixels)]
-    axis = camera.lift(np.array([[u, v]]))[0]
-    angles = np.arccos(np.clip(camera.lift(pixels) @ axis, -1, 1))
-    seen = angles[np.isfinite(angles)]
-    return (float(seen.min()), float(seen.max())) if len(seen) else (np.nan, np.nan)
-
-
 def inside_image(camera: OmniCamera, pixels: Array) -> NDArray[np.bool_]:
     """True (N,) for pixels (N, 2) on the camera's image; False for NaN."""
     width, height = camera.size

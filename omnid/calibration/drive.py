@@ -23,7 +23,7 @@ from calib.fit.rig_from_drive import (
 )
 from calib.fit.rig_uncertainty import drive_uncertainty
 from calib.models.ocam import has_wavefront
-from calib.rig import Rig, RigCovariance, ShutterTimes
+from calib.rig import Rig, RigCovariance
 from calib.rig_file import read_rig
 from calib.validation import silent
 from drivers.logs.log_reader import AnyCameras, LogCameras
@@ -49,10 +49,8 @@ SMALL_GAIN = 0.95
 # Distortion terms of omni cameras that are fitted although the file has none: a camera may be tilted below its mirror.
 DISTORTION = ("p1", "p2")
 TIMES = (UPPER_DELAY, LINE_TIME)
-# Times below these are those of synchronous cameras with global shutters.
-MIN_TIME = {UPPER_DELAY: 0.5, LINE_TIME: 1.0}
-# A time within so many of its sigmas is none, and a camera's parameter that differs by more of those of a nominal rig
-# is that of another camera: 1 of 16,000 normal errors is larger.
+# A camera's parameter that differs by more of the sigmas of a nominal rig is that of another camera: 1 of 16,000 normal
+# errors is larger.
 SIGNIFICANT_SIGMAS = 4.0
 # Rounds of matching columns before the first drive: each matches in panoramas that the one before has straightened, so
 # that wrong matches become fewer.
@@ -94,11 +92,6 @@ class DriveCalibration:
         for name, old, new, sigma, seen in rows:
             unseen = "" if seen else "  the drive does not show it: it stays near its start"
             lines.append(f"{name:<14}{old:>14.5f}{new:>14.5f}{sigma:>11.5f}{unseen}")
-        if (times := self.rig.times) != ShutterTimes():
-            lines.append(
-                f"times of exposure: upper delay {1e3 * times.upper_delay_s:.3g} ms, line time "
-                f"{1e6 * times.line_time_s:.3g} us: in the table [times] of the file, where runs read them"
-            )
         return lines
 
     @property
@@ -137,12 +130,7 @@ def calibrate_drive(
     require_same_rig(parameters, start, tracked=False)
     # 3. Track and adjust in rounds, until lengths change no more.
     found, drives = _in_rounds(paths, parameters, start, cameras, config, progress)
-    # 4. Adjust once more without the times of exposure that do not differ from none, and refuse what is another rig.
-    times = significant_times(found)
-    if times != TIMES:
-        parameters = RigParameters.about(_with_times(before, times), DISTORTION, times, waves=waves)
-        steps = dict(zip(found.parameters.names, found.state.steps.tolist(), strict=True))
-        found = _adjusted(parameters, np.array([steps.get(name, 0.0) for name in parameters.names]), drives)
+    # 4. Refuse what is another rig.
     require_same_rig(parameters, found.state.steps)
     # 5. The length of the baseline by the prior, and the covariance.
     adjusted = _finished_rig(before, found)
@@ -200,7 +188,7 @@ def _in_rounds(
         drives = collect(logs, rig, cameras, config)
         found = _adjusted(parameters, steps, drives)
         moved = scale_change(found, rig)
-        steps, rig = found.state.steps, _with_times(found.rig, significant_times(found))
+        steps, rig = found.state.steps, found.rig
         progress(
             f"round {number}: {len(drives.observations)} observations from {drives.keyframes} keyframes, error "
             f"{found.sigma_px:.3f} px, lengths {100 * moved:+.3f} %"
@@ -224,25 +212,6 @@ def _finished_rig(before: Rig, found: DriveAdjustment) -> Rig:
     baseline_m, matrix = parameters.baseline(change, covariance)
     rig = rescaled(found.rig, baseline_m / before.baseline_m)
     return replace(rig, covariance=RigCovariance.of_matrix([*names, "baseline"], matrix))
-
-
-def _with_times(rig: Rig, kept: tuple[str, ...]) -> Rig:
-    """Return the rig without the times of exposure that are not kept."""
-    times = ShutterTimes(
-        rig.times.upper_delay_s if UPPER_DELAY in kept else 0.0, rig.times.line_time_s if LINE_TIME in kept else 0.0
-    )
-    return replace(rig, times=times)
-
-
-def significant_times(found: DriveAdjustment) -> tuple[str, ...]:
-    """Return the names of the times of exposure that differ from none."""
-    names, values = found.parameters.names, found.parameters.values + found.state.steps * found.parameters.units
-    sigmas = found.sigmas * found.parameters.units
-    return tuple(
-        name
-        for name, value, sigma in zip(names, values, sigmas, strict=True)
-        if name in TIMES and abs(value) > max(MIN_TIME[name], SIGNIFICANT_SIGMAS * sigma)
-    )
 
 
 def scale_change(found: DriveAdjustment, before: Rig) -> float:

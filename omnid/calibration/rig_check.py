@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -13,25 +13,20 @@ import numpy as np
 from calib.fit.rig_drift import apply_drift
 from calib.rig import Rig
 from drivers.logs.log_reader import LogCameras
-from omnid.calibration.drive_observations import tracked_updates
 from omnid.calibration.images import TOLERANCE_NS, open_log, spread_pairs
 from omnid.config import Config, PanoramaConfig
 from omnid.core.rig.column_finding import (
     DRIFTED_PX,
     MIN_MATCHES,
-    Matches,
     RigFinding,
     RigState,
-    is_motion_unknown,
     judge,
     match,
     together,
 )
-from omnid.core.rig.rig_health import RigHealth
 from omnid.errors import OmnidError
 from omnid.messages import FramePair
 from omnid.stages.dewarp import Dewarp
-from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry, with_rims
 from omnid.stages.synchronise import Decoder
 
@@ -64,14 +59,6 @@ class RigCheckResult:
         return self.finding.state
 
     @property
-    def skewed(self) -> str:
-        """Words that the cameras are not synchronised; empty if they are."""
-        if abs(self.skew_s) < MAX_SKEW_S:
-            return ""
-        late = "later" if self.skew_s > 0 else "earlier"
-        return f"the upper images are {1e3 * abs(self.skew_s):.1f} ms {late} than the lower ones"
-
-    @property
     def has_changed_intrinsics(self) -> bool:
         """True if the columns show a change other than that of the upper camera's pose."""
         shift = np.zeros(2) if self.finding.drift is None else self.finding.drift.shift
@@ -101,8 +88,6 @@ class RigCheckResult:
                 f"remaining offset of the columns: {finding.left_px:.2f} px or less in half of all directions",
             ]
             lines += [RECALIBRATE] * self.has_changed_intrinsics
-        if self.skewed:
-            lines.append(f"{self.skewed}: the motion in between, as the odometry sees it, is allowed for")
         return "\n".join(lines)
 
 
@@ -110,9 +95,12 @@ def check_log(log: Path, rig: Rig, cameras: LogCameras) -> tuple[RigCheckResult,
     """Check a rig by pairs spread over a log; return them as well. OmnidError where they show too little."""
     pairs = read_rig_pairs(log, rig, cameras)
     found = check_rig(pairs, rig, Config().panorama)
-    if found.skewed:
-        # The motion between the exposures would be taken for a drift.
-        found = replace(found, finding=moving_rig_finding(log, rig, cameras, Config()))
+    if abs(found.skew_s) >= MAX_SKEW_S:
+        raise OmnidError(
+            f"calibrate drive: --only check would take motion for a drift: the upper images are "
+            f"{1e3 * found.skew_s:+.1f} ms later than the lower ones; without --only the times of exposure are "
+            "calibrated as well"
+        )
     if found.finding.state is RigState.UNCHECKED:
         raise OmnidError(
             f"calibrate drive: expected at least {MIN_MATCHES} points in both panoramas, found "
@@ -123,11 +111,6 @@ def check_log(log: Path, rig: Rig, cameras: LogCameras) -> tuple[RigCheckResult,
 
 def with_upper_corrected(rig: Rig, pairs: Sequence[FramePair], found: RigCheckResult) -> tuple[Rig, str]:
     """Return the rig whose upper camera's pose is corrected by the drift that was found, and what remains, in words."""
-    if found.skewed:
-        raise OmnidError(
-            f"calibrate drive: --only check would take motion for a drift: {found.skewed}; without --only the times of "
-            "exposure are calibrated as well"
-        )
     is_doubtful = found.has_changed_intrinsics
     for _ in range(REFINEMENTS):
         if found.finding.drift is None:
@@ -171,27 +154,6 @@ def check_rig(pairs: Sequence[FramePair], rig: Rig, config: PanoramaConfig) -> R
     found = [match(panoramas.lower, panoramas.upper, panoramas.visible) for panoramas in seen]
     skew_s = float(np.median([pair.skew_s for pair in pairs]))
     return RigCheckResult(judge(together(found), rectification.cylinder), len(pairs), skew_s)
-
-
-def moving_rig_finding(log: Path, rig: Rig, cameras: LogCameras, config: Config) -> RigFinding:
-    """Return what at most PAIRS pairs of cameras that are not synchronised say about the rig.
-
-    The odometry finds the motion between the exposures, for which the pixels are corrected. OmnidError where no pose is
-    found.
-    """
-    place = geometry(rig, config.panorama)
-    front_end = FrontEnd(place, config, RigHealth(place.cylinder, "warn"))
-    found, number = list[Matches](), 0
-    with closing(open_log(log, cameras, rig)) as reader:
-        stride = max(1, (reader.pair_estimate() or 0) // PAIRS)
-        for update in tracked_updates(reader, front_end, config, log):
-            exposure, seen = update.depth.exposure, update.depth.panoramas
-            if is_motion_unknown(seen, exposure):
-                continue
-            if number % stride == 0:
-                found.append(match(seen.lower, seen.upper, seen.visible, exposure))
-            number += 1
-    return judge(together(found[-PAIRS:]), place.cylinder)
 
 
 def with_masks(log: Path, rig: Rig, cameras: LogCameras) -> Rig:

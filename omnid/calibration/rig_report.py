@@ -12,9 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib import se3
 from calib.errors import CalibError
-from calib.fit.boards.bundle import TWIST_NAMES
 from calib.fit.boards.rig_fit import RigCalibration
 from calib.models.camera import Array, OmniCamera, inside_image
 from calib.panorama import fit_cylinder, remap_tables
@@ -22,7 +20,7 @@ from calib.rig import Rig
 from omnid.calibration.images import SIDES, PairedImages
 from omnid.calibration.live_boards import HOURS, hours_of, listed
 from omnid.calibration.snapshot import GREEN, RED
-from omnid.report.page import bar, figure, folded, page, table
+from omnid.report.page import figure, page, table
 
 # Factor by which residuals are drawn longer.
 ARROW = 40.0
@@ -40,38 +38,12 @@ def rig_report_html(found: RigCalibration, images: PairedImages, rig: Rig, angle
         f"<h1>Rig calibration</h1><p>{found.pairs} pairs, {len(found.views) - found.pairs} views of one camera. "
         f"<b>Baseline {found.baseline_m * 1e3:.2f} mm</b>, standard deviation {found.baseline_sigma_m * 1e3:.2f} "
         f"mm. Mean reprojection error {found.fit.mean_px:.3f} px.</p>{left_out}",
-        "<h2>Between the cameras</h2>",
-        _motion(found),
     ]
-    for name, parameters, by_angle in zip(SIDES, found.parameters, angles, strict=True):
-        rows = [(key, f"{value:.8g}", f"{sigma:.2g}") for key, value, sigma in parameters]
-        parts += [
-            f"<h2>The {name} camera</h2>",
-            table(HEAD, [row.cells() for row in by_angle]),
-            folded("parameters", table(("parameter", "value", "standard deviation"), rows)),
-        ]
+    for name, by_angle in zip(SIDES, angles, strict=True):
+        parts += [f"<h2>The {name} camera</h2>", table(HEAD, [row.cells() for row in by_angle])]
     coverage = "".join(_coverage(found, images, side) for side in range(len(SIDES)))
-    parts += [
-        "<h2>Coverage</h2>",
-        f"<div class='tiles wide'>{coverage}</div>",
-        "<h2>Error by instant</h2>",
-        _errors(found),
-        "<h2>Rectified</h2>",
-        _rectified(found, images, rig),
-    ]
-    return page("Rig calibration", parts)
-
-
-def _motion(found: RigCalibration) -> str:
-    """Return the table of T_upper_lower in millimetres and degrees."""
-    turn = se3.rotation_log(se3.R_of(found.T_upper_lower))
-    values = np.concatenate([se3.t_of(found.T_upper_lower) * 1e3, np.rad2deg(turn)])
-    sigmas = np.concatenate([found.motion_sigma[:3] * 1e3, np.rad2deg(found.motion_sigma[3:])])
-    rows = [
-        (name, f"{value:.4f} {unit}", f"{sigma:.4f}")
-        for name, value, sigma, unit in zip(TWIST_NAMES, values, sigmas, ["mm"] * 3 + ["deg"] * 3, strict=True)
-    ]
-    return table(("T_upper_lower", "value", "standard deviation"), rows)
+    figures = ["<h2>Coverage</h2>", f"<div class='tiles wide'>{coverage}</div>", "<h2>Rectified</h2>"]
+    return page("Rig calibration", [*parts, *figures, _rectified(found, images, rig)])
 
 
 def _coverage(found: RigCalibration, images: PairedImages, side: int) -> str:
@@ -94,18 +66,6 @@ def _coverage(found: RigCalibration, images: PairedImages, side: int) -> str:
     return figure(np.asarray(canvas, np.uint8), f"{SIDES[side]}: {text}")
 
 
-def _errors(found: RigCalibration) -> str:
-    """Return the table of each instant's mean errors."""
-    lower, upper = (found.side_errors_px(side) for side in (0, 1))
-    worst = float(np.nanmax([lower, upper]))
-
-    def cells(error: float) -> tuple[str, str]:
-        return (f"{error:.3f}", bar(error / worst)) if np.isfinite(error) else ("not seen", "")
-
-    rows = [(escape(view.name), *cells(a), *cells(b)) for view, a, b in zip(found.views, lower, upper, strict=True)]
-    return table(("instant", "lower [px]", "", "upper [px]", ""), rows)
-
-
 def _rectified(found: RigCalibration, images: PairedImages, rig: Rig) -> str:
     """Return the figure of both panoramas of one instant, one above the other, with common columns."""
     name = next(view.name for view in found.views if None not in view.seen)
@@ -118,8 +78,7 @@ def _rectified(found: RigCalibration, images: PairedImages, rig: Rig) -> str:
         for side, mounted in zip(reversed(images.sides), (rig.upper, rig.lower), strict=True)
     ]
     canvas = cv2.cvtColor(np.vstack(rows), cv2.COLOR_GRAY2BGR)
-    # Lines stand as far apart in a sector, whose panorama is narrower than a full turn.
-    canvas[:, WIDTH_PX // (2 * LINES) :: WIDTH_PX // LINES] = GREEN
+    canvas[:, :: WIDTH_PX // LINES] = GREEN
     return figure(
         np.asarray(canvas, np.uint8),
         f"{name}: the upper panorama above the lower one; a point is in the same column of both",

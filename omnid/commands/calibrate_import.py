@@ -10,9 +10,7 @@ import numpy as np
 from calib import se3
 from calib.errors import CalibError
 from calib.importers import import_chain, import_pair, read_transform, stacked_rig, straight_up
-from calib.models.camera import field_of_view
-from calib.models.names import model_name
-from calib.models.ocam import OcamCamera
+from calib.models.names import model_in_words
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import read_rig, write_rig
 from omnid.commands.options import HEIGHT, command, height_of, warn
@@ -49,13 +47,6 @@ def run(args: argparse.Namespace) -> int:
     rig = _imported(args)
     if args.height_m is not None:
         rig = rig.at_height(args.height_m)
-    for side, mounted in rig.sides:
-        if np.isnan(field_of_view(mounted.camera, mounted.visible)[0]):
-            width, height = mounted.camera.size
-            raise OmnidError(
-                f"the {side} camera sees nothing of its image of {width}x{height} px, whose centre is at "
-                f"{mounted.camera.center}: are both in the order of its program?"
-            )
     if args.output.exists() and not args.replace:
         _must_lose_nothing(args.output, rig)
     write_rig(args.output, rig)
@@ -113,8 +104,5 @@ def describe(rig: Rig) -> str:
 
 
 def _describe(mounted: MountedCamera, topic: str) -> str:
-    camera = mounted.camera
-    model = f"ocam {camera.view}" if isinstance(camera, OcamCamera) else model_name(camera)
-    nearest, farthest = np.rad2deg(field_of_view(camera, mounted.visible))
-    seen = f"{model} {camera.size[0]}x{camera.size[1]}, {nearest:.0f} to {farthest:.0f} deg from its axis"
-    return seen + (f" ({topic})" if topic else "")
+    width, height = mounted.camera.size
+    return f"{model_in_words(mounted.camera)} {width}x{height}" + (f" ({topic})" if topic else "")

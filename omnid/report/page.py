@@ -39,16 +39,6 @@ def page(title: str, parts: Sequence[str], style: str = "", script: str = "") ->
     return _CONTROL.sub("\N{REPLACEMENT CHARACTER}", text)
 
 
-def folded(title: str, text: str) -> str:
-    """Return a part of the page that can be unfolded; both are HTML."""
-    return f"<details><summary>{title}</summary>{text}</details>"
-
-
-def bar(share: float) -> str:
-    """Return a horizontal bar that begins at the left, as a cell of a table; share: of its full length, 0 to 1."""
-    return f"<td class='bar'><span style='width:{200 * share:.0f}px'></span></td>"
-
-
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Return a table; cells are HTML, those that begin with <td as they are."""
     titles = "".join(f"<th>{title}</th>" for title in head)

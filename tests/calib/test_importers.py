@@ -241,9 +241,9 @@ def test_parses_every_number_as_the_toolbox_defines_it() -> None:
     ("old", "new", "message"),
     [
         ("5 -2.315000e+02", "6 -2.315000e+02", "expected lines of numbers as OCamCalib"),
-        ("5 -2.315000e+02", "5 nan", "must be a finite number"),
-        ("5 -2.315000e+02", "5 231", "ocam camera: expected a0 < 0"),
-        ("1.590000e-09", "1.590000e+308", "overflows"),
+        ("5 -2.315000e+02", "5 nan", "ocam camera: expected"),
+        ("5 -2.315000e+02", "5 231", "with a0 < 0"),
+        ("1.590000e-09", "1.590000e+308", "ocam camera: expected"),
         ("1.000529 0.000053", "1.000529 one", "could not convert"),
         ("480 640", "480.5 640", "in whole pixels"),
         ("480 640", "32767 32767", "at most 67108864 in all"),

@@ -19,7 +19,6 @@ from calib.fit.boards.start import LinearCamera, initialise_relative_pose, solve
 from calib.fit.least_squares import BEST_STEP, central_differences
 from calib.fit.residual_structure import ResidualStructure, residual_structure
 from calib.models.camera import Array
-from calib.models.names import values_of
 from calib.models.ocam import OcamCamera, View
 from calib.rig import TRANSFORM_NAMES, Rig, RigCovariance
 
@@ -80,17 +79,6 @@ class RigCalibration:
         return float(np.linalg.norm(se3.t_of(self.T_upper_lower)))
 
     @property
-    def parameters(self) -> list[list[tuple[str, float, float]]]:
-        """Return name, value and standard deviation of the parameters of each camera."""
-        sigmas = np.sqrt(np.maximum(0, np.diag(self.fit.covariance)))
-        names = self.fit.rig.names
-        parts = np.split(sigmas[: len(names) * len(self.cameras)], len(self.cameras))
-        return [
-            [(name, values_of(camera)[name], sigma) for name, sigma in zip(names, part.tolist(), strict=True)]
-            for camera, part in zip(self.cameras, parts, strict=True)
-        ]
-
-    @property
     def motion_covariance(self) -> Array:
         """Return the covariance (6, 6) of T_upper_lower, translation [m] and rotation [rad], in the upper frame."""
         first = len(self.fit.rig.names) * len(self.cameras)
@@ -117,18 +105,10 @@ class RigCalibration:
         """Return the number of instants at which all cameras saw the board."""
         return _pairs(self.views)
 
-    def side_errors_px(self, side: int) -> Array:
-        """Return the mean error (K,) of every view in the lower (0) or upper (1) camera; NaN without a view."""
-        errors = self.fit.errors_px[:, side]
-        known = np.isfinite(errors)
-        return np.where(known.any(axis=1), np.nansum(errors, axis=1) / np.maximum(known.sum(axis=1), 1), np.nan)
-
     def structure(self, side: int) -> ResidualStructure:
         """Return the structure of the lower (0) or upper (1) camera's residuals."""
-        views = [(k, own.pixels) for k, view in enumerate(self.views) if (own := view.seen[side]) is not None]
-        residuals = self.fit.residuals[[k for k, _ in views], side]
-        pixels = np.array([pixels for _, pixels in views])
-        return residual_structure(pixels, residuals, self.board.points, self.cameras[side].center)
+        pixels, residuals = _pixels(self.views, self.board)[:, side], self.fit.residuals[:, side]
+        return residual_structure(pixels.reshape(-1, 2), residuals.reshape(-1, 2), self.cameras[side].center)
 
 
 def calibrate_boards(

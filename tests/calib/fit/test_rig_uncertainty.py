@@ -24,7 +24,7 @@ NOISE = np.random.default_rng(1).standard_normal(PIXELS.shape)
 
 
 def test_noise_alone_has_no_systematic_part() -> None:
-    structure = residual_structure(PIXELS, 0.3 * NOISE, BOARD.points, CENTER)
+    structure = residual_structure(PIXELS.reshape(-1, 2), 0.3 * NOISE.reshape(-1, 2), CENTER)
     assert structure.systematic_px < 0.06 and structure.noise_px == pytest.approx(0.3, rel=0.05)
     assert not structure.is_misfit
 
@@ -40,7 +40,7 @@ def test_noise_alone_has_no_systematic_part() -> None:
     ],
 )
 def test_a_smooth_field_is_a_misfit(field: np.ndarray) -> None:
-    structure = residual_structure(PIXELS, field + 0.05 * NOISE, BOARD.points, CENTER)
+    structure = residual_structure(PIXELS.reshape(-1, 2), (field + 0.05 * NOISE).reshape(-1, 2), CENTER)
     rms = float(np.sqrt((field**2).mean()))
     assert structure.is_misfit and 0.6 * rms < structure.systematic_px < 1.1 * rms
 

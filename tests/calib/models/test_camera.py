@@ -115,7 +115,6 @@ def test_ocam_ends_at_the_radius_where_rays_repeat() -> None:
         {"polynomial": (math.nan,)},
         {"affine": (0.0, 0.0, 1.0)},
         {"size": (0, 4)},
-        {"view": "window"},
         {"tangential": (math.inf, 0.0)},
     ],
 )

@@ -54,12 +54,6 @@ def test_motion_between_the_exposures_is_no_drift_to_correct(
     drive = build("two_walls", 3, 256, 8)
     write_log(tmp_path, drive.rig, drive.poses, drive.scene, readout=Readout(skew_ms=(-20.0, -20.0)), supersample=1)
     words = (tmp_path / "log.mcap", "--rig", tmp_path / "rig.toml")
-    assert run(*words) == 0
-    found = capsys.readouterr().out
-    assert found.startswith("fits") and "the upper images are 20.0 ms earlier than the lower ones: the motion" in found
-    write_rig(tmp_path / "turned.toml", with_upper_rotated(read_rig(tmp_path / "rig.toml"), (0.0, 0.5, 0.0)))
-    assert run(*words[:-1], tmp_path / "turned.toml") == 1
-    assert capsys.readouterr().out.startswith("drifted")
     assert run(*words, "-o", tmp_path / "new.toml") == 2
     assert (
         "without --only the times of exposure are calibrated" in capsys.readouterr().err

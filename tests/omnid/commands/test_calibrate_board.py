@@ -104,7 +104,7 @@ def test_recovers_cameras_and_rig_from_images(many: Path, tmp_path: Path, capsys
         assert mounted.mask is not None and mounted.mask.outer_px == pytest.approx(310, abs=3)
     page = report.read_text()
     # The panoramas, and the corners of each camera.
-    assert page.count("data:image/jpeg;base64,") == 1 + 2 and "Baseline 180" in page and "r_x" in page
+    assert page.count("data:image/jpeg;base64,") == 1 + 2 and "Baseline 180" in page
 
 
 def test_the_result_in_python_prints_itself_names_its_limits_and_is_saved(found: RigResult, tmp_path: Path) -> None:
@@ -130,7 +130,6 @@ def test_views_of_one_camera_are_used_and_exchanged_cameras_are_a_warning(
     assert "4 pairs, 2 views of one camera alone; drives: scale uncertain by " in output.out
     assert "drives may be wrong by" in output.err
     assert "exchange their images, unless the cameras look down into their mirrors" in output.err
-    assert "not seen" in (tmp_path / "report.html").read_text()
     assert found.covariance is not None and "upper a2" in found.covariance.names
     assert abs(found.baseline_m - TRUTH.baseline_m) < 4 * found.covariance.sigma("baseline") < 8e-3
 

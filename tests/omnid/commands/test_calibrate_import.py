@@ -27,7 +27,7 @@ def kalibr(tmp_path: Path) -> Path:
 def test_imports_kalibr_files(kalibr: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert omnid(kalibr, "-o", tmp_path / "rig.toml") == 0
     (line,) = capsys.readouterr().out.splitlines()
-    assert "lower omni 768x770, 0 to 1" in line and "deg from its axis (/lower/image_raw), upper omni 768x770" in line
+    assert "lower omni 768x770 (/lower/image_raw), upper omni 768x770" in line
     assert "baseline 201.2 mm, upper rotated by 17.4" in line and "no height of the cameras (--height-m" in line
     assert omnid(kalibr, "--lower", "cam1", "-o", tmp_path / "swapped.toml", "--height-m", 0.8) == 0
     swapped = read_rig(tmp_path / "swapped.toml")
@@ -49,11 +49,8 @@ def test_imports_ocam_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     )
     assert omnid(*files) == 2 and "--transform FILE or --baseline METRES" in capsys.readouterr().err
     assert omnid(*files, "--baseline", 0.2, "--view", "direct") == 0
-    assert "upper ocam direct 640x480, 0 to " in (line := capsys.readouterr().out)
+    assert "upper ocam, direct view 640x480" in (line := capsys.readouterr().out)
     assert "baseline 200.0 mm, upper rotated by 0.00 deg" in line
-    (tmp_path / "c.txt").write_text(OCAM.replace("480 640", "240 318").replace("240.378942 318.540278", "480 640"))
-    assert omnid(*files, "--baseline", 0.2, "--view", "direct") == 2
-    assert "the lower camera sees nothing of its image of 318x240 px" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -62,7 +62,7 @@ def test_fits_the_toolbox_corners_with_less_error_than_the_toolbox(
     numbers, views, errors = reference(shared_data, key)
     found = calibrate_boards(one_sided(views), BOARD, [SIZE])
     assert found.fit.mean_px < mean_px < numbers["stored_mean_err_px"]
-    assert (found.side_errors_px(0) < errors * 1.15).all()
+    assert (np.nanmean(found.fit.errors_px[:, 0], axis=1) < errors * 1.15).all()
     row, column = found.cameras[0].center_row_column
     assert (row + 1, column + 1) == pytest.approx((numbers["xc_row_1based"], numbers["yc_col_1based"]), abs=3.0)
     radius = np.linspace(100, 350, 26)

@@ -13,6 +13,7 @@ from calib.errors import CalibError
 from calib.fit.boards.bundle import fit_boards
 from calib.fit.boards.rig_fit import PairView, RigCalibration, calibrate_boards, rig_covariance
 from calib.models.camera import Array, Mask, OmniCamera
+from calib.models.names import values_of
 from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig, rig_between
@@ -100,6 +101,13 @@ def test_recovers_one_camera_of_any_kind(truth: OmniCamera) -> None:
     assert found.view == view and found.center == pytest.approx(truth.center, abs=0.02)
 
 
+def sigmas_of(found: RigCalibration) -> list[dict[str, float]]:
+    """Return the standard deviations of the parameters of each camera by name."""
+    names, sigmas = found.fit.rig.names, np.sqrt(np.diag(found.fit.covariance))
+    parts = np.split(sigmas[: len(names) * len(found.cameras)], len(found.cameras))
+    return [dict(zip(names, part.tolist(), strict=True)) for part in parts]
+
+
 @pytest.mark.slow
 def test_sigmas_are_consistent_with_errors() -> None:
     """Errors divided by their sigmas are about normal, over parameters and repetitions."""
@@ -107,8 +115,8 @@ def test_sigmas_are_consistent_with_errors() -> None:
     ratios, rigs = [], []
     for seed in range(6):
         one = calibrate_boards(one_sided(OCAM, 0.2, seed), ODD, [SIZE])
-        known = {name: (value, sigma) for name, value, sigma in one.parameters[0]}
-        ratios += [(known[name][0] - value) / known[name][1] for name, value in truth.items()]
+        found, sigmas = values_of(one.cameras[0]), sigmas_of(one)[0]
+        ratios += [(found[name] - value) / sigmas[name] for name, value in truth.items()]
         rigs.append(calibrated(pairs(ODD, noise_px=0.1, seed=seed)))
     assert np.std(ratios) < 1.6 and np.abs(ratios).max() < 4
     length = float(np.linalg.norm(T_TRUE[:3, 3]))
@@ -160,7 +168,7 @@ def test_the_shape_of_the_print_is_found_and_leaves_the_rig_as_it_is(shape: Prin
 
 def profile_sigmas(found: RigCalibration) -> Array:
     """Return the standard deviations of a4 and w_s of both cameras, which boards show together only."""
-    return np.array([[s for name, _, s in side if name in ("a4", "w_s")] for side in found.parameters])
+    return np.array([[side["a4"], side["w_s"]] for side in sigmas_of(found)])
 
 
 @pytest.mark.slow
