@@ -105,7 +105,9 @@ def _keys(section: Any, table: dict[str, Any], path: Path) -> Iterator[tuple[Any
 
 def _explained(error: str, root: Any, table: dict[str, Any], path: Path) -> str:
     """Return an error of msgspec with the path of the key, as TOML has it, and with what was expected and found."""
-    kind, value, names = root, table, path
+    kind: Any = root
+    value: Any = table
+    names = path
     text, _, place = error.partition(" - at `$")
     # 1. Follow the place through sections and lists of sections, up to a key.
     for name, index in re.findall(r"\.(\w+)|\[(\d+)\]", place):
