@@ -33,7 +33,7 @@ from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Stream, nothing
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.logging_setup import Report
 from omnid.engine.realtime import ThreadStart, name_thread, prepare
-from omnid.engine.robot_clock import RobotClock, SegmentTime, fixed_offset, log_time
+from omnid.engine.robot_clock import RobotClock, fixed_offset, log_time
 from omnid.engine.telemetry import Histogram
 from omnid.engine.threads import started
 from omnid.formats.route_file import RouteFolder
@@ -247,10 +247,9 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
     bus = session.open_bus(rig, gives_time=robot.waits)
     recorder = None
     if config.record.enabled:
-        times = SegmentTime(clock)
-        encode = session.encoder(rig, LOG_POINTS, times.unix_ns)
+        encode = session.encoder(rig, LOG_POINTS, clock.segment_unix_ns)
         images_hz = config.record.images_hz
-        recorder = open_recorder(config, rig_toml(rig), report, encode=encode, time=times, images_hz=images_hz)
+        recorder = open_recorder(config, rig_toml(rig), report, encode=encode, clock=clock, images_hz=images_hz)
         session.outputs.callback(recorder.close)
 
     # 2. Who takes what the stages make.

@@ -13,7 +13,7 @@ from drivers.logs.rotating_log import RotatingLog
 from omnid.config import Config
 from omnid.engine.graph import NEWEST, Graph
 from omnid.engine.process import handle_stop_signals
-from omnid.engine.robot_clock import RobotClock, SegmentTime
+from omnid.engine.robot_clock import RobotClock
 from omnid.runs.wiring import RECORDED_DEPTH
 from omnid.settings import dump
 from omnid.sinks.encoder import Encoder
@@ -28,24 +28,24 @@ def open_recorder(
     report: EventCallback,
     *,
     encode: Encoder | None = None,
-    time: SegmentTime | None = None,
+    clock: RobotClock | None = None,
     images_hz: float = 0.0,
 ) -> Recorder:
     """Return a recorder to the folder of the configuration; the first message makes the first file.
 
     rig: the rig's TOML, or "" where there is none; it is attached to every file, as is the configuration.
-    report: takes severity and text of problems. encode, time, images_hz: see Recorder.
+    report: takes severity and text of problems. encode, clock, images_hz: see Recorder.
     """
     attachments = {"omnid.toml": dump(config).encode()} | ({"rig.toml": rig.encode()} if rig else {})
     folder = Path(config.record.folder)
     log = RotatingLog(folder, config.bus.robot, config.record.rotation(), attachments, on_event=report)
-    return Recorder(log, config.bus.robot, encode, time=time, skip_invalid=True, images_hz=images_hz)
+    return Recorder(log, config.bus.robot, encode, clock=clock, skip_invalid=True, images_hz=images_hz)
 
 
 def record(sources: Mapping[Camera, FrameSource], config: Config, rig: str, report: EventCallback) -> Recorder:
     """Record frames with stamps of CLOCK_MONOTONIC until the sources end or a signal comes; return the recorder."""
     clock = RobotClock(report=lambda line: report(logging.WARNING, line))
-    recorder = open_recorder(config, rig, report, time=SegmentTime(clock))
+    recorder = open_recorder(config, rig, report, clock=clock)
     graph = Graph(policy=NEWEST, depth=RECORDED_DEPTH)
     frames = [graph.source(name, source.frames, wake=source.close) for name, source in sources.items()]
     graph.sink("record", recorder, *frames)

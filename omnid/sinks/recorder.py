@@ -11,7 +11,7 @@ from drivers.frame import Frame
 from drivers.logs.mcap_writer import LogWriter
 from drivers.logs.rotating_log import RotatingLog, RotatingLogState
 from omnid.core.nanoseconds import NS_PER_S
-from omnid.engine.robot_clock import SegmentTime, log_time
+from omnid.engine.robot_clock import RobotClock, log_time
 from omnid.errors import OmnidError
 from omnid.messages import OdometryUpdate
 from omnid.sinks.encoder import Changes, Encoder, Outgoing, OutgoingMessage
@@ -94,16 +94,17 @@ class Recorder:
         robot: str,
         encode: Encoder | None = None,
         *,
-        time: SegmentTime | None = None,
+        clock: RobotClock | None = None,
         skip_invalid: bool = False,
         images_hz: float = 0.0,
     ) -> None:
-        """time: that of the files, which the encoder has as well; None: the stamps are Unix time.
+        """clock: that of the stamps, None: they are Unix time; the encoder has its segment_unix_ns.
 
         images_hz: pairs of images a second that are recorded; 0: all.
         """
         self._log, self._robot, self._encode = log, robot, encode
-        self._time, self._skip_invalid = time or SegmentTime(log_time()), skip_invalid
+        self._clock, self._skip_invalid = clock or log_time(), skip_invalid
+        self._steps = self._clock.steps
         self._changes = None if encode is None else Changes(encode)
         self._thinned = ThinnedPairs(images_hz)
         self._files = 0
@@ -124,14 +125,16 @@ class Recorder:
     def process(self, message: Recorded) -> None:
         """Record a message and, for a pose, its state where it has changed or a new file has begun."""
         # 1. A step of the computer's clock begins a new file: within one, all times are those of one clock.
-        if self._time.is_over():
+        self._clock.follow()
+        if self._steps != self._clock.steps:
+            self._steps = self._clock.steps
             self._log.end_file()
         # 2. The message, and what changes with it.
-        stamp_ns, encode = self._time.unix_ns(message.stamp_ns), self._encode
+        stamp_ns, encode = self._clock.segment_unix_ns(message.stamp_ns), self._encode
         try:
             if isinstance(message, Frame):
                 for frame in self._thinned.take(message):
-                    frame_ns = self._time.unix_ns(frame.stamp_ns)
+                    frame_ns = self._clock.segment_unix_ns(frame.stamp_ns)
                     self._write([OutgoingMessage(image_topic(frame), *image_cdr(frame, frame_ns))], frame_ns)
             elif encode is not None:
                 self._write(encode(message), stamp_ns)

@@ -48,7 +48,7 @@ from omnid.core.control.heading_controller import Setpoint
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.core.navigation import requests
 from omnid.core.navigation.path import FARTHEST_M
-from omnid.engine.robot_clock import RobotClock, duration_words
+from omnid.engine.robot_clock import RobotClock
 from omnid.errors import OmnidError
 from omnid.plain_text import plain
 from omnid.transport import codec, topics
@@ -149,7 +149,7 @@ class Freshness:
             how = "ROS 2: `header: auto`; String: last word stamp=NANOSECONDS"
             raise Refused("no stamp", f"fill in the stamp ({how}), or repeat that of odom")
         age_ns = arrival_ns - sent_ns
-        by_robot = f"{duration_words(abs(age_ns) * S_PER_NS)} by the robot's clock"
+        by_robot = f"{abs(age_ns) * S_PER_NS:.3f} s by the robot's clock"
         if age_ns < -self.stale_ns:
             raise Refused("stamp in the future", f"by {by_robot}; {_CLOCKS}")
         if age_ns > self.stale_ns:

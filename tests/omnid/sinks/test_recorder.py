@@ -21,7 +21,7 @@ from drivers.motor import VelocityCommand
 from omnid.config import Config, RecordConfig
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.engine.graph import NEWEST, Graph
-from omnid.engine.robot_clock import SegmentTime
+from omnid.engine.robot_clock import RobotClock
 from omnid.messages import MapUpdate, OdometryUpdate
 from omnid.runs.record import open_recorder, record
 from omnid.sinks.encoder import Encoder, StatusReport
@@ -53,8 +53,8 @@ def settings(folder: Path, **more: Any) -> Config:
     return replace(config, record=replace(config.record, folder=str(folder), free_mb=0, file_mb=1, **more))
 
 
-def times() -> SegmentTime:
-    return SegmentTime(SetClock(OFFSET_NS).clock())
+def set_clock() -> RobotClock:
+    return SetClock(OFFSET_NS).clock()
 
 
 def recorded(folder: Path) -> list[Path]:
@@ -63,7 +63,7 @@ def recorded(folder: Path) -> list[Path]:
 
 @pytest.mark.parametrize("encoding", ["jpeg", *LENGTHS])
 def test_recorded_images_are_read_unchanged_and_found_by_name(tmp_path: Path, encoding: str) -> None:
-    recorder = open_recorder(settings(tmp_path / "log"), "", lambda *_: None, time=times())
+    recorder = open_recorder(settings(tmp_path / "log"), "", lambda *_: None, clock=set_clock())
     given = [frame(n, camera, encoding) for n in range(3) for camera in ("lower", "upper")]
     for each in given:
         recorder.process(each)
@@ -81,7 +81,7 @@ def test_recorded_images_are_read_unchanged_and_found_by_name(tmp_path: Path, en
 @pytest.mark.parametrize("skew_ns", [-16_000_000, 100_000, 16_000_000])
 def test_a_recording_of_fewer_images_holds_whole_pairs(tmp_path: Path, skew_ns: int, upper_first: bool) -> None:
     """Of three seconds at 30 Hz 15 pairs at 5 Hz; the images of each are as far apart as the cameras are."""
-    recorder = open_recorder(settings(tmp_path), "", lambda *_: None, time=times(), images_hz=5.0)
+    recorder = open_recorder(settings(tmp_path), "", lambda *_: None, clock=set_clock(), images_hz=5.0)
     for n in range(92):
         lower, upper = frame(n, "lower"), frame(n, "upper")
         upper = replace(upper, stamp_ns=upper.stamp_ns + skew_ns)
@@ -101,9 +101,9 @@ def odometry(seq: int, state: str = "tracking") -> OdometryUpdate:
 
 
 def test_all_messages_are_recorded_in_unix_time(tmp_path: Path) -> None:
-    of_run = times()
-    encode = Encoder(np.eye(4), 100, of_run.unix_ns)
-    recorder = open_recorder(settings(tmp_path / "log"), "version = 1", lambda *_: None, encode=encode, time=of_run)
+    of_run = set_clock()
+    encode = Encoder(np.eye(4), 100, of_run.segment_unix_ns)
+    recorder = open_recorder(settings(tmp_path / "log"), "version = 1", lambda *_: None, encode=encode, clock=of_run)
     points = MapPoints(np.zeros((3, 3), np.float32), np.zeros(3, np.float32), *[np.zeros(3, np.int32)] * 2)
     for n in range(4):
         recorder.process(odometry(n, "lost" if n == 3 else "tracking"))
@@ -144,11 +144,11 @@ def test_a_step_of_the_clock_begins_a_file_and_no_file_has_one_in_it(
     """The oldest files are deleted by their order in the run, whatever their names say."""
     computer = SetClock(OFFSET_NS)
     computer.advance(5.0)
-    of_run = SegmentTime(computer.clock())
-    encode = Encoder(np.eye(4), 0, of_run.unix_ns)
+    of_run = computer.clock()
+    encode = Encoder(np.eye(4), 0, of_run.segment_unix_ns)
     monkeypatch.setattr(RecordConfig, "rotation", lambda _: RotationSettings(keep_files=2, free_bytes=0))
     config = settings(tmp_path / "log")
-    recorder = open_recorder(config, "", lambda *_: None, encode=encode, time=of_run)
+    recorder = open_recorder(config, "", lambda *_: None, encode=encode, clock=of_run)
     for n in range(30):
         stamp_ns = 5 * 10**9 + n * 10**8
         for camera in ("lower", "upper"):
@@ -209,7 +209,7 @@ class Given:
 
 
 def test_a_blocked_disk_stops_no_camera(tmp_path: Path) -> None:
-    recorder = open_recorder(settings(tmp_path / "log"), "", lambda *_: None, time=times())
+    recorder = open_recorder(settings(tmp_path / "log"), "", lambda *_: None, clock=set_clock())
     graph, seen_s, until_s = Graph(policy=NEWEST, depth=3), list[float](), time.monotonic() + 0.5
 
     def late(message: Frame) -> None:
@@ -228,14 +228,14 @@ def test_a_blocked_disk_stops_no_camera(tmp_path: Path) -> None:
 
 def test_reports_the_state_of_the_recording(tmp_path: Path) -> None:
     config = settings(tmp_path / "log")
-    recorder = open_recorder(config, "", lambda *_: None, time=times())
+    recorder = open_recorder(config, "", lambda *_: None, clock=set_clock())
     assert (entry(RECORDING, recorder.stats()).level, entry(RECORDING, recorder.stats()).message) == (OK, "waiting")
     recorder.process(frame(0, "lower"))
     status = entry(RECORDING, recorder.stats())
     assert status.message == "recording" and status.values["messages"] == "1" and Path(status.values["file"]).exists()
     recorder.close()
     full = replace(config, record=replace(config.record, free_mb=1_000_000))
-    recorder = open_recorder(full, "", lambda *_: None, time=times())
+    recorder = open_recorder(full, "", lambda *_: None, clock=set_clock())
     recorder.process(frame(0, "lower"))
     status = entry(RECORDING, recorder.stats())
     assert status.level == ERROR and status.values["lost"] == "1" and "1000001 needed" in status.message
