@@ -175,7 +175,6 @@ def demo(args: argparse.Namespace) -> int:
         plan=args.output / "plan.png",
         record=args.output / "log.mcap",
         publish=True,
-        bus_optional=True,
         paced=True,
         settings=args.config,
     )

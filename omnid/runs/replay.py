@@ -20,11 +20,9 @@ from drivers.errors import DriverError
 from drivers.frame import Frame
 from drivers.logs.log_reader import WHOLE, LogReader
 from drivers.motion import MotionSample
-from omnid.calibration.drive_observations import tracked_updates
 from omnid.config import Config
-from omnid.controller.motor import SIMULATED
 from omnid.core.control.motion_monitor import ADVICE
-from omnid.core.rig.rig_health import RigContradictedError, RigHealth
+from omnid.core.rig.rig_health import RigContradictedError
 from omnid.diagnostics.run_summary import RunCounters, RunStatistics, input_warnings
 from omnid.diagnostics.status import stage_stats, summary_stats
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Sink
@@ -42,7 +40,7 @@ from omnid.runs.session import LOG_POINTS, Session, attached_rig, motion_topics,
 from omnid.runs.wiring import Inputs, Outputs, wire
 from omnid.settings import dump
 from omnid.sinks.bus_sink import BusSink
-from omnid.sinks.drive import ReplayDrive, SimulatedWheels
+from omnid.sinks.drive import ReplayDrive
 from omnid.sinks.encoder import Outgoing, StatusReport
 from omnid.sinks.files import TrajectoryFile, check_outputs, write_known, write_plan
 from omnid.sinks.recorder import Recorder, SingleLog
@@ -56,8 +54,6 @@ Array = NDArray[np.float64]
 Topics: TypeAlias = tuple[str | None, str | None]  # of the lower and the upper camera
 UNPRIVILEGED: Final = RealtimeSettings(lock_memory=False, motor_priority=0)  # of the controller process of a replay
 PROGRESS_S: Final = 0.2  # between two calls that show the progress
-# Pairs by which the rig is examined: ten seconds of a log at 30 Hz. In the dark the run continues to check.
-MOST_PAIRS: Final = 300
 BOOKKEEPING: Final = frozenset(  # left out of the timings
     {"progress", "statistics", "collect-poses", "collect-map", "collect-places"}
 )
@@ -78,7 +74,6 @@ class ReplayOptions:
     record: Path | None = None
     collect: bool = False  # keep poses and map in memory for the result: 0.7 kB a pose
     publish: bool = False
-    bus_optional: bool = False  # without a bus, warn and continue
     inline: bool = False
     paced: bool = False  # at the pace of the log's stamps, unless the computer is slower; False: as fast as possible
     drops: bool = False  # a late stage drops messages, as on the robot; False: the stages before it wait
@@ -112,7 +107,7 @@ class _Replay:
         self._poses: list[tuple[int, Array, Array, TrackingState]] = []
         self._in_map: list[PlaceUpdate] = []
         self._map: deque[MapUpdate] = deque(maxlen=1)  # the newest one
-        self._wheels: ReplayDrive | SimulatedWheels | None = None
+        self._wheels: ReplayDrive | None = None
         self._warnings: list[str] = []
         self._begun_s = 0.0
 
@@ -125,12 +120,12 @@ class _Replay:
         graph = Graph(policy=NEWEST if options.drops else LOSSLESS, threaded=not options.inline)
         with opencv_in_one_thread(), ExitStack() as outputs:
             self._session = session = Session(config, graph, outputs, self._warnings.append)
-            # 1. The log and its rig, which the first pairs are compared with.
+            # 1. The log and its rig.
             self._reader = reader = self._opened()
             outputs.callback(reader.close)
             geometry = session.geometry(self._rig(), reader.frames())
             prepare_kernels()  # may take a minute: after a log or a rig that is wrong was refused
-            self._front_end = front_end = FrontEnd(geometry, config, self._examined_rig(geometry))
+            self._front_end = front_end = FrontEnd(geometry, config)
             # 2. The stages, between the log and the outputs; one that cannot be opened ends the run before it begins.
             run_places = RunPlaces(config, geometry, session.warn)
             messages, sinks = graph.source("read", self._messages()), self._outputs(geometry)
@@ -186,27 +181,6 @@ class _Replay:
             return attached_rig(self._reader, self._log)
         return read_rig(found) if isinstance(found, Path) else found
 
-    def _examined_rig(self, place: Geometry) -> RigHealth:
-        """Return the rig, decided as far as its first pairs show; RigContradictedError for a wrong rig.
-
-        It is examined before the replay opens its outputs: a wrong rig leaves no file behind. Odometry finds the motion
-        between the exposures of a pair, where these are not simultaneous.
-        """
-        config, mode = self._config, self._config.rig.check
-        health = RigHealth(place.cylinder, mode)
-        if mode != "refuse":
-            return health
-        try:
-            for update in tracked_updates(self._reader, FrontEnd(place, config, health), config, self._log):
-                if not health.is_checking or update.seq >= MOST_PAIRS:
-                    break
-        except RigContradictedError:
-            raise
-        except (OmnidError, DriverError):
-            pass  # A damaged log, or poses that are lost too often: the run reports them, after the poses there are.
-        # Where too little was seen, the run checks from its beginning.
-        return RigHealth(place.cylinder, mode) if health.is_checking else health
-
     def _messages(self) -> Callable[[], Iterator[Frame | MotionSample]]:
         """Return the source of the log; paced, each message comes when its stamp is due."""
         messages, graph = self._reader.messages, self._session.graph
@@ -235,7 +209,7 @@ class _Replay:
             )
             outputs.maps["collect-map"] = self._map.append
         if options.tum:
-            outputs.poses["trajectory"] = TrajectoryFile(options.tum, lambda: session.graph.is_stopping)
+            outputs.poses["trajectory"] = TrajectoryFile(options.tum)
         if options.map_tum or options.map_live_tum or options.collect:
             outputs.places["collect-places"] = self._in_map.append
         if cloud := options.cloud:  # each map replaces the file
@@ -251,24 +225,15 @@ class _Replay:
             log = SingleLog(options.record, attachments)
             recorder = Recorder(log, config.bus.robot, session.encoder(geometry.rig, LOG_POINTS))
             session.outputs.callback(recorder.close)
-        if config.motor.port == SIMULATED:
-            outputs.commands["wheels"] = self._wheels = SimulatedWheels(config.motor)
-        elif config.motor.port:
+        if config.motor.port:
             controller = session.start_controller(UNPRIVILEGED, of_replay=True)
             setpoint = config.controller.setpoint.setpoint()
             outputs.counters["controller"] = self._wheels = ReplayDrive(controller, setpoint, geometry.rig.T_base_rig)
-        return replace(outputs, bus=self._bus(geometry) if options.publish else None, recorder=recorder)
-
-    def _bus(self, geometry: Geometry) -> BusSink | None:
-        session = self._session
-        try:
-            bus = session.open_bus(geometry.rig, gives_time=True)
-        except OmnidError as error:
-            if not self._options.bus_optional:
-                raise
-            session.warn(f"the run goes on without a bus: {error}")
-            return None
-        return BusSink(bus, session.encoder(geometry.rig, LOG_POINTS), clock=OdometryUpdate)
+        bus: BusSink | None = None
+        if options.publish:
+            encode = session.encoder(geometry.rig, LOG_POINTS)
+            bus = BusSink(session.open_bus(geometry.rig, gives_time=True), encode, clock=OdometryUpdate)
+        return replace(outputs, bus=bus, recorder=recorder)
 
     def _on_signal(self, again: bool) -> None:
         if again and self._options.inline:  # nothing else interrupts the stage that runs in this thread

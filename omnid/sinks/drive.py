@@ -1,4 +1,4 @@
-"""Sinks that bring poses to the controller process, on the robot and in a replay, and the simulated base of one."""
+"""Sinks that bring poses to the controller process, on the robot and in a replay."""
 
 from __future__ import annotations
 
@@ -10,11 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import DriverError
-from drivers.motor import VelocityCommand, is_stop
-from drivers.motors.simulated.simulated_base import SimulatedBase
-from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from omnid.controller.link import ControllerLink, DriveLink
-from omnid.controller.motor_settings import MotorSettings
 from omnid.core.control.command_sources import PLANNER, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.nanoseconds import S_PER_NS
@@ -117,39 +113,6 @@ class ReplayDrive:
         """Return the commands that were answered, the errors, and how often moving wheels had to stop."""
         state = self._link.statistics.state
         return {"commands": state.sent, "errors": state.errors, "stops": state.stops.total()}
-
-
-class SimulatedWheels:
-    """Sends commands to a simulated motor controller, and turns its wheels.
-
-    A busy computer makes no command late: time passes for this base only from one command's stamp to the next.
-    """
-
-    def __init__(self, settings: MotorSettings) -> None:
-        self._now_ns, self._moves = 0, False
-        self._sent = self._stops = 0
-        self._motor = SimulatedMotor(settings.drive.geometry(), settings.watchdog_ms, lambda: self._now_ns)
-
-    @property
-    def base(self) -> SimulatedBase:
-        """The simulated base."""
-        return self._motor.base
-
-    def process(self, command: VelocityCommand) -> None:
-        """Let the base drive until the command's stamp, then send it; count it, and each stop of wheels that moved."""
-        self._now_ns = command.stamp_ns
-        self._motor.send(command)
-        self._sent += 1
-        self._stops += self._moves and is_stop(command)
-        self._moves = not is_stop(command)
-
-    def finish(self) -> None:
-        """Stop the wheels."""
-        self._motor.close()
-
-    def counts(self) -> dict[str, int]:
-        """Return the commands that were answered, the errors, and how often moving wheels had to stop."""
-        return {"commands": self._sent, "errors": self.base.errors, "stops": self._stops}
 
 
 def _motor_failed() -> DriverError:

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import errno
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from io import FileIO
+from io import BufferedWriter
 from pathlib import Path
-from select import select
 from typing import Final, TypeAlias
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.logs.image_folder import IMAGE_SUFFIXES
 from drivers.logs.mcap_writer import is_locked, lock
 from drivers.logs.open_log import is_log_name
 from omnid.core.mapping.voxel_map import MapPoints
@@ -33,21 +30,20 @@ REPLACED: Final = {"--cloud": (".ply",), "--plan": (".png",), "--ply": (".ply",)
 def check_outputs(outputs: Named, inputs: Named) -> None:
     """Check that all outputs (option, path) can be written, and none is another one, an input (name, path) or in use.
 
-    Of an input that is a folder, logs and images in it are inputs as well. Leaves no file behind. Raises OmnidError.
+    Of an input that is a folder, the logs in it are inputs as well. Leaves no file behind. Raises OmnidError.
     """
-    taken = {_identity(path): what for what, path in inputs}
+    used = {_identity(path): what for what, path in inputs}
+    folders = [folder.resolve() for _, folder in inputs if folder.is_dir()]
     for option, path in outputs:
-        _require_writable(option, path)
-        other = taken.setdefault(_identity(path), option)
-        if other != option and path.exists() == path.is_file():
-            raise OmnidError(f"{option} {path}: this is {other} as well; name another file")
-        folders = [folder for _, folder in inputs if folder.is_dir() and folder.resolve() in path.resolve().parents]
-        # A plan is an image beside the folders of a log, not in them.
-        is_read = is_log_name(path.name) or (path.suffix.lower() in IMAGE_SUFFIXES and option != "--plan")
-        if folders and is_read and path.is_file():
-            raise OmnidError(f"{option} {path}: this is a file of {folders[0]}, which is read; name another file")
-        if path.suffix and path.suffix.lower() not in REPLACED.get(option, (path.suffix.lower(),)):
-            raise OmnidError(f"{option} {path}: expected a name that ends in {REPLACED[option][0]}; name another file")
+        wrong = _why_not_written(option, path)
+        other = used.setdefault(_identity(path), option)
+        if not wrong and other != option and path.exists() == path.is_file():
+            wrong = f"this is {other} as well"
+        folder = next((folder for folder in folders if folder in path.resolve().parents), None)
+        if not wrong and folder is not None and is_log_name(path.name) and path.is_file():
+            wrong = f"this is a file of {folder}, which is read"
+        if wrong:
+            raise OmnidError(f"{option} {path}: {wrong}; name another file")
 
 
 def on_stdout(outputs: Named) -> bool:
@@ -66,80 +62,59 @@ def _identity(path: Path) -> tuple[int, int] | str:
     return os.path.realpath(path)
 
 
-def _require_writable(option: str, path: Path) -> None:
-    wrong, other = "", "name another file"
+def _why_not_written(option: str, path: Path) -> str:
+    """Return why a file cannot be written; empty if it can."""
+    endings = REPLACED.get(option, ())
     try:
-        if str(path) == "-":
-            wrong, other = "expected the name of a file", "use /dev/stdout for the standard output"
-        elif path.is_dir():
-            wrong = "expected a file to write, found a folder"
-        elif not path.parent.is_dir():
-            wrong, other = f"there is no folder {path.parent}", "make it first"
-        elif path.exists() and not path.is_file():  # not opened: a pipe that is opened and closed would end its reader
-            wrong = "expected a file that can be replaced, found a device or a pipe" if option in REPLACED else ""
-        else:
-            is_new = not path.exists()
-            path.open("ab").close()
-            if is_new:
-                os.unlink(os.path.realpath(path))  # where path is a link, it stays one
-            elif is_locked(path):
-                wrong, other = "another program is writing it", "name another file, or wait"
+        if path.is_dir():
+            return "expected a file to write, found a folder"
+        if not path.parent.is_dir():
+            return f"there is no folder {path.parent}"
+        if endings and path.suffix and path.suffix.lower() not in endings:
+            return f"expected a name that ends in {endings[0]}"
+        if path.exists() and not path.is_file():  # not opened: a pipe that is opened and closed would end its reader
+            return "expected a file that can be replaced, found a device or a pipe" if endings else ""
+        is_new = not path.exists()
+        path.open("ab").close()
+        if is_new:
+            os.unlink(os.path.realpath(path))  # where path is a link, it stays one
+        elif is_locked(path):
+            return "another program is writing it"
     except OSError as error:
-        wrong = f"cannot be written: {error.strerror or error}"
-    if wrong:
-        raise OmnidError(f"{option} {path}: {wrong}; {other}")
+        return f"cannot be written: {error.strerror or error}"
+    return ""
 
 
 class TrajectoryFile:
     """A trajectory as TUM, one line a pose, written as soon as the pose is known.
 
-    The file is opened for the first pose: a run without poses leaves an existing file as it was. A pipe is opened at
-    once: OmnidError where nobody reads it. A reader that is late is waited for, after a stop for a second.
+    The file is opened for the first pose: a run without poses leaves an existing file as it was.
     """
 
-    def __init__(self, path: Path, is_over: Callable[[], bool] = lambda: False) -> None:
-        """is_over: whether the run was stopped."""
-        self._path, self._is_over = path, is_over
-        self._file = self._opened() if path.is_fifo() else None
-        self._whole_bytes = 0
-
-    def _opened(self) -> FileIO:
-        """Open the file; no call on it waits."""
-        try:
-            number = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
-        except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-            if getattr(error, "errno", 0) == errno.ENXIO:
-                raise OmnidError(f"{self._path}: nobody reads this pipe; start its reader first") from error
-            raise _no_longer_written(self._path, error) from error
-        return FileIO(number, "wb")
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._file: BufferedWriter | None = None
 
     def process(self, odometry: OdometryUpdate) -> None:
         """Write the row of a pose T_odom_rig."""
         self.write(odometry.stamp_ns, odometry.T_odom_rig)
 
     def write(self, stamp_ns: int, T: NDArray[np.float64]) -> None:
-        """Write the row of a pose (4, 4)."""
-        row = tum_row(stamp_ns, T).encode("ascii") + b"\n"
+        """Write the row of a pose (4, 4). Raises OmnidError."""
         try:
             if self._file is None:
-                self._file = self._opened()
+                self._file = self._path.open("wb")
                 lock(self._file)
-            written = 0
-            while written < len(row):  # a full disk takes a part of the row, then nothing; a full pipe nothing
-                written += self._file.write(row[written:]) or 0
-                if written < len(row) and not select([], [self._file], [], 1.0)[1] and self._is_over():
-                    raise OSError(errno.EAGAIN, "its reader does not read")
+            self._file.write(tum_row(stamp_ns, T).encode("ascii") + b"\n")
+            self._file.flush()
         except OSError as error:
-            with suppress(OSError):
-                if self._file is not None:
-                    self._file.truncate(self._whole_bytes)  # remove the part of a row
             raise _no_longer_written(self._path, error) from error
-        self._whole_bytes += len(row)
 
     def finish(self) -> None:
         """Close the file."""
         if self._file is not None:
-            self._file.close()
+            with suppress(OSError):  # which `write` has reported
+                self._file.close()
 
 
 def write_trajectory(path: Path, stamps_ns: NDArray[np.int64], poses: NDArray[np.float64]) -> None:
@@ -171,8 +146,8 @@ def write_known(
     return [f"{path}: {left_out}: no place of the map was recognised there, so it is not known where in it they are"]
 
 
-def _no_longer_written(path: Path, error: OSError | ValueError) -> OmnidError:
-    return OmnidError(f"{path}: can no longer be written: {getattr(error, 'strerror', None) or error}")
+def _no_longer_written(path: Path, error: OSError) -> OmnidError:
+    return OmnidError(f"{path}: can no longer be written: {error.strerror or error}")
 
 
 def write_plan(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
@@ -114,16 +113,13 @@ class _Tables(NamedTuple):
     visible: NDArray[np.bool_]  # (H, W) of both cameras
 
 
-@lru_cache(maxsize=1)
 def _tables(geometry: Geometry, config: PanoramaConfig) -> _Tables:
-    """Return the tables; a run that examines its rig first has more than one front end of the same geometry."""
+    """Return the tables of a geometry."""
     rig, cylinder = geometry.rig, geometry.cylinder
     lower, upper = (remap_tables(rig, mounted, cylinder, config.pad_px) for mounted in (rig.lower, rig.upper))
     both = visible(rig.lower, lower, config.rim_margin_px)
     both &= visible(rig.upper, upper, config.rim_margin_px)
     shared = np.ascontiguousarray(_inner(both, config.margin_px)[:, config.pad_px : -config.pad_px])
-    for table in (*lower, *upper, shared):
-        table.setflags(write=False)
     return _Tables(lower, upper, _blur_px((lower, upper)), shared)
 
 

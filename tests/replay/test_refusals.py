@@ -49,7 +49,6 @@ TABLE = (
     ("replay {log} --rig {log}", "expected TOML in UTF-8"),
     ("replay {log} --rig {folder}/absent.toml", "`omnid calibrate import` or"),
     ("calibrate import {rig} -o {folder}/x", "use it as it is, --rig {rig}"),
-    ("calibrate import {folder}/camchain.yaml -o -", "-"),
     ("record --rig {folder}/absent.toml", "absent.toml"),
     # Outputs.
     ("replay {log} --rig {rig} --cloud /dev/null", "device"),
@@ -59,7 +58,6 @@ TABLE = (
     ("replay {log} --tum {folder}/x --cloud {folder}/x", "--tum"),
     ("replay {log} --cloud {folder}/x.png", "expected a name that ends in .ply"),
     ("replay {log} --plan {folder}/x.ply", "expected a name that ends in .png"),
-    ("replay {log} --rig {rig} --tum {folder}/pipe", "nobody reads this pipe"),
     ("replay {log} --record {log}", "the log that is read"),
     ("replay {log} --rig {rig} --record {folder}/loop", "loop"),
     # Settings and words.
@@ -126,7 +124,6 @@ def folder(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         (made / f"{name}.toml").write_text(content)
     (made / "camchain.yaml").write_text("cam0: {}\n")
     (made / "loop").symlink_to(made / "loop")
-    os.mkfifo(made / "pipe")
     return made
 
 

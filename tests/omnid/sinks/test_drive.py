@@ -10,21 +10,19 @@ import numpy as np
 import pytest
 
 from drivers.errors import DriverError
-from drivers.motor import VelocityCommand, stop_command
+from drivers.motor import VelocityCommand
 from omnid.controller.link import ControllerStatistics
-from omnid.controller.motor_settings import MotorSettings
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControllerPose
 from omnid.core.control.heading_controller import Setpoint
 from omnid.engine.telemetry import StageStats
 from omnid.messages import NavigationUpdate, OdometryUpdate, RequestAnswer
 from omnid.navigation_state import NavigationState
-from omnid.sinks.drive import PlannerDrive, ReplayDrive, SimulatedWheels
+from omnid.sinks.drive import PlannerDrive, ReplayDrive
 from omnid.tracking_state import TrackingState
 from omnid.transport.topics import Answer
 
 AHEAD = Setpoint(0.3, 0.0)
-START_NS, PERIOD_NS = 10**18, 10**8
 
 
 class Link:
@@ -94,22 +92,3 @@ def test_the_answers_of_the_navigation_are_given(link: Any) -> None:
     drive.process(update)
     assert answered == [(4, Answer(True, "paused: by a request")), (5, Answer(False, "no route lost"))]
     assert [setpoint for setpoint, _ in link.setpoints] == [AHEAD]
-
-
-def test_the_base_drives_as_long_as_the_stamps_say() -> None:
-    wheels = SimulatedWheels(MotorSettings())
-    for number in range(50):
-        wheels.process(VelocityCommand(START_NS + number * PERIOD_NS, 0.2, 0.0, 0.0))
-    assert wheels.base.pose[0] == pytest.approx(49 * 0.1 * 0.2, abs=0.05)
-    wheels.process(stop_command(START_NS + 50 * PERIOD_NS))
-    wheels.finish()
-    assert wheels.counts() == {"commands": 51, "errors": 0, "stops": 1}
-
-
-def test_a_gap_in_the_log_stops_the_base_and_it_goes_on_afterwards() -> None:
-    wheels = SimulatedWheels(MotorSettings())
-    for start_ns in (START_NS, START_NS + 3600 * 10**9):
-        for number in range(10):
-            wheels.process(VelocityCommand(start_ns + number * PERIOD_NS, 0.2, 0.0, 0.0))
-    assert wheels.counts()["errors"] == 0 and wheels.base.velocity_mps > 0.1
-    assert wheels.base.pose[0] < 1.0, "the base did not drive through the gap"

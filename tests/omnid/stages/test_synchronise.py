@@ -352,14 +352,10 @@ def test_a_drifted_rig_is_reported_and_motion_is_not(skewed: tuple[Path, Rig], t
     assert any("do not quite fit the rig" in text for text in warnings) == warned, warnings
 
 
-def test_exchanged_cameras_are_refused_and_nothing_is_written(skewed: tuple[Path, Rig], tmp_path: Path) -> None:
+def test_exchanged_cameras_are_refused(skewed: tuple[Path, Rig]) -> None:
     log, rig = skewed
-    options = ReplayOptions(
-        rig=rig, topics=(rig.topics[1], rig.topics[0]), tum=tmp_path / "a.tum", record=tmp_path / "a.mcap"
-    )
     with pytest.raises(RigContradictedError, match="other way round"):
-        run_log(log, Config(), options)
-    assert not list(tmp_path.iterdir())
+        run_log(log, Config(), ReplayOptions(rig=rig, topics=(rig.topics[1], rig.topics[0])))
 
 
 def test_images_with_both_stamps_give_the_poses_of_a_replay(skewed: tuple[Path, Rig]) -> None:
