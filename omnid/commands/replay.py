@@ -7,7 +7,6 @@ import math
 import sys
 from dataclasses import replace
 from pathlib import Path
-from shutil import get_terminal_size
 from typing import NamedTuple
 
 from omnid.commands.options import (
@@ -25,7 +24,7 @@ from omnid.commands.options import (
     warn,
 )
 from omnid.config import Config, unused_settings
-from omnid.diagnostics.run_summary import Progress, folded_entry, run_summary
+from omnid.diagnostics.run_summary import Progress, run_summary, summary_line
 from omnid.errors import OmnidError
 from omnid.runs.replay import ReplayOptions, run_log
 from omnid.runs.run_result import RunFailedError, RunResult
@@ -137,8 +136,7 @@ def _print_result(result: RunResult, options: ReplayOptions, output: Output, *, 
             stream,
         )
         return
-    columns = get_terminal_size().columns if stream.isatty() else 0
-    print(run_summary(result.counters, result.timings.values(), columns, verbose=output.verbose), file=stream)
+    print(run_summary(result.counters, result.timings.values(), verbose=output.verbose), file=stream)
     speed = f"{result.counters.pairs / max(1e-3, result.elapsed_s):.1f} pairs/s, in {result.elapsed_s:.1f} s"
     files = [path for _, path in options.files] + ([result.map_file] if result.map_file else [])
     entries = {
@@ -147,4 +145,4 @@ def _print_result(result: RunResult, options: ReplayOptions, output: Output, *, 
     }
     for name, words in entries.items():
         if words:
-            print(*folded_entry(name, words, columns), sep="\n", file=stream)
+            print(summary_line(name, words), file=stream)

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import logging
-import math
 import sys
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from textwrap import wrap
 from typing import Any, Final
 
 import numpy as np
@@ -81,83 +79,65 @@ class RunCounters:
         return self.poses == self.states[TrackingState.LOST]
 
 
-_NAME_COLUMNS: Final = 9
+def summary_entries(counters: RunCounters, *, verbose: bool = False) -> dict[str, str]:
+    """Return the counters as texts, by name: pairs and what was lost, last the length and the states.
 
-
-def summary_entries(counters: RunCounters, *, verbose: bool = True) -> dict[str, str]:
-    """Return the counters as texts, by name.
-
-    verbose: all of them, zeros too; else what everybody wants to know: what was lost, and last the length and states.
+    verbose: with counts of zero, and those of the map.
     """
-    poses, resets = counters.poses, counters.resets
-    drops = _listed({name: count for name, count in counters.drops.items() if count or verbose})
+    poses, resets, motor = counters.poses, counters.resets, counters.motor
     states = ((state, count / (poses or 1)) for state, count in counters.states.items() if count or verbose)
-    motor = "{commands} commands sent, {errors} errors, {stops} stops".format_map(counters.motor or Counter())
-    way = {"length": f"{counters.length_m:.4f} m", "states": ", ".join(f"{name} {share:.1%}" for name, share in states)}
-    found = {"pairs": str(counters.pairs), "poses": str(poses), **way, "resets": str(resets), "drops": drops}
-    found |= {"map": _listed(counters.map), "places": _listed(counters.places)}
-    if not verbose:
-        gaps = f"{resets}, after gaps in which the motion is unknown" if resets else ""
-        found = {"poses": f"{poses} of {counters.pairs} pairs of images", "lost": drops, "resets": gaps}
-    found |= {"motor": motor if counters.motor else ""} | ({} if verbose else way)
+    found = {
+        "pairs": str(counters.pairs),
+        "poses": str(poses),
+        "lost": _listed({name: count for name, count in counters.drops.items() if count or verbose}),
+        "resets": str(resets) if resets or verbose else "",
+        "map": _listed(counters.map) if verbose else "",
+        "places": _listed(counters.places) if verbose else "",
+        "motor": "{commands} commands sent, {errors} errors, {stops} stops".format_map(motor) if motor else "",
+        "length": f"{counters.length_m:.4f} m",
+        "states": ", ".join(f"{state} {share:.1%}" for state, share in states),
+    }
     return {name: text for name, text in found.items() if text or name == "states"}
 
 
-def run_summary(
-    counters: RunCounters, timings: Iterable[SummaryRow], columns: int = 0, *, verbose: bool = False
-) -> str:
-    """Return the counters, one a line.
-
-    verbose: with a row for each stage that processed messages, and with all counters, zeros too. columns: of the
-    terminal, whose width no line exceeds; 0: each counter has one line, as programs read it.
-    """
+def run_summary(counters: RunCounters, timings: Iterable[SummaryRow], *, verbose: bool = False) -> str:
+    """Return the counters, one a line. verbose: all, with a row for each stage that processed messages."""
     lines = []
     if verbose:
-        lines = [f"{'stage':<11}{'n':>8}{'drops':>7}{'p50 ms':>9}{'p99 ms':>9}{'max ms':>9}"]
+        lines = [f"{'stage':<17}{'n':>8}{'drops':>7}{'p50 ms':>9}{'p99 ms':>9}{'max ms':>9}"]
         lines += [
-            f"{r.stage:<11}{r.n:>8}{r.drops:>7}{r.p50_ms:>9.2f}{r.p99_ms:>9.2f}{r.max_ms:>9.2f}" for r in timings if r.n
+            f"{r.stage:<17}{r.n:>8}{r.drops:>7}{r.p50_ms:>9.2f}{r.p99_ms:>9.2f}{r.max_ms:>9.2f}" for r in timings if r.n
         ]
         lines.append("")
-    entries = summary_entries(counters, verbose=verbose)
-    lines += [line for name, text in entries.items() for line in folded_entry(name, text, columns)]
-    return "\n".join(lines)
+    return "\n".join([*lines, *(summary_line(*one) for one in summary_entries(counters, verbose=verbose).items())])
 
 
-def folded_entry(name: str, text: str, columns: int) -> list[str]:
-    """Return an entry as lines of at most `columns` columns; the texts stay below each other. 0: as one line."""
-    line = f"{name:<{_NAME_COLUMNS}} {text}"
-    if columns <= 2 * _NAME_COLUMNS:
-        return [line]
-    return wrap(line, columns, subsequent_indent=" " * (_NAME_COLUMNS + 1), break_long_words=False)
+def summary_line(name: str, text: str) -> str:
+    """Return an entry of the summary as a line."""
+    return f"{name:<9} {text}"
 
 
 def _listed(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{name} {count}" for name, count in counts.items())
 
 
-BAR_COLUMNS: Final = 24
-
-
 class Progress:
-    """Shows how far a run over a log is: a bar on a terminal, else a line each five seconds."""
+    """Shows how far a run over a log is: a line that a terminal keeps showing, else one each five seconds."""
 
     def __init__(self) -> None:
         self._is_terminal = sys.stderr.isatty()
         self._start_s = self._shown_s = time.monotonic()
 
     def __call__(self, statistics: RunStatistics, expected: int | None, ended: bool) -> None:
-        """Show the progress now; ended: remove the bar."""
+        """Show the progress now; ended: remove it."""
         newest, now_s = statistics.newest, time.monotonic()
-        if self._is_terminal and ended:
+        if ended:
             HANDLER.show("")
-        elif newest is not None and (self._is_terminal or now_s >= self._shown_s + 5) and not ended:
+        elif newest is not None and (self._is_terminal or now_s >= self._shown_s + 5):
             self._shown_s, done = now_s, newest.seq + 1
-            share = f"{done}/{expected}" if expected else f"{done} pairs"
-            if self._is_terminal and expected:
-                filled = min(BAR_COLUMNS, BAR_COLUMNS * done // expected)
-                share = f"[{'#' * filled}{'.' * (BAR_COLUMNS - filled)}] {share}"
+            share = f"{done}/{expected}" if expected else f"{done}"
             rate = done / max(1e-3, now_s - self._start_s)
-            line = f"{share} {rate:5.1f} pairs/s  {statistics.length_m:8.2f} m  {newest.state}"
+            line = f"{share} pairs, {rate:.1f} pairs/s, {statistics.length_m:.2f} m, {newest.state}"
             HANDLER.show(line) if self._is_terminal else log(logging.INFO, line)
 
 
@@ -167,28 +147,21 @@ def input_warnings(pairing: Synchronise, rig: RigHealth, statistics: RunStatisti
     poses, states = statistics.poses, statistics.states
     lost, notable = states[TrackingState.LOST], NOTABLE_SHARE * poses
     unsure = lost + states[TrackingState.DEGRADED]
-    tolerance = f"pair.tolerance_ms is {stats['tolerance_ms']:g}"
-    closest_ms = f"{stats['closest_miss_ms']:.3f} ms apart"
     # 1. Images and their stamps.
     if stats["_fault"]:
         yield f"{stats['broken']} images could not be used; the first: {stats['_fault']}"
-    if not stats["pairs"] and math.isnan(stats["closest_miss_ms"]):
-        yield "no pair of images: one camera or both have none that can be used, see the drops below"
-    elif not stats["pairs"]:
-        yield (
-            f"no pair of images: the stamps of the two cameras are at least {closest_ms}, {tolerance}: increase it, or "
-            "correct the clocks of the cameras"
-        )
+    if not stats["pairs"] and not min(stats["unpaired_lower"], stats["unpaired_upper"]):
+        yield "no pair of images: one camera or both have none that can be used, see what was lost below"
     elif min(stats["unpaired_lower"], stats["unpaired_upper"]) > stats["pairs"]:
         yield (
-            f"most images of both cameras found no partner: the closest ones are {closest_ms}, {tolerance}; if no "
-            "images are missing, synchronise the cameras"
+            "most images of both cameras found no partner: their stamps are more than pair.tolerance_ms = "
+            f"{stats['tolerance_ms']:g} apart: correct the clocks of the cameras, synchronise them, or increase it"
         )
     for camera in CAMERAS:
-        if (in_a_row := stats[f"_frozen_{camera}"]) >= FROZEN_IMAGES:
+        if (repeated := stats[f"repeated_{camera}"]) >= FROZEN_IMAGES:
             yield (
-                f"the {camera} camera was frozen: {stats[f'repeated_{camera}']} of its images had all pixels as "
-                f"before, {in_a_row} in a row; {REPEATED[config.pair.repeated_images]}"
+                f"the {camera} camera was frozen: {repeated} of its images had all pixels as before; "
+                f"{REPEATED[config.pair.repeated_images]}"
             )
     # 2. The rig, the light, dead parts of images.
     if rig.warning:

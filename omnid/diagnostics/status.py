@@ -7,6 +7,8 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
+
 from drivers.cameras.camera_state import CameraState
 from drivers.frame import Camera
 from omnid.controller.link import ControllerStatistics
@@ -14,10 +16,9 @@ from omnid.core.control.arming import STARTED
 from omnid.core.control.collision_monitor import remedy
 from omnid.core.control.safety_rules import ASKED, AWAITED, COMMAND_STALE, FAILED, IDLE, NOT_ARMED
 from omnid.core.nanoseconds import S_PER_NS
-from omnid.core.obstacles.unwatched import Unwatched
 from omnid.core.rig.column_finding import RigState
 from omnid.core.rig.rig_health import VIEWS, RigHealth
-from omnid.core.stereo.tiles import SIDES, Side, TileStates
+from omnid.core.stereo.tiles import SIDES
 from omnid.diagnostics.run_summary import RunCounters, RunStatistics
 from omnid.engine.telemetry import Histogram, StageStats, Telemetry
 from omnid.messages import OdometryUpdate
@@ -103,7 +104,6 @@ class StatusCollector:
         taken_hz, dropped_hz = (
             self._rate_hz(f"pair {name}", getattr(images, name)) for name in ("processed", "dropped")
         )
-        apart = "further apart in time than pair.tolerance_ms"
         warning = ""
         if missing:
             warning = f"no images of the {' and the '.join(missing)} camera"
@@ -118,9 +118,7 @@ class StatusCollector:
                 "--profile small"
             )
         elif pairs_hz == 0:
-            warning = f"the cameras' images are {apart}: synchronise them"
-        elif stats["_is_fixed"] and abs(stats["skew_ms"]) > stats["tolerance_ms"] / 2:
-            warning = f"the cameras' images are nearly {apart} allows: synchronise them"
+            warning = "the cameras' images are further apart in time than pair.tolerance_ms: synchronise them"
         is_corrected = bool(stats["exposure_skew_ms"])
         words = "not synchronised: the motion between the exposures is corrected" if is_corrected else "synchronised"
         return stats | {"_warning": warning, "_words": words}
@@ -242,23 +240,15 @@ def rig_stats(health: RigHealth) -> Stats:
     return stats
 
 
-def image_stats(unwatched: Unwatched, newest: OdometryUpdate | None) -> Stats:
-    """Return the parts of the newest pair that are frozen or blind, and how long."""
+def image_stats(newest: OdometryUpdate | None) -> Stats:
+    """Return which cameras show parts that are frozen or blind in the newest pair, and how long."""
     if newest is None:
         return {"_stale": "no pose yet"}
-    tiles = newest.depth.panoramas.tiles
-    lost = [side for side in SIDES if side in tiles.columns and tiles.columns[side].any()]
-    since_s = {f"{side}_since_s": round((newest.stamp_ns - tiles.since_ns[side]) * S_PER_NS) for side in lost}
-    words = "; ".join(_lost_parts(unwatched, side, tiles) for side in lost)
-    return {**since_s, "_error": words, "_words": status_names.LIVE}
-
-
-def _lost_parts(unwatched: Unwatched, side: Side, tiles: TileStates) -> str:
-    """Return what a camera does not show, such as "the upper camera is blind from 300 to 40 degrees"."""
-    columns, is_dead = tiles.columns[side], tiles.dead[side].any(axis=0)
-    parts = []
-    for word, found in (("frozen", columns & is_dead), ("blind", columns & ~is_dead)):
-        spans = unwatched.spans_deg(found) if found.any() else []
-        where = " and ".join(f"from {begin} to {end} degrees" for begin, end in spans)
-        parts += [f"{word} {'all around' if spans == [(0, 360)] else where}"] if spans else []
-    return f"the {side} camera is {' and '.join(parts)}"
+    tiles, since_s, words = newest.depth.panoramas.tiles, {}, []
+    for side in SIDES:
+        columns = tiles.columns.get(side, np.zeros(0, bool))
+        if columns.any():
+            since_s[f"{side}_since_s"] = round((newest.stamp_ns - tiles.since_ns[side]) * S_PER_NS)
+            where = "all around" if columns.all() else "in a part of its view"
+            words.append(f"the {side} camera is {'frozen' if tiles.dead[side].any() else 'blind'} {where}")
+    return {**since_s, "_error": "; ".join(words), "_words": status_names.LIVE}

@@ -41,17 +41,27 @@ class Histogram:
 
     def p(self, q: float) -> float:
         """Return the quantile q (0 to 1) of the durations, s; NaN before the first."""
-        return self.quantiles(q)[0]
-
-    def quantiles(self, *shares: float) -> list[float]:
-        """Return quantiles (0 to 1) of the durations of one state, s; NaN before the first."""
         ranks = list(accumulate(self._bins[:]))
-        found = []
-        for share in shares:
-            rank = max(1, math.ceil(share * ranks[-1]))
-            centre_s: float = S_PER_NS * 2.0 ** ((bisect_left(ranks, rank) + 0.5) / BINS_PER_OCTAVE)
-            found.append(self.max_s if rank >= ranks[-1] else min(centre_s, self.max_s))
-        return found
+        rank = max(1, math.ceil(q * ranks[-1]))
+        if rank >= ranks[-1]:
+            return self.max_s
+        centre_s: float = S_PER_NS * 2.0 ** ((bisect_left(ranks, rank) + 0.5) / BINS_PER_OCTAVE)
+        return min(centre_s, self.max_s)
+
+    def times_ms(self) -> dict[str, float]:
+        """Return median, 99th percentile and maximum, ms; NaN before the first."""
+        return {"p50": 1e3 * self.p(0.5), "p99": 1e3 * self.p(0.99), "max": 1e3 * self.max_s}
+
+
+class SummaryRow(NamedTuple):
+    """One printed line: wall time per message in milliseconds, NaN if no message was processed."""
+
+    stage: str
+    n: int
+    drops: int
+    p50_ms: float
+    p99_ms: float
+    max_ms: float
 
 
 @dataclass(slots=True)
@@ -85,52 +95,32 @@ class StageStats:
         self.processed += 1
 
 
-class SummaryRow(NamedTuple):
-    """One printed line: wall time per message in milliseconds, NaN if no message was processed."""
-
-    stage: str
-    n: int
-    drops: int
-    p50_ms: float
-    p99_ms: float
-    max_ms: float
-
-
 class Telemetry:
     """Registry of all counters of a run, in the order of the wiring."""
 
     def __init__(self) -> None:
-        self._stages: dict[str, StageStats] = {}
+        self.stages: list[StageStats] = []
 
     def add(self, stats: StageStats) -> StageStats:
         """Register the counters, whose name is that of no other stage, and return them."""
-        assert stats.name not in self._stages, stats.name
-        self._stages[stats.name] = stats
+        assert stats.name not in [other.name for other in self.stages], stats.name
+        self.stages.append(stats)
         return stats
 
     def of(self, name: str) -> StageStats:
-        """Return the counters of a stage; KeyError without it."""
-        return self._stages[name]
-
-    @property
-    def stages(self) -> tuple[StageStats, ...]:
-        """All counters."""
-        return tuple(self._stages.values())
+        """Return the counters of a stage; StopIteration without it."""
+        return next(stats for stats in self.stages if stats.name == name)
 
     @property
     def dropped_messages(self) -> int:
         """Number of messages that were dropped in front of stages and sinks."""
-        return sum(stats.dropped for stats in self._stages.values() if not stats.is_ticker)
+        return sum(stats.dropped for stats in self.stages if not stats.is_ticker)
 
     @property
     def missed_deadlines(self) -> int:
         """Number of deadlines that tickers have missed."""
-        return sum(stats.dropped for stats in self._stages.values() if stats.is_ticker)
+        return sum(stats.dropped for stats in self.stages if stats.is_ticker)
 
     def summary(self) -> list[SummaryRow]:
         """Return one row per stage, for printing."""
-        rows = []
-        for stats in self.stages:
-            times_s = [*stats.wall.quantiles(0.5, 0.99), stats.wall.max_s]
-            rows.append(SummaryRow(stats.name, stats.processed, stats.dropped, *(1e3 * time_s for time_s in times_s)))
-        return rows
+        return [SummaryRow(one.name, one.processed, one.dropped, *one.wall.times_ms().values()) for one in self.stages]

@@ -26,7 +26,6 @@ from omnid.core.control.command_sources import PLANNER
 from omnid.core.control.safety_rules import AWAITED, NO_POSE
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.core.navigation.requests import NavigationCommand
-from omnid.core.obstacles.unwatched import Unwatched
 from omnid.core.rig.rig_health import RigHealth
 from omnid.diagnostics.status import StatusCollector, image_stats, rig_stats, wheel_stats
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Stream, nothing
@@ -302,9 +301,9 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
 
     # 4. What comes from the bus, and the status of all parts.
     watched = _subscribe(session, bus, robot, controller, requests, run_places, front_end)
-    unwatched, statistics = Unwatched(geometry.cylinder, rig.T_base_rig @ geometry.T_rig_rect), session.statistics
+    statistics = session.statistics
     watched |= {
-        names.IMAGES: lambda: image_stats(unwatched, statistics.newest),
+        names.IMAGES: lambda: image_stats(statistics.newest),
         names.EXPOSURE: exposure.stats,
         names.RIG: partial(rig_stats, health),
         names.CLOCK: clock.stats,

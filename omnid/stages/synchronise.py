@@ -34,39 +34,26 @@ AHEAD_NS: Final = 5 * NS_PER_S  # a sample that is later than a pair by more has
 
 
 class Skew:
-    """Statistics of the skew, the upper camera's stamp minus the lower's, in ns."""
+    """The time between the exposures of a pair [ns], by the stamps of the recent ones, upper minus lower."""
 
     def __init__(self) -> None:
-        self.max_ns = 0  # largest absolute value
+        self.median_ns = math.nan
+        self.exposure_ns = 0.0  # 0 where the exposures may be simultaneous
         self._recent: deque[int] = deque(maxlen=RECENT)
-        self.exposure_ns = 0.0  # upper minus lower exposure of the newest pair
-        self._newest_ns, self._limit_ns = 0.0, math.inf  # of the line at the newest pair, and twice its scatter
-
-    @property
-    def mean_ns(self) -> float:
-        """Mean of the recent skews, NaN before the first."""
-        return float(np.mean(self._recent)) if self._recent else math.nan
+        self._limit_ns = math.inf
 
     def add(self, skew_ns: int) -> None:
-        """Add the skew of a pair; find that of the exposures, 0 where they may be simultaneous.
+        """Add the skew of a pair: the median of the recent ones counts, where it exceeds what their scatter explains.
 
-        Free-running cameras drift against each other, so a line is fitted to the recent skews; its newest value is 0
-        unless it exceeds twice the scatter. A value that is as far from the line means a lost image, or a camera that
-        was started again, and begins another line.
+        A value that is far from the others means a lost image, or a camera that was started again: it begins anew.
         """
         recent = self._recent
-        self.max_ns = max(self.max_ns, abs(skew_ns))
-        if recent and abs(skew_ns - self._newest_ns) > 2 * self._limit_ns:
+        if abs(skew_ns - self.median_ns) > 2 * self._limit_ns:  # never before the first
             recent.clear()
         recent.append(skew_ns)
-        count = len(recent)
-        self._newest_ns, residuals = float(skew_ns), np.zeros(1)
-        if count > 2:
-            since = np.arange(count) - (count - 1.0)
-            slope, self._newest_ns = np.polyfit(since, recent, 1).tolist()
-            residuals = np.array(recent) - self._newest_ns - slope * since
-        self._limit_ns = 2 * math.sqrt((STAMP_SIGMA_NS**2 + float(residuals @ residuals)) / count)
-        self.exposure_ns = self._newest_ns if abs(self._newest_ns) > self._limit_ns else 0.0
+        self.median_ns = float(np.median(recent))
+        self._limit_ns = 2 * math.hypot(STAMP_SIGMA_NS / math.sqrt(len(recent)), float(np.std(recent)))
+        self.exposure_ns = self.median_ns if abs(self.median_ns) > self._limit_ns else 0.0
 
 
 class Decoder:
@@ -115,14 +102,8 @@ class RepeatedImages:
 
     def __init__(self) -> None:
         self._earlier: Image | None = None
-        self.count = 0  # repeated images in all
-        self.longest = 0  # most of them in a row
-        self._in_a_row = 0
-
-    @property
-    def frozen(self) -> bool:
-        """True if the newest images are repeated ones."""
-        return self._in_a_row >= FROZEN_IMAGES
+        self.count = 0
+        self.in_a_row = 0  # of the newest images
 
     def add(self, image: Image) -> bool:
         """Take the next image (H, W); return True if it repeats the one before."""
@@ -132,8 +113,7 @@ class RepeatedImages:
             np.array_equal(image[part], earlier[part]) for part in (np.s_[:, 0], ...)
         )
         self.count += repeated
-        self._in_a_row = self._in_a_row + 1 if repeated else 0
-        self.longest = max(self.longest, self._in_a_row)
+        self.in_a_row = self.in_a_row + 1 if repeated else 0
         return repeated
 
 
@@ -234,7 +214,6 @@ class Synchronise:
         self._decode = Decoder(rig)
         self._cameras: dict[Camera, _Camera] = {name: _Camera() for name in CAMERAS}
         self._fixed_ns = round(config.tolerance_ms * 1e6)  # 0: none
-        self._closest_miss_ns = math.nan  # smallest gap between images of both cameras that made no pair
         self._pairs = self._repeating = 0  # pairs made, images of those that were left out
         self._use_repeated = config.repeated_images == "use"
         self.skew = Skew()
@@ -257,15 +236,11 @@ class Synchronise:
         cameras = self._cameras.items()
         return {
             **self.counts,
-            "skew_ms": self.skew.mean_ns * 1e-6,
-            "max_skew_ms": self.skew.max_ns * 1e-6,
+            "skew_ms": self.skew.median_ns * 1e-6,
             "exposure_skew_ms": self.skew.exposure_ns * 1e-6,
             "tolerance_ms": self._tolerance_ns * 1e-6,  # largest difference between the stamps of a pair
-            "closest_miss_ms": self._closest_miss_ns * 1e-6,
-            "_is_fixed": self._fixed_ns > 0,  # cameras whose clocks drift apart then make no pairs some day
             "_fault": self._decode.fault,  # reason why the first of the broken images could not be decoded
-            "_frozen": " and the ".join(name for name, camera in cameras if camera.repeated.frozen),
-            **{f"_frozen_{name}": camera.repeated.longest for name, camera in cameras},
+            "_frozen": " and the ".join(name for name, one in cameras if one.repeated.in_a_row >= FROZEN_IMAGES),
         }
 
     def loss(self, read: Mapping[str, int]) -> str:
@@ -292,8 +267,6 @@ class Synchronise:
         while lower.waiting and upper.waiting:
             frames = min(product(lower.waiting, upper.waiting), key=_gap_ns)
             if _gap_ns(frames) > self._tolerance_ns:
-                # The first where the second is NaN.
-                self._closest_miss_ns = min(_gap_ns(frames), self._closest_miss_ns)
                 break
             images = [self._decode(frame) for frame in frames]
             for camera, frame, image in zip((lower, upper), frames, images, strict=True):

@@ -155,8 +155,7 @@ def times(name: str, histogram: Histogram) -> dict[str, float]:
     """Return median, 99th percentile and maximum in ms; nothing before the first measurement."""
     if not histogram.count:
         return {}
-    found = zip(("p50", "p99", "max"), (*histogram.quantiles(0.5, 0.99), histogram.max_s), strict=True)
-    return {time_key(name, statistic): 1e3 * value_s for statistic, value_s in found}
+    return {time_key(name, statistic): value_ms for statistic, value_ms in histogram.times_ms().items()}
 
 
 def camera_name(camera: str) -> str:

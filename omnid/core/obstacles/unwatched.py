@@ -43,16 +43,6 @@ class Unwatched:
         """Return the directions (SECTORS,) from the viewpoint, about axes parallel to the base's, of columns (C,)."""
         return self._marked(self._sectors[-1, np.flatnonzero(columns)])
 
-    def spans_deg(self, columns: Flags) -> list[tuple[int, int]]:
-        """Return from where to where columns of tiles lie about the base, counter-clockwise from ahead [deg]."""
-        marked = self.directions(columns)
-        if marked.all():
-            return [(0, 360)]
-        begins, ends = (np.flatnonzero(marked & ~np.roll(marked, shift)) for shift in (1, -1))
-        # A span may lie across sector 0, which is behind.
-        ends = np.roll(ends, -1) if len(ends) and ends[0] < begins[0] else ends
-        return [((int(begin) - 180) % 360, (int(end) - 179) % 360) for begin, end in zip(begins, ends, strict=True)]
-
     @staticmethod
     def _marked(sectors: NDArray[np.intp]) -> Flags:
         found = np.zeros(SECTORS, bool)

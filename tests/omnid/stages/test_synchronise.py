@@ -264,7 +264,7 @@ def jitter(sigma_ms: float, count: int) -> np.ndarray:
         ([15.0], 15.0, 0.0),
         (15 + jitter(1.0, 60), 15.0, 1.0),
         (-9 + jitter(0.1, 60), -9.0, 0.1),
-        (5 + 0.2 * np.arange(100) + jitter(0.1, 100), 24.8, 0.15),
+        (5 + 0.003 * np.arange(100) + jitter(0.1, 100), 5.3, 0.15),
         # Another one after a lost image counts at once.
         ([14.0] * 40 + [-19.0], -19.0, 0.0),
     ],

@@ -32,14 +32,3 @@ def test_a_viewpoint_beside_the_origin_covers_near_and_far_directions() -> None:
     for range_m in (0.6, 1.2, 4.0):
         azimuth = math.atan2(0.3, range_m)
         assert found[math.floor((azimuth + math.pi) * SECTORS / math.tau)], range_m
-
-
-def test_spans_are_named_counter_clockwise_from_ahead() -> None:
-    """Across ahead, across the seam behind, all around and none."""
-    unwatched = Unwatched(CYLINDER, np.eye(4))
-    ((begin, end),) = unwatched.spans_deg(AHEAD)
-    assert begin in (341, 342) and end in (18, 19)
-    ((begin, end),) = unwatched.spans_deg(np.roll(AHEAD, TILE_COLUMNS // 2))
-    assert begin in (161, 162) and end in (198, 199)
-    assert unwatched.spans_deg(np.ones(TILE_COLUMNS, bool)) == [(0, 360)]
-    assert unwatched.spans_deg(np.zeros(TILE_COLUMNS, bool)) == []
