@@ -77,16 +77,6 @@ def test_a_rig_that_cannot_be_checked_is_a_warning(omnid: Command, tmp_path: Pat
     assert wrong.code == 2 and wrong.err.count("\n") == 1 and "the other way round" in wrong.err
 
 
-def test_the_topics_of_an_inverted_rig_are_used(omnid: Command, tmp_path: Path, scene: Path) -> None:
-    """The rig's lower camera writes to a topic named upper: the rig decides, and the motion is the same."""
-    rig = read_rig(scene / "rig.toml")
-    write_rig(tmp_path / "rig.toml", replace(rig, lower=rig.upper, upper=rig.lower, topics=(UPPER, LOWER)))
-    for name, file in (("a", scene / "rig.toml"), ("b", tmp_path / "rig.toml")):
-        assert omnid.replay(scene / "log.mcap", "--tum", tmp_path / name, rig=file).code == 0
-    a, b = (read_tum(tmp_path / name).T for name in "ab")
-    np.testing.assert_allclose(a[:, :3, 3], b[:, :3, 3], atol=0.02)
-
-
 @pytest.mark.hazard("H34")
 @pytest.mark.parametrize(("dead", "words"), [(("lower",), ()), (("lower", "upper"), ("--inline",))])
 def test_pairs_of_a_frozen_camera_give_no_pose(

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from calib import se3
-from calib.panorama import fit_cylinder
 from calib.rig import Rig
 from drivers.cameras.camera_state import CameraState
 from drivers.frame import Camera, Frame
@@ -23,10 +22,9 @@ from omnid.core.control.arming import ArmRequest
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControllerSettings
 from omnid.core.control.heading_controller import Setpoint
-from omnid.core.rig.rig_health import RigHealth
 from omnid.core.stereo.tiles import ALL_LIVE, TILE_COLUMNS, TILE_ROWS, TileStates
 from omnid.diagnostics.run_summary import RunCounters, RunStatistics, run_summary
-from omnid.diagnostics.status import StatusCollector, image_stats, rig_stats, wheel_stats
+from omnid.diagnostics.status import StatusCollector, image_stats, wheel_stats
 from omnid.engine.telemetry import Histogram, StageStats, Telemetry
 from omnid.messages import OdometryUpdate, StereoDepth
 from omnid.stages.lockstep_drive import controller_pose
@@ -36,10 +34,10 @@ from omnid.tracking_state import TrackingState
 from omnid.transport import codec
 from omnid.transport.codec import ERROR, OK, STALE, WARN, DiagnosticStatus, diagnostics_cdr
 from omnid.transport.commands import CommandReceiver, Freshness
-from omnid.transport.status_names import FLOOR, IMAGES, LIVE, REMEDIES, RIG, TIMEOUT_S, WHEELS, Key, entry, short_name
+from omnid.transport.status_names import FLOOR, IMAGES, LIVE, REMEDIES, TIMEOUT_S, WHEELS, Key, entry, short_name
 from omnid.transport.topics import Request
 from tests.omnid.small_pair import small_depth
-from tests.omnid.stages.test_keyframe_scan import depth
+from tests.omnid.stages.test_obstacles import depth
 from tests.simulation import build
 from tests.simulation.rigs import make_rig
 
@@ -154,16 +152,6 @@ def test_a_camera_without_images_is_named(daemon: Daemon) -> None:
     assert entries["lower camera"].level == OK
 
 
-def test_images_without_a_partner_and_images_that_cannot_be_decoded(daemon: Daemon) -> None:
-    daemon.collected()
-    daemon.shoot("lower")
-    daemon.shoot("upper", age_s=0.3)
-    assert "pair.tolerance_ms" in daemon.collected()["pairing"].message
-    daemon.shoot("lower", "upper", data=b"no image")
-    status = daemon.collected()["pairing"]
-    assert status.level == WARN and "cannot be decoded" in status.message and status.values["broken"] == "2"
-
-
 def test_a_computer_that_is_too_slow_is_named_with_what_to_do(daemon: Daemon) -> None:
     daemon.collected()
     for dropped in (5, 20):
@@ -206,17 +194,6 @@ def test_wheels_driving_stopped_and_faulty(daemon: Daemon) -> None:
     daemon.tick()
     status = daemon.collected()["wheels"]
     assert status.level == ERROR and status.values["fault"] == "7"
-
-
-@pytest.fixture
-def health() -> RigHealth:
-    return RigHealth(fit_cylinder(make_rig(size=256)), "warn", 5.0)
-
-
-def test_a_rig_that_was_not_checked_says_what_to_do(health: RigHealth) -> None:
-    status = entry(RIG, rig_stats(health))
-    assert status.level == OK and status.message.startswith("not checked yet: the robot must drive")
-    assert status.values == {"state": "unchecked", "new_views": "0", "needed_views": "16"}
 
 
 def test_the_height_is_published_with_its_origin_and_warns_unless_it_is_stated() -> None:

@@ -288,24 +288,6 @@ def test_newest_drops_the_oldest_and_counts_it() -> None:
     assert counted["numbers"] == counted["fast"] == (50, 0)
 
 
-def test_a_failed_reader_releases_its_waiting_writer() -> None:
-    graph, third = Graph(depth=1), threading.Event()
-
-    def numbers() -> Iterator[int]:
-        yield from (0, 1)
-        third.set()  # one message in process, one in the inbox: the next one has to wait
-        yield 2
-
-    def fail(message: int) -> int:
-        assert third.wait(LONG_S)
-        raise ValueError(f"cannot take {message}")
-
-    graph.stage("fragile", Apply(fail), graph.source("numbers", numbers))
-    with pytest.raises(ValueError, match="cannot take 0"):
-        graph.run()
-    assert [(row.n, row.drops) for row in graph.telemetry.summary()] == [(3, 0), (0, 2)]
-
-
 @both
 def test_a_ticker_runs_beside_a_slow_stage(threaded: bool) -> None:
     graph, sink, action = Graph(threaded=threaded), Collect(), Action(enough=20)

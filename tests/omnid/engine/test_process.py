@@ -1,4 +1,4 @@
-"""Parts of the engine without a graph: threads, programs, signals, counters, logging, real-time settings.
+"""Parts of the engine without a graph: threads, programs, signals, counters, logging, clocks, real-time settings.
 
 Real-time settings take effect where the system allows them, and are reported, not raised, where it does not; they are
 those of a whole process, so they are tested in one of their own.
@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 import json
 import logging
-import math
 import os
 import signal
 import subprocess
@@ -26,9 +25,11 @@ import pytest
 from omnid.engine.graph import Graph
 from omnid.engine.logging_setup import LOGGER, StderrHandler
 from omnid.engine.process import STOP_SIGNALS, handle_stop_signals, python, python_environment
-from omnid.engine.realtime import LOCK_ADVICE, ThreadStart, highest_priority
-from omnid.engine.telemetry import Histogram, StageStats, Telemetry
+from omnid.engine.realtime import ThreadStart, highest_priority
+from omnid.engine.robot_clock import RobotClock
+from omnid.engine.telemetry import Histogram
 from omnid.engine.threads import Poller, started
+from tests.set_clock import SetClock
 
 ROOT = Path(__file__).parents[3]
 LONG_S = 20.0  # a timeout that only a defect reaches
@@ -41,15 +42,6 @@ def test_a_caller_goes_on_after_its_time_and_may_wait_later() -> None:
     assert not has_ended(0.01) and not done
     release.set()
     assert has_ended(None) and done == [True]
-
-
-def test_a_call_that_blocks_for_ever_does_not_keep_the_program_from_ending() -> None:
-    code = (
-        "import threading; from omnid.engine.threads import started; "
-        "print(started(threading.Event().wait, 'blocked')(0.01))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
-    assert done.stdout == "False\n"
 
 
 @pytest.mark.usefixtures("no_thread_is_left")
@@ -98,21 +90,11 @@ def test_quantiles_agree_with_sorting(centre: float) -> None:
     histogram = Histogram()
     for duration_s in durations_s.tolist():
         histogram.add(duration_s)
-    expected = np.quantile(durations_s, [0.0, 0.01, 0.5, 0.9, 0.99], method="inverted_cdf")
-    assert histogram.quantiles(0.0, 0.01, 0.5, 0.9, 0.99) == pytest.approx(expected, rel=0.05)
+    for q in (0.0, 0.01, 0.5, 0.9, 0.99):
+        expected = np.quantile(durations_s, q, method="inverted_cdf")
+        assert histogram.p(q) == pytest.approx(expected, rel=0.05)
     assert histogram.p(1.0) == histogram.max_s == durations_s.max()
     assert histogram.count == 5000
-
-
-def test_summary_has_a_row_per_stage_in_milliseconds() -> None:
-    telemetry = Telemetry()
-    stats = telemetry.add(StageStats("stereo", processed=2, dropped=1))
-    telemetry.add(StageStats("idle"))
-    stats.wall.add(0.010)
-    stats.wall.add(0.030)
-    stereo, idle = telemetry.summary()
-    assert stereo[:3] == ("stereo", 2, 1) and stereo[3:] == pytest.approx((10.0, 30.0, 30.0), rel=0.05)
-    assert idle[:3] == ("idle", 0, 0) and all(map(math.isnan, idle[3:]))
 
 
 SETUP = "import logging; from omnid.engine.logging_setup import *; configure_logging(); configure_logging()\n"
@@ -121,7 +103,6 @@ OF_A_LIBRARY = SETUP + (
     "library = logging.getLogger('library'); library.info('detail')\n"
     "library.warning('careful, %d', 7); library.critical('broken')"
 )
-UNCONFIGURED = "import logging; from omnid.engine.logging_setup import log; log(logging.WARNING, 'one'); log(20, 'two')"
 
 
 @dataclass
@@ -180,18 +161,6 @@ def test_the_command_line_writes_its_error_with_priority(pipe: tuple[int, int]) 
     assert os.read(pipe[0], 1000).startswith(b"<3>the settings file '/nowhere' cannot be read")
 
 
-@pytest.mark.parametrize("environment", [{}, {"JOURNAL_STREAM": "1:2"}, {"JOURNAL_STREAM": "nonsense"}])
-@pytest.mark.parametrize(
-    ("script", "written"), [(LOG_THREE, b"omnid: warning: one\nomnid: two\nomnid: three\n"), (UNCONFIGURED, b"one\n")]
-)
-def test_writes_plain_text_elsewhere(
-    environment: dict[str, str], pipe: tuple[int, int], script: str, written: bytes
-) -> None:
-    """Also under systemd with another stderr."""
-    assert exit_code(environment, pipe[1], "-c", script) == 0
-    assert os.read(pipe[0], 1000) == written
-
-
 @pytest.mark.parametrize(
     ("text", "line"),
     [
@@ -207,14 +176,6 @@ def test_writes_plain_text_elsewhere(
 def test_writes_one_printable_line_of_bounded_length_per_record(log: Log, text: str, line: str) -> None:
     log(logging.INFO, text)
     assert log.lines == [f"omnid: {line}"]
-
-
-def test_a_stream_that_cannot_be_written_is_no_error() -> None:
-    closed = Log()
-    closed.stream.close()
-    closed(logging.ERROR, "lost")
-    with open("/dev/full", "wb", buffering=0) as full:
-        assert exit_code({}, full.fileno(), "-c", LOG_THREE) == 0
 
 
 UNPRIVILEGED = 65534
@@ -274,21 +235,6 @@ def test_only_the_named_thread_has_priority() -> None:
     assert seen == {"source": ("lower", os.SCHED_FIFO | os.SCHED_RESET_ON_FORK), "sink": ("sink", os.SCHED_OTHER)}
 
 
-@allowed
-def test_priorities_are_not_inherited() -> None:
-    script = """
-def motor():
-    ThreadStart({"motor": 18})("motor")
-    found["own"] = os.sched_getparam(0).sched_priority
-    child = threading.Thread(target=lambda: found.update(child=os.sched_getscheduler(0)))
-    child.start(); child.join()
-found = {"main": os.sched_getscheduler(0)}
-thread = threading.Thread(target=motor); thread.start(); thread.join()
-print(json.dumps(found))
-"""
-    assert vars(answer(script)) == {"main": os.SCHED_OTHER, "own": 18, "child": os.SCHED_OTHER}
-
-
 def test_reports_a_refused_priority_once_with_advice() -> None:
     done = answer(
         WITHOUT_RIGHTS
@@ -305,18 +251,6 @@ print(json.dumps({"reported": reported, "policy": os.sched_getscheduler(0)}))
     assert "LimitRTPRIO=20" in text and done.policy == os.SCHED_OTHER
 
 
-def test_does_not_lock_memory_under_a_limit() -> None:
-    done = answer(
-        WITHOUT_RIGHTS
-        + """
-reported = lock_memory()
-grown = len(bytearray(50 << 20))
-print(json.dumps({"reported": reported, "locked": locked_kb()}))
-"""
-    )
-    assert done.reported.endswith(f"swapped out: {LOCK_ADVICE}") and done.locked == 0  # not even tried
-
-
 @allowed
 def test_the_kernel_ends_a_real_time_thread_that_does_not_wait() -> None:
     done = process("""
@@ -327,3 +261,60 @@ while time.monotonic() < until_s:
     pass
 """)
     assert done.returncode == -signal.SIGXCPU
+
+
+S = 10**9
+START_NS = 1_700_000_000 * S
+
+
+@pytest.mark.parametrize(
+    ("step_s", "words"),
+    [(3600.0, "forwards by 3600.000 s"), (0.02, "forwards by 0.020 s"), (-3 * 3600.0, "back by 10800.000 s")],
+)
+def test_a_step_is_found_and_reported_once_and_stamps_from_before_it_keep_their_time(step_s: float, words: str) -> None:
+    lines: list[str] = []
+    computer = SetClock(START_NS)
+    clock = computer.clock(lines.append)
+    computer.advance(100.0)
+    before_ns = computer.monotonic_ns
+    assert clock.unix_ns(before_ns) == START_NS + before_ns
+    sent_before_ns = computer.unix_ns
+    computer.set_forwards(step_s)
+    computer.advance(0.1)
+    now_ns, change_ns = computer.monotonic_ns, round(step_s * 1e9)
+    assert [clock.unix_ns(now_ns) for _ in range(3)] == [START_NS + now_ns + change_ns] * 3
+    assert clock.unix_ns(before_ns) == START_NS + before_ns, "the messages of one pair have one time"
+    # A message that was on its way during the step is as old as it is, and so is one that is sent after it.
+    assert clock.age_ns(sent_before_ns) == pytest.approx(0.1e9) and clock.age_ns(computer.unix_ns) == 0
+    # A sender whose clock is another one is off by the step; sent once more it is still older.
+    other_ns = computer.unix_ns - change_ns
+    assert clock.age_ns(other_ns) == change_ns
+    assert len(lines) == 1 and words in lines[0] and clock.stats()["steps"] == 1
+
+
+@pytest.mark.parametrize("rate", [-500e-6, 40e-6])
+def test_slewing_is_followed_in_silence(rate: float) -> None:
+    lines: list[str] = []
+    computer = SetClock(START_NS)
+    clock, unix_ns = computer.clock(lines.append), 0
+    for _ in range(4000):
+        computer.advance(0.1)
+        computer.set_forwards(0.1 * rate)
+        before_ns, unix_ns = unix_ns, clock.unix_ns(computer.monotonic_ns)
+        assert abs(unix_ns - computer.unix_ns) < 1_100_000 and unix_ns > before_ns
+    assert not lines and clock.steps == 0
+
+
+def test_a_thread_that_is_not_scheduled_between_two_readings_has_seen_no_step() -> None:
+    lines: list[str] = []
+    computer, pauses_s = SetClock(START_NS), [0.0]
+
+    def late_ns() -> int:
+        computer.advance(pauses_s[0])
+        return computer.monotonic_ns
+
+    clock = RobotClock(late_ns, lambda: computer.unix_ns, lines.append)
+    pauses_s[0] = 0.05
+    for _ in range(50):
+        clock.follow()
+    assert not lines and clock.unix_ns(5 * S) == START_NS + 5 * S

@@ -17,29 +17,20 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import ExitStack, closing
-from itertools import islice
+from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-from calib.errors import CalibError
-from calib.rig_file import rig_toml
-from drivers.cameras.camera_state import CameraState
-from drivers.frame import Camera, Frame
-from drivers.logs.log_reader import LogReader
 from omnid.config import load_config
 from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.graph import NEWEST, Graph
 from omnid.engine.telemetry import Telemetry
-from omnid.errors import OmnidError
-from omnid.runs.live import ConnectedRobot
-from omnid.runs.session import Session, attached_rig
+from omnid.runs.session import Session
 from omnid.runs.systemd import Service, StatusLine, notify, watchdog_s
 from omnid.simulation.robot import with_masks
 from omnid.transport.status_names import Key
-from tests.drivers.logs.mcap_logs import pairs, write_log
 from tests.simulation.rigs import make_rig
 from tests.waiting import wait_until
 
@@ -69,67 +60,6 @@ def test_small_images_are_named_with_what_to_do() -> None:
 )
 def test_no_warning_of_images_that_are_large_enough_or_do_not_matter(size_px: int, override: str) -> None:
     assert warnings_of(size_px, override) == []
-
-
-def test_a_run_without_obstacles_says_that_nothing_keeps_the_base_from_them() -> None:
-    (line,) = warnings_of(320, "obstacles.enabled=false")
-    assert "the collision monitor is off" in line
-
-
-def test_the_attached_rig_is_read(tmp_path: Path) -> None:
-    rig = make_rig(size=256)
-    log = write_log(tmp_path / "a.mcap", pairs(1), [("rig.toml", rig_toml(rig).encode())])
-    with closing(LogReader(log)) as reader:
-        assert attached_rig(reader, log).baseline_m == pytest.approx(rig.baseline_m)
-
-
-@pytest.mark.parametrize(
-    ("attached", "error", "words"),
-    [([], OmnidError, "give one with --rig"), ([("rig.toml", b"x = ")], CalibError, "a.mcap: attached rig.toml: ")],
-)
-def test_a_log_without_a_rig_says_what_to_do(
-    tmp_path: Path, attached: list[tuple[str, bytes]], error: type[Exception], words: str
-) -> None:
-    log = write_log(tmp_path / "a.mcap", pairs(1), attached)
-    with closing(LogReader(log)) as reader, pytest.raises(error, match=words):
-        attached_rig(reader, log)
-
-
-class Images:
-    """A camera that never ends, and counts how often it is closed."""
-
-    def __init__(self, camera: Camera) -> None:
-        self.camera, self.closed, self.state = camera, 0, CameraState()
-
-    def frames(self) -> Iterator[Frame]:
-        seq = 0
-        while True:
-            yield Frame(seq, seq, self.camera, "mono8", b"\0", 1, 1)
-            seq += 1
-
-    def close(self) -> None:
-        self.closed += 1
-
-
-def test_the_first_images_come_in_turn_and_the_cameras_are_closed() -> None:
-    opened = list[Images]()
-
-    def open_camera(camera: Camera) -> Images:
-        opened.append(Images(camera))
-        return opened[-1]
-
-    frames = list(islice(ConnectedRobot(open_camera).first_frames(), 100))
-    assert [(frame.camera, frame.seq) for frame in frames[:4]] == [
-        ("lower", 0),
-        ("upper", 0),
-        ("lower", 1),
-        ("upper", 1),
-    ]
-    assert [camera.closed for camera in opened] == [1, 1]
-    begun = ConnectedRobot(open_camera).first_frames()
-    next(begun)
-    begun.close()
-    assert [camera.closed for camera in opened] == [1, 1, 1, 1]
 
 
 def test_the_line_and_the_summary_of_a_run() -> None:
@@ -175,19 +105,10 @@ def manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Manager
     manager.close()
 
 
-def test_notifies_systemd_of_a_state(manager: Manager) -> None:
-    assert notify("READY=1\nSTATUS=all is well")
-    assert manager.received() == ["READY=1", "STATUS=all is well"]
-
-
 @pytest.mark.parametrize("address", ["", "relative", "/nowhere/notify", "@nosuch", "/" + "x" * 200, "vsock:2:1"])
 def test_a_missing_manager_is_no_error(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NOTIFY_SOCKET", address)
     assert not notify("READY=1")
-
-
-def test_does_not_wait_for_a_manager_that_does_not_read(manager: Manager) -> None:
-    assert not all(notify("STATUS=x") for _ in range(100_000))  # its queue is full: notify returns, with False
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,10 @@
-"""Messages of the stages as those of ROS 2, and on the bus."""
+"""Messages of the stages as those of ROS 2, on the bus, and to the controller."""
 
 from __future__ import annotations
 
 import contextlib
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from struct import unpack_from
 from types import SimpleNamespace
@@ -15,16 +16,26 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from calib import se3
+from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
 from omnid.client import Robot
+from omnid.controller.link import ControllerStatistics
+from omnid.core.control.command_sources import TimedSetpoint
+from omnid.core.control.control_law import ControllerPose
+from omnid.core.control.heading_controller import Setpoint
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.odometry.stereo_frame import Features
 from omnid.core.types.panorama import PaddedPanorama
-from omnid.messages import MapUpdate, OdometryUpdate
+from omnid.engine.telemetry import StageStats
+from omnid.messages import MapUpdate, NavigationUpdate, OdometryUpdate, RequestAnswer
+from omnid.navigation_state import NavigationState
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
+from omnid.sinks.drive import PlannerDrive, ReplayDrive
 from omnid.sinks.encoder import Encoder, Outgoing, static_frames
+from omnid.tracking_state import TrackingState
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import PlanarPath, decode_pose
+from omnid.transport.topics import Answer
 from tests.omnid.transport.bus_fixtures import free_endpoint
 from tests.simulation import make_rig
 from tests.waiting import wait_until
@@ -134,12 +145,6 @@ def decoded(message: Outgoing, points: int = 10) -> list[tuple[str, Any]]:
     return [(sent.topic, STORE.deserialize_cdr(sent.payload, sent.schema)) for sent in encode(message)]
 
 
-def test_a_command_is_in_unix_time_and_in_the_frame_of_the_base() -> None:
-    [(topic, twist)] = decoded(VelocityCommand(5 * 10**9, 0.25, 0.0, -0.5))
-    assert (topic, twist.header.frame_id, twist.header.stamp.sec) == ("drive", "base_link", 10**9 + 5)
-    assert (twist.twist.linear.x, twist.twist.angular.z) == (0.25, -0.5)
-
-
 def test_a_cloud_has_the_most_confident_points_in_their_order() -> None:
     xyz = np.arange(12, dtype=np.float32).reshape(4, 3)
     ages = np.zeros(4, np.int32)
@@ -161,3 +166,75 @@ def test_the_static_frames_lead_from_the_base_to_the_cameras() -> None:
     assert list(found) == [("base_link", "rig"), ("rig", "lower"), ("rig", "upper")]
     np.testing.assert_allclose(found["base_link", "rig"], rig.T_base_rig, atol=1e-12)
     np.testing.assert_allclose(found["rig", "upper"] @ rig.upper.T_cam_rig, np.eye(4), atol=1e-9)
+
+
+AHEAD = Setpoint(0.3, 0.0)
+
+
+class Link:
+    """A link without a process, which keeps what it sends."""
+
+    def __init__(self) -> None:
+        self.poses: list[ControllerPose] = []
+        self.setpoints: list[tuple[Setpoint, int]] = []
+        self.statistics = ControllerStatistics(StageStats("motor"))
+        self.ended = False
+
+    def send(self, given: ControllerPose | TimedSetpoint) -> None:
+        if isinstance(given, ControllerPose):
+            self.poses.append(given)
+        else:
+            self.setpoints.append((given.setpoint, given.arrival_ns))
+
+    def receive_waiting(self) -> None:
+        """Nothing waits."""
+
+    def end(self) -> None:
+        self.ended = True
+
+    def commands(self) -> Iterator[VelocityCommand]:
+        assert self.ended, "the process is asked to end before its end is awaited"
+        return iter(())
+
+
+def pose_at(stamp_ns: int) -> OdometryUpdate:
+    depth: Any = None
+    return OdometryUpdate(
+        0, stamp_ns, np.eye(4), np.eye(6), np.zeros(6), np.eye(6), TrackingState.TRACKING, 0, 99, 99, depth
+    )
+
+
+@pytest.fixture
+def link() -> Any:
+    return Link()
+
+
+def test_a_pose_of_a_replay_counts_as_captured_on_arrival_and_renews_the_setpoint(link: Any) -> None:
+    drive = ReplayDrive(link, AHEAD, np.eye(4))
+    before_ns = time.monotonic_ns()
+    for stamp_ns in (10**18, 10**18 + 10**8):
+        drive.process(pose_at(stamp_ns))
+    assert [setpoint for setpoint, _ in link.setpoints] == [AHEAD, AHEAD]
+    assert all(before_ns <= pose.stamp_ns <= time.monotonic_ns() for pose in link.poses)
+    assert [arrival_ns for _, arrival_ns in link.setpoints] == [pose.stamp_ns for pose in link.poses]
+
+
+def test_a_motor_controller_that_failed_ends_a_replay(link: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    drive = ReplayDrive(link, AHEAD, np.eye(4))
+    link.statistics.state.failed = True
+    drive.process(pose_at(1))
+    monkeypatch.setattr("omnid.sinks.drive.FAILED_S", -1.0)
+    with pytest.raises(DriverError, match="does not answer"):
+        drive.process(pose_at(2))
+    with pytest.raises(DriverError, match="does not answer"):
+        drive.finish()
+
+
+def test_the_answers_of_the_navigation_are_given(link: Any) -> None:
+    answered: list[tuple[int, Answer]] = []
+    drive = PlannerDrive(link, lambda id, answer: answered.append((id, answer)))
+    answers = (RequestAnswer(4, "pause", ""), RequestAnswer(5, "repeat lost", "no route lost"))
+    update = NavigationUpdate(1, 1, AHEAD, NavigationState.PAUSED, "by a request", answers=answers)
+    drive.process(update)
+    assert answered == [(4, Answer(True, "paused: by a request")), (5, Answer(False, "no route lost"))]
+    assert [setpoint for setpoint, _ in link.setpoints] == [AHEAD]

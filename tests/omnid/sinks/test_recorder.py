@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import signal
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +22,7 @@ from omnid.core.mapping.voxel_map import MapPoints
 from omnid.engine.graph import NEWEST, Graph
 from omnid.engine.robot_clock import RobotClock
 from omnid.messages import MapUpdate, OdometryUpdate
-from omnid.runs.record import open_recorder, record
+from omnid.runs.record import open_recorder
 from omnid.sinks.encoder import Encoder, StatusReport
 from omnid.transport.codec import ERROR, OK, DiagnosticStatus
 from omnid.transport.status_names import RECORDING, entry
@@ -239,27 +238,3 @@ def test_reports_the_state_of_the_recording(tmp_path: Path) -> None:
     recorder.process(frame(0, "lower"))
     status = entry(RECORDING, recorder.stats())
     assert status.level == ERROR and status.values["lost"] == "1" and "1000001 needed" in status.message
-
-
-def test_records_both_cameras_and_reports_the_result(tmp_path: Path) -> None:
-    events: list[tuple[int, str]] = []
-    now_ns = time.monotonic_ns()
-    sources = {
-        camera: Given([replace(frame(n, camera), stamp_ns=now_ns + n * 10**7) for n in range(10)])
-        for camera in ("lower", "upper")
-    }
-    before = signal.getsignal(signal.SIGTERM)
-    state = record(
-        sources,
-        settings(tmp_path / "log"),
-        "version = 1",  # type: ignore[arg-type]
-        lambda severity, text: events.append((severity, text)),
-    ).state
-    assert signal.getsignal(signal.SIGTERM) is before
-    assert (state.messages, state.lost, state.status) == (20, 0, "closed")
-    assert "20 messages in 1 files" in events[-1][1]
-    (path,) = recorded(tmp_path / "log")
-    reader = LogReader(path)
-    frames = list(reader.frames())
-    assert len(frames) == 20 and abs(frames[0].stamp_ns - time.time_ns()) < 60 * 10**9
-    assert "rig.toml" in reader.attachments()

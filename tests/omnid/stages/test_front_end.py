@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import threading
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -110,17 +109,6 @@ def test_a_dim_image_is_brightened_and_its_noise_is_known(place: Geometry, pairs
     assert bright.lower.noise_grey < 3.0
 
 
-def test_a_coarser_panorama_is_made_of_a_blurred_image(place: Geometry) -> None:
-    """Single pixels of noise are averaged, not picked."""
-    size = place.rig.lower.camera.size[::-1]
-    image = np.random.default_rng(3).integers(100, 200, size).astype(np.uint8)
-    pair, spread = FramePair(0, 0, image, image), []
-    for config in (CONFIG.panorama, replace(CONFIG.panorama, scale=0.5)):
-        seen = Dewarp(geometry(place.rig, config), config).process(pair)
-        spread.append(seen.lower.panorama[seen.visible].std())
-    assert spread[1] < 0.75 * spread[0]
-
-
 class Seen(RigHealth):
     """State of a rig that notes the first pairs, and decides nothing."""
 
@@ -146,15 +134,6 @@ def test_the_rig_is_checked_by_pairs_that_are_not_synchronised_after_odometry_ha
     assert all(is_given for number, is_given in skewed.pairs if number > 0)
 
 
-def test_the_stereo_of_the_papers_method_is_chosen_for_all(place: Geometry, pairs: list[FramePair]) -> None:
-    """The method of the odometry decides the matching that each user of the front end gets."""
-    paper = Config(odometry=Config().odometry.__class__(method="paper"))
-    found = [FrontEnd(place, config).dense for config in (Config(), paper)]
-    panoramas = FrontEnd(place, Config()).dewarp.process(pairs[0])
-    disparities = [np.nan_to_num(dense.points(panoramas).disparity) for dense in found]
-    assert not np.array_equal(*disparities)
-
-
 def test_the_reflection_of_a_lens_in_its_mirror_has_no_depth(
     place: Geometry, pairs: list[FramePair], scene: Path
 ) -> None:
@@ -177,13 +156,6 @@ def test_the_reflection_of_a_lens_in_its_mirror_has_no_depth(
     assert below > 100 and confirmed < 0.4 * below, (below, confirmed)
 
 
-def test_the_first_pair_has_new_features_only(poses: list[OdometryUpdate]) -> None:
-    first, *others = poses
-    assert len(others) == PAIRS - 1
-    assert len(first.features.new) >= first.tracks > 50  # a few are too far away to be located
-    assert not len(first.features.inliers) and not len(first.features.rejected)
-
-
 def test_inliers_and_rejected_features_are_different_ones(poses: list[OdometryUpdate]) -> None:
     gaps: list[float] = []
     for odometry in poses[1:]:
@@ -191,21 +163,6 @@ def test_inliers_and_rejected_features_are_different_ones(poses: list[OdometryUp
         assert len(seen.inliers) >= odometry.inliers and len(seen.rejected) <= odometry.tracks
         gaps += np.linalg.norm(seen.rejected[:, None] - seen.inliers[None], axis=2).min(axis=1).tolist()
     assert gaps and np.mean(np.array(gaps) < 1) < 0.2  # px; a wrongly tracked feature may end on another
-
-
-def test_features_are_pixels_of_the_lower_panorama(poses: list[OdometryUpdate]) -> None:
-    for odometry in poses:
-        height, width = odometry.depth.panoramas.visible.shape
-        for pixels in (odometry.features.inliers, odometry.features.rejected, odometry.features.new):
-            assert pixels.shape[1] == 2 and (pixels >= -1).all() and (pixels <= [width, height]).all()
-
-
-def test_new_features_are_inliers_of_the_keyframe_before(poses: list[OdometryUpdate]) -> None:
-    for before, odometry in pairwise(poses):
-        new = {tuple(pixel) for pixel in odometry.features.new}
-        assert new <= {tuple(pixel) for pixel in odometry.features.inliers}
-        assert not new or (before.is_keyframe and before.features.new.size == 0)
-    assert any(len(odometry.features.new) for odometry in poses[1:])
 
 
 @pytest.mark.parametrize(("min_range_m", "found"), [(0.5, True), (3.0, False)])
@@ -222,15 +179,6 @@ def test_the_search_reaches_the_nearest_points(min_range_m: float, found: bool) 
     assert ((np.abs(depth.disparity - 60) < 1).sum() > 5000) == found
 
 
-def test_panoramas_are_scaled_but_not_their_elevations() -> None:
-    rig = make_rig(size=768, baseline_m=0.2)
-    full, half = (geometry(rig, replace(CONFIG.panorama, scale=scale)).cylinder for scale in (1.0, 0.5))
-    assert half.width == pytest.approx(full.width / 2, abs=8)
-    assert half.height == pytest.approx(full.height / 2, rel=0.02)
-    assert half.row0 / half.focal_px == pytest.approx(full.row0 / full.focal_px, abs=0.01)
-    assert geometry(rig, replace(CONFIG.panorama, width_px=800, scale=0.5)).cylinder.width == 800
-
-
 @pytest.fixture(scope="module")
 def depth(place: Geometry, pairs: list[FramePair]) -> DensePoints:
     front_end = FrontEnd(place, CONFIG)
@@ -245,15 +193,6 @@ def test_points_lie_on_the_surfaces_of_the_world(scene: Path, depth: DensePoints
     assert np.quantile(points[sure, 2], 0.02) > -0.1
     assert len(depth.points) == len(depth.pixels) == len(depth.variance_m2)
     assert np.isfinite(depth.disparity).sum() >= len(depth.points)
-
-
-def test_the_variance_of_a_point_follows_from_its_disparity(place: Geometry, depth: DensePoints) -> None:
-    """Half a pixel of disparity moves a point by about its standard deviation."""
-    rect = se3.apply(place.rig.T_rect_rig, depth.points)
-    range_m = np.linalg.norm(rect, axis=1)
-    disparity = place.cylinder.focal_px * place.rig.baseline_m / np.hypot(rect[:, 0], rect[:, 1])
-    moved = range_m * CONFIG.stereo.noise_px / disparity
-    np.testing.assert_allclose(np.sqrt(depth.variance_m2), moved, rtol=0.01)
 
 
 def test_a_slow_bus_drops_messages_and_delays_no_pose(place: Geometry, frames: list[Frame]) -> None:

@@ -80,13 +80,6 @@ def test_pairs_enter_the_map_at_its_rate_while_the_robot_moves(
     np.testing.assert_allclose(path_xy[-1], [speed_mps * 59 / 30, 0], atol=1e-6)
 
 
-def test_keyframes_enter_the_map_after_half_the_time(place: Geometry) -> None:
-    """Their dense stereo is computed in any case: with one in time, no other pair needs it."""
-    dense = CountedDepths(place)
-    driven(Mapping(MappingConfig(rate_hz=5.0), dense), 1.0, lambda seq: seq % 4 == 0)
-    assert dense.computed == list(range(0, 60, 4))
-
-
 def test_keyframes_alone_enter_a_map_without_readers(place: Geometry) -> None:
     """Later readers find it; from then on pairs enter it at its rate."""
     dense = CountedDepths(place)
@@ -118,15 +111,6 @@ def test_it_is_drawn_when_it_is_due_and_has_changed() -> None:
     assert stage.process(grid_update(8, scans(3))) is None
     [last] = stage.finish()
     assert last.seq == 8 and last.grid.cells.max() == 100
-
-
-def test_without_a_period_it_is_drawn_at_the_end() -> None:
-    stage = MapGrid(0.05, np.eye(4))
-    assert stage.finish() == [] and given(stage, [grid_update(k, scans(1)) for k in range(5)]) == []
-    assert [found.seq for found in stage.finish()] == [4]
-    empty = MapGrid(0.05, np.eye(4))
-    empty.process(grid_update(1, None))
-    assert empty.finish() == []
 
 
 def test_scans_of_unknown_place_are_not_drawn_into_the_map() -> None:

@@ -17,7 +17,6 @@ from calib.rig import Rig
 from calib.rig_file import read_rig
 from drivers.frame import Camera, Frame, gray
 from drivers.logs.log_reader import LogReader
-from drivers.logs.ros_messages import parse_motion
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.camera_config import PairConfig
 from omnid.config import Config, load_config
@@ -29,8 +28,6 @@ from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry
 from omnid.stages.synchronise import MAX_WAITING, Decoder, MotionInbox, Skew, Synchronise
 from omnid.tracking_state import TrackingState
-from omnid.transport.codec import IMU_SCHEMA
-from omnid.transport.sensor_codec import gyro_cdr
 from tests.simulation import MountedSensor, Sensor, build, corridor, render_grey, write_log
 from tests.simulation.logs import Readout
 from tests.simulation.paths import planar_poses
@@ -62,14 +59,6 @@ def made(pair: Synchronise, *frames: Frame) -> list[FramePair]:
 
 def unpaired(pair: Synchronise) -> tuple[int, int]:
     return pair.counts["unpaired_lower"], pair.counts["unpaired_upper"]
-
-
-def test_a_pair_has_the_lower_stamp_and_both_images(pair: Synchronise) -> None:
-    dark = cv2.imencode(".jpg", np.zeros((SIZE, SIZE), np.uint8))[1].tobytes()
-    for index, order in enumerate((("lower", "upper"), ("upper", "lower"))):
-        (found,) = made(pair, *(shot(c, index, 3 * MS * (c == "upper"), dark if c == "upper" else JPEG) for c in order))  # type: ignore[arg-type]
-        assert (found.seq, found.stamp_ns) == (index, shot("lower", index).stamp_ns)
-        assert found.lower.mean() > 80 and found.upper.mean() < 5
 
 
 def test_pairs_all_frames_in_any_order_of_arrival(pair: Synchronise) -> None:
@@ -124,15 +113,6 @@ def test_pairs_again_after_a_camera_was_away(pair: Synchronise, running: Camera,
     assert unpaired(pair) == ((990, 0) if running == "lower" else (0, 990)) and pair.counts["pairs"] == 20
 
 
-def test_cameras_that_never_match_keep_few_frames(pair: Synchronise) -> None:
-    """Stamps half a period apart make no pairs; all frames are counted."""
-    for index in range(500):
-        assert made(pair, shot("lower", index), shot("upper", index, PERIOD_NS // 2)) == []
-    assert min(unpaired(pair)) >= 500 - MAX_WAITING
-    pair.finish()
-    assert unpaired(pair) == (500, 500)
-
-
 def test_a_broken_image_counts_and_its_partner_is_unpaired(pair: Synchronise) -> None:
     frames = [
         frame
@@ -181,24 +161,6 @@ def test_free_running_cameras_make_a_pair_of_every_image(free: Synchronise, skew
     assert all(p.skew_s == pytest.approx(1e-3 * skew_ms, abs=1e-6) for p in found[10:])
 
 
-def test_free_running_cameras_lose_only_images_without_a_partner(free: Synchronise) -> None:
-    taken = [
-        shot(c, index, 14 * MS * (c == "upper"))
-        for index in range(60)
-        for c in ("lower", "upper")
-        if (c, index) not in (("lower", 20), ("upper", 31))
-    ]
-    found = made(free, *sorted(taken, key=lambda frame: frame.stamp_ns))
-    free.finish()
-    assert len(found) == 58 and unpaired(free) == (1, 1)
-    assert all(p.skew_s == pytest.approx(0.014, abs=1e-6) for p in found)
-
-
-def test_a_slower_camera_decides_how_many_pairs_there_are(free: Synchronise) -> None:
-    taken = [shot("lower", index) for index in range(90)] + [shot("upper", index, 12 * MS) for index in range(0, 90, 3)]
-    assert len(made(free, *sorted(taken, key=lambda frame: frame.stamp_ns))) == 30
-
-
 def image(number: int) -> np.ndarray:
     """Return a grey wall with the noise of the frame with this number."""
     noise = np.random.default_rng(number).integers(-2, 3, (SIZE, SIZE))
@@ -236,16 +198,6 @@ def test_pairs_of_a_frozen_camera_are_left_out(rig: Rig, dead: tuple[Camera, ...
         "repeated_upper": 10 * ("upper" in dead),
     }
     assert [pair.seq for pair in made] == list(range(10, 20)) and not pairing.stats()["_frozen"]
-
-
-def test_a_simulator_without_noise_may_use_them(rig: Rig) -> None:
-    pairing = Synchronise(rig, PairConfig(repeated_images="use"))
-    made = [pair for frame in frames([1] * 20, [1] * 20) if (pair := pairing.process(frame)) is not None]
-    assert (
-        len(made) == 20
-        and pairing.stats()["_frozen"] == "lower and the upper"
-        and pairing.counts["repeated_lower"] == 19
-    )
 
 
 TRIGGERED = random.Random(1)
@@ -291,9 +243,6 @@ def test_the_first_image_must_have_the_size_of_the_rig_and_later_ones_are_left_o
     assert decode.fault == "lower frame 3 is 32x32 px, unlike those before"
 
 
-UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])
-
-
 def test_samples_of_another_clock_and_too_many_are_dropped_and_counted() -> None:
     inbox = MotionInbox()
     for k in range(5000):
@@ -314,18 +263,6 @@ def test_a_sample_that_is_not_finite_makes_no_pose_so(sample: MotionSample) -> N
     inbox.add(kept)
     (taken,) = inbox.take(10)
     assert taken is kept and inbox.dropped == 1 and inbox.gyro == 0
-
-
-def test_the_axes_of_a_recorded_gyro_are_not_turned_again() -> None:
-    live = MotionInbox(UPSIDE_DOWN)
-    live.add(GyroSample(5, 0.1, 0.2, 0.5))
-    (sample,) = live.take(10)
-    assert isinstance(sample, GyroSample) and (sample.x_radps, sample.y_radps, sample.z_radps) == (0.1, -0.2, -0.5)
-    again = MotionInbox(UPSIDE_DOWN)
-    recorded = parse_motion(IMU_SCHEMA, memoryview(gyro_cdr(sample, 5)))
-    assert recorded is not None
-    again.add(recorded)
-    assert again.take(10) == (sample,)
 
 
 @pytest.fixture(scope="module")
