@@ -1,10 +1,9 @@
 """Real-time settings of the live daemon: scheduling priorities, locked memory, garbage collection, switch interval.
 
 Only threads that mostly wait become SCHED_FIFO, never the process: a FIFO thread that does not wait blocks its core
-for all others. Three safeguards: threads that it starts are ordinary ones (SCHED_RESET_ON_FORK), the kernel ends the
-daemon when such a thread runs for too long without a wait (RLIMIT_RTTIME, SIGXCPU), and by default it leaves 5 % of
-each second to other threads (sched_rt_runtime_us). A FIFO thread still waits for Python's global lock, up to the
-switch interval, which is therefore short.
+for all others. Two safeguards: threads that it starts are ordinary ones (SCHED_RESET_ON_FORK), and by default the
+kernel leaves 5 % of each second to other threads (sched_rt_runtime_us). A FIFO thread still waits for Python's global
+lock, up to the switch interval, which is therefore short.
 """
 
 from __future__ import annotations
@@ -49,11 +48,6 @@ class RealtimeSettings:
         int, Meta(ge=0, le=99), "SCHED_FIFO priority of the controller's tick, needs LimitRTPRIO; 0: none"
     ] = 20
     capture_priority: Annotated[int, Meta(ge=0, le=99), "SCHED_FIFO priority of the capture threads; 0: none"] = 10
-    longest_run_ms: Annotated[
-        int,
-        Meta(ge=0, le=10_000),
-        "longest run of a SCHED_FIFO thread without a wait, ms; beyond it the kernel ends the daemon; 0: no limit",
-    ] = 500
 
 
 def prepare(config: RealtimeSettings) -> str:
@@ -61,7 +55,6 @@ def prepare(config: RealtimeSettings) -> str:
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     gc.collect()
     gc.freeze()  # what exists at the start is not examined again
-    limit_realtime_runs(config.longest_run_ms)
     return lock_memory() if config.lock_memory else ""
 
 
@@ -100,17 +93,6 @@ def set_realtime_priority(priority: int) -> bool:
 def name_thread(name: str) -> None:
     """Set the kernel's name of the calling thread, which `top -H` shows, to the first 15 bytes."""
     _LIBC.prctl(_PR_SET_NAME, name.encode()[:_NAME_BYTES], 0, 0, 0)
-
-
-def limit_realtime_runs(max_run_ms: int) -> None:
-    """Let the kernel end the daemon by SIGXCPU when a SCHED_FIFO thread runs this long without a wait; 0: never.
-
-    A stricter limit of the parent process stays.
-    """
-    _, hard = resource.getrlimit(resource.RLIMIT_RTTIME)
-    wanted = max_run_ms * 1000 if max_run_ms else hard
-    if hard == resource.RLIM_INFINITY or wanted <= hard:
-        resource.setrlimit(resource.RLIMIT_RTTIME, (wanted, hard))
 
 
 def lock_memory() -> str:

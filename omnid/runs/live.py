@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, suppress
 from functools import partial
 from importlib import import_module
@@ -28,7 +28,7 @@ from omnid.core.nanoseconds import S_PER_NS
 from omnid.core.navigation.requests import NavigationCommand
 from omnid.core.rig.rig_health import RigHealth
 from omnid.diagnostics.status import StatusCollector, image_stats, rig_stats, wheel_stats
-from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Stream, nothing
+from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Stream
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.logging_setup import Report
 from omnid.engine.realtime import ThreadStart, name_thread, prepare
@@ -80,7 +80,7 @@ class LiveCamera(FrameSource, Protocol):
     state: CameraState
 
 
-OpenCamera: TypeAlias = Callable[[Camera], LiveCamera]  # called a second time after the first camera was closed
+OpenCamera: TypeAlias = Callable[[Camera], LiveCamera]
 
 
 class LiveRobot(Protocol):
@@ -100,9 +100,6 @@ class LiveRobot(Protocol):
 
     def clock_ns(self) -> int:
         """Return the time, by the clock of the stamps of images, poses and ticks [ns]."""
-
-    def first_frames(self) -> Generator[Frame, None, None]:
-        """Yield the first frames of both cameras in turn, for the rims of the mirrors."""
 
     def connect(
         self, session: Session, take: Callable[[MotionSample], None]
@@ -132,18 +129,6 @@ class ConnectedRobot:
     def clock_ns(self) -> int:
         """Return CLOCK_MONOTONIC."""
         return time.monotonic_ns()
-
-    def first_frames(self) -> Generator[Frame, None, None]:
-        """Yield the frames of both cameras in turn; they are open until this generator is closed."""
-        with ExitStack() as cameras:
-            streams = []
-            for name in CAMERAS:
-                camera = cameras.enter_context(closing(self._open_camera(name)))
-                streams.append(iter(camera.frames()))
-                # A generator holds the device until it is closed.
-                cameras.callback(getattr(streams[-1], "close", nothing))
-            for pair in zip(*streams, strict=False):
-                yield from pair
 
     def connect(
         self, session: Session, take: Callable[[MotionSample], None]
@@ -181,7 +166,6 @@ class LiveRun:
         else:
             priorities: dict[str, int] = dict.fromkeys(CAMERAS, config.realtime.capture_priority)
             self._graph = Graph(policy=NEWEST, depth=1, on_thread=ThreadStart(priorities, report))
-        self._connected = False
         self.clock = log_time()  # that of the run, once it has begun
 
     def run(self) -> int:
@@ -197,15 +181,13 @@ class LiveRun:
         self.clock = fixed_offset(robot.clock_ns) if robot.waits else RobotClock(robot.clock_ns, report=warn)
         with ExitStack() as outputs:
             session = Session(config, graph, outputs, warn, clock=self.clock)
-            outputs.enter_context(session.signals(self._on_signal))
-            # 1. The rig, with masks that are found in the first images; and the compiled functions.
+            # 1. The rig, and the compiled functions.
             rig = self._rig or read_rig(Path(config.cameras.rig))
-            with closing(robot.first_frames()) as frames:
-                geometry = session.geometry(rig, frames)
+            geometry = session.geometry(rig, ())
             loaded(None)
             prepare_kernels()  # which raises what has failed in the other thread
+            outputs.enter_context(session.signals())
             # 2. The connections, and the stages between them.
-            self._connected = True
             run_places = RunPlaces(config, geometry, warn)
             _join(session, geometry, robot, self._report, run_places)
             if (show := self._show) is not None:
@@ -223,15 +205,6 @@ class LiveRun:
             started(partial(import_module, "scipy.sparse.linalg"), "imports")
             run_to_end(graph, run_places)
         return 0
-
-    def _on_signal(self, again: bool) -> None:
-        """End the program at once while the first images are awaited.
-
-        Later the session has stopped the graph, which ends the run as soon as it begins: an exception while
-        connections are opened would leave threads behind that keep Python from ending.
-        """
-        if not self._connected:
-            raise SystemExit(0)
 
 
 def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report, run_places: RunPlaces) -> None:

@@ -20,11 +20,9 @@ from drivers.logs.topics import MotionTopics
 from omnid.config import Config
 from omnid.controller.link import ControllerLink
 from omnid.controller.messages import ControllerStart
-from omnid.core.control.collision_monitor import STOP
 from omnid.core.control.control_law import ControllerSettings
-from omnid.core.obstacles.column import FLOOR_FOCAL_PX
 from omnid.diagnostics.run_summary import RunStatistics
-from omnid.engine.graph import Graph
+from omnid.engine.graph import Graph, nothing
 from omnid.engine.process import handle_stop_signals
 from omnid.engine.realtime import RealtimeSettings
 from omnid.engine.robot_clock import RobotClock, log_time
@@ -116,20 +114,17 @@ class Session:
         self.clock = clock or log_time()
         self.statistics = RunStatistics()
         self.signal = 0  # number of the signal that ended the run
-        self._focal_px = FLOOR_FOCAL_PX  # of the panoramas
 
     def geometry(self, rig: Rig, frames: Iterable[Frame]) -> Geometry:
-        """Return the geometry of the rig; its missing masks are found in the frames, which are read only for that."""
-        given, rig = rig, with_rims(rig, frames)  # the same where no image can be decoded, which the run reports
+        """Return the geometry of the rig; its missing masks are looked for in frames of a log."""
+        rig = with_rims(rig, frames)
         for name, camera in (("lower", rig.lower), ("upper", rig.upper)):
-            if rig is not given and camera.mask is None and not sees_directly(camera.camera):
+            if camera.mask is None and not sees_directly(camera.camera):
                 self.warn(
-                    f"no mirror rim was found in the first images of the {name} camera: the largest disc is used; "
-                    f"the mask can be given in the rig's file under [{name}.mask]"
+                    f"no mirror rim is known of the {name} camera: the largest disc is used; give it in the rig's file "
+                    f"under [{name}.mask], by `omnid calibrate drive --only mask`"
                 )
-        found = geometry(rig, self.config.panorama)
-        self._focal_px = found.cylinder.focal_px
-        return found
+        return geometry(rig, self.config.panorama)
 
     def open_bus(self, rig: Rig, *, gives_time: bool) -> Bus:
         """Open the bus; it answers queries for the configuration and the rig. gives_time: as Bus has it."""
@@ -160,27 +155,14 @@ class Session:
         return link
 
     def with_obstacles_known(self, settings: ControllerSettings) -> ControllerSettings:
-        """Return the settings, without the collision monitor where no obstacles are searched, which is reported.
-
-        Images that are too small to see the floor are reported, too: the base would stop without a reason in view.
-        """
-        collision = settings.collision
-        if not collision.check:
+        """Return the settings, without the collision monitor where no obstacles are searched, which is reported."""
+        if not settings.collision.check or self.config.obstacles.enabled:
             return settings
-        if not self.config.obstacles.enabled:
-            self.warn(
-                "obstacles.enabled = false: the collision monitor is off, nothing keeps the base from driving "
-                "against obstacles"
-            )
-            return settings.without_obstacles
-        if collision.unknown == STOP and self._focal_px < FLOOR_FOCAL_PX:
-            self.warn(
-                f"the images are small: {self._focal_px:.0f} rows of the panorama a radian, where it takes "
-                f"{FLOOR_FOCAL_PX:.0f} to tell the floor from an edge of 5 cm (384 px by a mirror), so the base "
-                "will often stop because the way ahead is unknown; use larger images, "
-                'or controller.collision.unknown = "slow"'
-            )
-        return settings
+        self.warn(
+            "obstacles.enabled = false: the collision monitor is off, nothing keeps the base from driving against "
+            "obstacles"
+        )
+        return settings.without_obstacles
 
     def encoder(self, rig: Rig, cloud_points: int, unix_ns: UnixTime | None = None) -> Encoder:
         """Return an encoder that limits the number of points of the map; unix_ns: None for that of the clock."""
@@ -188,7 +170,7 @@ class Session:
         return Encoder(rig.T_base_rig, cloud_points, unix_ns or self.clock.unix_ns, rig, scan_range_m)
 
     @contextmanager
-    def signals(self, on_signal: Callable[[bool], None]) -> Iterator[None]:
+    def signals(self, on_signal: Callable[[bool], None] = nothing) -> Iterator[None]:
         """Stop the graph on SIGINT, SIGTERM and SIGHUP in this block, a second signal stops it at once.
 
         on_signal: called in the handler; True: it is the second signal or a later one.

@@ -10,7 +10,6 @@ import faulthandler
 import logging
 import math
 import os
-import signal
 import socket
 import time
 from collections.abc import Callable
@@ -50,7 +49,6 @@ def print_stacks_when_killed() -> None:
     """Print the stacks of all threads on stderr, if that is a file, when the process is killed for a stalled thread."""
     with suppress(OSError, ValueError):
         faulthandler.enable()  # SIGABRT, sent by systemd's watchdog
-        faulthandler.register(signal.SIGXCPU, chain=True)  # sent by the kernel to a real-time thread that never waits
 
 
 class Service:

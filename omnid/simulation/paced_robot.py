@@ -10,7 +10,7 @@ import copy
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from queue import SimpleQueue
 from typing import Any, Final
@@ -113,10 +113,6 @@ class PacedRobot:
     def clock_ns(self) -> int:
         """Return the simulated time; it begins with that of the computer, and never runs ahead of it."""
         return self._start_ns if self._vehicle is None else self._vehicle.now_ns
-
-    def first_frames(self) -> Generator[Frame, None, None]:
-        """Yield none: the rig has its masks."""
-        yield from ()
 
     def connect(self, session: Session, take: Callable[[MotionSample], None]) -> tuple[list[Stream[Frame]], DriveLink]:
         """Set the robot up, with the controller of the settings; one source of both cameras advances the time."""

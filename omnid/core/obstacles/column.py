@@ -26,8 +26,6 @@ Flags = NDArray[np.bool_]
 Tables = NDArray[np.int32]
 
 NEAREST_M: Final = 0.5  # Least range at which surfaces are searched.
-# Rows of panoramas in a radian; by trial: with 104 all of 4 goals were reached, with 87 not.
-FLOOR_FOCAL_PX: Final = 100.0
 OUTLIER: Final = np.uint8(4 * UNITS)  # Most units by which a pixel differs, because more than four sigmas are no noise.
 # Log-likelihood by a sigma of difference of a direction: 1 would be that of independent pixels; and of planes beside
 # the floor, which are compared in seven directions together.

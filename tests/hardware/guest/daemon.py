@@ -92,8 +92,6 @@ enabled = false
 [record]
 enabled = true
 free_mb = 10
-[realtime]
-longest_run_ms = 10000
 [service]
 stall_timeout_s = 30.0
 """

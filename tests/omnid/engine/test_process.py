@@ -1,7 +1,6 @@
 """Parts of the engine without a graph: threads, programs, signals, counters, logging, clocks, real-time settings.
 
-Real-time settings take effect where the system allows them, and are reported, not raised, where it does not; they are
-those of a whole process, so they are tested in one of their own.
+Real-time settings take effect where the system allows them, and are reported, not raised, where it does not.
 """
 
 from __future__ import annotations
@@ -178,37 +177,7 @@ def test_writes_one_printable_line_of_bounded_length_per_record(log: Log, text: 
     assert log.lines == [f"omnid: {line}"]
 
 
-UNPRIVILEGED = 65534
 allowed = pytest.mark.skipif(highest_priority() < 20, reason="no right to real-time priorities: ulimit -r 20")
-PREAMBLE = """
-import gc, json, os, resource, sys, threading, time
-from pathlib import Path
-from omnid.engine.realtime import RealtimeSettings, ThreadStart, limit_realtime_runs, lock_memory, prepare
-from omnid.engine.realtime import set_realtime_priority
-def locked_kb():
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith("VmLck"))
-"""
-WITHOUT_RIGHTS = f"""
-resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
-resource.setrlimit(resource.RLIMIT_MEMLOCK, (1 << 20, 1 << 20))
-if os.getuid() == 0:
-    os.setgid({UNPRIVILEGED}); os.setuid({UNPRIVILEGED})
-"""
-
-
-def process(script: str) -> subprocess.CompletedProcess[str]:
-    """Run the script in a process of its own."""
-    return subprocess.run(
-        [sys.executable, "-c", PREAMBLE + script], cwd=ROOT, capture_output=True, text=True, timeout=60
-    )
-
-
-def answer(script: str) -> SimpleNamespace:
-    """Return the JSON that the script prints."""
-    done = process(script)
-    assert done.returncode == 0, done.stderr
-    return SimpleNamespace(**json.loads(done.stdout))
 
 
 def seen_in(name: str, start: ThreadStart) -> dict[str, tuple[str, int]]:
@@ -236,31 +205,23 @@ def test_only_the_named_thread_has_priority() -> None:
 
 
 def test_reports_a_refused_priority_once_with_advice() -> None:
-    done = answer(
-        WITHOUT_RIGHTS
-        + """
+    """In a process of its own, without rights."""
+    script = """
+import json, os, resource
+from omnid.engine.realtime import ThreadStart
+resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
+if os.getuid() == 0:
+    os.setgid(65534); os.setuid(65534)
 reported = []
 start = ThreadStart({"motor": 20, "lower": 10}, lambda *words: reported.append(words))
 for name in ("motor", "lower", "stereo"):
     start(name)
-print(json.dumps({"reported": reported, "policy": os.sched_getscheduler(0)}))
+print(json.dumps([*reported, os.sched_getscheduler(0)]))
 """
-    )
-    ((priority, text),) = done.reported
+    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    (priority, text), policy = json.loads(done.stdout)
     assert priority == logging.WARNING and text.startswith("thread 'motor' cannot have real-time priority 20")
-    assert "LimitRTPRIO=20" in text and done.policy == os.SCHED_OTHER
-
-
-@allowed
-def test_the_kernel_ends_a_real_time_thread_that_does_not_wait() -> None:
-    done = process("""
-limit_realtime_runs(50)
-assert set_realtime_priority(10)
-until_s = time.monotonic() + 20
-while time.monotonic() < until_s:
-    pass
-""")
-    assert done.returncode == -signal.SIGXCPU
+    assert "LimitRTPRIO=20" in text and policy == os.SCHED_OTHER
 
 
 S = 10**9
