@@ -59,8 +59,7 @@ def replay(
     second, in a thread of the run, with the number of pairs so far and the expected one, None where it is not known.
 
     All poses and the map stay in memory (about 75 MB an hour at 30 Hz). Ctrl-C ends the run and
-    raises KeyboardInterrupt. Raises OmnidError for input that cannot be used; RunFailedError, which is one, holds the
-    result up to an error after the first pose.
+    raises KeyboardInterrupt. Raises OmnidError for input that cannot be used.
     """
     given = [overrides] if isinstance(overrides, str) else overrides
     settings = [*given, *([f"odometry.method={method}"] if method else [])]

@@ -27,7 +27,7 @@ from omnid.config import Config, unused_settings
 from omnid.diagnostics.run_summary import Progress, run_summary, summary_line
 from omnid.errors import OmnidError
 from omnid.runs.replay import ReplayOptions, run_log
-from omnid.runs.run_result import RunFailedError, RunResult
+from omnid.runs.run_result import RunResult
 from omnid.sinks.files import on_stdout
 
 
@@ -107,20 +107,13 @@ class Output(NamedTuple):
 
 def replay_and_print(log: Path, config: Config, options: ReplayOptions, output: Output) -> int:
     """Replay a log, print its warnings and its summary, and return the exit code."""
-    try:
-        result = run_log(log, config, options if output.quiet else replace(options, progress=Progress()))
-    except RunFailedError as error:
-        _print_result(error.result, options, output, failed=True)
-        raise
+    result = run_log(log, config, options if output.quiet else replace(options, progress=Progress()))
     _print_result(result, options, output)
     return 128 + result.signal if result.signal else int(result.counters.no_pose or bool(result.counters.loss))
 
 
-def _print_result(result: RunResult, options: ReplayOptions, output: Output, *, failed: bool = False) -> None:
-    """Print warnings on stderr and the summary on stdout, or also on stderr where a file goes to stdout.
-
-    failed: by an error, which is reported later; of the files only those that exist are named.
-    """
+def _print_result(result: RunResult, options: ReplayOptions, output: Output) -> None:
+    """Print warnings on stderr and the summary on stdout, or also on stderr where a file goes to stdout."""
     for warning in result.warnings:
         warn(warning)
     stream = sys.stderr if on_stdout(options.files) else sys.stdout
@@ -141,7 +134,7 @@ def _print_result(result: RunResult, options: ReplayOptions, output: Output, *, 
     files = [path for _, path in options.files] + ([result.map_file] if result.map_file else [])
     entries = {
         "speed": speed,
-        "cut short" if failed else "written": ", ".join(str(path) for path in files if not failed or path.exists()),
+        "written": ", ".join(map(str, files)),
     }
     for name, words in entries.items():
         if words:

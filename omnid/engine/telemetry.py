@@ -1,52 +1,44 @@
-"""Counters of every stage: messages, drops and durations, in constant memory."""
+"""Counters of every stage: messages, drops and durations, in bounded memory."""
 
 from __future__ import annotations
 
 import math
 import time
-from array import array
-from bisect import bisect_left
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from itertools import accumulate
 from typing import Any, Final, NamedTuple, TypeVar
 
-from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
+from omnid.core.nanoseconds import S_PER_NS
 
 T = TypeVar("T")
 
-BINS_PER_OCTAVE: Final = 8  # of nanoseconds: neighbouring bins differ by 9 %
-OCTAVES: Final = 40  # up to 18 minutes
+RECENT: Final = 1000  # durations whose distribution is known: ten seconds of the controller's ticks
 
 
 class Histogram:
-    """Distribution of durations from 1 ns to 18 minutes within 5 %, in 3 kB for any count.
+    """Distribution of the newest durations, their number, and the longest of all.
 
-    One thread adds; any thread may read at the same time and gets a state at most one duration old.
+    One thread adds; any thread may read at the same time.
     """
 
-    __slots__ = ("_bins", "count", "max_s")
+    __slots__ = ("_recent_s", "count", "max_s")
 
     def __init__(self) -> None:
-        self._bins = array("Q", [0]) * (OCTAVES * BINS_PER_OCTAVE)
+        self._recent_s: deque[float] = deque(maxlen=RECENT)
         self.count = 0
         self.max_s = math.nan
 
     def add(self, duration_s: float) -> None:
         """Add one duration."""
-        octaves = math.log2(max(duration_s * NS_PER_S, 1.0))
-        self._bins[min(int(octaves * BINS_PER_OCTAVE), len(self._bins) - 1)] += 1
+        self._recent_s.append(duration_s)
         self.max_s = duration_s if self.count == 0 else max(self.max_s, duration_s)
         self.count += 1
 
     def p(self, q: float) -> float:
-        """Return the quantile q (0 to 1) of the durations, s; NaN before the first."""
-        ranks = list(accumulate(self._bins[:]))
-        rank = max(1, math.ceil(q * ranks[-1]))
-        if rank >= ranks[-1]:
-            return self.max_s
-        centre_s: float = S_PER_NS * 2.0 ** ((bisect_left(ranks, rank) + 0.5) / BINS_PER_OCTAVE)
-        return min(centre_s, self.max_s)
+        """Return the quantile q (0 to 1) of the newest durations, s; NaN before the first."""
+        found_s = sorted(self._recent_s.copy())
+        return found_s[max(0, math.ceil(q * len(found_s)) - 1)] if found_s else math.nan
 
     def times_ms(self) -> dict[str, float]:
         """Return median, 99th percentile and maximum, ms; NaN before the first."""

@@ -23,7 +23,7 @@ from omnid.controller.statistics import ARMED, ControllerState
 from omnid.core.compiled import is_kept, kernel_modules
 from omnid.core.control.arming import MANUAL, NO_ANSWER
 from omnid.core.control.command_sources import PLANNER
-from omnid.core.control.safety_rules import AWAITED, NO_POSE
+from omnid.core.control.safety_rules import AWAITED
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.core.navigation.requests import NavigationCommand
 from omnid.core.rig.rig_health import RigHealth
@@ -260,7 +260,7 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
     navigation = None
     if controller is not None:
         states = controller.statistics.states = graph.inlet(1, thread="drive")
-        graph.sink("arming", ArmAnswers(session, bus), states, thread=states.thread)
+        graph.sink("arming", ArmAnswers(bus), states, thread=states.thread)
         if config.motion.wheels != "off" and not robot.brings_samples:
             wheels = controller.statistics.wheels = graph.inlet(1, thread="drive")
             graph.sink("wheels", motion.add, wheels, thread=wheels.thread)
@@ -374,8 +374,8 @@ def _subscribe(
 class ArmAnswers:
     """A sink of the controller's states that gives its answers; of several requests at once it answers the newest."""
 
-    def __init__(self, session: Session, bus: Bus) -> None:
-        self._session, self._bus, self._given = session, bus, NO_ANSWER
+    def __init__(self, bus: Bus) -> None:
+        self._bus, self._given = bus, NO_ANSWER
 
     def process(self, state: ControllerState) -> None:
         """Give the answer of a state, if it is a new one."""
@@ -386,11 +386,6 @@ class ArmAnswers:
         text = answer.refusal or "armed: it obeys commands from now on"
         if answer.refusal == AWAITED:
             text = f"{AWAITED}: {state.problem}"
-        if answer.refusal == NO_POSE:
-            if self._session.graph.telemetry.of("pair").processed:
-                text += ": the first images are being processed: try again in a moment (`omnid listen` shows the state)"
-            else:
-                text += ": no images have come from the cameras (`omnid listen`, `omnid doctor`)"
         self._bus.answer(answer.id, Answer(not answer.refusal, text), also_before=topics.ARM)
 
 

@@ -22,7 +22,6 @@ from drivers.logs.log_reader import WHOLE, LogReader
 from drivers.motion import MotionSample
 from omnid.config import Config
 from omnid.core.control.motion_monitor import ADVICE
-from omnid.core.rig.rig_health import RigContradictedError
 from omnid.diagnostics.run_summary import RunCounters, RunStatistics, input_warnings
 from omnid.diagnostics.status import stage_stats, summary_stats
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Sink
@@ -35,7 +34,7 @@ from omnid.formats.exports import write_ply
 from omnid.formats.plan import drawn_heights
 from omnid.messages import MapUpdate, OdometryUpdate, PlaceUpdate
 from omnid.runs.place_maps import RunPlaces
-from omnid.runs.run_result import RunFailedError, RunResult
+from omnid.runs.run_result import RunResult
 from omnid.runs.session import LOG_POINTS, Session, attached_rig, motion_topics, opencv_in_one_thread, run_to_end
 from omnid.runs.wiring import Inputs, Outputs, wire
 from omnid.settings import dump
@@ -95,7 +94,7 @@ def run_log(log: Path, config: Config, options: ReplayOptions | None = None) -> 
 
     Prints nothing. A first SIGINT, SIGTERM or SIGHUP ends the run early with whole files and `signal` in the result;
     a second one raises KeyboardInterrupt. Raises OmnidError, DriverError or CalibError for wrong input and outputs that
-    cannot be written, and RunFailedError, which holds the result so far, for such an error after the first pose.
+    cannot be written.
     """
     return _Replay(log, config, options or ReplayOptions()).run()
 
@@ -135,18 +134,11 @@ class _Replay:
                 show = partial(options.progress, session.statistics, reader.pair_estimate())
                 graph.ticker("progress", PROGRESS_S, partial(show, False))
                 outputs.callback(show, True)
-            # 3. The run; what it has found until an error is part of the error.
+            # 3. The run.
             self._begun_s = time.monotonic()
-            try:
-                with session.signals(self._on_signal):
-                    run_to_end(graph, run_places)  # before the result is made: it may warn
-                self._end_recording(sinks.recorder)
-            except (OmnidError, DriverError) as error:
-                with suppress(OmnidError, DriverError):  # the error that ended the run is the one that is reported
-                    self._end_recording(sinks.recorder)
-                if not session.statistics.poses or isinstance(error, RigContradictedError):
-                    raise
-                raise RunFailedError(str(error), self._result()) from error
+            with session.signals(self._on_signal):
+                run_to_end(graph, run_places)  # before the result is made: it may warn
+            self._end_recording(sinks.recorder)
             return replace(self._result(), map_file=run_places.written)
 
     def _inputs(self) -> list[tuple[str, Path]]:

@@ -93,11 +93,3 @@ class RunResult:
         if self.map is None:
             raise OmnidError(f"{path}: this run has no map: it found no pair of images, or it did not collect")
         write_ply(Path(path), self.map)
-
-
-class RunFailedError(OmnidError):
-    """An error that ended a run after its first pose; `result` holds what was found until then."""
-
-    def __init__(self, message: str, result: RunResult) -> None:
-        super().__init__(message)
-        self.result = result

@@ -83,17 +83,10 @@ class CameraFloor:
         """Return one sentence about a height that the rig does not state; empty where it does."""
         if self.stated is not None:
             return ""
-        floor = self._estimator.floor
-        if floor is None:
-            return (
-                "the rig does not state the height of the cameras, and the images do not show the floor: map, grid "
-                f"and obstacles call nothing free; {ADVICE}"
-            )
-        return (
-            f"the rig does not state the height of the cameras: the images show the floor {floor.height_m:.2f} m "
-            f"(sigma {floor.sigma_m:.2f}) below the lower one, tilted by {math.degrees(floor.tilt_rad):.1f} deg "
-            f"(sigma {math.degrees(floor.sigma_rad):.1f}), which is used; {ADVICE}"
-        )
+        floor, found = self._estimator.floor, "do not show the floor: map, grid and obstacles call nothing free"
+        if floor is not None:
+            found = f"show the floor {floor.height_m:.2f} m (sigma {floor.sigma_m:.2f}) below the lower one"
+        return f"the rig does not state the height of the cameras, and the images {found}; {ADVICE}"
 
 
 # Scan of a pair while the floor is not known.

@@ -23,11 +23,9 @@ from omnid.formats.place_file import read_places, write_places
 from omnid.formats.tum import read_tum
 from omnid.recordings.evaluation import evaluate
 from omnid.runs.replay import ReplayOptions, run_log
-from omnid.runs.run_result import RunFailedError
 from omnid.tracking_state import MapState
 from omnid.transport.codec import decode_diagnostics
 from omnid.transport.status_names import PLACES, Key
-from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import STORE
 from tests.ports import free_port
 from tests.replay.command import Command
@@ -215,21 +213,6 @@ def test_a_live_run_extends_its_map_now_and_then_and_at_its_end(scene: Path, oma
         code, err = daemon.end()
         assert code == 0 and "Traceback" not in err, err
     assert sessions(omap) == {0, 1, 2}
-
-
-def test_a_replay_whose_map_cannot_be_written_keeps_its_poses(scene: Path, tmp_path: Path) -> None:
-    """The folder of the map is removed while the log is replayed."""
-    folder = tmp_path / "maps"
-    folder.mkdir()
-
-    def progress(done: int, expected: int | None) -> None:
-        if done and folder.exists():
-            folder.rmdir()
-
-    settings = [f"places.map={folder / 'm.omap'}"]
-    with pytest.raises(RunFailedError, match="cannot write the map") as failed:
-        replay(scene / "log.mcap", scene / "rig.toml", overrides=settings, progress=progress)
-    assert len(failed.value.result.stamps_ns) == PAIRS
 
 
 @pytest.mark.parametrize("exists", [True, False])

@@ -171,10 +171,9 @@ def test_a_lost_motor_ends_the_run(tmp_path: Path, scene: Path) -> None:
     with started(replaying(scene, "--realtime", "--quiet", "--tum", tum, "--motor", motor.port)) as process:
         wait_until(lambda: tum.exists() and tum.read_bytes().count(b"\n") >= 3)
         motor.close()
-        out, err = process.communicate(timeout=PATIENCE_S)
-    assert process.returncode == 2 and "omnid: warning: motor on" in err, err
+        _, err = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 2, err
     assert err.splitlines()[-1].startswith("omnid: the motor controller does not answer any more"), err
-    assert out.startswith("poses "), "the result until then is printed"
     assert len(rows(tum)) >= 3
 
 
