@@ -30,10 +30,8 @@ LOCK_ADVICE: Final = (
     "set LimitMEMLOCK=infinity in the unit, or 'memlock unlimited' in /etc/security/limits.d, or "
     "realtime.lock_memory = false"
 )
-FILES: Final = 4096  # open at once
 SWITCH_INTERVAL_S: Final = 1e-3  # time after which Python switches threads
 _PR_SET_NAME: Final = 15
-_NAME_BYTES: Final = 15
 # MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT; without the last one, untouched stacks take 400 MB.
 _MCL_ALL: Final = 1 | 2 | 4
 _LIBC: Final = ctypes.CDLL(None, use_errno=True)
@@ -91,8 +89,8 @@ def set_realtime_priority(priority: int) -> bool:
 
 
 def name_thread(name: str) -> None:
-    """Set the kernel's name of the calling thread, which `top -H` shows, to the first 15 bytes."""
-    _LIBC.prctl(_PR_SET_NAME, name.encode()[:_NAME_BYTES], 0, 0, 0)
+    """Set the kernel's name of the calling thread, of which `top -H` shows the first 15 bytes."""
+    _LIBC.prctl(_PR_SET_NAME, name.encode(), 0, 0, 0)
 
 
 def lock_memory() -> str:
@@ -133,11 +131,3 @@ def priority_advice(priority: int) -> str:
         f"set LimitRTPRIO={priority} in the unit, or 'rtprio {priority}' in /etc/security/limits.d, or "
         "realtime.motor_priority = 0 and realtime.capture_priority = 0"
     )
-
-
-def raise_file_limit() -> None:
-    """Raise this process's limit of open files to FILES, or to what it may: connections of others need some."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = FILES if hard == resource.RLIM_INFINITY else min(FILES, hard)
-    if soft != resource.RLIM_INFINITY and soft < wanted:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))

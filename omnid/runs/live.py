@@ -40,7 +40,7 @@ from omnid.light.exposure import ExposureControl, UsefulArea
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.record import open_recorder
 from omnid.runs.route_files import Requests
-from omnid.runs.session import BUS_POINTS, LOG_POINTS, Session, joint_wheels, run_to_end
+from omnid.runs.session import Session, joint_wheels, run_to_end
 from omnid.runs.systemd import Service, StatusLine, print_stacks_when_killed
 from omnid.runs.wiring import Inputs, Navigation, Outputs, wire
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
@@ -219,7 +219,7 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
     bus = session.open_bus(rig, gives_time=robot.waits)
     recorder = None
     if config.record.enabled:
-        encode = session.encoder(rig, LOG_POINTS, clock.segment_unix_ns)
+        encode = session.encoder(rig, clock.segment_unix_ns)
         images_hz = config.record.images_hz
         recorder = open_recorder(config, rig_toml(rig), report, encode=encode, clock=clock, images_hz=images_hz)
         session.outputs.callback(recorder.close)
@@ -234,7 +234,7 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
             "latency": lambda pose: to_pose.add((clock.monotonic_ns() - pose.stamp_ns) * S_PER_NS),
         },
         # The ticks of wheels that wait give the time.
-        bus=BusSink(bus, session.encoder(rig, BUS_POINTS), clock=VelocityCommand if robot.waits else None),
+        bus=BusSink(bus, session.encoder(rig), clock=VelocityCommand if robot.waits else None),
         recorder=recorder,
         records_images=True,
         reports=reports,

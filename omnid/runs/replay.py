@@ -35,7 +35,7 @@ from omnid.formats.plan import drawn_heights
 from omnid.messages import MapUpdate, OdometryUpdate, PlaceUpdate
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.run_result import RunResult
-from omnid.runs.session import LOG_POINTS, Session, attached_rig, motion_topics, opencv_in_one_thread, run_to_end
+from omnid.runs.session import Session, attached_rig, motion_topics, opencv_in_one_thread, run_to_end
 from omnid.runs.wiring import Inputs, Outputs, wire
 from omnid.settings import dump
 from omnid.sinks.bus_sink import BusSink
@@ -215,7 +215,7 @@ class _Replay:
         if options.record:
             attachments = {"rig.toml": rig_toml(geometry.rig).encode(), "omnid.toml": dump(config).encode()}
             log = SingleLog(options.record, attachments)
-            recorder = Recorder(log, config.bus.robot, session.encoder(geometry.rig, LOG_POINTS))
+            recorder = Recorder(log, config.bus.robot, session.encoder(geometry.rig))
             session.outputs.callback(recorder.close)
         if config.motor.port:
             controller = session.start_controller(UNPRIVILEGED, of_replay=True)
@@ -223,7 +223,7 @@ class _Replay:
             outputs.counters["controller"] = self._wheels = ReplayDrive(controller, setpoint, geometry.rig.T_base_rig)
         bus: BusSink | None = None
         if options.publish:
-            encode = session.encoder(geometry.rig, LOG_POINTS)
+            encode = session.encoder(geometry.rig)
             bus = BusSink(session.open_bus(geometry.rig, gives_time=True), encode, clock=OdometryUpdate)
         return replace(outputs, bus=bus, recorder=recorder)
 

@@ -37,9 +37,7 @@ from omnid.transport.bus import Bus
 
 BUS_END_S: Final = 3.0
 ROUTER_S: Final = 2.0  # Time between two attempts of a client to reach its router for the first time.
-# Largest number of points of the map, the most confident ones, in one message on the bus and in a log.
-BUS_POINTS: Final = 50_000
-LOG_POINTS: Final = 200_000
+CLOUD_POINTS: Final = 50_000  # Most points of the map, the most confident ones, in one message.
 
 
 def attached_rig(reader: LogReader, log: Path) -> Rig:
@@ -164,10 +162,10 @@ class Session:
         )
         return settings.without_obstacles
 
-    def encoder(self, rig: Rig, cloud_points: int, unix_ns: UnixTime | None = None) -> Encoder:
-        """Return an encoder that limits the number of points of the map; unix_ns: None for that of the clock."""
+    def encoder(self, rig: Rig, unix_ns: UnixTime | None = None) -> Encoder:
+        """Return the encoder of the messages that leave the run; unix_ns: None for that of the clock."""
         scan_range_m = self.config.obstacles.scan.max_range_m
-        return Encoder(rig.T_base_rig, cloud_points, unix_ns or self.clock.unix_ns, rig, scan_range_m)
+        return Encoder(rig.T_base_rig, CLOUD_POINTS, unix_ns or self.clock.unix_ns, rig, scan_range_m)
 
     @contextmanager
     def signals(self, on_signal: Callable[[bool], None] = nothing) -> Iterator[None]:

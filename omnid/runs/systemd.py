@@ -54,7 +54,7 @@ def print_stacks_when_killed() -> None:
 class Service:
     """The action of a ticker: notifies systemd that the daemon is ready, and of its status, and feeds the watchdog.
 
-    The watchdog is not fed while a stage is stalled. A stage that stalls, or resumes, is logged once.
+    The watchdog is not fed while a stage is stalled; that is logged once.
     """
 
     def __init__(self, telemetry: Telemetry, status: Callable[[], str], stall_timeout_s: float) -> None:
@@ -75,29 +75,21 @@ class Service:
         busy = [(stage.name, stage.busy_since_ns) for stage in self._telemetry.stages]
         busy_s = {name: (now_ns - since_ns) * S_PER_NS for name, since_ns in busy if since_ns}
         stalled = {name: duration_s for name, duration_s in busy_s.items() if duration_s > self._stall_timeout_s}
-        self._log_changes(stalled)
-        # 2. What is told.
-        ready = [] if self._ready else ["READY=1"]
-        alive = [] if stalled else ["WATCHDOG=1"]
-        self._ready = notify("\n".join([*ready, *alive, f"STATUS={self._line(stalled)}"])) or self._ready
-
-    def close(self) -> None:
-        """Notify systemd that the daemon stops; from now on only TimeoutStopSec limits it."""
-        notify("STOPPING=1\nSTATUS=stopping")
-
-    def _line(self, stalled: dict[str, float]) -> str:
-        parts = [f"{name} stalled for {duration_s:.0f} s" for name, duration_s in stalled.items()]
-        return " ".join(", ".join([*parts, self._status()]).split())
-
-    def _log_changes(self, stalled: dict[str, float]) -> None:
         for name in stalled.keys() - self._stalled:
             log(
                 logging.ERROR,
                 f"stage '{name}' is stalled: {stalled[name]:.1f} s at one message; systemd's watchdog is no longer fed",
             )
-        for name in self._stalled - stalled.keys():
-            log(logging.INFO, f"stage '{name}' goes on")
         self._stalled = frozenset(stalled)
+        # 2. What is reported.
+        words = ", ".join([*(f"{name} stalled for {stalled[name]:.0f} s" for name in stalled), self._status()])
+        ready = [] if self._ready else ["READY=1"]
+        alive = [] if stalled else ["WATCHDOG=1"]
+        self._ready = notify("\n".join([*ready, *alive, f"STATUS={' '.join(words.split())}"])) or self._ready
+
+    def close(self) -> None:
+        """Notify systemd that the daemon stops; from now on only TimeoutStopSec limits it."""
+        notify("STOPPING=1\nSTATUS=stopping")
 
 
 class StatusLine:

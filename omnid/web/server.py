@@ -27,7 +27,6 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from omnid.engine.logging_setup import is_journal, log
-from omnid.engine.realtime import raise_file_limit
 from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig, checked
 from omnid.web.access import Access, Guard, is_of_other_site, token_of
@@ -76,7 +75,6 @@ def serve(bus: BusConfig, settings: WebSettings) -> None:
         access = Access(token, hosts, not local, f"omnid_{port}", stop_token)
         page = RobotPage(RobotFeed(bus))
         server = _Server(_uvicorn_config(site(page, access, secure=settings.tls is not None), settings))
-        raise_file_limit()
         # 3. Print where it is; with the tokens, unless the journal would keep them.
         url = f"{'https' if settings.tls else 'http'}://{_address(host)}:{port}/"
         if is_journal(sys.stdout):
