@@ -13,7 +13,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from functools import partial
 from typing import Any, Final, Generic, Protocol, TypeAlias, TypeVar
@@ -112,48 +112,48 @@ class Node:
 
 @dataclass(slots=True, eq=False)
 class _Link:
-    """One of the streams that a node reads, with the bound of what may wait of it."""
+    """One of the streams that a node reads, with what waits of it and the bound of that."""
 
     node: Node
     depth: int
     policy: Policy
-    waiting: int = 0
+    waiting: deque[object] = field(default_factory=deque)
 
 
 class _Inbox:
-    """Bounded queue in front of a thread, from which it serves its nodes.
+    """Bounded queues in front of a thread, from which it serves its nodes in the order of arrival.
 
-    With the policy NEWEST a stream drops its own oldest message, so none of two cameras takes the place of the other
-    one's image.
+    With the policy NEWEST a stream drops its own oldest message, whose place in the order its next one takes: none of
+    two cameras takes the place of the other one's image.
     """
 
     def __init__(self, graph: Graph) -> None:
         self.nodes: set[Node] = set()
         self._graph, self._changed = graph, threading.Condition(graph.lock)
-        self._messages: deque[tuple[_Link, object]] = deque()
+        self._order: deque[_Link] = deque()
 
     def put(self, link: _Link, message: object) -> None:
         """Add a message of a stream; the end of one always has room."""
+        waiting = link.waiting
         with self._changed:
             if message is not END and link.policy is LOSSLESS:
-                self._changed.wait_for(lambda: link.waiting < link.depth)
-            elif message is not END and link.waiting >= link.depth:
-                del self._messages[next(k for k, (other, _) in enumerate(self._messages) if other is link)]
-                link.waiting -= 1
+                self._changed.wait_for(lambda: len(waiting) < link.depth)
+            waiting.append(message)
+            if message is not END and len(waiting) > link.depth:
+                waiting.popleft()
                 link.node.stats.dropped += 1
-                self._graph.waiting -= 1
-            link.waiting += message is not END
+                return
+            self._order.append(link)
             self._graph.waiting += 1
-            self._messages.append((link, message))
             self._changed.notify_all()
 
     def serve(self) -> None:
         """Pass the messages to their nodes until all streams of these have ended."""
         while any(node.writers for node in self.nodes):
             with self._changed:
-                self._changed.wait_for(lambda: self._messages)
-                link, message = self._messages.popleft()
-                link.waiting -= message is not END
+                self._changed.wait_for(lambda: self._order)
+                link = self._order.popleft()
+                message = link.waiting.popleft()
                 self._changed.notify_all()
             link.node.put(message)
             self._graph.done()
