@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Sequence
 from contextlib import suppress
-from io import BufferedWriter
+from io import FileIO
 from pathlib import Path
 from typing import Final, TypeAlias
 
@@ -93,7 +94,8 @@ class TrajectoryFile:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._file: BufferedWriter | None = None
+        self._file: FileIO | None = None
+        self._whole_bytes = 0
 
     def process(self, odometry: OdometryUpdate) -> None:
         """Write the row of a pose T_odom_rig."""
@@ -103,18 +105,20 @@ class TrajectoryFile:
         """Write the row of a pose (4, 4). Raises OmnidError."""
         try:
             if self._file is None:
-                self._file = self._path.open("wb")
+                self._file = self._path.open("wb", buffering=0)
                 lock(self._file)
-            self._file.write(tum_row(stamp_ns, T).encode("ascii") + b"\n")
-            self._file.flush()
+            row = tum_row(stamp_ns, T).encode("ascii") + b"\n"
+            if self._file.write(row) != len(row):
+                self._file.truncate(self._whole_bytes)  # remove the part of a row
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            self._whole_bytes += len(row)
         except OSError as error:
             raise _no_longer_written(self._path, error) from error
 
     def finish(self) -> None:
         """Close the file."""
         if self._file is not None:
-            with suppress(OSError):  # which `write` has reported
-                self._file.close()
+            self._file.close()
 
 
 def write_trajectory(path: Path, stamps_ns: NDArray[np.int64], poses: NDArray[np.float64]) -> None:

@@ -98,15 +98,13 @@ def test_pairs_of_a_frozen_camera_give_no_pose(
     assert moved_m == pytest.approx(np.linalg.norm(truth.T[19, :3, 3] - truth.T[7, :3, 3]), abs=0.03)
 
 
-@pytest.mark.parametrize(("apart_ns", "expected"), [(12_000_000, "ms apart"), (3600 * 10**9, "clocks")])
-def test_warns_of_stamps_that_are_apart(
-    omnid: Command, tmp_path: Path, scene: Path, apart_ns: int, expected: str
-) -> None:
+def test_warns_of_stamps_that_are_apart(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    apart_ns = 12_000_000
     taken = [replace(p, stamp_ns=p.stamp_ns + apart_ns * (p.camera == "upper")) for p in images(scene / "log.mcap")]
     log, settings = save(tmp_path / "log.mcap", taken), ("pair.tolerance_ms=10", "log.time='header'")
     words = [word for setting in settings for word in ("--set", setting)]
     result = omnid.replay(log, *words, rig=scene / "rig.toml")
-    assert result.code == 1 and expected in result.err and "pair.tolerance_ms" in result.err
+    assert result.code == 1 and "pair.tolerance_ms = 10 apart: correct the clocks" in result.err
     assert result.count("unpaired_lower") == result.count("unpaired_upper") == PAIRS
 
 
