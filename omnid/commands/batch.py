@@ -32,9 +32,8 @@ from omnid.errors import OmnidError
 from omnid.plain_text import one_line, plain
 from omnid.version import __version__
 
-RESULT_FILE, RECORDING = "result.json", "recording.mcap"
-DONE: dict[int | None, str] = {0: "ok", 1: "no pose"}  # by the exit code of `omnid replay`
-LOSSY = "images lost"  # where it ends with 1, but has poses
+RESULT_FILE = "result.json"
+DONE = {0: "ok", 1: "no pose, or images lost"}  # by the exit code of `omnid replay`
 OUTPUTS = (("--tum", "est.txt"), ("--map-tum", "map_est.txt"), ("--cloud", "cloud.ply"), ("--plan", "plan.png"))
 # One thread for each program: as many programs run as there are cores.
 ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1"}
@@ -48,7 +47,6 @@ class Job:
     folder: Path  # of the results
     words: tuple[str, ...]  # of `omnid replay`
     truth: Path | None  # trajectory that the result is compared with
-    timeout_s: float
     seen: str  # version of omnid, words, size and date of the log: what is stored is of another job where it differs
 
 
@@ -60,15 +58,13 @@ def run(args: argparse.Namespace) -> int:
     --out DIR              a folder for each log with its result.json (required)
     --rig FILE             the rig.toml of all logs; default: that attached to each
     --truth NAME=truth.txt  trajectory beside each log, which is compared where it exists
-    --record               keep a recording and a report of each log
     --jobs N 1..           logs at a time; default: the cores
     --scheduler ADDRESS    run on the workers of this dask scheduler, such as tcp://HOST:8786; they need omnid and the
         same paths
-    --timeout-s S=3600 0.001..1e6  for one log
 
     examples:
       batch logs/ --out results --rig rig.toml
-      batch 'logs/2026-*/*.mcap' --out results --jobs 2 --record
+      batch 'logs/2026-*/*.mcap' --out results --jobs 2
       batch logs/ --out results --scheduler tcp://HOST:8786
     """
     jobs = _jobs(args)
@@ -105,38 +101,28 @@ def replay(job: Job) -> dict[str, Any]:
     shutil.rmtree(job.folder, ignore_errors=True)
     job.folder.mkdir(parents=True)
     code, summary = _omnid(job.words, job)
-    if code is not None and code < 0:
+    if code < 0:
         raise RuntimeError(f"{job.log}: the program was ended by signal {-code}")
     status, error = DONE.get(code, "failed"), ""
-    if code is None:
-        error = f"more than {job.timeout_s:g} s"
-    elif code not in DONE:
+    if code not in DONE:
         lines = (job.folder / "messages.txt").read_text("utf-8", "replace").strip().splitlines()
         error = one_line(lines[-1]).removeprefix("omnid: ") if lines else f"exit code {code}"
-    elif code == 1 and summary and summary["counters"]["loss"] and summary["counters"]["poses"]:
-        status = LOSSY
     result = {"log": str(job.log), "seen": job.seen, "status": status, "error": error, "replay": summary}
-    if status in (DONE[0], LOSSY):
-        if job.truth is not None:
-            result["eval"] = _omnid(("eval", "est.txt", str(job.truth), "--json"), job)[1]
-        if RECORDING in job.words:
-            _omnid(("report", RECORDING, "-o", "report.html"), job)
+    if code in DONE and job.truth is not None:
+        result["eval"] = _omnid(("eval", "est.txt", str(job.truth), "--json"), job)[1]
     result["seconds"] = round(time.monotonic() - started_s, 3)
     write_file(job.folder / RESULT_FILE, json.dumps(result, indent=1).encode() + b"\n")
     return result
 
 
-def _omnid(words: Sequence[str], job: Job) -> tuple[int | None, Any]:
-    """Run omnid in the folder of a job; return its exit code (None: it took too long) and the JSON that it printed."""
+def _omnid(words: Sequence[str], job: Job) -> tuple[int, Any]:
+    """Run omnid in the folder of a job; return its exit code and the JSON that it printed."""
     command, environment = python("-m", "omnid", *words), python_environment(**ENVIRONMENT)
-    with (job.folder / "messages.txt").open("ab") as messages, suppress(subprocess.TimeoutExpired):
-        done = subprocess.run(
-            command, cwd=job.folder, env=environment, stdout=subprocess.PIPE, stderr=messages, timeout=job.timeout_s
-        )
-        with suppress(ValueError):
-            return done.returncode, json.loads(done.stdout)
-        return done.returncode, None
-    return None, None
+    with (job.folder / "messages.txt").open("ab") as messages:
+        done = subprocess.run(command, cwd=job.folder, env=environment, stdout=subprocess.PIPE, stderr=messages)
+    with suppress(ValueError):
+        return done.returncode, json.loads(done.stdout)
+    return done.returncode, None
 
 
 def _jobs(args: argparse.Namespace) -> list[Job]:
@@ -149,7 +135,7 @@ def _jobs(args: argparse.Namespace) -> list[Job]:
         )
     options = [(f"--{name}", path and path.absolute()) for name, path in (("rig", args.rig), ("config", args.config))]
     options += [("--lower", args.lower), ("--upper", args.upper), *(("--set", value) for value in args.set)]
-    options += [("--record", RECORDING if args.record else None), *OUTPUTS]
+    options += OUTPUTS
     given = tuple(str(word) for option in options if option[1] is not None for word in option)
     named = [Path(path) for name in map(str, args.logs) for path in glob.glob(name, recursive=True) or [name]]
     logs = sorted({Path(os.path.abspath(log)) for path in named for log in _below(path)})
@@ -162,7 +148,7 @@ def _jobs(args: argparse.Namespace) -> list[Job]:
         truth = beside if args.truth and beside.is_file() else None
         words = ("replay", str(log), *given, "--inline", "--quiet", "--json")
         seen = f"omnid {__version__} {' '.join(words)} {log.stat().st_size} {log.stat().st_mtime_ns}"
-        jobs.append(Job(log, args.out.absolute() / log.relative_to(common), words, truth, args.timeout_s, seen))
+        jobs.append(Job(log, args.out.absolute() / log.relative_to(common), words, truth, seen))
     return jobs
 
 
@@ -188,7 +174,7 @@ def _stored(job: Job) -> dict[str, Any] | None:
     """Return the result of an earlier run of the same job, None without one. Raise OmnidError for another log's."""
     try:
         result: dict[str, Any] = json.loads((job.folder / RESULT_FILE).read_text())
-        log, is_done = result["log"], result["seen"] == job.seen and result["status"] in (*DONE.values(), LOSSY)
+        log, is_done = result["log"], result["seen"] == job.seen and result["status"] in DONE.values()
     except (OSError, ValueError, TypeError, KeyError):
         return None
     if log != str(job.log):

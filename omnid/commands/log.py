@@ -18,7 +18,7 @@ from omnid.utc import utc
 MAX_LINE = 5000  # Most characters of a line: it may contain the path of a file.
 
 
-@command(RATE, JSON)
+@command(RATE)
 def info(args: argparse.Namespace) -> int:
     """Print topics, types, counts, times, attachments, and whether the log is whole.
 
@@ -30,7 +30,7 @@ def info(args: argparse.Namespace) -> int:
       log info recordings/*.mcap
       log info images --rate 20
     """
-    code, logs = 0, []
+    code = 0
     for number, path in enumerate(args.logs):
         try:
             found = log_info(path, examine=True, rate_hz=args.rate or 0.0)
@@ -38,13 +38,9 @@ def info(args: argparse.Namespace) -> int:
             failed(plain(str(error), MAX_LINE))
             code = 2
             continue
-        logs.append(found)
-        if not args.json:
-            print("\n" * bool(number), end="")
-            _show(found)
+        print("\n" * bool(number), end="")
+        _show(found)
         code = max(code, int(found.state is LogState.BROKEN))
-    if args.json:
-        print_json(logs)
     return code
 
 

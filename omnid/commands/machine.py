@@ -19,7 +19,7 @@ from drivers.frame import Camera, Frame, gray
 from drivers.logs.log_reader import LogReader
 from drivers.motors.protocols.protocol_registry import motor_protocol
 from omnid.calibration import snapshot
-from omnid.commands.options import CAMERAS, JSON, SETTINGS, command, failed, make_folder, print_json, settings_of
+from omnid.commands.options import CAMERAS, SETTINGS, command, failed, make_folder, settings_of
 from omnid.commands.tools import require_packages
 from omnid.config import Config
 from omnid.doctor import checks
@@ -32,7 +32,7 @@ ROOT = Path("/")  # folder of sys, dev and proc
 BYTES_PER_PIXEL = 0.2  # of a JPEG of quality 90 from below a mirror
 
 
-@command(SETTINGS, JSON)
+@command(SETTINGS)
 def doctor(args: argparse.Namespace) -> int:
     """Check cameras, motor, rig, rights, bus and disk, a line each; exit code 1: something is wrong.
 
@@ -41,13 +41,9 @@ def doctor(args: argparse.Namespace) -> int:
     """
     found: list[checks.Finding] = []
     for finding in examine(settings_of(args)):
-        if not args.json:
-            print(finding, flush=True)
+        print(finding, flush=True)
         found.append(finding)
-    if args.json:
-        print_json(found)
-    else:
-        print(checks.summary(found))
+    print(checks.summary(found))
     return int(any(finding.level == "error" for finding in found))
 
 

@@ -6,7 +6,7 @@ Also the routes on this computer: `omnid route list`, `delete`.
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
@@ -81,7 +81,7 @@ def build(args: argparse.Namespace) -> int:
     return 0
 
 
-@options.command(MAP, options.JSON)
+@options.command(MAP)
 def show(args: argparse.Namespace) -> int:
     """Print keyframes, sessions, loops, size, and the rig that made the map.
 
@@ -89,12 +89,7 @@ def show(args: argparse.Namespace) -> int:
       map show place.omap
     """
     places, rig = read_places(args.map)
-    if args.json:
-        sizes = asdict(place_views.summary(places, rig))
-        size_bytes = args.map.stat().st_size
-        options.print_json({"path": args.map, "size_bytes": size_bytes, "rig_hash": rig.rig_hash, **sizes})
-    else:
-        options.print_entries(_described(args.map, places, rig))
+    options.print_entries(_described(args.map, places, rig))
     return 0
 
 
@@ -165,13 +160,12 @@ def _described(path: Path, places: PlaceMap, rig: PlaceRig) -> dict[str, str]:
     }
 
 
-@options.command(options.SETTINGS, options.JSON)
+@options.command(options.SETTINGS)
 def list_routes(args: argparse.Namespace) -> int:
     """List the routes in navigation.routes, here; exit code 2: a file is damaged.
 
     examples:
       route list
-      route list --json
     """
     folder, code, found = _folder(args), 0, []
     for name in folder.names():
@@ -180,14 +174,10 @@ def list_routes(args: argparse.Namespace) -> int:
         except OmnidError as error:
             options.failed(str(error))
             code = 2
-    if args.json:
-        known = ("name", "map_name", "created_s", "length_m", "is_closed")
-        options.print_json([{name: getattr(route, name) for name in known} for route in found])
-    elif not found and not code:
+    for route in found:
+        print(f"{route.name:<20} {route.length_m:8.1f} m  {utc(route.created_s * 10**9)}  {route.map_name}")
+    if not found and not code:
         print(f"no routes in {folder.folder}: teach one (`omnid route teach NAME`)")
-    else:
-        for route in found:
-            print(f"{route.name:<20} {route.length_m:8.1f} m  {utc(route.created_s * 10**9)}  {route.map_name}")
     return code
 
 

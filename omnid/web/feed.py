@@ -93,7 +93,7 @@ class RobotFeed:
         self._wanted_until_s = -math.inf  # the panorama
         self._map_in_odom: list[float] | None = None
         self._large: dict[str, ReceivedMessage] = {}  # newest map, panorama ... that are not processed yet
-        self._wake, self._large_wake = asyncio.Event(), asyncio.Event()
+        self._wake = asyncio.Event()
 
     def news(self, seen: int) -> dict[str, Any]:
         """Return all that has changed since a version, and the state."""
@@ -127,7 +127,7 @@ class RobotFeed:
     async def run(self) -> None:
         """Connect to the robot as soon as it can be reached, and follow it until this task is cancelled."""
         try:
-            await asyncio.gather(self._connect(), self._give_news(), self._process_large())
+            await asyncio.gather(self._connect(), self._give_news())
         finally:
             if self.robot is not None:
                 self.robot.close()
@@ -140,6 +140,8 @@ class RobotFeed:
                     await self._wake.wait()
             self._wake.clear()
             self.process_inbox()
+            while self._large:
+                await self.take_large(self._large.popitem()[1])
             async with self._changed:
                 self.version += 1
                 self._changed.notify_all()
@@ -155,10 +157,9 @@ class RobotFeed:
                 self._large[topic] = ReceivedMessage(0, topic, payload, attachment, 0)
             else:
                 self.state.put(topic, payload, attachment)
-            wake = self._large_wake if topic in self._large else self._wake
-            if not wake.is_set():
+            if not self._wake.is_set():
                 with suppress(RuntimeError):  # the event loop has ended
-                    loop.call_soon_threadsafe(wake.set)
+                    loop.call_soon_threadsafe(self._wake.set)
 
         while self.robot is None:
             try:
@@ -221,18 +222,8 @@ class RobotFeed:
         gap = before is not None and pose.attachment.resets != before.attachment.resets
         self.path.add(pose.x_m, pose.y_m, self.version + 1, gap=gap)
 
-    async def _process_large(self) -> None:
-        """Decode and encode maps and panoramas in a thread; they take longer than a pose may wait."""
-        while True:
-            await self._large_wake.wait()
-            self._large_wake.clear()
-            for topic in _NEWEST_ONLY:
-                if (message := self._large.pop(topic, None)) is not None:
-                    await self.take_large(message)
-            self._wake.set()
-
     async def take_large(self, message: ReceivedMessage) -> None:
-        """Take a scan, a report of the navigation, a map or a panorama."""
+        """Take a scan, a report of the navigation, a map or a panorama, which are decoded in a thread."""
         match await asyncio.to_thread(self.state.process, message):
             case Scan() as scan:
                 self._set(SCAN, scan_news(scan, self.state.recent))

@@ -7,7 +7,6 @@ import json
 import re
 from collections.abc import Iterator
 from functools import cache
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -146,11 +145,8 @@ def test_nav2_uses_topics_that_exist() -> None:
 
 
 NOTEBOOK = Path(__file__).parents[2] / "omnid" / "examples" / "first_replay.ipynb"
-CELL_S = 300  # generous: a replay of 99 pairs on a busy machine
-HAS_JUPYTER = all(find_spec(name) for name in ("nbclient", "nbformat", "ipykernel"))
 
 
-@pytest.mark.skipif(HAS_JUPYTER, reason="it runs in Jupyter")
 def test_its_cells_run(monkeypatch: pytest.MonkeyPatch) -> None:
     matplotlib = pytest.importorskip("matplotlib")
     matplotlib.use("Agg")
@@ -161,18 +157,6 @@ def test_its_cells_run(monkeypatch: pytest.MonkeyPatch) -> None:
     names["plt"].close("all")
     assert names["errors"].ate_rmse_m < 0.01  # of 4.8 m; `omnid demo` prints 1 mm
     assert names["errors"].pairs == 99
-
-
-@pytest.mark.skipif(not HAS_JUPYTER, reason="needs nbclient and ipykernel: pip install '.[docs]'")
-def test_it_runs_in_jupyter() -> None:
-    import nbformat
-    from nbclient import NotebookClient
-
-    notebook = nbformat.read(NOTEBOOK, as_version=4)
-    NotebookClient(notebook, timeout=CELL_S).execute()
-    outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
-    assert any("ATE" in output.get("text", "") for output in outputs)
-    assert sum("image/png" in output.get("data", {}) for output in outputs) == 3
 
 
 def test_the_wiring_beside_the_figure_is_that_of_the_code() -> None:

@@ -188,23 +188,6 @@ def test_an_image_that_repeats_an_earlier_one_is_refused_and_changes_nothing(sce
         odometry.process(stamp_ns + later_ns, *buffers)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "named"),
-    [
-        (("absent.mcap", "rig.toml"), "absent.mcap"),
-        (("log.mcap", "absent.toml"), "absent.toml"),
-        (("log.mcap",), "rig"),
-    ],
-)
-def test_one_error_class_for_all_wrong_input(scene: Path, arguments: tuple[str, ...], named: str) -> None:
-    with pytest.raises(OmnidError, match=named):
-        omnid.replay(*(scene / name for name in arguments))
-    with pytest.raises(OmnidError, match=r"absent\.toml"):
-        omnid.Odometry(scene / "absent.toml")
-    with pytest.raises(OmnidError, match="sterio"):
-        omnid.Odometry(scene / "rig.toml", overrides=["sterio.noise_px=1"])
-
-
 def test_ctrl_c_ends_a_replay_with_a_keyboard_interrupt(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = Graph.run
 

@@ -88,12 +88,3 @@ def test_the_controller_does_not_run_it(hostile: Path, tmp_path: Path) -> None:
     recordings.mkdir()
     done = run(hostile, "-m", "omnid", "replay", log, "--motor", "simulated", "--record", recordings / "a.mcap")
     assert done.returncode == 0, done.stderr
-
-
-def test_the_viewer_does_not_run_it(hostile: Path) -> None:
-    pytest.importorskip("rerun")
-    ask = (
-        "import subprocess\nfrom omnid.engine.process import python\nwords = python('-m', 'rerun_cli', '--version')\n"
-        "print(subprocess.run(words, capture_output=True, text=True).stdout)"
-    )
-    assert "rerun" in run(hostile, "-c", ask).stdout

@@ -16,7 +16,6 @@ from typing import Any
 
 import pytest
 
-from omnid.commands.batch import _below
 from tests.waiting import wait_until
 
 pytestmark = pytest.mark.skipif(find_spec("distributed") is None, reason="needs dask.distributed")
@@ -67,13 +66,12 @@ def test_results_are_those_of_single_runs_and_what_is_done_is_not_done_again(tmp
     outputs = ("--tum", tmp_path / "est.txt", "--cloud", tmp_path / "cloud.ply", "--plan", tmp_path / "plan.png")
     assert omnid("replay", good, *outputs, "--quiet")[0] == 0
     shutil.copy(tmp_path / "est.txt", good.parent / "truth.txt")
-    words = ("batch", tmp_path / "logs", "--out", out, "--jobs", 2, "--record")
+    words = ("batch", tmp_path / "logs", "--out", out, "--jobs", 2)
     code, text, err = omnid(*words)
     assert (code == 1 and "1 ok, 1 failed" in text) or "1 failed, 1 ok" in text, err
     folder, broken = out / "day1" / "log.mcap", out / "broken.mcap"
     for name in ("est.txt", "cloud.ply", "plan.png"):
         assert (folder / name).read_bytes() == (tmp_path / name).read_bytes()
-    assert (folder / "report.html").exists() and (folder / "recording.mcap").exists()
     found = result(folder)
     assert found["status"] == "ok" and found["replay"]["counters"]["pairs"] >= 3 and found["eval"]["ate_rmse_m"] == 0
     assert result(broken)["status"] == "failed" and "is no log" in result(broken)["error"]
@@ -106,18 +104,6 @@ def test_a_program_that_is_killed_is_run_again_and_an_interrupted_batch_leaves_n
     assert batch.returncode == 130
     wait_until(lambda: not replays_of(log))
     assert not (out / "log.mcap" / "result.json").exists()
-
-
-def test_finds_logs(tmp_path: Path) -> None:
-    images = ("d/run1/lower/1.5.png", "d/run1/upper/1.5.png", "d/run2/cam0/data/1.5.png", "d/run2/cam1/data/1.5.png")
-    logs = ("a/1.mcap", "a/2.mcap", "a/notes.txt", "b/bag_0.db3", "b/bag_1.db3", "b/metadata.yaml", "c/x.bag")
-    for name in (*logs, *images):
-        path = tmp_path / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch()
-    (tmp_path / "a/circle").symlink_to(tmp_path)
-    expected = ("a/1.mcap", "a/2.mcap", "b", "c/x.bag", "d/run1", "d/run2")
-    assert list(_below(tmp_path)) == [tmp_path / name for name in expected]
 
 
 @pytest.mark.parametrize(

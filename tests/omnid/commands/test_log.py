@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import os
-import random
 import re
 import signal
 import subprocess
@@ -17,7 +15,7 @@ from mcap.reader import make_reader
 
 from drivers.logs.log_reader import LogReader
 from tests.drivers.logs.bags import write_folders
-from tests.drivers.logs.mcap_logs import BARE, LOWER, START_NS, UPPER, Entry, pairs, text, write_log
+from tests.drivers.logs.mcap_logs import BARE, LOWER, START_NS, Entry, pairs, text, write_log
 from tests.replay.command import Command
 
 pytestmark = pytest.mark.usefixtures("default_signals")
@@ -120,8 +118,6 @@ def test_info_shows_the_rate_of_each_topic_over_its_own_time(omnid: Command, tmp
         code, out, err = omnid("log", "info", log, *options)
         assert (code, err) == (0 if not options else 1, "")
         assert re.findall(r"CompressedImage +(\d+) +(\S+)\n", out + "\n") == [("40", "10.00"), ("10", "10.00")]
-    code, out, _ = omnid("log", "info", write_log(tmp_path / "log.mcap", entries), "--json")
-    assert json.loads(out)[0]["rates_hz"] == {LOWER: 10.0, UPPER: 10.0}
 
 
 def test_info_shows_the_damage_and_advice(omnid: Command, tmp_path: Path) -> None:
@@ -133,19 +129,3 @@ def test_info_shows_the_damage_and_advice(omnid: Command, tmp_path: Path) -> Non
     assert "rig.toml (2.0 kB)" in out and "without an index" in out
     code, out, err = omnid("log", "info", tmp_path / "no.mcap", bare)
     assert code == 2 and "No such file" in err and LOWER in out
-
-
-def test_any_bytes_give_no_traceback(omnid: Command, tmp_path: Path) -> None:
-    whole = write_log(tmp_path / "whole.mcap", pairs(5), [("rig.toml", b"1")], chunk_size=700).read_bytes()
-    path, chance = tmp_path / "log.mcap", random.Random(3)
-    codes = set()
-    for _ in range(60):
-        data = bytearray(whole)
-        for _ in range(chance.choice((1, 4))):
-            data[chance.randrange(len(data))] ^= 1 << chance.randrange(8)
-        path.write_bytes(data[: chance.choice((len(data), chance.randrange(len(data))))])
-        code, stdout, err = omnid("log", "info", path)
-        assert err.count("\n") == (code == 2)
-        assert all(line.isprintable() for line in (stdout + err).splitlines())
-        codes.add(code)
-    assert codes == {0, 1}

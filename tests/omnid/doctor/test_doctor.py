@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import grp
-import json
 import math
 import os
 import subprocess
 import sys
-import tempfile
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +22,7 @@ from omnid.cli import main
 from omnid.config import RecordConfig
 from omnid.controller.motor_settings import DriveSettings, MotorSettings
 from omnid.doctor import checks
-from omnid.doctor.checks import Finding, access, bus, cameras, disk, motor, rig
+from omnid.doctor.checks import Finding, bus, cameras, disk, motor, rig
 from omnid.doctor.wheel_wiring import tested_drive as drive_by_answers
 from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig
@@ -117,20 +114,6 @@ def as_another_user(script: str) -> list[str]:
     return done.stdout.splitlines()
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a file to group video")
-def test_finds_a_device_without_permission() -> None:
-    with tempfile.NamedTemporaryFile(prefix="omnid-doctor-") as file:
-        device = Path(file.name)
-        device.chmod(0)
-        os.chown(device, -1, grp.getgrnam("video").gr_gid)
-        (line,) = as_another_user(
-            "from omnid.doctor.checks import access\nos.setuid({user})\n" + f"print(*access('motor', Path('{device}')))"
-        )
-        assert "no permission" in line and "usermod" in line
-        device.chmod(0o660)
-        assert list(access("motor", device)) == []
-
-
 def test_checks_the_rights_of_this_user() -> None:
     lines = as_another_user(
         "from omnid.doctor.checks import rights\n"
@@ -198,15 +181,12 @@ def test_the_command_runs_all_checks_and_returns_an_exit_code(
     assert {line[:9].strip() for line in lines} <= {"ok", "warning", "error"}
     subjects = "camera lower,camera upper,rig,motor,real time,memory,disk,bus"
     assert set(subjects.split(",")) <= {line[9:22].strip() for line in lines} and " errors, " in last
-    assert main(["doctor", "--set", missing, "--json"]) == 1
-    assert {found["level"] for found in json.loads(capsys.readouterr().out)} <= {"ok", "warning", "error"}
     assert main(["doctor", "--set", "cameras.widht_px=3"]) == 2
     assert "cameras.width_px" in capsys.readouterr().err
 
 
 ROOT = Path(__file__).parents[3]
 RADIUS_M = 0.02
-LATE_S = 0.25  # more than an answer may take
 
 
 class WatchedController:
@@ -215,15 +195,10 @@ class WatchedController:
     def __init__(self, controller: SimulatedController) -> None:
         self._controller, self.base = controller, controller.base
         self.notes: list[tuple[float, float]] = []
-        self.late_stops = 0  # stops of wheels that turn whose answers are still to come late
 
     def feed(self, data: bytes) -> bytes:
         """Return the answers of the controller."""
-        did_turn = any(self.base.commanded_mps)
         answer = self._controller.feed(data)
-        if self.late_stops and did_turn and not any(self.base.commanded_mps):
-            self.late_stops -= 1
-            time.sleep(LATE_S)
         self.notes.append((self.base.commanded_mps[0], self.base.commanded_mps[1]))
         return answer
 

@@ -179,7 +179,6 @@ def test_says_when_it_is_too_dark_or_too_bright_and_what_to_do(area: UsefulArea)
 @pytest.mark.parametrize(
     ("config", "ranges", "words"),
     [(CamerasConfig(auto_exposure="on"), (RANGES, RANGES), 'cameras.auto_exposure = "on"'),
-     (CamerasConfig(exposure_us=5000), (RANGES, RANGES), "fixed by cameras.exposure_us"),
      (CamerasConfig(), (RANGES, None), "no exposure time to set in the upper camera"),
      (CamerasConfig(), (RANGES, ExposureRanges(ValueRange(300_000, 400_000))), "no value in common")],
 )  # fmt: skip

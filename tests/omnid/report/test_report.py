@@ -22,7 +22,7 @@ from omnid.errors import OmnidError
 from omnid.formats.tum import Trajectory, tum_row
 from omnid.recordings.evaluation import evaluate
 from omnid.report.recorded_run import RecordedRun
-from omnid.report.report import MAX_EVENTS, _Truth, report_html
+from omnid.report.report import _Truth, report_html
 from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.status_names import ODOMETRY, PAIRING, PLACES, SUMMARY, WHEELS, Key, camera_name, stage_name
 from tests.omnid.report.pages import (
@@ -122,31 +122,6 @@ def test_a_hostile_log_is_shown_as_text(tmp_path: Path) -> None:
     assert "<b>x" not in html and html.count("<script>") == 1 and "<b>log" not in html
     assert page.text.count(EVIL) > 5
     assert "unknown key '<img src=x" in page.text, "of the rig"
-
-
-def test_a_very_large_log_gives_a_small_page(tmp_path: Path) -> None:
-    rng = random.Random(1)
-    entries = []
-    for k in range(3000):
-        T = se3.exp([rng.uniform(-9, 9), rng.uniform(-9, 9), 0, 0, 0, rng.uniform(-3, 3)])
-        entries.append(odom(k, T, sigma_m=rng.uniform(0.001, 10), speed_mps=rng.uniform(-5, 5)))
-        entries.append(state(k, rng.choice(("tracking", "degraded", "lost")), resets=k))
-        if k % 30 == 0:
-            values = {f"stopped, {rng.randrange(10**6)}" * 20: str(k) for _ in range(70)}
-            entries.append(
-                status(
-                    k,
-                    *(
-                        DiagnosticStatus(f"part {n}", 1, f"{'x' * 300}{rng.choice('abc')}", values)
-                        for n in range(k, k + 9)
-                    ),
-                )
-            )
-    entries.append(cloud(2999, np.random.default_rng(1).uniform(-9, 9, (200_000, 3))))
-    found = RecordedRun(save(tmp_path / "log.mcap", entries))
-    html = report_html(found)
-    assert len(html) < 3_000_000 and len(found.events()) > MAX_EVENTS
-    assert re.search(r"and \d+ more", Page(html).text)
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -321,15 +296,15 @@ def test_compares_with_the_truth_as_eval_does(tmp_path: Path, capsys: pytest.Cap
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 
 
-@pytest.fixture(params=[(390, 844), (1440, 900)], ids=["phone", "desk"])
-def page(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Any]:
+@pytest.fixture
+def page(tmp_path: Path) -> Iterator[Any]:
     """The report of 10 s whose speed rises by 0.01 m/s each pose, in a browser, where no error occurs."""
     playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
     entries = [odom(k, speed_mps=0.01 * k) for k in range(100)] + [drive(k, 0.4) for k in range(0, 100, 5)]
     (tmp_path / "run.html").write_text(html_of(save(tmp_path / "run.mcap", entries)), "utf-8")
     with playwright.sync_playwright() as tools:
         browser = tools.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        found = browser.new_page(viewport=dict(zip(("width", "height"), request.param, strict=True)))
+        found = browser.new_page(viewport={"width": 390, "height": 844})
         errors: list[str] = []
         found.on("pageerror", lambda error: errors.append(str(error)))
         found.on("console", lambda message: errors.append(message.text))

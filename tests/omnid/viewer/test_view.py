@@ -62,23 +62,10 @@ def rows(path: Path, entity: str, component: str) -> list[Row]:
     return sorted(found, key=lambda row: row.stamp_ns)
 
 
-def entities(path: Path) -> set[str]:
-    """Return the paths of all entities."""
-    from rerun.chunk import RrdReader
-
-    return {chunk.entity_path for chunk in RrdReader(str(path)).stream()}
-
-
 def positions(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return stamps [ns] and positions (N, 3) [m] of the robot."""
     found = rows(path, "/odom/base_link", "Transform3D:translation")
     return np.array([row.stamp_ns for row in found]), np.array([row.value[0] for row in found])
-
-
-def verified(path: Path) -> bool:
-    """True if rerun's own program finds no fault in the file."""
-    words = [sys.executable, "-c", "import sys; from rerun_cli.__main__ import main; sys.exit(main())"]
-    return subprocess.run([*words, "rrd", "verify", str(path)], capture_output=True, check=False).returncode == 0
 
 
 START_NS = 10**18
@@ -106,7 +93,6 @@ def test_the_path_is_that_of_the_tum_file(drawn: Path) -> None:
     pieces = [row.value[0] for row in rows(drawn / "out.rrd", "/odom/path", "LineStrips3D:strips")]
     np.testing.assert_allclose([piece[1] for piece in pieces], estimate.T[:, :3, 3], atol=1e-6)
     np.testing.assert_allclose([piece[0] for piece in pieces[1:]], [piece[1] for piece in pieces[:-1]], atol=0)
-    assert verified(drawn / "out.rrd")
 
 
 def test_shows_a_recording(drawn: Path, omnid: Command) -> None:
@@ -117,7 +103,6 @@ def test_shows_a_recording(drawn: Path, omnid: Command) -> None:
     clouds = [rows(drawn / name, "/odom/map", "Points3D:positions")[-1].value for name in ("out.rrd", "rec.rrd")]
     np.testing.assert_allclose(clouds[0], clouds[1], atol=1e-6)
     assert [row.value for row in rows(drawn / "rec.rrd", "/state", "StateChange:state")] == [["tracking"]]
-    assert "/panorama" not in entities(drawn / "rec.rrd") and verified(drawn / "rec.rrd")
 
 
 def test_without_rerun_the_installation_is_named(scene: Path, omnid: Command, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -191,7 +176,6 @@ def test_draws_the_messages_of_a_robot(tmp_path: Path) -> None:
     corrections = rows(drawn, "/correction/position\\ mm", "Scalars:scalars")
     assert corrections and corrections[0].value == [pytest.approx(200.0)]
     assert rows(drawn, "/panorama", "EncodedImage:blob") and rows(drawn, "/odom/map", "Points3D:positions")
-    assert verified(drawn)
 
 
 def test_without_a_display_the_way_to_a_browser_is_named(drawn: Path, tmp_path: Path) -> None:

@@ -76,27 +76,6 @@ def shown(robot: RobotState, link: str = "") -> dict[str, Any]:
     return state_news("rover", robot, link, {"more": 3})
 
 
-@pytest.mark.parametrize(
-    ("values", "alive", "armed"),
-    [
-        ({Key.ARMED: "1"}, True, True),
-        ({Key.ARMED: "0"}, None, False),
-        ({}, True, False),
-        ({Key.ARMED: "1"}, False, None),
-    ],
-)
-def test_the_wheels_count_as_armed_only_where_the_robot_says_so(
-    values: dict[str, str], alive: bool | None, armed: bool | None
-) -> None:
-    robot = state(DiagnosticStatus(WHEELS, 1, "a person stands in the way", {**values, Key.SOURCE: "planner"}))
-    if alive is not None:
-        robot.set_alive(alive)
-    found = shown(robot)["wheels"]
-    expected = {"armed": armed, "message": "a person stands in the way", "level": 1, "source": "planner"}
-    assert found == (None if armed is None else expected)
-    assert shown(state())["wheels"] is None
-
-
 def test_warnings_come_with_the_worst_first_and_with_their_remedies() -> None:
     robot = state(
         DiagnosticStatus(PLACES, 1, "lost", {Key.REMEDY: "drive back"}),
@@ -114,22 +93,6 @@ def test_warnings_come_with_the_worst_first_and_with_their_remedies() -> None:
     first = shown(robot, "no route")["warnings"][0]
     assert (first["level"], first["name"], first["message"]) == (2, "connection", "no route")
     assert len(shown(robot, "no route")["warnings"]) == 3, "one of both only"
-
-
-@pytest.mark.parametrize("frame", ["odom", "map"])
-def test_a_map_is_sent_as_unknown_free_and_occupied_cells(frame: str) -> None:
-    cells = np.array([[-1, 0, 50], [51, 100, 30]], np.int8)
-    header, content = map_cells(Map(0, frame, cells, 0.05, (-1.0, 2.0)))
-    assert header == {
-        "width": 3,
-        "height": 2,
-        "frame": frame,
-        "cell_m": 0.05,
-        "x_m": -1.0,
-        "y_m": 2.0,
-        "known": [-1.0, 2.0, pytest.approx(-0.85), pytest.approx(2.1)],
-    }
-    assert list(zlib.decompress(content)) == [0, 1, 1, 2, 2, 1]
 
 
 def test_a_large_map_is_reduced_and_loses_no_obstacle() -> None:
