@@ -46,9 +46,6 @@ CASES: Final = {
     "torn, each third": Case(
         ("upper",), lambda taken: tear(taken, 128, every=3, since=SINCE), "upper camera are torn at row"
     ),
-    "torn, a sensor on its side": Case(
-        BOTH, lambda taken: tear(taken, 128, every=5, axis=1, since=SINCE), "cameras are torn at column"
-    ),
     "displaced, both": Case(
         BOTH, lambda taken: shift(taken, (3, 0), since=SINCE), r"cameras were displaced by \+(2\.9|3\.)"
     ),

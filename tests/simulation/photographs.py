@@ -4,8 +4,8 @@ Photographs are those that scikit-image installs (`pip install '.[test]'`), each
 files are read, the package is not imported.
 
 Broken images are whole, but not of one instant or of one geometry: what buses, buffers and stabilisers make of them.
-Each function returns images (N, H, W) of one camera; those that it leaves are the same objects. axis 0: a line is a row
-of the raw image, and what follows it is below; 1: it is a column, as of a sensor that was mounted on its side.
+Each function returns images (N, H, W) of one camera; those that it leaves are the same objects. A line is a row
+of the raw image.
 """
 
 from __future__ import annotations
@@ -99,9 +99,9 @@ Line = int | Callable[[int], int]  # where the image breaks: a line, or that of 
 
 
 def tear(
-    images: Sequence[Image], line: Line, *, every: int = 1, axis: int = 0, new_below: bool = False, since: int = 1
+    images: Sequence[Image], line: Line, *, every: int = 1, new_below: bool = False, since: int = 1
 ) -> list[Image]:
-    """Return images whose lines from one on are those of the image before, in each `every`-th from `since` on.
+    """Return images whose rows from one on are those of the image before, in each `every`-th from `since` on.
 
     new_below: the lines before it are old instead.
     """
@@ -110,7 +110,7 @@ def tear(
         if (number - since) % every == 0:
             first, second = images[number], images[number - 1]
             parts = (second, first) if new_below else (first, second)
-            torn[number] = _joined(parts, _at(line, number), axis)
+            torn[number] = _joined(parts, _at(line, number))
     return torn
 
 
@@ -137,16 +137,14 @@ def warp(images: Sequence[Image], affine: NDArray[np.float64], *, since: int) ->
     ]
 
 
-def repeat_lines(
-    images: Sequence[Image], line: Line, count: int, *, every: int = 1, axis: int = 0, since: int = 1
-) -> list[Image]:
-    """Return images in which `count` lines from one on are there twice; negative: so many are missing."""
+def repeat_lines(images: Sequence[Image], line: Line, count: int, *, every: int = 1, since: int = 1) -> list[Image]:
+    """Return images in which `count` rows from one on are there twice; negative: so many are missing."""
     found = list(images)
     for number in range(since, len(images), every):
-        size, at = images[number].shape[axis], _at(line, number)
+        size, at = len(images[number]), _at(line, number)
         lines = np.arange(size)
         source = np.where(lines < at, lines, np.clip(lines - count, 0, size - 1))
-        found[number] = np.take(images[number], source, axis=axis)
+        found[number] = images[number][source]
     return found
 
 
@@ -154,21 +152,20 @@ def _at(line: Line, number: int) -> int:
     return line(number) if callable(line) else line
 
 
-def _joined(parts: tuple[Image, Image], line: int, axis: int) -> Image:
-    """Return the lines of the first part before a line, and those of the second one from it on."""
-    before, after = (np.split(part, [line], axis=axis)[number] for number, part in enumerate(parts))
-    return np.ascontiguousarray(np.concatenate([before, after], axis=axis))
+def _joined(parts: tuple[Image, Image], line: int) -> Image:
+    """Return the rows of the first part before one, and those of the second one from it on."""
+    return np.concatenate([parts[0][:line], parts[1][line:]])
 
 
-def roll(images: Sequence[Image], share: float, *, axis: int = 0, since: int = 1) -> list[Image]:
-    """Return images whose lines are exposed one after the other, the last one by a share of a period before the first.
+def roll(images: Sequence[Image], share: float, *, since: int = 1) -> list[Image]:
+    """Return images whose rows are exposed one after the other, the last one by a share of a period before the first.
 
     They are warped by the dense flow from the image before, from one on.
     """
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     height, width = images[0].shape
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    late = np.float32(share) * (x / np.float32(width) if axis else y / np.float32(height))
+    late = np.float32(share) * y / np.float32(height)
     rolled = list(images[:since])
     for before, now in pairwise(images[since - 1 :]):
         back = flow.calc(now, before, np.zeros((height, width, 2), np.float32))

@@ -8,8 +8,8 @@ images are right. With the flow d_i of landmark i in the panorama of a camera, l
 
 F_i a is a shift in the raw image (its window moved, lines repeat or are missing), a shift and a turn of the whole image
 (a mirror moved), or another motion of the rig (what is beyond the line is of another image, as in torn ones, or the
-lines are exposed one after the other). Lines are rows or columns of the raw image, as a sensor may be mounted on its
-side. What moves in view, as people do, does not end at a raw line. H1 is compared with H0 by the generalised likelihood
+rows are exposed one after the other). Lines are rows of the raw image. What moves in view, as people do, does not end
+at a raw line. H1 is compared with H0 by the generalised likelihood
 ratio, robustly, with the Bayesian information criterion (Schwarz 1978).
 
 The flow shows a displacement in the pair in which it begins, and once more where it ends: in between, the landmarks
@@ -34,6 +34,7 @@ from omnid.core.odometry.line_times import (
     LAG_S,
     LEAST_PX,
     MEMORY_S,
+    SETS,
     LineTimes,
     RawImage,
     ReadOut,
@@ -72,13 +73,12 @@ FAR: Final = KltSettings(levels=2)  # 28 px
 EDGE_PX: Final = 8  # of the panorama, in which patches are cut
 ROUNDS: Final = 6
 RIDGE: Final = 1e-6
-SETS: Final = ((0,), (1,), (0, 1))  # cameras of a break
 KINDS: Final[tuple[tuple[Kind, tuple[int, ...]], ...]] = (
     *(("torn", cameras) for cameras in SETS),
     *(("displaced", cameras) for cameras in SETS),
     *(("turned", cameras) for cameras in SETS[:2]),  # both images turned alike are a turn of the rig
 )
-CHOICES: Final = 4 * LINES * len(KINDS)  # axes and sides, lines, kinds
+CHOICES: Final = 2 * LINES * len(KINDS)  # sides, lines, kinds
 
 
 class Break(NamedTuple):
@@ -86,8 +86,7 @@ class Break(NamedTuple):
 
     kind: Kind
     cameras: tuple[int, ...]  # 0: lower, 1: upper
-    axis: int  # 0: the line is a row, 1: a column
-    line_px: int  # of the raw image; 0: the whole image
+    line_px: int  # row of the raw image; 0: the whole image
     is_before: bool = False  # what is before the line is displaced, and not what is beyond
     amount: Array = np.zeros((1, 2))  # (C, K) raw px, and turn, rad; of torn images none
     angle_rad: float = 0.0  # by which what is beyond is displaced in view, mean
@@ -120,7 +119,7 @@ class _Flow(NamedTuple):
     null: Array  # (N, 2, 7) derivatives by the step's error, and by the lag of the upper camera
     shift: Array  # (N, 2, 3) by a shift and a turn of the raw image
     camera: Indices  # (N,)
-    place: Array  # (N, 2) as a fraction of the raw image: column, row
+    row: Array  # (N,) of the raw image, as a fraction of it
     px: Array  # (N,) standard deviations
 
 
@@ -152,8 +151,8 @@ class ImageBreaks:
     _last_tear: Break | None = None
     _open: list[Break] = field(default_factory=list)  # displacements that have not ended
     _usual_cost: float = 0.0  # of a landmark in whole images: none is known yet, so that the first pairs are tested
-    _found: dict[tuple[Kind, tuple[int, ...], int], list[Break]] = field(default_factory=dict)
-    _read_out: dict[tuple[tuple[int, ...], int], ReadOut] = field(default_factory=dict)  # likeliest by cameras and axis
+    _found: dict[tuple[Kind, tuple[int, ...]], list[Break]] = field(default_factory=dict)
+    _read_out: dict[tuple[int, ...], ReadOut] = field(default_factory=dict)  # likeliest by cameras
 
     def add(
         self,
@@ -209,7 +208,7 @@ class ImageBreaks:
         """
         self._torn *= math.exp(-dt_s / MEMORY_S)
         if found is not None:
-            self._found.setdefault((found.kind, found.cameras, found.axis if found.line_px else 0), []).append(found)
+            self._found.setdefault((found.kind, found.cameras), []).append(found)
             if found.kind == "torn":
                 self._torn, self._last_tear = self._torn + found.gain, found
             else:
@@ -222,8 +221,8 @@ class ImageBreaks:
         is_read = read_out is not None and read_out.gain > DECIDING_COST
         self.fault = "" if shown is None else _words([shown])
         if read_out is not None and is_read:
-            key = read_out.cameras, read_out.axis
-            self._read_out[key] = max(read_out, self._read_out.get(key, read_out), key=lambda each: each.gain)
+            before_it = self._read_out.get(read_out.cameras, read_out)
+            self._read_out[read_out.cameras] = max(read_out, before_it, key=lambda each: each.gain)
             self.fault = read_out.words(self.raws)
         if last is None or (shown is None and read_out is None and not self.covariance.any()):
             return
@@ -275,7 +274,7 @@ class ImageBreaks:
             turn = shift @ np.column_stack([-arm[:, 1], arm[:, 0]])[:, :, None]
             null = np.concatenate([J, lag * camera * (J @ step)[:, :, None]], axis=2)
             shift, of_camera = np.concatenate([shift, turn], axis=2), np.full(len(rows), camera)
-            parts.append(_Flow(d / px[:, None], null, shift, of_camera, raw[rows] / size, px))
+            parts.append(_Flow(d / px[:, None], null, shift, of_camera, raw[rows, 1] / size[1], px))
         flow = _Flow(*(np.concatenate(part) for part in zip(*parts, strict=True)))
         return flow if len(flow.y) >= max(3 * LEAST, sought / 2) else None
 
@@ -351,14 +350,13 @@ def likeliest_break(flow: _Flow, raws: tuple[RawImage, RawImage], focal_px: floa
         return None
     cameras = tuple(best.cameras[number] for number in shares)
     amount = np.zeros((1, 2)) if best.kind == "torn" else best.amount.reshape(len(best.cameras), -1)[shares]
-    line_px, angle_rad = round(best.line * raws[cameras[0]].size[1 - best.axis]), max(mean_px) / focal_px
-    return Break(best.kind, cameras, best.axis, line_px, best.is_before, amount, angle_rad, best.gain)
+    line_px, angle_rad = round(best.line * raws[cameras[0]].size[1]), max(mean_px) / focal_px
+    return Break(best.kind, cameras, line_px, best.is_before, amount, angle_rad, best.gain)
 
 
 class _Candidate(NamedTuple):
     kind: Kind
     cameras: tuple[int, ...]
-    axis: int
     is_before: bool  # what is before the line is displaced
     line: float  # part of the raw image that is before the line; 0: the whole image is displaced
     amount: Array  # (K,)
@@ -388,36 +386,36 @@ def _candidates(flow: _Flow, whole: _Whole, kind: Kind, cameras: tuple[int, ...]
         if kind == "torn":  # the pose may have followed the part that is torn
             starts.append(np.concatenate([amounts, [0.0], -amounts]))
     for start in starts:
-        # 3. The likeliest line, of all axes and sides; 0: the whole image.
+        # 3. The likeliest line, of both sides; 0: the whole image.
         left = y - null @ start[:unknowns]
         extra = whole.gains(left - columns @ start[unknowns:]) - whole.gains(left)
-        for axis, side, line in _likely_lines(flow, kind, extra, own):
+        for side, line in _likely_lines(flow, kind, extra, own):
             # One image displaced is the other one displaced the other way, and a step.
             if line == 0 and cameras == (1 - most_off,):
                 continue
             # 4. The amount and the step together, and the likelihood.
-            beyond = (flow.place[:, 1 - axis] >= line) != side
+            beyond = (flow.row >= line) != side
             masked = np.concatenate([null, columns * beyond[:, None, None]], axis=2)
             solution = _robust(masked, y, start)
             gain = float(whole.gains(y - masked @ solution).sum()) - _cost(columns.shape[2], len(y))
             amount = solution[unknowns:]
-            yield _Candidate(kind, cameras, axis, bool(side), line, amount, masked[:, :, unknowns:] @ amount, gain)
+            yield _Candidate(kind, cameras, side, line, amount, masked[:, :, unknowns:] @ amount, gain)
 
 
-def _likely_lines(flow: _Flow, kind: Kind, extra: Array, own: list[Flags]) -> list[tuple[int, int, float]]:
-    """Return axis, side and line, a part of the raw image, of the whole image and of the likeliest line in it.
+def _likely_lines(flow: _Flow, kind: Kind, extra: Array, own: list[Flags]) -> list[tuple[bool, float]]:
+    """Return side and line, a part of the raw image, of the whole image and of the likeliest line in it.
 
     extra (N,): by how much likelier a break makes each flow; own: flags (N,) of each camera that may have it.
     """
     found, lines = [], np.arange(1, LINES)[:, None] / LINES
-    for axis, side in np.ndindex(2, 2) if kind != "turned" else ():
-        beyond = (flow.place[:, 1 - axis] >= lines) != side
+    for side in (False, True) if kind != "turned" else ():
+        beyond = (flow.row >= lines) != side
         counts = np.array([[(beyond & each).sum(axis=1), (~beyond & each).sum(axis=1)] for each in own])
         least = np.array([LEAST_PART * each.sum() if kind == "torn" else LEAST // len(own) for each in own])
         gains = np.where((counts >= least[:, None, None]).all(axis=(0, 1)), beyond @ extra, -np.inf)
-        found.append((float(gains.max()), (axis, side, (1 + int(gains.argmax())) / LINES)))
+        found.append((float(gains.max()), (side, (1 + int(gains.argmax())) / LINES)))
     likeliest = [max(found)[1]] if found and max(found)[0] > 0 else []
-    return likeliest if kind == "torn" else [(0, 0, 0.0), *likeliest]
+    return likeliest if kind == "torn" else [(False, 0.0), *likeliest]
 
 
 def _cost(parameters: int, flows: int) -> float:
@@ -451,16 +449,15 @@ def _words(breaks: list[Break]) -> str:
     """Return what breaks of one kind in the same cameras were, and what to do."""
     newest = breaks[0]
     cameras = camera_names(newest.cameras)
-    line, beyond, before = ("row", "below", "above") if newest.axis == 0 else ("column", "right of", "left of")
-    place = f"{line} {round(float(np.median([found.line_px for found in breaks])))}"
+    row = round(float(np.median([found.line_px for found in breaks])))
     shown = "1 pair shows" if len(breaks) == 1 else f"{len(breaks)} pairs show"
     if newest.kind == "torn":
         return (
-            f"images of the {cameras} are torn at {place}: what is {beyond} is of another moment than what is "
-            f"{before}, as {shown}; check bandwidth and buffers, poses were degraded"
+            f"images of the {cameras} are torn at row {row}: what is below is of another moment than what is "
+            f"above, as {shown}; check bandwidth and buffers, poses were degraded"
         )
     u, v = newest.amount[:, :2].mean(axis=0)
-    part = f" {before if newest.is_before else beyond} {line} {newest.line_px}" if newest.line_px else ""
+    part = f" {'above' if newest.is_before else 'below'} row {newest.line_px}" if newest.line_px else ""
     if not newest.line_px and len(newest.cameras) == 1:
         part = f" against those of the {CAMERAS[1 - newest.cameras[0]]} one"
     turned = f" and turned by {math.degrees(newest.amount[0, 2]):+.2f} deg" if newest.kind == "turned" else ""

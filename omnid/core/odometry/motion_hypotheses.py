@@ -190,6 +190,8 @@ def _cost(each: PoseEstimate, cheapest: PoseEstimate) -> float:
 
 def contradict(a: PoseEstimate, b: PoseEstimate) -> bool:
     """True if about as many landmarks support one pose as the other, and they are not the same landmarks."""
+    if a is b:
+        return False
     shares = [len(each.landmarks) / max(1, each.in_view) for each in (a, b)]
     common = len(np.intersect1d(a.landmarks, b.landmarks, assume_unique=True))
     fewest = min(len(a.landmarks), len(b.landmarks))
