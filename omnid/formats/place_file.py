@@ -21,8 +21,6 @@ from omnid.core.mapping.range_scan import MAX_RANGE_M, SECTORS
 from omnid.core.places.features import COLUMNS, ROWS
 from omnid.core.places.place_map import (
     DESCRIPTOR,
-    UNUSED,
-    KeyframeUse,
     Link,
     PlaceFeatures,
     PlaceKeyframe,
@@ -33,7 +31,7 @@ from omnid.errors import OmnidError
 from omnid.formats.exports import replaced
 from omnid.formats.tum import STAMP_LIMIT_NS
 
-FORMAT: Final = 7  # to be raised where thumbnails or features of a place are computed otherwise: old maps fit no more
+FORMAT: Final = 8  # to be raised where what is kept of a place changes: old maps fit no more
 # Maps up to version 6 were SQLite databases.
 EARLIER: Final = b"SQLite format 3\0"
 MAX_FILE_BYTES: Final = 1 << 30
@@ -67,7 +65,7 @@ _FIELDS: Final[dict[str, dict[str, _Field]]] = {
         "rig_hash": _Field("S64", 0, 0),
     },
     "keyframes": {
-        **dict.fromkeys(("id", "session", "stamp_ns", "found", "missed", "features"), _COUNT),
+        **dict.fromkeys(("id", "session", "stamp_ns", "features"), _COUNT),
         **dict.fromkeys(("T_map_rect", "T_odom_rect"), _TRANSFORM),
         "covariance": _COVARIANCE,
         "thumbnail": _Field("i1", -math.inf, math.inf, (ROWS, COLUMNS)),
@@ -155,8 +153,8 @@ def _to_arrays(places: PlaceMap, rig: PlaceRig) -> _Arrays:
     head = FORMAT, places.dropped, cylinder.width, cylinder.height, cylinder.row0, rig.baseline_m, *poses
     keyframes = []
     for id in ids:
-        its, use = places.keyframes[id], places.uses.get(id, UNUSED)
-        numbers = id, its.session, its.stamp_ns, use.found, use.missed, len(its.features.views)
+        its = places.keyframes[id]
+        numbers = id, its.session, its.stamp_ns, len(its.features.views)
         poses = places.poses[id][:upper], its.T_odom_rect[:upper]
         keyframes.append((*numbers, *poses, its.covariance, its.thumbnail, its.scan, its.free_m))
     links = [(link.a, link.b, link.inliers, link.T_a_b[:upper], link.covariance) for link in places.links]
@@ -182,8 +180,6 @@ def _from_arrays(arrays: _Arrays, places: PlaceMap) -> PlaceRig:
         numbers = int(row["session"]), int(row["stamp_ns"])
         places.keyframes[id] = PlaceKeyframe(id, *numbers, T_odom, covariance, thumbnail, scan, free_m, features)
         places.poses[id] = T
-        if row["found"] or row["missed"]:
-            places.uses[id] = KeyframeUse(int(row["found"]), int(row["missed"]))
     places.links = [
         Link(int(row["a"]), int(row["b"]), T, np.array(row["covariance"]), int(row["inliers"]))
         for row, T in zip(links, _transforms(links["T_a_b"]), strict=True)

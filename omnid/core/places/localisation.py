@@ -166,7 +166,6 @@ class MapLocaliser:
             # 3. Correct the map where several frames agree; a full one may just have dropped the recognised keyframe.
             if found is not None and self._newest is not None and found.id in self.places.poses:
                 self._close_loop(frame, found, self._newest)
-                self._age(found)
         return self._pose(frame, self._state())
 
     @property
@@ -177,7 +176,6 @@ class MapLocaliser:
             "map_kb": self.places.nbytes // 1000,
             "loops": self.places.loops,
             "dropped": self.places.dropped,
-            "aged": self.places.aged,
             "rejected": self.correction.rejected,
             "unjoined": max(0, len(self.places.parts()) - 1),
             "ambiguous": self.search.ambiguous,
@@ -312,15 +310,6 @@ class MapLocaliser:
         self._path_at[keyframe.id] = self._path_m
         self._newest = keyframe
         self._map_changed()
-
-    def _age(self, found: Recognition) -> None:
-        """Count what the search found and missed at a place that is known; what has aged leaves the map."""
-        if self._localize_only or self._state() is not MapState.LOCALIZED:
-            return
-        at, aged = (self.places.poses[found.id] @ found.T_place_rect)[:3, 3], self.places.aged
-        self.places.observe(at, self.search.compared, self._path_m)
-        if self.places.aged > aged:
-            self._map_changed()
 
     def _close_loop(self, frame: OdometryFrame, found: Recognition, newest: PlaceKeyframe) -> None:
         """Link a recognised place, once several frames agree, and correct the map."""

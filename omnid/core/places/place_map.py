@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Final, NamedTuple
+from typing import Annotated, Final
 
 import numpy as np
 import scipy
@@ -24,11 +24,6 @@ MOST_LOOPS: Final = 4
 # A map is of the same rig where baseline, shift [m] and turn [rad] of the rectified frame differ by less than this: the
 # rig may have been calibrated again.
 BASELINE_RATIO, SHIFT_M, TURN_RAD = 0.01, 0.01, 0.02
-# Ageing, by trial on development seeds.
-BESIDE_M: Final = 0.3  # A keyframe this near to a frame shows the same view, if nothing has changed.
-FOUND_INLIERS: Final = 20  # Inliers with which a keyframe counts as recognised.
-VISIT_M: Final = 3.0  # Length of path between two visits of a place.
-AGED_MISSES: Final = 3  # Consecutive visits at which a keyframe is missed, before the next one drops it.
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,16 +127,6 @@ class Link:
         return Link(self.a, other.b, self.T_a_b @ other.T_a_b, covariance, weakest)
 
 
-class KeyframeUse(NamedTuple):
-    """Visits at which a keyframe was recognised, and visits since the last one of them at which it was not."""
-
-    found: int = 0
-    missed: int = 0
-
-
-UNUSED: Final = KeyframeUse()
-
-
 class PlaceMap:
     """Keyframes by id with their poses T_map_rect, and the links between them; bounded in number."""
 
@@ -151,10 +136,7 @@ class PlaceMap:
         self.keyframes: dict[int, PlaceKeyframe] = {}
         self.poses: dict[int, Array] = {}
         self.links: list[Link] = []
-        self.uses: dict[int, KeyframeUse] = {}  # uses by id; a keyframe without an entry is UNUSED
         self.dropped = 0  # keyframes, because the map was full
-        self.aged = 0  # keyframes, because they were missed visit after visit
-        self._visits: dict[int, tuple[float, bool]] = {}  # path at the last visit, and whether it was found at it
 
     def __len__(self) -> int:
         return len(self.keyframes)
@@ -189,15 +171,14 @@ class PlaceMap:
     def add(self, keyframe: PlaceKeyframe, T_map_rect: Array, link: Link | None = None) -> None:
         """Add a keyframe with the link of odometry that leads to it; None where there is no such link.
 
-        A full map drops one of the two keyframes that are nearest to each other: the one that was recognised at fewer
-        visits, less those it was missed at since; the older one of equal ones.
+        A full map drops the older one of the two keyframes that are nearest to each other.
         """
         self.keyframes[keyframe.id] = keyframe
         self.poses[keyframe.id] = T_map_rect
         if link is not None:
             self.links.append(link)
         while len(self) > max(2, self.max_keyframes):
-            self.drop(self._least_useful(keyframe.id))
+            self.drop(self._most_crowded(keyframe.id))
             self.dropped += 1
 
     def drop(self, id: int) -> None:
@@ -217,43 +198,14 @@ class PlaceMap:
             ]
         # 3. The keyframe leaves the map.
         del self.keyframes[id], self.poses[id]
-        self.uses.pop(id, None)
-        self._visits.pop(id, None)
 
-    def _least_useful(self, newest: int) -> int:
-        """Return the id of the keyframe that is to be dropped, not the newest."""
+    def _most_crowded(self, newest: int) -> int:
+        """Return the older one of the two keyframes that are nearest to each other, not the newest."""
         ids = [id for id in self.keyframes if id != newest]
         apart, neighbour = scipy.spatial.cKDTree(self.positions(ids)).query(self.positions(ids), k=2)
         nearest = int(apart[:, 1].argmin())
         # Where several are at one position, the second of them may be found first.
-        pair = sorted({ids[nearest], *(ids[int(n)] for n in neighbour[nearest])})
-        uses = {id: self.uses.get(id, UNUSED) for id in pair}
-        return min(pair, key=lambda id: uses[id].found - uses[id].missed)
-
-    def observe(self, position: Array, inliers: Mapping[int, int], path_m: float) -> None:
-        """Count the keyframes that were compared with a frame at a position (3,) in the map; drop those that aged.
-
-        inliers: of each keyframe that was compared. path_m: of the run so far. A keyframe is counted once a visit, as
-        found where one frame of the visit finds it. One that was found at many visits is kept as long: light may come
-        back that one season takes away.
-        """
-        ids = [id for id in inliers if id in self.keyframes]
-        beside = np.linalg.norm(self.positions(ids) - position, axis=1) < BESIDE_M
-        for id, is_beside in zip(ids, beside.tolist(), strict=True):
-            is_found = inliers[id] >= FOUND_INLIERS
-            if not (is_found or is_beside):
-                continue
-            last_m, was_found = self._visits.get(id, (-np.inf, False))
-            is_new = path_m - last_m >= VISIT_M
-            self._visits[id] = path_m, is_found or (was_found and not is_new)
-            use = self.uses.get(id, UNUSED)
-            if is_found:
-                self.uses[id] = KeyframeUse(use.found + (is_new or not was_found), 0)
-            elif is_new and use.missed >= max(AGED_MISSES, use.found):
-                self.drop(id)
-                self.aged += 1
-            elif is_new:
-                self.uses[id] = KeyframeUse(use.found, use.missed + 1)
+        return min(ids[nearest], *(ids[int(n)] for n in neighbour[nearest]))
 
     def part(self, ids: Iterable[int]) -> PlaceMap:
         """Return a map of some keyframes, and the links between them."""
@@ -262,7 +214,6 @@ class PlaceMap:
         part.keyframes = {id: keyframe for id, keyframe in self.keyframes.items() if id in chosen}
         part.poses = {id: self.poses[id] for id in part.keyframes}
         part.links = [link for link in self.links if link.a in chosen and link.b in chosen]
-        part.uses = {id: use for id, use in self.uses.items() if id in part.keyframes}
         part.dropped = self.dropped
         return part
 

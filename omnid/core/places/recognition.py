@@ -110,7 +110,6 @@ class PlaceSearch:
         self.ambiguous = 0  # frames that fit two places equally well
         self.refused = 0  # recognitions that odometry contradicts
         self.contradicted = 0  # the newest of them, without one that odometry confirms in between
-        self.compared: dict[int, int] = {}  # inliers of each keyframe that the last search compared
 
     def find(
         self, small: Thumbnail, features: PlaceFeatures, places: PlaceMap, where: Expected | list[int]
@@ -132,7 +131,6 @@ class PlaceSearch:
         # 2. Votes and geometry of these: the best one, unless another place is as similar.
         known = {id: places.keyframes[id].features for id in ids}
         best, found = search(features, known, places.poses, effort, self._model)
-        self.compared = {id: 0 if place is None else place.inliers for id, place in found.items()}
         self.ambiguous += best is None and any(place is not None and place.has(effort) for place in found.values())
         # 3. Unless odometry contradicts it.
         if best is None or not isinstance(where, Expected):

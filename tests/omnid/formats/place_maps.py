@@ -6,7 +6,7 @@ import numpy as np
 
 from calib import se3
 from calib.panorama import Cylinder
-from omnid.core.places.place_map import KeyframeUse, Link, PlaceFeatures, PlaceKeyframe, PlaceMap, PlaceRig
+from omnid.core.places.place_map import Link, PlaceFeatures, PlaceKeyframe, PlaceMap, PlaceRig
 
 RIG = PlaceRig(
     Cylinder(1304, 378, 128.75),
@@ -43,7 +43,7 @@ def some_places(count: int, features: int = 256, seed: int = 1) -> PlaceMap:
         places.add(keyframe, T, link)
     if count > 2:
         places.links.append(Link(0, count - 1, se3.exp(rng.normal(size=6)), covariance(rng), 77))
-    places.dropped, places.uses = 3, {id: KeyframeUse(id, 1) for id in range(1, count, 2)}
+    places.dropped = 3
     return places
 
 

@@ -48,7 +48,7 @@ def test_reads_what_was_written_and_writes_the_same_bytes(tmp_path: Path, count:
     places = some_places(count)
     write_places(tmp_path / "a.omap", places, RIG)
     read, rig = read_places(tmp_path / "a.omap")
-    assert same(rig, RIG) and read.dropped == places.dropped and read.uses == places.uses
+    assert same(rig, RIG) and read.dropped == places.dropped
     assert list(read.keyframes) == list(places.keyframes)
     assert all(same(read.keyframes[id], places.keyframes[id]) for id in places.keyframes)
     assert all(same(read.poses[id], places.poses[id]) for id in places.keyframes)
@@ -119,7 +119,7 @@ def edit(name: str, field: str, value: object, row: int = 1) -> Callable[[Arrays
         (lambda arrays: arrays.update(descriptors=arrays["descriptors"][:-1]), "descriptors has another type or size"),
         (lambda arrays: arrays.update(views=arrays["views"].astype(">f4")), "views has another type or size"),
         (lambda arrays: arrays.update(map=arrays["map"].repeat(2)), "expected version"),
-        (edit("map", "format", 8, 0), "expected version"),
+        (edit("map", "format", 9, 0), "expected version"),
         (edit("map", "width", 0, 0), "width of map is outside 1 to"),
         (edit("map", "baseline_m", np.nan, 0), "baseline_m of map is outside"),
         (edit("map", "rig_hash", b"", 0), "the hash of the rig is none"),
