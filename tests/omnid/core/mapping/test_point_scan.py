@@ -73,12 +73,6 @@ def test_no_range_is_longer_than_the_longest() -> None:
             assert np.isposinf(scan).all(), range_m
 
 
-def test_beyond_the_longest_range_is_free_and_above_the_band_is_nothing() -> None:
-    scan = seen(arc(9.0, (-30, 30), (-0.5, 0.5), 20_000), arc(2.0, (90, 120), (1.0, 1.4)))
-    assert np.isposinf(scan[within(-28, 28)]).all()
-    assert np.isnan(scan[within(92, 118)]).all()
-
-
 @pytest.mark.parametrize(("gap", "far_m", "is_filled"), [(4, 3.0, True), (5, 3.0, False), (4, 5.0, False)])
 def test_short_gaps_of_one_surface_are_filled(gap: int, far_m: float, is_filled: bool) -> None:
     """Across the seam between the last sector and the first."""
@@ -97,10 +91,3 @@ def test_free_ranges_of_a_base_are_those_of_the_room_from_a_turned_viewpoint_on_
     found = seen_from(scan_of(room, np.eye(4)), se3.inverse(T_base_view))
     true = scan_of(room, T_base_view)
     assert (found < true + 0.02).all() and (found > true - 0.15).all()
-
-
-def test_where_a_base_knows_no_floor_a_viewpoint_on_it_knows_none() -> None:
-    ahead = np.abs(azimuths()) < 0.5
-    found = seen_from(np.where(ahead, np.float32(2), np.float32(0)), pose(0.1, 0.0, np.pi / 2))
-    left = np.abs(azimuths() - np.pi / 2) < 0.3
-    assert (found[left] > 1.8).all() and not found[np.abs(azimuths() - np.pi / 2) > 0.7].any()

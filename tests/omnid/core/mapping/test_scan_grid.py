@@ -66,21 +66,6 @@ def test_an_obstacle_that_has_gone_is_cleared_and_a_new_one_appears() -> None:
     assert near(grid, 1.0, 1.0) == {FREE} and OCCUPIED in near(grid, 1.0, -0.7)
 
 
-def test_no_free_cell_touches_an_occupied_one() -> None:
-    scans = [scan_of(np.concatenate([ROOM, box((1, 1), (1.3, 1.3))]), T, 0.02, n) for n, T in enumerate(PATH)]
-    grid = grid_of(scans, PATH)
-    occupied = np.pad(grid.cells == OCCUPIED, 1)
-    near_occupied = np.any([np.roll(occupied, (dy, dx), (0, 1)) for dx in (-1, 0, 1) for dy in (-1, 0, 1)], axis=0)
-    assert occupied.sum() > 100 and not (grid.cells[near_occupied[1:-1, 1:-1]] == FREE).any()
-
-
-def test_space_is_free_when_two_views_have_seen_through_it() -> None:
-    T = np.tile(pose(0, 0, 0), (2, 1, 1))
-    scan = scan_of(ROOM, T[0])
-    assert at(grid_of([scan], T[:1]), 1.0, 0.0) == UNKNOWN
-    assert at(grid_of([scan] * 2, T), 1.0, 0.0) == FREE
-
-
 def test_what_no_scan_shows_is_free_nowhere_as_its_floor_is_not_seen() -> None:
     """All scans pass over a low box; views pass through the space above it."""
     path = np.array([pose(x, 0, 0) for x in np.arange(-2.5, 7.0, 0.3)])
@@ -155,23 +140,6 @@ def test_a_direction_that_sees_through_a_wall_beside_others_that_do_not_makes_it
     assert FREE not in behind
 
 
-def test_the_map_moves_with_its_keyframes() -> None:
-    scans = [scan_of(ROOM, T) for T in PATH]
-    moved = pose(1.0, 2.0, np.pi / 2)
-    grid = grid_of(scans, moved @ PATH)
-    for y in np.arange(-1.9, 2.4, 0.1):
-        x_m, y_m = (moved @ [4.0, y, 0, 1])[:2]
-        assert OCCUPIED in near(grid, x_m, y_m)
-    assert at(grid, 1.0, 2.0) == FREE
-
-
-def test_directions_without_a_range_stay_unknown() -> None:
-    scan = scan_of(ROOM, pose(0, 0, 0))
-    scan[: SECTORS // 2] = np.nan  # azimuths below 0
-    grid = grid_of([scan] * 3, np.tile(np.eye(4), (3, 1, 1)))
-    assert at(grid, 0.5, -0.5) == UNKNOWN and at(grid, 0.5, 0.5) == FREE
-
-
 def test_no_scan_is_no_map_and_a_large_area_gets_larger_cells() -> None:
     assert set(grid_of([], np.zeros((0, 4, 4))).cells.ravel()) == {UNKNOWN}
     far = np.array([pose(0, 0, 0), pose(900, 300, 0)])
@@ -199,13 +167,6 @@ def of(scans: dict[int, np.ndarray], poses: np.ndarray) -> KeyframeScans:
 
 def same(a: Grid, b: Grid) -> bool:
     return a.cell_m == b.cell_m and np.allclose(a.corner, b.corner) and np.array_equal(a.cells, b.cells)
-
-
-def test_new_keyframes_are_drawn_into_the_grid() -> None:
-    grid = KeyframeGrid(0.05)
-    for count in range(1, len(PATH) + 1):
-        found = grid.draw(seen(count), T_BASE_RECT)
-    assert same(found, drawn_at_once(SCANS, PATH)) and grid.redrawn == 1
 
 
 def test_the_map_moves_when_a_loop_moves_its_keyframes() -> None:

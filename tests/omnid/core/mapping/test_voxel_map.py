@@ -6,13 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from omnid.core.mapping.voxel_map import MapPoints, VoxelMap
+from omnid.core.mapping.voxel_map import VoxelMap
 
 Array = NDArray[np.float64]
-
-
-def one(x: float, y: float, z: float) -> Array:
-    return np.array([[x, y, z]])
 
 
 def var(count: int, variance_m2: float = 1e-4) -> Array:
@@ -22,10 +18,6 @@ def var(count: int, variance_m2: float = 1e-4) -> Array:
 def row(start: int, count: int) -> Array:
     """Return the centres of `count` neighbouring voxels of 1 m."""
     return np.stack([np.arange(start, start + count) + 0.5, np.zeros(count), np.zeros(count)], axis=1)
-
-
-def as_bytes(points: MapPoints) -> bytes:
-    return b"".join(a.tobytes() for a in (points.xyz, points.confidence, points.frames, points.age))
 
 
 def test_agrees_with_a_dictionary() -> None:
@@ -46,28 +38,6 @@ def test_agrees_with_a_dictionary() -> None:
     np.testing.assert_allclose(found.xyz, [sums[k][1:] / sums[k][0] for k in keys], atol=1e-6)
     assert found.frames.tolist() == [len(set(seen[k])) for k in keys]
     assert found.age.tolist() == [19 - seen[k][-1] for k in keys]
-
-
-def test_confidence_grows_with_frames_and_precision() -> None:
-    voxels = VoxelMap(voxel_m=0.05, most=44)
-    history = []
-    for seq in range(6):
-        voxels.insert(one(0.01, 0.01, 0.01), var(1, 1e-3), seq)
-        history.append(float(voxels.points(1).confidence[0]))
-    assert history == sorted(set(history)) and 0.0 < history[0] < 0.5 and history[-1] < 1.0
-    sharp = VoxelMap(voxel_m=0.05, most=44)
-    sharp.insert(one(0.01, 0.01, 0.01), var(1, 1e-5), 0)
-    assert sharp.points(1).confidence[0] > history[0]
-
-
-def test_counts_refused_points_and_leaves_them_out() -> None:
-    voxels = VoxelMap(voxel_m=1.0, most=44)
-    points = np.repeat(one(0.5, 0.5, 0.5), 9, axis=0)
-    points[0, 1], points[1, 2], points[2, 0], points[3, 0] = np.nan, np.inf, float(1 << 20), -1e300
-    variance = var(9)
-    variance[4:8] = [0.0, -1.0, np.nan, np.inf]
-    voxels.insert(points, variance, 0)
-    assert (voxels.refused, len(voxels)) == (8, 1)
 
 
 def test_evicts_old_single_voxels_then_the_least_confident() -> None:
@@ -94,16 +64,3 @@ def test_memory_stays_bounded(most: int) -> None:
         assert len(voxels) <= most
     assert len(voxels) + voxels.evicted == 15_000
     assert len(voxels.points(1).xyz) == len(voxels)
-
-
-def test_same_input_gives_the_same_bytes() -> None:
-    def run() -> VoxelMap:
-        rng = np.random.default_rng(9)
-        voxels = VoxelMap(voxel_m=0.1, most=350)
-        for seq in range(30):
-            voxels.insert(rng.normal(0.0, 1.0, (300, 3)), rng.uniform(1e-4, 1e-2, 300), seq)
-        return voxels
-
-    first, second = run(), run()
-    assert first.evicted == second.evicted > 0
-    assert as_bytes(first.points(1)) == as_bytes(second.points(1)) != b""

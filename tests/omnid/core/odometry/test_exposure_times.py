@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.odometry.exposure_times import Exposure, RigVelocity
-from omnid.core.odometry.pose_estimation import SharedError, gauss_newton
 from omnid.core.stereo.triangulation import view
 from omnid.core.types.pixel_times import PixelTimes
 from omnid.core.types.stereo_model import StereoModel
@@ -75,21 +74,3 @@ def test_views_are_corrected_to_the_instant_of_the_stamp(times: PixelTimes) -> N
     assert np.abs(error).max() < 0.05
     columns, spread_px = exposure.upper_columns(lower, upper[:, 1])
     assert np.abs(MODEL.cylinder.wrap(columns - upper[:, 0])).max() < 0.05 and (spread_px > 0).all()
-
-
-def test_velocity_and_pose_are_estimated_together() -> None:
-    """The rows of a rolling shutter tell the velocity where the landmarks are known."""
-    points, times = world(), TIMES[2]
-    lower, upper = seen(points, times, TWIST)
-    believed = RigVelocity(TWIST + np.array([0.05, -0.05, 0.02, 0.1, -0.1, 0.1]), SIGMA**2)
-    shift = Exposure(times, believed, MODEL).shift(points)
-    views = np.column_stack([lower + shift.lower, upper[:, 1] + shift.upper[:, 1]])
-    shared = SharedError(shift.by_motion[:, :3], SIGMA**2)
-    fixed, free = (
-        gauss_newton(points, np.zeros((len(points), 3, 3)), views, np.eye(4), MODEL, shared=error)
-        for error in (None, shared)
-    )
-    errors = [np.abs(se3.log(result.T)).max() for result in (fixed, free)]
-    assert errors[1] < 0.2 * errors[0]
-    assert np.abs(believed.twist + free.shared - TWIST).max() < 0.02
-    assert np.trace(free.covariance) > np.trace(fixed.covariance)

@@ -212,17 +212,6 @@ def pose(x_m: float, yaw_rad: float = 0.0) -> Array:
     return se3.exp(np.array([x_m, 0.0, 0.0, 0.0, 0.0, 0.0])) @ se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, yaw_rad]))
 
 
-@pytest.mark.parametrize("scale", [0.6, 0.85, 1.2])
-def test_it_is_about_the_whole_difference_of_the_drive(scale: float) -> None:
-    """Of 9 m straight on: images of a rig whose size is wrong, or of a person who walks along."""
-    contradiction = Contradiction()
-    for at_s, witness in driven(Errors(images_scale=scale), 20.0, turns=False):
-        way_m = 0.5 * max(0.0, at_s - BEGINS_S - 0.4)
-        covariance = contradiction.add(witness, pose(scale * way_m), at_s)
-    sigmas_m = np.sqrt(np.diag(covariance)[:3])
-    assert sigmas_m == pytest.approx([abs(1 - scale) * way_m, 0.0, 0.0], rel=0.1, abs=1e-9)
-
-
 def test_a_fault_stays_in_a_later_pose_and_turns_with_it() -> None:
     """After a quarter turn to the left, what was ahead is to the right."""
     contradiction = Contradiction()

@@ -165,17 +165,6 @@ def test_a_gyro_alone_knows_the_turn_and_not_the_distance() -> None:
     assert np.abs(motion.values[BIAS] - WRONG.bias_radps).max() < 0.001
 
 
-def test_late_samples_and_any_order_give_the_same_motion() -> None:
-    rng = np.random.default_rng(2)
-    new = samples(SensorErrors(), 0.0, 1.0, rng)
-    ordered, mixed = MotionFilter(), MotionFilter()
-    ordered.sensors.add(new)
-    for part in (new[1::2], new[::2]):
-        mixed.sensors.add(list(rng.permutation(np.array(part, object))))
-    (one, _), (other, is_complete) = sensed(ordered, 0.9), sensed(mixed, 0.9)
-    assert is_complete and np.allclose(one, other, atol=1e-12)
-
-
 @pytest.mark.hazard("H14")
 def test_a_wheel_that_slips_in_the_dark_is_noticed_by_the_gyro() -> None:
     """The base goes straight on, one wheel turns faster: the distance is not to be believed either."""
@@ -213,16 +202,6 @@ def test_a_steady_turn_of_one_sensor_alone_is_noticed_before_clocks_are_learned(
     assert trusted[ends_s < 1.0].all() and not trusted[ends_s > 1.0 + 3 * period_s].any()
 
 
-def test_wheels_that_do_not_tell_their_turn_need_a_gyro() -> None:
-    """As those of controllers that hold a heading by themselves."""
-    for gyro in (True, False):
-        rng, motion = np.random.default_rng(4), MotionFilter()
-        new = samples(SensorErrors(), 0.0, 2.0, rng)
-        motion.sensors.add([turning(sample, np.nan) for sample in new if gyro or isinstance(sample, WheelSample)])
-        twist, is_complete = sensed(motion, 1.5)
-        assert np.isfinite(twist).all() and np.isfinite(motion.velocity_covariance).all() and is_complete == gyro
-
-
 def test_rough_wheels_do_not_count_as_slipping() -> None:
     """Ten times the noise of the other tests: after some seconds it is known, and the covariance says so."""
     calm, _ = driven(SensorErrors(), 20)
@@ -236,37 +215,3 @@ def test_rough_wheels_do_not_count_as_slipping() -> None:
     sensed(rough, end_s), sensed(calm, 19.9)
     variances = [np.trace(motion.velocity_covariance[:3, :3]) for motion in (rough, calm)]
     assert variances[0] > 2.0 * variances[1]
-
-
-TWIST = np.array([0.5, -0.1, 0.02, 0.05, -0.03, 0.8])  # m/s, rad/s
-NOISE = np.diag(np.repeat([0.002, 0.001], 3) ** 2)  # of a motion, m^2 and rad^2
-
-
-def test_constant_velocity_is_estimated_and_smoothed_with_irregular_steps() -> None:
-    motion, rng = MotionFilter(), np.random.default_rng(1)
-    raw, filtered = [], []
-    for _ in range(60):
-        dt_s = float(rng.choice([0.03, 0.1, 0.2]))
-        noise = rng.multivariate_normal(np.zeros(6), NOISE)
-        motion.predict(dt_s)
-        motion.update(se3.exp(TWIST * dt_s) @ se3.exp(noise), NOISE, dt_s)
-        raw.append(np.abs(noise) / dt_s)
-        filtered.append(np.abs(motion.velocity - TWIST))
-    assert (np.mean(filtered[20:], axis=0) < 0.9 * np.mean(raw[20:], axis=0)).all()
-    np.testing.assert_allclose(motion.velocity, TWIST, atol=0.05)
-
-
-def test_the_covariance_is_symmetric_positive_and_shrinks_with_measurements() -> None:
-    motion = MotionFilter()
-    before = motion.velocity_covariance
-    coupled = NOISE.copy()
-    coupled[0, 4] = coupled[4, 0] = 1.5e-6
-    for _ in range(200):
-        motion.predict(0.1)
-        motion.update(se3.exp(TWIST * 0.1), coupled, 0.1)
-    P = motion.velocity_covariance
-    np.testing.assert_array_equal(P, P.T)
-    assert np.linalg.eigvalsh(P).min() > 0
-    assert (np.diag(P) < np.diag(before)).all() and (np.diag(P) < 1.01 * np.diag(NOISE) / 0.1**2).all()
-    motion.predict(1.0)
-    assert (np.diag(motion.velocity_covariance) > 10 * np.diag(P)).all()

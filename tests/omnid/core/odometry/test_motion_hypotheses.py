@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ from numpy.typing import NDArray
 
 from calib import se3
 from drivers.motion import WheelSample
-from omnid.core.odometry import pose_search
 from omnid.core.odometry.estimates import OdometryEstimate, OdometryLimits, PoseEstimate
 from omnid.core.odometry.motion_filter import MotionFilter
 from omnid.core.odometry.motion_hypotheses import MotionHypotheses
@@ -108,24 +106,3 @@ def test_the_motion_of_a_vehicle_decides_between_images_that_are_about_as_good()
     assert chosen(MotionHypotheses(), pose(0.0, 0.1), pose(0.05, 0.5), predicted_m=0.05) == 0.0
     others = pose(0.05, 0.5, range(40, 90))
     assert chosen(MotionHypotheses(), pose(0.0, 0.1, range(60)), others, predicted_m=0.05) == 0.05
-
-
-def test_a_motion_that_was_refused_stays_a_hypothesis_at_its_velocity() -> None:
-    hypotheses = MotionHypotheses()
-    hypotheses.add(np.eye(4), se3.exp([1.0, 0, 0, 0, 0, 0]), np.array([10.0, 0, 0]))
-    hypotheses.predict(PERIOD_S)
-    assert not hypotheses.is_single and sigma_m(hypotheses) == pytest.approx(2.0, rel=0.01)
-
-
-@pytest.mark.parametrize(("reach_m", "expected"), [(0.002, 1), (0.05, 0)])
-def test_the_pose_by_outliers_is_sought_where_the_inliers_show_no_motion_of_a_vehicle(
-    alike: RenderedCameras, monkeypatch: pytest.MonkeyPatch, reach_m: float, expected: int
-) -> None:
-    """They may be on a person who follows the robot."""
-    monkeypatch.setattr(pose_search, "displacements", lambda *_: [])
-    monkeypatch.setattr(pose_search.PoseSearch, "coarse", lambda *_: pose(0.028, 0.5))
-    monkeypatch.setattr(pose_search.PoseSearch, "refine", lambda _, frame, coarse, exposure: coarse)
-    search = pose_search.PoseSearch(Mock(), alike.model, OdometryLimits(), KltSettings())
-    T_predicted = pose(0.020).T_odom_rect
-    found = search.others(alike.frame(0, np.eye(4)), pose(0.0, 0.6, range(70)), T_predicted, Mock(), reach_m)
-    assert len(found) == expected

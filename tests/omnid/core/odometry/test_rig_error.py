@@ -51,7 +51,3 @@ def test_a_turn_of_a_camera_makes_poses_worse_the_farther_what_they_see() -> Non
         for distance_m in (2.0, 8.0)
     )
     assert far[2, 2] > 4 * near[2, 2] > 0
-
-
-def test_a_rig_that_is_said_to_be_exact_adds_nothing() -> None:
-    assert not RigError(motion_errors(rig(0.0))).at(se3.transform(np.eye(3), [3.0, 0.0, 0.0]), 2.0).any()

@@ -13,19 +13,13 @@ from calib import se3
 from omnid.core.mapping.range_scan import SECTORS
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.localisation import (
-    CONSISTENT,
     SEARCHES,
-    SURE_INLIERS,
-    Hypothesis,
     MapLocaliser,
     MapPose,
     OdometryFrame,
-    agreeing,
 )
-from omnid.core.places.place_map import Link, PlaceLimits
-from omnid.core.places.recognition import Recognition
+from omnid.core.places.place_map import PlaceLimits
 from omnid.tracking_state import MapState
-from tests.omnid.core.mapping.rooms import pose as on_floor
 from tests.omnid.core.scenery import Array, RenderedCameras, motion_errors
 from tests.simulation import corridor
 from tests.simulation.paths import planar_poses
@@ -226,36 +220,3 @@ def test_in_an_unknown_building_it_goes_on_as_odometry(cameras: RenderedCameras,
     found = run(MapLocaliser(cameras.model, PlaceLimits(), deepcopy(out).places), drive)
     assert {pose.state for pose in found} == {MapState.ODOMETRY_ONLY}
     assert all(np.array_equal(pose.T_map_odom, np.eye(4)) for pose in found)
-
-
-PLACE, NEWEST = 3, 9  # ids of keyframes: one of the map, one of the run
-KNOWN = {PLACE: on_floor(5.0, 1.0, 0.5), NEWEST: on_floor(5.2, 1.1, 0.6)}
-T_MAP_ODOM = on_floor(4.0, -1.0, 0.3)
-BY_FRAME = np.diag([0.01] * 3 + [0.01] * 3) ** 2
-
-
-def hypothesis(x_m: float, error_m: float = 0.0, inliers: int = 12) -> Hypothesis:
-    """Return a recognition from a frame at x in odom, wrong by an error."""
-    T_odom_rect = on_floor(x_m, 0.0, 0.0)
-    T_map_rect = T_MAP_ODOM @ T_odom_rect @ on_floor(0.0, error_m, 0.0)
-    found = Recognition(PLACE, se3.inverse(KNOWN[PLACE]) @ T_map_rect, BY_FRAME, inliers, 30, 4)
-    return Hypothesis(found, T_odom_rect, Link(PLACE, NEWEST, np.eye(4), BY_FRAME))
-
-
-def consistent(*given: Hypothesis, poses: dict[int, Array] = KNOWN) -> int:
-    """Return how many agree at the last one of recognitions that are added in turn."""
-    return len(agreeing(given[:-1], given[-1], poses))
-
-
-def test_recognitions_that_agree_count_once_they_are_enough() -> None:
-    assert [consistent(*[hypothesis(0.1 * k) for k in range(n)]) for n in (1, 2, 3, 4)] == [0, 0, CONSISTENT, 4]
-
-
-def test_one_that_contradicts_does_not_count() -> None:
-    assert consistent(hypothesis(0.0), hypothesis(0.1, error_m=0.2), hypothesis(0.2)) == 0
-    assert consistent(hypothesis(0.0), hypothesis(0.1, error_m=0.2), hypothesis(0.2), hypothesis(0.3)) == CONSISTENT
-
-
-def test_a_robot_at_rest_needs_recognitions_with_more_inliers() -> None:
-    assert consistent(*[hypothesis(0.0)] * 5) == 0
-    assert consistent(*[hypothesis(0.0, inliers=SURE_INLIERS) for _ in range(3)]) == CONSISTENT

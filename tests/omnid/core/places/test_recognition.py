@@ -12,17 +12,13 @@ from calib import se3
 from omnid.core.odometry.local_map import Keyframe
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.features import (
-    FEATURES,
     describe,
     describe_patches,
-    signature_of,
-    similarities,
     thumbnail,
 )
 from omnid.core.places.place_map import PlaceKeyframe, PlaceMap
 from omnid.core.places.recognition import Expected, PlaceSearch, recognise
 from omnid.core.places.relocalisation import Relocaliser
-from omnid.core.types.panorama import PaddedPanorama
 from tests.omnid.core.scenery import RenderedCameras, motion_errors, texture, wrapped
 from tests.simulation import corridor
 from tests.simulation.builders import twin_corridor
@@ -43,14 +39,6 @@ def elsewhere(cameras: RenderedCameras) -> StereoFrame:
 
 
 # Features and thumbnails.
-def test_features_have_known_depths_and_are_bounded(cameras: RenderedCameras, frames: list[StereoFrame]) -> None:
-    frame = frames[0]
-    found = describe(frame)
-    assert 50 < len(found.views) == len(found.descriptors) <= FEATURES and found.descriptors.shape[1:] == (128,)
-    assert np.isfinite(found.views).all() and (found.views[:, 2] > found.views[:, 1]).all()
-    columns, rows = np.rint(found.views[:, :2]).astype(int).T
-    assert frame.usable[rows, columns % frame.lower.width].all()
-    assert len(describe(cameras.darkness(1)).views) == 0
 
 
 def test_another_light_changes_nothing_and_another_patch_much() -> None:
@@ -61,25 +49,6 @@ def test_another_light_changes_nothing_and_another_patch_much() -> None:
     )
     apart = np.linalg.norm(plain[:, None] - dimmer[None], axis=2)
     assert np.diag(apart).max() < 60 and apart[~np.eye(5, dtype=bool)].min() > 150
-
-
-def similarity(a: PaddedPanorama, b: PaddedPanorama) -> float:
-    """The largest correlation of two panoramas' thumbnails over all headings."""
-    here, there = (signature_of(thumbnail(panorama)) for panorama in (a, b))
-    return float(similarities(here, there[None])[0])
-
-
-def test_thumbnails_tell_nearby_places_from_others_at_any_heading_and_in_another_light(
-    cameras: RenderedCameras, elsewhere: StereoFrame
-) -> None:
-    poses = planar_poses(np.array([[0.0, 0], [0.0, 0.2], [1.5, 0]]), np.array([0.0, 2.0, 0.0]))
-    here, aside, further = (cameras.frame(k, T).lower for k, T in enumerate(poses))
-    turned = np.roll(here.panorama, here.width // 3, axis=1)
-    dimmer = PaddedPanorama(np.pad((0.7 * turned + 10).astype(np.uint8), ((0, 0), (16, 16)), mode="wrap"), 16)
-    assert similarity(here, here) == pytest.approx(1.0, abs=1e-5) and similarity(here, dimmer) > 0.95
-    assert similarity(here, aside) > max(similarity(here, further), similarity(here, elsewhere.lower)) + 0.05
-    blank = PaddedPanorama(np.full((100, 532), 90, np.uint8), 16)
-    assert similarity(blank, blank) == 0.0
 
 
 # One keyframe.

@@ -11,7 +11,6 @@ from omnid.core.stereo.tiles import (
     ALL_LIVE,
     IN_A_ROW,
     SIDES,
-    TILE_ROWS,
     Side,
     TileMonitor,
     TileStates,
@@ -96,17 +95,6 @@ def test_a_scene_that_stands_is_live_by_its_noise(changed: Callable[[Image], Ima
     assert all(cameras.update(cameras.images()) is ALL_LIVE for _ in range(6))
 
 
-def test_what_a_codec_writes_again_with_hardly_any_noise_is_dead() -> None:
-    """A twentieth of the pixels that change by one grey level is not the noise of a sensor."""
-    cameras = Cameras()
-    rng, kept, found = np.random.default_rng(2), cameras.images()["lower"][:, PART].copy(), ALL_LIVE
-    for number in range(IN_A_ROW + 1):
-        images = cameras.images(moved_px=3 * number)
-        images["lower"][:, PART] = kept + (rng.random(kept.shape) < 0.05)
-        found = cameras.update(images)
-    assert found.dead["lower"][:, INSIDE].all()
-
-
 def test_without_noise_a_scene_in_which_a_little_moves_is_live() -> None:
     """Images of a simulator, or of a camera that removes noise: the base stands, somebody walks."""
     cameras = Cameras(noise_grey=0.0)
@@ -144,15 +132,6 @@ def test_dark_and_saturated_parts_are_blind_at_once() -> None:
         states = cameras.update(images)
         assert states.blind["lower"][:, INSIDE].all() and states.unknown[INSIDE].all(), grey
         assert not states.unknown[OUTSIDE].any()
-
-
-def test_a_lamp_makes_no_direction_unknown() -> None:
-    """A saturated tile of four."""
-    cameras = Cameras()
-    images = cameras.images()
-    images["lower"][: SHAPE[0] // TILE_ROWS, PART] = 255
-    states = cameras.update(images)
-    assert states.blind["lower"][0, INSIDE].all() and not states.unknown.any()
 
 
 @pytest.mark.hazard("H22")
@@ -195,14 +174,6 @@ def test_texture_that_only_one_camera_sees_is_no_dirt_on_the_other() -> None:
         images["upper"][100:200:4, 300:330] = 20
         states = cameras.update(images)
     assert states is ALL_LIVE
-
-
-def test_the_time_of_a_lost_part_counts_from_its_first_pair() -> None:
-    """It does not begin again from pair to pair."""
-    cameras = Cameras()
-    states = list(frozen(cameras, IN_A_ROW + 6))
-    first_ns = (IN_A_ROW + 1) * 100_000_000
-    assert {found.since_ns["upper"] for found in states if found is not ALL_LIVE} == {first_ns}
 
 
 def test_a_small_panorama_of_little_noise_is_live() -> None:

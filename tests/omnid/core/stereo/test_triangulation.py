@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from calib.panorama import Cylinder
-from omnid.core.stereo.triangulation import common_perpendicular, point_covariance, triangulate, view, view_jacobian
+from omnid.core.stereo.triangulation import point_covariance, triangulate, view, view_jacobian
 
 Array = NDArray[np.float64]
 
@@ -21,13 +21,6 @@ def points() -> Array:
     azimuth, r = rng.uniform(-np.pi, np.pi, 40), rng.uniform(0.5, 4, 40)
     azimuth[0] = np.pi
     return np.column_stack([r * np.cos(azimuth), r * np.sin(azimuth), rng.uniform(-1.2, 1.5, 40)])
-
-
-def test_intersecting_rays_give_the_point(points: Array) -> None:
-    origin = np.array([0.1, -0.05, 0.3])
-    lengths = np.random.default_rng(2).uniform(0.2, 5, (2, len(points), 1))
-    found = common_perpendicular(lengths[0] * points, lengths[1] * (points - origin), origin)
-    np.testing.assert_allclose(found, points, atol=1e-12)
 
 
 def test_jacobian_equals_the_numeric_derivative(points: Array) -> None:
