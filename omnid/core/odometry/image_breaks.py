@@ -28,7 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.exposure_times import Exposure, ViewShift
+from omnid.core.odometry.estimates import OdometryEstimate
+from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.line_times import (
     CAMERAS,
     LAG_S,
@@ -101,14 +102,11 @@ class Break(NamedTuple):
 
 
 class _View(NamedTuple):
-    """A pair, and the landmarks that the map shows in it."""
+    """A pair with its pose."""
 
     pair: Pair
     T_odom_rect: Array
-    points: Array  # (N, 3) m, in odom
-    shift: ViewShift  # of their views, to the stamp
-    covariance: Array  # (N, 3, 3) m^2
-    slopes: Array  # (N, 2) of the disparity, px/px
+    exposure: Exposure
     step: Array  # (6,) that led to it
 
 
@@ -157,7 +155,7 @@ class ImageBreaks:
     def add(
         self,
         pair: Pair,
-        T_odom_rect: Array,
+        estimate: OdometryEstimate,
         exposure: Exposure,
         local_map: LocalMap,
         dt_s: float,
@@ -169,23 +167,19 @@ class ImageBreaks:
         as it must explain to be believed: where the views fit as usual there is none, and no flow is measured.
         """
         last, found = self._last, None
-        step = np.zeros(6) if last is None else se3.log(se3.inverse(last.T_odom_rect) @ T_odom_rect)
+        step = np.zeros(6) if last is None else se3.log(se3.inverse(last.T_odom_rect) @ estimate.T_odom_rect)
+        now = _View(pair, estimate.T_odom_rect, exposure, step)
         is_usual = cost is not None and cost[1] * (cost[0] - self._usual_cost) < DECIDING_COST and not self._is_broken
         # A pose that was only predicted says too little about the motion between several exposures.
         is_known = cost is not None or exposure.times.is_at_once
         if last is not None and dt_s > 0 and is_known and not is_usual:
-            flow = self._flow(last, pair, T_odom_rect, exposure, step, LAG_S / dt_s)
+            flow = self._flow(last, now, local_map, LAG_S / dt_s)
             found = None if flow is None else likeliest_break(flow, self.raws, self.model.cylinder.focal_px)
         if cost is not None and found is None:
             usual = self._usual_cost + FOLLOWED * (cost[0] - self._usual_cost)
             self._usual_cost = min(usual, RIGHT_COST)  # a run whose images are broken from the start is not usual
-        self._spread(last, step, found, dt_s)
-        table = local_map.table
-        rows, _ = local_map.visible(T_odom_rect)
-        rows = rows[:: max(1, -(-len(rows) // MOST))]
-        slopes, points = local_map.slopes(T_odom_rect, rows), table.points[rows]
-        shift = exposure.shift(se3.apply(se3.inverse(T_odom_rect), points))
-        self._last = _View(pair, T_odom_rect, points, shift, table.covariance[rows], slopes, step)
+        self._spread(last, step, found, dt_s, estimate.distance_m)
+        self._last = now
 
     @property
     def words(self) -> list[str]:
@@ -198,8 +192,8 @@ class ImageBreaks:
         """True while a tear has been seen lately, or a displacement has not ended."""
         return self._torn > DECIDING_COST or bool(self._open)
 
-    def _spread(self, last: _View | None, step: Array, found: Break | None, dt_s: float) -> None:
-        """Add what a break makes uncertain.
+    def _spread(self, last: _View | None, step: Array, found: Break | None, dt_s: float, range_m: float) -> None:
+        """Add what a break makes uncertain; range_m: that of the landmarks.
 
         A torn image shows the rig up to an image too early, and landmarks are misplaced by as much. A displaced one
         turns directions, and moves the rig by as much of the landmarks' range. Lines that are read one after another
@@ -231,27 +225,30 @@ class ImageBreaks:
         share = 1.0 if is_torn else min(1.0, abs(read_out.time_s) / dt_s) if read_out is not None and dt_s else 0.0
         self.covariance = self.covariance + share**2 * (np.outer(step, step) + np.outer(last.step, last.step))
         if found is not None:
-            away = se3.apply(se3.inverse(last.T_odom_rect), last.points)
-            range_m = float(np.median(np.linalg.norm(away, axis=1)))
             self.covariance = self.covariance + found.angle_rad**2 * np.diag(np.repeat([range_m**2, 1.0], 3))
 
-    def _flow(self, last: _View, pair: Pair, T_now: Array, exposure: Exposure, step: Array, lag: float) -> _Flow | None:
-        """Return the flows of the last pair's landmarks, None: too few, as most of them are not found.
+    def _flow(self, last: _View, now: _View, local_map: LocalMap, lag: float) -> _Flow | None:
+        """Return the flows of the landmarks that the map shows in the last pair, None: too few of them are found.
 
         lag: standard deviation as a fraction of a step.
         """
         cylinder, baseline_m = self.model.cylinder, self.model.baseline_m
-        before, now = (se3.apply(se3.inverse(T), last.points) for T in (last.T_odom_rect, T_now))
-        views = tuple(view(points, cylinder, baseline_m) for points in (before, now))
-        shift_now = exposure.shift(now)
-        J_before, J_now = (view_jacobian(points, cylinder, baseline_m) for points in (before, now))
-        of_step = np.concatenate([np.broadcast_to(-np.eye(3), (len(now), 3, 3)), se3.hat(now)], axis=2)
-        of_point = J_now @ T_now[:3, :3].T - J_before @ last.T_odom_rect[:3, :3].T
+        landmarks, _ = local_map.visible(last.T_odom_rect)
+        landmarks = landmarks[:: max(1, -(-len(landmarks) // MOST))]
+        covariance, slopes = local_map.table.covariance[landmarks], local_map.slopes(last.T_odom_rect, landmarks)
+        before, after = (
+            se3.apply(se3.inverse(each.T_odom_rect), local_map.table.points[landmarks]) for each in (last, now)
+        )
+        shifts = last.exposure.shift(before), now.exposure.shift(after)
+        views = tuple(view(points, cylinder, baseline_m) for points in (before, after))
+        J_before, J_now = (view_jacobian(points, cylinder, baseline_m) for points in (before, after))
+        of_step = np.concatenate([np.broadcast_to(-np.eye(3), (len(after), 3, 3)), se3.hat(after)], axis=2)
+        of_point = J_now @ now.T_odom_rect[:3, :3].T - J_before @ last.T_odom_rect[:3, :3].T
         parts, sought = [], 0
         for camera, raw_image in enumerate(self.raws):
             # 1. Landmarks that both pairs show, and where they are instead of where the step puts them.
             own = [0, 1 + camera]
-            started, ended = ((each.lower, each.upper)[camera] for each in (last.shift, shift_now))
+            started, ended = ((each.lower, each.upper)[camera] for each in shifts)
             start, end = views[0][:, own] - started, views[1][:, own] - ended
             raw, by_raw = raw_image.at(end)
             inside = np.isfinite(raw).all(axis=1)
@@ -260,19 +257,20 @@ class ImageBreaks:
                 inside &= cylinder.shows(pixels[:, 0])
             rows = np.flatnonzero(inside)
             sought += len(rows)
-            there, found = self._found_at(camera, last, pair, T_now, before[rows], rows, (start[rows], end[rows]))
+            surfaces = before[rows], slopes[rows]
+            there, found = self._found_at(camera, (last, now), surfaces, (start[rows], end[rows]))
             rows, d = rows[found], there[found] - end[rows[found]]
             d[:, 0] = cylinder.wrap(d[:, 0])
             # 2. Derivatives, in standard deviations.
-            noise = np.einsum("nij,njk,nik->ni", of_point[rows][:, own], last.covariance[rows], of_point[rows][:, own])
+            noise = np.einsum("nij,njk,nik->ni", of_point[rows][:, own], covariance[rows], of_point[rows][:, own])
             of_motion = [0, 1] if camera == 0 else [3, 2]
-            noise += shift_now.variance(exposure.motion)[rows][:, of_motion]
+            noise += shifts[1].variance(now.exposure.motion)[rows][:, of_motion]
             px = np.sqrt(SIGMA_PX**2 + noise.mean(axis=1))
             J, shift = J_now[rows][:, own] @ of_step[rows] / px[:, None, None], by_raw[rows] / px[:, None, None]
             size = np.array(raw_image.size)
             arm = raw[rows] - (size - 1) / 2
             turn = shift @ np.column_stack([-arm[:, 1], arm[:, 0]])[:, :, None]
-            null = np.concatenate([J, lag * camera * (J @ step)[:, :, None]], axis=2)
+            null = np.concatenate([J, lag * camera * (J @ now.step)[:, :, None]], axis=2)
             shift, of_camera = np.concatenate([shift, turn], axis=2), np.full(len(rows), camera)
             parts.append(_Flow(d / px[:, None], null, shift, of_camera, raw[rows, 1] / size[1], px))
         flow = _Flow(*(np.concatenate(part) for part in zip(*parts, strict=True)))
@@ -281,34 +279,32 @@ class ImageBreaks:
     def _found_at(
         self,
         camera: int,
-        last: _View,
-        pair: Pair,
-        T_now: Array,
-        before: Array,
-        rows: Indices,
+        between: tuple[_View, _View],
+        surfaces: tuple[Array, Array],
         seen: tuple[Array, Array],
     ) -> tuple[Array, Flags]:
-        """Return the pixels (M, 2) of landmarks (rows (M,)) in a camera's panorama, and flags (M,): they were found.
+        """Return the pixels (M, 2) of landmarks in a camera's newer panorama, and flags (M,): they were found.
 
-        before (M, 3) [m]: in the last rectified frame; seen (M, 2), (M, 2): before, and as the step predicts. They are
-        tracked from there, else as if the rig had stood, as torn images show it. Then their patches are aligned, bent
-        as the step bends them; those that were not tracked where the step predicts them.
+        surfaces: points (M, 3) [m] and slopes (M, 2) in the older rectified frame; seen (M, 2), (M, 2): pixels there,
+        and as the step predicts. They are tracked from there, else as if the rig had stood, as torn images show it.
+        Then their patches are aligned, bent as the step bends them; those that were not tracked where the step
+        predicts them.
         """
-        start, end = seen
-        there, found = end.copy(), np.zeros(len(rows), bool)
+        (start, end), (last, now), (before, slopes) = seen, between, surfaces
+        there, found = end.copy(), np.zeros(len(start), bool)
         for guess in (end, start):
             rest = np.flatnonzero(~found)
-            tracked, found[rest] = track(last.pair[camera], pair[camera], start[rest], guess[rest], FAR)
+            tracked, found[rest] = track(last.pair[camera], now.pair[camera], start[rest], guess[rest], FAR)
             there[rest] = np.where(found[rest][:, None], tracked, there[rest])
         # The upper camera is like a lower one whose frame is higher, in which slopes are those over its own rows.
-        up, slopes = np.eye(4), last.slopes[rows]
+        up = np.eye(4)
         if camera:
             up[2, 3] = -self.model.baseline_m
             slopes = slopes / (1.0 + slopes[:, 1:])
-        T_now_last = np.tile(up @ se3.inverse(T_now) @ last.T_odom_rect @ se3.inverse(up), (len(rows), 1, 1))
-        one, surfaces = np.zeros(len(rows), np.intp), (se3.apply(up, before), slopes)
+        T_now_last = np.tile(up @ se3.inverse(now.T_odom_rect) @ last.T_odom_rect @ se3.inverse(up), (len(start), 1, 1))
+        one, surfaces = np.zeros(len(start), np.intp), (se3.apply(up, before), slopes)
         templates = plane_templates({0: last.pair[camera]}, one, start, surfaces, T_now_last, self.model, there)
-        aligned = align(templates, pair[camera], there)
+        aligned = align(templates, now.pair[camera], there)
         return np.where(aligned.found[:, None], aligned.pixels, there), aligned.found | found
 
 

@@ -105,7 +105,7 @@ class VisualOdometry:
         if self.breaks is None:
             return estimate
         pair, exposure = (frame.lower, frame.upper), self._exposure(frame)
-        self.breaks.add(pair, estimate.T_odom_rect, exposure, self._map, dt_s, self._cost)
+        self.breaks.add(pair, estimate, exposure, self._map, dt_s, self._cost)
         if not self.breaks.fault and not self.breaks.covariance.any():
             return estimate
         is_torn = self.breaks.fault and estimate.state is TrackingState.TRACKING
