@@ -228,7 +228,6 @@ def rig_stats(health: RigHealth) -> Stats:
     """Return the state of the rig, and the evidence of the newest finding."""
     finding, start = health.finding, health.start_finding
     stats = {Key.STATE: health.state, "new_views": health.new_views, "needed_views": VIEWS}
-    stats[Key.AGE_S] = health.finding_age_s
     severity, words = RIG_WORDS[health.state]
     if health.warning and not finding:  # the words of the first pairs count while the drive has shown nothing
         severity, words = "_error" if severity == "_error" else "_warning", health.warning

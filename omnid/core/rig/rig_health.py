@@ -35,10 +35,8 @@ Array = NDArray[np.float64]
 ROUND_PAIRS, MOST_ROUND_PAIRS = 2, 8
 # Rounds that must agree before the rig counts as contradicted, because a hand before a mirror passes.
 CONTRADICTIONS: Final = 2
-# Between two rounds while the images show too little, because light changes slower than that. After MOST_ROUNDS without
-# a decision the first minute of a run is over, and the check ends.
+# Between two rounds while the images show too little, because light changes slower than that.
 RETRY_NS: Final = 1_000_000_000
-MOST_ROUNDS: Final = 40
 # Pairs whose motion is not known, before such pairs are used as if the rig stood, because with a rig that is wrong by
 # degrees, no odometry starts that could find the motion.
 PATIENT_PAIRS: Final = 5
@@ -64,7 +62,7 @@ class FirstPairs:
         self._cylinder = cylinder
         self._straight: list[Matches] = []
         self._exchanged: list[Matches] = []
-        self._contradictions = self._rounds = self._unknown_pairs = 0
+        self._contradictions = self._unknown_pairs = 0
         self._last_ns = last_ns  # stamp of the last pair that was used
         self.finding: RigFinding | None = None  # finding of the last round
         self.state = RigState.UNCHECKED  # state that was decided
@@ -72,7 +70,7 @@ class FirstPairs:
     @property
     def ended(self) -> bool:
         """True if no more pairs are needed."""
-        return self.state is not RigState.UNCHECKED or self._rounds >= MOST_ROUNDS
+        return self.state is not RigState.UNCHECKED
 
     @property
     def used_unknown_motion(self) -> bool:
@@ -99,7 +97,7 @@ class FirstPairs:
         straight, exchanged = together(self._straight), len(together(self._exchanged).lower)
         if pairs < MOST_ROUND_PAIRS and (pairs < ROUND_PAIRS or len(straight.lower) + exchanged < MIN_MATCHES):
             return
-        self._straight, self._exchanged, self._rounds = [], [], self._rounds + 1
+        self._straight, self._exchanged = [], []
         self.finding = judge(straight, self._cylinder, exchanged)
         state = self.finding.state
         self._contradictions = self._contradictions + 1 if state.is_contradicted else 0
@@ -114,7 +112,6 @@ EXCHANGE: Final = (
 CALIBRATE: Final = (
     "give the rig of these cameras, or calibrate it: `omnid calibrate drive --only check` shows by how much it is off"
 )
-LATE_OR_MOVED: Final = "; if the rig was right before, one of the cameras is late now, or was moved"
 
 
 class RigContradictedError(OmnidError):
@@ -137,13 +134,12 @@ class RigHealth:
         self._running = None if mode == "off" else self._decided  # the check that needs pairs; None: none does
         self._since = ""  # when the state was found, as a line begins
         self.uses_views = every_s > 0  # True if views of the drive are used
-        self._every_ns, self._used_ns, self._newest_ns = every_s * 1e9, math.inf, 0
+        self._every_ns, self._used_ns = every_s * 1e9, math.inf
         self._views: deque[Matches] = deque(maxlen=VIEWS)
         self._view_at: Array | None = None  # (3,) m: where the newest of them was seen
         self.new_views = 0  # views of the drive since the last whole check
         self._later = RigState.UNCHECKED  # state by the views of the drive
         self.finding: RigFinding | None = None  # the newest finding of the drive; None before the first
-        self._found_ns = 0
 
     @property
     def state(self) -> RigState:
@@ -164,17 +160,11 @@ class RigHealth:
         return self._decided.finding
 
     @property
-    def finding_age_s(self) -> float:
-        """Time since the newest finding of the drive, by the stamps; NaN before the first."""
-        return (self._newest_ns - self._found_ns) * 1e-9 if self.finding else float("nan")
-
-    @property
     def warning(self) -> str:
         """One line about a rig that the first pairs contradict, or could not check, and what to do; else empty."""
         check, finding = self._decided, self._decided.finding
         if finding is None or check.state is RigState.FITS:
             return ""
-        changed = LATE_OR_MOVED if self._since else ""
         if check.state is RigState.EXCHANGED:
             return (
                 f"{self._since}the images match better the other way round: {finding.exchanged_matches} points are "
@@ -183,7 +173,7 @@ class RigHealth:
         if check.state is RigState.BROKEN:
             return (
                 f"{self._since}the images contradict the rig: the upper camera seems turned by {finding.turn_deg:.1f} "
-                f"deg by {finding.matches} points: {CALIBRATE}{changed}"
+                f"deg by {finding.matches} points: {CALIBRATE}"
             )
         if check.state is RigState.UNCHECKED:
             return (
@@ -198,7 +188,7 @@ class RigHealth:
             )
         return (
             f"{self._since}the images do not quite fit the rig, {finding.summary}: run `omnid calibrate drive --only "
-            f"check` on a recording{changed}"
+            "check` on a recording"
         )
 
     def begin(self, pair: PanoramaPair, exposure: Exposure | None = None) -> None:
@@ -217,7 +207,7 @@ class RigHealth:
         if not check.ended:
             return
         self._running = None
-        if not is_first and check.state is not RigState.UNCHECKED:
+        if not is_first:
             self._decided, self._since = check, "after the pose was lost, "
         if not is_first and check.state.is_contradicted:
             self._running = FirstPairs(self._cylinder, pair.stamp_ns)
@@ -238,7 +228,6 @@ class RigHealth:
         all other pairs almost nothing.
         """
         # 1. A pair that is due, of another place, and whose motion is known.
-        self._newest_ns = pair.stamp_ns
         is_due = not self._used_ns <= pair.stamp_ns < self._used_ns + self._every_ns
         is_new = self._view_at is None or float(np.linalg.norm(position - self._view_at)) >= VIEW_M
         if not (self.uses_views and is_due and is_new) or is_motion_unknown(pair, exposure):
@@ -255,6 +244,6 @@ class RigHealth:
             self.new_views = 0
         elif finding.misfit_deg <= BROKEN_DEG:
             return
-        self.finding, self._found_ns = finding, pair.stamp_ns
+        self.finding = finding
         if finding.state is not RigState.UNCHECKED:
             self._later = finding.state

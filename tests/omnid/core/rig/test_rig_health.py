@@ -128,7 +128,7 @@ def test_a_correct_rig_is_good(true: tuple[RigHealth, Collector]) -> None:
     assert float(status.values["turn_deg"]) < 0.05 and abs(float(status.values["offset_px"])) < 0.03
     assert status.values["state"] == "fits" and int(status.values["new_views"]) == len(true[1]) - VIEWS
     found, sought = int(status.values["matches"]), int(status.values["tried"])
-    assert 500 < found < sought and float(status.values["age_s"]) == pytest.approx(1, abs=0.5)
+    assert 500 < found < sought
 
 
 @pytest.mark.parametrize("turn_deg", [(0.5, 0.0, 0.0), (0.0, -0.5, 0.0), (0.0, 0.0, 0.5), (0.3, 0.2, -0.35)])
