@@ -3,7 +3,7 @@
 When an image was taken is stated in one of three ways:
 
 1. `rate_hz`: so many images a second, in the natural order of their names, from 0 s on;
-2. a list in the folder of the images or the one above: times.txt or timestamps.txt with a line for each image, or any
+2. a list in the folder of the images or the one above: times.txt or timestamps.txt with a stamp for each image, or any
    of STAMP_FILES with the names of the images beside their stamps, as data.csv of EuRoC and rgb.txt of TUM;
 3. its name: nanoseconds, a whole number of 16 to 19 digits (1403636579763555584.png), or seconds with a decimal point.
 
@@ -117,17 +117,15 @@ def _stamped(folder: Path, rate_hz: float, notes: list[str]) -> list[tuple[int, 
     paths = sorted((path for path in folder.iterdir() if _is_image(path.name)), key=_numbers_of)
     if rate_hz:
         return [(round(index * 1e9 / rate_hz), path) for index, path in enumerate(paths)]
-    # 1. A list, in which a name or a number may tell the image.
-    numbered = [{str(number): path for number, path in enumerate(paths, first)} for first in (0, 1)]
+    # 1. A list.
+    names = {path.name: path for path in paths}
     for listing in (place / name for place in (folder, folder.parent) for name in STAMP_FILES):
         rows = _rows(listing)
-        named = _named(rows, {path.name: path for path in paths}, folder)
-        for images in ({path.stem: path for path in paths}, *numbered):
-            named = named or _named(rows, images, folder, is_whole=True)
+        named = dict(image for row in rows if (image := _named(row, names, folder)))
         if named:
-            unlisted = len(paths) - len(named)
-            if unlisted:
-                notes.append(f"{unlisted} images of {str(folder)!r} are left out: {listing.name} does not list them")
+            if len(named) < len(paths):
+                unlisted = f"{len(paths) - len(named)} images of {str(folder)!r} are left out"
+                notes.append(f"{unlisted}: {listing.name} does not list them")
             return [(_listed_ns(text, path), path) for path, text in named.items()]
         if rows and listing.name in STAMP_FILES[:2]:
             if len(rows) != len(paths):
@@ -166,24 +164,13 @@ def _rows(listing: Path) -> list[list[str]]:
     return rows[1:] if is_head else rows
 
 
-def _named(
-    rows: Sequence[Sequence[str]], images: Mapping[str, Path], folder: Path, *, is_whole: bool = False
-) -> dict[Path, str]:
-    """Return image -> stamp of the rows that name one, by the column that names the most images of a folder.
-
-    is_whole: none unless all rows name an image.
-    """
-    best = dict[Path, str]()
-    for column in range(max(map(len, rows), default=0)):
-        found = {}
-        for row in rows:
-            named = Path(row[column] if column < len(row) else "")
-            # A list above the folders may name the images of all of them.
-            if len(row) > 1 and named.name in images and named.parent.name in ("", folder.name):
-                found[images[named.name]] = " ".join([*row[:column], *row[column + 1 :]])
-        if len(found) > len(best) and (len(found) == len(rows) or not is_whole):
-            best = found
-    return best
+def _named(row: Sequence[str], images: Mapping[str, Path], folder: Path) -> tuple[Path, str] | None:
+    """Return the image that a row names, and the row's stamp; a list above the folders may name those of all."""
+    for column, word in enumerate(row):
+        name = Path(word)
+        if name.name in images and name.parent.name in ("", folder.name):
+            return images[name.name], " ".join([*row[:column], *row[column + 1 :]])
+    return None
 
 
 def _listed_ns(text: str, path: Path) -> int:

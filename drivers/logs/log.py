@@ -2,7 +2,7 @@
 
 A format states three things only (`LogFile`): where in a file which message is and when it was stamped, what bytes it
 has, and what is attached. The places of all messages are collected first, some 60 bytes a message. So the order in a
-file need not be the order in time, and a step of a clock is found before anything is delivered.
+file need not be the order in time.
 """
 
 from __future__ import annotations
@@ -10,10 +10,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -23,7 +21,6 @@ from drivers.errors import RecordError
 from drivers.frame import Frame
 from drivers.logs.compression import unpack_message
 from drivers.logs.ros_messages import (
-    IMAGE_TYPES,
     STAMPED_TYPES,
     JointWheels,
     cdr_of_ros1,
@@ -40,14 +37,11 @@ MAX_ATTACHMENT_BYTES: Final = 16 * 2**20
 MAX_NAME: Final = 256  # characters of a topic, a type or an attachment
 MAX_LISTED: Final = 16  # names in a message
 LATEST_NS: Final = 2**62  # A time beyond is none; the difference of two times fits 64 bits.
-FEWEST_IN_ORDER: Final = 8  # Where fewer messages of a topic follow each other on average, it is written out of order.
-LONGEST_STEP: Final = 1.5  # Where two messages are more periods apart than that, one is missing between them.
 
 # When a message was logged, the stamp of its header if it begins with one (0 if unset), and where it is. In a file,
 # messages are in the order of block and offset, whose meaning is the format's own.
 ENTRY: Final = np.dtype([(name, np.int64) for name in ("channel", "time_ns", "header_ns", "block", "offset")])
 Entries = NDArray[Any]  # (N,) of ENTRY
-Times = NDArray[np.int64]  # (N,) [ns]
 
 
 class Topic(NamedTuple):
@@ -61,14 +55,11 @@ class Topic(NamedTuple):
 class LogFile(ABC):
     """An open file of messages, which may be damaged or malicious."""
 
-    is_indexed = True  # other programs can read it without a search for its messages
-
     def __init__(self, name: str) -> None:
         """name: for messages."""
         self.name = name
         self.topics: dict[int, Topic] = {}  # by channel; complete after entries()
         self.faults: dict[int, str] = {}  # what cannot be read, by block, or by offset without one; grows by reading
-        self.carried: Counter[str] = Counter()  # stamps by topic whose nanoseconds are a second or more
         self.stated: Counter[int] = Counter()  # messages by channel, by the summary of a closed file, where it has one
         self.cut = ""  # one line that says what is missing at the end, "" of a complete file; known after entries()
 
@@ -92,9 +83,7 @@ class LogFile(ABC):
         topic = self.topics.get(channel)
         if topic is None or topic.kind not in STAMPED_TYPES:
             return 0
-        stamp_ns, carries = header_stamp(unpack_message(memoryview(start)), aligned=topic.aligned)
-        self.carried[topic.name] += carries
-        return stamp_ns
+        return header_stamp(unpack_message(memoryview(start)), aligned=topic.aligned)
 
     def close(self) -> None:  # noqa: B027  (some keep no file open)
         """Close the file; may be called twice."""
@@ -127,13 +116,6 @@ class LoggedMessage:
         return parse_motion(self.kind, self.data(), aligned=self.aligned, joints=joints)
 
 
-class ClockStep(NamedTuple):
-    """A clock was set between two messages: the time before, as it runs on, and by how much."""
-
-    before_ns: int
-    size_ns: int  # negative: back
-
-
 class LogDamage(NamedTuple):
     """Faults that were found while a log was read."""
 
@@ -149,18 +131,12 @@ class LogIndex(NamedTuple):
     topic: NDArray[np.int32]  # (N,) index in topics
     file: NDArray[np.int16]  # (N,) index of the file
     entries: Entries
-    run_ns: Times  # log times, which run on where the recorder's clock was set back
-    order: NDArray[np.int64]  # (N,) rows in the order of these times, else of the files
-    steps: list[ClockStep]
+    order: NDArray[np.int64]  # (N,) rows in the order of log time, else of the files
     lost: Mapping[str, int]  # topic -> messages that a summary states, and that are nowhere
 
 
 class Log:
-    """An open log, which may be read several times.
-
-    Within a file, and from one part to the next, the recorder's clock may have been set back: the messages after such a
-    step follow those before it.
-    """
+    """An open log, which may be read several times."""
 
     def __init__(self, name: str, files: Sequence[LogFile], missing: Sequence[str] = ()) -> None:
         """name: for messages; files: the parts of the log in order; missing: names of those that are not there."""
@@ -255,80 +231,8 @@ class Log:
             is_known = topic >= 0
             parts.append((entries[is_known], topic[is_known], np.full(int(is_known.sum()), number, np.int16)))
         entries, topic, of_file = map(np.concatenate, zip(*parts, strict=True))
-        # 2. The order of time, in which images decide where the clock was set.
-        images = [place for place, kind in enumerate(topics.values()) if kind in IMAGE_TYPES]
-        run_ns, steps = running_on(topic, entries["time_ns"], images)
-        if steps and (kept := ~self._is_repeated(topic, entries, of_file)).sum() < len(kept):
-            topic, entries, of_file = topic[kept], entries[kept], of_file[kept]
-            run_ns, steps = running_on(topic, entries["time_ns"], images)
-        return LogIndex(topics, topic, of_file, entries, run_ns, np.argsort(run_ns, kind="stable"), steps, lost)
-
-    def _is_repeated(self, topic: NDArray[np.int32], entries: Entries, of_file: NDArray[np.int16]) -> NDArray[np.bool_]:
-        """Return which messages (N,) have topic, time and bytes of one before, as where a part was written twice."""
-        order = np.lexsort((entries["time_ns"], topic))
-        same = (np.diff(topic[order]) == 0) & (np.diff(entries["time_ns"][order]) == 0)
-        found = np.zeros(len(topic), np.bool_)
-        for before, row in zip(order[:-1][same].tolist(), order[1:][same].tolist(), strict=True):
-            with suppress(RecordError):
-                places = ((self.files[of_file[n]], entries[["block", "offset"]][n].item()) for n in (before, row))
-                first, second = (bytes(file.read(*place)) for file, place in places)
-                found[row] = first == second
-        return found
-
-
-def running_on(topic: NDArray[np.int32], times: Times, images: Iterable[int]) -> tuple[Times, list[ClockStep]]:
-    """Return times (N,) that run on where their clock was set back, and its steps.
-
-    topic, times: (N,) in the order of the files. images: the topics that decide; others follow the first of them.
-    """
-    # 1. The segment of each message: between two of them the clock was set back.
-    rows_of = {number: np.flatnonzero(topic == number) for number in np.unique(topic).tolist()}
-    found = {number: rows_of[number][steps_back(times[rows_of[number]])] for number in images if number in rows_of}
-    cuts = {number: rows for number, rows in found.items() if rows.size}
-    if not cuts:
-        return times, []
-    first = min(cuts, key=lambda number: int(cuts[number][0]))
-    segments = np.zeros(len(topic), np.int64)
-    for number, rows in rows_of.items():
-        segments[rows] = np.searchsorted(cuts.get(number, cuts[first]), rows, "right")
-    # 2. Each segment begins one period after the one before it has ended.
-    increments, run_ns, steps, before_ns = np.diff(times[rows_of[first]]), times.copy(), [], 0
-    period_ns = round(float(np.median(increments[increments > 0])))
-    for segment in range(1, int(segments.max()) + 1):
-        within, end_ns = segments == segment, int(run_ns[segments < segment].max())
-        shift_ns = min(end_ns + period_ns - int(times[within].min()), LATEST_NS)
-        run_ns[within] += shift_ns
-        steps.append(ClockStep(end_ns, before_ns - shift_ns))
-        before_ns = shift_ns
-    return run_ns, steps
-
-
-def steps_back(times: Times) -> NDArray[np.int64]:
-    """Return the indices in the times of one topic, in the order of the file, at which its clock was set back.
-
-    A file may also be written out of order: then what comes late fits into holes, or times go back at every
-    few messages. After a step, times are covered again that were covered before, or others that lie far from them.
-    """
-    increments = np.diff(times)
-    back = np.flatnonzero(increments < 0) + 1
-    if not back.size or FEWEST_IN_ORDER * back.size > increments.size:
-        return back[:0]
-    period = float(np.median(increments[increments > 0]))
-    starts, low, high = [0], times[0], times[back[0] - 1]  # begins of segments; first and last time of the newest one
-    for at, end in pairwise([*back.tolist(), len(times)]):
-        run = times[at:end]  # which ascends
-        within = run[np.searchsorted(run, low) : np.searchsorted(run, high, "right")]
-        is_step = bool(run[-1] < low - 2 * period)
-        if within.size > 1 or (within.size and run.size >= FEWEST_IN_ORDER):
-            segment = times[starts[-1] : at]
-            before = np.sort(segment[segment > within[0] - LONGEST_STEP * period])
-            behind = np.searchsorted(before, within)
-            again = np.count_nonzero((behind > 0) & (before[behind] - before[behind - 1] < LONGEST_STEP * period))
-            is_step = is_step or bool(again > within.size / 2)
-        if is_step:
-            starts.append(at)
-        low, high = (run[0], run[-1]) if is_step else (min(low, run[0]), max(high, run[-1]))
-    return np.array(starts[1:], np.int64)
+        # 2. The order of time.
+        return LogIndex(topics, topic, of_file, entries, np.argsort(entries["time_ns"], kind="stable"), lost)
 
 
 def listed(names: Iterable[str], none: str = "") -> str:

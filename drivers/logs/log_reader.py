@@ -6,7 +6,6 @@ import math
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple, TypeAlias
@@ -15,23 +14,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import DriverError, FrameDecodeError
-from drivers.frame import CAMERAS, SAMPLE_BITS, Camera, Frame, gray, is_deep
+from drivers.frame import CAMERAS, Camera, Frame
 from drivers.logs.open_log import open_log
 from drivers.logs.ros_messages import IMU
-from drivers.logs.stamps import STEP_NS, ImageTimes, LoggedImages, TimeSource
+from drivers.logs.stamps import STEP_NS, ImageStamps, LoggedImages, TimeSource, image_stamps
 from drivers.logs.topics import MotionChoice, MotionTopics, choose_motion_topics, choose_topics
 from drivers.motion import MotionSample, WheelSample
 
 _WARNINGS = {
     "duplicate": "dropped {} frames with the same stamp as the frame before of the same camera",
-    "carried": "{} stamps have 10^9 nanoseconds or more, which were added to their seconds",
     "broken_motion": "skipped {} messages of wheels or IMU that are not valid; the first: {fault}",
     "no_joints": "none of {} messages of joints names the wheels: see motion.wheel_joints",
     "broken": "skipped {} messages of the cameras' topics that hold no valid image; the first: {fault}",
     "broken_records": "skipped {} corrupt chunks or records of the file; the first: {fault}",
 }
-MOST_PERCENT = 99.0
-NEUTRAL_GREY, NEAR_NEUTRAL = 128, 16  # grey levels of colourless U and V, and how near those of weak colours are
 _COUNTERS = ("lower", "upper", "unstamped", "repeated", "unreadable", *_WARNINGS)
 WHOLE = (0.0, math.inf)  # span of all of a log [s]
 
@@ -60,7 +56,7 @@ class LogReader:
     path, rate_hz: as for `open_log`. bits: of the samples of images of 16 bits, see Frame. lower, upper: topics, where
     their names do not identify the cameras. span_s: the part of the log that is read, from and until so many seconds
     after the stamp of its first image. motion: topics of wheels and IMU; None: their samples are not read. time: which
-    of its two times an image is stamped with, see `image_times`. Raises DriverError where the path is no such log, or
+    of its two times an image is stamped with, see `image_stamps`. Raises DriverError where the path is no such log, or
     the topics of the two cameras are ambiguous.
 
     The headers of all messages are read first, so that the order is that of the stamps, whatever that of the file.
@@ -144,7 +140,6 @@ class LogReader:
                         yield replace(sample, stamp_ns=stamp_ns)
                     continue
                 image = replace(message.image(), stamp_ns=stamp_ns, camera=camera, bits=self._bits)
-                self._examine(message.topic, image)
             except FrameDecodeError as error:
                 counter = "broken" if camera else "broken_motion"
                 self.counts[counter] += 1
@@ -167,39 +162,22 @@ class LogReader:
     def _order(self) -> _Order:
         """The messages of the cameras, the wheels and the IMU, in the order of their stamps."""
         log, names = self._log, [*self._log.topics()]
-        rows = log.rows({*self._cameras.values(), *self._motion.names})
-        topic, run_ns, header_ns = log.index.topic[rows], log.index.run_ns[rows], log.index.entries["header_ns"][rows]
-        # 1. Of images whose header is not set or is that of the one before, some may be broken or repeat that one.
-        (is_image, is_broken), images = np.zeros((2, len(rows)), np.bool_), dict[Camera, LoggedImages]()
-        rank, at_of = np.zeros(len(rows), np.int64), dict[Camera, NDArray[np.int64]]()
-        for place, camera in enumerate(CAMERAS, 1):
-            at = np.flatnonzero(topic == names.index(self._cameras[camera]))
-            header, repeats = header_ns[at], np.zeros(len(at), np.bool_)
-            same = np.diff(header, prepend=-1) == 0
-            for n in np.flatnonzero(same | (header == 0)).tolist() if self._time != "log" else ():
-                here, before = (self._image(int(rows[at[k]])) for k in (n, max(0, n - 1)))
-                is_broken[at[n]] = here is None
-                repeats[n] = same[n] and header[n] > 0 and here is not None and here == before
-            whole = ~is_broken[at]
-            at_of[camera], is_image[at[whole]], rank[at] = at[whole], True, place
-            images[camera] = LoggedImages(header[whole], run_ns[at][whole], repeats[whole])
-        # 2. Stamps.
-        times, stamps_ns, is_motion = ImageTimes(images, self._time, log.index.steps), run_ns.copy(), rank == 0
-        stamps_ns[is_motion] = times.sample_ns(header_ns[is_motion], run_ns[is_motion])
-        for camera, at in at_of.items():
-            stamps_ns[at] = times.stamps_ns[camera]
-        stamps_of = {name: stamps_ns[(topic == n) & ~is_broken] for n, name in enumerate(names)}
+        rows = np.sort(log.rows({*self._cameras.values(), *self._motion.names}))  # in the order of the files
+        topic, entries = log.index.topic[rows], log.index.entries[rows]
+        log_ns, header_ns = entries["time_ns"], entries["header_ns"]
+        # 1. The stamps.
+        at_of = {camera: np.flatnonzero(topic == names.index(name)) for camera, name in self._cameras.items()}
+        images = {camera: LoggedImages(header_ns[at], log_ns[at]) for camera, at in at_of.items()}
+        times, stamps_ns, rank = image_stamps(images, self._time), log_ns.copy(), np.zeros(len(rows), np.int64)
+        for number, camera in enumerate(CAMERAS, 1):
+            stamps_ns[at_of[camera]], rank[at_of[camera]] = times.stamps_ns[camera], number
+        is_image = rank > 0
+        stamps_ns[~is_image] = times.sample_ns(header_ns[~is_image], log_ns[~is_image])
+        stamps_of = {name: stamps_ns[topic == number] for number, name in enumerate(names)}
         spans = {name: (int(ns.min()), int(ns.max())) for name, ns in stamps_of.items() if ns.size}
-        # 3. The order: of one stamp samples, the lower camera, the upper one.
+        # 2. The order: of one stamp samples, the lower camera, the upper one.
         order = np.lexsort((rank, stamps_ns))
         return _Order(rows[order], stamps_ns[order], is_image[order], times, spans)
-
-    def _image(self, row: int) -> bytes | None:
-        """Return the bytes of an image, None of one that is broken."""
-        with suppress(FrameDecodeError):
-            message = self._log.message(row)
-            return None if message is None else bytes(message.image().data)
-        return None
 
     def close(self) -> None:
         """End frames() and close the log."""
@@ -221,29 +199,9 @@ class LogReader:
         self.counts: Counter[str] = Counter(dict.fromkeys(_COUNTERS, 0))
         self.warnings: list[str] = [self._motion.warning] if self._motion.warning else []
         self.truncated = False
-        self._examined: set[str] = set()  # topics whose first image was
         self._faults: dict[str, str] = {}  # by counter: what is wrong with the first message that is not valid
         self._other_joints = 0  # messages of joints without the wheels
         self._has_wheels = False
-
-    def _examine(self, topic: str, frame: Frame) -> None:
-        """Warn where the first image of a topic would be black, or grey, as it is encoded otherwise than stated."""
-        if topic in self._examined:
-            return
-        self._examined.add(topic)
-        with suppress(FrameDecodeError):  # who decodes the image says what is wrong with it
-            # Of colours that are taken for brightness nearly all are near the middle.
-            colours = np.abs(gray(frame).astype(np.int16) - NEUTRAL_GREY) if frame.width else np.array([NEUTRAL_GREY])
-            if np.percentile(colours, MOST_PERCENT) <= NEAR_NEUTRAL:
-                self.warnings.append(
-                    f"the first image of {topic!r} ({frame.encoding!r}) has grey levels near {NEUTRAL_GREY} only, as "
-                    "colours have in YUV: is its encoding right? yuv422 is UYVY, yuv422_yuy2 is YUYV"
-                )
-            if self._bits == SAMPLE_BITS[-1] and is_deep(frame) and gray(frame).max() < 2**12 >> 8:
-                self.warnings.append(
-                    f"the first image of {topic!r} has samples of 16 bits, none above {2**12 - 1}: of a camera of 10 "
-                    "or 12 bits? Name them: --set cameras.bits=12, in `omnid calibrate rig` and `drive` --bits 12"
-                )
 
     def _of_another_clock(self) -> Iterator[str]:
         """Yield a warning for cameras, and for wheels or gyro, whose stamps are shifted against each other."""
@@ -269,8 +227,7 @@ class LogReader:
         self.truncated = bool(damage.cut)
         self.counts["broken_records"] = damage.broken
         topics = self._cameras.values()
-        self.counts["carried"] = sum(file.carried[topic] for file in self._log.files for topic in topics)
-        self.counts["unstamped"] = times.by_log.total()
+        self.counts["unstamped"] = times.by_log
         if self._span_s == WHOLE:
             self.counts["unreadable"] += sum(self._log.index.lost.get(topic, 0) for topic in topics)
         self.counts["no_joints"] = 0 if self._has_wheels else self._other_joints
@@ -279,7 +236,7 @@ class LogReader:
         for name, text in _WARNINGS.items():
             if self.counts[name]:
                 self.warnings.append(text.format(self.counts[name], fault=self._faults.get(name, "")))
-        self.warnings += [*times.warnings(), *self._of_another_clock()]
+        self.warnings += [*times.warnings, *self._of_another_clock()]
 
 
 class _Order(NamedTuple):
@@ -288,7 +245,7 @@ class _Order(NamedTuple):
     rows: NDArray[np.int64]  # (N,) of the log
     stamps_ns: NDArray[np.int64]  # (N,)
     is_image: NDArray[np.bool_]  # (N,)
-    times: ImageTimes
+    times: ImageStamps
     spans_ns: Mapping[str, tuple[int, int]]  # topic -> first and last stamp
 
 

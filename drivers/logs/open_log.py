@@ -6,7 +6,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from enum import Enum
 from itertools import pairwise
@@ -15,24 +15,24 @@ from typing import Final
 
 import numpy as np
 
-from drivers.errors import DriverError, FrameDecodeError
-from drivers.logs.compression import PACKED_SUFFIXES, is_packed, scratch_folder, unpack_file
+from drivers.errors import DriverError
 from drivers.logs.image_folder import ImageFolder, image_folders
 from drivers.logs.log import MAX_ATTACHMENT_BYTES, MAX_LISTED, Log, LogFile
+from drivers.logs.mcap_file import MAGIC as MCAP_MAGIC
+from drivers.logs.mcap_file import McapFile
 from drivers.logs.mcap_writer import is_locked
-from drivers.logs.record_file import BAG_MAGIC, MCAP_MAGIC, McapFile, Ros1Bag
-from drivers.logs.ros_messages import IMAGE_TYPES
+from drivers.logs.ros1_bag import MAGIC as BAG_MAGIC
+from drivers.logs.ros1_bag import Ros1Bag
 from drivers.logs.sqlite_bag import MAGIC as SQLITE_MAGIC
 from drivers.logs.sqlite_bag import SqliteBag
 
 MAX_PARTS: Final = 1000
-_JPEG_END: Final = b"\xff\xd9"  # ITU T.81, B.1.1.3
 LOG_SUFFIXES: Final = (".mcap", ".db3", ".bag")
-_UNFINISHED: Final = (".part", ".active")  # A recording of omnid, or of rosbag, has these until it is complete.
-# A log: name, time of its first message (of omnid's recordings and of ROS 1), number of the part, format.
+# A log: name, time of its first message (of omnid's recordings and of ROS 1), number of the part, format. Until it is
+# complete, a recording of omnid ends with .part, and one of rosbag with .active.
 _NAME: Final = re.compile(
     r"(?P<log>(?P<name>.+?)(?P<time>_\d{8}T\d{6}Z|_\d{4}(?:-\d{2}){5})?(?:_(?P<part>\d{1,9}))?"
-    rf"(?P<format>\.(?:mcap|db3|bag)))(?:{'|'.join(map(re.escape, (*_UNFINISHED, *PACKED_SUFFIXES)))})*"
+    r"(?P<format>\.(?:mcap|db3|bag)))(?:\.part|\.active)?"
 )
 _LISTED_FILES: Final = re.compile(r"^ *relative_file_paths:[ \t]*\n((?:[ \t]*- .*\n)*)", re.M)
 _FORMATS: Final[dict[bytes, Callable[[Path, str], LogFile]]] = {
@@ -43,7 +43,7 @@ _FORMATS: Final[dict[bytes, Callable[[Path, str], LogFile]]] = {
 
 
 def is_log_name(name: str) -> bool:
-    """True if a file is a log by its name, which may be unfinished or compressed as a whole."""
+    """True if a file is a log by its name, which may be unfinished."""
     return _NAME.fullmatch(name) is not None
 
 
@@ -62,7 +62,6 @@ class LogState(Enum):
 
     WHOLE = "whole"
     WRITTEN = "being written"
-    UNINDEXED = "whole, but without an index"
     BROKEN = "cut or corrupt"
 
 
@@ -74,7 +73,7 @@ class LogInfo:
     size_bytes: int
     state: LogState
     broken: int  # corrupt chunks and records; those that nothing but reading shows are 0 where it was not examined
-    fault: str  # one line that says what of the log, or of its images, is missing; empty for a complete log
+    fault: str  # one line that says what of the log is missing; empty for a complete log
     topics: Mapping[str, tuple[str, int]]  # topic -> type ('' where it cannot be decoded), number of messages
     rates_hz: Mapping[str, float]  # topic -> mean rate from its first message to its last one; two are needed
     span_ns: tuple[int, int] | None  # first and last log time; None without messages
@@ -89,33 +88,22 @@ class LogInfo:
 def log_info(path: str | os.PathLike[str], *, examine: bool = False, rate_hz: float = 0.0) -> LogInfo:
     """Return the contents of a log of any format.
 
-    examine: read it to its end; otherwise corrupt chunks and images are not noticed. rate_hz: see `ImageFolder`. Raise
+    examine: read it to its end; otherwise corrupt chunks are not noticed. rate_hz: see `ImageFolder`. Raise
     DriverError without a log.
     """
     locked, given = is_locked(path), Path(path)  # before it is read: the writer may end in the meantime
     with closing(open_log(path, rate_hz)) as log:
-        counts, cut_images = Counter[str]({} if examine else log.counts()), Counter[str]()
-        for message in log.messages() if examine else ():
-            counts[message.topic] += 1
-            with suppress(FrameDecodeError):
-                # A JPEG without its end is left by a driver that was killed half-way.
-                image = message.image() if message.kind in IMAGE_TYPES else None
-                if image and image.encoding == "jpeg" and _JPEG_END not in bytes(image.data):
-                    cut_images[message.topic] += 1
+        counts = Counter(message.topic for message in log.messages()) if examine else log.counts()
         damage, index = log.damage(), log.index
-        faults = [damage.cut] if damage.cut else []
-        faults += [f"{count} images of {topic!r} end too early" for topic, count in cut_images.items()]
-        is_indexed = all(file.is_indexed for file in log.files)
-        state = LogState.WHOLE if is_indexed else LogState.UNINDEXED
         logged_ns = index.entries["time_ns"]
-        times = {name: index.run_ns[index.topic == n] for n, name in enumerate(index.topics)}
+        times = {name: logged_ns[index.topic == n] for n, name in enumerate(index.topics)}
         files = given.rglob("*") if given.is_dir() else [given]
         return LogInfo(
             given,
             sum(file.stat().st_size for file in files if file.is_file()),
-            LogState.WRITTEN if locked else LogState.BROKEN if faults or damage.broken else state,
+            LogState.WRITTEN if locked else LogState.BROKEN if damage.cut or damage.broken else LogState.WHOLE,
             damage.broken,
-            "; ".join(faults),
+            damage.cut,
             {name: (kind, counts.get(name, 0)) for name, kind in sorted(index.topics.items())},
             {name: (len(ns) - 1) * 1e9 / float(np.ptp(ns)) for name, ns in times.items() if len(ns) and np.ptp(ns)},
             (int(logged_ns.min()), int(logged_ns.max())) if logged_ns.size else None,
@@ -123,32 +111,24 @@ def log_info(path: str | os.PathLike[str], *, examine: bool = False, rate_hz: fl
         )
 
 
-def _open_file(path: Path, name: str | None = None) -> LogFile:
-    """Open a log by its first bytes; name: for error messages, where it is not the path."""
-    name = name or str(path)
+def _open_file(path: Path) -> LogFile:
+    """Open a log by its first bytes."""
     try:
         if path.exists() and not path.is_file():
             raise DriverError(
-                f"cannot read the log {name!r}: it is no regular file; give one of {', '.join(LOG_SUFFIXES)}"
+                f"cannot read the log {str(path)!r}: it is no regular file; give one of {', '.join(LOG_SUFFIXES)}"
             )
         with path.open("rb") as file:
             start = file.read(max(map(len, _FORMATS)))
     except OSError as error:
-        raise DriverError(f"cannot read the log {name!r}: {error.strerror}") from error
+        raise DriverError(f"cannot read the log {str(path)!r}: {error.strerror}") from error
     for magic, kind in _FORMATS.items():
-        # A recorder that was killed early may have left all of a database in its write-ahead log.
-        if start.startswith(magic) or (kind is SqliteBag and not start.strip(b"\0") and Path(f"{path}-wal").is_file()):
-            return kind(path, name)
-    if is_packed(start) and name == str(path):
-        with scratch_folder(name) as folder:
-            inside = unpack_file(path, folder)
-            if not inside.stat().st_size:
-                raise DriverError(f"{name!r} is compressed, but cut or corrupt at its start: record it again")
-            return _open_file(inside, name)
-    found = (
-        f"it starts with {start!r}: give one of {', '.join(LOG_SUFFIXES)}" if start else "it is empty: record it again"
+        if start.startswith(magic):
+            return kind(path, str(path))
+    found = f"it starts with {start!r}" if start else "it is empty"
+    raise DriverError(
+        f"{str(path)!r} is no log: {found}: give one of {', '.join(LOG_SUFFIXES)}, unpacked if it was compressed"
     )
-    raise DriverError(f"{name!r} is no log: {found}")
 
 
 def _open_folder(path: Path, rate_hz: float) -> Log:
@@ -169,7 +149,7 @@ def _open_folder(path: Path, rate_hz: float) -> Log:
         return Log(str(path), [ImageFolder(path, folders, rate_hz)])
     names = ", ".join(log.name for log in logs[:MAX_LISTED]) or "none"
     raise DriverError(
-        f"{str(path)!r} must contain one log ({' '.join(LOG_SUFFIXES)}), the numbered parts of one, or a "
+        f"{str(path)!r} must contain one log ({' '.join(LOG_SUFFIXES)}, unpacked), the numbered parts of one, or a "
         f"folder of images for each camera; found: {names}; give one file"
     )
 
@@ -177,17 +157,14 @@ def _open_folder(path: Path, rate_hz: float) -> Log:
 def logs_in(folder: Path) -> list[Path]:
     """Return the logs in a folder by their names. Raise OSError where it is unreadable.
 
-    One that was cut, or is compressed, is one of them, unless it is there completed or unpacked, or is being written.
+    One that was cut is one of them, unless it is there completed, or is being written.
     """
     return [
         file
         for file in sorted(folder.iterdir())
         if is_log_name(file.name)
         and file.is_file()
-        and (
-            file.suffix in LOG_SUFFIXES
-            or not (file.with_suffix("").exists() or (file.suffix in _UNFINISHED and is_locked(file)))
-        )
+        and (file.suffix in LOG_SUFFIXES or not (file.with_suffix("").exists() or is_locked(file)))
     ]
 
 
@@ -211,11 +188,11 @@ def _missing(folder: Path, logs: Sequence[Path]) -> list[str]:
     there = [match for log in logs if (match := _NAME.fullmatch(log.name))]
     if metadata.is_file() and metadata.stat().st_size <= MAX_ATTACHMENT_BYTES:
         listed = _LISTED_FILES.search(metadata.read_text("utf-8", "replace"))
-        # The first versions of rosbag2 listed paths. One file may be compressed or unfinished, and the other not.
+        # The first versions of rosbag2 listed paths; what was compressed may have been unpacked.
         lines = listed[1].splitlines() if listed else []
         names = [Path(line.strip().removeprefix("- ").strip("'\" ")).name for line in lines]
         known = {match["log"] for match in there}
-        return [name for name in names if not ((match := _NAME.match(name)) and match["log"] in known)]
+        return [name for name in names if name.removesuffix(".zstd") not in known]
     numbers = [int(match["part"]) for match in there if match["part"]]
     if not numbers or len(set(numbers)) != len(logs):
         return []

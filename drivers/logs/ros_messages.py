@@ -139,18 +139,14 @@ def _decoded(kind: str, message: memoryview, aligned: bool) -> Any:
         raise FrameDecodeError(f"a {kind} of {len(message)} bytes is truncated or invalid") from error
 
 
-def header_stamp(message: memoryview, *, aligned: bool = True) -> tuple[int, bool]:
-    """Return the stamp [ns] of the header with which images, wheels and IMUs begin; 0 where it is unset or cut.
-
-    The second result is True where its nanoseconds are a second or more.
-    """
+def header_stamp(message: memoryview, *, aligned: bool = True) -> int:
+    """Return the stamp [ns] of the header with which images, wheels and IMUs begin; 0 where it is unset or cut."""
     start = bytes(message[:HEADER_BYTES])
     if len(start) < HEADER_BYTES:
-        return 0, False
+        return 0
     # CDR states its byte order; ROS 1 begins with a sequence number, and its seconds have no sign.
     layout = ("<4xiI" if start[1] & 1 else ">4xiI") if aligned else "<4xII"
-    seconds, nanoseconds = struct.unpack(layout, start)
-    return _stamp_ns(seconds, nanoseconds), nanoseconds >= 10**9
+    return _stamp_ns(*struct.unpack(layout, start))
 
 
 typestore = cache(get_typestore)

@@ -1,23 +1,14 @@
-"""Stamps of the images of a log: by their headers, or by the times of logging where those cannot be used.
+"""Stamps of the images of a log: all by their headers, or all by the times of logging where the headers are faulty.
 
-A camera driver stamps the header when the image is taken; the recorder logs the message when it arrives. Of the two
-the header is the better one, unless it is not set, does not advance, or counts by another clock.
-
-1. The first images decide for the whole log: their headers are used if they advance and both cameras share a clock.
-2. Headers run on, and never gain on the times of logging, as a recorder can only be late. Where they do, a run ends.
-   Runs of some images that were taken and logged at about one rate are right: from one to the next the delay (header
-   minus time of logging) changes where a clock was set. The images after it are a new segment, whose stamps are moved
-   so that time runs on, as the times of logging do (`running_on`).
-3. Of other images, those have the time of logging, moved by the usual delay, whose header is not set, repeats the one
-   before, or lies far from that time; one that was logged late, between others, keeps its header. Where that is so
-   for most images between two runs, or headers run back there, all of these have it: one clock for a stretch.
+A camera driver stamps the header when the image is taken; the recorder logs the message when it arrives. The header is
+the better one, unless it is not set, does not advance, runs back, or counts by another clock than that of the other
+camera. A recorder may log images late and out of order: such an image fills a hole between others. Where a clock was
+set back, images lie beside or between others instead.
 """
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from itertools import pairwise
+from collections.abc import Mapping
 from typing import Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -25,225 +16,144 @@ from numpy.typing import NDArray
 
 from drivers.errors import DriverError
 from drivers.frame import CAMERAS, Camera
-from drivers.logs.log import FEWEST_IN_ORDER, LONGEST_STEP, ClockStep, Times, running_on
 
+Times: TypeAlias = NDArray[np.int64]  # (N,) [ns]
 TimeSource: TypeAlias = Literal["auto", "header", "log"]
 
-FIRST_IMAGES: Final = FEWEST_IN_ORDER  # by which the headers of a camera are judged, and the delays of a run
 SHORTEST_STEP_NS: Final = 1_000_000  # No camera takes 1,000 images a second, as stamps that hardly advance say.
-STEP_NS: Final = 500_000_000  # Delays between header and logging change by less, unless a clock is set.
-FASTEST: Final = 3.0  # Clocks and images run on at rates that differ by less than this factor.
-SHORTEST_RUN: Final = FIRST_IMAGES // 2  # images that tell a step of the clock from wrong stamps
-EPOCH_NS: Final = 10**18  # The year 2001: earlier stamps count from a start, as of the computer.
+STEP_NS: Final = 500_000_000  # Delays between header and logging vary by less, unless a clock is set.
+_FASTEST: Final = 3.0  # Clocks and images run at rates that differ by less than this factor.
+_FEW: Final = 0.1  # Up to this share of headers may be unset or repeat the one before.
+_MANY: Final = 0.25  # Fewer images than this share are logged late.
 
 
 class LoggedImages(NamedTuple):
-    """The N images of a camera in the order of logging."""
+    """The N images of a camera in the order of the file."""
 
     header_ns: Times  # stamps of the headers, 0 where unset
-    log_ns: Times  # times of logging, which run on
-    repeats: NDArray[np.bool_]  # (N,) the image before has the same header and the same content
+    log_ns: Times
 
 
-class ImageTimes:
+class ImageStamps(NamedTuple):
     """The stamps of the images of both cameras, and what is wrong with their headers."""
 
-    def __init__(
-        self, images: Mapping[Camera, LoggedImages], source: TimeSource = "auto", log_steps: Sequence[ClockStep] = ()
-    ) -> None:
-        """log_steps: those of the times of logging. DriverError where no camera can have taken the images so fast."""
-        self.by_log: Counter[str] = Counter()  # images with the time of logging, by what is wrong with their headers
-        self.stamps_ns: dict[Camera, Times] = {camera: of_camera.log_ns for camera, of_camera in images.items()}
-        self._steps, self._shifts_ns, self._delay_ns = [*log_steps], {0}, 0  # the latter two of the lower camera
-        self._apart_ns = 0.0  # clocks of the cameras, where it is half a period or more
-        # 1. What serves as the stamp.
-        some = slice(FIRST_IMAGES)
-        first = [LoggedImages(one.header_ns[some], one.log_ns[some], one.repeats[some]) for one in images.values()]
-        fault, has_log = _judged([one for one in first if len(one.log_ns) > 1])
-        is_auto = source == "auto"
-        step_ns = min((_step_ns(one.header_ns) for one in first), default=0.0)
-        log_us = min((_step_ns(one.log_ns) for one in first), default=0.0) / 1000
-        if is_auto and not has_log and 0 < step_ns < SHORTEST_STEP_NS:
-            raise DriverError(
-                f"the images are {step_ns / 1000:g} us apart by their headers, {log_us:g} us by the times of "
-                'logging: were microseconds written as nanoseconds? log.time = "header" reads them as they are'
-            )
-        self._source = ("log" if fault and has_log else "header") if is_auto else source
-        self._is_old = self._source == "header" and any(
-            0 < one.header_ns.max() < EPOCH_NS < one.log_ns.min() for one in first if len(one.log_ns)
-        )
-        # 2. The stamps.
-        if self._source == "log":
-            self.by_log[fault] += sum(map(len, self.stamps_ns.values())) if is_auto else 0
-        elif has_log:
-            self._steps = []
-            for camera in sorted(images):  # the lower one first, whose shifts are those of the upper one if it has them
-                found = _Segments(images[camera], may_replace=is_auto, known_ns=self._shifts_ns)
-                self.stamps_ns[camera] = found.stamps_ns
-                self.by_log += found.faults
-                self._steps += found.steps
-                if camera == CAMERAS[0]:
-                    self._shifts_ns, self._delay_ns = found.shifts_ns, found.delay_ns
-            self._steps.sort()
-            delays = [self.stamps_ns[camera] - images[camera].log_ns for camera in CAMERAS]
-            if is_auto and min(map(len, delays)) > 1:  # A recorder can only be late: the least delay counts as well.
-                apart_ns = min(abs(float(usual(delays[1]) - usual(delays[0]))) for usual in (np.median, np.max))
-                self._apart_ns = apart_ns if 2 * apart_ns >= min(map(_step_ns, self.stamps_ns.values())) else 0.0
-        else:
-            # The times of logging say nothing: headers that step back run on by themselves.
-            sizes = [len(images[camera].log_ns) for camera in CAMERAS]
-            camera_of = np.repeat(np.arange(len(CAMERAS), dtype=np.int32), sizes)
-            log_ns = np.concatenate([images[camera].log_ns for camera in CAMERAS])
-            header_ns = np.concatenate([images[camera].header_ns for camera in CAMERAS])
-            self.by_log["are 0"] += int(np.count_nonzero(header_ns == 0))
-            header_ns = np.where(header_ns > 0, header_ns, log_ns)
-            order = np.argsort(log_ns, kind="stable")
-            run_ns, self._steps = running_on(camera_of[order], header_ns[order], range(len(CAMERAS)))
-            for number, camera in enumerate(CAMERAS):
-                self.stamps_ns[camera] = run_ns[camera_of[order] == number]
-        starts = [int(stamps_ns[0]) for stamps_ns in self.stamps_ns.values() if len(stamps_ns)]
-        self._first_ns = min(starts, default=0)
+    stamps_ns: Mapping[Camera, Times]
+    by_header: bool
+    delay_ns: int  # usual stamp of the lower camera minus the time of logging
+    by_log: int  # images that have the time of logging instead of the header's
+    warnings: list[str]
 
     def sample_ns(self, header_ns: Times, log_ns: Times) -> Times:
-        """Return the stamps (N,) of samples of wheels or IMU by the clock of the images; log_ns: which run on."""
-        if self._source == "log" or not len(header_ns):
-            return log_ns
-        # Where a clock was set, the one of the samples may be the same.
-        return np.where(header_ns > 0, _shifted(header_ns, log_ns + self._delay_ns, {0, *self._shifts_ns}), log_ns)
+        """Return the stamps (N,) of samples of wheels or IMU by the clock of the images."""
+        return np.where(self.by_header & (header_ns > 0), header_ns, log_ns + self.delay_ns)
 
-    def warnings(self) -> Iterator[str]:
-        """Yield one line for each fault of the stamps."""
-        if self._is_old:
-            yield (
-                "the stamps of the images begin in 1970, as by a clock that counts from the start of the computer; "
-                'log.time = "log" takes the times of logging'
+
+def image_stamps(images: Mapping[Camera, LoggedImages], source: TimeSource = "auto") -> ImageStamps:
+    """Return the stamps of the images of both cameras.
+
+    Raise DriverError, by "auto", where neither headers nor times of logging can be those of a camera.
+    """
+    # 1. What is wrong with the times of logging, and with the headers.
+    log_fault = next(filter(None, (_fault(of_camera.log_ns) for of_camera in images.values())), "")
+    fault, is_auto = "", source == "auto"
+    if is_auto:
+        fault = next(filter(None, (_header_fault(images[camera], is_logged=not log_fault) for camera in CAMERAS)), "")
+        apart_ns = abs(_delay_ns(images["lower"]) - _delay_ns(images["upper"]))
+        if not (fault or log_fault) and all(map(_is_live, images.values())) and apart_ns > STEP_NS:
+            fault = f"are {apart_ns * 1e-9:.3f} s apart between the cameras"
+        if fault and log_fault:
+            raise DriverError(
+                f"the stamps of the images' headers {fault}, and the times of logging {log_fault}: expected one that "
+                'runs on; cut the log there, or choose: log.time = "header" or "log"'
             )
-        if self.by_log.total():
-            reasons = " or ".join(reason for reason, count in self.by_log.items() if count)
-            yield f"used the times of logging for {self.by_log.total()} images: the stamps of their headers {reasons}"
-        if self._steps:
-            before_ns, size_ns = self._steps[0]
-            way, at_s = "forward" if size_ns > 0 else "back", (before_ns - self._first_ns) * 1e-9
-            more = f" ({len(self._steps) - 1} more steps follow)" if len(self._steps) > 1 else ""
-            yield (
-                f"the clock of the images was set {way} by {abs(size_ns) * 1e-9:.3f} s {at_s:.3f} s after the first "
-                f"one{more}: the images after it are a new segment, whose stamps are moved so that time runs on"
-            )
-        if self._apart_ns:
-            yield (
-                f"the clocks of the cameras differ by {self._apart_ns * 1e-9:.3f} s, half a period or more: images of "
+    # 2. The stamps. A header that is not set is replaced by the time of logging and the usual delay.
+    by_header = source == "header" or (is_auto and not fault)
+    delay_ns = _delay_ns(images["lower"]) if by_header and not log_fault else 0
+    stamps_ns, unset = dict[Camera, Times](), 0
+    for camera, (header_ns, log_ns) in images.items():
+        stamps_ns[camera] = np.where(by_header & (header_ns > 0), header_ns, log_ns + delay_ns)
+        unset += int(np.count_nonzero((header_ns == 0) & (log_ns != 0))) if by_header else is_auto * len(log_ns)
+    found = ImageStamps(stamps_ns, by_header, delay_ns, unset, [])
+    if unset:
+        found.warnings.append(
+            f"used the times of logging for {unset} images: the stamps of their headers {fault or 'are 0'}"
+        )
+    # 3. Cameras whose clocks differ by less, and pauses.
+    if by_header and not log_fault and all(map(_is_live, images.values())):
+        apart_ns = abs(_delay_ns(images["lower"]) - _delay_ns(images["upper"]))
+        if 2 * apart_ns >= min(map(_step_ns, stamps_ns.values())):
+            found.warnings.append(
+                f"the clocks of the cameras differ by {apart_ns * 1e-9:.3f} s, half a period or more: images of "
                 'different moments make pairs, which do not fit the rig; correct the clocks, or take log.time = "log"'
             )
-        lower, upper = (np.sort(self.stamps_ns[camera]) for camera in CAMERAS)
-        steps_ns, period_ns = np.diff(lower), round(_step_ns(lower))
-        is_empty = np.searchsorted(upper, lower[:-1] + period_ns) >= np.searchsorted(upper, lower[1:] - period_ns)
-        for at in np.flatnonzero(is_empty & (steps_ns > max(STEP_NS, FIRST_IMAGES * period_ns)))[:1]:
-            yield f"{steps_ns[at] * 1e-9:.1f} s without images after image {at + 1}: a pause, or a clock set forward"
+    every = np.sort(np.concatenate([*stamps_ns.values()]))
+    pauses_ns, longest_ns = np.diff(every), STEP_NS + max(map(_step_ns, stamps_ns.values()), default=0)
+    for at in np.flatnonzero(pauses_ns > longest_ns)[:1].tolist():
+        number = np.count_nonzero(stamps_ns["lower"] <= every[at])
+        found.warnings.append(
+            f"{pauses_ns[at] * 1e-9:.1f} s without images after image {number}: a pause, or a clock that was set"
+        )
+    return found
 
 
-def _judged(cameras: Sequence[LoggedImages]) -> tuple[str, bool]:
-    """Return what is wrong with all headers, by the first images of each camera, and whether the log times serve."""
-    headers, logged = [images.header_ns for images in cameras], [images.log_ns for images in cameras]
-    has_log = bool(cameras) and all(_step_ns(times) >= SHORTEST_STEP_NS for times in logged)
-    if any(np.count_nonzero(header == 0) > len(header) / 2 for header in headers):
-        return "are 0", has_log
-    if (step_ns := min(map(_step_ns, headers), default=SHORTEST_STEP_NS)) < SHORTEST_STEP_NS:
-        return f"are {step_ns / 1000:g} us apart" if step_ns else "do not advance", has_log
-    if has_log and any(_runs_back(header[header > 0]) for header in headers):
-        return "run back", has_log
-    delays_ns = [round(float(np.median((h - log)[h != 0]))) for h, log in zip(headers, logged, strict=True)]
-    if len(cameras) == len(CAMERAS) and abs(delays_ns[0] - delays_ns[1]) > STEP_NS and has_log:
-        return f"are {abs(delays_ns[0] - delays_ns[1]) * 1e-9:.3f} s apart between the cameras", has_log
-    # Times of logging that run at another rate, as those of a conversion, tell nothing about the headers.
-    rates = [_step_ns(header) / max(1, _step_ns(log)) for header, log in zip(headers, logged, strict=True)]
-    return "", has_log and all(1 / FASTEST < rate < FASTEST for rate in rates)
+def _header_fault(images: LoggedImages, *, is_logged: bool) -> str:
+    """Return what is wrong with the headers of a camera; is_logged: the times of logging are in order."""
+    # 1. The images in the order of logging, without repeated messages.
+    order = np.argsort(images.log_ns, kind="stable") if is_logged else np.arange(len(images.log_ns))
+    header_ns, log_ns = images.header_ns[order], images.log_ns[order]
+    repeated = (np.diff(header_ns, prepend=-1) == 0) & (np.diff(log_ns, prepend=-1) == 0)
+    header_ns, log_ns = header_ns[~repeated], log_ns[~repeated]
+    is_set = header_ns > 0
+    if np.count_nonzero(~is_set) > max(1, _FEW * len(is_set)):
+        return "are 0"
+    header_ns = header_ns[is_set]
+    if fault := _fault(header_ns):
+        return fault
+    # 2. The times of logging show what lies before the first image, or behind most of them.
+    if is_logged and _is_live(LoggedImages(header_ns, log_ns[is_set])):
+        latest_ns = np.maximum.accumulate(header_ns)
+        behind = header_ns < latest_ns - STEP_NS
+        wrong = behind & ((header_ns < header_ns[0] - STEP_NS) | (np.mean(behind) > _MANY))
+        return _running_back(latest_ns - header_ns, wrong)
+    return ""
 
 
-class _Segments:
-    """The stamps of one camera, whose times of logging serve: see the head of this file."""
-
-    def __init__(self, images: LoggedImages, *, may_replace: bool, known_ns: set[int]) -> None:
-        """may_replace: by the time of logging. known_ns: shifts of the other camera, which may have the same clock."""
-        header_ns, log_ns, repeats = images
-        self.steps: list[ClockStep] = []
-        # 1. Headers that are not set, or are those of another image.
-        wrong = {"are 0": (header_ns == 0) & (log_ns != 0)}
-        if may_replace:
-            wrong["do not advance"] = (np.diff(header_ns, prepend=-1) == 0) & ~repeats & (header_ns > 0)
-        used = np.flatnonzero(~np.any([*wrong.values()], axis=0))
-        header, log = header_ns[used], log_ns[used]
-        delays, increments = header - log, np.diff(header)
-        period = float(np.median(increments[increments > 0])) if np.any(increments > 0) else 0.0
-        # 2. Runs, and the shift of each that is regular.
-        cuts = np.flatnonzero((increments < 0) | (np.diff(delays) > STEP_NS)) + 1
-        runs = [slice(*ends) for ends in pairwise([0, *cuts.tolist(), len(header)])]
-        regular = [run for run in runs if _is_regular(header[run], log[run])]
-        shifts, is_regular, shift_ns = np.zeros(len(header), np.int64), np.zeros(len(header), np.bool_), 0
-        for before, run in zip([None, *regular], regular, strict=False):
-            if before is not None:
-                old, new = delays[before][-FIRST_IMAGES:], delays[run][:FIRST_IMAGES]
-                size_ns = round(np.median(new) - np.median(old))
-                if abs(size_ns) > max(period, np.ptp(old) + np.ptp(new)):
-                    # Both cameras are moved alike where one clock was set.
-                    moved_ns = shift_ns - size_ns
-                    known = next((other_ns for other_ns in known_ns if abs(other_ns - moved_ns) < period / 2), None)
-                    if known is None:
-                        self.steps.append(ClockStep(int(header[before.stop - 1]) + shift_ns, size_ns))
-                    shift_ns = moved_ns if known is None else known
-            shifts[run], is_regular[run] = shift_ns, True
-        self.shifts_ns = {*shifts[is_regular].tolist()}
-        stamps = header + shifts
-        lateness = (stamps - log)[is_regular] if regular else delays
-        self.delay_ns = round(float(np.median(lateness))) if len(lateness) else 0
-        # 3. Other images: the shift that fits best. What is far behind was logged late, unless
-        # its place among the others is its own in the log, or is taken by the stamps.
-        stamps[~is_regular] = _shifted(header, log + self.delay_ns, {*self.shifts_ns} or {0})[~is_regular]
-        if may_replace and len(log):
-            apart, around = stamps - log - self.delay_ns, np.pad(log_ns, 1, "reflect", reflect_type="odd")
-            is_alone = (around[2:] - around[:-2] >= LONGEST_STEP * period)[used]
-            is_alone[1 - SHORTEST_RUN :] = False  # what follows them is not known
-            # No image was taken long before the first one, nor within half a period of another.
-            taken = np.append(np.sort(stamps[is_regular]), [np.iinfo(np.int64).max])
-            is_taken = taken[np.searchsorted(taken, stamps - round(period / 2))] < stamps + period / 2
-            is_taken |= stamps < taken[0] - LONGEST_STEP * period
-            usual = min(STEP_NS, max(period, 2 * np.ptp(lateness))) if regular else STEP_NS
-            is_ahead = ~is_regular & (apart > usual)
-            is_before = ~is_regular & (((apart < -STEP_NS) & is_alone) | ((apart < -usual) & is_taken))
-            replaced, is_mixed = is_ahead | is_before, np.zeros(len(log), np.bool_)
-            mixed = np.where(replaced, log + self.delay_ns, stamps)
-            for begin, end in np.flatnonzero(np.diff(is_regular, prepend=True, append=True)).reshape(-1, 2):
-                part = slice(begin, end)
-                is_most = np.mean(replaced[part]) >= 1 / 2 or _runs_back(header[part])
-                is_mixed[part] = is_most and replaced[part].any() and (np.diff(mixed[part]) < 0).any()
-            for fault, is_so in (("lie ahead of the log", is_ahead), ("lie long before the log", is_before)):
-                wrong[fault] = np.isin(np.arange(len(header_ns)), used[is_so & ~is_mixed])
-            wrong["run back or jump"] = np.isin(np.arange(len(header_ns)), used[is_mixed])
-        # 4. The stamps.
-        self.faults = Counter({fault: int(np.count_nonzero(is_so)) for fault, is_so in wrong.items()})
-        self.stamps_ns = log_ns + self.delay_ns
-        self.stamps_ns[used] = stamps
-        is_wrong = np.any([*wrong.values()], axis=0)
-        self.stamps_ns[is_wrong] = log_ns[is_wrong] + self.delay_ns
+def _fault(times: Times) -> str:
+    """Return why times, in their order, cannot be those at which a camera took its images; empty where they can."""
+    if len(times) < 2:
+        return ""
+    if np.count_nonzero(np.diff(times) == 0) > max(1, _FEW * len(times)):
+        return "do not advance"
+    step_ns = _step_ns(times)
+    if step_ns < SHORTEST_STEP_NS:
+        return f"are {step_ns / 1000:g} us apart"
+    # An image behind the latest one must fill a hole: half a period beside others is none.
+    times = times[np.diff(times, prepend=-1) != 0]
+    latest_ns = np.maximum.accumulate(times)
+    order, place, counts = np.unique(times, return_inverse=True, return_counts=True)
+    gaps_ns = np.diff(order).astype(np.float64)
+    room_ns = np.minimum(np.append(np.inf, gaps_ns), np.append(gaps_ns, np.inf))
+    is_crowded = (room_ns <= step_ns / 2) | (counts > 1)
+    is_late = np.append(False, times[1:] <= latest_ns[:-1])
+    return _running_back(latest_ns - times, is_late & is_crowded[place])
 
 
-def _is_regular(header: Times, log: Times) -> bool:
-    """True for a run of images that were taken and logged at about one rate."""
-    if len(header) < SHORTEST_RUN:
-        return False
-    taken_ns, logged_ns = int(header[-1] - header[0]), int(log[-1] - log[0])
-    return taken_ns < FASTEST * logged_ns and logged_ns < FASTEST * taken_ns
+def _running_back(behind_ns: Times, wrong: NDArray[np.bool_]) -> str:
+    """Return the fault of times of which some are wrong; empty where none is."""
+    first = np.flatnonzero(wrong)[:1].tolist()
+    return f"run back by {behind_ns[first[0]] * 1e-9:.3f} s at image {first[0] + 1}" if first else ""
 
 
-def _runs_back(times: Times) -> bool:
-    """True for times, in the order of logging, most of which are before the one before."""
-    return len(times) > 1 and bool(np.median(np.diff(times)) < 0 and times[-1] < times[0])
+def _is_live(images: LoggedImages) -> bool:
+    """True if images were logged at about the rate of their headers, unlike by a conversion."""
+    header_ns, log_ns = map(_step_ns, images)
+    return header_ns < _FASTEST * log_ns and log_ns < _FASTEST * header_ns
 
 
-def _shifted(header_ns: Times, expected_ns: Times, shifts_ns: set[int]) -> Times:
-    """Return the headers (N,), each moved by that of the shifts which brings it nearest to the expected time."""
-    candidates_ns = header_ns + np.array(sorted(shifts_ns), np.int64)[:, None]
-    nearest = np.abs(candidates_ns - expected_ns).argmin(axis=0)
-    return np.asarray(candidates_ns[nearest, np.arange(len(header_ns))])
+def _delay_ns(images: LoggedImages) -> int:
+    """Return the usual header minus time of logging; 0 without headers."""
+    is_set = images.header_ns > 0
+    return round(float(np.median((images.header_ns - images.log_ns)[is_set]))) if is_set.any() else 0
 
 
 def _step_ns(times: Times) -> float:

@@ -48,8 +48,9 @@ def _show(found: LogInfo) -> None:
     """Print the properties of a log, and the table of its topics. The log may contain anything."""
     faults = [found.fault] if found.fault else []
     faults += [f"{found.broken} corrupt chunks or records, which are skipped"] if found.broken else []
-    states = {LogState.BROKEN: f": {'; '.join(faults)}", LogState.UNINDEXED: ": omnid reads it"}
-    state = found.state.value + states.get(found.state, "")
+    state = found.state.value
+    if found.state is LogState.BROKEN:
+        state += f": {'; '.join(faults)}"
     time = ""
     if found.span_ns is not None:
         first_ns, last_ns = found.span_ns

@@ -15,9 +15,9 @@ from mcap.writer import CompressionType
 
 from omnid.calibration.images import read_pairs
 from tests.conftest import PAIRS
-from tests.drivers.logs.bags import unclosed_bag, write_bag, write_db3
+from tests.drivers.logs.bags import write_bag, write_db3
 from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, UPPER, Entry, compressed, write_log
-from tests.drivers.logs.test_formats import FORMATS, WITHOUT_INDEX
+from tests.drivers.logs.test_formats import FORMATS
 from tests.replay.command import Command
 from tests.replay.edited import Image, images, save
 
@@ -30,28 +30,29 @@ def entries(scene: Path) -> list[Entry]:
     return [Entry(topics[i.camera], COMPRESSED, compressed(i.stamp_ns, i.jpeg), i.written_ns) for i in taken]
 
 
-@pytest.mark.parametrize("name", FORMATS)
-def test_every_command_reads_every_format_alike(omnid: Command, tmp_path: Path, scene: Path, name: str) -> None:
-    log = FORMATS[name](tmp_path, entries(scene))
-    # 1. `log info`
-    code, out, err = omnid("log", "info", log)
-    assert (
-        (code, err) == (0, "")
-        and re.search(r"state +whole", out)
-        and ("without an index" in out) == (name in WITHOUT_INDEX)
-    )
-    assert len(re.findall(rf" +{COMPRESSED} +{PAIRS} ", out)) == 2
-    # 2. `calibrate`
-    pairs = read_pairs(log)
-    assert len(pairs.names) == PAIRS and not pairs.notes
-    assert all(map(np.array_equal, pairs.sides[0].values(), read_pairs(scene / "log.mcap").sides[0].values()))
-    # 3. `replay`
-    rows = []
-    for source in (scene / "log.mcap", log):
-        result = omnid.replay(source, *QUICK, "--tum", tmp_path / "est.txt", rig=scene / "rig.toml")
+READ = ("mcap, zstd", "mcap, compressed messages", "db3 of a killed recorder", "bag, bz2", "folder")
+
+
+def test_every_command_reads_every_format_alike(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    logs, trajectories = [scene / "log.mcap"], set()
+    for name in READ:
+        folder = tmp_path / name
+        folder.mkdir()
+        logs.append(FORMATS[name](folder, entries(scene)))
+    for log in logs:
+        # 1. `log info`
+        code, out, err = omnid("log", "info", log)
+        assert (code, err) == (0, "") and re.search(r"state +whole", out)
+        assert len(re.findall(rf" +{COMPRESSED} +{PAIRS} ", out)) == 2
+        # 2. `calibrate`
+        pairs = read_pairs(log)
+        assert len(pairs.names) == PAIRS and not pairs.notes
+        assert all(map(np.array_equal, pairs.sides[0].values(), read_pairs(scene / "log.mcap").sides[0].values()))
+        # 3. `replay`
+        result = omnid.replay(log, *QUICK, "--tum", tmp_path / "est.txt", rig=scene / "rig.toml")
         assert result.code == 0 and not result.err and result.count("pairs") == PAIRS
-        rows.append((tmp_path / "est.txt").read_bytes())
-    assert rows[0] == rows[1]
+        trajectories.add((tmp_path / "est.txt").read_bytes())
+    assert len(trajectories) == 1
 
 
 def test_reports_of_every_format_are_the_same(omnid: Command, tmp_path: Path, scene: Path) -> None:
@@ -65,19 +66,15 @@ def test_reports_of_every_format_are_the_same(omnid: Command, tmp_path: Path, sc
         ]
     logs = [
         write_log(tmp_path / "few.mcap", found),
-        write_db3(tmp_path / "few", found),
         write_db3(tmp_path / "packed", found, zstd=True),
         write_bag(tmp_path / "few.bag", found, "LZ4"),
-        unclosed_bag(write_bag(tmp_path / "killed.bag", found)),
     ]
     pages = []
     for log in logs:
         page = tmp_path / "report.html"
         code, _, err = omnid("report", log, "-o", page)
         assert code == 0, err
-        text = page.read_text()
-        assert ("is cut or corrupt" in text) == (log.suffix == ".active")
-        pages.append(re.findall(r"<div class='numbers'>.*?</div>", text))
+        pages.append(re.findall(r"<div class='numbers'>.*?</div>", page.read_text()))
     assert pages[0] and pages == [pages[0]] * len(logs)
 
 

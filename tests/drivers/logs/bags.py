@@ -76,29 +76,6 @@ def write_bag(path: Path, entries: Sequence[Entry], compression: str = "", chunk
     return path
 
 
-def unclosed_bag(path: Path, *, open_chunk: bool = False) -> Path:
-    """Make a bag of one chunk the .bag.active of a recorder that was killed: without its index.
-
-    open_chunk: its chunk was not ended either, so that its size is not known.
-    """
-    data = bytearray(path.read_bytes())
-    start = len(b"#ROSBAG V2.0\n")
-    (size,) = struct.unpack_from("<I", data, start)
-    at = data.index(b"index_pos=", start) + len(b"index_pos=")
-    (index,) = struct.unpack_from("<Q", data, at)
-    data[at : at + 8] = bytes(8)
-    active = path.with_name(f"{path.name}.active")
-    if open_chunk:
-        first = start + 4 + size
-        first += 4 + struct.unpack_from("<I", data, first)[0]
-        (size,) = struct.unpack_from("<I", data, first)
-        stated = data.index(b"size=", first) + len(b"size=")
-        data[stated : stated + 4] = data[first + 4 + size : first + 8 + size] = bytes(4)
-    active.write_bytes(data[:index])
-    path.unlink()
-    return active
-
-
 def write_interrupted_db3(folder: Path, entries: Sequence[Entry]) -> Path:
     """Write the file of a recorder that was killed within a transaction, which its journal undoes."""
     whole, killed = write_db3(folder, entries), folder / "killed"

@@ -58,10 +58,7 @@ def test_a_list_holds_the_seconds_of_numbered_images(tmp_path: Path, where: str,
 
 # Lines of a list with two columns, by number, stamp [ns] and camera -> name of the file, a line, folder it is in.
 LISTS: Final[dict[str, tuple[str, Callable[[int, int, str], str], str]]] = {
-    "number and seconds": ("times.txt", lambda n, ns, _: f"{n} {ns // 10**9}.{ns % 10**9:09d}", "lower"),
-    "seconds and number": ("times.txt", lambda n, ns, _: f"{ns // 10**9}.{ns % 10**9:09d},{n}", "lower"),
     "name and seconds": ("timestamps.txt", lambda n, ns, _: f"frame{n}.jpg;{ns // 10**9}.{ns % 10**9:09d}", "lower"),
-    "name without suffix": ("times.txt", lambda n, ns, _: f"frame{n} {ns // 10**9}.{ns % 10**9:09d}", ""),
     "nanoseconds": ("times.txt", lambda n, ns, _: str(ns), ""),
     "EuRoC": ("data.csv", lambda n, ns, _: f"{ns},frame{n}.jpg", "lower"),
     "TUM": ("rgb.txt", lambda n, ns, camera: f"{ns // 10**9}.{ns % 10**9:09d} {camera}/frame{n}.jpg", ""),
@@ -71,7 +68,7 @@ LISTS: Final[dict[str, tuple[str, Callable[[int, int, str], str], str]]] = {
 
 @pytest.mark.parametrize("name", LISTS)
 @pytest.mark.parametrize("head", ["", "#timestamp [ns],filename\n", "stamp name\n"])
-def test_a_list_may_have_names_or_numbers_beside_the_stamps(tmp_path: Path, name: str, head: str) -> None:
+def test_a_list_may_have_names_beside_the_stamps(tmp_path: Path, name: str, head: str) -> None:
     """In any order of lines where it names the images."""
     folder = write_folders(tmp_path / "images", pairs(PAIRS), lambda stamp_ns: f"frame{NUMBERS[stamp_ns]}")
     file, line, where = LISTS[name]
@@ -110,9 +107,7 @@ def test_numbered_images_have_the_stated_rate(tmp_path: Path) -> None:
     assert stamps(named, rate_hz=20.0) == [stamp_ns // 2 for stamp_ns in as_taken()], "it replaces the names"
 
 
-@pytest.mark.parametrize(
-    "name", ["frame0", "0000000001", "1e30", "-1", "nan", "1_0.5", "1.2.3", "9" * 30, "2011-09-26 13:02:25"]
-)
+@pytest.mark.parametrize("name", ["frame0", "0000000001", "1_0.5", "1.2.3", "9" * 30])
 def test_a_name_that_is_no_stamp_is_refused_and_names_the_setting(tmp_path: Path, name: str) -> None:
     folder = write_folders(tmp_path / "images", pairs(1), lambda _: name)
     with pytest.raises(DriverError, match=r"is named .*log\.rate_hz of the settings"):
@@ -137,28 +132,18 @@ def test_cameras_of_folders_with_other_names_are_given(tmp_path: Path) -> None:
     assert read(folder, lower="mav0/cam0/data", upper="mav0/cam1/data")[0] == expected(PAIRS)
 
 
-@pytest.mark.parametrize("kind", ["pipe", "device", "folder", "a link that leads nowhere"])
+@pytest.mark.parametrize("kind", ["pipe", "a link that leads nowhere"])
 @pytest.mark.parametrize("name", ["lower/1700000000000000001.jpg", "rig.toml"])
 def test_what_is_no_file_is_told_and_not_waited_for(tmp_path: Path, kind: str, name: str) -> None:
     folder = write_folders(tmp_path / "images", pairs(2))
     odd = folder / name
     if kind == "pipe":
         os.mkfifo(odd)
-    elif kind == "folder":
-        odd.mkdir()
     else:
-        odd.symlink_to("/dev/zero" if kind == "device" else tmp_path / "nowhere")
+        odd.symlink_to(tmp_path / "nowhere")
     with closing(LogReader(folder)) as reader:
         assert reader.attachments() == {} and len(list(reader.frames())) == 4
         assert (str(odd) in "".join(reader.warnings)) == (name != "rig.toml")
-
-
-def test_images_may_be_links(tmp_path: Path) -> None:
-    folder = write_folders(tmp_path / "images", pairs(3))
-    first = min((folder / "lower").iterdir())
-    first.rename(tmp_path / "image")
-    first.symlink_to(tmp_path / "image")
-    assert read(folder)[0] == expected(3)
 
 
 def test_hidden_files_beside_the_images_are_left_out(tmp_path: Path) -> None:

@@ -1,0 +1,80 @@
+"""Bags of ROS 1 (.bag), whose index is read by rosbags: one that was cut must be repaired by `rosbag reindex`."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from rosbags.rosbag1 import Reader
+
+from drivers.errors import DriverError, RecordError
+from drivers.logs.log import ENTRY, MAX_NAME, Entries, LogFile, Topic
+from drivers.logs.ros_messages import HEADER_BYTES
+
+MAGIC: Final = b"#ROSBAG V2.0\n"
+_KEPT_CHUNKS: Final = 4  # that stay unpacked
+_LENGTH_BYTES: Final = 4  # of the head of a record, and of its data, before each (wiki.ros.org/Bags/Format/2.0)
+
+
+class Ros1Bag(LogFile):
+    """A LogFile of one .bag file; raises DriverError where it cannot be read."""
+
+    def __init__(self, path: Path, name: str) -> None:
+        super().__init__(name)
+        self._chunks: dict[int, memoryview] = {}  # the last ones that were unpacked
+        self._bag = Reader(path)
+        try:
+            self._bag.open()
+            self._file = path.open("rb", buffering=0)
+        except Exception as error:  # of any kind, as it trusts the lengths in the bytes
+            reason = " ".join(str(error).split())[:MAX_NAME] or type(error).__name__
+            raise DriverError(
+                f"cannot read the bag {name!r}: {reason}; if its recorder was stopped, try `rosbag reindex`"
+            ) from error
+        for of in self._bag.connections:
+            self.topics[of.id] = Topic(of.topic[:MAX_NAME], of.msgtype[:MAX_NAME], aligned=False)
+            self.stated[of.id] = len(self._bag.indexes[of.id])
+
+    def entries(self) -> Entries:
+        """Return the places of all messages by the index, chunk by chunk."""
+        places = (
+            (place.chunk_pos, place.offset, channel, place.time)
+            for channel, found in self._bag.indexes.items()
+            for place in found
+        )
+        found = []
+        for block, offset, channel, time_ns in sorted(places):
+            try:
+                start = self.read(block, offset)[:HEADER_BYTES]
+                found.append((channel, time_ns, self.header_ns(channel, start), block, offset))
+            except RecordError as error:
+                self.faults.setdefault(block, str(error))
+        return np.array(found, ENTRY)
+
+    def read(self, block: int, offset: int) -> memoryview:
+        """Return the bytes of the message of an entry; raise RecordError where they are not those that were written."""
+        if block not in self._chunks:
+            chunk = self._bag.chunks[block]
+            try:
+                packed = os.pread(self._file.fileno(), chunk.datasize, chunk.datapos)
+                self._chunks[block] = memoryview(chunk.decompressor(packed))
+            except Exception as error:  # of any kind that a decompressor or a closed file raises
+                raise RecordError(f"the chunk at byte {block}: it does not unpack") from error
+        self._chunks[block] = data = self._chunks.pop(block)  # the newest one
+        if len(self._chunks) > _KEPT_CHUNKS:
+            del self._chunks[next(iter(self._chunks))]
+        for _ in ("head", "data"):
+            size = int.from_bytes(data[offset : offset + _LENGTH_BYTES], "little")
+            begin, offset = offset + _LENGTH_BYTES, offset + _LENGTH_BYTES + size
+        if not begin < offset <= len(data):
+            raise RecordError(f"the chunk at byte {block}: the message at its byte {offset} is not whole")
+        return data[begin:offset]
+
+    def close(self) -> None:
+        """Close the file; may be called twice."""
+        self._chunks.clear()
+        if not self._file.closed:
+            self._file.close()
+            self._bag.close()
