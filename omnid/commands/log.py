@@ -94,7 +94,7 @@ def evaluate_run(args: argparse.Namespace) -> int:
     --live FILE            the poses as they were known while driving (replay --map-live-tum), whose errors are printed
         beside
     --frame rig|auto=rig   the body whose truth it is: the rig; auto: fit one constant pose of another body on the
-        robot, and unit, delay and convention of the file, and print what was fitted
+        robot and the delay of its clock, and print what was fitted
 
     examples:
       eval est.txt truth.txt

@@ -1,16 +1,14 @@
 """Trajectories in the TUM format: one pose a line, `t x y z qx qy qz qw` (seconds, metres, unit quaternion).
 
 A head that names the columns, as `#timestamp [ns], p_RS_R_x [m], ..., q_RS_w [], ...` of EuRoC's CSV files, states the
-order of the quaternion and the unit of the stamps.
+order of the quaternion. A whole number of 16 digits or more is a stamp in nanoseconds.
 """
 
 from __future__ import annotations
 
-import codecs
 import re
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
-from io import BytesIO, TextIOWrapper
 from itertools import pairwise
 from pathlib import Path
 from typing import Final
@@ -28,9 +26,6 @@ STAMP_LIMIT_NS: Final = 1 << 62  # Largest stamp, so that the difference of two 
 _DECIMALS: Final = 9  # nanoseconds, nanometres
 _AXES: Final = ["x", "y", "z"]
 _QUATERNION: Final = [*_AXES, "w"]
-# The power of ten from a stamp to nanoseconds, by its unit. Where the file does not name the unit, it is the first that
-# gives a time within the limit.
-_TO_NANOSECONDS: Final = {"s": 9, "ms": 6, "us": 3, "ns": 0}
 _SHOWN: Final = 60  # characters of a wrong line
 
 
@@ -54,19 +49,18 @@ def read_tum(path: str | Path) -> Trajectory:
     at one time contradict each other. Raises OmnidError that names the file, the line and what was found.
     """
     # 1. Stamp, line and numbers of each pose.
-    found, line, order, unit = list[tuple[int, int, list[float]]](), 0, _QUATERNION, ""
+    found, line, order = list[tuple[int, int, list[float]]](), 0, _QUATERNION
     try:
         for line, content in enumerate(_lines(Path(path)), start=1):
             data, _, comment = content.partition("#")
             words = _words(data)
             is_head = len(words) > 1 and not any(re.match(r"[-+.]?[0-9]", word) for word in words)
             if words and (found or not is_head):
-                unit = unit or _unit_of(words[0])
                 # Tables may have more columns, such as velocities.
-                stamp_ns, pose = _row(words[:8] if re.search("[,;]", data) else words, unit)
+                stamp_ns, pose = _row(words[:8] if "," in data else words)
                 found.append((stamp_ns, line, pose))
             elif not found:
-                order, unit = _columns(data if words else comment) or (order, unit)
+                order = _quaternion_order(data if words else comment) or order
     except ValueError as error:
         raise OmnidError(f"{path}, line {line}: {error}") from error
     if not found:
@@ -100,8 +94,8 @@ def tum_row(stamp_ns: int, T: Array) -> str:
     return " ".join([f"{sign}{whole_s}.{rest_ns:09d}", *(f"{float(value):.{_DECIMALS}f}" for value in pose)])
 
 
-def _lines(path: Path) -> TextIOWrapper:
-    """Return the lines of a text, in UTF-16 if it begins with its byte order mark; comments may have any encoding."""
+def _lines(path: Path) -> list[str]:
+    """Return the lines of a text; comments may have any encoding."""
     try:
         with path.open("rb") as file:
             raw = file.read(FILE_LIMIT_BYTES + 1)
@@ -109,43 +103,28 @@ def _lines(path: Path) -> TextIOWrapper:
         raise OmnidError(f"{path}: cannot read the trajectory: {getattr(error, 'strerror', None) or error}") from error
     if len(raw) > FILE_LIMIT_BYTES:
         raise OmnidError(f"{path}: expected at most {FILE_LIMIT_BYTES >> 20} MiB: split the file")
-    is_wide = raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-    return TextIOWrapper(BytesIO(raw), "utf-16" if is_wide else "utf-8-sig", errors="replace")
+    return raw.decode("utf-8-sig", "replace").split("\n")
 
 
 def _words(data: str) -> list[str]:
-    """Return the words of a line, separated by spaces, commas or semicolons; numbers may have decimal commas."""
-    data = data.replace('"', " ").replace(";", " ")
-    words = data.split()
-    if len(words) > 1 and all(re.fullmatch(r"[-+]?\d+,\d+", word) for word in words):
-        return [word.replace(",", ".") for word in words]
+    """Return the words of a line, separated by spaces or commas."""
     return data.replace(",", " ").split()
 
 
-def _columns(head: str) -> tuple[list[str], str] | None:
-    """Return the order of the quaternion and the unit of the stamps; None unless time, position, quaternion follow."""
-    unit = re.match(r"[^,]*\[(s|ms|us|ns)\]", head)
-    names = _words(re.sub(r"\[[^\]]*\]", "", head).lower())
-    axes = [name[-1] for name in names[1:8]]
+def _quaternion_order(head: str) -> list[str] | None:
+    """Return the order of the quaternion; None unless a head names time, position, quaternion."""
+    axes = [name[-1] for name in _words(re.sub(r"\[[^\]]*\]", "", head).lower())[1:8]]
     order = axes[len(_AXES) :]
-    if axes[: len(_AXES)] != _AXES or sorted(order) != sorted(_QUATERNION):
-        return None
-    return order, unit[1] if unit else ""
+    return order if axes[: len(_AXES)] == _AXES and sorted(order) == sorted(_QUATERNION) else None
 
 
-def _unit_of(stamp: str) -> str:
-    """Return the unit of a stamp by its size; whole numbers of ten digits or more may be other units than seconds."""
-    whole = int(stamp) if re.fullmatch(r"\d{10,19}", stamp) else 0
-    return next((unit for unit, places in _TO_NANOSECONDS.items() if whole * 10**places < STAMP_LIMIT_NS), "s")
-
-
-def _row(words: list[str], unit: str) -> tuple[int, list[float]]:
+def _row(words: list[str]) -> tuple[int, list[float]]:
     """Return the stamp [ns] and the seven numbers of a line. Raises ValueError with what was found."""
     found = repr(" ".join(words[:9])[:_SHOWN])
     if len(words) != 8:
         raise ValueError(f"expected 8 numbers separated by spaces (t x y z qx qy qz qw), found {len(words)}: {found}")
     # Not by float64, whose resolution at Unix times is 238 ns. adjusted() comes first: 1e999999999 has no end.
-    places = _TO_NANOSECONDS[unit]
+    places = 0 if re.fullmatch(r"\d{16,19}", words[0]) else _DECIMALS
     try:
         stamp = Decimal(words[0])
     except InvalidOperation:

@@ -1,4 +1,4 @@
-"""What one constant difference between an estimate and its truth explains: body frame, unit, clock, convention.
+"""What one constant difference between an estimate and its truth explains: another body, another clock.
 
 A truth is often the trajectory of another body on the same robot: a marker, an IMU, a camera. With a constant pose
 T_rig_body of that body, and the unknown pose T_truth_odom of the estimate's world, the truth is
@@ -10,15 +10,14 @@ Shah 2013, with the positions in the same system):
 
     A R_truth_body = R_odom_rig R_rig_body,    A p_truth_body = R_odom_rig t_rig_body + p_odom_rig + c.
 
-Rotations are the nearest ones to the solution. The same is done for other conventions in which the file may be written.
-Of the differences that leave about the least error, the one with the fewest parts is reported, if what each half of the
-drive shows of it explains the error of the other half: drift, jumps and other drives show none.
+Rotations are the nearest ones to the solution. Of the differences that leave about the least error, the one with the
+fewest parts is reported, if what each half of the drive shows of it explains the error of the other half: drift, jumps
+and other drives show none.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
 from typing import Final
@@ -37,57 +36,29 @@ Array = NDArray[np.float64]
 # Of two explanations the simpler one is reported, unless the other leaves less than this part of its error.
 WORTH_PART: Final = 0.5
 SMALL_ERROR: Final = 0.02  # as a fraction of the path's spread, and rad: that of odometry needs no explanation
-# Units of positions, as the number of them in a metre.
-UNITS: Final = {"m": 1.0, "mm": 1e3, "cm": 1e2, "km": 1e-3, "feet": 1 / 0.3048, "inches": 1 / 0.0254}
 MAX_POSES: Final = 100  # Poses of a fit, evenly spread, for the 13 unknowns.
 LEAST_SIGMA: Final = 1e-6  # [m, rad] Residuals of exact poses count as this.
-_MIRROR: Final = np.diag([1.0, -1.0, 1.0, 1.0])
-
-
-def _with_w_first(T: Array) -> Array:
-    """Return poses whose quaternions were read as x y z w, and are w x y z."""
-    R, xyz = parts(T)
-    return se3.transform(se3.rotation(np.roll(se3.quaternion(R), -1, axis=1)), xyz)
-
-
-# How a file may be written, in words, and the poses T_world_body of the poses as they were read.
-READINGS: Final[dict[str, Callable[[Array], Array]]] = {
-    "": lambda T: T,
-    "its quaternions begin with w": _with_w_first,
-    "its poses are inverse (T_body_world)": se3.inverse,
-    "its rotations are inverse (conjugated quaternions)": lambda T: se3.transform(
-        np.swapaxes(T[:, :3, :3], 1, 2), T[:, :3, 3]
-    ),
-    "its frames are left-handed (y is mirrored)": lambda T: _MIRROR @ T @ _MIRROR,  # as of game engines
-    "its quaternions begin with w, its poses are inverse (T_body_world)": lambda T: se3.inverse(_with_w_first(T)),
-}
 
 
 @dataclass(frozen=True, slots=True)
 class TruthFrame:
     """How a truth differs from the truth of an estimate's own rig, and what of it was fitted."""
 
-    reading: str = ""  # a key of READINGS
-    unit: str = "m"  # a key of UNITS
     delay_s: float = 0.0  # of the truth's stamps against the estimate's
     T_rig_body: Array | None = None  # (4, 4); None: the rig itself
     freedom: int = 0  # number of fitted unknowns that the path determines
     unknown: str = ""  # axes of the lever arm that the path does not show
 
     def rig_poses(self, truth: Trajectory, estimate: Trajectory) -> Trajectory:
-        """Return the truth of the rig, in metres, on the estimate's clock; after a delay at the estimate's stamps."""
-        R, xyz = parts(READINGS[self.reading](truth.T))
-        T = se3.transform(R, xyz / UNITS[self.unit])
-        T = T if self.T_rig_body is None else T @ se3.inverse(self.T_rig_body)
+        """Return the truth of the rig on the estimate's clock; after a delay at the estimate's stamps."""
+        T = truth.T if self.T_rig_body is None else truth.T @ se3.inverse(self.T_rig_body)
         of_rig = Trajectory(truth.stamps_ns - round(self.delay_s * 1e9), T)
         covered = _covered(estimate, of_rig).stamps_ns
         return Trajectory(covered, _at(of_rig, covered)) if self.delay_s else of_rig
 
     def __str__(self) -> str:
         """Return the differences in one line."""
-        words = [self.reading] if self.reading else []
-        if self.unit != "m":
-            words.append(f"its positions are in {self.unit}")
+        words = []
         if self.delay_s:
             words.append(f"its stamps are {abs(self.delay_s):.3f} s {'later' if self.delay_s > 0 else 'earlier'}")
         if self.T_rig_body is not None:
@@ -121,17 +92,12 @@ def find_truth_frame(estimate: Trajectory, truth: Trajectory) -> TruthFrame | No
     """
     if _error(estimate, truth) < SMALL_ERROR:
         return None
-    # 1. For each convention, fit a delay, a turn and a lever arm, or none of these. Other conventions are tried as long
-    # as none leaves a small error.
+    # 1. Fit a delay, a turn and a lever arm, or none of these.
     found: list[tuple[int, float, tuple[bool, ...], TruthFrame]] = []
-    for reading in READINGS:
-        for fitted in product((False, True), repeat=3):
-            frame = _fitted(estimate, truth, reading, *fitted)
-            if frame is not None:
-                left = _error(estimate, frame.rig_poses(truth, estimate))
-                found.append((bool(reading) + (frame.unit != "m") + sum(fitted), left, fitted, frame))
-        if found and min(found, key=lambda one: one[1])[1] < SMALL_ERROR:
-            break
+    for fitted in product((False, True), repeat=3):
+        frame = _fitted(estimate, truth, *fitted)
+        if frame is not None:
+            found.append((sum(fitted), _error(estimate, frame.rig_poses(truth, estimate)), fitted, frame))
     # 2. Of those that leave little, the one with the fewest differences.
     most = max(LEAST_SIGMA, min((left for _, left, *_ in found), default=math.inf)) / WORTH_PART
     good = [one for one in found if one[1] <= most < math.inf]
@@ -145,43 +111,34 @@ def find_truth_frame(estimate: Trajectory, truth: Trajectory) -> TruthFrame | No
     halves = [Trajectory(estimate.stamps_ns[part], estimate.T[part]) for part in np.s_[:middle, middle:]]
     left = plain = 0.0
     for one, other in (halves, halves[::-1]):
-        of_half = _fitted(one, truth, frame.reading, *fitted)
+        of_half = _fitted(one, truth, *fitted)
         left += math.inf if of_half is None else _error(other, of_half.rig_poses(truth, other))
         plain += min(1.0, _error(other, truth))
     return frame if left < WORTH_PART * plain else None
 
 
 def _fitted(
-    estimate: Trajectory, truth: Trajectory, reading: str, has_delay: bool, is_turned: bool, has_lever: bool
+    estimate: Trajectory, truth: Trajectory, has_delay: bool, is_turned: bool, has_lever: bool
 ) -> TruthFrame | None:
     """Return a difference, of which what is not wanted is none; None where too few poses are at the same times."""
-    # 1. How late the stamps are, and the unit.
-    read = Trajectory(truth.stamps_ns, READINGS[reading](truth.T))
-    delay_s, step_s = _delay(estimate, read) if has_delay else (0.0, 0.0)
-    pair = _common(estimate, read, delay_s)
-    if pair is None:
-        return None
-    spread, true_spread = map(_spread, pair)
-    is_moved, ratio = min(spread, true_spread) > 0.0, true_spread / max(spread, LEAST_SIGMA)
-    unit = min(UNITS, key=lambda unit: abs(math.log(ratio / UNITS[unit]))) if is_moved else "m"
-    R, xyz = parts(read.T)
-    scaled = Trajectory(read.stamps_ns, se3.transform(R, xyz / UNITS[unit]))
 
-    # 2. The pose of the body, and the delay by which it leaves the least error.
-    def left(more_s: float) -> float:
-        pair = _common(estimate, scaled, delay_s + more_s)
+    def left(delay_s: float) -> float:
+        pair = _common(estimate, truth, delay_s)
         return math.inf if pair is None else _body(*pair, is_turned, has_lever)[2]
 
+    # 1. The delay by which the pose of the body leaves the least error.
+    delay_s, step_s = _delay(estimate, truth) if has_delay else (0.0, 0.0)
     if has_delay:
-        options = {"xatol": 1e-4}
-        delay_s += float(minimize_scalar(left, bounds=(-step_s, step_s), method="bounded", options=options).x)
-    pair = _common(estimate, scaled, delay_s)
+        bounds, options = (delay_s - step_s, delay_s + step_s), {"xatol": 1e-4}
+        delay_s = float(minimize_scalar(left, bounds=bounds, method="bounded", options=options).x)
+    # 2. The pose of the body.
+    pair = _common(estimate, truth, delay_s)
     if pair is None:
         return None
     T_rig_body, unknown, _ = _body(*pair, is_turned, has_lever)
     freedom = has_delay + 3 * is_turned + (3 - len(unknown)) * has_lever
     body = T_rig_body if has_lever or is_turned else None
-    return TruthFrame(reading, unit, delay_s, body, freedom, ", ".join(unknown))
+    return TruthFrame(delay_s, body, freedom, ", ".join(unknown))
 
 
 def _body(T_odom_rig: Array, T_truth_body: Array, is_turned: bool, has_lever: bool) -> tuple[Array, str, float]:

