@@ -4,6 +4,6 @@ Begin with `log_reader.py`: it gives the frames of both cameras and the samples 
 its format. `log.py` joins the parts of a log, puts messages into the order of time and says what is missing;
 `stamps.py` decides between the times of headers and of logging; `topics.py` finds the cameras. The formats stand below:
 `mcap_file.py` (whole and cut), `sqlite_bag.py`, `ros1_bag.py`, `image_folder.py`, and `compression.py` for chunks and
-messages. `open_log.py` tells them apart by their content. `mcap_writer.py` and `rotating_log.py` write recordings within
-a bound.
+messages. `open_log.py` tells them apart by their content. `mcap_writer.py` and `rotating_log.py` write recordings that
+are bounded.
 """

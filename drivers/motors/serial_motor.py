@@ -7,7 +7,6 @@ import errno
 import fcntl
 import math
 import os
-import string
 import termios
 import time
 from collections.abc import Iterator
@@ -30,8 +29,7 @@ READ_LIMIT_BYTES: Final = 4096
 POLL_PERIOD_S: Final = 0.001  # Received bytes are read with this period while an answer is awaited.
 FRESH_SHARE: Final = 0.5  # After a pause of this share of the watchdog's time it may expire before a command arrives.
 LONGEST_WAIT_S: Final = 5.0  # between two attempts to open the port
-HEARD_BYTES: Final = 256  # of what came instead of an answer: enough to say what it is
-_TEXT: Final = frozenset(string.printable.encode())
+HEARD_BYTES: Final = 40  # of what came instead of an answer
 _REASONS = {
     errno.ENOENT: "there is no such port; plug it in, or choose one of `ls /dev/serial/by-id/*`",
     errno.EACCES: "no permission; add the user to group dialout: `sudo usermod -aG dialout $USER`, and log in again",
@@ -113,7 +111,7 @@ class SerialMotor:
         self._reopening, self._next_open_s = Backoff(LONGEST_WAIT_S), -math.inf
         self._asking: Transaction[float] | None = None  # of the setting-up, while its answer is awaited
         self._ask_again_s = -math.inf
-        self._sent = self._came = b""  # the first bytes since a question was asked
+        self._came = b""  # the first bytes since a question was asked
         self._problem = ""
         next(self._protocol.connect(watchdog_ms))  # what no controller can be asked for is an error at once
         if connect_s:
@@ -244,7 +242,7 @@ class SerialMotor:
     def _begun(self, transaction: Transaction[T]) -> Transaction[T]:
         """Discard replies to earlier commands, and send the first bytes of a transaction."""
         self._framer.reset()
-        self._sent = self._came = b""
+        self._came = b""
         with self._on_port():
             if self._port is not None:
                 self._port.reset_input_buffer()
@@ -286,7 +284,6 @@ class SerialMotor:
 
     def _write(self, data: bytes) -> None:
         """Write all data at once; raise NoReplyError if the output buffer is full, as the other end does not read."""
-        self._sent = (self._sent + data)[:HEARD_BYTES]
         if data and self._port is not None:
             with contextlib.suppress(BlockingIOError):
                 if os.write(self._port.fileno(), data) == len(data):
@@ -309,28 +306,10 @@ class SerialMotor:
         return os.read(self._port.fileno(), READ_LIMIT_BYTES)
 
     def _no_reply(self) -> NoReplyError:
-        """Return the error for a missing reply: what the protocol has seen of it, else what came at all."""
-        is_echo = len(self._came) > 3 and self._came[: len(self._sent)] == self._sent[: len(self._came)]
-        # Text, or bytes as another baud rate makes them.
-        is_text = sum(byte in _TEXT for byte in self._came) >= 0.95 * len(self._came)
-        if not self._came:
-            found = f" gave no answer, not a byte; check power, cable, the baud rate ({self._baud}) and motor.protocol"
-        elif is_echo:
-            found = (
-                " gave no answer of its own: what comes back is what was sent; are TX and RX joined, or does the "
-                "adapter echo (RS-485)?"
-            )
-        elif self._protocol.seen:
-            found = f": {self._protocol.seen}"
-        elif is_text:
-            text = self._came.decode("ascii", "replace").strip()[:40]
-            found = f" answers, but not in its protocol: {text!r}; is it another firmware, or another motor.protocol?"
-        else:
-            found = (
-                f" answers, but not in its protocol: bytes as {self._came[:8].hex(' ')}, which are no text; check the "
-                f"baud rate ({self._baud}, motor.baud), motor.protocol and the cable"
-            )
-        return NoReplyError(f"motor on {self._name}{found}")
+        """Return the error for a missing reply, with what came instead."""
+        found = f"answers, but not in its protocol: {self._came!r}" if self._came else "gave no answer, not a byte"
+        advice = f"check power, cable, the baud rate ({self._baud}, motor.baud) and motor.protocol"
+        return NoReplyError(f"motor on {self._name} {found}; {advice}")
 
 
 def _opened(port: str, baud: int) -> serial.Serial:

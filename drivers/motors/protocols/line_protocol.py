@@ -38,6 +38,7 @@ import binascii
 import math
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Final, NamedTuple
 
@@ -171,7 +172,6 @@ class LineProtocol:
     framer = TextFramer
 
     def __init__(self, drive: DifferentialDrive) -> None:
-        self.seen = ""
         self._drive = drive
         self._seq = 0
         self._zero_rad = 0.0  # heading at which the controller's heading is 0
@@ -196,15 +196,10 @@ class LineProtocol:
 
     def _answer(self, line: bytes, kind: str, seq: int | None = None) -> Transaction[tuple[int, ...]]:
         """Send a line and return the numbers of the first line of this kind, with this seq if one is given."""
-        self.seen = ""
         frame = yield line
         while True:
-            try:
+            with suppress(ProtocolError):
                 found, numbers = decode(frame)
                 if found == kind and seq in (None, numbers[0]):
                     return numbers
-                if found == kind:
-                    self.seen = f"it answers command {seq} with a status of {numbers[0]}: does its firmware repeat it?"
-            except ProtocolError as error:
-                self.seen = str(error) if b"$" in frame else self.seen
             frame = yield b""

@@ -43,7 +43,6 @@ class MotorProtocol(Protocol):
     """Commands <-> bytes of one kind of controller; one object serves one connection."""
 
     baud: int  # default of the controller
-    seen: str  # what the frames of the present transaction show so far, for the case that no answer comes; "": nothing
 
     @property
     def framer(self) -> Callable[[], Framer]:

@@ -30,14 +30,9 @@ from drivers.motors.protocols.motor_protocol import TextFramer, Transaction, req
 AXES = (0, 1)
 WATCHDOG_EXPIRED = 0x800  # AXIS_ERROR_WATCHDOG_TIMER_EXPIRED (firmware 0.5, odrive-interface.yaml)
 CLOSED_LOOP = 8  # AXIS_STATE_CLOSED_LOOP_CONTROL
-STILL = 10  # commands after which an axis that does not turn is asked for its state: half a second at the usual rate
-FOLLOWED = 0.05  # share of a speed that a wheel has at least, if it follows at all
 VELOCITY_CONTROL = 2  # CONTROL_MODE_VELOCITY_CONTROL
 
 _CHECKED_LINE = re.compile(rb"([^*]*)\*([0-9]{1,3})")
-_BARE = re.compile(rb"-?[0-9.]+( -?[0-9.]+){0,2}")
-_STATES = {0: "undefined", 1: "idle", 3: "calibrating", 4: "calibrating its motor", 6: "searching its index",
-           7: "calibrating its encoder"}  # fmt: skip
 _MAX_NUMBERS = 3  # parsed of a reply; more than any reply has
 
 
@@ -53,10 +48,8 @@ class ODriveAscii:
     framer = TextFramer
 
     def __init__(self, drive: DifferentialDrive) -> None:
-        self.seen = ""
         self._drive = drive
         self._disarmed = True
-        self._still = 0  # consecutive commands to turn that no axis has followed
 
     def connect(self, watchdog_ms: int) -> Transaction[float]:
         """Set both watchdogs and read them back; return the time in force [ms]. The first stop arms the axes.
@@ -81,37 +74,19 @@ class ODriveAscii:
         if arming:
             lines += [line for axis in AXES for line in _arming(axis)]
         requests = ["f 0", "f 1", "r axis0.error", "r axis1.error", "r vbus_voltage"]
-        requests += [f"r axis{axis}.current_state" for axis in AXES if self._still >= STILL]
-        first, second, first_error, second_error, battery, *states = yield from self._query(lines, requests)
-        self._require_closed_loop(states)
+        first, second, first_error, second_error, battery = yield from self._query(lines, requests)
         flags = int(first_error[0]) | int(second_error[0])
         self._disarmed = bool(flags & WATCHDOG_EXPIRED) or (self._disarmed and not arming)
         (_, first_turns_per_s), (_, second_turns_per_s) = first, second  # position, velocity
-        turns = zip(speeds, (first_turns_per_s, second_turns_per_s), strict=True)
-        follows = any(abs(found) > FOLLOWED * abs(mps) * self._drive.turns_per_m for mps, found in turns)
-        self._still = 0 if flags or follows or is_stop(command) else self._still + 1
         velocity_mps, yaw_rate_radps = self._drive.motion(
             first_turns_per_s / self._drive.turns_per_m, second_turns_per_s / self._drive.turns_per_m
         )
         return MotorStatus(velocity_mps, math.nan, yaw_rate_radps, self._disarmed, flags & ~WATCHDOG_EXPIRED,
                            battery[0])  # fmt: skip
 
-    def _require_closed_loop(self, states: Sequence[Sequence[float]]) -> None:
-        """Raise DriverError where an axis has no error and is not in closed-loop control, which it was asked for."""
-        for axis, (state,) in enumerate(states):
-            self._still = 0
-            if state != CLOSED_LOOP:
-                self._disarmed = True
-                found = f"{state:.0f} ({_STATES.get(int(state), 'see its manual')})"
-                raise DriverError(
-                    f"axis {axis} does not turn: it is in state {found}, not in closed-loop control ({CLOSED_LOOP}): "
-                    "calibrate it by odrivetool"
-                )
-
     def _query(self, lines: Sequence[str], requests: Sequence[str]) -> Transaction[list[list[float]]]:
         """Write lines and requests, and return the numbers of each reply: two for "f", one for "r"."""
         replies: list[list[float]] = []
-        self.seen = ""
         frame = yield b"".join(map(with_checksum, [*lines, *requests]))
         while True:
             numbers = self._numbers(frame)
@@ -119,14 +94,8 @@ class ODriveAscii:
                 replies.append(numbers)
                 if len(replies) == len(requests):
                     return replies
-                missing = requests[len(replies)]
-                self.seen = f"{len(replies)} of {len(requests)} answers came, none to {missing!r}"
             else:
                 replies.clear()  # a reply is missing, so those before cannot be assigned: this ends in the timeout
-                is_bare = _BARE.fullmatch(frame)
-                self.seen = (
-                    f"its answers carry no checksum: {frame.decode()!r}; firmware 0.5 is needed" if is_bare else ""
-                )
             frame = yield b""
 
     def _numbers(self, frame: bytes) -> list[float] | None:

@@ -35,7 +35,7 @@ class Roboteq:
     framer = TextFramer
 
     def __init__(self, drive: DifferentialDrive) -> None:
-        self.seen, self._drive, self._rpm_per_mps = "", drive, drive.rpm_per_mps
+        self._drive, self._rpm_per_mps = drive, drive.rpm_per_mps
 
     def connect(self, watchdog_ms: int) -> Transaction[float]:
         """Set the serial watchdog, read it back and return the time in force [ms].
@@ -65,7 +65,6 @@ class Roboteq:
         """Write lines, and return the replies by name once all commands are confirmed."""
         commands, confirmed = sum(line[:1] in b"!^" for line in lines), 0
         values: dict[bytes, list[int]] = {}
-        self.seen = ""
         frame = yield b"".join(line + b"\r" for line in lines)
         while True:
             confirmed += frame == b"+"
@@ -73,11 +72,6 @@ class Roboteq:
                 raise DriverError(f"it rejected one of {b', '.join(lines).decode()}; check its configuration")
             if reply := _REPLY.fullmatch(frame):
                 values[reply[1]] = [int(number) for number in reply[2].split(b":")]
-            missing = b", ".join(sorted(names - values.keys())).decode()
-            if confirmed >= commands and not missing:
+            if confirmed >= commands and names <= values.keys():
                 return values
-            if values or confirmed:
-                silent = f", and says nothing of {missing}" if missing else ""
-                found = f"it confirmed {confirmed} of {commands} commands{silent}"
-                self.seen = f"{found}: is it a Roboteq with two channels?"
             frame = yield b""

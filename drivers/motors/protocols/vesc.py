@@ -110,7 +110,7 @@ class Vesc:
     framer = PacketFramer
 
     def __init__(self, drive: DifferentialDrive) -> None:
-        self.seen, self._drive = "", drive
+        self._drive = drive
 
     def connect(self, watchdog_ms: int) -> Transaction[float]:
         """Read the timeouts of both controllers and return the shorter one [ms].
@@ -144,7 +144,7 @@ class Vesc:
     ) -> Transaction[tuple[tuple[int, T], tuple[int, T]]]:
         """Send a query to both controllers, then the commands; return (id, parsed reply) of each."""
         replies: dict[bool, tuple[int, T]] = {}  # the key is True for the controller on CAN
-        can_id, self.seen = self._drive.can_id, ""
+        can_id = self._drive.can_id
         frame = yield packet(query) + packet(forwarded(can_id, query)) + commands
         while True:
             reply = parse(frame)
@@ -152,14 +152,6 @@ class Vesc:
                 replies[reply[0] == can_id] = reply
             if len(replies) == 2:
                 return replies[False], replies[True]
-            if False in replies:
-                found = f"VESC {replies[False][0]} answers, none with id {can_id} on CAN"
-                self.seen = f"{found}: motor.drive.can_id, or the wires of CAN"
-            elif True in replies:
-                found = f"VESC {can_id} is on the port itself, and no other one answers"
-                self.seen = f"{found}: motor.drive.can_id is the other's"
-            else:
-                self.seen = f"it answers packets of command {frame[0]}, which was not asked for: an older firmware?"
             frame = yield b""
 
 
