@@ -72,19 +72,6 @@ def test_a_sector_gives_poses(sector: Path, command: Command) -> None:
     assert abs(found["length_error_ratio"]) < 0.002 and found["ate_rmse_m"] < 0.004, found
 
 
-def test_a_sector_of_bricks_half_of_which_are_first_seen_too_far_away(tmp_path: Path) -> None:
-    """Bricks at 2.9 m of which half match one course beside, as if at 11 m: the motion is not that by the far ones."""
-    rig = lens_rig(lens("pinhole", 30, (640, 480)))
-    poses = paths.spline_path(4, 60, 0.05)[:6]
-    write_log(tmp_path, rig, poses, corridor(4, 6.2), seed=4)
-    result, truth = omnid.replay(tmp_path / "log.mcap", rig=tmp_path / "rig.toml"), read_tum(tmp_path / "truth.txt")
-    wrong = result.T_odom_rig[:, :3, 3] - (se3.inverse(truth.T[0]) @ truth.T)[:, :3, 3]
-    assert np.linalg.norm(wrong, axis=1).max() < 0.02
-    # The first steps are in doubt, and their covariance covers the step by the others, of 0.2 m.
-    assert [str(state) for state in result.states[1:4]] == ["degraded"] * 3
-    assert np.sqrt(result.covariances[1:4, 0, 0]).min() > 0.1
-
-
 def test_beside_a_sector_nothing_is_free(sector: Path) -> None:
     """Obstacles and scans know nothing of directions that the cameras do not see, from the first pair to the last."""
     found = scans_of(sector).scans

@@ -7,7 +7,6 @@ import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import gettempdir
 
 import numpy as np
 import pytest
@@ -17,19 +16,16 @@ from calib import se3
 from calib.rig_file import read_rig, write_rig
 from omnid.api import replay
 from omnid.client import Robot
-from omnid.config import load_config
 from omnid.core.mapping.scan_grid import FREE, OCCUPIED
 from omnid.formats.place_file import read_places, write_places
 from omnid.formats.tum import read_tum
 from omnid.recordings.evaluation import evaluate
-from omnid.runs.replay import ReplayOptions, run_log
 from omnid.tracking_state import MapState
 from omnid.transport.codec import decode_diagnostics
 from omnid.transport.status_names import PLACES, Key
 from tests.drivers.logs.mcap_logs import STORE
 from tests.ports import free_port
 from tests.replay.command import Command
-from tests.replay.edited import dark, images, save
 from tests.replay.live import Daemon, Operator, answers, command_line, started
 from tests.simulation import build, write_log
 from tests.simulation.rigs import with_upper_rotated
@@ -88,20 +84,6 @@ def test_a_second_run_is_localised_from_its_first_second_and_extends_the_map(
     np.testing.assert_allclose(in_map.T[-1][:3, 3], T[:3, 3], atol=0.02)
 
 
-def test_a_map_that_does_not_exist_is_made(omnid: Command, scene: Path, built: Path, tmp_path: Path) -> None:
-    new = tmp_path / "new.omap"
-    result = omnid.replay(scene / "log.mcap", "--map", new, rig=scene / "rig.toml")
-    assert result.code == 0 and f"{new.name}: there is no such map: this run begins a new one" in result.err
-    assert new.read_bytes() == built.read_bytes()
-
-
-def test_a_build_that_fails_names_the_file_of_the_user(omnid: Command, scene: Path, tmp_path: Path) -> None:
-    log, place = save(tmp_path / "log.mcap", map(dark, images(scene / "log.mcap")[:8])), tmp_path / "place.omap"
-    code, _, err = omnid("map", "build", log, "-o", place, "--rig", scene / "rig.toml", "--quiet")
-    assert code == 1 and f"{place}: no keyframe was found: no map was written" in err
-    assert "place.omap: there is no such map" in err and f"{gettempdir()}/tmp" not in err
-
-
 def test_localize_only_leaves_the_map_as_it_is_and_a_rig_that_was_calibrated_again_warns(
     omnid: Command, scene: Path, omap: Path, tmp_path: Path
 ) -> None:
@@ -155,9 +137,7 @@ def test_the_map_of_another_rig_is_refused(omnid: Command, scene: Path, omap: Pa
     ("words", "message"),
     [
         (["--map", "{}/none.omap", "--localize-only"], "cannot read the map"),
-        (["--map", "{}/none/a.omap"], "there is no folder"),
-        (["--map", "{}/a.ply"], "--cloud FILE.ply"),
-        (["--map", "{}/log.mcap"], "expected a map of places"),
+        (["--map-tum", "{}/map.txt", "--set", "places.enabled=false"], "places.enabled"),
         (["--localize-only"], "needs a map"),
         (["--map", "{}/none.omap", "--set", "places.enabled=false"], "places.enabled = true"),
     ],
@@ -165,14 +145,6 @@ def test_the_map_of_another_rig_is_refused(omnid: Command, scene: Path, omap: Pa
 def test_wrong_maps_are_one_line(omnid: Command, scene: Path, words: list[str], message: str) -> None:
     given = [word.format(scene) for word in words]
     assert message in omnid.refused("replay", scene / "log.mcap", "--rig", scene / "rig.toml", "--quiet", *given)
-
-
-def test_build_refuses_what_it_cannot_do(omnid: Command, scene: Path, tmp_path: Path) -> None:
-    build = ("map", "build", scene / "log.mcap", "--rig", scene / "rig.toml", "--quiet", "-o")
-    assert "there is no folder" in omnid.refused(*build, tmp_path / "none" / "a.omap")
-    assert "this is the log" in omnid.refused(*build, scene / "log.mcap")
-    assert "cannot read the map" in omnid.refused(*build, tmp_path / "a.omap", "--extend")
-    assert "places.enabled" in omnid.refused(*build, tmp_path / "a.omap", "--set", "places.enabled=false")
 
 
 @contextmanager
@@ -215,17 +187,15 @@ def test_a_live_run_extends_its_map_now_and_then_and_at_its_end(scene: Path, oma
     assert sessions(omap) == {0, 1, 2}
 
 
-@pytest.mark.parametrize("exists", [True, False])
 def test_a_map_that_another_program_has_written_meanwhile_is_not_replaced(
-    scene: Path, built: Path, tmp_path: Path, exists: bool
+    scene: Path, built: Path, tmp_path: Path
 ) -> None:
     """Two replays extend one map: the last one does not win."""
     omap, moved = tmp_path / "place.omap", tmp_path / "moved.omap"
     places, rig = read_places(built)
     places.poses.update({id: se3.transform(np.eye(3), [100.0, 50.0, 0.0]) @ T for id, T in places.poses.items()})
     write_places(moved, places, rig)
-    if exists:
-        omap.write_bytes(built.read_bytes())
+    omap.write_bytes(built.read_bytes())
 
     def progress(done: int, expected: int | None) -> None:
         if done and moved.exists():
@@ -236,19 +206,6 @@ def test_a_map_that_another_program_has_written_meanwhile_is_not_replaced(
     assert any("another program has written this map" in warning for warning in result.warnings)
     for path, x_m in ((omap, 100.0), (tmp_path / "place-2.omap", 0.0)):
         assert abs(min(T[0, 3] for T in read_places(path)[0].poses.values()) - x_m) < 5.0
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("default_signals")
-def test_a_map_that_cannot_be_saved_is_an_error_in_the_status(scene: Path, omap: Path) -> None:
-    """Its place is taken by a folder; the run goes on, and its exit code is that of the failed save at the end."""
-    with running(scene, omap) as (daemon, operator):
-        omap.unlink()
-        (omap / "taken").mkdir(parents=True)
-        wait_until(lambda: "cannot write the map" in operator.message("map file"), "the error")
-        assert int(operator.values("map file")["failed"]) >= 1 and daemon.alive
-        code, err = daemon.end()
-        assert code == 2 and "cannot write the map" in err and "Traceback" not in err, err
 
 
 @pytest.fixture(scope="module")
@@ -316,36 +273,3 @@ def _assert_published(log: Path, T_odom_rig: np.ndarray) -> None:
     # The map is that of the keyframes, in their frame: it moves when a loop closes.
     [grid] = found["/omnid/map"]
     assert grid.header.frame_id == "map" and {FREE, OCCUPIED} <= set(grid.data.tolist())
-
-
-def test_a_run_begins_in_a_known_map(scene: Path, elsewhere: Path, tmp_path: Path) -> None:
-    """It localises within a second, in another world it does not; localize_only leaves the map as it was."""
-    options, words = ReplayOptions(rig=scene / "rig.toml", collect=True), [f"places.map='{tmp_path / 'a.omap'}'"]
-    first = run_log(scene / "log.mcap", load_config(None, words), options)
-    assert first.places is not None and len(first.places) >= 3
-    poses = {id: pose.copy() for id, pose in first.places.poses.items()}
-    for log, known in ((scene, True), (elsewhere, False)):
-        result = run_log(log / "log.mcap", load_config(None, [*words, "places.localize_only=true"]), options)
-        assert (MapState.LOCALIZED in result.map_states[:10]) == known
-        assert result.places is not None and result.places.poses.keys() >= poses.keys()
-        assert all(np.allclose(result.places.poses[id], pose, atol=1e-9) for id, pose in poses.items())
-        if known:
-            errors = se3.log(se3.inverse(first.T_odom_rig[10:]) @ result.T_map_rig[10:])
-            assert np.abs(errors[:, :3]).max() < 0.01 and np.abs(errors[:, 3:]).max() < 0.005
-        else:
-            assert set(result.map_states) == {MapState.ODOMETRY_ONLY}
-
-
-def test_without_places_there_is_no_trajectory_in_the_map(omnid: Command, tmp_path: Path, scene: Path) -> None:
-    error = omnid.refused(
-        "replay",
-        scene / "log.mcap",
-        "--rig",
-        scene / "rig.toml",
-        "--quiet",
-        "--map-tum",
-        tmp_path / "map.txt",
-        "--set",
-        "places.enabled=false",
-    )
-    assert "places.enabled" in error

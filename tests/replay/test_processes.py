@@ -20,7 +20,6 @@ from mcap.reader import make_reader
 from drivers.motor import is_stop
 from omnid.formats.tum import read_tum
 from omnid.transport.codec import Pose, decode_pose
-from tests.busy import stopped_by_turns
 from tests.conftest import PAIRS
 from tests.contract.pty_motor import PtyMotor
 from tests.ply import read_ply
@@ -32,7 +31,8 @@ from tests.waiting import PATIENCE_S, wait_until
 pytestmark = pytest.mark.usefixtures("default_signals")
 
 ROOT = Path(__file__).parents[2]
-SLICE_S = 0.1
+
+
 PAUSE_PAIRS = 36_000  # an hour
 FEW = ("--seconds", 0.55)  # of the scene, where the end of a run is looked at
 FEW_PAIRS = 6
@@ -81,9 +81,6 @@ def paused(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         (signal.SIGINT, 130, []),
         (signal.SIGTERM, 143, []),
         (signal.SIGHUP, 129, ["--inline"]),
-        pytest.param(signal.SIGINT, 130, ["--inline"], marks=pytest.mark.slow),
-        pytest.param(signal.SIGTERM, 143, ["--inline"], marks=pytest.mark.slow),
-        pytest.param(signal.SIGHUP, 129, [], marks=pytest.mark.slow),
     ],
 )
 def test_signals_leave_whole_results(tmp_path: Path, paused: Path, number: int, code: int, manner: list[str]) -> None:
@@ -177,33 +174,6 @@ def test_a_lost_motor_ends_the_run(tmp_path: Path, scene: Path) -> None:
     assert len(rows(tum)) >= 3
 
 
-def test_the_first_start_of_a_drive_says_what_it_waits_for(tmp_path: Path) -> None:
-    """The compilation before it takes a minute on a busy computer; it ends with the program that began it."""
-    environment = {**os.environ, "OMNID_CACHE_DIR": str(tmp_path / "cache")}
-    command = [sys.executable, "-m", "omnid", "demo", "--drive", "--output", str(tmp_path / "out")]
-    with subprocess.Popen(
-        command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, text=True
-    ) as process:
-        assert process.stderr is not None
-        first = process.stderr.readline()
-        process.send_signal(signal.SIGINT)
-        out, _ = process.communicate(timeout=PATIENCE_S)
-    assert "compiling" in first and out == ""
-
-
-@pytest.mark.slow
-def test_demo_waits_for_a_busy_computer_and_loses_nothing(tmp_path: Path) -> None:
-    """It has half of one core: it is stopped for the other half of the time."""
-    one_core = ["taskset", "--cpu-list", str(min(os.sched_getaffinity(0)))]
-    command = [*one_core, sys.executable, "-m", "omnid", "demo", "--quiet", "--output", str(tmp_path / "out")]
-    with started(command) as process, stopped_by_turns(process, SLICE_S, SLICE_S):
-        out, err = process.communicate(timeout=4 * PATIENCE_S)
-    assert process.returncode == 0 and err == "", err
-    assert "against the truth" in out and "commands sent, 0 errors, 0 stops" in out
-    assert out.splitlines()[0] == "pairs     99"
-    assert {p.name for p in (tmp_path / "out").iterdir()} == {"trajectory.tum", "map.ply", "plan.png", "log.mcap"}
-
-
 def test_progress_on_a_terminal(scene: Path) -> None:
     screen, terminal = os.openpty()
     with subprocess.Popen(replaying(scene, "--realtime"), stdout=subprocess.PIPE, stderr=terminal, cwd=ROOT) as process:
@@ -222,17 +192,6 @@ def test_no_traceback_if_stdout_cannot_be_written(where: str) -> None:
         _, err = process.communicate(timeout=PATIENCE_S)
     assert "Traceback" not in err
     assert (process.returncode, err.count("\n")) == ((2, 1) if where == "/dev/full" else (0, 0))
-
-
-@pytest.mark.parametrize("closed", ["1", "2"])
-def test_runs_with_a_closed_stream(tmp_path: Path, scene: Path, closed: str) -> None:
-    tum = tmp_path / "est.txt"
-    shell = " ".join(replaying(scene, "--tum", tum, *FEW)) + f" {closed}>&-"
-    with started(["sh", "-c", shell]) as process:
-        out, err = process.communicate(timeout=PATIENCE_S)
-    assert process.returncode == 0 and len(rows(tum)) == FEW_PAIRS
-    assert "\r" not in err, "there is no terminal, so no bar"
-    assert out.startswith("pairs ") if closed == "2" else not out
 
 
 def test_a_trajectory_on_stdout_is_the_only_output_there(scene: Path) -> None:
