@@ -5,9 +5,8 @@ that are up to 1.5 % off shape.
 
 chain: 24 pairs of images of a board, `omnid calibrate rig` with all defaults, and a drive of 5 m with a turn of 94
 degrees. Images and logs that are in --folder already are used again. --drives: the rig of the boards is also calibrated
-by a round through a room and tried on the same drive. --amount: part of tilt and shape; 0: perfect mirrors. --high:
-further pairs in the outer part of the images. --bend-mm, --stretch: the board is not as drawn. --options: words for
-`calibrate rig`, like view=mirror. Wanted: 0.1 % of the length on 10 of 10 rigs, and errors near their stated sigma.
+by a round through a room and tried on the same drive. --amount: part of tilt and shape; 0: perfect mirrors. --bend-mm,
+--stretch: the board is not as drawn. Wanted: 0.1 % of the length on 10 of 10 rigs, and errors near their stated sigma.
 
 check: what `omnid calibrate drive --only check` says of right rigs, whose upper camera is turned by nothing, by drives
 of 5 m in a corridor.
@@ -35,7 +34,6 @@ from calib.boards.aprilgrid import AprilGrid
 from calib.boards.board import AS_DRAWN, Board, BoardView, PrintShape
 from calib.fit.boards.rig_fit import PairView
 from calib.fit.rig_uncertainty import drive_uncertainty
-from calib.models.camera import Array
 from calib.rig import Rig
 from calib.rig_file import read_rig
 from omnid.calibration.images import BY_NAME
@@ -57,8 +55,6 @@ BOARD = Board(9, 6, 0.05)
 SENSOR = Sensor(noise_sigma=2.0)
 SIZE, PAIRS, DRIVE, ROOM = 768, 24, "two_walls", "rooms"
 DISTANCE_M = (0.3, 0.7)
-# Pairs that the hint of `calibrate rig` asks for (--high): where the upper image is near its rim.
-HIGH_SEED, HIGH_DISTANCE_M, HIGH_ELEVATION_DEG = 5000, (0.6, 0.8), (100.0, 125.0)
 
 
 def board_rig(seed: int, amount: float) -> tuple[Rig, Rig]:
@@ -67,17 +63,7 @@ def board_rig(seed: int, amount: float) -> tuple[Rig, Rig]:
     return (with_real_mirrors(perfect, seed, amount) if amount else perfect), perfect
 
 
-def board_poses(perfect: Rig, seed: int, high: int) -> list[Array]:
-    """Return the poses T_rig_board (4, 4) of the pairs of a seed, and of so many with higher boards."""
-    poses = board_poses_around_rig(perfect, BOARD, PAIRS, seed=seed, distance_m=DISTANCE_M)
-    if high:
-        poses += board_poses_around_rig(
-            perfect, BOARD, high, seed=seed + HIGH_SEED, distance_m=HIGH_DISTANCE_M, elevation_deg=HIGH_ELEVATION_DEG
-        )
-    return poses
-
-
-def render_boards(seed: int, amount: float, folder: Path, high: int = 0, shape: PrintShape = AS_DRAWN) -> None:
+def render_boards(seed: int, amount: float, folder: Path, shape: PrintShape = AS_DRAWN) -> None:
     """Write pairs of images of a board of that shape as lower_*.jpg, upper_*.jpg, unless they are there."""
     if (folder / "rendered").exists():
         return
@@ -85,7 +71,7 @@ def render_boards(seed: int, amount: float, folder: Path, high: int = 0, shape: 
     rig, perfect = board_rig(seed, amount)
     sides = (("lower", rig.lower), ("upper", rig.upper))
     renderers = {name: BoardRenderer(BOARD, mounted, shape) for name, mounted in sides}
-    for k, T in enumerate(board_poses(perfect, seed, high)):
+    for k, T in enumerate(board_poses_around_rig(perfect, BOARD, PAIRS, seed=seed, distance_m=DISTANCE_M)):
         made = {name: one.render_board(T, seed=1000 * seed + k, sensor=SENSOR) for name, one in renderers.items()}
         for name, mounted in sides:
             jpeg = MountedSensor.of(SENSOR, mounted.visible, mounted.camera.size).jpeg(made[name].image)
@@ -100,10 +86,10 @@ def render_drive(name: str, seed: int, amount: float, folder: Path) -> None:
         write_log(folder, board_rig(seed, amount)[0], run.poses, run.scene, sensor=run.sensor, seed=seed)
 
 
-def calibrate(folder: Path, output: Path, options: Sequence[str] = ()) -> Rig:
+def calibrate(folder: Path, output: Path) -> Rig:
     """Return the rig that `omnid calibrate rig` makes of the images of a folder, and print its line."""
     board = ["--corners", f"{BOARD.columns}x{BOARD.rows}", "--square-mm", f"{1e3 * BOARD.square_m:g}"]
-    words = ["calibrate", "rig", str(folder), *board, "--view", "mirror", "--quiet", "-o", str(output), *options]
+    words = ["calibrate", "rig", str(folder), *board, "--view", "mirror", "--quiet", "-o", str(output)]
     with contextlib.redirect_stdout(sys.stderr):
         code = omnid_main(words)
     if code != 0:
@@ -158,10 +144,8 @@ def chain(
     folder: Path = Path("build/chain"),
     amount: float = 1.0,
     drives: bool = False,
-    high: int = 0,
     bend_mm: float = 0.0,
     stretch: float = 0.0,
-    options: Sequence[str] = (),
 ) -> None:
     """Measure rigs of boards, and of drives, on a drive."""
     head = columns(
@@ -170,15 +154,14 @@ def chain(
     )
     table = ResultTable("calibration_chain", "Boards, rig, drive", head)
     shape = PrintShape((1e-3 * bend_mm, 0.0, 0.0, stretch))
-    words = [part for word in options for part in ("--" + word).split("=")]
     for seed in seeds:
         truth = board_rig(seed, amount)[0]
         log, room = (folder / f"{kind}_a{amount:g}_s{seed}" for kind in ("drive", ROOM))
-        boards = folder / f"boards_a{amount:g}_s{seed}_h{high}_b{bend_mm:g}_{stretch:g}"
-        render_boards(seed, amount, boards, high, shape)
+        boards = folder / f"boards_a{amount:g}_s{seed}_b{bend_mm:g}_{stretch:g}"
+        render_boards(seed, amount, boards, shape)
         render_drive(DRIVE, seed, amount, log)
         begin_s = time.monotonic()
-        found = {"boards": (calibrate(boards, boards / "rig.toml", words), time.monotonic() - begin_s)}
+        found = {"boards": (calibrate(boards, boards / "rig.toml"), time.monotonic() - begin_s)}
         if drives:
             render_drive(ROOM, seed, amount, room)
             begin_s = time.monotonic()

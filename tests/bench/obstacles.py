@@ -2,7 +2,7 @@
 
 Two tables follow from the same command. The first: how far the robot drove where nothing was in the way. The second:
 what it touched where something was, and whether it stopped 0.05 to 0.8 m before that, or passed. A drive is asked to go
-straight on, to turn towards the hazard (--turning), or to a goal; it ends there, or where it has stood for a while.
+straight on or to a goal; it ends there, or where it has stood for a while.
 Each is a line of build/results/obstacles.jsonl; the command goes on where it ended as long as the commit is the same.
 """
 
@@ -13,7 +13,6 @@ import json
 import math
 import os
 import random
-import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
@@ -30,7 +29,7 @@ from omnid.core.navigation.requests import GoalRequest, NavigationFrame
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun
 from omnid.simulation.robot import SimulatedRobot
 from omnid.simulation.world import Walkers, clearance_m
-from tests.bench.results import ROOT, Column, ResultTable, commit
+from tests.bench.results import ROOT, ResultTable, columns, commit
 from tests.simulation.disturbed import simulate
 from tests.simulation.harmless_worlds import FLOORS, Trial
 from tests.simulation.hazard_worlds import HARMLESS, HAZARDS, trial
@@ -43,7 +42,6 @@ OWN_MPS: Final = 0.05  # A contact at a lower speed is not the robot's own.
 DRIVEN: Final = 0.95  # share of what was asked that counts as all
 STOPS_M: Final = (0.05, 0.8)  # before a hazard
 STANDS_M, STANDS_S, HAZARD_STANDS_S = 0.03, 12.0, 8.0  # a drive ends that moved by less than this in that time
-TURN_RADIUS_M, TURN_M = 4.0, 2.4  # of the arc towards a hazard, which ends there
 RANDOMLY_S: Final = 40.0  # of a drive at random
 TEXTURED: Final = "marbled"  # the floor whose time is the measure of the others
 USUAL_MPS: Final = 0.5
@@ -59,13 +57,12 @@ class Planned:
     speed_mps: float = 0.3
     size_px: int = 512
     floor: str | None = None
-    is_turning: bool = False
     overrides: tuple[str, ...] = ()  # of settings
 
     def __str__(self) -> str:
         parts = [f"{self.world} seed {self.seed}, {self.speed_mps:g} m/s, {self.size_px} px"]
         parts += [f"on {self.floor}"] * (self.floor is not None)
-        parts += ["turning"] * self.is_turning + list(self.overrides)
+        parts += self.overrides
         return ", ".join(parts)
 
 
@@ -81,8 +78,6 @@ class Drive:
     clearance_m: float  # least
     stopped_m: float | None  # from the hazard at the end; None: there is none, or it was passed
     ended: str  # where it did not get there, why the wheels stopped last, in the daemon's words
-    pairs: int
-    cpu_s: float
 
     @property
     def share(self) -> float:
@@ -141,8 +136,6 @@ class Asker:
         self._asked, self._stands_s = asked, STANDS_S if asked.things is None else HAZARD_STANDS_S
         speed_mps = -planned.speed_mps if asked.motion == "back" else planned.speed_mps
         self._setpoint = Setpoint(speed_mps, heading_rad=0.0)
-        if planned.is_turning or asked.motion == "turn left":
-            self._setpoint = Setpoint(speed_mps, yaw_rate_radps=abs(speed_mps) / TURN_RADIUS_M)
         if asked.motion == "turn left":
             self._setpoint = Setpoint(0.5 * speed_mps, yaw_rate_radps=speed_mps / 0.3)
         self._start: Array | None = None
@@ -178,14 +171,8 @@ def prepared(planned: Planned) -> tuple[Trial, SimulatedRobot]:
     asked = trial(planned.world, planned.seed, planned.floor)
     robot = asked.robot(planned.size_px)
     x_m, y_m, heading_rad = asked.world.start
-    if asked.motion == "ahead" and asked.goal is None:
-        if planned.is_turning:  # an arc to the left, at whose end the base looks along x
-            angle_rad = TURN_M / TURN_RADIUS_M
-            y_m, heading_rad = TURN_RADIUS_M * (1 - math.cos(angle_rad)), -angle_rad
-            if planned.speed_mps < 0:
-                y_m, heading_rad = -y_m, angle_rad
-        if planned.speed_mps < 0:
-            heading_rad += math.pi
+    if asked.motion == "ahead" and asked.goal is None and planned.speed_mps < 0:
+        heading_rad += math.pi
     return replace(asked, world=replace(asked.world, start=(x_m, y_m, heading_rad))), robot
 
 
@@ -199,7 +186,6 @@ def settings_for(planned: Planned) -> list[str]:
 
 def drive(planned: Planned) -> Drive:
     """Make a drive."""
-    cpu_s = time.process_time()
     asked, robot = prepared(planned)
     asked_m = asked.way_m if asked.goal is None else math.hypot(*asked.goal[:2])
     asker = Asker(asked, planned)
@@ -210,12 +196,10 @@ def drive(planned: Planned) -> Drive:
     config = load_config(None, settings_for(planned))
     run = simulate(asked.world, robot, script, seconds=seconds, seed=planned.seed, config=config)
     began_s = 0.0 if math.isinf(asker.began_s) else asker.began_s
-    return judged(run, asked, robot, asked_m, began_s, time.process_time() - cpu_s)
+    return judged(run, asked, robot, asked_m, began_s)
 
 
-def judged(
-    run: SimulatedRun, asked: Trial, robot: SimulatedRobot, asked_m: float, began_s: float, cpu_s: float
-) -> Drive:
+def judged(run: SimulatedRun, asked: Trial, robot: SimulatedRobot, asked_m: float, began_s: float) -> Drive:
     """Return what came of a run, by the truth."""
     places, times_s = np.array([tick.pose[:2] for tick in run.ticks]), np.array([tick.time_s for tick in run.ticks])
     speeds = np.linalg.norm(np.diff(places, axis=0), axis=1) / np.diff(times_s)
@@ -240,8 +224,8 @@ def judged(
     disarmed = [line for at_s, line in run.lines if line.startswith("disarmed") and at_s < run.ticks[-1].time_s - 2.5]
     states = [f"{update.state}: {update.reason}" for update in run.navigation if update.reason]
     ended = "" if is_through else "; ".join([*states[-1:], *(disarmed or stops)[-1:]])
-    time_s, pairs = float(last_s - began_s), len(run.stamps_ns)
-    return Drive(asked_m, driven_m, time_s, len(run.contacts), own, run.clearance_m, stopped_m, ended, pairs, cpu_s)
+    time_s = float(last_s - began_s)
+    return Drive(asked_m, driven_m, time_s, len(run.contacts), own, run.clearance_m, stopped_m, ended)
 
 
 def _from_hazard_m(run: SimulatedRun, asked: Trial, robot: SimulatedRobot) -> float:
@@ -274,7 +258,7 @@ def groups(made: Made) -> Iterator[tuple[str, Made]]:
     """Yield the rows of a table: by world, then by speed, size and floor where there are several, then all."""
     keys: tuple[Callable[[Planned], str], ...] = (
         lambda one: one.world,
-        lambda one: f"at {one.speed_mps:g} m/s" + " turning" * one.is_turning,
+        lambda one: f"at {one.speed_mps:g} m/s",
         lambda one: f"{one.size_px} px",
         lambda one: f"on {one.floor or 'its own floor'}",
     )
@@ -297,16 +281,11 @@ def pace(planned: Planned, made: Made) -> float:
 
 def add_free_table(made: Made) -> None:
     """Print and write the table of the worlds in which nothing is in the way."""
-    columns = (
-        Column("world"),
-        Column("drives"),
-        Column("driven of what was asked", "%", 0),
-        Column("time to that of a textured floor", "", 2),
-        Column("all of it, in 1.5 times that time", "%", 0),
-        Column("contacts"),
-        Column("last stop"),
+    head = columns(
+        *("world", "drives", "driven of what was asked|%|0", "time to that of a textured floor||2"),
+        *("all of it, in 1.5 times that time|%|0", "contacts", "last stop"),
     )
-    table = ResultTable("obstacles_free", "Where nothing is in the way", columns)
+    table = ResultTable("obstacles_free", "Where nothing is in the way", head)
     table.seeds = sorted({(FAMILY, planned.seed) for planned, _ in made})
     for name, part in groups(made):
         ratios = [d.time_s / max(d.driven_m, 0.1) / pace(one, made) for one, d in part]
@@ -319,18 +298,11 @@ def add_free_table(made: Made) -> None:
 
 def add_hazard_table(made: Made) -> None:
     """Print and write the table of the worlds in which something is in the way."""
-    columns = (
-        Column("hazard"),
-        Column("drives"),
-        Column("contacts"),
-        Column("of the robot's own"),
-        Column("least clearance", "m", 2),
-        Column("passed, or stopped 0.05 to 0.8 m before it", "%", 0),
-        Column("stopped earlier"),
-        Column("distances of the stops", "m"),
-        Column("last stop"),
+    head = columns(
+        *("hazard", "drives", "contacts", "of the robot's own", "least clearance|m|2"),
+        *("passed, or stopped 0.05 to 0.8 m before it|%|0", "stopped earlier", "distances of the stops|m", "last stop"),
     )
-    table = ResultTable("obstacles_touched", "What was touched", columns)
+    table = ResultTable("obstacles_touched", "What was touched", head)
     table.seeds = sorted({(FAMILY, planned.seed) for planned, _ in made})
     for name, part in groups(made):
         drives = [d for _, d in part]
@@ -368,15 +340,13 @@ def main() -> None:
     parser.add_argument("--speed", type=float, nargs="+", default=[0.3], help="m/s; below 0: backwards")
     parser.add_argument("--px", type=int, nargs="+", default=[512], help="sizes of the images")
     parser.add_argument("--floor", nargs="+", choices=FLOORS, default=[None], help="other floors than the worlds' own")
-    parser.add_argument("--turning", action="store_true", help="towards hazards on an arc")
     parser.add_argument("--jobs", type=int, default=1, help="drives at a time")
     parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE")
     arguments = parser.parse_args()
     lists = {"harmless": HARMLESS, "hazards": HAZARDS}
     names = [name for given in arguments.only or lists for name in lists.get(given, (given,))]
-    changed = arguments.turning, tuple(arguments.overrides)
     wanted = [
-        Planned(name, seed, speed_mps, size_px, floor, *changed)
+        Planned(name, seed, speed_mps, size_px, floor, tuple(arguments.overrides))
         for name, speed_mps, size_px, floor, seed in product(
             names, arguments.speed, arguments.px, arguments.floor, arguments.seeds
         )

@@ -8,13 +8,10 @@ camera of the rig about a random axis. kidnapped: the log of such a folder is cu
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
-from unittest.mock import patch
 
 import numpy as np
 
@@ -24,12 +21,9 @@ from calib.models.camera import Array
 from calib.rig import Rig
 from calib.rig_file import read_rig
 from omnid.core.places.place_map import PlaceMap
-from omnid.engine.kernel_cache import prepare_kernels
 from omnid.formats.tum import Trajectory, read_tum
-from omnid.messages import OdometryUpdate, PlaceUpdate
 from omnid.recordings.evaluation import evaluate
 from omnid.runs.run_result import RunResult
-from omnid.stages.places import Places
 from omnid.tracking_state import MapState
 from tests.bench.results import Cell, ResultTable, columns, run
 from tests.omnid.core.scenery import motion_errors
@@ -42,7 +36,7 @@ AFTER_CUT = 50  # pairs of a log after it was cut
 LAPS: Final = columns(
     *("log", "rig off by|deg|1", "odometry: ATE|mm|1", "its end|mm|1", "live in the map: ATE|mm|1", "its end|mm|1"),
     *("ratio||2", "at the end: ATE|mm|1", "its ratio||2", "loops", "false loops", "loop after revisit|m|1"),
-    *("keyframes", "processor time of places|%|1"),
+    "keyframes",
 )
 KIDNAPPED: Final = columns(
     *("log", "carried|m|1", "localised after|s|1", "error after that|mm|0", "wrong after that"),
@@ -64,10 +58,8 @@ def replayed(folder: Path, degrees: float, seed: int) -> RunResult:
 
 def laps_row(folder: Path, degrees: float, seed: int) -> list[Cell]:
     """Return one row of the table."""
-    truth, started = read_tum(folder / "truth.txt"), time.process_time()
-    with timed_places() as spent:
-        result = replayed(folder, degrees, seed)
-    share = sum(spent) / (time.process_time() - started)
+    truth = read_tum(folder / "truth.txt")
+    result = replayed(folder, degrees, seed)
     odom, live, final = (
         evaluate(Trajectory(result.stamps_ns, T), truth)
         for T in (result.T_odom_rig, result.T_map_rig_live, result.T_map_rig)
@@ -89,24 +81,7 @@ def laps_row(folder: Path, degrees: float, seed: int) -> list[Cell]:
         false,
         after_m,
         len(result.places or ()),
-        100 * share,
     ]
-
-
-@contextmanager
-def timed_places() -> Iterator[list[float]]:
-    """Yield a list that gets the processor times [s] of the places stage in this block."""
-    spent: list[float] = []
-    untimed = Places.process
-
-    def process(self: Places, odometry: OdometryUpdate) -> PlaceUpdate:
-        started = time.thread_time()
-        result = untimed(self, odometry)
-        spent.append(time.thread_time() - started)
-        return result
-
-    with patch.object(Places, "process", process):
-        yield spent
 
 
 def loop_errors(places: PlaceMap, truth: Trajectory, rig: Rig) -> list[tuple[float, float]]:
@@ -157,7 +132,6 @@ def kidnapped_row(folder: Path, seed: int) -> list[Cell]:
 
 def laps(folders: Sequence[Path], *, wrong_deg: Sequence[float] = (0.0, 0.1)) -> None:
     """Print the errors of closed drives, and of places that look alike, by the error of the rig."""
-    prepare_kernels(lambda _level, _text: None)  # their compilation is no part of the shares
     table = ResultTable("places_laps", "Loops on closed drives, and places that look alike", LAPS)
     for folder in folders:
         for degrees in wrong_deg:

@@ -9,7 +9,7 @@ A set is one of
 - honesty: drives on which poses were, or may be, wrong without saying so. Of `alike` and `too fast` all but the first
   pose must not be `tracking`. The rig is right: a refusal of it is a failure.
 - disturbances: drives in rooms with each disturbance of tests/simulation/disturbances.py, with none (`clean`), with all
-  together, and with photographs on the walls. Wanted of all together: ATE within a factor of 3 of the clean drive,
+  together. Wanted of all together: ATE within a factor of 3 of the clean drive,
   length within 0.2 %, errors below 2 sigmas.
 
 The error over sigma is that of the position, sqrt(e^T C^-1 e / 3); NEES is the mean of e^T C^-1 e, of which 3 is right.
@@ -35,19 +35,14 @@ from calib.rig_file import read_rig
 from omnid.core.rig.rig_health import RigContradictedError
 from omnid.formats.tum import Trajectory, read_tum
 from omnid.recordings.evaluation import evaluate
-from omnid.simulation.rendering.ray_caster import render_grey
-from omnid.simulation.rendering.sensor import Floats, Sensor
-from omnid.simulation.rendering.shapes import box
-from omnid.simulation.rendering.surfaces import Scene
-from omnid.simulation.world import Person, Walkers
+from omnid.simulation.rendering.sensor import Sensor
 from omnid.tracking_state import TrackingState
 from tests.bench.accuracy import position_errors, squared_errors
 from tests.bench.results import Cell, ResultTable, columns, run
 from tests.simulation import SimulatedRun, build, corridor, paths, write_log
 from tests.simulation.builders import repeating
 from tests.simulation.disturbances import DISTURBANCES, Disturbance
-from tests.simulation.logs import PERIOD_NS, Readout, pack_log
-from tests.simulation.photographs import with_photographs
+from tests.simulation.logs import Readout
 from tests.simulation.recipes import DIM, mild_rig
 from tests.simulation.rigs import lens, lens_rig
 
@@ -69,8 +64,6 @@ class Case:
     drive: Callable[[int], SimulatedRun]
     disturbances: tuple[Disturbance, ...] = ()
     line_us: float = 0.0
-    has_people: bool = False
-    has_photographs: bool = False
     is_exact: bool = False  # the replay is told that the rig is exact
 
 
@@ -104,19 +97,6 @@ def rooms(seed: int, pairs: int = 60, sensor: Sensor | None = None, tilt_deg: fl
     return replace(made, poses=poses, sensor=sensor or made.sensor)
 
 
-def walkers(seed: int) -> Walkers:
-    """Return five people who walk back and forth in `rooms`, 0.5 to 1 m from the way, at 0.8 to 1.4 m/s."""
-    rng = np.random.default_rng([seed, 51])
-    walking = []
-    for number in range(5):
-        at, ends = rng.uniform(1.5, 1.8), rng.uniform(0.6, 1.4, 2) * (-1, 1)
-        c, s = np.cos(np.pi / 2 * number), np.sin(np.pi / 2 * number)
-        first, last = ((float(c * at - s * end), float(s * at + c * end)) for end in ends)
-        faces = tuple(box(rng, (0.0, 0.0), (0.3, 0.5, 1.7), 0.0))
-        walking.append(Person(faces, (first, last), float(rng.uniform(0.8, 1.4)), "back and forth"))
-    return Walkers(tuple(walking))
-
-
 ROOMS: Final = partial(rooms, pairs=40)
 SETS: Final[dict[str, dict[str, Case]]] = {
     "lenses": {
@@ -137,13 +117,10 @@ SETS: Final[dict[str, dict[str, Case]]] = {
         "too fast": Case(too_fast, is_exact=True),
         "dim": Case(partial(rooms, sensor=DIM), is_exact=True),
         "bumpy": Case(partial(rooms, sensor=Sensor(), tilt_deg=0.3), line_us=LINE_US, is_exact=True),
-        "people": Case(rooms, has_people=True, is_exact=True),
     },
     "disturbances": {
         "clean": Case(ROOMS),
         "all": Case(ROOMS, DISTURBANCES),
-        "photographs": Case(ROOMS, has_photographs=True),
-        "photographs, all": Case(ROOMS, DISTURBANCES, has_photographs=True),
         **{name: Case(ROOMS, (name,)) for name in DISTURBANCES},
     },
 }
@@ -154,22 +131,9 @@ SEEDS: Final = {"lenses": (1, 2, 600, 608), "honesty": (3, 603, 604), "disturban
 def render(folder: Path, case: Case, seed: int) -> None:
     """Write the log of a case."""
     made = case.drive(seed)
-    if case.has_photographs:
-        made = replace(made, scene=with_photographs(made.scene, seed))
-    if not case.has_people:
-        readout = Readout(line_time_us=(case.line_us, case.line_us))
-        options = {"sensor": made.sensor, "readout": readout, "disturbances": case.disturbances}
-        write_log(folder, made.rig, made.poses, made.scene, seed=seed, **options)  # type: ignore[arg-type]
-        return
-    people, cameras = walkers(seed), (made.rig.lower, made.rig.upper)
-
-    def ideal_image(pair: int, camera: int) -> Floats:
-        x_m, y_m = made.poses[pair, :2, 3].tolist()
-        people.advance(1e-9 * PERIOD_NS * pair, (x_m, y_m))
-        scene = Scene((*made.scene.rectangles, *people.faces()))
-        return render_grey(scene, cameras[camera], made.poses[pair], 2, np.zeros(6))
-
-    pack_log(folder, made.rig, made.poses, ideal_image, sensor=made.sensor, seed=seed)
+    readout = Readout(line_time_us=(case.line_us, case.line_us))
+    options = {"sensor": made.sensor, "readout": readout, "disturbances": case.disturbances}
+    write_log(folder, made.rig, made.poses, made.scene, seed=seed, **options)  # type: ignore[arg-type]
 
 
 def measured(case: Case, seed: int) -> list[Cell]:

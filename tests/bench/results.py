@@ -84,24 +84,13 @@ def add_arguments(parser: argparse.ArgumentParser, measure: Callable[..., int | 
             if parameter.default == ():
                 words |= {"action": "extend"}
         if get_origin(kind) is Literal:
-            kind, words = one_of(get_args(kind)), words | {"metavar": "|".join(get_args(kind))}
+            kind, words = str, words | {"choices": get_args(kind)}
         if has_default:
             words["default"] = list(parameter.default) if "nargs" in words else parameter.default
         if parameter.kind is inspect.Parameter.KEYWORD_ONLY:
             parser.add_argument(flag(name), type=kind, dest=name, required=not has_default, **words)
         else:
             parser.add_argument(name, type=kind, **words)
-
-
-def one_of(names: Sequence[str]) -> Callable[[str], str]:
-    """Return what takes one of some words, for argparse, whose own choices refuse a list of none."""
-
-    def chosen(text: str) -> str:
-        if text not in names:
-            raise argparse.ArgumentTypeError(f"expected one of {', '.join(names)}, found {text}")
-        return text
-
-    return chosen
 
 
 def flag(name: str) -> str:

@@ -1,4 +1,4 @@
-"""Attack the daemon: `python -m tests.bench.faults [PART ...]` measures tables and returns 1 where it did not hold.
+"""Attack the daemon: `python -m tests.bench.faults PART ...` measures tables and returns 1 where it did not hold.
 
 Parts: stops (times from a cause to wheels at rest), commands (mutated commands), files (mutated files), images (drives
 on tampered images, in lock-step). --only: of stops and images, those whose name has one of the words. --stops: so many
@@ -21,7 +21,7 @@ from tests.simulation import build, write_log
 
 
 def faults(
-    parts: Sequence[Literal["stops", "commands", "files", "images"]] = ("stops", "commands", "files", "images"),
+    parts: Sequence[Literal["stops", "commands", "files", "images"]],
     *,
     only: Sequence[str] = (),
     seed: int = 1,

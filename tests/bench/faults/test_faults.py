@@ -7,8 +7,6 @@ unplugged, taken ports) and in `tests/contract` (motor controllers and their lin
 from __future__ import annotations
 
 import contextlib
-import os
-import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,10 +19,8 @@ from omnid.transport.status_names import STOPPED_PREFIX
 from tests.bench.faults import hostile_commands, stop_times
 from tests.bench.faults.hostile_files import FORMATS, attack, short_run
 from tests.bench.faults.stop_times import FAULTY_DAEMON
-from tests.omnid.transport.bus_fixtures import script
-from tests.ports import free_port
-from tests.replay.live import Base, Daemon, Operator, command_line, patient, robot, started
-from tests.waiting import PATIENCE_S, wait_until
+from tests.replay.live import Base, Daemon, Operator, patient, robot
+from tests.waiting import wait_until
 
 
 def test_mutated_files_give_a_result_or_one_line(tmp_path: Path) -> None:
@@ -83,11 +79,6 @@ def expect_stop(base: Base) -> None:
     assert not base.line.moved_since(since_s), "the wheels moved without a setpoint"
 
 
-def expect_motion(base: Base) -> None:
-    """Wait until the wheels turn."""
-    wait_until(lambda: base.line.base.velocity_mps > 0.2, "motion again")
-
-
 @pytest.mark.slow
 def test_images_of_another_drive_stop_the_wheels(setting: Setting) -> None:
     """The images go to and fro at 0.5 m/s, as if the lens saw a screen, while 0.3 m/s forwards are commanded."""
@@ -98,75 +89,3 @@ def test_images_of_another_drive_stop_the_wheels(setting: Setting) -> None:
         wait_until(lambda: not base.drives, "wheels that stop although commands arrive")
         operator.stop_sending()  # after two seconds at rest the base would try again
         expect_stop(base)
-
-
-@pytest.mark.slow
-def test_of_two_daemons_on_one_serial_device_the_second_waits(setting: Setting) -> None:
-    """The second waits for its motor controller; the first drives on."""
-    port = free_port()
-    with (
-        driving(setting) as (_, _, base),
-        started(command_line(setting.scene, port, base.port), port) as second,
-        contextlib.closing(Operator(port)) as watcher,
-    ):
-        wait_until(lambda: watcher.states, "its status")
-        since_s = time.monotonic()
-        time.sleep(2.0)
-        assert base.line.moved_since(since_s) and base.line.base.errors == 0
-        code, err = second.end()
-        assert code == 0 and "in use" in err, err
-
-
-@pytest.mark.slow
-def test_the_wheels_slow_down_after_a_sigkill(setting: Setting) -> None:
-    """The controller process goes on alone."""
-    with robot(setting.scene, setting.folder) as (daemon, operator, base):
-        operator.drive()
-        expect_motion(base)
-        controller_pid = daemon.controller_pid
-        daemon.process.kill()
-        expect_stop(base)
-        wait_until(lambda: not Path(f"/proc/{controller_pid}").exists(), "its end")
-        speeds = [note.wheels_mps[0] for note in base.line.notes if note.wheels_mps[0] > 0]
-        assert speeds[-1] < 0.2, "slowed down, not at once"
-
-
-@pytest.mark.slow
-def test_a_killed_controller_process_ends_the_daemon(setting: Setting) -> None:
-    """The daemon cannot go on without it: systemd starts both again."""
-    with robot(setting.scene, setting.folder) as (daemon, operator, base):
-        operator.drive()
-        expect_motion(base)
-        os.kill(daemon.controller_pid, signal.SIGKILL)
-        _, err = daemon.process.communicate(timeout=PATIENCE_S)
-        assert daemon.process.returncode == 2 and "Traceback" not in err, err
-        wait_until(lambda: base.twin.base.watchdog_expired and base.line.base.velocity_mps == 0, "its watchdog's stop")
-    assert "controller process" in err
-
-
-@pytest.mark.slow
-def test_a_router_comes_and_goes(setting: Setting) -> None:
-    """The daemon is to connect to a peer that is not there, then is, then is gone again."""
-    port = free_port()
-    words = ("--set", f'bus.connect=["tcp/127.0.0.1:{port}"]')
-    with driving(setting, *words) as (_, _, base):
-        for _ in range(2):
-            with script(LISTENER, str(port)):  # it is ready when it has received a pose
-                pass
-            since_s = time.monotonic()
-            time.sleep(1.0)
-            assert base.line.moved_since(since_s), "it drives on as its operator commands"
-
-
-LISTENER = """
-import json, sys, threading, zenoh
-config = zenoh.Config()
-config.insert_json5("listen/endpoints", json.dumps([f"tcp/127.0.0.1:{sys.argv[1]}"]))
-config.insert_json5("scouting/multicast/enabled", "false")
-received = threading.Event()
-with zenoh.open(config) as session:
-    subscriber = session.declare_subscriber("omnid/odom", lambda sample: received.set())
-    received.wait()
-    print("ready", flush=True)
-    threading.Event().wait()
-"""

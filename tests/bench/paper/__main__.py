@@ -1,6 +1,6 @@
 """The paper's experiments: `python -m tests.bench.paper render NAME --seed N --out DIR`, then `... measure DIR`.
 
-Scenes are those of section V: bricks, a control and a smooth wall (fig. 8), turns (fig. 7), a path between two walls
+Scenes are those of section V: bricks (fig. 8), turns (fig. 7), a path between two walls
 (fig. 9), once around a building (fig. 10).
 """
 
@@ -32,7 +32,7 @@ def measure(logs: Path) -> None:
         "paper_turns",
         "Features through turns, of 500 (IV.F, fig. 7)",
         columns(
-            *("scene", "turn|deg|0", "moved"),
+            *("scene", "turn|deg|0"),
             *(f"{name}: {what}" for name in measures.TRACKERS for what in ("right", "claimed")),
         ),
     )
@@ -40,23 +40,22 @@ def measure(logs: Path) -> None:
         "paper_paths",
         "The path between two walls (V.C, fig. 9), and around a building (V.D, fig. 10)",
         columns(
-            *(*where, "length|%|3", "ATE rmse|mm|2", "end|mm|2", "heading, max|deg|3", "map, RMS|mm|1"),
-            *("map, over 5 cm off|%|2", "walls mapped|%|1"),
+            *(*where, "length|%|3", "ATE rmse|mm|2", "end|mm|2", "heading, max|deg|3"),
         ),
     )
     for description in sorted(logs.glob(f"*/{DESCRIPTION}")):
         folder, experiment = description.parent, Experiment.read(description.parent)
-        if experiment.name in ("brick", "control", "smooth"):
+        if experiment.name == "brick":
             for method, figures in measures.walls(folder, experiment).items():
                 walls.add(experiment.label, method, *figures)
         elif experiment.name == "turns":
             for turn in measures.turns(folder, experiment):
                 counts = [count[name] for name in measures.TRACKERS for count in (turn.right, turn.claimed)]
-                turns.add(experiment.label, turn.angle_deg, turn.is_moved, *counts)
+                turns.add(experiment.label, turn.angle_deg, *counts)
         else:
             only = (measures.THE_PAPER, measures.OMNID) if experiment.name == "building" else tuple(measures.METHODS)
             for method in only:
-                paths.add(experiment.label, method, *measures.path(folder, experiment, method))
+                paths.add(experiment.label, method, *measures.path(folder, method))
 
 
 def render(name: str, *, out: Path, seed: Sequence[int] = (11,), size: int = 768, pairs: int = 0) -> None:

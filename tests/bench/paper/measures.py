@@ -25,7 +25,7 @@ from omnid.messages import Panoramas
 from omnid.recordings.evaluation import evaluate
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
 from omnid.stages.dense_depths import DenseDepths
-from tests.bench.paper.scenes import MOVED_TURNS_DEG, TURNS_DEG, WALL_M, Experiment, Views
+from tests.bench.paper.scenes import TURNS_DEG, WALL_M, Experiment, Views
 from tests.bench.results import Cell
 from tests.simulation.recipes import SimulatedRun
 
@@ -170,7 +170,6 @@ class Turn:
     """A turn from one pair to another: its angle, positive to the left, and the features that were followed."""
 
     angle_deg: float
-    is_moved: bool  # with a small translation
     features: int
     right: dict[str, int]  # by tracker: claimed, and within RIGHT_PX
     claimed: dict[str, int]
@@ -183,21 +182,13 @@ def turns(folder: Path, experiment: Experiment) -> Iterator[Turn]:
         StereoFrame(p.seq, p.lower, p.upper, np.full(p.visible.shape, np.nan, np.float32), p.visible)
         for p in views.panoramas
     ]
-    angles = [(float(a), False) for a in TURNS_DEG] + [(float(a), True) for a in MOVED_TURNS_DEG]
-    for number, (angle_deg, is_moved) in enumerate(angles[: len(frames) - 1], 1):
-        yield _turn(run, views, frames, (0, number), angle_deg, is_moved)
+    for number, angle_deg in enumerate(TURNS_DEG[: len(frames) - 1], 1):
+        yield _turn(run, views, frames, (0, number), angle_deg)
         if angle_deg:
-            yield _turn(run, views, frames, (number, 0), -angle_deg, is_moved)
+            yield _turn(run, views, frames, (number, 0), -angle_deg)
 
 
-def _turn(
-    run: SimulatedRun,
-    views: Views,
-    frames: list[StereoFrame],
-    pair: tuple[int, int],
-    angle_deg: float,
-    is_moved: bool,
-) -> Turn:
+def _turn(run: SimulatedRun, views: Views, frames: list[StereoFrame], pair: tuple[int, int], angle_deg: float) -> Turn:
     """Track corners of one pair into another, and count those that are found where they truly are."""
     (before, after), (T_before, T_after) = (frames[n] for n in pair), (run.poses[n] for n in pair)
     # 1. Corners of the first panorama, and the points of the scene that they show.
@@ -215,74 +206,26 @@ def _turn(
         error[:, 0] = views.geometry.cylinder.wrap(error[:, 0])
         claimed[name] = int(is_claimed.sum())
         right[name] = int((is_claimed & visible & (np.hypot(*error.T) <= RIGHT_PX)).sum())
-    return Turn(angle_deg, is_moved, len(pixels), right, claimed)
+    return Turn(angle_deg, len(pixels), right, claimed)
 
 
-# V.C, fig. 9, V.D, fig. 10: paths between two walls and around a building, and the map of the latter.
+# V.C, fig. 9, V.D, fig. 10: paths between two walls and around a building.
 
 SAD, ENHANCED = "stereo.matching.method=sad", "stereo.matching.method=enhanced"
-PAPER, KLT, KEYFRAME = "odometry.method=paper", "odometry.tracker=klt", "odometry.reference=keyframe"
+PAPER, KLT = "odometry.method=paper", "odometry.tracker=klt"
 THE_PAPER: Final = "enhanced SAD, improved KLT, eq. 9 (the paper)"
 OMNID: Final = "bearings, keyframes, semi-global prior (omnid)"
 METHODS: Final = {  # settings; each step from the paper's method to omnid's
     "original SAD, plain KLT, eq. 9": (PAPER, SAD, KLT),
     "enhanced SAD, plain KLT, eq. 9": (PAPER, ENHANCED, KLT),
-    "original SAD, improved KLT, eq. 9": (PAPER, SAD),
     THE_PAPER: (PAPER, ENHANCED),
-    "eq. 9 with keyframes": (PAPER, ENHANCED, KEYFRAME),
-    "bearings, frame to frame": ("odometry.limits.keyframes=1",),
-    "bearings, keyframes, enhanced SAD": (ENHANCED,),
     OMNID: (),
 }
-NEAR_M: Final = 4.0  # the map is judged within this distance from the path
-SEEN_M: Final = 0.1  # a spot of a wall counts as mapped with a point this close
-SPOT_M: Final = 0.25  # distance between the spots
-HEIGHT_M: Final = (0.3, 2.2)  # lowest and highest spot
-OFF_M: Final = 0.05  # a point of the map farther from all surfaces is wrong
 
 
-def path(folder: Path, experiment: Experiment, method: str) -> list[Cell]:
-    """Return length [%], ATE, end [mm], heading [deg]; for a building the map's RMS [mm], wrong points, walls [%]."""
+def path(folder: Path, method: str) -> list[Cell]:
+    """Return the errors of a log by a method: length [%], ATE, end [mm], heading [deg]."""
     result = omnid.replay(folder / "log.mcap", folder / "rig.toml", overrides=list(METHODS[method]))
     found = evaluate(Trajectory(result.stamps_ns, result.T_odom_rig), read_tum(folder / "truth.txt"))
     lengths = (1e3 * found.ate_rmse_m, 1e3 * found.end_error_m)
-    cells: list[Cell] = [100 * found.length_error_ratio, *lengths, math.degrees(found.heading_max_rad)]
-    if experiment.name != "building":
-        return [*cells, None, None, None]
-    assert result.map is not None
-    return [*cells, *map_figures(experiment.run, result.map.xyz.astype(float))]
-
-
-def map_figures(run: SimulatedRun, xyz: Array) -> tuple[float, float, float]:
-    """Return the RMS distance [mm] of map points near the path from the nearest true surface, and two shares [%].
-
-    xyz (N, 3) m in odom. Shares: of the points that are wrong, and of the spots of walls that are mapped.
-    """
-    in_world = se3.apply(run.poses[0], xyz)
-    nearest_m = np.min([np.linalg.norm(in_world[:, :2] - T[:2, 3], axis=1) for T in run.poses[::3]], axis=0)
-    near = in_world[nearest_m < NEAR_M]
-    error = surface_distance_m(run.scene, near)
-    spots = np.concatenate([_spots(face) for face in run.scene.rectangles if _is_wall(face)])
-    visible = np.zeros(len(spots), bool)
-    for T in run.poses[::5]:
-        todo = ~visible & (np.linalg.norm((spots - T[:3, 3])[:, :2], axis=1) < NEAR_M)
-        visible[todo] |= sees(run.scene, T[:3, 3], spots[todo])
-    # A spot is mapped if its cell or one of its neighbours holds a point.
-    steps = np.stack(np.meshgrid(*3 * [[-1, 0, 1]]), axis=-1).reshape(-1, 3)
-    cells = {tuple(cell) for cell in np.floor(near / SEEN_M).astype(int).tolist()}
-    around = np.floor(spots[visible] / SEEN_M).astype(int)[:, None] + steps
-    mapped = float(np.mean([any(tuple(cell) in cells for cell in of_spot) for of_spot in around.tolist()]))
-    return 1e3 * float(np.sqrt((error**2).mean())), 100 * float((error > OFF_M).mean()), 100 * mapped
-
-
-def _is_wall(face: Rectangle) -> bool:
-    return abs(face.normal[2]) < 0.1 and face.width_m > 1.0
-
-
-def _spots(face: Rectangle) -> Array:
-    """Return points (N, 3) on a grid over a wall, at heights that a robot's cameras see well."""
-    across, down = (
-        (np.arange(count) + 0.5) / count for count in (max(1, round(m / SPOT_M)) for m in (face.width_m, face.height_m))
-    )
-    points = face.points(np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2))
-    return points[(points[:, 2] > HEIGHT_M[0]) & (points[:, 2] < HEIGHT_M[1])]
+    return [100 * found.length_error_ratio, *lengths, math.degrees(found.heading_max_rad)]

@@ -6,7 +6,6 @@ import json
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +19,7 @@ from omnid.config import Config
 from omnid.messages import Panoramas
 from omnid.simulation.rendering.shapes import CEILING_M
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
-from omnid.simulation.rendering.textures import PAINTERS, value_noise
+from omnid.simulation.rendering.textures import PAINTERS
 from omnid.simulation.world_file import load_world
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry, geometry
@@ -35,13 +34,7 @@ from tests.simulation.rigs import make_rig
 DESCRIPTION = "experiment.json"  # in the folder of a log
 WALL_M = 2.0  # section V.B: distance from the cameras to the wall
 WALL_SIZE_M = (9.0, CEILING_M)
-SMOOTH_PX_PER_M = 200.0  # resolution of the smooth wall's texture
-SMOOTH_GREY = (140.0, 30.0)  # mean and standard deviation of the smooth wall
-SMOOTH_SCALE_M = 0.5  # size of the clouds of the smooth wall
-SMOOTH_PERSISTENCE = 0.3  # amplitude of each octave over that of the next coarser one: hardly any fine detail
 TURNS_DEG = tuple(range(0, 181, 9))  # yaw of the pairs after the first, relative to the first pair
-MOVED_TURNS_DEG = (18, 45, 90, 135, 180)  # yaw of the last pairs, which are translated as well
-MOVED_M = (0.05, 0.03)  # their translation, x and y
 
 
 def seeded_rig(seed: int, size: int) -> Rig:
@@ -53,23 +46,11 @@ def seeded_rig(seed: int, size: int) -> Rig:
     return make_rig(size=size, scale=scale, baseline_m=baseline, misaligned_deg=turned, offset_mm=(x, y))
 
 
-def smooth(seed: int, size: int, pairs: int) -> SimulatedRun:
-    """Return a run before a smooth wall: soft clouds without edges, the weakness named in section III.C."""
-    run = facing(seed, size, pairs, "plain")
-    rng = np.random.default_rng([seed, 25])
-    mean, sigma = SMOOTH_GREY
-    texture_size = (round(WALL_SIZE_M[0] * SMOOTH_PX_PER_M), round(WALL_SIZE_M[1] * SMOOTH_PX_PER_M))
-    clouds = value_noise(rng, texture_size, SMOOTH_SCALE_M * SMOOTH_PX_PER_M, SMOOTH_PERSISTENCE)
-    texture = np.clip(np.rint(mean + sigma * clouds), 0, 255).astype(np.uint8)
-    front, *others = run.scene.rectangles
-    return replace(run, scene=Scene((replace(front, texture=texture), *others)))
-
-
-def facing(seed: int, size: int, pairs: int, kind: str) -> SimulatedRun:
-    """Return a run before a wall named 'wall' (V.B); other walls are plaster. The pairs are 7 cm apart, sideways."""
+def facing(seed: int, size: int, pairs: int) -> SimulatedRun:
+    """Return a run before bricks, a wall named 'wall' (V.B); others are plaster. Pairs are 7 cm apart, sideways."""
     rng = np.random.default_rng([seed, 24])
     half = WALL_SIZE_M[0] / 2
-    front = upright(rng, kind, (WALL_M, half), (WALL_M, -half))
+    front = upright(rng, "brick", (WALL_M, half), (WALL_M, -half))
     ends = (((-2.5, half), (WALL_M, half)), ((WALL_M, -half), (-2.5, -half)), ((-2.5, -half), (-2.5, half)))
     others = [upright(rng, "plaster", a, b) for a, b in ends]
     floor = Rectangle(
@@ -91,14 +72,14 @@ def two_walls(seed: int, size: int, pairs: int) -> SimulatedRun:
 
 
 def turns(seed: int, size: int, pairs: int) -> SimulatedRun:
-    """Return a first pair with yaw 0, pairs turned left by TURNS_DEG, and pairs turned by MOVED_TURNS_DEG and moved.
+    """Return a first pair with yaw 0, and pairs turned left by TURNS_DEG.
 
     Section IV.F. Tracking from the first pair to another is a turn to the left, the other way a turn to the right.
     """
-    angles = np.deg2rad([0, *TURNS_DEG, *MOVED_TURNS_DEG])
-    xy = np.zeros((len(angles), 2))
-    xy[-len(MOVED_TURNS_DEG) :] = MOVED_M
-    return SimulatedRun(seeded_rig(seed, size), paths.planar_poses(xy, angles)[:pairs], corridor(seed))
+    angles = np.deg2rad([0, *TURNS_DEG])
+    return SimulatedRun(
+        seeded_rig(seed, size), paths.planar_poses(np.zeros((len(angles), 2)), angles)[:pairs], corridor(seed)
+    )
 
 
 def building(seed: int, size: int, pairs: int) -> SimulatedRun:
@@ -113,11 +94,9 @@ def building(seed: int, size: int, pairs: int) -> SimulatedRun:
 
 
 EXPERIMENTS: dict[str, tuple[Callable[[int, int, int], SimulatedRun], int]] = {  # recipe and number of pairs
-    "brick": (partial(facing, kind="brick"), 3),
-    "control": (partial(facing, kind="granite"), 3),  # a texture that does not repeat
-    "smooth": (smooth, 3),
+    "brick": (facing, 3),
     "two_walls": (two_walls, 99),
-    "turns": (turns, 1 + len(TURNS_DEG) + len(MOVED_TURNS_DEG)),
+    "turns": (turns, 1 + len(TURNS_DEG)),
     "building": (building, 349),
 }
 

@@ -24,7 +24,6 @@ from drivers.cameras import v4l2_ioctl as v4l2
 from drivers.cameras.v4l2_camera import V4l2Camera
 from drivers.cameras.v4l2_device import RULES_FILE, capture_devices, udev_rules
 from drivers.cameras.v4l2_settings import V4l2Settings
-from drivers.errors import DriverError
 from drivers.frame import Frame, gray
 from tests.hardware.guest.loopback import DEVICES, Loopback, load_loopback
 
@@ -33,7 +32,7 @@ RATE_HZ = 10.0
 LIMIT_S = 40.0
 LOWER, UPPER = "/dev/omnid/lower", "/dev/omnid/upper"
 BIND = Path("/sys/bus/platform/drivers/vivid")
-DROPS, DISCONNECT, FLAG_ERROR, FATAL_ERROR = 0xF0F040, 0xF0F041, 0xF0F042, 0xF0F046  # vivid's own controls
+DROPS, DISCONNECT, FATAL_ERROR = 0xF0F040, 0xF0F041, 0xF0F046  # vivid's own controls
 GAIN = 0x980913
 # the start of the exposure as stamp: the end of the frame lies in the future; no text within the image
 STILL = ("timestamp_source=1", "osd_text_mode=2")
@@ -214,17 +213,6 @@ def test_counts_dropped_buffers(vivid: None) -> None:
     assert watched.state.frames == len(watched.taken) and watched.state.errors == watched.state.losses == 0
 
 
-def test_skips_and_counts_flagged_buffers(vivid: None) -> None:
-    with CameraReader() as watched:
-        for count in (1, 2, 3):
-            watched.more(3)
-            control(LOWER, FLAG_ERROR, 1)
-            until(lambda count=count: watched.state.errors == count)
-        watched.more(3)
-    watched.require_order()
-    assert abs(watched.missing() - watched.state.drops - 3) <= LATE_STAMPS and watched.state.losses == 0
-
-
 def test_replaces_stamps_in_the_future_by_the_arrival(vivid: None) -> None:
     with CameraReader(controls=("timestamp_source=0",)) as watched:
         watched.more(10)
@@ -284,20 +272,6 @@ def test_reopens_a_camera_that_sends_no_images(loopback: None) -> None:
     watched.require_events("clock", "lost", "back")
 
 
-def test_waits_for_a_writer_that_has_closed(loopback: None) -> None:
-    device, image = DEVICES[1], bytes(SIZE[0] * SIZE[1])
-    with Writer(device, image):
-        watched = CameraReader(device, controls=(), timeout_s=1.0)
-        watched.thread.start()
-        watched.more(5)
-    until(lambda: "no capture device" in watched.state.problem)
-    with Writer(device, image):
-        watched.more(5)
-        watched.__exit__()
-    watched.require_order()
-    watched.require_events("clock", "lost", "back")
-
-
 def test_motion_jpeg_arrives_whole(loopback: None) -> None:
     image = np.tile(np.linspace(0, 255, SIZE[0], dtype=np.uint8), (SIZE[1], 1))
     jpeg = cv2.imencode(".jpg", image)[1].tobytes()
@@ -318,22 +292,6 @@ def test_every_raw_format_shows_the_same_luma(vivid: None) -> None:
     for name in ("UYVY", "NV12"):
         np.testing.assert_allclose(images[name].astype(int), images["YUYV"], atol=3)
     assert np.corrcoef(images["GREY"].ravel(), images["YUYV"].ravel())[0, 1] > 0.95
-
-
-def test_a_device_has_one_user(vivid: None) -> None:
-    with CameraReader() as watched:
-        watched.more(3)
-        with pytest.raises(DriverError, match="is used by another program"):
-            CameraReader()
-        watched.more(3)
-    with CameraReader(width_px=640, height_px=360) as later:
-        later.more(3)
-    watched.require_events()
-
-
-def test_refuses_an_output_device(loopback: None) -> None:
-    with pytest.raises(DriverError, match="is no capture device now"):
-        CameraReader(DEVICES[0], controls=())
 
 
 def test_close_ends_a_wait_at_any_time(vivid: None, loopback: None) -> None:

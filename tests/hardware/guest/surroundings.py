@@ -136,10 +136,6 @@ class GuestOperator:
         self._thread.join()
         self._robot.close()
 
-    def index(self, pose: Pose) -> int:
-        """Return the number of the image of a pose."""
-        return self._sample_log.index(pose.stamp_ns - self._offset_ns)
-
     def message(self, part: str) -> str:
         """Return the last status message of a part of the daemon."""
         statuses = () if self.report is None else self.report.statuses

@@ -48,10 +48,16 @@ class Floor:
         middle = np.round(pose[:2] / CELL_M) if self._all_seen else np.zeros(2)
         corner_m = CELL_M * (middle - self._side // 2)
         if not self._all_seen:
-            y, x = CELL_M * (np.indices(self._states.shape) + 0.5) + (corner_m - pose[:2])[::-1, None, None]
-            sector = np.floor((np.arctan2(y, x) - (pose[2] - math.pi)) * (360 / math.tau)).astype(int) % 360
             seen_m = np.where(np.isfinite(ranges_m), ranges_m, 4.0) if free_m is None else free_m
-            self._states[np.hypot(x, y) <= np.maximum(seen_m, OWN_M)[sector]] = 0.0
+            seen_m = np.maximum(seen_m, OWN_M)
+            # Only the cells about the base: a grid of all of them takes most of the time of a drive.
+            reach = math.ceil(float(seen_m.max()) / CELL_M) + 1
+            first = np.maximum(np.floor((pose[:2] - corner_m) / CELL_M).astype(int) - reach, 0)
+            near = self._states[first[1] : first[1] + 2 * reach, first[0] : first[0] + 2 * reach]
+            middles = np.indices(near.shape) + 0.5 + first[::-1, None, None]
+            y, x = CELL_M * middles + (corner_m - pose[:2])[::-1, None, None]
+            sector = np.floor((np.arctan2(y, x) - (pose[2] - math.pi)) * (360 / math.tau)).astype(int) % 360
+            near[np.hypot(x, y) <= seen_m[sector]] = 0.0
         at = np.flatnonzero(np.isfinite(ranges_m))
         angles = pose[2] - math.pi + (at + 0.5) * (math.tau / 360)
         points = pose[:2] + ranges_m[at, None] * np.column_stack([np.cos(angles), np.sin(angles)])

@@ -44,8 +44,11 @@ class BaseAmongPatches(DrivenBase):
 
 
 @pytest.mark.hazard("H31")
-@pytest.mark.parametrize("occupied", [math.nan, 0.05], ids=["unknown", "each cell free"])
-@pytest.mark.parametrize("path", [None, drive_path([(0.0, 0.0), (5.0, 0.0)], 0.0)], ids=["goal", "path"])
+@pytest.mark.parametrize(
+    ("path", "occupied"),
+    [(None, math.nan), (drive_path([(0.0, 0.0), (5.0, 0.0)], 0.0), 0.05)],
+    ids=["goal, unknown", "path, each cell free"],
+)
 def test_a_patch_that_closes_the_way_is_passed_beside_it(path: DrivePath | None, occupied: float) -> None:
     """Its cells are unknown, or each of them is free and only a way across them has more than the risk."""
     base = BaseAmongPatches(Boxes((2.4, -0.15, 2.7, 0.2)), path, occupied)
