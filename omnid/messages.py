@@ -14,7 +14,7 @@ from calib import se3
 from drivers.jpeg import Steps
 from drivers.motion import MotionSample
 from omnid.core.control.heading_controller import Setpoint
-from omnid.core.control.motion_monitor import AGREE, Witness
+from omnid.core.control.motion_monitor import AGREE, Conflict
 from omnid.core.mapping.scan_grid import Grid, KeyframeScans
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.navigation.requests import TaughtRoute
@@ -108,7 +108,7 @@ class OdometryUpdate:
     light: Light = field(default_factory=Light)
     motion: tuple[MotionSample, ...] = ()  # samples of wheels and gyro since the last pair
     is_keyframe: bool = False  # odometry needs its dense depth in any case
-    witness: Witness = AGREE  # whether images, wheels and gyro show the same motion
+    conflict: Conflict = AGREE  # whether images, wheels and gyro show the same motion
     refused_mps: float = 0.0  # speed of a pose that was refused for it alone; 0: none was
     image_fault: str = ""  # how the images of a camera are torn or displaced; empty: they are not
     T_odom_rect: Array = field(default_factory=lambda: np.eye(4))  # (4, 4) the same pose, as it was estimated

@@ -12,7 +12,7 @@ from drivers.motion import WheelSample
 from drivers.motor import VelocityCommand
 from omnid.core.control.arming import NO_ANSWER, STARTED, ArmAnswer
 from omnid.core.control.collision_monitor import remedy
-from omnid.core.control.motion_monitor import ADVICE, COMPARED, DISAGREEMENTS, WITNESSES, Witness
+from omnid.core.control.motion_monitor import ADVICE, COMPARED, CONFLICTS, DISAGREEMENTS, Conflict
 from omnid.core.control.safety_rules import ENDS, IDLE
 from omnid.core.control.trust import MOTION_DOUBTFUL
 
@@ -58,10 +58,10 @@ def cuts_drive_short(before: ControllerState, after: ControllerState) -> bool:
     return not before.reason and after.reason not in ("", IDLE)
 
 
-def transitions(before: ControllerState, after: ControllerState, witness: Witness) -> Iterator[str]:
+def transitions(before: ControllerState, after: ControllerState, conflict: Conflict) -> Iterator[str]:
     """Yield lines for the log that say what has changed from one tick to the next.
 
-    witness: how images, wheels and gyro differ, where they do.
+    conflict: how images, wheels and gyro differ, where they do.
     """
     # 1. Arming: each time, and a refusal where its reason is another one.
     answer, last = after.arm_answer, before.arm_answer
@@ -71,8 +71,8 @@ def transitions(before: ControllerState, after: ControllerState, witness: Witnes
     if before.armed and after.needs_request and before.reason:
         yield f"disarmed while the wheels stand: {after.disarmed_by}; {UNTIL_ARMED}"
     # 3. A reason to drive slowly that a person should examine.
-    if after.slowed_by != before.slowed_by and after.slowed_by in (MOTION_DOUBTFUL, *WITNESSES):
-        yield f"the wheels turn slowly: {after.slowed_by}{_detail(after.slowed_by, witness)}"
+    if after.slowed_by != before.slowed_by and after.slowed_by in (MOTION_DOUBTFUL, *CONFLICTS):
+        yield f"the wheels turn slowly: {after.slowed_by}{_detail(after.slowed_by, conflict)}"
     # 4. A stop by the collision monitor.
     if after.blocked and not before.blocked:
         yield f"the wheels stop: {after.obstacle}; {remedy(after.obstacle)}"
@@ -81,15 +81,15 @@ def transitions(before: ControllerState, after: ControllerState, witness: Witnes
         latched = f"; {UNTIL_ARMED}" if after.needs_request else ""
         advice = f"; {ADVICE}" if after.reason in DISAGREEMENTS else ""
         is_long = after.reason in COMPARED  # three accounts: a line of their own
-        detail = "" if is_long else _detail(after.reason, witness)
+        detail = "" if is_long else _detail(after.reason, conflict)
         yield f"the wheels stop: {after.reason}{detail}{advice}{latched}"
-        if is_long and witness.detail:
-            yield f"measured: {witness.detail}"
+        if is_long and conflict.detail:
+            yield f"measured: {conflict.detail}"
 
 
-def _detail(reason: str, witness: Witness) -> str:
+def _detail(reason: str, conflict: Conflict) -> str:
     """Return by how much images, wheels and gyro differ, where that is the reason."""
-    return f" {witness.detail}" if witness.reason == reason and witness.detail else ""
+    return f" {conflict.detail}" if conflict.reason == reason and conflict.detail else ""
 
 
 class TickReport(NamedTuple):

@@ -35,18 +35,18 @@ class FrontEnd:
 
     def motion_stats(self) -> dict[str, object]:
         """Return samples of wheels and gyro, their estimated errors with sigmas, and the sensor that differs."""
-        inbox, sensors, witness = self.pairing.motion, self.odometry.motion, self.odometry.witness
+        inbox, sensors, conflict = self.pairing.motion, self.odometry.motion, self.odometry.conflict
         stats: dict[str, object] = {
             "wheel_samples": inbox.wheels,
             "gyro_samples": inbox.gyro,
             "dropped": inbox.dropped,
             "slips": sensors.slips,
             "refused_gyro": sensors.refused,
-            "_warning": "wheels slip" if sensors.is_slipping else f"{witness.reason} {witness.detail}".strip(),
+            "_warning": "wheels slip" if sensors.is_slipping else f"{conflict.reason} {conflict.detail}".strip(),
         }
         if not sensors.wheels_are_sane:
             what = "wheels contradict the cameras: check motor.drive (radius, track, reversed, swapped)"
-            stats["_warning"] = f"{what}: {witness.detail}" if witness.detail else what
+            stats["_warning"] = f"{what}: {conflict.detail}" if conflict.detail else what
         estimated: dict[str, tuple[int, float]] = {}  # state of the filter, and the unit
         if sensors.steps and inbox.wheels:
             estimated |= {"wheel_scale": (DISTANCE, 1.0), "turn_scale": (TURN, 1.0)}

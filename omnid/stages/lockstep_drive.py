@@ -87,5 +87,5 @@ def controller_pose(odometry: OdometryUpdate, T_base_rig: NDArray[np.float64]) -
         sigma_mps,
         sigma_radps,
         odometry.reset_counter,
-        odometry.witness,
+        odometry.conflict,
     )

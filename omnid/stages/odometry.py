@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.fit.rig_uncertainty import motion_errors
 from omnid.config import OdometryConfig
-from omnid.core.control.motion_monitor import AGREE, Witness
+from omnid.core.control.motion_monitor import AGREE, Conflict
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.core.odometry.earlier_view import EarlierView
 from omnid.core.odometry.estimates import OdometryEstimate
@@ -69,7 +69,7 @@ class OdometryStage:
         self._rig_error = RigError(motion_errors(geometry.rig))
 
     @property
-    def witness(self) -> Witness:
+    def conflict(self) -> Conflict:
         """That of images, wheels and gyro which differs from the others now."""
         return self._agreement.result
 
@@ -104,8 +104,8 @@ class OdometryStage:
         if estimate.step is not None and last_ns is not None:
             seen = self._to_base @ se3.log(estimate.step)
             self._agreement.add_step(last_ns, pair.stamp_ns, *map(float, seen[[0, 5, 1]]))
-            if self.witness.is_fault:
-                self.last_fault = self.witness
+            if self.conflict.is_fault:
+                self.last_fault = self.conflict
         # 4. The message, in the frame of the rig, with the uncertainty by what wheels and gyro contradict.
         covariance_rect = estimate.covariance + self._contradicted(estimate.T_odom_rect, pair.stamp_ns)
         return self._update(pair, estimate, covariance_rect)
@@ -122,7 +122,7 @@ class OdometryStage:
             self._in_rig(with_rig_error),
             self._to_rig @ estimate.velocity,
             self._in_rig(estimate.velocity_covariance),
-            _state(estimate.state, pair, self.witness),
+            _state(estimate.state, pair, self.conflict),
             estimate.resets,
             estimate.inliers,
             estimate.tracked,
@@ -160,7 +160,7 @@ class OdometryStage:
     def _contradicted(self, T_odom_rect: Array, stamp_ns: int) -> Array:
         """Return what wheels and gyro that contradict the poses add to the covariance (6, 6) of one."""
         T_odom_base, to_rect = T_odom_rect @ se3.inverse(self._T_base_rect), np.linalg.inv(self._to_base)
-        covariance = self._contradiction.add(self.witness, T_odom_base, stamp_ns * S_PER_NS)
+        covariance = self._contradiction.add(self.conflict, T_odom_base, stamp_ns * S_PER_NS)
         return np.asarray(to_rect @ covariance @ to_rect.T)
 
     def _in_rig(self, covariance: Array) -> Array:
@@ -181,9 +181,9 @@ def _moving(exposure: Exposure | None) -> Exposure | None:
     return None if exposure is None or exposure.times.is_at_once else exposure
 
 
-def _state(state: TrackingState, pair: Panoramas, witness: Witness) -> TrackingState:
+def _state(state: TrackingState, pair: Panoramas, conflict: Conflict) -> TrackingState:
     """Return the state of a pose: at best DEGRADED where it is too dark, or wheels and gyro contradict the images."""
-    is_doubtful = pair.light.is_too_dark or (witness.is_fault and witness.contradicts_images)
+    is_doubtful = pair.light.is_too_dark or (conflict.is_fault and conflict.contradicts_images)
     return TrackingState.DEGRADED if state is TrackingState.TRACKING and is_doubtful else state
 
 

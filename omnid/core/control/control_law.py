@@ -27,7 +27,7 @@ from omnid.core.control.heading_controller import (
     VelocityLimits,
     wrap_angle,
 )
-from omnid.core.control.motion_monitor import AGREE, Motion, MotionSettings, Witness
+from omnid.core.control.motion_monitor import AGREE, Conflict, Motion, MotionSettings
 from omnid.core.control.safety_rules import FAULTS, IDLE, Deadlines, SafetyInputs, stop_reason
 from omnid.core.control.trust import Plausibility, TrustSettings
 from omnid.core.nanoseconds import S_PER_NS
@@ -98,7 +98,7 @@ class ControllerPose(NamedTuple):
     velocity_sigma_mps: float = 0.0
     yaw_rate_sigma_radps: float = 0.0
     resets: int = 0  # how often odometry has lost its map and begun again
-    witness: Witness = AGREE  # whether images, wheels and gyro show the same motion
+    conflict: Conflict = AGREE  # whether images, wheels and gyro show the same motion
 
     @property
     def motion(self) -> Motion:
@@ -154,7 +154,7 @@ class ControlLaw:
         if isinstance(given, ControllerPose):
             self._pose_jumped |= self.pose is not None and self._jumps(self.pose, given)
             self.pose = given
-            self.plausibility.add_pose(given.stamp_ns, given.state, given.motion, given.resets, given.witness)
+            self.plausibility.add_pose(given.stamp_ns, given.state, given.motion, given.resets, given.conflict)
         elif isinstance(given, ControllerScan):
             self.collision.set_scan(given)
         elif isinstance(given, TimedSetpoint):

@@ -44,8 +44,8 @@ GYRO_DIFFERS: Final = "the gyro disagrees with images and wheels"
 IMAGES_OR_WHEELS: Final = "images and wheels disagree"
 IMAGES_OR_GYRO: Final = "images and gyro disagree"
 IMAGES_ASIDE: Final = "the images show motion to the side"
-WITNESSES: Final = (IMAGES_DIFFER, WHEELS_DIFFER, GYRO_DIFFERS, IMAGES_OR_WHEELS, IMAGES_OR_GYRO, IMAGES_ASIDE)
-DISAGREEMENTS: Final = (*COMPARED, *WITNESSES)
+CONFLICTS: Final = (IMAGES_DIFFER, WHEELS_DIFFER, GYRO_DIFFERS, IMAGES_OR_WHEELS, IMAGES_OR_GYRO, IMAGES_ASIDE)
+DISAGREEMENTS: Final = (*COMPARED, *CONFLICTS)
 ADVICE: Final = "check wheels, cameras, motor.drive, baseline and T_base_rig of the rig; see controller.motion"
 
 
@@ -60,10 +60,10 @@ class Difference(NamedTuple):
         return self.amount * min(1.0, seconds / self.span_s) if self.span_s > 0 else 0.0
 
 
-class Witness(NamedTuple):
+class Conflict(NamedTuple):
     """Account of the motion (images, wheels, gyro) that differs slowly from the others."""
 
-    reason: str = ""  # one of WITNESSES; empty: all agree
+    reason: str = ""  # one of CONFLICTS; empty: all agree
     detail: str = ""  # size of the disagreement, in words
     is_fault: bool = False  # False: a doubt
     distance: Difference = Difference()  # of the wheels; empty where they agree, or are late
@@ -75,7 +75,7 @@ class Witness(NamedTuple):
         return self.reason in (IMAGES_DIFFER, IMAGES_OR_WHEELS, IMAGES_OR_GYRO)
 
 
-AGREE: Final = Witness()
+AGREE: Final = Conflict()
 
 
 @dataclass(frozen=True, slots=True)

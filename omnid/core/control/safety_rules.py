@@ -14,7 +14,7 @@ from typing import Annotated, Final, NamedTuple
 from msgspec import Meta
 
 from omnid.core.control.contacts import BUMPER, CLIFF
-from omnid.core.control.motion_monitor import NOT_COMMANDED, NOT_FOLLOWED, NOT_SEEN, WITNESSES
+from omnid.core.control.motion_monitor import CONFLICTS, NOT_COMMANDED, NOT_FOLLOWED, NOT_SEEN
 from omnid.tracking_state import TrackingState
 
 
@@ -104,7 +104,7 @@ RULES: Final = (
     Rule(POSE_LOST, True, lambda now, _: now.pose_state == TrackingState.LOST),
     Rule(POSE_RESET, True, lambda now, _: now.pose_reset),
     Rule(POSE_UNSURE, True, lambda now, _: now.pose_unsure),
-    *map(_disagree, (NOT_FOLLOWED, NOT_SEEN, NOT_COMMANDED, *WITNESSES)),
+    *map(_disagree, (NOT_FOLLOWED, NOT_SEEN, NOT_COMMANDED, *CONFLICTS)),
     Rule(POSE_JUMPED, False, lambda now, _: now.pose_jumped),
     Rule(NOT_ARMED, False, lambda now, _: not now.armed),
     Rule(IDLE, False, lambda now, _: now.command_age_s == float("inf")),

@@ -9,7 +9,7 @@ from typing import Annotated, Final, Literal, NamedTuple
 from msgspec import Meta
 
 from omnid.core.control.heading_controller import Twist, VelocityLimits
-from omnid.core.control.motion_monitor import AGREE, Motion, MotionMonitor, MotionSettings, Witness
+from omnid.core.control.motion_monitor import AGREE, Conflict, Motion, MotionMonitor, MotionSettings
 from omnid.core.control.safety_rules import SafetyInputs
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.tracking_state import TrackingState
@@ -71,24 +71,24 @@ class Plausibility:
         self._unsure, self._low = Lasting(), Lasting()  # velocity, battery
         self._resets: int | None = None
         self._is_degraded = self._is_reset = self._is_faulty = False
-        self.witness = AGREE  # witness of the newest pose
+        self.conflict = AGREE  # conflict of the newest pose
 
     @property
     def slowed_by(self) -> str:
         """The reason to drive slowly; empty without one."""
         if self._is_degraded:
             return POSE_DEGRADED
-        return MOTION_DOUBTFUL if self.monitor.is_doubtful else self.witness.reason
+        return MOTION_DOUBTFUL if self.monitor.is_doubtful else self.conflict.reason
 
     @property
-    def account(self) -> Witness:
+    def account(self) -> Conflict:
         """What is measured of the disagreement for which the base stops, or drives slowly."""
-        return Witness(self.monitor.reason, self.monitor.detail, True) if self.monitor.reason else self.witness
+        return Conflict(self.monitor.reason, self.monitor.detail, True) if self.monitor.reason else self.conflict
 
-    def add_pose(self, stamp_ns: int, state: str, seen: Motion, resets: int, witness: Witness = AGREE) -> None:
+    def add_pose(self, stamp_ns: int, state: str, seen: Motion, resets: int, conflict: Conflict = AGREE) -> None:
         """Take the next pose, and how often odometry has begun again; a lost pose says nothing about the motion."""
         settings = self._settings
-        self.witness = witness if self._checks else AGREE
+        self.conflict = conflict if self._checks else AGREE
         self._is_degraded = state == TrackingState.DEGRADED
         # A NaN is uncertain; a level of 0 switches its rule off.
         levels = (
@@ -116,7 +116,7 @@ class Plausibility:
             pose_unsure=self._unsure.seconds >= self._settings.sigma_s,
             motor_faulty=self._is_faulty,
             battery_empty=self._low.seconds >= BATTERY_S,
-            disagreement=self.monitor.reason or (self.witness.reason if self.witness.is_fault else ""),
+            disagreement=self.monitor.reason or (self.conflict.reason if self.conflict.is_fault else ""),
         )
 
     def slowed(self, wanted: Twist, limits: VelocityLimits) -> Twist:

@@ -38,8 +38,8 @@ from omnid.core.control.motion_monitor import (
     IMAGES_OR_GYRO,
     IMAGES_OR_WHEELS,
     WHEELS_DIFFER,
+    Conflict,
     Difference,
-    Witness,
 )
 from omnid.core.odometry.motion_filter import MotionFilter
 
@@ -125,7 +125,7 @@ class MotionAgreement:
         while self._steps and self._steps[0][1] < time_s:
             self._steps.popleft()
 
-    def _compare(self, starts: Array, ends: Array, ways: Array, turns: Array, aside: Array) -> Witness:
+    def _compare(self, starts: Array, ends: Array, ways: Array, turns: Array, aside: Array) -> Conflict:
         """Return the account that differs, and whether it is a fault, by steps (N,) of the cameras."""
         # 1. The sums of each account and the images; wheels are the worse one of distance and turn.
         lagged = starts - LAGS_S[:, None], ends - LAGS_S[:, None]
@@ -140,7 +140,7 @@ class MotionAgreement:
         if not wheels.differs and not of_gyro.differs:
             self._late_since_s = None
             to_side = _aside(spans, turns, aside) if distance.is_known else _Finding()
-            return Witness(IMAGES_ASIDE, to_side.text, to_side.excess >= 1.0) if to_side.differs else AGREE
+            return Conflict(IMAGES_ASIDE, to_side.text, to_side.excess >= 1.0) if to_side.differs else AGREE
         if wheels.differs and of_gyro.differs:
             reason, found = IMAGES_DIFFER, max(wheels, of_gyro, key=lambda found: found.excess)
         elif wheels.differs:
@@ -168,7 +168,7 @@ class MotionAgreement:
         else:
             cause = likely_cause.of_wheels(seen, Steps(*wheels_by_lag[_NO_LAG].T.tolist()))
         detail = f"{'by a factor' if cause and found.is_late else found.text}{cause and ': '}{cause}"
-        return Witness(reason, detail, is_fault, *differences)
+        return Conflict(reason, detail, is_fault, *differences)
 
     def _is_at_rest(self, starts: Array, ends: Array, ways: Array, turns: Array) -> bool:
         """True if images and wheels have shown no motion for STILL_S."""
@@ -266,14 +266,14 @@ class Contradiction:
         self._faults, self._doubt = np.zeros(6), np.zeros(6)  # displacements [t; r] as twists in odom
         self._fault_s = -math.inf  # time of the last fault
 
-    def add(self, witness: Witness, T_odom_base: Array, time_s: float) -> Array:
+    def add(self, conflict: Conflict, T_odom_base: Array, time_s: float) -> Array:
         """Add what the accounts differ by at a pose; return its covariance (6, 6) in the axes of the base."""
-        # The sums of the witness overlap from pair to pair: only their part since the last fault is new. Ways and turns
+        # The sums of a conflict overlap from pair to pair: only the part since the last fault is new. Ways and turns
         # in it are so short that their order does not matter.
         seconds, to_odom = time_s - self._fault_s, se3.adjoint(T_odom_base)
-        new = to_odom @ [witness.distance.part(seconds), 0.0, 0.0, 0.0, 0.0, witness.turn.part(seconds)]
-        is_fault = witness.contradicts_images and witness.is_fault
-        self._doubt = new if witness.contradicts_images and not is_fault else np.zeros(6)
+        new = to_odom @ [conflict.distance.part(seconds), 0.0, 0.0, 0.0, 0.0, conflict.turn.part(seconds)]
+        is_fault = conflict.contradicts_images and conflict.is_fault
+        self._doubt = new if conflict.contradicts_images and not is_fault else np.zeros(6)
         if is_fault:
             self._faults, self._fault_s = self._faults + new, time_s
         displacement = se3.adjoint(se3.inverse(T_odom_base)) @ (self._faults + self._doubt)

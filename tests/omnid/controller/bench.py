@@ -14,7 +14,7 @@ from omnid.core.control.arming import AUTOMATIC, ArmRequest
 from omnid.core.control.command_sources import OPERATOR, TimedSetpoint
 from omnid.core.control.control_law import ControllerPose, ControllerSettings
 from omnid.core.control.heading_controller import HeadingLimits, Setpoint, VelocityLimits
-from omnid.core.control.motion_monitor import AGREE, Witness
+from omnid.core.control.motion_monitor import AGREE, Conflict
 from omnid.core.control.safety_rules import Deadlines
 from omnid.core.control.trust import TrustSettings
 from omnid.engine.telemetry import StageStats
@@ -99,7 +99,7 @@ class Bench:
         velocity_mps: float = math.nan,
         sigma_mps: float = 0.0,
         resets: int = 0,
-        witness: Witness = AGREE,
+        conflict: Conflict = AGREE,
     ) -> None:
         self.controller.take(
             ControllerPose(
@@ -110,7 +110,7 @@ class Bench:
                 velocity_mps,
                 sigma_mps,
                 resets=resets,
-                witness=witness,
+                conflict=conflict,
             )
         )
 

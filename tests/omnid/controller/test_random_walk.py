@@ -39,7 +39,7 @@ from omnid.core.control.heading_controller import (
     longest_lead_rad,
     wrap_angle,
 )
-from omnid.core.control.motion_monitor import AGREE, WITNESSES, Witness
+from omnid.core.control.motion_monitor import AGREE, CONFLICTS, Conflict
 from tests.omnid.controller.bench import LIMITS, PERIOD_NS, PERIOD_S, SETTINGS
 
 TICKS = 6_000
@@ -155,7 +155,7 @@ class Oracle:
             or late_s > DEADLINES.tick_s
             or pose is None
             or pose.state == "lost"
-            or pose.witness.is_fault
+            or pose.conflict.is_fault
             or abs(now_ns - pose.stamp_ns) * 1e-9 > DEADLINES.pose_s
         )
 
@@ -190,7 +190,7 @@ class Walk:
         self.motion, self.last_ns = STOP, self.now_ns  # that the base follows, and since when
         self.calm, self.quiet = True, False  # phases with few faults and with many, without commands
         self.seen_mps, self.sigma_mps, self.resets, self.steady = math.nan, 0.0, 0, False
-        self.contacts, self.witness = NO_CONTACT, AGREE
+        self.contacts, self.conflict = NO_CONTACT, AGREE
         self.main = SENDERS[0]  # source and sender of most commands of a phase
         self.heading_rad = self.reported_rad = 0.0  # in odom; in the count of the motor controller
         self.seen: Counter[str] = Counter()
@@ -202,9 +202,9 @@ class Walk:
             if tick % PHASE == 0:
                 self.calm = self.rng.random() < 0.7
                 usual, self.steady = self.chance(0.7, 0.4), rng.random() < 0.5
-                oddity, self.witness = USUAL if usual else rng.choice(ODDITIES), AGREE
+                oddity, self.conflict = USUAL if usual else rng.choice(ODDITIES), AGREE
                 if usual and rng.random() < 0.4:
-                    self.witness = Witness(rng.choice(WITNESSES), "", rng.random() < 0.7)
+                    self.conflict = Conflict(rng.choice(CONFLICTS), "", rng.random() < 0.7)
                 self.motor.number, self.motor.battery_v, self.motor.wheels_mps, self.seen_mps, self.sigma_mps = oddity
             if tick % 25 == 0:
                 self.scans = self.rng.choice(SCANS)
@@ -271,7 +271,7 @@ class Walk:
             self.seen_mps,
             self.sigma_mps,
             resets=self.resets,
-            witness=self.witness,
+            conflict=self.conflict,
         )
         self.oracle.pose = pose
         self.controller.take(pose)

@@ -17,13 +17,13 @@ from omnid.core.control.contacts import BUMPER, BUS, CLIFF, LATCHING, MOTOR, NO_
 from omnid.core.control.motion_monitor import (
     ADVICE,
     COMPARED,
+    CONFLICTS,
     DISAGREEMENTS,
     NOT_COMMANDED,
     NOT_FOLLOWED,
     NOT_SEEN,
-    WITNESSES,
+    Conflict,
     MotionSettings,
-    Witness,
 )
 from tests.omnid.controller.bench import LIMITS, SETTINGS, UNATTENDED, Bench
 
@@ -80,7 +80,7 @@ def run_away(bench: Bench) -> None:
 
 
 def differ(bench: Bench, reason: str) -> None:
-    bench.send_pose(witness=Witness(reason, is_fault=True))
+    bench.send_pose(conflict=Conflict(reason, is_fault=True))
     bench.tick()
 
 
@@ -108,7 +108,7 @@ FAULTS: dict[str, Callable[[Bench], None]] = {
     NOT_FOLLOWED: run_away,
     NOT_SEEN: lambda bench: drive_until_stopped(bench, velocity_mps=0.0),
     NOT_COMMANDED: lambda bench: drive_until_stopped(bench, velocity_mps=1.2),
-    **{reason: partial(differ, reason=reason) for reason in WITNESSES},
+    **{reason: partial(differ, reason=reason) for reason in CONFLICTS},
 }
 
 
@@ -279,19 +279,19 @@ def test_bumper_and_cliff_latch_in_both_modes_and_no_request_is_accepted_while_t
 @pytest.mark.hazard("H37")
 def test_a_doubt_slows_the_base_down_and_says_what_differs_and_by_how_much(driving: Bench) -> None:
     """Half of the limits of speed; with the check of motion off, nothing."""
-    doubt = Witness(WITNESSES[0], "by 0.5 s")
+    doubt = Conflict(CONFLICTS[0], "by 0.5 s")
     for _ in range(20):
-        driving.send_pose(witness=doubt)
+        driving.send_pose(conflict=doubt)
         driving.send_setpoint()
         driving.tick()
     assert 0.0 < driving.last.velocity_mps == pytest.approx(0.5 * LIMITS.velocity_mps)
     assert driving.lines[-1] == f"the wheels turn slowly: {doubt.reason} by 0.5 s"
-    driving.send_pose(witness=doubt._replace(is_fault=True))
+    driving.send_pose(conflict=doubt._replace(is_fault=True))
     driving.tick()
     assert driving.lines[-1].startswith(f"the wheels stop: {doubt.reason} by 0.5 s; {ADVICE}")
     unchecked = Bench(replace(SETTINGS, motion=MotionSettings(check=False)))
     unchecked.drive()
-    unchecked.send_pose(witness=doubt._replace(is_fault=True))
+    unchecked.send_pose(conflict=doubt._replace(is_fault=True))
     unchecked.send_setpoint()
     unchecked.tick()
     assert unchecked.controller.state.armed and unchecked.last.velocity_mps == 0.3

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from drivers.motion import GyroSample, MotionSample, WheelSample
-from omnid.core.control.motion_monitor import Motion, MotionMonitor, MotionSettings, Twist, Witness
+from omnid.core.control.motion_monitor import Conflict, Motion, MotionMonitor, MotionSettings, Twist
 from omnid.core.odometry.motion_agreement import MotionAgreement
 from omnid.core.odometry.motion_filter import MotionFilter
 
@@ -48,7 +48,9 @@ def right_gyro(w: float) -> float:
     return w
 
 
-def witness(path: Path, wheels: Wheels | None, gyro: Gyro | None, seconds: float = 4.0, late_s: float = 0.0) -> Witness:
+def conflict(
+    path: Path, wheels: Wheels | None, gyro: Gyro | None, seconds: float = 4.0, late_s: float = 0.0
+) -> Conflict:
     """Return what the comparison says after so many seconds; late_s: of the images."""
     motion, rng = MotionFilter(), np.random.default_rng(1)
     sensors, agreement = motion.sensors, MotionAgreement(motion)
@@ -105,13 +107,13 @@ def witness(path: Path, wheels: Wheels | None, gyro: Gyro | None, seconds: float
     ],
 )
 def test_a_wrong_setting_is_named(path: Path, wheels: Wheels | None, gyro: Gyro | None, expected: str) -> None:
-    found = witness(path, wheels, gyro)
+    found = conflict(path, wheels, gyro)
     assert found.reason and expected in found.detail, found
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.8])
 def test_nothing_is_guessed_of_right_settings(late_s: float) -> None:
-    found = witness(curves, right_wheels, right_gyro, 9.0, late_s)
+    found = conflict(curves, right_wheels, right_gyro, 9.0, late_s)
     assert ":" not in found.detail and bool(found.reason) == bool(late_s)
 
 

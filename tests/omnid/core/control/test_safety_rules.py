@@ -9,7 +9,7 @@ from itertools import combinations
 import pytest
 
 from omnid.core.control import safety_rules
-from omnid.core.control.motion_monitor import NOT_COMMANDED, NOT_FOLLOWED, NOT_SEEN, WITNESSES
+from omnid.core.control.motion_monitor import CONFLICTS, NOT_COMMANDED, NOT_FOLLOWED, NOT_SEEN
 from omnid.core.control.safety_rules import Deadlines, SafetyInputs, stop_reason
 
 DEADLINES = Deadlines(pose_s=0.5, command_s=0.4, tick_s=0.25)
@@ -33,7 +33,7 @@ CAUSES: dict[str, dict[str, object]] = {  # in the order in which they are repor
     NOT_FOLLOWED: {"disagreement": NOT_FOLLOWED},
     NOT_SEEN: {"disagreement": NOT_SEEN},
     NOT_COMMANDED: {"disagreement": NOT_COMMANDED},
-    **{reason: {"disagreement": reason} for reason in WITNESSES},
+    **{reason: {"disagreement": reason} for reason in CONFLICTS},
     safety_rules.POSE_JUMPED: {"pose_jumped": True},
     safety_rules.NOT_ARMED: {"armed": False},
     safety_rules.COMMAND_STALE: {"command_age_s": 0.41},

@@ -17,8 +17,8 @@ from omnid.core.control.motion_monitor import (
     IMAGES_DIFFER,
     IMAGES_OR_WHEELS,
     WHEELS_DIFFER,
+    Conflict,
     Difference,
-    Witness,
 )
 from omnid.core.odometry.motion_agreement import LATE_S, STILL_S, Contradiction, MotionAgreement
 from omnid.core.odometry.motion_filter import MotionFilter
@@ -56,7 +56,7 @@ def speeds(turns: bool) -> tuple[Array, Array]:
 
 def driven(
     errors: Errors, seconds: float, *, turns: bool = True, stops_s: float = np.inf, seed: int = 1
-) -> list[tuple[float, Witness]]:
+) -> list[tuple[float, Conflict]]:
     """Return the result after each pair of a drive."""
     rng, motion = np.random.default_rng(seed), MotionFilter()
     sensors, agreement = motion.sensors, MotionAgreement(motion)
@@ -98,7 +98,7 @@ def ns(time_s: float) -> int:
     return START_NS + round(time_s * 1e9)
 
 
-def first(found: list[tuple[float, Witness]], *, is_fault: bool) -> tuple[float, Witness]:
+def first(found: list[tuple[float, Conflict]], *, is_fault: bool) -> tuple[float, Conflict]:
     """Return the first result of that grade, with its time."""
     return next((at_s, result) for at_s, result in found if result.reason and result.is_fault >= is_fault)
 
@@ -215,14 +215,14 @@ def pose(x_m: float, yaw_rad: float = 0.0) -> Array:
 def test_a_fault_stays_in_a_later_pose_and_turns_with_it() -> None:
     """After a quarter turn to the left, what was ahead is to the right."""
     contradiction = Contradiction()
-    contradiction.add(Witness(IMAGES_OR_WHEELS, "", True, Difference(0.4, 6.0)), pose(1.0), 1.0)
+    contradiction.add(Conflict(IMAGES_OR_WHEELS, "", True, Difference(0.4, 6.0)), pose(1.0), 1.0)
     later = contradiction.add(AGREE, pose(1.0, np.pi / 2), 9.0)
     assert np.diag(later)[:3] == pytest.approx([0.0, 0.4**2, 0.0], abs=1e-9)
 
 
 def test_a_doubt_is_over_with_its_reason() -> None:
     """Until then the pose may be off by it, beside what a fault has left."""
-    doubt, fault = (Witness(IMAGES_OR_WHEELS, "", is_fault, Difference(0.2, 6.0)) for is_fault in (False, True))
+    doubt, fault = (Conflict(IMAGES_OR_WHEELS, "", is_fault, Difference(0.2, 6.0)) for is_fault in (False, True))
     contradiction = Contradiction()
     assert contradiction.add(doubt, pose(0.0), 1.0)[0, 0] == pytest.approx(0.2**2)
     assert not contradiction.add(AGREE, pose(0.0), 2.0).any()
@@ -232,5 +232,5 @@ def test_a_doubt_is_over_with_its_reason() -> None:
 
 @pytest.mark.parametrize("reason", [WHEELS_DIFFER, GYRO_DIFFERS])
 def test_accounts_that_two_others_contradict_say_nothing_about_the_pose(reason: str) -> None:
-    witness = Witness(reason, "", True, Difference(0.4, 6.0), Difference(0.1, 6.0))
-    assert not Contradiction().add(witness, pose(0.0), 0.0).any()
+    conflict = Conflict(reason, "", True, Difference(0.4, 6.0), Difference(0.1, 6.0))
+    assert not Contradiction().add(conflict, pose(0.0), 0.0).any()
