@@ -86,9 +86,6 @@ def show_cameras(args: argparse.Namespace) -> int:
     """
     if args.snapshot is not None:
         return _snapshot(args)
-    for name in ("log", "lower", "upper"):
-        if getattr(args, name) is not None:
-            raise OmnidError(f"--{name} belongs to --snapshot DIR: name the folder for the images as well")
     devices = capture_devices(ROOT)
     if not devices:
         return failed("no cameras: the kernel has no capture device; check the cables and the output of `dmesg`")

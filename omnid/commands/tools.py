@@ -30,8 +30,6 @@ def print_config(args: argparse.Namespace) -> int:
     """
     if args.action == "check" and args.file is None:
         raise OmnidError("omnid config check: name the file")
-    if args.action == "print" and args.file is not None:
-        raise OmnidError(f"omnid config print: takes no file: `omnid config --config {args.file}` prints its settings")
     args.config = args.file or args.config
     config = settings_of(args)
     if args.action == "print":

@@ -52,10 +52,6 @@ def run(args: argparse.Namespace) -> int:
       view out.mcap -o out.rrd
       view --robot rover --connect tcp/robot:7447
     """
-    if args.log is None and args.topic:
-        raise OmnidError("--topic belongs to a recording: name a LOG as well")
-    if args.log is not None and (args.connect or args.seconds):
-        raise OmnidError(f"--connect and --seconds do not go with {args.log}: leave out the LOG to show a robot")
     config, sink = settings_of(args), sink_of(args.output, args.log)
     try:
         if args.log is None:

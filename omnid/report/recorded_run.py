@@ -36,7 +36,6 @@ from omnid.transport import status_names
 from omnid.transport.codec import Cloud, Diagnostics, DiagnosticStatus, Pose, PoseInMap, TwistRecord
 from omnid.transport.status_names import Key, short_name
 from omnid.transport.topics import MAP_POSE
-from omnid.utc import OTHER_CLOCK_NS
 
 STATES: Final = tuple(TrackingState)
 UNKNOWN: Final = -1  # rank of a state that is not recorded
@@ -48,6 +47,7 @@ _COUNTERS: Final[Mapping[str, str]] = {  # of faults, with the text of the event
     Key.ERRORS: "errors",
     Key.LOSSES: "camera lost",
     Key.RESTARTS: "stream restarted",
+    Key.RESETS: "odometry was reset, with an unknown gap",
     Key.BROKEN: "images that cannot be decoded",
     Key.EXPIRIES: "watchdog expired",
     Key.UNPAIRED_LOWER: "lower images without a partner",
@@ -81,10 +81,9 @@ class RecordedRun:
     newest of all values
     map_poses (M, 3): t, position's and heading's correction by the map [m, rad]; map_xy (M, 2) m
     drives: (K, 3) t, m/s, rad/s by topic, DRIVE or TWIST_COMMAND; cloud: the newest
-    restarts: first poses after each start of the daemon but the first; restarted_s: times of the reports of them
-    resets: times and numbers of resets of odometry
-    left_out: messages not of their type, poses out of range, not later than the one before, or stamped far from the
-    time of logging; corrupt: chunks and records of the file left out
+    resets: number of resets of odometry
+    left_out: messages not of their type, poses out of range or not later than the one before; corrupt: chunks and
+    records of the file left out
     """
 
     def __init__(self, path: Path, topic: str | None = None) -> None:
@@ -100,15 +99,12 @@ class RecordedRun:
         statuses, names = list[Diagnostics](), set[str]()
         drives: dict[str, list[TwistRecord]] = {}
         self.cloud: Cloud | None = None
-        offset_ns: int | None = None  # from the stamps of the poses to the times of logging
         left_out = 0
         for message in reader.messages((ODOMETRY, MAP_POSE, STATUS, CLOUD, DRIVE, TWIST_COMMAND)):
             match message.content:
                 case Pose() as pose:
-                    offset_ns = message.log_time_ns - pose.stamp_ns if offset_ns is None else offset_ns
-                    is_near = abs(message.log_time_ns - pose.stamp_ns - offset_ns) <= OTHER_CLOCK_NS
                     is_later = not poses or pose.stamp_ns > poses[-1].stamp_ns
-                    if is_near and is_later and (np.abs(pose.T_odom_base[:-1, -1]) <= POSITION_LIMIT_M).all():
+                    if is_later and (np.abs(pose.T_odom_base[:-1, -1]) <= POSITION_LIMIT_M).all():
                         poses.append(pose)
                     else:
                         left_out += 1
@@ -158,7 +154,7 @@ class RecordedRun:
                 corrections.append((seconds(in_map.stamp_ns), moved_m, turned_rad))
                 map_xy.append(T_map[:2, -1])
         self.map_poses, self.map_xy = np.array(corrections).reshape(-1, 3), np.array(map_xy).reshape(-1, 2)
-        # 5. The newest values of each part, the state of each pose, starts and resets.
+        # 5. The newest values of each part, the state of each pose, resets.
         self.newest: dict[str, DiagnosticStatus] = {}
         self.by_name: dict[str, list[tuple[float, DiagnosticStatus]]] = {}
         for t_s, status in ((t_s, status) for t_s, report in self.statuses for status in report):
@@ -173,9 +169,7 @@ class RecordedRun:
         known = sorted((t, STATES.index(state)) for t, state in states if state is not None)
         ranks = np.array([UNKNOWN, *(rank for _, rank in known)])
         self.ranks = ranks[np.searchsorted([t for t, _ in known], self.t_s + 1e-9, side="right")]
-        self.restarts, self.restarted_s = list[int](), list[float]()
-        self.resets = list[tuple[float, int]]()
-        self._find_starts_and_resets()
+        self.resets = int(max(self.series(status_names.ODOMETRY, Key.RESETS)[1], default=0))
 
     @property
     def T_base_rig(self) -> Array:
@@ -217,10 +211,8 @@ class RecordedRun:
         return np.column_stack([self.t_s[:-1], self.t_s[1:]])[steps_s > longest_s]
 
     def length_m(self) -> float:
-        """Return the length of the path; the step from one odom to the next is no part of it."""
-        steps_m = np.linalg.norm(np.diff(self.xyz, axis=0), axis=1)
-        steps_m[[index - 1 for index in self.restarts]] = 0.0
-        return float(steps_m.sum())
+        """Return the length of the path."""
+        return float(np.linalg.norm(np.diff(self.xyz, axis=0), axis=1).sum())
 
     def events(self) -> list[Event]:
         """Return the events in the order of time."""
@@ -230,30 +222,10 @@ class RecordedRun:
             if index or rank != 0:  # a run that begins well is no event
                 text = STATES[rank] if rank >= 0 else "unknown"
                 found.append(Event(t_s, t_s, (GOOD, WARNING, ERROR)[max(rank, 0)], "state", text))
-        text = "odometry was reset, with an unknown gap"
-        found += [Event(t_s, t_s, ERROR, "state", text, count if count > 1 else 0) for t_s, count in self.resets]
-        text = "the robot was started again, with a new odom"
-        found += [Event(t_s, t_s, WARNING, "state", text) for t_s in self.restarted_s]
         for name in self.newest:
             found += self._message_events(name) if name not in (status_names.ODOMETRY, status_names.SUMMARY) else ()
             found += self._counter_events(name)
         return sorted(found, key=lambda event: event.start_s)
-
-    def _find_starts_and_resets(self) -> None:
-        """Find the starts of the daemon, with a new odom, by the identity of its runs, and the resets of odometry."""
-        run, newest = "", -1
-        for t_s, status in self.entries(status_names.ODOMETRY):
-            resets, now = status_names.count(status.values.get(Key.RESETS, "")), status.values.get(Key.RUN, run)
-            if resets is None:
-                continue
-            if run and now != run:
-                self.restarts += [index for index in [int(np.searchsorted(self.t_s, t_s))] if 0 < index < len(self.t_s)]
-                self.restarted_s.append(t_s)
-                newest = 0
-            run = now
-            if resets > newest >= 0:
-                self.resets.append((t_s, resets - newest))
-            newest = max(resets, newest)
 
     def _message_events(self, name: str) -> Iterator[Event]:
         """Yield the changes of a part's message; a change of digits only is none."""

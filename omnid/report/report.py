@@ -82,7 +82,7 @@ def _head(run: RecordedRun) -> list[str]:
     known = run.ranks[run.ranks != UNKNOWN]
     if len(known):
         tiles += [(name, _share(int((known == rank).sum()), len(known))) for rank, name in enumerate(STATES)]
-        tiles.append(("resets", str(sum(count for _, count in run.resets))))
+        tiles.append(("resets", str(run.resets)))
     p50, p99 = (_rounded(run.values(ODOMETRY).get(time_key(CAPTURE_TO_POSE, p), "")) for p in ("p50", "p99"))
     if p50:
         tiles.append(("image to pose, p50 / p99", f"{p50} / {p99} ms"))
@@ -99,7 +99,7 @@ def _warnings(run: RecordedRun, true: Trajectory | None) -> list[str]:
     lines = {
         f"The log is cut or corrupt: {found.fault}.": found.state is LogState.BROKEN,
         f"{run.corrupt} corrupt chunks or records were skipped.": run.corrupt,
-        f"{run.left_out} messages were left out: not of their type, out of range, or with a wrong stamp.": run.left_out,
+        f"{run.left_out} messages were left out: not of their type, out of range, or not in order.": run.left_out,
         f"The truth is compared as if the rig's frame were base_link: {run.rig_fault}.": true and run.rig is None,
     }
     return [f"<p class='warn'>{escape(line)}</p>" for line, is_so in lines.items() if is_so]
@@ -133,13 +133,12 @@ def _plan(run: RecordedRun, events: Sequence[Event], truth: _Truth | None) -> li
     height_m = float((run.T_odom_base[0] @ run.T_base_rig)[2, -1])
     low_m, high_m = drawn_heights((run.rig and run.rig.height_m()) or 0.0)
     points_xy, confidence = between(points, confidence, (height_m + low_m, height_m + high_m))
-    # 2. The lines: a stretch of the path for each state; none leads from one odom to the next.
+    # 2. The lines: a stretch of the path for each state.
     xy, in_map, colour = run.xyz[:, :2], _map_path(run), colours()
     stretches: dict[int, list[Array]] = {}
-    breaks = {0, len(xy), *run.restarts, *(np.flatnonzero(np.diff(run.ranks)) + 1).tolist()}
+    breaks = {0, len(xy), *(np.flatnonzero(np.diff(run.ranks)) + 1).tolist()}
     for first, last in pairwise(sorted(breaks)):
-        begins_odom = first == 0 or first in run.restarts
-        stretches.setdefault(int(run.ranks[first]), []).append(xy[first if begins_odom else first - 1 : last])
+        stretches.setdefault(int(run.ranks[first]), []).append(xy[max(0, first - 1) : last])
     beside = {"truth": ([truth.base_xy] if truth else [], "the true path"), "map": ([in_map], "in the map")}
     lines = [Lines(parts, colour[name], 2) for name, (parts, _) in beside.items()]
     lines.append(Lines([part for parts in stretches.values() for part in parts], WHITE, 9))

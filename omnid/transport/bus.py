@@ -92,14 +92,13 @@ class Bus:
     ) -> None:
         """Open the session, or that of a client with the first `connect`. gives_time: there is a topic /clock.
 
-        Raise OmnidError for a wrong configuration. Robots of the same name are reported by one call of warn and in the
-        status; each time that the name is no longer unique, the subscriber of commands receives a stop.
+        Raise OmnidError for a wrong configuration. Each time that the name is no longer unique, warn is called, and the
+        subscriber of commands receives a stop.
         """
         self._config, self._warn = checked(config), warn
         # A robot whose time is the computer's has none: programs that wait for it would believe to be in a simulation.
         self._topics = {name: topic for name, topic in PUBLISHED.items() if gives_time or name != CLOCK}
         self._namesakes: set[str] = set()  # liveliness tokens of other robots of this name
-        self._warned = False
         self._session: zenoh.Session | None = None
         self._publishers: dict[str, TopicPublisher] = {}
         self._newest: dict[str, tuple[bytes, bytes | None]] = {}  # payload and attachment of latched topics
@@ -238,12 +237,11 @@ class Bus:
                 self._namesakes.discard(key)
             elif key != own:
                 self._namesakes.add(key)
-                if was_unique and not self._warned:
-                    self._warned = True
+                if was_unique:
                     self._warn(self._same_name)
-                # Two robots that obey one operator are not what the operator expects.
-                if was_unique and self._on_command is not None:
-                    self._on_command(Request(STOP))
+                    # Two robots that obey one operator are not what the operator expects.
+                    if self._on_command is not None:
+                        self._on_command(Request(STOP))
 
         tokens = session.liveliness()
         self._declared += [

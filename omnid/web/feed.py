@@ -37,7 +37,6 @@ from omnid.transport.topics import MAP_POSE, PANORAMA, SCAN
 QUIET_S: Final = 0.5  # The state is sent after this time even without a message of the robot; between two connections
 MOST_POINTS: Final = 4000  # Most points of the path.
 OLDEST_S: Final = 1.0  # age of the newest state that a page may have when it asks for a motion
-LARGEST_MAP_PX: Final = 1024  # edge of the map as it is sent; larger ones are reduced
 NAVIGATION: Final = "navigation"
 PATH_FRAME: Final = "odom"
 FRAMES: Final = (PATH_FRAME, "map")  # Frames of a map that is drawn.
@@ -321,16 +320,12 @@ def map_cells(grid: Map) -> tuple[dict[str, Any], bytes]:
     """
     if not all(map(math.isfinite, (grid.cell_m, *grid.corner))) or not grid.cells.size or grid.frame not in FRAMES:
         return {"width": 0, "frame": grid.frame}, b""
-    step = -(-max(grid.cells.shape) // LARGEST_MAP_PX)
     cells = np.where(grid.cells > 50, 2, np.where(grid.cells >= 0, 1, 0)).astype(np.uint8)
-    # The highest value in each square of step x step cells.
-    squares = np.pad(cells, [(0, -edge % step) for edge in cells.shape])
-    cells = squares.reshape(-1, step, squares.shape[1] // step, step).max(axis=(1, 3))
     header = {
         "width": cells.shape[1],
         "height": cells.shape[0],
         "frame": grid.frame,
-        "cell_m": step * grid.cell_m,
+        "cell_m": grid.cell_m,
         "x_m": grid.corner[0],
         "y_m": grid.corner[1],
         "known": None,
@@ -339,7 +334,7 @@ def map_cells(grid: Map) -> tuple[dict[str, Any], bytes]:
     rows, columns = np.nonzero(cells)
     if rows.size:
         edges = np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1])
-        header["known"] = (np.tile(grid.corner, 2) + step * grid.cell_m * edges).tolist()
+        header["known"] = (np.tile(grid.corner, 2) + grid.cell_m * edges).tolist()
     return header, zlib.compress(cells.tobytes(), 1)
 
 

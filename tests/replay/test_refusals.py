@@ -59,7 +59,6 @@ TABLE = (
     ("run --log {log} --rig {rig} --lower /front", "no topic '/front'"),
     ("simulate room --size 10", "--size: expected 64 to 2048, found '10'"),
     ("record --rig {rig} --lower /dev/no-camera --upper /dev/null", "/dev/no-camera"),
-    ("cameras --lower /front", "belongs to --snapshot DIR"),
     ("config check", "name the file"),
     ("goto 1", "expected X Y [YAW]"),
     ("route teach a/b", "a/b"),

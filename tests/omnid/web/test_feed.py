@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import math
 import time
-import zlib
 from typing import Any
 
 import numpy as np
@@ -17,10 +16,10 @@ from drivers.frame import Frame
 from omnid.monitor.robot_state import ReceivedMessage, RobotState
 from omnid.transport import codec
 from omnid.transport.bus import BusConfig
-from omnid.transport.codec import Diagnostics, DiagnosticStatus, Map, Pose, PoseAttachment, Scan, scan_cdr
+from omnid.transport.codec import Diagnostics, DiagnosticStatus, Pose, PoseAttachment, Scan, scan_cdr
 from omnid.transport.sensor_codec import image_cdr
 from omnid.transport.status_names import NAVIGATION, ODOMETRY, PLACES, WHEELS, Key
-from omnid.web.feed import LARGEST_MAP_PX, MOST_POINTS, LivePath, RobotFeed, map_cells, scan_news, state_news
+from omnid.web.feed import MOST_POINTS, LivePath, RobotFeed, scan_news, state_news
 from omnid.web.metrics import metrics
 from tests.omnid.transport.bus_fixtures import odometry
 
@@ -93,17 +92,6 @@ def test_warnings_come_with_the_worst_first_and_with_their_remedies() -> None:
     first = shown(robot, "no route")["warnings"][0]
     assert (first["level"], first["name"], first["message"]) == (2, "connection", "no route")
     assert len(shown(robot, "no route")["warnings"]) == 3, "one of both only"
-
-
-def test_a_large_map_is_reduced_and_loses_no_obstacle() -> None:
-    cells = np.zeros((3, LARGEST_MAP_PX + 1), np.int8)
-    cells[2, -1] = cells[0, 3] = 100
-    header, content = map_cells(Map(0, "odom", cells, 0.05, (0.0, 0.0)))
-    assert (header["width"], header["height"], header["cell_m"]) == (LARGEST_MAP_PX // 2 + 1, 2, 0.1)
-    small = np.frombuffer(zlib.decompress(content), np.uint8).reshape(2, -1)
-    assert np.argwhere(small == 2).tolist() == [[0, 1], [1, LARGEST_MAP_PX // 2]]
-    header, content = map_cells(Map(0, "odom", cells[:, 1:], 0.05, (0.0, 0.0)))
-    assert header["width"] == LARGEST_MAP_PX and header["cell_m"] == 0.05
 
 
 def scan(ranges: list[float], azimuths: list[float], frame: str = "base_link", stamp_ns: int = 100) -> Scan:
