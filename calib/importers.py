@@ -99,14 +99,14 @@ def parse_chain(
 ) -> Rig:
     """Parse the rig of a file's text; warn: takes lines about what had to be assumed."""
 
-    def told(line: str) -> None:
+    def warn_of_file(line: str) -> None:
         warn(f"{name}: {line}")
 
     with within(f"{name}: "):
         chain = _chain(load_yaml(text))
         # 1. The poses of the cameras, and which of them is lower.
         poses, has_rig_frame = _poses(chain)
-        low, up = _lower_and_upper(chain, (lower, upper), poses, told, has_rig_frame=has_rig_frame)
+        low, up = _lower_and_upper(chain, (lower, upper), poses, warn_of_file, has_rig_frame=has_rig_frame)
         if not {low, up} <= poses.keys():
             raise CalibError(f"no transform between {low} and {up}; expected T_cam_imu of both, or T_cn_cnm1")
         # 2. Their models. Nothing in the file tells lenses from mirrors whose images were flipped.
@@ -115,7 +115,7 @@ def parse_chain(
             with within(f"{key}: "):
                 models.append(chain[key].camera())
         if any(isinstance(camera, UnifiedCamera) and camera.xi > 0 and sees_directly(camera) for camera in models):
-            told(
+            warn_of_file(
                 "its omni cameras count as lenses, by their focal lengths; if these are mirrors whose images were "
                 "flipped, give them masks in the rig.toml"
             )
@@ -127,7 +127,7 @@ def parse_chain(
             x, y, z = rig.upper.viewpoint - rig.lower.viewpoint
             lean_rad = np.arctan2(np.hypot(x, y), z)
             if lean_rad > MAX_LEAN_RAD:
-                told(
+                warn_of_file(
                     "expected the upper camera along z of the IMU, whose axes become those of the rig, found it "
                     f"{np.rad2deg(lean_rad):.0f} deg off: give --frame cameras, by which the rig frame follows from "
                     "the cameras, or add T_base_rig to the rig"
@@ -135,7 +135,7 @@ def parse_chain(
         else:
             rig = rig_between(models[0], models[1], poses[low] @ se3.inverse(poses[up]), topics)
             for note in mounting_notes(rig):
-                told(f"{note} (or T_cn_cnm1 is inverted)" if is_turned_over(rig) else note)
+                warn_of_file(f"{note} (or T_cn_cnm1 is inverted)" if is_turned_over(rig) else note)
         # 4. The delay of the upper camera: the difference of both cameras' shifts against the IMU's clock.
         shifts = chain[low].timeshift_cam_imu, chain[up].timeshift_cam_imu
         delay_s = 0.0 if shifts[0] is None or shifts[1] is None else shifts[1] - shifts[0]

@@ -39,7 +39,7 @@ _Point: TypeAlias = tuple[_Position, _Position, _Yaw, _Speed, _Keyframe, _Positi
 
 
 class _Head(Struct):
-    """What tells whether a file can be read."""
+    """The part of each version by which a reader knows whether it can read the file."""
 
     format: Literal["omnid route"]
     version: int

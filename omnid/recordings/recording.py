@@ -77,7 +77,7 @@ def choose_odometry_topic(found: LogInfo, topic: str | None = None, robot: str |
 def no_pose(path: Path, topic: str) -> OmnidError:
     """Return the error for a log whose topic of the poses has none that can be read."""
     return OmnidError(
-        f"{path}: topic {topic!r} has no readable pose; `omnid log info {path}` tells whether the log is complete"
+        f"{path}: topic {topic!r} has no readable pose; `omnid log info {path}` reports whether the log is complete"
     )
 
 

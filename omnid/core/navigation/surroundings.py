@@ -59,29 +59,31 @@ class Surroundings:
         self._state = np.array([(m.x_m, m.y_m, m.vx_mps, m.vy_mps) for m in moving]).reshape(-1, 4)
         self._radius_m = np.array([m.radius_m for m in moving])
         self._covariance = np.array([m.covariance for m in moving]).reshape(-1, 4, 4)
-        # 1. What stands there: what moves is left out, with its trail.
-        is_taken = states == OCCUPIED
+        # 1. Obstacles at rest: what moves is left out, with its trail.
+        is_occupied = states == OCCUPIED
         trail = self._state[:, :2] - TRAIL_S * self._state[:, 2:]
-        is_own = _from_segments_m(self._places(is_taken), trail, self._state[:, :2]) <= self._radius_m + OWN_M
-        is_taken[is_taken] = ~is_own.any(axis=1)
-        self.room_m = distances_m(is_taken)  # of each cell to what stands nearest
-        # 2. Floor that is not known, and that which was not seen from near.
+        is_own = _from_segments_m(self._places(is_occupied), trail, self._state[:, :2]) <= self._radius_m + OWN_M
+        is_occupied[is_occupied] = ~is_own.any(axis=1)
+        self.room_m = distances_m(is_occupied)  # of each cell to the nearest obstacle
+        # 2. Floor that is not known, and floor that was not seen although the base came near.
         self.is_unknown = states == UNKNOWN
         is_patch = cv2.morphologyEx(self.is_unknown.view(np.uint8), cv2.MORPH_OPEN, SPECK) > 0
-        is_vain = np.zeros(states.shape, bool)
+        is_unseen = np.zeros(states.shape, bool)
         if pose is not None:
             middle = grid.corner_m + 0.5 * CELL_M - pose[:2]
             y, x = CELL_M * np.indices(states.shape) + middle[::-1, None, None]
-            is_vain = np.hypot(x, y) < NEAR_M
+            is_unseen = np.hypot(x, y) < NEAR_M
         if before is not None:
-            is_vain |= self._cells(before._vain)
-        is_vain &= is_patch
-        self._vain: Array = self._places(is_vain)
+            is_unseen |= self._cells(before._unseen)
+        is_unseen &= is_patch
+        self._unseen: Array = self._places(is_unseen)
         # 3. Where ways end among cells each of which is free.
         if ends is not None:
             is_end = self._cells(ends)
-            self.is_unknown, is_vain = self.is_unknown | is_end, is_vain | is_end
-        self.closed_m = distances_m(is_taken | is_vain)  # of each cell to what stands, or was not seen from near
+            self.is_unknown, is_unseen = self.is_unknown | is_end, is_unseen | is_end
+        self.closed_m = distances_m(
+            is_occupied | is_unseen
+        )  # of each cell to an obstacle or to floor that was not seen from near
 
     @property
     def moves(self) -> bool:
@@ -101,7 +103,7 @@ class Surroundings:
         return flags
 
     def room_at(self, points: Array, of: Array | None = None) -> Array:
-        """Return the distance of points (N, 2) to what stands nearest, FAR_M outside the grid; of: other distances."""
+        """Return the distance of points (N, 2) to the nearest obstacle, FAR_M outside the grid; of: other distances."""
         of = self.room_m if of is None else of
         rows, columns = self.grid.at(points)
         size = len(of)
