@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable
 from copy import copy
 
-from drivers.backoff import Backoff
 from drivers.errors import DriverError
 from drivers.motion import WheelSample
 from drivers.motor import MotorDriver, MotorStatus, VelocityCommand
@@ -20,8 +19,6 @@ from omnid.core.control.motion_monitor import Motion
 from omnid.core.control.safety_rules import AWAITED
 from omnid.core.control.trust import MotorReport
 from omnid.core.nanoseconds import S_PER_NS
-
-FIRST_TOLD_S, LONGEST_TOLD_S = 2.0, 300.0  # between two lines about a motor controller that does not answer
 
 
 class Controller:
@@ -54,7 +51,6 @@ class Controller:
         self._period_ns = round(period_s * 1e9)
         self._law = ControlLaw(settings, self._clock_ns())
         self._boots_until_ns = self._clock_ns() + round((boot_s or 0.0) * 1e9)
-        self._told_again, self._tell_ns = Backoff(LONGEST_TOLD_S, first_s=FIRST_TOLD_S), 0
         self._last_ns = self._due_ns = 0  # the last tick, and when the next one is due
         self._driven_ns = 0  # capture of the newest pose that a command has followed from
         self._motor_stopped = False  # True if the motor controller stopped by itself before the last tick
@@ -143,7 +139,11 @@ class Controller:
         state.reason = reason
         arming, commands, monitor = law.arming, law.commands, law.collision
         state.armed, state.disarmed_by, state.arm_answer = arming.armed, arming.reason, arming.answer
-        state.needs_request, state.halts, state.halted_by = arming.needs_request, arming.halts, arming.halted_by
+        state.needs_request, state.stop_count, state.stopped_by = (
+            arming.needs_request,
+            arming.stop_count,
+            arming.stopped_by,
+        )
         state.refused = commands.refused
         state.source = "" if law.reason or commands.current is None else commands.current.source
         state.slowed_by = law.plausibility.slowed_by
@@ -175,19 +175,16 @@ class Controller:
         if self.state.problem:
             self._report("the motor controller is back" if self.state.sent else "the motor controller answers")
         self.state.failed, self.state.problem, self.state.overdue = False, "", False
-        self._told_again.reset()
         self.state.sent += 1
         return status
 
     def _take_problem(self, problem: str, now_ns: int) -> None:
-        """Keep why the motor controller has not taken a command; report it where it is new, after growing waits."""
+        """Keep why the motor controller has not taken a command; report it where it is new."""
         state = self.state
         state.overdue = not state.sent and now_ns > self._boots_until_ns
-        if state.failed and (problem == state.problem or now_ns < self._tell_ns):
-            return
-        state.problem = problem
-        self._tell_ns = now_ns + round(self._told_again.next_s() * 1e9)
-        self._report(problem if state.sent else f"{AWAITED}: {problem}")
+        if problem != state.problem:
+            state.problem = problem
+            self._report(problem if state.sent else f"{AWAITED}: {problem}")
 
     def _take_status(self, status: MotorStatus, now_ns: int) -> None:
         self._motor_stopped = status.watchdog_expired

@@ -12,7 +12,7 @@ from drivers.motion import WheelSample
 from drivers.motor import VelocityCommand
 from omnid.core.control.arming import NO_ANSWER, STARTED, ArmAnswer
 from omnid.core.control.collision_monitor import remedy
-from omnid.core.control.motion_monitor import ADVICE, COMPARED, CONFLICTS, DISAGREEMENTS, Conflict
+from omnid.core.control.motion_monitor import ADVICE, CONFLICTS, DISAGREEMENTS, Conflict
 from omnid.core.control.safety_rules import ENDS, IDLE
 from omnid.core.control.trust import MOTION_DOUBTFUL
 
@@ -28,8 +28,8 @@ class ControllerState:
     armed: bool = False
     disarmed_by: str = STARTED  # empty while armed
     needs_request: bool = False  # only cmd/arm lets the wheels turn again
-    halts: int = 0  # how often a stop or a fault has made cmd/arm necessary
-    halted_by: str = ""  # the newest of their reasons, kept while armed again
+    stop_count: int = 0  # how often a stop or a fault has made cmd/arm necessary
+    stopped_by: str = ""  # the newest of their reasons, kept while armed again
     arm_answer: ArmAnswer = NO_ANSWER
     source: str = ""  # source of the commands that drive; empty while none does
     failed: bool = False  # the motor controller did not take the last command
@@ -39,7 +39,7 @@ class ControllerState:
     battery_v: float = math.nan  # voltage that the motor controller reports
     slowed_by: str = ""  # why the base drives slowly; empty: it need not
     slowed: int = 0  # how often it began to
-    measured: str = ""  # of the accounts of the motion that differ, and what may have made it; empty: they agree
+    measured: str = ""  # by how much the sensors of the motion differ; empty: they agree
     obstacle: str = ""  # why the collision monitor slows down or stops the base; empty: it does not
     blocked: bool = False  # it stops the base: the command leads to an obstacle
     obstacle_stops: int = 0  # how often it began to
@@ -69,7 +69,7 @@ def transitions(before: ControllerState, after: ControllerState, conflict: Confl
         yield f"arming is refused: {answer.refusal}" if answer.refusal else ARMED
     # 2. A fault while the wheels are at rest, which ends no drive.
     if before.armed and after.needs_request and before.reason:
-        yield f"disarmed while the wheels stand: {after.disarmed_by}; {UNTIL_ARMED}"
+        yield f"disarmed while the wheels are stopped: {after.disarmed_by}; {UNTIL_ARMED}"
     # 3. A reason to drive slowly that a person should examine.
     if after.slowed_by != before.slowed_by and after.slowed_by in (MOTION_DOUBTFUL, *CONFLICTS):
         yield f"the wheels turn slowly: {after.slowed_by}{_detail(after.slowed_by, conflict)}"
@@ -80,11 +80,7 @@ def transitions(before: ControllerState, after: ControllerState, conflict: Confl
     if cuts_drive_short(before, after) and after.reason != ENDS:
         latched = f"; {UNTIL_ARMED}" if after.needs_request else ""
         advice = f"; {ADVICE}" if after.reason in DISAGREEMENTS else ""
-        is_long = after.reason in COMPARED  # three accounts: a line of their own
-        detail = "" if is_long else _detail(after.reason, conflict)
-        yield f"the wheels stop: {after.reason}{detail}{advice}{latched}"
-        if is_long and conflict.detail:
-            yield f"measured: {conflict.detail}"
+        yield f"the wheels stop: {after.reason}{_detail(after.reason, conflict)}{advice}{latched}"
 
 
 def _detail(reason: str, conflict: Conflict) -> str:

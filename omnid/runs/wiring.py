@@ -192,6 +192,6 @@ def wheel_state(state: ControllerState) -> WheelState:
         state.reason,
         state.source,
         state.obstacle if state.blocked else "",
-        state.halts,
-        state.halted_by,
+        state.stop_count,
+        state.stopped_by,
     )

@@ -9,7 +9,6 @@ from __future__ import annotations
 import copy
 import math
 import time
-from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from queue import SimpleQueue
@@ -36,8 +35,6 @@ from omnid.simulation.robot import SimulatedRobot, with_masks
 from omnid.simulation.vehicle import Tick, Vehicle
 from omnid.simulation.world import World
 from omnid.transport.status_names import Key
-
-RECENT: Final = 30  # pairs over which the real-time factor is measured: three seconds
 
 
 class PacedLink:
@@ -105,7 +102,8 @@ class PacedRobot:
         self._vehicle: Vehicle | None = None
         self._link: PacedLink | None = None
         self.states = {camera: CameraState(mode="simulated", status="streaming") for camera in CAMERAS}
-        self._given_ns: deque[int] = deque(maxlen=RECENT)  # when the last pairs were given
+        self._given_ns = [0, 0]  # when the first pair and the newest one were given, by the computer's clock
+        self._given = 0  # pairs
         self._closed = self._ends = False
         self.truth: dict[int, Pose] = {}  # true poses of the base in the world by the stamps of the pairs, where kept
         self.contacts, self._touches = 0, False
@@ -130,20 +128,15 @@ class PacedRobot:
 
     def stats(self) -> dict[str, Any]:
         """Return the real-time factor, the time since the start [s] and the contacts with obstacles."""
-        time_s = (self.clock_ns() - self._start_ns) * S_PER_NS
-        factor, words = round(self._real_time_factor, 2), "its time waits for the daemon"
+        time_s, passed_ns = (self.clock_ns() - self._start_ns) * S_PER_NS, self._given_ns[1] - self._given_ns[0]
+        simulated_ns = (self._given - 1) * NS_PER_S / self._robot.rate_hz
+        factor = round(simulated_ns / passed_ns, 2) if passed_ns else math.nan
+        words = "its time waits for the daemon"
         return {Key.REAL_TIME_FACTOR: factor, "time_s": time_s, "contacts": self.contacts, "_words": words}
 
     def close(self) -> None:
         """End the images; from any thread."""
         self._closed = True
-
-    @property
-    def _real_time_factor(self) -> float:
-        """Simulated time over time on the wall, of the last pairs, at most 1; NaN before the second pair."""
-        at_ns = list(self._given_ns)
-        simulated_ns = (len(at_ns) - 1) * NS_PER_S / self._robot.rate_hz
-        return simulated_ns / (at_ns[-1] - at_ns[0]) if len(at_ns) > 1 else math.nan
 
     def _frames(self, settle: Callable[[], None], take: Callable[[MotionSample], None]) -> Iterator[Frame]:
         """Advance from pair to pair; settle: returns when the daemon has answered."""
@@ -161,8 +154,9 @@ class PacedRobot:
                 sleep_until(due_ns, lambda: self._closed)
                 if self._closed:
                     return
-                self._given_ns.append(time.monotonic_ns())
-                due_ns = max(due_ns + period_ns, self._given_ns[-1])
+                self._given, now_ns = self._given + 1, time.monotonic_ns()
+                self._given_ns = [self._given_ns[0] or now_ns, now_ns]
+                due_ns = max(due_ns + period_ns, now_ns)
                 for frame in pair.frames:
                     self.states[frame.camera].frames += 1
                     yield frame

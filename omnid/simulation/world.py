@@ -15,8 +15,7 @@ from omnid.simulation.rendering.surfaces import Rectangle
 
 Point = tuple[float, float]
 
-PATIENCE_S = 4.0  # A person waits this long, then comes nearer, and after as long again turns round if possible.
-IMPATIENT = 0.5  # Distance to which the person then comes, by that at which he waits.
+PATIENCE_S = 4.0  # A person who walks back and forth waits this long for the robot, then turns round.
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,9 +90,7 @@ class Walkers:
             self._waited_s[number] = 0.0
             return started_s
         self._waited_s[number] += passed_s
-        if self._waited_s[number] >= PATIENCE_S and now_m >= IMPATIENT * person.waits_within_m:
-            return started_s
-        if self._waited_s[number] < 2 * PATIENCE_S or person.repeat != "back and forth":
+        if self._waited_s[number] < PATIENCE_S or person.repeat != "back and forth":
             return started_s + passed_s
         self._waited_s[number] = 0.0
         return self.time_s - person.turned(walked_s - passed_s)

@@ -178,7 +178,7 @@ def prepared(planned: Planned) -> tuple[Trial, SimulatedRobot]:
 
 def settings_for(planned: Planned) -> list[str]:
     """Return the settings of a drive."""
-    names = ("controller.limits.velocity_mps", "controller.heading.velocity_mps", "navigation.pursuit.velocity_mps")
+    names = ("controller.limits.velocity_mps", "navigation.pursuit.velocity_mps")
     speed_mps = 0.8 if planned.world.startswith("room_") else abs(planned.speed_mps)
     settings = [f"{name}={speed_mps}" for name in names]
     return ["places.enabled=false", *settings, *planned.overrides]

@@ -61,8 +61,8 @@ class Arming:
         self.armed = False
         self.reason = STARTED  # why the base is disarmed: a requested stop, else the first fault; empty while armed
         self.answer = NO_ANSWER
-        self.halts = 0  # how often a stop or a fault has made a request necessary
-        self.halted_by = ""  # the newest of their reasons, kept while armed again
+        self.stop_count = 0  # how often a stop or a fault has made a request necessary
+        self.stopped_by = ""  # the newest of their reasons, kept while armed again
 
     @property
     def stop_asked(self) -> bool:
@@ -95,7 +95,7 @@ class Arming:
         if self.stop_asked:
             self.armed, self.reason = False, ASKED
         if self.needs_request and self.reason != waited:
-            self.halts, self.halted_by = self.halts + 1, self.reason
+            self.stop_count, self.stopped_by = self.stop_count + 1, self.reason
         # 2. The newest request is answered, and arms where nothing refuses it.
         request, self._request = self._request, None
         if request is not None:

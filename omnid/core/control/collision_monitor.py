@@ -25,7 +25,6 @@ from omnid.core.nanoseconds import S_PER_NS
 
 STOP: Final = "stop"
 SLOW: Final = "slow"
-IGNORE: Final = "ignore"
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,20 +44,15 @@ class CollisionSettings:
     slow_side_m: float = 0.12  # the same beside its way, m
     slow_mps: Annotated[float, Meta(ge=0.01, le=10), "speed near obstacles and into the unknown, m/s"] = 0.2
     unknown: Annotated[
-        Literal["stop", "slow", "ignore"],
+        Literal["stop", "slow"],
         "at the end of the floor that was seen, where nothing is known: stop; slow drives on at "
         "slow_mps, also into a plain wall",
-    ] = STOP
-    stale: Annotated[
-        Literal["stop", "slow", "ignore"],
-        "when nothing fresh is known of the way: the newest scan of obstacles is older than "
-        "stale_s, there is none, or its images are frozen, dark or dirty there",
     ] = STOP
     stale_s: Annotated[
         float,
         Meta(ge=0.1, le=10),
-        "no motion without evidence: the base drives by what its images of so long ago, or "
-        "newer ones, showed, whatever the pose says, s",
+        "no motion without evidence: the base stops where the newest scan of obstacles is older, whatever the pose "
+        "says, s",
     ] = 0.5
 
 
@@ -141,7 +135,7 @@ UNWATCHED: Final = "the images of the way ahead are frozen, dark or dirty"
 UNSEEN: Final = "the images show nothing: they are frozen, dark or dirty"
 SCAN_STALE: Final = "no new obstacle scan"
 REMEDY: Final = "drive back or turn away, or clear the way"
-SCAN_REMEDY: Final = "check the cameras and the load; see controller.collision.stale"
+SCAN_REMEDY: Final = "check the cameras and the load; see controller.collision.stale_s"
 IMAGES_REMEDY: Final = "check light, mirrors and cameras, which the status names"
 
 
@@ -164,7 +158,7 @@ class Kind(NamedTuple):
     """Places of a scan that the base must not reach, in the frame of the scan."""
 
     reason: str
-    policy: str  # STOP, SLOW or IGNORE
+    policy: str  # STOP or SLOW
     points: list[Point]
     is_known: bool = False  # something is there; else nothing is known of what is there
     is_gap: bool = False  # a surface is seen beyond: it counts ahead of the base only
@@ -210,7 +204,7 @@ class CollisionMonitor:
             Kind(BLOCKED, STOP, seen, is_known=True),
             Kind(UNKNOWN, settings.unknown, ends["end"]),
             Kind(UNKNOWN, settings.unknown, ends["gap"], is_gap=True),
-            Kind(UNWATCHED, settings.stale, ends["unwatched"]),
+            Kind(UNWATCHED, STOP, ends["unwatched"]),
         )
 
     def step(self, now_ns: int, motion: Twist, *, to_heading: bool = False) -> Twist:
@@ -247,12 +241,10 @@ class CollisionMonitor:
             return FREE
         # 1. Without a recent scan nothing is known.
         age_s = math.inf if self._stamp_ns is None else (now_ns - self._stamp_ns) * S_PER_NS
-        is_stale = not abs(age_s) <= settings.stale_s or not self._way.reaches_back_to(self._stamp_ns or 0)
-        if settings.stale == IGNORE and is_stale:
-            return FREE
-        if settings.stale != IGNORE and (is_stale or self._is_blind):
-            most_mps = 0.0 if settings.stale == STOP else settings.slow_mps
-            return self._capped(motion, most_mps, SCAN_STALE if is_stale else UNSEEN)
+        if not abs(age_s) <= settings.stale_s or not self._way.reaches_back_to(self._stamp_ns or 0):
+            return Allowance(0.0, SCAN_STALE)
+        if self._is_blind:
+            return Allowance(0.0, UNSEEN)
         # 2. What the base has driven over since the scan's images is not passed as if it were free.
         moved = self._way.since(self._stamp_ns or now_ns, now_ns)
         for kind in self._kinds:
@@ -266,7 +258,7 @@ class CollisionMonitor:
         reach2 = (way_m + near_m + self._outline.radius_m) ** 2
         allowances = [FREE]
         for kind in self._kinds:
-            if kind.policy != IGNORE and kind.points:
+            if kind.points:
                 near = [(x, y) for x, y in kind.points if (x - moved.x_m) ** 2 + (y - moved.y_m) ** 2 <= reach2]
                 allowances.append(self._before(kind, seen_from(moved, near), motion))
         allowances += [self._before_moving(one, moved, age_s, motion) for one in self._moving]

@@ -19,12 +19,11 @@ from omnid.core.control.contacts import Contacts
 from omnid.core.control.heading_controller import (
     LONGEST_TICK_S,
     STOP,
-    HeadingController,
     HeadingGoal,
-    HeadingLimits,
     Setpoint,
     Twist,
     VelocityLimits,
+    towards,
     wrap_angle,
 )
 from omnid.core.control.motion_monitor import AGREE, Conflict, Motion, MotionSettings
@@ -52,11 +51,10 @@ class ReplaySetpoint:
 
 @dataclass(frozen=True, slots=True)
 class ControllerSettings:
-    """Deadlines, limits and heading control of the base, the same in `omnid run` and in replays."""
+    """Deadlines and limits of the base, the same in `omnid run` and in replays."""
 
     deadlines: Deadlines = field(default_factory=Deadlines)
     limits: VelocityLimits = field(default_factory=VelocityLimits)
-    heading: HeadingLimits = field(default_factory=HeadingLimits)
     setpoint: ReplaySetpoint = field(default_factory=ReplaySetpoint)
     sources: SourceSettings = field(default_factory=SourceSettings)
     arming: Annotated[
@@ -134,8 +132,7 @@ class ControlLaw:
     def __init__(self, settings: ControllerSettings, start_ns: int) -> None:
         """start_ns: setpoints that arrived until then are void."""
         self._settings = settings
-        self._heading_controller = HeadingController(settings.heading)
-        self.goal = HeadingGoal(settings.heading, settings.limits)  # of a motor controller that holds headings
+        self.goal = HeadingGoal(settings.limits)  # of a motor controller that holds headings
         self._void_ns = start_ns  # setpoints that arrived until then are void
         self._pose_jumped = False
         self.pose: ControllerPose | None = None  # the newest one
@@ -209,8 +206,8 @@ class ControlLaw:
 
     def _drive(self, setpoint: Setpoint, heading_rad: float, now_ns: int, dt_s: float) -> float:
         """Step the motion towards a setpoint; return the goal for a motor controller that holds headings."""
-        wanted = self._heading_controller.step(setpoint, heading_rad, dt_s, self.motion)
         limits = self._settings.limits
+        wanted = towards(setpoint, heading_rad, self.motion, limits)
         motion = limits.step(self.plausibility.slowed(wanted, limits), self.motion, dt_s)
         # The collision monitor comes last; what it allows is reached with the deceleration of the limits.
         allowed = self.collision.step(now_ns, motion, to_heading=setpoint.heading_rad is not None)

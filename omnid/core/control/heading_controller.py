@@ -12,6 +12,7 @@ from typing import Annotated, Final
 from msgspec import Meta
 
 LONGEST_TICK_S: Final = 0.2  # a late tick does not allow a larger step; by trial on development seeds
+GAIN_HZ: Final = 1.5  # yaw rate per heading error
 HALF_TURN_RAD: Final = 0.2  # closer to half a turn than this, noise would change the side to turn to
 # Share of a deceleration that is planned for braking; the rest is left for the lag of the base.
 BRAKING_SHARE: Final = 0.8
@@ -60,11 +61,11 @@ def clamp(value: float, magnitude: float) -> float:
 class VelocityLimits:
     """Limits of the commands to the wheels, in magnitude; the deceleration holds for stops as well."""
 
-    velocity_mps: Annotated[float, Meta(ge=0.001, le=10), "highest speed, m/s"] = 0.6
-    acceleration_mps2: Annotated[float, Meta(ge=0.001, le=100), "highest acceleration, m/s^2"] = 0.6
+    velocity_mps: Annotated[float, Meta(ge=0.001, le=10), "highest speed, m/s"] = 0.5
+    acceleration_mps2: Annotated[float, Meta(ge=0.001, le=100), "highest acceleration, m/s^2"] = 0.5
     deceleration_mps2: Annotated[float, Meta(ge=0.001, le=100), "highest deceleration, at stops as well, m/s^2"] = 1.5
-    yaw_rate_radps: Annotated[float, Meta(ge=0.001, le=20), "highest yaw rate, rad/s"] = 1.2
-    yaw_acceleration_radps2: Annotated[float, Meta(ge=0.001, le=200), "highest yaw acceleration, rad/s^2"] = 4.0
+    yaw_rate_radps: Annotated[float, Meta(ge=0.001, le=20), "highest yaw rate, rad/s"] = 1.0
+    yaw_acceleration_radps2: Annotated[float, Meta(ge=0.001, le=200), "highest yaw acceleration, rad/s^2"] = 3.0
 
     def step(self, wanted: Twist, last: Twist, dt_s: float) -> Twist:
         """Return the motion to send dt_s after `last`; a wanted motion that is not finite is a stop.
@@ -93,61 +94,34 @@ class VelocityLimits:
         return Twist(clamp(motion.velocity_mps, self.velocity_mps), clamp(motion.yaw_rate_radps, self.yaw_rate_radps))
 
 
-@dataclass(frozen=True, slots=True)
-class HeadingLimits:
-    """Limits of the heading controller, in magnitude, and its gain."""
+def towards(setpoint: Setpoint, heading_rad: float, last: Twist, limits: VelocityLimits) -> Twist:
+    """Return the wanted motion; heading_rad is measured, in odom. A stop where a number is not finite.
 
-    velocity_mps: Annotated[float, Meta(ge=0.001, le=10), "highest speed, m/s"] = 0.5
-    acceleration_mps2: Annotated[float, Meta(ge=0.001, le=100), "highest acceleration, m/s^2"] = 0.5
-    yaw_rate_radps: Annotated[float, Meta(ge=0.001, le=20), "highest yaw rate, rad/s"] = 1.0
-    yaw_acceleration_radps2: float = 3.0  # highest yaw acceleration, rad/s^2
-    gain_hz: float = 1.5  # yaw rate per heading error, 1/s
-
-
-@dataclass(frozen=True, slots=True)
-class HeadingController:
-    """A proportional heading controller whose output never exceeds its limits, whatever its input.
-
-    Near the goal the yaw rate is at most sqrt(2 a e) with the yaw acceleration a and the heading error e, from which
-    the base can still brake.
+    A heading is held by a proportional yaw rate. Near the goal it is at most sqrt(2 a e) with the yaw acceleration a
+    and the heading error e, from which the base can still brake. last: the present motion.
     """
-
-    limits: HeadingLimits = HeadingLimits()
-
-    def step(self, setpoint: Setpoint, heading_rad: float, dt_s: float, previous: Twist) -> Twist:
-        """Return the motion dt_s after `previous`; heading_rad is measured, in odom.
-
-        Where setpoint or heading are not finite, the base stops as fast as the limits allow. Where the time or the
-        previous motion are not finite, it stops at once: there is no speed to slow down from.
-        """
-        if not (math.isfinite(dt_s) and previous.is_finite):
-            return STOP
-        of, wanted = self.limits, Twist(setpoint.velocity_mps, setpoint.yaw_rate_radps)
-        if not math.isfinite(heading_rad):
-            wanted = STOP
-        elif setpoint.heading_rad is not None and wanted.is_finite:
-            error_rad = wrap_angle(wrap_angle(setpoint.heading_rad) - wrap_angle(heading_rad))
-            size_rad, side = abs(error_rad), error_rad
-            # Near half a turn the base keeps the side to which it turns.
-            if size_rad > math.pi - HALF_TURN_RAD and previous.yaw_rate_radps != 0.0:
-                side = previous.yaw_rate_radps
-            braking_radps = math.sqrt(2 * BRAKING_SHARE * of.yaw_acceleration_radps2 * size_rad)
-            rate_radps = math.copysign(min(of.gain_hz * size_rad, braking_radps), side)
-            wanted = Twist(setpoint.velocity_mps, rate_radps)
-        both = of.acceleration_mps2, of.acceleration_mps2
-        limits = VelocityLimits(of.velocity_mps, *both, of.yaw_rate_radps, of.yaw_acceleration_radps2)
-        return limits.step(wanted, previous, dt_s)
+    wanted = Twist(setpoint.velocity_mps, setpoint.yaw_rate_radps)
+    if not (math.isfinite(heading_rad) and wanted.is_finite):
+        return STOP
+    if setpoint.heading_rad is None:
+        return limits.within(wanted)
+    error_rad = wrap_angle(wrap_angle(setpoint.heading_rad) - heading_rad)
+    size_rad, side = abs(error_rad), error_rad
+    # Near half a turn the base keeps the side to which it turns.
+    if size_rad > math.pi - HALF_TURN_RAD and last.yaw_rate_radps != 0.0:
+        side = last.yaw_rate_radps
+    braking_radps = math.sqrt(2 * BRAKING_SHARE * limits.yaw_acceleration_radps2 * size_rad)
+    return limits.within(Twist(setpoint.velocity_mps, math.copysign(min(GAIN_HZ * size_rad, braking_radps), side)))
 
 
-def longest_lead_rad(heading: HeadingLimits, velocity: VelocityLimits) -> float:
+def longest_lead_rad(limits: VelocityLimits) -> float:
     """Return the limit of the lead of the goal over the heading.
 
     It is the angle that the base turns at the highest rate within the reaction time, and then until it has braked. A
     motor controller turns the faster, the larger the lead is, by a gain that is not known here.
     """
-    rate_radps = min(heading.yaw_rate_radps, velocity.yaw_rate_radps)
-    acceleration_radps2 = min(heading.yaw_acceleration_radps2, velocity.yaw_acceleration_radps2)
-    return min(math.pi / 2, rate_radps * REACTION_S + rate_radps**2 / (2 * acceleration_radps2))
+    rate_radps = limits.yaw_rate_radps
+    return min(math.pi / 2, rate_radps * REACTION_S + rate_radps**2 / (2 * limits.yaw_acceleration_radps2))
 
 
 class HeadingGoal:
@@ -158,9 +132,9 @@ class HeadingGoal:
     than the limits allow in a tick.
     """
 
-    def __init__(self, heading: HeadingLimits, velocity: VelocityLimits) -> None:
-        self._longest_rad = longest_lead_rad(heading, velocity)
-        self._highest_radps = OVERSPEED * min(heading.yaw_rate_radps, velocity.yaw_rate_radps)
+    def __init__(self, limits: VelocityLimits) -> None:
+        self._longest_rad = longest_lead_rad(limits)
+        self._highest_radps = OVERSPEED * limits.yaw_rate_radps
         self._goal_rad: float | None = None  # goal of the last tick, while the base turns or drives
         self._counted_rad = self._rate_radps = 0.0  # values of the last report
 

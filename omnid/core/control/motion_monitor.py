@@ -21,11 +21,9 @@ from typing import Annotated, Final, NamedTuple, TypeAlias
 
 from msgspec import Meta
 
-from omnid.core.control import likely_cause
 from omnid.core.control.heading_controller import LONGEST_TICK_S, STOP, Twist
 from omnid.core.nanoseconds import S_PER_NS
 
-MOST_STEPS: Final = 64  # of images that are kept for the words about a disagreement: two seconds of 30 Hz
 MOST_ACCOUNTS: Final = 2048  # kept of each kind, because 10 s at the highest rate of commands have so many
 SIGMAS: Final = 3.0  # Of right differences 0.3 % exceed this, so that false alarms are rare.
 # Of the motion that stops, per second in which nothing is unexplained; by trial on development seeds.
@@ -122,10 +120,8 @@ class MotionMonitor:
         self._last_seen_ns = self._last_report_ns = 0
         self._wheels_report = False  # they have reported a motion: some controllers never do
         self._unexplained = {reason: [0.0, 0.0] for reason in COMPARED}  # m, rad
-        self._steps: deque[tuple[float, ...]] = deque(maxlen=MOST_STEPS)  # m, rad: seen, seen, commanded, commanded
-        self._last_seen: Motion | None = None
         self.reason = ""  # the disagreement for which the base must stop, until it has stood for REST_S
-        self.detail = ""  # what was measured of it, and what may have made it
+        self.detail = ""  # the motions that disagree
 
     @property
     def is_doubtful(self) -> bool:
@@ -150,11 +146,8 @@ class MotionMonitor:
         before_ns, self._last_seen_ns = self._last_seen_ns, max(stamp_ns, self._last_seen_ns)
         if stamp_ns <= before_ns or not self._drives_at(stamp_ns):
             return
-        dt_s = _passed_s(before_ns, stamp_ns)
-        commanded = self._recent(self._commanded, stamp_ns)
-        self._last_seen = seen
-        self._steps.append(tuple(dt_s * speed for speed in (seen.velocity_mps, seen.yaw_rate_radps, *_mean(commanded))))
-        self._compare(seen, [*commanded, *self._recent(self._reported, stamp_ns)], dt_s, NOT_SEEN, NOT_COMMANDED)
+        explained = [*self._recent(self._commanded, stamp_ns), *self._recent(self._reported, stamp_ns)]
+        self._compare(seen, explained, _passed_s(before_ns, stamp_ns), NOT_SEEN, NOT_COMMANDED)
 
     def add_report(self, now_ns: int, reported: Motion) -> None:
         """Compare what the wheels report with what was commanded; a yaw rate of NaN is not compared."""
@@ -205,33 +198,15 @@ class MotionMonitor:
                 sums, adds = self._unexplained[reason], beyond != 0.0 and reason == of
                 sums[axis] = max(0.0, sums[axis] + dt_s * (abs(beyond) if adds else -RECOVERY * limit))
                 if sums[axis] > limit and not self.reason:
-                    self.reason, self.detail = reason, self._measured(reason)
-
-    def _measured(self, reason: str) -> str:
-        """Return the motion of all accounts in the last moments, and what may have made the difference."""
-        newest_ns = max(self._last_seen_ns, self._last_report_ns)
-        shown = [f"commanded {_words(*_mean(self._recent(self._commanded, newest_ns)))}"]
-        if reported := self._recent(self._reported, newest_ns):
-            shown.append(f"reported {_words(*_mean(reported))}")
-        if self._last_seen is not None:
-            shown.append(f"seen {_words(self._last_seen.velocity_mps, self._last_seen.yaw_rate_radps)}")
-        cause = ""
-        if reason != NOT_FOLLOWED and self._steps:
-            columns = list(zip(*self._steps, strict=True))
-            cause = likely_cause.of_wheels(likely_cause.Steps(*columns[:2]), likely_cause.Steps(*columns[2:]))
-        return f"({', '.join(shown)}){cause and ': '}{cause}"
+                    what = "reported" if reason == NOT_FOLLOWED else "seen"
+                    mean = (sum(account[part] for account in explained) / len(explained) for part in (1, 2))
+                    moved = found.velocity_mps, found.yaw_rate_radps
+                    self.reason, self.detail = reason, f"({what} {_words(*moved)}, expected {_words(*mean)})"
 
     def _forget(self) -> None:
         self.reason = self.detail = ""
-        self._steps.clear()
         for sums in self._unexplained.values():
             sums[:] = 0.0, 0.0
-
-
-def _mean(accounts: list[_Account]) -> tuple[float, float]:
-    """Return the mean velocity and yaw rate of accounts."""
-    count = max(1, len(accounts))
-    return sum(account[1] for account in accounts) / count, sum(account[2] for account in accounts) / count
 
 
 def _words(velocity_mps: float, yaw_rate_radps: float) -> str:

@@ -13,7 +13,7 @@ class PursuitSettings:
     """Regulated pure pursuit (Macenski et al. 2023); the limits of the controller hold after it."""
 
     velocity_mps: Annotated[float, Meta(ge=0.02, le=5), "highest speed on a path, m/s"] = 0.4
-    acceleration_mps2: float = 0.3  # acceleration and deceleration that are planned, below that of controller.heading
+    acceleration_mps2: float = 0.3  # acceleration and deceleration that are planned, below that of controller.limits
     yaw_rate_radps: Annotated[float, Meta(ge=0.02, le=10), "highest yaw rate on a path, rad/s"] = 0.8
     lookahead_s: float = 1.2  # distance of the point that is driven to, as time at the speed, s
     lookahead_m: tuple[float, float] = (0.35, 0.9)  # least and largest distance of that point, m

@@ -28,8 +28,6 @@ from numpy.typing import NDArray
 
 from calib import se3
 from drivers.motion import GyroSample, WheelSample
-from omnid.core.control import likely_cause
-from omnid.core.control.likely_cause import Steps
 from omnid.core.control.motion_monitor import (
     AGREE,
     GYRO_DIFFERS,
@@ -159,16 +157,7 @@ class MotionAgreement:
         is_fault = is_long or (found.excess >= 1.0 and not is_explained)
         turn = of_gyro if of_gyro.differs else of_wheels
         differences = (each.difference if each.differs else Difference() for each in (distance, turn))
-        # 4. What makes the accounts differ as they do.
-        seen, by_gyro = Steps(ways.tolist(), turns.tolist()), gyro_by_lag[_NO_LAG].tolist()
-        if reason == IMAGES_DIFFER:
-            cause = likely_cause.of_images(seen.turns, by_gyro)
-        elif reason in (GYRO_DIFFERS, IMAGES_OR_GYRO):
-            cause = likely_cause.of_gyro(seen.turns, by_gyro)
-        else:
-            cause = likely_cause.of_wheels(seen, Steps(*wheels_by_lag[_NO_LAG].T.tolist()))
-        detail = f"{'by a factor' if cause and found.is_late else found.text}{cause and ': '}{cause}"
-        return Conflict(reason, detail, is_fault, *differences)
+        return Conflict(reason, found.text, is_fault, *differences)
 
     def _is_at_rest(self, starts: Array, ends: Array, ways: Array, turns: Array) -> bool:
         """True if images and wheels have shown no motion for STILL_S."""
@@ -268,8 +257,8 @@ class Contradiction:
 
     def add(self, conflict: Conflict, T_odom_base: Array, time_s: float) -> Array:
         """Add what the accounts differ by at a pose; return its covariance (6, 6) in the axes of the base."""
-        # The sums of a conflict overlap from pair to pair: only the part since the last fault is new. Ways and turns
-        # in it are so short that their order does not matter.
+        # The sums overlap from pair to pair: only their part since the last fault is new. Ways and turns in it are so
+        # short that their order does not matter.
         seconds, to_odom = time_s - self._fault_s, se3.adjoint(T_odom_base)
         new = to_odom @ [conflict.distance.part(seconds), 0.0, 0.0, 0.0, 0.0, conflict.turn.part(seconds)]
         is_fault = conflict.contradicts_images and conflict.is_fault

@@ -53,7 +53,7 @@ SLIPPING, MOST_OUTLIERS = 2, 40
 # The noise of wheels depends on floor and tyres: its variance is multiplied by a factor of 1 or more, which follows the
 # mean of the squared innovations by their expected values, over 50 steps because a floor is the same for some seconds.
 NOISE_GAIN = 0.02
-# Rotation by which two steps of a robot do not differ, because 4 rad/s^2, the most that controller.limits allows by
+# Rotation by which two steps of a robot do not differ, because 4 rad/s^2, more than controller.limits allows by
 # default, make 0.04 rad in steps of 0.1 s.
 SUDDEN_RAD = 0.14
 

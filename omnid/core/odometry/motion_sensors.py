@@ -28,7 +28,7 @@ WHEEL_SHARES, WHEEL_LEAST, GYRO_RADPS_SQRT_S = (0.01, 0.02), (3e-4, 5e-4), 1e-3
 # Wheels roll forwards on a plane: lateral error as a share of the way and at least, vertical error, roll and pitch.
 SIDE_SHARE, SIDE_M, HEIGHT_M, TILT_RAD = 0.01, 3e-4, 5e-4, 1e-3
 # Sigmas of the change of the rates, m/s^2 and rad/s^2, where samples of the end of a step have not come yet: about half
-# of the most that controller.limits allows by default, 1.5 m/s^2 and 4 rad/s^2.
+# of the most that controller.limits allows by default, 1.5 m/s^2 and 3 rad/s^2.
 NOT_YET: Final = (1.0, 2.0)
 # At rest: rates of wheels [m/s, rad/s] and of the gyro without its bias, also for this time before the step, so that
 # nothing swings on; and the motion that is left, m and rad.

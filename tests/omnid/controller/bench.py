@@ -13,7 +13,7 @@ from omnid.controller.link import ControllerStatistics
 from omnid.core.control.arming import AUTOMATIC, ArmRequest
 from omnid.core.control.command_sources import OPERATOR, TimedSetpoint
 from omnid.core.control.control_law import ControllerPose, ControllerSettings
-from omnid.core.control.heading_controller import HeadingLimits, Setpoint, VelocityLimits
+from omnid.core.control.heading_controller import Setpoint, VelocityLimits
 from omnid.core.control.motion_monitor import AGREE, Conflict
 from omnid.core.control.safety_rules import Deadlines
 from omnid.core.control.trust import TrustSettings
@@ -24,9 +24,7 @@ PERIOD_NS = 50_000_000
 LIMITS = VelocityLimits(
     velocity_mps=0.4, acceleration_mps2=0.6, deceleration_mps2=1.5, yaw_rate_radps=0.8, yaw_acceleration_radps2=4.0
 )
-SETTINGS = ControllerSettings(
-    Deadlines(), LIMITS, HeadingLimits(velocity_mps=1.0, acceleration_mps2=5.0), trust=TrustSettings(battery_v=11.0)
-).without_obstacles
+SETTINGS = ControllerSettings(Deadlines(), LIMITS, trust=TrustSettings(battery_v=11.0)).without_obstacles
 UNATTENDED = replace(SETTINGS, arming=AUTOMATIC)
 AHEAD = Setpoint(0.3, None, 0.0)
 

@@ -20,7 +20,7 @@ from drivers.logs.log_reader import LogReader
 from drivers.motor import VelocityCommand
 from omnid import Odometry
 from omnid.core.control.control_law import ControllerSettings, ReplaySetpoint
-from omnid.core.control.heading_controller import HeadingLimits, Twist, VelocityLimits
+from omnid.core.control.heading_controller import Twist, VelocityLimits
 from omnid.core.control.motion_monitor import NOT_COMMANDED, NOT_SEEN, Motion, MotionSettings
 from omnid.core.control.safety_rules import Deadlines
 from omnid.core.control.trust import MotorReport, Plausibility, TrustSettings
@@ -36,9 +36,7 @@ LIMITS = VelocityLimits(velocity_mps=0.4, acceleration_mps2=0.5, deceleration_mp
 
 
 def settings(velocity_mps: float = 0.3, heading_deg: float = 0.0) -> ControllerSettings:
-    return ControllerSettings(
-        Deadlines(), LIMITS, HeadingLimits(acceleration_mps2=10.0), ReplaySetpoint(velocity_mps, heading_deg)
-    )
+    return ControllerSettings(Deadlines(), LIMITS, ReplaySetpoint(velocity_mps, heading_deg))
 
 
 def odometry(

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import cmath
+import itertools
 import math
 import random
+from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+import numpy.typing as npt
 import pytest
 
 from omnid.core.control import collision_monitor as monitor_module
-from omnid.core.control.collision_geometry import MOST_MOTIONS
 from omnid.core.control.collision_monitor import (
-    UNKNOWN_SECTORS,
     CollisionMonitor,
     CollisionSettings,
     ControllerScan,
     MovingPoint,
-    unknown_ends,
 )
 from omnid.core.control.heading_controller import Twist
 
@@ -63,11 +65,6 @@ def after(
     return allowed, monitor.reason
 
 
-def test_free_is_free() -> None:
-    for motion in (AHEAD, Twist(-0.5), Twist(0.0, 1.0), Twist(0.3, -0.8)):
-        assert after(FREE_SCAN, motion) == (motion, "")
-
-
 @pytest.mark.hazard("H16")
 @pytest.mark.parametrize("point", [(0.39, 0.0), (0.3, 0.2), (0.26, -0.1), (0.2, 0.0)])
 def test_stops_before_an_obstacle_in_the_stop_polygon_and_lets_the_base_back_out(point: tuple[float, float]) -> None:
@@ -75,17 +72,6 @@ def test_stops_before_an_obstacle_in_the_stop_polygon_and_lets_the_base_back_out
     allowed, _ = after(with_points(point), Twist(-0.3))
     assert allowed == Twist(-0.3)
     assert after(with_points((-point[0], point[1])), Twist(-0.3)) == (Twist(), monitor_module.BLOCKED)
-
-
-@pytest.mark.hazard("H16")
-@pytest.mark.parametrize("distance_m", [0.5, 0.8, 1.1])
-def test_the_speed_is_the_distance_by_the_time_to_collision(distance_m: float) -> None:
-    settings = replace(SETTINGS, slow_m=0.0)
-    allowed, reason = after(with_points((distance_m, 0.0)), AHEAD, settings)
-    expected = (distance_m - settings.front_m - settings.stop_m) / settings.time_s
-    assert allowed.velocity_mps == pytest.approx(min(0.5, expected), rel=0.01) and (reason == monitor_module.NEAR) == (
-        expected < 0.5
-    )
 
 
 def test_a_stopped_base_does_not_creep_on_when_the_scan_changes_by_a_cell() -> None:
@@ -113,12 +99,6 @@ def test_a_stopped_base_obeys_another_direction_and_a_slow_command() -> None:
         assert (monitor.step(10 * S, motion).velocity_mps != 0) == moves
 
 
-def test_a_base_that_stands_needs_no_scan() -> None:
-    monitor = CollisionMonitor(SETTINGS, 1.5)
-    assert (monitor.step(S, Twist()), monitor.reason) == (Twist(), "")
-    assert (monitor.step(S, Twist(1.0)), monitor.reason) == (Twist(), monitor_module.SCAN_STALE)
-
-
 @pytest.mark.hazard("H16")
 def test_drives_slowly_past_what_is_beside_its_way() -> None:
     allowed, reason = after(with_points((0.6, 0.3)))
@@ -136,12 +116,6 @@ def test_an_arc_is_judged_on_the_arc() -> None:
     assert after(with_points(point), Twist(0.3), settings)[0] == Twist(0.3)
     allowed, _ = after(with_points(point), arc, settings)
     assert allowed.yaw_rate_radps / allowed.velocity_mps == pytest.approx(2.0)
-
-
-def test_turns_on_the_spot_unless_a_corner_would_touch() -> None:
-    turn = Twist(0.0, -0.5)
-    assert after(with_points((0.38, 0.0)), turn)[0] == turn
-    assert after(with_points((0.27, 0.2)), turn)[0].yaw_rate_radps > -0.3
 
 
 @pytest.mark.hazard("H19")
@@ -176,7 +150,6 @@ def test_an_unknown_way_is_approached_slowly_or_not_at_all() -> None:
     assert after(wall) == (Twist(), monitor_module.UNKNOWN)
     allowed, reason = after(wall, settings=replace(SETTINGS, unknown="slow"))
     assert allowed.velocity_mps == pytest.approx(SETTINGS.slow_mps) and reason == monitor_module.UNKNOWN
-    assert after(wall, settings=replace(SETTINGS, unknown="ignore")) == (AHEAD, "")
     assert after(wall, Twist(-0.5)) == (Twist(-0.5), "")
 
 
@@ -222,16 +195,12 @@ def test_a_base_drives_along_what_is_unknown_beside_it(yaw_rate_radps: float, go
 
 
 @pytest.mark.hazard("H22")
-@pytest.mark.parametrize("policy", ["stop", "slow", "ignore"])
-@pytest.mark.parametrize("unknown", ["stop", "ignore"])
-def test_towards_dead_and_blind_parts_of_the_images_counts_as_without_a_fresh_scan(policy: str, unknown: str) -> None:
-    """The setting for them is `stale`, not `unknown`: something may have come there."""
-    ranges, settings = with_unknown(-30, 30), replace(SETTINGS, stale=policy, unknown=unknown)
+@pytest.mark.parametrize("unknown", ["stop", "slow"])
+def test_the_base_stops_before_dead_and_blind_parts_of_the_images(unknown: str) -> None:
+    """Whatever the setting for the end of the seen floor is: something may have come there."""
+    ranges, settings = with_unknown(-30, 30), replace(SETTINGS, unknown=unknown)
     unwatched = tuple(math.isnan(range_m) for range_m in ranges)
-    expected_mps = {"stop": 0.0, "slow": SETTINGS.slow_mps, "ignore": 0.5}[policy]
-    allowed, reason = after(ranges, settings=settings, unwatched=unwatched)
-    assert allowed.velocity_mps == pytest.approx(expected_mps)
-    assert reason == ("" if policy == "ignore" else monitor_module.UNWATCHED)
+    assert after(ranges, settings=settings, unwatched=unwatched) == (Twist(), monitor_module.UNWATCHED)
     for away in (Twist(-0.5), Twist(0.0, 1.0)):
         assert after(ranges, away, settings, unwatched=unwatched) == (away, "")
 
@@ -242,20 +211,14 @@ def test_in_the_dark_the_base_does_not_even_turn() -> None:
     ranges, turn = (math.nan,) * 360, Twist(0.0, 1.0)
     assert after(ranges, turn) == (turn, "")
     assert after(ranges, turn, unwatched=(True,) * 360) == (Twist(), monitor_module.UNSEEN)
-    assert monitor_module.remedy(monitor_module.UNSEEN) == monitor_module.IMAGES_REMEDY
-    assert monitor_module.remedy(monitor_module.SCAN_STALE) == monitor_module.SCAN_REMEDY
-    assert monitor_module.remedy(monitor_module.BLOCKED) == monitor_module.REMEDY
 
 
 @pytest.mark.hazard("H21")
-@pytest.mark.parametrize(("stale", "expected_mps"), [("stop", 0.0), ("slow", SETTINGS.slow_mps), ("ignore", 0.5)])
-def test_a_stale_scan_and_a_missing_one_stop_the_base(stale: str, expected_mps: float) -> None:
-    settings = replace(SETTINGS, stale=stale)
-    allowed, reason = after(FREE_SCAN, settings=settings, age_s=settings.stale_s + 0.01)
-    assert allowed.velocity_mps == pytest.approx(expected_mps)
-    assert reason == ("" if stale == "ignore" else monitor_module.SCAN_STALE)
-    missing = CollisionMonitor(settings, 1.5)
-    assert missing.step(S, AHEAD).velocity_mps == pytest.approx(expected_mps)
+def test_a_stale_scan_and_a_missing_one_stop_the_base() -> None:
+    assert after(FREE_SCAN, age_s=SETTINGS.stale_s + 0.01) == (Twist(), monitor_module.SCAN_STALE)
+    missing = CollisionMonitor(SETTINGS, 1.5)
+    assert (missing.step(S, Twist()), missing.reason) == (Twist(), "")
+    assert (missing.step(S, AHEAD), missing.reason) == (Twist(), monitor_module.SCAN_STALE)
 
 
 @pytest.mark.hazard("H20")
@@ -276,22 +239,6 @@ def test_an_older_scan_makes_the_base_no_freer(age_s: float, speed_mps: float) -
             assert monitor.step(now_ns, Twist(-speed_mps)) == Twist(-speed_mps), "it may back out"
 
 
-@pytest.mark.hazard("H20")
-def test_a_scan_from_before_all_motions_that_are_remembered_is_stale() -> None:
-    monitor = CollisionMonitor(replace(SETTINGS, stale_s=10.0), 1.5)
-    monitor.set_scan(ControllerScan(10 * S, FREE_SCAN))
-    for tick in range(MOST_MOTIONS + 1):
-        assert monitor.step(10 * S + tick * S // 200, Twist(0.2)) == Twist(0.2)
-        monitor.follow(10 * S + tick * S // 200, Twist(0.2))
-    assert monitor.step(12 * S + S // 100, Twist(0.2)) == Twist()
-    assert monitor.reason == monitor_module.SCAN_STALE
-
-
-def test_is_off_when_it_is_off() -> None:
-    off = replace(SETTINGS, check=False)
-    assert after(with_points((0.3, 0.0)), settings=off, age_s=9.0) == (AHEAD, "")
-
-
 @pytest.mark.hazard("H17")
 def test_a_person_who_comes_from_the_side_stops_the_base_and_one_who_leaves_does_not() -> None:
     crossing = MovingPoint(0.9, 0.9, 0.0, -1.0, 0.25)
@@ -300,6 +247,18 @@ def test_a_person_who_comes_from_the_side_stops_the_base_and_one_who_leaves_does
     assert after(FREE_SCAN, moving=(crossing._replace(y_m=1.8, vy_mps=1.0),)) == (AHEAD, "")
     near = MovingPoint(0.9, 0.0, -1.0, 0.0, 0.25)
     assert after(FREE_SCAN, moving=(near,)) == (Twist(), monitor_module.MOVING)
+
+
+@pytest.mark.hazard("H17")
+def test_the_base_is_at_rest_before_a_person_beside_its_way_who_turns_towards_it_reaches_it() -> None:
+    """At 1.6 m/s, 0.4 s after the turn; one who leaves lets it drive on slowly."""
+    beside = MovingPoint(0.5, 1.3, 0.0, -0.05, 0.25)
+    gap_m = math.hypot(0.5 - SETTINGS.front_m, 1.295 - SETTINGS.half_width_m) - 0.25
+    allowed, reason = after(FREE_SCAN, moving=(beside,))
+    assert allowed.velocity_mps == pytest.approx(0.8 * 1.5 * (gap_m / 1.6 - 0.4)) and reason == monitor_module.MOVING
+    leaving = beside._replace(y_m=1.0, vy_mps=0.05)
+    assert after(FREE_SCAN, moving=(leaving,))[0].velocity_mps == pytest.approx(SETTINGS.slow_mps)
+    assert after(FREE_SCAN, Twist(-0.5), moving=(leaving._replace(x_m=0.8),)) == (Twist(-0.5), "")
 
 
 @pytest.mark.hazard("H17")
@@ -340,34 +299,280 @@ def test_a_scan_of_the_future_or_of_no_time_is_stale(stamp_ns: float) -> None:
     assert (monitor.step(10 * S, AHEAD), monitor.reason) == (Twist(), monitor_module.SCAN_STALE)
 
 
-COUNT = 36
+# A second account: the outline swept along its arc in millimetres. It shares no code with omnid.
+Array = npt.NDArray[np.float64]
+Complex = npt.NDArray[np.complex128]
+Box = tuple[float, float, float]
+STEP_M = 1e-3  # of the fastest point of interest
 
 
-@pytest.mark.parametrize(
-    ("range_m", "free_m", "is_end", "is_gap"),
-    [
-        (math.inf, 6.0, False, False),
-        (math.inf, 1.5, True, False),
-        (math.inf, 0.0, False, False),  # the scan holds no free floor
-        (math.nan, 0.7, True, False),
-        (2.0, 1.95, False, False),
-        (2.0, 1.0, True, True),
-    ],
-)
-def test_nothing_is_known_between_seen_floor_and_a_surface(
-    range_m: float, free_m: float, is_end: bool, is_gap: bool
+def depth_m(box: Box, points: Complex | complex) -> Array:
+    """Return the distance of points from the outline, below 0 inside."""
+    front_m, rear_m, half_width_m = box
+    points = np.asarray(points)
+    dx = np.maximum(points.real - front_m, -rear_m - points.real)
+    dy = np.abs(points.imag) - half_width_m
+    outside = np.hypot(np.maximum(dx, 0.0), np.maximum(dy, 0.0))
+    return np.where(outside > 0.0, outside, np.maximum(dx, dy))
+
+
+def sweep(
+    motion: tuple[float, float], points: Sequence[complex], longest_s: float, step_s: float = 0.0
+) -> tuple[Array, Complex]:
+    """Return times [s] and, for each of them, points that stand in the axes of the base, (times, points)."""
+    v, w = motion
+    fastest_mps = abs(v) + abs(w) * (max(abs(point) for point in points) + abs(v) * longest_s)
+    step_s = step_s or max(STEP_M / fastest_mps, longest_s / 100_000)
+    times = np.arange(0.0, longest_s, step_s)
+    yaws = w * times
+    # Midpoint rule: the error is of the order of the cube of a step.
+    steps = v * step_s * np.exp(1j * (yaws + w * step_s / 2))
+    places = np.concatenate([[0.0], np.cumsum(steps)[:-1]])
+    return times, (np.asarray(points)[None, :] - places[:, None]) * np.exp(-1j * yaws)[:, None]
+
+
+def contact_s(box: Box, motion: tuple[float, float], points: Sequence[complex], longest_s: float) -> float:
+    """Return when the outline first contains a point; inf if it does not within the time."""
+    times, seen = sweep(motion, points, longest_s)
+    hits = np.flatnonzero((depth_m(box, seen) <= 0.0).any(axis=1))
+    return float(times[hits[0]]) if len(hits) else math.inf
+
+
+def approach_mps(box: Box, motion: tuple[float, float], point: complex) -> float:
+    """Return the speed with which the outline nears a point, or takes it deeper inside; below 0 where it leaves it."""
+    step_s = 1e-6
+    seen = sweep(motion, [point], 1.5 * step_s, step_s)[1][:, 0]
+    before, after = depth_m(box, seen)
+    return float(before - after) / step_s
+
+
+def grown(box: Box, by_m: float) -> Box:
+    """Return the outline with all sides farther out."""
+    return box[0] + by_m, box[1] + by_m, box[2] + by_m
+
+
+SLACK_M = 2e-3
+SECTORS = 72
+LEAST_MPS, BRAKING_SHARE = 0.02, 0.8  # as documented in the monitor
+Pair = tuple[float, float]
+
+
+def azimuth_rad(sector: int, count: int = SECTORS) -> float:
+    """Return the direction of the middle of a sector; the first begins behind."""
+    return math.radians(-180.0 + 360.0 * (sector + 0.5) / count)
+
+
+def any_settings(rng: random.Random, **changes: object) -> CollisionSettings:
+    numbers = {
+        "front_m": rng.uniform(0.1, 0.5),
+        "rear_m": rng.uniform(0.1, 0.5),
+        "half_width_m": rng.uniform(0.1, 0.35),
+        "stop_m": rng.uniform(0.05, 0.2),
+        "side_m": rng.uniform(0.02, 0.1),
+        "time_s": rng.uniform(0.4, 2.5),
+        "slow_m": 0.0,
+        "slow_side_m": 0.0,
+        "slow_mps": 9.0,
+        "stale_s": 10.0,
+    }
+    return CollisionSettings(**{**numbers, **changes})  # type: ignore[arg-type]
+
+
+def any_motion(rng: random.Random) -> Pair:
+    """Return a motion forward or backward, slow or fast, straight, on an arc or on the spot."""
+    v = rng.choice((0.0, 0.005, rng.uniform(0.1, 0.8), -rng.uniform(0.1, 0.8), -rng.uniform(0.1, 0.8)))
+    turn = rng.choice((-1, 1)) * rng.uniform(0.3, 2.5)
+    return v, turn if v == 0.0 else rng.choice((0.0, turn))
+
+
+def outline_of(settings: CollisionSettings) -> Box:
+    return settings.front_m, settings.rear_m, settings.half_width_m
+
+
+def stop_box(settings: CollisionSettings, v: float) -> Box:
+    """Return the outline with the distance to keep ahead, on the side of the motion, and at the sides."""
+    front_m, rear_m, half_width_m = outline_of(settings)
+    return (
+        front_m + settings.stop_m * (v > 0.0),
+        rear_m + settings.stop_m * (v < 0.0),
+        half_width_m + settings.side_m,
+    )
+
+
+def driven(monitor: CollisionMonitor, rng: random.Random, scan_ns: int, now_ns: int) -> tuple[complex, float]:
+    """Drive any way since the images of the scan; return position and yaw."""
+    place, yaw, forward = 0j, 0.0, rng.uniform(-1.0, 1.0)
+    for at_ns in range(scan_ns, now_ns, S // 10):
+        v, w = forward + rng.uniform(-0.2, 0.2), rng.uniform(-1.0, 1.0)
+        monitor.follow(at_ns, Twist(v, w))
+        place, yaw = travelled((v, w), 0.1, place, yaw)
+    return place, yaw
+
+
+def travelled(motion: Pair, time_s: float, place: complex, yaw: float) -> tuple[complex, float]:
+    """Return position and yaw after a time, by steps of a millisecond."""
+    v, w = motion
+    for _ in range(round(1000 * time_s)):
+        place += v * 1e-3 * cmath.exp(1j * (yaw + w * 5e-4))
+        yaw += w * 1e-3
+    return place, yaw
+
+
+def add_ahead(
+    ranges: list[float], motion: Pair, settings: CollisionSettings, rng: random.Random, now: tuple[complex, float]
 ) -> None:
-    ranges, free = [math.inf] * COUNT, [6.0] * COUNT
-    for k in range(10, 10 + UNKNOWN_SECTORS):
-        ranges[k], free[k] = range_m, free_m
-    found = unknown_ends(ranges, free, 0.15)
-    assert [end.sector for end in found] == (list(range(10, 10 + UNKNOWN_SECTORS)) if is_end else [])
-    assert all(end.free_m == free_m and end.is_gap == is_gap for end in found)
-    ranges[10], free[10] = math.inf, 6.0
-    assert not unknown_ends(ranges, free, 0.15), "too narrow to be more than noise"
+    """Put an obstacle where the front or the rear of the base will be within the time that it keeps, or soon after."""
+    place, yaw = travelled(motion, rng.uniform(0.0, 1.3 * settings.time_s), *now)
+    end_m = settings.stop_m + settings.front_m if motion[0] >= 0 else -settings.stop_m - settings.rear_m
+    point = place + complex(end_m, rng.uniform(-0.9, 0.9) * settings.half_width_m) * cmath.exp(1j * yaw)
+    if abs(point) > 0.1:
+        ranges[math.floor((cmath.phase(point) / math.tau + 0.5) * SECTORS) % SECTORS] = abs(point)
 
 
-def test_a_scan_without_free_floor_is_unknown_where_it_shows_no_range() -> None:
-    ranges = [2.0] * COUNT
-    ranges[: UNKNOWN_SECTORS + 1] = [math.nan] * (UNKNOWN_SECTORS + 1)
-    assert [end.free_m for end in unknown_ends(ranges, (), 0.15)] == [0.0] * (UNKNOWN_SECTORS + 1)
+def share_before(
+    settings: CollisionSettings, braking_mps2: float, motion: Pair, points: Sequence[complex], grow_m: float
+) -> float:
+    """Return the share of a motion that keeps time and braking distance before points that stand."""
+    v, _ = motion
+    box = stop_box(settings, v)
+    within = depth_m(box, np.array(points)) <= 0.0
+    for point in np.array(points)[within]:
+        if approach_mps(outline_of(settings), motion, point) > 1e-4:
+            return 0.0
+    outside = np.array(points)[~within]
+    if not len(outside):
+        return 1.0
+    # From twice the time on nothing slows the base down but weak brakes.
+    longest_s = max(2.0 * settings.time_s, 1.5 * abs(v) / braking_mps2)
+    first_s = contact_s(grown(box, grow_m), motion, list(outside), longest_s)
+    if math.isinf(first_s):
+        return 1.0
+    share = first_s / settings.time_s
+    if v != 0.0:
+        share = min(share, math.sqrt(2 * BRAKING_SHARE * braking_mps2 * abs(v) * first_s) / abs(v))
+        share *= share * abs(v) >= LEAST_MPS or share >= 1.0
+    return min(1.0, share)
+
+
+def is_clear(settings: CollisionSettings, motion: Pair, points: Sequence[complex]) -> bool:
+    """True if no point is so near to an edge, nor so nearly passed along one, that the sweep's errors would decide."""
+    if not points:
+        return True
+    box = stop_box(settings, motion[0])
+    inside = [point for point in points if depth_m(box, point) <= 0.0]
+    return bool(
+        (np.abs(depth_m(box, np.array(points))) > 3 * SLACK_M).all()
+        and all(abs(approach_mps(outline_of(settings), motion, point)) > 1e-3 for point in inside)
+    )
+
+
+def seen_from(place: complex, yaw: float, points: Sequence[complex]) -> list[complex]:
+    return [(point - place) * cmath.exp(-1j * yaw) for point in points]
+
+
+def check(
+    settings: CollisionSettings,
+    braking_mps2: float,
+    motion: Pair,
+    points: Sequence[complex],
+    found: float,
+    least: float = 0.0,
+) -> float:
+    """Compare the share that was found with that of the sweep; return the latter."""
+    low, high = (max(least, share_before(settings, braking_mps2, motion, points, by_m)) for by_m in (SLACK_M, -SLACK_M))
+    assert low - 0.01 <= found <= high + 0.01, (settings, braking_mps2, motion, points, low, found, high)
+    return (low + high) / 2
+
+
+def drove_over(
+    settings: CollisionSettings, motion: Pair, before: Sequence[complex], now: Sequence[complex], way_m: float
+) -> bool:
+    """True if a point that was ahead of the leading edge is now behind that, between the sides, by the way at most."""
+    side = math.copysign(1.0, motion[0])
+    edge_m = settings.front_m if side > 0 else settings.rear_m
+    return motion[0] != 0.0 and any(
+        side * then.real >= edge_m
+        and 0 < edge_m - side * point.real <= way_m
+        and abs(point.imag) < settings.half_width_m
+        for then, point in zip(before, now, strict=True)
+    )
+
+
+def test_the_share_is_that_of_a_sweep_after_any_way_since_the_images() -> None:
+    rng, shares, over = random.Random(1), list[float](), 0
+    for _ in range(220):
+        settings, braking_mps2, motion = any_settings(rng), rng.uniform(0.05, 2.0), any_motion(rng)
+        monitor = CollisionMonitor(settings, braking_mps2)
+        scan_ns, now_ns = 50 * S, 50 * S + rng.randrange(0, 2 * S, S // 10)
+        place, yaw = driven(monitor, rng, scan_ns, now_ns)
+        ranges = [math.inf] * SECTORS
+        for sector in rng.sample(range(SECTORS), rng.randrange(0, 7)):
+            ranges[sector] = rng.uniform(0.2, 3.0)
+        if rng.random() < 0.7:
+            add_ahead(ranges, motion, settings, rng, (place, yaw))
+        points = seen_from(place, yaw, [cmath.rect(r, azimuth_rad(k)) for k, r in enumerate(ranges) if r < math.inf])
+        if not points or not is_clear(settings, motion, points):
+            continue
+        monitor.set_scan(ControllerScan(scan_ns, tuple(ranges)))
+        allowed = monitor.step(now_ns, Twist(*motion))
+        found = (allowed.velocity_mps + allowed.yaw_rate_radps) / sum(motion)
+        assert bool(monitor.reason) == (found < 1.0) and monitor.share == pytest.approx(found)
+        before = [cmath.rect(r, azimuth_rad(k)) for k, r in enumerate(ranges) if r < math.inf]
+        if drove_over(settings, motion, before, points, abs(place)):
+            over += 1
+            assert found == 0.0
+            continue
+        shares.append(check(settings, braking_mps2, motion, points, found))
+    assert over > 3
+    reduced = [share for share in shares if 0.0 < share < 1.0]
+    assert len(reduced) > 15 and shares.count(0.0) > 15 and shares.count(1.0) > 15
+
+
+def any_unknown(rng: random.Random) -> tuple[tuple[bool, ...], list[int]]:
+    """Return which sectors are unknown, and those of them in runs of five and more, also across the seam behind."""
+    unknown = [False] * SECTORS
+    for _ in range(rng.randrange(1, 5)):
+        begin = rng.randrange(SECTORS)
+        for k in range(begin, begin + rng.randrange(2, 9)):
+            unknown[k % SECTORS] = True
+    known = [k for k in range(-SECTORS, 2 * SECTORS) if not unknown[k % SECTORS]]
+    runs = [range(low + 1, high) for low, high in itertools.pairwise(known) if high - low > 5]
+    return tuple(unknown), sorted({k % SECTORS for run in runs for k in run})
+
+
+def edge_m(box: Box, ray: complex) -> float:
+    """Return where a ray from the origin leaves a rectangle, by steps."""
+    return float(np.argmax(depth_m(box, np.arange(0.0, 1.0, 1e-4) * ray) >= 0.0)) * 1e-4
+
+
+@pytest.mark.parametrize("policy", ["stop", "slow"])
+def test_the_end_of_what_was_seen_counts_as_a_wall(policy: str) -> None:
+    rng, shares, turns = random.Random(2), list[float](), list[float]()
+    for _ in range(150):
+        settings = any_settings(rng, slow_mps=rng.uniform(0.05, 0.3), unknown=policy)
+        braking_mps2, motion = rng.uniform(0.05, 2.0), any_motion(rng)
+        unknown, counted = any_unknown(rng)
+        free_m = tuple(rng.uniform(0.0, 1.5) for _ in range(SECTORS))
+        rays = {k: cmath.rect(1.0, azimuth_rad(k)) for k in counted}
+        walls = [max(free_m[k], edge_m(outline_of(settings), ray)) * ray for k, ray in rays.items()]
+        if not is_clear(settings, motion, walls):
+            continue
+        monitor = CollisionMonitor(settings, braking_mps2)
+        # What is not unknown is open up to the longest range.
+        free_m = tuple(f if one else 6.0 for f, one in zip(free_m, unknown, strict=True))
+        monitor.set_scan(ControllerScan(S, tuple(math.nan if one else math.inf for one in unknown), free_m))
+        allowed = monitor.step(S, Twist(*motion))
+        found = (allowed.velocity_mps + allowed.yaw_rate_radps) / sum(motion)
+        edge_mps = abs(motion[0])
+        if motion[0] == 0.0:
+            # What may be at the outline already keeps no base from turning on the spot.
+            walls = [wall for wall in walls if depth_m(stop_box(settings, 0.0), wall) > 0.0]
+            edge_mps = abs(motion[1]) * math.hypot(max(settings.front_m, settings.rear_m), settings.half_width_m)
+            turns.append(found)
+        if not walls:
+            assert found == 1.0
+            continue
+        least = min(1.0, settings.slow_mps / edge_mps) if policy == "slow" else 0.0
+        shares.append(check(settings, braking_mps2, motion, walls, found, least))
+    assert sum(share < 1.0 for share in shares) > 8 and sum(share == 1.0 for share in shares) > 8
+    assert sum(turn < 1.0 for turn in turns) > 3 and turns.count(1.0) > 3

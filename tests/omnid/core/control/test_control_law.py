@@ -2,18 +2,30 @@
 
 from __future__ import annotations
 
-import cmath
 import math
-import random
+from dataclasses import replace
+from itertools import combinations
 
 import pytest
 
+from omnid.core.control import safety_rules
 from omnid.core.control.arming import AUTOMATIC
 from omnid.core.control.collision_monitor import CollisionSettings, ControllerScan
-from omnid.core.control.command_sources import TimedSetpoint
+from omnid.core.control.command_sources import (
+    LOWER_PRIORITY,
+    OPERATOR,
+    OTHER_SENDER,
+    PLANNER,
+    UNKNOWN_SOURCE,
+    CommandSelector,
+    SourceSettings,
+    TimedSetpoint,
+)
 from omnid.core.control.control_law import ControlLaw, ControllerPose, ControllerSettings
-from omnid.core.control.heading_controller import Setpoint, VelocityLimits
-from omnid.core.control.safety_rules import IDLE, POSE_JUMPED
+from omnid.core.control.heading_controller import Setpoint
+from omnid.core.control.motion_monitor import CONFLICTS, NOT_COMMANDED, NOT_FOLLOWED, NOT_SEEN
+from omnid.core.control.safety_rules import Deadlines, SafetyInputs, stop_reason
+from omnid.errors import OmnidError
 
 TICK_NS, TICK_S = 20_000_000, 0.02
 START_NS = 10**12
@@ -74,90 +86,145 @@ def test_a_stick_that_is_held_leads_no_farther_however_small_the_first_step(
     assert law.reason == "" and left_m > 0.15 + 0.25 - 0.004
 
 
-def law_with(first: ControllerPose) -> ControlLaw:
-    """Return a law that drives, without obstacles and without a comparison of motions, from a pose."""
-    settings = ControllerSettings(arming=AUTOMATIC).of_log
-    law = ControlLaw(settings, START_NS)
-    law.take(first)
-    law.step(first.stamp_ns, TICK_S)
-    law.take(TimedSetpoint(first.stamp_ns + 1, Setpoint(0.3)))
-    law.step(first.stamp_ns + 1, TICK_S)
-    assert law.reason == ""
-    return law
-
-
-def between_rad(one_rad: float, other_rad: float) -> float:
-    """Return the angle between two directions."""
-    return abs(cmath.phase(cmath.exp(1j * (one_rad - other_rad))))
-
-
-def test_a_heading_jumps_where_the_base_cannot_have_turned_so_far() -> None:
-    """By more than 0.3 rad beyond a turn from a stand, and beyond one at the rate of the last pose, to either side.
-
-    Each case lies shortly within or beyond one of the two terms; many headings cross pi, and some poses are older.
-    """
-    limits = VelocityLimits()
-    rng, counts = random.Random(8), {True: 0, False: 0}
-    for _ in range(1500):
-        passed_s = rng.choice((-1, 1)) * rng.randrange(0, 400) * 1e-3
-        before = ControllerPose(START_NS + 10**9, rng.uniform(-math.pi, math.pi), rng.uniform(-1.2, 1.2), "tracking")
-        turn_rad = 0.3 + limits.yaw_rate_radps * abs(passed_s)
-        brake_rad = 0.3 + limits.yaw_acceleration_radps2 * passed_s**2 / 2
-        base_rad, bound_rad = rng.choice(((0.0, turn_rad), (before.yaw_rate_radps * passed_s, brake_rad)))
-        heading_rad = before.heading_rad + base_rad + rng.choice((-1, 1)) * (bound_rad + rng.choice((-0.01, 0.01, 0.3)))
-        pose = before._replace(
-            stamp_ns=before.stamp_ns + round(passed_s * 1e9), heading_rad=math.remainder(heading_rad, math.tau)
-        )
-        terms = (
-            between_rad(pose.heading_rad, before.heading_rad) - turn_rad,
-            between_rad(pose.heading_rad, before.heading_rad + before.yaw_rate_radps * passed_s) - brake_rad,
-        )
-        law = law_with(before)
-        law.take(pose)
-        law.step(before.stamp_ns + 2, TICK_S)
-        jumps = min(terms) > 0.0
-        assert (law.reason == POSE_JUMPED) == jumps, (before, pose, terms)
-        counts[jumps] += 1
-    assert min(counts.values()) > 300
-
-
-@pytest.mark.parametrize("side", [1, -1])
-def test_the_goal_of_a_motor_controller_does_not_pass_a_heading_across_pi(side: int) -> None:
-    """It holds headings by itself; here it is blocked, so that the goal goes as far as it may."""
-    law = law_with(ControllerPose(START_NS, side * 3.13, 0.0, "tracking"))
-    goals_rad = []
-    for tick in range(1, 120):
-        now_ns = START_NS + tick * TICK_NS
-        law.take(ControllerPose(now_ns, side * 3.13, 0.0, "tracking"))
-        law.take(TimedSetpoint(now_ns, Setpoint(0.0, -side * 3.13)))
-        goals_rad.append(side * law.step(now_ns, TICK_S).heading_rad)
-    assert max(goals_rad) == pytest.approx(math.tau - 6.26) and min(goals_rad) >= 0.0
-
-
-def test_the_goal_of_a_motor_controller_moves_by_the_turn_of_each_tick() -> None:
-    law, goal_rad = law_with(ControllerPose(START_NS, 0.0, 0.0, "tracking")), 0.0
-    for tick, dt_s in enumerate((TICK_S, 0.05, 0.01, TICK_S, 0.03, 0.1), 1):
-        now_ns = START_NS + tick * TICK_NS
-        law.take(TimedSetpoint(now_ns, Setpoint(0.0, None, 0.6)))
-        output = law.step(now_ns, dt_s)
-        goal_rad += output.motion.yaw_rate_radps * dt_s
-        assert output.heading_rad == pytest.approx(goal_rad) and output.motion.yaw_rate_radps > 0.0
-    output = law.step(START_NS + 8 * TICK_NS, 9.0)
-    assert output.heading_rad == pytest.approx(goal_rad + output.motion.yaw_rate_radps * 0.2), "a late tick"
-
-
-def test_a_setpoint_of_the_very_instant_of_a_reason_to_stop_is_void() -> None:
-    law = ControlLaw(ControllerSettings(arming=AUTOMATIC).of_log, START_NS)
-    law.take(ControllerPose(START_NS, 0.0, 0.0, "tracking"))
-    law.take(TimedSetpoint(START_NS, Setpoint(0.3)))
-    assert law.step(START_NS, TICK_S).reason == IDLE
-    law.take(TimedSetpoint(START_NS + 1, Setpoint(0.3)))
-    assert law.step(START_NS + 1, TICK_S).reason == ""
-
-
 def test_where_the_images_are_those_of_a_log_neither_motion_nor_obstacles_are_compared() -> None:
     settings = ControllerSettings()
     for of in (settings.of_log, settings.of_replay):
         assert not of.motion.check and not of.collision.check
     assert settings.motion.check and settings.collision.check and settings.without_obstacles.motion.check
     assert settings.of_replay.arming == AUTOMATIC
+
+
+# The safety rules: every reason to stop, their order, and numbers that are not finite.
+DEADLINES = Deadlines(pose_s=0.5, command_s=0.4, tick_s=0.25)
+GOOD = SafetyInputs(pose_age_s=0.1, pose_state="tracking", command_age_s=0.1, late_s=0.01)
+CAUSES: dict[str, dict[str, object]] = {  # in the order in which they are reported
+    safety_rules.ENDS: {"ending": True},
+    safety_rules.ASKED: {"stop_asked": True},
+    safety_rules.CLIFF: {"contact": safety_rules.CLIFF},
+    safety_rules.BUMPER: {"contact": safety_rules.BUMPER},
+    safety_rules.AWAITED: {"motor_awaited": True},
+    safety_rules.FAILED: {"motor_failed": True},
+    safety_rules.STOPPED: {"motor_stopped": True},
+    safety_rules.MOTOR_FAULT: {"motor_faulty": True},
+    safety_rules.BATTERY_EMPTY: {"battery_empty": True},
+    safety_rules.OVERLOADED: {"late_s": 0.26},
+    safety_rules.NO_POSE: {"pose_age_s": math.inf},
+    safety_rules.POSE_STALE: {"pose_age_s": 0.51},
+    safety_rules.POSE_LOST: {"pose_state": "lost"},
+    safety_rules.POSE_RESET: {"pose_reset": True},
+    safety_rules.POSE_UNSURE: {"pose_unsure": True},
+    NOT_FOLLOWED: {"disagreement": NOT_FOLLOWED},
+    NOT_SEEN: {"disagreement": NOT_SEEN},
+    NOT_COMMANDED: {"disagreement": NOT_COMMANDED},
+    **{reason: {"disagreement": reason} for reason in CONFLICTS},
+    safety_rules.POSE_JUMPED: {"pose_jumped": True},
+    safety_rules.NOT_ARMED: {"armed": False},
+    safety_rules.COMMAND_STALE: {"command_age_s": 0.41},
+}
+
+
+def reason_for(**changes: object) -> str:
+    return stop_reason(replace(GOOD, **changes), DEADLINES)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("state", ["tracking", "degraded"])
+def test_lets_the_wheels_turn_where_no_rule_applies(state: str) -> None:
+    assert reason_for(pose_state=state) == ""
+    assert reason_for(pose_age_s=0.5, command_age_s=0.4, late_s=0.25) == "", "a deadline itself is in time"
+
+
+@pytest.mark.parametrize("reason", CAUSES)
+def test_stops_for_each_cause(reason: str) -> None:
+    assert reason_for(**CAUSES[reason]) == reason
+
+
+def test_reports_the_first_of_two_causes() -> None:
+    for first, second in combinations(CAUSES, 2):
+        if not CAUSES[first].keys() & CAUSES[second].keys():  # one disagreement is reported at a time
+            assert reason_for(**CAUSES[first], **CAUSES[second]) == first
+
+
+def test_reports_what_was_never_there_as_missing_rather_than_stale() -> None:
+    assert reason_for(command_age_s=math.inf) == safety_rules.IDLE
+    assert reason_for(pose_age_s=math.inf, pose_state="") == safety_rules.NO_POSE
+    assert reason_for(pose_age_s=math.inf, command_age_s=math.inf) == safety_rules.NO_POSE
+
+
+@pytest.mark.parametrize("name", ["pose_age_s", "command_age_s", "late_s"])
+def test_stops_where_an_input_is_nan(name: str) -> None:
+    assert reason_for(**{name: math.nan}) != ""
+
+
+@pytest.mark.parametrize("name", ["pose_age_s", "command_age_s"])
+def test_stops_where_a_stamp_is_in_the_future(name: str) -> None:
+    """A camera with wrong stamps must not give a pose that never goes stale."""
+    assert reason_for(**{name: -0.001}) == ""
+    assert reason_for(**{name: -10.0}) != "" and reason_for(**{name: -math.inf}) != ""
+
+
+def test_the_table_has_every_reason_once() -> None:
+    reasons = [rule.reason for rule in safety_rules.RULES]
+    assert reasons == [*list(CAUSES)[:-1], safety_rules.IDLE, safety_rules.COMMAND_STALE]
+
+
+def test_only_faults_disarm() -> None:
+    """Faults of the robot, not the wishes of its operator."""
+    kept = {
+        safety_rules.ENDS,
+        safety_rules.ASKED,
+        safety_rules.POSE_JUMPED,
+        safety_rules.NOT_ARMED,
+        safety_rules.IDLE,
+        safety_rules.COMMAND_STALE,
+    }
+    assert {rule.reason for rule in safety_rules.RULES if not rule.disarms} == kept
+    for reason in CAUSES.keys() - kept:
+        everything = replace(GOOD, armed=False, **CAUSES[reason])  # type: ignore[arg-type]
+        assert stop_reason(everything, DEADLINES, safety_rules.FAULTS) == reason
+
+
+# Sources of commands: priorities, ownership of a source by one sender, and their end.
+HOLD_S = 0.5
+
+
+@pytest.fixture
+def selector() -> CommandSelector:
+    return CommandSelector(SourceSettings(("joystick", OPERATOR, PLANNER), HOLD_S))
+
+
+def offer(selector: CommandSelector, at_s: float, source: str = OPERATOR, sender: str = "a") -> bool:
+    """Offer a command; return whether it is the current one now."""
+    command = TimedSetpoint(10**12 + round(at_s * 1e9), Setpoint(0.1), source, sender)
+    selector.offer(command)
+    return selector.current == command
+
+
+@pytest.mark.hazard("H07")
+def test_a_higher_source_takes_over_at_once_and_keeps_the_lower_one_out(selector: CommandSelector) -> None:
+    assert offer(selector, 0.0, PLANNER) and offer(selector, 0.1, OPERATOR)
+    assert not any(offer(selector, 0.1 + 0.1 * k, PLANNER) for k in range(6))
+    assert offer(selector, 0.61, PLANNER), "the operator has been silent for longer than hold_s"
+    assert selector.refused == {LOWER_PRIORITY: 6} and selector.conflict == ""
+
+
+@pytest.mark.hazard("H07")
+def test_the_first_sender_of_a_source_keeps_it_until_it_is_silent(selector: CommandSelector) -> None:
+    assert offer(selector, 0.0, sender="a")
+    for k in range(10):
+        assert not offer(selector, 0.1 * k + 0.05, sender="b") and offer(selector, 0.1 * k + 0.1, sender="a")
+    assert offer(selector, 1.51, sender="b"), "a has been silent since 1.0 s"
+    assert not offer(selector, 1.6, sender="a")
+    assert selector.refused == {OTHER_SENDER: 11}
+
+
+def test_refuses_unknown_sources_and_keeps_the_newest_of_reordered_commands(selector: CommandSelector) -> None:
+    assert not offer(selector, 0.0, "autopilot") and selector.refused == {UNKNOWN_SOURCE: 1}
+    assert offer(selector, 1.0) and not offer(selector, 0.9)
+    assert selector.current is not None and selector.current.arrival_ns == 10**12 + 10**9
+
+
+@pytest.mark.parametrize("names", [(), ("a",) * 2, tuple("abcdefghi"), ("A",), ("a/b",), ("stop",), ("",), ("x" * 33,)])
+def test_refuses_names_that_are_no_topics(names: tuple[str, ...]) -> None:
+    with pytest.raises(OmnidError, match=r"controller\.sources\.names"):
+        SourceSettings(names)
+    assert SourceSettings(("a",)).names == ("a",) and len(SourceSettings(tuple("abcdefgh")).names) == 8

@@ -19,6 +19,8 @@ from omnid.core.control.motion_monitor import (
     MotionMonitor,
     MotionSettings,
 )
+from omnid.core.control.safety_rules import SafetyInputs
+from omnid.core.control.trust import MotorReport, Plausibility, TrustSettings
 
 TICK_S, POSE_S, DELAY_S = 0.05, 0.1, 0.15  # of the ticks, of the poses, from an image to the arrival of its pose
 NS = 10**9
@@ -197,9 +199,43 @@ def test_rest_forgets_what_was_unexplained() -> None:
     assert held_s > 6.0 + 0.8 * REST_S and not monitor.reason and not monitor.is_doubtful
 
 
-def test_recovers_where_the_contradiction_ends() -> None:
-    """A wheel that spins for a moment slows the base down, and no more."""
-    _, history = run(steady(0.4), 30.0, World(seen=lambda at_s, m: still(at_s, m) if 5 < at_s < 5.8 else m))
-    assert not any(reason for _, _, reason in history)
-    doubtful = [at_s for at_s, slow, _ in history if slow]
-    assert doubtful and max(doubtful) < 12.0
+# Trust in pose and motor: levels, times, switches, and how slowly a base drives.
+NS = 10**9
+STILL = Motion(0.0, 0.0)
+SURE, UNSURE, TURNING = (0.01, 0.01), (0.5, 0.01), (0.01, 0.9)
+
+
+def judged(plausibility: Plausibility) -> SafetyInputs:
+    return plausibility.added_to(SafetyInputs(0.0, "tracking", 0.0))
+
+
+def is_unsure(*sigmas: tuple[float, float], settings: TrustSettings | None = None) -> bool:
+    """Return whether the pose is unsure after poses 0.1 s apart, with sigmas of velocity and yaw rate."""
+    plausibility = Plausibility(settings or TrustSettings(), MotionSettings())
+    for number, pair in enumerate(sigmas):
+        plausibility.add_pose(number * NS // 10, "tracking", Motion(0.0, 0.0, *pair), 0)
+    return judged(plausibility).pose_unsure
+
+
+@pytest.mark.parametrize("sigmas", [UNSURE, TURNING, (math.nan, 0.0), (math.inf, math.inf)])
+def test_a_pose_is_unsure_for_a_time_before_it_counts(sigmas: tuple[float, float]) -> None:
+    assert not is_unsure(SURE, *[sigmas] * 3), "0.2 s: a refused frame and the one after it"
+    assert is_unsure(SURE, *[sigmas] * 4)
+    assert not is_unsure(SURE, *[sigmas] * 9, SURE)
+    assert not is_unsure(*[sigmas, sigmas, SURE] * 5)
+    off = TrustSettings(velocity_sigma_mps=0.0, yaw_rate_sigma_radps=0.0)
+    assert not is_unsure(*[sigmas] * 9, settings=off)
+
+
+def test_a_battery_is_empty_once_its_voltage_stays_low() -> None:
+    def reports(*volts: float, level_v: float = 11.0) -> list[bool]:
+        """Return after each report, 0.5 s apart, whether the battery is empty."""
+        plausibility, found = Plausibility(TrustSettings(battery_v=level_v), MotionSettings()), []
+        for number, battery_v in enumerate(volts):
+            plausibility.add_report(number * NS // 2, MotorReport(STILL, 0, battery_v))
+            found.append(judged(plausibility).battery_empty)
+        return found
+
+    assert reports(12.0, *[10.9] * 5) == [False] * 5 + [True], "2 s"
+    assert not any(reports(*[10.9, 10.9, 12.0] * 5)), "a motor that starts"
+    assert not any(reports(*[math.nan] * 20)) and not any(reports(*[1.0] * 20, level_v=0.0))
