@@ -238,14 +238,8 @@ def _covariance(table: CovarianceTable, rig: RigTable) -> RigCovariance:
 
 # 3. Writing.
 def write_rig(path: Path, rig: Rig) -> None:
-    """Write `rig.toml`, and mask images in the same folder as `<stem>.lower.png` and `<stem>.upper.png`."""
-    masks = {side: mounted.mask for side, mounted in rig.sides}
-    painted = {side: mask.image for side, mask in masks.items() if mask is not None and mask.image is not None}
-    images = {side: f"{path.stem}.{side}.png" for side in painted}
-    text = rig_toml(rig, images).encode()
-    for side, image in painted.items():
-        write_file(path.with_name(images[side]), png(image))
-    write_file(path, text)
+    """Write `rig.toml`, with the images of masks within it."""
+    write_file(path, rig_toml(rig).encode())
 
 
 def png(image: NDArray[np.uint8]) -> bytes:
@@ -253,8 +247,8 @@ def png(image: NDArray[np.uint8]) -> bytes:
     return cv2.imencode(".png", image)[1].tobytes()
 
 
-def rig_toml(rig: Rig, images: Mapping[str, str] | None = None) -> str:
-    """Return the text of a `rig.toml`; images: file names of mask images by side, others are embedded."""
+def rig_toml(rig: Rig) -> str:
+    """Return the text of a `rig.toml`."""
     text = f"schema = {SCHEMA}\n"
     if not np.array_equal(rig.T_base_rig, np.eye(4)):  # else it is not stated
         text += f"T_base_rig = {_value(rig.T_base_rig.tolist())}\n"
@@ -270,8 +264,8 @@ def rig_toml(rig: Rig, images: Mapping[str, str] | None = None) -> str:
         }
         text += _table_text(side, head) + _table_text(f"{side}.intrinsics", _intrinsics(camera))
         if mounted.mask is not None:
-            mask, image = mounted.mask, (images or {}).get(side)
-            if mask.image is not None and not image:
+            mask, image = mounted.mask, None
+            if mask.image is not None:
                 image = EMBEDDED + base64.b64encode(png(mask.image)).decode()
             outer_px = mask.outer_px if np.isfinite(mask.outer_px) else None
             text += _table_text(f"{side}.mask", asdict(MaskTable(mask.center, mask.inner_px, outer_px, image)))

@@ -8,7 +8,6 @@ points of grey, also those of tags that could not be read.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -26,8 +25,6 @@ from calib.models.camera import Array
 Tags = dict[int, Array]
 # Tags as in Kalibr: number of those of the family 36h11, width of the border [bits], bits along a side within it.
 TAGS, TAG_BORDER_BITS, TAG_BITS = 587, 2, 6
-# Tag 0 of the family 36h11 (Olson 2011): row by row, the most significant bit at the upper left, 1 is light.
-TAG_0 = 0xD5D628584
 
 
 # Least perimeter of a tag as a fraction of the image's larger side, and pixels per bit when it is read: half and 1.5 of
@@ -95,8 +92,9 @@ class AprilGrid:
     def tag_corners(self) -> Array:
         """Return the corners (M, 4, 2) [m] of the tags in the order of cv2.aruco."""
         y, x = np.divmod(np.arange(self.columns * self.rows), self.columns)
-        # Clockwise from the upper left of the tag as Kalibr prints it, then from that of OpenCV's dictionary.
-        corner = np.roll(np.array([[0, 1], [1, 1], [1, 0], [0, 0]]), _quarter_turns(), axis=0)
+        # Clockwise from the upper left of the tag in OpenCV's dictionary, which is turned by half a turn as Kalibr
+        # prints it.
+        corner = np.array([[1, 0], [0, 0], [0, 1], [1, 1]])
         return np.asarray((np.column_stack([x, y])[:, None] * (1 + self.spacing) + corner) * self.tag_m)
 
     def __str__(self) -> str:
@@ -215,14 +213,6 @@ def _detected(detector: cv2.aruco.ArucoDetector, derived: DerivedImage, reflecte
 
 def _dictionary() -> cv2.aruco.Dictionary:
     return cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
-
-
-@lru_cache(maxsize=1)
-def _quarter_turns() -> int:
-    """Return the counter-clockwise quarter turns from OpenCV's tags to the family's."""
-    image = cv2.aruco.generateImageMarker(_dictionary(), 0, TAG_BITS + 2, borderBits=1)[1:-1, 1:-1] > 0
-    bits = np.array([TAG_0 >> k & 1 for k in range(TAG_BITS**2 - 1, -1, -1)], bool).reshape(TAG_BITS, TAG_BITS)
-    return next(k for k in range(4) if (np.rot90(image, k) == bits).all())
 
 
 def _grown(image: Grey, points: Array, places: Array, outlines: Array, window: float) -> Array:

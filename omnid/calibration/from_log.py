@@ -132,7 +132,7 @@ class MaskCalibration:
         )
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the rig.toml, and its masks as PNGs beside it."""
+        """Write the rig.toml."""
         write_rig(Path(path), self.rig)
 
 

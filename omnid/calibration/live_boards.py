@@ -32,7 +32,6 @@ NEEDED_RINGS: Final = 2  # Rings that need boards at half of the hours: boards t
 # Two positions of a board differ if their corners are this far apart on average, as a fraction of the rim's radius.
 NEW_VIEW_PART: Final = 0.06
 STILL_PART: Final = 0.004  # a board that is held still moves less between two images
-MOST_PAIRS: Final = 200
 Views = tuple[BoardView | None, BoardView | None]
 
 
@@ -99,7 +98,6 @@ class PairOutcome(StrEnum):
     ONE_CAMERA = "one camera only"
     MOVING = "hold it still"
     SEEN_BEFORE = "seen there before: move it"
-    FULL = "enough pairs are kept"
 
 
 class LiveBoards:
@@ -148,8 +146,6 @@ class LiveBoards:
             return PairOutcome.MOVING
         if any(self._near(kept, (lower, upper), NEW_VIEW_PART) for kept in self._kept):
             return PairOutcome.SEEN_BEFORE
-        if self.pairs >= MOST_PAIRS:
-            return PairOutcome.FULL
         # 3. Keep the pair, and count what it covers.
         self._kept.append((lower, upper))
         for coverage, view in zip(self.coverage, (lower, upper), strict=True):

@@ -17,7 +17,7 @@ from calib.fit.boards.rig_fit import SIDES, PairView, RigCalibration, calibrate_
 from calib.fit.residual_structure import ResidualStructure
 from calib.fit.rig_uncertainty import DriveUncertainty, drive_uncertainty
 from calib.models.names import sees_directly
-from calib.rig import MAX_BASELINE_M, MIN_BASELINE_M, Rig, mounting_notes, rig_between
+from calib.rig import Rig, mounting_notes, rig_between
 from calib.rig_file import write_rig
 from calib.rim import find_rim
 from calib.validation import silent
@@ -152,16 +152,10 @@ def _find_views(images: PairedImages, board: AnyBoard, progress: Progress) -> li
 
 def _check_baseline(found: RigCalibration, board: AnyBoard, expected_m: float | None) -> list[str]:
     """Return warnings about the baseline; raises OmnidError if it is far from the expected one."""
-    # The board scales the rig: a baseline that no rig has shows a wrong length of the board.
-    baseline_mm, (low, high) = found.baseline_m * 1e3, (MIN_BASELINE_M, MAX_BASELINE_M)
+    baseline_mm = found.baseline_m * 1e3
     option, length_mm = (
         ("--tag-mm", board.tag_m * 1e3) if isinstance(board, AprilGrid) else ("--square-mm", board.square_m * 1e3)
     )
-    if not low <= found.baseline_m <= high:
-        raise OmnidError(
-            f"calibrate rig: expected a baseline of {low * 1e3:.0f} to {high * 1e3:.0f} mm, found {baseline_mm:.4g} "
-            f"mm; it is proportional to {option}, which is {length_mm:g}: measure the board"
-        )
     if expected_m is None:
         return []
     expected_mm = expected_m * 1e3

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -15,11 +15,9 @@ from calib.rim import find_rim
 from omnid.calibration.images import Image, brightest, middle_px
 
 IMAGES: Final = 10  # Images of each camera: the rim is searched in their maximum.
-# Grey levels at which a pixel is too bright, and a mean that is too dark; most of the pixels that may be too bright.
-SATURATED, DARK_GREY, BRIGHT_SHARE = 250, 25.0, 0.05
+SATURATED: Final = 250  # grey level at which a pixel is too bright
 NOISE_GREY2: Final = 4.0  # of the variance of the grey levels: an image without any content has no focus
-LESS_SHARP: Final = 0.5  # share of the other camera's focus measure
-EDGE_PX: Final = 3.0  # width of what counts as the edge of the image, of the rim and of the hub
+EDGE_PX: Final = 3.0  # width of what counts as the edge of the rim and of the hub
 GREEN, RED = (80, 220, 80), (60, 60, 230)
 
 
@@ -64,37 +62,6 @@ def described(view: CameraView) -> str:
         f"{width}x{height}, {rim}; focus {1e3 * view.focus:.1f}; brightness {view.level_grey:.0f}, "
         f"{100 * view.saturated:.1f} % too bright"
     )
-
-
-def warnings(views: Mapping[str, CameraView]) -> Iterator[str]:
-    """Yield what should be corrected before the cameras are calibrated."""
-    for name, view in views.items():
-        if view.rim is None:
-            yield (
-                f"{name}: the mirror's rim was not found: light all around, and the whole circle in the image; "
-                "without a rim the mask must be given in the rig; a lens without a mirror has none, and needs no mask"
-            )
-        elif _reach_px(view) < EDGE_PX:
-            yield f"{name}: the rim leaves the image: move the camera towards the middle of the mirror, or farther away"
-        if view.level_grey < DARK_GREY:
-            yield f"{name}: it is dark: more light, a longer exposure (cameras.exposure_us) or more gain"
-        if view.saturated > BRIGHT_SHARE:
-            yield f"{name}: {100 * view.saturated:.0f} % of the image are too bright: a shorter exposure, or less gain"
-    sharpest = max(views, key=lambda name: views[name].focus)
-    for name, view in views.items():
-        if view.focus < LESS_SHARP * views[sharpest].focus:
-            yield (
-                f"{name}: less sharp than the {sharpest} camera: turn its lens until `focus` is highest; both see "
-                "the same world"
-            )
-
-
-def _reach_px(view: CameraView) -> float:
-    """Return the distance from the rim to the nearest border of the image, px; negative where it leaves it."""
-    assert view.rim is not None
-    height, width = view.image.shape
-    (u, v), radius = view.rim.center, view.rim.outer_px
-    return float(min(u, v, width - 1 - u, height - 1 - v) - radius)
 
 
 def annotated(view: CameraView) -> Image:

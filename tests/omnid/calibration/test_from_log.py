@@ -108,7 +108,6 @@ def test_the_command_writes_a_rig_that_needs_no_other_mask(
     words = ("drive", spin / "log.mcap", "--only", "mask", "--rig")
     assert command(*words, spin / "rig.toml", "-o", masked) == 0
     assert f"{masks}\n{masked}: written" in capsys.readouterr().out
-    assert {path.name for path in tmp_path.iterdir()} == {"rig.toml", "rig.lower.png", "rig.upper.png"}
     assert command(*words, masked) == 0
     assert capsys.readouterr().out.startswith("nothing is fixed to the cameras that the masks do not hide")
 

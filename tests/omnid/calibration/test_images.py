@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -12,7 +11,6 @@ import pytest
 import omnid
 from drivers.logs.log_reader import LogCameras
 from omnid.calibration.images import read_pairs
-from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, START_NS, UPPER, Entry, compressed, jpeg, write_log
 
 
 @pytest.mark.parametrize(("suffix", "bits"), [("png", 8), ("png", 10), ("tif", 12), ("pgm", 12), ("png", 16)])
@@ -36,24 +34,3 @@ def test_a_pair_of_the_same_images_counts_once_and_a_name_stands_for_one_image(t
     cv2.imwrite(str(tmp_path / "lower_1.jpg"), np.full((48, 64), 7, np.uint8))
     with pytest.raises(omnid.OmnidError, match=r"lower_1\.jpg and lower_1\.png have one name"):
         read_pairs(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("stamp_ns", "data", "line"),
-    [
-        (lambda number: 0, jpeg(0), ".*same stamp"),
-        (lambda number: START_NS + number * 10**8, b"\xff\xd8\xff", "left out 6 pairs; the first: "),
-    ],
-)
-def test_a_log_without_a_pair_is_refused_with_the_cause(
-    tmp_path: Path, stamp_ns: Callable[[int], int], data: bytes, line: str
-) -> None:
-    entries = [
-        Entry(
-            topic, COMPRESSED, compressed(stamp_ns(number), data + bytes(number)), START_NS + (topic == UPPER) * 10**8
-        )
-        for number in range(6)
-        for topic in (LOWER, UPPER)
-    ]
-    with pytest.raises(omnid.OmnidError, match=f"no pair of images: .*{line}"):
-        read_pairs(write_log(tmp_path / "log.mcap", entries))

@@ -109,10 +109,8 @@ def test_tags_are_reflected_by_a_mirror(view: str) -> None:
     ("choice", "cameras", "chosen", "is_warned"),
     [
         ("auto", [rim(25.0), rim(25.0)], "mirror", False),
-        ("auto", [rim(25.0), rim(0.0)], "mirror", False),
         ("mirror", [rim(25.0), PLAIN], "mirror", False),
         ("direct", [rim(25.0), PLAIN], "direct", True),
-        ("direct", [PLAIN, PLAIN], "direct", False),
     ],
 )
 def test_rim_and_hub_of_a_mirror_show_it(
