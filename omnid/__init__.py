@@ -8,7 +8,7 @@
     odometry = omnid.Odometry("rig.toml")                 # images in, poses out
     pose = odometry.process(stamp_ns, lower, upper)       # grey images (H, W) uint8 -> OdometryUpdate
 
-    found = omnid.calibrate_rig("boards/", omnid.Board(6, 7, 0.03))   # also calibrate_drive
+    found = omnid.calibrate_rig("boards/", omnid.Board(6, 7, 0.03), view="mirror")   # also calibrate_drive
     print(found)
     found.save("rig.toml")
 

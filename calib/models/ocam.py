@@ -27,7 +27,6 @@ from calib.models import wavefront as wavefronts
 from calib.models.camera import Array, OmniCamera, undistorted
 
 View = Literal["mirror", "direct"]
-VIEWS: tuple[View, View] = ("mirror", "direct")
 # The tangential and the astigmatic terms, as files and results name them.
 TANGENTIAL_NAMES, ASTIGMATISM_NAMES = ("p1", "p2"), ("s1", "s2")
 

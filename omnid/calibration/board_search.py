@@ -5,17 +5,15 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Final, Literal
 
 import numpy as np
 
 from calib.boards.aprilgrid import AprilGrid, find_april_grid
 from calib.boards.board import Board, BoardView
 from calib.boards.checkerboard import find_board
-from calib.models.ocam import VIEWS, View
-from calib.rim import find_rim
+from calib.models.ocam import View
 from calib.validation import silent
-from omnid.calibration.images import Image, Images, brightest, middle_px
+from omnid.calibration.images import Image, Images
 from omnid.errors import OmnidError
 
 AnyBoard = Board | AprilGrid
@@ -65,49 +63,8 @@ def select_diverse_views(views: Sequence[BoardView]) -> list[BoardView]:
     return [views[index] for index in sorted(set(chosen))]
 
 
-ViewChoice = Literal["auto", "mirror", "direct"]
-VIEW_CHOICES: Final[tuple[ViewChoice, ...]] = ("auto", *VIEWS)
-
-
-def view_of_images(
-    choice: ViewChoice,
-    cameras: Sequence[tuple[Images, Sequence[BoardView]]],
-    board: Board | AprilGrid,
-    progress: Progress,
-) -> tuple[View, list[str]]:
-    """Return the chosen view, or the one that the images of a rig's cameras and their views of the board show.
-
-    With it comes a warning where the images show another view than the chosen one: the world would be its mirror image.
-    Raises OmnidError for "auto" where the images show no view, or where they contradict each other.
-    """
-    if choice not in VIEW_CHOICES:
-        raise OmnidError(f"view: expected one of {', '.join(VIEW_CHOICES)}, found {choice!r}")
-    shown = {found for images, views in cameras if (found := _view_of_camera(images, views, board)) is not None}
-    if choice != "auto":
-        warning = (
-            f"the view is given as {choice}, but the images do not look like that: where it is wrong, left and right "
-            "are exchanged in all that follows; leave --view out unless you are sure"
-        )
-        return choice, [] if shown <= {choice} else [warning]
-    if len(shown) != 1:
-        words = (
-            "a mirror in one and a lens in the other camera" if shown else "no markers and no mirror's rim with a hub"
-        )
-        raise OmnidError(
-            "calibrate: the images do not show whether the world is seen in a mirror or through a lens (found "
-            f"{words}): add --view mirror or --view direct"
-        )
-    (view,) = shown
-    progress(f"view: {view}, as the images show")
-    return view, []
-
-
-def _view_of_camera(images: Images, views: Sequence[BoardView], board: Board | AprilGrid) -> View | None:
-    """Return the view of one camera by its images and its views of the board; None: undecided."""
-    if isinstance(board, Board):
-        image = brightest(images.values())
-        rim = find_rim(image, middle_px(image))
-        return "mirror" if rim is not None and rim.inner_px > 0 else None
+def view_of_tags(stated: View | None, views: Sequence[BoardView], board: AprilGrid) -> View:
+    """Return the view of cameras that the tags of a grid show; OmnidError where another one is stated."""
     # The grid's y points up in an image that is not reflected, the pixels' v down.
     reflected = []
     for view in views:
@@ -115,6 +72,7 @@ def _view_of_camera(images: Images, views: Sequence[BoardView], board: Board | A
         known = np.column_stack([board.points[seen, :2], np.ones(seen.sum())])
         affine = np.linalg.lstsq(known, view.pixels[seen], rcond=None)[0]
         reflected.append(np.linalg.det(affine[:2]) > 0)
-    if not reflected:
-        return None
-    return "mirror" if 2 * sum(reflected) > len(reflected) else "direct"
+    found: View = "mirror" if np.mean(reflected) > 0.5 else "direct"
+    if stated not in (None, found):
+        raise OmnidError(f"calibrate: the view is given as {stated}, but the tags show it as {found}: leave --view out")
+    return found

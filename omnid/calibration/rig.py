@@ -12,11 +12,12 @@ import numpy as np
 from calib import se3
 from calib.atomic_file import write_file
 from calib.boards.aprilgrid import AprilGrid
-from calib.boards.board import BoardView
+from calib.boards.board import Board, BoardView
 from calib.fit.boards.rig_fit import SIDES, PairView, RigCalibration, calibrate_boards, rig_covariance
 from calib.fit.residual_structure import ResidualStructure
 from calib.fit.rig_uncertainty import DriveUncertainty, drive_uncertainty
 from calib.models.names import sees_directly
+from calib.models.ocam import View
 from calib.rig import Rig, mounting_notes, rig_between
 from calib.rig_file import write_rig
 from calib.rim import find_rim
@@ -25,10 +26,9 @@ from drivers.logs.log_reader import AnyCameras, LogCameras
 from omnid.calibration.board_search import (
     AnyBoard,
     Progress,
-    ViewChoice,
     find_boards,
     select_diverse_views,
-    view_of_images,
+    view_of_tags,
 )
 from omnid.calibration.images import PairedImages, brightest, read_pairs
 from omnid.calibration.rig_report import AngleRow, angle_lines, angle_rows, rig_report_html
@@ -45,7 +45,7 @@ class RigResult:
     rig: Rig
     calibration: RigCalibration
     images: PairedImages
-    notes: tuple[str, ...]  # about repeated images, baseline, view, order of the cameras, and masks that are missing
+    notes: tuple[str, ...]  # about repeated images, baseline, order of the cameras, and masks that are missing
     drives: DriveUncertainty | None  # errors of drives by the covariance; None if the cameras see too little in common
     angles: tuple[tuple[AngleRow, ...], ...]  # residuals and coverage of the lower and the upper camera
 
@@ -99,36 +99,40 @@ def calibrate_rig(
     board: AnyBoard,
     *,
     topics: AnyCameras = (None, None),
-    view: ViewChoice = "auto",
+    view: View | None = None,
     expected_baseline_m: float | None = None,
     progress: Progress = silent,
 ) -> RigResult:
     """Calibrate two cameras and the transform between them by images of a board.
 
     source: a log of both cameras with the topics of the lower and the upper one, or a folder with images lower_*,
-    upper_*. view: the world is seen in a mirror or directly; "auto": as the images show, see `view_of_images`.
+    upper_*. view: the world is seen in a mirror or directly; None: as the tags of an AprilTag grid show.
     expected_baseline_m: by ruler; a result that differs by a tenth is refused. progress receives one line for each
     image and each fit. Raises OmnidError or CalibError where the images do not suffice.
     """
     # 1. Read the images, each once.
+    if view is None and isinstance(board, Board):
+        raise OmnidError(
+            "calibrate: a checkerboard looks the same in a mirror and through a lens: add --view mirror or direct"
+        )
     images = read_pairs(Path(source), LogCameras(*topics))
     for line in images.notes:
         progress(line)
     # 2. Find the board in all of them.
     views = _find_views(images, board, progress)
-    # 3. Find the view of the cameras, that of a mirror or of a lens.
-    seen = [[own for pair in views if (own := pair.seen[side]) is not None] for side in range(len(SIDES))]
-    direction, shown = view_of_images(view, list(zip(images.sides, seen, strict=True)), board, progress)
+    # 3. The view of the cameras, that of a mirror or of a lens, by tags.
+    if isinstance(board, AprilGrid):
+        view = view_of_tags(view, [seen for pair in views for seen in pair.seen if seen is not None], board)
     # 4. Fit the cameras, and the transform between them.
     sizes = [next(iter(side.values())).shape[::-1] for side in images.sides]
-    found = calibrate_boards(views, board, [(w, h) for w, h in sizes], direction, images.sides, progress)
+    found = calibrate_boards(views, board, [(w, h) for w, h in sizes], view or "mirror", images.sides, progress)
     # 5. Compare the baseline with what it can be.
     baseline_notes = _check_baseline(found, board, expected_baseline_m)
     # 6. Build the rig with masks and covariance, and predict the errors of drives.
     rig, unmasked = _masked_rig(found, images)
     rig = replace(rig, covariance=rig_covariance(found, rig))
     angles = tuple(tuple(angle_rows(found, rig, side)) for side in range(len(SIDES)))
-    notes = (*images.notes, *baseline_notes, *shown, *mounting_notes(rig), *unmasked)
+    notes = (*images.notes, *baseline_notes, *mounting_notes(rig), *unmasked)
     return RigResult(rig, found, images, notes, drive_uncertainty(rig), angles)
 
 

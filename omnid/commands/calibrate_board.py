@@ -90,12 +90,12 @@ def rig(args: argparse.Namespace) -> int:
     -o, --output FILE  the rig.toml to write (required)
     --expected-baseline-mm MM 0.001..  the measured distance of the mirrors: a result that differs by more than a tenth
         is refused
-    --view auto|mirror|direct=auto     the world is seen in a mirror or directly through a lens; auto: what markers, or
-        rim and hub of a mirror show; else it must be given, as a checkerboard looks the same
+    --view mirror|direct  the world is seen in a mirror or directly through a lens; the tags of an AprilTag grid show
+        it, a checkerboard does not
     --report FILE     write an HTML report with residuals and panoramas
 
     examples:
-      calibrate rig boards.mcap --corners 6x7 --square-mm 30 -o rig.toml
+      calibrate rig boards.mcap --corners 6x7 --square-mm 30 --view mirror -o rig.toml
       calibrate rig DIR --board aprilgrid --tags 6x6 --tag-mm 88 --tag-spacing 0.3 -o rig.toml
     """
     board = board_of(args)
@@ -168,8 +168,9 @@ def live(args: argparse.Namespace) -> int:
     HANDLER.show("")
     if missing := boards.missing():
         return options.failed(f"{boards.pairs} pairs, not enough yet: {'; '.join(missing)}")
-    words = shlex.join([str(args.images or args.log), *options_of(args)])
-    print(f"{boards.pairs} pairs, enough: omnid calibrate rig {words} -o rig.toml")
+    view = ["--view", "mirror"] if args.board == "checkerboard" else []
+    words = shlex.join([str(args.images or args.log), *options_of(args), *view])
+    print(f"{boards.pairs} pairs, enough: omnid calibrate rig {words} -o rig.toml (through lenses: --view direct)")
     return 0
 
 

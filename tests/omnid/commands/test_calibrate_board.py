@@ -198,6 +198,7 @@ def test_invalid_input_is_one_line_and_exit_code_2(
     [
         (["--corners", "6x5"], "--board checkerboard: expected --corners, --square-mm, found no --square-mm"),
         (["--corners", "6x5", "--square-mm", "30", "--tags", "2x2"], "--tags belongs to another kind of board"),
+        (["--corners", "6x5", "--square-mm", "30"], "add --view mirror or direct"),
         (["--board", "aprilgrid", "--tags", "6x6", "--tag-mm", "80", "--tag-spacing", "24"], "Kalibr's tagSpacing"),
     ],
 )
