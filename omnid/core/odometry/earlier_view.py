@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.panorama import Cylinder
-from omnid.core.odometry.correlation_kernels import correlate
 from omnid.core.odometry.exposure_times import Exposure
+from omnid.core.odometry.patch_kernels import correlate
 from omnid.core.types.panorama import PaddedPanorama
 
 Array = NDArray[np.float64]

@@ -249,6 +249,9 @@ class TileMonitor:
         is_faint = np.zeros(self._columns, bool)
         if textured.sum() >= COMPARED_COLUMNS:
             is_faint = textured & (ratio < BLURRED_SHARE * float(np.median(ratio[textured])))
+        if not is_faint.any():
+            self._faint[side] = np.zeros(self._columns, np.intp)
+            return is_faint
         # Runs of such columns, and those next to them, which dirt covers in part. The ends of a sector are no
         # neighbours.
         is_sector = self._columns < TILE_COLUMNS
