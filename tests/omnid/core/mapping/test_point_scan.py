@@ -63,16 +63,6 @@ def test_a_box_before_a_wall_is_found_although_most_points_are_of_the_wall() -> 
     np.testing.assert_allclose(scan[within(8, 50)], 3.0, atol=0.02)
 
 
-def test_no_range_is_longer_than_the_longest() -> None:
-    """A bin of inverse range may begin before it and end beyond: a map with such a range is refused when it is read."""
-    for range_m in np.arange(5.55, 8.0, 0.1):
-        scan = seen(arc(range_m, (-30, 30), (-0.5, 0.5), 20_000))[within(-29, 29)]
-        if range_m <= LIMITS.max_range_m:
-            np.testing.assert_allclose(scan, range_m, atol=0.01)
-        else:
-            assert np.isposinf(scan).all(), range_m
-
-
 @pytest.mark.parametrize(("gap", "far_m", "is_filled"), [(4, 3.0, True), (5, 3.0, False), (4, 5.0, False)])
 def test_short_gaps_of_one_surface_are_filled(gap: int, far_m: float, is_filled: bool) -> None:
     """Across the seam between the last sector and the first."""

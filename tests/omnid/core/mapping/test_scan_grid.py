@@ -122,24 +122,6 @@ def test_what_is_narrow_is_cleared_by_near_views_that_pass_it_and_not_by_far_one
         assert at(grid, 0.2, 1.2) == expected and at(grid, 0.2, 0.8) == FREE
 
 
-def test_what_is_narrow_and_hides_the_nearest_floor_in_view_may_stand_anywhere_before_it() -> None:
-    ended, path = OPEN.copy(), np.array([pose(0.225, 0, 0)] * 4)  # in the middle of a cell
-    ended[SECTORS * 3 // 4 - 2 : SECTORS * 3 // 4 + 2] = -0.9  # to the left
-    passed = np.array([pose(-0.4, 0, 0)] * 2)
-    views = np.concatenate([passed, path])
-    grid = scan_grid([scan_of(ROOM, T) for T in views], [OPEN] * 2 + [ended] * 4, views)
-    assert {at(grid, 0.2, 0.4), at(grid, 0.2, 0.6), at(grid, 0.2, 0.95)} == {UNKNOWN}
-    assert {at(grid, 0.35, 0.6), at(grid, 0.05, 0.6), at(grid, 0.2, 1.2)} == {FREE}
-
-
-def test_a_direction_that_sees_through_a_wall_beside_others_that_do_not_makes_it_free_nowhere() -> None:
-    scan, T = scan_of(ROOM, pose(0, 0, 0)), np.tile(np.eye(4), (4, 1, 1))
-    scan[180 + 45] = 10.0  # a false match far behind the wall, at 45.5 degrees
-    grid = grid_of([scan] * 4, T)
-    behind = [at(grid, r * np.cos(np.deg2rad(45.5)), r * np.sin(np.deg2rad(45.5))) for r in np.arange(3.7, 9.5, 0.1)]
-    assert FREE not in behind
-
-
 def test_no_scan_is_no_map_and_a_large_area_gets_larger_cells() -> None:
     assert set(grid_of([], np.zeros((0, 4, 4))).cells.ravel()) == {UNKNOWN}
     far = np.array([pose(0, 0, 0), pose(900, 300, 0)])

@@ -196,18 +196,6 @@ def test_once_all_have_stood_it_is_forgotten() -> None:
     assert set(after) == {AGREE}
 
 
-def test_samples_with_gaps_floods_and_numbers_that_are_not_finite_do_no_harm() -> None:
-    """Memory stays bounded."""
-    motion = MotionFilter()
-    sensors, agreement = motion.sensors, MotionAgreement(motion)
-    for k in range(6000):
-        sensors.add([WheelSample(ns(k * 1e-3), 0.3, float("nan")), WheelSample(ns(0.5), float("inf"), 0.0)])
-    sensors.add([WheelSample(ns(900.0), 0.3, 0.0)])
-    for k in range(30):
-        agreement.add_step(ns(900.0 + 0.1 * k), ns(900.1 + 0.1 * k), 0.03, 0.0)
-    assert agreement.result == AGREE
-
-
 def pose(x_m: float, yaw_rad: float = 0.0) -> Array:
     return se3.exp(np.array([x_m, 0.0, 0.0, 0.0, 0.0, 0.0])) @ se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, yaw_rad]))
 
@@ -228,9 +216,3 @@ def test_a_doubt_is_over_with_its_reason() -> None:
     assert not contradiction.add(AGREE, pose(0.0), 2.0).any()
     contradiction.add(fault, pose(0.0), 3.0)
     assert contradiction.add(doubt, pose(0.0), 6.0)[0, 0] == pytest.approx((0.2 + 0.2 * 3 / 6) ** 2)
-
-
-@pytest.mark.parametrize("reason", [WHEELS_DIFFER, GYRO_DIFFERS])
-def test_accounts_that_two_others_contradict_say_nothing_about_the_pose(reason: str) -> None:
-    conflict = Conflict(reason, "", True, Difference(0.4, 6.0), Difference(0.1, 6.0))
-    assert not Contradiction().add(conflict, pose(0.0), 0.0).any()

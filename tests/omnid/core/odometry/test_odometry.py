@@ -188,22 +188,6 @@ def test_refuses_an_impossible_speed(cameras: RenderedCameras, frames: list[Ster
     assert estimate.T_odom_rect[0, 3] < 0.1
 
 
-def test_dark_from_the_start_is_lost_until_there_is_light(
-    odometry: VisualOdometry, frames: list[StereoFrame], cameras: RenderedCameras
-) -> None:
-    dark = run(odometry, [cameras.darkness(100), cameras.darkness(101)])
-    assert [estimate.state for estimate in dark] == [TrackingState.LOST, TrackingState.LOST]
-    light = run(odometry, frames[:3], first=False)
-    assert [estimate.state for estimate in light] == [TrackingState.TRACKING] * 3
-    assert motion_errors(light[-1].T_odom_rect, truth(2))[0] < 4e-3
-
-
-def test_the_same_frames_give_the_same_bytes(cameras: RenderedCameras, frames: list[StereoFrame]) -> None:
-    first, second = (run(visual_odometry(cameras.model, OdometryLimits()), frames)[-1] for _ in range(2))
-    assert first.T_odom_rect.tobytes() == second.T_odom_rect.tobytes()
-    assert first.covariance.tobytes() == second.covariance.tobytes()
-
-
 def test_a_pose_refused_for_its_speed_leaves_a_covariance_that_covers_it(cameras: RenderedCameras) -> None:
     """The vehicle may be as fast as the pose says that was refused."""
     odometry = visual_odometry(cameras.model, OdometryLimits(max_speed_mps=2.0))

@@ -40,13 +40,6 @@ def test_a_strut_is_masked_and_the_moving_world_is_not() -> None:
     assert left[world].mean() > 0.97
 
 
-def test_standing_still_gives_no_evidence() -> None:
-    mask = StaticMask()
-    for _ in range(30):
-        mask.observe(seen(0), pose(0))
-    assert mask.without(ALL).all()
-
-
 def test_bare_walls_are_not_masked() -> None:
     """Images on white walls: nearly all of the panorama stays the same, and none of it is fixed."""
     room = np.full((120, 480), 200, np.uint8)

@@ -212,11 +212,3 @@ def test_what_is_saved_is_joined_with_the_oldest_place(
     assert localiser.counts["unjoined"] == 1 and len(localiser.places) == len(out.places) + 1
     saved = localiser.map()
     assert list(saved.keyframes) == list(out.places.keyframes) and len(saved.links) == len(out.places.links)
-
-
-def test_in_an_unknown_building_it_goes_on_as_odometry(cameras: RenderedCameras, out: MapLocaliser) -> None:
-    elsewhere = replace(cameras, scene=corridor(8))
-    drive = odometry([elsewhere.frame(300 + k, T) for k, T in enumerate(POSES[:8])])
-    found = run(MapLocaliser(cameras.model, PlaceLimits(), deepcopy(out).places), drive)
-    assert {pose.state for pose in found} == {MapState.ODOMETRY_ONLY}
-    assert all(np.array_equal(pose.T_map_odom, np.eye(4)) for pose in found)

@@ -18,9 +18,6 @@ from omnid.camera_config import PairConfig
 from omnid.config import Config, PanoramaConfig
 from omnid.core.rig.column_finding import RigState
 from omnid.core.rig.rig_health import (
-    MOST_ROUND_PAIRS,
-    RETRY_NS,
-    ROUND_PAIRS,
     VIEWS,
     RigContradictedError,
     RigHealth,
@@ -192,19 +189,6 @@ def test_the_status_has_the_result_of_the_start(
         assert health.state is (RigState.BROKEN if level == 2 else RigState.DRIFTED)
     with pytest.raises(RigContradictedError, match="contradict the rig"):
         started(place, seen[:4], "refuse")
-
-
-def test_darkness_at_the_start_decides_nothing_and_the_next_round_begins_later(
-    place: Geometry, true: tuple[RigHealth, Collector]
-) -> None:
-    dark = [darkened(one, 0.0, 0.0) for one in true[1]]
-    pairs = [replace(dark[n % 8], stamp_ns=n) for n in range(MOST_ROUND_PAIRS)]
-    pairs += [replace(one, stamp_ns=100 + n) for n, one in enumerate(true[1][: 2 * ROUND_PAIRS])]
-    health = started(place, pairs)
-    assert health.state is RigState.UNCHECKED and health.is_checking and "too few points" in health.warning
-    for number, one in enumerate(true[1][:ROUND_PAIRS]):
-        health.begin(replace(one, stamp_ns=2 * RETRY_NS + number))
-    assert health.state is RigState.FITS and not health.warning
 
 
 def test_the_drive_overrules_the_start_except_for_exchanged_cameras(

@@ -165,17 +165,6 @@ def test_the_ends_of_a_sector_are_no_neighbours(tiles: int, is_blind: bool) -> N
     assert bool(states.blind and states.blind["lower"][:, [0, -1]].all()) == is_blind
 
 
-def test_texture_that_only_one_camera_sees_is_no_dirt_on_the_other() -> None:
-    """A poster at the edge of the view, two columns of tiles wide."""
-    cameras, states = Cameras(), ALL_LIVE
-    cameras.scene[:, 300:330] = 120
-    for _ in range(IN_A_ROW + 1):
-        images = cameras.images()
-        images["upper"][100:200:4, 300:330] = 20
-        states = cameras.update(images)
-    assert states is ALL_LIVE
-
-
 def test_a_small_panorama_of_little_noise_is_live() -> None:
     """In tiles of a few pixels all keep their greys now and then."""
     rng, shape, noise_grey = np.random.default_rng(3), (80, 272), 0.3

@@ -18,7 +18,6 @@ from omnid.core.odometry.paper.paper_odometry import (
 from omnid.core.odometry.paper.registration import Registration
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings
-from omnid.errors import OmnidError
 from omnid.tracking_state import TrackingState
 from tests.omnid.core.scenery import RenderedCameras, motion_errors, texture, turned, wrapped
 from tests.simulation.paths import planar_poses
@@ -107,10 +106,3 @@ def test_darkness_is_lost_and_keeps_the_pose(cameras: RenderedCameras, frames: l
     assert (after.state, after.resets) == (TrackingState.TRACKING, 1)
     moved = se3.inverse(out.T_odom_rect) @ again.T_odom_rect
     assert motion_errors(moved, se3.inverse(PATH[1]) @ PATH[2])[0] < 0.02
-
-
-def test_an_unknown_tracker_or_reference_is_refused(cameras: RenderedCameras) -> None:
-    with pytest.raises(OmnidError, match="improved, klt, found 'sift'"):
-        PaperOdometry(cameras.model, KltSettings(), "sift")
-    with pytest.raises(OmnidError, match="previous, keyframe, found 'first'"):
-        PaperOdometry(cameras.model, KltSettings(), reference="first")
