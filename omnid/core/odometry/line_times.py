@@ -36,6 +36,7 @@ Indices = NDArray[np.intp]
 LAG_S: Final = 0.003  # standard deviation of the time between the exposures of two cameras that are triggered together
 LEAST_PX: Final = 0.5  # by which a part of an image is displaced against the rest: less harms no pose
 MEMORY_S: Final = 1.0  # time after which evidence counts as a third: vehicles change their motion more often
+EVERY_S: Final = 0.04  # between two pairs that are used at least: nearer ones show the same motion
 CAMERAS: Final = ("lower", "upper")
 LAG: Final = 2  # the unknown behind the times of the lower and the upper camera
 SETS: Final = ((0,), (1,), (0, 1))  # cameras whose images are wrong in one way
@@ -104,13 +105,21 @@ class LineTimes:
         self._velocities: dict[int, Array] = {}  # (6,) of the rig at each keyframe
         self._information = np.zeros((LAG + 2, LAG + 2))  # of [c, lag], bordered by that of the residuals
         self._views = 0.0  # that were pooled
+        self._since_s = 0.0  # since the last pair that was used
         self._px_per_s = 0.0  # median motion of the landmarks in the last image
 
     def add(self, seq: int, seen: PoseEstimate, local_map: LocalMap, velocity: Array, dt_s: float) -> None:
-        """Use the inliers of a pair (seq: its number), with the velocity (6,) of the rig in it."""
+        """Use the inliers of a pair (seq: its number), dt_s after the one before.
+
+        velocity (6,): of the rig in it.
+        """
         # 1. The velocities at the keyframes: the first one of a map has that of the step after it.
         known = {key: self._velocities.get(key, velocity) for key in local_map.keyframes}
         self._velocities = known | {seq: velocity}
+        self._since_s += dt_s
+        if self._since_s < EVERY_S:
+            return
+        dt_s, self._since_s = self._since_s, 0.0
         # 2. Residuals of the views, and their derivatives by [d_k, c, lag].
         cylinder, baseline_m = self._model.cylinder, self._model.baseline_m
         every = round(CORRELATED_LANDMARKS)
