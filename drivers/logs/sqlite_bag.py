@@ -24,13 +24,7 @@ from drivers.logs.log import ENTRY, MAX_DEFINITIONS, MAX_NAME, Entries, LogFile,
 MAGIC: Final = b"SQLite format 3\0"
 # A file that is shorter than it states is read up to its end with a writable schema only; it is opened read-only.
 _PRAGMAS: Final = ("trusted_schema = OFF", "cell_size_check = ON", "mmap_size = 0", "writable_schema = ON")
-_TABLES: Final = (
-    "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name IN ('topics', 'messages') "
-    "AND sql LIKE 'CREATE TABLE%'"
-)
-# The pragma lists no computed columns. The small columns come first, so that reading them never reads a whole row.
-_COLUMNS: Final = "SELECT name FROM pragma_table_info('messages') LIMIT 4"
-_EXPECTED: Final = [("id",), ("topic_id",), ("timestamp",), ("data",)]
+_TABLES: Final = "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name IN ('topics', 'messages')"
 _TOPICS: Final = (
     f"SELECT id, substr(name, 1, 256), substr(type, 1, 256), serialization_format FROM topics LIMIT {MAX_DEFINITIONS}"
 )
@@ -51,8 +45,7 @@ class SqliteBag(LogFile):
         super().__init__(name)
         try:
             self._bag = _opened(path)
-            has_tables = self._bag.execute(_TABLES).fetchone()[0] == 2
-            is_bag = has_tables and self._bag.execute(_COLUMNS).fetchall() == _EXPECTED
+            is_bag = self._bag.execute(_TABLES).fetchone()[0] == 2
             rows = self._bag.execute(_TOPICS).fetchall() if is_bag else []
         except (*_FAULTS, OSError) as error:
             raise DriverError(

@@ -24,6 +24,7 @@ SHORTEST_STEP_NS: Final = 1_000_000  # No camera takes 1,000 images a second, as
 STEP_NS: Final = 500_000_000  # Delays between header and logging vary by less, unless a clock is set.
 _FASTEST: Final = 3.0  # Clocks and images run at rates that differ by less than this factor.
 _FEW: Final = 0.1  # Up to this share of headers may be unset or repeat the one before.
+_PAUSE: Final = 8  # periods; boards are photographed in no rhythm
 _MANY: Final = 0.25  # Fewer images than this share are logged late.
 
 
@@ -87,7 +88,7 @@ def image_stamps(images: Mapping[Camera, LoggedImages], source: TimeSource = "au
                 'different moments make pairs, which do not fit the rig; correct the clocks, or take log.time = "log"'
             )
     every = np.sort(np.concatenate([*stamps_ns.values()]))
-    pauses_ns, longest_ns = np.diff(every), STEP_NS + max(map(_step_ns, stamps_ns.values()), default=0)
+    pauses_ns, longest_ns = np.diff(every), max(STEP_NS, _PAUSE * max(map(_step_ns, stamps_ns.values())))
     for at in np.flatnonzero(pauses_ns > longest_ns)[:1].tolist():
         number = np.count_nonzero(stamps_ns["lower"] <= every[at])
         found.warnings.append(

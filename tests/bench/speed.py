@@ -36,7 +36,7 @@ from omnid.stages.odometry import OdometryStage
 from omnid.stages.synchronise import Synchronise
 from tests.bench.accuracy import rig_of
 from tests.bench.results import ResultTable, columns, lucas_kanade_ns, run, sgbm_ns
-from tests.replay.test_memory import to_and_fro
+from tests.replay.test_outputs import to_and_fro
 
 REFERENCE_EVERY: Final = 10  # pairs between two runs of the reference kernels
 SKIPPED: Final = 10  # first pairs, in which caches, buffers and the first map are filled

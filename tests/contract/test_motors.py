@@ -19,7 +19,7 @@ from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.motor_protocol import Framer, MotorProtocol, NoReplyError
 from drivers.motors.protocols.protocol_registry import PROTOCOLS
 from drivers.motors.serial_motor import LateReplyError, SerialMotor
-from tests.contract.pty_motor import (
+from tests.contract.simulated_controllers import (
     BASE,
     INSTANT,
     LONG_MS,
@@ -27,12 +27,12 @@ from tests.contract.pty_motor import (
     REPLY_S,
     SHORT_MS,
     PtyMotor,
+    SimulatedController,
     connected_motor,
     controller_of,
     run,
     until,
 )
-from tests.contract.simulated_controllers import SIMULATED_CONTROLLERS, SimulatedController
 
 WIRINGS = [
     BASE,
@@ -63,10 +63,6 @@ class Connection:
             self.base.advance(0.05)
             self.now_s += 0.05
         return status
-
-
-def test_every_protocol_has_a_simulated_controller() -> None:
-    assert set(PROTOCOLS) == set(SIMULATED_CONTROLLERS)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -313,29 +309,6 @@ def test_recovers_from_garbage(name: str) -> None:
         simulated.garbage = b""
         assert until(lambda: first_status(motor) is not None and simulated.base.commanded_mps != [0.0, 0.0])
         assert simulated.base.errors == 0, "received garbage was not sent back"
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_an_endless_stream_is_an_error(name: str) -> None:
-    """The deadline holds for a controller that sends without a break and never replies."""
-    with connected_motor(name, timeout_s=SHORT_S) as (motor, simulated):
-        simulated.garbage = b"\xff\xfe{[" * 900
-        for _ in range(3):
-            with contextlib.suppress(DriverError):
-                motor.send(FORWARD)
-        simulated.garbage = b""
-        assert first_status(motor) is not None
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_a_late_reply_is_discarded(name: str) -> None:
-    with connected_motor(name) as (motor, simulated):
-        simulated.base.battery_v = 9.5
-        late = simulated.controller.feed(next(PROTOCOLS[name](BASE).drive(stop_command(0), 0.0)))
-        simulated.base.battery_v = 12.0
-        simulated.send(late)
-        assert motor._port is not None and until(lambda: motor._port.in_waiting >= len(late))
-        assert motor.send(stop_command(0)).battery_v == 12.0
 
 
 @pytest.mark.parametrize("name", NAMES)

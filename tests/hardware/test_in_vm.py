@@ -24,7 +24,7 @@ from drivers.logs.log_reader import LogReader
 from drivers.motors.simulated.simulated_line import SimulatedLine
 from omnid.runs.session import attached_rig
 from omnid.stages.geometry import with_rims
-from tests.contract.pty_motor import LONGEST_ABSENCE_S
+from tests.contract.simulated_controllers import LONGEST_ABSENCE_S
 from tests.hardware.image import ROOT, ImageUnavailableError, image
 from tests.hardware.machine import Result, names_in, run_tests
 

@@ -1,4 +1,4 @@
-"""Recordings, read by programs of other projects: @mcap/core under node, Rerun, evo; README.md names their versions."""
+"""Recordings, read by programs of other projects: @mcap/core under node, evo; README.md names their versions."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.sensor_codec import image_cdr, image_topic
 from omnid.transport.status_names import ODOMETRY, Key
 from tests.drivers.logs.mcap_logs import STORE
-from tests.replay.recorded import recorded_run
+from tests.replay.live import recorded_run
 
 START_NS = 1_700_000_000 * 10**9 + 123_456_789
 PERIOD_NS = 33_333_333
@@ -93,7 +93,8 @@ def _messages(stamp_ns: int, numbers: np.random.Generator) -> Iterator[tuple[str
 
 HERE = Path(__file__).parent
 TIMEOUT_S = 300.0
-NO_ANALYTICS = {"CI": "1"}  # with it Rerun sends no usage statistics
+
+
 NPM = ("package.json", "read_log.mjs")
 
 
@@ -105,7 +106,6 @@ def run(words: Sequence[object], folder: Path) -> str:
         capture_output=True,
         text=True,
         timeout=TIMEOUT_S,
-        env=os.environ | NO_ANALYTICS,
     )
     assert done.returncode == 0, f"{words}: {done.stderr[-2000:]}"
     return done.stdout
@@ -178,9 +178,6 @@ def live(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return recorded_run(scene, tmp_path_factory.mktemp("live"), POSES)
 
 
-pytestmark = pytest.mark.interop
-
-
 def read_by_node(log: Path) -> tuple[dict[str, Any], Expected]:
     """Return the header of the log and its messages by topic; assert that log times are the stamps."""
     reader = npm_reader()
@@ -209,88 +206,6 @@ def test_reads_a_live_recording_as_rosbags_does(live: Path) -> None:
     head, found = read_by_node(live)
     assert set(head["attachments"]) == {"rig.toml", "omnid.toml"} and len(found) >= 8
     assert found == expected
-
-
-pytestmark = pytest.mark.interop
-
-FIELDS = {
-    "/omnid/odom": "nav_msgs.msg.Odometry",
-    "/omnid/status": "diagnostic_msgs.msg.DiagnosticArray",
-    "/omnid/drive": "geometry_msgs.msg.TwistStamped",
-}
-FLOAT32 = 1e-6  # of numbers around 1
-
-Parts = dict[str, list[dict[str, Any]]]  # topic -> components of each message, in order
-
-
-@pytest.fixture
-def parts(known: Known) -> Parts:
-    """The known log as read_by_rerun by Rerun."""
-    return read_by_rerun(known.path)
-
-
-def read_by_rerun(log: Path) -> Parts:
-    """Return all messages of a log; Rerun may split one into several rows."""
-    python = program("rerun", "rerun-sdk").resolve().with_name("python")
-    found: dict[str, dict[int, dict[str, Any]]] = {}
-    for entry in lines([python, HERE / "read_log_rerun.py", log], log.parent):
-        found.setdefault(entry["topic"], {}).setdefault(entry["log_ns"], {}).update(entry["parts"])
-    return {topic: [messages[at_ns] for at_ns in sorted(messages)] for topic, messages in found.items()}
-
-
-def test_reads_every_message(known: Known, parts: Parts) -> None:
-    assert {topic: len(messages) for topic, messages in parts.items()} == {
-        topic: len(messages) for topic, messages in known.expected.items()
-    }
-
-
-@pytest.mark.parametrize("topic", FIELDS)
-def test_reads_the_fields_that_were_written(known: Known, parts: Parts, topic: str) -> None:
-    assert [message[f"{FIELDS[topic]}:message"] for message in parts[topic]] == [
-        [message] for message in known.expected[topic]
-    ]
-
-
-def test_reads_the_poses_and_transforms_that_were_written(known: Known, parts: Parts) -> None:
-    written: Expected = known.expected
-    for found, pose in zip(parts["/omnid/pose"], written["/omnid/pose"], strict=True):
-        assert found["CoordinateFrame:frame"] == ["odom"]
-        close(found["InstancePoses3D:translations"][0], pose["pose"]["position"])
-        close(found["InstancePoses3D:quaternions"][0], pose["pose"]["orientation"])
-    for found, message in zip(parts["/tf"], written["/tf"], strict=True):
-        (edge,) = message["transforms"]
-        assert found["Transform3D:parent_frame"] == ["odom"] and found["Transform3D:child_frame"] == ["base_link"]
-        close(found["Transform3D:translation"][0], edge["transform"]["translation"])
-        close(found["Transform3D:quaternion"][0], edge["transform"]["rotation"])
-
-
-def test_reads_the_points_and_images_that_were_written(known: Known, parts: Parts) -> None:
-    for found, cloud in zip(parts["/omnid/cloud"], known.expected["/omnid/cloud"], strict=True):
-        points = np.column_stack([found["Points3D:positions"], found["Points3D:confidence"]])
-        assert points.tolist() == cloud["points"]
-        assert found["sensor_msgs.msg.PointCloud2:data"] == [cloud["data"]]
-    lower, upper = "/omnid/lower/image_raw/compressed", "/omnid/upper/image_raw"
-    for found, image in zip(parts[lower], known.expected[lower], strict=True):
-        assert found["EncodedImage:blob"] == [image["data"]]
-    for found, image in zip(parts[upper], known.expected[upper], strict=True):
-        (shape,) = found["DepthImage:format"]  # as for all raw images with one channel
-        assert found["DepthImage:buffer"] == [image["data"]] and (shape["width"], shape["height"]) == (32, 24)
-
-
-def test_check_finds_no_problem(known: Known, live: Path, tmp_path: Path) -> None:
-    """`rerun mcap check` always exits 0. With --full it reports its own splitting of clouds as a fault."""
-    for log in (known.path, live):
-        output = run([program("rerun", "rerun-sdk"), "mcap", "check", log], tmp_path)
-        assert "PROBLEM" not in output and output.count("\nok ") >= 8, output
-
-
-def test_reads_a_complete_live_recording(live: Path) -> None:
-    counts = {topic: len(messages) for topic, messages in read_by_rerun(live).items()}
-    assert len(counts) >= 8 and counts["/omnid/odom"] == counts["/omnid/pose"] == counts["/tf"] > 5
-
-
-def close(found: list[float], written: dict[str, float]) -> None:
-    np.testing.assert_allclose(found, list(written.values()), atol=FLOAT32)
 
 
 pytestmark = pytest.mark.interop

@@ -21,7 +21,7 @@ from rosbags.typesys import Stores, get_typestore
 from drivers.motors.simulated.simulated_line import SimulatedLine
 from omnid.transport import codec
 from omnid.transport.codec import Pose
-from tests.contract.pty_motor import PtyMotor
+from tests.contract.simulated_controllers import PtyMotor
 from tests.ports import free_port
 from tests.waiting import ended, wait_until
 
@@ -256,3 +256,27 @@ def robot(scene: Path, folder: Path, *words: object, module: str = "omnid") -> I
         ends.callback(operator.close)
         wait_until(lambda: operator.poses and operator.states, "a pose")
         yield daemon, operator, base
+
+
+# A recording of `omnid run` with a driven simulated base
+
+
+def recorded_run(scene: Path, folder: Path, poses: int) -> Path:
+    """Return a recording of at least so many poses, at half speed so that an idle machine drops no image."""
+    port, base, kept = free_port(), Base(folder), folder / "kept"
+    more = (
+        "--pace",
+        "0.5",
+        *patient("record.enabled=true", "record.images_hz=0", f"record.folder={kept}", "record.free_mb=0"),
+    )
+    with started(command_line(scene, port, base.port, *more), port) as daemon:
+        wait_until(lambda: answers(port) or not daemon.alive, "the bus")
+        operator = Operator(port)
+        operator.drive(0.3)
+        wait_until(lambda: len(operator.poses) > poses and base.line.base.velocity_mps > 0.2, "poses and motion")
+        operator.close()
+        code, err = daemon.end()
+    base.close()
+    assert code == 0, err
+    (path,) = kept.glob("*.mcap")
+    return path

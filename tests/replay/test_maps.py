@@ -52,19 +52,6 @@ def omap(built: Path, tmp_path: Path) -> Path:
     return tmp_path / "place.omap"
 
 
-def test_a_map_without_the_height_of_the_cameras_warns_and_has_no_free_cell(
-    omnid: Command, omap: Path, tmp_path: Path
-) -> None:
-    places, rig = read_places(omap)
-    for number, expected in enumerate((True, False)):
-        result = omnid("map", "export", omap, "--grid", tmp_path / f"{number}.yaml")
-        assert result.code == 0 and (b"\xfe" in (tmp_path / f"{number}.pgm").read_bytes()) == expected
-        assert ("warning" not in result.err) == expected and ("no cell is free" in result.err) != expected
-        for keyframe in places.keyframes.values():
-            keyframe.free_m.fill(0)
-        write_places(omap, places, rig)
-
-
 def test_a_second_run_is_localised_from_its_first_second_and_extends_the_map(
     omnid: Command, scene: Path, omap: Path, tmp_path: Path
 ) -> None:
@@ -110,12 +97,6 @@ def test_what_is_not_recognised_is_left_out_with_a_warning(
     with log.open("rb") as file:
         topics = [channel.topic for _, channel, message in make_reader(file).iter_messages() if b"map" in message.data]
     assert "/omnid/map_pose" in topics and "/tf" not in topics and "/omnid/map" not in topics
-
-
-def test_build_extends_a_map(omnid: Command, scene: Path, omap: Path) -> None:
-    before = len(read_places(omap)[0])
-    result = omnid("map", "build", scene / "log.mcap", "-o", omap, "--extend", "--rig", scene / "rig.toml", "--quiet")
-    assert result.code == 0 and f"keyframes    {2 * before}, " in result.out and "sessions     2" in result.out
 
 
 def test_the_map_of_another_rig_is_refused(omnid: Command, scene: Path, omap: Path) -> None:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import re
 import tomllib
+from collections.abc import Iterator
 from dataclasses import replace
+from importlib.resources import files
+from itertools import cycle
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,11 +21,20 @@ from scipy.spatial import cKDTree
 
 from calib import se3
 from calib.rig_file import parse_rig, read_rig, rig_toml, write_rig
+from drivers.frame import Frame
 from drivers.logs.log_reader import LogReader
 from omnid.config import Config
+from omnid.diagnostics.run_summary import RunStatistics
+from omnid.engine.graph import Graph
+from omnid.formats.exports import write_ply
 from omnid.formats.tum import read_tum
-from omnid.recordings.evaluation import evaluate
+from omnid.messages import OdometryUpdate
+from omnid.recordings.evaluation import Metrics, evaluate
+from omnid.runs.wiring import Inputs, Outputs, wire
 from omnid.settings import parse
+from omnid.sinks.files import TrajectoryFile
+from omnid.stages.front_end import FrontEnd
+from omnid.stages.geometry import geometry, with_rims
 from omnid.transport.codec import decode_diagnostics, decode_map, decode_pose
 from omnid.transport.status_names import ODOMETRY, SUMMARY, WHEELS, camera_name, stage_name
 from tests.conftest import PAIRS
@@ -29,7 +42,7 @@ from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, STORE, UPPER, Entry,
 from tests.ply import read_ply
 from tests.replay.command import Command, rows
 from tests.replay.edited import images
-from tests.replay.recorded import recorded_run
+from tests.replay.live import recorded_run
 
 METHODS = ([], ["--method", "paper"])
 FEW = ("--seconds", 0.55)  # of the scene, where every pair shows the same
@@ -311,3 +324,88 @@ def test_a_replay_gives_the_same_trajectory(omnid: Command, tmp_path: Path, reco
     # Where a busy computer dropped pairs of the live run, the replay sees other pairs than it.
     limit_m = 0.0 if ours.keys() == theirs.keys() else 0.02
     assert max(float(np.linalg.norm(ours[stamp] - theirs[stamp])) for stamp in common) <= limit_m
+
+
+# Constant memory in long runs: the sample forwards and backwards, repeated
+
+
+MANY_PAIRS = 2000
+PERIOD_NS = 100_000_000
+SETTLED, GROWTH_MIB = 200, 12.0
+
+
+def to_and_fro(frames: list[Frame], pairs: int, period_ns: int = PERIOD_NS) -> Iterator[Frame]:
+    """Yield the frames of so many pairs, forwards and backwards, with rising stamps."""
+    both = [frames[i : i + 2] for i in range(0, len(frames), 2)]
+    path = cycle([*both, *both[-2:0:-1]])
+    for k in range(pairs):
+        for frame in next(path):
+            yield replace(frame, stamp_ns=k * period_ns)
+
+
+class MemoryMonitor:
+    """A sink that measures the resident memory every hundred poses."""
+
+    def __init__(self) -> None:
+        self.mib: dict[int, float] = {}
+
+    def process(self, odometry: OdometryUpdate) -> None:
+        if odometry.seq % 100 == 99:
+            status = Path("/proc/self/status").read_text().split("VmRSS:")[1]
+            self.mib[odometry.seq + 1] = int(status.split()[0]) / 1024
+
+
+@pytest.mark.slow
+def test_memory_stays_constant(tmp_path: Path) -> None:
+    reader = LogReader(Path(str(files("omnid.sample") / "log.mcap")))
+    config, frames = Config(), list(reader.frames())
+    place = geometry(with_rims(parse_rig(reader.attachments()["rig.toml"]), frames), config.panorama)
+    monitor, statistics = MemoryMonitor(), RunStatistics()
+    poses = {"monitor": monitor, "statistics": statistics, "trajectory": TrajectoryFile(tmp_path / "est.txt")}
+    graph = Graph(threaded=True)
+    ends = Outputs(poses=poses, maps={"map": lambda update: write_ply(tmp_path / "map.ply", update.points)})
+    read = graph.source("read", lambda: to_and_fro(frames, MANY_PAIRS))
+    wire(config, Inputs([read]), FrontEnd(place, config), graph, ends)
+    graph.run()
+    print(statistics.states, monitor.mib)
+    assert statistics.poses == MANY_PAIRS
+    later = np.array([mib for seq, mib in monitor.mib.items() if seq >= SETTLED])
+    assert later.max() - later[0] < GROWTH_MIB
+
+
+# Accuracy on the logs beside the repository; skipped if they do not exist
+
+
+DATA = Path(__file__).parents[3] / "shared" / "data"
+
+
+def measured(omnid: Command, folder: Path, name: str, *words: object) -> Metrics:
+    """Return the errors of the documented commands on a log."""
+    source = DATA / name
+    if not source.is_dir():
+        pytest.skip(f"{source} does not exist")
+    rig, tum = folder / "rig.toml", folder / "est.txt"
+    assert omnid("calibrate", "import", source / "camchain.yaml", "-o", rig).code == 0
+    result = omnid.replay(source / "log.mcap", "--tum", tum, "--cloud", folder / "map.ply", *words, rig=rig)
+    assert result.code == 0, result.err
+    return evaluate(read_tum(tum), read_tum(source / "truth.txt"))
+
+
+def test_two_walls(omnid: Command, tmp_path: Path) -> None:
+    found = measured(omnid, tmp_path, "two_walls")
+    assert found.pairs == 99 and found.coverage >= 0.99
+    assert abs(found.length_error_ratio) <= 0.0005
+    assert found.ate_rmse_m <= 0.002 and found.end_error_m <= 0.003
+    assert math.degrees(found.heading_max_rad) <= 0.05
+
+
+def test_two_walls_misaligned(omnid: Command, tmp_path: Path) -> None:
+    found = measured(omnid, tmp_path, "two_walls_crooked")
+    assert found.coverage >= 0.99 and found.ate_rmse_m <= 0.004
+    assert math.degrees(found.heading_max_rad) <= 0.1
+
+
+def test_the_papers_method(omnid: Command, tmp_path: Path) -> None:
+    """The first fifth of the log, a metre: its matching takes ten times as long as that of the other method."""
+    found = measured(omnid, tmp_path, "two_walls", "--method", "paper", "--seconds", "2.05")
+    assert found.pairs >= 20 and found.ate_rmse_m < 0.06

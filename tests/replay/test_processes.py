@@ -12,16 +12,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import zenoh
 from mcap.reader import make_reader
 
 from drivers.motor import is_stop
-from omnid.formats.tum import read_tum
-from omnid.transport.codec import Pose, decode_pose
 from tests.conftest import PAIRS
-from tests.contract.pty_motor import PtyMotor
+from tests.contract.simulated_controllers import PtyMotor
 from tests.ply import read_ply
 from tests.ports import free_port
 from tests.replay.command import Command, Result, rows
@@ -100,25 +97,6 @@ def test_signals_leave_whole_results(tmp_path: Path, paused: Path, number: int, 
     assert written - Result(process.returncode, out, err).count("queue") <= recorded <= written
 
 
-def test_another_process_receives_the_poses(tmp_path: Path, scene: Path) -> None:
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    poses: list[Pose] = []
-    config = zenoh.Config()
-    for key, value in (("listen/endpoints", f'["{endpoint}"]'), ("scouting/multicast/enabled", "false")):
-        config.insert_json5(key, value)
-    tum = tmp_path / "est.txt"
-    with zenoh.open(config) as session:
-        session.declare_subscriber("rover/odom", lambda sample: poses.append(decode_pose(bytes(sample.payload))))
-        settings = ("--set", "bus.robot=rover", "--set", "bus.listen=[]", "--set", f'bus.connect=["{endpoint}"]')
-        with started(replaying(scene, "--publish", "--realtime", "--quiet", "--tum", tum, *settings)) as process:
-            _, err = process.communicate(timeout=PATIENCE_S)
-        assert process.returncode == 0, err
-        wait_until(lambda: bool(poses))  # on a busy computer a run in real time leaves out most pairs
-    truth = {int(stamp): T for stamp, T in zip(read_tum(tum).stamps_ns, read_tum(tum).T, strict=True)}
-    for record in poses:
-        np.testing.assert_allclose(record.T_odom_base, truth[record.stamp_ns], atol=1e-8)
-
-
 def test_the_ten_lines_of_the_document_hear_a_robot_without_omnid(scene: Path) -> None:
     """docs/bus.md begins with a program of zenoh and rosbags alone; only its endpoint is changed here."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
@@ -194,13 +172,6 @@ def test_no_traceback_if_stdout_cannot_be_written(where: str) -> None:
     assert (process.returncode, err.count("\n")) == ((2, 1) if where == "/dev/full" else (0, 0))
 
 
-def test_a_trajectory_on_stdout_is_the_only_output_there(scene: Path) -> None:
-    with started(replaying(scene, "--quiet", "--tum", "/dev/stdout", *FEW)) as process:
-        out, err = process.communicate(timeout=PATIENCE_S)
-    assert process.returncode == 0 and err.startswith("pairs ")
-    assert [len(line.split()) for line in out.splitlines()] == [8] * FEW_PAIRS
-
-
 def test_a_full_disk_leaves_whole_rows(tmp_path: Path, scene: Path) -> None:
     """A limit on the size of files acts as the disk: Python ignores its signal and gets the error."""
     tum = tmp_path / "est.txt"
@@ -209,10 +180,3 @@ def test_a_full_disk_leaves_whole_rows(tmp_path: Path, scene: Path) -> None:
         _, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 2 and err.startswith("omnid: ") and err.count("\n") == 1 and str(tum) in err
     assert 0 < len(rows(tum)) < PAIRS
-
-
-def test_no_traceback_if_the_reader_of_stdout_leaves(scene: Path) -> None:
-    shell = " ".join(replaying(scene, "--quiet", *FEW)) + " | head -1"
-    with started(["sh", "-c", shell]) as process:
-        out, err = process.communicate(timeout=PATIENCE_S)
-    assert out.count("\n") == 1 and "Traceback" not in err

@@ -21,7 +21,6 @@ from drivers.logs.ros_messages import IMU, JOINT_STATE, ODOMETRY
 from drivers.logs.topics import MotionTopics
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.config import load_config
-from omnid.errors import OmnidError
 from omnid.formats.tum import read_tum
 from omnid.runs.replay import ReplayOptions, run_log
 from omnid.runs.run_result import RunResult
@@ -104,16 +103,6 @@ def test_darkness_is_bridged_and_the_bytes_are_the_same_threaded_and_inline(
     assert float(motion.values["gyro_bias_z_radps"]) == pytest.approx(0.01, abs=0.005)
 
 
-def test_samples_are_read_in_the_order_of_their_stamps(log: Path, samples: list[MotionSample]) -> None:
-    reader = LogReader(log, motion=MotionTopics())
-    stamps = [message.stamp_ns for message in reader.messages()]
-    assert stamps == sorted(stamps)
-    read = [message for message in reader.messages() if isinstance(message, (WheelSample, GyroSample))]
-    until_ns = max(frame.stamp_ns for frame in reader.frames())
-    assert read == [sample for sample in samples if sample.stamp_ns <= until_ns]
-    assert len(list(reader.frames())) == 2 * PAIRS and not reader.warnings
-
-
 def test_broken_messages_and_topics_that_are_not_clear_are_reported(
     scene: Path, samples: list[MotionSample], tmp_path: Path
 ) -> None:
@@ -178,26 +167,6 @@ def test_wheels_are_joints_where_these_are_named(scene: Path, samples: list[Moti
     reader = LogReader(log, motion=motion_topics(load_config(None, ["motion.wheel_joints=['l', 'r']"])))
     assert len(list(reader.messages())) == 2 * PAIRS
     assert reader.warnings[0].startswith("none of ") and "motion.wheel_joints" in reader.warnings[0]
-    reader = LogReader(log, motion=motion_topics(load_config()))
-    assert len([message for message in reader.messages() if isinstance(message, WheelSample)]) == 1
-    for wrong in (["motion.wheel_joints=['l']"], ["motion.wheel_joints=['l', 'l']"]):
-        with pytest.raises(OmnidError, match="expected the names of two joints"):
-            motion_topics(load_config(None, wrong))
-
-
-def test_wheels_that_contradict_the_cameras_are_reported(
-    scene: Path, samples: list[MotionSample], tmp_path: Path
-) -> None:
-    """Their sign is wrong: they are left out, the poses stay right, and a line says what to check."""
-    backwards = [
-        replace(sample, velocity_mps=-sample.velocity_mps) if isinstance(sample, WheelSample) else sample
-        for sample in samples
-    ]
-    log = saved(tmp_path / "log.mcap", scene, [entry(sample) for sample in backwards])
-    result = run(log, scene)
-    assert any("wheels" in warning for warning in result.warnings)
-    assert offsets_m(result, scene)[: DARK.start].max() < 0.01
-    assert TrackingState.LOST in result.states  # no wheels to be trusted in the dark
 
 
 def test_a_pose_that_the_wheels_contradict_is_degraded_and_its_sigma_covers_theirs(

@@ -6,14 +6,12 @@ import fcntl
 import os
 import random
 import re
-import shutil
 import sqlite3
 import struct
 import tracemalloc
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import lz4.frame  # type: ignore[import-untyped]
@@ -169,24 +167,6 @@ def test_a_log_that_is_written_says_so(tmp_path: Path) -> None:
     assert log_info(path).state is LogState.WHOLE
 
 
-def test_a_closed_database_in_a_folder_that_cannot_be_written_is_read_by_any_user(tmp_path: Path) -> None:
-    with TemporaryDirectory() as place:
-        path = Path(shutil.copy(write_db3(tmp_path / "bag", pairs(PAIRS)), place))
-        with closing(sqlite3.connect(path)) as writer:
-            writer.execute("PRAGMA journal_mode = WAL")
-        Path(place).chmod(0o555)
-        child = os.fork()
-        if child == 0:  # as another user than root, who may write everywhere
-            try:
-                if os.getuid() == 0:
-                    os.setuid(65534)
-                os._exit(read(path)[0] != expected(PAIRS))
-            finally:
-                os._exit(2)
-        assert os.waitpid(child, 0)[1] == 0
-        Path(place).chmod(0o755)
-
-
 # Folders and parts
 
 
@@ -215,7 +195,7 @@ def test_the_parts_of_a_split_log_are_read_as_one(tmp_path: Path, suffix: str) -
 METADATA: Final = "rosbag2_bagfile_information:\n  version: 5\n  relative_file_paths:\n{}\n  message_count: 24\n"
 
 
-@pytest.mark.parametrize("missing", [None, 0, 2])
+@pytest.mark.parametrize("missing", [None, 2])
 @pytest.mark.parametrize("suffix", ["", ".zstd"])
 def test_parts_that_metadata_lists_but_are_not_there_are_named(
     tmp_path: Path, missing: int | None, suffix: str
@@ -231,13 +211,6 @@ def test_parts_that_metadata_lists_but_are_not_there_are_named(
     lines = [] if missing is None else [f"are missing: {names[missing]}: used the others"]
     assert len(reader.warnings) == len(lines) and all(line in reader.warnings[0] for line in lines)
     assert log_info(tmp_path).state is (LogState.WHOLE if missing is None else LogState.BROKEN)
-
-
-def test_a_cut_before_the_images_of_one_camera_is_named(tmp_path: Path) -> None:
-    path = write_log(tmp_path / "log.mcap", sorted(pairs(20), key=lambda entry: entry.topic), **SMALL)
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 3])
-    with pytest.raises(DriverError, match=r"found only .* is cut or corrupt after byte"):
-        LogReader(path)
 
 
 def test_omnids_own_recordings_of_one_run_are_parts(tmp_path: Path) -> None:
@@ -256,14 +229,6 @@ def test_omnids_own_recordings_of_one_run_are_parts(tmp_path: Path) -> None:
         assert logs_in(tmp_path) == [first]
     write_log(last.with_suffix(""), entries[4:])
     assert len(logs_in(tmp_path)) == 2 and read(tmp_path)[0] == expected(6)
-
-
-def test_recordings_of_two_runs_are_not_one_log(tmp_path: Path) -> None:
-    """Of the first run the oldest files are gone, by the limit of their number."""
-    write_log(tmp_path / "omnid_20260202T023000Z_002.mcap", pairs(2))
-    write_log(tmp_path / "omnid_20260203T023000Z_001.mcap", pairs(2))
-    with pytest.raises(DriverError, match="give one file"):
-        LogReader(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -338,13 +303,6 @@ def test_flipped_bits_change_no_frame_of_a_chunk(tmp_path: Path, name: str) -> N
     assert readable > 15
 
 
-def test_a_corrupt_chunk_of_a_bag_costs_its_own_frames(tmp_path: Path) -> None:
-    path = write_bag(tmp_path / "log.bag", pairs(1), "BZ2")
-    path.write_bytes(path.read_bytes().replace(b"BZh9", b"BZh0"))
-    found, reader = read(path)
-    assert found == [] and is_one_fault(reader.warnings) and reader.counts["unreadable"] == 2
-
-
 def test_a_transaction_that_was_not_ended_is_undone(tmp_path: Path) -> None:
     """The journal lies beside the file, which is not changed."""
     path = write_interrupted_db3(tmp_path / "bag", pairs(PAIRS))
@@ -378,31 +336,10 @@ def test_a_file_behind_another_one_is_told(tmp_path: Path) -> None:
     assert found == expected(10) and reader.truncated and "cut or corrupt after byte" in reader.warnings[0]
 
 
-SQL_OF_OTHER_TABLES: Final = {
-    "no bag": ["DROP TABLE messages"],
-    "columns in another order": [
-        "DROP TABLE messages",
-        "CREATE TABLE messages (data, topic_id, timestamp, id INTEGER PRIMARY KEY)",
-    ],
-    "a computed column": [
-        "DROP TABLE messages",
-        "CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id AS (1), timestamp, data)",
-    ],
-    "an endless view": [
-        "DROP TABLE messages",
-        "CREATE VIEW messages AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n) "
-        "SELECT id, 1 AS topic_id, 0 AS timestamp, zeroblob(1000) AS data FROM n",
-    ],
-}
-
-
-@pytest.mark.parametrize("case", SQL_OF_OTHER_TABLES)
-def test_a_database_of_other_tables_is_no_bag(tmp_path: Path, case: str) -> None:
+def test_a_database_of_other_tables_is_no_bag(tmp_path: Path) -> None:
     path = write_db3(tmp_path / "bag", pairs(1))
     with closing(sqlite3.connect(path)) as bag:
-        for statement in SQL_OF_OTHER_TABLES[case]:
-            bag.execute(statement)
-        bag.commit()
+        bag.execute("DROP TABLE messages")
     with pytest.raises(DriverError, match="no bag of ROS 2"):
         LogReader(path)
 
@@ -502,21 +439,6 @@ def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
         assert count == 200 and tracemalloc.get_traced_memory()[1] < 16 * 2**20 < path.stat().st_size
     finally:
         tracemalloc.stop()
-
-
-def test_before_the_first_image_only_heads_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    noise = np.random.default_rng(0).bytes(50_000)
-    entries = [entry._replace(data=compressed(entry.log_time_ns, jpeg(1) + noise)) for entry in pairs(100)]
-    path, read_bytes, pread = write_log(tmp_path / "log.mcap", entries), [0], os.pread
-
-    def counted(fd: int, size: int, offset: int) -> bytes:
-        read_bytes[0] += size
-        return pread(fd, size, offset)
-
-    monkeypatch.setattr("os.pread", counted)
-    with closing(LogReader(path)) as reader:
-        next(reader.frames())
-        assert read_bytes[0] < path.stat().st_size / 4
 
 
 # Attachments and topics

@@ -111,12 +111,6 @@ def test_the_upper_eight_of_the_stated_bits_are_shown(tmp_path: Path, kind: str,
     assert [gray(frame).tolist() for frame in frames if frame.camera == "lower"] == expected and not reader.warnings
 
 
-def test_samples_above_the_stated_bits_are_white(tmp_path: Path) -> None:
-    images = [np.full((4, 4), value, np.uint16) for value in (1000, 4000)]
-    frames, _ = read(deep_log(tmp_path, "<u2", images), bits=10)
-    assert [int(gray(frame)[0, 0]) for frame in frames if frame.camera == "upper"] == [250, 255]
-
-
 @pytest.mark.parametrize(
     ("suffix", "format_", "encoding"),
     [

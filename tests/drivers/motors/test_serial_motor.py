@@ -8,7 +8,6 @@ import math
 import os
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -26,7 +25,7 @@ from drivers.motors.protocols.protocol_registry import PROTOCOLS
 from drivers.motors.serial_motor import SerialMotor
 from drivers.motors.simulated.simulated_base import SimulatedBase
 from drivers.motors.simulated.simulated_line import SimulatedLine
-from tests.contract.pty_motor import PtyMotor
+from tests.contract.simulated_controllers import PtyMotor
 
 ROOT = Path(__file__).parents[3]
 MODULES = [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in (ROOT / "drivers/motors").rglob("*.py")]
@@ -144,12 +143,6 @@ def test_open_failure_gives_advice(port: str, what: str) -> None:
     assert f"motor port {port!r} " in str(caught.value) and "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(("watchdog_ms", "timeout_s"), [(0, 0.05), (20_000, 0.05), (500, 0.0), (500, math.nan)])
-def test_refuses_invalid_settings(simulated: PtyMotor, watchdog_ms: int, timeout_s: float) -> None:
-    with pytest.raises(DriverError, match=r"watchdog|timeout"):
-        SerialMotor(simulated.port, watchdog_ms=watchdog_ms, timeout_s=timeout_s)
-
-
 class FixedWatchdog(SimulatedLine):
     """A controller that keeps its own watchdog time."""
 
@@ -209,42 +202,6 @@ def run(transaction: Transaction[T], simulated: SimulatedLine) -> T:
     except StopIteration as done:
         return done.value  # type: ignore[no-any-return]
     raise AssertionError("the transaction waits for more")
-
-
-class Stalling(SimulatedLine):
-    """A controller that stops reading while `reading` is not set."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.reading = threading.Event()
-        self.reading.set()
-
-    def feed(self, data: bytes) -> bytes:
-        """Return the replies, once it reads."""
-        self.reading.wait(PATIENCE_S)
-        return super().feed(data)
-
-
-def test_a_full_output_buffer_is_an_error_and_close_returns() -> None:
-    controller = Stalling()
-    with contextlib.closing(PtyMotor(controller)) as simulated:
-        motor = SerialMotor(simulated.port, timeout_s=REPLY_S / 4, watchdog_ms=10_000)  # waited for four times
-        controller.reading.clear()
-        fill(simulated.port)
-        with pytest.raises(DriverError, match="gave no answer"):
-            motor.send(VelocityCommand(0, 0.5, 0.0, 0.0))
-        motor.close()
-        controller.reading.set()
-    assert simulated.base.last_command == stop_command(0)
-
-
-def fill(port: str) -> None:
-    """Write until the kernel's buffer is full."""
-    descriptor = os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
-    with contextlib.suppress(BlockingIOError):
-        while True:
-            os.write(descriptor, b"\n" * 1000)
-    os.close(descriptor)
 
 
 DRIVE = DifferentialDrive(can_id=2)

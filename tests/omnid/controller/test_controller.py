@@ -37,7 +37,7 @@ from omnid.core.control.heading_controller import (
     longest_lead_rad,
 )
 from omnid.core.control.safety_rules import POSE_JUMPED, Deadlines
-from tests.contract.pty_motor import PtyMotor
+from tests.contract.simulated_controllers import PtyMotor
 from tests.omnid.controller.bench import (
     LIMITS,
     PERIOD_NS,

@@ -41,8 +41,7 @@ from omnid.core.control.safety_rules import Deadlines
 from omnid.engine.realtime import RealtimeSettings
 from omnid.engine.telemetry import StageStats
 from omnid.errors import OmnidError
-from tests.contract.pty_motor import PtyMotor
-from tests.contract.simulated_controllers import SIMULATED_CONTROLLERS
+from tests.contract.simulated_controllers import SIMULATED_CONTROLLERS, PtyMotor
 from tests.omnid.controller.bench import PERIOD_S, UNATTENDED, Wheels
 from tests.replay.live import ROOT, Base
 from tests.waiting import wait_until

@@ -26,8 +26,7 @@ from omnid.doctor.checks import Finding, bus, cameras, disk, motor, rig
 from omnid.doctor.wheel_wiring import tested_drive as drive_by_answers
 from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig
-from tests.contract.pty_motor import PtyMotor
-from tests.contract.simulated_controllers import SIMULATED_CONTROLLERS, SimulatedController
+from tests.contract.simulated_controllers import SIMULATED_CONTROLLERS, PtyMotor, SimulatedController
 from tests.replay.command import Command
 from tests.waiting import wait_until
 
