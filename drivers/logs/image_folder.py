@@ -19,9 +19,7 @@ import re
 import stat
 from collections.abc import Mapping, Sequence
 from decimal import Decimal, InvalidOperation
-from itertools import pairwise
 from pathlib import Path
-from statistics import median_high
 from typing import Final
 
 import numpy as np
@@ -30,7 +28,6 @@ from drivers.errors import DriverError, RecordError
 from drivers.logs.compression import MAX_RECORD_BYTES
 from drivers.logs.log import ENTRY, MAX_ATTACHMENT_BYTES, Entries, LogFile, Topic
 from drivers.logs.ros_messages import COMPRESSED_IMAGE, compressed_image
-from drivers.logs.stamps import SHORTEST_STEP_NS
 
 SUFFIXES: Final = (".png", ".jpg", ".jpeg")
 # What OpenCV reads as an image, as of boards: a log has those above.
@@ -142,12 +139,6 @@ def _stamped(folder: Path, rate_hz: float, notes: list[str]) -> list[tuple[int, 
         if stamp_ns is None:
             raise _no_stamp(path, "is named", path.stem)
         found.append((stamp_ns, path))
-    steps_ns = [after - before for before, after in pairwise(sorted(stamp_ns for stamp_ns, _ in found))]
-    if steps_ns and 0 < (step_ns := median_high(steps_ns)) <= SHORTEST_STEP_NS:
-        raise DriverError(
-            f"the images beside {str(paths[0])!r} are {step_ns / 1000:g} us apart, as names are nanoseconds; write "
-            f"seconds to {STAMP_FILES[0]}, or {_GIVE_RATE}"
-        )
     return found
 
 

@@ -20,7 +20,7 @@ from drivers.frame import CAMERAS, Camera
 Times: TypeAlias = NDArray[np.int64]  # (N,) [ns]
 TimeSource: TypeAlias = Literal["auto", "header", "log"]
 
-SHORTEST_STEP_NS: Final = 1_000_000  # No camera takes 1,000 images a second, as stamps that hardly advance say.
+_SHORTEST_STEP_NS: Final = 1_000_000  # No camera takes 1,000 images a second, as stamps that hardly advance say.
 STEP_NS: Final = 500_000_000  # Delays between header and logging vary by less, unless a clock is set.
 _FASTEST: Final = 3.0  # Clocks and images run at rates that differ by less than this factor.
 _FEW: Final = 0.1  # Up to this share of headers may be unset or repeat the one before.
@@ -126,7 +126,7 @@ def _fault(times: Times) -> str:
     if np.count_nonzero(np.diff(times) == 0) > max(1, _FEW * len(times)):
         return "do not advance"
     step_ns = _step_ns(times)
-    if step_ns < SHORTEST_STEP_NS:
+    if step_ns < _SHORTEST_STEP_NS:
         return f"are {step_ns / 1000:g} us apart"
     # An image behind the latest one must fill a hole: half a period beside others is none.
     times = times[np.diff(times, prepend=-1) != 0]

@@ -118,8 +118,8 @@ def test_images_named_by_microseconds_are_not_taken_for_nanoseconds(tmp_path: Pa
     """30 images a second: as nanoseconds they are taken 1,000 times too fast."""
     named = {stamp_ns: str(1_418_381_798_086_398 + 33_333 * number) for stamp_ns, number in NUMBERS.items()}
     folder = write_folders(tmp_path / "images", pairs(PAIRS), named.__getitem__)
-    with pytest.raises(DriverError, match=r"1418381798086398.* are 33.333 us apart, as names are nanoseconds"):
-        LogReader(folder)
+    with pytest.raises(DriverError, match=r"33.333 us apart"):
+        read(folder)
 
 
 def test_cameras_of_folders_with_other_names_are_given(tmp_path: Path) -> None:
