@@ -27,7 +27,6 @@ from starlette.responses import PlainTextResponse
 
 from omnid.errors import OmnidError
 
-OPEN_PATHS: Final = ("/", "/login", "/static/login.css")  # answered without a token
 # Letters that are not mistaken for others, because a phone's user types them.
 _ALPHABET: Final = "abcdefghjkmnpqrstuvwxyz23456789"
 _TOKEN: Final = re.compile(r"[!-~]{16,256}")
@@ -143,8 +142,8 @@ class Access:
             return "no origin"
         if is_of_other_site(request) and not (reads and path == "/"):
             return "cross-site"
-        # 3. The token, except for the form that asks for it.
-        if path in OPEN_PATHS:
+        # 3. The token, except at the address that takes it.
+        if path == "/":
             return ""
         role = self.role(request)
         if role is None:

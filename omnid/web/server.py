@@ -1,4 +1,4 @@
-"""The server: the names by which it may be called, the form for the token, its start and its end."""
+"""The server: the names by which it may be called, the cookie for the token, its start and its end."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any, Final
-from urllib.parse import parse_qs
 
 import uvicorn
 from prometheus_client import CONTENT_TYPE_LATEST
@@ -29,10 +28,10 @@ from starlette.staticfiles import StaticFiles
 from omnid.engine.logging_setup import is_journal, log
 from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig, checked
-from omnid.web.access import Access, Guard, is_of_other_site, token_of
+from omnid.web.access import REFUSALS, Access, Guard, is_of_other_site, token_of
 from omnid.web.feed import RobotFeed
 from omnid.web.metrics import metrics
-from omnid.web.robot import RobotPage, text_of
+from omnid.web.robot import RobotPage
 
 DEFAULT_LISTEN: Final = "127.0.0.1:8447"
 STATIC: Final = Path(__file__).with_name("static")
@@ -97,38 +96,23 @@ def site(page: RobotPage, access: Access, *, secure: bool) -> Guard:
     """Return the server's application. secure: it speaks TLS, so that browsers send the cookie over TLS only."""
 
     async def index(request: Request) -> Response:
-        """Return the page, or the form for the token; let a browser in that names the token."""
-        if "token" in request.query_params:
-            return let_in(request.query_params["token"])
-        if access.role(request) is not None:
+        """Return the page; let a browser in that names the token."""
+        if (token := request.query_params.get("token")) is not None and (role := access.role_of(token)) is not None:
+            response = RedirectResponse("/", HTTPStatus.SEE_OTHER)
+            value = access.new_cookie(role)
+            response.set_cookie(access.cookie, value, COOKIE_S, httponly=True, samesite="strict", secure=secure)
+            return response
+        if token is None and access.role(request) is not None:
             return FileResponse(STATIC / "index.html")
-        if is_of_other_site(request):
+        if token is None and is_of_other_site(request):
             return HTMLResponse(_AGAIN)
-        return FileResponse(STATIC / "login.html", status_code=HTTPStatus.UNAUTHORIZED)
-
-    async def login(request: Request) -> Response:
-        """Let a browser in that sends the token in a form."""
-        try:
-            fields = parse_qs(await text_of(request), max_num_fields=4)
-        except (OmnidError, ValueError):  # too long, too slow, or more fields
-            return PlainTextResponse("omnid web: this is no token\n", HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
-        return let_in(fields.get("token", [""])[0])
-
-    def let_in(token: str) -> Response:
-        role = access.role_of(token)
-        if role is None:
-            return FileResponse(STATIC / "login.html", status_code=HTTPStatus.UNAUTHORIZED)
-        response = RedirectResponse("/", HTTPStatus.SEE_OTHER)
-        value = access.new_cookie(role)
-        response.set_cookie(access.cookie, value, COOKIE_S, httponly=True, samesite="strict", secure=secure)
-        return response
+        return PlainTextResponse(f"omnid web: {REFUSALS['no token']}\n", HTTPStatus.UNAUTHORIZED)
 
     async def numbers(_: Request) -> Response:
         return PlainTextResponse(metrics(page.feed.state), media_type=CONTENT_TYPE_LATEST)
 
     outer = [
         Route("/", index),
-        Route("/login", login, methods=["POST"]),
         Route("/metrics", numbers),
         Mount("/static", StaticFiles(directory=STATIC)),
     ]
