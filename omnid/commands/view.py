@@ -155,9 +155,9 @@ def _draw_robot(sink: RerunSink, config: Config, seconds: float) -> None:
         for topic in (ODOMETRY, MAP_POSE, SCAN, PANORAMA, STATUS, CLOUD):
             robot.on_message(state.put, topic, kept=topic in (STATUS, CLOUD))
         while time.monotonic() < end_s and not signals:
-            message, content = state.next(0.5) or (None, None)
-            if message is not None and content is not None:
-                sink.draw(content, message.received_ns)
+            _, content = state.next(0.5) or (None, None)
+            if content is not None:
+                sink.draw(content)
     if not sink.poses:
         print(f"omnid: no pose of {config.bus.robot} came: `omnid listen` names those that are there", file=sys.stderr)
 

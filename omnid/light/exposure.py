@@ -155,8 +155,6 @@ class ExposureLaw:
 USUAL_HZ: Final = 30.0  # rate of cameras that keep their own
 PERIOD_SHARE: Final = 0.9  # Longest exposure by the images' period: the rest reads the image out.
 AFTER_PERIODS: Final = 1.5  # from a pair to the request: both cameras then carry it out after the same pair
-# Means beyond which images of cameras that regulate themselves are reported.
-DARK_GREY, WHITE_GREY = TARGET / 4, SATURATED - TARGET / 4
 
 
 class ExposureControl:
@@ -204,17 +202,14 @@ class ExposureControl:
             "lower_grey": round(lower.mean),
             "upper_grey": round(upper.mean),
         }
-        reason = self._left_to_cameras
-        if self._law is not None and not self._left_to_cameras:
-            state, setting = self._law.state, self._law.setting
-            gain = "" if setting.gain is None else setting.gain
-            stats |= {"exposure_ms": setting.exposure_us * 1e-3, "steps": self._law.steps, "gain": gain}
-            reason = "" if state == "regulated" else "exposure time and gain are at their limits"
-        else:
-            is_dark, is_white = min(lower.mean, upper.mean) < DARK_GREY, max(lower.mean, upper.mean) > WHITE_GREY
-            state = "too dark" if is_dark else "too bright" if is_white else "regulated"
-        words = {"_words": reason or state} if state == "regulated" else {"_warning": f"{state}: {reason}"}
-        return stats | words
+        if self._law is None or self._left_to_cameras:
+            return stats | {"_words": self._left_to_cameras}
+        state, setting = self._law.state, self._law.setting
+        gain = "" if setting.gain is None else setting.gain
+        stats |= {"exposure_ms": setting.exposure_us * 1e-3, "steps": self._law.steps, "gain": gain}
+        if state == "regulated":
+            return stats | {"_words": state}
+        return stats | {"_warning": f"{state}: exposure time and gain are at their limits"}
 
     def _request(self, setting: ExposureSetting | None, stamp_ns: int) -> None:
         """Ask both cameras for a setting; None: they regulate themselves."""

@@ -109,7 +109,6 @@ WORK: Final = "work"
 CAPTURE_TO_POSE: Final = "capture_to_pose"
 CAPTURE_TO_WHEEL: Final = "capture_to_wheel"
 TICK_LATE: Final = "tick_late"
-_TIME_SUFFIX: Final = "_ms"
 
 Stats: TypeAlias = Mapping[Any, Any]  # the numbers of a part by their keys, and words
 SAYS: Final = {"_error": ERROR, "_stale": STALE, "_warning": WARN, "_words": OK}  # severity of words by their key
@@ -175,13 +174,7 @@ def short_name(name: str) -> str:
 
 def time_key(name: str, statistic: str) -> str:
     """Return the key of a measured time in ms: time_key("work", "p50") == "work_p50_ms"."""
-    return f"{name}_{statistic}{_TIME_SUFFIX}"
-
-
-def parsed_time_key(key: str) -> tuple[str, str]:
-    """Return name and statistic of the key of a measured time, ("work", "p50"); ("", "") for any other key."""
-    name, _, statistic = key.removesuffix(_TIME_SUFFIX).rpartition("_")
-    return (name, statistic) if name and key.endswith(_TIME_SUFFIX) else ("", "")
+    return f"{name}_{statistic}_ms"
 
 
 def number(text: str) -> float | None:

@@ -1,7 +1,7 @@
 """A run drawn in Rerun: a replay as it computes, a recording, or a live robot by its messages; time is the stamp.
 
 Entities: odom (the world) with path, covariance, map, and base_link with obstacles and the points of
-the newest images; panorama with its features; depth; plots of speed, yaw_rate, landmarks, sigma, latency, correction;
+the newest images; panorama with its features; depth; plots of speed, yaw_rate, landmarks, sigma, correction;
 state; log. Colours are those of Okabe and Ito, which colour-blind people can distinguish.
 """
 
@@ -28,7 +28,7 @@ from omnid.sinks.encoder import Changes, Encoder, Outgoing, pose_attachment
 from omnid.stages.front_end import FrontEnd
 from omnid.transport import status_names
 from omnid.transport.codec import Cloud, Diagnostics, Panorama, Pose, PoseInMap, Scan
-from omnid.transport.status_names import ODOMETRY, STAGE_PREFIX, parsed_time_key, short_name
+from omnid.transport.status_names import ODOMETRY, short_name
 from omnid.transport.topics import PUBLISHED, SCAN
 
 Array: TypeAlias = NDArray[np.float64]
@@ -50,7 +50,6 @@ PLOTS: Final = {
     "yaw_rate": "Yaw rate",
     "landmarks": "Landmarks",
     "sigma": "Standard deviation",
-    "latency": "Latency, ms",
     "correction": "Correction by the map",
 }
 # Topics of a replay that are drawn; the pose in the map is not, because it may come before that in odom.
@@ -103,13 +102,11 @@ class RerunSink:
         self._messages: dict[str, tuple[int, str]] = {}  # level and message of each status
         self.poses = self.images = 0
 
-    def draw(self, content: Content | Panorama, received_ns: int = 0) -> None:
-        """Draw a decoded message; received_ns: of a pose by the bus, 0: not known."""
+    def draw(self, content: Content | Panorama) -> None:
+        """Draw a decoded message."""
         match content:
             case Pose():
                 self._pose(content)
-                if received_ns:
-                    self._plot(content.stamp_ns, "latency", "age", 1e-6 * (received_ns - content.stamp_ns))
             case PoseInMap(stamp_ns, T_map_base):
                 for pose in (pose for pose in self._poses if pose.stamp_ns == stamp_ns):
                     self.correction(stamp_ns, T_map_base @ se3.inverse(pose.T_odom_base))
@@ -235,18 +232,12 @@ class RerunSink:
             self._plot(stamp_ns, "landmarks", "inliers", pose.attachment.inliers)
 
     def _status(self, diagnostics: Diagnostics) -> None:
-        """Plot the medians of the stages' and other times; add a line to the log for each entry that has changed."""
+        """Add a line to the log for each entry that has changed."""
         stamp_ns = diagnostics.stamp_ns
         for status in diagnostics.statuses:
             if status.name == ODOMETRY:
                 self._state = status_names.tracking_state(status.message, status.values) or self._state
                 self._show_state(stamp_ns)
-            for key, text in status.values.items():
-                (time, statistic), value_ms = parsed_time_key(key), status_names.number(text)
-                if statistic == "p50" and value_ms is not None:
-                    own = status.name.removeprefix(STAGE_PREFIX)
-                    name = own if own != status.name else f"{short_name(status.name)} {time}"
-                    self._plot(stamp_ns, "latency", plain(name), value_ms)
             if self._messages.get(status.name) != (status.level, status.message):
                 self._messages[status.name] = status.level, status.message
                 text, level = f"{short_name(status.name)}: {status.message}", LEVELS[status.level % len(LEVELS)]
