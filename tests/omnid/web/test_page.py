@@ -341,8 +341,9 @@ def test_text_of_the_robot_is_never_html(browser: Any) -> None:
         opened(browser, server) as page,
     ):
         entries = [DiagnosticStatus(f"{HOSTILE}{number}", 2, HOSTILE, {HOSTILE: HOSTILE}) for number in range(3)]
+        entries.append(DiagnosticStatus(CALIBRATION, 0, HOSTILE, {"missing": HOSTILE}))
         end_s = time.monotonic() + 20
-        while "onerror" not in page.inner_text("#warnings") or "script" not in page.text_content("#parts"):
+        while "onerror" not in page.inner_text("#warnings") or "script" not in page.text_content("#calibration-box"):
             assert time.monotonic() < end_s
             bus.publish("status", codec.diagnostics_cdr(10**18, entries))
             bus.publish("odom", odometry(1), PoseAttachment(1, HOSTILE, 0, 1, 1, 1).to_bytes())
