@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, closing
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -20,7 +20,6 @@ from drivers.motor import VelocityCommand
 from omnid.config import Config
 from omnid.controller.link import DriveLink
 from omnid.controller.statistics import ARMED, ControllerState
-from omnid.core.compiled import is_kept, kernel_modules
 from omnid.core.control.arming import MANUAL, NO_ANSWER
 from omnid.core.control.command_sources import PLANNER
 from omnid.core.control.safety_rules import AWAITED
@@ -171,7 +170,6 @@ class LiveRun:
     def run(self) -> int:
         """Run until a signal comes, or the cameras end; return the exit code."""
         print_stacks_when_killed()
-        loaded = started(_load, "imports")
         config, graph, robot = self._config, self._graph, self._robot
 
         def warn(line: str) -> None:
@@ -184,8 +182,10 @@ class LiveRun:
             # 1. The rig, and the compiled functions.
             rig = self._rig or read_rig(Path(config.cameras.rig))
             geometry = session.geometry(rig, ())
-            loaded(None)
-            prepare_kernels()  # which raises what has failed in the other thread
+            compile_serialisers(
+                [*(topic.schema for topic in topics.PUBLISHED.values()), *topics.command_topics(()).values()]
+            )
+            prepare_kernels()
             outputs.enter_context(session.signals())
             # 2. The connections, and the stages between them.
             run_places = RunPlaces(config, geometry, warn)
@@ -398,13 +398,3 @@ def _ready(config: Config) -> str:
     elif config.controller.arming == MANUAL:
         wheels = "; the wheels turn after `omnid arm`"
     return f"ready: poses of {config.bus.robot!r} at {endpoints or 'no endpoint'} (`omnid listen`){wheels}; Ctrl-C ends"
-
-
-def _load() -> None:
-    """Prepare what the stages need while images are awaited; what fails is done, and reported, where it is used."""
-    schemas = {topic.schema for topic in topics.PUBLISHED.values()} | set(topics.command_topics(()).values())
-    with suppress(Exception):
-        compile_serialisers(schemas)
-    with suppress(Exception):
-        if all(map(is_kept, kernel_modules())):  # else they are compiled when the rig is known to be right
-            prepare_kernels()

@@ -35,7 +35,7 @@ from omnid.formats.plan import drawn_heights
 from omnid.messages import MapUpdate, OdometryUpdate, PlaceUpdate
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.run_result import RunResult
-from omnid.runs.session import Session, attached_rig, motion_topics, opencv_in_one_thread, run_to_end
+from omnid.runs.session import Session, attached_rig, motion_topics, run_to_end
 from omnid.runs.wiring import Inputs, Outputs, wire
 from omnid.settings import dump
 from omnid.sinks.bus_sink import BusSink
@@ -117,7 +117,7 @@ class _Replay:
         if in_map and not config.places.enabled:
             raise OmnidError(f"{in_map[0]}: places.enabled = false, so that there is no pose in the map; leave one out")
         graph = Graph(policy=NEWEST if options.drops else LOSSLESS, threaded=not options.inline)
-        with opencv_in_one_thread(), ExitStack() as outputs:
+        with ExitStack() as outputs:
             self._session = session = Session(config, graph, outputs, self._warnings.append)
             # 1. The log and its rig.
             self._reader = reader = self._opened()

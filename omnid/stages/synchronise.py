@@ -59,14 +59,13 @@ class Skew:
 class Decoder:
     """Grey images of the size that the rig was calibrated for.
 
-    `broken` counts the frames that could not be used, `other_size` those of them that have another size than the ones
-    before, `fault` is the reason of the first of them.
+    `broken` counts the frames that could not be used, `fault` is the reason of the first of them.
     """
 
     def __init__(self, rig: Rig) -> None:
         self._sizes: dict[Camera, tuple[int, int]] = {"lower": rig.lower.camera.size, "upper": rig.upper.camera.size}
         self._fitted: set[Camera] = set()
-        self.broken = self.other_size = 0
+        self.broken = 0
         self.fault = ""
 
     def __call__(self, frame: Frame) -> Image | None:
@@ -88,7 +87,6 @@ class Decoder:
                 f"the {frame.camera} camera's images are {found[0]}x{found[1]} px, the rig's are {expected[0]}x"
                 f"{expected[1]} px: it is that of other cameras; name the rig.toml of these, or calibrate them"
             )
-        self.other_size += 1
         self._skip(f"{frame.camera} frame {frame.seq} is {found[0]}x{found[1]} px, unlike those before")
         return None
 
@@ -244,16 +242,27 @@ class Synchronise:
         }
 
     def loss(self, read: Mapping[str, int]) -> str:
-        """Return one line about images of a log that made no pair; empty where these are few.
+        """Return one line where more than a tenth of the images of a log made no pair, with the reasons; else "".
 
-        read: counts of its reader.
+        read: counts of its reader. Images of a faster camera that the other one has no partners for are no loss.
         """
-        arrived, unpaired, periods_ns = (
-            {name: getattr(camera, field) for name, camera in self._cameras.items()}
-            for field in ("arrived", "unpaired", "period_ns")
-        )
-        size, broken, repeated = self._decode.other_size, self._decode.broken - self._decode.other_size, self._repeating
-        return image_loss(read, arrived, unpaired, periods_ns, undecodable=broken, other_size=size, repeated=repeated)
+        cameras = self._cameras.values()
+        faster, slower = sorted(cameras, key=lambda camera: camera.period_ns)
+        surplus = 1 - faster.period_ns / slower.period_ns  # NaN: a period is unknown
+        by_chance = 0 if math.isnan(surplus) else min(faster.unpaired, round(surplus * faster.arrived))
+        equal = read["duplicate"] - read["repeated"]
+        images = read["lower"] + read["upper"] + equal + read["broken"] + read["unreadable"]
+        lost = {
+            "without a partner": sum(camera.unpaired for camera in cameras) - by_chance,
+            "not decodable": read["broken"] + self._decode.broken,
+            "repeated or with a partner that is": self._repeating,
+            "in corrupt records": read["unreadable"],
+            "with the stamp of the one before": equal,
+        }
+        if sum(lost.values()) <= NOTABLE_SHARE * images:
+            return ""
+        reasons = ", ".join(f"{count} {reason}" for reason, count in lost.items() if count)
+        return f"{sum(lost.values())} of {images} images made no pair: {reasons}"
 
     def process(self, message: Frame | MotionSample) -> FramePair | None:
         """Return the pair that a frame completes; None where the frame waits, is broken or shows nothing new."""
@@ -312,37 +321,3 @@ class Synchronise:
 
 def _gap_ns(frames: tuple[Frame, Frame]) -> int:
     return abs(frames[1].stamp_ns - frames[0].stamp_ns)
-
-
-def image_loss(
-    read: Mapping[str, int],
-    arrived: Mapping[Camera, int],
-    unpaired: Mapping[Camera, int],
-    periods_ns: Mapping[Camera, float],
-    *,
-    undecodable: int = 0,
-    other_size: int = 0,
-    repeated: int = 0,
-) -> str:
-    """Return one line about images of a log that make no pair, with the reasons; empty where these are a tenth or less.
-
-    read: counts of the reader; the others: of the images that it delivered, with the usual time between two of them.
-    Images of a faster camera that the other one has no partners for are no loss.
-    """
-    faster: Camera = "lower" if periods_ns["lower"] < periods_ns["upper"] else "upper"
-    surplus = 1 - periods_ns[faster] / max(periods_ns.values())  # NaN: a period is unknown
-    by_chance = 0 if math.isnan(surplus) else min(unpaired[faster], round(surplus * arrived[faster]))
-    equal = read["duplicate"] - read["repeated"]
-    images = read["lower"] + read["upper"] + equal + read["broken"] + read["unreadable"]
-    lost = {
-        "without a partner": sum(unpaired.values()) - by_chance,
-        "not decodable": read["broken"] + undecodable,
-        "of another size": other_size,
-        "repeated or with a partner that is": repeated,
-        "in corrupt records": read["unreadable"],
-        "with the stamp of the one before": equal,
-    }
-    if sum(lost.values()) <= NOTABLE_SHARE * images:
-        return ""
-    reasons = ", ".join(f"{count} {reason}" for reason, count in lost.items() if count)
-    return f"{sum(lost.values())} of {images} images made no pair: {reasons}"

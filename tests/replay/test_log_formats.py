@@ -91,7 +91,7 @@ LOSSES: dict[str, tuple[Callable[[Image], Image | None], int, str]] = {
     "an image is small": (
         lambda image: replace(image, jpeg=SMALL) if image.camera == "lower" else image,
         1,
-        "6 without a partner, 6 of another size",
+        "6 without a partner, 6 not decodable",
     ),
 }
 
