@@ -69,29 +69,21 @@ def joint_wheels(config: Config) -> JointWheels | None:
     return JointWheels(*joints, drive.wheel_radius_m, drive.track_m)
 
 
-@contextmanager
-def opencv_in_one_thread() -> Iterator[None]:
-    """Let OpenCV use one thread in this block, as the stages are threads themselves; then as many as before."""
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(before)
-
-
 def run_to_end(graph: Graph, run_places: RunPlaces) -> None:
     """Run until the end, then complete the map of places.
 
     A run that fails completes it as well: the error that ended the run is the one that is raised.
     """
-    with opencv_in_one_thread():
-        try:
-            graph.run()
-        except BaseException:
-            with suppress(OmnidError):
-                run_places.finish_run()
-            raise
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)  # the stages are threads themselves
+    try:
+        graph.run()
+    except BaseException:
+        with suppress(OmnidError):
+            run_places.finish_run()
+        raise
+    finally:
+        cv2.setNumThreads(threads)
     run_places.finish_run()
 
 
