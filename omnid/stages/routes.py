@@ -92,10 +92,7 @@ class Routes:
         return ""
 
     def finish(self, created_s: int, id: int) -> None:
-        """Have the recorded route written; id: of the request. Raise OmnidError where there is none, or no end of it.
-
-        It can be repeated at once.
-        """
+        """Have the recorded route written; id: of the request. Raise OmnidError where there is none, or it has no end."""
         if self._recorder is None:
             raise OmnidError("no route is being taught: begin with `omnid route teach NAME`")
         if self.taught is not None:
@@ -120,17 +117,12 @@ class Routes:
     def found(self, request: RouteRequest, refusal: str) -> Route:
         """Return the route of a request if it is one of this map. Raise OmnidError else, or with the refusal."""
         self._require_map()
-        taught = self.taught
-        if taught is not None and taught.route.name == request.name:
-            return taught.route
         if refusal or request.route is None:
             raise OmnidError(refusal or f"the route {request.name} was not read")
         if not request.route.fits(self._keyframe):
-            taught_in = request.route.map_name
-            other = "built again since" if taught_in == self.map_name else f"and not in {self.map_name}"
             raise OmnidError(
-                f"the route {request.name} was taught in the map {taught_in}, {other}: start with the map that it was "
-                "taught in (`omnid run --map`), or teach it again"
+                f"the route {request.name} was taught in the map {request.route.map_name} as it was then: start with "
+                "that map (`omnid run --map`), or teach it again"
             )
         return request.route
 
