@@ -109,7 +109,6 @@ class OdometryUpdate:
     motion: tuple[MotionSample, ...] = ()  # samples of wheels and gyro since the last pair
     is_keyframe: bool = False  # odometry needs its dense depth in any case
     conflict: Conflict = AGREE  # whether images, wheels and gyro show the same motion
-    refused_mps: float = 0.0  # speed of a pose that was refused for it alone; 0: none was
     image_fault: str = ""  # how the images of a camera are torn or displaced; empty: they are not
     T_odom_rect: Array = field(default_factory=lambda: np.eye(4))  # (4, 4) the same pose, as it was estimated
     # covariance of T_odom_rect, [t; r] in the rectified axes, without the errors of the rig

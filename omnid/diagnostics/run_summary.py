@@ -35,8 +35,6 @@ class RunStatistics:
         self.resets = 0
         self.dark = 0  # pairs that were too dark
         self.lost_parts: Counter[Side] = Counter()  # pairs in which a part of a camera's image was frozen or blind
-        self.too_fast = 0  # pairs whose pose was refused for its speed alone
-        self.fastest_mps = 0.0  # of those
         self.newest: OdometryUpdate | None = None
         self._position: NDArray[np.float64] | None = None
 
@@ -53,8 +51,6 @@ class RunStatistics:
         columns = odometry.depth.panoramas.tiles.columns
         self.lost_parts.update(side for side, found in columns.items() if found.any())
         self.resets = odometry.reset_counter
-        self.too_fast += odometry.refused_mps > 0
-        self.fastest_mps = max(self.fastest_mps, odometry.refused_mps)
         self.poses += 1
 
 
@@ -178,16 +174,11 @@ def input_warnings(pairing: Synchronise, rig: RigHealth, statistics: RunStatisti
                 "pairs: it was not used; clean the mirror, check the camera and its driver"
             )
     # 3. Poses that are not sure.
-    if statistics.too_fast and unsure > notable:
+    if unsure > poses / 2:
         yield (
-            f"the pose was lost or degraded in {unsure} of {poses} pairs, and the images show up to "
-            f"{statistics.fastest_mps:.1f} m/s: poses that imply more than odometry.limits.max_speed_mps = "
-            f"{config.odometry.limits.max_speed_mps:g} are refused; raise it if the robot is that fast"
-        )
-    elif lost > poses / 2:
-        yield (
-            f"the pose was lost in {lost} of {poses} pairs: is the rig that of these cameras, is --lower the lower "
-            "one, are the images bright and sharp?"
+            f"the pose was lost in {lost} of {poses} pairs, degraded in {unsure - lost}: is the rig that of these "
+            "cameras, is --lower the lower one, are the images bright and sharp, is the robot slower than "
+            f"odometry.limits.max_speed_mps = {config.odometry.limits.max_speed_mps:g}?"
         )
 
 

@@ -132,7 +132,6 @@ class OdometryStage:
             pair.motion,
             estimate.is_keyframe,
             self._agreement.result,
-            estimate.refused_mps,
             estimate.image_fault,
             estimate.T_odom_rect,
             covariance_rect,

@@ -92,7 +92,7 @@ class Routes:
         return ""
 
     def finish(self, created_s: int, id: int) -> None:
-        """Have the recorded route written; id: of the request. Raise OmnidError where there is none, or it has no end."""
+        """Have the recorded route written; id: of the request. Raise OmnidError without one, or where it has no end."""
         if self._recorder is None:
             raise OmnidError("no route is being taught: begin with `omnid route teach NAME`")
         if self.taught is not None:

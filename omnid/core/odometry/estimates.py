@@ -118,7 +118,6 @@ class OdometryEstimate:
     features: Features = field(default_factory=Features)
     step: Array | None = None  # T_prev_curr (4, 4) by the cameras alone; None: a break, or it is in doubt
     is_keyframe: bool = False  # dense stereo of the frame is computed for the local map
-    refused_mps: float = 0.0  # speed of a pose that was refused for it alone; 0: none was
     image_fault: str = ""  # how the images of a camera are torn or displaced, see image_breaks.py; empty: they are not
     # The motion during the exposures, for dense stereo of the frame; None: not known.
     exposure: Exposure | None = None

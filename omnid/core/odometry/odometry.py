@@ -150,9 +150,7 @@ class VisualOdometry:
 
         # 5. Accept or refuse, by the inliers and the speed that the pose implies; after a break, relocalise.
         plausible = [each for each in found if self._is_plausible(each, now)]
-        too_fast_mps = 0.0
-        if found and not plausible and self._has_support(found[0]):
-            too_fast_mps = found[0].distance_m(self._T_odom_rect) / now.since_fix_s
+        is_too_fast = bool(found) and not plausible and self._has_support(found[0])
         if searched and (after_refusal or dt_s > self._limits.max_gap_s) and self._is_doubtful(plausible):
             recognised = self.relocalise(frame, now.exposure)
             plausible = [recognised] if recognised is not None and self._is_plausible(recognised, now) else []
@@ -160,11 +158,10 @@ class VisualOdometry:
         gap = _step(now.T_odom_rect, plausible[0].T_odom_rect) if plausible and after_refusal else np.zeros(6)
         if not plausible or np.linalg.norm(gap[:3]) > JUMP_M:
             self._hypotheses.predict(dt_s)
-            if too_fast_mps:
+            if is_too_fast:
                 self._add_fast(found[0].T_odom_rect, now)
             is_known = bool(plausible) and plausible[0].inliers >= self._limits.good_inliers
-            refused = self._refuse(now, found, gap if is_known else None)
-            return replace(refused, refused_mps=too_fast_mps)
+            return self._refuse(now, found, gap if is_known else None)
         estimate, contradicting = self._hypotheses.choose(plausible, now.T_odom_rect, now.since_fix_s, now.sigma_mps)
 
         # 6. Update the filter (eq. 11), the pose, the mask of what is fixed to the rig, and the map.

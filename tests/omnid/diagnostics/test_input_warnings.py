@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,10 +14,7 @@ from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import LOWER, UPPER
 from tests.replay.command import Command
 from tests.replay.edited import dark, images, save
-from tests.simulation import corridor
-from tests.simulation import write_log as write_drive
-from tests.simulation.paths import spline_path
-from tests.simulation.rigs import lens, lens_rig, with_upper_rotated
+from tests.simulation.rigs import with_upper_rotated
 
 EXCHANGED = ("--lower", UPPER, "--upper", LOWER)
 
@@ -30,30 +26,6 @@ def test_refuses_exchanged_cameras(omnid: Command, scene: Path) -> None:
         wrong = omnid.replay(scene / "log.mcap", *EXCHANGED, *words, rig=scene / "rig.toml")
         assert wrong.code == 2 and wrong.out == "" and wrong.err.count("\n") == 1
         assert "the other way round" in wrong.err and "--lower" in wrong.err
-
-
-@pytest.fixture(scope="module")
-def fast(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of a log of two pinhole cameras at 10 m/s."""
-    folder = tmp_path_factory.mktemp("fast")
-    rig = lens_rig(lens("pinhole", 60, (320, 240)), baseline_m=0.5)
-    write_drive(folder, rig, spline_path(1, 16, 1.0, sway_m=0.1), corridor(1, 30.0), seed=1)
-    return folder
-
-
-@pytest.mark.parametrize("limit_mps", [5, 20])
-def test_a_drive_faster_than_the_limit_is_named(omnid: Command, fast: Path, limit_mps: int) -> None:
-    """At 10 m/s and 10 Hz poses are refused: the warning names the speed and the limit, and none after the first one is
-    called tracking while nothing moves."""
-    words = ("--set", f"odometry.limits.max_speed_mps={limit_mps}", "--set", "places.enabled=false", "--inline")
-    done = omnid.replay(fast / "log.mcap", *words, rig=fast / "rig.toml")
-    states = re.search(r"states +tracking ([0-9.]+)%", done.out)
-    assert states
-    if limit_mps == 5:
-        assert re.search(r"up to (9|10)\.[0-9] m/s: .* odometry.limits.max_speed_mps = 5 ", done.err), done
-        assert float(states[1]) <= 100 / 16 + 0.1
-    else:
-        assert "m/s" not in done.err, done
 
 
 @pytest.mark.hazard("H35")

@@ -193,7 +193,6 @@ def test_a_pose_refused_for_its_speed_leaves_a_covariance_that_covers_it(cameras
     odometry = visual_odometry(cameras.model, OdometryLimits(max_speed_mps=2.0))
     poses = planar_poses(np.array([[0.4 * k, 0.0] for k in range(4)]), np.zeros(4))
     found = run(odometry, [cameras.frame(k, T) for k, T in enumerate(poses)])
-    assert found[1].refused_mps == pytest.approx(4.0, abs=0.2)
     for k, estimate in enumerate(found[1:3], 1):
         off_m = float(np.linalg.norm(estimate.T_odom_rect[:3, 3] - 0.4 * k * np.array([1.0, 0, 0])))
         assert estimate.state is TrackingState.DEGRADED and off_m > 0.35, k
