@@ -51,7 +51,7 @@ from omnid.stages.obstacles import ADVICE, controller_scan
 from omnid.transport import status_names as names
 from omnid.transport import topics
 from omnid.transport.bus import Bus
-from omnid.transport.codec import STALE, compile_serialisers
+from omnid.transport.codec import compile_serialisers
 from omnid.transport.commands import CommandReceiver, Freshness, NavigationReceiver, SensorReceiver
 from omnid.transport.topics import Answer, Request
 
@@ -294,19 +294,10 @@ def _join(session: Session, geometry: Geometry, robot: LiveRobot, report: Report
     collect = StatusCollector(
         graph.telemetry, robot.states, front_end.pairing, statistics, to_pose, watched, clock.monotonic_ns
     )
-    reported, is_read = names.LIVE, True  # of the images in the log, and what the mapping knows
 
     def give_status() -> None:
-        nonlocal is_read, reported
-        if is_read != (recorder is not None or bus.is_received("cloud")):
-            is_read = not is_read
-            map_is_read.push(is_read)
-        statuses = collect()
-        images = next(status for status in statuses if status.name == names.IMAGES)
-        if images.level != STALE and images.message != reported:
-            reported = images.message
-            warn(f"images: {reported}")
-        reports.push(StatusReport(clock.monotonic_ns(), statuses))
+        map_is_read.push(recorder is not None or bus.is_received("cloud"))
+        reports.push(StatusReport(clock.monotonic_ns(), collect()))
 
     graph.ticker("status", config.live.status_s, give_status)
     service = Service(graph.telemetry, StatusLine(statistics, graph.telemetry), config.service.stall_timeout_s)

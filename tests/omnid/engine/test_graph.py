@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import count
-from typing import NoReturn
 
 import pytest
 
@@ -175,40 +174,6 @@ def test_a_failing_stage_ends_the_run_with_its_error(threaded: bool) -> None:
     assert [sink.finished for sink in (before, beside, after)] == [1, 1, 1]  # all are finished nevertheless
     assert before.got == list(range(len(before.got)))
     assert closed.is_set()
-
-
-@both
-@pytest.mark.parametrize("place", ["open", "next", "close", "finish", "sink"])
-def test_raises_an_error_with_the_name_of_its_stage(threaded: bool, place: str) -> None:
-    def broken() -> NoReturn:
-        raise OSError(place)
-
-    class Messages:
-        def __iter__(self) -> Iterator[int]:
-            return self
-
-        def __next__(self) -> int:
-            if place in ("next", "sink"):
-                return 1 if place == "sink" else broken()
-            raise StopIteration
-
-        def close(self) -> None:
-            if place == "close":
-                broken()
-
-    class Last(Collect):
-        def process(self, message: int) -> None:
-            broken()
-
-        def finish(self) -> None:
-            broken()
-
-    graph = Graph(threaded=threaded)
-    stream = graph.source("source", broken if place == "open" else Messages)
-    graph.sink("sink", Last() if place in ("finish", "sink") else Collect(), stream)
-    with pytest.raises(OSError, match=place) as caught:
-        graph.run()
-    assert caught.value.__notes__ == ["in 'sink'" if place in ("finish", "sink") else "in 'source'"]
 
 
 @both

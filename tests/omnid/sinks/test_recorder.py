@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -19,7 +18,6 @@ from drivers.logs.rotating_log import RotationSettings
 from drivers.motor import VelocityCommand
 from omnid.config import Config, RecordConfig
 from omnid.core.mapping.voxel_map import MapPoints
-from omnid.engine.graph import NEWEST, Graph
 from omnid.engine.robot_clock import RobotClock
 from omnid.messages import MapUpdate, OdometryUpdate
 from omnid.runs.record import open_recorder
@@ -205,24 +203,6 @@ class Given:
 
     def close(self) -> None:
         """Nothing to close."""
-
-
-def test_a_blocked_disk_stops_no_camera(tmp_path: Path) -> None:
-    recorder = open_recorder(settings(tmp_path / "log"), "", lambda *_: None, clock=set_clock())
-    graph, seen_s, until_s = Graph(policy=NEWEST, depth=3), list[float](), time.monotonic() + 0.5
-
-    def late(message: Frame) -> None:
-        time.sleep(max(0.0, until_s - time.monotonic()))
-        recorder.process(message)
-
-    stream = graph.source("lower", lambda: iter([frame(n, "lower") for n in range(50)]))
-    graph.sink("record", late, stream)
-    graph.sink("odometry", lambda _: seen_s.append(time.monotonic()), stream)
-    graph.run()
-    recorder.close()
-    stats = graph.telemetry.of("record")
-    assert stats.dropped >= 40 and stats.dropped + recorder.state.messages == 50
-    assert min(seen_s) < until_s  # the others went on meanwhile
 
 
 def test_reports_the_state_of_the_recording(tmp_path: Path) -> None:

@@ -156,15 +156,6 @@ def test_the_reflection_of_a_lens_in_its_mirror_has_no_depth(
     assert below > 100 and confirmed < 0.4 * below, (below, confirmed)
 
 
-def test_inliers_and_rejected_features_are_different_ones(poses: list[OdometryUpdate]) -> None:
-    gaps: list[float] = []
-    for odometry in poses[1:]:
-        seen = odometry.features
-        assert len(seen.inliers) >= odometry.inliers and len(seen.rejected) <= odometry.tracks
-        gaps += np.linalg.norm(seen.rejected[:, None] - seen.inliers[None], axis=2).min(axis=1).tolist()
-    assert gaps and np.mean(np.array(gaps) < 1) < 0.2  # px; a wrongly tracked feature may end on another
-
-
 @pytest.mark.parametrize(("min_range_m", "found"), [(0.5, True), (3.0, False)])
 def test_the_search_reaches_the_nearest_points(min_range_m: float, found: bool) -> None:
     """A wall whose disparity is 60 px stands 0.6 m away."""
