@@ -28,18 +28,15 @@ from omnid.diagnostics.status import StatusCollector, image_stats, wheel_stats
 from omnid.engine.telemetry import Histogram, StageStats, Telemetry
 from omnid.messages import OdometryUpdate, StereoDepth
 from omnid.stages.lockstep_drive import controller_pose
-from omnid.stages.obstacles import CameraFloor
 from omnid.stages.synchronise import Synchronise
 from omnid.tracking_state import TrackingState
 from omnid.transport import codec
 from omnid.transport.codec import ERROR, OK, STALE, WARN, DiagnosticStatus, diagnostics_cdr
 from omnid.transport.commands import CommandReceiver, Freshness
-from omnid.transport.status_names import FLOOR, IMAGES, LIVE, REMEDIES, TIMEOUT_S, WHEELS, Key, entry, short_name
+from omnid.transport.status_names import IMAGES, LIVE, REMEDIES, TIMEOUT_S, WHEELS, Key, entry, short_name
 from omnid.transport.topics import Request
 from tests.omnid.small_pair import small_depth
-from tests.omnid.stages.test_obstacles import depth
 from tests.simulation import build
-from tests.simulation.rigs import make_rig
 
 SIZE = 256
 JPEG = cv2.imencode(".jpg", np.full((SIZE, SIZE), 90, np.uint8))[1].tobytes()
@@ -194,18 +191,6 @@ def test_wheels_driving_stopped_and_faulty(daemon: Daemon) -> None:
     daemon.tick()
     status = daemon.collected()["wheels"]
     assert status.level == ERROR and status.values["fault"] == "7"
-
-
-def test_the_height_is_published_with_its_origin_and_warns_unless_it_is_stated() -> None:
-    stated = entry(FLOOR, CameraFloor(make_rig().at_height(0.9), 0.0).stats())
-    assert stated.level == OK and stated.values == {"height_m": "0.9", "sigma_m": "0", "tilt_deg": "0"}
-    camera_floor = CameraFloor(make_rig(), 0.0)
-    unknown = entry(FLOOR, camera_floor.stats())
-    assert unknown.level == WARN and "nothing is free" in unknown.message and set(unknown.values) == {Key.REMEDY}
-    camera_floor.add(depth(np.eye(4)))
-    found = entry(FLOOR, camera_floor.stats())
-    assert found.level == WARN and abs(float(found.values["height_m"]) - 1.2) < 0.03
-    assert 0.005 < float(found.values["sigma_m"]) < 0.05
 
 
 S = 1_000_000_000

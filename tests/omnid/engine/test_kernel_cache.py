@@ -76,11 +76,6 @@ def run(copy: Path, cache: Path) -> list[str]:
     return (output + errors).splitlines()
 
 
-def files_in(folder: Path) -> set[Path]:
-    """Return the files below a folder, but for those of Python."""
-    return {path for path in folder.rglob("*") if path.is_file() and path.suffix != ".pyc"}
-
-
 def test_the_first_program_compiles_and_others_read_until_a_file_is_edited(copy: Path) -> None:
     """Also one that only the callee is in, which numba itself would not notice; the code of other files stays."""
     cache = copy / "cache"
@@ -96,16 +91,6 @@ def test_the_first_program_compiles_and_others_read_until_a_file_is_edited(copy:
     assert first.startswith("INFO compiling") and last == "[1.0, 2.0]"
     now = {path.name for path in cache.iterdir()}
     assert len(now) == 3 and {name.partition("-")[0] for name in now & kept} == {"other_kernels"}
-
-
-def test_in_a_read_only_installation_without_a_cache_there_is_one_warning_and_no_file(copy: Path) -> None:
-    before = files_in(copy)
-    for path in (copy / "omnid").rglob("*"):
-        path.chmod(0o555)
-    warning, result = run(copy, Path("/proc/no/cache"))
-    assert warning.startswith("WARNING the compiled functions are not kept in /proc/no/cache: ") and result == HALVES
-    assert "set OMNID_CACHE_DIR" in warning
-    assert files_in(copy) == before
 
 
 def test_code_that_others_could_have_written_is_not_read(copy: Path) -> None:
