@@ -53,9 +53,6 @@ Array = NDArray[np.float64]
 Topics: TypeAlias = tuple[str | None, str | None]  # of the lower and the upper camera
 UNPRIVILEGED: Final = RealtimeSettings(lock_memory=False, motor_priority=0)  # of the controller process of a replay
 PROGRESS_S: Final = 0.2  # between two calls that show the progress
-BOOKKEEPING: Final = frozenset(  # left out of the timings
-    {"progress", "statistics", "collect-poses", "collect-map", "collect-places"}
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -281,7 +278,7 @@ class _Replay:
     def _end_recording(self, recorder: object) -> None:
         """Complete a recording with the counters of the run and of its stages, if it has messages."""
         if isinstance(recorder, Recorder) and recorder.state.messages:
-            stages = [stage for stage in self._session.graph.telemetry.stages if stage.name not in BOOKKEEPING]
+            stages = self._session.graph.telemetry.stages
             found = [entry(stage_name(stage.name), stage_stats(stage)) for stage in stages]
             summary = replace(self._counters(), motor={})
             statuses = [entry(SUMMARY, summary_stats(summary)), *self._motion(), *found]
@@ -309,7 +306,7 @@ class _Replay:
             np.array(covariances, np.float64).reshape(-1, 6, 6),
             tuple(states),
             counters,
-            {row.stage: row for row in session.graph.telemetry.summary() if row.stage not in BOOKKEEPING},
+            {row.stage: row for row in session.graph.telemetry.summary()},
             (*dict.fromkeys(self._warnings), *self._about_input(counters)),
             self._map[0].points if self._map else None,
             session.signal,

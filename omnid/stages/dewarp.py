@@ -24,7 +24,6 @@ from omnid.stages.geometry import Geometry
 
 NOISE_NS = NS_PER_S  # Time between two measurements of the noise, because exposure changes it slowly.
 BLUR_SHARE = 0.6  # sigma of the blur by the additional pixels that a pixel of the panorama covers
-MIN_SHARED_PART = 0.05  # Least share of the panorama that both cameras must see.
 
 
 class Dewarp:
@@ -46,11 +45,8 @@ class Dewarp:
             RawImage(upper[0], upper[1], rig.upper.camera.size),
         )
         self._rows_s = [maps[1][:, inner] * np.float32(line_s) for maps in (self._lower, self._upper) if line_s]
-        if self._visible.mean() < MIN_SHARED_PART:
-            raise OmnidError(
-                f"the cameras share {self._visible.mean():.1%} of the panorama, less than {MIN_SHARED_PART:.0%}: check "
-                "the rig's transforms and masks"
-            )
+        if not self._visible.any():
+            raise OmnidError("the cameras share no part of the panorama: check the rig's transforms and masks")
 
     def process(self, pair: FramePair) -> Panoramas:
         """Return the panoramas of a pair."""

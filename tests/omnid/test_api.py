@@ -106,7 +106,6 @@ def test_the_result_holds_arrays_counters_and_timings(result: omnid.RunResult) -
     for stage in ("pair", "dewarp", "odometry", "mapping"):
         timing = result.timings[stage]
         assert timing.n >= PAIRS and 0 < timing.p50_ms <= timing.p99_ms <= timing.max_ms
-    assert not {"statistics", "collect-poses"} & result.timings.keys()
 
 
 def test_a_result_is_compared_with_the_truth(result: omnid.RunResult, tmp_path: Path) -> None:
