@@ -28,7 +28,6 @@ Out = TypeVar("Out")
 T_co = TypeVar("T_co", covariant=True)
 Out_co = TypeVar("Out_co", covariant=True)
 In_contra = TypeVar("In_contra", contravariant=True)
-TICKS: Final = "ticks"  # the thread of the tickers that name no other
 END: Final = object()  # the last message of a stream
 
 
@@ -159,26 +158,6 @@ class _Inbox:
             self._graph.done()
 
 
-@dataclass(slots=True, eq=False)
-class _Source:
-    """Input of the graph: messages of an iterable."""
-
-    stats: StageStats
-    open: Callable[[], Iterable[object]]
-    wake: Callable[[], None]
-    stream: Stream[Any]
-
-
-@dataclass(slots=True, eq=False)
-class _Ticker:
-    """An action at a fixed rate. `stats.dropped` counts missed deadlines."""
-
-    stats: StageStats
-    period_ns: int
-    action: Callable[[], object]
-    deadline_ns: int = 0
-
-
 class Graph:
     """The wiring of one run, and the run itself.
 
@@ -201,10 +180,11 @@ class Graph:
         self.lock = threading.Lock()  # of all inboxes
         self._idle = threading.Condition(self.lock)
         self.waiting = 0  # messages in all inboxes, with those that are processed; under the lock
-        self._sources: list[_Source] = []
+        self._readers: dict[str, Callable[[], object]] = {}  # bodies of the threads of sources, by their names
+        self._wakes: dict[str, Callable[[], None]] = {}
         self._inlets: list[Stream[Any]] = []
         self._inboxes: dict[str, _Inbox] = {}  # by thread
-        self._tickers: dict[str, list[_Ticker]] = {}  # by thread
+        self._tickers: dict[str, Callable[[], object]] = {}  # bodies of their threads, by their names
         self.failed: set[str] = set()  # names of stages
         self._errors: list[BaseException] = []
         self._stops: deque[None] = deque(maxlen=2)
@@ -222,7 +202,8 @@ class Graph:
         sources are read one after the other.
         """
         stream: Stream[T] = Stream(name)
-        self._sources.append(_Source(self.telemetry.add(StageStats(name)), messages, wake, stream))
+        self._readers[name] = partial(self._read, self.telemetry.add(StageStats(name)), messages, stream)
+        self._wakes[name] = wake
         self._open_sources += 1
         return stream
 
@@ -256,14 +237,14 @@ class Graph:
         own = None if self._sinks_wait else policy
         self._node(name, sink, inputs, own or self.policy, self._depth if depth is None else depth, thread)
 
-    def ticker(self, name: str, period_s: float, action: Callable[[], object], thread: str = TICKS) -> None:
-        """Add an action that is called at a fixed rate, also inline, until the run ends; tickers share a thread.
+    def ticker(self, name: str, period_s: float, action: Callable[[], object]) -> None:
+        """Add an action that is called at a fixed rate in a thread of its own, also inline, until the run ends.
 
         A stop or a failure ends it at once, before the inboxes are empty. The action's optional `close` is called once,
-        also after an error.
+        also after an error. `dropped` of its counters are missed deadlines.
         """
-        ticker = _Ticker(self.telemetry.add(StageStats(name, is_ticker=True)), round(period_s * NS_PER_S), action)
-        self._tickers.setdefault(thread, []).append(ticker)
+        stats = self.telemetry.add(StageStats(name, is_ticker=True))
+        self._tickers[name] = partial(self._tick, stats, round(period_s * NS_PER_S), action)
 
     def _node(
         self, name: str, work: Any, inputs: tuple[Stream[Any], ...], policy: Policy, depth: int, thread: str
@@ -287,18 +268,17 @@ class Graph:
 
         Raises the first error of any stage with later ones in its notes, and KeyboardInterrupt after a second stop.
         """
-        # 1. A thread for each source, each group of stages, and each group of tickers.
-        bodies: dict[str, Callable[[], object]] = {each.stats.name: partial(self._read, each) for each in self._sources}
-        bodies |= {name: inbox.serve for name, inbox in self._inboxes.items()}
+        # 1. A thread for each source, each group of stages, and each ticker.
+        bodies = self._readers | {name: inbox.serve for name, inbox in self._inboxes.items()}
         work = [self._thread(name, body) for name, body in bodies.items()] if self._threaded else []
-        ticks = [self._thread(name, partial(self._tick, group)) for name, group in self._tickers.items()]
+        ticks = [self._thread(name, body) for name, body in self._tickers.items()]
         # 2. Run, and wait for the end of all.
         try:
             for thread in ticks + work:
                 thread.start()
             if not self._threaded:
-                for source in self._sources:
-                    self._read(source)
+                for read in self._readers.values():
+                    read()
             self._join(work)
         except BaseException as error:  # from the caller's signal handler, or no thread could be started
             self._errors.insert(0, error)
@@ -367,47 +347,44 @@ class Graph:
 
         return threading.Thread(target=run, name=name)
 
-    def _read(self, source: _Source) -> None:
+    def _read(self, stats: StageStats, given: Callable[[], Iterable[object]], stream: Stream[Any]) -> None:
         """Pass on the messages of a source; then its stream ends, and with the last one the inlets."""
-        stats, messages = source.stats, iter(tuple[object]())
+        messages = iter(tuple[object]())
         with self.watched(stats.name):
             try:
                 if not self.is_stopping:
-                    start_ns, messages = time.perf_counter_ns(), iter(source.open())
+                    start_ns, messages = time.perf_counter_ns(), iter(given())
                     for message in messages:
                         stats.add(start_ns)
-                        source.stream.push(message)
+                        stream.push(message)
                         if self.is_stopping:
                             break
                         start_ns = time.perf_counter_ns()
             finally:
                 getattr(messages, "close", nothing)()
-        source.stream.push(END)
+        stream.push(END)
         with self.lock:
             self._open_sources -= 1
             is_last = not self._open_sources
         for inlet in self._inlets if is_last else ():
             inlet.push(END)
 
-    def _tick(self, group: list[_Ticker]) -> None:
-        """Call the actions of a thread, each at its rate, until the end; then close them.
+    def _tick(self, stats: StageStats, period_ns: int, action: Callable[[], object]) -> None:
+        """Call an action at its rate until the end; then close it.
 
         Of several deadlines that have passed the newest is served, without drift and burst.
         """
-        for ticker in group:
-            ticker.deadline_ns = time.monotonic_ns()
-        while True:
-            ticker = min(group, key=lambda each: each.deadline_ns)
-            if self._no_ticks.wait(max(0.0, (ticker.deadline_ns - time.monotonic_ns()) * S_PER_NS)) or self.is_stopping:
+        deadline_ns = time.monotonic_ns()
+        while not self._no_ticks.wait(max(0.0, (deadline_ns - time.monotonic_ns()) * S_PER_NS)):
+            if self.is_stopping:
                 break
-            skipped = max(0, time.monotonic_ns() - ticker.deadline_ns) // ticker.period_ns
-            ticker.deadline_ns += (1 + skipped) * ticker.period_ns
-            ticker.stats.dropped += skipped
-            with self.watched(ticker.stats.name):
-                ticker.stats.timed(ticker.action)
-        for ticker in group:
-            with self.watched(ticker.stats.name):
-                getattr(ticker.action, "close", nothing)()
+            skipped = max(0, time.monotonic_ns() - deadline_ns) // period_ns
+            deadline_ns += (1 + skipped) * period_ns
+            stats.dropped += skipped
+            with self.watched(stats.name):
+                stats.timed(action)
+        with self.watched(stats.name):
+            getattr(action, "close", nothing)()
 
     def _join(self, threads: list[threading.Thread]) -> None:
         """Wait for the threads that were started; pass a stop or a failure on to tickers and sources."""
@@ -416,7 +393,7 @@ class Graph:
                 thread.join(POLL_S)
                 if self.is_stopping:
                     self._no_ticks.set()
-                    for source in self._sources:
-                        wake, source.wake = source.wake, nothing
-                        with self.watched(source.stats.name):
+                    while self._wakes:
+                        name, wake = self._wakes.popitem()
+                        with self.watched(name):
                             wake()

@@ -192,9 +192,7 @@ class LiveRun:
             _join(session, geometry, robot, self._report, run_places)
             if (show := self._show) is not None:
                 line = StatusLine(session.statistics, graph.telemetry, robot.stats)
-                graph.ticker(
-                    "terminal", 0.5, lambda: show(f"{line.statistics.length_m:8.2f} m  {line()}"), thread="terminal"
-                )
+                graph.ticker("terminal", 0.5, lambda: show(f"{line.statistics.length_m:8.2f} m  {line()}"))
                 outputs.callback(lambda: self._report(logging.INFO, line.summary()))
                 outputs.callback(show, "")
                 self._report(logging.INFO, _ready(config))

@@ -123,7 +123,7 @@ class Session:
         bus.serve("config", dump(self.config))
         bus.serve("rig", rig_toml(rig))
         if bus.needs_router:
-            self.graph.ticker("router", ROUTER_S, bus.connect, thread="router")
+            self.graph.ticker("router", ROUTER_S, bus.connect)
         return bus
 
     def _close_bus(self, bus: Bus) -> None:
