@@ -11,6 +11,7 @@ from omnid.core.control.collision_monitor import UNKNOWN, ControllerScan
 from omnid.core.navigation.navigator import Navigator
 from omnid.core.navigation.path import DrivePath, drive_path, goal_path
 from omnid.core.navigation.requests import NavigationFrame
+from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import Situation
 from omnid.core.navigation.surroundings import Surroundings, near_ends
 from omnid.navigation_state import NavigationState
@@ -25,9 +26,15 @@ class BaseAmongPatches(DrivenBase):
 
     has_scan = True
 
-    def __init__(self, patches: Boxes, path: DrivePath | None = None, occupied: float = math.nan) -> None:
+    def __init__(
+        self,
+        patches: Boxes,
+        path: DrivePath | None = None,
+        occupied: float = math.nan,
+        settings: NavigationSettings = SETTINGS,
+    ) -> None:
         """occupied: probability of a thing in each cell that no scan has shown to be free."""
-        super().__init__(Navigator(SETTINGS), 1)
+        super().__init__(Navigator(settings), 1)
         self.occupied = occupied
         self.boxes, self.floor, self.around = patches, Floor(), None
         self.navigator.start("goal", NavigationFrame.ODOM, [path or goal_path(self.pose, (5.0, 0.0), 0.0)], self.seen())
@@ -59,7 +66,7 @@ def test_a_patch_that_closes_the_way_is_passed_beside_it(path: DrivePath | None,
 
 @pytest.mark.hazard("H31")
 def test_where_no_floor_is_seen_across_the_way_the_drive_ends_and_says_so() -> None:
-    base = BaseAmongPatches(Boxes((2.4, -9.0, 2.7, 9.0)))
+    base = BaseAmongPatches(Boxes((2.4, -9.0, 2.7, 9.0)), settings=NavigationSettings(give_up_s=4.0, stuck_s=6.0))
     answer = base.run(150)
     assert answer.state is NavigationState.FAILED and " m are left" in answer.reason
     assert UNKNOWN in answer.reason or "ways were tried" in answer.reason
