@@ -25,7 +25,7 @@ from drivers.cameras.v4l2_camera import V4l2Camera
 from drivers.cameras.v4l2_device import RULES_FILE, capture_devices, udev_rules
 from drivers.cameras.v4l2_settings import V4l2Settings
 from drivers.frame import Frame, gray
-from tests.hardware.guest.loopback import DEVICES, Loopback, load_loopback
+from tests.hardware.guest.surroundings import DEVICES, Loopback, load_loopback
 
 SIZE = 320, 180
 RATE_HZ = 10.0

@@ -18,7 +18,6 @@ from typing import Any
 import pytest
 import serial  # type: ignore[import-untyped]
 
-from tests.hardware.guest.loopback import load_loopback
 from tests.hardware.guest.probe import PORT, REPORT
 from tests.hardware.guest.surroundings import (
     DROP_INS,
@@ -26,6 +25,7 @@ from tests.hardware.guest.surroundings import (
     GuestOperator,
     SampleLog,
     journal,
+    load_loopback,
     restarted,
     run,
     show,
