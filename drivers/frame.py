@@ -20,8 +20,6 @@ Camera = Literal["lower", "upper"]
 CAMERAS: tuple[Camera, Camera] = ("lower", "upper")
 
 MAX_PIXELS = 64 * 2**20
-# Pixels times channels of a compressed image: decoders of progressive and interlaced ones store all samples at once.
-MAX_SAMPLES = MAX_PIXELS
 SAMPLE_BITS = (8, 10, 12, 16)  # bits of a camera that images of 16 bits a sample may hold
 _START_MARKER = {"jpeg": b"\xff\xd8\xff", "png": b"\x89PNG\r\n\x1a\n"}  # ITU T.81, B.1.1.3; PNG 1.2, 3.1
 _JPEG_CHANNELS = {"Gray": 1, "YCbCr": 3, "RGB": 3}
@@ -31,7 +29,6 @@ _EXTRANEOUS_AT_END = "extraneous bytes before marker 0xd9"
 _PNG_END = b"IEND\xaeB`\x82"
 # Signature, then the chunk IHDR: length, name, width, height, bit depth, colour type (PNG 1.2, 4.1.1).
 _PNG_START = struct.Struct(">8x4x4sIIBB")
-_PNG_ANIMATION = b"\0\0\0\x08acTL"  # length and name of the chunk of an animation: OpenCV takes 10 bytes a pixel
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by colour type
 # Conversions by encoding without the number of bits, which are 8 or 16 a sample.
 _TO_GRAY = {
@@ -140,8 +137,8 @@ def _of_png(frame: Frame, data: NDArray[np.uint8]) -> NDArray[np.uint8]:
     if raw.rfind(_PNG_END) < 0:
         raise ValueError(f"its end is missing after {data.size} bytes")
     name, width, height, _, colours = _PNG_START.unpack_from(raw.ljust(_PNG_START.size, b"\0"))
-    channels, is_plain = _PNG_CHANNELS.get(colours, 4), name == b"IHDR" and _PNG_ANIMATION not in raw
-    _require_samples(width if is_plain else 0, height if is_plain else 0, channels)
+    channels, is_plain = _PNG_CHANNELS.get(colours, 4), name == b"IHDR"
+    _require_samples(width if is_plain else 0, height, channels)
     image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH)
     if image is None or image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
         raise ValueError("its content is corrupt")
@@ -182,8 +179,6 @@ def _interpolated(frame: Frame, encoding: str, samples: NDArray[Any]) -> NDArray
 
 
 def _require_samples(width: int, height: int, channels: int) -> None:
-    """Raise ValueError for an empty or excessive image."""
-    if width < 1 or height < 1 or width * height > MAX_PIXELS:
-        raise ValueError(f"its size is {width} x {height} px, not 1 to {MAX_PIXELS} px in all")
-    if width * height * channels > MAX_SAMPLES:
-        raise ValueError(f"{width} x {height} px of {channels} channels exceed {MAX_SAMPLES} samples")
+    """Raise ValueError for an empty or excessive image; decoders of progressive ones store all samples at once."""
+    if width < 1 or height < 1 or width * height * channels > MAX_PIXELS:
+        raise ValueError(f"its size is {width} x {height} px of {channels} channels, not 1 to {MAX_PIXELS} in all")

@@ -94,8 +94,6 @@ class SerialMotor:
         protocol: default is the line protocol. baud: 0 is the protocol's default. connect_s: time for the first reply;
         0: it is not waited for, `send` opens the port and asks.
         """
-        if not (math.isfinite(timeout_s) and timeout_s > 0):
-            raise DriverError(f"motor timeout is {timeout_s} s; give a time above 0, for example 0.05")
         self.errors = 0  # calls of `send` that failed
         self.replaced_by_stop = 0  # commands in place of which a stop was sent
         self.connections = 0  # times that the controller was set up

@@ -94,7 +94,7 @@ def evaluate_run(args: argparse.Namespace) -> int:
     --live FILE            the poses as they were known while driving (replay --map-live-tum), whose errors are printed
         beside
     --frame rig|auto=rig   the body whose truth it is: the rig; auto: fit one constant pose of another body on the
-        robot and the delay of its clock, and print what was fitted
+        robot, and print what was fitted
 
     examples:
       eval est.txt truth.txt
@@ -104,7 +104,7 @@ def evaluate_run(args: argparse.Namespace) -> int:
     """
     estimate, truth, tolerance_s = read_tum(args.estimate), read_tum(args.truth), args.tolerance_ms * 1e-3
     frame = find_truth_frame(estimate, truth)
-    of_rig = truth if frame is None else frame.rig_poses(truth, estimate)
+    of_rig = truth if frame is None else frame.rig_poses(truth)
     if args.frame == "auto":
         truth = of_rig
     try:

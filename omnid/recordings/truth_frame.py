@@ -1,9 +1,9 @@
-"""What one constant difference between an estimate and its truth explains: another body, another clock.
+"""What one constant difference between an estimate and its truth explains: another body.
 
 A truth is often the trajectory of another body on the same robot: a marker, an IMU, a camera. With a constant pose
 T_rig_body of that body, and the unknown pose T_truth_odom of the estimate's world, the truth is
 
-    T_truth_body(t + delay) = T_truth_odom T_odom_rig(t) T_rig_body.
+    T_truth_body = T_truth_odom T_odom_rig T_rig_body.
 
 With A = R_truth_odom^T this is linear in A, R_rig_body and both translations (robot-world and hand-eye calibration,
 Shah 2013, with the positions in the same system):
@@ -19,13 +19,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from itertools import product
 from typing import Final
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from calib import se3
@@ -44,31 +41,23 @@ LEAST_SIGMA: Final = 1e-6  # [m, rad] Residuals of exact poses count as this.
 class TruthFrame:
     """How a truth differs from the truth of an estimate's own rig, and what of it was fitted."""
 
-    delay_s: float = 0.0  # of the truth's stamps against the estimate's
-    T_rig_body: Array | None = None  # (4, 4); None: the rig itself
-    freedom: int = 0  # number of fitted unknowns that the path determines
-    unknown: str = ""  # axes of the lever arm that the path does not show
+    T_rig_body: Array  # (4, 4)
+    freedom: int  # number of fitted unknowns that the path determines
+    unknown: str  # axes of the lever arm that the path does not show
 
-    def rig_poses(self, truth: Trajectory, estimate: Trajectory) -> Trajectory:
-        """Return the truth of the rig on the estimate's clock; after a delay at the estimate's stamps."""
-        T = truth.T if self.T_rig_body is None else truth.T @ se3.inverse(self.T_rig_body)
-        of_rig = Trajectory(truth.stamps_ns - round(self.delay_s * 1e9), T)
-        covered = _covered(estimate, of_rig).stamps_ns
-        return Trajectory(covered, _at(of_rig, covered)) if self.delay_s else of_rig
+    def rig_poses(self, truth: Trajectory) -> Trajectory:
+        """Return the truth of the rig."""
+        return Trajectory(truth.stamps_ns, truth.T @ se3.inverse(self.T_rig_body))
 
     def __str__(self) -> str:
         """Return the differences in one line."""
-        words = []
-        if self.delay_s:
-            words.append(f"its stamps are {abs(self.delay_s):.3f} s {'later' if self.delay_s > 0 else 'earlier'}")
-        if self.T_rig_body is not None:
-            words.append("it is of another body than the rig")
-            R, (x, y, z) = parts(self.T_rig_body)
-            if not np.array_equal(R, np.eye(len(R))):
-                words.append(f"turned by {_turn_words(R)}")
-            if np.any([x, y, z]):
-                unknown = f" (the path does not show {self.unknown})" if self.unknown else ""
-                words.append(f"at x {x:.3f} y {y:.3f} z {z:.3f} m{unknown}")
+        words = ["it is of another body than the rig"]
+        R, (x, y, z) = parts(self.T_rig_body)
+        if not np.array_equal(R, np.eye(len(R))):
+            words.append(f"turned by {_turn_words(R)}")
+        if np.any([x, y, z]):
+            unknown = f" (the path does not show {self.unknown})" if self.unknown else ""
+            words.append(f"at x {x:.3f} y {y:.3f} z {z:.3f} m{unknown}")
         return ", ".join(words)
 
 
@@ -92,60 +81,41 @@ def find_truth_frame(estimate: Trajectory, truth: Trajectory) -> TruthFrame | No
     """
     if _error(estimate, truth) < SMALL_ERROR:
         return None
-    # 1. Fit a delay, a turn and a lever arm, or none of these.
-    found: list[tuple[int, float, tuple[bool, ...], TruthFrame]] = []
-    for fitted in product((False, True), repeat=3):
+    # 1. Fit a turn, a lever arm or both.
+    found: list[tuple[int, float, tuple[bool, bool], TruthFrame]] = []
+    for fitted in ((True, False), (False, True), (True, True)):
         frame = _fitted(estimate, truth, *fitted)
         if frame is not None:
-            found.append((sum(fitted), _error(estimate, frame.rig_poses(truth, estimate)), fitted, frame))
+            found.append((sum(fitted), _error(estimate, frame.rig_poses(truth)), fitted, frame))
     # 2. Of those that leave little, the one with the fewest differences.
+    plain = _error(estimate, truth)
     most = max(LEAST_SIGMA, min((left for _, left, *_ in found), default=math.inf)) / WORTH_PART
-    good = [one for one in found if one[1] <= most < math.inf]
-    if not good:
+    good = [one for one in found if one[1] <= most]
+    if not good or plain <= most:
         return None
-    changes, _, fitted, frame = min(good, key=lambda one: one[:2])
-    if not changes:
-        return None
+    _, _, fitted, frame = min(good, key=lambda one: one[:2])
     # 3. It must explain the error of each half of the drive by the other half; an error of the spread is the most.
     middle = len(estimate.stamps_ns) // 2
     halves = [Trajectory(estimate.stamps_ns[part], estimate.T[part]) for part in np.s_[:middle, middle:]]
     left = plain = 0.0
     for one, other in (halves, halves[::-1]):
         of_half = _fitted(one, truth, *fitted)
-        left += math.inf if of_half is None else _error(other, of_half.rig_poses(truth, other))
+        left += math.inf if of_half is None else _error(other, of_half.rig_poses(truth))
         plain += min(1.0, _error(other, truth))
     return frame if left < WORTH_PART * plain else None
 
 
-def _fitted(
-    estimate: Trajectory, truth: Trajectory, has_delay: bool, is_turned: bool, has_lever: bool
-) -> TruthFrame | None:
+def _fitted(estimate: Trajectory, truth: Trajectory, is_turned: bool, has_lever: bool) -> TruthFrame | None:
     """Return a difference, of which what is not wanted is none; None where too few poses are at the same times."""
-
-    def left(delay_s: float) -> float:
-        pair = _common(estimate, truth, delay_s)
-        return math.inf if pair is None else _body(*pair, is_turned, has_lever)[2]
-
-    # 1. The delay by which the pose of the body leaves the least error.
-    delay_s, step_s = _delay(estimate, truth) if has_delay else (0.0, 0.0)
-    if has_delay:
-        bounds, options = (delay_s - step_s, delay_s + step_s), {"xatol": 1e-4}
-        delay_s = float(minimize_scalar(left, bounds=bounds, method="bounded", options=options).x)
-    # 2. The pose of the body.
-    pair = _common(estimate, truth, delay_s)
+    pair = _common(estimate, truth)
     if pair is None:
         return None
-    T_rig_body, unknown, _ = _body(*pair, is_turned, has_lever)
-    freedom = has_delay + 3 * is_turned + (3 - len(unknown)) * has_lever
-    body = T_rig_body if has_lever or is_turned else None
-    return TruthFrame(delay_s, body, freedom, ", ".join(unknown))
+    T_rig_body, unknown = _body(*pair, is_turned, has_lever)
+    return TruthFrame(T_rig_body, 3 * is_turned + (3 - len(unknown)) * has_lever, ", ".join(unknown))
 
 
-def _body(T_odom_rig: Array, T_truth_body: Array, is_turned: bool, has_lever: bool) -> tuple[Array, str, float]:
-    """Return T_rig_body (4, 4) by poses (N, 4, 4) of the same times, and what these do not show and explain.
-
-    These are the axes along which the path shows no lever arm, and the errors of position [m] times rotation [rad].
-    """
+def _body(T_odom_rig: Array, T_truth_body: Array, is_turned: bool, has_lever: bool) -> tuple[Array, str]:
+    """Return T_rig_body (4, 4) by poses (N, 4, 4) of the same times, and the axes of the lever arm that these hide."""
     (R, p), (true_R, true_p) = parts(T_odom_rig), parts(T_truth_body)
     p, true_p, swing, eye = p - p.mean(axis=0), true_p - true_p.mean(axis=0), R - R.mean(axis=0), np.eye(3)
     # 1. The linear system of A row by row, R_rig_body column by column and t_rig_body. A rotation counts as the
@@ -175,12 +145,12 @@ def _body(T_odom_rig: Array, T_truth_body: Array, is_turned: bool, has_lever: bo
         shown = np.square(swing).mean(axis=0).sum(axis=0) > np.square(error).mean(axis=0).sum() / WORTH_PART
         unknown = "".join(axis for axis, is_shown in zip("xyz", shown, strict=True) if not is_shown)
         lever[shown] = np.linalg.lstsq(swing[:, :, shown].reshape(moved.size, -1), moved.ravel(), rcond=None)[0]
-    return se3.transform(R_rig_body, lever), unknown, _rms(moved - swing @ lever) * _rms(error)
+    return se3.transform(R_rig_body, lever), unknown
 
 
 def _error(estimate: Trajectory, truth: Trajectory) -> float:
     """Return the error that `omnid eval` shows, see `_shown_error`; infinite without poses at the same times."""
-    pair = _common(estimate, truth, 0.0)
+    pair = _common(estimate, truth)
     return math.inf if pair is None else _shown_error(*pair, np.eye(4))
 
 
@@ -194,25 +164,19 @@ def _shown_error(T_odom_rig: Array, T_truth_body: Array, T_rig_body: Array) -> f
     return _rms(xyz) / max(_spread(T_true), _spread(T_odom_rig), LEAST_SIGMA) + _rms(se3.rotation_log(R))
 
 
-def _covered(estimate: Trajectory, truth: Trajectory) -> Trajectory:
-    """Return the part of an estimate that a truth covers."""
-    covered = (estimate.stamps_ns >= truth.stamps_ns[0]) & (estimate.stamps_ns <= truth.stamps_ns[-1])
-    return Trajectory(estimate.stamps_ns[covered], estimate.T[covered])
-
-
-def _common(estimate: Trajectory, truth: Trajectory, delay_s: float) -> tuple[Array, Array] | None:
+def _common(estimate: Trajectory, truth: Trajectory) -> tuple[Array, Array] | None:
     """Return the estimate's poses that the truth covers, evenly chosen, and the truth interpolated there.
 
     None where these are fewer than unknowns: three poses have 18 numbers.
     """
     if len(truth.stamps_ns) <= 3:
         return None
-    late = Trajectory(truth.stamps_ns - round(delay_s * 1e9), truth.T)
-    covered = _covered(estimate, late)
-    if len(covered.stamps_ns) <= 3:
+    covered = (estimate.stamps_ns >= truth.stamps_ns[0]) & (estimate.stamps_ns <= truth.stamps_ns[-1])
+    rows = np.flatnonzero(covered)
+    if len(rows) <= 3:
         return None
-    chosen = np.unique(np.linspace(0, len(covered.stamps_ns) - 1, MAX_POSES).astype(int))
-    return covered.T[chosen], _at(late, covered.stamps_ns[chosen])
+    chosen = rows[np.unique(np.linspace(0, len(rows) - 1, MAX_POSES).astype(int))]
+    return estimate.T[chosen], _at(truth, estimate.stamps_ns[chosen])
 
 
 def _at(trajectory: Trajectory, stamps_ns: NDArray[np.int64]) -> Array:
@@ -221,36 +185,6 @@ def _at(trajectory: Trajectory, stamps_ns: NDArray[np.int64]) -> Array:
     before, T = trajectory.stamps_ns[after - 1], trajectory.T[after - 1]
     part = (stamps_ns - before) / (trajectory.stamps_ns[after] - before)
     return np.asarray(T @ se3.exp(se3.log(se3.inverse(T) @ trajectory.T[after]) * part[:, None]))
-
-
-def _delay(estimate: Trajectory, truth: Trajectory) -> tuple[float, float]:
-    """Return how late the truth's stamps are [s], and how precisely: by the correlation of speeds and rates of turning.
-
-    Both are the same for every body fixed to the robot, but for the lever arm's part of the speed. The shorter one
-    may exceed the longer one by half of its length at both ends.
-    """
-    # 1. Rates at times that are a step apart, as dense as the sparser trajectory.
-    step_ns = max(int(np.ptp(one.stamps_ns)) // (len(one.T) - 1) for one in (estimate, truth))
-    ours, theirs = _rates(estimate, step_ns), _rates(truth, step_ns)
-    shorter, longer = sorted((ours, theirs), key=len)
-    # 2. Normalised correlation at each shift.
-    half = len(shorter) // 2
-    score = 0.0
-    for a, b in zip(longer.T, shorter.T, strict=True):
-        if a.std() and b.std():
-            padded = np.pad(a, half, mode="mean").astype(np.float32)
-            score = score + cv2.matchTemplate(padded[None], b.astype(np.float32)[None], cv2.TM_CCOEFF_NORMED)[0]
-    shift_ns = (int(np.argmax(score)) - half) * step_ns if np.any(score) else 0
-    begins_apart_ns = int(truth.stamps_ns[0] - estimate.stamps_ns[0])
-    return 1e-9 * (begins_apart_ns + (shift_ns if longer is theirs else -shift_ns)), 1e-9 * step_ns
-
-
-def _rates(trajectory: Trajectory, step_ns: int) -> Array:
-    """Return the rate of turning [rad/s] and the speed [m/s] (N, 2) at times a step apart."""
-    T = _at(trajectory, np.arange(trajectory.stamps_ns[0], trajectory.stamps_ns[-1] + 1, step_ns))
-    translation, rotation = np.split(se3.log(se3.inverse(T[:-1]) @ T[1:]), 2, axis=1)
-    rates = [np.linalg.norm(part, axis=1) / (1e-9 * step_ns) for part in (rotation, translation)]
-    return np.round(np.column_stack(rates), 6)  # so that rounding is no rate
 
 
 def _spread(T: Array) -> float:

@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.errors import FrameDecodeError
-from drivers.frame import MAX_PIXELS, MAX_SAMPLES, Frame, coding_steps, gray
+from drivers.frame import MAX_PIXELS, Frame, coding_steps, gray
 from drivers.jpeg import coding_sigma
 
 WIDTH, HEIGHT = 37, 23
@@ -210,7 +210,7 @@ def with_size(data: bytes, width: int, height: int, marker: bytes = b"\xff\xc0")
 def test_refuses_colour_images_whose_samples_would_fill_the_memory(suffix: str, encoding: str) -> None:
     """Decoders of progressive JPEG and interlaced PNG store all samples."""
     data, side = encoded(suffix), 5000
-    assert side * side < MAX_PIXELS and 3 * side * side > MAX_SAMPLES
+    assert side * side < MAX_PIXELS and 3 * side * side > MAX_PIXELS
     large = data[:16] + struct.pack(">II", side, side) + data[24:]
     if encoding == "jpeg":
         large = b"".join(with_size(data, side, side))

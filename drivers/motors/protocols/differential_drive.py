@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
 
-_SIZES = ("track_m", "wheel_radius_m", "max_wheel_mps", "gear", "pole_pairs")
-
 
 @dataclass(frozen=True, slots=True)
 class DifferentialDrive:
@@ -27,13 +25,6 @@ class DifferentialDrive:
     reverse_right: bool = False
     swapped: bool = False  # channel 1 is the right wheel
     can_id: int = 1  # of the controller of channel 2, where each motor has its own
-
-    def __post_init__(self) -> None:
-        """Raise DriverError for a size that is not finite and above 0."""
-        for name in _SIZES:
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise DriverError(f"motor drive: {name} is {value}; give a finite number above 0")
 
     @property
     def turns_per_m(self) -> float:

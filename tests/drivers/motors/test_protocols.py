@@ -107,13 +107,6 @@ def test_motion_inverts_the_wiring(wiring: tuple[bool, bool, bool]) -> None:
     assert drive.motion(*drive.channels(VelocityCommand(0, 0.3, 0.0, -0.7))) == pytest.approx((0.3, -0.7))
 
 
-@pytest.mark.parametrize("name", ["track_m", "wheel_radius_m", "max_wheel_mps", "gear", "pole_pairs"])
-@pytest.mark.parametrize("bad", [0, math.nan])
-def test_refuses_invalid_sizes(name: str, bad: float) -> None:
-    with pytest.raises(DriverError, match=name):
-        DifferentialDrive(**{name: bad})  # type: ignore[arg-type]
-
-
 def test_a_name_leads_to_a_protocol_of_omnid_or_of_an_installed_package(monkeypatch: pytest.MonkeyPatch) -> None:
     installed = EntryPoints(
         [

@@ -180,21 +180,18 @@ HAND, FLAT = drive(flat=False), drive(flat=True)
 
 
 @pytest.mark.parametrize(
-    ("poses", "truth", "late_ns", "said", "unknowns"),
+    ("poses", "truth", "said", "unknowns"),
     [
-        (HAND, HAND @ turned(88.6), 0, "another body than the rig, turned by 88.6 deg about z", 3),
-        (HAND, HAND @ CAMERA, 0, "turned by 120.0 deg about (0.58 -0.58 0.58), at x 0.10", 6),
-        (FLAT, FLAT @ turned(88.6), 0, "turned by 88.6 deg about z", 3),
-        (FLAT, FLAT @ turned(180, (0.4, 0, 0.7)), 0, "(the path does not show z)", 5),
-        (HAND, HAND, 350_000_000, "its stamps are 0.350 s later", 1),
-        (HAND, HAND @ turned(88.6), 40_000_000, "0.040 s later, it is of another body than the rig, turned", 4),
-        (HAND, HAND, 0, "", 0),
+        (HAND, HAND @ turned(88.6), "another body than the rig, turned by 88.6 deg about z", 3),
+        (HAND, HAND @ CAMERA, "turned by 120.0 deg about (0.58 -0.58 0.58), at x 0.10", 6),
+        (FLAT, FLAT @ turned(88.6), "turned by 88.6 deg about z", 3),
+        (FLAT, FLAT @ turned(180, (0.4, 0, 0.7)), "(the path does not show z)", 5),
+        (HAND, HAND, "", 0),
     ],
 )
 def test_says_what_explains_the_error_and_fits_it_where_asked(
     poses: Array,
     truth: Array,
-    late_ns: int,
     said: str,
     unknowns: int,
     tmp_path: Path,
@@ -202,7 +199,7 @@ def test_says_what_explains_the_error_and_fits_it_where_asked(
 ) -> None:
     est, true = tmp_path / "est.txt", tmp_path / "truth.txt"
     est.write_text("\n".join(tum_row(int(n), T) for T, n in zip(estimated(poses), STAMPS_NS, strict=True)))
-    true.write_text("\n".join(tum_row(int(n) + late_ns, T) for T, n in zip(truth, STAMPS_NS, strict=True)))
+    true.write_text("\n".join(tum_row(int(n), T) for T, n in zip(truth, STAMPS_NS, strict=True)))
     code = main(["eval", str(est), str(true)])
     shown = capsys.readouterr()
     assert code == 0
