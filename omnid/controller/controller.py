@@ -150,12 +150,9 @@ class Controller:
         state.measured = law.plausibility.account.detail
         state.obstacle = "" if law.reason else monitor.reason
         state.blocked = bool(state.obstacle) and monitor.holds
-        # 2. How often it began.
-        state.slowed += bool(state.slowed_by and not before.slowed_by)
-        state.obstacle_stops += state.blocked and not before.blocked
         if cuts_drive_short(before, state):
             state.stops[reason] += 1
-        # 3. What a person should know of it.
+        # 2. What a person should know of it.
         for line in transitions(before, state, law.plausibility.account):
             self._report(line)
 

@@ -24,7 +24,6 @@ from omnid.engine.realtime import RealtimeSettings, ThreadStart, prepare
 
 THREAD_NAME: Final = "controller"
 MOST_OVERDUE: Final = 500  # messages received while a tick is due already: more than can wait in the channel
-START_MESSAGE_S: Final = 10.0  # Time within which a daemon that is not broken sends its first message, at any load.
 ABORTING: Final = signal.SIGABRT  # systemd ends a daemon that does not respond by this, and all its processes
 
 
@@ -39,9 +38,7 @@ class ControllerLoop:
         """Run until the daemon sends no more and the wheels are at rest."""
         while not self._ended():
             self._receive_until_due()
-            report = self._controller.tick()
-            report.state.lost_reports = self._channel.lost
-            self._channel.send(report)
+            self._channel.send(self._controller.tick())
 
     def _ended(self) -> bool:
         return bool(self._until_ns) and (self._controller.is_at_rest or time.monotonic_ns() > self._until_ns)
@@ -80,7 +77,7 @@ def run_controller(channel: Channel) -> int:
     """Run as the daemon's first message says; return the exit code, 2 where it cannot start."""
     with ExitStack() as closing:
         closing.callback(channel.close)  # last of all, when the wheels are at rest
-        start: ControllerStart = channel.receive(START_MESSAGE_S)
+        start: ControllerStart = channel.receive(LONGEST_RAMP_S)
         try:
             driver = open_motor(start.motor, closing, waits=start.waits)
         except DriverError as error:

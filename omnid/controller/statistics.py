@@ -38,17 +38,14 @@ class ControllerState:
     fault: int = 0  # the motor controller's own number
     battery_v: float = math.nan  # voltage that the motor controller reports
     slowed_by: str = ""  # why the base drives slowly; empty: it need not
-    slowed: int = 0  # how often it began to
     measured: str = ""  # by how much the sensors of the motion differ; empty: they agree
     obstacle: str = ""  # why the collision monitor slows down or stops the base; empty: it does not
     blocked: bool = False  # it stops the base: the command leads to an obstacle
-    obstacle_stops: int = 0  # how often it began to
     sent: int = 0  # commands that were answered
     late: int = 0  # commands whose answer did not come in time; the wheels keep turning
     errors: int = 0  # commands that failed
     expiries: int = 0  # how often the motor controller had stopped the wheels by itself
     missed: int = 0  # ticks that were left out
-    lost_reports: int = 0  # reports of ticks that the daemon was too slow to take
     refused: Counter[str] = field(default_factory=Counter)  # commands, by reason
     stops: Counter[str] = field(default_factory=Counter)  # stops of wheels that turned, by reason
 

@@ -155,7 +155,7 @@ def wheel_stats(controller: ControllerStatistics, commands: CommandReceiver) -> 
     is_unwanted = slow or stop not in ("", IDLE, ASKED, COMMAND_STALE, STARTED)
     severity = "_error" if has_failed else "_warning" if is_unwanted else "_words"
     # 2. The numbers.
-    counts = ("sent", "late", Key.ERRORS, Key.EXPIRIES, "fault", "lost_reports", "slowed")
+    counts = ("sent", "late", Key.ERRORS, Key.EXPIRIES, "fault")
     arm = "send cmd/arm: `omnid arm`" if state.needs_request else ""
     return {
         **{key: getattr(state, key) for key in counts},
@@ -174,7 +174,6 @@ def wheel_stats(controller: ControllerStatistics, commands: CommandReceiver) -> 
         "arm_refusal": state.arm_answer.refusal,  # of the newest request to arm; empty: it was accepted
         Key.SOURCE: state.source,
         "obstacle": state.obstacle,  # why the collision monitor slows down or stops the base
-        "obstacle_stops": state.obstacle_stops,
         "problem": state.problem,  # why the motor controller took no command
         "measured": state.measured,  # of commands, wheels, gyro and images that differ
         "battery_v": state.battery_v,

@@ -25,7 +25,6 @@ STRAIGHT_M, RADIUS_M = 0.8, 0.7  # The oval that is taught: 6 m.
 ARC_STEPS: Final = 15
 ANSWER_S: Final = 0.5  # Time after a request before its end is awaited.
 RECOGNISED_S: Final = 5.0  # Within this time after the first drive the robot must have recognised the start.
-SHOWN_S: Final = 5.0  # Time between two lines of progress.
 PX_PER_M: Final = 90.0
 BORDER_M: Final = 0.25  # around the world
 LEGEND: Final = (  # colour (BGR) and width [px]
@@ -50,7 +49,7 @@ class TeachAndRepeat:
     def __init__(self, show: Callable[[str], None]) -> None:
         self._show = show
         self._taught = False
-        self._asked_s, self._driven_s, self._shown_s = 0.0, math.inf, 0.0
+        self._asked_s, self._driven_s = 0.0, math.inf
         self.repeated_s = math.inf  # when the repetition began
         self.end = ""  # in words
 
@@ -73,10 +72,7 @@ class TeachAndRepeat:
         yield PathRequest(NavigationFrame.ODOM, oval(), 0.0)
 
     def _continue(self, moment: Moment, place: PlaceUpdate, navigation: NavigationUpdate) -> Iterator[Request]:
-        """Show the progress; at the end of the oval repeat the route, and at that of the repetition end the run."""
-        if moment.time_s >= self._shown_s + SHOWN_S and math.isfinite(navigation.left_m):
-            self._shown_s = moment.time_s
-            self._show(f"{moment.time_s:5.1f} s: {navigation.left_m:.1f} m left")
+        """At the end of the oval repeat the route, and at that of the repetition end the run."""
         refusal = "" if navigation.answer is None else navigation.answer.refusal
         if refusal or (navigation.state.is_end and navigation.state is not NavigationState.REACHED):
             self.end = f"refused: {refusal}" if refusal else f"{navigation.state}: {navigation.reason}"
@@ -98,7 +94,7 @@ class TeachAndRepeat:
             yield "end"
 
     def _tell(self, moment: Moment, text: str) -> None:
-        self._asked_s = self._shown_s = moment.time_s
+        self._asked_s = moment.time_s
         self._show(f"{moment.time_s:5.1f} s: {text}")
 
 

@@ -12,7 +12,6 @@ import argparse
 import json
 import math
 import os
-import random
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
@@ -24,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.config import load_config
-from omnid.core.control.heading_controller import Setpoint, wrap_angle
+from omnid.core.control.heading_controller import Setpoint
 from omnid.core.navigation.requests import GoalRequest, NavigationFrame
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun
 from omnid.simulation.robot import SimulatedRobot
@@ -42,7 +41,6 @@ OWN_MPS: Final = 0.05  # A contact at a lower speed is not the robot's own.
 DRIVEN: Final = 0.95  # share of what was asked that counts as all
 STOPS_M: Final = (0.05, 0.8)  # before a hazard
 STANDS_M, STANDS_S, HAZARD_STANDS_S = 0.03, 12.0, 8.0  # a drive ends that moved by less than this in that time
-RANDOMLY_S: Final = 40.0  # of a drive at random
 TEXTURED: Final = "marbled"  # the floor whose time is the measure of the others
 USUAL_MPS: Final = 0.5
 SLOWEST_MPS: Final = 0.1  # A drive that is slower than this on average ends unfinished.
@@ -97,38 +95,6 @@ def ahead(moment: Moment) -> Iterator[Request]:
     yield Setpoint(USUAL_MPS, heading_rad=0.0)
 
 
-class Wanderer:
-    """Holds the stick in one direction for some seconds, then in another one; turns away where the base stands."""
-
-    SPEEDS_MPS: Final = (0.3, 0.5, 0.8, -0.4)
-    MOVED_M, MOVED_RAD, STANDS_S = 0.05, 0.1, 1.5  # of a base that does not stand
-    LEG_S: Final = (2.0, 5.0)
-    TURN_RAD: Final = math.radians(70.0)  # largest change of the heading from leg to leg
-
-    def __init__(self, seed: int) -> None:
-        self._rng = random.Random(seed)
-        self._until_s, self._setpoint = 0.0, Setpoint(0.5, heading_rad=0.0)
-        self._moved_s, self._at, self._heading_rad = 0.0, (0.0, 0.0), 0.0
-
-    def __call__(self, moment: Moment) -> Iterator[Request]:
-        """Yield the operator's requests at a moment."""
-        if moment.odometry is not None and not moment.controller.armed and moment.time_s < 2.0:
-            yield "arm"
-        T = moment.T_odom_base
-        at, heading_rad = (float(T[0, 3]), float(T[1, 3])), math.atan2(T[1, 0], T[0, 0])
-        turned_rad = abs(wrap_angle(heading_rad - self._heading_rad))
-        if math.dist(at, self._at) > self.MOVED_M or turned_rad > self.MOVED_RAD:
-            self._at, self._heading_rad, self._moved_s = at, heading_rad, moment.time_s
-        stands = moment.time_s - self._moved_s > self.STANDS_S
-        if moment.time_s >= self._until_s or stands:
-            # Where the base stands the way is closed: any direction may be free.
-            most_rad = math.pi if stands else self.TURN_RAD
-            heading_rad += self._rng.uniform(-most_rad, most_rad)
-            self._setpoint = Setpoint(self._rng.choice(self.SPEEDS_MPS), heading_rad=heading_rad)
-            self._until_s, self._moved_s = moment.time_s + self._rng.uniform(*self.LEG_S), moment.time_s
-        yield self._setpoint
-
-
 class Asker:
     """Arms, then asks for the way or for the goal; ends the drive there, or where the base stands."""
 
@@ -179,8 +145,7 @@ def prepared(planned: Planned) -> tuple[Trial, SimulatedRobot]:
 def settings_for(planned: Planned) -> list[str]:
     """Return the settings of a drive."""
     names = ("controller.limits.velocity_mps", "navigation.pursuit.velocity_mps")
-    speed_mps = 0.8 if planned.world.startswith("room_") else abs(planned.speed_mps)
-    settings = [f"{name}={speed_mps}" for name in names]
+    settings = [f"{name}={abs(planned.speed_mps)}" for name in names]
     return ["places.enabled=false", *settings, *planned.overrides]
 
 
@@ -189,12 +154,9 @@ def drive(planned: Planned) -> Drive:
     asked, robot = prepared(planned)
     asked_m = asked.way_m if asked.goal is None else math.hypot(*asked.goal[:2])
     asker = Asker(asked, planned)
-    script: Callable[[Moment], Iterator[Request]] = asker
     seconds = 5.0 + asked_m / min(SLOWEST_MPS, abs(planned.speed_mps))
-    if asked.motion == "at random":
-        script, seconds = Wanderer(planned.seed), RANDOMLY_S
     config = load_config(None, settings_for(planned))
-    run = simulate(asked.world, robot, script, seconds=seconds, seed=planned.seed, config=config)
+    run = simulate(asked.world, robot, asker, seconds=seconds, seed=planned.seed, config=config)
     began_s = 0.0 if math.isinf(asker.began_s) else asker.began_s
     return judged(run, asked, robot, asked_m, began_s)
 

@@ -69,7 +69,7 @@ class Trial:
 
     world: BuildingWorld
     things: tuple[Rectangle, ...] | None = None  # None: nothing is in the way
-    motion: Literal["ahead", "back", "turn left", "at random"] = "ahead"  # that is asked for
+    motion: Literal["ahead", "back", "turn left"] = "ahead"  # that is asked for
     changes: tuple[tuple[str, object], ...] = ()  # of fields of the robot
     way_m: float = 8.0  # that is asked for straight on
     goal: Pose | None = None  # x, y [m], heading [rad] in odom, which begins at the start
@@ -153,15 +153,6 @@ def _lift_gap(b: Builder) -> Trial:
     for a, c in pairwise(corners):
         b.wall(a, c, skirting=False, grey=150.0)
     return Trial(built(b), way_m=at_m + 1.0)
-
-
-def _door_step(b: Builder, height_cm: str) -> Trial:
-    """A sill across the way."""
-    corridor(b)
-    at_m, high_m = b.rng.uniform(1.8, 2.6), float(height_cm) / 100
-    b.thing([(0.0, 0.0, 0.0, 0.12, 1.9, high_m)], (at_m, 0.0), 0.0, plain_paint(b.rng, 150.0, 2.0), "floor")
-    profile = ((at_m - 0.06, 0.0), (at_m - 0.06, high_m), (at_m + 0.06, high_m), (at_m + 0.06, 0.0))
-    return Trial(built(b, ground=Ground(profile)))
 
 
 def _sun_moving(b: Builder) -> Trial:
@@ -295,7 +286,6 @@ MAKERS: Final[Makers] = {
     **{f"{name}_hall": (kind, partial(_floor, in_hall=True)) for name, kind in FLOORS.items()},
     r"ramp_(\d+)": (None, _ramp),
     "lift_gap": (None, _lift_gap),
-    r"door_step_(\d+)cm": (None, _door_step),
     "sun_moving": (None, _sun_moving),
     "light_switch": (None, lambda b: _lights(b, (6.0, 0.5), (13.0, 1.0))),
     "dark_and_on": (None, lambda b: _lights(b, (8.0, 0.004), (11.0, 1.0))),

@@ -18,7 +18,7 @@ from omnid.errors import OmnidError
 from omnid.simulation.rendering.shapes import Paint, Point, painted, solid
 from omnid.simulation.rendering.surfaces import Rectangle
 from omnid.simulation.robot import WheelErrors
-from omnid.simulation.world import Person, distances_m, moved
+from omnid.simulation.world import Person, moved
 from tests.simulation import harmless_worlds
 from tests.simulation.building_parts import (
     BEHIND_M,
@@ -30,7 +30,6 @@ from tests.simulation.building_parts import (
     four_legs,
     plain_paint,
     poster_paint,
-    put_thing,
     trolley,
 )
 from tests.simulation.disturbed import Ground, Push, Slip
@@ -332,7 +331,7 @@ def _crosses(b: Builder, how: str) -> Trial:
     return _people(b, *people)
 
 
-# Nearer than the view, and rooms full of things
+# Nearer than the view
 
 
 def _near(b: Builder, what: str, where: str) -> Trial:
@@ -351,46 +350,6 @@ def _near(b: Builder, what: str, where: str) -> Trial:
         b.faces += solid(at, (side_m, side_m, 0.6 if what == "box" else 1.8), angle, paint, is_raised=False)
     motion = {"ahead": "ahead", "behind": "back", "beside": "turn left"}[where]
     return replace(_hazard(b, first), motion=motion)  # type: ignore[arg-type]
-
-
-def _room(b: Builder, what: str) -> Trial:
-    """A room full of things at random places, which an operator drives through at random."""
-    x_m, y_m = b.rng.uniform(2.6, 4.0), b.rng.uniform(2.4, 3.5)
-    end_m = x_m + 1.5 * (what == "at_an_edge")
-    low, high = (-x_m, -y_m), (end_m, y_m)
-    b.floor(low, (x_m, y_m))
-    ground, edges = Ground(), np.zeros((0, 2, 2))
-    if what == "at_an_edge":
-        drop_m = float(b.rng.choice([0.08, 0.15, 0.3, 0.5]))
-        b.floor((x_m, -y_m), high, (-drop_m, -drop_m))
-        ground, edges = Ground(((x_m, 0.0), (x_m, -drop_m))), np.array([[[x_m, -y_m], [x_m, y_m]]])
-        for a, c in (((x_m, y_m), high), ((end_m, -y_m), (x_m, -y_m)), (high, (end_m, -y_m))):
-            b.upright(a, c, (-drop_m, 0.0), b.wall_grey)
-    b.ceiling(low, high)
-    b.room(low, high, doors=2, pictures=3, windows=2)
-    first, places = len(b.faces), [(0.0, 0.0)]
-    for _ in range(300):
-        at = float(b.rng.uniform(0.5 - x_m, x_m - 0.5)), float(b.rng.uniform(0.5 - y_m, y_m - 0.5))
-        if len(places) < 15 and math.hypot(*at) > 1.3 and all(math.dist(at, other) > 0.9 for other in places[1:]):
-            places.append(at)
-            if len(places) % 3:
-                put_thing(b, str(b.rng.choice(["box", "carton", "chair", "table", "bin"])), at)
-            else:
-                name = str(b.rng.choice(["low_box", "pole", "stool", "bar"]))
-                _put(b, name, plain_paint(b.rng, b.rng.uniform(50, 230)), at)
-    people: list[Person] = []
-    for _ in range(200):
-        path = tuple(
-            (float(b.rng.uniform(0.4 - x_m, x_m - 0.4)), float(b.rng.uniform(0.4 - y_m, y_m - 0.4))) for _ in "ab"
-        )
-        clear = (distances_m(np.array([path]), np.array(places[1:])) > 0.6).all()
-        if what == "with_people" and len(people) < 2 and clear and math.dist(*path) > 2.0:
-            speed_mps, start_s = b.rng.uniform(0.8, 1.6), b.rng.uniform(3.0, 6.0)
-            people.append(Person(b.adult(), path, speed_mps, "back and forth", start_s, waits_within_m=1.0))
-    world = built(
-        b, start=(0.0, 0.0, b.rng.uniform(-math.pi, math.pi)), people=tuple(people), ground=ground, edges=edges
-    )
-    return Trial(world, things=tuple(b.faces[first:]), motion="at random")
 
 
 def _robot(b: Builder, **changes: object) -> Trial:
@@ -429,7 +388,6 @@ MAKERS: Final[Makers] = {
     r"person_steps_in_at_(\d+)cm": (None, _steps_in),
     rf"person_crosses_({'|'.join(CROSSING)})": (None, _crosses),
     rf"near_({'|'.join(NEAR)})_(ahead|behind|beside)": (None, _near),
-    r"room_(of_things|with_people|at_an_edge)": (None, _room),
 }
 HARMLESS: Final = (*harmless_worlds.NAMES, *OF_ROBOT)
 HAZARDS: Final = (
@@ -441,5 +399,4 @@ HAZARDS: Final = (
     *("person_stops", "person_steps_back", "person_steps_in_at_80cm", "person_steps_in_at_150cm"),
     *(f"person_crosses_{how}" for how in CROSSING),
     *(f"near_{what}_{where}" for what in NEAR for where in ("ahead", "behind", "beside")),
-    *("room_of_things", "room_with_people", "room_at_an_edge"),
 )

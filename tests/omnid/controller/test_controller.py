@@ -208,7 +208,7 @@ def test_drives_slowly_where_the_pose_is_degraded(driving: Bench) -> None:
         speeds.append(driving.last.velocity_mps)
     assert speeds[10] == LIMITS.velocity_mps / 2 and speeds[-1] == pytest.approx(0.3)
     assert all(a - b <= LIMITS.deceleration_mps2 * PERIOD_S + 1e-6 for a, b in pairwise(speeds))
-    assert (driving.controller.state.slowed, driving.controller.state.slowed_by) == (1, "")
+    assert driving.controller.state.slowed_by == ""
     assert driving.lines == [] and not driving.controller.state.stops
 
 
@@ -332,11 +332,13 @@ def test_wheels_that_are_limited_by_their_driver_follow_the_commands(known: bool
     slow = DifferentialDrive(max_wheel_mps=0.1)
     bench = Bench(UNATTENDED, slow if known else None)
     bench.wheels.drive, bench.wheels.velocity_mps = slow, None
+    slowed = False
     for _ in range(200):
         bench.send_pose(velocity_mps=0.1, sigma_mps=0.01)
         bench.send_setpoint()
         bench.tick()
-    assert (not bench.controller.state.stops and not bench.controller.state.slowed) == known
+        slowed |= bool(bench.controller.state.slowed_by)
+    assert (not bench.controller.state.stops and not slowed) == known
 
 
 def test_counts_commands_and_stops_before_obstacles() -> None:
@@ -357,10 +359,10 @@ def test_counts_commands_and_stops_before_obstacles() -> None:
     state = drive(free, 20)
     assert state.sent == len(bench.wheels.commands) == 21 and not state.blocked and not state.obstacle
     slowed = drive(tuple(0.9 if 150 <= k < 210 else math.inf for k in range(360)), 3)
-    assert slowed.obstacle and not slowed.blocked and slowed.obstacle_stops == 0
-    for number in (1, 2):
+    assert slowed.obstacle and not slowed.blocked
+    for _ in range(2):
         stopped = drive(tuple(0.38 if 150 <= k < 210 else math.inf for k in range(360)), 10)
-        assert stopped.blocked and stopped.obstacle == BLOCKED and stopped.obstacle_stops == number
+        assert stopped.blocked and stopped.obstacle == BLOCKED
         assert not drive(free, 10).blocked
 
 

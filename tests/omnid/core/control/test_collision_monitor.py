@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import cmath
-import itertools
 import math
 import random
 from collections.abc import Sequence
@@ -526,53 +525,3 @@ def test_the_share_is_that_of_a_sweep_after_any_way_since_the_images() -> None:
     assert over > 3
     reduced = [share for share in shares if 0.0 < share < 1.0]
     assert len(reduced) > 15 and shares.count(0.0) > 15 and shares.count(1.0) > 15
-
-
-def any_unknown(rng: random.Random) -> tuple[tuple[bool, ...], list[int]]:
-    """Return which sectors are unknown, and those of them in runs of five and more, also across the seam behind."""
-    unknown = [False] * SECTORS
-    for _ in range(rng.randrange(1, 5)):
-        begin = rng.randrange(SECTORS)
-        for k in range(begin, begin + rng.randrange(2, 9)):
-            unknown[k % SECTORS] = True
-    known = [k for k in range(-SECTORS, 2 * SECTORS) if not unknown[k % SECTORS]]
-    runs = [range(low + 1, high) for low, high in itertools.pairwise(known) if high - low > 5]
-    return tuple(unknown), sorted({k % SECTORS for run in runs for k in run})
-
-
-def edge_m(box: Box, ray: complex) -> float:
-    """Return where a ray from the origin leaves a rectangle, by steps."""
-    return float(np.argmax(depth_m(box, np.arange(0.0, 1.0, 1e-4) * ray) >= 0.0)) * 1e-4
-
-
-@pytest.mark.parametrize("policy", ["stop", "slow"])
-def test_the_end_of_what_was_seen_counts_as_a_wall(policy: str) -> None:
-    rng, shares, turns = random.Random(2), list[float](), list[float]()
-    for _ in range(150):
-        settings = any_settings(rng, slow_mps=rng.uniform(0.05, 0.3), unknown=policy)
-        braking_mps2, motion = rng.uniform(0.05, 2.0), any_motion(rng)
-        unknown, counted = any_unknown(rng)
-        free_m = tuple(rng.uniform(0.0, 1.5) for _ in range(SECTORS))
-        rays = {k: cmath.rect(1.0, azimuth_rad(k)) for k in counted}
-        walls = [max(free_m[k], edge_m(outline_of(settings), ray)) * ray for k, ray in rays.items()]
-        if not is_clear(settings, motion, walls):
-            continue
-        monitor = CollisionMonitor(settings, braking_mps2)
-        # What is not unknown is open up to the longest range.
-        free_m = tuple(f if one else 6.0 for f, one in zip(free_m, unknown, strict=True))
-        monitor.set_scan(ControllerScan(S, tuple(math.nan if one else math.inf for one in unknown), free_m))
-        allowed = monitor.step(S, Twist(*motion))
-        found = (allowed.velocity_mps + allowed.yaw_rate_radps) / sum(motion)
-        edge_mps = abs(motion[0])
-        if motion[0] == 0.0:
-            # What may be at the outline already keeps no base from turning on the spot.
-            walls = [wall for wall in walls if depth_m(stop_box(settings, 0.0), wall) > 0.0]
-            edge_mps = abs(motion[1]) * math.hypot(max(settings.front_m, settings.rear_m), settings.half_width_m)
-            turns.append(found)
-        if not walls:
-            assert found == 1.0
-            continue
-        least = min(1.0, settings.slow_mps / edge_mps) if policy == "slow" else 0.0
-        shares.append(check(settings, braking_mps2, motion, walls, found, least))
-    assert sum(share < 1.0 for share in shares) > 8 and sum(share == 1.0 for share in shares) > 8
-    assert sum(turn < 1.0 for turn in turns) > 3 and turns.count(1.0) > 3
