@@ -27,7 +27,6 @@ from omnid.sinks.files import check_outputs, write_plan
 from omnid.stages.obstacles import ADVICE
 from omnid.utc import utc
 
-# Suffixes of `map show -o`, and the options of `map export` that write the same.
 MAP: Final = "map FILE.omap  a map of places"
 
 

@@ -186,12 +186,6 @@ def number(text: str) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def count(text: str) -> int | None:
-    """Return a value as a count; None for any other text."""
-    value = number(text)
-    return int(value) if value is not None and value >= 0 and value.is_integer() else None
-
-
 def tracking_state(message: str, values: Mapping[str, str]) -> TrackingState | None:
     """Return the tracking state in an entry of the odometry: its key `state`, else its message; None without one."""
     text = values.get(Key.STATE, message)
