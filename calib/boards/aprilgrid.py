@@ -107,8 +107,7 @@ class AprilGrid:
 def find_april_grid(image: Image, board: AprilGrid, name: str = "", *, thorough: bool = True) -> BoardView | None:
     """Find the visible corners of a grid in an image (H, W) uint8; None if there are too few.
 
-    The view's pixels are NaN for corners that are hidden; its confidence is the share of visible ones. thorough=False
-    reads the original image only.
+    The view's pixels are NaN for corners that are hidden. thorough=False reads the original image only.
     """
     corners = board.tag_corners / board.tag_m
     tags = _read_tags(image, corners, thorough=thorough)
@@ -124,7 +123,7 @@ def find_april_grid(image: Image, board: AprilGrid, name: str = "", *, thorough:
     spread = np.linalg.svd(points[seen] - points[seen].mean(axis=0), compute_uv=False)
     if spread[1] <= MIN_SPREAD * spread[0]:
         return None
-    return BoardView(name, pixels, float(seen.mean()))
+    return BoardView(name, pixels)
 
 
 def _read_tags(image: Image, on_board: Array, *, thorough: bool) -> Tags:

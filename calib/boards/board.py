@@ -78,13 +78,12 @@ class Board:
 class BoardView:
     """The corners of a board in one image: pixels (N, 2) in the order of Board.points, NaN for unknown corners.
 
-    confidence 0 to 1: share of accepted corners times the regularity of the grid. The board's x and y axes turn
-    clockwise in the image. The first square is dark where the board's sides (one even, one odd) determine it.
+    The board's x and y axes turn clockwise in the image. The first square is dark where the board's sides (one even,
+    one odd) determine it.
     """
 
     name: str
     pixels: Array
-    confidence: float = 1.0
 
 
 MIN_CORNERS = 6  # A homography needs four corners; with two more a wrong one has a large error.

@@ -68,7 +68,7 @@ def find_board(image: Image, board: Board, name: str = "", *, thorough: bool = T
             share = float(np.isfinite(corners[:, 0]).mean())
             # 3. Accept it by its score.
             if share >= MIN_FILLED and board_score(blurred, corners, board) >= MIN_SCORE:
-                return BoardView(name, corners, share)
+                return BoardView(name, corners)
     return None
 
 

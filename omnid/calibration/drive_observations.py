@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -113,7 +112,7 @@ def _drive(log: Path, place: Geometry, cameras: LogCameras, config: Config, most
     with closing(open_log(log, cameras, place.rig)) as reader:
         # So many pairs at least lie between two keyframes that there are not too many.
         apart = max(1, -(-(reader.pair_estimate() or 0) // most))
-        for before, update, after in _with_neighbours(tracked_updates(reader, front_end, config, log)):
+        for update in tracked_updates(reader, front_end, config, log):
             # 1. Choose the poses that are far enough apart to add information.
             T_odom_rig, since = update.T_odom_rig, since + 1
             if T_rig_odom:
@@ -126,10 +125,8 @@ def _drive(log: Path, place: Geometry, cameras: LogCameras, config: Config, most
             seen, disparity = update.depth.panoramas, front_end.dense.of(update.depth).disparity
             landmarks.add(View(seen.lower, seen.upper, seen.visible, disparity, T_odom_rig @ place.T_rig_rect))
             T_rig_odom.append(se3.inverse(T_odom_rig))
-            # 3. Its motion: the twist per second from the pose before to the one after, in the rig frame.
-            span_s = 1e-9 * (after.stamp_ns - before.stamp_ns)
-            step = se3.log(se3.inverse(before.T_odom_rig) @ after.T_odom_rig)
-            twists.append(step / span_s if span_s > 0 else np.zeros(6))
+            # 3. Its motion, by which exposures at other times are predicted.
+            twists.append(update.velocity)
             # Upper minus lower stamp; the rig's delay of the exposures is a parameter of its own.
             delays_s.append(seen.times.skew_s - place.rig.times.upper_delay_s)
     # 4. The observations in the images.
@@ -139,18 +136,6 @@ def _drive(log: Path, place: Geometry, cameras: LogCameras, config: Config, most
     observations, used = observations.only(np.asarray(np.isfinite(pixels).all(axis=1)))
     state = DriveState(np.array(T_rig_odom), found.points[used], np.array(twists), np.array(delays_s), np.zeros(0))
     return Drives(state, observations, (0,))
-
-
-def _with_neighbours(
-    updates: Iterator[OdometryUpdate],
-) -> Iterator[tuple[OdometryUpdate, OdometryUpdate, OdometryUpdate]]:
-    """Yield each pose between the one before and the one after, which are itself at the ends."""
-    before: OdometryUpdate | None = None
-    current: OdometryUpdate | None = None
-    for after in chain(updates, [None]):
-        if current is not None:
-            yield before or current, current, after or current
-        before, current = current, after
 
 
 def tracked_updates(reader: LogReader, front_end: FrontEnd, config: Config, log: Path) -> Iterator[OdometryUpdate]:

@@ -67,12 +67,9 @@ class RigCheckResult:
     def __str__(self) -> str:
         """Return the result as lines of text, the condition first."""
         finding = self.finding
-        by_azimuth = (f"{azimuth:+.0f}: {median:+.2f}" for azimuth, median, count in finding.by_azimuth if count)
         lines = [
             f"{self.state}: {self.pairs} pairs, {finding.matches} of {finding.tried} points found in both panoramas",
-            f"columns: median {finding.offset_px:+.3f} px, spread {finding.spread_px:.3f} px; by azimuth, degrees to "
-            "the left of forward:",
-            "  " + "  ".join(by_azimuth),
+            f"columns: median {finding.offset_px:+.3f} px, spread {finding.spread_px:.3f} px",
         ]
         if (drift := finding.drift) is not None:
             turn, turn_sigma = np.rad2deg(drift.turn), np.rad2deg(drift.turn_sigma)

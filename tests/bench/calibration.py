@@ -133,7 +133,7 @@ def projected_views(
         sides = []
         for mounted in (rig.lower, rig.upper):
             pixels = mounted.camera.project(se3.apply(mounted.T_cam_rig @ T, board.points))
-            sides.append(BoardView(f"{k:02d}", pixels + rng.normal(0, noise_px, pixels.shape), 1.0))
+            sides.append(BoardView(f"{k:02d}", pixels + rng.normal(0, noise_px, pixels.shape)))
         views.append(PairView(f"{k:02d}", (sides[0], sides[1])))
     return views
 

@@ -219,7 +219,6 @@ class RigFinding:
     exchanged_matches: int | None  # matches with the cameras exchanged; None: not tried
     offset_px: float  # median of upper minus lower columns
     spread_px: float  # 1.48 times the median absolute deviation
-    by_azimuth: tuple[tuple[float, float, int], ...]  # degrees, median offset [px] or NaN, matches
     left_px: float  # median residual of the sectors after the drift: no rotation of a camera explains it
     drift: RigDrift | None
 
@@ -289,18 +288,14 @@ def judge(found: Matches, cylinder: Cylinder, exchanged_matches: int | None = No
     if len(shifts) >= MIN_MATCHES:
         drift = estimate_rig_drift(cylinder.rays(found.lower), cylinder.rays(found.upper))
     # 3. What is left in each direction shows a camera whose intrinsics have changed.
-    residuals = _by_azimuth(found.lower, drift.residuals * cylinder.focal_px, cylinder) if drift else ()
-    offsets = [abs(median) for _, median, count in residuals if count >= MIN_IN_SECTOR]
+    offsets = _sector_offsets(found.lower, drift.residuals * cylinder.focal_px, cylinder) if drift else []
     left_px = float(np.median(offsets)) if offsets else float("nan")
-    by_azimuth = _by_azimuth(found.lower, shifts, cylinder)
-    return RigFinding(found, exchanged_matches, offset, spread, by_azimuth, left_px, drift)
+    return RigFinding(found, exchanged_matches, offset, spread, left_px, drift)
 
 
-def _by_azimuth(lower: Array, shifts: Array, cylinder: Cylinder) -> tuple[tuple[float, float, int], ...]:
-    """Return azimuth of the middle [deg], median offset [px], NaN without matches, and matches of each sector."""
+def _sector_offsets(lower: Array, shifts: Array, cylinder: Cylinder) -> list[float]:
+    """Return the size of the median shift [px] in each sector of azimuth with enough matches."""
     azimuth = cylinder.azimuth(lower[:, 0])
     sector = np.floor((azimuth + np.pi) / (2 * np.pi) * SECTORS).astype(int) % SECTORS
-    middle_deg = -180 + (np.arange(SECTORS) + 0.5) * 360 / SECTORS
     parts = [shifts[sector == k] for k in range(SECTORS)]
-    medians = [float(np.median(part)) if len(part) else float("nan") for part in parts]
-    return tuple(zip(middle_deg.tolist(), medians, map(len, parts), strict=True))
+    return [abs(float(np.median(part))) for part in parts if len(part) >= MIN_IN_SECTOR]

@@ -42,7 +42,7 @@ def calibrated(widest_deg: float) -> tuple[RigCalibration, Rig]:
             for T_cam_lower in (np.eye(4), se3.inverse(T_LOWER_UPPER))
         ]
         if all(np.isfinite(p).all() and (p > 2).all() and (p < np.array(SIZE) - 3).all() for p in pixels):
-            seen = [BoardView(str(len(views)), p + random.normal(0, NOISE_PX, p.shape), 1.0) for p in pixels]
+            seen = [BoardView(str(len(views)), p + random.normal(0, NOISE_PX, p.shape)) for p in pixels]
             views.append(PairView(str(len(views)), (seen[0], seen[1])))
     found = calibrate_boards(views, BOARD, [SIZE, SIZE], "direct")
     return found, rig_between(*found.cameras, se3.inverse(found.T_upper_lower))
