@@ -98,16 +98,6 @@ class DriveAdjustment:
         """The adjusted rig."""
         return self.parameters.at(self.state.steps)
 
-    @property
-    def sigmas(self) -> Array:
-        """Standard deviations (P,) of the steps."""
-        return np.asarray(np.sqrt(np.diag(self.covariance)))
-
-    @property
-    def seen(self) -> Flags:
-        """True (P,) for the parameters whose sigma the drive has reduced to less than half of that of the prior."""
-        return np.asarray(self.sigmas < np.sqrt(np.diag(np.linalg.inv(self.prior))) / 2)
-
     def structure(self, side: int) -> ResidualStructure:
         """Return the systematic part and the noise of the residuals in the lower (0) or in the upper (1) image."""
         problem = DriveProblem(self.parameters, self.observations, self.prior, np.zeros(1, int))

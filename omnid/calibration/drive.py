@@ -79,20 +79,8 @@ class DriveCalibration:
         )
 
     def lines(self) -> list[str]:
-        """Return the result as lines: errors before and after, change of lengths, each parameter with its sigma."""
-        adjustment, parameters = self.adjustment, self.adjustment.parameters
-        lines = [
-            str(self),
-            *(f"{side}: {structure}" for side, structure in zip(SIDES, self.structure, strict=True)),
-            f"{'parameter':<14}{'before':>14}{'after':>14}{'sigma':>11}",
-        ]
-        after = parameters.values + adjustment.state.steps * parameters.units
-        sigmas = adjustment.sigmas * parameters.units
-        rows = zip(parameters.names, parameters.values, after, sigmas, adjustment.seen.tolist(), strict=True)
-        for name, old, new, sigma, seen in rows:
-            unseen = "" if seen else "  the drive does not show it: it stays near its start"
-            lines.append(f"{name:<14}{old:>14.5f}{new:>14.5f}{sigma:>11.5f}{unseen}")
-        return lines
+        """Return the result as lines: errors before and after with the change of lengths, residuals of each camera."""
+        return [str(self), *(f"{side}: {structure}" for side, structure in zip(SIDES, self.structure, strict=True))]
 
     @property
     def is_better(self) -> bool:
@@ -241,8 +229,8 @@ def rescaled(rig: Rig, ratio: float) -> Rig:
     return replace(rig, upper=replace(rig.upper, T_cam_rig=se3.transform(R_upper_rig, -R_upper_rig @ viewpoint)))
 
 
-# Largest rotation of the upper camera, and of the baseline's direction, against a measured rig. A nominal rig does not
-# know how its cameras were mounted: its limit is three of its sigmas.
+# Largest rotation of the upper camera, and of the baseline's direction, against a rig with a covariance. Without one
+# the rig may be nominal: three sigmas of a mount.
 MAX_TURN_RAD = np.deg2rad(2.8)
 
 
@@ -253,11 +241,7 @@ def require_same_rig(parameters: RigParameters, steps: Array, *, tracked: bool =
     """
     change = (steps * parameters.units)[parameters.of_transform]
     turn, lean = float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:])) if tracked else 0.0
-    # A nominal rig was not measured: it has no covariance, and one camera exactly above the other without any rotation.
-    rig = parameters.rig
-    T = rig.upper.T_cam_rig @ se3.inverse(rig.lower.T_cam_rig)
-    is_straight = np.allclose(np.append(se3.R_of(T) - np.eye(3), se3.t_of(T)[:2]), 0)
-    limit = 3 * NOMINAL_TURN_RAD if rig.covariance is None and is_straight else MAX_TURN_RAD
+    limit = 3 * NOMINAL_TURN_RAD if parameters.rig.covariance is None else MAX_TURN_RAD
     away = np.abs(steps / parameters.nominal_sigmas)[: parameters.of_transform.start]
     worst = int(np.argmax(away))
     if max(turn, lean) > limit:

@@ -57,7 +57,7 @@ class CameraCoverage:
         """Return a text about what no board covers yet, for the person who holds the board."""
         counts = self.counts()
         hours = [int(hour) or HOURS for hour in np.flatnonzero(counts.sum(axis=0) == 0)]
-        found = [f"no board at {listed(sorted(hours))} o'clock"] if hours else []
+        found = [f"no board at {', '.join(map(str, sorted(hours)))} o'clock"] if hours else []
         rings = int((np.count_nonzero(counts, axis=1) >= HOURS // 2).sum())
         if rings < NEEDED_RINGS:
             found.append("one ring only: hold it nearer, farther, higher, lower")
@@ -77,17 +77,6 @@ def moved(a: BoardView | None, b: BoardView | None) -> float:
     distance = np.linalg.norm(a.pixels - b.pixels, axis=1)
     known = distance[np.isfinite(distance)]
     return float(known.mean()) if known.size else math.inf
-
-
-def listed(hours: Sequence[int]) -> str:
-    """Return "1 to 4, 9" for 1, 2, 3, 4, 9."""
-    groups: list[list[int]] = []
-    for hour in hours:
-        if groups and groups[-1][-1] == hour - 1:
-            groups[-1].append(hour)
-        else:
-            groups.append([hour])
-    return ", ".join(f"{group[0]} to {group[-1]}" if len(group) > 2 else ", ".join(map(str, group)) for group in groups)
 
 
 class PairOutcome(StrEnum):

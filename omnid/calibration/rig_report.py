@@ -18,7 +18,7 @@ from calib.models.camera import Array, OmniCamera, inside_image
 from calib.panorama import fit_cylinder, remap_tables
 from calib.rig import Rig
 from omnid.calibration.images import SIDES, PairedImages
-from omnid.calibration.live_boards import HOURS, hours_of, listed
+from omnid.calibration.live_boards import HOURS, hours_of
 from omnid.calibration.snapshot import GREEN, RED
 from omnid.report.page import figure, page, table
 
@@ -106,7 +106,7 @@ class AngleRow:
         elif len(self.uncovered) == self.visible:
             missing = "anywhere"
         else:
-            missing = f"{listed(self.uncovered)} o'clock"
+            missing = f"{', '.join(map(str, self.uncovered))} o'clock"
         rms = f"{self.rms_px:.3f}" if self.corners else ""
         return f"{self.low_deg} to {self.low_deg + BIN_DEG} deg", str(self.corners), rms, missing
 

@@ -84,7 +84,6 @@ def test_a_disturbed_rig_becomes_the_true_one(truth: Rig) -> None:
     assert np.median(rays_apart_deg(found.rig, truth)) < 0.01
     assert found.rig.baseline_m == pytest.approx(truth.baseline_m, rel=1e-9)
     assert found.sigma_px == pytest.approx(NOISE_PX, rel=0.15)
-    assert found.seen.all()
     assert observation_sigma(rig, found) > 3 * found.sigma_px
 
 
@@ -96,7 +95,7 @@ def test_sigmas_are_those_of_the_errors(truth: Rig) -> None:
         state, observations = drive(truth, seed)
         begin = replace(state, steps=np.zeros(len(parameters.names)))
         found = adjust_drive(parameters, begin, observations)
-        ratios.append(found.state.steps / found.sigmas)
+        ratios.append(found.state.steps / np.sqrt(np.diag(found.covariance)))
     assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 1.8
 
 

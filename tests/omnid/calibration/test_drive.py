@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from calib.fit.parameters import LINE_TIME, UPPER_DELAY, RigParameters
 from calib.fit.rig_from_drive import DriveAdjustment, DriveObservations, DriveState
 from calib.models.camera import Array
-from calib.rig import Rig
+from calib.rig import Rig, RigCovariance
 from omnid.calibration.drive import require_same_rig
 from omnid.errors import OmnidError
 from tests.simulation.rigs import make_rig, nominal_rig, with_real_mirrors
 
 MEASURED = make_rig(misaligned_deg=(0.6, -0.4, 0.5))
+MEASURED = replace(MEASURED, covariance=RigCovariance.of_matrix(("r_x",), np.eye(1) * 1e-8))
 
 
 def adjusted(rig: Rig, sigma: float = 0.01, **changes: float) -> DriveAdjustment:
