@@ -75,18 +75,6 @@ def test_follows_curves_within_5_cm_and_slows_down_in_them() -> None:
     assert max(speeds) > 0.3 and min(speeds) < 0.8 * max(speeds)
 
 
-def test_a_path_that_crosses_itself_is_driven_in_its_order() -> None:
-    a = np.linspace(0, 2 * math.pi, 160)
-    eight = np.column_stack([2 * np.sin(a), np.sin(2 * a)])
-    base = DrivenBase(Navigator(NavigationSettings()), 5, start=(0.0, 0.0, math.pi / 4))
-    base.navigator.start("path", NavigationFrame.ODOM, [drive_path(eight)], base.seen())
-    assert base.run(120).state is NavigationState.REACHED
-    xy = np.array([sample.pose[:2] for sample in base.samples])
-    assert xy[:, 0].max() > 1.8 and xy[:, 0].min() < -1.8
-    first_right = int(np.argmax(xy[:, 0] > 1.8))
-    assert not (xy[:first_right, 0] < -1.0).any()
-
-
 def test_drives_backwards_where_the_path_was_driven_so() -> None:
     points = [(0.0, 0.0), (2.0, 0.0), (1.0, 0.0)]
     path = drive_path(points, 0.0, backwards=[False, False, True])

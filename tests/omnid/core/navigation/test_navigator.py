@@ -143,15 +143,6 @@ def test_gives_up_without_progress() -> None:
     assert answer.state is NavigationState.FAILED and answer.reason == "no progress for 3 s: look at the robot"
 
 
-def test_a_new_goal_ends_the_stops_of_the_one_before() -> None:
-    base = driving()
-    base.navigator.cancel("by a request")
-    assert base.navigator.stopping
-    path = DrivePath((straight_leg(base.pose, (5.0, 0.0)),), 0.0)
-    base.navigator.start("goal", NavigationFrame.ODOM, [path], base.seen())
-    assert not base.navigator.stopping and base.navigator.state is NavigationState.DRIVING
-
-
 @pytest.mark.hazard("H30")
 def test_waits_while_the_operator_drives_and_fails_where_it_was_taken_far_away() -> None:
     base = driving()

@@ -106,17 +106,6 @@ def test_a_keyframe_of_another_map_does_not_count() -> None:
     assert route.fits(some), "an aged map is still the same"
 
 
-def test_reversed_faces_the_other_way_and_comes_back() -> None:
-    poses = way()
-    places = Map(poses)
-    route = taught(poses, places)
-    back = route.reversed()
-    np.testing.assert_allclose(back.poses[0, :2], route.poses[-1, :2])
-    assert math.cos(back.poses[0, 2] - route.poses[-1, 2]) == pytest.approx(-1.0)
-    places.move(bent)
-    np.testing.assert_allclose(back.in_map(places)[::-1, :2], route.in_map(places)[:, :2], atol=0.01)
-
-
 @pytest.mark.parametrize("start", [(0.0, 0.2, 0.0), (4.0, 2.0, 0.3), (0.3, -0.6, 2.0)])
 def test_is_repeated_from_anywhere_on_it(start: tuple[float, float, float]) -> None:
     poses = way()
@@ -177,18 +166,6 @@ def test_is_driven_back_and_there_again_and_in_rounds() -> None:
     assert len(rounds) == 3 and rounds[1] is rounds[2] and rounds[1].length_m == pytest.approx(4 * math.pi, abs=0.3)
 
 
-def test_in_a_way_there_and_back_the_heading_decides_where_it_begins() -> None:
-    there = np.column_stack([np.arange(0, 4, 0.02), np.zeros(200), np.zeros(200)])
-    back = np.column_stack([np.arange(4, 0, -0.02), np.full(200, 0.05), np.full(200, math.pi)])
-    poses = np.vstack([there, back])
-    route = taught(poses, Map(poses))
-    one, other = (
-        repeated_paths(route, Map(poses), np.array([2.0, 0.0, heading]), loops=1, reverse=False)[0].length_m
-        for heading in (0.0, math.pi)
-    )
-    assert one == pytest.approx(6.0, abs=0.3) and other == pytest.approx(2.0, abs=0.3)
-
-
 @pytest.mark.hazard("H29")
 def test_a_robot_that_is_not_near_is_refused() -> None:
     poses = way()
@@ -212,11 +189,6 @@ def test_a_single_place_is_no_path(points: list[tuple[float, float]]) -> None:
         drive_path(points)
 
 
-def test_each_section_keeps_its_own_speed_up_to_the_end() -> None:
-    (leg,) = drive_path([(0.0, 0.0), (1.0, 0.0), (2.0, 0.0)], speeds=[0.4, 0.3, 0.1]).legs
-    assert leg.speed[np.searchsorted(leg.s, (0.5, 1.5, 2.0 - 1e-9))].tolist() == [0.3, 0.1, 0.1]
-
-
 @pytest.mark.parametrize(("turn_deg", "legs"), [(35.0, 1), (-35.0, 1), (45.0, 2), (-45.0, 2), (180.0, 2)])
 def test_a_leg_ends_where_the_path_turns_by_more_than_40_degrees(turn_deg: float, legs: int) -> None:
     turn = math.radians(turn_deg)
@@ -228,14 +200,6 @@ def test_a_leg_ends_where_the_path_turns_by_more_than_40_degrees(turn_deg: float
         if legs == 2:
             np.testing.assert_allclose(path.legs[0].xy[-1], first)
             np.testing.assert_allclose(path.legs[1].xy[0], first)
-
-
-def test_a_leg_ends_where_the_base_changes_between_forwards_and_backwards() -> None:
-    points = [(0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (3.0, 0.0)]
-    legs = drive_path(points, backwards=[False, False, True, True]).legs
-    assert [(leg.backwards, leg.length_m) for leg in legs] == [(False, pytest.approx(1.0)), (True, pytest.approx(2.0))]
-    assert [leg.backwards for leg in drive_path(points, backwards=[True] * 4).legs] == [True]
-    assert [leg.backwards for leg in drive_path(points).legs] == [False]
 
 
 @pytest.mark.parametrize(
