@@ -35,10 +35,10 @@ TABLE = (
     ("replay {log} --rig {folder}/bare.toml", "images are 256x256"),
     ("replay {log} --rig {folder}/narrow.toml", "share no view between -50.0 and 40.0 degrees of elevation"),
     ("replay {log} --rig {folder}/huge.toml", "at most 67108864 in all"),
-    ("replay {log} --rig {folder}/camchain.yaml", "`omnid calibrate import {folder}/camchain.yaml -o rig.toml`"),
+    ("replay {log} --rig {folder}/camchain.yaml", "expected TOML"),
     ("replay {log} --rig {log}", "expected TOML in UTF-8"),
     ("replay {log} --rig {folder}/absent.toml", "`omnid calibrate import` or"),
-    ("calibrate import {rig} -o {folder}/x", "use it as it is, --rig {rig}"),
+    ("calibrate import {rig} -o {folder}/x", "expected two cameras (cam0, cam1) as Kalibr writes them"),
     # Outputs.
     ("replay {log} --rig {rig} --cloud /dev/null", "device"),
     ("replay {log} --tum {folder}/x --record {folder}/absent/x", "no folder"),
