@@ -37,31 +37,18 @@ _NAMES: Final = {
 EXPOSURE_UNIT_US: Final = 100  # unit of V4L2_CID_EXPOSURE_ABSOLUTE
 AUTOMATIC, MANUAL_EXPOSURE, APERTURE_PRIORITY = 0, 1, 3  # enum v4l2_exposure_auto_type
 _POWER_LINE: Final = {"off": 0, "50": 1, "60": 2, "auto": 3}  # enum v4l2_power_line_frequency
-_MAX_MENU: Final = 64
-_MENUS: Final = (v4l2.CONTROL_MENU, v4l2.CONTROL_INTEGER_MENU)
+_NUMERIC: Final = (v4l2.CONTROL_INTEGER, v4l2.CONTROL_BOOLEAN, v4l2.CONTROL_MENU, v4l2.CONTROL_INTEGER_MENU)
 _LOST: Final = (errno.ENODEV, errno.EBUSY)  # the camera is opened again, with its settings and its request
 
 
 @dataclass(frozen=True, slots=True)
 class CameraControl:
-    """One control of a device, with the values that it accepts."""
+    """One control of a device."""
 
     id: int
     name: str  # the driver's, as `v4l2-ctl --list-ctrls` writes it: gain, exposure_time_absolute
     range: ValueRange
-    menu: tuple[int, ...] = ()  # of a menu: the values that it offers
-
-    def accepts(self, value: int) -> bool:
-        """True if the control has this value."""
-        return value in self.menu if self.menu else self.range.nearest(value) == value
-
-    @property
-    def accepted(self) -> str:
-        """The values that it accepts, as text."""
-        if self.menu:
-            return ", ".join(map(str, self.menu))
-        steps = f" in steps of {self.range.step}" if self.range.step > 1 else ""
-        return f"{self.range.low} to {self.range.high}{steps}"
+    has_automatic: bool = False  # of the exposure: it offers AUTOMATIC, unlike USB cameras
 
 
 def list_controls(fd: int) -> dict[int, CameraControl]:
@@ -76,26 +63,24 @@ def list_controls(fd: int) -> dict[int, CameraControl]:
             return found
         if entry.id <= last:
             return found
-        last, menu = entry.id, list[int]()
-        numeric = entry.type in (v4l2.CONTROL_INTEGER, v4l2.CONTROL_BOOLEAN, *_MENUS)
+        last, has_automatic = entry.id, False
+        numeric = entry.type in _NUMERIC
         if not numeric or entry.flags & (v4l2.CONTROL_DISABLED | v4l2.CONTROL_READ_ONLY):
             continue
-        for index in range(max(0, entry.minimum), min(entry.maximum, _MAX_MENU) + 1) if entry.type in _MENUS else ():
-            with suppress(OSError):  # the driver rejects those that it does not offer
-                v4l2.call(fd, v4l2.QUERYMENU, v4l2.QueryMenu(id=entry.id, index=index))
-                menu.append(index)
+        if entry.id == AUTO_EXPOSURE:
+            with suppress(OSError):  # the driver rejects what it does not offer
+                v4l2.call(fd, v4l2.QUERYMENU, v4l2.QueryMenu(id=entry.id, index=AUTOMATIC))
+                has_automatic = True
         # As v4l2-ctl writes it: exposure_time_absolute for 'Exposure Time, Absolute'.
         name = re.sub(r"[^a-z0-9]+", "_", entry.name.decode("utf-8", "replace").lower()).strip("_")
-        found[last] = CameraControl(
-            last, name, ValueRange(entry.minimum, entry.maximum, max(1, entry.step)), tuple(menu)
-        )
+        values = ValueRange(entry.minimum, entry.maximum, max(1, entry.step))
+        found[last] = CameraControl(last, name, values, has_automatic)
 
 
 def plan_controls(settings: V4l2Settings, offered: Mapping[int, CameraControl]) -> list[tuple[CameraControl, int]]:
     """Return the controls to set with their values, automatic modes before the values that they govern.
 
-    A fixed value switches its automatic mode off. Raises DriverError for a control that the device does not offer, and
-    for a value that it does not accept.
+    A fixed value switches its automatic mode off. Raises DriverError for a control that the device does not offer.
     """
     # 1. Those of the settings, by id.
     wanted: list[tuple[int, int]] = []
@@ -104,7 +89,7 @@ def plan_controls(settings: V4l2Settings, offered: Mapping[int, CameraControl]) 
         # An exposure that a run regulates is automatic until the run sends its first value.
         if settings.auto_exposure == "on" or settings.is_regulated:
             control = offered.get(AUTO_EXPOSURE)
-            mode = APERTURE_PRIORITY if control and AUTOMATIC not in control.menu else AUTOMATIC  # USB cameras; others
+            mode = APERTURE_PRIORITY if control and not control.has_automatic else AUTOMATIC
         if AUTO_EXPOSURE in offered or not settings.is_regulated:
             wanted.append((AUTO_EXPOSURE, mode))
         wanted += [(EXPOSURE_MAY_SLOW, 0)] if EXPOSURE_MAY_SLOW in offered else []
@@ -125,9 +110,6 @@ def plan_controls(settings: V4l2Settings, offered: Mapping[int, CameraControl]) 
         if name.strip() not in by_name:
             raise DriverError(f"the device has no control '{name.strip()}'. {all_names}")
         plan.append((by_name[name.strip()], int(number)))
-    for control, value in plan:
-        if not control.accepts(value):
-            raise DriverError(f"control {control.name}: {value} was requested, it accepts {control.accepted}")
     return plan
 
 
@@ -140,8 +122,8 @@ def apply_controls(fd: int, plan: list[tuple[CameraControl, int]]) -> None:
             if error.errno in _LOST:
                 raise
             raise DriverError(
-                f"control {control.name}: the device refused {value} ({error.strerror}); "
-                f"it accepts {control.accepted}, and some only while their automatic mode is off"
+                f"control {control.name}: the device refused {value} ({error.strerror}); it accepts "
+                f"{control.range.low} to {control.range.high}, and some only while their automatic mode is off"
             ) from error
     for control, value in plan:
         found = _read(fd, control.id)

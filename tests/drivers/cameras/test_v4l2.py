@@ -277,19 +277,9 @@ def test_what_a_camera_lacks_is_needed_only_where_it_is_asked_for(camera: FakeCa
             plan(**fields)
 
 
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"gain": 300}, "gain: 300 was requested, it accepts 0 to 255 in steps of 5"),
-        ({"exposure_us": 40}, "exposure_time_absolute: 0 was requested, it accepts 3 to 2047"),
-        ({"controls": ("auto_exposure=2",)}, "it accepts 1, 3"),
-        ({"controls": ("sharpness=1",)}, "no control 'sharpness'. It has: contrast, gain_automatic"),
-    ],
-)
-def test_refuses_what_the_camera_does_not_accept(camera: FakeCamera, fields: dict[str, Any], message: str) -> None:
-    with pytest.raises(DriverError, match=message) as caught:
-        plan(**fields)
-    assert "\n" not in str(caught.value)
+def test_refuses_a_control_that_the_camera_does_not_have(camera: FakeCamera) -> None:
+    with pytest.raises(DriverError, match=r"no control 'sharpness'\. It has: contrast, gain_automatic"):
+        plan(controls=("sharpness=1",))
 
 
 def test_controls_are_set_in_order_and_read_back(camera: FakeCamera, monkeypatch: pytest.MonkeyPatch) -> None:
