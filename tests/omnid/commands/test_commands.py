@@ -1,0 +1,351 @@
+"""`omnid config`, `replay --json`, `run`, `log info`, `record`, `map show|export` and `goto` as commands."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import pty
+import re
+import signal
+import subprocess
+import sys
+from contextlib import closing
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from calib import se3
+from drivers.logs.log_reader import LogReader
+from omnid.cli import main
+from omnid.client import Robot
+from omnid.config import Config, load_config
+from omnid.errors import OmnidError
+from omnid.formats.place_file import write_places
+from omnid.formats.tum import read_tum
+from tests.drivers.logs.bags import write_folders
+from tests.drivers.logs.mcap_logs import BARE, LOWER, START_NS, Entry, pairs, text, write_log
+from tests.omnid.formats.place_maps import RIG, some_places
+from tests.omnid.transport.bus_fixtures import free_endpoint
+from tests.ply import read_ply
+from tests.ports import free_port
+from tests.replay.command import Command
+from tests.replay.live import started
+from tests.waiting import wait_until
+
+
+def test_a_minimal_file_has_what_a_robot_needs_and_changes_nothing(omnid: Command, tmp_path: Path) -> None:
+    file = tmp_path / "omnid.toml"
+    file.write_text(omnid("config", "--minimal").out)
+    assert load_config(file) == Config()
+    text = file.read_text()
+    assert "# lower = " in text and "[motor.drive]" in text and len(text.splitlines()) < 120
+    changed = omnid("config", "--minimal", "--set", "bus.robot=rover", "--set", "stereo.min_range_m=0.7").out
+    file.write_text(changed)
+    assert load_config(file) == load_config(None, ["bus.robot=rover", "stereo.min_range_m=0.7"])
+    assert '\nrobot = "rover"\n' in changed
+
+
+def test_a_profile_is_a_set_of_settings_and_gives_way_to_set(omnid: Command, tmp_path: Path) -> None:
+    file = tmp_path / "omnid.toml"
+    for words, scale in ((["--profile", "small"], 0.5), (["--set", "panorama.scale=0.7", "--profile", "small"], 0.7)):
+        file.write_text(omnid("config", "--minimal", *words).out)
+        config = load_config(file)
+        assert (config.panorama.scale, config.odometry.limits.features) == (scale, 250)
+
+
+def test_check_lists_what_differs(omnid: Command, tmp_path: Path) -> None:
+    file = tmp_path / "omnid.toml"
+    file.write_text("[bus]\nrobot = 'rover'\n")
+    assert omnid("config", "check", file).out == (
+        f"{file}: good; 1 settings differ from their defaults\nbus.robot = 'rover', default 'omnid'\n"
+    )
+    file.write_text("[bus]\nrobots = 'rover'\n")
+    assert "did you mean bus.robot?" in omnid.refused("config", "check", file)
+    file.write_text("[motor]\nprotocol = 'waveshare_json'\n")
+    assert "expected one of line, roboteq" in omnid.refused("config", "check", file)
+    assert "expected one of line, roboteq" in omnid.refused("motor", "test", "--motor", "simulated", "--config", file)
+    file.write_text("[bus]\nrobot = 'a/*'\n")
+    assert "bus.robot is 'a/*'" in omnid.refused("config", "check", file)
+
+
+FEW = 8  # pairs of a replay of 0.75 s
+
+
+def loaded(omnid: Command, *words: object, code: int = 0) -> Any:
+    done = omnid(*words, "--json")
+    assert done.code == code, done.err
+    return json.loads(done.out)
+
+
+def test_results_of_a_replay_as_json(omnid: Command, scene: Path, tmp_path: Path) -> None:
+    tum = tmp_path / "est.txt"
+    words = ("replay", scene / "log.mcap", "--rig", scene / "rig.toml", "--quiet", "--inline", "--seconds", 0.75)
+    first = loaded(omnid, *words, "--tum", tum)
+    assert first["counters"]["poses"] == FEW and first["counters"]["states"]["tracking"] == FEW
+    assert first["timings"]["odometry"]["n"] == FEW and first["signal"] == 0
+    assert 0 < first["elapsed_s"] < 600
+    metrics = loaded(omnid, "eval", tum, scene / "truth.txt")
+    assert metrics["pairs"] == FEW and 0 < metrics["ate_rmse_m"] < 0.05
+
+
+SAMPLE = Path(str(files("omnid.sample") / "log.mcap"))
+
+
+def test_says_that_it_is_ready_and_ends_with_a_summary(tmp_path: Path) -> None:
+    log, endpoint = tmp_path / "log.mcap", free_endpoint()
+    with SAMPLE.open("rb") as sample:
+        log.write_bytes(sample.read(450_000))
+    master, slave = pty.openpty()
+    command = [
+        sys.executable,
+        "-m",
+        "omnid",
+        "run",
+        "--log",
+        str(log),
+        "--once",
+        "--motor",
+        "simulated",
+        "--set",
+        f'bus.listen=["{endpoint}"]',
+    ]
+    with subprocess.Popen(command, stdout=slave, stderr=slave, stdin=subprocess.DEVNULL) as process:
+        os.close(slave)
+        shown = b""
+        while data := _read(master):
+            shown += data
+        assert process.wait() == 0
+    os.close(master)
+    text = shown.decode()
+    ready = f"omnid: ready: poses of 'omnid' at {endpoint} (`omnid listen`); the wheels turn after `omnid arm`"
+    assert ready in text and re.search(r"\x1b\[K\d+\.\d\d m .* poses/s, ", text)
+    last = re.findall(r"omnid: .*", text)[-1]  # numba resets colours behind it where colorama is installed
+    assert re.match(r"omnid: ended: \d+ poses, \d+\.\d\d m, 0 resets; tracking \d+", last)
+
+
+def _read(master: int) -> bytes:
+    try:
+        return os.read(master, 4096)
+    except OSError:  # the program has ended
+        return b""
+
+
+pytestmark = pytest.mark.usefixtures("default_signals")
+
+ROOT = Path(__file__).parents[3]
+RECORDS = """
+import os
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from drivers.cameras.log_camera import LogCamera, LogClock, LogImages
+from omnid.config import Config
+from omnid.runs.record import record
+
+log, rig, folder = map(Path, sys.argv[1:])
+config = Config()
+config = replace(config, record=replace(config.record, folder=str(folder), free_mb=0, file_mb=100))
+images = LogImages.load(log)
+clock = LogClock(time.monotonic_ns())
+
+class Camera(LogCamera):
+    def frames(self):
+        for frame in super().frames():
+            line = f"{frame.camera} {frame.stamp_ns + time.time_ns() - time.monotonic_ns()}\\n"
+            os.write(1, line.encode())  # one write, so that the lines of both threads do not mix
+            yield frame
+
+cameras = {name: Camera(images, name, clock, pace=3.0) for name in ("lower", "upper")}
+record(cameras, config, rig.read_text(), lambda *_: None)
+"""
+
+
+def recording(scene: Path, folder: Path) -> subprocess.Popen[str]:
+    """Start a program that records the scene at 30 images a second of each camera, and prints their stamps."""
+    command = [sys.executable, "-c", RECORDS, str(scene / "log.mcap"), str(scene / "rig.toml"), str(folder)]
+    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+
+
+def printed(process: subprocess.Popen[str], count: int) -> list[int]:
+    assert process.stdout is not None
+    return [int(process.stdout.readline().split()[1]) for _ in range(count)]
+
+
+def test_a_kill_costs_at_most_a_second_and_the_rest_is_read(tmp_path: Path, scene: Path, omnid: Command) -> None:
+    folder = tmp_path / "log"
+    with recording(scene, folder) as process:
+        stamps = printed(process, 150)  # 2.5 s
+        process.kill()
+        assert process.stdout is not None
+        stamps += [int(line.split()[1]) for line in process.stdout if line.endswith("\n")]
+    (part,) = folder.iterdir()
+    assert part.suffixes == [".mcap", ".part"]
+    assert omnid("log", "info", part).code == 1
+    with closing(LogReader(part)) as reader:
+        times = [frame.stamp_ns for frame in reader.frames()]
+    # The writer syncs once a second; on a busy computer the sync itself may take most of another one.
+    assert max(stamps) - max(times) < 2 * 10**9
+    shortly_before_ns = max(times) - 216_000_000  # the order of simultaneous images of both cameras is arbitrary
+    assert sum(stamp < shortly_before_ns for stamp in times) == sum(stamp < shortly_before_ns for stamp in stamps)
+    replayed = omnid.replay(part, "--inline")
+    assert replayed.code == 0, replayed.err
+    # Images whose partner was dropped on a busy machine, and those at which the log turns back: they come twice.
+    alone = sum(
+        replayed.count(f"{reason}_{camera}") for reason in ("unpaired", "repeated") for camera in ("lower", "upper")
+    )
+    assert 2 * replayed.count("pairs") + alone == len(times) and replayed.count("poses") == replayed.count("pairs") > 50
+
+
+def test_a_signal_leaves_a_whole_recording(tmp_path: Path, scene: Path) -> None:
+    folder = tmp_path / "log"
+    with recording(scene, folder) as process:
+        printed(process, 20)
+        process.send_signal(signal.SIGTERM)
+        rest = process.communicate(timeout=30)[0]
+    assert process.returncode == 0
+    (path,) = folder.iterdir()
+    with path.open("rb") as file:
+        count = sum(1 for _ in make_reader(file).iter_messages())
+    assert path.suffix == ".mcap" and count == 20 + rest.count("\n")
+
+
+def test_info_shows_the_content_of_a_log(omnid: Command, tmp_path: Path) -> None:
+    noise = [Entry("/chatter", "std_msgs/msg/String", text("hello"), START_NS)]
+    path = write_log(tmp_path / "log.mcap", [*pairs(11), *noise], [("rig.toml", bytes(2000))])
+    code, out, err = omnid("log", "info", path)
+    assert (code, err) == (0, "")
+    assert re.search(r"state +whole\n", out) and re.search(r"messages +23\n", out)
+    assert "2023-11-14T22:13:20.000Z to 2023-11-14T22:13:21.001Z, 1.001 s" in out
+    assert "rig.toml (2.0 kB)" in out
+    assert re.search(rf"{LOWER} +sensor_msgs/msg/CompressedImage +11 +10.00\n", out)
+    assert re.search(r"/chatter +std_msgs/msg/String +1 +-\n", out)
+
+
+def test_info_shows_the_rate_of_each_topic_over_its_own_time(omnid: Command, tmp_path: Path) -> None:
+    """The upper camera was started late. Images without stamps have the rate that is given."""
+    entries = [entry for n, entry in enumerate(pairs(40)) if entry.topic == LOWER or n > 60]
+    write_folders(tmp_path / "images", entries, names=lambda ns: f"{ns % 10**10:06d}")
+    for log, *options in ([write_log(tmp_path / "log.mcap", entries)], [tmp_path / "images", "--rate", "10"]):
+        code, out, err = omnid("log", "info", log, *options)
+        assert (code, err) == (0 if not options else 1, "")
+        assert re.findall(r"CompressedImage +(\d+) +(\S+)\n", out + "\n") == [("40", "10.00"), ("10", "10.00")]
+
+
+def test_info_shows_the_damage_and_advice(omnid: Command, tmp_path: Path) -> None:
+    path = write_log(tmp_path / "log.mcap", pairs(11), [("rig.toml", bytes(2000))])
+    bare = write_log(tmp_path / "bare.mcap", pairs(2), **BARE)
+    os.truncate(path, path.stat().st_size - 1)
+    code, out, _ = omnid("log", "info", bare, path)
+    assert code == 1 and f"cut or corrupt after byte {path.read_bytes().index(bytes([15, 4, 0, 0])) + 13}" in out
+    assert "rig.toml (2.0 kB)" in out
+    code, out, err = omnid("log", "info", tmp_path / "no.mcap", bare)
+    assert code == 2 and "No such file" in err and LOWER in out
+
+
+@pytest.fixture
+def omap(tmp_path: Path) -> Path:
+    """Write a map of 12 keyframes."""
+    write_places(tmp_path / "a.omap", some_places(12, features=20), RIG)
+    return tmp_path / "a.omap"
+
+
+def test_show_prints_the_sizes(omap: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["map", "show", str(omap)]) == 0
+    printed = capsys.readouterr().out
+    for line in (
+        "sessions     2",
+        "keyframes    12, with 240 features; 3 were dropped",
+        "loops        1",
+        "path         3.3 m",
+        "rig          0123abcd0123, baseline 0.2400 m, panoramas of 1304 x 378 px",
+    ):
+        assert line in printed
+
+
+def test_export_writes_the_files_and_names_them(omap: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    a = {end: omap.parent / f"a.{end}" for end in ("ply", "png", "yaml", "pgm")}
+    words = ["--ply", str(a["ply"]), "--plan", str(a["png"]), "--grid", str(a["yaml"]), "--cell", "0.1"]
+    assert main(["map", "export", str(omap), *words]) == 0
+    printed = capsys.readouterr().out
+    assert all(str(path) in printed for path in a.values())
+    assert len(read_ply(a["ply"]).xyz) > 50 and a["pgm"].read_bytes().startswith(b"P5\n")
+    assert "resolution: 0.1\n" in a["yaml"].read_text() and "image: a.pgm\n" in a["yaml"].read_text()
+    # The loop is a line of its own colour in the plan.
+    plan = cv2.imread(str(a["png"])).astype(int)
+    assert np.count_nonzero(plan[..., 0] > plan[..., 2] + 100) > 20
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["export", "{}"], "nothing to write"),
+        (["export", "{}", "--grid", "{}.png"], "expected a name that ends in .yaml"),
+        (["export", "{}", "--grid", "."], "--grid .: expected a file to write, found a folder"),
+        (["export", "{}", "--ply", "{}"], "expected a name that ends in .ply"),
+        (["show", "{}.none"], "cannot read the map"),
+    ],
+)
+def test_mistakes_are_one_line(omap: Path, words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    before = omap.read_bytes()
+    try:
+        code = main(["map", *(word.format(omap) for word in words)])
+    except SystemExit as ended:
+        code = int(str(ended.code))
+    error = capsys.readouterr().err
+    assert code == 2 and message in error and error.count("\n") == 1
+    assert omap.read_bytes() == before and [path.name for path in omap.parent.iterdir()] == ["a.omap"]
+
+
+GOAL = (0.6, 0.1, 45.0)  # m, m, deg
+NEAR_M, NEAR_DEG = 0.05, 2.0
+
+
+def takes_requests(port: int) -> bool:
+    try:
+        with Robot(connect=(f"tcp/127.0.0.1:{port}",)) as robot:
+            return "no pose yet" not in robot.driver().navigate("resume").text
+    except OmnidError:
+        return False
+
+
+@pytest.mark.slow
+def test_goals_in_odom_and_in_the_saved_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    port, truth = free_port(), tmp_path / "truth.tum"
+    connect = ["--connect", f"tcp/127.0.0.1:{port}"]
+    command = [
+        *(sys.executable, "-m", "omnid", "simulate", "room", "--no-people", "--size", "320"),
+        *("--truth", str(truth)),
+        *("--map", str(tmp_path / "site.omap")),
+        *("--set", f'bus.listen=["tcp/127.0.0.1:{port}"]'),
+        *("--set", "controller.collision.unknown=slow"),
+    ]  # such small images show little of the floor
+    goals: dict[str, list[tuple[str, ...]]] = {"odom": [("0.8", "0"), ("0", "0", "0")], "map": [tuple(map(str, GOAL))]}
+    for frame, poses in goals.items():
+        with started(command, port) as daemon:
+            wait_until(lambda: takes_requests(port), "the navigation")
+            if frame == "odom":
+                assert main(["goto", "1", "0", *connect]) == 2
+                assert "not armed" in capsys.readouterr().err
+                assert main(["arm", *connect]) == 0
+                assert main(["goto", "1", "0", "--frame", "map", *connect]) == 2
+                assert "not localised in a map" in capsys.readouterr().err
+            for pose in poses:
+                # A busy computer may stop the simulated motor controller for a moment, which disarms.
+                wait_until(
+                    lambda pose=pose: (
+                        main(["arm", *connect]) == 0 and main(["goto", *pose, "--frame", frame, *connect]) == 0  # noqa: B023
+                    ),
+                    "the goal",
+                )
+            assert "reached" in capsys.readouterr().out
+            assert daemon.end()[0] == 0
+    end = read_tum(truth).T[-1]
+    assert math.dist(end[:2, 3], GOAL[:2]) < NEAR_M
+    assert math.degrees(float(se3.yaw(end))) == pytest.approx(GOAL[2], abs=NEAR_DEG)
