@@ -56,11 +56,12 @@ def image_stamps(images: Mapping[Camera, LoggedImages], source: TimeSource = "au
     """
     # 1. What is wrong with the times of logging, and with the headers.
     log_fault = next(filter(None, (_fault(of_camera.log_ns) for of_camera in images.values())), "")
-    fault, is_auto = "", source == "auto"
+    fault, is_auto, apart_ns = "", source == "auto", 0
+    if not log_fault and all(map(_is_live, images.values())):
+        apart_ns = abs(_delay_ns(images["lower"]) - _delay_ns(images["upper"]))
     if is_auto:
         fault = next(filter(None, (_header_fault(images[camera], is_logged=not log_fault) for camera in CAMERAS)), "")
-        apart_ns = abs(_delay_ns(images["lower"]) - _delay_ns(images["upper"]))
-        if not (fault or log_fault) and all(map(_is_live, images.values())) and apart_ns > STEP_NS:
+        if apart_ns > STEP_NS and not fault:
             fault = f"are {apart_ns * 1e-9:.3f} s apart between the cameras"
         if fault and log_fault:
             raise DriverError(
@@ -80,13 +81,11 @@ def image_stamps(images: Mapping[Camera, LoggedImages], source: TimeSource = "au
             f"used the times of logging for {unset} images: the stamps of their headers {fault or 'are 0'}"
         )
     # 3. Cameras whose clocks differ by less, and pauses.
-    if by_header and not log_fault and all(map(_is_live, images.values())):
-        apart_ns = abs(_delay_ns(images["lower"]) - _delay_ns(images["upper"]))
-        if 2 * apart_ns >= min(map(_step_ns, stamps_ns.values())):
-            found.warnings.append(
-                f"the clocks of the cameras differ by {apart_ns * 1e-9:.3f} s, half a period or more: images of "
-                'different moments make pairs, which do not fit the rig; correct the clocks, or take log.time = "log"'
-            )
+    if by_header and apart_ns and 2 * apart_ns >= min(map(_step_ns, stamps_ns.values())):
+        found.warnings.append(
+            f"the clocks of the cameras differ by {apart_ns * 1e-9:.3f} s, half a period or more: images of different "
+            'moments make pairs, which do not fit the rig; correct the clocks, or take log.time = "log"'
+        )
     every = np.sort(np.concatenate([*stamps_ns.values()]))
     pauses_ns, longest_ns = np.diff(every), max(STEP_NS, _PAUSE * max(map(_step_ns, stamps_ns.values())))
     for at in np.flatnonzero(pauses_ns > longest_ns)[:1].tolist():

@@ -1,8 +1,7 @@
 """`omnid run` on a log whose cameras are made faulty by lines on the standard input.
 
 upper mute      no more images          lower garbage   JPEGs of noise        both black   dark ones
-lower cut       halves of JPEGs           both frozen     the same image again and again
-lower glitch    every fourth image is the one before      both ok         no fault
+both frozen     the same image again and again              both ok         no fault
 clock 3600      the system clock is that many seconds ahead
 """
 
@@ -37,7 +36,6 @@ class FaultyCamera(LogCamera):
         self._camera, self._faults = camera, faults
         first = gray((images.lower if camera == "lower" else images.upper)[0][1])
         self._size, self._dark = first.shape, np.random.default_rng(len(camera))
-        self._frames_since_repeated = 0
         self._last = b""  # image without a fault
         self._rng = random.Random(1)
 
@@ -52,17 +50,11 @@ class FaultyCamera(LogCamera):
         match fault:
             case "garbage":
                 return b"\xff\xd8\xff" + self._rng.randbytes(len(data)) + b"\xff\xd9"
-            case "cut":
-                return data[: len(data) // 2]
             case "black":
                 noise = self._dark.integers(0, 4, self._size, np.uint8)
                 return cv2.imencode(".jpg", noise)[1].tobytes()
             case "frozen":
                 return self._last
-            case "glitch":
-                self._frames_since_repeated = (self._frames_since_repeated + 1) % 4
-                if not self._frames_since_repeated:
-                    return self._last
         self._last = data
         return data
 

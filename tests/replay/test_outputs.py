@@ -38,7 +38,7 @@ from omnid.stages.geometry import geometry, with_rims
 from omnid.transport.codec import decode_diagnostics, decode_map, decode_pose
 from omnid.transport.status_names import ODOMETRY, SUMMARY, WHEELS, camera_name, stage_name
 from tests.conftest import PAIRS
-from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, STORE, UPPER, Entry, compressed, write_log
+from tests.drivers.logs.mcap_logs import COMPRESSED, STORE, Entry, compressed, write_log
 from tests.ply import read_ply
 from tests.replay.command import Command, rows
 from tests.replay.edited import images
@@ -152,20 +152,6 @@ def test_record_is_whole_with_rig_configuration_and_summary(omnid: Command, tmp_
     rig = parse_rig(attachments["rig.toml"])
     np.testing.assert_allclose(rig.upper.T_cam_rig, read_rig(scene / "rig.toml").upper.T_cam_rig, atol=1e-9)
     assert parse(Config, attachments["omnid.toml"], origin="attached").bus.robot == "rover"
-
-
-def test_uses_the_rig_that_is_attached_to_the_log(omnid: Command, tmp_path: Path, scene: Path) -> None:
-    """A log with an attached rig needs no --rig, as the sample."""
-    topics = {"lower": LOWER, "upper": UPPER}
-    entries = [
-        Entry(topics[p.camera], COMPRESSED, compressed(p.stamp_ns, p.jpeg), p.stamp_ns)
-        for p in images(scene / "log.mcap")
-    ]
-    log = write_log(tmp_path / "log.mcap", entries, [("rig.toml", (scene / "rig.toml").read_bytes())])
-    for name, source, rig in (("a", log, None), ("b", scene / "log.mcap", scene / "rig.toml")):
-        assert omnid.replay(source, "--tum", tmp_path / name, *FEW, rig=rig).code == 0
-    assert len(rows(tmp_path / "a")) == FEW_PAIRS
-    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
 def test_topics_by_option_or_by_the_rig(omnid: Command, tmp_path: Path, scene: Path) -> None:

@@ -17,7 +17,6 @@ import pytest
 
 from omnid.formats.tum import read_tum
 from tests.ports import free_port
-from tests.replay.command import Command
 from tests.replay.edited import images, save
 from tests.replay.live import Base, Operator, answers, command_line, patient, robot, started
 from tests.waiting import PATIENCE_S, wait_until
@@ -188,28 +187,3 @@ def test_waits_for_its_motor_and_cannot_be_armed_before_that_has_answered(tmp_pa
                 wait_until(lambda: base.line.base.velocity_mps > 0.2, "motion")
             code, err = daemon.end()
     assert code == 0 and 1 <= err.count("waiting for the motor") < 5 and "the motor controller answers" in err
-
-
-BAD = {
-    "no log": (["--log", "none.mcap"], "none.mcap"),
-    "no rig": (["--log", "{log}"], "no rig.toml is attached"),
-    "pace 0": (["--log", "{log}", "--rig", "{rig}", "--pace", "0"], "pace"),
-    "once without a log": (["--once"], "--log"),
-    "short watchdog": (
-        ["--log", "{log}", "--rig", "{rig}", "--motor", "/dev/nothing", "--set", "motor.watchdog_ms=100"],
-        "watchdog_ms",
-    ),
-    "no such protocol": (
-        ["--log", "{log}", "--rig", "{rig}", "--motor", "/dev/nothing", "--set", 'motor.protocol="can"'],
-        "protocol",
-    ),
-    "no such setting": (["--set", "controller.speed=1"], "controller.speed"),
-}
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_wrong_options_give_one_line(omnid: Command, scene: Path, case: str) -> None:
-    words, expected = BAD[case]
-    paths = {"log": scene / "log.mcap", "rig": scene / "rig.toml"}
-    listen = f'bus.listen=["tcp/127.0.0.1:{free_port()}"]'
-    assert expected in omnid.refused("run", *(word.format(**paths) for word in words), "--set", listen)

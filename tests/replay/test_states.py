@@ -13,22 +13,16 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-import omnid
 from calib import se3
-from calib.rig import ShutterTimes
 from calib.rig_file import read_rig
 from omnid.api import replay
 from omnid.formats.tum import Trajectory, read_tum
-from omnid.recordings.evaluation import Metrics, evaluate
-from omnid.tracking_state import TrackingState
 from omnid.transport.codec import Pose, decode_pose
 from omnid.transport.status_names import ODOMETRY
 from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import STORE
 from tests.replay.command import Command, rows
 from tests.replay.edited import Image, dark, images, save
-from tests.simulation import build, write_log
-from tests.simulation.logs import Readout
 from tests.simulation.photographs import Image as Pixels
 from tests.simulation.photographs import repeat_lines, roll, shift, tear, turn
 
@@ -139,41 +133,6 @@ def test_a_camera_whose_images_are_half_as_bright(omnid: Command, tmp_path: Path
     omnid.replay(log, "--record", tmp_path / "out.mcap", "--tum", tmp_path / "est", rig=scene / "rig.toml")
     assert states(tmp_path / "out.mcap") == [("tracking", 0)]
     assert errors_m(read_tum(tmp_path / "est"), read_tum(scene / "truth.txt")).max() < 0.02
-
-
-SEED, SIZE = 3, 512
-LINE_TIME_US = 40.0  # 20 ms for 512 rows
-
-
-def driven(folder: Path, readout: Readout) -> Metrics:
-    """Render the first metre of two_walls, and return the errors of a replay in which no pair was lost."""
-    run = build("two_walls", SEED, SIZE, 99)
-    write_log(
-        folder,
-        run.rig,
-        run.poses[:PAIRS],
-        run.scene,
-        sensor=run.sensor,
-        seed=SEED,
-        supersample=2,
-        readout=readout,
-    )
-    times = ShutterTimes(0.0, 1e-6 * readout.line_time_us[0])
-    result = omnid.replay(folder / "log.mcap", replace(read_rig(folder / "rig.toml"), times=times))
-    states = result.counters.states
-    assert result.counters.pairs == PAIRS and states[TrackingState.LOST] == 0
-    assert states[TrackingState.TRACKING] > 0.9 * PAIRS
-    return evaluate(Trajectory(result.stamps_ns, result.T_odom_rig), read_tum(folder / "truth.txt"))
-
-
-@pytest.mark.slow
-def test_the_motion_between_the_exposures_is_corrected(tmp_path: Path) -> None:
-    speed = 1.4  # 0.7 m/s
-    skew = driven(tmp_path / "skew", readout=Readout(speed, (15.0, 15.0)))
-    assert abs(skew.length_error_ratio) < 0.0015 and skew.ate_rmse_m < 0.002
-    rolling = Readout(speed, line_time_us=(LINE_TIME_US, LINE_TIME_US))
-    known = driven(tmp_path / "known", readout=rolling)
-    assert abs(known.length_error_ratio) < 0.0015 and known.ate_rmse_m < 0.002
 
 
 # Images that are whole, but torn, displaced, or with lines twice or missing: no pose of them is sure, a line says so
