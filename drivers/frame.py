@@ -20,7 +20,6 @@ Camera = Literal["lower", "upper"]
 CAMERAS: tuple[Camera, Camera] = ("lower", "upper")
 
 MAX_PIXELS = 64 * 2**20
-SAMPLE_BITS = (8, 10, 12, 16)  # bits of a camera that images of 16 bits a sample may hold
 _START_MARKER = {"jpeg": b"\xff\xd8\xff", "png": b"\x89PNG\r\n\x1a\n"}  # ITU T.81, B.1.1.3; PNG 1.2, 3.1
 _JPEG_CHANNELS = {"Gray": 1, "YCbCr": 3, "RGB": 3}
 # Some webcams write zeros before the end of image, which libjpeg reports as a fault. A zero after 0xFF is none of them.
@@ -61,7 +60,7 @@ class Frame:
     height: int = 0  # px
     step: int = 0  # bytes from row to row; 0: rows without padding
     bigendian: bool = False  # byte order of samples of 16 bits
-    bits: int = 16  # one of SAMPLE_BITS: of these, images of 16 bits a sample show the upper eight
+    bits: int = 16  # of the camera, 8, 10, 12 or 16: of these, images of 16 bits a sample show the upper eight
     bayer: str = ""  # encoding such as bayer_rggb8 of what was compressed: a jpeg or png of one channel is a pattern
 
 
@@ -102,14 +101,6 @@ def gray(frame: Frame) -> NDArray[np.uint8]:
 def coding_steps(frame: Frame) -> Steps:
     """Return the steps of a JPEG's quantisation, in zigzag order, () of another image."""
     return quantisation_steps(np.frombuffer(frame.data, np.uint8).data) if frame.encoding == "jpeg" else ()
-
-
-def is_deep(frame: Frame) -> bool:
-    """True if an image has 16 bits a sample, of which Frame.bits are those of the camera."""
-    if frame.encoding != "png":
-        return frame.encoding.endswith(_DEEP)
-    start = np.frombuffer(frame.data, np.uint8)[: _PNG_START.size].tobytes()
-    return bool(_PNG_START.unpack(start.ljust(_PNG_START.size))[-2] == int(_DEEP))
 
 
 def upper_eight_bits(samples: NDArray[Any], bits: int) -> NDArray[np.uint8]:
