@@ -15,8 +15,7 @@ from mcap.writer import CompressionType
 
 from omnid.calibration.images import read_pairs
 from tests.conftest import PAIRS
-from tests.drivers.logs.bags import write_bag, write_db3
-from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, UPPER, Entry, compressed, write_log
+from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, UPPER, Entry, compressed, write_bag, write_db3, write_log
 from tests.drivers.logs.test_formats import FORMATS
 from tests.replay.command import Command
 from tests.replay.edited import Image, images, save

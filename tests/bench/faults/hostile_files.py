@@ -35,8 +35,7 @@ from omnid.transport.codec import DiagnosticStatus, PoseAttachment, decode_diagn
 from tests.bench.faults.mutation import mutated
 from tests.bench.results import ResultTable, columns
 from tests.calib.test_importers import BOTH, NAMED, T_UPPER_LOWER, chain
-from tests.drivers.logs.bags import write_bag, write_db3
-from tests.drivers.logs.mcap_logs import pairs
+from tests.drivers.logs.mcap_logs import pairs, write_bag, write_db3
 from tests.omnid.formats.place_maps import RIG, some_places
 from tests.simulation import build, write_log
 

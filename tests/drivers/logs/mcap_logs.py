@@ -1,15 +1,25 @@
-"""Small logs for the tests, written with mcap and rosbags, not with the code under test."""
+"""Small logs in all formats for the tests, written with mcap and rosbags, not with the code under test."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import shutil
+import sqlite3
+import struct
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+import zstandard
 from mcap.writer import CompressionType, IndexType, Writer
+from mcap.writer import Writer as McapWriter
 from numpy.typing import NDArray
+from rosbags.convert.converter import migrate_bytes
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
 
 STORE: Any = get_typestore(Stores.ROS2_HUMBLE)
@@ -97,3 +107,109 @@ BARE: dict[str, Any] = {
     "use_statistics": False,
     "use_summary_offsets": False,
 }
+
+
+# Small logs in all other formats for the tests: bags of ROS 2 (SQLite) and ROS 1, written by rosbags, and folders
+
+
+ROS1: Any = get_typestore(Stores.ROS1_NOETIC)
+
+
+def write_db3(folder: Path, entries: Sequence[Entry], zstd: bool = False) -> Path:
+    writer = Ros2Writer(folder, version=9, storage_plugin=StoragePlugin.SQLITE3)
+    if zstd:
+        writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
+    with writer:
+        connections = {
+            topic: writer.add_connection(topic, kind, typestore=STORE)
+            for topic, kind in {entry.topic: entry.type for entry in entries}.items()
+        }
+        for entry in entries:
+            writer.write(connections[entry.topic], entry.log_time_ns, entry.data)
+    return next(folder.glob("*.db3"))
+
+
+def write_killed_db3(folder: Path, entries: Sequence[Entry]) -> Path:
+    """Write the file that a recorder leaves when it is killed: all messages are in its write-ahead log."""
+    whole, killed = write_db3(folder, entries), folder / "killed"
+    killed.mkdir()
+    with closing(sqlite3.connect(whole)) as bag:
+        rows = bag.execute("SELECT * FROM messages").fetchall()
+        bag.execute("DELETE FROM messages")
+        bag.commit()
+        bag.execute("VACUUM")
+        bag.execute("PRAGMA journal_mode = WAL")
+        bag.execute("PRAGMA wal_autocheckpoint = 0")
+        bag.executemany("INSERT INTO messages VALUES (?, ?, ?, ?)", rows)
+        bag.commit()
+        for suffix in ("", "-wal"):
+            shutil.copy(f"{whole}{suffix}", f"{killed / whole.name}{suffix}")
+    return killed / whole.name
+
+
+def ros1_bytes(entry: Entry) -> bytes:
+    migrated = migrate_bytes(STORE, ROS1, entry.type, entry.type, {}, entry.data, src_is2=True, dst_is2=False)
+    return bytes(migrated)
+
+
+def write_bag(path: Path, entries: Sequence[Entry], compression: str = "", chunk_bytes: int = 1 << 20) -> Path:
+    writer = Ros1Writer(path)
+    writer.chunk_threshold = chunk_bytes
+    if compression:
+        writer.set_compression(Ros1Writer.CompressionFormat[compression])
+    with writer:
+        connections = {
+            topic: writer.add_connection(topic, kind, typestore=ROS1)
+            for topic, kind in {entry.topic: entry.type for entry in entries}.items()
+        }
+        for entry in entries:
+            writer.write(connections[entry.topic], entry.log_time_ns, ros1_bytes(entry))
+    return path
+
+
+def write_interrupted_db3(folder: Path, entries: Sequence[Entry]) -> Path:
+    """Write the file of a recorder that was killed within a transaction, which its journal undoes."""
+    whole, killed = write_db3(folder, entries), folder / "killed"
+    killed.mkdir()
+    with closing(sqlite3.connect(whole)) as bag:
+        bag.execute("PRAGMA cache_size = 1")
+        bag.execute("BEGIN")
+        bag.execute("UPDATE messages SET data = zeroblob(9)")
+        for suffix in ("", "-journal"):
+            shutil.copy(f"{whole}{suffix}", f"{killed / whole.name}{suffix}")
+        bag.rollback()
+    return killed / whole.name
+
+
+def write_ros1_mcap(path: Path, entries: Sequence[Entry]) -> Path:
+    """Write an MCAP file as it is converted from a bag of ROS 1, with one message of an IMU."""
+    with path.open("wb") as file:
+        writer = McapWriter(file)
+        writer.start("ros1", "test")
+        schema = writer.register_schema("sensor_msgs/CompressedImage", "ros1msg", b"")
+        imu = writer.register_channel("/imu", "ros1", writer.register_schema("sensor_msgs/Imu", "ros1msg", b""))
+        channels = {topic: writer.register_channel(topic, "ros1", schema) for topic in {e.topic for e in entries}}
+        for entry in entries:
+            writer.add_message(channels[entry.topic], entry.log_time_ns, ros1_bytes(entry), entry.log_time_ns)
+        rates = struct.pack("<IIII37d", 1, 100, 0, 0, *[0.0] * 13, 0.1, 0.2, 0.3, *[0.0] * 21)
+        writer.add_message(imu, entries[0].log_time_ns, rates, entries[0].log_time_ns)
+        writer.finish()  # type: ignore[no-untyped-call]
+    return path
+
+
+def write_zstd_mcap(path: Path, entries: Sequence[Entry]) -> Path:
+    """Write an MCAP file as `ros2 bag record -s mcap --compression-mode message` does: each message is compressed."""
+    compressed = [entry._replace(data=zstandard.compress(entry.data)) for entry in entries]
+    return write_log(path, compressed, chunk_size=700)
+
+
+def write_folders(top: Path, entries: Sequence[Entry], names: Callable[[int], str] = str, suffix: str = ".jpg") -> Path:
+    """Write a folder of images for each camera; names: file names of log times."""
+    for entry in entries:
+        folder = top / ("lower" if entry.topic == LOWER else "upper")
+        folder.mkdir(parents=True, exist_ok=True)
+        data = STORE.deserialize_cdr(entry.data, entry.type).data
+        if suffix != ".jpg":
+            data = cv2.imencode(suffix, cv2.imdecode(data, cv2.IMREAD_GRAYSCALE))[1]
+        (folder / f"{names(entry.log_time_ns)}{suffix}").write_bytes(data.tobytes())
+    return top

@@ -28,8 +28,7 @@ from omnid.config import Config, load_config
 from omnid.errors import OmnidError
 from omnid.formats.place_file import write_places
 from omnid.formats.tum import read_tum
-from tests.drivers.logs.bags import write_folders
-from tests.drivers.logs.mcap_logs import BARE, LOWER, START_NS, Entry, pairs, text, write_log
+from tests.drivers.logs.mcap_logs import BARE, LOWER, START_NS, Entry, pairs, text, write_folders, write_log
 from tests.omnid.formats.place_maps import RIG, some_places
 from tests.omnid.transport.bus_fixtures import free_endpoint
 from tests.ply import read_ply
