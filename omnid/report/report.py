@@ -274,7 +274,8 @@ def _sections(run: RecordedRun, truth: _Truth | None) -> Iterator[tuple[str, lis
         ]
         yield "In the map", [*_counters(run, PLACES), grid(figures)]
     # 5. Rates, latencies, the stages' times; counters of the other parts at the end.
-    yield "Times and losses", _timing(run)
+    if any(timing := _timing(run)):
+        yield "Times and losses", timing
     names = [name for name in run.newest if name not in (ODOMETRY, SUMMARY) and not name.startswith(STAGE_PREFIX)]
     if names:
         rows = [
