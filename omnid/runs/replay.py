@@ -28,7 +28,7 @@ from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Sink
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.realtime import RealtimeSettings
 from omnid.engine.telemetry import Telemetry
-from omnid.engine.threads import sleep_until
+from omnid.engine.threads import POLL_S, sleep_until
 from omnid.errors import OmnidError
 from omnid.formats.exports import write_ply
 from omnid.formats.plan import drawn_heights
@@ -52,7 +52,6 @@ from omnid.transport.status_names import MOTION, SUMMARY, entry, stage_name
 Array = NDArray[np.float64]
 Topics: TypeAlias = tuple[str | None, str | None]  # of the lower and the upper camera
 UNPRIVILEGED: Final = RealtimeSettings(lock_memory=False, motor_priority=0)  # of the controller process of a replay
-PROGRESS_S: Final = 0.2  # between two calls that show the progress
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +73,7 @@ class ReplayOptions:
     paced: bool = False  # at the pace of the log's stamps, unless the computer is slower; False: as fast as possible
     drops: bool = False  # a late stage drops messages, as on the robot; False: the stages before it wait
     settings: Path | None = None  # file of the configuration, so that no output overwrites it
-    # Called each PROGRESS_S and at the end, with statistics, expected pairs, and whether the run has ended.
+    # Called ten times a second and at the end, with statistics, expected pairs, and whether the run has ended.
     progress: Callable[[RunStatistics, int | None, bool], object] | None = None
     observer: Callable[[FrontEnd, Telemetry], Sink[Outgoing]] | None = None  # of all messages; excludes record
     map_every_s: float = 0.0  # between two maps, by the stamps; 0: one, at the end
@@ -129,7 +128,7 @@ class _Replay:
             self._stages = wire(config, inputs, front_end, graph, sinks)
             if options.progress is not None:
                 show = partial(options.progress, session.statistics, reader.pair_estimate())
-                graph.ticker("progress", PROGRESS_S, partial(show, False))
+                graph.ticker("progress", POLL_S, partial(show, False))
                 outputs.callback(show, True)
             # 3. The run.
             self._begun_s = time.monotonic()

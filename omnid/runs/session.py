@@ -35,8 +35,7 @@ from omnid.sinks.encoder import Encoder, UnixTime
 from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.transport.bus import Bus
 
-BUS_END_S: Final = 3.0
-ROUTER_S: Final = 2.0  # Time between two attempts of a client to reach its router for the first time.
+BUS_S: Final = 3.0  # Time between two attempts to reach a router for the first time, and until a bus must be closed.
 CLOUD_POINTS: Final = 50_000  # Most points of the map, the most confident ones, in one message.
 
 
@@ -123,13 +122,13 @@ class Session:
         bus.serve("config", dump(self.config))
         bus.serve("rig", rig_toml(rig))
         if bus.needs_router:
-            self.graph.ticker("router", ROUTER_S, bus.connect)
+            self.graph.ticker("router", BUS_S, bus.connect)
         return bus
 
     def _close_bus(self, bus: Bus) -> None:
         """Close the bus. zenoh waits for subscribers that do not read, for 10 s and more; a service has less time."""
-        if not started(bus.close, "bus-close")(BUS_END_S):
-            self.warn(f"the bus has not closed within {BUS_END_S:g} s, for a subscriber does not read: it is given up")
+        if not started(bus.close, "bus-close")(BUS_S):
+            self.warn(f"the bus has not closed within {BUS_S:g} s, for a subscriber does not read: it is given up")
 
     def start_controller(self, realtime: RealtimeSettings, *, of_replay: bool = False) -> ControllerLink:
         """Start the controller process; DriverError where its settings cannot be used.

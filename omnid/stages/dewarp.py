@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -35,7 +34,13 @@ class Dewarp:
         self._pad_px = config.pad_px
         rig, cylinder = geometry.rig, geometry.cylinder
         self._sector, self._scale = (cylinder.turn_px, cylinder.first), cylinder.scale
-        self._lower, self._upper, self._blur_px, self._visible = _tables(geometry, config)
+        self._lower, self._upper = (remap_tables(rig, one, cylinder, config.pad_px) for one in (rig.lower, rig.upper))
+        self._blur_px = _blur_px((self._lower, self._upper))
+        both = visible(rig.lower, self._lower, config.rim_margin_px)
+        both &= visible(rig.upper, self._upper, config.rim_margin_px)
+        self._visible = np.ascontiguousarray(_inner(both, config.margin_px)[:, config.pad_px : -config.pad_px])
+        if not self._visible.any():
+            raise OmnidError("the cameras share no part of the panorama: check the rig's transforms and masks")
         self._tiles = TileMonitor(self._visible, tile_columns(cylinder))
         self.upper_delay_s, line_s = rig.times.upper_delay_s, rig.times.line_time_s
         inner = slice(config.pad_px, -config.pad_px)
@@ -45,8 +50,6 @@ class Dewarp:
             RawImage(upper[0], upper[1], rig.upper.camera.size),
         )
         self._rows_s = [maps[1][:, inner] * np.float32(line_s) for maps in (self._lower, self._upper) if line_s]
-        if not self._visible.any():
-            raise OmnidError("the cameras share no part of the panorama: check the rig's transforms and masks")
 
     def process(self, pair: FramePair) -> Panoramas:
         """Return the panoramas of a pair."""
@@ -98,25 +101,6 @@ class Dewarp:
         noise_grey = gain * self._noise_grey[camera]
         image, of_turn = brightened(remapped, gain), (*self._sector, steps, self._scale)
         return PaddedPanorama(image, self._pad_px, noise_grey, gain, *of_turn)
-
-
-class _Tables(NamedTuple):
-    """The part of dewarping that follows from the geometry; the arrays are read-only."""
-
-    lower: Maps
-    upper: Maps
-    blur_px: float
-    visible: NDArray[np.bool_]  # (H, W) of both cameras
-
-
-def _tables(geometry: Geometry, config: PanoramaConfig) -> _Tables:
-    """Return the tables of a geometry."""
-    rig, cylinder = geometry.rig, geometry.cylinder
-    lower, upper = (remap_tables(rig, mounted, cylinder, config.pad_px) for mounted in (rig.lower, rig.upper))
-    both = visible(rig.lower, lower, config.rim_margin_px)
-    both &= visible(rig.upper, upper, config.rim_margin_px)
-    shared = np.ascontiguousarray(_inner(both, config.margin_px)[:, config.pad_px : -config.pad_px])
-    return _Tables(lower, upper, _blur_px((lower, upper)), shared)
 
 
 def _blur_px(tables: tuple[Maps, ...]) -> float:
