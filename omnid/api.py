@@ -182,21 +182,16 @@ class Odometry:
     def _checked(self, name: Camera, image: InputImage) -> GreyImage:
         """Return the image, contiguous; OmnidError where it is not one of this camera."""
         width, height = self._cameras[name].size
-        expected = f"{name} image: expected a grey image ({height}, {width}) uint8 as the rig's"
-        if not isinstance(image, np.ndarray):
-            found = "nothing: could the file be read?" if image is None else type(image).__name__
-            raise OmnidError(f"{expected}, found {found}")
-        if image.shape != (height, width) or image.dtype != np.uint8:
-            advice = ": convert colour images with cv2.COLOR_BGR2GRAY" if image.ndim > 2 else ""
-            raise OmnidError(f"{expected}, found {image.shape} {image.dtype}{advice}")
-        return np.ascontiguousarray(image)
+        found = type(image).__name__
+        if isinstance(image, np.ndarray):
+            if image.shape == (height, width) and image.dtype == np.uint8:
+                return np.ascontiguousarray(image)
+            found = f"{image.shape} {image.dtype}"
+        raise OmnidError(f"{name} image: expected a grey one ({height}, {width}) uint8 as the rig's, found {found}")
 
     def _frames(self, pairs: Iterable[tuple[InputImage, InputImage]]) -> Iterator[Frame]:
-        names: tuple[Camera, Camera] = ("lower", "upper")
         for seq, pair in enumerate(pairs):
-            if isinstance(pair, np.ndarray) or len(pair) != len(names):
-                raise OmnidError("mask_images: expected pairs (lower, upper) of images, found something else")
-            for name, image in zip(names, pair, strict=True):
+            for name, image in zip(CAMERAS, pair, strict=True):
                 grey = self._checked(name, image)
                 yield Frame(seq, seq, name, "mono8", grey, width=grey.shape[1], height=grey.shape[0])
 

@@ -155,9 +155,9 @@ def test_wrong_images_and_stamps_are_refused_and_change_nothing(scene: Path, pai
     odometry, whole = omnid.Odometry(scene / "rig.toml"), omnid.Odometry(scene / "rig.toml")
     first_ns, lower, upper = pairs[0]
     wrong = {
-        "found nothing": (first_ns, None, upper),
+        "found NoneType": (first_ns, None, upper),
         "found list": (first_ns, lower, upper.tolist()),
-        r"found \(256, 256, 3\) uint8: convert": (first_ns, cv2.cvtColor(lower, cv2.COLOR_GRAY2BGR), upper),
+        r"found \(256, 256, 3\) uint8": (first_ns, cv2.cvtColor(lower, cv2.COLOR_GRAY2BGR), upper),
         r"lower image.*found \(255, 256\)": (first_ns, lower[1:], upper),
         r"upper image.*found \(256, 256\) float64": (first_ns, lower, upper.astype(float)),
         "expected an integer": (first_ns * 1e-9, lower, upper),
