@@ -8,7 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -156,8 +156,8 @@ def input_warnings(pairing: Synchronise, rig: RigHealth, statistics: RunStatisti
     for camera in CAMERAS:
         if (repeated := stats[f"repeated_{camera}"]) >= FROZEN_IMAGES:
             yield (
-                f"the {camera} camera was frozen: {repeated} of its images had all pixels as before; "
-                f"{REPEATED[config.pair.repeated_images]}"
+                f"the {camera} camera was frozen: {repeated} of its images had all pixels as before; pairs of such "
+                "images are left out, unless pair.repeated_images = 'use', as for a simulator without noise"
             )
     # 2. The rig, the light, dead parts of images.
     if rig.warning:
@@ -180,9 +180,3 @@ def input_warnings(pairing: Synchronise, rig: RigHealth, statistics: RunStatisti
             "cameras, is --lower the lower one, are the images bright and sharp, is the robot slower than "
             f"odometry.limits.max_speed_mps = {config.odometry.limits.max_speed_mps:g}?"
         )
-
-
-REPEATED: Final = {
-    "drop": "their pairs were left out; a simulator without noise needs pair.repeated_images = 'use'",
-    "use": "they were used, as pair.repeated_images says",
-}
