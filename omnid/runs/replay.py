@@ -216,7 +216,8 @@ class _Replay:
         if config.motor.port:
             controller = session.start_controller(UNPRIVILEGED, of_replay=True)
             setpoint = config.controller.setpoint.setpoint()
-            outputs.counters["controller"] = self._wheels = ReplayDrive(controller, setpoint, geometry.rig.T_base_rig)
+            health, T_base_rig = self._front_end.health, geometry.rig.T_base_rig
+            outputs.counters["controller"] = self._wheels = ReplayDrive(controller, setpoint, T_base_rig, health)
         bus: BusSink | None = None
         if options.publish:
             encode = session.encoder(geometry.rig)

@@ -14,6 +14,7 @@ from omnid.controller.link import ControllerLink, DriveLink
 from omnid.core.control.command_sources import PLANNER, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.nanoseconds import S_PER_NS
+from omnid.core.rig.rig_health import RigHealth
 from omnid.messages import NavigationUpdate, OdometryUpdate
 from omnid.navigation_state import NavigationState
 from omnid.stages.lockstep_drive import controller_pose
@@ -82,12 +83,19 @@ class ReplayDrive:
     and renews the setpoint. A replay that gives no pose for the deadlines' time stops the wheels, as a robot does.
     """
 
-    def __init__(self, link: ControllerLink, setpoint: Setpoint, T_base_rig: NDArray[np.float64]) -> None:
+    def __init__(
+        self, link: ControllerLink, setpoint: Setpoint, T_base_rig: NDArray[np.float64], health: RigHealth
+    ) -> None:
+        """health: of the rig; the wheels stand until the first pairs have shown whether it is right."""
         self._link, self._setpoint, self._T_base_rig = link, setpoint, T_base_rig
+        self._health, self._has_begun = health, False
         self._failed_since_ns = 0  # 0: the motor controller answers
 
     def process(self, odometry: OdometryUpdate) -> None:
         """Send a pose and the setpoint; DriverError where the motor controller has failed for FAILED_S."""
+        self._has_begun |= not self._health.is_checking
+        if not self._has_begun:
+            return
         # 1. Send both as of now, and take the controller's reports.
         now_ns = time.monotonic_ns()
         self._link.send(controller_pose(odometry, self._T_base_rig)._replace(stamp_ns=now_ns))

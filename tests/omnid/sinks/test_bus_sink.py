@@ -209,8 +209,22 @@ def link() -> Any:
     return Link()
 
 
+def rig_health(is_checking: bool = False) -> Any:
+    return SimpleNamespace(is_checking=is_checking)
+
+
+def test_no_pose_of_a_replay_drives_before_its_rig_is_checked(link: Any) -> None:
+    health = rig_health(is_checking=True)
+    drive = ReplayDrive(link, AHEAD, np.eye(4), health)
+    drive.process(pose_at(10**18))
+    assert not link.poses and not link.setpoints
+    for health.is_checking in (False, True):  # a later check stops nothing
+        drive.process(pose_at(10**18 + 10**8))
+    assert len(link.poses) == len(link.setpoints) == 2
+
+
 def test_a_pose_of_a_replay_counts_as_captured_on_arrival_and_renews_the_setpoint(link: Any) -> None:
-    drive = ReplayDrive(link, AHEAD, np.eye(4))
+    drive = ReplayDrive(link, AHEAD, np.eye(4), rig_health())
     before_ns = time.monotonic_ns()
     for stamp_ns in (10**18, 10**18 + 10**8):
         drive.process(pose_at(stamp_ns))
@@ -220,7 +234,7 @@ def test_a_pose_of_a_replay_counts_as_captured_on_arrival_and_renews_the_setpoin
 
 
 def test_a_motor_controller_that_failed_ends_a_replay(link: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    drive = ReplayDrive(link, AHEAD, np.eye(4))
+    drive = ReplayDrive(link, AHEAD, np.eye(4), rig_health())
     link.statistics.state.failed = True
     drive.process(pose_at(1))
     monkeypatch.setattr("omnid.sinks.drive.FAILED_S", -1.0)
