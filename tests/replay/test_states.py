@@ -23,8 +23,8 @@ from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import STORE
 from tests.replay.command import Command, rows
 from tests.replay.edited import Image, dark, images, save
-from tests.simulation.photographs import Image as Pixels
-from tests.simulation.photographs import repeat_lines, roll, shift, tear, turn
+from tests.simulation.image_breaks import Image as Pixels
+from tests.simulation.image_breaks import repeat_lines, roll, shift, tear, turn
 
 DARK_PAIRS = 20  # pairs, 2 s
 

@@ -5,8 +5,8 @@ synchronised: `--speed 1.4 --skew-ms 15`, or `--skew-ms 5 25` (upper minus lower
 last pair); --stamp-offset-ms: upper exposure later than its stamp says. A rolling shutter of 20 ms on 768 rows:
 `--line-time-us 26`, or that of lower and upper; a stamp is that of the first row. Real mirrors: `--mirrors 1` (tilted
 cameras, mirrors off shape by 1.5 %), with nominal.toml instead of rig.toml. Real lenses, lamps and electronics:
-`--real`, or some of `tests/simulation/disturbances.py` by `--disturb flicker dust`. Photographs on walls, floor and
-pictures: `--photographs`. Dim images with much noise, whose brightness changes: `--dim`.
+`--real`, or some of `tests/simulation/disturbances.py` by `--disturb flicker dust`. Dim images with much noise, whose
+brightness changes: `--dim`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from calib.rig_file import write_rig
 from tests.bench.results import run
 from tests.simulation.disturbances import DISTURBANCES, Disturbance
 from tests.simulation.logs import Readout, write_log
-from tests.simulation.photographs import with_photographs
 from tests.simulation.recipes import DIM, build
 from tests.simulation.rigs import with_real_mirrors
 
@@ -41,7 +40,6 @@ def render(
     stamp_offset_ms: float = 0.0,
     line_time_us: Sequence[float] = (0.0,),
     dim: bool = False,
-    photographs: bool = False,
     disturb: Sequence[Disturbance] = (),
     real: bool = False,
 ) -> None:
@@ -59,7 +57,7 @@ def render(
         out,
         rig,
         made.poses,
-        with_photographs(made.scene, seed) if photographs else made.scene,
+        made.scene,
         sensor=DIM if dim else made.sensor,
         seed=seed,
         supersample=supersample,

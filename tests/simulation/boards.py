@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -85,17 +85,13 @@ def print_rectangles(
 
 
 def clutter(rng: np.random.Generator, radius_m: float = 3.0) -> list[Rectangle]:
-    """Return six noisy walls around the camera."""
-    return six_walls(lambda: np.clip(120 + 45 * value_noise(rng, (400, 400), 60.0), 0, 255).astype(np.uint8), radius_m)
-
-
-def six_walls(paint: Callable[[], NDArray[np.uint8]], radius_m: float) -> list[Rectangle]:
-    """Return six square walls around the camera, each with a texture of its own."""
+    """Return six square noisy walls around the camera."""
     walls = []
     for axis in np.vstack([np.eye(3), -np.eye(3)]):
         side = np.roll(axis, 1) * 2 * radius_m
         below = np.roll(axis, 2) * 2 * radius_m
-        walls.append(Rectangle(axis * radius_m - side / 2 - below / 2, side, below, paint()))
+        noise = np.clip(120 + 45 * value_noise(rng, (400, 400), 60.0), 0, 255).astype(np.uint8)
+        walls.append(Rectangle(axis * radius_m - side / 2 - below / 2, side, below, noise))
     return walls
 
 
@@ -131,13 +127,12 @@ class BoardRenderer:
         supersample: int = 2,
         contrast: tuple[float, float] = (25.0, 225.0),
         shadow: float = 1.0,
-        walls: Sequence[Rectangle] | None = None,
     ) -> BoardImage:
-        """Render the board among walls (noisy ones if None); shadow: brightness factor of a part of the board."""
+        """Render the board among noisy walls; shadow: brightness factor of a part of the board."""
         rng = np.random.default_rng(seed)
         texture = board_texture(self.board, *contrast).astype(float)
         texture[:, : round(texture.shape[1] * rng.uniform(0.3, 0.7))] *= shadow
-        around = clutter(rng) if walls is None else walls
+        around = clutter(rng)
         faces = print_rectangles(self.board, self.shape, T_rig_board, texture.astype(np.uint8))
         points = self.shape.points(self.board.points)
         scene, T_cam_board = Scene((*faces, *around)), self.mounted.T_cam_rig @ T_rig_board

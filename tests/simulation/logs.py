@@ -92,8 +92,6 @@ SCHEMA = "sensor_msgs/msg/CompressedImage"
 Stamps = NDArray[np.int64]
 # Number of the pair, JPEG of lower and upper camera.
 Images = Iterator[tuple[int, bytes, bytes]]
-# Returns the ideal image (H, W), 0 to 255, of a pair and a camera (0 lower, 1 upper).
-ImageSource = Callable[[int, int], Floats]
 
 
 def write_log(
@@ -109,11 +107,19 @@ def write_log(
     disturbances: Collection[Disturbance] = (),
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
-    """Render both cameras' images at poses T_world_rig (N, 4, 4), and write the log and its ground truth to folder."""
+    """Render both cameras' images at poses T_world_rig (N, 4, 4), and write the log and its ground truth to folder.
+
+    rig.toml has masks of the rims only; if struts or a hub hide pixels, rig_masked.toml has masks of those too. A rig
+    of ray-traced mirrors has no model: nominal.toml is what its builder knows. Without a readout both images of a pair
+    show the instant of the lower camera's stamp, and stamps differ by up to SKEW_NS. Same arguments, same bytes.
+    """
     readout = readout or Readout()
     cameras, delay_s = (rig.lower, rig.upper), readout.delay_s(len(poses))
     twists = body_twists(poses, 1e-9 * readout.period_ns)
-    disturbed = _disturbed(rig, disturbances, seed)
+    disturbed = [
+        DisturbedCamera.of(disturbances, number, mounted.visible, mounted.camera.size, seed)
+        for number, mounted in enumerate(cameras)
+    ]
 
     def ideal_image(pair: int, camera: int) -> Floats:
         row_twist = twists[pair] * 1e-6 * readout.line_time_us[camera]
@@ -125,40 +131,7 @@ def write_log(
         time_s = 1e-9 * readout.period_ns * pair + delay_s[pair] * camera
         return disturbed[camera].shown(np.mean(parts, axis=0, dtype=np.float32), time_s)
 
-    pack_log(
-        folder,
-        rig,
-        poses,
-        ideal_image,
-        sensor=sensor,
-        seed=seed,
-        readout=readout,
-        disturbances=disturbances,
-        progress=progress,
-    )
-
-
-def pack_log(
-    folder: Path,
-    rig: Rig,
-    poses: Array,
-    ideal_image: ImageSource,
-    *,
-    sensor: Sensor | None = None,
-    seed: int = 0,
-    readout: Readout | None = None,
-    disturbances: Collection[Disturbance] = (),
-    progress: Callable[[int, int], None] | None = None,
-) -> None:
-    """Write the log of a run at poses T_world_rig (N, 4, 4), and its ground truth, from ideal images.
-
-    rig.toml has masks of the rims only; if struts or a hub hide pixels, rig_masked.toml has masks of those too. A rig
-    of ray-traced mirrors has no model: nominal.toml is what its builder knows. Without a readout both images of a pair
-    show the instant of the lower camera's stamp, and stamps differ by up to SKEW_NS. disturbances: those of
-    electronics and encoding; those of the light are in the ideal images. Same arguments, same bytes.
-    """
     folder.mkdir(parents=True, exist_ok=True)
-    readout = readout or Readout()
     stamps: Stamps = START_NS + readout.period_ns * np.arange(len(poses), dtype=np.int64)
     (folder / "truth.txt").write_text(tum(stamps, poses))
     rng = np.random.default_rng([seed, 6])
@@ -168,7 +141,6 @@ def pack_log(
     sensor = sensor or Sensor()
     exposures = [MountedSensor.of(sensor, m.visible, m.camera.size) for m in (rig.lower, rig.upper)]
     _write_rigs(folder, rig, exposures)
-    disturbed = _disturbed(rig, disturbances, seed)
 
     def jpeg(pair: int, camera: int) -> bytes:
         exposed = exposures[camera].expose(ideal_image(pair, camera), rng)
@@ -184,13 +156,6 @@ def pack_log(
     # log.mcap appears only when it is complete.
     _write_mcap(folder / "log.mcap.part", rig, (stamps, stamps + skews), images())
     (folder / "log.mcap.part").replace(folder / "log.mcap")
-
-
-def _disturbed(rig: Rig, names: Collection[Disturbance], seed: int) -> list[DisturbedCamera]:
-    return [
-        DisturbedCamera.of(names, number, mounted.visible, mounted.camera.size, seed)
-        for number, mounted in enumerate((rig.lower, rig.upper))
-    ]
 
 
 def _write_rigs(folder: Path, rig: Rig, exposures: list[MountedSensor]) -> None:
