@@ -46,7 +46,6 @@ def test_focus_falls_with_blur_and_not_with_light(images: dict[str, list[Image]]
 
 def test_wrong_input(tmp_path: Path, scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
     omnid = Command(capsys)
-    assert "--snapshot" in omnid.refused("cameras", "--log", scene / "log.mcap")
     assert "a folder that can be made" in omnid.refused("cameras", "--snapshot", "/dev/null/a")
     device = f"cameras.lower={tmp_path / 'none'}"
     assert "is not there" in omnid.refused("cameras", "--snapshot", tmp_path, "--set", device)
