@@ -109,7 +109,7 @@ class PairScans:
         """Add the evidence of a pair; return the scan at it, which is unknown while the floor or the pose is."""
         # 1. Forget the grid and the tracks where odometry has begun again.
         if odometry.reset_counter != self._resets:
-            self.scans.grid.begin_again()
+            self.scans.begin_again()
             self._tracker.clear()
             self._resets = odometry.reset_counter
         panoramas, self.scans.belief = odometry.depth.panoramas, None
@@ -125,7 +125,7 @@ class PairScans:
         # 2. The scan by the images, without their dead and blind parts.
         lost = panoramas.tiles.lost_pixels(panoramas.visible.shape)
         pose = transform(planar(T_odom_base))
-        scan = self.scans.add(odometry.stamp_ns, pose, panoramas.lower, panoramas.upper, lost)
+        scan = self.scans.add(odometry.stamp_ns, T_odom_base, panoramas.lower, panoramas.upper, lost)
         # 3. The moving obstacles.
         scan.arrivals.ranges_m[self._unwatched.directions(panoramas.tiles.unknown)] = np.nan
         moving = self._tracker.update(odometry.stamp_ns, self.scans.grid.viewpoint(pose), scan.arrivals)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.obstacles import evidence_kernels as kernels
-from omnid.core.obstacles.panoramas import DIRECTIONS, FOCAL_PX, UNITS, Views, WorkingPair, WorkingPanoramas
+from omnid.core.obstacles.panoramas import DIRECTIONS, FOCAL_PX, UNITS, Views, WorkingPanoramas
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -95,25 +95,27 @@ class Columns:
         heights_m: tuple[float, float],
         ranges_m: tuple[float, float],
         visible: Flags,
+        *,
+        is_ramp: bool = False,
     ) -> None:
         """heights_m: of surfaces over the floor: lower ones are floor, higher ones are passed below. ranges_m: nearest
         and farthest; visible (H, W): pixels of a panorama that both cameras see."""
         self._baseline_m, self._plane, self._heights_m = baseline_m, plane, heights_m
-        self._floor_slope = baseline_m / plane.height_m
-        self.panoramas = WorkingPanoramas(cylinder, (plane.a, plane.b), self._floor_slope, visible)
+        self.floor_slope = baseline_m / plane.height_m
+        self.panoramas = WorkingPanoramas(cylinder, (plane.a, plane.b), self.floor_slope, visible, is_steep=is_ramp)
         self._row0 = self.panoramas.row0
         self.at_1m = FOCAL_PX * baseline_m  # disparity
         self.bins = math.ceil(self.at_1m / ranges_m[0])
         self.first_bin = max(1, math.floor(self.at_1m / ranges_m[1]))  # first disparity that is compared
-        in_view = self.panoramas.visible[:, self.panoramas.shown].mean(axis=1) > 0.5
+        share = self.panoramas.visible[:, self.panoramas.shown].mean(axis=1)
+        in_view = share > (0.0 if is_ramp else 0.5)
         first_row, self.last_row = _rows_in_use(in_view, round(self._row0))
         self._patches, self._offsets = self._made_patches()
         self._strips = self._made_strips(first_row)
         self._prior = np.exp(-np.arange(self.bins) / ADJACENT_PX).astype(np.float32) + np.float32(DISTANT_SHARE)
 
-    def evidence(self, pair: WorkingPair) -> ColumnEvidence:
-        """Return the evidence of a pair."""
-        surfaces, views = self.panoramas.views(pair)
+    def evidence(self, surfaces: Views, views: Views) -> ColumnEvidence:
+        """Return the evidence of a pair, normalised for surfaces and for floor."""
         others, level = np.empty((self.bins, DIRECTIONS), np.float32), np.empty((2, self.bins, DIRECTIONS), np.float32)
         tables = self.panoramas.plane_rows, self._patches, self._offsets, self._prior
         scales = DIFFERENCE_RATIO / np.float32(UNITS), LEVEL_RATIO / np.float32(64 * UNITS)
@@ -139,10 +141,10 @@ class Columns:
         patches = np.zeros((self.bins, 7), np.int32)
         offsets = np.full((4, self.bins, math.ceil(OTHERS_PX[0] / LEVEL_STEP_PX)), np.nan, np.float32)
         for k in range(self.first_bin, self.bins):
-            first, end = (math.ceil(self._row0 + n / self._floor_slope) for n in (k, k + 1))
-            middle = self._floor_slope * ((first + end - 1) / 2 - self._row0)
+            first, end = (math.ceil(self._row0 + n / self.floor_slope) for n in (k, k + 1))
+            middle = self.floor_slope * ((first + end - 1) / 2 - self._row0)
             first, end = first - BIN_ROWS, end + BIN_ROWS
-            if first < 0 or end + self._floor_slope * (end - self._row0) > self.last_row:
+            if first < 0 or end + self.floor_slope * (end - self._row0) > self.last_row:
                 continue
             # Planes above and just below, to where other disparities are compared, and deeper ones to the lowest
             # disparity: floor that repeats itself, and falls deep at an edge, fits there by another period.
@@ -175,9 +177,9 @@ class Columns:
             if fall <= 0:
                 mine = math.ceil(self._baseline_m * -fall / max(high_m - h, 1e-3))
             else:
-                floor = self._floor_slope * fall
+                floor = self.floor_slope * fall
                 mine = math.ceil(max(floor * h / (h - low_m), floor + FLOOR_PX))
-            below = max(math.floor(self._floor_slope * (first - self._row0) - FLOOR_PX), 0)
+            below = max(math.floor(self.floor_slope * (first - self._row0) - FLOOR_PX), 0)
             found.append((first, end, max(self.first_bin, mine), max(last, 0), fall > 0, below))
         # Strips above the first and below the last that may show a surface are not needed.
         useful = [n for n, (_, _, mine, last, *_) in enumerate(found) if last > mine]

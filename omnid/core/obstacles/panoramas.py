@@ -65,31 +65,42 @@ class Views(NamedTuple):
 class WorkingPanoramas:
     """Brings panoramas to the working size, with the floor's horizon level."""
 
-    def __init__(self, cylinder: Cylinder, tilt: tuple[float, float], floor_slope: float, visible: Flags) -> None:
+    def __init__(
+        self,
+        cylinder: Cylinder,
+        tilt: tuple[float, float],
+        floor_slope: float,
+        visible: Flags,
+        *,
+        is_steep: bool = False,
+    ) -> None:
         """tilt: slopes of the floor in the rectified frame; floor_slope: change of its disparity from row to row.
 
-        visible (H, W): pixels of a panorama that both cameras see.
+        visible (H, W): pixels of a panorama that both cameras see. is_steep: a ramp, which is seen nearer than the
+        floor: there are so many more rows as it is lifted.
         """
         # A sector has a whole number of directions (calib.panorama.SECTOR_STEPS); in the others nothing is seen.
         by_column = DIRECTIONS / cylinder.turn_px
         self.shown = np.arange(round(by_column * cylinder.width)) + round(by_column * cylinder.first)
         self.shown %= DIRECTIONS
-        self.height = round(cylinder.height * FOCAL_PX / cylinder.focal_px)
-        self.row0 = (cylinder.row0 + 0.5) * self.height / cylinder.height - 0.5
+        self._shown_rows = round(cylinder.height * FOCAL_PX / cylinder.focal_px)
+        self.row0 = (cylinder.row0 + 0.5) * self._shown_rows / cylinder.height - 0.5
+        azimuth = math.pi - (np.arange(DIRECTIONS) + 0.5) * (math.tau / DIRECTIONS)
+        rise_px = FOCAL_PX * (tilt[0] * np.cos(azimuth) + tilt[1] * np.sin(azimuth))
+        self.height = self._shown_rows + (math.ceil(rise_px.max()) if is_steep else 0)
         self._coding_frequencies = max(2, round(CODING_FREQUENCIES * FOCAL_PX / cylinder.focal_px))
-        rows, columns = np.arange(self.height), np.arange(DIRECTIONS)
+        rows = np.arange(self.height)
         self.plane_rows = (rows + floor_slope * np.maximum(rows - self.row0, 0.0)).astype(np.float32)
         self._plane_map = _map_of(np.broadcast_to(self.plane_rows[:, None], (self.height, DIRECTIONS)))
-        azimuth = math.pi - (columns + 0.5) * (math.tau / DIRECTIONS)
-        rise_px = FOCAL_PX * (tilt[0] * np.cos(azimuth) + tilt[1] * np.sin(azimuth))
         self._level_map = _map_of(rows[:, None] - rise_px) if any(tilt) else None
-        self.visible = self._sized(visible * np.uint8(255)) > 127  # (H, DIRECTIONS)
+        self._is_steep = is_steep
+        self.visible = self._mask(visible) > 127  # (H, DIRECTIONS)
 
     def pair(self, lower: PaddedPanorama, upper: PaddedPanorama, lost: Flags | None = None) -> WorkingPair:
         """Return a pair in the working size; lost (H, W): pixels that are no evidence, None: all in view are."""
         seen = self.visible
         if lost is not None and lost.any():
-            seen = seen & (self._sized(lost * np.uint8(255)) == 0)
+            seen = seen & (self._mask(lost) == 0)
         both = lower, upper
         images = [self._sized(np.ascontiguousarray(one.panorama)).astype(np.float32) for one in both]
         if self._level_map is not None:
@@ -110,12 +121,17 @@ class WorkingPanoramas:
             found.append(Views(lower, upper, _half_row_bounds(upper), plane, live))
         return found[0], found[1]
 
+    def _mask(self, flags: Flags) -> Bytes:
+        """Return flags of a panorama (H, W) in the working size, 255 where they are set."""
+        sized = self._sized(flags * np.uint8(255))
+        return _remapped(sized, self._level_map) if self._is_steep and self._level_map is not None else sized
+
     def _sized(self, image: Bytes) -> Bytes:
         """Return a panorama (H, W) in the working size of a full turn, 0 in directions that it does not show."""
-        shown = cv2.resize(image, (len(self.shown), self.height), interpolation=cv2.INTER_AREA)
+        shown = cv2.resize(image, (len(self.shown), self._shown_rows), interpolation=cv2.INTER_AREA)
         if len(self.shown) == DIRECTIONS:
             return np.asarray(shown, np.uint8)
-        whole = np.zeros((self.height, DIRECTIONS), np.uint8)
+        whole = np.zeros((self._shown_rows, DIRECTIONS), np.uint8)
         whole[:, self.shown] = shown
         return whole
 

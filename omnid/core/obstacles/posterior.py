@@ -28,16 +28,14 @@ from numpy.typing import NDArray
 
 from omnid.core.mapping.range_scan import SECTORS, FreeRanges
 from omnid.core.obstacles import ray_kernels as kernels
-from omnid.core.obstacles.column import ColumnEvidence, Columns
-from omnid.core.obstacles.panoramas import DIRECTIONS, WorkingPair
+from omnid.core.obstacles.bins import BINS_PER_PX, Bins, ShownBins, pooled, turned
+from omnid.core.obstacles.panoramas import DIRECTIONS
 from omnid.core.obstacles.ray_kernels import RayParameters
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 
-BINS_PER_PX: Final = 2
-STEP_ROWS: Final = 4.0  # of a step below its bin, which must be in view
 MAD: Final = 1.48  # sigma of a normal distribution by the median of its magnitudes
 LEAST_STEP: Final = 0.35  # sigma of a step by the rounding of greys
 TYPICAL_M: Final = 1.3  # range at which the near floor is seen
@@ -80,82 +78,57 @@ def thin_things_m(belief: RayBelief, risk: float) -> FreeRanges:
 
 
 class RayPosterior:
-    """Posterior of pairs over one plane of the floor."""
+    """Posterior of the bins of pairs."""
 
-    def __init__(self, columns: Columns, height_m: float, baseline_m: float, parameters: RayParameters) -> None:
-        """height_m: of the viewpoint over the floor."""
-        self._columns, self._p = columns, parameters
-        # Bins from near to far: the nearest whose step is in view, to the last that stereo compares.
-        numbers = np.arange(BINS_PER_PX * columns.bins)
-        middle = (numbers + 0.5) / BINS_PER_PX
-        rows = columns.panoramas.row0 + 0.5 + middle * height_m / baseline_m
-        in_view = (rows + middle + STEP_ROWS < columns.last_row) & (numbers >= BINS_PER_PX * columns.first_bin)
-        self._bins = np.flatnonzero(in_view)[::-1]
-        # What lies beyond them shows the foot of what ends the floor.
-        every = np.concatenate([self._bins, np.arange(1, BINS_PER_PX * columns.first_bin)[::-1]])
-        self._rows = np.stack([rows[every], rows[every] + middle[every]])  # (2, N + far ones) in both views
-        self._step_weights, self._grey_weights = _step_weights(self._rows, columns.panoramas.height)
-        self.ranges_m = columns.at_1m / middle[self._bins]  # (N,) of the bins
-        begins = (self._bins + 1) / BINS_PER_PX
-        self.ends_m = columns.at_1m / np.append(begins, begins[-1:] - 1 / BINS_PER_PX)
-        self._lengths_m = np.diff(self.ends_m).astype(np.float32)
+    def __init__(self, bins: Bins, parameters: RayParameters) -> None:
+        self._bins, self._p = bins, parameters
+        self._lengths_m = np.diff(bins.ends_m).astype(np.float32)
         azimuth = math.pi - (np.arange(DIRECTIONS) + 0.5) * (math.tau / DIRECTIONS)
         along = np.abs(np.sin(azimuth)) < math.sin(ALONG_RAD)
-        self._assumed = (self.ranges_m < parameters.look_m)[:, None] & along
-        self.shows_floor = bool(self._of_bins(columns.panoramas.visible).any())  # whether any floor is in view
+        self._assumed = (bins.ranges_m < parameters.look_m)[:, None] & along
 
-    def belief(self, pair: WorkingPair, evidence: ColumnEvidence, known: Flags | None = None) -> RayBelief:
-        """Return the belief by a pair and its stereo evidence.
+    def belief(self, shown: ShownBins, sensor_grey: float, known: Flags | None = None) -> RayBelief:
+        """Return the belief by what a pair shows of the bins; sensor_grey: noise of the difference of two pixels.
 
         known (N, DIRECTIONS): bins that are known to be floor, None: the nearest ahead and behind are taken for it.
         """
-        p, count, seen = self._p, len(self._bins), self._of_bins(pair.seen)
+        p, count, ranges_m = self._p, len(self._bins.ranges_m), self._bins.ranges_m
         # 1. The floor by which its look is learned: of the cells that are known, or assumed where these are few.
-        known = self._assumed & seen.T if known is None else known & seen.T
-        near = known & (self.ranges_m < p.look_m)[:, None]
+        known = self._assumed & shown.seen if known is None else known & shown.seen
+        near = known & (ranges_m < p.look_m)[:, None]
         if near.sum() < p.look_bins:
-            known = near = self._assumed & seen.T
+            known = near = self._assumed & shown.seen
         if near.sum() < p.look_bins:
             return self._nothing()
-        # 2. Steps of grey, pooled over three directions, and greys.
-        steps, greys = np.zeros((2, self._rows.shape[1], DIRECTIONS), np.float32)
-        for weights, into in ((self._step_weights, steps), (self._grey_weights, greys)):
-            for of_view, image in zip(weights, (pair.lower, pair.upper), strict=True):
-                kernels.add_weighted_rows(of_view, image, into)
-        pooled = np.asarray((np.roll(steps, 1, axis=1) + 2 * steps + np.roll(steps, -1, axis=1)) / 4, np.float32)
-        far_steps, steps, greys, pooled = np.abs(pooled[count:]), steps[:count], greys[:count], pooled[:count]
-        # 3. Stereo, by bins. Noise without texture fits other disparities a little better: the ratio of known floor
+        # 2. Stereo, by bins. Noise without texture fits other disparities a little better: the ratio of known floor
         #    says by how much.
-        of_bin = self._bins // BINS_PER_PX
-        floor = evidence.floor[of_bin]
-        floor = floor - np.float32(min(max(float(np.median(floor[near])), -1.0), 0.0))
+        floor = shown.floor - np.float32(min(max(float(np.median(shown.floor[near])), -1.0), 0.0))
         floor = p.w_floor * np.clip(floor, -p.floor_most, p.floor_most)
         # A bin without texture fits a plane beside the floor by noise, of which known floor says how much: a ratio L
         # counts by the odds that it is more than that.
-        levels = evidence.level[:, of_bin]
+        levels = shown.levels
         noise2 = np.square(np.minimum(levels[:, near], 0)).mean(axis=1, keepdims=True)[..., None] + np.float32(LEAST)
         levels = levels * (1 - np.exp(-np.square(levels) / (2 * noise2)))
         levels = floor - p.w_level * np.clip(levels, -p.level_most, p.level_most)
-        # A surface that fits at a whole disparity is within half of one of it.
-        of_surface = np.minimum((self._bins + 1) // BINS_PER_PX, len(evidence.surface) - 1)
-        fits = np.minimum(self._surfaces(evidence.surface)[of_surface], p.surface_most) - p.surface_noise
-        # 4. Edges and look, by those of the floor.
-        sigmas = self._step_sigmas(pooled, near, known)
-        marks = float((np.abs(pooled) > 5 * sigmas)[near].mean())
+        fits = np.minimum(shown.fits, p.surface_most) - p.surface_noise
+        # 3. Edges and look, by those of the floor.
+        steps, greys = pooled(shown.steps), shown.greys
+        sigmas = self._step_sigmas(steps, near, known)
+        marks = float((np.abs(steps) > 5 * sigmas)[near].mean())
         marks = min((p.marks + 2 * marks) / 3, 0.5)
-        plain = max(p.noise_share * pair.sensor_grey, LEAST_STEP)
-        edges = self._edges(np.abs(pooled), greys, sigmas, marks, plain)
-        look = self._look(steps, greys, near & (self.ranges_m < 1.6)[:, None])
-        far = far_steps.max(axis=0, initial=0.0) / max(float(sigmas[-1, 0]), float(sigmas.min()))
-        # 5. The posterior.
-        seen = seen & (greys.T < SATURATED)
-        terms = np.where(seen.T, np.stack([floor, *levels, look, *edges, fits]).astype(np.float32), 0)
+        plain = max(p.noise_share * sensor_grey, LEAST_STEP)
+        edges = self._edges(np.abs(steps), greys, sigmas, marks, plain)
+        look = self._look(shown.steps, greys, near & (ranges_m < 1.6)[:, None])
+        far = (shown.far / max(float(sigmas[-1, 0]), float(sigmas.min()))).astype(np.float32)
+        # 4. The posterior.
+        seen = shown.seen & (greys < SATURATED)
+        terms = np.where(seen, np.stack([floor, *levels, look, *edges, fits]).astype(np.float32), 0)
         terms[kernels.FITS] = fits
         first = np.empty((DIRECTIONS, count + 1), np.float32)
         ratios, view = np.empty((2, DIRECTIONS, count), np.float32)
-        kernels.posterior(terms, self._lengths_m, far.astype(np.float32), float(self.ends_m[0]), p, first, ratios, view)
-        surfaces = np.ascontiguousarray(evidence.surface[of_surface].T)
-        return RayBelief(first, ratios, np.where(seen, view, np.float32(0)), surfaces, self.ends_m)
+        kernels.posterior(terms, self._lengths_m, far, float(self._bins.ends_m[0]), p, first, ratios, view)
+        surfaces = np.ascontiguousarray(shown.surface.T)
+        return RayBelief(first, ratios, np.where(seen.T, view, np.float32(0)), surfaces, self._bins.ends_m)
 
     def _step_sigmas(self, steps: Floats, near: Flags, known: Flags) -> Floats:
         """Return the sigmas (N, 1) of steps (N, D) of the floor at each range, within twice that of near ones."""
@@ -197,11 +170,11 @@ class RayPosterior:
 
         near (N, D): bins that are known to be floor. Far away the same floor shows less contrast, in other light.
         """
-        p, far = self._p, np.maximum(self.ranges_m / TYPICAL_M, 1.0)[:, None].astype(np.float32)
+        p, far = self._p, np.maximum(self._bins.ranges_m / TYPICAL_M, 1.0)[:, None].astype(np.float32)
         grey = float(np.median(greys[near]))
         scale = np.float32(p.contrast * max(grey, 20.0))
         # 1. The size of steps around.
-        size2 = np.asarray(cv2.blur(_turned(steps * steps, 1), (3, 5))[:, 1:-1], np.float32)
+        size2 = np.asarray(cv2.blur(turned(steps * steps, 1), (3, 5))[:, 1:-1], np.float32)
         contrast = np.asarray(np.log(np.sqrt(size2) + np.float32(0.3)), np.float32)
         z = np.asarray(contrast - np.median(contrast[near]), np.float32)
         sigma = np.float32(max(_sigma_of(z[near]), 0.25))
@@ -209,7 +182,7 @@ class RayPosterior:
         by_contrast = _alike(_noise(z, np.where(z < 0, sigma + np.log(far), sigma), 0.0), anything)
         # 2. The difference to both sides, of a bin or of five, whichever is less. A thing shows an outline in half of
         #    its directions.
-        side = _turned(greys, SIDE)
+        side = turned(greys, SIDE)
         one = greys - (side[:, : -2 * SIDE] + side[:, 2 * SIDE :]) / 2
         five = cv2.blur(one, (1, 5))
         outline = np.asarray(np.where(np.abs(one) < np.abs(five), one, five), np.float32)
@@ -231,25 +204,10 @@ class RayPosterior:
 
     def _nothing(self) -> RayBelief:
         """Return the belief by a pair that shows no floor."""
-        count = len(self._bins)
+        count = len(self._bins.ranges_m)
         first, zero = np.zeros((DIRECTIONS, count + 1), np.float32), np.zeros((DIRECTIONS, count), np.float32)
         first[:, -1] = 1.0
-        return RayBelief(first, zero, zero, zero, self.ends_m)
-
-    def _of_bins(self, pixels: Flags) -> Flags:
-        """Return the bins (DIRECTIONS, N) whose pixels (H, DIRECTIONS) of both views are set."""
-        rows = np.clip(np.rint(self._rows[:, : len(self._bins)]).astype(int), 0, len(pixels) - 1)
-        return np.ascontiguousarray((pixels[rows[0]] & pixels[rows[1]]).T)
-
-    def _surfaces(self, surface: Floats) -> Floats:
-        """Return ratios (K, DIRECTIONS) of surfaces, where one fits best at least the weighted mean of neighbours."""
-        p = self._p
-        most = np.minimum(surface, p.surface_most)
-        three = np.maximum(most, np.maximum(np.roll(most, 1, 0), np.roll(most, -1, 0)))
-        half = int(p.wide_columns) // 2
-        wide = cv2.blur(_turned(three, half), (2 * half + 1, 1), borderType=cv2.BORDER_REPLICATE)[:, half:-half]
-        is_best = wide >= np.maximum(np.roll(wide, 1, 0), np.roll(wide, -1, 0))
-        return np.asarray(np.where(is_best, np.maximum(most, p.wide_weight * wide), most))
+        return RayBelief(first, zero, zero, zero, self._bins.ends_m)
 
 
 def _noise(values: Floats, sigma: Floats | np.float32, tail: float) -> Floats:
@@ -281,26 +239,3 @@ def _row_medians(values: Floats, chosen: Flags) -> Floats:
     ordered = np.sort(np.where(chosen, values, np.float32(np.inf)), axis=1)
     counts = chosen.sum(axis=1)
     return np.asarray(ordered[np.arange(len(values)), counts // 2 - (counts == values.shape[1])])
-
-
-def _turned(values: Floats, count: int) -> Floats:
-    """Return values (N, D) of a turn with so many directions repeated on either side."""
-    return np.concatenate([values[:, -count:], values, values[:, :count]], axis=1)
-
-
-def _step_weights(rows: Array, height: int) -> tuple[Floats, Floats]:
-    """Return the weights (2, N, H) of the rows of both views for steps of grey at rows (2, N), and for greys there.
-
-    A step is the difference of the means of 2.6 rows on either side, less the trend of the rows beyond: a shading is no
-    edge.
-    """
-    edges = np.arange(height)
-
-    def mean(first: float, end: float) -> Array:
-        low, high = (np.clip(rows[..., None] + at, 0, height - 1) for at in (first, end))
-        part = np.clip(np.minimum(high, edges + 1) - np.maximum(low, edges), 0, None)
-        return np.asarray(part / np.maximum(part.sum(axis=-1, keepdims=True), 1e-6))
-
-    above, below, before, beyond = mean(-3.6, -1.0), mean(1.0, 3.6), mean(-8.0, -3.6), mean(3.6, 8.0)
-    step = above - below - 0.575 * (before - above + below - beyond)
-    return (step / 2).astype(np.float32), (mean(-1.1, 1.1) / 2).astype(np.float32)

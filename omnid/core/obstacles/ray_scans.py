@@ -1,25 +1,32 @@
-"""Scan of free floor and things of each pair: stereo, posterior of the rays, grid; over a floor that may lean.
+"""Scan of free floor and things of each pair: stereo, posterior of the rays, grid; over a floor that leans, and ramps.
 
 A tilt (a, b) of the floor beyond that which the rig states changes the disparity of all its rows by
 f t / h (a cos u + b sin u), whatever their range. So the difference of both views on the plane, by the gradient along
 columns, is a linear measurement of a and b, and a Kalman filter adds up pairs. Floor without texture has no gradient,
 and changes nothing. Only floor nearer than where a step down looks like a tilt counts, and only where it is known.
+
+A ramp (ramps.py) is a second plane beyond a line. While a base drives over that line it stands on neither plane: then
+its own pose says where both are.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calib import se3
 from calib.panorama import Cylinder
+from calib.se2_arrays import planar, transform
+from omnid.core.obstacles.bins import Bins, PlaneView
 from omnid.core.obstacles.column import NEAREST_M, Columns, FloorPlane, floor_plane
 from omnid.core.obstacles.grid import GridScan, ObstacleGrid, unknown_scan
 from omnid.core.obstacles.panoramas import AROUND_ROWS, DIRECTIONS, FOCAL_PX, WorkingPair
 from omnid.core.obstacles.posterior import RayBelief, RayPosterior
+from omnid.core.obstacles.ramps import AZIMUTHS, Ramp, Ramps
 from omnid.core.obstacles.ray_kernels import RayParameters
 from omnid.core.obstacles.settings import ScanSettings
 from omnid.core.types.panorama import PaddedPanorama
@@ -28,12 +35,23 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 LEAN_M: Final = 1.7  # range up to which floor shows the tilt: farther away a step down looks like one
-LEAN_NS: Final = 500_000_000  # between two pairs by which a tilt that is known is followed
+FOLLOWED_NS: Final = 500_000_000  # between two pairs by which a known tilt, and ramps, are followed
 PRIOR_RAD: Final = math.radians(1.0)  # sigma of a rig that leans,
 DRIFT_RAD: Final = math.radians(0.05)  # of its change from pair to pair,
 SURE_RAD: Final = math.radians(0.3)  # and of a tilt that is used
-LEAST_RAD: Final = math.radians(0.15)  # change of the tilt for which the tables are made again
+LEAST_RAD: Final = math.radians(0.15)  # change of a tilt for which tables are made again,
+LEAST_M: Final = 0.005  # and of a height
 CORRELATED: Final = 20.0  # pixels with one error: neighbours are smoothed, and share what is wrong
+HALF_BASE_M: Final = 0.5  # From a line so far on, a base stands with all wheels on one side of it.
+FOUND_M: Final = 1.0  # A ramp that begins nearer is known: what is left of the floor before it tells no start.
+PARAMETERS: Final = RayParameters()
+
+
+class _Plane(NamedTuple):
+    """A plane of the floor, and the tables of it."""
+
+    plane: FloorPlane
+    view: PlaneView
 
 
 class RayScans:
@@ -44,51 +62,90 @@ class RayScans:
         self.grid = ObstacleGrid(FOCAL_PX * baseline_m, settings.max_range_m)
         # Tilt (2,) beyond what the rig states by all pairs, its covariance, and that of the tables.
         self._tilt, self._P, self._used = np.zeros(2), PRIOR_RAD**2 * np.eye(2), np.zeros(2)
-        self._leaned_ns: int | None = None  # stamp of the last pair by which the tilt was followed
-        azimuth = math.pi - (np.arange(DIRECTIONS) + 0.5) * (math.tau / DIRECTIONS)
-        self._way = np.column_stack([np.cos(azimuth), np.sin(azimuth)])
+        self._followed_ns: int | None = None  # stamp of the last pair by which tilt and ramps were followed
+        self._ramps = Ramps()
+        self._way = np.column_stack([np.cos(AZIMUTHS), np.sin(AZIMUTHS)])
         self.belief: RayBelief | None = None  # of the newest pair
 
     def set_floor(self, T_rect_base: Array, visible: Flags) -> None:
         """Take T_rect_base (4, 4), from the base level on the floor to the panoramas, and their pixels (H, W)."""
-        self._plane, self._visible = floor_plane(T_rect_base), visible
+        self._T_rect_base, self._visible = T_rect_base, visible
+        self._T_odom_floor = np.eye(4)  # pose of the base when it stood on the floor before a ramp
         self.grid.set_floor(T_rect_base)
-        self._make_tables()
+        self._ramps.forget()
+        plane = floor_plane(T_rect_base)
+        columns = self._columns(plane)
+        self._bins = Bins(columns)
+        self._posterior = RayPosterior(self._bins, PARAMETERS)
+        self._floor = self._ramp = _Plane(plane, PlaneView(columns, self._bins, PARAMETERS))
+
+    def begin_again(self) -> None:
+        """Forget what is known in odom, as the way since then is not."""
+        self.grid.begin_again()
+        self._ramps.forget()
 
     def add(
         self, stamp_ns: int, T_odom_base: Array, lower: PaddedPanorama, upper: PaddedPanorama, lost: Flags | None
     ) -> GridScan:
-        """Return the scan at a pair, whose base has the planar pose T_odom_base (4, 4).
+        """Return the scan at a pair, whose base has the pose T_odom_base (4, 4).
 
         lost (H, W): pixels that are no evidence, None: all in view are.
         """
-        if not self._posterior.shows_floor:
+        pose = transform(planar(T_odom_base))
+        viewpoint = planar(self.grid.viewpoint(pose))
+        turn_rad = math.atan2(self._T_rect_base[1, 0], self._T_rect_base[0, 0]) - viewpoint[2]
+        # 1. The plane of the floor, and that of a ramp.
+        ramp = self._ramps.seen_from(viewpoint, turn_rad)
+        if ramp is not None and ramp.start_m < -HALF_BASE_M:
+            self._ramps.forget()
+            ramp = None
+        stands_level = ramp is None or ramp.start_m > HALF_BASE_M
+        if stands_level:
+            self._T_odom_floor = T_odom_base
+        floor = floor_plane(self._T_rect_base @ se3.inverse(T_odom_base) @ self._T_odom_floor)
+        floor = FloorPlane(floor.height_m, floor.a + float(self._used[0]), floor.b + float(self._used[1]))
+        self._floor = self._seen(floor, self._floor)
+        if not self._floor.view.shows_floor:
             return unknown_scan()
-        # 1. The belief, with the look of floor that is known, and the grid.
-        pair = self._columns.panoramas.pair(lower, upper, lost)
-        known = self.grid.is_floor(T_odom_base, self._posterior.ranges_m, DIRECTIONS)
-        self.belief = self._posterior.belief(pair, self._columns.evidence(pair), known)
-        scan = self.grid.update(stamp_ns, T_odom_base, self.belief)
-        # 2. The tilt, for the next pair.
-        is_due = self._leaned_ns is None or not 0 <= stamp_ns - self._leaned_ns < LEAN_NS
-        if is_due or np.diag(self._P).max() > SURE_RAD**2:
-            self._leaned_ns = stamp_ns
-            self._observe_tilt(T_odom_base, pair)
-            is_sure = np.diag(self._P) < SURE_RAD**2
-            if np.abs((self._tilt - self._used)[is_sure]).max(initial=0.0) > LEAST_RAD:
-                self._used = np.where(is_sure, self._tilt, self._used)
-                self._make_tables()
+        # 2. What the pair shows on them.
+        columns = self._floor.view.columns
+        pair = columns.panoramas.pair(lower, upper, lost)
+        views = columns.panoramas.views(pair)
+        shown = self._floor.view.shown(pair, columns.evidence(*views))
+        if ramp is not None:
+            self._ramp = self._seen(ramp.plane(floor), self._ramp, is_ramp=True)
+            columns = self._ramp.view.columns
+            on_ramp = columns.panoramas.pair(lower, upper, lost)
+            evidence = columns.evidence(*columns.panoramas.views(on_ramp))
+            shown = shown.beyond(ramp.begins_before(self._bins.ranges_m), self._ramp.view.shown(on_ramp, evidence))
+        # 3. The belief, with the look of floor that is known, and the grid.
+        known = self.grid.is_floor(pose, self._bins.ranges_m, DIRECTIONS)
+        self.belief = self._posterior.belief(shown, pair.sensor_grey, known)
+        scan = self.grid.update(stamp_ns, pose, self.belief)
+        # 4. Tilt and ramps, for the next pair.
+        is_due = self._followed_ns is None or not 0 <= stamp_ns - self._followed_ns < FOLLOWED_NS
+        if stands_level and (is_due or np.diag(self._P).max() > SURE_RAD**2):
+            self._observe_tilt(pose, pair, ramp)
+        if is_due:
+            self._followed_ns = stamp_ns
+        if is_due and (ramp is None or ramp.start_m > FOUND_M):
+            geometry, climbed = (floor.height_m, self._baseline_m), float(T_odom_base[2, 0])
+            self._ramps.search(views[1], self._floor.view.columns.panoramas, *geometry, viewpoint, turn_rad, climbed)
         return scan
 
-    def _observe_tilt(self, T_odom_base: Array, pair: WorkingPair) -> None:
-        """Take a pair into the filter of the tilt, by near floor that is known."""
+    def _observe_tilt(self, pose: Array, pair: WorkingPair, ramp: Ramp | None) -> None:
+        """Take a pair into the filter of the tilt, by near floor that is known; pose (4, 4): of the base, planar."""
         self._P = self._P + DRIFT_RAD**2 * np.eye(2)
-        rows = self._near_rows
-        known = self.grid.is_floor(T_odom_base, self._row_ranges_m[rows], DIRECTIONS) & pair.seen[rows]
+        columns, height_m = self._floor.view.columns, self._floor.plane.height_m
+        ranges_m = FOCAL_PX * height_m / np.maximum(np.arange(columns.panoramas.height) - columns.panoramas.row0, 1e-6)
+        rows = np.flatnonzero((ranges_m < LEAN_M) & (columns.panoramas.plane_rows < columns.last_row - 2))
+        known = self.grid.is_floor(pose, ranges_m[rows], DIRECTIONS) & pair.seen[rows]
+        if ramp is not None:
+            known &= ~ramp.begins_before(ranges_m[rows])
         if not known.any():
             return
         # 1. Difference and gradient of both views on the plane.
-        at = self._columns.panoramas.plane_rows[rows]
+        at = columns.panoramas.plane_rows[rows]
         lower, upper = (image - cv2.blur(image, (1, AROUND_ROWS)) for image in (pair.lower, pair.upper))
         above, share = np.floor(at).astype(int), (at % 1)[:, None]
         both = np.stack([upper, (np.roll(upper, -1, 0) - np.roll(upper, 1, 0)) / 2])
@@ -100,7 +157,7 @@ class RayScans:
         squares, products = (weight * gradient * gradient).sum(0), (weight * gradient * difference).sum(0)
         # The gradient has noise of its own: without that share a plain floor would seem to measure something.
         textured = max(1.0 - float(weight.sum()) * sigma**2 / 4 / max(float(squares.sum()), 1e-6), 0.0)
-        px_per_rad = FOCAL_PX * self._baseline_m / self._plane.height_m
+        px_per_rad = FOCAL_PX * self._baseline_m / height_m
         scale = px_per_rad / (sigma * math.sqrt(CORRELATED))
         H = (scale * textured) ** 2 * np.einsum("u,ui,uj->ij", squares, self._way, self._way)
         y = scale**2 * textured / px_per_rad * (self._way.T @ products)
@@ -108,17 +165,19 @@ class RayScans:
         information = np.linalg.inv(self._P)
         self._P = np.linalg.inv(information + H)
         self._tilt = self._P @ (information @ self._tilt + H @ self._used + y)
+        # 4. The tilt that is used.
+        is_sure = np.diag(self._P) < SURE_RAD**2
+        if np.abs((self._tilt - self._used)[is_sure]).max(initial=0.0) > LEAST_RAD:
+            self._used = np.where(is_sure, self._tilt, self._used)
 
-    def _make_tables(self) -> None:
-        """Make the tables of the floor's plane, with its tilt."""
-        plane, visible = self._plane, self._visible
-        tilted = FloorPlane(plane.height_m, float(plane.a + self._used[0]), float(plane.b + self._used[1]))
-        ranges_m = NEAREST_M, self._settings.max_range_m
-        cylinder, heights_m = self._cylinder, self._settings.heights_m
-        self._columns = Columns(cylinder, self._baseline_m, tilted, heights_m, ranges_m, visible)
-        self._posterior = RayPosterior(self._columns, plane.height_m, self._baseline_m, RayParameters())
-        panoramas = self._columns.panoramas
-        below = np.maximum(np.arange(panoramas.height) - panoramas.row0, 1e-6)
-        self._row_ranges_m = FOCAL_PX * plane.height_m / below
-        in_view = panoramas.plane_rows < self._columns.last_row - 2
-        self._near_rows = np.flatnonzero((self._row_ranges_m < LEAN_M) & in_view)
+    def _columns(self, plane: FloorPlane, *, is_ramp: bool = False) -> Columns:
+        """Return the stereo evidence on a plane."""
+        heights_m, ranges_m = self._settings.heights_m, (NEAREST_M, self._settings.max_range_m)
+        return Columns(self._cylinder, self._baseline_m, plane, heights_m, ranges_m, self._visible, is_ramp=is_ramp)
+
+    def _seen(self, plane: FloorPlane, before: _Plane, *, is_ramp: bool = False) -> _Plane:
+        """Return a plane with its tables, those of a plane before where it is about the same."""
+        height_m, *slopes = np.abs(np.subtract(plane, before.plane))
+        if height_m < LEAST_M and max(slopes) < LEAST_RAD:
+            return before
+        return _Plane(plane, PlaneView(self._columns(plane, is_ramp=is_ramp), self._bins, PARAMETERS))

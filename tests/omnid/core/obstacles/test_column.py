@@ -36,7 +36,7 @@ def columns() -> Columns:
 
 
 def evidence(columns: Columns, floor: Pattern, wall: Pattern, drop_m: float = 0.0) -> ColumnEvidence:
-    return columns.evidence(columns.panoramas.pair(*panoramas(floor, WALL_M, wall, drop_m)))
+    return columns.evidence(*columns.panoramas.views(columns.panoramas.pair(*panoramas(floor, WALL_M, wall, drop_m))))
 
 
 def floor_at(columns: Columns, found: ColumnEvidence, near_m: float, far_m: float) -> np.ndarray:
@@ -54,7 +54,7 @@ def test_wall_and_the_floor_before_it_are_found_in_all_directions(columns: Colum
 
 def test_wall_of_courses_that_are_all_alike_is_none_farther_away_below_the_floor(columns: Columns) -> None:
     """By another number of courses it fits farther away, but not near its foot: there the floor would be above it."""
-    found = columns.evidence(columns.panoramas.pair(*panoramas(stains, 1.2, courses)))
+    found = columns.evidence(*columns.panoramas.views(columns.panoramas.pair(*panoramas(stains, 1.2, courses))))
     at = round(columns.at_1m / 1.2)
     assert (found.surface[at - 2 : at + 3].max(axis=0) > 2).mean() > 0.95
     assert (found.surface[at + 3 :] > 2).mean() < 0.01
@@ -99,7 +99,7 @@ def test_floor_nearer_than_a_scan_that_no_direction_shows_is_not_used() -> None:
 
 def _floor_of(columns: Columns) -> np.ndarray:
     """Return the evidence (K, DIRECTIONS) of a floor with stains."""
-    return columns.evidence(columns.panoramas.pair(*panoramas(stains, WALL_M, striped))).floor
+    return columns.evidence(*columns.panoramas.views(columns.panoramas.pair(*panoramas(stains, WALL_M, striped)))).floor
 
 
 QUALITY = 40
@@ -120,7 +120,9 @@ def test_a_floor_in_jpegs_is_no_evidence_against_itself() -> None:
 def _floor(lower: PaddedPanorama, upper: PaddedPanorama) -> NDArray[np.float32]:
     """Return the evidence of the floor from 1 to 2.5 m."""
     ranges_m = COLUMNS.at_1m / (np.arange(COLUMNS.bins) + 0.5)
-    floor = COLUMNS.evidence(COLUMNS.panoramas.pair(lower, upper)).floor[(ranges_m > 1.0) & (ranges_m < 2.5)]
+    floor = COLUMNS.evidence(*COLUMNS.panoramas.views(COLUMNS.panoramas.pair(lower, upper))).floor[
+        (ranges_m > 1.0) & (ranges_m < 2.5)
+    ]
     return np.asarray(floor[np.isfinite(floor)])
 
 
