@@ -35,8 +35,10 @@ class ShownBins(NamedTuple):
 
     def beyond(self, where: Flags, other: ShownBins) -> ShownBins:
         """Return what is shown of a floor that is another plane in some bins (N, DIRECTIONS)."""
-        *bins, (far, other_far) = zip(self, other, strict=True)
-        return ShownBins(*(np.where(where, b, a) for a, b in bins), np.where(where[-1], other_far, far))
+        return ShownBins._make(
+            np.where(where if mine.ndim > 1 else where[-1], theirs, mine)
+            for mine, theirs in zip(self, other, strict=True)
+        )
 
 
 class Bins:

@@ -156,6 +156,13 @@ class ObstacleGrid:
         self._forget()
         self.odds[kept], self._known[kept], self._cell = odds[kept], 1, cell
 
+    def forget_beyond(self, way_rad: float, offset_m: float) -> None:
+        """Forget the cells beyond a line across a way: azimuth of the way in odom, and offset of the line along it."""
+        if self._cell is None:
+            return
+        y, x = CELL_M * (np.indices((SIDE, SIDE)) + 0.5 + (self._cell - REACH_CELLS)[::-1, None, None])
+        self._layers[:, x * math.cos(way_rad) + y * math.sin(way_rad) > offset_m] = self._empty[:, None]
+
     def _forget(self) -> None:
         """Forget everything."""
         self._empty = np.array([self._p.prior, 0, 0, 0, 0, 0, np.inf, np.inf], np.float32)

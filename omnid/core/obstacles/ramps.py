@@ -127,8 +127,8 @@ class Ramps:
     """The ramp before a base, or that which it drives onto, by all pairs."""
 
     def __init__(self) -> None:
-        self._way_rad, self._offset_m, self._slope = 0.0, 0.0, 0.0  # azimuth in odom; of the line, along it
-        self._nats = 0.0  # of all pairs; 0: no ramp is known
+        self.way_rad, self.offset_m = 0.0, 0.0  # azimuth of the way in odom, and offset of the line along it
+        self._slope, self._nats = 0.0, 0.0  # and evidence by all pairs; 0: no ramp is known
 
     def forget(self) -> None:
         """Forget the ramp that is known."""
@@ -139,7 +139,7 @@ class Ramps:
         frame."""
         if not self._nats:
             return None
-        return Ramp(self._offset_m - self._along(viewpoint, self._way_rad), self._slope, self._way_rad + turn_rad)
+        return Ramp(self.offset_m - self._along(viewpoint, self.way_rad), self._slope, self.way_rad + turn_rad)
 
     def search(
         self,
@@ -150,8 +150,8 @@ class Ramps:
         viewpoint: Array,
         turn_rad: float,
         climbed: float,
-    ) -> None:
-        """Search for a ramp ahead in a pair whose views are normalised for floor.
+    ) -> bool:
+        """Search for a ramp ahead in a pair whose views are normalised for floor; return whether it is a new one.
 
         height_m: of the viewpoint over the floor before the ramp. viewpoint: x, y, heading in odom; turn_rad: of odom
         in the rectified frame; climbed: slope of the base in odom.
@@ -181,24 +181,23 @@ class Ramps:
         better = 2 * RATIO / UNITS * PARTS * np.median(ramps.sum(axis=-1) - np.maximum(things, 0), axis=0)
         total = np.where(nats.min(axis=2) > 0, better, 0.0)
         x, s = np.unravel_index(total.argmax(), total.shape)
-        if total[x, s] > LEAST_NATS and slopes[s] < TOO_STEEP[0]:
-            offset_m = float(STARTS_M[x]) + self._along(viewpoint, viewpoint[2])
-            self._add(float(viewpoint[2]), offset_m, float(slopes[s]), float(total[x, s]))
+        if total[x, s] < LEAST_NATS or slopes[s] >= TOO_STEEP[0]:
+            return False
+        offset_m = float(STARTS_M[x]) + self._along(viewpoint, viewpoint[2])
+        return self._add(float(viewpoint[2]), offset_m, float(slopes[s]), float(total[x, s]))
 
-    def _add(self, way_rad: float, offset_m: float, slope: float, nats: float) -> None:
-        """Take what a pair shows into the mean of all pairs that show the same ramp, weighted by their evidence."""
-        is_same = (
-            abs(offset_m - self._offset_m) < SAME_M
-            and abs(slope - self._slope) < SAME
-            and math.cos(way_rad - self._way_rad) > math.cos(HALF_RAD)
-        )
-        if not self._nats or not is_same:
-            self._way_rad, self._offset_m, self._slope, self._nats = way_rad, offset_m, slope, nats
-            return
+    def _add(self, way_rad: float, offset_m: float, slope: float, nats: float) -> bool:
+        """Take what a pair shows into the mean of all pairs that show the same ramp, weighted by their evidence; return
+        whether it is a new one."""
+        is_same = abs(offset_m - self.offset_m) < SAME_M and abs(slope - self._slope) < SAME
+        if not self._nats or not is_same or math.cos(way_rad - self.way_rad) < math.cos(HALF_RAD):
+            self.way_rad, self.offset_m, self._slope, self._nats = way_rad, offset_m, slope, nats
+            return True
         self._nats += nats
         share = nats / self._nats
-        self._offset_m += share * (offset_m - self._offset_m)
+        self.offset_m += share * (offset_m - self.offset_m)
         self._slope += share * (slope - self._slope)
+        return False
 
     @staticmethod
     def _along(place: Array, way_rad: float) -> float:

@@ -130,7 +130,10 @@ class RayScans:
             self._followed_ns = stamp_ns
         if is_due and (ramp is None or ramp.start_m > FOUND_M):
             geometry, climbed = (floor.height_m, self._baseline_m), float(T_odom_base[2, 0])
-            self._ramps.search(views[1], self._floor.view.columns.panoramas, *geometry, viewpoint, turn_rad, climbed)
+            panoramas = self._floor.view.columns.panoramas
+            if self._ramps.search(views[1], panoramas, *geometry, viewpoint, turn_rad, climbed):
+                # What was seen beyond its start was compared with another floor.
+                self.grid.forget_beyond(self._ramps.way_rad, self._ramps.offset_m)
         return scan
 
     def _observe_tilt(self, pose: Array, pair: WorkingPair, ramp: Ramp | None) -> None:

@@ -79,8 +79,19 @@ class Bar:
     grey: float = 190.0
 
 
+@dataclass(frozen=True)
+class Slope:
+    """The floor beyond a line across the way rises."""
+
+    start_m: float
+    degrees: float
+
+
+Thing = Pole | Bar | Slope
+
+
 def panoramas(
-    floor: Pattern, wall_m: float, wall: Pattern, drop_m: float = 0.0, thing: Pole | Bar | None = None, seed: int = 4
+    floor: Pattern, wall_m: float, wall: Pattern, drop_m: float = 0.0, thing: Thing | None = None, seed: int = 4
 ) -> tuple[PaddedPanorama, PaddedPanorama]:
     """Return the lower and the upper panorama of a floor with a round wall; wall: grey of azimuth and height.
 
@@ -102,12 +113,17 @@ def _exposed(grey: np.ndarray, rng: np.random.Generator) -> PaddedPanorama:
 
 
 @lru_cache(maxsize=16)  # most pairs differ in their noise only
-def _drawn(height_m: float, floor: Pattern, wall_m: float, wall: Pattern, thing: Pole | Bar | None) -> np.ndarray:
+def _drawn(height_m: float, floor: Pattern, wall_m: float, wall: Pattern, thing: Thing | None) -> np.ndarray:
     """Return the grey levels of a panorama without noise."""
     columns, rows = np.meshgrid(np.arange(CYLINDER.width), np.arange(CYLINDER.height))
     rays = CYLINDER.rays(np.column_stack([columns.ravel(), rows.ravel()]).astype(float))
     with np.errstate(divide="ignore"):
         r = np.where(rays[:, 2] < 0, -height_m / rays[:, 2], np.inf)
+        if isinstance(thing, Slope):
+            slope = math.tan(math.radians(thing.degrees))
+            steeper = slope * rays[:, 0] - rays[:, 2]
+            on_slope = np.where(steeper > 0, (height_m + slope * thing.start_m) / steeper, np.inf)
+            r = np.where(r * rays[:, 0] > thing.start_m, on_slope, r)
     near = np.minimum(r, wall_m)
     x, y, z = (near * rays.T[i] for i in range(3))
     azimuth = np.arctan2(y, x)
@@ -115,7 +131,7 @@ def _drawn(height_m: float, floor: Pattern, wall_m: float, wall: Pattern, thing:
     if isinstance(thing, Pole):
         hidden = (np.abs(azimuth) < thing.width_m / thing.range_m / 2) & (r > thing.range_m)
         grey = np.where(hidden, thing.grey, grey)
-    elif thing is not None:
+    elif isinstance(thing, Bar):
         height = height_m + thing.range_m * rays[:, 2]
         grey = np.where((height > thing.heights_m[0]) & (height < thing.heights_m[1]), thing.grey, grey)
     return np.asarray(grey.reshape(columns.shape))

@@ -20,6 +20,8 @@ from tests.omnid.core.obstacles.drawn_floor import (
     Bar,
     Pattern,
     Pole,
+    Slope,
+    Thing,
     panoramas,
     plain,
     stains,
@@ -45,7 +47,7 @@ class Standing:
 
     def scan(
         self,
-        thing: Pole | Bar | None = None,
+        thing: Thing | None = None,
         *,
         pairs: int = 1,
         wall_m: float = WALL_M,
@@ -147,6 +149,20 @@ def test_nothing_is_free_a_while_after_all_images_are_lost() -> None:
     assert np.median(base.scan(pairs=PAIRS).free_m) > 0.75 * WALL_M
     assert base.scan(pairs=25, lost=SHOWN).free_m.max() < 0.5
     assert np.median(base.scan(pairs=PAIRS).free_m) > 0.6 * WALL_M
+
+
+@pytest.mark.parametrize("degrees", [3.0, 6.0, 9.0])
+def test_a_ramp_is_free(degrees: float) -> None:
+    """It is a second plane of the floor, from where it begins on."""
+    scan = Standing(stains).scan(Slope(1.4, degrees), pairs=3 * PAIRS)
+    assert np.median(scan.free_m[AHEAD]) > 2.2
+    assert np.median(scan.free_m[BEHIND]) > 0.75 * WALL_M and scan.free_m.max() < WALL_M + 0.1
+
+
+@pytest.mark.hazard("H19")
+@pytest.mark.parametrize("degrees", [14.0, 20.0])
+def test_a_slope_that_is_too_steep_is_not_free(degrees: float) -> None:
+    assert Standing(stains).scan(Slope(1.4, degrees), pairs=3 * PAIRS).free_m[AHEAD].max() < 1.8
 
 
 @pytest.mark.parametrize("drop_m", [0.12, -0.12])
