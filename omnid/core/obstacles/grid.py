@@ -165,13 +165,13 @@ class ObstacleGrid:
 
     def _forget(self) -> None:
         """Forget everything."""
-        self._empty = np.array([self._p.prior, 0, 0, 0, 0, 0, np.inf, np.inf], np.float32)
+        self._empty = np.array([self._p.prior, 0, 0, 0, 0, 0, 0, 0, np.inf, np.inf], np.float32)
         self._layers = np.tile(self._empty[:, None, None], (1, SIDE, SIDE))
         # Log-odds of a thing; evidence of the pair before; mean of what single pairs show; whether a cell is known;
-        # views past it; whether the last pair saw floor behind it; time since it was free [s]; and
-        # since it was seen.
+        # views past it; whether the last pair saw floor behind it; the most that this place has shown of what hangs;
+        # times [s] since that was shown, since the cell was free, and since it was seen.
         self.odds, self._before, self._shown, self._known, self._past_views, *others = self._layers
-        self._was_past, self._free_s, self._age_s = others
+        self._was_past, self._here, self._gone_s, self._free_s, self._age_s = others
         self._cell = None
         self._last: tuple[int, Array] | None = None  # stamp and place [m] of the pair before
         self._carry = 0.0
@@ -197,6 +197,11 @@ class ObstacleGrid:
         self._before[:] = np.where(in_view, found[kernels.RATIO], 0)
         shown = cv2.blur(found[kernels.SURFACE], (5, 5))
         self._shown += np.where(in_view, np.float32(p.shown_rate * (1 - rho)) * (shown - self._shown), 0)
+        # What this place showed, and shows no longer, has gone: errors of pairs from one place would be alike.
+        self._here[:] = np.maximum(self._here * np.float32(max(1.0 - way_m / CELL_M, 0.0)), np.where(in_view, shown, 0))
+        self._gone_s += np.float32(passed_s)
+        self._gone_s[~in_view | (shown > 0.5 * self._here) | (self._here < p.shown_least)] = 0
+        self._shown[self._gone_s > p.lately_s] = 0
         # 3. What is known: seen, or seen past. What was hidden from the start may look like floor in some pairs: it is
         #    known after so many views past it.
         self._past_views[past] += np.float32(1 - rho)

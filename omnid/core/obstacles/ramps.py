@@ -39,6 +39,7 @@ PARTS: Final = 8  # of that angle: most of them must show a ramp
 RATIO: Final = 0.075
 LEAST_NATS: Final = 10.0  # Evidence of a ramp in one pair: without one it is below 4 in textured corridors.
 SAME_M, SAME = 0.5, math.tan(math.radians(3.0))  # within which pairs show the same ramp
+VIEWS: Final = 3.0  # Pairs that count: nearer ones show a ramp better.
 AZIMUTHS: Final = math.pi - (np.arange(DIRECTIONS) + 0.5) * (math.tau / DIRECTIONS)  # of directions
 
 
@@ -162,8 +163,8 @@ class Ramps:
         ahead = order[np.abs(aside[order]) < HALF_RAD]
         parts = ahead[: len(ahead) // PARTS * PARTS].reshape(PARTS, -1)[:, ::2].astype(np.int32)
         slopes = np.append(np.arange(GENTLEST, STEEPEST + STEP / 2, STEP), TOO_STEEP)
-        if climbed > GENTLEST:
-            slopes = np.append(slopes, -np.arange(GENTLEST, climbed + 2 * STEP, STEP))
+        if climbed > GENTLEST:  # A landing is level.
+            slopes = np.append(slopes, STEP * np.arange(-2, 3) - climbed)
         ramps = np.empty((PARTS, len(STARTS_M), len(slopes), 2))
         upright = np.empty((PARTS, math.ceil(FOCAL_PX * baseline_m / STARTS_M[0]), panoramas.height))
         images = views.lower, views.upper, views.live, panoramas.plane_rows, np.ascontiguousarray(parts), np.cos(aside)
@@ -187,13 +188,13 @@ class Ramps:
         return self._add(float(viewpoint[2]), offset_m, float(slopes[s]), float(total[x, s]))
 
     def _add(self, way_rad: float, offset_m: float, slope: float, nats: float) -> bool:
-        """Take what a pair shows into the mean of all pairs that show the same ramp, weighted by their evidence; return
+        """Take what a pair shows into the mean of those that showed the same ramp, weighted by their evidence; return
         whether it is a new one."""
         is_same = abs(offset_m - self.offset_m) < SAME_M and abs(slope - self._slope) < SAME
         if not self._nats or not is_same or math.cos(way_rad - self.way_rad) < math.cos(HALF_RAD):
             self.way_rad, self.offset_m, self._slope, self._nats = way_rad, offset_m, slope, nats
             return True
-        self._nats += nats
+        self._nats = min(self._nats, (VIEWS - 1) * nats) + nats
         share = nats / self._nats
         self.offset_m += share * (offset_m - self.offset_m)
         self._slope += share * (slope - self._slope)
