@@ -350,9 +350,11 @@ class Navigator:
             first_m = around.first_blocked_m(drive.ahead(now, LOOK_M), room_m, *look)
         # 2. Without a way around it, drive up to the obstacle and wait.
         left_m = first_m - self.collision.front_m - 2 * self.collision.stop_m
-        if left_m <= 0 and wanted.velocity_mps > 0:
-            return following, None, CROSSES if around.moves else STANDS
         braking_mps = math.sqrt(2 * BRAKE_SHARE * pursuit.acceleration_mps2 * max(left_m, 0.0))
+        if (
+            wanted.velocity_mps > 0 and braking_mps < pursuit.least_mps
+        ):  # It is there: slower than that it would not move.
+            return following, None, CROSSES if around.moves else STANDS
         share = min(1.0, braking_mps / wanted.velocity_mps) if wanted.velocity_mps > 0 else 1.0
         slower = Setpoint(share * wanted.velocity_mps, wanted.heading_rad, share * wanted.yaw_rate_radps)
         return following, slower, ""
