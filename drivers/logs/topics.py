@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import NamedTuple
 
 from drivers.errors import DriverError
@@ -26,49 +26,32 @@ def choose_topics(log: str, topics: Mapping[str, str], wanted: Mapping[Camera, s
     choice is ambiguous.
     """
     images = [name for name, kind in topics.items() if kind in IMAGE_TYPES and not name.endswith("/compressedDepth")]
-    if not topics:
-        raise DriverError(f"no messages can be read in {log}: `omnid log info` says whether it was cut")
     if not images:
         raise DriverError(
-            f"no image topics in {log}: found {listed(topics)}; record {IMAGE} or {COMPRESSED_IMAGE} of both cameras"
+            f"no image topics in {log}: found {listed(topics, 'no messages')}; record {IMAGE} or {COMPRESSED_IMAGE} of "
+            "both cameras; `omnid log info` says whether the log was cut"
         )
-    # 1. Requested topics; image_transport publishes an image raw, compressed, or both.
     found: dict[Camera, str] = {}
     for camera, name in wanted.items():
-        if name is None:
-            continue
-        transports = name, f"{name}{_COMPRESSED}", name.removesuffix(_COMPRESSED)
-        topic = next((topic for topic in transports if topic in topics), name)
-        if topic not in topics:
-            raise DriverError(f"no topic {topic!r} in {log}: found {listed(topics)}; give one of these")
-        if topics[topic] not in IMAGE_TYPES:
-            holds = topics[topic] or "no CDR"
-            raise DriverError(f"topic {topic!r} in {log} holds {holds}; give one of: {listed(topics)}")
-        found[camera] = topic
-    # 2. Topics named after a camera, by the first word that names one: /upper/down_sampled is the upper camera.
-    free = [name for name in images if name not in found.values()]
-    words = {name: [word for word in re.split(r"[^a-z0-9]+", name.lower()) if word in _WORDS] for name in free}
-    for camera in CAMERAS:
-        mine = [name for name in free if words[name] and _WORDS[words[name][0]] == camera]
-        if camera in found or not mine:
-            continue
-        if len(_images(mine)) > 1:
-            raise DriverError(
-                f"several {camera} cameras in {log}: found {listed(mine)}; give one of them by --{camera}"
-            )
-        found[camera] = max(mine, key=lambda name: name.endswith(_COMPRESSED))
-    if not found and len(_images(images)) > 1:
-        raise DriverError(f"cannot tell the cameras in {log} apart: found {listed(images)}; give --lower and --upper")
-    for camera in CAMERAS:
-        if camera not in found:
-            raise DriverError(f"no {camera} camera in {log}: found only {listed(images)}; give --{camera} TOPIC")
+        if name is not None:
+            # image_transport publishes an image raw, compressed, or both.
+            transports = name, f"{name}{_COMPRESSED}", name.removesuffix(_COMPRESSED)
+            mine = [topic for topic in transports if topic in images][:1]
+        else:
+            mine = [topic for topic in images if _camera_of(topic) == camera]
+        if len({topic.removesuffix(_COMPRESSED) for topic in mine}) != 1:
+            named = f"{'several' if mine else 'no'} topics named after the {camera} camera"
+            problem = named if name is None else f"no topic {name!r} of images"
+            raise DriverError(f"{problem} in {log}: found {listed(images)}; give --lower and --upper")
+        found[camera] = max(mine, key=lambda topic: topic.endswith(_COMPRESSED))
     if found["lower"] == found["upper"]:
         raise DriverError(f"topic {found['lower']!r} of {log} is named for both cameras: expected two topics")
     return found
 
 
-def _images(names: Iterable[str]) -> set[str]:
-    return {name.removesuffix(_COMPRESSED) for name in names}
+def _camera_of(topic: str) -> Camera | None:
+    """Return the camera of the first word that names one: /upper/down_sampled is of the upper camera."""
+    return next((_WORDS[word] for word in re.split(r"[^a-z0-9]+", topic.lower()) if word in _WORDS), None)
 
 
 class MotionTopics(NamedTuple):

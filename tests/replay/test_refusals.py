@@ -27,7 +27,7 @@ TABLE = (
     ("replay {folder}/text.mcap --rig {rig}", "text.mcap"),
     ("replay {folder}/chatter.mcap --rig {rig}", "no image topics"),
     ("replay {folder}/cut.mcap --rig {rig}", "`omnid log info`"),
-    ("replay {folder}/lower.mcap --rig {rig}", "no upper camera"),
+    ("replay {folder}/lower.mcap --rig {rig}", "named after the upper camera"),
     # Rigs.
     ("replay {log}", "omnid calibrate import"),
     ("replay {log} --rig {folder}/broken.toml", "broken.toml"),
