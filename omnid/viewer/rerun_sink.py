@@ -40,11 +40,11 @@ AXES_M, LEAST_M = 0.3, 0.05  # of the robot's axes; radius from which an ellipso
 SIGMAS: Final = 3.0  # radius of the ellipsoid in standard deviations
 # Colours, and sizes on the screen: the radii of lines and points, which do not depend on the distance [px]; of the path
 # by the state: the worse, the thicker.
-BLUE, GREEN, ORANGE, RED, YELLOW = "#56b4e9", "#009e73", "#e69f00", "#d55e00", "#f0e442"
+BLUE, GREEN, ORANGE, RED = "#56b4e9", "#009e73", "#e69f00", "#d55e00"
 GREY = "#969696"
 THIN, MEDIUM, THICK = 1.5, 2.5, 5.0
 STATES: Final = {"tracking": (BLUE, THIN), "degraded": (ORANGE, MEDIUM), "lost": (RED, THICK), "unknown": (GREY, THIN)}
-FEATURES: Final = {"inliers": BLUE, "rejected": RED, "new": YELLOW}
+FEATURES: Final = {"inliers": BLUE, "rejected": RED}
 PLOTS: Final = {
     "speed": "Speed",
     "yaw_rate": "Yaw rate",

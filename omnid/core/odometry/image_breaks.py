@@ -149,7 +149,8 @@ class ImageBreaks:
     _last_tear: Break | None = None
     _open: list[Break] = field(default_factory=list)  # displacements that have not ended
     _usual_cost: float = 0.0  # of a landmark in whole images: none is known yet, so that the first pairs are tested
-    _found: dict[tuple[Kind, tuple[int, ...]], list[Break]] = field(default_factory=dict)
+    # The first break of each kind and cameras, and the number of pairs that showed one.
+    _found: dict[tuple[Kind, tuple[int, ...]], tuple[Break, int]] = field(default_factory=dict)
     _read_out: dict[tuple[int, ...], ReadOut] = field(default_factory=dict)  # likeliest by cameras
 
     def add(
@@ -185,7 +186,7 @@ class ImageBreaks:
     def words(self) -> list[str]:
         """One line for each kind of break and the cameras that showed it."""
         read_out = [found.words(self.raws) for found in self._read_out.values()]
-        return [_words(breaks) for breaks in self._found.values()] + read_out
+        return [_words(first, pairs) for first, pairs in self._found.values()] + read_out
 
     @property
     def _is_broken(self) -> bool:
@@ -202,7 +203,8 @@ class ImageBreaks:
         """
         self._torn *= math.exp(-dt_s / MEMORY_S)
         if found is not None:
-            self._found.setdefault((found.kind, found.cameras), []).append(found)
+            first, pairs = self._found.get((found.kind, found.cameras), (found, 0))
+            self._found[found.kind, found.cameras] = first, pairs + 1
             if found.kind == "torn":
                 self._torn, self._last_tear = self._torn + found.gain, found
             else:
@@ -213,7 +215,7 @@ class ImageBreaks:
         shown = found or (self._last_tear if is_torn else None) or (self._open[-1] if self._open else None)
         read_out = self.lines.likeliest() if shown is None else None
         is_read = read_out is not None and read_out.gain > DECIDING_COST
-        self.fault = "" if shown is None else _words([shown])
+        self.fault = "" if shown is None else _words(shown)
         if read_out is not None and is_read:
             before_it = self._read_out.get(read_out.cameras, read_out)
             self._read_out[read_out.cameras] = max(read_out, before_it, key=lambda each: each.gain)
@@ -441,22 +443,20 @@ def _least_squares(A: Array, y: Array, weight: Array) -> Array:
     return np.asarray(np.linalg.solve(weighted.T @ A.reshape(-1, size) + np.diag(prior), weighted.T @ y.ravel()))
 
 
-def _words(breaks: list[Break]) -> str:
-    """Return what breaks of one kind in the same cameras were, and what to do."""
-    newest = breaks[0]
-    cameras = camera_names(newest.cameras)
-    row = round(float(np.median([found.line_px for found in breaks])))
-    shown = "1 pair shows" if len(breaks) == 1 else f"{len(breaks)} pairs show"
-    if newest.kind == "torn":
+def _words(found: Break, pairs: int = 1) -> str:
+    """Return what a break was that so many pairs showed, and what to do."""
+    cameras = camera_names(found.cameras)
+    shown = "1 pair shows" if pairs == 1 else f"{pairs} pairs show"
+    if found.kind == "torn":
         return (
-            f"images of the {cameras} are torn at row {row}: what is below is of another moment than what is "
+            f"images of the {cameras} are torn at row {found.line_px}: what is below is of another moment than what is "
             f"above, as {shown}; check bandwidth and buffers, poses were degraded"
         )
-    u, v = newest.amount[:, :2].mean(axis=0)
-    part = f" {'above' if newest.is_before else 'below'} row {newest.line_px}" if newest.line_px else ""
-    if not newest.line_px and len(newest.cameras) == 1:
-        part = f" against those of the {CAMERAS[1 - newest.cameras[0]]} one"
-    turned = f" and turned by {math.degrees(newest.amount[0, 2]):+.2f} deg" if newest.kind == "turned" else ""
+    u, v = found.amount[:, :2].mean(axis=0)
+    part = f" {'above' if found.is_before else 'below'} row {found.line_px}" if found.line_px else ""
+    if not found.line_px and len(found.cameras) == 1:
+        part = f" against those of the {CAMERAS[1 - found.cameras[0]]} one"
+    turned = f" and turned by {math.degrees(found.amount[0, 2]):+.2f} deg" if found.kind == "turned" else ""
     return (
         f"images of the {cameras} were displaced by {u:+.1f}, {v:+.1f} px{turned}{part}, as {shown}: the rig does not "
         "fit them; check the mirror, the sensor's window and the driver, poses were degraded"

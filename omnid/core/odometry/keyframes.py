@@ -68,8 +68,8 @@ class Keyframes:
         sparse = inliers < limits.refresh * self._limits.features and self._tracked_s >= limits.sparse_s
         return sparse or inliers < limits.refresh * self._most_inliers or inliers < limits.good_inliers
 
-    def add(self, request: KeyframeRequest) -> Array:
-        """Add a keyframe with new landmarks between the known ones; return the pixels (M, 2) of the new ones."""
+    def add(self, request: KeyframeRequest) -> None:
+        """Add a keyframe with new landmarks between the known ones."""
         frame = request.frame
         free = clear_around(request.usable, request.pixels, LANDMARK_SPACING_PX)
         points = corners(frame.lower, free, self._limits.features - len(request.pixels))
@@ -83,7 +83,6 @@ class Keyframes:
         if len(self._map) >= self._limits.min_inliers:
             self._relocaliser.add(replace(frame, exposure=request.exposure), keyframe)
         self._most_inliers, self._tracked_s = 0, 0.0
-        return new.pixels
 
 
 def located(

@@ -90,7 +90,6 @@ class VisualOdometry:
         self._step: Array | None = None  # last step by the cameras
         self._first: StereoFrame | None = None  # started the map before its velocity was known
         self._requested: KeyframeRequest | None = None  # keyframe that the last frame asked for, see complete
-        self._added: int | None = None  # seq of the keyframe that the last frame became
         self._distance_m = ROOM_M  # median of the landmarks by which the last pose was found
         self._cost: tuple[float, int] | None = None  # of those in view, and their number; None: no pose was found
         self.breaks = None if raw_images is None else ImageBreaks(model, raw_images, LineTimes(model, raw_images))
@@ -121,7 +120,6 @@ class VisualOdometry:
         requested, self._requested = self._requested, None
         if requested is not None:
             self._keyframes.add(requested)
-            self._added = requested.frame.seq
 
     def relocalise(self, frame: StereoFrame, exposure: Exposure) -> PoseEstimate | None:
         """Return the pose of a frame among the newest keyframes, refined by the patches of the local map in view."""
@@ -166,12 +164,10 @@ class VisualOdometry:
 
         # 6. Update the filter (eq. 11), the pose, the mask of what is fixed to the rig, and the map.
         self._accept(now, estimate, is_reset=bool(np.linalg.norm(gap[3:]) > JUMP_RAD))
-        new = estimate.pixels[self._map.table.anchor[estimate.landmarks] == self._added]
-        self._added = None
         exposure = self._exposure(frame, dt_s)
         self._map.give_up(contradicting)
         self._requested = self._update_map(now, estimate, exposure)
-        features, is_keyframe = Features(estimate.pixels, estimate.rejected, new), self._requested is not None
+        features, is_keyframe = Features(estimate.pixels, estimate.rejected), self._requested is not None
         exposure = exposure if is_keyframe else self._exposure(frame)
         result = self._result(estimate.tracked, estimate.inliers, features, exposure)
         return replace(result, is_keyframe=is_keyframe)
@@ -331,7 +327,7 @@ class VisualOdometry:
     def _start_map(self, now: _Prediction, *, carried: bool, is_elsewhere: bool = False) -> OdometryEstimate:
         """Start a map at the current pose if the frame has enough landmarks; the facts: see Tracking."""
         exposure = self._exposure(now.frame)
-        new = self._keyframes.add(self._request(now.frame, now.usable, exposure))
+        self._keyframes.add(self._request(now.frame, now.usable, exposure))
         if len(self._map) < self._limits.min_inliers:
             self._map.clear()
             self._tracking.miss(now.dt_s, carried=carried)
@@ -340,7 +336,7 @@ class VisualOdometry:
         self._motion.found(self._motion.pose_covariance)
         self._tracking.start(carried=carried, is_elsewhere=is_elsewhere)
         self._T_at_fix = self._T_odom_rect
-        return replace(self._result(len(self._map), len(self._map), Features(new=new), exposure), is_keyframe=True)
+        return replace(self._result(len(self._map), len(self._map), exposure=exposure), is_keyframe=True)
 
     def _update_map(self, now: _Prediction, estimate: PoseEstimate, exposure: Exposure) -> KeyframeRequest | None:
         """Remove lost landmarks; return the keyframe that is to be added, where too few are left."""

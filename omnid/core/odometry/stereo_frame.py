@@ -64,4 +64,3 @@ class Features:
 
     inliers: NDArray[np.float64] = field(default_factory=_no_pixels)  # landmarks that support the pose
     rejected: NDArray[np.float64] = field(default_factory=_no_pixels)  # tracked landmarks, no inliers
-    new: NDArray[np.float64] = field(default_factory=_no_pixels)  # inliers, of the keyframe before
