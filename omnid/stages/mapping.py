@@ -47,8 +47,8 @@ class Mapping:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Voxels of the map, voxels evicted for space, points that could not be mapped."""
-        return {"voxels": len(self._map), "evicted": self._map.evicted, "refused": self._map.refused}
+        """Voxels of the map."""
+        return {"voxels": len(self._map)}
 
     def process(self, message: OdometryUpdate | bool) -> MapUpdate | None:
         """Add the points of a pair; return the map when it is due. A bool: whether the map has a reader from now on."""

@@ -81,7 +81,6 @@ class KeyframeGrid:
         self._wanted_m, self._max_cells = cell_m, max_cells
         self._drawn: dict[int, Array] = {}  # x, y [m], yaw [rad] of the keyframes in it
         self._area = np.array([[np.inf] * 2, [-np.inf] * 2])  # lowest and highest x, y [m]
-        self.redrawn = 0
 
     def draw(self, keyframes: KeyframeScans, T_base_rect: Array) -> Grid:
         """Return the known part of the grid, in the axes of the base at the start of the map."""
@@ -117,7 +116,6 @@ class KeyframeGrid:
         width, height = (np.floor(area[1] / self._cell_m) - self._first + 1).astype(int)
         # Of obstacles; of the floor, by the views that have seen it; of what is narrow, by views that end, or pass it.
         self._odds, self._floor_odds, self._narrow_odds = np.zeros((3, height, width), np.int8)
-        self.redrawn += 1
 
     def _add(self, scan: Ranges, free_m: Ranges, pose: Array) -> None:
         """Add a scan (SECTORS,) at x, y, yaw, and up to where floor was seen there.

@@ -37,14 +37,12 @@ class VoxelMap:
     """Voxels in arrays that are sorted by their keys, of 52 bytes a voxel.
 
     Each voxel keeps the mean position weighted by information (1 / variance), its sum of weights, the number of frames
-    that saw it and the last of them. `evicted` counts voxels dropped for space, `refused` points that were not mapped:
-    not finite, of no valid variance, or outside +-2^20 voxels.
+    that saw it and the last of them. Points are not mapped that are not finite, of no valid
+    variance, or outside +-2^20 voxels.
     """
 
     def __init__(self, voxel_m: float = 0.05, most: int = 180_000) -> None:
         """voxel_m: edge of a voxel. most: largest number of voxels."""
-        self.evicted = 0
-        self.refused = 0
         self._voxel_m, self._most = voxel_m, most
         self._newest_seq = 0
         self._voxels = np.zeros(0, VOXEL)
@@ -58,7 +56,6 @@ class VoxelMap:
         half_span = 1 << (_AXIS_BITS - 1)
         usable = (np.abs(points) < half_span * self._voxel_m).all(axis=1)  # False for NaN and infinity
         usable &= np.isfinite(variance_m2) & (variance_m2 > 0.0)
-        self.refused += len(points) - int(usable.sum())
         self._newest_seq = max(self._newest_seq, seq)
         points, weight = points[usable], 1.0 / np.clip(variance_m2[usable], *_VARIANCE_RANGE_M2)
         index = np.floor(points / self._voxel_m).astype(np.int64) + half_span
@@ -104,5 +101,4 @@ class VoxelMap:
         # The sort is stable, so the key decides about ties.
         order = np.lexsort((self._confidence(), ~is_old))
         dropped = len(order) - int(_LOAD_AFTER_EVICTION * self._most)
-        self.evicted += dropped
         self._voxels = self._voxels[np.sort(order[dropped:])]

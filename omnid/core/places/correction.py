@@ -42,9 +42,7 @@ class MapCorrection:
         self._anchor: _Anchor | None = None
         self._is_due = False  # the next loop says how well the place of odom in the map is known
         self._waiting = 0  # loops since the last optimisation
-        self.rejected = 0  # loops that the graph refused
         self.factor = 1.0  # factor on odometry's covariance that the loops show
-        self.optimisations = 0
 
     def forget(self) -> None:
         """Forget the covariance in the map: odom has been continued after a gap, or its part has joined another one.
@@ -67,7 +65,6 @@ class MapCorrection:
         if may_wait and not self._is_due and all(map(self._fits, loops)):
             return
         self._waiting, self._is_due = 0, False
-        self.optimisations += 1
         # 2. The drift that the loops show, which weighs odometry in the graph.
         among = set(part)
         links = [link for link in places.links if link.a in among]
@@ -91,7 +88,6 @@ class MapCorrection:
         recent = [id(link) for link in links if link.is_loop][-RECENT:]
         bad = {id(links[n]) for n in np.flatnonzero(result.weights < ACCEPTED)}.difference(recent)
         places.links = [link for link in places.links if id(link) not in bad]
-        self.rejected += len(bad)
         # 5. The covariance of later poses in the map.
         newest = places.keyframes[part[-1]]
         if np.isfinite(result.covariance).all():

@@ -176,10 +176,7 @@ class MapLocaliser:
             "map_kb": self.places.nbytes // 1000,
             "loops": self.places.loops,
             "dropped": self.places.dropped,
-            "rejected": self.correction.rejected,
             "unjoined": max(0, len(self.places.parts()) - 1),
-            "ambiguous": self.search.ambiguous,
-            "refused": self.search.refused,
         }
 
     def map(self) -> PlaceMap:

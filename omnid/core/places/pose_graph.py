@@ -56,12 +56,6 @@ class PoseGraphResult:
     # (6, 6) [t; r] of the last node in its axes, relative to the fixed ones; infinite if neither odometry nor accepted
     # loops join it to one of them.
     covariance: Array
-    converged: bool
-
-    @property
-    def accepted(self) -> Flags:
-        """Flags (M,) of the edges that count."""
-        return self.weights > ACCEPTED
 
 
 def optimise(poses: Array, edges: PoseEdges, fixed: Flags | None = None) -> PoseGraphResult:
@@ -76,7 +70,7 @@ def optimise(poses: Array, edges: PoseEdges, fixed: Flags | None = None) -> Pose
     residual, J = graph.linearised(poses)
     # With this factor the cost is convex for the largest of the squared residuals.
     largest = float((residual[loop] ** 2).sum(axis=1).max(initial=0.0))
-    mu, converged = LARGEST_SQUARED / max(2 * largest - LARGEST_SQUARED, LARGEST_SQUARED), False
+    mu = LARGEST_SQUARED / max(2 * largest - LARGEST_SQUARED, LARGEST_SQUARED)
     for _ in range(MAX_STEPS):
         # 1. The weights of the loops at this mu; 2. one step of Gauss-Newton; 3. a steeper cost.
         weights[loop] = _weights((residual[loop] ** 2).sum(axis=1), mu)
@@ -84,15 +78,14 @@ def optimise(poses: Array, edges: PoseEdges, fixed: Flags | None = None) -> Pose
         poses = poses @ se3.exp(change)
         residual, J = graph.linearised(poses)
         decided = bool((np.minimum(weights, 1 - weights) < UNDECIDED).all())
-        converged = decided and float(np.abs(change).max()) < CONVERGED
-        if converged:
+        if decided and float(np.abs(change).max()) < CONVERGED:
             break
         mu *= STEEPER
     last = next(
         part for part in connected(range(len(poses)), edges.pairs[weights > ACCEPTED]) if part[-1] + 1 == len(poses)
     )
     covariance = graph.last_covariance(J, weights) if fixed[last].any() else np.full((6, 6), np.inf)
-    return PoseGraphResult(poses, weights, covariance, converged)
+    return PoseGraphResult(poses, weights, covariance)
 
 
 class _Graph:

@@ -102,14 +102,12 @@ class Expected:
 
 
 class PlaceSearch:
-    """Finds frames among keyframes, and counts what it refuses."""
+    """Finds frames among keyframes."""
 
     def __init__(self, model: StereoModel) -> None:
         self._model = model
         self._signatures: dict[int, Signature] = {}
-        self.ambiguous = 0  # frames that fit two places equally well
-        self.refused = 0  # recognitions that odometry contradicts
-        self.contradicted = 0  # the newest of them, without one that odometry confirms in between
+        self.contradicted = 0  # recognitions in a row that odometry contradicts
 
     def find(
         self, small: Thumbnail, features: PlaceFeatures, places: PlaceMap, where: Expected | list[int]
@@ -130,13 +128,11 @@ class PlaceSearch:
             ids = [ids[n] for n in ranked[: effort.voted].tolist()]
         # 2. Votes and geometry of these: the best one, unless another place is as similar.
         known = {id: places.keyframes[id].features for id in ids}
-        best, found = search(features, known, places.poses, effort, self._model)
-        self.ambiguous += best is None and any(place is not None and place.has(effort) for place in found.values())
+        best = search(features, known, places.poses, effort, self._model)
         # 3. Unless odometry contradicts it.
         if best is None or not isinstance(where, Expected):
             return best
         is_confirmed = where.confirms(best, places.poses)
-        self.refused += not is_confirmed
         self.contradicted = 0 if is_confirmed else self.contradicted + 1
         return best if is_confirmed else None
 
@@ -156,8 +152,8 @@ def search(
     poses: Mapping[int, Array],
     effort: Effort,
     model: StereoModel,
-) -> tuple[Recognition | None, dict[int, Recognition | None]]:
-    """Return the place that a frame shows, None where none has the support or two have it; and all that were compared.
+) -> Recognition | None:
+    """Return the place that a frame shows, None where none has the support or two have it.
 
     known: features of each keyframe; poses: (4, 4) of each. Those are compared for which most features of the frame
     vote, at most PER_PLACE near another one, so that a second, similar place is compared as well, although all
@@ -182,8 +178,8 @@ def search(
         moved_m, turned_rad = motion_between(T_best, T_other)
         is_elsewhere = moved_m > RUNNER_UP_M or turned_rad > RUNNER_UP_RAD
         if is_elsewhere and other.inliers > RUNNER_UP * best.inliers:
-            return None, found
-    return best, found
+            return None
+    return best
 
 
 def recognise(

@@ -51,7 +51,7 @@ class Relocaliser:
         keyframes = {keyframe.seq: keyframe for _, keyframe in self._kept}
         poses = {seq: keyframe.T_odom_rect for seq, keyframe in keyframes.items()}
         effort = NEAR._replace(compared=len(keyframes))
-        best, _ = search(here, self._features, poses, effort, self._model)
+        best = search(here, self._features, poses, effort, self._model)
         if best is None:
             return None
         A = se3.adjoint(se3.inverse(best.T_place_rect))

@@ -91,7 +91,7 @@ def test_loops_halve_the_error_and_odom_never_jumps(
         for pose, frame, T in zip(found, drive, truth, strict=True)
     ]
     assert by_odometry[-1] > 0.1 and in_map[-1] < 0.3 * by_odometry[-1]
-    assert localiser.counts["loops"] >= 5 and localiser.counts["rejected"] == 0
+    assert localiser.counts["loops"] >= 5
     # The map's end error lies within what the covariance says, which is far less than that of odometry.
     sigma = float(np.sqrt(np.trace(found[-1].covariance[:3, :3])))
     assert in_map[-1] < 4 * sigma and sigma < 0.1
