@@ -106,6 +106,9 @@ class MotionHypotheses:
         The first candidate is the pose that was found first, the others are of peaks. sigma_mps: standard deviation of
         the predicted velocity.
         """
+        if self.is_single and len(candidates) == 1:
+            self._left = [Hypothesis(self._left[0].displacement, np.zeros(3))]
+            return candidates[0], np.zeros(0, np.intp)
         # 1. Costs of the images. Those of poses by wrong and by right depths do not decide: the motion does.
         cheapest = min(candidates, key=lambda each: each.cost)
         costs = np.array([_cost(each, cheapest) for each in candidates])

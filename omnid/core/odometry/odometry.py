@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.odometry.corners import corners
 from omnid.core.odometry.estimates import ROOM_M, OdometryEstimate, OdometryLimits, PoseEstimate
-from omnid.core.odometry.exposure_times import Exposure
+from omnid.core.odometry.exposure_times import NO_VELOCITY, Exposure
 from omnid.core.odometry.image_breaks import ImageBreaks
 from omnid.core.odometry.keyframes import KeyframeLocaliser, KeyframeRequest, Keyframes
 from omnid.core.odometry.line_times import LineTimes, RawImage
@@ -188,7 +188,8 @@ class VisualOdometry:
 
     def _exposure(self, frame: StereoFrame, dt_s: float = 0.0) -> Exposure:
         """Return the exposure of a frame by the filter's velocity, after a step of dt_s was predicted to it."""
-        return Exposure.of(frame.times, self._motion.at_exposure(dt_s), self._model)
+        motion = NO_VELOCITY if frame.times.is_at_once else self._motion.at_exposure(dt_s)
+        return Exposure(frame.times, motion, self._model)
 
     def _find(self, now: _Prediction) -> list[PoseEstimate]:
         """Return the pose of a frame in the map, and those of other motions; none: no landmarks were found."""

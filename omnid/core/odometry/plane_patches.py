@@ -79,16 +79,16 @@ def plane_templates(
     anchor without an image.
     """
     templates = np.empty((len(pixels), window_px + 2, window_px + 2), np.float32)
-    focal_px = model.cylinder.focal_px
+    if not len(pixels):
+        return templates
+    # All panoramas of a run have the same columns.
+    focal_px, centres = model.cylinder.focal_px, _padded(images[int(anchors[0])], pixels)
     points, normals = np.ascontiguousarray(surfaces[0]), _normals(surfaces, model.baseline_m)
     shift = np.ascontiguousarray(np.rint(predicted) - predicted)
     height_m = model.baseline_m if upper else 0.0
     for key in np.unique(anchors).tolist():
-        image, chosen = images[key], np.flatnonzero(anchors == key)
-        centres = _padded(image, pixels)
-        patch_kernels.sample(
-            image.image, chosen, centres, points, normals, T_curr_ref, height_m, shift, focal_px, templates
-        )
+        image, chosen = images[key].image, np.flatnonzero(anchors == key)
+        patch_kernels.sample(image, chosen, centres, points, normals, T_curr_ref, height_m, shift, focal_px, templates)
     return templates
 
 

@@ -123,10 +123,10 @@ def gauss_newton(
     shared = SharedError.none(len(views)) if shared is None else shared
     size = 6 + len(shared.covariance)
     prior = np.diag(np.full(size, DAMPING))
-    prior[6:, 6:] += np.linalg.inv(shared.covariance)
-    S = np.tile(model.sigma_px**2 * np.eye(3), (len(views), 1, 1))
-    if noise is not None:
-        S += noise
+    if len(shared.covariance):
+        prior[6:, 6:] += np.linalg.inv(shared.covariance)
+    of_corner = model.sigma_px**2 * np.eye(3)
+    S = np.tile(of_corner, (len(views), 1, 1)) if noise is None else np.ascontiguousarray(of_corner + noise)
     T, error, squared, inverse = np.array(T), np.zeros(size - 6), np.empty(len(views)), np.empty((size, size))
     landmarks, covariance, views = map(np.ascontiguousarray, (landmarks, covariance, views))
     derivatives = np.ascontiguousarray(shared.derivatives)
