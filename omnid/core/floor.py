@@ -9,7 +9,7 @@ A part p lies on the floor, the others above it, evenly over S (walls, furniture
 lie below the floor: a table is not a floor. The prior of a and b is 0 +- 1 degree. h is searched on a grid, with S = h;
 then expectation maximisation (Dempster, Laird, Rubin 1977) finds h, a, b, p and the noise's scale, with S = SPAN_M.
 The evidence for a floor is the log of the ratio of the likelihoods with it (p) and without (p = 0). Points of one
-surface share their errors: POINTS_ALIKE of them count as one. The evidence of pairs adds up.
+surface share their errors: CORRELATED_POINTS of them count as one. The evidence of pairs adds up.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ ITERATIONS: Final = 40
 CONVERGED: Final = 1e-5  # m, rad; so that what is left is less than a 300th of RIG_SIGMAS
 # Fitted on rendered logs (the sample, rooms 601, two_walls 601), where a line gives no other reason: pairs scatter by
 # 6 mm and 0.3 degrees.
-POINTS_ALIKE: Final = 20.0
+CORRELATED_POINTS: Final = 20.0
 LEAST_EVIDENCE: Final = 5.0  # Log-likelihood ratio from which a run has a floor, because it is odds of 150 to 1.
 LEAST_OF_PAIR: Final = 0.5  # a pair with less shows no floor
 # Sectors of ten degrees, and those of them in which the floor must be seen, because a smaller part of a turn determines
@@ -122,7 +122,7 @@ def fit_floor(points: Array, variance_m2: Array) -> FloorFit | None:
         near = np.abs(e) < SPAN_M
         on, off = _densities(e, scale * seen.sigma_m, SPAN_M)
         share = np.where(near, part * on / (part * on + (1 - part) * off), 0.0)
-        weight = share / (scale * seen.sigma_m) ** 2 / POINTS_ALIKE
+        weight = share / (scale * seen.sigma_m) ** 2 / CORRELATED_POINTS
         information = A.T @ (weight[:, None] * A) + prior
         total, before = float(share.sum()), q
         if total < 1.0:
@@ -133,7 +133,7 @@ def fit_floor(points: Array, variance_m2: Array) -> FloorFit | None:
         if np.abs(q - before).max() < CONVERGED:
             break
     # 4. The evidence, and the directions in which the floor is seen.
-    evidence = float(np.log((part * on + (1 - part) * off) / off)[near].sum()) / POINTS_ALIKE
+    evidence = float(np.log((part * on + (1 - part) * off) / off)[near].sum()) / CORRELATED_POINTS
     x, y = seen.xyz[share > 0.5, :2].T
     sectors = len(np.unique(np.floor(np.arctan2(y, x) * (SECTORS / (2 * math.pi)))))
     if evidence < LEAST_OF_PAIR or sectors < LEAST_SECTORS or q[0] < HEIGHTS_M[0]:

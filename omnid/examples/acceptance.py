@@ -31,8 +31,8 @@ PLACING_M, ACCEPTED = 0.01, 0.005  # error of placing a robot by eye; accepted e
 Array = NDArray[np.float64]
 
 
-def stands(stamps_s: Array, T: Array) -> list[int]:
-    """Return the indices of the middle poses of all stands; T (N, 4, 4): T_odom_base."""
+def rests(stamps_s: Array, T: Array) -> list[int]:
+    """Return the indices of the middle poses of all rests; T (N, 4, 4): T_odom_base."""
     middles, first, yaw_rad = [], 0, np.unwrap(se3.yaw(T))
     while first < len(T):
         moved = np.linalg.norm((T[first:] - T[first])[:, :, -1], axis=1) > STAND_M
@@ -45,7 +45,7 @@ def stands(stamps_s: Array, T: Array) -> list[int]:
 
 
 def visits(xyz: Array, rests: list[int], distance_m: float) -> list[int]:
-    """Return the poses on A, B, A, ...: of several stands on one mark the last one of the first A, else the first."""
+    """Return the poses on A, B, A, ...: of several rests on one mark the last one of the first A, else the first."""
     found: list[int] = []
     for pose in rests:
         from_a_m = math.dist(xyz[pose], xyz[rests[0]])
@@ -62,10 +62,10 @@ def visits(xyz: Array, rests: list[int], distance_m: float) -> list[int]:
 def judge(stamps_s: Array, T: Array, distance_m: float) -> int:
     """Print the errors of each round; return 1 where one is not accepted."""
     xyz = T[:, :-1, -1]
-    marks = visits(xyz, stands(stamps_s, T), distance_m)
+    marks = visits(xyz, rests(stamps_s, T), distance_m)
     if len(marks) < 3:
         found = f"on B {distance_m:g} m away, and on A; found {len(marks)}"
-        raise OmnidError(f"expected stands of {STAND_S:g} s on A, {found}")
+        raise OmnidError(f"expected rests of {STAND_S:g} s on A, {found}")
     legs_m = np.array([math.dist(xyz[a], xyz[b]) for a, b in pairwise(marks)])
     for leg, length_m in enumerate(legs_m):
         print(f"{'AB'[leg % 2]} to {'BA'[leg % 2]} {length_m:.4f} m, {length_m / distance_m - 1:+.2%}")

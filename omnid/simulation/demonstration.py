@@ -67,7 +67,7 @@ class TeachAndRepeat:
         if not moment.controller.armed:
             yield "arm"
             return
-        self._tell(moment, "is taught the route: it is driven along an oval")
+        self._begin(moment, "is taught the route: it is driven along an oval")
         yield RouteRequest(RouteAction.TEACH, ROUTE, replace=True)  # that of an earlier demonstration
         yield PathRequest(NavigationFrame.ODOM, oval(), 0.0)
 
@@ -85,7 +85,7 @@ class TeachAndRepeat:
                     yield "end"
                 return
             self._taught = True
-            self._tell(moment, "repeats the route in the map that it has made")
+            self._begin(moment, "repeats the route in the map that it has made")
             self.repeated_s = moment.time_s
             yield RouteRequest(RouteAction.FINISH)
             yield RouteRequest(RouteAction.REPEAT, ROUTE)
@@ -93,7 +93,7 @@ class TeachAndRepeat:
             self.end = NavigationState.REACHED
             yield "end"
 
-    def _tell(self, moment: Moment, text: str) -> None:
+    def _begin(self, moment: Moment, text: str) -> None:
         self._asked_s = moment.time_s
         self._show(f"{moment.time_s:5.1f} s: {text}")
 

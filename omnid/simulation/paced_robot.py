@@ -63,7 +63,7 @@ class PacedLink:
         self._vehicle.post(self._contacts)
 
     def end(self) -> None:
-        """Let `commands` end when the last ones are taken; the simulation makes sure that the wheels are at rest."""
+        """Let `commands` end after the last one; the simulation makes sure that the wheels are at rest."""
         self._commands.put(None)
 
     def commands(self) -> Iterator[VelocityCommand]:

@@ -1,7 +1,7 @@
 """A robot in simulated time: x(k+1) = f(x(k), u(k), dt) of its body, with its cameras and the real controller.
 
 Time passes from pair to pair of images, with the ticks of the controller between them. Before the tick at a pair time
-stands still until the images of the pair before have been answered: `wait` of `Vehicle.pairs`. In lock-step the stages
+stops until the images of the pair before have been answered: `wait` of `Vehicle.pairs`. In lock-step the stages
 run inline, so nothing is waited for. A daemon in other threads is waited for, so that a busy computer slows the robot
 down and changes nothing else: poses take longer than a tick to the wheels, so that the next pair can be rendered while
 the daemon works on the last.

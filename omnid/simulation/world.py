@@ -1,4 +1,4 @@
-"""A simulated world: what stands in it, who walks along polylines, its light, and what a robot may touch."""
+"""A simulated world: its walls and things, people who walk along polylines, its light, and what a robot may touch."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ class World:
     brightness: float = 1.0  # factor on the grey of all images
 
     def T_world_base(self, pose: Pose) -> Array:
-        """Return the pose (4, 4) of a base that stands there; x, y and heading are those of its middle."""
+        """Return the pose (4, 4) of a base there; x, y and heading are those of its middle."""
         x_m, y_m, heading_rad = pose
         return se3.transform(se3.rotation_exp([0.0, 0.0, heading_rad]), [x_m, y_m, 0.0])
 

@@ -18,10 +18,9 @@ from calib import se3
 from calib.models.camera import Mask
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera
-from omnid.simulation.rendering.shapes import box
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
 from omnid.simulation.robot import make_robot, with_masks
-from omnid.simulation.world import clearance_m, footprints
+from omnid.simulation.world import clearance_m
 from tests.simulation import build, corridor, render, render_grey, write_log
 from tests.simulation.disturbances import Mirror, reflectance
 from tests.simulation.harmless_worlds import FLOORS, NAMES, can_drive
@@ -234,20 +233,3 @@ def test_a_ramp_lifts_and_pitches_the_base() -> None:
         T = world.T_world_base((middle_m, 0.0, heading_rad))
         assert T[2, 3] == pytest.approx(2.0 * math.tan(math.radians(5.0)), abs=1e-6)
         assert math.degrees(math.asin(T[2, 0])) == pytest.approx(sign * 5.0, abs=1e-6)
-
-
-def upright(height_m: float, from_m: float = 0.0) -> Rectangle:
-    """Return a wall along x from 0 to 2 at y 1."""
-    top = np.array([0.0, 1.0, from_m + height_m])
-    return Rectangle(top, np.array([2.0, 0, 0]), np.array([0, 0, -height_m]), np.zeros((8, 8), np.uint8), "wall")
-
-
-def test_the_clearance_is_that_of_the_outline_from_what_is_neither_driven_over_nor_under() -> None:
-    for wall in (upright(0.01), upright(1.0, from_m=0.6)):
-        assert footprints([wall], 0.5).shape == (0, 2, 2)
-    assert clearance_m(np.zeros((0, 2, 2)), (1.0, 1.0), 0.2) == np.inf
-    segments = footprints([upright(1.0)], 0.5)
-    assert clearance_m(segments, (1.0, 0.0), 0.2) == pytest.approx(0.8)
-    assert clearance_m(segments, (3.0, 1.0), 0.2) == pytest.approx(0.8) and clearance_m(segments, (1.0, 0.9), 0.2) < 0
-    around = footprints(box(np.random.default_rng(1), (5.0, 5.0), (1.0, 1.0, 0.5), 0.0), 0.4)
-    assert clearance_m(around, (5.0, 3.5), 0.2) == pytest.approx(0.8)

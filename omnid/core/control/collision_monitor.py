@@ -41,7 +41,7 @@ class CollisionSettings:
     side_m: float = 0.04  # free space that it needs at its sides, m
     time_s: float = 1.5  # time to collision that it keeps: speed <= distance / time_s, s
     slow_m: float = 0.5  # an obstacle nearer than this ahead slows it down to slow_mps, m
-    slow_side_m: float = 0.12  # the same beside its way, m
+    slow_side_m: float = 0.12  # the same at the side of its way, m
     slow_mps: Annotated[float, Meta(ge=0.01, le=10), "speed near obstacles and into the unknown, m/s"] = 0.2
     unknown: Annotated[
         Literal["stop", "slow"],
@@ -227,7 +227,7 @@ class CollisionMonitor:
         if share == 0.0 and to_heading:
             motion = Twist(0.0, motion.yaw_rate_radps)
             share = self._judged(now_ns, motion).share
-        # 3. Scale both speeds alike.
+        # 3. Scale both speeds by the same share.
         return motion if share >= 1.0 else Twist(share * motion.velocity_mps, share * motion.yaw_rate_radps)
 
     def follow(self, now_ns: int, motion: Twist) -> None:
@@ -361,7 +361,7 @@ class CollisionMonitor:
         return allowance
 
     def _capped(self, motion: Twist, speed_mps: float, reason: str) -> Allowance:
-        """Return the share at which the speed is at most so high; turns on the spot slow down alike."""
+        """Return the share at which the speed is at most so high; turns on the spot slow down by the same share."""
         if speed_mps <= 0.0:
             return Allowance(0.0, reason)
         edge_mps = max(abs(motion.velocity_mps), abs(motion.yaw_rate_radps) * self._outline.radius_m)

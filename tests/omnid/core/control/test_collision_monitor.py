@@ -85,19 +85,6 @@ def test_a_stopped_base_does_not_creep_on_when_the_scan_changes_by_a_cell() -> N
     assert monitor.step(17 * S, Twist(0.0, 1.0)) == Twist(0.0, 1.0)
 
 
-def test_a_stopped_base_obeys_another_direction_and_a_slow_command() -> None:
-    monitor = CollisionMonitor(replace(SETTINGS, slow_m=0.0), 1.5)
-    for distance_m, motion, moves in (
-        (0.405, AHEAD, False),
-        (0.44, AHEAD, False),
-        (0.44, Twist(0.03), True),
-        (0.405, AHEAD, False),
-        (0.44, Twist(-0.4), True),
-    ):
-        monitor.set_scan(ControllerScan(10 * S, with_points((distance_m, 0.0))))
-        assert (monitor.step(10 * S, motion).velocity_mps != 0) == moves
-
-
 @pytest.mark.hazard("H16")
 def test_drives_slowly_past_what_is_beside_its_way() -> None:
     allowed, reason = after(with_points((0.6, 0.3)))
