@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.logs.image_folder import IMAGE_SUFFIXES
 from drivers.logs.mcap_writer import is_locked, lock
 from drivers.logs.open_log import is_log_name
 from omnid.core.mapping.voxel_map import MapPoints
@@ -31,7 +32,7 @@ REPLACED: Final = {"--cloud": (".ply",), "--plan": (".png",), "--ply": (".ply",)
 def check_outputs(outputs: Named, inputs: Named) -> None:
     """Check that all outputs (option, path) can be written, and none is another one, an input (name, path) or in use.
 
-    Of an input that is a folder, the logs in it are inputs as well. Leaves no file behind. Raises OmnidError.
+    Of a folder that is an input, the logs and images are inputs as well. Leaves no file behind. Raises OmnidError.
     """
     used = {_identity(path): what for what, path in inputs}
     folders = [folder.resolve() for _, folder in inputs if folder.is_dir()]
@@ -41,7 +42,8 @@ def check_outputs(outputs: Named, inputs: Named) -> None:
         if not wrong and other != option and path.exists() == path.is_file():
             wrong = f"this is {other} as well"
         folder = next((folder for folder in folders if folder in path.resolve().parents), None)
-        if not wrong and folder is not None and is_log_name(path.name) and path.is_file():
+        is_image = path.suffix.lower() in IMAGE_SUFFIXES and option != "--plan"
+        if not wrong and folder is not None and (is_image or is_log_name(path.name)) and path.is_file():
             wrong = f"this is a file of {folder}, which is read"
         if wrong:
             raise OmnidError(f"{option} {path}: {wrong}; name another file")
