@@ -99,11 +99,11 @@ class Import:
 
 
 @cache
-def imports(root: Path) -> tuple[Import, ...]:
+def imports() -> tuple[Import, ...]:
     """Return all imports of the product, at the top of files or within functions."""
     found = []
-    for path in sorted(path for layer in LAYERS for path in (root / layer).rglob("*.py")):
-        package = path.relative_to(root).parts[:-1]
+    for path in sorted(path for layer in LAYERS for path in (ROOT / layer).rglob("*.py")):
+        package = path.relative_to(ROOT).parts[:-1]
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             if isinstance(node, ast.Import):
                 names = [alias.name for alias in node.names]
@@ -113,39 +113,39 @@ def imports(root: Path) -> tuple[Import, ...]:
                 names = [".".join([*base, alias.name]) for alias in node.names]
             else:
                 continue
-            found += [Import(path.relative_to(root).as_posix(), name) for name in names]
+            found += [Import(path.relative_to(ROOT).as_posix(), name) for name in names]
     return tuple(found)
 
 
 @cache
-def room_of_module(module: str, root: Path) -> str | None:
+def room_of_module(module: str) -> str | None:
     """Return the room that an imported name lies in; None for what is not ours."""
     parts = module.split(".")
     if parts[0] not in LAYERS:
         return None
-    while len(parts) > 1 and not (path := root.joinpath(*parts)).is_dir():
+    while len(parts) > 1 and not (path := ROOT.joinpath(*parts)).is_dir():
         if path.with_suffix(".py").exists():
-            return Import(path.with_suffix(".py").relative_to(root).as_posix(), "").room
+            return Import(path.with_suffix(".py").relative_to(ROOT).as_posix(), "").room
         parts.pop()
     return ".".join(parts)
 
 
-def measured_arrows(root: Path) -> dict[str, set[str]]:
+def measured_arrows() -> dict[str, set[str]]:
     """Return for each room the other rooms that its files import."""
-    files = [path.relative_to(root).as_posix() for layer in LAYERS for path in (root / layer).rglob("*.py")]
+    files = [path.relative_to(ROOT).as_posix() for layer in LAYERS for path in (ROOT / layer).rglob("*.py")]
     arrows: dict[str, set[str]] = {Import(file, "").room: set() for file in files}
-    for each in imports(root):
-        target = room_of_module(each.name, root)
+    for each in imports():
+        target = room_of_module(each.name)
         if target not in (None, each.room):
             arrows[each.room].add(str(target))
     return arrows
 
 
-def breaches(rule: Rule, root: Path) -> list[str]:
+def breaches(rule: Rule) -> list[str]:
     """Return every import that the rule forbids, as "file: module"."""
     return [
         f"{each.file}: {each.name}"
-        for each in imports(root)
+        for each in imports()
         if f"{each.room}.".startswith(f"{rule.room}.") and each.file not in rule.excepted
         if any(f"{each.name}.".startswith(f"{forbidden}.") for forbidden in rule.forbidden)
     ]
@@ -163,7 +163,7 @@ def tier_of(room: str) -> int | None:
 
 
 def test_every_room_has_a_tier_and_every_tier_names_rooms_that_exist() -> None:
-    rooms = set(measured_arrows(ROOT))
+    rooms = set(measured_arrows())
     named = [name for names in TIERS.values() for name in names.split()]
     assert [room for room in sorted(rooms) if tier_of(room) is None] == []
     assert sorted(set(named)) == sorted(named)
@@ -173,7 +173,7 @@ def test_every_room_has_a_tier_and_every_tier_names_rooms_that_exist() -> None:
 def test_imports_point_to_the_same_or_a_lower_tier() -> None:
     upward = [
         f"{room} -> {target}"
-        for room, targets in measured_arrows(ROOT).items()
+        for room, targets in measured_arrows().items()
         for target in sorted(targets)
         if (tier_of(room) or 0) < (tier_of(target) or 0)
     ]
@@ -181,34 +181,11 @@ def test_imports_point_to_the_same_or_a_lower_tier() -> None:
 
 
 def test_rooms_do_not_import_each_other_in_circles() -> None:
-    TopologicalSorter(measured_arrows(ROOT)).prepare()  # raises CycleError with the rooms of the circle
+    TopologicalSorter(measured_arrows()).prepare()  # raises CycleError with the rooms of the circle
 
 
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: f"{rule.room} without {rule.forbidden[0]}")
 def test_rooms_keep_clear_of_modules_that_are_not_theirs(rule: Rule) -> None:
     assert ROOT.joinpath(*rule.room.split(".")).is_dir()
     assert all((ROOT / path).exists() for path in rule.excepted)
-    assert breaches(rule, ROOT) == []
-
-
-@pytest.mark.parametrize(
-    ("name", "text", "room", "target", "is_breach"),
-    [
-        ("calib/fit/a.py", "from drivers import frame", "calib.fit", "drivers.frame", True),
-        ("calib/a.py", "def f():\n    import omnid.engine.graph as g", "calib.a", "omnid.engine", True),
-        ("omnid/engine/a.py", "from ..core import stereo", "omnid.engine", "omnid.core.stereo", False),
-        ("omnid/a.py", "from omnid.core.stereo.sad import X", "omnid.a", "omnid.core.stereo", False),
-        ("omnid/stages/a.py", "import os, threading", "omnid.stages", None, True),
-        ("omnid/core/a.py", "import logging.handlers", "omnid.core", None, True),
-        ("calib/a.py", "import timeit, numpy as np", "calib.a", None, False),
-        ("omnid/engine/graph.py", "import threading", "omnid.engine", None, False),
-    ],
-)
-def test_an_arrow_and_a_forbidden_module_are_found(
-    tmp_path: Path, name: str, text: str, room: str, target: str | None, is_breach: bool
-) -> None:
-    for module in ("drivers/frame", "omnid/engine/graph", "omnid/core/stereo/sad", "calib/b", name[:-3]):
-        (tmp_path / module).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / f"{module}.py").write_text(text if module == name[:-3] else "", "utf-8")
-    assert measured_arrows(tmp_path)[room] == ({target} if target else set())
-    assert any(breaches(rule, tmp_path) for rule in RULES) == is_breach
+    assert breaches(rule) == []

@@ -38,17 +38,7 @@ MASKED = (
     *("dpkg-db-backup.timer", "e2scrub_all.timer", "e2scrub_reap.service", "fstrim.timer", "getty.target"),
     *("getty@tty1.service", "serial-getty@ttyS0.service"),
 )
-TOOLS = {"qemu-system-x86_64": "qemu-system-x86"}
-BUILD_TOOLS = {
-    "mmdebstrap": "mmdebstrap",
-    "mke2fs": "e2fsprogs",
-    "depmod": "kmod",
-    "cpio": "cpio",
-    "make": "make",
-    "busybox": "busybox-static",
-    "gcc-12": "gcc-12",
-    "xz": "xz-utils",
-}
+BUILD_TOOLS = ("mmdebstrap", "mke2fs", "depmod", "cpio", "make", "busybox", "gcc-12", "xz")
 
 
 class ImageUnavailableError(Exception):
@@ -66,11 +56,11 @@ def image() -> Path:
     mounts the disk; and root.ext4, of which guests write to a snapshot. Raises ImageUnavailableError where it is
     neither cached nor can be built.
     """
-    _require(TOOLS)
+    _require("qemu-system-x86_64")
     pins, kernel = pinned(), kernel_package()
     folder = cache_folder() / f"{kernel.removeprefix('linux-image-')}-{_digest(pins)}"
     if not (folder / "root.ext4").exists():
-        _require(BUILD_TOOLS)
+        _require(*BUILD_TOOLS)
         if os.geteuid() != 0:
             raise ImageUnavailableError(
                 f"no image in {cache_folder()}: build it once by `sudo {sys.executable} -m tests.hardware.image`"
@@ -110,10 +100,10 @@ def _digest(pins: Iterable[str]) -> str:
     return digest.hexdigest()[:8]
 
 
-def _require(tools: dict[str, str]) -> None:
-    missing = [package for tool, package in tools.items() if shutil.which(tool) is None]
+def _require(*tools: str) -> None:
+    missing = [tool for tool in tools if shutil.which(tool) is None]
     if missing:
-        raise ImageUnavailableError(f"missing tools: apt-get install {' '.join(missing)}")
+        raise ImageUnavailableError(f"missing programs: {' '.join(missing)}")
 
 
 def _build(folder: Path, kernel: str, pins: list[str]) -> None:

@@ -112,7 +112,7 @@ def rig_of_the_sample() -> bytes:
 
 @pytest.fixture(scope="module", autouse=True)
 def guest_image() -> None:
-    """Build the image if necessary; without QEMU the tests are skipped with a message that names the packages."""
+    """Build the image if necessary; without QEMU the tests are skipped with a message that names the program."""
     try:
         image()
     except ImageUnavailableError as reason:
