@@ -12,8 +12,16 @@ from typing import Final, Protocol
 from drivers.errors import DriverError
 from drivers.motion import WheelSample
 from drivers.motor import VelocityCommand
-from omnid.controller.ipc import NO_MESSAGE, Channel, socket_pair
-from omnid.controller.messages import LONGEST_RAMP_S, ControllerStart, ControllerUpdate, LogRecord, StartFailed
+from omnid.controller.ipc import (
+    LONGEST_RAMP_S,
+    NO_MESSAGE,
+    Channel,
+    ControllerStart,
+    ControllerUpdate,
+    LogRecord,
+    StartFailed,
+    socket_pair,
+)
 from omnid.controller.statistics import ControllerState, TickReport
 from omnid.core.control.contacts import NO_CONTACT
 from omnid.core.control.control_law import ControlInput

@@ -15,8 +15,15 @@ from typing import Final
 
 from drivers.errors import DriverError
 from omnid.controller.controller import Controller
-from omnid.controller.ipc import NO_MESSAGE, Channel
-from omnid.controller.messages import LONGEST_RAMP_S, ControllerStart, ControllerUpdate, LogRecord, StartFailed
+from omnid.controller.ipc import (
+    LONGEST_RAMP_S,
+    NO_MESSAGE,
+    Channel,
+    ControllerStart,
+    ControllerUpdate,
+    LogRecord,
+    StartFailed,
+)
 from omnid.controller.motor import open_motor
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.engine.process import STOP_SIGNALS

@@ -18,8 +18,8 @@ from drivers.logs.log_reader import LogReader
 from drivers.logs.ros_messages import JointWheels
 from drivers.logs.topics import MotionTopics
 from omnid.config import Config
+from omnid.controller.ipc import ControllerStart
 from omnid.controller.link import ControllerLink
-from omnid.controller.messages import ControllerStart
 from omnid.core.control.control_law import ControllerSettings
 from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.graph import Graph, nothing

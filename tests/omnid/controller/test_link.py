@@ -23,9 +23,8 @@ import pytest
 from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
 from omnid.controller.controller import Controller
-from omnid.controller.ipc import Channel, socket_pair
+from omnid.controller.ipc import Channel, ControllerStart, ControllerUpdate, socket_pair
 from omnid.controller.link import ControllerLink
-from omnid.controller.messages import ControllerStart, ControllerUpdate
 from omnid.controller.motor_settings import MotorSettings
 from omnid.controller.process import ControllerLoop, run_controller
 from omnid.controller.statistics import ControllerState, TickReport
