@@ -168,7 +168,11 @@ class LogReader:
         # 1. The stamps.
         at_of = {camera: np.flatnonzero(topic == names.index(name)) for camera, name in self._cameras.items()}
         images = {camera: LoggedImages(header_ns[at], log_ns[at]) for camera, at in at_of.items()}
-        times, stamps_ns, rank = image_stamps(images, self._time), log_ns.copy(), np.zeros(len(rows), np.int64)
+        try:
+            times = image_stamps(images, self._time)
+        except DriverError as error:
+            raise DriverError(f"{log.name!r}: {error}") from None
+        stamps_ns, rank = log_ns.copy(), np.zeros(len(rows), np.int64)
         for number, camera in enumerate(CAMERAS, 1):
             stamps_ns[at_of[camera]], rank[at_of[camera]] = times.stamps_ns[camera], number
         is_image = rank > 0

@@ -65,7 +65,7 @@ def image_stamps(images: Mapping[Camera, LoggedImages], source: TimeSource = "au
             fault = f"are {apart_ns * 1e-9:.3f} s apart between the cameras"
         if fault and log_fault:
             raise DriverError(
-                f"the stamps of the images' headers {fault}, and the times of logging {log_fault}: expected one that "
+                f"the stamps of its images' headers {fault}, and the times of logging {log_fault}: expected one that "
                 'runs on; cut the log there, or choose: log.time = "header" or "log"'
             )
     # 2. The stamps. A header that is not set is replaced by the time of logging and the usual delay.
