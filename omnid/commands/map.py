@@ -6,6 +6,7 @@ Also the routes on this computer: `omnid route list`, `delete`.
 from __future__ import annotations
 
 import argparse
+import math
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -144,16 +145,17 @@ def save(args: argparse.Namespace) -> int:
 
 def _described(path: Path, places: PlaceMap, rig: PlaceRig) -> dict[str, str]:
     """Return the properties of a map, as they are printed."""
-    sizes, size = place_views.summary(places, rig), path.stat().st_size
+    size, parts = path.stat().st_size, len(places.parts())
+    path_m = sum(math.hypot(*link.T_a_b[:3, 3]) for link in places.links if not link.is_loop)
     return {
         "map": str(path),
-        "size": f"{size / 1e6:.1f} MB, {size / max(1, sizes.keyframes) / 1e3:.0f} kB a keyframe",
-        "time": f"{utc(sizes.first_stamp_ns)} to {utc(sizes.last_stamp_ns)}",
-        "sessions": str(sizes.sessions),
-        "keyframes": f"{sizes.keyframes}, with {sizes.features} features; {sizes.dropped} were dropped",
-        "loops": str(sizes.loops),
-        "path": f"{sizes.path_m:.1f} m, within {sizes.extent_m[0]:.1f} x {sizes.extent_m[1]:.1f} m",
-        "parts": f"{sizes.parts}, between which no pose is known" if sizes.parts > 1 else "",
+        "size": f"{size / 1e6:.1f} MB, {size / max(1, len(places)) / 1e3:.0f} kB a keyframe",
+        "newest": utc(max((keyframe.stamp_ns for keyframe in places.keyframes.values()), default=0)),
+        "sessions": str(len({keyframe.session for keyframe in places.keyframes.values()})),
+        "keyframes": f"{len(places)}; {places.dropped} were dropped",
+        "loops": str(places.loops),
+        "path": f"{path_m:.1f} m",
+        "parts": f"{parts}, between which no pose is known" if parts > 1 else "",
         "rig": f"{rig.rig_hash[:12]}, baseline {rig.baseline_m:.4f} m, panoramas of {rig.cylinder.width} x "
         f"{rig.cylinder.height} px",
     }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -20,42 +19,6 @@ Array = NDArray[np.float64]
 SIGMA_PX: Final = 0.3  # standard deviation of a disparity; by trial on development seeds
 MAX_SIGMA_M: Final = 0.3  # largest standard deviation of a landmark that is shown; by trial on development seeds
 VOXEL_M: Final = 0.05  # Side of the voxels in which landmarks of several keyframes are fused; as in the grids.
-
-
-@dataclass(frozen=True, slots=True)
-class PlaceSummary:
-    """Sizes of a map of places."""
-
-    keyframes: int
-    sessions: int
-    features: int
-    loops: int
-    dropped: int  # keyframes that were dropped because the map was full
-    parts: int  # number of parts that no link joins; 1: all is one map
-    path_m: float  # length of the links of odometry
-    extent_m: tuple[float, float]  # along x and y
-    first_stamp_ns: int
-    last_stamp_ns: int
-
-
-def summary(places: PlaceMap, rig: PlaceRig) -> PlaceSummary:
-    """Return the sizes of a map."""
-    keyframes = [places.keyframes[id] for id in sorted(places.keyframes)]
-    xy = base_poses(places, rig)[:, :2, 3]
-    extent = np.ptp(xy, axis=0) if len(xy) else np.zeros(2)
-    stamps = [keyframe.stamp_ns for keyframe in keyframes] or [0]
-    return PlaceSummary(
-        len(keyframes),
-        len({keyframe.session for keyframe in keyframes}),
-        sum(len(keyframe.features.views) for keyframe in keyframes),
-        places.loops,
-        places.dropped,
-        len(places.parts()),
-        float(sum(np.linalg.norm(link.T_a_b[:3, 3]) for link in places.links if not link.is_loop)),
-        (float(extent[0]), float(extent[1])),
-        min(stamps),
-        max(stamps),
-    )
 
 
 def base_poses(places: PlaceMap, rig: PlaceRig) -> Array:

@@ -260,7 +260,7 @@ def test_show_prints_the_sizes(omap: Path, capsys: pytest.CaptureFixture[str]) -
     printed = capsys.readouterr().out
     for line in (
         "sessions     2",
-        "keyframes    12, with 240 features; 3 were dropped",
+        "keyframes    12; 3 were dropped",
         "loops        1",
         "path         3.3 m",
         "rig          0123abcd0123, baseline 0.2400 m, panoramas of 1304 x 378 px",
