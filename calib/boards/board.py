@@ -1,4 +1,4 @@
-"""A checkerboard, its view in one image, its pose in front of a known camera, and the shape of its print.
+"""A checkerboard, its view in one image, and the shape of its print.
 
 Paper curls, a plate gives way, a printer stretches one side. The drawing's points lie in a plane. A print differs from
 it to second order: out of the plane by a quadratic surface, in the plane by the ratio of its sides. mrcal models the
@@ -14,9 +14,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from calib import se3
 from calib.errors import CalibError
-from calib.models.camera import Array, OmniCamera
+from calib.models.camera import Array
 
 # Inner corners along one side: fewer do not determine a pose well, more are a misread option.
 MIN_SIDE, MAX_SIDE = 3, 60
@@ -84,63 +83,6 @@ class BoardView:
 
     name: str
     pixels: Array
-
-
-MIN_CORNERS = 6  # A homography needs four corners; with two more a wrong one has a large error.
-# A corner is an outlier if its error is above OUTLIER_RATIO times the median error: 5.9 sigma of errors of two normal
-# coordinates, which one right corner in 30 million exceeds. It must exceed MIN_OUTLIER_RAD too, because the median of
-# exact corners is near 0. ROUNDS bounds the work: the pose is solved again without the outliers.
-OUTLIER_RATIO, MIN_OUTLIER_RAD, ROUNDS = 5.0, np.deg2rad(0.3), 4
-
-
-def board_pose(camera: OmniCamera, pixels: Array, board: CalibrationBoard) -> Array | None:
-    """Estimate T_cam_board (4, 4) from corners (N, 2), NaN for unknown ones; None if too few have a ray.
-
-    Linear solution by the rays' homography [r1 r2 t] (Zhang 2000, section 2.1, with rays in place of pixels), solved
-    again without the corners that lie far off the board.
-    """
-    rays = camera.lift(pixels)
-    known = np.isfinite(rays).all(axis=1)
-    T = None
-    for _ in range(ROUNDS):
-        if known.sum() < MIN_CORNERS:
-            return T
-        T = _linear_pose(rays[known], board.points[known], board.square_m)
-        errors = _ray_errors_rad(T, rays, board.points)
-        near = errors < max(OUTLIER_RATIO * float(np.median(errors[known])), MIN_OUTLIER_RAD)
-        if not (known & ~near).any():
-            break
-        known &= near
-    return T
-
-
-def _linear_pose(rays: Array, points: Array, square_m: float) -> Array:
-    """Return T_cam_board (4, 4) of rays (N, 3) to points (N, 3) of a board."""
-    xy1 = np.column_stack([points[:, :2] / square_m, np.ones(len(points))])
-    A = np.einsum("nij,nk->nijk", se3.hat(rays), xy1).reshape(-1, 9)
-    H = np.linalg.svd(A, full_matrices=False)[2][-1].reshape(3, 3) / (square_m, square_m, 1)
-    ahead = np.sum(rays * (xy1 * (square_m, square_m, 1) @ H.T))
-    H /= np.linalg.norm(H[:, :2], axis=0).mean() * np.sign(ahead)
-    return pose_of_columns(H)
-
-
-def pose_of_columns(columns: Array) -> Array:
-    """Return the rigid transform (..., 4, 4) of columns r1, r2, t (..., 3, 3), of which r1 and r2 are nearly unit."""
-    left, _, right = np.linalg.svd(columns[..., :2], full_matrices=False)
-    first, second = np.moveaxis(left @ right, -1, 0)
-    return se3.transform(np.stack([first, second, np.cross(first, second)], axis=-1), columns[..., 2])
-
-
-def pose_error_rad(camera: OmniCamera, T_cam_board: Array, pixels: Array, board: CalibrationBoard) -> float:
-    """Return the mean angle between the rays of corners (N, 2) and the board's points."""
-    return float(np.nanmean(_ray_errors_rad(T_cam_board, camera.lift(pixels), board.points)))
-
-
-def _ray_errors_rad(T_cam_board: Array, rays: Array, points: Array) -> Array:
-    """Return the angles (N,) between rays (N, 3) and points (N, 3) of a board; NaN without a ray."""
-    directions = se3.apply(T_cam_board, points)
-    across = np.linalg.norm(np.cross(rays, directions), axis=1)
-    return np.asarray(np.arctan2(across, (rays * directions).sum(axis=1)))
 
 
 def ambiguous_orders(board: CalibrationBoard) -> list[NDArray[np.intp]]:

@@ -219,13 +219,17 @@ def _fit_pair(views: Sequence[PairView], board: CalibrationBoard, alone: Sequenc
     """Fit two cameras and the transform between them."""
     _require(_pairs(views), "instants at which both cameras saw the board")
     cameras = (alone[0].cameras[0], alone[1].cameras[0])
-    initial = initialise_relative_pose([(view.seen[0], view.seen[1]) for view in views], board, cameras)
+    numbers = {view.name: k for k, view in enumerate(views)}
+    lower, upper = (
+        {numbers[view.name]: T for view, T in zip(one.views, one.fit.rig.T_lower_board, strict=True)} for one in alone
+    )
+    initial = initialise_relative_pose(lower, upper, board)
     rejected = [RejectedView(views[k].name, reason) for k, reason in initial.rejected]
     good = [views[k] for k in initial.T_lower_board]
     for at, k in enumerate(initial.T_lower_board):
-        upper = good[at].seen[1]
-        if upper is not None and k in initial.orders:
-            good[at] = _with(good[at], 1, replace(upper, pixels=upper.pixels[initial.orders[k]]))
+        seen = good[at].seen[1]
+        if seen is not None and k in initial.orders:
+            good[at] = _with(good[at], 1, replace(seen, pixels=seen.pixels[initial.orders[k]]))
     _require(_pairs(good), "consistent pairs of views", rejected)
     shape = PrintShape(tuple(np.mean([one.shape.values for one in alone], axis=0).tolist()))
     start = BoardRig(cameras, initial.T_upper_lower, np.array([*initial.T_lower_board.values()]), shape, np.zeros(2))

@@ -7,23 +7,16 @@ corners may be ambiguous in one image; the consensus decides it for every pair.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from calib.boards.board import (
-    BoardView,
-    CalibrationBoard,
-    ambiguous_orders,
-    board_pose,
-    pose_error_rad,
-    pose_of_columns,
-)
+from calib.boards.board import CalibrationBoard, ambiguous_orders
 from calib.errors import CalibError
-from calib.models.camera import Array, OmniCamera
+from calib.models.camera import Array
 from calib.models.ocam import OcamCamera, View
 
 # The polynomial of a surface without a tip has even powers of rho.
@@ -143,14 +136,11 @@ def _eliminate_depths(
     return A - shift[..., None] * along_A[:, None], b - shift * along_b, shifts
 
 
-# Largest mean ray error of a board's pose in a given camera; beyond it the corners or the camera are wrong.
-MAX_POSE_ERROR_RAD = np.deg2rad(1.0)
 # Distance of two transforms: angle [rad] plus shift relative to the baseline. A pair is an inlier below INLIER_RATIO
 # times the median distance, within these limits.
 MIN_INLIER_DISTANCE, MAX_INLIER_DISTANCE, INLIER_RATIO = 0.06, 0.3, 5.0
 # The order of corners is ambiguous if a transform farther away than any inlier costs less than this ratio.
 MIN_COST_RATIO = 3.0
-ViewPair = tuple[BoardView | None, BoardView | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,61 +154,51 @@ class RelativePoseInitialisation:
 
 
 def initialise_relative_pose(
-    views: Sequence[ViewPair], board: CalibrationBoard, cameras: tuple[OmniCamera, OmniCamera]
+    lower: Mapping[int, Array], upper: Mapping[int, Array], board: CalibrationBoard
 ) -> RelativePoseInitialisation:
-    """Find the transform with the most consistent pairs, and the board's pose in every view.
+    """Find the transform with the most consistent pairs, by the board's poses (4, 4) in front of each camera, by view.
 
-    Raises CalibError if no board fits both cameras or the order of the corners is ambiguous.
+    Raises CalibError if the order of the corners is ambiguous.
     """
-    # 1. The board's pose in every view, for the upper camera with every possible order of the corners.
+    # 1. The transform by each pair of views, for every possible order of the upper corners.
     orders = ambiguous_orders(board)
-    lower = {k: poses[0] for k, poses in _poses_of(cameras[0], [seen for seen, _ in views], board, orders[:1]).items()}
-    upper = _poses_of(cameras[1], [seen for _, seen in views], board, orders)
+    turns = [_turn_of(board.points, order) for order in orders]
     both = sorted(lower.keys() & upper.keys())
-    if not both:
-        raise CalibError(
-            "calibrate rig: no board fits both cameras; check --corners, and that the camera files are "
-            "those of these cameras, lower and upper"
-        )
+    candidates = np.array([[upper[k] @ turn @ se3.inverse(lower[k]) for turn in turns] for k in both])
     # 2. Consensus of the transforms of all pairs.
-    best, apart = _consensus(np.array([upper[k] @ se3.inverse(lower[k]) for k in both]))
+    best, apart = _consensus(candidates)
     gap = apart.min(axis=1)
     limit = float(np.clip(INLIER_RATIO * np.median(gap), MIN_INLIER_DISTANCE, MAX_INLIER_DISTANCE))
     outliers = {k: float(gap[i]) for i, k in enumerate(both) if gap[i] > limit}
-    # 3. The pose of the board in the lower camera's frame, for each view that is left.
-    placed = {k: T for k, T in lower.items() if k not in outliers and (k in upper or views[k][1] is None)}
-    placed |= {k: se3.inverse(best) @ T[0] for k, T in upper.items() if views[k][0] is None}
+    # 3. The pose of the board in the lower camera's frame, for each view that is left. Outlier pairs are rejected.
+    placed = {k: se3.inverse(best) @ T for k, T in upper.items() if k not in lower}
+    placed |= {k: T for k, T in lower.items() if k not in outliers}
     orders_of = {k: orders[int(apart[i].argmin())] for i, k in enumerate(both) if k not in outliers}
-    # 4. Outlier pairs and views without a pose are rejected.
-    rejected = [(k, "no board fits its corners") for k in range(len(views)) if k not in placed and k not in outliers]
-    rejected += [
+    rejected = tuple(
         (
             k,
             f"its relative pose of the cameras is {np.rad2deg(distance):.1f} deg or more off that of the "
             "others: was the board moving?",
         )
         for k, distance in outliers.items()
-    ]
-    return RelativePoseInitialisation(best, dict(sorted(placed.items())), orders_of, tuple(rejected))
+    )
+    return RelativePoseInitialisation(best, dict(sorted(placed.items())), orders_of, rejected)
 
 
-def _poses_of(
-    camera: OmniCamera, views: Sequence[BoardView | None], board: CalibrationBoard, orders: Sequence[NDArray[np.intp]]
-) -> dict[int, Array]:
-    """Return by view the board's poses (S, 4, 4) for each order of its corners; views that do not fit are left out."""
-    found = dict[int, Array]()
-    for k, seen in enumerate(views):
-        poses = [] if seen is None else [board_pose(camera, seen.pixels[order], board) for order in orders]
-        fitting = [
-            T
-            for T, order in zip(poses, orders, strict=False)
-            if seen is not None
-            and T is not None
-            and pose_error_rad(camera, T, seen.pixels[order], board) < MAX_POSE_ERROR_RAD
-        ]
-        if len(fitting) == len(orders):
-            found[k] = np.array(fitting)
-    return found
+def _turn_of(points: Array, order: NDArray[np.intp]) -> Array:
+    """Return the transform (4, 4) of the board onto itself that moves each point (N, 3) to that of another order."""
+    middle = points.mean(axis=0)
+    left, _, right = np.linalg.svd((points[order] - middle)[:, :2].T @ (points - middle)[:, :2])
+    R = np.eye(3)
+    R[:2, :2] = left @ right
+    return se3.transform(R, middle - R @ middle)
+
+
+def pose_of_columns(columns: Array) -> Array:
+    """Return the rigid transform (..., 4, 4) of columns r1, r2, t (..., 3, 3), of which r1 and r2 are nearly unit."""
+    left, _, right = np.linalg.svd(columns[..., :2], full_matrices=False)
+    first, second = np.moveaxis(left @ right, -1, 0)
+    return se3.transform(np.stack([first, second, np.cross(first, second)], axis=-1), columns[..., 2])
 
 
 def _consensus(candidates: Array) -> tuple[Array, Array]:
