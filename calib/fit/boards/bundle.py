@@ -30,6 +30,7 @@ import scipy
 from calib import se3
 from calib.boards.board import MODE_NAMES, MODE_SIGMAS, MODE_UNITS, CalibrationBoard, PrintShape, all_modes
 from calib.errors import CalibError
+from calib.fit.boards.derivatives import pixel_derivatives
 from calib.fit.boards.smooth_misfit import covariance_with_misfit, smooth_fields
 from calib.fit.least_squares import (
     BEST_STEP,
@@ -44,7 +45,6 @@ from calib.fit.least_squares import (
 )
 from calib.fit.parameters import WAVEFRONT_UNIT_M, stepped, units_of
 from calib.models.camera import Array
-from calib.models.derivatives import pixel_derivatives
 from calib.models.names import values_of
 from calib.models.ocam import ASTIGMATISM_NAMES, TANGENTIAL_NAMES, OcamCamera
 from calib.models.wavefront import WAVEFRONT_NAMES

@@ -1,4 +1,4 @@
-"""Derivatives of the pixels of ocam cameras by points and by named parameters, in closed form, for the fit to boards.
+"""Derivatives of the pixels of ocam cameras by points and by named parameters: in closed form, but for wavefronts.
 
 The names are those of models/names.py; d moves e along, because their difference is a rotation of the camera.
 """
@@ -9,14 +9,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from calib.fit.least_squares import BEST_STEP, central_differences
 from calib.models.camera import Array
 from calib.models.ocam import ASTIGMATISM_NAMES, TANGENTIAL_NAMES, OcamCamera
-from calib.models.wavefront import TERMS, WAVEFRONT_NAMES, directions_to, offsets
-
-# Step on the unit sphere of the derivatives of a wavefront's offsets, which are smooth over a radian.
-SPHERE_STEP = 1e-4
-# Terms of the series that inverts the effect of the offset on the direction: each is about a thousandth of the last.
-SERIES = 3
+from calib.models.wavefront import WAVEFRONT_NAMES, directions_to
 
 
 def pixel_derivatives(camera: OcamCamera, points: Array, names: Sequence[str]) -> tuple[Array, Array]:
@@ -35,8 +31,12 @@ def _derivatives(camera: OcamCamera, points: Array, names: Sequence[str]) -> tup
     ray_by_point, rays = None, points
     ray_by_wave = dict[str, Array]()
     if waves or any(camera.wavefront):
-        rays = directions_to(points, camera.wavefront, -camera.sign)
-        ray_by_point, ray_by_wave = _direction_derivatives(camera, points, rays, waves)
+        axis, wavefront = -camera.sign, np.array(camera.wavefront)
+        rays = directions_to(points, camera.wavefront, axis)
+        step = BEST_STEP * np.ones(len(wavefront))
+        ray_by_point = central_differences(lambda by: directions_to(points + by, camera.wavefront, axis), step[:3])
+        by_term = central_differences(lambda by: directions_to(points, tuple((wavefront + by).tolist()), axis), step)
+        ray_by_wave = {name: by_term[..., WAVEFRONT_NAMES.index(name)] for name in waves}
     # 2. The radius of that direction.
     X, Y, z = rays[:, 0], rays[:, 1], camera.sign * rays[:, 2]
     r = np.hypot(X, Y)
@@ -84,38 +84,6 @@ def _derivatives(camera: OcamCamera, points: Array, names: Sequence[str]) -> tup
     by_point = by_ray if ray_by_point is None else by_ray @ ray_by_point
     by_name = [columns[name] for name in names]
     return by_point, np.stack(by_name, axis=2) if by_name else np.zeros((len(points), 2, 0))
-
-
-def _direction_derivatives(
-    camera: OcamCamera, points: Array, rays: Array, waves: Sequence[str]
-) -> tuple[Array, dict[str, Array]]:
-    """Return the derivatives of unit directions (N, 3) by points, (N, 3, 3), and by the wavefront's terms, (N, 3) each.
-
-    d is along p - o(d), so with P = (I - d d^T) / |p - o| and the derivative O of the offset o by the
-    direction, dd = P (dp - O dd - do), which is a series in P O.
-    """
-    axis = -camera.sign
-    left = points - offsets(rays, camera.wavefront, axis)
-    norm = np.linalg.norm(left, axis=1)[:, None, None]
-    P = (np.eye(3) - rays[:, :, None] * rays[:, None]) / norm
-    by_direction = np.stack(
-        [
-            (offsets(rays + step, camera.wavefront, axis) - offsets(rays - step, camera.wavefront, axis))
-            / (2 * SPHERE_STEP)
-            for step in SPHERE_STEP * np.eye(3)
-        ],
-        axis=2,
-    )
-    by_point, term = P, P
-    for _ in range(SERIES):
-        term = -P @ by_direction @ term
-        by_point = by_point + term
-    by_wave = {}
-    for name in waves:
-        one = tuple(float(name == other) for other in WAVEFRONT_NAMES)
-        assert len(one) == TERMS
-        by_wave[name] = -np.einsum("nij,nj->ni", by_point, offsets(rays, one, axis))
-    return by_point, by_wave
 
 
 def _pairs(u: Array, v: Array) -> Array:
