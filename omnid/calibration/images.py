@@ -28,7 +28,6 @@ SIDES = ("lower", "upper")
 TOLERANCE_NS = 10_000_000
 # Number of pairs of a log that are used, evenly spread: a board held by hand moves little between two of them.
 LOG_PAIRS = 100
-MAX_IMAGES = 400
 BY_NAME = LogCameras()
 
 
@@ -122,8 +121,6 @@ def _of_side(folder: Path, side: str, bits: int) -> Images:
             raise OmnidError(f"{folder}: {other.name} and {path.name} have one name; remove or rename one of them")
     if not paths:
         raise OmnidError(f"{folder}: no images {side}_* in this folder; name them lower_001.png, upper_001.png ...")
-    if len(paths) > MAX_IMAGES:
-        raise OmnidError(f"calibrate: expected {MAX_IMAGES} images at most, found {len(paths)}; 40 are enough")
     images = {name: _read(path, bits) for name, path in paths.items()}
     sizes = dict[tuple[int, ...], str]()
     for name, image in images.items():

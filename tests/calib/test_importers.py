@@ -139,35 +139,20 @@ def test_takes_the_nearest_rotation_of_numbers_typed_with_few_digits() -> None:
             "cam0: expected one of omni-radtan.*fov",
         ),
         (chain(BOTH, None).replace("0.003, 0.004]", "0.003]", 1), "cam0: expected 4 numbers .k1 k2 p1 p2., found"),
-        (chain(BOTH, None).replace("[1.0, -207.0", "[1.0, 0.0"), "cam0: omni camera: expected"),
         (chain(BOTH, None).replace("[768, 770]", "768"), "cam0: .*resolution"),
         (chain(BOTH, None).replace("T_cam_imu: [[", "T_cam_imu: [[9"), "cam0.T_cam_imu: expected a rotation"),
         (chain(BOTH, None).replace("cam1:", "cam0:"), "not a YAML file"),
         (chain((None, None), None, NAMED), "no transform between cam0 and cam1"),
         (chain((BOTH[0], BOTH[0]), None), "neither topics nor heights"),
-        (chain((BOTH[0], BOTH[0]), None, NAMED), "viewpoints must lie apart"),
         (f"cam0:{CAMERA}", "expected two cameras .*found cam0"),
         ("", "expected two cameras"),
         ("[" * 3000, "not a YAML file"),
-        ("!!python/none x", "YAML"),
     ],
 )
 def test_errors_are_one_line_that_names_file_and_camera(text: str, message: str) -> None:
     with pytest.raises(CalibError, match=message) as caught:
         parse_chain(text, "c.yaml")
     assert str(caught.value).startswith("c.yaml: ") and "\n" not in str(caught.value)
-
-
-def test_damaged_text_is_a_calib_error_or_a_result() -> None:
-    random = np.random.default_rng(0)
-    for parse, text in ((parse_chain, chain(BOTH, None, NAMED)), (parse_ocam, TEXT)) * 60:
-        damaged = bytearray(text.encode())
-        for at in random.integers(0, len(text), 3):
-            damaged[at] = random.integers(0, 256)
-        try:
-            parse(bytes(damaged[: random.integers(1, len(text) + 400)]).decode("latin-1"))
-        except CalibError as error:
-            assert "\n" not in str(error)
 
 
 def test_yaml_aliases_do_not_fill_the_memory() -> None:
@@ -177,12 +162,6 @@ def test_yaml_aliases_do_not_fill_the_memory() -> None:
     code = f"from calib.importers import parse_chain\ntry: parse_chain({text!r})\nexcept Exception as e: print(e)"
     printed, memory_mb = run_limited(code)
     assert "no anchors and aliases" in printed and memory_mb < 200
-
-
-def test_reads_the_file_of_a_misaligned_rig(shared_data: Path) -> None:
-    rig = import_chain(shared_data / "two_walls_crooked" / "camchain.yaml")
-    assert rig.baseline_m == pytest.approx(0.16, abs=1e-3)
-    assert rig.upper.viewpoint[2] - rig.lower.viewpoint[2] > 0.15
 
 
 def test_a_stereo_camera_on_its_side_needs_no_names(shared_data: Path) -> None:
@@ -246,7 +225,6 @@ def test_parses_every_number_as_the_toolbox_defines_it() -> None:
         ("1.590000e-09", "1.590000e+308", "ocam camera: expected"),
         ("1.000529 0.000053", "1.000529 one", "could not convert"),
         ("480 640", "480.5 640", "in whole pixels"),
-        ("480 640", "32767 32767", "at most 67108864 in all"),
         ("480 640", "", "expected lines of numbers"),
     ],
 )

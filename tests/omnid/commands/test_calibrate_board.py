@@ -8,7 +8,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from rosbags.typesys import Stores, get_typestore
 
 import omnid
 from calib import se3
@@ -17,8 +16,6 @@ from calib.models.camera import Array, Mask
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import read_rig
-from drivers.logs.mcap_writer import LogWriter
-from omnid.calibration.images import read_pairs
 from omnid.calibration.live_boards import LiveBoards, PairOutcome, status
 from omnid.calibration.rig import RigResult
 from omnid.cli import main
@@ -133,23 +130,6 @@ def test_views_of_one_camera_are_used_and_exchanged_cameras_are_a_warning(
     assert "exchange their images, unless the cameras look down into their mirrors" in output.err
     assert found.covariance is not None and "upper a2" in found.covariance.names
     assert abs(found.baseline_m - TRUTH.baseline_m) < 4 * found.covariance.sigma("baseline") < 8e-3
-
-
-def test_pairs_a_log_by_its_stamps(folder: Path, tmp_path: Path) -> None:
-    """PNG messages, the upper camera 2 ms later, with an unpaired image between."""
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    kinds, schema = store.types, "sensor_msgs/msg/CompressedImage"
-    with LogWriter(tmp_path / "log.mcap") as writer:
-        for k in range(PAIRS):
-            for name, late_ns in (("lower", 0), ("upper", 2_000_000), ("upper", 50_000_000))[: 2 + (k == 3)]:
-                data = np.frombuffer((folder / f"{name}_{k:02d}.png").read_bytes(), np.uint8)
-                header = kinds["std_msgs/msg/Header"](kinds["builtin_interfaces/msg/Time"](k + 1, late_ns), name)
-                cdr = store.serialize_cdr(kinds[schema](header, "png", data), schema)
-                writer.write(f"/{name}/image", schema, bytes(cdr), (k + 1) * 10**9 + late_ns)
-    found = read_pairs(tmp_path / "log.mcap")
-    assert found.topics == ("/lower/image", "/upper/image")
-    assert [len(side) for side in found.sides] == [PAIRS, PAIRS]
-    assert (found.sides[1]["pair00001"] == cv2.imread(str(folder / "upper_01.png"), cv2.IMREAD_GRAYSCALE)).all()
 
 
 def bad(folder: Path, made: Path, kind: str) -> Path:
