@@ -22,8 +22,8 @@ from omnid.transport.status_names import DISARMED_BY_STOP, WHEELS, Key
 from omnid.transport.stop_datagram import STOPPED, StopSender
 
 SILENCE_S: Final = ANSWER_S  # A robot that sends no report for this time counts as gone.
-SHOWN_S: Final = 0.5  # Time between two looks at the keyboard.
-# Time between two stops over the bus, and until the first: a datagram without an answer by then is behind a router.
+# Time between two stops over the bus, and until the first: a datagram without an answer by then is behind a router;
+# between two looks at the keyboard.
 _REPEAT_S: Final = 0.15
 
 
@@ -97,8 +97,8 @@ def record_until_enter(robot: Robot, name: str) -> int:
     driver, reports = robot.driver(), robot.subscribe(NavigationReport)
     print(f"records {name}: drive it; Enter writes it, Ctrl-C drops it", flush=True)
     try:
-        while not select.select([sys.stdin], [], [], SHOWN_S)[0]:
-            report = reports.wait(SHOWN_S)
+        while not select.select([sys.stdin], [], [], _REPEAT_S)[0]:
+            report = reports.wait(_REPEAT_S)
             if report is None:
                 continue
             if report.teaching != name:
