@@ -17,8 +17,9 @@ Flags = NDArray[np.bool_]
 # about 200 cells, so that each has two or three of the 500 landmarks wanted.
 CELL_PX = 48
 BLOCK_PX = 5  # window over which the gradients of a corner are summed.
-# Side of the square in which a corner is the maximum: that of LANDMARK_SPACING_PX, because nearer corners would be two
-# landmarks of one piece of texture. At all scales, because patches have as many pixels at each.
+# Side of the square in which a corner is the maximum, and least distance of a new landmark from a known one: two thirds
+# of a patch, because nearer ones would share most of their texture, and so their errors. At all scales, because patches
+# have as many pixels at each.
 APART_PX = 9
 MIN_RESPONSE = 2e-4  # smallest eigenvalue of a corner, in OpenCV's scale for 8 bit images
 # Measured response that noise of one grey level reaches in 1 % of the pixels; it grows with its square.

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from omnid.core.odometry.tracking import KltSettings
 from omnid.core.types.panorama import PaddedPanorama
 
 Array = NDArray[np.float64]
@@ -28,7 +29,7 @@ NEIGHBOURS = 5  # known landmarks whose median disparity counts, because two of 
 # Two disparities whose ratio is larger are of two surfaces, because the slope of one surface changes them by 0.15
 # px/px. A match within the second, as a share of the neighbours' disparity, is at theirs.
 OTHER_RATIO, SAME_SHARE = 1.25, 0.2
-SIDE_PX = 15  # side of a patch, because the tracker's window has as many
+SIDE_PX = KltSettings().window_px  # side of a patch
 # By how much the correlation of the patch at its own disparity exceeds that at another one where it does not repeat,
 # because identical bricks differ by less than 0.05, other textures by 0.3 and more.
 LEAST_LEAD = 0.15

@@ -43,7 +43,7 @@ from omnid.core.odometry.line_times import (
 )
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.motion_hypotheses import DECIDING_COST
-from omnid.core.odometry.plane_patches import align, plane_templates
+from omnid.core.odometry.plane_patches import TEMPLATE_PX, align, plane_templates
 from omnid.core.odometry.pose_search import CORRELATED_LANDMARKS
 from omnid.core.odometry.tracking import KltSettings, track
 from omnid.core.stereo.triangulation import view, view_jacobian
@@ -71,7 +71,6 @@ LEAST_PART: Final = 0.2
 RIGHT_COST: Final = 0.31
 FOLLOWED: Final = 0.2  # part of a new pair in the mean of the costs
 FAR: Final = KltSettings(levels=2)  # 28 px
-EDGE_PX: Final = 8  # of the panorama, in which patches are cut
 ROUNDS: Final = 6
 RIDGE: Final = 1e-6
 KINDS: Final[tuple[tuple[Kind, tuple[int, ...]], ...]] = (
@@ -255,7 +254,7 @@ class ImageBreaks:
             raw, by_raw = raw_image.at(end)
             inside = np.isfinite(raw).all(axis=1)
             for pixels in (start, end):
-                inside &= (pixels[:, 1] > EDGE_PX) & (pixels[:, 1] < cylinder.height - EDGE_PX)
+                inside &= np.abs(pixels[:, 1] - cylinder.height / 2) < (cylinder.height - TEMPLATE_PX) / 2
                 inside &= cylinder.shows(pixels[:, 0])
             rows = np.flatnonzero(inside)
             sought += len(rows)

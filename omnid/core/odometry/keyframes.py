@@ -8,22 +8,18 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.odometry.corners import clear_around, corners, nearby_disparity, pixels_in_upper
+from omnid.core.odometry.corners import APART_PX, clear_around, corners, nearby_disparity, pixels_in_upper
 from omnid.core.odometry.correlation import has_wrong_period
 from omnid.core.odometry.estimates import OdometryLimits, PoseEstimate
 from omnid.core.odometry.exposure_times import AssumedMotion, Exposure
 from omnid.core.odometry.first_depths import FirstDepths
 from omnid.core.odometry.local_map import Keyframe, LocalMap, NewLandmarks
-from omnid.core.odometry.plane_patches import WINDOW_PX, align_rows, disparity_slopes, fitted_slopes, view_noise
+from omnid.core.odometry.plane_patches import align_rows, disparity_slopes, fitted_slopes, view_noise
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings
 from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
-
-# Smallest distance of a new landmark from a known one, two thirds of a patch: nearer ones would share most of their
-# patches, which have as many pixels at all scales, and so their errors.
-LANDMARK_SPACING_PX = -(-2 * WINDOW_PX // 3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,7 +67,7 @@ class Keyframes:
     def add(self, request: KeyframeRequest) -> None:
         """Add a keyframe with new landmarks between the known ones."""
         frame = request.frame
-        free = clear_around(request.usable, request.pixels, LANDMARK_SPACING_PX)
+        free = clear_around(request.usable, request.pixels, APART_PX)
         points = corners(frame.lower, free, self._limits.features - len(request.pixels))
         new = located(frame, points, self._model, self._klt, request.exposure, request.views)
         keyframe = Keyframe(frame.seq, frame.lower, request.T_odom_rect, request.covariance)
