@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import math
 import re
-import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
@@ -20,7 +19,6 @@ from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.protocol_registry import PROTOCOLS
 from drivers.motors.serial_motor import LateReplyError, SerialMotor
 from drivers.motors.simulated.simulated_base import MotionLimits, SimulatedBase
-from drivers.motors.simulated.simulated_line import SimulatedLine
 from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from omnid.controller.controller import Controller
 from omnid.controller.motor import open_motor
@@ -34,7 +32,6 @@ from omnid.core.control.control_law import ControllerPose, ControllerSettings
 from omnid.core.control.heading_controller import (
     Setpoint,
     VelocityLimits,
-    longest_lead_rad,
 )
 from omnid.core.control.safety_rules import POSE_JUMPED, Deadlines
 from tests.contract.simulated_controllers import PtyMotor
@@ -137,24 +134,6 @@ def test_a_setpoint_from_before_a_jump_is_void_and_the_robot_stays_armed() -> No
     robot.jump_rad = 1.5
     robot.run(STRAIGHT, 40)
     assert robot.driver.base.velocity_mps > 0.15, "it obeys the next one"
-
-
-def test_a_real_serial_line_shows_the_same() -> None:
-    """In real time on a pty; on a busy machine the bound is the lead times the motor controller's gain."""
-    twin = PtyMotor(SimulatedLine(limits=FAST))
-    fastest_radps = 0.0
-    with contextlib.closing(twin), contextlib.closing(SerialMotor(twin.port, timeout_s=1.0, watchdog_ms=9000)) as wire:
-        controller, until_s = Controller(wire, HOLDER_SETTINGS, PERIOD_S), time.monotonic() + 2.5
-        while time.monotonic() < until_s:
-            base = twin.base
-            controller.take(ControllerPose(time.monotonic_ns(), base.pose[2], base.yaw_rate_radps, "tracking"))
-            controller.take(TimedSetpoint(time.monotonic_ns(), Setpoint(0.2, 3.0)))
-            controller.tick()
-            for _ in range(5):
-                time.sleep(PERIOD_S / 5)
-                fastest_radps = max(fastest_radps, abs(twin.base.yaw_rate_radps))
-        assert twin.base.pose[2] > 0.5, "it turns"
-    assert fastest_radps <= GAIN_HZ * longest_lead_rad(HOLDER_LIMITS) + 0.1 < FAST.yaw_rate_radps / 2
 
 
 @pytest.fixture
@@ -282,25 +261,6 @@ def test_drives_on_where_an_answer_is_late(driving: Bench) -> None:
         driving.tick()
     assert driving.controller.state.late == 1 and driving.controller.state.errors == 0
     assert driving.last.velocity_mps == 0.3 and driving.controller.state.reason == "" and driving.lines == []
-
-
-def test_sends_headings_in_the_motor_controllers_own_count(bench: Bench) -> None:
-    """The goal leads the reported heading, on the side of the wanted one and not beyond it."""
-    bench.wheels.heading_rad = -2.0  # while the base stands at 0.5 rad in odom
-    bench.send_pose(0.5)
-    bench.tick()
-    for _ in range(40):
-        bench.send_pose(0.5)
-        bench.send_setpoint(Setpoint(0.2, 0.6))
-        bench.tick()
-        assert -2.0 < bench.last.heading_rad <= -2.0 + 0.1 + 1e-9
-    assert bench.last.heading_rad == pytest.approx(-2.0 + 0.1)
-    bench.wheels.heading_rad = -1.95  # its count drifts: odometry corrects it
-    for _ in range(10):
-        bench.send_pose(0.5)
-        bench.send_setpoint(Setpoint(0.2, 0.6))
-        bench.tick()
-    assert bench.last.heading_rad == pytest.approx(-1.95 + 0.1)
 
 
 def test_slows_down_at_the_end_whatever_the_setpoint(driving: Bench) -> None:
