@@ -27,8 +27,8 @@ from msgspec.structs import asdict
 from calib.typed_toml import bytes_of, convert, table_of
 from omnid.errors import OmnidError
 from omnid.simulation.rendering import textures
-from omnid.simulation.rendering.shapes import CEILING_M, Point, Random, box, painted, poster_paint, posters, solid
-from omnid.simulation.rendering.surfaces import Rectangle, Texture
+from omnid.simulation.rendering.surfaces import CEILING_M, Point, Rectangle, box, painted, poster_paint, posters, solid
+from omnid.simulation.rendering.textures import Random, Texture
 from omnid.simulation.world import Person, World
 
 MAX_BYTES: Final = 1 << 18

@@ -2,8 +2,7 @@
 
 from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.sensor import MountedSensor, Sensor
-from omnid.simulation.rendering.shapes import box, posters
-from omnid.simulation.rendering.surfaces import Rectangle, Scene
+from omnid.simulation.rendering.surfaces import Rectangle, Scene, box, posters
 from tests.simulation.builders import corridor, room, wall
 from tests.simulation.logs import camchain, render, tum, write_log
 from tests.simulation.recipes import RECIPES, SimulatedRun, build

@@ -9,8 +9,8 @@ import numpy as np
 
 from calib.models.camera import Array
 from omnid.simulation.rendering import textures
-from omnid.simulation.rendering.shapes import CEILING_M, PX_PER_M, Point, Random, box, painted, posters
-from omnid.simulation.rendering.surfaces import Rectangle, Scene
+from omnid.simulation.rendering.surfaces import CEILING_M, PX_PER_M, Point, Rectangle, Scene, box, painted, posters
+from omnid.simulation.rendering.textures import Random
 from tests.simulation.paths import planar_poses
 
 # Number of worlds of each kind that are kept, as many tests show the same; their textures are a few megabytes each.

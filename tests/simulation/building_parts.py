@@ -16,9 +16,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from calib.models.camera import Array
 from omnid.simulation.rendering import textures
-from omnid.simulation.rendering.shapes import CEILING_M, Paint, Point, Random, pixels_of, solid
-from omnid.simulation.rendering.surfaces import Rectangle, Texture
-from omnid.simulation.rendering.textures import PAINTERS, Painter, Size, grey_of, stretched, value_noise
+from omnid.simulation.rendering.surfaces import CEILING_M, Paint, Point, Rectangle, pixels_of, solid
+from omnid.simulation.rendering.textures import (
+    PAINTERS,
+    Painter,
+    Random,
+    Size,
+    Texture,
+    grey_of,
+    stretched,
+    value_noise,
+)
 
 Point3 = tuple[float, float, float]
 # A box of a thing: the middle of its bottom, x, y, z, from the middle of the thing, then its sides along them [m].

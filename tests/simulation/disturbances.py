@@ -25,7 +25,8 @@ from calib.models.camera import Array, Mask
 from calib.rig import MountedCamera
 from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.sensor import Floats
-from omnid.simulation.rendering.surfaces import POSTER_GAP_M, Rectangle, Scene, Texture
+from omnid.simulation.rendering.surfaces import POSTER_GAP_M, Rectangle, Scene
+from omnid.simulation.rendering.textures import Texture
 
 REFRACTIVE_INDEX: Final = 1.5  # of glass, glazed tiles, polish and lacquer
 WHITE: Final[Texture] = np.full((8, 8), 255, np.uint8)

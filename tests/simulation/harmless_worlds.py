@@ -22,8 +22,7 @@ from calib.models.camera import Array
 from drivers.motors.simulated.simulated_base import Pose
 from omnid.errors import OmnidError
 from omnid.simulation.rendering.sensor import Sensor
-from omnid.simulation.rendering.shapes import Point
-from omnid.simulation.rendering.surfaces import Rectangle
+from omnid.simulation.rendering.surfaces import Point, Rectangle
 from omnid.simulation.robot import SimulatedRobot, make_robot
 from omnid.simulation.world import Person
 from tests.simulation.building_parts import (

@@ -15,8 +15,7 @@ from typing import Final
 import numpy as np
 
 from omnid.errors import OmnidError
-from omnid.simulation.rendering.shapes import Paint, Point, painted, solid
-from omnid.simulation.rendering.surfaces import Rectangle
+from omnid.simulation.rendering.surfaces import Paint, Point, Rectangle, painted, solid
 from omnid.simulation.robot import WheelErrors
 from omnid.simulation.world import Person, moved
 from tests.simulation import harmless_worlds

@@ -21,7 +21,8 @@ from calib import se3
 from calib.models.camera import Array, Mask, OmniCamera
 from calib.rig import MountedCamera
 from omnid.simulation.rendering.caster_kernels import cast
-from omnid.simulation.rendering.surfaces import Rectangle, Scene, Texture
+from omnid.simulation.rendering.surfaces import Rectangle, Scene
+from omnid.simulation.rendering.textures import Texture
 
 Floats = NDArray[np.float32]
 TILE_PX = 32  # samples along a tile's side

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.models.camera import Array
-from omnid.simulation.rendering.surfaces import Texture
 
+Texture = NDArray[np.uint8]
 Random = np.random.Generator
 # (width, height) [px]
 Size = tuple[int, int]

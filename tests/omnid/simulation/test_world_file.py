@@ -12,7 +12,7 @@ import pytest
 from calib import se3
 from calib.rig import MountedCamera, Rig
 from omnid.errors import OmnidError
-from omnid.simulation.rendering import shapes
+from omnid.simulation.rendering import surfaces
 from omnid.simulation.world import Walkers, clearance_m
 from omnid.simulation.world_file import load_world, shipped_worlds
 from tests.simulation import Rectangle, Scene, make_rig, render
@@ -102,8 +102,8 @@ def test_wrong_worlds_are_refused(tmp_path: Path, old: str, new: str, message: s
 def test_the_area_is_checked_before_anything_is_painted(
     tmp_path: Path, text: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(shapes.textures, "PAINTERS", {name: None for name in shapes.textures.PAINTERS})
-    monkeypatch.setattr(shapes.textures, "poster", None)
+    monkeypatch.setattr(surfaces.textures, "PAINTERS", {name: None for name in surfaces.textures.PAINTERS})
+    monkeypatch.setattr(surfaces.textures, "poster", None)
     with pytest.raises(OmnidError, match=r"the surfaces are \d+ m2; expected at most 1200"):
         load_world(write(tmp_path, text), 1)
 
