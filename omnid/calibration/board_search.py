@@ -18,8 +18,6 @@ from omnid.errors import OmnidError
 
 AnyBoard = Board | AprilGrid
 Progress = Callable[[str], None]  # receives the lines that a long calibration reports while it runs
-# A log shows similar views many times: this number of diverse views is as good as all, in a fraction of the time.
-MAX_LOG_VIEWS = 40
 CORNERS_HINT = "count the inner corners, and take images with the whole board in view, sharp and well lit"
 TAGS_HINT = (
     "check --tags and --tag-spacing, and take images with the board nearer (six pixels a bit of its tags), sharp and "
@@ -50,17 +48,6 @@ def find_boards(images: Images, board: AnyBoard, *, thorough: bool, progress: Pr
         hint = CORNERS_HINT if isinstance(board, Board) else TAGS_HINT
         raise OmnidError(f"calibrate: no {board} in any of {len(images)} images; {hint}")
     return views
-
-
-def select_diverse_views(views: Sequence[BoardView]) -> list[BoardView]:
-    """Select at most MAX_LOG_VIEWS whose first and last corners are far apart (farthest point sampling)."""
-    corners = np.array([view.pixels[np.flatnonzero(np.isfinite(view.pixels[:, 0]))[[0, -1]]].ravel() for view in views])
-    chosen = [0]
-    distance = np.full(len(views), np.inf)
-    while len(chosen) < min(MAX_LOG_VIEWS, len(views)):
-        distance = np.minimum(distance, np.linalg.norm(corners - corners[chosen[-1]], axis=1))
-        chosen.append(int(distance.argmax()))
-    return [views[index] for index in sorted(set(chosen))]
 
 
 def view_of_tags(stated: View | None, views: Sequence[BoardView], board: AprilGrid) -> View:

@@ -27,7 +27,7 @@ SIDES = ("lower", "upper")
 # Largest difference between the stamps of a pair: boards are held still, so that 10 ms show the same instant.
 TOLERANCE_NS = 10_000_000
 # Number of pairs of a log that are used, evenly spread: a board held by hand moves little between two of them.
-LOG_PAIRS = 100
+LOG_PAIRS = 60
 BY_NAME = LogCameras()
 
 

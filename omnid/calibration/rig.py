@@ -27,7 +27,6 @@ from omnid.calibration.board_search import (
     AnyBoard,
     Progress,
     find_boards,
-    select_diverse_views,
     view_of_tags,
 )
 from omnid.calibration.images import PairedImages, brightest, read_pairs
@@ -137,7 +136,7 @@ def calibrate_rig(
 
 
 def _find_views(images: PairedImages, board: AnyBoard, progress: Progress) -> list[PairView]:
-    """Find the board in the images of both cameras; of a log's many pairs the most diverse ones are selected."""
+    """Find the board in the images of both cameras."""
     of_log = bool(images.topics[0])
     found = list[dict[str, BoardView]]()
     for name, side in zip(SIDES, images.sides, strict=True):
@@ -146,11 +145,7 @@ def _find_views(images: PairedImages, board: AnyBoard, progress: Progress) -> li
         except OmnidError as error:
             raise OmnidError(f"{name} camera: {error}") from error
         found.append({view.name: view for view in views})
-    both = [found[0][name] for name in images.names if name in found[0] and name in found[1]]
-    selected = set(images.names)
-    if of_log and both:
-        selected = {view.name for view in select_diverse_views(both)}
-    seen = [PairView(name, (found[0].get(name), found[1].get(name))) for name in images.names if name in selected]
+    seen = [PairView(name, (found[0].get(name), found[1].get(name))) for name in images.names]
     return [view for view in seen if any(view.seen)]
 
 

@@ -54,11 +54,6 @@ class RigCheckResult:
     skew_s: float  # median time from the lower camera's exposure to the upper one's
 
     @property
-    def state(self) -> RigState:
-        """The state by the columns."""
-        return self.finding.state
-
-    @property
     def has_changed_intrinsics(self) -> bool:
         """True if the columns show a change other than that of the upper camera's pose."""
         shift = np.zeros(2) if self.finding.drift is None else self.finding.drift.shift
@@ -68,7 +63,7 @@ class RigCheckResult:
         """Return the result as lines of text, the condition first."""
         finding = self.finding
         lines = [
-            f"{self.state}: {self.pairs} pairs, {finding.matches} of {finding.tried} points found in both panoramas",
+            f"{finding.state}: {self.pairs} pairs, {finding.matches} of {finding.tried} points found in both panoramas",
             f"columns: median {finding.offset_px:+.3f} px, spread {finding.spread_px:.3f} px",
         ]
         if (drift := finding.drift) is not None:

@@ -98,7 +98,7 @@ def _checked(args: argparse.Namespace, rig: Rig) -> tuple[Rig, bool]:
     if args.output is not None:
         rig, remains = with_upper_corrected(rig, pairs, found)
         print(f"{args.output}: {remains}")
-    return rig, found.state is not RigState.FITS
+    return rig, found.finding.state is not RigState.FITS
 
 
 def _at_height(args: argparse.Namespace, rig: Rig) -> tuple[Rig, str]:

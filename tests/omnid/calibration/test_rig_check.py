@@ -79,7 +79,7 @@ def test_measures_turns_about_every_axis(drive: Path, pairs: list[FramePair], tu
 
 def test_exchanged_images_do_not_fit_and_dark_ones_say_nothing(drive: Path, pairs: list[FramePair]) -> None:
     exchanged = [replace(pair, lower=pair.upper, upper=pair.lower) for pair in pairs]
-    assert check_rotated(drive, exchanged, (0, 0, 0)).state is not RigState.FITS
+    assert check_rotated(drive, exchanged, (0, 0, 0)).finding.state is not RigState.FITS
     dark = [replace(pair, lower=np.zeros_like(pair.lower), upper=np.zeros_like(pair.upper)) for pair in pairs]
     found = check_rotated(drive, dark, (0, 0, 0))
     assert found.finding.state is RigState.UNCHECKED
