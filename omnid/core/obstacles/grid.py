@@ -209,10 +209,11 @@ class ObstacleGrid:
         gone = self._gone_s > p.lately_s
         self._shown[gone], self._here[gone], self.odds[gone & past] = 0, 0, p.arrival
         # 3. What is known: seen, or seen past. What was hidden from the start may look like floor in some pairs: it is
-        #    known after so many views past it.
+        #    known after so many more views past it.
         self._past_views[past] += np.float32(1 - rho)
         self._past_views[observed] = p.views
-        self._past_views[hidden & (self._past_views < p.views)] = 0
+        taken_back = hidden & (self._past_views < p.views)
+        self._past_views[taken_back] = np.maximum(self._past_views[taken_back] - p.views * (1 - rho), 0)
         self._known[observed | (past & (self._past_views >= p.views))] = 1
         if is_first:
             self._assume_free(yaw, belief)
