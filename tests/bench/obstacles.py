@@ -2,8 +2,11 @@
 
 Two tables follow from the same command. The first: how far the robot drove where nothing was in the way. The second:
 what it touched where something was, and whether it stopped 0.05 to 0.8 m before that, or passed. A drive is asked to go
-straight on or to a goal; it ends there, or where it has stood for a while.
+straight on, to turn towards the hazard (--turning), or to a goal; it ends there, or where it has stood for a while.
 Each is a line of build/results/obstacles.jsonl; the command goes on where it ended as long as the commit is the same.
+
+With --open-loop FOLDER, pairs along the way are kept there with the truth, made by a base that nothing stops, and what
+the scan and the grid say is compared with it (tests/bench/open_loop.py).
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from multiprocessing import get_context
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -26,12 +30,14 @@ from omnid.config import load_config
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.navigation.requests import GoalRequest, NavigationFrame
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun
+from omnid.simulation.rendering.surfaces import Scene
 from omnid.simulation.robot import SimulatedRobot
 from omnid.simulation.world import Walkers, clearance_m
 from tests.bench.results import ROOT, ResultTable, columns, commit
 from tests.simulation.disturbed import simulate
 from tests.simulation.harmless_worlds import FLOORS, Trial
 from tests.simulation.hazard_worlds import HARMLESS, HAZARDS, trial
+from tests.simulation.photographs import with_photographs
 
 Array = NDArray[np.float64]
 
@@ -41,6 +47,7 @@ OWN_MPS: Final = 0.05  # A contact at a lower speed is not the robot's own.
 DRIVEN: Final = 0.95  # share of what was asked that counts as all
 STOPS_M: Final = (0.05, 0.8)  # before a hazard
 STANDS_M, STANDS_S, HAZARD_STANDS_S = 0.03, 12.0, 8.0  # a drive ends that moved by less than this in that time
+TURN_RADIUS_M, TURN_M = 4.0, 2.4  # of the arc towards a hazard, which ends there
 TEXTURED: Final = "marbled"  # the floor whose time is the measure of the others
 USUAL_MPS: Final = 0.5
 SLOWEST_MPS: Final = 0.1  # A drive that is slower than this on average ends unfinished.
@@ -55,12 +62,14 @@ class Planned:
     speed_mps: float = 0.3
     size_px: int = 512
     floor: str | None = None
+    is_turning: bool = False
+    has_photographs: bool = False  # of floors, walls and pictures
     overrides: tuple[str, ...] = ()  # of settings
 
     def __str__(self) -> str:
         parts = [f"{self.world} seed {self.seed}, {self.speed_mps:g} m/s, {self.size_px} px"]
-        parts += [f"on {self.floor}"] * (self.floor is not None)
-        parts += self.overrides
+        parts += [f"on {self.floor}"] * (self.floor is not None) + ["turning"] * self.is_turning
+        parts += ["photographs"] * self.has_photographs + list(self.overrides)
         return ", ".join(parts)
 
 
@@ -102,6 +111,8 @@ class Asker:
         self._asked, self._stands_s = asked, STANDS_S if asked.things is None else HAZARD_STANDS_S
         speed_mps = -planned.speed_mps if asked.motion == "back" else planned.speed_mps
         self._setpoint = Setpoint(speed_mps, heading_rad=0.0)
+        if planned.is_turning:
+            self._setpoint = Setpoint(speed_mps, yaw_rate_radps=abs(speed_mps) / TURN_RADIUS_M)
         if asked.motion == "turn left":
             self._setpoint = Setpoint(0.5 * speed_mps, yaw_rate_radps=speed_mps / 0.3)
         self._start: Array | None = None
@@ -136,9 +147,16 @@ def prepared(planned: Planned) -> tuple[Trial, SimulatedRobot]:
     """Return the trial, with the start that the drive needs, and the robot."""
     asked = trial(planned.world, planned.seed, planned.floor)
     robot = asked.robot(planned.size_px)
+    if planned.has_photographs:
+        standing = with_photographs(Scene(asked.world.standing), planned.seed).rectangles
+        asked = replace(asked, world=replace(asked.world, standing=standing))
     x_m, y_m, heading_rad = asked.world.start
-    if asked.motion == "ahead" and asked.goal is None and planned.speed_mps < 0:
-        heading_rad += math.pi
+    if asked.motion == "ahead" and asked.goal is None:
+        if planned.is_turning:  # an arc to the left, at whose end the base looks along x
+            angle_rad = math.copysign(TURN_M / TURN_RADIUS_M, planned.speed_mps)
+            y_m, heading_rad = math.copysign(TURN_RADIUS_M * (1 - math.cos(angle_rad)), angle_rad), -angle_rad
+        if planned.speed_mps < 0:
+            heading_rad += math.pi
     return replace(asked, world=replace(asked.world, start=(x_m, y_m, heading_rad))), robot
 
 
@@ -220,7 +238,7 @@ def groups(made: Made) -> Iterator[tuple[str, Made]]:
     """Yield the rows of a table: by world, then by speed, size and floor where there are several, then all."""
     keys: tuple[Callable[[Planned], str], ...] = (
         lambda one: one.world,
-        lambda one: f"at {one.speed_mps:g} m/s",
+        lambda one: f"at {one.speed_mps:g} m/s" + " turning" * one.is_turning,
         lambda one: f"{one.size_px} px",
         lambda one: f"on {one.floor or 'its own floor'}",
     )
@@ -302,18 +320,27 @@ def main() -> None:
     parser.add_argument("--speed", type=float, nargs="+", default=[0.3], help="m/s; below 0: backwards")
     parser.add_argument("--px", type=int, nargs="+", default=[512], help="sizes of the images")
     parser.add_argument("--floor", nargs="+", choices=FLOORS, default=[None], help="other floors than the worlds' own")
+    parser.add_argument("--turning", action="store_true", help="towards hazards on an arc")
+    parser.add_argument("--photographs", action="store_true", help="on floors, walls and pictures (scikit-image's)")
+    parser.add_argument("--open-loop", type=Path, metavar="FOLDER", help="keep pairs there, and judge the scan")
     parser.add_argument("--jobs", type=int, default=1, help="drives at a time")
     parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE")
     arguments = parser.parse_args()
     lists = {"harmless": HARMLESS, "hazards": HAZARDS}
     names = [name for given in arguments.only or lists for name in lists.get(given, (given,))]
+    overrides = tuple(arguments.overrides)
     wanted = [
-        Planned(name, seed, speed_mps, size_px, floor, tuple(arguments.overrides))
+        Planned(name, seed, speed_mps, size_px, floor, arguments.turning, arguments.photographs, overrides)
         for name, speed_mps, size_px, floor, seed in product(
             names, arguments.speed, arguments.px, arguments.floor, arguments.seeds
         )
     ]
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of the processes that follow
+    if arguments.open_loop:
+        from tests.bench.open_loop import judge_scans
+
+        judge_scans(wanted, arguments.open_loop, arguments.jobs)
+        return
     here, drives = commit(), known_drives()
     missing = [planned for planned in wanted if str(planned) not in drives]
     LINES.parent.mkdir(parents=True, exist_ok=True)
