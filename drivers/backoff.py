@@ -4,10 +4,10 @@ from __future__ import annotations
 
 
 class Backoff:
-    """Waits that double up to `longest_s`; reads no clock and does not wait itself."""
+    """Waits that double from 0.1 s up to `longest_s`; reads no clock and does not wait itself."""
 
-    def __init__(self, longest_s: float, *, first_s: float = 0.1) -> None:
-        self._first_s, self._longest_s = min(first_s, longest_s), longest_s
+    def __init__(self, longest_s: float) -> None:
+        self._first_s, self._longest_s = min(0.1, longest_s), longest_s
         self._next_s = self._first_s
 
     def next_s(self) -> float:

@@ -220,17 +220,12 @@ class Pose:
 
 
 def odometry_cdr(
-    stamp_ns: int,
-    T_odom_base: Array,
-    covariance: Array,
-    velocity: Array,
-    velocity_covariance: Array,
-    frames: Frames = ("odom", "base_link"),
+    stamp_ns: int, T_odom_base: Array, covariance: Array, velocity: Array, velocity_covariance: Array
 ) -> bytes:
-    """Encode a nav_msgs/msg/Odometry: pose in the parent frame, velocity (6,) [m/s, rad/s] in the child frame."""
+    """Encode a nav_msgs/msg/Odometry: pose in odom, velocity (6,) [m/s, rad/s] in base_link."""
     linear, angular = (tuple(part.tolist()) for part in np.split(velocity, 2))
     pose, twist = (T_odom_base, np.ravel(covariance)), ((linear, angular), np.ravel(velocity_covariance))
-    return encoded(ODOMETRY_SCHEMA, (stamp_ns, frames[0]), frames[1], pose, twist)
+    return encoded(ODOMETRY_SCHEMA, (stamp_ns, "odom"), "base_link", pose, twist)
 
 
 def decode_pose(payload: bytes, attachment: bytes = b"", received_ns: int | None = None) -> Pose:

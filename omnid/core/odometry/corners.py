@@ -16,13 +16,14 @@ Flags = NDArray[np.bool_]
 # Side, at scale 1, of the cells among which the corners are shared out evenly: in a panorama of 1300 x 380 px there are
 # about 200 cells, so that each has two or three of the 500 landmarks wanted.
 CELL_PX = 48
-BLOCK_PX = 5  # window over which the gradients of a corner are summed.
+BLOCK_PX = 5  # Side of the window over which the gradients of a corner are summed.
 # Side of the square in which a corner is the maximum, and least distance of a new landmark from a known one: two thirds
 # of a patch, because nearer ones would share most of their texture, and so their errors. At all scales, because patches
 # have as many pixels at each.
 APART_PX = 9
 MIN_RESPONSE = 2e-4  # smallest eigenvalue of a corner, in OpenCV's scale for 8 bit images
-# Measured response that noise of one grey level reaches in 1 % of the pixels; it grows with its square.
+# Response that noise of one grey level reaches in 1 % of the pixels, as measured. The response grows with the square of
+# the noise.
 NOISE_RESPONSE = 2.5e-5
 # Largest horizontal error of a vertical match, at all scales, because matches err by parts of a pixel at each; a right
 # calibration errs by 0.1 degrees, 0.4 px of 1300 columns.
@@ -60,11 +61,11 @@ def _rank_within(group: NDArray[np.intp]) -> NDArray[np.intp]:
     return rank
 
 
-def clear_around(usable: Flags, points: Array, radius_px: int) -> Flags:
-    """Return usable (H, W) without the discs around points (N, 2), so that no landmark is detected twice."""
+def clear_around(usable: Flags, points: Array) -> Flags:
+    """Return usable (H, W) without discs of APART_PX around points (N, 2), so that no landmark is detected twice."""
     free = usable.astype(np.uint8)
     for column, row in np.rint(points).astype(int).tolist():
-        cv2.circle(free, (column, row), radius_px, 0, -1)
+        cv2.circle(free, (column, row), APART_PX, 0, -1)
     return free.astype(bool)
 
 
@@ -77,8 +78,8 @@ def pixels_in_upper(
 ) -> Array:
     """Return pixels (N, 2) in the upper panorama of points (N, 2) of the lower one; NaN without a match.
 
-    guess (N, 2) pixels. A match passes the forward-backward check, and lies in the guessed column within CROSS_PX and
-    spread_px (N,), below the point.
+    guess (N, 2) pixels. A match passes the forward-backward check, lies within CROSS_PX + spread_px (N,) of the
+    guessed column, and lies below the point.
     """
     lower, upper = pair
     finite = np.flatnonzero(np.isfinite(guess).all(axis=1))

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.odometry.corners import APART_PX, clear_around, corners, nearby_disparity, pixels_in_upper
+from omnid.core.odometry.corners import clear_around, corners, nearby_disparity, pixels_in_upper
 from omnid.core.odometry.correlation import has_wrong_period
 from omnid.core.odometry.estimates import OdometryLimits, PoseEstimate
 from omnid.core.odometry.exposure_times import AssumedMotion, Exposure
@@ -67,7 +67,7 @@ class Keyframes:
     def add(self, request: KeyframeRequest) -> None:
         """Add a keyframe with new landmarks between the known ones."""
         frame = request.frame
-        free = clear_around(request.usable, request.pixels, APART_PX)
+        free = clear_around(request.usable, request.pixels)
         points = corners(frame.lower, free, self._limits.features - len(request.pixels))
         new = located(frame, points, self._model, self._klt, request.exposure, request.views)
         keyframe = Keyframe(frame.seq, frame.lower, request.T_odom_rect, request.covariance)

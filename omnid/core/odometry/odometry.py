@@ -82,7 +82,7 @@ class VisualOdometry:
         self._limits, self._model, self._relocaliser = limits, model, relocaliser
         self._map = LocalMap(model, klt, limits.keyframes)
         self._keyframes = Keyframes(self._map, model, replace(klt, levels=1), limits, relocaliser)
-        self._search = PoseSearch(self._map, model, limits, klt)
+        self._search = PoseSearch(self._map, model, limits)
         self._motion, self._hypotheses, self._tracking = motion or MotionFilter(), MotionHypotheses(), Tracking(limits)
         self._static_mask = StaticMask(model.cylinder.edges_rad)
         self._T_odom_rect = np.eye(4)

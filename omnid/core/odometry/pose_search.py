@@ -25,7 +25,7 @@ from omnid.core.odometry.pose_estimation import (
     ransac,
 )
 from omnid.core.odometry.stereo_frame import StereoFrame
-from omnid.core.odometry.tracking import KltSettings, correlation_peaks
+from omnid.core.odometry.tracking import correlation_peaks
 from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
@@ -79,7 +79,7 @@ class CoarsePose:
 class PoseSearch:
     """Finds a frame in the local map."""
 
-    def __init__(self, local_map: LocalMap, model: StereoModel, limits: OdometryLimits, klt: KltSettings) -> None:
+    def __init__(self, local_map: LocalMap, model: StereoModel, limits: OdometryLimits) -> None:
         self._map, self._model, self._limits = local_map, model, limits
         self._coarse_model = replace(model, sigma_px=COARSE_SIGMA_PX)
         # Number of landmarks that are tracked at most.

@@ -21,11 +21,6 @@ MAX_SIGMA_M: Final = 0.3  # largest standard deviation of a landmark that is sho
 VOXEL_M: Final = 0.05  # Side of the voxels in which landmarks of several keyframes are fused; as in the grids.
 
 
-def base_poses(places: PlaceMap, rig: PlaceRig) -> Array:
-    """Return the poses (K, 4, 4) of the base at the keyframes, in the base's axes at the start of the map."""
-    return _of_base(np.array([places.poses[id] for id in sorted(places.keyframes)]), rig)
-
-
 def paths_xy(places: PlaceMap, rig: PlaceRig) -> Array:
     """Return the paths (N, 2) [m] of all drives, a row of NaN after each; one ends with its session or the odometry."""
     rows = [np.zeros((0, 2))]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from calib.panorama import Cylinder
 from calib.rig import Rig
-from omnid.core.odometry.corners import APART_PX, clear_around, corners, nearby_disparity
+from omnid.core.odometry.corners import clear_around, corners, nearby_disparity
 from omnid.core.odometry.local_map import Keyframe, LocalMap
 from omnid.core.odometry.plane_patches import disparity_slopes, fitted_slopes
 from omnid.core.odometry.tracking import KltSettings, track
@@ -66,9 +66,8 @@ class PanoramaObservations:
 class DriveLandmarks:
     """Tracks landmarks from keyframe to keyframe; keeps the images of the newest MAX_KEYFRAMES keyframes only."""
 
-    def __init__(self, model: StereoModel, max_count: int = LANDMARKS) -> None:
-        """max_count: landmarks in view of a keyframe."""
-        self._model, self._max_count = model, max_count
+    def __init__(self, model: StereoModel) -> None:
+        self._model = model
         # Landmarks that a keyframe does not show are not sought again.
         self._map = LocalMap(model, KltSettings(), MAX_KEYFRAMES, max_misses=1)
         self._number = -1  # of the last keyframe
@@ -112,8 +111,8 @@ class DriveLandmarks:
         """Begin new landmarks in the gaps, where both panoramas show the same patch."""
         # 1. Corners in the gaps, with the disparity of the pixels around them.
         known_pixels, pair = self._map.table.pixels, (current.lower, current.upper)
-        free = clear_around(current.visible, known_pixels, APART_PX)
-        pixels = corners(current.lower, free, self._max_count - len(known_pixels))
+        free = clear_around(current.visible, known_pixels)
+        pixels = corners(current.lower, free, LANDMARKS - len(known_pixels))
         disparity = nearby_disparity(current.disparity, pixels)
         pixels, disparity = pixels[np.isfinite(disparity)], disparity[np.isfinite(disparity)]
         # 2. Track them into the upper panorama.

@@ -20,8 +20,7 @@ from omnid.core.stereo.semiglobal import ColumnShift, SemiGlobalSearch
 Scalar = TypeVar("Scalar", bound=np.generic)
 Matches = tuple[Indices, Floats]  # flat indices (N,) into the lower panorama, disparities (N,) > 0 [px]
 
-METHODS = ("sad", "enhanced", "semiglobal")
-RESPONSE_SCALE = 0.5  # because a 3x3 Sobel of 8-bit images reaches 1020: half of it and less is kept in 8 bits
+RESPONSE_SCALE = 0.5  # A 3x3 Sobel of 8-bit images reaches 1020; half of that, clipped at 255, is kept in 8 bits.
 # Largest disagreement of the disparities that both panoramas choose; as in OpenCV's samples (disp12MaxDiff).
 LEFT_RIGHT_PX = 1
 # Sobel response that noise of one grey level reaches in one pixel of a hundred; by trial on development seeds.

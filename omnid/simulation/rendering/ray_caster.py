@@ -48,7 +48,6 @@ class NonCentralCamera(Protocol):
 class RayTable:
     """The rays of one camera's visible samples by square tiles, row by row; N samples, M tiles, some of them empty."""
 
-    supersample: int
     rays: Floats  # (3, N) unit, camera frame
     origins: Floats  # (3, N) [m] camera frame; (3, 1) zero where all rays start at the camera's origin
     spacing: Floats  # (N,) [rad] to the next sample, the root of the sample's solid angle
@@ -86,7 +85,6 @@ def ray_table(camera: OmniCamera, mask: Mask, supersample: int) -> RayTable:
     starts = np.searchsorted(tile[index], np.arange(lines * columns + 1))
     pixel = row[index] // supersample * (width // supersample) + column[index] // supersample
     return RayTable(
-        supersample,
         np.ascontiguousarray(rays[index].T),
         np.ascontiguousarray((origins if len(origins) == 1 else origins[index]).T),
         spacing[index],

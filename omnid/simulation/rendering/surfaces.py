@@ -139,6 +139,6 @@ def _length(edge: Array) -> float:
     return float(np.linalg.norm(edge))
 
 
-def poster_paint(rng: Random, px_per_m: float = PX_PER_M) -> Paint:
+def poster_paint(rng: Random) -> Paint:
     """Return what paints a face as a printed page, a drawing or a photograph."""
-    return lambda sides_m: textures.poster(rng, pixels_of(sides_m, px_per_m))
+    return lambda sides_m: textures.poster(rng, pixels_of(sides_m, PX_PER_M))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from omnid.core.stereo.matcher import METHODS, Matcher, MatchingSettings, smooth
+from omnid.core.stereo.matcher import Matcher, MatchingSettings, smooth
 from omnid.core.stereo.semiglobal import ColumnShift
 from tests.omnid.core.scenery import texture, turned
 
@@ -14,6 +14,7 @@ Image = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
 
 SHAPE, SHIFT_PX, COURSE_PX, DISPARITIES = (160, 240), 20, 16, 44
+METHODS = ("sad", "enhanced", "semiglobal")
 
 
 def matched(method: str, lower: Image, upper: Image, valid: Flags) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
