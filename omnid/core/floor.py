@@ -5,11 +5,11 @@ e_i = z_i + h - a x_i - b y_i and its noise sigma_i, a point within a span S of 
 
     p N(e_i; sigma_i) + (1 - p) ((1 - FALSE) Phi(e_i / sigma_i) + FALSE) / S
 
-A part p lies on the floor, the others above it, evenly over S (walls, furniture), and few are false. So little may
-lie below the floor: a table is not a floor. The prior of a and b is 0 +- 1 degree. h is searched on a grid, with S = h;
-then expectation maximisation (Dempster, Laird, Rubin 1977) finds h, a, b, p and the noise's scale, with S = SPAN_M.
-The evidence for a floor is the log of the ratio of the likelihoods with it (p) and without (p = 0). Points of one
-surface share their errors: CORRELATED_POINTS of them count as one. The evidence of pairs adds up.
+A share p of the points lies on the floor, the others above it, evenly over S (walls, furniture), and a few are false.
+So few may lie below: the top of a table is not a floor. The prior of a and b is 0 +- 1 degree. h is searched on a
+grid, with S = h; then expectation maximisation (Dempster, Laird, Rubin 1977) finds h, a, b, p and the noise's scale,
+with S = SPAN_M. The evidence for a floor is the log of the ratio of the likelihoods with it (p) and without (p = 0).
+Points of one surface share their errors: CORRELATED_POINTS of them count as one. The evidence of pairs adds up.
 """
 
 from __future__ import annotations
@@ -26,39 +26,35 @@ from calib.fit.least_squares import SIGMA_PER_MAD
 Array = NDArray[np.float64]
 
 TILT_SIGMA_RAD: Final = math.radians(1.0)  # prior of the tilt of a base on its wheels
-# Heights that are searched, because cameras of robots are between them; the step is finer than the noise that the
-# prior's tilt adds, so that none is missed.
+# Heights of cameras on robots, which are searched; the step is finer than the noise that the prior of the tilt adds.
 HEIGHTS_M: Final = np.arange(0.1, 3.0, 0.02)
-SPAN_M: Final = 0.3  # Points so near to the floor are compared with it, because that is 3 sigma of the noisiest ones.
+SPAN_M: Final = 0.3  # Points within this distance of the floor are fitted: 3 sigma of the noisiest ones.
 FALSE: Final = 0.05  # Share of the points that lie on no surface, false matches.
-# Share of the points on the floor at the start of the search, because a narrow corridor shows so much.
+# Share of the points on the floor at the start of the search: that of a narrow corridor.
 FIRST_PART: Final = 0.1
-# Slope below the horizon, because flatter rays measure the floor's height badly.
+# Least slope of rays below the horizon, because flatter ones measure the height of the floor badly.
 STEEP: Final = math.tan(math.radians(15))
-LARGEST_SIGMA_M: Final = 0.1  # Noisier points are left out: by UNEVEN_M they would weigh a 400th of the best.
+LARGEST_SIGMA_M: Final = 0.1  # Noisier points are left out: their weight is below a 400th of that of the best.
 UNEVEN_M: Final = 0.005  # Standard deviation of an uneven floor.
-NOISE_SCALES: Final = (0.25, 1.0)  # limits of the factor on the stated noise, because it was 0.3 to 0.9 on floors
-MOST_POINTS: Final = 2000  # more of a pair say the same
-# Enough: of 36 floors of test_floor.py 2000 iterations move 34 by 3 mm at most, and deny 2.
+NOISE_SCALES: Final = (0.25, 1.0)  # limits of the factor on the stated noise; measured on floors: 0.3 to 0.9
+MOST_POINTS: Final = 2000  # of a pair: more would cost time and change nothing
+# Of the 36 floors of test_floor.py, 2000 iterations move 34 by 3 mm at most, and reject 2.
 ITERATIONS: Final = 40
-CONVERGED: Final = 1e-5  # m, rad; so that what is left is less than a 300th of RIG_SIGMAS
-# Fitted on rendered logs (the sample, rooms 601, two_walls 601), where a line gives no other reason: pairs scatter by
-# 6 mm and 0.3 degrees.
+CONVERGED: Final = 1e-5  # m, rad: a step below a 300th of RIG_SIGMAS ends the search
+# Points of one surface that count as one; fitted on rendered logs, whose pairs scatter by 6 mm and 0.3 degrees.
 CORRELATED_POINTS: Final = 20.0
-LEAST_EVIDENCE: Final = 5.0  # Log-likelihood ratio from which a run has a floor, because it is odds of 150 to 1.
+LEAST_EVIDENCE: Final = 5.0  # Log-likelihood ratio from which a run has a floor: odds of 150 to 1.
 LEAST_OF_PAIR: Final = 0.5  # a pair with less shows no floor
-# Sectors of ten degrees, and those of them in which the floor must be seen, because a smaller part of a turn determines
-# its tilt badly.
+# Sectors of ten degrees. The floor must be seen in a third of them, because fewer determine its tilt badly.
 SECTORS: Final = 36
 LEAST_SECTORS: Final = 12
-# Errors [m, rad, rad] of the rig and of stereo, which many pairs do not average out; measured on the same logs: -12 to
-# +8 mm.
+# Errors [m, rad, rad] of the rig and of stereo, which many pairs do not average out; measured: -12 to +8 mm.
 RIG_SIGMAS: Final = np.array([0.01, math.radians(0.2), math.radians(0.2)])
-# Pairs whose heights scatter more show no common floor, because those of one floor scatter by 6 mm.
+# Pairs whose heights scatter by more show no common floor; those of one floor scatter by 6 mm.
 LARGEST_SCATTER_M: Final = 0.05
-# Pairs after which the floor stays as it is, so that it costs nothing any more. The number was chosen by judgement.
+# Number of pairs after which the floor is constant and costs no more time.
 MOST_PAIRS: Final = 12
-# Pairs; what depends on the floor is computed again then, seldom because the median hardly changes.
+# Numbers of pairs after which the median is published again; each time what depends on the floor is computed again.
 RENEWED_AT: Final = (3, 6, MOST_PAIRS)
 
 

@@ -31,13 +31,13 @@ from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
 from omnid.messages import FramePair
 
 SAMPLED_COLUMNS: Final = 160  # of the panorama: some thousand samples
-# Grey levels: the wanted mean, the least mean that bright spots may cause, the level from which those are saturated.
+# Grey levels: the mean that is regulated to, the least mean to which bright spots may lower it, and saturation.
 TARGET, LEAST_MEAN, SATURATED = 100.0, 60.0, 250.0
-# Wanted factors of the light within this one cause no step, so that a step down causes none up; twice as much is the
-# largest step. What is saturated is brighter than it shows by at least this factor.
+# Dead band: a factor of the light below this one causes no step, so that a step down causes none up. Its square is the
+# largest step. A saturated area is assumed to be too bright by this factor.
 BAND: Final = math.sqrt(2)
 GAIN_STEPS: Final = 16  # A step of the gain is its range by this number, since its unit is not known.
-STEP_S: Final = 0.5  # between two steps: the images must show the last one
+STEP_S: Final = 0.5  # between two steps: images show a step only some frames later
 
 ExposureState = Literal["regulated", "too dark", "too bright"]
 
@@ -72,14 +72,14 @@ def _levels(grey: NDArray[np.uint8]) -> GreyLevels:
 
 
 def wanted_factor(lower: GreyLevels, upper: GreyLevels) -> float:
-    """Return the factor of the light that the images want, of both cameras together."""
+    """Return the factor by which the light of both cameras should change, between 1 / BAND^2 and BAND^2."""
     mean = max(1.0, math.sqrt(lower.mean * upper.mean))
     factor = TARGET / mean
     if max(lower.bright, upper.bright) >= SATURATED:
         factor = min(factor, 1 / BAND)
     else:
         factor = min(factor, max(1.0, SATURATED / max(1.0, lower.bright, upper.bright)))
-    factor = max(factor, LEAST_MEAN / mean)  # lamps and windows are small: the rest shall be seen
+    factor = max(factor, LEAST_MEAN / mean)  # lamps and windows are small: the rest shall stay visible
     return min(max(factor, 1 / BAND**2), BAND**2)
 
 
@@ -114,7 +114,7 @@ class ExposureLaw:
         wanted = before
         if direction:
             wanted = self._raised(factor) if direction > 0 else self._lowered(factor)
-        # A coarse step of the time that leads farther beyond the wanted light than it is now would hunt.
+        # Hunting: a coarse step of the time would lead farther beyond the wanted light than it is away now.
         made = wanted.exposure_us / before.exposure_us
         hunts = wanted.gain == before.gain and abs(math.log(made)) > 2 * abs(math.log(factor))
         self.state = "regulated"
@@ -154,13 +154,14 @@ class ExposureLaw:
 
 USUAL_HZ: Final = 30.0  # rate of cameras that keep their own
 PERIOD_SHARE: Final = 0.9  # Longest exposure by the images' period: the rest reads the image out.
-AFTER_PERIODS: Final = 1.5  # from a pair to the request: both cameras then carry it out after the same pair
+# Periods from a pair to the time of its request, so that both cameras carry it out after the same pair.
+AFTER_PERIODS: Final = 1.5
 
 
 class ExposureControl:
-    """A sink of the pairs of a live run.
+    """A sink of the pairs of a live run: measures grey levels, and regulates the exposure.
 
-    Only where the configuration says so and both cameras offer it, it makes requests; it measures in any case.
+    It makes requests only if cameras.auto_exposure is "rig" and both cameras offer an exposure time.
     """
 
     def __init__(self, area: UsefulArea, config: CamerasConfig, cameras: Mapping[Camera, CameraState]) -> None:
@@ -183,7 +184,7 @@ class ExposureControl:
         if problem := next((exposure.problem for exposure in self._exposures if exposure.problem), ""):
             self._left_to_cameras = f"left to the cameras: {problem}"
             self._request(None, pair.stamp_ns)
-        elif self._law is None:  # it starts with what the lower camera has now
+        elif self._law is None:  # start from the setting of the lower camera
             limit_us = min(1e3 * self._config.exposure_limit_ms, PERIOD_SHARE * self._period_ns * 1e-3)
             start = self._exposures[0].in_force or ExposureSetting(int(limit_us))
             mains = self._config.power_line

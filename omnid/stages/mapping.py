@@ -19,25 +19,28 @@ from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]
 
-MIN_VOXEL_FRAMES = 2  # frames that must have seen a voxel, also in a short run; one where there are fewer than 4
-FRAMES_PER_VOXEL_FRAME = 10  # frames of the run for each frame required, up to mapping.min_frames
-# Less motion shows the same points again. Measured: with 15 cm and 8 degrees half as many pairs enter the map, but of
-# its points up to 2.4 times as many are wrong where as much is seen (`tests.bench.accuracy --cloud`).
+# A voxel is published if enough of the mapped frames have seen it: a tenth of them, from MIN_VOXEL_FRAMES (half of the
+# frames where there are fewer than 4) to mapping.min_frames.
+MIN_VOXEL_FRAMES = 2
+FRAMES_PER_VOXEL_FRAME = 10
+# A pair that has moved by less shows the same points again. Measured: with 15 cm and 8 degrees half as many pairs enter
+# the map, but up to 2.4 times as many of its points are wrong (`tests.bench.accuracy --cloud`).
 SAME_VIEW_M, SAME_VIEW_TRACE = 0.03, 3 - math.radians(2) ** 2
-STANDING_NS = NS_PER_S  # Least time between two pairs of the same view that enter the map.
-STAMP_JITTER_NS = 5_000_000  # Tolerance of stamps: a period of the cameras that divides that of the map then does so.
+SAME_VIEW_NS = NS_PER_S  # Least time between two pairs of the same view that enter the map.
+STAMP_JITTER_NS = 5_000_000  # A pair that is early by less is due, because stamps of cameras jitter.
 
 
 class Mapping:
     """Fuses points of small variance at tracked poses; returns the map periodically and at the end."""
 
     def __init__(self, config: MappingConfig, dense: DenseDepths, every_s: float = 0.0) -> None:
-        """dense: computes the depth of a pair that enters the map. every_s: between two maps, by the stamps; 0: one,
-        at the end.
+        """dense: computes the depth of a pair that enters the map.
+
+        every_s: time between two maps, by the stamps; 0: one map, at the end.
         """
         self._is_read = True  # whether the map has a reader
         self._config, self._dense = config, dense
-        self._every_ns, self._given_ns = round(every_s * NS_PER_S), 0
+        self._every_ns, self._published_ns = round(every_s * NS_PER_S), 0
         self._map = VoxelMap(config.voxel_m, config.max_voxels)
         self._path = ThinnedPath(config.path_poses, config.voxel_m)
         self._newest: tuple[int, int] | None = None
@@ -67,17 +70,17 @@ class Mapping:
             points = se3.apply(odometry.T_odom_rig, depth.points[sure])
             self._map.insert(points, depth.variance_m2[sure], odometry.seq)
         # 2. The map, where a period has passed since the last one.
-        if not self._every_ns or odometry.stamp_ns - self._given_ns < self._every_ns:
+        if not self._every_ns or odometry.stamp_ns - self._published_ns < self._every_ns:
             return None
-        self._given_ns = odometry.stamp_ns
+        self._published_ns = odometry.stamp_ns
         return self._update(odometry.seq, odometry.stamp_ns)
 
     def _is_due(self, odometry: OdometryUpdate) -> bool:
-        """True if a pair is to enter the map: so often, and sooner where the view has changed.
+        """True if a pair is to enter the map: at mapping.rate_hz, or once a second while the view is the same.
 
-        Dense stereo costs as much as the odometry of a pair. A robot at rest sees nothing new. A keyframe, whose dense
-        stereo the odometry needs anyway, is due after half the time: then another pair can do without. While no client
-        reads the map, keyframes are enough: one that reads it later finds all of it, of fewer views.
+        Dense stereo costs as much as the odometry of a pair. A keyframe, whose dense stereo the odometry needs anyway,
+        is due after half the time, which saves that of another pair. While no client reads the map, only keyframes
+        enter it: a client that comes later finds all of the map, from fewer views.
         """
         if not (odometry.is_keyframe or self._is_read):
             return False
@@ -85,7 +88,7 @@ class Mapping:
             return True
         since_ns, moved = odometry.stamp_ns - self._mapped[0], se3.inverse(self._mapped[1]) @ odometry.T_odom_rig
         is_same_view = np.linalg.norm(moved[:3, 3]) < SAME_VIEW_M and np.trace(moved[:3, :3]) > SAME_VIEW_TRACE
-        wait_ns = max(self._min_gap_ns, STANDING_NS if is_same_view else 0)
+        wait_ns = max(self._min_gap_ns, SAME_VIEW_NS if is_same_view else 0)
         return since_ns >= (wait_ns / 2 if odometry.is_keyframe else wait_ns) - STAMP_JITTER_NS
 
     def finish(self) -> list[MapUpdate]:
@@ -93,7 +96,7 @@ class Mapping:
         return [] if self._newest is None else [self._update(*self._newest)]
 
     def _update(self, seq: int, stamp_ns: int) -> MapUpdate:
-        """Return the voxels that enough frames have seen: false matches seldom repeat in the same place."""
+        """Return the path, and the voxels that enough frames have seen: false matches seldom repeat in one place."""
         least = min(MIN_VOXEL_FRAMES, max(1, self._frames // 2))
         enough = min(self._config.min_frames, max(least, self._frames // FRAMES_PER_VOXEL_FRAME))
         path_xy = np.array([vertex[:2] for vertex in self._path.with_end()], float).reshape(-1, 2)
@@ -101,32 +104,33 @@ class Mapping:
 
 
 class MapGrid:
-    """Draw the map periodically and at the end, where it has changed: it moves when a loop closes."""
+    """Draws the grid of the map periodically and at the end, if the map has changed."""
 
     def __init__(self, cell_m: float, T_base_rect: Array, every_s: float = 0.0) -> None:
         """cell_m: side of a cell. every_s: time between two grids, by the stamps; 0: one grid, at the end."""
         self._grid, self._T_base_rect = KeyframeGrid(cell_m), T_base_rect
-        self._every_ns, self._given_ns = round(every_s * NS_PER_S), 0
-        self._given: object = None  # scans of the last grid
+        self._every_ns, self._published_ns = round(every_s * NS_PER_S), 0
+        self._published: object = None  # scans of the last grid
         self._newest: PlaceUpdate | None = None
 
     def process(self, update: PlaceUpdate) -> GridUpdate | None:
         """Return the grid when it is due and has changed."""
-        if not update.is_known:  # where these scans lie in the map is unknown
+        if not update.is_known:  # the pose of these scans in the map is unknown
             return None
         self._newest = update
-        if not self._every_ns or update.stamp_ns - self._given_ns < self._every_ns or update.scans is self._given:
+        is_early = not self._every_ns or update.stamp_ns - self._published_ns < self._every_ns
+        if is_early or update.scans is self._published:
             return None
         return self._drawn(update)
 
     def finish(self) -> list[GridUpdate]:
         """Return the final grid, if there was a keyframe."""
         newest = self._newest
-        if newest is None or newest.scans is None or not newest.scans.scans or newest.scans is self._given:
+        if newest is None or newest.scans is None or not newest.scans.scans or newest.scans is self._published:
             return []
         return [self._drawn(newest)]
 
     def _drawn(self, update: PlaceUpdate) -> GridUpdate:
         assert update.scans is not None
-        self._given_ns, self._given = update.stamp_ns, update.scans
+        self._published_ns, self._published = update.stamp_ns, update.scans
         return GridUpdate(update.seq, update.stamp_ns, self._grid.draw(update.scans, self._T_base_rect))

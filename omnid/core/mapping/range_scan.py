@@ -1,9 +1,9 @@
 """Range scan: the nearest obstacle in each direction, as a planar laser scanner would see it.
 
-That of one pair's points is for the map and its keyframes (`point_scan`). The floor and what is passed below are
-removed by height, with a margin that grows with the range: by the noise of stereo along the slanting ray, and by the
-tilt of the base. Support is counted in bins of inverse range, in which the noise of stereo is the same at all ranges
-(sigma_r = r^2 / (f t) sigma_d).
+`point_scan` makes one of the points of a pair, for the map and its keyframes. Points of the floor, and those under
+which the robot passes, are removed by their height, with a margin that grows with the range: by the noise of stereo
+along the slanting ray, and by the tilt of the base. Points are counted in bins of inverse range, in which the noise of
+stereo is the same at all ranges (sigma_r = r^2 / (f t) sigma_d).
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from calib import se3
 Array = NDArray[np.float64]
 Counts = NDArray[np.intp]
 
-# Sectors of one degree are as wide as a cell of the map, 5 cm, at 3 m; finer ones would not show more.
+# Sectors of one degree are as wide as a cell of the map, 5 cm, at 3 m.
 SECTORS: Final = 360
 # Points of a keyframe that are farther away do not enter its scan; by trial on development seeds.
 MAX_RANGE_M: Final = 12.0
-# Longest gap that is filled between two sectors of one surface, because it is 0.2 m wide at 3 m, too narrow for a
-# person.
+# Longest gap that is filled between two sectors of one surface: 0.2 m at 3 m, too narrow for a person.
 FILLED_SECTORS: Final = 4
 # The ranges on both sides of a gap belong to one surface if their ratio is at most this; by trial on development seeds.
 SURFACE_RATIO: Final = 1.15
 
-HEIGHT_SIGMAS: Final = 2.0  # Sigmas above the floor from which a point is an obstacle, so that 2 % of the floor's are.
-INVERSE_STEP: Final = 0.02  # 1/m: width of a bin, because two of them are about four sigma of a usual rig
+# Sigmas above the floor from which a point is an obstacle: 2 % of the points of the floor are.
+HEIGHT_SIGMAS: Final = 2.0
+INVERSE_STEP: Final = 0.02  # width of a bin [1/m]: two of them are about four sigma of a usual rig
 NEAREST_M: Final = 0.2  # Range of the first bin, from the middle of the base.
 
 # Ranges (SECTORS,) [m] of the sectors in the order of azimuth, from -pi on. NaN: no obstacle was seen.
@@ -114,7 +114,7 @@ def point_scan(points: Array, sigma_m: Array, view: Array, limits: ScanLimits, f
     # 3. The nearest bin that enough points support, those of the neighbouring sectors included.
     of_neighbours = count + np.roll(count, 1, axis=0) + np.roll(count, -1, axis=0)
     supported = (of_neighbours >= limits.min_points) & (count > 0)
-    limit = bins - math.floor(1 / (limits.max_range_m * INVERSE_STEP))  # bins from here on lie beyond
+    limit = bins - math.floor(1 / (limits.max_range_m * INVERSE_STEP))  # bins from this one on lie beyond
     first = supported.argmax(axis=1)[:, None]
     is_near = supported.any(axis=1) & (first[:, 0] < limit)
     total, of_inverse = (np.take_along_axis(each, first, axis=1)[:, 0] for each in (count, inverse))

@@ -2,8 +2,8 @@
 
 Courses of bricks of the height c fit the upper panorama at every disparity d (1 - k c / B), B the baseline, whatever
 their distance: a world that is larger by 1 / (1 - k c / B) explains the pair as well. Where a landmark repeats, dense
-stereo may have taken any of its disparities d_k, and landmarks of an earlier keyframe, which would decide, there are
-none. The lower panorama alone, followed from the keyframe on, decides:
+stereo may have chosen any of its disparities d_k, and there is no earlier keyframe whose landmarks would decide. So
+they are tracked in the lower panorama, from the keyframe on:
 
 1. Motion without depths: of directions t at right angles to the baseline and turns R about it, those that most pairs
    of bearings (a_i, b_i) fit,
@@ -15,11 +15,13 @@ none. The lower panorama alone, followed from the keyframe on, decides:
 
        S(|t|) = sum_i max_k exp(-(log |t| - log f B / (d_k r_i))^2 / (2 sigma_ik^2)).
 
-   The true distance has the votes of all landmarks, that of a larger world not those of landmarks that do not repeat.
-3. Of the distances that a vehicle can have made, the one with most votes decides the depths. While another one has
-   nearly as many, or too few landmarks have moved far enough to vote, the pose is in doubt by the difference of both.
+   The true distance has the votes of all landmarks; that of a larger world lacks those of landmarks that do not
+   repeat.
+3. Of the distances that a vehicle can have moved, the one with most votes decides the depths. While another distance
+   has nearly as many, or too few landmarks have enough parallax to vote, the pose is uncertain by the difference of the
+   two.
 
-Pairs that are not synchronised are left as they are (keyframes.py).
+Depths of pairs that are not synchronised are not corrected (keyframes.py).
 """
 
 from __future__ import annotations
@@ -45,34 +47,36 @@ Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 Pair = tuple[PaddedPanorama, PaddedPanorama]
 
-# Landmarks that do not repeat, as a share of all, below which the others decide the scale of the map: rendered rooms
-# with a wall of bricks have 0.42 and more, so that only worlds which repeat nearly everywhere are in doubt.
-LEAST_SURE = 0.4
-# Directions of the motion and turns that are tried first, rad: such a step moves an epipolar line by TOLERANCE_PX, so
-# that none is missed; each round is FINER times as fine. The last turn is as far as the tracker reaches.
+# The scale of the map is certain if at least this share of the landmarks does not repeat: rendered rooms with a wall of
+# bricks have 0.42 and more, so that it is uncertain only in worlds that repeat nearly everywhere.
+LEAST_UNIQUE_SHARE = 0.4
+# Steps of the direction of the motion and of its turn in the first round of the search [rad]: a step moves an epipolar
+# line by TOLERANCE_PX. The steps of each round are smaller by FINER. The largest turn is the reach of the tracker.
 DIRECTION_STEP, TURN_STEP, MOST_TURN = math.radians(2.5), math.radians(0.5), math.radians(10.0)
 ROUNDS, FINER = 3, 3
-# Share of the bearings that the motion explains, because a wrong one, where the turn is too large, explains 0.6.
+# Least share of the bearings that the motion must explain: a wrong one, where the turn is too large, explains 0.6.
 FIT_SHARE = 2 / 3
-# Share of the bearings that fit the best turn from which another turn fits as well, and how far apart both are, rad:
-# with a view of 30 degrees on a wall all of 10 degrees do, with a full turn those of 1.5 degrees, as measured.
-ALIKE_SHARE, ALIKE_TURN = 0.9, math.radians(2.5)
-TOLERANCE_PX = 1.5  # distance of a track from its epipolar line, because vehicles roll and pitch by half a degree
+# A turn fits as well as the best one if it has this share of its score. The motion is unknown if such a turn differs by
+# more than EQUAL_FIT_TURN [rad]. Measured: turns up to 10 degrees away fit as well for a view of 30 degrees on a wall,
+# up to 1.5 degrees for a full turn.
+EQUAL_FIT_SHARE, EQUAL_FIT_TURN = 0.9, math.radians(2.5)
+TOLERANCE_PX = 1.5  # distance of a track from its epipolar line: vehicles roll and pitch by half a degree
 # Parallax from which a landmark votes: with errors of SIGMA_PX, as measured for tracks without warped patches, its
 # range errs by an eighth, so that neighbouring courses differ by two sigmas.
 PARALLAX_PX, SIGMA_PX = 6.0, 0.7
-DISPARITY_SIGMA_PX = 0.5  # because peaks of the correlation are found among whole pixels
-LEAST_SIGMA = 0.02  # of a vote, because the motion is only known to a tenth of a degree
-LEAST_VOTES = 30.0  # that decide, because fewer are as many as scattered votes of a hundred landmarks give
-# Share of the landmarks with a vote that must agree, because without repetition no two distances can have so many.
+DISPARITY_SIGMA_PX = 0.5  # Peaks of the correlation are found at whole pixels.
+LEAST_SIGMA = 0.02  # of the logarithm of a voted distance: the motion is only known to a tenth of a degree
+LEAST_VOTES = 30.0  # of a distance that decides: more than the scattered votes of a hundred landmarks give
+# Share of the voting landmarks that a distance must have to decide: without repetition no two distances have so many.
 DECIDING_SHARE = 0.5
-# Votes by which a runner-up has fewer, so that it is less likely by a million to one: an outlier costs 1.1 (`_cost` in
+# Lead in votes that makes every other distance less likely by a million to one: an outlier costs 1.1 (`_cost` in
 # pose_search.py).
 LEAD_VOTES = math.log(1e6) / 1.1
-# Of the distance that wheels report, because theirs errs by less also before its scale is learned, and periods by more.
+# Largest ratio of the true distance to that of the wheels: their scale errs by less also before it is learned, while
+# distances by neighbouring courses differ by more.
 WHEELS_RATIO = 1.2
-OTHER_RATIO = 1.1  # distances whose ratio is less are one, because the votes for one distance are spread so far
-VOTED_SIGMAS = 3.0  # within which a disparity is the voted one, because three in a thousand of the right ones are not
+OTHER_RATIO = 1.1  # Distances with a smaller ratio are one: the votes for one distance spread so far.
+VOTED_SIGMAS = 3.0  # A disparity within so many sigmas of the distance is the voted one: 99.7 % of the right ones.
 
 
 class FirstDepths:
@@ -81,17 +85,18 @@ class FirstDepths:
     def __init__(self, pair: Pair, keyframe: Keyframe, ids: Indices, views: Array, model: StereoModel) -> None:
         """pair: lower and upper panorama of the keyframe; ids (N,) and views (N, 3) [px] of its landmarks."""
         self._model, self._T_odom_rect, self._ids, self._views = model, keyframe.T_odom_rect, ids, views
-        # Those at which they match, up to that of the baseline's distance, and which of them they have now.
+        # Disparities (N, K) [px] at which a landmark matches, up to that of a point at the distance of the baseline;
+        # and the column (N,) of the one that the map has now.
         self._disparities = matching_disparities(pair, views, round(model.cylinder.focal_px))
-        self._taken = np.zeros(len(ids), np.intp)
-        # Those that are followed (M,), and where the last panorama shows them.
+        self._chosen = np.zeros(len(ids), np.intp)
+        # Rows (M,) of the landmarks that are tracked, the last panorama, and their pixels (M, 2) in it.
         self._rows, self._last, self._pixels = np.arange(len(ids)), pair[0], views[:, :2]
-        # The largest distance from the keyframe that is possible, and the one by wheels; NaN: not known.
+        # The largest possible distance from the keyframe, and the one that wheels report, NaN: unknown [m].
         self._reached_m = np.zeros(2)
-        # Share of the motion by which it may be larger or smaller; 0: enough landmarks do not repeat.
+        # Fraction by which the motion may be larger (positive) or smaller; 0: it is certain.
         self._larger_share = 0.0
         self._repeats = np.asarray(np.isfinite(self._disparities[:, 1:]).any(axis=1))
-        if self._repeats.sum() > (1.0 - LEAST_SURE) * len(ids):
+        if self._repeats.sum() > (1.0 - LEAST_UNIQUE_SHARE) * len(ids):
             ratios = self._disparities[self._repeats, :1] / self._disparities[self._repeats] - 1.0
             edges = [float(np.median(edge(ratios, axis=1))) for edge in (np.nanmin, np.nanmax)]
             self._larger_share = max(edges, key=abs)
@@ -102,21 +107,22 @@ class FirstDepths:
         return self._larger_share != 0.0
 
     def doubt_m(self, T_odom_rect: Array) -> float:
-        """Return the distance [m] from a pose to the runner-up."""
+        """Return the distance [m] between a pose and the one by the other depths."""
         return abs(self._larger_share) * float(np.linalg.norm(T_odom_rect[:3, 3] - self._T_odom_rect[:3, 3]))
 
     def decide(self, lower: PaddedPanorama, klt: KltSettings, local_map: LocalMap, step_m: tuple[float, float]) -> None:
-        """Follow the landmarks into the next panorama, and correct their depths where it shows how far it is.
+        """Track the landmarks into the next panorama, and correct their depths in the map if the motion decides them.
 
-        step_m: the most that a vehicle can move since the last panorama, and the step by wheels, NaN: not known.
+        step_m: the largest possible distance since the last panorama, and the one that wheels report, NaN: unknown.
         """
-        # 1. Follow them from the keyframe on.
+        # 1. Track them from panorama to panorama.
         self._reached_m += step_m
         pixels, found = track(self._last, lower, self._pixels, self._pixels, klt)
         self._last, self._pixels, self._rows = lower, pixels[found], self._rows[found]
         if len(self._rows) < LEAST_VOTES:
             return
-        # 2. Each of their disparities is a logarithm of the distance. Wheels that hardly move may not have begun to.
+        # 2. Each of their disparities gives a distance; its logarithm is voted for. The wheels limit the distances,
+        #    unless they have hardly moved: they may report the start late.
         ranges, parallax_px = self._ranges()
         disparities = self._disparities[self._rows]
         distances = np.log(self._model.cylinder.focal_px * self._model.baseline_m / (disparities * ranges[:, None]))
@@ -130,7 +136,7 @@ class FirstDepths:
         grid = np.arange(least, min(float(np.nanmax(distances)), math.log(max(reach_m[1], SAME_M))), LEAST_SIGMA / 2)
         if not len(grid):
             return
-        # 3. Count the votes, and find another distance that has nearly as many.
+        # 3. Count the votes of each distance, and of the best one of clearly different distances.
         each = np.exp(-0.5 * ((grid[:, None, None] - distances[votes]) / sigmas[votes]) ** 2)
         scores = np.nan_to_num(each).max(axis=2).sum(axis=1)
         best = int(scores.argmax())
@@ -139,13 +145,13 @@ class FirstDepths:
         others = np.where(np.abs(grid - grid[best]) > math.log(OTHER_RATIO), scores, 0.0)
         is_near = others.max() > scores[best] - LEAD_VOTES
         self._larger_share = math.expm1(grid[others.argmax()] - grid[best]) if is_near else 0.0
-        # 4. Landmarks take the disparity of that distance. Those without one are wrong, and so may be those that repeat
-        #    without a vote.
+        # 4. Landmarks get the disparity of that distance. Voting landmarks without such a disparity are false; those
+        #    that repeat and have no vote may be. Both are removed.
         off = np.where(np.isfinite(distances), np.abs(distances - grid[best]) / sigmas, np.inf)
         chosen, is_decided = off.argmin(axis=1), off.min(axis=1) < VOTED_SIGMAS
-        moved = np.flatnonzero(is_decided & (chosen != self._taken[self._rows]))
+        moved = np.flatnonzero(is_decided & (chosen != self._chosen[self._rows]))
         rows = self._rows[moved]
-        self._taken[rows], views = chosen[moved], self._views[rows]
+        self._chosen[rows], views = chosen[moved], self._views[rows]
         views[:, 2] = views[:, 1] + disparities[moved, chosen[moved]]
         noise = np.tile(np.diag([0.0, 0.0, DISPARITY_SIGMA_PX**2]), (len(rows), 1, 1))
         local_map.set_views(self._ids[rows], views, noise)
@@ -165,7 +171,7 @@ class FirstDepths:
         direction, turn = motion
         t, turned = np.array([math.cos(direction), math.sin(direction), 0.0]), _turned(before, turn)
         error_px = cylinder.focal_px * epipolar_errors(turned, now, direction)
-        # r R a + t = q b in the least-squares sense; t points forwards or backwards, whichever leaves most in front.
+        # r R a + t = q b in the least-squares sense. The sign of t is the one with which most landmarks lie in front.
         a2, ab = (turned**2).sum(axis=1), (turned * now).sum(axis=1)
         sine2 = np.maximum(a2 - ab**2, 1e-12)
         ranges = (ab * (now @ t) - turned @ t) / sine2
@@ -178,8 +184,8 @@ class FirstDepths:
 def most_likely_motion(before: Array, now: Array, focal_px: float) -> tuple[float, float] | None:
     """Return direction and turn [rad] of the horizontal motion that most bearings (N, 3) fit, before and after it.
 
-    None: other turns fit as well, because what fills a narrow view turns as it moves aside, or may do so beyond
-    MOST_TURN; or too few bearings fit.
+    None: too few bearings fit; or other turns fit as well, or may do so beyond MOST_TURN: in a narrow view a turn looks
+    like a motion to the side.
     """
     direction, turn = np.arange(0.0, math.pi, DIRECTION_STEP), np.arange(-MOST_TURN, MOST_TURN + TURN_STEP, TURN_STEP)
     steps = DIRECTION_STEP, TURN_STEP
@@ -190,9 +196,9 @@ def most_likely_motion(before: Array, now: Array, focal_px: float) -> tuple[floa
             row[:] = np.exp(-0.5 * (errors_px / TOLERANCE_PX) ** 2).sum(axis=1)
         best = np.unravel_index(int(scores.argmax()), scores.shape)
         at = float(direction[best[1]]), float(turn[best[0]])
-        as_good = scores.max(axis=1) >= ALIKE_SHARE * scores.max()
-        is_shown = scores.max() > FIT_SHARE * len(now) and abs(at[1]) < MOST_TURN - ALIKE_TURN
-        if not is_shown or np.abs(turn[as_good] - at[1]).max() > ALIKE_TURN:
+        as_good = scores.max(axis=1) >= EQUAL_FIT_SHARE * scores.max()
+        is_shown = scores.max() > FIT_SHARE * len(now) and abs(at[1]) < MOST_TURN - EQUAL_FIT_TURN
+        if not is_shown or np.abs(turn[as_good] - at[1]).max() > EQUAL_FIT_TURN:
             return None
         steps = steps[0] / FINER, steps[1] / FINER
         direction, turn = (middle + step * np.arange(-FINER, FINER + 1) for middle, step in zip(at, steps, strict=True))
