@@ -1,8 +1,8 @@
 """Two omnidirectional cameras on one rigid body, the frame in which epipolar lines are columns, and the covariance.
 
 Parameters of the covariance: "lower NAME" and "upper NAME" for the intrinsics, in the units of rig.toml (d of an ocam
-camera moves d and e alike), then TRANSFORM_NAMES. Those describe the upper camera in the rectified frame, while the rig
-frame stays with the lower camera: R_true = exp(r) R, viewpoint along (e_x, e_y, 1) at the distance of the baseline.
+camera moves d and e together), then TRANSFORM_NAMES. These describe the upper camera in the rectified frame, while the
+rig frame stays with the lower camera: R_true = exp(r) R, viewpoint along (e_x, e_y, 1) at the distance of the baseline.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from calib.models.names import sees_directly, visible_part
 
 # Rotation [rad] and direction of the baseline [rad], in the rectified frame; length of the baseline [m].
 TRANSFORM_NAMES = ("r_x", "r_y", "r_z", "e_x", "e_y", "baseline")
-# Correlations are rounded, so that their text is exact; a matrix may be negative by the rounding.
+# Correlations are rounded, so that their text is exact; by the rounding an eigenvalue may be slightly negative.
 CORRELATION_DECIMALS, MIN_EIGENVALUE = 12, -1e-9
 
 
@@ -77,11 +77,11 @@ class RigCovariance:
         return self.names.index(name)
 
 
-MIN_BASELINE_M = 1e-3  # because viewpoints that are closer would show no depth
-MAX_BASELINE_M = 5.0  # of two cameras on one robot, because a number beyond it has another unit
+MIN_BASELINE_M = 1e-3  # Viewpoints that are closer would show no depth.
+MAX_BASELINE_M = 5.0  # of two cameras on one robot: a larger number has another unit
 # A T_base_rig that puts the cameras on the floor states no height; the identity, used without a measurement, does so.
 LEAST_HEIGHT_M = 0.1
-MAX_HEIGHT_M = 10.0  # Of cameras on a robot: a number beyond it is refused, because it has another unit.
+MAX_HEIGHT_M = 10.0  # of cameras on a robot: a larger number has another unit
 # Larger numbers are refused: they are probably in ms and us.
 MAX_UPPER_DELAY_S, MAX_LINE_TIME_S = 1.0, 1e-3
 

@@ -55,8 +55,8 @@ def replay(
     log: an MCAP file, or the folder of `ros2 bag record -s mcap`. rig: a rig.toml or a Rig; None: the one attached to
     the log. config: a TOML file or a Config; None: the defaults. overrides: settings such as "stereo.min_range_m=0.5"
     over those of the file. method: odometry.method. lower, upper: topics of the images; None: those of the rig, else
-    by their names. A motor.port of the configuration is driven as by `omnid replay`. progress: called some times a
-    second, in a thread of the run, with the number of pairs so far and the expected one, None where it is not known.
+    by their names. A motor.port of the configuration is driven as by `omnid replay`. progress: called several times
+    a second, in a thread of the run, with the number of pairs so far and the expected number, None if unknown.
 
     All poses and the map stay in memory (about 75 MB an hour at 30 Hz). Ctrl-C ends the run and
     raises KeyboardInterrupt. Raises OmnidError for input that cannot be used.
@@ -133,13 +133,13 @@ class Odometry:
         (H, W) uint8. Points and disparities are those of the method `depth`.
 
         Raises OmnidError for an image of another type or size than the rig's, for a stamp that is not later than the
-        previous one, and for stamps of a pair that are MAX_SKEW_S or more apart; such a pair changes nothing. So does
-        a pair with an image that repeats an earlier one to the last pixel, unless pair.repeated_images is "use": a
-        replay drops it, as a camera that is frozen shows no motion. Its images count as earlier ones, too. Also raises
-        it where one of the first pairs shows that the images cannot be of this rig, unless rig.check says otherwise.
+        previous one, and for stamps of a pair that are MAX_SKEW_S or more apart; such a pair changes nothing. Also for
+        an image that repeats an earlier one to the last pixel, unless pair.repeated_images is "use": a frozen camera
+        shows no motion, and a replay drops such a pair; later images are compared with those of this pair, too. And
+        where one of the first pairs shows that the images cannot be of this rig, unless rig.check says otherwise.
         """
         with self._lock:
-            # 1. Refuse what is no pair of this rig; it changes nothing.
+            # 1. Refuse images and stamps that are no pair of this rig, before any state changes.
             stamp_ns = _nanoseconds("stamp_ns", stamp_ns)
             if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
                 raise OmnidError(

@@ -101,9 +101,11 @@ def ambiguous_orders(board: CalibrationBoard) -> list[NDArray[np.intp]]:
 
 
 MODE_NAMES = ("bend_x", "bend_y", "twist", "stretch")
-# One step of a mode, a millimetre of height and a hundredth of the sides' ratio, because each is about a pixel of a
-# near board; and what prints have before their images are seen.
-MODE_UNITS, MODE_SIGMAS = np.array([1e-3, 1e-3, 1e-3, 1e-2]), np.array([1e-3, 1e-3, 1e-3, 2e-3])
+# One step of each mode: a millimetre of height, or a hundredth of the sides' ratio. Each is about a pixel of a near
+# board.
+MODE_UNITS = np.array([1e-3, 1e-3, 1e-3, 1e-2])
+# Standard deviations of the modes of usual prints, the prior of a fit [m, m, m, ratio].
+MODE_SIGMAS = np.array([1e-3, 1e-3, 1e-3, 2e-3])
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,14 +113,14 @@ class PrintShape:
     """Difference of a print from its drawing.
 
     With u, v from -1 to 1 along the sides x and y of the corners, points are higher by bend_x (1 - u^2) + bend_y
-    (1 - v^2) + twist u v [m]. Lengths along y are longer by the part stretch / 2, those along x shorter.
+    (1 - v^2) + twist u v [m]. Lengths along y are longer by the fraction stretch / 2, those along x shorter.
     """
 
     values: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)  # in the order of MODE_NAMES
 
     @property
     def stretch(self) -> float:
-        """Return the part by which y is longer against x."""
+        """Return the fraction by which lengths along y are longer than those along x."""
         return self.values[3]
 
     def points(self, drawn: Array) -> Array:

@@ -63,7 +63,7 @@ def find_board(image: Image, board: Board, name: str = "", *, thorough: bool = T
             if not windows:
                 continue
             placed = max(windows, key=lambda window: float(np.isfinite(window).mean()))  # the fullest
-            # 2. Refine its corners, and leave out those that are none or off the others.
+            # 2. Refine its corners, and leave out false ones and outliers.
             corners = _refined(image, blurred, orient_corners(blurred, placed, board), board)
             share = float(np.isfinite(corners[:, 0]).mean())
             # 3. Accept it by its score.
@@ -85,7 +85,7 @@ def _refined(image: Image, blurred: Grey, placed: Array, board: Board) -> Array:
 
 
 def board_score(image: Grey, corners: Array, board: Board) -> float:
-    """Return how much corners (N, 2) look like all of a board: 1 at most, about 0 for a part of a larger pattern.
+    """Return the score of corners (N, 2) as a complete board: 1 at most, about 0 for a part of a larger pattern.
 
     Steps of grey between neighbouring squares count from -1 to 1 as a fraction of the median step within the board. The
     score is their mean within the board and in the ring of squares around its corners, as far as the image shows it,

@@ -86,8 +86,8 @@ class Problem(Protocol[State]):
 
 
 @dataclass(frozen=True, slots=True)
-class Ending:
-    """End of a search: with a step of less than the relative gain, damped by less than `damping`, or after `steps`.
+class Termination:
+    """Criteria that end a search: a relative gain below `gain` with a damping below `damping`, or `steps` steps.
 
     A damped step follows the steep directions only: where flat ones count, the last step needs little damping. The
     number of steps is a bound that is never reached by good data.
@@ -98,12 +98,12 @@ class Ending:
     steps: int = 60
 
 
-def minimise(problem: Problem[State], state: State, ending: Ending, damping: float = START_DAMPING) -> State:
+def minimise(problem: Problem[State], state: State, termination: Termination, damping: float = START_DAMPING) -> State:
     """Return the state of least cost near the one given (Levenberg and Marquardt).
 
     damping: of the first step; one next to the minimum needs hardly any.
     """
-    for _ in range(ending.steps):
+    for _ in range(termination.steps):
         # 1. Linearise at the state, with the scale of its residuals.
         scale = problem.scale(state)
         cost, system = problem.cost(state, scale), problem.normal_equations(state, scale)
@@ -116,7 +116,7 @@ def minimise(problem: Problem[State], state: State, ending: Ending, damping: flo
             trial, trial_cost = _trial(problem, state, system, scale, damping)
         # 3. Take the step. End if it gained little, else lower the damping.
         state = trial
-        if cost - trial_cost < ending.gain * cost and damping < ending.damping:
+        if cost - trial_cost < termination.gain * cost and damping < termination.damping:
             return state
         damping = max(MIN_DAMPING, damping / DAMPING_FACTOR)
     return state
@@ -140,11 +140,12 @@ def central_differences(function: Callable[[Array], Array], steps: Array) -> Arr
 
 # Ratio of the standard deviation to the median absolute deviation of a normal distribution.
 SIGMA_PER_MAD = 1.4826
-# Least standard deviation assumed for a coordinate: exact pixels would make the width of a robust function 0. Residual
-# of what a model cannot project: larger than any residual in an image.
-MIN_SIGMA_PX, LOST_PX = 0.01, 300.0
+# Least standard deviation assumed for a coordinate, because exact pixels would make the width of a robust function 0.
+MIN_SIGMA_PX = 0.01
+# Residual of a point that a model cannot project: larger than any residual in an image.
+LOST_PX = 300.0
 
 
 def robust_sigma(residual: Array) -> float:
-    """Return the standard deviation of residuals by the median of their sizes (NaN: none), not less than the least."""
+    """Return the standard deviation [px] of residuals (NaN: none) by their median size, MIN_SIGMA_PX at least."""
     return max(MIN_SIGMA_PX, SIGMA_PER_MAD * float(np.nanmedian(np.abs(residual))))

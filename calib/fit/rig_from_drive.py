@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.errors import CalibError
-from calib.fit.least_squares import BEST_STEP, LOST_PX, ArrowSystem, Ending, minimise, robust_sigma
+from calib.fit.least_squares import BEST_STEP, LOST_PX, ArrowSystem, Termination, minimise, robust_sigma
 from calib.fit.parameters import RigParameters
 from calib.fit.residual_structure import ResidualStructure, residual_structure
 from calib.models.camera import Array
@@ -189,7 +189,7 @@ class DriveProblem:
 
     def minimised(self, state: DriveState, gain: float) -> tuple[DriveState, float]:
         """Return the state of least cost, and the standard deviation [px] of one coordinate there."""
-        found = minimise(self, state, Ending(gain))
+        found = minimise(self, state, Termination(gain))
         return found, self.scale(found)
 
     def consistent(self, state: DriveState, sigma_px: float) -> Flags:

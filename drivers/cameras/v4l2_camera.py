@@ -97,7 +97,7 @@ class V4l2Camera:
         deadline_s = time.monotonic() + self._settings.timeout_s
         while not self._closing:
             if self._wake.wait_for(stream.fd, deadline_s - time.monotonic()):
-                filled, arrival_ns = stream.take(), time.monotonic_ns()
+                filled, arrival_ns = stream.dequeue(), time.monotonic_ns()
                 if filled is None:
                     self._wake.wait(_PAUSE_S)
                 elif self._accounting.accept(filled[0], stream.image.min_bytes):
@@ -145,7 +145,7 @@ class V4l2Camera:
     def _discard(self) -> None:
         """Return the buffers that were filled before the first read."""
         with suppress(OSError):  # a lost device raises again at the next read
-            while not self._closing and self._streams and self._streams[0].take():
+            while not self._closing and self._streams and self._streams[0].dequeue():
                 pass
 
     def _release(self) -> None:

@@ -101,7 +101,7 @@ class V4l2Stream:
             self._resources.close()
             raise
 
-    def take(self) -> tuple[v4l2.V4l2Buffer, bytes] | None:
+    def dequeue(self) -> tuple[v4l2.V4l2Buffer, bytes] | None:
         """Return the oldest filled buffer and a copy of its bytes, None if there is none.
 
         Raises OSError for a lost device.
@@ -112,9 +112,9 @@ class V4l2Stream:
         except BlockingIOError:
             return None
         data = self._maps[buffer.index][: buffer.bytesused]
-        taken = v4l2.V4l2Buffer.from_buffer_copy(buffer)  # QBUF overwrites the structure
+        filled = v4l2.V4l2Buffer.from_buffer_copy(buffer)  # QBUF overwrites the structure
         v4l2.call(self.fd, v4l2.QBUF, buffer)
-        return taken, data
+        return filled, data
 
     def close(self) -> None:
         """Release the device, lost or not; may be called twice."""
@@ -157,9 +157,9 @@ def _require_capture(fd: int) -> str:
 
 
 def _set_image(fd: int, settings: V4l2Settings) -> StreamFormat:
-    """Set format, size and rate, and return them; of "auto" the first format that the device takes with both.
+    """Set format, size and rate, and return them; for "auto" the first format that the device accepts with both.
 
-    Raises DriverError, which says what the device sets instead, where it takes none.
+    Raises DriverError, which names what the device sets instead, if it accepts none.
     """
     instead: list[StreamFormat] = []
     busy: OSError | None = None
@@ -255,7 +255,7 @@ def capture_devices(root: Path = Path("/")) -> list[CaptureDevice]:
     its problem; metadata nodes, outputs and codecs are left out.
     """
     nodes = sorted((root / "sys/class/video4linux").glob("video*"), key=lambda path: (len(path.name), path.name))
-    found = [_device(root, path) for path in nodes if _word(path / "index") in ("0", "")]
+    found = [_device(root, path) for path in nodes if _text(path / "index") in ("0", "")]
     return [device for device in found if device is not None]
 
 
@@ -308,7 +308,7 @@ def _device(root: Path, entry: Path) -> CaptureDevice | None:
     siblings = [other.name for other in entry.parent.glob("video*") if (other / "device").resolve() == port]
     links = (by_path, *(_link(root, "by-path", root / "dev" / name) for name in siblings if port.exists()))
     id_path = re.sub(r"-video-index\d+$", "", next(filter(None, links), "").rpartition("/")[2])
-    names = _in(root, node), _word(entry / "name"), driver, bus, by_path, _link(root, "by-id", node)
+    names = _path_in(root, node), _text(entry / "name"), driver, bus, by_path, _link(root, "by-id", node)
     return CaptureDevice(*names, id_path, problem, exposure)
 
 
@@ -318,14 +318,14 @@ def _link(root: Path, folder: str, node: Path) -> str:
     Newer versions of udev make two links for a port; the one with the older name is returned.
     """
     links = sorted((root / "dev/v4l" / folder).glob("*"))  # "-usb-" sorts before "-usbv2-"
-    return next((_in(root, link) for link in links if link.resolve() == node.resolve()), "")
+    return next((_path_in(root, link) for link in links if link.resolve() == node.resolve()), "")
 
 
-def _in(root: Path, path: Path) -> str:
+def _path_in(root: Path, path: Path) -> str:
     return "/" + path.relative_to(root).as_posix()
 
 
-def _word(path: Path) -> str:
+def _text(path: Path) -> str:
     try:
         return path.read_text("utf-8", "replace").strip()
     except OSError:

@@ -21,7 +21,7 @@ from drivers.logs.open_log import is_log_name
 from omnid.errors import OmnidError
 
 Image = NDArray[np.uint8]
-# By name, all of one size.
+# Images of one camera by the name of their instant, all of one size.
 Images = dict[str, Image]
 SIDES = ("lower", "upper")
 # Largest difference between the stamps of a pair: boards are held still, so that 10 ms show the same instant.
@@ -52,12 +52,12 @@ def read_pairs(source: Path, cameras: LogCameras = BY_NAME) -> PairedImages:
     and would count the same errors again.
     """
     # 1. Read the images of both cameras.
-    of_log = is_log_name(source.name)
+    is_log = is_log_name(source.name)
     if source.is_dir():  # a folder of a log's files, or of folders of images, one for each camera
         has_folders = not any(source.glob(f"{SIDES[0]}_*")) and len(image_folders(source)) > 1
-        of_log |= has_folders or any(is_log_name(path.name) for path in source.iterdir())
+        is_log |= has_folders or any(is_log_name(path.name) for path in source.iterdir())
     faults, topics = list[str](), ("", "")
-    if of_log:
+    if is_log:
         with closing(cameras.reader(source)) as reader:
             sides = _of_log(reader, faults)
             topics = reader.topics["lower"], reader.topics["upper"]
@@ -72,7 +72,7 @@ def read_pairs(source: Path, cameras: LogCameras = BY_NAME) -> PairedImages:
         )
     if not sides[0].keys() & sides[1].keys():
         expected = "pairs like lower_001.png and upper_001.png"
-        if of_log:
+        if is_log:
             expected = f"images whose stamps differ by less than {TOLERANCE_NS // 10**6} ms"
         raise OmnidError("; ".join([f"{source}: no pair of images: expected {expected}", *faults]))
     # 2. Leave out those that repeat an earlier instant.
@@ -91,8 +91,8 @@ def _of_log(reader: LogReader, faults: list[str]) -> tuple[Images, Images]:
         except FrameDecodeError as error:
             left_out.append(str(error))
             continue
-        usual = [next(iter(side.values()), image).shape for side, image in zip((lower, upper), pair, strict=True)]
-        if [image.shape for image in pair] != usual:
+        expected = [next(iter(side.values()), image).shape for side, image in zip((lower, upper), pair, strict=True)]
+        if [image.shape for image in pair] != expected:
             left_out.append("images of another size")
             continue
         lower[f"pair{number:05d}"], upper[f"pair{number:05d}"] = pair
@@ -132,7 +132,7 @@ def _of_side(folder: Path, side: str, bits: int) -> Images:
 
 
 def _read(path: Path, bits: int) -> Image:
-    """Return a grey image (H, W); of 16 bits a sample the upper eight of so many bits."""
+    """Return a grey image (H, W) uint8. bits: significant bits of a 16-bit sample, whose upper eight are kept."""
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH
     try:
         data = np.frombuffer(path.read_bytes(), np.uint8)
@@ -149,7 +149,7 @@ def _read(path: Path, bits: int) -> Image:
 
 
 def spread_pairs(reader: LogReader, most: int, tolerance_ns: float) -> Iterator[tuple[int, Frame, Frame]]:
-    """Yield number, lower and upper frame of at most so many pairs, evenly spread over a log, undecoded."""
+    """Yield number, lower and upper frame of at most `most` pairs, evenly spread over a log, undecoded."""
     stride = max(1, -(-sum(1 for _ in _paired(reader.frames(), tolerance_ns)) // most))
     for number, (lower, upper) in enumerate(_paired(reader.frames(), tolerance_ns)):
         if number % stride == 0:
@@ -177,7 +177,7 @@ def open_log(log: Path, cameras: LogCameras, rig: Rig | None) -> LogReader:
 
 
 def brightest(images: Iterable[Image]) -> Image:
-    """Return the maximum (H, W) of images of one size: of a mirror it shows the rim best."""
+    """Return the maximum (H, W) of images of one size, in which the rim of a mirror is clearest."""
     return np.asarray(np.max(np.stack(list(images)), axis=0), np.uint8)
 
 

@@ -118,15 +118,15 @@ class LiveBoards:
         return found + [f"upper camera: {words}" for words in upper if words not in lower]
 
     def process(self, images: Sequence[Image], *, need_still: bool) -> PairOutcome:
-        """Search the board in the images of the lower and the upper camera at one instant.
+        """Search the board in images of the lower and the upper camera at one instant, and keep the pair if it is new.
 
-        need_still: they count only where the board was at the same place in the pair before.
+        need_still: the pair is kept only if the board was at the same place in the pair before.
         """
         # 1. Search the board.
         self._update_rims(images)
         lower, upper = self._pool.map(lambda image: search_board(image, self._board, thorough=False), images)
         before, self._before, self.views = self._before, (lower, upper), (lower, upper)
-        # 2. Leave out what says nothing new.
+        # 2. Leave out pairs that add no information.
         if lower is None and upper is None:
             return PairOutcome.NO_BOARD
         if lower is None or upper is None:
@@ -146,7 +146,7 @@ class LiveBoards:
         self._pool.shutdown()
 
     def _near(self, a: Views, b: Views, part: float) -> bool:
-        """True if both boards are nearly at the same places in both views, as parts of the rims' radii."""
+        """True if the board moved by at most `part` of the rim's radius from a to b, in both cameras."""
         return all(
             moved(one, other) <= part * coverage.rim.outer_px
             for one, other, coverage in zip(a, b, self.coverage, strict=True)

@@ -6,8 +6,8 @@ map, odom: fixed to the world; T_map_odom carries the corrections (REP 105). bas
 ground below the robot (REP 103). rig: the frame in which the cameras were calibrated. rect: the rectified frame, at the
 lower viewpoint with z towards the upper one, in which epipolar lines are columns of the panoramas.
 
-The covariance of a pose T_a_b is body-fixed: of a small motion [t; r] of b in its own axes. Those who write a pose for
-others turn it into the axes of a, once, as messages of ROS want it: `in_outer_axes`.
+The covariance of a pose T_a_b is body-fixed: of a small motion [t; r] of b in the axes of b. Messages of ROS have it in
+the axes of a; it is converted where a message is encoded: `in_outer_axes`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Checks of `omnid doctor`: cameras and motor, the rights of this user and of the service, the machine, rig and bus.
 
-A check is a table of what may be wrong, each with what was found and what to do; the findings are those that apply, or
-else the one that all is well.
+A check is a table of cases that may be wrong, each with what was found and what to do. Its findings are the cases that
+apply, or else one of level ok.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def summary(findings: Sequence[Finding]) -> str:
 
 
 def _applying(subject: str, *cases: Case, good: str = "") -> list[Finding]:
-    """Return the findings of the cases that apply; where there are none that all is well, unless good is empty."""
+    """Return the findings of the cases that apply; if none does, a finding of level ok with the text good, if any."""
     found = [Finding(level, subject, what, advice) for applies, level, what, advice in cases if applies]
     return found or ([Finding("ok", subject, good)] if good else [])
 
@@ -154,13 +154,13 @@ def rights(priority: int, lock_memory: bool) -> list[Finding]:
 
 def disk(folder: Path, config: RecordConfig, bytes_per_s: float) -> list[Finding]:
     """Check the space for recordings in the folder (or where it will be), and that the service may write there."""
-    place = next(path for path in (folder, *folder.parents) if path.exists())
-    free = shutil.disk_usage(place).free
-    room = min(free - config.free_mb * 10**6, config.keep_mb * 10**6)
-    is_full, hours = room <= 0, room / bytes_per_s / 3600
-    where = f"{free / 1e9:.1f} GB free at {place}"
+    existing = next(path for path in (folder, *folder.parents) if path.exists())
+    free = shutil.disk_usage(existing).free
+    usable = min(free - config.free_mb * 10**6, config.keep_mb * 10**6)
+    is_full, hours = usable <= 0, usable / bytes_per_s / 3600
+    where = f"{free / 1e9:.1f} GB free at {existing}"
     kept = (
-        f"{where}: the newest {room / 1e9:.1f} GB of recordings are kept, some {hours:.1f} h of JPEG at "
+        f"{where}: the newest {usable / 1e9:.1f} GB of recordings are kept, some {hours:.1f} h of JPEG at "
         f"{bytes_per_s / 1e6:.1f} MB/s (record.keep_mb, record.images_hz)"
     )
     full = f"{where}: nothing is recorded below record.free_mb = {config.free_mb}"

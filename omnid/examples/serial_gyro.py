@@ -61,7 +61,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 for x, y, z in rates_radps(received):
                     payload = gyro_cdr(GyroSample(now_ns, x, y, z), now_ns, FRAME)
                     session.put(f"{args.robot}/cmd/imu", payload)
-    except OSError as error:  # pyserial lets errors of the system pass while it counts what waits
+    except OSError as error:  # SerialException is an OSError, and in_waiting raises a plain one
         print(f"serial_gyro: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

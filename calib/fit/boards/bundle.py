@@ -38,7 +38,7 @@ from calib.fit.least_squares import (
     LOST_PX,
     START_DAMPING,
     ArrowSystem,
-    Ending,
+    Termination,
     central_differences,
     minimise,
     robust_sigma,
@@ -92,7 +92,7 @@ SHRUNK_SIGMAS: Final = np.array([0.1, 0.1, 1.0, 1.0])
 TWIST_NAMES: Final = ("t_x", "t_y", "t_z", "r_x", "r_y", "r_z")
 # A damped step hardly moves along a flat direction: so the search ends only with a nearly undamped step that lowers the
 # cost in its ninth digit.
-ENDING: Final = Ending(gain=1e-9, damping=1e-7)
+TERMINATION: Final = Termination(gain=1e-9, damping=1e-7)
 # Number of optimisations, each with the kernel's width estimated again, because the width depends on the residuals and
 # these on the width.
 KERNEL_ROUNDS: Final = 3
@@ -171,8 +171,8 @@ def fit_boards(start: BoardRig, pixels: Array, board: CalibrationBoard, *, telec
     for _ in range(KERNEL_ROUNDS):
         sigma = min(sigma, robust_sigma(state.residuals))
         problem = replace(problem, kernel_px=HUBER_WIDTH * sigma)
-        state = minimise(problem, state, ENDING, damping)
-        damping = min(START_DAMPING, ENDING.damping / DAMPING_FACTOR)  # the next one begins next to its minimum
+        state = minimise(problem, state, TERMINATION, damping)
+        damping = min(START_DAMPING, TERMINATION.damping / DAMPING_FACTOR)  # the next one begins next to its minimum
     return problem.result(state)
 
 

@@ -1,9 +1,9 @@
 """Covariance of a fit whose model does not describe the cameras exactly.
 
 The error of a camera model is a smooth function of the image position, the same in all views. Most of it is absorbed
-by the parameters, which it shifts, so residuals do not show it directly; but their remaining correlation shows its
-size. So residuals have the covariance sigma^2 I + tau^2 F F^T, where the columns of F are smooth fields: gradients of
-Gaussian functions on a grid. A mirror or lens whose surface is not the model's deflects rays by the gradient of the
+by the parameters, which it shifts; what remains correlates the residuals, and this correlation shows its size. So
+residuals have the covariance sigma^2 I + tau^2 F F^T, where the columns of F are smooth fields: gradients of Gaussian
+functions on a grid. A mirror or lens whose surface is not the model's deflects rays by the gradient of the
 difference of the surfaces, so such fields have no swirl: they move elevations, and hardly turn a camera about its axis.
 
 tau^2 is the mean of its posterior distribution by the restricted likelihood (Patterson and Thompson 1971) with a flat
@@ -23,8 +23,8 @@ NODES, WIDTH = 5, 1.0
 MAX_RADIUS = 1.3
 # Values of tau / sigma over which the posterior is summed: steps of 4 % are fine enough for any ratio.
 RATIOS = np.concatenate([[0.0], np.geomspace(1e-3, 30.0, 240)])
-# Least part of the largest eigenvalue of what the fields explain beyond the parameters: less is rounding.
-LEAST_PART = 1e-3
+# Smaller eigenvalues of what the fields explain beyond the parameters, as a fraction of the largest, are rounding.
+MIN_EIGENVALUE_RATIO = 1e-3
 
 
 def smooth_fields(pixels: Array, cameras: int) -> Array:
@@ -63,9 +63,9 @@ def covariance_with_misfit(normal: Array, gradient: Array, parameters: int, vari
     inverse = np.linalg.pinv(normal[:P, :P], rcond=1e-14, hermitian=True)
     # What the fields explain beyond the parameters: y ~ N(0, sigma^2 d + tau^2 d^2) along each eigenvector.
     by_field = normal[P:, :P] @ inverse
-    left = normal[P:, P:] - by_field @ normal[:P, P:]
-    d, axes = np.linalg.eigh((left + left.T) / 2)
-    known = d > LEAST_PART * max(float(d[-1]), 1.0)
+    unexplained = normal[P:, P:] - by_field @ normal[:P, P:]
+    d, axes = np.linalg.eigh((unexplained + unexplained.T) / 2)
+    known = d > MIN_EIGENVALUE_RATIO * max(float(d[-1]), 1.0)
     d, y = d[known], (axes.T @ (gradient[P:] - by_field @ gradient[:P]))[known]
     # The posterior mean of (tau / sigma)^2.
     spread = variance * (d + RATIOS[:, None] ** 2 * d**2)
