@@ -8,7 +8,6 @@ import math
 import os
 import re
 import runpy
-import signal
 import struct
 import subprocess
 import sys
@@ -35,7 +34,6 @@ from drivers.frame import gray
 from drivers.logs.log_reader import LogReader
 from drivers.motion import GyroSample
 from omnid.client import Answer, Driver, Robot
-from omnid.engine.graph import Graph
 from omnid.errors import OmnidError
 from omnid.formats.tum import Trajectory, tum_row
 from omnid.transport import codec
@@ -197,22 +195,6 @@ def test_an_image_that_repeats_an_earlier_one_is_refused_and_changes_nothing(sce
         for buffer in buffers:
             buffer[1, later_ns] ^= 1
         odometry.process(stamp_ns + later_ns, *buffers)
-
-
-def test_ctrl_c_ends_a_replay_with_a_keyboard_interrupt(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run = Graph.run
-
-    def interrupt() -> Iterator[object]:
-        os.kill(os.getpid(), signal.SIGINT)
-        return iter(())
-
-    def interrupted(self: Graph) -> None:
-        self.source("interrupt", interrupt)
-        run(self)
-
-    monkeypatch.setattr(Graph, "run", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        omnid.replay(scene / "log.mcap", scene / "rig.toml")
 
 
 def example(name: str, *words: object, cwd: Path) -> str:

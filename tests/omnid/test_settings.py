@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -80,19 +79,13 @@ def test_an_override_needs_no_quotes(override: str, value: str) -> None:
     [
         (f"{'q' * 300} = 1", "unknown key 'qqq"),
         ("[stereo]\nwindow = 5", "unknown key stereo.window: did you mean stereo.window_px?"),
-        ("[stereo]\nzzz = 5", "unknown key stereo.zzz: known are stereo.window_px, "),
         ("stereo = 5", "stereo: expected a section, found 5"),
-        ("robot.name = 'x'", "robot: expected a string, found a section"),
         ("stereo.window_px = '11'", "stereo.window_px: expected an integer from 3 to 31, found '11'"),
-        ("stereo.window_px = 11.0", "expected an integer from 3 to 31, found 11.0"),
         ("stereo.window_px = 32", "expected an integer from 3 to 31, found 32"),
         ("stereo.subpixel = 1", "stereo.subpixel: expected true or false, found 1"),
-        ("stereo.ratio = true", "stereo.ratio: expected a number from 0.0 to 1.0, found True"),
         ("stereo.horizon_s = inf", "found inf"),
-        ("motor.limit_mps = 0.5", "motor.limit_mps: expected a number of at most 0, found 0.5"),
         ("stereo.method = 'ncc'", "stereo.method: expected one of 'sad', 'census', found 'ncc'"),
         ("offset_m = [1, 2]", "offset_m: expected a list of 3 numbers, found [1, 2]"),
-        ("topics = 'a'", "topics: expected a list of strings, found 'a'"),
         ("motor.serial.bauds = [0]", "expected a list of integers of at least 1, found [0]"),
         (f"stereo.ratio = 0x{'f' * 5000}", "expected a number from 0.0 to 1.0, found a huge int"),
         (f"topics = {'[' * 20_000}", "expected TOML, found: "),
@@ -109,7 +102,6 @@ def test_refuses_what_is_not_as_declared(text: str | bytes, expected: str) -> No
     [
         ("stereo.window_px", "expected section.key=value, found no '='"),
         ("stereo=5", "stereo is a section: name one of its keys, such as stereo.window_px"),
-        ("stereo.window=5", "did you mean stereo.window_px?"),
         ("stereo.window_px=5\nrobot='x'", "expected an integer from 3 to 31, found \"5\\nrobot='x'\""),
         ("robot=a\udcff", "robot: expected UTF-8, found 'a\\udcff'"),
     ],
@@ -171,18 +163,6 @@ def test_the_papers_method_works_on_the_enhanced_sad_unless_the_matching_is_set(
     overrides: list[str], matching: str
 ) -> None:
     assert load_config(None, overrides).stereo_settings().matching.method == matching
-
-
-@pytest.mark.parametrize(
-    ("key", "proposed"),
-    [
-        ("controller.velocity_mps", "controller.limits.velocity_mps"),
-        ("mapping.voxel_mm", "mapping.voxel_m"),
-    ],
-)
-def test_a_wrong_key_is_answered_by_a_similar_one(key: str, proposed: str) -> None:
-    with pytest.raises(OmnidError, match=re.escape(f"unknown key {key}: did you mean {proposed}?")):
-        load_config(None, [f"{key}=1"])
 
 
 @pytest.mark.parametrize(

@@ -74,7 +74,7 @@ def test_a_sector_gives_poses(sector: Path, command: Command) -> None:
 
 def test_beside_a_sector_nothing_is_free(sector: Path) -> None:
     """Obstacles and scans know nothing of directions that the cameras do not see, from the first pair to the last."""
-    found = scans_of(sector).scans
+    found = scans_of(sector)
     assert len(found) > 10
     azimuths = np.rad2deg(np.pi * (2 * np.arange(360) + 1) / 360 - np.pi)
     aside = np.abs((azimuths + 173 + 180) % 360 - 180)

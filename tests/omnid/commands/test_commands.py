@@ -28,7 +28,7 @@ from omnid.config import Config, load_config
 from omnid.errors import OmnidError
 from omnid.formats.place_file import write_places
 from omnid.formats.tum import read_tum
-from tests.drivers.logs.mcap_logs import BARE, LOWER, START_NS, Entry, pairs, text, write_folders, write_log
+from tests.drivers.logs.mcap_logs import BARE, LOWER, START_NS, Entry, pairs, text, write_log
 from tests.omnid.formats.place_maps import RIG, some_places
 from tests.omnid.transport.bus_fixtures import free_endpoint
 from tests.ply import read_ply
@@ -227,16 +227,6 @@ def test_info_shows_the_content_of_a_log(omnid: Command, tmp_path: Path) -> None
     assert re.search(r"/chatter +std_msgs/msg/String +1 +-\n", out)
 
 
-def test_info_shows_the_rate_of_each_topic_over_its_own_time(omnid: Command, tmp_path: Path) -> None:
-    """The upper camera was started late. Images without stamps have the rate that is given."""
-    entries = [entry for n, entry in enumerate(pairs(40)) if entry.topic == LOWER or n > 60]
-    write_folders(tmp_path / "images", entries, names=lambda ns: f"{ns % 10**10:06d}")
-    for log, *options in ([write_log(tmp_path / "log.mcap", entries)], [tmp_path / "images", "--rate", "10"]):
-        code, out, err = omnid("log", "info", log, *options)
-        assert (code, err) == (0 if not options else 1, "")
-        assert re.findall(r"CompressedImage +(\d+) +(\S+)\n", out + "\n") == [("40", "10.00"), ("10", "10.00")]
-
-
 def test_info_shows_the_damage_and_advice(omnid: Command, tmp_path: Path) -> None:
     path = write_log(tmp_path / "log.mcap", pairs(11), [("rig.toml", bytes(2000))])
     bare = write_log(tmp_path / "bare.mcap", pairs(2), **BARE)
@@ -287,7 +277,6 @@ def test_export_writes_the_files_and_names_them(omap: Path, capsys: pytest.Captu
         (["export", "{}"], "nothing to write"),
         (["export", "{}", "--grid", "{}.png"], "expected a name that ends in .yaml"),
         (["export", "{}", "--grid", "."], "--grid .: expected a file to write, found a folder"),
-        (["export", "{}", "--ply", "{}"], "expected a name that ends in .ply"),
         (["show", "{}.none"], "cannot read the map"),
     ],
 )

@@ -359,29 +359,19 @@ FREE = (math.inf,) * 360
 WALL = tuple(0.38 if 150 <= k < 210 else math.inf for k in range(360))  # ahead, in the stop polygon
 
 
-@pytest.fixture
-def seeing(tmp_path: Path) -> Iterator[Robot]:
-    """Yield a robot that looks for obstacles."""
+@pytest.mark.hazard("H16", "H21")
+def test_the_wheels_stop_before_an_obstacle_and_when_no_more_scans_come(tmp_path: Path) -> None:
     with started(tmp_path, has_scans=True) as robot:
-        yield robot
-
-
-@pytest.mark.hazard("H16")
-def test_the_wheels_stop_before_an_obstacle_and_may_back_out(seeing: Robot) -> None:
-    wait_until(lambda: seeing.drives(0.3, FREE), "motion")
-    wait_until(lambda: seeing.stands(0.3, WALL), "the stop")
-    state = seeing.link.statistics.state
-    assert state.blocked and state.obstacle == BLOCKED and state.armed
-    assert any(line == f"the wheels stop: {BLOCKED}; {REMEDY}" for line in seeing.lines)
-    wait_until(lambda: seeing.drives(-0.3, WALL), "the way back")
-
-
-@pytest.mark.hazard("H21")
-def test_the_wheels_stop_when_no_more_scans_come(seeing: Robot) -> None:
-    wait_until(lambda: seeing.drives(0.3, FREE), "motion")
-    wait_until(lambda: seeing.stands(0.3, None), "the stop")
-    assert seeing.link.statistics.state.obstacle == SCAN_STALE
-    wait_until(lambda: seeing.drives(0.3, FREE), "motion again, without arming")
+        state = robot.link.statistics
+        wait_until(lambda: robot.drives(0.3, FREE), "motion")
+        wait_until(lambda: robot.stands(0.3, WALL), "the stop")
+        assert state.state.blocked and state.state.obstacle == BLOCKED and state.state.armed
+        assert any(line == f"the wheels stop: {BLOCKED}; {REMEDY}" for line in robot.lines)
+        wait_until(lambda: robot.drives(-0.3, WALL), "the way back")
+        wait_until(lambda: robot.drives(0.3, FREE), "motion where the way is free")
+        wait_until(lambda: robot.stands(0.3, None), "the stop")
+        assert state.state.obstacle == SCAN_STALE
+        wait_until(lambda: robot.drives(0.3, FREE), "motion again, without arming")
 
 
 # The loop of the controller process: what it receives before a tick, that no flood keeps the tick, and its end.

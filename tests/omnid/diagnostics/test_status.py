@@ -35,7 +35,7 @@ from omnid.transport.codec import ERROR, OK, STALE, WARN, DiagnosticStatus, diag
 from omnid.transport.commands import CommandReceiver, Freshness
 from omnid.transport.status_names import IMAGES, LIVE, REMEDIES, TIMEOUT_S, WHEELS, Key, entry, short_name
 from omnid.transport.topics import Request
-from tests.omnid.small_pair import small_depth
+from tests.omnid.sinks.test_recorder import small_depth
 from tests.simulation import build
 
 SIZE = 256

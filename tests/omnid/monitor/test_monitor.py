@@ -63,14 +63,14 @@ def publish(bus: Bus, number: int) -> None:
 
 
 def publish_until_it_ends(
-    bus: Bus, process: subprocess.Popen[str], number_of_signal: signal.Signals | None = None
+    bus: Bus, process: subprocess.Popen[str], number_of_signal: signal.Signals
 ) -> tuple[str, str]:
-    """Publish, and send the signal where there is one after 150 messages."""
+    """Publish, and send the signal after 150 messages."""
     deadline_s = time.monotonic() + DEADLINE_S
     for number in count():
         publish(bus, number)
         time.sleep(0.01)
-        if number == 150 and number_of_signal is not None:
+        if number == 150:
             process.send_signal(number_of_signal)
         if process.poll() is not None:
             break
@@ -78,26 +78,15 @@ def publish_until_it_ends(
     return process.communicate()
 
 
-def test_prints_a_line_per_second() -> None:
-    endpoint = free_endpoint()
-    words = ("--robot", "rover", "--connect", endpoint, "--seconds", 2.2)
-    with contextlib.closing(Bus(BusConfig(robot="rover", listen=(endpoint,)))) as bus, listening(*words) as it:
-        out, err = publish_until_it_ends(bus, it)
-    assert it.returncode == 0 and err == ""
-    lines = out.splitlines()
-    assert 2 <= len(lines) <= 3 and all(
-        "x +0.500 y +0.250" in text and text.startswith("rover: tracking  ") for text in lines
-    )
-    assert "missed " in lines[-1] and "network " in lines[-1] and "\x1b" not in out
-
-
 def test_waits_for_the_robot_and_ends_with_a_signal() -> None:
     endpoint = free_endpoint()
-    with listening("--connect", endpoint) as it:
+    with listening("--robot", "rover", "--connect", endpoint) as it:
         assert it.stderr is not None and endpoint in it.stderr.readline()
-        with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
+        with contextlib.closing(Bus(BusConfig(robot="rover", listen=(endpoint,)))) as bus:
             out, err = publish_until_it_ends(bus, it, signal.SIGTERM)
-    assert it.returncode == 0 and "tracking" in out.splitlines()[-1] and err == ""
+    assert it.returncode == 0 and err == "" and "\x1b" not in out
+    last = out.splitlines()[-1]
+    assert last.startswith("rover: tracking  ") and "x +0.500 y +0.250" in last and "network " in last
 
 
 def test_a_wrong_name_is_answered_by_those_of_the_robots_there() -> None:

@@ -91,6 +91,7 @@ def test_a_hostile_log_is_shown_as_text(tmp_path: Path) -> None:
         DiagnosticStatus(EVIL, 2, EVIL, {EVIL: EVIL, "drops": "1"}),
         DiagnosticStatus(stage_name(EVIL), 1, EVIL, stage),
         DiagnosticStatus(SUMMARY, 0, EVIL, {EVIL: EVIL}),
+        DiagnosticStatus(TERMINAL, 1, TERMINAL, {}),
         DiagnosticStatus(ODOMETRY, 0, EVIL, odometry),
     )
     settings = f'robot = "{EVIL.replace(chr(34), "")}"\n["<b>"]\nx = 1\n'
@@ -108,7 +109,7 @@ def test_a_hostile_log_is_shown_as_text(tmp_path: Path) -> None:
     page = Page(html)
     assert_harmless(page)
     assert "<b>x" not in html and html.count("<script>") == 1 and "<b>log" not in html
-    assert page.text.count(EVIL) > 5
+    assert page.text.count(EVIL) > 5 and not set(html) & {"\x1b", "\x07", "\x9b"}
     assert "unknown key '<img src=x" in page.text, "of the rig"
 
 
@@ -134,29 +135,6 @@ def test_any_bytes_give_a_page_or_one_error_line(tmp_path: Path, seed: int) -> N
         assert_harmless(Page(html_of(log)))
     except OmnidError as error:
         assert "\n" not in str(error)
-
-
-@pytest.fixture
-def hostile(tmp_path: Path) -> Path:
-    """A log whose topic, frames, states, file name, attachments and settings hold sequences that control a terminal."""
-    entries = [odom(k, topic=f"/{TERMINAL}/odom") for k in range(5)]
-    entries += [
-        status(2, DiagnosticStatus(ODOMETRY, 2, TERMINAL, {TERMINAL: TERMINAL})),
-        status(3, DiagnosticStatus(TERMINAL, 1, f"{TERMINAL} again", {})),
-    ]
-    attachments = {f"{TERMINAL}.txt": b"", "omnid.toml": b'"\\u001b]0;x\\u0007" = "\\u009b31m"', "rig.toml": b"a = 1"}
-    return save(tmp_path / f"{TERMINAL}.mcap", entries, attachments)
-
-
-def test_prints_no_control_characters_of_a_log(hostile: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    page = hostile.with_name("page.html")
-    main(["report", str(hostile), "-o", str(page)])
-    main(["log", "info", str(hostile)])
-    main(["log", "info", str(hostile.with_name(f"{TERMINAL}.none"))])
-    main(["report", str(hostile), "--topic", TERMINAL, "-o", str(page)])
-    shown = "".join((*capsys.readouterr(), page.read_text("utf-8")))
-    assert "poses of" in shown and "odom" in shown
-    assert not set(shown) & {chr(code) for code in (*range(9), *range(11, 32), *range(127, 160))}
 
 
 def test_states_gaps_resets_losses_and_messages_are_events(tmp_path: Path) -> None:
@@ -275,7 +253,7 @@ def page(tmp_path: Path) -> Iterator[Any]:
 
 @pytest.mark.browser
 @pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
-def test_the_pointer_shows_values_and_the_place_on_the_plan_and_a_drag_zooms_all_charts(page: Any) -> None:
+def test_the_pointer_shows_values_and_the_place_on_the_plan(page: Any) -> None:
     charts = page.locator(".u-over")
     assert charts.count() > 4
     speed = page.locator("figure.chart", has_text="Forward speed")
@@ -287,13 +265,6 @@ def test_the_pointer_shows_values_and_the_place_on_the_plan_and_a_drag_zooms_all
     assert 4 < time_s < 6 and measured == pytest.approx(0.1 * time_s, abs=0.011)
     assert page.locator(".sheet i").is_visible()
     assert page.evaluate("document.documentElement.scrollWidth") <= page.viewport_size["width"]
-    page.mouse.move(box["x"] + 0.3 * box["width"], box["y"] + 0.5 * box["height"])
-    page.mouse.down()
-    page.mouse.move(box["x"] + 0.4 * box["width"], box["y"] + 0.5 * box["height"], steps=3)
-    page.mouse.up()
-    page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"])
-    time_s = float(re.findall(r"-?[\d.]+", speed.locator(".u-legend").text_content())[0])
-    assert 3.2 < time_s < 3.7, "the middle of the drag"
 
 
 SAMPLE = Path(__file__).parents[3] / "omnid" / "sample"

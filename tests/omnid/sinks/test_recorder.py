@@ -18,17 +18,16 @@ from drivers.logs.rotating_log import RotationSettings
 from drivers.motor import VelocityCommand
 from omnid.config import Config, RecordConfig
 from omnid.core.mapping.voxel_map import MapPoints
+from omnid.core.types.panorama import PaddedPanorama
 from omnid.engine.robot_clock import RobotClock
-from omnid.messages import MapUpdate, OdometryUpdate
+from omnid.messages import MapUpdate, OdometryUpdate, Panoramas, StereoDepth
 from omnid.runs.record import open_recorder
 from omnid.sinks.encoder import Encoder, StatusReport
 from omnid.transport.codec import ERROR, OK, DiagnosticStatus
 from omnid.transport.status_names import RECORDING, entry
 from tests.drivers.logs.mcap_logs import jpeg
-from tests.omnid.small_pair import small_depth
 from tests.set_clock import SetClock
 
-ROOT = Path(__file__).parents[3]
 START_NS = 1_700_000_000 * 10**9
 OFFSET_NS = START_NS - 5 * 10**9  # boot time of the machine: five seconds before
 WIDTH, HEIGHT = 6, 4
@@ -43,6 +42,12 @@ def frame(seq: int, camera: Camera, encoding: str = "jpeg") -> Frame:
     rows = HEIGHT * 3 // 2 if encoding == "nv12" else HEIGHT
     data = np.random.default_rng(seq).bytes(step * rows + 100)  # and the unused end of a driver's buffer
     return Frame(seq, stamp_ns, camera, encoding, data, WIDTH, HEIGHT, step)
+
+
+def small_depth(stamp_ns: int = 0) -> StereoDepth:
+    """Return a depth with panoramas of 6 x 4 pixels, all of whose parts are live."""
+    panorama = PaddedPanorama(np.zeros((4, 8), np.uint8), 1)
+    return StereoDepth(Panoramas(0, stamp_ns, panorama, panorama, np.ones((4, 6), bool)))
 
 
 def settings(folder: Path, **more: Any) -> Config:
@@ -192,17 +197,6 @@ def test_every_file_has_the_state_of_the_odometry(tmp_path: Path, monkeypatch: p
     for path in files:
         with path.open("rb") as file:
             assert sum(1 for _ in make_reader(file).iter_messages(["/omnid/status"])) == 1
-
-
-class Given:
-    """A source of given frames."""
-
-    def __init__(self, frames: list[Frame]) -> None:
-        self._frames = frames
-        self.frames = lambda: iter(self._frames)
-
-    def close(self) -> None:
-        """Nothing to close."""
 
 
 def test_reports_the_state_of_the_recording(tmp_path: Path) -> None:

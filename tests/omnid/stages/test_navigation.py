@@ -179,18 +179,6 @@ def test_refuses_with_the_remedy_and_sends_nothing(tmp_path: Path) -> None:
     assert len(robot.updates[-1].answers) == 9
 
 
-@pytest.mark.hazard("H24")
-def test_cancel_is_a_stop_at_once(tmp_path: Path) -> None:
-    robot = Robot(tmp_path)
-    robot.pass_on()
-    robot.send(GoalRequest(ODOM, 3.0, 0.0))
-    for _ in range(15):
-        robot.pass_on()
-    update = robot.send(NavigationVerb.CANCEL)
-    assert update.state is NavigationState.CANCELLED
-    assert update.setpoint is not None and update.setpoint.velocity_mps == 0.0
-
-
 def test_a_scan_makes_it_wait_and_an_old_one_does_not(tmp_path: Path) -> None:
     for age_ns, expected in ((0, NavigationState.BLOCKED), (3_000_000_000, NavigationState.DRIVING)):
         robot = Robot(tmp_path)
@@ -231,12 +219,3 @@ def test_unknown_floor_that_stops_the_wheels_is_passed(tmp_path: Path) -> None:
     robot.stage.process(WheelState(True, False))
     robot.pass_on()
     assert robot.updates[-1].state is NavigationState.AVOIDING
-
-
-def test_a_pose_in_the_map_without_a_known_covariance_begins_no_drive_in_it(tmp_path: Path) -> None:
-    robot = Robot(tmp_path)
-    robot.pass_on()
-    robot.stage.process(
-        PlaceUpdate(9, 9 * PERIOD_NS, np.eye(4), np.eye(4), np.full((6, 6), np.nan), MapState.LOCALIZED, 3, np.eye(4))
-    )
-    assert "uncertain by nan m" in robot.send(GoalRequest(MAP, 1.0, 0.0), id=7).answers[-1].refusal

@@ -37,55 +37,32 @@ from tests.simulation.rigs import make_rig
 
 
 class Scans:
-    """Scans of a run, and the number of its poses."""
+    """The scans of a run."""
 
     def __init__(self) -> None:
         self.scans: list[ObstacleScan] = []
-        self.poses = 0
 
     def process(self, message: Outgoing) -> None:
         """Keep a scan."""
-        self.poses += isinstance(message, OdometryUpdate)
         if isinstance(message, ObstacleScan):
             self.scans.append(message)
 
 
-def scans_of(scene: Path, *settings: str, inline: bool = True) -> Scans:
-    """Return the scans of the rendered run."""
-    found = Scans()
-    config = load_config(None, ["places.enabled=false", *settings])
-    run_log(
-        scene / "log.mcap",
-        config,
-        ReplayOptions(rig=scene / "rig.toml", inline=inline, observer=lambda geometry, telemetry: found),
-    )
-    return found
+def scans_of(scene: Path) -> list[ObstacleScan]:
+    """Return the scans of a rendered run."""
+    found, config = Scans(), load_config(None, ["places.enabled=false"])
+    run_log(scene / "log.mcap", config, ReplayOptions(rig=scene / "rig.toml", inline=True, observer=lambda *_: found))
+    return found.scans
 
 
-@pytest.fixture(scope="module")
-def inline(scene: Path) -> Scans:
-    return scans_of(scene)
-
-
-def test_the_walls_of_the_corridor_stand_left_and_right(inline: Scans) -> None:
+def test_the_walls_of_the_corridor_stand_left_and_right(scene: Path) -> None:
+    found = scans_of(scene)
     # Left wall between 0.9 and 1.6 m, right wall between 0.8 and 1.4 m from the middle; see corridor().
-    scan = inline.scans[len(inline.scans) // 2]
+    scan = found[len(found) // 2]
     left, right = scan.ranges_m[260:280], scan.ranges_m[80:100]
     assert np.isfinite(left).any() and np.isfinite(right).any()
     assert 0.6 < np.nanmedian(left) < 2.0 and 0.5 < np.nanmedian(right) < 1.8
     assert np.isfinite(scan.ranges_m).sum() > 150
-
-
-def test_scans_come_at_a_lower_rate(scene: Path, inline: Scans) -> None:
-    assert abs(len(scans_of(scene, "obstacles.rate_hz=5").scans) - len(inline.scans) / 2) <= 1
-
-
-def test_threads_give_the_same_bytes(scene: Path, inline: Scans) -> None:
-    threaded = scans_of(scene, inline=False)
-    assert [scan.seq for scan in threaded.scans] == [scan.seq for scan in inline.scans]
-    for one, other in zip(threaded.scans, inline.scans, strict=True):
-        assert one.ranges_m.tobytes() == other.ranges_m.tobytes()
-        assert one.sigma_m.tobytes() == other.sigma_m.tobytes()
 
 
 SHOWN = np.ones((CYLINDER.height, CYLINDER.width), bool)

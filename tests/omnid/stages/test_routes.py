@@ -184,15 +184,6 @@ def test_a_halt_overtakes_what_waits_for_a_disk_and_ends_it(tmp_path: Path) -> N
     assert site.work().state is NavigationState.DRIVING, "a request after the halt is granted"
 
 
-def test_a_drive_that_has_begun_meanwhile_is_not_replaced_by_what_waited_for_a_disk(tmp_path: Path) -> None:
-    site = Site(tmp_path)
-    site.robot.send(FINISH)
-    repeat, goal = site.ask(REPEAT), site.ask(GoalRequest(NavigationFrame.ODOM, 2.0, 0.0))
-    site.pass_on(site.direct)
-    assert site.pass_on(site.of_routes).task == "goal"
-    assert site.answers()[goal] == "" and "a later request has ended it" in site.answers()[repeat]
-
-
 @pytest.mark.hazard("H26")
 def test_what_waits_for_a_disk_begins_nothing_after_a_stop_or_a_long_time(tmp_path: Path) -> None:
     site = Site(tmp_path)

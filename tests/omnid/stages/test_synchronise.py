@@ -72,13 +72,6 @@ def test_pairs_all_frames_in_any_order_of_arrival(pair: Synchronise) -> None:
     assert all(a.stamp_ns < b.stamp_ns for a, b in pairwise(found))
 
 
-@pytest.mark.parametrize(("skew_ns", "pairs"), [(10 * MS, 1), (10 * MS + 1, 0), (-10 * MS, 1), (-10 * MS - 1, 0)])
-def test_pairs_within_the_tolerance_only(pair: Synchronise, skew_ns: int, pairs: int) -> None:
-    assert len(made(pair, shot("lower", 1), shot("upper", 1, skew_ns))) == pairs
-    pair.finish()
-    assert unpaired(pair) == (1 - pairs, 1 - pairs)
-
-
 @pytest.mark.parametrize(
     ("order", "stamps", "expected"),
     [
@@ -111,17 +104,6 @@ def test_pairs_again_after_a_camera_was_away(pair: Synchronise, running: Camera,
     assert unpaired(pair) == ((990, 0) if running == "lower" else (0, 990)) and pair.counts["pairs"] == 20
 
 
-def test_a_broken_image_counts_and_its_partner_is_unpaired(pair: Synchronise) -> None:
-    frames = [
-        frame
-        for index in range(6)
-        for frame in (shot("lower", index, data=JPEG[:100] if index % 2 else JPEG), shot("upper", index))
-    ]
-    assert [p.seq for p in made(pair, *frames)] == [0, 1, 2]
-    pair.finish()
-    assert pair.counts["broken"] == 3 and "lower frame 1" in pair.stats()["_fault"] and unpaired(pair) == (0, 3)
-
-
 @pytest.mark.parametrize("broken", [("lower",), ("upper",), ("lower", "upper")])
 def test_a_broken_image_is_treated_as_if_it_had_never_come(pair: Synchronise, broken: tuple[Camera, ...]) -> None:
     """The frames before a broken one can still be paired."""
@@ -149,7 +131,7 @@ def free(rig: Rig) -> Synchronise:
     return Synchronise(rig, PairConfig(repeated_images="use"))
 
 
-@pytest.mark.parametrize("skew_ms", [0.0, 15.0, -15.0, 16.6, 3.0])
+@pytest.mark.parametrize("skew_ms", [0.0, 15.0, -16.6])
 def test_free_running_cameras_make_a_pair_of_every_image(free: Synchronise, skew_ms: float) -> None:
     """Also of the first ones, which wait until the period is known."""
     taken = [shot(c, index, round(skew_ms * MS) * (c == "upper")) for index in range(60) for c in ("lower", "upper")]
@@ -209,11 +191,10 @@ def jitter(sigma_ms: float, count: int) -> np.ndarray:
     ("skews_ms", "expected_ms", "within_ms"),
     [
         # Cameras that are triggered together are simultaneous however their stamps scatter.
-        *(([TRIGGERED.uniform(-2, 2) for _ in range(count)], 0.0, 0.0) for count in (1, 5, 8, 20, 100)),
+        *(([TRIGGERED.uniform(-2, 2) for _ in range(count)], 0.0, 0.0) for count in (1, 8, 100)),
         # That of free cameras is found below the scatter of the stamps, also where their clocks drift.
         ([15.0], 15.0, 0.0),
         (15 + jitter(1.0, 60), 15.0, 1.0),
-        (-9 + jitter(0.1, 60), -9.0, 0.1),
         (5 + 0.003 * np.arange(100) + jitter(0.1, 100), 5.3, 0.15),
         # Another one after a lost image counts at once.
         ([14.0] * 40 + [-19.0], -19.0, 0.0),

@@ -177,12 +177,6 @@ def test_draws_the_messages_of_a_robot(tmp_path: Path) -> None:
     assert rows(drawn, "/panorama", "EncodedImage:blob") and rows(drawn, "/odom/map", "Points3D:positions")
 
 
-def test_without_a_display_the_way_to_a_browser_is_named(drawn: Path, tmp_path: Path) -> None:
-    with viewing(tmp_path, drawn / "rec.mcap") as it:
-        _, err = it.communicate(timeout=DEADLINE_S)
-    assert it.returncode == 2 and "rerun --serve-web" in err and "Traceback" not in err
-
-
 def panels(node: Any) -> list[str]:
     """Return the panels of a layout tree."""
     return [node] if isinstance(node, str) else panels(node["first"]) + panels(node["second"])

@@ -27,13 +27,12 @@ from omnid.transport.status_names import CALIBRATION
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry
 from tests.omnid.web.servers import WebServer, served
 from tests.omnid.web.test_robot import Navigator
-from tests.replay.live import robot, started
-from tests.replay.test_arming import MANUAL
+from tests.replay.live import started
 from tests.waiting import PATIENCE_S, wait_until
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytestmark = [pytest.mark.browser, pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")]
-SIZES = {"phone": (390, 844), "laptop": (1280, 800), "desk": (1366, 768)}
+SIZES = {"phone": (390, 844), "desk": (1366, 768)}
 # What drives the robot is on the screen without scrolling; routes are beside it, on a phone below.
 CONTROLS = ("arm", "goal", "stick", "fit")
 HOSTILE = "<img src=x onerror=document.title='hacked'><script>document.title='hacked'</script>"
@@ -128,43 +127,6 @@ def expect_it_fits(page: Any, size: str) -> None:
             assert 0 <= control["y"] <= control["y"] + control["height"] <= box["y"], name
 
 
-def test_the_page_shows_drives_and_stops_a_robot(browser: Any, tmp_path: Path, course: Path) -> None:
-    with (
-        robot(course, tmp_path, *MANUAL, "--set", "bus.panorama_hz=2") as (daemon, operator, base),
-        served("--connect", f"tcp/127.0.0.1:{daemon.port}") as server,
-    ):
-        operator.drive(0.3)
-        for size, scheme in (("phone", "light"), ("desk", "dark")):
-            with opened(browser, server, size, scheme) as page:
-                shows(page, "state", "tracking")
-                shows(page, "armed", "not armed")
-                expect_it_fits(page, size)
-                press = page.tap if size == "phone" else page.click
-                press("#arm")
-                assert not base.drives, "one press only asks"
-                arm(page, press)
-                wait_until(lambda: base.drives, "motion")
-                screenshot(page, f"{size}-armed")
-                press("#stop")
-                shows(page, "stop-answer", "the robot stops")
-                wait_until(lambda: not base.drives, "the stop")
-                shows(page, "armed", "not armed")
-                page.wait_for_function("() => document.getElementById('panorama').naturalWidth > 100", timeout=WAIT_MS)
-                expect_it_fits(page, size)
-                screenshot(page, f"{size}-all")
-        with opened(browser, server) as page:
-            arm(page, page.click)
-            wait_until(lambda: base.drives, "motion")
-            page.keyboard.press("Space")  # the focus is on the button Arm
-            wait_until(lambda: not base.drives, "the stop")
-            shows(page, "stop-answer", "the robot stops")
-        operator.stop_sending()
-        assert daemon.end()[0] == 0
-        with opened(browser, server) as page:
-            shows(page, "warnings", "its daemon has ended")
-            screenshot(page, "ended")
-
-
 def test_obstacles_and_the_coverage_of_a_calibration(browser: Any) -> None:
     endpoint = free_endpoint()
     ranges = (1.5 + np.abs(np.sin(np.linspace(0, 9, 360)))).astype(np.float32)
@@ -180,8 +142,8 @@ def test_obstacles_and_the_coverage_of_a_calibration(browser: Any) -> None:
     with contextlib.ExitStack() as ends:
         bus = ends.enter_context(contextlib.closing(Bus(BusConfig(listen=(endpoint,)))))
         server = ends.enter_context(served("--connect", endpoint))
-        for size, scheme in (("phone", "light"), ("desk", "dark")):
-            with opened(browser, server, size, scheme) as page:
+        for size in ("phone", "desk"):
+            with opened(browser, server, size) as page:
                 end_s = time.monotonic() + PATIENCE_S
                 while not (
                     "nearest obstacle" in page.inner_text("#pose")
@@ -215,34 +177,31 @@ def test_routes_are_taught_and_repeated(browser: Any) -> None:
         thread.start()
         ends.callback(thread.join)
         ends.callback(publishing.set)
-        for size in SIZES:
-            with opened(browser, server, size) as page:
-                navigator.state = "driving"
-                shows(page, "navigation", "route dock: driving, 3.5 m left")
-                buttons = {
-                    name: page.locator(f"#route-{name}") for name in ("teach", "repeat", "stop", "pause", "resume")
-                }
-                page.wait_for_function("() => !document.getElementById('route-pause').disabled", timeout=WAIT_MS)
-                assert [name for name, button in buttons.items() if button.is_enabled()] == ["repeat", "stop", "pause"]
-                navigator.state = "idle"
-                page.wait_for_function("() => document.getElementById('route-pause').disabled", timeout=WAIT_MS)
-                assert [name for name, button in buttons.items() if button.is_enabled()] == ["teach", "repeat"]
-                count = len(navigator.asked)
-                page.fill("#route-name", "../x")
-                page.click("#route-teach")
-                page.fill("#route-name", "dock 1")
-                page.click("#route-repeat")
-                assert len(navigator.asked) == count
-                page.fill("#route-name", "dock-1")
-                page.click("#route-teach")
-                shows(page, "route-answer", "does teach dock-1")
-                page.click("#route-repeat")
-                assert navigator.asked[-1] == "teach dock-1", "one press only asks"
-                page.click("#route-repeat")
-                wait_until(lambda: navigator.asked[-1] == "repeat dock-1", "the repetition")
-                page.locator("#navigation-box").scroll_into_view_if_needed()
-                expect_it_fits(page, size)
-                screenshot(page, f"{size}-routes")
+        with opened(browser, server, "phone") as page:
+            navigator.state = "driving"
+            shows(page, "navigation", "route dock: driving, 3.5 m left")
+            buttons = {name: page.locator(f"#route-{name}") for name in ("teach", "repeat", "stop", "pause", "resume")}
+            page.wait_for_function("() => !document.getElementById('route-pause').disabled", timeout=WAIT_MS)
+            assert [name for name, button in buttons.items() if button.is_enabled()] == ["repeat", "stop", "pause"]
+            navigator.state = "idle"
+            page.wait_for_function("() => document.getElementById('route-pause').disabled", timeout=WAIT_MS)
+            assert [name for name, button in buttons.items() if button.is_enabled()] == ["teach", "repeat"]
+            count = len(navigator.asked)
+            page.fill("#route-name", "../x")
+            page.click("#route-teach")
+            page.fill("#route-name", "dock 1")
+            page.click("#route-repeat")
+            assert len(navigator.asked) == count
+            page.fill("#route-name", "dock-1")
+            page.click("#route-teach")
+            shows(page, "route-answer", "does teach dock-1")
+            page.click("#route-repeat")
+            assert navigator.asked[-1] == "teach dock-1", "one press only asks"
+            page.click("#route-repeat")
+            wait_until(lambda: navigator.asked[-1] == "repeat dock-1", "the repetition")
+            page.locator("#navigation-box").scroll_into_view_if_needed()
+            expect_it_fits(page, "phone")
+            screenshot(page, "phone-routes")
 
 
 def heading_deg(page: Any) -> float:
@@ -290,7 +249,10 @@ def test_stick_keys_and_a_tap_drive_a_simulated_robot(browser: Any, size: str, s
         assert page.locator("#goal").is_disabled() and page.get_attribute("#stick", "aria-disabled") == "true"
         page.wait_for_function("() => document.getElementById('panorama').naturalWidth > 100", timeout=WAIT_MS)
         assert page.locator("#panorama").bounding_box()["width"] >= 0.95 * SIZES[size][0]
-        arm(page, page.tap if size == "phone" else page.click)
+        press = page.tap if size == "phone" else page.click
+        press("#arm")
+        shows(page, "armed", "not armed")  # one press only asks
+        arm(page, press)
         shows(page, "well", "All is well. It obeys commands.")
         # 1. The stick, released outside of it.
         box = page.locator("#stick").bounding_box()
@@ -327,7 +289,13 @@ def test_stick_keys_and_a_tap_drive_a_simulated_robot(browser: Any, size: str, s
         held(page, lambda: math.dist(position(page), (x, y)) > 0.1, "the drive to the goal")
         page.click("#goal-leave")
         shows(page, "goal-answer", "cancelled")
-        page.click("#stop")
+        # 4. Stops, by the button and by a key.
+        press("#stop")
+        shows(page, "stop-answer", "the robot stops")
+        shows(page, "armed", "not armed")
+        arm(page, press)
+        page.keyboard.press("Space")  # the focus is on the button Arm
+        shows(page, "stop-answer", "the robot stops")
         shows(page, "armed", "not armed")
         expect_it_fits(page, size)
         assert daemon.end()[0] == 0

@@ -28,11 +28,9 @@ from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import (
     Diagnostics,
     DiagnosticStatus,
-    PlanarPath,
     Pose,
     PoseAttachment,
     Scan,
-    goal_from_cdr,
     scan_cdr,
     string_from_cdr,
 )
@@ -106,12 +104,6 @@ def page(rover: Rover) -> Iterator[RobotPage]:
         feed.robot, feed.link = connection, ""
         wait_until(lambda: connection.driver().connected)
         yield RobotPage(feed)
-
-
-@pytest.fixture
-def alone() -> RobotPage:
-    """A page without a connection."""
-    return RobotPage(RobotFeed(BusConfig()))
 
 
 @pytest.fixture(autouse=True)
@@ -290,26 +282,16 @@ def test_what_lets_the_robot_move_and_comes_late_or_without_a_stamp_is_refused(
 
 
 class Navigator:
-    """A robot that grants every request but those for the route `lost`, and whose disk is full at the second save."""
+    """A robot that grants every request but those for the route `lost`."""
 
     def __init__(self, bus: Bus) -> None:
-        self._bus, self.asked, self.goals = bus, list[str](), list[PlanarPath]()
-        self.twists: list[tuple[float, float]] = []
-        self.state = "driving"
+        self._bus, self.asked, self.state = bus, list[str](), "driving"
         bus.subscribe_commands(self._take, command_topics(("operator",)))
 
     def _take(self, request: Request) -> None:
-        if request.topic == "cmd/twist":
-            command = codec.twist_from_cdr(request.payload)
-            self.twists.append((command.velocity_mps, command.yaw_rate_radps))
-            return
-        if request.topic == "cmd/goal":
-            self.goals.append(goal_from_cdr(request.payload))
-            self._bus.answer(request.id, Answer(True, "it drives there"))
-            return
         text = string_from_cdr(request.payload)
         self.asked.append(text)
-        is_refused = text.endswith("lost") or self.asked.count("save") == 2
+        is_refused = text.endswith("lost")
         self._bus.answer(request.id, Answer(not is_refused, "that cannot be" if is_refused else f"does {text}"))
 
     def publish(self) -> None:
@@ -517,7 +499,6 @@ def test_obstacles_are_drawn_from_the_pose_nearest_in_time() -> None:
 # The feed.
 
 
-STATUS = codec.diagnostics_cdr(10**18, [DiagnosticStatus(WHEELS, 0, "armed", {Key.ARMED: "1"})])
 MAP = codec.grid_cdr(10**18, "odom", np.full((4, 3), 100, np.int8), 0.1, (-1.0, -2.0))
 SCAN = scan_cdr(10**9, "base_link", np.ones(360, np.float32), np.ones(360, np.float32), (0.1, 6.0))
 

@@ -87,18 +87,6 @@ def test_nothing_is_answered_without_token_or_for_another_site(server: WebServer
     assert server.request(path, method, {**server.bearer, "Host": "evil.example"}).status == 403
 
 
-@pytest.mark.parametrize(
-    "path",
-    [
-        "/static/..%2faccess.py",
-        "/static//etc/passwd",
-    ],
-)
-def test_no_other_file_can_be_read(server: WebServer, path: str) -> None:
-    answer = server.request(path, headers=server.bearer)
-    assert answer.status in (404, 409) and "import" not in answer.text and "root:" not in answer.text
-
-
 @pytest.mark.parametrize("query", ["", "seen=-1", "seen=" + "9" * 40])
 def test_news_since_no_version_are_refused(server: WebServer, query: str) -> None:
     assert server.request(f"/live?{quote(query, safe='=')}", headers=server.bearer).status == 400
@@ -213,12 +201,8 @@ def test_without_a_robot_the_page_says_so_and_a_stop_is_not_confirmed(default_si
     ("words", "expected"),
     [
         (("--listen", "nonsense"), "HOST:PORT"),
-        (("--listen", "127.0.0.1:99999"), "HOST:PORT"),
         (("--listen", "192.0.2.1:0"), "another address"),
-        (("--connect", "nonsense"), "bus.connect"),
         (("--tls-key", "key.pem"), "--tls-certificate"),
-        (("--token-file", "/nowhere/token"), "--token-file"),
-        (("--tls-key", "/nowhere", "--tls-certificate", "/nowhere"), "--tls-certificate"),
         (("--tls-key", "/etc/hostname", "--tls-certificate", "/etc/hostname"), "in PEM"),
     ],
 )
@@ -335,14 +319,11 @@ def reason(access: Access, *headers: dict[str, str], path: str = "/metrics", met
     ("access", "host", "enters"),
     [
         (LOCAL, HOST, True),
-        (LOCAL, "localhost", True),
         (LOCAL, "[::1]:8447", True),
         (LOCAL, "evil.example", False),
-        (LOCAL, "192.168.1.7:8447", False),
         (LOCAL, "localhost@evil.example", False),
         (LOCAL, "", False),
         (NETWORK, "192.168.1.7:8447", True),
-        (NETWORK, "rover.local:8447", True),
         (NETWORK, "evil.example:8447", False),
     ],
 )
@@ -358,9 +339,7 @@ def test_only_own_names_are_answered(access: Access, host: str, enters: bool) ->
         (BEARER, ""),
         ({"authorization": "Bearer wrong-wrong-wrong"}, "wrong token"),
         ({"authorization": f"Basic {TOKEN}"}, "wrong token"),
-        ({"authorization": "Bearer \xe4\xf6"}, "wrong token"),
         ({**COOKIE, "authorization": "Bearer wrong"}, "wrong token"),
-        ({"cookie": f"omnid_8447={TOKEN}"}, "wrong token"),
         ({"cookie": "omnid_8447=\xe4"}, "wrong token"),
         ({"cookie": f"omnid_8447={LOCAL.new_cookie(Role.STOP)}"}, "wrong token"),
         ({"cookie": f"omnid_1={LOCAL.new_cookie(Role.DRIVE)}"}, "no token"),
@@ -375,9 +354,7 @@ def test_the_token_or_its_cookie_is_needed(headers: dict[str, str], expected: st
     ("headers", "expected"),
     [
         (OWN, ""),
-        ({"origin": f"https://{HOST}"}, ""),
         ({"origin": "http://evil.example"}, "cross-site"),
-        ({"origin": "http://127.0.0.1:3000"}, "cross-site"),
         ({"origin": "null"}, "cross-site"),
         ({}, "no origin"),
         (BEARER, ""),

@@ -336,29 +336,11 @@ def test_is_finite_and_bounded_after_any_previous_motion(seed: int) -> None:
 
 
 OF_HOLDER = VelocityLimits(yaw_rate_radps=0.8, yaw_acceleration_radps2=2.0)
-LONGEST_RAD = 0.15 * 0.8 + 0.8**2 / (2 * 2)
 
 
 @pytest.fixture
 def goal() -> HeadingGoal:
     return HeadingGoal(OF_HOLDER)
-
-
-@pytest.mark.hazard("H11")
-def test_a_blocked_base_gets_no_goal_beyond_the_longest_lead(goal: HeadingGoal) -> None:
-    goal.update(2.0, 0.0)
-    for error_rad in (None, 3.0):
-        goals = [goal.towards(0.05, error_rad) for _ in range(100)]
-        assert goals[0] == pytest.approx(2.05) and goals[-1] == pytest.approx(2.0 + LONGEST_RAD)
-        goal.stay()
-    assert [goal.towards(-0.05, -3.0) for _ in range(100)][-1] == pytest.approx(2.0 - LONGEST_RAD)
-
-
-def test_the_goal_does_not_pass_the_wanted_heading(goal: HeadingGoal) -> None:
-    goal.update(1.0, 0.5)
-    for error_rad, turn_rad, expected_rad in ((0.1, 0.5, 1.1), (-0.1, -0.5, 0.9), (0.1, -0.5, 1.0), (0.0, 0.5, 1.0)):
-        goal.stay()
-        assert goal.towards(turn_rad, error_rad) == pytest.approx(expected_rad)
 
 
 def test_a_base_that_turns_too_fast_is_to_hold_its_heading(goal: HeadingGoal) -> None:

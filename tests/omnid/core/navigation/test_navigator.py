@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 
 import numpy as np
@@ -22,7 +21,6 @@ from omnid.tracking_state import MapState, TrackingState
 from tests.omnid.core.navigation.driven_base import DrivenBase
 
 SETTINGS = NavigationSettings(unlocalised_m=1.0, unlocalised_s=4.0, stuck_s=3.0)
-LOCALISED = MapPosition(np.zeros(3), MapState.LOCALIZED, 0.02)
 
 
 def driving(
@@ -164,48 +162,16 @@ def test_a_hold_of_the_collision_monitor_is_a_block_with_its_reason() -> None:
     assert answer.setpoint is not None and answer.setpoint.velocity_mps > 0, "the monitor lets go by itself"
 
 
-class Steps:
-    """A navigator that drives straight on from the origin, 0.1 s from step to step."""
-
-    def __init__(self, frame: NavigationFrame = NavigationFrame.ODOM, lengths_m: tuple[float, ...] = (5.0,)) -> None:
-        """lengths_m: of the paths, each from the end of the one before."""
-        self.navigator, self.now_s = Navigator(SETTINGS), 0.0
-        ends = np.concatenate([[0.0], np.cumsum(lengths_m)])
-        paths = [DrivePath((straight_leg((a, 0.0), (b, 0.0)),)) for a, b in itertools.pairwise(ends)]
-        self.navigator.start("goal", frame, paths, self.at(0.0, 0.0, 0.0))
-        self.step(0.0)
-
-    def at(self, x_m: float, y_m: float, step_s: float = 0.1, **change: object) -> Situation:
-        """Return the situation some time after the last one."""
-        self.now_s += step_s
-        now = Situation(
-            round(self.now_s * 1e9),
-            np.array([x_m, y_m, 0.0]),
-            0.0,
-            0.0,
-            TrackingState.TRACKING,
-            0,
-            WheelState(True, False),
-            LOCALISED,
-        )
-        now = now._replace(**change)  # type: ignore[arg-type]
-        return now if now.in_map is None else now._replace(in_map=self._stamped(now.in_map, now.stamp_ns))
-
-    def _stamped(self, in_map: MapPosition, stamp_ns: int) -> MapPosition:
-        return in_map if in_map.stamp_ns else in_map._replace(stamp_ns=stamp_ns)
-
-    def step(self, x_m: float, y_m: float = 0.0, step_s: float = 0.1, **change: object) -> Navigation:
-        return self.navigator.step(self.at(x_m, y_m, step_s, **change))
-
-
 @pytest.mark.hazard("H28")
 def test_a_pose_in_the_map_counts_once() -> None:
     """The drive ends as without any where no more of them come, as the search for places hangs."""
-    steps = Steps(NavigationFrame.MAP)
-    old = LOCALISED._replace(stamp_ns=round(steps.now_s * 1e9))
-    found = [steps.step(0.3 * k, in_map=old).state for k in range(1, 6)]
-    assert found.index(NavigationState.NOT_LOCALISED) + 1 == math.ceil(SETTINGS.unlocalised_m / 0.3)
-    assert steps.step(1.5).state is NavigationState.DRIVING
+    base = driving(NavigationFrame.MAP)
+    old, begin_m = base.seen().in_map, base.pose[0]
+    while base.navigator.step(base.seen()._replace(in_map=old)).state is NavigationState.DRIVING:
+        base.pose, base.t_s = base.pose + np.array([0.1, 0.0, 0.0]), base.t_s + 0.1
+    assert base.navigator.state is NavigationState.NOT_LOCALISED
+    assert base.pose[0] - begin_m == pytest.approx(SETTINGS.unlocalised_m, abs=0.15)
+    assert base.navigator.step(base.seen()).state is NavigationState.DRIVING
 
 
 @pytest.mark.hazard("H26")
@@ -215,13 +181,14 @@ def test_a_pose_in_the_map_counts_once() -> None:
 def test_a_stop_between_two_poses_ends_a_drive_although_it_is_armed_again(
     halted_by: str, state: NavigationState
 ) -> None:
-    steps = Steps()
+    base = driving()
     armed = WheelState(True, False, halts=1, halted_by=halted_by)
-    assert steps.step(0.1, wheels=armed).state is state
-    assert steps.step(0.1, wheels=armed).state is state
+    for _ in range(2):
+        assert base.navigator.step(base.seen()._replace(wheels=armed)).state is state
     if state is NavigationState.PAUSED:
-        assert not steps.navigator.resume(steps.at(0.1, 0.0, wheels=armed))
-        assert steps.step(0.1, wheels=armed).state is NavigationState.DRIVING, "a person resumed it"
+        assert not base.navigator.resume(base.seen()._replace(wheels=armed))
+        now = base.seen()._replace(wheels=armed)
+        assert base.navigator.step(now).state is NavigationState.DRIVING, "a person resumed it"
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Paths and their legs; routes: recorded, tied to keyframes, repeated from anywhere on them, bound to their map."""
+"""Paths and their legs; requests; routes: tied to keyframes, repeated from anywhere on them, bound to their map."""
 
 from __future__ import annotations
 
@@ -12,7 +12,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from omnid.core.navigation.navigator import Navigator
 from omnid.core.navigation.path import MAX_LENGTH_M, MAX_POINTS, drive_path
-from omnid.core.navigation.requests import NavigationFrame
+from omnid.core.navigation.requests import (
+    GoalRequest,
+    NavigationFrame,
+    NavigationRequest,
+    NavigationVerb,
+    PathRequest,
+    RouteAction,
+    RouteRequest,
+    is_halt,
+    navigation_verb,
+    route_request,
+)
 from omnid.core.navigation.route import KeyframePose, Route, RouteRecorder, repeated_paths
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.errors import OmnidError
@@ -183,12 +194,6 @@ def test_a_piece_that_was_driven_backwards_is_repeated_so() -> None:
     assert [leg.backwards for leg in path.legs] == [False, True]
 
 
-@pytest.mark.parametrize("points", [[(1.0, 2.0)], [(1.0, 2.0), (1.0, 2.0)]])
-def test_a_single_place_is_no_path(points: list[tuple[float, float]]) -> None:
-    with pytest.raises(OmnidError, match="a path"):
-        drive_path(points)
-
-
 @pytest.mark.parametrize(("turn_deg", "legs"), [(35.0, 1), (-35.0, 1), (45.0, 2), (-45.0, 2), (180.0, 2)])
 def test_a_leg_ends_where_the_path_turns_by_more_than_40_degrees(turn_deg: float, legs: int) -> None:
     turn = math.radians(turn_deg)
@@ -206,7 +211,7 @@ def test_a_leg_ends_where_the_path_turns_by_more_than_40_degrees(turn_deg: float
     ("points", "words"),
     [
         (np.zeros((MAX_POINTS + 1, 2)), f"a path of {MAX_POINTS + 1} points"),
-        ([(0.0, 0.0), (math.nan, 1.0)], "not finite"),
+        ([(1.0, 2.0), (1.0, 2.0)], "a path"),
         ([(0.0, 0.0), (math.inf, 1.0)], "not finite"),
         ([(0.0, 0.0), (MAX_LENGTH_M + 1.0, 0.0)], "longer than 5000 m"),
         ([(0.0, 0.0), (0.0, 3000.0), (0.0, 0.0)], "longer than 5000 m"),
@@ -215,3 +220,60 @@ def test_a_leg_ends_where_the_path_turns_by_more_than_40_degrees(turn_deg: float
 def test_other_points_are_no_path_and_the_message_says_why(points: ArrayLike, words: str) -> None:
     with pytest.raises(OmnidError, match=words):
         drive_path(points)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("teach hall", RouteRequest(RouteAction.TEACH, "hall")),
+        ("teach hall replace", RouteRequest(RouteAction.TEACH, "hall", replace=True)),
+        ("stop", RouteRequest(RouteAction.STOP)),
+        ("repeat hall", RouteRequest(RouteAction.REPEAT, "hall")),
+        ("  repeat  hall-2 reverse  loops=12 ", RouteRequest(RouteAction.REPEAT, "hall-2", True, 12)),
+        ("repeat hall from=start loops=2", RouteRequest(RouteAction.REPEAT, "hall", False, 2, True)),
+    ],
+)
+def test_requests_about_routes(text: str, expected: RouteRequest) -> None:
+    assert route_request(text) == expected
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "teach",
+        "repeat a from=here from=start",
+        "teach ../etc",
+        "repeat a loops=0",
+        "finish now",
+        "teach " + "a" * 65,
+        "repeat a" + " " * 500,
+        "repeat a\0",
+    ],
+)
+def test_other_texts_are_refused_in_one_line(text: str) -> None:
+    with pytest.raises(OmnidError) as error:
+        route_request(text)
+    assert "\n" not in str(error.value) and len(str(error.value)) < 300 and str(error.value).isascii()
+
+
+@pytest.mark.parametrize("verb", list(NavigationVerb))
+def test_verbs(verb: NavigationVerb) -> None:
+    assert navigation_verb(f" {verb}\n") is verb
+    with pytest.raises(OmnidError):
+        navigation_verb(verb.upper())
+
+
+@pytest.mark.parametrize(
+    ("request_", "halts"),
+    [
+        (NavigationVerb.CANCEL, True),
+        (NavigationVerb.PAUSE, True),
+        (NavigationVerb.RESUME, False),
+        (GoalRequest(NavigationFrame.ODOM, 1.0, 0.0), False),
+        (PathRequest(NavigationFrame.ODOM, np.zeros((2, 2))), False),
+        *((RouteRequest(action, "hall"), action is RouteAction.STOP) for action in RouteAction),
+    ],
+)
+def test_only_cancel_pause_and_the_stop_of_a_route_halt(request_: NavigationRequest, halts: bool) -> None:
+    assert is_halt(request_) == halts

@@ -135,17 +135,3 @@ def test_a_part_of_the_way_that_nothing_measured_is_not_forgotten(cameras: Rende
     assert {one.resets for one in found} == {0}
     assert [(one.state, one.resets) for one in there[-4:]] == [(DEGRADED, 0), (DEGRADED, 1), *[(TRACKING, 1)] * 2]
     assert np.sqrt(there[-1].covariance[0, 0]) > 0.1
-
-
-def test_a_way_without_a_map_that_nothing_measured_is_not_forgotten(cameras: RenderedCameras) -> None:
-    """The upper lens is fogged: there is texture that matches nothing, and no depth for a new map."""
-    robot = Robot(cameras, SOON)
-    there, black = replace(cameras, scene=corridor(7)), cameras.darkness(0)
-    found = [
-        robot.see(replace(there.frame(100 + k, PATH[10]), upper=black.upper, disparities=black.disparities), sample)
-        for k, sample in enumerate([AHEAD] * 5 + [None] * 4)
-    ]
-    assert [found[-5].state, found[-1].state] == [DEGRADED, LOST]
-    begun = robot.see(there.frame(120, PATH[10]), AHEAD)
-    assert (begun.state, begun.resets) == (DEGRADED, 1)
-    assert np.sqrt(begun.covariance[0, 0]) > 0.1

@@ -67,16 +67,16 @@ def test_a_pose_that_one_camera_contradicts_is_refused(
     assert motion_errors(estimates[4].T_odom_rect, truth(4))[0] < 0.01
 
 
-def test_estimates_the_path_through_a_right_angle(odometry: VisualOdometry, frames: list[StereoFrame]) -> None:
+def test_estimates_the_path_through_a_right_angle_and_its_own_error(
+    odometry: VisualOdometry, frames: list[StereoFrame]
+) -> None:
     for k, estimate in enumerate(run(odometry, frames)):
         distance, angle = motion_errors(estimate.T_odom_rect, truth(k))
         assert distance < 4e-3 and angle < 2e-3, k
         assert (estimate.state, estimate.resets) == (TrackingState.TRACKING, 0)
         assert estimate.tracked >= estimate.inliers >= 50
-
-
-def test_the_covariance_matches_the_error(odometry: VisualOdometry, frames: list[StereoFrame]) -> None:
-    for k, estimate in enumerate(run(odometry, frames)[1:], 1):
+        if k == 0:
+            continue
         np.testing.assert_allclose(estimate.covariance, estimate.covariance.T, atol=1e-12)
         error = se3.log(se3.inverse(estimate.T_odom_rect) @ truth(k))
         assert error @ np.linalg.solve(estimate.covariance, error) < 30  # a chi-square of six degrees of freedom
@@ -177,15 +177,6 @@ def test_frames_that_match_nothing_are_refused_and_then_restart_the_map(
     moved = se3.inverse(there[-2].T_odom_rect) @ there[-1].T_odom_rect
     assert motion_errors(moved, se3.inverse(PATH[2]) @ PATH[3])[0] < 5e-3
     assert np.sqrt(there[-1].covariance[0, 0]) > 0.1 > 10 * np.sqrt(before.covariance[0, 0])
-
-
-def test_refuses_an_impossible_speed(cameras: RenderedCameras, frames: list[StereoFrame]) -> None:
-    """The stamps are so close that the robot would have had to be faster than its limit."""
-    odometry = visual_odometry(cameras.model, OdometryLimits(max_speed_mps=0.5))
-    run(odometry, frames[:2])
-    estimate = odometry.process(frames[4], 0.05)  # 0.15 m in 0.05 s
-    assert estimate.state != TrackingState.TRACKING and estimate.inliers == 0
-    assert estimate.T_odom_rect[0, 3] < 0.1
 
 
 def test_a_pose_refused_for_its_speed_leaves_a_covariance_that_covers_it(cameras: RenderedCameras) -> None:

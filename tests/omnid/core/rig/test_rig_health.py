@@ -1,4 +1,4 @@
-"""State of the rig by panoramas of rendered rooms: right rigs and wrong ones, at the start and while driving."""
+"""State of the rig by panoramas of rendered rooms, right rigs and wrong ones; landmarks of a drive."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Matching two panoramas: repeated and unique textures, subpixel disparities, borders of the image."""
+"""Matching two panoramas: textures, subpixel disparities, borders; triangulation: points, Jacobians, covariances."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from calib.panorama import Cylinder
 from omnid.core.stereo.matcher import Matcher, MatchingSettings, smooth
 from omnid.core.stereo.semiglobal import ColumnShift
+from omnid.core.stereo.triangulation import point_covariance, triangulate, view
 from tests.omnid.core.scenery import texture, turned
 
 Image = NDArray[np.uint8]
@@ -137,3 +139,29 @@ def test_the_search_follows_columns_that_have_moved() -> None:
     ]
     assert len(errors[0]) > 500 and np.mean(errors[0] < 0.2) > 0.85
     assert np.mean(errors[1] < 0.2) < 0.6  # without it
+
+
+Array = NDArray[np.float64]
+
+CYLINDER, BASELINE_M = Cylinder(1304, 383, 128.5), 0.2
+
+
+@pytest.fixture
+def points() -> Array:
+    """Return points (40, 3) [m] all around, one of them straight behind."""
+    rng = np.random.default_rng(1)
+    azimuth, r = rng.uniform(-np.pi, np.pi, 40), rng.uniform(0.5, 4, 40)
+    azimuth[0] = np.pi
+    return np.column_stack([r * np.cos(azimuth), r * np.sin(azimuth), rng.uniform(-1.2, 1.5, 40)])
+
+
+def test_covariance_equals_the_scatter_of_noisy_views(points: Array) -> None:
+    sigma_px = 0.1
+    rng = np.random.default_rng(4)
+    covariances = point_covariance(points, CYLINDER, BASELINE_M, sigma_px)
+    for point, covariance in zip(points[:6], covariances, strict=False):
+        views = view(np.tile(point, (20_000, 1)), CYLINDER, BASELINE_M)
+        seen = np.cov(triangulate(views + sigma_px * rng.standard_normal(views.shape), CYLINDER, BASELINE_M).T)
+        # Whitened: W^T S W = I, so that the short axes count as much as the long ones.
+        W = np.linalg.inv(np.linalg.cholesky(covariance))
+        np.testing.assert_allclose(W @ seen @ W.T, np.eye(3), atol=0.12)

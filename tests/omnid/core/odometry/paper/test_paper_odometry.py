@@ -1,4 +1,4 @@
-"""The paper's ego-motion: its equations, its trackers, step 4 of figure 5, and a short rendered run."""
+"""The paper's ego-motion: its equations, its trackers, step 4 of figure 5, registration, and a short rendered run."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from omnid.core.odometry.paper.paper_odometry import (
     refine,
     turned_track,
 )
-from omnid.core.odometry.paper.registration import Registration
+from omnid.core.odometry.paper.registration import Registration, consensus
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings
 from omnid.tracking_state import TrackingState
@@ -106,3 +106,24 @@ def test_darkness_is_lost_and_keeps_the_pose(cameras: RenderedCameras, frames: l
     assert (after.state, after.resets) == (TrackingState.TRACKING, 1)
     moved = se3.inverse(out.T_odom_rect) @ again.T_odom_rect
     assert motion_errors(moved, se3.inverse(PATH[1]) @ PATH[2])[0] < 0.02
+
+
+Array = NDArray[np.float64]
+
+
+MOTION = se3.exp([0.1, -0.05, 0.02, 0.05, -0.1, 1.6])
+
+
+def cloud(count: int, seed: int = 0) -> Array:
+    """Points (N, 3) [m] on all sides."""
+    return np.random.default_rng(seed).normal(0, 1.5, (count, 3))
+
+
+def test_the_consensus_set_is_found_among_outliers() -> None:
+    a = cloud(100)
+    b = se3.apply(MOTION, a) + np.random.default_rng(1).normal(0, 0.005, (100, 3))
+    b[:60] = cloud(60, 2)
+    M, agree = consensus(a, b, np.random.default_rng(3), 0.05)
+    assert agree[60:].mean() > 0.9 and agree[:60].sum() <= 3
+    assert motion_errors(M, MOTION)[0] < 0.05
+    assert not consensus(a[:2], b[:2], np.random.default_rng(3), 0.05)[1].any()
