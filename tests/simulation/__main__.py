@@ -2,7 +2,7 @@
 
 --speed: factor on the speed; at 1 two_walls has 0.5 m/s, rooms about 0.57 m/s and 36 deg/s. Cameras that are not
 synchronised: `--speed 1.4 --skew-ms 15`, or `--skew-ms 5 25` (upper minus lower exposure and stamp of the first and the
-last pair); --stamp-offset-ms: upper exposure later than its stamp says. A rolling shutter of 20 ms on 768 rows:
+last pair). A rolling shutter of 20 ms on 768 rows:
 `--line-time-us 26`, or that of lower and upper; a stamp is that of the first row. Real mirrors: `--mirrors 1` (tilted
 cameras, mirrors off shape by 1.5 %), with nominal.toml instead of rig.toml. Real lenses, lamps and electronics:
 `--real`, or some of `tests/simulation/disturbances.py` by `--disturb flicker dust`. Dim images with much noise, whose
@@ -11,8 +11,6 @@ brightness changes: `--dim`.
 
 from __future__ import annotations
 
-import sys
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -33,11 +31,9 @@ def render(
     seed: int = 1,
     size: int = 768,
     pairs: int = 0,
-    supersample: int = 3,
     mirrors: float = 0.0,
     speed: float = 1.0,
     skew_ms: Sequence[float] = (0.0,),
-    stamp_offset_ms: float = 0.0,
     line_time_us: Sequence[float] = (0.0,),
     dim: bool = False,
     disturb: Sequence[Disturbance] = (),
@@ -46,13 +42,7 @@ def render(
     """Render one recipe into a folder."""
     made = build(name, seed, size, pairs or None)
     rig = with_real_mirrors(made.rig, seed, mirrors) if mirrors else made.rig
-    readout = Readout(speed, (skew_ms[0], skew_ms[-1]), stamp_offset_ms, (line_time_us[0], line_time_us[-1]))
-    started = time.monotonic()
-
-    def progress(done: int, total: int) -> None:
-        left_s = (time.monotonic() - started) / done * (total - done)
-        sys.stderr.write(f"\r{name} {done}/{total} pairs, {left_s:.0f} s left  ")
-
+    readout = Readout(speed, (skew_ms[0], skew_ms[-1]), line_time_us=(line_time_us[0], line_time_us[-1]))
     write_log(
         out,
         rig,
@@ -60,14 +50,12 @@ def render(
         made.scene,
         sensor=DIM if dim else made.sensor,
         seed=seed,
-        supersample=supersample,
+        supersample=3,
         readout=readout,
         disturbances=DISTURBANCES if real else tuple(disturb),
-        progress=progress,
     )
     if any(line_time_us):
         write_rig(out / "rig.toml", replace(rig, times=ShutterTimes(0.0, 1e-6 * line_time_us[0])))
-    sys.stderr.write("\n")
 
 
 if __name__ == "__main__":

@@ -73,9 +73,9 @@ def poster_paint(rng: Random) -> Paint:
 class Builder:
     """Collects the surfaces of a world."""
 
-    def __init__(self, rng: Random, floor: str, ceiling_m: float = CEILING_M) -> None:
+    def __init__(self, rng: Random, floor: str) -> None:
         """floor: the kind of its texture."""
-        self.rng, self.floor_kind, self.ceiling_m = rng, floor, ceiling_m
+        self.rng, self.floor_kind, self.ceiling_m = rng, floor, CEILING_M
         self.faces: list[Rectangle] = []
         self.panes: list[Rectangle] = []  # of glass: they are touched, and mirror a little
         self.wall_grey = float(rng.uniform(165, 215))
@@ -131,10 +131,9 @@ class Builder:
         pictures: int = 0,
         grey: float | None = None,
         skirting: bool = True,
-        height_m: float | None = None,
     ) -> None:
         """Add a painted wall between two points, left and right as seen from its front, with what hangs on it."""
-        rng, top_m = self.rng, height_m or self.ceiling_m
+        rng, top_m = self.rng, self.ceiling_m
         first, last = np.array([*a, 0.0]), np.array([*b, 0.0])
         length_m = float(np.linalg.norm(last - first))
         along = (last - first) / length_m
@@ -212,13 +211,11 @@ class Builder:
                 Rectangle(origin, np.array([thick_m, 0.0, 0.0]), across, paint((thick_m, one.width_m)), "lintel")
             )
 
-    def room(
-        self, low: Point, high: Point, *, doors: int = 1, windows: int = 0, pictures: int = 1, end_doors: int = 0
-    ) -> None:
+    def room(self, low: Point, high: Point, *, doors: int = 1, windows: int = 0, pictures: int = 1) -> None:
         """Add four walls around a rectangle: windows in the long left one, doors in both long ones."""
         (x0, y0), (x1, y1) = low, high
         self.wall((x0, y1), (x1, y1), doors=doors * (not windows), windows=windows, pictures=pictures)
-        self.wall((x1, y1), (x1, y0), doors=end_doors, pictures=1)
+        self.wall((x1, y1), (x1, y0), pictures=1)
         self.wall((x1, y0), (x0, y0), doors=doors, pictures=pictures)
         self.wall((x0, y0), (x0, y1), doors=1)
 
@@ -297,12 +294,12 @@ class Builder:
 
     # Things
 
-    def thing(self, parts: Iterable[Part], at: Point, yaw_rad: float, paint: Paint, name: str = "box") -> None:
+    def thing(self, parts: Iterable[Part], at: Point, yaw_rad: float, paint: Paint) -> None:
         """Add the boxes of one thing."""
         c, s = math.cos(yaw_rad), math.sin(yaw_rad)
         for x, y, z, length_m, width_m, height_m in parts:
             place, size_m = (at[0] + c * x - s * y, at[1] + s * x + c * y, z), (length_m, width_m, height_m)
-            self.faces += solid(place, size_m, yaw_rad, paint, name=name, is_raised=z > 0)
+            self.faces += solid(place, size_m, yaw_rad, paint, name="box", is_raised=z > 0)
 
     def star_chair(self, at: Point, yaw_rad: float) -> None:
         """Add an office chair: five legs, a column, a seat and a back."""
@@ -325,8 +322,9 @@ class Builder:
         plate = [(0.0, 0.0, height - thick, length, width, thick)]
         self.thing(plate, at, yaw_rad, plain_paint(self.rng, self.rng.uniform(120, 225), 1.5))
 
-    def shelf(self, at: Point, yaw_rad: float, width_m: float = 0.9) -> None:
+    def shelf(self, at: Point, yaw_rad: float) -> None:
         """Add boards between two sides, with books and boxes on them."""
+        width_m = 0.9
         boards = [(0.0, 0.0, z, 0.35, width_m, 0.02) for z in (0.08, 0.45, 0.82, 1.19, 1.56)]
         sides = [(0.0, y, 0.0, 0.35, 0.02, 1.8) for y in (width_m / 2, -width_m / 2)]
         self.thing([*boards, *sides], at, yaw_rad, plain_paint(self.rng, self.rng.uniform(120, 210), 1.5))

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -44,7 +44,6 @@ class Readout:
 
     speed: float = 1.0  # factor on the speed of the run: the pairs follow faster, the poses stay
     skew_ms: tuple[float, float] = (0.0, 0.0)
-    stamp_offset_ms: float = 0.0
     line_time_us: tuple[float, float] = (0.0, 0.0)
 
     @property
@@ -55,7 +54,7 @@ class Readout:
     @property
     def is_synchronous(self) -> bool:
         """True if both images show the same instant."""
-        return not (any(self.skew_ms) or self.stamp_offset_ms or any(self.line_time_us))
+        return not (any(self.skew_ms) or any(self.line_time_us))
 
     def skew_ns(self, pairs: int) -> Array:
         """Return upper minus lower stamp (N,) [ns] of every pair."""
@@ -63,7 +62,7 @@ class Readout:
 
     def delay_s(self, pairs: int) -> Array:
         """Return the time (N,) [s] from the lower to the upper exposure of every pair."""
-        return np.asarray(1e-9 * self.skew_ns(pairs) + 1e-3 * self.stamp_offset_ms)
+        return 1e-9 * self.skew_ns(pairs)
 
 
 def body_twists(poses: Array, period_s: float) -> Array:
@@ -105,13 +104,12 @@ def write_log(
     supersample: int = 2,
     readout: Readout | None = None,
     disturbances: Collection[Disturbance] = (),
-    progress: Callable[[int, int], None] | None = None,
 ) -> None:
     """Render both cameras' images at poses T_world_rig (N, 4, 4), and write the log and its ground truth to folder.
 
-    rig.toml has masks of the rims only; if struts or a hub hide pixels, rig_masked.toml has masks of those too. A rig
-    of ray-traced mirrors has no model: nominal.toml is what its builder knows. Without a readout both images of a pair
-    show the instant of the lower camera's stamp, and stamps differ by up to SKEW_NS. Same arguments, same bytes.
+    rig.toml has masks of the rims only. A rig of ray-traced mirrors has no model: nominal.toml is what its builder
+    knows. Without a readout both images of a pair show the instant of the lower camera's stamp, and stamps differ by up
+    to SKEW_NS. Same arguments, same bytes.
     """
     readout = readout or Readout()
     cameras, delay_s = (rig.lower, rig.upper), readout.delay_s(len(poses))
@@ -140,25 +138,20 @@ def write_log(
         skews = readout.skew_ns(len(poses)).astype(np.int64)
     sensor = sensor or Sensor()
     exposures = [MountedSensor.of(sensor, m.visible, m.camera.size) for m in (rig.lower, rig.upper)]
-    _write_rigs(folder, rig, exposures)
+    _write_rigs(folder, rig)
 
     def jpeg(pair: int, camera: int) -> bytes:
         exposed = exposures[camera].expose(ideal_image(pair, camera), rng)
         image = disturbed[camera].digitised(exposed)
         return disturbed[camera].encoded(image, pair) or exposures[camera].jpeg(image)
 
-    def images() -> Images:
-        for i in range(len(poses)):
-            yield i, jpeg(i, 0), jpeg(i, 1)
-            if progress:
-                progress(i + 1, len(poses))
-
+    images = ((i, jpeg(i, 0), jpeg(i, 1)) for i in range(len(poses)))
     # log.mcap appears only when it is complete.
-    _write_mcap(folder / "log.mcap.part", rig, (stamps, stamps + skews), images())
+    _write_mcap(folder / "log.mcap.part", rig, (stamps, stamps + skews), images)
     (folder / "log.mcap.part").replace(folder / "log.mcap")
 
 
-def _write_rigs(folder: Path, rig: Rig, exposures: list[MountedSensor]) -> None:
+def _write_rigs(folder: Path, rig: Rig) -> None:
     """Write the files that describe the rig."""
     if isinstance(rig.lower.camera, MirrorCamera):
         write_rig(folder / "nominal.toml", nominal_rig(rig))
@@ -167,9 +160,6 @@ def _write_rigs(folder: Path, rig: Rig, exposures: list[MountedSensor]) -> None:
     if isinstance(rig.lower.camera, UnifiedCamera):
         (folder / "camchain.yaml").write_text(camchain(rig))
     write_rig(folder / "rig.toml", rig)
-    if any(e.hidden.any() for e in exposures):
-        lower, upper = (_masked(m, e) for m, e in zip((rig.lower, rig.upper), exposures, strict=True))
-        write_rig(folder / "rig_masked.toml", replace(rig, lower=lower, upper=upper))
 
 
 def _write_mcap(path: Path, rig: Rig, stamps: tuple[Stamps, Stamps], images: Images) -> None:
@@ -232,12 +222,6 @@ def _number(value: float) -> str:
 def _unified(camera: OmniCamera) -> UnifiedCamera:
     assert isinstance(camera, UnifiedCamera), "Kalibr's file holds unified cameras only"
     return camera
-
-
-def _masked(mounted: MountedCamera, exposure: MountedSensor) -> MountedCamera:
-    """Return the camera with a mask that excludes struts and hub."""
-    clear = (255 * (exposure.hidden == 0)).astype(np.uint8)
-    return replace(mounted, mask=replace(mounted.visible, image=clear))
 
 
 @dataclass(frozen=True)

@@ -48,11 +48,6 @@ def turns(angles_deg: list[float], step_m: float = 0.03) -> Array:
     return planar_poses(np.concatenate([np.zeros((1, 2)), np.cumsum(moves, axis=0)]), heading)
 
 
-def still(pairs: int) -> Array:
-    """Return poses of a rig that stands at the origin."""
-    return planar_poses(np.zeros((pairs, 2)), np.zeros(pairs))
-
-
 def back_again(poses: Array) -> Array:
     """Return the path forwards and then backwards over the same poses, 2 N - 1 of them."""
     return np.concatenate([poses, poses[-2::-1]])

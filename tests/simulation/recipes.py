@@ -61,12 +61,6 @@ def two_walls(seed: int, size: int, pairs: int) -> SimulatedRun:
     return SimulatedRun(mild_rig(seed, size), poses, corridor(seed, max(8.0, 0.05 * pairs + 3.2)))
 
 
-def slow(seed: int, size: int, pairs: int) -> SimulatedRun:
-    """Return steps of 17 mm between the same walls: with --speed 3, 0.5 m/s before cameras of 30 Hz."""
-    poses = paths.spline_path(seed, pairs, 0.05 / 3)
-    return SimulatedRun(mild_rig(seed, size), poses, corridor(seed, max(8.0, 0.05 / 3 * pairs + 3.2)))
-
-
 def misaligned(seed: int, size: int, pairs: int) -> SimulatedRun:
     """Return 15 cm steps with cameras rotated about every axis; the rig frame is neither camera's."""
     rig = make_rig(
@@ -97,27 +91,9 @@ def struts(seed: int, size: int, pairs: int) -> SimulatedRun:
     return SimulatedRun(run.rig, run.poses, run.scene, sensor)
 
 
-def still(seed: int, size: int, pairs: int) -> SimulatedRun:
-    """Return a rig that stands; only the noise changes."""
-    return SimulatedRun(mild_rig(seed, size), paths.still(pairs), corridor(seed))
-
-
-def fast(seed: int, size: int, pairs: int) -> SimulatedRun:
-    """Return 30 cm between pairs (3 m/s), with a little vibration."""
-    poses = paths.vibrate(paths.spline_path(seed, pairs, 0.3), seed)
-    return SimulatedRun(mild_rig(seed, size), poses, corridor(seed, max(8.0, 0.3 * pairs + 3.2)))
-
-
 def rooms(seed: int, size: int, pairs: int) -> SimulatedRun:
     """Return a closed loop through a room with boxes at changing speed, with a little vibration."""
     return SimulatedRun(mild_rig(seed, size), paths.vibrate(paths.loop(seed, pairs), seed, 0.2), room(seed))
-
-
-def back(seed: int, size: int, pairs: int) -> SimulatedRun:
-    """Return a rig that stands, drives, comes back in reverse over the same poses, and stands: the end shows drift."""
-    there = paths.spline_path(seed, max(1, pairs // 2 - 4), 0.06)
-    poses = np.concatenate([there[[0] * 5], paths.back_again(there), there[[0] * 5]])[:pairs]
-    return SimulatedRun(mild_rig(seed, size), poses, corridor(seed))
 
 
 def plain(seed: int, size: int, pairs: int) -> SimulatedRun:
@@ -166,11 +142,7 @@ RECIPES: dict[str, tuple[Recipe, int]] = {
     "misaligned": (misaligned, 33),
     "turns": (turns, 11),
     "struts": (struts, 99),
-    "still": (still, 30),
-    "slow": (slow, 60),
-    "fast": (fast, 33),
     "rooms": (rooms, 100),
-    "back": (back, 80),
     "plain": (plain, 60),
     "spin": (spin, 31),
     "two_laps": (two_laps, 384),

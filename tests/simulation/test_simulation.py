@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 
@@ -19,10 +18,8 @@ from calib.models.camera import Mask
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
-from omnid.simulation.robot import make_robot, with_masks
 from omnid.simulation.world import clearance_m
 from tests.simulation import build, corridor, render, render_grey, write_log
-from tests.simulation.disturbances import Mirror, reflectance
 from tests.simulation.harmless_worlds import FLOORS, NAMES, can_drive
 from tests.simulation.hazard_worlds import HAZARDS, OF_ROBOT, trial
 from tests.simulation.logs import Readout, body_twists
@@ -91,28 +88,17 @@ def test_every_row_of_a_rolling_shutter_has_its_own_pose(amount: float) -> None:
         assert row == 0 or apart.mean() < 0.2 * moved.mean()
 
 
-def test_the_upper_image_is_exposed_after_skew_and_stamp_offset(tmp_path: Path) -> None:
+def test_the_upper_image_is_exposed_after_the_skew(tmp_path: Path) -> None:
     run = build("rooms", 4, SIZE, 5)
-    write(tmp_path, "rooms", pairs=5, readout=Readout(speed=2.0, skew_ms=(10.0, 14.0), stamp_offset_ms=5.0))
+    write(tmp_path, "rooms", pairs=5, readout=Readout(speed=2.0, skew_ms=(10.0, 14.0)))
     read = messages(tmp_path / "log.mcap")
     lower, upper = ([m for m in read if side in m[0]] for side in ("lower", "upper"))
     assert [t - lower[0][1] for _, t, _ in lower] == [n * 50_000_000 for n in range(5)]
     assert [u[1] - m[1] for u, m in zip(upper, lower, strict=True)] == [(10 + n) * 1_000_000 for n in range(5)]
-    T = run.poses[2] @ se3.exp(0.017 * body_twists(run.poses, 0.05)[2])
+    T = run.poses[2] @ se3.exp(0.012 * body_twists(run.poses, 0.05)[2])
     image = cv2.imdecode(upper[2][2].data, cv2.IMREAD_UNCHANGED).astype(float)
     expected, unmoved = (render_grey(run.scene, run.rig.upper, pose) for pose in (T, run.poses[2]))
     assert np.abs(image - expected).mean() < 0.5 * np.abs(image - unmoved).mean()
-
-
-CENTER = (384.2, 381.1)
-PIXELS = np.random.default_rng(0).uniform(60, 700, (300, 2))
-
-
-def test_project_inverts_the_rays_at_any_distance() -> None:
-    tilted = MirrorCamera(207.0, CENTER, (768, 768), tilt_rad=(0.008, -0.006), conic=0.01, ellipticity=0.01)
-    origins, rays = tilted.rays(PIXELS)
-    distance = np.random.default_rng(1).uniform(0.2, 5, (len(PIXELS), 1))
-    np.testing.assert_allclose(tilted.project(origins + distance * rays), PIXELS, atol=1e-7)
 
 
 def test_a_rendered_spot_near_a_tilted_camera_equals_the_projection() -> None:
@@ -128,66 +114,8 @@ def test_a_rendered_spot_near_a_tilted_camera_equals_the_projection() -> None:
     np.testing.assert_allclose(centroid, camera.project(grid).mean(axis=0), atol=0.1)
 
 
-ROBOT = make_robot(256)
-RIG = with_masks(ROBOT.rig)
-WALL_M = 2.0
-SCENE = Scene(
-    (
-        Rectangle(
-            np.array([-9.0, 9, 0]), np.array([18.0, 0, 0]), np.array([0, -18.0, 0]), np.zeros((8, 8), np.uint8), "floor"
-        ),
-        Rectangle(
-            np.array([WALL_M, 3, 2.0]),
-            np.array([0, -6.0, 0]),
-            np.array([0, 0, -2.0]),
-            np.full((8, 8), 200, np.uint8),
-            "wall",
-        ),
-    )
-)
-
-
-@pytest.mark.parametrize("side", ["lower", "upper"])
-def test_a_wall_is_seen_upside_down_where_the_floor_is(side: str) -> None:
-    mounted = getattr(RIG, side)
-    matt = render_grey(SCENE, mounted, RIG.T_base_rig, 2)
-    polished = Mirror(mounted).reflected(matt, SCENE, SCENE.named("floor"), RIG.T_base_rig, 2)
-    on_wall, in_floor = (WALL_M, 0.0, 0.4), (WALL_M, 0.0, -0.4)
-    T_cam_base = mounted.T_cam_rig @ np.linalg.inv(RIG.T_base_rig)
-    viewpoint = np.linalg.inv(T_cam_base)[:3, 3]
-    grey, mirrored = (
-        _grey(polished, mounted.camera.project((T_cam_base @ [*point, 1.0])[None, :3])) for point in (on_wall, in_floor)
-    )
-    ray = np.array(in_floor) - viewpoint
-    share = reflectance(np.array([abs(ray[2]) / np.linalg.norm(ray)], np.float32))[0]
-    assert _grey(matt, mounted.camera.project((T_cam_base @ [*in_floor, 1.0])[None, :3])) == 0.0
-    assert mirrored == pytest.approx(share * grey, rel=0.03) and mirrored > 5
-    np.testing.assert_array_equal(polished[matt > 100], matt[matt > 100])  # what stands is as it was
-
-
-def _grey(image: np.ndarray, pixel: np.ndarray) -> float:
-    u, v = np.rint(pixel[0]).astype(int)
-    return float(image[v, u])
-
-
-# Worlds like buildings and what stands in them: every name makes a world, whose outlines are where it says.
-Array = NDArray[np.float64]
 ROBOT_M = 0.2, 1.2  # radius and height
 ALIKE = {f"{floor}_hall" for floor in FLOORS if floor != "plain"} | set(OF_ROBOT) - {"lean_1deg"}
-
-
-def ranges_m(segments: Array, place: tuple[float, float], azimuths_rad: Array) -> Array:
-    """Return the distances (N,) [m] from a place to the first of segments (M, 2, 2) along azimuths (N,); inf: none."""
-    if not len(segments):
-        return np.full(len(azimuths_rad), np.inf)
-    ray = np.column_stack([np.cos(azimuths_rad), np.sin(azimuths_rad)])
-    start, along = segments[:, 0] - place, segments[:, 1] - segments[:, 0]
-    across = ray[:, None, 0] * along[:, 1] - ray[:, None, 1] * along[:, 0]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        distance_m = (start[:, 0] * along[:, 1] - start[:, 1] * along[:, 0]) / across
-        share = (start[:, 0] * ray[:, None, 1] - start[:, 1] * ray[:, None, 0]) / across
-    met = (distance_m > 0) & (share >= 0) & (share <= 1)
-    return np.asarray(np.where(met, distance_m, np.inf).min(axis=1))
 
 
 @pytest.mark.parametrize("name", sorted({*NAMES, *OF_ROBOT} - ALIKE))
@@ -209,11 +137,9 @@ def test_something_is_in_the_way_of_hazards(name: str) -> None:
     assert clearance_m(segments, (0.0, 0.0), ROBOT_M[0]) > 0.1
     if name == "steep_ramp":
         assert asked.world.ground.heights_m(asked.way_m) < -0.7
-    elif asked.motion == "ahead" and not name.startswith("person"):
-        paths = [place for person in asked.world.people for place in person.path]
-        first_m = min((x_m for x_m, _ in paths), default=math.inf)
-        first_m = min(first_m, float(ranges_m(segments, (0.0, 0.0), np.linspace(-0.1, 0.1, 41)).min()))
-        assert 0.3 < first_m < 4.6 and (paths or asked.things is not None)
+    elif asked.motion == "ahead" and not asked.world.people:
+        along = np.arange(0.0, 4.8, 0.05)
+        assert min(clearance_m(segments, (x_m, 0.0), ROBOT_M[0]) for x_m in along) < 0.0
 
 
 @pytest.mark.parametrize("percent", [10, 20])
