@@ -11,7 +11,6 @@ import tempfile
 import threading
 import time
 import tty
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Final, Protocol
@@ -36,7 +35,6 @@ from drivers.motors.simulated.simulated_base import (
     SIDES,
     STEP_S,
     MotionLimits,
-    Pose,
     SimulatedBase,
     SimulatedFirmware,
 )
@@ -248,7 +246,6 @@ SIMULATED_CONTROLLERS: Final[Mapping[str, Callable[[DifferentialDrive], Simulate
 
 
 READ_LIMIT_BYTES = 4096
-POSES_KEPT = 1000  # Number of poses that are kept with their times: those of some seconds.
 LONGEST_ABSENCE_S = 0.05  # a thread that was not scheduled for longer does not advance: the host was not late
 
 
@@ -258,21 +255,19 @@ class PtyMotor:
     def __init__(self, controller: SimulatedController | None = None) -> None:
         """Open the pty; `port` is the path for the driver."""
         self.controller = controller or SimulatedLine()
-        self.unsent = 0  # replies dropped because the host did not read
         self.drop_replies = False  # fault: commands are carried out without a reply
         self.drop_input = False  # fault: received bytes are ignored
         self.garbage = b""  # fault: sent before each reply
-        self.poses: deque[tuple[int, Pose]] = deque(maxlen=POSES_KEPT)  # time (CLOCK_MONOTONIC) [ns] and pose
         device, self._host = os.openpty()
         tty.setraw(self._host)  # kept open: without an open host side, reads of the device side fail
         os.set_blocking(device, False)
-        self._device: int | None = device  # None: unplugged
+        self._device = device
         # A name of its own, as udev gives it: the system gives the number of a closed pty to the next one that opens.
         self._folder = tempfile.TemporaryDirectory(prefix="omnid-motor-")
         os.chmod(self._folder.name, 0o755)  # other users may try to open it
         self.port = str(Path(self._folder.name, "tty"))
         os.symlink(os.ttyname(self._host), self.port)
-        self._expiring, self._unplugging = threading.Event(), threading.Event()
+        self._expiring = threading.Event()
         self._wake_read, self._wake_write = os.pipe()
         self._thread = threading.Thread(target=self._serve, name="simulated-motor", daemon=True)
         self._thread.start()
@@ -288,18 +283,10 @@ class PtyMotor:
         while self._expiring.is_set() and self._thread.is_alive():
             time.sleep(STEP_S)
 
-    def unplug(self) -> None:
-        """Close the pty permanently, as a pulled plug does; the controller runs on, its watchdog stops the wheels."""
-        self._unplugging.set()
-        while self._device is not None and self._thread.is_alive():
-            time.sleep(STEP_S)
-
     def send(self, data: bytes) -> None:
         """Send bytes; drop them where the host does not read."""
         with contextlib.suppress(BlockingIOError):
-            if self._device is not None and os.write(self._device, data) == len(data):
-                return
-        self.unsent += 1
+            os.write(self._device, data)
 
     def close(self) -> None:
         """End the thread and close the pty; a second call does nothing."""
@@ -307,34 +294,23 @@ class PtyMotor:
             return
         os.write(self._wake_write, b"x")
         self._thread.join()
-        self._close_pty()
-        for descriptor in (self._wake_read, self._wake_write):
+        self._folder.cleanup()
+        for descriptor in (self._device, self._host, self._wake_read, self._wake_write):
             os.close(descriptor)
-
-    def _close_pty(self) -> None:
-        if self._device is not None:
-            self._folder.cleanup()
-            os.close(self._device)
-            os.close(self._host)
-            self._device = None
 
     def _serve(self) -> None:
         last_s = time.monotonic()
         while True:
-            sources = [self._wake_read] if self._device is None else [self._wake_read, self._device]
-            readable, _, _ = select.select(sources, [], [], STEP_S)
+            readable, _, _ = select.select([self._wake_read, self._device], [], [], STEP_S)
             now_s = time.monotonic()
             self.base.advance(min(now_s - last_s, LONGEST_ABSENCE_S))
             last_s = now_s
-            self.poses.append((round(now_s * 1e9), self.base.pose))
             if self._wake_read in readable:
                 return
             if self._expiring.is_set():
                 self.base.expire()
                 self._expiring.clear()
-            if self._unplugging.is_set():
-                self._close_pty()
-            elif readable and self._device is not None:
+            if readable:
                 self._receive(os.read(self._device, READ_LIMIT_BYTES))
 
     def _receive(self, data: bytes) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import struct
 from collections.abc import Callable
@@ -99,12 +98,6 @@ def test_bytes_of_a_command_and_status_in_the_units_of_the_base(name: str) -> No
     for missing in range(len(replies)):
         with pytest.raises(UnfinishedError):
             result(make().drive(TURN, 0.0), *replies[:missing], *replies[missing + 1 :])
-
-
-@pytest.mark.parametrize("wiring", list(itertools.product([False, True], repeat=3)))
-def test_motion_inverts_the_wiring(wiring: tuple[bool, bool, bool]) -> None:
-    drive = DifferentialDrive(**dict(zip(("reverse_left", "reverse_right", "swapped"), wiring, strict=True)))
-    assert drive.motion(*drive.channels(VelocityCommand(0, 0.3, 0.0, -0.7))) == pytest.approx((0.3, -0.7))
 
 
 def test_a_name_leads_to_a_protocol_of_omnid_or_of_an_installed_package(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -66,16 +66,6 @@ def simulated() -> Iterator[PtyMotor]:
 # The serial motor and the simulated controller over a pty
 
 
-def test_an_invalid_command_sends_nothing(simulated: PtyMotor) -> None:
-    with contextlib.closing(SerialMotor(simulated.port, timeout_s=REPLY_S)) as motor:
-        before = simulated.base.commands
-        with pytest.raises(DriverError, match="velocity is nan"):
-            motor.send(VelocityCommand(0, math.nan, 0.0, 0.0))
-        assert simulated.base.commands == before
-        motor.send(stop_command(0))
-        assert simulated.base.commands == before + 1 and simulated.base.errors == 0
-
-
 def opens_as_another_user(port: str) -> bool:
     """True if another program can open the port; without the privileges of root, which ignores the exclusive mode."""
     user: dict[str, Any] = {"user": OTHER_ID, "group": OTHER_ID, "extra_groups": []} if os.geteuid() == 0 else {}
