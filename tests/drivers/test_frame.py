@@ -135,15 +135,6 @@ def test_images_differ_from_their_jpegs_by_the_stated_error(quality: int, highes
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
-@pytest.mark.parametrize("padding", [0, 1, 5000])
-def test_compressed_images_and_the_padding_of_cameras(suffix: str, padding: int) -> None:
-    data = encoded(suffix)
-    expected = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
-    encoding = {".jpg": "jpeg", ".png": "png"}[suffix]
-    np.testing.assert_array_equal(gray(Frame(0, 0, "upper", encoding, data + bytes(padding))), expected)
-
-
-@pytest.mark.parametrize("suffix", [".jpg", ".png"])
 def test_detects_truncation_at_any_byte(suffix: str) -> None:
     data, encoding = encoded(suffix), {".jpg": "jpeg", ".png": "png"}[suffix]
     for size in range(len(data)):
@@ -174,18 +165,6 @@ def test_refuses_malformed_frames_in_one_line(broken: Frame, reason: str) -> Non
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
-def test_refuses_an_excessive_size_before_decoding(suffix: str) -> None:
-    data = bytearray(encoded(suffix))
-    if suffix == ".png":
-        data[16:24] = struct.pack(">II", 60000, 60000)
-    else:
-        start = data.index(b"\xff\xc0")
-        data[start + 5 : start + 9] = struct.pack(">HH", 60000, 60000)
-    with pytest.raises(FrameDecodeError, match="60000 x 60000"):
-        gray(frame({".jpg": "jpeg", ".png": "png"}[suffix], bytes(data)))
-
-
-@pytest.mark.parametrize("suffix", [".jpg", ".png"])
 def test_damaged_images_raise_only_decode_errors(suffix: str) -> None:
     chance, whole = random.Random(3), encoded(suffix)
     for _ in range(300):
@@ -198,21 +177,13 @@ def test_damaged_images_raise_only_decode_errors(suffix: str) -> None:
             continue
 
 
-def with_size(data: bytes, width: int, height: int, marker: bytes = b"\xff\xc0") -> tuple[bytes, bytes, bytes]:
-    """Return a JPEG's bytes before its frame header, that header with another size, and the bytes after it."""
-    start = data.index(marker)
-    end = start + 2 + int.from_bytes(data[start + 2 : start + 4], "big")
-    header = data[start : start + 5] + struct.pack(">HH", height, width) + data[start + 9 : end]
-    return data[:start], header, data[end:]
-
-
 @pytest.mark.parametrize(("suffix", "encoding"), [(".jpg", "jpeg"), (".png", "png")])
-def test_refuses_colour_images_whose_samples_would_fill_the_memory(suffix: str, encoding: str) -> None:
-    """Decoders of progressive JPEG and interlaced PNG store all samples."""
-    data, side = encoded(suffix), 5000
-    assert side * side < MAX_PIXELS and 3 * side * side > MAX_PIXELS
-    large = data[:16] + struct.pack(">II", side, side) + data[24:]
-    if encoding == "jpeg":
-        large = b"".join(with_size(data, side, side))
-    with pytest.raises(FrameDecodeError, match="5000 x 5000 px of 3 channels"):
+@pytest.mark.parametrize(("side", "words"), [(60000, "60000 x 60000"), (5000, "5000 x 5000 px of 3 channels")])
+def test_refuses_images_whose_samples_would_fill_the_memory(suffix: str, encoding: str, side: int, words: str) -> None:
+    """Decoders of progressive JPEG and interlaced PNG store the samples of all channels."""
+    data = encoded(suffix)
+    assert 3 * side * side > MAX_PIXELS
+    at, layout = (16, ">II") if encoding == "png" else (data.index(b"\xff\xc0") + 5, ">HH")
+    large = data[:at] + struct.pack(layout, side, side) + data[at + struct.calcsize(layout) :]
+    with pytest.raises(FrameDecodeError, match=words):
         gray(frame(encoding, large))

@@ -34,7 +34,6 @@ class FakeCamera:
         self.written: list[tuple[int, int]] = []
         self.failing = 0  # errno of every call but those that enumerate
         self.modes = {("YUYV", 640, 480): 30.0, ("YUYV", 1280, 960): 7.5, ("MJPG", 1280, 960): 30.0}
-        self.busy_formats: tuple[str, ...] = ()
         self.bus_info = b"usb-1"
         self.filled: deque[tuple[bytes, int, int, int]] = deque()  # bytes, sequence, stamp [ns], flags
         self._mode, self._rate_hz = ("YUYV", 640, 480), 30.0
@@ -72,8 +71,6 @@ class FakeCamera:
     def _set_format(self, wanted: ctypes.Structure) -> None:
         pix = wanted.fmt.pix
         mode = (v4l2.fourcc(pix.pixelformat), pix.width, pix.height)
-        if mode[0] in self.busy_formats:
-            raise OSError(errno.EBUSY, "busy")
         others = [other for other in self.modes if other[0] == mode[0]] or list(self.modes)
         self._mode = mode if mode in self.modes else others[0]
         self._rate_hz = self.modes[self._mode]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import errno
 import logging
-import os
 import runpy
 import threading
 import time
@@ -37,7 +36,6 @@ from drivers.cameras.v4l2_controls import (
 )
 from drivers.cameras.v4l2_device import (
     capture_devices,
-    device_error,
     offered_image,
     udev_rules,
 )
@@ -201,15 +199,6 @@ def test_refuses_other_modes_and_names_what_the_device_sets(
     with pytest.raises(DriverError, match=message) as caught:
         image(FakeCamera(), tmp_path / "video", **fields)
     assert "--list-formats-ext" in str(caught.value) and "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("number", "advice"),
-    [(errno.EBUSY, "used by another program"), (errno.ENOSPC, "choose MJPG"), (errno.EIO, "Input/output error")],
-)
-def test_errors_of_the_system_have_advice(number: int, advice: str) -> None:
-    message = str(device_error("/dev/video0", OSError(number, os.strerror(number))))
-    assert message.startswith("camera /dev/video0 ") and advice in message and "\n" not in message
 
 
 @pytest.mark.parametrize(
@@ -438,12 +427,6 @@ class Stamps:
 @pytest.fixture
 def stamps() -> Stamps:
     return Stamps()
-
-
-def test_keeps_the_kernels_stamps(stamps: Stamps) -> None:
-    expected = [START_NS + PERIOD_NS * number for number in range(3)]
-    assert [stamps.validate(stamp_ns, stamp_ns + DELAY_NS) for stamp_ns in expected] == expected
-    assert stamps.state == CameraState() and stamps.events == []
 
 
 @pytest.mark.parametrize("flags", [0, 0x4000])

@@ -79,10 +79,9 @@ def write_log(
     path: Path,
     entries: Iterable[Entry],
     attachments: Sequence[tuple[str, bytes]] = (),
-    schema_names: dict[str, str] | None = None,
     **options: Any,
 ) -> Path:
-    """The path, written with the options of mcap's Writer; schema_names renames the types in the file."""
+    """The path, written with the options of mcap's Writer."""
     settings: dict[str, Any] = {"chunk_size": 4096, "compression": CompressionType.NONE} | options
     with path.open("wb") as file:
         writer = Writer(file, **settings)
@@ -92,9 +91,8 @@ def write_log(
         ids: dict[str, int] = {}
         for topic, kind, data, log_time_ns in entries:
             if topic not in ids:
-                name = (schema_names or {}).get(kind, kind)
                 definition = STORE.generate_msgdef(kind, ros_version=2)[0].encode()
-                ids[topic] = writer.register_channel(topic, "cdr", writer.register_schema(name, "ros2msg", definition))
+                ids[topic] = writer.register_channel(topic, "cdr", writer.register_schema(kind, "ros2msg", definition))
             writer.add_message(ids[topic], log_time_ns, data, log_time_ns)
         writer.finish()  # type: ignore[no-untyped-call]
     return path
@@ -165,20 +163,6 @@ def write_bag(path: Path, entries: Sequence[Entry], compression: str = "", chunk
         for entry in entries:
             writer.write(connections[entry.topic], entry.log_time_ns, ros1_bytes(entry))
     return path
-
-
-def write_interrupted_db3(folder: Path, entries: Sequence[Entry]) -> Path:
-    """Write the file of a recorder that was killed within a transaction, which its journal undoes."""
-    whole, killed = write_db3(folder, entries), folder / "killed"
-    killed.mkdir()
-    with closing(sqlite3.connect(whole)) as bag:
-        bag.execute("PRAGMA cache_size = 1")
-        bag.execute("BEGIN")
-        bag.execute("UPDATE messages SET data = zeroblob(9)")
-        for suffix in ("", "-journal"):
-            shutil.copy(f"{whole}{suffix}", f"{killed / whole.name}{suffix}")
-        bag.rollback()
-    return killed / whole.name
 
 
 def write_ros1_mcap(path: Path, entries: Sequence[Entry]) -> Path:

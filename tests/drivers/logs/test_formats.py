@@ -6,7 +6,6 @@ import fcntl
 import os
 import random
 import re
-import sqlite3
 import struct
 import tracemalloc
 from collections.abc import Callable, Sequence
@@ -18,7 +17,6 @@ import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
 import pytest
 import zstandard
-from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
 
@@ -28,13 +26,12 @@ from drivers.logs import mcap_file
 from drivers.logs.compression import unpack_message
 from drivers.logs.log_reader import LogReader
 from drivers.logs.mcap_file import MAGIC
-from drivers.logs.open_log import LogInfo, LogState, log_info, logs_in, open_log
+from drivers.logs.open_log import LogInfo, LogState, log_info, logs_in
 from drivers.logs.topics import MotionTopics
 from drivers.motion import GyroSample
 from tests.drivers.logs.mcap_logs import (
     BARE,
     COMPRESSED,
-    IMAGE,
     LOWER,
     START_NS,
     UPPER,
@@ -46,7 +43,6 @@ from tests.drivers.logs.mcap_logs import (
     write_bag,
     write_db3,
     write_folders,
-    write_interrupted_db3,
     write_killed_db3,
     write_log,
     write_ros1_mcap,
@@ -155,14 +151,6 @@ def test_an_mcap_of_ros1_has_the_samples_of_its_imu(tmp_path: Path) -> None:
     with closing(LogReader(path, motion=MotionTopics(imu="/imu"))) as reader:
         samples = [message for message in reader.messages() if not isinstance(message, Frame)]
     assert samples == [GyroSample(100 * 10**9, 0.1, 0.2, 0.3)]
-
-
-def test_a_log_that_is_written_says_so(tmp_path: Path) -> None:
-    path = write_log(tmp_path / "log.mcap", pairs(2))
-    with path.open("rb") as file:
-        fcntl.flock(file.fileno(), fcntl.LOCK_EX)
-        assert log_info(path).state is LogState.WRITTEN
-    assert log_info(path).state is LogState.WHOLE
 
 
 # Folders and parts
@@ -301,22 +289,6 @@ def test_flipped_bits_change_no_frame_of_a_chunk(tmp_path: Path, name: str) -> N
     assert readable > 15
 
 
-def test_a_transaction_that_was_not_ended_is_undone(tmp_path: Path) -> None:
-    """The journal lies beside the file, which is not changed."""
-    path = write_interrupted_db3(tmp_path / "bag", pairs(PAIRS))
-    before = path.read_bytes()
-    found, reader = read(path)
-    assert found == expected(PAIRS) and not reader.warnings and path.read_bytes() == before
-    assert log_info(path).state is LogState.WHOLE
-
-
-def test_a_bag_that_was_not_closed_must_be_reindexed(tmp_path: Path) -> None:
-    path = write_bag(tmp_path / "log.bag", pairs(PAIRS))
-    os.truncate(path, path.stat().st_size - 300)
-    with pytest.raises(DriverError, match="try `rosbag reindex`"):
-        LogReader(path)
-
-
 def test_a_cut_database_is_read_up_to_its_end(tmp_path: Path) -> None:
     path = write_db3(tmp_path / "bag", pairs(60))
     os.truncate(path, int(0.7 * path.stat().st_size))
@@ -324,22 +296,6 @@ def test_a_cut_database_is_read_up_to_its_end(tmp_path: Path) -> None:
     assert found is not None
     assert 0 < len(found[0]) < 120 and found[1].truncated and "cut or corrupt" in found[1].warnings[0]
     assert log_info(path).state is LogState.BROKEN
-
-
-def test_a_file_behind_another_one_is_told(tmp_path: Path) -> None:
-    first, second = (write_log(tmp_path / f"{n}.mcap", pairs(20)[20 * n :][:20]).read_bytes() for n in range(2))
-    path = tmp_path / "both.mcap"
-    path.write_bytes(first + second)
-    found, reader = read(path)
-    assert found == expected(10) and reader.truncated and "cut or corrupt after byte" in reader.warnings[0]
-
-
-def test_a_database_of_other_tables_is_no_bag(tmp_path: Path) -> None:
-    path = write_db3(tmp_path / "bag", pairs(1))
-    with closing(sqlite3.connect(path)) as bag:
-        bag.execute("DROP TABLE messages")
-    with pytest.raises(DriverError, match="no bag of ROS 2"):
-        LogReader(path)
 
 
 @pytest.mark.parametrize("name", ["mcap", "db3"])
@@ -460,41 +416,6 @@ def test_ignores_a_corrupt_attachment_and_a_corrupt_summary(tmp_path: Path) -> N
     assert reader.topics == {"lower": LOWER, "upper": UPPER}
 
 
-def string(words: str) -> bytes:
-    return struct.pack("<I", len(words)) + words.encode()
-
-
-def record(opcode: int, body: bytes) -> bytes:
-    return struct.pack("<BQ", opcode, len(body)) + body
-
-
-def schema(number: int, name: str) -> bytes:
-    return record(Opcode.SCHEMA, struct.pack("<H", number) + string(name) + string("ros2msg") + struct.pack("<I", 0))
-
-
-def channel(number: int, schema_id: int, topic: str, encoding: str = "cdr") -> bytes:
-    body = struct.pack("<HH", number, schema_id) + string(topic) + string(encoding) + struct.pack("<I", 0)
-    return record(Opcode.CHANNEL, body)
-
-
-def topics_of(path: Path, records: bytes) -> dict[str, str]:
-    path.write_bytes(MAGIC + records)
-    with closing(open_log(path)) as log:
-        return dict(log.topics())
-
-
-def test_topics_have_types_that_can_be_decoded_and_their_names_are_bounded(tmp_path: Path) -> None:
-    encodings = ((10, 1, "cdr"), (11, 1, "ros1"), (12, 2, "ros1"), (13, 1, "json"), (14, 9, "cdr"))
-    known = schema(1, IMAGE) + schema(2, "std_msgs/String")
-    known += b"".join(channel(number, kind, f"/{number}", encoding) for number, kind, encoding in encodings)
-    expected = {"/10": IMAGE, "/11": IMAGE, "/12": "std_msgs/msg/String", "/13": ""}
-    assert topics_of(tmp_path / "log.mcap", known) == expected
-    malformed = record(Opcode.CHANNEL, b"\1\0\xff\xff\xff\xff") + record(Opcode.SCHEMA, b"\1\0\xff\xff\xff\xff")
-    assert topics_of(tmp_path / "log.mcap", malformed + schema(2, "") + channel(1, 2, "x" * 1000)) == {"x" * 256: ""}
-    many = b"".join(channel(number, 1, f"/{number}") for number in range(5000))
-    assert len(topics_of(tmp_path / "log.mcap", schema(1, IMAGE) + many)) == 4096
-
-
 # Folders of images with stamps, one folder for each camera
 
 
@@ -572,14 +493,6 @@ def test_a_list_may_have_names_beside_the_stamps(tmp_path: Path, name: str, head
         assert [image for _, image in mine] == [frame[3] for frame in expected(PAIRS) if frame[0] == camera]
 
 
-def test_images_that_a_list_does_not_name_are_told(tmp_path: Path) -> None:
-    folder = write_folders(tmp_path / "images", pairs(PAIRS), lambda stamp_ns: f"frame{NUMBERS[stamp_ns]}")
-    (folder / "rgb.txt").write_text("\n".join(f"{number}.5 frame{number}.jpg" for number in range(PAIRS - 2)))
-    found, reader = read(folder)
-    assert len(found) == 2 * (PAIRS - 2) and reader.truncated
-    assert f"2 images of '{folder}/lower' are left out: rgb.txt does not list them" in reader.warnings[0]
-
-
 def test_numbered_images_have_the_stated_rate(tmp_path: Path) -> None:
     folder = write_folders(tmp_path / "images", pairs(PAIRS), lambda stamp_ns: str(NUMBERS[stamp_ns]))
     with pytest.raises(DriverError, match=r"expected nanoseconds .* seconds in times.txt; else give --rate HZ"):
@@ -612,20 +525,6 @@ def test_cameras_of_folders_with_other_names_are_given(tmp_path: Path) -> None:
     with pytest.raises(DriverError, match="mav0/cam0/data, mav0/cam1/data; give --lower and --upper"):
         LogReader(folder)
     assert read(folder, lower="mav0/cam0/data", upper="mav0/cam1/data")[0] == expected(PAIRS)
-
-
-@pytest.mark.parametrize("kind", ["pipe", "a link that leads nowhere"])
-@pytest.mark.parametrize("name", ["lower/1700000000000000001.jpg", "rig.toml"])
-def test_what_is_no_file_is_told_and_not_waited_for(tmp_path: Path, kind: str, name: str) -> None:
-    folder = write_folders(tmp_path / "images", pairs(2))
-    odd = folder / name
-    if kind == "pipe":
-        os.mkfifo(odd)
-    else:
-        odd.symlink_to(tmp_path / "nowhere")
-    with closing(LogReader(folder)) as reader:
-        assert reader.attachments() == {} and len(list(reader.frames())) == 4
-        assert (str(odd) in "".join(reader.warnings)) == (name != "rig.toml")
 
 
 def test_hidden_files_beside_the_images_are_left_out(tmp_path: Path) -> None:
