@@ -32,8 +32,7 @@ RATE_HZ = 10.0
 LIMIT_S = 40.0
 LOWER, UPPER = "/dev/omnid/lower", "/dev/omnid/upper"
 BIND = Path("/sys/bus/platform/drivers/vivid")
-DROPS, DISCONNECT, FATAL_ERROR = 0xF0F040, 0xF0F041, 0xF0F046  # vivid's own controls
-GAIN = 0x980913
+DISCONNECT = 0xF0F041  # vivid's own control
 # the start of the exposure as stamp: the end of the frame lies in the future; no text within the image
 STILL = ("timestamp_source=1", "osd_text_mode=2")
 LATE_STAMPS = 2  # gaps that stamps of a virtual camera may show too many or too few on a busy machine
@@ -43,13 +42,11 @@ def run(*command: str) -> str:
     return subprocess.run(command, check=True, capture_output=True, text=True).stdout
 
 
-def control(device: str, control_id: int, value: int | None = None) -> int:
-    """Set or press a control without the driver, or read it."""
+def press(device: str, control_id: int) -> None:
+    """Press a control without the driver."""
     fd = os.open(device, os.O_RDWR)
     try:
-        entry = v4l2.V4l2Control(control_id, value or 0)
-        v4l2.call(fd, v4l2.G_CTRL if value is None else v4l2.S_CTRL, entry)
-        return int(entry.value)
+        v4l2.call(fd, v4l2.S_CTRL, v4l2.V4l2Control(control_id, 1))
     finally:
         os.close(fd)
 
@@ -124,13 +121,11 @@ class Writer:
     def __init__(self, device: str, image: bytes, pixel_format: str = "GREY") -> None:
         self._loopback = Loopback(device, pixel_format, SIZE)
         self._image, self._halt = image, threading.Event()
-        self.pausing = False
         self._thread = threading.Thread(target=self._write, daemon=True)
 
     def _write(self) -> None:
         while not self._halt.wait(1 / RATE_HZ):
-            if not self.pausing:
-                self._loopback.write(self._image)
+            self._loopback.write(self._image)
 
     def __enter__(self) -> Writer:
         self._loopback.write(self._image)
@@ -213,32 +208,11 @@ def test_counts_dropped_buffers(vivid: None) -> None:
     assert watched.state.frames == len(watched.taken) and watched.state.errors == watched.state.losses == 0
 
 
-def test_replaces_stamps_in_the_future_by_the_arrival(vivid: None) -> None:
-    with CameraReader(controls=("timestamp_source=0",)) as watched:
-        watched.more(10)
-    watched.require_order()
-    watched.require_events("stamp")
-    assert watched.state.restamped == watched.state.frames
-
-
-def test_recovers_from_an_input_error_with_all_settings(vivid: None) -> None:
-    with CameraReader(gain=77) as watched:
-        watched.more(5)
-        control(LOWER, GAIN, 5)
-        control(LOWER, FATAL_ERROR, 1)
-        until(lambda: watched.state.reopens)
-        watched.more(5)
-        assert control(LOWER, GAIN) == 77
-    watched.require_order()
-    watched.require_events("lost", "back, GREY 320x180 at 10 Hz")
-    assert (watched.state.losses, watched.state.reopens, watched.state.drops) == (1, 1, 0)
-
-
 def test_both_cameras_are_unplugged_and_reconnected(vivid: None) -> None:
     with CameraReader(LOWER) as lower, CameraReader(UPPER) as upper:
         lower.more(5)
         upper.more(5)
-        control(LOWER, DISCONNECT, 1)
+        press(LOWER, DISCONNECT)
         # vivid reconnects when it is closed
         until(lambda: lower.state.losses == 1 and lower.state.status == "streaming")
         upper.more(5)
@@ -254,22 +228,6 @@ def test_both_cameras_are_unplugged_and_reconnected(vivid: None) -> None:
     upper.require_order()
     lower.require_events("lost", "back", "lost", "back")
     upper.require_events("lost", "back")
-
-
-def test_reopens_a_camera_that_sends_no_images(loopback: None) -> None:
-    device, image = DEVICES[0], bytes(SIZE[0] * SIZE[1])
-    with Writer(device, image) as writer:
-        watched = CameraReader(device, controls=(), timeout_s=1.0)
-        with watched:
-            watched.more(5)
-            writer.pausing = True
-            until(lambda: watched.state.status == "lost")
-            assert "no valid image for 1 s" in watched.state.problem
-            until(lambda: watched.state.reopens >= 2)
-            writer.pausing = False
-            watched.more(5)
-    watched.require_order()
-    watched.require_events("clock", "lost", "back")
 
 
 def test_motion_jpeg_arrives_whole(loopback: None) -> None:
@@ -292,21 +250,3 @@ def test_every_raw_format_shows_the_same_luma(vivid: None) -> None:
     for name in ("UYVY", "NV12"):
         np.testing.assert_allclose(images[name].astype(int), images["YUYV"], atol=3)
     assert np.corrcoef(images["GREY"].ravel(), images["YUYV"].ravel())[0, 1] > 0.95
-
-
-def test_close_ends_a_wait_at_any_time(vivid: None, loopback: None) -> None:
-    device, image = DEVICES[0], bytes(SIZE[0] * SIZE[1])
-    with Writer(device, image) as writer, CameraReader(device, controls=(), timeout_s=60.0) as watched:
-        watched.more(1)
-        writer.pausing = True
-        time.sleep(0.5)
-        started_s = time.monotonic()
-        watched.camera.close()
-        watched.thread.join(LIMIT_S)
-        assert time.monotonic() - started_s < 30 and watched.state.status == "closed"
-    unread = CameraReader()
-    unread.camera.close()
-    unread.camera.close()
-    assert list(unread.camera.frames()) == [] and unread.state.status == "closed"
-    with CameraReader() as again:  # it was released
-        again.more(1)
