@@ -27,7 +27,7 @@ MIN_POINTS = 30  # six for each unknown.
 # With 1, the rotation of right rigs is off by 1.1 to 3.8 sigma (rms of drives of development seeds, see
 # tests/bench/calibration.py); clusters of 10 degrees or of whole pairs explain no more of it than 1 does.
 CORRELATED_POINTS = 4.0
-ITERATIONS = 12  # enough: 70 of 72 estimates of test_rig_drift.py end before
+ITERATIONS = 12  # enough: 70 of 72 estimates of test_rig_accuracy.py end before
 # Width of the weights (Geman and McClure 1987) in standard deviations of the residuals, so that of normal errors 86 %
 # of the efficiency of least squares remains.
 KERNEL_WIDTH = 2.5

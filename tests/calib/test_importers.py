@@ -124,13 +124,6 @@ def test_selects_two_of_three_cameras_by_name() -> None:
     assert rig.topics == (NAMED[1], "")
 
 
-def test_takes_the_nearest_rotation_of_numbers_typed_with_few_digits() -> None:
-    typed = str([[round(float(value), 3) for value in row] for row in BOTH[1]])
-    T = parse_chain(chain(BOTH, None, NAMED).replace(str(BOTH[1].tolist()), typed)).upper.T_cam_rig
-    np.testing.assert_allclose(T, BOTH[1], atol=1e-3)
-    np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -144,9 +137,6 @@ def test_takes_the_nearest_rotation_of_numbers_typed_with_few_digits() -> None:
         (chain(BOTH, None).replace("cam1:", "cam0:"), "not a YAML file"),
         (chain((None, None), None, NAMED), "no transform between cam0 and cam1"),
         (chain((BOTH[0], BOTH[0]), None), "neither topics nor heights"),
-        (f"cam0:{CAMERA}", "expected two cameras .*found cam0"),
-        ("", "expected two cameras"),
-        ("[" * 3000, "not a YAML file"),
     ],
 )
 def test_errors_are_one_line_that_names_file_and_camera(text: str, message: str) -> None:
@@ -220,11 +210,8 @@ def test_parses_every_number_as_the_toolbox_defines_it() -> None:
     ("old", "new", "message"),
     [
         ("5 -2.315000e+02", "6 -2.315000e+02", "expected lines of numbers as OCamCalib"),
-        ("5 -2.315000e+02", "5 nan", "ocam camera: expected"),
         ("5 -2.315000e+02", "5 231", "with a0 < 0"),
-        ("1.590000e-09", "1.590000e+308", "ocam camera: expected"),
         ("1.000529 0.000053", "1.000529 one", "could not convert"),
-        ("480 640", "480.5 640", "in whole pixels"),
         ("480 640", "", "expected lines of numbers"),
     ],
 )

@@ -81,8 +81,6 @@ ROWS = "[0.0, 0.0, 0.0, 1.0],\n]\n\n[lower]"
         ("schema = 1", "schema = 2", "schema: expected version 1, found 2"),
         ("schema = 1", "schema = 1\nspeed = 3", "unknown key speed: known are schema, lower"),
         ("xi = 0.93", "xi = '0.93'", "lower.intrinsics.xi: expected a number, found '0.93'"),
-        ("xi = 0.93", "xi = nan", "lower.intrinsics.xi: expected a number, found nan"),
-        ("xi = 0.93", "xi = -1.0", "lower.intrinsics: omni camera: expected xi > -1"),
         ("xi = 0.93", "xi = 0.93\nk3 = 0.0", "unknown key lower.intrinsics.k3: known are lower.intrinsics.xi, "),
         ("fu = -205.0\n", "", "lower.intrinsics.fu is missing"),
         ('model = "omni"', 'model = "pinhole"', "lower.model: expected one of 'omni', 'ocam', 'ds', 'equi"),
@@ -91,20 +89,14 @@ ROWS = "[0.0, 0.0, 0.0, 1.0],\n]\n\n[lower]"
             'model = "omni"\nview = "mirror"',
             "lower.view: expected mirror or direct for",
         ),
-        ("size = [768, 770]", "size = [768.5, 770]", "lower.size: expected a list of 2 integers, found [768.5, 770]"),
         ("size = [768, 770]", "size = [32767, 32767]", "at most 67108864 in all"),
         ("T_rig_lower = [", "T_rig_upper = [", "lower: expected T_rig_lower, found that of the other camera"),
         (ROWS, ROWS.replace("0.0, 1.0", "0.5, 1.0"), "T_base_rig: expected a rotation"),
-        ("[lower]", "[lower", "expected TOML, found: Expected ']'"),
-        ("inner_px = 0.0", "inner_px = 400.0", "lower.mask.inner_px"),
         ("inner_px = 0.0", "image = 'data:image/png;base64,AAAA'", "lower.mask.image: expected an image"),
         ("upper_delay_s = 0.00725", "upper_delay_s = 2.0", "times: times of exposure: expected"),
-        ('"r_x"', '"r_q"', "covariance.parameters: expected names"),
         ('"lower xi"', '"baseline"', "covariance: expected different parameters"),
         ("sigma = [2.0, ", "sigma = [", "covariance: expected 3 sigmas"),
-        ("sigma = [2.0", "sigma = [nan", "covariance.sigma: expected a list of numbers, found [nan"),
         ("[0.0, 0.25]", "[0.0]", "covariance.correlation: expected 3 rows"),
-        ("[0.0, 0.25]", "[-0.99, 0.99]", "contradict each other"),
     ],
 )
 def test_errors_name_the_key(omni_rig: Rig, old: str, new: str, message: str) -> None:
@@ -138,12 +130,6 @@ def test_unreadable_files_are_one_line_errors(omni_rig: Rig, tmp_path: Path) -> 
     (tmp_path / "bytes.toml").write_bytes(b"schema = 1\xff")
     with pytest.raises(CalibError, match="expected TOML"):
         read_rig(tmp_path / "bytes.toml")
-
-
-def test_reads_what_other_editors_leave(omni_rig: Rig, tmp_path: Path) -> None:
-    text = "# K\xe4lte\n" + rig_toml(omni_rig)
-    (tmp_path / "rig.toml").write_bytes(text.replace("\n", "\r\n").encode("utf-8-sig"))
-    assert rig_toml(read_rig(tmp_path / "rig.toml")) == rig_toml(omni_rig)
 
 
 def names_of(rig: Rig) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Images for a calibration: as bright as they are meant, each of them once."""
+"""Images for a calibration, as bright as they are meant and each of them once; `omnid cameras --snapshot`."""
 
 from __future__ import annotations
 
@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 
 import omnid
-from drivers.logs.log_reader import LogCameras
+from drivers.frame import gray
+from drivers.logs.log_reader import LogCameras, LogReader
 from omnid.calibration.images import read_pairs
+from omnid.calibration.snapshot import Image, described, view_of
+from tests.replay.command import Command
 
 
 @pytest.mark.parametrize(("suffix", "bits"), [("png", 8), ("png", 10), ("tif", 12), ("pgm", 12), ("png", 16)])
@@ -34,3 +37,35 @@ def test_a_pair_of_the_same_images_counts_once_and_a_name_stands_for_one_image(t
     cv2.imwrite(str(tmp_path / "lower_1.jpg"), np.full((48, 64), 7, np.uint8))
     with pytest.raises(omnid.OmnidError, match=r"lower_1\.jpg and lower_1\.png have one name"):
         read_pairs(tmp_path)
+
+
+# Snapshots: the rim, and measures that follow focus and light
+
+
+@pytest.fixture(scope="module")
+def images(scene: Path) -> dict[str, list[Image]]:
+    """The images of both cameras."""
+    reader = LogReader(scene / "log.mcap")
+    found: dict[str, list[Image]] = {"lower": [], "upper": []}
+    for frame in reader.frames():
+        found[frame.camera].append(gray(frame))
+    reader.close()
+    return found
+
+
+def test_the_command_writes_both_images(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, err = Command(capsys)("cameras", "--snapshot", tmp_path / "views", "--log", scene / "log.mcap")
+    assert (code, err) == (0, "") and out.count("rim: centre (12") == 2
+    for name in ("lower", "upper"):
+        image = cv2.imread(str(tmp_path / "views" / f"{name}.png"))
+        assert image is not None and image.shape == (256, 256, 3)
+        assert (image[:, :, 1].astype(int) - image[:, :, 0] > 60).sum() > 300, "the rim is drawn in green"
+
+
+def test_focus_falls_with_blur_and_not_with_light(images: dict[str, list[Image]]) -> None:
+    sharp = images["lower"][:5]
+    blurred = [cv2.GaussianBlur(image, (0, 0), 1.5) for image in sharp]
+    dim = [np.asarray(image // 2, np.uint8) for image in sharp]
+    focus, worse, darker = (view_of(some).focus for some in (sharp, blurred, dim))
+    assert worse < 0.35 * focus and darker == pytest.approx(focus, rel=0.15)
+    assert "no rim found" in described(view_of([np.zeros((200, 200), np.uint8)]))

@@ -117,28 +117,3 @@ def test_recommends_recalibration_for_a_shifted_centre(
     write_rig(tmp_path / "rig.toml", replace(rig, upper=replace(rig.upper, camera=off)))
     assert run(drive / "log.mcap", "--rig", tmp_path / "rig.toml") == 1
     assert "calibrate again with a board" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ([], "no rig.toml is attached to the log"),
-        (["--rig", "none.toml"], "none.toml: there is no such rig"),
-        (["--rig", "larger.toml"], "images are 256x256 px, the rig's are 300x256"),
-        (["--lower", "/x"], "no topic '/x'"),
-    ],
-)
-def test_invalid_input_is_one_line(
-    drive: Path,
-    tmp_path: Path,
-    words: list[str],
-    message: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    text = (drive / "rig.toml").read_text().replace("size = [256, 256]", "size = [300, 256]")
-    (tmp_path / "larger.toml").write_text(text)
-    monkeypatch.chdir(tmp_path)
-    assert run(drive / "log.mcap", *words) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert message in line

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from calib import se3
 from calib.boards.board import AS_DRAWN, Board, BoardView, PrintShape, ambiguous_orders
+from calib.boards.checkerboard import find_board
 from calib.errors import CalibError
-from calib.fit.boards.bundle import fit_boards
-from calib.fit.boards.rig_fit import PairView, RigCalibration, calibrate_boards, rig_covariance
+from calib.fit.boards.rig_fit import PairView, RigCalibration, calibrate_boards
 from calib.models.camera import Array, Mask, OmniCamera
 from calib.models.names import values_of
 from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
-from calib.rig import MountedCamera, Rig, rig_between
-from tests.bench.calibration import board_rig, projected_views
+from calib.rig import MountedCamera, Rig
 from tests.simulation.boards import board_poses_around_camera, board_poses_around_rig
 
 SIZE = (780, 768)
@@ -165,23 +169,59 @@ def test_the_shape_of_the_print_is_found_and_leaves_the_rig_as_it_is(shape: Prin
     assert found.fit.mean_px < 0.014 and off(found)[0] < 0.02 and off(found)[1] < 0.3
 
 
-def profile_sigmas(found: RigCalibration) -> Array:
-    """Return the standard deviations of a4 and w_s of both cameras, which boards show together only."""
-    return np.array([[side["a4"], side["w_s"]] for side in sigmas_of(found)])
+# Ten real images of a mirror, compared with OCamCalib's corners, polynomial, centre and errors
+
+
+BOARD = Board(6, 7, 0.03)
+REAL_SIZE = (1024, 768)
+Images = dict[str, NDArray[np.uint8]]
+
+
+def read_images(shared_data: Path) -> Images:
+    paths = sorted((shared_data / "vmr_board").glob("*.jpg"))
+    return {path.name: cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).astype(np.uint8) for path in paths}
+
+
+def reference(shared_data: Path, key: str) -> tuple[dict[str, Any], list[BoardView], Array]:
+    """Return OCamCalib's numbers, its corners as views, and its errors by image."""
+    numbers = json.loads((shared_data / "vmr_board" / "reference.json").read_text())[key]
+    views = [
+        BoardView(entry["image"], np.column_stack([entry["col_1based"], entry["row_1based"]]) - 1.0)
+        for entry in numbers["images"]
+    ]
+    # From the toolbox's order of corners to Board.points: x varies fastest.
+    order = np.lexsort((numbers["Xt_mm"], numbers["Yt_mm"]))
+    reordered = [BoardView(view.name, view.pixels[order]) for view in views]
+    return numbers, reordered, np.array(numbers["stored_errMean_px"])
+
+
+def of_one_camera(views: list[BoardView]) -> list[PairView]:
+    return [PairView(view.name, (view,)) for view in views]
 
 
 @pytest.mark.slow
-def test_boards_of_paraboloids_give_the_profile_of_the_mirrors_twice_as_well() -> None:
-    truth, perfect = board_rig(21, 1.0)
-    board = Board(5, 4, 0.08)
-    found = calibrate_boards(
-        projected_views(truth, perfect, board, 12, 0.015, seed=21, noise_seed=[3]), board, [truth.lower.camera.size] * 2
-    )
-    assert found.telecentric and not found.structure(0).is_misfit
-    pixels = np.array([[seen.pixels for seen in view.seen if seen] for view in found.views])
-    free = replace(found, fit=fit_boards(found.fit.rig, pixels, board))
-    assert (profile_sigmas(found) < 0.7 * profile_sigmas(free)).all()
-    rig = rig_between(found.cameras[0], found.cameras[1], se3.inverse(found.T_upper_lower))
-    covariance = rig_covariance(found, rig)
-    assert {"lower w_s", "upper a4", "baseline"} < set(covariance.names)
-    assert abs(rig.baseline_m - truth.baseline_m) < 4 * covariance.sigma("baseline") < 1e-3
+def test_a_real_mirror_is_fitted_to_a_quarter_of_a_pixel(shared_data: Path) -> None:
+    images = read_images(shared_data)
+    views = [view for name, image in images.items() if (view := find_board(image, BOARD, name)) is not None]
+    assert len(views) == 10
+    found = calibrate_boards(of_one_camera(views), BOARD, [REAL_SIZE], "mirror", [images])
+    assert found.rejected == () and found.fit.mean_px < 0.25 and not found.structure(0).is_misfit
+
+
+@pytest.mark.parametrize(
+    ("key", "mean_px", "apart_deg"),
+    [pytest.param("ocam_std", 0.4705, 0.35, marks=pytest.mark.slow), ("ocam_subpix", 0.305, 0.2)],
+)
+def test_fits_the_toolbox_corners_with_less_error_than_the_toolbox(
+    shared_data: Path, key: str, mean_px: float, apart_deg: float
+) -> None:
+    numbers, views, errors = reference(shared_data, key)
+    found = calibrate_boards(of_one_camera(views), BOARD, [REAL_SIZE])
+    assert found.fit.mean_px < mean_px < numbers["stored_mean_err_px"]
+    assert (np.nanmean(found.fit.errors_px[:, 0], axis=1) < errors * 1.15).all()
+    row, column = found.cameras[0].center_row_column
+    assert (row + 1, column + 1) == pytest.approx((numbers["xc_row_1based"], numbers["yc_col_1based"]), abs=3.0)
+    radius = np.linspace(100, 350, 26)
+    theirs = np.polynomial.polynomial.polyval(radius, numbers["ss"])
+    ours = found.cameras[0].height(radius)
+    assert np.rad2deg(np.abs(np.arctan2(ours, radius) - np.arctan2(theirs, radius))).max() < apart_deg
