@@ -50,13 +50,6 @@ def test_version_and_help_load_nothing_heavy() -> None:
     assert out.splitlines() == [f"omnid {__version__}", "False"]
 
 
-def test_help_of_every_command(omnid: Command) -> None:
-    listed = omnid("--help").out
-    for command in ("replay", "demo", "eval", "calibrate", "config"):
-        assert command in listed
-        assert f"omnid {command}" in omnid(command, "--help").out
-
-
 def tracked(*folders: str) -> set[str]:
     """Return the files of the repository, those of some folders or all."""
     listed = subprocess.run(["git", "ls-files", "-z", *folders], cwd=ROOT, capture_output=True, text=True)

@@ -135,11 +135,6 @@ def test_motor_gets_the_commands_and_stops_at_the_end(omnid: Command, scene: Pat
         motor.close()
 
 
-def test_starts_a_simulated_motor(omnid: Command, scene: Path) -> None:
-    result = omnid.replay(scene / "log.mcap", "--motor", "simulated", "--realtime", rig=scene / "rig.toml")
-    assert result.code == 0 and result.count("motor") > 20 and "0 errors" in result.out
-
-
 def test_a_lost_motor_ends_the_run(tmp_path: Path, scene: Path) -> None:
     motor = PtyMotor()
     tum = tmp_path / "est.txt"
@@ -150,17 +145,6 @@ def test_a_lost_motor_ends_the_run(tmp_path: Path, scene: Path) -> None:
     assert process.returncode == 2, err
     assert err.splitlines()[-1].startswith("omnid: the motor controller does not answer any more"), err
     assert len(rows(tum)) >= 3
-
-
-def test_progress_on_a_terminal(scene: Path) -> None:
-    screen, terminal = os.openpty()
-    with subprocess.Popen(replaying(scene, "--realtime"), stdout=subprocess.PIPE, stderr=terminal, cwd=ROOT) as process:
-        process.communicate(timeout=PATIENCE_S)
-    os.close(terminal)
-    drawn = os.read(screen, 1 << 16).decode()
-    os.close(screen)
-    assert f"/{PAIRS} " in drawn and "pairs/s" in drawn and "tracking" in drawn
-    assert drawn.endswith("\r\x1b[K"), "the line is cleared"
 
 
 @pytest.mark.parametrize("where", ["/dev/full", "&-"])

@@ -11,20 +11,18 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from numpy.typing import NDArray
-from rosbags.typesys import Stores, get_typestore
 
 from calib import se3
 from calib.rig_file import read_rig
 from drivers.errors import DriverError
 from drivers.logs.log_reader import LogReader
-from drivers.logs.ros_messages import IMU, JOINT_STATE, ODOMETRY
+from drivers.logs.ros_messages import IMU, ODOMETRY
 from drivers.logs.topics import MotionTopics
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.config import load_config
 from omnid.formats.tum import read_tum
 from omnid.runs.replay import ReplayOptions, run_log
 from omnid.runs.run_result import RunResult
-from omnid.runs.session import motion_topics
 from omnid.tracking_state import TrackingState
 from omnid.transport.codec import decode_diagnostics
 from omnid.transport.sensor_codec import gyro_cdr, wheel_cdr
@@ -138,35 +136,6 @@ def test_sensors_with_another_clock_than_the_images_are_named(
     assert [line for line in reader.warnings if "is used" in line] == [
         f"no sample of the gyro is used: they begin {words} the images by their stamps: are these of another clock?"
     ]
-
-
-def test_wheels_are_joints_where_these_are_named(scene: Path, samples: list[MotionSample], tmp_path: Path) -> None:
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    t = store.types
-    wheels, (radius_m, track_m) = [each for each in samples if isinstance(each, WheelSample)], (0.05, 0.3)
-
-    def joint_entry(sample: WheelSample) -> Entry:
-        half_mps = sample.yaw_rate_radps * track_m / 2
-        speeds = np.array([sample.velocity_mps - half_mps, 0.0, sample.velocity_mps + half_mps]) / radius_m
-        stamp = t["builtin_interfaces/msg/Time"](*divmod(sample.stamp_ns, 10**9))
-        message = t[JOINT_STATE](
-            t["std_msgs/msg/Header"](stamp, ""), ["left", "arm", "right"], np.zeros(3), speeds, np.zeros(0)
-        )
-        return Entry("/joint_states", JOINT_STATE, bytes(store.serialize_cdr(message, JOINT_STATE)), sample.stamp_ns)
-
-    log = saved(tmp_path / "log.mcap", scene, [*(joint_entry(each) for each in wheels), entry(wheels[0])])
-    settings = ["motion.wheel_joints=['left', 'right']"]
-    reader = LogReader(log, motion=motion_topics(load_config(None, settings)))
-    read = [message for message in reader.messages() if isinstance(message, WheelSample)]
-    assert len(read) > 50 and not reader.warnings
-    for sample, expected in zip(read, wheels, strict=False):
-        assert sample.stamp_ns == expected.stamp_ns
-        assert (sample.velocity_mps, sample.yaw_rate_radps) == pytest.approx(
-            (expected.velocity_mps, expected.yaw_rate_radps), abs=1e-9
-        )
-    reader = LogReader(log, motion=motion_topics(load_config(None, ["motion.wheel_joints=['l', 'r']"])))
-    assert len(list(reader.messages())) == 2 * PAIRS
-    assert reader.warnings[0].startswith("none of ") and "motion.wheel_joints" in reader.warnings[0]
 
 
 def test_a_pose_that_the_wheels_contradict_is_degraded_and_its_sigma_covers_theirs(

@@ -62,9 +62,7 @@ def test_rows_written_are_read_back(tmp_path: Path) -> None:
     [
         ("1700000000.099999905", 1_700_000_000_099_999_905),
         ("1.700000000099999905e+09", 1_700_000_000_099_999_905),
-        (".5", 500_000_000),
         ("-0.000000001", -1),
-        ("1e-300", 0),
     ],
 )
 def test_stamps_are_exact(tmp_path: Path, word: str, stamp_ns: int) -> None:
@@ -85,14 +83,10 @@ def test_accepts_other_layouts(tmp_path: Path) -> None:
     ("line", "found"),
     [
         ("1 2 3", "found 3: '1 2 3'"),
-        ("1 " * 9, "found 9"),
         ("1 0 0 0 0 0 0 x", "expected finite numbers, found '1 0 0 0 0 0 0 x'"),
-        ("1 0 0 nan 0 0 0 1", "finite"),
         ("1 0 0 2e9 0 0 0 1", "position within"),
         ("1 0 0 0 0 0 0 0", "found zero"),
         ("nan 0 0 0 0 0 0 1", "stamp in seconds, found 'nan'"),
-        ("today 0 0 0 0 0 0 1", "'today'"),
-        ("1e999999999 0 0 0 0 0 0 1", "'1e999999999'"),
         ("\x00\x1b[2J", "found 1: '\\x00\\x1b[2J'"),
     ],
 )
@@ -163,9 +157,6 @@ def points(xyz: NDArray[np.float64], confidence: float = 0.8) -> MapPoints:
     return MapPoints(xyz.astype(np.float32), np.full(len(xyz), confidence, dtype=np.float32), ones, ones)
 
 
-EMPTY = points(np.empty((0, 3)))
-
-
 def box(x_m: float, y_m: float, z_m: float = 0.0) -> NDArray[np.float64]:
     """Return a filled square of 0.4 m about a point."""
     grid = np.arange(-0.2, 0.21, 0.05)
@@ -211,20 +202,6 @@ def test_the_floor_below_cameras_of_known_height_is_not_drawn(height_m: float, i
     assert (area(plan_view(points(box(0, 0, floor_m + 0.25)), NO_PATH, heights_m=heights_m)) < 200).any()
 
 
-@pytest.mark.parametrize("path", [NO_PATH, np.zeros((1, 2)), np.full((3, 2), np.nan)])
-def test_draws_an_image_of_an_almost_empty_map(path: NDArray[np.float64]) -> None:
-    image = plan_view(EMPTY, path)
-    assert image.dtype == np.uint8 and image.ndim == 3 and image.shape[2] == 3
-    assert (image[MARGIN_PX - 20 :] < 100).any()  # axes
-
-
-@pytest.mark.parametrize("extent_m", [0.01, 250.0, 1e9])
-def test_size_is_bounded_for_any_extent(extent_m: float) -> None:
-    for shape in ([1.0, 0.0], [0.0, 1.0], [1.0, -0.7]):
-        image = plan_view(points(box(0, 0)), np.linspace(0, extent_m, 30)[:, None] * shape)
-        assert max(image.shape) <= 1400 and min(image.shape[:2]) > 2 * MARGIN_PX + 10
-
-
 CELLS = np.array([[FREE, OCCUPIED, UNKNOWN], [UNKNOWN, FREE, FREE]], np.int8)
 
 
@@ -246,15 +223,6 @@ def test_map_server_reads_the_same_cells(tmp_path: Path, name: str) -> None:
 def test_another_name_is_refused(tmp_path: Path) -> None:
     with pytest.raises(OmnidError, match=r"expected a name that ends in \.yaml"):
         write_grid(tmp_path / "place.png", Grid(CELLS, 0.05, (0.0, 0.0)))
-
-
-def test_a_map_that_cannot_be_written_whole_leaves_the_old_image(tmp_path: Path) -> None:
-    """Its text tells where it lies."""
-    (tmp_path / "place.pgm").write_bytes(b"old")
-    (tmp_path / "place.yaml").mkdir()
-    with pytest.raises(OmnidError, match="cannot write the map"):
-        write_grid(tmp_path / "place.yaml", Grid(CELLS, 0.05, (0.0, 0.0)))
-    assert (tmp_path / "place.pgm").read_bytes() == b"old" and len(list(tmp_path.iterdir())) == 2
 
 
 def write_map(path: Path, content: bytes) -> None:
@@ -288,10 +256,3 @@ def test_a_link_in_the_place_of_the_temporary_file_is_not_followed(
     (tmp_path / f".file.{os.getpid()}.part").symlink_to(victim)
     write(path, b"new")
     assert victim.read_bytes() == b"mine" and path.is_file() and not path.is_symlink()
-
-
-def test_a_loop_of_links_is_one_line(tmp_path: Path) -> None:
-    (tmp_path / "a").symlink_to(tmp_path / "b")
-    (tmp_path / "b").symlink_to(tmp_path / "a")
-    with pytest.raises(OmnidError, match="cannot write the file"):
-        write_whole(tmp_path / "a" / "file", b"new")

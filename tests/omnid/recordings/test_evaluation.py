@@ -212,12 +212,6 @@ def test_says_what_explains_the_error_and_fits_it_where_asked(
     assert float(errors.split("rmse")[1].split(",")[0]) < 20.0, "millimetres, of an estimate with 7 mm of noise"
 
 
-def wander(seed: int) -> Array:
-    """Return the poses (N, 4, 4) of a random walk."""
-    steps = np.random.default_rng(seed).normal(0, 1, (len(S), 6)) * np.repeat([0.05, 0.03], 3)
-    return se3.transform(se3.rotation_exp(steps[:, 3:].cumsum(axis=0)), steps[:, :3].cumsum(axis=0))
-
-
 def with_jump(T: Array) -> Array:
     later = np.arange(len(T)) >= 60
     return np.where(later[:, None, None], T[60] @ se3.exp([0.3, 0.3, 0.25, 0.0, 0.02, 0.0]) @ se3.inverse(T[60]) @ T, T)
@@ -227,20 +221,11 @@ def scaled(T: Array, factor: float) -> Array:
     return se3.transform(T[:, :3, :3], factor * T[:, :3, 3])
 
 
-STANDING = np.broadcast_to(np.eye(4), HAND.shape)
-ALONG = se3.transform(np.eye(3), np.outer(2 * S + 0.2 * np.sin(3 * S), [1.0, 0.0, 0.0]))
-TURNING = se3.transform(se3.rotation_exp(np.outer(S, [0.0, 0.0, 0.8])), np.zeros((len(S), 3)))
-
-
 @pytest.mark.parametrize(
     ("estimate", "truth"),
     [
         (HAND, scaled(HAND, 0.97)),
         (with_jump(FLAT), FLAT),
-        (with_jump(ALONG), ALONG),
-        (wander(2), wander(3)),
-        (with_jump(STANDING), STANDING),
-        (TURNING, TURNING @ se3.exp(np.random.default_rng(2).normal(0, 0.02, (len(S), 6)))),
     ],
 )
 def test_claims_no_difference_where_none_explains_the_error(
@@ -259,14 +244,10 @@ START_NS = 1_700_000_000 * 10**9
 REFUSED = ""
 CASES = {  # name: (topics of the log, --topic, chosen topic or REFUSED)
     "one": (("/omnid/odom",), None, "/omnid/odom"),
-    "one of any name": (("/wheels/odometry",), None, "/wheels/odometry"),
-    "one without a robot": (("/odom",), None, "/odom"),
     "own name preferred": (("/odometry/filtered", "/omnid/odom"), None, "/omnid/odom"),
-    "own name preferred to all others": (("/a/pose", "/omnid/odom", "/z/pose"), None, "/omnid/odom"),
     "several of other names": (("/a/pose", "/b/pose"), None, REFUSED),
     "several of the own name": (("/omnid/odom", "/rover/odom"), None, REFUSED),
     "named": (("/a/pose", "/b/pose"), "/b/pose", "/b/pose"),
-    "named beside the own name": (("/omnid/odom", "/wheels/pose"), "/wheels/pose", "/wheels/pose"),
     "named but absent": (("/omnid/odom",), "/c", REFUSED),
     "none": ((), None, REFUSED),
 }
