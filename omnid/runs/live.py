@@ -327,7 +327,7 @@ def _subscribe(
     bus.serve(topics.TIME, freshness.own_time)
 
     def ask(command: NavigationCommand) -> None:
-        requests.put(command._replace(halts=controller.statistics.state.stop_count if controller else 0))
+        requests.put(command._replace(stop_count=controller.statistics.state.stop_count if controller else 0))
 
     received = NavigationReceiver(ask, freshness, report=warn)
     taken = {topic: topics.command_of(topic).schema for topic in (*topics.SENSOR_TOPICS, topics.MAP)}

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Final
 
 from omnid.core.nanoseconds import NS_PER_S
-from omnid.core.navigation.requests import NavigationCommand, RouteAction, RouteRequest, TaughtRoute, is_halt
+from omnid.core.navigation.requests import NavigationCommand, RouteAction, RouteRequest, TaughtRoute, stops_motion
 from omnid.engine.graph import Graph
 from omnid.errors import OmnidError
 from omnid.formats.route_file import RouteFolder
@@ -21,7 +21,7 @@ LONGEST_WAIT_S: Final = 5.0  # A robot that sets out later than this after the r
 class Requests:
     """The inlets of a graph for requests to the navigation, from any thread.
 
-    Requests about routes pass through the thread of the files. All others, and halts, overtake them there.
+    Requests about routes pass through the thread of the files. All others, and those that stop a motion, overtake them.
     """
 
     def __init__(self, graph: Graph) -> None:
@@ -29,7 +29,7 @@ class Requests:
 
     def put(self, command: NavigationCommand) -> None:
         """Add a request."""
-        is_of_route = isinstance(command.request, RouteRequest | TaughtRoute) and not is_halt(command.request)
+        is_of_route = isinstance(command.request, RouteRequest | TaughtRoute) and not stops_motion(command.request)
         (self.of_routes if is_of_route else self.direct).push(command)
 
 

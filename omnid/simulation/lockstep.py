@@ -203,7 +203,7 @@ def simulate(
                 ends = True
             else:
                 states.push(state)
-                requests.put(NavigationCommand(request, arrival_ns, arrival_ns, halts=state.stop_count))
+                requests.put(NavigationCommand(request, arrival_ns, arrival_ns, stop_count=state.stop_count))
         states.push(state)
         return ends
 

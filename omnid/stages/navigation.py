@@ -27,8 +27,8 @@ from omnid.core.navigation.requests import (
     RouteAction,
     RouteRequest,
     TaughtRoute,
-    is_halt,
     may_begin_motion,
+    stops_motion,
 )
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import MapPosition, Situation, WheelState, refusal_to_drive
@@ -164,7 +164,7 @@ class NavigationStage:
     def _execute(self, command: NavigationCommand) -> None:
         """Execute a request. Raise OmnidError with the reason to refuse it."""
         request, navigator = command.request, self._navigator
-        if is_halt(request):
+        if stops_motion(request):
             self._halted = max(self._halted, command.id)
         elif 0 < command.id < self._halted and not isinstance(request, TaughtRoute):
             raise OmnidError(OVERTAKEN)
@@ -172,7 +172,7 @@ class NavigationStage:
             _raise_if(command.refusal)
         if may_begin_motion(request):
             _raise_if(command.void)
-            if command.halts < self._wheels.halts:
+            if command.stop_count < self._wheels.stop_count:
                 raise OmnidError("a stop or a fault has come since: ask again")
             if 0 < command.id < self._begun:
                 raise OmnidError(OVERTAKEN)

@@ -317,7 +317,7 @@ class NavigationReceiver(Receiver):
     def _ask(self, message: Request, arrival_ns: int) -> None:
         request, stamp_ns = navigation_request(message.topic, message.payload)
         is_finish = isinstance(request, requests.RouteRequest) and request.action is requests.RouteAction.FINISH
-        if not (requests.is_halt(request) or is_finish):
+        if not (requests.stops_motion(request) or is_finish):
             self._freshness.require(message, arrival_ns, stamp_ns)
         self.accepted += 1
         stamp_ns = stamp_ns or message.sent_ns

@@ -1,8 +1,8 @@
-"""State machine of the navigation: from requests and poses to setpoints, with the reason for each halt.
+"""State machine of the navigation: from requests and poses to setpoints, with the reason for each stop.
 
-Every end is a stop. Time is that of the poses. A drive in the frame map follows the corrections of the map. A goal is
-driven to straight on where that way is free, a path along itself; else by a way of the planner, to the goal or back to
-the path. What moves is an obstacle where the base would meet it; what closes every way is waited for.
+Every end is a stop. Time is that of the poses. A drive in the frame map follows the corrections of the map. The base
+drives straight to a goal, or along a path, while that is free; else by a way of the planner, to the goal or back to the
+path. A moving object is an obstacle where the base would meet it. While no way is free, the base waits.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ Array = NDArray[np.float64]
 
 PROGRESS_M, PROGRESS_RAD = SHORTEST_M / 2, math.radians(5)  # A smaller motion is no progress.
 STOPS: Final = 5  # A stop is sent at so many poses after the end of a drive, because one might be lost.
-LOOK_M: Final = 2.0  # Length of the way ahead in which obstacles are searched; a free place behind them in twice that.
+LOOK_M: Final = 2.0  # Length of the way ahead that is searched for obstacles; twice that for a free place behind them.
 REJOIN_M: Final = 0.3  # Free length of the path behind an obstacle, at which a detour ends.
-# Between two searches where the way is blocked, and where it is free.
+# Time between two searches for a way while the present one is blocked, and for a shorter one while it is free.
 AGAIN_NS, SHORTER_NS = 500_000_000, 2_000_000_000
 DOCK_M: Final = 0.5  # The last way to a goal is driven straight on.
 BETTER: Final = 0.8  # A way replaces one that is free only if it takes less than this share of its time.
@@ -69,7 +69,7 @@ class Drive:
     paths: list[DrivePath]  # paths that are driven one after the other
     follower: Follower  # of the first of them
     resets: int
-    halts: int  # WheelState.halts at the start, or when a person let it go on
+    stop_count: int  # WheelState.stop_count at the start, or when a person resumed it
     heading_rad: float  # heading at the last progress
     xy: Array  # last position in odom
     detour: Detour | None = None  # None: it follows the path
@@ -120,12 +120,12 @@ class Drive:
         setpoint = replace(following.setpoint, heading_rad=wrap_angle(heading_rad - turned_rad))
         return following._replace(setpoint=setpoint)
 
-    def take(self, detour: Detour) -> None:
-        """Follow a way of the planner from now on."""
+    def begin_detour(self, detour: Detour) -> None:
+        """Begin a detour."""
         self.detour, self.nearest_m, self.way_s = detour, math.inf, 0.0
 
     def rejoin(self, now: Situation) -> None:
-        """Follow the path from where the detour leads to; to a goal straight on."""
+        """Follow the path again, from the place to which the detour leads; to a goal straight on."""
         path, detour = self.paths[0], self.detour
         leg, s_m = (0, 0.0) if detour is None else (detour.leg, detour.s_m)
         if path.is_goal:
@@ -134,7 +134,7 @@ class Drive:
         self.follower = Follower(path, self.follower.settings, leg, s_m, now.speed_mps)
 
     def advance(self, now: Situation, left_m: float, dt_s: float) -> None:
-        """Count the time since the last progress, which is a shorter way left or a turn, and that on this way."""
+        """Count the time since the last progress, a shorter way to go or a turn, and the time on this way."""
         turned_rad = abs(wrap_angle(float(now.pose[2]) - self.heading_rad))
         self.stuck_s, self.way_s = self.stuck_s + dt_s, self.way_s + dt_s
         if left_m < self.nearest_m - PROGRESS_M or turned_rad > PROGRESS_RAD:
@@ -152,7 +152,7 @@ class Navigation(NamedTuple):
 
 
 class Rule(NamedTuple):
-    """A reason to stand, in the order in which it is looked for, or to end the drive."""
+    """A reason to stop or to end a drive."""
 
     state: NavigationState
     words: Callable[[Drive, Situation, NavigationSettings], str]  # empty: it does not hold
@@ -163,9 +163,11 @@ def _stopped(drive: Drive, now: Situation, settings: NavigationSettings) -> str:
 
 
 def _fault(drive: Drive, now: Situation) -> str:
-    """Return the fault that has disarmed; between two poses it may have been armed again, which alone moves nothing."""
+    """Return the stop or fault that has disarmed the wheels, also if they were armed again since; empty without one."""
     wheels = now.wheels
-    return wheels.halted_by if wheels.halts != drive.halts else wheels.disarmed_by if wheels.needs_request else ""
+    if wheels.stop_count != drive.stop_count:
+        return wheels.stopped_by
+    return wheels.disarmed_by if wheels.needs_request else ""
 
 
 def _new_odom(drive: Drive, now: Situation, settings: NavigationSettings) -> str:
@@ -234,7 +236,9 @@ class Navigator:
     ) -> None:
         """Begin a drive, which replaces the one before."""
         follower, pose = Follower(paths[0], self.settings), now.pose
-        self.drive = Drive(task, frame, paths, follower, now.resets, now.wheels.halts, float(pose[2]), pose[:2].copy())
+        self.drive = Drive(
+            task, frame, paths, follower, now.resets, now.wheels.stop_count, float(pose[2]), pose[:2].copy()
+        )
         self.task, self.command_ns, self._stops = task, command_ns, 0
         self.state, self.reason = NavigationState.DRIVING, ""
 
@@ -244,18 +248,18 @@ class Navigator:
             self._end(NavigationState.CANCELLED, reason)
 
     def pause(self, reason: str) -> None:
-        """Halt until `resume`."""
+        """Stop until `resume`."""
         if self.drive is not None:
             self.drive.paused = self.drive.paused or reason
             self.state, self.reason = NavigationState.PAUSED, self.drive.paused
 
     def resume(self, now: Situation) -> str:
-        """Go on; return the reason where it cannot."""
+        """Continue a paused drive; return the reason if that is refused, else an empty text."""
         if self.drive is None:
             return "nothing is under way: give a goal, or repeat a route"
         refusal = refusal_to_drive(now, NavigationFrame.ODOM, math.inf)
         if not refusal:
-            self.drive.paused, self.drive.halts = "", now.wheels.halts
+            self.drive.paused, self.drive.stop_count = "", now.wheels.stop_count
             self.drive.waited_s = self.drive.stuck_s = 0.0
         return refusal
 
@@ -271,7 +275,7 @@ class Navigator:
         for rule in RULES:
             words = rule.words(drive, now, settings)
             if words:
-                return self._halt(drive, rule.state, words, dt_s)
+                return self._wait(drive, rule.state, words, dt_s)
         drive.resets = now.resets
         # 2. The way.
         following = drive.step(now, self._room_m(drive, now))
@@ -314,8 +318,8 @@ class Navigator:
         elif in_map.sigma_m > UNKNOWN_M:
             drive.unlocalised_m = math.inf
 
-    def _halt(self, drive: Drive, state: NavigationState, reason: str, dt_s: float) -> Navigation:
-        """Stand and count the time, or end; fail where the pose in the map is missing for too long."""
+    def _wait(self, drive: Drive, state: NavigationState, reason: str, dt_s: float) -> Navigation:
+        """Stop and count the time, or end; fail where the pose in the map is missing for too long."""
         if state.is_end:
             return self._end(state, reason)
         if state is NavigationState.NOT_LOCALISED:
@@ -326,7 +330,7 @@ class Navigator:
         return Navigation(None if state is NavigationState.PAUSED else STAND, state, reason)
 
     def _room_m(self, drive: Drive, now: Situation) -> float:
-        """Return the distance of the outline from what stands nearest to the base, and its front, on the way."""
+        """Return the distance [m] from the side of the base to the nearest obstacle on the next front_m."""
         if now.around is None:
             return math.inf
         near = drive.ahead(now, self.collision.front_m)
@@ -351,9 +355,7 @@ class Navigator:
         # 2. Without a way around it, drive up to the obstacle and wait.
         left_m = first_m - self.collision.front_m - 2 * self.collision.stop_m
         braking_mps = math.sqrt(2 * BRAKE_SHARE * pursuit.acceleration_mps2 * max(left_m, 0.0))
-        if (
-            wanted.velocity_mps > 0 and braking_mps < pursuit.least_mps
-        ):  # It is there: slower than that it would not move.
+        if wanted.velocity_mps > 0 and braking_mps < pursuit.least_mps:  # the base has reached the obstacle
             return following, None, CROSSES if around.moves else STANDS
         share = min(1.0, braking_mps / wanted.velocity_mps) if wanted.velocity_mps > 0 else 1.0
         slower = Setpoint(share * wanted.velocity_mps, wanted.heading_rad, share * wanted.yaw_rate_radps)
@@ -400,11 +402,11 @@ class Navigator:
             left_s = detour.time_s * following.left_m / max(detour.follower.path.length_m, SHORTEST_M)
             if found.time_s > BETTER * left_s:
                 return False
-        drive.take(found)
+        drive.begin_detour(found)
         return True
 
     def _search(self, drive: Drive, now: Situation, around: Surroundings, barred: Move | None) -> Detour | str:
-        """Return a way to the goal, or to the path behind what is on it; why there is none otherwise."""
+        """Return a way to the goal, or to the path behind its obstacle; or the reason why there is none."""
         settings, path = self.settings, drive.paths[0]
         place, corridor, heading_rad = (0, 0.0), None, math.nan
         if path.is_goal:

@@ -25,12 +25,12 @@ from omnid.core.obstacles.grid import CELL_M
 
 Array = NDArray[np.float64]
 
-MOVE_CELLS: Final = 3  # length of an arc, which leaves its cell in any direction
+MOVE_CELLS: Final = 3  # length of an arc, so that it leaves its cell in any direction
 BACK_MPS: Final = 0.2  # slower than forwards, because people do not expect a robot to back up
 MARGIN_M: Final = 0.2 * CELL_M  # room for errors of the grid and of the base on its way
 # Speed that is planned through floor that was not seen: a detour over floor that was is preferred up to 4 times as far.
 UNKNOWN_MPS: Final = 0.1
-LOOK_M: Final = 1.0  # Nearer than that to what stands at the goal it is seen well.
+LOOK_M: Final = 1.0  # Distance from which an obstacle at the goal is seen well.
 
 
 class Move(IntEnum):
@@ -124,7 +124,7 @@ class Planner:
         if is_free:
             left_s[row, column] = 0.0
         elif is_inside:
-            # What looks from afar as if it stood at the goal may be beside it: as near as it is free, to look.
+            # An obstacle that from afar seems to be at the goal may be beside it: drive as near as is free, to see.
             least_m = float(away_m[is_open].min())
             if math.dist(goal, pose[:2]) < least_m + LOOK_M:
                 return f"something stands {_nearest_m(goal, around):.1f} m from the goal"

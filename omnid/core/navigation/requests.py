@@ -97,7 +97,8 @@ class NavigationCommand(NamedTuple):
     id: int = 0  # id of the request; the answer has the same
     refusal: str = ""  # why it is refused already, as by a file that is missing
     void: str = ""  # why it may begin no motion any more; empty: it may
-    halts: int = 0  # stops and faults that had made cmd/arm necessary before it: it begins no motion after a later one
+    # Stops and faults that had made cmd/arm necessary before the request: it begins no motion after a later one.
+    stop_count: int = 0
     asked_ns: int = 0  # arrival by CLOCK_MONOTONIC; 0: it may wait for its file as long as that takes
 
 
@@ -105,11 +106,11 @@ def may_begin_motion(request: NavigationRequest) -> bool:
     """True if a request may begin or resume a motion."""
     if isinstance(request, RouteRequest):
         return request.action is RouteAction.REPEAT
-    return not is_halt(request) and not isinstance(request, TaughtRoute)
+    return not stops_motion(request) and not isinstance(request, TaughtRoute)
 
 
-def is_halt(request: NavigationRequest) -> bool:
-    """True if a request ends or halts a motion."""
+def stops_motion(request: NavigationRequest) -> bool:
+    """True if a request ends or pauses a motion."""
     if isinstance(request, RouteRequest):
         return request.action is RouteAction.STOP
     return request in (NavigationVerb.CANCEL, NavigationVerb.PAUSE)

@@ -28,8 +28,8 @@ class WheelState(NamedTuple):
     reason: str = ""  # why the wheels must stop now; empty: they may turn
     source: str = ""  # source of the commands that drive; empty while none does
     held_by: str = ""  # why the collision monitor stops the base; empty: it does not
-    halts: int = 0  # how often a stop or a fault has made cmd/arm necessary, also if it has come since
-    halted_by: str = ""  # the newest of their reasons
+    stop_count: int = 0  # stops and faults that have made cmd/arm necessary, those that were armed again included
+    stopped_by: str = ""  # reason of the newest of them
 
     @property
     def is_held(self) -> bool:

@@ -190,13 +190,13 @@ def test_what_waits_for_a_disk_begins_nothing_after_a_stop_or_a_long_time(tmp_pa
     site.ask(FINISH)
     site.work()
     repeated = site.ask(REPEAT)
-    site.robot.stage.process(WheelState(True, False, halts=1))  # a bumper; then it was armed again
+    site.robot.stage.process(WheelState(True, False, stop_count=1))  # a bumper; then it was armed again
     site.work()
     assert "a stop or a fault has come since" in site.answers()[repeated]
-    again = site.ask(REPEAT, halts=1, asked_ns=1)
+    again = site.ask(REPEAT, stop_count=1, asked_ns=1)
     assert site.work().state is not NavigationState.DRIVING
     assert "waited too long" in site.answers()[again]
-    third = site.ask(REPEAT, halts=1)
+    third = site.ask(REPEAT, stop_count=1)
     site.work()
     assert site.answers()[third] == ""
 

@@ -176,13 +176,13 @@ def test_a_pose_in_the_map_counts_once() -> None:
 
 @pytest.mark.hazard("H26")
 @pytest.mark.parametrize(
-    ("halted_by", "state"), [(ASKED, NavigationState.CANCELLED), ("the bumper is pressed", NavigationState.PAUSED)]
+    ("stopped_by", "state"), [(ASKED, NavigationState.CANCELLED), ("the bumper is pressed", NavigationState.PAUSED)]
 )
 def test_a_stop_between_two_poses_ends_a_drive_although_it_is_armed_again(
-    halted_by: str, state: NavigationState
+    stopped_by: str, state: NavigationState
 ) -> None:
     base = driving()
-    armed = WheelState(True, False, halts=1, halted_by=halted_by)
+    armed = WheelState(True, False, stop_count=1, stopped_by=stopped_by)
     for _ in range(2):
         assert base.navigator.step(base.seen()._replace(wheels=armed)).state is state
     if state is NavigationState.PAUSED:

@@ -20,9 +20,9 @@ from omnid.core.navigation.requests import (
     PathRequest,
     RouteAction,
     RouteRequest,
-    is_halt,
     navigation_verb,
     route_request,
+    stops_motion,
 )
 from omnid.core.navigation.route import KeyframePose, Route, RouteRecorder, repeated_paths
 from omnid.core.navigation.settings import NavigationSettings
@@ -265,7 +265,7 @@ def test_verbs(verb: NavigationVerb) -> None:
 
 
 @pytest.mark.parametrize(
-    ("request_", "halts"),
+    ("request_", "stops"),
     [
         (NavigationVerb.CANCEL, True),
         (NavigationVerb.PAUSE, True),
@@ -275,5 +275,5 @@ def test_verbs(verb: NavigationVerb) -> None:
         *((RouteRequest(action, "hall"), action is RouteAction.STOP) for action in RouteAction),
     ],
 )
-def test_only_cancel_pause_and_the_stop_of_a_route_halt(request_: NavigationRequest, halts: bool) -> None:
-    assert is_halt(request_) == halts
+def test_only_cancel_pause_and_the_stop_of_a_route_stop_motion(request_: NavigationRequest, stops: bool) -> None:
+    assert stops_motion(request_) == stops
