@@ -45,12 +45,12 @@ def quantisation_steps(data: memoryview) -> Steps:
 
 @lru_cache(maxsize=16)
 def coding_sigma(steps: Steps, highest: int) -> float:
-    """Return the standard deviation [grey levels] of what quantisation changes, of the lowest frequencies of blocks.
+    """Return the standard deviation [grey levels] of the error of quantisation in the lowest frequencies of blocks.
 
-    steps: as of `quantisation_steps`, (): 0. highest: of a block's 8 frequencies along rows and columns, the first that
-    does not count. An error is even within a step, so its variance is a twelfth of the step's square; the transform is
-    orthonormal (A.3.3), so a pixel has a 64th of their sum. The mean grey of blocks, which varies little within a
-    window of some blocks, does not count. Weaker contrast than a step is lost, with an error as large as itself.
+    steps: as of `quantisation_steps`, (): 0. highest: the first of a block's 8 frequencies along rows and columns that
+    does not count. An error is uniform within a step, so its variance is a twelfth of the square of the step; the
+    transform is orthonormal (A.3.3), so that of a pixel is a 64th of their sum. The mean grey of blocks does not count:
+    it varies little within a window of some blocks. Contrast below a step is lost; its error is the contrast itself.
     """
     if not steps:
         return 0.0

@@ -106,7 +106,7 @@ class _Playback:
     """A part of a log, played forwards and backwards in turn until it is closed.
 
     clock: start of the log, shared by the cameras and the motion. pace: speed relative to the recording. once: play the
-    log once, forwards. Raises DriverError for a pace that is none.
+    log once, forwards. Raises DriverError for a pace that is not above 0.
     """
 
     def __init__(self, images: LogImages, clock: LogClock, *, pace: float = 1.0, once: bool = False) -> None:

@@ -22,11 +22,10 @@ from omnid.core.nanoseconds import S_PER_NS
 
 
 class Controller:
-    """Take poses and setpoints, of which the newest count; each call is one tick.
+    """Runs the control law on the newest pose and setpoint; each call of `tick` is one tick.
 
     The law (omnid.core.control.control_law) decides; this class keeps the rhythm of the ticks, and reports to the law
-    what became of its motions: an unanswered or failed command, a motor controller that had stopped by itself. Not
-    thread-safe.
+    what became of its commands: unanswered, failed, or the motor controller had stopped by itself. Not thread-safe.
     """
 
     def __init__(
@@ -42,7 +41,7 @@ class Controller:
     ) -> None:
         """report: takes lines for the log. clock_ns: the clock of the poses' stamps.
 
-        boot_s: the motor controller has not answered yet, and may boot for so long; None: it has.
+        boot_s: time for which a motor controller that has not answered yet may boot; None: it has answered.
 
         limited: velocity [m/s] and yaw rate [rad/s] that the driver makes of a command; None: those of the command.
         """
@@ -67,7 +66,7 @@ class Controller:
         return self._law.motion == STOP or self.state.failed
 
     def take(self, given: ControlInput) -> None:
-        """Take what the daemon gives: a pose, an obstacle scan, a setpoint, or a request to arm."""
+        """Pass a pose, an obstacle scan, a setpoint or a request to arm to the law."""
         conflict = self._law.commands.conflict
         self._law.take(given)
         if self._law.commands.conflict != conflict:
@@ -147,13 +146,13 @@ class Controller:
         state.refused = commands.refused
         state.source = "" if law.reason or commands.current is None else commands.current.source
         state.slowed_by = law.plausibility.slowed_by
-        state.measured = law.plausibility.account.detail
+        state.measured = law.plausibility.disagreement.detail
         state.obstacle = "" if law.reason else monitor.reason
         state.blocked = bool(state.obstacle) and monitor.holds
         if cuts_drive_short(before, state):
             state.stops[reason] += 1
-        # 2. What a person should know of it.
-        for line in transitions(before, state, law.plausibility.account):
+        # 2. Lines for a person.
+        for line in transitions(before, state, law.plausibility.disagreement):
             self._report(line)
 
     def _send(self, command: VelocityCommand) -> MotorStatus | None:

@@ -93,14 +93,14 @@ class DriveLink(Protocol):
 
 
 class ControllerLink:
-    """Send poses and setpoints to the controller, and receive the commands that it gave.
+    """Sends poses and setpoints to the controller, and receives its reports and commands.
 
     The tick runs in a process of its own, which no stage can delay. Every message carries the time of the last stop
     request, so that a stop arrives even where messages were lost.
     """
 
     def __init__(self, start: ControllerStart, stats: StageStats, report: Callable[[str], None]) -> None:
-        """Start the process; DriverError where its settings cannot be used, or where it waits in vain."""
+        """Start the process; DriverError where it refuses to start, OmnidError where it ends or does not answer."""
         self._report = report
         self.statistics = ControllerStatistics(stats)
         self._stop_ns, self._contacts = 0, NO_CONTACT
@@ -149,7 +149,7 @@ class ControllerLink:
         self._require_asked_end()
 
     def receive_waiting(self) -> None:
-        """Take the reports that have come, without waiting; OmnidError where the process has ended unasked."""
+        """Process the reports that have arrived, without waiting; OmnidError where the process has ended unasked."""
         try:
             while self._receive(0.0) is not NO_MESSAGE:
                 pass

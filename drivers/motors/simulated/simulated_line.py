@@ -15,16 +15,14 @@ from drivers.motors.protocols.line_protocol import (
     status_line,
 )
 from drivers.motors.protocols.motor_protocol import TextFramer
-from drivers.motors.simulated.simulated_base import MotionLimits, SimulatedBase, SimulatedFirmware
+from drivers.motors.simulated.simulated_base import SimulatedBase, SimulatedFirmware
 
 
 class SimulatedLine(SimulatedFirmware):
     """One controller; heading_input: steer to the commanded heading, else follow the commanded yaw rate."""
 
-    def __init__(
-        self, drive: DifferentialDrive | None = None, *, heading_input: bool = True, limits: MotionLimits | None = None
-    ) -> None:
-        super().__init__(SimulatedBase(drive, limits), TextFramer())
+    def __init__(self, drive: DifferentialDrive | None = None, *, heading_input: bool = True) -> None:
+        super().__init__(SimulatedBase(drive), TextFramer())
         self._heading_input = heading_input
         self._zero_rad = 0.0  # heading in the world at which the controller's heading is 0
         self._next_seq: int | None = None

@@ -1,9 +1,9 @@
-"""Comparison of three accounts of the motion: commanded, reported by the wheels, and seen by the cameras.
+"""Comparison of the motion that is commanded, reported by the wheels, and seen by the cameras.
 
-Each account differs from the others within plausible slip, delay and noise. A speed that was seen or reported is
-plausible if it lies between the lowest and the highest speed of the last delay_s, widened by the slip, the tolerance
-and three standard deviations. The part of it beyond, integrated over time, is the unexplained motion in m and rad: some
-of it slows the base down, more stops it. While nothing is unexplained, the sum falls again.
+The three differ by plausible slip, delay and noise. A speed that was seen or reported is plausible if it lies between
+the lowest and the highest expected speed of the last delay_s, widened by the slip, the tolerance and three standard
+deviations. What lies beyond, integrated over time, is the unexplained motion in m and rad: some of it slows the base
+down, more stops it. While nothing is unexplained, the sum falls again.
 
     commanded 0.3 m/s, seen 0: the slowest plausible speed is 0.3 (1 - 0.4) - 0.02 = 0.16 m/s: 0.16 m a second
 
@@ -24,9 +24,10 @@ from msgspec import Meta
 from omnid.core.control.heading_controller import LONGEST_TICK_S, STOP, Twist
 from omnid.core.nanoseconds import S_PER_NS
 
-MOST_ACCOUNTS: Final = 2048  # kept of each kind, because 10 s at the highest rate of commands have so many
-SIGMAS: Final = 3.0  # Of right differences 0.3 % exceed this, so that false alarms are rare.
-# Of the motion that stops, per second in which nothing is unexplained; by trial on development seeds.
+MAX_MOTIONS: Final = 2048  # kept of each kind: 10 s at the highest rate of commands
+SIGMAS: Final = 3.0  # Noise exceeds this in 0.3 % of the samples, so that false alarms are rare.
+# Fraction of the stopping limit by which the sum falls per second while nothing is unexplained; by trial on development
+# seeds.
 RECOVERY: Final = 0.5
 # After this time at rest by command, all unexplained motion is forgotten; by trial on development seeds.
 REST_S: Final = 2.0
@@ -48,18 +49,18 @@ ADVICE: Final = "check wheels, cameras, motor.drive, baseline and T_base_rig of 
 
 
 class Difference(NamedTuple):
-    """By how much wheels or gyro have moved farther than the images show."""
+    """Motion that wheels or gyro report beyond what the images show."""
 
     amount: float = 0.0  # m or rad
-    span_s: float = 0.0  # in the newest so many seconds
+    span_s: float = 0.0  # time, up to now, in which it has arisen
 
     def part(self, seconds: float) -> float:
-        """Return its part in so many seconds, the whole at most."""
+        """Return the amount in a part of the span [s], the whole amount at most."""
         return self.amount * min(1.0, seconds / self.span_s) if self.span_s > 0 else 0.0
 
 
 class Conflict(NamedTuple):
-    """Account of the motion (images, wheels, gyro) that differs slowly from the others."""
+    """Slow disagreement of one sensor of the motion (images, wheels, gyro) with the others."""
 
     reason: str = ""  # one of CONFLICTS; empty: all agree
     detail: str = ""  # size of the disagreement, in words
@@ -102,8 +103,8 @@ class Motion(NamedTuple):
     yaw_rate_sigma_radps: float = 0.0
 
 
-# A motion that was commanded or reported: its time [ns], velocity and yaw rate.
-_Account: TypeAlias = tuple[int, float, float]
+# Time [ns], velocity [m/s] and yaw rate [rad/s] of a motion that was commanded or reported.
+_TimedMotion: TypeAlias = tuple[int, float, float]
 
 
 class MotionMonitor:
@@ -114,11 +115,11 @@ class MotionMonitor:
 
     def __init__(self, settings: MotionSettings) -> None:
         self._settings = settings
-        self._commanded: deque[_Account] = deque(maxlen=MOST_ACCOUNTS)
-        self._reported: deque[_Account] = deque(maxlen=MOST_ACCOUNTS)
+        self._commanded: deque[_TimedMotion] = deque(maxlen=MAX_MOTIONS)
+        self._reported: deque[_TimedMotion] = deque(maxlen=MAX_MOTIONS)
         self._driven_ns: int | None = None  # the newest tick with a commanded motion
         self._last_seen_ns = self._last_report_ns = 0
-        self._wheels_report = False  # they have reported a motion: some controllers never do
+        self._wheels_report = False  # whether the wheels have reported a motion: some controllers never do
         self._unexplained = {reason: [0.0, 0.0] for reason in COMPARED}  # m, rad
         self.reason = ""  # the disagreement for which the base must stop, until it has stood for REST_S
         self.detail = ""  # the motions that disagree
@@ -168,18 +169,20 @@ class MotionMonitor:
         """True if a motion was commanded within the delay before a time."""
         return any(velocity_mps or turn_radps for _, velocity_mps, turn_radps in self._recent(self._commanded, at_ns))
 
-    def _recent(self, accounts: deque[_Account], at_ns: int) -> list[_Account]:
-        """Return the accounts within the delay before a time, the newest first."""
+    def _recent(self, motions: deque[_TimedMotion], at_ns: int) -> list[_TimedMotion]:
+        """Return the motions within the delay before a time, the newest first."""
         since_ns = at_ns - self._settings.delay_s / S_PER_NS
         return [
-            entry for entry in takewhile(lambda entry: entry[0] >= since_ns, reversed(accounts)) if entry[0] <= at_ns
+            entry for entry in takewhile(lambda entry: entry[0] >= since_ns, reversed(motions)) if entry[0] <= at_ns
         ]
 
-    def _compare(self, found: Motion, explained: list[_Account], dt_s: float, too_little: str, too_much: str) -> None:
-        """Add by how far a motion lies beyond what others explain, to the reason; a speed of NaN is not compared.
+    def _compare(
+        self, found: Motion, explained: list[_TimedMotion], dt_s: float, too_little: str, too_much: str
+    ) -> None:
+        """Add the part of a motion that others do not explain to the sum of its reason; a speed of NaN is not compared.
 
-        A slip of the slowest speed never changes its sign. too_little, too_much: the reasons by the side on which it
-        lies beyond; where nothing does, the sums fall.
+        A slip of the slowest speed never changes its sign. too_little, too_much: the reasons of a motion that is slower
+        or faster than explained; the sum of the reason that does not hold falls.
         """
         limits = self._settings
         axes = (
@@ -189,7 +192,7 @@ class MotionMonitor:
         for axis, (value, tolerance, limit) in enumerate(axes):
             if not math.isfinite(value):
                 continue
-            speeds = [account[1 + axis] for account in explained]
+            speeds = [motion[1 + axis] for motion in explained]
             low, high = min(speeds), max(speeds)
             low, high = low - limits.slip * abs(low) - tolerance, high + limits.slip * abs(high) + tolerance
             beyond = max(0.0, value - high) - max(0.0, low - value)
@@ -199,7 +202,7 @@ class MotionMonitor:
                 sums[axis] = max(0.0, sums[axis] + dt_s * (abs(beyond) if adds else -RECOVERY * limit))
                 if sums[axis] > limit and not self.reason:
                     what = "reported" if reason == NOT_FOLLOWED else "seen"
-                    mean = (sum(account[part] for account in explained) / len(explained) for part in (1, 2))
+                    mean = (sum(motion[part] for motion in explained) / len(explained) for part in (1, 2))
                     moved = found.velocity_mps, found.yaw_rate_radps
                     self.reason, self.detail = reason, f"({what} {_words(*moved)}, expected {_words(*mean)})"
 
@@ -214,5 +217,5 @@ def _words(velocity_mps: float, yaw_rate_radps: float) -> str:
 
 
 def _passed_s(before_ns: int, now_ns: int) -> float:
-    """Return the time between two accounts, at most LONGEST_TICK_S: nothing is known of a longer gap."""
+    """Return the time between two samples, at most LONGEST_TICK_S: nothing is known of a longer gap."""
     return min(max(0.0, (now_ns - before_ns) * S_PER_NS), LONGEST_TICK_S)

@@ -14,7 +14,7 @@ from omnid.core.control.safety_rules import SafetyInputs
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.tracking_state import TrackingState
 
-# A voltage that is low for a shorter time is that of a motor that starts; by trial on development seeds.
+# A voltage may be low for this time while a motor starts; by trial on development seeds.
 BATTERY_S: Final = 2.0
 POSE_DEGRADED: Final = "the pose is degraded"
 MOTION_DOUBTFUL: Final = "the motion that is seen or reported is not the commanded one"
@@ -54,7 +54,7 @@ class Lasting:
         self.seconds = math.nan
 
     def add(self, now_ns: int, *, holds: bool) -> None:
-        """Take a sample."""
+        """Add a sample."""
         if not holds:
             self._since_ns = None
         elif self._since_ns is None:
@@ -81,12 +81,12 @@ class Plausibility:
         return MOTION_DOUBTFUL if self.monitor.is_doubtful else self.conflict.reason
 
     @property
-    def account(self) -> Conflict:
-        """What is measured of the disagreement for which the base stops, or drives slowly."""
+    def disagreement(self) -> Conflict:
+        """The measured disagreement for which the base stops or drives slowly."""
         return Conflict(self.monitor.reason, self.monitor.detail, True) if self.monitor.reason else self.conflict
 
     def add_pose(self, stamp_ns: int, state: str, seen: Motion, resets: int, conflict: Conflict = AGREE) -> None:
-        """Take the next pose, and how often odometry has begun again; a lost pose says nothing about the motion."""
+        """Add the next pose; resets: how often odometry has begun again. A lost pose says nothing about the motion."""
         settings = self._settings
         self.conflict = conflict if self._checks else AGREE
         self._is_degraded = state == TrackingState.DEGRADED
@@ -102,13 +102,13 @@ class Plausibility:
             self.monitor.add_seen(stamp_ns, seen)
 
     def add_report(self, now_ns: int, report: MotorReport) -> None:
-        """Take a report of the motor controller."""
+        """Add a report of the motor controller."""
         self.monitor.add_report(now_ns, report.motion)
         self._is_faulty = report.fault != 0
         self._low.add(now_ns, holds=report.battery_v < self._settings.battery_v)
 
     def added_to(self, inputs: SafetyInputs) -> SafetyInputs:
-        """Return the inputs of the safety rules with these; a reset counts for one step."""
+        """Return the inputs of the safety rules with the findings about pose and motor; a reset counts for one step."""
         is_reset, self._is_reset = self._is_reset, False
         return replace(
             inputs,

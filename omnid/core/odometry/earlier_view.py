@@ -1,12 +1,15 @@
 """Dense points that an earlier view of the same camera contradicts.
 
-What is fixed to a camera, as the reflection of its lens in its mirror, lies at the same pixels of both panoramas of the
-pair: they match, at some disparity. In a window of K pixels with unknown gain and offset, a hypothesis h of where the
-earlier panorama showed the same surface has the log-likelihood -K/2 log(1 - rho_h^2), rho_h > 0 the correlation of the
-windows. There are three: the point stood in the world at its range, so that it was seen where the motion puts it; it is
-fixed to the rig, so that it was seen at the same pixel; or none of both, with the likelihood of rho = LEAST. A point is
-contradicted where the first is not the likeliest. The third one also finds wrong periods of repeated texture, and edges
-between two surfaces.
+What is fixed to the rig, such as the reflection of a lens in its mirror, keeps its pixels while the rig moves; both
+panoramas of a pair show it, so that they match, at some disparity. In a window of K pixels with unknown gain and
+offset, a hypothesis h of where the earlier panorama showed the same surface has the log-likelihood
+-K/2 log(1 - rho_h^2), rho_h > 0 the correlation of the windows. The hypotheses are:
+
+1. The point is fixed to the world, at its range: it was seen where the motion predicts it.
+2. It is fixed to the rig: it was seen at the same pixel.
+3. Neither, with the likelihood of rho = LEAST: also wrong periods of repeated texture, and edges between two surfaces.
+
+A point is contradicted where the first is not the likeliest.
 """
 
 from __future__ import annotations

@@ -2,15 +2,15 @@
 
 A row at the share s of a raw image (0: the first one, 1: the last one) that is read within the time c is exposed
 c (s - 1/2) after its middle. Landmark x is then seen off by c f(s, x, V), f = -(s - 1/2) J(x) (v + w x x), by the
-velocity V = [v; w] of the rig and the derivative J of a view by a point. So was it in its keyframe k, by which it has
-its place, and its residual at a later pair is
+velocity V = [v; w] of the rig and the derivative J of a view by a point. In its keyframe k, which gives its position,
+it was seen off in the same way, and its residual at a later pair is
 
     e = c (f(s, x, V) - J(x) R_k J(x_k)^-1 f(s_k, x_k, V_k)) + J(x) [-1 [x]x] d_k + noise,
 
 d_k (6,) the error of the pose against that keyframe. The times c of both cameras, and a lag of the upper camera, whose
 prior is that of a trigger's jitter, are one information filter; the d_k are eliminated (Schur complement). One c is as
-likely as its generalised likelihood ratio, with the Bayesian information criterion. A part of the landmarks is used, so
-few that their errors are independent.
+likely as its generalised likelihood ratio, with the Bayesian information criterion. Of each pair one landmark in
+CORRELATED_LANDMARKS is used, so that their errors are independent.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 LAG_S: Final = 0.003  # standard deviation of the time between the exposures of two cameras that are triggered together
-LEAST_PX: Final = 0.5  # by which a part of an image is displaced against the rest: less harms no pose
-MEMORY_S: Final = 1.0  # time after which evidence counts as a third: vehicles change their motion more often
-EVERY_S: Final = 0.04  # between two pairs that are used at least: nearer ones show the same motion
+LEAST_PX: Final = 0.5  # least displacement of a part of an image against the rest: less harms no pose
+MEMORY_S: Final = 1.0  # time constant with which old evidence decays: vehicles change their motion more often
+EVERY_S: Final = 0.04  # least time between two pairs that are used: nearer ones show the same motion
 CAMERAS: Final = ("lower", "upper")
 LAG: Final = 2  # the unknown behind the times of the lower and the upper camera
 SETS: Final = ((0,), (1,), (0, 1))  # cameras whose images are wrong in one way
@@ -109,9 +109,9 @@ class LineTimes:
         self._px_per_s = 0.0  # median motion of the landmarks in the last image
 
     def add(self, seq: int, seen: PoseEstimate, local_map: LocalMap, velocity: Array, dt_s: float) -> None:
-        """Use the inliers of a pair (seq: its number), dt_s after the one before.
+        """Add the residuals of the inliers of a pair.
 
-        velocity (6,): of the rig in it.
+        seq: number of the pair. velocity (6,): of the rig in it [m/s; rad/s]. dt_s: since the pair before.
         """
         # 1. The velocities at the keyframes: the first one of a map has that of the step after it.
         known = {key: self._velocities.get(key, velocity) for key in local_map.keyframes}
@@ -154,12 +154,13 @@ class LineTimes:
         total = (is_own @ each.reshape(len(each), -1)).reshape(-1, 6 + size, 6 + size)
         # A prior of a metre and a radian of each pose: a keyframe with one or two landmarks leaves next to nothing.
         of_d, across = total[:, :6, :6] + np.eye(6), total[:, :6, 6:]
-        left = (total[:, 6:, 6:] - np.swapaxes(across, 1, 2) @ np.linalg.solve(of_d, across)).sum(axis=0)
+        reduced = (total[:, 6:, 6:] - np.swapaxes(across, 1, 2) @ np.linalg.solve(of_d, across)).sum(axis=0)
         unit = max(1.0, float(squared.mean()) / VIEW_DIMENSIONS)
-        # 5. The sum over time. Where the view hardly moves, patches err as in the pair before: a pixel is a new sample.
+        # 5. The sum over time. Where the view hardly moves, patches err as in the pair before: a sample is independent
+        #    after a motion of one pixel.
         self._px_per_s = float(np.median(np.linalg.norm(moved[usable][:, :2], axis=1)))
         kept, new = math.exp(-dt_s / MEMORY_S), min(1.0, self._px_per_s * dt_s)
-        self._information = kept * self._information + new * left / unit
+        self._information = kept * self._information + new * reduced / unit
         self._views = kept * self._views + new * len(squared)
 
     def likeliest(self) -> ReadOut | None:

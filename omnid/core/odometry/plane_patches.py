@@ -32,20 +32,20 @@ WINDOW_PX = 13  # side of a patch
 TEMPLATE_PX = WINDOW_PX + 2  # holds the window and the border that the gradient's 3x3 operator needs
 # Half the side of the window in which the slope of the dense disparity is taken.
 SLOPE_REACH_PX = 8
-# Disparities that differ more belong to another surface.
+# Disparities that differ by more belong to another surface.
 SAME_SURFACE_PX = 2.0
-# px^2, weight of slope zero (an upright surface facing the camera) in the least squares: a full window has 6936
-# px^2, so that the slope is 0.7 % too flat.
+# Weight [px^2] of slope zero (an upright surface facing the camera) in the least squares: a full window has 6936, so
+# that its slope is 0.7 % too flat.
 SLOPE_PRIOR = 50.0
-# Side of the window in which slopes are fitted. They err by the third power of it, but a large window leaves the plane.
-# 17 was tried as well, on thirteen logs of development: set by trial.
+# Side of the window in which slopes are fitted, by trial on development logs: in a smaller one they are noisier, a
+# larger one leaves the plane.
 SLOPE_WINDOW_PX, SLOPE_ROUNDS = 21, 2
-MAX_SLOPE = 0.7  # Largest slope of a disparity, because a steeper plane is seen so obliquely that it has no patch.
-# Px/px, of the start, because those of dense stereo are a third too flat, its windows being upright.
+MAX_SLOPE = 0.7  # Largest slope of a disparity: steeper planes are seen too obliquely for a patch.
+# Standard deviation [px/px] of the slopes by dense stereo, which are a third too flat, because its windows are upright.
 SLOPE_SIGMA = 0.1
-# Reach of patches whose pose and depth are known well.
+# Largest distance of an aligned patch from its prediction, if pose and depth are known well.
 REACH_PX = 1
-# By which a patch may move sideways in the upper panorama from where it was tracked to.
+# Largest lateral distance of an aligned patch in the upper panorama from its tracked pixel.
 CROSS_PX = 0.5
 
 
@@ -149,11 +149,10 @@ def fitted_slopes(
 ) -> Array:
     """Return slopes (N, 2) of the disparity at pixels (N, 2) of the lower panorama, seen near (N, 2) in the upper one.
 
-    start (N, 2): first values, which stay where near is NaN or the fit fails. A plane makes the upper window a bent
-    lower one: its shift, its two slopes, gain and offset are fitted to both windows together, by Gauss-Newton with the
-    lower one's gradient, in rounds, each of which bends the lower window anew. The start is a weak prior. Dense
-    slopes are a third too flat and scatter by 0.05; a landmark's patch, seen from elsewhere, would be shifted by tenths
-    of a pixel.
+    start (N, 2): slopes by dense stereo, a weak prior; they are returned where near is NaN or the fit fails. A plane
+    warps the lower window into the upper one. Shift, two slopes, gain and offset are fitted by Gauss-Newton with the
+    gradient of the lower window, which each round warps again. Dense slopes are a third too flat and scatter by 0.05:
+    with them a patch seen from elsewhere would be shifted by tenths of a pixel.
     """
     known, slopes = np.flatnonzero(np.isfinite(near).all(axis=1)), start.copy()
     found, fits, predicted = start[known], np.ones(len(known), bool), near[known]
@@ -178,9 +177,9 @@ def _in_upper(
 ) -> Floats:
     """Return templates of the lower panorama's patches at pixels (N, 2) as the upper one shows them at predicted."""
     points = triangulate(np.column_stack([pixels, predicted[:, 1]]), model.cylinder, model.baseline_m)
-    one, still = np.zeros(len(pixels), np.intp), np.tile(np.eye(4), (len(pixels), 1, 1))
+    anchors, identity = np.zeros(len(pixels), np.intp), np.tile(np.eye(4), (len(pixels), 1, 1))
     return plane_templates(
-        {0: pair[0]}, one, pixels, (points, slopes), still, model, predicted, upper=True, window_px=window_px
+        {0: pair[0]}, anchors, pixels, (points, slopes), identity, model, predicted, upper=True, window_px=window_px
     )
 
 
@@ -223,9 +222,9 @@ def align_rows(
 ) -> tuple[Array, Array]:
     """Align patches of the lower panorama at points (N, 2) with the upper one near pixels (N, 2), NaN where unknown.
 
-    slopes (N, 2) of the disparity; reach_px: from the pixels; spread_px: standard deviations (N,) of their columns,
-    twice. Returns the rows (N,), NaN where no patch fits, and their variances (N,) [px^2] by the noise. Gain and offset
-    of the two cameras may differ.
+    slopes (N, 2) of the disparity; reach_px: largest distance from the pixels; spread_px (N,): two standard deviations
+    of their columns. Returns the rows (N,), NaN where no patch fits, and their variances (N,) [px^2] by the noise. Gain
+    and offset of the two cameras may differ.
     """
     known = np.flatnonzero(near[:, 1] > points[:, 1])
     pixels, predicted = points[known], near[known]

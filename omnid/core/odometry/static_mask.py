@@ -28,12 +28,12 @@ USUAL_RANGE_M = 3.0  # range at which a translation is converted to an angle.
 SAME_LEVEL = 6
 MIN_CONTRAST = 25  # grey levels within REACH_PX, because without contrast nothing can be seen to keep its place
 REACH_PX = 4  # at half resolution.
-EVIDENCE = 5  # consecutive comparisons, so many that chance repeats no pixel in all of them; each is of another view
-MAX_EVIDENCE = 4 * EVIDENCE  # Limit, so that a pixel that was wrongly taken for fixed is released after a few changes.
+EVIDENCE = 5  # Number of comparisons, each of another view, after which a pixel is fixed: chance repeats none in all.
+MAX_EVIDENCE = 4 * EVIDENCE  # Limit, so that a pixel that was fixed by mistake is released after a few changes.
 
 
 class StaticMask:
-    """Learn, at half resolution, where structure stays the same while the robot moves."""
+    """Learns, at half resolution, where structure stays the same while the robot moves."""
 
     def __init__(self, azimuths_rad: tuple[float, float] = (math.pi, -math.pi)) -> None:
         """azimuths_rad: of the left and of the right edge of the panoramas."""
@@ -72,7 +72,7 @@ class StaticMask:
         self._streak = np.where(moving, counted, streak)
         margin = np.ones((2 * REACH_PX + 1, 2 * REACH_PX + 1), np.uint8)
         fixed = cv2.dilate((self._streak >= EVIDENCE).view(np.uint8), margin)
-        # Mostly nothing is: a mask of the whole size would be made, and taken off each frame, for nothing.
+        # Usually nothing is fixed: then no mask of the whole size is made and applied.
         self._free = None
         if fixed.any():
             free = cv2.resize(1 - fixed, shape[::-1], interpolation=cv2.INTER_NEAREST)

@@ -1,4 +1,4 @@
-"""Tracking state: what supports the pose, and the counters of a loss.
+"""Tracking state of the odometry, and the times and counts of losses.
 
 A pose by the cameras is TRACKING; DEGRADED with few inliers, few of them in the upper camera, with more than one
 hypothesis of the motion, or after a gap or a refused frame. A frame without one is DEGRADED while wheels and gyro carry
@@ -36,20 +36,20 @@ class Tracking:
         return self._refused_s is not None
 
     def accept(self, dt_s: float, *, is_doubtful: bool, is_reset: bool) -> None:
-        """Go on after a frame with a pose; is_reset: its heading is not what was published."""
+        """Update the state after a frame with a pose; is_reset: its heading is not what was published."""
         is_doubtful |= self.is_refused or dt_s > self._limits.max_gap_s
         self._fix(TrackingState.DEGRADED if is_doubtful else TrackingState.TRACKING, self.resets + is_reset)
 
     def refuse(
         self, dt_s: float, *, is_textured: bool, is_elsewhere: bool = False, carried: bool = False, stayed: bool = False
     ) -> bool:
-        """Go on after a frame without a pose; return whether the map is to be started again.
+        """Update the state after a frame without a pose; return whether the map is to be started again.
 
         is_textured: it has enough corners for a map. is_elsewhere: it was recognised at a place to which the predicted
         motion does not lead. stayed: the predicted pose has hardly changed since the last fix, and no landmark of the
         map shows it.
         """
-        # Nothing is seen in a time without frames: no more of it counts than goes without a doubt.
+        # Of a gap without frames no more than max_gap_s counts, because nothing could be seen in it.
         step_s = min(dt_s, self._limits.max_gap_s)
         self._refused_s = 0.0 if self._refused_s is None else self._refused_s + step_s
         is_lost = self._refused_s >= self._limits.lost_s
@@ -63,14 +63,14 @@ class Tracking:
         return restarts
 
     def start(self, *, carried: bool, is_elsewhere: bool = False) -> None:
-        """Go on after a frame at which a map was started."""
-        # A map that takes the place of a lost one says nothing about the motion between the two.
+        """Update the state after a frame at which a map was started."""
+        # A map that replaces a lost one says nothing about the motion between the two.
         is_unknown = self.unknown_motion or (self._has_begun and not carried)
         is_doubtful = is_unknown and not is_elsewhere
         self._fix(TrackingState.DEGRADED if is_doubtful else TrackingState.TRACKING, self.resets + is_unknown)
 
     def miss(self, dt_s: float, *, carried: bool) -> None:
-        """Go on after a frame that has too few landmarks to start a map, where there is none."""
+        """Update the state after a frame that has too few landmarks to start a map, where there is none."""
         self._refused_s = self._unmatched_s = None
         self._predict(dt_s, is_lost=True, carried=carried)
 
