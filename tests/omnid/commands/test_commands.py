@@ -1,17 +1,14 @@
-"""`omnid config`, `replay --json`, `run`, `log info`, `record`, `map show|export` and `goto` as commands."""
+"""`omnid config`, `replay --json`, `log info`, `record` and `map show|export` as commands."""
 
 from __future__ import annotations
 
 import json
-import math
 import os
-import pty
 import re
 import signal
 import subprocess
 import sys
 from contextlib import closing
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -20,22 +17,14 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from calib import se3
 from drivers.logs.log_reader import LogReader
 from omnid.cli import main
-from omnid.client import Robot
 from omnid.config import Config, load_config
-from omnid.errors import OmnidError
 from omnid.formats.place_file import write_places
-from omnid.formats.tum import read_tum
 from tests.drivers.logs.mcap_logs import BARE, LOWER, START_NS, Entry, pairs, text, write_log
 from tests.omnid.formats.place_maps import RIG, some_places
-from tests.omnid.transport.bus_fixtures import free_endpoint
 from tests.ply import read_ply
-from tests.ports import free_port
 from tests.replay.command import Command
-from tests.replay.live import started
-from tests.waiting import wait_until
 
 
 def test_a_minimal_file_has_what_a_robot_needs_and_changes_nothing(omnid: Command, tmp_path: Path) -> None:
@@ -91,48 +80,6 @@ def test_results_of_a_replay_as_json(omnid: Command, scene: Path, tmp_path: Path
     assert 0 < first["elapsed_s"] < 600
     metrics = loaded(omnid, "eval", tum, scene / "truth.txt")
     assert metrics["pairs"] == FEW and 0 < metrics["ate_rmse_m"] < 0.05
-
-
-SAMPLE = Path(str(files("omnid.sample") / "log.mcap"))
-
-
-def test_says_that_it_is_ready_and_ends_with_a_summary(tmp_path: Path) -> None:
-    log, endpoint = tmp_path / "log.mcap", free_endpoint()
-    with SAMPLE.open("rb") as sample:
-        log.write_bytes(sample.read(450_000))
-    master, slave = pty.openpty()
-    command = [
-        sys.executable,
-        "-m",
-        "omnid",
-        "run",
-        "--log",
-        str(log),
-        "--once",
-        "--motor",
-        "simulated",
-        "--set",
-        f'bus.listen=["{endpoint}"]',
-    ]
-    with subprocess.Popen(command, stdout=slave, stderr=slave, stdin=subprocess.DEVNULL) as process:
-        os.close(slave)
-        shown = b""
-        while data := _read(master):
-            shown += data
-        assert process.wait() == 0
-    os.close(master)
-    text = shown.decode()
-    ready = f"omnid: ready: poses of 'omnid' at {endpoint} (`omnid listen`); the wheels turn after `omnid arm`"
-    assert ready in text and re.search(r"\x1b\[K\d+\.\d\d m .* poses/s, ", text)
-    last = re.findall(r"omnid: .*", text)[-1]  # numba resets colours behind it where colorama is installed
-    assert re.match(r"omnid: ended: \d+ poses, \d+\.\d\d m, 0 resets; tracking \d+", last)
-
-
-def _read(master: int) -> bytes:
-    try:
-        return os.read(master, 4096)
-    except OSError:  # the program has ended
-        return b""
 
 
 pytestmark = pytest.mark.usefixtures("default_signals")
@@ -289,51 +236,3 @@ def test_mistakes_are_one_line(omap: Path, words: list[str], message: str, capsy
     error = capsys.readouterr().err
     assert code == 2 and message in error and error.count("\n") == 1
     assert omap.read_bytes() == before and [path.name for path in omap.parent.iterdir()] == ["a.omap"]
-
-
-GOAL = (0.6, 0.1, 45.0)  # m, m, deg
-NEAR_M, NEAR_DEG = 0.05, 2.0
-
-
-def takes_requests(port: int) -> bool:
-    try:
-        with Robot(connect=(f"tcp/127.0.0.1:{port}",)) as robot:
-            return "no pose yet" not in robot.driver().navigate("resume").text
-    except OmnidError:
-        return False
-
-
-@pytest.mark.slow
-def test_goals_in_odom_and_in_the_saved_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    port, truth = free_port(), tmp_path / "truth.tum"
-    connect = ["--connect", f"tcp/127.0.0.1:{port}"]
-    command = [
-        *(sys.executable, "-m", "omnid", "simulate", "room", "--no-people", "--size", "320"),
-        *("--truth", str(truth)),
-        *("--map", str(tmp_path / "site.omap")),
-        *("--set", f'bus.listen=["tcp/127.0.0.1:{port}"]'),
-        *("--set", "controller.collision.unknown=slow"),
-    ]  # such small images show little of the floor
-    goals: dict[str, list[tuple[str, ...]]] = {"odom": [("0.8", "0"), ("0", "0", "0")], "map": [tuple(map(str, GOAL))]}
-    for frame, poses in goals.items():
-        with started(command, port) as daemon:
-            wait_until(lambda: takes_requests(port), "the navigation")
-            if frame == "odom":
-                assert main(["goto", "1", "0", *connect]) == 2
-                assert "not armed" in capsys.readouterr().err
-                assert main(["arm", *connect]) == 0
-                assert main(["goto", "1", "0", "--frame", "map", *connect]) == 2
-                assert "not localised in a map" in capsys.readouterr().err
-            for pose in poses:
-                # A busy computer may stop the simulated motor controller for a moment, which disarms.
-                wait_until(
-                    lambda pose=pose: (
-                        main(["arm", *connect]) == 0 and main(["goto", *pose, "--frame", frame, *connect]) == 0  # noqa: B023
-                    ),
-                    "the goal",
-                )
-            assert "reached" in capsys.readouterr().out
-            assert daemon.end()[0] == 0
-    end = read_tum(truth).T[-1]
-    assert math.dist(end[:2, 3], GOAL[:2]) < NEAR_M
-    assert math.degrees(float(se3.yaw(end))) == pytest.approx(GOAL[2], abs=NEAR_DEG)

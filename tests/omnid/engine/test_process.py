@@ -12,7 +12,6 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -102,28 +101,6 @@ OF_A_LIBRARY = SETUP + (
 )
 
 
-@dataclass
-class Log:
-    """A handler that writes into memory."""
-
-    stream: io.StringIO = field(default_factory=io.StringIO)
-
-    def __post_init__(self) -> None:
-        self.handler = StderrHandler(self.stream)
-
-    def __call__(self, level: int, text: str, **attributes: object) -> None:
-        self.handler.handle(logging.makeLogRecord({"name": LOGGER.name, "levelno": level, "msg": text, **attributes}))
-
-    @property
-    def lines(self) -> list[str]:
-        return self.stream.getvalue().splitlines()
-
-
-@pytest.fixture
-def log() -> Log:
-    return Log()
-
-
 @pytest.fixture
 def pipe() -> Iterator[tuple[int, int]]:
     ends = os.pipe()
@@ -167,9 +144,10 @@ def test_the_command_line_writes_its_error_with_priority(pipe: tuple[int, int]) 
         ("x" * 10**6, "x" * 4000),
     ],
 )
-def test_writes_one_printable_line_of_bounded_length_per_record(log: Log, text: str, line: str) -> None:
-    log(logging.INFO, text)
-    assert log.lines == [f"omnid: {line}"]
+def test_writes_one_printable_line_of_bounded_length_per_record(text: str, line: str) -> None:
+    stream = io.StringIO()
+    StderrHandler(stream).handle(logging.makeLogRecord({"name": LOGGER.name, "levelno": logging.INFO, "msg": text}))
+    assert stream.getvalue() == f"omnid: {line}\n"
 
 
 allowed = pytest.mark.skipif(highest_priority() < 20, reason="no right to real-time priorities: ulimit -r 20")

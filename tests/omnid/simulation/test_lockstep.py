@@ -38,7 +38,7 @@ from tests.bench.obstacles import ahead
 from tests.busy import stopped_by_turns
 from tests.ports import free_port
 from tests.replay.live import started
-from tests.simulation.disturbed import Fault, Slip, Tamper, disturbed, simulate
+from tests.simulation.disturbed import Fault, Tamper, simulate
 from tests.waiting import wait_until
 
 SIZE = 160
@@ -92,15 +92,6 @@ def test_a_motor_that_is_cut_off_stops_by_its_own_watchdog() -> None:
     assert places[1.5] - places[1.4] > 0.015
     assert places[2.9] == places[2.5]
     assert any("no answer" in line for _, line in run.lines)
-
-
-def test_slipping_wheels_hardly_move_the_robot_and_are_noticed() -> None:
-    robot = disturbed(make_robot(SIZE), slips=(Slip(1.5, 9.0, 0.9),))
-    run = simulate(world(), robot, forward, seconds=2.5, seed=1, config=CONFIG)
-    x_m = run.truth_in_odom[:, 0, 3]
-    assert x_m[14] - x_m[10] > 0.08 and x_m[24] - x_m[20] < 0.02
-    noticed_s = (run.stamps_ns[run.slipping] - run.stamps_ns[0]) * 1e-9
-    assert len(noticed_s) >= 5 and noticed_s.min() > 1.5
 
 
 def fine_drive(tamper: Tamper | None = None, *faults: Fault) -> SimulatedRun:

@@ -19,16 +19,11 @@ from drivers.frame import Camera, Frame, gray
 from drivers.logs.log_reader import LogReader
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.camera_config import PairConfig
-from omnid.config import load_config
 from omnid.errors import OmnidError
 from omnid.messages import FramePair
-from omnid.stages.front_end import FrontEnd
-from omnid.stages.geometry import geometry
 from omnid.stages.synchronise import MAX_WAITING, Decoder, MotionInbox, Skew, Synchronise
-from omnid.tracking_state import TrackingState
-from tests.simulation import MountedSensor, Sensor, build, corridor, render_grey, write_log
+from tests.simulation import build, write_log
 from tests.simulation.logs import Readout
-from tests.simulation.paths import planar_poses
 from tests.simulation.rigs import make_rig, with_upper_rotated
 
 MS = 1_000_000
@@ -284,30 +279,3 @@ def test_images_with_both_stamps_give_the_poses_of_a_replay(skewed: tuple[Path, 
         odometry.process(lower.stamp_ns + 1, *images, upper_stamp_ns=lower.stamp_ns // 1000)
     with pytest.raises(omnid.OmnidError, match="upper_stamp_ns: expected an integer"):
         odometry.process(lower.stamp_ns + 1, *images, upper_stamp_ns=0.5)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("dark_pairs", [1, 3])
-def test_darkness_after_the_first_pair_costs_nothing(dark_pairs: int) -> None:
-    """Wheels carry the pose there, and the velocity that the first map waits for is known."""
-    rig, scene, period_ns, skew_s, speed_mps = make_rig(size=256), corridor(3), 100_000_000, 0.02, 0.5
-    config = load_config(None, ["rig.check=off"])
-    front_end = FrontEnd(geometry(rig, config.panorama), config)
-    rng = np.random.default_rng(0)
-    mounted = rig.lower, rig.upper
-    sensors = [MountedSensor.of(Sensor(), one.visible, one.camera.size) for one in mounted]
-    for number in range(dark_pairs + 3):
-        stamp_ns = 10**9 + number * period_ns
-        along_m = speed_mps * (number * period_ns * 1e-9 + np.array([0.0, skew_s]))
-        poses = planar_poses(np.column_stack([along_m, np.zeros(2)]), np.zeros(2))
-        images = [
-            sensor.expose(render_grey(scene, one, pose), rng)
-            for sensor, one, pose in zip(sensors, mounted, poses, strict=True)
-        ]
-        if 1 <= number <= dark_pairs:
-            images = [np.zeros_like(image) for image in images]
-        wheels = tuple(WheelSample(stamp_ns + k * period_ns // 5, speed_mps, 0.0) for k in range(-9, 2))
-        update = front_end.process(FramePair(number, stamp_ns, *images, skew_s, wheels))
-        front_end.odometry.complete()
-    assert update.state is TrackingState.TRACKING and update.reset_counter == 0
-    assert abs(update.T_odom_rig[0, 3] - along_m[0]) < 3e-3
-    assert np.sqrt(update.covariance[0, 0]) < 0.01

@@ -12,7 +12,6 @@ import sys
 import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -99,24 +98,6 @@ def test_zenohs_own_file_says_all_but_the_endpoints(tmp_path: Path) -> None:
 
 
 # Publishing.
-
-
-def test_a_program_reads_the_same_odometry() -> None:
-    endpoint, came = free_endpoint(), list[zenoh.Sample]()
-    with (
-        contextlib.closing(Bus(BusConfig(robot="site/robot-1", listen=(endpoint,)))) as bus,
-        session(mode="client", connect__endpoints=[endpoint]) as program,
-    ):
-        subscriber = program.declare_subscriber("site/robot-1/**", came.append)
-        numbers = count()
-        wait_until(lambda: bus.publish("odom", odometry(next(numbers))) is None and len(came) >= 5)
-        subscriber.undeclare()
-    assert (came[0].express, came[0].congestion_control) == (False, zenoh.CongestionControl.DROP)
-    for sample in came:
-        assert (str(sample.key_expr), str(sample.encoding)) == ("site/robot-1/odom", "application/cdr")
-        assert sample.priority == zenoh.Priority.REAL_TIME
-        record = codec.decode_pose(sample.payload.to_bytes())
-        assert sample.payload.to_bytes() == odometry(record.stamp_ns - 10**9)
 
 
 def test_late_subscribers_receive_the_newest_message_at_once() -> None:

@@ -103,72 +103,48 @@ def no_images(at_s: float, motion: Motion) -> Motion:
     return Motion(0.0, 0.0, 1.0, 1.0) if 2 < at_s < 6 else motion
 
 
-@pytest.mark.parametrize(
-    ("wish", "world"),
-    [
-        (steady(0.0), World()),
-        (steady(0.6, 1.2), World()),
-        (steady(-0.5), World(lag_s=0.3)),
-        (steady(0.05, 0.1), World()),
-        (alternating, World()),
-        (alternating, World(lag_s=0.3, steps_s=0.25)),
-        (steady(0.5, 0.8), World(grip=0.65)),
-        (steady(0.5, 0.8), World(grip=1.3)),
-        (steady(0.5), World(seen=bumps)),
-        (steady(0.5), World(seen=no_images)),
-        (steady(0.5), World(reported=lambda *_: Motion(0.0, 0.0))),
-        (steady(0.5, 0.5), World(reported=lambda _, motion: motion._replace(yaw_rate_radps=math.nan))),
-        (steady(0.3), World(noise_mps=0.06)),
-    ],
-    ids=[
-        "rest",
-        "fast",
-        "slow wheels",
-        "creeping",
-        "to and fro",
-        "to and fro, 4 Hz",
-        "slip",
-        "wheels too large",
-        "bumps",
-        "no pose",
-        "wheels that report nothing",
-        "wheels that hold a heading",
-        "noise",
-    ],
-)
+HONEST: dict[str, tuple[Wish, World]] = {
+    "rest": (steady(0.0), World()),
+    "fast": (steady(0.6, 1.2), World()),
+    "slow wheels": (steady(-0.5), World(lag_s=0.3)),
+    "creeping": (steady(0.05, 0.1), World()),
+    "to and fro": (alternating, World()),
+    "to and fro, 4 Hz": (alternating, World(lag_s=0.3, steps_s=0.25)),
+    "slip": (steady(0.5, 0.8), World(grip=0.65)),
+    "wheels too large": (steady(0.5, 0.8), World(grip=1.3)),
+    "bumps": (steady(0.5), World(seen=bumps)),
+    "no pose": (steady(0.5), World(seen=no_images)),
+    "wheels that report nothing": (steady(0.5), World(reported=lambda *_: Motion(0.0, 0.0))),
+    "wheels that hold a heading": (
+        steady(0.5, 0.5),
+        World(reported=lambda _, motion: motion._replace(yaw_rate_radps=math.nan)),
+    ),
+    "noise": (steady(0.3), World(noise_mps=0.06)),
+}
+
+
+@pytest.mark.parametrize(("wish", "world"), HONEST.values(), ids=HONEST)
 def test_what_robots_do_is_no_contradiction(wish: Wish, world: World) -> None:
     _, history = run(wish, 60.0, world)
     assert [entry for entry in history if entry[1] or entry[2]] == []
 
 
+CONTRADICTIONS: dict[str, tuple[Wish, World, str]] = {
+    "images stand": (steady(0.3), World(seen=still), NOT_SEEN),
+    "in reverse": (steady(-0.3), World(seen=still), NOT_SEEN),
+    "turning": (steady(0.0, 0.8), World(seen=still), NOT_SEEN),
+    "too far": (steady(0.3), World(seen=lambda _, m: m._replace(velocity_mps=4 * m.velocity_mps)), NOT_COMMANDED),
+    "rotation": (steady(0.3), World(seen=lambda _, m: m._replace(yaw_rate_radps=0.5)), NOT_COMMANDED),
+    "the other way": (steady(0.3), World(seen=lambda _, m: m._replace(velocity_mps=-m.velocity_mps)), NOT_SEEN),
+    "images stand later": (steady(0.3), World(seen=lambda at_s, m: still(at_s, m) if at_s > 5 else m), NOT_SEEN),
+    "wheels stand": (steady(0.3), World(reported=lambda at_s, m: Motion(0.0, 0.0) if at_s > 2 else m), NOT_FOLLOWED),
+    "wheels run away": (steady(0.2), World(reported=lambda at_s, m: Motion(2.0, 0.0)), NOT_FOLLOWED),
+    "wheels turn": (steady(0.2), World(reported=lambda _, m: Motion(m.velocity_mps, 1.0)), NOT_FOLLOWED),
+}
+
+
 @pytest.mark.hazard("H38")
-@pytest.mark.parametrize(
-    ("wish", "world", "expected"),
-    [
-        (steady(0.3), World(seen=still), NOT_SEEN),
-        (steady(-0.3), World(seen=still), NOT_SEEN),
-        (steady(0.0, 0.8), World(seen=still), NOT_SEEN),
-        (steady(0.3), World(seen=lambda _, m: m._replace(velocity_mps=4 * m.velocity_mps)), NOT_COMMANDED),
-        (steady(0.3), World(seen=lambda _, m: m._replace(yaw_rate_radps=0.5)), NOT_COMMANDED),
-        (steady(0.3), World(seen=lambda _, m: m._replace(velocity_mps=-m.velocity_mps)), NOT_SEEN),
-        (steady(0.3), World(seen=lambda at_s, m: still(at_s, m) if at_s > 5 else m), NOT_SEEN),
-        (steady(0.3), World(reported=lambda at_s, m: Motion(0.0, 0.0) if at_s > 2 else m), NOT_FOLLOWED),
-        (steady(0.2), World(reported=lambda at_s, m: Motion(2.0, 0.0)), NOT_FOLLOWED),
-        (steady(0.2), World(reported=lambda _, m: Motion(m.velocity_mps, 1.0)), NOT_FOLLOWED),
-    ],
-    ids=[
-        "images stand",
-        "in reverse",
-        "turning",
-        "too far",
-        "rotation",
-        "the other way",
-        "images stand later",
-        "wheels stand",
-        "wheels run away",
-        "wheels turn",
-    ],
-)
+@pytest.mark.parametrize(("wish", "world", "expected"), CONTRADICTIONS.values(), ids=CONTRADICTIONS)
 def test_a_contradiction_slows_down_and_then_stops(wish: Wish, world: World, expected: str) -> None:
     slowed_s, stopped_s, reason = stopped_after(run(wish, 12.0, world)[1])
     assert reason == expected and slowed_s < stopped_s

@@ -20,7 +20,7 @@ from omnid.core.obstacles.grid import CELL_M, SIDE, FloorGrid
 from omnid.tracking_state import MapState, TrackingState
 
 Array = NDArray[np.float64]
-TICK_S = 0.02
+TICK_S, TICKS_A_POSE = 0.02, 5
 TRACK_M = 0.4
 LAG_S = 0.1
 AGE_S = 0.08  # of a pose when it is known
@@ -89,7 +89,6 @@ class DrivenBase:
         seed: int,
         *,
         start: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        pose_hz: float = 10.0,
         T_map_odom: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
         self.navigator = navigator
@@ -107,7 +106,6 @@ class DrivenBase:
         self.law.take(ControllerPose(0, float(self.pose[2]), 0.0, "tracking", 0.0))
         self.law.step(0, 0.0)
         self._gain = 1.0 + 0.02 * self.rng.standard_normal(2)
-        self._every = round(1.0 / pose_hz / TICK_S)
         self._ticks = 0
         self._coming: list[tuple[float, Situation]] = []
 
@@ -133,7 +131,7 @@ class DrivenBase:
     def tick(self) -> Navigation | None:
         """Advance by TICK_S; return the answer of the navigation where a pose has come."""
         answer = None
-        if self._ticks % self._every == 0:
+        if self._ticks % TICKS_A_POSE == 0:
             self._coming.append((self.t_s + AGE_S, self.seen()))
         while self._coming and self._coming[0][0] <= self.t_s:
             _, now = self._coming.pop(0)

@@ -158,19 +158,25 @@ def test_a_robot_that_stands_in_the_dark_knows_where_it_is_when_there_is_light(
     assert motion_errors(found[-1].T_map_odom, se3.inverse(POSES[0]) @ POSES[at])[0] < 0.25
 
 
-def test_a_saved_map_is_extended_by_another_run_elsewhere_in_it(
-    cameras: RenderedCameras, frames: list[StereoFrame], out: MapLocaliser
+@pytest.mark.parametrize("localize_only", [False, True])
+def test_a_saved_map_is_extended_by_another_run_elsewhere_in_it_unless_it_is_for_localisation_alone(
+    cameras: RenderedCameras, frames: list[StereoFrame], out: MapLocaliser, localize_only: bool
 ) -> None:
-    first = deepcopy(out)
-    kept = len(first.places)
-    second = MapLocaliser(cameras.model, PlaceLimits(), first.places)
+    known = deepcopy(out).places
+    before = {id: pose.copy() for id, pose in known.poses.items()}
     back = slice(len(OUT) + 3, len(OUT) + 14)
     drive = odometry(frames[back], POSES[back])
-    found = run(second, drive)
-    assert found[-1].state is MapState.LOCALIZED and len(second.places) > kept
+    localiser = MapLocaliser(cameras.model, PlaceLimits(), known, localize_only=localize_only)
+    found = run(localiser, drive)
+    assert found[-1].state is MapState.LOCALIZED
     error_m, _ = motion_errors(found[-1].T_map_odom @ drive[-1].T_odom_rect, se3.inverse(POSES[0]) @ POSES[back][-1])
     assert error_m < 0.25
-    assert {k.session for k in second.places.keyframes.values()} == {0, 1}
+    new = [keyframe for id, keyframe in known.keyframes.items() if id not in before]
+    assert new and {keyframe.session for keyframe in new} == {1}
+    assert any(len(keyframe.features.views) for keyframe in new) != localize_only
+    if localize_only:
+        for id, pose in before.items():
+            np.testing.assert_allclose(known.poses[id], pose, atol=1e-9)
 
 
 def test_in_a_saved_map_the_covariance_is_that_of_the_place_and_not_of_odom(
@@ -184,22 +190,6 @@ def test_in_a_saved_map_the_covariance_is_that_of_the_place_and_not_of_odom(
     for pose, sigma_m in zip(found, sigmas_m, strict=True):
         assert 0.002 < sigma_m < 0.1 if pose.state is MapState.LOCALIZED else sigma_m > 1000.0
     assert {pose.state for pose in found} == {MapState.ODOMETRY_ONLY, MapState.LOCALIZED}
-
-
-def test_localisation_alone_leaves_the_map_as_it_is(
-    cameras: RenderedCameras, frames: list[StereoFrame], out: MapLocaliser
-) -> None:
-    known = deepcopy(out).places
-    before = {id: pose.copy() for id, pose in known.poses.items()}
-    back = slice(len(OUT) + 3, len(OUT) + 14)
-    drive = odometry(frames[back], POSES[back])
-    localiser = MapLocaliser(cameras.model, PlaceLimits(), known, localize_only=True)
-    found = run(localiser, drive)
-    assert found[-1].state is MapState.LOCALIZED
-    for id, pose in before.items():
-        np.testing.assert_allclose(known.poses[id], pose, atol=1e-9)
-    ties = [keyframe for id, keyframe in known.keyframes.items() if id not in before]
-    assert ties and not any(len(keyframe.features.views) for keyframe in ties)
 
 
 def test_what_is_saved_is_joined_with_the_oldest_place(

@@ -1,14 +1,19 @@
-"""The map of places: what leaves it within its bounds, which parts links join, its landmarks and its grid."""
+"""The map of places: what leaves it within its bounds, its landmarks and grid; pose graphs with truth."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, fields
+
 import numpy as np
+import pytest
+from numpy.typing import NDArray
 
 from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.mapping.scan_grid import FREE, OCCUPIED
 from omnid.core.places.place_map import Link, PlaceFeatures, PlaceKeyframe, PlaceMap, PlaceRig
 from omnid.core.places.place_views import grid, landmarks
+from omnid.core.places.pose_graph import ACCEPTED, PoseEdges, PoseGraphResult, optimise
 from omnid.core.stereo.triangulation import view
 from tests.omnid.core.mapping.rooms import OPEN, box, pose, scan_of
 
@@ -97,3 +102,138 @@ def test_the_grid_shows_the_room_where_the_base_sees_it() -> None:
     cells = np.floor((corners[:, :2] - found.corner) / 0.05).astype(int)
     around = found.cells[cells[0, 1] - 1 : cells[0, 1] + 2, cells[0, 0] - 1 : cells[0, 0] + 2]
     assert OCCUPIED in around and found.cells[cells[1, 1], cells[1, 0]] == FREE
+
+
+Array = NDArray[np.float64]
+
+STEP_M = 0.3
+SIGMA_STEP = np.array([3e-3, 3e-3, 1e-3, 2e-4, 2e-4, 1e-3])  # m and rad, of each step of the odometry
+SIGMA_LOOP = np.array([0.01, 0.01, 0.01, 2e-3, 2e-3, 2e-3])
+
+
+@dataclass(frozen=True)
+class Laps:
+    """Poses, measurements and which loops are right."""
+
+    truth: Array  # (N, 4, 4)
+    odometry: PoseEdges
+    loops: PoseEdges
+    right: NDArray[np.bool_]  # (L,)
+
+    @property
+    def edges(self) -> PoseEdges:
+        """All edges: those of the odometry, then the loops."""
+        return joined(self.odometry, self.loops)
+
+    @property
+    def start(self) -> Array:
+        """Return the poses (N, 4, 4) of the odometry alone."""
+        poses = [np.eye(4)]
+        for step in self.odometry.T_a_b:
+            poses.append(poses[-1] @ step)
+        return np.array(poses)
+
+    def error_m(self, T: Array) -> float:
+        """Return the root mean square of the position errors, all in the frame of the first node."""
+        return float(np.sqrt(((T[:, :3, 3] - self.truth[:, :3, 3]) ** 2).sum(axis=1).mean()))
+
+
+def laps(seed: int, nodes: int, per_lap: int, loops: int, wrong: float) -> Laps:
+    """Return laps along a rectangle; `wrong` is the share of loops whose pose has nothing to do with the truth."""
+    rng = np.random.default_rng(seed)
+    truth = np.array([np.eye(4) for _ in range(nodes)])
+    for k in range(1, nodes):
+        turn = np.pi / 2 if k % (per_lap // 4) == 0 else 0.0
+        truth[k] = truth[k - 1] @ se3.exp([STEP_M, 0, 0, 0, 0, 0]) @ se3.exp([0, 0, 0, 0, 0, turn])
+    a = np.arange(nodes - 1)
+    odometry = measured(rng, truth, a, a + 1, SIGMA_STEP)
+    first = rng.integers(0, nodes - per_lap, loops)
+    laps_later = np.array([rng.integers(1, (nodes - 1 - k) // per_lap + 1) for k in first], np.intp)
+    second = np.clip(first + per_lap * laps_later + rng.integers(-2, 3, loops), 0, nodes - 1)
+    right = np.arange(loops) >= round(wrong * loops)
+    found = measured(rng, truth, first, second, SIGMA_LOOP, is_loop=True)
+    xi = np.concatenate(
+        [rng.uniform(-1, 1, (loops, 3)), rng.uniform(-0.1, 0.1, (loops, 2)), rng.uniform(-np.pi, np.pi, (loops, 1))],
+        axis=1,
+    )
+    elsewhere = np.array([rng.integers(0, nodes) for _ in range(loops)], np.intp)
+    b = np.where(right, second, elsewhere)
+    T = np.where(right[:, None, None], found.T_a_b, se3.exp(xi))
+    pairs = np.column_stack([first, b])
+    return Laps(truth, odometry, PoseEdges(pairs, T, found.covariance, np.ones(loops, bool)), right)
+
+
+def measured(
+    rng: np.random.Generator,
+    truth: Array,
+    a: NDArray[np.intp],
+    b: NDArray[np.intp],
+    sigma: Array,
+    is_loop: bool = False,
+) -> PoseEdges:
+    """Return edges with noise of those standard deviations (6,)."""
+    exact = se3.inverse(truth[a]) @ truth[b]
+    covariance = np.broadcast_to(np.diag(sigma**2), (len(a), 6, 6)).copy()
+    noisy = exact @ se3.exp(sigma * rng.normal(size=(len(a), 6)))
+    return PoseEdges(np.column_stack([a, b]), noisy, covariance, np.full(len(a), is_loop))
+
+
+def joined(*parts: PoseEdges) -> PoseEdges:
+    """Return all edges, one part after the other."""
+    return PoseEdges(*(np.concatenate([getattr(part, item.name) for part in parts]) for item in fields(PoseEdges)))
+
+
+def without(edges: PoseEdges, row: int) -> PoseEdges:
+    """Return the edges but one."""
+    return PoseEdges(*(np.delete(getattr(edges, item.name), row, axis=0) for item in fields(PoseEdges)))
+
+
+def loops_of(found: PoseGraphResult) -> NDArray[np.bool_]:
+    """Return flags of the loops of a run of `laps` that were accepted."""
+    odometry_edges = len(found.poses) - 1
+    return found.weights[odometry_edges:] > ACCEPTED
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_loops_take_most_of_the_drift_away_and_wrong_ones_do_not_count(seed: int) -> None:
+    run = laps(seed, nodes=400, per_lap=100, loops=60, wrong=0.1)
+    found = optimise(run.start, run.edges)
+    assert not loops_of(found)[~run.right].any()
+    assert loops_of(found)[run.right].mean() > 0.95
+    assert run.error_m(found.poses) < 0.3 * run.error_m(run.start)
+
+
+def test_wrong_loops_that_agree_with_each_other_do_not_bend_the_odometry() -> None:
+    """As in two corridors that look the same, 15 m apart."""
+    run = laps(4, nodes=400, per_lap=100, loops=30, wrong=0.0)
+    pairs = np.column_stack([np.arange(5, 25), np.arange(55, 75)])
+    twins = PoseEdges(
+        pairs, np.tile(np.eye(4), (20, 1, 1)), np.tile(np.diag(SIGMA_LOOP**2), (20, 1, 1)), np.ones(20, bool)
+    )
+    accepted = loops_of(optimise(run.start, joined(run.edges, twins)))
+    assert not accepted[30:].any()
+    assert accepted[:30].mean() > 0.9
+
+
+def test_the_covariance_of_the_last_node_is_that_of_its_error() -> None:
+    """The squared Mahalanobis distance of the last pose is chi-squared with six degrees of freedom: mean 6."""
+    squared = []
+    for seed in range(25):
+        run = laps(100 + seed, nodes=60, per_lap=20, loops=6, wrong=0.0)
+        found = optimise(run.start, run.edges)
+        error = se3.log(se3.inverse(found.poses[-1]) @ run.truth[-1])
+        squared.append(error @ np.linalg.solve(found.covariance, error))
+    assert 6 - 4 * np.sqrt(12 / 25) < np.mean(squared) < 6 + 4 * np.sqrt(12 / 25)
+
+
+def test_fixed_nodes_stay_and_the_others_move_to_them() -> None:
+    """A saved map of 100 nodes is fixed; a second session, 5 m off, comes to it by its loops."""
+    run = laps(7, nodes=200, per_lap=100, loops=30, wrong=0.0)
+    fixed = np.arange(200) < 100
+    start = run.truth.copy()
+    start[100:] = se3.exp([5, 3, 0, 0, 0, 0.5]) @ start[100:]
+    cut = without(run.odometry, 99)
+    found = optimise(start, joined(cut, run.loops), fixed)
+    np.testing.assert_array_equal(found.poses[:100], start[:100])
+    assert np.isfinite(found.covariance).all()
+    assert run.error_m(found.poses) < 0.05

@@ -66,15 +66,6 @@ def test_a_place_is_recognised_aside_and_turned(
     assert sigmas.max() < 0.02
 
 
-def test_another_place_and_darkness_are_not_recognised(
-    cameras: RenderedCameras, frames: list[StereoFrame], elsewhere: StereoFrame
-) -> None:
-    there = describe(frames[0])
-    found = recognise(describe(elsewhere), there, 0, 0.0, cameras.model)
-    assert found is None or found.inliers < 15
-    assert recognise(describe(cameras.darkness(4)), there, 0, 0.0, cameras.model) is None
-
-
 # Places that look the same: none is chosen, unless odometry tells which one it is.
 PERIOD_M = 6.0
 X = np.array([0.6, 0.9, 1.2])  # of the keyframes in one half of the corridor

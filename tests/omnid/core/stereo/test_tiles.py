@@ -10,7 +10,6 @@ import pytest
 from numpy.typing import NDArray
 
 from omnid.core.stereo.photometry import (
-    noise_sigma,
     pair_gains,
 )
 from omnid.core.stereo.tiles import (
@@ -195,19 +194,6 @@ def sums_of(image: NDArray[np.uint8], visible: NDArray[np.bool_] = EVERYWHERE) -
 
 def gains_of(lower: NDArray[np.uint8], upper: NDArray[np.uint8], gains: tuple[float, float]) -> tuple[float, float]:
     return pair_gains(sums_of(lower), sums_of(upper), gains)
-
-
-@pytest.mark.parametrize("sigma", [2.0, 5.0, 12.0])
-def test_noise_is_measured_beside_texture(sigma: float) -> None:
-    rng = np.random.default_rng(1)
-    image = 60.0 + 0 * EVERYWHERE
-    image[:, 200:] = texture(2, WIDE, 4.0)[:, 200:]
-    # The noise of a panorama is that of the camera, interpolated: neighbours are alike.
-    fine = rng.standard_normal((WIDE[0] + 1, WIDE[1] + 1))
-    noise = fine[:-1, :-1] + fine[1:, :-1] + fine[:-1, 1:] + fine[1:, 1:]
-    image += sigma * noise / noise.std()
-    found = noise_sigma(np.clip(np.rint(image), 0, 255).astype(np.uint8), EVERYWHERE)
-    assert 0.6 * sigma < found < 1.5 * sigma
 
 
 @pytest.mark.parametrize("share", [1.0, 0.95, 0.6, 0.3])
