@@ -22,11 +22,11 @@ import pytest
 
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.codec import DiagnosticStatus, PoseAttachment, scan_cdr
-from omnid.transport.status_names import CALIBRATION
+from omnid.transport.codec import DiagnosticStatus, PoseAttachment, scan_cdr, string_from_cdr
+from omnid.transport.status_names import CALIBRATION, NAVIGATION, WHEELS, Key
+from omnid.transport.topics import Answer, Request, command_topics
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry
 from tests.omnid.web.servers import WebServer, served
-from tests.omnid.web.test_robot import Navigator
 from tests.replay.live import started
 from tests.waiting import PATIENCE_S, wait_until
 
@@ -52,6 +52,27 @@ document.getElementById("form").submit();
 Promise.allSettled(tries).then((results) => setTimeout(() => {
   document.title = `tried ${opened} ${results[2].status}`; }, 1000));
 </script>"""
+
+
+class Navigator:
+    """A robot that grants every request about routes."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._bus, self.asked, self.state = bus, list[str](), "driving"
+        bus.subscribe_commands(self._take, command_topics(("operator",)))
+
+    def _take(self, request: Request) -> None:
+        text = string_from_cdr(request.payload)
+        self.asked.append(text)
+        self._bus.answer(request.id, Answer(True, f"does {text}"))
+
+    def publish(self) -> None:
+        """Report the navigation, and that it is armed."""
+        wheels = DiagnosticStatus(WHEELS, 0, "driving", {Key.ARMED: "1"})
+        self._bus.publish("status", codec.diagnostics_cdr(time.time_ns(), [wheels]))
+        values = {Key.STATE: self.state, Key.REASON: "", Key.TASK: "route dock", Key.LEFT_M: "3.5"}
+        entry = DiagnosticStatus(NAVIGATION, 0, "", {str(key): value for key, value in values.items()})
+        self._bus.publish("navigation", codec.diagnostics_cdr(time.time_ns(), [entry]))
 
 
 @pytest.fixture(scope="module")

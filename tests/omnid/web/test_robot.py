@@ -41,7 +41,6 @@ from omnid.web.feed import MOST_POINTS, LivePath, RobotFeed, scan_news, state_ne
 from omnid.web.metrics import metrics
 from omnid.web.server import STATIC
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry
-from tests.omnid.web.servers import Shown, WebServer, served
 
 pytest.importorskip("starlette", reason="needs the packages of omnid[web]")
 from starlette.requests import Request as WebRequest
@@ -65,9 +64,7 @@ class Rover:
     def __init__(self, bus: Bus, endpoint: str) -> None:
         self._bus, self.endpoint = bus, endpoint
         self.topics, self.twists = list[str](), list[tuple[float, float]]()
-        self.is_stopped, self.is_granted = False, True
-        self.answering = threading.Event()
-        self.answering.set()
+        self.texts, self.is_stopped, self.is_granted = list[str](), False, True
         bus.serve("config", "[controller.limits]\nvelocity_mps = 0.7\nyaw_rate_radps = 1.5\n")
         bus.subscribe_commands(self._take, command_topics(("operator",)), lambda: self.is_stopped)
 
@@ -77,7 +74,8 @@ class Rover:
             command = codec.twist_from_cdr(request.payload)
             self.twists.append((command.velocity_mps, command.yaw_rate_radps))
         elif request.topic != "cmd/stop":
-            self.answering.wait(30.0)
+            if request.topic in ("cmd/route", "cmd/navigation"):
+                self.texts.append(string_from_cdr(request.payload))
             self._bus.answer(request.id, Answer(self.is_granted, "as asked" if self.is_granted else "a fault holds"))
 
     def has_more_than(self, count: int) -> bool:
@@ -281,46 +279,7 @@ def test_what_lets_the_robot_move_and_comes_late_or_without_a_stamp_is_refused(
     assert not answer.done and words in answer.text and not rover.topics
 
 
-class Navigator:
-    """A robot that grants every request but those for the route `lost`."""
-
-    def __init__(self, bus: Bus) -> None:
-        self._bus, self.asked, self.state = bus, list[str](), "driving"
-        bus.subscribe_commands(self._take, command_topics(("operator",)))
-
-    def _take(self, request: Request) -> None:
-        text = string_from_cdr(request.payload)
-        self.asked.append(text)
-        is_refused = text.endswith("lost")
-        self._bus.answer(request.id, Answer(not is_refused, "that cannot be" if is_refused else f"does {text}"))
-
-    def publish(self) -> None:
-        """Report the navigation, and that it is armed."""
-        wheels = DiagnosticStatus(WHEELS, 0, "driving", {Key.ARMED: "1"})
-        self._bus.publish("status", codec.diagnostics_cdr(time.time_ns(), [wheels]))
-        values = {Key.STATE: self.state, Key.REASON: "", Key.TASK: "route dock", Key.LEFT_M: "3.5"}
-        entry = DiagnosticStatus(NAVIGATION, 0, "", {str(key): value for key, value in values.items()})
-        self._bus.publish("navigation", codec.diagnostics_cdr(time.time_ns(), [entry]))
-
-
-@pytest.fixture(scope="module")
-def answering() -> Iterator[tuple[WebServer, Navigator]]:
-    endpoint = free_endpoint()
-    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus, served("--connect", endpoint) as server:
-        navigator = Navigator(bus)
-        Shown(server).until("navigation", navigator.publish)
-        yield server, navigator
-
-
-def answer(answering: tuple[WebServer, Navigator], path: str, text: str) -> dict[str, Any]:
-    """Return the answer to a request."""
-    server, _ = answering
-    found: dict[str, Any] = json.loads(server.request(path, "POST", server.bearer, text).text)
-    return found
-
-
-def test_requests_reach_the_robot_and_its_answer_the_page(answering: tuple[WebServer, Navigator]) -> None:
-    server, navigator = answering
+def test_requests_reach_the_robot_and_its_answer_the_page(rover: Rover, page: RobotPage) -> None:
     for path, text, moves in (
         ("/route", "teach dock", False),
         ("/route", "finish", False),
@@ -329,13 +288,11 @@ def test_requests_reach_the_robot_and_its_answer_the_page(answering: tuple[WebSe
         ("/navigation", "pause", False),
         ("/navigation", "resume", True),
     ):
-        stamp = f" stamp={server.state_ms()}" if moves else ""
-        assert answer(answering, path, f"{text}{stamp}") == {"done": True, "text": f"does {text}"}
-        assert navigator.asked[-1] == text
-    refused = answer(answering, "/route", f"repeat lost stamp={server.state_ms()}")
-    assert not refused["done"] and refused["text"] == "omnid refuses: that cannot be"
-    shown = Shown(server).until("navigation", navigator.publish)
-    assert (shown["state"], shown["task"], shown["left_m"]) == ("driving", "route dock", 3.5)
+        assert post(page, path, f"{text} stamp={NOW_MS}" if moves else text) == Answer(True, "as asked")
+        assert rover.texts[-1] == text
+    rover.is_granted = False
+    refused = post(page, "/route", f"repeat dock stamp={NOW_MS}")
+    assert refused == Answer(False, "omnid refuses: a fault holds")
 
 
 NODE = shutil.which("node")

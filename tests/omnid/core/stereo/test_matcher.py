@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from calib.panorama import Cylinder
-from omnid.core.stereo.matcher import Matcher, MatchingSettings, smooth
+from omnid.core.stereo.matcher import Matcher, MatchingSettings
 from omnid.core.stereo.semiglobal import ColumnShift
 from omnid.core.stereo.triangulation import point_covariance, triangulate, view
 from tests.omnid.core.scenery import texture, turned
@@ -60,35 +60,6 @@ def test_enhanced_sad_is_right_on_a_brick_wall_where_sad_is_wrong() -> None:
     assert original.mean() < 0.6  # eq. (1) alone cannot tell the courses apart
     assert enhanced.mean() > 0.95
     assert enhanced.sum() > 1.5 * original.sum()
-
-
-def test_sad_takes_the_lowest_sum_with_left_right_check() -> None:
-    """The lowest of eq. (1), written out, from the lower pixel and from the upper one."""
-    lower, upper = brick_wall()
-    pixels, disparity = matched("sad", lower, upper, middle())
-    soft = [smooth(image, 0.8).astype(int) for image in (lower, upper)]
-    window = np.arange(-4, 5)
-
-    def cost(row: int, column: int, d: int) -> float:
-        if not 0 <= row <= SHAPE[0] - 1 - d or not 0 <= d < DISPARITIES:
-            return np.inf
-        here, columns = np.clip(row + window, 0, SHAPE[0] - 1 - d), column + window
-        return float(np.abs(soft[0][np.ix_(here, columns)] - soft[1][np.ix_(here + d, columns)]).sum())
-
-    for pixel, found in list(zip(pixels, disparity, strict=True))[::40]:
-        row, column = divmod(int(pixel), SHAPE[1])
-        down = [cost(row, column, d) for d in range(DISPARITIES)]
-        best = int(np.argmin(down))
-        up = [cost(row + best - d, column, d) for d in range(DISPARITIES)]
-        assert abs(found - best) <= 0.5
-        assert down[best] <= 12 * 81 and abs(int(np.argmin(up)) - best) <= 1
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_no_valid_pixels_give_no_matches(method: str) -> None:
-    image = texture(19, SHAPE)
-    pixels, disparity = matched(method, image, image, np.zeros(SHAPE, bool))
-    assert len(pixels) == len(disparity) == 0
 
 
 @pytest.mark.parametrize("method", METHODS)
