@@ -30,6 +30,7 @@ from omnid.core.mapping.range_scan import SECTORS, azimuths
 from omnid.core.obstacles import grid_kernels as kernels
 from omnid.core.obstacles.column import THIN_M
 from omnid.core.obstacles.moving_tracker import Arrivals
+from omnid.core.obstacles.panoramas import AZIMUTHS
 from omnid.core.obstacles.posterior import RayBelief
 
 Array = NDArray[np.float64]
@@ -236,13 +237,12 @@ class ObstacleGrid:
         grid = FloorGrid(np.asarray(CELL_M * (self._cell - REACH_CELLS), float), *cells)
         return GridScan(*self._ways(taken, self._in_cells(place_m), yaw), arrivals, grid)
 
-    def is_floor(self, T_odom_base: Array, ranges_m: Array, directions: int) -> Flags:
-        """Return the bins (N, directions) about the viewpoint, at ranges (N,), whose cells are floor by all pairs."""
+    def is_floor(self, T_odom_base: Array, ranges_m: Array) -> Flags:
+        """Return the bins (N, DIRECTIONS) about the viewpoint, at ranges (N,), whose cells are floor by all pairs."""
         if self._cell is None:
-            return np.zeros((len(ranges_m), directions), bool)
+            return np.zeros((len(ranges_m), len(AZIMUTHS)), bool)
         T = T_odom_base @ se3.inverse(self._T_rect_base)
-        azimuth = math.pi - (np.arange(directions) + 0.5) * (math.tau / directions)
-        unit = np.column_stack([np.cos(azimuth), np.sin(azimuth)]) @ T[:2, :2].T / CELL_M
+        unit = np.column_stack([np.cos(AZIMUTHS), np.sin(AZIMUTHS)]) @ T[:2, :2].T / CELL_M
         # OpenCV has integers at the middles of cells.
         at = (self._in_cells(T[:2, 3]) - 0.5)[:, None, None] + ranges_m[:, None] * unit.T[:, None]
         x, y = np.asarray(at, np.float32)

@@ -24,6 +24,7 @@ Bytes = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
 
 DIRECTIONS: Final = 480  # columns of the working panorama, 0.75 degrees, because a pole of 3 cm is as wide at 2 m
+AZIMUTHS: Final = math.pi - (np.arange(DIRECTIONS) + 0.5) * (math.tau / DIRECTIONS)  # of directions, rectified frame
 FOCAL_PX: Final = 139.0  # rows of the working panorama in a radian, because images of 512 px have that resolution
 FINE_PX: Final = 0.8  # sigma of the smoothing along columns, because views differ by parts of a row
 AROUND_ROWS: Final = 17  # rows with which a pixel is compared
@@ -85,8 +86,7 @@ class WorkingPanoramas:
         self.shown %= DIRECTIONS
         self._shown_rows = round(cylinder.height * FOCAL_PX / cylinder.focal_px)
         self.row0 = (cylinder.row0 + 0.5) * self._shown_rows / cylinder.height - 0.5
-        azimuth = math.pi - (np.arange(DIRECTIONS) + 0.5) * (math.tau / DIRECTIONS)
-        rise_px = FOCAL_PX * (tilt[0] * np.cos(azimuth) + tilt[1] * np.sin(azimuth))
+        rise_px = FOCAL_PX * (tilt[0] * np.cos(AZIMUTHS) + tilt[1] * np.sin(AZIMUTHS))
         self.height = self._shown_rows + (math.ceil(rise_px.max()) if is_steep else 0)
         self._coding_frequencies = max(2, round(CODING_FREQUENCIES * FOCAL_PX / cylinder.focal_px))
         rows = np.arange(self.height)

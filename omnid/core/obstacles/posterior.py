@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from omnid.core.mapping.range_scan import SECTORS, FreeRanges
 from omnid.core.obstacles import ray_kernels as kernels
 from omnid.core.obstacles.bins import BINS_PER_PX, Bins, ShownBins, pooled, turned
-from omnid.core.obstacles.panoramas import DIRECTIONS
+from omnid.core.obstacles.panoramas import AZIMUTHS, DIRECTIONS
 from omnid.core.obstacles.ray_kernels import RayParameters
 
 Array = NDArray[np.float64]
@@ -83,8 +83,7 @@ class RayPosterior:
     def __init__(self, bins: Bins, parameters: RayParameters) -> None:
         self._bins, self._p = bins, parameters
         self._lengths_m = np.diff(bins.ends_m).astype(np.float32)
-        azimuth = math.pi - (np.arange(DIRECTIONS) + 0.5) * (math.tau / DIRECTIONS)
-        along = np.abs(np.sin(azimuth)) < math.sin(ALONG_RAD)
+        along = np.abs(np.sin(AZIMUTHS)) < math.sin(ALONG_RAD)
         self._assumed = (bins.ranges_m < parameters.look_m)[:, None] & along
 
     def belief(self, shown: ShownBins, sensor_grey: float, known: Flags | None = None) -> RayBelief:

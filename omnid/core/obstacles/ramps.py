@@ -3,7 +3,8 @@
 A ramp of slope s that begins x_0 ahead lies on a plane of its own: z = -(h + s x_0) + r (a + s) cos(u), about the
 viewpoint, over a floor z = -h + r a cos(u). So it has a disparity in each row, too, and both planes are compared, pixel
 by pixel, in the rows beyond the line. Of all (x_0, s) the likeliest is taken, where it explains those rows better than
-the floor in most directions: what is narrower than the way, such as a box, is no ramp.
+the floor, and than anything upright, in most directions: what is narrower than the way, such as a box, is no ramp, and
+neither is a wall.
 A ramp goes up by at most what may be driven; and down by at most what the base has climbed: a landing. Any other fall
 is an edge.
 """
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from omnid.core.compiled import compiled
 from omnid.core.obstacles.column import OUTLIER, FloorPlane
-from omnid.core.obstacles.panoramas import DIRECTIONS, FOCAL_PX, UNITS, Views, WorkingPanoramas
+from omnid.core.obstacles.panoramas import AZIMUTHS, FOCAL_PX, UNITS, Views, WorkingPanoramas
 
 Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
@@ -40,7 +41,6 @@ RATIO: Final = 0.075
 LEAST_NATS: Final = 10.0  # Evidence of a ramp in one pair: without one it is below 4 in textured corridors.
 SAME_M, SAME = 0.5, math.tan(math.radians(3.0))  # within which pairs show the same ramp
 VIEWS: Final = 3.0  # Pairs that count: nearer ones show a ramp better.
-AZIMUTHS: Final = math.pi - (np.arange(DIRECTIONS) + 0.5) * (math.tau / DIRECTIONS)  # of directions
 
 
 class Ramp(NamedTuple):

@@ -24,9 +24,9 @@ from calib.se2_arrays import planar, transform
 from omnid.core.obstacles.bins import Bins, PlaneView
 from omnid.core.obstacles.column import NEAREST_M, Columns, FloorPlane, floor_plane
 from omnid.core.obstacles.grid import GridScan, ObstacleGrid, unknown_scan
-from omnid.core.obstacles.panoramas import AROUND_ROWS, DIRECTIONS, FOCAL_PX, WorkingPair
+from omnid.core.obstacles.panoramas import AROUND_ROWS, AZIMUTHS, FOCAL_PX, WorkingPair
 from omnid.core.obstacles.posterior import RayBelief, RayPosterior
-from omnid.core.obstacles.ramps import AZIMUTHS, Ramp, Ramps
+from omnid.core.obstacles.ramps import Ramp, Ramps
 from omnid.core.obstacles.ray_kernels import RayParameters
 from omnid.core.obstacles.settings import ScanSettings
 from omnid.core.types.panorama import PaddedPanorama
@@ -119,7 +119,7 @@ class RayScans:
             evidence = columns.evidence(*columns.panoramas.views(on_ramp))
             shown = shown.beyond(ramp.begins_before(self._bins.ranges_m), self._ramp.view.shown(on_ramp, evidence))
         # 3. The belief, with the look of floor that is known, and the grid.
-        known = self.grid.is_floor(pose, self._bins.ranges_m, DIRECTIONS)
+        known = self.grid.is_floor(pose, self._bins.ranges_m)
         self.belief = self._posterior.belief(shown, pair.sensor_grey, known)
         scan = self.grid.update(stamp_ns, pose, self.belief)
         # 4. Tilt and ramps, for the next pair.
@@ -142,7 +142,7 @@ class RayScans:
         columns, height_m = self._floor.view.columns, self._floor.plane.height_m
         ranges_m = FOCAL_PX * height_m / np.maximum(np.arange(columns.panoramas.height) - columns.panoramas.row0, 1e-6)
         rows = np.flatnonzero((ranges_m < LEAN_M) & (columns.panoramas.plane_rows < columns.last_row - 2))
-        known = self.grid.is_floor(pose, ranges_m[rows], DIRECTIONS) & pair.seen[rows]
+        known = self.grid.is_floor(pose, ranges_m[rows]) & pair.seen[rows]
         if ramp is not None:
             known &= ~ramp.begins_before(ranges_m[rows])
         if not known.any():
