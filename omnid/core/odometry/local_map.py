@@ -5,7 +5,8 @@ that its error is that of one pair, and that of the keyframe's pose comes in onc
 
 Bounds: at most max_keyframes keyframes K; a keyframe adds at most as many landmarks as the caller passes (F, the
 features wanted), so N <= K F landmarks. A landmark leaves with its anchor or after max_misses frames without it; a
-keyframe leaves when it is the oldest of too many or anchors no landmark any more.
+keyframe leaves when it anchors no landmark any more, or of too many the oldest that anchors no more than half of all:
+where few corners are in view each keyframe adds a few, and the oldest one may anchor nearly all.
 """
 
 from __future__ import annotations
@@ -119,7 +120,7 @@ class LocalMap:
     def add_keyframe(
         self, keyframe: Keyframe, views: Array, slopes: Array, noise: Array | None = None, pixels: Array | None = None
     ) -> Indices:
-        """Add a keyframe at the last panorama with new landmarks, and remove the oldest keyframe beyond the bound.
+        """Add a keyframe at the last panorama with new landmarks, and remove one beyond the bound.
 
         views (N, 3) [px]: those of the landmarks. slopes (N, 2): those of the disparity. noise: covariance (N, 3, 3)
         [px^2] of the views in addition to that of the model; None: none. pixels (N, 2): those in the keyframe's
@@ -136,8 +137,10 @@ class LocalMap:
         self.keyframes[keyframe.seq] = keyframe
         self._set_rows(np.concatenate([self._rows, new]))
         self.set_views(new["id"], views[finite], None if noise is None else noise[finite])
-        while len(self.keyframes) > self._max_keyframes:
-            self.keyframes.pop(min(self.keyframes))
+        if len(self.keyframes) > self._max_keyframes:
+            counts = {seq: int((self._rows["anchor"] == seq).sum()) for seq in self.keyframes}
+            others, half = counts.keys() - {keyframe.seq}, len(self._rows) / 2
+            self.keyframes.pop(min(others, key=lambda seq: (counts[seq] > half, seq)))
         self._select(np.isin(self.table.anchor, list(self.keyframes)))
         given = np.full(finite.shape, -1)
         given[finite] = new["id"]

@@ -41,6 +41,8 @@ TEXTURED_CORNERS, COUNTED_CORNERS = 2, 4
 # Share of the landmarks in view, inliers, below which a pose after a break is doubtful. Wrong ones at 10 m/s before a
 # limit of 5 had 0.09, 0.24 and 0.27 (set on seed 3 of `honesty`, too fast).
 AGAIN_SHARE = 1 / 3
+# Parts of the full turn, half of which few inliers must fill to support a pose, and the least share of the tracks.
+AROUND, NEARLY_ALL = 12, 0.9
 # A larger step of odom would be a jump for the readers of published poses, as REP 105 has odom continuous: it raises
 # reset_counter, or the gap stays open.
 JUMP_M, JUMP_RAD = 0.5, math.radians(30)
@@ -239,6 +241,12 @@ class VisualOdometry:
         limits = self._limits
         return estimate.inliers >= limits.min_inliers and estimate.least_ratio >= limits.min_inlier_ratio
 
+    def _is_well_supported(self, estimate: PoseEstimate) -> bool:
+        """True if many landmarks support a pose, or nearly all of few all around: they are no single moving thing."""
+        parts = np.unique(np.floor(estimate.pixels[:, 0] * (AROUND / self._model.cylinder.turn_px)) % AROUND)
+        is_all = estimate.least_ratio >= NEARLY_ALL and len(parts) >= AROUND / 2
+        return estimate.inliers >= self._limits.good_inliers or is_all
+
     def _is_doubtful(self, plausible: list[PoseEstimate]) -> bool:
         """True if no pose is plausible, or it has too few inliers to be relied on after an unknown motion."""
         return not plausible or plausible[0].inliers < min(
@@ -253,9 +261,7 @@ class VisualOdometry:
     def _accept(self, now: _Prediction, estimate: PoseEstimate, *, is_reset: bool) -> None:
         """Update the filter, from standstill after a break, and set the pose; is_reset: its heading is a jump."""
         limits, at_previous = self._limits, None
-        is_sure = (
-            self._hypotheses.is_single and not estimate.doubtful_depths and estimate.inliers >= limits.good_inliers
-        )
+        is_sure = self._hypotheses.is_single and not estimate.doubtful_depths and self._is_well_supported(estimate)
         if not self._tracking.is_refused and 0 < now.dt_s <= limits.max_gap_s:
             T_prev_curr = se3.inverse(self._T_odom_rect) @ estimate.T_odom_rect
             at_previous = self._motion.accept(
