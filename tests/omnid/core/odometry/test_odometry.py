@@ -83,6 +83,15 @@ def test_estimates_the_path_through_a_right_angle_and_its_own_error(
         assert np.sqrt(np.diag(estimate.covariance)).max() < 5e-3
 
 
+def test_few_landmarks_all_around_support_each_pose(cameras: RenderedCameras) -> None:
+    """As in a plain corridor: keyframes add a few each, and the one that anchors most of them stays in a full map."""
+    path = planar_poses(np.array([[0.1 * k, 0] for k in range(14)]), np.zeros(14))
+    odometry = visual_odometry(cameras.model, OdometryLimits(features=40))
+    for estimate, T in zip(run(odometry, [cameras.frame(k, T) for k, T in enumerate(path)]), path, strict=True):
+        assert motion_errors(estimate.T_odom_rect, se3.inverse(path[0]) @ T)[0] < 0.01
+        assert estimate.state is TrackingState.TRACKING and 20 <= estimate.inliers < 50
+
+
 def test_standing_still_does_not_drift(odometry: VisualOdometry, cameras: RenderedCameras) -> None:
     estimates = run(odometry, [cameras.frame(k, PATH[0]) for k in range(8)])
     distances = [motion_errors(estimate.T_odom_rect, np.eye(4))[0] for estimate in estimates]
