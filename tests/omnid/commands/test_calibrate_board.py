@@ -233,12 +233,3 @@ def test_live_writes_what_it_keeps_and_goes_on_where_it_ended(
         and f"{LIVE_PAIRS} pairs, not enough yet" in again.err
         and len(list(kept.iterdir())) == 2 * LIVE_PAIRS
     )
-
-
-def test_wrong_use_of_live_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    omnid = Command(capsys)
-    assert "name a folder" in omnid.refused("calibrate", "live", *OPTIONS)
-    assert "--square-mm" in omnid.refused("calibrate", "live", tmp_path, "--corners", "7x6")
-    assert "/dev/no-camera" in omnid("calibrate", "live", tmp_path, *OPTIONS, "--lower", "/dev/no-camera").err
-    (tmp_path / "file").touch()
-    assert "name a folder" in omnid.refused("calibrate", "live", tmp_path / "file", *OPTIONS)

@@ -37,7 +37,6 @@ from omnid.core.control.safety_rules import POSE_JUMPED, Deadlines
 from tests.contract.simulated_controllers import PtyMotor
 from tests.omnid.controller.bench import (
     LIMITS,
-    PERIOD_NS,
     PERIOD_S,
     SETTINGS,
     UNATTENDED,
@@ -268,22 +267,6 @@ def test_slows_down_at_the_end_whatever_the_setpoint(driving: Bench) -> None:
     assert not driving.controller.is_at_rest
     slows_down(driving, lambda: send_both(driving))
     assert driving.controller.is_at_rest and driving.controller.state.reason == safety_rules.ENDS
-
-
-def test_reports_each_tick(driving: Bench) -> None:
-    """The latency of a pose is reported once; a command that was not answered is not reported."""
-    driving.send_pose(age_s=0.01)
-    driving.now_ns += PERIOD_NS
-    tick = driving.controller.tick()
-    assert tick.command == driving.last and tick.to_wheel_s == pytest.approx(0.06)
-    driving.now_ns += PERIOD_NS
-    assert math.isnan(driving.controller.tick().to_wheel_s)
-    driving.wheels.silent = True
-    driving.send_pose()
-    driving.now_ns += 4 * PERIOD_NS
-    tick = driving.controller.tick()
-    assert tick.command is None and math.isnan(tick.to_wheel_s)
-    assert tick.late_s == pytest.approx(3 * PERIOD_S) and tick.state.missed == 3
 
 
 @pytest.mark.parametrize("known", [True, False])

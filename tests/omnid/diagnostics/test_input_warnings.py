@@ -85,14 +85,3 @@ def test_warns_if_the_pose_is_always_lost(omnid: Command, tmp_path: Path, scene:
     result = omnid.replay(log, rig=scene / "rig.toml")
     assert result.code == 1 and f"lost in {PAIRS} of {PAIRS} pairs" in result.err
     assert f"too dark in {PAIRS} of {PAIRS} pairs" in result.err
-
-
-def test_warns_of_a_rim_that_is_not_found(omnid: Command, tmp_path: Path, scene: Path) -> None:
-    rig = read_rig(scene / "rig.toml")
-    write_rig(tmp_path / "rig.toml", replace(rig, upper=replace(rig.upper, mask=None)))
-    log = save(tmp_path / "log.mcap", map(dark, images(scene / "log.mcap")))
-    result = omnid.replay(log, rig=tmp_path / "rig.toml")
-    assert "no mirror rim" in result.err and "[upper.mask]" in result.err and "[lower.mask]" not in result.err
-    log = save(tmp_path / "log.mcap", [replace(image, jpeg=b"none") for image in images(scene / "log.mcap")])
-    result = omnid.replay(log, rig=tmp_path / "rig.toml")
-    assert "one camera or both have none that can be used" in result.err

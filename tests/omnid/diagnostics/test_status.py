@@ -23,7 +23,7 @@ from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControllerSettings
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.stereo.tiles import ALL_LIVE, TILE_COLUMNS, TILE_ROWS, TileStates
-from omnid.diagnostics.run_summary import RunCounters, RunStatistics, run_summary
+from omnid.diagnostics.run_summary import RunStatistics
 from omnid.diagnostics.status import StatusCollector, image_stats, wheel_stats
 from omnid.engine.telemetry import Histogram, StageStats, Telemetry
 from omnid.messages import OdometryUpdate, StereoDepth
@@ -237,14 +237,3 @@ def test_names_the_camera_and_the_time() -> None:
     assert frozen.message == "the upper camera is frozen all around"
     live = entry(IMAGES, image_stats(update(ALL_LIVE, 115 * S)))
     assert (live.level, live.message) == (OK, LIVE)
-
-
-def test_zeros_are_left_out_of_a_summary() -> None:
-    counters = RunCounters(99, 98, 4.82741, {TrackingState.TRACKING: 98}, 0, {"late": 0, "queue": 1})
-    assert run_summary(counters, []).splitlines() == [
-        "pairs     99",
-        "poses     98",
-        "lost      queue 1",
-        "length    4.8274 m",
-        "states    tracking 100.0%",
-    ]

@@ -23,7 +23,7 @@ from omnid.engine.graph import Graph
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import NavigationUpdate, PlaceUpdate
 from omnid.navigation_state import NavigationState
-from omnid.runs.route_files import Requests, RouteFiles, TaughtRoutes
+from omnid.runs.route_files import Requests, TaughtRoutes
 from omnid.tracking_state import MapState
 from tests.omnid.stages.test_navigation import (
     ODOM,
@@ -199,11 +199,3 @@ def test_what_waits_for_a_disk_begins_nothing_after_a_stop_or_a_long_time(tmp_pa
     third = site.ask(REPEAT, stop_count=1)
     site.work()
     assert site.answers()[third] == ""
-
-
-@pytest.mark.parametrize("replace", [False, True])
-def test_an_existing_route_is_replaced_only_where_that_is_asked_for(tmp_path: Path, replace: bool) -> None:
-    (tmp_path / "hall.route.json").write_text("damaged, but there")
-    request = RouteRequest(RouteAction.TEACH, "hall", replace=replace)
-    command = RouteFiles(RouteFolder(tmp_path)).process(NavigationCommand(request, 0))
-    assert ("--replace" in command.refusal) is not replace
