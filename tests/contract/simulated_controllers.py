@@ -34,7 +34,6 @@ from drivers.motors.simulated.simulated_base import (
     RIGHT,
     SIDES,
     STEP_S,
-    MotionLimits,
     SimulatedBase,
     SimulatedFirmware,
 )
@@ -327,7 +326,6 @@ REPLY_S = 2.0
 LONG_MS = 10_000
 SHORT_MS = 100
 BASE = DifferentialDrive(track_m=0.4, wheel_radius_m=0.08, max_wheel_mps=1.0, gear=12.0)
-INSTANT = MotionLimits(acceleration_mps2=1e4, yaw_acceleration_radps2=1e5)
 
 
 def controller_of(name: str, drive: DifferentialDrive = BASE, watchdog_ms: int = LONG_MS) -> SimulatedController:

@@ -21,7 +21,6 @@ from drivers.motors.protocols.protocol_registry import PROTOCOLS
 from drivers.motors.serial_motor import LateReplyError, SerialMotor
 from tests.contract.simulated_controllers import (
     BASE,
-    INSTANT,
     LONG_MS,
     NAMES,
     REPLY_S,
@@ -144,23 +143,7 @@ def noises(rng: random.Random, valid: bytes) -> Iterator[bytes]:
 
 
 FORWARD = VelocityCommand(0, 0.4, 0.0, 0.0)
-ARC = VelocityCommand(0, 0.72, 0.0, 0.9)
 SHORT_S = 0.05
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_drives_turns_and_stops(name: str) -> None:
-    with connected_motor(name) as (motor, simulated):
-        simulated.base.limits = INSTANT
-        assert until(lambda: motor.send(ARC).watchdog_expired or simulated.base.pose[2] > 0.5)
-        x_m, y_m, heading_rad = simulated.base.pose
-        assert ((x_m**2 + (y_m - 0.8) ** 2) ** 0.5) == pytest.approx(0.8, rel=0.02)  # a circle of v / w = 0.8 m
-        assert simulated.base.velocity_mps == pytest.approx(0.72, rel=0.02)
-        assert until(lambda: delayed(motor).velocity_mps == pytest.approx(0.4, rel=0.2))
-        assert simulated.base.pose[2] >= heading_rad
-        motor.send(stop_command(0))
-        assert until(lambda: simulated.base.velocity_mps == simulated.base.yaw_rate_radps == 0.0)
-        assert simulated.base.errors == motor.errors == motor.replaced_by_stop == 0
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -301,12 +284,6 @@ def test_an_unplugged_controller_is_an_error_and_reconnects(name: str, tmp_path:
             port.symlink_to(second.port)
             assert until(lambda: first_status(motor) is not None and second.base.commanded_mps != [0.0, 0.0])
             assert motor.connections == 2 and second.base.errors == 0
-
-
-def delayed(motor: SerialMotor) -> MotorStatus:
-    """Return the status after a pause, which speeds from differences of counts need."""
-    time.sleep(0.05)
-    return motor.send(FORWARD)
 
 
 def first_status(motor: SerialMotor, tries: int = 200) -> MotorStatus | None:

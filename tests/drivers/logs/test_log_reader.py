@@ -221,11 +221,12 @@ def odometry(velocity_mps: float, yaw_rate_radps: float) -> bytes:
     return serialised(TYPES[ODOMETRY](header(5, "odom"), "base_link", *parts), ODOMETRY)
 
 
-def imu(rates: tuple[float, float, float], frame: str = "imu", covariance: float = 0.0) -> bytes:
+def imu(rates: tuple[float, float, float], frame: str = "imu", covariance: float = 0.0, stamp_ns: int = 5) -> bytes:
     nine = np.zeros(9)
     nine[0] = covariance
     rest = VECTOR(9.0, 9.0, 9.0), np.zeros(9)
-    message = TYPES[IMU](header(5, frame), QUATERNION(9.0, 9.0, 9.0, 9.0), np.zeros(9), VECTOR(*rates), nine, *rest)
+    head = header(stamp_ns, frame)
+    message = TYPES[IMU](head, QUATERNION(9.0, 9.0, 9.0, 9.0), np.zeros(9), VECTOR(*rates), nine, *rest)
     return serialised(message, IMU)
 
 
@@ -453,15 +454,12 @@ def test_equal_images_with_equal_stamps_are_one(tmp_path: Path) -> None:
 
 def test_samples_of_a_gyro_follow_the_clock_of_the_images(tmp_path: Path) -> None:
     """The computer's clock is set back by a second, and with it the stamps of images and gyro."""
-    imu, clock = "sensor_msgs/msg/Imu", back(1)
+    clock = back(1)
     written = entries(clock)
-    vector, rotation, nine = TYPES["geometry_msgs/msg/Vector3"], TYPES["geometry_msgs/msg/Quaternion"], np.zeros(9)
     for number in range(COUNT):
         ns = taken(LOWER, number) + STEP_NS // 2
-        head = header(clock(LOWER, number, ns))
-        rates = vector(0.0, 0.0, float(number))
-        message = TYPES[imu](head, rotation(0.0, 0.0, 0.0, 1.0), nine, rates, nine, vector(0.0, 0.0, 9.8), nine)
-        written.append(Entry("/imu", imu, bytes(STORE.serialize_cdr(message, imu)), ns + DELAY_NS))
+        data = imu((0.0, 0.0, float(number)), stamp_ns=clock(LOWER, number, ns))
+        written.append(Entry("/imu", IMU, data, ns + DELAY_NS))
     path = write_log(tmp_path / "log.mcap", sorted(written, key=lambda entry: entry.log_time_ns))
     with closing(LogReader(path, motion=MotionTopics(imu="/imu"))) as reader:
         messages = list(reader.messages())

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from drivers.errors import DriverError
-from drivers.motor import MotorStatus, VelocityCommand, stop_command
+from drivers.motor import MotorStatus, VelocityCommand
 from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.line_protocol import LineProtocol, encode
 from drivers.motors.protocols.motor_protocol import NoReplyError, T, Transaction
@@ -213,11 +213,3 @@ def test_what_came_instead_of_an_answer_is_named(name: str, answer: bytes, expec
     with contextlib.closing(PtyMotor(Board(lambda _: answer))) as board, pytest.raises(DriverError) as caught:
         SerialMotor(board.port, PROTOCOLS[name](DRIVE), timeout_s=0.3, connect_s=0.1)
     assert expected in str(caught.value) and board.port in str(caught.value) and "\n" not in str(caught.value)
-
-
-def test_a_roboteq_with_one_channel_is_refused() -> None:
-    drive = PROTOCOLS["roboteq"](DRIVE).drive(stop_command(0), 0.0)
-    next(drive)
-    with pytest.raises(DriverError, match="it has one channel; a base needs two"):
-        for reply in (b"+", b"+", b"S=0", b"V=240", b"FF=0"):
-            drive.send(reply)
