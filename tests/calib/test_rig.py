@@ -16,7 +16,7 @@ from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
 from calib.panorama import Cylinder, fit_cylinder, remap_tables
 from calib.rig import MountedCamera, Rig, is_turned_over, rig_between
-from tests.simulation.rigs import LENSES, lens, lens_rig
+from tests.simulation.rigs import lens, lens_rig
 
 FOCAL_PX = 200.0
 CENTER = (384.0, 380.0)
@@ -128,15 +128,11 @@ def test_rig_between_is_upright_with_x_along_the_image_axis() -> None:
         np.testing.assert_allclose(rig.lower.T_cam_rig[:3, 0], T_down[:3, 1], rtol=0, atol=1e-12)
 
 
-def test_exchanged_mirror_cameras_turn_the_rig_over() -> None:
-    for camera in (parabolic_omni().camera, parabolic_ocam().camera):
-        assert not is_turned_over(rig_between(camera, camera, straight_up(0.25)))
-        assert is_turned_over(rig_between(camera, camera, se3.inverse(straight_up(0.25))))
-
-
-@pytest.mark.parametrize("model", LENSES)
-def test_exchanged_lenses_that_look_ahead_turn_the_rig_over(model: str) -> None:
-    rig = lens_rig(lens(model, 90))
+def test_exchanged_cameras_turn_the_rig_over() -> None:
+    for mirror in (parabolic_omni().camera, parabolic_ocam().camera):
+        assert not is_turned_over(rig_between(mirror, mirror, straight_up(0.25)))
+        assert is_turned_over(rig_between(mirror, mirror, se3.inverse(straight_up(0.25))))
+    rig = lens_rig(lens("ds", 90))  # that looks ahead
     camera = rig.lower.camera
     T_lower_upper = rig.lower.T_cam_rig @ se3.inverse(rig.upper.T_cam_rig)
     assert not is_turned_over(rig) and not is_turned_over(rig_between(camera, camera, T_lower_upper))

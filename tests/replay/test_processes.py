@@ -31,8 +31,6 @@ ROOT = Path(__file__).parents[2]
 
 
 PAUSE_PAIRS = 36_000  # an hour
-FEW = ("--seconds", 0.55)  # of the scene, where the end of a run is looked at
-FEW_PAIRS = 6
 
 
 def replaying(scene: Path, *words: object) -> list[str]:
@@ -145,15 +143,6 @@ def test_a_lost_motor_ends_the_run(tmp_path: Path, scene: Path) -> None:
     assert process.returncode == 2, err
     assert err.splitlines()[-1].startswith("omnid: the motor controller does not answer any more"), err
     assert len(rows(tum)) >= 3
-
-
-@pytest.mark.parametrize("where", ["/dev/full", "&-"])
-def test_no_traceback_if_stdout_cannot_be_written(where: str) -> None:
-    shell = f"{sys.executable} -m omnid config >{where}"
-    with started(["sh", "-c", shell]) as process:
-        _, err = process.communicate(timeout=PATIENCE_S)
-    assert "Traceback" not in err
-    assert (process.returncode, err.count("\n")) == ((2, 1) if where == "/dev/full" else (0, 0))
 
 
 def test_a_full_disk_leaves_whole_rows(tmp_path: Path, scene: Path) -> None:

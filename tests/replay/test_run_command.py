@@ -114,21 +114,8 @@ def test_a_camera_fails_and_recovers(tmp_path: Path, course: Path) -> None:
 
 def test_uses_the_attached_rig_and_ends_with_the_log() -> None:
     port = free_port()
-    command = [
-        sys.executable,
-        "-m",
-        "omnid",
-        "run",
-        "--log",
-        str(SAMPLE),
-        "--once",
-        "--pace",
-        "20",
-        "--motor",
-        "simulated",
-        "--set",
-        f'bus.listen=["tcp/127.0.0.1:{port}"]',
-    ]
+    command = [sys.executable, "-m", "omnid", "run", "--log", str(SAMPLE), "--once", "--pace", "20"]
+    command += ["--motor", "simulated", "--set", f'bus.listen=["tcp/127.0.0.1:{port}"]']
     with started(command, port) as daemon:
         _, err = daemon.process.communicate(timeout=PATIENCE_S)
     assert daemon.process.returncode == 0 and "Traceback" not in err, err
@@ -145,23 +132,8 @@ def test_uses_the_attached_rig_and_ends_with_the_log() -> None:
 def test_signals_end_it_without_output_at_any_time(scene: Path, number: int) -> None:
     """Also while it starts."""
     port = free_port()
-    command = [
-        sys.executable,
-        "-m",
-        "omnid",
-        "run",
-        "--log",
-        str(scene / "log.mcap"),
-        "--rig",
-        str(scene / "rig.toml"),
-        "--motor",
-        "simulated",
-        "--set",
-        f'bus.listen=["tcp/127.0.0.1:{port}"]',
-        "--set",
-        "obstacles.scan.floor_m=-1.2",
-    ]
-    with started(command, port) as daemon:
+    words = ("--motor", "simulated", "--set", "obstacles.scan.floor_m=-1.2")
+    with started(command_line(scene, port, None, *words), port) as daemon:
         wait_until(lambda: answers(port), "the bus")  # opened after cameras and motor, before anything runs
         code, err = daemon.end(number)
     assert code == 0 and err == ""

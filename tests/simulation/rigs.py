@@ -189,7 +189,6 @@ def with_upper_rotated(rig: Rig, turn_deg: tuple[float, float, float]) -> Rig:
 
 # A camera that looks ahead: its z is the rig's x, its x the rig's -y, its y the rig's -z.
 R_RIG_AHEAD = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
-LENSES = ("pinhole", "equidistant", "ds")
 
 
 def lens(model: str, field_deg: float, size: tuple[int, int] = (640, 480)) -> OmniCamera:

@@ -123,9 +123,7 @@ def test_a_robot_that_hardly_turns_is_refused(scene: Path) -> None:
 
 
 CYLINDER = Cylinder(872, 253, 86.0)
-RING = slice(200, 216)  # rows of the reflection of a lens
 SHOWN = np.ones((CYLINDER.height, CYLINDER.width), bool)
-LIGHT_GREY = 60.0
 PAD_PX, NOISE_GREY = 24, 1.0
 TURN = [(n + 0.5) * math.tau / HEADINGS for n in range(HEADINGS)]
 
@@ -141,10 +139,9 @@ def world() -> NDArray[np.float32]:
     return grey
 
 
-def seen(heading_rad: float, ring_grey: float = 0.0, columns: slice = slice(None)) -> PaddedPanorama:
-    """Return the world at a heading, with light that is added by a reflection in some columns."""
+def seen(heading_rad: float) -> PaddedPanorama:
+    """Return the world at a heading."""
     grey = np.roll(world(), round(heading_rad / math.tau * CYLINDER.width), axis=1)
-    grey[RING, columns] += ring_grey
     noise = np.random.default_rng(round(1e3 * heading_rad)).normal(0.0, NOISE_GREY, grey.shape)
     image = np.clip(np.rint(grey + noise), 0, 255).astype(np.uint8)
     return PaddedPanorama(np.pad(image, ((0, 0), (PAD_PX, PAD_PX)), mode="wrap"), PAD_PX, NOISE_GREY)
@@ -164,14 +161,6 @@ def observed(pairs: Callable[[float], tuple[PaddedPanorama, PaddedPanorama]]) ->
         parts.observe(turned(heading), *pairs(heading), SHOWN)
     assert parts.headings == HEADINGS
     return parts.pixels()
-
-
-def test_a_reflection_is_found_within_a_turn_and_nothing_else() -> None:
-    pixels = observed(lambda heading: (seen(heading), seen(heading, LIGHT_GREY)))
-    rows = pixels.mean(axis=1)
-    assert rows[RING].min() > 0.9
-    # The band-pass spreads a border over its 17 rows of 139 a radian.
-    assert not rows[: RING.start - 16].any() and not rows[RING.stop + 16 :].any()
 
 
 def test_the_world_the_horizon_and_images_that_do_not_follow_the_heading_are_not_fixed() -> None:

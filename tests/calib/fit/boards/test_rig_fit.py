@@ -158,7 +158,6 @@ def test_refuses_too_few_views_and_pairs() -> None:
     "shape",
     [
         AS_DRAWN,
-        PrintShape((0.8e-3, -0.5e-3, 0.3e-3, 0.0)),
         PrintShape((3e-3, 0.0, 0.0, 0.003)),
     ],
 )
