@@ -240,7 +240,7 @@ class NavigationUpdate:
     stamp_ns: int
     setpoint: Setpoint | None  # heading in odom; None: nothing is sent, and the wheels stop
     state: NavigationState
-    reason: str = ""  # reason of a halt or an end, in words
+    reason: str = ""  # reason of a stop or an end, in words
     task: str = ""  # such as "goal" or "route NAME"
     command_ns: int = 0  # stamp of the request that it follows from
     left_m: float = math.nan  # way to the end of the path

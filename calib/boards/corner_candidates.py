@@ -23,8 +23,8 @@ RING = 32
 BLUR_PX = 0.7
 # Least contrast of a ring [grey levels].
 MIN_CONTRAST = 6.0
-# Largest ratio of the ring's odd part to its even part (standard deviations), because opposite sides of a corner are
-# alike.
+# Largest ratio of the ring's odd part to its even part (standard deviations), because opposite sides of a corner have
+# the same grey.
 MAX_ODD = 0.6
 # Least angle between the two edges of a corner.
 MIN_CROSSING_RAD = np.deg2rad(18)

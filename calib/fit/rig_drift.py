@@ -6,9 +6,9 @@ a lateral shift e of the upper viewpoint, as a fraction of the baseline, move th
 
     -w_z + slope_upper (w_x cos a + w_y sin a) + (slope_lower - slope_upper) (e_x sin a - e_y cos a)    [rad]
 
-A rotation about the vertical moves all columns alike. A tilt moves them by one sine wave over the azimuth, which grows
-with the distance from the horizon. A shifted viewpoint moves them by one sine wave, which grows with the nearness of
-the point. (Longuet-Higgins 1981. The length of the baseline is not observable.)
+A rotation about the vertical moves all columns equally. A tilt moves them by one sine wave over the azimuth, which
+grows with the distance from the horizon. A shifted viewpoint moves them by one sine wave, which grows with the nearness
+of the point. (Longuet-Higgins 1981. The length of the baseline is not observable.)
 """
 
 from __future__ import annotations

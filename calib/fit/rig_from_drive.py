@@ -45,9 +45,9 @@ ROUGH_GAIN, FINE_GAIN = 1e-3, 1e-6
 HELD = 1e12
 # About six times the number of parameters of a rig. Fewer landmarks would not show that a parameter is wrong.
 MIN_LANDMARKS = 100
-# Errors of a patch are alike in both cameras, and from keyframe to keyframe (correlation 0.9 in rendered rooms),
-# so ten of these observations tell about as much as one corner in a calibration by boards.
-OBSERVATIONS_ALIKE = 10.0
+# Observations that count as one corner of a calibration by boards: errors of a patch are correlated in both cameras and
+# from keyframe to keyframe (0.9 in rendered rooms).
+CORRELATED_OBSERVATIONS = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,16 +112,16 @@ def adjust_drive(
     observations: DriveObservations,
     fixed: Sequence[int] = (0,),
     *,
-    alike: float = 1.0,
+    correlated: float = 1.0,
 ) -> DriveAdjustment:
     """Return the rig, poses and landmarks of least robust reprojection error near those given.
 
-    fixed: keyframes whose pose stays, one for each drive. alike: number of observations that tell as much as one
-    independent one; the prior of the parameters gets so many times its weight.
+    fixed: keyframes whose pose stays, one for each drive. correlated: number of observations that count as one
+    independent one; the weight of the prior of the parameters is multiplied by it.
     CalibError where fewer than MIN_LANDMARKS landmarks agree.
     """
     prior = parameters.prior()
-    problem = DriveProblem(parameters, observations, alike * prior, np.asarray(fixed))
+    problem = DriveProblem(parameters, observations, correlated * prior, np.asarray(fixed))
     state, sigma_px = problem.minimised(state, ROUGH_GAIN)
     for number in range(SELECTIONS):
         kept, used = observations.only(problem.consistent(state, sigma_px))
@@ -138,15 +138,15 @@ def adjust_drive(
         observations, state = kept, replace(state, points=state.points[used])
         problem = replace(problem, observations=observations)
         state, sigma_px = problem.minimised(state, FINE_GAIN if number == SELECTIONS - 1 else ROUGH_GAIN)
-    covariance = problem.covariance(state, sigma_px, alike**2 * prior)
+    covariance = problem.covariance(state, sigma_px, correlated**2 * prior)
     return DriveAdjustment(parameters, state, observations, covariance, sigma_px, prior)
 
 
 def adjust_pairs(parameters: RigParameters, state: DriveState, observations: DriveObservations) -> Array:
     """Return the steps (P,) by points that both cameras saw at once, near those of the state: a start for a drive.
 
-    The only condition is that the rays of both cameras meet. It tells the columns of the panoramas, but no lengths. The
-    poses of all keyframes stay; wherever they are, the result is the same.
+    The only condition is that the rays of both cameras meet. It determines the columns of the panoramas, but no lengths.
+    The poses of all keyframes stay; wherever they are, the result is the same.
     """
     problem = DriveProblem(parameters, observations, parameters.prior(), np.arange(len(state.T_rig_odom)))
     return problem.minimised(state, ROUGH_GAIN)[0].steps

@@ -90,7 +90,7 @@ def camera_of(
 def changed(camera: OmniCamera, changes: Mapping[str, float]) -> OmniCamera:
     """Return the camera with parameters changed by these amounts; CalibError for an unknown name or an invalid result.
 
-    d of an ocam camera moves d and e alike, because their difference is a rotation of the camera.
+    d of an ocam camera moves d and e together, because their difference is a rotation of the camera.
     """
     values = values_of(camera)
     for name, change in changes.items():

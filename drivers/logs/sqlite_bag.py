@@ -1,8 +1,8 @@
 """Bags of ROS 2 in SQLite (.db3), read by Python's sqlite3.
 
 Layout, as `ros2 bag record -s sqlite3` writes it: rosbag2_storage_sqlite3, versions 1 to 4: table topics (id, name,
-type, serialization_format, ...) and table messages (id, topic_id, timestamp [ns], data). What a recorder that was
-killed leaves beside the file counts: a write-ahead log, or a journal by which the last transaction is undone.
+type, serialization_format, ...) and table messages (id, topic_id, timestamp [ns], data). The files
+that a killed recorder leaves next to it are used: a write-ahead log, or a journal, which undoes the last transaction.
 """
 
 from __future__ import annotations
@@ -102,14 +102,14 @@ def _opened(path: Path) -> sqlite3.Connection:
     are copied, into $TMPDIR or /tmp; they stay readable when they are deleted. A file that had a write-ahead log is
     read as one that does not change.
     """
-    beside = [file for suffix in ("-wal", "-journal") if (file := Path(f"{path}{suffix}")).exists()]
+    extra_files = [file for suffix in ("-wal", "-journal") if (file := Path(f"{path}{suffix}")).exists()]
     try:
         return _connected(path, "ro")
     except sqlite3.Error:
-        if not beside:
+        if not extra_files:
             return _connected(path, "ro&immutable=1")  # else it locks what nobody writes
     with TemporaryDirectory(prefix="omnid-") as folder:
-        for file in (path, *beside):
+        for file in (path, *extra_files):
             shutil.copyfile(file, Path(folder, file.name))
         return _connected(Path(folder, path.name), "rw")
 

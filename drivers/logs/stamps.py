@@ -127,7 +127,7 @@ def _fault(times: Times) -> str:
     step_ns = _step_ns(times)
     if step_ns < _SHORTEST_STEP_NS:
         return f"are {step_ns / 1000:g} us apart"
-    # An image behind the latest one must fill a hole: half a period beside others is none.
+    # An image behind the latest one must fill a hole: closer than half a period to others there is none.
     times = times[np.diff(times, prepend=-1) != 0]
     latest_ns = np.maximum.accumulate(times)
     order, place, counts = np.unique(times, return_inverse=True, return_counts=True)

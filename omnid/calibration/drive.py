@@ -15,7 +15,7 @@ from calib.fit.parameters import LINE_TIME, NOMINAL_TURN_RAD, UPPER_DELAY, RigPa
 from calib.fit.residual_structure import ResidualStructure
 from calib.fit.rig_drift import apply_drift
 from calib.fit.rig_from_drive import (
-    OBSERVATIONS_ALIKE,
+    CORRELATED_OBSERVATIONS,
     DriveAdjustment,
     adjust_drive,
     adjust_pairs,
@@ -187,8 +187,10 @@ def _in_rounds(
 
 
 def _adjusted(parameters: RigParameters, steps: Array, drives: Drives) -> DriveAdjustment:
-    alike = 1.0 if parameters.rig.covariance is None else OBSERVATIONS_ALIKE
-    return adjust_drive(parameters, replace(drives.state, steps=steps), drives.observations, drives.fixed, alike=alike)
+    correlated = 1.0 if parameters.rig.covariance is None else CORRELATED_OBSERVATIONS
+    return adjust_drive(
+        parameters, replace(drives.state, steps=steps), drives.observations, drives.fixed, correlated=correlated
+    )
 
 
 def _finished_rig(before: Rig, found: DriveAdjustment) -> Rig:

@@ -1,7 +1,7 @@
-"""What a log tells of a rig beside its cameras: height and tilt by the floor, and masks of what is fixed to a camera.
+"""Height and tilt of a rig by the floor in a log, and masks of what is fixed to its cameras.
 
 The floor gives the height of the lower viewpoint. What stays in the images while the robot turns is fixed to a camera,
-as the reflection of a lens in its mirror.
+such as the reflection of a lens in its mirror.
 """
 
 from __future__ import annotations

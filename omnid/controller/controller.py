@@ -175,7 +175,7 @@ class Controller:
         return status
 
     def _take_problem(self, problem: str, now_ns: int) -> None:
-        """Keep why the motor controller has not taken a command; report it where it is new."""
+        """Keep the reason why a command failed; report it if it is new."""
         state = self.state
         state.overdue = not state.sent and now_ns > self._boots_until_ns
         if problem != state.problem:

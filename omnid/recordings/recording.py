@@ -45,9 +45,9 @@ Content: TypeAlias = Pose | PoseInMap | Diagnostics | Cloud | Scan | TwistRecord
 def choose_odometry_topic(found: LogInfo, topic: str | None = None, robot: str | None = None) -> str:
     """Return the topic of the poses.
 
-    1. A topic or a robot that the user names is taken; it must hold nav_msgs/msg/Odometry.
-    2. Else the only topic with messages of that type is taken.
-    3. Of several, the only one that has omnid's name `.../odom` is taken.
+    1. A topic or a robot that the user names; it must hold nav_msgs/msg/Odometry.
+    2. Else the only topic with messages of that type.
+    3. Of several, the only one that has omnid's name `.../odom`.
     4. Else the user must name one.
 
     topic: the full name, such as /omnid/odom; robot: stands for /<robot>/odom. Raise OmnidError where there is no

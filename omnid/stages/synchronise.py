@@ -45,7 +45,7 @@ class Skew:
     def add(self, skew_ns: int) -> None:
         """Add the skew of a pair: the median of the recent ones counts, where it exceeds what their scatter explains.
 
-        A value that is far from the others means a lost image, or a camera that was started again: it begins anew.
+        A value that is far from the others means a lost image, or a camera that was started again: the older ones go.
         """
         recent = self._recent
         if abs(skew_ns - self.median_ns) > 2 * self._limit_ns:  # never before the first

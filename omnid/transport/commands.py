@@ -25,7 +25,7 @@ the robot's CLOCK_MONOTONIC. A message says when it was sent by
 and the nearer of the two to its arrival counts. What can begin a motion (arm, a goal, the first setpoint of a stream,
 the release of a contact) must say it, and have been sent within stale_s of its arrival: a message that waited in a
 network, or was recorded, begins none. What goes on with a motion is as old as it says, and at least as its arrival; it
-need not say anything. What ends a motion is taken in any case.
+need not say anything. What ends a motion is accepted in any case.
 """
 
 from __future__ import annotations

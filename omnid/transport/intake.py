@@ -107,7 +107,7 @@ class CommandIntake:
         requests: OpenRequests,
         callback: RequestCallback,
     ) -> None:
-        """topics: those to take beside stops and requests to arm. requests: keeps unanswered queries.
+        """topics: those to receive besides stops and requests to arm. requests: keeps unanswered queries.
 
         callback: takes each message, in the thread of `process`.
         """

@@ -80,7 +80,7 @@ _SETPOINTS: Final = {TWIST: codec.TWIST_SCHEMA, HEADING: codec.VECTOR_SCHEMA}
 
 
 class Command(NamedTuple):
-    """What is taken on a topic, how often, and how long it may be."""
+    """Type, highest rate and largest size of the messages that are accepted on a topic."""
 
     schema: str  # ROS 2 message type
     rate_hz: float = 1000.0  # messages that are decoded a second: of setpoints, samples
@@ -103,7 +103,7 @@ COMMANDS: Final = {
 
 
 def command_of(topic: str) -> Command:
-    """Return what is taken on a topic of commands or, by its last part, of setpoints."""
+    """Return what is accepted on a topic of commands or, by its last part, of setpoints."""
     return COMMANDS.get(topic) or Command(_SETPOINTS.get(topic.rpartition("/")[2], ""))
 
 

@@ -211,7 +211,7 @@ def _consensus(candidates: Array) -> tuple[Array, Array]:
     distances = np.linalg.norm(gaps, axis=-1) + np.linalg.norm(t - t[:, None], axis=-1) / length
     apart = distances.reshape(-1, *candidates.shape[:2])
     nearest = apart.min(axis=2)
-    # Far ones count alike: the cost is that of MSAC (Torr and Zisserman 2000).
+    # All outliers have the same cost: MSAC (Torr and Zisserman 2000).
     cost = np.minimum(nearest, MAX_INLIER_DISTANCE).mean(axis=1)
     best = int(cost.argmin())
     others = cost[apart[best].ravel() > MAX_INLIER_DISTANCE]

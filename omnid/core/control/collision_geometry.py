@@ -28,7 +28,7 @@ class Outline(NamedTuple):
     half_width_m: float
 
     def grown(self, front_m: float, rear_m: float, side_m: float) -> Outline:
-        """Return the outline with so much room around it."""
+        """Return the outline enlarged by margins in front, behind and on both sides [m]."""
         return Outline(self.front_m + front_m, self.rear_m + rear_m, self.half_width_m + side_m)
 
     def offset_m(self, x_m: float, y_m: float) -> Point:

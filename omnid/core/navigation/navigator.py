@@ -83,9 +83,9 @@ class Drive:
     lost_s: float = 0.0  # time since then for which no way was free
     tried_s: float = 0.0  # time since then on ways that were blocked again
     way_s: float = 0.0  # time on the present way
-    ways: int = 0  # number of ways that were taken since then
+    ways: int = 0  # number of ways that were begun since then
     searched_ns: int = -AGAIN_NS  # stamp of the last search
-    no_way: str = ""  # why it was in vain
+    no_way: str = ""  # why that search found none
     is_waiting: bool = False  # a way around is known that takes longer than what it has waited is worth
 
     @property
@@ -364,10 +364,10 @@ class Navigator:
     def _takes_other_way(
         self, drive: Drive, now: Situation, around: Surroundings, following: Following, *, is_closed: bool
     ) -> bool:
-        """True if the base takes another way from now on; is_closed: something stands or comes in the present one.
+        """True if the base begins another way; is_closed: an obstacle is or will be on the present one.
 
-        A long way round, where the path or who moves was in the way, is taken once as much time was lost by waiting:
-        nobody knows when the way is free again, and so at most twice the least time is lost (the ski rental problem).
+        A long way around an obstacle is chosen only after a wait as long as the time it costs: it is unknown when the
+        present way is free again, and so at most twice the least time is lost (the ski rental problem).
         """
         detour, settings, path = drive.detour, self.settings, drive.paths[0]
         is_to_goal, is_blocked = detour is not None and path.is_goal, is_closed or bool(now.wheels.held_by)

@@ -28,7 +28,7 @@ FARTHEST_M: Final = 1e6  # Largest coordinate, so that nonsense is refused: larg
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathLeg:
-    """A smooth piece of a path, driven without a halt. A position on it is given by the arc length s from its start."""
+    """A smooth piece of a path, driven without a stop. A position on it is given by the arc length s from its start."""
 
     xy: Array  # (N, 2) positions [m], N >= 2
     s: Array  # (N,) arc length from the start [m]

@@ -1,11 +1,11 @@
-"""What is about the base, in odom: the grid of the obstacles, and where what moves will be.
+"""Surroundings of the base, in odom: the grid of the obstacles, and the predicted places of moving objects.
 
-What moves keeps its velocity (van den Berg, Lin, Manocha 2008, "Reciprocal velocity obstacles", ICRA: the usual
-assumption over some seconds). It is no part of the grid here, but an obstacle where the base would meet it.
-Floor that is not known has a cost, as it may be seen when the base comes near; where it was not seen from near, as
-behind a plain surface, coming nearer shows no more: that counts as an obstacle until it is seen. So does the end of a
-way on which small probabilities of things add up to more than the risk, though each of its cells is free: the collision
-monitor lets nobody pass there.
+A moving object keeps its velocity (van den Berg, Lin, Manocha 2008, "Reciprocal velocity obstacles", ICRA: the usual
+assumption over some seconds). It is no part of the grid here, but an obstacle where the base would meet it. Unknown
+floor has a cost, as it may be seen when the base comes near. Floor that was not seen from near, such as behind a plain
+surface, is an obstacle until it is seen, because coming nearer shows no more. So is the end of a way along which small
+probabilities of obstacles add up to more than the risk, though each of its cells is free: the collision monitor stops
+the base there.
 """
 
 from __future__ import annotations

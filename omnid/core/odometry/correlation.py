@@ -2,8 +2,8 @@
 
 Along a column, texture that repeats matches at several rows of the upper panorama. Courses of bricks of the height c
 fit at every disparity d (1 - k c / B), B the baseline, whatever their distance. Dense stereo chooses by its
-surroundings, and at the ends of a sector these are few: bricks at 5 m were taken for ones at 50 m, twenty in a row.
-They hardly move with the robot's lateral motion, so that they distinguish it from a turn, and moved the pose by seven
+surroundings, and at the ends of a sector these are few: twenty bricks in a row at 5 m were measured at 50 m. Points so
+far hardly move with the robot's lateral motion, so that they decide between it and a turn: the pose was wrong by seven
 sigmas.
 
 The landmarks that the map knows nearby have been seen from several places, which show their depth. A new one whose

@@ -76,7 +76,7 @@ RIDGE: Final = 1e-6
 KINDS: Final[tuple[tuple[Kind, tuple[int, ...]], ...]] = (
     *(("torn", cameras) for cameras in SETS),
     *(("displaced", cameras) for cameras in SETS),
-    *(("turned", cameras) for cameras in SETS[:2]),  # both images turned alike are a turn of the rig
+    *(("turned", cameras) for cameras in SETS[:2]),  # both images turned by the same angle are a turn of the rig
 )
 CHOICES: Final = 2 * LINES * len(KINDS)  # sides, lines, kinds
 

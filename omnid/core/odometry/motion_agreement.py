@@ -1,20 +1,22 @@
 """Do images, wheels and gyro show the same motion at the same time? Windowed sums of their innovations.
 
-Images that come late, play slowly, or are of a rig of another size track well, and so do wheels of another radius: each
-of them is consistent in itself. Three accounts of the same drive are not:
+Images that arrive late, play slowly, or are of a rig of another size track well, and so do wheels of another radius:
+each sensor is consistent in itself. The comparison of all three is not:
 
     distance  of images and wheels
     turn      of images, wheels and gyro, each with each
 
 1. Delay. For lags l from -0.5 to 1.5 s, J(l) = min_s sum (s D(start - l, end - l) - seen)^2 over the steps of the last
    10 s, D the motion by a sensor. The smallest J(l) is compared with the smallest one within 0.3 s of 0: their
-   difference in variances of the residuals is the evidence (a likelihood ratio). A steady motion has none.
-2. Scale. The sums of both over the newest 3 m or 10 s, whichever is shorter, at the likeliest lag within 0.3 s.
-3. Direction. Wheels roll forwards: motion to the side, as the images show it while the base drives straight on, is that
-   of a rig whose yaw on the base is not that of T_base_rig.
+   difference, divided by the variance of the residuals, is the evidence (a likelihood ratio). A steady motion has none.
+2. Scale. The motion of the sensor and of the images is summed over the newest 3 m or 10 s, whichever is shorter, at the
+   likeliest lag within 0.3 s.
+3. Direction. Wheels roll forwards: if the images show motion to the side while the base drives straight on, the yaw of
+   the rig on the base is not that of T_base_rig.
 
-The account that two others contradict, which agree, is named; of two it is not known which one is wrong. A part of a
-limit is a doubt. Once all have been at rest for STILL_S everything is forgotten: a person may arm and try again.
+A sensor that differs from two others, which agree, is wrong; of two it is unknown which one is. A difference of
+DOUBT_SHARE of its limit is a doubt, the whole limit a fault. After STILL_S at rest everything is forgotten: a person
+may arm and try again.
 """
 
 from __future__ import annotations
@@ -43,29 +45,29 @@ from omnid.core.odometry.motion_filter import MotionFilter
 
 Array = NDArray[np.float64]
 
-# So much because a delay of 0.3 s is 0.15 m at 0.5 m/s, what the collision monitor keeps as distance; 10 % of 3 m is
-# twice that.
+# Window of the sums, and allowed differences: 0.3 s are 0.15 m at 0.5 m/s, the distance that the collision monitor
+# keeps; 10 % of 3 m are twice that.
 WINDOW_S, WINDOW_M, SCALE_SHARE, ALLOWED_LAG_S = 10.0, 3.0, 0.1, 0.3
-# Lags that are compared: buffers of cameras hold up to a second or so, because drivers keep a handful of images.
+# Lags that are compared: drivers of cameras buffer some images, up to a second or so.
 LAG_STEP_S: Final = 0.05
 LAGS_S: Final = np.arange(-0.5, 1.5 + LAG_STEP_S / 2, LAG_STEP_S)
-# Sigma of a lag that is in order, because motors follow commands late and exposures last: of two accounts one may show
-# a motion so much before the other.
+# Sigma of an allowed lag: of two sensors one may show a motion so much before the other, because motors follow commands
+# late and exposures last.
 LAG_SIGMA_S: Final = 0.1
 DOUBT_SHARE: Final = 0.5  # Share of a limit from which on the base drives slowly; by trial on development seeds.
-# The same of the newest second alone: 0.1 m, and a third of the way, because images that play at half of the speed show
-# half of it.
+# Limits for a doubt in the newest second alone, 0.1 m and a third of the way: images that play at half of the speed
+# show half of it.
 SOON_S, SOON_M, SOON_SHARE = 1.0, 0.1, 1 / 3
-# Motion to the side as a share of the way: 0.15 m a metre ahead, because the collision monitor keeps as much as
-# distance. In a curve, with more turn than this, an offset of the rig moves to the side.
+# Allowed motion to the side as a share of the way: the distance of the collision monitor, 0.15 m, after a metre. In a
+# curve with more turn than STRAIGHT_RADPM an offset of the rig also moves to the side.
 ASIDE_SHARE, STRAIGHT_RADPM = 0.15, 0.1
 # Least differences of sums: an allowed delay moves a base of 0.2 m/s so far; a gyro's bias is estimated to less than
 # half a degree a second; wheels whose diameters differ by 0.7 % turn by 4 degrees over 3 m, which is no doubt yet.
 LEAST_M, TURN_RAD, WHEEL_TURN_RAD = 0.05, math.radians(5.0), math.radians(15.0)
 STEP_SIGMA: Final = 0.003  # m and rad of a step, added to that of its residuals: roughness of floor and images
-EVIDENCE: Final = 50.0  # Log-likelihood ratio, doubled: seven sigma, because a lag is sought in each pair.
+EVIDENCE: Final = 50.0  # Twice the log-likelihood ratio: seven sigma, because a lag is searched in each pair.
 WORSE: Final = 3.0  # ratio of the sums of squares that the lag must explain, because slip makes both of them large
-LATE_S: Final = 0.5  # A lag is a fault after this time, because the newest steps are the most noisy.
+LATE_S: Final = 0.5  # A lag is a fault after this time, because the newest steps are the noisiest.
 SCALES: Final = (0.3, 3.0)  # Scales of the motion in the search of a lag, because images may be slow as well as late.
 STILL_S, STILL_M, STILL_RAD = 2.0, 0.02, 0.04  # Limits of rest, because 1 cm/s and a degree a second are noise.
 MOST_KEPT: Final = 2048  # steps, so that memory is bounded: WINDOW_S at 200 Hz
@@ -74,7 +76,7 @@ EVERY_S: Final = 0.1  # Time between two comparisons, because each takes a milli
 
 
 class _Finding(NamedTuple):
-    """Comparison of one account with the images, or of wheels with the gyro."""
+    """Comparison of one sensor with the images, or of wheels with the gyro."""
 
     is_known: bool = False
     excess: float = 0.0  # difference of the sums as a fraction of its limit; 1 and more is a fault
@@ -89,7 +91,7 @@ class _Finding(NamedTuple):
 
 
 class MotionAgreement:
-    """Follows the accounts; memory and work are bounded."""
+    """Compares images, wheels and gyro at each pair; memory and work are bounded."""
 
     def __init__(self, motion: MotionFilter) -> None:
         """motion: the filter, with the samples of wheels and gyro."""
@@ -124,8 +126,8 @@ class MotionAgreement:
             self._steps.popleft()
 
     def _compare(self, starts: Array, ends: Array, ways: Array, turns: Array, aside: Array) -> Conflict:
-        """Return the account that differs, and whether it is a fault, by steps (N,) of the cameras."""
-        # 1. The sums of each account and the images; wheels are the worse one of distance and turn.
+        """Return the sensor that differs, and whether it is a fault, by steps (N,) of the cameras."""
+        # 1. Each sensor against the images; for the wheels the worse one of distance and turn counts.
         lagged = starts - LAGS_S[:, None], ends - LAGS_S[:, None]
         wheels_by_lag = self._motion.motion(WheelSample, *lagged)
         gyro_by_lag = self._motion.motion(GyroSample, *lagged)[..., 2]
@@ -148,8 +150,8 @@ class MotionAgreement:
             between = _finding(spans, gyro_by_lag[_NO_LAG], wheels_by_lag[..., 1], WHEEL_TURN_RAD)
             is_alone = of_wheels.is_known and between.excess >= of_wheels.excess
             reason, found = GYRO_DIFFERS if is_alone else IMAGES_OR_GYRO, of_gyro
-        # 3. Wheels that turn otherwise than images and gyro are explained by themselves: a weak motor, another radius.
-        #    The pose is right, so the base drives on slowly. Their distance, and a delay, nobody else confirms.
+        # 3. Wheels that turn otherwise than both images and gyro are wrong: a weak motor, another radius. The pose is
+        #    right, so the base drives on slowly. Neither a distance nor a delay is confirmed by a third sensor.
         now_s = float(ends[-1])
         self._late_since_s = (self._late_since_s or now_s) if found.is_late else None
         is_long = self._late_since_s is not None and now_s - self._late_since_s >= LATE_S
@@ -166,7 +168,7 @@ class MotionAgreement:
             return False
         by_wheels = self._motion.motion(WheelSample, np.array(now_s - STILL_S), np.array(now_s - LAG_STEP_S))
         by_images = np.array([ways[newest].sum(), turns[newest].sum()])
-        # Wheels that say nothing (NaN) have not moved.
+        # Wheels without samples (NaN) count as at rest.
         return not any((np.abs(each) > (STILL_M, STILL_RAD)).any() for each in (by_images, by_wheels))
 
 
@@ -245,10 +247,10 @@ def _is_long(starts: Array, ends: Array) -> bool:
 
 
 class Contradiction:
-    """What wheels and gyro that contradict the images add to the covariance of the pose.
+    """Covariance of the pose by the difference between the images and the wheels or gyro that contradict them.
 
-    What they differed by in a fault stays when they agree again, since a later image does not mend a pose that went
-    wrong. A doubt is over with its reason.
+    The difference in a fault stays when they agree again, since later images do not correct a wrong pose. That of a
+    doubt ends with the doubt.
     """
 
     def __init__(self) -> None:
@@ -256,7 +258,7 @@ class Contradiction:
         self._fault_s = -math.inf  # time of the last fault
 
     def add(self, conflict: Conflict, T_odom_base: Array, time_s: float) -> Array:
-        """Add what the accounts differ by at a pose; return its covariance (6, 6) in the axes of the base."""
+        """Add the difference at a pose; return its covariance (6, 6) in the axes of the base."""
         # The sums overlap from pair to pair: only their part since the last fault is new. Ways and turns in it are so
         # short that their order does not matter.
         seconds, to_odom = time_s - self._fault_s, se3.adjoint(T_odom_base)

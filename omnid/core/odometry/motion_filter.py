@@ -43,8 +43,8 @@ START_SIGMA = np.array([0.05, 0.1, 0.02, 0.02, 0.02, 0.02, 0.02])
 WALK_SIGMA = np.array([2e-4, 5e-4, 1e-5, 1e-5, 5e-5, 5e-5, 5e-5])
 LOST_SIGMA = np.array([1.0, 1.0, 0.1, 0.1, 0.2, 0.2, 0.2])
 STATES_OF = {WheelSample: slice(0, 3), GyroSample: slice(3, 7)}
-SANE_SCALE = (0.5, 2.0)  # limits of the wheels' scales, because beyond them their settings are wrong.
-CAMERA_SIGMA = np.repeat([3e-4, 1e-4], 3)  # of the cameras' step, m and rad, beside what its covariance says
+SANE_SCALE = (0.5, 2.0)  # Limits of the wheels' scales: beyond them their settings are wrong.
+CAMERA_SIGMA = np.repeat([3e-4, 1e-4], 3)  # of the cameras' step, m and rad, in addition to its covariance
 # A larger difference from the cameras' step means that a sensor slips or is wrong: noise makes one of 16,000 so large.
 GATE_SIGMAS = 4.0
 # Consecutive outliers of wheels that mean slip, because a single one may be a bump. They are counted, and not timed,

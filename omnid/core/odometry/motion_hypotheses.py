@@ -1,17 +1,17 @@
 """Motions that explain the images about as well: at most three hypotheses (multiple hypothesis tracking, Reid 1979).
 
-Along identical bricks a step and that step plus a period show the same. A hypothesis j holds its displacement d_j from
+Along identical bricks a step and that step plus a period look the same. A hypothesis j holds its displacement d_j from
 the published pose, its velocity w_j relative to the published one, and the logarithm l_j of its weight. A new frame has
 pose candidates m, which lie x_m [m] off the predicted pose. A pair of both has
 
     l_jm = l_j - |x_m - w_j dt|^2 / (2 s_j^2),    d_jm = d_j + x_m - x_m*,    w_jm = (x_m - x_m*) / dt,
 
 s_j what is known of the predicted step, m* the candidate of the likeliest pair, which is published. Landmarks on a
-pattern err alike, so the images only tell which candidates there are: those that cost less than a million to one more
-than the cheapest one. Noise hides a peak now and then: then a hypothesis goes on at its velocity, at the price of the
-logarithm of that probability. Pairs that move alike, within SAME_M in a step, are one with the larger displacement,
-since no later frame tells them apart; those that are less likely by a million to one are dropped, and the likeliest
-three remain.
+pattern have correlated errors, so the images only show which candidates there are: those less than a million to one
+less likely than the best. Now and then noise hides a peak: then a hypothesis continues at its velocity, at the cost of
+the logarithm of that probability. Pairs whose steps agree within SAME_M are merged, with the larger displacement, since
+no later frame distinguishes them; those that are less likely by a million to one are dropped, and the likeliest three
+remain.
 
 Candidates are peaks of the mean correlation of the landmarks' patches A_i of the last panorama with the new one, B,
 over horizontal displacements d of the pose T:
@@ -167,8 +167,8 @@ class MotionHypotheses:
         for each in sorted(hypotheses, key=lambda each: -each.log_weight):
             if each.log_weight <= best - DECIDING_COST:
                 break
-            alike = (n for n, one in enumerate(left) if np.linalg.norm(each.velocity - one.velocity) * dt_s <= SAME_M)
-            number = next(alike, None)
+            same = (n for n, one in enumerate(left) if np.linalg.norm(each.velocity - one.velocity) * dt_s <= SAME_M)
+            number = next(same, None)
             if number is None:
                 left.append(replace(each, log_weight=each.log_weight - best))
                 continue

@@ -22,7 +22,7 @@ LEAST_GAIN, LARGEST_GAIN = 0.25, 4.0  # Limits; exposures were made equal before
 MIN_CONTRAST = 0.5  # grey levels, standard deviation in a window, because less is no texture
 # Determinant of the gradients' matrix by its squared trace, because less is an edge, along which a patch slides.
 MIN_DETERMINANT = 1e-3
-# Interpolation makes the noise of neighbouring pixels alike, so that a sum over a window of a panorama varies by this
+# Interpolation correlates the noise of neighbouring pixels, so that a sum over a window of a panorama varies by this
 # factor more.
 NOISE_CORRELATION = 3.0
 # Variance of a gradient of the panorama's noise per variance of the noise, which enlarges the gradients' matrix.

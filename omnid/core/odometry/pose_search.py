@@ -280,8 +280,10 @@ class PoseSearch:
             if kept.sum() < MIN_LANDMARKS:
                 return None, kept
             points, covariance = table.points[landmarks[kept]], table.covariance[landmarks[kept]]
-            alike = None if shared is None else shared.of(kept)
-            solution = gauss_newton(points, covariance, views[kept], T_curr_odom, model, noise[kept], steps, alike)
+            shared_error = None if shared is None else shared.of(kept)
+            solution = gauss_newton(
+                points, covariance, views[kept], T_curr_odom, model, noise[kept], steps, shared_error
+            )
             T_curr_odom, squared = solution.T, np.full(len(landmarks), np.inf)
             squared[kept] = solution.squared
             kept = squared < OUTLIER_SQUARED

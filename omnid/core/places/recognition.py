@@ -164,8 +164,8 @@ def search(
     for id in sorted(known, key=lambda id: -voted[id][0]):
         if len(found) == effort.compared:
             break
-        beside = sum(np.linalg.norm(poses[id][:3, 3] - poses[other][:3, 3]) < NEAR_M for other in found)
-        if beside >= PER_PLACE:
+        neighbours = sum(np.linalg.norm(poses[id][:3, 3] - poses[other][:3, 3]) < NEAR_M for other in found)
+        if neighbours >= PER_PLACE:
             continue
         place = found[id] = recognise(here, known[id], id, voted[id][1], model)
         if place is not None and place.inliers >= effort.enough:

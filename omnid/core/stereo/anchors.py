@@ -28,7 +28,7 @@ CELL_PX = 32  # side of a cell, because the courses of most brick walls are lowe
 # Samples on the line to the anchor of a neighbouring cell; enough: every fourth pixel of two cells.
 LONG_LINE_SAMPLES = 16
 SHORT_LINE_SAMPLES = 8  # Samples on the line to the nearest anchor; enough: every fourth pixel of a cell.
-NEW_ANCHOR_MARGIN = 2.0  # grey levels by which the runner-up of a new anchor must be worse: an error would propagate
+NEW_ANCHOR_MARGIN = 2.0  # grey levels by which the second candidate of a new anchor must be worse: errors propagate
 CLEAR_MARGIN = 1.0  # the same of an ordinary point; by trial on development seeds
 CHUNK_LINES = 4_000  # lines sampled at a time, so that their pixels stay in the processor's cache
 NO_ANCHOR = -1  # because indices are never negative
@@ -48,7 +48,7 @@ class Candidates:
         return Candidates(self.point[rows], self.disparity[rows], self.difference[rows])
 
     def best(self, total: Array, count: int) -> tuple[Indices, Array]:
-        """Return each point's row with the lowest total, and the margin to its runner-up (count,); 0 without rows.
+        """Return each point's row with the lowest total, and the margin to its second one (count,); 0 without rows.
 
         total: (M,) one per row. The margin of a point with a single candidate is infinite.
         """
@@ -79,7 +79,7 @@ class AnchorPropagation:
         self._anchor = np.full((height // CELL_PX + 3) * cells_per_row, NO_ANCHOR)
 
     def propagate(self, sure: Flags, candidates: Candidates) -> Flags:
-        """Choose the disparity of each point with candidates; return the points (N,) that beat their runner-up clearly.
+        """Choose the disparity of each point with candidates; return flags (N,) of points with a clear margin.
 
         sure: (N,) points that may be anchors; their disparities must be right. A point takes its lowest total even
         where the margin is small; one without an anchor in its neighbourhood keeps its disparity.

@@ -38,9 +38,9 @@ class MatchingSettings:
     window_px: int = 9  # side of the matching window, px; odd
     disparities: int = 128  # largest number of disparities searched, px; fewer where stereo.min_range_m needs fewer
     max_difference: float = 12.0  # largest mean difference of grey levels in the window of a match
-    # enhanced: a runner-up's SAD is at most so many times the lowest one, plus runner_up_difference
+    # enhanced: a further candidate has a SAD of at most this times the lowest one, plus runner_up_difference
     runner_up_ratio: float = 2.0
-    # enhanced: mean difference of grey levels; a point without a runner-up is an anchor
+    # enhanced: in mean grey levels of the window; a point without a further candidate is an anchor
     runner_up_difference: float = 4.0
     edge_threshold: int = 40  # least Sobel response of an edge, 8 per grey level and pixel
     max_points: int = 30_000  # largest number of edge pixels matched in a pair
@@ -130,7 +130,7 @@ class ColumnSearch:
         propagation = AnchorPropagation((lower, upper), pixels, disparity)
         clear = propagation.propagate(kept, self._candidates(costs, minima, count))
         disparity = propagation.disparity
-        # 3. The upper panorama confirms: strictly where the margin to the runner-up was small.
+        # 3. The upper panorama confirms: strictly where the margin to the second candidate was small.
         unclear = ambiguous & ~clear & _at(minima, disparity)
         _, lowest = self._volume.best_from_upper(pixels[clear], disparity[clear])
         kept[clear] = _at(costs, disparity)[clear] <= self._candidate_limit(lowest)

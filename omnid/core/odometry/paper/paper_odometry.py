@@ -75,10 +75,8 @@ class PaperOdometry:
         self._T_odom_rect, self._covariance = np.eye(4), np.zeros((6, 6))
         self._reference: Reference | None = None
         self._most_inliers = 0
-        self._untracked_s, self._resets = (
-            0.0,
-            0,
-        )  # time since the last pose that was tracked, gaps after which it went on
+        self._untracked_s = 0.0  # time since the last tracked pose
+        self._resets = 0  # gaps after which tracking went on
 
     def complete(self) -> None:
         """Do nothing: `process` leaves nothing to do."""
@@ -225,7 +223,7 @@ def turned_track(
 
     The paper stops at the first turn that will do; but half a step away half of the features may be found as well, so
     the search goes on while the next larger turn, to the left or to the right, finds more. If no turn finds enough,
-    the one that finds most is taken.
+    the one that finds most is used.
 
     On a panorama a turn of image k+1 is a shift of its columns, and to start the search that much further along is
     the same; the columns returned are those of k+1 itself, so the motion estimated from them is the total one. The
