@@ -204,7 +204,7 @@ class LocalMap:
 
         variance (M,) [px^2] of the disparities; NaN disparities are ignored. A Kalman update of each point in its
         anchor's frame, by the disparity alone: that depends on the depth, and hardly on the error of the pose. The
-        errors of one texture are correlated from frame to frame, so each variance is multiplied.
+        errors of one texture are correlated from frame to frame, so each variance is enlarged.
         """
         known = np.isfinite(disparity)
         rows, disparity, variance = rows[known], disparity[known], variance[known]
