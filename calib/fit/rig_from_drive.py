@@ -145,7 +145,7 @@ def adjust_drive(
 def adjust_pairs(parameters: RigParameters, state: DriveState, observations: DriveObservations) -> Array:
     """Return the steps (P,) by points that both cameras saw at once, near those of the state: a start for a drive.
 
-    The only condition is that the rays of both cameras meet. It determines the columns of the panoramas, but no lengths.
+    The only condition is that the rays of both cameras meet: it determines the columns of the panoramas, but no length.
     The poses of all keyframes stay; wherever they are, the result is the same.
     """
     problem = DriveProblem(parameters, observations, parameters.prior(), np.arange(len(state.T_rig_odom)))

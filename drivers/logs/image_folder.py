@@ -4,7 +4,7 @@ When an image was taken is stated in one of three ways:
 
 1. `rate_hz`: so many images a second, in the natural order of their names, from 0 s on;
 2. a list in the folder of the images or the one above: times.txt or timestamps.txt with a stamp for each image, or any
-   of STAMP_FILES with the names of the images beside their stamps, as data.csv of EuRoC and rgb.txt of TUM;
+   of STAMP_FILES with the names of the images and their stamps, as data.csv of EuRoC and rgb.txt of TUM;
 3. its name: nanoseconds, a whole number of 16 to 19 digits (1403636579763555584.png), or seconds with a decimal point.
 
 A stamp in a list is written as one in a name, in whole seconds, or as a date and a time (2011-09-26 13:02:25.96).
@@ -30,7 +30,7 @@ from drivers.logs.log import ENTRY, MAX_ATTACHMENT_BYTES, Entries, LogFile, Topi
 from drivers.logs.ros_messages import COMPRESSED_IMAGE, compressed_image
 
 SUFFIXES: Final = (".png", ".jpg", ".jpeg")
-# What OpenCV reads as an image, as of boards: a log has those above.
+# Images of boards, which OpenCV reads; those of a log have one of SUFFIXES.
 IMAGE_SUFFIXES: Final = frozenset({*SUFFIXES, ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp"})
 STAMP_FILES: Final = ("times.txt", "timestamps.txt", "data.csv", "rgb.txt")
 ATTACHMENT: Final = "rig.toml"  # The rig's file, in the same folder as the folders of the cameras.
@@ -183,7 +183,7 @@ def _stamp_ns(text: str) -> int | None:
     try:
         if re.fullmatch(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d{1,9})?Z?", text):
             return int(np.datetime64(text.rstrip("Z").replace(" ", "T"), "ns").astype(np.int64))
-        stamp = Decimal(text if "_" not in text else "")  # which Python takes for a mark between digits
+        stamp = Decimal(text if "_" not in text else "")  # Python allows "_" between digits
     except (InvalidOperation, ValueError):
         return None
     places = 0 if text.isdecimal() and len(text) >= NANOSECOND_DIGITS else 9

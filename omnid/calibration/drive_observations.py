@@ -110,7 +110,7 @@ def _drive(log: Path, place: Geometry, cameras: LogCameras, config: Config, most
     T_rig_odom, twists, delays_s = list[Array](), list[Array](), list[float]()
     since = 0
     with closing(open_log(log, cameras, place.rig)) as reader:
-        # So many pairs at least lie between two keyframes that there are not too many.
+        # Least number of pairs between two keyframes, so that there are `most` at most.
         apart = max(1, -(-(reader.pair_estimate() or 0) // most))
         for update in tracked_updates(reader, front_end, config, log):
             # 1. Choose the poses that are far enough apart to add information.
@@ -125,7 +125,7 @@ def _drive(log: Path, place: Geometry, cameras: LogCameras, config: Config, most
             seen, disparity = update.depth.panoramas, front_end.dense.of(update.depth).disparity
             landmarks.add(View(seen.lower, seen.upper, seen.visible, disparity, T_odom_rig @ place.T_rig_rect))
             T_rig_odom.append(se3.inverse(T_odom_rig))
-            # 3. Its motion, by which exposures at other times are predicted.
+            # 3. Its motion, which predicts the views at other times of exposure.
             twists.append(update.velocity)
             # Upper minus lower stamp; the rig's delay of the exposures is a parameter of its own.
             delays_s.append(seen.times.skew_s - place.rig.times.upper_delay_s)

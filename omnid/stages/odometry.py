@@ -40,7 +40,7 @@ class OdometryMethod(Protocol):
         """Return the pose at a frame, dt_s [s] after the previous one (0 for the first)."""
 
     def complete(self) -> None:
-        """Do what is left to do for the last frame; otherwise `process` does it before the next one."""
+        """Finish the work for the last frame now; otherwise `process` does so before the next one."""
 
 
 class OdometryStage:
@@ -70,7 +70,7 @@ class OdometryStage:
 
     @property
     def conflict(self) -> Conflict:
-        """That of images, wheels and gyro which differs from the others now."""
+        """The present disagreement of images, wheels and gyro."""
         return self._agreement.result
 
     @property
@@ -138,11 +138,11 @@ class OdometryStage:
         )
 
     def complete(self) -> None:
-        """Make the keyframe of the last pair, if there is to be one; otherwise that is done before the next pair."""
+        """Finish the work for the last pair now, such as its keyframe; otherwise that is done before the next pair."""
         self._method.complete()
 
     def _earlier(self, pair: Panoramas, estimate: OdometryEstimate) -> EarlierView | None:
-        """Return the view at the last keyframe, as it is seen from a pose; remember the pair if it is one."""
+        """Return the view at the last keyframe, with the motion since; keep the pair for later ones if it is one."""
         is_known = estimate.state is TrackingState.TRACKING
         before = self._keyframe
         if estimate.is_keyframe:
@@ -157,7 +157,7 @@ class OdometryStage:
         return self._dense.points(pair, _moving(exposure)).disparity
 
     def _contradicted(self, T_odom_rect: Array, stamp_ns: int) -> Array:
-        """Return what wheels and gyro that contradict the poses add to the covariance (6, 6) of one."""
+        """Return the covariance (6, 6) that contradicting wheels or gyro add to a pose of the rectified frame."""
         T_odom_base, to_rect = T_odom_rect @ se3.inverse(self._T_base_rect), np.linalg.inv(self._to_base)
         covariance = self._contradiction.add(self.conflict, T_odom_base, stamp_ns * S_PER_NS)
         return np.asarray(to_rect @ covariance @ to_rect.T)
@@ -168,7 +168,7 @@ class OdometryStage:
 
 
 class _LastKeyframe(NamedTuple):
-    """The last keyframe whose pose was known well, without what else its pair holds, such as the dense depth."""
+    """The last keyframe whose pose was known well; without the rest of its pair, such as the dense depth."""
 
     lower: PaddedPanorama
     usable: NDArray[np.bool_]  # (H, W)

@@ -37,12 +37,12 @@ class RigState(StrEnum):
     UNCHECKED = "unchecked"  # The images show too little, or nothing was checked yet.
     FITS = "fits"
     DRIFTED = "drifted"  # The rig is off by some tenths of a degree: poses are less accurate.
-    EXCHANGED = "exchanged"  # The lower camera was taken for the upper one.
+    EXCHANGED = "exchanged"  # The lower and the upper camera are exchanged.
     BROKEN = "broken"  # The rig is off by degrees: a mirror was knocked, a camera covered, or it is of other cameras.
 
     @property
     def is_contradicted(self) -> bool:
-        """True if the images cannot be of this rig, so that no pose of them is to be relied on."""
+        """True if the images cannot be of this rig, so that their poses are not reliable."""
         return self in (RigState.EXCHANGED, RigState.BROKEN)
 
 
@@ -50,7 +50,7 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Image = NDArray[np.uint8]
 
-# Corners per pair, so that a round of two pairs has the matches of a finding (120) where four corners in ten are found.
+# Corners per pair: two pairs have the matches of a finding (120) if four corners in ten are found.
 POINTS: Final = 160
 # The coarse search works on images reduced by this factor, because its cost falls with the fourth power, and the
 # tracker that follows converges from two reduced pixels away.
@@ -65,8 +65,8 @@ ASIDE_PX: Final = 5
 DOWN_PX: Final = 30
 # Least correlation of a coarse match, because the search is wide, and a lower one lets more chance matches pass.
 MIN_CORRELATION: Final = 0.8
-# Points at infinity have no disparity, and so less than this, because noise makes it negative for some of them, as
-# exchanged cameras do for all.
+# Least disparity: that of points at infinity is 0, and noise makes it negative for some of them, as exchanged cameras
+# do for all.
 MIN_DISPARITY_PX: Final = 0.5
 # Two levels are enough: half a window reaches 7 px, and 28 px on the second level, farther than the coarse search errs.
 KLT: Final = KltSettings(window_px=15, levels=2, max_error_px=0.3)
@@ -113,7 +113,7 @@ class Matches:
 
 
 def is_motion_unknown(pair: PanoramaPair, exposure: Exposure | None) -> bool:
-    """True if a pair has several exposures and the unknown motion in between would be taken for a drift."""
+    """True if a pair has several times of exposure and the motion in between, which looks like drift, is unknown."""
     return not pair.times.is_at_once and (exposure is None or not exposure.is_known)
 
 
@@ -185,29 +185,29 @@ def _reduced(image: Image) -> Image:
 
 # Matches for a finding: ten in each sector of azimuth, so that a tilt and a shift can be distinguished.
 MIN_MATCHES: Final = 120
-# Rotation of the upper camera, because rigs as calibrated, rendered and real, are measured below 0.1 deg.
+# Rotation of the upper camera from which a rig has drifted: calibrated rigs, rendered and real, show less than 0.1 deg.
 DRIFTED_DEG: Final = 0.2
-# So many because two degrees are seven columns of a panorama of 1300, where stereo, which searches one column, matches
-# by chance.
+# Rotation from which a rig is broken: two degrees are seven columns of a panorama of 1300, so that stereo, which
+# searches one column, matches by chance.
 BROKEN_DEG: Final = 2.0
 # Weight of the shift's angle against the rotation's, because a shifted viewpoint affects near points only.
 SHIFT_WEIGHT: Final = 0.2
 # Standard deviations subtracted from rotation and shift, so that an uncertain finding accuses no rig.
 SIGMAS: Final = 4.0
-# With a rig that is wrong by many degrees, points match by chance only. Corners in noise match nowhere either, so only
-# points with contrast are counted, because a smaller part of them that match means a broken rig.
+# Least part of the points with contrast that match: with a rig that is wrong by many degrees they match by chance only.
+# Corners without contrast are noise, which matches with no rig.
 MIN_MATCHED_PART: Final = 0.08
 MIN_CONTRAST_POINTS: Final = 400
 SECTORS: Final = 12  # Sectors of azimuth, 30 deg each, because that is about the width of a wall in a room.
 # Matches for the median of a sector, so that it is known to 1.25 / sqrt(20), about a quarter of the spread.
 MIN_IN_SECTOR: Final = 20
-# Median residual of the sectors, because a camera whose intrinsics have changed bends the columns all around; the
-# matches of one wall alone may be misled.
+# Median residual of the sectors from which a rig has drifted: changed intrinsics bend the columns all around, while
+# wrong matches on one wall change one sector.
 DRIFTED_PX: Final = 0.3
-# Scatter of the columns in the first pairs, because right rigs stay below 0.45 px, other mirrors have 0.3 to 7 px. At
-# all scales, because most of the scatter of a right rig is of the matches, which err by parts of a pixel at each.
+# Scatter of the columns in the first pairs from which a rig has drifted: right rigs have less than 0.45 px, other
+# mirrors 0.3 to 7 px. It is the same at all scales, because matches err by parts of a pixel at each.
 SCATTERED_PX: Final = 0.6
-# Matches with the cameras exchanged, per match, because right rigs have up to 0.41, exchanged ones 2.0 or more.
+# Matches with the cameras exchanged, per match: right rigs have up to 0.41, exchanged ones 2.0 or more.
 EXCHANGED_RATIO: Final = 1.2
 
 
@@ -287,7 +287,7 @@ def judge(found: Matches, cylinder: Cylinder, exchanged_matches: int | None = No
     drift = None
     if len(shifts) >= MIN_MATCHES:
         drift = estimate_rig_drift(cylinder.rays(found.lower), cylinder.rays(found.upper))
-    # 3. What is left in each direction shows a camera whose intrinsics have changed.
+    # 3. Residuals in each direction show changed intrinsics.
     offsets = _sector_offsets(found.lower, drift.residuals * cylinder.focal_px, cylinder) if drift else []
     left_px = float(np.median(offsets)) if offsets else float("nan")
     return RigFinding(found, exchanged_matches, offset, spread, left_px, drift)
