@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -150,12 +149,3 @@ def test_a_thing_of_a_contrast_has_it_in_the_image(percent: int) -> None:
     for face in asked.things:
         share = float(face.texture.mean()) * face.brightness / (float(floor.texture.mean()) * floor.brightness)
         assert abs(share - 1) == pytest.approx(percent / 100, abs=0.01)
-
-
-def test_a_ramp_lifts_and_pitches_the_base() -> None:
-    world = trial("ramp_5", 1).world
-    middle_m = float(np.mean([x_m for x_m, _ in world.ground.profile]))
-    for heading_rad, sign in ((0.0, 1), (math.pi, -1)):
-        T = world.T_world_base((middle_m, 0.0, heading_rad))
-        assert T[2, 3] == pytest.approx(2.0 * math.tan(math.radians(5.0)), abs=1e-6)
-        assert math.degrees(math.asin(T[2, 0])) == pytest.approx(sign * 5.0, abs=1e-6)

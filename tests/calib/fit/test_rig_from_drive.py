@@ -18,7 +18,6 @@ from calib.fit.rig_from_drive import (
     project,
 )
 from calib.models.camera import Array
-from calib.models.unified import UnifiedCamera
 from calib.rig import Rig
 from tests.simulation.paths import loop, vibrate
 from tests.simulation.rigs import make_rig
@@ -109,24 +108,6 @@ def test_landmarks_that_move_are_left_out(truth: Rig) -> None:
     found = adjust_drive(parameters, begin, replace(observations, pixels=pixels))
     assert len(found.state.points) <= LANDMARKS - 30
     assert np.median(rays_apart_deg(found.rig, truth)) < 0.01
-
-
-def test_tangential_terms_are_found(truth: Rig) -> None:
-    """Cameras with decentring terms, calibrated from a file that has none."""
-    state, observations = drive(truth, 5)
-    assert isinstance(truth.lower.camera, UnifiedCamera)
-    camera = replace(truth.lower.camera, distortion=(0.0, 0.0, 0.004, 0.002))
-    points = problem_points(truth, state, observations)
-    bent, straight = (
-        project(rig, observations.camera, points)
-        for rig in (replace(truth, lower=replace(truth.lower, camera=camera)), truth)
-    )
-    observations = replace(observations, pixels=observations.pixels + bent - straight)
-    parameters = RigParameters.about(truth, ("p1", "p2"))
-    found = adjust_drive(parameters, replace(state, steps=np.zeros(len(parameters.names))), observations)
-    lower = found.rig.lower.camera
-    assert isinstance(lower, UnifiedCamera)
-    assert lower.distortion[2:] == pytest.approx((0.004, 0.002), abs=3e-4)
 
 
 def problem_points(truth: Rig, state: DriveState, observations: DriveObservations) -> Array:

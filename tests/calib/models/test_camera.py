@@ -16,9 +16,7 @@ from calib.models.camera import Array, Mask, OmniCamera, inscribed_mask
 from calib.models.lens import DoubleSphereCamera, EquidistantCamera, EquirectangularCamera
 from calib.models.ocam import OcamCamera, View
 from calib.models.unified import UnifiedCamera
-from calib.models.wavefront import offsets
 from calib.rig import Rig
-from tests.simulation.rigs import MirrorCamera
 
 BENT = (-0.02, 0.004, 1e-3, -5e-4)
 CAMERAS: dict[str, OmniCamera] = {
@@ -99,19 +97,6 @@ def test_ocam_projection_equals_the_equations(view: str, sign: float) -> None:
     np.testing.assert_allclose(camera.lift(np.array([[column, row]])), ray / np.linalg.norm(ray), rtol=0, atol=1e-12)
     np.testing.assert_allclose(camera.project(ray), [[column, row]], rtol=0, atol=1e-9)
     assert camera.center == (320.0, 240.0)
-
-
-def test_ocam_ends_at_the_radius_where_rays_repeat() -> None:
-    camera = OcamCamera((-100.0, 0.0, 1e-3, 0.0, -1e-8), (300.0, 300.0), (1.0, 0.0, 0.0), (600, 600))
-    low, high = 0.0, 600.0
-    for _ in range(60):
-        middle = (low + high) / 2
-        low, high = (middle, high) if 100 + 1e-3 * middle**2 - 3e-8 * middle**4 > 0 else (low, middle)
-    assert camera.radius_limit_px == pytest.approx(low, abs=1e-6)
-    rays = camera.lift(np.array([[300 + low - 1e-3, 300.0], [300 + low + 1e-3, 300.0]]))
-    assert np.isfinite(rays[0]).all() and np.isnan(rays[1]).any()
-    beyond = rays[0] - (0, 0, 1e-3)
-    assert np.isnan(camera.project(beyond[None])).all()
 
 
 def test_mask_is_a_ring_without_the_zero_pixels_of_its_image() -> None:
@@ -202,27 +187,12 @@ def test_reproduces_the_toolbox_errors(shared_data: Path, key: str, view: View) 
 
 
 WAVEFRONT = (2e-4, -1e-4, -3e-4, 4e-4, 5e-5)
-MIRROR = MirrorCamera(207.0, (383.5, 383.5), (768, 768), tilt_rad=(0.009, -0.008), conic=0.015, ellipticity=-0.012)
 
 
 def with_terms(rig: Rig, view: str = "mirror") -> OcamCamera:
     camera = rig.lower.camera
     assert isinstance(camera, OcamCamera)
     return replace(camera, view=view, tangential=(1e-6, -2e-6), astigmatism=(3e-10, -2e-10), wavefront=WAVEFRONT)
-
-
-def test_describes_the_rays_of_a_tilted_camera_under_a_mirror_off_shape() -> None:
-    """Offsets of up to a millimetre are fitted to a hundredth of it by the five terms and a shift of the viewpoint."""
-    pixels = np.random.default_rng(0).uniform(0, 767, (2000, 2))
-    radius = np.hypot(*(pixels - 383.5).T)
-    origins, rays = MIRROR.rays(pixels[(radius > 60) & (radius < 370)])
-    across = origins - rays * (origins * rays).sum(axis=1, keepdims=True)
-    shifts = [axis - rays * rays[:, [k]] for k, axis in enumerate(np.eye(3))]
-    terms = [offsets(rays, tuple(unit), 1.0) for unit in np.eye(5)]
-    A = np.stack([*shifts, *terms], axis=-1).reshape(-1, 8)
-    left = across.ravel() - A @ np.linalg.lstsq(A, across.ravel(), rcond=None)[0]
-    central = across.ravel() - A[:, :3] @ np.linalg.lstsq(A[:, :3], across.ravel(), rcond=None)[0]
-    assert np.sqrt(np.mean(central**2)) > 2e-4 and np.sqrt(np.mean(left**2)) < 5e-6
 
 
 @pytest.mark.parametrize("view", ["mirror", "direct"])
