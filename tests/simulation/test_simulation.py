@@ -139,13 +139,3 @@ def test_something_is_in_the_way_of_hazards(name: str) -> None:
     elif asked.motion == "ahead" and not asked.world.people:
         along = np.arange(0.0, 4.8, 0.05)
         assert min(clearance_m(segments, (x_m, 0.0), ROBOT_M[0]) for x_m in along) < 0.0
-
-
-@pytest.mark.parametrize("percent", [10, 20])
-def test_a_thing_of_a_contrast_has_it_in_the_image(percent: int) -> None:
-    asked = trial(f"box_{percent}percent", 1)
-    floor = asked.world.standing[0]
-    assert asked.things
-    for face in asked.things:
-        share = float(face.texture.mean()) * face.brightness / (float(floor.texture.mean()) * floor.brightness)
-        assert abs(share - 1) == pytest.approx(percent / 100, abs=0.01)

@@ -527,14 +527,6 @@ def test_cameras_of_folders_with_other_names_are_given(tmp_path: Path) -> None:
     assert read(folder, lower="mav0/cam0/data", upper="mav0/cam1/data")[0] == expected(PAIRS)
 
 
-def test_hidden_files_beside_the_images_are_left_out(tmp_path: Path) -> None:
-    """As macOS writes them to other disks."""
-    folder = write_folders(tmp_path / "images", pairs(3))
-    (folder / "lower" / "._1.jpg").write_bytes(b"\0\5\x16\7")
-    with closing(LogReader(folder)) as reader:
-        assert len(list(reader.frames())) == 6 and not reader.warnings
-
-
 @pytest.mark.parametrize("missing", [0, 1])
 def test_a_missing_image_is_told_where_a_rate_stands_for_stamps(tmp_path: Path, missing: int) -> None:
     folder = write_folders(tmp_path / "images", pairs(4))

@@ -108,20 +108,6 @@ def test_the_upper_eight_of_the_stated_bits_are_shown(tmp_path: Path, kind: str,
     assert [gray(frame).tolist() for frame in frames if frame.camera == "lower"] == expected and not reader.warnings
 
 
-@pytest.mark.parametrize(
-    ("suffix", "format_", "encoding"),
-    [
-        (".jpg", "bgr8; jpeg compressed bgr8", "jpeg"),
-        (".png", "jpeg", "png"),
-    ],
-)
-def test_first_bytes_decide_the_compression(tmp_path: Path, suffix: str, format_: str, encoding: str) -> None:
-    data = compressed(START_NS, cv2.imencode(suffix, np.full((8, 8), 90, np.uint8))[1].tobytes(), format_)
-    frames, _ = read(write_log(tmp_path / "log.mcap", [Entry(t, COMPRESSED, data, 0) for t in (LOWER, UPPER)]))
-    assert [frame.encoding for frame in frames] == [encoding] * 2
-    assert abs(int(gray(frames[0])[4, 4]) - 90) < 2
-
-
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 @pytest.mark.parametrize("colours", [False, True])
 def test_a_pattern_that_was_compressed_as_it_is_becomes_grey(tmp_path: Path, suffix: str, colours: bool) -> None:
@@ -393,13 +379,6 @@ def test_microseconds_in_headers_and_logging_are_refused(tmp_path: Path) -> None
     with pytest.raises(DriverError, match="headers are 100 us apart, and the times of logging are 100 us apart"):
         stamped(path)
     assert stamped(path, time="header")[0]
-
-
-def test_images_without_stamps_are_told_as_a_pause(tmp_path: Path) -> None:
-    """As where the clock was set forward."""
-    frames, warnings = stamped(write_log(tmp_path / "log.mcap", entries(back(-3), back(-3))))
-    assert shown(frames) == AS_TAKEN
-    assert warnings == ["3.1 s without images after image 20: a pause, or a clock that was set"]
 
 
 LOGGED: Final[dict[str, Times]] = {
