@@ -28,19 +28,19 @@ class ControllerState:
     armed: bool = False
     disarmed_by: str = STARTED  # empty while armed
     needs_request: bool = False  # only cmd/arm lets the wheels turn again
-    stop_count: int = 0  # how often a stop or a fault has made cmd/arm necessary
-    stopped_by: str = ""  # the newest of their reasons, kept while armed again
+    stop_count: int = 0  # stops and faults that have made cmd/arm necessary
+    stopped_by: str = ""  # reason of the newest of them, kept after arming
     arm_answer: ArmAnswer = NO_ANSWER
     source: str = ""  # source of the commands that drive; empty while none does
-    failed: bool = False  # the motor controller did not take the last command
+    failed: bool = False  # the last command failed
     problem: str = ""  # why, in words
-    overdue: bool = False  # it has not answered yet, though it has had the time to boot
+    overdue: bool = False  # the motor controller has not answered within its time to boot
     fault: int = 0  # the motor controller's own number
     battery_v: float = math.nan  # voltage that the motor controller reports
     slowed_by: str = ""  # why the base drives slowly; empty: it need not
     measured: str = ""  # by how much the sensors of the motion differ; empty: they agree
     obstacle: str = ""  # why the collision monitor slows down or stops the base; empty: it does not
-    blocked: bool = False  # it stops the base: the command leads to an obstacle
+    blocked: bool = False  # the collision monitor stops the base: the command leads to an obstacle
     sent: int = 0  # commands that were answered
     late: int = 0  # commands whose answer did not come in time; the wheels keep turning
     errors: int = 0  # commands that failed
@@ -51,7 +51,7 @@ class ControllerState:
 
 
 def cuts_drive_short(before: ControllerState, after: ControllerState) -> bool:
-    """True if wheels that might turn before must stop now, other than for want of a command at the start."""
+    """True if wheels that were allowed to turn must stop now, for another reason than a missing command."""
     return not before.reason and after.reason not in ("", IDLE)
 
 

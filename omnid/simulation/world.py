@@ -1,4 +1,4 @@
-"""A simulated world: its walls and things, people who walk along polylines, its light, and what a robot may touch."""
+"""A simulated world: walls and objects, people who walk along polylines, light, and the obstacles of a robot."""
 
 from __future__ import annotations
 
@@ -119,14 +119,14 @@ def moved(face: Rectangle, place: tuple[float, float, float]) -> Rectangle:
     return replace(face, origin=R @ face.origin + (x_m, y_m, 0.0), edge_u=R @ face.edge_u, edge_v=R @ face.edge_v)
 
 
-FLOOR_M = 0.02  # what is lower than this is driven over
+FLOOR_M = 0.02  # Objects that are lower than this are driven over.
 
 
 @dataclass(frozen=True)
 class World:
     """A level floor at z = 0 and what is on it; the robot starts at x, y [m], heading [rad].
 
-    What a subclass may change of a world are its methods: ground that is not level, light that changes.
+    Subclasses override its methods for ground that is not level and light that changes.
     """
 
     name: str

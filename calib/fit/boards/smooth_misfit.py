@@ -16,10 +16,10 @@ import numpy as np
 
 from calib.models.camera import Array
 
-# Grid of the fields: nodes along the diameter of the seen part of an image, and the width of each as a fraction of
-# their distance, because five nodes follow three waves over the azimuth and a turning point over the radius.
-NODES, WIDTH = 5, 1.0
-# Nodes farther from the centre, as a fraction of the largest radius, are left out, because no corner determines them.
+# Nodes of the fields along the diameter of the seen part of an image: five follow three waves over the azimuth and a
+# turning point over the radius. Each field is as wide as the distance of two nodes.
+NODES = 5
+# Nodes farther from the centre, as a fraction of the largest radius, are left out: no corner determines them.
 MAX_RADIUS = 1.3
 # Values of tau / sigma over which the posterior is summed: steps of 4 % are fine enough for any ratio.
 RATIOS = np.concatenate([[0.0], np.geomspace(1e-3, 30.0, 240)])
@@ -33,7 +33,7 @@ def smooth_fields(pixels: Array, cameras: int) -> Array:
     Rows of unknown pixels (NaN) are 0. The sum of all fields has about unit size.
     """
     K, N, _ = pixels.shape
-    own, width = [], WIDTH * 2 / (NODES - 1)
+    own, width = [], 2 / (NODES - 1)
     for part in np.split(pixels, cameras, axis=1):
         known = part[np.isfinite(part).all(axis=2)]
         center = known.mean(axis=0)

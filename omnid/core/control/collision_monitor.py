@@ -24,7 +24,6 @@ from omnid.core.control.heading_controller import BRAKING_SHARE, Twist
 from omnid.core.nanoseconds import S_PER_NS
 
 STOP: Final = "stop"
-SLOW: Final = "slow"
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +157,7 @@ class Kind(NamedTuple):
     """Places of a scan that the base must not reach, in the frame of the scan."""
 
     reason: str
-    policy: str  # STOP or SLOW
+    policy: str  # "stop" or "slow"
     points: list[Point]
     is_known: bool = False  # something is there; else nothing is known of what is there
     is_gap: bool = False  # a surface is seen beyond: it counts ahead of the base only
