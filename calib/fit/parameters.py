@@ -32,8 +32,8 @@ ANGLE_UNIT_RAD: Final = 1.0 / 250.0
 UPPER_DELAY, LINE_TIME = "upper delay [ms]", "line time [us]"
 TIME_UNITS: Final = {UPPER_DELAY: 5.0, LINE_TIME: 5.0}
 S_PER_UNIT: Final = {UPPER_DELAY: 1e-3, LINE_TIME: 1e-6}
-# Tolerances of a nominal rig in the parameters' own units, by the name without its camera: of what the mount and the
-# trigger leave open, and of a mirror, by which a ray passes the viewpoint within about a millimetre.
+# Tolerances of a nominal rig in the parameters' own units, by the name without its camera: those of mount and trigger,
+# and of a mirror whose rays pass the viewpoint within about a millimetre.
 NOMINAL_TURN_RAD: Final = math.radians(1.5)
 NOMINAL_SIGMAS: Final = {
     **dict.fromkeys(("r_x", "r_y", "r_z"), NOMINAL_TURN_RAD),
@@ -42,20 +42,20 @@ NOMINAL_SIGMAS: Final = {
     **{UPPER_DELAY: 15.0, LINE_TIME: 30.0, "xi": 0.02},
     **dict.fromkeys(WAVEFRONT_NAMES, 1e-3),
 }
-# Those of distortion terms, in steps. Focal lengths and polynomials: a part of their value, and in steps what a
-# polynomial has beyond a paraboloid's.
+# Tolerances of distortion terms, in steps.
 NOMINAL_STEPS: Final = {
     **dict.fromkeys(("p1", "p2"), 3.0),
     **dict.fromkeys(("k1", "k2", "c", "d", "s1", "s2"), 1.0),
 }
+# Tolerance of focal lengths and polynomials as a fraction of their value, and of terms beyond a paraboloid's in steps.
 RELATIVE_SIGMA, HIGHER_STEPS = 0.02, 0.5
 RULER_SIGMA_M: Final = 0.5e-3
-# Smallest part of a nominal sigma to which a board's covariance is trusted: mirrors are knocked and metal grows.
+# Least sigma of a calibrated parameter, as a fraction of the nominal one: mirrors are knocked and metal grows.
 MIN_PART: Final = 1e-3
 
 
 def central_names(camera: OmniCamera, distortion: Collection[str] = ()) -> tuple[str, ...]:
-    """Return the parameters of a camera without its wavefront: all, and of distortion and polynomial the terms not 0.
+    """Return the parameters of a camera without its wavefront; of distortion and polynomial those that are not 0.
 
     distortion: terms of an omni camera that are parameters although they are 0. CalibError for other models.
     """
