@@ -31,8 +31,7 @@ import numpy as np
 import omnid
 from calib import se3
 from calib.boards.aprilgrid import AprilGrid
-from calib.boards.board import AS_DRAWN, Board, BoardView, PrintShape
-from calib.fit.boards.rig_fit import PairView
+from calib.boards.board import AS_DRAWN, Board, PrintShape
 from calib.fit.rig_uncertainty import drive_uncertainty
 from calib.rig import Rig
 from calib.rig_file import read_rig
@@ -122,20 +121,6 @@ def drive(folder: Path, rig: Rig) -> tuple[float, float, float]:
     result.save_tum(folder / "estimate.txt")
     found = evaluate(read_tum(folder / "estimate.txt"), read_tum(folder / "truth.txt"))
     return 100 * found.length_error_ratio, 1e3 * found.ate_rmse_m, math.degrees(found.heading_max_rad)
-
-
-def projected_views(
-    rig: Rig, perfect: Rig, board: Board, pairs: int, noise_px: float, *, seed: int, noise_seed: Sequence[int]
-) -> list[PairView]:
-    """Return the corners of boards around a perfect rig by the cameras of another one."""
-    rng, views = np.random.default_rng(noise_seed), []
-    for k, T in enumerate(board_poses_around_rig(perfect, board, pairs, seed=seed, distance_m=DISTANCE_M)):
-        sides = []
-        for mounted in (rig.lower, rig.upper):
-            pixels = mounted.camera.project(se3.apply(mounted.T_cam_rig @ T, board.points))
-            sides.append(BoardView(f"{k:02d}", pixels + rng.normal(0, noise_px, pixels.shape)))
-        views.append(PairView(f"{k:02d}", (sides[0], sides[1])))
-    return views
 
 
 def chain(

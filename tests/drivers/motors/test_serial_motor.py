@@ -20,12 +20,12 @@ from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
 from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.line_protocol import LineProtocol, encode
-from drivers.motors.protocols.motor_protocol import NoReplyError, T, Transaction
+from drivers.motors.protocols.motor_protocol import NoReplyError
 from drivers.motors.protocols.protocol_registry import PROTOCOLS
 from drivers.motors.serial_motor import SerialMotor
 from drivers.motors.simulated.simulated_base import SimulatedBase
 from drivers.motors.simulated.simulated_line import SimulatedLine
-from tests.contract.simulated_controllers import PtyMotor
+from tests.contract.simulated_controllers import PtyMotor, run
 
 ROOT = Path(__file__).parents[3]
 MODULES = [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in (ROOT / "drivers/motors").rglob("*.py")]
@@ -169,10 +169,10 @@ def test_a_watchdog_that_stays_expired_is_an_error() -> None:
 def test_heading_continues_after_a_reconnection() -> None:
     """A controller measures from 0 again once its watchdog is set; the heading reported by the protocol continues."""
     protocol, simulated = LineProtocol(DifferentialDrive()), SimulatedLine()
-    run(protocol.connect(500), simulated)
+    run(protocol.connect(500), simulated, protocol.framer())
     turn(protocol, simulated, 1.0)
     assert simulated.base.pose[2] == pytest.approx(1.0, abs=0.01)
-    run(protocol.connect(500), simulated)
+    run(protocol.connect(500), simulated, protocol.framer())
     status = turn(protocol, simulated, 1.5)
     assert simulated.base.pose[2] == pytest.approx(1.5, abs=0.01)
     assert status.heading_rad == pytest.approx(1.5, abs=0.01)
@@ -180,18 +180,10 @@ def test_heading_continues_after_a_reconnection() -> None:
 
 def turn(protocol: LineProtocol, simulated: SimulatedLine, heading_rad: float) -> MotorStatus:
     for _ in range(100):
-        status = run(protocol.drive(VelocityCommand(0, 0.1, heading_rad, 0.0), 0.0), simulated)
+        command = VelocityCommand(0, 0.1, heading_rad, 0.0)
+        status = run(protocol.drive(command, 0.0), simulated, protocol.framer())
         simulated.base.advance(0.05)
     return status
-
-
-def run(transaction: Transaction[T], simulated: SimulatedLine) -> T:
-    """Run a transaction that needs one reply, and return its result."""
-    try:
-        transaction.send(simulated.feed(next(transaction)))
-    except StopIteration as done:
-        return done.value  # type: ignore[no-any-return]
-    raise AssertionError("the transaction waits for more")
 
 
 DRIVE = DifferentialDrive(can_id=2)
