@@ -129,18 +129,11 @@ def test_finds_a_drawn_rim_from_different_guesses(guess: tuple[float, float]) ->
     assert_ring(find_rim(drawn(), guess))
 
 
-def squares() -> NDArray[np.float64]:
-    return np.asarray((U // 40 + V // 40) % 2 * 255)
-
-
 NOTHING: dict[str, Callable[[], NDArray[np.float64]]] = {
     "black": lambda: 0 * U,
     "noise": lambda: np.random.default_rng(0).uniform(0, 255, U.shape),
-    "squares": squares,
     "soft vignette": lambda: 220 * np.exp(-((R / 300) ** 2)),
-    "square": lambda: np.where((np.abs(U - 384) < 300) & (np.abs(V - 384) < 300), 150, 5),
     "ellipse": lambda: np.where(np.hypot((U - 384) / 1.15, V - 384) < 300, 150, 5),
-    "tiny": lambda: np.zeros((20, 20)),
     "most of the rim dark": lambda: np.where((R < RADIUS) & (V < 500) & (U > 300), world(), 5),
     "blobs": lambda: cv2.GaussianBlur(np.random.default_rng(3).uniform(0, 255, U.shape), (0, 0), 25) * 30 - 3700,
 }

@@ -199,13 +199,6 @@ def test_opens_no_bus_without_publish(omnid: Command, scene: Path) -> None:
     assert result.code == 0
 
 
-def test_reads_the_printed_configuration(omnid: Command, tmp_path: Path, scene: Path) -> None:
-    (tmp_path / "omnid.toml").write_text(omnid("config", "--set", "pair.tolerance_ms=0.5").out)
-    assert tomllib.loads((tmp_path / "omnid.toml").read_text())["pair"]["tolerance_ms"] == 0.5
-    result = omnid.replay(scene / "log.mcap", "--config", tmp_path / "omnid.toml", rig=scene / "rig.toml")
-    assert 0 < result.count("unpaired_lower") == PAIRS - result.count("pairs")
-
-
 POSES = 18
 ODOM = "/omnid/odom"
 IMAGES = ("/omnid/lower/image_raw/compressed", "/omnid/upper/image_raw/compressed")
