@@ -128,7 +128,8 @@ class RayScans:
             self._observe_tilt(pose, pair, ramp)
         if is_due:
             self._followed_ns = stamp_ns
-        if is_due and (ramp is None or ramp.start_m > FOUND_M):
+        is_sure = np.diag(self._P).max() < SURE_RAD**2  # A rig that leans shows a slope everywhere.
+        if is_due and is_sure and (ramp is None or ramp.start_m > FOUND_M):
             geometry, climbed = (floor.height_m, self._baseline_m), float(T_odom_base[2, 0])
             panoramas = self._floor.view.columns.panoramas
             if self._ramps.search(views[1], panoramas, *geometry, viewpoint, turn_rad, climbed):
