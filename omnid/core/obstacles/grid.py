@@ -71,7 +71,6 @@ SIDE: Final = 2 * REACH_CELLS + 1
 OWN: Final = slice(REACH_CELLS - 3, REACH_CELLS + 4)  # cells that nothing but the base can be in
 CROSS: Final = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
 SQUARE: Final = np.ones((3, 3), np.uint8)
-AROUND: Final = np.ones((5, 5), np.uint8)  # in which a surface is one
 SPECK_CELLS: Final = 4
 OPEN_SHARE: Final = 0.9  # of the longest range, from which on a direction is open: few pairs show the last cells
 
@@ -167,13 +166,12 @@ class ObstacleGrid:
 
     def _forget(self) -> None:
         """Forget everything."""
-        self._empty = np.array([self._p.prior, 0, 0, 0, 0, 0, 0, 0, np.inf, np.inf], np.float32)
+        self._empty = np.array([self._p.prior, 0, 0, 0, 0, 0, np.inf, np.inf], np.float32)
         self._layers = np.tile(self._empty[:, None, None], (1, SIDE, SIDE))
         # Log-odds of a thing; evidence of the pair before; mean of what single pairs show; whether a cell is known;
-        # views past it; whether the last pair saw floor behind it; the most that this place has shown of what hangs, 1
-        # for what hid floor; times [s] since that was shown, since the cell was free, and since it was seen.
+        # views past it; whether the last pair saw floor behind it; times [s] since it was free, and since it was seen.
         self.odds, self._before, self._shown, self._known, self._past_views, *others = self._layers
-        self._was_past, self._here, self._gone_s, self._free_s, self._age_s = others
+        self._was_past, self._free_s, self._age_s = others
         self._cell = None
         self._last: tuple[int, Array] | None = None  # stamp and place [m] of the pair before
         self._carry = 0.0
@@ -197,18 +195,8 @@ class ObstacleGrid:
         updated = np.clip(p.prior + np.float32(keep) * (self.odds - p.prior) + change, p.arrival, p.most)
         self.odds[:] = np.where(in_view, updated, self.odds)
         self._before[:] = np.where(in_view, found[kernels.RATIO], 0)
-        shown = cv2.blur(found[kernels.SURFACE], AROUND.shape)
+        shown = cv2.blur(found[kernels.SURFACE], (5, 5))
         self._shown += np.where(in_view, np.float32(p.shown_rate * (1 - rho)) * (shown - self._shown), 0)
-        # What this place has shown of it, or what stood nearer than the view and hid floor in view, has gone
-        # when that is over: else errors of pairs from one place would stay as they are. Low things hide nothing.
-        stands = (self.odds > p.prior) | (self._shown > p.shown_least)
-        around = cv2.dilate(hidden.view(np.uint8), AROUND) > 0
-        shows = np.where(in_view, shown, around & stands)
-        self._here[:] = np.maximum(self._here * np.float32(max(1.0 - way_m / CELL_M, 0.0)), shows)
-        self._gone_s += np.float32(passed_s)
-        self._gone_s[~(in_view | past) | (shows > 0.5 * self._here) | (self._here < p.shown_least)] = 0
-        gone = self._gone_s > p.lately_s
-        self._shown[gone], self._here[gone], self.odds[gone & past] = 0, 0, p.arrival
         # 3. What is known: seen, or seen past. What was hidden from the start may look like floor in some pairs: it is
         #    known after so many more views past it.
         self._past_views[past] += np.float32(1 - rho)
