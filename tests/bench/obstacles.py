@@ -49,7 +49,6 @@ STOPS_M: Final = (0.05, 0.8)  # before a hazard
 STANDS_M, STANDS_S, HAZARD_STANDS_S = 0.03, 12.0, 8.0  # a drive ends that moved by less than this in that time
 TURN_RADIUS_M, TURN_M = 4.0, 2.4  # of the arc towards a hazard, which ends there
 TEXTURED: Final = "marbled"  # the floor whose time is the measure of the others
-USUAL_MPS: Final = 0.5
 SLOWEST_MPS: Final = 0.1  # A drive that is slower than this on average ends unfinished.
 
 
@@ -95,13 +94,6 @@ class Drive:
     def is_right(self) -> bool:
         """True if a hazard was not touched by the robot's own motion, and it passed or stopped at its distance."""
         return not self.own and (self.stopped_m is None or STOPS_M[0] <= self.stopped_m <= STOPS_M[1])
-
-
-def ahead(moment: Moment) -> Iterator[Request]:
-    """Arm, and hold the stick ahead."""
-    if moment.odometry is not None and not moment.controller.armed and moment.time_s < 2.0:
-        yield "arm"
-    yield Setpoint(USUAL_MPS, heading_rad=0.0)
 
 
 class Asker:

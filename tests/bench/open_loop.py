@@ -12,11 +12,11 @@ its file says; profile (P, 2), the heights z of the floor at places x; radius_m 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import cv2
 import numpy as np
@@ -32,11 +32,9 @@ from omnid.core.obstacles.grid import FloorGrid
 from omnid.simulation.lockstep import Moment, Request
 from omnid.simulation.vehicle import START_NS
 from omnid.simulation.world import Walkers, clearance_m
-from tests.bench.results import Column, ResultTable
+from tests.bench.obstacles import Planned, prepared, settings_for
+from tests.bench.results import ResultTable, columns
 from tests.simulation.disturbed import simulate
-
-if TYPE_CHECKING:
-    from tests.bench.obstacles import Planned
 
 Array = NDArray[np.float64]
 EVERY: Final = 3  # pair that is stored
@@ -74,8 +72,6 @@ def ranges_m(segments: Array, place: tuple[float, float], azimuths_rad: Array) -
 
 def stored(planned: Planned, folder: Path) -> Path:
     """Return the file of a drive, which is made where there is none."""
-    from tests.bench.obstacles import prepared, settings_for
-
     path = folder / f"{planned}.npz".replace(" ", "_").replace(",", "").replace("/", "p")
     if path.exists():
         return path
@@ -153,14 +149,8 @@ def add_scan_table(paths: Sequence[Path]) -> None:
         with np.load(path) as file:
             parts.append(np.array([file[name] for name in names], float).reshape(len(names), -1))
     scan_m, first_m, sigma_m = np.concatenate(parts, axis=1)
-    columns = (
-        Column("range", "m"),
-        Column("ranges"),
-        Column("median error", "m", 3),
-        Column("90 % of the magnitudes", "m", 3),
-        Column("68 % of the magnitudes by sigma", "", 1),
-    )
-    table = ResultTable("obstacles_scan", "Ranges of the scan against the truth", columns)
+    head = columns("range|m", "ranges", "median error|m|3", "90 % of the magnitudes|m|3", "68 % of them by sigma||1")
+    table = ResultTable("obstacles_scan", "Ranges of the scan against the truth", head)
     for metre in range(math.ceil(np.nanmax(first_m, where=np.isfinite(first_m), initial=0.0))):
         chosen = np.isfinite(scan_m) & (first_m >= metre) & (first_m < metre + 1)
         if chosen.any():
@@ -173,25 +163,20 @@ def add_scan_table(paths: Sequence[Path]) -> None:
 def add_reliability_table(paths: Sequence[Path]) -> None:
     """Print and write the share of cells in which a thing is, by the probability of one that the grid says."""
     cells = sum(np.load(path)["cells"] for path in paths)
-    columns = Column("said probability"), Column("cells"), Column("true share", "", 5)
-    table = ResultTable("obstacles_reliability", "Cells of the grid against the truth", columns)
+    head = columns("said probability", "cells", "true share||5")
+    table = ResultTable("obstacles_reliability", "Cells of the grid against the truth", head)
     for low, high, (count, taken) in zip(DECADES, DECADES[1:], np.transpose(cells), strict=False):
         table.add(f"{low:g} to {high:g}", int(count), float(taken / max(count, 1)))
 
 
 def judge_scans(wanted: Sequence[Planned], folder: Path, jobs: int) -> None:
     """Make the files that are missing, and print a row for each world."""
-    columns = (
-        Column("world"),
-        Column("scans"),
-        Column("free of what is free up to 3 m, within 15 degrees", "%", 0),
-        Column("rays falsely free more than 0.1 m beyond the first thing", "%", 1),
-    )
-    table = ResultTable("obstacles_open_loop", "The obstacle scan on stored pairs", columns)
-    make: Callable[[Planned, Path], Path] = stored
+    ahead = "free of what is free up to 3 m, within 15 degrees|%|0"
+    head = columns("world", "scans", ahead, "rays falsely free more than 0.1 m beyond the first thing|%|1")
+    table = ResultTable("obstacles_open_loop", "The obstacle scan on stored pairs", head)
     paths = []
     with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
-        for planned, path in zip(wanted, pool.map(make, wanted, [folder] * len(wanted)), strict=True):
+        for planned, path in zip(wanted, pool.map(stored, wanted, [folder] * len(wanted)), strict=True):
             count, free, false = shares(path, backwards=planned.speed_mps < 0)
             table.add(str(planned), count, 100 * free, 100 * false, seed=("buildings", planned.seed))
             paths.append(path)

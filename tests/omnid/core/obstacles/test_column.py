@@ -8,12 +8,11 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.frame import Frame, coding_steps
-from omnid.core.obstacles.column import NEAREST_M, ColumnEvidence, Columns, FloorPlane, floor_plane
+from omnid.core.obstacles.column import NEAREST_M, ColumnEvidence, Columns, floor_plane
 from omnid.core.types.panorama import PaddedPanorama
 from tests.omnid.core.obstacles.drawn_floor import (
     BASELINE_M,
     CYLINDER,
-    HEIGHT_M,
     PAD_PX,
     T_RECT_BASE,
     Pattern,
@@ -30,31 +29,26 @@ VISIBLE = np.zeros((CYLINDER.height, CYLINDER.width), bool)
 VISIBLE[8:-8] = True
 
 
+def made(visible: NDArray[np.bool_] = VISIBLE) -> Columns:
+    return Columns(CYLINDER, BASELINE_M, floor_plane(T_RECT_BASE), (0.06, 1.3), (NEAREST_M, 6.0), visible)
+
+
 @pytest.fixture(scope="module")
 def columns() -> Columns:
-    return Columns(CYLINDER, BASELINE_M, floor_plane(T_RECT_BASE), (0.06, 1.3), (NEAREST_M, 6.0), VISIBLE)
+    return made()
+
+
+def seen(columns: Columns, pair: tuple[PaddedPanorama, PaddedPanorama]) -> ColumnEvidence:
+    return columns.evidence(*columns.panoramas.views(columns.panoramas.pair(*pair)))
 
 
 def evidence(columns: Columns, floor: Pattern, wall: Pattern, drop_m: float = 0.0) -> ColumnEvidence:
-    return columns.evidence(*columns.panoramas.views(columns.panoramas.pair(*panoramas(floor, WALL_M, wall, drop_m))))
-
-
-def floor_at(columns: Columns, found: ColumnEvidence, near_m: float, far_m: float) -> np.ndarray:
-    """Return the evidence of the floor between two ranges."""
-    return found.floor[int(columns.at_1m / far_m) : int(columns.at_1m / near_m)]
-
-
-def test_wall_and_the_floor_before_it_are_found_in_all_directions(columns: Columns) -> None:
-    found = evidence(columns, stains, striped)
-    assert (np.abs(np.argmax(found.surface, axis=0) - columns.at_1m / WALL_M) <= 1.5).mean() > 0.95
-    assert (floor_at(columns, found, 1.1, 1.6) > 1).mean() > 0.9
-    assert (floor_at(columns, found, 2.5, 4.0) < -1).mean() > 0.95
-    assert (found.surface[int(columns.at_1m / 1.5) :] > 2).mean() < 0.01
+    return seen(columns, panoramas(floor, WALL_M, wall, drop_m))
 
 
 def test_wall_of_courses_that_are_all_alike_is_none_farther_away_below_the_floor(columns: Columns) -> None:
     """By another number of courses it fits farther away, but not near its foot: there the floor would be above it."""
-    found = columns.evidence(*columns.panoramas.views(columns.panoramas.pair(*panoramas(stains, 1.2, courses))))
+    found = seen(columns, panoramas(stains, 1.2, courses))
     at = round(columns.at_1m / 1.2)
     assert (found.surface[at - 2 : at + 3].max(axis=0) > 2).mean() > 0.95
     assert (found.surface[at + 3 :] > 2).mean() < 0.01
@@ -78,33 +72,15 @@ def test_a_floor_that_repeats_itself_and_falls_deep_is_no_floor_where_its_period
 
 
 def test_floor_nearer_than_a_scan_that_no_direction_shows_is_not_used() -> None:
-    """People who cross the scan would be out of view on their way to the base."""
-    visible = VISIBLE.copy()
-    visible[160:175] = False  # 1.4 to 1.7 m away
-    whole, cut = (
-        Columns(CYLINDER, BASELINE_M, floor_plane(T_RECT_BASE), (0.06, 1.3), (NEAREST_M, 6.0), shown)
-        for shown in (VISIBLE, visible)
-    )
-    # Floor below rows of the horizon that are hidden is seen as before, and so is that beside a speck.
-    horizon, speck = VISIBLE.copy(), VISIBLE.copy()
-    horizon[78:96] = False
-    speck[160:175, 100:400] = False
-    others = (
-        Columns(CYLINDER, BASELINE_M, floor_plane(T_RECT_BASE), (0.06, 1.3), (NEAREST_M, 6.0), shown)
-        for shown in (horizon, speck)
-    )
-    floors_m = [one.at_1m / np.flatnonzero(_floor_of(one).any(axis=1)).max() for one in (whole, cut, *others)]
+    """Who crosses it would be out of view on the way to the base; not so below hidden rows, or beside a speck."""
+    shown = np.stack([VISIBLE] * 4)
+    shown[1, 160:175] = shown[2, 78:96] = shown[3, 160:175, 100:400] = False  # 1.4 to 1.7 m away, the horizon, a speck
+    floors = [evidence(made(visible), stains, striped).floor.any(axis=1) for visible in shown]
+    floors_m = [made().at_1m / np.flatnonzero(floor).max() for floor in floors]
     assert floors_m[0] < 1.1 and floors_m[1] > 1.7 and floors_m[2:] == pytest.approx(2 * floors_m[:1])
 
 
-def _floor_of(columns: Columns) -> np.ndarray:
-    """Return the evidence (K, DIRECTIONS) of a floor with stains."""
-    return columns.evidence(*columns.panoramas.views(columns.panoramas.pair(*panoramas(stains, WALL_M, striped)))).floor
-
-
 QUALITY = 40
-ALL_VISIBLE = np.ones((CYLINDER.height, CYLINDER.width), bool)
-COLUMNS = Columns(CYLINDER, BASELINE_M, FloorPlane(HEIGHT_M, 0.0, 0.0), (0.06, 1.2), (0.5, 4.0), ALL_VISIBLE)
 
 
 def test_a_floor_in_jpegs_is_no_evidence_against_itself() -> None:
@@ -119,11 +95,8 @@ def test_a_floor_in_jpegs_is_no_evidence_against_itself() -> None:
 
 def _floor(lower: PaddedPanorama, upper: PaddedPanorama) -> NDArray[np.float32]:
     """Return the evidence of the floor from 1 to 2.5 m."""
-    ranges_m = COLUMNS.at_1m / (np.arange(COLUMNS.bins) + 0.5)
-    floor = COLUMNS.evidence(*COLUMNS.panoramas.views(COLUMNS.panoramas.pair(lower, upper))).floor[
-        (ranges_m > 1.0) & (ranges_m < 2.5)
-    ]
-    return np.asarray(floor[np.isfinite(floor)])
+    at_1m = made().at_1m
+    return seen(made(), (lower, upper)).floor[round(at_1m / 2.5) : round(at_1m / 1.0)]
 
 
 def _coded(panorama: PaddedPanorama, known: bool = True) -> PaddedPanorama:
