@@ -96,6 +96,13 @@ class Drive:
         return not self.own and (self.stopped_m is None or STOPS_M[0] <= self.stopped_m <= STOPS_M[1])
 
 
+def ahead(moment: Moment) -> Iterator[Request]:
+    """Arm, and hold the stick ahead."""
+    if moment.odometry is not None and not moment.controller.armed and moment.time_s < 2.0:
+        yield "arm"
+    yield Setpoint(0.5, heading_rad=0.0)
+
+
 class Asker:
     """Arms, then asks for the way or for the goal; ends the drive there, or where the base stands."""
 

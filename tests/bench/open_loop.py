@@ -143,11 +143,10 @@ def shares(path: Path, *, backwards: bool) -> tuple[int, float, float]:
 
 def add_scan_table(paths: Sequence[Path]) -> None:
     """Print and write the errors of ranges against the truth, by metre of it."""
-    names = "scan_m", "first_m", "sigma_m"
     parts = []
     for path in paths:
         with np.load(path) as file:
-            parts.append(np.array([file[name] for name in names], float).reshape(len(names), -1))
+            parts.append(np.array([file[name] for name in ("scan_m", "first_m", "sigma_m")], float).reshape(3, -1))
     scan_m, first_m, sigma_m = np.concatenate(parts, axis=1)
     head = columns("range|m", "ranges", "median error|m|3", "90 % of the magnitudes|m|3", "68 % of them by sigma||1")
     table = ResultTable("obstacles_scan", "Ranges of the scan against the truth", head)
@@ -174,11 +173,10 @@ def judge_scans(wanted: Sequence[Planned], folder: Path, jobs: int) -> None:
     ahead = "free of what is free up to 3 m, within 15 degrees|%|0"
     head = columns("world", "scans", ahead, "rays falsely free more than 0.1 m beyond the first thing|%|1")
     table = ResultTable("obstacles_open_loop", "The obstacle scan on stored pairs", head)
-    paths = []
     with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
-        for planned, path in zip(wanted, pool.map(stored, wanted, [folder] * len(wanted)), strict=True):
-            count, free, false = shares(path, backwards=planned.speed_mps < 0)
-            table.add(str(planned), count, 100 * free, 100 * false, seed=("buildings", planned.seed))
-            paths.append(path)
+        paths = list(pool.map(stored, wanted, [folder] * len(wanted)))
+    for planned, path in zip(wanted, paths, strict=True):
+        count, free, false = shares(path, backwards=planned.speed_mps < 0)
+        table.add(str(planned), count, 100 * free, 100 * false, seed=("buildings", planned.seed))
     add_scan_table(paths)
     add_reliability_table(paths)

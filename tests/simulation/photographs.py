@@ -1,6 +1,4 @@
-"""Photographs on walls, floors and pictures: those that scikit-image installs (`pip install '.[test]'`), each with a
-license that allows it. Only its files are read, the package is not imported.
-"""
+"""Photographs on walls, floors and pictures: files that scikit-image installs, each with a license that allows it."""
 
 from __future__ import annotations
 

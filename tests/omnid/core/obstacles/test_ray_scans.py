@@ -67,8 +67,7 @@ class Standing:
 def test_floor_is_free_up_to_the_wall_whatever_it_shows(floor: Pattern) -> None:
     """A plain floor shows nothing, and no edge at which something could begin; a painted line is a mark."""
     scan = Standing(floor).scan(pairs=PAIRS)
-    assert np.median(scan.free_m) > 0.75 * WALL_M
-    assert (scan.free_m < WALL_M + 0.1).all()
+    assert np.median(scan.free_m) > 0.75 * WALL_M and (scan.free_m < WALL_M + 0.1).all()
 
 
 @dataclass(frozen=True)
@@ -125,8 +124,7 @@ def test_floor_is_not_free_while_a_pole_that_was_put_there_hides_it(floor: Patte
 def test_who_steps_onto_free_floor_is_found_in_two_pairs(floor: Pattern, ahead_m: float) -> None:
     """As wide as a person, and where the cameras see it; nothing else has come."""
     base = Standing(floor, ahead_m=ahead_m)
-    before = base.scan(pairs=8)
-    assert np.isnan(before.arrivals.ranges_m).all()
+    assert np.isnan(base.scan(pairs=8).arrivals.ranges_m).all()
     found = [base.scan(Pole(1.5, 0.4, 60.0)).arrivals.ranges_m for _ in range(2)]
     came = np.isfinite(found).any(axis=0)
     assert came[AHEAD].all() and not came[np.abs(azimuths()) > math.radians(15)].any()
@@ -186,5 +184,4 @@ def test_without_floor_in_view_nothing_is_free() -> None:
     visible = SHOWN.copy()
     visible[round(CYLINDER.row0) + 5 :] = False
     scan = Standing(plain, visible).scan(pairs=PAIRS)
-    assert scan.free_m.max() < 0.3
-    assert not np.isinf(scan.ranges_m).any()
+    assert scan.free_m.max() < 0.3 and not np.isinf(scan.ranges_m).any()
