@@ -32,7 +32,7 @@ AROUND_ROWS: Final = 17  # rows with which a pixel is compared
 # 8.5 and 15.5 % of the directions of things are called free beyond these instead of 11.1 %.
 TEXTURE_SHARE: Final = 0.3
 # Noise of a smooth image by that of a panorama: of white noise in images of 512 px 0.54 to 0.66 in the rows of floor,
-# of 960 px 0.36 to 0.53 (test_panoramas.py). With 0.35, by trial, bases stood before free floor in noisy images.
+# of 960 px 0.36 to 0.53. With 0.35, by trial, bases stood before free floor in noisy images.
 BAND_NOISE: Final = 0.65
 # Frequencies of a JPEG's blocks, of 8, whose errors a working panorama of the image's own resolution shows, because the
 # smoothing halves those above. A coarser panorama shows fewer.

@@ -33,7 +33,6 @@ GENTLEST: Final = math.tan(math.radians(1.0))  # The filter of the tilt follows 
 STEP: Final = math.tan(math.radians(0.5))  # between slopes that are compared
 STARTS_M: Final = np.arange(0.6, 3.3, 0.1)  # where ramps are looked for: nearer ones are known by their pairs before
 SEEN_M: Final = 4.0  # range up to which they are seen
-BEGIN_M: Final = 0.5  # first part of a ramp, which must show it as the rest does
 HALF_RAD: Final = math.radians(27.0)  # half of the angle in which a ramp is as wide as the way
 PARTS: Final = 8  # of that angle: most of them must show a ramp
 # Log-likelihood by a sigma of difference of a pixel: that of column.py with the weight that the posterior gives it.
@@ -61,8 +60,8 @@ class Ramp(NamedTuple):
 
 
 @compiled(
-    "(u1[:, ::1], u1[:, ::1], u1[:, ::1], f4[::1], i4[:, ::1], f8[::1], f8, f8, f8, f8, f8, f8, f8[::1], f8[::1], u1,"
-    " f8[:, :, :, ::1], f8[:, :, ::1])",
+    "(u1[:, ::1], u1[:, ::1], u1[:, ::1], f4[::1], i4[:, ::1], f8[::1], f8, f8, f8, f8, f8, f8[::1], f8[::1], u1,"
+    " f8[:, :, ::1], f8[:, :, ::1])",
     writes=("ramps", "upright"),
 )
 def gains(
@@ -76,7 +75,6 @@ def gains(
     focal_px: float,
     height_m: float,
     baseline_m: float,
-    begin_m: float,
     seen_m: float,
     starts_m: Array,
     slopes: Array,
@@ -88,8 +86,8 @@ def gains(
 
     lower, upper, live (H, W): normalised panoramas, and 255 where pixels may be compared; plane_rows (H,): row of the
     upper one that shows the floor of a row, row0: the horizon. parts (P, C): directions, along (W,): cosines of all
-    against the way. starts_m (X,), slopes (S,) of ramps, seen up to the range seen_m. ramps (P, X, S, 2): beyond the
-    start, up to begin_m and later; upright (P, K, H): by disparity, in each row above its foot.
+    against the way. starts_m (X,), slopes (S,) of ramps, seen up to the range seen_m. ramps (P, X, S). upright
+    (P, K, H): by disparity, in each row above its foot.
     """
     height = len(lower)
     for p in range(len(parts)):
@@ -120,8 +118,7 @@ def gains(
                             continue
                         share = row - above
                         shown = (1.0 - share) * upper[above, u] + share * upper[above + 1, u]
-                        beyond_m = focal_px * below_m / lift * along[u] - starts_m[x]
-                        ramps[p, x, s, 0 if beyond_m < begin_m else 1] += floor - min(abs(mine - shown), most)
+                        ramps[p, x, s] += floor - min(abs(mine - shown), most)
 
 
 class Ramps:
@@ -165,10 +162,10 @@ class Ramps:
         slopes = np.append(np.arange(GENTLEST, STEEPEST + STEP / 2, STEP), TOO_STEEP)
         if climbed > GENTLEST:  # A landing is level.
             slopes = np.append(slopes, STEP * np.arange(-2, 3) - climbed)
-        ramps = np.empty((PARTS, len(STARTS_M), len(slopes), 2))
+        ramps = np.empty((PARTS, len(STARTS_M), len(slopes)))
         upright = np.empty((PARTS, math.ceil(FOCAL_PX * baseline_m / STARTS_M[0]), panoramas.height))
         images = views.lower, views.upper, views.live, panoramas.plane_rows, np.ascontiguousarray(parts), np.cos(aside)
-        geometry = panoramas.row0, FOCAL_PX, height_m, baseline_m, BEGIN_M, SEEN_M
+        geometry = panoramas.row0, FOCAL_PX, height_m, baseline_m, SEEN_M
         gains(*images, *geometry, STARTS_M, slopes, OUTLIER, ramps, upright)
         # 2. Those of the best upright thing in the same rows of each part, from the farthest of a ramp to its start.
         sums = np.pad(np.cumsum(upright, axis=2), ((0, 0), (0, 0), (1, 0)))
@@ -177,15 +174,13 @@ class Ramps:
         near = np.floor(panoramas.row0 + FOCAL_PX * height_m / STARTS_M).astype(int)[:, None]
         ends = (np.clip(rows, int(panoramas.row0), panoramas.height) for rows in (near + 1, far))
         things = np.subtract(*(sums[:, :, rows] for rows in ends)).max(axis=1)
-        # 3. The likeliest, which most parts and both its begin and the rest show.
-        nats = 2 * RATIO / UNITS * PARTS * np.median(ramps, axis=0)
-        better = 2 * RATIO / UNITS * PARTS * np.median(ramps.sum(axis=-1) - np.maximum(things, 0), axis=0)
-        total = np.where(nats.min(axis=2) > 0, better, 0.0)
-        x, s = np.unravel_index(total.argmax(), total.shape)
-        if total[x, s] < LEAST_NATS or slopes[s] >= TOO_STEEP[0]:
+        # 3. The likeliest, which most parts show. Every second direction was looked at.
+        nats = 2 * RATIO / UNITS * PARTS * np.median(ramps - np.maximum(things, 0), axis=0)
+        x, s = np.unravel_index(nats.argmax(), nats.shape)
+        if nats[x, s] < LEAST_NATS or slopes[s] >= TOO_STEEP[0]:
             return False
         offset_m = float(STARTS_M[x]) + self._along(viewpoint, viewpoint[2])
-        return self._add(float(viewpoint[2]), offset_m, float(slopes[s]), float(total[x, s]))
+        return self._add(float(viewpoint[2]), offset_m, float(slopes[s]), float(nats[x, s]))
 
     def _add(self, way_rad: float, offset_m: float, slope: float, nats: float) -> bool:
         """Take what a pair shows into the mean of those that showed the same ramp, weighted by their evidence; return
