@@ -86,6 +86,10 @@ def show_cameras(args: argparse.Namespace) -> int:
     """
     if args.snapshot is not None:
         return _snapshot(args)
+    if args.log is not None:
+        raise OmnidError(
+            f"--log {args.log} is for images: add --snapshot DIR; `omnid log info {args.log}` shows its content"
+        )
     devices = capture_devices(ROOT)
     if not devices:
         return failed("no cameras: the kernel has no capture device; check the cables and the output of `dmesg`")
