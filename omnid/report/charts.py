@@ -1,4 +1,4 @@
-"""Charts over time, drawn by uPlot: one time, one zoom and one cursor for all; a table of values stands under each."""
+"""Charts over time, drawn by uPlot: one time, one zoom and one cursor for all."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-
-from omnid.report.page import table
 
 Array = NDArray[np.float64]
 COLUMNS: Final = 400  # of a chart, in each of which the lowest and the highest value are kept
@@ -41,22 +39,15 @@ def chart(title: str, curves: Sequence[Curve], unit: str = "", *, log: bool = Fa
         unit, shown = "mm", [Curve(name, t_s, 1e3 * values) for name, t_s, values in shown]
     lines = [{"name": name, "points": thinned(t_s, values)} for name, t_s, values in shown]
     data = escape(json.dumps({"lines": lines, "log": log, "unit": unit}, separators=(",", ":")))
-    rows = [
-        (escape(name), *(f"{value:.4g}" for value in (v[0], v.min(), v.mean(), v.max(), v[-1]))) for name, _, v in shown
-    ]
-    summary = table(("", "first", "lowest", "mean", "highest", "last"), rows)
     caption = f"<b>{escape(title)}</b>{f' [{escape(unit)}]' if unit else ''}"
     footnote = f"<small>{escape(note)}</small>" if note else ""
     return (
-        f"<figure class='chart'><figcaption>{caption}</figcaption><div data-chart=\"{data}\"></div>{footnote}"
-        f"<details><summary>values</summary>{summary}</details></figure>"
+        f"<figure class='chart'><figcaption>{caption}</figcaption><div data-chart=\"{data}\"></div>{footnote}</figure>"
     )
 
 
 def thinned(t_s: Array, values: Array) -> list[tuple[float, float | None]]:
     """Return at most two points for each column, the lowest and the highest, and None in gaps of six usual steps."""
-    if not len(t_s):
-        return []
     step = -(-len(t_s) // (2 * COLUMNS))
     if step > 1:
         starts = np.arange(0, len(t_s), 2 * step)
@@ -64,13 +55,10 @@ def thinned(t_s: Array, values: Array) -> list[tuple[float, float | None]]:
         bounds = [bound.reduceat(values, starts) for bound in (np.minimum, np.maximum)]
         t_s, values = t_s[np.column_stack([starts, middles])].ravel(), np.column_stack(bounds).ravel()
     steps_s = np.diff(t_s)
-    is_gap = steps_s > 6.0 * float(np.median(steps_s)) if len(steps_s) > 2 else np.zeros(len(steps_s), bool)
-    points: list[tuple[float, float | None]] = []
-    for index, (t, value) in enumerate(zip(t_s.tolist(), values.tolist(), strict=True)):
-        if index and is_gap[index - 1]:
-            points.append((round((t_s[index - 1] + t) / 2, 3), None))
-        points.append((round(t, 3), float(f"{value:.6g}") if math.isfinite(value) else None))
-    return points
+    gaps = np.flatnonzero(steps_s > 6.0 * np.median(steps_s)) + 1 if len(steps_s) > 2 else np.zeros(0, int)
+    t_s, values = np.insert(t_s, gaps, (t_s[gaps - 1] + t_s[gaps]) / 2), np.insert(values, gaps, np.nan)
+    rounded = zip(t_s.round(3).tolist(), values.tolist(), strict=True)
+    return [(t, float(f"{value:.6g}") if math.isfinite(value) else None) for t, value in rounded]
 
 
 def grid(figures: Sequence[str]) -> str:

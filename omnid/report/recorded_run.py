@@ -5,17 +5,15 @@ Times are in s since the first pose. A pose takes 300 bytes: an hour at 30 Hz 32
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from calib import se3
 from calib.errors import CalibError
-from calib.rig import Rig
 from calib.rig_file import parse_rig
 from drivers.logs.open_log import log_info
 from omnid.formats.tum import POSITION_LIMIT_M
@@ -73,15 +71,13 @@ class RecordedRun:
     """Everything that the report shows of a recording. N poses.
 
     path, info (LogInfo), topic (of the odometry), robot, attachments, frames (of the odometry)
-    rig, or None and why there is none (rig_fault)
+    T_base_rig (4, 4), the identity where no rig that can be read is attached; height_m: of the cameras, 0 if unknown
     start_ns: stamp of the first pose; t_s (N,) rising; T_odom_base (N, 4, 4)
     variances (N, 6) of x y z rx ry rz; velocity (N, 6) m/s, rad/s
     ranks (N,): of the state in STATES, UNKNOWN where it is not recorded
-    statuses: messages in the order of the file; by_name: times and entries of each part; newest: entries with the
-    newest of all values
-    map_poses (M, 3): t, position's and heading's correction by the map [m, rad]; map_xy (M, 2) m
-    drives: (K, 3) t, m/s, rad/s by topic, DRIVE or TWIST_COMMAND; cloud: the newest
-    resets: number of resets of odometry
+    by_name: times and entries of each part in the order of the file; newest: entries with the newest of all values
+    map_xy (M, 2) m: the path in the map; drives: (K, 3) t, m/s, rad/s by topic, DRIVE or TWIST_COMMAND; cloud: the
+    newest; resets: number of resets of odometry
     left_out: messages not of their type, poses out of range or not later than the one before; corrupt: chunks and
     records of the file left out
     """
@@ -95,11 +91,10 @@ class RecordedRun:
         reader = RecordingReader(self.info, choose_odometry_topic(self.info, topic))
         self.topic, self.robot, self.attachments = reader.topic, reader.robot, reader.attachments
         # 1. All messages.
-        poses, map_poses = list[Pose](), list[PoseInMap]()
-        statuses, names = list[Diagnostics](), set[str]()
+        poses, map_xy, left_out = list[Pose](), list[Array](), 0
+        entries: dict[str, list[tuple[int, DiagnosticStatus]]] = {}
         drives: dict[str, list[TwistRecord]] = {}
         self.cloud: Cloud | None = None
-        left_out = 0
         for message in reader.messages((ODOMETRY, MAP_POSE, STATUS, CLOUD, DRIVE, TWIST_COMMAND)):
             match message.content:
                 case Pose() as pose:
@@ -109,11 +104,11 @@ class RecordedRun:
                     else:
                         left_out += 1
                 case PoseInMap() as in_map if (np.abs(in_map.T_map_base[:-1, -1]) <= POSITION_LIMIT_M).all():
-                    map_poses.append(in_map)
-                case Diagnostics(stamp_ns, entries):
-                    bounded = [_bounded(status) for status in entries]
-                    names |= {status.name for status in bounded[: MOST_ENTRIES - len(names)]}
-                    statuses.append(Diagnostics(stamp_ns, tuple(status for status in bounded if status.name in names)))
+                    map_xy.append(in_map.T_map_base[:2, -1])
+                case Diagnostics(stamp_ns, statuses):
+                    for status in map(_bounded, statuses):
+                        if status.name in entries or len(entries) < MOST_ENTRIES:
+                            entries.setdefault(status.name, []).append((stamp_ns, status))
                 case Cloud():
                     self.cloud = message.content
                 case TwistRecord():
@@ -122,13 +117,10 @@ class RecordedRun:
             raise no_pose(path, reader.topic)
         self.left_out, self.corrupt = reader.unreadable.total() + left_out, reader.corrupt
         # 2. The rig.
-        self.rig: Rig | None = None
-        self.rig_fault = "no rig.toml is attached"
-        if (rig_toml := reader.attachments.get("rig.toml")) is not None:
-            try:
-                self.rig = parse_rig(rig_toml)
-            except CalibError as error:
-                self.rig_fault = f"the attached rig.toml cannot be read: {error}"
+        self.T_base_rig, self.height_m = np.eye(4), 0.0
+        with suppress(CalibError):
+            rig = parse_rig(self.attachments.get("rig.toml", b""))
+            self.T_base_rig, self.height_m = rig.T_base_rig, rig.height_m() or 0.0
         # 3. The arrays.
         self.start_ns, self.frames = poses[0].stamp_ns, poses[0].frames
 
@@ -139,42 +131,26 @@ class RecordedRun:
         self.T_odom_base = np.array([pose.T_odom_base for pose in poses])
         self.variances = np.array([np.diag(pose.covariance) for pose in poses])
         self.velocity = np.array([pose.velocity for pose in poses])
-        self.statuses = [(seconds(report.stamp_ns), report.statuses) for report in statuses]
+        self.map_xy = np.array(map_xy).reshape(-1, 2)
         self.drives = {
             name: np.array([(seconds(twist.stamp_ns), twist.velocity_mps, twist.yaw_rate_radps) for twist in twists])
             for name, twists in drives.items()
         }
-        # 4. The pose in the map relative to that of odometry with the same stamp: map -> odom as seen at the robot.
-        by_stamp = {pose.stamp_ns: pose.T_odom_base for pose in poses}
-        corrections, map_xy = [], []
-        for in_map in map_poses:
-            if (T_odom := by_stamp.get(in_map.stamp_ns)) is not None:
-                T_map = in_map.T_map_base
-                moved_m, turned_rad = math.dist(T_map[:2, -1], T_odom[:2, -1]), se3.yaw(T_map @ se3.inverse(T_odom))
-                corrections.append((seconds(in_map.stamp_ns), moved_m, turned_rad))
-                map_xy.append(T_map[:2, -1])
-        self.map_poses, self.map_xy = np.array(corrections).reshape(-1, 3), np.array(map_xy).reshape(-1, 2)
-        # 5. The newest values of each part, the state of each pose, resets.
+        # 4. The entries of each part with their times, and its newest values.
+        self.by_name = {name: [(seconds(at_ns), status) for at_ns, status in found] for name, found in entries.items()}
         self.newest: dict[str, DiagnosticStatus] = {}
-        self.by_name: dict[str, list[tuple[float, DiagnosticStatus]]] = {}
-        for t_s, status in ((t_s, status) for t_s, report in self.statuses for status in report):
-            self.by_name.setdefault(status.name, []).append((t_s, status))
-            values = self.newest[status.name].values if status.name in self.newest else {}
-            merged = dict([*{**values, **status.values}.items()][:MOST_ENTRIES])
-            self.newest[status.name] = replace(status, values=merged)
-        # An entry with `state` has the stamp of the first pose in it; others tell the state of an earlier pose.
-        found = self.entries(status_names.ODOMETRY)
-        found = [(t, status) for t, status in found if Key.STATE in status.values] or found
-        states = [(t, status_names.tracking_state(status.message, status.values)) for t, status in found]
+        for name, found in self.by_name.items():
+            values = {key: value for _, status in found for key, value in status.values.items()}
+            self.newest[name] = replace(found[-1][1], values=dict([*values.items()][:MOST_ENTRIES]))
+        # 5. The state of each pose, and resets. An entry with `state` has the stamp of the first pose in it; others
+        #    have the state of an earlier pose.
+        of_odometry = self.by_name.get(status_names.ODOMETRY, [])
+        of_odometry = [(t, status) for t, status in of_odometry if Key.STATE in status.values] or of_odometry
+        states = [(t, status_names.tracking_state(status.message, status.values)) for t, status in of_odometry]
         known = sorted((t, STATES.index(state)) for t, state in states if state is not None)
         ranks = np.array([UNKNOWN, *(rank for _, rank in known)])
         self.ranks = ranks[np.searchsorted([t for t, _ in known], self.t_s + 1e-9, side="right")]
-        self.resets = int(max(self.series(status_names.ODOMETRY, Key.RESETS)[1], default=0))
-
-    @property
-    def T_base_rig(self) -> Array:
-        """Pose of the rig on the robot; the identity where it is unknown."""
-        return np.eye(4) if self.rig is None else self.rig.T_base_rig
+        self.resets = int(max(self.curve("", status_names.ODOMETRY, Key.RESETS).values, default=0))
 
     @property
     def xyz(self) -> Array:
@@ -186,29 +162,15 @@ class RecordedRun:
         """Time of the last pose."""
         return float(self.t_s[-1])
 
-    def entries(self, name: str) -> Sequence[tuple[float, DiagnosticStatus]]:
-        """Return the entries of a part with their times, in the order of the file."""
-        return self.by_name.get(name, [])
-
-    def series(self, name: str, key: str) -> tuple[Array, Array]:
-        """Return times and values of a number of a part."""
-        found = [(t_s, status_names.number(status.values.get(key, ""))) for t_s, status in self.entries(name)]
-        known = sorted((t_s, value) for t_s, value in found if value is not None)
-        return np.array([t_s for t_s, _ in known]), np.array([value for _, value in known])
-
     def curve(self, title: str, name: str, key: str) -> Curve:
-        """Return a number of a part as a curve with that title."""
-        return Curve(title, *self.series(name, key))
+        """Return a number of a part over time as a curve with that title."""
+        found = [(t_s, status_names.number(status.values.get(key, ""))) for t_s, status in self.by_name.get(name, [])]
+        known = sorted((t_s, value) for t_s, value in found if value is not None)
+        return Curve(title, np.array([t_s for t_s, _ in known]), np.array([value for _, value in known]))
 
     def values(self, name: str) -> Mapping[str, str]:
         """Return the newest values of a part."""
         return self.newest[name].values if name in self.newest else {}
-
-    def gaps(self) -> Array:
-        """Return begin and end (G, 2) of the times without a pose: half a second, and five periods."""
-        steps_s = np.diff(self.t_s)
-        longest_s = max(0.5, 5.0 * float(np.median(steps_s))) if len(steps_s) > 2 else 0.5
-        return np.column_stack([self.t_s[:-1], self.t_s[1:]])[steps_s > longest_s]
 
     def length_m(self) -> float:
         """Return the length of the path."""
@@ -216,12 +178,20 @@ class RecordedRun:
 
     def events(self) -> list[Event]:
         """Return the events in the order of time."""
-        found = [Event(a, b, WARNING, "poses", f"none for {b - a:.2f} s") for a, b in self.gaps()]
+        # 1. Times without a pose: half a second, and five periods.
+        steps_s = np.diff(self.t_s)
+        gaps = np.flatnonzero(steps_s > max(0.5, 5.0 * float(np.median(steps_s)) if len(steps_s) > 2 else 0.0))
+        found = [
+            Event(float(self.t_s[at]), float(self.t_s[at + 1]), WARNING, "poses", f"none for {steps_s[at]:.2f} s")
+            for at in gaps
+        ]
+        # 2. Changes of the state; a run that begins well is no event.
         for index in np.flatnonzero(np.diff(self.ranks, prepend=UNKNOWN)):
             rank, t_s = int(self.ranks[index]), float(self.t_s[index])
-            if index or rank != 0:  # a run that begins well is no event
+            if index or rank != 0:
                 text = STATES[rank] if rank >= 0 else "unknown"
                 found.append(Event(t_s, t_s, (GOOD, WARNING, ERROR)[max(rank, 0)], "state", text))
+        # 3. Messages and counters of all parts.
         for name in self.newest:
             found += self._message_events(name) if name not in (status_names.ODOMETRY, status_names.SUMMARY) else ()
             found += self._counter_events(name)
@@ -230,11 +200,10 @@ class RecordedRun:
     def _message_events(self, name: str) -> Iterator[Event]:
         """Yield the changes of a part's message; a change of digits only is none."""
         before = None
-        for t_s, status in self.entries(name):
+        for t_s, status in self.by_name[name]:
             message = status.message.translate(_DIGITS)
             if message and message != before and (before is not None or status.level > 0):
-                level = (GOOD, WARNING, ERROR, ERROR)[min(status.level, 3)]
-                yield Event(t_s, t_s, level, short_name(name), status.message)
+                yield Event(t_s, t_s, min(status.level, ERROR), short_name(name), status.message)
             before = message
 
     def _counter_events(self, name: str) -> Iterator[Event]:
@@ -242,12 +211,13 @@ class RecordedRun:
 
         One that rises again with the next report but one is the same event.
         """
+        first_s = min(found[0][0] for found in self.by_name.values())
         for key in self.values(name):
             is_reason = key.startswith(_REASONS)
             if not (key in _COUNTERS or is_reason):
                 continue
-            t_s, counts = self.series(name, key)
-            if is_reason and len(t_s) and t_s[0] > self.statuses[0][0]:  # the first one of this reason
+            _, t_s, counts = self.curve("", name, key)
+            if is_reason and len(t_s) and t_s[0] > first_s:  # the first one of this reason
                 t_s, counts = np.insert(t_s, 0, t_s[0]), np.insert(counts, 0, 0.0)
             rises = np.diff(counts)
             at = np.flatnonzero(rises > 0)
@@ -256,11 +226,6 @@ class RecordedRun:
                     start_s, end_s = float(t_s[same[0] + 1]), float(t_s[same[-1] + 1])
                     text, count = _COUNTERS.get(key, key), int(rises[same].sum())
                     yield Event(start_s, end_s, WARNING, short_name(name), text, count)
-
-
-def root(variances: Array) -> Array:
-    """Return standard deviations; NaN for a variance that is not positive, which means that it was not set."""
-    return np.sqrt(np.where(variances > 0, variances, np.nan))
 
 
 def _bounded(status: DiagnosticStatus) -> DiagnosticStatus:
