@@ -35,7 +35,7 @@ from omnid.sinks.files import on_stdout
 def run(args: argparse.Namespace) -> int:
     """Run a recorded log through the stages of the daemon, and print a summary.
 
-    Exit code 1: no pose was found, or a tenth of the images made no pair.
+    Exit code 1: no pose was found, or a tenth of the pairs is missing.
 
     log LOG              an .mcap, .db3 or .bag file, a folder with one or with its parts, or a folder with a folder of
         stamped images for each camera

@@ -67,12 +67,23 @@ class RunCounters:
     map: Mapping[str, int] = field(default_factory=dict)  # voxels and points; empty without a map
     places: Mapping[str, int] = field(default_factory=dict)  # keyframes, loops, refusals; empty without a map of places
     motor: Mapping[str, int] = field(default_factory=dict)  # commands, errors, stops; empty without a motor
-    loss: str = ""  # one line where more than a tenth of the images make no pair
+    loss: str = ""  # one line where more than a tenth of the pairs is missing
 
     @property
     def no_pose(self) -> bool:
         """True if no pose was measured: there are none, or all are predictions."""
         return self.poses == self.states[TrackingState.LOST]
+
+
+def pair_loss(pairing: Synchronise, read: Mapping[str, int]) -> str:
+    """Return one line where more than a tenth of the pairs of a log is missing; else "".
+
+    read: counts of its reader. Images of a faster camera that the other one has no partners for are no loss.
+    """
+    unusable = read["broken"] + read["unreadable"] + read["duplicate"] - read["repeated"]
+    possible, made = round(pairing.possible + unusable / len(CAMERAS)), pairing.counts["pairs"]
+    lost = possible - made
+    return f"{lost} of {possible} pairs are missing: see what was lost" if lost > NOTABLE_SHARE * possible else ""
 
 
 def summary_entries(counters: RunCounters, *, verbose: bool = False) -> dict[str, str]:

@@ -22,7 +22,7 @@ from drivers.logs.log_reader import WHOLE, LogReader
 from drivers.motion import MotionSample
 from omnid.config import Config
 from omnid.core.control.motion_monitor import ADVICE
-from omnid.diagnostics.run_summary import RunCounters, RunStatistics, input_warnings
+from omnid.diagnostics.run_summary import RunCounters, RunStatistics, input_warnings, pair_loss
 from omnid.diagnostics.status import stage_stats, summary_stats
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Sink
 from omnid.engine.kernel_cache import prepare_kernels
@@ -246,7 +246,7 @@ class _Replay:
             {} if mapping is None else mapping.counts,
             {} if places is None else places.counts,
             {} if self._wheels is None else self._wheels.counts(),
-            "" if drops["queue"] else self._front_end.pairing.loss(read),  # else they were dropped on purpose
+            "" if drops["queue"] else pair_loss(self._front_end.pairing, read),  # else they were dropped on purpose
         )
 
     def _about_input(self, counters: RunCounters) -> Iterator[str]:

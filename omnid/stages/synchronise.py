@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping
 from itertools import product
 from statistics import median_low
 from typing import Final
@@ -20,7 +19,6 @@ from omnid.camera_config import PairConfig
 from omnid.core.nanoseconds import NS_PER_S, S_PER_NS
 from omnid.errors import OmnidError
 from omnid.messages import FramePair
-from omnid.transport.status_names import NOTABLE_SHARE
 
 Image = NDArray[np.uint8]
 
@@ -95,26 +93,6 @@ class Decoder:
         self.fault = self.fault or fault
 
 
-class RepeatedImages:
-    """Counts the images of one camera whose pixels all equal those of the image before."""
-
-    def __init__(self) -> None:
-        self._earlier: Image | None = None
-        self.count = 0
-        self.in_a_row = 0  # of the newest images
-
-    def add(self, image: Image) -> bool:
-        """Take the next image (H, W); return True if it repeats the one before."""
-        earlier, self._earlier = self._earlier, image
-        # One column decides at once for images that are not equal: the noise of any real image differs there.
-        repeated = earlier is not None and all(
-            np.array_equal(image[part], earlier[part]) for part in (np.s_[:, 0], ...)
-        )
-        self.count += repeated
-        self.in_a_row = self.in_a_row + 1 if repeated else 0
-        return repeated
-
-
 class MotionInbox:
     """Samples of wheels and gyro on their way to the next pair: a bounded queue, whose oldest samples give way.
 
@@ -131,18 +109,16 @@ class MotionInbox:
 
     def add(self, sample: MotionSample) -> None:
         """Add a sample, unless its rates are not finite, which would make the poses not finite too."""
-        gyro = sample if isinstance(sample, GyroSample) else None
-        rates: tuple[float, ...] = (
-            (sample.velocity_mps,)
-            if isinstance(sample, WheelSample)
-            else (sample.x_radps, sample.y_radps, sample.z_radps)
-        )
-        if not all(map(math.isfinite, rates)):
+        if isinstance(sample, WheelSample):
+            rates = np.array([sample.velocity_mps])
+        else:
+            rates = np.array([sample.x_radps, sample.y_radps, sample.z_radps])
+        if not np.isfinite(rates).all():
             self.dropped += 1
             return
-        self.wheels += gyro is None
-        self.gyro += gyro is not None
-        if gyro is not None and self._R_base_imu is not None and not gyro.of_base:
+        self.wheels += isinstance(sample, WheelSample)
+        self.gyro += isinstance(sample, GyroSample)
+        if isinstance(sample, GyroSample) and self._R_base_imu is not None and not sample.of_base:
             x, y, z = (self._R_base_imu @ rates).tolist()
             sample = GyroSample(sample.stamp_ns, x, y, z, of_base=True)
         self.dropped += len(self._waiting) == MOST_WAITING
@@ -160,14 +136,15 @@ class MotionInbox:
 
 
 class _Camera:
-    """The frames of one camera on their way to pairs."""
+    """The frames of one camera on their way to pairs, and what is counted of them."""
 
     def __init__(self) -> None:
         self.waiting: deque[Frame] = deque()
         self.steps_ns: deque[int] = deque(maxlen=RECENT)  # between the stamps of its frames
         self.newest_ns = 0  # stamp of its newest frame
-        self.arrived = self.unpaired = 0  # numbers of frames
-        self.repeated = RepeatedImages()
+        self.arrived = self.unpaired = self.repeated = 0  # numbers of frames
+        self.repeated_in_a_row = 0  # of the newest images of pairs
+        self._image: Image | None = None  # of the newest pair
 
     @property
     def period_ns(self) -> float:
@@ -187,6 +164,17 @@ class _Camera:
         while len(self.waiting) > count:
             self.waiting.popleft()
             self.unpaired += 1
+
+    def repeats(self, image: Image) -> bool:
+        """Return True for an image (H, W) whose pixels all equal those of the one before."""
+        earlier, self._image = self._image, image
+        # One column decides at once for images that are not equal: the noise of any real image differs there.
+        repeated = earlier is not None and all(
+            np.array_equal(image[part], earlier[part]) for part in (np.s_[:, 0], ...)
+        )
+        self.repeated += repeated
+        self.repeated_in_a_row = self.repeated_in_a_row + 1 if repeated else 0
+        return repeated
 
 
 class Synchronise:
@@ -212,7 +200,7 @@ class Synchronise:
         self._decode = Decoder(rig)
         self._cameras: dict[Camera, _Camera] = {name: _Camera() for name in CAMERAS}
         self._fixed_ns = round(config.tolerance_ms * 1e6)  # 0: none
-        self._pairs = self._repeating = 0  # pairs made, images of those that were left out
+        self._pairs = 0
         self._use_repeated = config.repeated_images == "use"
         self.skew = Skew()
         self.motion = MotionInbox(R_base_imu)
@@ -226,7 +214,7 @@ class Synchronise:
     def counts(self) -> dict[str, int]:
         """Pairs made, frames without a partner, images that could not be decoded, images that repeat earlier ones."""
         unpaired = {f"unpaired_{name}": camera.unpaired for name, camera in self._cameras.items()}
-        repeated = {f"repeated_{name}": camera.repeated.count for name, camera in self._cameras.items()}
+        repeated = {f"repeated_{name}": camera.repeated for name, camera in self._cameras.items()}
         return {"pairs": self._pairs, **unpaired, "broken": self._decode.broken, **repeated}
 
     def stats(self) -> dict[str, object]:
@@ -238,31 +226,17 @@ class Synchronise:
             "exposure_skew_ms": self.skew.exposure_ns * 1e-6,
             "tolerance_ms": self._tolerance_ns * 1e-6,  # largest difference between the stamps of a pair
             "_fault": self._decode.fault,  # reason why the first of the broken images could not be decoded
-            "_frozen": " and the ".join(name for name, one in cameras if one.repeated.in_a_row >= FROZEN_IMAGES),
+            "_frozen": " and the ".join(name for name, one in cameras if one.repeated_in_a_row >= FROZEN_IMAGES),
         }
 
-    def loss(self, read: Mapping[str, int]) -> str:
-        """Return one line where more than a tenth of the images of a log made no pair, with the reasons; else "".
-
-        read: counts of its reader. Images of a faster camera that the other one has no partners for are no loss.
-        """
-        cameras = self._cameras.values()
-        faster, slower = sorted(cameras, key=lambda camera: camera.period_ns)
-        surplus = 1 - faster.period_ns / slower.period_ns  # NaN: a period is unknown
-        by_chance = 0 if math.isnan(surplus) else min(faster.unpaired, round(surplus * faster.arrived))
-        equal = read["duplicate"] - read["repeated"]
-        images = read["lower"] + read["upper"] + equal + read["broken"] + read["unreadable"]
-        lost = {
-            "without a partner": sum(camera.unpaired for camera in cameras) - by_chance,
-            "not decodable": read["broken"] + self._decode.broken,
-            "repeated or with a partner that is": self._repeating,
-            "in corrupt records": read["unreadable"],
-            "with the stamp of the one before": equal,
-        }
-        if sum(lost.values()) <= NOTABLE_SHARE * images:
-            return ""
-        reasons = ", ".join(f"{count} {reason}" for reason, count in lost.items() if count)
-        return f"{sum(lost.values())} of {images} images made no pair: {reasons}"
+    @property
+    def possible(self) -> float:
+        """Number of pairs if no image were lost: the images of a camera at the rate of the slower one."""
+        lower, upper = self._cameras.values()
+        if not lower.steps_ns or not upper.steps_ns:
+            return max(lower.arrived, upper.arrived)
+        slower_ns = max(lower.period_ns, upper.period_ns)
+        return max(camera.arrived * camera.period_ns / slower_ns for camera in (lower, upper))
 
     def process(self, message: Frame | MotionSample) -> FramePair | None:
         """Return the pair that a frame completes; None where the frame waits, is broken or shows nothing new."""
@@ -307,9 +281,8 @@ class Synchronise:
         # 2. Images that show nothing new.
         lower, upper = frames
         self.skew.add(upper.stamp_ns - lower.stamp_ns)
-        repeated = [camera.repeated.add(image) for camera, image in zip(self._cameras.values(), images, strict=True)]
+        repeated = [camera.repeats(image) for camera, image in zip(self._cameras.values(), images, strict=True)]
         if any(repeated) and not self._use_repeated:
-            self._repeating += len(frames)
             return None
         # 3. The pair.
         self._pairs += 1
