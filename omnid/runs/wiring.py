@@ -97,7 +97,7 @@ def wire(config: Config, inputs: Inputs, front_end: FrontEnd, graph: Graph, outp
     # 1. Images give pairs, pairs give panoramas, and these give poses.
     pairs = graph.stage("pair", front_end.pairing, *inputs.frames)
     panoramas = graph.stage("dewarp", front_end.dewarp, pairs, thread="pair")
-    poses = graph.stage("odometry", front_end.poses, panoramas, thread="pair" if graph.policy is NEWEST else "")
+    poses = graph.stage("odometry", front_end.odometry, panoramas, thread="pair" if graph.policy is NEWEST else "")
 
     # 2. Poses go to the controller, which waits for no stage.
     if inputs.controller is not None:

@@ -2,25 +2,47 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING
 
-from omnid.config import Config
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from calib.fit.rig_uncertainty import motion_errors
+from omnid.config import Config, OdometryConfig
+from omnid.core.control.motion_monitor import AGREE, Conflict
+from omnid.core.nanoseconds import S_PER_NS
+from omnid.core.odometry.earlier_view import EarlierView
+from omnid.core.odometry.estimates import OdometryEstimate
+from omnid.core.odometry.exposure_times import Exposure
+from omnid.core.odometry.line_times import RawImage
+from omnid.core.odometry.motion_agreement import Contradiction, MotionAgreement
+from omnid.core.odometry.motion_filter import MotionFilter
 from omnid.core.odometry.motion_sensors import BIAS, DISTANCE, GYRO_OFFSET, TURN, WHEEL_OFFSET
+from omnid.core.odometry.odometry import VisualOdometry
+from omnid.core.odometry.rig_error import RigError
+from omnid.core.odometry.stereo_frame import StereoFrame
+from omnid.core.places.relocalisation import Relocaliser
 from omnid.core.rig.rig_health import RigHealth
 from omnid.messages import FramePair, OdometryUpdate, Panoramas, StereoDepth
 from omnid.stages.dense_depths import DenseDepths
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry
-from omnid.stages.odometry import OdometryStage
 from omnid.stages.synchronise import Synchronise
 from omnid.tracking_state import TrackingState
+
+if TYPE_CHECKING:  # it takes a second, and few runs use it
+    from omnid.core.odometry.paper.paper_odometry import PaperOdometry
+
+Array = NDArray[np.float64]
 
 
 class FrontEnd:
     """The stages from images to their pose, with the settings of one configuration.
 
-    A run has `pairing`, `dewarp` and `poses` as stages; `process` does the work of the last two. `dense` computes the
-    dense depth of their pairs for all stages that need it.
+    A run has `pairing`, `dewarp` and `odometry` as stages; `process` does the work of the last two. `dense` computes
+    the dense depth of their pairs for all stages that need it.
     """
 
     def __init__(self, geometry: Geometry, config: Config, health: RigHealth | None = None) -> None:
@@ -30,62 +52,183 @@ class FrontEnd:
         self.pairing = Synchronise(geometry.rig, config.pair, config.motion.R_base_imu)
         self.dewarp = Dewarp(geometry, config.panorama)
         self.dense = DenseDepths(geometry, config.stereo_settings())
-        self.odometry = OdometryStage(geometry, config.odometry, self.dense, self.dewarp.raw_images)
-        self.poses = CheckedOdometry(self.odometry, self.health)
+        self.odometry = OdometryStage(geometry, config.odometry, self.dense, self.dewarp.raw_images, self.health)
+
+    def process(self, pair: FramePair) -> OdometryUpdate:
+        """Return the pose at a pair."""
+        return self.odometry.process(self.dewarp.process(pair))
 
     def motion_stats(self) -> dict[str, object]:
         """Return samples of wheels and gyro, their estimated errors with sigmas, and the sensor that differs."""
         inbox, sensors, conflict = self.pairing.motion, self.odometry.motion, self.odometry.conflict
+        # 1. What is wrong.
+        warning = f"{conflict.reason} {conflict.detail}".strip()
+        if not sensors.wheels_are_sane:
+            what = "wheels contradict the cameras: check motor.drive (radius, track, reversed, swapped)"
+            warning = f"{what}: {conflict.detail}" if conflict.detail else what
+        elif sensors.is_slipping:
+            warning = "wheels slip"
+        # 2. The numbers.
         stats: dict[str, object] = {
             "wheel_samples": inbox.wheels,
             "gyro_samples": inbox.gyro,
             "dropped": inbox.dropped,
             "slips": sensors.slips,
             "refused_gyro": sensors.refused,
-            "_warning": "wheels slip" if sensors.is_slipping else f"{conflict.reason} {conflict.detail}".strip(),
+            "_warning": warning,
         }
-        if not sensors.wheels_are_sane:
-            what = "wheels contradict the cameras: check motor.drive (radius, track, reversed, swapped)"
-            stats["_warning"] = f"{what}: {conflict.detail}" if conflict.detail else what
-        estimated: dict[str, tuple[int, float]] = {}  # state of the filter, and the unit
-        if sensors.steps and inbox.wheels:
-            estimated |= {"wheel_scale": (DISTANCE, 1.0), "turn_scale": (TURN, 1.0)}
-            estimated |= {"wheel_offset_ms": (WHEEL_OFFSET, 1e3)}
-        if sensors.steps and inbox.gyro:
-            estimated |= {"gyro_offset_ms": (GYRO_OFFSET, 1e3)}
-            estimated |= {f"gyro_bias_{axis}_radps": (BIAS.start + k, 1.0) for k, axis in enumerate("xyz")}
-        stats |= {name: unit * float(sensors.values[state]) for name, (state, unit) in estimated.items()}
-        return stats | {f"{name}_sigma": unit * float(sensors.sigmas[k]) for name, (k, unit) in estimated.items()}
-
-    def process(self, pair: FramePair) -> OdometryUpdate:
-        """Return the pose at a pair."""
-        return self.poses.process(self.dewarp.process(pair))
+        wheels = {"wheel_scale": DISTANCE, "turn_scale": TURN, "wheel_offset_s": WHEEL_OFFSET}
+        gyro = {"gyro_offset_s": GYRO_OFFSET}
+        gyro |= {f"gyro_bias_{axis}_radps": BIAS.start + k for k, axis in enumerate("xyz")}
+        for states, count in ((wheels, inbox.wheels), (gyro, inbox.gyro)):
+            for name, state in states.items() if count and sensors.steps else ():
+                stats[name], stats[f"{name}_sigma"] = float(sensors.values[state]), float(sensors.sigmas[state])
+        return stats
 
 
-class CheckedOdometry:
-    """Odometry of a rig that its images do not contradict: the first pairs, and those after a loss, are checked."""
+class OdometryStage:
+    """Estimate poses in odom, which is the rig frame of the first pair, by a rig that is checked.
 
-    def __init__(self, odometry: OdometryStage, health: RigHealth) -> None:
-        self._odometry, self._health = odometry, health
+    The first pairs, and those after a loss, are checked by `health`.
+    """
+
+    def __init__(
+        self,
+        geometry: Geometry,
+        config: OdometryConfig,
+        dense: DenseDepths,
+        raw_images: tuple[RawImage, RawImage],
+        health: RigHealth,
+    ) -> None:
+        """dense: computes the depth of keyframes. raw_images: see VisualOdometry."""
+        self._dense, self._health = dense, health
+        self._T_rig_rect = geometry.T_rig_rect
+        self._to_rig = se3.adjoint(self._T_rig_rect)
+        self._T_base_rect = geometry.rig.T_base_rig @ self._T_rig_rect
+        self._last_ns: int | None = None
         self._unchecked: StereoDepth | None = None  # the last pair, if it is to be checked with its motion
         self._was_found = False  # whether a pose was tracked yet
+        self._keyframe: tuple[Panoramas, OdometryEstimate] | None = None  # the last one, if its pose was known well
+        self.motion = MotionFilter(T_base_rect=self._T_base_rect)
+        self._method: VisualOdometry | PaperOdometry
+        model = geometry.model(config.noise_px)
+        if config.method == "default":
+            relocaliser = Relocaliser(model)
+            self._method = VisualOdometry(model, config.klt, config.limits, relocaliser, raw_images, self.motion)
+        else:
+            from omnid.core.odometry.paper.paper_odometry import PaperOdometry
 
-    def process(self, panoramas: Panoramas) -> OdometryUpdate:
+            self._method = PaperOdometry(model, config.klt, config.tracker, config.reference)
+        self._agreement = MotionAgreement(self.motion)
+        self.last_fault = AGREE  # the last disagreement that was more than a doubt
+        self._contradiction = Contradiction()
+        self._rig_error = RigError(motion_errors(geometry.rig))
+
+    @property
+    def conflict(self) -> Conflict:
+        """The present disagreement of images, wheels and gyro."""
+        return self._agreement.result
+
+    @property
+    def image_faults(self) -> list[str]:
+        """One line for each way in which the images of a camera are torn or displaced."""
+        breaks = self._method.breaks if isinstance(self._method, VisualOdometry) else None
+        return [] if breaks is None else breaks.words
+
+    def process(self, pair: Panoramas) -> OdometryUpdate:
         """Return the pose at a pair; RigContradictedError where the images contradict the rig."""
         # 1. Check the rig by the pair; where the pixels were exposed at several times, by the pair before: the odometry
         #    has found the motion during its exposures.
-        if panoramas.times.is_at_once:
-            self._health.begin(panoramas)
+        if pair.times.is_at_once:
+            self._health.begin(pair)
         elif self._unchecked is not None:
             self._health.begin(self._unchecked.panoramas, self._unchecked.exposure)
         is_contradicted, is_checking = self._health.state.is_contradicted, self._health.is_checking
-
-        # 2. Estimate the pose. With a rig that the images contradict it is degraded at best.
-        update = self._odometry.process(panoramas)
-        self._unchecked = update.depth if is_checking and not panoramas.times.is_at_once else None
-        self._was_found |= update.state is TrackingState.TRACKING
-        if self._was_found and update.state is TrackingState.LOST:
+        # 2. What wheels and gyro have measured since the pair before.
+        last_ns, self._last_ns = self._last_ns, pair.stamp_ns
+        sensors = self.motion.sensors
+        sensors.add(pair.motion)
+        dt_s, interval_s = 0.0, None
+        if last_ns is not None:
+            dt_s = (pair.stamp_ns - last_ns) * S_PER_NS
+            interval_s = sensors.seconds(last_ns), sensors.seconds(pair.stamp_ns)
+        # 3. The pose of the rectified frame.
+        frame = StereoFrame(
+            pair.seq,
+            pair.lower,
+            pair.upper,
+            partial(self._disparity, pair),
+            np.zeros_like(pair.visible) if pair.light.shows_nothing else pair.usable,
+            pair.times,
+            interval_s,
+            lost=pair.tiles.lost_pixels(pair.visible.shape),
+        )
+        estimate = self._method.process(frame, dt_s)
+        # 4. Compare its step with wheels and gyro over seconds.
+        if estimate.step is not None and last_ns is not None:
+            seen = se3.adjoint(self._T_base_rect) @ se3.log(estimate.step)
+            self._agreement.add_step(last_ns, pair.stamp_ns, *map(float, seen[[0, 5, 1]]))
+            if self.conflict.is_fault:
+                self.last_fault = self.conflict
+        # 5. The message, at best degraded where the rig, darkness, or wheels and gyro contradict the pose.
+        is_doubted = pair.light.is_too_dark or (self.conflict.is_fault and self.conflict.contradicts_images)
+        state = estimate.state
+        if state is TrackingState.TRACKING and (is_doubted or is_contradicted):
+            state = TrackingState.DEGRADED
+        update = self._update(pair, estimate, state)
+        # 6. Whether the next pair is to be checked.
+        self._unchecked = update.depth if is_checking and not pair.times.is_at_once else None
+        self._was_found |= estimate.state is TrackingState.TRACKING
+        if self._was_found and state is TrackingState.LOST:
             self._health.check_again()
-        if is_contradicted and update.state is TrackingState.TRACKING:
-            return replace(update, state=TrackingState.DEGRADED)
         return update
+
+    def complete(self) -> None:
+        """Finish the work for the last pair now, such as its keyframe; otherwise that is done before the next pair."""
+        self._method.complete()
+
+    def _update(self, pair: Panoramas, estimate: OdometryEstimate, state: TrackingState) -> OdometryUpdate:
+        """Return the message of an estimate, in the frame of the rig, with the errors of rig and sensors."""
+        # 1. The uncertainty by what wheels and gyro contradict, and by the errors of the rig.
+        T_odom_rect, T_rect_base = estimate.T_odom_rect, se3.inverse(self._T_base_rect)
+        to_rect = se3.adjoint(T_rect_base)
+        contradicted = self._contradiction.add(self.conflict, T_odom_rect @ T_rect_base, pair.stamp_ns * S_PER_NS)
+        covariance_rect = estimate.covariance + to_rect @ contradicted @ to_rect.T
+        covariance = covariance_rect + self._rig_error.at(T_odom_rect, estimate.distance_m)
+        # 2. The depth, with what the camera saw at the last keyframe, where the motion since is known.
+        is_known, before, earlier = estimate.state is TrackingState.TRACKING, self._keyframe, None
+        if estimate.is_keyframe:
+            self._keyframe = (pair, estimate) if is_known else None
+        if before is not None and is_known and before[1].resets == estimate.resets:
+            T_earlier_now = se3.inverse(before[1].T_odom_rect) @ T_odom_rect
+            earlier = EarlierView(before[0].lower, before[0].usable, T_earlier_now, _moving(before[1].exposure))
+        return OdometryUpdate(
+            pair.seq,
+            pair.stamp_ns,
+            self._T_rig_rect @ T_odom_rect @ se3.inverse(self._T_rig_rect),
+            self._to_rig @ covariance @ self._to_rig.T,
+            self._to_rig @ estimate.velocity,
+            self._to_rig @ estimate.velocity_covariance @ self._to_rig.T,
+            state,
+            estimate.resets,
+            estimate.inliers,
+            estimate.tracked,
+            StereoDepth(pair, _moving(estimate.exposure), earlier),
+            estimate.features,
+            pair.light,
+            pair.motion,
+            estimate.is_keyframe,
+            self.conflict,
+            estimate.image_fault,
+            T_odom_rect,
+            covariance_rect,
+        )
+
+    def _disparity(self, pair: Panoramas, exposure: Exposure | None) -> NDArray[np.float32]:
+        """Return the disparities (H, W) of a pair for a motion during its exposures."""
+        return self._dense.points(pair, _moving(exposure)).disparity
+
+
+def _moving(exposure: Exposure | None) -> Exposure | None:
+    """Return the exposure of a frame, None where all its pixels are exposed at the stamp."""
+    return None if exposure is None or exposure.times.is_at_once else exposure

@@ -29,10 +29,9 @@ from omnid.messages import OdometryUpdate
 from omnid.runs.wiring import Inputs, Outputs, wire
 from omnid.sinks.files import TrajectoryFile
 from omnid.stages.dewarp import Dewarp
-from omnid.stages.front_end import FrontEnd
+from omnid.stages.front_end import FrontEnd, OdometryStage
 from omnid.stages.geometry import geometry, with_rims
 from omnid.stages.mapping import Mapping
-from omnid.stages.odometry import OdometryStage
 from omnid.stages.synchronise import Synchronise
 from tests.bench.accuracy import rig_of
 from tests.bench.results import ResultTable, columns, lucas_kanade_ns, run, sgbm_ns
