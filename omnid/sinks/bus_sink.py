@@ -58,8 +58,8 @@ class BusSink:
         self._path_is_new |= len(self._path.vertices) != vertices
         if self._path_is_new and odometry.stamp_ns >= self._path_ns + PATH_NS:
             self._path_is_new, self._path_ns = False, odometry.stamp_ns
-            xy = [vertex[:2] for vertex in self._path.with_end()]
-            self._bus.publish("path", path_cdr(self._encode.unix_ns(odometry.stamp_ns), "odom", xy))
+            path = path_cdr(self._encode.unix_ns(odometry.stamp_ns), "odom", self._path.xy())
+            self._bus.publish("path", path)
 
 
 class PanoramaSink:

@@ -14,7 +14,7 @@ from calib import se3
 from omnid.config import StereoConfig
 from omnid.core.odometry.earlier_view import EarlierView, contradicted
 from omnid.core.odometry.exposure_times import Exposure
-from omnid.core.stereo.matcher import Matcher, MatchingSettings
+from omnid.core.stereo.matcher import Matcher
 from omnid.core.stereo.triangulation import triangulate
 from omnid.engine.threads import Lock
 from omnid.errors import OmnidError
@@ -37,6 +37,17 @@ class DenseDepths:
     def __init__(self, geometry: Geometry, config: StereoConfig) -> None:
         self._config, self._cylinder, self._baseline_m = config, geometry.cylinder, geometry.rig.baseline_m
         self._T_rig_rect = geometry.T_rig_rect
+        # Disparities up to those of the nearest points; rows are left beyond the largest one.
+        height, step_px = geometry.cylinder.height, DISPARITY_STEP_PX
+        limit = (height - step_px // 2) // step_px * step_px
+        if limit < step_px:
+            raise OmnidError(
+                f"the panoramas are {height} px high, stereo needs at least {step_px + step_px // 2} px: use "
+                "larger images, or a rig whose cameras share more of their view"
+            )
+        nearest_px = self._cylinder.focal_px * self._baseline_m / config.min_range_m
+        disparities = min(config.matching.disparities, math.ceil(nearest_px / step_px) * step_px, limit)
+        self._matching = replace(config.matching, disparities=disparities)
         self._idle: deque[Matcher] = deque()  # matchers with their buffers: one for each thread that matched at once
         self._known: WeakKeyDictionary[Panoramas, _Known] = WeakKeyDictionary()
         self._one = Lock()
@@ -73,7 +84,7 @@ class DenseDepths:
         try:
             matcher = self._idle.pop()
         except IndexError:
-            matcher = Matcher(lower.image.shape[:2], self._matching(lower.image.shape[0]))
+            matcher = Matcher(lower.image.shape[:2], self._matching)
         flat, found = matcher.match(lower.image, panoramas.upper.image, valid, lower.noise_grey, shift)
         self._idle.append(matcher)
         rows, columns = np.divmod(flat, lower.image.shape[1])
@@ -105,23 +116,7 @@ class DenseDepths:
         disparity = dense.disparity.copy()
         columns, rows = dense.pixels[wrong].astype(np.intp).T
         disparity[rows, columns] = np.nan
-        kept = np.flatnonzero(~wrong)
-        pixels, points, variance_m2 = (a.take(kept, axis=0) for a in (dense.pixels, dense.points, dense.variance_m2))
-        return DensePoints(disparity, pixels, points, variance_m2)
-
-    def _matching(self, height: int) -> MatchingSettings:
-        """Return the settings with disparities up to those of the nearest points, for panoramas of height rows."""
-        step_px, matching = DISPARITY_STEP_PX, self._config.matching
-        nearest_px = self._cylinder.focal_px * self._baseline_m / self._config.min_range_m
-        limit = (height - step_px // 2) // step_px * step_px  # rows are left beyond the largest disparity
-        if limit < step_px:
-            raise OmnidError(
-                f"the panoramas are {height} px high, stereo needs at least {step_px + step_px // 2} px: use "
-                "larger images, or a rig whose cameras share more of their view"
-            )
-        return replace(
-            matching, disparities=min(matching.disparities, math.ceil(nearest_px / step_px) * step_px, limit)
-        )
+        return DensePoints(disparity, dense.pixels[~wrong], dense.points[~wrong], dense.variance_m2[~wrong])
 
 
 class _Known:

@@ -1,4 +1,4 @@
-"""Map of a run: points of all pairs in one frame, fused in voxels (Dang et al. 2012, section IV.G)."""
+"""Map of a run: points of all pairs in one frame, fused in voxels (Dang et al. 2012, section IV.G), and its grid."""
 
 from __future__ import annotations
 
@@ -19,9 +19,8 @@ from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]
 
-# A voxel is published if enough of the mapped frames have seen it: a tenth of them, from MIN_VOXEL_FRAMES (half of the
-# frames where there are fewer than 4) to mapping.min_frames.
-MIN_VOXEL_FRAMES = 2
+# A voxel is published if enough of the mapped frames have seen it: a tenth of them, from two (half of the frames where
+# there are fewer than 4) to mapping.min_frames.
 FRAMES_PER_VOXEL_FRAME = 10
 # A pair that has moved by less shows the same points again. Measured: with 15 cm and 8 degrees half as many pairs enter
 # the map, but up to 2.4 times as many of its points are wrong (`tests.bench.accuracy --cloud`).
@@ -43,7 +42,7 @@ class Mapping:
         self._every_ns, self._published_ns = round(every_s * NS_PER_S), 0
         self._map = VoxelMap(config.voxel_m, config.max_voxels)
         self._path = ThinnedPath(config.path_poses, config.voxel_m)
-        self._newest: tuple[int, int] | None = None
+        self._newest: OdometryUpdate | None = None
         self._min_gap_ns = round(NS_PER_S / config.rate_hz) if config.rate_hz else 0
         self._mapped: tuple[int, Array] | None = None  # stamp and pose of the last pair that entered the map
         self._frames = 0  # number of pairs that entered the map
@@ -58,9 +57,8 @@ class Mapping:
         if isinstance(message, bool):
             self._is_read = message
             return None
-        odometry = message
         # 1. The path has all poses, the map the points of those pairs that are due.
-        self._newest = odometry.seq, odometry.stamp_ns
+        odometry = self._newest = message
         self._path.add(Vertex(*odometry.T_odom_rig[:2, 3].tolist()))
         if odometry.state == TrackingState.TRACKING and self._is_due(odometry):
             self._mapped = odometry.stamp_ns, odometry.T_odom_rig
@@ -73,7 +71,11 @@ class Mapping:
         if not self._every_ns or odometry.stamp_ns - self._published_ns < self._every_ns:
             return None
         self._published_ns = odometry.stamp_ns
-        return self._update(odometry.seq, odometry.stamp_ns)
+        return self._update(odometry)
+
+    def finish(self) -> list[MapUpdate]:
+        """Return the final map, if there was a pair."""
+        return [] if self._newest is None else [self._update(self._newest)]
 
     def _is_due(self, odometry: OdometryUpdate) -> bool:
         """True if a pair is to enter the map: at mapping.rate_hz, or once a second while the view is the same.
@@ -91,16 +93,11 @@ class Mapping:
         wait_ns = max(self._min_gap_ns, SAME_VIEW_NS if is_same_view else 0)
         return since_ns >= (wait_ns / 2 if odometry.is_keyframe else wait_ns) - STAMP_JITTER_NS
 
-    def finish(self) -> list[MapUpdate]:
-        """Return the final map, if there was a pair."""
-        return [] if self._newest is None else [self._update(*self._newest)]
-
-    def _update(self, seq: int, stamp_ns: int) -> MapUpdate:
+    def _update(self, newest: OdometryUpdate) -> MapUpdate:
         """Return the path, and the voxels that enough frames have seen: false matches seldom repeat in one place."""
-        least = min(MIN_VOXEL_FRAMES, max(1, self._frames // 2))
+        least = min(2, max(1, self._frames // 2))
         enough = min(self._config.min_frames, max(least, self._frames // FRAMES_PER_VOXEL_FRAME))
-        path_xy = np.array([vertex[:2] for vertex in self._path.with_end()], float).reshape(-1, 2)
-        return MapUpdate(seq, stamp_ns, self._map.points(enough), path_xy)
+        return MapUpdate(newest.seq, newest.stamp_ns, self._map.points(enough), self._path.xy())
 
 
 class MapGrid:
@@ -109,8 +106,8 @@ class MapGrid:
     def __init__(self, cell_m: float, T_base_rect: Array, every_s: float = 0.0) -> None:
         """cell_m: side of a cell. every_s: time between two grids, by the stamps; 0: one grid, at the end."""
         self._grid, self._T_base_rect = KeyframeGrid(cell_m), T_base_rect
-        self._every_ns, self._published_ns = round(every_s * NS_PER_S), 0
-        self._published: object = None  # scans of the last grid
+        self._every_ns, self._drawn_ns = round(every_s * NS_PER_S), 0
+        self._drawn: object = None  # scans of the last grid
         self._newest: PlaceUpdate | None = None
 
     def process(self, update: PlaceUpdate) -> GridUpdate | None:
@@ -118,19 +115,16 @@ class MapGrid:
         if not update.is_known:  # the pose of these scans in the map is unknown
             return None
         self._newest = update
-        is_early = not self._every_ns or update.stamp_ns - self._published_ns < self._every_ns
-        if is_early or update.scans is self._published:
-            return None
-        return self._drawn(update)
+        is_due = self._every_ns and update.stamp_ns - self._drawn_ns >= self._every_ns
+        return self._update(update) if is_due else None
 
     def finish(self) -> list[GridUpdate]:
         """Return the final grid, if there was a keyframe."""
-        newest = self._newest
-        if newest is None or newest.scans is None or not newest.scans.scans or newest.scans is self._published:
-            return []
-        return [self._drawn(newest)]
+        final = None if self._newest is None else self._update(self._newest)
+        return [] if final is None else [final]
 
-    def _drawn(self, update: PlaceUpdate) -> GridUpdate:
-        assert update.scans is not None
-        self._published_ns, self._published = update.stamp_ns, update.scans
-        return GridUpdate(update.seq, update.stamp_ns, self._grid.draw(update.scans, self._T_base_rect))
+    def _update(self, newest: PlaceUpdate) -> GridUpdate | None:
+        if newest.scans is None or not newest.scans.scans or newest.scans is self._drawn:
+            return None
+        self._drawn_ns, self._drawn = newest.stamp_ns, newest.scans
+        return GridUpdate(newest.seq, newest.stamp_ns, self._grid.draw(newest.scans, self._T_base_rect))

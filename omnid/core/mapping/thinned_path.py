@@ -5,6 +5,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 
 class Vertex(NamedTuple):
     """A position on a path."""
@@ -49,9 +52,10 @@ class ThinnedPath:
             self.vertices = vertices[:1] + list(map(_after, vertices[1::2], vertices[2::2]))
             self._pending = vertices[-1] if len(vertices) % 2 == 0 else None
 
-    def with_end(self) -> list[Vertex]:
-        """Return the vertices and the end of the path."""
-        return self.vertices if self._pending is None else [*self.vertices, self._pending]
+    def xy(self) -> NDArray[np.float64]:
+        """Return the positions (N, 2) [m] of the vertices and of the end of the path."""
+        end = [] if self._pending is None else [self._pending]
+        return np.array([vertex[:2] for vertex in (*self.vertices, *end)], float).reshape(-1, 2)
 
 
 def _after(dropped: Vertex, vertex: Vertex) -> Vertex:
